@@ -1,0 +1,1 @@
+"""One module per sensor: its settings, its record, its parameters and its equation."""

@@ -1,0 +1,276 @@
+"""The Doppler velocity log: settings, record, and the velocity that it reports."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from factorgraph_dvl.conventions import DEG, Array, rotate, skew
+from factorgraph_dvl.earth import LocalFrame
+from factorgraph_dvl.sensors.protocol import (
+    Linearization,
+    Motion,
+    NonNegative,
+    Observation,
+    Parameter,
+    Section,
+    Sigma3,
+    Values,
+    Vector3,
+    check_all_or_none,
+    check_range,
+    check_times,
+    lever_arm_sigma,
+    named_columns,
+)
+
+VELOCITY_COLUMNS = ("vel_x_m_s", "vel_y_m_s", "vel_z_m_s")
+STD_COLUMNS = ("std_x_m_s", "std_y_m_s", "std_z_m_s")
+
+MISALIGNMENT = "misalignment_deg"
+SCALE_ERROR = "scale_error"
+LEVER_ARM = "lever_arm_m"
+BIAS = "dvl_bias_m_s"
+TIME_OFFSET = "time_offset_s"
+CURRENT = "current_m_s"
+
+# A DVL at rest reports a standard deviation of zero under a purely relative model.
+_LEAST_SIGMA = 1e-4
+
+
+class DvlSettings(Section, frozen=True, kw_only=True):
+    """Section `dvl` of trial.yaml."""
+
+    file: str = "dvl.csv"
+    velocity_std_m_s: NonNegative = 0.001
+    velocity_std_fraction: NonNegative = 0.002
+    misalignment_deg: Vector3 = (0.0, 0.0, 0.0)
+    misalignment_std_deg: Sigma3 = (180.0, 180.0, 180.0)
+    scale_error: float | Vector3 = 0.0
+    scale_error_std: NonNegative | Sigma3 = 0.1
+    lever_arm_m: Vector3 = (0.0, 0.0, 0.0)
+    lever_arm_std_m: Sigma3 = (10.0, 10.0, 10.0)
+    bias_std_m_s: Sigma3 = (0.0, 0.0, 0.0)
+    time_offset_s: float = 0.0
+    time_offset_std_s: NonNegative = 0.0
+    reference: Literal["bottom", "water"] = "bottom"
+    current_std_m_s: tuple[NonNegative, NonNegative] = (0.5, 0.5)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        scales = np.atleast_1d(self.scale_error)
+        if np.any(scales <= -1.0):
+            raise ValueError("`scale_error` must be above -1")
+
+
+@dataclass(frozen=True)
+class Dvl:
+    """Settings and record of the DVL.
+
+    Parameters
+    ----------
+    settings : DvlSettings
+    time : (M,) s, strictly increasing; true time plus the time offset.
+    velocity : (M, 3) velocity of the DVL over the seabed (or through the water), in
+        its own axes d, m/s; nan = no lock.
+    std : (M, 3) m/s; nan where the record has none.
+    source : name of the file, for messages.
+    """
+
+    settings: DvlSettings
+    time: Array
+    velocity: Array
+    std: Array
+    source: str = "dvl"
+    label: str = "DVL"
+
+    def __post_init__(self) -> None:
+        check_times(self.time, self.source)
+        velocity = named_columns(VELOCITY_COLUMNS, self.velocity)
+        check_all_or_none(velocity, self.source)
+        check_range(velocity, -50.0, 50.0, "m/s", self.source)
+        std = named_columns(STD_COLUMNS, self.std)
+        check_all_or_none(std, self.source)
+        check_range(std, 1e-6, 100.0, "m/s, above 0", self.source)
+
+    @property
+    def locked(self) -> Array:
+        """Pings with a velocity, (M,) bool."""
+        return ~np.isnan(self.velocity[:, 0])
+
+    def sigma(self) -> Array:
+        """Return the standard deviations of the velocity components, (M, 3), m/s.
+
+        The record's own where it has them, else sqrt(floor² + (fraction |v|)²).
+        """
+        s = self.settings
+        speed = np.linalg.norm(self.velocity, axis=1, keepdims=True)
+        model = np.hypot(s.velocity_std_m_s, s.velocity_std_fraction * speed)
+        return np.maximum(np.where(np.isnan(self.std), model, self.std), _LEAST_SIGMA)
+
+    def parameters(self) -> tuple[Parameter, ...]:
+        """Return misalignment, scale error, lever arm, bias, time offset and current."""
+        s = self.settings
+        mean = np.atleast_1d(np.array(s.scale_error, dtype=float))
+        sigma = np.atleast_1d(np.array(s.scale_error_std, dtype=float))
+        axes = max(mean.size, sigma.size)
+        zero = np.zeros(3)
+        through_water = s.reference == "water"
+        current = np.array(s.current_std_m_s) if through_water else np.zeros(2)
+        return (
+            Parameter(
+                "misalignment",
+                "deg",
+                DEG,
+                np.array(s.misalignment_deg) * DEG,
+                np.array(s.misalignment_std_deg) * DEG,
+                rotation=True,
+            ),
+            Parameter(
+                "scale_error",
+                "",
+                1.0,
+                np.broadcast_to(mean, axes).copy(),
+                np.broadcast_to(sigma, axes).copy(),
+                labels=("x", "y", "z") if axes == 3 else ("",),
+            ),
+            Parameter("lever_arm", "m", 1.0, np.array(s.lever_arm_m), np.array(s.lever_arm_std_m)),
+            Parameter("dvl_bias", "m_s", 1.0, zero, np.array(s.bias_std_m_s)),
+            Parameter(
+                "time_offset",
+                "s",
+                1.0,
+                np.array([s.time_offset_s]),
+                np.array([s.time_offset_std_s]),
+                labels=("",),
+            ),
+            Parameter("current", "m_s", 1.0, np.zeros(2), current, labels=("e", "n")),
+        )
+
+    def observations(self, frame: LocalFrame) -> tuple[Observation, ...]:
+        """Return the pings that have a lock."""
+        m = self.locked
+        if not m.any():
+            return ()
+        return (DvlVelocity(self.time[m], self.velocity[m], self.sigma()[m]),)
+
+    def explain(self, parameter: str, component: int, motion: Motion | None) -> str:
+        """Say why a component could not be observed, given the motion of the trial."""
+        if motion is None:
+            return "the trial has no ping with a lock"
+        v_b = rotate(motion.nRb.transpose(0, 2, 1), motion.v_n)
+        speed = np.linalg.norm(v_b, axis=1)
+        moving = speed > 0.3 * max(speed.max(), 1e-9)
+        direction = v_b[moving] / speed[moving, None]
+        spread = np.degrees(
+            np.linalg.svd(direction, full_matrices=False)[1][1] / np.sqrt(moving.sum())
+        )
+        rates = np.degrees(np.std(motion.omega_eb_b, axis=0))
+        if parameter == MISALIGNMENT:
+            return (
+                f"the velocity keeps its direction in the body to {spread:.2g} deg, and a "
+                "rotation about the velocity changes nothing: it takes side slip, heave or a "
+                "current from changing sides"
+            )
+        if parameter == LEVER_ARM:
+            x, y, z = rates
+            return (
+                f"the body turns too little (rms rate {x:.2g}, {y:.2g}, {z:.2g} deg/s about "
+                "x, y, z): a lever arm shows only through rotation about another axis than its own"
+            )
+        if parameter == SCALE_ERROR:
+            return (
+                f"nothing else in the trial measures speed well enough (it was {speed.min():.2g} "
+                f"to {speed.max():.2g} m/s): it takes GNSS and distance"
+            )
+        if parameter == BIAS:
+            return "a bias separates from the scale only when speed or direction vary"
+        if parameter == TIME_OFFSET:
+            return "a time offset shows only where velocity or attitude change"
+        return "a current separates from the other errors only when the heading changes"
+
+
+@dataclass(frozen=True)
+class DvlVelocity:
+    """Velocity reported by a DVL; zero error where
+
+        v_d = (1 + k) dRb (nRbᵀ (v_n - c_n) + omega_eb_b x l) + beta,
+
+    all at the true time of the ping, which is time - offset. k acts per axis of d where
+    it has three components. c_n is the current, zero for bottom track. The large-angle
+    form of Luo et al. (2024), eq. 1, with the rate relative to the Earth.
+
+    Parameters
+    ----------
+    time : (M,) s, as in the file.
+    measured_d : (M, 3) m/s.
+    std : (M, 3) m/s.
+    """
+
+    time: Array
+    measured_d: Array
+    std: Array
+    label: str = "DVL velocity"
+    parameters: tuple[str, ...] = (
+        MISALIGNMENT,
+        SCALE_ERROR,
+        LEVER_ARM,
+        BIAS,
+        TIME_OFFSET,
+        CURRENT,
+    )
+
+    def true_time(self, values: Values) -> Array:
+        """Return the times of the pings on the trial's clock."""
+        return self.time - values[TIME_OFFSET][0]
+
+    def sigma(self, motion: Motion, values: Values) -> Array:
+        """Return the standard deviations, the gyro's share through the lever arm included."""
+        return np.hypot(self.std, lever_arm_sigma(motion, values[LEVER_ARM])[:, None])
+
+    def residual(self, motion: Motion, values: Values) -> Array:
+        """Return predicted - measured in d, (M, 3), m/s."""
+        dvl_b, _ = _velocity_at_dvl(motion, values)
+        predicted = (1.0 + values[SCALE_ERROR]) * (dvl_b @ values[MISALIGNMENT].T)
+        return predicted + values[BIAS] - self.measured_d
+
+    def linearize(self, motion: Motion, values: Values) -> Linearization:
+        """Return the residual and its Jacobians."""
+        dvl_b, imu_b = _velocity_at_dvl(motion, values)
+        bRn = motion.nRb.transpose(0, 2, 1)
+        scale = 1.0 + values[SCALE_ERROR]
+        unscaled_d = dvl_b @ values[MISALIGNMENT].T
+        dMb = np.broadcast_to(scale, (3,))[:, None] * values[MISALIGNMENT]
+        lever_arm = values[LEVER_ARM]
+        n_scale = values[SCALE_ERROR].size
+        d_scale = unscaled_d[:, :, None] if n_scale == 1 else unscaled_d[:, :, None] * np.eye(3)
+        # d/dt of (bRn (v_n - c_n) + omega x l), whose sign turns with that of the offset.
+        rate_b = (
+            rotate(bRn, motion.a_n)
+            - np.cross(motion.omega_eb_b, imu_b)
+            + np.cross(motion.alpha_b, lever_arm)
+        )
+        d_v = dMb @ bRn
+        return Linearization(
+            residual=scale * unscaled_d + values[BIAS] - self.measured_d,
+            d_theta=dMb @ skew(imu_b),
+            d_v=d_v,
+            d_omega=np.broadcast_to(-dMb @ skew(lever_arm), d_v.shape),
+            d_parameters={
+                MISALIGNMENT: -dMb @ skew(dvl_b),
+                SCALE_ERROR: d_scale,
+                LEVER_ARM: dMb @ skew(motion.omega_eb_b),
+                BIAS: np.broadcast_to(np.eye(3), d_v.shape),
+                TIME_OFFSET: -(rate_b @ dMb.T)[:, :, None],
+                CURRENT: -d_v[:, :, :2],
+            },
+        )
+
+
+def _velocity_at_dvl(motion: Motion, values: Values) -> tuple[Array, Array]:
+    """Return the velocities of DVL and IMU, relative to bottom or water, in body, (M, 3)."""
+    current_n = np.append(values[CURRENT], 0.0)
+    imu_b = rotate(motion.nRb.transpose(0, 2, 1), motion.v_n - current_n)
+    return imu_b + np.cross(motion.omega_eb_b, values[LEVER_ARM]), imu_b

@@ -1,0 +1,218 @@
+"""The GNSS receiver: position and velocity of its antenna."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from factorgraph_dvl.conventions import DEG, Array, rotate, skew
+from factorgraph_dvl.earth import LocalFrame
+from factorgraph_dvl.sensors.protocol import (
+    Linearization,
+    Motion,
+    Observation,
+    Parameter,
+    Positive,
+    Section,
+    Sigma3,
+    Values,
+    Vector3,
+    check_all_or_none,
+    check_range,
+    check_times,
+    lever_arm_sigma,
+    named_columns,
+)
+
+POSITION_COLUMNS = ("lat_deg", "lon_deg", "height_m")
+VELOCITY_COLUMNS = ("vel_e_m_s", "vel_n_m_s", "vel_u_m_s")
+POSITION_STD_COLUMNS = ("std_e_m", "std_n_m", "std_u_m")
+VELOCITY_STD_COLUMNS = ("vel_std_e_m_s", "vel_std_n_m_s", "vel_std_u_m_s")
+
+LEVER_ARM = "gnss_lever_arm_m"
+
+
+class GnssSettings(Section, frozen=True, kw_only=True):
+    """Section `gnss` of trial.yaml."""
+
+    file: str = "gnss.csv"
+    position_std_m: tuple[Positive, Positive, Positive] = (1.0, 1.0, 2.0)
+    velocity_std_m_s: tuple[Positive, Positive, Positive] = (0.1, 0.1, 0.1)
+    lever_arm_m: Vector3 = (0.0, 0.0, 0.0)
+    lever_arm_std_m: Sigma3 = (0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True)
+class Gnss:
+    """Settings and record of the GNSS receiver.
+
+    Parameters
+    ----------
+    settings : GnssSettings
+    time : (M,) s, strictly increasing.
+    geodetic : (M, 3) latitude, longitude (rad), ellipsoidal height (m) of the antenna;
+        nan where not measured.
+    velocity : (M, 3) east, north, up, m/s; nan where not measured.
+    position_std, velocity_std : (M, 3) standard deviations, east, north, up; the
+        settings' where the record has none (nan).
+    source : name of the file, for messages.
+    """
+
+    settings: GnssSettings
+    time: Array
+    geodetic: Array
+    velocity: Array
+    position_std: Array
+    velocity_std: Array
+    source: str = "gnss"
+    label: str = "GNSS"
+
+    def __post_init__(self) -> None:
+        check_times(self.time, self.source)
+        position = named_columns(POSITION_COLUMNS, self.geodetic)
+        check_all_or_none(position, self.source)
+        velocity = named_columns(VELOCITY_COLUMNS, self.velocity)
+        check_all_or_none(velocity, self.source)
+        degrees = {k: v / DEG for k, v in position.items()}
+        check_range({"lat_deg": degrees["lat_deg"]}, -90.0, 90.0, "deg", self.source)
+        check_range({"lon_deg": degrees["lon_deg"]}, -360.0, 360.0, "deg", self.source)
+        check_range({"height_m": position["height_m"]}, -12e3, 20e3, "m", self.source)
+        check_range(velocity, -200.0, 200.0, "m/s", self.source)
+        for names, std in (
+            (POSITION_STD_COLUMNS, self.position_std),
+            (VELOCITY_STD_COLUMNS, self.velocity_std),
+        ):
+            check_range(named_columns(names, std), 1e-6, 1e6, "above 0", self.source)
+        for std, default in (
+            (self.position_std, self.settings.position_std_m),
+            (self.velocity_std, self.settings.velocity_std_m_s),
+        ):
+            np.copyto(std, np.broadcast_to(default, std.shape), where=np.isnan(std))
+
+    def parameters(self) -> tuple[Parameter, ...]:
+        """Return the antenna's lever arm."""
+        s = self.settings
+        return (
+            Parameter(
+                "gnss_lever_arm", "m", 1.0, np.array(s.lever_arm_m), np.array(s.lever_arm_std_m)
+            ),
+        )
+
+    def observations(self, frame: LocalFrame) -> tuple[Observation, ...]:
+        """Return position and velocity measurements, where there are any."""
+        out: list[Observation] = []
+        has_position = ~np.isnan(self.geodetic[:, 0])
+        has_velocity = ~np.isnan(self.velocity[:, 0])
+        # A receiver that loses its position keeps the axes of the last one: the
+        # vertical turns by a degree in 111 km.
+        known = np.maximum.accumulate(np.where(has_position, np.arange(self.time.size), -1))
+        known = np.where(known < 0, np.argmax(has_position), known)
+        lat, lon = self.geodetic[known, 0], self.geodetic[known, 1]
+        lat, lon = np.where(np.isnan(lat), frame.lat, lat), np.where(np.isnan(lon), frame.lon, lon)
+        lRn = frame.level_from_tangent(lat, lon)
+        if has_position.any():
+            m = has_position
+            p_n = frame.position(*self.geodetic[m].T)
+            out.append(AntennaPosition(self.time[m], p_n, lRn[m], self.position_std[m]))
+        if has_velocity.any():
+            m = has_velocity
+            out.append(
+                AntennaVelocity(self.time[m], self.velocity[m], lRn[m], self.velocity_std[m])
+            )
+        return tuple(out)
+
+    def explain(self, parameter: str, component: int, motion: Motion | None) -> str:
+        """Say why a component of the antenna's lever arm could not be observed."""
+        return (
+            "the antenna's lever arm shows only where the vehicle turns, rolls or pitches "
+            "about another axis than the lever arm's own"
+        )
+
+
+@dataclass(frozen=True)
+class AntennaPosition:
+    """Position of the antenna; zero error where measured = p_n + nRb l.
+
+    Parameters
+    ----------
+    time : (M,) s.
+    measured_n : (M, 3) position in n, m.
+    lRn : (M, 3, 3) n to the local-level axes in which `std` holds.
+    std : (M, 3) east, north, up, m.
+    """
+
+    time: Array
+    measured_n: Array
+    lRn: Array
+    std: Array
+    label: str = "GNSS position"
+    parameters: tuple[str, ...] = (LEVER_ARM,)
+
+    def true_time(self, values: Values) -> Array:
+        """Return the times of the measurements."""
+        return self.time
+
+    def sigma(self, motion: Motion, values: Values) -> Array:
+        """Return the receiver's standard deviations, (M, 3), m."""
+        return self.std
+
+    def residual(self, motion: Motion, values: Values) -> Array:
+        """Return predicted - measured in local-level east, north, up, (M, 3), m."""
+        antenna_n = motion.p_n + motion.nRb @ values[LEVER_ARM]
+        return rotate(self.lRn, antenna_n - self.measured_n)
+
+    def linearize(self, motion: Motion, values: Values) -> Linearization:
+        """Return the residual and its Jacobians."""
+        lRb = self.lRn @ motion.nRb
+        return Linearization(
+            residual=self.residual(motion, values),
+            d_theta=-lRb @ skew(values[LEVER_ARM]),
+            d_p=self.lRn,
+            d_parameters={LEVER_ARM: lRb},
+        )
+
+
+@dataclass(frozen=True)
+class AntennaVelocity:
+    """Velocity of the antenna; zero error where measured = v_n + nRb (omega_eb_b x l).
+
+    Parameters
+    ----------
+    time : (M,) s.
+    measured_l : (M, 3) east, north, up at the vehicle, m/s.
+    lRn : (M, 3, 3) n to local-level axes.
+    std : (M, 3) m/s.
+    """
+
+    time: Array
+    measured_l: Array
+    lRn: Array
+    std: Array
+    label: str = "GNSS velocity"
+    parameters: tuple[str, ...] = (LEVER_ARM,)
+
+    def true_time(self, values: Values) -> Array:
+        """Return the times of the measurements."""
+        return self.time
+
+    def sigma(self, motion: Motion, values: Values) -> Array:
+        """Return the standard deviations, the gyro's share through the lever arm included."""
+        return np.hypot(self.std, lever_arm_sigma(motion, values[LEVER_ARM])[:, None])
+
+    def residual(self, motion: Motion, values: Values) -> Array:
+        """Return predicted - measured in local-level east, north, up, (M, 3), m/s."""
+        turning_b = np.cross(motion.omega_eb_b, values[LEVER_ARM])
+        return rotate(self.lRn, motion.v_n + rotate(motion.nRb, turning_b)) - self.measured_l
+
+    def linearize(self, motion: Motion, values: Values) -> Linearization:
+        """Return the residual and its Jacobians."""
+        lever_arm = values[LEVER_ARM]
+        lRb = self.lRn @ motion.nRb
+        return Linearization(
+            residual=self.residual(motion, values),
+            d_theta=-lRb @ skew(np.cross(motion.omega_eb_b, lever_arm)),
+            d_v=self.lRn,
+            d_omega=-lRb @ skew(lever_arm),
+            d_parameters={LEVER_ARM: lRb @ skew(motion.omega_eb_b)},
+        )

@@ -1,0 +1,234 @@
+"""What every sensor offers: settings, parameters, and observations with Jacobians."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import Annotated, Any, Protocol
+
+import msgspec
+import numpy as np
+
+from factorgraph_dvl.conventions import Array
+from factorgraph_dvl.earth import LocalFrame
+from factorgraph_dvl.errors import DataError
+
+Positive = Annotated[float, msgspec.Meta(gt=0)]
+NonNegative = Annotated[float, msgspec.Meta(ge=0)]
+Vector3 = tuple[float, float, float]
+Sigma3 = tuple[NonNegative, NonNegative, NonNegative]
+Values = Mapping[str, Array]
+
+
+class Section(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A section of trial.yaml, in the units that its names state."""
+
+    def __post_init__(self) -> None:
+        for name in self.__struct_fields__:
+            if not _finite(getattr(self, name)):
+                raise ValueError(f"`{name}` must be finite")
+
+
+def _finite(value: Any) -> bool:
+    if isinstance(value, float):
+        return math.isfinite(value)
+    if isinstance(value, (tuple, list)):
+        return all(_finite(item) for item in value)
+    return True
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """A constant of a sensor that the solver estimates, with its prior.
+
+    Parameters
+    ----------
+    stem, unit : reported name without unit, and the unit (empty if dimensionless).
+    si : SI value of one reported unit.
+    mean, sigma : (n,) prior mean and standard deviation, SI. A component with sigma 0
+        is held at its mean.
+    rotation : the value is a rotation, `mean` its rotation vector and `sigma` that of
+        the components of the rotation vector.
+    labels : component names; empty for a scalar.
+    """
+
+    stem: str
+    unit: str
+    si: float
+    mean: Array
+    sigma: Array
+    rotation: bool = False
+    labels: tuple[str, ...] = ("x", "y", "z")
+
+    @property
+    def name(self) -> str:
+        """Name in calibration.json, with the unit."""
+        return f"{self.stem}_{self.unit}" if self.unit else self.stem
+
+    @property
+    def component_names(self) -> tuple[str, ...]:
+        """Names of the components as in `covariance.order`."""
+        parts = [(self.stem, label) if label else (self.stem,) for label in self.labels]
+        tail = (self.unit,) if self.unit else ()
+        return tuple("_".join((*part, *tail)) for part in parts)
+
+    @property
+    def estimated(self) -> bool:
+        """Whether any component is free."""
+        return bool(np.any(self.sigma > 0.0))
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Motion of the body at the times of M measurements.
+
+    Parameters
+    ----------
+    nRb : (M, 3, 3) attitude, body to n.
+    p_n, v_n : (M, 3) position and Earth-relative velocity of the IMU in n, m, m/s.
+    omega_eb_b : (M, 3) angular rate of the body relative to the Earth, rad/s.
+    a_n : (M, 3) Earth-relative acceleration, dv_n/dt, m/s².
+    alpha_b : (M, 3) time derivative of omega_eb_b, rad/s².
+    omega_sigma : (M, 3) standard deviation of omega_eb_b from the gyro's noise and
+        from motion that its samples do not resolve, rad/s.
+    """
+
+    nRb: Array
+    p_n: Array
+    v_n: Array
+    omega_eb_b: Array
+    a_n: Array
+    alpha_b: Array
+    omega_sigma: Array
+
+
+@dataclass(frozen=True)
+class Linearization:
+    """Residual = predicted - measured, and its derivatives (None where zero).
+
+    Parameters
+    ----------
+    residual : (M, d).
+    d_theta : (M, d, 3) with respect to theta in nRb Exp(theta).
+    d_p, d_v : (M, d, 3) with respect to p_n and v_n.
+    d_omega : (M, d, 3) with respect to omega_eb_b.
+    d_parameters : name to (M, d, n); for a rotation, with respect to delta in
+        R Exp(delta).
+    """
+
+    residual: Array
+    d_theta: Array | None = None
+    d_p: Array | None = None
+    d_v: Array | None = None
+    d_omega: Array | None = None
+    d_parameters: dict[str, Array] = field(default_factory=dict)
+
+
+class Observation(Protocol):
+    """M measurements of one kind, of d components each."""
+
+    label: str
+    time: Array
+    parameters: tuple[str, ...]
+
+    def true_time(self, values: Values) -> Array:
+        """Return the (M,) times at which the measurements were true, s."""
+
+    def sigma(self, motion: Motion, values: Values) -> Array:
+        """Return the (M, d) standard deviations of the residual."""
+
+    def residual(self, motion: Motion, values: Values) -> Array:
+        """Return predicted - measured, (M, d)."""
+
+    def linearize(self, motion: Motion, values: Values) -> Linearization:
+        """Return the residual and its Jacobians."""
+
+
+class Aid(Protocol):
+    """A sensor that observes the motion which the IMU integrates."""
+
+    label: str
+
+    def parameters(self) -> tuple[Parameter, ...]:
+        """Return the calibration parameters, fixed ones included."""
+
+    def observations(self, frame: LocalFrame) -> tuple[Observation, ...]:
+        """Return the measurements, with positions expressed in `frame`."""
+
+    def explain(self, parameter: str, component: int, motion: Motion | None) -> str:
+        """Say why a component could not be observed, given the motion of the trial."""
+
+
+def lever_arm_sigma(motion: Motion, lever_arm: Array) -> Array:
+    """Return the standard deviation, (M,), m/s, of omega x l from that of omega.
+
+    Across the lever arm, where it is largest: half the trace of the covariance.
+    """
+    l2 = lever_arm**2
+    return np.sqrt(0.5 * (motion.omega_sigma**2 @ (l2.sum() - l2)))
+
+
+def check_times(time: Array, source: str) -> None:
+    """Raise DataError unless (M,) times are finite and strictly increasing."""
+    if time.ndim != 1 or time.size == 0:
+        raise DataError("no samples", where=source, expected="at least one row")
+    bad = np.flatnonzero(~np.isfinite(time))
+    if bad.size:
+        raise DataError("time_s is not a number", where=at_row(source, bad[0]))
+    bad = np.flatnonzero(np.diff(time) <= 0.0)
+    if bad.size:
+        i = int(bad[0]) + 1
+        raise DataError(
+            f"time_s does not increase ({time[i - 1]:.9g} is followed by {time[i]:.9g})",
+            where=at_row(source, i),
+            expected="strictly increasing times",
+        )
+
+
+def check_finite(columns: Mapping[str, Array], source: str) -> None:
+    """Raise DataError, naming row and column, unless all values are finite."""
+    for name, values in columns.items():
+        bad = np.flatnonzero(~np.isfinite(values))
+        if bad.size:
+            raise DataError(
+                f"{name} is empty or not a number",
+                where=at_row(source, bad[0]),
+                expected="a finite number in every row",
+            )
+
+
+def check_range(
+    columns: Mapping[str, Array], low: float, high: float, unit: str, source: str
+) -> None:
+    """Raise DataError where a value that is present lies outside [low, high]."""
+    for name, values in columns.items():
+        bad = np.flatnonzero((values < low) | (values > high))
+        if bad.size:
+            raise DataError(
+                f"{name} = {values[bad[0]]:.6g} is out of range",
+                where=at_row(source, bad[0]),
+                expected=f"{low:g} to {high:g} {unit}",
+            )
+
+
+def check_all_or_none(columns: Mapping[str, Array], source: str) -> None:
+    """Raise DataError where some of the columns are empty in a row and others are not."""
+    missing = np.isnan(np.stack(list(columns.values()), axis=1))
+    bad = np.flatnonzero(missing.any(axis=1) & ~missing.all(axis=1))
+    if bad.size:
+        raise DataError(
+            f"only some of {', '.join(columns)} are given",
+            where=at_row(source, bad[0]),
+            expected="all of them, or none",
+        )
+
+
+def at_row(source: str, row: int | np.integer[Any]) -> str:
+    """Name a row of a record so that it is found in the file (one header line)."""
+    return f"{source} line {int(row) + 2}"
+
+
+def named_columns(names: Iterable[str], values: Array) -> dict[str, Array]:
+    """Pair names with the columns of an (M, n) array."""
+    return {name: values[:, i] for i, name in enumerate(names)}

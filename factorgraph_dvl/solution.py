@@ -1,0 +1,146 @@
+"""A solution: trajectory, calibration, joint covariance, status."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from factorgraph_dvl.conventions import Array, BodyAxes
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """Estimated motion of the IMU over the ellipsoid, with its covariance.
+
+    Parameters
+    ----------
+    time : (M,) s.
+    geodetic : (M, 3) latitude, longitude (rad), ellipsoidal height (m).
+    velocity : (M, 3) local-level east, north, up, m/s.
+    rph : (M, 3) roll, pitch, heading, rad.
+    position_cov : (M, 3, 3) local-level east, north, up, m².
+    velocity_cov : (M, 3, 3) local-level east, north, up, m²/s².
+    rph_cov : (M, 3, 3) roll, pitch, heading, rad².
+    """
+
+    time: Array
+    geodetic: Array
+    velocity: Array
+    rph: Array
+    position_cov: Array
+    velocity_cov: Array
+    rph_cov: Array
+
+    @property
+    def position_std(self) -> Array:
+        """Standard deviation east, north, up, (M, 3), m."""
+        return _std(self.position_cov)
+
+    @property
+    def velocity_std(self) -> Array:
+        """Standard deviation east, north, up, (M, 3), m/s."""
+        return _std(self.velocity_cov)
+
+    @property
+    def rph_std(self) -> Array:
+        """Standard deviation of roll, pitch, heading, (M, 3), rad."""
+        return _std(self.rph_cov)
+
+
+def _std(covariance: Array) -> Array:
+    return np.sqrt(np.maximum(np.diagonal(covariance, axis1=1, axis2=2), 0.0))
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """An estimated calibration parameter, in its reported parametrisation and unit.
+
+    Parameters
+    ----------
+    name : as in calibration.json, e.g. `misalignment_deg`.
+    component_names : as in `covariance.order`.
+    value, std : (n,) in the unit of the name.
+    prior_value, prior_std : (n,) what was known before.
+    observable : (n,) bool, whether the data at least halved the prior's standard
+        deviation.
+    """
+
+    name: str
+    component_names: tuple[str, ...]
+    value: Array
+    std: Array
+    prior_value: Array
+    prior_std: Array
+    observable: np.ndarray
+
+
+@dataclass(frozen=True)
+class Residuals:
+    """What a sensor measured against what the solution predicts.
+
+    Parameters
+    ----------
+    label, unit : of the measurement.
+    components : names of the d components.
+    time : (M,) s.
+    residual : (M, d) predicted - measured.
+    sigma : (M, d) standard deviation of the measurement.
+    """
+
+    label: str
+    unit: str
+    components: tuple[str, ...]
+    time: Array
+    residual: Array
+    sigma: Array
+
+
+@dataclass(frozen=True)
+class Solution:
+    """What a solver found.
+
+    Parameters
+    ----------
+    trial, solver : names.
+    body_axes : axes of the body quantities.
+    converged : whether the solver reached a minimum.
+    iterations : that it took.
+    cost : half the sum of squared whitened residuals, at the solution.
+    estimates : the calibration parameters that were estimated.
+    covariance : (P, P) joint covariance of all their components, in reported units, in
+        the order of `estimates`.
+    trajectory : the motion.
+    residuals : of each sensor.
+    warnings : what the user must know.
+    """
+
+    trial: str
+    solver: str
+    body_axes: BodyAxes
+    converged: bool
+    iterations: int
+    cost: float
+    estimates: tuple[Estimate, ...]
+    covariance: Array
+    trajectory: Trajectory
+    residuals: tuple[Residuals, ...] = ()
+    warnings: tuple[str, ...] = field(default_factory=tuple)
+
+    @property
+    def order(self) -> tuple[str, ...]:
+        """Component names of the rows of `covariance`."""
+        return tuple(name for e in self.estimates for name in e.component_names)
+
+    def estimate(self, name: str) -> Estimate:
+        """Return a parameter by its name in calibration.json.
+
+        Raises
+        ------
+        KeyError
+            If the parameter was not estimated.
+        """
+        for estimate in self.estimates:
+            if estimate.name == name:
+                return estimate
+        raise KeyError(f"{name} was not estimated; there are {[e.name for e in self.estimates]}")

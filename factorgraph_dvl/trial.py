@@ -1,0 +1,117 @@
+"""A trial: the records of its sensors, where it starts, and a reference to compare with."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from factorgraph_dvl.conventions import Array, BodyAxes
+from factorgraph_dvl.earth import LocalFrame
+from factorgraph_dvl.errors import DataError
+from factorgraph_dvl.sensors.dvl import Dvl
+from factorgraph_dvl.sensors.gnss import Gnss
+from factorgraph_dvl.sensors.imu import Imu
+from factorgraph_dvl.sensors.protocol import Aid
+
+
+@dataclass(frozen=True)
+class InitialPosition:
+    """Prior of the position at the first IMU sample.
+
+    Parameters
+    ----------
+    geodetic : (3,) latitude, longitude (rad), ellipsoidal height (m).
+    std : (3,) east, north, up, m.
+    """
+
+    geodetic: Array
+    std: Array
+
+
+@dataclass(frozen=True)
+class InitialAttitude:
+    """Prior of the attitude at the first IMU sample.
+
+    Parameters
+    ----------
+    rph : (3,) roll, pitch, heading, rad.
+    std : (3,) rad.
+    """
+
+    rph: Array
+    std: Array
+
+
+@dataclass(frozen=True)
+class Reference:
+    """Truth or a trusted solution; never used to solve.
+
+    Parameters
+    ----------
+    time : (M,) s.
+    geodetic : (M, 3) latitude, longitude (rad), ellipsoidal height (m) of the IMU.
+    velocity : (M, 3) local-level east, north, up, m/s.
+    rph : (M, 3) roll, pitch, heading, rad.
+    """
+
+    time: Array
+    geodetic: Array
+    velocity: Array
+    rph: Array
+
+
+@dataclass(frozen=True)
+class Trial:
+    """Everything that is known of a trial before it is solved.
+
+    Parameters
+    ----------
+    name : of the trial.
+    imu : the IMU; a trial without one cannot be smoothed.
+    gnss, dvl : the other sensors, None where the trial does not have them.
+    body_axes : axes in which all body quantities are given.
+    epoch : UTC of time zero, ISO 8601; empty if not given.
+    initial_attitude, initial_position : priors; None = found from the data.
+    reference : truth or a trusted solution, None if there is none.
+    calibration_truth : true values of calibration parameters by reported name, in
+        reported units; empty outside simulations.
+    notes : what was noticed while loading, for the user.
+    """
+
+    name: str
+    imu: Imu
+    gnss: Gnss | None = None
+    dvl: Dvl | None = None
+    body_axes: BodyAxes = "RFU"
+    epoch: str = ""
+    initial_attitude: InitialAttitude | None = None
+    initial_position: InitialPosition | None = None
+    reference: Reference | None = None
+    calibration_truth: dict[str, Array] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+
+    @property
+    def aids(self) -> tuple[Aid, ...]:
+        """The sensors other than the IMU."""
+        return tuple(aid for aid in (self.gnss, self.dvl) if aid is not None)
+
+    def frame(self) -> LocalFrame:
+        """Return the tangent frame at the first known position.
+
+        Raises
+        ------
+        DataError
+            If neither GNSS nor `initial.position` gives a position.
+        """
+        if self.initial_position is not None:
+            return LocalFrame(*self.initial_position.geodetic)
+        if self.gnss is not None:
+            fixes = np.flatnonzero(~np.isnan(self.gnss.geodetic[:, 0]))
+            if fixes.size:
+                return LocalFrame(*self.gnss.geodetic[fixes[0]])
+        raise DataError(
+            "the trial has no position",
+            where="trial.yaml",
+            expected="a gnss section with positions, or initial.position",
+        )
