@@ -1,0 +1,215 @@
+"""CSV and Parquet tables: named columns of numbers."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.csv
+import pyarrow.parquet
+
+from factorgraph_dvl.conventions import Array
+from factorgraph_dvl.errors import DataError
+
+_EMPTY = ("", "nan", "NaN", "NAN")
+_PARQUET = (".parquet", ".pq")
+
+
+def read_table(
+    path: Path,
+    required: Sequence[str],
+    optional: Sequence[Sequence[str]] = (),
+    *,
+    source: str = "",
+) -> dict[str, Array]:
+    """Read columns of numbers from a CSV or, by its suffix, a Parquet file.
+
+    Parameters
+    ----------
+    path : of the file. A CSV has one header line; a cell that is empty or `nan` is nan.
+    required : columns that must be there. Others than those asked for are not read.
+    optional : groups of columns; of each, all or none are there. Absent ones are nan.
+    source : name of the file in messages; by default that of `path`.
+
+    Returns
+    -------
+    Name to (N,) array, for every required and optional column.
+
+    Raises
+    ------
+    DataError
+        If the file is missing, unreadable or empty, a column is missing or given
+        twice, or a cell is not a number.
+    """
+    source = source or path.name
+    if not path.is_file():
+        what = "is a folder" if path.is_dir() else "does not exist"
+        raise DataError(f"the file {what}", where=source, expected=f"a table at {path}")
+    is_parquet = path.suffix.lower() in _PARQUET
+    try:
+        header = _parquet_header(path, source) if is_parquet else _csv_header(path, source)
+        names = _choose(header, required, optional, source)
+        table = (_read_parquet if is_parquet else _read_csv)(path, header, names, source)
+    except OSError as error:
+        reason = error.strerror or str(error)
+        raise DataError(f"cannot be read ({reason})", where=source) from error
+    absent = np.full(table.num_rows, np.nan)
+    columns = {name: _numbers(table, name) for name in names}
+    return {name: columns.get(name, absent) for group in (required, *optional) for name in group}
+
+
+def write_table(path: Path, columns: Mapping[str, Array]) -> None:
+    """Write columns (N,) of numbers as CSV or, by its suffix, Parquet; nan as empty.
+
+    CSV cells have as many digits as it takes to read the same numbers back.
+    """
+    table = pa.table({k: pa.array(v, pa.float64(), from_pandas=True) for k, v in columns.items()})
+    if path.suffix.lower() in _PARQUET:
+        pyarrow.parquet.write_table(table, path)
+        return
+    with path.open("wb") as file:
+        file.write((",".join(columns) + "\n").encode())
+        pyarrow.csv.write_csv(table, file, pyarrow.csv.WriteOptions(include_header=False))
+
+
+def stack(columns: Mapping[str, Array], names: Sequence[str]) -> Array:
+    """Return the columns of those names side by side, (N, n)."""
+    return np.column_stack([columns[name] for name in names])
+
+
+def _choose(
+    header: Sequence[str],
+    required: Sequence[str],
+    optional: Sequence[Sequence[str]],
+    source: str,
+) -> list[str]:
+    """Return the names of the columns to read."""
+    where = f"{source} line 1"
+    chosen = list(required)
+    for group in optional:
+        present = [name for name in group if name in header]
+        if present and len(present) < len(group):
+            raise DataError(
+                f"there is {', '.join(present)} but not "
+                f"{', '.join(name for name in group if name not in header)}",
+                where=where,
+                expected="all of them, or none",
+            )
+        chosen += present
+    missing = [name for name in chosen if name not in header]
+    if missing:
+        raise DataError(
+            f"missing column {', '.join(missing)}",
+            where=where,
+            expected=f"columns {', '.join(required)}",
+            hint=f"Found {', '.join(header[:20])}",
+        )
+    for name in chosen:
+        if header.count(name) > 1:
+            raise DataError(
+                f"column {name} is given {header.count(name)} times", where=where, expected="one"
+            )
+    return chosen
+
+
+def _csv_header(path: Path, source: str) -> list[str]:
+    with path.open("rb") as file:
+        line = file.readline(1_000_000)
+    try:
+        header = next(csv.reader([line.decode("utf-8-sig").strip()]), [])
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise DataError(
+            "is not a CSV text file", where=f"{source} line 1", expected="a line of column names"
+        ) from error
+    if not header:
+        what = "has an empty first line" if line else "is empty"
+        raise DataError(
+            f"the file {what}", where=f"{source} line 1", expected="a line of column names"
+        )
+    return [name.strip() for name in header]
+
+
+def _read_csv(path: Path, header: list[str], names: list[str], source: str) -> pa.Table:
+    # Columns that are not read may bear any name, or the same one twice.
+    unique = [name if name in names else f"unread {i}" for i, name in enumerate(header)]
+    try:
+        return pyarrow.csv.read_csv(
+            path,
+            read_options=pyarrow.csv.ReadOptions(column_names=unique, skip_rows=1),
+            convert_options=pyarrow.csv.ConvertOptions(
+                column_types={name: pa.float64() for name in names},
+                include_columns=names,
+                null_values=list(_EMPTY),
+            ),
+        )
+    except pa.ArrowInvalid as error:
+        raise _explain_csv(path, header, names, source, error) from None
+
+
+def _explain_csv(
+    path: Path, header: list[str], names: list[str], source: str, error: Exception
+) -> DataError:
+    """Return what is wrong with the first row that cannot be read, and its line."""
+    rows = 0
+    with path.open(encoding="utf-8-sig", errors="replace", newline="") as file:
+        reader = csv.reader(file)
+        next(reader)
+        try:
+            for row in reader:
+                if not row:
+                    continue
+                rows += 1
+                where = f"{source} line {reader.line_num}"
+                if len(row) != len(header):
+                    return DataError(
+                        f"there are {len(row)} cells",
+                        where=where,
+                        expected=f"{len(header)}, as in the header line",
+                    )
+                for name, cell in zip(header, row, strict=True):
+                    if name in names and not _is_number(cell):
+                        shown = cell if len(cell) <= 40 else cell[:40] + "…"
+                        return DataError(f"{name} is '{shown}'", where=where, expected="a number")
+        except csv.Error as csv_error:
+            return DataError(str(csv_error), where=f"{source} line {reader.line_num}")
+    if rows == 0:
+        return DataError("no samples", where=source, expected="at least one row")
+    return DataError("cannot be read as CSV", where=source, hint=str(error))
+
+
+def _is_number(cell: str) -> bool:
+    if cell.strip() in _EMPTY:
+        return True
+    try:
+        float(cell)
+    except ValueError:
+        return False
+    return True
+
+
+def _parquet_header(path: Path, source: str) -> list[str]:
+    try:
+        return list(pyarrow.parquet.read_schema(path).names)
+    except pa.ArrowInvalid as error:
+        raise DataError(
+            "is not a Parquet file", where=source, expected="a table of numbers"
+        ) from error
+
+
+def _read_parquet(path: Path, header: list[str], names: list[str], source: str) -> pa.Table:
+    table = pyarrow.parquet.read_table(path, columns=names)
+    for field in table.schema:
+        if not (pa.types.is_floating(field.type) or pa.types.is_integer(field.type)):
+            raise DataError(
+                f"column {field.name} holds {field.type}", where=source, expected="numbers"
+            )
+    return table
+
+
+def _numbers(table: pa.Table, name: str) -> Array:
+    """Return a column, (N,), writable, with nan where it is null."""
+    column = table.column(name).cast(pa.float64(), safe=False)
+    return np.array(column.to_numpy(zero_copy_only=False), dtype=float)

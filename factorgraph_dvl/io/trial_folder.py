@@ -1,0 +1,272 @@
+"""Trial folders, format 1: trial.yaml and the tables that it names."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import msgspec
+import numpy as np
+from msgspec import UNSET
+
+from factorgraph_dvl.conventions import DEG, Array
+from factorgraph_dvl.errors import DataError
+from factorgraph_dvl.io.folders import new_folder
+from factorgraph_dvl.io.motion_table import GEODETIC_SI, motion_columns, read_reference
+from factorgraph_dvl.io.tables import read_table, stack, write_table
+from factorgraph_dvl.io.trial_yaml import (
+    DvlSection,
+    InitialSettings,
+    PositionSettings,
+    ReferenceSettings,
+    TrialSettings,
+    to_yaml,
+)
+from factorgraph_dvl.io.yaml_file import parse_yaml, read_text
+from factorgraph_dvl.sensors import dvl as dvl_columns
+from factorgraph_dvl.sensors import gnss as gnss_columns
+from factorgraph_dvl.sensors import imu as imu_columns
+from factorgraph_dvl.sensors.dvl import Dvl, DvlSettings
+from factorgraph_dvl.sensors.gnss import Gnss, GnssSettings
+from factorgraph_dvl.sensors.imu import Imu, ImuSettings
+from factorgraph_dvl.trial import InitialAttitude, InitialPosition, Trial
+
+SETTINGS_FILE = "trial.yaml"
+TRUTH_FILE = "truth.json"
+_TABLES = ("imu", "gnss", "dvl", "reference")
+_OWNED = (
+    SETTINGS_FILE,
+    TRUTH_FILE,
+    *(f"{table}{suffix}" for table in _TABLES for suffix in (".csv", ".parquet")),
+)
+
+
+class _TruthValue(msgspec.Struct):
+    value: list[float]
+
+
+class _Truth(msgspec.Struct):
+    parameters: dict[str, _TruthValue]
+
+
+def load_trial(path: Path | str) -> Trial:
+    """Read a trial folder.
+
+    Parameters
+    ----------
+    path : of the folder, or of the trial.yaml in it.
+
+    Raises
+    ------
+    ConfigError
+        If trial.yaml is missing or holds a key that is unknown, missing, of the wrong
+        type or out of range.
+    DataError
+        If a table is missing or does not hold what it should.
+    """
+    path = Path(path)
+    if not path.exists():
+        raise DataError("the trial does not exist", where=str(path), expected="a trial folder")
+    file = path / SETTINGS_FILE if path.is_dir() else path
+    folder = file.parent
+    settings = parse_yaml(read_text(file), TrialSettings, source=file.name)
+    initial = settings.initial
+    return Trial(
+        name=settings.name or folder.resolve().name,
+        imu=_read_imu(folder, settings.imu),
+        gnss=None if settings.gnss is UNSET else _read_gnss(folder, settings.gnss),
+        dvl=None if settings.dvl is UNSET else _read_dvl(folder, settings.dvl.settings()),
+        body_axes=settings.body_axes,
+        epoch=settings.epoch,
+        initial_attitude=None if initial is UNSET else _attitude(initial),
+        initial_position=None if initial is UNSET else _position(initial),
+        reference=(
+            None
+            if settings.reference is UNSET
+            else read_reference(folder / settings.reference.file, settings.reference.file)
+        ),
+        calibration_truth=_read_truth(folder / TRUTH_FILE),
+        notes=tuple(
+            f"section `{name}` of {file.name} is not used by this version"
+            for name in settings.unused
+        ),
+    )
+
+
+def save_trial(
+    trial: Trial, path: Path | str, *, force: bool = False, parquet: bool = False
+) -> None:
+    """Write a trial folder, complete or not at all.
+
+    Parameters
+    ----------
+    trial : to write.
+    path : of the folder.
+    force : replace the trial that is there.
+    parquet : write the sensors' tables as Parquet.
+
+    Raises
+    ------
+    DataError
+        If the folder exists, is not empty, and `force` is not set.
+    """
+    suffix = ".parquet" if parquet else ".csv"
+
+    with new_folder(Path(path), force=force, owned=_OWNED) as folder:
+        write_table(folder / f"imu{suffix}", _imu_table(trial.imu))
+        if trial.gnss is not None:
+            write_table(folder / f"gnss{suffix}", _gnss_table(trial.gnss))
+        if trial.dvl is not None:
+            write_table(folder / f"dvl{suffix}", _dvl_table(trial.dvl))
+        if trial.reference is not None:
+            write_table(folder / f"reference{suffix}", motion_columns(trial.reference))
+        if trial.calibration_truth:
+            (folder / TRUTH_FILE).write_bytes(_truth_json(trial.calibration_truth))
+        (folder / SETTINGS_FILE).write_text(to_yaml(_settings(trial, suffix)), encoding="utf-8")
+
+
+def _read_imu(folder: Path, settings: ImuSettings) -> Imu:
+    names = imu_columns.COLUMNS
+    columns = read_table(folder / settings.file, names, source=settings.file)
+    return Imu(
+        settings,
+        columns["time_s"],
+        stack(columns, names[1:4]),
+        stack(columns, names[4:7]),
+        source=settings.file,
+    )
+
+
+def _imu_table(imu: Imu) -> dict[str, Array]:
+    values = np.column_stack([imu.time, imu.gyro, imu.accel])
+    return dict(zip(imu_columns.COLUMNS, values.T, strict=True))
+
+
+def _read_gnss(folder: Path, settings: GnssSettings) -> Gnss:
+    groups = (
+        gnss_columns.VELOCITY_COLUMNS,
+        gnss_columns.POSITION_STD_COLUMNS,
+        gnss_columns.VELOCITY_STD_COLUMNS,
+    )
+    required = ("time_s", *gnss_columns.POSITION_COLUMNS)
+    columns = read_table(folder / settings.file, required, groups, source=settings.file)
+    velocity, position_std, velocity_std = (stack(columns, group) for group in groups)
+    return Gnss(
+        settings,
+        columns["time_s"],
+        stack(columns, gnss_columns.POSITION_COLUMNS) * GEODETIC_SI,
+        velocity,
+        position_std,
+        velocity_std,
+        source=settings.file,
+    )
+
+
+def _gnss_table(gnss: Gnss) -> dict[str, Array]:
+    table = {
+        "time_s": gnss.time,
+        **_named(gnss_columns.POSITION_COLUMNS, gnss.geodetic / GEODETIC_SI),
+        **_named(gnss_columns.POSITION_STD_COLUMNS, gnss.position_std),
+    }
+    if not np.isnan(gnss.velocity).all():
+        table |= _named(gnss_columns.VELOCITY_COLUMNS, gnss.velocity)
+        table |= _named(gnss_columns.VELOCITY_STD_COLUMNS, gnss.velocity_std)
+    return table
+
+
+def _read_dvl(folder: Path, settings: DvlSettings) -> Dvl:
+    required = ("time_s", *dvl_columns.VELOCITY_COLUMNS)
+    groups = (dvl_columns.STD_COLUMNS,)
+    columns = read_table(folder / settings.file, required, groups, source=settings.file)
+    return Dvl(
+        settings,
+        columns["time_s"],
+        stack(columns, dvl_columns.VELOCITY_COLUMNS),
+        stack(columns, dvl_columns.STD_COLUMNS),
+        source=settings.file,
+    )
+
+
+def _dvl_table(dvl: Dvl) -> dict[str, Array]:
+    table = {"time_s": dvl.time, **_named(dvl_columns.VELOCITY_COLUMNS, dvl.velocity)}
+    if not np.isnan(dvl.std).all():
+        table |= _named(dvl_columns.STD_COLUMNS, dvl.std)
+    return table
+
+
+def _named(names: tuple[str, ...], values: Array) -> dict[str, Array]:
+    return dict(zip(names, values.T, strict=True))
+
+
+def _attitude(initial: InitialSettings) -> InitialAttitude | None:
+    if initial.roll_pitch_heading_deg is UNSET or initial.std_deg is UNSET:
+        return None
+    return InitialAttitude(
+        np.array(initial.roll_pitch_heading_deg) * DEG, np.array(initial.std_deg) * DEG
+    )
+
+
+def _position(initial: InitialSettings) -> InitialPosition | None:
+    position = initial.position
+    if position is UNSET:
+        return None
+    geodetic = np.array([position.lat_deg, position.lon_deg, position.height_m])
+    return InitialPosition(geodetic * GEODETIC_SI, np.array(position.std_m))
+
+
+def _settings(trial: Trial, suffix: str) -> TrialSettings:
+    replace = msgspec.structs.replace
+    return TrialSettings(
+        format=1,
+        name=trial.name,
+        body_axes=trial.body_axes,
+        epoch=trial.epoch,
+        imu=replace(trial.imu.settings, file=f"imu{suffix}"),
+        gnss=UNSET if trial.gnss is None else replace(trial.gnss.settings, file=f"gnss{suffix}"),
+        dvl=UNSET if trial.dvl is None else _dvl_section(trial.dvl.settings, f"dvl{suffix}"),
+        initial=_initial(trial),
+        reference=(
+            UNSET if trial.reference is None else ReferenceSettings(file=f"reference{suffix}")
+        ),
+    )
+
+
+def _dvl_section(settings: DvlSettings, file: str) -> DvlSection:
+    return DvlSection(**{**msgspec.structs.asdict(settings), "file": file})
+
+
+def _initial(trial: Trial) -> InitialSettings | msgspec.UnsetType:
+    attitude, position = trial.initial_attitude, trial.initial_position
+    if attitude is None and position is None:
+        return UNSET
+    fields: dict[str, object] = {}
+    if attitude is not None:
+        fields["roll_pitch_heading_deg"] = tuple((attitude.rph / DEG).tolist())
+        fields["std_deg"] = tuple((attitude.std / DEG).tolist())
+    if position is not None:
+        lat, lon, height = (position.geodetic / GEODETIC_SI).tolist()
+        fields["position"] = PositionSettings(
+            lat_deg=lat, lon_deg=lon, height_m=height, std_m=tuple(position.std.tolist())
+        )
+    return InitialSettings(**fields)  # type: ignore[arg-type]
+
+
+def _read_truth(path: Path) -> dict[str, Array]:
+    if not path.exists():
+        return {}
+    try:
+        truth = msgspec.json.decode(path.read_bytes(), type=_Truth)
+    except (msgspec.MsgspecError, UnicodeDecodeError) as error:
+        raise DataError(
+            f"cannot be read ({error})",
+            where=path.name,
+            expected='{"parameters": {name: {"value": [numbers]}}}',
+        ) from None
+    return {name: np.array(item.value) for name, item in truth.parameters.items()}
+
+
+def _truth_json(truth: dict[str, Array]) -> bytes:
+    values = {
+        name: _TruthValue(np.atleast_1d(value).astype(float).tolist())
+        for name, value in truth.items()
+    }
+    return msgspec.json.format(msgspec.json.encode(_Truth(values)), indent=2) + b"\n"
