@@ -1,0 +1,242 @@
+"""What the sensors of a simulated vehicle report."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import pymap3d
+from scipy.spatial.transform import Rotation
+from scipy.special import factorial
+
+from factorgraph_dvl.conventions import (
+    DEG,
+    DEG_PER_HOUR,
+    DEG_PER_SQRT_HOUR,
+    HOUR,
+    MICRO_G,
+    Array,
+    rotation_from_rph,
+)
+from factorgraph_dvl.errors import ConfigError
+from factorgraph_dvl.sensors.dvl import Dvl
+from factorgraph_dvl.sensors.gnss import Gnss
+from factorgraph_dvl.sensors.imu import Imu
+from factorgraph_dvl.simulate.motion import Motion, State
+from factorgraph_dvl.simulate.scenario import Interval, Sampled, Scenario
+
+_CHUNK = 32768
+
+
+def simulate_imu(
+    scenario: Scenario, motion: Motion, rng: np.random.Generator
+) -> tuple[Imu, dict[str, Array]]:
+    """Return the IMU's record, and its biases by reported name.
+
+    `mean` samples are averages over the interval from the sample before; the sample
+    after a gap still averages over its own period only.
+    """
+    truth = scenario.imu
+    jitter_rng, bias_rng, walk_rng, noise_rng = rng.spawn(4)
+    # The interval of the first sample must not begin before the motion does.
+    bounds = _times(truth, motion.duration, jitter_rng, first=0)
+    time, interval = bounds[1:], np.diff(bounds)
+    if time.size == 0:
+        raise ConfigError(
+            "the manoeuvres are shorter than one IMU period",
+            where=f"{scenario.source} key manoeuvres",
+            expected=f"more than {1.0 / truth.rate_hz:g} s",
+        )
+    if truth.sampling == "mean":
+        gyro, accel = _mean_samples(motion, bounds)
+    else:
+        gyro, accel = _instantaneous_samples(motion, time)
+
+    biases = {}
+    for name, samples, unit, constant, std, walk, noise in (
+        (
+            "gyro_bias_deg_h",
+            gyro,
+            DEG_PER_HOUR,
+            truth.gyro_bias_deg_h,
+            truth.gyro_bias_std_deg_h,
+            truth.gyro_bias_walk_deg_h_sqrt_h,
+            truth.gyro_noise_deg_sqrt_h * DEG_PER_SQRT_HOUR,
+        ),
+        (
+            "accel_bias_ug",
+            accel,
+            MICRO_G,
+            truth.accel_bias_ug,
+            truth.accel_bias_std_ug,
+            truth.accel_bias_walk_ug_sqrt_h,
+            truth.accel_noise_ug_sqrt_hz * MICRO_G,
+        ),
+    ):
+        # Drawn whether used or not, so that one setting does not move the other draws.
+        drawn = bias_rng.standard_normal(3) * (std or 0.0)
+        bias = np.broadcast_to(drawn if constant == "draw" else np.array(constant), gyro.shape)
+        if scenario.noise and walk > 0.0:
+            steps = walk_rng.standard_normal(gyro.shape) * np.sqrt(interval / HOUR)[:, None]
+            bias = bias + walk * np.cumsum(steps, axis=0)
+        samples += bias * unit
+        if scenario.noise and noise > 0.0:
+            white = noise_rng.standard_normal(gyro.shape)
+            samples += white * (noise / np.sqrt(interval))[:, None]
+        biases[name] = bias
+    keep = ~_within(time, truth.gaps_s)
+    imu = Imu(
+        settings=scenario.imu_settings(),
+        time=time[keep],
+        gyro=gyro[keep],
+        accel=accel[keep],
+    )
+    return imu, {name: bias[keep].mean(axis=0) for name, bias in biases.items()}
+
+
+def simulate_gnss(scenario: Scenario, motion: Motion, rng: np.random.Generator) -> Gnss:
+    """Return the receiver's record: position and velocity of the antenna."""
+    truth, settings = scenario.gnss, scenario.gnss_settings()
+    assert truth is not None
+    assert settings is not None
+    jitter_rng, position_rng, velocity_rng = rng.spawn(3)
+    time = _times(truth, motion.duration, jitter_rng)
+    state = motion.at(time)
+    nRb = rotation_from_rph(state.rph, scenario.body_axes)
+    arm_n = _apply(nRb, np.array(truth.lever_arm_m))
+    velocity = state.v_n + _apply(nRb, np.cross(state.omega_eb_b, truth.lever_arm_m))
+    error = position_rng.standard_normal(arm_n.shape) * truth.position_std_m
+    geodetic = displaced(state.geodetic, arm_n + error if scenario.noise else arm_n)
+    if truth.velocity_std_m_s is None:
+        velocity = np.full_like(velocity, np.nan)
+    elif scenario.noise:
+        velocity += velocity_rng.standard_normal(velocity.shape) * truth.velocity_std_m_s
+    keep = ~_within(time, truth.outages_s)
+    unknown = np.full((int(keep.sum()), 3), np.nan)
+    return Gnss(
+        settings=settings,
+        time=time[keep],
+        geodetic=geodetic[keep],
+        velocity=velocity[keep],
+        position_std=unknown,
+        velocity_std=unknown.copy(),
+    )
+
+
+def simulate_dvl(scenario: Scenario, motion: Motion, rng: np.random.Generator) -> Dvl:
+    """Return the DVL's record.
+
+        v_d = (1 + k) C_b^d (v_b + omega_eb_b x l) + beta + noise,
+
+    at the true time of the ping; the record's time is later by the time offset. Through
+    the water, v_b lacks the current.
+    """
+    truth, settings = scenario.dvl, scenario.dvl_settings()
+    assert truth is not None
+    assert settings is not None
+    jitter_rng, noise_rng = rng.spawn(2)
+    time = _times(truth, motion.duration, jitter_rng)
+    state = motion.at(time)
+    velocity = _dvl_velocity(scenario, state)
+    if scenario.noise:
+        speed = np.linalg.norm(velocity, axis=1, keepdims=True)
+        sigma = np.hypot(truth.velocity_std_m_s, truth.velocity_std_fraction * speed)
+        velocity += sigma * noise_rng.standard_normal(velocity.shape)
+    velocity[_within(time, truth.no_lock_s)] = np.nan
+    return Dvl(
+        settings=settings,
+        time=time + truth.time_offset_s,
+        velocity=velocity,
+        std=np.full_like(velocity, np.nan),
+    )
+
+
+def _dvl_velocity(scenario: Scenario, state: State) -> Array:
+    truth = scenario.dvl
+    assert truth is not None
+    current = np.array(scenario.current_m_s) if truth.reference == "water" else np.zeros(3)
+    bRn = np.swapaxes(rotation_from_rph(state.rph, scenario.body_axes), 1, 2)
+    at_imu = _apply(bRn, state.v_n - current)
+    at_dvl = at_imu + np.cross(state.omega_eb_b, truth.lever_arm_m)
+    misalignment = Rotation.from_rotvec(np.array(truth.misalignment_deg) * DEG)
+    return (1.0 + np.array(truth.scale_error)) * misalignment.apply(at_dvl) + truth.bias_m_s
+
+
+def displaced(geodetic: Array, enu: Array) -> Array:
+    """Return geodetic coordinates (M, 3) moved by local east, north, up (M, 3), m."""
+    moved = pymap3d.enu2geodetic(*enu.T, *geodetic.T, deg=False)
+    return np.stack([np.asarray(x, dtype=float) for x in moved], axis=1)
+
+
+def _apply(matrices: Array, vectors: Array) -> Array:
+    return np.asarray(
+        np.einsum("mij,mj->mi", matrices, np.broadcast_to(vectors, (len(matrices), 3)))
+    )
+
+
+def _times(
+    sampled: Sampled, duration: float, rng: np.random.Generator, first: int | None = None
+) -> Array:
+    """Return times phase + k / rate after 0, or from k = `first` on, up to the end."""
+    if first is None:
+        first = 0 if sampled.phase_s > 0.0 else 1
+    last = int(np.floor((duration - sampled.phase_s) * sampled.rate_hz + 1e-6))
+    # Divided, not multiplied by a period: 0.3, not 0.30000000000000004.
+    time = sampled.phase_s + np.arange(first, last + 1) / sampled.rate_hz
+    shift = sampled.jitter_s * rng.uniform(-1.0, 1.0, time.size)
+    return np.asarray(np.clip(time + shift, 0.0, duration))
+
+
+def _within(time: Array, intervals: Sequence[Interval]) -> Array:
+    out = np.zeros(time.size, dtype=bool)
+    for start, end in intervals:
+        out |= (time >= start) & (time <= end)
+    return out
+
+
+def _instantaneous_samples(motion: Motion, time: Array) -> tuple[Array, Array]:
+    gyro, accel = np.empty((time.size, 3)), np.empty((time.size, 3))
+    for begin in range(0, time.size, _CHUNK):
+        part = slice(begin, begin + _CHUNK)
+        state = motion.at(time[part])
+        gyro[part], accel[part] = state.omega_ib_b, state.f_b
+    return gyro, accel
+
+
+def _mean_samples(motion: Motion, bounds: Array) -> tuple[Array, Array]:
+    """Return averages of angular rate and specific force between bounds (N + 1,).
+
+    Gauss-Legendre quadrature, on pieces between the kinks of the motion.
+    """
+    n = bounds.size - 1
+    order = _quadrature_order(motion.highest_rate() * float(np.max(np.diff(bounds))))
+    points, weights = np.polynomial.legendre.leggauss(order)
+    gyro, accel = np.empty((n, 3)), np.empty((n, 3))
+    for begin in range(0, n, _CHUNK):
+        own = bounds[begin : begin + _CHUNK + 1]
+        inside = motion.kinks[(motion.kinks > own[0]) & (motion.kinks < own[-1])]
+        edges = np.union1d(own, inside)
+        width = np.diff(edges)
+        t = edges[:-1, None] + 0.5 * width[:, None] * (points + 1.0)
+        state = motion.at(t.ravel())
+        first = np.searchsorted(edges, own[:-1])
+        for out, values in ((gyro, state.omega_ib_b), (accel, state.f_b)):
+            integral = (
+                0.5 * width[:, None] * np.einsum("q,mqi->mi", weights, values.reshape(*t.shape, 3))
+            )
+            sums = np.add.reduceat(integral, first, axis=0)
+            out[begin : begin + _CHUNK] = sums / np.diff(own)[:, None]
+    return gyro, accel
+
+
+def _quadrature_order(phase: float) -> int:
+    """Return the fewest Gauss points that average a sinusoid over `phase` rad exactly.
+
+    Error bound: phase^(2q) (q!)⁴ / ((2q + 1) (2q)!³). Davis and Rabinowitz, Methods of
+    Numerical Integration, eq. 2.7.12.
+    """
+    orders = np.arange(2, 25)
+    bound = phase ** (2.0 * orders) * factorial(orders) ** 4
+    bound /= (2 * orders + 1) * factorial(2 * orders) ** 3
+    good = orders[bound < 1e-13]
+    return int(good[0]) if good.size else int(orders[-1])

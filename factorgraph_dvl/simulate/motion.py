@@ -1,0 +1,362 @@
+"""Analytic motion over the ellipsoid, in the local-level frame.
+
+Speed and heading are piecewise polynomials, the sway is a sum of sinusoids; velocity,
+acceleration, attitude and rates follow in closed form. Only latitude and longitude are
+integrated, by collocation to the last digits of a double.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.interpolate import PPoly
+
+from factorgraph_dvl.conventions import DEG, Array, BodyAxes, frd_from_body
+from factorgraph_dvl.earth import RATE, normal_gravity, radii
+from factorgraph_dvl.errors import ConfigError
+from factorgraph_dvl.simulate.scenario import Accelerate, Manoeuvre, Scenario, Straight
+
+_COLLOCATION_NODES = 6
+_MAX_LATITUDE = 89.5 * DEG
+
+
+@dataclass(frozen=True)
+class Sway:
+    """A sum of sinusoids.
+
+    Parameters
+    ----------
+    amplitude, frequency, phase : (K,) of amplitude · sin(frequency t + phase); the
+        frequency in rad/s.
+    """
+
+    amplitude: Array
+    frequency: Array
+    phase: Array
+
+    def derivatives(self, t: Array) -> tuple[Array, Array, Array]:
+        """Return value, first and second derivative at times (M,)."""
+        value, rate, acceleration = np.zeros_like(t), np.zeros_like(t), np.zeros_like(t)
+        for a, w, phase in zip(self.amplitude, self.frequency, self.phase, strict=True):
+            angle = w * t + phase
+            sine = a * np.sin(angle)
+            value += sine
+            rate += a * w * np.cos(angle)
+            acceleration -= w * w * sine
+        return value, rate, acceleration
+
+    @property
+    def highest_frequency(self) -> float:
+        """Highest frequency, rad/s; 0 without any sway."""
+        return float(np.max(self.frequency, initial=0.0))
+
+
+@dataclass(frozen=True)
+class State:
+    """Motion at M times.
+
+    Parameters
+    ----------
+    geodetic : (M, 3) latitude, longitude (rad), ellipsoidal height (m).
+    v_n, a_n : (M, 3) velocity over ground and its derivative, local-level ENU.
+    rph : (M, 3) roll, pitch, heading, rad; the heading is not wrapped.
+    omega_eb_b : (M, 3) angular rate relative to the Earth, rad/s.
+    omega_ib_b : (M, 3) angular rate relative to inertial space, rad/s.
+    f_b : (M, 3) specific force, m/s².
+    """
+
+    geodetic: Array
+    v_n: Array
+    a_n: Array
+    rph: Array
+    omega_eb_b: Array
+    omega_ib_b: Array
+    f_b: Array
+
+
+@dataclass(frozen=True)
+class Motion:
+    """The motion of a scenario, exact at any time from 0 to `duration`.
+
+    The vehicle moves through the water along its course; yaw sway turns the bow about
+    the course, so that it makes the vehicle slip sideways, as waves do.
+
+    Parameters
+    ----------
+    speed : through the water, m/s.
+    course : clockwise from north, rad.
+    lat, lon : rad.
+    height : mean height, m.
+    current_n : (3,) ENU, m/s.
+    roll, pitch, yaw, heave : sway, rad and m.
+    kinks : (K,) times at which acceleration or turn rate change abruptly, s.
+    duration : s.
+    body_axes : axes of the body frame.
+    """
+
+    speed: PPoly
+    course: PPoly
+    lat: PPoly
+    lon: PPoly
+    height: float
+    current_n: Array
+    roll: Sway
+    pitch: Sway
+    yaw: Sway
+    heave: Sway
+    kinks: Array
+    duration: float
+    body_axes: BodyAxes
+
+    def highest_rate(self) -> float:
+        """Return the highest angular frequency in the body-frame signals, rad/s.
+
+        Roll and pitch multiply each other and the gravity: twice the highest of the sway.
+        """
+        sway = max(s.highest_frequency for s in (self.roll, self.pitch, self.yaw, self.heave))
+        turn = float(np.max(np.abs(_evaluate(self.course, self.kinks[:-1], 1)), initial=0.0))
+        return 2.0 * sway + turn
+
+    def velocity(self, t: Array) -> tuple[Array, ...]:
+        """Return east, north, up velocity over ground and their derivatives, each (M,)."""
+        speed, course = _evaluate(self.speed, t), _evaluate(self.course, t)
+        acceleration, rate = _evaluate(self.speed, t, 1), _evaluate(self.course, t, 1)
+        sine, cosine = np.sin(course), np.cos(course)
+        _, heave_rate, heave_acceleration = self.heave.derivatives(t)
+        east, north, up = self.current_n
+        return (
+            speed * sine + east,
+            speed * cosine + north,
+            heave_rate + up,
+            acceleration * sine + speed * rate * cosine,
+            acceleration * cosine - speed * rate * sine,
+            heave_acceleration,
+        )
+
+    def height_at(self, t: Array) -> Array:
+        """Return the ellipsoidal height, (M,), m."""
+        return self.height + self.current_n[2] * t + self.heave.derivatives(t)[0]
+
+    def at(self, t: Array) -> State:
+        """Return the motion at times (M,).
+
+        With M and N the radii of curvature, L the latitude and h the height,
+
+            omega_ie = [0, O cos L, O sin L],
+            omega_en = [-v_n / (M + h), v_e / (N + h), v_e tan L / (N + h)],
+            omega_ib_b = omega_nb_b + nRbᵀ (omega_ie + omega_en),
+            f_b = nRbᵀ (dv_n/dt + (2 omega_ie + omega_en) x v_n - g_n).
+
+        Groves, Principles of GNSS, Inertial, and Multisensor Integrated Navigation
+        Systems, 2nd ed., eqs. 5.39 to 5.54, in ENU.
+        """
+        t = np.asarray(t, dtype=float)
+        v_e, v_n, v_u, a_e, a_n, a_u = self.velocity(t)
+        lat, lon, height = _evaluate(self.lat, t), _evaluate(self.lon, t), self.height_at(t)
+        roll, roll_rate, _ = self.roll.derivatives(t)
+        pitch, pitch_rate, _ = self.pitch.derivatives(t)
+        yaw, yaw_rate, _ = self.yaw.derivatives(t)
+        heading = _evaluate(self.course, t) + yaw
+        heading_rate = _evaluate(self.course, t, 1) + yaw_rate
+
+        sl, cl = np.sin(lat), np.cos(lat)
+        meridian, prime = radii(lat)
+        earth_n, earth_u = RATE * cl, RATE * sl
+        level_e = -v_n / (meridian + height)
+        level_n = v_e / (prime + height)
+        level_u = level_n * sl / cl
+        turn_n, turn_u = 2.0 * earth_n + level_n, 2.0 * earth_u + level_u
+        f_e = a_e + turn_n * v_u - turn_u * v_n
+        f_n = a_n + turn_u * v_e - level_e * v_u
+        f_u = a_u + level_e * v_n - turn_n * v_e + normal_gravity(lat, height)
+
+        to_body = _LevelToBody(roll, pitch, heading, self.body_axes)
+        sr, cr, sp, cp = to_body.sr, to_body.cr, to_body.sp, to_body.cp
+        omega_nb_b = to_body.from_frd(
+            roll_rate - heading_rate * sp,
+            pitch_rate * cr + heading_rate * sr * cp,
+            -pitch_rate * sr + heading_rate * cr * cp,
+        )
+        omega_eb_b = omega_nb_b + to_body(level_e, level_n, level_u)
+        return State(
+            geodetic=np.stack([lat, _wrapped(lon), height], axis=1),
+            v_n=np.stack([v_e, v_n, v_u], axis=1),
+            a_n=np.stack([a_e, a_n, a_u], axis=1),
+            rph=np.stack([roll, pitch, heading], axis=1),
+            omega_eb_b=omega_eb_b,
+            omega_ib_b=omega_eb_b + to_body(np.zeros_like(t), earth_n, earth_u),
+            f_b=to_body(f_e, f_n, f_u),
+        )
+
+
+class _LevelToBody:
+    """Resolve east, north, up components in body."""
+
+    def __init__(self, roll: Array, pitch: Array, heading: Array, body_axes: BodyAxes) -> None:
+        self.sr, self.cr = np.sin(roll), np.cos(roll)
+        self.sp, self.cp = np.sin(pitch), np.cos(pitch)
+        self.sh, self.ch = np.sin(heading), np.cos(heading)
+        self.frd_from_body = frd_from_body(body_axes)
+
+    def from_frd(self, x: Array, y: Array, z: Array) -> Array:
+        """Return (M, 3) body components of forward, right, down ones."""
+        return np.stack([x, y, z], axis=1) @ self.frd_from_body
+
+    def __call__(self, east: Array, north: Array, up: Array) -> Array:
+        """Return (M, 3) body components."""
+        ahead = self.ch * north + self.sh * east
+        right = self.ch * east - self.sh * north
+        below = self.sp * ahead - self.cp * up
+        return self.from_frd(
+            self.cp * ahead + self.sp * up,
+            self.cr * right + self.sr * below,
+            self.cr * below - self.sr * right,
+        )
+
+
+def plan_motion(scenario: Scenario) -> Motion:
+    """Return the motion of a scenario.
+
+    Raises
+    ------
+    ConfigError
+        If the manoeuvres cannot be carried out.
+    """
+    speed, rate = _profiles(scenario.plan(), scenario.start.speed_m_s, scenario.source)
+    course = rate.antiderivative()
+    course.c[-1] += scenario.start.heading_deg * DEG
+    sway = scenario.sway
+    heave = _sway((s.amplitude_m, s.frequency_hz, s.phase_deg) for s in sway.heave)
+    roll, pitch, yaw = (
+        _sway((s.amplitude_deg * DEG, s.frequency_hz, s.phase_deg) for s in part)
+        for part in (sway.roll, sway.pitch, sway.yaw)
+    )
+    still = PPoly(np.zeros((1, 1)), np.array([0.0, 1.0]))
+    motion = Motion(
+        speed=speed,
+        course=course,
+        lat=still,
+        lon=still,
+        height=scenario.start.height_m,
+        current_n=np.array(scenario.current_m_s),
+        roll=roll,
+        pitch=pitch,
+        yaw=yaw,
+        heave=heave,
+        kinks=np.asarray(speed.x, dtype=float),
+        duration=float(speed.x[-1]),
+        body_axes=scenario.body_axes,
+    )
+    lat, lon = _integrate_position(
+        motion, scenario.start.lat_deg * DEG, scenario.start.lon_deg * DEG, scenario.source
+    )
+    return Motion(**{**vars(motion), "lat": lat, "lon": lon})
+
+
+def _profiles(plan: list[Manoeuvre], speed: float, source: str) -> tuple[PPoly, PPoly]:
+    """Return speed through the water (m/s) and turn rate (rad/s) over time."""
+    times, speeds, rates = [0.0], [], []
+
+    def add(duration: float, acceleration: float, rate: float, rate_slope: float) -> None:
+        times.append(times[-1] + duration)
+        speeds.append((acceleration, speed))
+        rates.append((rate_slope, rate))
+
+    for number, m in enumerate(plan, start=1):
+        if isinstance(m, Accelerate):
+            change = m.to_m_s - speed
+            if change * m.accelerate_m_s2 <= 0.0:
+                raise ConfigError(
+                    f"accelerate_m_s2 = {m.accelerate_m_s2:g} does not lead from "
+                    f"{speed:g} to {m.to_m_s:g} m/s",
+                    where=f"{source} key manoeuvres, manoeuvre {number} with repetitions "
+                    "written out",
+                    expected="another speed than the present one, and the sign of the change",
+                )
+            add(change / m.accelerate_m_s2, m.accelerate_m_s2, 0.0, 0.0)
+            speed = m.to_m_s
+        elif isinstance(m, Straight):
+            add(m.straight_s, 0.0, 0.0, 0.0)
+        else:
+            rate = m.turn_deg_s * DEG
+            if m.ramp_s > 0.0:
+                add(m.ramp_s, 0.0, 0.0, rate / m.ramp_s)
+            if m.duration_s > m.ramp_s:
+                add(m.duration_s - m.ramp_s, 0.0, rate, 0.0)
+            if m.ramp_s > 0.0:
+                add(m.ramp_s, 0.0, rate, -rate / m.ramp_s)
+    breaks = np.array(times)
+    return PPoly(np.array(speeds).T, breaks), PPoly(np.array(rates).T, breaks)
+
+
+def _sway(parts: Iterable[tuple[float, float, float]]) -> Sway:
+    table = np.array(list(parts), dtype=float).reshape(-1, 3)
+    return Sway(table[:, 0], 2.0 * np.pi * table[:, 1], table[:, 2] * DEG)
+
+
+def _integrate_position(
+    motion: Motion, lat0: float, lon0: float, source: str
+) -> tuple[PPoly, PPoly]:
+    """Integrate dL/dt = v_n / (M + h) and dlon/dt = v_e / ((N + h) cos L).
+
+    Gauss-Legendre collocation: the rates at the nodes of every step determine a
+    polynomial; as they depend on the latitude, the whole is iterated to its fixed point,
+    which contracts by the fraction of the Earth's radius that was travelled.
+    """
+    step = min(0.5, 0.5 / max(motion.highest_rate(), 1e-9))
+    counts = np.maximum(np.ceil(np.diff(motion.kinks) / step), 1).astype(int)
+    pieces = [
+        np.linspace(a, b, n, endpoint=False)
+        for a, b, n in zip(motion.kinks[:-1], motion.kinks[1:], counts, strict=True)
+    ]
+    edges = np.append(np.concatenate(pieces), motion.duration)
+    width = np.diff(edges)
+    nodes = 0.5 * (np.polynomial.legendre.leggauss(_COLLOCATION_NODES)[0] + 1.0)
+    powers = np.arange(_COLLOCATION_NODES)
+    # Row i: coefficients of tau^i of the polynomial through the values at the nodes.
+    interpolate = np.linalg.inv(nodes[:, None] ** powers)
+    integral_at = nodes[:, None] ** (powers + 1) / (powers + 1)
+
+    t = edges[:-1, None] + width[:, None] * nodes
+    v_e, v_n = (v.reshape(t.shape) for v in motion.velocity(t.ravel())[:2])
+    height = motion.height_at(t.ravel()).reshape(t.shape)
+
+    def integrate(rate: Array) -> tuple[Array, Array]:
+        coefficients = rate @ interpolate.T * width[:, None]
+        whole = np.concatenate([[0.0], np.cumsum(coefficients @ (1.0 / (powers + 1.0)))])
+        return coefficients, whole[:-1]
+
+    lat = np.full(t.shape, lat0)
+    for _ in range(50):
+        coefficients, begin = integrate(v_n / (radii(lat)[0] + height))
+        update = lat0 + begin[:, None] + coefficients @ integral_at.T
+        if not np.all(np.abs(update) < _MAX_LATITUDE):
+            raise ConfigError(
+                "the vehicle reaches a pole, where east and north end",
+                where=f"{source} key start.lat_deg",
+                expected="a track between 89.5 degrees south and north",
+            )
+        change = float(np.max(np.abs(update - lat)))
+        lat = update
+        if change < 4e-16:
+            break
+    lat_poly = _polynomial(edges, lat0 + begin, coefficients)
+    coefficients, begin = integrate(v_e / ((radii(lat)[1] + height) * np.cos(lat)))
+    return lat_poly, _polynomial(edges, lon0 + begin, coefficients)
+
+
+def _polynomial(edges: Array, begin: Array, rate_coefficients: Array) -> PPoly:
+    """Return begin + the integral of a polynomial in tau = (t - edge) / width."""
+    degree = np.arange(1, rate_coefficients.shape[1] + 1)
+    rising = rate_coefficients / degree / np.diff(edges)[:, None] ** degree
+    return PPoly(np.column_stack([rising[:, ::-1], begin]).T, edges)
+
+
+def _evaluate(polynomial: PPoly, t: Array, derivative: int = 0) -> Array:
+    return np.asarray(polynomial(t, derivative), dtype=float)
+
+
+def _wrapped(lon: Array) -> Array:
+    return np.where(np.abs(lon) > np.pi, (lon + np.pi) % (2.0 * np.pi) - np.pi, lon)
