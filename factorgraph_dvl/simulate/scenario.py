@@ -57,8 +57,8 @@ Latitude = Annotated[float, msgspec.Meta(ge=-89, le=89)]
 Longitude = Annotated[float, msgspec.Meta(ge=-360, le=360)]
 Interval = tuple[float, float]
 _T = TypeVar("_T")
-# Longer than any trial, far shorter than what would exhaust memory.
-_MAX_DURATION_S = 1e6
+# More than any trial has, far fewer than would exhaust memory.
+_MAX_MANOEUVRES = 100_000
 
 
 class Start(Section, frozen=True, kw_only=True):
@@ -100,7 +100,7 @@ class Turn(Section, frozen=True, kw_only=True):
 class Repeat(Section, frozen=True, kw_only=True):
     """Run a list of manoeuvres several times."""
 
-    repeat: Annotated[int, msgspec.Meta(ge=1, le=100_000)]
+    repeat: Annotated[int, msgspec.Meta(ge=1)]
     manoeuvres: list[dict[str, Any]]
 
 
@@ -335,8 +335,14 @@ def parse_scenario(data: Mapping[str, Any], source: str = "scenario") -> Scenari
     ConfigError
         As `load_scenario`.
     """
-    if not isinstance(data, Mapping) or "source" in data:
-        _convert({"source": 0}, Start, "", source)
+    if not isinstance(data, Mapping):
+        raise ConfigError(
+            "this is not a scenario",
+            where=source,
+            expected="keys such as `name`, `start`, `manoeuvres` and `imu`",
+        )
+    if "source" in data:
+        raise ConfigError("object contains unknown field `source`", where=source)
     scenario = _convert({**data, "source": source}, Scenario, "", source)
     scenario.plan()
     scenario.imu_settings()
@@ -376,6 +382,12 @@ def _flatten(items: Sequence[Mapping[str, Any]], key: str, source: str) -> list[
         manoeuvre = _convert(dict(item), kinds[0], f"{key}[{i}]", source)
         if isinstance(manoeuvre, Repeat):
             inner = _flatten(manoeuvre.manoeuvres, f"{key}[{i}].manoeuvres", source)
+            if len(out) + len(inner) * manoeuvre.repeat > _MAX_MANOEUVRES:
+                raise ConfigError(
+                    "the repetitions add up to too many manoeuvres",
+                    where=f"{source} key {key}[{i}].repeat",
+                    expected=f"at most {_MAX_MANOEUVRES} in all",
+                )
             out += inner * manoeuvre.repeat
         else:
             out.append(manoeuvre)
