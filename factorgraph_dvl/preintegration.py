@@ -214,15 +214,25 @@ class Attachment:
 
 def attach(seg: Segments, time: Array, earth_rate_n: Array) -> Attachment:
     """Attach times (M,), all covered by arcs, to the chain."""
+    index, since, _ = seg.increments.locate(time)
+    return _attach(seg, index, since, earth_rate_n)
+
+
+def segment_ends(seg: Segments, earth_rate_n: Array) -> Attachment:
+    """Attach the ends of all segments to the nodes at their starts."""
+    index = seg.last - 1
+    return _attach(seg, index, seg.increments.dt[index], earth_rate_n)
+
+
+def _attach(seg: Segments, index: IntArray, since: Array, earth_rate_n: Array) -> Attachment:
     inc = seg.increments
-    index, since, _ = inc.locate(time)
     part = inc.partial(index, since)
     segment = np.searchsorted(seg.first, index, side="right") - 1
     node = seg.origin[segment]
     dR = seg.dR[index]
     turned = rotate(dR, part.dv)
     h = since[:, None]
-    tau = time - seg.node_time[node]
+    tau = inc.start[index] + since - seg.node_time[node]
     return Attachment(
         segment=segment,
         node=node,

@@ -213,6 +213,8 @@ class DvlVelocity:
     measured_d: Array
     std: Array
     label: str = "DVL velocity"
+    unit: str = "m/s"
+    components: tuple[str, ...] = ("x", "y", "z")
     parameters: tuple[str, ...] = (
         MISALIGNMENT,
         SCALE_ERROR,

@@ -147,6 +147,8 @@ class AntennaPosition:
     lRn: Array
     std: Array
     label: str = "GNSS position"
+    unit: str = "m"
+    components: tuple[str, ...] = ("east", "north", "up")
     parameters: tuple[str, ...] = (LEVER_ARM,)
 
     def true_time(self, values: Values) -> Array:
@@ -190,6 +192,8 @@ class AntennaVelocity:
     lRn: Array
     std: Array
     label: str = "GNSS velocity"
+    unit: str = "m/s"
+    components: tuple[str, ...] = ("east", "north", "up")
     parameters: tuple[str, ...] = (LEVER_ARM,)
 
     def true_time(self, values: Values) -> Array:

@@ -129,6 +129,8 @@ class Observation(Protocol):
     """M measurements of one kind, of d components each."""
 
     label: str
+    unit: str
+    components: tuple[str, ...]
     time: Array
     parameters: tuple[str, ...]
 

@@ -1,0 +1,477 @@
+"""A trial as a factor graph: native IMU factors, and sensors linearised in bulk.
+
+A measurement hangs on the node before it through the increments up to its own time.
+Each sensor states its residual in terms of the motion at that time; the chain rule
+takes it to the node. All measurements of a kind are evaluated in one NumPy pass and
+written into one Jacobian factor per node, because a Python callback per factor would be
+slow and makes GTSAM's optimisers copy all values.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import gtsam
+import numpy as np
+
+from factorgraph_dvl import keys
+from factorgraph_dvl.conventions import Array, exp_so3, right_jacobian, rotation_from_rph
+from factorgraph_dvl.conventions import rph_jacobian as euler_jacobian
+from factorgraph_dvl.earth import LocalFrame
+from factorgraph_dvl.increments import IntArray
+from factorgraph_dvl.preintegration import (
+    Attachment,
+    Segments,
+    States,
+    attach,
+    chain_at,
+    motion_at,
+    preintegrate,
+)
+from factorgraph_dvl.sensors.protocol import Linearization, Motion, Observation, Parameter
+from factorgraph_dvl.trial import Trial
+
+# Bounds, not knowledge: they keep an unaided chain from being singular.
+_FREE_ATTITUDE = np.pi
+_FREE_POSITION = 1e5
+_FREE_VELOCITY = 1e2
+# Standard deviation that stands for zero in a parameter of which only some components
+# are held; in SI units, far below what can be measured.
+_HELD = 1e-9
+# Keeps the walk of a bias that does not walk regular.
+_LEAST_WALK = 1e-12
+# Times closer than this are the same for the motion between them.
+_SAME_TIME = 1e-7
+
+_STATE = 9
+_BIAS = 6
+
+
+@dataclass(frozen=True)
+class Chain:
+    """The inertial part of a graph, common to every set of aiding sensors.
+
+    Parameters
+    ----------
+    trial, frame, segments : what it was made from.
+    gravity_n : (S, 3) along the segments, m/s².
+    graph : IMU factors, walks of the biases, priors of states and biases.
+    """
+
+    trial: Trial
+    frame: LocalFrame
+    segments: Segments
+    gravity_n: Array
+    graph: gtsam.NonlinearFactorGraph
+
+    @property
+    def walking(self) -> bool:
+        """Whether every node has a bias of its own."""
+        return self.trial.imu.settings.bias_walks
+
+    def bias_key(self, k: int) -> int:
+        """Return the key of the bias at node k."""
+        return keys.bias(k if self.walking else 0)
+
+
+def inertial_chain(trial: Trial, frame: LocalFrame, seg: Segments, start: States) -> Chain:
+    """Return the inertial part of the graph, with gravity at the positions of `start`."""
+    middle = 0.5 * (start.p_n[seg.origin] + start.p_n[seg.origin + 1])
+    gravity_n = frame.gravity_without_rotation(middle)
+    settings = trial.imu.settings
+    graph = gtsam.NonlinearFactorGraph()
+    chain = Chain(trial, frame, seg, gravity_n, graph)
+    pims = preintegrate(seg, settings, gravity_n, frame.earth_rate)
+    for k, pim in zip(seg.origin.tolist(), pims, strict=True):
+        graph.add(gtsam.GalileanImuFactor2(keys.node(k), keys.node(k + 1), chain.bias_key(k), pim))
+    gyro, accel = trial.imu.parameters(0.0)
+    sigmas = np.concatenate([accel.sigma, gyro.sigma])
+    graph.addPriorConstantBias(
+        keys.bias(0), gtsam.imuBias.ConstantBias(), gtsam.noiseModel.Diagonal.Sigmas(sigmas)
+    )
+    if chain.walking:
+        root_psd = np.repeat(
+            [settings.accel_bias_walk_root_psd, settings.gyro_bias_walk_root_psd], 3
+        )
+        step = np.diff(seg.node_time)
+        for k in range(step.size):
+            walk = np.maximum(root_psd * np.sqrt(step[k]), _LEAST_WALK)
+            graph.add(
+                gtsam.BetweenFactorConstantBias(
+                    keys.bias(k),
+                    keys.bias(k + 1),
+                    gtsam.imuBias.ConstantBias(),
+                    gtsam.noiseModel.Diagonal.Sigmas(walk),
+                )
+            )
+    for a, (first, _) in enumerate(seg.arc_nodes):
+        mean, covariance = _state_prior(trial, frame, start, int(first), known=a == 0)
+        noise = gtsam.noiseModel.Gaussian.Covariance(covariance)
+        graph.add(gtsam.PriorFactorNavState(keys.node(int(first)), mean, noise))
+    return chain
+
+
+def _state_prior(
+    trial: Trial, frame: LocalFrame, start: States, k: int, *, known: bool
+) -> tuple[gtsam.NavState, Array]:
+    """Return mean and covariance, in GTSAM's tangent space, of a state at the start of an arc."""
+    nRb, p_n = start.nRb[k], start.p_n[k]
+    attitude = np.eye(3) * _FREE_ATTITUDE**2
+    position = np.eye(3) * _FREE_POSITION**2
+    if known and trial.initial_attitude is not None:
+        nRb = rotation_from_rph(trial.initial_attitude.rph, trial.body_axes)
+        inverse = np.linalg.inv(euler_jacobian(trial.initial_attitude.rph, trial.body_axes))
+        std = np.maximum(trial.initial_attitude.std, _HELD)
+        attitude = inverse @ np.diag(std**2) @ inverse.T
+    if known and trial.initial_position is not None:
+        p_n = frame.position(*trial.initial_position.geodetic)
+        std = np.maximum(trial.initial_position.std, 1e-6)
+        position = nRb.T @ np.diag(std**2) @ nRb
+    covariance = np.zeros((_STATE, _STATE))
+    covariance[:3, :3] = attitude
+    covariance[3:6, 3:6] = position
+    covariance[6:, 6:] = np.eye(3) * _FREE_VELOCITY**2
+    return gtsam.NavState(gtsam.Rot3(nRb), p_n, start.v_n[k]), covariance
+
+
+@dataclass
+class _Bound:
+    """An observation tied to the chain."""
+
+    observation: Observation
+    attachment: Attachment
+    time: Array
+    weight: Array
+
+
+@dataclass
+class _Block:
+    """Observations with the same parameters: one factor per node for all of them.
+
+    `matrices` and `vectors` are views into `factors` and live no longer than they do.
+    """
+
+    bound: list[_Bound]
+    parameters: tuple[Parameter, ...]
+    nodes: IntArray = field(default_factory=lambda: np.empty(0, int))
+    order: IntArray = field(default_factory=lambda: np.empty(0, int))
+    rows: list[slice] = field(default_factory=list)
+    factors: list[gtsam.JacobianFactor] = field(default_factory=list)
+    matrices: list[Array] = field(default_factory=list)
+    vectors: list[Array] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """All there is to know at one set of values, before linearising.
+
+    Parameters
+    ----------
+    values : GTSAM's.
+    states, parameters : the same as arrays; parameters by name, rotations as matrices.
+    motions, residuals : per observation; residuals whitened, (M, d).
+    cost : half the sum of all squared whitened residuals.
+    """
+
+    values: gtsam.Values
+    states: States
+    parameters: dict[str, Array]
+    motions: list[Motion]
+    residuals: list[Array]
+    cost: float
+
+
+class Problem:
+    """A chain with aiding sensors: what a solver minimises.
+
+    Parameters
+    ----------
+    chain : Chain
+    observations : of the aiding sensors.
+    parameters : of the aiding sensors, fixed ones included.
+    """
+
+    def __init__(
+        self,
+        chain: Chain,
+        observations: Sequence[Observation],
+        parameters: Sequence[Parameter],
+    ) -> None:
+        self.chain = chain
+        self.all_parameters = tuple(parameters)
+        self.parameters = tuple(p for p in parameters if p.estimated)
+        self._key = {p.name: keys.calibration(i) for i, p in enumerate(self.parameters)}
+        self._fixed = {p.name: _from_prior(p) for p in parameters if not p.estimated}
+        self.graph = gtsam.NonlinearFactorGraph(chain.graph)
+        for p in self.parameters:
+            self._add_prior(p)
+        self.uncovered: dict[str, int] = {}
+        self._bound = [self._bind(o) for o in observations]
+        blocks: dict[tuple[str, ...], _Block] = {}
+        for bound in self._bound:
+            used = tuple(p for p in self.parameters if p.name in bound.observation.parameters)
+            names = tuple(p.name for p in used)
+            blocks.setdefault(names, _Block([], used)).bound.append(bound)
+        self._blocks = list(blocks.values())
+        for block in self._blocks:
+            self._lay_out(block)
+
+    @property
+    def observations(self) -> tuple[Observation, ...]:
+        """The observations, in the order of `Evaluation.residuals`."""
+        return tuple(b.observation for b in self._bound)
+
+    @property
+    def weights(self) -> tuple[Array, ...]:
+        """Inverse standard deviations of the observations, (M, d) each; 0 = not used."""
+        return tuple(b.weight for b in self._bound)
+
+    def prior_values(self) -> dict[str, Array]:
+        """Return the prior means of all parameters, rotations as matrices."""
+        return {**self._fixed, **{p.name: _from_prior(p) for p in self.parameters}}
+
+    def values(self, states: States, parameters: dict[str, Array]) -> gtsam.Values:
+        """Return GTSAM's values of states and parameters."""
+        out = gtsam.Values()
+        n = states.nRb.shape[0]
+        for k in range(n):
+            out.insert(
+                keys.node(k),
+                gtsam.NavState(gtsam.Rot3(states.nRb[k]), states.p_n[k], states.v_n[k]),
+            )
+        for k in range(n if self.chain.walking else 1):
+            out.insert(
+                keys.bias(k),
+                gtsam.imuBias.ConstantBias(states.accel_bias[k], states.gyro_bias[k]),
+            )
+        for p in self.parameters:
+            value = parameters[p.name]
+            out.insert(self._key[p.name], gtsam.Rot3(value) if p.rotation else value)
+        return out
+
+    def evaluate(self, values: gtsam.Values) -> Evaluation:
+        """Evaluate motion, residuals and cost."""
+        states = self._states(values)
+        parameters = {**self._fixed}
+        for p in self.parameters:
+            key = self._key[p.name]
+            parameters[p.name] = (
+                values.atRot3(key).matrix() if p.rotation else values.atVector(key)
+            )
+        motions, residuals = [], []
+        cost = self.graph.error(values)
+        rate = self.chain.frame.earth_rate
+        for bound in self._bound:
+            self._follow(bound, parameters)
+            motion = motion_at(bound.attachment, states, self.chain.gravity_n, rate)
+            residual = bound.weight * bound.observation.residual(motion, parameters)
+            motions.append(motion)
+            residuals.append(residual)
+            cost += 0.5 * float(np.vdot(residual, residual))
+        return Evaluation(values, states, parameters, motions, residuals, cost)
+
+    def weigh(self, evaluation: Evaluation) -> None:
+        """Set the weights of all measurements from their standard deviations there."""
+        for bound, motion in zip(self._bound, evaluation.motions, strict=True):
+            sigma = bound.observation.sigma(motion, evaluation.parameters)
+            bound.weight = np.where(bound.weight > 0.0, 1.0 / sigma, 0.0)
+
+    def linearize(self, evaluation: Evaluation) -> gtsam.GaussianFactorGraph:
+        """Return the Gaussian graph at an evaluation.
+
+        Its measurement factors are written in place at the next call.
+        """
+        gaussian = self.graph.linearize(evaluation.values)
+        motions = {id(b): m for b, m in zip(self._bound, evaluation.motions, strict=True)}
+        for block in self._blocks:
+            nodes = np.concatenate([b.attachment.node for b in block.bound])
+            if not np.array_equal(nodes, block.nodes):
+                self._lay_out(block)
+            matrix, vector = self._fill(block, motions, evaluation)
+            for target, source, rows in zip(
+                block.matrices, block.vectors, block.rows, strict=True
+            ):
+                target[...] = matrix[rows]
+                source[...] = vector[rows]
+            for factor in block.factors:
+                gaussian.push_back(factor)
+        return gaussian
+
+    def ordering(self, gaussian: gtsam.GaussianFactorGraph) -> gtsam.Ordering:
+        """Return an elimination order in which biases and calibration come last."""
+        last = [self._key[p.name] for p in self.parameters]
+        if not self.chain.walking:
+            last.insert(0, keys.bias(0))
+        return gtsam.Ordering.ColamdConstrainedLastGaussianFactorGraph(gaussian, last)
+
+    def key(self, name: str) -> int:
+        """Return the key of an estimated parameter."""
+        return self._key[name]
+
+    def _states(self, values: gtsam.Values) -> States:
+        n = self.chain.segments.node_time.size
+        nRb, p_n, v_n = np.empty((n, 3, 3)), np.empty((n, 3)), np.empty((n, 3))
+        for k in range(n):
+            state = values.atNavState(keys.node(k))
+            nRb[k] = state.attitude().matrix()
+            p_n[k] = state.position()
+            v_n[k] = state.velocity()
+        m = n if self.chain.walking else 1
+        bias = np.array([values.atConstantBias(keys.bias(k)).vector() for k in range(m)])
+        bias = np.broadcast_to(bias, (n, _BIAS))
+        return States(nRb, p_n, v_n, gyro_bias=bias[:, 3:], accel_bias=bias[:, :3])
+
+    def _add_prior(self, p: Parameter) -> None:
+        key = self._key[p.name]
+        sigma = np.maximum(p.sigma, _HELD)
+        if p.rotation:
+            # The prior is stated for the rotation vector, GTSAM's for its tangent space.
+            to_tangent = right_jacobian(p.mean)
+            covariance = to_tangent @ np.diag(sigma**2) @ to_tangent.T
+            noise = gtsam.noiseModel.Gaussian.Covariance(covariance)
+            self.graph.addPriorRot3(key, gtsam.Rot3(exp_so3(p.mean)), noise)
+        else:
+            self.graph.addPriorVector(key, p.mean, gtsam.noiseModel.Diagonal.Sigmas(sigma))
+
+    def _bind(self, observation: Observation) -> _Bound:
+        time = observation.true_time(self.prior_values())
+        _, _, covered = self.chain.segments.increments.locate(time)
+        if not covered.all():
+            self.uncovered[observation.label] = int((~covered).sum())
+        weight = np.repeat(covered.astype(float)[:, None], len(observation.components), axis=1)
+        return _Bound(observation, self._attach(time), time, weight)
+
+    def _attach(self, time: Array) -> Attachment:
+        seg = self.chain.segments
+        index, since, covered = seg.increments.locate(time)
+        if not covered.all():
+            # They weigh nothing; they only need a place on the chain.
+            inside = np.clip(since, 0.0, seg.increments.dt[index])
+            time = np.where(covered, time, seg.increments.start[index] + inside)
+        return attach(seg, time, self.chain.frame.earth_rate)
+
+    def _follow(self, bound: _Bound, parameters: dict[str, Array]) -> None:
+        """Move a bound observation along when a time offset has changed."""
+        time = bound.observation.true_time(parameters)
+        if np.array_equal(time, bound.time) or abs(time[0] - bound.time[0]) < _SAME_TIME:
+            return
+        bound.time = time
+        bound.attachment = self._attach(time)
+
+    def _lay_out(self, block: _Block) -> None:
+        """Make a block's factors for the nodes that its measurements hang on now."""
+        block.nodes = np.concatenate([b.attachment.node for b in block.bound])
+        depth = [len(b.observation.components) for b in block.bound]
+        row_node = np.concatenate(
+            [np.repeat(b.attachment.node, d) for b, d in zip(block.bound, depth, strict=True)]
+        )
+        block.order = np.argsort(row_node, kind="stable")
+        used, counts = np.unique(row_node, return_counts=True)
+        edges = np.concatenate([[0], np.cumsum(counts)])
+        block.rows = [slice(a, b) for a, b in zip(edges[:-1], edges[1:], strict=True)]
+        sizes = [_STATE, _BIAS] + [p.mean.size for p in block.parameters]
+        shared = [self._key[p.name] for p in block.parameters]
+        values = self.values(
+            _origin_states(self.chain.segments.node_time.size), self.prior_values()
+        )
+        block.matrices, block.vectors, block.factors = [], [], []
+        for k, rows in zip(used.tolist(), counts.tolist(), strict=True):
+            node_keys = [keys.node(k), self.chain.bias_key(k), *shared]
+            factor = _template(node_keys, sizes, rows, values)
+            block.factors.append(factor)
+            block.matrices.append(factor.getA())
+            block.vectors.append(factor.getb())
+
+    def _fill(
+        self, block: _Block, motions: dict[int, Motion], evaluation: Evaluation
+    ) -> tuple[Array, Array]:
+        """Return the whitened Jacobian and right-hand side of a block, rows by node."""
+        columns = _STATE + _BIAS + sum(p.mean.size for p in block.parameters)
+        parts, rhs = [], []
+        for bound in block.bound:
+            motion = motions[id(bound)]
+            lin = bound.observation.linearize(motion, evaluation.parameters)
+            matrix = node_jacobian(
+                lin, bound.attachment, evaluation.states, motion, self.chain.frame.earth_rate
+            )
+            m, d = lin.residual.shape
+            full = np.empty((m, d, columns))
+            full[:, :, : _STATE + _BIAS] = matrix
+            c = _STATE + _BIAS
+            for p in block.parameters:
+                full[:, :, c : c + p.mean.size] = lin.d_parameters[p.name]
+                c += p.mean.size
+            full *= bound.weight[:, :, None]
+            parts.append(full.reshape(m * d, columns))
+            rhs.append(-(bound.weight * lin.residual).ravel())
+        matrix = np.concatenate(parts) if len(parts) > 1 else parts[0]
+        vector = np.concatenate(rhs)
+        return matrix[block.order], vector[block.order]
+
+
+def node_jacobian(
+    lin: Linearization, at: Attachment, states: States, motion: Motion, earth_rate_n: Array
+) -> Array:
+    """Return the derivative of residuals with respect to node and bias, (M, d, 15).
+
+    Columns: attitude, position, velocity in GTSAM's tangent space of NavState, then
+    accelerometer and gyro bias.
+
+    Parameters
+    ----------
+    lin : derivatives with respect to the motion at the time.
+    at : Attachment of the M times.
+    states : at the nodes.
+    motion : at the M times.
+    earth_rate_n : (3,) rad/s.
+    """
+    chain = chain_at(at, states, motion, earth_rate_n)
+    out = np.zeros((*lin.residual.shape, _STATE + _BIAS))
+    theta, p, v, accel, gyro = (out[:, :, i : i + 3] for i in range(0, 15, 3))
+    d_theta = lin.d_theta
+    if lin.d_omega is not None:
+        by_attitude = lin.d_omega @ chain.omega_earth
+        d_theta = by_attitude if d_theta is None else d_theta + by_attitude
+        gyro -= lin.d_omega
+    if d_theta is not None:
+        theta += d_theta @ chain.theta_theta
+        gyro += d_theta @ chain.theta_gyro
+    if lin.d_p is not None:
+        theta += lin.d_p @ chain.p_theta
+        p += lin.d_p @ chain.p_p
+        v += lin.d_p @ chain.p_v
+        accel += lin.d_p @ chain.p_accel
+        gyro += lin.d_p @ chain.p_gyro
+    if lin.d_v is not None:
+        theta += lin.d_v @ chain.v_theta
+        v += lin.d_v @ chain.v_v
+        accel += lin.d_v @ chain.v_accel
+        gyro += lin.d_v @ chain.v_gyro
+    return out
+
+
+def _template(
+    node_keys: list[int], sizes: list[int], rows: int, values: gtsam.Values
+) -> gtsam.JacobianFactor:
+    """Return an empty Jacobian factor; only a custom factor makes one of any number of keys."""
+
+    def nothing(
+        this: gtsam.CustomFactor, at: gtsam.Values, jacobians: list[Array] | None
+    ) -> Array:
+        if jacobians is not None:
+            for i, size in enumerate(sizes):
+                jacobians[i] = np.zeros((rows, size), order="F")
+        return np.zeros(rows)
+
+    noise = gtsam.noiseModel.Unit.Create(rows)
+    return gtsam.CustomFactor(noise, node_keys, nothing).linearize(values)
+
+
+def _origin_states(n: int) -> States:
+    zero = np.zeros((n, 3))
+    return States(np.tile(np.eye(3), (n, 1, 1)), zero, zero, zero, zero)
+
+
+def _from_prior(p: Parameter) -> Array:
+    return exp_so3(p.mean) if p.rotation else p.mean

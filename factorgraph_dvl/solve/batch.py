@@ -1,0 +1,132 @@
+"""Batch smoothing of a whole trial: alignment, mounting, Levenberg-Marquardt, covariance."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from factorgraph_dvl.alignment import initial_states
+from factorgraph_dvl.earth import LocalFrame
+from factorgraph_dvl.errors import ConfigError
+from factorgraph_dvl.graph import Problem, inertial_chain
+from factorgraph_dvl.increments import increments
+from factorgraph_dvl.mounting import initial_mounting
+from factorgraph_dvl.preintegration import Segments, States, attach, motion_at, segments
+from factorgraph_dvl.sensors.protocol import Aid, Motion
+from factorgraph_dvl.solution import Solution
+from factorgraph_dvl.solve.levenberg_marquardt import Minimum, Progress, minimise
+from factorgraph_dvl.solve.summary import summarise
+from factorgraph_dvl.trial import Trial
+
+# States this far apart, s, are as good as denser ones: every measurement hangs on the
+# state before it through the increments up to its own time.
+STATE_INTERVAL = 1.0
+# Gravity was taken at positions that are wrong by no more than this, m.
+_SAME_GRAVITY = 30.0
+# The first stage only prepares the second.
+_ROUGH = 1.0
+_ROUGH_ITERATIONS = 10
+_ROUNDS = 3
+
+
+def solve(
+    trial: Trial,
+    *,
+    rate_hz: float = 10.0,
+    state_interval_s: float = STATE_INTERVAL,
+    progress: Progress | None = None,
+) -> Solution:
+    """Estimate trajectory and calibration of a trial with their joint covariance.
+
+    Parameters
+    ----------
+    trial : Trial
+    rate_hz : rate of the trajectory in the solution; the solver's states are independent
+        of it.
+    state_interval_s : time between the states of the graph.
+    progress : called with stage, iteration and cost (None where there is none yet).
+
+    Returns
+    -------
+    Solution
+        Also where the solver did not converge: `Solution.converged` says so.
+
+    Raises
+    ------
+    ConfigError, DataError
+        If the trial cannot be solved as it is.
+    SolveError
+        If no minimum can be searched for at all.
+    """
+    if rate_hz <= 0 or state_interval_s <= 0:
+        raise ConfigError("rate and state interval must be above 0")
+    report = progress or (lambda stage, iteration, cost: None)
+    frame = trial.frame()
+    report("increments", 0, None)
+    inc, gaps = increments(trial.imu)
+    seg = segments(inc, state_interval_s)
+    report("alignment", 0, None)
+    start = initial_states(trial, frame, seg)
+    notes = [*trial.notes, *gaps, *start.notes]
+
+    states, values = start.states, None
+    iterations = 0
+    for _ in range(_ROUNDS):
+        chain = inertial_chain(trial, frame, seg, states)
+        if values is None:
+            if trial.gnss is not None:
+                coarse = _problem_minimum(
+                    Problem(chain, *_sensors([trial.gnss], frame)), states, {}, report
+                )
+                iterations += coarse.iterations
+                states = coarse.evaluation.states
+            report("mounting", 0, None)
+            values = _mounting(trial, frame, seg, chain.gravity_n, states)
+        problem = Problem(chain, *_sensors(trial.aids, frame))
+        at = problem.values(states, {**problem.prior_values(), **values})
+        minimum = minimise(problem, at, stage="all sensors", progress=report)
+        iterations += minimum.iterations
+        moved = np.abs(minimum.evaluation.states.p_n - states.p_n).max()
+        states, values = minimum.evaluation.states, minimum.evaluation.parameters
+        if moved < _SAME_GRAVITY:
+            break
+    report("covariance", 0, None)
+    minimum = replace(minimum, iterations=iterations)
+    return summarise(problem, minimum, rate_hz=rate_hz, notes=notes)
+
+
+def _problem_minimum(
+    problem: Problem, states: States, values: dict[str, np.ndarray], report: Progress
+) -> Minimum:
+    at = problem.values(states, {**problem.prior_values(), **values})
+    return minimise(
+        problem,
+        at,
+        stage="inertial and GNSS",
+        progress=report,
+        max_iterations=_ROUGH_ITERATIONS,
+        tolerance=_ROUGH,
+    )
+
+
+def _sensors(aids: Sequence[Aid], frame: LocalFrame) -> tuple[list, list]:  # type: ignore[type-arg]
+    observations = [o for aid in aids for o in aid.observations(frame)]
+    parameters = [p for aid in aids for p in aid.parameters()]
+    return observations, parameters
+
+
+def _mounting(
+    trial: Trial, frame: LocalFrame, seg: Segments, gravity_n: np.ndarray, states: States
+) -> dict[str, np.ndarray]:
+    if trial.dvl is None:
+        return {}
+
+    def motion_at_pings(pings: np.ndarray, time: np.ndarray) -> tuple[Motion, np.ndarray]:
+        index, since, covered = seg.increments.locate(time)
+        inside = seg.increments.start[index] + np.clip(since, 0.0, seg.increments.dt[index])
+        at = attach(seg, np.where(covered, time, inside), frame.earth_rate)
+        return motion_at(at, states, gravity_n, frame.earth_rate), covered
+
+    return initial_mounting(trial.dvl, motion_at_pings)

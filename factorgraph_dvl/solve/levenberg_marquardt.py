@@ -1,0 +1,144 @@
+"""Levenberg-Marquardt over a problem, with GTSAM's elimination by QR."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+
+from factorgraph_dvl.errors import SolveError
+from factorgraph_dvl.graph import Evaluation, Problem
+
+Progress = Callable[[str, int, float | None], None]
+
+# A step is small when all of it together is this many standard deviations, squared and
+# halved: the decrease of the cost that the linear model still promises.
+CONVERGED = 1e-5
+# Sizes of a step that the linear model is trusted for, once it has failed: NavState
+# (rad, m, m/s), and how many priors' standard deviations in other variables.
+_TRUSTED_STATE = np.repeat([0.05, 5.0, 0.5], 3)
+_FIRST_DAMPING = 1.0
+_MAX_DAMPING = 1e12
+
+
+@dataclass(frozen=True)
+class Minimum:
+    """Where the minimisation ended.
+
+    Parameters
+    ----------
+    evaluation : at the last values.
+    gaussian : the graph linearised there.
+    ordering : elimination order.
+    converged : whether the linear model promises no more.
+    iterations : accepted and refused steps.
+    """
+
+    evaluation: Evaluation
+    gaussian: gtsam.GaussianFactorGraph
+    ordering: gtsam.Ordering
+    converged: bool
+    iterations: int
+
+
+def minimise(
+    problem: Problem,
+    values: gtsam.Values,
+    *,
+    stage: str,
+    progress: Progress | None = None,
+    max_iterations: int = 30,
+    tolerance: float = CONVERGED,
+) -> Minimum:
+    """Minimise a problem's cost.
+
+    Starts as Gauss-Newton; a step that does not lower the cost brings in Levenberg's
+    damping. Damping from the start, in proportion to the diagonal of the information
+    matrix, would stall: the diagonal is that of relative attitudes known to 1e-7 rad, and
+    holds back the common rotation of the whole trajectory as well.
+
+    Parameters
+    ----------
+    problem : Problem
+    values : where to start.
+    stage : name, for the progress.
+    progress : called with stage, iteration and cost.
+    max_iterations : steps after which to give up.
+    tolerance : promised decrease of the cost below which the minimum is reached.
+
+    Raises
+    ------
+    SolveError
+        If the cost at the start is not finite.
+    """
+    evaluation = problem.evaluate(values)
+    problem.weigh(evaluation)
+    evaluation = problem.evaluate(values)
+    if not np.isfinite(evaluation.cost):
+        raise SolveError(
+            "the cost at the start is not finite",
+            where=stage,
+            hint="Inspect the trial: a unit or a column may be wrong",
+        )
+    gaussian = problem.linearize(evaluation)
+    ordering = problem.ordering(gaussian)
+    damping = 0.0
+    iteration = 0
+    converged = False
+    if progress:
+        progress(stage, 0, evaluation.cost)
+    while iteration < max_iterations:
+        iteration += 1
+        delta = _step(gaussian, ordering, evaluation.values, damping)
+        promised = evaluation.cost - gaussian.error(delta)
+        trial = problem.evaluate(evaluation.values.retract(delta))
+        small = promised < tolerance
+        if np.isfinite(trial.cost) and (trial.cost <= evaluation.cost or small):
+            if trial.cost <= evaluation.cost:
+                evaluation = trial
+            if damping == 0.0 and small:
+                converged = True
+            damping = 0.0 if damping <= _FIRST_DAMPING else damping / 100.0
+            if progress:
+                progress(stage, iteration, evaluation.cost)
+            gaussian = problem.linearize(evaluation)
+            if converged:
+                break
+        else:
+            damping = max(damping * 10.0, _FIRST_DAMPING)
+            if damping > _MAX_DAMPING:
+                break
+            # Evaluating moved the attachments along with a time offset.
+            problem.evaluate(evaluation.values)
+    return Minimum(evaluation, gaussian, ordering, converged, iteration)
+
+
+def eliminate(
+    gaussian: gtsam.GaussianFactorGraph, ordering: gtsam.Ordering
+) -> gtsam.GaussianBayesTree:
+    """Return the Bayes tree from QR: Cholesky has no digits left at navigation grade."""
+    return gaussian.eliminateMultifrontal(ordering, gtsam.EliminateQR)
+
+
+def _step(
+    gaussian: gtsam.GaussianFactorGraph,
+    ordering: gtsam.Ordering,
+    values: gtsam.Values,
+    damping: float,
+) -> gtsam.VectorValues:
+    if damping == 0.0:
+        return eliminate(gaussian, ordering).optimize()
+    damped = gtsam.GaussianFactorGraph()
+    for i in range(gaussian.size()):
+        damped.push_back(gaussian.at(i))
+    for key, size in values.dims().items():
+        scale = 1.0 / _TRUSTED_STATE if size == _TRUSTED_STATE.size else np.ones(size)
+        damped.add(
+            key,
+            np.sqrt(damping) * np.diag(scale),
+            np.zeros(size),
+            gtsam.noiseModel.Unit.Create(size),
+        )
+    return eliminate(damped, ordering).optimize()

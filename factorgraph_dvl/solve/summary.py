@@ -1,0 +1,273 @@
+"""From a minimum to a solution: covariances, reported parametrisation, warnings."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from factorgraph_dvl import keys
+from factorgraph_dvl.conventions import (
+    Array,
+    exp_so3,
+    inverse_right_jacobian,
+    log_so3,
+    reported_rotation_vector,
+    rotate,
+    rph_from_rotation,
+    rph_jacobian,
+)
+from factorgraph_dvl.graph import Problem
+from factorgraph_dvl.preintegration import States, attach, motion_at, segment_ends
+from factorgraph_dvl.sensors.protocol import Motion, Parameter
+from factorgraph_dvl.solution import Estimate, Residuals, Solution, Trajectory
+from factorgraph_dvl.solve.covariance import SquareRootInformation
+from factorgraph_dvl.solve.levenberg_marquardt import Minimum, eliminate
+
+# The data observed a component if they at least halved what was unknown of it.
+_OBSERVABLE = 0.5
+# Residuals larger than stated by this factor make every standard deviation too small.
+_TOO_LARGE = 1.3
+_FIRST = ("misalignment", "scale_error", "lever_arm", "gyro_bias", "accel_bias")
+
+
+def summarise(
+    problem: Problem, minimum: Minimum, *, rate_hz: float, notes: Sequence[str]
+) -> Solution:
+    """Return the solution at a minimum.
+
+    Parameters
+    ----------
+    problem, minimum : what was minimised, and where it ended.
+    rate_hz : rate of the trajectory.
+    notes : what is already known to be worth telling.
+    """
+    chain = problem.chain
+    trial = chain.trial
+    evaluation = minimum.evaluation
+    sizes = evaluation.values.dims()
+    information = SquareRootInformation(eliminate(minimum.gaussian, minimum.ordering), sizes)
+    estimates, covariance = _calibration(problem, minimum, information)
+    trajectory = _trajectory(problem, evaluation.states, information, rate_hz)
+    residuals = _residuals(problem, minimum)
+    warnings = [*notes]
+    if not minimum.converged:
+        warnings.append(
+            f"the solver did not converge in {minimum.iterations} iterations: do not use the values"
+        )
+    for label, count in problem.uncovered.items():
+        warnings.append(f"{label}: {count} measurements at times without IMU data were not used")
+    warnings += _unexplained(residuals)
+    warnings += _unobservable(problem, estimates, evaluation.motions)
+    return Solution(
+        trial=trial.name,
+        solver="batch",
+        body_axes=trial.body_axes,
+        converged=minimum.converged,
+        iterations=minimum.iterations,
+        cost=evaluation.cost,
+        estimates=estimates,
+        covariance=covariance,
+        trajectory=trajectory,
+        residuals=residuals,
+        warnings=tuple(warnings),
+    )
+
+
+def _calibration(
+    problem: Problem, minimum: Minimum, information: SquareRootInformation
+) -> tuple[tuple[Estimate, ...], Array]:
+    chain, evaluation = problem.chain, minimum.evaluation
+    time = chain.segments.node_time
+    weight = _mean_weights(time)
+    gyro, accel = chain.trial.imu.parameters(float(time[-1] - time[0]))
+    states = evaluation.states
+    rows: list[tuple[Parameter, Array, dict[int, Array] | None]] = []
+    for parameter, bias, first in ((gyro, states.gyro_bias, 3), (accel, states.accel_bias, 0)):
+        select = np.eye(6)[first : first + 3] / parameter.si
+        functional = (
+            {keys.bias(k): w * select for k, w in enumerate(weight)}
+            if chain.walking
+            else {keys.bias(0): select}
+        )
+        rows.append((parameter, weight @ bias / parameter.si, functional))
+    for p in problem.all_parameters:
+        value = evaluation.parameters[p.name]
+        derivative = np.eye(p.mean.size)
+        if p.rotation:
+            value = reported_rotation_vector(value, p.mean)
+            derivative = inverse_right_jacobian(value)
+        if p.estimated:
+            rows.append((p, value / p.si, {problem.key(p.name): derivative / p.si}))
+        elif p.stem in _FIRST:
+            rows.append((p, value / p.si, None))
+    rows.sort(key=lambda r: _FIRST.index(r[0].stem) if r[0].stem in _FIRST else len(_FIRST))
+
+    free = [f for _, _, f in rows if f is not None]
+    joint = information.covariance_of(free)
+    total = sum(p.mean.size for p, _, _ in rows)
+    covariance = np.zeros((total, total))
+    is_free = np.concatenate([np.full(p.mean.size, f is not None) for p, _, f in rows])
+    covariance[np.ix_(is_free, is_free)] = joint
+    std = np.sqrt(np.diag(covariance))
+    estimates, at = [], 0
+    for p, value, _ in rows:
+        own = std[at : at + p.mean.size]
+        at += p.mean.size
+        prior = p.sigma / p.si
+        estimates.append(
+            Estimate(
+                name=p.name,
+                component_names=p.component_names,
+                value=np.array(value),
+                std=own,
+                prior_value=p.mean / p.si,
+                prior_std=prior,
+                observable=(prior > 0.0) & (own <= _OBSERVABLE * prior),
+            )
+        )
+    return tuple(estimates), covariance
+
+
+def _mean_weights(time: Array) -> Array:
+    """Return weights of the nodes in the mean over time."""
+    step = np.diff(time)
+    weight = np.concatenate([step, [0.0]]) + np.concatenate([[0.0], step])
+    return np.asarray(weight / weight.sum())
+
+
+def _trajectory(
+    problem: Problem, states: States, information: SquareRootInformation, rate_hz: float
+) -> Trajectory:
+    chain = problem.chain
+    seg, frame, body_axes = chain.segments, chain.frame, chain.trial.body_axes
+    time = _output_times(problem, rate_hz)
+    motion, fraction, node = _smoothed(problem, states, time)
+    lat, lon, height = frame.geodetic(motion.p_n)
+    lRn = frame.level_from_tangent(lat, lon)
+    nRb = lRn @ motion.nRb
+    rph = rph_from_rotation(nRb, body_axes)
+
+    n = seg.node_time.size
+    marginals = information.marginals([keys.node(k) for k in range(n)])
+    P = np.stack([marginals[keys.node(k)] for k in range(n)])
+    # GTSAM's tangent space is in body axes, which differ from node to node; n does not.
+    P_n = P.reshape(n, 3, 3, 3, 3)
+    P_n = np.einsum("kia,kxayb,kjb->kxiyj", states.nRb, P_n, states.nRb)
+    at = P_n[node] + fraction[:, None, None, None, None] * (P_n[node + 1] - P_n[node])
+
+    def level(i: int) -> Array:
+        return lRn @ at[:, i, :, i, :] @ lRn.transpose(0, 2, 1)
+
+    to_rph = rph_jacobian(rph, body_axes) @ nRb.transpose(0, 2, 1)
+    return Trajectory(
+        time=time,
+        geodetic=np.stack([lat, lon, height], axis=1),
+        velocity=rotate(lRn, motion.v_n),
+        rph=rph,
+        position_cov=level(1),
+        velocity_cov=level(2),
+        rph_cov=to_rph @ level(0) @ to_rph.transpose(0, 2, 1),
+    )
+
+
+def _output_times(problem: Problem, rate_hz: float) -> Array:
+    """Return the multiples of 1 / rate that arcs cover."""
+    inc = problem.chain.segments.increments
+    first, last = inc.start[0], inc.end[-1]
+    time = np.arange(np.ceil(first * rate_hz - 1e-6), np.floor(last * rate_hz + 1e-6) + 1)
+    time = time / rate_hz
+    index, since, covered = inc.locate(time)
+    time = np.where(covered, inc.start[index] + np.clip(since, 0.0, inc.dt[index]), time)
+    return np.asarray(time[covered])
+
+
+def _smoothed(problem: Problem, states: States, time: Array) -> tuple[Motion, Array, np.ndarray]:
+    """Return the motion between the nodes, carried forward and closed onto the node after.
+
+    What the IMU misses of the next node's state is its noise over the segment; it is
+    spread in proportion to time.
+    """
+    chain = problem.chain
+    seg, rate = chain.segments, chain.frame.earth_rate
+    at = attach(seg, time, rate)
+    motion = motion_at(at, states, chain.gravity_n, rate)
+    ends = motion_at(segment_ends(seg, rate), states, chain.gravity_n, rate)
+    after = seg.origin + 1
+    fraction = np.clip(at.tau / seg.duration[at.segment], 0.0, 1.0)
+    part = fraction[:, None]
+    miss = log_so3(states.nRb[after] @ ends.nRb.transpose(0, 2, 1))
+    closed = Motion(
+        nRb=exp_so3(part * miss[at.segment]) @ motion.nRb,
+        p_n=motion.p_n + part * (states.p_n[after] - ends.p_n)[at.segment],
+        v_n=motion.v_n + part * (states.v_n[after] - ends.v_n)[at.segment],
+        omega_eb_b=motion.omega_eb_b,
+        a_n=motion.a_n,
+        alpha_b=motion.alpha_b,
+        omega_sigma=motion.omega_sigma,
+    )
+    return closed, fraction, at.node
+
+
+def _residuals(problem: Problem, minimum: Minimum) -> tuple[Residuals, ...]:
+    out = []
+    for observation, whitened, weight in zip(
+        problem.observations, minimum.evaluation.residuals, problem.weights, strict=True
+    ):
+        used = weight[:, 0] > 0.0
+        out.append(
+            Residuals(
+                label=observation.label,
+                unit=observation.unit,
+                components=observation.components,
+                time=observation.time[used],
+                residual=whitened[used] / weight[used],
+                sigma=1.0 / weight[used],
+            )
+        )
+    return tuple(out)
+
+
+def _unexplained(residuals: Sequence[Residuals]) -> list[str]:
+    out = []
+    for r in residuals:
+        if r.time.size == 0:
+            continue
+        rms = float(np.sqrt(np.mean((r.residual / r.sigma) ** 2)))
+        if rms > _TOO_LARGE:
+            out.append(
+                f"{r.label}: residuals are {rms:.1f} times as large as their stated standard "
+                "deviation; the reported standard deviations are too small unless it is corrected"
+            )
+    return out
+
+
+def _unobservable(
+    problem: Problem, estimates: Sequence[Estimate], motions: Sequence[Motion]
+) -> list[str]:
+    """Say which components the data did not determine, and why."""
+    trial = problem.chain.trial
+    by_name = {p.name: aid for aid in trial.aids for p in aid.parameters()}
+    seen = {
+        name: motion
+        for observation, motion in zip(problem.observations, motions, strict=True)
+        for name in observation.parameters
+    }
+    out = []
+    for e in estimates:
+        bad = np.flatnonzero(~e.observable & (e.prior_std > 0.0))
+        if bad.size == 0:
+            continue
+        names = ", ".join(e.component_names[i] for i in bad)
+        if e.name in by_name:
+            why = by_name[e.name].explain(e.name, int(bad[0]), seen.get(e.name))
+        elif trial.gnss is None:
+            why = "without GNSS nothing separates the errors of the IMU from the motion"
+        else:
+            why = (
+                "the trial is too short or too calm to know it better than the prior; turns and "
+                "changes of speed separate it from the attitude error"
+            )
+        missing = "; the trial has no GNSS" if trial.gnss is None and e.name in by_name else ""
+        out.append(f"{names} not observable: {why}{missing}")
+    return out
