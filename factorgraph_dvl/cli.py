@@ -1,0 +1,261 @@
+"""The command line: parse, load, call, report, exit code."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from time import perf_counter
+from typing import TYPE_CHECKING, Annotated, NoReturn
+
+import typer
+from rich.console import Console
+from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+from rich.text import Text
+
+from factorgraph_dvl import __version__
+from factorgraph_dvl.errors import FactorgraphDvlError
+
+# GTSAM, SciPy, Matplotlib and Arrow take seconds to load: only in the commands that use
+# them, so that --help answers at once.
+if TYPE_CHECKING:
+    from types import TracebackType
+
+    from factorgraph_dvl.solution import Solution
+    from factorgraph_dvl.trial import Trial
+
+_NAME = "factorgraph-dvl"
+# Tables that go to a file or a pipe are not cut to the 80 columns of no terminal.
+_PIPE_WIDTH = 160
+
+app = typer.Typer(
+    name=_NAME,
+    help="Calibrate a Doppler velocity log, jointly with the trajectory of its vehicle.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+
+TrialPath = Annotated[
+    Path, typer.Argument(metavar="TRIAL", help="Trial folder, or the trial.yaml in it.")
+]
+Force = Annotated[bool, typer.Option("--force", help="Replace results that are there.")]
+
+
+def main(argv: list[str] | None = None) -> NoReturn:
+    """Run the command line and exit: 0 done, 1 could not deliver, 2 bad input or usage.
+
+    Parameters
+    ----------
+    argv : arguments; by default those of the process.
+    """
+    args = sys.argv[1:] if argv is None else argv
+    for stream in (sys.stdout, sys.stderr):
+        # A terminal that knows no µ shall not fail a run.
+        if hasattr(stream, "reconfigure"):
+            stream.reconfigure(errors="replace")
+    try:
+        app(args=[arg for arg in args if arg != "--debug"], prog_name=_NAME)
+    except FactorgraphDvlError as error:
+        _fail(str(error), error.exit_code, args)
+    except KeyboardInterrupt:
+        _fail("interrupted", 130, args)
+    except OSError as error:
+        name = error.filename if error.filename is not None else "a file"
+        _fail(f"{name}: {error.strerror or error}", 2, args)
+    except Exception as error:
+        hint = "" if "--debug" in args else ". Run with --debug to see where"
+        _fail(f"internal error: {type(error).__name__}: {error}{hint}", 1, args)
+    sys.exit(0)
+
+
+def _fail(message: str, exit_code: int, args: list[str]) -> NoReturn:
+    if "--debug" in args:
+        _stderr().print_exception()
+    _stderr().print(Text(f"error: {message}", "red"), soft_wrap=True)
+    sys.exit(exit_code)
+
+
+def _show_version(value: bool) -> None:
+    if value:
+        typer.echo(f"{_NAME} {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _options(
+    version: Annotated[
+        bool,
+        typer.Option(
+            "--version", help="Show the version and exit.", callback=_show_version, is_eager=True
+        ),
+    ] = False,
+    debug: Annotated[
+        bool, typer.Option("--debug", help="Show the traceback of an error.")
+    ] = False,
+) -> None:
+    pass
+
+
+@app.command()
+def simulate(
+    config: Annotated[Path, typer.Argument(metavar="CONFIG", help="Scenario, a YAML file.")],
+    out: Annotated[Path, typer.Option("--out", metavar="TRIAL", help="Trial folder to write.")],
+    seed: Annotated[int, typer.Option(min=0, help="Of all that is random.")] = 0,
+    force: Force = False,
+    parquet: Annotated[
+        bool, typer.Option("--parquet", help="Write tables as Parquet instead of CSV.")
+    ] = False,
+) -> None:
+    """Simulate a trial with known truth."""
+    from factorgraph_dvl.io.folders import check_output
+    from factorgraph_dvl.io.trial_folder import save_trial
+    from factorgraph_dvl.simulate import simulate as run
+
+    check_output(out, force=force)
+    start = perf_counter()
+    trial = run(config, seed=seed)
+    save_trial(trial, out, force=force, parquet=parquet)
+    _stdout().print(
+        f"Wrote trial {trial.name} to {out} in {perf_counter() - start:.1f} s",
+        markup=False,
+        soft_wrap=True,
+    )
+
+
+@app.command()
+def solve(
+    trial_path: TrialPath,
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Solution folder to write.")],
+    force: Force = False,
+    no_figures: Annotated[bool, typer.Option("--no-figures", help="Draw no figures.")] = False,
+    rate: Annotated[
+        float, typer.Option(metavar="HZ", min=1e-3, max=1e4, help="Rate of the trajectory.")
+    ] = 10.0,
+    quiet: Annotated[bool, typer.Option("--quiet", help="Show no progress.")] = False,
+) -> None:
+    """Estimate calibration and trajectory from all data of a trial."""
+    from factorgraph_dvl.io.folders import check_output
+    from factorgraph_dvl.io.solution_folder import FIGURES_FOLDER, save_solution
+    from factorgraph_dvl.io.trial_folder import load_trial
+
+    check_output(out, force=force)
+    with _ProgressLine(quiet=quiet) as progress:
+        progress("load", 0, None)
+        trial = load_trial(trial_path)
+        _print_notes(trial)
+        # The solver takes longest to load: after what is most often wrong.
+        from factorgraph_dvl.solve.batch import solve as run
+
+        solution = run(trial, rate_hz=rate, progress=progress)
+        progress("write", 0, None)
+
+        def draw(folder: Path) -> None:
+            from factorgraph_dvl.report.figures import write_figures
+
+            try:
+                write_figures(trial, solution, folder / FIGURES_FOLDER)
+            except Exception as error:
+                # A figure is not worth the solution.
+                _warn(f"figures could not be drawn: {type(error).__name__}: {error}")
+
+        save_solution(solution, out, force=force, extra=None if no_figures else draw)
+    _print_solution(trial, solution)
+    written = sorted(path.relative_to(out) for path in out.rglob("*") if path.is_file())
+    _stdout().print(f"Wrote {', '.join(map(str, written))} to {out}", markup=False, soft_wrap=True)
+    if not solution.converged:
+        _stderr().print(
+            Text(f"error: not converged after {solution.iterations} iterations", "red"),
+            soft_wrap=True,
+        )
+        raise typer.Exit(1)
+
+
+@app.command()
+def inspect(trial_path: TrialPath) -> None:
+    """Show what a trial holds, and check its units and signs."""
+    from factorgraph_dvl.analysis.survey import survey
+    from factorgraph_dvl.io.trial_folder import load_trial
+    from factorgraph_dvl.report.tables import finding_lines, motion_line, sensor_table
+
+    trial = load_trial(trial_path)
+    result = survey(trial)
+    console = _stdout()
+    console.print(sensor_table(result))
+    console.print(motion_line(result), markup=False, soft_wrap=True)
+    _print_notes(trial)
+    for line in finding_lines(result):
+        console.print(line, soft_wrap=True)
+
+
+class _ProgressLine:
+    """Stage, iteration, cost and time: live on a terminal, else a line for each."""
+
+    def __init__(self, *, quiet: bool) -> None:
+        self._quiet = quiet
+        self._start = perf_counter()
+        self._console = _stderr()
+        self._live = Progress(
+            SpinnerColumn(),
+            TextColumn("{task.description}", markup=False),
+            TimeElapsedColumn(),
+            console=self._console,
+            transient=True,
+            disable=quiet or not self._console.is_terminal,
+        )
+        self._task = self._live.add_task("")
+
+    def __enter__(self) -> _ProgressLine:
+        self._live.start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self._live.stop()
+
+    def __call__(self, stage: str, iteration: int = 0, cost: float | None = None) -> None:
+        text = stage
+        if iteration:
+            text += f", iteration {iteration}"
+        if cost is not None:
+            text += f", cost {cost:.6g}"
+        if self._console.is_terminal:
+            self._live.update(self._task, description=text)
+        elif not self._quiet:
+            elapsed = perf_counter() - self._start
+            self._console.print(f"{elapsed:7.1f} s  {text}", markup=False, soft_wrap=True)
+
+
+def _print_solution(trial: Trial, solution: Solution) -> None:
+    from factorgraph_dvl.analysis.consistency import calibration_errors
+    from factorgraph_dvl.report.tables import calibration_table
+
+    truth = trial.calibration_truth
+    errors = calibration_errors(solution, truth) if truth else None
+    _stdout().print(calibration_table(solution, errors))
+    for warning in solution.warnings:
+        _warn(warning)
+
+
+def _print_notes(trial: Trial) -> None:
+    for note in trial.notes:
+        _stderr().print(Text(f"note: {note}", "cyan"), soft_wrap=True)
+
+
+def _warn(message: str) -> None:
+    _stderr().print(Text(f"warning: {message}", "yellow"), soft_wrap=True)
+
+
+def _stdout() -> Console:
+    return Console(width=None if sys.stdout.isatty() else _PIPE_WIDTH)
+
+
+def _stderr() -> Console:
+    return Console(stderr=True)
+
+
+if __name__ == "__main__":
+    main()
