@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import pymap3d
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from scipy.special import factorial
 
@@ -165,7 +166,8 @@ def _dvl_velocity(scenario: Scenario, state: State) -> Array:
 def displaced(geodetic: Array, enu: Array) -> Array:
     """Return geodetic coordinates (M, 3) moved by local east, north, up (M, 3), m."""
     moved = pymap3d.enu2geodetic(*enu.T, *geodetic.T, deg=False)
-    return np.stack([np.asarray(x, dtype=float) for x in moved], axis=1)
+    # pymap3d drops the dimension of a single latitude, and only of that.
+    return np.stack([np.reshape(x, -1).astype(float) for x in moved], axis=1)
 
 
 def _apply(matrices: Array, vectors: Array) -> Array:
@@ -187,7 +189,7 @@ def _times(
     return np.asarray(np.clip(time + shift, 0.0, duration))
 
 
-def _within(time: Array, intervals: Sequence[Interval]) -> Array:
+def _within(time: Array, intervals: Sequence[Interval]) -> NDArray[np.bool_]:
     out = np.zeros(time.size, dtype=bool)
     for start, end in intervals:
         out |= (time >= start) & (time <= end)

@@ -137,7 +137,8 @@ class Motion:
 
     def height_at(self, t: Array) -> Array:
         """Return the ellipsoidal height, (M,), m."""
-        return self.height + self.current_n[2] * t + self.heave.derivatives(t)[0]
+        drift = float(self.current_n[2]) * t
+        return self.height + drift + self.heave.derivatives(t)[0]
 
     def at(self, t: Array) -> State:
         """Return the motion at times (M,).
