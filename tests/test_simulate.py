@@ -115,11 +115,12 @@ def test_rates_and_forces_drive_a_tangent_frame_integration_along_the_truth(body
         inside = (begin, np.nextafter(end, begin))
         y = solve_ivp(derivative, (begin, end), y, "DOP853", rtol=1e-10, atol=1e-11).y[:, -1]
     error = y - tangent_states(motion, frame, motion.kinks[-1:])[0]
-    assert np.max(np.abs(error[:9])) < 1e-9
-    assert np.max(np.abs(error[9:12])) < 1e-6
-    assert np.max(np.abs(error[12:])) < 1e-7
+    assert np.max(np.abs(error[:9])) < 1e-10
+    assert np.max(np.abs(error[9:12])) < 1e-7
+    assert np.max(np.abs(error[12:])) < 1e-8
 
 
+@pytest.mark.filterwarnings("ignore:The copy keyword")
 @pytest.mark.parametrize("body_axes", ["RFU", "FRD", "FLU"])
 def test_pyins_integrates_the_mean_samples_back_to_the_truth(body_axes):
     legs = [
@@ -152,16 +153,18 @@ def test_pyins_integrates_the_mean_samples_back_to_the_truth(body_axes):
         index=["lat", "lon", "alt", "VN", "VE", "VD", "roll", "pitch", "heading"],
     )
     increments = strapdown.compute_increments_from_imu(imu, "increment")
+    # Its increments lack the second-order rotation, g · theta² / 6: 2e-7 m/s² in this swell.
+    theta, dv = (increments[[f"{name}_{x}" for x in "xyz"]].to_numpy() for name in ("theta", "dv"))
+    increments[["dv_x", "dv_y", "dv_z"]] += np.cross(theta, np.cross(theta, dv)) / 6.0
     found = strapdown.Integrator(start).integrate(increments)
     lat, lon, height = reference.geodetic[1:].T
-    position = [found.lat * DEG - lat, found.lon * DEG - lon, (found.alt - height) / 6.4e6]
+    position = np.transpose([found.lat * DEG - lat, found.lon * DEG - lon, found.alt - height])
+    position *= [6.4e6, 6.4e6, 1]
     velocity = found[["VE", "VN", "VD"]].to_numpy() * [1, 1, -1] - reference.velocity[1:]
     attitude = found[["roll", "pitch", "heading"]].to_numpy() - reference.rph[1:] / DEG
-    print(np.max(np.abs(position), axis=1) * 6.4e6, np.max(np.abs(velocity), axis=0))
-    print(np.max(np.abs((attitude + 180) % 360 - 180), axis=0))
-    assert np.max(np.abs(position)) * 6.4e6 < 2e-3
-    assert np.max(np.abs(velocity)) < 1e-4
-    assert np.max(np.abs((attitude + 180) % 360 - 180)) < 5e-6
+    assert np.max(np.abs(position)) < 1e-3
+    assert np.max(np.abs(velocity)) < 1e-5
+    assert np.max(np.abs((attitude + 180) % 360 - 180)) < 5e-8
 
 
 def test_mean_samples_average_exactly_across_kinks():
@@ -407,21 +410,21 @@ def test_gaps_and_outages_leave_the_rest_alone():
 
 
 def test_jittered_samples_average_their_own_interval():
-    sway = {"roll": [{"amplitude_deg": 4, "frequency_hz": 2}]}
-    even, odd = run(sway=sway), run(sway=sway, imu={"jitter_s": 0.004}, gnss={"jitter_s": 0.05})
-    steps = np.diff(odd.imu.time)
+    changes = {
+        "sway": {"roll": [{"amplitude_deg": 4, "frequency_hz": 2}]},
+        "manoeuvres": [{"straight_s": 10}],
+    }
+    trial = run(imu={"jitter_s": 0.004}, gnss={"jitter_s": 0.05}, **changes)
+    steps = np.diff(trial.imu.time)
     assert np.all(steps > 0)
-    assert 0.0015 < np.std(steps) < 0.005
-    assert np.all(np.diff(odd.gnss.time) > 0)
-    start = odd.imu.time[0]
-    i = int(np.argmin(np.abs(even.imu.time - start)))
-    motion = motion_of(sway=sway)
-    state = motion.at(odd.imu.time)
-    # Roll is the integral of its rate whatever the intervals are: heading is steady here.
-    part = odd.imu.time < 4.5
-    roll = state.rph[0, 0] + np.cumsum((odd.imu.gyro[1:, 1] - RATE * 0.70) * steps)
-    assert np.max(np.abs(roll - state.rph[1:, 0])[part[1:]]) < 1e-4
-    assert abs(even.imu.time[i] - start) <= 0.005
+    # Both ends of an interval shift by a uniform +-4 ms.
+    assert np.std(steps) == pytest.approx(0.004 * np.sqrt(2 / 3), rel=0.1)
+    assert np.all(np.diff(trial.gnss.time) > 0)
+    # Whatever the intervals are, the samples add up to the angle; the Earth turns with it.
+    earth_ahead = RATE * np.cos(36 * DEG) * np.cos(30 * DEG)
+    roll = motion_of(**changes).at(trial.imu.time).rph[:, 0]
+    turned = np.cumsum((trial.imu.gyro[1:, 1] - earth_ahead) * steps)
+    np.testing.assert_allclose(roll[0] + turned, roll[1:], rtol=0, atol=1e-12)
 
 
 def test_the_seed_determines_everything():
