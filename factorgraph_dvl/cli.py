@@ -142,7 +142,6 @@ def solve(
     with _ProgressLine(quiet=quiet) as progress:
         progress("load", 0, None)
         trial = load_trial(trial_path)
-        _print_notes(trial)
         # The solver takes longest to load: after what is most often wrong.
         from factorgraph_dvl.solve.batch import solve as run
 
@@ -182,7 +181,8 @@ def inspect(trial_path: TrialPath) -> None:
     console = _stdout()
     console.print(sensor_table(result))
     console.print(motion_line(result), markup=False, soft_wrap=True)
-    _print_notes(trial)
+    for note in trial.notes:
+        _warn(note)
     for line in finding_lines(result):
         console.print(line, soft_wrap=True)
 
@@ -238,11 +238,6 @@ def _print_solution(trial: Trial, solution: Solution) -> None:
     _stdout().print(calibration_table(solution, errors))
     for warning in solution.warnings:
         _warn(warning)
-
-
-def _print_notes(trial: Trial) -> None:
-    for note in trial.notes:
-        _stderr().print(Text(f"note: {note}", "cyan"), soft_wrap=True)
 
 
 def _warn(message: str) -> None:

@@ -328,7 +328,7 @@ def _gyro_findings(imu: Imu) -> Iterator[Finding]:
     losses = {text: 1.0 - _force_steadiness(imu, factor) for text, factor in candidates.items()}
     best = min(losses, key=lambda text: losses[text])
     # Turned by a right gyro, the force keeps the direction of gravity.
-    if 1.0 - steady > 0.003 and 1.0 - steady > 4.0 * losses[best]:
+    if 1.0 - steady > 0.001 and 1.0 - steady > 4.0 * losses[best]:
         yield Finding(
             "error",
             "IMU",
