@@ -2,13 +2,17 @@
 
 Angular rate and specific force are rebuilt between the samples as polynomials through
 the neighbouring samples on both sides. That is better than the usual compensation by
-the sample before: all samples are there when a trial is processed.
+the sample before: all samples are there when a trial is processed. Where the rate steps,
+as at the start of an abrupt turn, a polynomial across the step would ring; there the
+neighbours are taken from the smoother side (the idea of essentially non-oscillatory
+schemes: Harten, Engquist, Osher, Chakravarthy, J. Comput. Phys. 71 (1987)).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from math import comb
 
 import numpy as np
 
@@ -26,6 +30,10 @@ _LOST = 1.5
 _REGULAR = 0.1
 _UNIFORM = 1e-3
 _CHUNK = 50_000
+# How much rougher than the noise of the gyro a motion must be to look for a step in it,
+# and how much smoother the stencil on one side.
+_ROUGH = 6.0
+_SMOOTHER = 0.3
 _GAUSS_NODES = np.array([0.5 - np.sqrt(15.0) / 10.0, 0.5, 0.5 + np.sqrt(15.0) / 10.0])
 _GAUSS_WEIGHTS = np.array([5.0, 8.0, 5.0]) / 18.0
 
@@ -63,7 +71,8 @@ class Increments:
         over the intervals, or the values at their ends.
     first_sample : (A,) index in `samples` of each arc's first.
     averaged : whether `samples` are means over the intervals.
-    filled_sigma : (N, 6) standard deviation of interpolated samples, 0 for real ones.
+    open_sigma : (N, 6) standard deviation of the mean rate and force over an interval where
+        the samples leave it open: lost ones, or a step between two of them; else 0.
     gyro_sigma : standard deviation of one gyro sample from its noise, rad/s.
     """
 
@@ -73,7 +82,7 @@ class Increments:
     samples: Array
     first_sample: IntArray
     averaged: bool
-    filled_sigma: Array
+    open_sigma: Array
     gyro_sigma: float
 
     @cached_property
@@ -111,10 +120,10 @@ class Increments:
         signal = _evaluate(c, u)
         order = np.arange(1, c.shape[1])
         slope = _evaluate(c[:, 1:] * order[:, None], u) / dt[:, None]
-        # The fourth difference of the rate: what a smooth motion has almost none of, and
-        # a step or a vibration much, less its expectation for the noise of the gyro.
-        fourth = np.abs(24.0 * c[:, 4, :3])
-        excess = np.sqrt(np.maximum(fourth**2 - 70.0 * self.gyro_sigma**2, 0.0))
+        # A step or a vibration leaves high differences, a smooth motion almost none; the
+        # part that the gyro's noise accounts for is in its own standard deviation already.
+        rough = np.abs(self._differences[self._centred_sample(index)])
+        excess = np.sqrt(np.maximum(rough**2 - self._difference_sigma**2, 0.0))
         return Partial(
             phi=phi,
             dv=dv,
@@ -124,14 +133,62 @@ class Increments:
             unresolved=excess / 4.0,
         )
 
+    @property
+    def _width(self) -> int:
+        """Number of samples that a polynomial passes through."""
+        return 5 if self.averaged else 6
+
+    @cached_property
+    def _differences(self) -> Array:
+        """Highest difference of the rate over the stencil from each sample on, (S, 3)."""
+        out = np.full((self.samples.shape[0], 3), np.inf)
+        highest = np.diff(self.samples[:, :3], n=self._width - 1, axis=0)
+        out[: highest.shape[0]] = highest
+        return out
+
+    @cached_property
+    def _roughness(self) -> Array:
+        """Size of `_differences`, (S,), rad/s."""
+        return np.asarray(np.linalg.norm(self._differences, axis=1))
+
+    @property
+    def _difference_sigma(self) -> float:
+        """Standard deviation of `_differences` from the noise of the gyro, rad/s."""
+        return self.gyro_sigma * float(np.sqrt(comb(2 * self._width - 2, self._width - 1)))
+
+    def _centred_sample(self, index: IntArray) -> IntArray:
+        """Return the first sample of the centred stencil of intervals `index`."""
+        arc = self.arc_of[index]
+        first, last = self.arcs[arc, 0], self.arcs[arc, 1]
+        count = last - first + (0 if self.averaged else 1)
+        return self.first_sample[arc] + np.clip(index - first - 2, 0, count - self._width)
+
+    def _stencil(self, inside: IntArray, most: IntArray, base: IntArray) -> IntArray:
+        """Return the first sample, within the arc, of the stencils of intervals `inside` it.
+
+        Centred, unless the rate is rougher there than noise explains: then the smoothest
+        stencil that still holds the interval.
+        """
+        stencil = np.clip(inside - 2, 0, most)
+        roughness = self._roughness[base + stencil]
+        rough = np.flatnonzero(roughness > _ROUGH * self._difference_sigma)
+        if rough.size:
+            back = np.arange(self._width if self.averaged else self._width - 1)
+            options = np.clip(inside[rough, None] - back, 0, most[rough, None])
+            scores = self._roughness[base[rough, None] + options]
+            best = np.argmin(scores, axis=1)
+            smoother = scores.min(axis=1) < _SMOOTHER * roughness[rough]
+            chosen = np.take_along_axis(options, best[:, None], axis=1)[:, 0]
+            stencil[rough[smoother]] = chosen[smoother]
+        return stencil
+
     def _polynomials(self, index: IntArray) -> Array:
         """Return coefficients (M, K, 6) of rate and force in powers of (t - start) / dt."""
         arc = self.arc_of[index]
         first, last = self.arcs[arc, 0], self.arcs[arc, 1]
-        width = 5 if self.averaged else 6
+        width = self._width
         count = last - first + (0 if self.averaged else 1)
-        back = 2
-        stencil = np.clip(index - first - back, 0, count - width)
+        stencil = self._stencil(index - first, count - width, self.first_sample[arc])
         offset = index - first - stencil
         rows = (self.first_sample[arc] + stencil)[:, None] + np.arange(width)
         values = self.samples[rows]
@@ -223,19 +280,50 @@ def increments(imu: Imu) -> tuple[Increments, tuple[str, ...]]:
             f"{imu.source}: gap of {start[c] - end:.3f} s at {end:.3f} s: the inertial chain "
             "breaks there"
         )
-    return (
-        Increments(
-            start=start,
-            dt=length,
-            arcs=np.array(arcs),
-            samples=np.concatenate(kept),
-            first_sample=np.array(first_sample),
-            averaged=averaged,
-            filled_sigma=np.concatenate(fill),
-            gyro_sigma=imu.settings.gyro_noise_root_psd / np.sqrt(dt),
-        ),
-        tuple(notes),
+    out = Increments(
+        start=start,
+        dt=length,
+        arcs=np.array(arcs),
+        samples=np.concatenate(kept),
+        first_sample=np.array(first_sample),
+        averaged=averaged,
+        open_sigma=np.concatenate(fill),
+        gyro_sigma=imu.settings.gyro_noise_root_psd / np.sqrt(dt),
     )
+    if not averaged:
+        accel_sigma = imu.settings.accel_noise_root_psd / np.sqrt(dt)
+        noise = np.repeat([out.gyro_sigma, accel_sigma], 3)
+        np.hypot(out.open_sigma, _steps(out, noise), out=out.open_sigma)
+    return out, tuple(notes)
+
+
+def _steps(inc: Increments, noise: Array) -> Array:
+    """Return the standard deviation of means, (N, 6), over intervals in which a signal steps.
+
+    Two instantaneous samples do not tell when between them a signal stepped from the one
+    value to the other: the mean is uniform between the two. A step shows as an interval
+    that is rough in every stencil that holds it, while the stencils beside it are smooth.
+
+    Parameters
+    ----------
+    inc : Increments of instantaneous samples.
+    noise : (6,) standard deviation of the samples.
+    """
+    width = 6
+    highest = np.abs(np.diff(inc.samples, n=width - 1, axis=0))
+    sigma = noise * np.sqrt(comb(2 * width - 2, width - 1))
+    out = np.zeros((inc.start.size, 6))
+    for (a, b), base in zip(inc.arcs, inc.first_sample, strict=True):
+        n = b - a
+        rough = highest[base : base + n + 2 - width]
+        inside = np.arange(width - 1, n - width + 1)
+        if inside.size == 0:
+            continue
+        holding = np.min([rough[inside - k] for k in range(width - 1)], axis=0)
+        beside = np.maximum(rough[inside - width + 1], rough[inside + 1])
+        step = (holding > _ROUGH * sigma) & (_SMOOTHER * holding > beside)
+        out[a + inside] = np.where(step, holding / np.sqrt(12.0), 0.0)
+    return out
 
 
 def _fill(

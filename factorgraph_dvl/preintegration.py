@@ -162,7 +162,7 @@ def preintegrate(
     gyro_psd = settings.gyro_noise_root_psd**2 * np.eye(3)
     accel_psd = settings.accel_noise_root_psd**2 * np.eye(3)
     integration_psd = _INTEGRATION_ROOT_PSD**2 * np.eye(3)
-    filled = inc.filled_sigma.any(axis=1)
+    open_ = inc.open_sigma.any(axis=1)
     out = []
     for s in range(seg.first.size):
         a, b = int(seg.first[s]), int(seg.last[s])
@@ -170,8 +170,8 @@ def preintegrate(
         params.setOmegaCoriolis(earth_rate_n)
         params.setIntegrationCovariance(integration_psd)
         extra_gyro, extra_accel = 0.0, 0.0
-        if filled[a:b].any():
-            extra = (inc.filled_sigma[a:b] * inc.dt[a:b, None]) ** 2
+        if open_[a:b].any():
+            extra = (inc.open_sigma[a:b] * inc.dt[a:b, None]) ** 2
             extra_gyro = extra[:, :3].sum() / seg.duration[s]
             extra_accel = extra[:, 3:].sum() / seg.duration[s]
         params.setGyroscopeCovariance(gyro_psd + extra_gyro * np.eye(3))
