@@ -20,9 +20,9 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from factorgraph_dvl.io.solution_folder import load_solution, save_solution
     from factorgraph_dvl.io.trial_folder import load_trial, save_trial
-    from factorgraph_dvl.simulate import simulate
+    from factorgraph_dvl.simulation import simulate
     from factorgraph_dvl.solution import Solution
-    from factorgraph_dvl.solve.batch import solve
+    from factorgraph_dvl.solvers.batch import solve
     from factorgraph_dvl.trial import Trial
 
 __version__ = version("factorgraph-dvl")
@@ -34,8 +34,8 @@ _PUBLIC = {
     "load_trial": "factorgraph_dvl.io.trial_folder",
     "save_solution": "factorgraph_dvl.io.solution_folder",
     "save_trial": "factorgraph_dvl.io.trial_folder",
-    "simulate": "factorgraph_dvl.simulate",
-    "solve": "factorgraph_dvl.solve.batch",
+    "simulate": "factorgraph_dvl.simulation",
+    "solve": "factorgraph_dvl.solvers.batch",
 }
 
 __all__ = [

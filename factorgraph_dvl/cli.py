@@ -109,7 +109,7 @@ def simulate(
     """Simulate a trial with known truth."""
     from factorgraph_dvl.io.folders import check_output
     from factorgraph_dvl.io.trial_folder import save_trial
-    from factorgraph_dvl.simulate import simulate as run
+    from factorgraph_dvl.simulation import simulate as run
 
     check_output(out, force=force)
     start = perf_counter()
@@ -143,7 +143,7 @@ def solve(
         progress("load", 0, None)
         trial = load_trial(trial_path)
         # The solver takes longest to load: after what is most often wrong.
-        from factorgraph_dvl.solve.batch import solve as run
+        from factorgraph_dvl.solvers.batch import solve as run
 
         solution = run(trial, rate_hz=rate, progress=progress)
         progress("write", 0, None)

@@ -91,7 +91,9 @@ class LocalFrame:
         lat, lon, height = pymap3d.enu2geodetic(
             p_n[..., 0], p_n[..., 1], p_n[..., 2], self.lat, self.lon, self.height, deg=False
         )
-        return np.asarray(lat), np.asarray(lon), np.asarray(height)
+        # A single position comes back with mixed shapes.
+        shape = p_n.shape[:-1]
+        return tuple(np.reshape(x, shape) for x in (lat, lon, height))  # type: ignore[return-value]
 
     def level_from_tangent(self, lat: ArrayLike, lon: ArrayLike) -> Array:
         """Return the (..., 3, 3) rotation from n to the local-level ENU at lat, lon (rad)."""

@@ -41,8 +41,6 @@ _FREE_VELOCITY = 1e2
 _HELD = 1e-9
 # Keeps the walk of a bias that does not walk regular.
 _LEAST_WALK = 1e-12
-# Times closer than this are the same for the motion between them.
-_SAME_TIME = 1e-7
 
 _STATE = 9
 _BIAS = 6
@@ -354,7 +352,7 @@ class Problem:
     def _follow(self, bound: _Bound, parameters: dict[str, Array]) -> None:
         """Move a bound observation along when a time offset has changed."""
         time = bound.observation.true_time(parameters)
-        if np.array_equal(time, bound.time) or abs(time[0] - bound.time[0]) < _SAME_TIME:
+        if np.array_equal(time, bound.time):
             return
         bound.time = time
         bound.attachment = self._attach(time)

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from math import comb
+from math import comb, factorial
 
 import numpy as np
 
@@ -117,9 +117,7 @@ class Increments:
         dt = self.dt[index]
         u = since / dt
         phi, dv = _integrate(c, dt, u)
-        signal = _evaluate(c, u)
-        order = np.arange(1, c.shape[1])
-        slope = _evaluate(c[:, 1:] * order[:, None], u) / dt[:, None]
+        omega, alpha = self._blended_rate(index, since, c)
         # A step or a vibration leaves high differences, a smooth motion almost none; the
         # part that the gyro's noise accounts for is in its own standard deviation already.
         rough = np.abs(self._differences[self._centred_sample(index)])
@@ -127,10 +125,33 @@ class Increments:
         return Partial(
             phi=phi,
             dv=dv,
-            omega=signal[:, :3],
-            alpha=slope[:, :3],
-            force=signal[:, 3:],
+            omega=omega,
+            alpha=alpha,
+            force=_evaluate(c, u)[:, 3:],
             unresolved=excess / 4.0,
+        )
+
+    def _blended_rate(self, index: IntArray, since: Array, c: Array) -> tuple[Array, Array]:
+        """Return rate and derivative, (M, 3), continuous from interval to interval.
+
+        Towards an end of its interval the polynomial gives way to the neighbour's, half and
+        half at the end itself. In smooth motion the two agree; at a step they do not, and a
+        time offset can only be found where the prediction does not jump.
+        """
+        u = since / self.dt[index]
+        near = np.where(u < 0.5, index - 1, index + 1)
+        near = np.clip(near, 0, self.dt.size - 1)
+        near = np.where(self.arc_of[near] == self.arc_of[index], near, index)
+        gap = np.where(near < index, self.dt[near], -self.dt[index])
+        gap = np.where(near == index, 0.0, gap)
+        own, own_slope = _rate_and_slope(c, since, self.dt[index])
+        other, other_slope = _rate_and_slope(self._polynomials(near), since + gap, self.dt[near])
+        inward = np.where(u < 0.5, 1.0, -1.0)
+        weight = np.clip(0.5 + np.where(u < 0.5, u, 1.0 - u), 0.0, 1.0)[:, None]
+        moving = ((weight > 0.0) & (weight < 1.0)) * (inward / self.dt[index])[:, None]
+        return (
+            weight * own + (1.0 - weight) * other,
+            weight * own_slope + (1.0 - weight) * other_slope + moving * (own - other),
         )
 
     @property
@@ -142,8 +163,13 @@ class Increments:
     def _differences(self) -> Array:
         """Highest difference of the rate over the stencil from each sample on, (S, 3)."""
         out = np.full((self.samples.shape[0], 3), np.inf)
-        highest = np.diff(self.samples[:, :3], n=self._width - 1, axis=0)
-        out[: highest.shape[0]] = highest
+        for (a, b), base in zip(self.arcs, self.first_sample, strict=True):
+            edges = np.append(self.start[a:b], self.end[b - 1])
+            count = b - a + (0 if self.averaged else 1)
+            highest = _highest_difference(
+                self.samples[base : base + count, :3], edges, self._width, self.averaged
+            )
+            out[base : base + highest.shape[0]] = highest
         return out
 
     @cached_property
@@ -310,12 +336,12 @@ def _steps(inc: Increments, noise: Array) -> Array:
     noise : (6,) standard deviation of the samples.
     """
     width = 6
-    highest = np.abs(np.diff(inc.samples, n=width - 1, axis=0))
     sigma = noise * np.sqrt(comb(2 * width - 2, width - 1))
     out = np.zeros((inc.start.size, 6))
     for (a, b), base in zip(inc.arcs, inc.first_sample, strict=True):
         n = b - a
-        rough = highest[base : base + n + 2 - width]
+        edges = np.append(inc.start[a:b], inc.end[b - 1])
+        rough = np.abs(_highest_difference(inc.samples[base : base + n + 1], edges, width, False))
         inside = np.arange(width - 1, n - width + 1)
         if inside.size == 0:
             continue
@@ -355,6 +381,21 @@ def _fill(
     )
 
 
+def _highest_difference(values: Array, edges: Array, width: int, averaged: bool) -> Array:
+    """Return differences of order width - 1 of means over intervals or values at their ends.
+
+    As they would be at regular intervals: by divided differences, that of the integral
+    for means.
+    """
+    reach = 1 if averaged else 0
+    out = values
+    for order in range(1, width):
+        span = edges[order + reach :] - edges[: -order - reach]
+        out = np.diff(out, axis=0) / span[:, None]
+    factor = factorial(width) if averaged else factorial(width - 1)
+    return np.asarray(out * factor * float(np.median(np.diff(edges))) ** (width - 1))
+
+
 def _interpolation(edges: Array, averaged: bool) -> Array:
     """Return (B, K, K) matrices from samples to polynomial coefficients.
 
@@ -380,6 +421,14 @@ def _evaluate(c: Array, u: Array | float) -> Array:
         out *= u
         out += c[:, k]
     return out
+
+
+def _rate_and_slope(c: Array, since: Array, dt: Array) -> tuple[Array, Array]:
+    """Return the rate and its derivative, (M, 3), `since` seconds into intervals."""
+    u = since / dt
+    rate = c[:, :, :3]
+    order = np.arange(1, c.shape[1])
+    return _evaluate(rate, u), _evaluate(rate[:, 1:] * order[:, None], u) / dt[:, None]
 
 
 def _integrate(c: Array, dt: Array, u: Array | float) -> tuple[Array, Array]:

@@ -12,7 +12,7 @@ import pytest
 from builders import build_solution, build_trial, edit, write_trial
 
 import factorgraph_dvl.report.figures
-import factorgraph_dvl.solve.batch
+import factorgraph_dvl.solvers.batch
 from factorgraph_dvl.cli import main
 from factorgraph_dvl.errors import SolveError
 from factorgraph_dvl.io.solution_folder import load_solution
@@ -61,7 +61,7 @@ def stub(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
         folder.mkdir()
         (folder / "track.png").write_text("png")
 
-    monkeypatch.setattr(factorgraph_dvl.solve.batch, "solve", solve)
+    monkeypatch.setattr(factorgraph_dvl.solvers.batch, "solve", solve)
     monkeypatch.setattr(factorgraph_dvl.report.figures, "write_figures", write_figures)
     return state
 
@@ -247,7 +247,7 @@ def test_simulate_writes_a_trial(
 ) -> None:
     import importlib
 
-    module = importlib.import_module("factorgraph_dvl.simulate")
+    module = importlib.import_module("factorgraph_dvl.simulation")
     seeds = []
 
     def simulate(scenario: Path, seed: int) -> Trial:

@@ -13,7 +13,7 @@ import yaml
 from pyins import strapdown
 from scipy.integrate import quad, solve_ivp
 
-import factorgraph_dvl.simulate as package
+import factorgraph_dvl.simulation as package
 from factorgraph_dvl.conventions import (
     DEG,
     DEG_PER_HOUR,
@@ -26,7 +26,7 @@ from factorgraph_dvl.conventions import (
 )
 from factorgraph_dvl.earth import RATE, LocalFrame, enu_from_ecef, normal_gravity, radii
 from factorgraph_dvl.errors import ConfigError
-from factorgraph_dvl.simulate import load_scenario, parse_scenario, plan_motion, simulate
+from factorgraph_dvl.simulation import load_scenario, parse_scenario, plan_motion, simulate
 
 CONFIGS = Path(__file__).parent.parent / "configs"
 SWELL = {
@@ -667,7 +667,6 @@ def test_the_simulator_shares_no_measurement_model_with_the_estimator():
         "earth": None,
         "errors": None,
         "trial": None,
-        "io.trial_yaml": {"DvlSection"},
         "sensors.imu": {"Imu", "ImuSettings"},
         "sensors.gnss": {"Gnss", "GnssSettings"},
         "sensors.dvl": {"Dvl", "DvlSettings"},

@@ -14,7 +14,6 @@ from factorgraph_dvl.io.folders import new_folder
 from factorgraph_dvl.io.motion_table import GEODETIC_SI, motion_columns, read_reference
 from factorgraph_dvl.io.tables import read_table, stack, write_table
 from factorgraph_dvl.io.trial_yaml import (
-    DvlSection,
     InitialSettings,
     PositionSettings,
     ReferenceSettings,
@@ -74,7 +73,7 @@ def load_trial(path: Path | str) -> Trial:
         name=settings.name or folder.resolve().name,
         imu=_read_imu(folder, settings.imu),
         gnss=None if settings.gnss is UNSET else _read_gnss(folder, settings.gnss),
-        dvl=None if settings.dvl is UNSET else _read_dvl(folder, settings.dvl.settings()),
+        dvl=None if settings.dvl is UNSET else _read_dvl(folder, settings.dvl),
         body_axes=settings.body_axes,
         epoch=settings.epoch,
         initial_attitude=None if initial is UNSET else _attitude(initial),
@@ -222,16 +221,12 @@ def _settings(trial: Trial, suffix: str) -> TrialSettings:
         epoch=trial.epoch,
         imu=replace(trial.imu.settings, file=f"imu{suffix}"),
         gnss=UNSET if trial.gnss is None else replace(trial.gnss.settings, file=f"gnss{suffix}"),
-        dvl=UNSET if trial.dvl is None else _dvl_section(trial.dvl.settings, f"dvl{suffix}"),
+        dvl=UNSET if trial.dvl is None else replace(trial.dvl.settings, file=f"dvl{suffix}"),
         initial=_initial(trial),
         reference=(
             UNSET if trial.reference is None else ReferenceSettings(file=f"reference{suffix}")
         ),
     )
-
-
-def _dvl_section(settings: DvlSettings, file: str) -> DvlSection:
-    return DvlSection(**{**msgspec.structs.asdict(settings), "file": file})
 
 
 def _initial(trial: Trial) -> InitialSettings | msgspec.UnsetType:

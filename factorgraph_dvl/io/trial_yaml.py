@@ -51,23 +51,6 @@ class ReferenceSettings(Section, frozen=True, kw_only=True):
     file: str = "reference.csv"
 
 
-class DvlSection(DvlSettings, frozen=True, kw_only=True):
-    """Section `dvl` of trial.yaml, as it is parsed."""
-
-    # msgspec (0.22 at least) corrupts memory where a union holds a constrained number
-    # and a tuple of fixed length, so the number is checked here.
-    scale_error_std: float | Sigma3 = 0.1
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if isinstance(self.scale_error_std, float) and self.scale_error_std < 0:
-            raise ValueError("`scale_error_std` must be 0 or above")
-
-    def settings(self) -> DvlSettings:
-        """Return the settings of the sensor."""
-        return DvlSettings(**msgspec.structs.asdict(self))
-
-
 class TrialSettings(Section, frozen=True, kw_only=True):
     """The whole of trial.yaml; sections that are absent are unset."""
 
@@ -77,7 +60,7 @@ class TrialSettings(Section, frozen=True, kw_only=True):
     epoch: str = ""
     imu: ImuSettings
     gnss: GnssSettings | UnsetType = UNSET
-    dvl: DvlSection | UnsetType = UNSET
+    dvl: DvlSettings | UnsetType = UNSET
     depth: dict[str, Any] | UnsetType = UNSET
     star: dict[str, Any] | UnsetType = UNSET
     dvl_beams: dict[str, Any] | UnsetType = UNSET

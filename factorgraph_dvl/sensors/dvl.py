@@ -49,7 +49,9 @@ class DvlSettings(Section, frozen=True, kw_only=True):
     misalignment_deg: Vector3 = (0.0, 0.0, 0.0)
     misalignment_std_deg: Sigma3 = (180.0, 180.0, 180.0)
     scale_error: float | Vector3 = 0.0
-    scale_error_std: NonNegative | Sigma3 = 0.1
+    # msgspec (0.22 at least) corrupts memory where a union holds a constrained number and
+    # a tuple of fixed length, so the number is checked below.
+    scale_error_std: float | Sigma3 = 0.1
     lever_arm_m: Vector3 = (0.0, 0.0, 0.0)
     lever_arm_std_m: Sigma3 = (10.0, 10.0, 10.0)
     bias_std_m_s: Sigma3 = (0.0, 0.0, 0.0)
@@ -63,6 +65,8 @@ class DvlSettings(Section, frozen=True, kw_only=True):
         scales = np.atleast_1d(self.scale_error)
         if np.any(scales <= -1.0):
             raise ValueError("`scale_error` must be above -1")
+        if np.any(np.atleast_1d(self.scale_error_std) < 0.0):
+            raise ValueError("`scale_error_std` must be 0 or above")
 
 
 @dataclass(frozen=True)

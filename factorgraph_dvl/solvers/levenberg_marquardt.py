@@ -21,6 +21,8 @@ CONVERGED = 1e-5
 _TRUSTED_STATE = np.repeat([0.05, 5.0, 0.5], 3)
 _FIRST_DAMPING = 1.0
 _MAX_DAMPING = 1e12
+# Relative error of a cost that sums up 1e5 squares.
+_ROUNDING = 1e-12
 
 
 @dataclass(frozen=True)
@@ -95,8 +97,9 @@ def minimise(
         promised = evaluation.cost - gaussian.error(delta)
         trial = problem.evaluate(evaluation.values.retract(delta))
         small = promised < tolerance
-        if np.isfinite(trial.cost) and (trial.cost <= evaluation.cost or small):
-            if trial.cost <= evaluation.cost:
+        lower = trial.cost <= evaluation.cost * (1.0 + _ROUNDING)
+        if np.isfinite(trial.cost) and (lower or small):
+            if lower:
                 evaluation = trial
             if damping == 0.0 and small:
                 converged = True

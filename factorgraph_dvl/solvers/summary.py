@@ -21,8 +21,8 @@ from factorgraph_dvl.graph import Problem
 from factorgraph_dvl.preintegration import States, attach, motion_at, segment_ends
 from factorgraph_dvl.sensors.protocol import Motion, Parameter
 from factorgraph_dvl.solution import Estimate, Residuals, Solution, Trajectory
-from factorgraph_dvl.solve.covariance import SquareRootInformation
-from factorgraph_dvl.solve.levenberg_marquardt import Minimum, eliminate
+from factorgraph_dvl.solvers.covariance import SquareRootInformation
+from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, eliminate
 
 # The data observed a component if they at least halved what was unknown of it.
 _OBSERVABLE = 0.5
@@ -177,9 +177,7 @@ def _output_times(problem: Problem, rate_hz: float) -> Array:
     first, last = inc.start[0], inc.end[-1]
     time = np.arange(np.ceil(first * rate_hz - 1e-6), np.floor(last * rate_hz + 1e-6) + 1)
     time = time / rate_hz
-    index, since, covered = inc.locate(time)
-    time = np.where(covered, inc.start[index] + np.clip(since, 0.0, inc.dt[index]), time)
-    return np.asarray(time[covered])
+    return np.asarray(time[inc.locate(time)[2]])
 
 
 def _smoothed(problem: Problem, states: States, time: Array) -> tuple[Motion, Array, np.ndarray]:

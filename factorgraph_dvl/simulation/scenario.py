@@ -47,7 +47,6 @@ import yaml
 
 from factorgraph_dvl.conventions import BodyAxes
 from factorgraph_dvl.errors import ConfigError
-from factorgraph_dvl.io.trial_yaml import DvlSection
 from factorgraph_dvl.sensors.dvl import DvlSettings
 from factorgraph_dvl.sensors.gnss import GnssSettings
 from factorgraph_dvl.sensors.imu import ImuSettings
@@ -292,8 +291,7 @@ class Scenario(Section, frozen=True, kw_only=True):
             "velocity_std_fraction": self.dvl.velocity_std_fraction,
             "reference": self.dvl.reference,
         }
-        section = _convert(simulated | self.trial.dvl, DvlSection, "trial.dvl", self.source)
-        return section.settings()
+        return _convert(simulated | self.trial.dvl, DvlSettings, "trial.dvl", self.source)
 
 
 def load_scenario(path: str | PathLike[str]) -> Scenario:

@@ -16,8 +16,8 @@ from factorgraph_dvl.mounting import initial_mounting
 from factorgraph_dvl.preintegration import Segments, States, attach, motion_at, segments
 from factorgraph_dvl.sensors.protocol import Aid, Motion
 from factorgraph_dvl.solution import Solution
-from factorgraph_dvl.solve.levenberg_marquardt import Minimum, Progress, minimise
-from factorgraph_dvl.solve.summary import summarise
+from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, Progress, minimise
+from factorgraph_dvl.solvers.summary import summarise
 from factorgraph_dvl.trial import Trial
 
 # States this far apart, s, are as good as denser ones: every measurement hangs on the
@@ -60,8 +60,9 @@ def solve(
     SolveError
         If no minimum can be searched for at all.
     """
-    if rate_hz <= 0 or state_interval_s <= 0:
-        raise ConfigError("rate and state interval must be above 0")
+    for name, value in (("rate_hz", rate_hz), ("state_interval_s", state_interval_s)):
+        if not (np.isfinite(value) and value > 0.0):
+            raise ConfigError(f"{name} is {value}", expected="a number above 0")
     report = progress or (lambda stage, iteration, cost: None)
     frame = trial.frame()
     report("increments", 0, None)

@@ -23,8 +23,8 @@ from factorgraph_dvl.errors import ConfigError
 from factorgraph_dvl.sensors.dvl import Dvl
 from factorgraph_dvl.sensors.gnss import Gnss
 from factorgraph_dvl.sensors.imu import Imu
-from factorgraph_dvl.simulate.motion import Motion, State
-from factorgraph_dvl.simulate.scenario import Interval, Sampled, Scenario
+from factorgraph_dvl.simulation.motion import Motion, State
+from factorgraph_dvl.simulation.scenario import Interval, Sampled, Scenario
 
 _CHUNK = 32768
 

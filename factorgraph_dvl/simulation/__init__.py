@@ -12,10 +12,10 @@ from os import PathLike
 import numpy as np
 
 from factorgraph_dvl.conventions import DEG, Array
-from factorgraph_dvl.simulate.measurements import displaced, simulate_dvl, simulate_gnss
-from factorgraph_dvl.simulate.measurements import simulate_imu as _simulate_imu
-from factorgraph_dvl.simulate.motion import Motion, plan_motion
-from factorgraph_dvl.simulate.scenario import Scenario, load_scenario, parse_scenario
+from factorgraph_dvl.simulation.measurements import displaced, simulate_dvl, simulate_gnss
+from factorgraph_dvl.simulation.measurements import simulate_imu as _simulate_imu
+from factorgraph_dvl.simulation.motion import Motion, plan_motion
+from factorgraph_dvl.simulation.scenario import Scenario, load_scenario, parse_scenario
 from factorgraph_dvl.trial import InitialAttitude, InitialPosition, Reference, Trial
 
 __all__ = ["Scenario", "load_scenario", "parse_scenario", "plan_motion", "simulate"]
