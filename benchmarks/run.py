@@ -1,0 +1,331 @@
+"""Measure speed, memory and integration error; write benchmarks/results.md.
+
+    python benchmarks/run.py [--long]
+
+Figures that are compared with each other are measured in the same run, alternating, so
+that a busy machine does not favour either. `--long` adds a trial eight times as long,
+which takes some minutes and about a gigabyte of disk.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import platform
+import re
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from datetime import date
+from importlib.metadata import version
+from itertools import pairwise
+from pathlib import Path
+from statistics import median
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+import yaml
+
+from factorgraph_dvl import load_trial
+from factorgraph_dvl.alignment import initial_states
+from factorgraph_dvl.conventions import DEG_PER_HOUR, exp_so3, log_so3, rotation_from_rph
+from factorgraph_dvl.earth import RATE, enu_from_ecef
+from factorgraph_dvl.graph import Chain, Problem, inertial_chain
+from factorgraph_dvl.increments import increments
+from factorgraph_dvl.preintegration import States, segments
+from factorgraph_dvl.sensors.protocol import Aid
+from factorgraph_dvl.simulation import parse_scenario, plan_motion, simulate
+from factorgraph_dvl.solvers.batch import STATE_INTERVAL
+from factorgraph_dvl.solvers.levenberg_marquardt import eliminate, minimise
+from factorgraph_dvl.trial import Trial
+
+ROOT = Path(__file__).resolve().parent.parent
+RESULTS = ROOT / "benchmarks" / "results.md"
+SHIPPED = ROOT / "data" / "seed-a-phase-90"
+CRUISE = ROOT / "configs" / "cruise.yaml"
+CONING = ROOT / "configs" / "seed-a-phase-90.yaml"
+TIMES_AS_LONG = 8
+ITERATIONS = 9
+
+MIB = 2**20
+
+
+@dataclass(frozen=True)
+class Run:
+    """A finished process: wall and CPU time in s, peak memory in bytes, stages in s."""
+
+    wall: float
+    cpu: float
+    peak: int
+    stages: dict[str, float]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--long", action="store_true", help="add the trial 8 times as long")
+    args = parser.parse_args()
+    load = os.getloadavg()[0]
+    lines: list[str] = []
+    for title, rows in (
+        ("Command line", command_line()),
+        (f"Calibration cruise of {cruise_duration():.0f} s", cruise(long=args.long)),
+        ("Coning and sculling", coning()),
+    ):
+        print(f"\n{title}", flush=True)
+        lines += [f"\n## {title}\n", "| what | measured | limit |", "|---|---|---|"]
+        for row in rows:
+            print("  " + " | ".join(row), flush=True)
+            lines.append("| " + " | ".join(row) + " |")
+    RESULTS.write_text("\n".join([*header(load), *lines]) + "\n", encoding="utf-8")
+    print(f"\nwrote {RESULTS.relative_to(ROOT)}")
+
+
+def header(load: float) -> list[str]:
+    packages = ("factorgraph-dvl", "gtsam", "numpy", "scipy", "pyarrow", "matplotlib")
+    return [
+        "# Benchmark results\n",
+        "Written by `python benchmarks/run.py [--long]`; do not edit.\n",
+        f"- date: {date.today().isoformat()}",
+        f"- machine: {cpu_name()}, {len(os.sched_getaffinity(0))} cores used of "
+        f"{os.cpu_count()}, {total_memory() / 2**30:.0f} GiB",
+        f"- load of the machine at the start, 1 min: {load:.1f}",
+        f"- system: {platform.system()} {platform.machine()}, Python {platform.python_version()}",
+        "- packages: " + ", ".join(f"{name} {version(name)}" for name in packages),
+    ]
+
+
+def cpu_name() -> str:
+    for line in Path("/proc/cpuinfo").read_text().splitlines():
+        if line.startswith("model name"):
+            return line.split(":", 1)[1].strip()
+    return platform.processor() or "unknown CPU"
+
+
+def total_memory() -> int:
+    return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+
+
+def command_line() -> Iterator[tuple[str, str, str]]:
+    helps = [run_cli("--help").wall for _ in range(7)]
+    yield "`--help`, median of 7", f"{median(helps):.2f} s", "1 s"
+    with temporary_folder() as folder:
+        runs = [run_cli("solve", SHIPPED, "--out", folder / f"{i}") for i in range(3)]
+    yield (
+        "shipped trial, files to files with figures, median of 3",
+        f"{median(r.wall for r in runs):.1f} s",
+        "10 s",
+    )
+    yield "peak memory of that", f"{max(r.peak for r in runs) / MIB:.0f} MiB", ""
+
+
+def cruise(*, long: bool) -> Iterator[tuple[str, str, str]]:
+    with temporary_folder() as folder:
+        trial_folder = folder / "cruise"
+        simulated = run_cli("simulate", CRUISE, "--out", trial_folder, "--seed", 1)
+        yield "simulate, CSV", f"{simulated.wall:.1f} s", ""
+        trial = load_trial(trial_folder)
+        yield (
+            "samples: IMU, GNSS, DVL",
+            ", ".join(str(s.time.size) for s in (trial.imu, trial.gnss, trial.dvl) if s),
+            "",
+        )
+        runs = [run_cli("solve", trial_folder, "--out", folder / f"{i}") for i in range(2)]
+        once = min(runs, key=lambda r: r.wall)
+        yield "**solve, files to files with figures**, better of 2", f"{once.wall:.1f} s", "20 s"
+        for stage, seconds in once.stages.items():
+            yield f"– {stage}", f"{seconds:.2f} s", ""
+        yield "CPU time of that", f"{once.cpu:.1f} s", ""
+        yield "peak memory", f"{max(r.peak for r in runs) / MIB:.0f} MiB", "1536 MiB"
+        yield from iteration_times(trial)
+        del trial
+        if long:
+            yield from eight_times(folder, once)
+
+
+def iteration_times(trial: Trial) -> Iterator[tuple[str, str, str]]:
+    """Time Gauss-Newton iterations of the same chain with and without the DVL."""
+    frame = trial.frame()
+    inc, _ = increments(trial.imu)
+    seg = segments(inc, STATE_INTERVAL)
+    start = initial_states(trial, frame, seg).states
+    chain = inertial_chain(trial, frame, seg, start)
+    assert trial.gnss is not None
+    assert trial.dvl is not None
+    without = problem_of(chain, (trial.gnss,))
+    minimum = minimise(without, values_of(without, start, {}), stage="GNSS")
+    states = minimum.evaluation.states
+    both = problem_of(chain, (trial.gnss, trial.dvl))
+    values = {
+        "without": values_of(without, states, {}),
+        "with": values_of(both, states, true_parameters(both, trial)),
+    }
+    problems = {"without": without, "with": both}
+    for name, problem in problems.items():
+        problem.weigh(problem.evaluate(values[name]))
+    orderings = {
+        name: problem.ordering(problem.linearize(problem.evaluate(values[name])))
+        for name, problem in problems.items()
+    }
+    taken: dict[str, list[dict[str, float]]] = {"without": [], "with": []}
+    for _ in range(ITERATIONS + 1):
+        for name, problem in problems.items():
+            t0 = perf_counter()
+            evaluation = problem.evaluate(values[name])
+            t1 = perf_counter()
+            gaussian = problem.linearize(evaluation)
+            t2 = perf_counter()
+            delta = eliminate(gaussian, orderings[name]).optimize()
+            values[name] = evaluation.values.retract(delta)
+            t3 = perf_counter()
+            taken[name].append(
+                {
+                    "all": t3 - t0,
+                    "evaluate": t1 - t0,
+                    "linearise": t2 - t1,
+                    "eliminate and solve": t3 - t2,
+                }
+            )
+    # The first is the only one that allocates.
+    medians = {
+        name: {part: median(t[part] for t in times[1:]) for part in times[0]}
+        for name, times in taken.items()
+    }
+    for name in ("without", "with"):
+        _, *parts = [f"{part} {s * 1e3:.0f}" for part, s in medians[name].items()]
+        yield (
+            f"solver iteration {name} the DVL, median of {ITERATIONS}",
+            f"{medians[name]['all'] * 1e3:.0f} ms ({', '.join(parts)})",
+            "",
+        )
+    ratio = medians["with"]["all"] / medians["without"]["all"]
+    yield "**ratio of the two**", f"{ratio:.2f}", "1.3"
+
+
+def problem_of(chain: Chain, aids: tuple[Aid, ...]) -> Problem:
+    observations = [o for aid in aids for o in aid.observations(chain.frame)]
+    parameters = [p for aid in aids for p in aid.parameters()]
+    return Problem(chain, observations, parameters)
+
+
+def values_of(problem: Problem, states: States, parameters: dict[str, np.ndarray]) -> Any:
+    return problem.values(states, {**problem.prior_values(), **parameters})
+
+
+def true_parameters(problem: Problem, trial: Trial) -> dict[str, np.ndarray]:
+    out = {}
+    for p in problem.parameters:
+        value = trial.calibration_truth[p.name] * p.si
+        out[p.name] = exp_so3(value) if p.rotation else np.broadcast_to(value, p.mean.shape).copy()
+    return out
+
+
+def eight_times(folder: Path, once: Run) -> Iterator[tuple[str, str, str]]:
+    data = yaml.safe_load(CRUISE.read_text(encoding="utf-8"))
+    data["name"] = "cruise-long"
+    data["manoeuvres"] = [{"repeat": TIMES_AS_LONG, "manoeuvres": data["manoeuvres"]}]
+    config = folder / "long.yaml"
+    config.write_text(yaml.safe_dump(data, sort_keys=False), encoding="utf-8")
+    simulated = run_cli("simulate", config, "--out", folder / "long", "--seed", 1)
+    yield f"simulate a cruise {TIMES_AS_LONG} times as long", f"{simulated.wall:.0f} s", ""
+    run = run_cli("solve", folder / "long", "--out", folder / "long-solved")
+    yield "solve it, files to files with figures", f"{run.wall:.1f} s", ""
+    for stage, seconds in run.stages.items():
+        yield f"– {stage}", f"{seconds:.2f} s", ""
+    yield f"**times the cruise of 1/{TIMES_AS_LONG}**", f"{run.wall / once.wall:.2f}", "9"
+    yield "peak memory", f"{run.peak / MIB:.0f} MiB", ""
+
+
+def coning() -> Iterator[tuple[str, str, str]]:
+    """Compare integrated with true attitude, without noise and biases."""
+    data = yaml.safe_load(CONING.read_text(encoding="utf-8"))
+    data["noise"] = False
+    data["imu"].update(gyro_bias_deg_h=[0, 0, 0], accel_bias_ug=[0, 0, 0])
+    for label, sampling, manoeuvres in (
+        ("whole scenario, `mean` samples", "mean", data["manoeuvres"]),
+        ("at rest for 300 s, `mean` samples", "mean", [{"straight_s": 300}]),
+        (
+            "at rest for 300 s, `instantaneous` samples",
+            "instantaneous",
+            [{"straight_s": 300}],
+        ),
+    ):
+        own = {**data, "manoeuvres": manoeuvres, "imu": {**data["imu"], "sampling": sampling}}
+        scenario = parse_scenario(own)
+        trial = simulate(scenario)
+        inc, _ = increments(trial.imu)
+        phi, _dv = inc.over(np.arange(inc.dt.size))
+        ends = np.array([inc.start[0], inc.end[-1]])
+        state = plan_motion(scenario).at(ends)
+        nRb = rotation_from_rph(state.rph, scenario.body_axes)
+        spin = exp_so3(np.outer(ends, [0.0, 0.0, RATE]))
+        lat, lon = state.geodetic[:, 0], state.geodetic[:, 1]
+        iRb = spin @ enu_from_ecef(lat, lon).transpose(0, 2, 1) @ nRb
+        gyro = trial.imu.gyro[-inc.dt.size :]
+        drifts = []
+        for steps in (gyro * inc.dt[:, None], phi):
+            turned = iRb[0] @ chained(exp_so3(steps))
+            error = log_so3(turned @ iRb[1].T)
+            drifts.append(float(np.linalg.norm(error)) / (ends[1] - ends[0]) / DEG_PER_HOUR)
+        limit = "" if sampling == "instantaneous" else "0.02 deg/h"
+        yield f"{label}: one rate per sample", f"{drifts[0]:.2f} deg/h", ""
+        yield f"{label}: this package", f"{drifts[1]:.1e} deg/h", limit
+
+
+def chained(turns: np.ndarray) -> np.ndarray:
+    """Return the product of rotations (N, 3, 3), by pairs."""
+    while turns.shape[0] > 1:
+        if turns.shape[0] % 2:
+            turns = np.concatenate([turns, np.eye(3)[None]])
+        turns = turns[::2] @ turns[1::2]
+    return np.asarray(turns[0])
+
+
+def cruise_duration() -> float:
+    return float(plan_motion(parse_scenario(yaml.safe_load(CRUISE.read_text()))).duration)
+
+
+def run_cli(*args: object) -> Run:
+    """Run the command line in a process of its own."""
+    command = [sys.executable, "-m", "factorgraph_dvl.cli", *map(str, args)]
+    with tempfile.TemporaryFile("w+") as log:
+        start = perf_counter()
+        process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=log)
+        # Of this child alone: getrusage knows only the largest of all children.
+        _, status, usage = os.wait4(process.pid, 0)
+        wall = perf_counter() - start
+        log.seek(0)
+        text = log.read()
+    process.returncode = os.waitstatus_to_exitcode(status)
+    if process.returncode != 0:
+        raise SystemExit(f"{' '.join(command)} failed:\n{text}")
+    return Run(
+        wall, usage.ru_utime + usage.ru_stime, usage.ru_maxrss * 1024, stages_of(text, wall)
+    )
+
+
+def stages_of(log: str, wall: float) -> dict[str, float]:
+    """Return how long each stage took, from the progress that `solve` reports."""
+    began: list[tuple[str, float]] = []
+    for line in log.splitlines():
+        match = re.match(r"\s*([0-9.]+) s  ([^,]+)", line)
+        if match and (not began or began[-1][0] != match[2]):
+            began.append((match[2], float(match[1])))
+    out: dict[str, float] = {}
+    for (stage, at), (_, until) in pairwise([*began, ("", wall)]):
+        name = stage if until != wall else f"{stage}, figures, start and end of the process"
+        out[name] = out.get(name, 0.0) + until - at
+    return out
+
+
+@contextmanager
+def temporary_folder() -> Iterator[Path]:
+    with tempfile.TemporaryDirectory(prefix="factorgraph-dvl-benchmark-") as name:
+        yield Path(name)
+
+
+if __name__ == "__main__":
+    main()
