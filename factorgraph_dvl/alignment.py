@@ -9,6 +9,7 @@ Velocity/position integration formula, IEEE T-AES 49(2), 2013).
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
@@ -272,7 +273,7 @@ def _nominal_velocity(dvl: Dvl, use: np.ndarray, omega_b: Array) -> Array:
 
 
 def _align(trial: Trial, arc: _Arc, pairs: _Pairs) -> tuple[Array, bool]:
-    """Return the attitude at the start as every node sees it, (M, 3, 3), and whether heading is found.
+    """Return the attitude at the start as each node sees it, and whether heading is found.
 
     Gyro biases turn the body axes of the start away with time: so each window has its own
     rotation, and windows that do not tell the heading take that of the nearest which does.
@@ -282,7 +283,7 @@ def _align(trial: Trial, arc: _Arc, pairs: _Pairs) -> tuple[Array, bool]:
     count = max(round(arc.since[-1] / length), 1)
     edges = arc.start + arc.since[-1] * np.arange(count + 1) / count
     rotations, found = [], []
-    for a, b in zip(edges[:-1], edges[1:], strict=True):
+    for a, b in itertools.pairwise(edges):
         use = (pairs.time >= a) & (pairs.time <= b)
         if use.sum() < _LEAST_PAIRS:
             rotations.append(np.eye(3))
@@ -320,7 +321,7 @@ def _towards_course(trial: Trial, arc: _Arc, pairs: _Pairs, rotation: Array) -> 
     """Turn an attitude about the vertical until the bow points along the course."""
     speed = np.linalg.norm(pairs.course[:, :2], axis=1)
     i = int(np.argmax(speed))
-    at, body_R, _, _ = arc.carry(pairs.time[i : i + 1])
+    _at, body_R, _, _ = arc.carry(pairs.time[i : i + 1])
     forward_b = frd_from_body(trial.body_axes)[0]
     spin = arc.to_space(pairs.time[i : i + 1])[0].T
     bow = spin @ rotation @ body_R[0] @ forward_b

@@ -45,7 +45,7 @@ def skew(v: ArrayLike) -> Array:
 
 
 def rotate(matrices: Array, vectors: Array) -> Array:
-    """Return the products of matrices (M, 3, 3) and vectors (M, 3), as (M, 3)."""
+    """Return the products of matrices (M, 3, 3) and vectors (M, 3) or (3,), as (M, 3)."""
     return np.asarray(np.matmul(matrices, vectors[..., None])[..., 0])
 
 

@@ -9,6 +9,7 @@ slow and makes GTSAM's optimisers copy all values.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -24,8 +25,8 @@ from factorgraph_dvl.preintegration import (
     Attachment,
     Segments,
     States,
+    Transition,
     attach,
-    chain_at,
     motion_at,
     preintegrate,
 )
@@ -205,7 +206,9 @@ class Problem:
         for p in self.parameters:
             self._add_prior(p)
         self.uncovered: dict[str, int] = {}
-        self._bound = [self._bind(o) for o in observations]
+        self._bound: list[_Bound] = []
+        for observation in observations:
+            self._bound.append(self._bind(observation))
         blocks: dict[tuple[str, ...], _Block] = {}
         for bound in self._bound:
             used = tuple(p for p in self.parameters if p.name in bound.observation.parameters)
@@ -258,11 +261,15 @@ class Problem:
                 values.atRot3(key).matrix() if p.rotation else values.atVector(key)
             )
         motions, residuals = [], []
+        known: dict[int, Motion] = {}
         cost = self.graph.error(values)
         rate = self.chain.frame.earth_rate
         for bound in self._bound:
             self._follow(bound, parameters)
-            motion = motion_at(bound.attachment, states, self.chain.gravity_n, rate)
+            shared = id(bound.attachment)
+            if shared not in known:
+                known[shared] = motion_at(bound.attachment, states, self.chain.gravity_n, rate)
+            motion = known[shared]
             residual = bound.weight * bound.observation.residual(motion, parameters)
             motions.append(motion)
             residuals.append(residual)
@@ -281,12 +288,16 @@ class Problem:
         Its measurement factors are written in place at the next call.
         """
         gaussian = self.graph.linearize(evaluation.values)
-        motions = {id(b): m for b, m in zip(self._bound, evaluation.motions, strict=True)}
+        rate = self.chain.frame.earth_rate
+        transitions = {
+            id(b.attachment): Transition(b.attachment, evaluation.states, motion, rate)
+            for b, motion in zip(self._bound, evaluation.motions, strict=True)
+        }
         for block in self._blocks:
             nodes = np.concatenate([b.attachment.node for b in block.bound])
             if not np.array_equal(nodes, block.nodes):
                 self._lay_out(block)
-            matrix, vector = self._fill(block, motions, evaluation)
+            matrix, vector = self._fill(block, transitions, evaluation)
             for target, source, rows in zip(
                 block.matrices, block.vectors, block.rows, strict=True
             ):
@@ -338,6 +349,9 @@ class Problem:
         if not covered.all():
             self.uncovered[observation.label] = int((~covered).sum())
         weight = np.repeat(covered.astype(float)[:, None], len(observation.components), axis=1)
+        for other in self._bound:
+            if np.array_equal(other.time, time):
+                return _Bound(observation, other.attachment, time, weight)
         return _Bound(observation, self._attach(time), time, weight)
 
     def _attach(self, time: Array) -> Attachment:
@@ -367,32 +381,28 @@ class Problem:
         block.order = np.argsort(row_node, kind="stable")
         used, counts = np.unique(row_node, return_counts=True)
         edges = np.concatenate([[0], np.cumsum(counts)])
-        block.rows = [slice(a, b) for a, b in zip(edges[:-1], edges[1:], strict=True)]
+        block.rows = [slice(a, b) for a, b in itertools.pairwise(edges)]
         sizes = [_STATE, _BIAS] + [p.mean.size for p in block.parameters]
         shared = [self._key[p.name] for p in block.parameters]
-        values = self.values(
-            _origin_states(self.chain.segments.node_time.size), self.prior_values()
-        )
         block.matrices, block.vectors, block.factors = [], [], []
         for k, rows in zip(used.tolist(), counts.tolist(), strict=True):
             node_keys = [keys.node(k), self.chain.bias_key(k), *shared]
-            factor = _template(node_keys, sizes, rows, values)
+            factor = _template(node_keys, sizes, rows)
             block.factors.append(factor)
             block.matrices.append(factor.getA())
             block.vectors.append(factor.getb())
 
     def _fill(
-        self, block: _Block, motions: dict[int, Motion], evaluation: Evaluation
+        self, block: _Block, transitions: dict[int, Transition], evaluation: Evaluation
     ) -> tuple[Array, Array]:
         """Return the whitened Jacobian and right-hand side of a block, rows by node."""
         columns = _STATE + _BIAS + sum(p.mean.size for p in block.parameters)
         parts, rhs = [], []
         for bound in block.bound:
-            motion = motions[id(bound)]
-            lin = bound.observation.linearize(motion, evaluation.parameters)
-            matrix = node_jacobian(
-                lin, bound.attachment, evaluation.states, motion, self.chain.frame.earth_rate
-            )
+            transition = transitions[id(bound.attachment)]
+            wanted = [p.name for p in block.parameters]
+            lin = bound.observation.linearize(transition.motion, evaluation.parameters, wanted)
+            matrix = node_jacobian(lin, transition)
             m, d = lin.residual.shape
             full = np.empty((m, d, columns))
             full[:, :, : _STATE + _BIAS] = matrix
@@ -408,9 +418,7 @@ class Problem:
         return matrix[block.order], vector[block.order]
 
 
-def node_jacobian(
-    lin: Linearization, at: Attachment, states: States, motion: Motion, earth_rate_n: Array
-) -> Array:
+def node_jacobian(lin: Linearization, transition: Transition) -> Array:
     """Return the derivative of residuals with respect to node and bias, (M, d, 15).
 
     Columns: attitude, position, velocity in GTSAM's tangent space of NavState, then
@@ -418,40 +426,34 @@ def node_jacobian(
 
     Parameters
     ----------
-    lin : derivatives with respect to the motion at the time.
-    at : Attachment of the M times.
-    states : at the nodes.
-    motion : at the M times.
-    earth_rate_n : (3,) rad/s.
+    lin : derivatives with respect to the motion at the M times.
+    transition : from the nodes to these times.
     """
-    chain = chain_at(at, states, motion, earth_rate_n)
     out = np.zeros((*lin.residual.shape, _STATE + _BIAS))
     theta, p, v, accel, gyro = (out[:, :, i : i + 3] for i in range(0, 15, 3))
     d_theta = lin.d_theta
     if lin.d_omega is not None:
-        by_attitude = lin.d_omega @ chain.omega_earth
+        by_attitude = lin.d_omega @ transition.omega_theta
         d_theta = by_attitude if d_theta is None else d_theta + by_attitude
         gyro -= lin.d_omega
     if d_theta is not None:
-        theta += d_theta @ chain.theta_theta
-        gyro += d_theta @ chain.theta_gyro
+        theta += d_theta @ transition.theta_theta
+        gyro += d_theta @ transition.theta_gyro
     if lin.d_p is not None:
-        theta += lin.d_p @ chain.p_theta
-        p += lin.d_p @ chain.p_p
-        v += lin.d_p @ chain.p_v
-        accel += lin.d_p @ chain.p_accel
-        gyro += lin.d_p @ chain.p_gyro
+        theta += lin.d_p @ transition.p_theta
+        p += lin.d_p @ transition.p_p
+        v += lin.d_p @ transition.p_v
+        accel += lin.d_p @ transition.p_accel
+        gyro += lin.d_p @ transition.p_gyro
     if lin.d_v is not None:
-        theta += lin.d_v @ chain.v_theta
-        v += lin.d_v @ chain.v_v
-        accel += lin.d_v @ chain.v_accel
-        gyro += lin.d_v @ chain.v_gyro
+        theta += lin.d_v @ transition.v_theta
+        v += lin.d_v @ transition.v_v
+        accel += lin.d_v @ transition.v_accel
+        gyro += lin.d_v @ transition.v_gyro
     return out
 
 
-def _template(
-    node_keys: list[int], sizes: list[int], rows: int, values: gtsam.Values
-) -> gtsam.JacobianFactor:
+def _template(node_keys: list[int], sizes: list[int], rows: int) -> gtsam.JacobianFactor:
     """Return an empty Jacobian factor; only a custom factor makes one of any number of keys."""
 
     def nothing(
@@ -463,12 +465,9 @@ def _template(
         return np.zeros(rows)
 
     noise = gtsam.noiseModel.Unit.Create(rows)
-    return gtsam.CustomFactor(noise, node_keys, nothing).linearize(values)
-
-
-def _origin_states(n: int) -> States:
-    zero = np.zeros((n, 3))
-    return States(np.tile(np.eye(3), (n, 1, 1)), zero, zero, zero, zero)
+    factor = gtsam.CustomFactor(noise, node_keys, nothing).linearize(gtsam.Values())
+    assert isinstance(factor, gtsam.JacobianFactor)
+    return factor
 
 
 def _from_prior(p: Parameter) -> Array:

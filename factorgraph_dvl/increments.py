@@ -10,6 +10,7 @@ schemes: Harten, Engquist, Osher, Chakravarthy, J. Comput. Phys. 71 (1987)).
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 from functools import cached_property
 from math import comb, factorial
@@ -277,7 +278,7 @@ def increments(imu: Imu) -> tuple[Increments, tuple[str, ...]]:
     bounds = np.concatenate([[0], np.flatnonzero(broken) + 1, [time.size]])
     starts, lengths, arcs, first_sample, kept, fill = [], [], [], [], [], []
     n_intervals = n_samples = 0
-    for a, b in zip(bounds[:-1], bounds[1:], strict=True):
+    for a, b in itertools.pairwise(bounds):
         if b - a < least:
             notes.append(
                 f"{imu.source}: {b - a} samples at {time[a]:.3f} s stand alone between gaps "
@@ -300,7 +301,7 @@ def increments(imu: Imu) -> tuple[Increments, tuple[str, ...]]:
             expected=f"at least {least} samples in a row",
         )
     start, length = np.concatenate(starts), np.concatenate(lengths)
-    for (_, b), (c, _) in zip(arcs[:-1], arcs[1:], strict=True):
+    for (_, b), (c, _) in itertools.pairwise(arcs):
         end = start[b - 1] + length[b - 1]
         notes.append(
             f"{imu.source}: gap of {start[c] - end:.3f} s at {end:.3f} s: the inertial chain "

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import gtsam
 import numpy as np
@@ -162,7 +163,7 @@ def preintegrate(
     gyro_psd = settings.gyro_noise_root_psd**2 * np.eye(3)
     accel_psd = settings.accel_noise_root_psd**2 * np.eye(3)
     integration_psd = _INTEGRATION_ROOT_PSD**2 * np.eye(3)
-    open_ = inc.open_sigma.any(axis=1)
+    is_open = np.any(inc.open_sigma > 0.0, axis=1)
     out = []
     for s in range(seg.first.size):
         a, b = int(seg.first[s]), int(seg.last[s])
@@ -170,7 +171,7 @@ def preintegrate(
         params.setOmegaCoriolis(earth_rate_n)
         params.setIntegrationCovariance(integration_psd)
         extra_gyro, extra_accel = 0.0, 0.0
-        if open_[a:b].any():
+        if np.any(is_open[a:b]):
             extra = (inc.open_sigma[a:b] * inc.dt[a:b, None]) ** 2
             extra_gyro = extra[:, :3].sum() / seg.duration[s]
             extra_accel = extra[:, 3:].sum() / seg.duration[s]
@@ -250,33 +251,103 @@ def _attach(seg: Segments, index: IntArray, since: Array, earth_rate_n: Array) -
 
 
 @dataclass(frozen=True)
-class Chain:
+class Transition:
     """Derivatives of the motion at M times with respect to the node before.
 
     The node's tangent space is GTSAM's: theta in nRb Exp(theta), and position and
-    velocity in body axes. None of the blocks that are missing is different from zero.
+    velocity in body axes. A block is computed when a sensor asks for it; none of those that
+    are missing differs from zero.
 
     Parameters
     ----------
-    theta_theta, theta_gyro : (M, 3, 3) of the attitude.
-    p_theta, p_p, p_v, p_gyro, p_accel : (M, 3, 3) of the position.
-    v_theta, v_v, v_gyro, v_accel : (M, 3, 3) of the velocity.
-    omega_earth : (M, 3, 3) of omega_eb_b with respect to the attitude at the time; its
-        derivative with respect to the gyro bias is -I.
+    at : Attachment of the M times.
+    states : at the nodes.
+    motion : at the times.
+    earth_rate_n : (3,) rad/s.
     """
 
-    theta_theta: Array
-    theta_gyro: Array
-    p_theta: Array
-    p_p: Array
-    p_v: Array
-    p_gyro: Array
-    p_accel: Array
-    v_theta: Array
-    v_v: Array
-    v_gyro: Array
-    v_accel: Array
-    omega_earth: Array
+    at: Attachment
+    states: States
+    motion: Motion
+    earth_rate_n: Array
+
+    @cached_property
+    def _turned(self) -> Array:
+        return self.at.turn @ self.states.nRb[self.at.node]
+
+    @cached_property
+    def _increments(self) -> tuple[Array, Array, Array]:
+        k = self.at.node
+        return _with_bias(self.at, self.states.gyro_bias[k], self.states.accel_bias[k])
+
+    @cached_property
+    def _cross_rate(self) -> Array:
+        return skew(self.earth_rate_n)
+
+    @property
+    def _tau(self) -> Array:
+        return self.at.tau[:, None, None]
+
+    @cached_property
+    def theta_theta(self) -> Array:
+        """Attitude by attitude, (M, 3, 3)."""
+        return self._increments[0].transpose(0, 2, 1)
+
+    @cached_property
+    def theta_gyro(self) -> Array:
+        """Attitude by gyro bias."""
+        return -self.theta_theta @ self.at.dA
+
+    @cached_property
+    def omega_theta(self) -> Array:
+        """Rate relative to the Earth by attitude at the time; by gyro bias it is -I."""
+        return -skew(rotate(self.motion.nRb.transpose(0, 2, 1), self.earth_rate_n))
+
+    @cached_property
+    def p_theta(self) -> Array:
+        """Position by attitude."""
+        return -self._turned @ skew(self._increments[2])
+
+    @cached_property
+    def p_p(self) -> Array:
+        """Position by position."""
+        R = self.states.nRb[self.at.node]
+        return self._turned + self._tau * (self.at.turn @ (self._cross_rate @ R))
+
+    @cached_property
+    def p_v(self) -> Array:
+        """Position by velocity."""
+        return self._tau * self._turned
+
+    @cached_property
+    def p_gyro(self) -> Array:
+        """Position by gyro bias."""
+        return self.v_gyro * (self._tau / 3.0)
+
+    @cached_property
+    def p_accel(self) -> Array:
+        """Position by accelerometer bias."""
+        return self.v_accel * (self._tau / 2.0)
+
+    @cached_property
+    def v_theta(self) -> Array:
+        """Velocity by attitude."""
+        return -self._turned @ skew(self._increments[1]) - self._cross_rate @ self.p_theta
+
+    @cached_property
+    def v_v(self) -> Array:
+        """Velocity by velocity."""
+        return self._turned - self._cross_rate @ self.p_v
+
+    @cached_property
+    def v_gyro(self) -> Array:
+        """Velocity by gyro bias, for force and rate constant since the node."""
+        return self._turned @ (0.5 * skew(self.at.dV) @ self.at.dA)
+
+    @cached_property
+    def v_accel(self) -> Array:
+        """Velocity by accelerometer bias."""
+        return -self._turned @ self.at.dA
 
 
 def motion_at(at: Attachment, states: States, gravity_n: Array, earth_rate_n: Array) -> Motion:
@@ -324,44 +395,6 @@ def motion_at(at: Attachment, states: States, gravity_n: Array, earth_rate_n: Ar
         alpha_b=at.alpha,
         omega_sigma=at.omega_sigma,
     )
-
-
-def chain_at(at: Attachment, states: States, motion: Motion, earth_rate_n: Array) -> Chain:
-    """Return the derivatives of `motion_at` with respect to the nodes."""
-    k = at.node
-    R = states.nRb[k]
-    w = earth_rate_n
-    tau = at.tau[:, None, None]
-    dR, dV, dP = _with_bias(at, states.gyro_bias[k], states.accel_bias[k])
-    TR = at.turn @ R
-    wx = skew(w)
-    p_gyro, p_accel, v_gyro, v_accel = _bias_derivatives(at)
-    rate_b = np.einsum("mij,i->mj", motion.nRb, w)
-    lag = TR - tau * (wx @ TR)
-    return Chain(
-        theta_theta=dR.transpose(0, 2, 1),
-        theta_gyro=-dR.transpose(0, 2, 1) @ at.dA,
-        p_theta=-TR @ skew(dP),
-        p_p=TR + tau * (at.turn @ (wx @ R)),
-        p_v=tau * TR,
-        p_gyro=TR @ p_gyro,
-        p_accel=TR @ p_accel,
-        v_theta=-TR @ skew(dV) + wx @ TR @ skew(dP),
-        v_v=lag,
-        v_gyro=TR @ v_gyro - wx @ (TR @ p_gyro),
-        v_accel=TR @ v_accel - wx @ (TR @ p_accel),
-        omega_earth=-skew(rate_b),
-    )
-
-
-def _bias_derivatives(at: Attachment) -> tuple[Array, Array, Array, Array]:
-    """Return d(dP, dP, dV, dV) / d(gyro, accel, gyro, accel bias), (M, 3, 3) each.
-
-    To the order that matters within a segment: force and rate constant over it.
-    """
-    tau = at.tau[:, None, None]
-    v_gyro = 0.5 * skew(at.dV) @ at.dA
-    return v_gyro * (tau / 3.0), -0.5 * tau * at.dA, v_gyro, -at.dA
 
 
 def _with_bias(at: Attachment, bg: Array, ba: Array) -> tuple[Array, Array, Array]:

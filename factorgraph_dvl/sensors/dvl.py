@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from typing import Literal
 
@@ -242,7 +243,7 @@ class DvlVelocity:
         predicted = (1.0 + values[SCALE_ERROR]) * (dvl_b @ values[MISALIGNMENT].T)
         return predicted + values[BIAS] - self.measured_d
 
-    def linearize(self, motion: Motion, values: Values) -> Linearization:
+    def linearize(self, motion: Motion, values: Values, wanted: Collection[str]) -> Linearization:
         """Return the residual and its Jacobians."""
         dvl_b, imu_b = _velocity_at_dvl(motion, values)
         bRn = motion.nRb.transpose(0, 2, 1)
@@ -252,26 +253,31 @@ class DvlVelocity:
         lever_arm = values[LEVER_ARM]
         n_scale = values[SCALE_ERROR].size
         d_scale = unscaled_d[:, :, None] if n_scale == 1 else unscaled_d[:, :, None] * np.eye(3)
-        # d/dt of (bRn (v_n - c_n) + omega x l), whose sign turns with that of the offset.
-        rate_b = (
-            rotate(bRn, motion.a_n)
-            - np.cross(motion.omega_eb_b, imu_b)
-            + np.cross(motion.alpha_b, lever_arm)
-        )
         d_v = dMb @ bRn
+
+        def by_offset() -> Array:
+            # d/dt of (bRn (v_n - c_n) + omega x l), against the direction of the offset.
+            rate_b = (
+                rotate(bRn, motion.a_n)
+                - np.cross(motion.omega_eb_b, imu_b)
+                + np.cross(motion.alpha_b, lever_arm)
+            )
+            return -(rate_b @ dMb.T)[:, :, None]
+
+        derivatives: dict[str, Callable[[], Array]] = {
+            MISALIGNMENT: lambda: -dMb @ skew(dvl_b),
+            SCALE_ERROR: lambda: d_scale,
+            LEVER_ARM: lambda: dMb @ skew(motion.omega_eb_b),
+            BIAS: lambda: np.broadcast_to(np.eye(3), d_v.shape),
+            TIME_OFFSET: by_offset,
+            CURRENT: lambda: -d_v[:, :, :2],
+        }
         return Linearization(
             residual=scale * unscaled_d + values[BIAS] - self.measured_d,
             d_theta=dMb @ skew(imu_b),
             d_v=d_v,
             d_omega=np.broadcast_to(-dMb @ skew(lever_arm), d_v.shape),
-            d_parameters={
-                MISALIGNMENT: -dMb @ skew(dvl_b),
-                SCALE_ERROR: d_scale,
-                LEVER_ARM: dMb @ skew(motion.omega_eb_b),
-                BIAS: np.broadcast_to(np.eye(3), d_v.shape),
-                TIME_OFFSET: -(rate_b @ dMb.T)[:, :, None],
-                CURRENT: -d_v[:, :, :2],
-            },
+            d_parameters={name: make() for name, make in derivatives.items() if name in wanted},
         )
 
 

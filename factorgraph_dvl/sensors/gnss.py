@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass
 
 import numpy as np
@@ -164,7 +165,7 @@ class AntennaPosition:
         antenna_n = motion.p_n + motion.nRb @ values[LEVER_ARM]
         return rotate(self.lRn, antenna_n - self.measured_n)
 
-    def linearize(self, motion: Motion, values: Values) -> Linearization:
+    def linearize(self, motion: Motion, values: Values, wanted: Collection[str]) -> Linearization:
         """Return the residual and its Jacobians."""
         lRb = self.lRn @ motion.nRb
         return Linearization(
@@ -209,7 +210,7 @@ class AntennaVelocity:
         turning_b = np.cross(motion.omega_eb_b, values[LEVER_ARM])
         return rotate(self.lRn, motion.v_n + rotate(motion.nRb, turning_b)) - self.measured_l
 
-    def linearize(self, motion: Motion, values: Values) -> Linearization:
+    def linearize(self, motion: Motion, values: Values, wanted: Collection[str]) -> Linearization:
         """Return the residual and its Jacobians."""
         lever_arm = values[LEVER_ARM]
         lRb = self.lRn @ motion.nRb
@@ -218,5 +219,5 @@ class AntennaVelocity:
             d_theta=-lRb @ skew(np.cross(motion.omega_eb_b, lever_arm)),
             d_v=self.lRn,
             d_omega=-lRb @ skew(lever_arm),
-            d_parameters={LEVER_ARM: lRb @ skew(motion.omega_eb_b)},
+            d_parameters={LEVER_ARM: lRb @ skew(motion.omega_eb_b)} if LEVER_ARM in wanted else {},
         )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Annotated, Any, Protocol
 
@@ -128,11 +128,25 @@ class Linearization:
 class Observation(Protocol):
     """M measurements of one kind, of d components each."""
 
-    label: str
-    unit: str
-    components: tuple[str, ...]
-    time: Array
-    parameters: tuple[str, ...]
+    @property
+    def label(self) -> str:
+        """Name of the measurement, for people."""
+
+    @property
+    def unit(self) -> str:
+        """Unit of the residual."""
+
+    @property
+    def components(self) -> tuple[str, ...]:
+        """Names of the d components."""
+
+    @property
+    def time(self) -> Array:
+        """Times as in the record, (M,), s."""
+
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        """Names of the calibration parameters that the measurement depends on."""
 
     def true_time(self, values: Values) -> Array:
         """Return the (M,) times at which the measurements were true, s."""
@@ -143,14 +157,16 @@ class Observation(Protocol):
     def residual(self, motion: Motion, values: Values) -> Array:
         """Return predicted - measured, (M, d)."""
 
-    def linearize(self, motion: Motion, values: Values) -> Linearization:
-        """Return the residual and its Jacobians."""
+    def linearize(self, motion: Motion, values: Values, wanted: Collection[str]) -> Linearization:
+        """Return the residual and its Jacobians, of the parameters `wanted` at least."""
 
 
 class Aid(Protocol):
     """A sensor that observes the motion which the IMU integrates."""
 
-    label: str
+    @property
+    def label(self) -> str:
+        """Name of the sensor, for people."""
 
     def parameters(self) -> tuple[Parameter, ...]:
         """Return the calibration parameters, fixed ones included."""

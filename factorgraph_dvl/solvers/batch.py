@@ -14,7 +14,7 @@ from factorgraph_dvl.graph import Problem, inertial_chain
 from factorgraph_dvl.increments import increments
 from factorgraph_dvl.mounting import initial_mounting
 from factorgraph_dvl.preintegration import Segments, States, attach, motion_at, segments
-from factorgraph_dvl.sensors.protocol import Aid, Motion
+from factorgraph_dvl.sensors.protocol import Aid, Motion, Observation, Parameter
 from factorgraph_dvl.solution import Solution
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, Progress, minimise
 from factorgraph_dvl.solvers.summary import summarise
@@ -112,7 +112,7 @@ def _problem_minimum(
     )
 
 
-def _sensors(aids: Sequence[Aid], frame: LocalFrame) -> tuple[list, list]:  # type: ignore[type-arg]
+def _sensors(aids: Sequence[Aid], frame: LocalFrame) -> tuple[list[Observation], list[Parameter]]:
     observations = [o for aid in aids for o in aid.observations(frame)]
     parameters = [p for aid in aids for p in aid.parameters()]
     return observations, parameters

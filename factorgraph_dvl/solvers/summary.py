@@ -53,7 +53,7 @@ def summarise(
     warnings = [*notes]
     if not minimum.converged:
         warnings.append(
-            f"the solver did not converge in {minimum.iterations} iterations: do not use the values"
+            f"the solver did not converge in {minimum.iterations} iterations: not to be used"
         )
     for label, count in problem.uncovered.items():
         warnings.append(f"{label}: {count} measurements at times without IMU data were not used")
