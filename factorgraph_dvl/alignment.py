@@ -151,7 +151,7 @@ def initial_states(trial: Trial, frame: LocalFrame, seg: Segments) -> Start:
         pairs = _pairs(trial, frame, arc)
         if pairs is None:
             raise DataError(
-                f"nothing to find the attitude with from {arc.start:.1f} s on",
+                f"nothing to find the attitude with from {arc.start:z.1f} s on",
                 where=trial.imu.source,
                 expected="GNSS or DVL data there, or `initial` in trial.yaml",
             )
@@ -159,7 +159,7 @@ def initial_states(trial: Trial, frame: LocalFrame, seg: Segments) -> Start:
         nRb[arc.nodes] = spin @ aligned @ arc.turn
         if not found:
             notes.append(
-                f"from {arc.start:.0f} s on the velocity changes too little to find the heading: "
+                f"from {arc.start:z.0f} s on the velocity changes too little to find the heading: "
                 "the solver starts from the course over ground, or from north without one"
             )
     p_n, v_n = _kinematics(trial, frame, seg, nRb)

@@ -17,7 +17,13 @@ import gtsam
 import numpy as np
 
 from factorgraph_dvl import keys
-from factorgraph_dvl.conventions import Array, exp_so3, right_jacobian, rotation_from_rph
+from factorgraph_dvl.conventions import (
+    Array,
+    exp_so3,
+    log_so3,
+    right_jacobian,
+    rotation_from_rph,
+)
 from factorgraph_dvl.conventions import rph_jacobian as euler_jacobian
 from factorgraph_dvl.earth import LocalFrame
 from factorgraph_dvl.increments import IntArray
@@ -39,7 +45,9 @@ _FREE_POSITION = 1e5
 _FREE_VELOCITY = 1e2
 # Standard deviation that stands for zero in a parameter of which only some components
 # are held; in SI units, far below what can be measured.
-_HELD = 1e-9
+_HELD = 1e-7
+# The same for a held direction, in standard deviations of the prior.
+_HELD_DIRECTION = 1e-4
 # Keeps the walk of a bias that does not walk regular.
 _LEAST_WALK = 1e-12
 
@@ -86,9 +94,7 @@ def inertial_chain(trial: Trial, frame: LocalFrame, seg: Segments, start: States
         graph.add(gtsam.GalileanImuFactor2(keys.node(k), keys.node(k + 1), chain.bias_key(k), pim))
     gyro, accel = trial.imu.parameters(0.0)
     sigmas = np.concatenate([accel.sigma, gyro.sigma])
-    graph.addPriorConstantBias(
-        keys.bias(0), gtsam.imuBias.ConstantBias(), gtsam.noiseModel.Diagonal.Sigmas(sigmas)
-    )
+    graph.addPriorConstantBias(keys.bias(0), gtsam.imuBias.ConstantBias(), _diagonal(sigmas))
     if chain.walking:
         root_psd = np.repeat(
             [settings.accel_bias_walk_root_psd, settings.gyro_bias_walk_root_psd], 3
@@ -101,12 +107,12 @@ def inertial_chain(trial: Trial, frame: LocalFrame, seg: Segments, start: States
                     keys.bias(k),
                     keys.bias(k + 1),
                     gtsam.imuBias.ConstantBias(),
-                    gtsam.noiseModel.Diagonal.Sigmas(walk),
+                    _diagonal(walk),
                 )
             )
     for a, (first, _) in enumerate(seg.arc_nodes):
         mean, covariance = _state_prior(trial, frame, start, int(first), known=a == 0)
-        noise = gtsam.noiseModel.Gaussian.Covariance(covariance)
+        noise = gtsam.noiseModel.Gaussian.Covariance(covariance, False)
         graph.add(gtsam.PriorFactorNavState(keys.node(int(first)), mean, noise))
     return chain
 
@@ -224,6 +230,11 @@ class Problem:
         return tuple(b.observation for b in self._bound)
 
     @property
+    def attachments(self) -> tuple[Attachment, ...]:
+        """Where the observations hang on the chain."""
+        return tuple(b.attachment for b in self._bound)
+
+    @property
     def weights(self) -> tuple[Array, ...]:
         """Inverse standard deviations of the observations, (M, d) each; 0 = not used."""
         return tuple(b.weight for b in self._bound)
@@ -251,15 +262,70 @@ class Problem:
             out.insert(self._key[p.name], gtsam.Rot3(value) if p.rotation else value)
         return out
 
+    @property
+    def columns(self) -> dict[str, slice]:
+        """Place of every estimated parameter among all of them."""
+        ends = np.cumsum([p.mean.size for p in self.parameters])
+        return {
+            p.name: slice(int(end) - p.mean.size, int(end))
+            for p, end in zip(self.parameters, ends, strict=True)
+        }
+
+    @property
+    def prior_sigma(self) -> Array:
+        """Standard deviations of the priors of all estimated parameters, (P,), SI."""
+        return np.concatenate([np.maximum(p.sigma, _HELD) for p in self.parameters])
+
+    def difference(self, parameters: dict[str, Array], origin: dict[str, Array]) -> Array:
+        """Return parameters minus origin in the origin's tangent space, (P,), SI."""
+        return np.concatenate(
+            [
+                log_so3(origin[p.name].T @ parameters[p.name])
+                if p.rotation
+                else parameters[p.name] - origin[p.name]
+                for p in self.parameters
+            ]
+        )
+
+    def moved(self, parameters: dict[str, Array], step: Array) -> dict[str, Array]:
+        """Return parameters after a step (P,) in their tangent space, SI."""
+        out = dict(parameters)
+        for p in self.parameters:
+            part = step[self.columns[p.name]]
+            value = parameters[p.name]
+            out[p.name] = value @ exp_so3(part) if p.rotation else value + part
+        return out
+
+    def hold(self, directions: Array, origin: dict[str, Array]) -> None:
+        """Hold combinations of the parameters at an origin.
+
+        Parameters
+        ----------
+        directions : (P, h) orthonormal, in units of the priors' standard deviations.
+        origin : values of the parameters there.
+        """
+        gain = directions.T / self.prior_sigma / _HELD_DIRECTION
+        columns = self.columns
+
+        def error(
+            this: gtsam.CustomFactor, at: gtsam.Values, jacobians: list[Array] | None
+        ) -> Array:
+            now = {p.name: self._parameter(at, p) for p in self.parameters}
+            if jacobians is not None:
+                for i, p in enumerate(self.parameters):
+                    jacobians[i] = np.asfortranarray(gain[:, columns[p.name]])
+            return gain @ self.difference(now, origin)
+
+        noise = gtsam.noiseModel.Unit.Create(directions.shape[1])
+        shared = [self._key[p.name] for p in self.parameters]
+        self.graph.add(gtsam.CustomFactor(noise, shared, error))
+
     def evaluate(self, values: gtsam.Values) -> Evaluation:
         """Evaluate motion, residuals and cost."""
         states = self._states(values)
         parameters = {**self._fixed}
         for p in self.parameters:
-            key = self._key[p.name]
-            parameters[p.name] = (
-                values.atRot3(key).matrix() if p.rotation else values.atVector(key)
-            )
+            parameters[p.name] = self._parameter(values, p)
         motions, residuals = [], []
         known: dict[int, Motion] = {}
         cost = self.graph.error(values)
@@ -318,6 +384,10 @@ class Problem:
         """Return the key of an estimated parameter."""
         return self._key[name]
 
+    def _parameter(self, values: gtsam.Values, p: Parameter) -> Array:
+        key = self._key[p.name]
+        return values.atRot3(key).matrix() if p.rotation else values.atVector(key)
+
     def _states(self, values: gtsam.Values) -> States:
         n = self.chain.segments.node_time.size
         nRb, p_n, v_n = np.empty((n, 3, 3)), np.empty((n, 3)), np.empty((n, 3))
@@ -338,10 +408,10 @@ class Problem:
             # The prior is stated for the rotation vector, GTSAM's for its tangent space.
             to_tangent = right_jacobian(p.mean)
             covariance = to_tangent @ np.diag(sigma**2) @ to_tangent.T
-            noise = gtsam.noiseModel.Gaussian.Covariance(covariance)
+            noise = gtsam.noiseModel.Gaussian.Covariance(covariance, False)
             self.graph.addPriorRot3(key, gtsam.Rot3(exp_so3(p.mean)), noise)
         else:
-            self.graph.addPriorVector(key, p.mean, gtsam.noiseModel.Diagonal.Sigmas(sigma))
+            self.graph.addPriorVector(key, p.mean, _diagonal(sigma))
 
     def _bind(self, observation: Observation) -> _Bound:
         time = observation.true_time(self.prior_values())
@@ -468,6 +538,11 @@ def _template(node_keys: list[int], sizes: list[int], rows: int) -> gtsam.Jacobi
     factor = gtsam.CustomFactor(noise, node_keys, nothing).linearize(gtsam.Values())
     assert isinstance(factor, gtsam.JacobianFactor)
     return factor
+
+
+def _diagonal(sigmas: Array) -> gtsam.noiseModel.Diagonal:
+    # GTSAM's default takes a sigma below 1e-8, as of a good gyro's bias, for a constraint.
+    return gtsam.noiseModel.Diagonal.Sigmas(sigmas, False)
 
 
 def _from_prior(p: Parameter) -> Array:

@@ -358,7 +358,7 @@ def _fill(
 ) -> tuple[Array, Array, Array, np.ndarray]:
     """Interpolate short runs of lost samples, with the standard deviation to expect."""
     add_time, add_samples, add_sigma, at = [], [], [], []
-    for i in np.flatnonzero(bridged):
+    for i in np.flatnonzero(bridged).tolist():
         n = int(lost[i])
         a, b = max(i - 2, 0), min(i + 4, time.size)
         new = time[i] + (time[i + 1] - time[i]) * np.arange(1, n + 1) / (n + 1)

@@ -79,26 +79,26 @@ def initial_mounting(
     pings = pings[:: max(pings.size // _MAX_PINGS, 1)]
     sigma = np.hypot(dvl.sigma()[pings], _VELOCITY_ERROR)
 
-    def at_offset(offset: float) -> tuple[float, _Mounting]:
+    def moments(offset: float) -> _Moments:
         motion, covered = motion_at(pings, dvl.time[pings] - offset)
         v_b = rotate(motion.nRb.transpose(0, 2, 1), motion.v_n)
         x = np.hstack([v_b, motion.omega_eb_b, np.ones((pings.size, 1))])
         weight = covered / (sigma**2).mean(axis=1)
         y = dvl.velocity[pings]
         xw = x * weight[:, None]
-        moments = _Moments(xw.T @ x, xw.T @ y, float(weight @ (y**2).sum(axis=1)))
-        return _best(moments, priors)
+        return _Moments(xw.T @ x, xw.T @ y, float(weight @ (y**2).sum(axis=1)))
 
     offset_prior = priors[TIME_OFFSET]
     offset = float(offset_prior.mean[0])
     if offset_prior.estimated:
         reach = min(4.0 * float(offset_prior.sigma[0]), _OFFSET_REACH)
         for step in (_OFFSET_STEP, _OFFSET_FINE):
-            grid = offset + np.arange(-np.ceil(reach / step), np.ceil(reach / step) + 1) * step
-            offset = float(grid[np.argmin([at_offset(t)[0] for t in grid])])
+            count = int(np.ceil(reach / step))
+            grid = offset + np.arange(-count, count + 1) * step
+            offset = float(grid[np.argmin([_linear_misfit(moments(t)) for t in grid])])
             reach = 2.0 * step
         values[TIME_OFFSET] = np.array([offset])
-    _, best = at_offset(offset)
+    best = _best(moments(offset), priors)
     values[MISALIGNMENT] = best.dRb
     values[SCALE_ERROR] = best.scale - 1.0
     values[LEVER_ARM] = best.lever_arm
@@ -106,8 +106,20 @@ def initial_mounting(
     return values
 
 
-def _best(moments: _Moments, priors: dict[str, Parameter]) -> tuple[float, _Mounting]:
-    """Return cost and mounting of the best of many starts."""
+def _linear_misfit(moments: _Moments) -> float:
+    """Return the misfit of v_d = M v_b + N omega + beta with the best free M, N, beta."""
+    theta = _least_squares(moments)
+    return moments.yy - float(np.sum(theta.T * moments.xy))
+
+
+def _least_squares(moments: _Moments) -> Array:
+    """Return [M N beta], (3, 7)."""
+    ridge = np.diag(1e-9 * np.trace(moments.xx) * np.ones(7))
+    return np.asarray(np.linalg.solve(moments.xx + ridge, moments.xy).T, dtype=float)
+
+
+def _best(moments: _Moments, priors: dict[str, Parameter]) -> _Mounting:
+    """Return the best mounting of many starts."""
     prior = _Mounting(
         exp_so3(priors[MISALIGNMENT].mean),
         1.0 + priors[SCALE_ERROR].mean,
@@ -120,7 +132,7 @@ def _best(moments: _Moments, priors: dict[str, Parameter]) -> tuple[float, _Moun
             _Mounting(R, prior.scale, prior.lever_arm, prior.bias)
             for R in Rotation.create_group("O").as_matrix()
         ]
-    return min((_descend(moments, s, priors) for s in starts), key=lambda r: r[0])
+    return min((_descend(moments, s, priors) for s in starts), key=lambda r: r[0])[1]
 
 
 def _closed_form(moments: _Moments, prior: _Mounting) -> list[_Mounting]:
@@ -128,8 +140,7 @@ def _closed_form(moments: _Moments, prior: _Mounting) -> list[_Mounting]:
 
     Wahba's solution alone would take the lever arm's share for a misalignment.
     """
-    ridge = np.diag(1e-9 * np.trace(moments.xx) * np.ones(7))
-    theta = np.linalg.solve(moments.xx + ridge, moments.xy).T
+    theta = _least_squares(moments)
     M, N = theta[:, :3], theta[:, 3:6]
     u, s, vt = np.linalg.svd(M)
     if s[2] < _LEAST_SCALE or np.linalg.det(M) < 0:

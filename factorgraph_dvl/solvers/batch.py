@@ -10,12 +10,14 @@ import numpy as np
 from factorgraph_dvl.alignment import initial_states
 from factorgraph_dvl.earth import LocalFrame
 from factorgraph_dvl.errors import ConfigError
-from factorgraph_dvl.graph import Problem, inertial_chain
+from factorgraph_dvl.graph import Chain, Problem, inertial_chain
 from factorgraph_dvl.increments import increments
 from factorgraph_dvl.mounting import initial_mounting
 from factorgraph_dvl.preintegration import Segments, States, attach, motion_at, segments
 from factorgraph_dvl.sensors.protocol import Aid, Motion, Observation, Parameter
 from factorgraph_dvl.solution import Solution
+from factorgraph_dvl.solvers.covariance import posterior
+from factorgraph_dvl.solvers.feigned import at_prior_along, feigned_directions
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, Progress, minimise
 from factorgraph_dvl.solvers.summary import summarise
 from factorgraph_dvl.trial import Trial
@@ -23,8 +25,9 @@ from factorgraph_dvl.trial import Trial
 # States this far apart, s, are as good as denser ones: every measurement hangs on the
 # state before it through the increments up to its own time.
 STATE_INTERVAL = 1.0
-# Gravity was taken at positions that are wrong by no more than this, m.
-_SAME_GRAVITY = 30.0
+# Root mean square error of the positions at which gravity was taken, m: 1 m turns it by
+# 0.16 micro-g.
+_SAME_GRAVITY = 2.0
 # The first stage only prepares the second.
 _ROUGH = 1.0
 _ROUGH_ITERATIONS = 10
@@ -75,12 +78,11 @@ def solve(
     states, values = start.states, None
     iterations = 0
     for _ in range(_ROUNDS):
+        p_gravity = states.p_n
         chain = inertial_chain(trial, frame, seg, states)
         if values is None:
             if trial.gnss is not None:
-                coarse = _problem_minimum(
-                    Problem(chain, *_sensors([trial.gnss], frame)), states, {}, report
-                )
+                coarse = _without_dvl(chain, states, report)
                 iterations += coarse.iterations
                 states = coarse.evaluation.states
             report("mounting", 0, None)
@@ -89,22 +91,32 @@ def solve(
         at = problem.values(states, {**problem.prior_values(), **values})
         minimum = minimise(problem, at, stage="all sensors", progress=report)
         iterations += minimum.iterations
-        moved = np.abs(minimum.evaluation.states.p_n - states.p_n).max()
         states, values = minimum.evaluation.states, minimum.evaluation.parameters
-        if moved < _SAME_GRAVITY:
+        if np.sqrt(np.mean((states.p_n - p_gravity) ** 2)) < _SAME_GRAVITY:
             break
     report("covariance", 0, None)
+    covariances = posterior(problem, minimum)
+    held = feigned_directions(problem, minimum, covariances)
+    if held.size:
+        origin = at_prior_along(problem, minimum.evaluation.parameters, held)
+        problem.hold(held, origin)
+        at = problem.values(states, origin)
+        minimum = minimise(
+            problem, at, stage="all sensors, without what they cannot tell", progress=report
+        )
+        iterations += minimum.iterations
+        covariances = posterior(problem, minimum)
     minimum = replace(minimum, iterations=iterations)
-    return summarise(problem, minimum, rate_hz=rate_hz, notes=notes)
+    return summarise(problem, minimum, covariances, held=held, rate_hz=rate_hz, notes=notes)
 
 
-def _problem_minimum(
-    problem: Problem, states: States, values: dict[str, np.ndarray], report: Progress
-) -> Minimum:
-    at = problem.values(states, {**problem.prior_values(), **values})
+def _without_dvl(chain: Chain, states: States, report: Progress) -> Minimum:
+    trial = chain.trial
+    assert trial.gnss is not None
+    problem = Problem(chain, *_sensors([trial.gnss], chain.frame))
     return minimise(
         problem,
-        at,
+        problem.values(states, problem.prior_values()),
         stage="inertial and GNSS",
         progress=report,
         max_iterations=_ROUGH_ITERATIONS,

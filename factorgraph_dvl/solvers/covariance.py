@@ -14,7 +14,10 @@ import gtsam
 import numpy as np
 from scipy.linalg.lapack import dtrtrs
 
+from factorgraph_dvl import keys
 from factorgraph_dvl.conventions import Array
+from factorgraph_dvl.graph import Problem
+from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, eliminate
 
 
 @dataclass(frozen=True)
@@ -137,6 +140,30 @@ class SquareRootInformation:
                     block = P[place[key], place[key]]
                     out[key] = 0.5 * (block + block.T)
         return out
+
+
+@dataclass(frozen=True)
+class Posterior:
+    """Covariances at a minimum.
+
+    Parameters
+    ----------
+    information : of all variables.
+    nodes : (K, 9, 9) covariances of the states, in GTSAM's tangent space.
+    """
+
+    information: SquareRootInformation
+    nodes: Array
+
+
+def posterior(problem: Problem, minimum: Minimum) -> Posterior:
+    """Return the covariances at a minimum."""
+    sizes = minimum.evaluation.values.dims()
+    tree = eliminate(minimum.gaussian, minimum.ordering)
+    information = SquareRootInformation(tree, sizes)
+    wanted = [keys.node(k) for k in range(problem.chain.segments.node_time.size)]
+    marginals = information.marginals(wanted)
+    return Posterior(information, np.stack([marginals[key] for key in wanted]))
 
 
 def _range(s: slice) -> np.ndarray:

@@ -21,8 +21,8 @@ from factorgraph_dvl.graph import Problem
 from factorgraph_dvl.preintegration import States, attach, motion_at, segment_ends
 from factorgraph_dvl.sensors.protocol import Motion, Parameter
 from factorgraph_dvl.solution import Estimate, Residuals, Solution, Trajectory
-from factorgraph_dvl.solvers.covariance import SquareRootInformation
-from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, eliminate
+from factorgraph_dvl.solvers.covariance import Posterior, SquareRootInformation
+from factorgraph_dvl.solvers.levenberg_marquardt import Minimum
 
 # The data observed a component if they at least halved what was unknown of it.
 _OBSERVABLE = 0.5
@@ -32,23 +32,29 @@ _FIRST = ("misalignment", "scale_error", "lever_arm", "gyro_bias", "accel_bias")
 
 
 def summarise(
-    problem: Problem, minimum: Minimum, *, rate_hz: float, notes: Sequence[str]
+    problem: Problem,
+    minimum: Minimum,
+    covariances: Posterior,
+    *,
+    held: Array,
+    rate_hz: float,
+    notes: Sequence[str],
 ) -> Solution:
     """Return the solution at a minimum.
 
     Parameters
     ----------
-    problem, minimum : what was minimised, and where it ended.
+    problem, minimum, covariances : what was minimised, and where it ended.
+    held : (P, h) directions of the parameters in which the prior was held because the
+        data say nothing; in units of the priors' standard deviations.
     rate_hz : rate of the trajectory.
     notes : what is already known to be worth telling.
     """
     chain = problem.chain
     trial = chain.trial
     evaluation = minimum.evaluation
-    sizes = evaluation.values.dims()
-    information = SquareRootInformation(eliminate(minimum.gaussian, minimum.ordering), sizes)
-    estimates, covariance = _calibration(problem, minimum, information)
-    trajectory = _trajectory(problem, evaluation.states, information, rate_hz)
+    estimates, covariance = _calibration(problem, minimum, covariances.information, held)
+    trajectory = _trajectory(problem, evaluation.states, covariances.nodes, rate_hz)
     residuals = _residuals(problem, minimum)
     warnings = [*notes]
     if not minimum.converged:
@@ -75,7 +81,7 @@ def summarise(
 
 
 def _calibration(
-    problem: Problem, minimum: Minimum, information: SquareRootInformation
+    problem: Problem, minimum: Minimum, information: SquareRootInformation, held: Array
 ) -> tuple[tuple[Estimate, ...], Array]:
     chain, evaluation = problem.chain, minimum.evaluation
     time = chain.segments.node_time
@@ -105,10 +111,13 @@ def _calibration(
 
     free = [f for _, _, f in rows if f is not None]
     joint = information.covariance_of(free)
+    joint = joint + _prior_in(problem, held, free)
     total = sum(p.mean.size for p, _, _ in rows)
     covariance = np.zeros((total, total))
     is_free = np.concatenate([np.full(p.mean.size, f is not None) for p, _, f in rows])
     covariance[np.ix_(is_free, is_free)] = joint
+    known = np.concatenate([p.sigma == 0.0 for p, _, _ in rows])
+    covariance[known] = covariance[:, known] = 0.0
     std = np.sqrt(np.diag(covariance))
     estimates, at = [], 0
     for p, value, _ in rows:
@@ -129,6 +138,22 @@ def _calibration(
     return tuple(estimates), covariance
 
 
+def _prior_in(problem: Problem, held: Array, functionals: Sequence[dict[int, Array]]) -> Array:
+    """Return the prior covariance of functionals along the held directions."""
+    spread = problem.prior_sigma[:, None] * held if held.size else held
+    by_key = {problem.key(name): spread[place] for name, place in problem.columns.items()}
+    parts = []
+    for functional in functionals:
+        rows = next(iter(functional.values())).shape[0]
+        part = np.zeros((rows, held.shape[1]))
+        for key, matrix in functional.items():
+            if key in by_key:
+                part += matrix @ by_key[key]
+        parts.append(part)
+    stacked = np.concatenate(parts)
+    return stacked @ stacked.T
+
+
 def _mean_weights(time: Array) -> Array:
     """Return weights of the nodes in the mean over time."""
     step = np.diff(time)
@@ -136,9 +161,7 @@ def _mean_weights(time: Array) -> Array:
     return np.asarray(weight / weight.sum())
 
 
-def _trajectory(
-    problem: Problem, states: States, information: SquareRootInformation, rate_hz: float
-) -> Trajectory:
+def _trajectory(problem: Problem, states: States, P: Array, rate_hz: float) -> Trajectory:
     chain = problem.chain
     seg, frame, body_axes = chain.segments, chain.frame, chain.trial.body_axes
     time = _output_times(problem, rate_hz)
@@ -149,8 +172,6 @@ def _trajectory(
     rph = rph_from_rotation(nRb, body_axes)
 
     n = seg.node_time.size
-    marginals = information.marginals([keys.node(k) for k in range(n)])
-    P = np.stack([marginals[keys.node(k)] for k in range(n)])
     # GTSAM's tangent space is in body axes, which differ from node to node; n does not.
     P_n = P.reshape(n, 3, 3, 3, 3)
     P_n = np.einsum("kia,kxayb,kjb->kxiyj", states.nRb, P_n, states.nRb)
