@@ -1,0 +1,138 @@
+"""Imports go down the layers only, never up: the order is stated here, as data."""
+
+from __future__ import annotations
+
+import ast
+from pathlib import Path
+
+import pytest
+
+import factorgraph_dvl
+
+PACKAGE = Path(factorgraph_dvl.__file__).parent
+
+# Each line may import from the lines before it, and from its own line only within one
+# package. `a.b` stands for a module or a whole package.
+LAYERS = (
+    ("conventions", "errors"),
+    ("earth",),
+    ("sensors",),
+    ("trial", "solution"),
+    ("io", "simulation"),
+    ("increments",),
+    ("preintegration",),
+    ("keys",),
+    ("alignment", "mounting"),
+    ("graph",),
+    ("solvers",),
+    ("analysis",),
+    ("report",),
+    ("cli",),
+)
+# On top of the order: what must not know of each other.
+FORBIDDEN = {
+    "io": ("simulation", "increments"),
+    "simulation": ("io", "increments", "preintegration", "graph", "solvers", "analysis"),
+    "solvers": ("io", "simulation", "analysis", "report"),
+    "analysis": ("solvers", "graph", "keys", "preintegration", "increments", "simulation", "io"),
+    "report": ("solvers", "graph", "keys", "preintegration", "simulation", "io"),
+    "alignment": ("mounting", "graph", "keys"),
+    "mounting": ("alignment", "graph", "keys", "preintegration"),
+    "preintegration": ("keys",),
+}
+# The graph asks every sensor through the protocol and knows none by name.
+NAMELESS = ("graph", "preintegration", "keys", "solvers")
+# Only where they are used: GTSAM, SciPy and Matplotlib take most of a second to load.
+LAZY_FOR_CLI = tuple(layer for line in LAYERS[1:-1] for layer in line)
+
+LEVEL = {name: i for i, line in enumerate(LAYERS) for name in line}
+MODULES = sorted(
+    path.relative_to(PACKAGE).with_suffix("").parts
+    for path in PACKAGE.rglob("*.py")
+    if path != PACKAGE / "__init__.py"
+)
+
+
+def read(parts):
+    path = PACKAGE.joinpath(*parts).with_suffix(".py")
+    return ast.parse(path.read_text(encoding="utf-8"))
+
+
+def imported(tree):
+    """Names within the package that a module imports, dotted, wherever in it."""
+    out = []
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            names = [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, "relative imports hide the layer"
+            names = [f"{node.module}.{alias.name}" for alias in node.names]
+        else:
+            continue
+        out += [
+            n.removeprefix("factorgraph_dvl.") for n in names if n.startswith("factorgraph_dvl.")
+        ]
+    return out
+
+
+def layer_of(name):
+    return name.split(".")[0]
+
+
+def test_every_module_has_a_layer():
+    assert {parts[0] for parts in MODULES} == set(LEVEL)
+
+
+@pytest.mark.parametrize("parts", MODULES, ids=".".join)
+def test_imports_go_down(parts):
+    own = parts[0]
+    for name in imported(read(parts)):
+        other = layer_of(name)
+        if other == "__version__":
+            continue
+        where = f"{'.'.join(parts)} imports {name}"
+        assert other in LEVEL, where
+        assert other == own or LEVEL[other] < LEVEL[own], where
+        assert other not in FORBIDDEN.get(own, ()), where
+        if own in NAMELESS and other == "sensors":
+            assert name.startswith(("sensors.protocol.", "sensors.imu.ImuSettings")), where
+
+
+def test_sensors_know_only_the_protocol():
+    for parts in MODULES:
+        if parts[0] == "sensors":
+            others = [n for n in imported(read(parts)) if layer_of(n) == "sensors"]
+            assert all(n.startswith("sensors.protocol.") for n in others), parts
+
+
+def test_simulation_takes_no_measurement_model_from_the_sensors():
+    allowed = ("Settings", "Imu", "Gnss", "Dvl")
+    for parts in MODULES:
+        if parts[0] == "simulation":
+            for name in imported(read(parts)):
+                module, _, last = name.rpartition(".")
+                if module.startswith("sensors.") and module != "sensors.protocol":
+                    assert last.endswith(allowed), f"{'.'.join(parts)} imports {name}"
+
+
+def test_nothing_but_the_command_line_imports_it():
+    for parts in [*MODULES, ("__init__",)]:
+        if parts != ("cli",):
+            assert "cli" not in map(layer_of, imported(read(parts))), parts
+
+
+def test_the_command_line_and_the_package_load_lazily():
+    for parts in (("cli",), ("__init__",)):
+        at_the_top = ast.Module(
+            [node for node in read(parts).body if isinstance(node, (ast.Import, ast.ImportFrom))],
+            [],
+        )
+        eager = set(map(layer_of, imported(at_the_top)))
+        assert not eager & set(LAZY_FOR_CLI), parts
+
+
+def test_only_keys_makes_symbols():
+    for parts in MODULES:
+        source = PACKAGE.joinpath(*parts).with_suffix(".py").read_text(encoding="utf-8")
+        if parts != ("keys",):
+            assert "symbol" not in source.replace("no symbol", ""), parts
