@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from pathlib import Path
 from time import perf_counter
@@ -49,6 +50,9 @@ def main(argv: list[str] | None = None) -> NoReturn:
     argv : arguments; by default those of the process.
     """
     args = sys.argv[1:] if argv is None else argv
+    # All matrices are small: more threads only wait for one another.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
     for stream in (sys.stdout, sys.stderr):
         # A terminal that knows no µ shall not fail a run.
         if hasattr(stream, "reconfigure"):
