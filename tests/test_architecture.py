@@ -22,6 +22,7 @@ LAYERS = (
     ("increments",),
     ("preintegration",),
     ("keys",),
+    ("chain",),
     ("alignment", "mounting"),
     ("graph",),
     ("solvers",),
@@ -41,7 +42,7 @@ FORBIDDEN = {
     "preintegration": ("keys",),
 }
 # The graph asks every sensor through the protocol and knows none by name.
-NAMELESS = ("graph", "preintegration", "keys", "solvers")
+NAMELESS = ("graph", "chain", "preintegration", "keys", "solvers")
 # Only where they are used: GTSAM, SciPy and Matplotlib take most of a second to load.
 LAZY_FOR_CLI = tuple(layer for line in LAYERS[1:-1] for layer in line)
 

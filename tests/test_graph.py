@@ -10,8 +10,9 @@ import pytest
 from truth import exact_states, scenario
 
 from factorgraph_dvl import keys
+from factorgraph_dvl.chain import inertial_chain
 from factorgraph_dvl.conventions import DEG, exp_so3, rotation_from_rph
-from factorgraph_dvl.graph import Problem, inertial_chain
+from factorgraph_dvl.graph import Problem
 from factorgraph_dvl.increments import increments
 from factorgraph_dvl.preintegration import segments
 from factorgraph_dvl.simulation import simulate

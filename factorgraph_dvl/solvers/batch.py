@@ -8,9 +8,10 @@ from dataclasses import replace
 import numpy as np
 
 from factorgraph_dvl.alignment import initial_states
+from factorgraph_dvl.chain import Chain, inertial_chain
 from factorgraph_dvl.earth import LocalFrame
 from factorgraph_dvl.errors import ConfigError
-from factorgraph_dvl.graph import Chain, Problem, inertial_chain
+from factorgraph_dvl.graph import Problem
 from factorgraph_dvl.increments import increments
 from factorgraph_dvl.mounting import initial_mounting
 from factorgraph_dvl.preintegration import Segments, States, attach, motion_at, segments
