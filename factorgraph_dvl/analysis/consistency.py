@@ -17,12 +17,12 @@ from factorgraph_dvl.conventions import (
     rph_from_rotation,
 )
 from factorgraph_dvl.earth import radii
-from factorgraph_dvl.solution import Estimate, Solution
+from factorgraph_dvl.solution import Estimate, Solution, Trajectory
 from factorgraph_dvl.trial import Reference
 
 _COINCIDENT_S = 1e-6
 _LONGEST_INTERVAL_S = 0.05
-_ROTATION_VECTORS = ("misalignment_deg", "star_mounting_deg")
+ROTATION_VECTORS = ("misalignment_deg", "star_mounting_deg")
 _PAPER_PARAMETERS = ("misalignment_deg", "scale_error", "lever_arm_m")
 
 
@@ -143,7 +143,11 @@ def trajectory_errors(solution: Solution, reference: Reference) -> TrajectoryErr
     -------
     TrajectoryErrors of M <= N epochs.
     """
-    trajectory = solution.trajectory
+    return motion_errors(solution.trajectory, reference)
+
+
+def motion_errors(trajectory: Trajectory, reference: Reference) -> TrajectoryErrors:
+    """Return the errors of a motion against another; see `trajectory_errors`."""
     epochs, truth = _reference_at(reference, trajectory.time)
     lat, lon, height = trajectory.geodetic[epochs].T
     meridian, prime_vertical = radii(truth.geodetic[:, 0])
@@ -226,8 +230,8 @@ def true_value_of(estimate: Estimate, truth: Mapping[str, ArrayLike]) -> Array |
     if value.size not in (1, estimate.value.size):
         return None
     value = np.broadcast_to(value, estimate.value.shape).copy()
-    if estimate.name in _ROTATION_VECTORS:
-        return _nearest_rotation_vector(value, estimate.value)
+    if estimate.name in ROTATION_VECTORS:
+        return nearest_rotation_vector(value, estimate.value)
     return value
 
 
@@ -294,8 +298,11 @@ def _wrap(angle: Array) -> Array:
     return (angle + np.pi) % (2.0 * np.pi) - np.pi
 
 
-def _nearest_rotation_vector(phi: Array, near: Array) -> Array:
-    """Return the rotation vector (3,), deg, of the same rotation that is nearer to `near`."""
+def nearest_rotation_vector(phi: Array, near: Array) -> Array:
+    """Return the rotation vector (3,), deg, of the same rotation that is nearer to `near`.
+
+    Near 180 deg two vectors, of opposite sign and 360 deg apart, mean the same.
+    """
     angle = float(np.linalg.norm(phi))
     if angle == 0.0:
         return phi

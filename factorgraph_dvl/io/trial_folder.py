@@ -27,7 +27,7 @@ from factorgraph_dvl.sensors import imu as imu_columns
 from factorgraph_dvl.sensors.dvl import Dvl, DvlSettings
 from factorgraph_dvl.sensors.gnss import Gnss, GnssSettings
 from factorgraph_dvl.sensors.imu import Imu, ImuSettings
-from factorgraph_dvl.trial import InitialAttitude, InitialPosition, Trial
+from factorgraph_dvl.trial import InitialAttitude, InitialPosition, Reference, Trial
 
 SETTINGS_FILE = "trial.yaml"
 TRUTH_FILE = "truth.json"
@@ -62,11 +62,7 @@ def load_trial(path: Path | str) -> Trial:
     DataError
         If a table is missing or does not hold what it should.
     """
-    path = Path(path)
-    if not path.exists():
-        raise DataError("the trial does not exist", where=str(path), expected="a trial folder")
-    file = path / SETTINGS_FILE if path.is_dir() else path
-    folder = file.parent
+    folder, file = _locate(Path(path))
     settings = parse_yaml(read_text(file), TrialSettings, source=file.name)
     initial = settings.initial
     return Trial(
@@ -78,17 +74,35 @@ def load_trial(path: Path | str) -> Trial:
         epoch=settings.epoch,
         initial_attitude=None if initial is UNSET else _attitude(initial),
         initial_position=None if initial is UNSET else _position(initial),
-        reference=(
-            None
-            if settings.reference is UNSET
-            else read_reference(folder / settings.reference.file, settings.reference.file)
-        ),
+        reference=_reference(folder, settings),
         calibration_truth=_read_truth(folder / TRUTH_FILE),
         notes=tuple(
             f"section `{name}` of {file.name} is not used by this version"
             for name in settings.unused
         ),
     )
+
+
+def load_reference(path: Path | str) -> tuple[Reference | None, dict[str, Array]]:
+    """Read what a trial folder has to compare with, and none of its sensors.
+
+    Parameters
+    ----------
+    path : of the folder, or of the trial.yaml in it.
+
+    Returns
+    -------
+    The reference, None if there is none, and the true calibration, empty if there is
+    none.
+
+    Raises
+    ------
+    ConfigError, DataError
+        As `load_trial`.
+    """
+    folder, file = _locate(Path(path))
+    settings = parse_yaml(read_text(file), TrialSettings, source=file.name)
+    return _reference(folder, settings), _read_truth(folder / TRUTH_FILE)
 
 
 def save_trial(
@@ -121,6 +135,20 @@ def save_trial(
         if trial.calibration_truth:
             (folder / TRUTH_FILE).write_bytes(_truth_json(trial.calibration_truth))
         (folder / SETTINGS_FILE).write_text(to_yaml(_settings(trial, suffix)), encoding="utf-8")
+
+
+def _locate(path: Path) -> tuple[Path, Path]:
+    """Return a trial's folder and its trial.yaml."""
+    if not path.exists():
+        raise DataError("the trial does not exist", where=str(path), expected="a trial folder")
+    file = path / SETTINGS_FILE if path.is_dir() else path
+    return file.parent, file
+
+
+def _reference(folder: Path, settings: TrialSettings) -> Reference | None:
+    if settings.reference is UNSET:
+        return None
+    return read_reference(folder / settings.reference.file, settings.reference.file)
 
 
 def _read_imu(folder: Path, settings: ImuSettings) -> Imu:

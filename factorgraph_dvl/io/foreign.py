@@ -1,0 +1,292 @@
+"""Results from elsewhere: a table of motion, or calibration values in JSON or YAML."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from msgspec import UNSET, UnsetType
+
+from factorgraph_dvl.conventions import DEG, Array, BodyAxes
+from factorgraph_dvl.errors import ConfigError, DataError
+from factorgraph_dvl.io.motion_table import read_reference
+from factorgraph_dvl.io.solution_folder import (
+    CALIBRATION_FILE,
+    STD_COLUMNS,
+    TRAJECTORY_FILE,
+    load_solution,
+)
+from factorgraph_dvl.io.tables import read_table, stack
+from factorgraph_dvl.io.trial_folder import SETTINGS_FILE, TRUTH_FILE
+from factorgraph_dvl.io.yaml_file import parse_yaml, read_text
+from factorgraph_dvl.sensors.protocol import Parameter, Section, check_range
+from factorgraph_dvl.solution import Estimate, Solution, Trajectory
+
+_TABLES = (".csv", ".parquet", ".pq")
+_TEXTS = (".json", ".yaml", ".yml")
+_STD_GROUPS = {"m": STD_COLUMNS[0:3], "m/s": STD_COLUMNS[3:6], "deg": STD_COLUMNS[6:9]}
+# Reported names: stem, unit, and the components that each possible number of them has.
+_KNOWN: dict[str, tuple[str, str, tuple[tuple[str, ...], ...]]] = {
+    "misalignment_deg": ("misalignment", "deg", (("x", "y", "z"),)),
+    "scale_error": ("scale_error", "", (("",), ("x", "y", "z"))),
+    "lever_arm_m": ("lever_arm", "m", (("x", "y", "z"),)),
+    "gyro_bias_deg_h": ("gyro_bias", "deg_h", (("x", "y", "z"),)),
+    "accel_bias_ug": ("accel_bias", "ug", (("x", "y", "z"),)),
+    "gnss_lever_arm_m": ("gnss_lever_arm", "m", (("x", "y", "z"),)),
+    "dvl_bias_m_s": ("dvl_bias", "m_s", (("x", "y", "z"),)),
+    "time_offset_s": ("time_offset", "s", (("",),)),
+    "current_m_s": ("current", "m_s", (("e", "n"),)),
+}
+
+_Numbers = float | list[float | None]
+
+
+class _Value(Section, frozen=True, kw_only=True):
+    """Values with standard deviations; null stands for a number that is not known."""
+
+    value: _Numbers
+    std: _Numbers | UnsetType = UNSET
+    observable: bool | list[bool] | UnsetType = UNSET
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if any(std < 0.0 for std in _array(self.std)):
+            raise ValueError("`std` must be 0 or more")
+
+
+_Given = _Numbers | _Value | UnsetType
+
+
+class _Parameters(Section, frozen=True, kw_only=True):
+    misalignment_deg: _Given = UNSET
+    scale_error: _Given = UNSET
+    lever_arm_m: _Given = UNSET
+    gyro_bias_deg_h: _Given = UNSET
+    accel_bias_ug: _Given = UNSET
+    gnss_lever_arm_m: _Given = UNSET
+    dvl_bias_m_s: _Given = UNSET
+    time_offset_s: _Given = UNSET
+    current_m_s: _Given = UNSET
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name, (_, _, choices) in _KNOWN.items():
+            given = getattr(self, name)
+            if given is not UNSET:
+                _check_sizes(name, _as_value(given), [len(labels) for labels in choices])
+
+    def given(self) -> dict[str, _Value]:
+        """Return what is there, by name."""
+        found = {name: getattr(self, name) for name in _KNOWN}
+        return {name: _as_value(g) for name, g in found.items() if g is not UNSET}
+
+
+class _File(_Parameters, frozen=True, kw_only=True):
+    trial: str = ""
+    solver: str = ""
+    body_axes: BodyAxes | UnsetType = UNSET
+    trajectory: str = ""
+    parameters: _Parameters | UnsetType = UNSET
+
+
+def load_results(path_a: Path | str, path_b: Path | str) -> tuple[Solution, Solution]:
+    """Read two results, each of this program or of another.
+
+    Parameters
+    ----------
+    path_a, path_b : each of a solution folder; of a CSV or Parquet table with the columns of
+        `reference` and, optionally, those of the standard deviations; or of a JSON or
+        YAML file of calibration values.
+
+    Returns
+    -------
+    Two Solutions. One from elsewhere has nan for what the file does not say, no epochs
+    without a table, no estimates without calibration values, no correlations, and the
+    body axes of the other result unless the file says which.
+
+    Raises
+    ------
+    ConfigError, DataError
+        If there is no such result, or it does not hold what it should.
+    """
+    (a, a_says), (b, b_says) = _load(Path(path_a)), _load(Path(path_b))
+    if not a_says:
+        a = replace(a, body_axes=b.body_axes)
+    if not b_says:
+        b = replace(b, body_axes=a.body_axes)
+    return a, b
+
+
+def _load(path: Path) -> tuple[Solution, bool]:
+    """Return a result, and whether it says in which body axes it is."""
+    if path.name == CALIBRATION_FILE and (path.parent / TRAJECTORY_FILE).exists():
+        path = path.parent
+    if path.is_dir():
+        if not (path / CALIBRATION_FILE).exists() and (path / SETTINGS_FILE).exists():
+            raise DataError(
+                "is a trial folder",
+                where=str(path),
+                expected="a solution folder, or a file of results from elsewhere",
+                hint=f"Solve it first: factorgraph-dvl solve {path} --out DIR",
+            )
+        return load_solution(path), True
+    suffix = path.suffix.lower()
+    if not path.exists():
+        raise DataError(
+            "the result does not exist",
+            where=str(path),
+            expected="a solution folder, or a file of results from elsewhere",
+        )
+    if suffix in _TABLES:
+        return _elsewhere(_File(), _read_trajectory(path)), False
+    if suffix in _TEXTS:
+        file = _read_calibration(path)
+        table = path.parent / file.trajectory
+        motion = _read_trajectory(table) if file.trajectory else _no_trajectory()
+        return _elsewhere(file, motion), file.body_axes is not UNSET
+    raise DataError(
+        f"the suffix `{suffix}` says nothing" if suffix else "has no suffix",
+        where=str(path),
+        expected=f"{', '.join(_TABLES)} for a trajectory, {', '.join(_TEXTS)} for a calibration",
+    )
+
+
+def read_truth(path: Path | str) -> dict[str, Array]:
+    """Read true calibration values, in the format of calibration values from elsewhere.
+
+    Parameters
+    ----------
+    path : of a JSON or YAML file, such as the `truth.json` of a trial folder.
+
+    Returns
+    -------
+    Name to (n,) values, in reported units. Standard deviations are ignored.
+
+    Raises
+    ------
+    ConfigError, DataError
+        If the file does not hold such values.
+    """
+    path = Path(path)
+    if path.suffix.lower() not in _TEXTS:
+        raise DataError(
+            "is not a file of calibration values",
+            where=str(path),
+            expected=f"JSON or YAML, such as {TRUTH_FILE}",
+        )
+    return {name: _array(value.value) for name, value in _given(_read_calibration(path)).items()}
+
+
+def _read_calibration(path: Path) -> _File:
+    text = read_text(path)
+    if path.suffix.lower() == ".json":
+        text = _checked_json(text, path.name)
+    file = parse_yaml(text, _File, source=path.name)
+    top, nested = file.given(), file.parameters is not UNSET
+    if top and nested:
+        raise ConfigError(
+            f"there is `parameters` and `{next(iter(top))}` beside it",
+            where=path.name,
+            expected="all values in `parameters`, or none",
+        )
+    if not _given(file):
+        raise ConfigError(
+            "there are no calibration values", where=path.name, expected=", ".join(_KNOWN)
+        )
+    return file
+
+
+def _checked_json(text: str, source: str) -> str:
+    """Return JSON as YAML can read it; raise ConfigError if it is not JSON."""
+    try:
+        json.loads(text)
+    except json.JSONDecodeError as error:
+        raise ConfigError(
+            f"not valid JSON: {error.msg}", where=f"{source} line {error.lineno}"
+        ) from None
+    except RecursionError:
+        raise ConfigError("nested too deeply", where=source) from None
+    # YAML forbids tabs between tokens; within the strings of JSON there can be none.
+    return text.replace("\t", " ")
+
+
+def _given(file: _File) -> dict[str, _Value]:
+    return file.given() if isinstance(file.parameters, UnsetType) else file.parameters.given()
+
+
+def _elsewhere(file: _File, trajectory: Trajectory) -> Solution:
+    estimates = tuple(_estimate(name, value) for name, value in _given(file).items())
+    std = np.concatenate([np.zeros(0), *(e.std for e in estimates)])
+    return Solution(
+        trial=file.trial,
+        solver=file.solver,
+        body_axes="RFU" if isinstance(file.body_axes, UnsetType) else file.body_axes,
+        converged=True,
+        iterations=0,
+        cost=float("nan"),
+        estimates=estimates,
+        covariance=np.diag(std**2),
+        trajectory=trajectory,
+    )
+
+
+def _estimate(name: str, given: _Value) -> Estimate:
+    value, std = _array(given.value), _array(given.std)
+    unknown = np.full(value.size, np.nan)
+    stem, unit, choices = _KNOWN[name]
+    labels = next(labels for labels in choices if len(labels) == value.size)
+    observable = True if isinstance(given.observable, UnsetType) else given.observable
+    return Estimate(
+        name,
+        Parameter(stem, unit, 1.0, value, unknown, labels=labels).component_names,
+        value,
+        std if std.size else unknown,
+        unknown,
+        unknown,
+        np.broadcast_to(np.asarray(observable, dtype=bool), value.shape).copy(),
+    )
+
+
+def _read_trajectory(path: Path) -> Trajectory:
+    motion = read_reference(path)
+    columns = read_table(path, ("time_s",), tuple(_STD_GROUPS.values()))
+    for unit, group in _STD_GROUPS.items():
+        check_range({name: columns[name] for name in group}, 1e-12, 1e6, unit, path.name)
+    position, velocity, rph = (_diagonal(stack(columns, g)) for g in _STD_GROUPS.values())
+    return Trajectory(
+        motion.time, motion.geodetic, motion.velocity, motion.rph, position, velocity, rph * DEG**2
+    )
+
+
+def _no_trajectory() -> Trajectory:
+    none, square = np.zeros((0, 3)), np.zeros((0, 3, 3))
+    return Trajectory(np.zeros(0), none, none, none, square, square, square)
+
+
+def _diagonal(std: Array) -> Array:
+    out = np.zeros((*std.shape, 3))
+    out[:, range(3), range(3)] = std**2
+    return out
+
+
+def _check_sizes(name: str, value: _Value, sizes: list[int]) -> None:
+    expected = " or ".join(map(str, sizes))
+    n = _array(value.value).size
+    if n not in sizes:
+        raise ValueError(f"`{name}` must have {expected} numbers, not {n}")
+    if value.std is not UNSET and _array(value.std).size != n:
+        raise ValueError(f"`{name}` must have as many numbers in `std` as in `value`, {n}")
+    if isinstance(value.observable, list) and len(value.observable) != n:
+        raise ValueError(f"`{name}` must have {n} entries in `observable`")
+
+
+def _as_value(given: _Numbers | _Value) -> _Value:
+    return given if isinstance(given, _Value) else _Value(value=given)
+
+
+def _array(numbers: _Numbers | UnsetType) -> Array:
+    if isinstance(numbers, UnsetType):
+        return np.zeros(0)
+    return np.atleast_1d(np.array(numbers, dtype=float))
