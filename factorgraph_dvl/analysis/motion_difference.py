@@ -20,6 +20,7 @@ COMPONENTS = (
 )
 # Share of a normal distribution within two standard deviations.
 TWO_SIGMA_SHARE = 0.954
+_OTHER: dict[Side | None, Side | None] = {"A": "B", "B": "A", None: None}
 _REPORTED = np.repeat([1.0, 1.0, 1.0 / DEG], 3)
 
 
@@ -84,7 +85,7 @@ def compare_motions(
     if a.time.size == 0 or b.time.size == 0:
         return None
     if _interval(a) < _interval(b):
-        swapped = compare_motions(b, a, {"A": "B", "B": "A", None: None}[efficient])  # type: ignore[arg-type]
+        swapped = compare_motions(b, a, _OTHER[efficient])
         return None if swapped is None else replace(swapped, difference=-swapped.difference)
     errors = motion_errors(a, Reference(b.time, b.geodetic, b.velocity, b.rph))
     if errors.time.size == 0:
@@ -96,8 +97,8 @@ def compare_motions(
     std_b = _std(b)[of_b]
     upper, hausman = std_of_difference(std_a, std_b, efficient)
     # One kind for the whole line: a band that jumps would look like a change of accuracy.
-    sharp = np.isfinite(hausman).all(axis=0)
-    known = np.isfinite(upper).any(axis=0)
+    sharp = [bool(np.isfinite(column).all()) for column in hausman.T]
+    known = [bool(np.isfinite(column).any()) for column in upper.T]
     kinds: tuple[Kind, ...] = tuple(
         "Hausman" if s else "upper bound" if k else "none"
         for s, k in zip(sharp, known, strict=True)
