@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from factorgraph_dvl.analysis.calibration_difference import AGREE_SIGMAS, Component, Side
-from factorgraph_dvl.conventions import Array, rotation_from_rph
+from factorgraph_dvl.conventions import Array, log_so3, rotation_from_rph
 from factorgraph_dvl.solution import Estimate, Solution, Trajectory
 
 # What the DVL's measurement equation holds: a result that lacks one of these puts its
@@ -131,16 +131,7 @@ def _angular_rate(trajectory: Trajectory, solution: Solution) -> Array:
     nRb = rotation_from_rph(trajectory.rph, solution.body_axes)
     turn = np.swapaxes(nRb[:-1], 1, 2) @ nRb[1:]
     short = interval < _LONGEST_INTERVAL_S
-    # Small turns: the antisymmetric part of Exp(phi) is phi.
-    phi = 0.5 * np.stack(
-        [
-            turn[:, 2, 1] - turn[:, 1, 2],
-            turn[:, 0, 2] - turn[:, 2, 0],
-            turn[:, 1, 0] - turn[:, 0, 1],
-        ],
-        axis=1,
-    )
-    return phi[short] / interval[short, None]
+    return log_so3(turn[short]) / interval[short, None]
 
 
 def _parametrisation(components: Sequence[Component]) -> Iterator[str]:

@@ -51,7 +51,7 @@ def calibration_table(solution: Solution, errors: CalibrationErrors | None = Non
             ]
             if component in known:
                 truth, normalised_error = known[component]
-                row += [_at_precision(truth, std), _or_dash(normalised_error, "+.2f")]
+                row += [at_precision(truth, std), or_dash(normalised_error, "+.2f")]
             elif known:
                 row += ["", ""]
             table.add_row(*row, end_section=component == estimate.component_names[-1])
@@ -67,7 +67,7 @@ def sensor_table(survey: Survey) -> Table:
     for s in survey.sensors:
         table.add_row(
             s.label,
-            _or_dash(s.rate, ".4g"),
+            or_dash(s.rate, ".4g"),
             f"{s.samples}",
             f"{s.start:.10g}",
             f"{s.end:.10g}",
@@ -106,15 +106,17 @@ def split_unit(component: str) -> tuple[str, str]:
 
 def with_std(value: float, std: float) -> str:
     """Write a value and its standard deviation, to two digits of the latter."""
-    return f"{_at_precision(value, std)} ± {_at_precision(std, std)}"
+    return f"{at_precision(value, std)} ± {at_precision(std, std)}"
 
 
-def _at_precision(value: float, std: float) -> str:
+def at_precision(value: float, std: float) -> str:
+    """Write a value to two digits of its standard deviation."""
     if not (math.isfinite(std) and std > 0.0 and math.isfinite(value)):
         return f"{value:.6g}"
     decimals = 1 - math.floor(math.log10(std))
     return f"{value:.{min(max(decimals, 0), 12)}f}"
 
 
-def _or_dash(value: float, spec: str) -> str:
+def or_dash(value: float, spec: str) -> str:
+    """Write a number; nan and infinity as a dash."""
     return format(value, spec) if math.isfinite(value) else "–"
