@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
+from enum import StrEnum
 from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING, Annotated, NoReturn
@@ -21,6 +22,7 @@ from factorgraph_dvl.errors import FactorgraphDvlError
 if TYPE_CHECKING:
     from types import TracebackType
 
+    from factorgraph_dvl.analysis.crosscheck import CrossCheck
     from factorgraph_dvl.solution import Solution
     from factorgraph_dvl.trial import Trial
 
@@ -40,6 +42,14 @@ TrialPath = Annotated[
     Path, typer.Argument(metavar="TRIAL", help="Trial folder, or the trial.yaml in it.")
 ]
 Force = Annotated[bool, typer.Option("--force", help="Replace results that are there.")]
+NoFigures = Annotated[bool, typer.Option("--no-figures", help="Draw no figures.")]
+
+
+class Side(StrEnum):
+    """One of the two results of a cross-check."""
+
+    A = "A"
+    B = "B"
 
 
 def main(argv: list[str] | None = None) -> NoReturn:
@@ -131,7 +141,7 @@ def solve(
     trial_path: TrialPath,
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Solution folder to write.")],
     force: Force = False,
-    no_figures: Annotated[bool, typer.Option("--no-figures", help="Draw no figures.")] = False,
+    no_figures: NoFigures = False,
     rate: Annotated[
         float, typer.Option(metavar="HZ", min=1e-3, max=1e4, help="Rate of the trajectory.")
     ] = 10.0,
@@ -163,8 +173,7 @@ def solve(
 
         save_solution(solution, out, force=force, extra=None if no_figures else draw)
     _print_solution(trial, solution)
-    written = sorted(path.relative_to(out) for path in out.rglob("*") if path.is_file())
-    _stdout().print(f"Wrote {', '.join(map(str, written))} to {out}", markup=False, soft_wrap=True)
+    _print_written(out)
     if not solution.converged:
         _stderr().print(
             Text(f"error: not converged after {solution.iterations} iterations", "red"),
@@ -189,6 +198,57 @@ def inspect(trial_path: TrialPath) -> None:
         _warn(note)
     for line in finding_lines(result):
         console.print(line, soft_wrap=True)
+
+
+@app.command("crosscheck")
+def crosscheck_command(
+    a: Annotated[
+        Path,
+        typer.Argument(metavar="A", help="Solution folder, or results from elsewhere: a file."),
+    ],
+    b: Annotated[Path, typer.Argument(metavar="B", help="Likewise.")],
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder to write.")],
+    reference: Annotated[
+        Path | None,
+        typer.Option(metavar="REF", help="Trial folder or table: the true trajectory."),
+    ] = None,
+    truth: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="True calibration, JSON or YAML; before the trial's."),
+    ] = None,
+    efficient: Annotated[
+        Side | None,
+        typer.Option(case_sensitive=False, help="Which result uses all data by a true model."),
+    ] = None,
+    force: Force = False,
+    no_figures: NoFigures = False,
+) -> None:
+    """Hold two results of one trial against each other, and against the truth."""
+    from factorgraph_dvl.analysis.crosscheck import crosscheck as compare
+    from factorgraph_dvl.io.folders import check_output, new_folder
+    from factorgraph_dvl.io.foreign import load_results, load_truth
+    from factorgraph_dvl.io.tables import write_table
+    from factorgraph_dvl.report.crosscheck_files import OWNED, difference_columns, to_csv, to_json
+
+    check_output(out, force=force)
+    result_a, result_b = load_results(a, b)
+    true_motion, true_values = load_truth(reference, truth)
+    check = compare(
+        result_a,
+        result_b,
+        efficient=None if efficient is None else efficient.value,
+        truth=true_values,
+        reference=true_motion,
+    )
+    with new_folder(out, force=force, owned=OWNED) as folder:
+        (folder / "crosscheck.csv").write_text(to_csv(check), encoding="utf-8")
+        if check.motion is not None:
+            write_table(folder / "differences.csv", difference_columns(check.motion))
+        if not no_figures:
+            _draw_crosscheck(check, folder)
+        (folder / "crosscheck.json").write_bytes(to_json(check, {"A": str(a), "B": str(b)}))
+    _print_crosscheck(check, a, b)
+    _print_written(out)
 
 
 class _ProgressLine:
@@ -242,6 +302,44 @@ def _print_solution(trial: Trial, solution: Solution) -> None:
     _stdout().print(calibration_table(solution, errors))
     for warning in solution.warnings:
         _warn(warning)
+
+
+def _draw_crosscheck(check: CrossCheck, folder: Path) -> None:
+    from factorgraph_dvl.report.crosscheck_figures import write_crosscheck_figures
+
+    try:
+        write_crosscheck_figures(check, folder)
+    except Exception as error:
+        _warn(f"figures could not be drawn: {type(error).__name__}: {error}")
+
+
+def _print_crosscheck(check: CrossCheck, a: Path, b: Path) -> None:
+    from factorgraph_dvl.report import crosscheck_tables as tables
+
+    console = _stdout()
+    for side, path, solution in (("A", a, check.a), ("B", b, check.b)):
+        solver = f" ({solution.solver})" if solution.solver else ""
+        console.print(f"{side}: {path}{solver}", markup=False, soft_wrap=True)
+    if check.components:
+        console.print(tables.component_table(check))
+    if check.motion is not None:
+        console.print(tables.motion_table(check.motion))
+    for table in tables.truth_tables(check):
+        console.print(table)
+    for note in check.notes:
+        _warn(note)
+    console.print(tables.paragraph(check), markup=False)
+    if check.explanation:
+        console.print("Where they differ:", markup=False)
+        for sentence in check.explanation:
+            console.print(f"- {sentence}", markup=False)
+    if check.components:
+        console.print(tables.verdict_line(check.components), markup=False)
+
+
+def _print_written(out: Path) -> None:
+    written = sorted(path.relative_to(out) for path in out.rglob("*") if path.is_file())
+    _stdout().print(f"Wrote {', '.join(map(str, written))} to {out}", markup=False, soft_wrap=True)
 
 
 def _warn(message: str) -> None:

@@ -19,10 +19,11 @@ from factorgraph_dvl.io.solution_folder import (
     load_solution,
 )
 from factorgraph_dvl.io.tables import read_table, stack
-from factorgraph_dvl.io.trial_folder import SETTINGS_FILE, TRUTH_FILE
+from factorgraph_dvl.io.trial_folder import SETTINGS_FILE, TRUTH_FILE, load_reference
 from factorgraph_dvl.io.yaml_file import parse_yaml, read_text
 from factorgraph_dvl.sensors.protocol import Parameter, Section, check_range
 from factorgraph_dvl.solution import Estimate, Solution, Trajectory
+from factorgraph_dvl.trial import Reference
 
 _TABLES = (".csv", ".parquet", ".pq")
 _TEXTS = (".json", ".yaml", ".yml")
@@ -151,6 +152,43 @@ def _load(path: Path) -> tuple[Solution, bool]:
         where=str(path),
         expected=f"{', '.join(_TABLES)} for a trajectory, {', '.join(_TEXTS)} for a calibration",
     )
+
+
+def load_truth(
+    reference: Path | str | None, truth: Path | str | None
+) -> tuple[Reference | None, dict[str, Array]]:
+    """Read what two results are to be held against.
+
+    Parameters
+    ----------
+    reference : a trial folder, for its reference and its true calibration, or a table
+        with the columns of `reference`.
+    truth : a file of true calibration values, which win over those of the trial folder.
+
+    Returns
+    -------
+    The true trajectory, or None, and the true calibration by reported name.
+
+    Raises
+    ------
+    ConfigError, DataError
+        If a file does not hold what it should, or the trial folder has neither.
+    """
+    motion: Reference | None = None
+    values: dict[str, Array] = {}
+    if reference is not None:
+        path = Path(reference)
+        if path.suffix.lower() in _TABLES:
+            motion = read_reference(path)
+        else:
+            motion, values = load_reference(path)
+        if motion is None and not values:
+            raise DataError(
+                "the trial has no truth", where=str(path), expected=f"a reference or {TRUTH_FILE}"
+            )
+    if truth is not None:
+        values = values | read_truth(truth)
+    return motion, values
 
 
 def read_truth(path: Path | str) -> dict[str, Array]:

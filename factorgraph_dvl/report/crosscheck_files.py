@@ -23,6 +23,11 @@ from factorgraph_dvl.analysis.motion_difference import (
 from factorgraph_dvl.conventions import Array
 from factorgraph_dvl.solution import Solution
 
+# What a cross-check writes; the first makes the folder valid.
+OWNED = (
+    *("crosscheck.json", "crosscheck.csv", "differences.csv"),
+    *("parameters.png", "differences.png", "errors.png"),
+)
 _COLUMNS = (
     *("parameter", "name", "a", "b", "difference", "std_a", "std_b"),
     *("std", "std_kind", "std_upper_bound", "std_hausman", "in_sigmas", "verdict", "reason"),

@@ -1,0 +1,216 @@
+"""Figures of a cross-check, as PNG files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from factorgraph_dvl.analysis.calibration_difference import AGREE_SIGMAS, Component
+from factorgraph_dvl.analysis.crosscheck import CrossCheck
+from factorgraph_dvl.analysis.motion_difference import (
+    COMPONENTS,
+    MotionDifference,
+    joined_errors,
+)
+from factorgraph_dvl.conventions import Array
+from factorgraph_dvl.report.drawing import (
+    ACCENT,
+    DARK,
+    GREY,
+    LIGHT,
+    NORMAL,
+    SMALL,
+    TITLE,
+    WIDE_BUCKETS,
+    draw_line,
+    envelope,
+    new_figure,
+    new_grid,
+    readable,
+    save,
+    style,
+    time_axis,
+    with_std,
+)
+
+_RED = "#c0392b"
+_COLORS = {"agree": ACCENT, "differ": _RED, "not comparable": GREY}
+# Further out, how far is only a number.
+_EDGE = 8.0
+_GROUPS = ("Position", "Velocity", "Attitude")
+
+
+def write_crosscheck_figures(check: CrossCheck, folder: Path) -> list[Path]:
+    """Draw a cross-check; figures for which there is nothing to draw are left out.
+
+    Parameters
+    ----------
+    check : what to draw.
+    folder : where the PNG files go; created if needed.
+
+    Returns
+    -------
+    Paths of the files: `parameters.png`, `differences.png`, `errors.png`.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    figures = {}
+    if any(np.isfinite(c.difference) for c in check.components):
+        figures["parameters"] = _parameters(check)
+    if check.motion is not None:
+        figures["differences"] = _differences(check.motion)
+    if check.truth_a.trajectory is not None or check.truth_b.trajectory is not None:
+        figures["errors"] = _errors(check)
+    paths = []
+    for name, figure in figures.items():
+        paths.append(folder / f"{name}.png")
+        save(figure, paths[-1])
+    return paths
+
+
+def _parameters(check: CrossCheck) -> Figure:
+    """Draw A − B of every component that both have, over its standard deviation."""
+    rows = [c for c in check.components if np.isfinite(c.difference)]
+    figure = new_figure(11.0, 1.25 + 0.3 * len(rows))
+    grid = new_grid(figure, 1, 1, left=2.0, right=4.6, top=0.72)
+    ax = figure.add_subplot(grid[0, 0])
+    ax.axvspan(-AGREE_SIGMAS, AGREE_SIGMAS, color=LIGHT, lw=0, zorder=0)
+    ax.axvline(0.0, color=GREY, lw=0.8, zorder=1)
+    for y, c in enumerate(rows):
+        _draw_component(ax, y, c)
+    ax.set_xlim(-_EDGE - 0.6, _EDGE + 0.6)
+    ax.set_ylim(len(rows) - 0.4, -0.6)
+    style(ax, "(A − B) / σ of A − B", "")
+    ax.grid(visible=False, axis="y")
+    ax.set_xticks([-8, -6, -3, 0, 3, 6, 8], ["−8", "−6", "−3", "0", "3", "6", "8"])
+    ax.set_yticks(range(len(rows)), [readable(c.name)[0] for c in rows], fontsize=NORMAL)
+    ax.tick_params(axis="y", length=0)
+    ax.spines["left"].set_visible(False)
+    shown = {c.kind for c in rows}
+    band = f"agree: inside ±{AGREE_SIGMAS:g}σ"
+    sigma = "σ: " + (" or ".join(k for k in ("upper bound", "Hausman") if k in shown) or "none")
+    legend = [
+        *ax.plot([], [], "o", color=ACCENT, ms=5, label="agree"),
+        *ax.plot([], [], "o", color=_RED, ms=5, label="differ"),
+        *ax.plot([], [], "o", color=GREY, ms=5, mfc="white", label="not comparable"),
+        *ax.plot([], [], color=ACCENT, lw=1.6, label="±1σ"),
+        *ax.plot([], [], color=LIGHT, lw=9, label=band),
+    ]
+    figure.legend(
+        handles=legend,
+        loc="upper left",
+        borderaxespad=0.3,
+        ncols=len(legend),
+        fontsize=NORMAL,
+        frameon=False,
+        title=f"Calibration, A − B; {sigma}",
+        title_fontsize=TITLE,
+        alignment="left",
+    )
+    return figure
+
+
+def _draw_component(ax: Axes, y: int, c: Component) -> None:
+    color = _COLORS[c.verdict]
+    z = c.in_sigmas
+    face = "white" if c.verdict == "not comparable" else color
+    if not np.isfinite(z):
+        ax.plot(0.0, y, "x", color=GREY, ms=5)
+    elif abs(z) > _EDGE:
+        side = float(np.sign(z))
+        ax.plot(side * _EDGE, y, ">" if side > 0 else "<", color=color, ms=7, mfc=face)
+    else:
+        ax.plot([z - 1.0, z + 1.0], [y, y], color=color, lw=1.6, zorder=2)
+        ax.plot(z, y, "o", color=color, ms=5, mfc=face, zorder=3)
+    unit = readable(c.name)[1]
+    known = np.isfinite(c.std) and c.std > 0.0
+    difference = with_std(c.difference, c.std) if known else f"{c.difference:.4g}"
+    kind = "" if c.kind in ("none", "upper bound") else f" ({c.kind})"
+    for x, text, weight in (
+        (1.02, f"{difference} {unit}{kind}".replace(" (", "  ("), "normal"),
+        (1.5, c.verdict + (f": {c.reason}" if c.reason else ""), "normal"),
+    ):
+        ax.text(
+            x,
+            y,
+            text,
+            transform=ax.get_yaxis_transform(),
+            va="center",
+            fontsize=SMALL,
+            color=DARK if x < 1.2 else color,
+            fontweight=weight,
+        )
+
+
+def _differences(motion: MotionDifference) -> Figure:
+    """Draw A − B over time within ±3σ of what is shown."""
+    figure = new_figure(12.0, 6.2)
+    axes = new_grid(figure, 3, 3, top=0.4).subplots(sharex=True, squeeze=False)
+    start, time_label = time_axis(motion.time)
+    time = motion.time - start
+    for i, name in enumerate(COMPONENTS):
+        ax = axes[i % 3, i // 3]
+        _draw_band(ax, time, motion.std[:, i])
+        draw_line(ax, time, motion.difference[:, i])
+        ax.axhline(0.0, color=GREY, lw=0.5)
+        _label(ax, i, name, time_label)
+        if i % 3 == 0:
+            kinds = dict.fromkeys(k for k in motion.kinds[i : i + 3] if k != "none")
+            band = f", ±3σ ({', '.join(kinds)})" if kinds else ""
+            ax.set_title(f"{_GROUPS[i // 3]}, A − B{band}", fontsize=TITLE, loc="left")
+    return figure
+
+
+def _errors(check: CrossCheck) -> Figure:
+    """Draw the errors of both against the reference, each within its ±3σ."""
+    sides = [("A", check.truth_a.trajectory, ACCENT), ("B", check.truth_b.trajectory, DARK)]
+    present = [(side, errors, color) for side, errors, color in sides if errors is not None]
+    figure = new_figure(12.0, 6.2)
+    axes = new_grid(figure, 3, 3, top=0.6).subplots(sharex=True, squeeze=False)
+    start, time_label = time_axis(np.concatenate([errors.time for _, errors, _ in present]))
+    for side, errors, color in present:
+        error, std = joined_errors(errors)
+        time = errors.time - start
+        for i in range(len(COMPONENTS)):
+            ax = axes[i % 3, i // 3]
+            for sign in (-3.0, 3.0):
+                bucket_time, _, high = envelope(time, std[:, i], WIDE_BUCKETS)
+                ax.plot(bucket_time, sign * high, color=color, lw=0.7, dashes=(4, 3))
+            bucket_time, low, high = envelope(time, error[:, i], WIDE_BUCKETS)
+            ax.fill_between(
+                bucket_time, low, high, color=color, alpha=0.5, lw=0.8, label=f"error of {side}"
+            )
+    for i, name in enumerate(COMPONENTS):
+        ax = axes[i % 3, i // 3]
+        _label(ax, i, name, time_label)
+        if i % 3 == 0:
+            ax.set_title(f"{_GROUPS[i // 3]}: error", fontsize=TITLE, loc="left")
+    handles = axes[0, 0].get_legend_handles_labels()[0]
+    handles += axes[0, 0].plot([], [], color=GREY, lw=0.8, dashes=(4, 3), label="±3σ of each")
+    figure.legend(
+        handles=handles,
+        loc="upper right",
+        ncols=3,
+        fontsize=NORMAL,
+        frameon=False,
+        borderaxespad=0.2,
+    )
+    return figure
+
+
+def _draw_band(ax: Axes, time: Array, std: Array) -> None:
+    if not np.isfinite(std).all():
+        return
+    bucket_time, _, high = envelope(time, 3.0 * std, WIDE_BUCKETS)
+    ax.fill_between(bucket_time, -high, high, color=LIGHT, lw=0, zorder=0)
+    ax.plot(bucket_time, high, color=GREY, lw=0.7)
+    ax.plot(bucket_time, -high, color=GREY, lw=0.7)
+
+
+def _label(ax: Axes, i: int, name: str, time_label: str) -> None:
+    words, unit = readable(name)
+    axis = {"e": "east", "n": "north", "u": "up"}
+    last = words.split()[-1]
+    style(ax, time_label if i % 3 == 2 else "", f"{axis.get(last, last)}, {unit}")
