@@ -49,7 +49,9 @@ def explain(
     out += _parametrisation(components)
     out += _too_sure(components, efficient)
     for side, own, _ in sides:
-        out += [f"{side} itself warns: {warning}." for warning in own.warnings]
+        # What is not observable is not compared, and no reason.
+        told = (w for w in own.warnings if "not observable" not in w)
+        out += [f"{side} itself warns: {warning}." for warning in told]
     return tuple(out) or (
         "The two results hold nothing that explains it: look at the data, the noise that was "
         "stated for them, and the residuals.",
@@ -72,8 +74,8 @@ def _white_noise(side: Side, own: Solution, differing: Sequence[Component]) -> I
     )
     yield (
         f"{side} ({own.solver}) takes the error of its inertial velocity for white noise, though "
-        "it is correlated in time: its σ does not contain that, is too small, and so is the σ of "
-        f"the difference.{measured}"
+        "it is correlated in time: its σ does not contain that and is too small, and with it the "
+        f"σ of the difference.{measured}"
     )
 
 

@@ -73,8 +73,9 @@ def write_crosscheck_figures(check: CrossCheck, folder: Path) -> list[Path]:
 def _parameters(check: CrossCheck) -> Figure:
     """Draw A − B of every component that both have, over its standard deviation."""
     rows = [c for c in check.components if np.isfinite(c.difference)]
-    figure = new_figure(11.0, 1.25 + 0.3 * len(rows))
-    grid = new_grid(figure, 1, 1, left=2.0, right=4.6, top=0.72)
+    right = 4.9 if any(c.reason for c in rows) else 2.9
+    figure = new_figure(6.2 + right, 1.2 + 0.3 * len(rows))
+    grid = new_grid(figure, 1, 1, left=1.6, right=right, top=0.65)
     ax = figure.add_subplot(grid[0, 0])
     ax.axvspan(-AGREE_SIGMAS, AGREE_SIGMAS, color=LIGHT, lw=0, zorder=0)
     ax.axvline(0.0, color=GREY, lw=0.8, zorder=1)
@@ -84,7 +85,7 @@ def _parameters(check: CrossCheck) -> Figure:
     ax.set_ylim(len(rows) - 0.4, -0.6)
     style(ax, "(A − B) / σ of A − B", "")
     ax.grid(visible=False, axis="y")
-    ax.set_xticks([-8, -6, -3, 0, 3, 6, 8], ["−8", "−6", "−3", "0", "3", "6", "8"])
+    ax.set_xticks([-6, -3, 0, 3, 6], ["−6", "−3", "0", "3", "6"])
     ax.set_yticks(range(len(rows)), [readable(c.name)[0] for c in rows], fontsize=NORMAL)
     ax.tick_params(axis="y", length=0)
     ax.spines["left"].set_visible(False)
@@ -127,11 +128,10 @@ def _draw_component(ax: Axes, y: int, c: Component) -> None:
     unit = readable(c.name)[1]
     known = np.isfinite(c.std) and c.std > 0.0
     difference = with_std(c.difference, c.std) if known else f"{c.difference:.4g}"
-    kind = "" if c.kind in ("none", "upper bound") else f" ({c.kind})"
-    for x, text, weight in (
-        (1.02, f"{difference} {unit}{kind}".replace(" (", "  ("), "normal"),
-        (1.5, c.verdict + (f": {c.reason}" if c.reason else ""), "normal"),
-    ):
+    kind = "" if c.kind in ("none", "upper bound") else f"({c.kind})"
+    verdict = c.verdict + (f": {c.reason}" if c.reason else "")
+    difference = " ".join(part for part in (difference, unit, kind) if part)
+    for x, text, text_color in ((1.02, difference, DARK), (1.48, verdict, color)):
         ax.text(
             x,
             y,
@@ -139,8 +139,7 @@ def _draw_component(ax: Axes, y: int, c: Component) -> None:
             transform=ax.get_yaxis_transform(),
             va="center",
             fontsize=SMALL,
-            color=DARK if x < 1.2 else color,
-            fontweight=weight,
+            color=text_color,
         )
 
 
@@ -170,6 +169,8 @@ def _errors(check: CrossCheck) -> Figure:
     figure = new_figure(12.0, 6.2)
     axes = new_grid(figure, 3, 3, top=0.6).subplots(sharex=True, squeeze=False)
     start, time_label = time_axis(np.concatenate([errors.time for _, errors, _ in present]))
+    # The smaller error would vanish behind the larger.
+    present.sort(key=lambda item: -float(np.mean(joined_errors(item[1])[0][:, 3:6] ** 2)))
     for side, errors, color in present:
         error, std = joined_errors(errors)
         time = errors.time - start
@@ -187,7 +188,8 @@ def _errors(check: CrossCheck) -> Figure:
         _label(ax, i, name, time_label)
         if i % 3 == 0:
             ax.set_title(f"{_GROUPS[i // 3]}: error", fontsize=TITLE, loc="left")
-    handles = axes[0, 0].get_legend_handles_labels()[0]
+    handles, labels = axes[0, 0].get_legend_handles_labels()
+    handles = [handle for _, handle in sorted(zip(labels, handles, strict=True), key=_label_of)]
     handles += axes[0, 0].plot([], [], color=GREY, lw=0.8, dashes=(4, 3), label="±3σ of each")
     figure.legend(
         handles=handles,
@@ -198,6 +200,10 @@ def _errors(check: CrossCheck) -> Figure:
         borderaxespad=0.2,
     )
     return figure
+
+
+def _label_of(item: tuple[object, object]) -> str:
+    return str(item[0])
 
 
 def _draw_band(ax: Axes, time: Array, std: Array) -> None:

@@ -55,7 +55,7 @@ def component_table(check: CrossCheck) -> Table:
 
 def motion_table(motion: MotionDifference) -> Table:
     """Render the differences of the trajectories, component by component."""
-    span = f"{motion.time.size} epochs, {motion.time[0]:.10g} to {motion.time[-1]:.10g} s"
+    span = f"{motion.time.size} epochs, {motion.time[0] + 0.0:.10g} to {motion.time[-1]:.10g} s"
     table = Table(title=f"Trajectory: A − B at {span}")
     table.add_column("component", no_wrap=True)
     for header in ("unit", "RMS", "largest", "at s", "RMS in σ", "largest in σ", "inside 2σ %"):
@@ -93,12 +93,15 @@ def paragraph(check: CrossCheck) -> str:
     """Say which standard deviation is shown, what a verdict means, and the joint test."""
     text = (
         "Both results come from the same data, so their errors are correlated: var(A − B) = "
-        "σ_A² + σ_B² − 2 cov, with an unknown covariance that is not negative. √(σ_A² + σ_B²) is "
-        "therefore an upper bound of the σ of A − B: what differs by it differs, what agrees "
-        "might differ by a sharper test."
+        "σ_A² + σ_B² − 2 cov, with a covariance that neither states. As long as it is not "
+        "negative, as of two sound estimates of the same data, √(σ_A² + σ_B²) is an upper bound "
+        "of the σ of A − B: what differs by it differs, what agrees might differ by a sharper "
+        "test."
     )
     if check.efficient is None:
-        text += " The upper bound is shown everywhere; --efficient A or B asks for the sharper."
+        text += (
+            " It is shown everywhere; `--efficient A` or `B` asks for the sharper one."
+        )
     else:
         other = "B" if check.efficient == "A" else "A"
         text += (
