@@ -233,7 +233,7 @@ def _compare(
         reason = obstacle or _component_obstacle(
             (value_a[i], std_a[i], seen_a[i]), (value_b[i], std_b[i], seen_b[i])
         )
-        if obstacle:
+        if obstacle or not np.isfinite(value_a[i] - value_b[i]):
             std, kind = float("nan"), "none"
         verdict, reason = _judge(float(value_a[i] - value_b[i]), std, kind, reason)
         out.append(

@@ -283,7 +283,7 @@ def _estimate(name: str, given: _Value) -> Estimate:
         std if std.size else unknown,
         unknown,
         unknown,
-        np.broadcast_to(np.asarray(observable, dtype=bool), value.shape).copy(),
+        np.asarray(observable, dtype=bool) & np.isfinite(value),
     )
 
 

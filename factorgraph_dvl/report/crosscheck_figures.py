@@ -73,7 +73,7 @@ def write_crosscheck_figures(check: CrossCheck, folder: Path) -> list[Path]:
 def _parameters(check: CrossCheck) -> Figure:
     """Draw A − B of every component that both have, over its standard deviation."""
     rows = [c for c in check.components if np.isfinite(c.difference)]
-    right = 4.9 if any(c.reason for c in rows) else 2.9
+    right = 2.2 + 0.062 * max(len(_verdict(c)) for c in rows)
     figure = new_figure(6.2 + right, 1.2 + 0.3 * len(rows))
     grid = new_grid(figure, 1, 1, left=1.6, right=right, top=0.65)
     ax = figure.add_subplot(grid[0, 0])
@@ -117,21 +117,20 @@ def _draw_component(ax: Axes, y: int, c: Component) -> None:
     color = _COLORS[c.verdict]
     z = c.in_sigmas
     face = "white" if c.verdict == "not comparable" else color
-    if not np.isfinite(z):
-        ax.plot(0.0, y, "x", color=GREY, ms=5)
-    elif abs(z) > _EDGE:
+    if abs(z) > _EDGE:
         side = float(np.sign(z))
         ax.plot(side * _EDGE, y, ">" if side > 0 else "<", color=color, ms=7, mfc=face)
-    else:
+    elif np.isfinite(z):
         ax.plot([z - 1.0, z + 1.0], [y, y], color=color, lw=1.6, zorder=2)
         ax.plot(z, y, "o", color=color, ms=5, mfc=face, zorder=3)
     unit = readable(c.name)[1]
     known = np.isfinite(c.std) and c.std > 0.0
-    difference = with_std(c.difference, c.std) if known else f"{c.difference:.4g}"
+    difference = (
+        with_std(c.difference, c.std) if known else f"{c.difference:.4g}".replace("-", "−")
+    )
     kind = "" if c.kind in ("none", "upper bound") else f"({c.kind})"
-    verdict = c.verdict + (f": {c.reason}" if c.reason else "")
     difference = " ".join(part for part in (difference, unit, kind) if part)
-    for x, text, text_color in ((1.02, difference, DARK), (1.48, verdict, color)):
+    for x, text, text_color in ((1.02, difference, DARK), (1.48, _verdict(c), color)):
         ax.text(
             x,
             y,
@@ -141,6 +140,10 @@ def _draw_component(ax: Axes, y: int, c: Component) -> None:
             fontsize=SMALL,
             color=text_color,
         )
+
+
+def _verdict(c: Component) -> str:
+    return f"{c.verdict}: {c.reason}" if c.reason else c.verdict
 
 
 def _differences(motion: MotionDifference) -> Figure:

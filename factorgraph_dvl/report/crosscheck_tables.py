@@ -99,9 +99,7 @@ def paragraph(check: CrossCheck) -> str:
         "test."
     )
     if check.efficient is None:
-        text += (
-            " It is shown everywhere; `--efficient A` or `B` asks for the sharper one."
-        )
+        text += " This bound is shown; `--efficient A` or `B` asks for the sharper one."
     else:
         other = "B" if check.efficient == "A" else "A"
         text += (
@@ -110,6 +108,11 @@ def paragraph(check: CrossCheck) -> str:
             "and the upper bound elsewhere."
         )
     text += f" Agree: within {AGREE_SIGMAS:g}σ of what is shown."
+    if any(c.kind in ("A alone", "B alone") for c in check.components):
+        text += (
+            " Where one result states no σ, that of the other alone is shown: inside it they "
+            "agree whatever the first one's is, beyond it nothing can be said."
+        )
     joint = check.joint
     if joint is not None:
         text += (
@@ -144,7 +147,7 @@ def _calibration_truth(sides: Sequence[tuple[str, AgainstTruth]]) -> Table:
             continue
         for i, name in enumerate(errors.names):
             row = rows.setdefault(name, [f"{errors.truth[i]:.6g}", "–", "–", "–", "–"])
-            row[1 + 2 * k] = f"{errors.error[i]:+.3g}"
+            row[1 + 2 * k] = or_dash(float(errors.error[i]), "+.3g")
             row[2 + 2 * k] = or_dash(float(errors.normalised[i]), "+.2f")
     for name, row in rows.items():
         short, unit = split_unit(name)
