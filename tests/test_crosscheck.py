@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -193,7 +194,7 @@ def test_angle_between_rotations() -> None:
 def moved(trajectory: Trajectory, metres: float) -> Trajectory:
     geodetic = trajectory.geodetic.copy()
     geodetic[:, 2] += metres
-    return replace(trajectory, geodetic=geodetic, rph=trajectory.rph + [0.0, 0.0, 0.001])
+    return replace(trajectory, geodetic=geodetic, rph=trajectory.rph + np.array([0.0, 0.0, 0.001]))
 
 
 def test_trajectories_by_hand() -> None:
@@ -498,7 +499,8 @@ def test_command(tmp_path: Path, run: Run, folders: tuple[Path, Path]) -> None:
     assert found["joint"]["verdict"] == "differ"
     assert found["trajectory"]["components"]["u_m"]["rms"] == pytest.approx(0.2)
     assert found["truth"]["a"]["calibration"]["error"][0] == pytest.approx(1.0 / 3.0)
-    rows = list(csv.DictReader((out / "crosscheck.csv").open()))
+    with (out / "crosscheck.csv").open() as file:
+        rows = list(csv.DictReader(file))
     assert [row["verdict"] for row in rows] == list(verdicts.values())
     assert rows[0]["std_hausman"] == ""
     assert float(rows[3]["difference"]) == pytest.approx(-1e-3)
@@ -549,6 +551,13 @@ def test_examples(tmp_path: Path, run: Run, name: str) -> None:
     found = json.loads((out / "crosscheck.json").read_text(), parse_constant=reject)
     assert found["a"]["file"].endswith(name)
     assert found["truth"] is not None
+
+
+def test_documentation_s_calibration_is_read(tmp_path: Path) -> None:
+    text = (EXAMPLES.parent.parent / "docs" / "crosscheck.md").read_text(encoding="utf-8")
+    (block,) = re.findall(r"```yaml\n(.*?)```", text, flags=re.DOTALL)
+    b = foreign(tmp_path, block)
+    assert [e.name for e in b.estimates] == ["misalignment_deg", "scale_error", "lever_arm_m"]
 
 
 def test_saved_solutions_agree_with_themselves(folders: tuple[Path, Path]) -> None:
