@@ -96,8 +96,10 @@ def compare_motions(
     std_a = _std(a)[errors.epochs]
     std_b = _std(b)[of_b]
     upper, hausman = std_of_difference(std_a, std_b, efficient)
-    # One kind for the whole line: a band that jumps would look like a change of accuracy.
-    sharp = [bool(np.isfinite(column).all()) for column in hausman.T]
+    # One kind for position, velocity, attitude each: a band that changes its meaning on
+    # the way would look like a change of accuracy.
+    vectors = (bool(np.isfinite(hausman[:, i : i + 3]).all()) for i in (0, 3, 6))
+    sharp = [kind for kind in vectors for _ in range(3)]
     known = [bool(np.isfinite(column).any()) for column in upper.T]
     kinds: tuple[Kind, ...] = tuple(
         "Hausman" if s else "upper bound" if k else "none"

@@ -89,9 +89,9 @@ def _parameters(check: CrossCheck) -> Figure:
     ax.set_yticks(range(len(rows)), [readable(c.name)[0] for c in rows], fontsize=NORMAL)
     ax.tick_params(axis="y", length=0)
     ax.spines["left"].set_visible(False)
-    shown = {c.kind for c in rows}
+    shown = dict.fromkeys(c.kind for c in rows)
     band = f"agree: inside ±{AGREE_SIGMAS:g}σ"
-    sigma = "σ: " + (" or ".join(k for k in ("upper bound", "Hausman") if k in shown) or "none")
+    sigma = "σ: " + (" or ".join(k for k in shown if k != "none") or "none")
     legend = [
         *ax.plot([], [], "o", color=ACCENT, ms=5, label="agree"),
         *ax.plot([], [], "o", color=_RED, ms=5, label="differ"),
