@@ -33,6 +33,7 @@ import yaml
 from factorgraph_dvl import load_trial
 from factorgraph_dvl.alignment import initial_states
 from factorgraph_dvl.chain import Chain, inertial_chain
+from factorgraph_dvl.chain import Chain, inertial_chain
 from factorgraph_dvl.conventions import DEG_PER_HOUR, exp_so3, log_so3, rotation_from_rph
 from factorgraph_dvl.earth import RATE, enu_from_ecef
 from factorgraph_dvl.graph import Problem
@@ -329,4 +330,9 @@ def temporary_folder() -> Iterator[Path]:
 
 
 if __name__ == "__main__":
+    # The command line's setting, for what is measured in this process; NumPy reads it when
+    # it is loaded.
+    threads = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
+    if not threads.keys() <= os.environ.keys():
+        os.execve(sys.executable, [sys.executable, *sys.argv], {**threads, **os.environ})
     main()
