@@ -33,7 +33,6 @@ import yaml
 from factorgraph_dvl import load_trial
 from factorgraph_dvl.alignment import initial_states
 from factorgraph_dvl.chain import Chain, inertial_chain
-from factorgraph_dvl.chain import Chain, inertial_chain
 from factorgraph_dvl.conventions import DEG_PER_HOUR, exp_so3, log_so3, rotation_from_rph
 from factorgraph_dvl.earth import RATE, enu_from_ecef
 from factorgraph_dvl.graph import Problem
