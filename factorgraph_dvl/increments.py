@@ -272,7 +272,7 @@ def increments(imu: Imu) -> tuple[Increments, tuple[str, ...]]:
         time, samples, filled_sigma, broken = _fill(time, samples, lost, bridged, broken)
         notes.append(
             f"{imu.source}: {int(lost[bridged].sum())} lost samples in {int(bridged.sum())} "
-            "places were interpolated"
+            f"places were interpolated, the first after {imu.time[np.argmax(bridged)]:.3f} s"
         )
 
     bounds = np.concatenate([[0], np.flatnonzero(broken) + 1, [time.size]])
