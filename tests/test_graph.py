@@ -104,7 +104,6 @@ def test_blocks_equal_custom_factors_with_numerical_jacobians(walks):
     scene = walking() if walks else scenario(manoeuvres=SHORT, trial=ALL_FREE)
     problem, values = problem_of(scene)
     assert problem.chain.walking == walks
-    trial_end = problem.chain.segments.node_time[-1]
     problem.weigh(problem.evaluate(values))
     evaluation = problem.evaluate(values)
     factors = measurement_factors(problem, problem.linearize(evaluation))
