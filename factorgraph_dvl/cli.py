@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
+from contextlib import suppress
 from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING, Annotated, NoReturn
@@ -20,6 +21,8 @@ from factorgraph_dvl.errors import FactorgraphDvlError
 # them, so that --help answers at once.
 if TYPE_CHECKING:
     from types import TracebackType
+
+    from rich.table import Table
 
     from factorgraph_dvl.solution import Solution
     from factorgraph_dvl.trial import Trial
@@ -144,7 +147,6 @@ def solve(
 
     check_output(out, force=force)
     with _ProgressLine(quiet=quiet) as progress:
-        progress("load", 0, None)
         trial = load_trial(trial_path)
         # The solver takes longest to load: after what is most often wrong.
         from factorgraph_dvl.solvers.batch import solve as run
@@ -183,7 +185,7 @@ def inspect(trial_path: TrialPath) -> None:
     trial = load_trial(trial_path)
     result = survey(trial)
     console = _stdout()
-    console.print(sensor_table(result))
+    _print_table(sensor_table(result))
     console.print(motion_line(result), markup=False, soft_wrap=True)
     for note in trial.notes:
         _warn(note)
@@ -206,7 +208,7 @@ class _ProgressLine:
             transient=True,
             disable=quiet or not self._console.is_terminal,
         )
-        self._task = self._live.add_task("")
+        self._task = self._live.add_task("load")
 
     def __enter__(self) -> _ProgressLine:
         self._live.start()
@@ -224,8 +226,9 @@ class _ProgressLine:
         text = stage
         if iteration:
             text += f", iteration {iteration}"
-        if cost is not None:
-            text += f", cost {cost:.6g}"
+            # That of the start values is huge, and says nothing.
+            if cost is not None:
+                text += f", cost {cost:.4g}"
         if self._console.is_terminal:
             self._live.update(self._task, description=text)
         elif not self._quiet:
@@ -239,9 +242,18 @@ def _print_solution(trial: Trial, solution: Solution) -> None:
 
     truth = trial.calibration_truth
     errors = calibration_errors(solution, truth) if truth else None
-    _stdout().print(calibration_table(solution, errors))
+    _print_table(calibration_table(solution, errors, width=_stdout().width))
     for warning in solution.warnings:
         _warn(warning)
+
+
+def _print_table(table: Table) -> None:
+    """Print a table whole: one wider than the terminal is wrapped by that, never cut."""
+    from factorgraph_dvl.report.tables import width_of
+
+    console = _stdout()
+    console.width = max(console.width, width_of(table))
+    console.print(table)
 
 
 def _warn(message: str) -> None:
@@ -253,6 +265,9 @@ def _stdout() -> Console:
 
 
 def _stderr() -> Console:
+    # What was said first comes first, also where both streams end in one file.
+    with suppress(OSError):
+        sys.stdout.flush()
     return Console(stderr=True)
 
 
