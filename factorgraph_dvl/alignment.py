@@ -40,7 +40,7 @@ _BASELINE = 5.0
 # Below this speed, m/s, the course says nothing about the heading.
 _LEAST_SPEED = 0.3
 # Between fixes further apart than this, s, the DVL gives the velocity to start from.
-_GNSS_GAP = 10.0
+_GNSS_GAP = 3.0
 _LEAST_PAIRS = 10
 
 
@@ -138,29 +138,44 @@ def initial_states(trial: Trial, frame: LocalFrame, seg: Segments) -> Start:
     nRb = np.empty((n, 3, 3))
     notes: list[str] = []
     p_rough = np.zeros((n, 3))
+    fixed = np.zeros(n, dtype=bool)
     if trial.gnss is not None:
         time, p_n = _fixes(trial.gnss, frame)
         p_rough = _interpolate(seg.node_time, time, p_n)
+        fixed = seg.increments.locate(time)[2]
+    if trial.initial_position is None and not fixed.any():
+        raise DataError(
+            "no position while the IMU runs",
+            where=trial.imu.source,
+            expected="GNSS positions between its first and last sample, or initial.position",
+            hint="Check that all clocks start together",
+        )
     for a in range(len(seg.arc_nodes)):
         arc = _arc(seg, a, frame, p_rough)
         spin = exp_so3(-arc.since[:, None] * arc.earth_rate)
         if a == 0 and trial.initial_attitude is not None:
             at_start = rotation_from_rph(trial.initial_attitude.rph, trial.body_axes)
+            if seg.increments.averaged:
+                at_start = at_start @ exp_so3(-seg.phi[0])
             nRb[arc.nodes] = spin @ at_start @ arc.turn
             continue
         pairs = _pairs(trial, frame, arc)
+        if pairs is None and a > 0:
+            nRb[arc.nodes] = spin @ nRb[arc.nodes[0] - 1] @ arc.turn
+            continue
         if pairs is None:
             raise DataError(
                 f"nothing to find the attitude with from {arc.start:z.1f} s on",
                 where=trial.imu.source,
                 expected="GNSS or DVL data there, or `initial` in trial.yaml",
             )
-        aligned, found = _align(trial, arc, pairs)
+        before = nRb[arc.nodes[0] - 1] if a > 0 else None
+        aligned, found = _align(trial, arc, pairs, before)
         nRb[arc.nodes] = spin @ aligned @ arc.turn
-        if not found:
+        if not found and before is None:
             notes.append(
                 f"from {arc.start:z.0f} s on the velocity changes too little to find the heading: "
-                "the solver starts from the course over ground, or from north without one"
+                "the solver starts from the course over ground"
             )
     p_n, v_n = _kinematics(trial, frame, seg, nRb)
     zero = np.zeros((n, 3))
@@ -204,7 +219,7 @@ def _pairs(trial: Trial, frame: LocalFrame, arc: _Arc) -> _Pairs | None:
 def _from_velocity(gnss: Gnss, frame: LocalFrame, arc: _Arc) -> _Pairs | None:
     use = ~np.isnan(gnss.velocity[:, 0]) & arc.covers(gnss.time)
     fix_time, fix = _fixes(gnss, frame)
-    if use.sum() < _LEAST_PAIRS or fix_time.size == 0:
+    if use.sum() < _LEAST_PAIRS:
         return None
     time = gnss.time[use]
     at, body_R, velocity, _ = arc.carry(time)
@@ -254,12 +269,15 @@ def _from_dvl(dvl: Dvl, arc: _Arc) -> _Pairs | None:
     time = true_time[use]
     at, body_R, velocity, _ = arc.carry(time)
     v_b = _nominal_velocity(dvl, use, at.gyro)
+    # A mounting that is not known turns the velocity as well as the wanted attitude does.
+    turned = min(float(np.max(dvl.settings.misalignment_std_deg)) * DEG, 1.0)
+    sigma = np.hypot(dvl.sigma()[use].mean(axis=1), turned * np.linalg.norm(v_b, axis=1))
     # What the motion adds to the Earth's turn of the velocity is below the mounting's error.
     return _Pairs(
         time,
         velocity - rotate(body_R, v_b),
         -arc.pull(at)[0],
-        dvl.sigma()[use].mean(axis=1),
+        sigma,
         np.zeros_like(v_b),
     )
 
@@ -272,7 +290,7 @@ def _nominal_velocity(dvl: Dvl, use: np.ndarray, omega_b: Array) -> Array:
     return unscaled @ dRb - np.cross(omega_b, np.array(s.lever_arm_m))
 
 
-def _align(trial: Trial, arc: _Arc, pairs: _Pairs) -> tuple[Array, bool]:
+def _align(trial: Trial, arc: _Arc, pairs: _Pairs, before: Array | None) -> tuple[Array, bool]:
     """Return the attitude at the start as each node sees it, and whether heading is found.
 
     Gyro biases turn the body axes of the start away with time: so each window has its own
@@ -297,7 +315,7 @@ def _align(trial: Trial, arc: _Arc, pairs: _Pairs) -> tuple[Array, bool]:
         nearest = good[np.argmin(np.abs(np.arange(count)[:, None] - good), axis=1)]
         chosen = [rotations[i] for i in nearest]
     else:
-        chosen = [_towards_course(trial, arc, pairs, r) for r in rotations[:1]] * count
+        chosen = [_towards(trial, arc, pairs, rotations[0], before)] * count
     window = np.clip(np.searchsorted(edges, arc.start + arc.since, side="right") - 1, 0, count - 1)
     return np.array(chosen)[window], any(found)
 
@@ -317,18 +335,30 @@ def _wahba(pairs: _Pairs, use: np.ndarray) -> tuple[Array, float]:
     return rotation, float(np.sqrt(covariance[2, 2]))
 
 
-def _towards_course(trial: Trial, arc: _Arc, pairs: _Pairs, rotation: Array) -> Array:
-    """Turn an attitude about the vertical until the bow points along the course."""
+def _towards(
+    trial: Trial, arc: _Arc, pairs: _Pairs, rotation: Array, before: Array | None
+) -> Array:
+    """Turn an attitude at the start about the vertical until the bow points where it should.
+
+    Where it pointed at the end of the arc before; on the first arc, along the course at the
+    highest speed. Without a course it stays, for want of anything better.
+    """
+    forward_b = frd_from_body(trial.body_axes)[0]
+    if before is not None:
+        return _turned_to(rotation @ forward_b, before @ forward_b) @ rotation
     speed = np.linalg.norm(pairs.course[:, :2], axis=1)
     i = int(np.argmax(speed))
-    _at, body_R, _, _ = arc.carry(pairs.time[i : i + 1])
-    forward_b = frd_from_body(trial.body_axes)[0]
+    if speed[i] < _LEAST_SPEED:
+        return rotation
+    _, body_R, _, _ = arc.carry(pairs.time[i : i + 1])
     spin = arc.to_space(pairs.time[i : i + 1])[0].T
-    bow = spin @ rotation @ body_R[0] @ forward_b
-    now = np.arctan2(bow[1], bow[0])
-    course = pairs.course[i] if speed[i] > _LEAST_SPEED else np.array([0.0, 1.0, 0.0])
-    wanted = np.arctan2(course[1], course[0])
-    return exp_so3(np.array([0.0, 0.0, wanted - now])) @ rotation
+    return _turned_to(spin @ rotation @ body_R[0] @ forward_b, pairs.course[i]) @ rotation
+
+
+def _turned_to(bow: Array, wanted: Array) -> Array:
+    """Return the rotation about the vertical that takes one horizontal direction to another."""
+    angle = np.arctan2(wanted[1], wanted[0]) - np.arctan2(bow[1], bow[0])
+    return exp_so3(np.array([0.0, 0.0, angle]))
 
 
 def _kinematics(trial: Trial, frame: LocalFrame, seg: Segments, nRb: Array) -> tuple[Array, Array]:
@@ -380,6 +410,9 @@ def _fixes(gnss: Gnss, frame: LocalFrame) -> tuple[Array, Array]:
 
 
 def _interpolate(time: Array, at: Array, values: Array) -> Array:
+    """Return values (M, 3) at times by linear interpolation; the origin if there are none."""
+    if at.size == 0:
+        return np.zeros((time.size, 3))
     return np.stack([np.interp(time, at, values[:, i]) for i in range(3)], axis=1)
 
 

@@ -3,20 +3,35 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import gtsam
 import numpy as np
 
 from factorgraph_dvl import keys
-from factorgraph_dvl.conventions import Array, rotation_from_rph, rph_jacobian
+from factorgraph_dvl.conventions import (
+    DEG,
+    Array,
+    exp_so3,
+    inverse_right_jacobian,
+    log_so3,
+    rotation_from_rph,
+    rph_jacobian,
+)
 from factorgraph_dvl.earth import LocalFrame
 from factorgraph_dvl.preintegration import Segments, States, preintegrate
 from factorgraph_dvl.trial import Trial
 
 # Bounds, not knowledge: they keep an unaided chain from being singular.
 _FREE_ATTITUDE = np.pi
-_FREE_POSITION = 1e5
+_FREE_POSITION = 1e4
 _FREE_VELOCITY = 1e2
+# How a vessel may move while its IMU is silent: acceleration, m/s², turn rate, rad/s, and
+# the sway that even the shortest gap allows, m and rad.
+_GAP_ACCELERATION = 1.0
+_GAP_TURN = 10.0 * DEG
+_GAP_SWAY_M = 0.1
+_GAP_SWAY_RAD = 10.0 * DEG
 # What a standard deviation of 0 in `initial` stands for, rad; far below what is measured.
 _LEAST_STD = 1e-7
 # Keeps the walk of a bias that does not walk regular.
@@ -79,33 +94,71 @@ def inertial_chain(trial: Trial, frame: LocalFrame, seg: Segments, start: States
                 )
             )
     for a, (first, _) in enumerate(seg.arc_nodes):
-        mean, covariance = _state_prior(trial, frame, start, int(first), known=a == 0)
-        noise = gtsam.noiseModel.Gaussian.Covariance(covariance, False)
-        graph.add(gtsam.PriorFactorNavState(keys.node(int(first)), mean, noise))
+        mean, root = _state_prior(trial, frame, seg, start, int(first), known=a == 0)
+        graph.add(gtsam.PriorFactorNavState(keys.node(int(first)), mean, square_root(root)))
+    for (_, last), (first, _) in pairwise(seg.arc_nodes):
+        graph.add(_gap_factor(int(last), int(first), seg.node_time))
     return chain
 
 
 def _state_prior(
-    trial: Trial, frame: LocalFrame, start: States, k: int, *, known: bool
+    trial: Trial, frame: LocalFrame, seg: Segments, start: States, k: int, *, known: bool
 ) -> tuple[gtsam.NavState, Array]:
-    """Return mean and covariance, in GTSAM's tangent space, of a state at the start of an arc."""
+    """Return mean and square-root information of an arc's first state."""
     nRb, p_n = start.nRb[k], start.p_n[k]
-    attitude = np.eye(3) * _FREE_ATTITUDE**2
-    position = np.eye(3) * _FREE_POSITION**2
+    root = np.diag(1.0 / np.repeat([_FREE_ATTITUDE, _FREE_POSITION, _FREE_VELOCITY], 3))
+    # The first mean sample ends where `initial` holds; the first node is where it begins.
+    back = exp_so3(-seg.phi[0]) if seg.increments.averaged else np.eye(3)
     if known and trial.initial_attitude is not None:
-        nRb = rotation_from_rph(trial.initial_attitude.rph, trial.body_axes)
-        inverse = np.linalg.inv(rph_jacobian(trial.initial_attitude.rph, trial.body_axes))
+        rph = trial.initial_attitude.rph
+        nRb = rotation_from_rph(rph, trial.body_axes) @ back
         std = np.maximum(trial.initial_attitude.std, _LEAST_STD)
-        attitude = inverse @ np.diag(std**2) @ inverse.T
+        root[:3, :3] = rph_jacobian(rph, trial.body_axes) @ back / std[:, None]
     if known and trial.initial_position is not None:
         p_n = frame.position(*trial.initial_position.geodetic)
-        std = np.maximum(trial.initial_position.std, 1e-6)
-        position = nRb.T @ np.diag(std**2) @ nRb
-    covariance = np.zeros((9, 9))
-    covariance[:3, :3] = attitude
-    covariance[3:6, 3:6] = position
-    covariance[6:, 6:] = np.eye(3) * _FREE_VELOCITY**2
-    return gtsam.NavState(gtsam.Rot3(nRb), p_n, start.v_n[k]), covariance
+        if seg.increments.averaged:
+            p_n = p_n - start.v_n[k] * seg.increments.dt[0]
+        std = np.maximum(trial.initial_position.std, _LEAST_STD)
+        root[3:6, 3:6] = nRb / std[:, None]
+    return gtsam.NavState(gtsam.Rot3(nRb), p_n, start.v_n[k]), root
+
+
+def _gap_factor(before: int, after: int, node_time: Array) -> gtsam.CustomFactor:
+    """Return what is known of a vehicle across a gap of its IMU: it cannot jump.
+
+    Zero error where the velocity is the same on both sides, the displacement is the mean
+    velocity times the gap, and the attitude is the same; standard deviations from the
+    acceleration and the turn rate of a vessel.
+    """
+    gap = float(node_time[after] - node_time[before])
+    velocity = _GAP_ACCELERATION * gap
+    position = _GAP_ACCELERATION * gap**2 / 8.0 + _GAP_SWAY_M
+    attitude = min(_GAP_TURN * gap + _GAP_SWAY_RAD, _FREE_ATTITUDE)
+    sigma = np.repeat([attitude, position, velocity], 3)
+    node_keys = [keys.node(before), keys.node(after)]
+
+    def error(this: gtsam.CustomFactor, at: gtsam.Values, jacobians: list[Array] | None) -> Array:
+        a, b = (at.atNavState(key) for key in node_keys)
+        Ra, Rb = a.attitude().matrix(), b.attitude().matrix()
+        turn = log_so3(Ra.T @ Rb)
+        if jacobians is not None:
+            by_a, by_b = np.zeros((9, 9), order="F"), np.zeros((9, 9), order="F")
+            by_b[:3, :3] = inverse_right_jacobian(turn)
+            by_a[:3, :3] = -by_b[:3, :3] @ Rb.T @ Ra
+            by_a[3:6, 3:6], by_a[3:6, 6:] = -Ra, -0.5 * gap * Ra
+            by_b[3:6, 3:6], by_b[3:6, 6:] = Rb, -0.5 * gap * Rb
+            by_a[6:, 6:], by_b[6:, 6:] = -Ra, Rb
+            jacobians[0], jacobians[1] = by_a, by_b
+        mean_velocity = 0.5 * (a.velocity() + b.velocity())
+        shift = b.position() - a.position() - gap * mean_velocity
+        return np.concatenate([turn, shift, b.velocity() - a.velocity()])
+
+    return gtsam.CustomFactor(loose_diagonal(sigma), node_keys, error)
+
+
+def square_root(root: Array) -> gtsam.noiseModel.Gaussian:
+    """Return a noise model from square-root information (n, n), not squared on the way."""
+    return gtsam.noiseModel.Gaussian.SqrtInformation(np.linalg.qr(root, mode="r"), False)
 
 
 def loose_diagonal(sigmas: Array) -> gtsam.noiseModel.Diagonal:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
+from contextlib import suppress
 from enum import StrEnum
 from pathlib import Path
 from time import perf_counter
@@ -22,13 +23,15 @@ from factorgraph_dvl.errors import FactorgraphDvlError
 if TYPE_CHECKING:
     from types import TracebackType
 
+    from rich.table import Table
+
     from factorgraph_dvl.analysis.crosscheck import CrossCheck
     from factorgraph_dvl.solution import Solution
     from factorgraph_dvl.trial import Trial
 
 _NAME = "factorgraph-dvl"
 # Tables that go to a file or a pipe are not cut to the 80 columns of no terminal.
-_PIPE_WIDTH = 160
+_PIPE_WIDTH = 180
 
 app = typer.Typer(
     name=_NAME,
@@ -154,7 +157,6 @@ def solve(
 
     check_output(out, force=force)
     with _ProgressLine(quiet=quiet) as progress:
-        progress("load", 0, None)
         trial = load_trial(trial_path)
         # The solver takes longest to load: after what is most often wrong.
         from factorgraph_dvl.solvers.batch import solve as run
@@ -192,7 +194,7 @@ def inspect(trial_path: TrialPath) -> None:
     trial = load_trial(trial_path)
     result = survey(trial)
     console = _stdout()
-    console.print(sensor_table(result))
+    _print_table(sensor_table(result))
     console.print(motion_line(result), markup=False, soft_wrap=True)
     for note in trial.notes:
         _warn(note)
@@ -266,7 +268,7 @@ class _ProgressLine:
             transient=True,
             disable=quiet or not self._console.is_terminal,
         )
-        self._task = self._live.add_task("")
+        self._task = self._live.add_task("load")
 
     def __enter__(self) -> _ProgressLine:
         self._live.start()
@@ -284,8 +286,9 @@ class _ProgressLine:
         text = stage
         if iteration:
             text += f", iteration {iteration}"
-        if cost is not None:
-            text += f", cost {cost:.6g}"
+            # That of the start values is huge, and says nothing.
+            if cost is not None:
+                text += f", cost {cost:.4g}"
         if self._console.is_terminal:
             self._live.update(self._task, description=text)
         elif not self._quiet:
@@ -299,7 +302,7 @@ def _print_solution(trial: Trial, solution: Solution) -> None:
 
     truth = trial.calibration_truth
     errors = calibration_errors(solution, truth) if truth else None
-    _stdout().print(calibration_table(solution, errors))
+    _print_table(calibration_table(solution, errors, width=_stdout().width))
     for warning in solution.warnings:
         _warn(warning)
 
@@ -321,11 +324,11 @@ def _print_crosscheck(check: CrossCheck, a: Path, b: Path) -> None:
         solver = f" ({solution.solver})" if solution.solver else ""
         console.print(f"{side}: {path}{solver}", markup=False, soft_wrap=True)
     if check.components:
-        console.print(tables.component_table(check))
+        _print_table(tables.component_table(check, width=console.width))
     if check.motion is not None:
-        console.print(tables.motion_table(check.motion))
+        _print_table(tables.motion_table(check.motion))
     for table in tables.truth_tables(check):
-        console.print(table)
+        _print_table(table)
     for note in check.notes:
         _warn(note)
     console.print(tables.paragraph(check), markup=False)
@@ -342,6 +345,15 @@ def _print_written(out: Path) -> None:
     _stdout().print(f"Wrote {', '.join(map(str, written))} to {out}", markup=False, soft_wrap=True)
 
 
+def _print_table(table: Table) -> None:
+    """Print a table whole: one wider than the terminal is wrapped by that, never cut."""
+    from factorgraph_dvl.report.tables import width_of
+
+    console = _stdout()
+    console.width = max(console.width, width_of(table))
+    console.print(table)
+
+
 def _warn(message: str) -> None:
     _stderr().print(Text(f"warning: {message}", "yellow"), soft_wrap=True)
 
@@ -351,6 +363,9 @@ def _stdout() -> Console:
 
 
 def _stderr() -> Console:
+    # What was said first comes first, also where both streams end in one file.
+    with suppress(OSError):
+        sys.stdout.flush()
     return Console(stderr=True)
 
 

@@ -17,8 +17,8 @@ import gtsam
 import numpy as np
 
 from factorgraph_dvl import keys
-from factorgraph_dvl.chain import Chain, loose_diagonal
-from factorgraph_dvl.conventions import Array, exp_so3, log_so3, right_jacobian
+from factorgraph_dvl.chain import Chain, loose_diagonal, square_root
+from factorgraph_dvl.conventions import Array, exp_so3, inverse_right_jacobian, log_so3
 from factorgraph_dvl.increments import IntArray
 from factorgraph_dvl.preintegration import Attachment, States, Transition, attach, motion_at
 from factorgraph_dvl.sensors.protocol import Linearization, Motion, Observation, Parameter
@@ -28,6 +28,8 @@ from factorgraph_dvl.sensors.protocol import Linearization, Motion, Observation,
 _HELD = 1e-7
 # The same for a held direction, in standard deviations of the prior.
 _HELD_DIRECTION = 1e-4
+# How far a time offset may move from its start, s, before measurements are bound anew.
+_TIME_MARGIN = 0.05
 
 _STATE = 9
 _BIAS = 6
@@ -53,7 +55,7 @@ class _Block:
     bound: list[_Bound]
     parameters: tuple[Parameter, ...]
     nodes: IntArray = field(default_factory=lambda: np.empty(0, int))
-    order: IntArray = field(default_factory=lambda: np.empty(0, int))
+    order: IntArray | None = None
     rows: list[slice] = field(default_factory=list)
     factors: list[gtsam.JacobianFactor] = field(default_factory=list)
     matrices: list[Array] = field(default_factory=list)
@@ -88,6 +90,7 @@ class Problem:
     chain : Chain
     observations : of the aiding sensors.
     parameters : of the aiding sensors, fixed ones included.
+    start : values of parameters, where they are known better than by their priors.
     """
 
     def __init__(
@@ -95,6 +98,7 @@ class Problem:
         chain: Chain,
         observations: Sequence[Observation],
         parameters: Sequence[Parameter],
+        start: dict[str, Array] | None = None,
     ) -> None:
         self.chain = chain
         self.all_parameters = tuple(parameters)
@@ -105,6 +109,7 @@ class Problem:
         for p in self.parameters:
             self._add_prior(p)
         self.uncovered: dict[str, int] = {}
+        self._start = {**self.prior_values(), **(start or {})}
         self._bound: list[_Bound] = []
         for observation in observations:
             self._bound.append(self._bind(observation))
@@ -167,7 +172,9 @@ class Problem:
     @property
     def prior_sigma(self) -> Array:
         """Standard deviations of the priors of all estimated parameters, (P,), SI."""
-        return np.concatenate([np.maximum(p.sigma, _HELD) for p in self.parameters])
+        return np.concatenate(
+            [np.empty(0), *(np.maximum(p.sigma, _HELD) for p in self.parameters)]
+        )
 
     def difference(self, parameters: dict[str, Array], origin: dict[str, Array]) -> Array:
         """Return parameters minus origin in the origin's tangent space, (P,), SI."""
@@ -299,16 +306,21 @@ class Problem:
         sigma = np.maximum(p.sigma, _HELD)
         if p.rotation:
             # The prior is stated for the rotation vector, GTSAM's for its tangent space.
-            to_tangent = right_jacobian(p.mean)
-            covariance = to_tangent @ np.diag(sigma**2) @ to_tangent.T
-            noise = gtsam.noiseModel.Gaussian.Covariance(covariance, False)
+            root = inverse_right_jacobian(p.mean) / sigma[:, None]
+            noise = square_root(root)
             self.graph.addPriorRot3(key, gtsam.Rot3(exp_so3(p.mean)), noise)
         else:
             self.graph.addPriorVector(key, p.mean, loose_diagonal(sigma))
 
     def _bind(self, observation: Observation) -> _Bound:
-        time = observation.true_time(self.prior_values())
-        _, _, covered = self.chain.segments.increments.locate(time)
+        time = observation.true_time(self._start)
+        later = observation.true_time(self.moved(self._start, self.prior_sigma))
+        # A measurement whose time is yet to be found must not leave the record on the way.
+        margin = 0.0 if np.array_equal(time, later) else _TIME_MARGIN
+        locate = self.chain.segments.increments.locate
+        covered = locate(time)[2]
+        if margin > 0.0:
+            covered &= locate(time - margin)[2] & locate(time + margin)[2]
         if not covered.all():
             self.uncovered[observation.label] = int((~covered).sum())
         weight = np.repeat(covered.astype(float)[:, None], len(observation.components), axis=1)
@@ -316,6 +328,12 @@ class Problem:
             if np.array_equal(other.time, time):
                 return _Bound(observation, other.attachment, time, weight)
         return _Bound(observation, self._attach(time), time, weight)
+
+    @property
+    def strayed(self) -> bool:
+        """Whether a time offset has moved measurements in use out of the record."""
+        locate = self.chain.segments.increments.locate
+        return any(np.any((b.weight[:, 0] > 0.0) & ~locate(b.time)[2]) for b in self._bound)
 
     def _attach(self, time: Array) -> Attachment:
         seg = self.chain.segments
@@ -341,7 +359,8 @@ class Problem:
         row_node = np.concatenate(
             [np.repeat(b.attachment.node, d) for b, d in zip(block.bound, depth, strict=True)]
         )
-        block.order = np.argsort(row_node, kind="stable")
+        in_order = bool(np.all(np.diff(row_node) >= 0))
+        block.order = None if in_order else np.argsort(row_node, kind="stable")
         used, counts = np.unique(row_node, return_counts=True)
         edges = np.concatenate([[0], np.cumsum(counts)])
         block.rows = [slice(a, b) for a, b in itertools.pairwise(edges)]
@@ -378,6 +397,8 @@ class Problem:
             rhs.append(-(bound.weight * lin.residual).ravel())
         matrix = np.concatenate(parts) if len(parts) > 1 else parts[0]
         vector = np.concatenate(rhs)
+        if block.order is None:
+            return matrix, vector
         return matrix[block.order], vector[block.order]
 
 

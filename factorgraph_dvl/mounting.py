@@ -45,11 +45,15 @@ _OFFSET_REACH = 1.0
 
 @dataclass(frozen=True)
 class _Moments:
-    """Weighted sums over pings of x xᵀ, x yᵀ, yᵀy with x = (v_b, omega, 1), y = v_d."""
+    """Weighted sums over pings of x xᵀ, x yᵀ, yᵀy with x = (v_b, omega, 1), y = v_d.
+
+    `share` of the pings were summed up, those that the IMU covers.
+    """
 
     xx: Array
     xy: Array
     yy: float
+    share: float
 
 
 @dataclass(frozen=True)
@@ -86,7 +90,8 @@ def initial_mounting(
         weight = covered / (sigma**2).mean(axis=1)
         y = dvl.velocity[pings]
         xw = x * weight[:, None]
-        return _Moments(xw.T @ x, xw.T @ y, float(weight @ (y**2).sum(axis=1)))
+        share = float(np.mean(covered))
+        return _Moments(xw.T @ x, xw.T @ y, float(weight @ (y**2).sum(axis=1)), share)
 
     offset_prior = priors[TIME_OFFSET]
     offset = float(offset_prior.mean[0])
@@ -95,10 +100,15 @@ def initial_mounting(
         for step in (_OFFSET_STEP, _OFFSET_FINE):
             count = int(np.ceil(reach / step))
             grid = offset + np.arange(-count, count + 1) * step
-            offset = float(grid[np.argmin([_linear_misfit(moments(t)) for t in grid])])
+            away = 0.5 * ((grid - offset_prior.mean) / offset_prior.sigma) ** 2
+            misfit = [_linear_misfit(moments(t)) for t in grid]
+            offset = float(grid[np.argmin(misfit + away)])
             reach = 2.0 * step
         values[TIME_OFFSET] = np.array([offset])
-    best = _best(moments(offset), priors)
+    found = moments(offset)
+    if found.share == 0.0:
+        return values
+    best = _best(found, priors)
     values[MISALIGNMENT] = best.dRb
     values[SCALE_ERROR] = best.scale - 1.0
     values[LEVER_ARM] = best.lever_arm
@@ -107,9 +117,14 @@ def initial_mounting(
 
 
 def _linear_misfit(moments: _Moments) -> float:
-    """Return the misfit of v_d = M v_b + N omega + beta with the best free M, N, beta."""
+    """Return the misfit of v_d = M v_b + N omega + beta with the best free M, N, beta.
+
+    As if all pings had been covered: an offset is no better for losing some.
+    """
+    if moments.share == 0.0:
+        return np.inf
     theta = _least_squares(moments)
-    return moments.yy - float(np.sum(theta.T * moments.xy))
+    return (moments.yy - float(np.sum(theta.T * moments.xy))) / moments.share
 
 
 def _least_squares(moments: _Moments) -> Array:

@@ -255,8 +255,8 @@ class Transition:
     """Derivatives of the motion at M times with respect to the node before.
 
     The node's tangent space is GTSAM's: theta in nRb Exp(theta), and position and
-    velocity in body axes. A block is computed when a sensor asks for it; none of those that
-    are missing differs from zero.
+    velocity in body axes. A block is computed when a sensor asks for it. What is left out is
+    of second order in the Earth's rate, or below 1e-4 of the bias's share.
 
     Parameters
     ----------

@@ -52,7 +52,8 @@ def stub(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
     def solve(trial: Trial, *, rate_hz: float, progress: Callable[..., None]) -> Solution:
         state["trial"], state["rate"] = trial, rate_hz
         progress("alignment", 0, None)
-        progress("batch", 1, 12.5)
+        progress("batch", 0, 9.87e12)
+        progress("batch", 1, 12.51234)
         if state["raises"] is not None:
             raise state["raises"]
         return state["solution"]
@@ -83,7 +84,8 @@ def test_solve_writes_a_solution_and_shows_it(
     for name in ("calibration.json", "trajectory.csv", "track.png"):
         assert name in result.out
     assert "warning: misalignment_z_deg was not observable" in result.err
-    assert "batch, iteration 1, cost 12.5" in result.err
+    steps = [line.partition(" s  ")[2] for line in result.err.splitlines() if " s  " in line]
+    assert steps == ["alignment", "batch", "batch, iteration 1, cost 12.51", "write"]
 
 
 def test_solve_options(tmp_path: Path, run: Run, stub: dict[str, Any]) -> None:
@@ -187,8 +189,58 @@ def test_bad_input_exits_2_and_says_where(
     assert result.code == 2
     assert f"error: {name}" in result.err or case == "no table"
     assert expected in result.err
+    assert result.err.startswith("error: ")
     assert "Traceback" not in result.err
     assert {p.name for p in tmp_path.iterdir()} == {"trial"}
+
+
+@pytest.mark.parametrize("command", ["solve", "inspect"])
+def test_a_missing_trial_prints_its_error_only(
+    tmp_path: Path, run: Run, stub: dict[str, Any], command: str
+) -> None:
+    args = ["--out", tmp_path / "out"] if command == "solve" else []
+    result = run(command, tmp_path / "nowhere", *args)
+    assert result.code == 2
+    assert result.out == ""
+    assert result.err.startswith("error: ")
+    assert len(result.err.splitlines()) == 1
+
+
+@pytest.mark.parametrize("width", [80, 60])
+def test_a_terminal_too_narrow_cuts_no_number(
+    tmp_path: Path,
+    run: Run,
+    stub: dict[str, Any],
+    monkeypatch: pytest.MonkeyPatch,
+    width: int,
+) -> None:
+    monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
+    monkeypatch.setenv("COLUMNS", str(width))
+    monkeypatch.setenv("TERM", "xterm")
+    trial = write_trial(tmp_path)
+    out = run("solve", trial, "--out", tmp_path / "out").out
+    assert "…" not in out
+    for text in ("misalignment_z, deg", "0.005123 ± 0.000033", "0.005000", "+3.70"):
+        assert text in out
+    assert "prior" not in out
+    out = run("inspect", trial).out
+    assert "…" not in out
+    assert "missing %" in out
+
+
+def test_the_table_comes_before_its_warnings_in_one_file(tmp_path: Path) -> None:
+    trial = write_trial(tmp_path)
+    with (trial / "trial.yaml").open("a") as file:
+        file.write("star: {file: star.csv}\n")
+    done = subprocess.run(
+        [sys.executable, "-m", "factorgraph_dvl.cli", "inspect", str(trial)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        timeout=60,
+        check=True,
+    )
+    assert 0 < done.stdout.index("missing %") < done.stdout.index("warning: section `star`")
 
 
 @pytest.mark.parametrize(

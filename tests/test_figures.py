@@ -7,10 +7,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
 from factorgraph_dvl.conventions import DEG
 from factorgraph_dvl.earth import LocalFrame
 from factorgraph_dvl.report.figures import write_figures
+from factorgraph_dvl.report.residual_figures import residuals_figure
+from factorgraph_dvl.report.trajectory_figures import motion_figure
 from factorgraph_dvl.sensors.gnss import Gnss, GnssSettings
 from factorgraph_dvl.sensors.imu import Imu, ImuSettings
 from factorgraph_dvl.solution import Estimate, Residuals, Solution, Trajectory
@@ -291,6 +294,38 @@ def test_outliers_and_vehicle_at_rest(short: tuple[Trial, Solution], tmp_path: P
         residuals=(gnss, replace(dvl, residual=residual)),
     )
     assert drawn(replace(trial, reference=None), changed, tmp_path) == UNCALIBRATED
+
+
+def titles(figure: Figure) -> list[str]:
+    return [title for ax in figure.axes if (title := ax.get_title(loc="left"))]
+
+
+def test_a_swing_too_fast_for_the_whole_time_is_drawn_close_up(
+    short: tuple[Trial, Solution], tmp_path: Path
+) -> None:
+    trajectory = short[1].trajectory
+    assert len(motion_figure(trajectory, None).axes) == 12
+    trial, solution = synthetic(900.0, trajectory_step=10)
+    figure = motion_figure(solution.trajectory, None)
+    assert len(figure.axes) == 18
+    assert "10 s of it" in titles(figure)
+    close_up = figure.axes[2]
+    (line,) = close_up.lines
+    seconds, roll = np.asarray(line.get_xdata()), np.asarray(line.get_ydata())
+    assert seconds[0] == pytest.approx(445.0)
+    assert seconds[-1] == pytest.approx(455.0)
+    shown = np.isin(solution.trajectory.time, seconds)
+    np.testing.assert_allclose(roll, solution.trajectory.rph[shown, 0] / DEG)
+    assert drawn(trial, solution, tmp_path) == ALL
+
+
+def test_a_band_beyond_the_panel_is_explained(short: tuple[Trial, Solution]) -> None:
+    _, dvl = short[1].residuals
+    assert not residuals_figure([dvl]).texts
+    sigma = dvl.sigma.copy()
+    sigma[7:9] *= 12.0
+    (note,) = residuals_figure([replace(dvl, sigma=sigma)]).texts
+    assert "gyro's samples" in note.get_text()
 
 
 def test_sensors_get_files_of_their_own(short: tuple[Trial, Solution], tmp_path: Path) -> None:

@@ -263,3 +263,15 @@ def test_records_that_are_too_short_are_refused():
     sparse = without(long, [i for i in range(100) if i % 20 >= 5])
     with pytest.raises(DataError, match="no stretch without gaps"):
         increments(sparse)
+
+
+@pytest.mark.parametrize(("rate_hz", "decimals", "epoch"), [(128.0, 3, 0.0), (100.0, 9, 1.7e9)])
+def test_rounded_time_stamps_are_not_taken_for_jitter(rate_hz, decimals, epoch):
+    edges = np.arange(0.0, 20.0, 1.0 / rate_hz)
+    exact = record(edges)
+    stamped = Imu(exact.settings, np.round(exact.time + epoch, decimals), exact.gyro, exact.accel)
+    found, true = increments(stamped)[0], increments(exact)[0]
+    every = np.arange(true.start.size)
+    # Each increment to the noise of a good gyro in a sample; by milliseconds it is 2e-4 rad.
+    np.testing.assert_allclose(found.over(every)[0], true.over(every)[0], atol=2e-8)
+    assert np.ptp(found.dt) < 1e-3 / rate_hz

@@ -678,7 +678,7 @@ def test_the_simulator_shares_no_measurement_model_with_the_estimator():
                 assert not any("factorgraph_dvl" in alias.name for alias in node.names)
             if isinstance(node, ast.ImportFrom) and node.module.startswith("factorgraph_dvl."):
                 module = node.module.removeprefix("factorgraph_dvl.")
-                if module.startswith("simulate"):
+                if module.startswith("simulation"):
                     continue
                 names = allowed[module]
                 assert names is None or {alias.name for alias in node.names} <= names

@@ -19,6 +19,15 @@ def test_a_good_trial_has_no_problems() -> None:
     assert {f.sensor for f in result.findings} == {"IMU", "GNSS", "DVL"}
 
 
+def test_a_speed_ratio_is_not_taken_for_a_scale_error() -> None:
+    (text,) = (
+        f.text for f in survey(dvl_velocity(build_trial(), 1.093)).findings if "times" in f.text
+    )
+    assert "1.09 times that of the GNSS" in text
+    for contributor in ("not its scale error", "lever arm", "sway"):
+        assert contributor in text
+
+
 def test_rates_gaps_and_motion_are_those_of_the_record() -> None:
     result = survey(build_trial())
     imu, gnss, dvl = result.sensors

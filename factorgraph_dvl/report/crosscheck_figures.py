@@ -15,7 +15,6 @@ from factorgraph_dvl.analysis.motion_difference import (
     MotionDifference,
     joined_errors,
 )
-from factorgraph_dvl.conventions import Array
 from factorgraph_dvl.report.drawing import (
     ACCENT,
     DARK,
@@ -24,17 +23,16 @@ from factorgraph_dvl.report.drawing import (
     NORMAL,
     SMALL,
     TITLE,
-    WIDE_BUCKETS,
+    clock,
+    draw_band,
     draw_line,
     envelope,
     new_figure,
     new_grid,
-    readable,
-    save,
+    save_figures,
     style,
-    time_axis,
-    with_std,
 )
+from factorgraph_dvl.report.text import split_unit, with_std
 
 _RED = "#c0392b"
 _COLORS = {"agree": ACCENT, "differ": _RED, "not comparable": GREY}
@@ -63,11 +61,7 @@ def write_crosscheck_figures(check: CrossCheck, folder: Path) -> list[Path]:
         figures["differences"] = _differences(check.motion)
     if check.truth_a.trajectory is not None or check.truth_b.trajectory is not None:
         figures["errors"] = _errors(check)
-    paths = []
-    for name, figure in figures.items():
-        paths.append(folder / f"{name}.png")
-        save(figure, paths[-1])
-    return paths
+    return save_figures(figures, folder)
 
 
 def _parameters(check: CrossCheck) -> Figure:
@@ -86,7 +80,9 @@ def _parameters(check: CrossCheck) -> Figure:
     style(ax, "(A − B) / σ of A − B", "")
     ax.grid(visible=False, axis="y")
     ax.set_xticks([-6, -3, 0, 3, 6], ["−6", "−3", "0", "3", "6"])
-    ax.set_yticks(range(len(rows)), [readable(c.name)[0] for c in rows], fontsize=NORMAL)
+    ax.set_yticks(
+        range(len(rows)), [split_unit(c.name)[0].replace("_", " ") for c in rows], fontsize=NORMAL
+    )
     ax.tick_params(axis="y", length=0)
     ax.spines["left"].set_visible(False)
     shown = dict.fromkeys(c.kind for c in rows)
@@ -123,7 +119,7 @@ def _draw_component(ax: Axes, y: int, c: Component) -> None:
     elif np.isfinite(z):
         ax.plot([z - 1.0, z + 1.0], [y, y], color=color, lw=1.6, zorder=2)
         ax.plot(z, y, "o", color=color, ms=5, mfc=face, zorder=3)
-    unit = readable(c.name)[1]
+    unit = split_unit(c.name)[1]
     known = np.isfinite(c.std) and c.std > 0.0
     difference = (
         with_std(c.difference, c.std) if known else f"{c.difference:.4g}".replace("-", "−")
@@ -150,11 +146,12 @@ def _differences(motion: MotionDifference) -> Figure:
     """Draw A − B over time within ±3σ of what is shown."""
     figure = new_figure(12.0, 6.2)
     axes = new_grid(figure, 3, 3, top=0.4).subplots(sharex=True, squeeze=False)
-    start, time_label = time_axis(motion.time)
+    start, time_label = clock(motion.time)
     time = motion.time - start
     for i, name in enumerate(COMPONENTS):
         ax = axes[i % 3, i // 3]
-        _draw_band(ax, time, motion.std[:, i])
+        if np.isfinite(motion.std[:, i]).all():
+            draw_band(ax, time, 3.0 * motion.std[:, i])
         draw_line(ax, time, motion.difference[:, i])
         ax.axhline(0.0, color=GREY, lw=0.5)
         _label(ax, i, name, time_label)
@@ -171,7 +168,7 @@ def _errors(check: CrossCheck) -> Figure:
     present = [(side, errors, color) for side, errors, color in sides if errors is not None]
     figure = new_figure(12.0, 6.2)
     axes = new_grid(figure, 3, 3, top=0.6).subplots(sharex=True, squeeze=False)
-    start, time_label = time_axis(np.concatenate([errors.time for _, errors, _ in present]))
+    start, time_label = clock(np.concatenate([errors.time for _, errors, _ in present]))
     # The smaller error would vanish behind the larger.
     present.sort(key=lambda item: -float(np.mean(joined_errors(item[1])[0][:, 3:6] ** 2)))
     for side, errors, color in present:
@@ -180,9 +177,9 @@ def _errors(check: CrossCheck) -> Figure:
         for i in range(len(COMPONENTS)):
             ax = axes[i % 3, i // 3]
             for sign in (-3.0, 3.0):
-                bucket_time, _, high = envelope(time, std[:, i], WIDE_BUCKETS)
+                bucket_time, _, high = envelope(time, std[:, i])
                 ax.plot(bucket_time, sign * high, color=color, lw=0.7, dashes=(4, 3))
-            bucket_time, low, high = envelope(time, error[:, i], WIDE_BUCKETS)
+            bucket_time, low, high = envelope(time, error[:, i])
             ax.fill_between(
                 bucket_time, low, high, color=color, alpha=0.5, lw=0.8, label=f"error of {side}"
             )
@@ -209,17 +206,8 @@ def _label_of(item: tuple[object, object]) -> str:
     return str(item[0])
 
 
-def _draw_band(ax: Axes, time: Array, std: Array) -> None:
-    if not np.isfinite(std).all():
-        return
-    bucket_time, _, high = envelope(time, 3.0 * std, WIDE_BUCKETS)
-    ax.fill_between(bucket_time, -high, high, color=LIGHT, lw=0, zorder=0)
-    ax.plot(bucket_time, high, color=GREY, lw=0.7)
-    ax.plot(bucket_time, -high, color=GREY, lw=0.7)
-
-
 def _label(ax: Axes, i: int, name: str, time_label: str) -> None:
-    words, unit = readable(name)
+    words, unit = split_unit(name)
     axis = {"e": "east", "n": "north", "u": "up"}
-    last = words.split()[-1]
+    last = words.split("_")[-1]
     style(ax, time_label if i % 3 == 2 else "", f"{axis.get(last, last)}, {unit}")

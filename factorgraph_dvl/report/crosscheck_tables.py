@@ -17,13 +17,43 @@ from factorgraph_dvl.analysis.motion_difference import (
     error_spreads,
     mean_nees,
 )
-from factorgraph_dvl.report.tables import at_precision, or_dash, split_unit, with_std
+from factorgraph_dvl.report.tables import width_of
+from factorgraph_dvl.report.text import at_precision, split_unit, with_std
 
+_UNLIMITED = 10_000
 _STYLES = {"agree": "green", "differ": "red", "not comparable": "yellow"}
 
 
-def component_table(check: CrossCheck) -> Table:
-    """Render every calibration component of both results, with its verdict."""
+def component_table(check: CrossCheck, *, width: int = _UNLIMITED) -> Table:
+    """Render every calibration component of both results, with its verdict.
+
+    Parameters
+    ----------
+    check : with the components.
+    width : columns that there are. If they are too few, only the differences are shown.
+    """
+    table = _full_table(check)
+    return table if width_of(table) <= width else _brief_table(check)
+
+
+def _brief_table(check: CrossCheck) -> Table:
+    table = Table(title="Calibration: A − B")
+    table.add_column("parameter", no_wrap=True)
+    table.add_column("A − B ± σ", justify="right", no_wrap=True)
+    table.add_column("in σ", justify="right", no_wrap=True)
+    table.add_column("verdict", no_wrap=True)
+    for c in check.components:
+        name, unit = split_unit(c.name)
+        table.add_row(
+            f"{name}, {unit}" if unit else name,
+            _value(c.difference, c.std, c.std),
+            _or_dash(c.in_sigmas, "+.2f"),
+            Text(c.verdict, _STYLES[c.verdict]),
+        )
+    return table
+
+
+def _full_table(check: CrossCheck) -> Table:
     table = Table(title="Calibration: A − B")
     table.add_column("parameter", no_wrap=True)
     for header in ("A ± σ", "B ± σ", "A − B", "σ of A − B", "in σ"):
@@ -31,7 +61,7 @@ def component_table(check: CrossCheck) -> Table:
     table.add_column("which σ", no_wrap=True)
     table.add_column("unit", no_wrap=True)
     table.add_column("verdict", no_wrap=True)
-    table.add_column("because")
+    table.add_column("because", no_wrap=True)
     components = check.components
     for i, c in enumerate(components):
         name, unit = split_unit(c.name)
@@ -42,8 +72,8 @@ def component_table(check: CrossCheck) -> Table:
             _value(c.a, c.std_a, scale),
             _value(c.b, c.std_b, scale),
             at_precision(c.difference, scale) if np.isfinite(c.difference) else "–",
-            or_dash(c.std, ".2g"),
-            or_dash(c.in_sigmas, "+.2f"),
+            _or_dash(c.std, ".2g"),
+            _or_dash(c.in_sigmas, "+.2f"),
             "" if c.kind == "none" else c.kind,
             unit,
             Text(c.verdict, _STYLES[c.verdict]),
@@ -69,9 +99,9 @@ def motion_table(motion: MotionDifference) -> Table:
             f"{s.rms:.3g}",
             f"{s.largest:.3g}",
             f"{s.time_of_largest:.10g}",
-            or_dash(s.rms_sigmas, ".2f"),
-            or_dash(s.largest_sigmas, ".2f"),
-            or_dash(100.0 * s.within_2_sigma, ".1f"),
+            _or_dash(s.rms_sigmas, ".2f"),
+            _or_dash(s.largest_sigmas, ".2f"),
+            _or_dash(100.0 * s.within_2_sigma, ".1f"),
             "" if kind == "none" else kind,
             end_section=i % 3 == 2,
         )
@@ -147,8 +177,8 @@ def _calibration_truth(sides: Sequence[tuple[str, AgainstTruth]]) -> Table:
             continue
         for i, name in enumerate(errors.names):
             row = rows.setdefault(name, [f"{errors.truth[i]:.6g}", "–", "–", "–", "–"])
-            row[1 + 2 * k] = or_dash(float(errors.error[i]), "+.3g")
-            row[2 + 2 * k] = or_dash(float(errors.normalised[i]), "+.2f")
+            row[1 + 2 * k] = _or_dash(float(errors.error[i]), "+.3g")
+            row[2 + 2 * k] = _or_dash(float(errors.normalised[i]), "+.2f")
     for name, row in rows.items():
         short, unit = split_unit(name)
         table.add_row(short, *row, unit)
@@ -188,18 +218,22 @@ def _trajectory_truth(sides: Sequence[tuple[str, AgainstTruth]]) -> Table:
                 cells += ["–"] * 3
                 continue
             s = spreads[i]
-            share = or_dash(100.0 * s.within_2_sigma, ".1f")
+            share = _or_dash(100.0 * s.within_2_sigma, ".1f")
             cells += [f"{s.rms:.3g}", f"{s.largest:.3g}", share]
         table.add_row(name, unit, *cells, end_section=i % 3 == 2)
     for k, group in enumerate(("position", "velocity", "attitude")):
         cells = []
         for _, against in sides:
             errors = against.trajectory
-            nees = "–" if errors is None else or_dash(float(mean_nees(errors)[k]), ".2f")
+            nees = "–" if errors is None else _or_dash(float(mean_nees(errors)[k]), ".2f")
             cells += [nees, "", ""]
         table.add_row(f"{group}: mean NEES (3 expected)", "", *cells)
     table.caption = f"Expected inside 2σ: {100.0 * TWO_SIGMA_SHARE:.1f} %, over many trials"
     return table
+
+
+def _or_dash(value: float, spec: str) -> str:
+    return format(value + 0.0, spec) if np.isfinite(value) else "–"
 
 
 def _resolution(c: Component) -> float:

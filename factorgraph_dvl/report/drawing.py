@@ -1,8 +1,8 @@
-"""What figures share: sizes, colours, axes, lines over time, numbers as text."""
+"""Axes, lines and bands that the figures have in common."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -10,15 +10,12 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.gridspec import GridSpec
-from matplotlib.ticker import MaxNLocator
-from numpy.typing import NDArray
 
-from factorgraph_dvl.analysis.consistency import VectorErrors
+from factorgraph_dvl.analysis.consistency import TrajectoryErrors, VectorErrors
 from factorgraph_dvl.conventions import Array
+from factorgraph_dvl.report.text import fixed
 
-DPI = 120
 ACCENT = "#0a6ebd"
-ACCENT_MEDIUM = "#6aa8dc"
 ACCENT_LIGHT = "#bcd9f0"
 DARK = "#222222"
 GREY = "#8a8a8a"
@@ -27,30 +24,33 @@ LIGHT = "#e9e9e9"
 SMALL = 7.5
 NORMAL = 8.5
 TITLE = 10.5
-BUCKETS = 2_500
+
+_DPI = 120
+_BUCKETS = 2_500
 # Filling a jagged area costs more than a line, and shows less.
-WIDE_BUCKETS = 400
-UNITS = {
-    "deg_h": "deg/h",
-    "m_s": "m/s",
-    "deg": "deg",
-    "ug": "µg",
-    "m": "m",
-    "s": "s",
-}
+_WIDE_BUCKETS = 400
+# A panel has about as many pixels from left to right.
+_MOST_CROSSINGS = 500.0
+# The envelope of noise is jagged and reads like two lines: later.
+_MOST_CROSSINGS_OF_NOISE = 1600.0
 
 
-def save(figure: Figure, path: Path) -> None:
-    """Write a figure as PNG."""
-    # Unlike `savefig` this draws only once. The fastest compression level is good
-    # enough for line drawings.
-    canvas = FigureCanvasAgg(figure)
-    canvas.print_png(path, pil_kwargs={"compress_level": 1})  # type: ignore[no-untyped-call]
+def save_figures(figures: Mapping[str, Figure], folder: Path) -> list[Path]:
+    """Write figures as PNG files under their names; return the paths."""
+    paths = []
+    for name, figure in figures.items():
+        path = folder / f"{name}.png"
+        # Unlike `savefig` this draws only once. The fastest compression level is good
+        # enough for line drawings.
+        canvas = FigureCanvasAgg(figure)
+        canvas.print_png(path, pil_kwargs={"compress_level": 1})  # type: ignore[no-untyped-call]
+        paths.append(path)
+    return paths
 
 
 def new_figure(width: float, height: float) -> Figure:
     """Return an empty figure, inches."""
-    return Figure(figsize=(width, height), dpi=DPI)
+    return Figure(figsize=(width, height), dpi=_DPI)
 
 
 def new_grid(
@@ -102,32 +102,56 @@ def style(ax: Axes, xlabel: str, ylabel: str) -> None:
         ax.yaxis.set_label_coords(-0.58 / width, 0.5)
 
 
-def draw_line(ax: Axes, time: Array, value: Array) -> None:
+def error_title(
+    ax: Axes, with_reference: str, without: str, errors: TrajectoryErrors | None
+) -> None:
+    """Write above axes whether they show errors or, without a reference, their claimed size."""
+    title = f"{without}: standard deviation" if errors is None else f"{with_reference}, ±3σ"
+    ax.set_title(title, fontsize=TITLE, loc="left")
+
+
+def is_dense(value: Array, most_crossings: float = _MOST_CROSSINGS) -> bool:
+    """Whether a line through (M,) values crosses its panel so often that only a block is seen."""
+    crossings = float(np.abs(np.diff(value)).sum()) / max(float(np.ptp(value)), 1e-300)
+    return crossings > most_crossings
+
+
+def draw_line(
+    ax: Axes,
+    time: Array,
+    value: Array,
+    *,
+    marker: str = "",
+    most_crossings: float = _MOST_CROSSINGS,
+) -> None:
     """Draw a line through (M,) values; where that would be a solid block, its envelope."""
-    strokes = float(np.abs(np.diff(value)).sum()) / max(float(np.ptp(value)), 1e-300)
-    if strokes > 4.0 * WIDE_BUCKETS:
-        bucket_time, low, high = envelope(time, value, WIDE_BUCKETS)
+    if is_dense(value, most_crossings):
+        bucket_time, low, high = envelope(time, value)
         # The outline remains where the envelope is too narrow to be seen.
         ax.fill_between(
-            bucket_time, low, high, facecolor=ACCENT_MEDIUM, edgecolor=ACCENT, lw=0.7, zorder=2
+            bucket_time, low, high, facecolor=ACCENT_LIGHT, edgecolor=ACCENT, lw=0.7, zorder=2
         )
         return
-    bucket_time, low, high = envelope(time, value)
+    bucket_time, low, high = envelope(time, value, _BUCKETS)
     if low is high:
-        ax.plot(time, value, color=ACCENT, lw=0.9)
+        ax.plot(time, value, color=ACCENT, lw=0.9, marker=marker, ms=2.5)
     else:
         zigzag = np.stack([low, high], axis=1).ravel()
         ax.plot(np.repeat(bucket_time, 2), zigzag, color=ACCENT, lw=0.9)
 
 
+def draw_band(ax: Axes, time: Array, half: Array) -> None:
+    """Draw a band about zero, of (M,) half widths."""
+    bucket_time, _, high = envelope(time, half)
+    ax.fill_between(bucket_time, -high, high, color=LIGHT, lw=0, zorder=0)
+    for edge in (-high, high):
+        ax.plot(bucket_time, edge, color=GREY, lw=0.7)
+
+
 def draw_error(ax: Axes, time: Array, errors: VectorErrors, c: int, scale: float) -> None:
     """Draw a component of errors within ±3σ."""
-    three_sigma = 3.0 * scale * errors.std[:, c]
-    bucket_time, _, high = envelope(time, three_sigma, WIDE_BUCKETS)
-    ax.fill_between(bucket_time, -high, high, color=LIGHT, lw=0, zorder=0)
-    ax.plot(bucket_time, high, color=GREY, lw=0.7)
-    ax.plot(bucket_time, -high, color=GREY, lw=0.7)
-    draw_line(ax, time, scale * errors.error[:, c])
+    draw_band(ax, time, 3.0 * scale * errors.std[:, c])
+    draw_line(ax, time, scale * errors.error[:, c], most_crossings=_MOST_CROSSINGS_OF_NOISE)
 
 
 def draw_std(ax: Axes, time: Array, std: Array) -> None:
@@ -136,7 +160,9 @@ def draw_std(ax: Axes, time: Array, std: Array) -> None:
     ax.set_ylim(0.0, 1.1 * float(std.max()) or 1.0)
 
 
-def envelope(time: Array, value: Array, buckets: int = BUCKETS) -> tuple[Array, Array, Array]:
+def envelope(
+    time: Array, value: Array, buckets: int = _WIDE_BUCKETS
+) -> tuple[Array, Array, Array]:
     """Return times, least and largest of (M,) values in buckets; the values if M is small."""
     if value.size <= 2 * buckets:
         return time, value, value
@@ -145,7 +171,7 @@ def envelope(time: Array, value: Array, buckets: int = BUCKETS) -> tuple[Array, 
     return np.append(time[edges], time[-1]), np.append(low, low[-1]), np.append(high, high[-1])
 
 
-def time_axis(time: Array) -> tuple[float, str]:
+def clock(time: Array) -> tuple[float, str]:
     """Return the start of the time axis, s, and its label."""
     first = float(time.min())
     # Seconds since some epoch long ago do not fit on a tick.
@@ -155,32 +181,11 @@ def time_axis(time: Array) -> tuple[float, str]:
     return start, f"time − {start:.0f}, s"
 
 
-def readable(component: str) -> tuple[str, str]:
-    """Split the name of a component into words and unit: `lever_arm_x_m`, `lever arm x`, `m`."""
-    for suffix, unit in UNITS.items():
-        if component.endswith(f"_{suffix}"):
-            return component.removesuffix(f"_{suffix}").replace("_", " "), unit
-    return component.replace("_", " "), ""
+def number(value: float, decimals: int) -> str:
+    """Write a number with so many decimals, as it is typeset."""
+    return typeset(fixed(float(value), decimals))
 
 
-def with_std(value: float, std: float) -> str:
-    """Write a value with its standard deviation, to two digits of the latter."""
-    if std <= 0.0:
-        return f"{value:g}"
-    digits = max(0, 1 - int(np.floor(np.log10(std))))
-    return f"{decimals(value, digits)} ± {decimals(std, digits)}"
-
-
-def decimals(value: float, digits: int) -> str:
-    """Write a number with so many decimals, without a negative zero."""
-    return f"{round(float(value), digits) + 0.0:.{digits}f}".replace("-", "−")
-
-
-def round_ticks(low: float, high: float) -> tuple[NDArray[np.float64], list[str]]:
-    """Return a few round ticks inside an interval, and their labels without offset."""
-    ticks = np.asarray(MaxNLocator(nbins=5, steps=[1, 2, 2.5, 5, 10]).tick_values(low, high))
-    step = ticks[1] - ticks[0]
-    margin = 0.03 * (high - low)
-    ticks = ticks[(ticks >= low + margin) & (ticks <= high - margin)]
-    digits = next((d for d in range(12) if abs(round(step, d) / step - 1.0) < 1e-3), 12)
-    return ticks, [decimals(t, digits) for t in ticks]
+def typeset(numbers: str) -> str:
+    """Replace hyphens by minus signs."""
+    return numbers.replace("-", "−")

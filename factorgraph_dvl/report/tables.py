@@ -4,54 +4,69 @@ from __future__ import annotations
 
 import math
 
+from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
 from factorgraph_dvl.analysis.consistency import CalibrationErrors
 from factorgraph_dvl.analysis.survey import Survey
+from factorgraph_dvl.report.text import at_precision, fixed, split_unit, with_std
 from factorgraph_dvl.solution import Solution
 
-_UNITS = {"deg_h": "deg/h", "m_s": "m/s", "deg": "deg", "ug": "µg", "m": "m", "s": "s"}
 _STYLES = {"error": "red", "warning": "yellow", "ok": "green"}
+_UNLIMITED = 10_000
 
 
-def calibration_table(solution: Solution, errors: CalibrationErrors | None = None) -> Table:
+def calibration_table(
+    solution: Solution, errors: CalibrationErrors | None = None, *, width: int = _UNLIMITED
+) -> Table:
     """Render the calibration: value and standard deviation against the prior's.
 
     Parameters
     ----------
     solution : with the estimates.
     errors : against the truth, if that is known.
+    width : columns that there are. If they are too few for all of the table, the prior is
+        left out and the unit joins the name; if they still are, the table is wider.
     """
+    table = _calibration_table(solution, errors, brief=False)
+    if width_of(table) > width:
+        return _calibration_table(solution, errors, brief=True)
+    return table
+
+
+def _calibration_table(
+    solution: Solution, errors: CalibrationErrors | None, *, brief: bool
+) -> Table:
     known = {}
     if errors is not None:
-        normalised = errors.normalised
-        known = {
-            name: (float(errors.truth[i]), float(normalised[i]))
-            for i, name in enumerate(errors.names)
-        }
+        rows = zip(errors.truth.tolist(), errors.normalised.tolist(), strict=True)
+        known = dict(zip(errors.names, rows, strict=True))
     table = Table(title="Calibration")
-    for header in ("parameter", "value ± std", "unit", "prior std", "observable"):
-        numeric = header in ("value ± std", "prior std")
-        table.add_column(header, justify="right" if numeric else "left", no_wrap=True)
+    _add_column(table, "parameter")
+    _add_column(table, "value ± std", numeric=True)
+    if not brief:
+        _add_column(table, "unit")
+        _add_column(table, "prior std", numeric=True)
+    _add_column(table, "observable")
     if known:
-        table.add_column("truth", justify="right", no_wrap=True)
-        table.add_column("error/σ", justify="right", no_wrap=True)
+        _add_column(table, "truth", numeric=True)
+        _add_column(table, "error/σ", numeric=True)
     for estimate in solution.estimates:
         for i, component in enumerate(estimate.component_names):
             name, unit = split_unit(component)
-            value, std = float(estimate.value[i]), float(estimate.std[i])
-            observable = bool(estimate.observable[i])
-            row: list[str | Text] = [
-                name,
-                with_std(value, std),
-                unit,
-                f"{float(estimate.prior_std[i]):.3g}",
-                Text("yes", "green") if observable else Text("no", "yellow"),
-            ]
+            std = float(estimate.std[i])
+            value = with_std(float(estimate.value[i]), std)
+            row: list[str | Text]
+            if brief:
+                row = [f"{name}, {unit}" if unit else name, value]
+            else:
+                row = [name, value, unit, f"{float(estimate.prior_std[i]):.3g}"]
+            row.append(Text("yes", "green") if estimate.observable[i] else Text("no", "yellow"))
             if component in known:
-                truth, normalised_error = known[component]
-                row += [at_precision(truth, std), or_dash(normalised_error, "+.2f")]
+                truth, normalised = known[component]
+                row.append(at_precision(truth, std))
+                row.append(fixed(normalised, 2, signed=True) if math.isfinite(normalised) else "–")
             elif known:
                 row += ["", ""]
             table.add_row(*row, end_section=component == estimate.component_names[-1])
@@ -60,14 +75,14 @@ def calibration_table(solution: Solution, errors: CalibrationErrors | None = Non
 
 def sensor_table(survey: Survey) -> Table:
     """Render what was recorded by each sensor."""
-    table = Table(title=f"Trial {survey.trial}")
-    table.add_column("sensor")
+    table = Table(title=Text(f"Trial {survey.trial}"))
+    _add_column(table, "sensor")
     for header in ("rate Hz", "samples", "from s", "to s", "gaps", "longest s", "missing %"):
-        table.add_column(header, justify="right", no_wrap=True)
+        _add_column(table, header, numeric=True)
     for s in survey.sensors:
         table.add_row(
-            s.label,
-            or_dash(s.rate, ".4g"),
+            Text(s.label),
+            f"{s.rate:.4g}" if math.isfinite(s.rate) else "–",
             f"{s.samples}",
             f"{s.start:.10g}",
             f"{s.end:.10g}",
@@ -76,6 +91,11 @@ def sensor_table(survey: Survey) -> Table:
             f"{100.0 * s.missing:.3g}",
         )
     return table
+
+
+def width_of(table: Table) -> int:
+    """Return the columns that a table takes if nothing of it is cut."""
+    return Console(width=_UNLIMITED).measure(table).maximum
 
 
 def motion_line(survey: Survey) -> str:
@@ -96,27 +116,5 @@ def finding_lines(survey: Survey) -> list[Text]:
     ]
 
 
-def split_unit(component: str) -> tuple[str, str]:
-    """Split `lever_arm_x_m` into `lever_arm_x` and a unit to show."""
-    for suffix, unit in _UNITS.items():
-        if component.endswith(f"_{suffix}"):
-            return component.removesuffix(f"_{suffix}"), unit
-    return component, ""
-
-
-def with_std(value: float, std: float) -> str:
-    """Write a value and its standard deviation, to two digits of the latter."""
-    return f"{at_precision(value, std)} ± {at_precision(std, std)}"
-
-
-def at_precision(value: float, std: float) -> str:
-    """Write a value to two digits of its standard deviation."""
-    if not (math.isfinite(std) and std > 0.0 and math.isfinite(value)):
-        return f"{value:.6g}"
-    decimals = 1 - math.floor(math.log10(std))
-    return f"{value:.{min(max(decimals, 0), 12)}f}"
-
-
-def or_dash(value: float, spec: str) -> str:
-    """Write a number; nan and infinity as a dash."""
-    return format(value, spec) if math.isfinite(value) else "–"
+def _add_column(table: Table, header: str, *, numeric: bool = False) -> None:
+    table.add_column(header, justify="right" if numeric else "left", no_wrap=True)

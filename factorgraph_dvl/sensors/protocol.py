@@ -89,7 +89,7 @@ class Motion:
     p_n, v_n : (M, 3) position and Earth-relative velocity of the IMU in n, m, m/s.
     omega_eb_b : (M, 3) angular rate of the body relative to the Earth, rad/s.
     a_n : (M, 3) Earth-relative acceleration, dv_n/dt, m/s².
-    alpha_b : (M, 3) time derivative of omega_eb_b, rad/s².
+    alpha_b : (M, 3) time derivative of the angular rate, rad/s².
     omega_sigma : (M, 3) standard deviation of omega_eb_b from the gyro's noise and
         from motion that its samples do not resolve, rad/s.
     """

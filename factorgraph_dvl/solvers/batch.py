@@ -88,12 +88,13 @@ def solve(
                 states = coarse.evaluation.states
             report("mounting", 0, None)
             values = _mounting(trial, frame, seg, chain.gravity_n, states)
-        problem = Problem(chain, *_sensors(trial.aids, frame))
+        problem = Problem(chain, *_sensors(trial.aids, frame), start=values)
         at = problem.values(states, {**problem.prior_values(), **values})
         minimum = minimise(problem, at, stage="all sensors", progress=report)
         iterations += minimum.iterations
         states, values = minimum.evaluation.states, minimum.evaluation.parameters
-        if np.sqrt(np.mean((states.p_n - p_gravity) ** 2)) < _SAME_GRAVITY:
+        same_gravity = np.sqrt(np.mean((states.p_n - p_gravity) ** 2)) < _SAME_GRAVITY
+        if same_gravity and not problem.strayed:
             break
     report("covariance", 0, None)
     covariances = posterior(problem, minimum)

@@ -17,7 +17,7 @@ from scipy.linalg.lapack import dtrtrs
 from factorgraph_dvl import keys
 from factorgraph_dvl.conventions import Array
 from factorgraph_dvl.graph import Problem
-from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, eliminate
+from factorgraph_dvl.solvers.levenberg_marquardt import Minimum
 
 
 @dataclass(frozen=True)
@@ -159,8 +159,7 @@ class Posterior:
 def posterior(problem: Problem, minimum: Minimum) -> Posterior:
     """Return the covariances at a minimum."""
     sizes = minimum.evaluation.values.dims()
-    tree = eliminate(minimum.gaussian, minimum.ordering)
-    information = SquareRootInformation(tree, sizes)
+    information = SquareRootInformation(minimum.tree, sizes)
     wanted = [keys.node(k) for k in range(problem.chain.segments.node_time.size)]
     marginals = information.marginals(wanted)
     return Posterior(information, np.stack([marginals[key] for key in wanted]))

@@ -1,4 +1,4 @@
-"""Levenberg-Marquardt over a problem, with GTSAM's elimination by QR."""
+"""Levenberg-Marquardt over a problem, with GTSAM's elimination."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ Progress = Callable[[str, int, float | None], None]
 # halved: the decrease of the cost that the linear model still promises.
 CONVERGED = 1e-5
 # Sizes of a step that the linear model is trusted for, once it has failed: NavState
-# (rad, m, m/s), and how many priors' standard deviations in other variables.
+# (rad, m, m/s), and SI units in other variables.
 _TRUSTED_STATE = np.repeat([0.05, 5.0, 0.5], 3)
-_FIRST_DAMPING = 1.0
+_FIRST_DAMPING = 1e-4
 _MAX_DAMPING = 1e12
 # Relative error of a cost that sums up 1e5 squares.
 _ROUNDING = 1e-12
@@ -32,15 +32,13 @@ class Minimum:
     Parameters
     ----------
     evaluation : at the last values.
-    gaussian : the graph linearised there.
-    ordering : elimination order.
+    tree : Bayes tree from QR there, up to the last step, which was small if `converged`.
     converged : whether the linear model promises no more.
     iterations : accepted and refused steps.
     """
 
     evaluation: Evaluation
-    gaussian: gtsam.GaussianFactorGraph
-    ordering: gtsam.Ordering
+    tree: gtsam.GaussianBayesTree
     converged: bool
     iterations: int
 
@@ -51,7 +49,7 @@ def minimise(
     *,
     stage: str,
     progress: Progress | None = None,
-    max_iterations: int = 30,
+    max_iterations: int = 50,
     tolerance: float = CONVERGED,
 ) -> Minimum:
     """Minimise a problem's cost.
@@ -60,6 +58,9 @@ def minimise(
     damping. Damping from the start, in proportion to the diagonal of the information
     matrix, would stall: the diagonal is that of relative attitudes known to 1e-7 rad, and
     holds back the common rotation of the whole trajectory as well.
+
+    Steps come from Cholesky's factorisation, which is fast but squares the condition of the
+    problem. When one fails, and before a minimum is believed, QR takes over.
 
     Parameters
     ----------
@@ -86,53 +87,69 @@ def minimise(
         )
     gaussian = problem.linearize(evaluation)
     ordering = problem.ordering(gaussian)
+    tree: gtsam.GaussianBayesTree | None = None
     damping = 0.0
+    careful = False
     iteration = 0
-    converged = False
     if progress:
         progress(stage, 0, evaluation.cost)
     while iteration < max_iterations:
         iteration += 1
-        delta = _step(gaussian, ordering, evaluation.values, damping)
-        promised = evaluation.cost - gaussian.error(delta)
+        damped = _damped(gaussian, evaluation.values, damping) if damping > 0.0 else gaussian
+        delta = None if careful else quick_step(damped, ordering)
+        promised = evaluation.cost - gaussian.error(delta) if delta is not None else -np.inf
+        if not promised > tolerance:
+            tree = eliminate(damped, ordering)
+            delta = tree.optimize()
+            promised = evaluation.cost - gaussian.error(delta)
+        assert delta is not None
         trial = problem.evaluate(evaluation.values.retract(delta))
-        small = promised < tolerance
         lower = trial.cost <= evaluation.cost * (1.0 + _ROUNDING)
+        small = promised < tolerance
         if np.isfinite(trial.cost) and (lower or small):
             if lower:
                 evaluation = trial
-            if damping == 0.0 and small:
-                converged = True
-            damping = 0.0 if damping <= _FIRST_DAMPING else damping / 100.0
             if progress:
                 progress(stage, iteration, evaluation.cost)
+            if small and damping == 0.0 and tree is not None:
+                return Minimum(evaluation, tree, True, iteration)
+            damping = damping / 10.0 if damping > _FIRST_DAMPING else 0.0
             gaussian = problem.linearize(evaluation)
-            if converged:
-                break
+        elif not careful and tree is None:
+            # The step may have been bad for want of digits only.
+            careful = True
+            problem.evaluate(evaluation.values)
         else:
             damping = max(damping * 10.0, _FIRST_DAMPING)
             if damping > _MAX_DAMPING:
                 break
             # Evaluating moved the attachments along with a time offset.
             problem.evaluate(evaluation.values)
-    return Minimum(evaluation, gaussian, ordering, converged, iteration)
+        tree = None
+    return Minimum(evaluation, eliminate(gaussian, ordering), False, iteration)
+
+
+def quick_step(
+    gaussian: gtsam.GaussianFactorGraph, ordering: gtsam.Ordering
+) -> gtsam.VectorValues | None:
+    """Return the step from Cholesky's factorisation, None where it has no digits left."""
+    try:
+        return gaussian.optimize(ordering)
+    except RuntimeError:
+        return None
 
 
 def eliminate(
     gaussian: gtsam.GaussianFactorGraph, ordering: gtsam.Ordering
 ) -> gtsam.GaussianBayesTree:
-    """Return the Bayes tree from QR: Cholesky has no digits left at navigation grade."""
+    """Return the Bayes tree from QR, which does not square the condition of the problem."""
     return gaussian.eliminateMultifrontal(ordering, gtsam.EliminateQR)
 
 
-def _step(
-    gaussian: gtsam.GaussianFactorGraph,
-    ordering: gtsam.Ordering,
-    values: gtsam.Values,
-    damping: float,
-) -> gtsam.VectorValues:
-    if damping == 0.0:
-        return eliminate(gaussian, ordering).optimize()
+def _damped(
+    gaussian: gtsam.GaussianFactorGraph, values: gtsam.Values, damping: float
+) -> gtsam.GaussianFactorGraph:
+    """Return the graph with Levenberg's damping on every variable."""
     damped = gtsam.GaussianFactorGraph()
     for i in range(gaussian.size()):
         damped.push_back(gaussian.at(i))
@@ -144,4 +161,4 @@ def _step(
             np.zeros(size),
             gtsam.noiseModel.Unit.Create(size),
         )
-    return eliminate(damped, ordering).optimize()
+    return damped

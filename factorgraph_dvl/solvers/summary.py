@@ -198,7 +198,7 @@ def _output_times(problem: Problem, rate_hz: float) -> Array:
     first, last = inc.start[0], inc.end[-1]
     time = np.arange(np.ceil(first * rate_hz - 1e-6), np.floor(last * rate_hz + 1e-6) + 1)
     time = time / rate_hz
-    return np.asarray(time[inc.locate(time)[2]])
+    return np.asarray(time[inc.locate(time)[2]] + 0.0)
 
 
 def _smoothed(problem: Problem, states: States, time: Array) -> tuple[Motion, Array, np.ndarray]:
@@ -272,6 +272,8 @@ def _unobservable(
         for observation, motion in zip(problem.observations, motions, strict=True)
         for name in observation.parameters
     }
+    time = problem.chain.segments.node_time
+    duration = float(time[-1] - time[0])
     out = []
     for e in estimates:
         bad = np.flatnonzero(~e.observable & (e.prior_std > 0.0))
@@ -284,8 +286,8 @@ def _unobservable(
             why = "without GNSS nothing separates the errors of the IMU from the motion"
         else:
             why = (
-                "the trial is too short or too calm to know it better than the prior; turns and "
-                "changes of speed separate it from the attitude error"
+                f"{duration:.0f} s with these manoeuvres do not tell it better than the prior; "
+                "it takes longer, or turns and changes of speed"
             )
         missing = "; the trial has no GNSS" if trial.gnss is None and e.name in by_name else ""
         out.append(f"{names} not observable: {why}{missing}")

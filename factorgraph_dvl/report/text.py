@@ -1,0 +1,33 @@
+"""Numbers and names as they are shown to the reader, in tables and in figures."""
+
+from __future__ import annotations
+
+import math
+
+_UNITS = {"deg_h": "deg/h", "m_s": "m/s", "deg": "deg", "ug": "µg", "m": "m", "s": "s"}
+_MOST_DECIMALS = 12
+
+
+def split_unit(component: str) -> tuple[str, str]:
+    """Split `lever_arm_x_m` into `lever_arm_x` and a unit to show, empty if there is none."""
+    for suffix, unit in _UNITS.items():
+        if component.endswith(f"_{suffix}"):
+            return component.removesuffix(f"_{suffix}"), unit
+    return component, ""
+
+
+def fixed(value: float, decimals: int, *, signed: bool = False) -> str:
+    """Write a number with so many decimals, never as a negative zero."""
+    return format(round(value, decimals) + 0.0, f"{'+' if signed else ''}.{decimals}f")
+
+
+def at_precision(value: float, std: float) -> str:
+    """Write a number to the second digit of its standard deviation."""
+    if not (math.isfinite(std) and std > 0.0 and math.isfinite(value)):
+        return f"{value + 0.0:.6g}"
+    return fixed(value, min(max(1 - math.floor(math.log10(std)), 0), _MOST_DECIMALS))
+
+
+def with_std(value: float, std: float) -> str:
+    """Write a value and its standard deviation, to two digits of the latter."""
+    return f"{at_precision(value, std)} ± {at_precision(std, std)}"
