@@ -331,13 +331,13 @@ def _print_crosscheck(check: CrossCheck, a: Path, b: Path) -> None:
         _print_table(table)
     for note in check.notes:
         _warn(note)
-    console.print(tables.paragraph(check), markup=False)
+    console.print(tables.paragraph(check), markup=False, highlight=False)
     if check.explanation:
         console.print("Where they differ:", markup=False)
         for sentence in check.explanation:
-            console.print(f"- {sentence}", markup=False)
+            console.print(f"- {sentence}", markup=False, highlight=False)
     if check.components:
-        console.print(tables.verdict_line(check.components), markup=False)
+        console.print(tables.verdict_line(check.components), markup=False, highlight=False)
 
 
 def _print_written(out: Path) -> None:
