@@ -31,6 +31,7 @@ from factorgraph_dvl.report.drawing import (
     new_grid,
     save_figures,
     style,
+    typeset,
 )
 from factorgraph_dvl.report.text import split_unit, with_std
 
@@ -125,7 +126,7 @@ def _draw_component(ax: Axes, y: int, c: Component) -> None:
         with_std(c.difference, c.std) if known else f"{c.difference:.4g}".replace("-", "−")
     )
     kind = "" if c.kind in ("none", "upper bound") else f"({c.kind})"
-    difference = " ".join(part for part in (difference, unit, kind) if part)
+    difference = typeset(" ".join(part for part in (difference, unit, kind) if part))
     for x, text, text_color in ((1.02, difference, DARK), (1.48, _verdict(c), color)):
         ax.text(
             x,
