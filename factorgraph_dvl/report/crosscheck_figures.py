@@ -122,9 +122,7 @@ def _draw_component(ax: Axes, y: int, c: Component) -> None:
         ax.plot(z, y, "o", color=color, ms=5, mfc=face, zorder=3)
     unit = split_unit(c.name)[1]
     known = np.isfinite(c.std) and c.std > 0.0
-    difference = (
-        with_std(c.difference, c.std) if known else f"{c.difference:.4g}".replace("-", "−")
-    )
+    difference = with_std(c.difference, c.std) if known else f"{c.difference:.4g}"
     kind = "" if c.kind in ("none", "upper bound") else f"({c.kind})"
     difference = typeset(" ".join(part for part in (difference, unit, kind) if part))
     for x, text, text_color in ((1.02, difference, DARK), (1.48, _verdict(c), color)):
