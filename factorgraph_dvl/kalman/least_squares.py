@@ -1,0 +1,159 @@
+"""Nonlinear least squares between the point sets, with lever arm and time offset.
+
+    v_d = (1 + k) dRb (v_b + omega x l) + beta,  at time_s - offset.
+
+Stands for the quaternion methods of Wang (2021) and, with the time offset, Liu (2022):
+the same minimum, found by a trust-region Gauss-Newton method from several rotations
+instead of by a genetic algorithm.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from scipy import optimize
+
+from factorgraph_dvl.conventions import Array, exp_so3, inverse_right_jacobian, log_so3, rotate
+from factorgraph_dvl.kalman.points import (
+    Estimated,
+    Outcome,
+    Points,
+    PointsAt,
+    prior_of,
+    rotation_starts,
+)
+from factorgraph_dvl.sensors.protocol import Parameter
+
+# The search for the time offset: a fraction of the period of a vessel's roll.
+_OFFSET_STEP = 0.04
+_OFFSET_REACH = 1.0
+
+
+@dataclass(frozen=True)
+class _Problem:
+    """Residuals as a function of steps from a rotation, and of the other parameters."""
+
+    parameters: tuple[Parameter, ...]
+    prior: Estimated
+    points_at: PointsAt
+    free: np.ndarray
+
+    def values(self, R: Array, x: Array) -> tuple[Array, ...]:
+        full = np.zeros(sum(p.mean.size for p in self.parameters))
+        full[3:] = np.concatenate(self.prior.values[1:])
+        full[self.free] = x
+        out, at = [R @ exp_so3(full[:3])], 3
+        for p in self.parameters[1:]:
+            out.append(full[at : at + p.mean.size])
+            at += p.mean.size
+        return tuple(out)
+
+    def residual(self, x: Array, R: Array, weight_of: tuple[Array, Array]) -> Array:
+        dRb, scale, arm, bias, offset = self.values(R, x)
+        points = self.points_at(float(offset[0]))
+        predicted = (1.0 + scale) * rotate(dRb[None], points.at_dvl(arm)) + bias
+        sigma = np.sqrt(
+            np.diagonal(points.covariance_d(*weight_of), axis1=1, axis2=2)
+        )
+        mean = self.parameters[0].mean
+        away = inverse_right_jacobian(mean) @ log_so3(exp_so3(mean).T @ dRb)
+        others = (
+            value - p.mean
+            for p, value in zip(self.parameters[1:], (scale, arm, bias, offset), strict=True)
+        )
+        deviation = np.concatenate([away, *others])[self.free]
+        prior_sigma = np.concatenate([p.sigma for p in self.parameters])[self.free]
+        return np.concatenate([((predicted - points.v_d) / sigma).ravel(), deviation / prior_sigma])
+
+
+def least_squares(points_at: PointsAt, parameters: Sequence[Parameter]) -> Outcome:
+    """Calibrate by nonlinear least squares, from several starts.
+
+    Parameters
+    ----------
+    points_at : returns the point sets for a time offset, s.
+    parameters : misalignment, scale error, lever arm, bias and time offset, with their
+        priors; those with a standard deviation of zero are held.
+    """
+    parameters = tuple(parameters)
+    prior = prior_of(parameters)
+    sigma = np.concatenate([p.sigma for p in parameters])
+    free = np.flatnonzero(sigma > 0.0)
+    offset = float(parameters[4].mean[0])
+    if parameters[4].estimated:
+        offset = _coarse_offset(points_at, offset, float(parameters[4].sigma[0]))
+    few = points_at(offset).thinned()
+    held = np.flatnonzero(free < sum(p.mean.size for p in parameters[:4]))
+    coarse = _Problem(parameters, prior, lambda _: few, free[held])
+    ends = [
+        _solve(coarse, R, coarse_x0(coarse), rounds=1) for R in rotation_starts(parameters[0])
+    ]
+    best = min(ends, key=_cost_of_plausible)
+    x0 = np.zeros(free.size)
+    x0[held] = best[0].x
+    x0[held[free[held] < 3]] = 0.0
+    if parameters[4].estimated:
+        x0[-1] = offset
+    problem = _Problem(parameters, prior, lru_cache(maxsize=4)(points_at), free)
+    result, R = _solve(problem, best[1], x0, rounds=2)
+    values = problem.values(R, result.x)
+    covariance = np.zeros_like(prior.covariance)
+    # Each column to its own size first, or units hide what is known.
+    size = np.maximum(np.linalg.norm(result.jac, axis=0), 1e-300)
+    J = result.jac / size
+    covariance[np.ix_(free, free)] = np.linalg.inv(J.T @ J) / np.outer(size, size)
+    used = [i for i, p in enumerate(parameters) if i < 3 or p.estimated]
+    rows = np.concatenate(
+        [np.full(p.mean.size, i in used) for i, p in enumerate(parameters)]
+    )
+    estimated = Estimated(
+        tuple(parameters[i] for i in used),
+        tuple(values[i] for i in used),
+        covariance[np.ix_(rows, rows)],
+    )
+    return Outcome(estimated, int(result.nfev), converged=bool(result.success))
+
+
+def coarse_x0(problem: _Problem) -> Array:
+    """Return the prior means of the free components, without a turn."""
+    full = np.concatenate([np.zeros(3), *problem.prior.values[1:]])
+    return full[problem.free]
+
+
+def _cost_of_plausible(end: tuple[optimize.OptimizeResult, Array]) -> float:
+    return float(end[0].cost)
+
+
+def _solve(
+    problem: _Problem, R: Array, x0: Array, *, rounds: int
+) -> tuple[optimize.OptimizeResult, Array]:
+    """Return the minimum and the rotation that it is relative to."""
+    turn = problem.free < 3
+    arm = problem.prior.values[2]
+    for _ in range(rounds):
+        result = optimize.least_squares(
+            problem.residual, x0, args=(R, (R, arm)), x_scale="jac", max_nfev=60
+        )
+        full_turn = problem.values(R, result.x)
+        R, arm = full_turn[0], full_turn[2]
+        x0 = np.where(turn, 0.0, result.x)
+        result.x = x0
+    return result, R
+
+
+def _coarse_offset(points_at: PointsAt, mean: float, sigma: float) -> float:
+    """Return the offset at which v_d = M v_b + N omega + beta fits best, with any M and N."""
+    reach = min(4.0 * sigma, _OFFSET_REACH)
+    count = int(np.ceil(reach / _OFFSET_STEP))
+    grid = mean + np.arange(-count, count + 1) * _OFFSET_STEP
+
+    def left_over(offset: float) -> float:
+        points = points_at(offset).thinned()
+        x = np.hstack([points.v_b, points.omega_b, np.ones((len(points), 1))])
+        fit = np.linalg.lstsq(x, points.v_d, rcond=None)[0]
+        return float(np.sum((points.v_d - x @ fit) ** 2))
+
+    return float(grid[np.argmin([left_over(float(t)) for t in grid])])
