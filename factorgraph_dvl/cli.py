@@ -62,7 +62,6 @@ class KalmanMethod(StrEnum):
     LEAST_SQUARES = "least-squares"
 
 
-
 def main(argv: list[str] | None = None) -> NoReturn:
     """Run the command line and exit: 0 done, 1 could not deliver, 2 bad input or usage.
 

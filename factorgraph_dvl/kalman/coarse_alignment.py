@@ -12,11 +12,20 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from factorgraph_dvl.conventions import DEG, Array, BodyAxes, exp_so3, frd_from_body, rotate
+from factorgraph_dvl.conventions import (
+    DEG,
+    DEG_PER_HOUR,
+    MICRO_G,
+    STANDARD_GRAVITY,
+    Array,
+    BodyAxes,
+    exp_so3,
+    frd_from_body,
+    rotate,
+)
 from factorgraph_dvl.earth import RATE, enu_from_ecef, normal_gravity
 from factorgraph_dvl.kalman.steps import Steps
 from factorgraph_dvl.sensors.imu import ImuSettings
-from factorgraph_dvl.conventions import DEG_PER_HOUR, MICRO_G, STANDARD_GRAVITY
 
 # Velocity, m/s, by which the bias of a gyro may bend a window, and its limits, s.
 _BENT = 0.2

@@ -16,11 +16,10 @@ from functools import lru_cache
 import numpy as np
 from scipy import optimize
 
-from factorgraph_dvl.conventions import Array, exp_so3, inverse_right_jacobian, log_so3, rotate
+from factorgraph_dvl.conventions import Array, exp_so3, inverse_right_jacobian, log_so3
 from factorgraph_dvl.kalman.points import (
     Estimated,
     Outcome,
-    Points,
     PointsAt,
     prior_of,
     rotation_starts,
@@ -51,13 +50,17 @@ class _Problem:
             at += p.mean.size
         return tuple(out)
 
-    def residual(self, x: Array, R: Array, weight_of: tuple[Array, Array]) -> Array:
+    def sigma(self, R: Array, x: Array) -> Array:
+        """Return the standard deviations of the velocities, (M, 3), near a solution."""
+        dRb, _, arm, _, offset = self.values(R, x)
+        P = self.points_at(float(offset[0])).covariance_d(dRb, arm)
+        return np.sqrt(np.diagonal(P, axis1=1, axis2=2))
+
+    def residual(self, x: Array, R: Array, sigma: Array) -> Array:
+        """Return the whitened residuals of velocities and priors."""
         dRb, scale, arm, bias, offset = self.values(R, x)
         points = self.points_at(float(offset[0]))
-        predicted = (1.0 + scale) * rotate(dRb[None], points.at_dvl(arm)) + bias
-        sigma = np.sqrt(
-            np.diagonal(points.covariance_d(*weight_of), axis1=1, axis2=2)
-        )
+        predicted = (1.0 + scale) * (points.at_dvl(arm) @ dRb.T) + bias
         mean = self.parameters[0].mean
         away = inverse_right_jacobian(mean) @ log_so3(exp_so3(mean).T @ dRb)
         others = (
@@ -66,7 +69,13 @@ class _Problem:
         )
         deviation = np.concatenate([away, *others])[self.free]
         prior_sigma = np.concatenate([p.sigma for p in self.parameters])[self.free]
-        return np.concatenate([((predicted - points.v_d) / sigma).ravel(), deviation / prior_sigma])
+        return np.concatenate(
+            [((predicted - points.v_d) / sigma).ravel(), deviation / prior_sigma]
+        )
+
+    def at_prior(self) -> Array:
+        """Return the prior means of the free components, without a turn."""
+        return np.concatenate([np.zeros(3), *self.prior.values[1:]])[self.free]
 
 
 def least_squares(points_at: PointsAt, parameters: Sequence[Parameter]) -> Outcome:
@@ -89,16 +98,16 @@ def least_squares(points_at: PointsAt, parameters: Sequence[Parameter]) -> Outco
     held = np.flatnonzero(free < sum(p.mean.size for p in parameters[:4]))
     coarse = _Problem(parameters, prior, lambda _: few, free[held])
     ends = [
-        _solve(coarse, R, coarse_x0(coarse), rounds=1) for R in rotation_starts(parameters[0])
+        _solve(coarse, R, coarse.at_prior(), rounds=1, most=15)
+        for R in rotation_starts(parameters[0])
     ]
-    best = min(ends, key=_cost_of_plausible)
+    best = min(ends, key=lambda end: float(end[0].cost))
     x0 = np.zeros(free.size)
     x0[held] = best[0].x
-    x0[held[free[held] < 3]] = 0.0
     if parameters[4].estimated:
         x0[-1] = offset
     problem = _Problem(parameters, prior, lru_cache(maxsize=4)(points_at), free)
-    result, R = _solve(problem, best[1], x0, rounds=2)
+    result, R = _solve(problem, best[1], x0, rounds=2, most=100)
     values = problem.values(R, result.x)
     covariance = np.zeros_like(prior.covariance)
     # Each column to its own size first, or units hide what is known.
@@ -106,9 +115,7 @@ def least_squares(points_at: PointsAt, parameters: Sequence[Parameter]) -> Outco
     J = result.jac / size
     covariance[np.ix_(free, free)] = np.linalg.inv(J.T @ J) / np.outer(size, size)
     used = [i for i, p in enumerate(parameters) if i < 3 or p.estimated]
-    rows = np.concatenate(
-        [np.full(p.mean.size, i in used) for i, p in enumerate(parameters)]
-    )
+    rows = np.concatenate([np.full(p.mean.size, i in used) for i, p in enumerate(parameters)])
     estimated = Estimated(
         tuple(parameters[i] for i in used),
         tuple(values[i] for i in used),
@@ -117,30 +124,18 @@ def least_squares(points_at: PointsAt, parameters: Sequence[Parameter]) -> Outco
     return Outcome(estimated, int(result.nfev), converged=bool(result.success))
 
 
-def coarse_x0(problem: _Problem) -> Array:
-    """Return the prior means of the free components, without a turn."""
-    full = np.concatenate([np.zeros(3), *problem.prior.values[1:]])
-    return full[problem.free]
-
-
-def _cost_of_plausible(end: tuple[optimize.OptimizeResult, Array]) -> float:
-    return float(end[0].cost)
-
-
 def _solve(
-    problem: _Problem, R: Array, x0: Array, *, rounds: int
+    problem: _Problem, R: Array, x0: Array, *, rounds: int, most: int
 ) -> tuple[optimize.OptimizeResult, Array]:
-    """Return the minimum and the rotation that it is relative to."""
+    """Return the minimum and the rotation that it is relative to, after `rounds` weightings."""
     turn = problem.free < 3
-    arm = problem.prior.values[2]
     for _ in range(rounds):
+        sigma = problem.sigma(R, x0)
         result = optimize.least_squares(
-            problem.residual, x0, args=(R, (R, arm)), x_scale="jac", max_nfev=60
+            problem.residual, x0, args=(R, sigma), x_scale="jac", max_nfev=most
         )
-        full_turn = problem.values(R, result.x)
-        R, arm = full_turn[0], full_turn[2]
-        x0 = np.where(turn, 0.0, result.x)
-        result.x = x0
+        R = problem.values(R, result.x)[0]
+        result.x = x0 = np.where(turn, 0.0, result.x)
     return result, R
 
 

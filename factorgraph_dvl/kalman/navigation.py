@@ -137,9 +137,7 @@ def navigate(trial: Trial, pings: Array) -> Navigation:
             where=gnss.source,
             expected="times on the clock of the IMU",
         )
-    joined = Track(
-        *(np.concatenate([getattr(t, f.name) for t in tracks]) for f in fields(Track))
-    )
+    joined = Track(*(np.concatenate([getattr(t, f.name) for t in tracks]) for f in fields(Track)))
     arc = np.repeat(np.arange(len(tracks)), [t.time.size for t in tracks])
     return Navigation(samples, joined, arc, tuple(notes))
 

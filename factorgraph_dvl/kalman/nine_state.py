@@ -12,7 +12,7 @@ The model has no lever arm: the trial's own value is taken off beforehand.
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -30,7 +30,8 @@ from factorgraph_dvl.sensors.protocol import Parameter
 
 # Standard deviation of the bias where the trial gives none: the method has it for a state.
 _BIAS_SIGMA = 0.5
-_PASSES = 30
+_PASSES = 50
+_HALVINGS = 12
 _SETTLED = 1e-3
 
 
@@ -73,7 +74,10 @@ def nine_state(
     at = prior
     if len(starts) > 1:
         few = points.thinned()
-        ends = [_iterate(few, prior, _turned(prior, R), lever_arm, free)[0] for R in starts]
+        ends = [
+            _iterate(few, prior, replace(prior, values=(R, *prior.values[1:])), lever_arm, free)[0]
+            for R in starts
+        ]
         fits = [misfit(few, e, lever_arm) if e.values[1].min() > -0.5 else np.inf for e in ends]
         at = ends[int(np.argmin(fits))]
     if iterated:
@@ -97,27 +101,51 @@ def nine_state(
     return Outcome(final, passes, history, tuple(warnings), unseparated, settled)
 
 
-def _turned(prior: Estimated, dRb: Array) -> Estimated:
-    return replace(prior, values=(dRb, *prior.values[1:]))
-
-
 def _iterate(
-    points: Points, prior: Estimated, at: Estimated, lever_arm: Array, free: np.ndarray
+    points: Points,
+    prior: Estimated,
+    at: Estimated,
+    lever_arm: Array,
+    free: np.ndarray,
+    most: int = _PASSES,
 ) -> tuple[Estimated, int, bool]:
-    for count in range(1, _PASSES + 1):
-        step, P = _last(points, prior, at, lever_arm, free)
-        # Far from the solution a full step may turn by more than it can know.
-        turn = np.linalg.norm(step[free < 3])
-        at = _moved(at, step * min(1.0, 1.0 / max(turn, 1e-9)), P, free)
-        if np.all(np.abs(step) < _SETTLED * np.sqrt(P.diagonal())):
+    """Return the fixed point of the filter, passes, and whether it was reached."""
+    # Weights that move with the estimate would make the cost jump.
+    R = points.covariance_d(at.values[0], lever_arm)
+    now = _linear(points, prior, at, lever_arm, free, R)
+    for count in range(1, most + 1):
+        P = np.linalg.inv(now.first + now.each.sum(axis=0))
+        step = P @ (now.pull + now.vector.sum(axis=0))
+        settled = bool(np.all(np.abs(step) < _SETTLED * np.sqrt(P.diagonal())))
+        for _ in range(_HALVINGS):
+            moved = _moved(at, step, P, free)
+            new = _linear(points, prior, moved, lever_arm, free, R)
+            if settled or new.cost < now.cost:
+                break
+            step = 0.5 * step
+        else:
+            return at, count, False
+        at, now = moved, new
+        if settled:
             return at, count, True
-    return at, _PASSES, False
+    return at, most, False
+
+
+@dataclass(frozen=True)
+class _Linear:
+    """Information and its vector about a point: of the prior, and of each ping."""
+
+    first: Array
+    pull: Array
+    each: Array
+    vector: Array
+    cost: float
 
 
 def _linear(
-    points: Points, prior: Estimated, at: Estimated, lever_arm: Array, free: np.ndarray
-) -> tuple[Array, Array, Array, Array]:
-    """Return information and its vector: of the prior, and of each ping, about `at`."""
+    points: Points, prior: Estimated, at: Estimated, lever_arm: Array, free: np.ndarray, R: Array
+) -> _Linear:
+    """Return the filter's model about `at`, for noise of covariance R, (M, 3, 3)."""
     dRb, a, b = at.values
     v = rotate(dRb[None], points.at_dvl(lever_arm))
     H = np.zeros((len(points), 3, 9))
@@ -125,22 +153,20 @@ def _linear(
     H[:, :, 3:6] = v[:, :, None] * np.eye(3)
     H[:, :, 6:9] = np.eye(3)
     residual = points.v_d - (1.0 + a) * v - b
-    weighted = np.linalg.solve(points.covariance_d(dRb, lever_arm), H[:, :, free])
-    each = weighted.transpose(0, 2, 1) @ H[:, :, free]
-    vector = rotate(weighted.transpose(0, 2, 1), residual)
+    weighted = np.linalg.solve(R, H[:, :, free])
     away = np.concatenate(
         [log_so3(dRb.T @ prior.values[0]), prior.values[1] - a, prior.values[2] - b]
     )
     first = np.linalg.inv(prior.covariance[np.ix_(free, free)])
-    return first, first @ away[free], each, vector
-
-
-def _last(
-    points: Points, prior: Estimated, at: Estimated, lever_arm: Array, free: np.ndarray
-) -> tuple[Array, Array]:
-    first, pull, each, vector = _linear(points, prior, at, lever_arm, free)
-    P = np.linalg.inv(first + each.sum(axis=0))
-    return P @ (pull + vector.sum(axis=0)), P
+    away = away[free]
+    fit = np.linalg.solve(R, residual[:, :, None])[:, :, 0]
+    return _Linear(
+        first=first,
+        pull=first @ away,
+        each=weighted.transpose(0, 2, 1) @ H[:, :, free],
+        vector=np.matmul(weighted.transpose(0, 2, 1), residual[:, :, None])[:, :, 0],
+        cost=float(away @ first @ away + np.sum(residual * fit)),
+    )
 
 
 def _pass(
@@ -151,11 +177,13 @@ def _pass(
     With constant states the filter adds up information, so its state after each ping is a
     running sum away.
     """
-    first, pull, each, vector = _linear(points, prior, at, lever_arm, free)
+    R = points.covariance_d(at.values[0], lever_arm)
+    model = _linear(points, prior, at, lever_arm, free, R)
     rows = rows_of_history(len(points))
-    P = np.linalg.inv(first + np.cumsum(each, axis=0)[rows])
-    steps = rotate(P, pull + np.cumsum(vector, axis=0)[rows])
-    return steps, P, each.sum(axis=0)
+    P = np.linalg.inv(model.first + np.cumsum(model.each, axis=0)[rows])
+    vector = model.pull + np.cumsum(model.vector, axis=0)[rows]
+    steps = np.matmul(P, vector[:, :, None])[:, :, 0]
+    return steps, P, model.each.sum(axis=0)
 
 
 def _moved(at: Estimated, step: Array, P: Array, free: np.ndarray) -> Estimated:

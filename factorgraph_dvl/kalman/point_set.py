@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from factorgraph_dvl.conventions import DEG, Array, exp_so3, right_jacobian, skew
+from factorgraph_dvl.conventions import DEG, Array, exp_so3, log_so3, right_jacobian, skew
 from factorgraph_dvl.kalman.points import (
     Estimated,
     Outcome,
@@ -31,12 +31,20 @@ _SIGNIFICANT = 3.0
 # Scale errors and misfits at which the filter has run into the mirror image.
 _MIRRORED = -0.5
 _POOR_FIT = 9.0
+_PASSES = 6
+_SETTLED = 0.05
+# A prior wider than this does not hold the angle back.
+_WIDE = 30.0 * DEG
 
 
 def point_set(
     points: Points, misalignment: Parameter, scale: Parameter, lever_arm: Parameter
 ) -> Outcome:
     """Calibrate with the seven-state filter.
+
+    The first pass over the data is the filter as it would run at sea, and gives the
+    history. Its early pings were weighed before the misalignment was known, so the filter
+    runs again over the data, rotated by what it found, until that no longer changes.
 
     From more than 90 degrees away the small-angle model ends in the mirror image, turned
     by 180 degrees with a scale error near -2. The filter then starts once more, from the
@@ -49,42 +57,51 @@ def point_set(
     """
     parameters = (misalignment, scale, lever_arm)
     starts = rotation_starts(misalignment)
-    states, rotations = _filter(points, parameters, starts[0])
+    states = _filter(points, parameters, starts[0])
     best = _estimated(parameters, states[-1])
     arm = lever_arm.mean
     mirrored = best.values[1][0] < _MIRRORED
     if len(starts) > 1 and (mirrored or misfit(points, best, arm) > _POOR_FIT):
         few = points.thinned()
-        ends = [_estimated(parameters, _filter(few, parameters, D)[0][-1]) for D in starts]
-        fits = [
-            misfit(few, e, arm) if e.values[1][0] > _MIRRORED else np.inf for e in ends
-        ]
-        again, more = _filter(points, parameters, starts[int(np.argmin(fits))])
+        ends = [_estimated(parameters, _filter(few, parameters, D)[-1]) for D in starts]
+        fits = [misfit(few, e, arm) if e.values[1][0] > _MIRRORED else np.inf for e in ends]
+        again = _filter(points, parameters, starts[int(np.argmin(fits))])
         other = _estimated(parameters, again[-1])
         if mirrored or misfit(points, other, arm) < misfit(points, best, arm):
-            states, rotations, best = again, more, other
+            states, best = again, other
     rows = rows_of_history(len(points))
     history = tuple(
         (float(points.time[i]), _estimated(parameters, states[i + 1])) for i in rows.tolist()
     )
-    return Outcome(best, 1 + rotations, history)
+    passes, moved = 1, np.inf
+    while passes < _PASSES and moved > _SETTLED:
+        before = best
+        states = _filter(points, parameters, before.values[0])
+        best = _estimated(parameters, states[-1])
+        turn = log_so3(before.values[0].T @ best.values[0])
+        sigma = np.sqrt(best.covariance.diagonal()[:3])
+        moved = float(np.max(np.abs(turn) / np.maximum(sigma, 1e-12)))
+        passes += 1
+    return Outcome(best, passes, history)
 
 
 _State = tuple[Array, Array, Array]
 
 
-def _filter(
-    points: Points, parameters: tuple[Parameter, ...], start: Array
-) -> tuple[list[_State], int]:
-    """Return rotation, states and covariance at the start and after each ping, and rotations.
+def _filter(points: Points, parameters: tuple[Parameter, ...], start: Array) -> list[_State]:
+    """Return rotation, states and covariance at the start and after each ping.
 
-    The first is the rotation taken off the data so far: dRb = D Exp(alpha).
+    The first is the rotation taken off the data so far: dRb = D Exp(alpha). The prior
+    stays where it is: what `start` takes off the data, alpha is expected to lack.
     """
     prior = prior_of(parameters)
+    misalignment_sigma = parameters[0].sigma
     D, P = start, prior.covariance.copy()
-    x = np.concatenate([np.zeros(3), prior.values[1], prior.values[2]])
+    left = log_so3(start.T @ prior.values[0])
+    left = np.where(misalignment_sigma > _WIDE, 0.0, left)
+    x = np.concatenate([left, prior.values[1], prior.values[2]])
     unknown = np.diag(np.concatenate([P.diagonal()[:4] > 0.0, P.diagonal()[4:]]))
-    states, rotations = [(D, x, P)], 0
+    states = [(D, x, P)]
     cross_v, cross_omega = skew(points.v_b), skew(points.omega_b)
     H = np.empty((3, 7))
     for k in range(len(points)):
@@ -105,9 +122,8 @@ def _filter(
         past = np.abs(alpha) > np.maximum(THRESHOLD, _SIGNIFICANT * np.sqrt(P.diagonal()[:3]))
         if past.any():
             D, x, P = _rotated(D, x, P, unknown)
-            rotations += 1
         states.append((D, x, P))
-    return states, rotations
+    return states
 
 
 def _rotated(D: Array, x: Array, P: Array, unknown: Array) -> _State:

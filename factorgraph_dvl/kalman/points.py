@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -13,7 +13,6 @@ from factorgraph_dvl.conventions import (
     Array,
     exp_so3,
     inverse_right_jacobian,
-    log_so3,
     reported_rotation_vector,
     right_jacobian,
     rotate,
@@ -55,9 +54,7 @@ class Points:
 
     def take(self, which: np.ndarray | slice) -> Points:
         """Return some of the pings."""
-        return Points(
-            *(getattr(self, name)[which] for name in self.__dataclass_fields__)  # type: ignore[arg-type]
-        )
+        return Points(*(getattr(self, name)[which] for name in self.__dataclass_fields__))
 
     def thinned(self) -> Points:
         """Return as many pings as tell good starts from bad ones."""
@@ -203,11 +200,6 @@ def rows_of_history(count: int) -> np.ndarray:
     if count == 0:
         return np.zeros(0, dtype=int)
     return np.unique(np.linspace(0, count - 1, min(count, _ROWS)).round().astype(int))
-
-
-def with_sigma(parameter: Parameter, sigma: Array) -> Parameter:
-    """Return a parameter with another prior standard deviation."""
-    return replace(parameter, sigma=sigma)
 
 
 PointsAt = Callable[[float], Points]

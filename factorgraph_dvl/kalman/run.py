@@ -8,7 +8,7 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from factorgraph_dvl.conventions import Array, rotate
+from factorgraph_dvl.conventions import Array
 from factorgraph_dvl.errors import ConfigError, DataError
 from factorgraph_dvl.kalman.least_squares import least_squares
 from factorgraph_dvl.kalman.navigation import Navigation, motion_at, navigate

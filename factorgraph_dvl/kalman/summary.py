@@ -139,9 +139,7 @@ def _dvl_residuals(
             points.sigma_d,
         )
     residual, sigma = residuals(points, outcome.estimated, np.array(settings.lever_arm_m))
-    return Residuals(
-        "DVL velocity", "m/s", ("x", "y", "z"), points.time + offset, residual, sigma
-    )
+    return Residuals("DVL velocity", "m/s", ("x", "y", "z"), points.time + offset, residual, sigma)
 
 
 def _gnss(trial: Trial, navigation: Navigation) -> tuple[Residuals, ...]:

@@ -31,9 +31,10 @@ def wahba(points: Points, misalignment: Parameter, scale: Parameter, lever_arm: 
     parameters = (misalignment, scale)
     prior = prior_of(parameters)
     v = points.at_dvl(lever_arm)
-    variance = np.mean(points.sigma_d**2, axis=1) + np.trace(
-        points.v_b_covariance, axis1=1, axis2=2
-    ) / 3.0
+    variance = (
+        np.mean(points.sigma_d**2, axis=1)
+        + np.trace(points.v_b_covariance, axis1=1, axis2=2) / 3.0
+    )
     weight = 1.0 / variance
     power = float(weight @ np.sum(v**2, axis=1))
     if power == 0.0:
@@ -43,9 +44,10 @@ def wahba(points: Points, misalignment: Parameter, scale: Parameter, lever_arm: 
     dRb = (u * sign) @ vt
     k = float(s @ sign) / power
     residual = k * rotate(dRb[None], v) - points.v_d
-    H = np.concatenate(
-        [-k * dRb @ skew(v), rotate(dRb[None], v)[:, :, None]], axis=2
-    ) * np.sqrt(weight)[:, None, None]
+    H = (
+        np.concatenate([-k * dRb @ skew(v), rotate(dRb[None], v)[:, :, None]], axis=2)
+        * np.sqrt(weight)[:, None, None]
+    )
     dof = max(3 * len(points) - 4, 1)
     unit = max(float(weight @ np.sum(residual**2, axis=1)) / dof, 1e-12)
     information = np.einsum("mij,mik->jk", H, H) / unit
