@@ -88,6 +88,17 @@ def point_set(
 _State = tuple[Array, Array, Array]
 
 
+def measurement_matrix(v_b: Array, omega_b: Array) -> Array:
+    """Return H = [-[v_b x], v_b, [omega x]] of pings, (M, 3, 7).
+
+    Parameters
+    ----------
+    v_b : (M, 3) velocity over the Earth, in body, m/s.
+    omega_b : (M, 3) rate relative to the Earth, rad/s.
+    """
+    return np.concatenate([-skew(v_b), v_b[:, :, None], skew(omega_b)], axis=2)
+
+
 def _filter(points: Points, parameters: tuple[Parameter, ...], start: Array) -> list[_State]:
     """Return rotation, states and covariance at the start and after each ping.
 
@@ -102,12 +113,9 @@ def _filter(points: Points, parameters: tuple[Parameter, ...], start: Array) -> 
     x = np.concatenate([left, prior.values[1], prior.values[2]])
     unknown = np.diag(np.concatenate([P.diagonal()[:4] > 0.0, P.diagonal()[4:]]))
     states = [(D, x, P)]
-    cross_v, cross_omega = skew(points.v_b), skew(points.omega_b)
-    H = np.empty((3, 7))
+    each = measurement_matrix(points.v_b, points.omega_b)
     for k in range(len(points)):
-        H[:, 0:3] = -cross_v[k]
-        H[:, 3] = points.v_b[k]
-        H[:, 4:7] = cross_omega[k]
+        H = each[k]
         square = x[4:7] ** 2 + P.diagonal()[4:7]
         shaken = 0.5 * float(points.omega_sigma[k] ** 2 @ (square.sum() - square))
         R = (D.T * points.sigma_d[k] ** 2) @ D + points.v_b_covariance[k]
