@@ -21,11 +21,13 @@ from factorgraph_dvl.errors import FactorgraphDvlError
 # GTSAM, SciPy, Matplotlib and Arrow take seconds to load: only in the commands that use
 # them, so that --help answers at once.
 if TYPE_CHECKING:
+    from collections.abc import Callable
     from types import TracebackType
 
     from rich.table import Table
 
     from factorgraph_dvl.analysis.crosscheck import CrossCheck
+    from factorgraph_dvl.kalman import History
     from factorgraph_dvl.solution import Solution
     from factorgraph_dvl.trial import Trial
 
@@ -44,8 +46,24 @@ app = typer.Typer(
 TrialPath = Annotated[
     Path, typer.Argument(metavar="TRIAL", help="Trial folder, or the trial.yaml in it.")
 ]
+SolutionPath = Annotated[
+    Path, typer.Option("--out", metavar="DIR", help="Solution folder to write.")
+]
 Force = Annotated[bool, typer.Option("--force", help="Replace results that are there.")]
 NoFigures = Annotated[bool, typer.Option("--no-figures", help="Draw no figures.")]
+Rate = Annotated[
+    float, typer.Option(metavar="HZ", min=1e-3, max=1e4, help="Rate of the trajectory.")
+]
+Quiet = Annotated[bool, typer.Option("--quiet", help="Show no progress.")]
+
+
+class KalmanMethod(StrEnum):
+    """How `kalman` holds the DVL against SINS/GNSS."""
+
+    POINT_SET = "point-set"
+    NINE_STATE = "nine-state"
+    WAHBA = "wahba"
+    LEAST_SQUARES = "least-squares"
 
 
 class Side(StrEnum):
@@ -142,29 +160,70 @@ def simulate(
 @app.command()
 def solve(
     trial_path: TrialPath,
-    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Solution folder to write.")],
+    out: SolutionPath,
     force: Force = False,
     no_figures: NoFigures = False,
-    rate: Annotated[
-        float, typer.Option(metavar="HZ", min=1e-3, max=1e4, help="Rate of the trajectory.")
-    ] = 10.0,
-    quiet: Annotated[bool, typer.Option("--quiet", help="Show no progress.")] = False,
+    rate: Rate = 10.0,
+    quiet: Quiet = False,
 ) -> None:
     """Estimate calibration and trajectory from all data of a trial."""
+
+    def run(trial: Trial, progress: _ProgressLine) -> tuple[Solution, None]:
+        # The solver takes longest to load: after what is most often wrong.
+        from factorgraph_dvl.solvers.batch import solve as run_batch
+
+        return run_batch(trial, rate_hz=rate, progress=progress), None
+
+    _solve_into(out, trial_path, run, force=force, figures=not no_figures, quiet=quiet)
+
+
+@app.command()
+def kalman(
+    trial_path: TrialPath,
+    out: SolutionPath,
+    method: Annotated[
+        KalmanMethod, typer.Option(help="How the DVL is held against SINS/GNSS.")
+    ] = KalmanMethod.POINT_SET,
+    force: Force = False,
+    no_figures: NoFigures = False,
+    rate: Rate = 10.0,
+    quiet: Quiet = False,
+) -> None:
+    """Calibrate against a SINS/GNSS Kalman filter, to compare with `solve`."""
+
+    def run(trial: Trial, progress: _ProgressLine) -> tuple[Solution, History | None]:
+        from factorgraph_dvl.kalman import calibrate
+
+        return calibrate(trial, method.value, rate_hz=rate, progress=progress)
+
+    _solve_into(out, trial_path, run, force=force, figures=not no_figures, quiet=quiet)
+
+
+def _solve_into(
+    out: Path,
+    trial_path: Path,
+    run: Callable[[Trial, _ProgressLine], tuple[Solution, History | None]],
+    *,
+    force: bool,
+    figures: bool,
+    quiet: bool,
+) -> None:
+    """Load a trial, run a solver on it, write and show its solution."""
     from factorgraph_dvl.io.folders import check_output
-    from factorgraph_dvl.io.solution_folder import FIGURES_FOLDER, save_solution
+    from factorgraph_dvl.io.solution_folder import FIGURES_FOLDER, save_solution, write_history
     from factorgraph_dvl.io.trial_folder import load_trial
 
     check_output(out, force=force)
     with _ProgressLine(quiet=quiet) as progress:
         trial = load_trial(trial_path)
-        # The solver takes longest to load: after what is most often wrong.
-        from factorgraph_dvl.solvers.batch import solve as run
-
-        solution = run(trial, rate_hz=rate, progress=progress)
+        solution, history = run(trial, progress)
         progress("write", 0, None)
 
-        def draw(folder: Path) -> None:
+        def add(folder: Path) -> None:
+            if history is not None:
+                write_history(folder, history.time, history.names, history.values, history.std)
+            if not figures:
+                return
             from factorgraph_dvl.report.figures import write_figures
 
             try:
@@ -173,7 +232,7 @@ def solve(
                 # A figure is not worth the solution.
                 _warn(f"figures could not be drawn: {type(error).__name__}: {error}")
 
-        save_solution(solution, out, force=force, extra=None if no_figures else draw)
+        save_solution(solution, out, force=force, extra=add)
     _print_solution(trial, solution)
     _print_written(out)
     if not solution.converged:

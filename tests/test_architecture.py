@@ -20,6 +20,7 @@ LAYERS = (
     ("trial", "solution"),
     ("io", "simulation"),
     ("increments",),
+    ("kalman",),
     ("preintegration",),
     ("keys",),
     ("chain",),
@@ -34,6 +35,7 @@ LAYERS = (
 FORBIDDEN = {
     "io": ("simulation", "increments"),
     "simulation": ("io", "increments", "preintegration", "graph", "solvers", "analysis"),
+    "kalman": ("io", "simulation"),
     "solvers": ("io", "simulation", "analysis", "report"),
     "analysis": ("solvers", "graph", "keys", "preintegration", "increments", "simulation", "io"),
     "report": ("solvers", "graph", "keys", "preintegration", "simulation", "io"),
@@ -41,6 +43,17 @@ FORBIDDEN = {
     "mounting": ("alignment", "graph", "keys", "preintegration"),
     "preintegration": ("keys",),
 }
+# What is held against the factor graph shares nothing with it: the cross-check and all
+# that would use it know only its solutions.
+FORBIDDEN |= {
+    name: (*FORBIDDEN.get(name, ()), "kalman")
+    for name in (
+        *("preintegration", "keys", "chain", "alignment", "mounting", "graph", "solvers"),
+        *("analysis", "report"),
+    )
+}
+# Data classes of the sensors: no measurement equation is among them.
+SENSOR_DATA = ("Imu", "ImuSettings", "Gnss", "Dvl", "Parameter", "Motion")
 # The graph asks every sensor through the protocol and knows none by name.
 NAMELESS = ("graph", "chain", "preintegration", "keys", "solvers")
 # Only where they are used: GTSAM, SciPy and Matplotlib take most of a second to load.
@@ -114,6 +127,16 @@ def test_simulation_takes_no_measurement_model_from_the_sensors():
                 module, _, last = name.rpartition(".")
                 if module.startswith("sensors.") and module != "sensors.protocol":
                     assert last.endswith(allowed), f"{'.'.join(parts)} imports {name}"
+
+
+def test_kalman_shares_no_measurement_equation_with_the_factors():
+    for parts in MODULES:
+        if parts[0] == "kalman":
+            for name in imported(read(parts)):
+                if name.startswith("sensors."):
+                    assert name.endswith(SENSOR_DATA), f"{'.'.join(parts)} imports {name}"
+            source = PACKAGE.joinpath(*parts).with_suffix(".py").read_text(encoding="utf-8")
+            assert "gtsam" not in source.lower(), parts
 
 
 def test_nothing_but_the_command_line_imports_it():

@@ -1,4 +1,4 @@
-"""Solution folders, format 1: calibration.json and trajectory.csv."""
+"""Solution folders, format 1: calibration.json, trajectory.csv, history.csv."""
 
 from __future__ import annotations
 
@@ -20,6 +20,7 @@ from factorgraph_dvl.solution import Estimate, Solution, Trajectory
 
 CALIBRATION_FILE = "calibration.json"
 TRAJECTORY_FILE = "trajectory.csv"
+HISTORY_FILE = "history.csv"
 FIGURES_FOLDER = "figures"
 STD_COLUMNS = (
     *("std_e_m", "std_n_m", "std_u_m"),
@@ -78,12 +79,30 @@ def save_solution(
     DataError
         If the folder exists, is not empty, and `force` is not set.
     """
-    owned = (CALIBRATION_FILE, TRAJECTORY_FILE, FIGURES_FOLDER)
+    owned = (CALIBRATION_FILE, TRAJECTORY_FILE, HISTORY_FILE, FIGURES_FOLDER)
     with new_folder(Path(path), force=force, owned=owned) as folder:
         write_table(folder / TRAJECTORY_FILE, _trajectory_columns(solution.trajectory))
         if extra is not None:
             extra(folder)
         (folder / CALIBRATION_FILE).write_bytes(_encode(solution))
+
+
+def write_history(
+    folder: Path, time: Array, names: Sequence[str], values: Array, std: Array
+) -> None:
+    """Write how a recursive solver converged, as history.csv.
+
+    Parameters
+    ----------
+    folder : to write into.
+    time : (H,) s.
+    names : of the n components, as in `covariance.order`.
+    values, std : (H, n) in reported units.
+    """
+    columns = {"time_s": time}
+    for i, name in enumerate(names):
+        columns |= {name: values[:, i], f"{name}_std": std[:, i]}
+    write_table(folder / HISTORY_FILE, columns)
 
 
 def load_solution(path: Path | str) -> Solution:

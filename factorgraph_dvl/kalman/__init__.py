@@ -1,0 +1,5 @@
+"""The Kalman point-set approach: SINS/GNSS first, then the DVL against it."""
+
+from factorgraph_dvl.kalman.run import METHODS, History, Method, calibrate, kalman
+
+__all__ = ["METHODS", "History", "Method", "calibrate", "kalman"]

@@ -1,0 +1,214 @@
+"""From a trial to a solution by SINS/GNSS and one of the point-set calibrators."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+import numpy as np
+
+from factorgraph_dvl.conventions import Array
+from factorgraph_dvl.errors import ConfigError, DataError
+from factorgraph_dvl.kalman.least_squares import least_squares
+from factorgraph_dvl.kalman.navigation import Navigation, motion_at, navigate
+from factorgraph_dvl.kalman.nine_state import nine_state
+from factorgraph_dvl.kalman.point_set import point_set
+from factorgraph_dvl.kalman.points import Outcome, Points
+from factorgraph_dvl.kalman.summary import summarise
+from factorgraph_dvl.kalman.wahba import wahba
+from factorgraph_dvl.sensors.dvl import Dvl
+from factorgraph_dvl.sensors.protocol import Parameter
+from factorgraph_dvl.solution import Solution
+from factorgraph_dvl.trial import Trial
+
+Method = Literal["point-set", "nine-state", "wahba", "least-squares"]
+METHODS: tuple[Method, ...] = get_args(Method)
+Progress = Callable[[str, int, float | None], None]
+
+_WHITE = (
+    "the error of the SINS/GNSS velocity is taken for white noise; it is correlated in time, so "
+    "the standard deviations of the DVL's parameters are too small"
+)
+_NEGLECTED: dict[Method, tuple[str, ...]] = {
+    "point-set": ("dvl_bias", "time_offset"),
+    "nine-state": ("lever_arm", "time_offset"),
+    "wahba": ("lever_arm", "dvl_bias", "time_offset"),
+    "least-squares": (),
+}
+# Offsets that a search may try must stay within the IMU's record, s.
+_MARGIN = 1.0
+
+
+@dataclass(frozen=True)
+class History:
+    """How a recursive filter converged.
+
+    Parameters
+    ----------
+    time : (H,) s.
+    names : of the n components, as in `covariance.order`.
+    values, std : (H, n) in reported units.
+    """
+
+    time: Array
+    names: tuple[str, ...]
+    values: Array
+    std: Array
+
+
+def kalman(
+    trial: Trial,
+    method: Method = "point-set",
+    *,
+    rate_hz: float = 10.0,
+    progress: Progress | None = None,
+) -> Solution:
+    """Calibrate a DVL against SINS/GNSS: `calibrate` without the history."""
+    return calibrate(trial, method, rate_hz=rate_hz, progress=progress)[0]
+
+
+def calibrate(
+    trial: Trial,
+    method: Method = "point-set",
+    *,
+    rate_hz: float = 10.0,
+    progress: Progress | None = None,
+) -> tuple[Solution, History | None]:
+    """Calibrate a DVL against SINS/GNSS, and tell how the filter converged.
+
+    First IMU and GNSS are filtered and smoothed without the DVL; then its velocities are
+    held against the smoothed ones. So the joint covariance has two blocks, DVL and IMU:
+    correlations between them exist, but this approach cannot know them.
+
+    Parameters
+    ----------
+    trial : with IMU, GNSS and DVL.
+    method : `point-set` (seven states), `nine-state`, `wahba` or `least-squares`.
+    rate_hz : rate of the trajectory in the solution.
+    progress : called with stage, iteration and cost (always None here).
+
+    Returns
+    -------
+    Solution
+    History
+        None for the methods that are not recursive.
+
+    Raises
+    ------
+    ConfigError, DataError
+        If the trial cannot be calibrated this way.
+    """
+    if method not in METHODS:
+        raise ConfigError(f"method is {method!r}", expected=f"one of {', '.join(METHODS)}")
+    if not (np.isfinite(rate_hz) and rate_hz > 0.0):
+        raise ConfigError(f"rate_hz is {rate_hz}", expected="a number above 0")
+    dvl = trial.dvl
+    if dvl is None:
+        raise DataError("the trial has no DVL", where="trial.yaml", expected="a dvl section")
+    if dvl.settings.reference == "water":
+        raise ConfigError(
+            "the point-set methods know no current, and this DVL measures through the water",
+            where="trial.yaml dvl.reference",
+            expected="bottom",
+            hint="`solve` estimates the current",
+        )
+    report = progress or (lambda stage, iteration, cost: None)
+    report("SINS/GNSS", 0, None)
+    navigation = navigate(trial, dvl.time[dvl.locked] - dvl.settings.time_offset_s)
+    report(method, 0, None)
+    points_at, unused = _point_sets(navigation, dvl)
+    outcome = _calibrate(method, points_at, dvl)
+    report("summary", 0, None)
+    notes = [*navigation.notes, *outcome.warnings, _WHITE, *_neglects(method, dvl)]
+    if unused:
+        notes.append(f"DVL: {unused} pings at times without SINS/GNSS were not used")
+    solution = summarise(
+        trial,
+        navigation,
+        points_at(dvl.settings.time_offset_s),
+        outcome,
+        solver=f"kalman-{method}",
+        rate_hz=rate_hz,
+        notes=notes,
+    )
+    return solution, _history(outcome)
+
+
+def _point_sets(navigation: Navigation, dvl: Dvl) -> tuple[Callable[[float], Points], int]:
+    """Return the point sets as a function of the time offset, and how many pings fall out."""
+    mean = dvl.settings.time_offset_s
+    reach = min(4.0 * dvl.settings.time_offset_std_s, _MARGIN)
+    locked = np.flatnonzero(dvl.locked)
+    covered = np.ones(locked.size, dtype=bool)
+    for offset in {mean - reach, mean, mean + reach}:
+        covered &= motion_at(navigation, dvl.time[locked] - offset).covered
+    used = locked[covered]
+    sigma = dvl.sigma()[used]
+
+    def points_at(offset: float) -> Points:
+        motion = motion_at(navigation, dvl.time[used] - offset)
+        return Points(
+            motion.time,
+            motion.v_b,
+            motion.v_b_covariance,
+            motion.omega_b,
+            motion.omega_sigma,
+            dvl.velocity[used],
+            sigma,
+        )
+
+    return points_at, int(locked.size - used.size)
+
+
+def _calibrate(method: Method, points_at: Callable[[float], Points], dvl: Dvl) -> Outcome:
+    parameters = {p.stem: p for p in dvl.parameters()}
+    misalignment, arm = parameters["misalignment"], parameters["lever_arm"]
+    scale, bias, offset = (parameters[s] for s in ("scale_error", "dvl_bias", "time_offset"))
+    if method == "least-squares":
+        return least_squares(points_at, (misalignment, scale, arm, bias, offset))
+    points = points_at(float(offset.mean[0]))
+    if method == "nine-state":
+        return nine_state(points, misalignment, scale, bias, arm.mean)
+    single = _single(scale)
+    if method == "wahba":
+        return wahba(points, misalignment, single, arm.mean)
+    return point_set(points, misalignment, single, arm)
+
+
+def _single(scale: Parameter) -> Parameter:
+    """Return one scale error for all axes."""
+    return Parameter(
+        scale.stem,
+        scale.unit,
+        scale.si,
+        np.array([scale.mean.mean()]),
+        np.array([scale.sigma.max()]),
+        labels=("",),
+    )
+
+
+def _neglects(method: Method, dvl: Dvl) -> list[str]:
+    """Say which parameters of the trial the method does not estimate."""
+    parameters = {p.stem: p for p in dvl.parameters()}
+    out = [
+        f"{method} does not estimate {p.name}: held at {np.round(p.mean / p.si, 6).tolist()}"
+        for p in (parameters[stem] for stem in _NEGLECTED[method])
+        if p.estimated
+    ]
+    if method in ("point-set", "wahba") and parameters["scale_error"].mean.size == 3:
+        out.append(f"{method} estimates one scale error for the three axes")
+    return out
+
+
+def _history(outcome: Outcome) -> History | None:
+    if not outcome.history:
+        return None
+    reported = [estimated.reported() for _, estimated in outcome.history]
+    names = tuple(n for p in outcome.estimated.parameters for n in p.component_names)
+    return History(
+        time=np.array([time for time, _ in outcome.history]),
+        names=names,
+        values=np.stack([values for values, _ in reported]),
+        std=np.stack([np.sqrt(np.maximum(np.diag(P), 0.0)) for _, P in reported]),
+    )

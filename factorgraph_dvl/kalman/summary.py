@@ -1,0 +1,230 @@
+"""From smoothed motion and a calibration to a solution."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from factorgraph_dvl.conventions import Array, rotate, rph_from_rotation, rph_jacobian
+from factorgraph_dvl.earth import radii
+from factorgraph_dvl.kalman.navigation import Motion, Navigation, motion_at
+from factorgraph_dvl.kalman.points import Estimated, Outcome, Points, residuals
+from factorgraph_dvl.sensors.protocol import Motion as SensorMotion
+from factorgraph_dvl.solution import Estimate, Residuals, Solution, Trajectory
+from factorgraph_dvl.trial import Trial
+
+_OBSERVABLE = 0.5
+# Residuals larger than stated by this factor make every standard deviation too small.
+_TOO_LARGE = 1.3
+
+
+def summarise(
+    trial: Trial,
+    navigation: Navigation,
+    points: Points,
+    outcome: Outcome,
+    *,
+    solver: str,
+    rate_hz: float,
+    notes: Sequence[str],
+) -> Solution:
+    """Return the solution of a calibrator.
+
+    Parameters
+    ----------
+    trial, navigation, outcome : what was solved, and how it ended.
+    points : the point sets at the prior's time offset.
+    solver : name.
+    rate_hz : rate of the trajectory.
+    notes : what is already known to be worth telling.
+    """
+    dvl_values, dvl_covariance = outcome.estimated.reported()
+    imu = _imu_biases(trial, navigation)
+    imu_values, imu_covariance = imu.reported()
+    n = dvl_values.size
+    covariance = np.zeros((n + imu_values.size, n + imu_values.size))
+    covariance[:n, :n], covariance[n:, n:] = dvl_covariance, imu_covariance
+    parameters = [*outcome.estimated.parameters, *imu.parameters]
+    values = np.concatenate([dvl_values, imu_values])
+    std = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    estimates, at = [], 0
+    for p in parameters:
+        rows = slice(at, at + p.mean.size)
+        at += p.mean.size
+        prior = p.sigma / p.si
+        joined = np.array([name in outcome.unseparated for name in p.component_names])
+        estimates.append(
+            Estimate(
+                name=p.name,
+                component_names=p.component_names,
+                value=values[rows],
+                std=std[rows],
+                prior_value=p.mean / p.si,
+                prior_std=prior,
+                observable=(prior > 0.0) & (std[rows] <= _OBSERVABLE * prior) & ~joined,
+            )
+        )
+    all_residuals = (_dvl_residuals(trial, navigation, outcome, points), *_gnss(trial, navigation))
+    warnings = [*notes, *_unexplained(all_residuals), *_unobservable(trial, points, estimates)]
+    dvl = all_residuals[0]
+    return Solution(
+        trial=trial.name,
+        solver=solver,
+        body_axes=trial.body_axes,
+        converged=outcome.converged,
+        iterations=outcome.iterations,
+        cost=0.5 * float(np.sum((dvl.residual / dvl.sigma) ** 2)),
+        estimates=tuple(estimates),
+        covariance=covariance,
+        trajectory=_trajectory(trial, navigation, rate_hz),
+        residuals=all_residuals,
+        warnings=tuple(warnings),
+    )
+
+
+def _imu_biases(trial: Trial, navigation: Navigation) -> Estimated:
+    """Return the biases: at the end if constant, else their mean over the trial.
+
+    The covariance of the mean of a random walk is taken as the mean covariance, which is
+    an upper bound.
+    """
+    track = navigation.track
+    parameters = trial.imu.parameters(float(track.time[-1] - track.time[0]))
+    if not trial.imu.settings.bias_walks:
+        values = (track.gyro_bias[-1], track.accel_bias[-1])
+        return Estimated(parameters, values, track.covariance[-1, 9:, 9:])
+    step = np.diff(track.time)
+    weight = np.append(step, 0.0) + np.append(0.0, step)
+    weight /= weight.sum()
+    values = (weight @ track.gyro_bias, weight @ track.accel_bias)
+    P = np.einsum("k,kij->ij", weight, track.covariance[:, 9:, 9:])
+    return Estimated(parameters, values, P)
+
+
+def _trajectory(trial: Trial, navigation: Navigation, rate_hz: float) -> Trajectory:
+    first, last = navigation.track.time[0], navigation.track.time[-1]
+    time = np.arange(np.ceil(first * rate_hz - 1e-6), np.floor(last * rate_hz + 1e-6) + 1)
+    motion = motion_at(navigation, time / rate_hz)
+    at = motion.covered
+    P = motion.covariance[at]
+    rph = rph_from_rotation(motion.nRb[at], trial.body_axes)
+    J = rph_jacobian(rph, trial.body_axes) @ motion.nRb[at].transpose(0, 2, 1)
+    return Trajectory(
+        time=motion.time[at],
+        geodetic=motion.geodetic[at],
+        velocity=motion.velocity[at],
+        rph=rph,
+        position_cov=P[:, 0:3, 0:3],
+        velocity_cov=P[:, 3:6, 3:6],
+        rph_cov=J @ P[:, 6:9, 6:9] @ J.transpose(0, 2, 1),
+    )
+
+
+def _dvl_residuals(
+    trial: Trial, navigation: Navigation, outcome: Outcome, points: Points
+) -> Residuals:
+    assert trial.dvl is not None
+    settings = trial.dvl.settings
+    offset = float(outcome.estimated.value("time_offset", np.array([settings.time_offset_s]))[0])
+    if offset != settings.time_offset_s:
+        motion = motion_at(navigation, points.time + settings.time_offset_s - offset)
+        points = Points(
+            motion.time,
+            motion.v_b,
+            motion.v_b_covariance,
+            motion.omega_b,
+            motion.omega_sigma,
+            points.v_d,
+            points.sigma_d,
+        )
+    residual, sigma = residuals(points, outcome.estimated, np.array(settings.lever_arm_m))
+    return Residuals("DVL velocity", "m/s", ("x", "y", "z"), points.time + offset, residual, sigma)
+
+
+def _gnss(trial: Trial, navigation: Navigation) -> tuple[Residuals, ...]:
+    gnss = trial.gnss
+    assert gnss is not None
+    motion: Motion = motion_at(navigation, gnss.time)
+    arm = np.array(gnss.settings.lever_arm_m)
+    meridian, east = radii(motion.geodetic[:, 0])
+    height = motion.geodetic[:, 2]
+    apart = motion.geodetic - gnss.geodetic
+    apart[:, 1] = (apart[:, 1] + np.pi) % (2.0 * np.pi) - np.pi
+    metres = np.stack(
+        [
+            apart[:, 1] * (east + height) * np.cos(motion.geodetic[:, 0]),
+            apart[:, 0] * (meridian + height),
+            apart[:, 2],
+        ],
+        axis=1,
+    )
+    position = metres + motion.nRb @ arm
+    velocity = motion.velocity + rotate(motion.nRb, np.cross(motion.omega_b, arm)) - gnss.velocity
+    out = []
+    for label, unit, residual, sigma in (
+        ("GNSS position", "m", position, gnss.position_std),
+        ("GNSS velocity", "m/s", velocity, gnss.velocity_std),
+    ):
+        known = motion.covered & ~np.isnan(residual[:, 0])
+        if known.any():
+            out.append(
+                Residuals(
+                    label,
+                    unit,
+                    ("east", "north", "up"),
+                    gnss.time[known],
+                    residual[known],
+                    sigma[known],
+                )
+            )
+    return tuple(out)
+
+
+def _unexplained(all_residuals: Sequence[Residuals]) -> list[str]:
+    out = []
+    for r in all_residuals:
+        rms = float(np.sqrt(np.mean((r.residual / r.sigma) ** 2))) if r.time.size else 0.0
+        if rms > _TOO_LARGE:
+            out.append(
+                f"{r.label}: residuals are {rms:.1f} times as large as their stated standard "
+                "deviation; the reported standard deviations are too small unless it is corrected"
+            )
+    return out
+
+
+def _unobservable(trial: Trial, points: Points, estimates: Sequence[Estimate]) -> list[str]:
+    """Say which components the data did not determine, and why."""
+    dvl = trial.dvl
+    assert dvl is not None
+    of_dvl = {p.name for p in dvl.parameters()}
+    out = []
+    for e in estimates:
+        bad = np.flatnonzero(~e.observable & (e.prior_std > 0.0))
+        if bad.size == 0:
+            continue
+        names = ", ".join(e.component_names[i] for i in bad)
+        why = (
+            "the trial is too short or too calm to know it better than the prior; turns and "
+            "changes of speed separate it from the attitude error"
+        )
+        if e.name in of_dvl:
+            why = dvl.explain(e.name, int(bad[0]), _as_sensors_see(points))
+        out.append(f"{names} not observable: {why}")
+    return out
+
+
+def _as_sensors_see(points: Points) -> SensorMotion | None:
+    """Return the motion at the pings, with the body's axes for n."""
+    if len(points) == 0:
+        return None
+    zero: Array = np.zeros_like(points.v_b)
+    return SensorMotion(
+        nRb=np.broadcast_to(np.eye(3), (len(points), 3, 3)),
+        p_n=zero,
+        v_n=points.v_b,
+        omega_eb_b=points.omega_b,
+        a_n=zero,
+        alpha_b=zero,
+        omega_sigma=points.omega_sigma,
+    )
