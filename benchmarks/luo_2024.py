@@ -260,7 +260,7 @@ def main() -> None:
     page += [
         "## Convergence",
         "",
-        "Seed 0. The filters as they run; the factor graph solved anew on the data up to each time. "
+        "Seed 0. The filters as they run; the factor graph solved anew on the data so far. "
         "The nine-state filter is given the true lever arm, which its model does not have.",
         "",
         "![Estimates over time, by filter and factor graph](images/luo-2024-convergence.png)",
