@@ -16,7 +16,14 @@ from functools import lru_cache
 import numpy as np
 from scipy import optimize
 
-from factorgraph_dvl.conventions import Array, exp_so3, inverse_right_jacobian, log_so3
+from factorgraph_dvl.conventions import (
+    Array,
+    exp_so3,
+    inverse_right_jacobian,
+    log_so3,
+    right_jacobian,
+    skew,
+)
 from factorgraph_dvl.kalman.points import (
     Estimated,
     Outcome,
@@ -29,6 +36,8 @@ from factorgraph_dvl.sensors.protocol import Parameter
 # The search for the time offset: a fraction of the period of a vessel's roll.
 _OFFSET_STEP = 0.04
 _OFFSET_REACH = 1.0
+# Half the span, s, over which the change of the motion with time is taken.
+_STEP = 1e-3
 
 
 @dataclass(frozen=True)
@@ -61,17 +70,52 @@ class _Problem:
         dRb, scale, arm, bias, offset = self.values(R, x)
         points = self.points_at(float(offset[0]))
         predicted = (1.0 + scale) * (points.at_dvl(arm) @ dRb.T) + bias
-        mean = self.parameters[0].mean
-        away = inverse_right_jacobian(mean) @ log_so3(exp_so3(mean).T @ dRb)
         others = (
             value - p.mean
             for p, value in zip(self.parameters[1:], (scale, arm, bias, offset), strict=True)
         )
-        deviation = np.concatenate([away, *others])[self.free]
+        deviation = np.concatenate([self.away(dRb), *others])[self.free]
         prior_sigma = np.concatenate([p.sigma for p in self.parameters])[self.free]
         return np.concatenate(
             [((predicted - points.v_d) / sigma).ravel(), deviation / prior_sigma]
         )
+
+    def away(self, dRb: Array) -> Array:
+        """Return how far a rotation is from the prior's, to first order in it, (3,), rad."""
+        mean = self.parameters[0].mean
+        return inverse_right_jacobian(mean) @ log_so3(exp_so3(mean).T @ dRb)
+
+    def jacobian(self, x: Array, R: Array, sigma: Array) -> Array:
+        """Return the derivative of `residual`."""
+        dRb, scale, arm, _, offset = self.values(R, x)
+        points = self.points_at(float(offset[0]))
+        at_dvl = points.at_dvl(arm)
+        turned = at_dvl @ dRb.T
+        M = np.broadcast_to(1.0 + scale, 3)[:, None] * dRb
+        full_turn = np.zeros(3)
+        full_turn[self.free[self.free < 3]] = x[self.free < 3]
+        Jr = right_jacobian(full_turn)
+        d_offset = np.zeros((len(points), 3, 1))
+        if self.parameters[4].estimated and self.free[-1] == self.prior.covariance.shape[0] - 1:
+            ahead, behind = (self.points_at(float(offset[0]) + h) for h in (_STEP, -_STEP))
+            change = (ahead.at_dvl(arm) - behind.at_dvl(arm)) @ M.T
+            d_offset = (change / (2.0 * _STEP))[:, :, None]
+        columns = [
+            -M @ skew(at_dvl) @ Jr,
+            turned[:, :, None] * (np.ones((3, 1)) if scale.size == 1 else np.eye(3)),
+            M @ skew(points.omega_b),
+            np.broadcast_to(np.eye(3), (len(points), 3, 3)),
+            d_offset,
+        ]
+        J = np.concatenate(columns, axis=2) / sigma[:, :, None]
+        prior = np.eye(J.shape[2])
+        here = self.away(dRb)
+        for i in range(3):
+            nudge = Jr @ (1e-6 * np.eye(3)[i])
+            prior[:3, i] = (self.away(dRb @ exp_so3(nudge)) - here) / 1e-6
+        prior_sigma = np.concatenate([p.sigma for p in self.parameters])[self.free]
+        whitened = prior[np.ix_(self.free, self.free)] / prior_sigma[:, None]
+        return np.concatenate([J[:, :, self.free].reshape(-1, self.free.size), whitened])
 
     def at_prior(self) -> Array:
         """Return the prior means of the free components, without a turn."""
@@ -132,7 +176,12 @@ def _solve(
     for _ in range(rounds):
         sigma = problem.sigma(R, x0)
         result = optimize.least_squares(
-            problem.residual, x0, args=(R, sigma), x_scale="jac", max_nfev=most
+            problem.residual,
+            x0,
+            problem.jacobian,
+            args=(R, sigma),
+            x_scale="jac",
+            max_nfev=most,
         )
         R = problem.values(R, result.x)[0]
         result.x = x0 = np.where(turn, 0.0, result.x)

@@ -7,7 +7,8 @@ order. The states are constant, so the linear Kalman filter is recursive least s
 larger angles the model is (1 + a)(Exp(theta) v_ref + b), and the filter runs again over
 the data, linearised about what it found, until that no longer moves.
 
-The model has no lever arm: the trial's own value is taken off beforehand.
+The model has no lever arm: the trial's own value is taken off beforehand. In place of b the
+filter has beta = (1 + a) b for states, the bias of the trial format.
 """
 
 from __future__ import annotations

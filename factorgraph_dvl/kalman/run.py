@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
 import numpy as np
 
 from factorgraph_dvl.conventions import Array
 from factorgraph_dvl.errors import ConfigError, DataError
+from factorgraph_dvl.kalman.feigned import without_feigned
 from factorgraph_dvl.kalman.least_squares import least_squares
 from factorgraph_dvl.kalman.navigation import Navigation, motion_at, navigate
 from factorgraph_dvl.kalman.nine_state import nine_state
@@ -120,13 +121,16 @@ def calibrate(
     points_at, unused = _point_sets(navigation, dvl)
     outcome = _calibrate(method, points_at, dvl)
     report("summary", 0, None)
+    points = points_at(dvl.settings.time_offset_s)
+    arm = np.array(dvl.settings.lever_arm_m)
+    outcome = replace(outcome, estimated=without_feigned(points, outcome.estimated, arm))
     notes = [*navigation.notes, *outcome.warnings, _WHITE, *_neglects(method, dvl)]
     if unused:
         notes.append(f"DVL: {unused} pings at times without SINS/GNSS were not used")
     solution = summarise(
         trial,
         navigation,
-        points_at(dvl.settings.time_offset_s),
+        points,
         outcome,
         solver=f"kalman-{method}",
         rate_hz=rate_hz,

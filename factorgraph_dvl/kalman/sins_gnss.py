@@ -59,7 +59,7 @@ class Fixes:
     ----------
     geodetic, velocity : (K, 3) of the antenna.
     position_variance, velocity_variance : (K, 3) east, north, up.
-    turning : (K, 3) gyro - Earth-fixed part not yet removed: the gyro's reading, rad/s.
+    turning : (K, 3) reading of the gyros, rad/s.
     lever_arm : (3,) of the antenna, in body, m.
     """
 
