@@ -139,7 +139,7 @@ def draw(curves: dict[int, tuple], path: Path) -> None:
     for column, (phase, (seven, nine, times, value, std)) in enumerate(curves.items()):
         for row, label in enumerate(LABELS):
             ax = axes[row, column]
-            ax.plot(seven.time, seven.values[:, row], color="0.45", lw=1, label="seven states")
+            ax.plot(seven.time, seven.values[:, row], color="0.45", lw=0.6, label="seven states")
             if row < 4:
                 # It has one scale for each axis: the mean stands for them.
                 own = nine.values[:, row] if row < 3 else nine.values[:, 3:6].mean(axis=1)
