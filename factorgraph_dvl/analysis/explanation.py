@@ -15,7 +15,8 @@ from factorgraph_dvl.solution import Estimate, Solution, Trajectory
 _OF_THE_DVL = ("lever_arm_m", "dvl_bias_m_s", "time_offset_s", "current_m_s")
 _CALIBRATED = ("misalignment_deg", "scale_error", "lever_arm_m")
 _WITHOUT_LEVER_ARM = ("kalman-wahba", "kalman-nine-state")
-_WHITE_NOISE = "kalman-point-set"
+# All of them hold the DVL against velocities that an inertial filter has smoothed.
+_WHITE_NOISE = "kalman-"
 # Differences of reported angles are the angular rate only over short intervals.
 _LONGEST_INTERVAL_S = 0.5
 
