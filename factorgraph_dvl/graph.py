@@ -20,7 +20,14 @@ from factorgraph_dvl import keys
 from factorgraph_dvl.chain import Chain, loose_diagonal, square_root
 from factorgraph_dvl.conventions import Array, exp_so3, inverse_right_jacobian, log_so3
 from factorgraph_dvl.increments import IntArray
-from factorgraph_dvl.preintegration import Attachment, States, Transition, attach, motion_at
+from factorgraph_dvl.preintegration import (
+    Attachment,
+    States,
+    Transition,
+    attach,
+    motion_at,
+    slid,
+)
 from factorgraph_dvl.sensors.protocol import Linearization, Motion, Observation, Parameter
 
 # Standard deviation that stands for zero in a parameter of which only some components
@@ -30,12 +37,15 @@ _HELD = 1e-7
 _HELD_DIRECTION = 1e-4
 # How far a time offset may move from its start, s, before measurements are bound anew.
 _TIME_MARGIN = 0.05
+# How far, s, a motion is extrapolated before its measurements are bound anew: 2 Hz sway of
+# 4 deg turns by 3e-6 rad/s otherwise than a straight line in the rate.
+_SAME_TIME = 2e-4
 
 _STATE = 9
 _BIAS = 6
 
 
-@dataclass
+@dataclass(eq=False)
 class _Bound:
     """An observation tied to the chain."""
 
@@ -54,7 +64,6 @@ class _Block:
 
     bound: list[_Bound]
     parameters: tuple[Parameter, ...]
-    nodes: IntArray = field(default_factory=lambda: np.empty(0, int))
     order: IntArray | None = None
     rows: list[slice] = field(default_factory=list)
     factors: list[gtsam.JacobianFactor] = field(default_factory=list)
@@ -227,14 +236,15 @@ class Problem:
         for p in self.parameters:
             parameters[p.name] = self._parameter(values, p)
         motions, residuals = [], []
-        known: dict[int, Motion] = {}
+        known: dict[tuple[int, float], Motion] = {}
         cost = self.graph.error(values)
         rate = self.chain.frame.earth_rate
         for bound in self._bound:
-            self._follow(bound, parameters)
-            shared = id(bound.attachment)
+            late = self._late(bound, parameters)
+            shared = (id(bound.attachment), late)
             if shared not in known:
-                known[shared] = motion_at(bound.attachment, states, self.chain.gravity_n, rate)
+                motion = motion_at(bound.attachment, states, self.chain.gravity_n, rate)
+                known[shared] = motion if late == 0.0 else slid(motion, late)
             motion = known[shared]
             residual = bound.weight * bound.observation.residual(motion, parameters)
             motions.append(motion)
@@ -256,13 +266,10 @@ class Problem:
         gaussian = self.graph.linearize(evaluation.values)
         rate = self.chain.frame.earth_rate
         transitions = {
-            id(b.attachment): Transition(b.attachment, evaluation.states, motion, rate)
+            id(motion): Transition(b.attachment, evaluation.states, motion, rate)
             for b, motion in zip(self._bound, evaluation.motions, strict=True)
         }
         for block in self._blocks:
-            nodes = np.concatenate([b.attachment.node for b in block.bound])
-            if not np.array_equal(nodes, block.nodes):
-                self._lay_out(block)
             matrix, vector = self._fill(block, transitions, evaluation)
             for target, source, rows in zip(
                 block.matrices, block.vectors, block.rows, strict=True
@@ -329,11 +336,9 @@ class Problem:
                 return _Bound(observation, other.attachment, time, weight)
         return _Bound(observation, self._attach(time), time, weight)
 
-    @property
-    def strayed(self) -> bool:
-        """Whether a time offset has moved measurements in use out of the record."""
-        locate = self.chain.segments.increments.locate
-        return any(np.any((b.weight[:, 0] > 0.0) & ~locate(b.time)[2]) for b in self._bound)
+    def strayed(self, parameters: dict[str, Array]) -> bool:
+        """Whether a time offset has moved measurements too far from where they were bound."""
+        return any(abs(self._late(b, parameters)) > _SAME_TIME for b in self._bound)
 
     def _attach(self, time: Array) -> Attachment:
         seg = self.chain.segments
@@ -344,17 +349,12 @@ class Problem:
             time = np.where(covered, time, seg.increments.start[index] + inside)
         return attach(seg, time, self.chain.frame.earth_rate)
 
-    def _follow(self, bound: _Bound, parameters: dict[str, Array]) -> None:
-        """Move a bound observation along when a time offset has changed."""
-        time = bound.observation.true_time(parameters)
-        if np.array_equal(time, bound.time):
-            return
-        bound.time = time
-        bound.attachment = self._attach(time)
+    def _late(self, bound: _Bound, parameters: dict[str, Array]) -> float:
+        """Return by how much a time offset has moved measurements since they were bound, s."""
+        return float((bound.observation.true_time(parameters) - bound.time)[0])
 
     def _lay_out(self, block: _Block) -> None:
         """Make a block's factors for the nodes that its measurements hang on now."""
-        block.nodes = np.concatenate([b.attachment.node for b in block.bound])
         depth = [len(b.observation.components) for b in block.bound]
         row_node = np.concatenate(
             [np.repeat(b.attachment.node, d) for b, d in zip(block.bound, depth, strict=True)]
@@ -381,7 +381,8 @@ class Problem:
         columns = _STATE + _BIAS + sum(p.mean.size for p in block.parameters)
         parts, rhs = [], []
         for bound in block.bound:
-            transition = transitions[id(bound.attachment)]
+            motion = evaluation.motions[self._bound.index(bound)]
+            transition = transitions[id(motion)]
             wanted = [p.name for p in block.parameters]
             lin = bound.observation.linearize(transition.motion, evaluation.parameters, wanted)
             matrix = node_jacobian(lin, transition)

@@ -20,6 +20,7 @@ import numpy as np
 from factorgraph_dvl.conventions import Array
 from factorgraph_dvl.errors import DataError
 from factorgraph_dvl.sensors.imu import Imu
+from factorgraph_dvl.signals import Smoothed, as_it_is, smooth
 
 IntArray = np.ndarray
 
@@ -35,6 +36,8 @@ _CHUNK = 50_000
 # and how much smoother the stencil on one side.
 _ROUGH = 6.0
 _SMOOTHER = 0.3
+# A difference is no sign of a step before it is so many of its standard deviations.
+_BEYOND_NOISE = 3.0
 _GAUSS_NODES = np.array([0.5 - np.sqrt(15.0) / 10.0, 0.5, 0.5 + np.sqrt(15.0) / 10.0])
 _GAUSS_WEIGHTS = np.array([5.0, 8.0, 5.0]) / 18.0
 
@@ -48,8 +51,9 @@ class Partial:
     phi : (M, 3) rotation vector, rad.
     dv : (M, 3) velocity increment in the axes at the start of the interval, m/s.
     omega, alpha, force : (M, 3) rate, its derivative, specific force at the end.
-    unresolved : (M, 3) standard deviation of omega due to motion that the samples do
-        not resolve, rad/s.
+    omega_sigma : (M, 3) standard deviation of omega from noise, and from motion that the
+        samples do not resolve, rad/s.
+    alpha_sigma, force_sigma : (M,) standard deviation of alpha and force from noise.
     """
 
     phi: Array
@@ -57,7 +61,9 @@ class Partial:
     omega: Array
     alpha: Array
     force: Array
-    unresolved: Array
+    omega_sigma: Array
+    alpha_sigma: Array
+    force_sigma: Array
 
 
 @dataclass(frozen=True)
@@ -74,7 +80,7 @@ class Increments:
     averaged : whether `samples` are means over the intervals.
     open_sigma : (N, 6) standard deviation of the mean rate and force over an interval where
         the samples leave it open: lost ones, or a step between two of them; else 0.
-    gyro_sigma : standard deviation of one gyro sample from its noise, rad/s.
+    gyro_sigma, accel_sigma : standard deviation of one sample from its noise, SI.
     """
 
     start: Array
@@ -85,6 +91,7 @@ class Increments:
     averaged: bool
     open_sigma: Array
     gyro_sigma: float
+    accel_sigma: float
 
     @cached_property
     def arc_of(self) -> IntArray:
@@ -119,18 +126,58 @@ class Increments:
         u = since / dt
         phi, dv = _integrate(c, dt, u)
         omega, alpha = self._blended_rate(index, since, c)
-        # A step or a vibration leaves high differences, a smooth motion almost none; the
-        # part that the gyro's noise accounts for is in its own standard deviation already.
+        force = _evaluate(c, u)[:, 3:]
+        # A step or a vibration leaves high differences, a smooth motion almost none; what
+        # the gyro's noise accounts for is in its own standard deviation already.
         rough = np.abs(self._differences[self._centred_sample(index)])
-        excess = np.sqrt(np.maximum(rough**2 - self._difference_sigma**2, 0.0))
+        noise = _BEYOND_NOISE * self._difference_sigma
+        unresolved = np.sqrt(np.maximum(rough**2 - noise**2, 0.0)) / 4.0
+        omega_sigma, alpha_sigma, force_sigma = (np.empty(index.size) for _ in range(3))
+        time = self.start[index] + since
+        for arc, (rates, forces) in enumerate(self._smoothed):
+            mine = np.flatnonzero(self.arc_of[index] == arc)
+            omega_sigma[mine], alpha_sigma[mine] = rates.sigma, rates.slope_sigma
+            force_sigma[mine] = forces.sigma
+            if rates.spline is not None:
+                omega[mine], alpha[mine], misfit = rates.at(time[mine])
+                unresolved[mine] = np.hypot(unresolved[mine], misfit)
+            if forces.spline is not None:
+                force[mine] = forces.at(time[mine])[0]
         return Partial(
             phi=phi,
             dv=dv,
             omega=omega,
             alpha=alpha,
-            force=_evaluate(c, u)[:, 3:],
-            unresolved=excess / 4.0,
+            force=force,
+            omega_sigma=np.hypot(omega_sigma[:, None], unresolved),
+            alpha_sigma=alpha_sigma,
+            force_sigma=force_sigma,
         )
+
+    @cached_property
+    def _smoothed(self) -> tuple[tuple[Smoothed, Smoothed], ...]:
+        """Rate and force of each arc, smoothed where their noise asks for it."""
+        out = []
+        for (a, b), base in zip(self.arcs, self.first_sample, strict=True):
+            steps = self.dt[a:b]
+            dt = float(np.median(steps))
+            time = self.start[a:b] + 0.5 * steps
+            if not self.averaged:
+                time = np.append(self.start[a:b], self.end[b - 1])
+            values = self.samples[base : base + time.size]
+            regular = np.abs(steps / dt - 1.0).max() < _UNIFORM
+            pair = []
+            for signal, sigma in (
+                (values[:, :3], self.gyro_sigma),
+                (values[:, 3:], self.accel_sigma),
+            ):
+                pair.append(
+                    smooth(time, signal, dt, sigma, averaged=self.averaged)
+                    if regular
+                    else as_it_is(dt, sigma)
+                )
+            out.append((pair[0], pair[1]))
+        return tuple(out)
 
     def _blended_rate(self, index: IntArray, since: Array, c: Array) -> tuple[Array, Array]:
         """Return rate and derivative, (M, 3), continuous from interval to interval.
@@ -319,10 +366,10 @@ def increments(imu: Imu) -> tuple[Increments, tuple[str, ...]]:
         averaged=averaged,
         open_sigma=np.concatenate(fill),
         gyro_sigma=imu.settings.gyro_noise_root_psd / np.sqrt(dt),
+        accel_sigma=imu.settings.accel_noise_root_psd / np.sqrt(dt),
     )
     if not averaged:
-        accel_sigma = imu.settings.accel_noise_root_psd / np.sqrt(dt)
-        noise = np.repeat([out.gyro_sigma, accel_sigma], 3)
+        noise = np.repeat([out.gyro_sigma, out.accel_sigma], 3)
         np.hypot(out.open_sigma, _steps(out, noise), out=out.open_sigma)
     return out, tuple(notes)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import gtsam
@@ -196,6 +196,7 @@ class Attachment:
     dR, dA : (M, 3, 3); dV, dP : (M, 3) increments up to the time.
     gyro, alpha, force : (M, 3) rate (rad/s), its derivative, specific force at the time.
     omega_sigma : (M, 3) standard deviation of the rate, rad/s.
+    alpha_sigma, force_sigma : (M,) standard deviation of alpha and force from noise.
     turn : (M, 3, 3) Exp(-earth_rate tau).
     """
 
@@ -210,6 +211,8 @@ class Attachment:
     alpha: Array
     force: Array
     omega_sigma: Array
+    alpha_sigma: Array
+    force_sigma: Array
     turn: Array
 
 
@@ -245,7 +248,9 @@ def _attach(seg: Segments, index: IntArray, since: Array, earth_rate_n: Array) -
         gyro=part.omega,
         alpha=part.alpha,
         force=part.force,
-        omega_sigma=np.hypot(inc.gyro_sigma, part.unresolved),
+        omega_sigma=part.omega_sigma,
+        alpha_sigma=part.alpha_sigma,
+        force_sigma=part.force_sigma,
         turn=exp_so3(-tau[:, None] * earth_rate_n),
     )
 
@@ -394,6 +399,23 @@ def motion_at(at: Attachment, states: States, gravity_n: Array, earth_rate_n: Ar
         a_n=a_n,
         alpha_b=at.alpha,
         omega_sigma=at.omega_sigma,
+    )
+
+
+def slid(motion: Motion, late: float) -> Motion:
+    """Return a motion `late` seconds later, to first order in all that changes.
+
+    Smooth in time where the increments are as rough as the noise of the samples: so a time
+    offset has a minimum to converge to.
+    """
+    omega = motion.omega_eb_b + motion.alpha_b * late
+    mean_rate = 0.5 * (motion.omega_eb_b + omega)
+    return replace(
+        motion,
+        nRb=motion.nRb @ exp_so3(mean_rate * late),
+        p_n=motion.p_n + motion.v_n * late + 0.5 * motion.a_n * late**2,
+        v_n=motion.v_n + motion.a_n * late,
+        omega_eb_b=omega,
     )
 
 

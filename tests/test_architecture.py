@@ -19,6 +19,7 @@ LAYERS = (
     ("sensors",),
     ("trial", "solution"),
     ("io", "simulation"),
+    ("signals",),
     ("increments",),
     ("kalman",),
     ("preintegration",),

@@ -186,7 +186,7 @@ def motion_at(navigation: Navigation, time: Array) -> Motion:
         v_b=v_b,
         v_b_covariance=J @ P[:, 3:, 3:] @ J.transpose(0, 2, 1),
         omega_b=signal.omega - bias - rotate(bRn, _earth_rate(geodetic[:, 0])),
-        omega_sigma=np.hypot(signal.unresolved, samples.increments.gyro_sigma),
+        omega_sigma=signal.omega_sigma,
         covered=covered,
     )
 
@@ -285,7 +285,7 @@ def _fixes_at(gnss: Gnss, samples: Samples, time: Array) -> Fixes:
     lever_arm = np.array(gnss.settings.lever_arm_m)
     unsure = float(np.max(gnss.settings.lever_arm_std_m))
     _, signal = at_times(samples, time)
-    omega_sigma = np.hypot(signal.unresolved, samples.increments.gyro_sigma)
+    omega_sigma = signal.omega_sigma
     # Across the lever arm, where it is largest: half the trace of the covariance.
     squares = lever_arm**2
     shaken = 0.5 * (omega_sigma**2 @ (squares.sum() - squares))

@@ -32,7 +32,7 @@ _SAME_GRAVITY = 2.0
 # The first stage only prepares the second.
 _ROUGH = 1.0
 _ROUGH_ITERATIONS = 10
-_ROUNDS = 3
+_ROUNDS = 4
 
 
 def solve(
@@ -78,9 +78,10 @@ def solve(
 
     states, values = start.states, None
     iterations = 0
+    p_gravity = np.full_like(states.p_n, np.inf)
     for _ in range(_ROUNDS):
-        p_gravity = states.p_n
-        chain = inertial_chain(trial, frame, seg, states)
+        if np.sqrt(np.mean((states.p_n - p_gravity) ** 2)) > _SAME_GRAVITY:
+            chain, p_gravity = inertial_chain(trial, frame, seg, states), states.p_n
         if values is None:
             if trial.gnss is not None:
                 coarse = _without_dvl(chain, states, report)
@@ -93,8 +94,8 @@ def solve(
         minimum = minimise(problem, at, stage="all sensors", progress=report)
         iterations += minimum.iterations
         states, values = minimum.evaluation.states, minimum.evaluation.parameters
-        same_gravity = np.sqrt(np.mean((states.p_n - p_gravity) ** 2)) < _SAME_GRAVITY
-        if same_gravity and not problem.strayed:
+        same_gravity = np.sqrt(np.mean((states.p_n - p_gravity) ** 2)) <= _SAME_GRAVITY
+        if same_gravity and not problem.strayed(values):
             break
     report("covariance", 0, None)
     covariances = posterior(problem, minimum)

@@ -122,12 +122,14 @@ def _feigned_by(
     root = np.linalg.cholesky(covariance + 1e-16 * np.eye(3))
     out = np.zeros((columns.size, columns.size))
     for k in range(3):
+        axis = np.eye(3)[k]
         waver = rotate(motion.nRb, root[:, :, k])
-        spin = np.zeros_like(motion.omega_eb_b)
-        spin[:, k] = motion.omega_sigma[:, k]
+        push = rotate(motion.nRb, attachment.force_sigma[:, None] * axis)
         for changed in (
             replace(motion, v_n=motion.v_n + waver),
-            replace(motion, omega_eb_b=motion.omega_eb_b + spin),
+            replace(motion, omega_eb_b=motion.omega_eb_b + motion.omega_sigma * axis),
+            replace(motion, a_n=motion.a_n + push),
+            replace(motion, alpha_b=motion.alpha_b + attachment.alpha_sigma[:, None] * axis),
         ):
             change = (jacobian(changed) - base) * weight[:, :, None]
             flat = change.reshape(-1, columns.size)

@@ -118,13 +118,10 @@ def minimise(
         elif not careful and tree is None:
             # The step may have been bad for want of digits only.
             careful = True
-            problem.evaluate(evaluation.values)
         else:
             damping = max(damping * 10.0, _FIRST_DAMPING)
             if damping > _MAX_DAMPING:
                 break
-            # Evaluating moved the attachments along with a time offset.
-            problem.evaluate(evaluation.values)
         tree = None
     return Minimum(evaluation, eliminate(gaussian, ordering), False, iteration)
 

@@ -1,0 +1,104 @@
+"""Rate and force at any time, as smooth as the noise of the samples asks for.
+
+The increments between samples use every sample as it is: their noise averages out in the
+sum. A DVL with a lever arm sees the rate at one moment, and a time offset even its
+derivative, and there the noise of one sample of a cheap gyro is larger than the motion.
+Local cubics (Savitzky and Golay, Anal. Chem. 36 (1964)) over a window that is as wide as
+the motion allows take it down.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.interpolate import BSpline, make_interp_spline
+from scipy.signal import savgol_coeffs, savgol_filter
+
+from factorgraph_dvl.conventions import Array
+
+# Half-widths that are tried, samples; none is longer than this many seconds.
+_HALF_WIDTHS = (2, 3, 5, 8, 12, 18, 25)
+_LONGEST = 0.25
+_ORDER = 3
+# A look at so many samples tells what the motion allows.
+_ENOUGH = 60_000
+# Noise of a derivative between single samples, in units of sample noise over interval.
+_RAW_SLOPE = 2.0
+# Differences between a narrow and the chosen window beyond which the motion has a step.
+_STEP = 4.0
+
+
+@dataclass(frozen=True)
+class Smoothed:
+    """A signal of three axes over one arc without gaps.
+
+    Parameters
+    ----------
+    spline : value over time, None where the samples are best left alone.
+    misfit : what the window does not resolve, over time; None likewise.
+    sigma, slope_sigma : standard deviation of value and derivative from the noise.
+    """
+
+    spline: BSpline | None
+    misfit: BSpline | None
+    sigma: float
+    slope_sigma: float
+
+    def at(self, time: Array) -> tuple[Array, Array, Array]:
+        """Return value, derivative and what is not resolved at times, (M, 3) each."""
+        assert self.spline is not None
+        assert self.misfit is not None
+        return (
+            np.asarray(self.spline(time)),
+            np.asarray(self.spline(time, 1)),
+            np.asarray(np.abs(self.misfit(time))),
+        )
+
+
+def as_it_is(dt: float, sigma: float) -> Smoothed:
+    """Return a signal that is not smoothed, with its noise."""
+    return Smoothed(None, None, sigma, _RAW_SLOPE * sigma / dt)
+
+
+def smooth(time: Array, values: Array, dt: float, sigma: float, *, averaged: bool) -> Smoothed:
+    """Smooth a signal over the window with the least error of noise and motion together.
+
+    Parameters
+    ----------
+    time : (N,) s, regular: the samples', or the middles of the intervals of means.
+    values : (N, 3) samples.
+    dt : interval of the samples, s.
+    sigma : standard deviation of a sample.
+    averaged : whether samples are means over their intervals.
+    """
+    few = values[:_ENOUGH]
+    best, width = sigma**2, 0
+    for half in _HALF_WIDTHS:
+        window = 2 * half + 1
+        if half * dt > _LONGEST or window >= few.shape[0]:
+            break
+        weights = savgol_coeffs(window, _ORDER)
+        kept = float(weights @ weights)
+        moved = np.mean((savgol_filter(few, window, _ORDER, axis=0) - few) ** 2)
+        by_motion = max(float(moved) - sigma**2 * (1.0 - 2.0 * weights[half] + kept), 0.0)
+        if by_motion + sigma**2 * kept < best:
+            best, width = by_motion + sigma**2 * kept, window
+    if width == 0:
+        return as_it_is(dt, sigma)
+    found = savgol_filter(values, width, _ORDER, axis=0)
+    if averaged:
+        # The mean over an interval exceeds the value at its middle by a'' dt² / 24.
+        bend = savgol_filter(values, width, _ORDER, deriv=2, delta=dt, axis=0)
+        found = found - bend * dt**2 / 24.0
+    narrow = 2 * _HALF_WIDTHS[0] + 1
+    weights, slopes = savgol_coeffs(width, _ORDER), savgol_coeffs(width, _ORDER, 1, dt)
+    noise = sigma * float(np.linalg.norm(savgol_coeffs(narrow, _ORDER)))
+    apart = np.abs(savgol_filter(values, narrow, _ORDER, axis=0) - found)
+    misfit = np.where(apart > _STEP * noise, apart, 0.0)
+    return Smoothed(
+        spline=make_interp_spline(time, found, k=3),
+        misfit=make_interp_spline(time, misfit, k=1),
+        sigma=sigma * float(np.linalg.norm(weights)),
+        slope_sigma=sigma * float(np.linalg.norm(slopes)),
+    )
