@@ -7,7 +7,7 @@ import sys
 from contextlib import suppress
 from enum import StrEnum
 from pathlib import Path
-from time import perf_counter
+from time import perf_counter, time
 from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from factorgraph_dvl.solution import Solution
     from factorgraph_dvl.trial import Trial
 
+_STARTED = time()
 _NAME = "factorgraph-dvl"
 # Tables that go to a file or a pipe are not cut to the 80 columns of no terminal.
 _PIPE_WIDTH = 180
@@ -400,7 +401,9 @@ def _print_crosscheck(check: CrossCheck, a: Path, b: Path) -> None:
 
 
 def _print_written(out: Path) -> None:
-    written = sorted(path.relative_to(out) for path in out.rglob("*") if path.is_file())
+    # A folder that was replaced by --force may hold files of others.
+    new = (p for p in out.rglob("*") if p.is_file() and p.stat().st_mtime >= _STARTED - 1.0)
+    written = sorted(path.relative_to(out) for path in new)
     _stdout().print(f"Wrote {', '.join(map(str, written))} to {out}", markup=False, soft_wrap=True)
 
 

@@ -28,6 +28,8 @@ IntArray = np.ndarray
 MAX_FILLED = 3
 # Samples that are this much later than the median interval were preceded by lost ones.
 _LOST = 1.5
+# Slower samples, s, do not follow any vessel; they are times in another unit.
+_SLOWEST = 0.5
 # Relative spread of the intervals up to which the clock counts as regular.
 _REGULAR = 0.1
 _UNIFORM = 1e-3
@@ -307,6 +309,13 @@ def increments(imu: Imu) -> tuple[Increments, tuple[str, ...]]:
         )
     step = np.diff(time)
     dt = float(np.median(step))
+    if dt > _SLOWEST:
+        raise DataError(
+            f"one sample in {dt:.3g} s",
+            where=imu.source,
+            expected=f"at least {1.0 / _SLOWEST:.0f} in a second",
+            hint="Is time_s in seconds?",
+        )
     filled_sigma = np.zeros_like(samples)
     notes: list[str] = []
 

@@ -2,11 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from factorgraph_dvl.conventions import Array, BodyAxes
+
+# Residuals larger than stated by this factor make every standard deviation too small, and by
+# the second the model is another than the data's.
+_TOO_LARGE = 1.3
+_DO_NOT_FIT = 10.0
+_FAR_FROM_PRIOR = 5.0
 
 
 @dataclass(frozen=True)
@@ -144,3 +151,36 @@ class Solution:
             if estimate.name == name:
                 return estimate
         raise KeyError(f"{name} was not estimated; there are {[e.name for e in self.estimates]}")
+
+
+def doubts(estimates: Sequence[Estimate], residuals: Sequence[Residuals]) -> list[str]:
+    """Return warnings where a solution contradicts what was stated before.
+
+    Residuals that are larger than their standard deviations make every reported standard
+    deviation too small; a value far outside its prior says that prior or data are wrong.
+    """
+    out = []
+    for e in estimates:
+        known = e.prior_std > 0.0
+        away = np.abs(e.value - e.prior_value)[known] / e.prior_std[known]
+        if away.size and away.max() > _FAR_FROM_PRIOR:
+            name = np.array(e.component_names)[known][np.argmax(away)]
+            out.append(
+                f"{name} is {away.max():.0f} prior standard deviations from its prior: the prior "
+                "is too tight, or a unit, an axis or the model is wrong; do not trust the values "
+                "before that is cleared up"
+            )
+    for r in residuals:
+        rms = float(np.sqrt(np.mean((r.residual / r.sigma) ** 2))) if r.time.size else 0.0
+        if rms > _DO_NOT_FIT:
+            out.append(
+                f"{r.label}: residuals are {rms:.0f} times as large as their stated standard "
+                "deviation: the model does not fit the data, and the values are not to be used. "
+                "A lever arm, a clock offset, a unit or an axis may be missing or wrong"
+            )
+        elif rms > _TOO_LARGE:
+            out.append(
+                f"{r.label}: residuals are {rms:.1f} times as large as their stated standard "
+                "deviation; the reported standard deviations are too small unless it is corrected"
+            )
+    return out

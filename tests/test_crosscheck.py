@@ -279,7 +279,8 @@ def test_explanations_come_from_the_results() -> None:
     neglected = told(result(off, solver="kalman-wahba"))
     assert "B (kalman-wahba) does not estimate the lever arm, and is 1 m off" in neglected
     assert "B does not estimate the lever arm" in told(result(off, lever_arm([0, 0, 0], 0.0)))
-    assert "B claims smaller σ than A" in told(result(off), efficient="A")
+    sure = estimate("scale_error", 1.0, 0.05)
+    assert "B claims smaller σ than A" in "".join(crosscheck(a, result(sure), efficient="A").notes)
     assert "B itself warns: residuals too large." in told(
         result(off, warnings=("residuals too large",))
     )

@@ -42,7 +42,7 @@ def problem_of(scene, trial=None):
     chain = inertial_chain(trial, frame, seg, states)
     observations = [o for aid in trial.aids for o in aid.observations(frame)]
     parameters = [p for aid in trial.aids for p in aid.parameters()]
-    problem = Problem(chain, observations, parameters)
+    prior = Problem(chain, observations, parameters)
     rng = np.random.default_rng(0)
     n = seg.node_time.size
     walk = np.cumsum(rng.normal(0.0, 1e-7, (n, 3)), axis=0) * chain.walking
@@ -54,10 +54,12 @@ def problem_of(scene, trial=None):
         gyro_bias=states.gyro_bias + 1e-6 + walk,
         accel_bias=states.accel_bias + 1e-3,
     )
-    values = problem.prior_values()
-    for p in problem.parameters:
+    values = prior.prior_values()
+    for p in prior.parameters:
         step = rng.normal(0.0, 0.2, p.mean.size) * p.sigma
         values[p.name] = values[p.name] @ exp_so3(step) if p.rotation else values[p.name] + step
+    # Bound where the offset is found, as the solver does it.
+    problem = Problem(chain, observations, parameters, start=values)
     return problem, problem.values(states, values)
 
 

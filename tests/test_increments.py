@@ -147,7 +147,8 @@ def test_motion_within_an_interval(sampling):
     step = 1e-5
     alpha = (rate(t + step) - rate(t - step)) / (2.0 * step)
     assert np.abs(part.alpha - alpha).max() < 5e-4
-    assert np.abs(part.force - force(t)).max() < 2e-5
+    # The force is smoothed as far as its noise of 2.5e-3 m/s² hides what that takes away.
+    assert np.abs(part.force - force(t)).max() < 2.5e-3
     gained = rotate(start.transpose(0, 2, 1), velocity(t) - velocity(inc.start[index]))
     assert np.abs(part.dv - gained).max() < 2e-8
 
@@ -173,7 +174,7 @@ def test_a_step_of_the_rate_does_not_ring(sampling, at):
     part = inc.partial(np.flatnonzero(away), 0.5 * inc.dt[away])
     # Centred polynomials of degree four are off by 5 % of the step two intervals away.
     assert np.abs(part.omega - stepping(middle[away])).max() < 1e-12
-    assert np.abs(part.unresolved).max() < 0.1
+    assert np.abs(part.omega_sigma).max() < 0.1
     phi, _ = inc.over(np.arange(inc.dt.size))
     swept = 0.1 * max(inc.end[-1] - at, 0.0)
     miss = abs(phi[:, 2].sum() - swept)

@@ -22,7 +22,7 @@ from factorgraph_dvl.analysis.consistency import (
     calibration_errors,
     trajectory_errors,
 )
-from factorgraph_dvl.analysis.explanation import explain
+from factorgraph_dvl.analysis.explanation import explain, too_sure
 from factorgraph_dvl.analysis.motion_difference import MotionDifference, compare_motions
 from factorgraph_dvl.errors import DataError
 from factorgraph_dvl.solution import Solution
@@ -135,7 +135,7 @@ def crosscheck(
         truth_a=truth_a,
         truth_b=truth_b,
         explanation=explain(a, b, components, efficient),
-        notes=tuple(notes),
+        notes=(*notes, *too_sure(components, efficient)),
     )
     both = any(np.isfinite(c.difference) for c in components)
     if not both and motion is None and not found.has_truth:

@@ -48,7 +48,6 @@ def explain(
         out += _white_noise(side, own, differing)
         out += _neglected(side, own, other)
     out += _parametrisation(components)
-    out += _too_sure(components, efficient)
     for side, own, _ in sides:
         # What is not observable is not compared, and no reason.
         told = (w for w in own.warnings if "not observable" not in w)
@@ -143,12 +142,13 @@ def _parametrisation(components: Sequence[Component]) -> Iterator[str]:
         if c.reason.startswith("other parametrisation") and c.parameter not in told:
             told.add(c.parameter)
             yield (
-                f"The results have {c.parameter} in {c.reason.removeprefix('other ')}: what the "
+                f"The results have {c.parameter} in different parametrisations "
+                f"({c.reason.split(': ')[-1]}): what the "
                 "fewer numbers cannot follow goes into other parameters."
             )
 
 
-def _too_sure(components: Sequence[Component], efficient: Side | None) -> Iterator[str]:
+def too_sure(components: Sequence[Component], efficient: Side | None) -> Iterator[str]:
     """Yield where a result claims more than the efficient one can know."""
     if efficient is None:
         return

@@ -31,8 +31,10 @@ _SIGNIFICANT = 3.0
 # Scale errors and misfits at which the filter has run into the mirror image.
 _MIRRORED = -0.5
 _POOR_FIT = 9.0
-_PASSES = 6
+_PASSES = 10
 _SETTLED = 0.05
+# Rotations that change by more standard deviations than this from pass to pass have no end.
+_STILL_MOVING = 1.0
 # A prior wider than this does not hold the angle back.
 _WIDE = 30.0 * DEG
 
@@ -82,7 +84,7 @@ def point_set(
         sigma = np.sqrt(best.covariance.diagonal()[:3])
         moved = float(np.max(np.abs(turn) / np.maximum(sigma, 1e-12)))
         passes += 1
-    return Outcome(best, passes, history)
+    return Outcome(best, passes, history, converged=moved <= _STILL_MOVING)
 
 
 _State = tuple[Array, Array, Array]

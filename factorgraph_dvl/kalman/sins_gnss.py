@@ -18,7 +18,7 @@ from math import cos, sin, sqrt, tan
 
 import numpy as np
 
-from factorgraph_dvl.conventions import Array, exp_so3, skew
+from factorgraph_dvl.conventions import Array, exp_so3, log_so3, skew
 from factorgraph_dvl.earth import (
     ECCENTRICITY_SQUARED,
     RATE,
@@ -28,6 +28,9 @@ from factorgraph_dvl.earth import (
 from factorgraph_dvl.kalman.steps import Steps
 
 _CHUNK = 5000
+
+# Below this, rad, rotations add up to better than 1e-12.
+_SMALL_TURN = 1e-6
 
 
 @dataclass(frozen=True)
@@ -261,7 +264,13 @@ def smooth(forward: Forward) -> Track:
     smoothed = track.covariance.copy()
     for k in range(k_events - 2, -1, -1):
         G = gains[k]
-        error[k] = G @ (forward.correction[k + 1] + error[k + 1])
+        fed_back = forward.correction[k + 1]
+        before = fed_back + error[k + 1]
+        if np.abs(fed_back[6:9]).max() > _SMALL_TURN:
+            # Feedback turned the attitude: rotations compose, they do not add.
+            turned = exp_so3(error[k + 1, 6:9]) @ exp_so3(fed_back[6:9])
+            before[6:9] = log_so3(turned)
+        error[k] = G @ before
         P = smoothed[k] + G @ (smoothed[k + 1] - forward.predicted[k + 1]) @ G.T
         smoothed[k] = 0.5 * (P + P.T)
     return _corrected(track, error, smoothed)

@@ -11,12 +11,10 @@ from factorgraph_dvl.earth import radii
 from factorgraph_dvl.kalman.navigation import Motion, Navigation, motion_at
 from factorgraph_dvl.kalman.points import Estimated, Outcome, Points, residuals
 from factorgraph_dvl.sensors.protocol import Motion as SensorMotion
-from factorgraph_dvl.solution import Estimate, Residuals, Solution, Trajectory
+from factorgraph_dvl.solution import Estimate, Residuals, Solution, Trajectory, doubts
 from factorgraph_dvl.trial import Trial
 
 _OBSERVABLE = 0.5
-# Residuals larger than stated by this factor make every standard deviation too small.
-_TOO_LARGE = 1.3
 
 
 def summarise(
@@ -66,7 +64,11 @@ def summarise(
             )
         )
     all_residuals = (_dvl_residuals(trial, navigation, outcome, points), *_gnss(trial, navigation))
-    warnings = [*notes, *_unexplained(all_residuals), *_unobservable(trial, points, estimates)]
+    warnings = [
+        *notes,
+        *doubts(estimates, all_residuals),
+        *_unobservable(trial, points, estimates),
+    ]
     dvl = all_residuals[0]
     return Solution(
         trial=trial.name,
@@ -181,18 +183,6 @@ def _gnss(trial: Trial, navigation: Navigation) -> tuple[Residuals, ...]:
     return tuple(out)
 
 
-def _unexplained(all_residuals: Sequence[Residuals]) -> list[str]:
-    out = []
-    for r in all_residuals:
-        rms = float(np.sqrt(np.mean((r.residual / r.sigma) ** 2))) if r.time.size else 0.0
-        if rms > _TOO_LARGE:
-            out.append(
-                f"{r.label}: residuals are {rms:.1f} times as large as their stated standard "
-                "deviation; the reported standard deviations are too small unless it is corrected"
-            )
-    return out
-
-
 def _unobservable(trial: Trial, points: Points, estimates: Sequence[Estimate]) -> list[str]:
     """Say which components the data did not determine, and why."""
     dvl = trial.dvl
@@ -205,8 +195,8 @@ def _unobservable(trial: Trial, points: Points, estimates: Sequence[Estimate]) -
             continue
         names = ", ".join(e.component_names[i] for i in bad)
         why = (
-            "the trial is too short or too calm to know it better than the prior; turns and "
-            "changes of speed separate it from the attitude error"
+            "the trial does not tell it better than the prior; it takes longer, or turns and "
+            "changes of speed"
         )
         if e.name in of_dvl:
             why = dvl.explain(e.name, int(bad[0]), _as_sensors_see(points))

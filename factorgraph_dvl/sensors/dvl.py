@@ -164,7 +164,7 @@ class Dvl:
     def explain(self, parameter: str, component: int, motion: Motion | None) -> str:
         """Say why a component could not be observed, given the motion of the trial."""
         if motion is None or motion.v_n.shape[0] < 2:
-            return "the trial has no ping with a lock, or only one"
+            return "the trial has no ping with a lock while the IMU runs, or only one"
         v_b = rotate(motion.nRb.transpose(0, 2, 1), motion.v_n)
         speed = np.linalg.norm(v_b, axis=1)
         moving = speed > 0.3 * max(speed.max(), 1e-9)

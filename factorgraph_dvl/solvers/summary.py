@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import fields
 
 import numpy as np
 
@@ -20,14 +21,12 @@ from factorgraph_dvl.conventions import (
 from factorgraph_dvl.graph import Problem
 from factorgraph_dvl.preintegration import States, attach, motion_at, segment_ends
 from factorgraph_dvl.sensors.protocol import Motion, Parameter
-from factorgraph_dvl.solution import Estimate, Residuals, Solution, Trajectory
+from factorgraph_dvl.solution import Estimate, Residuals, Solution, Trajectory, doubts
 from factorgraph_dvl.solvers.covariance import Posterior, SquareRootInformation
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum
 
 # The data observed a component if they at least halved what was unknown of it.
 _OBSERVABLE = 0.5
-# Residuals larger than stated by this factor make every standard deviation too small.
-_TOO_LARGE = 1.3
 _FIRST = ("misalignment", "scale_error", "lever_arm", "gyro_bias", "accel_bias")
 
 
@@ -63,7 +62,7 @@ def summarise(
         )
     for label, count in problem.uncovered.items():
         warnings.append(f"{label}: {count} measurements at times without IMU data were not used")
-    warnings += _unexplained(residuals)
+    warnings += doubts(estimates, residuals)
     warnings += _unobservable(problem, estimates, evaluation.motions)
     return Solution(
         trial=trial.name,
@@ -247,18 +246,8 @@ def _residuals(problem: Problem, minimum: Minimum) -> tuple[Residuals, ...]:
     return tuple(out)
 
 
-def _unexplained(residuals: Sequence[Residuals]) -> list[str]:
-    out = []
-    for r in residuals:
-        if r.time.size == 0:
-            continue
-        rms = float(np.sqrt(np.mean((r.residual / r.sigma) ** 2)))
-        if rms > _TOO_LARGE:
-            out.append(
-                f"{r.label}: residuals are {rms:.1f} times as large as their stated standard "
-                "deviation; the reported standard deviations are too small unless it is corrected"
-            )
-    return out
+def _subset(motion: Motion, used: np.ndarray) -> Motion:
+    return Motion(**{f.name: getattr(motion, f.name)[used] for f in fields(motion)})
 
 
 def _unobservable(
@@ -268,8 +257,10 @@ def _unobservable(
     trial = problem.chain.trial
     by_name = {p.name: aid for aid in trial.aids for p in aid.parameters()}
     seen = {
-        name: motion
-        for observation, motion in zip(problem.observations, motions, strict=True)
+        name: _subset(motion, weight[:, 0] > 0.0)
+        for observation, motion, weight in zip(
+            problem.observations, motions, problem.weights, strict=True
+        )
         for name in observation.parameters
     }
     time = problem.chain.segments.node_time
