@@ -13,12 +13,20 @@ from __future__ import annotations
 import itertools
 from dataclasses import dataclass
 from functools import cached_property
-from math import comb, factorial
+from math import comb
 
 import numpy as np
 
+from factorgraph_dvl.clock import fill_lost, unrounded
 from factorgraph_dvl.conventions import Array
 from factorgraph_dvl.errors import DataError
+from factorgraph_dvl.polynomials import (
+    evaluate,
+    highest_difference,
+    integrate,
+    interpolation,
+    rate_and_slope,
+)
 from factorgraph_dvl.sensors.imu import Imu
 from factorgraph_dvl.signals import Smoothed, as_it_is, smooth
 
@@ -40,8 +48,6 @@ _ROUGH = 6.0
 _SMOOTHER = 0.3
 # A difference is no sign of a step before it is so many of its standard deviations.
 _BEYOND_NOISE = 3.0
-_GAUSS_NODES = np.array([0.5 - np.sqrt(15.0) / 10.0, 0.5, 0.5 + np.sqrt(15.0) / 10.0])
-_GAUSS_WEIGHTS = np.array([5.0, 8.0, 5.0]) / 18.0
 
 
 @dataclass(frozen=True)
@@ -118,7 +124,7 @@ class Increments:
         for a in range(0, index.size, _CHUNK):
             part = index[a : a + _CHUNK]
             c = self._polynomials(part)
-            phi[a : a + _CHUNK], dv[a : a + _CHUNK] = _integrate(c, self.dt[part], 1.0)
+            phi[a : a + _CHUNK], dv[a : a + _CHUNK] = integrate(c, self.dt[part], 1.0)
         return phi, dv
 
     def partial(self, index: IntArray, since: Array) -> Partial:
@@ -126,9 +132,9 @@ class Increments:
         c = self._polynomials(index)
         dt = self.dt[index]
         u = since / dt
-        phi, dv = _integrate(c, dt, u)
+        phi, dv = integrate(c, dt, u)
         omega, alpha = self._blended_rate(index, since, c)
-        force = _evaluate(c, u)[:, 3:]
+        force = evaluate(c, u)[:, 3:]
         # A step or a vibration leaves high differences, a smooth motion almost none; what
         # the gyro's noise accounts for is in its own standard deviation already.
         rough = np.abs(self._differences[self._centred_sample(index)])
@@ -194,8 +200,8 @@ class Increments:
         near = np.where(self.arc_of[near] == self.arc_of[index], near, index)
         gap = np.where(near < index, self.dt[near], -self.dt[index])
         gap = np.where(near == index, 0.0, gap)
-        own, own_slope = _rate_and_slope(c, since, self.dt[index])
-        other, other_slope = _rate_and_slope(self._polynomials(near), since + gap, self.dt[near])
+        own, own_slope = rate_and_slope(c, since, self.dt[index])
+        other, other_slope = rate_and_slope(self._polynomials(near), since + gap, self.dt[near])
         inward = np.where(u < 0.5, 1.0, -1.0)
         weight = np.clip(0.5 + np.where(u < 0.5, u, 1.0 - u), 0.0, 1.0)[:, None]
         moving = ((weight > 0.0) & (weight < 1.0)) * (inward / self.dt[index])[:, None]
@@ -216,7 +222,7 @@ class Increments:
         for (a, b), base in zip(self.arcs, self.first_sample, strict=True):
             edges = np.append(self.start[a:b], self.end[b - 1])
             count = b - a + (0 if self.averaged else 1)
-            highest = _highest_difference(
+            highest = highest_difference(
                 self.samples[base : base + count, :3], edges, self._width, self.averaged
             )
             out[base : base + highest.shape[0]] = highest
@@ -277,13 +283,13 @@ class Increments:
         for shift in np.unique(offset[uniform]):
             pick = uniform & (offset == shift)
             edges = np.arange(lengths.shape[1] + 1, dtype=float) - shift
-            out[pick] = np.matmul(_interpolation(edges[None], self.averaged)[0], values[pick])
+            out[pick] = np.matmul(interpolation(edges[None], self.averaged)[0], values[pick])
         rest = np.flatnonzero(~uniform)
         if rest.size:
             edges = np.zeros((rest.size, lengths.shape[1] + 1))
             np.cumsum(lengths[rest], axis=1, out=edges[:, 1:])
             edges -= np.take_along_axis(edges, offset[rest][:, None], axis=1)
-            out[rest] = np.matmul(_interpolation(edges, self.averaged), values[rest])
+            out[rest] = np.matmul(interpolation(edges, self.averaged), values[rest])
         return out
 
 
@@ -325,7 +331,7 @@ def increments(imu: Imu) -> tuple[Increments, tuple[str, ...]]:
     bridged = (lost > 0) & (lost <= MAX_FILLED)
     broken = (lost > MAX_FILLED) | (step > (MAX_FILLED + _LOST) * dt)
     if bridged.any():
-        time, samples, filled_sigma, broken = _fill(time, samples, lost, bridged, broken)
+        time, samples, filled_sigma, broken = fill_lost(time, samples, lost, bridged, broken)
         notes.append(
             f"{imu.source}: {int(lost[bridged].sum())} lost samples in {int(bridged.sum())} "
             f"places were interpolated, the first after {imu.time[np.argmax(bridged)]:.3f} s"
@@ -342,7 +348,7 @@ def increments(imu: Imu) -> tuple[Increments, tuple[str, ...]]:
             )
             continue
         # Since the first sample: seconds of an epoch leave a double 1e-7 s only.
-        edges = _unrounded(time[a:b])
+        edges = unrounded(time[a:b])
         if averaged:
             edges = np.concatenate([[edges[0] - np.median(np.diff(edges))], edges])
         starts.append(time[a] + edges[:-1])
@@ -401,7 +407,7 @@ def _steps(inc: Increments, noise: Array) -> Array:
     for (a, b), base in zip(inc.arcs, inc.first_sample, strict=True):
         n = b - a
         edges = np.append(inc.start[a:b], inc.end[b - 1])
-        rough = np.abs(_highest_difference(inc.samples[base : base + n + 1], edges, width, False))
+        rough = np.abs(highest_difference(inc.samples[base : base + n + 1], edges, width, False))
         inside = np.arange(width - 1, n - width + 1)
         if inside.size == 0:
             continue
@@ -410,133 +416,3 @@ def _steps(inc: Increments, noise: Array) -> Array:
         step = (holding > _ROUGH * sigma) & (_SMOOTHER * holding > beside)
         out[a + inside] = np.where(step, holding / np.sqrt(12.0), 0.0)
     return out
-
-
-def _fill(
-    time: Array, samples: Array, lost: IntArray, bridged: np.ndarray, broken: np.ndarray
-) -> tuple[Array, Array, Array, np.ndarray]:
-    """Interpolate short runs of lost samples, with the standard deviation to expect."""
-    add_time, add_samples, add_sigma, at = [], [], [], []
-    for i in np.flatnonzero(bridged).tolist():
-        n = int(lost[i])
-        a, b = max(i - 2, 0), min(i + 4, time.size)
-        new = time[i] + (time[i + 1] - time[i]) * np.arange(1, n + 1) / (n + 1)
-        local = (time[a:b] - time[i]) / (time[i + 1] - time[i])
-        degree = min(3, b - a - 1)
-        fit = np.polyfit(local, samples[a:b], degree)
-        u = (new - time[i]) / (time[i + 1] - time[i])
-        value = np.stack([np.polyval(fit[:, k], u) for k in range(6)], axis=1)
-        straight = samples[i] + u[:, None] * (samples[i + 1] - samples[i])
-        add_time.append(new)
-        add_samples.append(value)
-        add_sigma.append(np.abs(value - straight))
-        at.append(np.full(n, i + 1))
-    where = np.concatenate(at)
-    out_broken = np.insert(broken, where - 1, False)
-    return (
-        np.insert(time, where, np.concatenate(add_time)),
-        np.insert(samples, where, np.concatenate(add_samples), axis=0),
-        np.insert(np.zeros_like(samples), where, np.concatenate(add_sigma), axis=0),
-        out_broken,
-    )
-
-
-def _unrounded(time: Array) -> Array:
-    """Return times since the first, regular where only rounding makes them irregular.
-
-    At 128 Hz a stamp in milliseconds is wrong by up to 6 % of the interval, and in a roll
-    of 50 deg/s a mean over the wrong interval by 0.02 deg. Times that a straight line fits
-    to within the last decimal (or the last bit) that they are written with lie on it.
-    """
-    count = np.arange(time.size) - 0.5 * (time.size - 1)
-    since = time - time[0]
-    slope = float(count @ since) / float(count @ count)
-    line = since.mean() + slope * count
-    quantum = float(np.spacing(np.abs(time).max()))
-    for decimals in range(1, 7):
-        unit = 10.0**-decimals
-        if unit < 0.5 * slope and np.all(np.abs(since / unit - np.rint(since / unit)) < 1e-3):
-            quantum = max(quantum, unit)
-    # A fitted line may be off by as much as the rounding itself.
-    return line if np.abs(since - line).max() <= quantum else since
-
-
-def _highest_difference(values: Array, edges: Array, width: int, averaged: bool) -> Array:
-    """Return differences of order width - 1 of means over intervals or values at their ends.
-
-    As they would be at regular intervals: by divided differences, that of the integral
-    for means.
-    """
-    reach = 1 if averaged else 0
-    out = values
-    for order in range(1, width):
-        span = edges[order + reach :] - edges[: -order - reach]
-        out = np.diff(out, axis=0) / span[:, None]
-    factor = factorial(width) if averaged else factorial(width - 1)
-    return np.asarray(out * factor * float(np.median(np.diff(edges))) ** (width - 1))
-
-
-def _interpolation(edges: Array, averaged: bool) -> Array:
-    """Return (B, K, K) matrices from samples to polynomial coefficients.
-
-    Parameters
-    ----------
-    edges : (B, E) ends of the intervals; K = E - 1 means over them, or K = E values.
-    averaged : which of the two.
-    """
-    power = np.arange(edges.shape[1] - 1 if averaged else edges.shape[1])
-    if averaged:
-        upper, lower = edges[:, 1:, None], edges[:, :-1, None]
-        rows = (upper ** (power + 1) - lower ** (power + 1)) / ((power + 1) * (upper - lower))
-    else:
-        rows = edges[:, :, None] ** power
-    return np.asarray(np.linalg.inv(rows))
-
-
-def _evaluate(c: Array, u: Array | float) -> Array:
-    """Return polynomials c (M, K, 6) at u (M,) or scalar."""
-    u = np.asarray(u)[..., None]
-    out = np.broadcast_to(c[:, -1], c[:, -1].shape).copy()
-    for k in range(c.shape[1] - 2, -1, -1):
-        out *= u
-        out += c[:, k]
-    return out
-
-
-def _rate_and_slope(c: Array, since: Array, dt: Array) -> tuple[Array, Array]:
-    """Return the rate and its derivative, (M, 3), `since` seconds into intervals."""
-    u = since / dt
-    rate = c[:, :, :3]
-    order = np.arange(1, c.shape[1])
-    return _evaluate(rate, u), _evaluate(rate[:, 1:] * order[:, None], u) / dt[:, None]
-
-
-def _integrate(c: Array, dt: Array, u: Array | float) -> tuple[Array, Array]:
-    """Return rotation vector and velocity increment over [0, u] of intervals.
-
-    The rotation by the sixth-order Magnus expansion at Gauss points (Blanes, Casas,
-    Oteo, Ros, Phys. Rep. 470 (2009), eq. 253), the velocity by Gauss quadrature of the
-    force rotated to the start.
-    """
-    u = np.broadcast_to(np.asarray(u, dtype=float), dt.shape)
-    h = (dt * u)[:, None]
-    at = [_evaluate(c, u * node) for node in _GAUSS_NODES]
-    w1, w2, w3 = (x[:, :3] for x in at)
-    a1 = h * w2
-    a2 = (np.sqrt(15.0) / 3.0) * h * (w3 - w1)
-    a3 = (10.0 / 3.0) * h * (w3 - 2.0 * w2 + w1)
-    # R' = R [w x] mirrors the textbook's Y' = A Y: every commutator changes sign.
-    c1 = -np.cross(a1, a2)
-    c2 = np.cross(a1, 2.0 * a3 + c1) / 60.0
-    phi = a1 + a3 / 12.0 - np.cross(-20.0 * a1 - a3 + c1, a2 + c2) / 240.0
-
-    power = np.arange(1, c.shape[1] + 1)
-    integral = np.concatenate([np.zeros_like(c[:, :1, :3]), c[:, :, :3] / power[:, None]], axis=1)
-    dv = np.zeros_like(phi)
-    for node, weight, x in zip(_GAUSS_NODES, _GAUSS_WEIGHTS, at, strict=True):
-        turned = dt[:, None] * _evaluate(integral, u * node)
-        force = x[:, 3:]
-        once = np.cross(turned, force)
-        twice = np.cross(turned, once)
-        dv += weight * (force + once + twice / 2.0 + np.cross(turned, twice) / 6.0)
-    return phi, h * dv

@@ -19,7 +19,7 @@ LAYERS = (
     ("sensors",),
     ("trial", "solution"),
     ("io", "simulation"),
-    ("signals",),
+    ("clock", "polynomials", "signals"),
     ("increments",),
     ("kalman",),
     ("preintegration",),
