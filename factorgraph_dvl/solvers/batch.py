@@ -124,6 +124,7 @@ def _without_dvl(chain: Chain, states: States, report: Progress) -> Minimum:
         progress=report,
         max_iterations=_ROUGH_ITERATIONS,
         tolerance=_ROUGH,
+        proven=False,
     )
 
 

@@ -157,7 +157,8 @@ class Posterior:
 
 
 def posterior(problem: Problem, minimum: Minimum) -> Posterior:
-    """Return the covariances at a minimum."""
+    """Return the covariances at a minimum that was proven."""
+    assert minimum.tree is not None
     sizes = minimum.evaluation.values.dims()
     information = SquareRootInformation(minimum.tree, sizes)
     wanted = [keys.node(k) for k in range(problem.chain.segments.node_time.size)]

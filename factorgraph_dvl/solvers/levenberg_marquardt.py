@@ -32,13 +32,14 @@ class Minimum:
     Parameters
     ----------
     evaluation : at the last values.
-    tree : Bayes tree from QR there, up to the last step, which was small if `converged`.
+    tree : Bayes tree from QR there, up to the last step, which was small if `converged`;
+        None if no proof was asked for.
     converged : whether the linear model promises no more.
     iterations : accepted and refused steps.
     """
 
     evaluation: Evaluation
-    tree: gtsam.GaussianBayesTree
+    tree: gtsam.GaussianBayesTree | None
     converged: bool
     iterations: int
 
@@ -51,6 +52,7 @@ def minimise(
     progress: Progress | None = None,
     max_iterations: int = 50,
     tolerance: float = CONVERGED,
+    proven: bool = True,
 ) -> Minimum:
     """Minimise a problem's cost.
 
@@ -70,6 +72,7 @@ def minimise(
     progress : called with stage, iteration and cost.
     max_iterations : steps after which to give up.
     tolerance : promised decrease of the cost below which the minimum is reached.
+    proven : whether QR must confirm the minimum.
 
     Raises
     ------
@@ -98,7 +101,7 @@ def minimise(
         damped = _damped(gaussian, evaluation.values, damping) if damping > 0.0 else gaussian
         delta = None if careful else quick_step(damped, ordering)
         promised = evaluation.cost - gaussian.error(delta) if delta is not None else -np.inf
-        if not promised > tolerance:
+        if delta is None or (proven and not promised > tolerance):
             tree = eliminate(damped, ordering)
             delta = tree.optimize()
             promised = evaluation.cost - gaussian.error(delta)
@@ -111,7 +114,7 @@ def minimise(
                 evaluation = trial
             if progress:
                 progress(stage, iteration, evaluation.cost)
-            if small and damping == 0.0 and tree is not None:
+            if small and damping == 0.0 and (tree is not None or not proven):
                 return Minimum(evaluation, tree, True, iteration)
             damping = damping / 10.0 if damping > _FIRST_DAMPING else 0.0
             gaussian = problem.linearize(evaluation)
