@@ -142,12 +142,12 @@ def test_kalman_shares_no_measurement_equation_with_the_factors():
 
 def test_nothing_but_the_command_line_imports_it():
     for parts in [*MODULES, ("__init__",)]:
-        if parts != ("cli",):
+        if parts[0] != "cli":
             assert "cli" not in map(layer_of, imported(read(parts))), parts
 
 
 def test_the_command_line_and_the_package_load_lazily():
-    for parts in (("cli",), ("__init__",)):
+    for parts in [*(p for p in MODULES if p[0] == "cli"), ("__init__",)]:
         at_the_top = ast.Module(
             [node for node in read(parts).body if isinstance(node, (ast.Import, ast.ImportFrom))],
             [],

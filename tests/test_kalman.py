@@ -17,7 +17,8 @@ from factorgraph_dvl.analysis.consistency import (
     paper_accuracy,
     trajectory_errors,
 )
-from factorgraph_dvl.cli import KalmanMethod, main
+from factorgraph_dvl.cli import main
+from factorgraph_dvl.cli.solve import KalmanMethod
 from factorgraph_dvl.conventions import DEG, MICRO_G, exp_so3, log_so3, rotation_from_rph
 from factorgraph_dvl.errors import ConfigError, DataError
 from factorgraph_dvl.increments import increments

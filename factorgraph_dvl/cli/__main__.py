@@ -1,0 +1,8 @@
+"""Run the command line as a module."""
+
+from __future__ import annotations
+
+from factorgraph_dvl.cli.app import main
+
+if __name__ == "__main__":
+    main()

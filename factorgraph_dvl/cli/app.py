@@ -1,0 +1,90 @@
+"""The application: its commands, its errors, its exit codes."""
+
+from __future__ import annotations
+
+import os
+import sys
+from typing import Annotated, NoReturn
+
+import typer
+from rich.text import Text
+
+from factorgraph_dvl import __version__
+from factorgraph_dvl.cli.console import stderr
+from factorgraph_dvl.cli.crosscheck import crosscheck
+from factorgraph_dvl.cli.inspect import inspect
+from factorgraph_dvl.cli.simulate import simulate
+from factorgraph_dvl.cli.solve import kalman, solve
+from factorgraph_dvl.errors import FactorgraphDvlError
+
+_NAME = "factorgraph-dvl"
+
+# A command's module loads nothing heavy at its top: GTSAM, SciPy, Matplotlib and Arrow take
+# seconds, and --help shall answer at once.
+app = typer.Typer(
+    name=_NAME,
+    help="Calibrate a Doppler velocity log, jointly with the trajectory of its vehicle.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+for _command in (simulate, solve, kalman, inspect, crosscheck):
+    app.command()(_command)
+
+
+def main(argv: list[str] | None = None) -> NoReturn:
+    """Run the command line and exit: 0 done, 1 could not deliver, 2 bad input or usage.
+
+    Parameters
+    ----------
+    argv : arguments; by default those of the process.
+    """
+    args = sys.argv[1:] if argv is None else argv
+    # All matrices are small: more threads only wait for one another.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+    for stream in (sys.stdout, sys.stderr):
+        # A terminal that knows no µ shall not fail a run.
+        if hasattr(stream, "reconfigure"):
+            stream.reconfigure(errors="replace")
+    try:
+        app(args=[arg for arg in args if arg != "--debug"], prog_name=_NAME)
+    except FactorgraphDvlError as error:
+        _fail(str(error), error.exit_code, args)
+    except KeyboardInterrupt:
+        _fail("interrupted", 130, args)
+    except OSError as error:
+        name = error.filename if error.filename is not None else "a file"
+        _fail(f"{name}: {error.strerror or error}", 2, args)
+    except Exception as error:
+        hint = "" if "--debug" in args else ". Run with --debug to see where"
+        _fail(f"internal error: {type(error).__name__}: {error}{hint}", 1, args)
+    sys.exit(0)
+
+
+def _fail(message: str, exit_code: int, args: list[str]) -> NoReturn:
+    if "--debug" in args:
+        stderr().print_exception()
+    stderr().print(Text(f"error: {message}", "red"), soft_wrap=True)
+    sys.exit(exit_code)
+
+
+def _show_version(value: bool) -> None:
+    if value:
+        typer.echo(f"{_NAME} {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _options(
+    version: Annotated[
+        bool,
+        typer.Option(
+            "--version", help="Show the version and exit.", callback=_show_version, is_eager=True
+        ),
+    ] = False,
+    debug: Annotated[
+        bool, typer.Option("--debug", help="Show the traceback of an error.")
+    ] = False,
+) -> None:
+    pass

@@ -1,0 +1,101 @@
+"""What the commands print: progress, tables, warnings."""
+
+from __future__ import annotations
+
+import sys
+from contextlib import suppress
+from pathlib import Path
+from time import perf_counter, time
+from typing import TYPE_CHECKING
+
+from rich.console import Console
+from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+from rich.text import Text
+
+if TYPE_CHECKING:
+    from types import TracebackType
+
+    from rich.table import Table
+
+_STARTED = time()
+# Tables that go to a file or a pipe are not cut to the 80 columns of no terminal.
+_PIPE_WIDTH = 180
+
+
+class ProgressLine:
+    """Stage, iteration, cost and time: live on a terminal, else a line for each."""
+
+    def __init__(self, *, quiet: bool) -> None:
+        self._quiet = quiet
+        self._start = perf_counter()
+        self._console = stderr()
+        self._live = Progress(
+            SpinnerColumn(),
+            TextColumn("{task.description}", markup=False),
+            TimeElapsedColumn(),
+            console=self._console,
+            transient=True,
+            disable=quiet or not self._console.is_terminal,
+        )
+        self._task = self._live.add_task("load")
+
+    def __enter__(self) -> ProgressLine:
+        self._live.start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self._live.stop()
+
+    def __call__(self, stage: str, iteration: int = 0, cost: float | None = None) -> None:
+        """Show where the work stands."""
+        text = stage
+        if iteration:
+            text += f", iteration {iteration}"
+            # That of the start values is huge, and says nothing.
+            if cost is not None:
+                text += f", cost {cost:.4g}"
+        if self._console.is_terminal:
+            self._live.update(self._task, description=text)
+        elif not self._quiet:
+            elapsed = perf_counter() - self._start
+            self._console.print(f"{elapsed:7.1f} s  {text}", markup=False, soft_wrap=True)
+
+
+def print_written(out: Path) -> None:
+    """Name the files that this run wrote to a folder."""
+    # A folder that was replaced by --force may hold files of others.
+    new = (p for p in out.rglob("*") if p.is_file() and p.stat().st_mtime >= _STARTED - 1.0)
+    written = sorted(path.relative_to(out) for path in new)
+    stdout().print(f"Wrote {', '.join(map(str, written))} to {out}", markup=False, soft_wrap=True)
+
+
+def print_table(table: Table) -> None:
+    """Print a table whole: one wider than the terminal is wrapped by that, never cut."""
+    from factorgraph_dvl.report.tables import width_of
+
+    console = stdout()
+    console.width = max(console.width, width_of(table))
+    console.print(table)
+
+
+def warn(message: str) -> None:
+    """Print a warning."""
+    stderr().print(Text(f"warning: {message}", "yellow"), soft_wrap=True)
+
+
+def stdout() -> Console:
+    """Return the console for results."""
+    return Console(width=None if sys.stdout.isatty() else _PIPE_WIDTH)
+
+
+def stderr() -> Console:
+    """Return the console for progress, warnings and errors."""
+    # What was said first comes first, also where both streams end in one file.
+    with suppress(OSError):
+        sys.stdout.flush()
+    return Console(stderr=True)

@@ -1,0 +1,105 @@
+"""The command `crosscheck`."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from factorgraph_dvl.cli.console import print_table, print_written, stdout, warn
+from factorgraph_dvl.cli.options import Force, NoFigures
+
+if TYPE_CHECKING:
+    from factorgraph_dvl.analysis.crosscheck import CrossCheck
+
+
+class Side(StrEnum):
+    """One of the two results of a cross-check."""
+
+    A = "A"
+    B = "B"
+
+
+def crosscheck(
+    a: Annotated[
+        Path,
+        typer.Argument(metavar="A", help="Solution folder, or results from elsewhere: a file."),
+    ],
+    b: Annotated[Path, typer.Argument(metavar="B", help="Likewise.")],
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder to write.")],
+    reference: Annotated[
+        Path | None,
+        typer.Option(metavar="REF", help="Trial folder or table: the true trajectory."),
+    ] = None,
+    truth: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="True calibration, JSON or YAML; before the trial's."),
+    ] = None,
+    efficient: Annotated[
+        Side | None,
+        typer.Option(case_sensitive=False, help="Which result uses all data by a true model."),
+    ] = None,
+    force: Force = False,
+    no_figures: NoFigures = False,
+) -> None:
+    """Hold two results of one trial against each other, and against the truth."""
+    from factorgraph_dvl.analysis.crosscheck import crosscheck as compare
+    from factorgraph_dvl.io.folders import check_output, new_folder
+    from factorgraph_dvl.io.foreign import load_results, load_truth
+    from factorgraph_dvl.io.tables import write_table
+    from factorgraph_dvl.report.crosscheck_files import OWNED, difference_columns, to_csv, to_json
+
+    check_output(out, force=force)
+    result_a, result_b = load_results(a, b)
+    true_motion, true_values = load_truth(reference, truth)
+    check = compare(
+        result_a,
+        result_b,
+        efficient=None if efficient is None else efficient.value,
+        truth=true_values,
+        reference=true_motion,
+    )
+    with new_folder(out, force=force, owned=OWNED) as folder:
+        (folder / "crosscheck.csv").write_text(to_csv(check), encoding="utf-8")
+        if check.motion is not None:
+            write_table(folder / "differences.csv", difference_columns(check.motion))
+        if not no_figures:
+            _draw_crosscheck(check, folder)
+        (folder / "crosscheck.json").write_bytes(to_json(check, {"A": str(a), "B": str(b)}))
+    _print_crosscheck(check, a, b)
+    print_written(out)
+
+
+def _draw_crosscheck(check: CrossCheck, folder: Path) -> None:
+    from factorgraph_dvl.report.crosscheck_figures import write_crosscheck_figures
+
+    try:
+        write_crosscheck_figures(check, folder)
+    except Exception as error:
+        warn(f"figures could not be drawn: {type(error).__name__}: {error}")
+
+
+def _print_crosscheck(check: CrossCheck, a: Path, b: Path) -> None:
+    from factorgraph_dvl.report import crosscheck_tables as tables
+
+    console = stdout()
+    for side, path, solution in (("A", a, check.a), ("B", b, check.b)):
+        solver = f" ({solution.solver})" if solution.solver else ""
+        console.print(f"{side}: {path}{solver}", markup=False, soft_wrap=True)
+    if check.components:
+        print_table(tables.component_table(check, width=console.width))
+    if check.motion is not None:
+        print_table(tables.motion_table(check.motion))
+    for table in tables.truth_tables(check):
+        print_table(table)
+    for note in check.notes:
+        warn(note)
+    console.print(tables.paragraph(check), markup=False, highlight=False)
+    if check.explanation:
+        console.print("Where they differ:", markup=False)
+        for sentence in check.explanation:
+            console.print(f"- {sentence}", markup=False, highlight=False)
+    if check.components:
+        console.print(tables.verdict_line(check.components), markup=False, highlight=False)

@@ -1,0 +1,37 @@
+"""The command `simulate`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from time import perf_counter
+from typing import Annotated
+
+import typer
+
+from factorgraph_dvl.cli.console import stdout
+from factorgraph_dvl.cli.options import Force
+
+
+def simulate(
+    config: Annotated[Path, typer.Argument(metavar="CONFIG", help="Scenario, a YAML file.")],
+    out: Annotated[Path, typer.Option("--out", metavar="TRIAL", help="Trial folder to write.")],
+    seed: Annotated[int, typer.Option(min=0, help="Of all that is random.")] = 0,
+    force: Force = False,
+    parquet: Annotated[
+        bool, typer.Option("--parquet", help="Write tables as Parquet instead of CSV.")
+    ] = False,
+) -> None:
+    """Simulate a trial with known truth."""
+    from factorgraph_dvl.io.folders import check_output
+    from factorgraph_dvl.io.trial_folder import save_trial
+    from factorgraph_dvl.simulation import simulate as run
+
+    check_output(out, force=force)
+    start = perf_counter()
+    trial = run(config, seed=seed)
+    save_trial(trial, out, force=force, parquet=parquet)
+    stdout().print(
+        f"Wrote trial {trial.name} to {out} in {perf_counter() - start:.1f} s",
+        markup=False,
+        soft_wrap=True,
+    )
