@@ -17,6 +17,8 @@ DEG_PER_HOUR = DEG / HOUR
 DEG_PER_SQRT_HOUR = DEG / np.sqrt(HOUR)
 STANDARD_GRAVITY = 9.80665
 MICRO_G = 1e-6 * STANDARD_GRAVITY
+# SI values of the units of latitude, longitude and height in files.
+GEODETIC_SI = np.array([DEG, DEG, 1.0])
 
 _FRD_FROM_BODY: dict[str, Array] = {
     "FRD": np.eye(3),

@@ -69,7 +69,9 @@ class Trial:
     ----------
     name : of the trial.
     imu : the IMU; a trial without one cannot be smoothed.
-    gnss, dvl : the other sensors, None where the trial does not have them.
+    gnss, dvl : the sensors that a calibration needs, None where the trial does not have
+        them.
+    others : all further sensors.
     body_axes : axes in which all body quantities are given.
     epoch : UTC of time zero, ISO 8601; empty if not given.
     initial_attitude, initial_position : priors; None = found from the data.
@@ -83,6 +85,7 @@ class Trial:
     imu: Imu
     gnss: Gnss | None = None
     dvl: Dvl | None = None
+    others: tuple[Aid, ...] = ()
     body_axes: BodyAxes = "RFU"
     epoch: str = ""
     initial_attitude: InitialAttitude | None = None
@@ -94,7 +97,7 @@ class Trial:
     @property
     def aids(self) -> tuple[Aid, ...]:
         """The sensors other than the IMU."""
-        return tuple(aid for aid in (self.gnss, self.dvl) if aid is not None)
+        return tuple(aid for aid in (self.gnss, self.dvl, *self.others) if aid is not None)
 
     def frame(self) -> LocalFrame:
         """Return the tangent frame at the first known position.

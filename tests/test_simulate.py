@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ast
 import copy
 from pathlib import Path
 
@@ -13,7 +12,6 @@ import yaml
 from pyins import strapdown
 from scipy.integrate import quad, solve_ivp
 
-import factorgraph_dvl.simulation as package
 from factorgraph_dvl.conventions import (
     DEG,
     DEG_PER_HOUR,
@@ -659,26 +657,3 @@ def test_unreadable_files_are_refused(tmp_path):
     path.write_text("- 1")
     with pytest.raises(ConfigError, match="not a scenario"):
         load_scenario(path)
-
-
-def test_the_simulator_shares_no_measurement_model_with_the_estimator():
-    allowed = {
-        "conventions": None,
-        "earth": None,
-        "errors": None,
-        "trial": None,
-        "sensors.imu": {"Imu", "ImuSettings"},
-        "sensors.gnss": {"Gnss", "GnssSettings"},
-        "sensors.dvl": {"Dvl", "DvlSettings"},
-        "sensors.protocol": {"NonNegative", "Positive", "Section", "Sigma3", "Vector3"},
-    }
-    for path in Path(package.__file__).parent.glob("*.py"):
-        for node in ast.walk(ast.parse(path.read_text())):
-            if isinstance(node, ast.Import):
-                assert not any("factorgraph_dvl" in alias.name for alias in node.names)
-            if isinstance(node, ast.ImportFrom) and node.module.startswith("factorgraph_dvl."):
-                module = node.module.removeprefix("factorgraph_dvl.")
-                if module.startswith("simulation"):
-                    continue
-                names = allowed[module]
-                assert names is None or {alias.name for alias in node.names} <= names

@@ -75,11 +75,6 @@ def write_table(path: Path, columns: Mapping[str, Array]) -> None:
         pyarrow.csv.write_csv(table, file, pyarrow.csv.WriteOptions(include_header=False))
 
 
-def stack(columns: Mapping[str, Array], names: Sequence[str]) -> Array:
-    """Return the columns of those names side by side, (N, n)."""
-    return np.column_stack([columns[name] for name in names])
-
-
 def _choose(
     header: Sequence[str],
     required: Sequence[str],

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Annotated, Any, Protocol
+from typing import Annotated, Any, ClassVar, Protocol, Self
 
 import msgspec
 import numpy as np
@@ -22,7 +22,7 @@ Values = Mapping[str, Array]
 
 
 class Section(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A section of trial.yaml, in the units that its names state."""
+    """A section of a YAML file, in the units that its names state."""
 
     def __post_init__(self) -> None:
         for name in self.__struct_fields__:
@@ -161,12 +161,51 @@ class Observation(Protocol):
         """Return the residual and its Jacobians, of the parameters `wanted` at least."""
 
 
-class Aid(Protocol):
+class SensorSection(Section, frozen=True, kw_only=True):
+    """A sensor's section of trial.yaml, with the table that holds its record."""
+
+    file: str
+
+
+class Record(Protocol):
+    """A sensor's record, and how it stands in files.
+
+    `section` names its part of trial.yaml and its table, `section_type` holds the
+    settings; of the columns, `required` must be there, and of each group of `optional`
+    ones all or none.
+    """
+
+    section: ClassVar[str]
+    section_type: ClassVar[type[SensorSection]]
+    required: ClassVar[tuple[str, ...]]
+    optional: ClassVar[tuple[tuple[str, ...], ...]]
+
+    @property
+    def settings(self) -> SensorSection:
+        """Settings of the sensor."""
+
+    @classmethod
+    def from_columns(cls, settings: Any, columns: Mapping[str, Array], source: str) -> Self:
+        """Return the record that a table holds; columns that it does not have are nan."""
+
+    def columns(self) -> dict[str, Array]:
+        """Return the record as a table."""
+
+
+class Aid(Record, Protocol):
     """A sensor that observes the motion which the IMU integrates."""
 
     @property
     def label(self) -> str:
         """Name of the sensor, for people."""
+
+    @property
+    def time(self) -> Array:
+        """Times of the record, (M,), s."""
+
+    @property
+    def missing(self) -> Array:
+        """Rows without a measurement, (M,) bool."""
 
     def parameters(self) -> tuple[Parameter, ...]:
         """Return the calibration parameters, fixed ones included."""
@@ -245,6 +284,11 @@ def check_all_or_none(columns: Mapping[str, Array], source: str) -> None:
 def at_row(source: str, row: int | np.integer[Any]) -> str:
     """Name a row of a record so that it is found in the file (one header line)."""
     return f"{source} line {int(row) + 2}"
+
+
+def stack(columns: Mapping[str, Array], names: Sequence[str]) -> Array:
+    """Return the columns of those names side by side, (M, n)."""
+    return np.column_stack([columns[name] for name in names])
 
 
 def named_columns(names: Iterable[str], values: Array) -> dict[str, Array]:

@@ -16,7 +16,8 @@ from scipy.interpolate import PPoly
 from factorgraph_dvl.conventions import DEG, Array, BodyAxes, frd_from_body
 from factorgraph_dvl.earth import RATE, normal_gravity, radii
 from factorgraph_dvl.errors import ConfigError
-from factorgraph_dvl.simulation.scenario import Accelerate, Manoeuvre, Scenario, Straight
+from factorgraph_dvl.simulation.manoeuvres import Accelerate, Manoeuvre, Straight
+from factorgraph_dvl.simulation.scenario import Scenario
 
 _COLLOCATION_NODES = 6
 _MAX_LATITUDE = 89.5 * DEG
