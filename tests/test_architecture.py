@@ -17,7 +17,7 @@ PACKAGE = Path(factorgraph_dvl.__file__).parent
 # package. `a.b` stands for a module or a whole package.
 LAYERS = (
     ("conventions", "errors"),
-    ("earth",),
+    ("earth", "yaml_file"),
     ("sensors",),
     ("trial", "solution"),
     ("io", "simulation"),

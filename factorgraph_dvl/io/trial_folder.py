@@ -21,13 +21,13 @@ from factorgraph_dvl.io.trial_yaml import (
     TrialSettings,
     to_yaml,
 )
-from factorgraph_dvl.io.yaml_file import parse_yaml, read_text
 from factorgraph_dvl.sensors.catalogue import AIDS
 from factorgraph_dvl.sensors.dvl import Dvl
 from factorgraph_dvl.sensors.gnss import Gnss
 from factorgraph_dvl.sensors.imu import Imu
 from factorgraph_dvl.sensors.protocol import Record, SensorSection
 from factorgraph_dvl.trial import InitialAttitude, InitialPosition, Reference, Trial
+from factorgraph_dvl.yaml_file import parse_yaml, read_text
 
 SETTINGS_FILE = "trial.yaml"
 TRUTH_FILE = "truth.json"

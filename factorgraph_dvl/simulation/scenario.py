@@ -41,7 +41,6 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import msgspec
-import yaml
 
 from factorgraph_dvl.conventions import BodyAxes
 from factorgraph_dvl.errors import ConfigError
@@ -56,6 +55,7 @@ from factorgraph_dvl.sensors.protocol import (
 from factorgraph_dvl.simulation.convert import convert
 from factorgraph_dvl.simulation.instruments import DvlTruth, GnssTruth, ImuTruth, Instrument
 from factorgraph_dvl.simulation.manoeuvres import Manoeuvre, flatten
+from factorgraph_dvl.yaml_file import read_yaml
 
 Latitude = Annotated[float, msgspec.Meta(ge=-89, le=89)]
 Longitude = Annotated[float, msgspec.Meta(ge=-360, le=360)]
@@ -129,7 +129,7 @@ class Scenario(Section, frozen=True, kw_only=True):
     gnss: GnssTruth | None = None
     dvl: DvlTruth | None = None
     trial: Claims = Claims()
-    source: str = "scenario"
+    source: str = ""
 
     def plan(self) -> list[Manoeuvre]:
         """Return the manoeuvres with repetitions written out.
@@ -169,23 +169,13 @@ def load_scenario(path: str | PathLike[str]) -> Scenario:
     ------
     ConfigError
         If the file is missing, is not YAML, or holds an unknown key, a wrong type or a
-        value out of range; the message names file and key.
+        value out of range; the message names file, line and key.
     """
     path = Path(path)
-    try:
-        data = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise ConfigError(
-            f"cannot read the scenario ({error.strerror})",
-            where=str(path),
-            expected="a YAML file",
-        ) from error
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        mark = getattr(error, "problem_mark", None)
-        where = f"{path} line {mark.line + 1}" if mark else str(path)
-        problem = getattr(error, "problem", None) or "not text in UTF-8"
-        raise ConfigError(f"not valid YAML ({problem})", where=where) from error
-    return parse_scenario(data, str(path))
+    scenario = read_yaml(path, Scenario, source=str(path))
+    if scenario.source:
+        raise ConfigError("unknown key `source`", where=str(path))
+    return _checked(msgspec.structs.replace(scenario, source=str(path)))
 
 
 def parse_scenario(data: Mapping[str, Any], source: str = "scenario") -> Scenario:
@@ -194,22 +184,18 @@ def parse_scenario(data: Mapping[str, Any], source: str = "scenario") -> Scenari
     Parameters
     ----------
     data : keys and values as in the file.
-    source : name of the file, for messages.
+    source : name of their origin, for messages.
 
     Raises
     ------
     ConfigError
         As `load_scenario`.
     """
-    if not isinstance(data, Mapping):
-        raise ConfigError(
-            "this is not a scenario",
-            where=source,
-            expected="keys such as `name`, `start`, `manoeuvres` and `imu`",
-        )
-    if "source" in data:
-        raise ConfigError("object contains unknown field `source`", where=source)
-    scenario = convert({**data, "source": source}, Scenario, "", source)
+    return _checked(convert({**data, "source": source}, Scenario, "", source))
+
+
+def _checked(scenario: Scenario) -> Scenario:
+    source = scenario.source
     scenario.plan()
     for name in ("imu", *scenario.aids):
         scenario.settings(name)
