@@ -153,6 +153,31 @@ class Solution:
         raise KeyError(f"{name} was not estimated; there are {[e.name for e in self.estimates]}")
 
 
+@dataclass(frozen=True)
+class Calibration:
+    """What a solver found of the sensors alone; the fields are those of `Solution`."""
+
+    trial: str
+    solver: str
+    body_axes: BodyAxes
+    converged: bool
+    iterations: int
+    cost: float
+    estimates: tuple[Estimate, ...]
+    covariance: Array
+    warnings: tuple[str, ...] = ()
+
+    @property
+    def order(self) -> tuple[str, ...]:
+        """Component names of the rows of `covariance`."""
+        return tuple(name for e in self.estimates for name in e.component_names)
+
+    @property
+    def values(self) -> dict[str, Array]:
+        """Values by name, in reported units."""
+        return {e.name: e.value for e in self.estimates}
+
+
 def doubts(estimates: Sequence[Estimate], residuals: Sequence[Residuals]) -> list[str]:
     """Return warnings where a solution contradicts what was stated before.
 

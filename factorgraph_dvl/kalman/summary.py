@@ -79,7 +79,7 @@ def summarise(
         cost=0.5 * float(np.sum((dvl.residual / dvl.sigma) ** 2)),
         estimates=tuple(estimates),
         covariance=covariance,
-        trajectory=_trajectory(trial, navigation, rate_hz),
+        trajectory=trajectory_of(trial, navigation, rate_hz),
         residuals=all_residuals,
         warnings=tuple(warnings),
     )
@@ -104,7 +104,8 @@ def _imu_biases(trial: Trial, navigation: Navigation) -> Estimated:
     return Estimated(parameters, values, P)
 
 
-def _trajectory(trial: Trial, navigation: Navigation, rate_hz: float) -> Trajectory:
+def trajectory_of(trial: Trial, navigation: Navigation, rate_hz: float) -> Trajectory:
+    """Return the smoothed motion at the multiples of 1 / rate that it covers."""
     first, last = navigation.track.time[0], navigation.track.time[-1]
     time = np.arange(np.ceil(first * rate_hz - 1e-6), np.floor(last * rate_hz + 1e-6) + 1)
     motion = motion_at(navigation, time / rate_hz)

@@ -131,6 +131,10 @@ class Dvl:
         """Pings with a velocity, (M,) bool."""
         return np.logical_not(self.missing)
 
+    def nominal(self) -> Self:
+        """Return this DVL as trial.yaml describes it, without the calibration it names."""
+        return self
+
     def sigma(self) -> Array:
         """Return the standard deviations of the velocity components, (M, 3), m/s.
 
