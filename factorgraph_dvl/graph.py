@@ -12,13 +12,21 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import gtsam
 import numpy as np
+from scipy.linalg import block_diag
 
 from factorgraph_dvl import keys
 from factorgraph_dvl.chain import Chain, loose_diagonal, square_root
-from factorgraph_dvl.conventions import Array, exp_so3, inverse_right_jacobian, log_so3
+from factorgraph_dvl.conventions import (
+    Array,
+    exp_so3,
+    inverse_right_jacobian,
+    log_so3,
+    right_jacobian,
+)
 from factorgraph_dvl.increments import IntArray
 from factorgraph_dvl.preintegration import (
     Attachment,
@@ -35,6 +43,8 @@ from factorgraph_dvl.sensors.protocol import Linearization, Motion, Observation,
 _HELD = 1e-7
 # The same for a held direction, in standard deviations of the prior.
 _HELD_DIRECTION = 1e-4
+# A calibration may know a combination of parameters this much better than each, squared.
+_LEAST_EIGENVALUE = 1e-12
 # How far a time offset may move from its start, s, before measurements are bound anew.
 _TIME_MARGIN = 0.05
 # How far, s, a motion is extrapolated before its measurements are bound anew: 2 Hz sway of
@@ -115,8 +125,7 @@ class Problem:
         self._key = {p.name: keys.calibration(i) for i, p in enumerate(self.parameters)}
         self._fixed = {p.name: _from_prior(p) for p in parameters if not p.estimated}
         self.graph = gtsam.NonlinearFactorGraph(chain.graph)
-        for p in self.parameters:
-            self._add_prior(p)
+        self._add_priors()
         self.uncovered: dict[str, int] = {}
         self._start = {**self.prior_values(), **(start or {})}
         self._bound: list[_Bound] = []
@@ -178,22 +187,24 @@ class Problem:
             for p, end in zip(self.parameters, ends, strict=True)
         }
 
-    @property
-    def prior_sigma(self) -> Array:
-        """Standard deviations of the priors of all estimated parameters, (P,), SI."""
-        return np.concatenate(
-            [np.empty(0), *(np.maximum(p.sigma, _HELD) for p in self.parameters)]
-        )
+    @cached_property
+    def prior_root(self) -> Array:
+        """Square root S of the prior covariance S Sᵀ of all estimated parameters, (P, P), SI.
+
+        In the tangent space at the prior's mean. Priors are stated for the rotation vector:
+        Exp(alpha + a) = Exp(alpha) Exp(Jr(alpha) a).
+        """
+        size = sum(p.mean.size for p in self.parameters)
+        out = np.zeros((size, size))
+        for group in self._prior_groups():
+            columns = np.concatenate([np.arange(size)[self.columns[p.name]] for p in group])
+            out[np.ix_(columns, columns)] = _prior_root(group)
+        return out
 
     def difference(self, parameters: dict[str, Array], origin: dict[str, Array]) -> Array:
         """Return parameters minus origin in the origin's tangent space, (P,), SI."""
         return np.concatenate(
-            [
-                log_so3(origin[p.name].T @ parameters[p.name])
-                if p.rotation
-                else parameters[p.name] - origin[p.name]
-                for p in self.parameters
-            ]
+            [_away(p, parameters[p.name], origin[p.name]) for p in self.parameters]
         )
 
     def moved(self, parameters: dict[str, Array], step: Array) -> dict[str, Array]:
@@ -210,24 +221,11 @@ class Problem:
 
         Parameters
         ----------
-        directions : (P, h) orthonormal, in units of the priors' standard deviations.
+        directions : (P, h) orthonormal, in the coordinates u of a step S u, S `prior_root`.
         origin : values of the parameters there.
         """
-        gain = directions.T / self.prior_sigma / _HELD_DIRECTION
-        columns = self.columns
-
-        def error(
-            this: gtsam.CustomFactor, at: gtsam.Values, jacobians: list[Array] | None
-        ) -> Array:
-            now = {p.name: self._parameter(at, p) for p in self.parameters}
-            if jacobians is not None:
-                for i, p in enumerate(self.parameters):
-                    jacobians[i] = np.asfortranarray(gain[:, columns[p.name]])
-            return gain @ self.difference(now, origin)
-
-        noise = gtsam.noiseModel.Unit.Create(directions.shape[1])
-        shared = [self._key[p.name] for p in self.parameters]
-        self.graph.add(gtsam.CustomFactor(noise, shared, error))
+        gain = directions.T @ np.linalg.inv(self.prior_root) / _HELD_DIRECTION
+        self._pull(self.parameters, np.asarray(gain, float), origin)
 
     def evaluate(self, values: gtsam.Values) -> Evaluation:
         """Evaluate motion, residuals and cost."""
@@ -308,6 +306,45 @@ class Problem:
         bias = np.broadcast_to(bias, (n, _BIAS))
         return States(nRb, p_n, v_n, gyro_bias=bias[:, 3:], accel_bias=bias[:, :3])
 
+    def _prior_groups(self) -> list[list[Parameter]]:
+        """Return the estimated parameters in groups with a common prior."""
+        groups: dict[int, list[Parameter]] = {}
+        for p in self.parameters:
+            groups.setdefault(id(p.joint or p), []).append(p)
+        return list(groups.values())
+
+    def _add_priors(self) -> None:
+        for group in self._prior_groups():
+            if group[0].joint is None:
+                self._add_prior(group[0])
+            else:
+                self._pull(group, np.asarray(np.linalg.inv(_prior_root(group)), float), self.prior_values())
+
+    def _pull(
+        self, parameters: Sequence[Parameter], gain: Array, origin: dict[str, Array]
+    ) -> None:
+        """Add a factor of unit noise on gain times the difference of parameters to an origin."""
+        keys_used = [self._key[p.name] for p in parameters]
+        ends = np.cumsum([p.mean.size for p in parameters])
+        columns = [
+            gain[:, end - p.mean.size : end] for p, end in zip(parameters, ends, strict=True)
+        ]
+
+        def error(
+            this: gtsam.CustomFactor, at: gtsam.Values, jacobians: list[Array] | None
+        ) -> Array:
+            total = np.zeros(gain.shape[0])
+            for i, (p, part) in enumerate(zip(parameters, columns, strict=True)):
+                away = _away(p, self._parameter(at, p), origin[p.name])
+                total += part @ away
+                if jacobians is not None:
+                    by_step = part @ inverse_right_jacobian(away) if p.rotation else part
+                    jacobians[i] = np.asfortranarray(by_step)
+            return total
+
+        noise = gtsam.noiseModel.Unit.Create(gain.shape[0])
+        self.graph.add(gtsam.CustomFactor(noise, keys_used, error))
+
     def _add_prior(self, p: Parameter) -> None:
         key = self._key[p.name]
         sigma = np.maximum(p.sigma, _HELD)
@@ -321,7 +358,7 @@ class Problem:
 
     def _bind(self, observation: Observation) -> _Bound:
         time = observation.true_time(self._start)
-        later = observation.true_time(self.moved(self._start, self.prior_sigma))
+        later = observation.true_time(self.moved(self._start, self._prior_sigma()))
         # A measurement whose time is yet to be found must not leave the record on the way.
         margin = 0.0 if np.array_equal(time, later) else _TIME_MARGIN
         locate = self.chain.segments.increments.locate
@@ -335,6 +372,10 @@ class Problem:
             if np.array_equal(other.time, time):
                 return _Bound(observation, other.attachment, time, weight)
         return _Bound(observation, self._attach(time), time, weight)
+
+    def _prior_sigma(self) -> Array:
+        """Return the standard deviations of the priors of all estimated parameters, (P,), SI."""
+        return np.concatenate([np.empty(0), *(p.sigma for p in self.parameters)])
 
     def strayed(self, parameters: dict[str, Array]) -> bool:
         """Whether a time offset has moved measurements too far from where they were bound."""
@@ -453,6 +494,32 @@ def _template(node_keys: list[int], sizes: list[int], rows: int) -> gtsam.Jacobi
     factor = gtsam.CustomFactor(noise, node_keys, nothing).linearize(gtsam.Values())
     assert isinstance(factor, gtsam.JacobianFactor)
     return factor
+
+
+def _away(p: Parameter, value: Array, origin: Array) -> Array:
+    """Return a parameter minus an origin, in the origin's tangent space, SI."""
+    return log_so3(origin.T @ value) if p.rotation else value - origin
+
+
+def _prior_root(group: Sequence[Parameter]) -> Array:
+    """Return a square root of the prior covariance of parameters in their tangent space, SI."""
+    sigma = np.maximum(np.concatenate([p.sigma for p in group]), _HELD)
+    root = np.diag(sigma)
+    joint = group[0].joint
+    if joint is not None:
+        rows = np.concatenate(
+            [np.arange(len(joint.covariance))[joint.rows(p.name)] for p in group]
+        )
+        std = np.sqrt(np.diag(joint.covariance))[rows]
+        scale = np.where(std > 0.0, std, 1.0)
+        correlation = joint.covariance[np.ix_(rows, rows)] / np.outer(scale, scale)
+        correlation[np.diag_indices_from(correlation)] = 1.0
+        values, vectors = np.linalg.eigh(0.5 * (correlation + correlation.T))
+        root = sigma[:, None] * vectors * np.sqrt(np.maximum(values, _LEAST_EIGENVALUE))
+    to_tangent = block_diag(
+        *(right_jacobian(p.mean) if p.rotation else np.eye(p.mean.size) for p in group)
+    )
+    return np.asarray(to_tangent @ root)
 
 
 def _from_prior(p: Parameter) -> Array:

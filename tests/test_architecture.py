@@ -25,6 +25,7 @@ LAYERS = (
     ("increments",),
     ("kalman",),
     ("preintegration",),
+    ("attitude",),
     ("keys",),
     ("chain",),
     ("alignment", "mounting"),

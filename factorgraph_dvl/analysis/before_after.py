@@ -91,24 +91,30 @@ def before_after(
     DataError
         As `dead_reckon`.
     """
-    nominal = mounting_of(trial)
-    calibrated = mounting_of(trial, values)
-    bare = replace(calibrated, lever_arm=np.zeros(3))
-    tracks = [dead_reckon(trial, m, orientation_at) for m in (calibrated, nominal, bare)]
     truth, scored_by = _truth(trial, orientation_at)
-    runs = []
-    for mounting, track in zip((calibrated, nominal, bare), tracks, strict=True):
-        found = None if truth is None else score(track, truth, along=tracks[0])
-        runs.append(Run(mounting, track, found))
-    if runs[0].score is None:
-        scored_by = "nothing"
-    nRb = rotation_from_rph(tracks[0].rph, trial.body_axes)
+    mounting = mounting_of(trial, values)
+    best = dead_reckon(trial, mounting, orientation_at)
+
+    def run(mounting: Mounting, track: Track) -> Run:
+        return Run(mounting, track, None if truth is None else score(track, truth, along=best))
+
+    nominal = mounting_of(trial)
+    bare = replace(mounting, lever_arm=np.zeros(3))
+    calibrated = run(mounting, best)
+    without = run(bare, dead_reckon(trial, bare, orientation_at))
+    nRb = rotation_from_rph(best.rph, trial.body_axes)
     effect = LeverArmEffect(
-        tracks[0].time,
-        difference(tracks[2], tracks[0].time, tracks[0].geodetic),
-        lever_arm_error(nRb, calibrated.lever_arm),
+        best.time,
+        difference(without.track, best.time, best.geodetic),
+        lever_arm_error(nRb, mounting.lever_arm),
     )
-    return BeforeAfter(*runs, effect, scored_by)
+    return BeforeAfter(
+        calibrated=calibrated,
+        uncalibrated=run(nominal, dead_reckon(trial, nominal, orientation_at)),
+        without_lever_arm=without,
+        lever_arm=effect,
+        scored_by="nothing" if calibrated.score is None else scored_by,
+    )
 
 
 def _truth(

@@ -221,11 +221,11 @@ def _filled(pings: Array) -> Array:
 
 def _integrated(time: Array, v_n: Array, start: Array) -> Array:
     """Return geodetic positions, (M, 3), from velocities (M, 3) and the first position."""
-    height = start[2] + cumulative_trapezoid(v_n[:, 2], time, initial=0.0)
+    height = start[2] + cumulative_trapezoid(v_n[:, 2], time, initial=0)
     lat = np.full(time.size, start[0])
     for _ in range(_ROUNDS):
         rate = v_n[:, 1] / (radii(lat)[0] + height)
-        lat = start[0] + cumulative_trapezoid(rate, time, initial=0.0)
+        lat = start[0] + cumulative_trapezoid(rate, time, initial=0)
     rate = v_n[:, 0] / ((radii(lat)[1] + height) * np.cos(lat))
-    lon = start[1] + cumulative_trapezoid(rate, time, initial=0.0)
+    lon = start[1] + cumulative_trapezoid(rate, time, initial=0)
     return np.stack([lat, lon, height], axis=1)

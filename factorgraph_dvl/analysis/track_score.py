@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from scipy.integrate import cumulative_trapezoid
@@ -107,8 +108,8 @@ class Score:
 def path_of(track: Track, time: Array) -> Path:
     """Return distance and course of a track at times (M,) within it."""
     speed = np.hypot(track.velocity[:, 0], track.velocity[:, 1])
-    distance = cumulative_trapezoid(speed, track.time, initial=0.0)
-    east, north = (cumulative_trapezoid(track.velocity[:, i], track.time, initial=0.0)
+    distance = cumulative_trapezoid(speed, track.time, initial=0)
+    east, north = (cumulative_trapezoid(track.velocity[:, i], track.time, initial=0)
                    for i in (0, 1))  # fmt: skip
 
     def shift(values: Array) -> Array:
@@ -180,7 +181,7 @@ def _stretches(path: Path, error: Array, length: float) -> Stretches:
     for a, b in _straight(path.course):
         stops = np.arange(path.distance[a], path.distance[b - 1] + 1e-9, length)
         at = a + np.searchsorted(path.distance[a:b], stops)
-        for i, j in zip(at[:-1], at[1:], strict=True):
+        for i, j in pairwise(at):
             grown = error[j] - error[i]
             course = float(np.mean(path.course[i : j + 1]))
             growth.append(float(np.hypot(grown[0], grown[1])))
@@ -192,15 +193,15 @@ def _stretches(path: Path, error: Array, length: float) -> Stretches:
         return Stretches(length, 0, nothing, nothing, nothing, nothing)
 
     def percent(value: float) -> float:
-        return 100.0 * float(value) / length
+        return 100.0 * value / length
 
     return Stretches(
         length=length,
         count=len(growth),
-        median=percent(np.median(growth)),
+        median=percent(float(np.median(growth))),
         largest=percent(max(growth)),
-        along=percent(np.mean(along)),
-        across=percent(np.mean(across)),
+        along=percent(float(np.mean(along))),
+        across=percent(float(np.mean(across))),
     )
 
 

@@ -31,6 +31,10 @@ _WHITE = (
     "the error of the SINS/GNSS velocity is taken for white noise; it is correlated in time, so "
     "the standard deviations of the DVL's parameters are too small"
 )
+_UNCORRELATED = (
+    "of the calibration in dvl.calibration values and standard deviations are the prior; these "
+    "methods take no correlations"
+)
 _NEGLECTED: dict[Method, tuple[str, ...]] = {
     "point-set": ("dvl_bias", "time_offset"),
     "nine-state": ("lever_arm", "time_offset"),
@@ -116,15 +120,18 @@ def calibrate(
         )
     report = progress or (lambda stage, iteration, cost: None)
     report("SINS/GNSS", 0, None)
-    navigation = navigate(trial, dvl.time[dvl.locked] - dvl.settings.time_offset_s)
+    prior = {p.stem: p for p in dvl.parameters()}
+    offset = float(prior["time_offset"].mean[0])
+    navigation = navigate(trial, dvl.time[dvl.locked] - offset)
     report(method, 0, None)
     points_at, unused = _point_sets(navigation, dvl)
     outcome = _calibrate(method, points_at, dvl)
     report("summary", 0, None)
-    points = points_at(dvl.settings.time_offset_s)
-    arm = np.array(dvl.settings.lever_arm_m)
+    points = points_at(offset)
+    arm = prior["lever_arm"].mean
     outcome = replace(outcome, estimated=without_feigned(points, outcome.estimated, arm))
-    notes = [*navigation.notes, *outcome.warnings, _WHITE, *_neglects(method, dvl)]
+    joint = [_UNCORRELATED] if dvl.prior is not None else []
+    notes = [*navigation.notes, *joint, *outcome.warnings, _WHITE, *_neglects(method, dvl)]
     if unused:
         notes.append(f"DVL: {unused} pings at times without SINS/GNSS were not used")
     solution = summarise(
@@ -141,8 +148,9 @@ def calibrate(
 
 def _point_sets(navigation: Navigation, dvl: Dvl) -> tuple[Callable[[float], Points], int]:
     """Return the point sets as a function of the time offset, and how many pings fall out."""
-    mean = dvl.settings.time_offset_s
-    reach = min(4.0 * dvl.settings.time_offset_std_s, _MARGIN)
+    prior = next(p for p in dvl.parameters() if p.stem == "time_offset")
+    mean = float(prior.mean[0])
+    reach = min(4.0 * float(prior.sigma[0]), _MARGIN)
     locked = np.flatnonzero(dvl.locked)
     covered = np.ones(locked.size, dtype=bool)
     for offset in {mean - reach, mean, mean + reach}:

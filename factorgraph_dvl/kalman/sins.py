@@ -19,7 +19,7 @@ from factorgraph_dvl.trial import Trial
 _GAP = 10.0
 _HELD_EVERY = 1.0
 _HELD_HEIGHT_STD = 100.0
-_ANYWHERE = 1e7
+_ANYWHERE = 1e6
 
 
 def sins(

@@ -128,10 +128,11 @@ def _dvl_residuals(
     trial: Trial, navigation: Navigation, outcome: Outcome, points: Points
 ) -> Residuals:
     assert trial.dvl is not None
-    settings = trial.dvl.settings
-    offset = float(outcome.estimated.value("time_offset", np.array([settings.time_offset_s]))[0])
-    if offset != settings.time_offset_s:
-        motion = motion_at(navigation, points.time + settings.time_offset_s - offset)
+    prior = {p.stem: p.mean for p in trial.dvl.parameters()}
+    before = float(prior["time_offset"][0])
+    offset = float(outcome.estimated.value("time_offset", prior["time_offset"])[0])
+    if offset != before:
+        motion = motion_at(navigation, points.time + before - offset)
         points = Points(
             motion.time,
             motion.v_b,
@@ -141,7 +142,7 @@ def _dvl_residuals(
             points.v_d,
             points.sigma_d,
         )
-    residual, sigma = residuals(points, outcome.estimated, np.array(settings.lever_arm_m))
+    residual, sigma = residuals(points, outcome.estimated, prior["lever_arm"])
     return Residuals("DVL velocity", "m/s", ("x", "y", "z"), points.time + offset, residual, sigma)
 
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from factorgraph_dvl.sensors.depth import Depth
 from factorgraph_dvl.sensors.dvl import Dvl
 from factorgraph_dvl.sensors.gnss import Gnss
 from factorgraph_dvl.sensors.protocol import Aid
 
-AIDS: tuple[type[Aid], ...] = (Gnss, Dvl)
+AIDS: tuple[type[Aid], ...] = (Gnss, Dvl, Depth)

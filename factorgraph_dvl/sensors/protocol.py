@@ -21,6 +21,10 @@ Sigma3 = tuple[NonNegative, NonNegative, NonNegative]
 Values = Mapping[str, Array]
 
 
+# Rounding may leave a correlation matrix with an eigenvalue this far below zero.
+_NEGATIVE = 1e-6
+
+
 class Section(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """A section of a YAML file, in the units that its names state."""
 
@@ -39,6 +43,62 @@ def _finite(value: Any) -> bool:
 
 
 @dataclass(frozen=True)
+class JointPrior:
+    """What an earlier calibration knows of several parameters together.
+
+    Parameters
+    ----------
+    source : name of the file, for messages.
+    values : (n,) by reported name, in reported units.
+    covariance : (N, N) of all their components, in the order of `values`, in reported units.
+
+    Raises
+    ------
+    DataError
+        If a number is not finite, or the covariance is not one.
+    """
+
+    source: str
+    values: Mapping[str, Array]
+    covariance: Array
+
+    def __post_init__(self) -> None:
+        for name, value in self.values.items():
+            if not np.isfinite(value).all():
+                raise DataError(f"{name} is not a number", where=self.source)
+        P = self.covariance
+        size = sum(value.size for value in self.values.values())
+        std = np.sqrt(np.maximum(np.diag(P), 0.0)) if P.ndim == 2 else np.zeros(0)
+        scale = np.where(std > 0.0, std, 1.0)
+        correct = P.shape == (size, size) and bool(np.isfinite(P).all())
+        if correct:
+            correlation = P / np.outer(scale, scale)
+            lowest = np.linalg.eigvalsh(0.5 * (correlation + correlation.T))[0] if size else 0.0
+            symmetric = np.allclose(correlation, correlation.T, atol=1e-6)
+            correct = symmetric and lowest > -_NEGATIVE and bool(np.all(np.diag(P) >= 0.0))
+        if not correct:
+            raise DataError(
+                "the covariance is not one",
+                where=self.source,
+                expected="a symmetric matrix of finite numbers, without negative eigenvalues",
+            )
+
+    def rows(self, name: str) -> slice:
+        """Return the place of a parameter's components in the covariance."""
+        at = 0
+        for other, value in self.values.items():
+            if other == name:
+                return slice(at, at + value.size)
+            at += value.size
+        raise KeyError(name)
+
+    def std(self, name: str) -> Array:
+        """Return the standard deviations of a parameter, in reported units."""
+        rows = self.rows(name)
+        return np.asarray(np.sqrt(np.diag(self.covariance)[rows]))
+
+
+@dataclass(frozen=True)
 class Parameter:
     """A constant of a sensor that the solver estimates, with its prior.
 
@@ -51,6 +111,7 @@ class Parameter:
     rotation : the value is a rotation, `mean` its rotation vector and `sigma` that of
         the components of the rotation vector.
     labels : component names; empty for a scalar.
+    joint : where mean and sigma come from a calibration of several parameters: all of it.
     """
 
     stem: str
@@ -60,6 +121,7 @@ class Parameter:
     sigma: Array
     rotation: bool = False
     labels: tuple[str, ...] = ("x", "y", "z")
+    joint: JointPrior | None = None
 
     @property
     def name(self) -> str:

@@ -7,6 +7,7 @@ from typing import Any, ClassVar, Literal
 
 import numpy as np
 
+from factorgraph_dvl.sensors.depth import DepthSettings
 from factorgraph_dvl.sensors.dvl import DvlSettings
 from factorgraph_dvl.sensors.gnss import GnssSettings
 from factorgraph_dvl.sensors.imu import ImuSettings
@@ -135,6 +136,21 @@ class DvlTruth(Instrument, frozen=True, kw_only=True):
         """Return noise and the kind of lock as simulated; the mounting is to be found."""
         names = ("velocity_std_m_s", "velocity_std_fraction", "reference")
         return {name: getattr(self, name) for name in names}
+
+
+class DepthTruth(Instrument, frozen=True, kw_only=True):
+    """The simulated depth sensor; the sea surface is at a height above the ellipsoid."""
+
+    section_type: ClassVar[type[SensorSection]] = DepthSettings
+
+    std_m: NonNegative = 0.0
+    lever_arm_m: Vector3 = (0.0, 0.0, 0.0)
+    sea_surface_height_m: float = 0.0
+
+    def claimed(self) -> dict[str, Any]:
+        """Return noise and lever arm as simulated; the height of the sea is to be found."""
+        out: dict[str, Any] = {"lever_arm_m": self.lever_arm_m}
+        return out | ({"std_m": self.std_m} if self.std_m > 0.0 else {})
 
 
 def check_intervals(name: str, intervals: Sequence[Interval]) -> None:

@@ -41,6 +41,14 @@ class Turn(Section, frozen=True, kw_only=True):
             raise ValueError("`ramp_s` must not exceed `duration_s`")
 
 
+class Climb(Section, frozen=True, kw_only=True):
+    """Change the height at a vertical speed that builds up over ramp_s, and down again."""
+
+    climb_m_s: float
+    to_height_m: float
+    ramp_s: Positive = 10.0
+
+
 class Repeat(Section, frozen=True, kw_only=True):
     """Run a list of manoeuvres several times."""
 
@@ -48,11 +56,12 @@ class Repeat(Section, frozen=True, kw_only=True):
     manoeuvres: list[dict[str, Any]]
 
 
-Manoeuvre = Accelerate | Straight | Turn
-_MANOEUVRES: dict[str, type[Accelerate | Straight | Turn | Repeat]] = {
+Manoeuvre = Accelerate | Straight | Turn | Climb
+_MANOEUVRES: dict[str, type[Manoeuvre | Repeat]] = {
     "accelerate_m_s2": Accelerate,
     "straight_s": Straight,
     "turn_deg_s": Turn,
+    "climb_m_s": Climb,
     "repeat": Repeat,
 }
 

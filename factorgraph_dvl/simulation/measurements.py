@@ -42,7 +42,7 @@ def simulate_imu(
     truth = scenario.imu
     jitter_rng, bias_rng, walk_rng, noise_rng = rng.spawn(4)
     # The interval of the first sample must not begin before the motion does.
-    bounds = _times(truth, motion.duration, jitter_rng, first=0)
+    bounds = sample_times(truth, motion.duration, jitter_rng, first=0)
     time, interval = bounds[1:], np.diff(bounds)
     if time.size == 0:
         raise ConfigError(
@@ -104,7 +104,7 @@ def simulate_gnss(
     truth = scenario.gnss
     assert truth is not None
     jitter_rng, position_rng, velocity_rng = rng.spawn(3)
-    time = _times(truth, motion.duration, jitter_rng)
+    time = sample_times(truth, motion.duration, jitter_rng)
     state = motion.at(time)
     nRb = rotation_from_rph(state.rph, scenario.body_axes)
     arm_n = _apply(nRb, np.array(truth.lever_arm_m))
@@ -141,7 +141,7 @@ def simulate_dvl(
     truth = scenario.dvl
     assert truth is not None
     jitter_rng, noise_rng = rng.spawn(2)
-    time = _times(truth, motion.duration, jitter_rng)
+    time = sample_times(truth, motion.duration, jitter_rng)
     state = motion.at(time)
     velocity = _dvl_velocity(scenario, state)
     if scenario.noise:
@@ -191,7 +191,7 @@ def _apply(matrices: Array, vectors: Array) -> Array:
     )
 
 
-def _times(
+def sample_times(
     sampled: Sampled, duration: float, rng: np.random.Generator, first: int | None = None
 ) -> Array:
     """Return times phase + k / rate after 0, or from k = `first` on, up to the end."""

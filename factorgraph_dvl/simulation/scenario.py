@@ -10,6 +10,7 @@ manoeuvres:                        # one after the other
   - {accelerate_m_s2: 1, to_m_s: 4}
   - {straight_s: 100}
   - {turn_deg_s: -2, duration_s: 45, ramp_s: 3}   # positive to starboard
+  - {climb_m_s: -0.5, to_height_m: -40, ramp_s: 10}   # sink, with heading and speed as they are
   - {repeat: 2, manoeuvres: [{straight_s: 10}, {turn_deg_s: 9, duration_s: 20}]}
 sway:                              # amplitude · sin(2 pi frequency · t + phase), summed
   roll: [{amplitude_deg: 4, frequency_hz: 2, phase_deg: 0}]
@@ -20,6 +21,7 @@ current_m_s: [0.1, 0.1, 0]         # east, north, up
 imu: {...}                         # ImuTruth: rate, errors
 gnss: {...}                        # GnssTruth, optional
 dvl: {...}                         # DvlTruth, optional
+depth: {...}                       # DepthTruth, optional
 trial:                             # what trial.yaml will claim
   imu: {gyro_bias_std_deg_h: 0.05, accel_bias_std_ug: 100}
   gnss: {}
@@ -53,7 +55,13 @@ from factorgraph_dvl.sensors.protocol import (
     Vector3,
 )
 from factorgraph_dvl.simulation.convert import convert
-from factorgraph_dvl.simulation.instruments import DvlTruth, GnssTruth, ImuTruth, Instrument
+from factorgraph_dvl.simulation.instruments import (
+    DepthTruth,
+    DvlTruth,
+    GnssTruth,
+    ImuTruth,
+    Instrument,
+)
 from factorgraph_dvl.simulation.manoeuvres import Manoeuvre, flatten
 from factorgraph_dvl.yaml_file import read_yaml
 
@@ -111,6 +119,7 @@ class Claims(Section, frozen=True, kw_only=True):
     imu: dict[str, Any] = msgspec.field(default_factory=dict)
     gnss: dict[str, Any] = msgspec.field(default_factory=dict)
     dvl: dict[str, Any] = msgspec.field(default_factory=dict)
+    depth: dict[str, Any] = msgspec.field(default_factory=dict)
     initial: InitialClaim | None = None
 
 
@@ -128,6 +137,7 @@ class Scenario(Section, frozen=True, kw_only=True):
     imu: ImuTruth
     gnss: GnssTruth | None = None
     dvl: DvlTruth | None = None
+    depth: DepthTruth | None = None
     trial: Claims = Claims()
     source: str = ""
 

@@ -83,7 +83,8 @@ def solve(
         if np.sqrt(np.mean((states.p_n - p_gravity) ** 2)) > _SAME_GRAVITY:
             chain, p_gravity = inertial_chain(trial, frame, seg, states), states.p_n
         if values is None:
-            if trial.gnss is not None:
+            # A DVL that is calibrated does no harm from the start.
+            if trial.gnss is not None and not _calibrated(trial):
                 coarse = _without_dvl(chain, states, report)
                 iterations += coarse.iterations
                 states = coarse.evaluation.states
@@ -128,6 +129,14 @@ def _without_dvl(chain: Chain, states: States, report: Progress) -> Minimum:
     )
 
 
+def _calibrated(trial: Trial) -> bool:
+    """Whether an earlier calibration knows all of the DVL's mounting that is to be estimated."""
+    if trial.dvl is None:
+        return False
+    free = [p for p in trial.dvl.parameters() if p.estimated]
+    return any(p.joint for p in free) and all(p.joint or not p.rotation for p in free)
+
+
 def _sensors(aids: Sequence[Aid], frame: LocalFrame) -> tuple[list[Observation], list[Parameter]]:
     observations = [o for aid in aids for o in aid.observations(frame)]
     parameters = [p for aid in aids for p in aid.parameters()]
@@ -137,7 +146,7 @@ def _sensors(aids: Sequence[Aid], frame: LocalFrame) -> tuple[list[Observation],
 def _mounting(
     trial: Trial, frame: LocalFrame, seg: Segments, gravity_n: np.ndarray, states: States
 ) -> dict[str, np.ndarray]:
-    if trial.dvl is None:
+    if trial.dvl is None or _calibrated(trial):
         return {}
 
     def motion_at_pings(pings: np.ndarray, time: np.ndarray) -> tuple[Motion, np.ndarray]:

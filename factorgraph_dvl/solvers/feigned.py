@@ -40,14 +40,15 @@ def feigned_directions(problem: Problem, minimum: Minimum, covariances: Posterio
 
     Returns
     -------
-    (P, h) orthonormal, in units of the priors' standard deviations; h may be 0.
+    (P, h) orthonormal, in the coordinates u of a step S u, S `Problem.prior_root`; h may be 0.
     """
     if not problem.parameters:
         return np.zeros((0, 0))
-    size = problem.prior_sigma.size
+    root = problem.prior_root
+    size = len(root)
     functionals = [{problem.key(p.name): np.eye(p.mean.size)} for p in problem.parameters]
-    scale = problem.prior_sigma
-    P = covariances.information.covariance_of(functionals) / np.outer(scale, scale)
+    whiten = np.linalg.inv(root)
+    P = whiten @ covariances.information.covariance_of(functionals) @ whiten.T
     data = np.linalg.inv(P) - np.eye(size)
     feigned = np.zeros((size, size))
     for observation, attachment, motion, weight in zip(
@@ -63,7 +64,7 @@ def feigned_directions(problem: Problem, minimum: Minimum, covariances: Posterio
                 problem, observation, attachment, motion, weight, minimum, covariances.nodes
             )
             feigned[np.ix_(columns, columns)] += part
-    feigned = feigned * np.outer(scale, scale)
+    feigned = root.T @ feigned @ root
     data = 0.5 * (data + data.T)
     share = eigh(feigned, _positive(data) + _LITTLE * np.eye(size), eigvals_only=True)
     if share.max() < _FEIGNED:
@@ -83,11 +84,11 @@ def at_prior_along(
 ) -> dict[str, Array]:
     """Return parameters with the prior's value along directions (P, h)."""
     prior = problem.prior_values()
-    scale = problem.prior_sigma
+    root = problem.prior_root
     for _ in range(10):
-        away = problem.difference(parameters, prior) / scale
+        away = np.linalg.solve(root, problem.difference(parameters, prior))
         step = -directions @ (directions.T @ away)
-        parameters = problem.moved(parameters, scale * step)
+        parameters = problem.moved(parameters, root @ step)
     return parameters
 
 
