@@ -318,7 +318,11 @@ class Problem:
             if group[0].joint is None:
                 self._add_prior(group[0])
             else:
-                self._pull(group, np.asarray(np.linalg.inv(_prior_root(group)), float), self.prior_values())
+                self._pull(
+                    group,
+                    np.asarray(np.linalg.inv(_prior_root(group)), float),
+                    self.prior_values(),
+                )
 
     def _pull(
         self, parameters: Sequence[Parameter], gain: Array, origin: dict[str, Array]

@@ -142,7 +142,9 @@ def test_sections_that_are_not_used_are_noted(tmp_path: Path) -> None:
     path = write_trial(tmp_path)
     with (path / "trial.yaml").open("a") as file:
         file.write("turntable: {file: turntable.csv}\n")
-    assert load_trial(path).notes == ("section `turntable` of trial.yaml is not used by this version",)
+    assert load_trial(path).notes == (
+        "section `turntable` of trial.yaml is not used by this version",
+    )
 
 
 BAD_SETTINGS = {

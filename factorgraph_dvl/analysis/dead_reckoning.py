@@ -21,6 +21,8 @@ OrientationAt = Callable[[Array], Orientation]
 
 # Intervals without a ping longer than this many usual ones are bridged, and counted.
 _GAP = 3.0
+# A velocity to bridge a gap with is the mean over as many seconds: a period of swell.
+_SWELL = 10.0
 # The latitude settles to the last digit: its rate depends on it by one part in 300 per radian.
 _ROUNDS = 4
 
@@ -98,7 +100,8 @@ def dead_reckon(trial: Trial, mounting: Mounting, orientation_at: OrientationAt)
         dL/dt = v_n / (M + h),  dlon/dt = v_e / ((N + h) cos L),  dh/dt = v_u
 
     by the trapezoidal rule over the pings. Where there is no lock, the velocity in body is
-    interpolated between the pings before and after, and turned by the attitude. The fix is
+    interpolated between what it was on average for some seconds before and after, and turned
+    by the attitude. The fix is
     of the antenna, the track of the IMU. Without GNSS it starts at `initial.position`.
 
     Parameters
@@ -132,15 +135,14 @@ def dead_reckon(trial: Trial, mounting: Mounting, orientation_at: OrientationAt)
     time = np.concatenate([[start_time], time])
     there = orientation_at(time)
     time, nRb = time[there.covered], there.nRb[there.covered]
-    v_n = rotate(nRb, np.stack([np.interp(time, pings, v_b[:, i]) for i in range(3)], axis=1))
-    step = np.diff(pings)
-    gaps = step[(step > _GAP * np.median(step)) & (pings[1:] > start_time)]
+    knots, velocity, gaps = _with_gaps(pings, v_b)
+    v_n = rotate(nRb, np.stack([np.interp(time, knots, v) for v in velocity.T], axis=1))
     return Track(
         time=time,
         geodetic=_integrated(time, v_n, start),
         velocity=v_n,
         rph=rph_from_rotation(nRb, trial.body_axes),
-        bridged=float(gaps.sum()),
+        bridged=float(np.diff(gaps[gaps[:, 0] > start_time], axis=1).sum()),
     )
 
 
@@ -205,6 +207,27 @@ def _start(
         where=trial.gnss.source if trial.gnss is not None else "trial.yaml",
         expected="a GNSS position while the DVL has a lock, or initial.position",
     )
+
+
+def _with_gaps(pings: Array, v_b: Array) -> tuple[Array, Array, Array]:
+    """Return knots to interpolate the velocity at, and the gaps, (G, 2), begin and end, s.
+
+    One ping is too noisy, and too much at the mercy of the swell, to bridge a gap with.
+    """
+    step = np.diff(pings)
+    before = np.flatnonzero(step > _GAP * np.median(step))
+    gaps = np.stack([pings[before], pings[before + 1]], axis=1)
+    inside = 1e-3 * step[before]
+    times, means = [pings], [v_b]
+    for (begin, end), inset in zip(gaps, inside, strict=True):
+        times.append(np.array([begin + inset, end - inset]))
+        means += [
+            v_b[(pings > begin - _SWELL) & (pings <= begin)].mean(axis=0, keepdims=True),
+            v_b[(pings >= end) & (pings < end + _SWELL)].mean(axis=0, keepdims=True),
+        ]
+    knots = np.concatenate(times)
+    order = np.argsort(knots)
+    return knots[order], np.concatenate(means)[order], gaps
 
 
 def _filled(pings: Array) -> Array:
