@@ -286,8 +286,8 @@ horizontal, in % of the whole distance: at the end, and the largest on the way; 
 error, no lever arm.
 
 The attitude decides as much as the calibration, so it is stated: of a SINS/GNSS filter and
-smoother that has GNSS all along; of the same with GNSS during the first {align:.0f} s only, which is
-all that a vessel has that is about to lose GNSS; and the true one.
+smoother that has GNSS all along; of the same with GNSS during the first {align:.0f} s only, which
+is all that a vessel has that is about to lose GNSS; and the true one.
 """
 
 
