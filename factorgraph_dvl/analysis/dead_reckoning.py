@@ -139,7 +139,7 @@ def dead_reckon(trial: Trial, mounting: Mounting, orientation_at: OrientationAt)
     v_n = rotate(nRb, np.stack([np.interp(time, knots, v) for v in velocity.T], axis=1))
     return Track(
         time=time,
-        geodetic=_integrated(time, v_n, start),
+        geodetic=integrated(time, v_n, start),
         velocity=v_n,
         rph=rph_from_rotation(nRb, trial.body_axes),
         bridged=float(np.diff(gaps[gaps[:, 0] > start_time], axis=1).sum()),
@@ -242,7 +242,7 @@ def _filled(pings: Array) -> Array:
     return np.append(begin + piece * np.repeat(step / pieces, pieces), pings[-1])
 
 
-def _integrated(time: Array, v_n: Array, start: Array) -> Array:
+def integrated(time: Array, v_n: Array, start: Array) -> Array:
     """Return geodetic positions, (M, 3), from velocities (M, 3) and the first position."""
     height = start[2] + cumulative_trapezoid(v_n[:, 2], time, initial=0)
     lat = np.full(time.size, start[0])
