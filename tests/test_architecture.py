@@ -46,6 +46,7 @@ FORBIDDEN = {
     "alignment": ("mounting", "graph", "keys"),
     "mounting": ("alignment", "graph", "keys", "preintegration"),
     "preintegration": ("keys",),
+    "attitude": ("io", "simulation"),
 }
 # What is held against the factor graph shares nothing with it: the cross-check and all
 # that would use it know only its solutions.
@@ -53,6 +54,7 @@ FORBIDDEN |= {
     name: (*FORBIDDEN.get(name, ()), "kalman")
     for name in (
         *("preintegration", "keys", "chain", "alignment", "mounting", "graph", "solvers"),
+        "attitude",
         *("analysis", "report"),
     )
 }

@@ -165,13 +165,8 @@ def test_attitude_is_known_only_where_source_and_imu_are():
 
 
 def test_sins_keeps_its_attitude_when_gnss_ends():
-    scn = config(
-        "cruise",
-        manoeuvres=[
-            *config("cruise").manoeuvres[1:2],
-            *config("cruise").manoeuvres[2]["manoeuvres"],
-        ],
-    )
+    circuit = config("cruise").manoeuvres[2]["manoeuvres"]
+    scn = config("cruise", start={"speed_m_s": 4}, manoeuvres=circuit[:6])
     trial = simulate(scn, 0)
     motion, bias, _ = sins(trial, align_s=200.0)
     assert isinstance(motion, Trajectory)

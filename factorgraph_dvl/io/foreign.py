@@ -43,6 +43,7 @@ _KNOWN: dict[str, tuple[str, str, tuple[tuple[str, ...], ...]]] = {
     "dvl_bias_m_s": ("dvl_bias", "m_s", (("x", "y", "z"),)),
     "time_offset_s": ("time_offset", "s", (("",),)),
     "current_m_s": ("current", "m_s", (("e", "n"),)),
+    "sea_surface_height_m": ("sea_surface_height", "m", (("",),)),
 }
 
 _Numbers = float | list[float | None]
@@ -74,6 +75,7 @@ class _Parameters(Section, frozen=True, kw_only=True):
     dvl_bias_m_s: _Given = UNSET
     time_offset_s: _Given = UNSET
     current_m_s: _Given = UNSET
+    sea_surface_height_m: _Given = UNSET
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -41,6 +41,8 @@ _NEGLECTED: dict[Method, tuple[str, ...]] = {
     "wahba": ("lever_arm", "dvl_bias", "time_offset"),
     "least-squares": (),
 }
+# GNSS that is missing for longer, s, leaves an INS to drift beyond what its filter models.
+_LONGEST_GAP = 300.0
 # Offsets that a search may try must stay within the IMU's record, s.
 _MARGIN = 1.0
 
@@ -131,7 +133,14 @@ def calibrate(
     arm = prior["lever_arm"].mean
     outcome = replace(outcome, estimated=without_feigned(points, outcome.estimated, arm))
     joint = [_UNCORRELATED] if dvl.prior is not None else []
-    notes = [*navigation.notes, *joint, *outcome.warnings, _WHITE, *_neglects(method, dvl)]
+    notes = [
+        *navigation.notes,
+        *_outage(trial),
+        *joint,
+        *outcome.warnings,
+        _WHITE,
+        *_neglects(method, dvl),
+    ]
     if unused:
         notes.append(f"DVL: {unused} pings at times without SINS/GNSS were not used")
     solution = summarise(
@@ -144,6 +153,20 @@ def calibrate(
         notes=notes,
     )
     return solution, _history(outcome)
+
+
+def _outage(trial: Trial) -> list[str]:
+    """Say that GNSS is missing for too long, if it is."""
+    assert trial.gnss is not None
+    fixes = trial.gnss.time[~np.isnan(trial.gnss.geodetic[:, 0])]
+    edges = np.concatenate([trial.imu.time[:1], fixes, trial.imu.time[-1:]])
+    longest = float(np.diff(edges).max())
+    if longest <= _LONGEST_GAP:
+        return []
+    return [
+        f"GNSS is missing for {longest:.0f} s: the SINS/GNSS filter drifts there, and neither its "
+        "motion nor the calibration is to be used; `solve` bridges it"
+    ]
 
 
 def _point_sets(navigation: Navigation, dvl: Dvl) -> tuple[Callable[[float], Points], int]:
