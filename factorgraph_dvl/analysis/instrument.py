@@ -16,6 +16,7 @@ from factorgraph_dvl.solution import Calibration, Solution
 # Intrinsic orders: ZYX is yaw, then pitch, then roll; the angles are given as roll, pitch, yaw.
 Order = Literal["ZYX", "XYZ"]
 ORDERS: tuple[Order, ...] = ("ZYX", "XYZ")
+NEEDED = ("misalignment_deg", "scale_error", "lever_arm_m")
 _STEP = 1e-6
 
 
@@ -70,7 +71,7 @@ def instrument_of(calibration: Calibration | Solution) -> Instrument:
         rows = slice(at, at + e.value.size)
         parts[e.name] = (e.value, calibration.covariance[rows, rows])
         at = rows.stop
-    for name in ("misalignment_deg", "scale_error", "lever_arm_m"):
+    for name in NEEDED:
         if name not in parts:
             raise DataError(f"the calibration has no {name}", expected="that of a DVL")
     alpha, covariance = parts["misalignment_deg"]

@@ -59,7 +59,7 @@ def record_of(label: str, time: Array, missing: Array) -> SensorSurvey:
         start=float(time[0]),
         end=float(time[-1]),
         gaps=int(gaps.size),
-        longest_gap=float(gaps.max(initial=0)),
+        longest_gap=float(gaps.max(initial=0.0)),
         missing=float(np.mean(missing)),
     )
 

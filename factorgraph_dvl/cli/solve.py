@@ -123,11 +123,11 @@ def _solve_into(
 
 def _write_instrument(solution: Solution, folder: Path) -> None:
     """Write the calibration as instruments take it, if there is one of a DVL."""
-    from factorgraph_dvl.analysis.instrument import instrument_of
+    from factorgraph_dvl.analysis.instrument import NEEDED, instrument_of
     from factorgraph_dvl.io.solution_folder import INSTRUMENT_FILE
     from factorgraph_dvl.report.instrument_text import instrument_text
 
-    if solution.converged and "misalignment_deg" in (e.name for e in solution.estimates):
+    if solution.converged and set(NEEDED) <= {e.name for e in solution.estimates}:
         text = instrument_text(instrument_of(solution), solution.trial)
         (folder / INSTRUMENT_FILE).write_text(text, encoding="utf-8")
 
