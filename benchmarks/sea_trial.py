@@ -303,7 +303,12 @@ def main() -> None:
         for seed in pool.map(one_seed, range(args.seeds)):
             seeds.append(seed)
             print(len(seeds), seed.transit[ATTITUDES[0]].after, flush=True)
-    images = args.out / "images"
+    print(write_study(seeds, args.out))
+
+
+def write_study(seeds: Sequence[Seed], out: Path) -> str:
+    """Write the page and its images; return its text."""
+    images = out / "images"
     images.mkdir(parents=True, exist_ok=True)
     trial = simulate(ROOT / "configs" / "transit.yaml", seed=1000)
     shown = before_after(trial, calibrate(0).values, by_sins(trial).at)
@@ -315,7 +320,7 @@ def main() -> None:
     save_figures(figures, images)
     draw(seeds, images / "sea-trial-dive.png")
     page = INTRODUCTION.format(
-        seeds=args.seeds,
+        seeds=len(seeds),
         minutes=np.ptp(track.time),
         km=track.path.total / 1e3,
         align=ALIGN_S,
@@ -343,8 +348,9 @@ def main() -> None:
         "",
         "![Error and claimed standard deviation over the dive](images/sea-trial-dive.png)",
     ]
-    (args.out / "sea-trial.md").write_text("\n".join(page) + "\n", encoding="utf-8")
-    print("\n".join(page))
+    text = "\n".join(page) + "\n"
+    (out / "sea-trial.md").write_text(text, encoding="utf-8")
+    return text
 
 
 if __name__ == "__main__":

@@ -10,7 +10,7 @@ slow and makes GTSAM's optimisers copy all values.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -290,8 +290,7 @@ class Problem:
         return self._key[name]
 
     def _parameter(self, values: gtsam.Values, p: Parameter) -> Array:
-        key = self._key[p.name]
-        return values.atRot3(key).matrix() if p.rotation else values.atVector(key)
+        return _value_at(values, self._key[p.name], p)
 
     def _states(self, values: gtsam.Values) -> States:
         n = self.chain.segments.node_time.size
@@ -328,26 +327,8 @@ class Problem:
         self, parameters: Sequence[Parameter], gain: Array, origin: dict[str, Array]
     ) -> None:
         """Add a factor of unit noise on gain times the difference of parameters to an origin."""
-        keys_used = [self._key[p.name] for p in parameters]
-        ends = np.cumsum([p.mean.size for p in parameters])
-        columns = [
-            gain[:, end - p.mean.size : end] for p, end in zip(parameters, ends, strict=True)
-        ]
-
-        def error(
-            this: gtsam.CustomFactor, at: gtsam.Values, jacobians: list[Array] | None
-        ) -> Array:
-            total = np.zeros(gain.shape[0])
-            for i, (p, part) in enumerate(zip(parameters, columns, strict=True)):
-                away = _away(p, self._parameter(at, p), origin[p.name])
-                total += part @ away
-                if jacobians is not None:
-                    by_step = part @ inverse_right_jacobian(away) if p.rotation else part
-                    jacobians[i] = np.asfortranarray(by_step)
-            return total
-
-        noise = gtsam.noiseModel.Unit.Create(gain.shape[0])
-        self.graph.add(gtsam.CustomFactor(noise, keys_used, error))
+        key_of = {p.name: self._key[p.name] for p in parameters}
+        self.graph.add(_pull_factor(parameters, key_of, gain, origin))
 
     def _add_prior(self, p: Parameter) -> None:
         key = self._key[p.name]
@@ -498,6 +479,38 @@ def _template(node_keys: list[int], sizes: list[int], rows: int) -> gtsam.Jacobi
     factor = gtsam.CustomFactor(noise, node_keys, nothing).linearize(gtsam.Values())
     assert isinstance(factor, gtsam.JacobianFactor)
     return factor
+
+
+def _pull_factor(
+    parameters: Sequence[Parameter],
+    key_of: Mapping[str, int],
+    gain: Array,
+    origin: Mapping[str, Array],
+) -> gtsam.CustomFactor:
+    """Return a factor of unit noise on gain times the difference of parameters to an origin.
+
+    The callback must not know the problem: GTSAM would keep it, and it GTSAM's graph, and
+    nothing would ever free the two.
+    """
+    ends = np.cumsum([p.mean.size for p in parameters])
+    columns = [gain[:, end - p.mean.size : end] for p, end in zip(parameters, ends, strict=True)]
+
+    def error(this: gtsam.CustomFactor, at: gtsam.Values, jacobians: list[Array] | None) -> Array:
+        total = np.zeros(gain.shape[0])
+        for i, (p, part) in enumerate(zip(parameters, columns, strict=True)):
+            away = _away(p, _value_at(at, key_of[p.name], p), origin[p.name])
+            total += part @ away
+            if jacobians is not None:
+                by_step = part @ inverse_right_jacobian(away) if p.rotation else part
+                jacobians[i] = np.asfortranarray(by_step)
+        return total
+
+    noise = gtsam.noiseModel.Unit.Create(gain.shape[0])
+    return gtsam.CustomFactor(noise, [key_of[p.name] for p in parameters], error)
+
+
+def _value_at(values: gtsam.Values, key: int, p: Parameter) -> Array:
+    return values.atRot3(key).matrix() if p.rotation else values.atVector(key)
 
 
 def _away(p: Parameter, value: Array, origin: Array) -> Array:

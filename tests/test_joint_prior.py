@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import gc
 import json
+import weakref
 from dataclasses import replace
 
 import gtsam
@@ -233,3 +235,15 @@ def replace_calibration(settings):
 def test_an_asymmetric_joint_prior_is_refused():
     with pytest.raises(DataError, match="the covariance is not one"):
         JointPrior("x", {"lever_arm_m": np.zeros(3)}, np.eye(2))
+
+
+def test_a_problem_with_a_joint_prior_is_freed():
+    # GTSAM would keep a callback that knows the problem, and with it all its arrays.
+    scene = scenario(manoeuvres=SHORT)
+    problem, values = problem_of(scene, with_prior(simulate(scene), calibration()))
+    problem.hold(np.eye(7)[:, :1], problem.prior_values())
+    problem.evaluate(values)
+    known = weakref.ref(problem)
+    del problem
+    gc.collect()
+    assert known() is None
