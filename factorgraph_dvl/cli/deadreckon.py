@@ -95,6 +95,8 @@ def deadreckon(
         )
     for note in (*trial.notes, *notes):
         warn(note)
+    if trial.dvl is not None and trial.dvl.settings.reference == "water":
+        warn("the DVL measures through the water: so does the track, and the current is its error")
     if result.calibrated.track.bridged > 0.0:
         warn(
             f"{result.calibrated.track.bridged:.1f} s without bottom lock were bridged by the "
