@@ -10,22 +10,18 @@ slow and makes GTSAM's optimisers copy all values.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 
 import gtsam
 import numpy as np
-from scipy.linalg import block_diag
 
 from factorgraph_dvl import keys
-from factorgraph_dvl.chain import Chain, loose_diagonal, square_root
+from factorgraph_dvl.chain import Chain
 from factorgraph_dvl.conventions import (
     Array,
     exp_so3,
-    inverse_right_jacobian,
-    log_so3,
-    right_jacobian,
 )
 from factorgraph_dvl.increments import IntArray
 from factorgraph_dvl.preintegration import (
@@ -36,15 +32,11 @@ from factorgraph_dvl.preintegration import (
     motion_at,
     slid,
 )
+from factorgraph_dvl.priors import add_priors, away, prior_mean, prior_root, pull, value_at
 from factorgraph_dvl.sensors.protocol import Linearization, Motion, Observation, Parameter
 
-# Standard deviation that stands for zero in a parameter of which only some components
-# are held; in SI units, far below what can be measured.
-_HELD = 1e-7
-# The same for a held direction, in standard deviations of the prior.
+# Standard deviation that stands for zero in a held direction, in those of the prior.
 _HELD_DIRECTION = 1e-4
-# A calibration may know a combination of parameters this much better than each, squared.
-_LEAST_EIGENVALUE = 1e-12
 # How far a time offset may move from its start, s, before measurements are bound anew.
 _TIME_MARGIN = 0.05
 # How far, s, a motion is extrapolated before its measurements are bound anew: 2 Hz sway of
@@ -123,9 +115,9 @@ class Problem:
         self.all_parameters = tuple(parameters)
         self.parameters = tuple(p for p in parameters if p.estimated)
         self._key = {p.name: keys.calibration(i) for i, p in enumerate(self.parameters)}
-        self._fixed = {p.name: _from_prior(p) for p in parameters if not p.estimated}
+        self._fixed = {p.name: prior_mean(p) for p in parameters if not p.estimated}
         self.graph = gtsam.NonlinearFactorGraph(chain.graph)
-        self._add_priors()
+        add_priors(self.graph, self.parameters, self._key)
         self.uncovered: dict[str, int] = {}
         self._start = {**self.prior_values(), **(start or {})}
         self._bound: list[_Bound] = []
@@ -157,7 +149,7 @@ class Problem:
 
     def prior_values(self) -> dict[str, Array]:
         """Return the prior means of all parameters, rotations as matrices."""
-        return {**self._fixed, **{p.name: _from_prior(p) for p in self.parameters}}
+        return {**self._fixed, **{p.name: prior_mean(p) for p in self.parameters}}
 
     def values(self, states: States, parameters: dict[str, Array]) -> gtsam.Values:
         """Return GTSAM's values of states and parameters."""
@@ -194,17 +186,12 @@ class Problem:
         In the tangent space at the prior's mean. Priors are stated for the rotation vector:
         Exp(alpha + a) = Exp(alpha) Exp(Jr(alpha) a).
         """
-        size = sum(p.mean.size for p in self.parameters)
-        out = np.zeros((size, size))
-        for group in self._prior_groups():
-            columns = np.concatenate([np.arange(size)[self.columns[p.name]] for p in group])
-            out[np.ix_(columns, columns)] = _prior_root(group)
-        return out
+        return prior_root(self.parameters)
 
     def difference(self, parameters: dict[str, Array], origin: dict[str, Array]) -> Array:
         """Return parameters minus origin in the origin's tangent space, (P,), SI."""
         return np.concatenate(
-            [_away(p, parameters[p.name], origin[p.name]) for p in self.parameters]
+            [away(p, parameters[p.name], origin[p.name]) for p in self.parameters]
         )
 
     def moved(self, parameters: dict[str, Array], step: Array) -> dict[str, Array]:
@@ -225,7 +212,7 @@ class Problem:
         origin : values of the parameters there.
         """
         gain = directions.T @ np.linalg.inv(self.prior_root) / _HELD_DIRECTION
-        self._pull(self.parameters, np.asarray(gain, float), origin)
+        self.graph.add(pull(self.parameters, self._key, np.asarray(gain, float), origin))
 
     def evaluate(self, values: gtsam.Values) -> Evaluation:
         """Evaluate motion, residuals and cost."""
@@ -290,7 +277,7 @@ class Problem:
         return self._key[name]
 
     def _parameter(self, values: gtsam.Values, p: Parameter) -> Array:
-        return _value_at(values, self._key[p.name], p)
+        return value_at(values, self._key[p.name], p)
 
     def _states(self, values: gtsam.Values) -> States:
         n = self.chain.segments.node_time.size
@@ -304,42 +291,6 @@ class Problem:
         bias = np.array([values.atConstantBias(keys.bias(k)).vector() for k in range(m)])
         bias = np.broadcast_to(bias, (n, _BIAS))
         return States(nRb, p_n, v_n, gyro_bias=bias[:, 3:], accel_bias=bias[:, :3])
-
-    def _prior_groups(self) -> list[list[Parameter]]:
-        """Return the estimated parameters in groups with a common prior."""
-        groups: dict[int, list[Parameter]] = {}
-        for p in self.parameters:
-            groups.setdefault(id(p.joint or p), []).append(p)
-        return list(groups.values())
-
-    def _add_priors(self) -> None:
-        for group in self._prior_groups():
-            if group[0].joint is None:
-                self._add_prior(group[0])
-            else:
-                self._pull(
-                    group,
-                    np.asarray(np.linalg.inv(_prior_root(group)), float),
-                    self.prior_values(),
-                )
-
-    def _pull(
-        self, parameters: Sequence[Parameter], gain: Array, origin: dict[str, Array]
-    ) -> None:
-        """Add a factor of unit noise on gain times the difference of parameters to an origin."""
-        key_of = {p.name: self._key[p.name] for p in parameters}
-        self.graph.add(_pull_factor(parameters, key_of, gain, origin))
-
-    def _add_prior(self, p: Parameter) -> None:
-        key = self._key[p.name]
-        sigma = np.maximum(p.sigma, _HELD)
-        if p.rotation:
-            # The prior is stated for the rotation vector, GTSAM's for its tangent space.
-            root = inverse_right_jacobian(p.mean) / sigma[:, None]
-            noise = square_root(root)
-            self.graph.addPriorRot3(key, gtsam.Rot3(exp_so3(p.mean)), noise)
-        else:
-            self.graph.addPriorVector(key, p.mean, loose_diagonal(sigma))
 
     def _bind(self, observation: Observation) -> _Bound:
         time = observation.true_time(self._start)
@@ -479,65 +430,3 @@ def _template(node_keys: list[int], sizes: list[int], rows: int) -> gtsam.Jacobi
     factor = gtsam.CustomFactor(noise, node_keys, nothing).linearize(gtsam.Values())
     assert isinstance(factor, gtsam.JacobianFactor)
     return factor
-
-
-def _pull_factor(
-    parameters: Sequence[Parameter],
-    key_of: Mapping[str, int],
-    gain: Array,
-    origin: Mapping[str, Array],
-) -> gtsam.CustomFactor:
-    """Return a factor of unit noise on gain times the difference of parameters to an origin.
-
-    The callback must not know the problem: GTSAM would keep it, and it GTSAM's graph, and
-    nothing would ever free the two.
-    """
-    ends = np.cumsum([p.mean.size for p in parameters])
-    columns = [gain[:, end - p.mean.size : end] for p, end in zip(parameters, ends, strict=True)]
-
-    def error(this: gtsam.CustomFactor, at: gtsam.Values, jacobians: list[Array] | None) -> Array:
-        total = np.zeros(gain.shape[0])
-        for i, (p, part) in enumerate(zip(parameters, columns, strict=True)):
-            away = _away(p, _value_at(at, key_of[p.name], p), origin[p.name])
-            total += part @ away
-            if jacobians is not None:
-                by_step = part @ inverse_right_jacobian(away) if p.rotation else part
-                jacobians[i] = np.asfortranarray(by_step)
-        return total
-
-    noise = gtsam.noiseModel.Unit.Create(gain.shape[0])
-    return gtsam.CustomFactor(noise, [key_of[p.name] for p in parameters], error)
-
-
-def _value_at(values: gtsam.Values, key: int, p: Parameter) -> Array:
-    return values.atRot3(key).matrix() if p.rotation else values.atVector(key)
-
-
-def _away(p: Parameter, value: Array, origin: Array) -> Array:
-    """Return a parameter minus an origin, in the origin's tangent space, SI."""
-    return log_so3(origin.T @ value) if p.rotation else value - origin
-
-
-def _prior_root(group: Sequence[Parameter]) -> Array:
-    """Return a square root of the prior covariance of parameters in their tangent space, SI."""
-    sigma = np.maximum(np.concatenate([p.sigma for p in group]), _HELD)
-    root = np.diag(sigma)
-    joint = group[0].joint
-    if joint is not None:
-        rows = np.concatenate(
-            [np.arange(len(joint.covariance))[joint.rows(p.name)] for p in group]
-        )
-        std = np.sqrt(np.diag(joint.covariance))[rows]
-        scale = np.where(std > 0.0, std, 1.0)
-        correlation = joint.covariance[np.ix_(rows, rows)] / np.outer(scale, scale)
-        correlation[np.diag_indices_from(correlation)] = 1.0
-        values, vectors = np.linalg.eigh(0.5 * (correlation + correlation.T))
-        root = sigma[:, None] * vectors * np.sqrt(np.maximum(values, _LEAST_EIGENVALUE))
-    to_tangent = block_diag(
-        *(right_jacobian(p.mean) if p.rotation else np.eye(p.mean.size) for p in group)
-    )
-    return np.asarray(to_tangent @ root)
-
-
-def _from_prior(p: Parameter) -> Array:
-    return exp_so3(p.mean) if p.rotation else p.mean

@@ -28,6 +28,7 @@ LAYERS = (
     ("attitude",),
     ("keys",),
     ("chain",),
+    ("priors",),
     ("alignment", "mounting"),
     ("graph",),
     ("solvers",),
@@ -54,14 +55,14 @@ FORBIDDEN |= {
     name: (*FORBIDDEN.get(name, ()), "kalman")
     for name in (
         *("preintegration", "keys", "chain", "alignment", "mounting", "graph", "solvers"),
-        "attitude",
+        *("attitude", "priors"),
         *("analysis", "report"),
     )
 }
 # Data classes of the sensors: no measurement equation is among them.
 SENSOR_DATA = ("Imu", "ImuSettings", "Gnss", "Dvl", "Parameter", "Motion")
 # The graph asks every sensor through the protocol and knows none by name.
-NAMELESS = ("graph", "chain", "preintegration", "keys", "solvers")
+NAMELESS = ("graph", "priors", "chain", "preintegration", "keys", "solvers")
 # Only where they are used: GTSAM, SciPy and Matplotlib take most of a second to load.
 LAZY_FOR_CLI = tuple(layer for line in LAYERS[1:-1] for layer in line)
 
