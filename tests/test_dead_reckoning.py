@@ -310,3 +310,17 @@ def test_frames_of_the_track_are_local(folder):
     track = dead_reckon(trial, mounting_of(trial, trial.calibration_truth), attitude_of(trial).at)
     frame = LocalFrame(*track.geodetic[0])
     assert np.abs(frame.position(*track.geodetic.T)[:, 2]).max() < 0.02
+
+
+def test_without_gnss_the_reference_gives_the_attitude_and_initial_the_start(run, tmp_path):  # noqa: F811
+    initial = {"attitude_std_deg": [1, 1, 1], "position_std_m": [5, 5, 5]}
+    trial = simulate(scenario(gnss=None, trial={"initial": initial}), 0)
+    save_trial(trial, tmp_path / "trial")
+    result = run(
+        "deadreckon", tmp_path / "trial", "--calibration", tmp_path / "trial" / "truth.json",
+        "--out", tmp_path / "out", "--no-figures",
+    )  # fmt: skip
+    assert result.code == 0, result.err
+    data = json.loads((tmp_path / "out" / "deadreckon.json").read_text())
+    assert data["attitude"] == "reference"
+    assert data["global_error_m"] < 0.05

@@ -102,7 +102,7 @@ def dead_reckon(trial: Trial, mounting: Mounting, orientation_at: OrientationAt)
     by the trapezoidal rule over the pings. Where there is no lock, the velocity in body is
     interpolated between what it was on average for some seconds before and after, and turned
     by the attitude. The fix is
-    of the antenna, the track of the IMU. Without GNSS it starts at `initial.position`.
+    of the antenna, the track of the IMU. Without GNSS it starts at `initial.position`, with the velocity of the first ping.
 
     Parameters
     ----------
@@ -201,7 +201,7 @@ def _start(
         if inside.size:
             return float(known.time[inside[0]]), known.geodetic[inside[0]]
     if trial.initial_position is not None:
-        return first, trial.initial_position.geodetic
+        return float(trial.imu.time[0]), trial.initial_position.geodetic
     raise DataError(
         "no position to start from",
         where=trial.gnss.source if trial.gnss is not None else "trial.yaml",

@@ -32,11 +32,13 @@ def deadreckon(
     ],
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder to write.")],
     attitude: Annotated[
-        str,
+        str | None,
         typer.Option(
-            metavar="SOURCE", help="sins, reference, or a solution folder: whose attitude."
+            metavar="SOURCE",
+            help="Whose: sins, reference, or a solution folder. By default sins, and without "
+            "GNSS reference.",
         ),
-    ] = "sins",
+    ] = None,
     align: Annotated[
         float | None,
         typer.Option(metavar="S", min=1.0, help="With sins: seconds of GNSS it may use."),
@@ -66,6 +68,7 @@ def deadreckon(
         trial = load_trial(trial_path)
         values = read_calibration_values(calibration, trial.body_axes)
         progress("attitude")
+        attitude = attitude or _default_attitude(trial)
         source, notes = _attitude(trial, attitude, align)
         progress("dead reckoning")
         result = before_after(trial, values, source.at)
@@ -103,6 +106,10 @@ def deadreckon(
             "velocity in body before and after"
         )
     print_written(out)
+
+
+def _default_attitude(trial: Trial) -> str:
+    return "reference" if trial.gnss is None and trial.reference is not None else "sins"
 
 
 def _attitude(trial: Trial, source: str, align: float | None) -> tuple[Attitude, tuple[str, ...]]:
