@@ -101,8 +101,8 @@ def dead_reckon(trial: Trial, mounting: Mounting, orientation_at: OrientationAt)
 
     by the trapezoidal rule over the pings. Where there is no lock, the velocity in body is
     interpolated between what it was on average for some seconds before and after, and turned
-    by the attitude. The fix is
-    of the antenna, the track of the IMU. Without GNSS it starts at `initial.position`, with the velocity of the first ping.
+    by the attitude. The fix is of the antenna, the track of the IMU. Without GNSS it starts
+    at `initial.position`, with the velocity of the first ping.
 
     Parameters
     ----------
