@@ -19,7 +19,7 @@ LAYERS = (
     ("conventions", "errors"),
     ("earth", "yaml_file"),
     ("sensors",),
-    ("trial", "solution"),
+    ("trial", "solution", "information"),
     ("io", "simulation"),
     ("clock", "polynomials", "signals"),
     ("increments",),

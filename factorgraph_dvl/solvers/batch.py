@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from factorgraph_dvl.alignment import initial_states
 from factorgraph_dvl.chain import Chain, inertial_chain
+from factorgraph_dvl.conventions import Array
 from factorgraph_dvl.earth import LocalFrame
 from factorgraph_dvl.errors import ConfigError
 from factorgraph_dvl.graph import Problem
@@ -17,7 +18,7 @@ from factorgraph_dvl.mounting import initial_mounting
 from factorgraph_dvl.preintegration import Segments, States, attach, motion_at, segments
 from factorgraph_dvl.sensors.protocol import Aid, Motion, Observation, Parameter
 from factorgraph_dvl.solution import Solution
-from factorgraph_dvl.solvers.covariance import posterior
+from factorgraph_dvl.solvers.covariance import Posterior, posterior
 from factorgraph_dvl.solvers.feigned import at_prior_along, feigned_directions
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, Progress, minimise
 from factorgraph_dvl.solvers.summary import summarise
@@ -33,6 +34,25 @@ _SAME_GRAVITY = 2.0
 _ROUGH = 1.0
 _ROUGH_ITERATIONS = 10
 _ROUNDS = 4
+
+
+@dataclass(frozen=True)
+class Minimised:
+    """A trial at its minimum, before it is summarised.
+
+    Parameters
+    ----------
+    problem, minimum, covariances : what was minimised, and where it ended.
+    held : (P, h) directions that are not observable, in units of the priors' standard
+        deviations.
+    notes : what is worth telling.
+    """
+
+    problem: Problem
+    minimum: Minimum
+    covariances: Posterior
+    held: Array
+    notes: tuple[str, ...]
 
 
 def solve(
@@ -64,9 +84,31 @@ def solve(
     SolveError
         If no minimum can be searched for at all.
     """
-    for name, value in (("rate_hz", rate_hz), ("state_interval_s", state_interval_s)):
-        if not (np.isfinite(value) and value > 0.0):
-            raise ConfigError(f"{name} is {value}", expected="a number above 0")
+    _check_above_zero("rate_hz", rate_hz)
+    found = minimised(trial, state_interval_s=state_interval_s, progress=progress)
+    return solution_of(found, rate_hz)
+
+
+def solution_of(found: Minimised, rate_hz: float) -> Solution:
+    """Return the solution at a minimum, with a trajectory of so many Hz."""
+    return summarise(
+        found.problem,
+        found.minimum,
+        found.covariances,
+        held=found.held,
+        rate_hz=rate_hz,
+        notes=found.notes,
+    )
+
+
+def minimised(
+    trial: Trial,
+    *,
+    state_interval_s: float = STATE_INTERVAL,
+    progress: Progress | None = None,
+) -> Minimised:
+    """Minimise the problem of a trial; arguments and errors as of `solve`."""
+    _check_above_zero("state_interval_s", state_interval_s)
     report = progress or (lambda stage, iteration, cost: None)
     frame = trial.frame()
     report("increments", 0, None)
@@ -110,7 +152,13 @@ def solve(
         iterations += minimum.iterations
         covariances = posterior(problem, minimum)
     minimum = replace(minimum, iterations=iterations)
-    return summarise(problem, minimum, covariances, held=held, rate_hz=rate_hz, notes=notes)
+    return Minimised(problem, minimum, covariances, held, tuple(notes))
+
+
+def _check_above_zero(name: str, value: float) -> None:
+    """Raise ConfigError unless a number is finite and above 0."""
+    if not (np.isfinite(value) and value > 0.0):
+        raise ConfigError(f"{name} is {value}", expected="a number above 0")
 
 
 def _without_dvl(chain: Chain, states: States, report: Progress) -> Minimum:
