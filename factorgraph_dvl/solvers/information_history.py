@@ -24,13 +24,17 @@ from factorgraph_dvl import keys
 from factorgraph_dvl.conventions import Array
 from factorgraph_dvl.graph import HELD_DIRECTION, Evaluation, Problem
 from factorgraph_dvl.information import InformationHistory
+from factorgraph_dvl.solution import Solution
+from factorgraph_dvl.solvers.batch import minimised, solution_of
 from factorgraph_dvl.solvers.feigned import (
     FEIGNED,
     directions_not_told,
     feigned_information,
     largest_feigned_share,
 )
+from factorgraph_dvl.solvers.levenberg_marquardt import Progress
 from factorgraph_dvl.solvers.summary import prior_along, reported
+from factorgraph_dvl.trial import Trial
 
 _STATE = 9
 _BIAS = 6
@@ -61,6 +65,26 @@ class _Layout:
             return 2 * self.own + self.constants[key]
         index, offset = node[key]
         return (index - k) * self.own + offset
+
+
+# Of the trajectory, Hz: angular rates are taken from its attitudes, under sway of some hertz.
+_RATE_HZ = 20.0
+
+
+def solve_with_history(
+    trial: Trial, *, progress: Progress | None = None
+) -> tuple[Solution, InformationHistory]:
+    """Solve a trial, and follow the information on its constants along it.
+
+    Parameters and errors as of `solvers.batch.solve`.
+    """
+    found = minimised(trial, progress=progress)
+    if progress:
+        progress("information along the trial", 0, None)
+    history = information_history(
+        found.problem, found.minimum.evaluation, found.held, found.covariances.nodes
+    )
+    return solution_of(found, _RATE_HZ), history
 
 
 def information_history(
