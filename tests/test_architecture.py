@@ -31,6 +31,7 @@ LAYERS = (
     ("graph",),
     ("solvers",),
     ("analysis",),
+    ("planning",),
     ("report",),
     ("cli",),
 )
@@ -41,10 +42,12 @@ FORBIDDEN = {
     "kalman": ("io", "simulation"),
     "solvers": ("io", "simulation", "analysis", "report"),
     "analysis": ("solvers", "graph", "keys", "preintegration", "increments", "simulation", "io"),
+    "planning": ("kalman", "io"),
     "report": ("solvers", "graph", "keys", "preintegration", "simulation", "io"),
     "alignment": ("mounting", "graph", "keys"),
     "mounting": ("alignment", "graph", "keys", "preintegration"),
     "preintegration": ("keys",),
+    "information": ("sensors", "earth"),
 }
 # What is held against the factor graph shares nothing with it: the cross-check and all
 # that would use it know only its solutions.

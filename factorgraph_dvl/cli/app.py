@@ -14,6 +14,7 @@ from factorgraph_dvl.cli.console import stderr
 from factorgraph_dvl.cli.crosscheck import crosscheck
 from factorgraph_dvl.cli.inspect import inspect
 from factorgraph_dvl.cli.observability import observability
+from factorgraph_dvl.cli.plan import plan
 from factorgraph_dvl.cli.simulate import simulate
 from factorgraph_dvl.cli.solve import kalman, solve
 from factorgraph_dvl.errors import FactorgraphDvlError
@@ -29,7 +30,7 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
-for _command in (simulate, solve, kalman, inspect, crosscheck, observability):
+for _command in (simulate, solve, kalman, inspect, crosscheck, observability, plan):
     app.command()(_command)
 
 

@@ -39,8 +39,7 @@ def observability(
     """Show what the data can tell, what they cannot, and which motion told it."""
     from factorgraph_dvl.io.folders import check_output, new_folder
     from factorgraph_dvl.io.segments_file import read_segments
-    from factorgraph_dvl.io.tables import write_table
-    from factorgraph_dvl.report.observability_files import OWNED, history_columns, to_csv, to_json
+    from factorgraph_dvl.report.observability_files import OWNED
 
     check_output(out, force=force)
     given = () if segments is None else read_segments(segments)
@@ -48,12 +47,7 @@ def observability(
         view, converged = _view(source, given, progress)
         progress("write", 0, None)
         with new_folder(out, force=force, owned=OWNED) as folder:
-            (folder / "observability.csv").write_text(to_csv(view), encoding="utf-8")
-            if view.history is not None:
-                write_table(folder / "history.csv", history_columns(view.history))
-            if not no_figures:
-                _draw(view, folder)
-            (folder / "observability.json").write_bytes(to_json(view, str(source)))
+            write_observability(view, folder, str(source), figures=not no_figures)
     print_observability(view)
     print_written(out)
     if not converged:
@@ -78,6 +72,19 @@ def _view(
 
     solution, history = solve_with_history(trial, progress=progress)
     return look(solution, trial=trial, history=history, given=given), solution.converged
+
+
+def write_observability(view: Observability, folder: Path, source: str, *, figures: bool) -> None:
+    """Write a view's JSON, tables and figures into a folder."""
+    from factorgraph_dvl.io.tables import write_table
+    from factorgraph_dvl.report.observability_files import history_columns, to_csv, to_json
+
+    (folder / "observability.csv").write_text(to_csv(view), encoding="utf-8")
+    if view.history is not None:
+        write_table(folder / "history.csv", history_columns(view.history))
+    if figures:
+        _draw(view, folder)
+    (folder / "observability.json").write_bytes(to_json(view, source))
 
 
 def _draw(view: Observability, folder: Path) -> None:

@@ -16,8 +16,8 @@ from typing import Annotated
 import msgspec
 
 from factorgraph_dvl.errors import ConfigError
-from factorgraph_dvl.io.yaml_file import read_yaml
 from factorgraph_dvl.sensors.protocol import Section
+from factorgraph_dvl.yaml_file import read_yaml
 
 
 class SegmentSettings(Section, frozen=True, kw_only=True):

@@ -88,7 +88,9 @@ def singular_value_figure(point_set: PointSet) -> Figure:
     grid = new_grid(figure, 2, 1, bottom=0.95, top=0.7, gap=(0.42, 0.0))
     kinds = list(dict.fromkeys(_kind(state) for state in point_set.states))
     colours = dict(zip(kinds, (ACCENT, "#d07b3c", DARK, GREY), strict=False))
-    highest = max(float(s.values.max()) for s in point_set.cumulative)
+    stacks_of_all = (*point_set.segments, *point_set.cumulative)
+    highest = max(float(s.values.max()) for s in stacks_of_all)
+    lowest = min(float(s.values.min()) for s in stacks_of_all)
     for i, (stacks, title) in enumerate(
         (
             (point_set.segments, "Singular values of each segment"),
@@ -99,7 +101,7 @@ def singular_value_figure(point_set: PointSet) -> Figure:
         for x, stack in enumerate(stacks):
             _draw_stack(ax, x, stack, colours, named=count <= _MOST_NAMED)
         ax.set_yscale("log")
-        ax.set_ylim(0.5 * _FLOOR, 4.0 * max(highest, 10.0))
+        ax.set_ylim(0.5 * max(_FLOOR, min(lowest, 1.0)), 4.0 * max(highest, 10.0))
         ax.axhline(OBSERVABLE, color=GREY, lw=0.9)
         ax.set_xlim(-0.4, count - 0.25 if count <= _MOST_NAMED else count - 0.6)
         style(ax, "", "singular value")
@@ -164,8 +166,8 @@ def history_figure(history: InformationHistory, segments: Sequence[Segment]) -> 
         groups.setdefault(_stem(name), []).append(i)
     rows = -(-len(groups) // 2)
     columns = min(len(groups), 2)
-    figure = new_figure(11.5, 1.25 + 1.95 * rows)
-    grid = new_grid(figure, rows, columns, bottom=0.5, top=0.72, gap=(0.36, 0.95), left=0.85)
+    figure = new_figure(11.5, 1.25 + 2.05 * rows)
+    grid = new_grid(figure, rows, columns, bottom=0.5, top=0.78, gap=(0.5, 0.75), left=0.65)
     start, label = clock(history.time)
     std = history.std
     for k, (stem, members) in enumerate(groups.items()):
@@ -187,6 +189,7 @@ def history_figure(history: InformationHistory, segments: Sequence[Segment]) -> 
         style(ax, label if last_row else "", "")
         ax.set_axisbelow(False)
         ax.grid(color=GREY, lw=0.4, alpha=0.35)
+        ax.tick_params(which="minor", labelsize=SMALL)
         ax.margins(x=0.0)
         ax.set_title(f"{stem}, {unit}" if unit else stem, fontsize=NORMAL, loc="left")
         ax.legend(fontsize=SMALL, frameon=False, ncols=len(members), loc="upper right")
@@ -217,7 +220,7 @@ def direction_figure(marginals: Marginals) -> Figure:
     """Draw what is left of the prior's σ in every direction, the weakest first."""
     directions = marginals.directions
     figure = new_figure(11.0, 1.15 + 0.3 * len(directions))
-    grid = new_grid(figure, 1, 1, left=4.9, right=0.75, top=0.42, bottom=0.5)
+    grid = new_grid(figure, 1, 1, left=4.3, right=0.5, top=0.42, bottom=0.5)
     ax = figure.add_subplot(grid[0, 0])
     ratio = np.array([d.ratio for d in directions])
     y = np.arange(len(directions))
@@ -241,11 +244,11 @@ def direction_figure(marginals: Marginals) -> Figure:
 def _combination(names: Sequence[str], vector: Array, order: Sequence[str]) -> str:
     """Write a direction as a sum, in units of the priors' σ."""
     parts: list[str] = []
-    for name in names[:4]:
+    for name in names[:3]:
         weight = float(vector[order.index(name)])
         sign = "−" if weight < 0.0 else "+" if parts else ""
         parts.append(f"{sign} {abs(weight):.2f} {readable(name)[0]}".strip())
-    return " ".join(parts) + (" …" if len(names) > 4 else "")
+    return " ".join(parts) + (" …" if len(names) > 3 else "")
 
 
 def share_figure(shares: Shares, segments: Sequence[Segment]) -> Figure:

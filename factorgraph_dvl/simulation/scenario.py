@@ -10,6 +10,8 @@ manoeuvres:                        # one after the other
   - {accelerate_m_s2: 1, to_m_s: 4}
   - {straight_s: 100}
   - {turn_deg_s: -2, duration_s: 45, ramp_s: 3}   # positive to starboard
+  - {figure_eight_deg_s: 6}        # a full circle to starboard, then one to port
+  - {stop_s: 30, acceleration_m_s2: 0.2}          # to rest, stay, and back to the speed before
   - {repeat: 2, manoeuvres: [{straight_s: 10}, {turn_deg_s: 9, duration_s: 20}]}
 sway:                              # amplitude · sin(2 pi frequency · t + phase), summed
   roll: [{amplitude_deg: 4, frequency_hz: 2, phase_deg: 0}]
@@ -38,7 +40,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from os import PathLike
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeVar
 
 import msgspec
 
@@ -162,6 +164,9 @@ class Scenario(Section, frozen=True, kw_only=True):
         )
 
 
+_S = TypeVar("_S", bound=Scenario)
+
+
 def load_scenario(path: str | PathLike[str]) -> Scenario:
     """Read a scenario from its YAML file.
 
@@ -171,8 +176,13 @@ def load_scenario(path: str | PathLike[str]) -> Scenario:
         If the file is missing, is not YAML, or holds an unknown key, a wrong type or a
         value out of range; the message names file, line and key.
     """
+    return read_scenario(path, Scenario)
+
+
+def read_scenario(path: str | PathLike[str], kind: type[_S]) -> _S:
+    """Read a scenario, or what has more keys than one; otherwise as `load_scenario`."""
     path = Path(path)
-    scenario = read_yaml(path, Scenario, source=str(path))
+    scenario = read_yaml(path, kind, source=str(path))
     if scenario.source:
         raise ConfigError("unknown key `source`", where=str(path))
     return _checked(msgspec.structs.replace(scenario, source=str(path)))
@@ -194,7 +204,7 @@ def parse_scenario(data: Mapping[str, Any], source: str = "scenario") -> Scenari
     return _checked(convert({**data, "source": source}, Scenario, "", source))
 
 
-def _checked(scenario: Scenario) -> Scenario:
+def _checked(scenario: _S) -> _S:
     source = scenario.source
     scenario.plan()
     for name in ("imu", *scenario.aids):

@@ -30,12 +30,16 @@ _LITTLE = 0.1
 _GENUINE = 0.5
 
 
-def feigned_directions(problem: Problem, minimum: Minimum, covariances: Posterior) -> Array:
+def feigned_directions(
+    problem: Problem, minimum: Minimum, covariances: Posterior, *, at_truth: bool = False
+) -> Array:
     """Return directions that are not observable, if the information on any is feigned.
 
     Parameters
     ----------
     problem, minimum, covariances : at the minimum.
+    at_truth : the motion there is the true one, and feigns nothing: return what will be
+        found once it is estimated.
 
     Returns
     -------
@@ -48,7 +52,8 @@ def feigned_directions(problem: Problem, minimum: Minimum, covariances: Posterio
     P = covariances.information.covariance_of(functionals) / np.outer(scale, scale)
     data = np.linalg.inv(P) - np.eye(scale.size)
     feigned = feigned_information(problem, minimum.evaluation, covariances.nodes)
-    return directions_not_told(data, feigned.sum(axis=0))
+    total = feigned.sum(axis=0)
+    return directions_not_told(data + total if at_truth else data, total)
 
 
 def feigned_information(problem: Problem, evaluation: Evaluation, nodes: Array) -> Array:

@@ -68,7 +68,7 @@ class _Layout:
 
 
 # Of the trajectory, Hz: angular rates are taken from its attitudes, under sway of some hertz.
-_RATE_HZ = 20.0
+RATE_HZ = 20.0
 
 
 def solve_with_history(
@@ -84,7 +84,7 @@ def solve_with_history(
     history = information_history(
         found.problem, found.minimum.evaluation, found.held, found.covariances.nodes
     )
-    return solution_of(found, _RATE_HZ), history
+    return solution_of(found, RATE_HZ), history
 
 
 def information_history(
