@@ -43,8 +43,9 @@ _NAMED = 0.4
 # Singular values this small, relative to the largest, are as good as zero, and their
 # directions are only defined together.
 _NOTHING = 1e-9
-# Central differences of sixth order.
-_STENCIL = ((1, 45.0 / 60.0), (2, -9.0 / 60.0), (3, 1.0 / 60.0))
+# Differences of sixth order of what is zero in the middle: centred, and to one side.
+_CENTRED = np.array([45.0, -9.0, 1.0]) / 60.0
+_ONE_SIDED = np.array([360.0, -450.0, 400.0, -225.0, 72.0, -10.0]) / 60.0
 _GAP = 1.5
 
 
@@ -133,8 +134,8 @@ def dominant(direction: Array, names: Sequence[str]) -> tuple[str, ...]:
 def body_motion(motion: Trajectory | Reference, body_axes: BodyAxes) -> BodyMotion:
     """Return velocity and angular rate in body of a trajectory.
 
-    The rate is the derivative of Log(R(t)ᵀ R(t + s)) with respect to s at zero, by central
-    differences of sixth order; at the ends of a piece without gaps, by the next epoch.
+    The rate is the derivative of Log(R(t)ᵀ R(t + s)) with respect to s at zero, by
+    differences of sixth order.
 
     Parameters
     ----------
@@ -155,20 +156,26 @@ def body_motion(motion: Trajectory | Reference, body_axes: BodyAxes) -> BodyMoti
 
 def _rates(nRb: Array, time: Array) -> Array:
     n = time.size
-    omega = np.zeros((n, 3))
-    if n < 2:
+    if n < 2 * _ONE_SIDED.size:
+        # Too few for more than the mean between two epochs.
+        omega = np.zeros((n, 3))
+        if n > 1:
+            omega[1:] = log_so3(nRb[:-1].transpose(0, 2, 1) @ nRb[1:]) / np.diff(time)[:, None]
+            omega[0] = omega[1]
         return omega
-    turned = log_so3(nRb[:-1].transpose(0, 2, 1) @ nRb[1:]) / np.diff(time)[:, None]
-    omega[:-1], omega[-1] = turned, turned[-1]
-    if n > 6:
-        inner = slice(3, n - 3)
-        here = nRb[inner].transpose(0, 2, 1)
-        total = np.zeros((n - 6, 3))
-        for j, weight in _STENCIL:
-            ahead = log_so3(here @ nRb[3 + j : n - 3 + j])
-            behind = log_so3(here @ nRb[3 - j : n - 3 - j])
-            total += weight * (ahead - behind)
-        omega[inner] = total / ((time[6:] - time[:-6])[:, None] / 6.0)
+    step = float(time[-1] - time[0]) / (n - 1)
+    omega = np.zeros((n, 3))
+    edge = _CENTRED.size
+    inner, first, last = np.arange(edge, n - edge), np.arange(edge), np.arange(n - edge, n)
+    for k, weights, sides in (
+        (inner, _CENTRED, (1, -1)),
+        (first, _ONE_SIDED, (1,)),
+        (last, _ONE_SIDED, (-1,)),
+    ):
+        here = nRb[k].transpose(0, 2, 1)
+        for side in sides:
+            for j, weight in enumerate(weights, start=1):
+                omega[k] += side * weight / step * log_so3(here @ nRb[k + side * j])
     return omega
 
 
@@ -270,7 +277,7 @@ def _decompose(
     if zero.any():
         directions[zero] = readable_basis(directions[zero])
     noise = np.einsum("ij,jk,ik->i", directions, stack.feigned, directions)
-    share = np.where(zero, 0.0, noise / np.maximum(values, 1e-300) ** 2)
+    share = np.divide(noise, values**2, out=np.zeros(n), where=~zero)
     return SingularValues(segment, stack.pings, values, directions, share, tuple(states))
 
 
