@@ -10,6 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
+from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
 from factorgraph_dvl.analysis.information_shares import Shares
 from factorgraph_dvl.analysis.manoeuvres import Segment
@@ -100,8 +101,7 @@ def singular_value_figure(point_set: PointSet) -> Figure:
         ax = figure.add_subplot(grid[i, 0])
         for x, stack in enumerate(stacks):
             _draw_stack(ax, x, stack, colours, named=count <= _MOST_NAMED)
-        ax.set_yscale("log")
-        ax.set_ylim(0.5 * max(_FLOOR, min(lowest, 1.0)), 4.0 * max(highest, 10.0))
+        _log_axis(ax, "y", max(_FLOOR, min(lowest, 1.0)), 2.5 * max(highest, 10.0))
         ax.axhline(OBSERVABLE, color=GREY, lw=0.9)
         ax.set_xlim(-0.4, count - 0.25 if count <= _MOST_NAMED else count - 0.6)
         style(ax, "", "singular value")
@@ -183,18 +183,29 @@ def history_figure(history: InformationHistory, segments: Sequence[Segment]) -> 
                 lw=1.3,
                 label=name.removeprefix(stem).strip() or "σ",
             )
-        ax.set_yscale("log")
+        _log_axis(ax, "y", float(std[:, members].min()), float(std[:, members].max()))
         _, unit = readable(history.names[members[0]])
         last_row = k // columns == rows - 1 or k + columns >= len(groups)
         style(ax, label if last_row else "", "")
         ax.set_axisbelow(False)
         ax.grid(color=GREY, lw=0.4, alpha=0.35)
-        ax.tick_params(which="minor", labelsize=SMALL)
         ax.margins(x=0.0)
         ax.set_title(f"{stem}, {unit}" if unit else stem, fontsize=NORMAL, loc="left")
         ax.legend(fontsize=SMALL, frameon=False, ncols=len(members), loc="upper right")
     _shade_legend(figure, segments, "σ given all data up to a time")
     return figure
+
+
+def _log_axis(ax: Axes, which: str, low: float, high: float) -> None:
+    """Make an axis logarithmic, with few ticks: those of every decade take long to lay out."""
+    ax.set(**{f"{which}scale": "log"})
+    axis = ax.yaxis if which == "y" else ax.xaxis
+    few = np.log10(high / low) < 1.5
+    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if few else (1.0,), numticks=8))
+    if few:
+        axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:.6g}"))
+    axis.set_minor_locator(NullLocator())
+    ax.set(**{f"{which}lim": (0.6 * low, 1.6 * high)})
 
 
 def _shade(ax: Axes, segments: Sequence[Segment], start: float) -> None:
@@ -229,8 +240,8 @@ def direction_figure(marginals: Marginals) -> Figure:
     ax.barh(y, ratio - floor, left=floor, color=colour, height=0.62)
     for k, r in enumerate(ratio):
         ax.text(r * 1.12, k, f"{min(r, 1.0):.2g}", va="center", fontsize=SMALL, color=DARK)
-    ax.set_xscale("log")
-    ax.set_xlim(floor, 3.0)
+    _log_axis(ax, "x", floor, 1.8)
+    ax.set_xlim(left=floor)
     ax.axvline(OPEN, color=GREY, lw=0.9)
     labels = [_combination(d.names, d.vector, marginals.names) for d in directions]
     ax.set_yticks(y, labels, fontsize=SMALL)
