@@ -144,8 +144,17 @@ def test_accelerating_makes_nothing_best_but_shows_the_fourth_direction():
         found.values[:3] / np.sqrt(time.size), 4.0 / np.sqrt(3.0), rtol=0.01
     )
     steady, steady_time = rows_of("steady")
-    ratio = known(rows, 3) / known(steady, 3) * np.sqrt(steady_time.size / time.size)
-    assert ratio == pytest.approx(1.0 / np.sqrt(3.0), rel=0.01)
+    for i in (2, 3):
+        ratio = known(rows, i) / known(steady, i) * np.sqrt(steady_time.size / time.size)
+        assert ratio == pytest.approx(1.0 / np.sqrt(3.0), rel=0.01)
+    # alpha_x beside an unknown alpha_y: 16/3 - (2 c)² / c² = 4/3; in a turn it is 16.
+    assert known(rows, 0) == pytest.approx(np.sqrt(4.0 / 3.0 * time.size), rel=0.01)
+    turn, turn_time = rows_of("turning")
+    assert known(turn, 0) == pytest.approx(4.0 * np.sqrt(turn_time.size), rel=0.01)
+    # Only against a turn that knows no lever arm is it better: that leaves alpha_z and the
+    # scale no more than the current.
+    for i in (2, 3):
+        assert known(turn, i) == pytest.approx(CURRENT * np.sqrt(turn_time.size), rel=0.02)
     # In a cross current it turns the velocity, from the current's direction to the bow:
     # what is left of the constant 0.2 m/s beside a rising 0..4 is half of it.
     assert known(rows, 1) == pytest.approx(0.5 * CURRENT * np.sqrt(time.size), rel=0.01)

@@ -13,6 +13,7 @@ required:                          # σ in the names and units of calibration.js
 from __future__ import annotations
 
 from os import PathLike
+from typing import Any
 
 import msgspec
 
@@ -22,14 +23,23 @@ from factorgraph_dvl.simulation.scenario import Scenario, read_scenario
 class Plan(Scenario, frozen=True, kw_only=True):
     """A scenario that is not drawn from but predicted, with the σ that it shall reach."""
 
-    required: dict[str, float | list[float]] = msgspec.field(default_factory=dict)
+    # A mapping of Any: the reader names keys of a typed one by their place only.
+    required: dict[str, Any] = msgspec.field(default_factory=dict)
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name, values in self.required.items():
-            numbers = values if isinstance(values, list) else [values]
-            if not numbers or not all(0.0 < s < float("inf") for s in numbers):
-                raise ValueError(f"`required` must hold σ above 0, unlike `{name}`: {values}")
+        for name, given in self.required.items():
+            numbers = given if isinstance(given, list) else [given]
+            if not numbers or not all(_is_sigma(number) for number in numbers):
+                raise ValueError(
+                    f"`required` must hold a number above 0 for each name, or a list of them; "
+                    f"{name} is {given}"
+                )
+
+
+def _is_sigma(value: Any) -> bool:
+    is_number = isinstance(value, float | int) and not isinstance(value, bool)
+    return is_number and 0.0 < value < float("inf")
 
 
 def load_plan(path: str | PathLike[str]) -> Plan:
