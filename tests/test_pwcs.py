@@ -277,3 +277,15 @@ def test_a_segment_without_pings():
     assert single[1].pings == 0
     assert not single[1].values.any()
     assert cumulative[1].values == pytest.approx(cumulative[0].values)
+
+
+def test_pings_at_a_border_stand_with_neither_side():
+    rows, time = rows_of("steady")
+    turn, _ = rows_of("turning")
+    rows[1000:] = turn[5:6]
+    parts = (Segment(-1.0, 50.1, "steady"), Segment(50.1, 1e6, "turning"))
+    for margin, observed in ((0.0, 5), (5.0, 3)):
+        single, cumulative = singular_values(rows, time, parts, STATES, margin=margin)
+        assert np.sum(single[0].values > 1e-3) == observed
+        assert cumulative[1].pings == time.size
+    assert single[0].pings + single[1].pings == time.size - 200

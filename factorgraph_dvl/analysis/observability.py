@@ -37,6 +37,8 @@ _WITHOUT_PRIOR = {MISALIGNMENT: 1.0, SCALE_ERROR: 0.01, LEVER_ARM: 1.0}
 _LEAST_SIGMA = 1e-4
 # A singular value that leaves 96 % of the prior's σ tells nothing.
 _NOTHING = 0.3
+# Where segments that were found begin and end, s: half of a slow ramp.
+_MARGIN_S = 5.0
 
 
 @dataclass(frozen=True)
@@ -134,7 +136,9 @@ def observability(
         motion = body_motion(trajectory, solution.body_axes)
         heading = np.unwrap(trajectory.rph[:, 2])
         motions = tuple(_describe(s, motion, heading) for s in segments)
-        point_set, why = _point_set(solution, trial, motion, segments)
+        # Who gives the segments knows where they begin.
+        margin = 0.0 if given else _MARGIN_S
+        point_set, why = _point_set(solution, trial, motion, segments, margin)
         missing += why
     view = marginals(solution.estimates, solution.covariance)
     if view is None:
@@ -177,7 +181,11 @@ def _describe(segment: Segment, motion: BodyMotion, heading: Array) -> SegmentMo
 
 
 def _point_set(
-    solution: Solution, trial: Trial | None, motion: BodyMotion, segments: Sequence[Segment]
+    solution: Solution,
+    trial: Trial | None,
+    motion: BodyMotion,
+    segments: Sequence[Segment],
+    margin: float,
 ) -> tuple[PointSet | None, list[str]]:
     by_name = {e.name: e for e in solution.estimates}
     if trial is not None and trial.dvl is None:
@@ -213,7 +221,13 @@ def _point_set(
         for wrong in (rows(root[:, :, k], none), rows(none, none + rate_sigma * np.eye(3)[k])):
             feigned += wrong.transpose(0, 2, 1) @ wrong
     single, cumulative = singular_values(
-        rows(at.v_b, at.omega_b), at.time, segments, states, feigned=feigned, nothing=_NOTHING
+        rows(at.v_b, at.omega_b),
+        at.time,
+        segments,
+        states,
+        feigned=feigned,
+        nothing=_NOTHING,
+        margin=margin,
     )
     return PointSet(states, scale[free], f"{how}, {source}", single, cumulative), []
 

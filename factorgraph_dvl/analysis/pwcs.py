@@ -233,6 +233,7 @@ def singular_values(
     *,
     feigned: Array | None = None,
     nothing: float = 0.0,
+    margin: float = 0.0,
 ) -> tuple[tuple[SingularValues, ...], tuple[SingularValues, ...]]:
     """Return singular values of each segment, and of all up to its end.
 
@@ -246,16 +247,27 @@ def singular_values(
     feigned : (M, n, n) expectation of what errors of the motion add to rowsᵀ rows.
     nothing : singular values up to here are as good as zero; their directions are only
         defined together, and given in a readable basis.
+    margin : s; pings this close to the border between two segments are left out of each
+        alone, so that the first of a turn does not stand with the straight run before it.
+        At most a fifth of a segment.
     """
     n = rows.shape[2]
     single, cumulative = [], []
     total = _Stack(np.zeros((0, n)), np.zeros((n, n)), 0)
-    for segment in segments:
-        inside = segment.covers(time)
+
+    def stack(inside: np.ndarray) -> _Stack:
         noise = np.zeros((n, n)) if feigned is None else feigned[inside].sum(axis=0)
-        own = _Stack(_triangle(rows[inside].reshape(-1, n)), noise, int(inside.sum()))
-        total = total.and_(own)
-        single.append(_decompose(own, segment, states, nothing))
+        return _Stack(_triangle(rows[inside].reshape(-1, n)), noise, int(inside.sum()))
+
+    for i, segment in enumerate(segments):
+        inside = segment.covers(time)
+        total = total.and_(stack(inside))
+        within = min(margin, 0.2 * (segment.end - segment.start))
+        if i > 0:
+            inside = inside & (time > segment.start + within)
+        if i < len(segments) - 1:
+            inside = inside & (time <= segment.end - within)
+        single.append(_decompose(stack(inside), segment, states, nothing))
         whole = Segment(segments[0].start, segment.end, segment.label)
         cumulative.append(_decompose(total, whole, states, nothing))
     return tuple(single), tuple(cumulative)

@@ -205,7 +205,7 @@ def _log_axis(ax: Axes, which: str, low: float, high: float) -> None:
     if few:
         axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:.6g}"))
     axis.set_minor_locator(NullLocator())
-    ax.set(**{f"{which}lim": (0.6 * low, 1.6 * high)})
+    ax.set(**{f"{which}lim": (0.6 * low, 2.2 * high)})
 
 
 def _shade(ax: Axes, segments: Sequence[Segment], start: float) -> None:
@@ -240,7 +240,7 @@ def direction_figure(marginals: Marginals) -> Figure:
     ax.barh(y, ratio - floor, left=floor, color=colour, height=0.62)
     for k, r in enumerate(ratio):
         ax.text(r * 1.12, k, f"{min(r, 1.0):.2g}", va="center", fontsize=SMALL, color=DARK)
-    _log_axis(ax, "x", floor, 1.8)
+    _log_axis(ax, "x", floor, 1.3)
     ax.set_xlim(left=floor)
     ax.axvline(OPEN, color=GREY, lw=0.9)
     labels = [_combination(d.names, d.vector, marginals.names) for d in directions]

@@ -12,7 +12,7 @@ from factorgraph_dvl.analysis.marginals import Marginals
 from factorgraph_dvl.analysis.observability import Observability
 from factorgraph_dvl.conventions import DEG
 from factorgraph_dvl.report.tables import add_column
-from factorgraph_dvl.report.text import split_unit, with_std
+from factorgraph_dvl.report.text import fixed, split_unit, with_std
 
 _MOST_SEGMENTS = 16
 # Shares below this are not worth a word.
@@ -37,9 +37,9 @@ def segment_table(view: Observability) -> Table:
             m.segment.label,
             f"{m.segment.start:.1f}",
             f"{m.segment.end:.1f}",
-            _number(m.speed, ".2f"),
-            _number(m.turn / DEG, ".0f"),
-            " ".join(_number(r / DEG, ".2g") for r in m.rates),
+            _number(m.speed, 2),
+            _number(m.turn / DEG, 0),
+            " ".join(_number(r / DEG, 2) for r in m.rates.tolist()),
         ]
         if point_set is not None:
             stack, total = point_set.segments[k], point_set.cumulative[k]
@@ -116,5 +116,5 @@ def _named(values: np.ndarray, names: tuple[str, ...], i: int) -> str:
     return f"{values[i]:.3g} {', '.join(short)}" + ("…" if len(names) > 2 else "")
 
 
-def _number(value: float, spec: str) -> str:
-    return format(value, spec).replace("-0", "0") if math.isfinite(value) else "–"
+def _number(value: float, decimals: int) -> str:
+    return fixed(value, decimals) if math.isfinite(value) else "–"
