@@ -127,7 +127,7 @@ def test_requirements():
 
 @pytest.mark.parametrize("value", ["0", "-1", "[]", "much", "[1, x]", "{a: 1}", ".nan"])
 def test_wrong_requirements(value, tmp_path):
-    text = (CONFIGS / "plan-harbour.yaml").read_text()
+    text = (CONFIGS / "plans" / "harbour.yaml").read_text()
     file = tmp_path / "plan.yaml"
     file.write_text(text.partition("required:")[0] + f"required:\n  scale_error: {value}\n")
     with pytest.raises(ConfigError, match=r"plan.yaml.*required"):
@@ -198,12 +198,13 @@ def run_cli(capsys, *args):
 
 
 def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    out = tmp_path / "out"
-    plan = CONFIGS / "plan-harbour.yaml"
+    plan, out = tmp_path / "plan.yaml", tmp_path / "out"
+    text = (CONFIGS / "plans" / "harbour.yaml").read_text().partition("required:")[0]
+    plan.write_text(text + "required: {misalignment_z_deg: 0.02, scale_error: 0.001}\n")
     code, text, _ = run_cli(capsys, "plan", plan, "--out", out)
     assert code == 0
     found = json.loads((out / "plan.json").read_text())
-    assert found["missed"]
+    assert found["missed"] == ["misalignment_z_deg"]
     proposal = found["proposal"]
     assert proposal["met"]
     assert f"Add {proposal['added_s']:.0f} s" in text
@@ -230,7 +231,7 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
 )
 def test_wrong_plans(change, message, tmp_path: Path, capsys) -> None:
     file, out = tmp_path / "plan.yaml", tmp_path / "out"
-    data = yaml.safe_load((CONFIGS / "plan-harbour.yaml").read_text())
+    data = yaml.safe_load((CONFIGS / "plans" / "harbour.yaml").read_text())
     file.write_text(yaml.safe_dump(merged(data, change)))
     if isinstance(change.get("required"), dict):
         file.write_text(yaml.safe_dump({**data, **change}))
@@ -249,7 +250,7 @@ def test_plans_that_tell_nothing(name, tmp_path: Path, capsys) -> None:
         "adrift": {"manoeuvres": [{"straight_s": 20}], "required": None},
         "two seconds": {"manoeuvres": [{"straight_s": 2}], "required": None},
     }[name]
-    data = yaml.safe_load((CONFIGS / "plan-harbour.yaml").read_text())
+    data = yaml.safe_load((CONFIGS / "plans" / "harbour.yaml").read_text())
     data = merged({**data, "required": None}, {**changes, "required": None})
     file = tmp_path / "plan.yaml"
     file.write_text(yaml.safe_dump(data))
