@@ -69,6 +69,16 @@ def test_several_that_are_not_told_are_named_one_by_one():
     assert [s.split()[0] for s in found.sentences] == ["b_m", "c_m"]
 
 
+def test_two_open_combinations_of_two_components():
+    # 0.9 and 0.7 of the prior's σ are left along the diagonals: neither is told.
+    turn = np.array([[1.0, 1.0], [1.0, -1.0]]) / np.sqrt(2.0)
+    found = view(turn @ np.diag([0.81, 0.49]) @ turn.T, [1.0, 1.0])
+    assert [d.ratio for d in found.directions] == pytest.approx([0.9, 0.7])
+    # sqrt((0.81 + 0.49) / 2) = 0.806.
+    left = "is not told by the data: 81 % of the prior's σ is left"
+    assert found.sentences == (f"a_deg {left}", f"b_m {left}")
+
+
 def test_known_but_correlated():
     P = np.array([[4.0, 1.96], [1.96, 1.0]]) * 1e-4
     found = view(P, [1.0, 1.0])

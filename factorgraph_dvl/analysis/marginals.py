@@ -110,30 +110,36 @@ def _directions(scaled: Array, names: tuple[str, ...]) -> tuple[Direction, ...]:
     untold = np.sqrt(np.maximum(values, 0.0)) > _NOTHING
     if untold.any():
         rows = np.concatenate([readable_basis(rows[untold]), rows[~untold]])
-    out = []
-    for row in rows:
-        # Eigenvectors have no sign: the largest component shall be positive.
-        vector = row * np.sign(row[np.argmax(np.abs(row))])
-        variance = max(float(vector @ scaled @ vector), 1e-300)
-        out.append(
-            Direction(
-                ratio=float(np.sqrt(variance)),
-                information=1.0 / variance,
-                vector=vector,
-                names=dominant(vector, names),
-            )
-        )
-    return tuple(out)
+    return tuple(_direction(row, scaled, names) for row in rows)
+
+
+def _direction(row: Array, scaled: Array, names: tuple[str, ...]) -> Direction:
+    # Eigenvectors have no sign: the largest component shall be positive.
+    vector = row * np.sign(row[np.argmax(np.abs(row))])
+    variance = max(float(vector @ scaled @ vector), 1e-300)
+    return Direction(
+        ratio=float(np.sqrt(variance)),
+        information=1.0 / variance,
+        vector=vector,
+        names=dominant(vector, names),
+    )
 
 
 def _open_sentences(
-    directions: Sequence[Direction], names: Sequence[str], prior: Array, P: Array
+    directions: Sequence[Direction], names: tuple[str, ...], prior: Array, P: Array
 ) -> list[str]:
-    """Say which directions the data left open."""
+    """Say which directions the data left open.
+
+    Together they span a subspace; of two open combinations of two components, each of
+    these is open.
+    """
+    vectors = [d.vector for d in directions if d.ratio >= OPEN]
+    if not vectors:
+        return []
     out = []
-    for d in directions:
-        if d.ratio < OPEN:
-            continue
+    basis = readable_basis(np.linalg.qr(np.array(vectors).T)[0].T)
+    for row in basis:
+        d = _direction(row, P / np.outer(prior, prior), names)
         left = f"{100.0 * min(d.ratio, 1.0):.0f} % of the prior's σ is left"
         index = [names.index(name) for name in d.names]
         if len(index) == 1:
