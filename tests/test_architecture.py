@@ -17,7 +17,7 @@ PACKAGE = Path(factorgraph_dvl.__file__).parent
 # package. `a.b` stands for a module or a whole package.
 LAYERS = (
     ("conventions", "errors"),
-    ("earth", "yaml_file"),
+    ("earth", "celestial", "yaml_file"),
     ("sensors",),
     ("trial", "solution", "information"),
     ("io", "simulation"),
@@ -27,6 +27,8 @@ LAYERS = (
     ("preintegration",),
     ("keys",),
     ("chain",),
+    ("arcs",),
+    ("attitude_alignment",),
     ("alignment", "mounting"),
     ("graph",),
     ("solvers",),
@@ -54,7 +56,8 @@ FORBIDDEN = {
 FORBIDDEN |= {
     name: (*FORBIDDEN.get(name, ()), "kalman")
     for name in (
-        *("preintegration", "keys", "chain", "alignment", "mounting", "graph", "solvers"),
+        *("preintegration", "keys", "chain", "arcs", "attitude_alignment", "alignment"),
+        *("mounting", "graph", "solvers"),
         *("analysis", "report"),
     )
 }

@@ -42,7 +42,7 @@ def simulate_imu(
     truth = scenario.imu
     jitter_rng, bias_rng, walk_rng, noise_rng = rng.spawn(4)
     # The interval of the first sample must not begin before the motion does.
-    bounds = _times(truth, motion.duration, jitter_rng, first=0)
+    bounds = sample_times(truth, motion.duration, jitter_rng, first=0)
     time, interval = bounds[1:], np.diff(bounds)
     if time.size == 0:
         raise ConfigError(
@@ -87,7 +87,7 @@ def simulate_imu(
             white = noise_rng.standard_normal(gyro.shape)
             samples += white * (noise / np.sqrt(interval))[:, None]
         biases[name] = bias
-    keep = ~_within(time, truth.gaps_s)
+    keep = ~within(time, truth.gaps_s)
     imu = Imu(
         settings=cast("ImuSettings", scenario.settings("imu")),
         time=time[keep],
@@ -104,7 +104,7 @@ def simulate_gnss(
     truth = scenario.gnss
     assert truth is not None
     jitter_rng, position_rng, velocity_rng = rng.spawn(3)
-    time = _times(truth, motion.duration, jitter_rng)
+    time = sample_times(truth, motion.duration, jitter_rng)
     state = motion.at(time)
     nRb = rotation_from_rph(state.rph, scenario.body_axes)
     arm_n = _apply(nRb, np.array(truth.lever_arm_m))
@@ -115,7 +115,7 @@ def simulate_gnss(
         velocity = np.full_like(velocity, np.nan)
     elif scenario.noise:
         velocity += velocity_rng.standard_normal(velocity.shape) * truth.velocity_std_m_s
-    keep = ~_within(time, truth.outages_s)
+    keep = ~within(time, truth.outages_s)
     unknown = np.full((int(keep.sum()), 3), np.nan)
     gnss = Gnss(
         settings=cast("GnssSettings", scenario.settings("gnss")),
@@ -141,14 +141,14 @@ def simulate_dvl(
     truth = scenario.dvl
     assert truth is not None
     jitter_rng, noise_rng = rng.spawn(2)
-    time = _times(truth, motion.duration, jitter_rng)
+    time = sample_times(truth, motion.duration, jitter_rng)
     state = motion.at(time)
     velocity = _dvl_velocity(scenario, state)
     if scenario.noise:
         speed = np.linalg.norm(velocity, axis=1, keepdims=True)
         sigma = np.hypot(truth.velocity_std_m_s, truth.velocity_std_fraction * speed)
         velocity += sigma * noise_rng.standard_normal(velocity.shape)
-    velocity[_within(time, truth.no_lock_s)] = np.nan
+    velocity[within(time, truth.no_lock_s)] = np.nan
     dvl = Dvl(
         settings=cast("DvlSettings", scenario.settings("dvl")),
         time=time + truth.time_offset_s,
@@ -191,7 +191,7 @@ def _apply(matrices: Array, vectors: Array) -> Array:
     )
 
 
-def _times(
+def sample_times(
     sampled: Sampled, duration: float, rng: np.random.Generator, first: int | None = None
 ) -> Array:
     """Return times phase + k / rate after 0, or from k = `first` on, up to the end."""
@@ -204,7 +204,8 @@ def _times(
     return np.asarray(np.clip(time + shift, 0.0, duration))
 
 
-def _within(time: Array, intervals: Sequence[Interval]) -> NDArray[np.bool_]:
+def within(time: Array, intervals: Sequence[Interval]) -> NDArray[np.bool_]:
+    """Return which of the times lie within any of the intervals."""
     out = np.zeros(time.size, dtype=bool)
     for start, end in intervals:
         out |= (time >= start) & (time <= end)

@@ -3,6 +3,7 @@
 ```yaml
 name: harbour
 body_axes: RFU                     # or FRD, FLU
+epoch: 2018-12-01T05:30:00Z        # UTC of time zero, needed for stars
 noise: true                        # false: exact measurements, constant biases only
 reference_rate_hz: 10
 start: {lat_deg: 36, lon_deg: 121, height_m: 0, heading_deg: 0, speed_m_s: 0}
@@ -22,6 +23,7 @@ current_m_s: [0.1, 0.1, 0]         # east, north, up
 imu: {...}                         # ImuTruth: rate, errors
 gnss: {...}                        # GnssTruth, optional
 dvl: {...}                         # DvlTruth, optional
+star: {...}                        # StarTruth, optional
 trial:                             # what trial.yaml will claim
   imu: {gyro_bias_std_deg_h: 0.05, accel_bias_std_ug: 100}
   gnss: {}
@@ -38,6 +40,7 @@ and sampling is claimed as simulated.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from datetime import date
 from os import PathLike
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
@@ -53,9 +56,16 @@ from factorgraph_dvl.sensors.protocol import (
     Section,
     SensorSection,
     Vector3,
+    check_epoch,
 )
 from factorgraph_dvl.simulation.convert import convert
-from factorgraph_dvl.simulation.instruments import DvlTruth, GnssTruth, ImuTruth, Instrument
+from factorgraph_dvl.simulation.instruments import (
+    DvlTruth,
+    GnssTruth,
+    ImuTruth,
+    Instrument,
+    StarTruth,
+)
 from factorgraph_dvl.simulation.manoeuvres import Manoeuvre, flatten
 from factorgraph_dvl.yaml_file import read_yaml
 
@@ -113,6 +123,7 @@ class Claims(Section, frozen=True, kw_only=True):
     imu: dict[str, Any] = msgspec.field(default_factory=dict)
     gnss: dict[str, Any] = msgspec.field(default_factory=dict)
     dvl: dict[str, Any] = msgspec.field(default_factory=dict)
+    star: dict[str, Any] = msgspec.field(default_factory=dict)
     initial: InitialClaim | None = None
 
 
@@ -121,6 +132,7 @@ class Scenario(Section, frozen=True, kw_only=True):
 
     name: str
     body_axes: BodyAxes = "RFU"
+    epoch: str = ""
     noise: bool = True
     reference_rate_hz: Positive = 10.0
     start: Start
@@ -130,8 +142,15 @@ class Scenario(Section, frozen=True, kw_only=True):
     imu: ImuTruth
     gnss: GnssTruth | None = None
     dvl: DvlTruth | None = None
+    star: StarTruth | None = None
     trial: Claims = Claims()
     source: str = ""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_epoch(self.epoch)
+        if self.star is not None and not self.epoch:
+            raise ValueError("`epoch` is needed where there is a section `star`")
 
     def plan(self) -> list[Manoeuvre]:
         """Return the manoeuvres with repetitions written out.
@@ -201,6 +220,9 @@ def parse_scenario(data: Mapping[str, Any], source: str = "scenario") -> Scenari
     ConfigError
         As `load_scenario`.
     """
+    if isinstance(data.get("epoch"), date):
+        # A type of YAML 1.1, which this format has as text.
+        data = {**data, "epoch": data["epoch"].isoformat()}
     return _checked(convert({**data, "source": source}, Scenario, "", source))
 
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from factorgraph_dvl.alignment import initial_states
+from factorgraph_dvl.attitude_alignment import attitudes, mean_mounting
 from factorgraph_dvl.chain import Chain, inertial_chain
 from factorgraph_dvl.conventions import Array
 from factorgraph_dvl.earth import LocalFrame
@@ -16,7 +17,7 @@ from factorgraph_dvl.graph import Problem
 from factorgraph_dvl.increments import increments
 from factorgraph_dvl.mounting import initial_mounting
 from factorgraph_dvl.preintegration import Segments, States, attach, motion_at, segments
-from factorgraph_dvl.sensors.protocol import Aid, Motion, Observation, Parameter
+from factorgraph_dvl.sensors.protocol import Aid, AttitudeAid, Motion, Observation, Parameter
 from factorgraph_dvl.solution import Solution
 from factorgraph_dvl.solvers.covariance import Posterior, posterior
 from factorgraph_dvl.solvers.feigned import at_prior_along, feigned_directions
@@ -126,11 +127,11 @@ def minimised(
             chain, p_gravity = inertial_chain(trial, frame, seg, states), states.p_n
         if values is None:
             if trial.gnss is not None:
-                coarse = _without_dvl(chain, states, report)
+                coarse = _without_dvl(chain, states, start.mountings, report)
                 iterations += coarse.iterations
                 states = coarse.evaluation.states
             report("mounting", 0, None)
-            values = _mounting(trial, frame, seg, chain.gravity_n, states)
+            values = start.mountings | _mountings(trial, frame, seg, chain.gravity_n, states)
         problem = Problem(chain, *_sensors(trial.aids, frame), start=values)
         at = problem.values(states, {**problem.prior_values(), **values})
         minimum = minimise(problem, at, stage="all sensors", progress=report)
@@ -161,13 +162,20 @@ def _check_above_zero(name: str, value: float) -> None:
         raise ConfigError(f"{name} is {value}", expected="a number above 0")
 
 
-def _without_dvl(chain: Chain, states: States, report: Progress) -> Minimum:
-    trial = chain.trial
-    assert trial.gnss is not None
-    problem = Problem(chain, *_sensors([trial.gnss], chain.frame))
+def _without_dvl(
+    chain: Chain, states: States, mountings: dict[str, np.ndarray], report: Progress
+) -> Minimum:
+    """Return the minimum without the sensors whose mounting that is to tell."""
+    used = [
+        aid
+        for aid in chain.trial.aids
+        if aid is not chain.trial.dvl
+        and not (isinstance(aid, AttitudeAid) and aid.parameters()[0].name not in mountings)
+    ]
+    problem = Problem(chain, *_sensors(used, chain.frame), start=mountings)
     return minimise(
         problem,
-        problem.values(states, problem.prior_values()),
+        problem.values(states, problem.prior_values() | mountings),
         stage="inertial and GNSS",
         progress=report,
         max_iterations=_ROUGH_ITERATIONS,
@@ -182,16 +190,22 @@ def _sensors(aids: Sequence[Aid], frame: LocalFrame) -> tuple[list[Observation],
     return observations, parameters
 
 
-def _mounting(
+def _mountings(
     trial: Trial, frame: LocalFrame, seg: Segments, gravity_n: np.ndarray, states: States
 ) -> dict[str, np.ndarray]:
-    if trial.dvl is None:
-        return {}
+    """Return values of the sensors' mountings, rotations as matrices, by the motion."""
 
-    def motion_at_pings(pings: np.ndarray, time: np.ndarray) -> tuple[Motion, np.ndarray]:
+    def motion_by(time: np.ndarray) -> tuple[Motion, np.ndarray]:
         index, since, covered = seg.increments.locate(time)
         inside = seg.increments.start[index] + np.clip(since, 0.0, seg.increments.dt[index])
         at = attach(seg, np.where(covered, time, inside), frame.earth_rate)
         return motion_at(at, states, gravity_n, frame.earth_rate), covered
 
-    return initial_mounting(trial.dvl, motion_at_pings)
+    out = {}
+    for seen in attitudes(trial, frame):
+        if seen.mounting.estimated:
+            motion, covered = motion_by(seen.time)
+            out[seen.mounting.name] = mean_mounting(seen, motion.nRb * covered[:, None, None])
+    if trial.dvl is not None:
+        out |= initial_mounting(trial.dvl, lambda pings, time: motion_by(time))
+    return out
