@@ -368,32 +368,28 @@ def test_stars_tell_more_of_the_misalignment():
 
 
 def test_errors_grow_as_the_filter_says():
-    # Eq. 16 as printed has the wrong sign of a term that sways with the vessel.
     trial = simulate(config("star", **SHORT, noise=False))
     samples = prepare(increments(trial.imu)[0], trial.imu.settings)
     frame = trial.frame()
-    seen = seen_by_stars(star_of(trial), trial.epoch, frame.lat, frame.lon).within(5.0, 10.1)
+    seen = seen_by_stars(star_of(trial), trial.epoch, frame.lat, frame.lon)
     pick = replace(
-        seen, time=seen.time[::10], nRb=seen.nRb[::10], covariance=seen.covariance[::10]
+        seen, time=seen.time[9:20:10], nRb=seen.nRb[9:20:10], covariance=seen.covariance[9:20:10]
     )
     F = run_filter(samples, pick, frame.lat, np.zeros(3), np.eye(3)).transition[1]
     step = compose(samples, pick.time[:1], pick.time[1:])
-    omega = frame.earth_rate
-
-    def after(dq, xi):
-        C = exp_so3(2.0 * dq) @ pick.nRb[0]
-        # The SINS does not take off xi; the truth does.
-        return exp_so3(-5.0 * omega) @ C @ step.turn[0], exp_so3(-5.0 * omega) @ pick.nRb[
-            0
-        ] @ exp_so3(-step.lean[0] @ xi) @ step.turn[0]
-
+    spin, start = exp_so3(-5.0 * frame.earth_rate), pick.nRb[0]
+    found = np.empty((3, 6))
     for i in range(6):
         x = np.zeros(6)
         x[i] = 1e-6
-        sins, true = after(x[:3], x[3:])
-        grown = 0.5 * log_so3(sins @ true.T)
-        # Within 5 s the vessel turns by some degrees: second order of the step.
-        np.testing.assert_allclose(grown, F[:3] @ x, atol=3e-9)
+        sins = spin @ exp_so3(2.0 * x[:3]) @ start @ step.turn[0]
+        # What drifts the SINS is a rate that the vessel does not have.
+        true = spin @ start @ exp_so3(-step.lean[0] @ x[3:]) @ step.turn[0]
+        found[:, i] = 0.5 * log_so3(sins @ true.T) / 1e-6
+    np.testing.assert_allclose(found, F[:3], atol=1e-3)
+    # Eq. 16 as printed turns dq with the vessel besides, here by 1.3 degrees.
+    swayed = spin @ start @ step.turn[0] @ start.T
+    assert np.abs(found[:, :3] - swayed).max() > 0.02
 
 
 def test_the_filter_says_what_it_does_not_estimate():
