@@ -172,9 +172,7 @@ def draw(
             label=f"1 − bound / drift, {drift:g} °/h",
         )
         axes[2].plot(CURVE_TIMES, 100.0 * accuracy(value - DRIFTS)[:, i], "o", ms=3, color=colour)
-        scatter = [
-            float(rms(np.array([r["factor graph", t].error[i] for r in runs]))) for t in TIMES
-        ]
+        errors = np.array([[r["factor graph", t].error[i] for t in TIMES] for r in runs])
         axes[2].plot(
             TIMES, 100.0 * (1.0 - rms(errors) / drift), "o", ms=9, mfc="none", color=colour
         )
