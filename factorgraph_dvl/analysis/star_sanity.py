@@ -39,8 +39,7 @@ def _identification(star: Star) -> Iterator[Finding]:
     if vectors is None:
         return
     count = np.diff(np.append(vectors.first, vectors.time.size))
-    each = np.repeat(star.quaternion, count, axis=0)
-    iRs = Rotation.from_quat(each, scalar_first=True)
+    iRs = Rotation.from_quat(np.repeat(star.quaternion[:, [1, 2, 3, 0]], count, axis=0))
     away = np.linalg.norm(iRs.apply(vectors.body) - vectors.inertial, axis=1)
     # Two components across each direction, less three of the attitude.
     freedom = 2 * count.sum() - 3 * count.size

@@ -116,7 +116,12 @@ def calibrate(
         return solution, _history(outcome)
     dvl = trial.dvl
     if dvl is None:
-        raise DataError("the trial has no DVL", where="trial.yaml", expected="a dvl section")
+        raise DataError(
+            "the trial has no DVL",
+            where="trial.yaml",
+            expected="a dvl section",
+            hint="The method `star` needs none",
+        )
     if dvl.settings.reference == "water":
         raise ConfigError(
             "the point-set methods know no current, and this DVL measures through the water",

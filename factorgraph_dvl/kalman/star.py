@@ -94,7 +94,7 @@ def seen_by_stars(star: Star, epoch: str, lat: float, lon: float) -> Seen:
     """
     known = np.logical_not(star.missing)
     time = star.time[known]
-    iRs = Rotation.from_quat(star.quaternion[known], scalar_first=True).as_matrix()
+    iRs = Rotation.from_quat(star.quaternion[known][:, [1, 2, 3, 0]]).as_matrix()
     sRb = Rotation.from_rotvec(np.array(star.settings.mounting_deg) * DEG).as_matrix()
     eRi = _earth_from_stars(epoch, time, star.settings.ut1_utc_s)
     nRb = enu_from_ecef(lat, lon) @ eRi @ iRs @ sRb

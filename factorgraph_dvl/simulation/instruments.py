@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
+import msgspec
 import numpy as np
 
 from factorgraph_dvl.sensors.dvl import DvlSettings
@@ -145,7 +146,7 @@ class StarTruth(Instrument, frozen=True, kw_only=True):
 
     std_arcsec: float | Vector3
     mounting_deg: Vector3 = (0.0, 0.0, 0.0)
-    ut1_utc_s: float = 0.0
+    ut1_utc_s: Annotated[float, msgspec.Meta(ge=-1, le=1)] = 0.0
     stars: tuple[Vector3, ...] = ()
     outages_s: tuple[Interval, ...] = ()
 
