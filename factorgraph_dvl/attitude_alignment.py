@@ -77,7 +77,10 @@ def known_mountings(trial: Trial, frame: LocalFrame, arcs: Sequence[Arc]) -> dic
 def attitude_at_start(
     trial: Trial, frame: LocalFrame, arc: Arc, mountings: dict[str, Array]
 ) -> Array | None:
-    """Return the attitude at the start as each node sees it by the nearest measured one."""
+    """Return the attitude at the start, (K, 3, 3), as each node sees it by the next measured one.
+
+    None if no attitude was measured in the arc by a sensor of known mounting.
+    """
     for seen in attitudes(trial, frame):
         use = arc.covers(seen.time)
         if seen.mounting.name in mountings and use.any():

@@ -539,6 +539,11 @@ def test_three_sigmas_are_not_those_of_vectors():
         )
 
 
+def test_a_simulated_tracker_needs_an_epoch():
+    with pytest.raises(ConfigError, match="key epoch"):
+        simulate(config("star", **SHORT, epoch=None), 0)
+
+
 def test_a_trial_without_stars_has_no_such_method(capsys):
     trial = simulate(config("star", **SHORT, star=None), 0)
     with pytest.raises(DataError, match="no star tracker"):

@@ -149,8 +149,6 @@ class Scenario(Section, frozen=True, kw_only=True):
     def __post_init__(self) -> None:
         super().__post_init__()
         check_epoch(self.epoch)
-        if self.star is not None and not self.epoch:
-            raise ValueError("`epoch` is needed where there is a section `star`")
 
     def plan(self) -> list[Manoeuvre]:
         """Return the manoeuvres with repetitions written out.

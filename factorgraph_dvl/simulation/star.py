@@ -11,6 +11,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from factorgraph_dvl.conventions import DEG, Array, rotation_from_rph
+from factorgraph_dvl.errors import ConfigError
 from factorgraph_dvl.sensors.star import Star, StarSettings
 from factorgraph_dvl.simulation.measurements import sample_times, within
 from factorgraph_dvl.simulation.motion import Motion, State
@@ -30,6 +31,12 @@ def simulate_star(
     """
     truth = scenario.star
     assert truth is not None
+    if not scenario.epoch:
+        raise ConfigError(
+            "a star tracker is simulated without `epoch`",
+            where=f"{scenario.source or 'scenario'} key epoch",
+            expected="UTC of time zero, such as 2018-12-01T05:30:00Z",
+        )
     jitter_rng, noise_rng = rng.spawn(2)
     time = sample_times(truth, motion.duration, jitter_rng)
     time = time[~within(time, truth.outages_s)]

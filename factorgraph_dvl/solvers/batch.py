@@ -17,7 +17,7 @@ from factorgraph_dvl.graph import Problem
 from factorgraph_dvl.increments import increments
 from factorgraph_dvl.mounting import initial_mounting
 from factorgraph_dvl.preintegration import Segments, States, attach, motion_at, segments
-from factorgraph_dvl.sensors.protocol import Aid, AttitudeAid, Motion, Observation, Parameter
+from factorgraph_dvl.sensors.protocol import Aid, Motion, Observation, Parameter
 from factorgraph_dvl.solution import Solution
 from factorgraph_dvl.solvers.covariance import Posterior, posterior
 from factorgraph_dvl.solvers.feigned import at_prior_along, feigned_directions
@@ -166,11 +166,12 @@ def _without_dvl(
     chain: Chain, states: States, mountings: dict[str, np.ndarray], report: Progress
 ) -> Minimum:
     """Return the minimum without the sensors whose mounting that is to tell."""
+    trial = chain.trial
+    unknown = {a.mounting.name for a in attitudes(trial, chain.frame)} - mountings.keys()
     used = [
         aid
-        for aid in chain.trial.aids
-        if aid is not chain.trial.dvl
-        and not (isinstance(aid, AttitudeAid) and aid.parameters()[0].name not in mountings)
+        for aid in trial.aids
+        if aid is not trial.dvl and not any(p.name in unknown for p in aid.parameters())
     ]
     problem = Problem(chain, *_sensors(used, chain.frame), start=mountings)
     return minimise(
