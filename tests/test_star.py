@@ -13,7 +13,7 @@ from jacobians import check_jacobians
 from msgspec.structs import replace as replace_settings
 from scipy.spatial.transform import Rotation
 from test_observations import random_motion
-from truth import config, exact_motion
+from truth import CONFIGS, config, exact_motion
 
 from factorgraph_dvl.analysis.consistency import calibration_errors, nees_band, trajectory_errors
 from factorgraph_dvl.analysis.survey import survey
@@ -446,7 +446,7 @@ def folder(tmp_path, floating):
 
 def test_commands_end_to_end(tmp_path, capsys):
     scene = tmp_path / "scene.yaml"
-    text = (config.__globals__["CONFIGS"] / "star.yaml").read_text()
+    text = (CONFIGS / "star.yaml").read_text()
     scene.write_text(text.replace("straight_s: 300", "straight_s: 20"))
     trial, graph, filtered = (tmp_path / n for n in ("trial", "graph", "filtered"))
     assert run(capsys, "simulate", scene, "--out", trial)[0] == 0
@@ -455,23 +455,16 @@ def test_commands_end_to_end(tmp_path, capsys):
     assert "Star tracker: its turns agree with those of the gyros" in shown.out
     assert run(capsys, "solve", trial, "--out", graph, "--quiet")[0] == 0
     assert (graph / "figures" / "star_residuals.png").stat().st_size > 0
-    code, _ = run(
-        capsys, "kalman", trial, "--method", "star", "--out", filtered, "--quiet", "--no-figures"
-    )
-    assert code == 0
+    quick = ("--quiet", "--no-figures")
+    assert run(capsys, "kalman", trial, "--method", "star", "--out", filtered, *quick)[0] == 0
     assert "gyro_bias_x_deg_h" in read_table(filtered / "history.csv", ["gyro_bias_x_deg_h"])
     assert load_solution(filtered).solver == "kalman-star"
-    code, shown = run(
-        capsys,
-        "crosscheck",
-        graph,
-        filtered,
-        "--reference",
-        trial,
-        "--out",
-        tmp_path / "check",
-        "--no-figures",
-    )
+    told = tmp_path / "told"
+    assert run(capsys, "observability", trial, "--out", told, *quick)[0] == 0
+    (std,) = read_table(told / "history.csv", ["gyro_bias_z_deg_h_std"]).values()
+    assert std[-1] == pytest.approx(bound(20.0), rel=0.01)
+    both = ("crosscheck", graph, filtered, "--reference", trial, "--no-figures")
+    code, shown = run(capsys, *both, "--out", tmp_path / "check")
     assert code == 0
     assert "3 agree" in shown.out
 
