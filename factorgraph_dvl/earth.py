@@ -69,11 +69,14 @@ class LocalFrame:
     ----------
     lat, lon : geodetic latitude and longitude of the origin, rad.
     height : ellipsoidal height of the origin, m.
+    epoch : UTC of the trial's time zero, ISO 8601, which fixes how the frame lies among the
+        stars at any time; empty if not known.
     """
 
     lat: float
     lon: float
     height: float
+    epoch: str = ""
 
     @property
     def earth_rate(self) -> Array:

@@ -36,7 +36,7 @@ from factorgraph_dvl.priors import add_priors, away, prior_mean, prior_root, pul
 from factorgraph_dvl.sensors.protocol import Linearization, Motion, Observation, Parameter
 
 # Standard deviation that stands for zero in a held direction, in those of the prior.
-_HELD_DIRECTION = 1e-4
+HELD_DIRECTION = 1e-4
 # How far a time offset may move from its start, s, before measurements are bound anew.
 _TIME_MARGIN = 0.05
 # How far, s, a motion is extrapolated before its measurements are bound anew: 2 Hz sway of
@@ -211,7 +211,7 @@ class Problem:
         directions : (P, h) orthonormal, in the coordinates u of a step S u, S `prior_root`.
         origin : values of the parameters there.
         """
-        gain = directions.T @ np.linalg.inv(self.prior_root) / _HELD_DIRECTION
+        gain = directions.T @ np.linalg.inv(self.prior_root) / HELD_DIRECTION
         self.graph.add(pull(self.parameters, self._key, np.asarray(gain, float), origin))
 
     def evaluate(self, values: gtsam.Values) -> Evaluation:

@@ -107,12 +107,14 @@ class Trial:
         DataError
             If neither GNSS nor `initial.position` gives a position.
         """
+        known = np.empty((0, 3))
         if self.initial_position is not None:
-            return LocalFrame(*self.initial_position.geodetic)
-        if self.gnss is not None:
-            fixes = np.flatnonzero(~np.isnan(self.gnss.geodetic[:, 0]))
-            if fixes.size:
-                return LocalFrame(*self.gnss.geodetic[fixes[0]])
+            known = self.initial_position.geodetic[None]
+        elif self.gnss is not None:
+            known = self.gnss.geodetic[~np.isnan(self.gnss.geodetic[:, 0])]
+        if known.size:
+            lat, lon, height = known[0]
+            return LocalFrame(lat, lon, height, self.epoch)
         raise DataError(
             "the trial has no position",
             where="trial.yaml",

@@ -6,8 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from factorgraph_dvl.analysis.finding import Finding
 from factorgraph_dvl.analysis.records import SensorSurvey, record_of, travel
-from factorgraph_dvl.analysis.sanity import Finding, findings
+from factorgraph_dvl.analysis.sanity import findings
 from factorgraph_dvl.trial import Trial
 
 

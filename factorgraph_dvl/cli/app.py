@@ -15,6 +15,8 @@ from factorgraph_dvl.cli.crosscheck import crosscheck
 from factorgraph_dvl.cli.deadreckon import deadreckon
 from factorgraph_dvl.cli.inspect import inspect
 from factorgraph_dvl.cli.instrument import instrument
+from factorgraph_dvl.cli.observability import observability
+from factorgraph_dvl.cli.plan import plan
 from factorgraph_dvl.cli.simulate import simulate
 from factorgraph_dvl.cli.solve import kalman, solve
 from factorgraph_dvl.errors import FactorgraphDvlError
@@ -30,7 +32,17 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
-for _command in (simulate, solve, kalman, inspect, crosscheck, deadreckon, instrument):
+for _command in (
+    simulate,
+    solve,
+    kalman,
+    inspect,
+    crosscheck,
+    observability,
+    plan,
+    deadreckon,
+    instrument,
+):
     app.command()(_command)
 
 

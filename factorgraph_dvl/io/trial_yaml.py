@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from datetime import datetime
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import msgspec
@@ -11,7 +10,7 @@ from msgspec import UNSET, Meta, UnsetType
 from factorgraph_dvl.conventions import BodyAxes
 from factorgraph_dvl.sensors.catalogue import AIDS
 from factorgraph_dvl.sensors.imu import ImuSettings
-from factorgraph_dvl.sensors.protocol import Section, SensorSection, Sigma3
+from factorgraph_dvl.sensors.protocol import Section, SensorSection, Sigma3, check_epoch
 
 # Sections of format 1 whose sensors this version does not know.
 _UNKNOWN = sorted(
@@ -64,13 +63,7 @@ class _Settings(Section, frozen=True, kw_only=True):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.epoch:
-            try:
-                datetime.fromisoformat(self.epoch)
-            except ValueError:
-                raise ValueError(
-                    "`epoch` must be a date and time such as 2022-10-12T02:00:00Z"
-                ) from None
+        check_epoch(self.epoch)
 
     @property
     def aids(self) -> dict[str, SensorSection]:

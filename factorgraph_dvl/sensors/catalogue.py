@@ -6,5 +6,6 @@ from factorgraph_dvl.sensors.depth import Depth
 from factorgraph_dvl.sensors.dvl import Dvl
 from factorgraph_dvl.sensors.gnss import Gnss
 from factorgraph_dvl.sensors.protocol import Aid
+from factorgraph_dvl.sensors.star import Star
 
-AIDS: tuple[type[Aid], ...] = (Gnss, Dvl, Depth)
+AIDS: tuple[type[Aid], ...] = (Gnss, Dvl, Star, Depth)

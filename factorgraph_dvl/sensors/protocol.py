@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Annotated, Any, ClassVar, Protocol, Self
+from datetime import datetime
+from typing import Annotated, Any, ClassVar, Protocol, Self, runtime_checkable
 
 import msgspec
 import numpy as np
@@ -32,6 +33,15 @@ class Section(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
         for name in self.__struct_fields__:
             if not _finite(getattr(self, name)):
                 raise ValueError(f"`{name}` must be finite")
+
+
+def check_epoch(epoch: str) -> None:
+    """Raise ValueError unless an epoch is empty or a date and time of ISO 8601."""
+    try:
+        if epoch:
+            datetime.fromisoformat(epoch)
+    except ValueError:
+        raise ValueError("`epoch` must be a date and time such as 2022-10-12T02:00:00Z") from None
 
 
 def _finite(value: Any) -> bool:
@@ -277,6 +287,30 @@ class Aid(Record, Protocol):
 
     def explain(self, parameter: str, component: int, motion: Motion | None) -> str:
         """Say why a component could not be observed, given the motion of the trial."""
+
+
+@dataclass(frozen=True)
+class Attitudes:
+    """Attitudes that a sensor measures by itself, without any motion.
+
+    Parameters
+    ----------
+    time : (M,) s.
+    nRs : (M, 3, 3) attitude of the sensor's axes.
+    mounting : the parameter sRb, with its prior.
+    """
+
+    time: Array
+    nRs: Array
+    mounting: Parameter
+
+
+@runtime_checkable
+class AttitudeAid(Aid, Protocol):
+    """An aid from which a vehicle at rest can start."""
+
+    def attitudes(self, frame: LocalFrame) -> Attitudes:
+        """Return the attitudes that were measured, in `frame`."""
 
 
 def lever_arm_sigma(motion: Motion, lever_arm: Array) -> Array:

@@ -22,6 +22,7 @@ from factorgraph_dvl.simulation.measurements import displaced, simulate_dvl, sim
 from factorgraph_dvl.simulation.measurements import simulate_imu as _simulate_imu
 from factorgraph_dvl.simulation.motion import Motion, plan_motion
 from factorgraph_dvl.simulation.scenario import Scenario, load_scenario, parse_scenario
+from factorgraph_dvl.simulation.star import simulate_star
 from factorgraph_dvl.trial import InitialAttitude, InitialPosition, Reference, Trial
 
 __all__ = ["Scenario", "load_scenario", "parse_scenario", "plan_motion", "simulate"]
@@ -30,6 +31,7 @@ __all__ = ["Scenario", "load_scenario", "parse_scenario", "plan_motion", "simula
 _AIDS: dict[str, Callable[..., tuple[Aid, dict[str, Array]]]] = {
     "gnss": simulate_gnss,
     "dvl": simulate_dvl,
+    "star": simulate_star,
     "depth": simulate_depth,
 }
 
@@ -66,6 +68,7 @@ def simulate(scenario: Scenario | str | PathLike[str], seed: int = 0) -> Trial:
         dvl=cast("Dvl | None", aids.pop("dvl", None)),
         others=tuple(aids.values()),
         body_axes=scenario.body_axes,
+        epoch=scenario.epoch,
         initial_attitude=attitude,
         initial_position=position,
         reference=_reference(motion, scenario.reference_rate_hz),

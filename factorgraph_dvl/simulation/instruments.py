@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
+import msgspec
 import numpy as np
 
 from factorgraph_dvl.sensors.depth import DepthSettings
@@ -19,6 +20,7 @@ from factorgraph_dvl.sensors.protocol import (
     Sigma3,
     Vector3,
 )
+from factorgraph_dvl.sensors.star import StarSettings
 
 Interval = tuple[float, float]
 
@@ -135,6 +137,33 @@ class DvlTruth(Instrument, frozen=True, kw_only=True):
     def claimed(self) -> dict[str, Any]:
         """Return noise and the kind of lock as simulated; the mounting is to be found."""
         names = ("velocity_std_m_s", "velocity_std_fraction", "reference")
+        return {name: getattr(self, name) for name in names}
+
+
+class StarTruth(Instrument, frozen=True, kw_only=True):
+    """The simulated star tracker; with `stars` it reports their directions."""
+
+    section_type: ClassVar[type[SensorSection]] = StarSettings
+
+    std_arcsec: float | Vector3
+    mounting_deg: Vector3 = (0.0, 0.0, 0.0)
+    ut1_utc_s: Annotated[float, msgspec.Meta(ge=-1, le=1)] = 0.0
+    stars: tuple[Vector3, ...] = ()
+    outages_s: tuple[Interval, ...] = ()
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_intervals("outages_s", self.outages_s)
+        if np.min(self.std_arcsec) <= 0.0:
+            raise ValueError("`std_arcsec` must be above 0")
+        if self.stars and np.ndim(self.std_arcsec) != 0:
+            raise ValueError("`std_arcsec` must be one number where there are `stars`")
+        if any(not any(star) for star in self.stars):
+            raise ValueError("`stars` must hold directions, none of them zero")
+
+    def claimed(self) -> dict[str, Any]:
+        """Return noise, mounting and UT1 - UTC as simulated."""
+        names = ("std_arcsec", "mounting_deg", "ut1_utc_s")
         return {name: getattr(self, name) for name in names}
 
 

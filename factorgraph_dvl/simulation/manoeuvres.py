@@ -41,6 +41,40 @@ class Turn(Section, frozen=True, kw_only=True):
             raise ValueError("`ramp_s` must not exceed `duration_s`")
 
 
+class FigureEight(Section, frozen=True, kw_only=True):
+    """Turn a full circle and then one to the other side; to starboard first where positive."""
+
+    figure_eight_deg_s: float
+    ramp_s: NonNegative = 0.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.figure_eight_deg_s == 0.0:
+            raise ValueError("`figure_eight_deg_s` must not be 0")
+        if self.ramp_s > self.circle_s:
+            raise ValueError("`ramp_s` must not exceed the time of a circle")
+
+    @property
+    def circle_s(self) -> float:
+        """Time of one circle without its ramp, s."""
+        return 360.0 / abs(self.figure_eight_deg_s)
+
+    def turns(self) -> tuple[Turn, Turn]:
+        """Return the two circles."""
+        rate, time = self.figure_eight_deg_s, self.circle_s
+        return (
+            Turn(turn_deg_s=rate, duration_s=time, ramp_s=self.ramp_s),
+            Turn(turn_deg_s=-rate, duration_s=time, ramp_s=self.ramp_s),
+        )
+
+
+class Stop(Section, frozen=True, kw_only=True):
+    """Come to rest in the water, stay for `stop_s`, and go on at the speed before."""
+
+    stop_s: NonNegative
+    acceleration_m_s2: Positive = 0.2
+
+
 class Climb(Section, frozen=True, kw_only=True):
     """Change the height at a vertical speed that builds up over ramp_s, and down again."""
 
@@ -56,18 +90,20 @@ class Repeat(Section, frozen=True, kw_only=True):
     manoeuvres: list[dict[str, Any]]
 
 
-Manoeuvre = Accelerate | Straight | Turn | Climb
-_MANOEUVRES: dict[str, type[Manoeuvre | Repeat]] = {
+Manoeuvre = Accelerate | Straight | Turn | Stop | Climb
+_MANOEUVRES: dict[str, type[Manoeuvre | FigureEight | Repeat]] = {
     "accelerate_m_s2": Accelerate,
     "straight_s": Straight,
     "turn_deg_s": Turn,
+    "figure_eight_deg_s": FigureEight,
+    "stop_s": Stop,
     "climb_m_s": Climb,
     "repeat": Repeat,
 }
 
 
 def flatten(items: Sequence[Mapping[str, Any]], key: str, source: str) -> list[Manoeuvre]:
-    """Return manoeuvres with their repetitions written out.
+    """Return manoeuvres with repetitions and figures of eight written out.
 
     Raises
     ------
@@ -93,6 +129,8 @@ def flatten(items: Sequence[Mapping[str, Any]], key: str, source: str) -> list[M
                     expected=f"at most {_MAX_MANOEUVRES} in all",
                 )
             out += inner * manoeuvre.repeat
+        elif isinstance(manoeuvre, FigureEight):
+            out += manoeuvre.turns()
         else:
             out.append(manoeuvre)
     if not out:

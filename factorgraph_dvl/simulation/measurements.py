@@ -87,7 +87,7 @@ def simulate_imu(
             white = noise_rng.standard_normal(gyro.shape)
             samples += white * (noise / np.sqrt(interval))[:, None]
         biases[name] = bias
-    keep = ~_within(time, truth.gaps_s)
+    keep = ~within(time, truth.gaps_s)
     imu = Imu(
         settings=cast("ImuSettings", scenario.settings("imu")),
         time=time[keep],
@@ -115,7 +115,7 @@ def simulate_gnss(
         velocity = np.full_like(velocity, np.nan)
     elif scenario.noise:
         velocity += velocity_rng.standard_normal(velocity.shape) * truth.velocity_std_m_s
-    keep = ~_within(time, truth.outages_s)
+    keep = ~within(time, truth.outages_s)
     unknown = np.full((int(keep.sum()), 3), np.nan)
     gnss = Gnss(
         settings=cast("GnssSettings", scenario.settings("gnss")),
@@ -148,7 +148,7 @@ def simulate_dvl(
         speed = np.linalg.norm(velocity, axis=1, keepdims=True)
         sigma = np.hypot(truth.velocity_std_m_s, truth.velocity_std_fraction * speed)
         velocity += sigma * noise_rng.standard_normal(velocity.shape)
-    velocity[_within(time, truth.no_lock_s)] = np.nan
+    velocity[within(time, truth.no_lock_s)] = np.nan
     dvl = Dvl(
         settings=cast("DvlSettings", scenario.settings("dvl")),
         time=time + truth.time_offset_s,
@@ -204,7 +204,8 @@ def sample_times(
     return np.asarray(np.clip(time + shift, 0.0, duration))
 
 
-def _within(time: Array, intervals: Sequence[Interval]) -> NDArray[np.bool_]:
+def within(time: Array, intervals: Sequence[Interval]) -> NDArray[np.bool_]:
+    """Return which of the times lie within any of the intervals."""
     out = np.zeros(time.size, dtype=bool)
     for start, end in intervals:
         out |= (time >= start) & (time <= end)

@@ -16,7 +16,7 @@ from scipy.interpolate import PPoly
 from factorgraph_dvl.conventions import DEG, Array, BodyAxes, frd_from_body
 from factorgraph_dvl.earth import RATE, normal_gravity, radii
 from factorgraph_dvl.errors import ConfigError
-from factorgraph_dvl.simulation.manoeuvres import Accelerate, Climb, Manoeuvre, Straight
+from factorgraph_dvl.simulation.manoeuvres import Accelerate, Climb, Manoeuvre, Stop, Straight
 from factorgraph_dvl.simulation.scenario import Scenario
 
 _COLLOCATION_NODES = 6
@@ -303,6 +303,16 @@ def _profiles(
             speed = m.to_m_s
         elif isinstance(m, Straight):
             add(m.straight_s)
+        elif isinstance(m, Stop):
+            before = speed
+            if before > 0.0:
+                add(before / m.acceleration_m_s2, acceleration=-m.acceleration_m_s2)
+            speed = 0.0
+            if m.stop_s > 0.0:
+                add(m.stop_s)
+            if before > 0.0:
+                add(before / m.acceleration_m_s2, acceleration=m.acceleration_m_s2)
+            speed = before
         elif isinstance(m, Climb):
             change = m.to_height_m - height
             if change * m.climb_m_s <= 0.0 or change / m.climb_m_s < m.ramp_s:

@@ -3,6 +3,7 @@
 ```yaml
 name: harbour
 body_axes: RFU                     # or FRD, FLU
+epoch: 2018-12-01T05:30:00Z        # UTC of time zero, needed for stars
 noise: true                        # false: exact measurements, constant biases only
 reference_rate_hz: 10
 start: {lat_deg: 36, lon_deg: 121, height_m: 0, heading_deg: 0, speed_m_s: 0}
@@ -10,6 +11,8 @@ manoeuvres:                        # one after the other
   - {accelerate_m_s2: 1, to_m_s: 4}
   - {straight_s: 100}
   - {turn_deg_s: -2, duration_s: 45, ramp_s: 3}   # positive to starboard
+  - {figure_eight_deg_s: 6}        # a full circle to starboard, then one to port
+  - {stop_s: 30, acceleration_m_s2: 0.2}          # to rest, stay, and back to the speed before
   - {climb_m_s: -0.5, to_height_m: -40, ramp_s: 10}   # sink, with heading and speed as they are
   - {repeat: 2, manoeuvres: [{straight_s: 10}, {turn_deg_s: 9, duration_s: 20}]}
 sway:                              # amplitude · sin(2 pi frequency · t + phase), summed
@@ -22,6 +25,7 @@ imu: {...}                         # ImuTruth: rate, errors
 gnss: {...}                        # GnssTruth, optional
 dvl: {...}                         # DvlTruth, optional
 depth: {...}                       # DepthTruth, optional
+star: {...}                        # StarTruth, optional
 trial:                             # what trial.yaml will claim
   imu: {gyro_bias_std_deg_h: 0.05, accel_bias_std_ug: 100}
   gnss: {}
@@ -38,9 +42,10 @@ and sampling is claimed as simulated.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from datetime import date
 from os import PathLike
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeVar
 
 import msgspec
 
@@ -53,6 +58,7 @@ from factorgraph_dvl.sensors.protocol import (
     Section,
     SensorSection,
     Vector3,
+    check_epoch,
 )
 from factorgraph_dvl.simulation.convert import convert
 from factorgraph_dvl.simulation.instruments import (
@@ -61,6 +67,7 @@ from factorgraph_dvl.simulation.instruments import (
     GnssTruth,
     ImuTruth,
     Instrument,
+    StarTruth,
 )
 from factorgraph_dvl.simulation.manoeuvres import Manoeuvre, flatten
 from factorgraph_dvl.yaml_file import read_yaml
@@ -119,6 +126,7 @@ class Claims(Section, frozen=True, kw_only=True):
     imu: dict[str, Any] = msgspec.field(default_factory=dict)
     gnss: dict[str, Any] = msgspec.field(default_factory=dict)
     dvl: dict[str, Any] = msgspec.field(default_factory=dict)
+    star: dict[str, Any] = msgspec.field(default_factory=dict)
     depth: dict[str, Any] = msgspec.field(default_factory=dict)
     initial: InitialClaim | None = None
 
@@ -128,6 +136,7 @@ class Scenario(Section, frozen=True, kw_only=True):
 
     name: str
     body_axes: BodyAxes = "RFU"
+    epoch: str = ""
     noise: bool = True
     reference_rate_hz: Positive = 10.0
     start: Start
@@ -137,9 +146,14 @@ class Scenario(Section, frozen=True, kw_only=True):
     imu: ImuTruth
     gnss: GnssTruth | None = None
     dvl: DvlTruth | None = None
+    star: StarTruth | None = None
     depth: DepthTruth | None = None
     trial: Claims = Claims()
     source: str = ""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_epoch(self.epoch)
 
     def plan(self) -> list[Manoeuvre]:
         """Return the manoeuvres with repetitions written out.
@@ -172,6 +186,9 @@ class Scenario(Section, frozen=True, kw_only=True):
         )
 
 
+_S = TypeVar("_S", bound=Scenario)
+
+
 def load_scenario(path: str | PathLike[str]) -> Scenario:
     """Read a scenario from its YAML file.
 
@@ -181,8 +198,13 @@ def load_scenario(path: str | PathLike[str]) -> Scenario:
         If the file is missing, is not YAML, or holds an unknown key, a wrong type or a
         value out of range; the message names file, line and key.
     """
+    return read_scenario(path, Scenario)
+
+
+def read_scenario(path: str | PathLike[str], kind: type[_S]) -> _S:
+    """Read a scenario, or what has more keys than one; otherwise as `load_scenario`."""
     path = Path(path)
-    scenario = read_yaml(path, Scenario, source=str(path))
+    scenario = read_yaml(path, kind, source=str(path))
     if scenario.source:
         raise ConfigError("unknown key `source`", where=str(path))
     return _checked(msgspec.structs.replace(scenario, source=str(path)))
@@ -201,10 +223,13 @@ def parse_scenario(data: Mapping[str, Any], source: str = "scenario") -> Scenari
     ConfigError
         As `load_scenario`.
     """
+    if isinstance(data.get("epoch"), date):
+        # A type of YAML 1.1, which this format has as text.
+        data = {**data, "epoch": data["epoch"].isoformat()}
     return _checked(convert({**data, "source": source}, Scenario, "", source))
 
 
-def _checked(scenario: Scenario) -> Scenario:
+def _checked(scenario: _S) -> _S:
     source = scenario.source
     scenario.plan()
     for name in ("imu", *scenario.aids):

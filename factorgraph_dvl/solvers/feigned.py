@@ -13,17 +13,16 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from scipy.linalg import eigh
 
 from factorgraph_dvl.conventions import Array, rotate, skew
-from factorgraph_dvl.graph import Problem
+from factorgraph_dvl.graph import Evaluation, Problem
 from factorgraph_dvl.preintegration import Attachment
 from factorgraph_dvl.sensors.protocol import Motion, Observation
 from factorgraph_dvl.solvers.covariance import Posterior
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum
 
 # Share of the error of the motion in the information from which on it is not believed.
-_FEIGNED = 0.5
+FEIGNED = 0.5
 # Information, in units of the prior's, that is not worth the question.
 _LITTLE = 0.1
 # Genuine information, in the same units, below which a direction is left to the prior once
@@ -31,12 +30,16 @@ _LITTLE = 0.1
 _GENUINE = 0.5
 
 
-def feigned_directions(problem: Problem, minimum: Minimum, covariances: Posterior) -> Array:
+def feigned_directions(
+    problem: Problem, minimum: Minimum, covariances: Posterior, *, at_truth: bool = False
+) -> Array:
     """Return directions that are not observable, if the information on any is feigned.
 
     Parameters
     ----------
     problem, minimum, covariances : at the minimum.
+    at_truth : the motion there is the true one, and feigns nothing: return what will be
+        found once it is estimated.
 
     Returns
     -------
@@ -44,39 +47,82 @@ def feigned_directions(problem: Problem, minimum: Minimum, covariances: Posterio
     """
     if not problem.parameters:
         return np.zeros((0, 0))
-    root = problem.prior_root
-    size = len(root)
     functionals = [{problem.key(p.name): np.eye(p.mean.size)} for p in problem.parameters]
-    whiten = np.linalg.inv(root)
+    whiten = np.linalg.inv(problem.prior_root)
     P = whiten @ covariances.information.covariance_of(functionals) @ whiten.T
-    data = np.linalg.inv(P) - np.eye(size)
-    feigned = np.zeros((size, size))
+    data = np.linalg.inv(P) - np.eye(len(P))
+    feigned = feigned_information(problem, minimum.evaluation, covariances.nodes)
+    total = feigned.sum(axis=0)
+    return directions_not_told(data + total if at_truth else data, total)
+
+
+def feigned_information(problem: Problem, evaluation: Evaluation, nodes: Array) -> Array:
+    """Return the information that the error of the motion feigns, by node.
+
+    Parameters
+    ----------
+    problem, evaluation : linearised there.
+    nodes : (K, 9, 9) covariances of the states, in GTSAM's tangent space.
+
+    Returns
+    -------
+    (K, P, P) expected share of the measurements that hang on each node, in the coordinates
+    u of a step S u, S `Problem.prior_root`.
+    """
+    root = problem.prior_root
+    out = np.zeros((nodes.shape[0], len(root), len(root)))
     for observation, attachment, motion, weight in zip(
         problem.observations,
         problem.attachments,
-        minimum.evaluation.motions,
+        evaluation.motions,
         problem.weights,
         strict=True,
     ):
         names = [p.name for p in problem.parameters if p.name in observation.parameters]
         if names:
             part, columns = _feigned_by(
-                problem, observation, attachment, motion, weight, minimum, covariances.nodes
+                problem, observation, attachment, motion, weight, evaluation, nodes
             )
-            feigned[np.ix_(columns, columns)] += part
-    feigned = root.T @ feigned @ root
-    data = 0.5 * (data + data.T)
-    share = eigh(feigned, _positive(data) + _LITTLE * np.eye(size), eigvals_only=True)
-    if share.max() < _FEIGNED:
-        return np.zeros((size, 0))
+            np.add.at(out, (attachment.node[:, None, None], columns[:, None], columns), part)
+    return np.asarray(root.T @ out @ root)
+
+
+def directions_not_told(data: Array, feigned: Array) -> Array:
+    """Return the directions (P, h) that are not observable, if any is feigned.
+
+    Parameters
+    ----------
+    data : (P, P) information of the data, beside the prior's identity; what is feigned
+        included.
+    feigned : (P, P) that share of it.
+    """
+    if not largest_feigned_share(data, feigned) >= FEIGNED:
+        return np.zeros((data.shape[0], 0))
     genuine, directions = np.linalg.eigh(data - feigned)
     return np.asarray(directions[:, genuine < _GENUINE])
 
 
+def largest_feigned_share(data: Array, feigned: Array) -> Array:
+    """Return the largest share of feigned information in any direction, (...).
+
+    Parameters
+    ----------
+    data, feigned : (..., P, P) as of `directions_not_told`.
+    """
+    data = 0.5 * (data + np.swapaxes(data, -1, -2))
+    L = np.linalg.cholesky(_positive(data) + _LITTLE * np.eye(data.shape[-1]))
+    half = np.linalg.solve(L, feigned)
+    whitened = np.linalg.solve(L, np.swapaxes(half, -1, -2))
+    return np.asarray(
+        np.linalg.eigvalsh(0.5 * (whitened + np.swapaxes(whitened, -1, -2)))[..., -1]
+    )
+
+
 def _positive(matrix: Array) -> Array:
-    """Return a symmetric matrix without its negative eigenvalues."""
+    """Return symmetric matrices without their negative eigenvalues."""
     values, vectors = np.linalg.eigh(matrix)
-    return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)
+    kept = vectors * np.maximum(values, 0.0)[..., None, :]
+    return np.asarray(kept @ np.swapaxes(vectors, -1, -2))
 
 
 def at_prior_along(
@@ -98,15 +144,18 @@ def _feigned_by(
     attachment: Attachment,
     motion: Motion,
     weight: Array,
-    minimum: Minimum,
+    evaluation: Evaluation,
     nodes: Array,
 ) -> tuple[Array, np.ndarray]:
-    """Return the expectation of the information that the motion's error adds, and its place."""
+    """Return what the motion's error is expected to add by measurement, and its place.
+
+    The first is (M, p, p) for the p columns that the second names.
+    """
     wanted = [p.name for p in problem.parameters if p.name in observation.parameters]
     columns = np.concatenate(
         [np.arange(place.start, place.stop) for place in map(problem.columns.get, wanted) if place]
     )
-    values = minimum.evaluation.parameters
+    values = evaluation.parameters
 
     def jacobian(at: Motion) -> Array:
         found = observation.linearize(at, values, wanted).d_parameters
@@ -121,7 +170,7 @@ def _feigned_by(
     )
     covariance = by_state @ P @ by_state.transpose(0, 2, 1)
     root = np.linalg.cholesky(covariance + 1e-16 * np.eye(3))
-    out = np.zeros((columns.size, columns.size))
+    out = np.zeros((attachment.node.size, columns.size, columns.size))
     for k in range(3):
         axis = np.eye(3)[k]
         waver = rotate(motion.nRb, root[:, :, k])
@@ -133,6 +182,5 @@ def _feigned_by(
             replace(motion, alpha_b=motion.alpha_b + attachment.alpha_sigma[:, None] * axis),
         ):
             change = (jacobian(changed) - base) * weight[:, :, None]
-            flat = change.reshape(-1, columns.size)
-            out += flat.T @ flat
+            out += change.transpose(0, 2, 1) @ change
     return out, columns

@@ -18,7 +18,7 @@ from factorgraph_dvl.conventions import (
     rph_from_rotation,
     rph_jacobian,
 )
-from factorgraph_dvl.graph import Problem
+from factorgraph_dvl.graph import Evaluation, Problem
 from factorgraph_dvl.preintegration import States, attach, motion_at, segment_ends
 from factorgraph_dvl.sensors.protocol import Motion, Parameter
 from factorgraph_dvl.solution import Estimate, Residuals, Solution, Trajectory, doubts
@@ -52,7 +52,7 @@ def summarise(
     chain = problem.chain
     trial = chain.trial
     evaluation = minimum.evaluation
-    estimates, covariance = _calibration(problem, minimum, covariances.information, held)
+    estimates, covariance = calibration(problem, evaluation, covariances.information, held)
     trajectory = _trajectory(problem, evaluation.states, covariances.nodes, rate_hz)
     residuals = _residuals(problem, minimum)
     warnings = [*notes]
@@ -79,10 +79,15 @@ def summarise(
     )
 
 
-def _calibration(
-    problem: Problem, minimum: Minimum, information: SquareRootInformation, held: Array
-) -> tuple[tuple[Estimate, ...], Array]:
-    chain, evaluation = problem.chain, minimum.evaluation
+def reported(
+    problem: Problem, evaluation: Evaluation
+) -> list[tuple[Parameter, Array, dict[int, Array] | None]]:
+    """Return all calibration parameters in the order in which they are reported.
+
+    Each with its value in reported units and the derivatives of that with respect to the
+    variables of the graph, by key; None for one that is fixed.
+    """
+    chain = problem.chain
     time = chain.segments.node_time
     weight = _mean_weights(time)
     gyro, accel = chain.trial.imu.parameters(float(time[-1] - time[0]))
@@ -107,10 +112,24 @@ def _calibration(
         elif p.stem in _FIRST:
             rows.append((p, value / p.si, None))
     rows.sort(key=lambda r: _FIRST.index(r[0].stem) if r[0].stem in _FIRST else len(_FIRST))
+    return rows
 
+
+def calibration(
+    problem: Problem, evaluation: Evaluation, information: SquareRootInformation, held: Array
+) -> tuple[tuple[Estimate, ...], Array]:
+    """Return the calibration with its joint covariance, in reported units.
+
+    Parameters
+    ----------
+    problem, evaluation, information : at the minimum.
+    held : as of `summarise`.
+    """
+    rows = reported(problem, evaluation)
     free = [f for _, _, f in rows if f is not None]
     joint = information.covariance_of(free)
-    joint = joint + _prior_in(problem, held, free)
+    spread = prior_along(problem, held, free)
+    joint = joint + spread @ spread.T
     total = sum(p.mean.size for p, _, _ in rows)
     covariance = np.zeros((total, total))
     is_free = np.concatenate([np.full(p.mean.size, f is not None) for p, _, f in rows])
@@ -137,9 +156,9 @@ def _calibration(
     return tuple(estimates), covariance
 
 
-def _prior_in(problem: Problem, held: Array, functionals: Sequence[dict[int, Array]]) -> Array:
-    """Return the prior covariance of functionals along the held directions."""
-    spread = problem.prior_root @ held if held.size else held
+def prior_along(problem: Problem, held: Array, functionals: Sequence[dict[int, Array]]) -> Array:
+    """Return a root (n, h) of the prior covariance of functionals along held directions."""
+    spread = problem.prior_root @ held
     by_key = {problem.key(name): spread[place] for name, place in problem.columns.items()}
     parts = []
     for functional in functionals:
@@ -149,8 +168,7 @@ def _prior_in(problem: Problem, held: Array, functionals: Sequence[dict[int, Arr
             if key in by_key:
                 part += matrix @ by_key[key]
         parts.append(part)
-    stacked = np.concatenate(parts)
-    return stacked @ stacked.T
+    return np.concatenate(parts)
 
 
 def _mean_weights(time: Array) -> Array:
