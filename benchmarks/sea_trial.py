@@ -341,7 +341,9 @@ def write_study(seeds: Sequence[Seed], out: Path) -> str:
         "at 50 m depth without, 120 s of it without bottom lock, then up. `factorgraph-dvl solve` "
         "with `dvl.calibration`, in two versions: GNSS returns at the surface, or does not. Dead "
         "reckoning is from the first fix on, with the attitude of the SINS that GNSS aided while "
-        "it was there, or with that of the smoothed solution. Errors are horizontal, over all "
+        "it was there, or with that of the smoothed solution. It keeps the error of that one fix "
+        "all the way, where smoothing averages five minutes of them: that is most of the ratio, "
+        "and all of it where the attitude is the smoothed one. Errors are horizontal, over all "
         "epochs of all seeds; the ratio is that to dead reckoning with the attitude of the SINS.",
         "",
         *dive_table(seeds),

@@ -113,9 +113,7 @@ def lever_arm_figure(result: BeforeAfter) -> Figure:
         middle.plot(time, effect.closed_form[:, i], color=color, lw=0.8, dashes=(4, 3),
                     label=f"{name}: (C(t) − C(0)) l")  # fmt: skip
     style(middle, "", "difference, m")
-    middle.legend(
-        loc="lower left", fontsize=NORMAL, ncols=2, frameon=True, framealpha=0.85, edgecolor="none"
-    )
+    middle.legend(loc="center left", fontsize=NORMAL, framealpha=0.85, edgecolor="none")
     bare, full = result.without_lever_arm.score, result.calibrated.score
     if bare is None or full is None:
         bottom.plot(time, np.hypot(effect.measured[:, 0], effect.measured[:, 1]), color=DARK)
