@@ -57,6 +57,17 @@ def test_a_prediction_claims_nothing_that_noise_would_feign():
         assert predicted.estimate(name).observable.tolist() == expected, name
 
 
+def test_one_scale_for_an_instrument_that_has_three():
+    scene = scenario(dvl={"scale_error": [0.005, 0.006, 0.004]})
+    predicted = predict(scene)
+    assert predicted.solution.estimate("scale_error").value == pytest.approx([0.005])
+    solved = solve(simulate(msgspec.structs.replace(scene, noise=True), 1))
+    claimed = std_of(solved)["scale_error"]
+    assert std_of(predicted.solution)["scale_error"] == pytest.approx(claimed, rel=0.02)
+    history, _ = go_on(predicted.scenario, [{"straight_s": 10}], predicted.ending)
+    assert np.isfinite(history.std).all()
+
+
 def test_going_on_is_as_good_as_starting_again():
     scene = scenario(current_m_s=[0.2, 0.1, 0])
     more = [{"turn_deg_s": 3, "duration_s": 30}, {"straight_s": 20}]

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+import numpy as np
+
 from factorgraph_dvl.chain import inertial_chain
 from factorgraph_dvl.conventions import Array, exp_so3
 from factorgraph_dvl.earth import LocalFrame
@@ -86,6 +88,9 @@ def _at_truth(trial: Trial, true_states: TrueStates) -> tuple[Problem, Evaluatio
     for p in parameters:
         value = trial.calibration_truth.get(p.name)
         if p.estimated and value is not None:
+            if p.mean.size < value.size:
+                # One scale is estimated of an instrument that has three.
+                value = np.mean(value, keepdims=True)
             truth[p.name] = exp_so3(value * p.si) if p.rotation else value * p.si + 0.0 * p.mean
     problem = Problem(chain, observations, parameters, start=truth)
     values = problem.values(states, {**problem.prior_values(), **truth})
