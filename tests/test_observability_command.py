@@ -116,6 +116,7 @@ def test_nothing_unobservable_stops_it(name: str, tmp_path: Path, run: Run) -> N
     if shares is not None:
         total = np.array(shares["prior"]) + np.sum(shares["segments"], axis=0)
         np.testing.assert_allclose(total, 1.0, atol=1e-6)
+        assert np.min([shares["prior"], *shares["segments"]]) >= -1e-9
     if trial.dvl is None or not trial.dvl.locked.any() or name == "held fixed":
         assert found["singular_values"] is None
         assert any("singular values" in text for text in found["missing"])
