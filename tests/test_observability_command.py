@@ -93,6 +93,9 @@ UNOBSERVABLE = {
             }
         }
     ),
+    "bias and current": lambda: under_way(
+        dvl={"reference": "water"}, trial={"dvl": {"bias_std_m_s": [1, 1, 1]}}
+    ),
     "gap": lambda: under_way(imu={"gaps_s": [[8.0, 12.0]]}),
 }
 
@@ -101,7 +104,7 @@ UNOBSERVABLE = {
 def test_nothing_unobservable_stops_it(name: str, tmp_path: Path, run: Run) -> None:
     trial = UNOBSERVABLE[name]()
     out = tmp_path / "out"
-    drawn = name in ("straight", "without GNSS")
+    drawn = name in ("straight", "without GNSS", "bias and current")
     options = [] if drawn else ["--no-figures"]
     code, _, err = run("observability", written(trial, tmp_path), "--out", out, *options)
     assert code == 0, err

@@ -57,7 +57,7 @@ class BodyMotion:
     Parameters
     ----------
     time : (M,) s.
-    v_b : (M, 3) velocity of the IMU over what it was given for, ground or water, m/s.
+    v_b : (M, 3) velocity of the IMU over ground, or through the water, m/s.
     omega_b : (M, 3) angular rate relative to the Earth, rad/s.
     """
 
