@@ -88,6 +88,9 @@ def _at_truth(trial: Trial, true_states: TrueStates) -> tuple[Problem, Evaluatio
     for p in parameters:
         value = trial.calibration_truth.get(p.name)
         if p.estimated and value is not None:
+            if p.mean.size < value.size:
+                # One scale is estimated of an instrument that has three.
+                value = np.mean(value, keepdims=True)
             truth[p.name] = exp_so3(value * p.si) if p.rotation else value * p.si + 0.0 * p.mean
     problem = Problem(chain, observations, parameters, start=truth)
     values = problem.values(states, {**problem.prior_values(), **truth})
