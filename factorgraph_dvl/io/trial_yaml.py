@@ -8,8 +8,11 @@ import msgspec
 from msgspec import UNSET, Meta, UnsetType
 
 from factorgraph_dvl.conventions import BodyAxes
+from factorgraph_dvl.sensors.beacon import BeaconSettings
 from factorgraph_dvl.sensors.catalogue import AIDS
+from factorgraph_dvl.sensors.depth import DepthSettings
 from factorgraph_dvl.sensors.imu import ImuSettings
+from factorgraph_dvl.sensors.log import HeadingSettings, LogSettings
 from factorgraph_dvl.sensors.protocol import Section, SensorSection, Sigma3, check_epoch
 
 # Sections of format 1 whose sensors this version does not know.
@@ -50,6 +53,26 @@ class ReferenceSettings(Section, frozen=True, kw_only=True):
     """Section `reference` of trial.yaml."""
 
     file: str = "reference.csv"
+
+
+class PlanarInitialSettings(Section, frozen=True, kw_only=True):
+    """Section `initial` of a planar trial.yaml."""
+
+    position: PositionSettings
+
+
+class PlanarSettings(Section, frozen=True, kw_only=True):
+    """The whole of a planar trial.yaml."""
+
+    format: Literal[1]
+    name: str = ""
+    body_axes: BodyAxes = "RFU"
+    heading: HeadingSettings
+    log: LogSettings
+    depth: DepthSettings
+    beacons: BeaconSettings
+    initial: PlanarInitialSettings | UnsetType = UNSET
+    reference: ReferenceSettings | UnsetType = UNSET
 
 
 class _Settings(Section, frozen=True, kw_only=True):
@@ -98,7 +121,7 @@ else:
     )
 
 
-def to_yaml(settings: TrialSettings) -> str:
+def to_yaml(settings: TrialSettings | PlanarSettings) -> str:
     """Return the text of trial.yaml."""
     import yaml
 

@@ -119,6 +119,7 @@ def go_on(
     sensors = {
         name: msgspec.structs.replace(truth, **{f: () for f in _INTERRUPTED if hasattr(truth, f)})
         for name, truth in {"imu": scenario.imu, **scenario.aids}.items()
+        if truth is not None
     }
     further = msgspec.structs.replace(
         scenario, start=ending.start, manoeuvres=manoeuvres, sway=shifted, **sensors

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from factorgraph_dvl.sensors.beacon import Beacons
 from factorgraph_dvl.sensors.depth import Depth
 from factorgraph_dvl.sensors.dvl import Dvl
 from factorgraph_dvl.sensors.gnss import Gnss
 from factorgraph_dvl.sensors.protocol import Aid
 from factorgraph_dvl.sensors.star import Star
 
-AIDS: tuple[type[Aid], ...] = (Gnss, Dvl, Star, Depth)
+AIDS: tuple[type[Aid], ...] = (Gnss, Dvl, Star, Depth, Beacons)

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from factorgraph_dvl.alignment import initial_states
+from factorgraph_dvl.anchoring import Anchors, anchored
 from factorgraph_dvl.attitude_alignment import attitudes, mean_mounting
 from factorgraph_dvl.chain import Chain, inertial_chain
 from factorgraph_dvl.conventions import Array
@@ -16,9 +17,10 @@ from factorgraph_dvl.errors import ConfigError
 from factorgraph_dvl.graph import Problem
 from factorgraph_dvl.increments import increments
 from factorgraph_dvl.mounting import initial_mounting
+from factorgraph_dvl.planar.hypotheses import odds_against
 from factorgraph_dvl.preintegration import Segments, States, attach, motion_at, segments
 from factorgraph_dvl.sensors.protocol import Aid, Motion, Observation, Parameter
-from factorgraph_dvl.solution import Solution
+from factorgraph_dvl.solution import Solution, joined
 from factorgraph_dvl.solvers.covariance import Posterior, posterior
 from factorgraph_dvl.solvers.feigned import at_prior_along, feigned_directions
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, Progress, minimise
@@ -56,6 +58,18 @@ class Minimised:
     notes: tuple[str, ...]
 
 
+@dataclass(frozen=True)
+class _Prepared:
+    """What every start has in common, and the starts."""
+
+    trial: Trial
+    frame: LocalFrame
+    seg: Segments
+    anchors: Anchors
+    mountings: dict[str, Array]
+    notes: tuple[str, ...]
+
+
 def solve(
     trial: Trial,
     *,
@@ -86,8 +100,12 @@ def solve(
         If no minimum can be searched for at all.
     """
     _check_above_zero("rate_hz", rate_hz)
-    found = minimised(trial, state_interval_s=state_interval_s, progress=progress)
-    return solution_of(found, rate_hz)
+    report = progress or (lambda stage, iteration, cost: None)
+    prepared = _prepare(trial, state_interval_s, report)
+    found = [_descended(prepared, states, report) for states in prepared.anchors.states]
+    solutions = [solution_of(each, rate_hz) for each in found]
+    against = odds_against([_cost_terms(each) for each in found])
+    return joined(solutions, against, prepared.anchors.hypotheses)
 
 
 def solution_of(found: Minimised, rate_hz: float) -> Solution:
@@ -109,17 +127,30 @@ def minimised(
     progress: Progress | None = None,
 ) -> Minimised:
     """Minimise the problem of a trial; arguments and errors as of `solve`."""
-    _check_above_zero("state_interval_s", state_interval_s)
     report = progress or (lambda stage, iteration, cost: None)
+    prepared = _prepare(trial, state_interval_s, report)
+    return _descended(prepared, prepared.anchors.states[0], report)
+
+
+def _prepare(trial: Trial, state_interval_s: float, report: Progress) -> _Prepared:
+    _check_above_zero("state_interval_s", state_interval_s)
     frame = trial.frame()
     report("increments", 0, None)
     inc, gaps = increments(trial.imu)
     seg = segments(inc, state_interval_s)
     report("alignment", 0, None)
     start = initial_states(trial, frame, seg)
-    notes = [*trial.notes, *gaps, *start.notes]
+    if trial.beacons is not None:
+        report("ranges", 0, None)
+    anchors = anchored(trial, frame, seg, start.states)
+    notes = (*trial.notes, *gaps, *start.notes, *anchors.notes)
+    return _Prepared(trial, frame, seg, anchors, start.mountings, notes)
 
-    states, values = start.states, None
+
+def _descended(prepared: _Prepared, states: States, report: Progress) -> Minimised:
+    trial, frame, seg = prepared.trial, prepared.frame, prepared.seg
+    rejected = prepared.anchors.rejected
+    values = None
     iterations = 0
     p_gravity = np.full_like(states.p_n, np.inf)
     for _ in range(_ROUNDS):
@@ -128,19 +159,22 @@ def minimised(
         if values is None:
             # A DVL that is calibrated does no harm from the start.
             if trial.gnss is not None and not _calibrated(trial):
-                coarse = _without_dvl(chain, states, start.mountings, report)
+                coarse = _without_dvl(chain, states, prepared.mountings, report)
                 iterations += coarse.iterations
                 states = coarse.evaluation.states
             report("mounting", 0, None)
-            values = start.mountings | _mountings(trial, frame, seg, chain.gravity_n, states)
+            values = prepared.mountings | _mountings(trial, frame, seg, chain.gravity_n, states)
         problem = Problem(chain, *_sensors(trial.aids, frame), start=values)
+        problem.reject(rejected)
         at = problem.values(states, {**problem.prior_values(), **values})
         minimum = minimise(problem, at, stage="all sensors", progress=report)
         iterations += minimum.iterations
         states, values = minimum.evaluation.states, minimum.evaluation.parameters
         same_gravity = np.sqrt(np.mean((states.p_n - p_gravity) ** 2)) <= _SAME_GRAVITY
-        if same_gravity and not problem.strayed(values):
+        outliers = problem.outliers(minimum.evaluation)
+        if same_gravity and not problem.strayed(values) and _same(outliers, rejected):
             break
+        rejected = outliers
     report("covariance", 0, None)
     covariances = posterior(problem, minimum)
     held = feigned_directions(problem, minimum, covariances)
@@ -154,7 +188,26 @@ def minimised(
         iterations += minimum.iterations
         covariances = posterior(problem, minimum)
     minimum = replace(minimum, iterations=iterations)
-    return Minimised(problem, minimum, covariances, held, tuple(notes))
+    return Minimised(problem, minimum, covariances, held, prepared.notes)
+
+
+def _same(a: Mapping[str, Array], b: Mapping[str, Array]) -> bool:
+    return a.keys() == b.keys() and all(np.array_equal(a[k], b[k]) for k in a)
+
+
+def _cost_terms(found: Minimised) -> Array:
+    """Return the terms of the cost: of each measurement, of the rest at once."""
+    evaluation = found.minimum.evaluation
+    parts = []
+    total = 0.0
+    for observation, residual, weight in zip(
+        found.problem.observations, evaluation.residuals, found.problem.weights, strict=True
+    ):
+        own = 0.5 * np.sum(residual**2, axis=1)
+        total += own.sum()
+        gate = getattr(observation, "gate", 0.0)
+        parts.append(np.where(weight[:, 0] > 0.0, own, 0.5 * gate**2))
+    return np.concatenate([*parts, [evaluation.cost - total]])
 
 
 def _check_above_zero(name: str, value: float) -> None:
