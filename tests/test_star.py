@@ -32,6 +32,7 @@ from factorgraph_dvl.kalman.steps import compose, prepare
 from factorgraph_dvl.sensors.star import Star, StarAttitude, StarSettings
 from factorgraph_dvl.simulation import plan_motion, simulate
 from factorgraph_dvl.solvers.batch import solve
+from factorgraph_dvl.solvers.state_times import dense_epochs
 
 SEEDS = int(os.environ.get("FACTORGRAPH_DVL_SEEDS", "50"))
 EPOCH = "2018-12-01T05:30:00Z"
@@ -383,6 +384,37 @@ def test_a_walking_bias_is_followed():
         assert error @ np.linalg.solve(P, error) < 16.3
 
 
+@pytest.mark.parametrize("rate", [2, 3, 10])
+@pytest.mark.parametrize("noise", [0.001, 0.005, 0.05, 0.2])
+def test_noise_of_the_gyros_between_states_counts(noise, rate):
+    scene = config(
+        "star", **SHORT, imu={"gyro_noise_deg_sqrt_h": noise}, star={"rate_hz": rate}
+    )  # fmt: skip
+    trial = simulate(scene, 1)
+    graph, filtered = solve(trial), calibrate(trial, "star")[0]
+    a, b = (s.estimate("gyro_bias_deg_h").std for s in (graph, filtered))
+    np.testing.assert_allclose(a, b, rtol=0.02)
+    # What T seconds of gyros leave of a drift, however good the stars; the prior is 5 deg/h.
+    assert a.min() > 1.0 / np.sqrt(50.0 / 3600.0 / noise**2 + 1.0 / 5.0**2)
+    time, rows, others = np.intersect1d(
+        graph.trajectory.time, filtered.trajectory.time, return_indices=True
+    )
+    assert time.size > 400
+    a, b = graph.trajectory.rph_std[rows], filtered.trajectory.rph_std[others]
+    np.testing.assert_allclose(np.median(a, axis=0), np.median(b, axis=0), rtol=0.05)
+
+
+def test_quiet_gyros_need_no_more_states(floating):
+    frame = floating.frame()
+    assert dense_epochs(floating, frame, 1.0) is None
+    noisy = replace_settings(floating.imu.settings, gyro_noise_deg_sqrt_h=0.2)
+    noisy = replace(floating, imu=replace(floating.imu, settings=noisy))
+    time = star_of(floating).time
+    np.testing.assert_array_equal(dense_epochs(noisy, frame, 1.0), time)
+    fast = replace(star_of(floating), time=time / 50.0)
+    assert np.diff(dense_epochs(replace(noisy, others=(fast,)), frame, 1.0)).min() > 0.049
+
+
 def test_stars_tell_more_of_the_misalignment():
     trial = simulate(config("seed-a-star", imu={"rate_hz": 50}), 0)
     without = solve(replace(trial, others=()))
@@ -619,3 +651,24 @@ def test_what_is_estimated_beside_the_drift_scatters_as_stated(changes):
     low, high = nees_band(3, SEEDS, 0.997)
     for runs in filter(None, (drift, mounting)):
         assert low < drift_nees(runs) < high
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("noise", "rate"), [(0.05, 2), (0.2, 10)])
+def test_with_noisy_gyros_drift_and_attitude_scatter_as_stated(noise, rate):
+    scene = config(
+        "star",
+        manoeuvres=[{"straight_s": 60}],
+        imu={"gyro_noise_deg_sqrt_h": noise},
+        star={"rate_hz": rate},
+    )
+    drift, attitude = [], []
+    for seed in range(SEEDS):
+        trial = simulate(scene, seed)
+        solution = solve(trial)
+        drift.append(drift_errors(solution, trial))
+        # Independent: one attitude of each run.
+        attitude.append(trajectory_errors(solution, trial.reference).attitude.nees[300])
+    low, high = nees_band(3, SEEDS, 0.997)
+    assert low < drift_nees(drift) < high
+    assert low < np.mean(attitude) < high

@@ -297,11 +297,13 @@ class Attitudes:
     ----------
     time : (M,) s.
     nRs : (M, 3, 3) attitude of the sensor's axes.
+    sigma : (M,) standard deviation about the axis that is known best, rad.
     mounting : the parameter sRb, with its prior.
     """
 
     time: Array
     nRs: Array
+    sigma: Array
     mounting: Parameter
 
 

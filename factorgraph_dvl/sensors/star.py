@@ -238,7 +238,8 @@ class Star:
         iRs = Rotation.from_quat(self.quaternion[known][:, [1, 2, 3, 0]]).as_matrix()
         nRe = enu_from_ecef(frame.lat, frame.lon)
         eRi = earth_from_inertial(frame.epoch, time, self.settings.ut1_utc_s)
-        return Attitudes(time, nRe @ eRi @ iRs, self.parameters()[0])
+        best = np.linalg.eigvalsh(self.covariance[known])[:, 0]
+        return Attitudes(time, nRe @ eRi @ iRs, np.sqrt(best), self.parameters()[0])
 
     def observations(self, frame: LocalFrame) -> tuple[Observation, ...]:
         """Return the attitudes that were measured.
