@@ -589,6 +589,31 @@ def test_mixed_up_quaternions_are_noticed(floating, quaternion, cause):
     assert any(cause in f.text for f in survey(wrong).problems)
 
 
+@pytest.mark.parametrize(
+    ("name", "changes"),
+    [
+        ("star", {}),
+        ("star", {"star": {"rate_hz": 10, "std_arcsec": 60}}),
+        ("star", {"star": {"rate_hz": 10, "std_arcsec": 60, "mounting_deg": MOUNTING_DEG}}),
+        # Attitudes between the samples of the gyros.
+        ("star", {"imu": {"rate_hz": 53}, "star": {"rate_hz": 3}}),
+        ("seed-a-star", {}),
+        ("seed-a-star", {"star": {"rate_hz": 10, "std_arcsec": 60}}),
+        ("seed-a-star", {"imu": {"sampling": "instantaneous"}, "star": {"rate_hz": 1}}),
+        ("seed-a-star", {"imu": {"gyro_noise_deg_sqrt_h": 0.2}}),
+    ],
+)
+def test_good_attitudes_are_not_suspected(name, changes):
+    trial = simulate(config(name, **(SHORT if name == "star" else {}), **changes), 0)
+    found = survey(trial)
+    assert not found.problems
+    assert any("its turns agree" in f.text for f in found.findings)
+    star = star_of(trial)
+    inverse = replace(star, quaternion=star.quaternion * [1, -1, -1, -1])
+    problems = survey(replace(trial, others=(inverse,))).problems
+    assert any("inertial to body" in f.text for f in problems)
+
+
 def test_mixed_up_stars_are_noticed():
     trial = simulate(config("star", **SHORT, star={"stars": PRINTED.tolist()}), 0)
     assert not survey(trial).problems

@@ -8,13 +8,18 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from factorgraph_dvl.analysis.finding import Finding
+from factorgraph_dvl.analysis.records import GAP_INTERVALS
 from factorgraph_dvl.celestial import ARCSEC
 from factorgraph_dvl.conventions import DEG, Array
 from factorgraph_dvl.sensors.imu import Imu
 from factorgraph_dvl.sensors.star import Star
 
-# Longest interval between two attitudes, s, over which a mean rate tells the turn.
-_LONGEST = 1.1
+# Attitudes that follow each other are compared, or where their noise is too large those about
+# 1 s apart; none further apart than the last.
+_SPANS = (0.0, 1.0)
+_LONGEST = 1.6
+# Noise of a turn between two attitudes, relative to the turns, that still tells conventions.
+_QUIET = 0.5
 # Least rms turn rate, rad/s, that tells conventions apart: the Earth's alone does not.
 _TURNING = 0.05 * DEG
 _AGREE = 0.2
@@ -60,26 +65,34 @@ def _convention(star: Star, imu: Imu) -> Iterator[Finding]:
         return
     known = np.logical_not(star.missing)
     time, quaternion = star.time[known], star.quaternion[known]
-    begin, end = time[:-1], time[1:]
-    use = (end - begin < _LONGEST) & (begin >= imu.time[0]) & (end <= imu.time[-1])
-    if use.sum() < 3:
-        return
-    sums = np.vstack([np.zeros(3), np.cumsum(imu.gyro, axis=0)])
-    i, j = (np.searchsorted(imu.time, t[use], side="right") for t in (begin, end))
-    rate = (sums[j] - sums[i]) / np.maximum(j - i, 1)[:, None]
-    if _rms(rate) < _TURNING:
-        return
     sRb = Rotation.from_rotvec(np.array(star.settings.mounting_deg) * DEG)
+    variance = np.trace(star.covariance[known], axis1=1, axis2=2)
+    for span in _SPANS:
+        first, second = _pairs(time, imu.time, span)
+        if first.size < 3:
+            return
+        begin, end = time[first], time[second]
+        turns = _turns(imu, begin, end)
+        size = _rms(turns.as_rotvec())
+        walk = 3.0 * imu.settings.gyro_noise_root_psd**2 * (end - begin)
+        noise = float(np.sqrt(np.mean(variance[first] + variance[second] + walk))) / size
+        if noise < _QUIET:
+            break
+    else:
+        return
+    if _rms(turns.as_rotvec() / (end - begin)[:, None]) < _TURNING:
+        return
 
     def misfit(scalar_last: Array, inverse: bool) -> float:
         iRs = Rotation.from_quat(scalar_last)
         iRb = (iRs.inv() if inverse else iRs) * sRb
-        turn = (iRb[:-1].inv() * iRb[1:]).as_rotvec()
-        return _rms(turn[use] / (end - begin)[use, None] - rate) / _rms(rate)
+        return _rms((turns.inv() * iRb[first].inv() * iRb[second]).as_rotvec()) / size
 
+    # The mean of squares of noise scatters itself.
+    limit = float(np.hypot(_AGREE, noise * np.sqrt(1.0 + 4.0 / np.sqrt(first.size))))
     right = quaternion[:, [1, 2, 3, 0]]
     stated = misfit(right, False)
-    if stated < _AGREE:
+    if stated < limit:
         text = f"its turns agree with those of the gyros to {100.0 * stated:.2g} %"
         yield Finding("ok", star.label, text)
         return
@@ -89,12 +102,44 @@ def _convention(star: Star, imu: Imu) -> Iterator[Finding]:
         "is the scalar last, and is it that of inertial to body?": misfit(quaternion, True),
     }
     best = min(candidates, key=lambda text: candidates[text])
-    cause = best if candidates[best] < _AGREE else "is `mounting_deg` right?"
+    cause = best if candidates[best] < limit else "is `mounting_deg` right?"
     yield Finding(
         "error",
         star.label,
         f"its turns differ from those of the gyros by {100.0 * stated:.3g} %: {cause}",
     )
+
+
+def _pairs(time: Array, imu_time: Array, span: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return pairs of attitudes at least `span` s apart, but not by much, while the IMU runs."""
+    first = np.arange(time.size - 1)
+    second = np.maximum(np.searchsorted(time, time[:-1] + span - 1e-6), first + 1)
+    inside = second < time.size
+    first, second = first[inside], second[inside]
+    begin, end = time[first], time[second]
+    # Not across a gap of the gyros.
+    steps = np.diff(imu_time)
+    gaps = np.append(0, np.cumsum(steps > GAP_INTERVALS * np.median(steps)))
+    i, j = (np.clip(np.searchsorted(imu_time, t), 0, gaps.size - 1) for t in (begin, end))
+    use = (end - begin < _LONGEST) & (begin >= imu_time[0]) & (end <= imu_time[-1])
+    use &= gaps[i] == gaps[j]
+    return first[use], second[use]
+
+
+def _turns(imu: Imu, begin: Array, end: Array) -> Rotation:
+    """Return the rotations by the gyros from `begin` to `end`, (M,), s, sample by sample."""
+    rate = imu.gyro
+    if imu.settings.sampling == "instantaneous":
+        rate = np.vstack([rate[:1], 0.5 * (rate[1:] + rate[:-1])])
+    first, last = (np.searchsorted(imu.time, t) for t in (begin, end))
+    turn = Rotation.identity(begin.size)
+    for j in range(int((last - first).max()) + 1):
+        i = np.minimum(first + j, last)
+        since = np.maximum(begin, imu.time[np.maximum(i - 1, 0)])
+        until = np.minimum(end, imu.time[i])
+        over = np.where(first + j <= last, np.maximum(until - since, 0.0), 0.0)
+        turn = turn * Rotation.from_rotvec(rate[i] * over[:, None])
+    return turn
 
 
 def _rms(vectors: Array) -> float:
