@@ -626,6 +626,38 @@ def test_mixed_up_stars_are_noticed():
     assert any("catalogue" in f.text for f in problems)
 
 
+# A star as far off as aberration takes it, and one that is another.
+@pytest.mark.parametrize(("off_arcsec", "severity"), [(20.0, "warning"), (3600.0, "error")])
+def test_a_star_that_does_not_fit_its_catalogue_is_named(off_arcsec, severity):
+    bright = [[1, 0, 0], [0.6, 0.8, 0], [0.6, 0, 0.8], [0.8, -0.36, 0.48], [0.8, 0.36, -0.48]]
+    trial = simulate(config("star", **SHORT, star={"stars": bright}), 0)
+    star = star_of(trial)
+    assert star.misfit == pytest.approx(1.0, abs=0.1)
+    assert star.doubts() == ()
+    v = star.vectors
+    moved = v.inertial.copy()
+    moved[2::5] = Rotation.from_rotvec([0, off_arcsec * ARCSEC, 0]).apply(moved[2::5])
+    wrong = Star.from_vectors(star.settings, v.time, v.body, moved, "star.csv")
+    trial = replace(trial, others=(wrong,))
+    expected = "not to be used" if severity == "error" else "too small"
+    for solution in (solve(trial), calibrate(trial, "star")[0]):
+        (said,) = (w for w in solution.warnings if "catalogue" in w)
+        assert "star.csv line 4" in said
+        assert expected in said
+    (problem,) = survey(trial).problems
+    assert problem.severity == severity
+    assert "star.csv line 4" in problem.text
+
+
+def test_a_few_stars_may_scatter_more():
+    rng = np.random.default_rng(0)
+    catalogue = PRINTED[1:] / np.linalg.norm(PRINTED[1:], axis=1)[:, None]
+    body = catalogue + rng.normal(0.0, 2.0 * 5.0 * ARCSEC, catalogue.shape)
+    # Twice as much, but of one degree of freedom.
+    star = Star.from_vectors(StarSettings(), np.zeros(2), body, catalogue, "star.csv")
+    assert star.doubts() == ()
+
+
 # Monte Carlo
 
 

@@ -7,9 +7,8 @@ from collections.abc import Iterator
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from factorgraph_dvl.analysis.finding import Finding
+from factorgraph_dvl.analysis.finding import Finding, Severity
 from factorgraph_dvl.analysis.records import GAP_INTERVALS
-from factorgraph_dvl.celestial import ARCSEC
 from factorgraph_dvl.conventions import DEG, Array
 from factorgraph_dvl.sensors.imu import Imu
 from factorgraph_dvl.sensors.star import Star
@@ -23,6 +22,7 @@ _QUIET = 0.5
 # Least rms turn rate, rad/s, that tells conventions apart: the Earth's alone does not.
 _TURNING = 0.05 * DEG
 _AGREE = 0.2
+# Misfit of stars to their catalogue from which on it is more than a sigma stated too small.
 _MISFIT = 3.0
 
 
@@ -34,29 +34,10 @@ def star_findings(star: Star, epoch: str, imu: Imu) -> Iterator[Finding]:
             star.label,
             "trial.yaml has no `epoch`, and stars tell the attitude only at a known time",
         )
-    yield from _identification(star)
+    for text in star.doubts():
+        severity: Severity = "error" if star.misfit > _MISFIT else "warning"
+        yield Finding(severity, star.label, text.removeprefix(f"{star.label}: "))
     yield from _convention(star, imu)
-
-
-def _identification(star: Star) -> Iterator[Finding]:
-    """Hold the angles between measured directions against the catalogue's."""
-    vectors = star.vectors
-    if vectors is None:
-        return
-    count = np.diff(np.append(vectors.first, vectors.time.size))
-    iRs = Rotation.from_quat(np.repeat(star.quaternion[:, [1, 2, 3, 0]], count, axis=0))
-    away = np.linalg.norm(iRs.apply(vectors.body) - vectors.inertial, axis=1)
-    # Two components across each direction, less three of the attitude.
-    freedom = 2 * count.sum() - 3 * count.size
-    sigma = float(np.max(star.settings.std_arcsec)) * ARCSEC
-    misfit = float(np.sqrt(np.sum(away**2) / max(freedom, 1))) / sigma
-    if misfit > _MISFIT:
-        yield Finding(
-            "error",
-            star.label,
-            f"the angles between stars differ from the catalogue's by {misfit:.0f} times "
-            "`std_arcsec`: is a star another one, or are columns mixed up?",
-        )
 
 
 def _convention(star: Star, imu: Imu) -> Iterator[Finding]:

@@ -132,7 +132,7 @@ def _summary(
     values, covariance = estimated.reported()
     estimates = estimates_of(estimated.parameters, values, covariance)
     residuals = (_star_residuals(star, courses, seen), *gnss_residuals(trial, navigation))
-    notes = [*navigation.notes]
+    notes = [*navigation.notes, *star.doubts()]
     if np.any(np.array(star.settings.mounting_std_deg) > 0.0):
         notes.append(
             "star does not estimate star_mounting_deg: held at "

@@ -117,6 +117,7 @@ def minimised(
     report("alignment", 0, None)
     start = initial_states(trial, frame, seg)
     notes = [*trial.notes, *gaps, *start.notes]
+    notes += [doubt for seen in attitudes(trial, frame) for doubt in seen.doubts]
 
     states, values = start.states, None
     iterations = 0
