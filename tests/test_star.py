@@ -626,6 +626,60 @@ def test_mixed_up_stars_are_noticed():
     assert any("catalogue" in f.text for f in problems)
 
 
+def test_a_wrong_epoch_is_noticed(floating):
+    late = replace(floating, epoch="2018-12-01T06:30:00Z")
+    assert any("`epoch`" in f.text for f in survey(late).problems)
+    assert any("`epoch`" in w for w in calibrate(late, "star")[0].warnings)
+    assert not any("`epoch`" in w for w in calibrate(floating, "star")[0].warnings)
+
+
+def test_an_unknown_mounting_is_not_for_the_filter(tmp_path, capsys):
+    trial = simulate(config("star", **SHORT, trial=UNKNOWN), 1)
+    save_trial(trial, tmp_path / "trial")
+    command = ("kalman", "--method", "star", tmp_path / "trial", "--out", tmp_path / "out")
+    code, shown = run(capsys, *command, "--quiet")
+    assert code == 2
+    assert "star.mounting_std_deg" in shown.err
+    assert not (tmp_path / "out").exists()
+
+
+def test_what_the_filter_does_not_know_of_the_mounting_is_in_its_sigma():
+    prior = {"star": {"mounting_deg": [0, 0, 0], "mounting_std_deg": [1, 1, 1]}}
+    errors = []
+    for off in np.eye(3):
+        star = {"mounting_deg": off.tolist()}
+        trial = simulate(config("star", **SHORT, noise=False, star=star, trial=prior))
+        solution = calibrate(trial, "star")[0]
+        errors.append(drift_errors(solution, trial)[0])
+        attitude = trajectory_errors(solution, trial.reference).attitude
+        np.testing.assert_allclose(np.sqrt(attitude.nees), 1.0, atol=0.1)
+    # Off by one sigma about each axis: the squares of the errors add up to the variance.
+    scatter = np.sqrt(np.sum(np.square(errors), axis=0))
+    assert scatter.min() > 0.2
+    np.testing.assert_allclose(solution.estimate("gyro_bias_deg_h").std, scatter, rtol=0.3)
+
+
+@pytest.mark.parametrize(
+    "star",
+    [
+        {"std_arcsec": [3, 6, 40], "mounting_deg": MOUNTING_DEG, "ut1_utc_s": 0.4},
+        {"stars": PRINTED.tolist(), "mounting_deg": MOUNTING_DEG},
+    ],
+    ids=["unequal", "vectors"],
+)
+def test_filter_and_graph_agree_on_attitude_and_sigma(star):
+    trial = simulate(config("star", **SHORT, star=star), 5)
+    graph, filtered = solve(trial), calibrate(trial, "star")[0]
+    (a, P), (b, Q) = (drift_errors(s, trial) for s in (graph, filtered))
+    np.testing.assert_allclose(np.sqrt(np.diag(P)), np.sqrt(np.diag(Q)), rtol=0.02)
+    assert np.abs((a - b) / np.sqrt(np.diag(P))).max() < 0.2
+    _, i, j = np.intersect1d(graph.trajectory.time, filtered.trajectory.time, return_indices=True)
+    sigma = graph.trajectory.rph_std[i]
+    np.testing.assert_allclose(sigma, filtered.trajectory.rph_std[j], rtol=0.05)
+    away = (graph.trajectory.rph[i] - filtered.trajectory.rph[j]) / sigma
+    assert np.abs(away).max() < 0.3
+
+
 # A star as far off as aberration takes it, and one that is another.
 @pytest.mark.parametrize(("off_arcsec", "severity"), [(20.0, "warning"), (3600.0, "error")])
 def test_a_star_that_does_not_fit_its_catalogue_is_named(off_arcsec, severity):

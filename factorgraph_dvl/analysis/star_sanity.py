@@ -9,9 +9,11 @@ from scipy.spatial.transform import Rotation
 
 from factorgraph_dvl.analysis.finding import Finding, Severity
 from factorgraph_dvl.analysis.records import GAP_INTERVALS
+from factorgraph_dvl.celestial import off_vertical
 from factorgraph_dvl.conventions import DEG, Array
 from factorgraph_dvl.sensors.imu import Imu
 from factorgraph_dvl.sensors.star import Star
+from factorgraph_dvl.trial import Trial
 
 # Attitudes that follow each other are compared, or where their noise is too large those about
 # 1 s apart; none further apart than the last.
@@ -22,13 +24,16 @@ _QUIET = 0.5
 # Least rms turn rate, rad/s, that tells conventions apart: the Earth's alone does not.
 _TURNING = 0.05 * DEG
 _AGREE = 0.2
+# The same of the vertical, rad, where the mounting is known at least so well, deg.
+_OFF_VERTICAL = 2.0 * DEG
+_KNOWN_MOUNTING_DEG = 0.5
 # Misfit of stars to their catalogue from which on it is more than a sigma stated too small.
 _MISFIT = 3.0
 
 
-def star_findings(star: Star, epoch: str, imu: Imu) -> Iterator[Finding]:
+def star_findings(star: Star, trial: Trial) -> Iterator[Finding]:
     """Check epoch, stars and convention of a star tracker."""
-    if not epoch:
+    if not trial.epoch:
         yield Finding(
             "error",
             star.label,
@@ -37,7 +42,32 @@ def star_findings(star: Star, epoch: str, imu: Imu) -> Iterator[Finding]:
     for text in star.doubts():
         severity: Severity = "error" if star.misfit > _MISFIT else "warning"
         yield Finding(severity, star.label, text.removeprefix(f"{star.label}: "))
-    yield from _convention(star, imu)
+    convention = list(_convention(star, trial.imu))
+    yield from convention
+    # What mixes up the quaternion turns the vertical too.
+    if trial.epoch and not any(f.severity == "error" for f in convention):
+        yield from _vertical(star, trial)
+
+
+def _vertical(star: Star, trial: Trial) -> Iterator[Finding]:
+    """Hold the vertical by the stars against that of the specific force."""
+    unknown = max(star.settings.mounting_std_deg) > _KNOWN_MOUNTING_DEG
+    if unknown or (trial.gnss is None and trial.initial_position is None):
+        return
+    seen = star.attitudes(trial.frame())
+    imu = trial.imu
+    use = (seen.time >= imu.time[0]) & (seen.time <= imu.time[-1])
+    if not use.any():
+        return
+    sRb = Rotation.from_rotvec(np.array(star.settings.mounting_deg) * DEG).as_matrix()
+    away = off_vertical(seen.time[use], seen.nRs[use] @ sRb, imu.time, imu.accel)
+    if away > _OFF_VERTICAL:
+        yield Finding(
+            "error",
+            star.label,
+            f"its attitudes put the vertical {np.degrees(away):.1f} deg away from that of the "
+            "specific force: are `epoch` (UTC of time_s = 0) and `mounting_deg` right?",
+        )
 
 
 def _convention(star: Star, imu: Imu) -> Iterator[Finding]:
