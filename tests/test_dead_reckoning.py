@@ -280,7 +280,26 @@ def test_command_takes_the_attitude_of_a_solution_or_the_reference(run, folder, 
         )  # fmt: skip
         assert result.code == 0, result.err
         found[source] = json.loads((out / "deadreckon.json").read_text())["end_point_error_m"]
+        assert ("is that of trial" in result.err) == (source != "reference")
     assert np.ptp(list(found.values())) < 1e-6
+
+
+def test_a_score_that_ends_before_the_track_says_so(run, folder, tmp_path):  # noqa: F811
+    from factorgraph_dvl.io.trial_folder import load_trial
+
+    trial = load_trial(folder / "trial")
+    early = trial.reference.time <= 20.0
+    r = trial.reference
+    short = Reference(r.time[early], r.geodetic[early], r.velocity[early], r.rph[early])
+    save_trial(replace(trial, reference=short), tmp_path / "trial")
+    result = run(
+        "deadreckon", tmp_path / "trial", "--calibration", folder / "trial" / "truth.json",
+        "--out", tmp_path / "out", "--no-figures",
+    )  # fmt: skip
+    assert result.code == 0, result.err
+    assert "reference ends at 20.0 s" in result.err
+    data = json.loads((tmp_path / "out" / "deadreckon.json").read_text())
+    assert data["scored_until_s"] == pytest.approx(20.0, abs=0.11)
 
 
 BAD = {

@@ -108,6 +108,12 @@ def test_text_is_yaml_and_states_the_commands():
     assert data["scale_factor"] == pytest.approx([1.0 / 1.0177], abs=1e-6)
 
 
+def test_axes_that_cannot_be_trdi_s_are_named():
+    for body_axes, said in (("RFU", False), ("FRD", True)):
+        text = instrument_text(instrument_of(calibrated([0.0, 0.0, 45.0], body_axes)), "a trial")
+        assert ("NOT TO BE TYPED IN" in text) == said
+
+
 def test_half_a_turn_is_within_the_range_of_the_command():
     text = instrument_text(instrument_of(calibrated([0.0, 0.0, -180.0])), "cruise")
     assert yaml.safe_load(text)["trdi"]["EA"] == 18000

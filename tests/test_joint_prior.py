@@ -29,6 +29,20 @@ ALPHA_DEG = np.array([10.0, -25.0, 130.0])
 NAMES = ("misalignment_deg", "scale_error", "lever_arm_m")
 
 
+def component_of(name, label):
+    """Name of a component as in `covariance.order`."""
+    if label == " ":
+        return name
+    if name == "scale_error":
+        return f"{name}_{label}"
+    stem, unit = {
+        "misalignment_deg": ("misalignment", "deg"),
+        "lever_arm_m": ("lever_arm", "m"),
+        "gyro_bias_deg_h": ("gyro_bias", "deg_h"),
+    }[name]
+    return f"{stem}_{label}_{unit}"
+
+
 def calibration(*, alpha=ALPHA_DEG, converged=True, body_axes="RFU", scale=1):
     """A calibration of seven correlated parameters, and a gyro bias that is nobody's business."""
     values = {
@@ -47,7 +61,7 @@ def calibration(*, alpha=ALPHA_DEG, converged=True, body_axes="RFU", scale=1):
     for name, v in values.items():
         own = std[at : at + v.size]
         at += v.size
-        names = tuple(f"{name}{i}" for i in range(v.size))
+        names = tuple(component_of(name, label) for label in ("xyz" if v.size > 1 else " "))
         estimates.append(Estimate(name, names, v, own, v, own, np.ones(v.size, dtype=bool)))
     return Calibration(
         "before", "batch", body_axes, converged, 1, 0.0, tuple(estimates), P
@@ -187,11 +201,23 @@ BAD = {
     ),
     "a number missing": (
         lambda d: d["parameters"]["lever_arm_m"]["value"].__setitem__(1, None),
-        "lever_arm_m is not a number",
+        "lever_arm_m holds no number",
     ),
     "negative variance": (
         lambda d: d["covariance"]["matrix"][0].__setitem__(0, -1.0),
-        "the covariance is not one",
+        "do not agree",
+    ),
+    "another variance": (
+        lambda d: d["covariance"]["matrix"][4].__setitem__(4, 9.0),
+        "do not agree",
+    ),
+    "a name twice": (
+        lambda d: d["covariance"]["order"].__setitem__(0, d["covariance"]["order"][1]),
+        "does not name the components of",
+    ),
+    "no scale left": (
+        lambda d: d["parameters"]["scale_error"].update(value=[-1.0]),
+        "scale_error is -1; expected numbers above -1",
     ),
     "not symmetric": (
         lambda d: d["covariance"]["matrix"][0].__setitem__(1, 0.03),
@@ -208,6 +234,30 @@ def test_bad_calibrations_are_named(tmp_path, case):
     with pytest.raises(DataError, match=message) as caught:
         load_trial(path)
     assert "before.json" in str(caught.value)
+
+
+def test_rows_of_the_covariance_go_by_their_names(tmp_path):
+    path = write_calibrated(tmp_path, calibration())
+    expected = load_trial(path).dvl.prior.covariance
+
+    def shuffled(data):
+        order, matrix = data["covariance"]["order"], data["covariance"]["matrix"]
+        rows = np.random.default_rng(1).permutation(len(order))
+        data["covariance"]["order"] = [order[i] for i in rows]
+        data["covariance"]["matrix"] = np.array(matrix)[np.ix_(rows, rows)].tolist()
+
+    (tmp_path / "before.json").write_text(corrupted(shuffled))
+    np.testing.assert_array_equal(load_trial(path).dvl.prior.covariance, expected)
+
+
+def test_a_calibration_that_states_no_axes_is_in_those_of_the_trial(tmp_path):
+    path = write_calibrated(tmp_path, calibration())
+    settings = path / "trial.yaml"
+    settings.write_text(settings.read_text().replace("body_axes: RFU", "body_axes: FRD"))
+    (tmp_path / "before.json").write_text(corrupted(lambda d: d.pop("body_axes")))
+    np.testing.assert_allclose(
+        load_trial(path).dvl.prior_means()["misalignment_deg"], np.radians(ALPHA_DEG)
+    )
 
 
 def test_a_file_that_is_missing_or_no_json_is_named(tmp_path):

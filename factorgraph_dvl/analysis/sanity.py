@@ -64,7 +64,7 @@ def findings(trial: Trial, sensors: list[SensorSurvey]) -> Iterator[Finding]:
         yield from _dvl_findings(trial.dvl, trial.gnss, trial.body_axes)
     for aid in trial.others:
         if isinstance(aid, Star):
-            yield from star_findings(aid, trial.epoch, trial.imu)
+            yield from star_findings(aid, trial)
 
 
 def _clock_findings(sensors: list[SensorSurvey]) -> Iterator[Finding]:

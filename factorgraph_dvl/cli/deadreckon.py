@@ -22,6 +22,10 @@ if TYPE_CHECKING:
     from factorgraph_dvl.trial import Trial
 
 
+# Of a track, s, that may be left unscored without a word.
+_UNSCORED_S = 10.0
+
+
 def deadreckon(
     trial_path: TrialPath,
     calibration: Annotated[
@@ -96,6 +100,12 @@ def deadreckon(
         stdout().print(
             f"{distance:.6g} m, scored by {result.scored_by}", markup=False, soft_wrap=True
         )
+        end, last = result.calibrated.score.time[-1], result.calibrated.track.time[-1]
+        if last - end > _UNSCORED_S:
+            warn(
+                f"{result.scored_by} ends at {end:.1f} s and the track at {last:.1f} s: distance "
+                "and errors are those up to there"
+            )
     for note in (*trial.notes, *notes):
         warn(note)
     if trial.dvl is not None and trial.dvl.settings.reference == "water":
@@ -143,6 +153,8 @@ def _attitude(trial: Trial, source: str, align: float | None) -> tuple[Attitude,
             expected="sins, reference, or a solution folder",
         )
     solution = load_solution(source)
+    if solution.trial != trial.name:
+        warn(f"the attitude in {source} is that of trial {solution.trial}, not of {trial.name}")
     names = [e.name for e in solution.estimates]
     bias = np.zeros(3)
     if "gyro_bias_deg_h" in names:

@@ -14,6 +14,7 @@ from factorgraph_dvl.errors import ConfigError, DataError
 from factorgraph_dvl.io.calibration_file import (
     CALIBRATION_FILE,
     check_usable,
+    check_values,
     load_calibration,
 )
 from factorgraph_dvl.io.motion_table import read_reference
@@ -245,7 +246,7 @@ def read_calibration_values(path: Path | str, body_axes: BodyAxes) -> dict[str, 
     path = Path(path)
     whole = path.is_dir() or (path.suffix.lower() == ".json" and '"covariance"' in read_text(path))
     if whole:
-        calibration = load_calibration(path)
+        calibration = load_calibration(path, body_axes=body_axes)
         check_usable(calibration, body_axes, str(path))
         values = {n: v for n, v in calibration.values.items() if n in _KNOWN}
     else:
@@ -254,8 +255,7 @@ def read_calibration_values(path: Path | str, body_axes: BodyAxes) -> dict[str, 
         if says not in (UNSET, body_axes):
             raise DataError(f"is in {says} axes", where=str(path), expected=body_axes)
     for name, value in values.items():
-        if not np.isfinite(value).all():
-            raise DataError(f"{name} is not a number", where=str(path), expected="finite numbers")
+        check_values(name, value, str(path))
     return values
 
 

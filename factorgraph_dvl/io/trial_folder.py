@@ -188,7 +188,7 @@ def _with_calibration(dvl: Dvl, folder: Path, body_axes: BodyAxes) -> Dvl:
             where=SETTINGS_FILE,
             expected=f"a calibration.json at {path}",
         )
-    return calibrated_by(dvl, load_calibration(path), body_axes, source=name)
+    return calibrated_by(dvl, load_calibration(path, body_axes=body_axes), body_axes, source=name)
 
 
 def calibrated_by(dvl: Dvl, calibration: Calibration, body_axes: BodyAxes, source: str) -> Dvl:

@@ -54,6 +54,8 @@ def _errors(run: Run) -> dict[str, Any]:
     at = int(np.argmax(s.horizontal))
     end, largest = float(s.horizontal[-1]), float(s.horizontal[at])
     return {
+        "scored_from_s": float(s.time[0]),
+        "scored_until_s": float(s.time[-1]),
         "distance_m": s.path.total,
         "end_point_error_m": end,
         "end_point_percent": s.percent(end),

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
+
 from factorgraph_dvl.analysis.instrument import ORDERS, Angles, Instrument, Order
 from factorgraph_dvl.conventions import Array
 from factorgraph_dvl.report.text import fixed
@@ -55,6 +57,7 @@ def instrument_text(instrument: Instrument, name: str) -> str:
         "# instrument. They hold for a DVL that looks down, if the trial was recorded in",
         "# instrument coordinates (aligned: X to starboard, Y, beam 3, ahead, Z up) with EA, EI",
         "# and EJ at 0, and if the body axes are parallel to those of the ship.",
+        *(_NOT_TRDI if np.max(np.abs(i.alignment[1:])) > _UPSIDE_DOWN_DEG else ()),
         "trdi:",
         *[
             f"  {name}: {_hundredths(value)}                 # {_command(name, value)}, "
@@ -65,6 +68,14 @@ def instrument_text(instrument: Instrument, name: str) -> str:
         ],
     ]
     return "\n".join(lines) + "\n"
+
+
+# No DVL that looks down is mounted with more.
+_UPSIDE_DOWN_DEG = 90.0
+_NOT_TRDI = (
+    "# NOT TO BE TYPED IN: with these the instrument would look up. The DVL's data in this",
+    "# trial are in other axes than TRDI's; turn them into those, and calibrate again.",
+)
 
 
 def _angles(by_order: dict[Order, Angles]) -> list[str]:

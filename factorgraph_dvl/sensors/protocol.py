@@ -21,6 +21,11 @@ Vector3 = tuple[float, float, float]
 Sigma3 = tuple[NonNegative, NonNegative, NonNegative]
 Values = Mapping[str, Array]
 
+# Residuals larger than stated by this factor make every standard deviation too small, and by
+# the second the model is another than the data's.
+TOO_LARGE = 1.3
+DO_NOT_FIT = 10.0
+
 
 # Rounding may leave a correlation matrix with an eigenvalue this far below zero.
 _NEGATIVE = 1e-6
@@ -297,12 +302,16 @@ class Attitudes:
     ----------
     time : (M,) s.
     nRs : (M, 3, 3) attitude of the sensor's axes.
+    sigma : (M,) standard deviation about the axis that is known best, rad.
     mounting : the parameter sRb, with its prior.
+    doubts : what the record says against itself, for people.
     """
 
     time: Array
     nRs: Array
+    sigma: Array
     mounting: Parameter
+    doubts: tuple[str, ...] = ()
 
 
 @runtime_checkable

@@ -24,12 +24,10 @@ from factorgraph_dvl.solution import Solution, joined
 from factorgraph_dvl.solvers.covariance import Posterior, posterior
 from factorgraph_dvl.solvers.feigned import at_prior_along, feigned_directions
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, Progress, minimise
+from factorgraph_dvl.solvers.state_times import STATE_INTERVAL, dense_epochs
 from factorgraph_dvl.solvers.summary import summarise
 from factorgraph_dvl.trial import Trial
 
-# States this far apart, s, are as good as denser ones: every measurement hangs on the
-# state before it through the increments up to its own time.
-STATE_INTERVAL = 1.0
 # Root mean square error of the positions at which gravity was taken, m: 1 m turns it by
 # 0.16 micro-g.
 _SAME_GRAVITY = 2.0
@@ -84,7 +82,8 @@ def solve(
     trial : Trial
     rate_hz : rate of the trajectory in the solution; the solver's states are independent
         of it.
-    state_interval_s : time between the states of the graph.
+    state_interval_s : time between the states of the graph; less where the noise of the
+        gyros in between matters to a sensor of attitude.
     progress : called with stage, iteration and cost (None where there is none yet).
 
     Returns
@@ -137,13 +136,14 @@ def _prepare(trial: Trial, state_interval_s: float, report: Progress) -> _Prepar
     frame = trial.frame()
     report("increments", 0, None)
     inc, gaps = increments(trial.imu)
-    seg = segments(inc, state_interval_s)
+    seg = segments(inc, state_interval_s, dense_epochs(trial, frame, state_interval_s))
     report("alignment", 0, None)
     start = initial_states(trial, frame, seg)
     if trial.beacons is not None:
         report("ranges", 0, None)
     anchors = anchored(trial, frame, seg, start.states)
-    notes = (*trial.notes, *gaps, *start.notes, *anchors.notes)
+    doubts = [doubt for seen in attitudes(trial, frame) for doubt in seen.doubts]
+    notes = (*trial.notes, *gaps, *start.notes, *doubts, *anchors.notes)
     return _Prepared(trial, frame, seg, anchors, start.mountings, notes)
 
 

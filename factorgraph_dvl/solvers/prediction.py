@@ -14,7 +14,7 @@ from factorgraph_dvl.increments import increments
 from factorgraph_dvl.information import InformationHistory
 from factorgraph_dvl.preintegration import States, segments
 from factorgraph_dvl.solution import Solution
-from factorgraph_dvl.solvers.batch import STATE_INTERVAL, Minimised, solution_of
+from factorgraph_dvl.solvers.batch import Minimised, solution_of
 from factorgraph_dvl.solvers.covariance import posterior
 from factorgraph_dvl.solvers.feigned import feigned_directions
 from factorgraph_dvl.solvers.information_history import (
@@ -24,6 +24,7 @@ from factorgraph_dvl.solvers.information_history import (
     run_filter,
 )
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, eliminate
+from factorgraph_dvl.solvers.state_times import STATE_INTERVAL, dense_epochs
 from factorgraph_dvl.trial import Trial
 
 TrueStates = Callable[[LocalFrame, Array], States]
@@ -79,7 +80,7 @@ def continue_posterior(
 def _at_truth(trial: Trial, true_states: TrueStates) -> tuple[Problem, Evaluation]:
     frame = trial.frame()
     inc, _ = increments(trial.imu)
-    seg = segments(inc, STATE_INTERVAL)
+    seg = segments(inc, STATE_INTERVAL, dense_epochs(trial, frame, STATE_INTERVAL))
     states = true_states(frame, seg.node_time)
     chain = inertial_chain(trial, frame, seg, states)
     observations = [o for aid in trial.aids for o in aid.observations(frame)]
