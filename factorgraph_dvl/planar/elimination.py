@@ -6,7 +6,7 @@ import numpy as np
 from scipy.linalg import cho_solve_banded, cholesky_banded
 
 from factorgraph_dvl.conventions import Array
-from factorgraph_dvl.planar.model import Evaluation, PlanarProblem, misfit
+from factorgraph_dvl.planar.model import Evaluation, PlanarProblem, changes, misfit
 
 # What a step is trusted for once one has failed, m; for the constants it is their prior sigma.
 _TRUSTED_M = 50.0
@@ -53,6 +53,14 @@ class System:
         off += before.transpose(0, 2, 1) @ info @ after
         corner = corner + np.einsum("kic,kid->cd", by_theta, weighted)
         h = h + np.einsum("kic,ki->c", by_theta, pull)
+
+        smooth = problem.change_info[: n - 1]
+        pull = np.einsum("kij,kj->ki", smooth, changes(problem, x))
+        diagonal[:-1, 2:, 2:] += smooth
+        diagonal[1:, 2:, 2:] += smooth
+        off[:, 2:, 2:] -= smooth
+        g[:-1, 2:] += pull
+        g[1:, 2:] -= pull
 
         node = problem.ranging.node[: at.range_residual.size]
         for residual, by_x, by_constants, weight in (

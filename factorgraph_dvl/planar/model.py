@@ -4,12 +4,16 @@
     r       = (1 + e) |x|,                x = p_k + arm - place - offset
     dr/dt   = (1 + e) xᵀ v / |x|,         v = R(b)ᵀ w_k / (1 + s) - n_k + c + v_arm
 
+    w_{k+1} - n_{k+1} = w_k - n_k + N(0, Q_k)
+
 with the reckoned displacement d and velocity w, the log's scale error s, the heading's bias
 b (R(b) turns clockwise), the current c, the error of the sound speed e and each beacon's
 offset. The noise n of heading and log at a node is in the way that is reckoned with it,
 tau being their sampling interval, and in the velocity that its range rate is held against:
-taken for two noises, it feigns information on the direction of the current, and the standard
-deviations come out too small by a third. Nodes are eliminated in order, the constants last: a
+taken for two noises, it feigns information on the direction of the current. So it does if nothing
+is said of the vehicle: then every jitter of heading and log may be a motion, and range rates
+without it tell the beacon's direction, falsely. So the velocity through the water is smooth, as
+smooth as it is seen to be (`track.change_psd`). Nodes are eliminated in order, the constants last: a
 banded factorisation with a border.
 """
 
@@ -62,6 +66,7 @@ class PlanarProblem:
     step_cov : (N - 1, 2, 2) that of the noise n at its ends not included, m².
     share : (N - 1,) tau of the steps, s.
     velocity, velocity_cov : (N, 2), (N, 2, 2) reckoned velocity and its noise.
+    change_cov : (N - 1, 2, 2) of the change of the true velocity over a step, m²/s².
     height, climb : (N,) above the frame's origin and its rate, m, m/s.
     arm, arm_velocity : (N, 3) of the transponder from the reference point, in n.
     place : (B, 3) stated positions of the beacons in n, m.
@@ -78,6 +83,7 @@ class PlanarProblem:
     share: Array
     velocity: Array
     velocity_cov: Array
+    change_cov: Array
     height: Array
     climb: Array
     arm: Array
@@ -116,6 +122,11 @@ class PlanarProblem:
     def velocity_info(self) -> Array:
         """Inverse covariances of the noise of the velocity, (N, 2, 2), s²/m²."""
         return np.asarray(np.linalg.inv(self.velocity_cov), dtype=float)
+
+    @cached_property
+    def change_info(self) -> Array:
+        """Inverse covariances of the changes of the velocity, (N - 1, 2, 2), s²/m²."""
+        return np.asarray(np.linalg.inv(self.change_cov), dtype=float)
 
     @cached_property
     def columns(self) -> dict[str, slice]:
@@ -265,17 +276,24 @@ def misfit(problem: PlanarProblem, x: Array, theta: Array) -> tuple[Array, Array
     return np.diff(x[:, :2], axis=0) - moves + wander, through
 
 
+def changes(problem: PlanarProblem, x: Array) -> Array:
+    """Return the changes of the velocity through the water between nodes, (n - 1, 2), m/s."""
+    return np.diff(problem.velocity[: x.shape[0]] - x[:, 2:], axis=0)
+
+
 def terms(problem: PlanarProblem, x: Array, theta: Array, at: Evaluation) -> Array:
-    """Return the terms of the cost: rows, steps, noise of the velocity, priors."""
+    """Return the terms of the cost: rows, steps, noise and changes of the velocity, priors."""
     squares = np.nan_to_num(np.concatenate([at.range_residual, at.rate_residual])) ** 2
     judged = np.nan_to_num(np.concatenate([at.range_residual, at.rate_alone])) ** 2
     error, _ = misfit(problem, x, theta)
     info = problem.step_info[: error.shape[0]]
+    change = changes(problem, x)
     away = x[0, :2] - problem.start_mean
     parts = [
         np.where(judged > GATE**2, GATE**2, squares),
         np.einsum("ki,kij,kj->k", error, info, error),
         np.einsum("ki,kij,kj->k", x[:, 2:], problem.velocity_info[: x.shape[0]], x[:, 2:]),
+        np.einsum("ki,kij,kj->k", change, problem.change_info[: change.shape[0]], change),
         (theta / problem.prior_sigma) ** 2,
         [away @ np.linalg.solve(problem.start_cov, away)],
     ]

@@ -11,7 +11,7 @@ from factorgraph_dvl.conventions import Array, rotation_from_rph
 from factorgraph_dvl.earth import LocalFrame
 from factorgraph_dvl.errors import DataError
 from factorgraph_dvl.planar.model import PlanarProblem, Ranging
-from factorgraph_dvl.planar.track import LEAST_PSD, Track, reckon
+from factorgraph_dvl.planar.track import LEAST_PSD, Track, change_psd, reckon
 from factorgraph_dvl.sensors.beacon import Beacons
 from factorgraph_dvl.sensors.protocol import Parameter
 from factorgraph_dvl.trial import InitialPosition, PlanarTrial
@@ -149,6 +149,9 @@ def problem_of(
     names = list(s.positions)
     dt = np.diff(time)
     share = np.minimum(dt, track.interval)
+    psd = change_psd(track).reshape(grid.size, 4)
+    middle = 0.5 * (time[1:] + time[:-1])
+    changing = np.stack([np.interp(middle, grid, column) for column in psd.T], axis=1)
     # What the noise at the ends of a step already accounts for.
     counted = share[:, None, None] ** 2 * at.velocity_cov[:-1]
     problem = PlanarProblem(
@@ -158,6 +161,7 @@ def problem_of(
         share=share,
         velocity=at.velocity,
         velocity_cov=at.velocity_cov,
+        change_cov=changing.reshape(-1, 2, 2) * dt[:, None, None],
         height=at.height - frame.height,
         climb=at.climb,
         arm=on_nodes(arm_n),

@@ -14,6 +14,8 @@ LEAST_PSD = 1e-5
 _LEAST_VELOCITY_VARIANCE = 1e-6
 # Time over which the rate of climb is taken, s.
 SLOPE_OVER = 10.0
+# Time over which it is seen how smoothly a vehicle moves, s.
+_SMOOTH_OVER = 60.0
 
 
 @dataclass(frozen=True)
@@ -120,6 +122,32 @@ def reckon(
         heading_std=heading_std,
         interval=min(_interval(speed_time), _interval(heading_time)),
     )
+
+
+def change_psd(track: Track) -> Array:
+    """Return the density of the changes of the true velocity at the grid, (G, 2, 2), m²/s³.
+
+    With the acceleration a that a straight line through the velocities around a moment has, and
+    its covariance S by their noise, the velocity changes over the time W of that line by
+    W² (a aᵀ + S), at most: as a random walk, of density W (a aᵀ + S).
+    """
+    time, v = track.time, track.velocity
+    half = 0.5 * _SMOOTH_OVER
+    low, high = np.maximum(time - half, time[0]), np.minimum(time + half, time[-1])
+    width = np.maximum(high - low, 2.0 * track.interval)
+    middle = 0.5 * (low + high)
+    # A line through a piecewise linear function: slope = 12 / W³ ∫ (t - m) v dt.
+    zeroth = _integral(v, time)
+    first = _integral((time - time[0])[:, None] * v, time)
+
+    def between(integral: Array) -> Array:
+        ends = [np.stack([np.interp(t, time, c) for c in integral.T], axis=1) for t in (low, high)]
+        return ends[1] - ends[0]
+
+    moment = between(first) - (middle - time[0])[:, None] * between(zeroth)
+    slope = 12.0 * moment / width[:, None] ** 3
+    noise = (12.0 * track.interval / width**3)[:, None, None] * track.velocity_cov
+    return width[:, None, None] * (slope[:, :, None] * slope[:, None, :] + noise)
 
 
 def _integral(values: Array, time: Array) -> Array:
