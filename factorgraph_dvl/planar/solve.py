@@ -11,6 +11,7 @@ from factorgraph_dvl.errors import ConfigError, SolveError
 from factorgraph_dvl.planar.hypotheses import Candidate, follow
 from factorgraph_dvl.planar.model import EARTH_RADIUS, PlanarProblem
 from factorgraph_dvl.planar.problem import Plan, plan
+from factorgraph_dvl.planar.ridge import shares_of, stations
 from factorgraph_dvl.planar.smoother import (
     Fit,
     covariance,
@@ -107,12 +108,14 @@ def _summary(
     depth_std = trial.depth.settings.std_m
     living = [c for c in candidates if c.died is None]
     best = living[0].fit
-    details = [covariance(problem, c.fit) for c in living]
-    weights = np.array([c.weight for c in living])
-    tracks = [
-        _trajectory(depth_std, made, c.fit, parts, rate_hz)
-        for c, parts in zip(living, details, strict=True)
+    ridges = [stations(problem, c.fit) for c in living]
+    along = [
+        [_trajectory(depth_std, made, s.fit, s.parts, rate_hz) for s in ridge] for ridge in ridges
     ]
+    shares = [shares_of(ridge) for ridge in ridges]
+    tracks = [mixed(parts, share) for parts, share in zip(along, shares, strict=True)]
+    every = [station for ridge in ridges for station in ridge]
+    weights = np.concatenate([c.weight * share for c, share in zip(living, shares, strict=True)])
     gone = [
         _trajectory(depth_std, made, c.fit, covariance(problem, c.fit), rate_hz)
         for c in candidates
@@ -122,8 +125,8 @@ def _summary(
         Hypothesis(c.weight, c.born, c.died, track, _history(c))
         for c, track in zip(candidates, [*tracks, *gone], strict=True)
     )
-    values = [c.fit.theta / problem.si for c in living]
-    covs = [parts[2] / np.outer(problem.si, problem.si) for parts in details]
+    values = [s.fit.theta / problem.si for s in every]
+    covs = [s.parts[2] / np.outer(problem.si, problem.si) for s in every]
     joint = _mixture(values, covs, weights)
     estimates = _estimates(problem, values[0], joint)
     used, rejected = measurements(trial.beacons, made, best)
@@ -148,7 +151,7 @@ def _summary(
         cost=best.cost,
         estimates=estimates,
         covariance=joint,
-        trajectory=mixed(tracks, weights),
+        trajectory=mixed([track for parts in along for track in parts], weights),
         residuals=used,
         warnings=tuple(warnings),
         hypotheses=hypotheses if len(hypotheses) > 1 else (),
