@@ -13,8 +13,8 @@ tau being their sampling interval, and in the velocity that its range rate is he
 taken for two noises, it feigns information on the direction of the current. So it does if nothing
 is said of the vehicle: then every jitter of heading and log may be a motion, and range rates
 without it tell the beacon's direction, falsely. So the velocity through the water is smooth, as
-smooth as it is seen to be (`track.change_psd`). Nodes are eliminated in order, the constants last: a
-banded factorisation with a border.
+smooth as it is seen to be (`track.change_psd`). Nodes are eliminated in order, the constants
+last: a banded factorisation with a border.
 """
 
 from __future__ import annotations

@@ -38,16 +38,16 @@ class Station:
     ----------
     fit : the most probable one at this place.
     parts : its covariances at this place, as of `smoother.covariance`.
-    likelihood : relative to the highest of the ridge.
+    cost : of the whole data, without what holds it at its place.
     """
 
     fit: Fit
     parts: tuple[Array, Array, Array]
-    likelihood: float
+    cost: float
 
 
 def stations(problem: PlanarProblem, best: Fit) -> list[Station]:
-    """Return tracks along the ridge of a fit to all data, that itself first.
+    """Return tracks along the ridge of a fit to all data, the most probable first.
 
     A fit whose ridge is straight stands alone, with its whole covariance.
     """
@@ -55,7 +55,7 @@ def stations(problem: PlanarProblem, best: Fit) -> list[Station]:
     values, vectors = np.linalg.eigh(parts[0][0, :2, :2])
     along, sigma = vectors[:, 1], float(np.sqrt(values[1]))
     if not best.converged or not _bent(problem, best, parts[0][0, :2, :2]):
-        return [Station(best, parts, 1.0)]
+        return [Station(best, parts, best.cost)]
     out = []
     for side in (0, 1, -1):
         near = best
@@ -64,16 +64,17 @@ def stations(problem: PlanarProblem, best: Fit) -> list[Station]:
             held = _held(problem, place, along, _HELD * _APART * sigma)
             moved = near.x + np.array([*(place - near.p[0]), 0.0, 0.0])
             near = fit(held, near.x if side == 0 else moved, near.theta)
-            cost = float(cost_terms(problem, near).sum()) - best.cost
-            if not near.converged or cost > _NEGLIGIBLE:
+            cost = float(cost_terms(problem, near).sum())
+            if not near.converged or cost > best.cost + _NEGLIGIBLE:
                 break
-            out.append(Station(near, covariance(held, near), float(np.exp(-cost))))
-    return out
+            out.append(Station(near, covariance(held, near), cost))
+    return sorted(out, key=lambda station: station.cost) or [Station(best, parts, best.cost)]
 
 
 def shares_of(ridge: Sequence[Station]) -> Array:
     """Return the normalised likelihoods of stations."""
-    likelihood = np.array([station.likelihood for station in ridge])
+    cost = np.array([station.cost for station in ridge])
+    likelihood = np.exp(cost.min() - cost)
     return np.asarray(likelihood / likelihood.sum())
 
 
@@ -88,5 +89,7 @@ def _held(problem: PlanarProblem, place: Array, along: Array, sigma: float) -> P
     """Return the problem with the first position held at a place, in one direction."""
     prior = np.linalg.inv(problem.start_cov)
     hold = np.outer(along, along) / sigma**2
-    mean = np.linalg.solve(prior + hold, prior @ problem.start_mean + hold @ place)
-    return replace(problem, start_mean=mean, start_cov=np.linalg.inv(prior + hold))
+    cov = np.asarray(np.linalg.inv(prior + hold), dtype=float)
+    return replace(
+        problem, start_mean=cov @ (prior @ problem.start_mean + hold @ place), start_cov=cov
+    )

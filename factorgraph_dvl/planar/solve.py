@@ -107,8 +107,8 @@ def _summary(
     problem = made.problem
     depth_std = trial.depth.settings.std_m
     living = [c for c in candidates if c.died is None]
-    best = living[0].fit
     ridges = [stations(problem, c.fit) for c in living]
+    best = ridges[0][0].fit
     along = [
         [_trajectory(depth_std, made, s.fit, s.parts, rate_hz) for s in ridge] for ridge in ridges
     ]

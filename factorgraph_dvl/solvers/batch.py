@@ -17,7 +17,7 @@ from factorgraph_dvl.errors import ConfigError
 from factorgraph_dvl.graph import Problem
 from factorgraph_dvl.increments import increments
 from factorgraph_dvl.mounting import initial_mounting
-from factorgraph_dvl.planar.hypotheses import odds_against
+from factorgraph_dvl.planar.evidence import odds_against
 from factorgraph_dvl.preintegration import Segments, States, attach, motion_at, segments
 from factorgraph_dvl.sensors.protocol import Aid, Motion, Observation, Parameter
 from factorgraph_dvl.solution import Solution, joined
