@@ -17,8 +17,9 @@ PACKAGE = Path(factorgraph_dvl.__file__).parent
 # package. `a.b` stands for a module or a whole package.
 LAYERS = (
     ("conventions", "errors"),
-    ("earth", "celestial", "yaml_file"),
+    ("earth", "celestial", "yaml_file", "directions", "turning"),
     ("sensors",),
+    ("beam_geometry",),
     ("trial", "solution", "information"),
     ("io", "simulation"),
     ("clock", "polynomials", "signals"),

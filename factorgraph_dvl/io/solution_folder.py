@@ -11,6 +11,7 @@ import msgspec
 import numpy as np
 
 from factorgraph_dvl.conventions import DEG, GEODETIC_SI, Array, BodyAxes
+from factorgraph_dvl.directions import turns_to
 from factorgraph_dvl.errors import DataError
 from factorgraph_dvl.io.folders import new_folder
 from factorgraph_dvl.io.motion_table import COLUMNS as MOTION_COLUMNS
@@ -31,14 +32,17 @@ STD_COLUMNS = (
 
 # JSON knows no nan: null stands for it.
 _Numbers = list[float | None]
+_Rows = list[float | _Numbers | None]
 
 
 class _Parameter(msgspec.Struct):
-    value: _Numbers
-    std: _Numbers
-    observable: list[bool]
-    prior_value: _Numbers = []
-    prior_std: _Numbers = []
+    """One entry for each component; of directions, value a vector and the others a pair."""
+
+    value: _Rows
+    std: _Rows
+    observable: list[bool | list[bool]]
+    prior_value: _Rows = []
+    prior_std: _Rows = []
 
 
 class _Covariance(msgspec.Struct):
@@ -147,16 +151,7 @@ def _encode(solution: Solution) -> bytes:
         solver=solution.solver,
         converged=bool(solution.converged),
         iterations=int(solution.iterations),
-        parameters={
-            e.name: _Parameter(
-                value=_numbers(e.value),
-                std=_numbers(e.std),
-                observable=np.asarray(e.observable, dtype=bool).tolist(),
-                prior_value=_numbers(e.prior_value),
-                prior_std=_numbers(e.prior_std),
-            )
-            for e in solution.estimates
-        },
+        parameters={e.name: _parameter(e) for e in solution.estimates},
         covariance=_Covariance(
             list(solution.order), [_numbers(row) for row in np.asarray(solution.covariance)]
         ),
@@ -168,6 +163,23 @@ def _encode(solution: Solution) -> bytes:
     return msgspec.json.format(msgspec.json.encode(calibration), indent=2) + b"\n"
 
 
+def _parameter(e: Estimate) -> _Parameter:
+    value, prior_value, shape = e.value, e.prior_value, np.shape(e.std)
+    if e.nominal is not None:
+        value, prior_value, shape = e.directions, e.nominal, (-1, 2)
+    rows: list[Any] = [
+        np.reshape(x, shape).tolist()
+        for x in (e.std, np.asarray(e.observable, dtype=bool), e.prior_std)
+    ]
+    return _Parameter(
+        value=np.asarray(value).tolist(),
+        std=rows[0],
+        observable=rows[1],
+        prior_value=np.asarray(prior_value).tolist(),
+        prior_std=rows[2],
+    )
+
+
 def _decode(file: Path) -> _Calibration:
     try:
         calibration = msgspec.json.decode(file.read_bytes(), type=_Calibration)
@@ -177,7 +189,14 @@ def _decode(file: Path) -> _Calibration:
         ) from None
     except (msgspec.MsgspecError, UnicodeDecodeError) as error:
         raise DataError(f"cannot be read ({error})", where=str(file)) from None
-    size = sum(len(parameter.value) for parameter in calibration.parameters.values())
+    try:
+        size = sum(np.size(_array(p.std)) for p in calibration.parameters.values())
+    except ValueError:
+        raise DataError(
+            "a parameter has rows of different lengths",
+            where=str(file),
+            expected="numbers, or pairs for directions",
+        ) from None
     shape = {len(calibration.covariance.order), len(calibration.covariance.matrix)}
     shape |= {len(row) for row in calibration.covariance.matrix}
     if shape != {size}:
@@ -190,8 +209,10 @@ def _decode(file: Path) -> _Calibration:
 
 
 def _estimate(name: str, parameter: _Parameter, names: Iterator[str]) -> Estimate:
+    if parameter.value and isinstance(parameter.value[0], list):
+        return _directions(name, parameter, names)
     size = len(parameter.value)
-    unknown: Sequence[float | None] = [None] * size
+    unknown: _Rows = [None] * size
     return Estimate(
         name,
         tuple(islice(names, size)),
@@ -200,6 +221,32 @@ def _estimate(name: str, parameter: _Parameter, names: Iterator[str]) -> Estimat
         _array(parameter.prior_value or unknown),
         _array(parameter.prior_std or unknown),
         np.array(parameter.observable, dtype=bool),
+    )
+
+
+def _directions(name: str, parameter: _Parameter, names: Iterator[str]) -> Estimate:
+    try:
+        nominal = _array(parameter.prior_value).reshape(-1, 3)
+        value = turns_to(nominal, _array(parameter.value)) / DEG
+        prior_std = _array(parameter.prior_std).reshape(value.shape)
+        observable = np.array(parameter.observable, dtype=bool).reshape(value.shape)
+        std = _array(parameter.std).reshape(value.shape)
+    except ValueError:
+        raise DataError(
+            f"parameter {name} does not hold directions",
+            where=CALIBRATION_FILE,
+            expected="as many unit vectors in `value` and `prior_value` as pairs in `std`, "
+            "`prior_std` and `observable`",
+        ) from None
+    return Estimate(
+        name,
+        tuple(islice(names, value.size)),
+        value.ravel(),
+        std.ravel(),
+        np.zeros(value.size),
+        prior_std.ravel(),
+        observable.ravel(),
+        nominal,
     )
 
 
@@ -236,5 +283,5 @@ def _numbers(values: Any) -> _Numbers:
     return list(np.atleast_1d(np.asarray(values, dtype=float)).tolist())
 
 
-def _array(values: Sequence[float | None]) -> Array:
+def _array(values: Sequence[float | _Numbers | None]) -> Array:
     return np.array(values, dtype=float)

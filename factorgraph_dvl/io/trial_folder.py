@@ -43,7 +43,7 @@ _Sensor = TypeVar("_Sensor", bound=Record)
 
 
 class _TruthValue(msgspec.Struct):
-    value: list[float]
+    value: list[float | list[float]]
 
 
 class _Truth(msgspec.Struct):
@@ -155,9 +155,8 @@ def _reference(folder: Path, settings: TrialSettings) -> Reference | None:
 
 
 def _read(folder: Path, kind: type[_Sensor], settings: SensorSection) -> _Sensor:
-    columns = read_table(
-        folder / settings.file, kind.required, kind.optional, source=settings.file
-    )
+    required = (*kind.required, *settings.more_columns)
+    columns = read_table(folder / settings.file, required, kind.optional, source=settings.file)
     return kind.from_columns(settings, columns, settings.file)
 
 
@@ -228,7 +227,7 @@ def _read_truth(path: Path) -> dict[str, Array]:
 
 def _truth_json(truth: dict[str, Array]) -> bytes:
     values = {
-        name: _TruthValue(np.atleast_1d(value).astype(float).tolist())
+        name: _TruthValue(np.atleast_1d(np.asarray(value, dtype=float)).tolist())
         for name, value in truth.items()
     }
     return msgspec.json.format(msgspec.json.encode(_Truth(values)), indent=2) + b"\n"

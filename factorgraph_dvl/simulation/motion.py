@@ -12,8 +12,16 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.interpolate import PPoly
+from scipy.spatial.transform import Rotation
 
-from factorgraph_dvl.conventions import DEG, Array, BodyAxes, frd_from_body
+from factorgraph_dvl.conventions import (
+    DEG,
+    Array,
+    BodyAxes,
+    frd_from_body,
+    rotation_from_rph,
+    rph_from_rotation,
+)
 from factorgraph_dvl.earth import RATE, normal_gravity, radii
 from factorgraph_dvl.errors import ConfigError
 from factorgraph_dvl.simulation.manoeuvres import Accelerate, Manoeuvre, Stop, Straight
@@ -95,6 +103,8 @@ class Motion:
     kinks : (K,) times at which acceleration or turn rate change abruptly, s.
     duration : s.
     body_axes : axes of the body frame.
+    table : angle of the turntable that carries the body on the vehicle, counter-clockwise
+        seen from above, rad; None without one. Its axis passes through the IMU.
     """
 
     speed: PPoly
@@ -110,6 +120,7 @@ class Motion:
     kinks: Array
     duration: float
     body_axes: BodyAxes
+    table: PPoly | None = None
 
     def highest_rate(self) -> float:
         """Return the highest angular frequency in the body-frame signals, rad/s.
@@ -118,6 +129,8 @@ class Motion:
         """
         sway = max(s.highest_frequency for s in (self.roll, self.pitch, self.yaw, self.heave))
         turn = float(np.max(np.abs(_evaluate(self.course, self.kinks[:-1], 1)), initial=0.0))
+        if self.table is not None:
+            turn += float(np.max(np.abs(_evaluate(self.table, self.kinks, 1))))
         return 2.0 * sway + turn
 
     def velocity(self, t: Array) -> tuple[Array, ...]:
@@ -142,7 +155,32 @@ class Motion:
         return self.height + drift + self.heave.derivatives(t)[0]
 
     def at(self, t: Array) -> State:
-        """Return the motion at times (M,).
+        """Return the motion of the body at times (M,).
+
+        On a turntable, components in the vehicle s are Rz(angle) times those in b, about the
+        upward axis u of both, so that nRb = nRs Rz, omega_b = Rzᵀ omega_s + rate u and
+        f_b = Rzᵀ f_s.
+        """
+        state = self.ship_at(t)
+        if self.table is None:
+            return state
+        angle, rate = _evaluate(self.table, t), _evaluate(self.table, t, 1)
+        up = frd_from_body(self.body_axes).T @ np.array([0.0, 0.0, -1.0])
+        turn = Rotation.from_rotvec(angle[:, None] * up)
+        nRs = rotation_from_rph(state.rph, self.body_axes)
+        turning = rate[:, None] * up
+        return State(
+            geodetic=state.geodetic,
+            v_n=state.v_n,
+            a_n=state.a_n,
+            rph=rph_from_rotation(nRs @ turn.as_matrix(), self.body_axes),
+            omega_eb_b=turn.apply(state.omega_eb_b, inverse=True) + turning,
+            omega_ib_b=turn.apply(state.omega_ib_b, inverse=True) + turning,
+            f_b=turn.apply(state.f_b, inverse=True),
+        )
+
+    def ship_at(self, t: Array) -> State:
+        """Return the motion of the vehicle at times (M,), in axes of its own like the body's.
 
         With M and N the radii of curvature, L the latitude and h the height,
 
@@ -236,6 +274,11 @@ def plan_motion(scenario: Scenario) -> Motion:
         for part in (sway.roll, sway.pitch, sway.yaw)
     )
     still = PPoly(np.zeros((1, 1)), np.array([0.0, 1.0]))
+    duration = float(speed.x[-1])
+    table = _table(scenario, duration)
+    kinks = np.asarray(speed.x, dtype=float)
+    if table is not None:
+        kinks = np.union1d(kinks, table.x)
     motion = Motion(
         speed=speed,
         course=course,
@@ -247,9 +290,10 @@ def plan_motion(scenario: Scenario) -> Motion:
         pitch=pitch,
         yaw=yaw,
         heave=heave,
-        kinks=np.asarray(speed.x, dtype=float),
-        duration=float(speed.x[-1]),
+        kinks=kinks,
+        duration=duration,
         body_axes=scenario.body_axes,
+        table=table,
     )
     lat, lon = _integrate_position(
         motion, scenario.start.lat_deg * DEG, scenario.start.lon_deg * DEG, scenario.source
@@ -301,6 +345,38 @@ def _profiles(plan: list[Manoeuvre], speed: float, source: str) -> tuple[PPoly, 
                 add(m.ramp_s, 0.0, rate, -rate / m.ramp_s)
     breaks = np.array(times)
     return PPoly(np.array(speeds).T, breaks), PPoly(np.array(rates).T, breaks)
+
+
+def _table(scenario: Scenario, duration: float) -> PPoly | None:
+    """Return the angle of the turntable over time, rad."""
+    if scenario.turntable is None:
+        return None
+    breaks, rates, slopes = [0.0], [], []
+
+    def add(until: float, rate: float, slope: float) -> None:
+        if until > breaks[-1]:
+            breaks.append(until)
+            rates.append(rate)
+            slopes.append(slope)
+
+    for i, turn in enumerate(scenario.turntable.turns):
+        end = turn.at_s + turn.duration_s
+        if end > duration:
+            raise ConfigError(
+                f"the turn ends at {end:g} s, after the manoeuvres, which take {duration:g} s",
+                where=f"{scenario.source} key turntable.turns[{i}]",
+                expected="an earlier turn, or longer manoeuvres",
+            )
+        rate = turn.turn_deg * DEG / (turn.duration_s - turn.ramp_s)
+        slope = rate / turn.ramp_s if turn.ramp_s > 0.0 else 0.0
+        add(turn.at_s, 0.0, 0.0)
+        add(turn.at_s + turn.ramp_s, 0.0, slope)
+        add(end - turn.ramp_s, rate, 0.0)
+        add(end, rate, -slope)
+    add(duration, 0.0, 0.0)
+    angle = PPoly(np.array([slopes, rates]), np.array(breaks)).antiderivative()
+    angle.c[-1] += scenario.turntable.start_deg * DEG
+    return angle
 
 
 def _sway(parts: Iterable[tuple[float, float, float]]) -> Sway:

@@ -24,6 +24,8 @@ imu: {...}                         # ImuTruth: rate, errors
 gnss: {...}                        # GnssTruth, optional
 dvl: {...}                         # DvlTruth, optional
 star: {...}                        # StarTruth, optional
+dvl_beams: {...}                   # DvlBeamsTruth, optional
+turntable: {...}                   # TurntableTruth, optional: turns IMU and DVL on the ship
 trial:                             # what trial.yaml will claim
   imu: {gyro_bias_std_deg_h: 0.05, accel_bias_std_ug: 100}
   gnss: {}
@@ -60,11 +62,13 @@ from factorgraph_dvl.sensors.protocol import (
 )
 from factorgraph_dvl.simulation.convert import convert
 from factorgraph_dvl.simulation.instruments import (
+    DvlBeamsTruth,
     DvlTruth,
     GnssTruth,
     ImuTruth,
     Instrument,
     StarTruth,
+    TurntableTruth,
 )
 from factorgraph_dvl.simulation.manoeuvres import Manoeuvre, flatten
 from factorgraph_dvl.yaml_file import read_yaml
@@ -124,6 +128,8 @@ class Claims(Section, frozen=True, kw_only=True):
     gnss: dict[str, Any] = msgspec.field(default_factory=dict)
     dvl: dict[str, Any] = msgspec.field(default_factory=dict)
     star: dict[str, Any] = msgspec.field(default_factory=dict)
+    dvl_beams: dict[str, Any] = msgspec.field(default_factory=dict)
+    turntable: dict[str, Any] = msgspec.field(default_factory=dict)
     initial: InitialClaim | None = None
 
 
@@ -143,6 +149,8 @@ class Scenario(Section, frozen=True, kw_only=True):
     gnss: GnssTruth | None = None
     dvl: DvlTruth | None = None
     star: StarTruth | None = None
+    dvl_beams: DvlBeamsTruth | None = None
+    turntable: TurntableTruth | None = None
     trial: Claims = Claims()
     source: str = ""
 
