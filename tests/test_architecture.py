@@ -63,7 +63,7 @@ FORBIDDEN |= {
     )
 }
 # Data classes of the sensors: no measurement equation is among them.
-SENSOR_DATA = ("Imu", "ImuSettings", "Gnss", "Dvl", "Star", "Parameter", "Motion")
+SENSOR_DATA = ("Imu", "ImuSettings", "Gnss", "Dvl", "Star", "Aid", "Parameter", "Motion")
 # The graph asks every sensor through the protocol and knows none by name.
 NAMELESS = ("graph", "chain", "preintegration", "keys", "solvers")
 # Only where they are used: GTSAM, SciPy and Matplotlib take most of a second to load.

@@ -35,6 +35,7 @@ class KalmanMethod(StrEnum):
     WAHBA = "wahba"
     LEAST_SQUARES = "least-squares"
     STAR = "star"
+    BEAMS = "beams"
 
 
 def solve(

@@ -255,9 +255,10 @@ class DvlBeams:
             if self.settings.parametrisation == "common"
             else FreeGeometry(self.nominal_b, misalignment, scale)
         )
-        return (
-            BeamVelocity(self.time[m], self.velocity[m], self.sigma()[m], geometry, lever_arm),
-        )
+        lost = np.isnan(self.velocity[m])
+        measured = np.where(lost, 0.0, self.velocity[m])
+        std = np.where(lost, np.inf, self.sigma()[m])
+        return (BeamVelocity(self.time[m], measured, std, geometry, lever_arm),)
 
     def explain(self, parameter: str, component: int, motion: Motion | None) -> str:
         """Say why a component could not be observed, given the motion of the trial."""
@@ -376,8 +377,8 @@ class BeamVelocity:
     Parameters
     ----------
     time : (M,) s.
-    measured : (M, N) m/s, nan where lost.
-    std : (M, N) m/s.
+    measured : (M, N) m/s; any number where lost.
+    std : (M, N) m/s, infinite where lost.
     geometry : directions and scales.
     lever_arm : name of the parameter.
     """
@@ -406,13 +407,12 @@ class BeamVelocity:
 
     def sigma(self, motion: Motion, values: Values) -> Array:
         """Return the standard deviations, the gyro's share through the lever arm included."""
-        sigma = np.hypot(self.std, lever_arm_sigma(motion, values[self.lever_arm])[:, None])
-        return np.where(np.isnan(self.measured), np.inf, sigma)
+        return np.hypot(self.std, lever_arm_sigma(motion, values[self.lever_arm])[:, None])
 
     def residual(self, motion: Motion, values: Values) -> Array:
-        """Return predicted - measured, (M, N), m/s; 0 where the beam was lost."""
+        """Return predicted - measured, (M, N), m/s."""
         dvl_b, _ = self._velocities(motion, values)
-        return self._where_measured(dvl_b @ self.geometry.gain(values).T)
+        return dvl_b @ self.geometry.gain(values).T - self.measured
 
     def linearize(self, motion: Motion, values: Values, wanted: Collection[str]) -> Linearization:
         """Return the residual and its Jacobians."""
@@ -422,15 +422,12 @@ class BeamVelocity:
         found[self.lever_arm] = gain @ skew(motion.omega_eb_b)
         d_omega = -gain @ skew(values[self.lever_arm])
         return Linearization(
-            residual=self._where_measured(dvl_b @ gain.T),
+            residual=dvl_b @ gain.T - self.measured,
             d_theta=gain @ skew(imu_b),
             d_v=gain @ motion.nRb.transpose(0, 2, 1),
             d_omega=np.broadcast_to(d_omega, (len(dvl_b), *d_omega.shape)),
             d_parameters={name: found[name] for name in found if name in wanted},
         )
-
-    def _where_measured(self, predicted: Array) -> Array:
-        return np.where(np.isnan(self.measured), 0.0, predicted - self.measured)
 
     def _velocities(self, motion: Motion, values: Values) -> tuple[Array, Array]:
         """Return the velocities of DVL and IMU in body, (M, 3)."""
