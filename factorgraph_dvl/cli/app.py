@@ -13,6 +13,7 @@ from factorgraph_dvl import __version__
 from factorgraph_dvl.cli.console import stderr
 from factorgraph_dvl.cli.crosscheck import crosscheck
 from factorgraph_dvl.cli.inspect import inspect
+from factorgraph_dvl.cli.instrument import instrument
 from factorgraph_dvl.cli.observability import observability
 from factorgraph_dvl.cli.plan import plan
 from factorgraph_dvl.cli.simulate import simulate
@@ -30,7 +31,7 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
-for _command in (simulate, solve, kalman, inspect, crosscheck, observability, plan):
+for _command in (simulate, solve, kalman, inspect, crosscheck, observability, plan, instrument):
     app.command()(_command)
 
 

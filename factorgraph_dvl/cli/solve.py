@@ -89,7 +89,12 @@ def _solve_into(
 ) -> None:
     """Load a trial, run a solver on it, write and show its solution."""
     from factorgraph_dvl.io.folders import check_output
-    from factorgraph_dvl.io.solution_folder import FIGURES_FOLDER, save_solution, write_history
+    from factorgraph_dvl.io.solution_folder import (
+        BEAMS_FILE,
+        FIGURES_FOLDER,
+        save_solution,
+        write_history,
+    )
     from factorgraph_dvl.io.trial_folder import load_trial
 
     check_output(out, force=force)
@@ -99,6 +104,12 @@ def _solve_into(
         progress("write", 0, None)
 
         def add(folder: Path) -> None:
+            if trial.beams is not None:
+                from factorgraph_dvl.analysis.beam_quality import beam_quality, calibration_of
+                from factorgraph_dvl.io.tables import write_table
+
+                quality = beam_quality(trial.beams, calibration_of(trial.beams, solution))
+                write_table(folder / BEAMS_FILE, quality.columns())
             if history is not None:
                 write_history(folder, history.time, history.names, history.values, history.std)
             if not figures:
