@@ -132,7 +132,7 @@ def as_dvl(beams: DvlBeams, calibration: tuple[Array, Array, Array] | None = Non
         )
     gain = (1.0 + np.broadcast_to(scale, len(directions_d)))[:, None] * directions_d
     velocity, std_d = velocities(gain, beams.velocity, beams.sigma())
-    return Dvl(settings, beams.time, velocity, std_d, source=beams.source)
+    return Dvl(settings, beams.time, velocity, std_d, source=beams.source, label=beams.label)
 
 
 def _by_pattern(beams: Array) -> list[tuple[np.ndarray, np.ndarray]]:

@@ -15,7 +15,7 @@ from factorgraph_dvl.earth import LocalFrame
 from factorgraph_dvl.errors import ConfigError
 from factorgraph_dvl.graph import Problem
 from factorgraph_dvl.increments import increments
-from factorgraph_dvl.mounting import initial_mounting
+from factorgraph_dvl.mounting import initial_values
 from factorgraph_dvl.preintegration import Segments, States, attach, motion_at, segments
 from factorgraph_dvl.sensors.protocol import Aid, Motion, Observation, Parameter
 from factorgraph_dvl.solution import Solution
@@ -207,6 +207,4 @@ def _mountings(
         if seen.mounting.estimated:
             motion, covered = motion_by(seen.time)
             out[seen.mounting.name] = mean_mounting(seen, motion.nRb * covered[:, None, None])
-    if trial.dvl is not None:
-        out |= initial_mounting(trial.dvl, lambda pings, time: motion_by(time))
-    return out
+    return out | initial_values(trial, lambda pings, time: motion_by(time))
