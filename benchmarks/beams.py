@@ -367,8 +367,9 @@ def reckoning_section(runs: list[Seed]) -> Iterator[str]:
     yield "\n## Dead reckoning with the same instrument on another cruise\n"
     yield (
         "Error in % of the distance, median over the seeds (largest in brackets; without a "
-        f"turntable {HULL_SEEDS} seeds), with the true attitude, so that only the calibration counts. "
-        "Instruments see what they make of nominal beams; their best seven parameters leave residuals of "
+        f"turntable {HULL_SEEDS} seeds), with the true attitude, so that only the "
+        "calibration counts. Instruments see what they make of nominal beams; their best seven "
+        "parameters leave residuals of "
         f"{median(run.misfit for run in runs):.1f} times the noise on the turntable.\n"
     )
     ways = list(dict.fromkeys(way for way, _ in runs[0].reckoning))

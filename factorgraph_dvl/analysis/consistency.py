@@ -24,7 +24,7 @@ from factorgraph_dvl.trial import Reference
 
 _COINCIDENT_S = 1e-6
 _LONGEST_INTERVAL_S = 0.05
-ROTATION_VECTORS = ("misalignment_deg", "star_mounting_deg")
+ROTATION_VECTORS = ("misalignment_deg", "star_mounting_deg", "beam_misalignment_deg")
 _PAPER_PARAMETERS = ("misalignment_deg", "scale_error", "lever_arm_m")
 
 

@@ -273,9 +273,9 @@ class DvlBeams:
         v_b = rotate(motion.nRb.transpose(0, 2, 1), motion.v_n)
         x, y, z = np.sqrt(np.mean(v_b**2, axis=0))
         return (
-            f"the velocity keeps to one direction in the body (rms {x:.2g}, {y:.2g}, {z:.2g} m/s "
-            "along x, y, z), and a beam shows its direction and its scale only by velocities in "
-            "three directions: turn body and DVL on a turntable, sail sideways, use heave"
+            "a beam shows its direction and its scale by velocities in three directions of the "
+            f"body, each against a better reference; here they were {x:.2g}, {y:.2g}, {z:.2g} m/s "
+            "rms along x, y, z: a turntable or sailing sideways adds the second, heave the third"
         )
 
 
