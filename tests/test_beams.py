@@ -398,10 +398,21 @@ def test_beams_lost_for_good_leave_the_others(lost):
     assert solution.converged
     nees, dof = nees_of(solution, trial.calibration_truth)
     assert nees < chi2.ppf(0.999, dof)
+    assert solution.estimate("beam_direction_b").observable.all()
     residual = next(r for r in solution.residuals if r.label == "Beam velocity")
     count = np.isfinite(residual.residual).sum(axis=0)
     assert list(count < count.max()) == [b in lost for b in (1, 2, 3, 4)]
     np.testing.assert_array_equal(np.isfinite(residual.sigma), np.isfinite(residual.residual))
+
+
+def test_a_beam_that_was_never_received_is_named():
+    trial = simulate(noisy(), 1)
+    trial.beams.velocity[:, 2] = np.nan
+    solution = solve(trial)
+    seen = solution.estimate("beam_direction_b").observable
+    assert seen.tolist() == [True] * 4 + [False] * 2 + [True] * 2
+    said = "beam_direction_3x_deg, beam_direction_3y_deg not observable: beam 3 was never received"
+    assert any(w.startswith(said) for w in solution.warnings)
 
 
 def test_the_common_mounting_is_found_from_anywhere():

@@ -270,6 +270,11 @@ class DvlBeams:
                 f"the body turns too little (rms rate {x:.2g}, {y:.2g}, {z:.2g} deg/s about "
                 "x, y, z): a lever arm shows only through rotation about another axis than its own"
             )
+        of_a_beam = {"beam_direction_b": component // 2, "beam_scale_error": component}
+        if self.settings.parametrisation == "beams":
+            beam = of_a_beam[parameter]
+            if np.isnan(self.velocity[:, beam]).all():
+                return f"beam {beam + 1} was never received"
         v_b = rotate(motion.nRb.transpose(0, 2, 1), motion.v_n)
         x, y, z = np.sqrt(np.mean(v_b**2, axis=0))
         return (
