@@ -453,6 +453,16 @@ def test_beams_beside_a_dvl_have_names_of_their_own():
     assert "lever_arm_m" in {p.name for p in replace(trial, dvl=None).beams.parameters()}
 
 
+def test_one_instrument_in_two_records_is_suspected(tmp_path):
+    dvl = {"rate_hz": 5, "velocity_std_m_s": 0.005}
+    claims = {"imu": {"gyro_bias_std_deg_h": 0.05, "accel_bias_std_ug": 100}}
+    save_trial(simulate(noisy(dvl=dvl, trial=claims), 1), tmp_path / "same")
+    assert any("counts twice" in note for note in load_trial(tmp_path / "same").notes)
+    apart = dvl | {"phase_s": 0.07}
+    save_trial(simulate(noisy(dvl=apart, trial=claims), 1), tmp_path / "apart")
+    assert load_trial(tmp_path / "apart").notes == ()
+
+
 def test_without_another_direction_of_motion_the_beams_are_not_observable():
     calm = {"roll": [], "pitch": [], "yaw": [], "heave": []}
     straight = [{"straight_s": 70}]

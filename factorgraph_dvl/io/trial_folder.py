@@ -25,7 +25,7 @@ from factorgraph_dvl.sensors.catalogue import AIDS
 from factorgraph_dvl.sensors.dvl import Dvl
 from factorgraph_dvl.sensors.gnss import Gnss
 from factorgraph_dvl.sensors.imu import Imu
-from factorgraph_dvl.sensors.protocol import Record, SensorSection
+from factorgraph_dvl.sensors.protocol import Aid, Record, SensorSection
 from factorgraph_dvl.trial import InitialAttitude, InitialPosition, Reference, Trial
 from factorgraph_dvl.yaml_file import parse_yaml, read_text
 
@@ -70,6 +70,14 @@ def load_trial(path: Path | str) -> Trial:
     initial = settings.initial
     kinds = {aid.section: aid for aid in AIDS}
     aids = {name: _read(folder, kinds[name], section) for name, section in settings.aids.items()}
+    notes = [
+        f"section `{name}` of {file.name} is not used by this version" for name in settings.unused
+    ]
+    if _share_pings(aids):
+        notes.append(
+            "`dvl` and `dvl_beams` have pings at the same times: if both are records of one "
+            "instrument, its noise counts twice, and standard deviations come out too small"
+        )
     return Trial(
         name=settings.name or folder.resolve().name,
         imu=_read(folder, Imu, settings.imu),
@@ -82,10 +90,7 @@ def load_trial(path: Path | str) -> Trial:
         initial_position=None if initial is UNSET else _position(initial),
         reference=_reference(folder, settings),
         calibration_truth=_read_truth(folder / TRUTH_FILE),
-        notes=tuple(
-            f"section `{name}` of {file.name} is not used by this version"
-            for name in settings.unused
-        ),
+        notes=tuple(notes),
     )
 
 
@@ -138,6 +143,13 @@ def save_trial(
         if trial.calibration_truth:
             (folder / TRUTH_FILE).write_bytes(_truth_json(trial.calibration_truth))
         (folder / SETTINGS_FILE).write_text(to_yaml(_settings(trial, suffix)), encoding="utf-8")
+
+
+def _share_pings(aids: dict[str, Aid]) -> bool:
+    dvl, beams = aids.get("dvl"), aids.get("dvl_beams")
+    if dvl is None or beams is None:
+        return False
+    return bool(np.mean(np.isin(beams.time, dvl.time)) > 0.5)
 
 
 def _locate(path: Path) -> tuple[Path, Path]:
