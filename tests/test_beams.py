@@ -15,6 +15,8 @@ from test_observations import random_motion
 from truth import exact_motion, scenario
 
 from factorgraph_dvl.analysis.consistency import calibration_errors
+from factorgraph_dvl.analysis.observability import observability
+from factorgraph_dvl.analysis.pwcs import BeamMounting, BodyMotion, beam_rows
 from factorgraph_dvl.beam_geometry import (
     as_dvl,
     error_rows,
@@ -32,6 +34,7 @@ from factorgraph_dvl.io.foreign import read_truth
 from factorgraph_dvl.io.solution_folder import load_solution, save_solution
 from factorgraph_dvl.io.trial_folder import load_trial, save_trial
 from factorgraph_dvl.kalman import calibrate
+from factorgraph_dvl.planning.prediction import go_on, predict
 from factorgraph_dvl.sensors.dvl_beams import DvlBeams, DvlBeamsSettings
 from factorgraph_dvl.sensors.protocol import Motion
 from factorgraph_dvl.simulation import plan_motion, simulate
@@ -589,3 +592,45 @@ def test_the_command_makes_a_dvl_that_solves(solved, tmp_path):
     residual = next(r for r in as_log.residuals if r.label == "DVL velocity")
     rms = np.sqrt(np.mean((residual.residual / residual.sigma) ** 2))
     assert 0.9 < rms < 1.1
+
+
+def test_singular_values_name_the_beams(solved):
+    trial, solution = solved
+    view = observability(solution, trial=trial).point_set
+    assert view.states[:2] == ("beam_direction_1x_deg", "beam_direction_1y_deg")
+    assert len(view.states) == 15
+    # The rows are the derivatives of the prediction itself.
+    nominal, turns = trial.beams.nominal_b, np.array(ERRORS).ravel() * DEG
+    motion = random_motion()
+    v_b = np.einsum("mji,mj->mi", motion.nRb, motion.v_n)
+    arm = np.array([1.0, -1.2, 1.4])
+    rows = beam_rows(
+        BodyMotion(np.arange(5.0), v_b, motion.omega_eb_b),
+        BeamMounting(nominal, turns, np.array(SCALES), arm),
+    )
+
+    def predicted(h):
+        A = (1.0 + np.array(SCALES) + h[8:12])[:, None] * turned(
+            nominal, (turns + h[:8]).reshape(-1, 2)
+        )
+        return (v_b + np.cross(motion.omega_eb_b, arm + h[12:])) @ A.T
+
+    np.testing.assert_allclose(rows, differentiate(predicted, 15), atol=1e-8)
+
+
+def test_a_plan_foresees_what_beams_will_be_known_to(solved):
+    _, solution = solved
+    prediction = predict(noisy())
+    for name in ("beam_direction_b", "beam_scale_error", "lever_arm_m"):
+        found, foreseen = (s.estimate(name).std for s in (solution, prediction.solution))
+        np.testing.assert_allclose(foreseen, found, rtol=0.15)
+    truth = prediction.trial.calibration_truth["beam_direction_b"]
+    directions = prediction.solution.estimate("beam_direction_b").directions
+    np.testing.assert_allclose(directions, truth, atol=1e-12)
+
+
+def test_a_plan_goes_on_with_the_turntable_where_it_stands():
+    planned = noisy()
+    first = predict(planned)
+    history, _ = go_on(planned, [{"straight_s": 30}], first.ending)
+    assert history.names == first.history.names

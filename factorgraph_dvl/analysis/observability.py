@@ -11,9 +11,11 @@ from factorgraph_dvl.analysis.information_shares import Shares, information_shar
 from factorgraph_dvl.analysis.manoeuvres import Segment, find_segments, given_segments
 from factorgraph_dvl.analysis.marginals import Marginals, marginals
 from factorgraph_dvl.analysis.pwcs import (
+    BeamMounting,
     BodyMotion,
     Mounting,
     SingularValues,
+    beam_rows,
     body_motion,
     point_set_rows,
     singular_values,
@@ -28,12 +30,17 @@ from factorgraph_dvl.sensors.dvl import (
     Dvl,
     DvlSettings,
 )
+from factorgraph_dvl.sensors.dvl_beams import DvlBeamsSettings
 from factorgraph_dvl.solution import Estimate, Solution
 from factorgraph_dvl.trial import Trial
 
 _SI = {MISALIGNMENT: DEG, SCALE_ERROR: 1.0, LEVER_ARM: 1.0}
+_DVL_BEAMS = {"beam_direction_b": DEG, "beam_scale_error": 1.0, LEVER_ARM: 1.0}
 # In reported units, where a solution does not say what its priors were.
-_WITHOUT_PRIOR = {MISALIGNMENT: 1.0, SCALE_ERROR: 0.01, LEVER_ARM: 1.0}
+_WITHOUT_PRIOR = {
+    **{MISALIGNMENT: 1.0, SCALE_ERROR: 0.01, LEVER_ARM: 1.0},
+    **{"beam_direction_b": 1.0, "beam_scale_error": 0.01},
+}
 _LEAST_SIGMA = 1e-4
 # A singular value that leaves 96 % of the prior's σ tells nothing.
 _NOTHING = 0.3
@@ -188,21 +195,30 @@ def _point_set(
     margin: float,
 ) -> tuple[PointSet | None, list[str]]:
     by_name = {e.name: e for e in solution.estimates}
-    if trial is not None and trial.dvl is None:
+    of_beams = _DVL_BEAMS.keys() <= by_name.keys() and (trial is None or trial.dvl is None)
+    si = _DVL_BEAMS if of_beams else _SI
+    if trial is not None and trial.log is None:
         return None, ["singular values: the trial has no DVL"]
-    if not by_name.keys() >= _SI.keys():
+    if not by_name.keys() >= si.keys():
         return None, ["singular values: the solution has no calibration of a DVL"]
-    parts = [by_name[name] for name in _SI]
+    parts = [by_name[name] for name in si]
     if not all(np.isfinite(e.value).all() for e in parts):
         return None, ["singular values: the calibration is not known where to linearise"]
     names = tuple(n for e in parts for n in e.component_names)
     scale, how = _prior_scale(parts)
-    mounting = Mounting(*(e.value * _SI[e.name] for e in parts))
-    at, sigma, source = _pings(solution, trial, motion, mounting)
+    values = [e.value * si[e.name] for e in parts]
+    if of_beams:
+        nominal = parts[0].nominal
+        assert nominal is not None
+        beams = BeamMounting(nominal, *values)
+        at, sigma, source = _beam_pings(trial, motion, beams)
+    else:
+        mounting = Mounting(*values)
+        at, sigma, source = _pings(solution, trial, motion, mounting)
     at_epoch = np.clip(np.searchsorted(motion.time, at.time - 1e-6), 0, motion.time.size - 1)
     if at.time.size == 0:
         return None, ["singular values: no ping has a lock while the IMU runs"]
-    si = np.concatenate([np.full(e.value.size, _SI[e.name]) for e in parts])
+    units = np.concatenate([np.full(e.value.size, si[e.name]) for e in parts])
     free = scale > 0.0
     if not free.any():
         return None, ["singular values: the calibration of the DVL is held fixed"]
@@ -210,8 +226,8 @@ def _point_set(
 
     def rows(v_b: Array, omega_b: Array) -> Array:
         moving = BodyMotion(at.time, v_b, omega_b)
-        whole = point_set_rows(moving, mounting) * (scale * si) / sigma[:, :, None]
-        return whole[:, :, free]
+        whole = beam_rows(moving, beams) if of_beams else point_set_rows(moving, mounting)
+        return (whole * (scale * units) / sigma[:, :, None])[:, :, free]
 
     none = np.zeros_like(at.v_b)
     feigned = np.zeros((at.time.size, len(states), len(states)))
@@ -260,6 +276,27 @@ def _prior_scale(parts: Sequence[Estimate]) -> tuple[Array, str]:
         return scale, "columns in units of the priors' σ"
     stated = [np.full(e.value.size, _WITHOUT_PRIOR[e.name]) for e in parts]
     return np.concatenate(stated), "columns in units of 1 deg, 0.01 and 1 m (no priors are known)"
+
+
+def _beam_pings(
+    trial: Trial | None, motion: BodyMotion, mounting: BeamMounting
+) -> tuple[BodyMotion, Array, str]:
+    """Return motion and σ (M, N) at the pings; infinite where a beam was lost."""
+    beams = trial.beams if trial is not None else None
+    if beams is not None:
+        received = np.logical_not(beams.missing)
+        at, covered = motion.at(beams.time[received])
+        sigma = beams.sigma()[received][covered]
+        return at, np.where(np.isnan(sigma), np.inf, sigma), "rows in units of the pings' σ"
+    settings = DvlBeamsSettings(directions=tuple(map(tuple, mounting.nominal_b.tolist())))
+    speed = motion.v_b @ mounting.nominal_b.T
+    sigma = np.hypot(settings.velocity_std_m_s, settings.velocity_std_fraction * speed)
+    text = (
+        "rows in units of an assumed σ, as the pings are not known: one ping for each epoch of "
+        f"the trajectory, {1000.0 * settings.velocity_std_m_s:g} mm/s and "
+        f"{100.0 * settings.velocity_std_fraction:g} % of each beam's velocity"
+    )
+    return motion, sigma, text
 
 
 def _pings(

@@ -11,7 +11,8 @@ from typing import Annotated, Any, ClassVar, Protocol, Self, runtime_checkable
 import msgspec
 import numpy as np
 
-from factorgraph_dvl.conventions import Array
+from factorgraph_dvl.conventions import Array, exp_so3
+from factorgraph_dvl.directions import turns_to
 from factorgraph_dvl.earth import LocalFrame
 from factorgraph_dvl.errors import DataError
 
@@ -80,6 +81,13 @@ class Parameter:
         if self.nominal is not None:
             return f"{self.stem}_b"
         return f"{self.stem}_{self.unit}" if self.unit else self.stem
+
+    def internal(self, reported: Array) -> Array:
+        """Return a value as solvers hold it: SI, a rotation's matrix, turns of directions."""
+        if self.nominal is not None:
+            return turns_to(self.nominal, reported.reshape(-1, 3)).ravel()
+        value = reported * self.si + 0.0 * self.mean
+        return exp_so3(value) if self.rotation else value
 
     @property
     def component_names(self) -> tuple[str, ...]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from factorgraph_dvl.chain import inertial_chain
-from factorgraph_dvl.conventions import Array, exp_so3
+from factorgraph_dvl.conventions import Array
 from factorgraph_dvl.earth import LocalFrame
 from factorgraph_dvl.graph import Evaluation, Problem
 from factorgraph_dvl.increments import increments
@@ -86,7 +86,7 @@ def _at_truth(trial: Trial, true_states: TrueStates) -> tuple[Problem, Evaluatio
     for p in parameters:
         value = trial.calibration_truth.get(p.name)
         if p.estimated and value is not None:
-            truth[p.name] = exp_so3(value * p.si) if p.rotation else value * p.si + 0.0 * p.mean
+            truth[p.name] = p.internal(value)
     problem = Problem(chain, observations, parameters, start=truth)
     values = problem.values(states, {**problem.prior_values(), **truth})
     problem.weigh(problem.evaluate(values))
