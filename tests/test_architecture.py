@@ -18,6 +18,7 @@ PACKAGE = Path(factorgraph_dvl.__file__).parent
 LAYERS = (
     ("conventions", "errors"),
     ("earth", "celestial", "yaml_file", "directions", "turning"),
+    ("gains",),
     ("sensors",),
     ("beam_geometry",),
     ("trial", "solution", "information"),
@@ -42,7 +43,7 @@ LAYERS = (
 FORBIDDEN = {
     "io": ("simulation", "increments"),
     "simulation": ("io", "increments", "preintegration", "graph", "solvers", "analysis"),
-    "kalman": ("io", "simulation"),
+    "kalman": ("io", "simulation", "gains"),
     "solvers": ("io", "simulation", "analysis", "report"),
     "analysis": ("solvers", "graph", "keys", "preintegration", "increments", "simulation", "io"),
     "planning": ("kalman", "io"),

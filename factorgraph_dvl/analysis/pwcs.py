@@ -30,7 +30,7 @@ from factorgraph_dvl.conventions import (
     rotation_from_rph,
     skew,
 )
-from factorgraph_dvl.sensors.dvl_beams import FreeGeometry
+from factorgraph_dvl.gains import FreeGeometry
 from factorgraph_dvl.solution import Trajectory
 from factorgraph_dvl.trial import Reference
 

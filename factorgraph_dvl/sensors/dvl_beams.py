@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
-from typing import Annotated, ClassVar, Literal, Protocol, Self
+from typing import Annotated, ClassVar, Literal, Self
 
 import msgspec
 import numpy as np
 from msgspec import UNSET, UnsetType
 
 from factorgraph_dvl.conventions import DEG, Array, exp_so3, rotate, skew
-from factorgraph_dvl.directions import turned, turned_jacobian
 from factorgraph_dvl.earth import LocalFrame
+from factorgraph_dvl.gains import CommonGeometry, FreeGeometry, Geometry
 from factorgraph_dvl.sensors.protocol import (
     Linearization,
     Motion,
@@ -282,92 +282,6 @@ class DvlBeams:
             f"body, each against a better reference; here they were {x:.2g}, {y:.2g}, {z:.2g} m/s "
             "rms along x, y, z: a turntable or sailing sideways adds the second, heave the third"
         )
-
-
-class Geometry(Protocol):
-    """Where beams point, and how their scales are off, as functions of parameters."""
-
-    @property
-    def parameters(self) -> tuple[str, ...]:
-        """Names of the parameters."""
-
-    def gain(self, values: Values) -> Array:
-        """Return the rows (1 + k_i) d_i^T in body, (N, 3)."""
-
-    def derivatives(self, values: Values, u_b: Array) -> dict[str, Array]:
-        """Return those of gain u, (M, N, n) each, for velocities u_b (M, 3)."""
-
-
-@dataclass(frozen=True)
-class FreeGeometry:
-    """Every beam has a direction and a scale error of its own.
-
-    Parameters
-    ----------
-    nominal_b : (N, 3) unit vectors in body, of which the directions are turns.
-    direction, scale : names of the parameters, (2N,) and (N,).
-    """
-
-    nominal_b: Array
-    direction: str
-    scale: str
-
-    @property
-    def parameters(self) -> tuple[str, ...]:
-        """Names of the parameters."""
-        return (self.direction, self.scale)
-
-    def gain(self, values: Values) -> Array:
-        """Return the rows (1 + k_i) d_i^T in body, (N, 3)."""
-        d_b = turned(self.nominal_b, values[self.direction].reshape(-1, 2))
-        return (1.0 + values[self.scale])[:, None] * d_b
-
-    def derivatives(self, values: Values, u_b: Array) -> dict[str, Array]:
-        """Return those of gain u, (M, N, n) each, for velocities u_b (M, 3)."""
-        eta = values[self.direction].reshape(-1, 2)
-        n = len(eta)
-        by_eta = (1.0 + values[self.scale])[:, None, None] * turned_jacobian(self.nominal_b, eta)
-        by_direction = np.zeros((len(u_b), n, n, 2))
-        by_scale = np.zeros((len(u_b), n, n))
-        own = np.arange(n)
-        by_direction[:, own, own] = np.einsum("mi,nij->mnj", u_b, by_eta)
-        by_scale[:, own, own] = u_b @ turned(self.nominal_b, eta).T
-        return {self.direction: by_direction.reshape(-1, n, 2 * n), self.scale: by_scale}
-
-
-@dataclass(frozen=True)
-class CommonGeometry:
-    """All beams share a misalignment and a scale error; among each other they are nominal.
-
-    Parameters
-    ----------
-    nominal_d : (N, 3) unit vectors in d.
-    misalignment, scale : names of the parameters, a rotation and one number.
-    """
-
-    nominal_d: Array
-    misalignment: str
-    scale: str
-
-    @property
-    def parameters(self) -> tuple[str, ...]:
-        """Names of the parameters."""
-        return (self.misalignment, self.scale)
-
-    def gain(self, values: Values) -> Array:
-        """Return the rows (1 + k) d_i^T in body, (N, 3)."""
-        return (1.0 + values[self.scale]) * (self.nominal_d @ values[self.misalignment])
-
-    def derivatives(self, values: Values, u_b: Array) -> dict[str, Array]:
-        """Return those of gain u, (M, N, n) each, for velocities u_b (M, 3).
-
-        R Exp(delta) u is R u - R [u x] delta to first order.
-        """
-        unscaled = self.nominal_d @ values[self.misalignment]
-        return {
-            self.misalignment: -self.gain(values) @ skew(u_b),
-            self.scale: (u_b @ unscaled.T)[:, :, None],
-        }
 
 
 @dataclass(frozen=True)

@@ -26,6 +26,7 @@ from factorgraph_dvl.earth import RATE, normal_gravity, radii
 from factorgraph_dvl.errors import ConfigError
 from factorgraph_dvl.simulation.manoeuvres import Accelerate, Manoeuvre, Stop, Straight
 from factorgraph_dvl.simulation.scenario import Scenario
+from factorgraph_dvl.simulation.table import table_angle
 
 _COLLOCATION_NODES = 6
 _MAX_LATITUDE = 89.5 * DEG
@@ -275,7 +276,7 @@ def plan_motion(scenario: Scenario) -> Motion:
     )
     still = PPoly(np.zeros((1, 1)), np.array([0.0, 1.0]))
     duration = float(speed.x[-1])
-    table = _table(scenario, duration)
+    table = table_angle(scenario, duration)
     kinks = np.asarray(speed.x, dtype=float)
     if table is not None:
         kinks = np.union1d(kinks, table.x)
@@ -345,38 +346,6 @@ def _profiles(plan: list[Manoeuvre], speed: float, source: str) -> tuple[PPoly, 
                 add(m.ramp_s, 0.0, rate, -rate / m.ramp_s)
     breaks = np.array(times)
     return PPoly(np.array(speeds).T, breaks), PPoly(np.array(rates).T, breaks)
-
-
-def _table(scenario: Scenario, duration: float) -> PPoly | None:
-    """Return the angle of the turntable over time, rad."""
-    if scenario.turntable is None:
-        return None
-    breaks, rates, slopes = [0.0], [], []
-
-    def add(until: float, rate: float, slope: float) -> None:
-        if until > breaks[-1]:
-            breaks.append(until)
-            rates.append(rate)
-            slopes.append(slope)
-
-    for i, turn in enumerate(scenario.turntable.turns):
-        end = turn.at_s + turn.duration_s
-        if end > duration:
-            raise ConfigError(
-                f"the turn ends at {end:g} s, after the manoeuvres, which take {duration:g} s",
-                where=f"{scenario.source} key turntable.turns[{i}]",
-                expected="an earlier turn, or longer manoeuvres",
-            )
-        rate = turn.turn_deg * DEG / (turn.duration_s - turn.ramp_s)
-        slope = rate / turn.ramp_s if turn.ramp_s > 0.0 else 0.0
-        add(turn.at_s, 0.0, 0.0)
-        add(turn.at_s + turn.ramp_s, 0.0, slope)
-        add(end - turn.ramp_s, rate, 0.0)
-        add(end, rate, -slope)
-    add(duration, 0.0, 0.0)
-    angle = PPoly(np.array([slopes, rates]), np.array(breaks)).antiderivative()
-    angle.c[-1] += scenario.turntable.start_deg * DEG
-    return angle
 
 
 def _sway(parts: Iterable[tuple[float, float, float]]) -> Sway:
