@@ -11,9 +11,8 @@ from factorgraph_dvl.earth import radii
 from factorgraph_dvl.kalman.navigation import Motion, Navigation, motion_at
 from factorgraph_dvl.kalman.points import Estimated, Outcome, Points, residuals
 from factorgraph_dvl.sensors.dvl import Dvl
-from factorgraph_dvl.sensors.protocol import Aid
+from factorgraph_dvl.sensors.protocol import Aid, Parameter
 from factorgraph_dvl.sensors.protocol import Motion as SensorMotion
-from factorgraph_dvl.sensors.protocol import Parameter
 from factorgraph_dvl.solution import Estimate, Residuals, Solution, Trajectory, doubts
 from factorgraph_dvl.trial import Trial
 
