@@ -23,6 +23,7 @@ from factorgraph_dvl.solution import Solution, Trajectory
 TRAJECTORY_FILE = "trajectory.csv"
 HISTORY_FILE = "history.csv"
 INSTRUMENT_FILE = "instrument.yaml"
+BEAMS_FILE = "beams.csv"
 FIGURES_FOLDER = "figures"
 STD_COLUMNS = (
     *("std_e_m", "std_n_m", "std_u_m"),
@@ -52,7 +53,10 @@ def save_solution(
     DataError
         If the folder exists, is not empty, and `force` is not set.
     """
-    owned = (CALIBRATION_FILE, TRAJECTORY_FILE, HISTORY_FILE, INSTRUMENT_FILE, FIGURES_FOLDER)
+    owned = (
+        *(CALIBRATION_FILE, TRAJECTORY_FILE, HISTORY_FILE),
+        *(INSTRUMENT_FILE, BEAMS_FILE, FIGURES_FOLDER),
+    )
     with new_folder(Path(path), force=force, owned=owned) as folder:
         write_table(folder / TRAJECTORY_FILE, _trajectory_columns(solution.trajectory))
         if extra is not None:
