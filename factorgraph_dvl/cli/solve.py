@@ -37,6 +37,7 @@ class KalmanMethod(StrEnum):
     WAHBA = "wahba"
     LEAST_SQUARES = "least-squares"
     STAR = "star"
+    BEAMS = "beams"
     TWO_OBSERVATIONS = "4sv-2ob"
     THREE_OBSERVATIONS = "4sv-3ob"
 
@@ -140,6 +141,7 @@ def _solve_into(
         progress("write", 0, None)
 
         def add(folder: Path) -> None:
+            _write_beams(trial, solution, folder)
             if history is not None:
                 write_history(folder, history.time, history.names, history.values, history.std)
             _write_instrument(solution, folder)
@@ -162,6 +164,17 @@ def _solve_into(
             soft_wrap=True,
         )
         raise typer.Exit(1)
+
+
+def _write_beams(trial: Trial | PlanarTrial, solution: Solution, folder: Path) -> None:
+    """Write how the beams agree, if the trial has some and the solution calibrates them."""
+    from factorgraph_dvl.analysis.beam_quality import beam_quality, calibrates, calibration_of
+    from factorgraph_dvl.io.solution_folder import BEAMS_FILE
+    from factorgraph_dvl.io.tables import write_table
+
+    if trial.beams is not None and calibrates(solution, trial.beams):
+        quality = beam_quality(trial.beams, calibration_of(trial.beams, solution))
+        write_table(folder / BEAMS_FILE, quality.columns())
 
 
 def _write_instrument(solution: Solution, folder: Path) -> None:

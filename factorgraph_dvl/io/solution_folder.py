@@ -28,6 +28,7 @@ HYPOTHESES_FILE = "hypotheses.json"
 HYPOTHESES_FOLDER = "hypotheses"
 REJECTED_FILE = "rejected.csv"
 INSTRUMENT_FILE = "instrument.yaml"
+BEAMS_FILE = "beams.csv"
 FIGURES_FOLDER = "figures"
 STD_COLUMNS = (
     *("std_e_m", "std_n_m", "std_u_m"),
@@ -72,14 +73,8 @@ def save_solution(
         If the folder exists, is not empty, and `force` is not set.
     """
     owned = (
-        CALIBRATION_FILE,
-        TRAJECTORY_FILE,
-        HISTORY_FILE,
-        HYPOTHESES_FILE,
-        HYPOTHESES_FOLDER,
-        REJECTED_FILE,
-        INSTRUMENT_FILE,
-        FIGURES_FOLDER,
+        *(CALIBRATION_FILE, TRAJECTORY_FILE, HISTORY_FILE, HYPOTHESES_FILE, HYPOTHESES_FOLDER),
+        *(REJECTED_FILE, INSTRUMENT_FILE, BEAMS_FILE, FIGURES_FOLDER),
     )
     with new_folder(Path(path), force=force, owned=owned) as folder:
         write_table(folder / TRAJECTORY_FILE, _trajectory_columns(solution.trajectory))

@@ -29,10 +29,11 @@ from factorgraph_dvl.sensors.beacon import Beacons
 from factorgraph_dvl.sensors.catalogue import AIDS
 from factorgraph_dvl.sensors.depth import Depth
 from factorgraph_dvl.sensors.dvl import CALIBRATED, SCALE_ERROR, TIME_OFFSET, Dvl
+from factorgraph_dvl.sensors.dvl_beams import DvlBeams
 from factorgraph_dvl.sensors.gnss import Gnss
 from factorgraph_dvl.sensors.imu import Imu
 from factorgraph_dvl.sensors.log import Heading, SpeedLog
-from factorgraph_dvl.sensors.protocol import JointPrior, Record, SensorSection
+from factorgraph_dvl.sensors.protocol import Aid, JointPrior, Record, SensorSection
 from factorgraph_dvl.solution import Calibration, Estimate
 from factorgraph_dvl.trial import InitialAttitude, InitialPosition, Reference, Trial
 from factorgraph_dvl.yaml_file import parse_yaml, read_text
@@ -58,7 +59,7 @@ _Sensor = TypeVar("_Sensor", bound=Record)
 
 
 class _TruthValue(msgspec.Struct):
-    value: list[float]
+    value: list[float | list[float]]
 
 
 class _Truth(msgspec.Struct):
@@ -96,6 +97,12 @@ def load_trial(path: Path | str) -> Trial:
         name: read_record(folder, kinds[name], section) for name, section in settings.aids.items()
     }
     dvl = cast("Dvl | None", aids.pop(Dvl.section, None))
+    notes = []
+    if dvl is not None and _share_pings(dvl, aids):
+        notes.append(
+            "`dvl` and `dvl_beams` have pings at the same times: if both are records of one "
+            "instrument, its noise counts twice, and standard deviations come out too small"
+        )
     return Trial(
         name=settings.name or folder.resolve().name,
         imu=read_record(folder, Imu, settings.imu),
@@ -108,10 +115,7 @@ def load_trial(path: Path | str) -> Trial:
         initial_position=None if initial is UNSET else position_of(initial),
         reference=reference_of(folder, settings),
         calibration_truth=read_truth(folder / TRUTH_FILE),
-        notes=tuple(
-            f"section `{name}` of {file.name} is not used by this version"
-            for name in settings.unused
-        ),
+        notes=tuple(notes),
     )
 
 
@@ -269,6 +273,11 @@ def looks_planar(text: str, source: str) -> bool:
     return kind.imu is None and (kind.heading is not None or kind.log is not None)
 
 
+def _share_pings(dvl: Dvl, others: dict[str, Aid]) -> bool:
+    beams = others.get(DvlBeams.section)
+    return beams is not None and bool(np.mean(np.isin(beams.time, dvl.time)) > 0.5)
+
+
 def locate(path: Path) -> tuple[Path, Path]:
     """Return a trial's folder and its trial.yaml."""
     if not path.exists():
@@ -286,9 +295,8 @@ def reference_of(folder: Path, settings: TrialSettings | PlanarSettings) -> Refe
 
 def read_record(folder: Path, kind: type[_Sensor], settings: SensorSection) -> _Sensor:
     """Return the record of a sensor, from the table that its settings name."""
-    columns = read_table(
-        folder / settings.file, kind.required, kind.optional, source=settings.file
-    )
+    required = (*kind.required, *settings.more_columns)
+    columns = read_table(folder / settings.file, required, kind.optional, source=settings.file)
     return kind.from_columns(settings, columns, settings.file)
 
 
@@ -367,7 +375,7 @@ def read_truth(path: Path) -> dict[str, Array]:
 def truth_json(truth: dict[str, Array]) -> bytes:
     """Return the text of truth.json."""
     values = {
-        name: _TruthValue(np.atleast_1d(value).astype(float).tolist())
+        name: _TruthValue(np.atleast_1d(np.asarray(value, dtype=float)).tolist())
         for name, value in truth.items()
     }
     return msgspec.json.format(msgspec.json.encode(_Truth(values)), indent=2) + b"\n"

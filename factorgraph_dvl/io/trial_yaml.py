@@ -15,11 +15,6 @@ from factorgraph_dvl.sensors.imu import ImuSettings
 from factorgraph_dvl.sensors.log import HeadingSettings, LogSettings
 from factorgraph_dvl.sensors.protocol import Section, SensorSection, Sigma3, check_epoch
 
-# Sections of format 1 whose sensors this version does not know.
-_UNKNOWN = sorted(
-    {"depth", "star", "dvl_beams", "turntable", "beacons"} - {aid.section for aid in AIDS}
-)
-
 _Latitude = Annotated[float, Meta(ge=-90, le=90)]
 _Longitude = Annotated[float, Meta(ge=-360, le=360)]
 _Height = Annotated[float, Meta(ge=-12e3, le=20e3)]
@@ -94,11 +89,6 @@ class _Settings(Section, frozen=True, kw_only=True):
         given = {aid.section: getattr(self, aid.section) for aid in AIDS}
         return {name: section for name, section in given.items() if section is not UNSET}
 
-    @property
-    def unused(self) -> tuple[str, ...]:
-        """Sections that are given, but that this version does not use."""
-        return tuple(name for name in _UNKNOWN if getattr(self, name) is not UNSET)
-
 
 if TYPE_CHECKING:
 
@@ -112,7 +102,6 @@ else:
         "TrialSettings",
         [
             *((aid.section, aid.section_type | UnsetType, UNSET) for aid in AIDS),
-            *((name, dict[str, Any] | UnsetType, UNSET) for name in _UNKNOWN),
         ],
         bases=(_Settings,),
         frozen=True,

@@ -14,8 +14,10 @@ LEAST_PSD = 1e-5
 _LEAST_VELOCITY_VARIANCE = 1e-6
 # Time over which the rate of climb is taken, s.
 SLOPE_OVER = 10.0
-# Time over which it is seen how smoothly a vehicle moves, s.
-_SMOOTH_OVER = 60.0
+# Times over which it is seen how smoothly a vehicle moves, s, the longest first; and in standard
+# deviations what is seen over one of the shorter.
+_SMOOTH_OVER = (60.0, 20.0, 6.0)
+_SEEN = 3.0
 
 
 @dataclass(frozen=True)
@@ -127,13 +129,26 @@ def reckon(
 def change_psd(track: Track) -> Array:
     """Return the density of the changes of the true velocity at the grid, (G, 2, 2), m²/s³.
 
-    With the acceleration a that a straight line through the velocities around a moment has, and
-    its covariance S by their noise, the velocity changes over the time W of that line by
-    W² (a aᵀ + S), at most: as a random walk, of density W (a aᵀ + S).
+    A straight line through the velocities of a time W around a moment has a slope a, of
+    covariance S by their noise: so within W the velocity changes by W² (|a|² I + S), at most, as
+    a random walk of density W (|a|² I + S). Of lines through shorter times, which see short
+    turns, only slopes count that are none of noise.
     """
+    longest, *shorter = _SMOOTH_OVER
+    slope, width, noise = _slopes(track, longest)
+    square = width * np.sum(slope**2, axis=1)
+    for over in shorter:
+        slope, each, spread = _slopes(track, over)
+        size = np.sum(slope**2, axis=1)
+        seen = size > _SEEN**2 * np.trace(spread, axis1=1, axis2=2)
+        square = np.maximum(square, np.where(seen, each * size, 0.0))
+    return square[:, None, None] * np.eye(2) + width[:, None, None] * noise
+
+
+def _slopes(track: Track, over: float) -> tuple[Array, Array, Array]:
+    """Return slopes (G, 2) of lines through velocities, their widths (G,) and covariances."""
     time, v = track.time, track.velocity
-    half = 0.5 * _SMOOTH_OVER
-    low, high = np.maximum(time - half, time[0]), np.minimum(time + half, time[-1])
+    low, high = np.maximum(time - 0.5 * over, time[0]), np.minimum(time + 0.5 * over, time[-1])
     width = np.maximum(high - low, 2.0 * track.interval)
     middle = 0.5 * (low + high)
     # A line through a piecewise linear function: slope = 12 / W³ ∫ (t - m) v dt.
@@ -146,8 +161,7 @@ def change_psd(track: Track) -> Array:
 
     moment = between(first) - (middle - time[0])[:, None] * between(zeroth)
     slope = 12.0 * moment / width[:, None] ** 3
-    noise = (12.0 * track.interval / width**3)[:, None, None] * track.velocity_cov
-    return width[:, None, None] * (slope[:, :, None] * slope[:, None, :] + noise)
+    return slope, width, (12.0 * track.interval / width**3)[:, None, None] * track.velocity_cov
 
 
 def _integral(values: Array, time: Array) -> Array:

@@ -18,6 +18,7 @@ from factorgraph_dvl.errors import ConfigError
 from factorgraph_dvl.sensors.dvl import Dvl
 from factorgraph_dvl.sensors.gnss import Gnss
 from factorgraph_dvl.sensors.protocol import Aid
+from factorgraph_dvl.simulation.beams import simulate_beams, simulate_turntable
 from factorgraph_dvl.simulation.depth import simulate_depth
 from factorgraph_dvl.simulation.measurements import displaced, simulate_dvl, simulate_gnss
 from factorgraph_dvl.simulation.measurements import simulate_imu as _simulate_imu
@@ -53,6 +54,8 @@ _AIDS: dict[str, Callable[..., tuple[Aid, dict[str, Array]]]] = {
     "star": simulate_star,
     "depth": simulate_depth,
     "beacons": simulate_beacons,
+    "dvl_beams": simulate_beams,
+    "turntable": simulate_turntable,
 }
 
 

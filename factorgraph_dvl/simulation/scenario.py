@@ -27,6 +27,8 @@ dvl: {...}                         # DvlTruth, optional
 depth: {...}                       # DepthTruth, optional
 star: {...}                        # StarTruth, optional
 beacons: {...}                     # BeaconTruth, optional
+dvl_beams: {...}                   # DvlBeamsTruth, optional
+turntable: {...}                   # TurntableTruth, optional: turns IMU and DVL on the ship
 heading: {...}                     # without imu: HeadingTruth, LogTruth, DepthTruth, and
 log: {...}                         # beacons make a planar trial
 depth: {...}
@@ -67,11 +69,13 @@ from factorgraph_dvl.sensors.protocol import (
 from factorgraph_dvl.simulation.convert import convert
 from factorgraph_dvl.simulation.instruments import (
     DepthTruth,
+    DvlBeamsTruth,
     DvlTruth,
     GnssTruth,
     ImuTruth,
     Instrument,
     StarTruth,
+    TurntableTruth,
 )
 from factorgraph_dvl.simulation.manoeuvres import Manoeuvre, flatten
 from factorgraph_dvl.simulation.ranging_instruments import BeaconTruth, HeadingTruth, LogTruth
@@ -140,6 +144,8 @@ class Claims(Section, frozen=True, kw_only=True):
     heading: dict[str, Any] = msgspec.field(default_factory=dict)
     log: dict[str, Any] = msgspec.field(default_factory=dict)
     depth: dict[str, Any] = msgspec.field(default_factory=dict)
+    dvl_beams: dict[str, Any] = msgspec.field(default_factory=dict)
+    turntable: dict[str, Any] = msgspec.field(default_factory=dict)
     initial: InitialClaim | None = None
 
 
@@ -163,6 +169,8 @@ class Scenario(Section, frozen=True, kw_only=True):
     heading: HeadingTruth | None = None
     log: LogTruth | None = None
     depth: DepthTruth | None = None
+    dvl_beams: DvlBeamsTruth | None = None
+    turntable: TurntableTruth | None = None
     trial: Claims = Claims()
     source: str = ""
 
