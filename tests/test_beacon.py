@@ -139,6 +139,30 @@ def test_by_hand():
     np.testing.assert_allclose(rate.residual(motion, values), [[1.1 * (9.0 + 4.0) / 5.0]])
 
 
+def test_a_two_way_range_is_that_of_its_middle():
+    frame = LocalFrame(np.radians(36.0), np.radians(121.0), 0.0)
+    settings = parsed(positions={"B1": {"lat_deg": 36.0, "lon_deg": 121.0, "height_m": 0}})
+    sound, v = 1500.0, np.array([2.0, 1.0, 0.0])
+    asked = np.array([1000.0, -400.0, -50.0])
+    out = np.linalg.norm(asked) / sound
+    back = out
+    for _ in range(20):
+        back = np.linalg.norm(asked + v * (out + back)) / sound
+    one = np.ones(1)
+    r = Beacons(
+        settings, one, np.array(["B1"]), 0.5 * sound * (out + back) * one, np.full(1, np.nan)
+    )
+    values = {"sound_speed_error": np.zeros(1), offset_name("B1"): np.zeros(3)}
+    (o, *_) = r.observations(frame)
+
+    def error(since):
+        motion = replace(random_motion(1), nRb=np.eye(3)[None], p_n=(asked + v * since)[None])
+        return float(np.abs(replace(o, arm_b=np.zeros(3)).residual(motion, values)[0, 0]))
+
+    assert error(0.5 * (out + back)) < 2e-3
+    assert error(out + back) > 1.0
+
+
 def dive(**changes):
     """A vehicle that starts from nowhere, 700 m from a beacon, with one turn by 90 degrees."""
     return scenario(

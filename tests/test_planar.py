@@ -18,10 +18,13 @@ from factorgraph_dvl.io.solution_folder import load_solution
 from factorgraph_dvl.io.trial_folder import load_trial
 from factorgraph_dvl.kalman.single_beacon import filter_planar
 from factorgraph_dvl.planar.elimination import System
-from factorgraph_dvl.planar.model import evaluate, misfit
-from factorgraph_dvl.planar.problem import plan
+from factorgraph_dvl.planar.evidence import evidence, odds_against
+from factorgraph_dvl.planar.model import GATE, evaluate, misfit, terms
+from factorgraph_dvl.planar.problem import plan, reckoned
+from factorgraph_dvl.planar.ridge import shares_of, stations
 from factorgraph_dvl.planar.smoother import covariance, fit
 from factorgraph_dvl.planar.solve import solve_planar
+from factorgraph_dvl.planar.track import change_psd
 from factorgraph_dvl.simulation import parse_scenario, simulate, simulate_planar
 
 SEEDS = int(os.environ.get("FACTORGRAPH_DVL_SEEDS", "20"))
@@ -136,6 +139,87 @@ def test_jacobians_against_differences():
         found = (c - d) / (2 * h[i])
         np.testing.assert_allclose(by, found, atol=2e-6 * max(1, np.abs(found).max()))
     assert node.size >= n - 1
+
+
+def test_the_gradient_is_that_of_the_cost():
+    t = trial(**ALL_CONSTANTS)
+    problem = plan(t).problem
+    x, theta = true_state(t, problem)
+    # Over the beginning of the turn too, where the velocity changes.
+    n = 160
+    rng = np.random.default_rng(4)
+    x = x[:n] + rng.normal(0.0, [0.3, 0.3, 0.02, 0.02], (n, 4))
+    at = evaluate(problem, x, theta)
+    used = tuple((np.abs(r) <= GATE).astype(float) for r in (at.range_residual, at.rate_alone))
+    assert sum(u.sum() for u in used) > 2 * n - 10
+    system = System(problem, x, theta, at, used, 0.0)
+
+    def cost(x, theta):
+        return terms(problem, x, theta, evaluate(problem, x, theta)).sum()
+
+    for node in (0, 7, 150, n - 1):
+        for i in range(4):
+            h = np.zeros_like(x)
+            h[node, i] = 1e-5
+            found = (cost(x + h, theta) - cost(x - h, theta)) / 2e-5
+            assert system._g[4 * node + i] == pytest.approx(found, rel=2e-4, abs=0.05)
+
+
+def test_a_vehicle_is_as_smooth_as_it_is_seen_to_be():
+    quiet, turning = trial(**STRAIGHT), trial()
+    psd = change_psd(reckoned(quiet))
+    root = np.sqrt(np.trace(psd, axis1=1, axis2=2))
+    # Within half a minute no more than a few of the centimetres per second of the mean's noise.
+    assert np.median(root[40:-40]) * np.sqrt(30.0) < 0.03
+    track = reckoned(turning)
+    at = np.argmin(np.abs(track.time - 157.0))
+    # 2 m/s turning by 2 degrees in a second: no less in any direction.
+    assert np.linalg.eigvalsh(change_psd(track)[at]).min() > (2.0 * np.radians(2.0)) ** 2
+    # A line of slope a, by hand: W a²; the trapezoid makes its slope larger by 2 (1 s / W)².
+    line = replace(
+        track,
+        velocity=np.outer(track.time, [0.003, -0.004]),
+        velocity_cov=np.zeros_like(track.velocity_cov),
+    )
+    by_hand = 60.0 * (0.005 * (1.0 + 2.0 / 60.0**2)) ** 2
+    np.testing.assert_allclose(change_psd(line)[at], by_hand * np.eye(2), rtol=1e-6)
+
+
+def test_a_straight_run_tells_no_more_of_the_current_than_its_prior():
+    t = trial(1, **STRAIGHT)
+    problem = plan(t).problem
+    x, theta = true_state(t, problem)
+    best = fit(problem, x, theta, iterations=100)
+    ridge = stations(problem, best)
+    assert len(ridge) > 5
+    share = shares_of(ridge)
+    first = np.array([s.fit.p[0] for s in ridge])
+    beacon = problem.place[0, :2]
+    # All on an arc about the beacon: its range is known, the bearing is not.
+    radius = np.hypot(*(first - beacon).T)
+    assert np.ptp(radius) < 0.05 * radius.mean()
+    spread = np.sqrt(np.sum(share[:, None] * (first - share @ first) ** 2))
+    # The ground velocity is known in size alone; across it the current has its prior, 0.3 m/s.
+    moved = np.linalg.norm(x[-1, :2] - x[0, :2]) / (problem.time[-1] - problem.time[0])
+    assert spread == pytest.approx(radius.mean() * 0.3 / moved, rel=0.3)
+
+
+def test_what_counts_as_evidence():
+    rng = np.random.default_rng(0)
+    base = 0.5 * rng.normal(size=1000) ** 2
+    walk = [odds_against([base, base + rng.normal(0.0, 0.5, 1000)])[1] for _ in range(200)]
+    # Sums of 16 by chance are not believed.
+    assert np.mean(np.abs(walk) < 3.0) > 0.95
+    turn = base.copy()
+    turn[:5] += 8.0
+    np.testing.assert_allclose(odds_against([base, turn]), [0.0, 40.0])
+    # A current that ten standard deviations of its prior speak against, and nothing else does.
+    t = trial(1, **STRAIGHT)
+    problem = plan(t).problem
+    x, theta = true_state(t, problem)
+    good = fit(problem, x, theta)
+    bad = replace(good, theta=good.theta + 3.0)
+    assert evidence(problem, [good, bad])[1] > 50.0
 
 
 def test_covariance_against_a_dense_inverse():
@@ -330,6 +414,19 @@ def test_a_planar_scenario_is_no_other(tmp_path, capsys):
     capsys.readouterr()
     assert exit_info.value.code == 0
     assert load_planar_trial(tmp_path / "t").name == "one-beacon"
+
+
+@pytest.mark.slow
+def test_a_straight_run_is_covered_and_never_decided():
+    covered = []
+    for seed in range(SEEDS):
+        current = np.random.default_rng([seed, 1]).normal(0.0, 0.3, 2)
+        t = trial(seed, **STRAIGHT, current_m_s=[*current.tolist(), 0.0])
+        solution = solve_planar(t, rate_hz=1.0)
+        error = error_of(t, solution)
+        covered.append(np.mean(np.abs(error) < 2.0 * solution.trajectory.position_std[:, :2]))
+        assert len([h for h in solution.hypotheses if h.died is None]) == 2
+    assert np.mean(covered) > 0.95 - 4.0 * np.sqrt(0.05 / SEEDS)
 
 
 @pytest.mark.slow
