@@ -154,7 +154,7 @@ def directions_not_told(data: Array, feigned: Array) -> Array:
         included.
     feigned : (P, P) that share of it.
     """
-    if not largest_feigned_share(data, feigned) >= FEIGNED:
+    if not data.size or not largest_feigned_share(data, feigned) >= FEIGNED:
         return np.zeros((data.shape[0], 0))
     genuine, directions = np.linalg.eigh(data - feigned)
     return np.asarray(directions[:, genuine < _GENUINE])
