@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from factorgraph_dvl.alignment import initial_states
 from factorgraph_dvl.anchoring import Anchors, anchored
@@ -35,6 +36,8 @@ _SAME_GRAVITY = 2.0
 _ROUGH = 1.0
 _ROUGH_ITERATIONS = 10
 _ROUNDS = 4
+# So long before and after a fix the motion without the DVL is good enough to mount it by, s.
+_HELD_BY_FIXES = 10.0
 
 
 @dataclass(frozen=True)
@@ -249,6 +252,16 @@ def _sensors(aids: Sequence[Aid], frame: LocalFrame) -> tuple[list[Observation],
     return observations, parameters
 
 
+def _near_fixes(trial: Trial, time: Array) -> NDArray[np.bool_]:
+    """Whether GNSS holds the inertial motion at times; without any, all are as good."""
+    if trial.gnss is None:
+        return np.ones(time.size, dtype=bool)
+    fixes = trial.gnss.time[~np.isnan(trial.gnss.geodetic[:, 0])]
+    after = np.clip(np.searchsorted(fixes, time), 1, max(fixes.size - 1, 1))
+    nearest = np.minimum(np.abs(time - fixes[after - 1]), np.abs(fixes[after % fixes.size] - time))
+    return np.asarray(nearest < _HELD_BY_FIXES)
+
+
 def _mountings(
     trial: Trial, frame: LocalFrame, seg: Segments, gravity_n: np.ndarray, states: States
 ) -> dict[str, np.ndarray]:
@@ -258,7 +271,8 @@ def _mountings(
         index, since, covered = seg.increments.locate(time)
         inside = seg.increments.start[index] + np.clip(since, 0.0, seg.increments.dt[index])
         at = attach(seg, np.where(covered, time, inside), frame.earth_rate)
-        return motion_at(at, states, gravity_n, frame.earth_rate), covered
+        held = covered & _near_fixes(trial, time)
+        return motion_at(at, states, gravity_n, frame.earth_rate), held
 
     out = {}
     for seen in attitudes(trial, frame):
