@@ -232,8 +232,12 @@ def test_a_terminal_too_narrow_cuts_no_number(
 
 def test_the_table_comes_before_its_warnings_in_one_file(tmp_path: Path) -> None:
     trial = write_trial(tmp_path)
+    # Beams at the times of the pings: one instrument in two records.
+    times = [line.split(",")[0] for line in (trial / "dvl.csv").read_text().splitlines()[1:]]
+    rows = ["time_s,beam1_m_s,beam2_m_s,beam3_m_s,beam4_m_s", *(f"{t},0,0,0,0" for t in times)]
+    (trial / "dvl_beams.csv").write_text("\n".join(rows) + "\n")
     with (trial / "trial.yaml").open("a") as file:
-        file.write("turntable: {file: turntable.csv}\n")
+        file.write("dvl_beams: {slant_azimuth_deg: [[30, 45], [30, 135], [30, 225], [30, 315]]}\n")
     done = subprocess.run(
         [sys.executable, "-m", "factorgraph_dvl.cli", "inspect", str(trial)],
         stdout=subprocess.PIPE,
@@ -242,7 +246,7 @@ def test_the_table_comes_before_its_warnings_in_one_file(tmp_path: Path) -> None
         timeout=60,
         check=True,
     )
-    assert 0 < done.stdout.index("missing %") < done.stdout.index("warning: section `turntable`")
+    assert 0 < done.stdout.index("missing %") < done.stdout.index("warning: `dvl` and `dvl_beams`")
 
 
 @pytest.mark.parametrize(
@@ -286,13 +290,6 @@ def test_inspect_shows_records_and_findings(tmp_path: Path, run: Run) -> None:
         "error: IMU: the mean specific",
     ):
         assert text in result.out
-
-
-def test_inspect_notes_what_is_not_used(tmp_path: Path, run: Run) -> None:
-    trial = write_trial(tmp_path)
-    with (trial / "trial.yaml").open("a") as file:
-        file.write("turntable: {file: turntable.csv}\n")
-    assert "section `turntable` of trial.yaml is not used" in run("inspect", trial).err
 
 
 @pytest.mark.parametrize("flag", [(), ("--parquet",)])
