@@ -116,6 +116,12 @@ def test_nominal_directions_three_ways_are_the_same_beams():
     alpha, theta = np.arcsin(root) / DEG, 60.0
     patent = DvlBeamsSettings(alpha_theta_deg=((alpha, theta),) * 4)
     np.testing.assert_allclose(patent.nominal_d, vectors, atol=1e-14)
+    # A Janus in +: beams 1 and 3 are in the xz plane, where rounding may go beyond it.
+    for slant in np.arange(5.0, 60.0):
+        plus = DvlBeamsSettings(alpha_theta_deg=((slant, 90 - slant), (0, 90 - slant)) * 2)
+        s, c = np.sin(slant * DEG), np.cos(slant * DEG)
+        by_hand = [[s, 0, -c], [0, s, -c], [-s, 0, -c], [0, -s, -c]]
+        np.testing.assert_allclose(plus.nominal_d, by_hand, atol=1e-7)
     given = DvlBeamsSettings(directions=tuple(map(tuple, (1.002 * vectors).tolist())))
     np.testing.assert_allclose(given.nominal_d, vectors, atol=1e-15)
 

@@ -41,6 +41,7 @@ Acute = Annotated[float, msgspec.Meta(ge=0, le=90)]
 _LEAST_SPREAD = 0.05
 _UNIT = 0.05
 _LEAST_SIGMA = 1e-4
+_ROUNDING = 1e-12
 # Signs of x and y in the octants V to VIII, below the plane of x and y.
 _OCTANTS = np.array([[1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0], [1.0, -1.0]])
 
@@ -114,10 +115,12 @@ class DvlBeamsSettings(SensorSection, frozen=True, kw_only=True):
         alpha, theta = np.array(self.alpha_theta_deg).reshape(-1, 2).T * DEG
         if alpha.size != 4:
             raise ValueError("`alpha_theta_deg` must hold four beams, in octants V to VIII")
-        if np.any(alpha + theta > 90.0 * DEG):
+        # A beam in the xz plane may be beyond it by rounding.
+        y2 = np.cos(alpha + theta) * np.cos(alpha - theta)
+        if np.any(y2 < -_ROUNDING):
             raise ValueError("`alpha_theta_deg` must not add up to more than 90 deg")
         x, z = np.sin(alpha), -np.sin(theta)
-        y = np.sqrt(1.0 - x**2 - z**2)
+        y = np.sqrt(np.maximum(y2, 0.0))
         return np.stack([_OCTANTS[:, 0] * x, _OCTANTS[:, 1] * y, z], axis=1)
 
     @property
