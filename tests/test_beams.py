@@ -452,6 +452,39 @@ def test_the_common_mounting_is_found_from_anywhere():
     np.testing.assert_allclose(solution.estimate("misalignment_deg").value, mounting, atol=0.3)
 
 
+def test_a_common_mounting_that_is_far_off_does_not_mislead_poor_gyros():
+    imu = {"gyro_noise_deg_sqrt_h": 0.15, "accel_noise_ug_sqrt_hz": 60}
+    imu |= {"gyro_bias_deg_h": "draw", "accel_bias_ug": "draw"}
+    bias = {"gyro_bias_std_deg_h": 20, "accel_bias_std_ug": 2000}
+    claims = {
+        "imu": bias,
+        "dvl": None,
+        "dvl_beams": {"parametrisation": "common", "misalignment_std_deg": [180, 180, 180]}
+        | {"misalignment_deg": [0, 0, 0]},
+    }
+    truth = {"rate_hz": 5, "slant_azimuth_deg": JANUS_X, "misalignment_deg": [170, 0, 0]}
+    truth |= {"scale_error": [0.01] * 4, "velocity_std_m_s": 0.005}
+    truth |= {"lever_arm_m": [1.0, -1.2, 1.4]}
+    gnss = {"rate_hz": 1, "position_std_m": [2, 2, 4], "velocity_std_m_s": [0.3, 0.3, 0.3]}
+    gnss |= {"lever_arm_m": [0.3, -1.5, 4.0]}
+    parts = [{"straight_s": 20}, {"turn_deg_s": 6, "duration_s": 30, "ramp_s": 4}]
+    parts += [{"straight_s": 60}, {"accelerate_m_s2": -0.1, "to_m_s": 2.5}, {"straight_s": 60}]
+    parts += [{"turn_deg_s": -4, "duration_s": 30, "ramp_s": 4}, {"straight_s": 60}]
+    changes = {
+        "imu": imu | bias,
+        "gnss": gnss,
+        "dvl_beams": truth,
+        "turntable": None,
+        "trial": claims,
+    }
+    for seed in (2, 4):
+        trial = simulate(noisy(manoeuvres=parts, **changes), seed)
+        solution = solve(trial, rate_hz=1.0)
+        assert solution.converged
+        nees, dof = nees_of(solution, trial.calibration_truth)
+        assert nees < chi2.ppf(0.999, dof)
+
+
 def test_beams_beside_a_dvl_have_names_of_their_own():
     claims = {"imu": {"gyro_bias_std_deg_h": 0.05, "accel_bias_std_ug": 100}}
     dvl = {"rate_hz": 5, "misalignment_deg": [1, 2, 30], "velocity_std_m_s": 0.005}

@@ -173,6 +173,8 @@ def _without_dvl(
     """Return the minimum without the sensors whose mounting that is to tell."""
     trial = chain.trial
     unknown = {a.mounting.name for a in attitudes(trial, chain.frame)} - mountings.keys()
+    if trial.beams is not None:
+        unknown |= {p.name for p in trial.beams.parameters() if p.rotation and p.estimated}
     used = [
         aid
         for aid in trial.aids
