@@ -414,6 +414,17 @@ def test_beams_lost_for_good_leave_the_others(lost):
     np.testing.assert_array_equal(np.isfinite(residual.sigma), np.isfinite(residual.residual))
 
 
+def test_noise_in_proportion_to_velocity_leaves_the_scales_alone():
+    base = msgspec.to_builtins(noisy().dvl_beams) | {"velocity_std_fraction": 0.05}
+    errors = []
+    for seed in range(6):
+        trial = simulate(noisy(dvl_beams=base), seed)
+        found = solve(trial, rate_hz=1.0).estimate("beam_scale_error")
+        errors.append((found.value - SCALES) / found.std)
+    # By the measured velocities they would be 0.005 too small, 1.4 sigma each.
+    assert abs(np.mean(errors)) < 2.5 / np.sqrt(np.size(errors))
+
+
 def test_a_beam_that_was_never_received_is_named():
     trial = simulate(noisy(), 1)
     trial.beams.velocity[:, 2] = np.nan
@@ -422,6 +433,10 @@ def test_a_beam_that_was_never_received_is_named():
     assert seen.tolist() == [True] * 4 + [False] * 2 + [True] * 2
     said = "beam_direction_3x_deg, beam_direction_3y_deg not observable: beam 3 was never received"
     assert any(w.startswith(said) for w in solution.warnings)
+    trial.beams.velocity[:, 0] = np.nan
+    for i in (1, 3):
+        said = f"beam_direction_{i}x_deg, beam_direction_{i}y_deg not observable: beam {i} was"
+        assert any(w.startswith(said) for w in solve(trial).warnings)
 
 
 def test_the_common_mounting_is_found_from_anywhere():

@@ -264,8 +264,9 @@ class DvlBeams:
         )
         lost = np.isnan(self.velocity[m])
         measured = np.where(lost, 0.0, self.velocity[m])
-        std = np.where(lost, np.inf, self.sigma()[m])
-        return (BeamVelocity(self.time[m], measured, std, geometry, lever_arm),)
+        s = self.settings
+        noise = (s.velocity_std_m_s, s.velocity_std_fraction)
+        return (BeamVelocity(self.time[m], measured, lost, noise, geometry, lever_arm),)
 
     def explain(self, parameter: str, component: int, motion: Motion | None) -> str:
         """Say why a component could not be observed, given the motion of the trial."""
@@ -304,14 +305,16 @@ class BeamVelocity:
     ----------
     time : (M,) s.
     measured : (M, N) m/s; any number where lost.
-    std : (M, N) m/s, infinite where lost.
+    lost : (M, N) bool.
+    noise : floor, m/s, and fraction of the beam's velocity.
     geometry : directions and scales.
     lever_arm : name of the parameter.
     """
 
     time: Array
     measured: Array
-    std: Array
+    lost: Array
+    noise: tuple[float, float]
     geometry: Geometry
     lever_arm: str
     label: str = "Beam velocity"
@@ -332,8 +335,16 @@ class BeamVelocity:
         return self.time
 
     def sigma(self, motion: Motion, values: Values) -> Array:
-        """Return the standard deviations, the gyro's share through the lever arm included."""
-        return np.hypot(self.std, lever_arm_sigma(motion, values[self.lever_arm])[:, None])
+        """Return the standard deviations, the gyro's share through the lever arm included.
+
+        By the predicted velocity: by the measured one, pings whose noise makes them smaller
+        would count more, and the scale would come out too small by twice the squared fraction.
+        """
+        floor, fraction = self.noise
+        predicted = self.residual(motion, values) + self.measured
+        std = np.maximum(np.hypot(floor, fraction * predicted), _LEAST_SIGMA)
+        std = np.hypot(std, lever_arm_sigma(motion, values[self.lever_arm])[:, None])
+        return np.where(self.lost, np.inf, std)
 
     def residual(self, motion: Motion, values: Values) -> Array:
         """Return predicted - measured, (M, N), m/s."""

@@ -140,7 +140,8 @@ def minimised(
         iterations += minimum.iterations
         states, values = minimum.evaluation.states, minimum.evaluation.parameters
         same_gravity = np.sqrt(np.mean((states.p_n - p_gravity) ** 2)) <= _SAME_GRAVITY
-        if same_gravity and not problem.strayed(values):
+        settled = not (problem.strayed(values) or problem.misweighed(minimum.evaluation))
+        if same_gravity and settled:
             break
     report("covariance", 0, None)
     covariances = posterior(problem, minimum)
