@@ -181,8 +181,13 @@ class Calibration:
 
     @property
     def values(self) -> dict[str, Array]:
-        """Values by name, in reported units."""
-        return {e.name: e.value for e in self.estimates}
+        """Values by name, as `values_of`."""
+        return values_of(self.estimates)
+
+
+def values_of(estimates: Sequence[Estimate]) -> dict[str, Array]:
+    """Return values by name as in calibration.json: of directions the unit vectors, (N, 3)."""
+    return {e.name: e.value if e.nominal is None else e.directions for e in estimates}
 
 
 def doubts(estimates: Sequence[Estimate], residuals: Sequence[Residuals]) -> list[str]:

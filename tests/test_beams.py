@@ -14,9 +14,12 @@ from scipy.stats import chi2
 from test_observations import random_motion
 from truth import exact_motion, scenario
 
+from factorgraph_dvl.analysis.beam_quality import beam_calibration
+from factorgraph_dvl.analysis.before_after import before_after
 from factorgraph_dvl.analysis.consistency import calibration_errors
 from factorgraph_dvl.analysis.observability import observability
 from factorgraph_dvl.analysis.pwcs import BeamMounting, BodyMotion, beam_rows
+from factorgraph_dvl.attitude import Attitude
 from factorgraph_dvl.beam_geometry import (
     as_dvl,
     error_rows,
@@ -592,6 +595,81 @@ def test_the_command_makes_a_dvl_that_solves(solved, tmp_path):
     residual = next(r for r in as_log.residuals if r.label == "DVL velocity")
     rms = np.sqrt(np.mean((residual.residual / residual.sigma) ** 2))
     assert 0.9 < rms < 1.1
+
+
+def reckoned(trial, values):
+    attitude = Attitude(trial.imu, trial.reference, trial.body_axes, np.zeros(3))
+    return before_after(trial, values, attitude.at)
+
+
+@pytest.mark.parametrize("body_axes", ["RFU", "FRD"])
+def test_dead_reckoning_by_the_true_beams_is_exact(body_axes):
+    scn = scene(body_axes=body_axes)
+    mounted = msgspec.structs.replace(scn.dvl_beams, misalignment_deg=(1.0, -2.0, 40.0))
+    trial = simulate(msgspec.structs.replace(scn, dvl_beams=mounted))
+    lost = trial.beams.velocity.copy()
+    lost[::3, 1] = np.nan
+    trial = replace(trial, others=(replace(trial.beams, velocity=lost), trial.others[1]))
+    result = reckoned(trial, trial.calibration_truth)
+    assert np.abs(result.calibrated.score.error).max() < 0.01
+    # The antenna, by which it is scored then, stays with the ship while the body turns.
+    attitude = Attitude(trial.imu, trial.reference, trial.body_axes, np.zeros(3))
+    fixes = before_after(replace(trial, reference=None), trial.calibration_truth, attitude.at)
+    assert fixes.scored_by == "GNSS"
+    assert np.abs(fixes.calibrated.score.error).max() < 0.01
+    # Nominal beams, half a degree and half a per cent off.
+    assert result.uncalibrated.score.horizontal.max() > 0.5
+    assert result.without_lever_arm.score.horizontal.max() > 0.5
+
+
+def test_dead_reckoning_takes_a_common_calibration_and_no_other_beams():
+    trial = simulate(scene())
+    whole = reckoned(trial, trial.calibration_truth).calibrated.track.geodetic
+    common = {"misalignment_deg": np.array([0.2, 0.0, 0.0]), "scale_error": np.zeros(1)}
+    assert np.abs(reckoned(trial, common).calibrated.track.geodetic - whole).max() > 0.0
+    three = {"beam_direction_b": trial.beams.nominal_b[:3]}
+    for other in (three, {"lever_arm_m": np.ones(3)}):
+        with pytest.raises(DataError, match="does not calibrate the 4 beams"):
+            reckoned(trial, other)
+
+
+def test_a_scale_of_each_axis_is_one_of_each_beam():
+    sensor = beams(np.zeros((1, 4)))
+    axes, vector = np.array([0.01, -0.02, 0.03]), np.array([0.0, 0.0, 90.0])
+    values = {"misalignment_deg": vector, "scale_error": axes, "lever_arm_m": np.zeros(3)}
+    found = beam_calibration(sensor, values)
+    # The beams of a DVL that reads (1 + k) C v: d^T (1 + k) C v.
+    rows = (1.0 + found.scale_error)[:, None] * found.directions_b
+    C = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    np.testing.assert_allclose(rows, sensor.nominal_b @ np.diag(1.0 + axes) @ C, atol=1e-12)
+
+
+@pytest.mark.parametrize("prefix", ["", "beam_"])
+def test_the_lever_arm_of_beams_is_not_that_of_a_dvl_beside_them(prefix):
+    # Calibrated beside a DVL, used without it, and the other way round.
+    values = {
+        "beam_direction_b": beams(np.zeros((1, 4))).nominal_b,
+        "beam_scale_error": np.zeros(4),
+        "lever_arm_m": np.ones(3),
+    }
+    sensor = replace(beams(np.zeros((1, 4))), prefix=prefix)
+    np.testing.assert_array_equal(beam_calibration(sensor, values).lever_arm, np.ones(3))
+    values["beam_lever_arm_m"] = np.full(3, 2.0)
+    np.testing.assert_array_equal(beam_calibration(sensor, values).lever_arm, np.full(3, 2.0))
+
+
+def test_the_command_dead_reckons_beams(solved, tmp_path):
+    trial, solution = solved
+    save_trial(trial, tmp_path / "trial")
+    save_solution(solution, tmp_path / "solved")
+    for calibration in (tmp_path / "solved", tmp_path / "trial" / "truth.json"):
+        out = tmp_path / f"by-{calibration.stem}"
+        args = ["deadreckon", tmp_path / "trial", "--calibration", calibration, "--out", out]
+        with pytest.raises(SystemExit) as done:
+            main([*map(str, args), "--no-figures"])
+        assert done.value.code == 0
+        found = json.loads((out / "deadreckon.json").read_text())
+        assert found["global_error_m"] < 0.2 * found["uncalibrated"]["global_error_m"]
 
 
 def test_singular_values_name_the_beams(solved):
