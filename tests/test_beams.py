@@ -38,10 +38,15 @@ from factorgraph_dvl.io.solution_folder import load_solution, save_solution
 from factorgraph_dvl.io.trial_folder import load_trial, save_trial
 from factorgraph_dvl.kalman import calibrate
 from factorgraph_dvl.planning.prediction import go_on, predict
+from factorgraph_dvl.report.observability_figures import (
+    history_figure,
+    write_observability_figures,
+)
 from factorgraph_dvl.sensors.dvl_beams import DvlBeams, DvlBeamsSettings
 from factorgraph_dvl.sensors.protocol import Motion
 from factorgraph_dvl.simulation import plan_motion, simulate
 from factorgraph_dvl.solvers.batch import solve
+from factorgraph_dvl.solvers.information_history import solve_with_history
 
 JANUS_X = ((30.0, 45.0), (30.0, 315.0), (30.0, 225.0), (30.0, 135.0))
 JANUS_PLUS = ((25.0, 0.0), (25.0, 90.0), (25.0, 180.0), (25.0, 270.0))
@@ -694,6 +699,18 @@ def test_singular_values_name_the_beams(solved):
         return (v_b + np.cross(motion.omega_eb_b, arm + h[12:])) @ A.T
 
     np.testing.assert_allclose(rows, differentiate(predicted, 15), atol=1e-8)
+
+
+def test_what_beams_tell_is_drawn(solved, tmp_path):
+    trial, solution = solved
+    _, history = solve_with_history(trial)
+    view = observability(solution, trial=trial, history=history)
+    names = {file.stem for file in write_observability_figures(view, tmp_path)}
+    assert names == {"singular_values", "std_along_trial", "correlation", "directions", "shares"}
+    panel = history_figure(view.history, []).axes[0]
+    looks = {(line.get_color(), line.get_linestyle()) for line in panel.get_lines()}
+    assert len(looks) == 8
+    assert panel.get_xlabel() == ""
 
 
 def test_a_plan_foresees_what_beams_will_be_known_to(solved):
