@@ -38,6 +38,7 @@ from factorgraph_dvl.io.solution_folder import load_solution, save_solution
 from factorgraph_dvl.io.trial_folder import load_trial, save_trial
 from factorgraph_dvl.kalman import calibrate
 from factorgraph_dvl.planning.prediction import go_on, predict
+from factorgraph_dvl.report.figures import write_figures
 from factorgraph_dvl.report.observability_figures import (
     history_figure,
     write_observability_figures,
@@ -426,6 +427,33 @@ def test_a_beam_that_was_never_received_is_named():
     assert any(w.startswith(said) for w in solution.warnings)
 
 
+def test_each_beam_that_was_never_received_is_named(tmp_path):
+    trial = simulate(noisy(turntable=None), 1)
+    trial.beams.velocity[:, 1:] = np.nan
+    solution = solve(trial)
+    for beam in (2, 3, 4):
+        said = f"beam_scale_error_{beam} not observable: beam {beam} was never received"
+        assert said in solution.warnings
+    arm = next(w for w in solution.warnings if w.startswith("lever_arm"))
+    assert arm.endswith("too few beams were ever received: 1")
+    # Nothing says how beams agree of which there is one.
+    drawn = {file.name for file in write_figures(trial, solution, tmp_path)}
+    assert "beam_residuals.png" in drawn
+    assert "beam_quality.png" not in drawn
+
+
+def test_a_single_ping_is_solved_and_written(tmp_path):
+    trial = simulate(noisy(turntable=None), 1)
+    sensor = replace(
+        trial.beams, time=trial.beams.time[:1], velocity=4.0 * trial.beams.velocity[:1] + 1.0
+    )
+    save_trial(replace(trial, others=(sensor,)), tmp_path / "trial")
+    with pytest.raises(SystemExit) as done:
+        main(["solve", str(tmp_path / "trial"), "--out", str(tmp_path / "out"), "--no-figures"])
+    assert done.value.code == 0
+    assert (tmp_path / "out" / "beams.csv").exists()
+
+
 def test_the_common_mounting_is_found_from_anywhere():
     mounting = [20.0, -30.0, 150.0]
     truth = {
@@ -548,6 +576,12 @@ def test_velocities_use_what_beams_there_are():
     each = group_velocities(A, record)
     np.testing.assert_allclose(each[0], np.tile(u[0], (4, 1)), atol=1e-13)
     assert np.isfinite(each[1, :, 0]).tolist() == [False, True, False, False]
+
+
+def test_beams_that_a_calibration_puts_in_one_plane_have_no_groups():
+    flat = np.array([[1.0, 0, 0], [0, 1.0, 0], [-1.0, 0, 0], [0, -1.0, 0]])
+    assert group_velocities(flat, np.ones((5, 4))).shape == (5, 0, 3)
+    assert np.isnan(error_velocity(flat, np.ones((5, 4)))).all()
 
 
 def test_the_error_velocity_scatters_as_a_beam_does():

@@ -268,7 +268,10 @@ class DvlBeams:
         """Say why a component could not be observed, given the motion of the trial."""
         if motion is None or motion.v_n.shape[0] < 2:
             return "the trial has no ping with a beam while the IMU runs, or only one"
+        received = np.flatnonzero(~np.isnan(self.velocity).all(axis=0)) + 1
         if parameter.endswith("lever_arm_m"):
+            if received.size < 3:
+                return f"too few beams were ever received: {' and '.join(map(str, received))}"
             x, y, z = np.degrees(np.std(motion.omega_eb_b, axis=0))
             return (
                 f"the body turns too little (rms rate {x:.2g}, {y:.2g}, {z:.2g} deg/s about "
@@ -277,7 +280,7 @@ class DvlBeams:
         of_a_beam = {DIRECTION: component // 2, SCALE_ERROR: component}
         if self.settings.parametrisation == "beams":
             beam = of_a_beam[parameter]
-            if np.isnan(self.velocity[:, beam]).all():
+            if beam + 1 not in received:
                 return f"beam {beam + 1} was never received"
         v_b = rotate(motion.nRb.transpose(0, 2, 1), motion.v_n)
         x, y, z = np.sqrt(np.mean(v_b**2, axis=0))
