@@ -19,6 +19,7 @@ from factorgraph_dvl.analysis.before_after import before_after
 from factorgraph_dvl.analysis.consistency import calibration_errors
 from factorgraph_dvl.analysis.observability import observability
 from factorgraph_dvl.analysis.pwcs import BeamMounting, BodyMotion, beam_rows
+from factorgraph_dvl.analysis.survey import survey
 from factorgraph_dvl.attitude import Attitude
 from factorgraph_dvl.beam_geometry import (
     as_dvl,
@@ -709,6 +710,34 @@ def test_the_command_dead_reckons_beams(solved, tmp_path):
         assert done.value.code == 0
         found = json.loads((out / "deadreckon.json").read_text())
         assert found["global_error_m"] < 0.2 * found["uncalibrated"]["global_error_m"]
+
+
+def surveyed(change):
+    """Return what `inspect` says of the beams, their velocities changed."""
+    trial = simulate(noisy(turntable=None), 1)
+    velocity = change(trial.beams.velocity.copy())
+    trial = replace(trial, others=(replace(trial.beams, velocity=velocity),))
+    return [(f.severity, f.text) for f in survey(trial).findings if f.sensor == "DVL beams"]
+
+
+def test_good_beams_have_no_problems():
+    found = surveyed(lambda v: v)
+    assert {severity for severity, _ in found} == {"ok"}
+    assert any("no more than noise and priors explain" in text for _, text in found)
+
+
+@pytest.mark.parametrize(
+    ("change", "severity", "message"),
+    [
+        (lambda v: v[:, [0, 2, 1, 3]], "warning", "is their order"),
+        (lambda v: v * [1, 1, -1, 1], "warning", "the sign of one"),
+        (lambda v: -v, "warning", "Moving in the direction of a beam must give it a positive"),
+        (lambda v: v * [np.nan, np.nan, 1, 1], "error", "there is no ping with three beams"),
+        (lambda v: v * [1, 1, np.nan, 1], "warning", "lost at 0, 0, 100, 0 % of the pings"),
+    ],
+)
+def test_mistakes_in_beams_are_named(change, severity, message):
+    assert any(s == severity and message in text for s, text in surveyed(change))
 
 
 def test_singular_values_name_the_beams(solved):
