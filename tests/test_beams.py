@@ -712,6 +712,27 @@ def test_the_command_dead_reckons_beams(solved, tmp_path):
         assert found["global_error_m"] < 0.2 * found["uncalibrated"]["global_error_m"]
 
 
+def test_a_record_is_not_made_of_another_instrument_or_of_nothing(solved, tmp_path, capsys):
+    trial, solution = solved
+    save_solution(solution, tmp_path / "solved")
+    args = ["correct", str(tmp_path / "trial"), str(tmp_path / "solved"), "--out"]
+    mounted = msgspec.structs.replace(trial.beams.settings, misalignment_deg=(0.0, 0.0, 30.0))
+    two = trial.beams.velocity * [1, 1, np.nan, np.nan]
+    for i, (changes, message) in enumerate(
+        (
+            ({"settings": mounted}, "deg away from where the trial has it"),
+            ({"velocity": two}, "dvl_beams.csv: no ping has a velocity"),
+        )
+    ):
+        others = (replace(trial.beams, **changes), trial.others[1])
+        save_trial(replace(trial, others=others), tmp_path / "trial", force=True)
+        with pytest.raises(SystemExit) as done:
+            main([*args, str(tmp_path / f"out-{i}")])
+        assert done.value.code == 2
+        assert message in capsys.readouterr().err
+        assert not (tmp_path / f"out-{i}").exists()
+
+
 def surveyed(change):
     """Return what `inspect` says of the beams, their velocities changed."""
     trial = simulate(noisy(turntable=None), 1)

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
+from msgspec import UnsetType
 
 from factorgraph_dvl.beam_geometry import (
     error_rows,
@@ -18,6 +19,10 @@ from factorgraph_dvl.conventions import DEG, Array, exp_so3
 from factorgraph_dvl.errors import DataError
 from factorgraph_dvl.sensors.dvl_beams import DIRECTION, SCALE_ERROR, DvlBeams
 from factorgraph_dvl.solution import Calibration, Solution, values_of
+
+# From how many standard deviations on a beam is another one; and from how many deg, at least.
+_FAR = 5.0
+_LEAST_DEG = 1.0
 
 
 @dataclass(frozen=True)
@@ -146,6 +151,31 @@ def beam_calibration(
         (1.0 + scale) * length - 1.0,
         np.asarray(values.get(f"{prefix}lever_arm_m", s.lever_arm_m)),
     )
+
+
+def check_same_instrument(beams: DvlBeams, calibration: BeamCalibration, source: str) -> None:
+    """Raise DataError where a calibration's beams are not those that a trial describes.
+
+    Parameters
+    ----------
+    beams : of the trial, with nominal directions and what they may be off by.
+    calibration : of them, or of another instrument.
+    source : of the calibration, for messages.
+    """
+    s = beams.settings
+    std = s.misalignment_std_deg
+    sigma = s.direction_std_deg if isinstance(std, UnsetType) else max(std)
+    allowed = max(_FAR * np.sqrt(2.0) * sigma, _LEAST_DEG)
+    apart = np.linalg.norm(calibration.directions_b - beams.nominal_b, axis=1)
+    away = 2.0 * np.arcsin(np.minimum(0.5 * apart, 1.0)) / DEG
+    if away.max() > allowed:
+        raise DataError(
+            f"beam {np.argmax(away) + 1} of the calibration points {away.max():.3g} deg away from "
+            "where the trial has it",
+            where=source,
+            expected=f"at most {allowed:.3g} deg, by what the trial says that it may be off by",
+            hint="Is it the same instrument, mounted as it was, and nominally described alike?",
+        )
 
 
 def beam_quality(beams: DvlBeams, calibration: BeamCalibration) -> BeamQuality:
