@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 
 import msgspec
@@ -137,7 +138,8 @@ def test_nominal_directions_three_ways_are_the_same_beams():
         ({"slant_azimuth_deg": JANUS_X, "directions": ((0, 0, -1),) * 3}, "found"),
         ({"slant_azimuth_deg": JANUS_X[:2]}, "three or more"),
         ({"slant_azimuth_deg": ((10, 0), (20, 0), (30, 180))}, "in one plane"),
-        ({"directions": ((1, 0, -1), (0, 1, -1), (-1, 0, -1))}, "unit vectors"),
+        ({"directions": ((0, 0, -1), (0, 1, -1), (-1, 0, 0))}, "beam 2 has the length 1.41"),
+        ({"alpha_theta_deg": ((20, 60), (20, 60), (31, 60), (20, 60))}, "those of beam 3 do"),
         ({"alpha_theta_deg": ((20, 60),) * 3}, "four beams"),
         ({"alpha_theta_deg": ((40, 60),) * 4}, "add up"),
         ({"slant_azimuth_deg": JANUS_X, "scale_error": (0.1, 0.2)}, "one number, or 4"),
@@ -368,6 +370,17 @@ def test_a_trial_keeps_beams_turntable_and_truth_in_files(tmp_path):
     np.testing.assert_array_equal(truth, trial.calibration_truth["beam_direction_b"])
     values = read_truth(tmp_path / "trial" / "truth.json")
     np.testing.assert_array_equal(values["beam_direction_b"], truth)
+
+
+def test_directions_given_twice_are_found_where_they_are(tmp_path):
+    save_trial(simulate(noisy(), 1), tmp_path / "trial")
+    file = tmp_path / "trial" / "trial.yaml"
+    data = yaml.safe_load(file.read_text())
+    data["dvl_beams"]["directions"] = [[0, 0, -1]] * 4
+    file.write_text(yaml.safe_dump(data))
+    with pytest.raises(ConfigError) as error:
+        load_trial(tmp_path / "trial")
+    assert re.match(r"trial.yaml line \d+: dvl_beams.directions: the beams'", str(error.value))
 
 
 def replace_file(section, name):
@@ -731,6 +744,14 @@ def test_a_record_is_not_made_of_another_instrument_or_of_nothing(solved, tmp_pa
         assert done.value.code == 2
         assert message in capsys.readouterr().err
         assert not (tmp_path / f"out-{i}").exists()
+
+
+def test_terms_of_instruments_are_not_those_of_beams(solved, tmp_path, capsys):
+    save_solution(solved[1], tmp_path / "solved")
+    with pytest.raises(SystemExit) as done:
+        main(["instrument", str(tmp_path / "solved")])
+    assert done.value.code == 2
+    assert "factorgraph-dvl correct" in capsys.readouterr().err
 
 
 def surveyed(change):

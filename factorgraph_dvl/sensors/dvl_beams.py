@@ -101,8 +101,12 @@ class DvlBeamsSettings(SensorSection, frozen=True, kw_only=True):
         if not isinstance(self.directions, UnsetType):
             vectors = np.array(self.directions, dtype=float).reshape(-1, 3)
             length = np.linalg.norm(vectors, axis=1)
-            if np.any(np.abs(length - 1.0) > _UNIT):
-                raise ValueError("`directions` must hold unit vectors")
+            worst = int(np.argmax(np.abs(length - 1.0))) if length.size else 0
+            if length.size and abs(length[worst] - 1.0) > _UNIT:
+                raise ValueError(
+                    "`directions` must hold unit vectors; that of "
+                    f"beam {worst + 1} has the length {length[worst]:.3g}"
+                )
             return np.asarray(vectors / length[:, None])
         if not isinstance(self.slant_azimuth_deg, UnsetType):
             slant, azimuth = np.array(self.slant_azimuth_deg).reshape(-1, 2).T * DEG
@@ -115,7 +119,10 @@ class DvlBeamsSettings(SensorSection, frozen=True, kw_only=True):
         if alpha.size != 4:
             raise ValueError("`alpha_theta_deg` must hold four beams, in octants V to VIII")
         if np.any(alpha + theta > 90.0 * DEG):
-            raise ValueError("`alpha_theta_deg` must not add up to more than 90 deg")
+            beam = int(np.argmax(alpha + theta)) + 1
+            raise ValueError(
+                f"`alpha_theta_deg` must not add up to more than 90 deg; those of beam {beam} do"
+            )
         x, z = np.sin(alpha), -np.sin(theta)
         y = np.sqrt(1.0 - x**2 - z**2)
         return np.stack([_OCTANTS[:, 0] * x, _OCTANTS[:, 1] * y, z], axis=1)
