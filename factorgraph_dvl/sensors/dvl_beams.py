@@ -102,8 +102,12 @@ class DvlBeamsSettings(SensorSection, frozen=True, kw_only=True):
         if not isinstance(self.directions, UnsetType):
             vectors = np.array(self.directions, dtype=float).reshape(-1, 3)
             length = np.linalg.norm(vectors, axis=1)
-            if np.any(np.abs(length - 1.0) > _UNIT):
-                raise ValueError("`directions` must hold unit vectors")
+            worst = int(np.argmax(np.abs(length - 1.0))) if length.size else 0
+            if length.size and abs(length[worst] - 1.0) > _UNIT:
+                raise ValueError(
+                    "`directions` must hold unit vectors; that of "
+                    f"beam {worst + 1} has the length {length[worst]:.3g}"
+                )
             return np.asarray(vectors / length[:, None])
         if not isinstance(self.slant_azimuth_deg, UnsetType):
             slant, azimuth = np.array(self.slant_azimuth_deg).reshape(-1, 2).T * DEG
@@ -118,7 +122,10 @@ class DvlBeamsSettings(SensorSection, frozen=True, kw_only=True):
         # A beam in the xz plane may be beyond it by rounding.
         y2 = np.cos(alpha + theta) * np.cos(alpha - theta)
         if np.any(y2 < -_ROUNDING):
-            raise ValueError("`alpha_theta_deg` must not add up to more than 90 deg")
+            beam = int(np.argmin(y2)) + 1
+            raise ValueError(
+                f"`alpha_theta_deg` must not add up to more than 90 deg; those of beam {beam} do"
+            )
         x, z = np.sin(alpha), -np.sin(theta)
         y = np.sqrt(np.maximum(y2, 0.0))
         return np.stack([_OCTANTS[:, 0] * x, _OCTANTS[:, 1] * y, z], axis=1)
@@ -272,7 +279,10 @@ class DvlBeams:
         """Say why a component could not be observed, given the motion of the trial."""
         if motion is None or motion.v_n.shape[0] < 2:
             return "the trial has no ping with a beam while the IMU runs, or only one"
+        received = np.flatnonzero(~np.isnan(self.velocity).all(axis=0)) + 1
         if parameter.endswith("lever_arm_m"):
+            if received.size < 3:
+                return f"too few beams were ever received: {' and '.join(map(str, received))}"
             x, y, z = np.degrees(np.std(motion.omega_eb_b, axis=0))
             return (
                 f"the body turns too little (rms rate {x:.2g}, {y:.2g}, {z:.2g} deg/s about "
@@ -281,7 +291,7 @@ class DvlBeams:
         of_a_beam = {DIRECTION: component // 2, SCALE_ERROR: component}
         if self.settings.parametrisation == "beams":
             beam = of_a_beam[parameter]
-            if np.isnan(self.velocity[:, beam]).all():
+            if beam + 1 not in received:
                 return f"beam {beam + 1} was never received"
         v_b = rotate(motion.nRb.transpose(0, 2, 1), motion.v_n)
         x, y, z = np.sqrt(np.mean(v_b**2, axis=0))

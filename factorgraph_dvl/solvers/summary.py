@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import fields
+from functools import partial
 
 import numpy as np
 
@@ -21,7 +22,14 @@ from factorgraph_dvl.conventions import (
 from factorgraph_dvl.graph import Evaluation, Problem
 from factorgraph_dvl.preintegration import States, attach, motion_at, segment_ends
 from factorgraph_dvl.sensors.protocol import Motion, Parameter
-from factorgraph_dvl.solution import Estimate, Residuals, Solution, Trajectory, doubts
+from factorgraph_dvl.solution import (
+    Estimate,
+    Residuals,
+    Solution,
+    Trajectory,
+    doubts,
+    not_observable,
+)
 from factorgraph_dvl.solvers.covariance import Posterior
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum
 
@@ -316,25 +324,19 @@ def _unobservable(
     if kept:
         source = next(iter(calibrated.values())).source
         out.append(f"{', '.join(kept)}: as in {source}; this trial adds little or nothing to that")
+
+    def why(name: str, component: int) -> str:
+        if name in by_name:
+            missing = "; the trial has no GNSS" if trial.gnss is None else ""
+            return by_name[name].explain(name, component, seen.get(name)) + missing
+        if trial.gnss is None:
+            return "without GNSS nothing separates the errors of the IMU from the motion"
+        return (
+            f"{duration:.0f} s with these manoeuvres do not tell it better than the prior; "
+            "it takes longer, or turns and changes of speed"
+        )
+
     for e in estimates:
-        bad = np.flatnonzero(~e.observable & (e.prior_std > 0.0))
-        if bad.size == 0 or e.name in calibrated:
-            continue
-        if e.name in by_name:
-            motion = seen.get(e.name)
-            reasons = [by_name[e.name].explain(e.name, int(i), motion) for i in bad]
-        elif trial.gnss is None:
-            why = "without GNSS nothing separates the errors of the IMU from the motion"
-            reasons = [why] * bad.size
-        else:
-            why = (
-                f"{duration:.0f} s with these manoeuvres do not tell it better than the prior; "
-                "it takes longer, or turns and changes of speed"
-            )
-            reasons = [why] * bad.size
-        missing = "; the trial has no GNSS" if trial.gnss is None and e.name in by_name else ""
-        for why in dict.fromkeys(reasons):
-            same = [i for i, reason in zip(bad, reasons, strict=True) if reason == why]
-            names = ", ".join(e.component_names[i] for i in same)
-            out.append(f"{names} not observable: {why}{missing}")
+        if e.name not in calibrated:
+            out += not_observable(e, partial(why, e.name))
     return out
