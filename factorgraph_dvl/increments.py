@@ -89,6 +89,7 @@ class Increments:
     open_sigma : (N, 6) standard deviation of the mean rate and force over an interval where
         the samples leave it open: lost ones, or a step between two of them; else 0.
     gyro_sigma, accel_sigma : standard deviation of one sample from its noise, SI.
+    windows : samples over which rate and force are smoothed; None = chosen from the record.
     """
 
     start: Array
@@ -100,6 +101,7 @@ class Increments:
     open_sigma: Array
     gyro_sigma: float
     accel_sigma: float
+    windows: tuple[int, int] | None = None
 
     @cached_property
     def arc_of(self) -> IntArray:
@@ -162,6 +164,12 @@ class Increments:
             force_sigma=force_sigma,
         )
 
+    @property
+    def chosen_windows(self) -> tuple[int, int]:
+        """Samples over which rate and force of the last arc are smoothed; 0 = not at all."""
+        rate, force = self._smoothed[-1]
+        return rate.window, force.window
+
     @cached_property
     def _smoothed(self) -> tuple[tuple[Smoothed, Smoothed], ...]:
         """Rate and force of each arc, smoothed where their noise asks for it."""
@@ -175,12 +183,12 @@ class Increments:
             values = self.samples[base : base + time.size]
             regular = np.abs(steps / dt - 1.0).max() < _UNIFORM
             pair = []
-            for signal, sigma in (
-                (values[:, :3], self.gyro_sigma),
-                (values[:, 3:], self.accel_sigma),
+            for i, (signal, sigma) in enumerate(
+                ((values[:, :3], self.gyro_sigma), (values[:, 3:], self.accel_sigma))
             ):
+                window = None if self.windows is None else self.windows[i]
                 pair.append(
-                    smooth(time, signal, dt, sigma, averaged=self.averaged)
+                    smooth(time, signal, dt, sigma, averaged=self.averaged, window=window)
                     if regular
                     else as_it_is(dt, sigma)
                 )
@@ -293,8 +301,15 @@ class Increments:
         return out
 
 
-def increments(imu: Imu) -> tuple[Increments, tuple[str, ...]]:
+def increments(
+    imu: Imu, windows: tuple[int, int] | None = None
+) -> tuple[Increments, tuple[str, ...]]:
     """Return increments between the samples of an IMU, and what had to be bridged.
+
+    Parameters
+    ----------
+    imu : Imu
+    windows : see `Increments`.
 
     Returns
     -------
@@ -382,6 +397,7 @@ def increments(imu: Imu) -> tuple[Increments, tuple[str, ...]]:
         open_sigma=np.concatenate(fill),
         gyro_sigma=imu.settings.gyro_noise_root_psd / np.sqrt(dt),
         accel_sigma=imu.settings.accel_noise_root_psd / np.sqrt(dt),
+        windows=windows,
     )
     if not averaged:
         noise = np.repeat([out.gyro_sigma, out.accel_sigma], 3)

@@ -131,6 +131,43 @@ def segments(inc: Increments, interval: float) -> Segments:
     )
 
 
+def one_segment(inc: Increments, first: int, last: int) -> Segments:
+    """Return intervals [first, last) of a single arc as a chain of two nodes.
+
+    Increments outside them stay zero.
+    """
+    n, inside = inc.start.size, np.arange(first, last)
+    phi, dv = np.zeros((n, 3)), np.zeros((n, 3))
+    phi[inside], dv[inside] = inc.over(inside)
+    turn = exp_so3(phi[inside])
+    dR = np.zeros((n, 3, 3))
+    R = np.eye(3)
+    for i, step in zip(inside.tolist(), turn, strict=True):
+        dR[i] = R
+        R = R @ step
+    dt = inc.dt[inside, None]
+    turned = rotate(dR[inside], dv[inside])
+    swept = dR[inside] @ (np.eye(3) + 0.5 * skew(phi[inside])) * dt[:, :, None]
+    dV, dP, dA = np.zeros((n, 3)), np.zeros((n, 3)), np.zeros((n, 3, 3))
+    dV[first + 1 : last] = np.cumsum(turned[:-1], axis=0)
+    dA[first + 1 : last] = np.cumsum(swept[:-1], axis=0)
+    dP[first + 1 : last] = np.cumsum((dV[inside] * dt + 0.5 * turned * dt)[:-1], axis=0)
+    return Segments(
+        increments=inc,
+        node_time=np.array([inc.start[first], inc.start[last - 1] + inc.dt[last - 1]]),
+        first=np.array([first]),
+        last=np.array([last]),
+        origin=np.array([0]),
+        arc_nodes=np.array([[0, 1]]),
+        phi=phi,
+        dv=dv,
+        dR=dR,
+        dV=dV,
+        dP=dP,
+        dA=dA,
+    )
+
+
 def _nearest(grid: Array, targets: Array) -> IntArray:
     right = np.clip(np.searchsorted(grid, targets), 1, grid.size - 1)
     return np.where(targets - grid[right - 1] < grid[right] - targets, right - 1, right)

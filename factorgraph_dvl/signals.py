@@ -38,12 +38,14 @@ class Smoothed:
     spline : value over time, None where the samples are best left alone.
     misfit : what the window does not resolve, over time; None likewise.
     sigma, slope_sigma : standard deviation of value and derivative from the noise.
+    window : number of samples that each value is made of, 0 where they are left alone.
     """
 
     spline: BSpline | None
     misfit: BSpline | None
     sigma: float
     slope_sigma: float
+    window: int
 
     def at(self, time: Array) -> tuple[Array, Array, Array]:
         """Return value, derivative and what is not resolved at times, (M, 3) each."""
@@ -58,20 +60,11 @@ class Smoothed:
 
 def as_it_is(dt: float, sigma: float) -> Smoothed:
     """Return a signal that is not smoothed, with its noise."""
-    return Smoothed(None, None, sigma, _RAW_SLOPE * sigma / dt)
+    return Smoothed(None, None, sigma, _RAW_SLOPE * sigma / dt, 0)
 
 
-def smooth(time: Array, values: Array, dt: float, sigma: float, *, averaged: bool) -> Smoothed:
-    """Smooth a signal over the window with the least error of noise and motion together.
-
-    Parameters
-    ----------
-    time : (N,) s, regular: the samples', or the middles of the intervals of means.
-    values : (N, 3) samples.
-    dt : interval of the samples, s.
-    sigma : standard deviation of a sample.
-    averaged : whether samples are means over their intervals.
-    """
+def best_window(values: Array, dt: float, sigma: float) -> int:
+    """Return the window with the least error of noise and motion together, 0 for none."""
     few = values[:_ENOUGH]
     best, width = sigma**2, 0
     for half in _HALF_WIDTHS:
@@ -84,7 +77,31 @@ def smooth(time: Array, values: Array, dt: float, sigma: float, *, averaged: boo
         by_motion = max(float(moved) - sigma**2 * (1.0 - 2.0 * weights[half] + kept), 0.0)
         if by_motion + sigma**2 * kept < best:
             best, width = by_motion + sigma**2 * kept, window
-    if width == 0:
+    return width
+
+
+def smooth(
+    time: Array,
+    values: Array,
+    dt: float,
+    sigma: float,
+    *,
+    averaged: bool,
+    window: int | None = None,
+) -> Smoothed:
+    """Smooth a signal.
+
+    Parameters
+    ----------
+    time : (N,) s, regular: the samples', or the middles of the intervals of means.
+    values : (N, 3) samples.
+    dt : interval of the samples, s.
+    sigma : standard deviation of a sample.
+    averaged : whether samples are means over their intervals.
+    window : number of samples; None = `best_window`.
+    """
+    width = best_window(values, dt, sigma) if window is None else window
+    if width == 0 or width > values.shape[0]:
         return as_it_is(dt, sigma)
     found = savgol_filter(values, width, _ORDER, axis=0)
     if averaged:
@@ -101,4 +118,5 @@ def smooth(time: Array, values: Array, dt: float, sigma: float, *, averaged: boo
         misfit=make_interp_spline(time, misfit, k=1),
         sigma=sigma * float(np.linalg.norm(weights)),
         slope_sigma=sigma * float(np.linalg.norm(slopes)),
+        window=width,
     )

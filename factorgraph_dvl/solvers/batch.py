@@ -68,13 +68,43 @@ def solve(
         if not (np.isfinite(value) and value > 0.0):
             raise ConfigError(f"{name} is {value}", expected="a number above 0")
     report = progress or (lambda stage, iteration, cost: None)
+    problem, minimum, notes = fit(trial, state_interval_s=state_interval_s, progress=report)
+    report("covariance", 0, None)
+    covariances = posterior(problem, minimum)
+    held = feigned_directions(problem, minimum, covariances)
+    if held.size:
+        origin = at_prior_along(problem, minimum.evaluation.parameters, held)
+        problem.hold(held, origin)
+        at = problem.values(minimum.evaluation.states, origin)
+        again = minimise(
+            problem, at, stage="all sensors, without what they cannot tell", progress=report
+        )
+        minimum = replace(again, iterations=minimum.iterations + again.iterations)
+        covariances = posterior(problem, minimum)
+    return summarise(problem, minimum, covariances, held=held, rate_hz=rate_hz, notes=notes)
+
+
+def fit(
+    trial: Trial, *, state_interval_s: float, progress: Progress
+) -> tuple[Problem, Minimum, tuple[str, ...]]:
+    """Find the minimum of a trial's cost, from nothing but its data.
+
+    Parameters
+    ----------
+    trial, state_interval_s : as for `solve`.
+    progress : called with stage, iteration and cost.
+
+    Returns
+    -------
+    problem, minimum, notes : what was minimised, where it ended, what the user must know.
+    """
     frame = trial.frame()
-    report("increments", 0, None)
+    progress("increments", 0, None)
     inc, gaps = increments(trial.imu)
     seg = segments(inc, state_interval_s)
-    report("alignment", 0, None)
+    progress("alignment", 0, None)
     start = initial_states(trial, frame, seg)
-    notes = [*trial.notes, *gaps, *start.notes]
+    notes = (*trial.notes, *gaps, *start.notes)
 
     states, values = start.states, None
     iterations = 0
@@ -84,33 +114,20 @@ def solve(
             chain, p_gravity = inertial_chain(trial, frame, seg, states), states.p_n
         if values is None:
             if trial.gnss is not None:
-                coarse = _without_dvl(chain, states, report)
+                coarse = _without_dvl(chain, states, progress)
                 iterations += coarse.iterations
                 states = coarse.evaluation.states
-            report("mounting", 0, None)
+            progress("mounting", 0, None)
             values = _mounting(trial, frame, seg, chain.gravity_n, states)
         problem = Problem(chain, *_sensors(trial.aids, frame), start=values)
         at = problem.values(states, {**problem.prior_values(), **values})
-        minimum = minimise(problem, at, stage="all sensors", progress=report)
+        minimum = minimise(problem, at, stage="all sensors", progress=progress)
         iterations += minimum.iterations
         states, values = minimum.evaluation.states, minimum.evaluation.parameters
         same_gravity = np.sqrt(np.mean((states.p_n - p_gravity) ** 2)) <= _SAME_GRAVITY
         if same_gravity and not problem.strayed(values):
             break
-    report("covariance", 0, None)
-    covariances = posterior(problem, minimum)
-    held = feigned_directions(problem, minimum, covariances)
-    if held.size:
-        origin = at_prior_along(problem, minimum.evaluation.parameters, held)
-        problem.hold(held, origin)
-        at = problem.values(states, origin)
-        minimum = minimise(
-            problem, at, stage="all sensors, without what they cannot tell", progress=report
-        )
-        iterations += minimum.iterations
-        covariances = posterior(problem, minimum)
-    minimum = replace(minimum, iterations=iterations)
-    return summarise(problem, minimum, covariances, held=held, rate_hz=rate_hz, notes=notes)
+    return problem, replace(minimum, iterations=iterations), notes
 
 
 def _without_dvl(chain: Chain, states: States, report: Progress) -> Minimum:

@@ -10,15 +10,16 @@ here; where it is most of it, the direction is not observable, and the prior is 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 from scipy.linalg import eigh
 
 from factorgraph_dvl.conventions import Array, rotate, skew
-from factorgraph_dvl.graph import Problem
+from factorgraph_dvl.graph import Evaluation, Problem
 from factorgraph_dvl.preintegration import Attachment
-from factorgraph_dvl.sensors.protocol import Motion, Observation
+from factorgraph_dvl.sensors.protocol import Motion, Observation, Values
 from factorgraph_dvl.solvers.covariance import Posterior
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum
 
@@ -44,32 +45,67 @@ def feigned_directions(problem: Problem, minimum: Minimum, covariances: Posterio
     """
     if not problem.parameters:
         return np.zeros((0, 0))
-    size = problem.prior_sigma.size
     functionals = [{problem.key(p.name): np.eye(p.mean.size)} for p in problem.parameters]
-    scale = problem.prior_sigma
-    P = covariances.information.covariance_of(functionals) / np.outer(scale, scale)
-    data = np.linalg.inv(P) - np.eye(size)
-    feigned = np.zeros((size, size))
-    for observation, attachment, motion, weight in zip(
-        problem.observations,
-        problem.attachments,
-        minimum.evaluation.motions,
-        problem.weights,
-        strict=True,
-    ):
-        names = [p.name for p in problem.parameters if p.name in observation.parameters]
-        if names:
-            part, columns = _feigned_by(
-                problem, observation, attachment, motion, weight, minimum, covariances.nodes
-            )
-            feigned[np.ix_(columns, columns)] += part
-    feigned = feigned * np.outer(scale, scale)
+    P = covariances.information.covariance_of(functionals)
+    feigned = feigned_information(problem, minimum.evaluation, covariances.nodes)
+    return feigned_among(P, feigned, problem.prior_sigma)
+
+
+def feigned_among(P: Array, feigned: Array, prior_sigma: Array) -> Array:
+    """Return directions that are not observable, as `feigned_directions` does.
+
+    Parameters
+    ----------
+    P : (P, P) covariance of the parameters, SI.
+    feigned : (P, P) information that the motion's error adds, SI.
+    prior_sigma : (P,) SI.
+    """
+    size = prior_sigma.size
+    scaled = np.outer(prior_sigma, prior_sigma)
+    data = np.linalg.inv(P / scaled) - np.eye(size)
     data = 0.5 * (data + data.T)
+    feigned = feigned * scaled
     share = eigh(feigned, _positive(data) + _LITTLE * np.eye(size), eigvals_only=True)
     if share.max() < _FEIGNED:
         return np.zeros((size, 0))
     genuine, directions = np.linalg.eigh(data - feigned)
     return np.asarray(directions[:, genuine < _GENUINE])
+
+
+def feigned_information(problem: Problem, evaluation: Evaluation, nodes: Array) -> Array:
+    """Return the information, (P, P), SI, that the error of the motion is expected to add.
+
+    Parameters
+    ----------
+    problem, evaluation : of what was minimised.
+    nodes : (K, 9, 9) covariances of the states, in GTSAM's tangent space.
+    """
+    size = problem.prior_sigma.size
+    feigned = np.zeros((size, size))
+    for observation, attachment, motion, weight in zip(
+        problem.observations,
+        problem.attachments,
+        evaluation.motions,
+        problem.weights,
+        strict=True,
+    ):
+        names = [p.name for p in problem.parameters if p.name in observation.parameters]
+        if names:
+            columns = np.concatenate([_range(problem.columns[name]) for name in names])
+            feigned[np.ix_(columns, columns)] += feigned_by(
+                observation,
+                attachment,
+                motion,
+                weight,
+                nodes[attachment.node],
+                evaluation.parameters,
+                names,
+            )
+    return feigned
+
+
+def _range(place: slice) -> np.ndarray:
+    return np.arange(place.start, place.stop)
 
 
 def _positive(matrix: Array) -> Array:
@@ -91,36 +127,41 @@ def at_prior_along(
     return parameters
 
 
-def _feigned_by(
-    problem: Problem,
+def feigned_by(
     observation: Observation,
     attachment: Attachment,
     motion: Motion,
     weight: Array,
-    minimum: Minimum,
-    nodes: Array,
-) -> tuple[Array, np.ndarray]:
-    """Return the expectation of the information that the motion's error adds, and its place."""
-    wanted = [p.name for p in problem.parameters if p.name in observation.parameters]
-    columns = np.concatenate(
-        [np.arange(place.start, place.stop) for place in map(problem.columns.get, wanted) if place]
-    )
-    values = minimum.evaluation.parameters
+    P: Array,
+    values: Values,
+    wanted: Sequence[str],
+) -> Array:
+    """Return the expectation of the information that the motion's error adds, SI.
+
+    Parameters
+    ----------
+    observation : of M measurements of d components.
+    attachment, motion : of them.
+    weight : (M, d) inverse standard deviations.
+    P : (M, 9, 9) covariances of the nodes before them, in GTSAM's tangent space.
+    values : of all parameters.
+    wanted : names of the parameters whose information is asked for.
+    """
 
     def jacobian(at: Motion) -> Array:
         found = observation.linearize(at, values, wanted).d_parameters
         return np.concatenate([found[name] for name in wanted], axis=2)
 
     base = jacobian(motion)
+    size = base.shape[2]
     v_b = rotate(motion.nRb.transpose(0, 2, 1), motion.v_n)
-    P = nodes[attachment.node]
     by_state = np.concatenate(
         [skew(v_b), np.zeros_like(motion.nRb), np.broadcast_to(np.eye(3), motion.nRb.shape)],
         axis=2,
     )
     covariance = by_state @ P @ by_state.transpose(0, 2, 1)
     root = np.linalg.cholesky(covariance + 1e-16 * np.eye(3))
-    out = np.zeros((columns.size, columns.size))
+    out = np.zeros((size, size))
     for k in range(3):
         axis = np.eye(3)[k]
         waver = rotate(motion.nRb, root[:, :, k])
@@ -132,6 +173,6 @@ def _feigned_by(
             replace(motion, alpha_b=motion.alpha_b + attachment.alpha_sigma[:, None] * axis),
         ):
             change = (jacobian(changed) - base) * weight[:, :, None]
-            flat = change.reshape(-1, columns.size)
+            flat = change.reshape(-1, size)
             out += flat.T @ flat
-    return out, columns
+    return out

@@ -11,23 +11,18 @@ from factorgraph_dvl import keys
 from factorgraph_dvl.conventions import (
     Array,
     exp_so3,
-    inverse_right_jacobian,
     log_so3,
-    reported_rotation_vector,
     rotate,
     rph_from_rotation,
     rph_jacobian,
 )
 from factorgraph_dvl.graph import Problem
 from factorgraph_dvl.preintegration import States, attach, motion_at, segment_ends
-from factorgraph_dvl.sensors.protocol import Motion, Parameter
+from factorgraph_dvl.sensors.protocol import Motion
 from factorgraph_dvl.solution import Estimate, Residuals, Solution, Trajectory, doubts
 from factorgraph_dvl.solvers.covariance import Posterior, SquareRootInformation
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum
-
-# The data observed a component if they at least halved what was unknown of it.
-_OBSERVABLE = 0.5
-_FIRST = ("misalignment", "scale_error", "lever_arm", "gyro_bias", "accel_bias")
+from factorgraph_dvl.solvers.reported import Reported, estimates_of, in_order, reported
 
 
 def summarise(
@@ -87,54 +82,25 @@ def _calibration(
     weight = _mean_weights(time)
     gyro, accel = chain.trial.imu.parameters(float(time[-1] - time[0]))
     states = evaluation.states
-    rows: list[tuple[Parameter, Array, dict[int, Array] | None]] = []
+    rows: list[Reported] = []
+    functionals: dict[str, dict[int, Array]] = {}
     for parameter, bias, first in ((gyro, states.gyro_bias, 3), (accel, states.accel_bias, 0)):
         select = np.eye(6)[first : first + 3] / parameter.si
-        functional = (
+        functionals[parameter.name] = (
             {keys.bias(k): w * select for k, w in enumerate(weight)}
             if chain.walking
             else {keys.bias(0): select}
         )
-        rows.append((parameter, weight @ bias / parameter.si, functional))
+        rows.append(reported(parameter, weight @ bias))
     for p in problem.all_parameters:
-        value = evaluation.parameters[p.name]
-        derivative = np.eye(p.mean.size)
-        if p.rotation:
-            value = reported_rotation_vector(value, p.mean)
-            derivative = inverse_right_jacobian(value)
+        row = reported(p, evaluation.parameters[p.name])
         if p.estimated:
-            rows.append((p, value / p.si, {problem.key(p.name): derivative / p.si}))
-        elif p.stem in _FIRST:
-            rows.append((p, value / p.si, None))
-    rows.sort(key=lambda r: _FIRST.index(r[0].stem) if r[0].stem in _FIRST else len(_FIRST))
-
-    free = [f for _, _, f in rows if f is not None]
+            functionals[p.name] = {problem.key(p.name): row.derivative}
+        rows.append(row)
+    rows = in_order(rows)
+    free = [functionals[r.parameter.name] for r in rows if r.parameter.name in functionals]
     joint = information.covariance_of(free)
-    joint = joint + _prior_in(problem, held, free)
-    total = sum(p.mean.size for p, _, _ in rows)
-    covariance = np.zeros((total, total))
-    is_free = np.concatenate([np.full(p.mean.size, f is not None) for p, _, f in rows])
-    covariance[np.ix_(is_free, is_free)] = joint
-    known = np.concatenate([p.sigma == 0.0 for p, _, _ in rows])
-    covariance[known] = covariance[:, known] = 0.0
-    std = np.sqrt(np.diag(covariance))
-    estimates, at = [], 0
-    for p, value, _ in rows:
-        own = std[at : at + p.mean.size]
-        at += p.mean.size
-        prior = p.sigma / p.si
-        estimates.append(
-            Estimate(
-                name=p.name,
-                component_names=p.component_names,
-                value=np.array(value),
-                std=own,
-                prior_value=p.mean / p.si,
-                prior_std=prior,
-                observable=(prior > 0.0) & (own <= _OBSERVABLE * prior),
-            )
-        )
-    return tuple(estimates), covariance
+    return estimates_of(rows, joint + _prior_in(problem, held, free))
 
 
 def _prior_in(problem: Problem, held: Array, functionals: Sequence[dict[int, Array]]) -> Array:
