@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterable, Mapping
-from dataclasses import dataclass, field
-from typing import Annotated, Any, Protocol
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
+from typing import Annotated, Any, Protocol, TypeVar
 
 import msgspec
 import numpy as np
@@ -168,6 +168,10 @@ class Aid(Protocol):
     def label(self) -> str:
         """Name of the sensor, for people."""
 
+    @property
+    def time(self) -> Array:
+        """Times of the rows of its record, (M,), s."""
+
     def parameters(self) -> tuple[Parameter, ...]:
         """Return the calibration parameters, fixed ones included."""
 
@@ -176,6 +180,34 @@ class Aid(Protocol):
 
     def explain(self, parameter: str, component: int, motion: Motion | None) -> str:
         """Say why a component could not be observed, given the motion of the trial."""
+
+
+_Record = TypeVar("_Record")
+
+
+def rows_of(record: _Record, rows: slice | Array) -> _Record:
+    """Return some rows of a sensor's record: of every array that it holds."""
+    return replace(  # type: ignore[type-var]
+        record, **{name: values[rows] for name, values in _arrays(record).items()}
+    )
+
+
+def joined(records: Sequence[_Record]) -> _Record:
+    """Return records of one sensor as one, in the order of time.
+
+    Of rows at the same time the first is kept.
+    """
+    columns = [_arrays(record) for record in records]
+    whole = {name: np.concatenate([c[name] for c in columns]) for name in columns[0]}
+    _, rows = np.unique(whole["time"], return_index=True)
+    return replace(  # type: ignore[type-var]
+        records[0], **{name: values[rows] for name, values in whole.items()}
+    )
+
+
+def _arrays(record: Any) -> dict[str, Array]:
+    every = {f.name: getattr(record, f.name) for f in fields(record)}
+    return {name: value for name, value in every.items() if isinstance(value, np.ndarray)}
 
 
 def lever_arm_sigma(motion: Motion, lever_arm: Array) -> Array:

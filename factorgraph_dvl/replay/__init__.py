@@ -1,0 +1,1 @@
+"""Incremental smoothing of data as they arrive: collect, align, go."""

@@ -1,0 +1,143 @@
+"""What is known at one moment, in the parametrisation in which it is reported."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from factorgraph_dvl.conventions import (
+    Array,
+    BodyAxes,
+    exp_so3,
+    log_so3,
+    rotate,
+    rph_from_rotation,
+    rph_jacobian,
+)
+from factorgraph_dvl.earth import LocalFrame
+from factorgraph_dvl.preintegration import States
+from factorgraph_dvl.sensors.protocol import Parameter
+from factorgraph_dvl.solution import Estimate, Trajectory
+from factorgraph_dvl.solvers.reported import estimates_of, in_order, reported
+
+_STATE = 9
+_BIAS = 6
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """The calibration at one moment.
+
+    Parameters
+    ----------
+    estimates : as in a solution.
+    covariance : (P, P) joint covariance of all their components, in reported units.
+    """
+
+    estimates: tuple[Estimate, ...]
+    covariance: Array
+
+
+def trajectory_of(
+    time: Array, states: States, P: Array, frame: LocalFrame, body_axes: BodyAxes
+) -> Trajectory:
+    """Return states with their covariances (K, 9, 9), in GTSAM's tangent space, as reported."""
+    lat, lon, height = frame.geodetic(states.p_n)
+    lRn = frame.level_from_tangent(lat, lon)
+    lRb = lRn @ states.nRb
+    rph = rph_from_rotation(lRb, body_axes)
+
+    def level(i: int) -> Array:
+        return lRb @ P[:, i : i + 3, i : i + 3] @ lRb.transpose(0, 2, 1)
+
+    to_rph = rph_jacobian(rph, body_axes)
+    return Trajectory(
+        time=time,
+        geodetic=np.stack([lat, lon, height], axis=1),
+        velocity=rotate(lRn, states.v_n),
+        rph=rph,
+        position_cov=level(3),
+        velocity_cov=level(6),
+        rph_cov=to_rph @ P[:, :3, :3] @ to_rph.transpose(0, 2, 1),
+    )
+
+
+def calibration_of(
+    parameters: Sequence[Parameter],
+    values: Mapping[str, Array],
+    biases: tuple[tuple[Parameter, Array], tuple[Parameter, Array]],
+    P: Array,
+    held: Array,
+) -> Calibration:
+    """Return the calibration as reported.
+
+    Parameters
+    ----------
+    parameters : all, those that are not estimated included.
+    values : of them; rotations as matrices.
+    biases : parameters and values of gyro and accelerometer.
+    P : (6 + n, 6 + n) joint covariance of accelerometer bias, gyro bias and the parameters
+        that are estimated, in GTSAM's tangent space, SI.
+    held : (n, h) directions that are not observable, in units of the priors' standard
+        deviations: the prior is reported there.
+    """
+    free = [p for p in parameters if p.estimated]
+    (gyro, gyro_bias), (accel, accel_bias) = biases
+    if held.size:
+        values, gyro_bias, accel_bias, P = _at_prior(free, values, gyro_bias, accel_bias, P, held)
+    rows = in_order(
+        [
+            reported(gyro, gyro_bias),
+            reported(accel, accel_bias),
+            *(reported(p, values[p.name]) for p in parameters),
+        ]
+    )
+    start = {accel.name: 0, gyro.name: 3}
+    at = _BIAS
+    for p in free:
+        start[p.name] = at
+        at += p.mean.size
+    estimated = [r for r in rows if r.parameter.estimated]
+    total = sum(r.value.size for r in estimated)
+    T = np.zeros((total, P.shape[0]))
+    at = 0
+    for r in estimated:
+        n, column = r.value.size, start[r.parameter.name]
+        T[at : at + n, column : column + n] = r.derivative
+        at += n
+    return Calibration(*estimates_of(rows, T @ P @ T.T))
+
+
+def _at_prior(
+    free: Sequence[Parameter],
+    values: Mapping[str, Array],
+    gyro_bias: Array,
+    accel_bias: Array,
+    P: Array,
+    held: Array,
+) -> tuple[dict[str, Array], Array, Array, Array]:
+    """Return values and covariance given that the prior holds along some directions."""
+    sigma = np.concatenate([p.sigma for p in free])
+    sigma = np.maximum(sigma, 1e-12)
+    A = np.zeros((held.shape[1], P.shape[0]))
+    A[:, _BIAS:] = held.T / sigma
+    away = np.concatenate(
+        [
+            log_so3(exp_so3(p.mean).T @ values[p.name]) if p.rotation else values[p.name] - p.mean
+            for p in free
+        ]
+    )
+    gain = np.linalg.solve(A @ P @ A.T, A @ P).T
+    step = -gain @ (A[:, _BIAS:] @ away)
+    P = P - gain @ A @ P
+    spread = np.zeros((P.shape[0], held.shape[1]))
+    spread[_BIAS:] = sigma[:, None] * held
+    out = dict(values)
+    at = _BIAS
+    for p in free:
+        part = step[at : at + p.mean.size]
+        at += p.mean.size
+        out[p.name] = out[p.name] @ exp_so3(part) if p.rotation else out[p.name] + part
+    return out, gyro_bias + step[3:6], accel_bias + step[:3], P + spread @ spread.T

@@ -1,0 +1,330 @@
+"""From segment to segment: predict, compare, update."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+
+from factorgraph_dvl import keys
+from factorgraph_dvl.chain import loose_diagonal
+from factorgraph_dvl.conventions import Array, BodyAxes, exp_so3
+from factorgraph_dvl.preintegration import (
+    Segments,
+    States,
+    attach,
+    motion_at,
+    preintegrate,
+    segment_ends,
+)
+from factorgraph_dvl.replay.estimate import Calibration, calibration_of, trajectory_of
+from factorgraph_dvl.replay.factor import NodeMeasurements, Rows, measurement_factor, state_of
+from factorgraph_dvl.replay.gate import Gate
+from factorgraph_dvl.replay.smoother import Smoother
+from factorgraph_dvl.replay.start import Start
+from factorgraph_dvl.sensors.imu import Imu
+from factorgraph_dvl.sensors.protocol import Aid, Parameter
+from factorgraph_dvl.solution import Trajectory
+from factorgraph_dvl.solvers.feigned import feigned_among, feigned_by
+
+# Keeps the walk of a bias that does not walk regular.
+_LEAST_WALK = 1e-12
+_STATE = 9
+
+
+@dataclass(frozen=True)
+class Innovations:
+    """What was measured against what was predicted.
+
+    Parameters
+    ----------
+    label, unit, components : of the kind.
+    time : (M,) s.
+    residual, sigma : (M, d) predicted - measured, and its standard deviation.
+    used : (M,) bool.
+    """
+
+    label: str
+    unit: str
+    components: tuple[str, ...]
+    time: Array
+    residual: Array
+    sigma: Array
+    used: np.ndarray
+
+
+class Navigator:
+    """The smoother between two starts.
+
+    Parameters
+    ----------
+    start : what it starts from.
+    imu : for its settings.
+    gate : what decides which measurements are used.
+    lag : s, of the smoother; None = none.
+    memory : s, for which segments are kept for measurements that arrive late.
+    """
+
+    def __init__(
+        self, start: Start, imu: Imu, gate: Gate, *, lag: float | None, memory: float
+    ) -> None:
+        self.start = start
+        self._imu = imu
+        self._gate = gate
+        self._memory = memory
+        self.smoother = Smoother(
+            start.prior,
+            start.values,
+            node=start.node,
+            time=start.time,
+            parameters=start.parameters,
+            walking=start.walking,
+            lag=lag,
+        )
+        self._sigma = np.concatenate([np.empty(0), *(p.sigma for p in start.parameters)])
+        self._feigned = start.feigned
+        self._feigned_at = start.time
+        self._held = np.zeros((self._sigma.size, 0))
+        self._segments: dict[int, tuple[Segments, Array]] = {}
+        self.innovations: list[Innovations] = []
+        self.messages: list[str] = []
+        self._refresh()
+
+    @property
+    def time(self) -> float:
+        """Time of the newest state, s."""
+        return self.smoother.times[self.smoother.node]
+
+    @property
+    def oldest(self) -> float:
+        """Time from which on measurements are still of use, s."""
+        return self.smoother.times[next(iter(self._segments), self.smoother.node)]
+
+    @property
+    def values(self) -> dict[str, Array]:
+        """Values of all parameters, rotations as matrices."""
+        return self._values
+
+    @property
+    def held(self) -> Array:
+        """Directions of the parameters that are not observable, as `feigned_directions`."""
+        return self._held
+
+    @property
+    def parameter_covariance(self) -> Array:
+        """Joint covariance of accelerometer bias, gyro bias and parameters, SI."""
+        return self._P[_STATE:, _STATE:]
+
+    def covariance_of(self, parameter: Parameter) -> Array:
+        """Return the covariance of a parameter in its tangent space, SI."""
+        before = self.start.parameters[: self.start.parameters.index(parameter)]
+        a = _STATE + 6 + sum(p.mean.size for p in before)
+        b = a + parameter.mean.size
+        return self._P[a:b, a:b]
+
+    def extend(self, seg: Segments, aids: Sequence[Aid]) -> None:
+        """Add the segment after the newest state, and what was measured in it."""
+        s = self.smoother
+        k = s.node
+        state, bias = s.state(k), s.bias(k)
+        states = state_of(state, bias)
+        earth = self.start.frame.earth_rate
+        duration = float(seg.duration[0])
+        middle = states.p_n + 0.5 * duration * states.v_n
+        gravity = self.start.frame.gravity_without_rotation(middle)
+        end = motion_at(segment_ends(seg, earth), states, gravity, earth)
+
+        factors, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+        pim = preintegrate(seg, self._imu.settings, gravity, earth)[0]
+        factors.add(
+            gtsam.GalileanImuFactor2(keys.node(k), keys.node(k + 1), s.bias_key(k), pim)
+        )
+        values.insert(
+            keys.node(k + 1), gtsam.NavState(gtsam.Rot3(end.nRb[0]), end.p_n[0], end.v_n[0])
+        )
+        if self.start.walking:
+            factors.add(self._walk(k, duration))
+            values.insert(keys.bias(k + 1), bias)
+        self._segments[k] = (seg, gravity)
+        measured = self._measured(k, aids, states)
+        if measured is not None:
+            factors.add(measured)
+        s.extend(float(seg.node_time[1]), factors, values)
+        for old in [j for j in self._segments if j < s.oldest or s.times[j] < self.time - self._memory]:
+            del self._segments[old]
+        self._refresh()
+
+    def correct(self, aids: Mapping[int, Sequence[Aid]]) -> None:
+        """Add measurements that arrived late, by the index of the state before them."""
+        factors = gtsam.NonlinearFactorGraph()
+        for k, records in aids.items():
+            measured = self._measured(k, records, state_of(self.smoother.state(k), self.smoother.bias(k)))
+            if measured is not None:
+                factors.add(measured)
+        if factors.size():
+            self.smoother.correct(factors)
+            self._refresh()
+
+    def node_before(self, time: float) -> int | None:
+        """Return the state whose segment holds a time, None if it is gone or yet to come."""
+        for k in reversed(self._segments):
+            if self.smoother.times[k] <= time:
+                return k if time < self.smoother.times[k + 1] else None
+        return None
+
+    def calibration(self) -> Calibration:
+        """Return the calibration as it is reported."""
+        bias = self.smoother.bias(self.smoother.node).vector()
+        gyro, accel = self._imu.parameters(0.0)
+        return calibration_of(
+            self.start.all_parameters,
+            self._values,
+            ((gyro, bias[3:]), (accel, bias[:3])),
+            self.parameter_covariance,
+            self._held,
+        )
+
+    def filtered(self, body_axes: BodyAxes) -> Trajectory:
+        """Return the newest state."""
+        return self._trajectory([self.smoother.node], self._P[None, :_STATE, :_STATE], body_axes)
+
+    def smoothed(self, first: int, last: int, body_axes: BodyAxes) -> Trajectory:
+        """Return states from index `first` to before `last`, given all that came since."""
+        wanted = [k for k in self.smoother.times if first <= k < last]
+        P = self.smoother.state_covariances(wanted)
+        return self._trajectory(wanted, np.stack([P[k] for k in wanted]), body_axes)
+
+    def _trajectory(self, nodes: Sequence[int], P: Array, body_axes: BodyAxes) -> Trajectory:
+        found = [self.smoother.state(k) for k in nodes]
+        zero = np.zeros((len(nodes), 3))
+        states = States(
+            np.stack([x.attitude().matrix() for x in found]),
+            np.stack([x.position() for x in found]),
+            np.stack([x.velocity() for x in found]),
+            zero,
+            zero,
+        )
+        time = np.array([self.smoother.times[k] for k in nodes])
+        return trajectory_of(time, states, P, self.start.frame, body_axes)
+
+    def _refresh(self) -> None:
+        self._P = self.smoother.joint_covariance()
+        self._values = {**self.start.fixed, **self.smoother.calibration()}
+
+    def _walk(self, k: int, duration: float) -> gtsam.BetweenFactorConstantBias:
+        s = self._imu.settings
+        root_psd = np.repeat([s.accel_bias_walk_root_psd, s.gyro_bias_walk_root_psd], 3)
+        walk = np.maximum(root_psd * np.sqrt(duration), _LEAST_WALK)
+        return gtsam.BetweenFactorConstantBias(
+            keys.bias(k), keys.bias(k + 1), gtsam.imuBias.ConstantBias(), loose_diagonal(walk)
+        )
+
+    def _measured(self, k: int, aids: Sequence[Aid], states: States) -> gtsam.CustomFactor | None:
+        """Return the factor of measurements after state k that pass the gate."""
+        observations = [o for aid in aids for o in aid.observations(self.start.frame)]
+        if not observations:
+            return None
+        seg, gravity = self._segments[k]
+        rows, times, count = [], [], 0
+        for o in observations:
+            time = o.true_time(self._values)
+            if rows and np.array_equal(time, rows[-1].time):
+                rows.append(Rows(o, rows[-1].at, time))
+                continue
+            rows.append(Rows(o, slice(count, count + time.size), time))
+            times.append(time)
+            count += time.size
+        used = {name for o in observations for name in o.parameters}
+        parameters = tuple(p for p in self.start.parameters if p.name in used)
+        measured = NodeMeasurements(
+            attachment=attach(seg, np.concatenate(times), self.start.frame.earth_rate),
+            rows=tuple(rows),
+            parameters=parameters,
+            fixed=self.start.fixed,
+            gravity_n=gravity,
+            earth_rate_n=self.start.frame.earth_rate,
+        )
+        residual, matrix, motions = measured.linearize(states, self._values)
+        sigma = measured.sigma(motions, self._values)
+        weight = self._weigh(measured, residual, matrix, sigma)
+        if k == self.smoother.node and self.time - self._feigned_at >= 1.0:
+            self._feign(measured, motions, weight)
+        if not weight.any():
+            return None
+        s = self.smoother
+        index = [self.start.parameters.index(p) for p in parameters]
+        return measurement_factor(
+            measured,
+            weight,
+            keys.node(k),
+            s.bias_key(k),
+            [s.calibration_keys[i] for i in index],
+        )
+
+    def _weigh(
+        self, measured: NodeMeasurements, residual: Array, matrix: Array, sigma: Array
+    ) -> Array:
+        """Return inverse standard deviations, 0 for what the gate does not let pass."""
+        columns = list(range(_STATE + 6))
+        at = _STATE + 6
+        for p in self.start.parameters:
+            if p in measured.parameters:
+                columns += range(at, at + p.mean.size)
+            at += p.mean.size
+        P = self._P[np.ix_(columns, columns)]
+        total = np.sqrt(np.einsum("ri,ij,rj->r", matrix, P, matrix) + sigma**2)
+        weight = np.empty_like(sigma)
+        row = 0
+        for r in measured.rows:
+            m, d = r.time.size, len(r.observation.components)
+            part = slice(row, row + m * d)
+            row += m * d
+            found, spread = residual[part].reshape(m, d), total[part].reshape(m, d)
+            used, message = self._gate.passes(r.observation.label, found / spread)
+            if message:
+                self.messages.append(message)
+            weight[part] = (used[:, None] / sigma[part].reshape(m, d)).ravel()
+            o = r.observation
+            self.innovations.append(
+                Innovations(o.label, o.unit, o.components, o.time, found, spread, used)
+            )
+        return weight
+
+    def _feign(self, measured: NodeMeasurements, motions: Sequence, weight: Array) -> None:
+        """Add the information that the motion's error feigns since it was last done."""
+        now = self.time
+        per_second = now - self._feigned_at
+        self._feigned_at = now
+        duration = float(self._segments[self.smoother.node][0].duration[0])
+        start = {}
+        at = 0
+        for p in self.start.parameters:
+            start[p.name] = at
+            at += p.mean.size
+        values = {**self.start.fixed, **self._values}
+        row = 0
+        for r, motion in zip(measured.rows, motions, strict=True):
+            m, d = r.time.size, len(r.observation.components)
+            own = weight[row : row + m * d].reshape(m, d)
+            row += m * d
+            wanted = [p for p in measured.parameters if p.name in r.observation.parameters]
+            if not wanted:
+                continue
+            columns = np.concatenate(
+                [start[p.name] + np.arange(p.mean.size) for p in wanted]
+            )
+            part = feigned_by(
+                r.observation,
+                measured.attachment_of(r),
+                motion,
+                own,
+                np.broadcast_to(self._P[:_STATE, :_STATE], (m, _STATE, _STATE)),
+                values,
+                [p.name for p in wanted],
+            )
+            self._feigned[np.ix_(columns, columns)] += part * max(per_second / duration, 1.0)
+        if self._sigma.size:
+            P = self._P[_STATE + 6 :, _STATE + 6 :]
+            self._held = feigned_among(P, self._feigned, np.maximum(self._sigma, 1e-7))

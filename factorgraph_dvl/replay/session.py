@@ -1,0 +1,368 @@
+"""A replay in progress: measurements go in one at a time, estimates come out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from time import perf_counter
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from factorgraph_dvl.conventions import Array
+from factorgraph_dvl.errors import ConfigError, FactorgraphDvlError
+from factorgraph_dvl.replay.collected import Collected
+from factorgraph_dvl.replay.estimate import Calibration
+from factorgraph_dvl.replay.gate import Gate
+from factorgraph_dvl.replay.navigator import Innovations, Navigator
+from factorgraph_dvl.replay.samples import Samples
+from factorgraph_dvl.replay.start import begin
+from factorgraph_dvl.sensors.imu import Imu
+from factorgraph_dvl.sensors.protocol import Aid, joined, rows_of
+from factorgraph_dvl.solution import Trajectory
+from factorgraph_dvl.trial import Trial
+
+Kind = Literal["fixed-lag", "isam2"]
+KINDS: tuple[Kind, ...] = ("fixed-lag", "isam2")
+LAG = 30.0
+RATE = 5.0
+
+# Data before the first attempt to start, s, and the growth of the time until the next one.
+_FIRST = 30.0
+_GROWTH = 1.5
+_RETRY = 1.2
+# Data that are kept for a start, s.
+_LONGEST = 1800.0
+# Agreement with a batch solution, in its standard deviations, and standard deviation of
+# rotations, rad, with which linearising once is enough.
+_AGREES = 0.1
+_SETTLED_ROTATION = np.radians(0.2)
+# A parameter that has moved so far since it was linearised, rad.
+_MOVED = 0.01
+_LEAST_BETWEEN = 10.0
+# Silence of a sensor that is worth a message, s.
+_SILENT = 5.0
+# Measurements that are ahead of the IMU by more than this, s, are not kept.
+_AHEAD = 60.0
+
+
+@dataclass(frozen=True)
+class Update:
+    """What is known after one more segment.
+
+    Parameters
+    ----------
+    time : of the newest state, s.
+    latency : time that the update took, s.
+    state : the newest state, as a trajectory of one epoch.
+    calibration : with its joint covariance.
+    smoothed : states that more data have made better, None if there are none this time.
+    innovations : what was measured against what was predicted.
+    messages : for the user.
+    solved : whether the update includes a solution of all that was collected.
+    """
+
+    time: float
+    latency: float
+    state: Trajectory
+    calibration: Calibration
+    smoothed: Trajectory | None
+    innovations: tuple[Innovations, ...]
+    messages: tuple[str, ...]
+    solved: bool
+
+
+class Replay:
+    """Smoother for a live feed: give it measurements as they arrive.
+
+    An estimate for time t needs IMU samples up to t + `delay`; it uses what else was
+    measured up to t and has arrived by then. Later arrivals correct it as long as their
+    time is within the lag.
+
+    Parameters
+    ----------
+    known : trial of which everything but the records counts: settings, axes, priors.
+    smoother : `fixed-lag` or `isam2`.
+    lag_s : states older than this are no longer corrected.
+    rate_hz : states a second.
+    progress : called with stage, iteration and cost while a start is solved.
+    """
+
+    def __init__(
+        self,
+        known: Trial,
+        *,
+        smoother: Kind = "fixed-lag",
+        lag_s: float = LAG,
+        rate_hz: float = RATE,
+        progress: Callable[[str, int, float | None], None] | None = None,
+    ) -> None:
+        if smoother not in KINDS:
+            raise ConfigError(f"smoother is {smoother!r}", expected=f"one of {', '.join(KINDS)}")
+        for name, value in (("lag_s", lag_s), ("rate_hz", rate_hz)):
+            if not (np.isfinite(value) and value > 0.0):
+                raise ConfigError(f"{name} is {value}", expected="a number above 0")
+        self._known = known
+        self._kind = smoother
+        self._lag = lag_s
+        self._interval = 1.0 / rate_hz
+        self._progress = progress or (lambda stage, iteration, cost: None)
+        self._samples = Samples(known.imu.settings)
+        self._collected: Collected | None = Collected(known, _LONGEST)
+        self._gate = Gate()
+        self._navigator: Navigator | None = None
+        self._waiting: dict[str, list[Aid]] = {}
+        self._clock = 0.0
+        self._attempt = np.nan
+        self._solved_at = np.nan
+        self._solve_again = np.nan
+        self._smoothed_to = 0
+        self._messages: list[str] = []
+        self._seen: dict[str, float] = {}
+        self.too_late: dict[str, int] = {}
+        self.unused: dict[str, int] = {}
+
+    @property
+    def delay(self) -> float:
+        """Time by which estimates are behind the newest IMU sample, s."""
+        return self._samples.delay
+
+    @property
+    def started(self) -> bool:
+        """Whether there is an estimate."""
+        return self._navigator is not None
+
+    @property
+    def settled(self) -> bool:
+        """Whether linearising once is enough from now on."""
+        return self._collected is None
+
+    @property
+    def gate(self) -> Gate:
+        """What decides which measurements are used."""
+        return self._gate
+
+    def add_imu(self, time: ArrayLike, gyro: ArrayLike, accel: ArrayLike) -> list[Update]:
+        """Take one IMU sample, or some, and return the updates that they make possible.
+
+        Parameters
+        ----------
+        time : () or (N,) s.
+        gyro, accel : (3,) or (N, 3) angular rate, rad/s, and specific force, m/s², in body.
+        """
+        table = np.column_stack(
+            [
+                np.atleast_1d(np.asarray(time, dtype=float)) + self._clock,
+                np.reshape(gyro, (-1, 3)),
+                np.reshape(accel, (-1, 3)),
+            ]
+        )
+        used, jump = self._samples.add(table)
+        if jump:
+            self._clock += jump
+            self._messages.append(
+                f"the clock of the IMU jumped back by {jump:.3f} s at {self._samples.newest:.3f} "
+                "s: what follows is moved by that"
+            )
+        if self._collected is not None:
+            self._collected.add_samples(used)
+        return self._advance(end=False)
+
+    def add(self, section: str, record: Aid) -> None:
+        """Take one measurement of another sensor, or some.
+
+        Parameters
+        ----------
+        section : of the sensor in trial.yaml, such as `gnss` or `dvl`.
+        record : one row or more.
+        """
+        if self._clock:
+            record = replace(record, time=record.time + self._clock)  # type: ignore[type-var]
+        ahead = record.time > self._samples.newest + _AHEAD
+        if ahead.any() and self._samples.newest > -np.inf:
+            self.unused[record.label] = self.unused.get(record.label, 0) + int(ahead.sum())
+            if ahead.all():
+                return
+            record = rows_of(record, ~ahead)
+        self._waiting.setdefault(section, []).append(record)
+
+    def finish(self) -> list[Update]:
+        """Return the updates that the last samples allow, without waiting for more."""
+        return self._advance(end=True)
+
+    def _advance(self, *, end: bool) -> list[Update]:
+        out = []
+        while True:
+            began = perf_counter()
+            if self._navigator is None:
+                solved = self._start(end=end)
+                if not solved:
+                    break
+                out.append(self._update(began, solved=True))
+                continue
+            now = self._navigator.time
+            target = self._next(now)
+            if not end and self._samples.newest < target + self._samples.delay:
+                break
+            seg = self._samples.segment(now, min(target, self._samples.newest))
+            if seg is None:
+                break
+            aids = self._take(now, float(seg.node_time[1]))
+            self._navigator.extend(seg, aids)
+            self._samples.forget(self._navigator.time)
+            out.append(self._update(began, solved=self._again()))
+        return out
+
+    def _next(self, now: float) -> float:
+        """Return the time of the next state: a multiple of the interval."""
+        dt = self._samples.dt
+        return float((np.floor((now + 0.5 * dt) / self._interval) + 1.0) * self._interval)
+
+    def _start(self, *, end: bool) -> bool:
+        """Solve what was collected, if it is time to; return whether there is a start."""
+        assert self._collected is not None
+        if self._collected.empty or self._samples.dt == 0.0:
+            return False
+        until = self._samples.newest - self._samples.delay
+        since = until - self._collected.start
+        if np.isnan(self._attempt):
+            self._attempt = _FIRST
+        if since < self._attempt and not (end and since > 1.0):
+            return False
+        self._attempt = max(_RETRY * since, since + 1.0)
+        for section, records in list(self._waiting.items()):
+            self._split(section, records, until)
+        self._samples.forget(until)
+        return self._solve(until)
+
+    def _solve(self, until: float) -> bool:
+        assert self._collected is not None
+        try:
+            start = begin(self._collected.trial(until), self._progress)
+        except FactorgraphDvlError as error:
+            start = str(error)
+        if isinstance(start, str):
+            self._messages.append(f"no start yet at {until:.1f} s: {start}")
+            return False
+        lag = self._lag if self._kind == "fixed-lag" else None
+        self._navigator = Navigator(
+            start, self._known.imu, self._gate, lag=lag, memory=self._lag
+        )
+        self._samples.windows = start.windows
+        self._solved_at = until
+        self._solve_again = self._collected.start + _GROWTH * (until - self._collected.start)
+        self._smoothed_to = start.node + 1
+        return True
+
+    def _again(self) -> bool:
+        """Solve all that was collected once more, while that still makes a difference."""
+        if self._collected is None:
+            return False
+        assert self._navigator is not None
+        now = self._navigator.time
+        if now < self._solve_again and not self._moved(now):
+            return False
+        before = self._navigator
+        if not self._solve(now):
+            self._solve_again = self._collected.start + _GROWTH * (now - self._collected.start)
+            return False
+        self._settle(before, self._navigator)
+        return True
+
+    def _moved(self, now: float) -> bool:
+        """Whether a rotation has left where it was linearised."""
+        return False
+
+    def _settle(self, before: Navigator, after: Navigator) -> None:
+        """Let what was collected go if the smoother found the same as the batch solution."""
+        old, new = before.calibration(), after.calibration()
+        std = np.sqrt(np.diag(new.covariance))
+        free = std > 0.0
+        difference = np.concatenate([e.value for e in old.estimates]) - np.concatenate(
+            [e.value for e in new.estimates]
+        )
+        agrees = bool(np.all(np.abs(difference[free]) < _AGREES * std[free]))
+        rotations = [
+            sigma
+            for p in after.start.parameters
+            if p.rotation
+            for sigma in np.sqrt(np.diag(after.covariance_of(p)))
+        ]
+        if agrees and not after.held.size and all(s < _SETTLED_ROTATION for s in rotations):
+            self._collected = None
+            self._messages.append(f"settled at {after.time:.1f} s")
+
+    def _take(self, start: float, end: float) -> list[Aid]:
+        """Return measurements true from `start` to before `end`; late ones correct."""
+        assert self._navigator is not None
+        out = []
+        late: dict[int, list[Aid]] = {}
+        for section, records in list(self._waiting.items()):
+            record = self._split(section, records, end)
+            if record is None:
+                continue
+            true = record.time - self._shift(record)
+            now = true >= start
+            if now.any():
+                out.append(rows_of(record, now))
+            for i in np.flatnonzero(~now).tolist():
+                k = self._navigator.node_before(float(true[i]))
+                if k is None:
+                    self.too_late[record.label] = self.too_late.get(record.label, 0) + 1
+                else:
+                    late.setdefault(k, []).append(rows_of(record, np.array([i])))
+        if late:
+            self._navigator.correct(late)
+        return out
+
+    def _split(self, section: str, records: list[Aid], end: float) -> Aid | None:
+        """Take what was true before a time out of the waiting records of a sensor."""
+        record = joined(records)
+        due = record.time - self._shift(record) < end
+        if not due.any():
+            self._waiting[section] = [record]
+            return None
+        if due.all():
+            del self._waiting[section]
+        else:
+            self._waiting[section] = [rows_of(record, ~due)]
+        record = rows_of(record, due)
+        if self._collected is not None:
+            self._collected.add_aid(section, record)
+        return record
+
+    def _shift(self, record: Aid) -> float:
+        """Return by how much the clock of a sensor is ahead, s."""
+        if self._navigator is None:
+            return 0.0
+        observations = record.observations(self._navigator.start.frame)
+        if not observations:
+            return 0.0
+        o = observations[0]
+        return float((o.time - o.true_time(self._navigator.values))[0])
+
+    def _update(self, began: float, *, solved: bool) -> Update:
+        nav = self._navigator
+        assert nav is not None
+        axes = self._known.body_axes
+        smoothed = None
+        s = nav.smoother
+        half = [k for k, t in s.times.items() if t <= nav.time - 0.5 * self._lag]
+        if half and s.times[half[-1]] - s.times.get(self._smoothed_to, nav.time) >= 0.5 * self._lag - self._interval:
+            smoothed = nav.smoothed(self._smoothed_to, half[-1] + 1, axes)
+            self._smoothed_to = half[-1] + 1
+        messages = (*self._messages, *nav.messages)
+        innovations = tuple(nav.innovations)
+        self._messages, nav.messages, nav.innovations = [], [], []
+        state, calibration = nav.filtered(axes), nav.calibration()
+        return Update(
+            time=nav.time,
+            latency=perf_counter() - began,
+            state=state,
+            calibration=calibration,
+            smoothed=smoothed,
+            innovations=innovations,
+            messages=messages,
+            solved=solved,
+        )

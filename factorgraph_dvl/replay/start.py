@@ -1,0 +1,130 @@
+"""Collect, align, go: from a batch solution of what was collected to a smoother's first state."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+
+from factorgraph_dvl import keys
+from factorgraph_dvl.conventions import DEG, Array
+from factorgraph_dvl.earth import LocalFrame
+from factorgraph_dvl.graph import Problem
+from factorgraph_dvl.increments import increments
+from factorgraph_dvl.sensors.protocol import Observation, Parameter
+from factorgraph_dvl.solvers.batch import STATE_INTERVAL, fit
+from factorgraph_dvl.solvers.covariance import posterior
+from factorgraph_dvl.solvers.feigned import (
+    at_prior_along,
+    feigned_among,
+    feigned_information,
+)
+from factorgraph_dvl.solvers.levenberg_marquardt import Progress
+from factorgraph_dvl.trial import Trial
+
+# Standard deviation of the attitude up to which the equations may be linearised in it.
+_ATTITUDE = 5.0 * DEG
+
+
+@dataclass(frozen=True)
+class Start:
+    """The last state of what was collected, and what is known of it.
+
+    Parameters
+    ----------
+    frame : in which positions are.
+    node, time : index of the state, and its time, s.
+    prior : linear factors on state, bias and parameters: all that was collected.
+    values : at which they are linear, and start from.
+    parameters, all_parameters : those that are estimated, and all.
+    fixed : values of those that are not.
+    windows : over which the IMU's samples are smoothed.
+    covariance : of state, bias and parameters, as `Smoother.joint_covariance`.
+    feigned : (P, P) information on the parameters that only noise makes, SI.
+    residual_rms : per observation, label and its rms normalised residual.
+    walking : whether biases walk.
+    notes : for the user.
+    """
+
+    frame: LocalFrame
+    node: int
+    time: float
+    prior: gtsam.NonlinearFactorGraph
+    values: gtsam.Values
+    parameters: tuple[Parameter, ...]
+    all_parameters: tuple[Parameter, ...]
+    fixed: dict[str, Array]
+    windows: tuple[int, int]
+    feigned: Array
+    walking: bool
+    notes: tuple[str, ...]
+
+
+def begin(trial: Trial, progress: Progress) -> Start | str:
+    """Solve what was collected, and condense it to its last state.
+
+    Returns
+    -------
+    Start, or why there is none yet.
+
+    Raises
+    ------
+    DataError, SolveError
+        If the data collected so far cannot be solved.
+    """
+    problem, minimum, notes = fit(trial, state_interval_s=STATE_INTERVAL, progress=progress)
+    if not minimum.converged:
+        return "the solver did not converge"
+    covariances = posterior(problem, minimum)
+    attitude = float(np.sqrt(np.linalg.eigvalsh(covariances.nodes[-1][:3, :3])[-1]))
+    if not attitude < _ATTITUDE:
+        return f"the attitude is known to {np.degrees(attitude):.2g} deg only"
+    evaluation = minimum.evaluation
+    feigned = feigned_information(problem, evaluation, covariances.nodes)
+    if problem.parameters:
+        functionals = [{problem.key(p.name): np.eye(p.mean.size)} for p in problem.parameters]
+        P = covariances.information.covariance_of(functionals)
+        held = feigned_among(P, feigned, problem.prior_sigma)
+        if held.size:
+            origin = at_prior_along(problem, evaluation.parameters, held)
+            evaluation = problem.evaluate(problem.values(evaluation.states, origin))
+    last = problem.chain.segments.node_time.size - 1
+    kept = [
+        keys.node(last),
+        problem.chain.bias_key(last),
+        *(problem.key(p.name) for p in problem.parameters),
+    ]
+    gaussian = problem.linearize(evaluation)
+    gone = [key for key in evaluation.values.keys() if key not in kept]
+    _, rest = gaussian.eliminatePartialMultifrontal(gone, gtsam.EliminateQR)
+    values = _some(problem, evaluation.values, last)
+    return Start(
+        frame=problem.chain.frame,
+        node=last,
+        time=float(problem.chain.segments.node_time[-1]),
+        prior=gtsam.LinearContainerFactor.ConvertLinearGraph(rest, values),
+        values=values,
+        parameters=problem.parameters,
+        all_parameters=problem.all_parameters,
+        fixed={
+            p.name: problem.prior_values()[p.name]
+            for p in problem.all_parameters
+            if not p.estimated
+        },
+        windows=problem.chain.segments.increments.chosen_windows,
+        feigned=feigned,
+        walking=problem.chain.walking,
+        notes=notes,
+    )
+
+
+def _some(problem: Problem, values: gtsam.Values, last: int) -> gtsam.Values:
+    out = gtsam.Values()
+    out.insert(keys.node(last), values.atNavState(keys.node(last)))
+    bias = problem.chain.bias_key(last)
+    out.insert(bias, values.atConstantBias(bias))
+    for p in problem.parameters:
+        key = problem.key(p.name)
+        out.insert(key, values.atRot3(key) if p.rotation else values.atVector(key))
+    return out
