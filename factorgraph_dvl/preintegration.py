@@ -256,7 +256,10 @@ class Attachment:
 def attach(seg: Segments, time: Array, earth_rate_n: Array) -> Attachment:
     """Attach times (M,), all covered by arcs, to the chain."""
     index, since, _ = seg.increments.locate(time)
-    return _attach(seg, index, since, earth_rate_n)
+    # A time on the edge of the chain may be off it by rounding.
+    inside = np.clip(index, seg.first[0], seg.last[-1] - 1)
+    since = np.where(inside == index, since, time - seg.increments.start[inside])
+    return _attach(seg, inside, since, earth_rate_n)
 
 
 def segment_ends(seg: Segments, earth_rate_n: Array) -> Attachment:

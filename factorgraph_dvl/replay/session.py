@@ -43,6 +43,8 @@ _MOVED = 0.01
 _LEAST_BETWEEN = 10.0
 # Silence of a sensor that is worth a message, s.
 _SILENT = 5.0
+# Times closer than this, s, are the same.
+_SAME_TIME = 1e-6
 # Measurements that are ahead of the IMU by more than this, s, are not kept.
 _AHEAD = 60.0
 
@@ -303,7 +305,7 @@ class Replay:
             if record is None:
                 continue
             true = record.time - self._shift(record)
-            now = true >= start
+            now = true >= start - _SAME_TIME
             if now.any():
                 out.append(rows_of(record, now))
             for i in np.flatnonzero(~now).tolist():
@@ -319,7 +321,7 @@ class Replay:
     def _split(self, section: str, records: list[Aid], end: float) -> Aid | None:
         """Take what was true before a time out of the waiting records of a sensor."""
         record = joined(records)
-        due = record.time - self._shift(record) < end
+        due = record.time - self._shift(record) < end - _SAME_TIME
         if not due.any():
             self._waiting[section] = [record]
             return None

@@ -27,6 +27,8 @@ _BIAS_STEP = np.full(6, 1e2)
 # In units of SI: a rotation, or what multiplies a velocity.
 _CALIBRATION_STEP = 1e-2
 _NEVER = 1e9
+# Interval, s, at which states are looked at for that.
+_CHECK = 1.0
 _STATE = 9
 _BIAS = 6
 
@@ -61,6 +63,7 @@ class Smoother:
         self.times = {node: time}
         self._walking = walking
         self._lag = lag
+        self._checked = time
         self._isam = gtsam.ISAM2(_settings(self.parameters, fixed=lag is not None))
         self._sizes = {key: _size(values, key) for key in values.keys()}
         self._update(prior, values)
@@ -161,28 +164,48 @@ class Smoother:
         return [*out, *([] if self._walking else [keys.bias(0)]), *self.calibration_keys]
 
     def _update(self, factors: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> None:
-        touched = {key for i in range(factors.size()) for key in factors.at(i).keys()}
-        old = [k for k in self.times if k < self.node - 1 and keys.node(k) in touched]
-        if old and self._lag is not None:
-            self._reorder(factors, values)
+        settings = gtsam.ISAM2UpdateParams()
+        if self._lag is None:
+            settings.constrainedKeys = _groups([(key, 1) for key in self._top()])
+            self._isam.update(factors, values, settings)
             return
-        settings = gtsam.ISAM2UpdateParams()
-        settings.constrainedKeys = _groups([(key, 1) for key in self._top()])
-        result = self._isam.update(factors, values, settings)
-        if self._lag is not None and result.getVariablesRelinearized():
-            self._reorder(gtsam.NonlinearFactorGraph(), gtsam.Values())
-
-    def _reorder(self, factors: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> None:
-        """Update with all variables eliminated anew, in the order of time."""
-        settings = gtsam.ISAM2UpdateParams()
-        order = self._in_time()
-        settings.constrainedKeys = _groups([(key, i) for i, key in enumerate(order)])
-        again = gtsam.KeyList()
-        for key in order:
-            if self._isam.valueExists(key):
-                again.push_back(key)
-        settings.extraReelimKeys = again
+        touched = {key for i in range(factors.size()) for key in factors.at(i).keys()}
+        first = next((k for k in self.times if keys.node(k) in touched), self.node)
+        moved = self._moved()
+        if moved is not None:
+            first = min(first, moved)
+            settings.force_relinearize = True
+        # What is touched, and all above it in the tree, is eliminated anew: in the order of
+        # time, so that the oldest state stays a leaf. Groups beyond the number of variables
+        # are not allowed; calibration and bias are in one.
+        first -= len(self.parameters)
+        nodes = [k for k in self.times if first <= k < self.node]
+        pairs = []
+        for i, k in enumerate(nodes):
+            pairs.append((keys.node(k), i))
+            if self._walking:
+                pairs.append((keys.bias(k), i))
+        pairs += [(key, len(nodes)) for key in self._top()]
+        settings.constrainedKeys = _groups(pairs)
         self._isam.update(factors, values, settings)
+
+    def _moved(self) -> int | None:
+        """Return the oldest state that has moved too far from where it was linearised."""
+        now = self.times[self.node]
+        if now < self._checked + _CHECK:
+            return None
+        self._checked = now
+        delta = self._isam.getDelta()
+        fixed = self._isam.getFixedVariables()
+        for k in self.times:
+            key = keys.node(k)
+            if (
+                delta.exists(key)
+                and np.any(np.abs(delta.at(key)) > _STATE_STEP)
+                and not fixed.count(key)
+            ):
+                return k
+        return None
 
     def _marginalise(self, k: int) -> None:
         leaves = gtsam.KeyList()
@@ -200,7 +223,8 @@ def _settings(parameters: Sequence[Parameter], *, fixed: bool) -> gtsam.ISAM2Par
     settings = gtsam.ISAM2Params()
     # Cholesky has no digits left at navigation grade.
     settings.setFactorization("QR")
-    settings.relinearizeSkip = 1
+    # With a lag, only where `Smoother` asks for it.
+    settings.relinearizeSkip = 10**6 if fixed else 1
     # Without it the list of factors grows for ever.
     settings.findUnusedFactorSlots = True
     thresholds = gtsam.ISAM2ThresholdMap()
