@@ -8,7 +8,7 @@ from functools import cached_property
 import gtsam
 import numpy as np
 
-from factorgraph_dvl.conventions import Array, exp_so3, rotate, skew
+from factorgraph_dvl.conventions import Array, cross, exp_so3, rotate, skew
 from factorgraph_dvl.increments import Increments, IntArray
 from factorgraph_dvl.sensors.imu import ImuSettings
 from factorgraph_dvl.sensors.protocol import Motion
@@ -194,8 +194,8 @@ def preintegrate(
     dt = inc.dt[:, None]
     rate = seg.phi / dt
     mean_force = seg.dv / dt
-    once = np.cross(seg.phi, mean_force)
-    force = mean_force - once / 2.0 + np.cross(seg.phi, once) / 12.0
+    once = cross(seg.phi, mean_force)
+    force = mean_force - once / 2.0 + cross(seg.phi, once) / 12.0
     rates, forces, steps = list(rate), list(force), inc.dt.tolist()
     gyro_psd = settings.gyro_noise_root_psd**2 * np.eye(3)
     accel_psd = settings.accel_noise_root_psd**2 * np.eye(3)
@@ -420,17 +420,15 @@ def motion_at(at: Attachment, states: States, gravity_n: Array, earth_rate_n: Ar
     w = earth_rate_n
     tau = at.tau[:, None]
     dR, dV, dP = _with_bias(at, bg, ba)
-    v_J = v + np.cross(w, p)
-    wg = np.cross(w, g)
+    v_J = v + cross(w, p)
+    wg = cross(w, g)
     p_end = rotate(
         at.turn, p + v_J * tau + rotate(R, dP) + g * (tau**2 / 2.0) + wg * (tau**3 / 6.0)
     )
     v_end = rotate(at.turn, v_J + rotate(R, dV) + g * tau + wg * (tau**2 / 2.0))
-    v_end = v_end - np.cross(w, p_end)
+    v_end = v_end - cross(w, p_end)
     nRb = at.turn @ R @ dR
-    a_n = (
-        rotate(nRb, at.force - ba) + g - 2.0 * np.cross(w, v_end) - np.cross(w, np.cross(w, p_end))
-    )
+    a_n = rotate(nRb, at.force - ba) + g - 2.0 * cross(w, v_end) - cross(w, cross(w, p_end))
     return Motion(
         nRb=nRb,
         p_n=p_end,
@@ -462,7 +460,7 @@ def slid(motion: Motion, late: float) -> Motion:
 def _with_bias(at: Attachment, bg: Array, ba: Array) -> tuple[Array, Array, Array]:
     """Return dR, dV, dP corrected to first order for the biases."""
     turned = rotate(at.dA, bg)
-    v_gyro = 0.5 * np.cross(at.dV, turned)
+    v_gyro = 0.5 * cross(at.dV, turned)
     v_accel = rotate(at.dA, ba)
     tau = at.tau[:, None]
     return (

@@ -10,14 +10,12 @@ import numpy as np
 
 from factorgraph_dvl import keys
 from factorgraph_dvl.chain import loose_diagonal
-from factorgraph_dvl.conventions import Array, BodyAxes, exp_so3
+from factorgraph_dvl.conventions import Array, BodyAxes
 from factorgraph_dvl.preintegration import (
     Segments,
     States,
     attach,
-    motion_at,
     preintegrate,
-    segment_ends,
 )
 from factorgraph_dvl.replay.estimate import Calibration, calibration_of, trajectory_of
 from factorgraph_dvl.replay.factor import NodeMeasurements, Rows, measurement_factor, state_of
@@ -134,16 +132,11 @@ class Navigator:
         duration = float(seg.duration[0])
         middle = states.p_n + 0.5 * duration * states.v_n
         gravity = self.start.frame.gravity_without_rotation(middle)
-        end = motion_at(segment_ends(seg, earth), states, gravity, earth)
 
         factors, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
         pim = preintegrate(seg, self._imu.settings, gravity, earth)[0]
-        factors.add(
-            gtsam.GalileanImuFactor2(keys.node(k), keys.node(k + 1), s.bias_key(k), pim)
-        )
-        values.insert(
-            keys.node(k + 1), gtsam.NavState(gtsam.Rot3(end.nRb[0]), end.p_n[0], end.v_n[0])
-        )
+        factors.add(gtsam.GalileanImuFactor2(keys.node(k), keys.node(k + 1), s.bias_key(k), pim))
+        values.insert(keys.node(k + 1), pim.predict(state, bias))
         if self.start.walking:
             factors.add(self._walk(k, duration))
             values.insert(keys.bias(k + 1), bias)
@@ -152,7 +145,9 @@ class Navigator:
         if measured is not None:
             factors.add(measured)
         s.extend(float(seg.node_time[1]), factors, values)
-        for old in [j for j in self._segments if j < s.oldest or s.times[j] < self.time - self._memory]:
+        for old in [
+            j for j in self._segments if j < s.oldest or s.times[j] < self.time - self._memory
+        ]:
             del self._segments[old]
         self._refresh()
 
@@ -160,7 +155,9 @@ class Navigator:
         """Add measurements that arrived late, by the index of the state before them."""
         factors = gtsam.NonlinearFactorGraph()
         for k, records in aids.items():
-            measured = self._measured(k, records, state_of(self.smoother.state(k), self.smoother.bias(k)))
+            measured = self._measured(
+                k, records, state_of(self.smoother.state(k), self.smoother.bias(k))
+            )
             if measured is not None:
                 factors.add(measured)
         if factors.size():
@@ -312,9 +309,7 @@ class Navigator:
             wanted = [p for p in measured.parameters if p.name in r.observation.parameters]
             if not wanted:
                 continue
-            columns = np.concatenate(
-                [start[p.name] + np.arange(p.mean.size) for p in wanted]
-            )
+            columns = np.concatenate([start[p.name] + np.arange(p.mean.size) for p in wanted])
             part = feigned_by(
                 r.observation,
                 measured.attachment_of(r),

@@ -10,7 +10,6 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from factorgraph_dvl.conventions import Array
 from factorgraph_dvl.errors import ConfigError, FactorgraphDvlError
 from factorgraph_dvl.replay.collected import Collected
 from factorgraph_dvl.replay.estimate import Calibration
@@ -18,8 +17,7 @@ from factorgraph_dvl.replay.gate import Gate
 from factorgraph_dvl.replay.navigator import Innovations, Navigator
 from factorgraph_dvl.replay.samples import Samples
 from factorgraph_dvl.replay.start import begin
-from factorgraph_dvl.sensors.imu import Imu
-from factorgraph_dvl.sensors.protocol import Aid, joined, rows_of
+from factorgraph_dvl.sensors.protocol import Aid, Observation, joined, rows_of
 from factorgraph_dvl.solution import Trajectory
 from factorgraph_dvl.trial import Trial
 
@@ -121,6 +119,7 @@ class Replay:
         self._solve_again = np.nan
         self._smoothed_to = 0
         self._messages: list[str] = []
+        self._example: dict[str, Observation] = {}
         self._seen: dict[str, float] = {}
         self.too_late: dict[str, int] = {}
         self.unused: dict[str, int] = {}
@@ -248,9 +247,7 @@ class Replay:
             self._messages.append(f"no start yet at {until:.1f} s: {start}")
             return False
         lag = self._lag if self._kind == "fixed-lag" else None
-        self._navigator = Navigator(
-            start, self._known.imu, self._gate, lag=lag, memory=self._lag
-        )
+        self._navigator = Navigator(start, self._known.imu, self._gate, lag=lag, memory=self._lag)
         self._samples.windows = start.windows
         self._solved_at = until
         self._solve_again = self._collected.start + _GROWTH * (until - self._collected.start)
@@ -304,8 +301,11 @@ class Replay:
             record = self._split(section, records, end)
             if record is None:
                 continue
-            true = record.time - self._shift(record)
+            true = record.time - self._shift(section, record)
             now = true >= start - _SAME_TIME
+            if now.all():
+                out.append(record)
+                continue
             if now.any():
                 out.append(rows_of(record, now))
             for i in np.flatnonzero(~now).tolist():
@@ -321,7 +321,7 @@ class Replay:
     def _split(self, section: str, records: list[Aid], end: float) -> Aid | None:
         """Take what was true before a time out of the waiting records of a sensor."""
         record = joined(records)
-        due = record.time - self._shift(record) < end - _SAME_TIME
+        due = record.time - self._shift(section, record) < end - _SAME_TIME
         if not due.any():
             self._waiting[section] = [record]
             return None
@@ -334,14 +334,16 @@ class Replay:
             self._collected.add_aid(section, record)
         return record
 
-    def _shift(self, record: Aid) -> float:
+    def _shift(self, section: str, record: Aid) -> float:
         """Return by how much the clock of a sensor is ahead, s."""
         if self._navigator is None:
             return 0.0
-        observations = record.observations(self._navigator.start.frame)
-        if not observations:
-            return 0.0
-        o = observations[0]
+        if section not in self._example:
+            observations = record.observations(self._navigator.start.frame)
+            if not observations:
+                return 0.0
+            self._example[section] = observations[0]
+        o = self._example[section]
         return float((o.time - o.true_time(self._navigator.values))[0])
 
     def _update(self, began: float, *, solved: bool) -> Update:
@@ -351,7 +353,11 @@ class Replay:
         smoothed = None
         s = nav.smoother
         half = [k for k, t in s.times.items() if t <= nav.time - 0.5 * self._lag]
-        if half and s.times[half[-1]] - s.times.get(self._smoothed_to, nav.time) >= 0.5 * self._lag - self._interval:
+        if (
+            half
+            and s.times[half[-1]] - s.times.get(self._smoothed_to, nav.time)
+            >= 0.5 * self._lag - self._interval
+        ):
             smoothed = nav.smoothed(self._smoothed_to, half[-1] + 1, axes)
             self._smoothed_to = half[-1] + 1
         messages = (*self._messages, *nav.messages)

@@ -65,7 +65,7 @@ class Smoother:
         self._lag = lag
         self._checked = time
         self._isam = gtsam.ISAM2(_settings(self.parameters, fixed=lag is not None))
-        self._sizes = {key: _size(values, key) for key in values.keys()}
+        self._sizes = {key: int(size) for key, size in values.dims().items()}
         self._update(prior, values)
 
     def bias_key(self, k: int) -> int:
@@ -94,8 +94,7 @@ class Smoother:
                 self._marginalise(k)
         self.node += 1
         self.times[self.node] = time
-        for key in values.keys():
-            self._sizes[key] = _size(values, key)
+        self._sizes.update(values.dims())
         self._update(factors, values)
 
     def correct(self, factors: gtsam.NonlinearFactorGraph) -> None:
@@ -169,7 +168,7 @@ class Smoother:
             settings.constrainedKeys = _groups([(key, 1) for key in self._top()])
             self._isam.update(factors, values, settings)
             return
-        touched = {key for i in range(factors.size()) for key in factors.at(i).keys()}
+        touched = set(factors.keyVector())
         first = next((k for k in self.times if keys.node(k) in touched), self.node)
         moved = self._moved()
         if moved is not None:
@@ -242,7 +241,3 @@ def _groups(pairs: Sequence[tuple[int, int]]) -> gtsam.KeyGroupMap:
     for key, group in pairs:
         out.insert2(key, group)
     return out
-
-
-def _size(values: gtsam.Values, key: int) -> int:
-    return int(values.dims()[key])

@@ -11,8 +11,7 @@ from factorgraph_dvl import keys
 from factorgraph_dvl.conventions import DEG, Array
 from factorgraph_dvl.earth import LocalFrame
 from factorgraph_dvl.graph import Problem
-from factorgraph_dvl.increments import increments
-from factorgraph_dvl.sensors.protocol import Observation, Parameter
+from factorgraph_dvl.sensors.protocol import Parameter
 from factorgraph_dvl.solvers.batch import STATE_INTERVAL, fit
 from factorgraph_dvl.solvers.covariance import posterior
 from factorgraph_dvl.solvers.feigned import (
@@ -96,7 +95,7 @@ def begin(trial: Trial, progress: Progress) -> Start | str:
         *(problem.key(p.name) for p in problem.parameters),
     ]
     gaussian = problem.linearize(evaluation)
-    gone = [key for key in evaluation.values.keys() if key not in kept]
+    gone = [key for key in evaluation.values.dims() if key not in kept]
     _, rest = gaussian.eliminatePartialMultifrontal(gone, gtsam.EliminateQR)
     values = _some(problem, evaluation.values, last)
     return Start(

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from factorgraph_dvl.conventions import DEG, Array, rotate, skew
+from factorgraph_dvl.conventions import DEG, Array, cross, rotate, skew
 from factorgraph_dvl.earth import LocalFrame
 from factorgraph_dvl.sensors.protocol import (
     Linearization,
@@ -207,7 +207,7 @@ class AntennaVelocity:
 
     def residual(self, motion: Motion, values: Values) -> Array:
         """Return predicted - measured in local-level east, north, up, (M, 3), m/s."""
-        turning_b = np.cross(motion.omega_eb_b, values[LEVER_ARM])
+        turning_b = cross(motion.omega_eb_b, values[LEVER_ARM])
         return rotate(self.lRn, motion.v_n + rotate(motion.nRb, turning_b)) - self.measured_l
 
     def linearize(self, motion: Motion, values: Values, wanted: Collection[str]) -> Linearization:
@@ -216,7 +216,7 @@ class AntennaVelocity:
         lRb = self.lRn @ motion.nRb
         return Linearization(
             residual=self.residual(motion, values),
-            d_theta=-lRb @ skew(np.cross(motion.omega_eb_b, lever_arm)),
+            d_theta=-lRb @ skew(cross(motion.omega_eb_b, lever_arm)),
             d_v=self.lRn,
             d_omega=-lRb @ skew(lever_arm),
             d_parameters={LEVER_ARM: lRb @ skew(motion.omega_eb_b)} if LEVER_ARM in wanted else {},

@@ -197,6 +197,8 @@ def joined(records: Sequence[_Record]) -> _Record:
 
     Of rows at the same time the first is kept.
     """
+    if len(records) == 1:
+        return records[0]
     columns = [_arrays(record) for record in records]
     whole = {name: np.concatenate([c[name] for c in columns]) for name in columns[0]}
     _, rows = np.unique(whole["time"], return_index=True)
