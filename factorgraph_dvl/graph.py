@@ -72,6 +72,22 @@ class _Block:
 
 
 @dataclass(frozen=True)
+class Known:
+    """What is known of biases and parameters beforehand, jointly, in place of their priors.
+
+    Parameters
+    ----------
+    bias : (6,) accelerometer and gyro bias at the first node, SI.
+    parameters : values of those that are estimated, rotations as matrices.
+    covariance : (6 + P, 6 + P) of biases and parameters, in the tangent space, SI.
+    """
+
+    bias: Array
+    parameters: dict[str, Array]
+    covariance: Array
+
+
+@dataclass(frozen=True)
 class Evaluation:
     """All there is to know at one set of values, before linearising.
 
@@ -100,6 +116,7 @@ class Problem:
     observations : of the aiding sensors.
     parameters : of the aiding sensors, fixed ones included.
     start : values of parameters, where they are known better than by their priors.
+    known : what stands in place of the priors; the chain then has none of the biases.
     """
 
     def __init__(
@@ -108,6 +125,7 @@ class Problem:
         observations: Sequence[Observation],
         parameters: Sequence[Parameter],
         start: dict[str, Array] | None = None,
+        known: Known | None = None,
     ) -> None:
         self.chain = chain
         self.all_parameters = tuple(parameters)
@@ -115,8 +133,11 @@ class Problem:
         self._key = {p.name: keys.calibration(i) for i, p in enumerate(self.parameters)}
         self._fixed = {p.name: _from_prior(p) for p in parameters if not p.estimated}
         self.graph = gtsam.NonlinearFactorGraph(chain.graph)
-        for p in self.parameters:
-            self._add_prior(p)
+        if known is None:
+            for p in self.parameters:
+                self._add_prior(p)
+        else:
+            self._add_known(known)
         self.uncovered: dict[str, int] = {}
         self._start = {**self.prior_values(), **(start or {})}
         self._bound: list[_Bound] = []
@@ -318,6 +339,29 @@ class Problem:
             self.graph.addPriorRot3(key, gtsam.Rot3(exp_so3(p.mean)), noise)
         else:
             self.graph.addPriorVector(key, p.mean, loose_diagonal(sigma))
+
+    def _add_known(self, known: Known) -> None:
+        """Add a joint prior of biases and parameters, linear about their values."""
+        sigma = np.sqrt(np.diag(known.covariance))
+        correlation = known.covariance / np.outer(sigma, sigma)
+        root = np.linalg.inv(np.linalg.cholesky(correlation)) / sigma
+        columns = [slice(0, _BIAS)]
+        columns += [slice(c.start + _BIAS, c.stop + _BIAS) for c in self.columns.values()]
+        bias_key = self.chain.bias_key(0)
+
+        def error(
+            this: gtsam.CustomFactor, at: gtsam.Values, jacobians: list[Array] | None
+        ) -> Array:
+            now = {p.name: self._parameter(at, p) for p in self.parameters}
+            away = at.atConstantBias(bias_key).vector() - known.bias
+            if jacobians is not None:
+                for i, place in enumerate(columns):
+                    jacobians[i] = np.asfortranarray(root[:, place])
+            return root @ np.concatenate([away, self.difference(now, known.parameters)])
+
+        noise = gtsam.noiseModel.Unit.Create(sigma.size)
+        shared = [bias_key, *(self._key[p.name] for p in self.parameters)]
+        self.graph.add(gtsam.CustomFactor(noise, shared, error))
 
     def _bind(self, observation: Observation) -> _Bound:
         time = observation.true_time(self._start)

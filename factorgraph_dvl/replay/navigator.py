@@ -10,7 +10,8 @@ import numpy as np
 
 from factorgraph_dvl import keys
 from factorgraph_dvl.chain import loose_diagonal
-from factorgraph_dvl.conventions import Array, BodyAxes
+from factorgraph_dvl.conventions import Array, BodyAxes, log_so3
+from factorgraph_dvl.graph import Known
 from factorgraph_dvl.preintegration import (
     Segments,
     States,
@@ -89,6 +90,7 @@ class Navigator:
         self.innovations: list[Innovations] = []
         self.messages: list[str] = []
         self._refresh()
+        self._begun = self._values
 
     @property
     def time(self) -> float:
@@ -104,6 +106,18 @@ class Navigator:
     def values(self) -> dict[str, Array]:
         """Values of all parameters, rotations as matrices."""
         return self._values
+
+    @property
+    def turned(self) -> float:
+        """Angle by which a rotation among the parameters differs from the start's, rad."""
+        return max(
+            (
+                float(np.linalg.norm(log_so3(self._begun[p.name].T @ self._values[p.name])))
+                for p in self.start.parameters
+                if p.rotation
+            ),
+            default=0.0,
+        )
 
     @property
     def held(self) -> Array:
@@ -163,6 +177,16 @@ class Navigator:
         if factors.size():
             self.smoother.correct(factors)
             self._refresh()
+
+    def known(self, later: float) -> Known:
+        """Return what is known of biases and parameters, `later` seconds from now."""
+        P = self.parameter_covariance.copy()
+        s = self._imu.settings
+        walk = np.repeat([s.accel_bias_walk_root_psd, s.gyro_bias_walk_root_psd], 3)
+        P[:6, :6] += np.diag(walk**2) * later
+        return Known(
+            self.smoother.bias(self.smoother.node).vector(), self.smoother.calibration(), P
+        )
 
     def node_before(self, time: float) -> int | None:
         """Return the state whose segment holds a time, None if it is gone or yet to come."""

@@ -11,15 +11,16 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from factorgraph_dvl.errors import ConfigError, FactorgraphDvlError
+from factorgraph_dvl.graph import Known
 from factorgraph_dvl.replay.collected import Collected
 from factorgraph_dvl.replay.estimate import Calibration
 from factorgraph_dvl.replay.gate import Gate
 from factorgraph_dvl.replay.navigator import Innovations, Navigator
-from factorgraph_dvl.replay.samples import Samples
+from factorgraph_dvl.replay.samples import Gap, Samples
 from factorgraph_dvl.replay.start import begin
 from factorgraph_dvl.sensors.protocol import Aid, Observation, joined, rows_of
 from factorgraph_dvl.solution import Trajectory
-from factorgraph_dvl.trial import Trial
+from factorgraph_dvl.trial import InitialPosition, Trial
 
 Kind = Literal["fixed-lag", "isam2"]
 KINDS: tuple[Kind, ...] = ("fixed-lag", "isam2")
@@ -30,6 +31,11 @@ RATE = 5.0
 _FIRST = 30.0
 _GROWTH = 1.5
 _RETRY = 1.2
+# The same after a gap of the IMU.
+_AFTER_GAP = 10.0
+# How a vessel may move in it: acceleration, m/s², and sway, m.
+_ACCELERATION = 1.0
+_SWAY = 0.5
 # Data that are kept for a start, s.
 _LONGEST = 1800.0
 # Agreement with a batch solution, in its standard deviations, and standard deviation of
@@ -115,6 +121,7 @@ class Replay:
         self._waiting: dict[str, list[Aid]] = {}
         self._clock = 0.0
         self._attempt = np.nan
+        self._prior: Known | None = None
         self._solved_at = np.nan
         self._solve_again = np.nan
         self._smoothed_to = 0
@@ -208,12 +215,37 @@ class Replay:
                 break
             seg = self._samples.segment(now, min(target, self._samples.newest))
             if seg is None:
-                break
+                gap = self._samples.gap_after(now)
+                if gap is None:
+                    break
+                self._break(gap)
+                continue
             aids = self._take(now, float(seg.node_time[1]))
             self._navigator.extend(seg, aids)
             self._samples.forget(self._navigator.time)
             out.append(self._update(began, solved=self._again()))
         return out
+
+    def _break(self, gap: Gap) -> None:
+        """End the chain at a gap of the IMU, and collect anew."""
+        nav = self._navigator
+        assert nav is not None
+        length = gap.after - gap.before
+        self._messages.append(
+            f"gap of {length:.2f} s in the IMU at {gap.before:.2f} s: the attitude is found anew"
+        )
+        if self._collected is None:
+            state = nav.filtered(self._known.body_axes)
+            speed = float(np.linalg.norm(state.velocity[0]))
+            reach = speed * length + 0.5 * _ACCELERATION * length**2 + _SWAY
+            self._prior = nav.known(length)
+            here = InitialPosition(state.geodetic[0], np.hypot(state.position_std[0], reach))
+            self._known = replace(self._known, initial_attitude=None, initial_position=here)
+            self._collected = Collected(self._known, _LONGEST)
+            self._collected.add_samples(self._samples.since(gap.after))
+        self._attempt = gap.after + _AFTER_GAP
+        self._samples.forget(gap.after)
+        self._navigator = None
 
     def _next(self, now: float) -> float:
         """Return the time of the next state: a multiple of the interval."""
@@ -226,12 +258,12 @@ class Replay:
         if self._collected.empty or self._samples.dt == 0.0:
             return False
         until = self._samples.newest - self._samples.delay
-        since = until - self._collected.start
         if np.isnan(self._attempt):
-            self._attempt = _FIRST
-        if since < self._attempt and not (end and since > 1.0):
+            self._attempt = self._collected.start + _FIRST
+        if until < self._attempt and not end:
             return False
-        self._attempt = max(_RETRY * since, since + 1.0)
+        since = until - self._collected.start
+        self._attempt = until + max((_RETRY - 1.0) * since, 1.0)
         for section, records in list(self._waiting.items()):
             self._split(section, records, until)
         self._samples.forget(until)
@@ -240,7 +272,7 @@ class Replay:
     def _solve(self, until: float) -> bool:
         assert self._collected is not None
         try:
-            start = begin(self._collected.trial(until), self._progress)
+            start = begin(self._collected.trial(until), self._prior, self._progress)
         except FactorgraphDvlError as error:
             start = str(error)
         if isinstance(start, str):
@@ -271,7 +303,8 @@ class Replay:
 
     def _moved(self, now: float) -> bool:
         """Whether a rotation has left where it was linearised."""
-        return False
+        assert self._navigator is not None
+        return now > self._solved_at + _LEAST_BETWEEN and self._navigator.turned > _MOVED
 
     def _settle(self, before: Navigator, after: Navigator) -> None:
         """Let what was collected go if the smoother found the same as the batch solution."""
@@ -352,14 +385,9 @@ class Replay:
         axes = self._known.body_axes
         smoothed = None
         s = nav.smoother
-        half = [k for k, t in s.times.items() if t <= nav.time - 0.5 * self._lag]
-        if (
-            half
-            and s.times[half[-1]] - s.times.get(self._smoothed_to, nav.time)
-            >= 0.5 * self._lag - self._interval
-        ):
-            smoothed = nav.smoothed(self._smoothed_to, half[-1] + 1, axes)
-            self._smoothed_to = half[-1] + 1
+        late = s.times.get(self._smoothed_to)
+        if late is not None and nav.time - late > self._lag - 2.0 * self._interval:
+            smoothed = self._smooth(0.5 * self._lag)
         messages = (*self._messages, *nav.messages)
         innovations = tuple(nav.innovations)
         self._messages, nav.messages, nav.innovations = [], [], []
@@ -374,3 +402,15 @@ class Replay:
             messages=messages,
             solved=solved,
         )
+
+    def _smooth(self, age: float) -> Trajectory | None:
+        """Return the states older than an age, s, that were not returned before."""
+        nav = self._navigator
+        assert nav is not None
+        s = nav.smoother
+        after = next((k for k, t in s.times.items() if t > nav.time - age), s.node + 1)
+        if after <= self._smoothed_to:
+            return None
+        out = nav.smoothed(self._smoothed_to, after, self._known.body_axes)
+        self._smoothed_to = after
+        return out

@@ -27,6 +27,8 @@ _BIAS_STEP = np.full(6, 1e2)
 # In units of SI: a rotation, or what multiplies a velocity.
 _CALIBRATION_STEP = 1e-2
 _NEVER = 1e9
+# Share of the states from which on all are eliminated anew.
+_MOST = 0.4
 # Interval, s, at which states are looked at for that.
 _CHECK = 1.0
 _STATE = 9
@@ -179,6 +181,14 @@ class Smoother:
         # are not allowed; calibration and bias are in one.
         first -= len(self.parameters)
         nodes = [k for k in self.times if first <= k < self.node]
+        if len(nodes) > _MOST * len(self.times):
+            # iSAM2 goes over to eliminating everything once it is most of it.
+            nodes = [k for k in self.times if k < self.node]
+            again = gtsam.KeyList()
+            for key in self._in_time():
+                if self._isam.valueExists(key):
+                    again.push_back(key)
+            settings.extraReelimKeys = again
         pairs = []
         for i, k in enumerate(nodes):
             pairs.append((keys.node(k), i))

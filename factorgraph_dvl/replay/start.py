@@ -10,7 +10,7 @@ import numpy as np
 from factorgraph_dvl import keys
 from factorgraph_dvl.conventions import DEG, Array
 from factorgraph_dvl.earth import LocalFrame
-from factorgraph_dvl.graph import Problem
+from factorgraph_dvl.graph import Known, Problem
 from factorgraph_dvl.sensors.protocol import Parameter
 from factorgraph_dvl.solvers.batch import STATE_INTERVAL, fit
 from factorgraph_dvl.solvers.covariance import posterior
@@ -39,9 +39,7 @@ class Start:
     parameters, all_parameters : those that are estimated, and all.
     fixed : values of those that are not.
     windows : over which the IMU's samples are smoothed.
-    covariance : of state, bias and parameters, as `Smoother.joint_covariance`.
     feigned : (P, P) information on the parameters that only noise makes, SI.
-    residual_rms : per observation, label and its rms normalised residual.
     walking : whether biases walk.
     notes : for the user.
     """
@@ -60,8 +58,14 @@ class Start:
     notes: tuple[str, ...]
 
 
-def begin(trial: Trial, progress: Progress) -> Start | str:
+def begin(trial: Trial, known: Known | None, progress: Progress) -> Start | str:
     """Solve what was collected, and condense it to its last state.
+
+    Parameters
+    ----------
+    trial : what was collected.
+    known : of biases and calibration from before, in place of the trial's priors.
+    progress : called with stage, iteration and cost.
 
     Returns
     -------
@@ -72,7 +76,9 @@ def begin(trial: Trial, progress: Progress) -> Start | str:
     DataError, SolveError
         If the data collected so far cannot be solved.
     """
-    problem, minimum, notes = fit(trial, state_interval_s=STATE_INTERVAL, progress=progress)
+    problem, minimum, notes = fit(
+        trial, state_interval_s=STATE_INTERVAL, progress=progress, known=known
+    )
     if not minimum.converged:
         return "the solver did not converge"
     covariances = posterior(problem, minimum)

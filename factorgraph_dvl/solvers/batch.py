@@ -11,7 +11,7 @@ from factorgraph_dvl.alignment import initial_states
 from factorgraph_dvl.chain import Chain, inertial_chain
 from factorgraph_dvl.earth import LocalFrame
 from factorgraph_dvl.errors import ConfigError
-from factorgraph_dvl.graph import Problem
+from factorgraph_dvl.graph import Known, Problem
 from factorgraph_dvl.increments import increments
 from factorgraph_dvl.mounting import initial_mounting
 from factorgraph_dvl.preintegration import Segments, States, attach, motion_at, segments
@@ -85,7 +85,7 @@ def solve(
 
 
 def fit(
-    trial: Trial, *, state_interval_s: float, progress: Progress
+    trial: Trial, *, state_interval_s: float, progress: Progress, known: Known | None = None
 ) -> tuple[Problem, Minimum, tuple[str, ...]]:
     """Find the minimum of a trial's cost, from nothing but its data.
 
@@ -93,6 +93,7 @@ def fit(
     ----------
     trial, state_interval_s : as for `solve`.
     progress : called with stage, iteration and cost.
+    known : of biases and calibration, in place of the trial's priors.
 
     Returns
     -------
@@ -106,12 +107,14 @@ def fit(
     start = initial_states(trial, frame, seg)
     notes = (*trial.notes, *gaps, *start.notes)
 
-    states, values = start.states, None
+    states = start.states
+    values = None if known is None else known.parameters
     iterations = 0
     p_gravity = np.full_like(states.p_n, np.inf)
     for _ in range(_ROUNDS):
         if np.sqrt(np.mean((states.p_n - p_gravity) ** 2)) > _SAME_GRAVITY:
-            chain, p_gravity = inertial_chain(trial, frame, seg, states), states.p_n
+            chain = inertial_chain(trial, frame, seg, states, bias_prior=known is None)
+            p_gravity = states.p_n
         if values is None:
             if trial.gnss is not None:
                 coarse = _without_dvl(chain, states, progress)
@@ -119,7 +122,7 @@ def fit(
                 states = coarse.evaluation.states
             progress("mounting", 0, None)
             values = _mounting(trial, frame, seg, chain.gravity_n, states)
-        problem = Problem(chain, *_sensors(trial.aids, frame), start=values)
+        problem = Problem(chain, *_sensors(trial.aids, frame), start=values, known=known)
         at = problem.values(states, {**problem.prior_values(), **values})
         minimum = minimise(problem, at, stage="all sensors", progress=progress)
         iterations += minimum.iterations
