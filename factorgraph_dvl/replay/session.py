@@ -67,6 +67,8 @@ class Update:
     innovations : what was measured against what was predicted.
     messages : for the user.
     solved : whether the update includes a solution of all that was collected.
+    doubted : kinds of measurements that disagree with the prediction, so that the standard
+        deviations are not to be trusted.
     """
 
     time: float
@@ -77,6 +79,7 @@ class Update:
     innovations: tuple[Innovations, ...]
     messages: tuple[str, ...]
     solved: bool
+    doubted: tuple[str, ...]
 
 
 class Replay:
@@ -127,7 +130,8 @@ class Replay:
         self._smoothed_to = 0
         self._messages: list[str] = []
         self._example: dict[str, Observation] = {}
-        self._seen: dict[str, float] = {}
+        self._heard: dict[str, float] = {}
+        self._silent: set[str] = set()
         self.too_late: dict[str, int] = {}
         self.unused: dict[str, int] = {}
 
@@ -388,6 +392,7 @@ class Replay:
         late = s.times.get(self._smoothed_to)
         if late is not None and nav.time - late > self._lag - 2.0 * self._interval:
             smoothed = self._smooth(0.5 * self._lag)
+        self._listen(nav)
         messages = (*self._messages, *nav.messages)
         innovations = tuple(nav.innovations)
         self._messages, nav.messages, nav.innovations = [], [], []
@@ -401,7 +406,23 @@ class Replay:
             innovations=innovations,
             messages=messages,
             solved=solved,
+            doubted=tuple(sorted(self._gate.doubted)),
         )
+
+    def _listen(self, nav: Navigator) -> None:
+        """Say which kinds of measurements have fallen silent, and which are back."""
+        for i in nav.innovations:
+            before = self._heard.get(i.label, nav.time)
+            self._heard[i.label] = max(float(i.time[-1]), before)
+            if i.label in self._silent:
+                self._silent.discard(i.label)
+                self._messages.append(f"{i.label}: back after {i.time[-1] - before:.1f} s")
+        for label, heard in self._heard.items():
+            if nav.time - heard > _SILENT and label not in self._silent:
+                self._silent.add(label)
+                self._messages.append(
+                    f"{label}: nothing since {heard:.1f} s; the estimate goes on without"
+                )
 
     def _smooth(self, age: float) -> Trajectory | None:
         """Return the states older than an age, s, that were not returned before."""
