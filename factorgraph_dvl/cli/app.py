@@ -13,6 +13,7 @@ from factorgraph_dvl import __version__
 from factorgraph_dvl.cli.console import stderr
 from factorgraph_dvl.cli.crosscheck import crosscheck
 from factorgraph_dvl.cli.inspect import inspect
+from factorgraph_dvl.cli.replay import replay
 from factorgraph_dvl.cli.simulate import simulate
 from factorgraph_dvl.cli.solve import kalman, solve
 from factorgraph_dvl.errors import FactorgraphDvlError
@@ -28,7 +29,7 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
-for _command in (simulate, solve, kalman, inspect, crosscheck):
+for _command in (simulate, solve, replay, kalman, inspect, crosscheck):
     app.command()(_command)
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
+from typing import cast
 
 import gtsam
 import numpy as np
@@ -97,7 +98,9 @@ class NodeMeasurements:
             lin = r.observation.linearize(own, values, wanted)
             m, d = lin.residual.shape
             matrix = np.zeros((m, d, width))
-            matrix[:, :, : _STATE + _BIAS] = node_jacobian(lin, _Window(transition, r.at))
+            matrix[:, :, : _STATE + _BIAS] = node_jacobian(
+                lin, cast(Transition, _Window(transition, r.at))
+            )
             column = _STATE + _BIAS
             for p in self.parameters:
                 if p.name in wanted:

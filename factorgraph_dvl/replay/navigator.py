@@ -24,7 +24,7 @@ from factorgraph_dvl.replay.gate import Gate
 from factorgraph_dvl.replay.smoother import Smoother
 from factorgraph_dvl.replay.start import Start
 from factorgraph_dvl.sensors.imu import Imu
-from factorgraph_dvl.sensors.protocol import Aid, Parameter
+from factorgraph_dvl.sensors.protocol import Aid, Motion, Parameter
 from factorgraph_dvl.solution import Trajectory
 from factorgraph_dvl.solvers.feigned import feigned_among, feigned_by
 
@@ -248,7 +248,9 @@ class Navigator:
         if not observations:
             return None
         seg, gravity = self._segments[k]
-        rows, times, count = [], [], 0
+        rows: list[Rows] = []
+        times: list[Array] = []
+        count = 0
         for o in observations:
             time = o.true_time(self._values)
             if rows and np.array_equal(time, rows[-1].time):
@@ -313,7 +315,7 @@ class Navigator:
             )
         return weight
 
-    def _feign(self, measured: NodeMeasurements, motions: Sequence, weight: Array) -> None:
+    def _feign(self, measured: NodeMeasurements, motions: Sequence[Motion], weight: Array) -> None:
         """Add the information that the motion's error feigns since it was last done."""
         now = self.time
         per_second = now - self._feigned_at

@@ -132,8 +132,8 @@ class Replay:
         self._example: dict[str, Observation] = {}
         self._heard: dict[str, float] = {}
         self._silent: set[str] = set()
-        self.too_late: dict[str, int] = {}
-        self.unused: dict[str, int] = {}
+        self._too_late: dict[str, int] = {}
+        self._unused: dict[str, int] = {}
 
     @property
     def delay(self) -> float:
@@ -151,9 +151,26 @@ class Replay:
         return self._collected is None
 
     @property
-    def gate(self) -> Gate:
-        """What decides which measurements are used."""
-        return self._gate
+    def messages(self) -> tuple[str, ...]:
+        """Messages that no update has carried yet."""
+        return tuple(self._messages)
+
+    def counts(self) -> list[str]:
+        """Say how many measurements were not used, and why."""
+        why = (
+            (
+                self._too_late,
+                f"came after what they belong to had left the lag of {self._lag:g} s",
+            ),
+            (self._unused, f"were more than {_AHEAD:g} s ahead of the IMU"),
+            (self._gate.refused, "contradicted the prediction"),
+        )
+        out = [
+            f"{k}: {n} measurements {text}" for found, text in why for k, n in found.items() if n
+        ]
+        if self._samples.refused:
+            out.append(f"IMU: {self._samples.refused} samples were out of order or not numbers")
+        return out
 
     def add_imu(self, time: ArrayLike, gyro: ArrayLike, accel: ArrayLike) -> list[Update]:
         """Take one IMU sample, or some, and return the updates that they make possible.
@@ -193,7 +210,7 @@ class Replay:
             record = replace(record, time=record.time + self._clock)  # type: ignore[type-var]
         ahead = record.time > self._samples.newest + _AHEAD
         if ahead.any() and self._samples.newest > -np.inf:
-            self.unused[record.label] = self.unused.get(record.label, 0) + int(ahead.sum())
+            self._unused[record.label] = self._unused.get(record.label, 0) + int(ahead.sum())
             if ahead.all():
                 return
             record = rows_of(record, ~ahead)
@@ -248,6 +265,8 @@ class Replay:
             self._collected = Collected(self._known, _LONGEST)
             self._collected.add_samples(self._samples.since(gap.after))
         self._attempt = gap.after + _AFTER_GAP
+        self._heard.clear()
+        self._silent.clear()
         self._samples.forget(gap.after)
         self._navigator = None
 
@@ -327,7 +346,6 @@ class Replay:
         ]
         if agrees and not after.held.size and all(s < _SETTLED_ROTATION for s in rotations):
             self._collected = None
-            self._messages.append(f"settled at {after.time:.1f} s")
 
     def _take(self, start: float, end: float) -> list[Aid]:
         """Return measurements true from `start` to before `end`; late ones correct."""
@@ -348,7 +366,7 @@ class Replay:
             for i in np.flatnonzero(~now).tolist():
                 k = self._navigator.node_before(float(true[i]))
                 if k is None:
-                    self.too_late[record.label] = self.too_late.get(record.label, 0) + 1
+                    self._too_late[record.label] = self._too_late.get(record.label, 0) + 1
                 else:
                     late.setdefault(k, []).append(rows_of(record, np.array([i])))
         if late:

@@ -10,6 +10,7 @@ from typing import Annotated, Any, Protocol, TypeVar
 
 import msgspec
 import numpy as np
+from numpy.typing import NDArray
 
 from factorgraph_dvl.conventions import Array
 from factorgraph_dvl.earth import LocalFrame
@@ -186,7 +187,7 @@ class Aid(Protocol):
 _Record = TypeVar("_Record")
 
 
-def rows_of(record: _Record, rows: slice | Array) -> _Record:
+def rows_of(record: _Record, rows: slice | NDArray[Any] | list[int]) -> _Record:
     """Return some rows of a sensor's record, in the order of time: of every array in it."""
     return _with(record, {name: values[rows] for name, values in _arrays(record).items()})
 
