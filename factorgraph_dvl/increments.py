@@ -26,6 +26,7 @@ from factorgraph_dvl.polynomials import (
     integrate,
     interpolation,
     rate_and_slope,
+    regular_interpolation,
 )
 from factorgraph_dvl.sensors.imu import Imu
 from factorgraph_dvl.signals import Smoothed, as_it_is, smooth
@@ -290,8 +291,8 @@ class Increments:
         out = np.empty((index.size, width, 6))
         for shift in np.unique(offset[uniform]):
             pick = uniform & (offset == shift)
-            edges = np.arange(lengths.shape[1] + 1, dtype=float) - shift
-            out[pick] = np.matmul(interpolation(edges[None], self.averaged)[0], values[pick])
+            matrix = regular_interpolation(lengths.shape[1] + 1, int(shift), self.averaged)
+            out[pick] = np.matmul(matrix, values[pick])
         rest = np.flatnonzero(~uniform)
         if rest.size:
             edges = np.zeros((rest.size, lengths.shape[1] + 1))

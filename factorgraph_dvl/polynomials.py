@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from math import factorial
 
 import numpy as np
@@ -42,6 +43,13 @@ def interpolation(edges: Array, averaged: bool) -> Array:
     else:
         rows = edges[:, :, None] ** power
     return np.asarray(np.linalg.inv(rows))
+
+
+@lru_cache(maxsize=64)
+def regular_interpolation(count: int, shift: int, averaged: bool) -> Array:
+    """Return `interpolation` (K, K) at `count` edges one apart, from -shift on."""
+    edges = np.arange(count, dtype=float) - shift
+    return interpolation(edges[None], averaged)[0]
 
 
 def evaluate(c: Array, u: Array | float) -> Array:

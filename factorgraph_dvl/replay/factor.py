@@ -152,6 +152,7 @@ def measurement_factor(
     node_key: int,
     bias_key: int,
     parameter_keys: Sequence[int],
+    first: tuple[States, Array, Array] | None = None,
 ) -> gtsam.CustomFactor:
     """Return the factor of what was measured after a node; zero error where it is predicted.
 
@@ -163,7 +164,9 @@ def measurement_factor(
     measured : rows R in all.
     weight : (R,) inverse standard deviations; 0 = not used.
     node_key, bias_key, parameter_keys : of the variables, parameters as in `measured`.
+    first : states at which GTSAM will linearise first, and residual and Jacobian there.
     """
+    kept = [first] if first is not None else []
     every = [node_key, bias_key, *parameter_keys]
     sizes = [_STATE, _BIAS, *(p.mean.size for p in measured.parameters)]
     edges = np.cumsum([0, *sizes])
@@ -179,15 +182,30 @@ def measurement_factor(
         }
         if jacobians is None:
             return weight * measured.residuals(states, values)
-        residual, matrix, _ = measured.linearize(states, values)
+        residual, matrix = _kept_at(kept, states) or measured.linearize(states, values)[:2]
         if matrix.shape != (rows, edges[-1]) or len(jacobians) != len(sizes):
             raise ValueError(f"Jacobian of shape {matrix.shape}, expected {(rows, edges[-1])}")
-        matrix *= weight[:, None]
+        matrix = matrix * weight[:, None]
         for i in range(len(sizes)):
             jacobians[i] = np.asfortranarray(matrix[:, edges[i] : edges[i + 1]])
         return weight * residual
 
     return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(rows), every, error)
+
+
+def _kept_at(
+    kept: list[tuple[States, Array, Array]], states: States
+) -> tuple[Array, Array] | None:
+    """Return, once, residual and Jacobian if they were computed at these very states."""
+    if not kept:
+        return None
+    at, residual, matrix = kept.pop()
+    same = (
+        np.array_equal(at.nRb, states.nRb)
+        and np.array_equal(at.v_n, states.v_n)
+        and np.array_equal(at.gyro_bias, states.gyro_bias)
+    )
+    return (residual, matrix) if same else None
 
 
 def state_of(state: gtsam.NavState, bias: gtsam.imuBias.ConstantBias) -> States:

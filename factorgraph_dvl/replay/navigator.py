@@ -28,6 +28,8 @@ from factorgraph_dvl.sensors.protocol import Aid, Motion, Parameter
 from factorgraph_dvl.solution import Trajectory
 from factorgraph_dvl.solvers.feigned import feigned_among, feigned_by
 
+# Distance, m, up to which gravity is taken as linear: to 3e-9 m/s².
+_NEAR = 100.0
 # Keeps the walk of a bias that does not walk regular.
 _LEAST_WALK = 1e-12
 _STATE = 9
@@ -86,11 +88,21 @@ class Navigator:
         self._feigned = start.feigned
         self._feigned_at = start.time
         self._held = np.zeros((self._sigma.size, 0))
+        self._near = np.full(3, np.inf)
         self._segments: dict[int, tuple[Segments, Array]] = {}
         self.innovations: list[Innovations] = []
         self.messages: list[str] = []
         self._refresh()
-        self._begun = self._values
+        first = keys.node(start.node)
+        self._begun = {
+            p.name: start.values.atRot3(key).matrix() if p.rotation else start.values.atVector(key)
+            for p, key in zip(start.parameters, self.smoother.calibration_keys, strict=True)
+        } | start.fixed
+        # Of the newest state; without a lag GTSAM moves it on its own account.
+        self._linear: tuple[gtsam.NavState, gtsam.imuBias.ConstantBias] | None = None
+        if lag is not None:
+            bias = start.values.atConstantBias(self.smoother.bias_key(start.node))
+            self._linear = (start.values.atNavState(first), bias)
 
     @property
     def time(self) -> float:
@@ -144,13 +156,13 @@ class Navigator:
         states = state_of(state, bias)
         earth = self.start.frame.earth_rate
         duration = float(seg.duration[0])
-        middle = states.p_n + 0.5 * duration * states.v_n
-        gravity = self.start.frame.gravity_without_rotation(middle)
+        gravity = self._gravity(states.p_n + 0.5 * duration * states.v_n)
 
         factors, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
         pim = preintegrate(seg, self._imu.settings, gravity, earth)[0]
         factors.add(gtsam.GalileanImuFactor2(keys.node(k), keys.node(k + 1), s.bias_key(k), pim))
-        values.insert(keys.node(k + 1), pim.predict(state, bias))
+        predicted = pim.predict(state, bias)
+        values.insert(keys.node(k + 1), predicted)
         if self.start.walking:
             factors.add(self._walk(k, duration))
             values.insert(keys.bias(k + 1), bias)
@@ -159,6 +171,8 @@ class Navigator:
         if measured is not None:
             factors.add(measured)
         s.extend(float(seg.node_time[1]), factors, values)
+        if self._linear is not None:
+            self._linear = (predicted, bias if self.start.walking else self._linear[1])
         for old in [
             j for j in self._segments if j < s.oldest or s.times[j] < self.time - self._memory
         ]:
@@ -230,6 +244,15 @@ class Navigator:
         time = np.array([self.smoother.times[k] for k in nodes])
         return trajectory_of(time, states, P, self.start.frame, body_axes)
 
+    def _gravity(self, p_n: Array) -> Array:
+        """Return gravity at a position (1, 3), linear about one that is near."""
+        if np.linalg.norm(p_n - self._near) > _NEAR:
+            self._near = p_n[0]
+            at = p_n + _NEAR * np.vstack([np.zeros(3), np.eye(3)])
+            found = self.start.frame.gravity_without_rotation(at)
+            self._near_gravity, self._gradient = found[0], (found[1:] - found[0]) / _NEAR
+        return self._near_gravity + (p_n - self._near) @ self._gradient
+
     def _refresh(self) -> None:
         self._P = self.smoother.joint_covariance()
         self._values = {**self.start.fixed, **self.smoother.calibration()}
@@ -269,7 +292,15 @@ class Navigator:
             gravity_n=gravity,
             earth_rate_n=self.start.frame.earth_rate,
         )
-        residual, matrix, motions = measured.linearize(states, self._values)
+        first = None
+        if self._linear is not None and k == self.smoother.node:
+            # Where GTSAM will linearise: so it is done once.
+            states = state_of(*self._linear)
+            residual, matrix, motions = measured.linearize(states, self._begun)
+            first = (states, residual, matrix)
+            residual = residual + matrix @ self._away()[self._columns(parameters)]
+        else:
+            residual, matrix, motions = measured.linearize(states, self._values)
         sigma = measured.sigma(motions, self._values)
         weight = self._weigh(measured, residual, matrix, sigma)
         if k == self.smoother.node and self.time - self._feigned_at >= 1.0:
@@ -284,20 +315,41 @@ class Navigator:
             keys.node(k),
             s.bias_key(k),
             [s.calibration_keys[i] for i in index],
+            first,
         )
+
+    def _away(self) -> Array:
+        """Return newest state, bias and parameters minus where they are linearised."""
+        assert self._linear is not None
+        state, bias = self._linear
+        s = self.smoother
+        k = s.node
+        parts = [
+            state.localCoordinates(s.state(k)),
+            s.bias(k).vector() - bias.vector(),
+        ]
+        for p in self.start.parameters:
+            now, then = self._values[p.name], self._begun[p.name]
+            parts.append(log_so3(then.T @ now) if p.rotation else now - then)
+        return np.concatenate(parts)
+
+    def _columns(self, parameters: Sequence[Parameter]) -> list[int]:
+        """Return the place of state, bias and some parameters among all."""
+        columns = list(range(_STATE + 6))
+        at = _STATE + 6
+        for p in self.start.parameters:
+            if p in parameters:
+                columns += range(at, at + p.mean.size)
+            at += p.mean.size
+        return columns
 
     def _weigh(
         self, measured: NodeMeasurements, residual: Array, matrix: Array, sigma: Array
     ) -> Array:
         """Return inverse standard deviations, 0 for what the gate does not let pass."""
-        columns = list(range(_STATE + 6))
-        at = _STATE + 6
-        for p in self.start.parameters:
-            if p in measured.parameters:
-                columns += range(at, at + p.mean.size)
-            at += p.mean.size
+        columns = self._columns(measured.parameters)
         P = self._P[np.ix_(columns, columns)]
-        total = np.sqrt(np.einsum("ri,ij,rj->r", matrix, P, matrix) + sigma**2)
+        total = np.sqrt(np.sum((matrix @ P) * matrix, axis=1) + sigma**2)
         weight = np.empty_like(sigma)
         row = 0
         for r in measured.rows:
