@@ -87,7 +87,6 @@ class Navigator:
         self._sigma = np.concatenate([np.empty(0), *(p.sigma for p in start.parameters)])
         self._feigned = start.feigned
         self._feigned_at = start.time
-        self._held = np.zeros((self._sigma.size, 0))
         self._near = np.full(3, np.inf)
         self._segments: dict[int, tuple[Segments, Array]] = {}
         self.innovations: list[Innovations] = []
@@ -98,6 +97,7 @@ class Navigator:
             p.name: start.values.atRot3(key).matrix() if p.rotation else start.values.atVector(key)
             for p, key in zip(start.parameters, self.smoother.calibration_keys, strict=True)
         } | start.fixed
+        self._held = self._not_observable()
         # Of the newest state; without a lag GTSAM moves it on its own account.
         self._linear: tuple[gtsam.NavState, gtsam.imuBias.ConstantBias] | None = None
         if lag is not None:
@@ -398,6 +398,10 @@ class Navigator:
                 [p.name for p in wanted],
             )
             self._feigned[np.ix_(columns, columns)] += part * max(per_second / duration, 1.0)
-        if self._sigma.size:
-            P = self._P[_STATE + 6 :, _STATE + 6 :]
-            self._held = feigned_among(P, self._feigned, np.maximum(self._sigma, 1e-7))
+        self._held = self._not_observable()
+
+    def _not_observable(self) -> Array:
+        if self._sigma.size == 0:
+            return np.zeros((0, 0))
+        P = self._P[_STATE + 6 :, _STATE + 6 :]
+        return feigned_among(P, self._feigned, np.maximum(self._sigma, 1e-7))

@@ -228,7 +228,7 @@ class Replay:
                 solved = self._start(end=end)
                 if not solved:
                     break
-                out.append(self._update(began, solved=True))
+                out.append(self._update(began, solved=True, end=end))
                 continue
             now = self._navigator.time
             target = self._next(now)
@@ -244,7 +244,9 @@ class Replay:
             aids = self._take(now, float(seg.node_time[1]))
             self._navigator.extend(seg, aids)
             self._samples.forget(self._navigator.time)
-            out.append(self._update(began, solved=self._again()))
+            out.append(self._update(began, solved=self._again(), end=end))
+        if end and out and self._navigator is not None:
+            out[-1] = replace(out[-1], smoothed=self._smooth(-1.0))
         return out
 
     def _break(self, gap: Gap) -> None:
@@ -283,7 +285,10 @@ class Replay:
         until = self._samples.newest - self._samples.delay
         if np.isnan(self._attempt):
             self._attempt = self._collected.start + _FIRST
-        if until < self._attempt and not end:
+        if until >= self._attempt:
+            # However many samples came at once.
+            until = self._attempt
+        elif not end:
             return False
         since = until - self._collected.start
         self._attempt = until + max((_RETRY - 1.0) * since, 1.0)
@@ -298,13 +303,15 @@ class Replay:
             start = begin(self._collected.trial(until), self._prior, self._progress)
         except FactorgraphDvlError as error:
             start = str(error)
+        self._solved_at = until
         if isinstance(start, str):
+            if self._navigator is not None:
+                return False
             self._messages.append(f"no start yet at {until:.1f} s: {start}")
             return False
         lag = self._lag if self._kind == "fixed-lag" else None
         self._navigator = Navigator(start, self._known.imu, self._gate, lag=lag, memory=self._lag)
         self._samples.windows = start.windows
-        self._solved_at = until
         self._solve_again = self._collected.start + _GROWTH * (until - self._collected.start)
         self._smoothed_to = start.node + 1
         return True
@@ -401,14 +408,14 @@ class Replay:
         o = self._example[section]
         return float((o.time - o.true_time(self._navigator.values))[0])
 
-    def _update(self, began: float, *, solved: bool) -> Update:
+    def _update(self, began: float, *, solved: bool, end: bool) -> Update:
         nav = self._navigator
         assert nav is not None
         axes = self._known.body_axes
         smoothed = None
         s = nav.smoother
         late = s.times.get(self._smoothed_to)
-        if late is not None and nav.time - late > self._lag - 2.0 * self._interval:
+        if late is not None and not end and nav.time - late > self._lag - 2.0 * self._interval:
             smoothed = self._smooth(0.5 * self._lag)
         self._listen(nav)
         messages = (*self._messages, *nav.messages)

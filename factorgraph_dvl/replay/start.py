@@ -15,8 +15,6 @@ from factorgraph_dvl.sensors.protocol import Parameter
 from factorgraph_dvl.solvers.batch import STATE_INTERVAL, fit
 from factorgraph_dvl.solvers.covariance import posterior
 from factorgraph_dvl.solvers.feigned import (
-    at_prior_along,
-    feigned_among,
     feigned_information,
 )
 from factorgraph_dvl.solvers.levenberg_marquardt import Progress
@@ -87,13 +85,6 @@ def begin(trial: Trial, known: Known | None, progress: Progress) -> Start | str:
         return f"the attitude is known to {np.degrees(attitude):.2g} deg only"
     evaluation = minimum.evaluation
     feigned = feigned_information(problem, evaluation, covariances.nodes)
-    if problem.parameters:
-        functionals = [{problem.key(p.name): np.eye(p.mean.size)} for p in problem.parameters]
-        P = covariances.information.covariance_of(functionals)
-        held = feigned_among(P, feigned, problem.prior_sigma)
-        if held.size:
-            origin = at_prior_along(problem, evaluation.parameters, held)
-            evaluation = problem.evaluate(problem.values(evaluation.states, origin))
     last = problem.chain.segments.node_time.size - 1
     kept = [
         keys.node(last),
