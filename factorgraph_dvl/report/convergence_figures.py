@@ -82,8 +82,8 @@ def convergence_figure(
     """
     columns = 3
     rows = [e for e in estimates if np.any(e.prior_std > 0.0)]
-    figure = new_figure(11.0, 0.75 + 1.75 * len(rows))
-    grid = new_grid(figure, len(rows), columns, top=0.62, gap=(0.45, 0.85))
+    figure = new_figure(11.0, 1.0 + 1.75 * len(rows))
+    grid = new_grid(figure, len(rows), columns, top=0.85, gap=(0.45, 0.85))
     start, label = clock(time)
     x = time - start
     place = 0
