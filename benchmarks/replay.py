@@ -49,7 +49,8 @@ def main() -> None:
         f"- machine: {cpu_name()}, {len(os.sched_getaffinity(0))} cores",
         f"- load of the machine at the start, 1 min: {load:.1f}",
         f"- states at {args.rate:g} Hz, lag 30 s\n",
-        "| what | median | 99 % | CPU, mean | last / first steady tenth | batch solutions | memory |",
+        "| what | median | 99 % | CPU, mean | last / first steady tenth "
+        "| batch solutions | memory |",
         "|---|---|---|---|---|---|---|",
     ]
     jobs = [("fixed lag", "fixed-lag", duration)]

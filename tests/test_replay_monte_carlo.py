@@ -11,6 +11,7 @@ import multiprocessing
 import os
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -47,7 +48,7 @@ def one(job):
     session, updates = Replay(trial, rate_hz=1.0), []
     imu = trial.imu
     edges = np.arange(0.0, imu.time[-1] + 1.0, 1.0)
-    for a, b in zip(edges[:-1], edges[1:], strict=True):
+    for a, b in pairwise(edges):
         for section in ("gnss", "dvl"):
             aid = getattr(trial, section)
             inside = np.flatnonzero((aid.time > a) & (aid.time <= b))
