@@ -265,7 +265,7 @@ def test_the_oldest_state_stays_a_leaf_when_old_states_are_corrected():
         if old <= smoother.node:
             noise = gtsam.noiseModel.Isotropic.Sigma(9, 0.5)
             late.add(gtsam.PriorFactorNavState(keys.node(old), smoother.state(old), noise))
-            smoother.correct(late)
+            smoother.correct(late, old)
     assert len(smoother.times) == 21
 
 

@@ -40,6 +40,56 @@ class Calibration:
     covariance: Array
 
 
+@dataclass(frozen=True)
+class Innovations:
+    """What was measured against what was predicted.
+
+    Parameters
+    ----------
+    label, unit, components : of the kind.
+    time : (M,) s.
+    residual, sigma : (M, d) predicted - measured, and its standard deviation.
+    used : (M,) bool.
+    """
+
+    label: str
+    unit: str
+    components: tuple[str, ...]
+    time: Array
+    residual: Array
+    sigma: Array
+    used: np.ndarray
+
+
+@dataclass(frozen=True)
+class Update:
+    """What is known after one more segment.
+
+    Parameters
+    ----------
+    time : of the newest state, s.
+    latency : time that the update took, s.
+    state : the newest state, as a trajectory of one epoch.
+    calibration : with its joint covariance.
+    smoothed : states that more data have made better, None if there are none this time.
+    innovations : what was measured against what was predicted.
+    messages : for the user.
+    solved : whether the update includes a solution of all that was collected.
+    doubted : kinds of measurements that disagree with the prediction, so that the standard
+        deviations are not to be trusted.
+    """
+
+    time: float
+    latency: float
+    state: Trajectory
+    calibration: Calibration
+    smoothed: Trajectory | None
+    innovations: tuple[Innovations, ...]
+    messages: tuple[str, ...]
+    solved: bool
+    doubted: tuple[str, ...]
+
+
 def trajectory_of(
     time: Array, states: States, P: Array, frame: LocalFrame, body_axes: BodyAxes
 ) -> Trajectory:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
 import gtsam
 import numpy as np
@@ -18,7 +17,7 @@ from factorgraph_dvl.preintegration import (
     attach,
     preintegrate,
 )
-from factorgraph_dvl.replay.estimate import Calibration, calibration_of, trajectory_of
+from factorgraph_dvl.replay.estimate import Calibration, Innovations, calibration_of, trajectory_of
 from factorgraph_dvl.replay.factor import NodeMeasurements, Rows, measurement_factor, state_of
 from factorgraph_dvl.replay.gate import Gate
 from factorgraph_dvl.replay.smoother import Smoother
@@ -33,27 +32,6 @@ _NEAR = 100.0
 # Keeps the walk of a bias that does not walk regular.
 _LEAST_WALK = 1e-12
 _STATE = 9
-
-
-@dataclass(frozen=True)
-class Innovations:
-    """What was measured against what was predicted.
-
-    Parameters
-    ----------
-    label, unit, components : of the kind.
-    time : (M,) s.
-    residual, sigma : (M, d) predicted - measured, and its standard deviation.
-    used : (M,) bool.
-    """
-
-    label: str
-    unit: str
-    components: tuple[str, ...]
-    time: Array
-    residual: Array
-    sigma: Array
-    used: np.ndarray
 
 
 class Navigator:
@@ -173,9 +151,11 @@ class Navigator:
         s.extend(float(seg.node_time[1]), factors, values)
         if self._linear is not None:
             self._linear = (predicted, bias if self.start.walking else self._linear[1])
-        for old in [
-            j for j in self._segments if j < s.oldest or s.times[j] < self.time - self._memory
-        ]:
+        since = max(s.times[s.oldest], self.time - self._memory)
+        while self._segments:
+            old = next(iter(self._segments))
+            if s.times.get(old, -np.inf) >= since:
+                break
             del self._segments[old]
         self._refresh()
 
@@ -189,7 +169,7 @@ class Navigator:
             if measured is not None:
                 factors.add(measured)
         if factors.size():
-            self.smoother.correct(factors)
+            self.smoother.correct(factors, min(aids))
             self._refresh()
 
     def known(self, later: float) -> Known:

@@ -11,8 +11,8 @@ import numpy as np
 
 from factorgraph_dvl.conventions import Array
 from factorgraph_dvl.errors import SolveError
-from factorgraph_dvl.replay.navigator import Innovations
-from factorgraph_dvl.replay.session import LAG, RATE, Kind, Replay, Update
+from factorgraph_dvl.replay.estimate import Innovations, Update
+from factorgraph_dvl.replay.session import LAG, RATE, Kind, Replay
 from factorgraph_dvl.sensors.protocol import rows_of
 from factorgraph_dvl.solution import Residuals, Solution, Trajectory, doubts
 from factorgraph_dvl.trial import Trial

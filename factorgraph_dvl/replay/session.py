@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from time import perf_counter
 from typing import Literal
 
@@ -13,9 +13,9 @@ from numpy.typing import ArrayLike
 from factorgraph_dvl.errors import ConfigError, FactorgraphDvlError
 from factorgraph_dvl.graph import Known
 from factorgraph_dvl.replay.collected import Collected
-from factorgraph_dvl.replay.estimate import Calibration
+from factorgraph_dvl.replay.estimate import Update
 from factorgraph_dvl.replay.gate import Gate
-from factorgraph_dvl.replay.navigator import Innovations, Navigator
+from factorgraph_dvl.replay.navigator import Navigator
 from factorgraph_dvl.replay.samples import Gap, Samples
 from factorgraph_dvl.replay.start import begin
 from factorgraph_dvl.sensors.protocol import Aid, Observation, joined, rows_of
@@ -51,35 +51,6 @@ _SILENT = 5.0
 _SAME_TIME = 1e-6
 # Measurements that are ahead of the IMU by more than this, s, are not kept.
 _AHEAD = 60.0
-
-
-@dataclass(frozen=True)
-class Update:
-    """What is known after one more segment.
-
-    Parameters
-    ----------
-    time : of the newest state, s.
-    latency : time that the update took, s.
-    state : the newest state, as a trajectory of one epoch.
-    calibration : with its joint covariance.
-    smoothed : states that more data have made better, None if there are none this time.
-    innovations : what was measured against what was predicted.
-    messages : for the user.
-    solved : whether the update includes a solution of all that was collected.
-    doubted : kinds of measurements that disagree with the prediction, so that the standard
-        deviations are not to be trusted.
-    """
-
-    time: float
-    latency: float
-    state: Trajectory
-    calibration: Calibration
-    smoothed: Trajectory | None
-    innovations: tuple[Innovations, ...]
-    messages: tuple[str, ...]
-    solved: bool
-    doubted: tuple[str, ...]
 
 
 class Replay:

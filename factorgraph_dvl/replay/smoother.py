@@ -68,7 +68,7 @@ class Smoother:
         self._checked = time
         self._isam = gtsam.ISAM2(_settings(self.parameters, fixed=lag is not None))
         self._sizes = {key: int(size) for key, size in values.dims().items()}
-        self._update(prior, values)
+        self._update(prior, values, node)
 
     def bias_key(self, k: int) -> int:
         """Return the key of the bias at state k."""
@@ -87,7 +87,7 @@ class Smoother:
         Parameters
         ----------
         time : of the new state, s.
-        factors : that tie it to the one before, and measurements of any state in the lag.
+        factors : that tie it to the one before, and measurements after that one.
         values : start values of the new state, and of its bias if that walks.
         """
         if self._lag is not None:
@@ -97,11 +97,11 @@ class Smoother:
         self.node += 1
         self.times[self.node] = time
         self._sizes.update(values.dims())
-        self._update(factors, values)
+        self._update(factors, values, self.node - 1)
 
-    def correct(self, factors: gtsam.NonlinearFactorGraph) -> None:
-        """Add measurements of states that are there."""
-        self._update(factors, gtsam.Values())
+    def correct(self, factors: gtsam.NonlinearFactorGraph, first: int) -> None:
+        """Add measurements of states that are there, the oldest of index `first`."""
+        self._update(factors, gtsam.Values(), first)
 
     def state(self, k: int) -> gtsam.NavState:
         """Return the estimate of state k."""
@@ -164,14 +164,14 @@ class Smoother:
                 out.append(keys.bias(k))
         return [*out, *([] if self._walking else [keys.bias(0)]), *self.calibration_keys]
 
-    def _update(self, factors: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> None:
+    def _update(
+        self, factors: gtsam.NonlinearFactorGraph, values: gtsam.Values, first: int
+    ) -> None:
         settings = gtsam.ISAM2UpdateParams()
         if self._lag is None:
             settings.constrainedKeys = _groups([(key, 1) for key in self._top()])
             self._isam.update(factors, values, settings)
             return
-        touched = set(factors.keyVector())
-        first = next((k for k in self.times if keys.node(k) in touched), self.node)
         moved = self._moved()
         if moved is not None:
             first = min(first, moved)
@@ -180,7 +180,7 @@ class Smoother:
         # time, so that the oldest state stays a leaf. Groups beyond the number of variables
         # are not allowed; calibration and bias are in one.
         first -= len(self.parameters)
-        nodes = [k for k in self.times if first <= k < self.node]
+        nodes = list(range(max(first, self.oldest), self.node))
         if len(nodes) > _MOST * len(self.times):
             # iSAM2 goes over to eliminating everything once it is most of it.
             nodes = [k for k in self.times if k < self.node]
