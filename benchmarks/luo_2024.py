@@ -104,8 +104,9 @@ def until(trial: Trial, end: float) -> Trial:
     return replace(
         trial,
         imu=cut(trial.imu),
-        gnss=cut(trial.gnss),
-        dvl=cut(trial.dvl),
+        gnss=None if trial.gnss is None else cut(trial.gnss),
+        dvl=None if trial.dvl is None else cut(trial.dvl),
+        others=tuple(cut(aid) for aid in trial.others),
         reference=None,
     )
 

@@ -101,14 +101,13 @@ def measure(trial: Trial, name: str, kind: str, seconds: float, rate: float) -> 
 def feed(session: Replay, trial: Trial, seconds: float, step: float) -> Iterator[list]:
     """Feed a trial in pieces of `step` seconds, and yield the updates."""
     imu = trial.imu
-    aids = {name: getattr(trial, name) for name in ("gnss", "dvl")}
     now = 0.0
     while now < min(seconds, float(imu.time[-1])):
         end = now + step
-        for name, aid in aids.items():
+        for aid in trial.aids:
             rows = slice(*np.searchsorted(aid.time, [now, end]))
             if rows.stop > rows.start:
-                session.add(name, rows_of(aid, rows))
+                session.add(rows_of(aid, rows))
         a, b = np.searchsorted(imu.time, [now, end])
         yield session.add_imu(imu.time[a:b], imu.gyro[a:b], imu.accel[a:b])
         now = end

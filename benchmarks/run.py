@@ -40,7 +40,8 @@ from factorgraph_dvl.increments import increments
 from factorgraph_dvl.preintegration import States, segments
 from factorgraph_dvl.sensors.protocol import Aid
 from factorgraph_dvl.simulation import parse_scenario, plan_motion, simulate
-from factorgraph_dvl.solvers.batch import STATE_INTERVAL
+from factorgraph_dvl.solvers.batch import STATE_INTERVAL, solve
+from factorgraph_dvl.solvers.information_history import solve_with_history
 from factorgraph_dvl.solvers.levenberg_marquardt import minimise, quick_step
 from factorgraph_dvl.trial import Trial
 
@@ -51,6 +52,7 @@ CRUISE = ROOT / "configs" / "cruise.yaml"
 CONING = ROOT / "configs" / "seed-a-phase-90.yaml"
 TIMES_AS_LONG = 8
 ITERATIONS = 9
+HISTORY_RUNS = 3
 
 MIB = 2**20
 
@@ -142,6 +144,7 @@ def cruise(*, long: bool) -> Iterator[tuple[str, str, str]]:
         yield "CPU time of that", f"{once.cpu:.1f} s", ""
         yield "peak memory", f"{max(r.peak for r in runs) / MIB:.0f} MiB", "1536 MiB"
         yield from iteration_times(trial)
+        yield from history_times(trial)
         del trial
         if long:
             yield from eight_times(folder, once)
@@ -204,6 +207,20 @@ def iteration_times(trial: Trial) -> Iterator[tuple[str, str, str]]:
         )
     ratio = medians["with"]["all"] / medians["without"]["all"]
     yield "**ratio of the two**", f"{ratio:.2f}", "1.3"
+
+
+def history_times(trial: Trial) -> Iterator[tuple[str, str, str]]:
+    """Time a solve with and without σ of the calibration along the trial, in turn."""
+    taken: dict[str, list[float]] = {"without": [], "with": []}
+    for _ in range(HISTORY_RUNS):
+        for name, run in (("without", solve), ("with", solve_with_history)):
+            start = perf_counter()
+            run(trial)
+            taken[name].append(perf_counter() - start)
+    best = {name: min(times) for name, times in taken.items()}
+    yield f"solve in this process, best of {HISTORY_RUNS}", f"{best['without']:.2f} s", ""
+    yield "the same with σ at every state along the trial", f"{best['with']:.2f} s", ""
+    yield "**ratio of these two**", f"{best['with'] / best['without']:.2f}", "2"
 
 
 def problem_of(chain: Chain, aids: tuple[Aid, ...]) -> Problem:

@@ -5,6 +5,9 @@ its start and the accelerometers the velocity change in the body axes at its sta
 (or the DVL) and gravity give the same velocity change in axes fixed in space. The
 rotation between the two sets of vectors is Wahba's problem (Wu and Pan,
 Velocity/position integration formula, IEEE T-AES 49(2), 2013).
+
+A sensor of attitude tells it at once, at rest too. If its mounting is not known, the
+rotations that it sees are those of the gyros in other axes, which gives the mounting.
 """
 
 from __future__ import annotations
@@ -14,6 +17,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from factorgraph_dvl.arcs import Arc, arc_from_start
+from factorgraph_dvl.attitude_alignment import attitude_at_start, known_mountings
 from factorgraph_dvl.conventions import (
     DEG,
     Array,
@@ -24,8 +29,7 @@ from factorgraph_dvl.conventions import (
 )
 from factorgraph_dvl.earth import LocalFrame
 from factorgraph_dvl.errors import DataError
-from factorgraph_dvl.increments import IntArray
-from factorgraph_dvl.preintegration import Attachment, Segments, States, attach
+from factorgraph_dvl.preintegration import Segments, States
 from factorgraph_dvl.sensors.dvl import Dvl
 from factorgraph_dvl.sensors.gnss import Gnss
 from factorgraph_dvl.trial import Trial
@@ -51,64 +55,13 @@ class Start:
     Parameters
     ----------
     states : at the nodes.
+    mountings : by parameter name, sRb of sensors of attitude where the gyros tell it.
     notes : what the user must know of how they were found.
     """
 
     states: States
+    mountings: dict[str, Array]
     notes: tuple[str, ...]
-
-
-@dataclass(frozen=True)
-class _Arc:
-    """An arc seen from its start: body axes there, and n at that moment, kept in space.
-
-    `turn`, `speed`, `place` are rotation, velocity and displacement by the specific force
-    alone, at the nodes; `pull1`, `pull2` the first and second integral of gravity;
-    `gravity` its value in space along the segments.
-    """
-
-    segments: Segments
-    earth_rate: Array
-    nodes: IntArray
-    since: Array
-    turn: Array
-    speed: Array
-    place: Array
-    gravity: Array
-    pull1: Array
-    pull2: Array
-
-    @property
-    def start(self) -> float:
-        return float(self.segments.node_time[self.nodes[0]])
-
-    def covers(self, time: Array) -> np.ndarray:
-        inside = (time >= self.start) & (time <= self.start + self.since[-1])
-        return inside & self.segments.increments.locate(time)[2]
-
-    def carry(self, time: Array) -> tuple[Attachment, Array, Array, Array]:
-        """Return attachment, and rotation, velocity, displacement in the start's body axes."""
-        at = attach(self.segments, time, self.earth_rate)
-        k = at.node - self.nodes[0]
-        velocity = self.speed[k] + rotate(self.turn[k], at.dV)
-        displacement = (
-            self.place[k] + self.speed[k] * at.tau[:, None] + rotate(self.turn[k], at.dP)
-        )
-        return at, self.turn[k] @ at.dR, velocity, displacement
-
-    def pull(self, at: Attachment) -> tuple[Array, Array]:
-        """Return the first and second integral of gravity, in space."""
-        k = at.node - self.nodes[0]
-        tau = at.tau[:, None]
-        g = self.gravity[k]
-        return (
-            self.pull1[k] + g * tau,
-            self.pull2[k] + self.pull1[k] * tau + g * (tau**2 / 2.0),
-        )
-
-    def to_space(self, time: Array) -> Array:
-        """Return the rotations from n to n at the start, kept in space."""
-        return exp_so3((time - self.start)[:, None] * self.earth_rate)
 
 
 @dataclass(frozen=True)
@@ -132,7 +85,8 @@ def initial_states(trial: Trial, frame: LocalFrame, seg: Segments) -> Start:
     Raises
     ------
     DataError
-        If there is nothing to align with: neither GNSS nor DVL nor `initial`.
+        If there is nothing to align with: neither GNSS nor DVL nor a sensor of attitude nor
+        `initial`.
     """
     n = seg.node_time.size
     nRb = np.empty((n, 3, 3))
@@ -150,14 +104,19 @@ def initial_states(trial: Trial, frame: LocalFrame, seg: Segments) -> Start:
             expected="GNSS positions between its first and last sample, or initial.position",
             hint="Check that all clocks start together",
         )
-    for a in range(len(seg.arc_nodes)):
-        arc = _arc(seg, a, frame, p_rough)
+    arcs = [arc_from_start(seg, a, frame, p_rough) for a in range(len(seg.arc_nodes))]
+    mountings = known_mountings(trial, frame, arcs)
+    for a, arc in enumerate(arcs):
         spin = exp_so3(-arc.since[:, None] * arc.earth_rate)
         if a == 0 and trial.initial_attitude is not None:
             at_start = rotation_from_rph(trial.initial_attitude.rph, trial.body_axes)
             if seg.increments.averaged:
                 at_start = at_start @ exp_so3(-seg.phi[0])
             nRb[arc.nodes] = spin @ at_start @ arc.turn
+            continue
+        seen = attitude_at_start(trial, frame, arc, mountings)
+        if seen is not None:
+            nRb[arc.nodes] = spin @ seen @ arc.turn
             continue
         pairs = _pairs(trial, frame, arc)
         if pairs is None and a > 0:
@@ -179,34 +138,10 @@ def initial_states(trial: Trial, frame: LocalFrame, seg: Segments) -> Start:
             )
     p_n, v_n = _kinematics(trial, frame, seg, nRb)
     zero = np.zeros((n, 3))
-    return Start(States(nRb, p_n, v_n, zero, zero), tuple(notes))
+    return Start(States(nRb, p_n, v_n, zero, zero), mountings, tuple(notes))
 
 
-def _arc(seg: Segments, a: int, frame: LocalFrame, p_n: Array) -> _Arc:
-    first, last = seg.arc_nodes[a]
-    nodes = np.arange(first, last + 1)
-    mine = np.flatnonzero((seg.origin >= first) & (seg.origin < last))
-    dR, dV, dP = (x[mine] for x in seg.totals())
-    step = seg.duration[mine]
-    since = seg.node_time[nodes] - seg.node_time[first]
-    rate = frame.earth_rate
-    middle = 0.5 * (p_n[nodes[:-1]] + p_n[nodes[1:]])
-    halfway = since[:-1] + step / 2.0
-    gravity = rotate(exp_so3(halfway[:, None] * rate), frame.gravity_without_rotation(middle))
-    m = nodes.size
-    turn = np.tile(np.eye(3), (m, 1, 1))
-    speed, place, pull1, pull2 = (np.zeros((m, 3)) for _ in range(4))
-    for j in range(m - 1):
-        turn[j + 1] = turn[j] @ dR[j]
-        place[j + 1] = place[j] + speed[j] * step[j] + turn[j] @ dP[j]
-        speed[j + 1] = speed[j] + turn[j] @ dV[j]
-        pull2[j + 1] = pull2[j] + pull1[j] * step[j] + gravity[j] * step[j] ** 2 / 2.0
-        pull1[j + 1] = pull1[j] + gravity[j] * step[j]
-    gravity = np.concatenate([gravity, gravity[-1:]])
-    return _Arc(seg, rate, nodes, since, turn, speed, place, gravity, pull1, pull2)
-
-
-def _pairs(trial: Trial, frame: LocalFrame, arc: _Arc) -> _Pairs | None:
+def _pairs(trial: Trial, frame: LocalFrame, arc: Arc) -> _Pairs | None:
     """Return pairs from GNSS velocity, else GNSS positions, else the DVL, else None."""
     if trial.gnss is not None:
         for make in (_from_velocity, _from_position):
@@ -216,7 +151,7 @@ def _pairs(trial: Trial, frame: LocalFrame, arc: _Arc) -> _Pairs | None:
     return _from_dvl(trial.dvl, arc) if trial.dvl is not None else None
 
 
-def _from_velocity(gnss: Gnss, frame: LocalFrame, arc: _Arc) -> _Pairs | None:
+def _from_velocity(gnss: Gnss, frame: LocalFrame, arc: Arc) -> _Pairs | None:
     use = ~np.isnan(gnss.velocity[:, 0]) & arc.covers(gnss.time)
     fix_time, fix = _fixes(gnss, frame)
     if use.sum() < _LEAST_PAIRS:
@@ -237,7 +172,7 @@ def _from_velocity(gnss: Gnss, frame: LocalFrame, arc: _Arc) -> _Pairs | None:
     )
 
 
-def _from_position(gnss: Gnss, frame: LocalFrame, arc: _Arc) -> _Pairs | None:
+def _from_position(gnss: Gnss, frame: LocalFrame, arc: Arc) -> _Pairs | None:
     """Return mean velocities between fixes some seconds apart, on both sides."""
     fix_time, fix = _fixes(gnss, frame)
     use = arc.covers(fix_time)
@@ -261,7 +196,7 @@ def _from_position(gnss: Gnss, frame: LocalFrame, arc: _Arc) -> _Pairs | None:
     )
 
 
-def _from_dvl(dvl: Dvl, arc: _Arc) -> _Pairs | None:
+def _from_dvl(dvl: Dvl, arc: Arc) -> _Pairs | None:
     true_time = dvl.time - dvl.settings.time_offset_s
     use = dvl.locked & arc.covers(true_time)
     if use.sum() < _LEAST_PAIRS:
@@ -290,7 +225,7 @@ def _nominal_velocity(dvl: Dvl, use: np.ndarray, omega_b: Array) -> Array:
     return unscaled @ dRb - np.cross(omega_b, np.array(s.lever_arm_m))
 
 
-def _align(trial: Trial, arc: _Arc, pairs: _Pairs, before: Array | None) -> tuple[Array, bool]:
+def _align(trial: Trial, arc: Arc, pairs: _Pairs, before: Array | None) -> tuple[Array, bool]:
     """Return the attitude at the start as each node sees it, and whether heading is found.
 
     Gyro biases turn the body axes of the start away with time: so each window has its own
@@ -336,7 +271,7 @@ def _wahba(pairs: _Pairs, use: np.ndarray) -> tuple[Array, float]:
 
 
 def _towards(
-    trial: Trial, arc: _Arc, pairs: _Pairs, rotation: Array, before: Array | None
+    trial: Trial, arc: Arc, pairs: _Pairs, rotation: Array, before: Array | None
 ) -> Array:
     """Turn an attitude at the start about the vertical until the bow points where it should.
 

@@ -17,6 +17,8 @@ DEG_PER_HOUR = DEG / HOUR
 DEG_PER_SQRT_HOUR = DEG / np.sqrt(HOUR)
 STANDARD_GRAVITY = 9.80665
 MICRO_G = 1e-6 * STANDARD_GRAVITY
+# SI values of the units of latitude, longitude and height in files.
+GEODETIC_SI = np.array([DEG, DEG, 1.0])
 
 _FRD_FROM_BODY: dict[str, Array] = {
     "FRD": np.eye(3),
@@ -93,14 +95,18 @@ def right_jacobian(phi: ArrayLike) -> Array:
 
 
 def inverse_right_jacobian(phi: ArrayLike) -> Array:
-    """Return the inverse of `right_jacobian`, (3, 3); finite for |phi| < 2 pi."""
+    """Return the inverses of `right_jacobian` of phi (..., 3), as (..., 3, 3).
+
+    Finite for |phi| < 2 pi.
+    """
     phi = np.asarray(phi, dtype=float)
-    angle = float(np.linalg.norm(phi))
+    angle = np.linalg.norm(phi, axis=-1)[..., None, None]
     cross = skew(phi)
-    if angle < 1e-4:
-        return np.eye(3) + cross / 2.0 + cross @ cross / 12.0
-    half = angle / 2.0
-    return np.eye(3) + cross / 2.0 + (1.0 - half / np.tan(half)) / angle**2 * cross @ cross
+    small = angle < 1e-4
+    safe = np.where(small, 1.0, angle)
+    half = safe / 2.0
+    gain = np.where(small, 1.0 / 12.0, (1.0 - half / np.tan(half)) / safe**2)
+    return np.asarray(np.eye(3) + cross / 2.0 + gain * (cross @ cross))
 
 
 def reported_rotation_vector(matrix: ArrayLike, near: ArrayLike) -> Array:

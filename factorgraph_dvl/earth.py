@@ -70,11 +70,14 @@ class LocalFrame:
     ----------
     lat, lon : geodetic latitude and longitude of the origin, rad.
     height : ellipsoidal height of the origin, m.
+    epoch : UTC of the trial's time zero, ISO 8601, which fixes how the frame lies among the
+        stars at any time; empty if not known.
     """
 
     lat: float
     lon: float
     height: float
+    epoch: str = ""
 
     @cached_property
     def _enu_from_ecef(self) -> Array:

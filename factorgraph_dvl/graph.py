@@ -34,7 +34,7 @@ from factorgraph_dvl.sensors.protocol import Linearization, Motion, Observation,
 # are held; in SI units, far below what can be measured.
 _HELD = 1e-7
 # The same for a held direction, in standard deviations of the prior.
-_HELD_DIRECTION = 1e-4
+HELD_DIRECTION = 1e-4
 # How far a time offset may move from its start, s, before measurements are bound anew.
 _TIME_MARGIN = 0.05
 # How far, s, a motion is extrapolated before its measurements are bound anew: 2 Hz sway of
@@ -234,7 +234,7 @@ class Problem:
         directions : (P, h) orthonormal, in units of the priors' standard deviations.
         origin : values of the parameters there.
         """
-        gain = directions.T / self.prior_sigma / _HELD_DIRECTION
+        gain = directions.T / self.prior_sigma / HELD_DIRECTION
         columns = self.columns
 
         def error(

@@ -69,7 +69,9 @@ class Trial:
     ----------
     name : of the trial.
     imu : the IMU; a trial without one cannot be smoothed.
-    gnss, dvl : the other sensors, None where the trial does not have them.
+    gnss, dvl : the sensors that a calibration needs, None where the trial does not have
+        them.
+    others : all further sensors.
     body_axes : axes in which all body quantities are given.
     epoch : UTC of time zero, ISO 8601; empty if not given.
     initial_attitude, initial_position : priors; None = found from the data.
@@ -83,6 +85,7 @@ class Trial:
     imu: Imu
     gnss: Gnss | None = None
     dvl: Dvl | None = None
+    others: tuple[Aid, ...] = ()
     body_axes: BodyAxes = "RFU"
     epoch: str = ""
     initial_attitude: InitialAttitude | None = None
@@ -94,7 +97,7 @@ class Trial:
     @property
     def aids(self) -> tuple[Aid, ...]:
         """The sensors other than the IMU."""
-        return tuple(aid for aid in (self.gnss, self.dvl) if aid is not None)
+        return tuple(aid for aid in (self.gnss, self.dvl, *self.others) if aid is not None)
 
     def frame(self) -> LocalFrame:
         """Return the tangent frame at the first known position.
@@ -104,12 +107,14 @@ class Trial:
         DataError
             If neither GNSS nor `initial.position` gives a position.
         """
+        known = np.empty((0, 3))
         if self.initial_position is not None:
-            return LocalFrame(*self.initial_position.geodetic)
-        if self.gnss is not None:
-            fixes = np.flatnonzero(~np.isnan(self.gnss.geodetic[:, 0]))
-            if fixes.size:
-                return LocalFrame(*self.gnss.geodetic[fixes[0]])
+            known = self.initial_position.geodetic[None]
+        elif self.gnss is not None:
+            known = self.gnss.geodetic[~np.isnan(self.gnss.geodetic[:, 0])]
+        if known.size:
+            lat, lon, height = known[0]
+            return LocalFrame(lat, lon, height, self.epoch)
         raise DataError(
             "the trial has no position",
             where="trial.yaml",

@@ -231,7 +231,7 @@ def test_a_terminal_too_narrow_cuts_no_number(
 def test_the_table_comes_before_its_warnings_in_one_file(tmp_path: Path) -> None:
     trial = write_trial(tmp_path)
     with (trial / "trial.yaml").open("a") as file:
-        file.write("star: {file: star.csv}\n")
+        file.write("beacons: {file: beacon.csv}\n")
     done = subprocess.run(
         [sys.executable, "-m", "factorgraph_dvl.cli", "inspect", str(trial)],
         stdout=subprocess.PIPE,
@@ -240,7 +240,7 @@ def test_the_table_comes_before_its_warnings_in_one_file(tmp_path: Path) -> None
         timeout=60,
         check=True,
     )
-    assert 0 < done.stdout.index("missing %") < done.stdout.index("warning: section `star`")
+    assert 0 < done.stdout.index("missing %") < done.stdout.index("warning: section `beacons`")
 
 
 @pytest.mark.parametrize(
@@ -289,8 +289,8 @@ def test_inspect_shows_records_and_findings(tmp_path: Path, run: Run) -> None:
 def test_inspect_notes_what_is_not_used(tmp_path: Path, run: Run) -> None:
     trial = write_trial(tmp_path)
     with (trial / "trial.yaml").open("a") as file:
-        file.write("star: {file: star.csv}\n")
-    assert "section `star` of trial.yaml is not used" in run("inspect", trial).err
+        file.write("beacons: {file: beacon.csv}\n")
+    assert "section `beacons` of trial.yaml is not used" in run("inspect", trial).err
 
 
 @pytest.mark.parametrize("flag", [(), ("--parquet",)])

@@ -24,7 +24,7 @@ from factorgraph_dvl.errors import ConfigError, DataError
 from factorgraph_dvl.increments import increments
 from factorgraph_dvl.io.solution_folder import load_solution
 from factorgraph_dvl.io.tables import read_table
-from factorgraph_dvl.kalman import METHODS, calibrate, kalman
+from factorgraph_dvl.kalman import DVL_METHODS, METHODS, calibrate, kalman
 from factorgraph_dvl.kalman.navigation import motion_at, navigate
 from factorgraph_dvl.kalman.point_set import measurement_matrix
 from factorgraph_dvl.kalman.sins_gnss import Fixes, State, run_filter, smooth
@@ -277,7 +277,7 @@ def test_seven_states_over_seeds(phase):
 @pytest.mark.parametrize(
     "misalignment", [[0, 0, 30], [0, 0, 90], [0, 0, 180], [0, 180, 0], [100, -80, 60]], ids=str
 )
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", DVL_METHODS)
 def test_without_noise_large_misalignments_are_exact(method, misalignment):
     knows_arm = method in ("nine-state", "wahba")
     claims = {"lever_arm_m": [1, 1.2, 1.4]} if knows_arm else {}
@@ -355,7 +355,7 @@ def test_least_squares_finds_a_time_offset():
 # What cannot be done
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", DVL_METHODS)
 @pytest.mark.parametrize(
     "changes",
     [

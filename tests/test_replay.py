@@ -64,7 +64,7 @@ def feed(session, trial, start, end, *, sections=("gnss", "dvl")):
             aid = getattr(trial, section)
             inside = np.flatnonzero((aid.time >= a) & (aid.time < b))
             if inside.size:
-                session.add(section, rows_of(aid, inside))
+                session.add(rows_of(aid, inside))
         i = trial.imu
         inside = (i.time >= a) & (i.time < b)
         out += session.add_imu(i.time[inside], i.gyro[inside], i.accel[inside])
@@ -126,7 +126,7 @@ def test_one_sample_at_a_time_gives_the_same(trial):
         for section in ("gnss", "dvl"):
             aid = getattr(trial, section)
             for row in np.flatnonzero((aid.time > now - 0.01 + 1e-9) & (aid.time <= now + 1e-9)):
-                single.add(section, rows_of(aid, [row]))
+                single.add(rows_of(aid, [row]))
         out += single.add_imu(now, trial.imu.gyro[i], trial.imu.accel[i])
     assert [u.time for u in out] == [u.time for u in blocks]
     assert len(out) > 10
@@ -143,14 +143,14 @@ def test_late_measurements_correct_and_later_ones_are_counted(trial):
     a = feed(on_time, trial, 60.0, 80.0)
     feed(late, trial, 60.0, 70.0, sections=("gnss",))
     missing = np.flatnonzero((trial.dvl.time >= 60.0) & (trial.dvl.time < 70.0))
-    late.add("dvl", rows_of(trial.dvl, missing[::-1]))
+    late.add(rows_of(trial.dvl, missing[::-1]))
     b = feed(late, trial, 70.0, 80.0)
     ours, theirs = (np.sqrt(np.diag(x[-1].calibration.covariance)) for x in (a, b))
     np.testing.assert_allclose(ours, theirs, rtol=1e-3)
     difference = values(a[-1].calibration) - values(b[-1].calibration)
     assert np.abs(difference / ours).max() < 0.05
     assert late.counts() == []
-    late.add("dvl", rows_of(trial.dvl, slice(0, 3)))
+    late.add(rows_of(trial.dvl, slice(0, 3)))
     feed(late, trial, 80.0, 82.0)
     assert any("DVL: 3 measurements came after" in line for line in late.counts())
 

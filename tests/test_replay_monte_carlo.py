@@ -53,7 +53,7 @@ def one(job):
             aid = getattr(trial, section)
             inside = np.flatnonzero((aid.time > a) & (aid.time <= b))
             if inside.size:
-                session.add(section, rows_of(aid, inside))
+                session.add(rows_of(aid, inside))
         inside = (imu.time > a) & (imu.time <= b)
         updates += session.add_imu(imu.time[inside], imu.gyro[inside], imu.accel[inside])
     updates += session.finish()

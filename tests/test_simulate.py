@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ast
 import copy
 from pathlib import Path
 
@@ -13,7 +12,6 @@ import yaml
 from pyins import strapdown
 from scipy.integrate import quad, solve_ivp
 
-import factorgraph_dvl.simulation as package
 from factorgraph_dvl.conventions import (
     DEG,
     DEG_PER_HOUR,
@@ -588,12 +586,21 @@ def test_shipped_scenarios_are_valid(path):
 
 
 BAD = {
-    "unknown key": (lambda d: d.update(speed=1), "unknown field `speed`"),
-    "unknown inner key": (lambda d: d["imu"].update(rate=1), "key imu: .*`rate`"),
-    "missing": (lambda d: d.pop("start"), "missing required field `start`"),
-    "wrong type": (lambda d: d["imu"].update(rate_hz="x"), r"key imu.rate_hz: expected `float`"),
-    "out of range": (lambda d: d["start"].update(lat_deg=95), "key start.lat_deg: .*89"),
-    "not finite": (lambda d: d["start"].update(height_m=float("nan")), "key start: .*finite"),
+    "unknown key": (lambda d: d.update(speed=1), r"line \d+: unknown key `speed`"),
+    "unknown inner key": (lambda d: d["imu"].update(rate=1), r"line \d+: unknown key `imu.rate`"),
+    "missing": (lambda d: d.pop("start"), "missing key `start`"),
+    "wrong type": (
+        lambda d: d["imu"].update(rate_hz="x"),
+        r"line \d+: imu.rate_hz is .x.; expected a number",
+    ),
+    "out of range": (
+        lambda d: d["start"].update(lat_deg=95),
+        r"line \d+: start.lat_deg is 95; expected .*89",
+    ),
+    "not finite": (
+        lambda d: d["start"].update(height_m=float("nan")),
+        r"line \d+: start.*height_m.*finite",
+    ),
     "no manoeuvre": (lambda d: d.update(manoeuvres=[]), "key manoeuvres: there is no"),
     "strange manoeuvre": (lambda d: d["manoeuvres"].append({"jump_m": 1}), r"manoeuvres\[6\]"),
     "ambiguous manoeuvre": (
@@ -621,7 +628,7 @@ BAD = {
         lambda d: (d.pop("gnss"), d["trial"].update(gnss={"lever_arm_m": [0, 0, 0]})),
         "key trial.gnss",
     ),
-    "internal name": (lambda d: d.update(source="x"), "unknown field `source`"),
+    "internal name": (lambda d: d.update(source="x"), "unknown key `source`"),
 }
 
 
@@ -635,6 +642,12 @@ def test_bad_scenarios_name_file_and_key(case, tmp_path):
     with pytest.raises(ConfigError, match=message) as caught:
         load_scenario(path)
     assert str(path) in str(caught.value)
+
+
+def test_numbers_may_be_written_as_engineers_do(tmp_path):
+    path = tmp_path / "scenario.yaml"
+    path.write_text(yaml.safe_dump(scenario_dict()) + "reference_rate_hz: 1e-1\n")
+    assert load_scenario(path).reference_rate_hz == 0.1
 
 
 def test_impossible_motion_is_refused():
@@ -657,28 +670,5 @@ def test_unreadable_files_are_refused(tmp_path):
     with pytest.raises(ConfigError, match="line 2"):
         load_scenario(path)
     path.write_text("- 1")
-    with pytest.raises(ConfigError, match="not a scenario"):
+    with pytest.raises(ConfigError, match="is not a mapping"):
         load_scenario(path)
-
-
-def test_the_simulator_shares_no_measurement_model_with_the_estimator():
-    allowed = {
-        "conventions": None,
-        "earth": None,
-        "errors": None,
-        "trial": None,
-        "sensors.imu": {"Imu", "ImuSettings"},
-        "sensors.gnss": {"Gnss", "GnssSettings"},
-        "sensors.dvl": {"Dvl", "DvlSettings"},
-        "sensors.protocol": {"NonNegative", "Positive", "Section", "Sigma3", "Vector3"},
-    }
-    for path in Path(package.__file__).parent.glob("*.py"):
-        for node in ast.walk(ast.parse(path.read_text())):
-            if isinstance(node, ast.Import):
-                assert not any("factorgraph_dvl" in alias.name for alias in node.names)
-            if isinstance(node, ast.ImportFrom) and node.module.startswith("factorgraph_dvl."):
-                module = node.module.removeprefix("factorgraph_dvl.")
-                if module.startswith("simulation"):
-                    continue
-                names = allowed[module]
-                assert names is None or {alias.name for alias in node.names} <= names

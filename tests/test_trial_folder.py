@@ -318,6 +318,7 @@ def test_bad_tables_name_line_and_column(tmp_path: Path, case: str) -> None:
         (None, "imu.csv: the file does not exist"),
         (b"", "imu.csv line 1: the file is empty"),
         (b"\xff\xfe\x00", "imu.csv line 1: is not a CSV text file"),
+        (b"time_s;gyro_x_rad_s\n0;0\n", "separated by semicolons"),
         (
             b"time_s,gyro_x_rad_s,gyro_y_rad_s,gyro_z_rad_s,accel_x_m_s2,accel_y_m_s2,accel_z_m_s2\n",
             "imu.csv: no samples",

@@ -7,11 +7,10 @@ they speak before anything is solved.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 
+from factorgraph_dvl.analysis.finding import Finding
 from factorgraph_dvl.analysis.records import (
     GAP_INTERVALS,
     WINDOW_S,
@@ -19,6 +18,7 @@ from factorgraph_dvl.analysis.records import (
     gnss_velocity,
     velocity_between_fixes,
 )
+from factorgraph_dvl.analysis.star_sanity import star_findings
 from factorgraph_dvl.conventions import (
     DEG,
     STANDARD_GRAVITY,
@@ -30,9 +30,8 @@ from factorgraph_dvl.conventions import (
 from factorgraph_dvl.sensors.dvl import Dvl
 from factorgraph_dvl.sensors.gnss import Gnss
 from factorgraph_dvl.sensors.imu import Imu
+from factorgraph_dvl.sensors.star import Star
 from factorgraph_dvl.trial import Trial
-
-Severity = Literal["ok", "warning", "error"]
 
 _WINDOWS = 20
 _MOVING_M_S = 0.3
@@ -46,22 +45,6 @@ _SPEED_UNITS = {
     "mm/s": 0.001,
 }
 _AXIS_NAMES = ("+x", "+y", "+z", "-x", "-y", "-z")
-
-
-@dataclass(frozen=True)
-class Finding:
-    """Something that the user should know about a sensor.
-
-    Parameters
-    ----------
-    severity : `ok`, `warning`, or `error` where solving would give a wrong answer.
-    sensor : label of the sensor.
-    text : in plain language.
-    """
-
-    severity: Severity
-    sensor: str
-    text: str
 
 
 def findings(trial: Trial, sensors: list[SensorSurvey]) -> Iterator[Finding]:
@@ -79,6 +62,9 @@ def findings(trial: Trial, sensors: list[SensorSurvey]) -> Iterator[Finding]:
         yield from _gnss_findings(trial.gnss)
     if trial.dvl is not None:
         yield from _dvl_findings(trial.dvl, trial.gnss, trial.body_axes)
+    for aid in trial.others:
+        if isinstance(aid, Star):
+            yield from star_findings(aid, trial.epoch, trial.imu)
 
 
 def _clock_findings(sensors: list[SensorSurvey]) -> Iterator[Finding]:

@@ -6,8 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from factorgraph_dvl.analysis.finding import Finding
 from factorgraph_dvl.analysis.records import SensorSurvey, record_of, travel
-from factorgraph_dvl.analysis.sanity import Finding, findings
+from factorgraph_dvl.analysis.sanity import findings
 from factorgraph_dvl.trial import Trial
 
 
@@ -46,13 +47,9 @@ def survey(trial: Trial) -> Survey:
     ----------
     trial : as loaded.
     """
-    gnss, dvl = trial.gnss, trial.dvl
     sensors = [record_of("IMU", trial.imu.time, np.zeros(trial.imu.time.size, dtype=bool))]
-    if gnss is not None:
-        sensors.append(record_of(gnss.label, gnss.time, np.isnan(gnss.geodetic[:, 0])))
-    if dvl is not None:
-        sensors.append(record_of(dvl.label, dvl.time, np.logical_not(dvl.locked)))
-    distance, speed = travel(gnss, dvl)
+    sensors += [record_of(aid.label, aid.time, aid.missing) for aid in trial.aids]
+    distance, speed = travel(trial.gnss, trial.dvl)
     return Survey(
         trial=trial.name,
         sensors=tuple(sensors),

@@ -13,6 +13,8 @@ from factorgraph_dvl import __version__
 from factorgraph_dvl.cli.console import stderr
 from factorgraph_dvl.cli.crosscheck import crosscheck
 from factorgraph_dvl.cli.inspect import inspect
+from factorgraph_dvl.cli.observability import observability
+from factorgraph_dvl.cli.plan import plan
 from factorgraph_dvl.cli.replay import replay
 from factorgraph_dvl.cli.simulate import simulate
 from factorgraph_dvl.cli.solve import kalman, solve
@@ -29,7 +31,7 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
-for _command in (simulate, solve, replay, kalman, inspect, crosscheck):
+for _command in (simulate, solve, replay, kalman, inspect, crosscheck, observability, plan):
     app.command()(_command)
 
 

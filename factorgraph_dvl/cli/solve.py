@@ -28,12 +28,13 @@ if TYPE_CHECKING:
 
 
 class KalmanMethod(StrEnum):
-    """How `kalman` holds the DVL against SINS/GNSS."""
+    """What `kalman` calibrates by which method: a DVL, or with `star` the gyros."""
 
     POINT_SET = "point-set"
     NINE_STATE = "nine-state"
     WAHBA = "wahba"
     LEAST_SQUARES = "least-squares"
+    STAR = "star"
 
 
 def solve(
@@ -59,14 +60,14 @@ def kalman(
     trial_path: TrialPath,
     out: SolutionPath,
     method: Annotated[
-        KalmanMethod, typer.Option(help="How the DVL is held against SINS/GNSS.")
+        KalmanMethod, typer.Option(help="How the DVL, or with star the gyros, are calibrated.")
     ] = KalmanMethod.POINT_SET,
     force: Force = False,
     no_figures: NoFigures = False,
     rate: Rate = 10.0,
     quiet: Quiet = False,
 ) -> None:
-    """Calibrate against a SINS/GNSS Kalman filter, to compare with `solve`."""
+    """Calibrate by a Kalman filter, to compare with `solve`."""
 
     def run(trial: Trial, progress: ProgressLine) -> tuple[Solution, History | None]:
         from factorgraph_dvl.kalman import calibrate

@@ -18,12 +18,12 @@ from factorgraph_dvl.io.solution_folder import (
     TRAJECTORY_FILE,
     load_solution,
 )
-from factorgraph_dvl.io.tables import read_table, stack
+from factorgraph_dvl.io.tables import read_table
 from factorgraph_dvl.io.trial_folder import SETTINGS_FILE, TRUTH_FILE, load_reference
-from factorgraph_dvl.io.yaml_file import parse_yaml, read_text
-from factorgraph_dvl.sensors.protocol import Parameter, Section, check_range
+from factorgraph_dvl.sensors.protocol import Parameter, Section, check_range, stack
 from factorgraph_dvl.solution import Estimate, Solution, Trajectory
 from factorgraph_dvl.trial import Reference
+from factorgraph_dvl.yaml_file import parse_yaml, read_text
 
 _TABLES = (".csv", ".parquet", ".pq")
 _TEXTS = (".json", ".yaml", ".yml")

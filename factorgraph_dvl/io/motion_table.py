@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
-from factorgraph_dvl.conventions import DEG, Array
-from factorgraph_dvl.io.tables import read_table, stack
-from factorgraph_dvl.sensors.protocol import check_finite, check_range, check_times
+from factorgraph_dvl.conventions import DEG, GEODETIC_SI, Array
+from factorgraph_dvl.io.tables import read_table
+from factorgraph_dvl.sensors.protocol import check_finite, check_range, check_times, stack
 from factorgraph_dvl.solution import Trajectory
 from factorgraph_dvl.trial import Reference
 
@@ -18,8 +18,6 @@ COLUMNS = (
     *("vel_e_m_s", "vel_n_m_s", "vel_u_m_s"),
     *("roll_deg", "pitch_deg", "heading_deg"),
 )
-# SI values of the units of latitude, longitude and height in files.
-GEODETIC_SI = np.array([DEG, DEG, 1.0])
 
 
 def read_reference(path: Path, source: str = "") -> Reference:

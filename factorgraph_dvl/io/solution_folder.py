@@ -10,12 +10,13 @@ from typing import Any, Literal
 import msgspec
 import numpy as np
 
-from factorgraph_dvl.conventions import DEG, Array, BodyAxes
+from factorgraph_dvl.conventions import DEG, GEODETIC_SI, Array, BodyAxes
 from factorgraph_dvl.errors import DataError
 from factorgraph_dvl.io.folders import new_folder
 from factorgraph_dvl.io.motion_table import COLUMNS as MOTION_COLUMNS
-from factorgraph_dvl.io.motion_table import GEODETIC_SI, motion_columns
-from factorgraph_dvl.io.tables import read_table, stack, write_table
+from factorgraph_dvl.io.motion_table import motion_columns
+from factorgraph_dvl.io.tables import read_table, write_table
+from factorgraph_dvl.sensors.protocol import stack
 from factorgraph_dvl.solution import Estimate, Solution, Trajectory
 
 CALIBRATION_FILE = "calibration.json"

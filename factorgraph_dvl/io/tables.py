@@ -75,11 +75,6 @@ def write_table(path: Path, columns: Mapping[str, Array]) -> None:
         pyarrow.csv.write_csv(table, file, pyarrow.csv.WriteOptions(include_header=False))
 
 
-def stack(columns: Mapping[str, Array], names: Sequence[str]) -> Array:
-    """Return the columns of those names side by side, (N, n)."""
-    return np.column_stack([columns[name] for name in names])
-
-
 def _choose(
     header: Sequence[str],
     required: Sequence[str],
@@ -105,7 +100,7 @@ def _choose(
             f"missing column {', '.join(missing)}",
             where=where,
             expected=f"columns {', '.join(required)}",
-            hint=f"Found {', '.join(header[:20])}",
+            hint=_separator_hint(header) or f"Found {', '.join(header[:20])}",
         )
     for name in chosen:
         if header.count(name) > 1:
@@ -113,6 +108,13 @@ def _choose(
                 f"column {name} is given {header.count(name)} times", where=where, expected="one"
             )
     return chosen
+
+
+def _separator_hint(header: Sequence[str]) -> str:
+    for mark, name in ((";", "semicolons"), ("\t", "tabs"), (" ", "spaces")):
+        if len(header) == 1 and mark in header[0]:
+            return f"The cells seem to be separated by {name}; commas are needed"
+    return ""
 
 
 def _csv_header(path: Path, source: str) -> list[str]:

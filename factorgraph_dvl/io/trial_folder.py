@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TypeVar, cast
 
 import msgspec
 import numpy as np
 from msgspec import UNSET
 
-from factorgraph_dvl.conventions import DEG, Array
+from factorgraph_dvl.conventions import DEG, GEODETIC_SI, Array
 from factorgraph_dvl.errors import DataError
 from factorgraph_dvl.io.folders import new_folder
-from factorgraph_dvl.io.motion_table import GEODETIC_SI, motion_columns, read_reference
-from factorgraph_dvl.io.tables import read_table, stack, write_table
+from factorgraph_dvl.io.motion_table import motion_columns, read_reference
+from factorgraph_dvl.io.tables import read_table, write_table
 from factorgraph_dvl.io.trial_yaml import (
     InitialSettings,
     PositionSettings,
@@ -20,23 +21,25 @@ from factorgraph_dvl.io.trial_yaml import (
     TrialSettings,
     to_yaml,
 )
-from factorgraph_dvl.io.yaml_file import parse_yaml, read_text
-from factorgraph_dvl.sensors import dvl as dvl_columns
-from factorgraph_dvl.sensors import gnss as gnss_columns
-from factorgraph_dvl.sensors import imu as imu_columns
-from factorgraph_dvl.sensors.dvl import Dvl, DvlSettings
-from factorgraph_dvl.sensors.gnss import Gnss, GnssSettings
-from factorgraph_dvl.sensors.imu import Imu, ImuSettings
+from factorgraph_dvl.sensors.catalogue import AIDS
+from factorgraph_dvl.sensors.dvl import Dvl
+from factorgraph_dvl.sensors.gnss import Gnss
+from factorgraph_dvl.sensors.imu import Imu
+from factorgraph_dvl.sensors.protocol import Record, SensorSection
 from factorgraph_dvl.trial import InitialAttitude, InitialPosition, Reference, Trial
+from factorgraph_dvl.yaml_file import parse_yaml, read_text
 
 SETTINGS_FILE = "trial.yaml"
 TRUTH_FILE = "truth.json"
-_TABLES = ("imu", "gnss", "dvl", "reference")
+_TABLES = ("imu", *(aid.section for aid in AIDS), "reference")
 _OWNED = (
     SETTINGS_FILE,
     TRUTH_FILE,
     *(f"{table}{suffix}" for table in _TABLES for suffix in (".csv", ".parquet")),
 )
+
+
+_Sensor = TypeVar("_Sensor", bound=Record)
 
 
 class _TruthValue(msgspec.Struct):
@@ -65,11 +68,14 @@ def load_trial(path: Path | str) -> Trial:
     folder, file = _locate(Path(path))
     settings = parse_yaml(read_text(file), TrialSettings, source=file.name)
     initial = settings.initial
+    kinds = {aid.section: aid for aid in AIDS}
+    aids = {name: _read(folder, kinds[name], section) for name, section in settings.aids.items()}
     return Trial(
         name=settings.name or folder.resolve().name,
-        imu=_read_imu(folder, settings.imu),
-        gnss=None if settings.gnss is UNSET else _read_gnss(folder, settings.gnss),
-        dvl=None if settings.dvl is UNSET else _read_dvl(folder, settings.dvl),
+        imu=_read(folder, Imu, settings.imu),
+        gnss=cast("Gnss | None", aids.pop(Gnss.section, None)),
+        dvl=cast("Dvl | None", aids.pop(Dvl.section, None)),
+        others=tuple(aids.values()),
         body_axes=settings.body_axes,
         epoch=settings.epoch,
         initial_attitude=None if initial is UNSET else _attitude(initial),
@@ -125,11 +131,8 @@ def save_trial(
     suffix = ".parquet" if parquet else ".csv"
 
     with new_folder(Path(path), force=force, owned=_OWNED) as folder:
-        write_table(folder / f"imu{suffix}", _imu_table(trial.imu))
-        if trial.gnss is not None:
-            write_table(folder / f"gnss{suffix}", _gnss_table(trial.gnss))
-        if trial.dvl is not None:
-            write_table(folder / f"dvl{suffix}", _dvl_table(trial.dvl))
+        for record in (trial.imu, *trial.aids):
+            write_table(folder / f"{record.section}{suffix}", record.columns())
         if trial.reference is not None:
             write_table(folder / f"reference{suffix}", motion_columns(trial.reference))
         if trial.calibration_truth:
@@ -151,77 +154,11 @@ def _reference(folder: Path, settings: TrialSettings) -> Reference | None:
     return read_reference(folder / settings.reference.file, settings.reference.file)
 
 
-def _read_imu(folder: Path, settings: ImuSettings) -> Imu:
-    names = imu_columns.COLUMNS
-    columns = read_table(folder / settings.file, names, source=settings.file)
-    return Imu(
-        settings,
-        columns["time_s"],
-        stack(columns, names[1:4]),
-        stack(columns, names[4:7]),
-        source=settings.file,
+def _read(folder: Path, kind: type[_Sensor], settings: SensorSection) -> _Sensor:
+    columns = read_table(
+        folder / settings.file, kind.required, kind.optional, source=settings.file
     )
-
-
-def _imu_table(imu: Imu) -> dict[str, Array]:
-    values = np.column_stack([imu.time, imu.gyro, imu.accel])
-    return dict(zip(imu_columns.COLUMNS, values.T, strict=True))
-
-
-def _read_gnss(folder: Path, settings: GnssSettings) -> Gnss:
-    groups = (
-        gnss_columns.VELOCITY_COLUMNS,
-        gnss_columns.POSITION_STD_COLUMNS,
-        gnss_columns.VELOCITY_STD_COLUMNS,
-    )
-    required = ("time_s", *gnss_columns.POSITION_COLUMNS)
-    columns = read_table(folder / settings.file, required, groups, source=settings.file)
-    velocity, position_std, velocity_std = (stack(columns, group) for group in groups)
-    return Gnss(
-        settings,
-        columns["time_s"],
-        stack(columns, gnss_columns.POSITION_COLUMNS) * GEODETIC_SI,
-        velocity,
-        position_std,
-        velocity_std,
-        source=settings.file,
-    )
-
-
-def _gnss_table(gnss: Gnss) -> dict[str, Array]:
-    table = {
-        "time_s": gnss.time,
-        **_named(gnss_columns.POSITION_COLUMNS, gnss.geodetic / GEODETIC_SI),
-        **_named(gnss_columns.POSITION_STD_COLUMNS, gnss.position_std),
-    }
-    if not np.isnan(gnss.velocity).all():
-        table |= _named(gnss_columns.VELOCITY_COLUMNS, gnss.velocity)
-        table |= _named(gnss_columns.VELOCITY_STD_COLUMNS, gnss.velocity_std)
-    return table
-
-
-def _read_dvl(folder: Path, settings: DvlSettings) -> Dvl:
-    required = ("time_s", *dvl_columns.VELOCITY_COLUMNS)
-    groups = (dvl_columns.STD_COLUMNS,)
-    columns = read_table(folder / settings.file, required, groups, source=settings.file)
-    return Dvl(
-        settings,
-        columns["time_s"],
-        stack(columns, dvl_columns.VELOCITY_COLUMNS),
-        stack(columns, dvl_columns.STD_COLUMNS),
-        source=settings.file,
-    )
-
-
-def _dvl_table(dvl: Dvl) -> dict[str, Array]:
-    table = {"time_s": dvl.time, **_named(dvl_columns.VELOCITY_COLUMNS, dvl.velocity)}
-    if not np.isnan(dvl.std).all():
-        table |= _named(dvl_columns.STD_COLUMNS, dvl.std)
-    return table
-
-
-def _named(names: tuple[str, ...], values: Array) -> dict[str, Array]:
-    return dict(zip(names, values.T, strict=True))
+    return kind.from_columns(settings, columns, settings.file)
 
 
 def _attitude(initial: InitialSettings) -> InitialAttitude | None:
@@ -241,15 +178,17 @@ def _position(initial: InitialSettings) -> InitialPosition | None:
 
 
 def _settings(trial: Trial, suffix: str) -> TrialSettings:
-    replace = msgspec.structs.replace
     return TrialSettings(
         format=1,
         name=trial.name,
         body_axes=trial.body_axes,
         epoch=trial.epoch,
-        imu=replace(trial.imu.settings, file=f"imu{suffix}"),
-        gnss=UNSET if trial.gnss is None else replace(trial.gnss.settings, file=f"gnss{suffix}"),
-        dvl=UNSET if trial.dvl is None else replace(trial.dvl.settings, file=f"dvl{suffix}"),
+        **{
+            record.section: msgspec.structs.replace(
+                record.settings, file=f"{record.section}{suffix}"
+            )
+            for record in (trial.imu, *trial.aids)
+        },
         initial=_initial(trial),
         reference=(
             UNSET if trial.reference is None else ReferenceSettings(file=f"reference{suffix}")

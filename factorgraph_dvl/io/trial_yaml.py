@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-from datetime import datetime
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import msgspec
 from msgspec import UNSET, Meta, UnsetType
 
 from factorgraph_dvl.conventions import BodyAxes
-from factorgraph_dvl.sensors.dvl import DvlSettings
-from factorgraph_dvl.sensors.gnss import GnssSettings
+from factorgraph_dvl.sensors.catalogue import AIDS
 from factorgraph_dvl.sensors.imu import ImuSettings
-from factorgraph_dvl.sensors.protocol import Section, Sigma3
+from factorgraph_dvl.sensors.protocol import Section, SensorSection, Sigma3, check_epoch
 
-UNUSED_SECTIONS = ("depth", "star", "dvl_beams", "turntable", "beacons")
+# Sections of format 1 whose sensors this version does not know.
+_UNKNOWN = sorted(
+    {"depth", "star", "dvl_beams", "turntable", "beacons"} - {aid.section for aid in AIDS}
+)
 
 _Latitude = Annotated[float, Meta(ge=-90, le=90)]
 _Longitude = Annotated[float, Meta(ge=-360, le=360)]
@@ -51,38 +52,50 @@ class ReferenceSettings(Section, frozen=True, kw_only=True):
     file: str = "reference.csv"
 
 
-class TrialSettings(Section, frozen=True, kw_only=True):
-    """The whole of trial.yaml; sections that are absent are unset."""
-
+class _Settings(Section, frozen=True, kw_only=True):
     format: Literal[1]
     name: str = ""
     body_axes: BodyAxes = "RFU"
     epoch: str = ""
     imu: ImuSettings
-    gnss: GnssSettings | UnsetType = UNSET
-    dvl: DvlSettings | UnsetType = UNSET
-    depth: dict[str, Any] | UnsetType = UNSET
-    star: dict[str, Any] | UnsetType = UNSET
-    dvl_beams: dict[str, Any] | UnsetType = UNSET
-    turntable: dict[str, Any] | UnsetType = UNSET
-    beacons: dict[str, Any] | UnsetType = UNSET
     initial: InitialSettings | UnsetType = UNSET
     reference: ReferenceSettings | UnsetType = UNSET
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.epoch:
-            try:
-                datetime.fromisoformat(self.epoch)
-            except ValueError:
-                raise ValueError(
-                    "`epoch` must be a date and time such as 2022-10-12T02:00:00Z"
-                ) from None
+        check_epoch(self.epoch)
+
+    @property
+    def aids(self) -> dict[str, SensorSection]:
+        """Sections of the sensors other than the IMU, by name."""
+        given = {aid.section: getattr(self, aid.section) for aid in AIDS}
+        return {name: section for name, section in given.items() if section is not UNSET}
 
     @property
     def unused(self) -> tuple[str, ...]:
         """Sections that are given, but that this version does not use."""
-        return tuple(name for name in UNUSED_SECTIONS if getattr(self, name) is not UNSET)
+        return tuple(name for name in _UNKNOWN if getattr(self, name) is not UNSET)
+
+
+if TYPE_CHECKING:
+
+    class TrialSettings(_Settings, frozen=True, kw_only=True):
+        """The whole of trial.yaml; sections that are absent are unset."""
+
+        def __init__(self, **sections: Any) -> None: ...
+
+else:
+    TrialSettings = msgspec.defstruct(
+        "TrialSettings",
+        [
+            *((aid.section, aid.section_type | UnsetType, UNSET) for aid in AIDS),
+            *((name, dict[str, Any] | UnsetType, UNSET) for name in _UNKNOWN),
+        ],
+        bases=(_Settings,),
+        frozen=True,
+        kw_only=True,
+        forbid_unknown_fields=True,
+    )
 
 
 def to_yaml(settings: TrialSettings) -> str:

@@ -1,5 +1,5 @@
-"""The Kalman point-set approach: SINS/GNSS first, then the DVL against it."""
+"""Kalman methods: SINS/GNSS, then the DVL against it; SINS against a star tracker."""
 
-from factorgraph_dvl.kalman.run import METHODS, History, Method, calibrate, kalman
+from factorgraph_dvl.kalman.run import DVL_METHODS, METHODS, History, Method, calibrate, kalman
 
-__all__ = ["METHODS", "History", "Method", "calibrate", "kalman"]
+__all__ = ["DVL_METHODS", "METHODS", "History", "Method", "calibrate", "kalman"]

@@ -1,4 +1,4 @@
-"""From a trial to a solution by SINS/GNSS and one of the point-set calibrators."""
+"""From a trial to a solution by one of the Kalman methods."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from factorgraph_dvl.kalman.navigation import Navigation, motion_at, navigate
 from factorgraph_dvl.kalman.nine_state import nine_state
 from factorgraph_dvl.kalman.point_set import point_set
 from factorgraph_dvl.kalman.points import Outcome, Points
+from factorgraph_dvl.kalman.star_run import calibrate_gyros
 from factorgraph_dvl.kalman.summary import summarise
 from factorgraph_dvl.kalman.wahba import wahba
 from factorgraph_dvl.sensors.dvl import Dvl
@@ -23,15 +24,17 @@ from factorgraph_dvl.sensors.protocol import Parameter
 from factorgraph_dvl.solution import Solution
 from factorgraph_dvl.trial import Trial
 
-Method = Literal["point-set", "nine-state", "wahba", "least-squares"]
-METHODS: tuple[Method, ...] = get_args(Method)
+DvlMethod = Literal["point-set", "nine-state", "wahba", "least-squares"]
+DVL_METHODS: tuple[DvlMethod, ...] = get_args(DvlMethod)
+Method = DvlMethod | Literal["star"]
+METHODS: tuple[Method, ...] = (*DVL_METHODS, "star")
 Progress = Callable[[str, int, float | None], None]
 
 _WHITE = (
     "the error of the SINS/GNSS velocity is taken for white noise; it is correlated in time, so "
     "the standard deviations of the DVL's parameters are too small"
 )
-_NEGLECTED: dict[Method, tuple[str, ...]] = {
+_NEGLECTED: dict[DvlMethod, tuple[str, ...]] = {
     "point-set": ("dvl_bias", "time_offset"),
     "nine-state": ("lever_arm", "time_offset"),
     "wahba": ("lever_arm", "dvl_bias", "time_offset"),
@@ -65,7 +68,7 @@ def kalman(
     rate_hz: float = 10.0,
     progress: Progress | None = None,
 ) -> Solution:
-    """Calibrate a DVL against SINS/GNSS: `calibrate` without the history."""
+    """Return the solution of `calibrate` without the history."""
     return calibrate(trial, method, rate_hz=rate_hz, progress=progress)[0]
 
 
@@ -76,16 +79,18 @@ def calibrate(
     rate_hz: float = 10.0,
     progress: Progress | None = None,
 ) -> tuple[Solution, History | None]:
-    """Calibrate a DVL against SINS/GNSS, and tell how the filter converged.
+    """Calibrate a DVL or gyros against a Kalman filter, and tell how it converged.
 
     First IMU and GNSS are filtered and smoothed without the DVL; then its velocities are
     held against the smoothed ones. So the joint covariance has two blocks, DVL and IMU:
     correlations between them exist, but this approach cannot know them.
 
+    The method `star` estimates the drift of the gyros against a star tracker instead.
+
     Parameters
     ----------
-    trial : with IMU, GNSS and DVL.
-    method : `point-set` (seven states), `nine-state`, `wahba` or `least-squares`.
+    trial : with IMU, GNSS and DVL, or star tracker.
+    method : `point-set` (seven states), `nine-state`, `wahba`, `least-squares`, or `star`.
     rate_hz : rate of the trajectory in the solution.
     progress : called with stage, iteration and cost (always None here).
 
@@ -104,9 +109,19 @@ def calibrate(
         raise ConfigError(f"method is {method!r}", expected=f"one of {', '.join(METHODS)}")
     if not (np.isfinite(rate_hz) and rate_hz > 0.0):
         raise ConfigError(f"rate_hz is {rate_hz}", expected="a number above 0")
+    report = progress or (lambda stage, iteration, cost: None)
+    if method == "star":
+        report("SINS/stars", 0, None)
+        solution, outcome = calibrate_gyros(trial, rate_hz=rate_hz)
+        return solution, _history(outcome)
     dvl = trial.dvl
     if dvl is None:
-        raise DataError("the trial has no DVL", where="trial.yaml", expected="a dvl section")
+        raise DataError(
+            "the trial has no DVL",
+            where="trial.yaml",
+            expected="a dvl section",
+            hint="The method `star` needs none",
+        )
     if dvl.settings.reference == "water":
         raise ConfigError(
             "the point-set methods know no current, and this DVL measures through the water",
@@ -114,7 +129,6 @@ def calibrate(
             expected="bottom",
             hint="`solve` estimates the current",
         )
-    report = progress or (lambda stage, iteration, cost: None)
     report("SINS/GNSS", 0, None)
     navigation = navigate(trial, dvl.time[dvl.locked] - dvl.settings.time_offset_s)
     report(method, 0, None)
@@ -165,7 +179,7 @@ def _point_sets(navigation: Navigation, dvl: Dvl) -> tuple[Callable[[float], Poi
     return points_at, int(locked.size - used.size)
 
 
-def _calibrate(method: Method, points_at: Callable[[float], Points], dvl: Dvl) -> Outcome:
+def _calibrate(method: DvlMethod, points_at: Callable[[float], Points], dvl: Dvl) -> Outcome:
     parameters = {p.stem: p for p in dvl.parameters()}
     misalignment, arm = parameters["misalignment"], parameters["lever_arm"]
     scale, bias, offset = (parameters[s] for s in ("scale_error", "dvl_bias", "time_offset"))
@@ -192,7 +206,7 @@ def _single(scale: Parameter) -> Parameter:
     )
 
 
-def _neglects(method: Method, dvl: Dvl) -> list[str]:
+def _neglects(method: DvlMethod, dvl: Dvl) -> list[str]:
     """Say which parameters of the trial the method does not estimate."""
     parameters = {p.stem: p for p in dvl.parameters()}
     out = [

@@ -11,6 +11,7 @@ from factorgraph_dvl.earth import radii
 from factorgraph_dvl.kalman.navigation import Motion, Navigation, motion_at
 from factorgraph_dvl.kalman.points import Estimated, Outcome, Points, residuals
 from factorgraph_dvl.sensors.protocol import Motion as SensorMotion
+from factorgraph_dvl.sensors.protocol import Parameter
 from factorgraph_dvl.solution import Estimate, Residuals, Solution, Trajectory, doubts
 from factorgraph_dvl.trial import Trial
 
@@ -45,25 +46,11 @@ def summarise(
     covariance[:n, :n], covariance[n:, n:] = dvl_covariance, imu_covariance
     parameters = [*outcome.estimated.parameters, *imu.parameters]
     values = np.concatenate([dvl_values, imu_values])
-    std = np.sqrt(np.maximum(np.diag(covariance), 0.0))
-    estimates, at = [], 0
-    for p in parameters:
-        rows = slice(at, at + p.mean.size)
-        at += p.mean.size
-        prior = p.sigma / p.si
-        joined = np.array([name in outcome.unseparated for name in p.component_names])
-        estimates.append(
-            Estimate(
-                name=p.name,
-                component_names=p.component_names,
-                value=values[rows],
-                std=std[rows],
-                prior_value=p.mean / p.si,
-                prior_std=prior,
-                observable=(prior > 0.0) & (std[rows] <= _OBSERVABLE * prior) & ~joined,
-            )
-        )
-    all_residuals = (_dvl_residuals(trial, navigation, outcome, points), *_gnss(trial, navigation))
+    estimates = estimates_of(parameters, values, covariance, outcome.unseparated)
+    all_residuals = (
+        _dvl_residuals(trial, navigation, outcome, points),
+        *gnss_residuals(trial, navigation),
+    )
     warnings = [
         *notes,
         *doubts(estimates, all_residuals),
@@ -77,12 +64,43 @@ def summarise(
         converged=outcome.converged,
         iterations=outcome.iterations,
         cost=0.5 * float(np.sum((dvl.residual / dvl.sigma) ** 2)),
-        estimates=tuple(estimates),
+        estimates=estimates,
         covariance=covariance,
         trajectory=_trajectory(trial, navigation, rate_hz),
         residuals=all_residuals,
         warnings=tuple(warnings),
     )
+
+
+def estimates_of(
+    parameters: Sequence[Parameter],
+    values: Array,
+    covariance: Array,
+    unseparated: frozenset[str] = frozenset(),
+) -> tuple[Estimate, ...]:
+    """Return parameters with their reported values (n,) and covariance (n, n).
+
+    Components of which the data tell only a sum are `unseparated`, so not observable.
+    """
+    std = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    estimates, at = [], 0
+    for p in parameters:
+        rows = slice(at, at + p.mean.size)
+        at += p.mean.size
+        prior = p.sigma / p.si
+        joined = np.array([name in unseparated for name in p.component_names])
+        estimates.append(
+            Estimate(
+                name=p.name,
+                component_names=p.component_names,
+                value=values[rows],
+                std=std[rows],
+                prior_value=p.mean / p.si,
+                prior_std=prior,
+                observable=(prior > 0.0) & (std[rows] <= _OBSERVABLE * prior) & ~joined,
+            )
+        )
+    return tuple(estimates)
 
 
 def _imu_biases(trial: Trial, navigation: Navigation) -> Estimated:
@@ -144,7 +162,8 @@ def _dvl_residuals(
     return Residuals("DVL velocity", "m/s", ("x", "y", "z"), points.time + offset, residual, sigma)
 
 
-def _gnss(trial: Trial, navigation: Navigation) -> tuple[Residuals, ...]:
+def gnss_residuals(trial: Trial, navigation: Navigation) -> tuple[Residuals, ...]:
+    """Return predicted - measured position and velocity of the antenna."""
     gnss = trial.gnss
     assert gnss is not None
     motion: Motion = motion_at(navigation, gnss.time)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, replace
+from typing import Any
 
 import numpy as np
 
@@ -44,16 +45,21 @@ class Collected:
             while self._samples[-1][-1, 0] - self._samples[0][-1, 0] > self._longest:
                 self._samples.pop(0)
 
-    def add_aid(self, section: str, record: Aid) -> None:
+    def add_aid(self, record: Aid) -> None:
         """Add rows of a sensor."""
-        self._aids.setdefault(section, []).append(record)
+        self._aids.setdefault(record.section, []).append(record)
+
+    @property
+    def complete(self) -> bool:
+        """Whether every sensor of the trial has been heard."""
+        return all(aid.section in self._aids for aid in self._known.aids)
 
     def trial(self, until: float) -> Trial:
         """Return what was collected up to a time, s."""
         samples = np.concatenate(self._samples)
         samples = samples[samples[:, 0] <= until]
         self._samples = [np.concatenate(self._samples)]
-        aids = {}
+        aids: dict[str, Aid] = {}
         for section, records in self._aids.items():
             record = joined(records)
             # Rows of before are of no use, and end here.
@@ -73,4 +79,9 @@ class Collected:
         if known.imu.time[0] < samples[0, 0] - 1.0:
             # What was known of the start has gone with it.
             known = replace(known, initial_attitude=None, initial_position=None)
-        return replace(known, imu=imu, **aids)  # type: ignore[arg-type]
+        # Sensors that were not heard yet are not known of: their records are of the future.
+        heard: dict[str, Any] = dict.fromkeys(aid.section for aid in known.aids)
+        heard |= aids
+        named = {f.name: heard.pop(f.name) for f in fields(Trial) if f.name in heard}
+        others = tuple(aid for aid in heard.values() if aid is not None)
+        return replace(known, imu=imu, others=others, **named)

@@ -20,7 +20,7 @@ from factorgraph_dvl.earth import LocalFrame
 from factorgraph_dvl.preintegration import States
 from factorgraph_dvl.sensors.protocol import Parameter
 from factorgraph_dvl.solution import Estimate, Trajectory
-from factorgraph_dvl.solvers.reported import estimates_of, in_order, reported
+from factorgraph_dvl.solvers.reported import estimates_of, in_order, in_unit
 
 _STATE = 9
 _BIAS = 6
@@ -139,10 +139,11 @@ def calibration_of(
         values, gyro_bias, accel_bias, P = _at_prior(free, values, gyro_bias, accel_bias, P, held)
     rows = in_order(
         [
-            reported(gyro, gyro_bias),
-            reported(accel, accel_bias),
-            *(reported(p, values[p.name]) for p in parameters),
-        ]
+            in_unit(gyro, gyro_bias),
+            in_unit(accel, accel_bias),
+            *(in_unit(p, values[p.name]) for p in parameters),
+        ],
+        lambda r: r.parameter,
     )
     start = {accel.name: 0, gyro.name: 3}
     at = _BIAS
@@ -157,7 +158,7 @@ def calibration_of(
         n, column = r.value.size, start[r.parameter.name]
         T[at : at + n, column : column + n] = r.derivative
         at += n
-    return Calibration(*estimates_of(rows, T @ P @ T.T))
+    return Calibration(*estimates_of([(r.parameter, r.value) for r in rows], T @ P @ T.T))
 
 
 def _at_prior(

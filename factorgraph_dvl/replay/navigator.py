@@ -25,10 +25,12 @@ from factorgraph_dvl.replay.start import Start
 from factorgraph_dvl.sensors.imu import Imu
 from factorgraph_dvl.sensors.protocol import Aid, Motion, Parameter
 from factorgraph_dvl.solution import Trajectory
-from factorgraph_dvl.solvers.feigned import feigned_among, feigned_by
+from factorgraph_dvl.solvers.feigned import directions_not_told, feigned_by
 
 # Distance, m, up to which gravity is taken as linear: to 3e-9 m/s².
 _NEAR = 100.0
+# Stands for a standard deviation of zero, as in the graph.
+_HELD = 1e-7
 # Keeps the walk of a bias that does not walk regular.
 _LEAST_WALK = 1e-12
 _STATE = 9
@@ -62,7 +64,9 @@ class Navigator:
             walking=start.walking,
             lag=lag,
         )
-        self._sigma = np.concatenate([np.empty(0), *(p.sigma for p in start.parameters)])
+        self._sigma = np.concatenate(
+            [np.empty(0), *(np.maximum(p.sigma, _HELD) for p in start.parameters)]
+        )
         self._feigned = start.feigned
         self._feigned_at = start.time
         self._near = np.full(3, np.inf)
@@ -377,11 +381,12 @@ class Navigator:
                 values,
                 [p.name for p in wanted],
             )
-            self._feigned[np.ix_(columns, columns)] += part * max(per_second / duration, 1.0)
+            scale = self._sigma[columns] * np.sqrt(max(per_second / duration, 1.0))
+            self._feigned[np.ix_(columns, columns)] += part.sum(axis=0) * np.outer(scale, scale)
         self._held = self._not_observable()
 
     def _not_observable(self) -> Array:
         if self._sigma.size == 0:
             return np.zeros((0, 0))
-        P = self._P[_STATE + 6 :, _STATE + 6 :]
-        return feigned_among(P, self._feigned, np.maximum(self._sigma, 1e-7))
+        P = self._P[_STATE + 6 :, _STATE + 6 :] / np.outer(self._sigma, self._sigma)
+        return directions_not_told(np.linalg.inv(P) - np.eye(self._sigma.size), self._feigned)

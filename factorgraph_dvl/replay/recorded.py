@@ -81,16 +81,13 @@ def replay(
     run = Replay(trial, smoother=smoother, lag_s=lag_s, rate_hz=rate_hz, progress=progress)
     tape = _Tape()
     imu = trial.imu
-    sections = [
-        f.name for f in fields(trial) if any(getattr(trial, f.name) is aid for aid in trial.aids)
-    ]
     step = 1.0 / rate_hz
     edges = np.arange(imu.time[0], imu.time[-1] + step, step)
     edges = np.append(edges, np.inf)
     samples = np.searchsorted(imu.time, edges)
-    rows = {name: np.searchsorted(getattr(trial, name).time, edges) for name in sections}
-    for name in sections:
-        rows[name][0] = 0
+    rows = [np.searchsorted(aid.time, edges) for aid in trial.aids]
+    for each in rows:
+        each[0] = 0
 
     def take(updates: list[Update]) -> None:
         for update in updates:
@@ -99,10 +96,10 @@ def replay(
                 watch(update)
 
     for j, (a, b) in enumerate(pairwise(samples.tolist())):
-        for name in sections:
-            first, last = rows[name][j : j + 2].tolist()
+        for aid, each in zip(trial.aids, rows, strict=True):
+            first, last = each[j : j + 2].tolist()
             if last > first:
-                run.add(name, rows_of(getattr(trial, name), slice(first, last)))
+                run.add(rows_of(aid, slice(first, last)))
         if b > a:
             take(run.add_imu(imu.time[a:b], imu.gyro[a:b], imu.accel[a:b]))
     take(run.finish())

@@ -169,13 +169,12 @@ class Replay:
             self._collected.add_samples(used)
         return self._advance(end=False)
 
-    def add(self, section: str, record: Aid) -> None:
+    def add(self, record: Aid) -> None:
         """Take one measurement of another sensor, or some.
 
         Parameters
         ----------
-        section : of the sensor in trial.yaml, such as `gnss` or `dvl`.
-        record : one row or more.
+        record : of a `Gnss`, `Dvl`, ...; one row or more.
         """
         if self._clock:
             record = replace(record, time=record.time + self._clock)  # type: ignore[type-var]
@@ -185,7 +184,7 @@ class Replay:
             if ahead.all():
                 return
             record = rows_of(record, ~ahead)
-        self._waiting.setdefault(section, []).append(record)
+        self._waiting.setdefault(record.section, []).append(record)
 
     def finish(self) -> list[Update]:
         """Return the updates that the last samples allow, without waiting for more."""
@@ -309,20 +308,22 @@ class Replay:
 
     def _settle(self, before: Navigator, after: Navigator) -> None:
         """Let what was collected go if the smoother found the same as the batch solution."""
+        assert self._collected is not None
+        if not self._collected.complete or before.start.sections != after.start.sections:
+            return
         old, new = before.calibration(), after.calibration()
         std = np.sqrt(np.diag(new.covariance))
         free = std > 0.0
-        difference = np.concatenate([e.value for e in old.estimates]) - np.concatenate(
-            [e.value for e in new.estimates]
+        moved = np.concatenate(
+            [a.value - b.value for a, b in zip(old.estimates, new.estimates, strict=True)]
         )
-        agrees = bool(np.all(np.abs(difference[free]) < _AGREES * std[free]))
-        rotations = [
-            sigma
+        agrees = bool(np.all(np.abs(moved[free]) < _AGREES * std[free]))
+        sure = all(
+            np.all(np.diag(after.covariance_of(p)) < _SETTLED_ROTATION**2)
             for p in after.start.parameters
             if p.rotation
-            for sigma in np.sqrt(np.diag(after.covariance_of(p)))
-        ]
-        if agrees and not after.held.size and all(s < _SETTLED_ROTATION for s in rotations):
+        )
+        if agrees and sure and not after.held.size:
             self._collected = None
 
     def _take(self, start: float, end: float) -> list[Aid]:
@@ -333,6 +334,10 @@ class Replay:
         for section, records in list(self._waiting.items()):
             record = self._split(section, records, end)
             if record is None:
+                continue
+            if section not in self._navigator.start.sections:
+                # It brings parameters that are not in the graph yet.
+                self._solve_again = min(self._solve_again, end + _LEAST_BETWEEN)
                 continue
             true = record.time - self._shift(section, record)
             now = true >= start - _SAME_TIME
@@ -364,7 +369,7 @@ class Replay:
             self._waiting[section] = [rows_of(record, ~due)]
         record = rows_of(record, due)
         if self._collected is not None:
-            self._collected.add_aid(section, record)
+            self._collected.add_aid(record)
         return record
 
     def _shift(self, section: str, record: Aid) -> float:

@@ -36,8 +36,10 @@ class Start:
     values : at which they are linear, and start from.
     parameters, all_parameters : those that are estimated, and all.
     fixed : values of those that are not.
+    sections : of the sensors that it knows.
     windows : over which the IMU's samples are smoothed.
-    feigned : (P, P) information on the parameters that only noise makes, SI.
+    feigned : (P, P) information on the parameters that only noise makes, in units of the
+        priors' standard deviations.
     walking : whether biases walk.
     notes : for the user.
     """
@@ -50,6 +52,7 @@ class Start:
     parameters: tuple[Parameter, ...]
     all_parameters: tuple[Parameter, ...]
     fixed: dict[str, Array]
+    sections: tuple[str, ...]
     windows: tuple[int, int]
     feigned: Array
     walking: bool
@@ -84,7 +87,7 @@ def begin(trial: Trial, known: Known | None, progress: Progress) -> Start | str:
     if not attitude < _ATTITUDE:
         return f"the attitude is known to {np.degrees(attitude):.2g} deg only"
     evaluation = minimum.evaluation
-    feigned = feigned_information(problem, evaluation, covariances.nodes)
+    feigned = feigned_information(problem, evaluation, covariances.nodes).sum(axis=0)
     last = problem.chain.segments.node_time.size - 1
     kept = [
         keys.node(last),
@@ -108,6 +111,7 @@ def begin(trial: Trial, known: Known | None, progress: Progress) -> Start | str:
             for p in problem.all_parameters
             if not p.estimated
         },
+        sections=tuple(aid.section for aid in trial.aids),
         windows=problem.chain.segments.increments.chosen_windows,
         feigned=feigned,
         walking=problem.chain.walking,

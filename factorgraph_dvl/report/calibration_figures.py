@@ -12,6 +12,7 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import ArrayLike, NDArray
 
 from factorgraph_dvl.analysis.consistency import true_value_of
+from factorgraph_dvl.conventions import Array
 from factorgraph_dvl.report.drawing import (
     ACCENT,
     DARK,
@@ -98,7 +99,7 @@ def _draw_component(ax: Axes, estimate: Estimate, c: int, truth: float | None) -
     style(ax, "", "")
     ax.grid(visible=False)
     ax.spines["left"].set_visible(False)
-    name, unit = _readable(estimate.component_names[c])
+    name, unit = readable(estimate.component_names[c])
     ax.set_title(f"{name}, {unit}" if unit else name, fontsize=NORMAL, loc="left", pad=3)
     ax.set_title(typeset(with_std(value, std)), fontsize=NORMAL, loc="right", pad=3, color=color)
     if fixed or not observable:
@@ -119,8 +120,14 @@ def correlation_figure(solution: Solution) -> Figure:
     """Draw the correlation matrix of the calibration components."""
     std = np.sqrt(np.maximum(np.diagonal(solution.covariance), 0.0))
     free = std > 0.0
-    names = [_readable(name)[0] for name, shown in zip(solution.order, free, strict=True) if shown]
+    names = [name for name, shown in zip(solution.order, free, strict=True) if shown]
     correlation = solution.covariance[np.ix_(free, free)] / np.outer(std[free], std[free])
+    return heat_map(names, correlation)
+
+
+def heat_map(components: Sequence[str], correlation: Array) -> Figure:
+    """Draw a correlation matrix (n, n) of components, with its numbers."""
+    names = [readable(name)[0] for name in components]
     n = len(names)
     cell = min(0.5, 13.0 / max(n, 1))
     side = cell * max(n, 3)
@@ -179,7 +186,7 @@ def _chunks(components: list[tuple[Estimate, int]]) -> Iterator[list[tuple[Estim
     return (components[i : i + 3] for i in range(0, len(components), 3))
 
 
-def _readable(component: str) -> tuple[str, str]:
+def readable(component: str) -> tuple[str, str]:
     """Split the name of a component into words and unit: `lever_arm_x_m`, `lever arm x`, `m`."""
     name, unit = split_unit(component)
     return name.replace("_", " "), unit

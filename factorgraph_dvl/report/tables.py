@@ -44,15 +44,15 @@ def _calibration_table(
         rows = zip(errors.truth.tolist(), errors.normalised.tolist(), strict=True)
         known = dict(zip(errors.names, rows, strict=True))
     table = Table(title="Calibration")
-    _add_column(table, "parameter")
-    _add_column(table, "value ± std", numeric=True)
+    add_column(table, "parameter")
+    add_column(table, "value ± std", numeric=True)
     if not brief:
-        _add_column(table, "unit")
-        _add_column(table, "prior std", numeric=True)
-    _add_column(table, "observable")
+        add_column(table, "unit")
+        add_column(table, "prior std", numeric=True)
+    add_column(table, "observable")
     if known:
-        _add_column(table, "truth", numeric=True)
-        _add_column(table, "error/σ", numeric=True)
+        add_column(table, "truth", numeric=True)
+        add_column(table, "error/σ", numeric=True)
     for estimate in solution.estimates:
         for i, component in enumerate(estimate.component_names):
             name, unit = split_unit(component)
@@ -77,9 +77,9 @@ def _calibration_table(
 def convergence_table(found: Convergence) -> Table:
     """Render from when each component was good enough."""
     table = Table(title="Convergence: time from which on it stayed within")
-    _add_column(table, "component")
+    add_column(table, "component")
     for header in ("σ below", "since s", "error below", "since s"):
-        _add_column(table, header, numeric=True)
+        add_column(table, header, numeric=True)
     truth = any(math.isfinite(c.error_since) for c in found.components)
     for c in found.components:
         name, unit = split_unit(c.name)
@@ -116,9 +116,9 @@ def _moment(time: float) -> str:
 def sensor_table(survey: Survey) -> Table:
     """Render what was recorded by each sensor."""
     table = Table(title=Text(f"Trial {survey.trial}"))
-    _add_column(table, "sensor")
+    add_column(table, "sensor")
     for header in ("rate Hz", "samples", "from s", "to s", "gaps", "longest s", "missing %"):
-        _add_column(table, header, numeric=True)
+        add_column(table, header, numeric=True)
     for s in survey.sensors:
         table.add_row(
             Text(s.label),
@@ -156,5 +156,6 @@ def finding_lines(survey: Survey) -> list[Text]:
     ]
 
 
-def _add_column(table: Table, header: str, *, numeric: bool = False) -> None:
+def add_column(table: Table, header: str, *, numeric: bool = False) -> None:
+    """Add a column that is never cut; numbers to the right."""
     table.add_column(header, justify="right" if numeric else "left", no_wrap=True)

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
-from typing import Literal
+from typing import ClassVar, Literal, Self
 
 import numpy as np
 
@@ -16,7 +16,7 @@ from factorgraph_dvl.sensors.protocol import (
     NonNegative,
     Observation,
     Parameter,
-    Section,
+    SensorSection,
     Sigma3,
     Values,
     Vector3,
@@ -25,6 +25,7 @@ from factorgraph_dvl.sensors.protocol import (
     check_times,
     lever_arm_sigma,
     named_columns,
+    stack,
 )
 
 VELOCITY_COLUMNS = ("vel_x_m_s", "vel_y_m_s", "vel_z_m_s")
@@ -41,7 +42,7 @@ CURRENT = "current_m_s"
 _LEAST_SIGMA = 1e-4
 
 
-class DvlSettings(Section, frozen=True, kw_only=True):
+class DvlSettings(SensorSection, frozen=True, kw_only=True):
     """Section `dvl` of trial.yaml."""
 
     file: str = "dvl.csv"
@@ -91,6 +92,11 @@ class Dvl:
     source: str = "dvl"
     label: str = "DVL"
 
+    section: ClassVar[str] = "dvl"
+    section_type: ClassVar[type[SensorSection]] = DvlSettings
+    required: ClassVar[tuple[str, ...]] = ("time_s", *VELOCITY_COLUMNS)
+    optional: ClassVar[tuple[tuple[str, ...], ...]] = (STD_COLUMNS,)
+
     def __post_init__(self) -> None:
         check_times(self.time, self.source)
         velocity = named_columns(VELOCITY_COLUMNS, self.velocity)
@@ -100,10 +106,30 @@ class Dvl:
         check_all_or_none(std, self.source)
         check_range(std, 1e-6, 100.0, "m/s, above 0", self.source)
 
+    @classmethod
+    def from_columns(
+        cls, settings: DvlSettings, columns: Mapping[str, Array], source: str
+    ) -> Self:
+        """Return the record that a table holds."""
+        velocity, std = stack(columns, VELOCITY_COLUMNS), stack(columns, STD_COLUMNS)
+        return cls(settings, columns["time_s"], velocity, std, source)
+
+    def columns(self) -> dict[str, Array]:
+        """Return the record as a table."""
+        table = {"time_s": self.time, **named_columns(VELOCITY_COLUMNS, self.velocity)}
+        if not np.isnan(self.std).all():
+            table |= named_columns(STD_COLUMNS, self.std)
+        return table
+
+    @property
+    def missing(self) -> Array:
+        """Pings without a velocity, (M,) bool."""
+        return np.isnan(self.velocity[:, 0])
+
     @property
     def locked(self) -> Array:
         """Pings with a velocity, (M,) bool."""
-        return ~np.isnan(self.velocity[:, 0])
+        return np.logical_not(self.missing)
 
     def sigma(self) -> Array:
         """Return the standard deviations of the velocity components, (M, 3), m/s.

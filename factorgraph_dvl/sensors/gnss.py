@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
+from typing import ClassVar, Self
 
 import numpy as np
 
-from factorgraph_dvl.conventions import DEG, Array, cross, rotate, skew
+from factorgraph_dvl.conventions import DEG, GEODETIC_SI, Array, cross, rotate, skew
 from factorgraph_dvl.earth import LocalFrame
 from factorgraph_dvl.sensors.protocol import (
     Linearization,
@@ -15,7 +16,7 @@ from factorgraph_dvl.sensors.protocol import (
     Observation,
     Parameter,
     Positive,
-    Section,
+    SensorSection,
     Sigma3,
     Values,
     Vector3,
@@ -24,6 +25,7 @@ from factorgraph_dvl.sensors.protocol import (
     check_times,
     lever_arm_sigma,
     named_columns,
+    stack,
 )
 
 POSITION_COLUMNS = ("lat_deg", "lon_deg", "height_m")
@@ -34,7 +36,7 @@ VELOCITY_STD_COLUMNS = ("vel_std_e_m_s", "vel_std_n_m_s", "vel_std_u_m_s")
 LEVER_ARM = "gnss_lever_arm_m"
 
 
-class GnssSettings(Section, frozen=True, kw_only=True):
+class GnssSettings(SensorSection, frozen=True, kw_only=True):
     """Section `gnss` of trial.yaml."""
 
     file: str = "gnss.csv"
@@ -69,6 +71,15 @@ class Gnss:
     source: str = "gnss"
     label: str = "GNSS"
 
+    section: ClassVar[str] = "gnss"
+    section_type: ClassVar[type[SensorSection]] = GnssSettings
+    required: ClassVar[tuple[str, ...]] = ("time_s", *POSITION_COLUMNS)
+    optional: ClassVar[tuple[tuple[str, ...], ...]] = (
+        VELOCITY_COLUMNS,
+        POSITION_STD_COLUMNS,
+        VELOCITY_STD_COLUMNS,
+    )
+
     def __post_init__(self) -> None:
         check_times(self.time, self.source)
         position = named_columns(POSITION_COLUMNS, self.geodetic)
@@ -90,6 +101,34 @@ class Gnss:
             (self.velocity_std, self.settings.velocity_std_m_s),
         ):
             np.copyto(std, np.broadcast_to(default, std.shape), where=np.isnan(std))
+
+    @classmethod
+    def from_columns(
+        cls, settings: GnssSettings, columns: Mapping[str, Array], source: str
+    ) -> Self:
+        """Return the record that a table holds."""
+        geodetic = stack(columns, POSITION_COLUMNS) * GEODETIC_SI
+        velocity, position_std, velocity_std = (stack(columns, group) for group in cls.optional)
+        return cls(
+            settings, columns["time_s"], geodetic, velocity, position_std, velocity_std, source
+        )
+
+    def columns(self) -> dict[str, Array]:
+        """Return the record as a table."""
+        table = {
+            "time_s": self.time,
+            **named_columns(POSITION_COLUMNS, self.geodetic / GEODETIC_SI),
+            **named_columns(POSITION_STD_COLUMNS, self.position_std),
+        }
+        if not np.isnan(self.velocity).all():
+            table |= named_columns(VELOCITY_COLUMNS, self.velocity)
+            table |= named_columns(VELOCITY_STD_COLUMNS, self.velocity_std)
+        return table
+
+    @property
+    def missing(self) -> Array:
+        """Epochs without a position, (M,) bool."""
+        return np.isnan(self.geodetic[:, 0])
 
     def parameters(self) -> tuple[Parameter, ...]:
         """Return the antenna's lever arm."""

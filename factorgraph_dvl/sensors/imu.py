@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal
+from typing import ClassVar, Literal, Self
 
 import numpy as np
 
@@ -18,11 +19,12 @@ from factorgraph_dvl.sensors.protocol import (
     NonNegative,
     Parameter,
     Positive,
-    Section,
+    SensorSection,
     check_finite,
     check_range,
     check_times,
     named_columns,
+    stack,
 )
 
 COLUMNS = (
@@ -42,7 +44,7 @@ _MAX_RATE_RAD_S = 100.0
 _MAX_FORCE_M_S2 = 1000.0
 
 
-class ImuSettings(Section, frozen=True, kw_only=True):
+class ImuSettings(SensorSection, frozen=True, kw_only=True):
     """Section `imu` of trial.yaml."""
 
     file: str = "imu.csv"
@@ -99,6 +101,11 @@ class Imu:
     accel: Array
     source: str = "imu"
 
+    section: ClassVar[str] = "imu"
+    section_type: ClassVar[type[SensorSection]] = ImuSettings
+    required: ClassVar[tuple[str, ...]] = COLUMNS
+    optional: ClassVar[tuple[tuple[str, ...], ...]] = ()
+
     def __post_init__(self) -> None:
         check_times(self.time, self.source)
         gyro = named_columns(COLUMNS[1:4], self.gyro)
@@ -106,6 +113,18 @@ class Imu:
         check_finite({**gyro, **accel}, self.source)
         check_range(gyro, -_MAX_RATE_RAD_S, _MAX_RATE_RAD_S, "rad/s", self.source)
         check_range(accel, -_MAX_FORCE_M_S2, _MAX_FORCE_M_S2, "m/s²", self.source)
+
+    @classmethod
+    def from_columns(
+        cls, settings: ImuSettings, columns: Mapping[str, Array], source: str
+    ) -> Self:
+        """Return the record that a table holds."""
+        gyro, accel = stack(columns, COLUMNS[1:4]), stack(columns, COLUMNS[4:7])
+        return cls(settings, columns["time_s"], gyro, accel, source)
+
+    def columns(self) -> dict[str, Array]:
+        """Return the record as a table."""
+        return named_columns(COLUMNS, np.column_stack([self.time, self.gyro, self.accel]))
 
     def parameters(self, duration: float) -> tuple[Parameter, Parameter]:
         """Return gyro and accelerometer bias; a walking one as its mean over `duration` s.

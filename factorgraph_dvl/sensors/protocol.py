@@ -6,7 +6,8 @@ import math
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, field
-from typing import Annotated, Any, Protocol, TypeVar
+from datetime import datetime
+from typing import Annotated, Any, ClassVar, Protocol, Self, TypeVar, runtime_checkable
 
 import msgspec
 import numpy as np
@@ -24,12 +25,21 @@ Values = Mapping[str, Array]
 
 
 class Section(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A section of trial.yaml, in the units that its names state."""
+    """A section of a YAML file, in the units that its names state."""
 
     def __post_init__(self) -> None:
         for name in self.__struct_fields__:
             if not _finite(getattr(self, name)):
                 raise ValueError(f"`{name}` must be finite")
+
+
+def check_epoch(epoch: str) -> None:
+    """Raise ValueError unless an epoch is empty or a date and time of ISO 8601."""
+    try:
+        if epoch:
+            datetime.fromisoformat(epoch)
+    except ValueError:
+        raise ValueError("`epoch` must be a date and time such as 2022-10-12T02:00:00Z") from None
 
 
 def _finite(value: Any) -> bool:
@@ -163,7 +173,38 @@ class Observation(Protocol):
         """Return the residual and its Jacobians, of the parameters `wanted` at least."""
 
 
-class Aid(Protocol):
+class SensorSection(Section, frozen=True, kw_only=True):
+    """A sensor's section of trial.yaml, with the table that holds its record."""
+
+    file: str
+
+
+class Record(Protocol):
+    """A sensor's record, and how it stands in files.
+
+    `section` names its part of trial.yaml and its table, `section_type` holds the
+    settings; of the columns, `required` must be there, and of each group of `optional`
+    ones all or none.
+    """
+
+    section: ClassVar[str]
+    section_type: ClassVar[type[SensorSection]]
+    required: ClassVar[tuple[str, ...]]
+    optional: ClassVar[tuple[tuple[str, ...], ...]]
+
+    @property
+    def settings(self) -> SensorSection:
+        """Settings of the sensor."""
+
+    @classmethod
+    def from_columns(cls, settings: Any, columns: Mapping[str, Array], source: str) -> Self:
+        """Return the record that a table holds; columns that it does not have are nan."""
+
+    def columns(self) -> dict[str, Array]:
+        """Return the record as a table."""
+
+
+class Aid(Record, Protocol):
     """A sensor that observes the motion which the IMU integrates."""
 
     @property
@@ -172,7 +213,11 @@ class Aid(Protocol):
 
     @property
     def time(self) -> Array:
-        """Times of the rows of its record, (M,), s."""
+        """Times of the record, (M,), s."""
+
+    @property
+    def missing(self) -> Array:
+        """Rows without a measurement, (M,) bool."""
 
     def parameters(self) -> tuple[Parameter, ...]:
         """Return the calibration parameters, fixed ones included."""
@@ -184,15 +229,39 @@ class Aid(Protocol):
         """Say why a component could not be observed, given the motion of the trial."""
 
 
-_Record = TypeVar("_Record")
+@dataclass(frozen=True)
+class Attitudes:
+    """Attitudes that a sensor measures by itself, without any motion.
+
+    Parameters
+    ----------
+    time : (M,) s.
+    nRs : (M, 3, 3) attitude of the sensor's axes.
+    mounting : the parameter sRb, with its prior.
+    """
+
+    time: Array
+    nRs: Array
+    mounting: Parameter
 
 
-def rows_of(record: _Record, rows: slice | NDArray[Any] | list[int]) -> _Record:
+@runtime_checkable
+class AttitudeAid(Aid, Protocol):
+    """An aid from which a vehicle at rest can start."""
+
+    def attitudes(self, frame: LocalFrame) -> Attitudes:
+        """Return the attitudes that were measured, in `frame`."""
+
+
+_AnyRecord = TypeVar("_AnyRecord")
+
+
+def rows_of(record: _AnyRecord, rows: slice | NDArray[Any] | list[int]) -> _AnyRecord:
     """Return some rows of a sensor's record, in the order of time: of every array in it."""
     return _with(record, {name: values[rows] for name, values in _arrays(record).items()})
 
 
-def joined(records: Sequence[_Record]) -> _Record:
+def joined(records: Sequence[_AnyRecord]) -> _AnyRecord:
     """Return records of one sensor as one, in the order of time.
 
     Of rows at the same time the first is kept.
@@ -205,7 +274,7 @@ def joined(records: Sequence[_Record]) -> _Record:
     return _with(records[0], {name: values[rows] for name, values in whole.items()})
 
 
-def _with(record: _Record, arrays: Mapping[str, Array]) -> _Record:
+def _with(record: _AnyRecord, arrays: Mapping[str, Array]) -> _AnyRecord:
     # Rows of a record that was checked need no check, which would take most of the time.
     out = copy(record)
     for name, values in arrays.items():
@@ -284,6 +353,11 @@ def check_all_or_none(columns: Mapping[str, Array], source: str) -> None:
 def at_row(source: str, row: int | np.integer[Any]) -> str:
     """Name a row of a record so that it is found in the file (one header line)."""
     return f"{source} line {int(row) + 2}"
+
+
+def stack(columns: Mapping[str, Array], names: Sequence[str]) -> Array:
+    """Return the columns of those names side by side, (M, n)."""
+    return np.column_stack([columns[name] for name in names])
 
 
 def named_columns(names: Iterable[str], values: Array) -> dict[str, Array]:

@@ -7,18 +7,31 @@ conventions and the Earth model, so that an error in one does not cancel in the 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from os import PathLike
+from typing import cast
 
 import numpy as np
 
 from factorgraph_dvl.conventions import DEG, Array
+from factorgraph_dvl.sensors.dvl import Dvl
+from factorgraph_dvl.sensors.gnss import Gnss
+from factorgraph_dvl.sensors.protocol import Aid
 from factorgraph_dvl.simulation.measurements import displaced, simulate_dvl, simulate_gnss
 from factorgraph_dvl.simulation.measurements import simulate_imu as _simulate_imu
 from factorgraph_dvl.simulation.motion import Motion, plan_motion
 from factorgraph_dvl.simulation.scenario import Scenario, load_scenario, parse_scenario
+from factorgraph_dvl.simulation.star import simulate_star
 from factorgraph_dvl.trial import InitialAttitude, InitialPosition, Reference, Trial
 
 __all__ = ["Scenario", "load_scenario", "parse_scenario", "plan_motion", "simulate"]
+
+# By section; the order is that of the random streams, so a new sensor comes last.
+_AIDS: dict[str, Callable[..., tuple[Aid, dict[str, Array]]]] = {
+    "gnss": simulate_gnss,
+    "dvl": simulate_dvl,
+    "star": simulate_star,
+}
 
 
 def simulate(scenario: Scenario | str | PathLike[str], seed: int = 0) -> Trial:
@@ -37,29 +50,23 @@ def simulate(scenario: Scenario | str | PathLike[str], seed: int = 0) -> Trial:
     """
     if not isinstance(scenario, Scenario):
         scenario = load_scenario(scenario)
-    imu_rng, gnss_rng, dvl_rng = np.random.default_rng(seed).spawn(3)
+    imu_rng, *aid_rngs = np.random.default_rng(seed).spawn(1 + len(_AIDS))
     motion = plan_motion(scenario)
     imu, truth = _simulate_imu(scenario, motion, imu_rng)
-    gnss = dvl = None
-    if scenario.gnss is not None:
-        gnss = simulate_gnss(scenario, motion, gnss_rng)
-        truth["gnss_lever_arm_m"] = np.array(scenario.gnss.lever_arm_m)
-    if scenario.dvl is not None:
-        dvl = simulate_dvl(scenario, motion, dvl_rng)
-        truth["misalignment_deg"] = np.array(scenario.dvl.misalignment_deg)
-        truth["scale_error"] = np.atleast_1d(np.array(scenario.dvl.scale_error, dtype=float))
-        truth["lever_arm_m"] = np.array(scenario.dvl.lever_arm_m)
-        truth["dvl_bias_m_s"] = np.array(scenario.dvl.bias_m_s)
-        truth["time_offset_s"] = np.array([scenario.dvl.time_offset_s])
-        if dvl.settings.reference == "water":
-            truth["current_m_s"] = np.array(scenario.current_m_s[:2])
+    aids: dict[str, Aid] = {}
+    for (section, run), rng in zip(_AIDS.items(), aid_rngs, strict=True):
+        if section in scenario.aids:
+            aids[section], calibration = run(scenario, motion, rng)
+            truth |= calibration
     attitude, position = _initial(scenario, motion, imu.time[:1])
     return Trial(
         name=scenario.name,
         imu=imu,
-        gnss=gnss,
-        dvl=dvl,
+        gnss=cast("Gnss | None", aids.pop("gnss", None)),
+        dvl=cast("Dvl | None", aids.pop("dvl", None)),
+        others=tuple(aids.values()),
         body_axes=scenario.body_axes,
+        epoch=scenario.epoch,
         initial_attitude=attitude,
         initial_position=position,
         reference=_reference(motion, scenario.reference_rate_hz),

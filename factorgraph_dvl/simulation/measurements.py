@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import cast
 
 import numpy as np
 import pymap3d
@@ -20,11 +21,12 @@ from factorgraph_dvl.conventions import (
     rotation_from_rph,
 )
 from factorgraph_dvl.errors import ConfigError
-from factorgraph_dvl.sensors.dvl import Dvl
-from factorgraph_dvl.sensors.gnss import Gnss
-from factorgraph_dvl.sensors.imu import Imu
+from factorgraph_dvl.sensors.dvl import Dvl, DvlSettings
+from factorgraph_dvl.sensors.gnss import Gnss, GnssSettings
+from factorgraph_dvl.sensors.imu import Imu, ImuSettings
+from factorgraph_dvl.simulation.instruments import Interval, Sampled
 from factorgraph_dvl.simulation.motion import Motion, State
-from factorgraph_dvl.simulation.scenario import Interval, Sampled, Scenario
+from factorgraph_dvl.simulation.scenario import Scenario
 
 _CHUNK = 32768
 
@@ -40,7 +42,7 @@ def simulate_imu(
     truth = scenario.imu
     jitter_rng, bias_rng, walk_rng, noise_rng = rng.spawn(4)
     # The interval of the first sample must not begin before the motion does.
-    bounds = _times(truth, motion.duration, jitter_rng, first=0)
+    bounds = sample_times(truth, motion.duration, jitter_rng, first=0)
     time, interval = bounds[1:], np.diff(bounds)
     if time.size == 0:
         raise ConfigError(
@@ -85,9 +87,9 @@ def simulate_imu(
             white = noise_rng.standard_normal(gyro.shape)
             samples += white * (noise / np.sqrt(interval))[:, None]
         biases[name] = bias
-    keep = ~_within(time, truth.gaps_s)
+    keep = ~within(time, truth.gaps_s)
     imu = Imu(
-        settings=scenario.imu_settings(),
+        settings=cast("ImuSettings", scenario.settings("imu")),
         time=time[keep],
         gyro=gyro[keep],
         accel=accel[keep],
@@ -95,13 +97,14 @@ def simulate_imu(
     return imu, {name: bias[keep].mean(axis=0) for name, bias in biases.items()}
 
 
-def simulate_gnss(scenario: Scenario, motion: Motion, rng: np.random.Generator) -> Gnss:
-    """Return the receiver's record: position and velocity of the antenna."""
-    truth, settings = scenario.gnss, scenario.gnss_settings()
+def simulate_gnss(
+    scenario: Scenario, motion: Motion, rng: np.random.Generator
+) -> tuple[Gnss, dict[str, Array]]:
+    """Return the receiver's record, position and velocity of the antenna, and its truth."""
+    truth = scenario.gnss
     assert truth is not None
-    assert settings is not None
     jitter_rng, position_rng, velocity_rng = rng.spawn(3)
-    time = _times(truth, motion.duration, jitter_rng)
+    time = sample_times(truth, motion.duration, jitter_rng)
     state = motion.at(time)
     nRb = rotation_from_rph(state.rph, scenario.body_axes)
     arm_n = _apply(nRb, np.array(truth.lever_arm_m))
@@ -112,44 +115,56 @@ def simulate_gnss(scenario: Scenario, motion: Motion, rng: np.random.Generator) 
         velocity = np.full_like(velocity, np.nan)
     elif scenario.noise:
         velocity += velocity_rng.standard_normal(velocity.shape) * truth.velocity_std_m_s
-    keep = ~_within(time, truth.outages_s)
+    keep = ~within(time, truth.outages_s)
     unknown = np.full((int(keep.sum()), 3), np.nan)
-    return Gnss(
-        settings=settings,
+    gnss = Gnss(
+        settings=cast("GnssSettings", scenario.settings("gnss")),
         time=time[keep],
         geodetic=geodetic[keep],
         velocity=velocity[keep],
         position_std=unknown,
         velocity_std=unknown.copy(),
     )
+    return gnss, {"gnss_lever_arm_m": np.array(truth.lever_arm_m)}
 
 
-def simulate_dvl(scenario: Scenario, motion: Motion, rng: np.random.Generator) -> Dvl:
-    """Return the DVL's record.
+def simulate_dvl(
+    scenario: Scenario, motion: Motion, rng: np.random.Generator
+) -> tuple[Dvl, dict[str, Array]]:
+    """Return the DVL's record, and its calibration by reported name.
 
         v_d = (1 + k) C_b^d (v_b + omega_eb_b x l) + beta + noise,
 
     at the true time of the ping; the record's time is later by the time offset. Through
     the water, v_b lacks the current.
     """
-    truth, settings = scenario.dvl, scenario.dvl_settings()
+    truth = scenario.dvl
     assert truth is not None
-    assert settings is not None
     jitter_rng, noise_rng = rng.spawn(2)
-    time = _times(truth, motion.duration, jitter_rng)
+    time = sample_times(truth, motion.duration, jitter_rng)
     state = motion.at(time)
     velocity = _dvl_velocity(scenario, state)
     if scenario.noise:
         speed = np.linalg.norm(velocity, axis=1, keepdims=True)
         sigma = np.hypot(truth.velocity_std_m_s, truth.velocity_std_fraction * speed)
         velocity += sigma * noise_rng.standard_normal(velocity.shape)
-    velocity[_within(time, truth.no_lock_s)] = np.nan
-    return Dvl(
-        settings=settings,
+    velocity[within(time, truth.no_lock_s)] = np.nan
+    dvl = Dvl(
+        settings=cast("DvlSettings", scenario.settings("dvl")),
         time=time + truth.time_offset_s,
         velocity=velocity,
         std=np.full_like(velocity, np.nan),
     )
+    calibration = {
+        "misalignment_deg": np.array(truth.misalignment_deg),
+        "scale_error": np.atleast_1d(np.array(truth.scale_error, dtype=float)),
+        "lever_arm_m": np.array(truth.lever_arm_m),
+        "dvl_bias_m_s": np.array(truth.bias_m_s),
+        "time_offset_s": np.array([truth.time_offset_s]),
+    }
+    if truth.reference == "water":
+        calibration["current_m_s"] = np.array(scenario.current_m_s[:2])
+    return dvl, calibration
 
 
 def _dvl_velocity(scenario: Scenario, state: State) -> Array:
@@ -176,7 +191,7 @@ def _apply(matrices: Array, vectors: Array) -> Array:
     )
 
 
-def _times(
+def sample_times(
     sampled: Sampled, duration: float, rng: np.random.Generator, first: int | None = None
 ) -> Array:
     """Return times phase + k / rate after 0, or from k = `first` on, up to the end."""
@@ -189,7 +204,8 @@ def _times(
     return np.asarray(np.clip(time + shift, 0.0, duration))
 
 
-def _within(time: Array, intervals: Sequence[Interval]) -> NDArray[np.bool_]:
+def within(time: Array, intervals: Sequence[Interval]) -> NDArray[np.bool_]:
+    """Return which of the times lie within any of the intervals."""
     out = np.zeros(time.size, dtype=bool)
     for start, end in intervals:
         out |= (time >= start) & (time <= end)

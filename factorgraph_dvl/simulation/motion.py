@@ -16,7 +16,8 @@ from scipy.interpolate import PPoly
 from factorgraph_dvl.conventions import DEG, Array, BodyAxes, frd_from_body
 from factorgraph_dvl.earth import RATE, normal_gravity, radii
 from factorgraph_dvl.errors import ConfigError
-from factorgraph_dvl.simulation.scenario import Accelerate, Manoeuvre, Scenario, Straight
+from factorgraph_dvl.simulation.manoeuvres import Accelerate, Manoeuvre, Stop, Straight
+from factorgraph_dvl.simulation.scenario import Scenario
 
 _COLLOCATION_NODES = 6
 _MAX_LATITUDE = 89.5 * DEG
@@ -280,6 +281,16 @@ def _profiles(plan: list[Manoeuvre], speed: float, source: str) -> tuple[PPoly, 
             speed = m.to_m_s
         elif isinstance(m, Straight):
             add(m.straight_s, 0.0, 0.0, 0.0)
+        elif isinstance(m, Stop):
+            before = speed
+            if before > 0.0:
+                add(before / m.acceleration_m_s2, -m.acceleration_m_s2, 0.0, 0.0)
+            speed = 0.0
+            if m.stop_s > 0.0:
+                add(m.stop_s, 0.0, 0.0, 0.0)
+            if before > 0.0:
+                add(before / m.acceleration_m_s2, m.acceleration_m_s2, 0.0, 0.0)
+            speed = before
         else:
             rate = m.turn_deg_s * DEG
             if m.ramp_s > 0.0:

@@ -3,6 +3,7 @@
 ```yaml
 name: harbour
 body_axes: RFU                     # or FRD, FLU
+epoch: 2018-12-01T05:30:00Z        # UTC of time zero, needed for stars
 noise: true                        # false: exact measurements, constant biases only
 reference_rate_hz: 10
 start: {lat_deg: 36, lon_deg: 121, height_m: 0, heading_deg: 0, speed_m_s: 0}
@@ -10,6 +11,8 @@ manoeuvres:                        # one after the other
   - {accelerate_m_s2: 1, to_m_s: 4}
   - {straight_s: 100}
   - {turn_deg_s: -2, duration_s: 45, ramp_s: 3}   # positive to starboard
+  - {figure_eight_deg_s: 6}        # a full circle to starboard, then one to port
+  - {stop_s: 30, acceleration_m_s2: 0.2}          # to rest, stay, and back to the speed before
   - {repeat: 2, manoeuvres: [{straight_s: 10}, {turn_deg_s: 9, duration_s: 20}]}
 sway:                              # amplitude · sin(2 pi frequency · t + phase), summed
   roll: [{amplitude_deg: 4, frequency_hz: 2, phase_deg: 0}]
@@ -20,6 +23,7 @@ current_m_s: [0.1, 0.1, 0]         # east, north, up
 imu: {...}                         # ImuTruth: rate, errors
 gnss: {...}                        # GnssTruth, optional
 dvl: {...}                         # DvlTruth, optional
+star: {...}                        # StarTruth, optional
 trial:                             # what trial.yaml will claim
   imu: {gyro_bias_std_deg_h: 0.05, accel_bias_std_ug: 100}
   gnss: {}
@@ -35,29 +39,38 @@ and sampling is claimed as simulated.
 
 from __future__ import annotations
 
-import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
+from datetime import date
 from os import PathLike
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, TypeVar
 
 import msgspec
-import numpy as np
-import yaml
 
 from factorgraph_dvl.conventions import BodyAxes
 from factorgraph_dvl.errors import ConfigError
-from factorgraph_dvl.sensors.dvl import DvlSettings
-from factorgraph_dvl.sensors.gnss import GnssSettings
-from factorgraph_dvl.sensors.imu import ImuSettings
-from factorgraph_dvl.sensors.protocol import NonNegative, Positive, Section, Sigma3, Vector3
+from factorgraph_dvl.sensors.catalogue import AIDS
+from factorgraph_dvl.sensors.protocol import (
+    NonNegative,
+    Positive,
+    Section,
+    SensorSection,
+    Vector3,
+    check_epoch,
+)
+from factorgraph_dvl.simulation.convert import convert
+from factorgraph_dvl.simulation.instruments import (
+    DvlTruth,
+    GnssTruth,
+    ImuTruth,
+    Instrument,
+    StarTruth,
+)
+from factorgraph_dvl.simulation.manoeuvres import Manoeuvre, flatten
+from factorgraph_dvl.yaml_file import read_yaml
 
 Latitude = Annotated[float, msgspec.Meta(ge=-89, le=89)]
 Longitude = Annotated[float, msgspec.Meta(ge=-360, le=360)]
-Interval = tuple[float, float]
-_T = TypeVar("_T")
-# More than any trial has, far fewer than would exhaust memory.
-_MAX_MANOEUVRES = 100_000
 
 
 class Start(Section, frozen=True, kw_only=True):
@@ -68,48 +81,6 @@ class Start(Section, frozen=True, kw_only=True):
     height_m: float = 0.0
     heading_deg: float = 0.0
     speed_m_s: NonNegative = 0.0
-
-
-class Accelerate(Section, frozen=True, kw_only=True):
-    """Change the speed through the water at a constant rate."""
-
-    accelerate_m_s2: float
-    to_m_s: NonNegative
-
-
-class Straight(Section, frozen=True, kw_only=True):
-    """Keep speed and heading."""
-
-    straight_s: Positive
-
-
-class Turn(Section, frozen=True, kw_only=True):
-    """Turn by turn_deg_s · duration_s, to starboard where positive."""
-
-    turn_deg_s: float
-    duration_s: Positive
-    ramp_s: NonNegative = 0.0
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.ramp_s > self.duration_s:
-            raise ValueError("`ramp_s` must not exceed `duration_s`")
-
-
-class Repeat(Section, frozen=True, kw_only=True):
-    """Run a list of manoeuvres several times."""
-
-    repeat: Annotated[int, msgspec.Meta(ge=1)]
-    manoeuvres: list[dict[str, Any]]
-
-
-Manoeuvre = Accelerate | Straight | Turn
-_MANOEUVRES: dict[str, type[Accelerate | Straight | Turn | Repeat]] = {
-    "accelerate_m_s2": Accelerate,
-    "straight_s": Straight,
-    "turn_deg_s": Turn,
-    "repeat": Repeat,
-}
 
 
 class AngularSway(Section, frozen=True, kw_only=True):
@@ -137,77 +108,6 @@ class SwaySettings(Section, frozen=True, kw_only=True):
     heave: tuple[Heave, ...] = ()
 
 
-class Sampled(Section, frozen=True, kw_only=True):
-    """When a sensor measures: at phase_s + k / rate_hz, each shifted by at most jitter_s."""
-
-    rate_hz: Positive
-    phase_s: NonNegative = 0.0
-    jitter_s: NonNegative = 0.0
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.phase_s >= 1.0 / self.rate_hz:
-            raise ValueError("`phase_s` must be below one period, 1 / rate_hz")
-        if self.jitter_s >= 0.5 / self.rate_hz:
-            raise ValueError("`jitter_s` must be below half a period, 0.5 / rate_hz")
-
-
-class ImuTruth(Sampled, frozen=True, kw_only=True):
-    """The simulated IMU; `draw` takes a bias from N(0, std²), anew for each seed."""
-
-    sampling: Literal["mean", "instantaneous"] = "mean"
-    gaps_s: tuple[Interval, ...] = ()
-    gyro_bias_deg_h: Vector3 | Literal["draw"] = (0.0, 0.0, 0.0)
-    gyro_bias_std_deg_h: Positive | None = None
-    gyro_bias_walk_deg_h_sqrt_h: NonNegative = 0.0
-    gyro_noise_deg_sqrt_h: NonNegative = 0.0
-    accel_bias_ug: Vector3 | Literal["draw"] = (0.0, 0.0, 0.0)
-    accel_bias_std_ug: Positive | None = None
-    accel_bias_walk_ug_sqrt_h: NonNegative = 0.0
-    accel_noise_ug_sqrt_hz: NonNegative = 0.0
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        _check_intervals("gaps_s", self.gaps_s)
-        if self.gyro_bias_deg_h == "draw" and self.gyro_bias_std_deg_h is None:
-            raise ValueError("`gyro_bias_deg_h: draw` needs `gyro_bias_std_deg_h`")
-        if self.accel_bias_ug == "draw" and self.accel_bias_std_ug is None:
-            raise ValueError("`accel_bias_ug: draw` needs `accel_bias_std_ug`")
-
-
-class GnssTruth(Sampled, frozen=True, kw_only=True):
-    """The simulated receiver; without velocity_std_m_s it measures no velocity."""
-
-    position_std_m: Sigma3
-    velocity_std_m_s: Sigma3 | None = None
-    lever_arm_m: Vector3 = (0.0, 0.0, 0.0)
-    outages_s: tuple[Interval, ...] = ()
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        _check_intervals("outages_s", self.outages_s)
-
-
-class DvlTruth(Sampled, frozen=True, kw_only=True):
-    """The simulated DVL; the noise variance is floor² + (fraction · |v|)²."""
-
-    misalignment_deg: Vector3 = (0.0, 0.0, 0.0)
-    scale_error: float | Vector3 = 0.0
-    lever_arm_m: Vector3 = (0.0, 0.0, 0.0)
-    bias_m_s: Vector3 = (0.0, 0.0, 0.0)
-    time_offset_s: float = 0.0
-    velocity_std_m_s: NonNegative = 0.0
-    velocity_std_fraction: NonNegative = 0.0
-    reference: Literal["bottom", "water"] = "bottom"
-    no_lock_s: tuple[Interval, ...] = ()
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        _check_intervals("no_lock_s", self.no_lock_s)
-        if np.any(np.atleast_1d(self.scale_error) <= -1.0):
-            raise ValueError("`scale_error` must be above -1")
-
-
 class InitialClaim(Section, frozen=True, kw_only=True):
     """Priors at the first IMU sample: the truth plus an error. No std = no such prior."""
 
@@ -223,6 +123,7 @@ class Claims(Section, frozen=True, kw_only=True):
     imu: dict[str, Any] = msgspec.field(default_factory=dict)
     gnss: dict[str, Any] = msgspec.field(default_factory=dict)
     dvl: dict[str, Any] = msgspec.field(default_factory=dict)
+    star: dict[str, Any] = msgspec.field(default_factory=dict)
     initial: InitialClaim | None = None
 
 
@@ -231,6 +132,7 @@ class Scenario(Section, frozen=True, kw_only=True):
 
     name: str
     body_axes: BodyAxes = "RFU"
+    epoch: str = ""
     noise: bool = True
     reference_rate_hz: Positive = 10.0
     start: Start
@@ -240,8 +142,13 @@ class Scenario(Section, frozen=True, kw_only=True):
     imu: ImuTruth
     gnss: GnssTruth | None = None
     dvl: DvlTruth | None = None
+    star: StarTruth | None = None
     trial: Claims = Claims()
-    source: str = "scenario"
+    source: str = ""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_epoch(self.epoch)
 
     def plan(self) -> list[Manoeuvre]:
         """Return the manoeuvres with repetitions written out.
@@ -251,47 +158,30 @@ class Scenario(Section, frozen=True, kw_only=True):
         ConfigError
             If one is not valid.
         """
-        return _flatten(self.manoeuvres, "manoeuvres", self.source)
+        return flatten(self.manoeuvres, "manoeuvres", self.source)
 
-    def imu_settings(self) -> ImuSettings:
-        """Return section `imu` of the trial."""
-        simulated: dict[str, Any] = {
-            name: getattr(self.imu, name)
-            for name in (
-                "sampling",
-                "gyro_noise_deg_sqrt_h",
-                "gyro_bias_walk_deg_h_sqrt_h",
-                "gyro_bias_std_deg_h",
-                "accel_noise_ug_sqrt_hz",
-                "accel_bias_walk_ug_sqrt_h",
-                "accel_bias_std_ug",
-            )
-            if getattr(self.imu, name) is not None
-        }
-        return _convert(simulated | self.trial.imu, ImuSettings, "trial.imu", self.source)
+    @property
+    def aids(self) -> dict[str, Instrument]:
+        """The simulated sensors other than the IMU, by section."""
+        given = {aid.section: getattr(self, aid.section) for aid in AIDS}
+        return {name: truth for name, truth in given.items() if truth is not None}
 
-    def gnss_settings(self) -> GnssSettings | None:
-        """Return section `gnss` of the trial, None if there is no receiver."""
-        if self.gnss is None:
-            return None
-        simulated: dict[str, Any] = {
-            "position_std_m": self.gnss.position_std_m,
-            "lever_arm_m": self.gnss.lever_arm_m,
-        }
-        if self.gnss.velocity_std_m_s is not None:
-            simulated["velocity_std_m_s"] = self.gnss.velocity_std_m_s
-        return _convert(simulated | self.trial.gnss, GnssSettings, "trial.gnss", self.source)
+    def settings(self, section: str) -> SensorSection:
+        """Return a sensor's section of the trial: as simulated, but for what it claims.
 
-    def dvl_settings(self) -> DvlSettings | None:
-        """Return section `dvl` of the trial, None if there is no DVL."""
-        if self.dvl is None:
-            return None
-        simulated: dict[str, Any] = {
-            "velocity_std_m_s": self.dvl.velocity_std_m_s,
-            "velocity_std_fraction": self.dvl.velocity_std_fraction,
-            "reference": self.dvl.reference,
-        }
-        return _convert(simulated | self.trial.dvl, DvlSettings, "trial.dvl", self.source)
+        Raises
+        ------
+        ConfigError
+            If a claim is not valid.
+        """
+        truth: Instrument = getattr(self, section)
+        claims = getattr(self.trial, section)
+        return convert(
+            truth.claimed() | claims, truth.section_type, f"trial.{section}", self.source
+        )
+
+
+_S = TypeVar("_S", bound=Scenario)
 
 
 def load_scenario(path: str | PathLike[str]) -> Scenario:
@@ -301,23 +191,18 @@ def load_scenario(path: str | PathLike[str]) -> Scenario:
     ------
     ConfigError
         If the file is missing, is not YAML, or holds an unknown key, a wrong type or a
-        value out of range; the message names file and key.
+        value out of range; the message names file, line and key.
     """
+    return read_scenario(path, Scenario)
+
+
+def read_scenario(path: str | PathLike[str], kind: type[_S]) -> _S:
+    """Read a scenario, or what has more keys than one; otherwise as `load_scenario`."""
     path = Path(path)
-    try:
-        data = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise ConfigError(
-            f"cannot read the scenario ({error.strerror})",
-            where=str(path),
-            expected="a YAML file",
-        ) from error
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        mark = getattr(error, "problem_mark", None)
-        where = f"{path} line {mark.line + 1}" if mark else str(path)
-        problem = getattr(error, "problem", None) or "not text in UTF-8"
-        raise ConfigError(f"not valid YAML ({problem})", where=where) from error
-    return parse_scenario(data, str(path))
+    scenario = read_yaml(path, kind, source=str(path))
+    if scenario.source:
+        raise ConfigError("unknown key `source`", where=str(path))
+    return _checked(msgspec.structs.replace(scenario, source=str(path)))
 
 
 def parse_scenario(data: Mapping[str, Any], source: str = "scenario") -> Scenario:
@@ -326,77 +211,29 @@ def parse_scenario(data: Mapping[str, Any], source: str = "scenario") -> Scenari
     Parameters
     ----------
     data : keys and values as in the file.
-    source : name of the file, for messages.
+    source : name of their origin, for messages.
 
     Raises
     ------
     ConfigError
         As `load_scenario`.
     """
-    if not isinstance(data, Mapping):
-        raise ConfigError(
-            "this is not a scenario",
-            where=source,
-            expected="keys such as `name`, `start`, `manoeuvres` and `imu`",
-        )
-    if "source" in data:
-        raise ConfigError("object contains unknown field `source`", where=source)
-    scenario = _convert({**data, "source": source}, Scenario, "", source)
+    if isinstance(data.get("epoch"), date):
+        # A type of YAML 1.1, which this format has as text.
+        data = {**data, "epoch": data["epoch"].isoformat()}
+    return _checked(convert({**data, "source": source}, Scenario, "", source))
+
+
+def _checked(scenario: _S) -> _S:
+    source = scenario.source
     scenario.plan()
-    scenario.imu_settings()
-    scenario.gnss_settings()
-    scenario.dvl_settings()
-    for name in ("gnss", "dvl"):
-        if getattr(scenario, name) is None and getattr(scenario.trial, name):
+    for name in ("imu", *scenario.aids):
+        scenario.settings(name)
+    for name in (aid.section for aid in AIDS):
+        if name not in scenario.aids and getattr(scenario.trial, name):
             raise ConfigError(
                 f"the trial claims a {name} that is not simulated",
                 where=f"{source} key trial.{name}",
                 expected=f"a section `{name}` beside it",
             )
     return scenario
-
-
-def _convert(data: Any, kind: type[_T], key: str, source: str) -> _T:
-    try:
-        return msgspec.convert(data, kind)
-    except msgspec.ValidationError as error:
-        what, _, path = str(error).partition(" - at ")
-        inner = path.strip("`").removeprefix("$").removeprefix(".")
-        full = re.sub(r"\.(?=\[)", "", ".".join(part for part in (key, inner) if part))
-        where = f"{source} key {full}" if full else source
-        raise ConfigError(what[:1].lower() + what[1:], where=where) from error
-
-
-def _flatten(items: Sequence[Mapping[str, Any]], key: str, source: str) -> list[Manoeuvre]:
-    out: list[Manoeuvre] = []
-    for i, item in enumerate(items):
-        kinds = [kind for name, kind in _MANOEUVRES.items() if name in item]
-        if len(kinds) != 1:
-            raise ConfigError(
-                f"{sorted(item)} is not a manoeuvre",
-                where=f"{source} key {key}[{i}]",
-                expected=f"exactly one of {', '.join(_MANOEUVRES)}",
-            )
-        manoeuvre = _convert(dict(item), kinds[0], f"{key}[{i}]", source)
-        if isinstance(manoeuvre, Repeat):
-            inner = _flatten(manoeuvre.manoeuvres, f"{key}[{i}].manoeuvres", source)
-            if len(out) + len(inner) * manoeuvre.repeat > _MAX_MANOEUVRES:
-                raise ConfigError(
-                    "the repetitions add up to too many manoeuvres",
-                    where=f"{source} key {key}[{i}].repeat",
-                    expected=f"at most {_MAX_MANOEUVRES} in all",
-                )
-            out += inner * manoeuvre.repeat
-        else:
-            out.append(manoeuvre)
-    if not out:
-        raise ConfigError(
-            "there is no manoeuvre", where=f"{source} key {key}", expected="at least one"
-        )
-    return out
-
-
-def _check_intervals(name: str, intervals: Sequence[Interval]) -> None:
-    for start, end in intervals:
-        if not start <= end:
-            raise ValueError(f"`{name}` must hold pairs [start, end] with start <= end")

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from factorgraph_dvl.alignment import initial_states
+from factorgraph_dvl.attitude_alignment import attitudes, mean_mounting
 from factorgraph_dvl.chain import Chain, inertial_chain
+from factorgraph_dvl.conventions import Array
 from factorgraph_dvl.earth import LocalFrame
 from factorgraph_dvl.errors import ConfigError
 from factorgraph_dvl.graph import Known, Problem
@@ -17,7 +19,7 @@ from factorgraph_dvl.mounting import initial_mounting
 from factorgraph_dvl.preintegration import Segments, States, attach, motion_at, segments
 from factorgraph_dvl.sensors.protocol import Aid, Motion, Observation, Parameter
 from factorgraph_dvl.solution import Solution
-from factorgraph_dvl.solvers.covariance import posterior
+from factorgraph_dvl.solvers.covariance import Posterior, posterior
 from factorgraph_dvl.solvers.feigned import at_prior_along, feigned_directions
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, Progress, minimise
 from factorgraph_dvl.solvers.summary import summarise
@@ -33,6 +35,25 @@ _SAME_GRAVITY = 2.0
 _ROUGH = 1.0
 _ROUGH_ITERATIONS = 10
 _ROUNDS = 4
+
+
+@dataclass(frozen=True)
+class Minimised:
+    """A trial at its minimum, before it is summarised.
+
+    Parameters
+    ----------
+    problem, minimum, covariances : what was minimised, and where it ended.
+    held : (P, h) directions that are not observable, in units of the priors' standard
+        deviations.
+    notes : what is worth telling.
+    """
+
+    problem: Problem
+    minimum: Minimum
+    covariances: Posterior
+    held: Array
+    notes: tuple[str, ...]
 
 
 def solve(
@@ -64,9 +85,31 @@ def solve(
     SolveError
         If no minimum can be searched for at all.
     """
-    for name, value in (("rate_hz", rate_hz), ("state_interval_s", state_interval_s)):
-        if not (np.isfinite(value) and value > 0.0):
-            raise ConfigError(f"{name} is {value}", expected="a number above 0")
+    _check_above_zero("rate_hz", rate_hz)
+    found = minimised(trial, state_interval_s=state_interval_s, progress=progress)
+    return solution_of(found, rate_hz)
+
+
+def solution_of(found: Minimised, rate_hz: float) -> Solution:
+    """Return the solution at a minimum, with a trajectory of so many Hz."""
+    return summarise(
+        found.problem,
+        found.minimum,
+        found.covariances,
+        held=found.held,
+        rate_hz=rate_hz,
+        notes=found.notes,
+    )
+
+
+def minimised(
+    trial: Trial,
+    *,
+    state_interval_s: float = STATE_INTERVAL,
+    progress: Progress | None = None,
+) -> Minimised:
+    """Minimise the problem of a trial; arguments and errors as of `solve`."""
+    _check_above_zero("state_interval_s", state_interval_s)
     report = progress or (lambda stage, iteration, cost: None)
     problem, minimum, notes = fit(trial, state_interval_s=state_interval_s, progress=report)
     report("covariance", 0, None)
@@ -81,7 +124,7 @@ def solve(
         )
         minimum = replace(again, iterations=minimum.iterations + again.iterations)
         covariances = posterior(problem, minimum)
-    return summarise(problem, minimum, covariances, held=held, rate_hz=rate_hz, notes=notes)
+    return Minimised(problem, minimum, covariances, held, notes)
 
 
 def fit(
@@ -117,11 +160,11 @@ def fit(
             p_gravity = states.p_n
         if values is None:
             if trial.gnss is not None:
-                coarse = _without_dvl(chain, states, progress)
+                coarse = _without_dvl(chain, states, start.mountings, progress)
                 iterations += coarse.iterations
                 states = coarse.evaluation.states
             progress("mounting", 0, None)
-            values = _mounting(trial, frame, seg, chain.gravity_n, states)
+            values = start.mountings | _mountings(trial, frame, seg, chain.gravity_n, states)
         problem = Problem(chain, *_sensors(trial.aids, frame), start=values, known=known)
         at = problem.values(states, {**problem.prior_values(), **values})
         minimum = minimise(problem, at, stage="all sensors", progress=progress)
@@ -133,13 +176,27 @@ def fit(
     return problem, replace(minimum, iterations=iterations), notes
 
 
-def _without_dvl(chain: Chain, states: States, report: Progress) -> Minimum:
+def _check_above_zero(name: str, value: float) -> None:
+    """Raise ConfigError unless a number is finite and above 0."""
+    if not (np.isfinite(value) and value > 0.0):
+        raise ConfigError(f"{name} is {value}", expected="a number above 0")
+
+
+def _without_dvl(
+    chain: Chain, states: States, mountings: dict[str, np.ndarray], report: Progress
+) -> Minimum:
+    """Return the minimum without the sensors whose mounting that is to tell."""
     trial = chain.trial
-    assert trial.gnss is not None
-    problem = Problem(chain, *_sensors([trial.gnss], chain.frame))
+    unknown = {a.mounting.name for a in attitudes(trial, chain.frame)} - mountings.keys()
+    used = [
+        aid
+        for aid in trial.aids
+        if aid is not trial.dvl and not any(p.name in unknown for p in aid.parameters())
+    ]
+    problem = Problem(chain, *_sensors(used, chain.frame), start=mountings)
     return minimise(
         problem,
-        problem.values(states, problem.prior_values()),
+        problem.values(states, problem.prior_values() | mountings),
         stage="inertial and GNSS",
         progress=report,
         max_iterations=_ROUGH_ITERATIONS,
@@ -154,16 +211,22 @@ def _sensors(aids: Sequence[Aid], frame: LocalFrame) -> tuple[list[Observation],
     return observations, parameters
 
 
-def _mounting(
+def _mountings(
     trial: Trial, frame: LocalFrame, seg: Segments, gravity_n: np.ndarray, states: States
 ) -> dict[str, np.ndarray]:
-    if trial.dvl is None:
-        return {}
+    """Return values of the sensors' mountings, rotations as matrices, by the motion."""
 
-    def motion_at_pings(pings: np.ndarray, time: np.ndarray) -> tuple[Motion, np.ndarray]:
+    def motion_by(time: np.ndarray) -> tuple[Motion, np.ndarray]:
         index, since, covered = seg.increments.locate(time)
         inside = seg.increments.start[index] + np.clip(since, 0.0, seg.increments.dt[index])
         at = attach(seg, np.where(covered, time, inside), frame.earth_rate)
         return motion_at(at, states, gravity_n, frame.earth_rate), covered
 
-    return initial_mounting(trial.dvl, motion_at_pings)
+    out = {}
+    for seen in attitudes(trial, frame):
+        if seen.mounting.estimated:
+            motion, covered = motion_by(seen.time)
+            out[seen.mounting.name] = mean_mounting(seen, motion.nRb * covered[:, None, None])
+    if trial.dvl is not None:
+        out |= initial_mounting(trial.dvl, lambda pings, time: motion_by(time))
+    return out

@@ -14,7 +14,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from scipy.linalg import eigh
 
 from factorgraph_dvl.conventions import Array, rotate, skew
 from factorgraph_dvl.graph import Evaluation, Problem
@@ -24,7 +23,7 @@ from factorgraph_dvl.solvers.covariance import Posterior
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum
 
 # Share of the error of the motion in the information from which on it is not believed.
-_FEIGNED = 0.5
+FEIGNED = 0.5
 # Information, in units of the prior's, that is not worth the question.
 _LITTLE = 0.1
 # Genuine information, in the same units, below which a direction is left to the prior once
@@ -32,12 +31,16 @@ _LITTLE = 0.1
 _GENUINE = 0.5
 
 
-def feigned_directions(problem: Problem, minimum: Minimum, covariances: Posterior) -> Array:
+def feigned_directions(
+    problem: Problem, minimum: Minimum, covariances: Posterior, *, at_truth: bool = False
+) -> Array:
     """Return directions that are not observable, if the information on any is feigned.
 
     Parameters
     ----------
     problem, minimum, covariances : at the minimum.
+    at_truth : the motion there is the true one, and feigns nothing: return what will be
+        found once it is estimated.
 
     Returns
     -------
@@ -46,42 +49,29 @@ def feigned_directions(problem: Problem, minimum: Minimum, covariances: Posterio
     if not problem.parameters:
         return np.zeros((0, 0))
     functionals = [{problem.key(p.name): np.eye(p.mean.size)} for p in problem.parameters]
-    P = covariances.information.covariance_of(functionals)
+    scale = problem.prior_sigma
+    P = covariances.information.covariance_of(functionals) / np.outer(scale, scale)
+    data = np.linalg.inv(P) - np.eye(scale.size)
     feigned = feigned_information(problem, minimum.evaluation, covariances.nodes)
-    return feigned_among(P, feigned, problem.prior_sigma)
-
-
-def feigned_among(P: Array, feigned: Array, prior_sigma: Array) -> Array:
-    """Return directions that are not observable, as `feigned_directions` does.
-
-    Parameters
-    ----------
-    P : (P, P) covariance of the parameters, SI.
-    feigned : (P, P) information that the motion's error adds, SI.
-    prior_sigma : (P,) SI.
-    """
-    size = prior_sigma.size
-    scaled = np.outer(prior_sigma, prior_sigma)
-    data = np.linalg.inv(P / scaled) - np.eye(size)
-    data = 0.5 * (data + data.T)
-    feigned = feigned * scaled
-    share = eigh(feigned, _positive(data) + _LITTLE * np.eye(size), eigvals_only=True)
-    if share.max() < _FEIGNED:
-        return np.zeros((size, 0))
-    genuine, directions = np.linalg.eigh(data - feigned)
-    return np.asarray(directions[:, genuine < _GENUINE])
+    total = feigned.sum(axis=0)
+    return directions_not_told(data + total if at_truth else data, total)
 
 
 def feigned_information(problem: Problem, evaluation: Evaluation, nodes: Array) -> Array:
-    """Return the information, (P, P), SI, that the error of the motion is expected to add.
+    """Return the information that the error of the motion feigns, by node.
 
     Parameters
     ----------
-    problem, evaluation : of what was minimised.
+    problem, evaluation : linearised there.
     nodes : (K, 9, 9) covariances of the states, in GTSAM's tangent space.
+
+    Returns
+    -------
+    (K, P, P) expected share of the measurements that hang on each node, in units of the
+    priors' standard deviations.
     """
-    size = problem.prior_sigma.size
-    feigned = np.zeros((size, size))
+    scale = problem.prior_sigma
+    out = np.zeros((nodes.shape[0], scale.size, scale.size))
     for observation, attachment, motion, weight in zip(
         problem.observations,
         problem.attachments,
@@ -91,8 +81,7 @@ def feigned_information(problem: Problem, evaluation: Evaluation, nodes: Array) 
     ):
         names = [p.name for p in problem.parameters if p.name in observation.parameters]
         if names:
-            columns = np.concatenate([_range(problem.columns[name]) for name in names])
-            feigned[np.ix_(columns, columns)] += feigned_by(
+            part = feigned_by(
                 observation,
                 attachment,
                 motion,
@@ -101,17 +90,48 @@ def feigned_information(problem: Problem, evaluation: Evaluation, nodes: Array) 
                 evaluation.parameters,
                 names,
             )
-    return feigned
+            places = [problem.columns[name] for name in names]
+            columns = np.concatenate([np.arange(p.start, p.stop) for p in places])
+            np.add.at(out, (attachment.node[:, None, None], columns[:, None], columns), part)
+    return out * np.outer(scale, scale)
 
 
-def _range(place: slice) -> np.ndarray:
-    return np.arange(place.start, place.stop)
+def directions_not_told(data: Array, feigned: Array) -> Array:
+    """Return the directions (P, h) that are not observable, if any is feigned.
+
+    Parameters
+    ----------
+    data : (P, P) information of the data, beside the prior's identity; what is feigned
+        included.
+    feigned : (P, P) that share of it.
+    """
+    if not largest_feigned_share(data, feigned) >= FEIGNED:
+        return np.zeros((data.shape[0], 0))
+    genuine, directions = np.linalg.eigh(data - feigned)
+    return np.asarray(directions[:, genuine < _GENUINE])
+
+
+def largest_feigned_share(data: Array, feigned: Array) -> Array:
+    """Return the largest share of feigned information in any direction, (...).
+
+    Parameters
+    ----------
+    data, feigned : (..., P, P) as of `directions_not_told`.
+    """
+    data = 0.5 * (data + np.swapaxes(data, -1, -2))
+    L = np.linalg.cholesky(_positive(data) + _LITTLE * np.eye(data.shape[-1]))
+    half = np.linalg.solve(L, feigned)
+    whitened = np.linalg.solve(L, np.swapaxes(half, -1, -2))
+    return np.asarray(
+        np.linalg.eigvalsh(0.5 * (whitened + np.swapaxes(whitened, -1, -2)))[..., -1]
+    )
 
 
 def _positive(matrix: Array) -> Array:
-    """Return a symmetric matrix without its negative eigenvalues."""
+    """Return symmetric matrices without their negative eigenvalues."""
     values, vectors = np.linalg.eigh(matrix)
-    return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)
+    kept = vectors * np.maximum(values, 0.0)[..., None, :]
+    return np.asarray(kept @ np.swapaxes(vectors, -1, -2))
 
 
 def at_prior_along(
@@ -136,7 +156,7 @@ def feigned_by(
     values: Values,
     wanted: Sequence[str],
 ) -> Array:
-    """Return the expectation of the information that the motion's error adds, SI.
+    """Return what the motion's error is expected to add by measurement, (M, p, p), SI.
 
     Parameters
     ----------
@@ -145,7 +165,7 @@ def feigned_by(
     weight : (M, d) inverse standard deviations.
     P : (M, 9, 9) covariances of the nodes before them, in GTSAM's tangent space.
     values : of all parameters.
-    wanted : names of the parameters whose information is asked for.
+    wanted : names of the parameters, of p columns, whose information is asked for.
     """
 
     def jacobian(at: Motion) -> Array:
@@ -161,7 +181,7 @@ def feigned_by(
     )
     covariance = by_state @ P @ by_state.transpose(0, 2, 1)
     root = np.linalg.cholesky(covariance + 1e-16 * np.eye(3))
-    out = np.zeros((size, size))
+    out = np.zeros((attachment.node.size, size, size))
     for k in range(3):
         axis = np.eye(3)[k]
         waver = rotate(motion.nRb, root[:, :, k])
@@ -173,6 +193,5 @@ def feigned_by(
             replace(motion, alpha_b=motion.alpha_b + attachment.alpha_sigma[:, None] * axis),
         ):
             change = (jacobian(changed) - base) * weight[:, :, None]
-            flat = change.reshape(-1, size)
-            out += flat.T @ flat
+            out += change.transpose(0, 2, 1) @ change
     return out

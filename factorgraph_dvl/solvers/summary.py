@@ -16,13 +16,13 @@ from factorgraph_dvl.conventions import (
     rph_from_rotation,
     rph_jacobian,
 )
-from factorgraph_dvl.graph import Problem
+from factorgraph_dvl.graph import Evaluation, Problem
 from factorgraph_dvl.preintegration import States, attach, motion_at, segment_ends
-from factorgraph_dvl.sensors.protocol import Motion
+from factorgraph_dvl.sensors.protocol import Motion, Parameter
 from factorgraph_dvl.solution import Estimate, Residuals, Solution, Trajectory, doubts
 from factorgraph_dvl.solvers.covariance import Posterior, SquareRootInformation
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum
-from factorgraph_dvl.solvers.reported import Reported, estimates_of, in_order, reported
+from factorgraph_dvl.solvers.reported import estimates_of, in_order, in_unit
 
 
 def summarise(
@@ -47,7 +47,7 @@ def summarise(
     chain = problem.chain
     trial = chain.trial
     evaluation = minimum.evaluation
-    estimates, covariance = _calibration(problem, minimum, covariances.information, held)
+    estimates, covariance = calibration(problem, evaluation, covariances.information, held)
     trajectory = _trajectory(problem, evaluation.states, covariances.nodes, rate_hz)
     residuals = _residuals(problem, minimum)
     warnings = [*notes]
@@ -74,37 +74,55 @@ def summarise(
     )
 
 
-def _calibration(
-    problem: Problem, minimum: Minimum, information: SquareRootInformation, held: Array
-) -> tuple[tuple[Estimate, ...], Array]:
-    chain, evaluation = problem.chain, minimum.evaluation
+def reported(
+    problem: Problem, evaluation: Evaluation
+) -> list[tuple[Parameter, Array, dict[int, Array] | None]]:
+    """Return all calibration parameters in the order in which they are reported.
+
+    Each with its value in reported units and the derivatives of that with respect to the
+    variables of the graph, by key; None for one that is fixed.
+    """
+    chain = problem.chain
     time = chain.segments.node_time
     weight = _mean_weights(time)
     gyro, accel = chain.trial.imu.parameters(float(time[-1] - time[0]))
     states = evaluation.states
-    rows: list[Reported] = []
-    functionals: dict[str, dict[int, Array]] = {}
+    rows: list[tuple[Parameter, Array, dict[int, Array] | None]] = []
     for parameter, bias, first in ((gyro, states.gyro_bias, 3), (accel, states.accel_bias, 0)):
         select = np.eye(6)[first : first + 3] / parameter.si
-        functionals[parameter.name] = (
+        functional = (
             {keys.bias(k): w * select for k, w in enumerate(weight)}
             if chain.walking
             else {keys.bias(0): select}
         )
-        rows.append(reported(parameter, weight @ bias))
+        rows.append((parameter, weight @ bias / parameter.si, functional))
     for p in problem.all_parameters:
-        row = reported(p, evaluation.parameters[p.name])
-        if p.estimated:
-            functionals[p.name] = {problem.key(p.name): row.derivative}
-        rows.append(row)
-    rows = in_order(rows)
-    free = [functionals[r.parameter.name] for r in rows if r.parameter.name in functionals]
+        row = in_unit(p, evaluation.parameters[p.name])
+        own = {problem.key(p.name): row.derivative} if p.estimated else None
+        rows.append((p, row.value, own))
+    return in_order(rows, lambda r: r[0])
+
+
+def calibration(
+    problem: Problem, evaluation: Evaluation, information: SquareRootInformation, held: Array
+) -> tuple[tuple[Estimate, ...], Array]:
+    """Return the calibration with its joint covariance, in reported units.
+
+    Parameters
+    ----------
+    problem, evaluation, information : at the minimum.
+    held : as of `summarise`.
+    """
+    rows = reported(problem, evaluation)
+    free = [f for _, _, f in rows if f is not None]
     joint = information.covariance_of(free)
-    return estimates_of(rows, joint + _prior_in(problem, held, free))
+    spread = prior_along(problem, held, free)
+    joint = joint + spread @ spread.T
+    return estimates_of([(p, value) for p, value, _ in rows], joint)
 
 
-def _prior_in(problem: Problem, held: Array, functionals: Sequence[dict[int, Array]]) -> Array:
-    """Return the prior covariance of functionals along the held directions."""
+def prior_along(problem: Problem, held: Array, functionals: Sequence[dict[int, Array]]) -> Array:
+    """Return a root (n, h) of the prior covariance of functionals along held directions."""
     spread = problem.prior_sigma[:, None] * held if held.size else held
     by_key = {problem.key(name): spread[place] for name, place in problem.columns.items()}
     parts = []
@@ -115,8 +133,7 @@ def _prior_in(problem: Problem, held: Array, functionals: Sequence[dict[int, Arr
             if key in by_key:
                 part += matrix @ by_key[key]
         parts.append(part)
-    stacked = np.concatenate(parts)
-    return stacked @ stacked.T
+    return np.concatenate(parts)
 
 
 def _mean_weights(time: Array) -> Array:

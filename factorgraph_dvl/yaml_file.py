@@ -39,13 +39,14 @@ for _tag, _pattern, _first in (
     )
 
 
-def read_yaml(path: Path, kind: type[T]) -> T:
+def read_yaml(path: Path, kind: type[T], *, source: str = "") -> T:
     """Read a YAML file into settings of a msgspec type.
 
     Parameters
     ----------
     path : of the file.
     kind : the type; it should forbid unknown fields.
+    source : name of the file in messages; by default that of `path`.
 
     Raises
     ------
@@ -53,7 +54,7 @@ def read_yaml(path: Path, kind: type[T]) -> T:
         If the file is missing or no YAML, or a key is unknown, missing, given twice,
         of the wrong type or out of range.
     """
-    return parse_yaml(read_text(path), kind, source=path.name)
+    return parse_yaml(read_text(path), kind, source=source or path.name)
 
 
 def read_text(path: Path) -> str:
@@ -182,7 +183,7 @@ def _explain(message: str, root: yaml.Node, value: Any, kind: Any, source: str) 
         return ConfigError(
             f"missing key `{_dotted((*path, match['name']))}`",
             where=where(path) if path else source,
-            expected="it to be given",
+            expected="this key",
         )
     if not reason.startswith(("Expected", "Invalid enum")):
         for name in re.findall(r"`(\w+)`", reason):

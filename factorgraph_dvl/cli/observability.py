@@ -1,0 +1,119 @@
+"""The command `observability`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.text import Text
+
+from factorgraph_dvl.cli.console import (
+    ProgressLine,
+    print_table,
+    print_written,
+    stderr,
+    stdout,
+    warn,
+)
+from factorgraph_dvl.cli.options import Force, NoFigures, Quiet
+
+if TYPE_CHECKING:
+    from factorgraph_dvl.analysis.observability import Observability
+
+
+def observability(
+    source: Annotated[
+        Path,
+        typer.Argument(metavar="TRIAL|SOLUTION", help="Trial folder, or solution folder."),
+    ],
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder to write.")],
+    segments: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Segments, a YAML file; by default they are found."),
+    ] = None,
+    force: Force = False,
+    no_figures: NoFigures = False,
+    quiet: Quiet = False,
+) -> None:
+    """Show what the data can tell, what they cannot, and which motion told it."""
+    from factorgraph_dvl.io.folders import check_output, new_folder
+    from factorgraph_dvl.io.segments_file import read_segments
+    from factorgraph_dvl.report.observability_files import OWNED
+
+    check_output(out, force=force)
+    given = () if segments is None else read_segments(segments)
+    with ProgressLine(quiet=quiet) as progress:
+        view, converged = _view(source, given, progress)
+        progress("write", 0, None)
+        with new_folder(out, force=force, owned=OWNED) as folder:
+            write_observability(view, folder, str(source), figures=not no_figures)
+    print_observability(view)
+    print_written(out)
+    if not converged:
+        stderr().print(Text("error: the solution did not converge", "red"), soft_wrap=True)
+        raise typer.Exit(1)
+
+
+def _view(
+    source: Path, given: tuple[tuple[float, float, str], ...], progress: ProgressLine
+) -> tuple[Observability, bool]:
+    """Return the view of a trial, which is solved for that, or of a solution."""
+    from factorgraph_dvl.analysis.observability import observability as look
+    from factorgraph_dvl.io.solution_folder import CALIBRATION_FILE, load_solution
+    from factorgraph_dvl.io.trial_folder import SETTINGS_FILE, load_trial
+
+    if (source / CALIBRATION_FILE).exists() and not (source / SETTINGS_FILE).exists():
+        solution = load_solution(source)
+        return look(solution, given=given), solution.converged
+    trial = load_trial(source)
+    # The solver takes longest to load: after what is most often wrong.
+    from factorgraph_dvl.solvers.information_history import solve_with_history
+
+    solution, history = solve_with_history(trial, progress=progress)
+    return look(solution, trial=trial, history=history, given=given), solution.converged
+
+
+def write_observability(view: Observability, folder: Path, source: str, *, figures: bool) -> None:
+    """Write a view's JSON, tables and figures into a folder."""
+    from factorgraph_dvl.io.tables import write_table
+    from factorgraph_dvl.report.observability_files import history_columns, to_csv, to_json
+
+    (folder / "observability.csv").write_text(to_csv(view), encoding="utf-8")
+    if view.history is not None:
+        write_table(folder / "history.csv", history_columns(view.history))
+    if figures:
+        _draw(view, folder)
+    (folder / "observability.json").write_bytes(to_json(view, source))
+
+
+def _draw(view: Observability, folder: Path) -> None:
+    from factorgraph_dvl.report.observability_figures import write_observability_figures
+
+    try:
+        write_observability_figures(view, folder)
+    except Exception as error:
+        warn(f"figures could not be drawn: {type(error).__name__}: {error}")
+
+
+def print_observability(view: Observability) -> None:
+    """Print segments, marginals and weak directions."""
+    from factorgraph_dvl.report.observability_tables import (
+        direction_lines,
+        marginal_table,
+        segment_table,
+    )
+
+    console = stdout()
+    if view.segments:
+        print_table(segment_table(view))
+    if view.point_set is not None:
+        console.print(f"Singular values: {view.point_set.scaling}.", markup=False, soft_wrap=True)
+    if view.marginals is not None:
+        print_table(marginal_table(view))
+        for line in direction_lines(view.marginals):
+            console.print(line, markup=False, highlight=False, soft_wrap=True)
+    for warning in view.warnings:
+        warn(warning)
+    for text in view.missing:
+        warn(f"left out: {text}")

@@ -1,0 +1,65 @@
+"""The command `plan`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from factorgraph_dvl.cli.console import ProgressLine, print_table, print_written, stdout
+from factorgraph_dvl.cli.observability import print_observability, write_observability
+from factorgraph_dvl.cli.options import Force, NoFigures, Quiet
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from factorgraph_dvl.planning import Proposal, Requirement
+
+
+def plan(
+    source: Annotated[
+        Path, typer.Argument(metavar="PLAN", help="Scenario with what is required, a YAML file.")
+    ],
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder to write.")],
+    force: Force = False,
+    no_figures: NoFigures = False,
+    quiet: Quiet = False,
+) -> None:
+    """Predict what a planned trial will tell, and what to add where that is not enough."""
+    from factorgraph_dvl.analysis.observability import observability as look
+    from factorgraph_dvl.io.folders import check_output, new_folder
+    from factorgraph_dvl.planning import load_plan, predict, propose, requirements
+    from factorgraph_dvl.report.plan_files import OWNED, to_json
+
+    check_output(out, force=force)
+    planned = load_plan(source)
+    with ProgressLine(quiet=quiet) as progress:
+        progress("prediction", 0, None)
+        prediction = predict(planned)
+        solution = prediction.solution
+        required = requirements(planned.required, solution.estimates, str(source))
+        view = look(solution, trial=prediction.trial, history=prediction.history, kind="plan")
+        proposal = propose(prediction, required, progress=progress)
+        progress("write", 0, None)
+        with new_folder(out, force=force, owned=OWNED) as folder:
+            write_observability(view, folder, str(source), figures=not no_figures)
+            (folder / "plan.json").write_bytes(
+                to_json(solution, prediction.duration, required, proposal, str(source))
+            )
+    print_observability(view)
+    _print_requirements(required, proposal)
+    print_written(out)
+
+
+def _print_requirements(required: Sequence[Requirement], proposal: Proposal | None) -> None:
+    from factorgraph_dvl.report.plan_files import proposal_lines, requirement_table
+
+    console = stdout()
+    if required:
+        print_table(requirement_table(required, proposal))
+    if proposal is not None:
+        for line in proposal_lines(proposal):
+            console.print(line, markup=False, highlight=False, soft_wrap=True)
+    elif required:
+        console.print("All that is required is met.", markup=False)

@@ -1,0 +1,209 @@
+"""From a trial to a solution by the six-state filter of gyro drift."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from factorgraph_dvl.conventions import (
+    DEG,
+    Array,
+    log_so3,
+    rph_from_rotation,
+    rph_jacobian,
+)
+from factorgraph_dvl.earth import enu_from_ecef
+from factorgraph_dvl.errors import ConfigError, DataError
+from factorgraph_dvl.increments import increments
+from factorgraph_dvl.kalman.navigation import Motion, motion_at, navigate
+from factorgraph_dvl.kalman.points import Estimated, Outcome, rows_of_history
+from factorgraph_dvl.kalman.star import (
+    Course,
+    Seen,
+    attitude_at,
+    attitude_before,
+    run_filter,
+    seen_by_stars,
+    smooth,
+)
+from factorgraph_dvl.kalman.steps import Samples, prepare
+from factorgraph_dvl.kalman.summary import estimates_of, gnss_residuals
+from factorgraph_dvl.sensors.star import Star
+from factorgraph_dvl.solution import Residuals, Solution, Trajectory, doubts
+from factorgraph_dvl.trial import InitialAttitude, Trial
+
+_ARCSEC = DEG / 3600.0
+# The SINS/GNSS filter, which gives position and velocity only, starts from the stars' attitude
+# as if known so well.
+_START = 0.3 * DEG
+
+
+def calibrate_gyros(trial: Trial, *, rate_hz: float) -> tuple[Solution, Outcome]:
+    """Estimate the drift of the gyros from SINS and star tracker.
+
+    Position and velocity of the trajectory are those of SINS/GNSS.
+
+    Raises
+    ------
+    ConfigError, DataError
+        If the trial has no star tracker, no epoch, no GNSS, or too few attitudes.
+    """
+    star = next((aid for aid in trial.others if isinstance(aid, Star)), None)
+    if star is None:
+        raise DataError(
+            "the trial has no star tracker", where="trial.yaml", expected="a star section"
+        )
+    if not trial.epoch:
+        raise ConfigError(
+            "the trial has no `epoch`",
+            where="trial.yaml key epoch",
+            expected="UTC of time_s = 0, such as 2022-10-12T02:00:00Z",
+        )
+    frame = trial.frame()
+    inc, _ = increments(trial.imu)
+    samples = prepare(inc, trial.imu.settings)
+    seen = seen_by_stars(star, trial.epoch, frame.lat, frame.lon)
+    (gyro, _) = trial.imu.parameters(0.0)
+    drift, P = np.zeros(3), np.diag(gyro.sigma**2)
+    courses: list[Course] = []
+    history: list[tuple[float, Estimated]] = []
+    for a, b in inc.arcs:
+        mine = seen.within(float(inc.start[a]), float(inc.end[b - 1]))
+        if mine.time.size < 2:
+            continue
+        if courses:
+            gap = mine.time[0] - courses[-1].time[-1]
+            P = P + trial.imu.settings.gyro_bias_walk_root_psd**2 * gap * np.eye(3)
+        forward = run_filter(samples, mine, frame.lat, drift, P)
+        drift, P = forward.course.drift[-1], forward.course.covariance[-1, 3:, 3:]
+        courses.append(smooth(forward))
+        history += [
+            (float(t), Estimated((gyro,), (xi,), Q[3:, 3:]))
+            for t, xi, Q in zip(
+                forward.course.time, forward.course.drift, forward.course.covariance, strict=True
+            )
+        ]
+    if not courses:
+        raise DataError(
+            "there are no two star attitudes in a row while the IMU runs",
+            where=star.source,
+            expected="times on the clock of the IMU",
+        )
+    kept = [history[i] for i in rows_of_history(len(history))]
+    estimated = _drift(trial, courses, drift, P)
+    outcome = Outcome(estimated, 1, tuple(kept))
+    solution = _summary(trial, star, samples, courses, seen, estimated, frame.lat, rate_hz)
+    return solution, outcome
+
+
+def _drift(trial: Trial, courses: list[Course], drift: Array, P: Array) -> Estimated:
+    """Return the drift at the end if constant, else its mean over the trial.
+
+    The covariance of the mean of a random walk is taken as the mean covariance, which is
+    an upper bound.
+    """
+    begin, end = courses[0].time[0], courses[-1].time[-1]
+    parameter = trial.imu.parameters(float(end - begin))[0]
+    if trial.imu.settings.gyro_bias_walk_root_psd == 0.0:
+        return Estimated((parameter,), (drift,), P)
+    mean = np.concatenate([c.drift for c in courses]).mean(axis=0)
+    spread = np.concatenate([c.covariance[:, 3:, 3:] for c in courses]).mean(axis=0)
+    return Estimated((parameter,), (mean,), spread)
+
+
+def _summary(
+    trial: Trial,
+    star: Star,
+    samples: Samples,
+    courses: list[Course],
+    seen: Seen,
+    estimated: Estimated,
+    lat: float,
+    rate_hz: float,
+) -> Solution:
+    begin = float(samples.increments.start[0])
+    initial = trial.initial_attitude
+    if courses[0].time[0] <= samples.increments.end[samples.increments.arcs[0, 1] - 1]:
+        nRb = attitude_before(samples, courses[0], lat, begin)
+        rph = rph_from_rotation(nRb, trial.body_axes)
+        initial = InitialAttitude(rph, np.full(3, _START))
+    navigation = navigate(replace(trial, initial_attitude=initial), np.empty(0))
+    values, covariance = estimated.reported()
+    estimates = estimates_of(estimated.parameters, values, covariance)
+    residuals = (_star_residuals(star, courses, seen), *gnss_residuals(trial, navigation))
+    notes = [*navigation.notes]
+    if np.any(np.array(star.settings.mounting_std_deg) > 0.0):
+        notes.append(
+            "star does not estimate star_mounting_deg: held at "
+            f"{np.round(star.settings.mounting_deg, 6).tolist()}"
+        )
+    notes += [
+        f"{name} not observable: the arc is too short for these stars"
+        for e in estimates
+        for name, seen_well in zip(e.component_names, e.observable, strict=True)
+        if not seen_well
+    ]
+    first = residuals[0]
+    time = np.arange(
+        np.ceil(courses[0].time[0] * rate_hz - 1e-6),
+        np.floor(courses[-1].time[-1] * rate_hz + 1e-6) + 1,
+    )
+    return Solution(
+        trial=trial.name,
+        solver="kalman-star",
+        body_axes=trial.body_axes,
+        converged=True,
+        iterations=1,
+        cost=0.5 * float(np.sum((first.residual / first.sigma) ** 2)),
+        estimates=estimates,
+        covariance=covariance,
+        trajectory=_trajectory(trial, samples, courses, motion_at(navigation, time / rate_hz)),
+        residuals=residuals,
+        warnings=(*notes, *doubts(estimates, residuals)),
+    )
+
+
+def _star_residuals(star: Star, courses: list[Course], seen: Seen) -> Residuals:
+    """Return smoothed - measured attitude in body axes, arcsec."""
+    time = np.concatenate([c.time for c in courses])
+    nRb = np.concatenate([c.nRb for c in courses])
+    rows = np.searchsorted(seen.time, time)
+    residual = log_so3(seen.nRb[rows].transpose(0, 2, 1) @ nRb)
+    variance = np.diagonal(seen.covariance[rows], axis1=1, axis2=2)
+    return Residuals(
+        "Star attitude",
+        "arcsec",
+        ("x", "y", "z"),
+        time,
+        residual / _ARCSEC,
+        np.sqrt(variance) / _ARCSEC,
+    )
+
+
+def _trajectory(
+    trial: Trial, samples: Samples, courses: list[Course], motion: Motion
+) -> Trajectory:
+    """Return position and velocity of SINS/GNSS with the attitude by the stars."""
+    frame = trial.frame()
+    nRb, P = motion.nRb.copy(), np.zeros_like(motion.nRb)
+    known = np.zeros(motion.time.size, dtype=bool)
+    for course in courses:
+        mine = (motion.time >= course.time[0]) & (motion.time <= course.time[-1])
+        mine &= motion.covered
+        nRb[mine], P[mine] = attitude_at(samples, course, frame.lat, motion.time[mine])
+        known |= mine
+    level = enu_from_ecef(motion.geodetic[known, 0], motion.geodetic[known, 1])
+    lRn = level @ enu_from_ecef(frame.lat, frame.lon).T
+    lRb = lRn @ nRb[known]
+    rph = rph_from_rotation(lRb, trial.body_axes)
+    J = rph_jacobian(rph, trial.body_axes) @ nRb[known].transpose(0, 2, 1)
+    return Trajectory(
+        time=motion.time[known],
+        geodetic=motion.geodetic[known],
+        velocity=motion.velocity[known],
+        rph=rph,
+        position_cov=motion.covariance[known, 0:3, 0:3],
+        velocity_cov=motion.covariance[known, 3:6, 3:6],
+        rph_cov=J @ P[known] @ J.transpose(0, 2, 1),
+    )

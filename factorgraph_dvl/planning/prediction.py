@@ -1,0 +1,168 @@
+"""From a planned motion to the posterior of the trial."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import msgspec
+import numpy as np
+
+from factorgraph_dvl.conventions import (
+    DEG,
+    DEG_PER_HOUR,
+    MICRO_G,
+    Array,
+    rotate,
+    rotation_from_rph,
+)
+from factorgraph_dvl.earth import LocalFrame
+from factorgraph_dvl.information import InformationHistory
+from factorgraph_dvl.preintegration import States
+from factorgraph_dvl.simulation import plan_motion, simulate
+from factorgraph_dvl.simulation.motion import Motion
+from factorgraph_dvl.simulation.scenario import AngularSway, Heave, Scenario, Start
+from factorgraph_dvl.solution import Solution
+from factorgraph_dvl.solvers.information_history import Frontier
+from factorgraph_dvl.solvers.prediction import (
+    TrueStates,
+    continue_posterior,
+    predict_posterior,
+)
+from factorgraph_dvl.trial import Trial
+
+_INTERRUPTED = ("gaps_s", "outages_s", "no_lock_s")
+
+
+@dataclass(frozen=True)
+class Ending:
+    """Where a motion ends, to go on from.
+
+    Parameters
+    ----------
+    start : position, heading and speed there.
+    time : since the sea's phase was zero, s.
+    frontier : what is known there.
+    """
+
+    start: Start
+    time: float
+    frontier: Frontier
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """What a planned trial will tell.
+
+    Parameters
+    ----------
+    scenario, trial : what was planned; its records without noise.
+    solution : values are the truth, covariances what a solver will claim.
+    history : information along the trial.
+    duration : s.
+    ending : to go on from.
+    """
+
+    scenario: Scenario
+    trial: Trial
+    solution: Solution
+    history: InformationHistory
+    duration: float
+    ending: Ending
+
+
+def predict(scenario: Scenario) -> Prediction:
+    """Predict the posterior of a scenario; nothing is drawn, nothing is solved.
+
+    Raises
+    ------
+    ConfigError
+        If the manoeuvres cannot be carried out.
+    """
+    scenario = msgspec.structs.replace(scenario, noise=False)
+    motion = plan_motion(scenario)
+    trial = simulate(scenario)
+    solution, history, frontier = predict_posterior(trial, _true_states(motion, trial))
+    return Prediction(
+        scenario=scenario,
+        trial=trial,
+        solution=replace(solution, solver="plan"),
+        history=history,
+        duration=motion.duration,
+        ending=_ending(motion, frontier, 0.0),
+    )
+
+
+def go_on(
+    scenario: Scenario, manoeuvres: list[dict[str, object]], ending: Ending
+) -> tuple[InformationHistory, Ending]:
+    """Predict what further manoeuvres add, from where a motion ended.
+
+    Parameters
+    ----------
+    scenario : the sea and the sensors.
+    manoeuvres : to add, as in a scenario.
+    ending : where to begin.
+
+    Returns
+    -------
+    The information at their end, and where that is.
+    """
+    sway = scenario.sway
+    shifted = msgspec.structs.replace(
+        sway,
+        **{
+            name: tuple(_later(part, ending.time) for part in getattr(sway, name))
+            for name in ("roll", "pitch", "yaw", "heave")
+        },
+    )
+    # Interruptions were planned for the time before.
+    sensors = {
+        name: msgspec.structs.replace(truth, **{f: () for f in _INTERRUPTED if hasattr(truth, f)})
+        for name, truth in {"imu": scenario.imu, **scenario.aids}.items()
+    }
+    further = msgspec.structs.replace(
+        scenario, start=ending.start, manoeuvres=manoeuvres, sway=shifted, **sensors
+    )
+    motion = plan_motion(further)
+    trial = simulate(further)
+    history, frontier = continue_posterior(trial, _true_states(motion, trial), ending.frontier)
+    return history, _ending(motion, frontier, ending.time)
+
+
+def _later(part: AngularSway | Heave, time: float) -> AngularSway | Heave:
+    phase = part.phase_deg + 360.0 * part.frequency_hz * time
+    return msgspec.structs.replace(part, phase_deg=phase % 360.0)
+
+
+def _ending(motion: Motion, frontier: Frontier, before: float) -> Ending:
+    end = np.array([motion.duration])
+    state = motion.at(end)
+    # The mean motion: sway comes on top of it again.
+    start = Start(
+        lat_deg=float(state.geodetic[0, 0] / DEG),
+        lon_deg=float(state.geodetic[0, 1] / DEG),
+        height_m=motion.height + float(motion.current_n[2]) * motion.duration,
+        heading_deg=float(motion.course(end)[0] / DEG) % 360.0,
+        speed_m_s=max(float(motion.speed(end)[0]), 0.0),
+    )
+    return Ending(start, before + motion.duration, frontier)
+
+
+def _true_states(motion: Motion, trial: Trial) -> TrueStates:
+    gyro = trial.calibration_truth["gyro_bias_deg_h"] * DEG_PER_HOUR
+    accel = trial.calibration_truth["accel_bias_ug"] * MICRO_G
+
+    def states(frame: LocalFrame, time: Array) -> States:
+        state = motion.at(np.clip(time, 0.0, motion.duration))
+        lRn = frame.level_from_tangent(state.geodetic[:, 0], state.geodetic[:, 1])
+        nRl = lRn.transpose(0, 2, 1)
+        zero = np.zeros((time.size, 3))
+        return States(
+            nRb=nRl @ rotation_from_rph(state.rph, motion.body_axes),
+            p_n=frame.position(*state.geodetic.T),
+            v_n=rotate(nRl, state.v_n),
+            gyro_bias=zero + gyro,
+            accel_bias=zero + accel,
+        )
+
+    return states

@@ -1,0 +1,10 @@
+"""The sensors that aid the IMU: a new one is known once it stands here."""
+
+from __future__ import annotations
+
+from factorgraph_dvl.sensors.dvl import Dvl
+from factorgraph_dvl.sensors.gnss import Gnss
+from factorgraph_dvl.sensors.protocol import Aid
+from factorgraph_dvl.sensors.star import Star
+
+AIDS: tuple[type[Aid], ...] = (Gnss, Dvl, Star)

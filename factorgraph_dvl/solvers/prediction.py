@@ -1,0 +1,99 @@
+"""The posterior of a trial that is not sailed yet: linearised at its true motion."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from factorgraph_dvl.chain import inertial_chain
+from factorgraph_dvl.conventions import Array, exp_so3
+from factorgraph_dvl.earth import LocalFrame
+from factorgraph_dvl.graph import Evaluation, Problem
+from factorgraph_dvl.increments import increments
+from factorgraph_dvl.information import InformationHistory
+from factorgraph_dvl.preintegration import States, segments
+from factorgraph_dvl.solution import Solution
+from factorgraph_dvl.solvers.batch import STATE_INTERVAL, Minimised, solution_of
+from factorgraph_dvl.solvers.covariance import posterior
+from factorgraph_dvl.solvers.feigned import feigned_directions
+from factorgraph_dvl.solvers.information_history import (
+    RATE_HZ,
+    Frontier,
+    as_history,
+    run_filter,
+)
+from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, eliminate
+from factorgraph_dvl.trial import Trial
+
+TrueStates = Callable[[LocalFrame, Array], States]
+
+
+def predict_posterior(
+    trial: Trial, true_states: TrueStates
+) -> tuple[Solution, InformationHistory, Frontier]:
+    """Return what a solver will know of a trial, without noise and without solving.
+
+    Parameters
+    ----------
+    trial : its records without noise, its true calibration, and the noise that it claims.
+    true_states : returns the states at (K,) times in a frame.
+
+    Returns
+    -------
+    A solution whose values are the truth; the information along the trial; what is known
+    at the last node, to go on from.
+    """
+    problem, evaluation = _at_truth(trial, true_states)
+    triangles, frontier = run_filter(problem, evaluation)
+    minimum = _minimum(problem, evaluation)
+    covariances = posterior(problem, minimum)
+    held = feigned_directions(problem, minimum, covariances, at_truth=True)
+    if held.size:
+        problem.hold(held, evaluation.parameters)
+        evaluation = problem.evaluate(evaluation.values)
+        minimum = _minimum(problem, evaluation)
+        covariances = posterior(problem, minimum)
+        triangles, _ = run_filter(problem, evaluation)
+    found = Minimised(problem, minimum, covariances, held, trial.notes)
+    history = as_history(problem, evaluation, held, triangles, {})
+    return solution_of(found, RATE_HZ), history, frontier
+
+
+def continue_posterior(
+    trial: Trial, true_states: TrueStates, start: Frontier
+) -> tuple[InformationHistory, Frontier]:
+    """Go on from what is known at the end of a trial through another that follows it.
+
+    Parameters
+    ----------
+    trial, true_states : as of `predict_posterior`; its priors are not used.
+    start : at the first node.
+    """
+    problem, evaluation = _at_truth(trial, true_states)
+    triangles, frontier = run_filter(problem, evaluation, start)
+    nothing_held = problem.prior_sigma[:, None][:, :0]
+    return as_history(problem, evaluation, nothing_held, triangles[-1:], {}), frontier
+
+
+def _at_truth(trial: Trial, true_states: TrueStates) -> tuple[Problem, Evaluation]:
+    frame = trial.frame()
+    inc, _ = increments(trial.imu)
+    seg = segments(inc, STATE_INTERVAL)
+    states = true_states(frame, seg.node_time)
+    chain = inertial_chain(trial, frame, seg, states)
+    observations = [o for aid in trial.aids for o in aid.observations(frame)]
+    parameters = [p for aid in trial.aids for p in aid.parameters()]
+    truth: dict[str, Array] = {}
+    for p in parameters:
+        value = trial.calibration_truth.get(p.name)
+        if p.estimated and value is not None:
+            truth[p.name] = exp_so3(value * p.si) if p.rotation else value * p.si + 0.0 * p.mean
+    problem = Problem(chain, observations, parameters, start=truth)
+    values = problem.values(states, {**problem.prior_values(), **truth})
+    problem.weigh(problem.evaluate(values))
+    return problem, problem.evaluate(values)
+
+
+def _minimum(problem: Problem, evaluation: Evaluation) -> Minimum:
+    gaussian = problem.linearize(evaluation)
+    tree = eliminate(gaussian, problem.ordering(gaussian))
+    return Minimum(evaluation, tree, converged=True, iterations=0)
