@@ -40,9 +40,10 @@ from factorgraph_dvl.increments import increments
 from factorgraph_dvl.preintegration import States, segments
 from factorgraph_dvl.sensors.protocol import Aid
 from factorgraph_dvl.simulation import parse_scenario, plan_motion, simulate
-from factorgraph_dvl.solvers.batch import STATE_INTERVAL, solve
+from factorgraph_dvl.solvers.batch import solve
 from factorgraph_dvl.solvers.information_history import solve_with_history
 from factorgraph_dvl.solvers.levenberg_marquardt import minimise, quick_step
+from factorgraph_dvl.solvers.state_times import STATE_INTERVAL
 from factorgraph_dvl.trial import Trial
 
 ROOT = Path(__file__).resolve().parent.parent

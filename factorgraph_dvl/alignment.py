@@ -30,7 +30,14 @@ from factorgraph_dvl.conventions import (
 from factorgraph_dvl.earth import LocalFrame
 from factorgraph_dvl.errors import DataError
 from factorgraph_dvl.preintegration import Segments, States
-from factorgraph_dvl.sensors.dvl import Dvl
+from factorgraph_dvl.sensors.dvl import (
+    BIAS,
+    LEVER_ARM,
+    MISALIGNMENT,
+    SCALE_ERROR,
+    TIME_OFFSET,
+    Dvl,
+)
 from factorgraph_dvl.sensors.gnss import Gnss
 from factorgraph_dvl.trial import Trial
 
@@ -197,7 +204,7 @@ def _from_position(gnss: Gnss, frame: LocalFrame, arc: Arc) -> _Pairs | None:
 
 
 def _from_dvl(dvl: Dvl, arc: Arc) -> _Pairs | None:
-    true_time = dvl.time - dvl.settings.time_offset_s
+    true_time = dvl.time - dvl.prior_means()[TIME_OFFSET][0]
     use = dvl.locked & arc.covers(true_time)
     if use.sum() < _LEAST_PAIRS:
         return None
@@ -205,7 +212,8 @@ def _from_dvl(dvl: Dvl, arc: Arc) -> _Pairs | None:
     at, body_R, velocity, _ = arc.carry(time)
     v_b = _nominal_velocity(dvl, use, at.gyro)
     # A mounting that is not known turns the velocity as well as the wanted attitude does.
-    turned = min(float(np.max(dvl.settings.misalignment_std_deg)) * DEG, 1.0)
+    sigma_of = {p.name: p.sigma for p in dvl.parameters()}
+    turned = min(float(np.max(sigma_of[MISALIGNMENT])), 1.0)
     sigma = np.hypot(dvl.sigma()[use].mean(axis=1), turned * np.linalg.norm(v_b, axis=1))
     # What the motion adds to the Earth's turn of the velocity is below the mounting's error.
     return _Pairs(
@@ -219,10 +227,9 @@ def _from_dvl(dvl: Dvl, arc: Arc) -> _Pairs | None:
 
 def _nominal_velocity(dvl: Dvl, use: np.ndarray, omega_b: Array) -> Array:
     """Return the velocity of the IMU in body if the mounting were as the prior says."""
-    s = dvl.settings
-    dRb = exp_so3(np.array(s.misalignment_deg) * DEG)
-    unscaled = dvl.velocity[use] / (1.0 + np.atleast_1d(np.array(s.scale_error)))
-    return unscaled @ dRb - np.cross(omega_b, np.array(s.lever_arm_m))
+    mean = dvl.prior_means()
+    unscaled = (dvl.velocity[use] - mean[BIAS]) / (1.0 + mean[SCALE_ERROR])
+    return unscaled @ exp_so3(mean[MISALIGNMENT]) - np.cross(omega_b, mean[LEVER_ARM])
 
 
 def _align(trial: Trial, arc: Arc, pairs: _Pairs, before: Array | None) -> tuple[Array, bool]:
@@ -323,7 +330,7 @@ def _kinematics(trial: Trial, frame: LocalFrame, seg: Segments, nRb: Array) -> t
             v_n = _interpolate(time, v_time, v_antenna) - rotate(nRb, np.cross(gyro, arm))
             far = _distance(time, v_time) > _GNSS_GAP
     if dvl is not None and dvl.locked.any() and far.any():
-        ping_time = dvl.time[dvl.locked] - dvl.settings.time_offset_s
+        ping_time = dvl.time[dvl.locked] - dvl.prior_means()[TIME_OFFSET][0]
         index, since, _ = seg.increments.locate(ping_time)
         since = np.clip(since, 0.0, seg.increments.dt[index])
         omega = seg.increments.partial(index, since).omega

@@ -8,7 +8,7 @@ from datetime import UTC, datetime
 import erfa
 import numpy as np
 
-from factorgraph_dvl.conventions import DEG, Array
+from factorgraph_dvl.conventions import DEG, Array, rotate
 from factorgraph_dvl.errors import ConfigError
 
 ARCSEC = DEG / 3600.0
@@ -109,3 +109,19 @@ def spread(directions: Array, first: np.ndarray) -> Array:
     count = np.diff(np.append(first, directions.shape[0]))
     rest = np.linalg.eigvalsh(outer)[:, :2].sum(axis=1)
     return np.sqrt(np.maximum(rest, 0.0) / count)
+
+
+def off_vertical(time: Array, nRb: Array, force_time: Array, force: Array) -> float:
+    """Return the angle between up and the mean specific force as attitudes turn it, rad.
+
+    The mean of nRb f is gravity's reaction but for the change of velocity: 0.01 m/s² of mean
+    acceleration turn it by 0.06 deg.
+
+    Parameters
+    ----------
+    time : (M,) s; nRb : (M, 3, 3) body to east, north, up.
+    force_time : (N,) s; force : (N, 3) specific force in body, m/s².
+    """
+    at = np.stack([np.interp(time, force_time, force[:, i]) for i in range(3)], axis=1)
+    mean = rotate(nRb, at).mean(axis=0)
+    return float(np.arctan2(np.hypot(mean[0], mean[1]), mean[2]))

@@ -12,13 +12,17 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import gtsam
 import numpy as np
 
 from factorgraph_dvl import keys
-from factorgraph_dvl.chain import Chain, loose_diagonal, square_root
-from factorgraph_dvl.conventions import Array, exp_so3, inverse_right_jacobian, log_so3
+from factorgraph_dvl.chain import Chain
+from factorgraph_dvl.conventions import (
+    Array,
+    exp_so3,
+)
 from factorgraph_dvl.increments import IntArray
 from factorgraph_dvl.preintegration import (
     Attachment,
@@ -28,12 +32,19 @@ from factorgraph_dvl.preintegration import (
     motion_at,
     slid,
 )
+from factorgraph_dvl.priors import (
+    Known,
+    add_priors,
+    away,
+    joint_pull,
+    prior_mean,
+    prior_root,
+    pull,
+    value_at,
+)
 from factorgraph_dvl.sensors.protocol import Linearization, Motion, Observation, Parameter
 
-# Standard deviation that stands for zero in a parameter of which only some components
-# are held; in SI units, far below what can be measured.
-_HELD = 1e-7
-# The same for a held direction, in standard deviations of the prior.
+# Standard deviation that stands for zero in a held direction, in those of the prior.
 HELD_DIRECTION = 1e-4
 # How far a time offset may move from its start, s, before measurements are bound anew.
 _TIME_MARGIN = 0.05
@@ -69,22 +80,6 @@ class _Block:
     factors: list[gtsam.JacobianFactor] = field(default_factory=list)
     matrices: list[Array] = field(default_factory=list)
     vectors: list[Array] = field(default_factory=list)
-
-
-@dataclass(frozen=True)
-class Known:
-    """What is known of biases and parameters beforehand, jointly, in place of their priors.
-
-    Parameters
-    ----------
-    bias : (6,) accelerometer and gyro bias at the first node, SI.
-    parameters : values of those that are estimated, rotations as matrices.
-    covariance : (6 + P, 6 + P) of biases and parameters, in the tangent space, SI.
-    """
-
-    bias: Array
-    parameters: dict[str, Array]
-    covariance: Array
 
 
 @dataclass(frozen=True)
@@ -131,13 +126,12 @@ class Problem:
         self.all_parameters = tuple(parameters)
         self.parameters = tuple(p for p in parameters if p.estimated)
         self._key = {p.name: keys.calibration(i) for i, p in enumerate(self.parameters)}
-        self._fixed = {p.name: _from_prior(p) for p in parameters if not p.estimated}
+        self._fixed = {p.name: prior_mean(p) for p in parameters if not p.estimated}
         self.graph = gtsam.NonlinearFactorGraph(chain.graph)
         if known is None:
-            for p in self.parameters:
-                self._add_prior(p)
+            add_priors(self.graph, self.parameters, self._key)
         else:
-            self._add_known(known)
+            self.graph.add(joint_pull(known, chain.bias_key(0), self.parameters, self._key))
         self.uncovered: dict[str, int] = {}
         self._start = {**self.prior_values(), **(start or {})}
         self._bound: list[_Bound] = []
@@ -169,7 +163,7 @@ class Problem:
 
     def prior_values(self) -> dict[str, Array]:
         """Return the prior means of all parameters, rotations as matrices."""
-        return {**self._fixed, **{p.name: _from_prior(p) for p in self.parameters}}
+        return {**self._fixed, **{p.name: prior_mean(p) for p in self.parameters}}
 
     def values(self, states: States, parameters: dict[str, Array]) -> gtsam.Values:
         """Return GTSAM's values of states and parameters."""
@@ -199,22 +193,19 @@ class Problem:
             for p, end in zip(self.parameters, ends, strict=True)
         }
 
-    @property
-    def prior_sigma(self) -> Array:
-        """Standard deviations of the priors of all estimated parameters, (P,), SI."""
-        return np.concatenate(
-            [np.empty(0), *(np.maximum(p.sigma, _HELD) for p in self.parameters)]
-        )
+    @cached_property
+    def prior_root(self) -> Array:
+        """Square root S of the prior covariance S Sᵀ of all estimated parameters, (P, P), SI.
+
+        In the tangent space at the prior's mean. Priors are stated for the rotation vector:
+        Exp(alpha + a) = Exp(alpha) Exp(Jr(alpha) a).
+        """
+        return prior_root(self.parameters)
 
     def difference(self, parameters: dict[str, Array], origin: dict[str, Array]) -> Array:
         """Return parameters minus origin in the origin's tangent space, (P,), SI."""
         return np.concatenate(
-            [
-                log_so3(origin[p.name].T @ parameters[p.name])
-                if p.rotation
-                else parameters[p.name] - origin[p.name]
-                for p in self.parameters
-            ]
+            [away(p, parameters[p.name], origin[p.name]) for p in self.parameters]
         )
 
     def moved(self, parameters: dict[str, Array], step: Array) -> dict[str, Array]:
@@ -231,24 +222,11 @@ class Problem:
 
         Parameters
         ----------
-        directions : (P, h) orthonormal, in units of the priors' standard deviations.
+        directions : (P, h) orthonormal, in the coordinates u of a step S u, S `prior_root`.
         origin : values of the parameters there.
         """
-        gain = directions.T / self.prior_sigma / HELD_DIRECTION
-        columns = self.columns
-
-        def error(
-            this: gtsam.CustomFactor, at: gtsam.Values, jacobians: list[Array] | None
-        ) -> Array:
-            now = {p.name: self._parameter(at, p) for p in self.parameters}
-            if jacobians is not None:
-                for i, p in enumerate(self.parameters):
-                    jacobians[i] = np.asfortranarray(gain[:, columns[p.name]])
-            return gain @ self.difference(now, origin)
-
-        noise = gtsam.noiseModel.Unit.Create(directions.shape[1])
-        shared = [self._key[p.name] for p in self.parameters]
-        self.graph.add(gtsam.CustomFactor(noise, shared, error))
+        gain = directions.T @ np.linalg.inv(self.prior_root) / HELD_DIRECTION
+        self.graph.add(pull(self.parameters, self._key, np.asarray(gain, float), origin))
 
     def evaluate(self, values: gtsam.Values) -> Evaluation:
         """Evaluate motion, residuals and cost."""
@@ -313,8 +291,7 @@ class Problem:
         return self._key[name]
 
     def _parameter(self, values: gtsam.Values, p: Parameter) -> Array:
-        key = self._key[p.name]
-        return values.atRot3(key).matrix() if p.rotation else values.atVector(key)
+        return value_at(values, self._key[p.name], p)
 
     def _states(self, values: gtsam.Values) -> States:
         n = self.chain.segments.node_time.size
@@ -329,43 +306,9 @@ class Problem:
         bias = np.broadcast_to(bias, (n, _BIAS))
         return States(nRb, p_n, v_n, gyro_bias=bias[:, 3:], accel_bias=bias[:, :3])
 
-    def _add_prior(self, p: Parameter) -> None:
-        key = self._key[p.name]
-        sigma = np.maximum(p.sigma, _HELD)
-        if p.rotation:
-            # The prior is stated for the rotation vector, GTSAM's for its tangent space.
-            root = inverse_right_jacobian(p.mean) / sigma[:, None]
-            noise = square_root(root)
-            self.graph.addPriorRot3(key, gtsam.Rot3(exp_so3(p.mean)), noise)
-        else:
-            self.graph.addPriorVector(key, p.mean, loose_diagonal(sigma))
-
-    def _add_known(self, known: Known) -> None:
-        """Add a joint prior of biases and parameters, linear about their values."""
-        sigma = np.sqrt(np.diag(known.covariance))
-        correlation = known.covariance / np.outer(sigma, sigma)
-        root = np.linalg.inv(np.linalg.cholesky(correlation)) / sigma
-        columns = [slice(0, _BIAS)]
-        columns += [slice(c.start + _BIAS, c.stop + _BIAS) for c in self.columns.values()]
-        bias_key = self.chain.bias_key(0)
-
-        def error(
-            this: gtsam.CustomFactor, at: gtsam.Values, jacobians: list[Array] | None
-        ) -> Array:
-            now = {p.name: self._parameter(at, p) for p in self.parameters}
-            away = at.atConstantBias(bias_key).vector() - known.bias
-            if jacobians is not None:
-                for i, place in enumerate(columns):
-                    jacobians[i] = np.asfortranarray(root[:, place])
-            return root @ np.concatenate([away, self.difference(now, known.parameters)])
-
-        noise = gtsam.noiseModel.Unit.Create(sigma.size)
-        shared = [bias_key, *(self._key[p.name] for p in self.parameters)]
-        self.graph.add(gtsam.CustomFactor(noise, shared, error))
-
     def _bind(self, observation: Observation) -> _Bound:
         time = observation.true_time(self._start)
-        later = observation.true_time(self.moved(self._start, self.prior_sigma))
+        later = observation.true_time(self.moved(self._start, self._prior_sigma()))
         # A measurement whose time is yet to be found must not leave the record on the way.
         margin = 0.0 if np.array_equal(time, later) else _TIME_MARGIN
         locate = self.chain.segments.increments.locate
@@ -379,6 +322,10 @@ class Problem:
             if np.array_equal(other.time, time):
                 return _Bound(observation, other.attachment, time, weight)
         return _Bound(observation, self._attach(time), time, weight)
+
+    def _prior_sigma(self) -> Array:
+        """Return the standard deviations of the priors of all estimated parameters, (P,), SI."""
+        return np.concatenate([np.empty(0), *(p.sigma for p in self.parameters)])
 
     def strayed(self, parameters: dict[str, Array]) -> bool:
         """Whether a time offset has moved measurements too far from where they were bound."""
@@ -497,7 +444,3 @@ def _template(node_keys: list[int], sizes: list[int], rows: int) -> gtsam.Jacobi
     factor = gtsam.CustomFactor(noise, node_keys, nothing).linearize(gtsam.Values())
     assert isinstance(factor, gtsam.JacobianFactor)
     return factor
-
-
-def _from_prior(p: Parameter) -> Array:
-    return exp_so3(p.mean) if p.rotation else p.mean

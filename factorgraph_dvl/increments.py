@@ -39,6 +39,8 @@ MAX_FILLED = 3
 _LOST = 1.5
 # Slower samples, s, do not follow any vessel; they are times in another unit.
 _SLOWEST = 0.5
+# What rounding may take off a time, s.
+_ROUNDING = 1e-6
 # Relative spread of the intervals up to which the clock counts as regular.
 _REGULAR = 0.1
 _UNIFORM = 1e-3
@@ -116,9 +118,11 @@ class Increments:
 
     def locate(self, time: Array) -> tuple[IntArray, Array, np.ndarray]:
         """Return interval, time since its start (s) and whether an arc covers the time."""
-        index = np.clip(np.searchsorted(self.start, time, side="right") - 1, 0, None)
+        # Times that were rounded belong to the interval at whose start they are meant to be.
+        index = np.searchsorted(self.start, time + _ROUNDING, side="right") - 1
+        index = np.clip(index, 0, None)
         since = time - self.start[index]
-        slack = 1e-6 + 1e-3 * self.dt[index]
+        slack = _ROUNDING + 1e-3 * self.dt[index]
         return index, since, (since >= -slack) & (since <= self.dt[index] + slack)
 
     def over(self, index: IntArray) -> tuple[Array, Array]:

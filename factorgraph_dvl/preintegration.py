@@ -80,15 +80,30 @@ class Segments:
         )
 
 
-def segments(inc: Increments, interval: float) -> Segments:
-    """Divide the arcs into segments of about `interval` seconds and integrate over each."""
+def segments(inc: Increments, interval: float, epochs: Array | None = None) -> Segments:
+    """Divide the arcs into segments of about `interval` seconds and integrate over each.
+
+    Parameters
+    ----------
+    inc : Increments
+    interval : length of the segments, s.
+    epochs : (M,) times, s, of which each has a node at most a sample before it; the
+        segments between them are no longer than `interval`. None: no such times.
+    """
     first, last, origin, arc_nodes, node_time = [], [], [], [], []
     n_nodes = 0
     for a, b in inc.arcs:
         length = inc.start[b - 1] + inc.dt[b - 1] - inc.start[a]
-        pieces = max(round(length / interval), 1)
-        targets = inc.start[a] + length * np.arange(1, pieces) / pieces
-        cuts = np.unique(np.concatenate([[a], a + _nearest(inc.start[a:b], targets), [b]]))
+        if epochs is None:
+            pieces = max(round(length / interval), 1)
+            targets = inc.start[a] + length * np.arange(1, pieces) / pieces
+            inner = a + _nearest(inc.start[a:b], targets)
+        else:
+            index, _, covered = inc.locate(epochs)
+            wanted = index[covered & (index >= a) & (index < b)]
+            edges = np.append(inc.start[a:b], inc.end[b - 1])
+            inner = a + _filled(np.unique(np.append(wanted - a, [0, b - a])), edges, interval)
+        cuts = np.unique(np.concatenate([[a], inner, [b]]))
         first.append(cuts[:-1])
         last.append(cuts[1:])
         origin.append(n_nodes + np.arange(cuts.size - 1))
@@ -166,6 +181,17 @@ def one_segment(inc: Increments, first: int, last: int) -> Segments:
         dP=dP,
         dA=dA,
     )
+
+
+def _filled(cuts: IntArray, edges: Array, interval: float) -> IntArray:
+    """Return cuts with others between them wherever they are more than `interval` apart."""
+    out = [cuts]
+    for i in np.flatnonzero(np.diff(edges[cuts]) > 1.5 * interval).tolist():
+        begin, end = edges[cuts[i]], edges[cuts[i + 1]]
+        pieces = round((end - begin) / interval)
+        targets = begin + (end - begin) * np.arange(1, pieces) / pieces
+        out.append(_nearest(edges, targets))
+    return np.concatenate(out)
 
 
 def _nearest(grid: Array, targets: Array) -> IntArray:

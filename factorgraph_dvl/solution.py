@@ -8,11 +8,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from factorgraph_dvl.conventions import Array, BodyAxes
+from factorgraph_dvl.sensors.protocol import DO_NOT_FIT, TOO_LARGE
 
-# Residuals larger than stated by this factor make every standard deviation too small, and by
-# the second the model is another than the data's.
-_TOO_LARGE = 1.3
-_DO_NOT_FIT = 10.0
 _FAR_FROM_PRIOR = 5.0
 
 
@@ -153,6 +150,31 @@ class Solution:
         raise KeyError(f"{name} was not estimated; there are {[e.name for e in self.estimates]}")
 
 
+@dataclass(frozen=True)
+class Calibration:
+    """What a solver found of the sensors alone; the fields are those of `Solution`."""
+
+    trial: str
+    solver: str
+    body_axes: BodyAxes
+    converged: bool
+    iterations: int
+    cost: float
+    estimates: tuple[Estimate, ...]
+    covariance: Array
+    warnings: tuple[str, ...] = ()
+
+    @property
+    def order(self) -> tuple[str, ...]:
+        """Component names of the rows of `covariance`."""
+        return tuple(name for e in self.estimates for name in e.component_names)
+
+    @property
+    def values(self) -> dict[str, Array]:
+        """Values by name, in reported units."""
+        return {e.name: e.value for e in self.estimates}
+
+
 def doubts(estimates: Sequence[Estimate], residuals: Sequence[Residuals]) -> list[str]:
     """Return warnings where a solution contradicts what was stated before.
 
@@ -172,13 +194,13 @@ def doubts(estimates: Sequence[Estimate], residuals: Sequence[Residuals]) -> lis
             )
     for r in residuals:
         rms = float(np.sqrt(np.mean((r.residual / r.sigma) ** 2))) if r.time.size else 0.0
-        if rms > _DO_NOT_FIT:
+        if rms > DO_NOT_FIT:
             out.append(
                 f"{r.label}: residuals are {rms:.0f} times as large as their stated standard "
                 "deviation: the model does not fit the data, and the values are not to be used. "
                 "A lever arm, a clock offset, a unit or an axis may be missing or wrong"
             )
-        elif rms > _TOO_LARGE:
+        elif rms > TOO_LARGE:
             out.append(
                 f"{r.label}: residuals are {rms:.1f} times as large as their stated standard "
                 "deviation; the reported standard deviations are too small unless it is corrected"

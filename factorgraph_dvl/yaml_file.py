@@ -163,7 +163,7 @@ _NAMES = {
 def _explain(message: str, root: yaml.Node, value: Any, kind: Any, source: str) -> ConfigError:
     """Turn a message of msgspec into what, where and what was expected."""
     reason, _, at = message.partition(" - at `$")
-    path = _parse_path(at.rstrip("`"))
+    path = _entries(_parse_path(at.rstrip("`")), value, kind)
 
     def where(path: tuple[Key, ...]) -> str:
         line = _find(root, path)
@@ -214,11 +214,38 @@ def _expected(reason: str, kind: Any) -> str:
     return re.sub(r"(\d)\.0\b", r"\1", text)
 
 
-def _parse_path(text: str) -> tuple[Key, ...]:
-    """Split `.dvl.lever_arm_m[0]` into its keys."""
+def _parse_path(text: str) -> tuple[Key | None, ...]:
+    """Split `.dvl.lever_arm_m[0]` into its keys; None where `[...]` stands for any key."""
     return tuple(
-        int(index) if index else name for name, index in re.findall(r"\.(\w+)|\[(\d+)\]", text)
+        int(index) if index else name or None
+        for name, index in re.findall(r"\.(\w+)|\[(\d*)\.*\]", text)
     )
+
+
+def _entries(path: tuple[Key | None, ...], value: Any, kind: Any) -> tuple[Key, ...]:
+    """Return a path with the keys of mappings that msgspec does not name.
+
+    The first entry that does not fit is the one it complains about; where none is found,
+    the path ends at the mapping.
+    """
+    out: list[Key] = []
+    for key in path:
+        if key is None:
+            inner = _entry(kind, "")
+            key = next((k for k, v in value.items() if not _fits(v, inner)), None)
+            if key is None:
+                break
+        out.append(key)
+        value, kind = value[key], _entry(kind, key)
+    return tuple(out)
+
+
+def _fits(value: Any, kind: Any) -> bool:
+    try:
+        msgspec.convert(value, Any if kind is None else kind)
+    except msgspec.ValidationError:
+        return False
+    return True
 
 
 def _dotted(path: tuple[Key, ...]) -> str:
@@ -261,5 +288,16 @@ def _fields(kind: Any) -> dict[str, Any]:
 def _descend(kind: Any, path: tuple[Key, ...]) -> Any:
     """Return the type of the value at a path; None where the types do not say."""
     for key in path:
-        kind = _fields(kind).get(key) if isinstance(key, str) else None
+        kind = _entry(kind, key)
     return kind
+
+
+def _entry(kind: Any, key: Key) -> Any:
+    """Return the type of what stands under a key; None where the types do not say."""
+    if isinstance(key, str):
+        for option in _options(kind):
+            if get_origin(option) is dict:
+                return get_args(option)[1]
+        return _fields(kind).get(key)
+    lists = [option for option in _options(kind) if get_origin(option) is list]
+    return get_args(lists[0])[0] if lists else None

@@ -25,8 +25,10 @@ LAYERS = (
     ("increments",),
     ("kalman",),
     ("preintegration",),
+    ("attitude",),
     ("keys",),
     ("chain",),
+    ("priors",),
     ("arcs",),
     ("attitude_alignment",),
     ("alignment", "mounting"),
@@ -54,6 +56,7 @@ FORBIDDEN = {
     "alignment": ("mounting", "graph", "keys"),
     "mounting": ("alignment", "graph", "keys", "preintegration"),
     "preintegration": ("keys",),
+    "attitude": ("io", "simulation"),
     "information": ("sensors", "earth"),
 }
 # What is held against the factor graph shares nothing with it: the cross-check and all
@@ -62,14 +65,14 @@ FORBIDDEN |= {
     name: (*FORBIDDEN.get(name, ()), "kalman")
     for name in (
         *("preintegration", "keys", "chain", "arcs", "attitude_alignment", "alignment"),
-        *("mounting", "graph", "solvers", "replay"),
+        *("mounting", "graph", "solvers", "replay", "attitude", "priors"),
         *("analysis", "report"),
     )
 }
 # Data classes of the sensors: no measurement equation is among them.
 SENSOR_DATA = ("Imu", "ImuSettings", "Gnss", "Dvl", "Star", "Parameter", "Motion")
 # The graph asks every sensor through the protocol and knows none but the IMU by name.
-NAMELESS = ("graph", "chain", "preintegration", "keys", "solvers", "replay")
+NAMELESS = ("graph", "priors", "chain", "preintegration", "keys", "solvers", "replay")
 # Only where they are used: GTSAM, SciPy and Matplotlib take most of a second to load.
 LAZY_FOR_CLI = tuple(layer for line in LAYERS[1:-1] for layer in line)
 

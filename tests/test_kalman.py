@@ -406,6 +406,7 @@ def test_command_line(tmp_path, capsys):
     assert run("kalman", trial, "--out", out, "--quiet", "--no-figures", "--rate", "5") == 0
     assert {p.name for p in out.iterdir()} == {
         "calibration.json",
+        "instrument.yaml",
         "trajectory.csv",
         "history.csv",
     }

@@ -47,7 +47,11 @@ def test_every_kind_of_motion_is_found(sea, noise):
     assert [s.label for s in found] == labels
     edges = [0, 60, 100, 160, 224, 284, 304, 364, 384, 424, 444]
     assert found[0].start == 0.0
-    np.testing.assert_allclose([s.end for s in found], edges[1:], atol=4.0)
+    off = np.abs(np.array([s.end for s in found]) - edges[1:])
+    # A ramp of 4 s begins and ends nowhere in particular.
+    ramped = np.isin(edges[1:], [160, 224])
+    assert off[ramped].max() < 3.0
+    assert off[~ramped].max() < (1.2 if noise else 0.3)
     for before, after in pairwise(found):
         assert before.end == after.start
 
@@ -88,7 +92,7 @@ def test_the_scenario_of_the_paper():
     kinds = ["steady", "turning"] * 3
     assert [s.label for s in found] == ["accelerating", *kinds, "accelerating"]
     np.testing.assert_allclose(
-        [s.end for s in found], [4, 104, 149, 249, 299, 399, 449, 453], atol=1.0
+        [s.end for s in found], [4, 104, 149, 249, 299, 399, 449, 453], atol=0.3
     )
 
 

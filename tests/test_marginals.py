@@ -75,7 +75,7 @@ def test_two_open_combinations_of_two_components():
     found = view(turn @ np.diag([0.81, 0.49]) @ turn.T, [1.0, 1.0])
     assert [d.ratio for d in found.directions] == pytest.approx([0.9, 0.7])
     # sqrt((0.81 + 0.49) / 2) = 0.806.
-    left = "is not told by the data: 81 % of the prior's σ is left"
+    left = "is hardly told by the data: 81 % of the prior's σ is left"
     assert found.sentences == (f"a_deg {left}", f"b_m {left}")
 
 

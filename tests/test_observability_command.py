@@ -93,6 +93,9 @@ UNOBSERVABLE = {
             }
         }
     ),
+    "bias and current": lambda: under_way(
+        dvl={"reference": "water"}, trial={"dvl": {"bias_std_m_s": [1, 1, 1]}}
+    ),
     "gap": lambda: under_way(imu={"gaps_s": [[8.0, 12.0]]}),
 }
 
@@ -101,7 +104,7 @@ UNOBSERVABLE = {
 def test_nothing_unobservable_stops_it(name: str, tmp_path: Path, run: Run) -> None:
     trial = UNOBSERVABLE[name]()
     out = tmp_path / "out"
-    drawn = name in ("straight", "without GNSS")
+    drawn = name in ("straight", "without GNSS", "bias and current")
     options = [] if drawn else ["--no-figures"]
     code, _, err = run("observability", written(trial, tmp_path), "--out", out, *options)
     assert code == 0, err
@@ -116,6 +119,7 @@ def test_nothing_unobservable_stops_it(name: str, tmp_path: Path, run: Run) -> N
     if shares is not None:
         total = np.array(shares["prior"]) + np.sum(shares["segments"], axis=0)
         np.testing.assert_allclose(total, 1.0, atol=1e-6)
+        assert np.min([shares["prior"], *shares["segments"]]) >= -1e-9
     if trial.dvl is None or not trial.dvl.locked.any() or name == "held fixed":
         assert found["singular_values"] is None
         assert any("singular values" in text for text in found["missing"])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from itertools import product
 from pathlib import Path
 
 import msgspec
@@ -15,8 +16,9 @@ import factorgraph_dvl.planning.proposal as proposing
 from factorgraph_dvl.cli import main
 from factorgraph_dvl.errors import ConfigError
 from factorgraph_dvl.planning import load_plan, predict, propose, requirements
-from factorgraph_dvl.planning.library import library
+from factorgraph_dvl.planning.library import Item, Library, library
 from factorgraph_dvl.planning.prediction import go_on
+from factorgraph_dvl.report.plan_files import proposal_lines
 from factorgraph_dvl.simulation import parse_scenario, plan_motion, simulate
 from factorgraph_dvl.solvers.batch import solve
 
@@ -55,6 +57,17 @@ def test_a_prediction_claims_nothing_that_noise_would_feign():
     for name in ("misalignment_deg", "lever_arm_m", "scale_error"):
         expected = solved.estimate(name).observable.tolist()
         assert predicted.estimate(name).observable.tolist() == expected, name
+
+
+def test_one_scale_for_an_instrument_that_has_three():
+    scene = scenario(dvl={"scale_error": [0.005, 0.006, 0.004]})
+    predicted = predict(scene)
+    assert predicted.solution.estimate("scale_error").value == pytest.approx([0.005])
+    solved = solve(simulate(msgspec.structs.replace(scene, noise=True), 1))
+    claimed = std_of(solved)["scale_error"]
+    assert std_of(predicted.solution)["scale_error"] == pytest.approx(claimed, rel=0.02)
+    history, _ = go_on(predicted.scenario, [{"straight_s": 10}], predicted.ending)
+    assert np.isfinite(history.std).all()
 
 
 def test_going_on_is_as_good_as_starting_again():
@@ -162,6 +175,115 @@ def test_the_shortest_addition_is_proposed():
     assert all(r.met for r in again)
     assert again == found.requirements
     assert planned.duration - prediction.duration == pytest.approx(found.added)
+
+
+def test_no_sequence_of_up_to_three_entries_is_shorter(monkeypatch):
+    prediction = predict(scenario(manoeuvres=[{"straight_s": 30}], **CALM))
+    items = (
+        Item("straight", ({"straight_s": 20},), 20.0),
+        Item("turn", ({"turn_deg_s": 9, "duration_s": 10},), 10.0),
+        Item("stop", ({"stop_s": 5, "acceleration_m_s2": 0.8},), 15.0),
+    )
+    monkeypatch.setattr(proposing, "library", lambda *_: Library(items, None))
+    # Sailed once for all searches.
+    sailed, planned = {}, {}
+
+    def remembered(scene, manoeuvres, ending):
+        key = (json.dumps(manoeuvres), id(ending))
+        if key not in sailed:
+            sailed[key] = go_on(scene, manoeuvres, ending)
+        return sailed[key]
+
+    def predicted(scene):
+        key = json.dumps(scene.manoeuvres)
+        if key not in planned:
+            planned[key] = predict(scene)
+        return planned[key]
+
+    monkeypatch.setattr(proposing, "go_on", remembered)
+    monkeypatch.setattr(proposing, "predict", predicted)
+    ends, std, duration = {(): prediction.ending}, {}, {}
+    for depth in (1, 2, 3):
+        for parts in product(range(3), repeat=depth):
+            last = items[parts[-1]]
+            history, ends[parts] = remembered(
+                prediction.scenario, list(last.manoeuvres), ends[parts[:-1]]
+            )
+            std[parts] = dict(zip(history.names, history.std[-1], strict=True))
+            duration[parts] = sum(items[i].duration for i in parts)
+
+    def shortest(required, slack):
+        met = (s for s in std if all(std[s][n] <= slack * v for n, v in required.items()))
+        return min(duration[s] for s in met)
+
+    rng = np.random.default_rng(0)
+    sequences = list(std)
+    calibration = [n for n in prediction.history.names if not n.startswith(("gyro", "accel"))]
+    several = 0
+    for _ in range(10):
+        goal = sequences[rng.integers(len(sequences))]
+        names = rng.choice(calibration, size=3, replace=False).tolist()
+        required = {n: 1.02 * std[goal][n] for n in names}
+        found = propose(prediction, required_of(prediction, **required))
+        if found is None:
+            continue
+        assert found.met
+        assert found.shortest
+
+        # Going on and starting again differ by up to 1 %.
+        assert found.added <= shortest(required, 1.0 / 1.01) + 1e-6
+        if len(found.names) <= 3:
+            assert found.added >= shortest(required, 1.01) - 1e-6
+        several += len(found.names) > 1
+    assert several >= 5
+
+
+def test_the_order_of_a_sequence_matters():
+    # A straight run after a turn tells more than before it: the turn alone is too little, and
+    # "straight, turn" is another result than "turn, straight".
+    prediction = predict(scenario(**STRAIGHT))
+    turn, straight = {"turn_deg_s": 3, "duration_s": 30}, {"straight_s": 60}
+    history, _ = go_on(prediction.scenario, [turn, straight], prediction.ending)
+    other, _ = go_on(prediction.scenario, [straight, turn], prediction.ending)
+    at = history.names.index("misalignment_y_deg")
+    assert history.std[-1, at] < 0.9 * other.std[-1, at]
+    required = required_of(prediction, misalignment_y_deg=1.005 * float(history.std[-1, at]))
+    found = propose(prediction, required)
+    assert found is not None
+    assert found.shortest
+    assert found.added <= 90.0 + 1e-6
+
+
+def test_a_search_that_ends_early_says_so(monkeypatch):
+    monkeypatch.setattr(proposing, "_MOST_TRIED", 20)
+    prediction = predict(scenario(**STRAIGHT))
+    history, _ = go_on(
+        prediction.scenario, [{"turn_deg_s": 3, "duration_s": 150}], prediction.ending
+    )
+    at = history.names.index("misalignment_y_deg")
+    required = required_of(prediction, misalignment_y_deg=float(history.std[-1, at]))
+    found = propose(prediction, required)
+    assert found is not None
+    assert found.tried <= 20
+    assert not found.shortest
+    assert found.limit < 150.0
+    (line, *_) = proposal_lines(found)
+    assert f"all of up to {found.limit:.0f} s among them" in line
+
+
+def test_a_bias_that_walks_is_searched_for():
+    changes = {"imu": {"gyro_noise_deg_sqrt_h": 0.01, "gyro_bias_walk_deg_h_sqrt_h": 0.01}}
+    prediction = predict(scenario(**changes, **STRAIGHT))
+    assert "gyro_bias_x_deg_h" not in prediction.history.names
+    before = std_of(prediction.solution)["gyro_bias_x_deg_h"]
+    more = predict(scenario(**changes, **{**STRAIGHT, "manoeuvres": [{"straight_s": 60}] * 2}))
+    after = std_of(more.solution)["gyro_bias_x_deg_h"]
+    required = required_of(prediction, gyro_bias_x_deg_h=after)
+    found = propose(prediction, required)
+    assert found is not None
+    assert found.met
+    assert found.requirements[0].predicted <= after < before
+    assert found.added <= 60.0 + 1e-6
 
 
 def test_what_no_manoeuvre_shows_is_said_to_be_missed(monkeypatch):

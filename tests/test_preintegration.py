@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from jacobians import differentiate
 from scipy.stats import chi2
-from truth import CONING, exact_motion, exact_states, scenario
+from truth import CONING, config, exact_motion, exact_states, scenario
 
 from factorgraph_dvl.conventions import DEG, HOUR, Array, log_so3
 from factorgraph_dvl.earth import LocalFrame
@@ -357,3 +357,20 @@ def test_nodes_at_the_interval_asked_for(cases):
         assert seg.first.size == count
         np.testing.assert_allclose(seg.duration, length / count, atol=0.011)
         assert seg.last[-1] == inc.dt.size
+
+
+def test_nodes_stand_just_before_the_epochs_asked_for():
+    inc, _ = increments(simulate(config("star", manoeuvres=[{"straight_s": 20}])).imu)
+    first = inc.start[0]
+    # In the middle of a sample; on one but for rounding; outside.
+    epochs = np.array([first + 3.2101, inc.start[400] - 1e-9, inc.start[600], 1e4])
+    seg = segments(inc, 1.0, epochs)
+    at = attach(seg, epochs[:3], np.zeros(3))
+    assert np.abs(at.tau).max() < 0.02
+    assert np.abs(at.tau[1:]).max() < 1e-8
+    lengths = np.diff(seg.node_time)
+    assert lengths.max() < 1.51
+    assert seg.node_time.size < 25
+    np.testing.assert_array_equal(
+        segments(inc, 1.0, np.empty(0)).node_time.size, segments(inc, 1.0).node_time.size
+    )

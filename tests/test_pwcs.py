@@ -162,7 +162,7 @@ def test_accelerating_makes_nothing_best_but_shows_the_fourth_direction():
 
 
 def test_turning_is_what_shows_the_horizontal_lever_arm():
-    # Finding 4, "turning makes alpha_y, l_x and l_y best", is confirmed.
+    # Finding 4, "turning makes alpha_y, l_x and l_y best", is confirmed for l_x and l_y.
     rows, time = rows_of("turning")
     root_n = np.sqrt(time.size)
     for i in (4, 5):
@@ -173,8 +173,13 @@ def test_turning_is_what_shows_the_horizontal_lever_arm():
             assert known(rows_of(other)[0], i) < 1e-4
     # Of the current's cosine across the bow, the mean square is a half.
     assert known(rows, 1) / root_n == pytest.approx(CURRENT / np.sqrt(2.0), rel=0.01)
-    accelerating, its_time = rows_of("accelerating")
-    assert known(rows, 1) / root_n > 1.4 * known(accelerating, 1) / np.sqrt(its_time.size)
+    # alpha_y is refuted: sqrt(2) times as much as accelerating, but drifting, all of whose
+    # current stands across the bow, has sqrt(2) times as much again. Steady has none.
+    for other, ratio in (("drifting", np.sqrt(0.5)), ("accelerating", np.sqrt(2.0))):
+        its_rows, its_time = rows_of(other)
+        per_ping = known(its_rows, 1) / np.sqrt(its_time.size)
+        assert known(rows, 1) / root_n == pytest.approx(ratio * per_ping, rel=0.01)
+    assert known(rows_of("steady")[0], 1) < 1e-4
     # The only motion of the four that shows six directions.
     assert np.sum(stacked(rows, time).values > 1e-3 * root_n) == 6
 

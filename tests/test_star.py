@@ -32,6 +32,7 @@ from factorgraph_dvl.kalman.steps import compose, prepare
 from factorgraph_dvl.sensors.star import Star, StarAttitude, StarSettings
 from factorgraph_dvl.simulation import plan_motion, simulate
 from factorgraph_dvl.solvers.batch import solve
+from factorgraph_dvl.solvers.state_times import dense_epochs
 
 SEEDS = int(os.environ.get("FACTORGRAPH_DVL_SEEDS", "50"))
 EPOCH = "2018-12-01T05:30:00Z"
@@ -383,6 +384,37 @@ def test_a_walking_bias_is_followed():
         assert error @ np.linalg.solve(P, error) < 16.3
 
 
+@pytest.mark.parametrize("rate", [2, 3, 10])
+@pytest.mark.parametrize("noise", [0.001, 0.005, 0.05, 0.2])
+def test_noise_of_the_gyros_between_states_counts(noise, rate):
+    scene = config(
+        "star", **SHORT, imu={"gyro_noise_deg_sqrt_h": noise}, star={"rate_hz": rate}
+    )  # fmt: skip
+    trial = simulate(scene, 1)
+    graph, filtered = solve(trial), calibrate(trial, "star")[0]
+    a, b = (s.estimate("gyro_bias_deg_h").std for s in (graph, filtered))
+    np.testing.assert_allclose(a, b, rtol=0.02)
+    # What T seconds of gyros leave of a drift, however good the stars; the prior is 5 deg/h.
+    assert a.min() > 1.0 / np.sqrt(50.0 / 3600.0 / noise**2 + 1.0 / 5.0**2)
+    time, rows, others = np.intersect1d(
+        graph.trajectory.time, filtered.trajectory.time, return_indices=True
+    )
+    assert time.size > 400
+    a, b = graph.trajectory.rph_std[rows], filtered.trajectory.rph_std[others]
+    np.testing.assert_allclose(np.median(a, axis=0), np.median(b, axis=0), rtol=0.05)
+
+
+def test_quiet_gyros_need_no_more_states(floating):
+    frame = floating.frame()
+    assert dense_epochs(floating, frame, 1.0) is None
+    noisy = replace_settings(floating.imu.settings, gyro_noise_deg_sqrt_h=0.2)
+    noisy = replace(floating, imu=replace(floating.imu, settings=noisy))
+    time = star_of(floating).time
+    np.testing.assert_array_equal(dense_epochs(noisy, frame, 1.0), time)
+    fast = replace(star_of(floating), time=time / 50.0)
+    assert np.diff(dense_epochs(replace(noisy, others=(fast,)), frame, 1.0)).min() > 0.049
+
+
 def test_stars_tell_more_of_the_misalignment():
     trial = simulate(config("seed-a-star", imu={"rate_hz": 50}), 0)
     without = solve(replace(trial, others=()))
@@ -557,6 +589,31 @@ def test_mixed_up_quaternions_are_noticed(floating, quaternion, cause):
     assert any(cause in f.text for f in survey(wrong).problems)
 
 
+@pytest.mark.parametrize(
+    ("name", "changes"),
+    [
+        ("star", {}),
+        ("star", {"star": {"rate_hz": 10, "std_arcsec": 60}}),
+        ("star", {"star": {"rate_hz": 10, "std_arcsec": 60, "mounting_deg": MOUNTING_DEG}}),
+        # Attitudes between the samples of the gyros.
+        ("star", {"imu": {"rate_hz": 53}, "star": {"rate_hz": 3}}),
+        ("seed-a-star", {}),
+        ("seed-a-star", {"star": {"rate_hz": 10, "std_arcsec": 60}}),
+        ("seed-a-star", {"imu": {"sampling": "instantaneous"}, "star": {"rate_hz": 1}}),
+        ("seed-a-star", {"imu": {"gyro_noise_deg_sqrt_h": 0.2}}),
+    ],
+)
+def test_good_attitudes_are_not_suspected(name, changes):
+    trial = simulate(config(name, **(SHORT if name == "star" else {}), **changes), 0)
+    found = survey(trial)
+    assert not found.problems
+    assert any("its turns agree" in f.text for f in found.findings)
+    star = star_of(trial)
+    inverse = replace(star, quaternion=star.quaternion * [1, -1, -1, -1])
+    problems = survey(replace(trial, others=(inverse,))).problems
+    assert any("inertial to body" in f.text for f in problems)
+
+
 def test_mixed_up_stars_are_noticed():
     trial = simulate(config("star", **SHORT, star={"stars": PRINTED.tolist()}), 0)
     assert not survey(trial).problems
@@ -567,6 +624,92 @@ def test_mixed_up_stars_are_noticed():
     wrong = Star.from_vectors(star.settings, v.time, v.body, swapped, "star.csv")
     problems = survey(replace(trial, others=(wrong,))).problems
     assert any("catalogue" in f.text for f in problems)
+
+
+def test_a_wrong_epoch_is_noticed(floating):
+    late = replace(floating, epoch="2018-12-01T06:30:00Z")
+    assert any("`epoch`" in f.text for f in survey(late).problems)
+    assert any("`epoch`" in w for w in calibrate(late, "star")[0].warnings)
+    assert not any("`epoch`" in w for w in calibrate(floating, "star")[0].warnings)
+
+
+def test_an_unknown_mounting_is_not_for_the_filter(tmp_path, capsys):
+    trial = simulate(config("star", **SHORT, trial=UNKNOWN), 1)
+    save_trial(trial, tmp_path / "trial")
+    command = ("kalman", "--method", "star", tmp_path / "trial", "--out", tmp_path / "out")
+    code, shown = run(capsys, *command, "--quiet")
+    assert code == 2
+    assert "star.mounting_std_deg" in shown.err
+    assert not (tmp_path / "out").exists()
+
+
+def test_what_the_filter_does_not_know_of_the_mounting_is_in_its_sigma():
+    prior = {"star": {"mounting_deg": [0, 0, 0], "mounting_std_deg": [1, 1, 1]}}
+    errors = []
+    for off in np.eye(3):
+        star = {"mounting_deg": off.tolist()}
+        trial = simulate(config("star", **SHORT, noise=False, star=star, trial=prior))
+        solution = calibrate(trial, "star")[0]
+        errors.append(drift_errors(solution, trial)[0])
+        attitude = trajectory_errors(solution, trial.reference).attitude
+        np.testing.assert_allclose(np.sqrt(attitude.nees), 1.0, atol=0.1)
+    # Off by one sigma about each axis: the squares of the errors add up to the variance.
+    scatter = np.sqrt(np.sum(np.square(errors), axis=0))
+    assert scatter.min() > 0.2
+    np.testing.assert_allclose(solution.estimate("gyro_bias_deg_h").std, scatter, rtol=0.3)
+
+
+@pytest.mark.parametrize(
+    "star",
+    [
+        {"std_arcsec": [3, 6, 40], "mounting_deg": MOUNTING_DEG, "ut1_utc_s": 0.4},
+        {"stars": PRINTED.tolist(), "mounting_deg": MOUNTING_DEG},
+    ],
+    ids=["unequal", "vectors"],
+)
+def test_filter_and_graph_agree_on_attitude_and_sigma(star):
+    trial = simulate(config("star", **SHORT, star=star), 5)
+    graph, filtered = solve(trial), calibrate(trial, "star")[0]
+    (a, P), (b, Q) = (drift_errors(s, trial) for s in (graph, filtered))
+    np.testing.assert_allclose(np.sqrt(np.diag(P)), np.sqrt(np.diag(Q)), rtol=0.02)
+    assert np.abs((a - b) / np.sqrt(np.diag(P))).max() < 0.2
+    _, i, j = np.intersect1d(graph.trajectory.time, filtered.trajectory.time, return_indices=True)
+    sigma = graph.trajectory.rph_std[i]
+    np.testing.assert_allclose(sigma, filtered.trajectory.rph_std[j], rtol=0.05)
+    away = (graph.trajectory.rph[i] - filtered.trajectory.rph[j]) / sigma
+    assert np.abs(away).max() < 0.3
+
+
+# A star as far off as aberration takes it, and one that is another.
+@pytest.mark.parametrize(("off_arcsec", "severity"), [(20.0, "warning"), (3600.0, "error")])
+def test_a_star_that_does_not_fit_its_catalogue_is_named(off_arcsec, severity):
+    bright = [[1, 0, 0], [0.6, 0.8, 0], [0.6, 0, 0.8], [0.8, -0.36, 0.48], [0.8, 0.36, -0.48]]
+    trial = simulate(config("star", **SHORT, star={"stars": bright}), 0)
+    star = star_of(trial)
+    assert star.misfit == pytest.approx(1.0, abs=0.1)
+    assert star.doubts() == ()
+    v = star.vectors
+    moved = v.inertial.copy()
+    moved[2::5] = Rotation.from_rotvec([0, off_arcsec * ARCSEC, 0]).apply(moved[2::5])
+    wrong = Star.from_vectors(star.settings, v.time, v.body, moved, "star.csv")
+    trial = replace(trial, others=(wrong,))
+    expected = "not to be used" if severity == "error" else "too small"
+    for solution in (solve(trial), calibrate(trial, "star")[0]):
+        (said,) = (w for w in solution.warnings if "catalogue" in w)
+        assert "star.csv line 4" in said
+        assert expected in said
+    (problem,) = survey(trial).problems
+    assert problem.severity == severity
+    assert "star.csv line 4" in problem.text
+
+
+def test_a_few_stars_may_scatter_more():
+    rng = np.random.default_rng(0)
+    catalogue = PRINTED[1:] / np.linalg.norm(PRINTED[1:], axis=1)[:, None]
+    body = catalogue + rng.normal(0.0, 2.0 * 5.0 * ARCSEC, catalogue.shape)
+    # Twice as much, but of one degree of freedom.
+    star = Star.from_vectors(StarSettings(), np.zeros(2), body, catalogue, "star.csv")
+    assert star.doubts() == ()
 
 
 # Monte Carlo
@@ -619,3 +762,24 @@ def test_what_is_estimated_beside_the_drift_scatters_as_stated(changes):
     low, high = nees_band(3, SEEDS, 0.997)
     for runs in filter(None, (drift, mounting)):
         assert low < drift_nees(runs) < high
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("noise", "rate"), [(0.05, 2), (0.2, 10)])
+def test_with_noisy_gyros_drift_and_attitude_scatter_as_stated(noise, rate):
+    scene = config(
+        "star",
+        manoeuvres=[{"straight_s": 60}],
+        imu={"gyro_noise_deg_sqrt_h": noise},
+        star={"rate_hz": rate},
+    )
+    drift, attitude = [], []
+    for seed in range(SEEDS):
+        trial = simulate(scene, seed)
+        solution = solve(trial)
+        drift.append(drift_errors(solution, trial))
+        # Independent: one attitude of each run.
+        attitude.append(trajectory_errors(solution, trial.reference).attitude.nees[300])
+    low, high = nees_band(3, SEEDS, 0.997)
+    assert low < drift_nees(drift) < high
+    assert low < np.mean(attitude) < high

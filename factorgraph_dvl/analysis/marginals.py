@@ -143,7 +143,8 @@ def _open_sentences(
         left = f"{100.0 * min(d.ratio, 1.0):.0f} % of the prior's σ is left"
         index = [names.index(name) for name in d.names]
         if len(index) == 1:
-            out.append(f"{d.names[0]} is not told by the data: {left}")
+            told = "is not told" if d.ratio > _NOTHING else "is hardly told"
+            out.append(f"{d.names[0]} {told} by the data: {left}")
         elif len(index) > _MOST_NAMED:
             out.append(f"{', '.join(d.names)} cannot be told apart: {left} of a combination")
         else:

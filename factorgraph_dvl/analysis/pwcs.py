@@ -46,7 +46,8 @@ _NOTHING = 1e-9
 # Differences of sixth order of what is zero in the middle: centred, and to one side.
 _CENTRED = np.array([45.0, -9.0, 1.0]) / 60.0
 _ONE_SIDED = np.array([360.0, -450.0, 400.0, -225.0, 72.0, -10.0]) / 60.0
-_GAP = 1.5
+# Epochs further apart than this many intervals have a gap between them.
+GAP = 1.5
 
 
 @dataclass(frozen=True)
@@ -56,7 +57,7 @@ class BodyMotion:
     Parameters
     ----------
     time : (M,) s.
-    v_b : (M, 3) velocity of the IMU over ground, m/s.
+    v_b : (M, 3) velocity of the IMU over ground, or through the water, m/s.
     omega_b : (M, 3) angular rate relative to the Earth, rad/s.
     """
 
@@ -69,7 +70,7 @@ class BodyMotion:
         interval = float(np.median(np.diff(self.time)))
         after = np.clip(np.searchsorted(self.time, time), 1, self.time.size - 1)
         within = (time >= self.time[0] - 1e-9) & (time <= self.time[-1] + 1e-9)
-        within &= self.time[after] - self.time[after - 1] < _GAP * interval
+        within &= self.time[after] - self.time[after - 1] < GAP * interval
         time = time[within]
         both = CubicSpline(self.time, np.hstack([self.v_b, self.omega_b]))(time)
         return BodyMotion(time, both[:, :3], both[:, 3:]), within
@@ -89,6 +90,11 @@ class Mounting:
     misalignment: Array
     scale_error: Array
     lever_arm: Array
+
+    @property
+    def gain(self) -> Array:
+        """What takes a velocity from b to the DVL's reading: (1 + k) D, (3, 3)."""
+        return np.broadcast_to(1.0 + self.scale_error, (3,))[:, None] * exp_so3(self.misalignment)
 
 
 @dataclass(frozen=True)
@@ -148,7 +154,7 @@ def body_motion(motion: Trajectory | Reference, body_axes: BodyAxes) -> BodyMoti
     omega = np.zeros_like(v_b)
     if time.size > 1:
         interval = float(np.median(np.diff(time)))
-        cuts = np.flatnonzero(np.diff(time) > _GAP * interval) + 1
+        cuts = np.flatnonzero(np.diff(time) > GAP * interval) + 1
         for a, b in pairwise([0, *cuts, time.size]):
             omega[a:b] = _rates(nRb[a:b], time[a:b])
     return BodyMotion(time, v_b, omega)
@@ -194,10 +200,9 @@ def point_set_rows(motion: BodyMotion, mounting: Mounting) -> Array:
     motion : at M pings.
     mounting : where to linearise.
     """
-    D = exp_so3(mounting.misalignment)
     u_b = motion.v_b + np.cross(motion.omega_b, mounting.lever_arm)
-    u_d = u_b @ D.T
-    gain = np.broadcast_to(1.0 + mounting.scale_error, (3,))[:, None] * D
+    u_d = u_b @ exp_so3(mounting.misalignment).T
+    gain = mounting.gain
     by_scale = u_d[:, :, None] * (np.ones((3, 1)) if mounting.scale_error.size == 1 else np.eye(3))
     return np.concatenate(
         [

@@ -27,7 +27,7 @@ from factorgraph_dvl.conventions import (
     exp_so3,
     frd_from_body,
 )
-from factorgraph_dvl.sensors.dvl import Dvl
+from factorgraph_dvl.sensors.dvl import MISALIGNMENT, Dvl
 from factorgraph_dvl.sensors.gnss import Gnss
 from factorgraph_dvl.sensors.imu import Imu
 from factorgraph_dvl.sensors.star import Star
@@ -64,7 +64,7 @@ def findings(trial: Trial, sensors: list[SensorSurvey]) -> Iterator[Finding]:
         yield from _dvl_findings(trial.dvl, trial.gnss, trial.body_axes)
     for aid in trial.others:
         if isinstance(aid, Star):
-            yield from star_findings(aid, trial.epoch, trial.imu)
+            yield from star_findings(aid, trial)
 
 
 def _clock_findings(sensors: list[SensorSurvey]) -> Iterator[Finding]:
@@ -348,10 +348,10 @@ def _speed_findings(dvl: Dvl, gnss: Gnss) -> Iterator[Finding]:
 
 def _sign_findings(dvl: Dvl, body_axes: BodyAxes, velocity_d: Array) -> Iterator[Finding]:
     """Check that the vehicle moves ahead, where the mounting is known well enough."""
-    settings = dvl.settings
-    if max(settings.misalignment_std_deg) > 30.0:
+    misalignment = next(p for p in dvl.parameters() if p.name == MISALIGNMENT)
+    if misalignment.sigma.max() > 30.0 * DEG:
         return
-    dRb = exp_so3(np.array(settings.misalignment_deg) * DEG)
+    dRb = exp_so3(misalignment.mean)
     frd = velocity_d @ dRb @ frd_from_body(body_axes).T
     horizontal = np.hypot(frd[:, 0], frd[:, 1])
     moving = horizontal > _MOVING_M_S

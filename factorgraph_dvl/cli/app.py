@@ -12,7 +12,9 @@ from rich.text import Text
 from factorgraph_dvl import __version__
 from factorgraph_dvl.cli.console import stderr
 from factorgraph_dvl.cli.crosscheck import crosscheck
+from factorgraph_dvl.cli.deadreckon import deadreckon
 from factorgraph_dvl.cli.inspect import inspect
+from factorgraph_dvl.cli.instrument import instrument
 from factorgraph_dvl.cli.observability import observability
 from factorgraph_dvl.cli.plan import plan
 from factorgraph_dvl.cli.replay import replay
@@ -31,7 +33,18 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
-for _command in (simulate, solve, replay, kalman, inspect, crosscheck, observability, plan):
+for _command in (
+    simulate,
+    solve,
+    replay,
+    kalman,
+    inspect,
+    crosscheck,
+    observability,
+    plan,
+    deadreckon,
+    instrument,
+):
     app.command()(_command)
 
 

@@ -60,7 +60,8 @@ def _view(
 ) -> tuple[Observability, bool]:
     """Return the view of a trial, which is solved for that, or of a solution."""
     from factorgraph_dvl.analysis.observability import observability as look
-    from factorgraph_dvl.io.solution_folder import CALIBRATION_FILE, load_solution
+    from factorgraph_dvl.io.calibration_file import CALIBRATION_FILE
+    from factorgraph_dvl.io.solution_folder import load_solution
     from factorgraph_dvl.io.trial_folder import SETTINGS_FILE, load_trial
 
     if (source / CALIBRATION_FILE).exists() and not (source / SETTINGS_FILE).exists():

@@ -100,6 +100,7 @@ def _solve_into(
         def add(folder: Path) -> None:
             if history is not None:
                 write_history(folder, history.time, history.names, history.values, history.std)
+            _write_instrument(solution, folder)
             if not figures:
                 return
             from factorgraph_dvl.report.figures import write_figures
@@ -119,6 +120,17 @@ def _solve_into(
             soft_wrap=True,
         )
         raise typer.Exit(1)
+
+
+def _write_instrument(solution: Solution, folder: Path) -> None:
+    """Write the calibration as instruments take it, if there is one of a DVL."""
+    from factorgraph_dvl.analysis.instrument import NEEDED, instrument_of
+    from factorgraph_dvl.io.solution_folder import INSTRUMENT_FILE
+    from factorgraph_dvl.report.instrument_text import instrument_text
+
+    if solution.converged and set(NEEDED) <= {e.name for e in solution.estimates}:
+        text = instrument_text(instrument_of(solution), solution.trial)
+        (folder / INSTRUMENT_FILE).write_text(text, encoding="utf-8")
 
 
 def _print_solution(trial: Trial, solution: Solution) -> None:

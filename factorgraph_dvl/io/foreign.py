@@ -11,9 +11,14 @@ from msgspec import UNSET, UnsetType
 
 from factorgraph_dvl.conventions import DEG, Array, BodyAxes
 from factorgraph_dvl.errors import ConfigError, DataError
+from factorgraph_dvl.io.calibration_file import (
+    CALIBRATION_FILE,
+    check_usable,
+    check_values,
+    load_calibration,
+)
 from factorgraph_dvl.io.motion_table import read_reference
 from factorgraph_dvl.io.solution_folder import (
-    CALIBRATION_FILE,
     STD_COLUMNS,
     TRAJECTORY_FILE,
     load_solution,
@@ -39,6 +44,7 @@ _KNOWN: dict[str, tuple[str, str, tuple[tuple[str, ...], ...]]] = {
     "dvl_bias_m_s": ("dvl_bias", "m_s", (("x", "y", "z"),)),
     "time_offset_s": ("time_offset", "s", (("",),)),
     "current_m_s": ("current", "m_s", (("e", "n"),)),
+    "sea_surface_height_m": ("sea_surface_height", "m", (("",),)),
 }
 
 _Numbers = float | list[float | None]
@@ -70,6 +76,7 @@ class _Parameters(Section, frozen=True, kw_only=True):
     dvl_bias_m_s: _Given = UNSET
     time_offset_s: _Given = UNSET
     current_m_s: _Given = UNSET
+    sea_surface_height_m: _Given = UNSET
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -215,6 +222,41 @@ def read_truth(path: Path | str) -> dict[str, Array]:
             expected=f"JSON or YAML, such as {TRUTH_FILE}",
         )
     return {name: _array(value.value) for name, value in _given(_read_calibration(path)).items()}
+
+
+def read_calibration_values(path: Path | str, body_axes: BodyAxes) -> dict[str, Array]:
+    """Read the values of a calibration, of this program or typed in by hand.
+
+    Parameters
+    ----------
+    path : of a calibration.json, of the solution folder that holds it, or of a JSON or YAML
+        file of calibration values.
+    body_axes : that the values must be in.
+
+    Returns
+    -------
+    Name to (n,) values, in reported units.
+
+    Raises
+    ------
+    ConfigError, DataError
+        If there are no such values, they are in other axes, or their solver did not
+        converge.
+    """
+    path = Path(path)
+    whole = path.is_dir() or (path.suffix.lower() == ".json" and '"covariance"' in read_text(path))
+    if whole:
+        calibration = load_calibration(path, body_axes=body_axes)
+        check_usable(calibration, body_axes, str(path))
+        values = {n: v for n, v in calibration.values.items() if n in _KNOWN}
+    else:
+        values = read_truth(path)
+        says = _read_calibration(path).body_axes
+        if says not in (UNSET, body_axes):
+            raise DataError(f"is in {says} axes", where=str(path), expected=body_axes)
+    for name, value in values.items():
+        check_values(name, value, str(path))
+    return values
 
 
 def _read_calibration(path: Path) -> _File:

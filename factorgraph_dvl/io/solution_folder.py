@@ -2,63 +2,35 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from itertools import islice
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, Literal
 
-import msgspec
 import numpy as np
 
-from factorgraph_dvl.conventions import DEG, GEODETIC_SI, Array, BodyAxes
-from factorgraph_dvl.errors import DataError
+from factorgraph_dvl.conventions import DEG, GEODETIC_SI, Array
+from factorgraph_dvl.io.calibration_file import (
+    CALIBRATION_FILE,
+    encode_calibration,
+    load_calibration,
+)
 from factorgraph_dvl.io.folders import new_folder
 from factorgraph_dvl.io.motion_table import COLUMNS as MOTION_COLUMNS
 from factorgraph_dvl.io.motion_table import motion_columns
 from factorgraph_dvl.io.tables import read_table, write_table
 from factorgraph_dvl.sensors.protocol import stack
-from factorgraph_dvl.solution import Estimate, Solution, Trajectory
+from factorgraph_dvl.solution import Solution, Trajectory
 
-CALIBRATION_FILE = "calibration.json"
 TRAJECTORY_FILE = "trajectory.csv"
 HISTORY_FILE = "history.csv"
 LATENCY_FILE = "latency.csv"
 CONVERGENCE_FILE = "convergence.csv"
+INSTRUMENT_FILE = "instrument.yaml"
 FIGURES_FOLDER = "figures"
 STD_COLUMNS = (
     *("std_e_m", "std_n_m", "std_u_m"),
     *("vel_std_e_m_s", "vel_std_n_m_s", "vel_std_u_m_s"),
     *("roll_std_deg", "pitch_std_deg", "heading_std_deg"),
 )
-
-# JSON knows no nan: null stands for it.
-_Numbers = list[float | None]
-
-
-class _Parameter(msgspec.Struct):
-    value: _Numbers
-    std: _Numbers
-    observable: list[bool]
-    prior_value: _Numbers = []
-    prior_std: _Numbers = []
-
-
-class _Covariance(msgspec.Struct):
-    order: list[str]
-    matrix: list[_Numbers]
-
-
-class _Calibration(msgspec.Struct):
-    format: Literal[1]
-    trial: str
-    solver: str
-    converged: bool
-    iterations: int
-    parameters: dict[str, _Parameter]
-    covariance: _Covariance
-    cost: float | None = None
-    body_axes: BodyAxes = "RFU"
-    warnings: list[str] = []
 
 
 def save_solution(
@@ -86,7 +58,7 @@ def save_solution(
     """
     owned = (
         *(CALIBRATION_FILE, TRAJECTORY_FILE, HISTORY_FILE, LATENCY_FILE, CONVERGENCE_FILE),
-        FIGURES_FOLDER,
+        *(INSTRUMENT_FILE, FIGURES_FOLDER),
     )
     with new_folder(Path(path), force=force, owned=owned) as folder:
         columns = _trajectory_columns(solution.trajectory)
@@ -95,7 +67,7 @@ def save_solution(
         write_table(folder / TRAJECTORY_FILE, columns)
         if extra is not None:
             extra(folder)
-        (folder / CALIBRATION_FILE).write_bytes(_encode(solution))
+        (folder / CALIBRATION_FILE).write_bytes(encode_calibration(solution))
 
 
 def write_history(
@@ -153,90 +125,9 @@ def load_solution(path: Path | str) -> Solution:
         If a file is missing or does not hold what it should.
     """
     folder = Path(path)
-    calibration = _decode(folder / CALIBRATION_FILE)
-    names = iter(calibration.covariance.order)
-    return Solution(
-        trial=calibration.trial,
-        solver=calibration.solver,
-        body_axes=calibration.body_axes,
-        converged=calibration.converged,
-        iterations=calibration.iterations,
-        cost=np.nan if calibration.cost is None else calibration.cost,
-        estimates=tuple(
-            _estimate(name, parameter, names) for name, parameter in calibration.parameters.items()
-        ),
-        covariance=_covariance(calibration),
-        trajectory=_read_trajectory(folder / TRAJECTORY_FILE),
-        warnings=tuple(calibration.warnings),
-    )
-
-
-def _encode(solution: Solution) -> bytes:
-    calibration = _Calibration(
-        format=1,
-        trial=solution.trial,
-        solver=solution.solver,
-        converged=bool(solution.converged),
-        iterations=int(solution.iterations),
-        parameters={
-            e.name: _Parameter(
-                value=_numbers(e.value),
-                std=_numbers(e.std),
-                observable=np.asarray(e.observable, dtype=bool).tolist(),
-                prior_value=_numbers(e.prior_value),
-                prior_std=_numbers(e.prior_std),
-            )
-            for e in solution.estimates
-        },
-        covariance=_Covariance(
-            list(solution.order), [_numbers(row) for row in np.asarray(solution.covariance)]
-        ),
-        cost=float(solution.cost),
-        body_axes=solution.body_axes,
-        warnings=list(solution.warnings),
-    )
-    # msgspec writes nan and infinity as null, and every float with the digits it takes.
-    return msgspec.json.format(msgspec.json.encode(calibration), indent=2) + b"\n"
-
-
-def _decode(file: Path) -> _Calibration:
-    try:
-        calibration = msgspec.json.decode(file.read_bytes(), type=_Calibration)
-    except FileNotFoundError:
-        raise DataError(
-            "the file does not exist", where=str(file), expected="a solution folder"
-        ) from None
-    except (msgspec.MsgspecError, UnicodeDecodeError) as error:
-        raise DataError(f"cannot be read ({error})", where=str(file)) from None
-    size = sum(len(parameter.value) for parameter in calibration.parameters.values())
-    shape = {len(calibration.covariance.order), len(calibration.covariance.matrix)}
-    shape |= {len(row) for row in calibration.covariance.matrix}
-    if shape != {size}:
-        raise DataError(
-            "the covariance does not fit the parameters",
-            where=str(file),
-            expected=f"{size} names in `order`, and a {size} x {size} matrix",
-        )
-    return calibration
-
-
-def _estimate(name: str, parameter: _Parameter, names: Iterator[str]) -> Estimate:
-    size = len(parameter.value)
-    unknown: Sequence[float | None] = [None] * size
-    return Estimate(
-        name,
-        tuple(islice(names, size)),
-        _array(parameter.value),
-        _array(parameter.std),
-        _array(parameter.prior_value or unknown),
-        _array(parameter.prior_std or unknown),
-        np.array(parameter.observable, dtype=bool),
-    )
-
-
-def _covariance(calibration: _Calibration) -> Array:
-    size = len(calibration.covariance.order)
-    return np.array(calibration.covariance.matrix, dtype=float).reshape(size, size)
+    calibration = load_calibration(folder / CALIBRATION_FILE)
+    fields = {name: getattr(calibration, name) for name in calibration.__dataclass_fields__}
+    return Solution(**fields, trajectory=_read_trajectory(folder / TRAJECTORY_FILE))
 
 
 def _trajectory_columns(trajectory: Trajectory) -> dict[str, Array]:
@@ -273,11 +164,3 @@ def _read_trajectory(file: Path) -> Trajectory:
 
 def _diagonal(std: Array) -> Array:
     return (std**2)[:, :, None] * np.eye(3)
-
-
-def _numbers(values: Any) -> _Numbers:
-    return list(np.atleast_1d(np.asarray(values, dtype=float)).tolist())
-
-
-def _array(values: Sequence[float | None]) -> Array:
-    return np.array(values, dtype=float)

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TypeVar, cast
 
 import msgspec
 import numpy as np
-from msgspec import UNSET
+from msgspec import UNSET, UnsetType
 
-from factorgraph_dvl.conventions import DEG, GEODETIC_SI, Array
-from factorgraph_dvl.errors import DataError
+from factorgraph_dvl.conventions import DEG, GEODETIC_SI, Array, BodyAxes
+from factorgraph_dvl.errors import ConfigError, DataError
+from factorgraph_dvl.io.calibration_file import check_usable, encode_calibration, load_calibration
 from factorgraph_dvl.io.folders import new_folder
 from factorgraph_dvl.io.motion_table import motion_columns, read_reference
 from factorgraph_dvl.io.tables import read_table, write_table
@@ -22,22 +24,29 @@ from factorgraph_dvl.io.trial_yaml import (
     to_yaml,
 )
 from factorgraph_dvl.sensors.catalogue import AIDS
-from factorgraph_dvl.sensors.dvl import Dvl
+from factorgraph_dvl.sensors.dvl import CALIBRATED, SCALE_ERROR, TIME_OFFSET, Dvl
 from factorgraph_dvl.sensors.gnss import Gnss
 from factorgraph_dvl.sensors.imu import Imu
-from factorgraph_dvl.sensors.protocol import Record, SensorSection
+from factorgraph_dvl.sensors.protocol import JointPrior, Record, SensorSection
+from factorgraph_dvl.solution import Calibration, Estimate
 from factorgraph_dvl.trial import InitialAttitude, InitialPosition, Reference, Trial
 from factorgraph_dvl.yaml_file import parse_yaml, read_text
 
 SETTINGS_FILE = "trial.yaml"
 TRUTH_FILE = "truth.json"
+# Where a trial that was loaded with a calibration of its DVL keeps it when it is saved.
+PRIOR_FILE = "dvl-calibration.json"
 _TABLES = ("imu", *(aid.section for aid in AIDS), "reference")
 _OWNED = (
     SETTINGS_FILE,
     TRUTH_FILE,
+    PRIOR_FILE,
     *(f"{table}{suffix}" for table in _TABLES for suffix in (".csv", ".parquet")),
 )
 
+
+# Numbers that a parameter of the DVL may have.
+_SIZES = {name: (3,) for name in CALIBRATED} | {SCALE_ERROR: (1, 3), TIME_OFFSET: (1,)}
 
 _Sensor = TypeVar("_Sensor", bound=Record)
 
@@ -70,11 +79,12 @@ def load_trial(path: Path | str) -> Trial:
     initial = settings.initial
     kinds = {aid.section: aid for aid in AIDS}
     aids = {name: _read(folder, kinds[name], section) for name, section in settings.aids.items()}
+    dvl = cast("Dvl | None", aids.pop(Dvl.section, None))
     return Trial(
         name=settings.name or folder.resolve().name,
         imu=_read(folder, Imu, settings.imu),
         gnss=cast("Gnss | None", aids.pop(Gnss.section, None)),
-        dvl=cast("Dvl | None", aids.pop(Dvl.section, None)),
+        dvl=dvl if dvl is None else _with_calibration(dvl, folder, settings.body_axes),
         others=tuple(aids.values()),
         body_axes=settings.body_axes,
         epoch=settings.epoch,
@@ -137,7 +147,93 @@ def save_trial(
             write_table(folder / f"reference{suffix}", motion_columns(trial.reference))
         if trial.calibration_truth:
             (folder / TRUTH_FILE).write_bytes(_truth_json(trial.calibration_truth))
+        if trial.dvl is not None and trial.dvl.prior is not None:
+            calibration = _calibration_of(trial.dvl.prior, trial)
+            (folder / PRIOR_FILE).write_bytes(encode_calibration(calibration))
+            settings = msgspec.structs.replace(trial.dvl.settings, calibration=PRIOR_FILE)
+            trial = replace(trial, dvl=replace(trial.dvl, settings=settings))
         (folder / SETTINGS_FILE).write_text(to_yaml(_settings(trial, suffix)), encoding="utf-8")
+
+
+def _with_calibration(dvl: Dvl, folder: Path, body_axes: BodyAxes) -> Dvl:
+    """Return a DVL with the calibration that its settings name, if any, as its prior."""
+    name = dvl.settings.calibration
+    if isinstance(name, UnsetType):
+        return dvl
+    path = folder / name
+    if not path.exists():
+        raise ConfigError(
+            f"dvl.calibration: the file {name} does not exist",
+            where=SETTINGS_FILE,
+            expected=f"a calibration.json at {path}",
+        )
+    return calibrated_by(dvl, load_calibration(path, body_axes=body_axes), body_axes, source=name)
+
+
+def calibrated_by(dvl: Dvl, calibration: Calibration, body_axes: BodyAxes, source: str) -> Dvl:
+    """Return a DVL whose prior is what a calibration says of it, correlations included.
+
+    What belongs to the day is left out: biases of the IMU, the current.
+
+    Parameters
+    ----------
+    dvl : without a calibration.
+    calibration : of the same DVL, mounted as it is now.
+    body_axes : of the trial.
+    source : name of the calibration, for messages.
+
+    Raises
+    ------
+    DataError
+        If the calibration did not converge, is in other axes, or says nothing of the DVL.
+    """
+    check_usable(calibration, body_axes, source)
+    values: dict[str, Array] = {}
+    rows: list[int] = []
+    at = 0
+    for e in calibration.estimates:
+        if e.name in CALIBRATED:
+            if e.value.size not in _SIZES[e.name]:
+                expected = " or ".join(map(str, _SIZES[e.name]))
+                raise DataError(
+                    f"{e.name} has {e.value.size} numbers", where=source, expected=expected
+                )
+            values[e.name] = e.value
+            rows += range(at, at + e.value.size)
+        at += e.value.size
+    if not values:
+        raise DataError(
+            "the calibration says nothing of the DVL", where=source, expected=", ".join(CALIBRATED)
+        )
+    prior = JointPrior(source, values, calibration.covariance[np.ix_(rows, rows)])
+    settings = msgspec.structs.replace(dvl.settings, calibration=source)
+    return replace(dvl, settings=settings, prior=prior)
+
+
+def _calibration_of(prior: JointPrior, trial: Trial) -> Calibration:
+    """Return a prior as the calibration that it came from."""
+    estimates = []
+    for name, value in prior.values.items():
+        std = prior.std(name)
+        names = next(p for p in _dvl(trial).parameters() if p.name == name).component_names
+        known = np.ones(value.size, dtype=bool)
+        unknown = np.full(value.size, np.nan)
+        estimates.append(Estimate(name, names, value, std, unknown, unknown, known))
+    return Calibration(
+        trial=prior.source,
+        solver="prior",
+        body_axes=trial.body_axes,
+        converged=True,
+        iterations=0,
+        cost=np.nan,
+        estimates=tuple(estimates),
+        covariance=prior.covariance,
+    )
+
+
+def _dvl(trial: Trial) -> Dvl:
+    assert trial.dvl is not None
+    return trial.dvl
 
 
 def _locate(path: Path) -> tuple[Path, Path]:

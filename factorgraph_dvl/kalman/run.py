@@ -34,12 +34,18 @@ _WHITE = (
     "the error of the SINS/GNSS velocity is taken for white noise; it is correlated in time, so "
     "the standard deviations of the DVL's parameters are too small"
 )
+_UNCORRELATED = (
+    "of the calibration in dvl.calibration values and standard deviations are the prior; these "
+    "methods take no correlations"
+)
 _NEGLECTED: dict[DvlMethod, tuple[str, ...]] = {
     "point-set": ("dvl_bias", "time_offset"),
     "nine-state": ("lever_arm", "time_offset"),
     "wahba": ("lever_arm", "dvl_bias", "time_offset"),
     "least-squares": (),
 }
+# GNSS that is missing for longer, s, leaves an INS to drift beyond what its filter models.
+_LONGEST_GAP = 300.0
 # Offsets that a search may try must stay within the IMU's record, s.
 _MARGIN = 1.0
 
@@ -130,15 +136,25 @@ def calibrate(
             hint="`solve` estimates the current",
         )
     report("SINS/GNSS", 0, None)
-    navigation = navigate(trial, dvl.time[dvl.locked] - dvl.settings.time_offset_s)
+    prior = {p.stem: p for p in dvl.parameters()}
+    offset = float(prior["time_offset"].mean[0])
+    navigation = navigate(trial, dvl.time[dvl.locked] - offset)
     report(method, 0, None)
     points_at, unused = _point_sets(navigation, dvl)
     outcome = _calibrate(method, points_at, dvl)
     report("summary", 0, None)
-    points = points_at(dvl.settings.time_offset_s)
-    arm = np.array(dvl.settings.lever_arm_m)
+    points = points_at(offset)
+    arm = prior["lever_arm"].mean
     outcome = replace(outcome, estimated=without_feigned(points, outcome.estimated, arm))
-    notes = [*navigation.notes, *outcome.warnings, _WHITE, *_neglects(method, dvl)]
+    joint = [_UNCORRELATED] if dvl.prior is not None else []
+    notes = [
+        *navigation.notes,
+        *_outage(trial),
+        *joint,
+        *outcome.warnings,
+        _WHITE,
+        *_neglects(method, dvl),
+    ]
     if unused:
         notes.append(f"DVL: {unused} pings at times without SINS/GNSS were not used")
     solution = summarise(
@@ -153,10 +169,25 @@ def calibrate(
     return solution, _history(outcome)
 
 
+def _outage(trial: Trial) -> list[str]:
+    """Say that GNSS is missing for too long, if it is."""
+    assert trial.gnss is not None
+    fixes = trial.gnss.time[~np.isnan(trial.gnss.geodetic[:, 0])]
+    edges = np.concatenate([trial.imu.time[:1], fixes, trial.imu.time[-1:]])
+    longest = float(np.diff(edges).max())
+    if longest <= _LONGEST_GAP:
+        return []
+    return [
+        f"GNSS is missing for {longest:.0f} s: the SINS/GNSS filter drifts there, and neither its "
+        "motion nor the calibration is to be used; `solve` bridges it"
+    ]
+
+
 def _point_sets(navigation: Navigation, dvl: Dvl) -> tuple[Callable[[float], Points], int]:
     """Return the point sets as a function of the time offset, and how many pings fall out."""
-    mean = dvl.settings.time_offset_s
-    reach = min(4.0 * dvl.settings.time_offset_std_s, _MARGIN)
+    prior = next(p for p in dvl.parameters() if p.stem == "time_offset")
+    mean = float(prior.mean[0])
+    reach = min(4.0 * float(prior.sigma[0]), _MARGIN)
     locked = np.flatnonzero(dvl.locked)
     covered = np.ones(locked.size, dtype=bool)
     for offset in {mean - reach, mean, mean + reach}:

@@ -6,12 +6,15 @@ from dataclasses import replace
 
 import numpy as np
 
+from factorgraph_dvl.celestial import off_vertical
 from factorgraph_dvl.conventions import (
     DEG,
     Array,
+    inverse_right_jacobian,
     log_so3,
     rph_from_rotation,
     rph_jacobian,
+    skew,
 )
 from factorgraph_dvl.earth import enu_from_ecef
 from factorgraph_dvl.errors import ConfigError, DataError
@@ -37,6 +40,11 @@ _ARCSEC = DEG / 3600.0
 # The SINS/GNSS filter, which gives position and velocity only, starts from the stars' attitude
 # as if known so well.
 _START = 0.3 * DEG
+# Standard deviation up to which a mounting that is not estimated is taken as it stands, deg.
+_KNOWN_DEG = 5.0
+# Angle between the stars' vertical and that of the specific force from which on epoch or
+# mounting are wrong, rad.
+_OFF_VERTICAL = 2.0 * DEG
 
 
 def calibrate_gyros(trial: Trial, *, rate_hz: float) -> tuple[Solution, Outcome]:
@@ -59,6 +67,15 @@ def calibrate_gyros(trial: Trial, *, rate_hz: float) -> tuple[Solution, Outcome]
             "the trial has no `epoch`",
             where="trial.yaml key epoch",
             expected="UTC of time_s = 0, such as 2022-10-12T02:00:00Z",
+        )
+    settings = star.settings
+    if max(settings.mounting_std_deg) > _KNOWN_DEG:
+        raise ConfigError(
+            f"the mounting of the star tracker is not known ({max(settings.mounting_std_deg):g} "
+            "deg), and this filter does not estimate it",
+            where="trial.yaml star.mounting_std_deg",
+            expected=f"at most {_KNOWN_DEG:g}",
+            hint="`solve` estimates the mounting",
         )
     frame = trial.frame()
     inc, _ = increments(trial.imu)
@@ -92,6 +109,7 @@ def calibrate_gyros(trial: Trial, *, rate_hz: float) -> tuple[Solution, Outcome]
         )
     kept = [history[i] for i in rows_of_history(len(history))]
     estimated = _drift(trial, courses, drift, P)
+    estimated = replace(estimated, covariance=estimated.covariance + _by_mounting(trial, star))
     outcome = Outcome(estimated, 1, tuple(kept))
     solution = _summary(trial, star, samples, courses, seen, estimated, frame.lat, rate_hz)
     return solution, outcome
@@ -110,6 +128,25 @@ def _drift(trial: Trial, courses: list[Course], drift: Array, P: Array) -> Estim
     mean = np.concatenate([c.drift for c in courses]).mean(axis=0)
     spread = np.concatenate([c.covariance[:, 3:, 3:] for c in courses]).mean(axis=0)
     return Estimated((parameter,), (mean,), spread)
+
+
+def _mounting_covariance(star: Star) -> Array:
+    """Return the covariance, (3, 3), rad², of delta in sRb Exp(delta) by the prior."""
+    (mounting,) = star.parameters()
+    root = np.linalg.inv(inverse_right_jacobian(mounting.mean)) * mounting.sigma
+    return np.asarray(root @ root.T)
+
+
+def _by_mounting(trial: Trial, star: Star) -> Array:
+    """Return what the mounting's prior adds to the covariance of the drift.
+
+    By delta the stars see the rate turned, which looks like a drift of omega x delta. What
+    counts of a rate is its mean with the weights that fit a slope to white attitudes.
+    """
+    time = trial.imu.time
+    weight = (time - time[0]) * (time[-1] - time)
+    W = skew(weight @ trial.imu.gyro / weight.sum())
+    return np.asarray(W @ _mounting_covariance(star) @ W.T)
 
 
 def _summary(
@@ -132,11 +169,18 @@ def _summary(
     values, covariance = estimated.reported()
     estimates = estimates_of(estimated.parameters, values, covariance)
     residuals = (_star_residuals(star, courses, seen), *gnss_residuals(trial, navigation))
-    notes = [*navigation.notes]
+    notes = [*navigation.notes, *star.doubts()]
     if np.any(np.array(star.settings.mounting_std_deg) > 0.0):
         notes.append(
             "star does not estimate star_mounting_deg: held at "
             f"{np.round(star.settings.mounting_deg, 6).tolist()}"
+        )
+    away = off_vertical(seen.time, seen.nRb, trial.imu.time, trial.imu.accel)
+    if away > _OFF_VERTICAL:
+        notes.append(
+            f"{star.label}: its attitudes put the vertical {np.degrees(away):.1f} deg away from "
+            "that of the specific force: are `epoch` and `mounting_deg` right? "
+            "The attitude is not to be used before that is cleared up"
         )
     notes += [
         f"{name} not observable: the arc is too short for these stars"
@@ -145,10 +189,11 @@ def _summary(
         if not seen_well
     ]
     first = residuals[0]
-    time = np.arange(
+    steps = np.arange(
         np.ceil(courses[0].time[0] * rate_hz - 1e-6),
         np.floor(courses[-1].time[-1] * rate_hz + 1e-6) + 1,
     )
+    motion = motion_at(navigation, steps / rate_hz)
     return Solution(
         trial=trial.name,
         solver="kalman-star",
@@ -158,7 +203,7 @@ def _summary(
         cost=0.5 * float(np.sum((first.residual / first.sigma) ** 2)),
         estimates=estimates,
         covariance=covariance,
-        trajectory=_trajectory(trial, samples, courses, motion_at(navigation, time / rate_hz)),
+        trajectory=_trajectory(trial, star, samples, courses, motion),
         residuals=residuals,
         warnings=(*notes, *doubts(estimates, residuals)),
     )
@@ -182,16 +227,18 @@ def _star_residuals(star: Star, courses: list[Course], seen: Seen) -> Residuals:
 
 
 def _trajectory(
-    trial: Trial, samples: Samples, courses: list[Course], motion: Motion
+    trial: Trial, star: Star, samples: Samples, courses: list[Course], motion: Motion
 ) -> Trajectory:
     """Return position and velocity of SINS/GNSS with the attitude by the stars."""
     frame = trial.frame()
     nRb, P = motion.nRb.copy(), np.zeros_like(motion.nRb)
     known = np.zeros(motion.time.size, dtype=bool)
+    mounting = _mounting_covariance(star)
     for course in courses:
         mine = (motion.time >= course.time[0]) & (motion.time <= course.time[-1])
         mine &= motion.covered
         nRb[mine], P[mine] = attitude_at(samples, course, frame.lat, motion.time[mine])
+        P[mine] += nRb[mine] @ mounting @ nRb[mine].transpose(0, 2, 1)
         known |= mine
     level = enu_from_ecef(motion.geodetic[known, 0], motion.geodetic[known, 1])
     lRn = level @ enu_from_ecef(frame.lat, frame.lon).T

@@ -66,7 +66,7 @@ def summarise(
         cost=0.5 * float(np.sum((dvl.residual / dvl.sigma) ** 2)),
         estimates=estimates,
         covariance=covariance,
-        trajectory=_trajectory(trial, navigation, rate_hz),
+        trajectory=trajectory_of(trial, navigation, rate_hz),
         residuals=all_residuals,
         warnings=tuple(warnings),
     )
@@ -122,7 +122,8 @@ def _imu_biases(trial: Trial, navigation: Navigation) -> Estimated:
     return Estimated(parameters, values, P)
 
 
-def _trajectory(trial: Trial, navigation: Navigation, rate_hz: float) -> Trajectory:
+def trajectory_of(trial: Trial, navigation: Navigation, rate_hz: float) -> Trajectory:
+    """Return the smoothed motion at the multiples of 1 / rate that it covers."""
     first, last = navigation.track.time[0], navigation.track.time[-1]
     time = np.arange(np.ceil(first * rate_hz - 1e-6), np.floor(last * rate_hz + 1e-6) + 1)
     motion = motion_at(navigation, time / rate_hz)
@@ -145,10 +146,11 @@ def _dvl_residuals(
     trial: Trial, navigation: Navigation, outcome: Outcome, points: Points
 ) -> Residuals:
     assert trial.dvl is not None
-    settings = trial.dvl.settings
-    offset = float(outcome.estimated.value("time_offset", np.array([settings.time_offset_s]))[0])
-    if offset != settings.time_offset_s:
-        motion = motion_at(navigation, points.time + settings.time_offset_s - offset)
+    prior = {p.stem: p.mean for p in trial.dvl.parameters()}
+    before = float(prior["time_offset"][0])
+    offset = float(outcome.estimated.value("time_offset", prior["time_offset"])[0])
+    if offset != before:
+        motion = motion_at(navigation, points.time + before - offset)
         points = Points(
             motion.time,
             motion.v_b,
@@ -158,7 +160,7 @@ def _dvl_residuals(
             points.v_d,
             points.sigma_d,
         )
-    residual, sigma = residuals(points, outcome.estimated, np.array(settings.lever_arm_m))
+    residual, sigma = residuals(points, outcome.estimated, prior["lever_arm"])
     return Residuals("DVL velocity", "m/s", ("x", "y", "z"), points.time + offset, residual, sigma)
 
 

@@ -23,7 +23,7 @@ from factorgraph_dvl.simulation.scenario import Scenario, read_scenario
 class Plan(Scenario, frozen=True, kw_only=True):
     """A scenario that is not drawn from but predicted, with the σ that it shall reach."""
 
-    # A mapping of Any: the reader names keys of a typed one by their place only.
+    # A mapping of Any: a number, or a list of them, is checked below in one sentence.
     required: dict[str, Any] = msgspec.field(default_factory=dict)
 
     def __post_init__(self) -> None:

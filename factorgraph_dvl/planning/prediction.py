@@ -141,7 +141,7 @@ def _ending(motion: Motion, frontier: Frontier, before: float) -> Ending:
     start = Start(
         lat_deg=float(state.geodetic[0, 0] / DEG),
         lon_deg=float(state.geodetic[0, 1] / DEG),
-        height_m=motion.height + float(motion.current_n[2]) * motion.duration,
+        height_m=float(motion.height(end)[0]) + float(motion.current_n[2]) * motion.duration,
         heading_deg=float(motion.course(end)[0] / DEG) % 360.0,
         speed_m_s=max(float(motion.speed(end)[0]), 0.0),
     )

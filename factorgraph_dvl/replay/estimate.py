@@ -11,13 +11,13 @@ from factorgraph_dvl.conventions import (
     Array,
     BodyAxes,
     exp_so3,
-    log_so3,
     rotate,
     rph_from_rotation,
     rph_jacobian,
 )
 from factorgraph_dvl.earth import LocalFrame
 from factorgraph_dvl.preintegration import States
+from factorgraph_dvl.priors import away, prior_mean, prior_root
 from factorgraph_dvl.sensors.protocol import Parameter
 from factorgraph_dvl.solution import Estimate, Trajectory
 from factorgraph_dvl.solvers.reported import estimates_of, in_order, in_unit
@@ -130,8 +130,8 @@ def calibration_of(
     biases : parameters and values of gyro and accelerometer.
     P : (6 + n, 6 + n) joint covariance of accelerometer bias, gyro bias and the parameters
         that are estimated, in GTSAM's tangent space, SI.
-    held : (n, h) directions that are not observable, in units of the priors' standard
-        deviations: the prior is reported there.
+    held : (n, h) directions that are not observable, as `feigned_directions` returns them:
+        the prior is reported there.
     """
     free = [p for p in parameters if p.estimated]
     (gyro, gyro_bias), (accel, accel_bias) = biases
@@ -170,21 +170,15 @@ def _at_prior(
     held: Array,
 ) -> tuple[dict[str, Array], Array, Array, Array]:
     """Return values and covariance given that the prior holds along some directions."""
-    sigma = np.concatenate([p.sigma for p in free])
-    sigma = np.maximum(sigma, 1e-12)
+    root = prior_root(free)
     A = np.zeros((held.shape[1], P.shape[0]))
-    A[:, _BIAS:] = held.T / sigma
-    away = np.concatenate(
-        [
-            log_so3(exp_so3(p.mean).T @ values[p.name]) if p.rotation else values[p.name] - p.mean
-            for p in free
-        ]
-    )
+    A[:, _BIAS:] = held.T @ np.linalg.inv(root)
+    off = np.concatenate([away(p, values[p.name], prior_mean(p)) for p in free])
     gain = np.linalg.solve(A @ P @ A.T, A @ P).T
-    step = -gain @ (A[:, _BIAS:] @ away)
+    step = -gain @ (A[:, _BIAS:] @ off)
     P = P - gain @ A @ P
     spread = np.zeros((P.shape[0], held.shape[1]))
-    spread[_BIAS:] = sigma[:, None] * held
+    spread[_BIAS:] = root @ held
     out = dict(values)
     at = _BIAS
     for p in free:

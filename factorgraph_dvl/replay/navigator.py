@@ -10,13 +10,13 @@ import numpy as np
 from factorgraph_dvl import keys
 from factorgraph_dvl.chain import loose_diagonal
 from factorgraph_dvl.conventions import Array, BodyAxes, log_so3
-from factorgraph_dvl.graph import Known
 from factorgraph_dvl.preintegration import (
     Segments,
     States,
     attach,
     preintegrate,
 )
+from factorgraph_dvl.priors import Known, prior_root
 from factorgraph_dvl.replay.estimate import Calibration, Innovations, calibration_of, trajectory_of
 from factorgraph_dvl.replay.factor import NodeMeasurements, Rows, measurement_factor, state_of
 from factorgraph_dvl.replay.gate import Gate
@@ -29,8 +29,6 @@ from factorgraph_dvl.solvers.feigned import directions_not_told, feigned_by
 
 # Distance, m, up to which gravity is taken as linear: to 3e-9 m/s².
 _NEAR = 100.0
-# Stands for a standard deviation of zero, as in the graph.
-_HELD = 1e-7
 # Keeps the walk of a bias that does not walk regular.
 _LEAST_WALK = 1e-12
 _STATE = 9
@@ -64,9 +62,7 @@ class Navigator:
             walking=start.walking,
             lag=lag,
         )
-        self._sigma = np.concatenate(
-            [np.empty(0), *(np.maximum(p.sigma, _HELD) for p in start.parameters)]
-        )
+        self._prior_root = prior_root(start.parameters)
         self._feigned = start.feigned
         self._feigned_at = start.time
         self._near = np.full(3, np.inf)
@@ -381,12 +377,14 @@ class Navigator:
                 values,
                 [p.name for p in wanted],
             )
-            scale = self._sigma[columns] * np.sqrt(max(per_second / duration, 1.0))
-            self._feigned[np.ix_(columns, columns)] += part.sum(axis=0) * np.outer(scale, scale)
+            root = self._prior_root[columns]
+            self._feigned += root.T @ part.sum(axis=0) @ root * max(per_second / duration, 1.0)
         self._held = self._not_observable()
 
     def _not_observable(self) -> Array:
-        if self._sigma.size == 0:
+        size = len(self._prior_root)
+        if size == 0:
             return np.zeros((0, 0))
-        P = self._P[_STATE + 6 :, _STATE + 6 :] / np.outer(self._sigma, self._sigma)
-        return directions_not_told(np.linalg.inv(P) - np.eye(self._sigma.size), self._feigned)
+        root = self._prior_root
+        information = root.T @ np.linalg.inv(self._P[_STATE + 6 :, _STATE + 6 :]) @ root
+        return directions_not_told(information - np.eye(size), self._feigned)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from factorgraph_dvl.errors import ConfigError, FactorgraphDvlError
-from factorgraph_dvl.graph import Known
+from factorgraph_dvl.priors import Known
 from factorgraph_dvl.replay.collected import Collected
 from factorgraph_dvl.replay.estimate import Update
 from factorgraph_dvl.replay.gate import Gate

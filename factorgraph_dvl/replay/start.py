@@ -10,14 +10,16 @@ import numpy as np
 from factorgraph_dvl import keys
 from factorgraph_dvl.conventions import DEG, Array
 from factorgraph_dvl.earth import LocalFrame
-from factorgraph_dvl.graph import Known, Problem
+from factorgraph_dvl.graph import Problem
+from factorgraph_dvl.priors import Known
 from factorgraph_dvl.sensors.protocol import Parameter
-from factorgraph_dvl.solvers.batch import STATE_INTERVAL, fit
+from factorgraph_dvl.solvers.batch import fit
 from factorgraph_dvl.solvers.covariance import posterior
 from factorgraph_dvl.solvers.feigned import (
     feigned_information,
 )
 from factorgraph_dvl.solvers.levenberg_marquardt import Progress
+from factorgraph_dvl.solvers.state_times import STATE_INTERVAL
 from factorgraph_dvl.trial import Trial
 
 # Standard deviation of the attitude up to which the equations may be linearised in it.

@@ -15,7 +15,8 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 from factorgraph_dvl.analysis.information_shares import Shares
 from factorgraph_dvl.analysis.manoeuvres import Segment
 from factorgraph_dvl.analysis.marginals import OPEN, Marginals
-from factorgraph_dvl.analysis.observability import Observability, PointSet
+from factorgraph_dvl.analysis.observability import Observability
+from factorgraph_dvl.analysis.point_set import PointSet
 from factorgraph_dvl.analysis.pwcs import FEIGNED, OBSERVABLE, SingularValues
 from factorgraph_dvl.conventions import Array
 from factorgraph_dvl.information import InformationHistory
@@ -88,7 +89,7 @@ def singular_value_figure(point_set: PointSet) -> Figure:
     figure = new_figure(min(max(11.0, 2.0 + 0.95 * count), 18.0), 7.2)
     grid = new_grid(figure, 2, 1, bottom=0.95, top=0.7, gap=(0.42, 0.0))
     kinds = list(dict.fromkeys(_kind(state) for state in point_set.states))
-    colours = dict(zip(kinds, (ACCENT, "#d07b3c", DARK, GREY), strict=False))
+    colours = dict(zip(kinds, (ACCENT, "#d07b3c", DARK, GREY, "#5b8c5a"), strict=False))
     stacks_of_all = (*point_set.segments, *point_set.cumulative)
     highest = max(float(s.values.max()) for s in stacks_of_all)
     lowest = min(float(s.values.min()) for s in stacks_of_all)

@@ -10,7 +10,8 @@ import msgspec
 import numpy as np
 
 from factorgraph_dvl.analysis.marginals import Direction, Marginals
-from factorgraph_dvl.analysis.observability import Observability, PointSet, SegmentMotion
+from factorgraph_dvl.analysis.observability import Observability, SegmentMotion
+from factorgraph_dvl.analysis.point_set import PointSet
 from factorgraph_dvl.analysis.pwcs import OBSERVABLE, SingularValues
 from factorgraph_dvl.conventions import DEG, Array
 from factorgraph_dvl.information import InformationHistory

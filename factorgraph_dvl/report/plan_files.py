@@ -77,7 +77,8 @@ def _proposal(p: Proposal) -> dict[str, Any]:
         "required": [_requirement(r) for r in p.requirements],
         "missed": [r.component for r in p.missed],
         "sequences_tried": p.tried,
-        "longest_tried_s": p.limit,
+        "all_tried_up_to_s": p.limit,
+        "shortest": p.shortest,
     }
 
 
@@ -104,13 +105,19 @@ def requirement_table(required: Sequence[Requirement], proposal: Proposal | None
 
 def proposal_lines(proposal: Proposal) -> list[str]:
     """Render a proposal: what to add, as it stands in a plan, or that nothing suffices."""
-    tried = f"{proposal.tried} sequences of up to {proposal.limit:.0f} s were tried"
+    tried = f"{proposal.tried} sequences were tried"
+    if proposal.shortest:
+        tried += ", all that are shorter among them"
+    else:
+        tried += f", all of up to {proposal.limit:.0f} s among them"
+    if proposal.met and not proposal.shortest:
+        tried += ": there may be a shorter one"
     if proposal.met:
         lines = [f"Add {proposal.added:.0f} s ({tried}): {', '.join(proposal.names)}."]
     else:
         missed = ", ".join(f"{r.component} ({r.predicted:.2g})" for r in proposal.missed)
         lines = [
-            f"No sequence of the library meets all that is required; {tried}. Still missed with "
+            f"No sequence that was tried meets all that is required; {tried}. Still missed with "
             f"the best of them, {proposal.added:.0f} s of {', '.join(proposal.names)}: {missed}."
         ]
     return lines + [f"  - {_as_yaml(m)}" for m in proposal.manoeuvres]

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from factorgraph_dvl.sensors.depth import Depth
 from factorgraph_dvl.sensors.dvl import Dvl
 from factorgraph_dvl.sensors.gnss import Gnss
 from factorgraph_dvl.sensors.protocol import Aid
 from factorgraph_dvl.sensors.star import Star
 
-AIDS: tuple[type[Aid], ...] = (Gnss, Dvl, Star)
+AIDS: tuple[type[Aid], ...] = (Gnss, Dvl, Star, Depth)

@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar, Literal, Self
 
+import msgspec
 import numpy as np
+from msgspec import UNSET, UnsetType
 
 from factorgraph_dvl.conventions import DEG, Array, cross, rotate, skew
 from factorgraph_dvl.earth import LocalFrame
+from factorgraph_dvl.errors import ConfigError
 from factorgraph_dvl.sensors.protocol import (
+    JointPrior,
     Linearization,
     Motion,
     NonNegative,
@@ -38,6 +42,9 @@ BIAS = "dvl_bias_m_s"
 TIME_OFFSET = "time_offset_s"
 CURRENT = "current_m_s"
 
+# What a calibration says of the DVL, and not of the sea that day.
+CALIBRATED = (MISALIGNMENT, SCALE_ERROR, LEVER_ARM, BIAS, TIME_OFFSET)
+
 # A DVL at rest reports a standard deviation of zero under a purely relative model.
 _LEAST_SIGMA = 1e-4
 
@@ -46,6 +53,7 @@ class DvlSettings(SensorSection, frozen=True, kw_only=True):
     """Section `dvl` of trial.yaml."""
 
     file: str = "dvl.csv"
+    calibration: str | UnsetType = UNSET
     velocity_std_m_s: NonNegative = 0.001
     velocity_std_fraction: NonNegative = 0.002
     misalignment_deg: Vector3 = (0.0, 0.0, 0.0)
@@ -83,6 +91,8 @@ class Dvl:
         its own axes d, m/s; nan = no lock.
     std : (M, 3) m/s; nan where the record has none.
     source : name of the file, for messages.
+    prior : what the calibration that `settings` name knows; it takes the place of the keys
+        for the parameters that it has.
     """
 
     settings: DvlSettings
@@ -91,6 +101,7 @@ class Dvl:
     std: Array
     source: str = "dvl"
     label: str = "DVL"
+    prior: JointPrior | None = None
 
     section: ClassVar[str] = "dvl"
     section_type: ClassVar[type[SensorSection]] = DvlSettings
@@ -131,6 +142,11 @@ class Dvl:
         """Pings with a velocity, (M,) bool."""
         return np.logical_not(self.missing)
 
+    def nominal(self) -> Self:
+        """Return this DVL as trial.yaml describes it, without the calibration it names."""
+        settings = msgspec.structs.replace(self.settings, calibration=UNSET)
+        return replace(self, settings=settings, prior=None)
+
     def sigma(self) -> Array:
         """Return the standard deviations of the velocity components, (M, 3), m/s.
 
@@ -142,7 +158,31 @@ class Dvl:
         return np.maximum(np.where(np.isnan(self.std), model, self.std), _LEAST_SIGMA)
 
     def parameters(self) -> tuple[Parameter, ...]:
-        """Return misalignment, scale error, lever arm, bias, time offset and current."""
+        """Return misalignment, scale error, lever arm, bias, time offset and current.
+
+        Raises
+        ------
+        ConfigError
+            If the calibration that trial.yaml names has not been read.
+        """
+        if self.prior is None:
+            if self.settings.calibration is not UNSET:
+                raise ConfigError(
+                    f"the calibration {self.settings.calibration} has not been read",
+                    where="dvl.calibration",
+                    expected="a trial loaded from its folder",
+                )
+            return self._nominal()
+        return tuple(
+            _from_joint(p, self.prior) if p.name in self.prior.values else p
+            for p in self._nominal()
+        )
+
+    def prior_means(self) -> dict[str, Array]:
+        """Return the prior means of all parameters by name, SI; a rotation as its vector."""
+        return {p.name: p.mean for p in self.parameters()}
+
+    def _nominal(self) -> tuple[Parameter, ...]:
         s = self.settings
         mean = np.atleast_1d(np.array(s.scale_error, dtype=float))
         sigma = np.atleast_1d(np.array(s.scale_error_std, dtype=float))
@@ -305,6 +345,17 @@ class DvlVelocity:
             d_omega=np.broadcast_to(-dMb @ skew(lever_arm), d_v.shape),
             d_parameters={name: make() for name, make in derivatives.items() if name in wanted},
         )
+
+
+def _from_joint(p: Parameter, joint: JointPrior) -> Parameter:
+    """Return a parameter with the mean and the standard deviations of a calibration."""
+    value = joint.values[p.name]
+    labels = p.labels
+    if p.name == SCALE_ERROR:
+        labels = ("x", "y", "z") if value.size == 3 else ("",)
+    return replace(
+        p, mean=value * p.si, sigma=joint.std(p.name) * p.si, labels=labels, joint=joint
+    )
 
 
 def _velocity_at_dvl(motion: Motion, values: Values) -> tuple[Array, Array]:

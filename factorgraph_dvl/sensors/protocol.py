@@ -23,6 +23,15 @@ Vector3 = tuple[float, float, float]
 Sigma3 = tuple[NonNegative, NonNegative, NonNegative]
 Values = Mapping[str, Array]
 
+# Residuals larger than stated by this factor make every standard deviation too small, and by
+# the second the model is another than the data's.
+TOO_LARGE = 1.3
+DO_NOT_FIT = 10.0
+
+
+# Rounding may leave a correlation matrix with an eigenvalue this far below zero.
+_NEGATIVE = 1e-6
+
 
 class Section(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """A section of a YAML file, in the units that its names state."""
@@ -51,6 +60,62 @@ def _finite(value: Any) -> bool:
 
 
 @dataclass(frozen=True)
+class JointPrior:
+    """What an earlier calibration knows of several parameters together.
+
+    Parameters
+    ----------
+    source : name of the file, for messages.
+    values : (n,) by reported name, in reported units.
+    covariance : (N, N) of all their components, in the order of `values`, in reported units.
+
+    Raises
+    ------
+    DataError
+        If a number is not finite, or the covariance is not one.
+    """
+
+    source: str
+    values: Mapping[str, Array]
+    covariance: Array
+
+    def __post_init__(self) -> None:
+        for name, value in self.values.items():
+            if not np.isfinite(value).all():
+                raise DataError(f"{name} is not a number", where=self.source)
+        P = self.covariance
+        size = sum(value.size for value in self.values.values())
+        std = np.sqrt(np.maximum(np.diag(P), 0.0)) if P.ndim == 2 else np.zeros(0)
+        scale = np.where(std > 0.0, std, 1.0)
+        correct = P.shape == (size, size) and bool(np.isfinite(P).all())
+        if correct:
+            correlation = P / np.outer(scale, scale)
+            lowest = np.linalg.eigvalsh(0.5 * (correlation + correlation.T))[0] if size else 0.0
+            symmetric = np.allclose(correlation, correlation.T, atol=1e-6)
+            correct = symmetric and lowest > -_NEGATIVE and bool(np.all(np.diag(P) >= 0.0))
+        if not correct:
+            raise DataError(
+                "the covariance is not one",
+                where=self.source,
+                expected="a symmetric matrix of finite numbers, without negative eigenvalues",
+            )
+
+    def rows(self, name: str) -> slice:
+        """Return the place of a parameter's components in the covariance."""
+        at = 0
+        for other, value in self.values.items():
+            if other == name:
+                return slice(at, at + value.size)
+            at += value.size
+        raise KeyError(name)
+
+    def std(self, name: str) -> Array:
+        """Return the standard deviations of a parameter, in reported units."""
+        rows = self.rows(name)
+        return np.asarray(np.sqrt(np.diag(self.covariance)[rows]))
+
+
+@dataclass(frozen=True)
 class Parameter:
     """A constant of a sensor that the solver estimates, with its prior.
 
@@ -63,6 +128,7 @@ class Parameter:
     rotation : the value is a rotation, `mean` its rotation vector and `sigma` that of
         the components of the rotation vector.
     labels : component names; empty for a scalar.
+    joint : where mean and sigma come from a calibration of several parameters: all of it.
     """
 
     stem: str
@@ -72,6 +138,7 @@ class Parameter:
     sigma: Array
     rotation: bool = False
     labels: tuple[str, ...] = ("x", "y", "z")
+    joint: JointPrior | None = None
 
     @property
     def name(self) -> str:
@@ -237,12 +304,16 @@ class Attitudes:
     ----------
     time : (M,) s.
     nRs : (M, 3, 3) attitude of the sensor's axes.
+    sigma : (M,) standard deviation about the axis that is known best, rad.
     mounting : the parameter sRb, with its prior.
+    doubts : what the record says against itself, for people.
     """
 
     time: Array
     nRs: Array
+    sigma: Array
     mounting: Parameter
+    doubts: tuple[str, ...] = ()
 
 
 @runtime_checkable

@@ -9,6 +9,7 @@ from typing import Annotated, ClassVar, Self
 import msgspec
 import numpy as np
 from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
 
 from factorgraph_dvl.celestial import (
     ARCSEC,
@@ -26,6 +27,8 @@ from factorgraph_dvl.conventions import (
 from factorgraph_dvl.earth import LocalFrame, enu_from_ecef
 from factorgraph_dvl.errors import ConfigError, DataError
 from factorgraph_dvl.sensors.protocol import (
+    DO_NOT_FIT,
+    TOO_LARGE,
     Attitudes,
     Linearization,
     Motion,
@@ -53,6 +56,8 @@ _NORM = 1e-3
 # Vectors closer to one line than this, rad, are parallel: they leave the rotation about
 # themselves open.
 _PARALLEL = 1e-3
+# Probability of a misfit of stars below which it is no chance.
+_BY_CHANCE = 1e-4
 
 
 class StarSettings(SensorSection, frozen=True, kw_only=True):
@@ -238,7 +243,58 @@ class Star:
         iRs = Rotation.from_quat(self.quaternion[known][:, [1, 2, 3, 0]]).as_matrix()
         nRe = enu_from_ecef(frame.lat, frame.lon)
         eRi = earth_from_inertial(frame.epoch, time, self.settings.ut1_utc_s)
-        return Attitudes(time, nRe @ eRi @ iRs, self.parameters()[0])
+        best = np.linalg.eigvalsh(self.covariance[known])[:, 0]
+        nRs = nRe @ eRi @ iRs
+        return Attitudes(time, nRs, np.sqrt(best), self.parameters()[0], self.doubts())
+
+    @property
+    def misfit(self) -> float:
+        """Angles between stars against the catalogue's: rms over its expectation.
+
+        The square is the loss of Wahba's problem over sigma² and the degrees of freedom: two
+        components across each direction, less three of each attitude. nan where the record
+        holds attitudes.
+        """
+        if self.vectors is None:
+            return np.nan
+        freedom = 2 * self.vectors.time.size - 3 * self.time.size
+        return float(np.sqrt(np.sum(self._star_misfits() ** 2) / freedom))
+
+    def doubts(self) -> tuple[str, ...]:
+        """Return a warning if the stars do not fit their catalogue, naming the worst of them."""
+        v = self.vectors
+        if v is None or not self.misfit > TOO_LARGE:
+            return ()
+        square = self._star_misfits() ** 2
+        freedom = 2 * v.time.size - 3 * self.time.size
+        if chi2.sf(square.sum(), freedom) > _BY_CHANCE:
+            return ()
+        stars, row, which = np.unique(
+            np.round(v.inertial, 4), axis=0, return_index=True, return_inverse=True
+        )
+        each = np.bincount(which.ravel(), square) / np.bincount(which.ravel())
+        worst = int(np.argmax(each))
+        x, y, z = stars[worst]
+        consequence = (
+            "the stars are not those of the catalogue, and the attitudes are not to be used"
+            if self.misfit > DO_NOT_FIT
+            else "the reported standard deviations are too small unless it is corrected"
+        )
+        return (
+            f"{self.label}: the angles between stars differ from the catalogue's by "
+            f"{self.misfit:.3g} times what `std_arcsec` lets expect, most at the star towards "
+            f"inertial ({x:.4f}, {y:.4f}, {z:.4f}), first in {at_row(self.source, row[worst])}: "
+            f"is it another one, are columns mixed up, or is aberration left in? {consequence}",
+        )
+
+    def _star_misfits(self) -> Array:
+        """Return the angles from the catalogue's directions to the measured ones, (K,), sigmas."""
+        v = self.vectors
+        assert v is not None
+        count = np.diff(np.append(v.first, v.time.size))
+        iRs = Rotation.from_quat(np.repeat(self.quaternion[:, [1, 2, 3, 0]], count, axis=0))
+        away = np.linalg.norm(iRs.apply(v.body) - v.inertial, axis=1)
+        return away / (float(np.max(self.settings.std_arcsec)) * ARCSEC)
 
     def observations(self, frame: LocalFrame) -> tuple[Observation, ...]:
         """Return the attitudes that were measured.

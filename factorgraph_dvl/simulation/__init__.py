@@ -17,6 +17,7 @@ from factorgraph_dvl.conventions import DEG, Array
 from factorgraph_dvl.sensors.dvl import Dvl
 from factorgraph_dvl.sensors.gnss import Gnss
 from factorgraph_dvl.sensors.protocol import Aid
+from factorgraph_dvl.simulation.depth import simulate_depth
 from factorgraph_dvl.simulation.measurements import displaced, simulate_dvl, simulate_gnss
 from factorgraph_dvl.simulation.measurements import simulate_imu as _simulate_imu
 from factorgraph_dvl.simulation.motion import Motion, plan_motion
@@ -31,6 +32,7 @@ _AIDS: dict[str, Callable[..., tuple[Aid, dict[str, Array]]]] = {
     "gnss": simulate_gnss,
     "dvl": simulate_dvl,
     "star": simulate_star,
+    "depth": simulate_depth,
 }
 
 

@@ -8,6 +8,7 @@ from typing import Annotated, Any, ClassVar, Literal
 import msgspec
 import numpy as np
 
+from factorgraph_dvl.sensors.depth import DepthSettings
 from factorgraph_dvl.sensors.dvl import DvlSettings
 from factorgraph_dvl.sensors.gnss import GnssSettings
 from factorgraph_dvl.sensors.imu import ImuSettings
@@ -164,6 +165,21 @@ class StarTruth(Instrument, frozen=True, kw_only=True):
         """Return noise, mounting and UT1 - UTC as simulated."""
         names = ("std_arcsec", "mounting_deg", "ut1_utc_s")
         return {name: getattr(self, name) for name in names}
+
+
+class DepthTruth(Instrument, frozen=True, kw_only=True):
+    """The simulated depth sensor; the sea surface is at a height above the ellipsoid."""
+
+    section_type: ClassVar[type[SensorSection]] = DepthSettings
+
+    std_m: NonNegative = 0.0
+    lever_arm_m: Vector3 = (0.0, 0.0, 0.0)
+    sea_surface_height_m: float = 0.0
+
+    def claimed(self) -> dict[str, Any]:
+        """Return noise and lever arm as simulated; the height of the sea is to be found."""
+        out: dict[str, Any] = {"lever_arm_m": self.lever_arm_m}
+        return out | ({"std_m": self.std_m} if self.std_m > 0.0 else {})
 
 
 def check_intervals(name: str, intervals: Sequence[Interval]) -> None:

@@ -75,6 +75,14 @@ class Stop(Section, frozen=True, kw_only=True):
     acceleration_m_s2: Positive = 0.2
 
 
+class Climb(Section, frozen=True, kw_only=True):
+    """Change the height at a vertical speed that builds up over ramp_s, and down again."""
+
+    climb_m_s: float
+    to_height_m: float
+    ramp_s: Positive = 10.0
+
+
 class Repeat(Section, frozen=True, kw_only=True):
     """Run a list of manoeuvres several times."""
 
@@ -82,13 +90,14 @@ class Repeat(Section, frozen=True, kw_only=True):
     manoeuvres: list[dict[str, Any]]
 
 
-Manoeuvre = Accelerate | Straight | Turn | Stop
+Manoeuvre = Accelerate | Straight | Turn | Stop | Climb
 _MANOEUVRES: dict[str, type[Manoeuvre | FigureEight | Repeat]] = {
     "accelerate_m_s2": Accelerate,
     "straight_s": Straight,
     "turn_deg_s": Turn,
     "figure_eight_deg_s": FigureEight,
     "stop_s": Stop,
+    "climb_m_s": Climb,
     "repeat": Repeat,
 }
 

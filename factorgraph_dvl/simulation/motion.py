@@ -16,7 +16,7 @@ from scipy.interpolate import PPoly
 from factorgraph_dvl.conventions import DEG, Array, BodyAxes, frd_from_body
 from factorgraph_dvl.earth import RATE, normal_gravity, radii
 from factorgraph_dvl.errors import ConfigError
-from factorgraph_dvl.simulation.manoeuvres import Accelerate, Manoeuvre, Stop, Straight
+from factorgraph_dvl.simulation.manoeuvres import Accelerate, Climb, Manoeuvre, Stop, Straight
 from factorgraph_dvl.simulation.scenario import Scenario
 
 _COLLOCATION_NODES = 6
@@ -89,7 +89,7 @@ class Motion:
     speed : through the water, m/s.
     course : clockwise from north, rad.
     lat, lon : rad.
-    height : mean height, m.
+    height : without heave and current, m.
     current_n : (3,) ENU, m/s.
     roll, pitch, yaw, heave : sway, rad and m.
     kinks : (K,) times at which acceleration or turn rate change abruptly, s.
@@ -101,7 +101,7 @@ class Motion:
     course: PPoly
     lat: PPoly
     lon: PPoly
-    height: float
+    height: PPoly
     current_n: Array
     roll: Sway
     pitch: Sway
@@ -130,16 +130,16 @@ class Motion:
         return (
             speed * sine + east,
             speed * cosine + north,
-            heave_rate + up,
+            heave_rate + up + _evaluate(self.height, t, 1),
             acceleration * sine + speed * rate * cosine,
             acceleration * cosine - speed * rate * sine,
-            heave_acceleration,
+            heave_acceleration + _evaluate(self.height, t, 2),
         )
 
     def height_at(self, t: Array) -> Array:
         """Return the ellipsoidal height, (M,), m."""
         drift = float(self.current_n[2]) * t
-        return self.height + drift + self.heave.derivatives(t)[0]
+        return _evaluate(self.height, t) + drift + self.heave.derivatives(t)[0]
 
     def at(self, t: Array) -> State:
         """Return the motion at times (M,).
@@ -226,9 +226,13 @@ def plan_motion(scenario: Scenario) -> Motion:
     ConfigError
         If the manoeuvres cannot be carried out.
     """
-    speed, rate = _profiles(scenario.plan(), scenario.start.speed_m_s, scenario.source)
-    course = rate.antiderivative()
-    course.c[-1] += scenario.start.heading_deg * DEG
+    start = scenario.start
+    speed, rate, climb = _profiles(
+        scenario.plan(), start.speed_m_s, start.height_m, scenario.source
+    )
+    course, height = rate.antiderivative(), climb.antiderivative()
+    course.c[-1] += start.heading_deg * DEG
+    height.c[-1] += start.height_m
     sway = scenario.sway
     heave = _sway((s.amplitude_m, s.frequency_hz, s.phase_deg) for s in sway.heave)
     roll, pitch, yaw = (
@@ -241,7 +245,7 @@ def plan_motion(scenario: Scenario) -> Motion:
         course=course,
         lat=still,
         lon=still,
-        height=scenario.start.height_m,
+        height=height,
         current_n=np.array(scenario.current_m_s),
         roll=roll,
         pitch=pitch,
@@ -257,50 +261,76 @@ def plan_motion(scenario: Scenario) -> Motion:
     return Motion(**{**vars(motion), "lat": lat, "lon": lon})
 
 
-def _profiles(plan: list[Manoeuvre], speed: float, source: str) -> tuple[PPoly, PPoly]:
-    """Return speed through the water (m/s) and turn rate (rad/s) over time."""
-    times, speeds, rates = [0.0], [], []
+def _profiles(
+    plan: list[Manoeuvre], speed: float, height: float, source: str
+) -> tuple[PPoly, PPoly, PPoly]:
+    """Return speed through the water, turn rate (rad/s) and vertical speed over time."""
+    times, speeds, rates, climbs = [0.0], [], [], []
 
-    def add(duration: float, acceleration: float, rate: float, rate_slope: float) -> None:
+    def add(
+        duration: float,
+        *,
+        acceleration: float = 0.0,
+        turn: tuple[float, float] = (0.0, 0.0),
+        climb: tuple[float, float] = (0.0, 0.0),
+    ) -> None:
+        """Add a piece; slope and value at its start of the rates."""
         times.append(times[-1] + duration)
         speeds.append((acceleration, speed))
-        rates.append((rate_slope, rate))
+        rates.append(turn)
+        climbs.append(climb)
+
+    def add_ramped(name: str, rate: float, duration: float, ramp: float) -> None:
+        if ramp > 0.0:
+            add(ramp, **{name: (rate / ramp, 0.0)})  # type: ignore[arg-type]
+        if duration > ramp:
+            add(duration - ramp, **{name: (0.0, rate)})  # type: ignore[arg-type]
+        if ramp > 0.0:
+            add(ramp, **{name: (-rate / ramp, rate)})  # type: ignore[arg-type]
 
     for number, m in enumerate(plan, start=1):
+        where = f"{source} key manoeuvres, manoeuvre {number} with repetitions written out"
         if isinstance(m, Accelerate):
             change = m.to_m_s - speed
             if change * m.accelerate_m_s2 <= 0.0:
                 raise ConfigError(
                     f"accelerate_m_s2 = {m.accelerate_m_s2:g} does not lead from "
                     f"{speed:g} to {m.to_m_s:g} m/s",
-                    where=f"{source} key manoeuvres, manoeuvre {number} with repetitions "
-                    "written out",
+                    where=where,
                     expected="another speed than the present one, and the sign of the change",
                 )
-            add(change / m.accelerate_m_s2, m.accelerate_m_s2, 0.0, 0.0)
+            add(change / m.accelerate_m_s2, acceleration=m.accelerate_m_s2)
             speed = m.to_m_s
         elif isinstance(m, Straight):
-            add(m.straight_s, 0.0, 0.0, 0.0)
+            add(m.straight_s)
         elif isinstance(m, Stop):
             before = speed
             if before > 0.0:
-                add(before / m.acceleration_m_s2, -m.acceleration_m_s2, 0.0, 0.0)
+                add(before / m.acceleration_m_s2, acceleration=-m.acceleration_m_s2)
             speed = 0.0
             if m.stop_s > 0.0:
-                add(m.stop_s, 0.0, 0.0, 0.0)
+                add(m.stop_s)
             if before > 0.0:
-                add(before / m.acceleration_m_s2, m.acceleration_m_s2, 0.0, 0.0)
+                add(before / m.acceleration_m_s2, acceleration=m.acceleration_m_s2)
             speed = before
+        elif isinstance(m, Climb):
+            change = m.to_height_m - height
+            if change * m.climb_m_s <= 0.0 or change / m.climb_m_s < m.ramp_s:
+                raise ConfigError(
+                    f"climb_m_s = {m.climb_m_s:g} does not lead from {height:g} to "
+                    f"{m.to_height_m:g} m with ramps of {m.ramp_s:g} s",
+                    where=where,
+                    expected="the sign of the change, and a change of at least ramp_s · climb_m_s",
+                )
+            add_ramped("climb", m.climb_m_s, change / m.climb_m_s, m.ramp_s)
+            height = m.to_height_m
         else:
-            rate = m.turn_deg_s * DEG
-            if m.ramp_s > 0.0:
-                add(m.ramp_s, 0.0, 0.0, rate / m.ramp_s)
-            if m.duration_s > m.ramp_s:
-                add(m.duration_s - m.ramp_s, 0.0, rate, 0.0)
-            if m.ramp_s > 0.0:
-                add(m.ramp_s, 0.0, rate, -rate / m.ramp_s)
+            add_ramped("turn", m.turn_deg_s * DEG, m.duration_s, m.ramp_s)
     breaks = np.array(times)
-    return PPoly(np.array(speeds).T, breaks), PPoly(np.array(rates).T, breaks)
+    speed_over_time, rate_over_time, climb_over_time = (
+        PPoly(np.array(pieces).T, breaks) for pieces in (speeds, rates, climbs)
+    )
+    return speed_over_time, rate_over_time, climb_over_time
 
 
 def _sway(parts: Iterable[tuple[float, float, float]]) -> Sway:

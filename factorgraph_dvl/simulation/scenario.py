@@ -13,6 +13,7 @@ manoeuvres:                        # one after the other
   - {turn_deg_s: -2, duration_s: 45, ramp_s: 3}   # positive to starboard
   - {figure_eight_deg_s: 6}        # a full circle to starboard, then one to port
   - {stop_s: 30, acceleration_m_s2: 0.2}          # to rest, stay, and back to the speed before
+  - {climb_m_s: -0.5, to_height_m: -40, ramp_s: 10}   # sink, with heading and speed as they are
   - {repeat: 2, manoeuvres: [{straight_s: 10}, {turn_deg_s: 9, duration_s: 20}]}
 sway:                              # amplitude · sin(2 pi frequency · t + phase), summed
   roll: [{amplitude_deg: 4, frequency_hz: 2, phase_deg: 0}]
@@ -23,6 +24,7 @@ current_m_s: [0.1, 0.1, 0]         # east, north, up
 imu: {...}                         # ImuTruth: rate, errors
 gnss: {...}                        # GnssTruth, optional
 dvl: {...}                         # DvlTruth, optional
+depth: {...}                       # DepthTruth, optional
 star: {...}                        # StarTruth, optional
 trial:                             # what trial.yaml will claim
   imu: {gyro_bias_std_deg_h: 0.05, accel_bias_std_ug: 100}
@@ -60,6 +62,7 @@ from factorgraph_dvl.sensors.protocol import (
 )
 from factorgraph_dvl.simulation.convert import convert
 from factorgraph_dvl.simulation.instruments import (
+    DepthTruth,
     DvlTruth,
     GnssTruth,
     ImuTruth,
@@ -124,6 +127,7 @@ class Claims(Section, frozen=True, kw_only=True):
     gnss: dict[str, Any] = msgspec.field(default_factory=dict)
     dvl: dict[str, Any] = msgspec.field(default_factory=dict)
     star: dict[str, Any] = msgspec.field(default_factory=dict)
+    depth: dict[str, Any] = msgspec.field(default_factory=dict)
     initial: InitialClaim | None = None
 
 
@@ -143,6 +147,7 @@ class Scenario(Section, frozen=True, kw_only=True):
     gnss: GnssTruth | None = None
     dvl: DvlTruth | None = None
     star: StarTruth | None = None
+    depth: DepthTruth | None = None
     trial: Claims = Claims()
     source: str = ""
 

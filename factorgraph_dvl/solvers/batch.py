@@ -13,21 +13,20 @@ from factorgraph_dvl.chain import Chain, inertial_chain
 from factorgraph_dvl.conventions import Array
 from factorgraph_dvl.earth import LocalFrame
 from factorgraph_dvl.errors import ConfigError
-from factorgraph_dvl.graph import Known, Problem
+from factorgraph_dvl.graph import Problem
 from factorgraph_dvl.increments import increments
 from factorgraph_dvl.mounting import initial_mounting
 from factorgraph_dvl.preintegration import Segments, States, attach, motion_at, segments
+from factorgraph_dvl.priors import Known
 from factorgraph_dvl.sensors.protocol import Aid, Motion, Observation, Parameter
 from factorgraph_dvl.solution import Solution
 from factorgraph_dvl.solvers.covariance import Posterior, posterior
 from factorgraph_dvl.solvers.feigned import at_prior_along, feigned_directions
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, Progress, minimise
+from factorgraph_dvl.solvers.state_times import STATE_INTERVAL, dense_epochs
 from factorgraph_dvl.solvers.summary import summarise
 from factorgraph_dvl.trial import Trial
 
-# States this far apart, s, are as good as denser ones: every measurement hangs on the
-# state before it through the increments up to its own time.
-STATE_INTERVAL = 1.0
 # Root mean square error of the positions at which gravity was taken, m: 1 m turns it by
 # 0.16 micro-g.
 _SAME_GRAVITY = 2.0
@@ -70,7 +69,8 @@ def solve(
     trial : Trial
     rate_hz : rate of the trajectory in the solution; the solver's states are independent
         of it.
-    state_interval_s : time between the states of the graph.
+    state_interval_s : time between the states of the graph; less where the noise of the
+        gyros in between matters to a sensor of attitude.
     progress : called with stage, iteration and cost (None where there is none yet).
 
     Returns
@@ -145,10 +145,11 @@ def fit(
     frame = trial.frame()
     progress("increments", 0, None)
     inc, gaps = increments(trial.imu)
-    seg = segments(inc, state_interval_s)
+    seg = segments(inc, state_interval_s, dense_epochs(trial, frame, state_interval_s))
     progress("alignment", 0, None)
     start = initial_states(trial, frame, seg)
-    notes = (*trial.notes, *gaps, *start.notes)
+    notes = [*trial.notes, *gaps, *start.notes]
+    notes += [doubt for seen in attitudes(trial, frame) for doubt in seen.doubts]
 
     states = start.states
     values = None if known is None else known.parameters
@@ -159,7 +160,8 @@ def fit(
             chain = inertial_chain(trial, frame, seg, states, bias_prior=known is None)
             p_gravity = states.p_n
         if values is None:
-            if trial.gnss is not None:
+            # A DVL that is calibrated does no harm from the start.
+            if trial.gnss is not None and not _calibrated(trial):
                 coarse = _without_dvl(chain, states, start.mountings, progress)
                 iterations += coarse.iterations
                 states = coarse.evaluation.states
@@ -173,7 +175,7 @@ def fit(
         same_gravity = np.sqrt(np.mean((states.p_n - p_gravity) ** 2)) <= _SAME_GRAVITY
         if same_gravity and not problem.strayed(values):
             break
-    return problem, replace(minimum, iterations=iterations), notes
+    return problem, replace(minimum, iterations=iterations), tuple(notes)
 
 
 def _check_above_zero(name: str, value: float) -> None:
@@ -205,6 +207,14 @@ def _without_dvl(
     )
 
 
+def _calibrated(trial: Trial) -> bool:
+    """Whether an earlier calibration knows all of the DVL's mounting that is to be estimated."""
+    if trial.dvl is None:
+        return False
+    free = [p for p in trial.dvl.parameters() if p.estimated]
+    return any(p.joint for p in free) and all(p.joint or not p.rotation for p in free)
+
+
 def _sensors(aids: Sequence[Aid], frame: LocalFrame) -> tuple[list[Observation], list[Parameter]]:
     observations = [o for aid in aids for o in aid.observations(frame)]
     parameters = [p for aid in aids for p in aid.parameters()]
@@ -227,6 +237,6 @@ def _mountings(
         if seen.mounting.estimated:
             motion, covered = motion_by(seen.time)
             out[seen.mounting.name] = mean_mounting(seen, motion.nRb * covered[:, None, None])
-    if trial.dvl is not None:
+    if trial.dvl is not None and not _calibrated(trial):
         out |= initial_mounting(trial.dvl, lambda pings, time: motion_by(time))
     return out

@@ -44,14 +44,14 @@ def feigned_directions(
 
     Returns
     -------
-    (P, h) orthonormal, in units of the priors' standard deviations; h may be 0.
+    (P, h) orthonormal, in the coordinates u of a step S u, S `Problem.prior_root`; h may be 0.
     """
     if not problem.parameters:
         return np.zeros((0, 0))
     functionals = [{problem.key(p.name): np.eye(p.mean.size)} for p in problem.parameters]
-    scale = problem.prior_sigma
-    P = covariances.information.covariance_of(functionals) / np.outer(scale, scale)
-    data = np.linalg.inv(P) - np.eye(scale.size)
+    whiten = np.linalg.inv(problem.prior_root)
+    P = whiten @ covariances.information.covariance_of(functionals) @ whiten.T
+    data = np.linalg.inv(P) - np.eye(len(P))
     feigned = feigned_information(problem, minimum.evaluation, covariances.nodes)
     total = feigned.sum(axis=0)
     return directions_not_told(data + total if at_truth else data, total)
@@ -67,11 +67,11 @@ def feigned_information(problem: Problem, evaluation: Evaluation, nodes: Array) 
 
     Returns
     -------
-    (K, P, P) expected share of the measurements that hang on each node, in units of the
-    priors' standard deviations.
+    (K, P, P) expected share of the measurements that hang on each node, in the coordinates
+    u of a step S u, S `Problem.prior_root`.
     """
-    scale = problem.prior_sigma
-    out = np.zeros((nodes.shape[0], scale.size, scale.size))
+    root = problem.prior_root
+    out = np.zeros((nodes.shape[0], len(root), len(root)))
     for observation, attachment, motion, weight in zip(
         problem.observations,
         problem.attachments,
@@ -93,7 +93,7 @@ def feigned_information(problem: Problem, evaluation: Evaluation, nodes: Array) 
             places = [problem.columns[name] for name in names]
             columns = np.concatenate([np.arange(p.start, p.stop) for p in places])
             np.add.at(out, (attachment.node[:, None, None], columns[:, None], columns), part)
-    return out * np.outer(scale, scale)
+    return np.asarray(root.T @ out @ root)
 
 
 def directions_not_told(data: Array, feigned: Array) -> Array:
@@ -139,11 +139,11 @@ def at_prior_along(
 ) -> dict[str, Array]:
     """Return parameters with the prior's value along directions (P, h)."""
     prior = problem.prior_values()
-    scale = problem.prior_sigma
+    root = problem.prior_root
     for _ in range(10):
-        away = problem.difference(parameters, prior) / scale
+        away = np.linalg.solve(root, problem.difference(parameters, prior))
         step = -directions @ (directions.T @ away)
-        parameters = problem.moved(parameters, scale * step)
+        parameters = problem.moved(parameters, root @ step)
     return parameters
 
 

@@ -98,8 +98,8 @@ def information_history(
     Parameters
     ----------
     problem, evaluation : linearised there.
-    held : (P, h) directions of the parameters that the problem holds, in units of the
-        priors' standard deviations: they stay at the prior all the time.
+    held : (P, h) directions of the parameters that the problem holds, as
+        `feigned_directions` returns them: they stay at the prior all the time.
     nodes : (K, 9, 9) covariances of the states, in GTSAM's tangent space.
     """
     triangles, _ = run_filter(problem, evaluation)
@@ -111,14 +111,13 @@ def _not_told(
     problem: Problem, evaluation: Evaluation, nodes: Array, triangles: Array
 ) -> dict[int, Array]:
     """Return the directions that are not told yet, by entry of the history."""
-    scale = problem.prior_sigma
-    size = scale.size
+    size = len(problem.prior_root)
     if size == 0:
         return {}
     feigned = np.zeros((nodes.shape[0], size, size))
     np.cumsum(feigned_information(problem, evaluation, nodes)[:-1], axis=0, out=feigned[1:])
     # The last columns are those of the parameters: their triangle has all else eliminated.
-    root = triangles[:, -size:, -size:] * scale
+    root = triangles[:, -size:, -size:] @ problem.prior_root
     data = np.swapaxes(root, 1, 2) @ root - np.eye(size)
     # The last entry was judged by the solver.
     doubtful = np.flatnonzero(largest_feigned_share(data, feigned)[:-1] >= FEIGNED)
@@ -206,8 +205,8 @@ def as_history(
         free.append(parameter.sigma > 0.0)
     is_free = np.concatenate(free)
     transport = np.concatenate(rows)[is_free]
-    scale = problem.prior_sigma
-    columns = slice(triangles.shape[1] - scale.size, None)
+    whiten = np.linalg.inv(problem.prior_root)
+    columns = slice(triangles.shape[1] - len(whiten), None)
 
     def prior(directions: Array) -> Array:
         return prior_along(problem, directions, kept)[is_free]
@@ -219,7 +218,7 @@ def as_history(
         spread = at_prior
         if k in not_told:
             hold = np.zeros((not_told[k].shape[1], triangle.shape[0]))
-            hold[:, columns] = not_told[k].T / scale / HELD_DIRECTION
+            hold[:, columns] = not_told[k].T @ whiten / HELD_DIRECTION
             triangle = _triangle(np.concatenate([triangle, hold]), triangle.shape[0])
             spread = np.hstack([at_prior, prior(not_told[k])])
         inverse, info = dtrtri(triangle)

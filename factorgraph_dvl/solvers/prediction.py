@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+import numpy as np
+
 from factorgraph_dvl.chain import inertial_chain
 from factorgraph_dvl.conventions import Array, exp_so3
 from factorgraph_dvl.earth import LocalFrame
@@ -12,7 +14,7 @@ from factorgraph_dvl.increments import increments
 from factorgraph_dvl.information import InformationHistory
 from factorgraph_dvl.preintegration import States, segments
 from factorgraph_dvl.solution import Solution
-from factorgraph_dvl.solvers.batch import STATE_INTERVAL, Minimised, solution_of
+from factorgraph_dvl.solvers.batch import Minimised, solution_of
 from factorgraph_dvl.solvers.covariance import posterior
 from factorgraph_dvl.solvers.feigned import feigned_directions
 from factorgraph_dvl.solvers.information_history import (
@@ -22,6 +24,7 @@ from factorgraph_dvl.solvers.information_history import (
     run_filter,
 )
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, eliminate
+from factorgraph_dvl.solvers.state_times import STATE_INTERVAL, dense_epochs
 from factorgraph_dvl.trial import Trial
 
 TrueStates = Callable[[LocalFrame, Array], States]
@@ -70,14 +73,14 @@ def continue_posterior(
     """
     problem, evaluation = _at_truth(trial, true_states)
     triangles, frontier = run_filter(problem, evaluation, start)
-    nothing_held = problem.prior_sigma[:, None][:, :0]
+    nothing_held = np.zeros((len(problem.prior_root), 0))
     return as_history(problem, evaluation, nothing_held, triangles[-1:], {}), frontier
 
 
 def _at_truth(trial: Trial, true_states: TrueStates) -> tuple[Problem, Evaluation]:
     frame = trial.frame()
     inc, _ = increments(trial.imu)
-    seg = segments(inc, STATE_INTERVAL)
+    seg = segments(inc, STATE_INTERVAL, dense_epochs(trial, frame, STATE_INTERVAL))
     states = true_states(frame, seg.node_time)
     chain = inertial_chain(trial, frame, seg, states)
     observations = [o for aid in trial.aids for o in aid.observations(frame)]
@@ -86,6 +89,9 @@ def _at_truth(trial: Trial, true_states: TrueStates) -> tuple[Problem, Evaluatio
     for p in parameters:
         value = trial.calibration_truth.get(p.name)
         if p.estimated and value is not None:
+            if p.mean.size < value.size:
+                # One scale is estimated of an instrument that has three.
+                value = np.mean(value, keepdims=True)
             truth[p.name] = exp_so3(value * p.si) if p.rotation else value * p.si + 0.0 * p.mean
     problem = Problem(chain, observations, parameters, start=truth)
     values = problem.values(states, {**problem.prior_values(), **truth})

@@ -40,7 +40,7 @@ def summarise(
     ----------
     problem, minimum, covariances : what was minimised, and where it ended.
     held : (P, h) directions of the parameters in which the prior was held because the
-        data say nothing; in units of the priors' standard deviations.
+        data say nothing, as `feigned_directions` returns them.
     rate_hz : rate of the trajectory.
     notes : what is already known to be worth telling.
     """
@@ -123,7 +123,7 @@ def calibration(
 
 def prior_along(problem: Problem, held: Array, functionals: Sequence[dict[int, Array]]) -> Array:
     """Return a root (n, h) of the prior covariance of functionals along held directions."""
-    spread = problem.prior_sigma[:, None] * held if held.size else held
+    spread = problem.prior_root @ held
     by_key = {problem.key(name): spread[place] for name, place in problem.columns.items()}
     parts = []
     for functional in functionals:
@@ -249,9 +249,15 @@ def _unobservable(
     time = problem.chain.segments.node_time
     duration = float(time[-1] - time[0])
     out = []
+    calibrated = {p.name: p.joint for p in problem.all_parameters if p.joint is not None}
+    kept = [n for e in estimates if e.name in calibrated and not e.observable.all()
+            for n in np.array(e.component_names)[~e.observable]]  # fmt: skip
+    if kept:
+        source = next(iter(calibrated.values())).source
+        out.append(f"{', '.join(kept)}: as in {source}; this trial adds little or nothing to that")
     for e in estimates:
         bad = np.flatnonzero(~e.observable & (e.prior_std > 0.0))
-        if bad.size == 0:
+        if bad.size == 0 or e.name in calibrated:
             continue
         names = ", ".join(e.component_names[i] for i in bad)
         if e.name in by_name:

@@ -1,0 +1,127 @@
+"""Dead reckoning before and after calibration, and what the lever arm is worth."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from factorgraph_dvl.analysis.dead_reckoning import (
+    Mounting,
+    OrientationAt,
+    Track,
+    antenna_removed,
+    dead_reckon,
+    lever_arm_error,
+    mounting_of,
+)
+from factorgraph_dvl.analysis.track_score import Score, difference, score
+from factorgraph_dvl.conventions import Array, rotation_from_rph
+from factorgraph_dvl.trial import Reference, Trial
+
+
+@dataclass(frozen=True)
+class Run:
+    """A dead-reckoned track, and its errors; None where there is nothing to score it by."""
+
+    mounting: Mounting
+    track: Track
+    score: Score | None
+
+
+@dataclass(frozen=True)
+class LeverArmEffect:
+    """What a neglected lever arm does to the position, two ways.
+
+    Parameters
+    ----------
+    time : (M,) s.
+    measured : (M, 3) track without lever arm minus track with it, east, north, up, m.
+    closed_form : (M, 3) (C(t) - C(0)) l, m.
+    """
+
+    time: Array
+    measured: Array
+    closed_form: Array
+
+    @property
+    def largest(self) -> float:
+        """Largest horizontal effect, m."""
+        return float(np.hypot(self.closed_form[:, 0], self.closed_form[:, 1]).max())
+
+    @property
+    def disagreement(self) -> float:
+        """Largest distance between the two ways, m."""
+        return float(np.linalg.norm(self.measured - self.closed_form, axis=1).max())
+
+
+@dataclass(frozen=True)
+class BeforeAfter:
+    """Dead reckoning with the calibration, without, and with all of it but the lever arm.
+
+    Parameters
+    ----------
+    calibrated, uncalibrated, without_lever_arm : the runs.
+    lever_arm : difference of the first and the last.
+    scored_by : what the errors are against.
+    """
+
+    calibrated: Run
+    uncalibrated: Run
+    without_lever_arm: Run
+    lever_arm: LeverArmEffect
+    scored_by: Literal["reference", "GNSS", "nothing"]
+
+
+def before_after(
+    trial: Trial, values: Mapping[str, Array], orientation_at: OrientationAt
+) -> BeforeAfter:
+    """Dead-reckon a trial by a calibration, and by what trial.yaml says of the mounting.
+
+    Parameters
+    ----------
+    trial : with DVL; GNSS gives the start, and scores where there is no reference.
+    values : of the calibration, by name, in reported units.
+    orientation_at : attitude and turn rate at times (M,).
+
+    Raises
+    ------
+    DataError
+        As `dead_reckon`.
+    """
+    truth, scored_by = _truth(trial, orientation_at)
+    mounting = mounting_of(trial, values)
+    best = dead_reckon(trial, mounting, orientation_at)
+
+    def run(mounting: Mounting, track: Track) -> Run:
+        return Run(mounting, track, None if truth is None else score(track, truth, along=best))
+
+    nominal = mounting_of(trial)
+    bare = replace(mounting, lever_arm=np.zeros(3))
+    calibrated = run(mounting, best)
+    without = run(bare, dead_reckon(trial, bare, orientation_at))
+    nRb = rotation_from_rph(best.rph, trial.body_axes)
+    effect = LeverArmEffect(
+        best.time,
+        difference(without.track, best.time, best.geodetic),
+        lever_arm_error(nRb, mounting.lever_arm),
+    )
+    return BeforeAfter(
+        calibrated=calibrated,
+        uncalibrated=run(nominal, dead_reckon(trial, nominal, orientation_at)),
+        without_lever_arm=without,
+        lever_arm=effect,
+        scored_by="nothing" if calibrated.score is None else scored_by,
+    )
+
+
+def _truth(
+    trial: Trial, orientation_at: OrientationAt
+) -> tuple[Reference | None, Literal["reference", "GNSS", "nothing"]]:
+    if trial.reference is not None:
+        return trial.reference, "reference"
+    if trial.gnss is not None:
+        return antenna_removed(trial.gnss, orientation_at), "GNSS"
+    return None, "nothing"

@@ -1,0 +1,171 @@
+"""The command `deadreckon`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from factorgraph_dvl.cli.console import (
+    ProgressLine,
+    print_table,
+    print_written,
+    stdout,
+    warn,
+)
+from factorgraph_dvl.cli.options import Force, NoFigures, Quiet, TrialPath
+
+if TYPE_CHECKING:
+    from factorgraph_dvl.analysis.before_after import BeforeAfter
+    from factorgraph_dvl.attitude import Attitude
+    from factorgraph_dvl.trial import Trial
+
+
+# Of a track, s, that may be left unscored without a word.
+_UNSCORED_S = 10.0
+
+
+def deadreckon(
+    trial_path: TrialPath,
+    calibration: Annotated[
+        Path,
+        typer.Option(
+            metavar="FILE", help="calibration.json, its folder, or a file of values typed in."
+        ),
+    ],
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder to write.")],
+    attitude: Annotated[
+        str | None,
+        typer.Option(
+            metavar="SOURCE",
+            help="Whose: sins, reference, or a solution folder. By default sins, and without "
+            "GNSS reference.",
+        ),
+    ] = None,
+    align: Annotated[
+        float | None,
+        typer.Option(metavar="S", min=1.0, help="With sins: seconds of GNSS it may use."),
+    ] = None,
+    force: Force = False,
+    no_figures: NoFigures = False,
+    quiet: Quiet = False,
+) -> None:
+    """Integrate the DVL's velocity, before and after calibration, and score the track."""
+    from factorgraph_dvl.analysis.before_after import before_after
+    from factorgraph_dvl.io.folders import check_output, new_folder
+    from factorgraph_dvl.io.foreign import read_calibration_values
+    from factorgraph_dvl.io.motion_table import motion_columns
+    from factorgraph_dvl.io.tables import write_table
+    from factorgraph_dvl.io.trial_folder import load_trial
+    from factorgraph_dvl.report.dead_reckoning_files import (
+        OWNED,
+        RESULT_FILE,
+        TRACK_FILE,
+        UNCALIBRATED_FILE,
+        error_table,
+        to_json,
+    )
+
+    check_output(out, force=force)
+    with ProgressLine(quiet=quiet) as progress:
+        trial = load_trial(trial_path)
+        values = read_calibration_values(calibration, trial.body_axes)
+        progress("attitude")
+        attitude = attitude or _default_attitude(trial)
+        source, notes = _attitude(trial, attitude, align)
+        progress("dead reckoning")
+        result = before_after(trial, values, source.at)
+        progress("write")
+        with new_folder(out, force=force, owned=OWNED) as folder:
+            for name, run in (
+                (TRACK_FILE, result.calibrated),
+                (UNCALIBRATED_FILE, result.uncalibrated),
+            ):
+                write_table(folder / name, motion_columns(run.track.motion))
+            if not no_figures:
+                _draw(trial, result, folder)
+            about = {
+                "trial": trial.name,
+                "calibration": str(calibration),
+                "attitude": attitude,
+                "align_s": align,
+            }
+            (folder / RESULT_FILE).write_bytes(to_json(result, about))
+    if result.calibrated.score is None:
+        warn("neither a reference nor GNSS covers the track: it is not scored")
+    else:
+        print_table(error_table(result))
+        distance = result.calibrated.score.path.total
+        stdout().print(
+            f"{distance:.6g} m, scored by {result.scored_by}", markup=False, soft_wrap=True
+        )
+        end, last = result.calibrated.score.time[-1], result.calibrated.track.time[-1]
+        if last - end > _UNSCORED_S:
+            warn(
+                f"{result.scored_by} ends at {end:.1f} s and the track at {last:.1f} s: distance "
+                "and errors are those up to there"
+            )
+    for note in (*trial.notes, *notes):
+        warn(note)
+    if trial.dvl is not None and trial.dvl.settings.reference == "water":
+        warn("the DVL measures through the water: so does the track, and the current is its error")
+    if result.calibrated.track.bridged > 0.0:
+        warn(
+            f"{result.calibrated.track.bridged:.1f} s without bottom lock were bridged by the "
+            "velocity in body before and after"
+        )
+    print_written(out)
+
+
+def _default_attitude(trial: Trial) -> str:
+    return "reference" if trial.gnss is None and trial.reference is not None else "sins"
+
+
+def _attitude(trial: Trial, source: str, align: float | None) -> tuple[Attitude, tuple[str, ...]]:
+    """Return whose attitude the track follows, and what is to be said of it."""
+    import numpy as np
+
+    from factorgraph_dvl.attitude import Attitude
+    from factorgraph_dvl.conventions import DEG_PER_HOUR
+    from factorgraph_dvl.errors import ConfigError
+
+    if align is not None and source != "sins":
+        raise ConfigError("goes with --attitude sins only", where="--align")
+    if source == "sins":
+        from factorgraph_dvl.kalman import sins
+
+        motion, bias, notes = sins(trial, align_s=align)
+        return Attitude(trial.imu, motion, trial.body_axes, bias), notes
+    if source == "reference":
+        if trial.reference is None:
+            raise ConfigError(
+                "the trial has no reference", where="--attitude reference",
+                expected="sins, or a solution folder",
+            )  # fmt: skip
+        return Attitude(trial.imu, trial.reference, trial.body_axes, np.zeros(3)), ()
+    from factorgraph_dvl.io.solution_folder import load_solution
+
+    if not Path(source).is_dir():
+        raise ConfigError(
+            f"there is no folder {source}",
+            where="--attitude",
+            expected="sins, reference, or a solution folder",
+        )
+    solution = load_solution(source)
+    if solution.trial != trial.name:
+        warn(f"the attitude in {source} is that of trial {solution.trial}, not of {trial.name}")
+    names = [e.name for e in solution.estimates]
+    bias = np.zeros(3)
+    if "gyro_bias_deg_h" in names:
+        bias = solution.estimate("gyro_bias_deg_h").value * DEG_PER_HOUR
+    return Attitude(trial.imu, solution.trajectory, solution.body_axes, bias), ()
+
+
+def _draw(trial: Trial, result: BeforeAfter, folder: Path) -> None:
+    from factorgraph_dvl.report.dead_reckoning_figures import write_dead_reckoning_figures
+
+    try:
+        write_dead_reckoning_figures(trial, result, folder)
+    except Exception as error:
+        warn(f"figures could not be drawn: {type(error).__name__}: {error}")

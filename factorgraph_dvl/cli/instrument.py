@@ -1,0 +1,23 @@
+"""The command `instrument`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+def instrument(
+    calibration: Annotated[
+        Path, typer.Argument(metavar="CALIBRATION", help="calibration.json, or its folder.")
+    ],
+) -> None:
+    """Print a calibration as instruments take it: angles, %, ppm, TRDI's EA and EI."""
+    from factorgraph_dvl.analysis.instrument import instrument_of
+    from factorgraph_dvl.io.calibration_file import check_usable, load_calibration
+    from factorgraph_dvl.report.instrument_text import instrument_text
+
+    found = load_calibration(calibration)
+    check_usable(found, found.body_axes, str(calibration))
+    typer.echo(instrument_text(instrument_of(found), found.trial), nl=False)

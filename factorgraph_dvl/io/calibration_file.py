@@ -1,0 +1,234 @@
+"""Calibration files: calibration.json, format 1."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from itertools import islice
+from pathlib import Path
+from typing import Any, Literal
+
+import msgspec
+import numpy as np
+from msgspec import UNSET, UnsetType
+
+from factorgraph_dvl.conventions import Array, BodyAxes
+from factorgraph_dvl.errors import DataError
+from factorgraph_dvl.sensors.dvl import CALIBRATED
+from factorgraph_dvl.solution import Calibration, Estimate, Solution
+
+CALIBRATION_FILE = "calibration.json"
+
+# Of components, in their order.
+_LABELS = ("x", "y", "z", "e", "n", "u")
+# Of a variance, for files with few digits.
+_ROUNDING = 0.02
+# JSON knows no nan: null stands for it.
+_Numbers = list[float | None]
+
+
+class _Parameter(msgspec.Struct):
+    value: _Numbers
+    std: _Numbers
+    observable: list[bool]
+    prior_value: _Numbers = []
+    prior_std: _Numbers = []
+
+
+class _Covariance(msgspec.Struct):
+    order: list[str]
+    matrix: list[_Numbers]
+
+
+class _File(msgspec.Struct):
+    format: Literal[1]
+    trial: str
+    solver: str
+    converged: bool
+    iterations: int
+    parameters: dict[str, _Parameter]
+    covariance: _Covariance
+    cost: float | None = None
+    body_axes: BodyAxes | UnsetType = UNSET
+    warnings: list[str] = []
+
+
+def load_calibration(path: Path | str, *, body_axes: BodyAxes = "RFU") -> Calibration:
+    """Read a calibration file.
+
+    Parameters
+    ----------
+    path : of the file, or of the solution folder that holds it.
+    body_axes : that it is in where it does not say so.
+
+    Raises
+    ------
+    DataError
+        If the file is missing or does not hold what it should.
+    """
+    path = Path(path)
+    path = path / CALIBRATION_FILE if path.is_dir() else path
+    file = _decode(path)
+    rows = _rows(file, str(path))
+    names = iter([file.covariance.order[i] for i in rows])
+    covariance = _covariance(file)[np.ix_(rows, rows)]
+    _check_std(file, covariance, str(path))
+    return Calibration(
+        trial=file.trial,
+        solver=file.solver,
+        body_axes=body_axes if file.body_axes is UNSET else file.body_axes,
+        converged=file.converged,
+        iterations=file.iterations,
+        cost=np.nan if file.cost is None else file.cost,
+        estimates=tuple(
+            _estimate(name, parameter, names) for name, parameter in file.parameters.items()
+        ),
+        covariance=covariance,
+        warnings=tuple(file.warnings),
+    )
+
+
+def check_usable(calibration: Calibration, body_axes: BodyAxes, source: str) -> None:
+    """Raise DataError unless a calibration converged, is in these body axes, and is one."""
+    for e in calibration.estimates:
+        if e.name in CALIBRATED:
+            check_values(e.name, e.value, source)
+    if not calibration.converged:
+        raise DataError(
+            "the calibration did not converge, its numbers are not to be used", where=source,
+            expected="`converged` true",
+        )  # fmt: skip
+    if calibration.body_axes != body_axes:
+        raise DataError(
+            f"the calibration is in {calibration.body_axes} axes", where=source,
+            expected=f"{body_axes}, as the trial has them",
+        )  # fmt: skip
+
+
+def check_values(name: str, value: Array, source: str) -> None:
+    """Raise DataError unless the values of a parameter are numbers that can be."""
+    if not np.isfinite(value).all():
+        raise DataError(f"{name} holds no number", where=source, expected="finite values")
+    if name == "scale_error" and np.min(value) <= -1.0:
+        raise DataError(
+            f"scale_error is {np.min(value):g}", where=source, expected="numbers above -1"
+        )
+
+
+def encode_calibration(solution: Solution | Calibration) -> bytes:
+    """Return the content of calibration.json."""
+    calibration = _File(
+        format=1,
+        trial=solution.trial,
+        solver=solution.solver,
+        converged=bool(solution.converged),
+        iterations=int(solution.iterations),
+        parameters={
+            e.name: _Parameter(
+                value=_numbers(e.value),
+                std=_numbers(e.std),
+                observable=np.asarray(e.observable, dtype=bool).tolist(),
+                prior_value=_numbers(e.prior_value),
+                prior_std=_numbers(e.prior_std),
+            )
+            for e in solution.estimates
+        },
+        covariance=_Covariance(
+            list(solution.order), [_numbers(row) for row in np.asarray(solution.covariance)]
+        ),
+        cost=float(solution.cost),
+        body_axes=solution.body_axes,
+        warnings=list(solution.warnings),
+    )
+    # msgspec writes nan and infinity as null, and every float with the digits it takes.
+    return msgspec.json.format(msgspec.json.encode(calibration), indent=2) + b"\n"
+
+
+def _decode(file: Path) -> _File:
+    try:
+        calibration = msgspec.json.decode(file.read_bytes(), type=_File)
+    except FileNotFoundError:
+        raise DataError(
+            "the file does not exist", where=str(file), expected="a solution folder"
+        ) from None
+    except (msgspec.MsgspecError, UnicodeDecodeError) as error:
+        raise DataError(f"cannot be read ({error})", where=str(file)) from None
+    size = sum(len(parameter.value) for parameter in calibration.parameters.values())
+    shape = {len(calibration.covariance.order), len(calibration.covariance.matrix)}
+    shape |= {len(row) for row in calibration.covariance.matrix}
+    if shape != {size}:
+        raise DataError(
+            "the covariance does not fit the parameters",
+            where=str(file),
+            expected=f"{size} names in `order`, and a {size} x {size} matrix",
+        )
+    return calibration
+
+
+def _rows(calibration: _File, source: str) -> list[int]:
+    """Return the rows of the covariance in the order of the parameters, by their names."""
+    left = dict(enumerate(calibration.covariance.order))
+    out: list[int] = []
+    for name, parameter in calibration.parameters.items():
+        own = {i: label for i, n in left.items() if (label := _label(n, name)) is not None}
+        if len(own) != len(parameter.value) or len(set(own.values())) != len(own):
+            raise DataError(
+                f"`covariance.order` does not name the components of {name}",
+                where=source,
+                expected="each once, such as lever_arm_x_m, lever_arm_y_m, lever_arm_z_m",
+            )
+        out += sorted(own, key=lambda i: own[i])
+        left = {i: n for i, n in left.items() if i not in own}
+    return out
+
+
+def _label(component: str, name: str) -> int | None:
+    """Return the place of a component in its parameter, None if it is not one of it."""
+    if component == name:
+        return 0
+    parts = component.split("_")
+    for i, label in enumerate(parts):
+        if label in _LABELS and "_".join(parts[:i] + parts[i + 1 :]) == name:
+            return _LABELS.index(label)
+    return None
+
+
+def _check_std(calibration: _File, covariance: Array, source: str) -> None:
+    """Raise DataError where standard deviations and covariance contradict each other."""
+    std = np.concatenate([np.empty(0), *(_array(p.std) for p in calibration.parameters.values())])
+    diagonal = np.diag(covariance)
+    known = np.isfinite(std) & np.isfinite(diagonal)
+    if std.size != diagonal.size or np.any(
+        np.abs(std[known] ** 2 - diagonal[known]) > _ROUNDING * np.maximum(diagonal[known], 1e-30)
+    ):
+        raise DataError(
+            "`std` and the diagonal of the covariance do not agree",
+            where=source,
+            expected="std² on the diagonal, to one per cent",
+        )
+
+
+def _estimate(name: str, parameter: _Parameter, names: Iterator[str]) -> Estimate:
+    size = len(parameter.value)
+    unknown: Sequence[float | None] = [None] * size
+    return Estimate(
+        name,
+        tuple(islice(names, size)),
+        _array(parameter.value),
+        _array(parameter.std),
+        _array(parameter.prior_value or unknown),
+        _array(parameter.prior_std or unknown),
+        np.array(parameter.observable, dtype=bool),
+    )
+
+
+def _covariance(calibration: _File) -> Array:
+    size = len(calibration.covariance.order)
+    return np.array(calibration.covariance.matrix, dtype=float).reshape(size, size)
+
+
+def _numbers(values: Any) -> _Numbers:
+    return list(np.atleast_1d(np.asarray(values, dtype=float)).tolist())
+
+
+def _array(values: Sequence[float | None]) -> Array:
+    return np.array(values, dtype=float)

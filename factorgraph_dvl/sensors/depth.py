@@ -1,0 +1,158 @@
+"""The depth sensor: how far it is below the surface of the sea."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+from typing import ClassVar, Self
+
+import numpy as np
+
+from factorgraph_dvl.conventions import Array, skew
+from factorgraph_dvl.earth import LocalFrame
+from factorgraph_dvl.sensors.protocol import (
+    Linearization,
+    Motion,
+    NonNegative,
+    Observation,
+    Parameter,
+    Positive,
+    SensorSection,
+    Values,
+    Vector3,
+    check_range,
+    check_times,
+)
+
+SEA_SURFACE_HEIGHT = "sea_surface_height_m"
+
+
+class DepthSettings(SensorSection, frozen=True, kw_only=True):
+    """Section `depth` of trial.yaml.
+
+    The sea is not the ellipsoid: the geoid leaves it by -107 to 86 m, and tide comes on top.
+    """
+
+    file: str = "depth.csv"
+    std_m: Positive = 0.1
+    lever_arm_m: Vector3 = (0.0, 0.0, 0.0)
+    sea_surface_height_m: float = 0.0
+    sea_surface_height_std_m: NonNegative = 100.0
+
+
+@dataclass(frozen=True)
+class Depth:
+    """Settings and record of the depth sensor.
+
+    Parameters
+    ----------
+    settings : DepthSettings
+    time : (M,) s, strictly increasing.
+    depth : (M,) below the sea surface, positive down, m; nan where not measured.
+    source : name of the file, for messages.
+    """
+
+    settings: DepthSettings
+    time: Array
+    depth: Array
+    source: str = "depth"
+    label: str = "Depth"
+
+    section: ClassVar[str] = "depth"
+    section_type: ClassVar[type[SensorSection]] = DepthSettings
+    required: ClassVar[tuple[str, ...]] = ("time_s", "depth_m")
+    optional: ClassVar[tuple[tuple[str, ...], ...]] = ()
+
+    def __post_init__(self) -> None:
+        check_times(self.time, self.source)
+        check_range({"depth_m": self.depth}, -100.0, 12e3, "m", self.source)
+
+    @classmethod
+    def from_columns(
+        cls, settings: DepthSettings, columns: Mapping[str, Array], source: str
+    ) -> Self:
+        """Return the record that a table holds."""
+        return cls(settings, columns["time_s"], columns["depth_m"], source)
+
+    def columns(self) -> dict[str, Array]:
+        """Return the record as a table."""
+        return {"time_s": self.time, "depth_m": self.depth}
+
+    @property
+    def missing(self) -> Array:
+        """Rows without a depth, (M,) bool."""
+        return np.isnan(self.depth)
+
+    def parameters(self) -> tuple[Parameter, ...]:
+        """Return the height of the sea surface above the ellipsoid."""
+        s = self.settings
+        mean, sigma = s.sea_surface_height_m, s.sea_surface_height_std_m
+        return (
+            Parameter(
+                "sea_surface_height", "m", 1.0, np.array([mean]), np.array([sigma]), labels=("",)
+            ),
+        )
+
+    def observations(self, frame: LocalFrame) -> tuple[Observation, ...]:
+        """Return the depths, where there are any."""
+        m = np.logical_not(self.missing)
+        if not m.any():
+            return ()
+        arm = np.array(self.settings.lever_arm_m)
+        return (DepthBelowSurface(self.time[m], self.depth[m], self.settings.std_m, arm, frame),)
+
+    def explain(self, parameter: str, component: int, motion: Motion | None) -> str:
+        """Say why the height of the sea surface could not be observed."""
+        return "nothing else in the trial measures height: it takes GNSS at the surface"
+
+
+@dataclass(frozen=True)
+class DepthBelowSurface:
+    """Depth of a sensor; zero error where
+
+        depth = h_surface - h(p_n + nRb l)
+
+    with h the height above the ellipsoid, of which dh/dp is the upward normal there.
+
+    Parameters
+    ----------
+    time : (M,) s.
+    measured : (M,) m, positive down.
+    std : m.
+    lever_arm : (3,) IMU to sensor, in body, m.
+    frame : of n.
+    """
+
+    time: Array
+    measured: Array
+    std: float
+    lever_arm: Array
+    frame: LocalFrame
+    label: str = "Depth"
+    unit: str = "m"
+    components: tuple[str, ...] = ("down",)
+    parameters: tuple[str, ...] = (SEA_SURFACE_HEIGHT,)
+
+    def true_time(self, values: Values) -> Array:
+        """Return the times of the measurements."""
+        return self.time
+
+    def sigma(self, motion: Motion, values: Values) -> Array:
+        """Return the standard deviation, (M, 1), m."""
+        return np.full((self.time.size, 1), self.std)
+
+    def residual(self, motion: Motion, values: Values) -> Array:
+        """Return predicted - measured, (M, 1), m."""
+        height = self.frame.geodetic(motion.p_n + motion.nRb @ self.lever_arm)[2]
+        return (values[SEA_SURFACE_HEIGHT] - height - self.measured)[:, None]
+
+    def linearize(self, motion: Motion, values: Values, wanted: Collection[str]) -> Linearization:
+        """Return the residual and its Jacobians."""
+        lat, lon, _ = self.frame.geodetic(motion.p_n + motion.nRb @ self.lever_arm)
+        up_n = self.frame.level_from_tangent(lat, lon)[:, 2:, :]
+        return Linearization(
+            residual=self.residual(motion, values),
+            d_theta=up_n @ motion.nRb @ skew(self.lever_arm),
+            d_p=-up_n,
+            d_parameters={SEA_SURFACE_HEIGHT: np.ones((self.time.size, 1, 1))},
+        )

@@ -1,0 +1,48 @@
+"""When states are needed: once a second, or wherever an accurate attitude was measured."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from factorgraph_dvl.attitude_alignment import attitudes
+from factorgraph_dvl.conventions import Array
+from factorgraph_dvl.earth import LocalFrame
+from factorgraph_dvl.trial import Trial
+
+# States this far apart, s, are as good as denser ones for positions and velocities: every
+# measurement hangs on the state before it through the increments up to its own time, and
+# the noise of these is left out.
+STATE_INTERVAL = 1.0
+# Share of the variance of the attitudes between two states up to which the noise of the
+# gyros may be left out.
+_SHARE = 0.02
+# States are not closer than this, s.
+_CLOSEST = 0.05
+
+
+def dense_epochs(trial: Trial, frame: LocalFrame, interval: float) -> Array | None:
+    """Return times (M,) at which states are needed besides those every `interval` s.
+
+    The angle of the gyros walks by q t within t. Attitudes of variance sigma² each, n of
+    them to a state, must not hang on that state if q interval is not far below sigma²/n.
+    """
+    walk = trial.imu.settings.gyro_noise_root_psd**2 * interval
+    epochs = [np.empty(0)]
+    for seen in attitudes(trial, frame):
+        step = float(np.median(np.diff(seen.time))) if seen.time.size > 1 else interval
+        each = float(np.median(seen.sigma)) ** 2 / max(interval / step, 1.0)
+        if walk > _SHARE * each:
+            epochs.append(seen.time)
+    time = np.unique(np.concatenate(epochs))
+    return _thinned(time) if time.size else None
+
+
+def _thinned(time: Array) -> Array:
+    """Return times without those that follow another too closely."""
+    if np.diff(time).min(initial=np.inf) >= _CLOSEST:
+        return time
+    kept = [time[0]]
+    for t in time[1:].tolist():
+        if t - kept[-1] >= 0.99 * _CLOSEST:
+            kept.append(t)
+    return np.array(kept)
