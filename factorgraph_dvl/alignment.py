@@ -155,7 +155,8 @@ def _pairs(trial: Trial, frame: LocalFrame, arc: Arc) -> _Pairs | None:
             pairs = make(trial.gnss, frame, arc)
             if pairs is not None:
                 return pairs
-    return _from_dvl(trial.dvl, arc) if trial.dvl is not None else None
+    log = trial.log
+    return _from_dvl(log, arc) if log is not None else None
 
 
 def _from_velocity(gnss: Gnss, frame: LocalFrame, arc: Arc) -> _Pairs | None:
@@ -168,7 +169,8 @@ def _from_velocity(gnss: Gnss, frame: LocalFrame, arc: Arc) -> _Pairs | None:
     p_n = _interpolate(time, fix_time, fix)
     lat, lon, _ = frame.geodetic(p_n)
     v_n = rotate(frame.level_from_tangent(lat, lon).transpose(0, 2, 1), gnss.velocity[use])
-    turning = np.cross(at.gyro, np.array(gnss.settings.lever_arm_m))
+    arm, omega_cb_b = gnss.lever_arm(time)
+    turning = np.cross(at.gyro - omega_cb_b, arm)
     space = rotate(arc.to_space(time), v_n + np.cross(arc.earth_rate, p_n))
     return _Pairs(
         time,
@@ -191,7 +193,7 @@ def _from_position(gnss: Gnss, frame: LocalFrame, arc: Arc) -> _Pairs | None:
     later = later[earlier]
     span = (time[later] - time[earlier])[:, None]
     at, body_R, _, displacement = arc.carry(time)
-    body = displacement + body_R @ np.array(gnss.settings.lever_arm_m)
+    body = displacement + rotate(body_R, gnss.lever_arm(time)[0])
     space = rotate(arc.to_space(time), p_n) - arc.pull(at)[1]
     sigma = np.sqrt((gnss.position_std**2).mean()) * np.sqrt(2.0) / span[:, 0]
     return _Pairs(
@@ -309,7 +311,7 @@ def _kinematics(trial: Trial, frame: LocalFrame, seg: Segments, nRb: Array) -> t
     Velocity from GNSS, in its gaps from the DVL with its nominal mounting; position as
     its integral, pulled to the fixes.
     """
-    gnss, dvl, time = trial.gnss, trial.dvl, seg.node_time
+    gnss, dvl, time = trial.gnss, trial.log, seg.node_time
     v_n = np.zeros((time.size, 3))
     far = np.full(time.size, True)
     index, since, _ = seg.increments.locate(time)
@@ -326,8 +328,9 @@ def _kinematics(trial: Trial, frame: LocalFrame, seg: Segments, nRb: Array) -> t
         else:
             v_time = np.empty(0)
         if v_time.size:
-            arm = np.array(gnss.settings.lever_arm_m)
-            v_n = _interpolate(time, v_time, v_antenna) - rotate(nRb, np.cross(gyro, arm))
+            arm, omega_cb_b = gnss.lever_arm(time)
+            turning = rotate(nRb, np.cross(gyro - omega_cb_b, arm))
+            v_n = _interpolate(time, v_time, v_antenna) - turning
             far = _distance(time, v_time) > _GNSS_GAP
     if dvl is not None and dvl.locked.any() and far.any():
         ping_time = dvl.time[dvl.locked] - dvl.prior_means()[TIME_OFFSET][0]
@@ -339,7 +342,7 @@ def _kinematics(trial: Trial, frame: LocalFrame, seg: Segments, nRb: Array) -> t
     step = np.diff(time)[:, None]
     p_n = np.concatenate([np.zeros((1, 3)), np.cumsum(0.5 * (v_n[1:] + v_n[:-1]) * step, axis=0)])
     if gnss is not None and fix_time.size:
-        arm_n = nRb @ np.array(gnss.settings.lever_arm_m)
+        arm_n = rotate(nRb, gnss.lever_arm(time)[0])
         miss = fix - _interpolate(fix_time, time, p_n + arm_n)
         p_n = p_n + _interpolate(time, fix_time, miss)
     return p_n, v_n

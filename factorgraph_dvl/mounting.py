@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from factorgraph_dvl.beam_geometry import as_dvl
 from factorgraph_dvl.conventions import (
     Array,
     exp_so3,
@@ -31,6 +32,7 @@ from factorgraph_dvl.sensors.dvl import (
     Dvl,
 )
 from factorgraph_dvl.sensors.protocol import Motion, Parameter
+from factorgraph_dvl.trial import Trial
 
 # Error of the velocity that comes from IMU and GNSS, m/s.
 _VELOCITY_ERROR = 0.03
@@ -64,9 +66,37 @@ class _Mounting:
     bias: Array
 
 
-def initial_mounting(
-    dvl: Dvl, motion_at: Callable[[np.ndarray, Array], tuple[Motion, np.ndarray]]
-) -> dict[str, Array]:
+MotionAt = Callable[[np.ndarray, Array], tuple[Motion, np.ndarray]]
+
+
+def initial_values(trial: Trial, motion_at: MotionAt) -> dict[str, Array]:
+    """Return values of parameters to start from, where the priors are not good enough.
+
+    Beams with directions of their own are near enough to the nominal ones.
+
+    Parameters
+    ----------
+    trial : its DVL, and beams with a common mounting.
+    motion_at : as for `initial_mounting`.
+    """
+    values: dict[str, Array] = {}
+    if trial.dvl is not None and not calibrated(trial.dvl):
+        values |= initial_mounting(trial.dvl, motion_at)
+    beams = trial.beams
+    if beams is not None and beams.settings.parametrisation == "common":
+        found = initial_mounting(as_dvl(beams), motion_at)
+        for p in beams.parameters():
+            values[p.name] = found[p.name.removeprefix(beams.prefix)]
+    return values
+
+
+def calibrated(dvl: Dvl) -> bool:
+    """Whether an earlier calibration knows all of the mounting that is to be estimated."""
+    free = [p for p in dvl.parameters() if p.estimated]
+    return any(p.joint for p in free) and all(p.joint or not p.rotation for p in free)
+
+
+def initial_mounting(dvl: Dvl, motion_at: MotionAt) -> dict[str, Array]:
     """Return values of the DVL's parameters to start from, rotations as matrices.
 
     Parameters

@@ -14,7 +14,6 @@ from factorgraph_dvl.conventions import (
     Array,
     exp_so3,
     inverse_right_jacobian,
-    log_so3,
     right_jacobian,
 )
 from factorgraph_dvl.sensors.protocol import Parameter
@@ -133,7 +132,9 @@ def value_at(values: gtsam.Values, key: int, p: Parameter) -> Array:
 
 def away(p: Parameter, value: Array, origin: Array) -> Array:
     """Return a parameter minus an origin, in the origin's tangent space, SI."""
-    return log_so3(origin.T @ value) if p.rotation else value - origin
+    if p.rotation:
+        return np.asarray(gtsam.Rot3.Logmap(gtsam.Rot3(origin.T @ value)))
+    return value - origin
 
 
 def prior_mean(p: Parameter) -> Array:

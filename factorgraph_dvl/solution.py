@@ -7,7 +7,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from factorgraph_dvl.conventions import Array, BodyAxes
+from factorgraph_dvl.conventions import DEG, Array, BodyAxes
+from factorgraph_dvl.directions import turned
 from factorgraph_dvl.sensors.protocol import DO_NOT_FIT, TOO_LARGE
 
 _FAR_FROM_PRIOR = 5.0
@@ -68,6 +69,8 @@ class Estimate:
     prior_value, prior_std : (n,) what was known before.
     observable : (n,) bool, whether the data at least halved the prior's standard
         deviation.
+    nominal : (N, 3) unit vectors, if the parameter is N directions: the n = 2 N components
+        turn them, in deg (`directions`). None for all other parameters.
     """
 
     name: str
@@ -77,6 +80,13 @@ class Estimate:
     prior_value: Array
     prior_std: Array
     observable: np.ndarray
+    nominal: Array | None = None
+
+    @property
+    def directions(self) -> Array:
+        """The unit vectors of a parameter that is directions, (N, 3)."""
+        assert self.nominal is not None
+        return turned(self.nominal, self.value.reshape(-1, 2) * DEG)
 
 
 @dataclass(frozen=True)
@@ -88,8 +98,8 @@ class Residuals:
     label, unit : of the measurement.
     components : names of the d components.
     time : (M,) s.
-    residual : (M, d) predicted - measured.
-    sigma : (M, d) standard deviation of the measurement.
+    residual : (M, d) predicted - measured; nan where a component was not measured.
+    sigma : (M, d) standard deviation of the measurement; likewise.
     """
 
     label: str
@@ -193,7 +203,7 @@ def doubts(estimates: Sequence[Estimate], residuals: Sequence[Residuals]) -> lis
                 "before that is cleared up"
             )
     for r in residuals:
-        rms = float(np.sqrt(np.mean((r.residual / r.sigma) ** 2))) if r.time.size else 0.0
+        rms = float(np.sqrt(np.nanmean((r.residual / r.sigma) ** 2))) if r.time.size else 0.0
         if rms > DO_NOT_FIT:
             out.append(
                 f"{r.label}: residuals are {rms:.0f} times as large as their stated standard "

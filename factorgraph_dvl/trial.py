@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from factorgraph_dvl.conventions import Array, BodyAxes
+from factorgraph_dvl.beam_geometry import as_dvl
+from factorgraph_dvl.conventions import Array, BodyAxes, frd_from_body
 from factorgraph_dvl.earth import LocalFrame
 from factorgraph_dvl.errors import DataError
 from factorgraph_dvl.sensors.dvl import Dvl
+from factorgraph_dvl.sensors.dvl_beams import DvlBeams
 from factorgraph_dvl.sensors.gnss import Gnss
 from factorgraph_dvl.sensors.imu import Imu
 from factorgraph_dvl.sensors.protocol import Aid
+from factorgraph_dvl.sensors.turntable import Turntable
 
 
 @dataclass(frozen=True)
@@ -93,6 +96,28 @@ class Trial:
     reference: Reference | None = None
     calibration_truth: dict[str, Array] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        # What a sensor must know of another is set here, whoever made or changed the trial.
+        prefix = "beam_" if self.dvl is not None else ""
+        for i, aid in enumerate(self.others):
+            if isinstance(aid, DvlBeams) and aid.prefix != prefix:
+                renamed = replace(aid, prefix=prefix)
+                others = (*self.others[:i], renamed, *self.others[i + 1 :])
+                object.__setattr__(self, "others", others)
+            if isinstance(aid, Turntable) and self.gnss is not None:
+                up = -frd_from_body(self.body_axes)[2]
+                object.__setattr__(self, "gnss", replace(self.gnss, turning=aid.turning(up)))
+
+    @property
+    def beams(self) -> DvlBeams | None:
+        """The beams of a DVL, None where the trial does not have them."""
+        return next((aid for aid in self.others if isinstance(aid, DvlBeams)), None)
+
+    @property
+    def log(self) -> Dvl | None:
+        """The DVL, or what its beams amount to with their nominal directions."""
+        return self.dvl if self.dvl is not None or self.beams is None else as_dvl(self.beams)
 
     @property
     def aids(self) -> tuple[Aid, ...]:

@@ -17,8 +17,10 @@ PACKAGE = Path(factorgraph_dvl.__file__).parent
 # package. `a.b` stands for a module or a whole package.
 LAYERS = (
     ("conventions", "errors"),
-    ("earth", "celestial", "yaml_file"),
+    ("earth", "celestial", "yaml_file", "directions", "turning"),
+    ("gains",),
     ("sensors",),
+    ("beam_geometry",),
     ("trial", "solution", "information"),
     ("io", "simulation"),
     ("clock", "polynomials", "signals"),
@@ -44,7 +46,7 @@ LAYERS = (
 FORBIDDEN = {
     "io": ("simulation", "increments"),
     "simulation": ("io", "increments", "preintegration", "graph", "solvers", "analysis"),
-    "kalman": ("io", "simulation"),
+    "kalman": ("io", "simulation", "gains"),
     "solvers": ("io", "simulation", "analysis", "report"),
     "replay": ("io", "simulation", "analysis", "report"),
     "analysis": (
@@ -70,7 +72,7 @@ FORBIDDEN |= {
     )
 }
 # Data classes of the sensors: no measurement equation is among them.
-SENSOR_DATA = ("Imu", "ImuSettings", "Gnss", "Dvl", "Star", "Parameter", "Motion")
+SENSOR_DATA = ("Imu", "ImuSettings", "Gnss", "Dvl", "Star", "Aid", "Parameter", "Motion")
 # The graph asks every sensor through the protocol and knows none but the IMU by name.
 NAMELESS = ("graph", "priors", "chain", "preintegration", "keys", "solvers", "replay")
 # Only where they are used: GTSAM, SciPy and Matplotlib take most of a second to load.

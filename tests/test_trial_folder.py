@@ -141,9 +141,9 @@ def test_a_trial_without_a_name_is_called_as_its_folder(tmp_path: Path) -> None:
 def test_sections_that_are_not_used_are_noted(tmp_path: Path) -> None:
     path = write_trial(tmp_path)
     with (path / "trial.yaml").open("a") as file:
-        file.write("turntable: {file: turntable.csv}\n")
+        file.write("beacons: {file: beacons.csv}\n")
     assert load_trial(path).notes == (
-        "section `turntable` of trial.yaml is not used by this version",
+        "section `beacons` of trial.yaml is not used by this version",
     )
 
 

@@ -15,6 +15,7 @@ from factorgraph_dvl.analysis.consistency import (
     nearest_rotation_vector,
 )
 from factorgraph_dvl.conventions import DEG, Array, exp_so3, log_so3
+from factorgraph_dvl.directions import turns_to
 from factorgraph_dvl.solution import Estimate, Solution
 
 Side = Literal["A", "B"]
@@ -31,6 +32,7 @@ HAUSMAN_RATIO = 1.05
 _IN_BODY_AXES = (
     *("misalignment_deg", "lever_arm_m", "gyro_bias_deg_h", "accel_bias_ug"),
     *("gnss_lever_arm_m", "star_mounting_deg", "beam_direction_b"),
+    *("beam_misalignment_deg", "beam_lever_arm_m"),
 )
 
 
@@ -171,6 +173,8 @@ def joint_test(a: Solution, b: Solution, components: tuple[Component, ...]) -> J
 def same_branch(solution: Solution, other: Solution) -> Solution:
     """Return a solution with the rotation vectors that are nearer to another's.
 
+    Directions become turns of the other's nominal ones.
+
     With φ' = φ (1 - 2π / |φ|), the same rotation, J = (1 - 2π / |φ|) I + 2π φ φ' / |φ|³
     takes its covariance along.
     """
@@ -181,6 +185,8 @@ def same_branch(solution: Solution, other: Solution) -> Solution:
     for i, estimate in enumerate(estimates):
         rows = slice(row, row + estimate.value.size)
         row = rows.stop
+        if estimate.nominal is not None:
+            estimates[i] = _about_the_same(estimate, other)
         if estimate.name not in ROTATION_VECTORS or estimate.name not in near:
             continue
         phi = estimate.value
@@ -196,6 +202,15 @@ def same_branch(solution: Solution, other: Solution) -> Solution:
         std = np.sqrt(np.diagonal(covariance)[rows])
         estimates[i] = replace(estimate, value=moved, std=std)
     return replace(solution, estimates=tuple(estimates), covariance=covariance)
+
+
+def _about_the_same(estimate: Estimate, other: Solution) -> Estimate:
+    """Return directions as turns of the other's nominal ones; the same to first order."""
+    theirs = next((e for e in other.estimates if e.name == estimate.name), None)
+    if theirs is None or theirs.nominal is None or theirs.value.size != estimate.value.size:
+        return estimate
+    turns = turns_to(theirs.nominal, estimate.directions).ravel() / DEG
+    return replace(estimate, value=turns, nominal=theirs.nominal)
 
 
 def std_of_difference(

@@ -10,19 +10,21 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.special import chdtri
 
 from factorgraph_dvl.conventions import (
+    DEG,
     Array,
     exp_so3,
     log_so3,
     rotation_from_rph,
     rph_from_rotation,
 )
+from factorgraph_dvl.directions import turns_to
 from factorgraph_dvl.earth import radii
 from factorgraph_dvl.solution import Estimate, Solution, Trajectory
 from factorgraph_dvl.trial import Reference
 
 _COINCIDENT_S = 1e-6
 _LONGEST_INTERVAL_S = 0.05
-ROTATION_VECTORS = ("misalignment_deg", "star_mounting_deg")
+ROTATION_VECTORS = ("misalignment_deg", "star_mounting_deg", "beam_misalignment_deg")
 _PAPER_PARAMETERS = ("misalignment_deg", "scale_error", "lever_arm_m")
 
 
@@ -222,11 +224,15 @@ def true_value_of(estimate: Estimate, truth: Mapping[str, ArrayLike]) -> Array |
     Parameters
     ----------
     estimate : of n components.
-    truth : true values by reported name, in reported units.
+    truth : true values by reported name, in reported units; of directions (N, 3) vectors.
     """
     if estimate.name not in truth:
         return None
     value = np.atleast_1d(np.asarray(truth[estimate.name], dtype=float))
+    if estimate.nominal is not None:
+        if value.size != estimate.nominal.size:
+            return None
+        return turns_to(estimate.nominal, value.reshape(-1, 3)).ravel() / DEG
     if value.size not in (1, estimate.value.size):
         return None
     value = np.broadcast_to(value, estimate.value.shape).copy()

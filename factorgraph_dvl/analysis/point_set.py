@@ -12,9 +12,11 @@ from scipy.special import comb
 from factorgraph_dvl.analysis.manoeuvres import Segment
 from factorgraph_dvl.analysis.pwcs import (
     GAP,
+    BeamMounting,
     BodyMotion,
     Mounting,
     SingularValues,
+    beam_rows,
     body_motion,
     point_set_rows,
     singular_values,
@@ -34,21 +36,26 @@ from factorgraph_dvl.sensors.dvl import (
     MISALIGNMENT,
     SCALE_ERROR,
     TIME_OFFSET,
-    Dvl,
     DvlSettings,
 )
+from factorgraph_dvl.sensors.dvl_beams import DIRECTION as BEAM_DIRECTION
+from factorgraph_dvl.sensors.dvl_beams import SCALE_ERROR as BEAM_SCALE_ERROR
 from factorgraph_dvl.solution import Estimate, Solution, Trajectory
 from factorgraph_dvl.trial import Trial
 
-# The calibration of the paper, and what has columns where it is estimated too.
+# The calibration of the paper, that of single beams, and what has columns where it is
+# estimated too.
 _ALWAYS = (MISALIGNMENT, SCALE_ERROR, LEVER_ARM)
+_OF_BEAMS = (BEAM_DIRECTION, BEAM_SCALE_ERROR, LEVER_ARM)
 _IF_ESTIMATED = (BIAS, CURRENT)
-_SI = {MISALIGNMENT: DEG}
+_SI = {MISALIGNMENT: DEG, BEAM_DIRECTION: DEG}
 # In reported units, where a solution does not say what its priors were.
 _WITHOUT_PRIOR = {
     MISALIGNMENT: (1.0, "1 deg"),
     SCALE_ERROR: (0.01, "0.01"),
     LEVER_ARM: (1.0, "1 m"),
+    BEAM_DIRECTION: (1.0, "1 deg"),
+    BEAM_SCALE_ERROR: (0.01, "0.01"),
     BIAS: (0.1, "0.1 m/s"),
     CURRENT: (0.5, "0.5 m/s"),
 }
@@ -87,7 +94,9 @@ def point_set(
     The rows are those of `pwcs.point_set_rows`, for the velocity relative to what the DVL
     measures against, with further columns where these are estimated:
 
-        bias: I,        current: -(1 + k) D bRn (e, n).
+        bias: I,        current: -(1 + k) D bRn (e, n);
+
+    for single beams without a DVL beside them those of `pwcs.beam_rows`.
 
     Parameters
     ----------
@@ -97,11 +106,13 @@ def point_set(
     margin : as of `pwcs.singular_values`.
     """
     by_name = {e.name: e for e in solution.estimates}
-    if trial is not None and trial.dvl is None:
+    if trial is not None and trial.log is None:
         return None, ["singular values: the trial has no DVL"]
-    if not by_name.keys() >= set(_ALWAYS):
+    of_beams = by_name.keys() >= set(_OF_BEAMS) and (trial is None or trial.dvl is None)
+    always = _OF_BEAMS if of_beams else _ALWAYS
+    if not by_name.keys() >= set(always):
         return None, ["singular values: the solution has no calibration of a DVL"]
-    parts = [by_name[name] for name in _ALWAYS]
+    parts = [by_name[name] for name in always]
     parts += [by_name[n] for n in _IF_ESTIMATED if n in by_name and _is_estimated(by_name[n])]
     if not all(np.isfinite(e.value).all() for e in parts):
         return None, ["singular values: the calibration is not known where to linearise"]
@@ -111,7 +122,9 @@ def point_set(
     free = scale > 0.0
     if not free.any():
         return None, ["singular values: the calibration of the DVL is held fixed"]
-    mounting = Mounting(*(by_name[n].value * _SI.get(n, 1.0) for n in _ALWAYS))
+    values = [by_name[n].value * _SI.get(n, 1.0) for n in always]
+    nominal = parts[0].nominal
+    mounting = Mounting(*values) if nominal is None else BeamMounting(nominal, *values)
     axes = solution.body_axes
     relative = _relative(solution)
     motion = body_motion(relative, axes)
@@ -120,7 +133,7 @@ def point_set(
         return None, ["singular values: no ping has a lock while the IMU runs"]
     bRn = rotation_from_rph(relative.rph, axes).transpose(0, 2, 1)
     level = CubicSpline(motion.time, bRn[:, :, :2])(at.time)
-    further = [e.name for e in parts[len(_ALWAYS) :]]
+    further = [e.name for e in parts[len(always) :]]
     states = tuple(n for n, is_free in zip(names, free, strict=True) if is_free)
 
     def rows(v_b: Array, omega_b: Array, others: Mapping[str, Array]) -> Array:
@@ -129,7 +142,12 @@ def point_set(
             np.broadcast_to(others[name], (at.time.size, *others[name].shape[-2:]))
             for name in further
         ]
-        whole = np.concatenate([point_set_rows(moving, mounting), *own], axis=2)
+        base = (
+            beam_rows(moving, mounting)
+            if isinstance(mounting, BeamMounting)
+            else point_set_rows(moving, mounting)
+        )
+        whole = np.concatenate([base, *own], axis=2)
         return (whole * (scale * si) / sigma[:, :, None])[:, :, free]
 
     none = np.zeros_like(at.v_b)
@@ -240,21 +258,27 @@ def _prior_scale(parts: Sequence[Estimate]) -> tuple[Array, str]:
 
 
 def _pings(
-    solution: Solution, trial: Trial | None, motion: BodyMotion, mounting: Mounting
+    solution: Solution, trial: Trial | None, motion: BodyMotion, mounting: Mounting | BeamMounting
 ) -> tuple[BodyMotion, Array, str]:
-    """Return motion and σ (M, 3) at the pings."""
-    if trial is not None and isinstance(trial.dvl, Dvl):
-        dvl = trial.dvl
-        locked = dvl.locked.astype(bool)
+    """Return motion and σ (M, d) at the pings; infinite where a beam was lost."""
+    of_beams = isinstance(mounting, BeamMounting)
+    sensor = None if trial is None else trial.beams if of_beams else trial.dvl
+    if sensor is not None:
+        received = np.logical_not(sensor.missing)
         offset = [e.value[0] for e in solution.estimates if e.name == TIME_OFFSET]
-        at, covered = motion.at(dvl.time[locked] - (offset[0] if offset else 0.0))
-        return at, dvl.sigma()[locked][covered], "rows in units of the pings' σ"
+        late = offset[0] if offset and not of_beams else 0.0
+        at, covered = motion.at(sensor.time[received] - late)
+        sigma = sensor.sigma()[received][covered]
+        return at, np.where(np.isnan(sigma), np.inf, sigma), "rows in units of the pings' σ"
     settings = DvlSettings()
-    speed = np.linalg.norm(motion.v_b, axis=1) * (1.0 + float(np.mean(mounting.scale_error)))
-    sigma = np.hypot(settings.velocity_std_m_s, settings.velocity_std_fraction * speed)
+    measured = motion.v_b @ mounting.gain.T
+    if not of_beams:
+        measured = np.linalg.norm(measured, axis=1, keepdims=True) * np.ones(3)
+    sigma = np.hypot(settings.velocity_std_m_s, settings.velocity_std_fraction * measured)
     text = (
         "rows in units of an assumed σ, as the pings are not known: one ping for each epoch of "
         f"the trajectory, {1000.0 * settings.velocity_std_m_s:g} mm/s and "
-        f"{100.0 * settings.velocity_std_fraction:g} % of the speed"
+        f"{100.0 * settings.velocity_std_fraction:g} % of "
+        + ("each beam's velocity" if of_beams else "the speed")
     )
-    return motion, np.repeat(np.maximum(sigma, _LEAST_SIGMA)[:, None], 3, axis=1), text
+    return motion, np.maximum(sigma, _LEAST_SIGMA), text

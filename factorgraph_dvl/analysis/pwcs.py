@@ -30,6 +30,8 @@ from factorgraph_dvl.conventions import (
     rotation_from_rph,
     skew,
 )
+from factorgraph_dvl.directions import turned
+from factorgraph_dvl.gains import FreeGeometry
 from factorgraph_dvl.solution import Trajectory
 from factorgraph_dvl.trial import Reference
 
@@ -95,6 +97,30 @@ class Mounting:
     def gain(self) -> Array:
         """What takes a velocity from b to the DVL's reading: (1 + k) D, (3, 3)."""
         return np.broadcast_to(1.0 + self.scale_error, (3,))[:, None] * exp_so3(self.misalignment)
+
+
+@dataclass(frozen=True)
+class BeamMounting:
+    """Where the model of single beams is linearised.
+
+    Parameters
+    ----------
+    nominal_b : (N, 3) unit vectors in body.
+    turns : (2N,) of them, rad.
+    scale_error : (N,).
+    lever_arm : (3,) m.
+    """
+
+    nominal_b: Array
+    turns: Array
+    scale_error: Array
+    lever_arm: Array
+
+    @property
+    def gain(self) -> Array:
+        """What takes a velocity from b to those of the beams, (N, 3)."""
+        directions = turned(self.nominal_b, self.turns.reshape(-1, 2))
+        return np.asarray((1.0 + self.scale_error)[:, None] * directions)
 
 
 @dataclass(frozen=True)
@@ -212,6 +238,29 @@ def point_set_rows(motion: BodyMotion, mounting: Mounting) -> Array:
         ],
         axis=2,
     )
+
+
+def beam_rows(motion: BodyMotion, mounting: BeamMounting) -> Array:
+    """Return the measurement rows H of beams, (M, N, 3N + 3).
+
+    Of v_i = (1 + k_i) d_i^T u with u = v_b + omega x l, for the turns of the directions,
+    the scale errors and the lever arm:
+
+        h_i = [(1 + k_i) u^T dd_i/deta_i, d_i^T u, (1 + k_i) d_i^T [omega x]],
+
+    the first two in the columns of beam i alone.
+
+    Parameters
+    ----------
+    motion : at M pings.
+    mounting : where to linearise.
+    """
+    u_b = motion.v_b + np.cross(motion.omega_b, mounting.lever_arm)
+    geometry = FreeGeometry(mounting.nominal_b, "turns", "scale")
+    values = {"turns": mounting.turns, "scale": mounting.scale_error}
+    found = geometry.derivatives(values, u_b)
+    by_lever_arm = mounting.gain @ skew(motion.omega_b)
+    return np.concatenate([found["turns"], found["scale"], by_lever_arm], axis=2)
 
 
 @dataclass(frozen=True)

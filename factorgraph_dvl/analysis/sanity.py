@@ -60,8 +60,9 @@ def findings(trial: Trial, sensors: list[SensorSurvey]) -> Iterator[Finding]:
     yield from _gyro_findings(trial.imu)
     if trial.gnss is not None:
         yield from _gnss_findings(trial.gnss)
-    if trial.dvl is not None:
-        yield from _dvl_findings(trial.dvl, trial.gnss, trial.body_axes)
+    log = trial.log
+    if log is not None:
+        yield from _dvl_findings(log, trial.gnss, trial.body_axes)
     for aid in trial.others:
         if isinstance(aid, Star):
             yield from star_findings(aid, trial)

@@ -49,7 +49,7 @@ def survey(trial: Trial) -> Survey:
     """
     sensors = [record_of("IMU", trial.imu.time, np.zeros(trial.imu.time.size, dtype=bool))]
     sensors += [record_of(aid.label, aid.time, aid.missing) for aid in trial.aids]
-    distance, speed = travel(trial.gnss, trial.dvl)
+    distance, speed = travel(trial.gnss, trial.log)
     return Survey(
         trial=trial.name,
         sensors=tuple(sensors),

@@ -11,6 +11,7 @@ from rich.text import Text
 
 from factorgraph_dvl import __version__
 from factorgraph_dvl.cli.console import stderr
+from factorgraph_dvl.cli.correct import correct
 from factorgraph_dvl.cli.crosscheck import crosscheck
 from factorgraph_dvl.cli.deadreckon import deadreckon
 from factorgraph_dvl.cli.inspect import inspect
@@ -44,6 +45,7 @@ for _command in (
     plan,
     deadreckon,
     instrument,
+    correct,
 ):
     app.command()(_command)
 

@@ -35,6 +35,7 @@ class KalmanMethod(StrEnum):
     WAHBA = "wahba"
     LEAST_SQUARES = "least-squares"
     STAR = "star"
+    BEAMS = "beams"
 
 
 def solve(
@@ -88,7 +89,11 @@ def _solve_into(
 ) -> None:
     """Load a trial, run a solver on it, write and show its solution."""
     from factorgraph_dvl.io.folders import check_output
-    from factorgraph_dvl.io.solution_folder import FIGURES_FOLDER, save_solution, write_history
+    from factorgraph_dvl.io.solution_folder import (
+        FIGURES_FOLDER,
+        save_solution,
+        write_history,
+    )
     from factorgraph_dvl.io.trial_folder import load_trial
 
     check_output(out, force=force)
@@ -98,6 +103,7 @@ def _solve_into(
         progress("write", 0, None)
 
         def add(folder: Path) -> None:
+            _write_beams(trial, solution, folder)
             if history is not None:
                 write_history(folder, history.time, history.names, history.values, history.std)
             _write_instrument(solution, folder)
@@ -120,6 +126,17 @@ def _solve_into(
             soft_wrap=True,
         )
         raise typer.Exit(1)
+
+
+def _write_beams(trial: Trial, solution: Solution, folder: Path) -> None:
+    """Write how the beams agree, if the trial has some and the solution calibrates them."""
+    from factorgraph_dvl.analysis.beam_quality import beam_quality, calibrates, calibration_of
+    from factorgraph_dvl.io.solution_folder import BEAMS_FILE
+    from factorgraph_dvl.io.tables import write_table
+
+    if trial.beams is not None and calibrates(solution, trial.beams):
+        quality = beam_quality(trial.beams, calibration_of(trial.beams, solution))
+        write_table(folder / BEAMS_FILE, quality.columns())
 
 
 def _write_instrument(solution: Solution, folder: Path) -> None:

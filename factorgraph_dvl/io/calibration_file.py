@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import re
+from collections.abc import Iterator
 from itertools import islice
 from pathlib import Path
 from typing import Any, Literal
@@ -11,27 +12,32 @@ import msgspec
 import numpy as np
 from msgspec import UNSET, UnsetType
 
-from factorgraph_dvl.conventions import Array, BodyAxes
+from factorgraph_dvl.conventions import DEG, Array, BodyAxes
+from factorgraph_dvl.directions import turns_to
 from factorgraph_dvl.errors import DataError
 from factorgraph_dvl.sensors.dvl import CALIBRATED
 from factorgraph_dvl.solution import Calibration, Estimate, Solution
 
 CALIBRATION_FILE = "calibration.json"
 
-# Of components, in their order.
+# Of components, in their order; those of beams are numbered.
 _LABELS = ("x", "y", "z", "e", "n", "u")
+_NUMBERED = re.compile(r"([1-9]\d?)([xy]?)")
 # Of a variance, for files with few digits.
 _ROUNDING = 0.02
 # JSON knows no nan: null stands for it.
 _Numbers = list[float | None]
+_Entries = list[float | _Numbers | None]
 
 
 class _Parameter(msgspec.Struct):
-    value: _Numbers
-    std: _Numbers
-    observable: list[bool]
-    prior_value: _Numbers = []
-    prior_std: _Numbers = []
+    """One entry for each component; of directions, `value` has vectors and the others pairs."""
+
+    value: _Entries
+    std: _Entries
+    observable: list[bool | list[bool]]
+    prior_value: _Entries = []
+    prior_std: _Entries = []
 
 
 class _Covariance(msgspec.Struct):
@@ -122,16 +128,7 @@ def encode_calibration(solution: Solution | Calibration) -> bytes:
         solver=solution.solver,
         converged=bool(solution.converged),
         iterations=int(solution.iterations),
-        parameters={
-            e.name: _Parameter(
-                value=_numbers(e.value),
-                std=_numbers(e.std),
-                observable=np.asarray(e.observable, dtype=bool).tolist(),
-                prior_value=_numbers(e.prior_value),
-                prior_std=_numbers(e.prior_std),
-            )
-            for e in solution.estimates
-        },
+        parameters={e.name: _parameter(e) for e in solution.estimates},
         covariance=_Covariance(
             list(solution.order), [_numbers(row) for row in np.asarray(solution.covariance)]
         ),
@@ -143,6 +140,23 @@ def encode_calibration(solution: Solution | Calibration) -> bytes:
     return msgspec.json.format(msgspec.json.encode(calibration), indent=2) + b"\n"
 
 
+def _parameter(e: Estimate) -> _Parameter:
+    value, prior_value, shape = e.value, e.prior_value, np.shape(e.std)
+    if e.nominal is not None:
+        value, prior_value, shape = e.directions, e.nominal, (-1, 2)
+    entries: list[Any] = [
+        np.reshape(x, shape).tolist()
+        for x in (e.std, np.asarray(e.observable, dtype=bool), e.prior_std)
+    ]
+    return _Parameter(
+        value=np.asarray(value).tolist(),
+        std=entries[0],
+        observable=entries[1],
+        prior_value=np.asarray(prior_value).tolist(),
+        prior_std=entries[2],
+    )
+
+
 def _decode(file: Path) -> _File:
     try:
         calibration = msgspec.json.decode(file.read_bytes(), type=_File)
@@ -152,7 +166,9 @@ def _decode(file: Path) -> _File:
         ) from None
     except (msgspec.MsgspecError, UnicodeDecodeError) as error:
         raise DataError(f"cannot be read ({error})", where=str(file)) from None
-    size = sum(len(parameter.value) for parameter in calibration.parameters.values())
+    for name, parameter in calibration.parameters.items():
+        _check_sizes(name, parameter, str(file))
+    size = sum(_size(parameter) for parameter in calibration.parameters.values())
     shape = {len(calibration.covariance.order), len(calibration.covariance.matrix)}
     shape |= {len(row) for row in calibration.covariance.matrix}
     if shape != {size}:
@@ -164,13 +180,47 @@ def _decode(file: Path) -> _File:
     return calibration
 
 
+def _size(parameter: _Parameter) -> int:
+    """Return the number of components: of each direction two."""
+    return (2 if _holds_directions(parameter) else 1) * len(parameter.value)
+
+
+def _holds_directions(parameter: _Parameter) -> bool:
+    return bool(parameter.value) and isinstance(parameter.value[0], list)
+
+
+def _check_sizes(name: str, parameter: _Parameter, source: str) -> None:
+    """Raise DataError unless the entries of a parameter have the sizes that belong together."""
+    n = len(parameter.value)
+    directions = _holds_directions(parameter)
+    own = (n, 2) if directions else (n,)
+    values = (n, 3) if directions else (n,)
+    empty = [] if directions else [(0,)]
+    for field, shapes in (
+        ("value", [values]),
+        ("std", [own]),
+        ("observable", [own]),
+        ("prior_value", [values, *empty]),
+        ("prior_std", [own, *empty]),
+    ):
+        try:
+            fits = np.array(getattr(parameter, field), dtype=float).shape in shapes
+        except (TypeError, ValueError):
+            fits = False
+        if not fits:
+            raise DataError(
+                f"{name}: `{field}` does not fit", where=source,
+                expected=" x ".join(map(str, shapes[0])) + " numbers",
+            )  # fmt: skip
+
+
 def _rows(calibration: _File, source: str) -> list[int]:
     """Return the rows of the covariance in the order of the parameters, by their names."""
     left = dict(enumerate(calibration.covariance.order))
     out: list[int] = []
     for name, parameter in calibration.parameters.items():
         own = {i: label for i, n in left.items() if (label := _label(n, name)) is not None}
-        if len(own) != len(parameter.value) or len(set(own.values())) != len(own):
+        if len(own) != _size(parameter) or len(set(own.values())) != len(own):
             raise DataError(
                 f"`covariance.order` does not name the components of {name}",
                 where=source,
@@ -185,16 +235,23 @@ def _label(component: str, name: str) -> int | None:
     """Return the place of a component in its parameter, None if it is not one of it."""
     if component == name:
         return 0
+    # Directions have a frame where other parameters have a unit.
+    name = f"{name.removesuffix('_b')}_deg" if name.endswith("_b") else name
     parts = component.split("_")
     for i, label in enumerate(parts):
-        if label in _LABELS and "_".join(parts[:i] + parts[i + 1 :]) == name:
-            return _LABELS.index(label)
+        if "_".join(parts[:i] + parts[i + 1 :]) == name:
+            if label in _LABELS:
+                return _LABELS.index(label)
+            if numbered := _NUMBERED.fullmatch(label):
+                return 2 * int(numbered[1]) + (numbered[2] == "y")
     return None
 
 
 def _check_std(calibration: _File, covariance: Array, source: str) -> None:
     """Raise DataError where standard deviations and covariance contradict each other."""
-    std = np.concatenate([np.empty(0), *(_array(p.std) for p in calibration.parameters.values())])
+    std = np.concatenate(
+        [np.empty(0), *(_array(p.std).ravel() for p in calibration.parameters.values())]
+    )
     diagonal = np.diag(covariance)
     known = np.isfinite(std) & np.isfinite(diagonal)
     if std.size != diagonal.size or np.any(
@@ -208,16 +265,24 @@ def _check_std(calibration: _File, covariance: Array, source: str) -> None:
 
 
 def _estimate(name: str, parameter: _Parameter, names: Iterator[str]) -> Estimate:
-    size = len(parameter.value)
-    unknown: Sequence[float | None] = [None] * size
+    size = _size(parameter)
+    unknown: _Entries = [None] * size
+    value = _array(parameter.value)
+    prior_value = _array(parameter.prior_value or unknown)
+    nominal = None
+    if _holds_directions(parameter):
+        nominal = prior_value
+        value = (turns_to(nominal, value) / DEG).ravel()
+        prior_value = np.zeros(size)
     return Estimate(
         name,
         tuple(islice(names, size)),
-        _array(parameter.value),
-        _array(parameter.std),
-        _array(parameter.prior_value or unknown),
-        _array(parameter.prior_std or unknown),
-        np.array(parameter.observable, dtype=bool),
+        value,
+        _array(parameter.std).ravel(),
+        prior_value,
+        _array(parameter.prior_std or unknown).ravel(),
+        np.array(parameter.observable, dtype=bool).ravel(),
+        nominal,
     )
 
 
@@ -226,9 +291,9 @@ def _covariance(calibration: _File) -> Array:
     return np.array(calibration.covariance.matrix, dtype=float).reshape(size, size)
 
 
-def _numbers(values: Any) -> _Numbers:
-    return list(np.atleast_1d(np.asarray(values, dtype=float)).tolist())
+def _numbers(values: Array) -> _Numbers:
+    return list(np.asarray(values, dtype=float).tolist())
 
 
-def _array(values: Sequence[float | None]) -> Array:
+def _array(values: _Entries) -> Array:
     return np.array(values, dtype=float)

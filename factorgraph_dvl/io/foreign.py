@@ -30,6 +30,8 @@ from factorgraph_dvl.solution import Estimate, Solution, Trajectory
 from factorgraph_dvl.trial import Reference
 from factorgraph_dvl.yaml_file import parse_yaml, read_text
 
+_MOST_BEAMS = 16
+_UNIT = 1e-3
 _TABLES = (".csv", ".parquet", ".pq")
 _TEXTS = (".json", ".yaml", ".yml")
 _STD_GROUPS = {"m": STD_COLUMNS[0:3], "m/s": STD_COLUMNS[3:6], "deg": STD_COLUMNS[6:9]}
@@ -45,9 +47,20 @@ _KNOWN: dict[str, tuple[str, str, tuple[tuple[str, ...], ...]]] = {
     "time_offset_s": ("time_offset", "s", (("",),)),
     "current_m_s": ("current", "m_s", (("e", "n"),)),
     "sea_surface_height_m": ("sea_surface_height", "m", (("",),)),
+    "beam_scale_error": (
+        "beam_scale_error",
+        "",
+        (("",), *(tuple(str(i + 1) for i in range(n)) for n in range(3, _MOST_BEAMS + 1))),
+    ),
+    "beam_misalignment_deg": ("beam_misalignment", "deg", (("x", "y", "z"),)),
+    "beam_lever_arm_m": ("beam_lever_arm", "m", (("x", "y", "z"),)),
 }
+# Directions are unit vectors, with standard deviations in pairs.
+_DIRECTIONS = "beam_direction_b"
 
 _Numbers = float | list[float | None]
+_Vectors = list[tuple[float, float, float]]
+_Pairs = list[tuple[float | None, float | None]]
 
 
 class _Value(Section, frozen=True, kw_only=True):
@@ -66,6 +79,24 @@ class _Value(Section, frozen=True, kw_only=True):
 _Given = _Numbers | _Value | UnsetType
 
 
+class _Directions(Section, frozen=True, kw_only=True):
+    """Unit vectors, with standard deviations across them, and flags, in pairs."""
+
+    value: _Vectors
+    std: _Pairs | UnsetType = UNSET
+    observable: list[tuple[bool, bool]] | UnsetType = UNSET
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        n = len(self.value)
+        if n == 0 or np.any(np.abs(np.linalg.norm(self.value, axis=1) - 1.0) > _UNIT):
+            raise ValueError("`value` must hold unit vectors")
+        if self.std is not UNSET and len(self.std) != n:
+            raise ValueError(f"`std` must have a pair for each of the {n} vectors in `value`")
+        if self.observable is not UNSET and len(self.observable) != n:
+            raise ValueError(f"`observable` must have a pair for each of the {n} vectors")
+
+
 class _Parameters(Section, frozen=True, kw_only=True):
     misalignment_deg: _Given = UNSET
     scale_error: _Given = UNSET
@@ -77,6 +108,10 @@ class _Parameters(Section, frozen=True, kw_only=True):
     time_offset_s: _Given = UNSET
     current_m_s: _Given = UNSET
     sea_surface_height_m: _Given = UNSET
+    beam_scale_error: _Given = UNSET
+    beam_misalignment_deg: _Given = UNSET
+    beam_lever_arm_m: _Given = UNSET
+    beam_direction_b: _Directions | UnsetType = UNSET
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -85,9 +120,9 @@ class _Parameters(Section, frozen=True, kw_only=True):
             if given is not UNSET:
                 _check_sizes(name, _as_value(given), [len(labels) for labels in choices])
 
-    def given(self) -> dict[str, _Value]:
+    def given(self) -> dict[str, _Value | _Directions]:
         """Return what is there, by name."""
-        found = {name: getattr(self, name) for name in _KNOWN}
+        found = {name: getattr(self, name) for name in (*_KNOWN, _DIRECTIONS)}
         return {name: _as_value(g) for name, g in found.items() if g is not UNSET}
 
 
@@ -292,7 +327,7 @@ def _checked_json(text: str, source: str) -> str:
     return text.replace("\t", " ")
 
 
-def _given(file: _File) -> dict[str, _Value]:
+def _given(file: _File) -> dict[str, _Value | _Directions]:
     return file.given() if isinstance(file.parameters, UnsetType) else file.parameters.given()
 
 
@@ -312,7 +347,9 @@ def _elsewhere(file: _File, trajectory: Trajectory) -> Solution:
     )
 
 
-def _estimate(name: str, given: _Value) -> Estimate:
+def _estimate(name: str, given: _Value | _Directions) -> Estimate:
+    if isinstance(given, _Directions):
+        return _direction_estimate(name, given)
     value, std = _array(given.value), _array(given.std)
     unknown = np.full(value.size, np.nan)
     stem, unit, choices = _KNOWN[name]
@@ -326,6 +363,24 @@ def _estimate(name: str, given: _Value) -> Estimate:
         unknown,
         unknown,
         np.asarray(observable, dtype=bool) & np.isfinite(value),
+    )
+
+
+def _direction_estimate(name: str, given: _Directions) -> Estimate:
+    nominal = np.array(given.value)
+    nominal = nominal / np.linalg.norm(nominal, axis=1, keepdims=True)
+    n = len(nominal)
+    unknown = np.full(2 * n, np.nan)
+    observable = True if isinstance(given.observable, UnsetType) else given.observable
+    return Estimate(
+        name,
+        tuple(f"beam_direction_{i + 1}{axis}_deg" for i in range(n) for axis in "xy"),
+        np.zeros(2 * n),
+        unknown if isinstance(given.std, UnsetType) else _array(given.std).ravel(),
+        unknown,
+        unknown,
+        np.broadcast_to(np.array(observable, dtype=bool), (n, 2)).ravel(),
+        nominal,
     )
 
 
@@ -351,8 +406,8 @@ def _diagonal(std: Array) -> Array:
     return out
 
 
-def _check_sizes(name: str, value: _Value, sizes: list[int]) -> None:
-    expected = " or ".join(map(str, sizes))
+def _check_sizes(name: str, value: _Value | _Directions, sizes: list[int]) -> None:
+    expected = " or ".join(map(str, sizes)) if len(sizes) < 4 else f"{sizes[0]} to {sizes[-1]}"
     n = _array(value.value).size
     if n not in sizes:
         raise ValueError(f"`{name}` must have {expected} numbers, not {n}")
@@ -362,11 +417,11 @@ def _check_sizes(name: str, value: _Value, sizes: list[int]) -> None:
         raise ValueError(f"`{name}` must have {n} entries in `observable`")
 
 
-def _as_value(given: _Numbers | _Value) -> _Value:
-    return given if isinstance(given, _Value) else _Value(value=given)
+def _as_value(given: _Numbers | _Value | _Directions) -> _Value | _Directions:
+    return given if isinstance(given, (_Value, _Directions)) else _Value(value=given)
 
 
-def _array(numbers: _Numbers | UnsetType) -> Array:
+def _array(numbers: _Numbers | _Vectors | _Pairs | UnsetType) -> Array:
     if isinstance(numbers, UnsetType):
         return np.zeros(0)
     return np.atleast_1d(np.array(numbers, dtype=float))

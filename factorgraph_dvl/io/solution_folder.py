@@ -25,6 +25,7 @@ HISTORY_FILE = "history.csv"
 LATENCY_FILE = "latency.csv"
 CONVERGENCE_FILE = "convergence.csv"
 INSTRUMENT_FILE = "instrument.yaml"
+BEAMS_FILE = "beams.csv"
 FIGURES_FOLDER = "figures"
 STD_COLUMNS = (
     *("std_e_m", "std_n_m", "std_u_m"),
@@ -58,7 +59,7 @@ def save_solution(
     """
     owned = (
         *(CALIBRATION_FILE, TRAJECTORY_FILE, HISTORY_FILE, LATENCY_FILE, CONVERGENCE_FILE),
-        *(INSTRUMENT_FILE, FIGURES_FOLDER),
+        *(INSTRUMENT_FILE, BEAMS_FILE, FIGURES_FOLDER),
     )
     with new_folder(Path(path), force=force, owned=owned) as folder:
         columns = _trajectory_columns(solution.trajectory)

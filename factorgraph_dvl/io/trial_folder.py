@@ -25,9 +25,10 @@ from factorgraph_dvl.io.trial_yaml import (
 )
 from factorgraph_dvl.sensors.catalogue import AIDS
 from factorgraph_dvl.sensors.dvl import CALIBRATED, SCALE_ERROR, TIME_OFFSET, Dvl
+from factorgraph_dvl.sensors.dvl_beams import DvlBeams
 from factorgraph_dvl.sensors.gnss import Gnss
 from factorgraph_dvl.sensors.imu import Imu
-from factorgraph_dvl.sensors.protocol import JointPrior, Record, SensorSection
+from factorgraph_dvl.sensors.protocol import Aid, JointPrior, Record, SensorSection
 from factorgraph_dvl.solution import Calibration, Estimate
 from factorgraph_dvl.trial import InitialAttitude, InitialPosition, Reference, Trial
 from factorgraph_dvl.yaml_file import parse_yaml, read_text
@@ -52,7 +53,7 @@ _Sensor = TypeVar("_Sensor", bound=Record)
 
 
 class _TruthValue(msgspec.Struct):
-    value: list[float]
+    value: list[float | list[float]]
 
 
 class _Truth(msgspec.Struct):
@@ -80,6 +81,14 @@ def load_trial(path: Path | str) -> Trial:
     kinds = {aid.section: aid for aid in AIDS}
     aids = {name: _read(folder, kinds[name], section) for name, section in settings.aids.items()}
     dvl = cast("Dvl | None", aids.pop(Dvl.section, None))
+    notes = [
+        f"section `{name}` of {file.name} is not used by this version" for name in settings.unused
+    ]
+    if dvl is not None and _share_pings(dvl, aids):
+        notes.append(
+            "`dvl` and `dvl_beams` have pings at the same times: if both are records of one "
+            "instrument, its noise counts twice, and standard deviations come out too small"
+        )
     return Trial(
         name=settings.name or folder.resolve().name,
         imu=_read(folder, Imu, settings.imu),
@@ -92,10 +101,7 @@ def load_trial(path: Path | str) -> Trial:
         initial_position=None if initial is UNSET else _position(initial),
         reference=_reference(folder, settings),
         calibration_truth=_read_truth(folder / TRUTH_FILE),
-        notes=tuple(
-            f"section `{name}` of {file.name} is not used by this version"
-            for name in settings.unused
-        ),
+        notes=tuple(notes),
     )
 
 
@@ -236,6 +242,11 @@ def _dvl(trial: Trial) -> Dvl:
     return trial.dvl
 
 
+def _share_pings(dvl: Dvl, others: dict[str, Aid]) -> bool:
+    beams = others.get(DvlBeams.section)
+    return beams is not None and bool(np.mean(np.isin(beams.time, dvl.time)) > 0.5)
+
+
 def _locate(path: Path) -> tuple[Path, Path]:
     """Return a trial's folder and its trial.yaml."""
     if not path.exists():
@@ -251,9 +262,8 @@ def _reference(folder: Path, settings: TrialSettings) -> Reference | None:
 
 
 def _read(folder: Path, kind: type[_Sensor], settings: SensorSection) -> _Sensor:
-    columns = read_table(
-        folder / settings.file, kind.required, kind.optional, source=settings.file
-    )
+    required = (*kind.required, *settings.more_columns)
+    columns = read_table(folder / settings.file, required, kind.optional, source=settings.file)
     return kind.from_columns(settings, columns, settings.file)
 
 
@@ -324,7 +334,7 @@ def _read_truth(path: Path) -> dict[str, Array]:
 
 def _truth_json(truth: dict[str, Array]) -> bytes:
     values = {
-        name: _TruthValue(np.atleast_1d(value).astype(float).tolist())
+        name: _TruthValue(np.atleast_1d(np.asarray(value, dtype=float)).tolist())
         for name, value in truth.items()
     }
     return msgspec.json.format(msgspec.json.encode(_Truth(values)), indent=2) + b"\n"

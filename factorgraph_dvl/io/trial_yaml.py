@@ -13,9 +13,7 @@ from factorgraph_dvl.sensors.imu import ImuSettings
 from factorgraph_dvl.sensors.protocol import Section, SensorSection, Sigma3, check_epoch
 
 # Sections of format 1 whose sensors this version does not know.
-_UNKNOWN = sorted(
-    {"depth", "star", "dvl_beams", "turntable", "beacons"} - {aid.section for aid in AIDS}
-)
+_UNKNOWN = sorted({"depth", "star", "beacons"} - {aid.section for aid in AIDS})
 
 _Latitude = Annotated[float, Meta(ge=-90, le=90)]
 _Longitude = Annotated[float, Meta(ge=-360, le=360)]

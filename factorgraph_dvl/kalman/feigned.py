@@ -69,7 +69,18 @@ def without_feigned(points: Points, estimated: Estimated, lever_arm: Array) -> E
     for block in noises:
         noise[at : at + len(block), at : at + len(block)] = block
         at += len(block)
+    return widened(estimated, information, noise)
 
+
+def widened(estimated: Estimated, information: Array, noise: Array) -> Estimated:
+    """Return the estimate with a wider covariance, where noise feigned what was told.
+
+    Parameters
+    ----------
+    estimated : n components.
+    information : (n, n) of the data, as it seems.
+    noise : (n, n) what noise of the motion adds to it, on average.
+    """
     sigma = np.concatenate([p.sigma for p in estimated.parameters])
     seeming = _posterior(information, sigma)
     supported = _posterior(information - _MARGIN * noise, sigma)

@@ -282,17 +282,19 @@ def _fixes_at(gnss: Gnss, samples: Samples, time: Array) -> Fixes:
     at = np.searchsorted(time, gnss.time[inside] + 2.0 * _SAME_TIME) - 1
     out = {name: np.full((time.size, 3), np.nan) for name in ("p", "v", "sp", "sv")}
     out["p"][at], out["v"][at] = gnss.geodetic[inside], gnss.velocity[inside]
-    lever_arm = np.array(gnss.settings.lever_arm_m)
+    lever_arm, omega_cb_b = gnss.lever_arm(time)
     unsure = float(np.max(gnss.settings.lever_arm_std_m))
     _, signal = at_times(samples, time)
     omega_sigma = signal.omega_sigma
     # Across the lever arm, where it is largest: half the trace of the covariance.
     squares = lever_arm**2
-    shaken = 0.5 * (omega_sigma**2 @ (squares.sum() - squares))
+    across = squares.sum(axis=1, keepdims=True) - squares
+    shaken = 0.5 * np.sum(omega_sigma**2 * across, axis=1)
     turned = unsure**2 * np.sum(signal.omega**2, axis=1)
     out["sp"][at] = gnss.position_std[inside] ** 2 + unsure**2
     out["sv"][at] = gnss.velocity_std[inside] ** 2 + (shaken + turned)[at, None]
-    return Fixes(out["p"], out["v"], out["sp"], out["sv"], signal.omega, lever_arm)
+    turning = signal.omega - omega_cb_b
+    return Fixes(out["p"], out["v"], out["sp"], out["sv"], turning, lever_arm)
 
 
 def _filled(geodetic: Array, time: Array) -> Array:
@@ -335,13 +337,13 @@ def _start(
     if moving.size:
         first = moving[0]
         waited = float(time[first] - time[0])
-        v = velocity[first] - attitude.nRb @ np.cross(fixes.turning[first], fixes.lever_arm)
+        v = velocity[first] - attitude.nRb @ np.cross(fixes.turning[first], fixes.lever_arm[first])
     P[3:6, 3:6] = (_VELOCITY_UNKNOWN + waited) ** 2 * np.eye(3)
     fix = np.flatnonzero(~np.isnan(fixes.geodetic[:, 0]))[0]
     waited = float(time[fix] - time[0])
     lat, lon, height = fixes.geodetic[fix]
     meridian, east = radii(lat)
-    back = v * waited + attitude.nRb @ fixes.lever_arm
+    back = v * waited + attitude.nRb @ fixes.lever_arm[fix]
     place = np.array(
         [lat - back[1] / meridian, lon - back[0] / (east * np.cos(lat)), height - back[2]]
     )

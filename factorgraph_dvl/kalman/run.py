@@ -10,6 +10,8 @@ import numpy as np
 
 from factorgraph_dvl.conventions import Array
 from factorgraph_dvl.errors import ConfigError, DataError
+from factorgraph_dvl.kalman.beams import BeamPings, beam_filter, beam_residuals
+from factorgraph_dvl.kalman.beams import without_feigned as without_feigned_beams
 from factorgraph_dvl.kalman.feigned import without_feigned
 from factorgraph_dvl.kalman.least_squares import least_squares
 from factorgraph_dvl.kalman.navigation import Navigation, motion_at, navigate
@@ -17,17 +19,17 @@ from factorgraph_dvl.kalman.nine_state import nine_state
 from factorgraph_dvl.kalman.point_set import point_set
 from factorgraph_dvl.kalman.points import Outcome, Points
 from factorgraph_dvl.kalman.star_run import calibrate_gyros
-from factorgraph_dvl.kalman.summary import summarise
+from factorgraph_dvl.kalman.summary import as_sensors_see, dvl_residuals, summarise
 from factorgraph_dvl.kalman.wahba import wahba
 from factorgraph_dvl.sensors.dvl import Dvl
 from factorgraph_dvl.sensors.protocol import Parameter
-from factorgraph_dvl.solution import Solution
+from factorgraph_dvl.solution import Residuals, Solution
 from factorgraph_dvl.trial import Trial
 
 DvlMethod = Literal["point-set", "nine-state", "wahba", "least-squares"]
 DVL_METHODS: tuple[DvlMethod, ...] = get_args(DvlMethod)
-Method = DvlMethod | Literal["star"]
-METHODS: tuple[Method, ...] = (*DVL_METHODS, "star")
+Method = DvlMethod | Literal["star", "beams"]
+METHODS: tuple[Method, ...] = (*DVL_METHODS, "star", "beams")
 Progress = Callable[[str, int, float | None], None]
 
 _WHITE = (
@@ -95,8 +97,10 @@ def calibrate(
 
     Parameters
     ----------
-    trial : with IMU, GNSS and DVL, or star tracker.
-    method : `point-set` (seven states), `nine-state`, `wahba`, `least-squares`, or `star`.
+    trial : with IMU, GNSS and DVL, or its beams, or star tracker.
+    method : `point-set` (seven states), `nine-state`, `wahba` or `least-squares`, which
+        take beams without a DVL beside them for the velocity that they amount to; `star`;
+        or `beams`, an extended Kalman filter of single beams.
     rate_hz : rate of the trajectory in the solution.
     progress : called with stage, iteration and cost (always None here).
 
@@ -120,7 +124,9 @@ def calibrate(
         report("SINS/stars", 0, None)
         solution, outcome = calibrate_gyros(trial, rate_hz=rate_hz)
         return solution, _history(outcome)
-    dvl = trial.dvl
+    if method == "beams":
+        return _calibrate_beams(trial, rate_hz, report)
+    dvl = trial.log
     if dvl is None:
         raise DataError(
             "the trial has no DVL",
@@ -160,8 +166,10 @@ def calibrate(
     solution = summarise(
         trial,
         navigation,
-        points,
         outcome,
+        aid=dvl,
+        measured=dvl_residuals(dvl, navigation, outcome, points),
+        seen=as_sensors_see(points),
         solver=f"kalman-{method}",
         rate_hz=rate_hz,
         notes=notes,
@@ -181,6 +189,52 @@ def _outage(trial: Trial) -> list[str]:
         f"GNSS is missing for {longest:.0f} s: the SINS/GNSS filter drifts there, and neither its "
         "motion nor the calibration is to be used; `solve` bridges it"
     ]
+
+
+def _calibrate_beams(
+    trial: Trial, rate_hz: float, report: Progress
+) -> tuple[Solution, History | None]:
+    sensor = trial.beams
+    if sensor is None:
+        raise DataError(
+            "the trial has no beams", where="trial.yaml", expected="a dvl_beams section"
+        )
+    if sensor.settings.parametrisation != "beams":
+        raise ConfigError(
+            "the filter estimates every beam on its own",
+            where="trial.yaml dvl_beams.parametrisation",
+            expected="beams",
+            hint="For a common misalignment and scale take another --method",
+        )
+    report("SINS/GNSS", 0, None)
+    received = np.logical_not(sensor.missing)
+    navigation = navigate(trial, sensor.time[received])
+    report("beams", 0, None)
+    covered = motion_at(navigation, sensor.time).covered
+    used = received & covered
+    motion = motion_at(navigation, sensor.time[used])
+    pings = BeamPings(motion, sensor.nominal_b, sensor.velocity[used], sensor.sigma()[used])
+    outcome = beam_filter(pings, sensor.parameters())
+    report("summary", 0, None)
+    outcome = replace(outcome, estimated=without_feigned_beams(pings, outcome.estimated))
+    residual, sigma = beam_residuals(pings, outcome.estimated)
+    components = tuple(f"beam {i}" for i in range(1, residual.shape[1] + 1))
+    notes = [*navigation.notes, _WHITE]
+    unused = int(np.sum(received & ~covered))
+    if unused:
+        notes.append(f"{sensor.label}: {unused} pings at times without SINS/GNSS were not used")
+    solution = summarise(
+        trial,
+        navigation,
+        outcome,
+        aid=sensor,
+        measured=Residuals("Beam velocity", "m/s", components, motion.time, residual, sigma),
+        seen=as_sensors_see(motion),
+        solver="kalman-beams",
+        rate_hz=rate_hz,
+        notes=notes,
+    )
+    return solution, _history(outcome)
 
 
 def _point_sets(navigation: Navigation, dvl: Dvl) -> tuple[Callable[[float], Points], int]:

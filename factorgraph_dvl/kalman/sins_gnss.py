@@ -62,8 +62,8 @@ class Fixes:
     ----------
     geodetic, velocity : (K, 3) of the antenna.
     position_variance, velocity_variance : (K, 3) east, north, up.
-    turning : (K, 3) reading of the gyros, rad/s.
-    lever_arm : (3,) of the antenna, in body, m.
+    turning : (K, 3) reading of the gyros, without what the body turns on its carrier, rad/s.
+    lever_arm : (3,) or (K, 3) of the antenna, in body, m.
     """
 
     geodetic: Array
@@ -142,7 +142,7 @@ def run_filter(
     by_gyro = skew(steps.dv * steps.duration[:, None] - steps.dp)
     has_position = ~np.isnan(fixes.geodetic[:, 0])
     has_velocity = ~np.isnan(fixes.velocity[:, 0])
-    lever_cross = skew(fixes.lever_arm)
+    lever_arm = np.broadcast_to(fixes.lever_arm, (k_events, 3))
     durations = steps.duration.tolist()
     eye = np.eye(3)
 
@@ -200,7 +200,7 @@ def run_filter(
             H = np.zeros((6, 15))
             z = np.zeros(6)
             if has_position[k]:
-                arm = C @ fixes.lever_arm
+                arm = C @ lever_arm[k]
                 meridian, east_radius, _ = _radii(lat)
                 measured = fixes.geodetic[k].tolist()
                 east = (east_radius + height) * cos(lat)
@@ -215,6 +215,7 @@ def run_filter(
             if has_velocity[k]:
                 earth = np.array((0.0, RATE * cos(lat), RATE * sin(lat)))
                 omega = fixes.turning[k] - bg - earth @ C
+                lever_cross = _cross(lever_arm[k].tolist())
                 turning = C @ -(lever_cross @ omega)
                 z[3:6] = fixes.velocity[k] - v - turning
                 H[3:6, 3:6] = eye

@@ -10,8 +10,9 @@ from factorgraph_dvl.conventions import Array, rotate, rph_from_rotation, rph_ja
 from factorgraph_dvl.earth import radii
 from factorgraph_dvl.kalman.navigation import Motion, Navigation, motion_at
 from factorgraph_dvl.kalman.points import Estimated, Outcome, Points, residuals
+from factorgraph_dvl.sensors.dvl import Dvl
+from factorgraph_dvl.sensors.protocol import Aid, Parameter
 from factorgraph_dvl.sensors.protocol import Motion as SensorMotion
-from factorgraph_dvl.sensors.protocol import Parameter
 from factorgraph_dvl.solution import Estimate, Residuals, Solution, Trajectory, doubts
 from factorgraph_dvl.trial import Trial
 
@@ -21,9 +22,11 @@ _OBSERVABLE = 0.5
 def summarise(
     trial: Trial,
     navigation: Navigation,
-    points: Points,
     outcome: Outcome,
     *,
+    aid: Aid,
+    measured: Residuals,
+    seen: SensorMotion | None,
     solver: str,
     rate_hz: float,
     notes: Sequence[str],
@@ -33,7 +36,8 @@ def summarise(
     Parameters
     ----------
     trial, navigation, outcome : what was solved, and how it ended.
-    points : the point sets at the prior's time offset.
+    aid, measured, seen : the sensor that was calibrated, its residuals, and the motion at
+        its measurements.
     solver : name.
     rate_hz : rate of the trajectory.
     notes : what is already known to be worth telling.
@@ -47,23 +51,19 @@ def summarise(
     parameters = [*outcome.estimated.parameters, *imu.parameters]
     values = np.concatenate([dvl_values, imu_values])
     estimates = estimates_of(parameters, values, covariance, outcome.unseparated)
-    all_residuals = (
-        _dvl_residuals(trial, navigation, outcome, points),
-        *gnss_residuals(trial, navigation),
-    )
+    all_residuals = (measured, *gnss_residuals(trial, navigation))
     warnings = [
         *notes,
         *doubts(estimates, all_residuals),
-        *_unobservable(trial, points, estimates),
+        *_unobservable(aid, seen, estimates),
     ]
-    dvl = all_residuals[0]
     return Solution(
         trial=trial.name,
         solver=solver,
         body_axes=trial.body_axes,
         converged=outcome.converged,
         iterations=outcome.iterations,
-        cost=0.5 * float(np.sum((dvl.residual / dvl.sigma) ** 2)),
+        cost=0.5 * float(np.nansum((measured.residual / measured.sigma) ** 2)),
         estimates=estimates,
         covariance=covariance,
         trajectory=trajectory_of(trial, navigation, rate_hz),
@@ -98,6 +98,7 @@ def estimates_of(
                 prior_value=p.mean / p.si,
                 prior_std=prior,
                 observable=(prior > 0.0) & (std[rows] <= _OBSERVABLE * prior) & ~joined,
+                nominal=p.nominal,
             )
         )
     return tuple(estimates)
@@ -142,11 +143,15 @@ def trajectory_of(trial: Trial, navigation: Navigation, rate_hz: float) -> Traje
     )
 
 
-def _dvl_residuals(
-    trial: Trial, navigation: Navigation, outcome: Outcome, points: Points
-) -> Residuals:
-    assert trial.dvl is not None
-    prior = {p.stem: p.mean for p in trial.dvl.parameters()}
+def dvl_residuals(dvl: Dvl, navigation: Navigation, outcome: Outcome, points: Points) -> Residuals:
+    """Return the residuals of a DVL's velocity.
+
+    Parameters
+    ----------
+    dvl, navigation, outcome : what was calibrated against what, and how it ended.
+    points : the point sets at the prior's time offset.
+    """
+    prior = {p.stem: p.mean for p in dvl.parameters()}
     before = float(prior["time_offset"][0])
     offset = float(outcome.estimated.value("time_offset", prior["time_offset"])[0])
     if offset != before:
@@ -169,7 +174,7 @@ def gnss_residuals(trial: Trial, navigation: Navigation) -> tuple[Residuals, ...
     gnss = trial.gnss
     assert gnss is not None
     motion: Motion = motion_at(navigation, gnss.time)
-    arm = np.array(gnss.settings.lever_arm_m)
+    arm, omega_cb_b = gnss.lever_arm(gnss.time)
     meridian, east = radii(motion.geodetic[:, 0])
     height = motion.geodetic[:, 2]
     apart = motion.geodetic - gnss.geodetic
@@ -182,8 +187,9 @@ def gnss_residuals(trial: Trial, navigation: Navigation) -> tuple[Residuals, ...
         ],
         axis=1,
     )
-    position = metres + motion.nRb @ arm
-    velocity = motion.velocity + rotate(motion.nRb, np.cross(motion.omega_b, arm)) - gnss.velocity
+    position = metres + rotate(motion.nRb, arm)
+    turning = np.cross(motion.omega_b - omega_cb_b, arm)
+    velocity = motion.velocity + rotate(motion.nRb, turning) - gnss.velocity
     out = []
     for label, unit, residual, sigma in (
         ("GNSS position", "m", position, gnss.position_std),
@@ -204,11 +210,9 @@ def gnss_residuals(trial: Trial, navigation: Navigation) -> tuple[Residuals, ...
     return tuple(out)
 
 
-def _unobservable(trial: Trial, points: Points, estimates: Sequence[Estimate]) -> list[str]:
+def _unobservable(aid: Aid, seen: SensorMotion | None, estimates: Sequence[Estimate]) -> list[str]:
     """Say which components the data did not determine, and why."""
-    dvl = trial.dvl
-    assert dvl is not None
-    of_dvl = {p.name for p in dvl.parameters()}
+    own = {p.name for p in aid.parameters()}
     out = []
     for e in estimates:
         bad = np.flatnonzero(~e.observable & (e.prior_std > 0.0))
@@ -219,23 +223,23 @@ def _unobservable(trial: Trial, points: Points, estimates: Sequence[Estimate]) -
             "the trial does not tell it better than the prior; it takes longer, or turns and "
             "changes of speed"
         )
-        if e.name in of_dvl:
-            why = dvl.explain(e.name, int(bad[0]), _as_sensors_see(points))
+        if e.name in own:
+            why = aid.explain(e.name, int(bad[0]), seen)
         out.append(f"{names} not observable: {why}")
     return out
 
 
-def _as_sensors_see(points: Points) -> SensorMotion | None:
+def as_sensors_see(at: Points | Motion) -> SensorMotion | None:
     """Return the motion at the pings, with the body's axes for n."""
-    if len(points) == 0:
+    if at.time.size == 0:
         return None
-    zero: Array = np.zeros_like(points.v_b)
+    zero: Array = np.zeros_like(at.v_b)
     return SensorMotion(
-        nRb=np.broadcast_to(np.eye(3), (len(points), 3, 3)),
+        nRb=np.broadcast_to(np.eye(3), (at.time.size, 3, 3)),
         p_n=zero,
-        v_n=points.v_b,
-        omega_eb_b=points.omega_b,
+        v_n=at.v_b,
+        omega_eb_b=at.omega_b,
         a_n=zero,
         alpha_b=zero,
-        omega_sigma=points.omega_sigma,
+        omega_sigma=at.omega_sigma,
     )

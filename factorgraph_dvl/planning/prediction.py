@@ -30,7 +30,7 @@ from factorgraph_dvl.solvers.prediction import (
 )
 from factorgraph_dvl.trial import Trial
 
-_INTERRUPTED = ("gaps_s", "outages_s", "no_lock_s")
+_INTERRUPTED = ("gaps_s", "outages_s", "no_lock_s", "lost")
 
 
 @dataclass(frozen=True)
@@ -120,6 +120,10 @@ def go_on(
         name: msgspec.structs.replace(truth, **{f: () for f in _INTERRUPTED if hasattr(truth, f)})
         for name, truth in {"imu": scenario.imu, **scenario.aids}.items()
     }
+    if scenario.turntable is not None:
+        turned = scenario.turntable.start_deg + sum(t.turn_deg for t in scenario.turntable.turns)
+        stopped = msgspec.structs.replace(scenario.turntable, turns=(), start_deg=turned)
+        sensors["turntable"] = stopped
     further = msgspec.structs.replace(
         scenario, start=ending.start, manoeuvres=manoeuvres, sway=shifted, **sensors
     )

@@ -45,11 +45,12 @@ class Gate:
         Parameters
         ----------
         label : of the kind.
-        normalised : (M, d) innovations over their standard deviations.
+        normalised : (M, d) innovations over their standard deviations; nan where a component
+            was not measured.
         """
         last = self._last.setdefault(label, deque(maxlen=_LAST))
-        beyond = ~(np.abs(normalised).max(axis=1) < _BEYOND)
-        squares = np.mean(np.minimum(normalised**2, 100.0 * _BEYOND**2), axis=1)
+        beyond = np.any(np.abs(normalised) >= _BEYOND, axis=1)
+        squares = np.nanmean(np.minimum(normalised**2, 100.0 * _BEYOND**2), axis=1)
         last.extend(zip(beyond.tolist(), squares.tolist(), strict=True))
         message = self._judge(label, last)
         used = np.zeros_like(beyond) if label in self.shut else ~beyond

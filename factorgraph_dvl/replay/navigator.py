@@ -9,14 +9,14 @@ import numpy as np
 
 from factorgraph_dvl import keys
 from factorgraph_dvl.chain import loose_diagonal
-from factorgraph_dvl.conventions import Array, BodyAxes, log_so3
+from factorgraph_dvl.conventions import Array, BodyAxes
 from factorgraph_dvl.preintegration import (
     Segments,
     States,
     attach,
     preintegrate,
 )
-from factorgraph_dvl.priors import Known, prior_root
+from factorgraph_dvl.priors import Known, away, prior_root
 from factorgraph_dvl.replay.estimate import Calibration, Innovations, calibration_of, trajectory_of
 from factorgraph_dvl.replay.factor import NodeMeasurements, Rows, measurement_factor, state_of
 from factorgraph_dvl.replay.gate import Gate
@@ -102,7 +102,7 @@ class Navigator:
         """Angle by which a rotation among the parameters differs from the start's, rad."""
         return max(
             (
-                float(np.linalg.norm(log_so3(self._begun[p.name].T @ self._values[p.name])))
+                float(np.linalg.norm(away(p, self._values[p.name], self._begun[p.name])))
                 for p in self.start.parameters
                 if p.rotation
             ),
@@ -309,8 +309,7 @@ class Navigator:
             s.bias(k).vector() - bias.vector(),
         ]
         for p in self.start.parameters:
-            now, then = self._values[p.name], self._begun[p.name]
-            parts.append(log_so3(then.T @ now) if p.rotation else now - then)
+            parts.append(away(p, self._values[p.name], self._begun[p.name]))
         return np.concatenate(parts)
 
     def _columns(self, parameters: Sequence[Parameter]) -> list[int]:
@@ -336,7 +335,9 @@ class Navigator:
             m, d = r.time.size, len(r.observation.components)
             part = slice(row, row + m * d)
             row += m * d
-            found, spread = residual[part].reshape(m, d), total[part].reshape(m, d)
+            there = np.isfinite(sigma[part])
+            found = np.where(there, residual[part], np.nan).reshape(m, d)
+            spread = np.where(there, total[part], np.nan).reshape(m, d)
             used, message = self._gate.passes(r.observation.label, found / spread)
             if message:
                 self.messages.append(message)

@@ -190,7 +190,7 @@ def _solution(trial: Trial, run: Replay, tape: _Tape) -> Solution:
         if bad.size:
             names = ", ".join(e.component_names[i] for i in bad)
             warnings.append(f"{names} not observable in what was measured until the end")
-    cost = 0.5 * sum(float(np.sum((r.residual / r.sigma) ** 2)) for r in residuals)
+    cost = 0.5 * sum(float(np.nansum((r.residual / r.sigma) ** 2)) for r in residuals)
     return Solution(
         trial=trial.name,
         solver="replay",

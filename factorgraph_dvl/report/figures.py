@@ -8,7 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
+from factorgraph_dvl.analysis.beam_quality import beam_quality, calibrates, calibration_of
 from factorgraph_dvl.analysis.consistency import trajectory_errors
+from factorgraph_dvl.report.beam_figures import beam_quality_figure
 from factorgraph_dvl.report.calibration_figures import calibration_figure, correlation_figure
 from factorgraph_dvl.report.drawing import save_figures
 from factorgraph_dvl.report.residual_figures import residuals_figure
@@ -34,7 +36,7 @@ def write_figures(trial: Trial, solution: Solution, folder: Path) -> list[Path]:
     Returns
     -------
     Paths of the files: `track.png`, `motion.png`, `<sensor>_residuals.png` of each
-    sensor with residuals, `calibration.png`, `correlation.png`.
+    sensor with residuals, `beam_quality.png`, `calibration.png`, `correlation.png`.
     """
     folder.mkdir(parents=True, exist_ok=True)
     thinned = replace(solution, trajectory=_thinned(solution.trajectory))
@@ -49,6 +51,9 @@ def write_figures(trial: Trial, solution: Solution, folder: Path) -> list[Path]:
     }
     for sensor, group in _by_sensor(solution.residuals).items():
         figures[f"{sensor.lower()}_residuals"] = residuals_figure(group)
+    if trial.beams is not None and calibrates(solution, trial.beams):
+        quality = beam_quality(trial.beams, calibration_of(trial.beams, solution))
+        figures["beam_quality"] = beam_quality_figure(quality)
     if solution.estimates:
         figures["calibration"] = calibration_figure(solution, trial.calibration_truth)
     if np.count_nonzero(np.diagonal(solution.covariance) > 0.0) > 1:

@@ -39,10 +39,10 @@ def residuals_figure(group: Sequence[Residuals]) -> Figure:
     ----------
     group : of one sensor, a measurement each.
     """
-    rows = [(r, c) for r in group for c in range(len(r.components))]
-    limits = [4.5 * float(np.quantile(r.sigma[:, c], 0.95)) for r, c in rows]
+    rows = [(r, c) for r in group for c in range(len(r.components)) if _measured(r, c).any()]
+    limits = [4.5 * float(np.quantile(r.sigma[_measured(r, c), c], 0.95)) for r, c in rows]
     cut = any(
-        3.0 * r.sigma[:, c].max() > _PANEL * limit
+        3.0 * np.nanmax(r.sigma[:, c]) > _PANEL * limit
         for (r, c), limit in zip(rows, limits, strict=True)
     )
     note_height = 0.22 if cut else 0.0
@@ -59,8 +59,9 @@ def residuals_figure(group: Sequence[Residuals]) -> Figure:
     density = np.exp(-0.5 * x**2) / np.sqrt(2.0 * np.pi)
     for i, (residuals, c) in enumerate(rows):
         left, right = axes[i]
-        time = residuals.time - start
-        value, sigma = residuals.residual[:, c], residuals.sigma[:, c]
+        used = _measured(residuals, c)
+        time = residuals.time[used] - start
+        value, sigma = residuals.residual[used, c], residuals.sigma[used, c]
         normalised = value / sigma
         limit = limits[i]
         # Outliers are few and matter: every one is drawn, at the edge if beyond it.
@@ -100,9 +101,13 @@ def residuals_figure(group: Sequence[Residuals]) -> Figure:
             fontsize=SMALL,
             color=DARK,
         )
-        if c == 0:
+        if i == 0 or rows[i - 1][0] is not residuals:
             left.set_title(
                 f"{residuals.label}: predicted − measured, ±3σ", fontsize=TITLE, loc="left"
             )
     axes[0, 1].set_title("against N(0, 1)", fontsize=TITLE, loc="left")
     return figure
+
+
+def _measured(residuals: Residuals, component: int) -> np.ndarray:
+    return np.isfinite(residuals.residual[:, component])

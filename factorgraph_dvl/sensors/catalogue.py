@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from factorgraph_dvl.sensors.depth import Depth
 from factorgraph_dvl.sensors.dvl import Dvl
+from factorgraph_dvl.sensors.dvl_beams import DvlBeams
 from factorgraph_dvl.sensors.gnss import Gnss
 from factorgraph_dvl.sensors.protocol import Aid
 from factorgraph_dvl.sensors.star import Star
+from factorgraph_dvl.sensors.turntable import Turntable
 
-AIDS: tuple[type[Aid], ...] = (Gnss, Dvl, Star, Depth)
+AIDS: tuple[type[Aid], ...] = (Gnss, Dvl, Star, Depth, DvlBeams, Turntable)

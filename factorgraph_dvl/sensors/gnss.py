@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import ClassVar, Self
 
 import numpy as np
@@ -27,6 +27,7 @@ from factorgraph_dvl.sensors.protocol import (
     named_columns,
     stack,
 )
+from factorgraph_dvl.turning import Turning
 
 POSITION_COLUMNS = ("lat_deg", "lon_deg", "height_m")
 VELOCITY_COLUMNS = ("vel_e_m_s", "vel_n_m_s", "vel_u_m_s")
@@ -60,6 +61,8 @@ class Gnss:
     position_std, velocity_std : (M, 3) standard deviations, east, north, up; the
         settings' where the record has none (nan).
     source : name of the file, for messages.
+    turning : of the body relative to the ship that carries the antenna; None = the antenna
+        is fixed to the body.
     """
 
     settings: GnssSettings
@@ -70,6 +73,7 @@ class Gnss:
     velocity_std: Array
     source: str = "gnss"
     label: str = "GNSS"
+    turning: Turning | None = None
 
     section: ClassVar[str] = "gnss"
     section_type: ClassVar[type[SensorSection]] = GnssSettings
@@ -130,6 +134,20 @@ class Gnss:
         """Epochs without a position, (M,) bool."""
         return np.isnan(self.geodetic[:, 0])
 
+    def carrier(self, time: Array) -> tuple[Array, Array]:
+        """Return bRc (M, 3, 3), axes of what carries the antenna to body, and omega_cb_b (M, 3).
+
+        The lever arm keeps its components in c, and c turns at omega_eb_b - omega_cb_b.
+        """
+        if self.turning is not None:
+            return self.turning.at(time)
+        return np.broadcast_to(np.eye(3), (time.size, 3, 3)), np.zeros((time.size, 3))
+
+    def lever_arm(self, time: Array) -> tuple[Array, Array]:
+        """Return the nominal lever arm in body, (M, 3), m, and omega_cb_b of `carrier`."""
+        bRc, omega_cb_b = self.carrier(time)
+        return bRc @ np.array(self.settings.lever_arm_m), omega_cb_b
+
     def parameters(self) -> tuple[Parameter, ...]:
         """Return the antenna's lever arm."""
         s = self.settings
@@ -151,14 +169,22 @@ class Gnss:
         lat, lon = self.geodetic[known, 0], self.geodetic[known, 1]
         lat, lon = np.where(np.isnan(lat), frame.lat, lat), np.where(np.isnan(lon), frame.lon, lon)
         lRn = frame.level_from_tangent(lat, lon)
+        bRc, omega_cb_b = self.carrier(self.time)
         if has_position.any():
             m = has_position
             p_n = frame.position(*self.geodetic[m].T)
-            out.append(AntennaPosition(self.time[m], p_n, lRn[m], self.position_std[m]))
+            out.append(AntennaPosition(self.time[m], p_n, lRn[m], self.position_std[m], bRc[m]))
         if has_velocity.any():
             m = has_velocity
             out.append(
-                AntennaVelocity(self.time[m], self.velocity[m], lRn[m], self.velocity_std[m])
+                AntennaVelocity(
+                    self.time[m],
+                    self.velocity[m],
+                    lRn[m],
+                    self.velocity_std[m],
+                    bRc[m],
+                    omega_cb_b[m],
+                )
             )
         return tuple(out)
 
@@ -172,7 +198,7 @@ class Gnss:
 
 @dataclass(frozen=True)
 class AntennaPosition:
-    """Position of the antenna; zero error where measured = p_n + nRb l.
+    """Position of the antenna; zero error where measured = p_n + nRb bRc l.
 
     Parameters
     ----------
@@ -180,12 +206,14 @@ class AntennaPosition:
     measured_n : (M, 3) position in n, m.
     lRn : (M, 3, 3) n to the local-level axes in which `std` holds.
     std : (M, 3) east, north, up, m.
+    bRc : (M, 3, 3) or (3, 3), axes of the antenna's carrier to body.
     """
 
     time: Array
     measured_n: Array
     lRn: Array
     std: Array
+    bRc: Array = field(default_factory=lambda: np.eye(3))
     label: str = "GNSS position"
     unit: str = "m"
     components: tuple[str, ...] = ("east", "north", "up")
@@ -201,7 +229,7 @@ class AntennaPosition:
 
     def residual(self, motion: Motion, values: Values) -> Array:
         """Return predicted - measured in local-level east, north, up, (M, 3), m."""
-        antenna_n = motion.p_n + motion.nRb @ values[LEVER_ARM]
+        antenna_n = motion.p_n + rotate(motion.nRb, self.bRc @ values[LEVER_ARM])
         return rotate(self.lRn, antenna_n - self.measured_n)
 
     def linearize(self, motion: Motion, values: Values, wanted: Collection[str]) -> Linearization:
@@ -209,15 +237,17 @@ class AntennaPosition:
         lRb = self.lRn @ motion.nRb
         return Linearization(
             residual=self.residual(motion, values),
-            d_theta=-lRb @ skew(values[LEVER_ARM]),
+            d_theta=-lRb @ skew(self.bRc @ values[LEVER_ARM]),
             d_p=self.lRn,
-            d_parameters={LEVER_ARM: lRb},
+            d_parameters={LEVER_ARM: lRb @ self.bRc},
         )
 
 
 @dataclass(frozen=True)
 class AntennaVelocity:
-    """Velocity of the antenna; zero error where measured = v_n + nRb (omega_eb_b x l).
+    """Velocity of the antenna; zero error where
+
+        measured = v_n + nRb (omega_ec_b x bRc l),    omega_ec_b = omega_eb_b - omega_cb_b.
 
     Parameters
     ----------
@@ -225,12 +255,16 @@ class AntennaVelocity:
     measured_l : (M, 3) east, north, up at the vehicle, m/s.
     lRn : (M, 3, 3) n to local-level axes.
     std : (M, 3) m/s.
+    bRc : (M, 3, 3) or (3, 3), axes of the antenna's carrier to body.
+    omega_cb_b : (M, 3) or (3,) rate of the body relative to that carrier, rad/s.
     """
 
     time: Array
     measured_l: Array
     lRn: Array
     std: Array
+    bRc: Array = field(default_factory=lambda: np.eye(3))
+    omega_cb_b: Array = field(default_factory=lambda: np.zeros(3))
     label: str = "GNSS velocity"
     unit: str = "m/s"
     components: tuple[str, ...] = ("east", "north", "up")
@@ -242,21 +276,25 @@ class AntennaVelocity:
 
     def sigma(self, motion: Motion, values: Values) -> Array:
         """Return the standard deviations, the gyro's share through the lever arm included."""
-        return np.hypot(self.std, lever_arm_sigma(motion, values[LEVER_ARM])[:, None])
+        arm_b = self.bRc @ values[LEVER_ARM]
+        return np.hypot(self.std, lever_arm_sigma(motion, arm_b)[:, None])
 
     def residual(self, motion: Motion, values: Values) -> Array:
         """Return predicted - measured in local-level east, north, up, (M, 3), m/s."""
-        turning_b = cross(motion.omega_eb_b, values[LEVER_ARM])
+        turning_b = cross(motion.omega_eb_b - self.omega_cb_b, self.bRc @ values[LEVER_ARM])
         return rotate(self.lRn, motion.v_n + rotate(motion.nRb, turning_b)) - self.measured_l
 
     def linearize(self, motion: Motion, values: Values, wanted: Collection[str]) -> Linearization:
         """Return the residual and its Jacobians."""
-        lever_arm = values[LEVER_ARM]
+        lever_arm = self.bRc @ values[LEVER_ARM]
+        omega_ec_b = motion.omega_eb_b - self.omega_cb_b
         lRb = self.lRn @ motion.nRb
         return Linearization(
             residual=self.residual(motion, values),
-            d_theta=-lRb @ skew(cross(motion.omega_eb_b, lever_arm)),
+            d_theta=-lRb @ skew(cross(omega_ec_b, lever_arm)),
             d_v=self.lRn,
             d_omega=-lRb @ skew(lever_arm),
-            d_parameters={LEVER_ARM: lRb @ skew(motion.omega_eb_b)} if LEVER_ARM in wanted else {},
+            d_parameters=(
+                {LEVER_ARM: lRb @ skew(omega_ec_b) @ self.bRc} if LEVER_ARM in wanted else {}
+            ),
         )

@@ -13,7 +13,8 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from factorgraph_dvl.conventions import Array
+from factorgraph_dvl.conventions import Array, exp_so3
+from factorgraph_dvl.directions import turns_to
 from factorgraph_dvl.earth import LocalFrame
 from factorgraph_dvl.errors import DataError
 
@@ -129,6 +130,8 @@ class Parameter:
         the components of the rotation vector.
     labels : component names; empty for a scalar.
     joint : where mean and sigma come from a calibration of several parameters: all of it.
+    nominal : (N, 3) unit vectors in body, if the parameter is N directions: the components
+        then turn them, two each (`directions`). Files hold the directions.
     """
 
     stem: str
@@ -139,11 +142,21 @@ class Parameter:
     rotation: bool = False
     labels: tuple[str, ...] = ("x", "y", "z")
     joint: JointPrior | None = None
+    nominal: Array | None = None
 
     @property
     def name(self) -> str:
-        """Name in calibration.json, with the unit."""
+        """Name in calibration.json, with the unit, or the frame of directions."""
+        if self.nominal is not None:
+            return f"{self.stem}_b"
         return f"{self.stem}_{self.unit}" if self.unit else self.stem
+
+    def internal(self, reported: Array) -> Array:
+        """Return a value as solvers hold it: SI, a rotation's matrix, turns of directions."""
+        if self.nominal is not None:
+            return turns_to(self.nominal, reported.reshape(-1, 3)).ravel()
+        value = reported * self.si + 0.0 * self.mean
+        return exp_so3(value) if self.rotation else value
 
     @property
     def component_names(self) -> tuple[str, ...]:
@@ -231,7 +244,10 @@ class Observation(Protocol):
         """Return the (M,) times at which the measurements were true, s."""
 
     def sigma(self, motion: Motion, values: Values) -> Array:
-        """Return the (M, d) standard deviations of the residual."""
+        """Return the (M, d) standard deviations of the residual.
+
+        Infinite where a component was not measured; its residual need only be finite.
+        """
 
     def residual(self, motion: Motion, values: Values) -> Array:
         """Return predicted - measured, (M, d)."""
@@ -245,13 +261,18 @@ class SensorSection(Section, frozen=True, kw_only=True):
 
     file: str
 
+    @property
+    def more_columns(self) -> tuple[str, ...]:
+        """Columns that the table must have because the settings say so."""
+        return ()
+
 
 class Record(Protocol):
     """A sensor's record, and how it stands in files.
 
     `section` names its part of trial.yaml and its table, `section_type` holds the
-    settings; of the columns, `required` must be there, and of each group of `optional`
-    ones all or none.
+    settings; of the columns, `required` and the settings' `more_columns` must be there,
+    and of each group of `optional` ones all or none.
     """
 
     section: ClassVar[str]
@@ -360,10 +381,12 @@ def _arrays(record: Any) -> dict[str, Array]:
 def lever_arm_sigma(motion: Motion, lever_arm: Array) -> Array:
     """Return the standard deviation, (M,), m/s, of omega x l from that of omega.
 
-    Across the lever arm, where it is largest: half the trace of the covariance.
+    Across the lever arm, (3,) or (M, 3), where it is largest: half the trace of the
+    covariance.
     """
     l2 = lever_arm**2
-    return np.sqrt(0.5 * (motion.omega_sigma**2 @ (l2.sum() - l2)))
+    across = l2.sum(axis=-1, keepdims=True) - l2
+    return np.asarray(np.sqrt(0.5 * np.sum(motion.omega_sigma**2 * across, axis=1)))
 
 
 def check_times(time: Array, source: str) -> None:

@@ -17,6 +17,7 @@ from factorgraph_dvl.conventions import DEG, Array
 from factorgraph_dvl.sensors.dvl import Dvl
 from factorgraph_dvl.sensors.gnss import Gnss
 from factorgraph_dvl.sensors.protocol import Aid
+from factorgraph_dvl.simulation.beams import simulate_beams, simulate_turntable
 from factorgraph_dvl.simulation.depth import simulate_depth
 from factorgraph_dvl.simulation.measurements import displaced, simulate_dvl, simulate_gnss
 from factorgraph_dvl.simulation.measurements import simulate_imu as _simulate_imu
@@ -33,6 +34,8 @@ _AIDS: dict[str, Callable[..., tuple[Aid, dict[str, Array]]]] = {
     "dvl": simulate_dvl,
     "star": simulate_star,
     "depth": simulate_depth,
+    "dvl_beams": simulate_beams,
+    "turntable": simulate_turntable,
 }
 
 

@@ -7,9 +7,11 @@ from typing import Annotated, Any, ClassVar, Literal
 
 import msgspec
 import numpy as np
+from msgspec import UNSET, UnsetType
 
 from factorgraph_dvl.sensors.depth import DepthSettings
 from factorgraph_dvl.sensors.dvl import DvlSettings
+from factorgraph_dvl.sensors.dvl_beams import DvlBeamsSettings
 from factorgraph_dvl.sensors.gnss import GnssSettings
 from factorgraph_dvl.sensors.imu import ImuSettings
 from factorgraph_dvl.sensors.protocol import (
@@ -21,6 +23,7 @@ from factorgraph_dvl.sensors.protocol import (
     Vector3,
 )
 from factorgraph_dvl.sensors.star import StarSettings
+from factorgraph_dvl.sensors.turntable import TurntableSettings
 
 Interval = tuple[float, float]
 
@@ -180,6 +183,104 @@ class DepthTruth(Instrument, frozen=True, kw_only=True):
         """Return noise and lever arm as simulated; the height of the sea is to be found."""
         out: dict[str, Any] = {"lever_arm_m": self.lever_arm_m}
         return out | ({"std_m": self.std_m} if self.std_m > 0.0 else {})
+
+
+class LostBeam(Section, frozen=True, kw_only=True):
+    """A beam, counted from 1, that is lost for a while."""
+
+    beam: Annotated[int, msgspec.Meta(ge=1)]
+    from_s: float
+    to_s: float
+
+
+class DvlBeamsTruth(Instrument, frozen=True, kw_only=True):
+    """The simulated beams; `draw` takes errors anew for each seed, evenly up to a limit.
+
+    The noise variance of a beam is floor² + (fraction · its velocity)².
+    """
+
+    section_type: ClassVar[type[SensorSection]] = DvlBeamsSettings
+
+    directions: tuple[Vector3, ...] | UnsetType = UNSET
+    slant_azimuth_deg: tuple[tuple[float, float], ...] | UnsetType = UNSET
+    alpha_theta_deg: tuple[tuple[float, float], ...] | UnsetType = UNSET
+    misalignment_deg: Vector3 = (0.0, 0.0, 0.0)
+    direction_error_deg: Literal["draw"] | tuple[tuple[float, float], ...] = ()
+    direction_error_up_to_deg: Positive | None = None
+    scale_error: Literal["draw"] | tuple[float, ...] = ()
+    scale_error_up_to: Positive | None = None
+    lever_arm_m: Vector3 = (0.0, 0.0, 0.0)
+    velocity_std_m_s: NonNegative = 0.0
+    velocity_std_fraction: NonNegative = 0.0
+    no_lock_s: tuple[Interval, ...] = ()
+    lost: tuple[LostBeam, ...] = ()
+    lost_fraction: Annotated[float, msgspec.Meta(ge=0, le=1)] = 0.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_intervals("no_lock_s", self.no_lock_s)
+        n = len(self.nominal.nominal_d)
+        for name, limit in (
+            ("direction_error_deg", "direction_error_up_to_deg"),
+            ("scale_error", "scale_error_up_to"),
+        ):
+            value = getattr(self, name)
+            if value == "draw" and getattr(self, limit) is None:
+                raise ValueError(f"`{name}: draw` needs `{limit}`")
+            if value != "draw" and len(value) not in (0, n):
+                raise ValueError(f"`{name}` must have {n} entries, one for each beam")
+        if any(item.beam > n for item in self.lost):
+            raise ValueError(f"`lost` must name beams from 1 to {n}")
+
+    @property
+    def nominal(self) -> DvlBeamsSettings:
+        """Nominal directions, as in trial.yaml."""
+        return DvlBeamsSettings(
+            directions=self.directions,
+            slant_azimuth_deg=self.slant_azimuth_deg,
+            alpha_theta_deg=self.alpha_theta_deg,
+            misalignment_deg=self.misalignment_deg,
+        )
+
+    def claimed(self) -> dict[str, Any]:
+        """Return nominal directions and misalignment, and noise, as simulated."""
+        ways = ("directions", "slant_azimuth_deg", "alpha_theta_deg")
+        names = ("misalignment_deg", "velocity_std_m_s", "velocity_std_fraction")
+        given = [name for name in ways if getattr(self, name) is not UNSET]
+        return {name: getattr(self, name) for name in (*given, *names)}
+
+
+class TableTurn(Section, frozen=True, kw_only=True):
+    """A turn of the turntable, counter-clockwise seen from above where positive."""
+
+    at_s: NonNegative
+    turn_deg: float
+    duration_s: Positive
+    ramp_s: NonNegative = 0.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if 2.0 * self.ramp_s > self.duration_s:
+            raise ValueError("`ramp_s` must not exceed half of `duration_s`")
+
+
+class TurntableTruth(Instrument, frozen=True, kw_only=True):
+    """The turntable that carries IMU and DVL, and when it turns; it reports without error."""
+
+    section_type: ClassVar[type[SensorSection]] = TurntableSettings
+
+    start_deg: float = 0.0
+    turns: tuple[TableTurn, ...] = ()
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        ends = [turn.at_s + turn.duration_s for turn in self.turns]
+        if any(turn.at_s < end for turn, end in zip(self.turns[1:], ends, strict=False)):
+            raise ValueError("`turns` must follow one another")
+
+    def claimed(self) -> dict[str, Any]:
+        """Return nothing: the trial holds the angle."""
+        return {}
 
 
 def check_intervals(name: str, intervals: Sequence[Interval]) -> None:

@@ -105,10 +105,11 @@ def simulate_gnss(
     assert truth is not None
     jitter_rng, position_rng, velocity_rng = rng.spawn(3)
     time = sample_times(truth, motion.duration, jitter_rng)
-    state = motion.at(time)
-    nRb = rotation_from_rph(state.rph, scenario.body_axes)
-    arm_n = _apply(nRb, np.array(truth.lever_arm_m))
-    velocity = state.v_n + _apply(nRb, np.cross(state.omega_eb_b, truth.lever_arm_m))
+    # On the ship, also where a turntable turns the IMU.
+    state = motion.ship_at(time)
+    nRs = rotation_from_rph(state.rph, scenario.body_axes)
+    arm_n = apply(nRs, np.array(truth.lever_arm_m))
+    velocity = state.v_n + apply(nRs, np.cross(state.omega_eb_b, truth.lever_arm_m))
     error = position_rng.standard_normal(arm_n.shape) * truth.position_std_m
     geodetic = displaced(state.geodetic, arm_n + error if scenario.noise else arm_n)
     if truth.velocity_std_m_s is None:
@@ -172,7 +173,7 @@ def _dvl_velocity(scenario: Scenario, state: State) -> Array:
     assert truth is not None
     current = np.array(scenario.current_m_s) if truth.reference == "water" else np.zeros(3)
     bRn = np.swapaxes(rotation_from_rph(state.rph, scenario.body_axes), 1, 2)
-    at_imu = _apply(bRn, state.v_n - current)
+    at_imu = apply(bRn, state.v_n - current)
     at_dvl = at_imu + np.cross(state.omega_eb_b, truth.lever_arm_m)
     misalignment = Rotation.from_rotvec(np.array(truth.misalignment_deg) * DEG)
     return (1.0 + np.array(truth.scale_error)) * misalignment.apply(at_dvl) + truth.bias_m_s
@@ -185,7 +186,8 @@ def displaced(geodetic: Array, enu: Array) -> Array:
     return np.stack([np.reshape(x, -1).astype(float) for x in moved], axis=1)
 
 
-def _apply(matrices: Array, vectors: Array) -> Array:
+def apply(matrices: Array, vectors: Array) -> Array:
+    """Return products of matrices (M, 3, 3) and vectors (M, 3) or (3,)."""
     return np.asarray(
         np.einsum("mij,mj->mi", matrices, np.broadcast_to(vectors, (len(matrices), 3)))
     )
@@ -205,7 +207,7 @@ def sample_times(
 
 
 def within(time: Array, intervals: Sequence[Interval]) -> NDArray[np.bool_]:
-    """Return which of the times lie within any of the intervals."""
+    """Return which times lie within any interval, its ends included."""
     out = np.zeros(time.size, dtype=bool)
     for start, end in intervals:
         out |= (time >= start) & (time <= end)

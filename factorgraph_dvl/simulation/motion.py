@@ -12,12 +12,21 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.interpolate import PPoly
+from scipy.spatial.transform import Rotation
 
-from factorgraph_dvl.conventions import DEG, Array, BodyAxes, frd_from_body
+from factorgraph_dvl.conventions import (
+    DEG,
+    Array,
+    BodyAxes,
+    frd_from_body,
+    rotation_from_rph,
+    rph_from_rotation,
+)
 from factorgraph_dvl.earth import RATE, normal_gravity, radii
 from factorgraph_dvl.errors import ConfigError
 from factorgraph_dvl.simulation.manoeuvres import Accelerate, Climb, Manoeuvre, Stop, Straight
 from factorgraph_dvl.simulation.scenario import Scenario
+from factorgraph_dvl.simulation.table import table_angle
 
 _COLLOCATION_NODES = 6
 _MAX_LATITUDE = 89.5 * DEG
@@ -95,6 +104,8 @@ class Motion:
     kinks : (K,) times at which acceleration or turn rate change abruptly, s.
     duration : s.
     body_axes : axes of the body frame.
+    table : angle of the turntable that carries the body on the vehicle, counter-clockwise
+        seen from above, rad; None without one. Its axis passes through the IMU.
     """
 
     speed: PPoly
@@ -110,6 +121,7 @@ class Motion:
     kinks: Array
     duration: float
     body_axes: BodyAxes
+    table: PPoly | None = None
 
     def highest_rate(self) -> float:
         """Return the highest angular frequency in the body-frame signals, rad/s.
@@ -118,6 +130,8 @@ class Motion:
         """
         sway = max(s.highest_frequency for s in (self.roll, self.pitch, self.yaw, self.heave))
         turn = float(np.max(np.abs(_evaluate(self.course, self.kinks[:-1], 1)), initial=0.0))
+        if self.table is not None:
+            turn += float(np.max(np.abs(_evaluate(self.table, self.kinks, 1))))
         return 2.0 * sway + turn
 
     def velocity(self, t: Array) -> tuple[Array, ...]:
@@ -142,7 +156,32 @@ class Motion:
         return _evaluate(self.height, t) + drift + self.heave.derivatives(t)[0]
 
     def at(self, t: Array) -> State:
-        """Return the motion at times (M,).
+        """Return the motion of the body at times (M,).
+
+        On a turntable, components in the vehicle s are Rz(angle) times those in b, about the
+        upward axis u of both, so that nRb = nRs Rz, omega_b = Rzᵀ omega_s + rate u and
+        f_b = Rzᵀ f_s.
+        """
+        state = self.ship_at(t)
+        if self.table is None:
+            return state
+        angle, rate = _evaluate(self.table, t), _evaluate(self.table, t, 1)
+        up = frd_from_body(self.body_axes).T @ np.array([0.0, 0.0, -1.0])
+        turn = Rotation.from_rotvec(angle[:, None] * up)
+        nRs = rotation_from_rph(state.rph, self.body_axes)
+        turning = rate[:, None] * up
+        return State(
+            geodetic=state.geodetic,
+            v_n=state.v_n,
+            a_n=state.a_n,
+            rph=rph_from_rotation(nRs @ turn.as_matrix(), self.body_axes),
+            omega_eb_b=turn.apply(state.omega_eb_b, inverse=True) + turning,
+            omega_ib_b=turn.apply(state.omega_ib_b, inverse=True) + turning,
+            f_b=turn.apply(state.f_b, inverse=True),
+        )
+
+    def ship_at(self, t: Array) -> State:
+        """Return the motion of the vehicle at times (M,), in axes of its own like the body's.
 
         With M and N the radii of curvature, L the latitude and h the height,
 
@@ -240,6 +279,11 @@ def plan_motion(scenario: Scenario) -> Motion:
         for part in (sway.roll, sway.pitch, sway.yaw)
     )
     still = PPoly(np.zeros((1, 1)), np.array([0.0, 1.0]))
+    duration = float(speed.x[-1])
+    table = table_angle(scenario, duration)
+    kinks = np.asarray(speed.x, dtype=float)
+    if table is not None:
+        kinks = np.union1d(kinks, table.x)
     motion = Motion(
         speed=speed,
         course=course,
@@ -251,9 +295,10 @@ def plan_motion(scenario: Scenario) -> Motion:
         pitch=pitch,
         yaw=yaw,
         heave=heave,
-        kinks=np.asarray(speed.x, dtype=float),
-        duration=float(speed.x[-1]),
+        kinks=kinks,
+        duration=duration,
         body_axes=scenario.body_axes,
+        table=table,
     )
     lat, lon = _integrate_position(
         motion, scenario.start.lat_deg * DEG, scenario.start.lon_deg * DEG, scenario.source

@@ -26,6 +26,8 @@ gnss: {...}                        # GnssTruth, optional
 dvl: {...}                         # DvlTruth, optional
 depth: {...}                       # DepthTruth, optional
 star: {...}                        # StarTruth, optional
+dvl_beams: {...}                   # DvlBeamsTruth, optional
+turntable: {...}                   # TurntableTruth, optional: turns IMU and DVL on the ship
 trial:                             # what trial.yaml will claim
   imu: {gyro_bias_std_deg_h: 0.05, accel_bias_std_ug: 100}
   gnss: {}
@@ -63,11 +65,13 @@ from factorgraph_dvl.sensors.protocol import (
 from factorgraph_dvl.simulation.convert import convert
 from factorgraph_dvl.simulation.instruments import (
     DepthTruth,
+    DvlBeamsTruth,
     DvlTruth,
     GnssTruth,
     ImuTruth,
     Instrument,
     StarTruth,
+    TurntableTruth,
 )
 from factorgraph_dvl.simulation.manoeuvres import Manoeuvre, flatten
 from factorgraph_dvl.yaml_file import read_yaml
@@ -128,6 +132,8 @@ class Claims(Section, frozen=True, kw_only=True):
     dvl: dict[str, Any] = msgspec.field(default_factory=dict)
     star: dict[str, Any] = msgspec.field(default_factory=dict)
     depth: dict[str, Any] = msgspec.field(default_factory=dict)
+    dvl_beams: dict[str, Any] = msgspec.field(default_factory=dict)
+    turntable: dict[str, Any] = msgspec.field(default_factory=dict)
     initial: InitialClaim | None = None
 
 
@@ -148,6 +154,8 @@ class Scenario(Section, frozen=True, kw_only=True):
     dvl: DvlTruth | None = None
     star: StarTruth | None = None
     depth: DepthTruth | None = None
+    dvl_beams: DvlBeamsTruth | None = None
+    turntable: TurntableTruth | None = None
     trial: Claims = Claims()
     source: str = ""
 

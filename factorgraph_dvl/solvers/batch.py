@@ -15,7 +15,7 @@ from factorgraph_dvl.earth import LocalFrame
 from factorgraph_dvl.errors import ConfigError
 from factorgraph_dvl.graph import Problem
 from factorgraph_dvl.increments import increments
-from factorgraph_dvl.mounting import initial_mounting
+from factorgraph_dvl.mounting import calibrated, initial_values
 from factorgraph_dvl.preintegration import Segments, States, attach, motion_at, segments
 from factorgraph_dvl.priors import Known
 from factorgraph_dvl.sensors.protocol import Aid, Motion, Observation, Parameter
@@ -161,7 +161,8 @@ def fit(
             p_gravity = states.p_n
         if values is None:
             # A DVL that is calibrated does no harm from the start.
-            if trial.gnss is not None and not _calibrated(trial):
+            mounted = trial.dvl is not None and calibrated(trial.dvl)
+            if trial.gnss is not None and not mounted:
                 coarse = _without_dvl(chain, states, start.mountings, progress)
                 iterations += coarse.iterations
                 states = coarse.evaluation.states
@@ -207,14 +208,6 @@ def _without_dvl(
     )
 
 
-def _calibrated(trial: Trial) -> bool:
-    """Whether an earlier calibration knows all of the DVL's mounting that is to be estimated."""
-    if trial.dvl is None:
-        return False
-    free = [p for p in trial.dvl.parameters() if p.estimated]
-    return any(p.joint for p in free) and all(p.joint or not p.rotation for p in free)
-
-
 def _sensors(aids: Sequence[Aid], frame: LocalFrame) -> tuple[list[Observation], list[Parameter]]:
     observations = [o for aid in aids for o in aid.observations(frame)]
     parameters = [p for aid in aids for p in aid.parameters()]
@@ -237,6 +230,4 @@ def _mountings(
         if seen.mounting.estimated:
             motion, covered = motion_by(seen.time)
             out[seen.mounting.name] = mean_mounting(seen, motion.nRb * covered[:, None, None])
-    if trial.dvl is not None and not _calibrated(trial):
-        out |= initial_mounting(trial.dvl, lambda pings, time: motion_by(time))
-    return out
+    return out | initial_values(trial, lambda pings, time: motion_by(time))

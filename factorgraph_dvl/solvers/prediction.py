@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from factorgraph_dvl.chain import inertial_chain
-from factorgraph_dvl.conventions import Array, exp_so3
+from factorgraph_dvl.conventions import Array
 from factorgraph_dvl.earth import LocalFrame
 from factorgraph_dvl.graph import Evaluation, Problem
 from factorgraph_dvl.increments import increments
@@ -89,10 +89,10 @@ def _at_truth(trial: Trial, true_states: TrueStates) -> tuple[Problem, Evaluatio
     for p in parameters:
         value = trial.calibration_truth.get(p.name)
         if p.estimated and value is not None:
-            if p.mean.size < value.size:
+            if p.nominal is None and p.mean.size < value.size:
                 # One scale is estimated of an instrument that has three.
                 value = np.mean(value, keepdims=True)
-            truth[p.name] = exp_so3(value * p.si) if p.rotation else value * p.si + 0.0 * p.mean
+            truth[p.name] = p.internal(value)
     problem = Problem(chain, observations, parameters, start=truth)
     values = problem.values(states, {**problem.prior_values(), **truth})
     problem.weigh(problem.evaluate(values))

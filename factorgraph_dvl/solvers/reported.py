@@ -18,7 +18,10 @@ from factorgraph_dvl.solution import Estimate
 
 # The data observed a component if they at least halved what was unknown of it.
 _OBSERVABLE = 0.5
-_FIRST = ("misalignment", "scale_error", "lever_arm", "gyro_bias", "accel_bias")
+_FIRST = (
+    *("beam_direction", "beam_scale_error", "misalignment", "scale_error", "lever_arm"),
+    *("gyro_bias", "accel_bias"),
+)
 
 _Row = TypeVar("_Row")
 
@@ -90,6 +93,7 @@ def estimates_of(
                 prior_value=p.mean / p.si,
                 prior_std=prior,
                 observable=(prior > 0.0) & (own <= _OBSERVABLE * prior),
+                nominal=p.nominal,
             )
         )
     return tuple(estimates), covariance

@@ -215,15 +215,16 @@ def _residuals(problem: Problem, minimum: Minimum) -> tuple[Residuals, ...]:
     for observation, whitened, weight in zip(
         problem.observations, minimum.evaluation.residuals, problem.weights, strict=True
     ):
-        used = weight[:, 0] > 0.0
+        used = np.any(weight > 0.0, axis=1)
+        measured = np.where(weight > 0.0, weight, np.nan)[used]
         out.append(
             Residuals(
                 label=observation.label,
                 unit=observation.unit,
                 components=observation.components,
                 time=observation.time[used],
-                residual=whitened[used] / weight[used],
-                sigma=1.0 / weight[used],
+                residual=whitened[used] / measured,
+                sigma=1.0 / measured,
             )
         )
     return tuple(out)
@@ -240,7 +241,7 @@ def _unobservable(
     trial = problem.chain.trial
     by_name = {p.name: aid for aid in trial.aids for p in aid.parameters()}
     seen = {
-        name: _subset(motion, weight[:, 0] > 0.0)
+        name: _subset(motion, np.any(weight > 0.0, axis=1))
         for observation, motion, weight in zip(
             problem.observations, motions, problem.weights, strict=True
         )

@@ -1,0 +1,42 @@
+"""The command `correct`: calibrated beams as the instrument that they amount to."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from factorgraph_dvl.cli.console import print_written
+from factorgraph_dvl.cli.options import Force, TrialPath
+
+
+def correct(
+    trial_path: TrialPath,
+    calibration: Annotated[
+        Path, typer.Argument(metavar="CALIBRATION", help="calibration.json, or its folder.")
+    ],
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder to write.")],
+    force: Force = False,
+) -> None:
+    """Turn a trial's beams, calibrated, into a DVL record; write the matrix that does so."""
+    from factorgraph_dvl.analysis.beam_quality import calibration_of
+    from factorgraph_dvl.errors import DataError
+    from factorgraph_dvl.io.calibration_file import check_usable, load_calibration
+    from factorgraph_dvl.io.corrected_record import save_corrected
+    from factorgraph_dvl.io.folders import check_output
+    from factorgraph_dvl.io.trial_folder import load_trial
+
+    check_output(out, force=force)
+    trial = load_trial(trial_path)
+    if trial.beams is None:
+        raise DataError(
+            "the trial has no beams", where=str(trial_path), expected="a dvl_beams section"
+        )
+    found = load_calibration(calibration, body_axes=trial.body_axes)
+    check_usable(found, trial.body_axes, str(calibration))
+    beams = calibration_of(trial.beams, found)
+    save_corrected(
+        trial.beams, beams.directions_b, beams.scale_error, beams.lever_arm, out, force=force
+    )
+    print_written(out)

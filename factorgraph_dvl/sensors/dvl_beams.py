@@ -1,0 +1,358 @@
+"""The single beams of a Doppler velocity log: settings, record, radial velocities."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+from typing import Annotated, ClassVar, Literal, Self
+
+import msgspec
+import numpy as np
+from msgspec import UNSET, UnsetType
+
+from factorgraph_dvl.conventions import DEG, Array, exp_so3, rotate, skew
+from factorgraph_dvl.earth import LocalFrame
+from factorgraph_dvl.gains import CommonGeometry, FreeGeometry, Geometry
+from factorgraph_dvl.sensors.protocol import (
+    Linearization,
+    Motion,
+    NonNegative,
+    Observation,
+    Parameter,
+    SensorSection,
+    Sigma3,
+    Values,
+    Vector3,
+    check_range,
+    check_times,
+    lever_arm_sigma,
+    named_columns,
+    stack,
+)
+
+# Names of the parameters of beams that have directions and scales of their own.
+DIRECTION = "beam_direction_b"
+SCALE_ERROR = "beam_scale_error"
+
+Angle = Annotated[float, msgspec.Meta(ge=-360, le=360)]
+Acute = Annotated[float, msgspec.Meta(ge=0, le=90)]
+
+# Beams that lie in one plane, to this sine of an angle, do not tell a velocity.
+_LEAST_SPREAD = 0.05
+_UNIT = 0.05
+_LEAST_SIGMA = 1e-4
+# Signs of x and y in the octants V to VIII, below the plane of x and y.
+_OCTANTS = np.array([[1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0], [1.0, -1.0]])
+
+
+class DvlBeamsSettings(SensorSection, frozen=True, kw_only=True):
+    """Section `dvl_beams` of trial.yaml."""
+
+    file: str = "dvl_beams.csv"
+    directions: tuple[Vector3, ...] | UnsetType = UNSET
+    slant_azimuth_deg: tuple[tuple[Acute, Angle], ...] | UnsetType = UNSET
+    alpha_theta_deg: tuple[tuple[Acute, Acute], ...] | UnsetType = UNSET
+    misalignment_deg: Vector3 = (0.0, 0.0, 0.0)
+    parametrisation: Literal["beams", "common"] = "beams"
+    misalignment_std_deg: Sigma3 | UnsetType = UNSET
+    direction_std_deg: NonNegative = 1.0
+    scale_error: float | tuple[float, ...] = 0.0
+    scale_error_std: NonNegative = 0.02
+    lever_arm_m: Vector3 = (0.0, 0.0, 0.0)
+    lever_arm_std_m: Sigma3 = (3.0, 3.0, 3.0)
+    velocity_std_m_s: NonNegative = 0.005
+    velocity_std_fraction: NonNegative = 0.002
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        ways = {
+            "directions": self.directions,
+            "slant_azimuth_deg": self.slant_azimuth_deg,
+            "alpha_theta_deg": self.alpha_theta_deg,
+        }
+        given = [name for name, value in ways.items() if value is not UNSET]
+        if len(given) != 1:
+            found = " and ".join(f"`{name}`" for name in given) or "none of them"
+            raise ValueError(
+                "the beams' nominal directions must be given one way, as `directions`, "
+                f"`slant_azimuth_deg` or `alpha_theta_deg`; found {found}"
+            )
+        beams = self.nominal_d
+        name = given[0]
+        if len(beams) < 3 or np.linalg.svd(beams, compute_uv=False)[2] < _LEAST_SPREAD:
+            raise ValueError(f"`{name}` must hold three or more beams that are not in one plane")
+        scale = np.atleast_1d(self.scale_error)
+        if scale.size not in (1, len(beams)):
+            raise ValueError(f"`scale_error` must have one number, or {len(beams)}")
+        if np.any(scale <= -1.0):
+            raise ValueError("`scale_error` must be above -1")
+        common = self.parametrisation == "common"
+        if common and scale.size != 1:
+            raise ValueError("`scale_error` must be one number with `parametrisation: common`")
+        if self.misalignment_std_deg is not UNSET and not common:
+            raise ValueError(
+                "`misalignment_std_deg` has no place beside beams of which each has a direction "
+                "of its own; it belongs to `parametrisation: common`"
+            )
+
+    @property
+    def nominal_d(self) -> Array:
+        """Nominal unit vectors of the beams in d, (N, 3)."""
+        if not isinstance(self.directions, UnsetType):
+            vectors = np.array(self.directions, dtype=float).reshape(-1, 3)
+            length = np.linalg.norm(vectors, axis=1)
+            if np.any(np.abs(length - 1.0) > _UNIT):
+                raise ValueError("`directions` must hold unit vectors")
+            return np.asarray(vectors / length[:, None])
+        if not isinstance(self.slant_azimuth_deg, UnsetType):
+            slant, azimuth = np.array(self.slant_azimuth_deg).reshape(-1, 2).T * DEG
+            level = np.sin(slant)
+            return np.stack(
+                [level * np.sin(azimuth), level * np.cos(azimuth), -np.cos(slant)], axis=1
+            )
+        assert not isinstance(self.alpha_theta_deg, UnsetType)
+        alpha, theta = np.array(self.alpha_theta_deg).reshape(-1, 2).T * DEG
+        if alpha.size != 4:
+            raise ValueError("`alpha_theta_deg` must hold four beams, in octants V to VIII")
+        if np.any(alpha + theta > 90.0 * DEG):
+            raise ValueError("`alpha_theta_deg` must not add up to more than 90 deg")
+        x, z = np.sin(alpha), -np.sin(theta)
+        y = np.sqrt(1.0 - x**2 - z**2)
+        return np.stack([_OCTANTS[:, 0] * x, _OCTANTS[:, 1] * y, z], axis=1)
+
+    @property
+    def more_columns(self) -> tuple[str, ...]:
+        """Columns of the beams."""
+        return beam_columns(len(self.nominal_d))
+
+
+def beam_columns(count: int) -> tuple[str, ...]:
+    """Return the names of the columns of so many beams."""
+    return tuple(f"beam{i}_m_s" for i in range(1, count + 1))
+
+
+@dataclass(frozen=True)
+class DvlBeams:
+    """Settings and record of the beams of a DVL.
+
+    Parameters
+    ----------
+    settings : DvlBeamsSettings
+    time : (M,) s, strictly increasing.
+    velocity : (M, N) velocity of the transducer along each beam's outward direction, m/s;
+        nan = beam lost.
+    source : name of the file, for messages.
+    prefix : of the parameters that a `dvl` beside it has under the same names.
+    """
+
+    settings: DvlBeamsSettings
+    time: Array
+    velocity: Array
+    source: str = "dvl_beams"
+    label: str = "DVL beams"
+    prefix: str = ""
+
+    section: ClassVar[str] = "dvl_beams"
+    section_type: ClassVar[type[SensorSection]] = DvlBeamsSettings
+    required: ClassVar[tuple[str, ...]] = ("time_s",)
+    optional: ClassVar[tuple[tuple[str, ...], ...]] = ()
+
+    def __post_init__(self) -> None:
+        check_times(self.time, self.source)
+        beams = named_columns(self.settings.more_columns, self.velocity)
+        check_range(beams, -50.0, 50.0, "m/s", self.source)
+
+    @classmethod
+    def from_columns(
+        cls, settings: DvlBeamsSettings, columns: Mapping[str, Array], source: str
+    ) -> Self:
+        """Return the record that a table holds."""
+        return cls(settings, columns["time_s"], stack(columns, settings.more_columns), source)
+
+    def columns(self) -> dict[str, Array]:
+        """Return the record as a table."""
+        return {"time_s": self.time, **named_columns(self.settings.more_columns, self.velocity)}
+
+    @property
+    def missing(self) -> Array:
+        """Pings at which every beam was lost, (M,) bool."""
+        return np.asarray(np.isnan(self.velocity).all(axis=1))
+
+    @property
+    def nominal_b(self) -> Array:
+        """Nominal unit vectors of the beams in body, (N, 3)."""
+        dRb = exp_so3(np.array(self.settings.misalignment_deg) * DEG)
+        return np.asarray(self.settings.nominal_d @ dRb)
+
+    def sigma(self) -> Array:
+        """Return the standard deviations sqrt(floor² + (fraction v)²), (M, N), m/s.
+
+        v is the beam's own velocity; nan where the beam was lost.
+        """
+        s = self.settings
+        model = np.hypot(s.velocity_std_m_s, s.velocity_std_fraction * self.velocity)
+        return np.maximum(model, _LEAST_SIGMA)
+
+    def parameters(self) -> tuple[Parameter, ...]:
+        """Return directions and scale errors, or misalignment and scale error; lever arm."""
+        s = self.settings
+        lever_arm = Parameter(
+            f"{self.prefix}lever_arm",
+            "m",
+            1.0,
+            np.array(s.lever_arm_m),
+            np.array(s.lever_arm_std_m),
+        )
+        if s.parametrisation == "common":
+            std = s.misalignment_std_deg
+            sigma = [s.direction_std_deg] * 3 if isinstance(std, UnsetType) else std
+            return (
+                Parameter(
+                    f"{self.prefix}misalignment",
+                    "deg",
+                    DEG,
+                    np.array(s.misalignment_deg) * DEG,
+                    np.array(sigma) * DEG,
+                    rotation=True,
+                ),
+                Parameter(
+                    f"{self.prefix}scale_error",
+                    "",
+                    1.0,
+                    np.atleast_1d(np.array(s.scale_error, dtype=float)),
+                    np.array([s.scale_error_std]),
+                    labels=("",),
+                ),
+                lever_arm,
+            )
+        numbers = range(1, len(self.nominal_b) + 1)
+        scale = np.broadcast_to(np.array(s.scale_error, dtype=float), (len(numbers),))
+        return (
+            Parameter(
+                "beam_direction",
+                "deg",
+                DEG,
+                np.zeros(2 * len(numbers)),
+                np.full(2 * len(numbers), s.direction_std_deg * DEG),
+                labels=tuple(f"{i}{axis}" for i in numbers for axis in "xy"),
+                nominal=self.nominal_b,
+            ),
+            Parameter(
+                "beam_scale_error",
+                "",
+                1.0,
+                scale.copy(),
+                np.full(len(numbers), s.scale_error_std),
+                labels=tuple(map(str, numbers)),
+            ),
+            lever_arm,
+        )
+
+    def observations(self, frame: LocalFrame) -> tuple[Observation, ...]:
+        """Return the pings at which at least one beam was not lost."""
+        m = np.logical_not(self.missing)
+        if not m.any():
+            return ()
+        misalignment, scale, lever_arm = (p.name for p in self.parameters())
+        geometry: Geometry = (
+            CommonGeometry(self.settings.nominal_d, misalignment, scale)
+            if self.settings.parametrisation == "common"
+            else FreeGeometry(self.nominal_b, misalignment, scale)
+        )
+        lost = np.isnan(self.velocity[m])
+        measured = np.where(lost, 0.0, self.velocity[m])
+        std = np.where(lost, np.inf, self.sigma()[m])
+        return (BeamVelocity(self.time[m], measured, std, geometry, lever_arm),)
+
+    def explain(self, parameter: str, component: int, motion: Motion | None) -> str:
+        """Say why a component could not be observed, given the motion of the trial."""
+        if motion is None or motion.v_n.shape[0] < 2:
+            return "the trial has no ping with a beam while the IMU runs, or only one"
+        if parameter.endswith("lever_arm_m"):
+            x, y, z = np.degrees(np.std(motion.omega_eb_b, axis=0))
+            return (
+                f"the body turns too little (rms rate {x:.2g}, {y:.2g}, {z:.2g} deg/s about "
+                "x, y, z): a lever arm shows only through rotation about another axis than its own"
+            )
+        of_a_beam = {DIRECTION: component // 2, SCALE_ERROR: component}
+        if self.settings.parametrisation == "beams":
+            beam = of_a_beam[parameter]
+            if np.isnan(self.velocity[:, beam]).all():
+                return f"beam {beam + 1} was never received"
+        v_b = rotate(motion.nRb.transpose(0, 2, 1), motion.v_n)
+        x, y, z = np.sqrt(np.mean(v_b**2, axis=0))
+        return (
+            "a beam shows its direction and its scale by velocities in three directions of the "
+            f"body, each against a better reference; here they were {x:.2g}, {y:.2g}, {z:.2g} m/s "
+            "rms along x, y, z: a turntable or sailing sideways adds the second, heave the third"
+        )
+
+
+@dataclass(frozen=True)
+class BeamVelocity:
+    """Radial velocities of the beams of a DVL; zero error where
+
+        v_i = (1 + k_i) d_i^T (nRb^T v_n + omega_eb_b x l)
+
+    with d_i the outward direction of beam i in body. A lost beam has an infinite standard
+    deviation, so that any number of valid ones counts.
+
+    Parameters
+    ----------
+    time : (M,) s.
+    measured : (M, N) m/s; any number where lost.
+    std : (M, N) m/s, infinite where lost.
+    geometry : directions and scales.
+    lever_arm : name of the parameter.
+    """
+
+    time: Array
+    measured: Array
+    std: Array
+    geometry: Geometry
+    lever_arm: str
+    label: str = "Beam velocity"
+    unit: str = "m/s"
+
+    @property
+    def components(self) -> tuple[str, ...]:
+        """Names of the beams."""
+        return tuple(f"beam {i}" for i in range(1, self.measured.shape[1] + 1))
+
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        """Names of directions or misalignment, scale and lever arm."""
+        return (*self.geometry.parameters, self.lever_arm)
+
+    def true_time(self, values: Values) -> Array:
+        """Return the times of the pings."""
+        return self.time
+
+    def sigma(self, motion: Motion, values: Values) -> Array:
+        """Return the standard deviations, the gyro's share through the lever arm included."""
+        return np.hypot(self.std, lever_arm_sigma(motion, values[self.lever_arm])[:, None])
+
+    def residual(self, motion: Motion, values: Values) -> Array:
+        """Return predicted - measured, (M, N), m/s."""
+        dvl_b, _ = self._velocities(motion, values)
+        return dvl_b @ self.geometry.gain(values).T - self.measured
+
+    def linearize(self, motion: Motion, values: Values, wanted: Collection[str]) -> Linearization:
+        """Return the residual and its Jacobians."""
+        dvl_b, imu_b = self._velocities(motion, values)
+        gain = self.geometry.gain(values)
+        found = self.geometry.derivatives(values, dvl_b)
+        found[self.lever_arm] = gain @ skew(motion.omega_eb_b)
+        d_omega = -gain @ skew(values[self.lever_arm])
+        return Linearization(
+            residual=dvl_b @ gain.T - self.measured,
+            d_theta=gain @ skew(imu_b),
+            d_v=gain @ motion.nRb.transpose(0, 2, 1),
+            d_omega=np.broadcast_to(d_omega, (len(dvl_b), *d_omega.shape)),
+            d_parameters={name: found[name] for name in found if name in wanted},
+        )
+
+    def _velocities(self, motion: Motion, values: Values) -> tuple[Array, Array]:
+        """Return the velocities of DVL and IMU in body, (M, 3)."""
+        imu_b = rotate(motion.nRb.transpose(0, 2, 1), motion.v_n)
+        return imu_b + np.cross(motion.omega_eb_b, values[self.lever_arm]), imu_b

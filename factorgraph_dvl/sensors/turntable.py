@@ -1,0 +1,91 @@
+"""The turntable on which IMU and DVL turn together under a ship."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import ClassVar, Self
+
+import numpy as np
+
+from factorgraph_dvl.conventions import DEG, Array
+from factorgraph_dvl.earth import LocalFrame
+from factorgraph_dvl.sensors.protocol import (
+    Motion,
+    Observation,
+    Parameter,
+    SensorSection,
+    check_finite,
+    check_range,
+    check_times,
+)
+from factorgraph_dvl.turning import Turning
+
+
+class TurntableSettings(SensorSection, frozen=True, kw_only=True):
+    """Section `turntable` of trial.yaml."""
+
+    file: str = "turntable.csv"
+
+
+@dataclass(frozen=True)
+class Turntable:
+    """Record of a turntable: it observes nothing, but tells where the antenna is.
+
+    Parameters
+    ----------
+    settings : TurntableSettings
+    time : (M,) s, strictly increasing.
+    angle : (M,) rotation of IMU and DVL relative to the ship, counter-clockwise seen from
+        above, rad; it may wrap.
+    source : name of the file, for messages.
+    """
+
+    settings: TurntableSettings
+    time: Array
+    angle: Array
+    source: str = "turntable"
+    label: str = "Turntable"
+
+    section: ClassVar[str] = "turntable"
+    section_type: ClassVar[type[SensorSection]] = TurntableSettings
+    required: ClassVar[tuple[str, ...]] = ("time_s", "angle_deg")
+    optional: ClassVar[tuple[tuple[str, ...], ...]] = ()
+
+    def __post_init__(self) -> None:
+        check_times(self.time, self.source)
+        angle = {"angle_deg": self.angle / DEG}
+        check_finite(angle, self.source)
+        check_range(angle, -36e3, 36e3, "deg", self.source)
+
+    @classmethod
+    def from_columns(
+        cls, settings: TurntableSettings, columns: Mapping[str, Array], source: str
+    ) -> Self:
+        """Return the record that a table holds."""
+        return cls(settings, columns["time_s"], columns["angle_deg"] * DEG, source)
+
+    def columns(self) -> dict[str, Array]:
+        """Return the record as a table."""
+        return {"time_s": self.time, "angle_deg": self.angle / DEG}
+
+    @property
+    def missing(self) -> Array:
+        """No row, (M,) bool: none may be empty."""
+        return np.zeros(self.time.size, dtype=bool)
+
+    def turning(self, up: Array) -> Turning:
+        """Return how the body turns about its axis `up`, (3,)."""
+        return Turning(self.time, np.unwrap(self.angle), up)
+
+    def parameters(self) -> tuple[Parameter, ...]:
+        """Return nothing: the angle is taken as exact."""
+        return ()
+
+    def observations(self, frame: LocalFrame) -> tuple[Observation, ...]:
+        """Return nothing: the turn is a motion of the body, which the IMU sees."""
+        return ()
+
+    def explain(self, parameter: str, component: int, motion: Motion | None) -> str:
+        """Say nothing: there is no parameter."""
+        return ""
