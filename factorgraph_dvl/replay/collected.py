@@ -20,11 +20,13 @@ class Collected:
     ----------
     known : trial with all but the records.
     longest : s of data that are kept.
+    before : s for which rows are kept that were true before the first sample.
     """
 
-    def __init__(self, known: Trial, longest: float) -> None:
+    def __init__(self, known: Trial, longest: float, before: float = 1.0) -> None:
         self._known = known
         self._longest = longest
+        self._before = before
         self._samples: list[Array] = []
         self._aids: dict[str, list[Aid]] = {}
 
@@ -54,6 +56,23 @@ class Collected:
         """Whether every sensor of the trial has been heard."""
         return all(aid.section in self._aids for aid in self._known.aids)
 
+    def set_back(self, since: float, by: float) -> None:
+        """Move the samples at and after a time by some seconds into the past."""
+        table = np.concatenate(self._samples)
+        table[table[:, 0] >= since, 0] -= by
+        self._samples = [table]
+
+    def give_back(self, since: float) -> list[Aid]:
+        """Return rows that are true at a time or later, and let them go."""
+        out = []
+        for section, records in list(self._aids.items()):
+            record = joined(records)
+            later = record.time >= since
+            if later.any():
+                out.append(rows_of(record, later))
+                self._aids[section] = [rows_of(record, ~later)]
+        return out
+
     def trial(self, until: float) -> Trial:
         """Return what was collected up to a time, s."""
         samples = np.concatenate(self._samples)
@@ -63,7 +82,7 @@ class Collected:
         for section, records in self._aids.items():
             record = joined(records)
             # Rows of before are of no use, and end here.
-            keep = np.flatnonzero(record.time >= self.start - 1.0)
+            keep = np.flatnonzero(record.time >= self.start - self._before)
             if keep.size:
                 record = rows_of(record, keep)
                 self._aids[section] = [record]

@@ -146,6 +146,12 @@ class Samples:
         if first > 0:
             self._table = self._table[first:]
 
+    def set_back(self, since: float, by: float) -> None:
+        """Move the samples at and after a time by some seconds into the past."""
+        later = self._table[:, 0] >= since
+        self._table = self._table.copy()
+        self._table[later, 0] -= by
+
     def since(self, time: float) -> Array:
         """Return the samples at and after a time, (M, 7)."""
         return self._table[np.searchsorted(self._table[:, 0], time) :]

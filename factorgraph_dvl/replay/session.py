@@ -17,7 +17,7 @@ from factorgraph_dvl.replay.estimate import Update
 from factorgraph_dvl.replay.gate import Gate
 from factorgraph_dvl.replay.navigator import Navigator
 from factorgraph_dvl.replay.samples import Gap, Samples
-from factorgraph_dvl.replay.start import begin
+from factorgraph_dvl.replay.start import Start, begin
 from factorgraph_dvl.sensors.protocol import Aid, Observation, joined, rows_of
 from factorgraph_dvl.solution import Trajectory
 from factorgraph_dvl.trial import InitialPosition, Trial
@@ -33,6 +33,8 @@ _GROWTH = 1.5
 _RETRY = 1.2
 # The same after a gap of the IMU.
 _AFTER_GAP = 10.0
+# Misfit of what was collected since a gap, from which on the IMU's clock may have jumped.
+_MISFIT = 1.5
 # How a vessel may move in it: acceleration, m/s², and sway, m.
 _ACCELERATION = 1.0
 _SWAY = 0.5
@@ -93,7 +95,13 @@ class Replay:
         self._gate = Gate()
         self._navigator: Navigator | None = None
         self._waiting: dict[str, list[Aid]] = {}
+        # What is added to the times of the IMU and, by section, of the other sensors.
         self._clock = 0.0
+        self._jumped_back = 0.0
+        self._clocks: dict[str, float] = {}
+        self._raw: dict[str, float] = {}
+        self._gap: Gap | None = None
+        self._usual_misfit = 1.0
         self._attempt = np.nan
         self._prior: Known | None = None
         self._solved_at = np.nan
@@ -161,6 +169,7 @@ class Replay:
         used, jump = self._samples.add(table)
         if jump:
             self._clock += jump
+            self._jumped_back += jump
             self._messages.append(
                 f"the clock of the IMU jumped back by {jump:.3f} s at {self._samples.newest:.3f} "
                 "s: what follows is moved by that"
@@ -176,8 +185,7 @@ class Replay:
         ----------
         record : of a `Gnss`, `Dvl`, ...; one row or more.
         """
-        if self._clock:
-            record = replace(record, time=record.time + self._clock)  # type: ignore[type-var]
+        record = self._on_time(record)
         ahead = record.time > self._samples.newest + _AHEAD
         if ahead.any() and self._samples.newest > -np.inf:
             self._unused[record.label] = self._unused.get(record.label, 0) + int(ahead.sum())
@@ -185,6 +193,23 @@ class Replay:
                 return
             record = rows_of(record, ~ahead)
         self._waiting.setdefault(record.section, []).append(record)
+
+    def _on_time(self, record: Aid) -> Aid:
+        """Return a record on the clock of the replay.
+
+        When the IMU's clock has jumped back, a sensor's has too if its own times did.
+        """
+        section = record.section
+        clock = self._clocks.get(section, 0.0)
+        newest = self._raw.get(section, -np.inf)
+        jump = self._jumped_back - clock
+        if jump > 0.0 and float(record.time[0]) < newest - 0.5 * jump:
+            clock = self._clocks[section] = self._jumped_back
+            newest = -np.inf
+        self._raw[section] = max(newest, float(record.time[-1]))
+        if clock:
+            record = replace(record, time=record.time + clock)  # type: ignore[type-var]
+        return record
 
     def finish(self) -> list[Update]:
         """Return the updates that the last samples allow, without waiting for more."""
@@ -234,8 +259,9 @@ class Replay:
             self._prior = nav.known(length)
             here = InitialPosition(state.geodetic[0], np.hypot(state.position_std[0], reach))
             self._known = replace(self._known, initial_attitude=None, initial_position=here)
-            self._collected = Collected(self._known, _LONGEST)
+            self._collected = Collected(self._known, _LONGEST, length + 1.0)
             self._collected.add_samples(self._samples.since(gap.after))
+        self._gap = gap
         self._attempt = gap.after + _AFTER_GAP
         self._heard.clear()
         self._silent.clear()
@@ -269,22 +295,51 @@ class Replay:
 
     def _solve(self, until: float) -> bool:
         assert self._collected is not None
-        try:
-            start = begin(self._collected.trial(until), self._prior, self._progress)
-        except FactorgraphDvlError as error:
-            start = str(error)
+        start = self._begin(until)
+        if self._gap is not None and self._contradicts(start):
+            # Either there was a gap, or the IMU went on and its clock jumped.
+            gap, by = self._gap, self._gap.after - self._gap.before - self._samples.dt
+            self._collected.set_back(gap.after, by)
+            other = self._begin(until - by)
+            if self._contradicts(other):
+                self._collected.set_back(gap.before + 0.5 * self._samples.dt, -by)
+                why = start if isinstance(start, str) else f"misfit of {start.misfit:.1f}"
+                start = f"after the gap IMU and other sensors contradict each other ({why})"
+            else:
+                start, until = other, until - by
+                self._samples.set_back(gap.after, by)
+                self._clock -= by
+                self._messages.append(
+                    f"there was no gap in the IMU at {gap.before:.2f} s: its clock jumped ahead "
+                    f"by {by:.2f} s; what follows is moved by that"
+                )
+                for record in self._collected.give_back(until):
+                    self._waiting.setdefault(record.section, []).append(record)
         self._solved_at = until
         if isinstance(start, str):
             if self._navigator is not None:
                 return False
             self._messages.append(f"no start yet at {until:.1f} s: {start}")
             return False
+        self._gap = None
+        self._usual_misfit = max(1.0, start.misfit)
         lag = self._lag if self._kind == "fixed-lag" else None
         self._navigator = Navigator(start, self._known.imu, self._gate, lag=lag, memory=self._lag)
         self._samples.windows = start.windows
         self._solve_again = self._collected.start + _GROWTH * (until - self._collected.start)
         self._smoothed_to = start.node + 1
         return True
+
+    def _begin(self, until: float) -> Start | str:
+        assert self._collected is not None
+        try:
+            return begin(self._collected.trial(until), self._prior, self._progress)
+        except FactorgraphDvlError as error:
+            return str(error)
+
+    def _contradicts(self, start: Start | str) -> bool:
+        """Whether there is no start, or one whose residuals are larger than they were."""
+        return isinstance(start, str) or start.misfit > _MISFIT * self._usual_misfit
 
     def _again(self) -> bool:
         """Solve all that was collected once more, while that still makes a difference."""

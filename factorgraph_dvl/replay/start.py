@@ -10,7 +10,7 @@ import numpy as np
 from factorgraph_dvl import keys
 from factorgraph_dvl.conventions import DEG, Array
 from factorgraph_dvl.earth import LocalFrame
-from factorgraph_dvl.graph import Problem
+from factorgraph_dvl.graph import Evaluation, Problem
 from factorgraph_dvl.priors import Known
 from factorgraph_dvl.sensors.protocol import Parameter
 from factorgraph_dvl.solvers.batch import fit
@@ -24,6 +24,8 @@ from factorgraph_dvl.trial import Trial
 
 # Standard deviation of the attitude up to which the equations may be linearised in it.
 _ATTITUDE = 5.0 * DEG
+# Residuals whose root mean square says something.
+_ENOUGH = 20
 
 
 @dataclass(frozen=True)
@@ -44,6 +46,7 @@ class Start:
         priors' standard deviations.
     walking : whether biases walk.
     notes : for the user.
+    misfit : largest root mean square of a kind of residuals over their standard deviations.
     """
 
     frame: LocalFrame
@@ -59,6 +62,7 @@ class Start:
     feigned: Array
     walking: bool
     notes: tuple[str, ...]
+    misfit: float
 
 
 def begin(trial: Trial, known: Known | None, progress: Progress) -> Start | str:
@@ -118,7 +122,17 @@ def begin(trial: Trial, known: Known | None, progress: Progress) -> Start | str:
         feigned=feigned,
         walking=problem.chain.walking,
         notes=notes,
+        misfit=_misfit(problem, evaluation),
     )
+
+
+def _misfit(problem: Problem, evaluation: Evaluation) -> float:
+    out = 0.0
+    for residual, weight in zip(evaluation.residuals, problem.weights, strict=True):
+        used = weight > 0.0
+        if np.count_nonzero(used) >= _ENOUGH:
+            out = max(out, float(np.sqrt(np.mean(residual[used] ** 2))))
+    return out
 
 
 def _some(problem: Problem, values: gtsam.Values, last: int) -> gtsam.Values:
