@@ -16,6 +16,8 @@ _SIDE = 8
 # Samples in a row that are older than those before, from which on the clock has jumped.
 _JUMPED = 20
 _LEAST = 6
+# Times closer than this, s, are the same.
+_SAME_TIME = 1e-6
 
 
 @dataclass(frozen=True)
@@ -139,6 +141,11 @@ class Samples:
         first = int(np.argmin(np.abs(inc.start - t[a])))
         last = int(np.argmin(np.abs(inc.end - t[b]))) + 1
         return one_segment(inc, first, last)
+
+    def until(self, time: float) -> float:
+        """Return the time of the newest sample at or before a time, s."""
+        i = int(np.searchsorted(self._table[:, 0], time + _SAME_TIME, side="right"))
+        return float(self._table[i - 1, 0])
 
     def forget(self, time: float) -> None:
         """Drop what no segment that starts at `time` or later needs."""

@@ -20,6 +20,7 @@ from factorgraph_dvl.replay.samples import Gap, Samples
 from factorgraph_dvl.replay.start import Start, begin
 from factorgraph_dvl.sensors.protocol import Aid, Observation, joined, rows_of
 from factorgraph_dvl.solution import Trajectory
+from factorgraph_dvl.solvers.state_times import CLOSEST
 from factorgraph_dvl.trial import InitialPosition, Trial
 
 Kind = Literal["fixed-lag", "isam2"]
@@ -269,9 +270,16 @@ class Replay:
         self._navigator = None
 
     def _next(self, now: float) -> float:
-        """Return the time of the next state: a multiple of the interval."""
+        """Return the time of the next state: a multiple of the interval, or an attitude's."""
+        assert self._navigator is not None
         dt = self._samples.dt
-        return float((np.floor((now + 0.5 * dt) / self._interval) + 1.0) * self._interval)
+        out = float((np.floor((now + 0.5 * dt) / self._interval) + 1.0) * self._interval)
+        for section in self._navigator.start.own_states:
+            for record in self._waiting.get(section, []):
+                later = record.time[record.time > now + CLOSEST]
+                if later.size and later.min() < out:
+                    out = self._samples.until(float(later.min()))
+        return out
 
     def _start(self, *, end: bool) -> bool:
         """Solve what was collected, if it is time to; return whether there is a start."""
@@ -333,7 +341,7 @@ class Replay:
     def _begin(self, until: float) -> Start | str:
         assert self._collected is not None
         try:
-            return begin(self._collected.trial(until), self._prior, self._progress)
+            return begin(self._collected.trial(until), self._prior, self._interval, self._progress)
         except FactorgraphDvlError as error:
             return str(error)
 

@@ -12,14 +12,14 @@ from factorgraph_dvl.conventions import DEG, Array
 from factorgraph_dvl.earth import LocalFrame
 from factorgraph_dvl.graph import Evaluation, Problem
 from factorgraph_dvl.priors import Known
-from factorgraph_dvl.sensors.protocol import Parameter
+from factorgraph_dvl.sensors.protocol import AttitudeAid, Parameter
 from factorgraph_dvl.solvers.batch import fit
 from factorgraph_dvl.solvers.covariance import posterior
 from factorgraph_dvl.solvers.feigned import (
     feigned_information,
 )
 from factorgraph_dvl.solvers.levenberg_marquardt import Progress
-from factorgraph_dvl.solvers.state_times import STATE_INTERVAL
+from factorgraph_dvl.solvers.state_times import STATE_INTERVAL, needs_states
 from factorgraph_dvl.trial import Trial
 
 # Standard deviation of the attitude up to which the equations may be linearised in it.
@@ -41,6 +41,7 @@ class Start:
     parameters, all_parameters : those that are estimated, and all.
     fixed : values of those that are not.
     sections : of the sensors that it knows.
+    own_states : sections of the sensors whose every measurement needs a state of its own.
     windows : over which the IMU's samples are smoothed.
     feigned : (P, P) information on the parameters that only noise makes, in units of the
         priors' standard deviations.
@@ -58,6 +59,7 @@ class Start:
     all_parameters: tuple[Parameter, ...]
     fixed: dict[str, Array]
     sections: tuple[str, ...]
+    own_states: tuple[str, ...]
     windows: tuple[int, int]
     feigned: Array
     walking: bool
@@ -65,13 +67,14 @@ class Start:
     misfit: float
 
 
-def begin(trial: Trial, known: Known | None, progress: Progress) -> Start | str:
+def begin(trial: Trial, known: Known | None, interval: float, progress: Progress) -> Start | str:
     """Solve what was collected, and condense it to its last state.
 
     Parameters
     ----------
     trial : what was collected.
     known : of biases and calibration from before, in place of the trial's priors.
+    interval : of the states to come, s.
     progress : called with stage, iteration and cost.
 
     Returns
@@ -118,12 +121,23 @@ def begin(trial: Trial, known: Known | None, progress: Progress) -> Start | str:
             if not p.estimated
         },
         sections=tuple(aid.section for aid in trial.aids),
+        own_states=_own_states(trial, problem.chain.frame, interval),
         windows=problem.chain.segments.increments.chosen_windows,
         feigned=feigned,
         walking=problem.chain.walking,
         notes=notes,
         misfit=_misfit(problem, evaluation),
     )
+
+
+def _own_states(trial: Trial, frame: LocalFrame, interval: float) -> tuple[str, ...]:
+    out = []
+    for aid in trial.aids:
+        if isinstance(aid, AttitudeAid):
+            seen = aid.attitudes(frame)
+            if seen.time.size and needs_states(seen, trial.imu.settings, interval):
+                out.append(aid.section)
+    return tuple(out)
 
 
 def _misfit(problem: Problem, evaluation: Evaluation) -> float:
