@@ -200,6 +200,36 @@ def test_a_clock_that_jumps_is_not_believed(trial):
     assert np.nanmax(np.abs(errors.normalised)) < 5.0
 
 
+def test_a_clock_of_the_imu_that_jumps_ahead_is_no_gap(trial, run):
+    time = np.where(trial.imu.time > 62.0, trial.imu.time + 1.37, trial.imu.time)
+    solution, record = replay(replace(trial, imu=replace(trial.imu, time=time)), rate_hz=1.0)
+    assert any("clock jumped ahead by 1.37" in w for w in solution.warnings)
+    assert solution.converged
+    within(solution, trial)
+    assert record.time[-1] == pytest.approx(run[1].time[-1], abs=1e-6)
+    # No estimate is better than a wrong one until the two have been told apart.
+    assert np.diff(record.time).max() < 11.0
+
+
+def test_a_clock_of_the_imu_alone_that_jumps_back_is_set_right(trial):
+    session = Replay(trial, rate_hz=1.0)
+    feed(session, trial, 0.0, 60.0)
+    updates = []
+    for a in np.arange(60.0, 80.0):
+        for section in ("gnss", "dvl"):
+            aid = getattr(trial, section)
+            session.add(rows_of(aid, (aid.time >= a) & (aid.time < a + 1.0)))
+        inside = (trial.imu.time >= a) & (trial.imu.time < a + 1.0)
+        i = trial.imu
+        updates += session.add_imu(i.time[inside] - 5.0, i.gyro[inside], i.accel[inside])
+    assert any("jumped back by 5.0" in m for u in updates for m in u.messages)
+    motion = motion_errors(updates[-1].state, trial.reference)
+    assert updates[-1].time > 77.0
+    for v in (motion.position, motion.velocity, motion.attitude):
+        assert np.abs(v.normalised).max() < 6.0
+    assert not updates[-1].doubted
+
+
 def test_a_clock_that_jumps_back_is_set_right(trial):
     session = Replay(trial, rate_hz=1.0)
     feed(session, trial, 0.0, 60.0)

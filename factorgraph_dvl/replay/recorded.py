@@ -190,6 +190,11 @@ def _solution(trial: Trial, run: Replay, tape: _Tape) -> Solution:
         if bad.size:
             names = ", ".join(e.component_names[i] for i in bad)
             warnings.append(f"{names} not observable in what was measured until the end")
+    if trial.imu.settings.bias_walks:
+        warnings.append(
+            "a bias of the IMU walks: what is reported is its value at the end, where a solution "
+            "of all data at once reports the mean over the trial"
+        )
     cost = 0.5 * sum(float(np.nansum((r.residual / r.sigma) ** 2)) for r in residuals)
     return Solution(
         trial=trial.name,

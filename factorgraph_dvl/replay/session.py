@@ -185,7 +185,17 @@ class Replay:
         Parameters
         ----------
         record : of a `Gnss`, `Dvl`, ...; one row or more.
+
+        Raises
+        ------
+        ConfigError
+            If the trial does not have such a sensor.
         """
+        sections = [aid.section for aid in self._known.aids]
+        if record.section not in sections:
+            raise ConfigError(
+                f"the trial has no sensor {record.section}", expected=", ".join(sections)
+            )
         record = self._on_time(record)
         ahead = record.time > self._samples.newest + _AHEAD
         if ahead.any() and self._samples.newest > -np.inf:
@@ -237,7 +247,11 @@ class Replay:
                     break
                 self._break(gap)
                 continue
-            aids = self._take(now, float(seg.node_time[1]))
+            until = float(seg.node_time[1])
+            if end and until > self._samples.newest - 0.5 * self._samples.dt:
+                # No segment follows that what was measured right now would belong to.
+                until += 2.0 * _SAME_TIME
+            aids = self._take(now, until)
             self._navigator.extend(seg, aids)
             self._samples.forget(self._navigator.time)
             out.append(self._update(began, solved=self._again(), end=end))
