@@ -10,15 +10,19 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
+from factorgraph_dvl.conventions import Array
 from factorgraph_dvl.errors import ConfigError, FactorgraphDvlError
 from factorgraph_dvl.priors import Known
+from factorgraph_dvl.replay.clocks import Clocks
 from factorgraph_dvl.replay.collected import Collected
 from factorgraph_dvl.replay.estimate import Update
 from factorgraph_dvl.replay.gate import Gate
 from factorgraph_dvl.replay.navigator import Navigator
 from factorgraph_dvl.replay.samples import Gap, Samples
+from factorgraph_dvl.replay.silence import Silence
 from factorgraph_dvl.replay.start import Start, begin
-from factorgraph_dvl.sensors.protocol import Aid, Observation, joined, rows_of
+from factorgraph_dvl.replay.waiting import AHEAD, SAME_TIME, Waiting
+from factorgraph_dvl.sensors.protocol import Aid, rows_of
 from factorgraph_dvl.solution import Trajectory
 from factorgraph_dvl.solvers.state_times import CLOSEST
 from factorgraph_dvl.trial import InitialPosition, Trial
@@ -48,12 +52,6 @@ _SETTLED_ROTATION = np.radians(0.2)
 # A parameter that has moved so far since it was linearised, rad.
 _MOVED = 0.01
 _LEAST_BETWEEN = 10.0
-# Silence of a sensor that is worth a message, s.
-_SILENT = 5.0
-# Times closer than this, s, are the same.
-_SAME_TIME = 1e-6
-# Measurements that are ahead of the IMU by more than this, s, are not kept.
-_AHEAD = 60.0
 
 
 class Replay:
@@ -95,12 +93,9 @@ class Replay:
         self._collected: Collected | None = Collected(known, _LONGEST)
         self._gate = Gate()
         self._navigator: Navigator | None = None
-        self._waiting: dict[str, list[Aid]] = {}
-        # What is added to the times of the IMU and, by section, of the other sensors.
-        self._clock = 0.0
-        self._jumped_back = 0.0
-        self._clocks: dict[str, float] = {}
-        self._raw: dict[str, float] = {}
+        self._waiting = Waiting()
+        self._clocks = Clocks()
+        self._silence = Silence()
         self._gap: Gap | None = None
         self._usual_misfit = 1.0
         self._attempt = np.nan
@@ -109,11 +104,7 @@ class Replay:
         self._solve_again = np.nan
         self._smoothed_to = 0
         self._messages: list[str] = []
-        self._example: dict[str, Observation] = {}
-        self._heard: dict[str, float] = {}
-        self._silent: set[str] = set()
         self._too_late: dict[str, int] = {}
-        self._unused: dict[str, int] = {}
 
     @property
     def delay(self) -> float:
@@ -142,7 +133,7 @@ class Replay:
                 self._too_late,
                 f"came after what they belong to had left the lag of {self._lag:g} s",
             ),
-            (self._unused, f"were more than {_AHEAD:g} s ahead of the IMU"),
+            (self._waiting.refused, f"were more than {AHEAD:g} s ahead of the IMU"),
             (self._gate.refused, "contradicted the prediction"),
         )
         out = [
@@ -162,15 +153,14 @@ class Replay:
         """
         table = np.column_stack(
             [
-                np.atleast_1d(np.asarray(time, dtype=float)) + self._clock,
+                np.atleast_1d(np.asarray(time, dtype=float)) + self._clocks.imu,
                 np.reshape(gyro, (-1, 3)),
                 np.reshape(accel, (-1, 3)),
             ]
         )
         used, jump = self._samples.add(table)
         if jump:
-            self._clock += jump
-            self._jumped_back += jump
+            self._clocks.jumped_back(jump)
             self._messages.append(
                 f"the clock of the IMU jumped back by {jump:.3f} s at {self._samples.newest:.3f} "
                 "s: what follows is moved by that"
@@ -196,31 +186,7 @@ class Replay:
             raise ConfigError(
                 f"the trial has no sensor {record.section}", expected=", ".join(sections)
             )
-        record = self._on_time(record)
-        ahead = record.time > self._samples.newest + _AHEAD
-        if ahead.any() and self._samples.newest > -np.inf:
-            self._unused[record.label] = self._unused.get(record.label, 0) + int(ahead.sum())
-            if ahead.all():
-                return
-            record = rows_of(record, ~ahead)
-        self._waiting.setdefault(record.section, []).append(record)
-
-    def _on_time(self, record: Aid) -> Aid:
-        """Return a record on the clock of the replay.
-
-        When the IMU's clock has jumped back, a sensor's has too if its own times did.
-        """
-        section = record.section
-        clock = self._clocks.get(section, 0.0)
-        newest = self._raw.get(section, -np.inf)
-        jump = self._jumped_back - clock
-        if jump > 0.0 and float(record.time[0]) < newest - 0.5 * jump:
-            clock = self._clocks[section] = self._jumped_back
-            newest = -np.inf
-        self._raw[section] = max(newest, float(record.time[-1]))
-        if clock:
-            record = replace(record, time=record.time + clock)  # type: ignore[type-var]
-        return record
+        self._waiting.add(self._clocks.on_time(record), self._samples.newest)
 
     def finish(self) -> list[Update]:
         """Return the updates that the last samples allow, without waiting for more."""
@@ -250,7 +216,7 @@ class Replay:
             until = float(seg.node_time[1])
             if end and until > self._samples.newest - 0.5 * self._samples.dt:
                 # No segment follows that what was measured right now would belong to.
-                until += 2.0 * _SAME_TIME
+                until += 2.0 * SAME_TIME
             aids = self._take(now, until)
             self._navigator.extend(seg, aids)
             self._samples.forget(self._navigator.time)
@@ -278,8 +244,7 @@ class Replay:
             self._collected.add_samples(self._samples.since(gap.after))
         self._gap = gap
         self._attempt = gap.after + _AFTER_GAP
-        self._heard.clear()
-        self._silent.clear()
+        self._silence.forget()
         self._samples.forget(gap.after)
         self._navigator = None
 
@@ -289,10 +254,9 @@ class Replay:
         dt = self._samples.dt
         out = float((np.floor((now + 0.5 * dt) / self._interval) + 1.0) * self._interval)
         for section in self._navigator.start.own_states:
-            for record in self._waiting.get(section, []):
-                later = record.time[record.time > now + CLOSEST]
-                if later.size and later.min() < out:
-                    out = self._samples.until(float(later.min()))
+            wanted = self._waiting.first_after(section, now + CLOSEST)
+            if wanted < out:
+                out = self._samples.until(wanted)
         return out
 
     def _start(self, *, end: bool) -> bool:
@@ -310,8 +274,8 @@ class Replay:
             return False
         since = until - self._collected.start
         self._attempt = until + max((_RETRY - 1.0) * since, 1.0)
-        for section, records in list(self._waiting.items()):
-            self._split(section, records, until)
+        for section in self._waiting.sections:
+            self._due(section, until)
         self._samples.forget(until)
         return self._solve(until)
 
@@ -330,13 +294,13 @@ class Replay:
             else:
                 start, until = other, until - by
                 self._samples.set_back(gap.after, by)
-                self._clock -= by
+                self._clocks.jumped_ahead(by)
                 self._messages.append(
                     f"there was no gap in the IMU at {gap.before:.2f} s: its clock jumped ahead "
                     f"by {by:.2f} s; what follows is moved by that"
                 )
                 for record in self._collected.give_back(until):
-                    self._waiting.setdefault(record.section, []).append(record)
+                    self._waiting.add(record)
         self._solved_at = until
         if isinstance(start, str):
             if self._navigator is not None:
@@ -408,16 +372,16 @@ class Replay:
         assert self._navigator is not None
         out = []
         late: dict[int, list[Aid]] = {}
-        for section, records in list(self._waiting.items()):
-            record = self._split(section, records, end)
-            if record is None:
+        for section in self._waiting.sections:
+            found = self._due(section, end)
+            if found is None:
                 continue
+            record, true = found
             if section not in self._navigator.start.sections:
                 # It brings parameters that are not in the graph yet.
                 self._solve_again = min(self._solve_again, end + _LEAST_BETWEEN)
                 continue
-            true = record.time - self._shift(section, record)
-            now = true >= start - _SAME_TIME
+            now = true >= start - SAME_TIME
             if now.all():
                 out.append(record)
                 continue
@@ -433,33 +397,15 @@ class Replay:
             self._navigator.correct(late)
         return out
 
-    def _split(self, section: str, records: list[Aid], end: float) -> Aid | None:
-        """Take what was true before a time out of the waiting records of a sensor."""
-        record = joined(records)
-        due = record.time - self._shift(section, record) < end - _SAME_TIME
-        if not due.any():
-            self._waiting[section] = [record]
-            return None
-        if due.all():
-            del self._waiting[section]
-        else:
-            self._waiting[section] = [rows_of(record, ~due)]
-        record = rows_of(record, due)
-        if self._collected is not None:
-            self._collected.add_aid(record)
-        return record
-
-    def _shift(self, section: str, record: Aid) -> float:
-        """Return by how much the clock of a sensor is ahead, s."""
-        if self._navigator is None:
-            return 0.0
-        if section not in self._example:
-            observations = record.observations(self._navigator.start.frame)
-            if not observations:
-                return 0.0
-            self._example[section] = observations[0]
-        o = self._example[section]
-        return float((o.time - o.true_time(self._navigator.values))[0])
+    def _due(self, section: str, end: float) -> tuple[Aid, Array] | None:
+        """Take what was true before a time out of what waits of a sensor; true times too."""
+        nav = self._navigator
+        frame = None if nav is None else nav.start.frame
+        values = {} if nav is None else nav.values
+        found = self._waiting.due(section, end, frame, values)
+        if found is not None and self._collected is not None:
+            self._collected.add_aid(found[0])
+        return found
 
     def _update(self, began: float, *, solved: bool, end: bool) -> Update:
         nav = self._navigator
@@ -470,7 +416,7 @@ class Replay:
         late = s.times.get(self._smoothed_to)
         if late is not None and not end and nav.time - late > self._lag - 2.0 * self._interval:
             smoothed = self._smooth(0.5 * self._lag)
-        self._listen(nav)
+        self._messages += self._silence.listen(nav.time, nav.innovations)
         messages = (*self._messages, *nav.messages)
         innovations = tuple(nav.innovations)
         self._messages, nav.messages, nav.innovations = [], [], []
@@ -486,21 +432,6 @@ class Replay:
             solved=solved,
             doubted=tuple(sorted(self._gate.doubted)),
         )
-
-    def _listen(self, nav: Navigator) -> None:
-        """Say which kinds of measurements have fallen silent, and which are back."""
-        for i in nav.innovations:
-            before = self._heard.get(i.label, nav.time)
-            self._heard[i.label] = max(float(i.time[-1]), before)
-            if i.label in self._silent:
-                self._silent.discard(i.label)
-                self._messages.append(f"{i.label}: back after {i.time[-1] - before:.1f} s")
-        for label, heard in self._heard.items():
-            if nav.time - heard > _SILENT and label not in self._silent:
-                self._silent.add(label)
-                self._messages.append(
-                    f"{label}: nothing since {heard:.1f} s; the estimate goes on without"
-                )
 
     def _smooth(self, age: float) -> Trajectory | None:
         """Return the states older than an age, s, that were not returned before."""
