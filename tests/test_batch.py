@@ -324,3 +324,34 @@ def test_the_reported_covariance_is_that_of_the_order():
     # The heading hangs on turns of a minute; roll and pitch on gravity.
     assert np.all(attitude[:, :2] < 0.05)
     assert np.all(attitude[:, 2] < 1.0)
+
+
+MEMS = {
+    "imu": {"gyro_noise_deg_sqrt_h": 0.3, "accel_noise_ug_sqrt_hz": 200},
+    "bias": {"imu": {"gyro_bias_std_deg_h": 20, "accel_bias_std_ug": 5000}},
+}
+
+
+@pytest.mark.parametrize("walk", [0, 5])
+@pytest.mark.parametrize("mounting_std", [1.0, 20.0])
+def test_a_heading_that_only_the_mounting_tells_is_known_no_better(mounting_std, walk):
+    imu = MEMS["bias"]["imu"] | {"gyro_bias_walk_deg_h_sqrt_h": walk}
+    claims = {"imu": imu, "dvl": {"misalignment_std_deg": [mounting_std] * 3}}
+    straight = {"manoeuvres": [{"straight_s": 100}], "sway": {}}
+    truth = {"misalignment_deg": [0.4 * mounting_std, 0, 0.7 * mounting_std]}
+    trial = simulate(scenario(noise=True, imu=MEMS["imu"], dvl=truth, trial=claims, **straight), 1)
+    solution = solve(trial, rate_hz=1.0)
+    heading = trajectory_errors(solution, trial.reference).attitude
+    np.testing.assert_allclose(heading.std[:, 2] / DEG, mounting_std, rtol=0.05)
+    assert 0.3 < np.abs(heading.normalised[:, 2]).max() < 2.0
+
+
+def test_a_heading_that_the_earth_tells_is_not_lost_to_the_mounting():
+    straight = {"manoeuvres": [{"straight_s": 120}], "sway": {}}
+    trial = simulate(scenario(noise=True, dvl={"misalignment_deg": [2, 2, 30]}, **straight), 1)
+    solution = solve(trial, rate_hz=1.0)
+    # The mounting is not told about the velocity, and may be anything there.
+    assert solution.estimate("misalignment_deg").std.max() > 100.0
+    heading = trajectory_errors(solution, trial.reference).attitude
+    assert np.max(heading.std[:, 2] / DEG) < 0.3
+    assert np.abs(heading.normalised[:, 2]).max() < 3.0

@@ -26,7 +26,7 @@ CALM = {"sway": {}, "current_m_s": [0.3, -0.1, 0]}
 def history_of(scene, seed=1):
     found = minimised(simulate(scene, seed))
     history = information_history(
-        found.problem, found.minimum.evaluation, found.held, found.covariances.nodes
+        found.problem, found.minimum.evaluation, found.held, found.covariances
     )
     return found, history
 
@@ -197,7 +197,7 @@ def test_a_trial_without_a_dvl_has_the_biases():
     trial = replace(simulate(scenario(noise=True), 1), dvl=None)
     found = minimised(trial)
     history = information_history(
-        found.problem, found.minimum.evaluation, found.held, found.covariances.nodes
+        found.problem, found.minimum.evaluation, found.held, found.covariances
     )
     assert len(history.names) == 6
     assert all("_bias_" in name for name in history.names)

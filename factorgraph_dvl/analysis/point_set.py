@@ -155,7 +155,8 @@ def point_set(
     epoch = np.clip(np.searchsorted(motion.time, at.time - 1e-6), 0, motion.time.size - 1)
     velocity_root = _root(bRn @ relative.velocity_cov @ bRn.transpose(0, 2, 1))[epoch]
     to_body = np.linalg.inv(rph_jacobian(relative.rph, axes))
-    attitude_root = _root(to_body @ relative.rph_cov @ to_body.transpose(0, 2, 1))[epoch]
+    wavering = _wavering(relative.rph_cov)
+    attitude_root = _root(to_body @ wavering @ to_body.transpose(0, 2, 1))[epoch]
     rate_sigma = _rate_sigma(trial, relative, axes)
     feigned = np.zeros((at.time.size, len(states), len(states)))
     for k in range(3):
@@ -217,6 +218,19 @@ def _relative(solution: Solution) -> Trajectory:
         velocity=trajectory.velocity - level @ current.value,
         velocity_cov=trajectory.velocity_cov + own,
     )
+
+
+def _wavering(rph_cov: Array) -> Array:
+    """Return covariances (M, 3, 3) of attitudes without what all headings have in common.
+
+    A heading that is wrong by the same angle all the time turns all rows alike, and feigns
+    no change. Where the heading is known best, its error is taken for that.
+    """
+    variance = rph_cov[:, 2, 2]
+    scale = np.ones((variance.size, 3))
+    known = variance > 0.0
+    scale[known, 2] = np.sqrt(1.0 - variance.min() / variance[known])
+    return rph_cov * scale[:, :, None] * scale[:, None, :]
 
 
 def _root(covariance: Array) -> Array:

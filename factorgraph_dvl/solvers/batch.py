@@ -20,8 +20,8 @@ from factorgraph_dvl.preintegration import Segments, States, attach, motion_at, 
 from factorgraph_dvl.priors import Known
 from factorgraph_dvl.sensors.protocol import Aid, Motion, Observation, Parameter
 from factorgraph_dvl.solution import Solution
-from factorgraph_dvl.solvers.covariance import Posterior, posterior
-from factorgraph_dvl.solvers.feigned import at_prior_along, feigned_directions
+from factorgraph_dvl.solvers.covariance import Posterior, changes_with, considered, posterior
+from factorgraph_dvl.solvers.feigned import at_prior_along, told_of
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, Progress, minimise
 from factorgraph_dvl.solvers.state_times import STATE_INTERVAL, dense_epochs
 from factorgraph_dvl.solvers.summary import summarise
@@ -114,8 +114,11 @@ def minimised(
     problem, minimum, notes = fit(trial, state_interval_s=state_interval_s, progress=report)
     report("covariance", 0, None)
     covariances = posterior(problem, minimum)
-    held = feigned_directions(problem, minimum, covariances)
+    told = told_of(problem, minimum, covariances)
+    held = told.directions_not_told()
     if held.size:
+        # How others go with what is held is linear here, where the directions belong.
+        changes = changes_with(problem, covariances, held, told.coupled(held))
         origin = at_prior_along(problem, minimum.evaluation.parameters, held)
         problem.hold(held, origin)
         at = problem.values(minimum.evaluation.states, origin)
@@ -123,7 +126,7 @@ def minimised(
             problem, at, stage="all sensors, without what they cannot tell", progress=report
         )
         minimum = replace(again, iterations=minimum.iterations + again.iterations)
-        covariances = posterior(problem, minimum)
+        covariances = considered(posterior(problem, minimum), changes)
     return Minimised(problem, minimum, covariances, held, notes)
 
 

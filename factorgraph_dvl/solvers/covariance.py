@@ -8,7 +8,7 @@ the digits that navigation-grade gyros need.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
@@ -64,6 +64,45 @@ class SquareRootInformation:
             )
             index = len(self._cliques) - 1
             stack += [(clique[i], index) for i in range(clique.nrChildren())]
+
+    def covariance_with(self, functional: Mapping[int, Array]) -> dict[int, Array]:
+        """Return the covariance of every variable with a linear functional.
+
+        P Wᵀ = R⁻¹ R⁻ᵀ Wᵀ: from the leaves to the root, and back.
+
+        Parameters
+        ----------
+        functional : keys to (n, size) matrices.
+
+        Returns
+        -------
+        Keys to (size, n).
+        """
+        width = next(iter(functional.values())).shape[0]
+        pending = {key: matrix.T for key, matrix in functional.items()}
+        halfway: list[Array] = []
+        for clique in reversed(self._cliques):
+            w = np.concatenate(
+                [pending.pop(key, np.zeros((self._sizes[key], width))) for key in clique.frontals]
+            )
+            z = _solve(clique.R, w, transposed=True)
+            halfway.append(z)
+            passed = -clique.T.T @ z
+            row = 0
+            for key in clique.separators:
+                size = self._sizes[key]
+                pending[key] = pending.get(key, 0.0) + passed[row : row + size]
+                row += size
+        out: dict[int, Array] = {}
+        for clique, z in zip(self._cliques, reversed(halfway), strict=True):
+            if clique.separators:
+                z = z - clique.T @ np.concatenate([out[key] for key in clique.separators])
+            x = _solve(clique.R, z, transposed=False)
+            row = 0
+            for key in clique.frontals:
+                out[key] = x[row : row + self._sizes[key]]
+                row += self._sizes[key]
+        return out
 
     def covariance_of(self, functionals: Sequence[Mapping[int, Array]]) -> Array:
         """Return the joint covariance of linear functionals of the variables.
@@ -146,24 +185,75 @@ class SquareRootInformation:
 class Posterior:
     """Covariances at a minimum.
 
+    Where directions of the parameters are held at their prior because the data do not tell
+    them, motion and biases were estimated as if they were known there. What hangs together
+    with one of them is no better known than it: P + K Kᵀ, with K the change with each
+    direction, for one standard deviation of its prior (Schmidt's consider analysis; Bierman,
+    Factorization Methods for Discrete Sequential Estimation, 1977, ch. VIII).
+
     Parameters
     ----------
-    information : of all variables.
-    nodes : (K, 9, 9) covariances of the states, in GTSAM's tangent space.
+    information : of all variables, the held directions taken as known.
+    nodes : (K, 9, 9) covariances of the states, in GTSAM's tangent space, K Kᵀ included.
+    given : (K, 9, 9) those that are left where the parameters are known.
+    considered : K of states and biases, (size, h) by key; empty where nothing is held.
     """
 
     information: SquareRootInformation
     nodes: Array
+    given: Array
+    considered: dict[int, Array]
 
 
 def posterior(problem: Problem, minimum: Minimum) -> Posterior:
-    """Return the covariances at a minimum that was proven."""
+    """Return the covariances at a minimum that was proven, held directions taken as known."""
     assert minimum.tree is not None
     sizes = minimum.evaluation.values.dims()
     information = SquareRootInformation(minimum.tree, sizes)
     wanted = [keys.node(k) for k in range(problem.chain.segments.node_time.size)]
     marginals = information.marginals(wanted)
-    return Posterior(information, np.stack([marginals[key] for key in wanted]))
+    nodes = np.stack([marginals[key] for key in wanted])
+    if not problem.parameters:
+        return Posterior(information, nodes, nodes, {})
+    every = _whitened(problem)
+    with_every = information.covariance_with(every)
+    cross = np.stack([with_every[key] for key in wanted])
+    P = information.covariance_of([every])
+    given = nodes - cross @ np.linalg.solve(P, cross.transpose(0, 2, 1))
+    return Posterior(information, nodes, given, {})
+
+
+def changes_with(
+    problem: Problem, found: Posterior, held: Array, coupled: Array
+) -> dict[int, Array]:
+    """Return the change K of states and biases with directions, (size, h) by key.
+
+    Parameters
+    ----------
+    problem, found : covariances where the directions are not held yet.
+    held : (P, h) directions in the coordinates u of a step S u, S `Problem.prior_root`.
+    coupled : (h, h) projection on those that others hang together with.
+    """
+    every = _whitened(problem)
+    P = found.information.covariance_of([every])
+    own = held @ np.linalg.inv(held.T @ P @ held) @ coupled
+    with_every = found.information.covariance_with(every)
+    return {key: out @ own for key, out in with_every.items() if key not in every}
+
+
+def considered(found: Posterior, changes: dict[int, Array]) -> Posterior:
+    """Return covariances where directions are held, with what hangs together with them."""
+    nodes = range(found.nodes.shape[0])
+    change = np.stack([changes[keys.node(k)] for k in nodes])
+    return replace(
+        found, nodes=found.nodes + change @ change.transpose(0, 2, 1), considered=changes
+    )
+
+
+def _whitened(problem: Problem) -> dict[int, Array]:
+    """Return the functional that gives all parameters in the coordinates u of a step S u."""
+    whiten = np.asarray(np.linalg.inv(problem.prior_root), float)
+    return {problem.key(name): whiten[:, place] for name, place in problem.columns.items()}
 
 
 def _range(s: slice) -> np.ndarray:

@@ -11,7 +11,7 @@ here; where it is most of it, the direction is not observable, and the prior is 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -26,35 +26,91 @@ from factorgraph_dvl.solvers.levenberg_marquardt import Minimum
 FEIGNED = 0.5
 # Information, in units of the prior's, that is not worth the question.
 _LITTLE = 0.1
+# Steps of other variables that go with a held direction are genuine from so many times
+# what noise feigns.
+_COUPLED = 10.0
 # Genuine information, in the same units, below which a direction is left to the prior once
 # some are feigned.
 _GENUINE = 0.5
 
 
-def feigned_directions(
+@dataclass(frozen=True)
+class Told:
+    """What the data say of the parameters, beside the prior's identity.
+
+    All in the coordinates u of a step S u, S `Problem.prior_root`.
+
+    Parameters
+    ----------
+    data : (P, P) information once all other variables are eliminated.
+    feigned : (P, P) share of it that the error of the motion is expected to feign.
+    full : (P, P) information where all other variables are known.
+    """
+
+    data: Array
+    feigned: Array
+    full: Array
+
+    def directions_not_told(self) -> Array:
+        """Return the directions (P, h) that are not observable, if any is feigned."""
+        return directions_not_told(self.data, self.feigned)
+
+    def coupled(self, held: Array) -> Array:
+        """Return the projection (h, h) on the held directions that other variables go with.
+
+        The step K of the others that goes with one prior's sigma of a direction is worth
+        |K|² in their own information: what they take of that on the direction. Noise
+        feigns such steps too, as large as the information that it feigns.
+        """
+        P = np.linalg.inv(self.data + np.eye(len(self.data)))
+        own = np.eye(held.shape[1])
+        taken = held.T @ self.full @ held + own - np.linalg.inv(held.T @ P @ held)
+        L = np.linalg.cholesky(held.T @ self.feigned @ held + own)
+        half = np.linalg.solve(L, taken)
+        share, directions = np.linalg.eigh(np.linalg.solve(L, half.T))
+        spanned = np.linalg.qr(np.linalg.solve(L.T, directions[:, share > _COUPLED]))[0]
+        return np.asarray(spanned @ spanned.T)
+
+
+def told_of(
     problem: Problem, minimum: Minimum, covariances: Posterior, *, at_truth: bool = False
-) -> Array:
-    """Return directions that are not observable, if the information on any is feigned.
+) -> Told:
+    """Return what the data say of the parameters.
 
     Parameters
     ----------
     problem, minimum, covariances : at the minimum.
     at_truth : the motion there is the true one, and feigns nothing: return what will be
         found once it is estimated.
-
-    Returns
-    -------
-    (P, h) orthonormal, in the coordinates u of a step S u, S `Problem.prior_root`; h may be 0.
     """
-    if not problem.parameters:
-        return np.zeros((0, 0))
+    size = len(problem.prior_root)
+    if size == 0:
+        return Told(*[np.zeros((0, 0))] * 3)
     functionals = [{problem.key(p.name): np.eye(p.mean.size)} for p in problem.parameters]
     whiten = np.linalg.inv(problem.prior_root)
     P = whiten @ covariances.information.covariance_of(functionals) @ whiten.T
-    data = np.linalg.inv(P) - np.eye(len(P))
-    feigned = feigned_information(problem, minimum.evaluation, covariances.nodes)
-    total = feigned.sum(axis=0)
-    return directions_not_told(data + total if at_truth else data, total)
+    data = np.linalg.inv(P) - np.eye(size)
+    feigned = feigned_information(problem, minimum.evaluation, covariances.given).sum(axis=0)
+    if at_truth:
+        data = data + feigned
+    return Told(data, feigned, _parameter_information(problem, minimum.evaluation))
+
+
+def _parameter_information(problem: Problem, evaluation: Evaluation) -> Array:
+    """Return the information (P, P) of the measurements on the parameters, all else known."""
+    root = problem.prior_root
+    out = np.zeros((len(root), len(root)))
+    for observation, motion, weight in zip(
+        problem.observations, evaluation.motions, problem.weights, strict=True
+    ):
+        wanted = [p.name for p in problem.parameters if p.name in observation.parameters]
+        if not wanted:
+            continue
+        found = observation.linearize(motion, evaluation.parameters, wanted).d_parameters
+        J = np.concatenate([found[name] for name in wanted], axis=2) * weight[:, :, None]
+        columns = np.concatenate([np.arange(len(root))[problem.columns[name]] for name in wanted])
+        out[np.ix_(columns, columns)] += np.einsum("mdi,mdj->ij", J, J)
+    return np.asarray(root.T @ out @ root)
 
 
 def feigned_information(problem: Problem, evaluation: Evaluation, nodes: Array) -> Array:
@@ -63,7 +119,9 @@ def feigned_information(problem: Problem, evaluation: Evaluation, nodes: Array) 
     Parameters
     ----------
     problem, evaluation : linearised there.
-    nodes : (K, 9, 9) covariances of the states, in GTSAM's tangent space.
+    nodes : (K, 9, 9) covariances of the states, in GTSAM's tangent space, where the
+        parameters are known: an error that all states share turns the Jacobians alike, and
+        feigns no change.
 
     Returns
     -------
@@ -105,7 +163,7 @@ def directions_not_told(data: Array, feigned: Array) -> Array:
         included.
     feigned : (P, P) that share of it.
     """
-    if not largest_feigned_share(data, feigned) >= FEIGNED:
+    if not data.size or not largest_feigned_share(data, feigned) >= FEIGNED:
         return np.zeros((data.shape[0], 0))
     genuine, directions = np.linalg.eigh(data - feigned)
     return np.asarray(directions[:, genuine < _GENUINE])

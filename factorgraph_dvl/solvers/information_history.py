@@ -26,6 +26,7 @@ from factorgraph_dvl.graph import HELD_DIRECTION, Evaluation, Problem
 from factorgraph_dvl.information import InformationHistory
 from factorgraph_dvl.solution import Solution
 from factorgraph_dvl.solvers.batch import minimised, solution_of
+from factorgraph_dvl.solvers.covariance import Posterior
 from factorgraph_dvl.solvers.feigned import (
     FEIGNED,
     directions_not_told,
@@ -82,13 +83,13 @@ def solve_with_history(
     if progress:
         progress("information along the trial", 0, None)
     history = information_history(
-        found.problem, found.minimum.evaluation, found.held, found.covariances.nodes
+        found.problem, found.minimum.evaluation, found.held, found.covariances
     )
     return solution_of(found, RATE_HZ), history
 
 
 def information_history(
-    problem: Problem, evaluation: Evaluation, held: Array, nodes: Array
+    problem: Problem, evaluation: Evaluation, held: Array, covariances: Posterior
 ) -> InformationHistory:
     """Return the covariance of all constants given the data up to each node.
 
@@ -100,10 +101,10 @@ def information_history(
     problem, evaluation : linearised there.
     held : (P, h) directions of the parameters that the problem holds, as
         `feigned_directions` returns them: they stay at the prior all the time.
-    nodes : (K, 9, 9) covariances of the states, in GTSAM's tangent space.
+    covariances : of the held problem.
     """
     triangles, _ = run_filter(problem, evaluation)
-    not_told = _not_told(problem, evaluation, nodes, triangles)
+    not_told = _not_told(problem, evaluation, covariances.given, triangles)
     return as_history(problem, evaluation, held, triangles, not_told)
 
 
@@ -209,7 +210,7 @@ def as_history(
     columns = slice(triangles.shape[1] - len(whiten), None)
 
     def prior(directions: Array) -> Array:
-        return prior_along(problem, directions, kept)[is_free]
+        return prior_along(problem, directions, kept, {})[is_free]
 
     at_prior = prior(held)
     size = int(is_free.sum())

@@ -15,8 +15,8 @@ from factorgraph_dvl.information import InformationHistory
 from factorgraph_dvl.preintegration import States, segments
 from factorgraph_dvl.solution import Solution
 from factorgraph_dvl.solvers.batch import Minimised, solution_of
-from factorgraph_dvl.solvers.covariance import posterior
-from factorgraph_dvl.solvers.feigned import feigned_directions
+from factorgraph_dvl.solvers.covariance import changes_with, considered, posterior
+from factorgraph_dvl.solvers.feigned import told_of
 from factorgraph_dvl.solvers.information_history import (
     RATE_HZ,
     Frontier,
@@ -49,12 +49,14 @@ def predict_posterior(
     triangles, frontier = run_filter(problem, evaluation)
     minimum = _minimum(problem, evaluation)
     covariances = posterior(problem, minimum)
-    held = feigned_directions(problem, minimum, covariances, at_truth=True)
+    told = told_of(problem, minimum, covariances, at_truth=True)
+    held = told.directions_not_told()
     if held.size:
+        changes = changes_with(problem, covariances, held, told.coupled(held))
         problem.hold(held, evaluation.parameters)
         evaluation = problem.evaluate(evaluation.values)
         minimum = _minimum(problem, evaluation)
-        covariances = posterior(problem, minimum)
+        covariances = considered(posterior(problem, minimum), changes)
         triangles, _ = run_filter(problem, evaluation)
     found = Minimised(problem, minimum, covariances, held, trial.notes)
     history = as_history(problem, evaluation, held, triangles, {})

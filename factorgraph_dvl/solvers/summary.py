@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import fields
 
 import numpy as np
@@ -20,7 +20,7 @@ from factorgraph_dvl.graph import Evaluation, Problem
 from factorgraph_dvl.preintegration import States, attach, motion_at, segment_ends
 from factorgraph_dvl.sensors.protocol import Motion, Parameter
 from factorgraph_dvl.solution import Estimate, Residuals, Solution, Trajectory, doubts
-from factorgraph_dvl.solvers.covariance import Posterior, SquareRootInformation
+from factorgraph_dvl.solvers.covariance import Posterior
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum
 from factorgraph_dvl.solvers.reported import estimates_of, in_order, in_unit
 
@@ -47,7 +47,7 @@ def summarise(
     chain = problem.chain
     trial = chain.trial
     evaluation = minimum.evaluation
-    estimates, covariance = calibration(problem, evaluation, covariances.information, held)
+    estimates, covariance = calibration(problem, evaluation, covariances, held)
     trajectory = _trajectory(problem, evaluation.states, covariances.nodes, rate_hz)
     residuals = _residuals(problem, minimum)
     warnings = [*notes]
@@ -104,27 +104,48 @@ def reported(
 
 
 def calibration(
-    problem: Problem, evaluation: Evaluation, information: SquareRootInformation, held: Array
+    problem: Problem, evaluation: Evaluation, covariances: Posterior, held: Array
 ) -> tuple[tuple[Estimate, ...], Array]:
     """Return the calibration with its joint covariance, in reported units.
 
     Parameters
     ----------
-    problem, evaluation, information : at the minimum.
+    problem, evaluation, covariances : at the minimum.
     held : as of `summarise`.
     """
     rows = reported(problem, evaluation)
     free = [f for _, _, f in rows if f is not None]
-    joint = information.covariance_of(free)
-    spread = prior_along(problem, held, free)
+    joint = covariances.information.covariance_of(free)
+    spread = prior_along(problem, held, free, covariances.considered)
+    if covariances.considered:
+        # Linear over a hundred degrees, a bias would change by more than its prior allows.
+        prior = np.concatenate([p.sigma / p.si for p, _, f in rows if f is not None])
+        room = np.sqrt(np.maximum(prior**2 - np.diag(joint), 0.0))
+        size = np.maximum(np.linalg.norm(spread, axis=1), room)
+        own = np.concatenate(
+            [np.full(p.mean.size, p.name in problem.columns) for p, _, f in rows if f is not None]
+        )
+        spread *= np.where(own, 1.0, room / np.maximum(size, np.finfo(float).tiny))[:, None]
     joint = joint + spread @ spread.T
     return estimates_of([(p, value) for p, value, _ in rows], joint)
 
 
-def prior_along(problem: Problem, held: Array, functionals: Sequence[dict[int, Array]]) -> Array:
-    """Return a root (n, h) of the prior covariance of functionals along held directions."""
+def prior_along(
+    problem: Problem,
+    held: Array,
+    functionals: Sequence[dict[int, Array]],
+    considered: Mapping[int, Array],
+) -> Array:
+    """Return a root (n, h) of the prior covariance of functionals along held directions.
+
+    Parameters
+    ----------
+    problem, held, functionals : of what.
+    considered : change of other variables with the directions, as of `Posterior`.
+    """
     spread = problem.prior_root @ held
     by_key = {problem.key(name): spread[place] for name, place in problem.columns.items()}
+    by_key |= considered
     parts = []
     for functional in functionals:
         rows = next(iter(functional.values())).shape[0]
