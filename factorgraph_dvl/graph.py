@@ -51,6 +51,8 @@ _TIME_MARGIN = 0.05
 # How far, s, a motion is extrapolated before its measurements are bound anew: 2 Hz sway of
 # 4 deg turns by 3e-6 rad/s otherwise than a straight line in the rate.
 _SAME_TIME = 2e-4
+# Change of a standard deviation, relative, from which on measurements are weighed anew.
+_SAME_WEIGHT = 0.2
 
 _STATE = 9
 _BIAS = 6
@@ -256,6 +258,15 @@ class Problem:
         for bound, motion in zip(self._bound, evaluation.motions, strict=True):
             sigma = bound.observation.sigma(motion, evaluation.parameters)
             bound.weight = np.where(bound.weight > 0.0, 1.0 / sigma, 0.0)
+
+    def misweighed(self, evaluation: Evaluation) -> bool:
+        """Whether standard deviations there are other than those that measurements count by."""
+        for bound, motion in zip(self._bound, evaluation.motions, strict=True):
+            used = bound.weight > 0.0
+            sigma = bound.observation.sigma(motion, evaluation.parameters)[used]
+            if np.any(np.abs(bound.weight[used] * sigma - 1.0) > _SAME_WEIGHT):
+                return True
+        return False
 
     def linearize(self, evaluation: Evaluation) -> gtsam.GaussianFactorGraph:
         """Return the Gaussian graph at an evaluation.

@@ -116,6 +116,12 @@ def test_nominal_directions_three_ways_are_the_same_beams():
     alpha, theta = np.arcsin(root) / DEG, 60.0
     patent = DvlBeamsSettings(alpha_theta_deg=((alpha, theta),) * 4)
     np.testing.assert_allclose(patent.nominal_d, vectors, atol=1e-14)
+    # A Janus in +: beams 1 and 3 are in the xz plane, where rounding may go beyond it.
+    for slant in np.arange(5.0, 60.0):
+        plus = DvlBeamsSettings(alpha_theta_deg=((slant, 90 - slant), (0, 90 - slant)) * 2)
+        s, c = np.sin(slant * DEG), np.cos(slant * DEG)
+        by_hand = [[s, 0, -c], [0, s, -c], [-s, 0, -c], [0, -s, -c]]
+        np.testing.assert_allclose(plus.nominal_d, by_hand, atol=1e-7)
     given = DvlBeamsSettings(directions=tuple(map(tuple, (1.002 * vectors).tolist())))
     np.testing.assert_allclose(given.nominal_d, vectors, atol=1e-15)
 
@@ -408,6 +414,17 @@ def test_beams_lost_for_good_leave_the_others(lost):
     np.testing.assert_array_equal(np.isfinite(residual.sigma), np.isfinite(residual.residual))
 
 
+def test_noise_in_proportion_to_velocity_leaves_the_scales_alone():
+    base = msgspec.to_builtins(noisy().dvl_beams) | {"velocity_std_fraction": 0.05}
+    errors = []
+    for seed in range(6):
+        trial = simulate(noisy(dvl_beams=base), seed)
+        found = solve(trial, rate_hz=1.0).estimate("beam_scale_error")
+        errors.append((found.value - SCALES) / found.std)
+    # By the measured velocities they would be 0.005 too small, 1.4 sigma each.
+    assert abs(np.mean(errors)) < 2.5 / np.sqrt(np.size(errors))
+
+
 def test_a_beam_that_was_never_received_is_named():
     trial = simulate(noisy(), 1)
     trial.beams.velocity[:, 2] = np.nan
@@ -416,6 +433,10 @@ def test_a_beam_that_was_never_received_is_named():
     assert seen.tolist() == [True] * 4 + [False] * 2 + [True] * 2
     said = "beam_direction_3x_deg, beam_direction_3y_deg not observable: beam 3 was never received"
     assert any(w.startswith(said) for w in solution.warnings)
+    trial.beams.velocity[:, 0] = np.nan
+    for i in (1, 3):
+        said = f"beam_direction_{i}x_deg, beam_direction_{i}y_deg not observable: beam {i} was"
+        assert any(w.startswith(said) for w in solve(trial).warnings)
 
 
 def test_the_common_mounting_is_found_from_anywhere():
@@ -444,6 +465,39 @@ def test_the_common_mounting_is_found_from_anywhere():
     assert dof == 7
     assert nees < chi2.ppf(0.999, dof)
     np.testing.assert_allclose(solution.estimate("misalignment_deg").value, mounting, atol=0.3)
+
+
+def test_a_common_mounting_that_is_far_off_does_not_mislead_poor_gyros():
+    imu = {"gyro_noise_deg_sqrt_h": 0.15, "accel_noise_ug_sqrt_hz": 60}
+    imu |= {"gyro_bias_deg_h": "draw", "accel_bias_ug": "draw"}
+    bias = {"gyro_bias_std_deg_h": 20, "accel_bias_std_ug": 2000}
+    claims = {
+        "imu": bias,
+        "dvl": None,
+        "dvl_beams": {"parametrisation": "common", "misalignment_std_deg": [180, 180, 180]}
+        | {"misalignment_deg": [0, 0, 0]},
+    }
+    truth = {"rate_hz": 5, "slant_azimuth_deg": JANUS_X, "misalignment_deg": [170, 0, 0]}
+    truth |= {"scale_error": [0.01] * 4, "velocity_std_m_s": 0.005}
+    truth |= {"lever_arm_m": [1.0, -1.2, 1.4]}
+    gnss = {"rate_hz": 1, "position_std_m": [2, 2, 4], "velocity_std_m_s": [0.3, 0.3, 0.3]}
+    gnss |= {"lever_arm_m": [0.3, -1.5, 4.0]}
+    parts = [{"straight_s": 20}, {"turn_deg_s": 6, "duration_s": 30, "ramp_s": 4}]
+    parts += [{"straight_s": 60}, {"accelerate_m_s2": -0.1, "to_m_s": 2.5}, {"straight_s": 60}]
+    parts += [{"turn_deg_s": -4, "duration_s": 30, "ramp_s": 4}, {"straight_s": 60}]
+    changes = {
+        "imu": imu | bias,
+        "gnss": gnss,
+        "dvl_beams": truth,
+        "turntable": None,
+        "trial": claims,
+    }
+    for seed in (2, 4):
+        trial = simulate(noisy(manoeuvres=parts, **changes), seed)
+        solution = solve(trial, rate_hz=1.0)
+        assert solution.converged
+        nees, dof = nees_of(solution, trial.calibration_truth)
+        assert nees < chi2.ppf(0.999, dof)
 
 
 def test_beams_beside_a_dvl_have_names_of_their_own():

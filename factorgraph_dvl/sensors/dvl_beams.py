@@ -41,6 +41,7 @@ Acute = Annotated[float, msgspec.Meta(ge=0, le=90)]
 _LEAST_SPREAD = 0.05
 _UNIT = 0.05
 _LEAST_SIGMA = 1e-4
+_ROUNDING = 1e-12
 # Signs of x and y in the octants V to VIII, below the plane of x and y.
 _OCTANTS = np.array([[1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0], [1.0, -1.0]])
 
@@ -114,10 +115,12 @@ class DvlBeamsSettings(SensorSection, frozen=True, kw_only=True):
         alpha, theta = np.array(self.alpha_theta_deg).reshape(-1, 2).T * DEG
         if alpha.size != 4:
             raise ValueError("`alpha_theta_deg` must hold four beams, in octants V to VIII")
-        if np.any(alpha + theta > 90.0 * DEG):
+        # A beam in the xz plane may be beyond it by rounding.
+        y2 = np.cos(alpha + theta) * np.cos(alpha - theta)
+        if np.any(y2 < -_ROUNDING):
             raise ValueError("`alpha_theta_deg` must not add up to more than 90 deg")
         x, z = np.sin(alpha), -np.sin(theta)
-        y = np.sqrt(1.0 - x**2 - z**2)
+        y = np.sqrt(np.maximum(y2, 0.0))
         return np.stack([_OCTANTS[:, 0] * x, _OCTANTS[:, 1] * y, z], axis=1)
 
     @property
@@ -261,8 +264,9 @@ class DvlBeams:
         )
         lost = np.isnan(self.velocity[m])
         measured = np.where(lost, 0.0, self.velocity[m])
-        std = np.where(lost, np.inf, self.sigma()[m])
-        return (BeamVelocity(self.time[m], measured, std, geometry, lever_arm),)
+        s = self.settings
+        noise = (s.velocity_std_m_s, s.velocity_std_fraction)
+        return (BeamVelocity(self.time[m], measured, lost, noise, geometry, lever_arm),)
 
     def explain(self, parameter: str, component: int, motion: Motion | None) -> str:
         """Say why a component could not be observed, given the motion of the trial."""
@@ -301,14 +305,16 @@ class BeamVelocity:
     ----------
     time : (M,) s.
     measured : (M, N) m/s; any number where lost.
-    std : (M, N) m/s, infinite where lost.
+    lost : (M, N) bool.
+    noise : floor, m/s, and fraction of the beam's velocity.
     geometry : directions and scales.
     lever_arm : name of the parameter.
     """
 
     time: Array
     measured: Array
-    std: Array
+    lost: Array
+    noise: tuple[float, float]
     geometry: Geometry
     lever_arm: str
     label: str = "Beam velocity"
@@ -329,8 +335,16 @@ class BeamVelocity:
         return self.time
 
     def sigma(self, motion: Motion, values: Values) -> Array:
-        """Return the standard deviations, the gyro's share through the lever arm included."""
-        return np.hypot(self.std, lever_arm_sigma(motion, values[self.lever_arm])[:, None])
+        """Return the standard deviations, the gyro's share through the lever arm included.
+
+        By the predicted velocity: by the measured one, pings whose noise makes them smaller
+        would count more, and the scale would come out too small by twice the squared fraction.
+        """
+        floor, fraction = self.noise
+        predicted = self.residual(motion, values) + self.measured
+        std = np.maximum(np.hypot(floor, fraction * predicted), _LEAST_SIGMA)
+        std = np.hypot(std, lever_arm_sigma(motion, values[self.lever_arm])[:, None])
+        return np.where(self.lost, np.inf, std)
 
     def residual(self, motion: Motion, values: Values) -> Array:
         """Return predicted - measured, (M, N), m/s."""

@@ -177,7 +177,8 @@ def fit(
         iterations += minimum.iterations
         states, values = minimum.evaluation.states, minimum.evaluation.parameters
         same_gravity = np.sqrt(np.mean((states.p_n - p_gravity) ** 2)) <= _SAME_GRAVITY
-        if same_gravity and not problem.strayed(values):
+        settled = not (problem.strayed(values) or problem.misweighed(minimum.evaluation))
+        if same_gravity and settled:
             break
     return problem, replace(minimum, iterations=iterations), tuple(notes)
 
@@ -194,6 +195,8 @@ def _without_dvl(
     """Return the minimum without the sensors whose mounting that is to tell."""
     trial = chain.trial
     unknown = {a.mounting.name for a in attitudes(trial, chain.frame)} - mountings.keys()
+    if trial.beams is not None:
+        unknown |= {p.name for p in trial.beams.parameters() if p.rotation and p.estimated}
     used = [
         aid
         for aid in trial.aids

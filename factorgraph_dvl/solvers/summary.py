@@ -281,16 +281,21 @@ def _unobservable(
         bad = np.flatnonzero(~e.observable & (e.prior_std > 0.0))
         if bad.size == 0 or e.name in calibrated:
             continue
-        names = ", ".join(e.component_names[i] for i in bad)
         if e.name in by_name:
-            why = by_name[e.name].explain(e.name, int(bad[0]), seen.get(e.name))
+            motion = seen.get(e.name)
+            reasons = [by_name[e.name].explain(e.name, int(i), motion) for i in bad]
         elif trial.gnss is None:
             why = "without GNSS nothing separates the errors of the IMU from the motion"
+            reasons = [why] * bad.size
         else:
             why = (
                 f"{duration:.0f} s with these manoeuvres do not tell it better than the prior; "
                 "it takes longer, or turns and changes of speed"
             )
+            reasons = [why] * bad.size
         missing = "; the trial has no GNSS" if trial.gnss is None and e.name in by_name else ""
-        out.append(f"{names} not observable: {why}{missing}")
+        for why in dict.fromkeys(reasons):
+            same = [i for i, reason in zip(bad, reasons, strict=True) if reason == why]
+            names = ", ".join(e.component_names[i] for i in same)
+            out.append(f"{names} not observable: {why}{missing}")
     return out
