@@ -225,7 +225,9 @@ class Dvl:
         m = self.locked
         if not m.any():
             return ()
-        return (DvlVelocity(self.time[m], self.velocity[m], self.sigma()[m]),)
+        s = self.settings
+        noise = (s.velocity_std_m_s, s.velocity_std_fraction)
+        return (DvlVelocity(self.time[m], self.velocity[m], self.std[m], noise),)
 
     def explain(self, parameter: str, component: int, motion: Motion | None) -> str:
         """Say why a component could not be observed, given the motion of the trial."""
@@ -277,12 +279,14 @@ class DvlVelocity:
     ----------
     time : (M,) s, as in the file.
     measured_d : (M, 3) m/s.
-    std : (M, 3) m/s.
+    std : (M, 3) m/s; nan where it follows from `noise`.
+    noise : floor, m/s, and fraction of the speed.
     """
 
     time: Array
     measured_d: Array
     std: Array
+    noise: tuple[float, float] = (0.0, 0.0)
     label: str = "DVL velocity"
     unit: str = "m/s"
     components: tuple[str, ...] = ("x", "y", "z")
@@ -300,8 +304,17 @@ class DvlVelocity:
         return self.time - values[TIME_OFFSET][0]
 
     def sigma(self, motion: Motion, values: Values) -> Array:
-        """Return the standard deviations, the gyro's share through the lever arm included."""
-        return np.hypot(self.std, lever_arm_sigma(motion, values[LEVER_ARM])[:, None])
+        """Return the standard deviations, the gyro's share through the lever arm included.
+
+        By the predicted speed: by the measured one, pings whose noise makes them smaller
+        would count more, and the scale would come out too small by twice the squared fraction.
+        """
+        floor, fraction = self.noise
+        predicted = self.residual(motion, values) + self.measured_d
+        speed = np.linalg.norm(predicted, axis=1, keepdims=True)
+        std = np.where(np.isnan(self.std), np.hypot(floor, fraction * speed), self.std)
+        std = np.maximum(std, _LEAST_SIGMA)
+        return np.hypot(std, lever_arm_sigma(motion, values[LEVER_ARM])[:, None])
 
     def residual(self, motion: Motion, values: Values) -> Array:
         """Return predicted - measured in d, (M, 3), m/s."""
