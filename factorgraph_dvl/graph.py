@@ -32,7 +32,16 @@ from factorgraph_dvl.preintegration import (
     motion_at,
     slid,
 )
-from factorgraph_dvl.priors import add_priors, away, prior_mean, prior_root, pull, value_at
+from factorgraph_dvl.priors import (
+    Known,
+    add_priors,
+    away,
+    joint_pull,
+    prior_mean,
+    prior_root,
+    pull,
+    value_at,
+)
 from factorgraph_dvl.sensors.protocol import Linearization, Motion, Observation, Parameter
 
 # Standard deviation that stands for zero in a held direction, in those of the prior.
@@ -104,6 +113,7 @@ class Problem:
     observations : of the aiding sensors.
     parameters : of the aiding sensors, fixed ones included.
     start : values of parameters, where they are known better than by their priors.
+    known : what stands in place of the priors; the chain then has none of the biases.
     """
 
     def __init__(
@@ -112,6 +122,7 @@ class Problem:
         observations: Sequence[Observation],
         parameters: Sequence[Parameter],
         start: dict[str, Array] | None = None,
+        known: Known | None = None,
     ) -> None:
         self.chain = chain
         self.all_parameters = tuple(parameters)
@@ -119,7 +130,10 @@ class Problem:
         self._key = {p.name: keys.calibration(i) for i, p in enumerate(self.parameters)}
         self._fixed = {p.name: prior_mean(p) for p in parameters if not p.estimated}
         self.graph = gtsam.NonlinearFactorGraph(chain.graph)
-        add_priors(self.graph, self.parameters, self._key)
+        if known is None:
+            add_priors(self.graph, self.parameters, self._key)
+        else:
+            self.graph.add(joint_pull(known, chain.bias_key(0), self.parameters, self._key))
         self.uncovered: dict[str, int] = {}
         self._start = {**self.prior_values(), **(start or {})}
         self._bound: list[_Bound] = []

@@ -10,7 +10,7 @@ import msgspec
 import numpy as np
 from msgspec import UNSET, UnsetType
 
-from factorgraph_dvl.conventions import DEG, Array, rotate, skew
+from factorgraph_dvl.conventions import DEG, Array, cross, rotate, skew
 from factorgraph_dvl.earth import LocalFrame
 from factorgraph_dvl.errors import ConfigError
 from factorgraph_dvl.sensors.protocol import (
@@ -338,8 +338,8 @@ class DvlVelocity:
             # d/dt of (bRn (v_n - c_n) + omega x l), against the direction of the offset.
             rate_b = (
                 rotate(bRn, motion.a_n)
-                - np.cross(motion.omega_eb_b, imu_b)
-                + np.cross(motion.alpha_b, lever_arm)
+                - cross(motion.omega_eb_b, imu_b)
+                + cross(motion.alpha_b, lever_arm)
             )
             return -(rate_b @ dMb.T)[:, :, None]
 
@@ -375,4 +375,4 @@ def _velocity_at_dvl(motion: Motion, values: Values) -> tuple[Array, Array]:
     """Return the velocities of DVL and IMU, relative to bottom or water, in body, (M, 3)."""
     current_n = np.append(values[CURRENT], 0.0)
     imu_b = rotate(motion.nRb.transpose(0, 2, 1), motion.v_n - current_n)
-    return imu_b + np.cross(motion.omega_eb_b, values[LEVER_ARM]), imu_b
+    return imu_b + cross(motion.omega_eb_b, values[LEVER_ARM]), imu_b

@@ -17,6 +17,7 @@ from factorgraph_dvl.graph import Problem
 from factorgraph_dvl.increments import increments
 from factorgraph_dvl.mounting import calibrated, initial_values
 from factorgraph_dvl.preintegration import Segments, States, attach, motion_at, segments
+from factorgraph_dvl.priors import Known
 from factorgraph_dvl.sensors.protocol import Aid, Motion, Observation, Parameter
 from factorgraph_dvl.solution import Solution
 from factorgraph_dvl.solvers.covariance import Posterior, changes_with, considered, posterior
@@ -110,39 +111,7 @@ def minimised(
     """Minimise the problem of a trial; arguments and errors as of `solve`."""
     _check_above_zero("state_interval_s", state_interval_s)
     report = progress or (lambda stage, iteration, cost: None)
-    frame = trial.frame()
-    report("increments", 0, None)
-    inc, gaps = increments(trial.imu)
-    seg = segments(inc, state_interval_s, dense_epochs(trial, frame, state_interval_s))
-    report("alignment", 0, None)
-    start = initial_states(trial, frame, seg)
-    notes = [*trial.notes, *gaps, *start.notes]
-    notes += [doubt for seen in attitudes(trial, frame) for doubt in seen.doubts]
-
-    states, values = start.states, None
-    iterations = 0
-    p_gravity = np.full_like(states.p_n, np.inf)
-    for _ in range(_ROUNDS):
-        if np.sqrt(np.mean((states.p_n - p_gravity) ** 2)) > _SAME_GRAVITY:
-            chain, p_gravity = inertial_chain(trial, frame, seg, states), states.p_n
-        if values is None:
-            # A DVL that is calibrated does no harm from the start.
-            known = trial.dvl is not None and calibrated(trial.dvl)
-            if trial.gnss is not None and not known:
-                coarse = _without_dvl(chain, states, start.mountings, report)
-                iterations += coarse.iterations
-                states = coarse.evaluation.states
-            report("mounting", 0, None)
-            values = start.mountings | _mountings(trial, frame, seg, chain.gravity_n, states)
-        problem = Problem(chain, *_sensors(trial.aids, frame), start=values)
-        at = problem.values(states, {**problem.prior_values(), **values})
-        minimum = minimise(problem, at, stage="all sensors", progress=report)
-        iterations += minimum.iterations
-        states, values = minimum.evaluation.states, minimum.evaluation.parameters
-        same_gravity = np.sqrt(np.mean((states.p_n - p_gravity) ** 2)) <= _SAME_GRAVITY
-        settled = not (problem.strayed(values) or problem.misweighed(minimum.evaluation))
-        if same_gravity and settled:
-            break
+    problem, minimum, notes = fit(trial, state_interval_s=state_interval_s, progress=report)
     report("covariance", 0, None)
     covariances = posterior(problem, minimum)
     told = told_of(problem, minimum, covariances)
@@ -152,14 +121,66 @@ def minimised(
         changes = changes_with(problem, covariances, held, told.coupled(held))
         origin = at_prior_along(problem, minimum.evaluation.parameters, held)
         problem.hold(held, origin)
-        at = problem.values(states, origin)
-        minimum = minimise(
+        at = problem.values(minimum.evaluation.states, origin)
+        again = minimise(
             problem, at, stage="all sensors, without what they cannot tell", progress=report
         )
-        iterations += minimum.iterations
+        minimum = replace(again, iterations=minimum.iterations + again.iterations)
         covariances = considered(posterior(problem, minimum), changes)
-    minimum = replace(minimum, iterations=iterations)
-    return Minimised(problem, minimum, covariances, held, tuple(notes))
+    return Minimised(problem, minimum, covariances, held, notes)
+
+
+def fit(
+    trial: Trial, *, state_interval_s: float, progress: Progress, known: Known | None = None
+) -> tuple[Problem, Minimum, tuple[str, ...]]:
+    """Find the minimum of a trial's cost, from nothing but its data.
+
+    Parameters
+    ----------
+    trial, state_interval_s : as for `solve`.
+    progress : called with stage, iteration and cost.
+    known : of biases and calibration, in place of the trial's priors.
+
+    Returns
+    -------
+    problem, minimum, notes : what was minimised, where it ended, what the user must know.
+    """
+    frame = trial.frame()
+    progress("increments", 0, None)
+    inc, gaps = increments(trial.imu)
+    seg = segments(inc, state_interval_s, dense_epochs(trial, frame, state_interval_s))
+    progress("alignment", 0, None)
+    start = initial_states(trial, frame, seg)
+    notes = [*trial.notes, *gaps, *start.notes]
+    notes += [doubt for seen in attitudes(trial, frame) for doubt in seen.doubts]
+
+    states = start.states
+    values = None if known is None else known.parameters
+    iterations = 0
+    p_gravity = np.full_like(states.p_n, np.inf)
+    for _ in range(_ROUNDS):
+        if np.sqrt(np.mean((states.p_n - p_gravity) ** 2)) > _SAME_GRAVITY:
+            chain = inertial_chain(trial, frame, seg, states, bias_prior=known is None)
+            p_gravity = states.p_n
+        if values is None:
+            # A DVL that is calibrated does no harm from the start.
+            mounted = trial.dvl is not None and calibrated(trial.dvl)
+            if trial.gnss is not None and not mounted:
+                coarse = _without_dvl(chain, states, start.mountings, progress)
+                iterations += coarse.iterations
+                states = coarse.evaluation.states
+            progress("mounting", 0, None)
+            values = start.mountings | _mountings(trial, frame, seg, chain.gravity_n, states)
+        problem = Problem(chain, *_sensors(trial.aids, frame), start=values, known=known)
+        at = problem.values(states, {**problem.prior_values(), **values})
+        minimum = minimise(problem, at, stage="all sensors", progress=progress)
+        iterations += minimum.iterations
+        states, values = minimum.evaluation.states, minimum.evaluation.parameters
+        same_gravity = np.sqrt(np.mean((states.p_n - p_gravity) ** 2)) <= _SAME_GRAVITY
+        settled = not (problem.strayed(values) or problem.misweighed(minimum.evaluation))
+        if same_gravity and settled:
+            break
+    return problem, replace(minimum, iterations=iterations), tuple(notes)
 
 
 def _check_above_zero(name: str, value: float) -> None:

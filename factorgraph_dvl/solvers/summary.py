@@ -12,9 +12,7 @@ from factorgraph_dvl import keys
 from factorgraph_dvl.conventions import (
     Array,
     exp_so3,
-    inverse_right_jacobian,
     log_so3,
-    reported_rotation_vector,
     rotate,
     rph_from_rotation,
     rph_jacobian,
@@ -32,13 +30,7 @@ from factorgraph_dvl.solution import (
 )
 from factorgraph_dvl.solvers.covariance import Posterior
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum
-
-# The data observed a component if they at least halved what was unknown of it.
-_OBSERVABLE = 0.5
-_FIRST = (
-    *("beam_direction", "beam_scale_error", "misalignment", "scale_error", "lever_arm"),
-    *("gyro_bias", "accel_bias"),
-)
+from factorgraph_dvl.solvers.reported import estimates_of, in_order, in_unit
 
 
 def summarise(
@@ -113,17 +105,10 @@ def reported(
         )
         rows.append((parameter, weight @ bias / parameter.si, functional))
     for p in problem.all_parameters:
-        value = evaluation.parameters[p.name]
-        derivative = np.eye(p.mean.size)
-        if p.rotation:
-            value = reported_rotation_vector(value, p.mean)
-            derivative = inverse_right_jacobian(value)
-        if p.estimated:
-            rows.append((p, value / p.si, {problem.key(p.name): derivative / p.si}))
-        elif p.stem in _FIRST:
-            rows.append((p, value / p.si, None))
-    rows.sort(key=lambda r: _FIRST.index(r[0].stem) if r[0].stem in _FIRST else len(_FIRST))
-    return rows
+        row = in_unit(p, evaluation.parameters[p.name])
+        own = {problem.key(p.name): row.derivative} if p.estimated else None
+        rows.append((p, row.value, own))
+    return in_order(rows, lambda r: r[0])
 
 
 def calibration(
@@ -150,31 +135,7 @@ def calibration(
         )
         spread *= np.where(own, 1.0, room / np.maximum(size, np.finfo(float).tiny))[:, None]
     joint = joint + spread @ spread.T
-    total = sum(p.mean.size for p, _, _ in rows)
-    covariance = np.zeros((total, total))
-    is_free = np.concatenate([np.full(p.mean.size, f is not None) for p, _, f in rows])
-    covariance[np.ix_(is_free, is_free)] = joint
-    known = np.concatenate([p.sigma == 0.0 for p, _, _ in rows])
-    covariance[known] = covariance[:, known] = 0.0
-    std = np.sqrt(np.diag(covariance))
-    estimates, at = [], 0
-    for p, value, _ in rows:
-        own = std[at : at + p.mean.size]
-        at += p.mean.size
-        prior = p.sigma / p.si
-        estimates.append(
-            Estimate(
-                name=p.name,
-                component_names=p.component_names,
-                value=np.array(value),
-                std=own,
-                prior_value=p.mean / p.si,
-                prior_std=prior,
-                observable=(prior > 0.0) & (own <= _OBSERVABLE * prior),
-                nominal=p.nominal,
-            )
-        )
-    return tuple(estimates), covariance
+    return estimates_of([(p, value) for p, value, _ in rows], joint)
 
 
 def prior_along(
