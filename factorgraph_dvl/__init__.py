@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from factorgraph_dvl.io.solution_folder import load_solution, save_solution
     from factorgraph_dvl.io.trial_folder import load_trial, save_trial
+    from factorgraph_dvl.replay.session import Replay
     from factorgraph_dvl.simulation import simulate
     from factorgraph_dvl.solution import Solution
     from factorgraph_dvl.solvers.batch import solve
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
 __version__ = version("factorgraph-dvl")
 
 _PUBLIC = {
+    "Replay": "factorgraph_dvl.replay.session",
     "Solution": "factorgraph_dvl.solution",
     "Trial": "factorgraph_dvl.trial",
     "load_solution": "factorgraph_dvl.io.solution_folder",
@@ -39,6 +41,7 @@ _PUBLIC = {
 }
 
 __all__ = [
+    "Replay",
     "Solution",
     "Trial",
     "load_solution",

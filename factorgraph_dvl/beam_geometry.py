@@ -89,8 +89,11 @@ def groups(gain: Array) -> list[tuple[int, int, int]]:
 
 def group_velocities(gain: Array, beams: Array) -> Array:
     """Return the velocity of each group of three beams, (M, G, 3), m/s; nan where one is lost."""
-    inverse = [(list(g), np.linalg.inv(gain[list(g)])) for g in groups(gain)]
-    return np.stack([beams[:, g] @ A.T for g, A in inverse], axis=1)
+    found = groups(gain)
+    out = np.empty((len(beams), len(found), 3))
+    for i, g in enumerate(found):
+        out[:, i] = beams[:, g] @ np.linalg.inv(gain[list(g)]).T
+    return out
 
 
 def as_dvl(beams: DvlBeams, calibration: tuple[Array, Array, Array] | None = None) -> Dvl:

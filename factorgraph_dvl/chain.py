@@ -65,7 +65,9 @@ class Chain:
         return keys.bias(k if self.walking else 0)
 
 
-def inertial_chain(trial: Trial, frame: LocalFrame, seg: Segments, start: States) -> Chain:
+def inertial_chain(
+    trial: Trial, frame: LocalFrame, seg: Segments, start: States, *, bias_prior: bool = True
+) -> Chain:
     """Return the inertial part of the graph, with gravity at the positions of `start`."""
     middle = 0.5 * (start.p_n[seg.origin] + start.p_n[seg.origin + 1])
     gravity_n = frame.gravity_without_rotation(middle)
@@ -77,7 +79,9 @@ def inertial_chain(trial: Trial, frame: LocalFrame, seg: Segments, start: States
         graph.add(gtsam.GalileanImuFactor2(keys.node(k), keys.node(k + 1), chain.bias_key(k), pim))
     gyro, accel = trial.imu.parameters(0.0)
     sigmas = np.concatenate([accel.sigma, gyro.sigma])
-    graph.addPriorConstantBias(keys.bias(0), gtsam.imuBias.ConstantBias(), loose_diagonal(sigmas))
+    if bias_prior:
+        none = gtsam.imuBias.ConstantBias()
+        graph.addPriorConstantBias(keys.bias(0), none, loose_diagonal(sigmas))
     if chain.walking:
         root_psd = np.repeat(
             [settings.accel_bias_walk_root_psd, settings.gyro_bias_walk_root_psd], 3

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import pymap3d
@@ -78,7 +79,11 @@ class LocalFrame:
     height: float
     epoch: str = ""
 
-    @property
+    @cached_property
+    def _enu_from_ecef(self) -> Array:
+        return enu_from_ecef(self.lat, self.lon)
+
+    @cached_property
     def earth_rate(self) -> Array:
         """Earth rotation resolved in n, (3,), rad/s."""
         return RATE * np.array([0.0, np.cos(self.lat), np.sin(self.lat)])
@@ -100,7 +105,7 @@ class LocalFrame:
 
     def level_from_tangent(self, lat: ArrayLike, lon: ArrayLike) -> Array:
         """Return the (..., 3, 3) rotation from n to the local-level ENU at lat, lon (rad)."""
-        return enu_from_ecef(lat, lon) @ enu_from_ecef(self.lat, self.lon).T
+        return enu_from_ecef(lat, lon) @ self._enu_from_ecef.T
 
     def gravity(self, p_n: ArrayLike) -> Array:
         """Return gravity at positions (..., 3) in n, resolved in n, m/s²."""

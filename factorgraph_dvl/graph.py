@@ -32,7 +32,16 @@ from factorgraph_dvl.preintegration import (
     motion_at,
     slid,
 )
-from factorgraph_dvl.priors import add_priors, away, prior_mean, prior_root, pull, value_at
+from factorgraph_dvl.priors import (
+    Known,
+    add_priors,
+    away,
+    joint_pull,
+    prior_mean,
+    prior_root,
+    pull,
+    value_at,
+)
 from factorgraph_dvl.sensors.protocol import Linearization, Motion, Observation, Parameter
 
 # Standard deviation that stands for zero in a held direction, in those of the prior.
@@ -42,6 +51,8 @@ _TIME_MARGIN = 0.05
 # How far, s, a motion is extrapolated before its measurements are bound anew: 2 Hz sway of
 # 4 deg turns by 3e-6 rad/s otherwise than a straight line in the rate.
 _SAME_TIME = 2e-4
+# Change of a standard deviation, relative, from which on measurements are weighed anew.
+_SAME_WEIGHT = 0.2
 
 _STATE = 9
 _BIAS = 6
@@ -102,6 +113,7 @@ class Problem:
     observations : of the aiding sensors.
     parameters : of the aiding sensors, fixed ones included.
     start : values of parameters, where they are known better than by their priors.
+    known : what stands in place of the priors; the chain then has none of the biases.
     """
 
     def __init__(
@@ -110,6 +122,7 @@ class Problem:
         observations: Sequence[Observation],
         parameters: Sequence[Parameter],
         start: dict[str, Array] | None = None,
+        known: Known | None = None,
     ) -> None:
         self.chain = chain
         self.all_parameters = tuple(parameters)
@@ -117,7 +130,10 @@ class Problem:
         self._key = {p.name: keys.calibration(i) for i, p in enumerate(self.parameters)}
         self._fixed = {p.name: prior_mean(p) for p in parameters if not p.estimated}
         self.graph = gtsam.NonlinearFactorGraph(chain.graph)
-        add_priors(self.graph, self.parameters, self._key)
+        if known is None:
+            add_priors(self.graph, self.parameters, self._key)
+        else:
+            self.graph.add(joint_pull(known, chain.bias_key(0), self.parameters, self._key))
         self.uncovered: dict[str, int] = {}
         self.rejected: Mapping[str, Array] = {}
         self._start = {**self.prior_values(), **(start or {})}
@@ -270,6 +286,15 @@ class Problem:
         for bound, motion in zip(self._bound, evaluation.motions, strict=True):
             sigma = bound.observation.sigma(motion, evaluation.parameters)
             bound.weight = np.where(bound.weight > 0.0, 1.0 / sigma, 0.0)
+
+    def misweighed(self, evaluation: Evaluation) -> bool:
+        """Whether standard deviations there are other than those that measurements count by."""
+        for bound, motion in zip(self._bound, evaluation.motions, strict=True):
+            used = bound.weight > 0.0
+            sigma = bound.observation.sigma(motion, evaluation.parameters)[used]
+            if np.any(np.abs(bound.weight[used] * sigma - 1.0) > _SAME_WEIGHT):
+                return True
+        return False
 
     def linearize(self, evaluation: Evaluation) -> gtsam.GaussianFactorGraph:
         """Return the Gaussian graph at an evaluation.

@@ -26,6 +26,7 @@ from factorgraph_dvl.polynomials import (
     integrate,
     interpolation,
     rate_and_slope,
+    regular_interpolation,
 )
 from factorgraph_dvl.sensors.imu import Imu
 from factorgraph_dvl.signals import Smoothed, as_it_is, smooth
@@ -91,6 +92,7 @@ class Increments:
     open_sigma : (N, 6) standard deviation of the mean rate and force over an interval where
         the samples leave it open: lost ones, or a step between two of them; else 0.
     gyro_sigma, accel_sigma : standard deviation of one sample from its noise, SI.
+    windows : samples over which rate and force are smoothed; None = chosen from the record.
     """
 
     start: Array
@@ -102,6 +104,7 @@ class Increments:
     open_sigma: Array
     gyro_sigma: float
     accel_sigma: float
+    windows: tuple[int, int] | None = None
 
     @cached_property
     def arc_of(self) -> IntArray:
@@ -166,6 +169,12 @@ class Increments:
             force_sigma=force_sigma,
         )
 
+    @property
+    def chosen_windows(self) -> tuple[int, int]:
+        """Samples over which rate and force of the last arc are smoothed; 0 = not at all."""
+        rate, force = self._smoothed[-1]
+        return rate.window, force.window
+
     @cached_property
     def _smoothed(self) -> tuple[tuple[Smoothed, Smoothed], ...]:
         """Rate and force of each arc, smoothed where their noise asks for it."""
@@ -179,12 +188,12 @@ class Increments:
             values = self.samples[base : base + time.size]
             regular = np.abs(steps / dt - 1.0).max() < _UNIFORM
             pair = []
-            for signal, sigma in (
-                (values[:, :3], self.gyro_sigma),
-                (values[:, 3:], self.accel_sigma),
+            for i, (signal, sigma) in enumerate(
+                ((values[:, :3], self.gyro_sigma), (values[:, 3:], self.accel_sigma))
             ):
+                window = None if self.windows is None else self.windows[i]
                 pair.append(
-                    smooth(time, signal, dt, sigma, averaged=self.averaged)
+                    smooth(time, signal, dt, sigma, averaged=self.averaged, window=window)
                     if regular
                     else as_it_is(dt, sigma)
                 )
@@ -286,8 +295,8 @@ class Increments:
         out = np.empty((index.size, width, 6))
         for shift in np.unique(offset[uniform]):
             pick = uniform & (offset == shift)
-            edges = np.arange(lengths.shape[1] + 1, dtype=float) - shift
-            out[pick] = np.matmul(interpolation(edges[None], self.averaged)[0], values[pick])
+            matrix = regular_interpolation(lengths.shape[1] + 1, int(shift), self.averaged)
+            out[pick] = np.matmul(matrix, values[pick])
         rest = np.flatnonzero(~uniform)
         if rest.size:
             edges = np.zeros((rest.size, lengths.shape[1] + 1))
@@ -297,8 +306,15 @@ class Increments:
         return out
 
 
-def increments(imu: Imu) -> tuple[Increments, tuple[str, ...]]:
+def increments(
+    imu: Imu, windows: tuple[int, int] | None = None
+) -> tuple[Increments, tuple[str, ...]]:
     """Return increments between the samples of an IMU, and what had to be bridged.
+
+    Parameters
+    ----------
+    imu : Imu
+    windows : see `Increments`.
 
     Returns
     -------
@@ -386,6 +402,7 @@ def increments(imu: Imu) -> tuple[Increments, tuple[str, ...]]:
         open_sigma=np.concatenate(fill),
         gyro_sigma=imu.settings.gyro_noise_root_psd / np.sqrt(dt),
         accel_sigma=imu.settings.accel_noise_root_psd / np.sqrt(dt),
+        windows=windows,
     )
     if not averaged:
         noise = np.repeat([out.gyro_sigma, out.accel_sigma], 3)

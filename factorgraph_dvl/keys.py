@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from gtsam.symbol_shorthand import B, C, X
+from gtsam import symbol
+from gtsam.symbol_shorthand import B, X
 
 
 def node(k: int) -> int:
@@ -16,5 +17,8 @@ def bias(k: int) -> int:
 
 
 def calibration(i: int) -> int:
-    """Return the key of calibration parameter i."""
-    return int(C(i))
+    """Return the key of calibration parameter i, which has a letter of its own.
+
+    iSAM2's thresholds go by letters, and must have the dimension of the variable.
+    """
+    return int(symbol(chr(ord("A") + i), 0))

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from math import factorial
 
 import numpy as np
 
-from factorgraph_dvl.conventions import Array
+from factorgraph_dvl.conventions import Array, cross
 
 _GAUSS_NODES = np.array([0.5 - np.sqrt(15.0) / 10.0, 0.5, 0.5 + np.sqrt(15.0) / 10.0])
 _GAUSS_WEIGHTS = np.array([5.0, 8.0, 5.0]) / 18.0
@@ -44,6 +45,13 @@ def interpolation(edges: Array, averaged: bool) -> Array:
     return np.asarray(np.linalg.inv(rows))
 
 
+@lru_cache(maxsize=64)
+def regular_interpolation(count: int, shift: int, averaged: bool) -> Array:
+    """Return `interpolation` (K, K) at `count` edges one apart, from -shift on."""
+    edges = np.arange(count, dtype=float) - shift
+    return interpolation(edges[None], averaged)[0]
+
+
 def evaluate(c: Array, u: Array | float) -> Array:
     """Return polynomials c (M, K, 6) at u (M,) or scalar."""
     u = np.asarray(u)[..., None]
@@ -77,9 +85,9 @@ def integrate(c: Array, dt: Array, u: Array | float) -> tuple[Array, Array]:
     a2 = (np.sqrt(15.0) / 3.0) * h * (w3 - w1)
     a3 = (10.0 / 3.0) * h * (w3 - 2.0 * w2 + w1)
     # R' = R [w x] mirrors the textbook's Y' = A Y: every commutator changes sign.
-    c1 = -np.cross(a1, a2)
-    c2 = np.cross(a1, 2.0 * a3 + c1) / 60.0
-    phi = a1 + a3 / 12.0 - np.cross(-20.0 * a1 - a3 + c1, a2 + c2) / 240.0
+    c1 = -cross(a1, a2)
+    c2 = cross(a1, 2.0 * a3 + c1) / 60.0
+    phi = a1 + a3 / 12.0 - cross(-20.0 * a1 - a3 + c1, a2 + c2) / 240.0
 
     power = np.arange(1, c.shape[1] + 1)
     integral = np.concatenate([np.zeros_like(c[:, :1, :3]), c[:, :, :3] / power[:, None]], axis=1)
@@ -87,7 +95,7 @@ def integrate(c: Array, dt: Array, u: Array | float) -> tuple[Array, Array]:
     for node, weight, x in zip(_GAUSS_NODES, _GAUSS_WEIGHTS, at, strict=True):
         turned = dt[:, None] * evaluate(integral, u * node)
         force = x[:, 3:]
-        once = np.cross(turned, force)
-        twice = np.cross(turned, once)
-        dv += weight * (force + once + twice / 2.0 + np.cross(turned, twice) / 6.0)
+        once = cross(turned, force)
+        twice = cross(turned, once)
+        dv += weight * (force + once + twice / 2.0 + cross(turned, twice) / 6.0)
     return phi, h * dv

@@ -8,7 +8,7 @@ from functools import cached_property
 import gtsam
 import numpy as np
 
-from factorgraph_dvl.conventions import Array, exp_so3, rotate, skew
+from factorgraph_dvl.conventions import Array, cross, exp_so3, rotate, skew
 from factorgraph_dvl.increments import Increments, IntArray
 from factorgraph_dvl.sensors.imu import ImuSettings
 from factorgraph_dvl.sensors.protocol import Motion
@@ -146,6 +146,43 @@ def segments(inc: Increments, interval: float, epochs: Array | None = None) -> S
     )
 
 
+def one_segment(inc: Increments, first: int, last: int) -> Segments:
+    """Return intervals [first, last) of a single arc as a chain of two nodes.
+
+    Increments outside them stay zero.
+    """
+    n, inside = inc.start.size, np.arange(first, last)
+    phi, dv = np.zeros((n, 3)), np.zeros((n, 3))
+    phi[inside], dv[inside] = inc.over(inside)
+    turn = exp_so3(phi[inside])
+    dR = np.zeros((n, 3, 3))
+    R = np.eye(3)
+    for i, step in zip(inside.tolist(), turn, strict=True):
+        dR[i] = R
+        R = R @ step
+    dt = inc.dt[inside, None]
+    turned = rotate(dR[inside], dv[inside])
+    swept = dR[inside] @ (np.eye(3) + 0.5 * skew(phi[inside])) * dt[:, :, None]
+    dV, dP, dA = np.zeros((n, 3)), np.zeros((n, 3)), np.zeros((n, 3, 3))
+    dV[first + 1 : last] = np.cumsum(turned[:-1], axis=0)
+    dA[first + 1 : last] = np.cumsum(swept[:-1], axis=0)
+    dP[first + 1 : last] = np.cumsum((dV[inside] * dt + 0.5 * turned * dt)[:-1], axis=0)
+    return Segments(
+        increments=inc,
+        node_time=np.array([inc.start[first], inc.start[last - 1] + inc.dt[last - 1]]),
+        first=np.array([first]),
+        last=np.array([last]),
+        origin=np.array([0]),
+        arc_nodes=np.array([[0, 1]]),
+        phi=phi,
+        dv=dv,
+        dR=dR,
+        dV=dV,
+        dP=dP,
+        dA=dA,
+    )
+
+
 def _filled(cuts: IntArray, edges: Array, interval: float) -> IntArray:
     """Return cuts with others between them wherever they are more than `interval` apart."""
     out = [cuts]
@@ -183,8 +220,8 @@ def preintegrate(
     dt = inc.dt[:, None]
     rate = seg.phi / dt
     mean_force = seg.dv / dt
-    once = np.cross(seg.phi, mean_force)
-    force = mean_force - once / 2.0 + np.cross(seg.phi, once) / 12.0
+    once = cross(seg.phi, mean_force)
+    force = mean_force - once / 2.0 + cross(seg.phi, once) / 12.0
     rates, forces, steps = list(rate), list(force), inc.dt.tolist()
     gyro_psd = settings.gyro_noise_root_psd**2 * np.eye(3)
     accel_psd = settings.accel_noise_root_psd**2 * np.eye(3)
@@ -245,7 +282,10 @@ class Attachment:
 def attach(seg: Segments, time: Array, earth_rate_n: Array) -> Attachment:
     """Attach times (M,), all covered by arcs, to the chain."""
     index, since, _ = seg.increments.locate(time)
-    return _attach(seg, index, since, earth_rate_n)
+    # A time on the edge of the chain may be off it by rounding.
+    inside = np.clip(index, seg.first[0], seg.last[-1] - 1)
+    since = np.where(inside == index, since, time - seg.increments.start[inside])
+    return _attach(seg, inside, since, earth_rate_n)
 
 
 def segment_ends(seg: Segments, earth_rate_n: Array) -> Attachment:
@@ -406,17 +446,15 @@ def motion_at(at: Attachment, states: States, gravity_n: Array, earth_rate_n: Ar
     w = earth_rate_n
     tau = at.tau[:, None]
     dR, dV, dP = _with_bias(at, bg, ba)
-    v_J = v + np.cross(w, p)
-    wg = np.cross(w, g)
+    v_J = v + cross(w, p)
+    wg = cross(w, g)
     p_end = rotate(
         at.turn, p + v_J * tau + rotate(R, dP) + g * (tau**2 / 2.0) + wg * (tau**3 / 6.0)
     )
     v_end = rotate(at.turn, v_J + rotate(R, dV) + g * tau + wg * (tau**2 / 2.0))
-    v_end = v_end - np.cross(w, p_end)
+    v_end = v_end - cross(w, p_end)
     nRb = at.turn @ R @ dR
-    a_n = (
-        rotate(nRb, at.force - ba) + g - 2.0 * np.cross(w, v_end) - np.cross(w, np.cross(w, p_end))
-    )
+    a_n = rotate(nRb, at.force - ba) + g - 2.0 * cross(w, v_end) - cross(w, cross(w, p_end))
     return Motion(
         nRb=nRb,
         p_n=p_end,
@@ -448,7 +486,7 @@ def slid(motion: Motion, late: float) -> Motion:
 def _with_bias(at: Attachment, bg: Array, ba: Array) -> tuple[Array, Array, Array]:
     """Return dR, dV, dP corrected to first order for the biases."""
     turned = rotate(at.dA, bg)
-    v_gyro = 0.5 * np.cross(at.dV, turned)
+    v_gyro = 0.5 * cross(at.dV, turned)
     v_accel = rotate(at.dA, ba)
     tau = at.tau[:, None]
     return (

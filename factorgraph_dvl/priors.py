@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import gtsam
 import numpy as np
@@ -13,7 +14,6 @@ from factorgraph_dvl.conventions import (
     Array,
     exp_so3,
     inverse_right_jacobian,
-    log_so3,
     right_jacobian,
 )
 from factorgraph_dvl.sensors.protocol import Parameter
@@ -23,6 +23,23 @@ from factorgraph_dvl.sensors.protocol import Parameter
 _HELD = 1e-7
 # A calibration may know a combination of parameters this much better than each, squared.
 _LEAST_EIGENVALUE = 1e-12
+_BIAS = 6
+
+
+@dataclass(frozen=True)
+class Known:
+    """What is known of biases and parameters beforehand, jointly, in place of their priors.
+
+    Parameters
+    ----------
+    bias : (6,) accelerometer and gyro bias at the first node, SI.
+    parameters : values of those that are estimated, rotations as matrices.
+    covariance : (6 + P, 6 + P) of biases and parameters, in the tangent space, SI.
+    """
+
+    bias: Array
+    parameters: dict[str, Array]
+    covariance: Array
 
 
 def add_priors(
@@ -82,6 +99,32 @@ def pull(
     return gtsam.CustomFactor(noise, [key_of[p.name] for p in parameters], error)
 
 
+def joint_pull(
+    known: Known, bias_key: int, parameters: Sequence[Parameter], key_of: Mapping[str, int]
+) -> gtsam.CustomFactor:
+    """Return a factor on biases and parameters for what is known of them together."""
+    sigma = np.sqrt(np.diag(known.covariance))
+    correlation = known.covariance / np.outer(sigma, sigma)
+    gain = np.linalg.inv(np.linalg.cholesky(correlation)) / sigma
+    ends = np.cumsum([_BIAS, *(p.mean.size for p in parameters)])
+    columns = np.split(gain, ends[:-1], axis=1)
+
+    def error(this: gtsam.CustomFactor, at: gtsam.Values, jacobians: list[Array] | None) -> Array:
+        total = columns[0] @ (at.atConstantBias(bias_key).vector() - known.bias)
+        parts = [columns[0]]
+        for p, part in zip(parameters, columns[1:], strict=True):
+            off = away(p, value_at(at, key_of[p.name], p), known.parameters[p.name])
+            total = total + part @ off
+            parts.append(part @ inverse_right_jacobian(off) if p.rotation else part)
+        if jacobians is not None:
+            for i, part in enumerate(parts):
+                jacobians[i] = np.asfortranarray(part)
+        return np.asarray(total)
+
+    every = [bias_key, *(key_of[p.name] for p in parameters)]
+    return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(sigma.size), every, error)
+
+
 def value_at(values: gtsam.Values, key: int, p: Parameter) -> Array:
     """Return a parameter among values, a rotation as its matrix."""
     return values.atRot3(key).matrix() if p.rotation else values.atVector(key)
@@ -89,7 +132,9 @@ def value_at(values: gtsam.Values, key: int, p: Parameter) -> Array:
 
 def away(p: Parameter, value: Array, origin: Array) -> Array:
     """Return a parameter minus an origin, in the origin's tangent space, SI."""
-    return log_so3(origin.T @ value) if p.rotation else value - origin
+    if p.rotation:
+        return np.asarray(gtsam.Rot3.Logmap(gtsam.Rot3(origin.T @ value)))
+    return value - origin
 
 
 def prior_mean(p: Parameter) -> Array:

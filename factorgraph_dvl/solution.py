@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -207,8 +207,27 @@ class Calibration:
 
     @property
     def values(self) -> dict[str, Array]:
-        """Values by name, in reported units."""
-        return {e.name: e.value for e in self.estimates}
+        """Values by name, as `values_of`."""
+        return values_of(self.estimates)
+
+
+def values_of(estimates: Sequence[Estimate]) -> dict[str, Array]:
+    """Return values by name as in calibration.json: of directions the unit vectors, (N, 3)."""
+    return {e.name: e.value if e.nominal is None else e.directions for e in estimates}
+
+
+def not_observable(estimate: Estimate, why: Callable[[int], str]) -> list[str]:
+    """Return a warning for each reason why components of an estimate are not observable.
+
+    Parameters
+    ----------
+    estimate : of which components that were held are left out.
+    why : the reason of a component, by its index.
+    """
+    reasons: dict[str, list[str]] = {}
+    for i in np.flatnonzero(~estimate.observable & (estimate.prior_std > 0.0)):
+        reasons.setdefault(why(int(i)), []).append(estimate.component_names[i])
+    return [f"{', '.join(names)} not observable: {reason}" for reason, names in reasons.items()]
 
 
 def doubts(estimates: Sequence[Estimate], residuals: Sequence[Residuals]) -> list[str]:

@@ -265,6 +265,8 @@ def _find(node: yaml.Node, path: tuple[Key, ...]) -> int:
         elif isinstance(node, yaml.SequenceNode) and isinstance(key, int):
             node = node.value[key]
             line = _line(node)
+        else:
+            return 0
     return line
 
 
@@ -281,7 +283,8 @@ def _fields(kind: Any) -> dict[str, Any]:
     """Return the fields of a settings type, among the options of a union."""
     for option in _options(kind):
         if isinstance(option, type) and issubclass(option, msgspec.Struct):
-            return get_type_hints(option, include_extras=True)
+            hints = get_type_hints(option, include_extras=True)
+            return {name: hints[name] for name in option.__struct_fields__}
     return {}
 
 

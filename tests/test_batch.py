@@ -355,3 +355,15 @@ def test_a_heading_that_the_earth_tells_is_not_lost_to_the_mounting():
     heading = trajectory_errors(solution, trial.reference).attitude
     assert np.max(heading.std[:, 2] / DEG) < 0.3
     assert np.abs(heading.normalised[:, 2]).max() < 3.0
+
+
+def test_noise_in_proportion_to_speed_leaves_the_scale_alone():
+    errors = []
+    for seed in range(8):
+        dvl = {"velocity_std_fraction": 0.05}
+        scene = scenario(noise=True, dvl=dvl, manoeuvres=[{"straight_s": 60}], sway={})
+        trial = simulate(scene, seed)
+        found = solve(trial, rate_hz=1.0).estimate("scale_error")
+        errors += list((found.value - trial.calibration_truth["scale_error"]) / found.std)
+    # By the measured speed it would be 0.005 too small.
+    assert abs(np.mean(errors)) < 2.5 / np.sqrt(len(errors))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 
 import msgspec
@@ -14,9 +15,13 @@ from scipy.stats import chi2
 from test_observations import random_motion
 from truth import exact_motion, scenario
 
+from factorgraph_dvl.analysis.beam_quality import beam_calibration
+from factorgraph_dvl.analysis.before_after import before_after
 from factorgraph_dvl.analysis.consistency import calibration_errors
 from factorgraph_dvl.analysis.observability import observability
 from factorgraph_dvl.analysis.pwcs import BeamMounting, BodyMotion, beam_rows
+from factorgraph_dvl.analysis.survey import survey
+from factorgraph_dvl.attitude import Attitude
 from factorgraph_dvl.beam_geometry import (
     as_dvl,
     error_rows,
@@ -35,10 +40,16 @@ from factorgraph_dvl.io.solution_folder import load_solution, save_solution
 from factorgraph_dvl.io.trial_folder import load_trial, save_trial
 from factorgraph_dvl.kalman import calibrate
 from factorgraph_dvl.planning.prediction import go_on, predict
+from factorgraph_dvl.report.figures import write_figures
+from factorgraph_dvl.report.observability_figures import (
+    history_figure,
+    write_observability_figures,
+)
 from factorgraph_dvl.sensors.dvl_beams import DvlBeams, DvlBeamsSettings
 from factorgraph_dvl.sensors.protocol import Motion
 from factorgraph_dvl.simulation import plan_motion, simulate
 from factorgraph_dvl.solvers.batch import solve
+from factorgraph_dvl.solvers.information_history import solve_with_history
 
 JANUS_X = ((30.0, 45.0), (30.0, 315.0), (30.0, 225.0), (30.0, 135.0))
 JANUS_PLUS = ((25.0, 0.0), (25.0, 90.0), (25.0, 180.0), (25.0, 270.0))
@@ -116,6 +127,12 @@ def test_nominal_directions_three_ways_are_the_same_beams():
     alpha, theta = np.arcsin(root) / DEG, 60.0
     patent = DvlBeamsSettings(alpha_theta_deg=((alpha, theta),) * 4)
     np.testing.assert_allclose(patent.nominal_d, vectors, atol=1e-14)
+    # A Janus in +: beams 1 and 3 are in the xz plane, where rounding may go beyond it.
+    for slant in np.arange(5.0, 60.0):
+        plus = DvlBeamsSettings(alpha_theta_deg=((slant, 90 - slant), (0, 90 - slant)) * 2)
+        s, c = np.sin(slant * DEG), np.cos(slant * DEG)
+        by_hand = [[s, 0, -c], [0, s, -c], [-s, 0, -c], [0, -s, -c]]
+        np.testing.assert_allclose(plus.nominal_d, by_hand, atol=1e-7)
     given = DvlBeamsSettings(directions=tuple(map(tuple, (1.002 * vectors).tolist())))
     np.testing.assert_allclose(given.nominal_d, vectors, atol=1e-15)
 
@@ -127,7 +144,8 @@ def test_nominal_directions_three_ways_are_the_same_beams():
         ({"slant_azimuth_deg": JANUS_X, "directions": ((0, 0, -1),) * 3}, "found"),
         ({"slant_azimuth_deg": JANUS_X[:2]}, "three or more"),
         ({"slant_azimuth_deg": ((10, 0), (20, 0), (30, 180))}, "in one plane"),
-        ({"directions": ((1, 0, -1), (0, 1, -1), (-1, 0, -1))}, "unit vectors"),
+        ({"directions": ((0, 0, -1), (0, 1, -1), (-1, 0, 0))}, "beam 2 has the length 1.41"),
+        ({"alpha_theta_deg": ((20, 60), (20, 60), (31, 60), (20, 60))}, "those of beam 3 do"),
         ({"alpha_theta_deg": ((20, 60),) * 3}, "four beams"),
         ({"alpha_theta_deg": ((40, 60),) * 4}, "add up"),
         ({"slant_azimuth_deg": JANUS_X, "scale_error": (0.1, 0.2)}, "one number, or 4"),
@@ -360,6 +378,17 @@ def test_a_trial_keeps_beams_turntable_and_truth_in_files(tmp_path):
     np.testing.assert_array_equal(values["beam_direction_b"], truth)
 
 
+def test_directions_given_twice_are_found_where_they_are(tmp_path):
+    save_trial(simulate(noisy(), 1), tmp_path / "trial")
+    file = tmp_path / "trial" / "trial.yaml"
+    data = yaml.safe_load(file.read_text())
+    data["dvl_beams"]["directions"] = [[0, 0, -1]] * 4
+    file.write_text(yaml.safe_dump(data))
+    with pytest.raises(ConfigError) as error:
+        load_trial(tmp_path / "trial")
+    assert re.match(r"trial.yaml line \d+: dvl_beams.directions: the beams'", str(error.value))
+
+
 def replace_file(section, name):
     return msgspec.structs.replace(section, file=name)
 
@@ -408,6 +437,17 @@ def test_beams_lost_for_good_leave_the_others(lost):
     np.testing.assert_array_equal(np.isfinite(residual.sigma), np.isfinite(residual.residual))
 
 
+def test_noise_in_proportion_to_velocity_leaves_the_scales_alone():
+    base = msgspec.to_builtins(noisy().dvl_beams) | {"velocity_std_fraction": 0.05}
+    errors = []
+    for seed in range(6):
+        trial = simulate(noisy(dvl_beams=base), seed)
+        found = solve(trial, rate_hz=1.0).estimate("beam_scale_error")
+        errors.append((found.value - SCALES) / found.std)
+    # By the measured velocities they would be 0.005 too small, 1.4 sigma each.
+    assert abs(np.mean(errors)) < 2.5 / np.sqrt(np.size(errors))
+
+
 def test_a_beam_that_was_never_received_is_named():
     trial = simulate(noisy(), 1)
     trial.beams.velocity[:, 2] = np.nan
@@ -416,6 +456,37 @@ def test_a_beam_that_was_never_received_is_named():
     assert seen.tolist() == [True] * 4 + [False] * 2 + [True] * 2
     said = "beam_direction_3x_deg, beam_direction_3y_deg not observable: beam 3 was never received"
     assert any(w.startswith(said) for w in solution.warnings)
+    trial.beams.velocity[:, 0] = np.nan
+    for i in (1, 3):
+        said = f"beam_direction_{i}x_deg, beam_direction_{i}y_deg not observable: beam {i} was"
+        assert any(w.startswith(said) for w in solve(trial).warnings)
+
+
+def test_each_beam_that_was_never_received_is_named(tmp_path):
+    trial = simulate(noisy(turntable=None), 1)
+    trial.beams.velocity[:, 1:] = np.nan
+    solution = solve(trial)
+    for beam in (2, 3, 4):
+        said = f"beam_scale_error_{beam} not observable: beam {beam} was never received"
+        assert said in solution.warnings
+    arm = next(w for w in solution.warnings if w.startswith("lever_arm"))
+    assert arm.endswith("too few beams were ever received: 1")
+    # Nothing says how beams agree of which there is one.
+    drawn = {file.name for file in write_figures(trial, solution, tmp_path)}
+    assert "beam_residuals.png" in drawn
+    assert "beam_quality.png" not in drawn
+
+
+def test_a_single_ping_is_solved_and_written(tmp_path):
+    trial = simulate(noisy(turntable=None), 1)
+    sensor = replace(
+        trial.beams, time=trial.beams.time[:1], velocity=4.0 * trial.beams.velocity[:1] + 1.0
+    )
+    save_trial(replace(trial, others=(sensor,)), tmp_path / "trial")
+    with pytest.raises(SystemExit) as done:
+        main(["solve", str(tmp_path / "trial"), "--out", str(tmp_path / "out"), "--no-figures"])
+    assert done.value.code == 0
+    assert (tmp_path / "out" / "beams.csv").exists()
 
 
 def test_the_common_mounting_is_found_from_anywhere():
@@ -444,6 +515,39 @@ def test_the_common_mounting_is_found_from_anywhere():
     assert dof == 7
     assert nees < chi2.ppf(0.999, dof)
     np.testing.assert_allclose(solution.estimate("misalignment_deg").value, mounting, atol=0.3)
+
+
+def test_a_common_mounting_that_is_far_off_does_not_mislead_poor_gyros():
+    imu = {"gyro_noise_deg_sqrt_h": 0.15, "accel_noise_ug_sqrt_hz": 60}
+    imu |= {"gyro_bias_deg_h": "draw", "accel_bias_ug": "draw"}
+    bias = {"gyro_bias_std_deg_h": 20, "accel_bias_std_ug": 2000}
+    claims = {
+        "imu": bias,
+        "dvl": None,
+        "dvl_beams": {"parametrisation": "common", "misalignment_std_deg": [180, 180, 180]}
+        | {"misalignment_deg": [0, 0, 0]},
+    }
+    truth = {"rate_hz": 5, "slant_azimuth_deg": JANUS_X, "misalignment_deg": [170, 0, 0]}
+    truth |= {"scale_error": [0.01] * 4, "velocity_std_m_s": 0.005}
+    truth |= {"lever_arm_m": [1.0, -1.2, 1.4]}
+    gnss = {"rate_hz": 1, "position_std_m": [2, 2, 4], "velocity_std_m_s": [0.3, 0.3, 0.3]}
+    gnss |= {"lever_arm_m": [0.3, -1.5, 4.0]}
+    parts = [{"straight_s": 20}, {"turn_deg_s": 6, "duration_s": 30, "ramp_s": 4}]
+    parts += [{"straight_s": 60}, {"accelerate_m_s2": -0.1, "to_m_s": 2.5}, {"straight_s": 60}]
+    parts += [{"turn_deg_s": -4, "duration_s": 30, "ramp_s": 4}, {"straight_s": 60}]
+    changes = {
+        "imu": imu | bias,
+        "gnss": gnss,
+        "dvl_beams": truth,
+        "turntable": None,
+        "trial": claims,
+    }
+    for seed in (2, 4):
+        trial = simulate(noisy(manoeuvres=parts, **changes), seed)
+        solution = solve(trial, rate_hz=1.0)
+        assert solution.converged
+        nees, dof = nees_of(solution, trial.calibration_truth)
+        assert nees < chi2.ppf(0.999, dof)
 
 
 def test_beams_beside_a_dvl_have_names_of_their_own():
@@ -542,6 +646,12 @@ def test_velocities_use_what_beams_there_are():
     assert np.isfinite(each[1, :, 0]).tolist() == [False, True, False, False]
 
 
+def test_beams_that_a_calibration_puts_in_one_plane_have_no_groups():
+    flat = np.array([[1.0, 0, 0], [0, 1.0, 0], [-1.0, 0, 0], [0, -1.0, 0]])
+    assert group_velocities(flat, np.ones((5, 4))).shape == (5, 0, 3)
+    assert np.isnan(error_velocity(flat, np.ones((5, 4)))).all()
+
+
 def test_the_error_velocity_scatters_as_a_beam_does():
     rng = np.random.default_rng(0)
     for slants in (JANUS_X, FOUR_AND_ONE):
@@ -594,6 +704,138 @@ def test_the_command_makes_a_dvl_that_solves(solved, tmp_path):
     assert 0.9 < rms < 1.1
 
 
+def reckoned(trial, values):
+    attitude = Attitude(trial.imu, trial.reference, trial.body_axes, np.zeros(3))
+    return before_after(trial, values, attitude.at)
+
+
+@pytest.mark.parametrize("body_axes", ["RFU", "FRD"])
+def test_dead_reckoning_by_the_true_beams_is_exact(body_axes):
+    scn = scene(body_axes=body_axes)
+    mounted = msgspec.structs.replace(scn.dvl_beams, misalignment_deg=(1.0, -2.0, 40.0))
+    trial = simulate(msgspec.structs.replace(scn, dvl_beams=mounted))
+    lost = trial.beams.velocity.copy()
+    lost[::3, 1] = np.nan
+    trial = replace(trial, others=(replace(trial.beams, velocity=lost), trial.others[1]))
+    result = reckoned(trial, trial.calibration_truth)
+    assert np.abs(result.calibrated.score.error).max() < 0.01
+    # The antenna, by which it is scored then, stays with the ship while the body turns.
+    attitude = Attitude(trial.imu, trial.reference, trial.body_axes, np.zeros(3))
+    fixes = before_after(replace(trial, reference=None), trial.calibration_truth, attitude.at)
+    assert fixes.scored_by == "GNSS"
+    assert np.abs(fixes.calibrated.score.error).max() < 0.01
+    # Nominal beams, half a degree and half a per cent off.
+    assert result.uncalibrated.score.horizontal.max() > 0.5
+    assert result.without_lever_arm.score.horizontal.max() > 0.5
+
+
+def test_dead_reckoning_takes_a_common_calibration_and_no_other_beams():
+    trial = simulate(scene())
+    whole = reckoned(trial, trial.calibration_truth).calibrated.track.geodetic
+    common = {"misalignment_deg": np.array([0.2, 0.0, 0.0]), "scale_error": np.zeros(1)}
+    assert np.abs(reckoned(trial, common).calibrated.track.geodetic - whole).max() > 0.0
+    three = {"beam_direction_b": trial.beams.nominal_b[:3]}
+    for other in (three, {"lever_arm_m": np.ones(3)}):
+        with pytest.raises(DataError, match="does not calibrate the 4 beams"):
+            reckoned(trial, other)
+
+
+def test_a_scale_of_each_axis_is_one_of_each_beam():
+    sensor = beams(np.zeros((1, 4)))
+    axes, vector = np.array([0.01, -0.02, 0.03]), np.array([0.0, 0.0, 90.0])
+    values = {"misalignment_deg": vector, "scale_error": axes, "lever_arm_m": np.zeros(3)}
+    found = beam_calibration(sensor, values)
+    # The beams of a DVL that reads (1 + k) C v: d^T (1 + k) C v.
+    rows = (1.0 + found.scale_error)[:, None] * found.directions_b
+    C = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    np.testing.assert_allclose(rows, sensor.nominal_b @ np.diag(1.0 + axes) @ C, atol=1e-12)
+
+
+@pytest.mark.parametrize("prefix", ["", "beam_"])
+def test_the_lever_arm_of_beams_is_not_that_of_a_dvl_beside_them(prefix):
+    # Calibrated beside a DVL, used without it, and the other way round.
+    values = {
+        "beam_direction_b": beams(np.zeros((1, 4))).nominal_b,
+        "beam_scale_error": np.zeros(4),
+        "lever_arm_m": np.ones(3),
+    }
+    sensor = replace(beams(np.zeros((1, 4))), prefix=prefix)
+    np.testing.assert_array_equal(beam_calibration(sensor, values).lever_arm, np.ones(3))
+    values["beam_lever_arm_m"] = np.full(3, 2.0)
+    np.testing.assert_array_equal(beam_calibration(sensor, values).lever_arm, np.full(3, 2.0))
+
+
+def test_the_command_dead_reckons_beams(solved, tmp_path):
+    trial, solution = solved
+    save_trial(trial, tmp_path / "trial")
+    save_solution(solution, tmp_path / "solved")
+    for calibration in (tmp_path / "solved", tmp_path / "trial" / "truth.json"):
+        out = tmp_path / f"by-{calibration.stem}"
+        args = ["deadreckon", tmp_path / "trial", "--calibration", calibration, "--out", out]
+        with pytest.raises(SystemExit) as done:
+            main([*map(str, args), "--no-figures"])
+        assert done.value.code == 0
+        found = json.loads((out / "deadreckon.json").read_text())
+        assert found["global_error_m"] < 0.2 * found["uncalibrated"]["global_error_m"]
+
+
+def test_a_record_is_not_made_of_another_instrument_or_of_nothing(solved, tmp_path, capsys):
+    trial, solution = solved
+    save_solution(solution, tmp_path / "solved")
+    args = ["correct", str(tmp_path / "trial"), str(tmp_path / "solved"), "--out"]
+    mounted = msgspec.structs.replace(trial.beams.settings, misalignment_deg=(0.0, 0.0, 30.0))
+    two = trial.beams.velocity * [1, 1, np.nan, np.nan]
+    for i, (changes, message) in enumerate(
+        (
+            ({"settings": mounted}, "deg away from where the trial has it"),
+            ({"velocity": two}, "dvl_beams.csv: no ping has a velocity"),
+        )
+    ):
+        others = (replace(trial.beams, **changes), trial.others[1])
+        save_trial(replace(trial, others=others), tmp_path / "trial", force=True)
+        with pytest.raises(SystemExit) as done:
+            main([*args, str(tmp_path / f"out-{i}")])
+        assert done.value.code == 2
+        assert message in capsys.readouterr().err
+        assert not (tmp_path / f"out-{i}").exists()
+
+
+def test_terms_of_instruments_are_not_those_of_beams(solved, tmp_path, capsys):
+    save_solution(solved[1], tmp_path / "solved")
+    with pytest.raises(SystemExit) as done:
+        main(["instrument", str(tmp_path / "solved")])
+    assert done.value.code == 2
+    assert "factorgraph-dvl correct" in capsys.readouterr().err
+
+
+def surveyed(change):
+    """Return what `inspect` says of the beams, their velocities changed."""
+    trial = simulate(noisy(turntable=None), 1)
+    velocity = change(trial.beams.velocity.copy())
+    trial = replace(trial, others=(replace(trial.beams, velocity=velocity),))
+    return [(f.severity, f.text) for f in survey(trial).findings if f.sensor == "DVL beams"]
+
+
+def test_good_beams_have_no_problems():
+    found = surveyed(lambda v: v)
+    assert {severity for severity, _ in found} == {"ok"}
+    assert any("no more than noise and priors explain" in text for _, text in found)
+
+
+@pytest.mark.parametrize(
+    ("change", "severity", "message"),
+    [
+        (lambda v: v[:, [0, 2, 1, 3]], "warning", "is their order"),
+        (lambda v: v * [1, 1, -1, 1], "warning", "the sign of one"),
+        (lambda v: -v, "warning", "Moving in the direction of a beam must give it a positive"),
+        (lambda v: v * [np.nan, np.nan, 1, 1], "error", "there is no ping with three beams"),
+        (lambda v: v * [1, 1, np.nan, 1], "warning", "lost at 0, 0, 100, 0 % of the pings"),
+    ],
+)
+def test_mistakes_in_beams_are_named(change, severity, message):
+    assert any(s == severity and message in text for s, text in surveyed(change))
+
+
 def test_singular_values_name_the_beams(solved):
     trial, solution = solved
     view = observability(solution, trial=trial).point_set
@@ -616,6 +858,18 @@ def test_singular_values_name_the_beams(solved):
         return (v_b + np.cross(motion.omega_eb_b, arm + h[12:])) @ A.T
 
     np.testing.assert_allclose(rows, differentiate(predicted, 15), atol=1e-8)
+
+
+def test_what_beams_tell_is_drawn(solved, tmp_path):
+    trial, solution = solved
+    _, history = solve_with_history(trial)
+    view = observability(solution, trial=trial, history=history)
+    names = {file.stem for file in write_observability_figures(view, tmp_path)}
+    assert names == {"singular_values", "std_along_trial", "correlation", "directions", "shares"}
+    panel = history_figure(view.history, []).axes[0]
+    looks = {(line.get_color(), line.get_linestyle()) for line in panel.get_lines()}
+    assert len(looks) == 8
+    assert panel.get_xlabel() == ""
 
 
 def test_a_plan_foresees_what_beams_will_be_known_to(solved):

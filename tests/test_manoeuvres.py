@@ -9,6 +9,7 @@ import pytest
 from truth import CONING, SWELL, config, scenario
 
 from factorgraph_dvl.analysis.manoeuvres import Segment, find_segments, given_segments
+from factorgraph_dvl.errors import ConfigError
 from factorgraph_dvl.simulation import simulate
 
 SEAS = {"calm": {}, "swell": SWELL, "2 Hz": CONING}
@@ -105,4 +106,6 @@ def test_given_segments_fill_the_trial():
         Segment(30.0, 90.0, "other"),
         Segment(90.0, 100.0, "c"),
     )
-    assert given_segments([(200.0, 300.0, "x")], 0.0, 100.0) == (Segment(0.0, 100.0, "other"),)
+    for outside in ((200.0, 300.0, "x"), (-20.0, 0.0, "x")):
+        with pytest.raises(ConfigError, match=r"segment `x`.*outside the trial.*0 and 100 s"):
+            given_segments([outside], 0.0, 100.0)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import ClassVar, Literal
 
 import msgspec
 import pytest
@@ -17,10 +17,19 @@ class Entry(msgspec.Struct, forbid_unknown_fields=True):
     inner: dict[str, list[float]] = msgspec.field(default_factory=dict)
 
 
+class Marked(Entry):
+    mark: ClassVar[str] = "not a key"
+
+
 class Settings(msgspec.Struct, forbid_unknown_fields=True):
     numbers: dict[str, float] = msgspec.field(default_factory=dict)
     entries: dict[str, Entry] = msgspec.field(default_factory=dict)
     rows: list[dict[str, Entry]] = msgspec.field(default_factory=list)
+
+
+def test_only_keys_are_offered():
+    with pytest.raises(ConfigError, match=r"expected one of inner, kind, size$"):
+        parse_yaml("speed: 1\nsize: 2\n", Marked, source="file.yaml")
 
 
 @pytest.mark.parametrize(

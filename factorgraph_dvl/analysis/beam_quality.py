@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
+from msgspec import UnsetType
 
 from factorgraph_dvl.beam_geometry import (
     error_rows,
@@ -16,7 +18,11 @@ from factorgraph_dvl.beam_geometry import (
 from factorgraph_dvl.conventions import DEG, Array, exp_so3
 from factorgraph_dvl.errors import DataError
 from factorgraph_dvl.sensors.dvl_beams import DIRECTION, SCALE_ERROR, DvlBeams
-from factorgraph_dvl.solution import Calibration, Solution
+from factorgraph_dvl.solution import Calibration, Solution, values_of
+
+# From how many standard deviations on a beam is another one; and from how many deg, at least.
+_FAR = 5.0
+_LEAST_DEG = 1.0
 
 
 @dataclass(frozen=True)
@@ -94,27 +100,82 @@ def calibration_of(beams: DvlBeams, solution: Solution | Calibration) -> BeamCal
     DataError
         If the solution is not one of these beams.
     """
+    return beam_calibration(beams, values_of(solution.estimates), solution.trial)
+
+
+def beam_calibration(
+    beams: DvlBeams, values: Mapping[str, Array], source: str = "calibration"
+) -> BeamCalibration:
+    """Return the beams as reported values have them.
+
+    Parameters
+    ----------
+    beams : of the trial; what `values` leave out of scale and lever arm is as its settings
+        have it.
+    values : by name as in calibration.json, in reported units; directions as (N, 3) vectors.
+    source : of the values, for messages.
+
+    Raises
+    ------
+    DataError
+        If the values are not of these beams.
+    """
     s = beams.settings
-    nominal = exp_so3(np.array(s.misalignment_deg) * DEG)
-    found = {e.name: e for e in solution.estimates}
     n = len(s.nominal_d)
-    lever_arm = found.get(f"{beams.prefix}lever_arm_m")
-    if DIRECTION in found and lever_arm is not None:
-        directions = found[DIRECTION].directions
-        scale = found[SCALE_ERROR].value
-        if len(directions) == n:
-            return BeamCalibration(directions @ nominal.T, directions, scale, lever_arm.value)
-    misalignment = found.get(f"{beams.prefix}misalignment_deg")
-    common = found.get(f"{beams.prefix}scale_error")
-    if misalignment is not None and common is not None and lever_arm is not None:
-        directions = s.nominal_d @ exp_so3(misalignment.value * DEG)
-        scale = np.full(n, common.value.mean())
-        return BeamCalibration(directions @ nominal.T, directions, scale, lever_arm.value)
-    raise DataError(
-        f"the solution does not calibrate the {n} beams of the trial",
-        where=solution.trial,
-        expected="beam_direction_b, beam_scale_error and lever_arm_m of these beams",
+    # Of beams beside a DVL, the names without a prefix are those of the DVL.
+    prefix = "beam_" if "beam_lever_arm_m" in values else beams.prefix
+    if DIRECTION in values:
+        prefix = prefix if f"{prefix}lever_arm_m" in values else ""
+        rows = values[DIRECTION]
+        rows = rows / np.linalg.norm(rows, axis=1, keepdims=True)
+        scale = values.get(SCALE_ERROR, np.array(s.scale_error))
+    elif f"{prefix}misalignment_deg" in values:
+        # One number, or one for each axis of d.
+        common = values.get(f"{prefix}scale_error", np.zeros(1))
+        axes = common if common.size in (1, 3) else np.full(3, np.nan)
+        rows = (s.nominal_d * (1.0 + axes)) @ exp_so3(values[f"{prefix}misalignment_deg"] * DEG)
+        scale = np.zeros(1)
+    else:
+        rows, scale = np.empty((0, 3)), np.zeros(1)
+    if len(rows) != n or scale.size not in (1, n) or not np.isfinite(rows).all():
+        raise DataError(
+            f"the solution does not calibrate the {n} beams of the trial",
+            where=source,
+            expected="beam_direction_b, beam_scale_error and lever_arm_m of these beams",
+        )
+    length = np.linalg.norm(rows, axis=1)
+    directions = rows / length[:, None]
+    return BeamCalibration(
+        directions @ exp_so3(np.array(s.misalignment_deg) * DEG).T,
+        directions,
+        (1.0 + scale) * length - 1.0,
+        np.asarray(values.get(f"{prefix}lever_arm_m", s.lever_arm_m)),
     )
+
+
+def check_same_instrument(beams: DvlBeams, calibration: BeamCalibration, source: str) -> None:
+    """Raise DataError where a calibration's beams are not those that a trial describes.
+
+    Parameters
+    ----------
+    beams : of the trial, with nominal directions and what they may be off by.
+    calibration : of them, or of another instrument.
+    source : of the calibration, for messages.
+    """
+    s = beams.settings
+    std = s.misalignment_std_deg
+    sigma = s.direction_std_deg if isinstance(std, UnsetType) else max(std)
+    allowed = max(_FAR * np.sqrt(2.0) * sigma, _LEAST_DEG)
+    apart = np.linalg.norm(calibration.directions_b - beams.nominal_b, axis=1)
+    away = 2.0 * np.arcsin(np.minimum(0.5 * apart, 1.0)) / DEG
+    if away.max() > allowed:
+        raise DataError(
+            f"beam {np.argmax(away) + 1} of the calibration points {away.max():.3g} deg away from "
+            "where the trial has it",
+            where=source,
+            expected=f"at most {allowed:.3g} deg, by what the trial says that it may be off by",
+            hint="Is it the same instrument, mounted as it was, and nominally described alike?",
+        )
 
 
 def beam_quality(beams: DvlBeams, calibration: BeamCalibration) -> BeamQuality:

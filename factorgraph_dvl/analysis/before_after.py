@@ -8,6 +8,7 @@ from typing import Literal
 
 import numpy as np
 
+from factorgraph_dvl.analysis.beam_quality import beam_calibration
 from factorgraph_dvl.analysis.dead_reckoning import (
     Mounting,
     OrientationAt,
@@ -18,6 +19,7 @@ from factorgraph_dvl.analysis.dead_reckoning import (
     mounting_of,
 )
 from factorgraph_dvl.analysis.track_score import Score, difference, score
+from factorgraph_dvl.beam_geometry import as_dvl
 from factorgraph_dvl.conventions import Array, rotation_from_rph
 from factorgraph_dvl.trial import Reference, Trial
 
@@ -80,20 +82,22 @@ def before_after(
 ) -> BeforeAfter:
     """Dead-reckon a trial by a calibration, and by what trial.yaml says of the mounting.
 
+    Of a trial with beams and without a DVL beside them it is the beams that are calibrated.
+
     Parameters
     ----------
-    trial : with DVL; GNSS gives the start, and scores where there is no reference.
-    values : of the calibration, by name, in reported units.
+    trial : with DVL or beams; GNSS gives the start, and scores where there is no reference.
+    values : of the calibration, by name, in reported units; directions as (N, 3) vectors.
     orientation_at : attitude and turn rate at times (M,).
 
     Raises
     ------
     DataError
-        As `dead_reckon`.
+        As `dead_reckon`, and if the calibration is one of other beams.
     """
     truth, scored_by = _truth(trial, orientation_at)
-    mounting = mounting_of(trial, values)
-    best = dead_reckon(trial, mounting, orientation_at)
+    corrected, mounting = _calibrated(trial, values)
+    best = dead_reckon(corrected, mounting, orientation_at)
 
     def run(mounting: Mounting, track: Track) -> Run:
         return Run(mounting, track, None if truth is None else score(track, truth, along=best))
@@ -101,7 +105,7 @@ def before_after(
     nominal = mounting_of(trial)
     bare = replace(mounting, lever_arm=np.zeros(3))
     calibrated = run(mounting, best)
-    without = run(bare, dead_reckon(trial, bare, orientation_at))
+    without = run(bare, dead_reckon(corrected, bare, orientation_at))
     nRb = rotation_from_rph(best.rph, trial.body_axes)
     effect = LeverArmEffect(
         best.time,
@@ -115,6 +119,16 @@ def before_after(
         lever_arm=effect,
         scored_by="nothing" if calibrated.score is None else scored_by,
     )
+
+
+def _calibrated(trial: Trial, values: Mapping[str, Array]) -> tuple[Trial, Mounting]:
+    """Return the trial with the log that a calibration makes of it, and what is left to apply."""
+    if trial.dvl is not None or trial.beams is None:
+        return trial, mounting_of(trial, values)
+    found = beam_calibration(trial.beams, values)
+    log = as_dvl(trial.beams, (found.directions_b, found.scale_error, found.lever_arm))
+    corrected = replace(trial, dvl=log)
+    return corrected, mounting_of(corrected)
 
 
 def _truth(

@@ -82,7 +82,7 @@ def mounting_of(trial: Trial, values: Mapping[str, Array] | None = None) -> Moun
     given = values or {}
     si = {
         p.name: np.asarray(given[p.name], dtype=float) * p.si if p.name in given else p.mean
-        for p in _dvl(trial).nominal().parameters()
+        for p in _log(trial).nominal().parameters()
     }
     return Mounting(
         dRb=exp_so3(si[dvl_names.MISALIGNMENT]),
@@ -106,7 +106,7 @@ def dead_reckon(trial: Trial, mounting: Mounting, orientation_at: OrientationAt)
 
     Parameters
     ----------
-    trial : its DVL, and its first fix.
+    trial : its DVL, or what its beams amount to, and its first fix.
     mounting : that the velocity is corrected by.
     orientation_at : attitude and turn rate at times (M,).
 
@@ -115,7 +115,7 @@ def dead_reckon(trial: Trial, mounting: Mounting, orientation_at: OrientationAt)
     DataError
         If there is no DVL, no lock while the attitude is known, or no position to start from.
     """
-    dvl = _dvl(trial)
+    dvl = _log(trial)
     pings = dvl.time[dvl.locked] - mounting.time_offset
     orientation = orientation_at(pings)
     used = orientation.covered
@@ -146,10 +146,15 @@ def dead_reckon(trial: Trial, mounting: Mounting, orientation_at: OrientationAt)
     )
 
 
-def _dvl(trial: Trial) -> Dvl:
-    if trial.dvl is None:
-        raise DataError("the trial has no DVL", where="trial.yaml", expected="a dvl section")
-    return trial.dvl
+def _log(trial: Trial) -> Dvl:
+    log = trial.log
+    if log is None:
+        raise DataError(
+            "the trial has no DVL",
+            where="trial.yaml",
+            expected="a section `dvl` or `dvl_beams`",
+        )
+    return log
 
 
 def lever_arm_error(nRb: Array, lever_arm: Array) -> Array:
@@ -171,7 +176,7 @@ def antenna_removed(gnss: Gnss, orientation_at: OrientationAt) -> Reference:
     has_fix = ~np.isnan(gnss.geodetic[:, 0])
     time, geodetic = gnss.time[has_fix], gnss.geodetic[has_fix]
     there = orientation_at(time)
-    arm_n = there.nRb[there.covered] @ np.array(gnss.settings.lever_arm_m)
+    arm_n = rotate(there.nRb[there.covered], gnss.lever_arm(time[there.covered])[0])
     moved = displaced(geodetic[there.covered], -arm_n)
     zero = np.zeros_like(moved)
     return Reference(time[there.covered], moved, zero, zero)

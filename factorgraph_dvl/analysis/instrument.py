@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from factorgraph_dvl.conventions import DEG, Array, BodyAxes, exp_so3, frd_from_body
 from factorgraph_dvl.errors import DataError
+from factorgraph_dvl.sensors.dvl_beams import DIRECTION
 from factorgraph_dvl.solution import Calibration, Solution
 
 # Intrinsic orders: ZYX is yaw, then pitch, then roll; the angles are given as roll, pitch, yaw.
@@ -73,7 +74,13 @@ def instrument_of(calibration: Calibration | Solution) -> Instrument:
         at = rows.stop
     for name in NEEDED:
         if name not in parts:
-            raise DataError(f"the calibration has no {name}", expected="that of a DVL")
+            beams = DIRECTION in parts
+            raise DataError(
+                f"the calibration has no {name}{': it is one of single beams' if beams else ''}",
+                expected="that of a DVL",
+                hint="Their matrix is written by: factorgraph-dvl correct TRIAL CALIBRATION "
+                "--out DIR" if beams else "",
+            )  # fmt: skip
     alpha, covariance = parts["misalignment_deg"]
     frd = frd_from_body(calibration.body_axes)
     # TRDI's instrument axes of a DVL that looks down, aligned: starboard, forward, up.

@@ -14,6 +14,7 @@ from itertools import pairwise
 import numpy as np
 
 from factorgraph_dvl.conventions import DEG, Array
+from factorgraph_dvl.errors import ConfigError
 from factorgraph_dvl.solution import Trajectory
 from factorgraph_dvl.trial import Reference
 
@@ -90,19 +91,28 @@ def given_segments(
     Parameters
     ----------
     parts : start and end, s, and label, in the order of time.
-    first, last : of the trial, s; what is outside is cut off.
+    first, last : of the trial, s; what reaches beyond is cut off.
+
+    Raises
+    ------
+    ConfigError
+        If a segment lies outside the trial.
     """
     out: list[Segment] = []
     at = first
     for start, end, label in parts:
+        if end <= first or start >= last:
+            raise ConfigError(
+                f"segment `{label}`, {start:g} to {end:g} s, is outside the trial",
+                where="segments",
+                expected=f"times between {first:g} and {last:g} s",
+            )
         start, end = max(start, at), min(end, last)
-        if end <= start:
-            continue
         if start > at:
             out.append(Segment(at, start, "other"))
         out.append(Segment(start, end, label))
         at = end
-    if at < last or not out:
+    if at < last:
         out.append(Segment(at, last, "other"))
     return tuple(out)
 

@@ -10,6 +10,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from factorgraph_dvl.analysis.beam_sanity import beam_findings
 from factorgraph_dvl.analysis.finding import Finding
 from factorgraph_dvl.analysis.records import (
     GAP_INTERVALS,
@@ -19,6 +20,7 @@ from factorgraph_dvl.analysis.records import (
     velocity_between_fixes,
 )
 from factorgraph_dvl.analysis.star_sanity import star_findings
+from factorgraph_dvl.beam_geometry import as_dvl
 from factorgraph_dvl.conventions import (
     DEG,
     STANDARD_GRAVITY,
@@ -44,6 +46,9 @@ _SPEED_UNITS = {
     "cm/s": 0.01,
     "mm/s": 0.001,
 }
+# What a ping takes, and which sign it has.
+_DVL_TERMS = ("a lock", "Moving along +x must give a positive x")
+_BEAM_TERMS = ("three beams", "Moving in the direction of a beam must give it a positive velocity")
 _AXIS_NAMES = ("+x", "+y", "+z", "-x", "-y", "-z")
 
 
@@ -60,9 +65,12 @@ def findings(trial: Trial, sensors: list[SensorSurvey]) -> Iterator[Finding]:
     yield from _gyro_findings(trial.imu)
     if trial.gnss is not None:
         yield from _gnss_findings(trial.gnss)
-    log = trial.log
-    if log is not None:
-        yield from _dvl_findings(log, trial.gnss, trial.body_axes)
+    if trial.dvl is not None:
+        yield from _dvl_findings(trial.dvl, trial.gnss, trial.body_axes, _DVL_TERMS)
+    if trial.beams is not None:
+        log = as_dvl(trial.beams)
+        yield from _dvl_findings(log, trial.gnss, trial.body_axes, _BEAM_TERMS)
+        yield from beam_findings(trial.beams)
     for aid in trial.others:
         if isinstance(aid, Star):
             yield from star_findings(aid, trial)
@@ -293,10 +301,13 @@ def _compare_vertical(gnss: Gnss, between: Array, mean: Array) -> Iterator[Findi
         )
 
 
-def _dvl_findings(dvl: Dvl, gnss: Gnss | None, body_axes: BodyAxes) -> Iterator[Finding]:
+def _dvl_findings(
+    dvl: Dvl, gnss: Gnss | None, body_axes: BodyAxes, terms: tuple[str, str]
+) -> Iterator[Finding]:
     locked = dvl.locked
+    lock, positive = terms
     if not locked.any():
-        yield Finding("error", dvl.label, "there is no ping with a lock")
+        yield Finding("error", dvl.label, f"there is no ping with {lock}")
         return
     velocity = dvl.velocity[locked]
     std = float(np.median(dvl.sigma()[locked]))
@@ -311,7 +322,7 @@ def _dvl_findings(dvl: Dvl, gnss: Gnss | None, body_axes: BodyAxes) -> Iterator[
         yield Finding("error", dvl.label, "the velocity never changes")
     if gnss is not None:
         yield from _speed_findings(dvl, gnss)
-    yield from _sign_findings(dvl, body_axes, velocity)
+    yield from _sign_findings(dvl, body_axes, velocity, positive)
 
 
 def _speed_findings(dvl: Dvl, gnss: Gnss) -> Iterator[Finding]:
@@ -347,7 +358,9 @@ def _speed_findings(dvl: Dvl, gnss: Gnss) -> Iterator[Finding]:
     )
 
 
-def _sign_findings(dvl: Dvl, body_axes: BodyAxes, velocity_d: Array) -> Iterator[Finding]:
+def _sign_findings(
+    dvl: Dvl, body_axes: BodyAxes, velocity_d: Array, positive: str
+) -> Iterator[Finding]:
     """Check that the vehicle moves ahead, where the mounting is known well enough."""
     misalignment = next(p for p in dvl.parameters() if p.name == MISALIGNMENT)
     if misalignment.sigma.max() > 30.0 * DEG:
@@ -364,7 +377,7 @@ def _sign_findings(dvl: Dvl, body_axes: BodyAxes, velocity_d: Array) -> Iterator
             "warning",
             dvl.label,
             "by its prior misalignment the vehicle moves astern most of the time: is the sign "
-            "that of PD0? Moving along +x must give a positive x",
+            f"that of PD0? {positive}",
         )
     elif ahead > 0.5:
         yield Finding("ok", dvl.label, "by its prior misalignment the vehicle moves ahead")

@@ -18,6 +18,7 @@ from factorgraph_dvl.cli.inspect import inspect
 from factorgraph_dvl.cli.instrument import instrument
 from factorgraph_dvl.cli.observability import observability
 from factorgraph_dvl.cli.plan import plan
+from factorgraph_dvl.cli.replay import replay
 from factorgraph_dvl.cli.simulate import simulate
 from factorgraph_dvl.cli.solve import kalman, solve
 from factorgraph_dvl.errors import FactorgraphDvlError
@@ -36,6 +37,7 @@ app = typer.Typer(
 for _command in (
     simulate,
     solve,
+    replay,
     kalman,
     inspect,
     crosscheck,

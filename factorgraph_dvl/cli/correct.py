@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from factorgraph_dvl.cli.console import print_written
+from factorgraph_dvl.cli.console import print_written, stdout, warn
 from factorgraph_dvl.cli.options import Force, TrialPath
 
 
@@ -20,7 +20,9 @@ def correct(
     force: Force = False,
 ) -> None:
     """Turn a trial's beams, calibrated, into a DVL record; write the matrix that does so."""
-    from factorgraph_dvl.analysis.beam_quality import calibration_of
+    import numpy as np
+
+    from factorgraph_dvl.analysis.beam_quality import calibration_of, check_same_instrument
     from factorgraph_dvl.errors import DataError
     from factorgraph_dvl.io.calibration_file import check_usable, load_calibration
     from factorgraph_dvl.io.corrected_record import save_corrected
@@ -36,7 +38,21 @@ def correct(
     found = load_calibration(calibration, body_axes=trial.body_axes)
     check_usable(found, trial.body_axes, str(calibration))
     beams = calibration_of(trial.beams, found)
-    save_corrected(
+    check_same_instrument(trial.beams, beams, str(calibration))
+    record = save_corrected(
         trial.beams, beams.directions_b, beams.scale_error, beams.lever_arm, out, force=force
     )
+    for note in trial.notes:
+        warn(note)
+    own = {p.name for p in trial.beams.parameters()}
+    unknown = [
+        name
+        for e in found.estimates
+        if e.name in own
+        for name in np.array(e.component_names)[~e.observable & (e.prior_std > 0.0)]
+    ]
+    if unknown:
+        warn(f"not observable in the calibration, and no better here: {', '.join(unknown)}")
+    pings = f"{record.locked.sum()} of {record.time.size} pings have a velocity"
+    stdout().print(pings, markup=False, highlight=False)
     print_written(out)

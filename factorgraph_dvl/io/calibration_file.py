@@ -114,10 +114,8 @@ def check_values(name: str, value: Array, source: str) -> None:
     """Raise DataError unless the values of a parameter are numbers that can be."""
     if not np.isfinite(value).all():
         raise DataError(f"{name} holds no number", where=source, expected="finite values")
-    if name == "scale_error" and np.min(value) <= -1.0:
-        raise DataError(
-            f"scale_error is {np.min(value):g}", where=source, expected="numbers above -1"
-        )
+    if name.endswith("scale_error") and np.min(value) <= -1.0:
+        raise DataError(f"{name} is {np.min(value):g}", where=source, expected="numbers above -1")
 
 
 def encode_calibration(solution: Solution | Calibration) -> bytes:

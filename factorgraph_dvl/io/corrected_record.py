@@ -9,8 +9,10 @@ import numpy as np
 
 from factorgraph_dvl.beam_geometry import as_dvl, error_rows, instrument_matrix
 from factorgraph_dvl.conventions import DEG, Array, exp_so3
+from factorgraph_dvl.errors import DataError
 from factorgraph_dvl.io.folders import new_folder
 from factorgraph_dvl.io.tables import write_table
+from factorgraph_dvl.sensors.dvl import Dvl
 from factorgraph_dvl.sensors.dvl_beams import DvlBeams
 
 INSTRUMENT_FILE = "instrument.json"
@@ -25,8 +27,8 @@ def save_corrected(
     path: Path,
     *,
     force: bool = False,
-) -> None:
-    """Write instrument.json and dvl.csv, complete or not at all.
+) -> Dvl:
+    """Write instrument.json and dvl.csv, complete or not at all; return the record.
 
     Parameters
     ----------
@@ -38,9 +40,15 @@ def save_corrected(
     Raises
     ------
     DataError
-        If the folder exists, is not empty, and `force` is not set.
+        If the folder exists, is not empty, and `force` is not set; if no ping has a velocity.
     """
     dvl = as_dvl(beams, (directions_b, scale_error, lever_arm))
+    if not dvl.locked.any():
+        raise DataError(
+            "no ping has a velocity",
+            where=beams.source,
+            expected="three beams, not in one plane, at one ping at least",
+        )
     dRb = exp_so3(np.array(beams.settings.misalignment_deg) * DEG)
     directions_d = directions_b @ dRb.T
     gain = (1.0 + scale_error)[:, None] * directions_d
@@ -57,3 +65,4 @@ def save_corrected(
         write_table(folder / RECORD_FILE, dvl.columns())
         text = msgspec.json.format(msgspec.json.encode(content), indent=2)
         (folder / INSTRUMENT_FILE).write_bytes(text + b"\n")
+    return dvl

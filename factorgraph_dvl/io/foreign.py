@@ -270,7 +270,7 @@ def read_calibration_values(path: Path | str, body_axes: BodyAxes) -> dict[str, 
 
     Returns
     -------
-    Name to (n,) values, in reported units.
+    Name to (n,) values, in reported units; of directions (N, 3) vectors.
 
     Raises
     ------
@@ -283,7 +283,7 @@ def read_calibration_values(path: Path | str, body_axes: BodyAxes) -> dict[str, 
     if whole:
         calibration = load_calibration(path, body_axes=body_axes)
         check_usable(calibration, body_axes, str(path))
-        values = {n: v for n, v in calibration.values.items() if n in _KNOWN}
+        values = {n: v for n, v in calibration.values.items() if n in (*_KNOWN, _DIRECTIONS)}
     else:
         values = read_truth(path)
         says = _read_calibration(path).body_axes

@@ -1,4 +1,4 @@
-"""Solution folders, format 1: calibration.json, trajectory.csv, history.csv."""
+"""Solution folders, format 1: calibration.json, trajectory.csv, history.csv, latency.csv."""
 
 from __future__ import annotations
 
@@ -27,6 +27,8 @@ HISTORY_FILE = "history.csv"
 HYPOTHESES_FILE = "hypotheses.json"
 HYPOTHESES_FOLDER = "hypotheses"
 REJECTED_FILE = "rejected.csv"
+LATENCY_FILE = "latency.csv"
+CONVERGENCE_FILE = "convergence.csv"
 INSTRUMENT_FILE = "instrument.yaml"
 BEAMS_FILE = "beams.csv"
 FIGURES_FOLDER = "figures"
@@ -57,6 +59,7 @@ def save_solution(
     *,
     force: bool = False,
     extra: Callable[[Path], object] | None = None,
+    smoothed: Trajectory | None = None,
 ) -> None:
     """Write a solution folder, complete or not at all.
 
@@ -66,6 +69,7 @@ def save_solution(
     path : of the folder.
     force : replace the solution that is there.
     extra : called with the folder before it appears under `path`, to add files.
+    smoothed : what later data made of states of the trajectory; more columns of it.
 
     Raises
     ------
@@ -73,11 +77,15 @@ def save_solution(
         If the folder exists, is not empty, and `force` is not set.
     """
     owned = (
-        *(CALIBRATION_FILE, TRAJECTORY_FILE, HISTORY_FILE, HYPOTHESES_FILE, HYPOTHESES_FOLDER),
-        *(REJECTED_FILE, INSTRUMENT_FILE, BEAMS_FILE, FIGURES_FOLDER),
+        *(CALIBRATION_FILE, TRAJECTORY_FILE, HISTORY_FILE, LATENCY_FILE, CONVERGENCE_FILE),
+        *(HYPOTHESES_FILE, HYPOTHESES_FOLDER, REJECTED_FILE),
+        *(INSTRUMENT_FILE, BEAMS_FILE, FIGURES_FOLDER),
     )
     with new_folder(Path(path), force=force, owned=owned) as folder:
-        write_table(folder / TRAJECTORY_FILE, _trajectory_columns(solution.trajectory))
+        columns = _trajectory_columns(solution.trajectory)
+        if smoothed is not None:
+            columns |= _smoothed_columns(solution.trajectory, smoothed)
+        write_table(folder / TRAJECTORY_FILE, columns)
         if solution.hypotheses:
             _write_hypotheses(folder, solution.hypotheses)
         if solution.rejected:
@@ -114,7 +122,12 @@ def _rejected_columns(rejected: Sequence[Residuals]) -> dict[str, Any]:
 
 
 def write_history(
-    folder: Path, time: Array, names: Sequence[str], values: Array, std: Array
+    folder: Path,
+    time: Array,
+    names: Sequence[str],
+    values: Array,
+    std: Array,
+    latency: Array | None = None,
 ) -> None:
     """Write how a recursive solver converged, as history.csv.
 
@@ -124,11 +137,27 @@ def write_history(
     time : (H,) s.
     names : of the n components, as in `covariance.order`.
     values, std : (H, n) in reported units.
+    latency : (H,) time that each update took, s, if it was measured.
     """
     columns = {"time_s": time}
+    if latency is not None:
+        columns["latency_ms"] = 1e3 * latency
     for i, name in enumerate(names):
         columns |= {name: values[:, i], f"{name}_std": std[:, i]}
     write_table(folder / HISTORY_FILE, columns)
+
+
+def write_latency(folder: Path, time: Array, latency: Array, solved: np.ndarray) -> None:
+    """Write how long each update took, as latency.csv.
+
+    Parameters
+    ----------
+    folder : to write into.
+    time, latency : (H,) s.
+    solved : (H,) updates that include a batch solution of what was collected.
+    """
+    columns = {"time_s": time, "latency_ms": 1e3 * latency, "batch": solved.astype(float)}
+    write_table(folder / LATENCY_FILE, columns)
 
 
 def load_solution(path: Path | str) -> Solution:
@@ -157,6 +186,18 @@ def _trajectory_columns(trajectory: Trajectory) -> dict[str, Array]:
         [trajectory.position_std, trajectory.velocity_std, trajectory.rph_std / DEG]
     )
     return motion_columns(trajectory) | dict(zip(STD_COLUMNS, std.T, strict=True))
+
+
+def _smoothed_columns(trajectory: Trajectory, smoothed: Trajectory) -> dict[str, Array]:
+    """Return columns `smoothed_...` in the rows of the trajectory, nan where there is none."""
+    row = np.searchsorted(trajectory.time, smoothed.time)
+    out = {}
+    for name, values in _trajectory_columns(smoothed).items():
+        if name != "time_s":
+            column = np.full(trajectory.time.size, np.nan)
+            column[row] = values
+            out[f"smoothed_{name}"] = column
+    return out
 
 
 def _read_trajectory(file: Path) -> Trajectory:

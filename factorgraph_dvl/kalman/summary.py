@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 
 import numpy as np
 
@@ -13,7 +14,14 @@ from factorgraph_dvl.kalman.points import Estimated, Outcome, Points, residuals
 from factorgraph_dvl.sensors.dvl import Dvl
 from factorgraph_dvl.sensors.protocol import Aid, Parameter
 from factorgraph_dvl.sensors.protocol import Motion as SensorMotion
-from factorgraph_dvl.solution import Estimate, Residuals, Solution, Trajectory, doubts
+from factorgraph_dvl.solution import (
+    Estimate,
+    Residuals,
+    Solution,
+    Trajectory,
+    doubts,
+    not_observable,
+)
 from factorgraph_dvl.trial import Trial
 
 _OBSERVABLE = 0.5
@@ -214,18 +222,17 @@ def _unobservable(aid: Aid, seen: SensorMotion | None, estimates: Sequence[Estim
     """Say which components the data did not determine, and why."""
     own = {p.name for p in aid.parameters()}
     out = []
-    for e in estimates:
-        bad = np.flatnonzero(~e.observable & (e.prior_std > 0.0))
-        if bad.size == 0:
-            continue
-        names = ", ".join(e.component_names[i] for i in bad)
-        why = (
+
+    def why(name: str, component: int) -> str:
+        if name in own:
+            return aid.explain(name, component, seen)
+        return (
             "the trial does not tell it better than the prior; it takes longer, or turns and "
             "changes of speed"
         )
-        if e.name in own:
-            why = aid.explain(e.name, int(bad[0]), seen)
-        out.append(f"{names} not observable: {why}")
+
+    for e in estimates:
+        out += not_observable(e, partial(why, e.name))
     return out
 
 

@@ -21,11 +21,18 @@ from factorgraph_dvl.report.drawing import (
 )
 
 _MOST_GROUPS = 10
+_COLOURS = (ACCENT, DARK, "#d98c1f", "#3c8a4e", "#a0478f")
+_DASHES = ("-", (0, (4, 4)), (0, (5, 2, 1, 2)), (0, (1, 3)))
 _MOST_POINTS = 4000
 
 
 def beam_quality_figure(quality: BeamQuality) -> Figure:
-    """Draw error velocity over time, and how far each group of three is from all beams."""
+    """Draw error velocity over time, and how far each group of three is from all beams.
+
+    Parameters
+    ----------
+    quality : of beams of which four or more were received together at least once.
+    """
     figure = new_figure(11.0, 5.6)
     grid = new_grid(figure, 4, 1, gap=(0.3, 0.0), right=0.9)
     axes = grid.subplots(squeeze=False, sharex=True)[:, 0]
@@ -41,17 +48,21 @@ def beam_quality_figure(quality: BeamQuality) -> Figure:
         ms=1.5,
         mew=0,
     )
-    if known.size:
-        draw_band(axes[0], quality.time[known] - start, 3.0 * quality.error_sigma[known])
-    axes[0].set_title("Error velocity, ±3σ of the beams' noise", fontsize=TITLE, loc="left")
+    draw_band(axes[0], quality.time[known] - start, 3.0 * quality.error_sigma[known])
+    if np.all(quality.error_velocity[known] >= 0.0):
+        axes[0].set_ylim(bottom=0.0)
+    axes[0].set_title(
+        "Error velocity of the beams as calibrated, ±3σ of their noise", fontsize=TITLE, loc="left"
+    )
     style(axes[0], "", "m/s")
     apart = quality.group_velocity - quality.velocity[:, None, :]
-    shades = (ACCENT, DARK, GREY, "#d98c1f", "#3c8a4e", "#a0478f")
     for i, ax in enumerate(axes[1:]):
         for g, name in enumerate(quality.groups[:_MOST_GROUPS]):
             value = _mean_over_time(apart[:, g, i])
             time = _mean_over_time(quality.time - start)
-            ax.plot(time, value, color=shades[g % len(shades)], lw=0.9, label=name)
+            # Of four beams two groups may have one curve: dashes let the other show through.
+            colour, dashes = _COLOURS[g % len(_COLOURS)], _DASHES[g % len(_DASHES)]
+            ax.plot(time, value, color=colour, ls=dashes, lw=1.1, label=name)
         ax.axhline(0.0, color=GREY, lw=0.5)
         style(ax, time_label if i == 2 else "", f"{'xyz'[i]}, m/s")
     axes[1].set_title(

@@ -88,7 +88,7 @@ def errors_figure(calibrated: Score, uncalibrated: Score) -> Figure:
         end = score.percent(float(score.horizontal[-1]))
         most = score.percent(float(score.horizontal.max()))
         panels[0].set_title(
-            f"{title}: end point {end:.3g} %, largest {most:.3g} % of distance",
+            f"{title}: end point {end:.2g} %, largest {most:.2g} % of distance",
             fontsize=TITLE,
             loc="left",
         )

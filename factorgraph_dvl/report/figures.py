@@ -53,7 +53,8 @@ def write_figures(trial: Trial | PlanarTrial, solution: Solution, folder: Path) 
         figures[f"{sensor.lower()}_residuals"] = residuals_figure(group)
     if trial.beams is not None and calibrates(solution, trial.beams):
         quality = beam_quality(trial.beams, calibration_of(trial.beams, solution))
-        figures["beam_quality"] = beam_quality_figure(quality)
+        if np.isfinite(quality.error_velocity).any():
+            figures["beam_quality"] = beam_quality_figure(quality)
     if solution.estimates:
         figures["calibration"] = calibration_figure(solution, trial.calibration_truth)
     if np.count_nonzero(np.diagonal(solution.covariance) > 0.0) > 1:

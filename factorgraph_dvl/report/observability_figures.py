@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -52,6 +53,8 @@ _SHARE_COLOURS = {
     "other": "#dddddd",
 }
 _LINES = ((ACCENT, "-"), (DARK, "--"), ("#d07b3c", "-."), (GREY, ":"))
+_BEAM_COLOURS = (ACCENT, DARK, "#d07b3c", "#5b8c5a", GREY, "#a0478f")
+_MOST_IN_A_LINE = 8
 _MOST_NAMED = 10
 _MOST_TICKS = 24
 _FLOOR = 1e-2
@@ -174,16 +177,10 @@ def history_figure(history: InformationHistory, segments: Sequence[Segment]) -> 
     for k, (stem, members) in enumerate(groups.items()):
         ax = figure.add_subplot(grid[k // columns, k % columns])
         _shade(ax, segments, start)
-        for i, (colour, dashes) in zip(members, _LINES * 3, strict=False):
-            name, _ = readable(history.names[i])
-            ax.plot(
-                history.time - start,
-                std[:, i],
-                color=colour,
-                ls=dashes,
-                lw=1.3,
-                label=name.removeprefix(stem).strip() or "σ",
-            )
+        for at, i in enumerate(members):
+            own = readable(history.names[i])[0].removeprefix(stem).strip() or "σ"
+            colour, dashes = _line(own, at)
+            ax.plot(history.time - start, std[:, i], color=colour, ls=dashes, lw=1.3, label=own)
         _log_axis(ax, "y", float(std[:, members].min()), float(std[:, members].max()))
         _, unit = readable(history.names[members[0]])
         last_row = k // columns == rows - 1 or k + columns >= len(groups)
@@ -192,9 +189,18 @@ def history_figure(history: InformationHistory, segments: Sequence[Segment]) -> 
         ax.grid(color=GREY, lw=0.4, alpha=0.35)
         ax.margins(x=0.0)
         ax.set_title(f"{stem}, {unit}" if unit else stem, fontsize=NORMAL, loc="left")
-        ax.legend(fontsize=SMALL, frameon=False, ncols=len(members), loc="upper right")
+        entries = len(members) if len(members) <= _MOST_IN_A_LINE else -(-len(members) // 2)
+        ax.legend(fontsize=SMALL, frameon=False, ncols=entries, loc="upper right")
     _shade_legend(figure, segments, "σ given all data up to a time")
     return figure
+
+
+def _line(component: str, place: int) -> tuple[str, str]:
+    """Return colour and dashes of a component; those of one beam have one colour."""
+    if not component[0].isdigit():
+        return _LINES[place % len(_LINES)]
+    beam = int(component.rstrip("xy")) - 1
+    return _BEAM_COLOURS[beam % len(_BEAM_COLOURS)], "--" if component.endswith("y") else "-"
 
 
 def _log_axis(ax: Axes, which: str, low: float, high: float) -> None:
@@ -259,7 +265,9 @@ def _combination(names: Sequence[str], vector: Array, order: Sequence[str]) -> s
     for name in names[:3]:
         weight = float(vector[order.index(name)])
         sign = "−" if weight < 0.0 else "+" if parts else ""
-        parts.append(f"{sign} {abs(weight):.2f} {readable(name)[0]}".strip())
+        # Directions and scale errors with a number are those of beams.
+        short = re.sub(r"^beam (?=.* \d)", "", readable(name)[0])
+        parts.append(f"{sign} {abs(weight):.2f} {short}".strip())
     return " ".join(parts) + (" …" if len(names) > 3 else "")
 
 
@@ -311,7 +319,8 @@ def _segment_label(segment: Segment) -> str:
 def _stem(component: str) -> str:
     name, _ = readable(component)
     head, _, tail = name.rpartition(" ")
-    return head if head and len(tail) == 1 else name
+    # Components are single letters; those of beams are numbered.
+    return head if head and (len(tail) == 1 or tail[0].isdigit()) else name
 
 
 def _kind(component: str) -> str:
@@ -319,7 +328,7 @@ def _kind(component: str) -> str:
 
 
 def _short(component: str) -> str:
-    name = readable(component)[0]
+    name = readable(component)[0].replace("beam direction ", "d").replace("beam scale error ", "k")
     return name.replace("misalignment", "α").replace("scale error", "δK").replace("lever arm", "l")
 
 

@@ -10,6 +10,7 @@ from rich.table import Table
 from rich.text import Text
 
 from factorgraph_dvl.analysis.consistency import CalibrationErrors
+from factorgraph_dvl.analysis.convergence import Convergence
 from factorgraph_dvl.analysis.survey import Survey
 from factorgraph_dvl.earth import LocalFrame
 from factorgraph_dvl.report.text import at_precision, fixed, split_unit, with_std
@@ -103,6 +104,45 @@ def rejected_line(solution: Solution) -> str:
         for r in solution.rejected
     ]
     return f"Rejected: {', '.join(parts)}; rejected.csv names them"
+
+
+def convergence_table(found: Convergence) -> Table:
+    """Render from when each component was good enough."""
+    table = Table(title="Convergence: time from which on it stayed within")
+    add_column(table, "component")
+    for header in ("σ below", "since s", "error below", "since s"):
+        add_column(table, header, numeric=True)
+    truth = any(math.isfinite(c.error_since) for c in found.components)
+    for c in found.components:
+        name, unit = split_unit(c.name)
+        table.add_row(
+            name,
+            f"{c.good_std:.3g} {unit}",
+            _moment(c.std_since),
+            f"{c.good_error:.3g} {unit}" if truth else "–",
+            _moment(c.error_since) if truth else "–",
+        )
+    return table
+
+
+def good_enough_line(found: Convergence, start: float) -> str:
+    """Say from when the calibration could have been stopped.
+
+    Parameters
+    ----------
+    found : how it converged.
+    start : of the trial, s.
+    """
+    if math.isfinite(found.good_since):
+        return f"good enough after {found.good_since - start:.0f} s"
+    if not found.components:
+        return "no limits apply to what was estimated"
+    late = [c.name for c in found.components if not math.isfinite(c.std_since)]
+    return f"not good enough until the end: {', '.join(late) or 'measurements were in doubt'}"
+
+
+def _moment(time: float) -> str:
+    return f"{time:.1f}" if math.isfinite(time) else "never"
 
 
 def sensor_table(survey: Survey) -> Table:

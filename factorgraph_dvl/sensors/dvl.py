@@ -10,7 +10,7 @@ import msgspec
 import numpy as np
 from msgspec import UNSET, UnsetType
 
-from factorgraph_dvl.conventions import DEG, Array, rotate, skew
+from factorgraph_dvl.conventions import DEG, Array, cross, rotate, skew
 from factorgraph_dvl.earth import LocalFrame
 from factorgraph_dvl.errors import ConfigError
 from factorgraph_dvl.sensors.protocol import (
@@ -225,7 +225,9 @@ class Dvl:
         m = self.locked
         if not m.any():
             return ()
-        return (DvlVelocity(self.time[m], self.velocity[m], self.sigma()[m]),)
+        s = self.settings
+        noise = (s.velocity_std_m_s, s.velocity_std_fraction)
+        return (DvlVelocity(self.time[m], self.velocity[m], self.std[m], noise),)
 
     def explain(self, parameter: str, component: int, motion: Motion | None) -> str:
         """Say why a component could not be observed, given the motion of the trial."""
@@ -277,12 +279,14 @@ class DvlVelocity:
     ----------
     time : (M,) s, as in the file.
     measured_d : (M, 3) m/s.
-    std : (M, 3) m/s.
+    std : (M, 3) m/s; nan where it follows from `noise`.
+    noise : floor, m/s, and fraction of the speed.
     """
 
     time: Array
     measured_d: Array
     std: Array
+    noise: tuple[float, float] = (0.0, 0.0)
     label: str = "DVL velocity"
     unit: str = "m/s"
     components: tuple[str, ...] = ("x", "y", "z")
@@ -300,8 +304,17 @@ class DvlVelocity:
         return self.time - values[TIME_OFFSET][0]
 
     def sigma(self, motion: Motion, values: Values) -> Array:
-        """Return the standard deviations, the gyro's share through the lever arm included."""
-        return np.hypot(self.std, lever_arm_sigma(motion, values[LEVER_ARM])[:, None])
+        """Return the standard deviations, the gyro's share through the lever arm included.
+
+        By the predicted speed: by the measured one, pings whose noise makes them smaller
+        would count more, and the scale would come out too small by twice the squared fraction.
+        """
+        floor, fraction = self.noise
+        predicted = self.residual(motion, values) + self.measured_d
+        speed = np.linalg.norm(predicted, axis=1, keepdims=True)
+        std = np.where(np.isnan(self.std), np.hypot(floor, fraction * speed), self.std)
+        std = np.maximum(std, _LEAST_SIGMA)
+        return np.hypot(std, lever_arm_sigma(motion, values[LEVER_ARM])[:, None])
 
     def residual(self, motion: Motion, values: Values) -> Array:
         """Return predicted - measured in d, (M, 3), m/s."""
@@ -325,8 +338,8 @@ class DvlVelocity:
             # d/dt of (bRn (v_n - c_n) + omega x l), against the direction of the offset.
             rate_b = (
                 rotate(bRn, motion.a_n)
-                - np.cross(motion.omega_eb_b, imu_b)
-                + np.cross(motion.alpha_b, lever_arm)
+                - cross(motion.omega_eb_b, imu_b)
+                + cross(motion.alpha_b, lever_arm)
             )
             return -(rate_b @ dMb.T)[:, :, None]
 
@@ -362,4 +375,4 @@ def _velocity_at_dvl(motion: Motion, values: Values) -> tuple[Array, Array]:
     """Return the velocities of DVL and IMU, relative to bottom or water, in body, (M, 3)."""
     current_n = np.append(values[CURRENT], 0.0)
     imu_b = rotate(motion.nRb.transpose(0, 2, 1), motion.v_n - current_n)
-    return imu_b + np.cross(motion.omega_eb_b, values[LEVER_ARM]), imu_b
+    return imu_b + cross(motion.omega_eb_b, values[LEVER_ARM]), imu_b

@@ -41,6 +41,7 @@ Acute = Annotated[float, msgspec.Meta(ge=0, le=90)]
 _LEAST_SPREAD = 0.05
 _UNIT = 0.05
 _LEAST_SIGMA = 1e-4
+_ROUNDING = 1e-12
 # Signs of x and y in the octants V to VIII, below the plane of x and y.
 _OCTANTS = np.array([[1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0], [1.0, -1.0]])
 
@@ -101,8 +102,12 @@ class DvlBeamsSettings(SensorSection, frozen=True, kw_only=True):
         if not isinstance(self.directions, UnsetType):
             vectors = np.array(self.directions, dtype=float).reshape(-1, 3)
             length = np.linalg.norm(vectors, axis=1)
-            if np.any(np.abs(length - 1.0) > _UNIT):
-                raise ValueError("`directions` must hold unit vectors")
+            worst = int(np.argmax(np.abs(length - 1.0))) if length.size else 0
+            if length.size and abs(length[worst] - 1.0) > _UNIT:
+                raise ValueError(
+                    "`directions` must hold unit vectors; that of "
+                    f"beam {worst + 1} has the length {length[worst]:.3g}"
+                )
             return np.asarray(vectors / length[:, None])
         if not isinstance(self.slant_azimuth_deg, UnsetType):
             slant, azimuth = np.array(self.slant_azimuth_deg).reshape(-1, 2).T * DEG
@@ -114,10 +119,15 @@ class DvlBeamsSettings(SensorSection, frozen=True, kw_only=True):
         alpha, theta = np.array(self.alpha_theta_deg).reshape(-1, 2).T * DEG
         if alpha.size != 4:
             raise ValueError("`alpha_theta_deg` must hold four beams, in octants V to VIII")
-        if np.any(alpha + theta > 90.0 * DEG):
-            raise ValueError("`alpha_theta_deg` must not add up to more than 90 deg")
+        # A beam in the xz plane may be beyond it by rounding.
+        y2 = np.cos(alpha + theta) * np.cos(alpha - theta)
+        if np.any(y2 < -_ROUNDING):
+            beam = int(np.argmin(y2)) + 1
+            raise ValueError(
+                f"`alpha_theta_deg` must not add up to more than 90 deg; those of beam {beam} do"
+            )
         x, z = np.sin(alpha), -np.sin(theta)
-        y = np.sqrt(1.0 - x**2 - z**2)
+        y = np.sqrt(np.maximum(y2, 0.0))
         return np.stack([_OCTANTS[:, 0] * x, _OCTANTS[:, 1] * y, z], axis=1)
 
     @property
@@ -261,14 +271,18 @@ class DvlBeams:
         )
         lost = np.isnan(self.velocity[m])
         measured = np.where(lost, 0.0, self.velocity[m])
-        std = np.where(lost, np.inf, self.sigma()[m])
-        return (BeamVelocity(self.time[m], measured, std, geometry, lever_arm),)
+        s = self.settings
+        noise = (s.velocity_std_m_s, s.velocity_std_fraction)
+        return (BeamVelocity(self.time[m], measured, lost, noise, geometry, lever_arm),)
 
     def explain(self, parameter: str, component: int, motion: Motion | None) -> str:
         """Say why a component could not be observed, given the motion of the trial."""
         if motion is None or motion.v_n.shape[0] < 2:
             return "the trial has no ping with a beam while the IMU runs, or only one"
+        received = np.flatnonzero(~np.isnan(self.velocity).all(axis=0)) + 1
         if parameter.endswith("lever_arm_m"):
+            if received.size < 3:
+                return f"too few beams were ever received: {' and '.join(map(str, received))}"
             x, y, z = np.degrees(np.std(motion.omega_eb_b, axis=0))
             return (
                 f"the body turns too little (rms rate {x:.2g}, {y:.2g}, {z:.2g} deg/s about "
@@ -277,7 +291,7 @@ class DvlBeams:
         of_a_beam = {DIRECTION: component // 2, SCALE_ERROR: component}
         if self.settings.parametrisation == "beams":
             beam = of_a_beam[parameter]
-            if np.isnan(self.velocity[:, beam]).all():
+            if beam + 1 not in received:
                 return f"beam {beam + 1} was never received"
         v_b = rotate(motion.nRb.transpose(0, 2, 1), motion.v_n)
         x, y, z = np.sqrt(np.mean(v_b**2, axis=0))
@@ -301,14 +315,16 @@ class BeamVelocity:
     ----------
     time : (M,) s.
     measured : (M, N) m/s; any number where lost.
-    std : (M, N) m/s, infinite where lost.
+    lost : (M, N) bool.
+    noise : floor, m/s, and fraction of the beam's velocity.
     geometry : directions and scales.
     lever_arm : name of the parameter.
     """
 
     time: Array
     measured: Array
-    std: Array
+    lost: Array
+    noise: tuple[float, float]
     geometry: Geometry
     lever_arm: str
     label: str = "Beam velocity"
@@ -329,8 +345,16 @@ class BeamVelocity:
         return self.time
 
     def sigma(self, motion: Motion, values: Values) -> Array:
-        """Return the standard deviations, the gyro's share through the lever arm included."""
-        return np.hypot(self.std, lever_arm_sigma(motion, values[self.lever_arm])[:, None])
+        """Return the standard deviations, the gyro's share through the lever arm included.
+
+        By the predicted velocity: by the measured one, pings whose noise makes them smaller
+        would count more, and the scale would come out too small by twice the squared fraction.
+        """
+        floor, fraction = self.noise
+        predicted = self.residual(motion, values) + self.measured
+        std = np.maximum(np.hypot(floor, fraction * predicted), _LEAST_SIGMA)
+        std = np.hypot(std, lever_arm_sigma(motion, values[self.lever_arm])[:, None])
+        return np.where(self.lost, np.inf, std)
 
     def residual(self, motion: Motion, values: Values) -> Array:
         """Return predicted - measured, (M, N), m/s."""

@@ -8,7 +8,7 @@ from typing import ClassVar, Self
 
 import numpy as np
 
-from factorgraph_dvl.conventions import DEG, GEODETIC_SI, Array, rotate, skew
+from factorgraph_dvl.conventions import DEG, GEODETIC_SI, Array, cross, rotate, skew
 from factorgraph_dvl.earth import LocalFrame
 from factorgraph_dvl.sensors.protocol import (
     Linearization,
@@ -281,7 +281,7 @@ class AntennaVelocity:
 
     def residual(self, motion: Motion, values: Values) -> Array:
         """Return predicted - measured in local-level east, north, up, (M, 3), m/s."""
-        turning_b = np.cross(motion.omega_eb_b - self.omega_cb_b, self.bRc @ values[LEVER_ARM])
+        turning_b = cross(motion.omega_eb_b - self.omega_cb_b, self.bRc @ values[LEVER_ARM])
         return rotate(self.lRn, motion.v_n + rotate(motion.nRb, turning_b)) - self.measured_l
 
     def linearize(self, motion: Motion, values: Values, wanted: Collection[str]) -> Linearization:
@@ -291,7 +291,7 @@ class AntennaVelocity:
         lRb = self.lRn @ motion.nRb
         return Linearization(
             residual=self.residual(motion, values),
-            d_theta=-lRb @ skew(np.cross(omega_ec_b, lever_arm)),
+            d_theta=-lRb @ skew(cross(omega_ec_b, lever_arm)),
             d_v=self.lRn,
             d_omega=-lRb @ skew(lever_arm),
             d_parameters=(

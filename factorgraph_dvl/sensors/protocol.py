@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Iterable, Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass, field
 from datetime import datetime
-from typing import Annotated, Any, ClassVar, Protocol, Self, runtime_checkable
+from typing import Annotated, Any, ClassVar, Protocol, Self, TypeVar, runtime_checkable
 
 import msgspec
 import numpy as np
+from numpy.typing import NDArray
 
 from factorgraph_dvl.conventions import Array, exp_so3
 from factorgraph_dvl.directions import turns_to
@@ -341,6 +343,39 @@ class AttitudeAid(Aid, Protocol):
 
     def attitudes(self, frame: LocalFrame) -> Attitudes:
         """Return the attitudes that were measured, in `frame`."""
+
+
+_AnyRecord = TypeVar("_AnyRecord")
+
+
+def rows_of(record: _AnyRecord, rows: slice | NDArray[Any] | list[int]) -> _AnyRecord:
+    """Return some rows of a sensor's record, in the order of time: of every array in it."""
+    return _with(record, {name: values[rows] for name, values in _arrays(record).items()})
+
+
+def joined(records: Sequence[_AnyRecord]) -> _AnyRecord:
+    """Return records of one sensor as one, in the order of time.
+
+    Of rows at the same time the first is kept.
+    """
+    if len(records) == 1:
+        return records[0]
+    columns = [_arrays(record) for record in records]
+    whole = {name: np.concatenate([c[name] for c in columns]) for name in columns[0]}
+    _, rows = np.unique(whole["time"], return_index=True)
+    return _with(records[0], {name: values[rows] for name, values in whole.items()})
+
+
+def _with(record: _AnyRecord, arrays: Mapping[str, Array]) -> _AnyRecord:
+    # Rows of a record that was checked need no check, which would take most of the time.
+    out = copy(record)
+    for name, values in arrays.items():
+        object.__setattr__(out, name, values)
+    return out
+
+
+def _arrays(record: Any) -> dict[str, Array]:
+    return {name: value for name, value in vars(record).items() if isinstance(value, np.ndarray)}
 
 
 def lever_arm_sigma(motion: Motion, lever_arm: Array) -> Array:

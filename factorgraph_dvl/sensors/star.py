@@ -255,14 +255,15 @@ class Star:
         components across each direction, less three of each attitude. nan where the record
         holds attitudes.
         """
-        if self.vectors is None:
+        v = self._seen
+        if v is None:
             return np.nan
-        freedom = 2 * self.vectors.time.size - 3 * self.time.size
+        freedom = 2 * v.time.size - 3 * self.time.size
         return float(np.sqrt(np.sum(self._star_misfits() ** 2) / freedom))
 
     def doubts(self) -> tuple[str, ...]:
         """Return a warning if the stars do not fit their catalogue, naming the worst of them."""
-        v = self.vectors
+        v = self._seen
         if v is None or not self.misfit > TOO_LARGE:
             return ()
         square = self._star_misfits() ** 2
@@ -287,9 +288,22 @@ class Star:
             f"is it another one, are columns mixed up, or is aberration left in? {consequence}",
         )
 
+    @property
+    def _seen(self) -> StarVectors | None:
+        """Vectors of the record's epochs; None where they are not those of every epoch.
+
+        Some rows of a record keep all vectors, and joined ones those of the first.
+        """
+        v = self.vectors
+        if v is None:
+            return None
+        rows = np.isin(v.time, self.time)
+        v = StarVectors(v.time[rows], v.body[rows], v.inertial[rows])
+        return v if np.array_equal(v.time[v.first], self.time) else None
+
     def _star_misfits(self) -> Array:
         """Return the angles from the catalogue's directions to the measured ones, (K,), sigmas."""
-        v = self.vectors
+        v = self._seen
         assert v is not None
         count = np.diff(np.append(v.first, v.time.size))
         iRs = Rotation.from_quat(np.repeat(self.quaternion[:, [1, 2, 3, 0]], count, axis=0))

@@ -20,6 +20,7 @@ from factorgraph_dvl.increments import increments
 from factorgraph_dvl.mounting import calibrated, initial_values
 from factorgraph_dvl.planar.evidence import odds_against
 from factorgraph_dvl.preintegration import Segments, States, attach, motion_at, segments
+from factorgraph_dvl.priors import Known
 from factorgraph_dvl.sensors.protocol import Aid, Motion, Observation, Parameter
 from factorgraph_dvl.solution import Solution, joined
 from factorgraph_dvl.solvers.covariance import Posterior, changes_with, considered, posterior
@@ -104,7 +105,10 @@ def solve(
     _check_above_zero("rate_hz", rate_hz)
     report = progress or (lambda stage, iteration, cost: None)
     prepared = _prepare(trial, state_interval_s, report)
-    found = [_descended(prepared, states, report) for states in prepared.anchors.states]
+    found = [
+        _described(*_descended(prepared, states, report), prepared.notes, report)
+        for states in prepared.anchors.states
+    ]
     solutions = [solution_of(each, rate_hz) for each in found]
     against = odds_against([_cost_terms(each) for each in found])
     return joined(solutions, against, prepared.anchors.hypotheses)
@@ -130,8 +134,66 @@ def minimised(
 ) -> Minimised:
     """Minimise the problem of a trial; arguments and errors as of `solve`."""
     report = progress or (lambda stage, iteration, cost: None)
-    prepared = _prepare(trial, state_interval_s, report)
-    return _descended(prepared, prepared.anchors.states[0], report)
+    problem, minimum, notes = fit(trial, state_interval_s=state_interval_s, progress=report)
+    return _described(problem, minimum, notes, report)
+
+
+def _described(
+    problem: Problem, minimum: Minimum, notes: tuple[str, ...], report: Progress
+) -> Minimised:
+    """Return a minimum with its covariances, and without what the data cannot tell."""
+    report("covariance", 0, None)
+    covariances = posterior(problem, minimum)
+    told = told_of(problem, minimum, covariances)
+    held = told.directions_not_told()
+    if held.size:
+        # How others go with what is held is linear here, where the directions belong.
+        changes = changes_with(problem, covariances, held, told.coupled(held))
+        origin = at_prior_along(problem, minimum.evaluation.parameters, held)
+        problem.hold(held, origin)
+        at = problem.values(minimum.evaluation.states, origin)
+        again = minimise(
+            problem, at, stage="all sensors, without what they cannot tell", progress=report
+        )
+        minimum = replace(again, iterations=minimum.iterations + again.iterations)
+        covariances = considered(posterior(problem, minimum), changes)
+    return Minimised(problem, minimum, covariances, held, notes)
+
+
+def _cost_terms(found: Minimised) -> Array:
+    """Return the terms of the cost: of each measurement, of the rest at once."""
+    evaluation = found.minimum.evaluation
+    parts = []
+    total = 0.0
+    for observation, residual, weight in zip(
+        found.problem.observations, evaluation.residuals, found.problem.weights, strict=True
+    ):
+        own = 0.5 * np.sum(residual**2, axis=1)
+        total += own.sum()
+        gate = getattr(observation, "gate", 0.0)
+        parts.append(np.where(weight[:, 0] > 0.0, own, 0.5 * gate**2))
+    return np.concatenate([*parts, [evaluation.cost - total]])
+
+
+def fit(
+    trial: Trial, *, state_interval_s: float, progress: Progress, known: Known | None = None
+) -> tuple[Problem, Minimum, tuple[str, ...]]:
+    """Find the minimum of a trial's cost, from nothing but its data.
+
+    Parameters
+    ----------
+    trial, state_interval_s : as for `solve`.
+    progress : called with stage, iteration and cost.
+    known : of biases and calibration, in place of the trial's priors.
+
+    Returns
+    -------
+    problem, minimum, notes : what was minimised, where it ended, what the user must know.
+    """
+    prepared = _prepare(trial, state_interval_s, progress)
+    states = prepared.anchors.states[0]
+    problem, minimum = _descended(prepared, states, progress, known)
+    return problem, minimum, prepared.notes
 
 
 def _prepare(trial: Trial, state_interval_s: float, report: Progress) -> _Prepared:
@@ -150,71 +212,45 @@ def _prepare(trial: Trial, state_interval_s: float, report: Progress) -> _Prepar
     return _Prepared(trial, frame, seg, anchors, start.mountings, notes)
 
 
-def _descended(prepared: _Prepared, states: States, report: Progress) -> Minimised:
+def _descended(
+    prepared: _Prepared, states: States, report: Progress, known: Known | None = None
+) -> tuple[Problem, Minimum]:
+    """Return the minimum that is reached from some states."""
     trial, frame, seg = prepared.trial, prepared.frame, prepared.seg
     rejected = prepared.anchors.rejected
-    values = None
+    values = None if known is None else known.parameters
     iterations = 0
     p_gravity = np.full_like(states.p_n, np.inf)
     for _ in range(_ROUNDS):
         if np.sqrt(np.mean((states.p_n - p_gravity) ** 2)) > _SAME_GRAVITY:
-            chain, p_gravity = inertial_chain(trial, frame, seg, states), states.p_n
+            chain = inertial_chain(trial, frame, seg, states, bias_prior=known is None)
+            p_gravity = states.p_n
         if values is None:
             # A DVL that is calibrated does no harm from the start.
-            known = trial.dvl is not None and calibrated(trial.dvl)
-            if trial.gnss is not None and not known:
+            mounted = trial.dvl is not None and calibrated(trial.dvl)
+            if trial.gnss is not None and not mounted:
                 coarse = _without_dvl(chain, states, prepared.mountings, report)
                 iterations += coarse.iterations
                 states = coarse.evaluation.states
             report("mounting", 0, None)
             values = prepared.mountings | _mountings(trial, frame, seg, chain.gravity_n, states)
-        problem = Problem(chain, *_sensors(trial.aids, frame), start=values)
+        problem = Problem(chain, *_sensors(trial.aids, frame), start=values, known=known)
         problem.reject(rejected)
         at = problem.values(states, {**problem.prior_values(), **values})
         minimum = minimise(problem, at, stage="all sensors", progress=report)
         iterations += minimum.iterations
         states, values = minimum.evaluation.states, minimum.evaluation.parameters
         same_gravity = np.sqrt(np.mean((states.p_n - p_gravity) ** 2)) <= _SAME_GRAVITY
+        settled = not (problem.strayed(values) or problem.misweighed(minimum.evaluation))
         outliers = problem.outliers(minimum.evaluation)
-        if same_gravity and not problem.strayed(values) and _same(outliers, rejected):
+        if same_gravity and settled and _same(outliers, rejected):
             break
         rejected = outliers
-    report("covariance", 0, None)
-    covariances = posterior(problem, minimum)
-    told = told_of(problem, minimum, covariances)
-    held = told.directions_not_told()
-    if held.size:
-        # How others go with what is held is linear here, where the directions belong.
-        changes = changes_with(problem, covariances, held, told.coupled(held))
-        origin = at_prior_along(problem, minimum.evaluation.parameters, held)
-        problem.hold(held, origin)
-        at = problem.values(states, origin)
-        minimum = minimise(
-            problem, at, stage="all sensors, without what they cannot tell", progress=report
-        )
-        iterations += minimum.iterations
-        covariances = considered(posterior(problem, minimum), changes)
-    minimum = replace(minimum, iterations=iterations)
-    return Minimised(problem, minimum, covariances, held, prepared.notes)
+    return problem, replace(minimum, iterations=iterations)
 
 
 def _same(a: Mapping[str, Array], b: Mapping[str, Array]) -> bool:
     return a.keys() == b.keys() and all(np.array_equal(a[k], b[k]) for k in a)
-
-
-def _cost_terms(found: Minimised) -> Array:
-    """Return the terms of the cost: of each measurement, of the rest at once."""
-    evaluation = found.minimum.evaluation
-    parts = []
-    total = 0.0
-    for observation, residual, weight in zip(
-        found.problem.observations, evaluation.residuals, found.problem.weights, strict=True
-    ):
-        own = 0.5 * np.sum(residual**2, axis=1)
-        total += own.sum()
-        gate = getattr(observation, "gate", 0.0)
-        parts.append(np.where(weight[:, 0] > 0.0, own, 0.5 * gate**2))
-    return np.concatenate([*parts, [evaluation.cost - total]])
 
 
 def _check_above_zero(name: str, value: float) -> None:
@@ -229,6 +265,8 @@ def _without_dvl(
     """Return the minimum without the sensors whose mounting that is to tell."""
     trial = chain.trial
     unknown = {a.mounting.name for a in attitudes(trial, chain.frame)} - mountings.keys()
+    if trial.beams is not None:
+        unknown |= {p.name for p in trial.beams.parameters() if p.rotation and p.estimated}
     used = [
         aid
         for aid in trial.aids

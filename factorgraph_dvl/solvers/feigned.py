@@ -10,6 +10,7 @@ here; where it is most of it, the direction is not observable, and the prior is 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,7 +18,7 @@ import numpy as np
 from factorgraph_dvl.conventions import Array, rotate, skew
 from factorgraph_dvl.graph import Evaluation, Problem
 from factorgraph_dvl.preintegration import Attachment
-from factorgraph_dvl.sensors.protocol import Motion, Observation
+from factorgraph_dvl.sensors.protocol import Motion, Observation, Values
 from factorgraph_dvl.solvers.covariance import Posterior
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum
 
@@ -138,9 +139,17 @@ def feigned_information(problem: Problem, evaluation: Evaluation, nodes: Array) 
     ):
         names = [p.name for p in problem.parameters if p.name in observation.parameters]
         if names:
-            part, columns = _feigned_by(
-                problem, observation, attachment, motion, weight, evaluation, nodes
+            part = feigned_by(
+                observation,
+                attachment,
+                motion,
+                weight,
+                nodes[attachment.node],
+                evaluation.parameters,
+                names,
             )
+            places = [problem.columns[name] for name in names]
+            columns = np.concatenate([np.arange(p.start, p.stop) for p in places])
             np.add.at(out, (attachment.node[:, None, None], columns[:, None], columns), part)
     return np.asarray(root.T @ out @ root)
 
@@ -196,39 +205,41 @@ def at_prior_along(
     return parameters
 
 
-def _feigned_by(
-    problem: Problem,
+def feigned_by(
     observation: Observation,
     attachment: Attachment,
     motion: Motion,
     weight: Array,
-    evaluation: Evaluation,
-    nodes: Array,
-) -> tuple[Array, np.ndarray]:
-    """Return what the motion's error is expected to add by measurement, and its place.
+    P: Array,
+    values: Values,
+    wanted: Sequence[str],
+) -> Array:
+    """Return what the motion's error is expected to add by measurement, (M, p, p), SI.
 
-    The first is (M, p, p) for the p columns that the second names.
+    Parameters
+    ----------
+    observation : of M measurements of d components.
+    attachment, motion : of them.
+    weight : (M, d) inverse standard deviations.
+    P : (M, 9, 9) covariances of the nodes before them, in GTSAM's tangent space.
+    values : of all parameters.
+    wanted : names of the parameters, of p columns, whose information is asked for.
     """
-    wanted = [p.name for p in problem.parameters if p.name in observation.parameters]
-    columns = np.concatenate(
-        [np.arange(place.start, place.stop) for place in map(problem.columns.get, wanted) if place]
-    )
-    values = evaluation.parameters
 
     def jacobian(at: Motion) -> Array:
         found = observation.linearize(at, values, wanted).d_parameters
         return np.concatenate([found[name] for name in wanted], axis=2)
 
     base = jacobian(motion)
+    size = base.shape[2]
     v_b = rotate(motion.nRb.transpose(0, 2, 1), motion.v_n)
-    P = nodes[attachment.node]
     by_state = np.concatenate(
         [skew(v_b), np.zeros_like(motion.nRb), np.broadcast_to(np.eye(3), motion.nRb.shape)],
         axis=2,
     )
     covariance = by_state @ P @ by_state.transpose(0, 2, 1)
     root = np.linalg.cholesky(covariance + 1e-16 * np.eye(3))
-    out = np.zeros((attachment.node.size, columns.size, columns.size))
+    out = np.zeros((attachment.node.size, size, size))
     for k in range(3):
         axis = np.eye(3)[k]
         waver = rotate(motion.nRb, root[:, :, k])
@@ -241,4 +252,4 @@ def _feigned_by(
         ):
             change = (jacobian(changed) - base) * weight[:, :, None]
             out += change.transpose(0, 2, 1) @ change
-    return out, columns
+    return out

@@ -7,6 +7,8 @@ import numpy as np
 from factorgraph_dvl.attitude_alignment import attitudes
 from factorgraph_dvl.conventions import Array
 from factorgraph_dvl.earth import LocalFrame
+from factorgraph_dvl.sensors.imu import ImuSettings
+from factorgraph_dvl.sensors.protocol import Attitudes
 from factorgraph_dvl.trial import Trial
 
 # States this far apart, s, are as good as denser ones for positions and velocities: every
@@ -17,7 +19,7 @@ STATE_INTERVAL = 1.0
 # gyros may be left out.
 _SHARE = 0.02
 # States are not closer than this, s.
-_CLOSEST = 0.05
+CLOSEST = 0.05
 
 
 def dense_epochs(trial: Trial, frame: LocalFrame, interval: float) -> Array | None:
@@ -26,23 +28,25 @@ def dense_epochs(trial: Trial, frame: LocalFrame, interval: float) -> Array | No
     The angle of the gyros walks by q t within t. Attitudes of variance sigma² each, n of
     them to a state, must not hang on that state if q interval is not far below sigma²/n.
     """
-    walk = trial.imu.settings.gyro_noise_root_psd**2 * interval
-    epochs = [np.empty(0)]
-    for seen in attitudes(trial, frame):
-        step = float(np.median(np.diff(seen.time))) if seen.time.size > 1 else interval
-        each = float(np.median(seen.sigma)) ** 2 / max(interval / step, 1.0)
-        if walk > _SHARE * each:
-            epochs.append(seen.time)
-    time = np.unique(np.concatenate(epochs))
+    settings = trial.imu.settings
+    seen = [s for s in attitudes(trial, frame) if needs_states(s, settings, interval)]
+    time = np.unique(np.concatenate([np.empty(0), *(s.time for s in seen)]))
     return _thinned(time) if time.size else None
+
+
+def needs_states(seen: Attitudes, settings: ImuSettings, interval: float) -> bool:
+    """Whether attitudes need states of their own besides those every `interval` s."""
+    step = float(np.median(np.diff(seen.time))) if seen.time.size > 1 else interval
+    each = float(np.median(seen.sigma)) ** 2 / max(interval / step, 1.0)
+    return settings.gyro_noise_root_psd**2 * interval > _SHARE * each
 
 
 def _thinned(time: Array) -> Array:
     """Return times without those that follow another too closely."""
-    if np.diff(time).min(initial=np.inf) >= _CLOSEST:
+    if np.diff(time).min(initial=np.inf) >= CLOSEST:
         return time
     kept = [time[0]]
     for t in time[1:].tolist():
-        if t - kept[-1] >= 0.99 * _CLOSEST:
+        if t - kept[-1] >= 0.99 * CLOSEST:
             kept.append(t)
     return np.array(kept)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import fields
+from functools import partial
 
 import numpy as np
 
@@ -11,9 +12,7 @@ from factorgraph_dvl import keys
 from factorgraph_dvl.conventions import (
     Array,
     exp_so3,
-    inverse_right_jacobian,
     log_so3,
-    reported_rotation_vector,
     rotate,
     rph_from_rotation,
     rph_jacobian,
@@ -28,16 +27,11 @@ from factorgraph_dvl.solution import (
     Trajectory,
     doubts,
     mostly_rejected,
+    not_observable,
 )
 from factorgraph_dvl.solvers.covariance import Posterior
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum
-
-# The data observed a component if they at least halved what was unknown of it.
-_OBSERVABLE = 0.5
-_FIRST = (
-    *("beam_direction", "beam_scale_error", "misalignment", "scale_error", "lever_arm"),
-    *("gyro_bias", "accel_bias"),
-)
+from factorgraph_dvl.solvers.reported import estimates_of, in_order, in_unit
 
 
 def summarise(
@@ -115,17 +109,10 @@ def reported(
         )
         rows.append((parameter, weight @ bias / parameter.si, functional))
     for p in problem.all_parameters:
-        value = evaluation.parameters[p.name]
-        derivative = np.eye(p.mean.size)
-        if p.rotation:
-            value = reported_rotation_vector(value, p.mean)
-            derivative = inverse_right_jacobian(value)
-        if p.estimated:
-            rows.append((p, value / p.si, {problem.key(p.name): derivative / p.si}))
-        elif p.stem in _FIRST:
-            rows.append((p, value / p.si, None))
-    rows.sort(key=lambda r: _FIRST.index(r[0].stem) if r[0].stem in _FIRST else len(_FIRST))
-    return rows
+        row = in_unit(p, evaluation.parameters[p.name])
+        own = {problem.key(p.name): row.derivative} if p.estimated else None
+        rows.append((p, row.value, own))
+    return in_order(rows, lambda r: r[0])
 
 
 def calibration(
@@ -152,31 +139,7 @@ def calibration(
         )
         spread *= np.where(own, 1.0, room / np.maximum(size, np.finfo(float).tiny))[:, None]
     joint = joint + spread @ spread.T
-    total = sum(p.mean.size for p, _, _ in rows)
-    covariance = np.zeros((total, total))
-    is_free = np.concatenate([np.full(p.mean.size, f is not None) for p, _, f in rows])
-    covariance[np.ix_(is_free, is_free)] = joint
-    known = np.concatenate([p.sigma == 0.0 for p, _, _ in rows])
-    covariance[known] = covariance[:, known] = 0.0
-    std = np.sqrt(np.diag(covariance))
-    estimates, at = [], 0
-    for p, value, _ in rows:
-        own = std[at : at + p.mean.size]
-        at += p.mean.size
-        prior = p.sigma / p.si
-        estimates.append(
-            Estimate(
-                name=p.name,
-                component_names=p.component_names,
-                value=np.array(value),
-                std=own,
-                prior_value=p.mean / p.si,
-                prior_std=prior,
-                observable=(prior > 0.0) & (own <= _OBSERVABLE * prior),
-                nominal=p.nominal,
-            )
-        )
-    return tuple(estimates), covariance
+    return estimates_of([(p, value) for p, value, _ in rows], joint)
 
 
 def prior_along(
@@ -338,20 +301,19 @@ def _unobservable(
     if kept:
         source = next(iter(calibrated.values())).source
         out.append(f"{', '.join(kept)}: as in {source}; this trial adds little or nothing to that")
+
+    def why(name: str, component: int) -> str:
+        if name in by_name:
+            missing = "; the trial has no GNSS" if trial.gnss is None else ""
+            return by_name[name].explain(name, component, seen.get(name)) + missing
+        if trial.gnss is None:
+            return "without GNSS nothing separates the errors of the IMU from the motion"
+        return (
+            f"{duration:.0f} s with these manoeuvres do not tell it better than the prior; "
+            "it takes longer, or turns and changes of speed"
+        )
+
     for e in estimates:
-        bad = np.flatnonzero(~e.observable & (e.prior_std > 0.0))
-        if bad.size == 0 or e.name in calibrated:
-            continue
-        names = ", ".join(e.component_names[i] for i in bad)
-        if e.name in by_name:
-            why = by_name[e.name].explain(e.name, int(bad[0]), seen.get(e.name))
-        elif trial.gnss is None:
-            why = "without GNSS nothing separates the errors of the IMU from the motion"
-        else:
-            why = (
-                f"{duration:.0f} s with these manoeuvres do not tell it better than the prior; "
-                "it takes longer, or turns and changes of speed"
-            )
-        missing = "; the trial has no GNSS" if trial.gnss is None and e.name in by_name else ""
-        out.append(f"{names} not observable: {why}{missing}")
+        if e.name not in calibrated:
+            out += not_observable(e, partial(why, e.name))
     return out

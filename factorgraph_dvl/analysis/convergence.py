@@ -1,0 +1,116 @@
+"""When a calibration was good enough: from what was known at each time."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from factorgraph_dvl.analysis.consistency import true_value_of
+from factorgraph_dvl.conventions import Array
+from factorgraph_dvl.errors import ConfigError
+from factorgraph_dvl.solution import Estimate
+
+# Standard deviations and errors that are good enough, by parameter, in reported units: what
+# leaves dead reckoning with 0.1 % of the distance.
+GOOD_STD: dict[str, float] = {"misalignment_deg": 0.03, "scale_error": 3e-4, "lever_arm_m": 0.03}
+GOOD_ERROR: dict[str, float] = {"misalignment_deg": 0.06, "scale_error": 6e-4, "lever_arm_m": 0.06}
+
+
+@dataclass(frozen=True)
+class ComponentConvergence:
+    """How a component converged.
+
+    Parameters
+    ----------
+    name : of the component.
+    good_std, good_error : limits, in its unit.
+    std_since : time from which on its standard deviation stayed below the limit, s; nan =
+        never.
+    error_since : the same of its error against the truth; nan also where that is unknown.
+    """
+
+    name: str
+    good_std: float
+    good_error: float
+    std_since: float
+    error_since: float
+
+
+@dataclass(frozen=True)
+class Convergence:
+    """How a calibration converged.
+
+    Parameters
+    ----------
+    components : those with a limit.
+    good_since : time from which on all standard deviations stayed below their limits, and no
+        measurements were in doubt, s; nan = never.
+    """
+
+    components: tuple[ComponentConvergence, ...]
+    good_since: float
+
+
+def convergence(
+    time: Array,
+    values: Array,
+    std: Array,
+    doubted: np.ndarray,
+    estimates: Sequence[Estimate],
+    truth: Mapping[str, ArrayLike],
+    good_std: Mapping[str, float],
+    good_error: Mapping[str, float],
+) -> Convergence:
+    """Return when each component stayed within its limits.
+
+    Parameters
+    ----------
+    time : (H,) s.
+    values, std : (H, n) what was known then, in the order of `estimates`.
+    doubted : (H,) whether the standard deviations were not to be trusted.
+    estimates : at the end.
+    truth : true values by reported name; may be empty.
+    good_std, good_error : limits by reported name, in its unit.
+
+    Raises
+    ------
+    ConfigError
+        If a limit is for something that was not estimated.
+    """
+    known = {e.name for e in estimates}
+    for name in (*good_std, *good_error):
+        if name not in known and name not in GOOD_STD:
+            raise ConfigError(
+                f"no parameter {name!r} was estimated", expected=f"one of {', '.join(known)}"
+            )
+    out, column = [], 0
+    all_good = ~doubted
+    for e in estimates:
+        true_value = true_value_of(e, truth)
+        for i, name in enumerate(e.component_names):
+            c = column + i
+            limit = good_std.get(e.name)
+            if limit is None or e.prior_std[i] == 0.0:
+                continue
+            error_limit = good_error.get(e.name, np.nan)
+            error_since = np.nan
+            if true_value is not None and np.isfinite(error_limit):
+                error_since = _since(time, np.abs(values[:, c] - true_value[i]) <= error_limit)
+            good = std[:, c] <= limit
+            all_good = all_good & good
+            out.append(
+                ComponentConvergence(name, limit, error_limit, _since(time, good), error_since)
+            )
+        column += len(e.component_names)
+    return Convergence(tuple(out), _since(time, all_good) if out else np.nan)
+
+
+def _since(time: Array, good: np.ndarray) -> float:
+    """Return the time from which on all is good, nan if the last is not."""
+    if good.size == 0 or not good[-1]:
+        return float("nan")
+    bad = np.flatnonzero(~good)
+    return float(time[bad[-1] + 1] if bad.size else time[0])

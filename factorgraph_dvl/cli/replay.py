@@ -1,0 +1,241 @@
+"""The command `replay`: a trial fed in the order of time."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from pathlib import Path
+from time import perf_counter
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.text import Text
+
+from factorgraph_dvl.cli.console import (
+    ProgressLine,
+    print_table,
+    print_written,
+    stderr,
+    stdout,
+    warn,
+)
+from factorgraph_dvl.cli.options import Force, NoFigures, Quiet, SolutionPath, TrialPath
+from factorgraph_dvl.errors import ConfigError
+
+if TYPE_CHECKING:
+    from factorgraph_dvl.analysis.convergence import Convergence
+    from factorgraph_dvl.replay import Record
+    from factorgraph_dvl.solution import Solution
+    from factorgraph_dvl.trial import Trial
+
+
+class Smoother(StrEnum):
+    """How far back states are corrected."""
+
+    FIXED_LAG = "fixed-lag"
+    ISAM2 = "isam2"
+
+
+def replay(
+    trial_path: TrialPath,
+    out: SolutionPath,
+    smoother: Annotated[
+        Smoother, typer.Option(help="Forget states after the lag, or never.")
+    ] = Smoother.FIXED_LAG,
+    lag: Annotated[
+        float, typer.Option(metavar="S", min=1.0, max=1e4, help="Lag of the smoother, s.")
+    ] = 30.0,
+    rate: Annotated[
+        float, typer.Option(metavar="HZ", min=0.1, max=50.0, help="States and updates a second.")
+    ] = 5.0,
+    live: Annotated[bool, typer.Option("--live", help="Show what is known as it runs.")] = False,
+    good_std: Annotated[
+        list[str] | None,
+        typer.Option(metavar="NAME=VALUE", help="σ of a parameter that is good enough."),
+    ] = None,
+    good_error: Annotated[
+        list[str] | None,
+        typer.Option(metavar="NAME=VALUE", help="Error of a parameter that is good enough."),
+    ] = None,
+    force: Force = False,
+    no_figures: NoFigures = False,
+    quiet: Quiet = False,
+) -> None:
+    """Feed a trial in the order of time, and show what was known when."""
+    from factorgraph_dvl.analysis.convergence import GOOD_ERROR, GOOD_STD, convergence
+    from factorgraph_dvl.io.folders import check_output
+    from factorgraph_dvl.io.trial_folder import load_trial
+
+    std_limits = GOOD_STD | _limits("--good-std", good_std)
+    error_limits = GOOD_ERROR | _limits("--good-error", good_error)
+    check_output(out, force=force)
+    with ProgressLine(quiet=quiet or live) as progress:
+        trial = load_trial(trial_path)
+        solution, record = _run(trial, smoother.value, lag, rate, progress, live=live)
+        found = convergence(
+            record.time,
+            record.values,
+            record.std,
+            record.doubted,
+            solution.estimates,
+            trial.calibration_truth,
+            std_limits,
+            error_limits,
+        )
+        progress("write", 0, None)
+        _write(trial, solution, record, found, out, force=force, figures=not no_figures)
+    _print(trial, solution, record, found)
+    print_written(out)
+    if not solution.converged:
+        text = "error: measurements disagree with the prediction at the end; see the warnings"
+        stderr().print(Text(text, "red"), soft_wrap=True)
+        raise typer.Exit(1)
+
+
+def _limits(option: str, pairs: list[str] | None) -> dict[str, float]:
+    """Return NAME=VALUE pairs as numbers by name."""
+    out = {}
+    for pair in pairs or []:
+        name, _, text = pair.partition("=")
+        try:
+            value = float(text)
+        except ValueError:
+            value = -1.0
+        if not value > 0.0:
+            raise ConfigError(
+                f"{option} is {pair!r}", expected="NAME=VALUE, such as misalignment_deg=0.05"
+            )
+        out[name] = value
+    return out
+
+
+def _run(
+    trial: Trial, smoother: str, lag: float, rate: float, progress: ProgressLine, *, live: bool
+) -> tuple[Solution, Record]:
+    from factorgraph_dvl.replay import KINDS, Update
+    from factorgraph_dvl.replay import replay as run
+
+    kind = next(k for k in KINDS if k == smoother)
+    began = perf_counter()
+    shown = began
+    first = float(trial.imu.time[0])
+
+    def speed(update: Update) -> float:
+        return (update.time - first) / max(perf_counter() - began, 1e-9)
+
+    if live:
+        from rich.live import Live
+
+        from factorgraph_dvl.report.live import live_view
+
+        # The display costs more than an update.
+        with Live(console=stderr(), refresh_per_second=8, transient=True) as view:
+
+            def show(update: Update) -> None:
+                nonlocal shown
+                now = perf_counter()
+                if now - shown > 0.1:
+                    shown = now
+                    view.update(
+                        live_view(
+                            trial.name,
+                            update.time - first,
+                            update.calibration.estimates,
+                            update.state,
+                            latency=update.latency,
+                            speed=speed(update),
+                            doubted=update.doubted,
+                        )
+                    )
+                for message in update.messages:
+                    view.console.print(
+                        f"{update.time:.1f} s: {message}", markup=False, soft_wrap=True
+                    )
+
+            return run(trial, smoother=kind, lag_s=lag, rate_hz=rate, watch=show)
+
+    def tell(update: Update) -> None:
+        nonlocal shown
+        now = perf_counter()
+        if now - shown > 2.0:
+            shown = now
+            progress(f"at {update.time - first:.0f} s, {speed(update):.0f} times real time")
+
+    return run(trial, smoother=kind, lag_s=lag, rate_hz=rate, watch=tell)
+
+
+def _write(
+    trial: Trial,
+    solution: Solution,
+    record: Record,
+    found: Convergence,
+    out: Path,
+    *,
+    force: bool,
+    figures: bool,
+) -> None:
+    from factorgraph_dvl.io.solution_folder import (
+        CONVERGENCE_FILE,
+        FIGURES_FOLDER,
+        save_solution,
+        write_history,
+        write_latency,
+    )
+    from factorgraph_dvl.report.convergence_file import to_csv
+
+    def add(folder: Path) -> None:
+        write_history(folder, record.time, record.names, record.values, record.std, record.latency)
+        write_latency(folder, record.time, record.latency, record.solved)
+        (folder / CONVERGENCE_FILE).write_text(to_csv(found), encoding="utf-8")
+        if not figures:
+            return
+        from factorgraph_dvl.report.convergence_figures import write_convergence_figures
+        from factorgraph_dvl.report.figures import write_figures
+
+        try:
+            write_figures(trial, solution, folder / FIGURES_FOLDER)
+            write_convergence_figures(
+                record.time,
+                record.values,
+                record.std,
+                record.latency,
+                solution.estimates,
+                trial.calibration_truth,
+                found,
+                folder / FIGURES_FOLDER,
+            )
+        except Exception as error:
+            # A figure is not worth the solution.
+            warn(f"figures could not be drawn: {type(error).__name__}: {error}")
+
+    save_solution(solution, out, force=force, extra=add, smoothed=record.smoothed)
+
+
+def _print(trial: Trial, solution: Solution, record: Record, found: Convergence) -> None:
+    import numpy as np
+
+    from factorgraph_dvl.analysis.consistency import calibration_errors
+    from factorgraph_dvl.report.tables import (
+        calibration_table,
+        convergence_table,
+        good_enough_line,
+    )
+
+    console = stdout()
+    truth = trial.calibration_truth
+    errors = calibration_errors(solution, truth) if truth else None
+    print_table(calibration_table(solution, errors, width=console.width))
+    print_table(convergence_table(found))
+    plain = 1e3 * record.latency[~record.solved]
+    if plain.size:
+        median, tail = np.percentile(plain, [50.0, 99.0])
+        console.print(
+            f"{plain.size} updates: latency {median:.1f} ms (median), {tail:.1f} ms (99 %); "
+            f"{int(record.solved.sum())} with a solution of all collected data, the longest "
+            f"{record.latency.max():.1f} s; estimates are {record.delay:.2f} s behind the IMU",
+            markup=False,
+            highlight=False,
+            soft_wrap=True,
+        )
+    console.print(good_enough_line(found, float(trial.imu.time[0])), markup=False, highlight=False)
+    for warning in solution.warnings:
+        warn(warning)

@@ -1,0 +1,9 @@
+"""Incremental smoothing of data as they arrive: collect, align, go."""
+
+from __future__ import annotations
+
+from factorgraph_dvl.replay.estimate import Update
+from factorgraph_dvl.replay.recorded import Record, replay
+from factorgraph_dvl.replay.session import KINDS, LAG, RATE, Kind, Replay
+
+__all__ = ["KINDS", "LAG", "RATE", "Kind", "Record", "Replay", "Update", "replay"]

@@ -1,0 +1,188 @@
+"""What is known at one moment, in the parametrisation in which it is reported."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from factorgraph_dvl.conventions import (
+    Array,
+    BodyAxes,
+    exp_so3,
+    rotate,
+    rph_from_rotation,
+    rph_jacobian,
+)
+from factorgraph_dvl.earth import LocalFrame
+from factorgraph_dvl.preintegration import States
+from factorgraph_dvl.priors import away, prior_mean, prior_root
+from factorgraph_dvl.sensors.protocol import Parameter
+from factorgraph_dvl.solution import Estimate, Trajectory
+from factorgraph_dvl.solvers.reported import estimates_of, in_order, in_unit
+
+_STATE = 9
+_BIAS = 6
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """The calibration at one moment.
+
+    Parameters
+    ----------
+    estimates : as in a solution.
+    covariance : (P, P) joint covariance of all their components, in reported units.
+    """
+
+    estimates: tuple[Estimate, ...]
+    covariance: Array
+
+
+@dataclass(frozen=True)
+class Innovations:
+    """What was measured against what was predicted.
+
+    Parameters
+    ----------
+    label, unit, components : of the kind.
+    time : (M,) s.
+    residual, sigma : (M, d) predicted - measured, and its standard deviation.
+    used : (M,) bool.
+    """
+
+    label: str
+    unit: str
+    components: tuple[str, ...]
+    time: Array
+    residual: Array
+    sigma: Array
+    used: np.ndarray
+
+
+@dataclass(frozen=True)
+class Update:
+    """What is known after one more segment.
+
+    Parameters
+    ----------
+    time : of the newest state, s.
+    latency : time that the update took, s.
+    state : the newest state, as a trajectory of one epoch.
+    calibration : with its joint covariance.
+    smoothed : states that more data have made better, None if there are none this time.
+    innovations : what was measured against what was predicted.
+    messages : for the user.
+    solved : whether the update includes a solution of all that was collected.
+    doubted : kinds of measurements that disagree with the prediction, so that the standard
+        deviations are not to be trusted.
+    """
+
+    time: float
+    latency: float
+    state: Trajectory
+    calibration: Calibration
+    smoothed: Trajectory | None
+    innovations: tuple[Innovations, ...]
+    messages: tuple[str, ...]
+    solved: bool
+    doubted: tuple[str, ...]
+
+
+def trajectory_of(
+    time: Array, states: States, P: Array, frame: LocalFrame, body_axes: BodyAxes
+) -> Trajectory:
+    """Return states with their covariances (K, 9, 9), in GTSAM's tangent space, as reported."""
+    lat, lon, height = frame.geodetic(states.p_n)
+    lRn = frame.level_from_tangent(lat, lon)
+    lRb = lRn @ states.nRb
+    rph = rph_from_rotation(lRb, body_axes)
+
+    def level(i: int) -> Array:
+        return lRb @ P[:, i : i + 3, i : i + 3] @ lRb.transpose(0, 2, 1)
+
+    to_rph = rph_jacobian(rph, body_axes)
+    return Trajectory(
+        time=time,
+        geodetic=np.stack([lat, lon, height], axis=1),
+        velocity=rotate(lRn, states.v_n),
+        rph=rph,
+        position_cov=level(3),
+        velocity_cov=level(6),
+        rph_cov=to_rph @ P[:, :3, :3] @ to_rph.transpose(0, 2, 1),
+    )
+
+
+def calibration_of(
+    parameters: Sequence[Parameter],
+    values: Mapping[str, Array],
+    biases: tuple[tuple[Parameter, Array], tuple[Parameter, Array]],
+    P: Array,
+    held: Array,
+) -> Calibration:
+    """Return the calibration as reported.
+
+    Parameters
+    ----------
+    parameters : all, those that are not estimated included.
+    values : of them; rotations as matrices.
+    biases : parameters and values of gyro and accelerometer.
+    P : (6 + n, 6 + n) joint covariance of accelerometer bias, gyro bias and the parameters
+        that are estimated, in GTSAM's tangent space, SI.
+    held : (n, h) directions that are not observable, as `feigned_directions` returns them:
+        the prior is reported there.
+    """
+    free = [p for p in parameters if p.estimated]
+    (gyro, gyro_bias), (accel, accel_bias) = biases
+    if held.size:
+        values, gyro_bias, accel_bias, P = _at_prior(free, values, gyro_bias, accel_bias, P, held)
+    rows = in_order(
+        [
+            in_unit(gyro, gyro_bias),
+            in_unit(accel, accel_bias),
+            *(in_unit(p, values[p.name]) for p in parameters),
+        ],
+        lambda r: r.parameter,
+    )
+    start = {accel.name: 0, gyro.name: 3}
+    at = _BIAS
+    for p in free:
+        start[p.name] = at
+        at += p.mean.size
+    estimated = [r for r in rows if r.parameter.estimated]
+    total = sum(r.value.size for r in estimated)
+    T = np.zeros((total, P.shape[0]))
+    at = 0
+    for r in estimated:
+        n, column = r.value.size, start[r.parameter.name]
+        T[at : at + n, column : column + n] = r.derivative
+        at += n
+    return Calibration(*estimates_of([(r.parameter, r.value) for r in rows], T @ P @ T.T))
+
+
+def _at_prior(
+    free: Sequence[Parameter],
+    values: Mapping[str, Array],
+    gyro_bias: Array,
+    accel_bias: Array,
+    P: Array,
+    held: Array,
+) -> tuple[dict[str, Array], Array, Array, Array]:
+    """Return values and covariance given that the prior holds along some directions."""
+    root = prior_root(free)
+    A = np.zeros((held.shape[1], P.shape[0]))
+    A[:, _BIAS:] = held.T @ np.linalg.inv(root)
+    off = np.concatenate([away(p, values[p.name], prior_mean(p)) for p in free])
+    gain = np.linalg.solve(A @ P @ A.T, A @ P).T
+    step = -gain @ (A[:, _BIAS:] @ off)
+    P = P - gain @ A @ P
+    spread = np.zeros((P.shape[0], held.shape[1]))
+    spread[_BIAS:] = root @ held
+    out = dict(values)
+    at = _BIAS
+    for p in free:
+        part = step[at : at + p.mean.size]
+        at += p.mean.size
+        out[p.name] = out[p.name] @ exp_so3(part) if p.rotation else out[p.name] + part
+    return out, gyro_bias + step[3:6], accel_bias + step[:3], P + spread @ spread.T

@@ -1,0 +1,211 @@
+"""A recorded trial, fed to a replay as it would have arrived, and what came out."""
+
+from __future__ import annotations
+
+from array import array
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+from itertools import pairwise
+
+import numpy as np
+
+from factorgraph_dvl.conventions import Array
+from factorgraph_dvl.errors import SolveError
+from factorgraph_dvl.replay.estimate import Innovations, Update
+from factorgraph_dvl.replay.session import LAG, RATE, Kind, Replay
+from factorgraph_dvl.sensors.protocol import rows_of
+from factorgraph_dvl.solution import Residuals, Solution, Trajectory, doubts
+from factorgraph_dvl.trial import Trial
+
+Watch = Callable[[Update], None]
+
+
+@dataclass(frozen=True)
+class Record:
+    """What was known when.
+
+    Parameters
+    ----------
+    time, latency : (H,) of the updates, s.
+    solved : (H,) updates that include a batch solution.
+    doubted : (H,) whether some measurements disagreed with the prediction.
+    names : of the n calibration components, as in `covariance.order`.
+    values, std : (H, n) in reported units.
+    smoothed : states that later data made better.
+    messages : time, s, and text.
+    delay : by which estimates are behind the IMU, s.
+    """
+
+    time: Array
+    latency: Array
+    solved: np.ndarray
+    doubted: np.ndarray
+    names: tuple[str, ...]
+    values: Array
+    std: Array
+    smoothed: Trajectory
+    messages: tuple[tuple[float, str], ...]
+    delay: float
+
+
+def replay(
+    trial: Trial,
+    *,
+    smoother: Kind = "fixed-lag",
+    lag_s: float = LAG,
+    rate_hz: float = RATE,
+    progress: Callable[[str, int, float | None], None] | None = None,
+    watch: Watch | None = None,
+) -> tuple[Solution, Record]:
+    """Feed a recorded trial in the order of time, and show what was known when.
+
+    Parameters
+    ----------
+    trial : recorded.
+    smoother, lag_s, rate_hz, progress : see `Replay`.
+    watch : called with every update.
+
+    Returns
+    -------
+    Solution
+        The calibration at the end, and the trajectory as it was known at each time.
+    Record
+
+    Raises
+    ------
+    ConfigError
+        If an option is out of range.
+    SolveError
+        If the data never sufficed to start.
+    """
+    run = Replay(trial, smoother=smoother, lag_s=lag_s, rate_hz=rate_hz, progress=progress)
+    tape = _Tape()
+    imu = trial.imu
+    step = 1.0 / rate_hz
+    edges = np.arange(imu.time[0], imu.time[-1] + step, step)
+    edges = np.append(edges, np.inf)
+    samples = np.searchsorted(imu.time, edges)
+    rows = [np.searchsorted(aid.time, edges) for aid in trial.aids]
+    for each in rows:
+        each[0] = 0
+
+    def take(updates: list[Update]) -> None:
+        for update in updates:
+            tape.add(update)
+            if watch is not None:
+                watch(update)
+
+    for j, (a, b) in enumerate(pairwise(samples.tolist())):
+        for aid, each in zip(trial.aids, rows, strict=True):
+            first, last = each[j : j + 2].tolist()
+            if last > first:
+                run.add(rows_of(aid, slice(first, last)))
+        if b > a:
+            take(run.add_imu(imu.time[a:b], imu.gyro[a:b], imu.accel[a:b]))
+    take(run.finish())
+    if tape.last is None:
+        why = "; ".join(run.messages) or "the record is too short"
+        raise SolveError(f"the data never sufficed to start: {why}", where=trial.name)
+    return _solution(trial, run, tape), tape.record(run)
+
+
+class _Tape:
+    """Updates, one row of numbers each."""
+
+    def __init__(self) -> None:
+        self.last: Update | None = None
+        self._numbers = array("d")
+        self._states: list[Trajectory] = []
+        self._smoothed: list[Trajectory] = []
+        self._innovations: dict[str, list[Innovations]] = {}
+        self.messages: list[tuple[float, str]] = []
+        self.count = 0
+
+    def add(self, update: Update) -> None:
+        self.last = update
+        self.count += 1
+        values = np.concatenate([e.value for e in update.calibration.estimates])
+        std = np.concatenate([e.std for e in update.calibration.estimates])
+        head = [update.time, update.latency, float(update.solved), float(bool(update.doubted))]
+        self._numbers.extend([*head, *values, *std])
+        self._states.append(update.state)
+        if update.smoothed is not None:
+            self._smoothed.append(update.smoothed)
+        for i in update.innovations:
+            self._innovations.setdefault(i.label, []).append(i)
+        self.messages += [(update.time, text) for text in update.messages]
+
+    def trajectory(self) -> Trajectory:
+        return _joined(self._states)
+
+    def residuals(self) -> tuple[Residuals, ...]:
+        return tuple(
+            Residuals(
+                label=label,
+                unit=parts[0].unit,
+                components=parts[0].components,
+                time=np.concatenate([p.time[p.used] for p in parts]),
+                residual=np.concatenate([p.residual[p.used] for p in parts]),
+                sigma=np.concatenate([p.sigma[p.used] for p in parts]),
+            )
+            for label, parts in self._innovations.items()
+        )
+
+    def record(self, run: Replay) -> Record:
+        assert self.last is not None
+        estimates = self.last.calibration.estimates
+        names = tuple(name for e in estimates for name in e.component_names)
+        n = len(names)
+        table = np.array(self._numbers).reshape(self.count, 4 + 2 * n)
+        return Record(
+            time=table[:, 0],
+            latency=table[:, 1],
+            solved=table[:, 2] > 0.0,
+            doubted=table[:, 3] > 0.0,
+            names=names,
+            values=table[:, 4 : 4 + n],
+            std=table[:, 4 + n :],
+            smoothed=_joined(self._smoothed) if self._smoothed else rows_of(self.last.state, []),
+            messages=tuple(self.messages),
+            delay=run.delay,
+        )
+
+
+def _joined(parts: list[Trajectory]) -> Trajectory:
+    return Trajectory(
+        *(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Trajectory))
+    )
+
+
+def _solution(trial: Trial, run: Replay, tape: _Tape) -> Solution:
+    assert tape.last is not None
+    calibration = tape.last.calibration
+    residuals = tape.residuals()
+    warnings = [*trial.notes, *(f"{time:.1f} s: {text}" for time, text in tape.messages)]
+    warnings += [f"at the end: {text}" for text in run.messages]
+    warnings += run.counts()
+    warnings += doubts(calibration.estimates, residuals)
+    for e in calibration.estimates:
+        bad = np.flatnonzero(~e.observable & (e.prior_std > 0.0))
+        if bad.size:
+            names = ", ".join(e.component_names[i] for i in bad)
+            warnings.append(f"{names} not observable in what was measured until the end")
+    if trial.imu.settings.bias_walks:
+        warnings.append(
+            "a bias of the IMU walks: what is reported is its value at the end, where a solution "
+            "of all data at once reports the mean over the trial"
+        )
+    cost = 0.5 * sum(float(np.nansum((r.residual / r.sigma) ** 2)) for r in residuals)
+    return Solution(
+        trial=trial.name,
+        solver="replay",
+        body_axes=trial.body_axes,
+        converged=run.started and not tape.last.doubted,
+        iterations=tape.count,
+        cost=cost,
+        estimates=calibration.estimates,
+        covariance=calibration.covariance,
+        trajectory=tape.trajectory(),
+        residuals=residuals,
+        warnings=tuple(warnings),
+    )

@@ -1,0 +1,253 @@
+"""iSAM2 with and without a lag: the newest state on top of the tree, the oldest at its leaf.
+
+`gtsam.IncrementalFixedLagSmoother` eliminates its whole window anew at every update, because
+it leaves the order of the variables in it open. With the newest state and the calibration
+last, and states in the order of time before them, an update touches the top of the tree
+only, the joint covariance of state and calibration is read off there, and the oldest state
+is a leaf that can be marginalised as it is. The estimates are the same.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import gtsam
+import numpy as np
+
+from factorgraph_dvl import keys
+from factorgraph_dvl.conventions import Array
+from factorgraph_dvl.sensors.protocol import Parameter
+from factorgraph_dvl.solvers.covariance import SquareRootInformation
+from factorgraph_dvl.solvers.levenberg_marquardt import eliminate
+
+# Steps after which a state is linearised anew: rad, m, m/s. Position enters linearly.
+_STATE_STEP = np.repeat([1e-3, 1e2, 0.05], 3)
+# Preintegration is linear in the biases.
+_BIAS_STEP = np.full(6, 1e2)
+# In units of SI: a rotation, or what multiplies a velocity.
+_CALIBRATION_STEP = 1e-2
+_NEVER = 1e9
+# Share of the states from which on all are eliminated anew.
+_MOST = 0.4
+# Interval, s, at which states are looked at for that.
+_CHECK = 1.0
+_STATE = 9
+_BIAS = 6
+
+
+class Smoother:
+    """Incremental smoother over states, biases and calibration.
+
+    Parameters
+    ----------
+    prior, values : graph and start values of the first state, its bias, the calibration.
+    node : index of the first state.
+    time : of it, s.
+    parameters : that are estimated, in the order of `keys.calibration`.
+    walking : whether every state has a bias of its own.
+    lag : s, after which states are marginalised; None = never.
+    """
+
+    def __init__(
+        self,
+        prior: gtsam.NonlinearFactorGraph,
+        values: gtsam.Values,
+        *,
+        node: int,
+        time: float,
+        parameters: Sequence[Parameter],
+        walking: bool,
+        lag: float | None,
+    ) -> None:
+        self.parameters = tuple(parameters)
+        self.calibration_keys = [keys.calibration(i) for i in range(len(self.parameters))]
+        self.node = node
+        self.times = {node: time}
+        self._walking = walking
+        self._lag = lag
+        self._checked = time
+        self._isam = gtsam.ISAM2(_settings(self.parameters, fixed=lag is not None))
+        self._sizes = {key: int(size) for key, size in values.dims().items()}
+        self._update(prior, values, node)
+
+    def bias_key(self, k: int) -> int:
+        """Return the key of the bias at state k."""
+        return keys.bias(k if self._walking else 0)
+
+    @property
+    def oldest(self) -> int:
+        """Index of the oldest state that can still be corrected."""
+        return next(iter(self.times))
+
+    def extend(
+        self, time: float, factors: gtsam.NonlinearFactorGraph, values: gtsam.Values
+    ) -> None:
+        """Add the next state, and marginalise those that leave the lag.
+
+        Parameters
+        ----------
+        time : of the new state, s.
+        factors : that tie it to the one before, and measurements after that one.
+        values : start values of the new state, and of its bias if that walks.
+        """
+        if self._lag is not None:
+            gone = [k for k, t in self.times.items() if t < time - self._lag and k < self.node]
+            for k in gone:
+                self._marginalise(k)
+        self.node += 1
+        self.times[self.node] = time
+        self._sizes.update(values.dims())
+        self._update(factors, values, self.node - 1)
+
+    def correct(self, factors: gtsam.NonlinearFactorGraph, first: int) -> None:
+        """Add measurements of states that are there, the oldest of index `first`."""
+        self._update(factors, gtsam.Values(), first)
+
+    def state(self, k: int) -> gtsam.NavState:
+        """Return the estimate of state k."""
+        return self._isam.calculateEstimateNavState(keys.node(k))
+
+    def bias(self, k: int) -> gtsam.imuBias.ConstantBias:
+        """Return the estimate of the bias at state k."""
+        return self._isam.calculateEstimateConstantBias(self.bias_key(k))
+
+    def calibration(self) -> dict[str, Array]:
+        """Return the estimates of the parameters, rotations as matrices."""
+        out = {}
+        for p, key in zip(self.parameters, self.calibration_keys, strict=True):
+            if p.rotation:
+                out[p.name] = self._isam.calculateEstimateRot3(key).matrix()
+            else:
+                out[p.name] = self._isam.calculateEstimateVector(key)
+        return out
+
+    def joint_covariance(self) -> Array:
+        """Return the joint covariance of newest state, its bias and the parameters.
+
+        In that order, in GTSAM's tangent space, SI: attitude, position, velocity, bias of
+        accelerometer and gyro, parameters.
+        """
+        wanted = self._top()
+        net = self._isam.jointBayesNet(wanted, gtsam.EliminateQR)
+        sizes = {key: self._sizes[key] for key in wanted}
+        order = [net.at(i).firstFrontalKey() for i in range(net.size())]
+        R, _ = net.matrix()
+        inverse = np.linalg.solve(R, np.eye(R.shape[0]))
+        P = inverse @ inverse.T
+        starts = dict(zip(order, np.cumsum([0, *(sizes[key] for key in order)]), strict=False))
+        index = np.concatenate([starts[key] + np.arange(sizes[key]) for key in wanted])
+        return np.asarray(P[np.ix_(index, index)])
+
+    def state_covariances(self, wanted: Sequence[int]) -> dict[int, Array]:
+        """Return covariances (9, 9) of states by index, given all that came since."""
+        order = self._in_time()
+        net = self._isam.jointBayesNet(order, gtsam.EliminateQR)
+        graph = gtsam.GaussianFactorGraph()
+        for i in range(net.size()):
+            graph.push_back(net.at(i))
+        ordering = gtsam.Ordering()
+        for key in order:
+            ordering.push_back(key)
+        information = SquareRootInformation(eliminate(graph, ordering), self._sizes)
+        marginals = information.marginals([keys.node(k) for k in wanted])
+        return {k: marginals[keys.node(k)] for k in wanted}
+
+    def _top(self) -> list[int]:
+        return [keys.node(self.node), self.bias_key(self.node), *self.calibration_keys]
+
+    def _in_time(self) -> list[int]:
+        """Return all keys in the order of elimination."""
+        out = []
+        for k in self.times:
+            out.append(keys.node(k))
+            if self._walking:
+                out.append(keys.bias(k))
+        return [*out, *([] if self._walking else [keys.bias(0)]), *self.calibration_keys]
+
+    def _update(
+        self, factors: gtsam.NonlinearFactorGraph, values: gtsam.Values, first: int
+    ) -> None:
+        settings = gtsam.ISAM2UpdateParams()
+        if self._lag is None:
+            settings.constrainedKeys = _groups([(key, 1) for key in self._top()])
+            self._isam.update(factors, values, settings)
+            return
+        moved = self._moved()
+        if moved is not None:
+            first = min(first, moved)
+            settings.force_relinearize = True
+        # What is touched, and all above it in the tree, is eliminated anew: in the order of
+        # time, so that the oldest state stays a leaf. Groups beyond the number of variables
+        # are not allowed; calibration and bias are in one.
+        first -= len(self.parameters)
+        nodes = list(range(max(first, self.oldest), self.node))
+        if len(nodes) > _MOST * len(self.times):
+            # iSAM2 goes over to eliminating everything once it is most of it.
+            nodes = [k for k in self.times if k < self.node]
+            again = gtsam.KeyList()
+            for key in self._in_time():
+                if self._isam.valueExists(key):
+                    again.push_back(key)
+            settings.extraReelimKeys = again
+        pairs = []
+        for i, k in enumerate(nodes):
+            pairs.append((keys.node(k), i))
+            if self._walking:
+                pairs.append((keys.bias(k), i))
+        pairs += [(key, len(nodes)) for key in self._top()]
+        settings.constrainedKeys = _groups(pairs)
+        self._isam.update(factors, values, settings)
+
+    def _moved(self) -> int | None:
+        """Return the oldest state that has moved too far from where it was linearised."""
+        now = self.times[self.node]
+        if now < self._checked + _CHECK:
+            return None
+        self._checked = now
+        delta = self._isam.getDelta()
+        fixed = self._isam.getFixedVariables()
+        for k in self.times:
+            key = keys.node(k)
+            if (
+                delta.exists(key)
+                and np.any(np.abs(delta.at(key)) > _STATE_STEP)
+                and not fixed.count(key)
+            ):
+                return k
+        return None
+
+    def _marginalise(self, k: int) -> None:
+        leaves = gtsam.KeyList()
+        leaves.push_back(keys.node(k))
+        if self._walking:
+            leaves.push_back(keys.bias(k))
+        self._isam.marginalizeLeaves(leaves)
+        del self.times[k]
+        del self._sizes[keys.node(k)]
+        if self._walking:
+            del self._sizes[keys.bias(k)]
+
+
+def _settings(parameters: Sequence[Parameter], *, fixed: bool) -> gtsam.ISAM2Params:
+    settings = gtsam.ISAM2Params()
+    # Cholesky has no digits left at navigation grade.
+    settings.setFactorization("QR")
+    # With a lag, only where `Smoother` asks for it.
+    settings.relinearizeSkip = 10**6 if fixed else 1
+    # Without it the list of factors grows for ever.
+    settings.findUnusedFactorSlots = True
+    thresholds = gtsam.ISAM2ThresholdMap()
+    thresholds.insert(("x", _STATE_STEP))
+    thresholds.insert(("b", _BIAS_STEP))
+    for i, p in enumerate(parameters):
+        step = _NEVER if fixed else _CALIBRATION_STEP
+        thresholds.insert((chr(ord("A") + i), np.full(p.mean.size, step)))
+    settings.setRelinearizeThreshold(thresholds)
+    return settings
+
+
+def _groups(pairs: Sequence[tuple[int, int]]) -> gtsam.KeyGroupMap:
+    out = gtsam.KeyGroupMap()
+    for key, group in pairs:
+        out.insert2(key, group)
+    return out

@@ -1,0 +1,160 @@
+"""Collect, align, go: from a batch solution of what was collected to a smoother's first state."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+
+from factorgraph_dvl import keys
+from factorgraph_dvl.conventions import DEG, Array
+from factorgraph_dvl.earth import LocalFrame
+from factorgraph_dvl.graph import Evaluation, Problem
+from factorgraph_dvl.priors import Known
+from factorgraph_dvl.sensors.protocol import AttitudeAid, Parameter
+from factorgraph_dvl.solvers.batch import fit
+from factorgraph_dvl.solvers.covariance import posterior
+from factorgraph_dvl.solvers.feigned import (
+    feigned_information,
+)
+from factorgraph_dvl.solvers.levenberg_marquardt import Progress
+from factorgraph_dvl.solvers.state_times import STATE_INTERVAL, needs_states
+from factorgraph_dvl.trial import Trial
+
+# Standard deviation of the attitude up to which the equations may be linearised in it.
+_ATTITUDE = 5.0 * DEG
+# Residuals whose root mean square says something.
+_ENOUGH = 20
+
+
+@dataclass(frozen=True)
+class Start:
+    """The last state of what was collected, and what is known of it.
+
+    Parameters
+    ----------
+    frame : in which positions are.
+    node, time : index of the state, and its time, s.
+    prior : linear factors on state, bias and parameters: all that was collected.
+    values : at which they are linear, and start from.
+    parameters, all_parameters : those that are estimated, and all.
+    fixed : values of those that are not.
+    sections : of the sensors that it knows.
+    own_states : sections of the sensors whose every measurement needs a state of its own.
+    windows : over which the IMU's samples are smoothed.
+    feigned : (P, P) information on the parameters that only noise makes, in units of the
+        priors' standard deviations.
+    walking : whether biases walk.
+    notes : for the user.
+    misfit : largest root mean square of a kind of residuals over their standard deviations.
+    """
+
+    frame: LocalFrame
+    node: int
+    time: float
+    prior: gtsam.NonlinearFactorGraph
+    values: gtsam.Values
+    parameters: tuple[Parameter, ...]
+    all_parameters: tuple[Parameter, ...]
+    fixed: dict[str, Array]
+    sections: tuple[str, ...]
+    own_states: tuple[str, ...]
+    windows: tuple[int, int]
+    feigned: Array
+    walking: bool
+    notes: tuple[str, ...]
+    misfit: float
+
+
+def begin(trial: Trial, known: Known | None, interval: float, progress: Progress) -> Start | str:
+    """Solve what was collected, and condense it to its last state.
+
+    Parameters
+    ----------
+    trial : what was collected.
+    known : of biases and calibration from before, in place of the trial's priors.
+    interval : of the states to come, s.
+    progress : called with stage, iteration and cost.
+
+    Returns
+    -------
+    Start, or why there is none yet.
+
+    Raises
+    ------
+    DataError, SolveError
+        If the data collected so far cannot be solved.
+    """
+    problem, minimum, notes = fit(
+        trial, state_interval_s=STATE_INTERVAL, progress=progress, known=known
+    )
+    if not minimum.converged:
+        return "the solver did not converge"
+    covariances = posterior(problem, minimum)
+    attitude = float(np.sqrt(np.linalg.eigvalsh(covariances.nodes[-1][:3, :3])[-1]))
+    if not attitude < _ATTITUDE:
+        return f"the attitude is known to {np.degrees(attitude):.2g} deg only"
+    evaluation = minimum.evaluation
+    feigned = feigned_information(problem, evaluation, covariances.nodes).sum(axis=0)
+    last = problem.chain.segments.node_time.size - 1
+    kept = [
+        keys.node(last),
+        problem.chain.bias_key(last),
+        *(problem.key(p.name) for p in problem.parameters),
+    ]
+    gaussian = problem.linearize(evaluation)
+    gone = [key for key in evaluation.values.dims() if key not in kept]
+    _, rest = gaussian.eliminatePartialMultifrontal(gone, gtsam.EliminateQR)
+    values = _some(problem, evaluation.values, last)
+    return Start(
+        frame=problem.chain.frame,
+        node=last,
+        time=float(problem.chain.segments.node_time[-1]),
+        prior=gtsam.LinearContainerFactor.ConvertLinearGraph(rest, values),
+        values=values,
+        parameters=problem.parameters,
+        all_parameters=problem.all_parameters,
+        fixed={
+            p.name: problem.prior_values()[p.name]
+            for p in problem.all_parameters
+            if not p.estimated
+        },
+        sections=tuple(aid.section for aid in trial.aids),
+        own_states=_own_states(trial, problem.chain.frame, interval),
+        windows=problem.chain.segments.increments.chosen_windows,
+        feigned=feigned,
+        walking=problem.chain.walking,
+        notes=notes,
+        misfit=_misfit(problem, evaluation),
+    )
+
+
+def _own_states(trial: Trial, frame: LocalFrame, interval: float) -> tuple[str, ...]:
+    out = []
+    for aid in trial.aids:
+        if isinstance(aid, AttitudeAid):
+            seen = aid.attitudes(frame)
+            if seen.time.size and needs_states(seen, trial.imu.settings, interval):
+                out.append(aid.section)
+    return tuple(out)
+
+
+def _misfit(problem: Problem, evaluation: Evaluation) -> float:
+    out = 0.0
+    for residual, weight in zip(evaluation.residuals, problem.weights, strict=True):
+        used = weight > 0.0
+        if np.count_nonzero(used) >= _ENOUGH:
+            out = max(out, float(np.sqrt(np.mean(residual[used] ** 2))))
+    return out
+
+
+def _some(problem: Problem, values: gtsam.Values, last: int) -> gtsam.Values:
+    out = gtsam.Values()
+    out.insert(keys.node(last), values.atNavState(keys.node(last)))
+    bias = problem.chain.bias_key(last)
+    out.insert(bias, values.atConstantBias(bias))
+    for p in problem.parameters:
+        key = problem.key(p.name)
+        out.insert(key, values.atRot3(key) if p.rotation else values.atVector(key))
+    return out

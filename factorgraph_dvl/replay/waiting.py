@@ -1,0 +1,80 @@
+"""Measurements that have arrived before the IMU has come so far."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from factorgraph_dvl.conventions import Array
+from factorgraph_dvl.earth import LocalFrame
+from factorgraph_dvl.sensors.protocol import Aid, Observation, joined, rows_of
+
+# Times closer than this, s, are the same.
+SAME_TIME = 1e-6
+# Measurements that are ahead of the IMU by more than this, s, are not kept.
+AHEAD = 60.0
+
+
+class Waiting:
+    """Records by sensor, until their time comes.
+
+    Attributes
+    ----------
+    refused : number of measurements that were too far ahead, by sensor.
+    """
+
+    def __init__(self) -> None:
+        self._records: dict[str, list[Aid]] = {}
+        self._example: dict[str, Observation] = {}
+        self.refused: dict[str, int] = {}
+
+    @property
+    def sections(self) -> tuple[str, ...]:
+        """Sections of the sensors of which something waits."""
+        return tuple(self._records)
+
+    def add(self, record: Aid, newest: float = np.inf) -> None:
+        """Take a record whose rows are not too far ahead of the IMU's newest sample, s."""
+        ahead = record.time > newest + AHEAD
+        if ahead.any() and newest > -np.inf:
+            self.refused[record.label] = self.refused.get(record.label, 0) + int(ahead.sum())
+            if ahead.all():
+                return
+            record = rows_of(record, ~ahead)
+        self._records.setdefault(record.section, []).append(record)
+
+    def due(
+        self, section: str, end: float, frame: LocalFrame | None, values: Mapping[str, Array]
+    ) -> tuple[Aid, Array] | None:
+        """Take out what was true before a time, and return it with its true times.
+
+        Parameters
+        ----------
+        section : of the sensor.
+        end : s.
+        frame : in which measurements are, None as long as there is none.
+        values : of the parameters.
+        """
+        record = joined(self._records.pop(section))
+        true = record.time - (0.0 if frame is None else self._late(record, frame, values))
+        due = true < end - SAME_TIME
+        if not due.all():
+            self._records[section] = [rows_of(record, ~due)]
+        return (rows_of(record, due), true[due]) if due.any() else None
+
+    def first_after(self, section: str, time: float) -> float:
+        """Return the first time of a waiting row after a time, s; infinite if there is none."""
+        later = [r.time[r.time > time] for r in self._records.get(section, [])]
+        return min((float(t.min()) for t in later if t.size), default=np.inf)
+
+    def _late(self, record: Aid, frame: LocalFrame, values: Mapping[str, Array]) -> float:
+        """Return by how much the clock of a sensor is ahead, s."""
+        section = record.section
+        if section not in self._example:
+            observations = record.observations(frame)
+            if not observations:
+                return 0.0
+            self._example[section] = observations[0]
+        o = self._example[section]
+        return float((o.time - o.true_time(values))[0])

@@ -1,0 +1,99 @@
+"""Calibration in the parametrisation, the units and the order in which it is reported."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from typing import TypeVar
+
+import numpy as np
+
+from factorgraph_dvl.conventions import (
+    Array,
+    inverse_right_jacobian,
+    reported_rotation_vector,
+)
+from factorgraph_dvl.sensors.protocol import Parameter
+from factorgraph_dvl.solution import Estimate
+
+# The data observed a component if they at least halved what was unknown of it.
+_OBSERVABLE = 0.5
+_FIRST = (
+    *("beam_direction", "beam_scale_error", "misalignment", "scale_error", "lever_arm"),
+    *("gyro_bias", "accel_bias"),
+)
+
+_Row = TypeVar("_Row")
+
+
+@dataclass(frozen=True)
+class Reported:
+    """A parameter as it is reported.
+
+    Parameters
+    ----------
+    parameter : what it is.
+    value : (n,) in its unit.
+    derivative : (n, n) of `value` by the parameter's tangent space, SI.
+    """
+
+    parameter: Parameter
+    value: Array
+    derivative: Array
+
+
+def in_unit(p: Parameter, value: Array) -> Reported:
+    """Return a parameter as it is reported, from its value in SI or its rotation matrix."""
+    derivative = np.eye(p.mean.size)
+    if p.rotation:
+        value = reported_rotation_vector(value, p.mean)
+        derivative = inverse_right_jacobian(value)
+    return Reported(p, value / p.si, derivative / p.si)
+
+
+def in_order(rows: Iterable[_Row], parameter: Callable[[_Row], Parameter]) -> list[_Row]:
+    """Return what is reported in its order: DVL, IMU, others that were estimated."""
+    kept = [r for r in rows if parameter(r).estimated or parameter(r).stem in _FIRST]
+
+    def place(row: _Row) -> int:
+        stem = parameter(row).stem
+        return _FIRST.index(stem) if stem in _FIRST else len(_FIRST)
+
+    return sorted(kept, key=place)
+
+
+def estimates_of(
+    rows: Sequence[tuple[Parameter, Array]], joint: Array
+) -> tuple[tuple[Estimate, ...], Array]:
+    """Return estimates and the covariance of all of them.
+
+    Parameters
+    ----------
+    rows : parameters with their values in reported units, in order.
+    joint : (F, F) covariance of those that were estimated, in reported units.
+    """
+    total = sum(value.size for _, value in rows)
+    covariance = np.zeros((total, total))
+    is_free = np.concatenate([np.full(value.size, p.estimated) for p, value in rows])
+    covariance[np.ix_(is_free, is_free)] = joint
+    known = np.concatenate([p.sigma == 0.0 for p, _ in rows])
+    covariance[known] = covariance[:, known] = 0.0
+    std = np.sqrt(np.diag(covariance))
+    estimates, at = [], 0
+    for p, value in rows:
+        own = std[at : at + value.size]
+        at += value.size
+        prior = p.sigma / p.si
+        estimates.append(
+            Estimate(
+                name=p.name,
+                component_names=p.component_names,
+                value=np.array(value),
+                std=own,
+                prior_value=p.mean / p.si,
+                prior_std=prior,
+                observable=(prior > 0.0) & (own <= _OBSERVABLE * prior),
+                nominal=p.nominal,
+            )
+        )
+    return tuple(estimates), covariance
