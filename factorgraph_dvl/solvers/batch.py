@@ -294,10 +294,11 @@ def _near_fixes(trial: Trial, time: Array) -> NDArray[np.bool_]:
     """Whether GNSS holds the inertial motion at times; without any, all are as good."""
     if trial.gnss is None:
         return np.ones(time.size, dtype=bool)
-    fixes = trial.gnss.time[~np.isnan(trial.gnss.geodetic[:, 0])]
-    after = np.clip(np.searchsorted(fixes, time), 1, max(fixes.size - 1, 1))
-    nearest = np.minimum(np.abs(time - fixes[after - 1]), np.abs(fixes[after % fixes.size] - time))
-    return np.asarray(nearest < _HELD_BY_FIXES)
+    known = ~np.isnan(trial.gnss.geodetic[:, 0]) | ~np.isnan(trial.gnss.velocity[:, 0])
+    fixes = np.concatenate([[-np.inf], trial.gnss.time[known], [np.inf]])
+    after = np.searchsorted(fixes, time)
+    nearest = np.minimum(time - fixes[after - 1], fixes[after] - time)
+    return np.asarray((nearest < _HELD_BY_FIXES) | (fixes.size == 2))
 
 
 def _mountings(
