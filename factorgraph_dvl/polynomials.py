@@ -55,10 +55,7 @@ def regular_interpolation(count: int, shift: int, averaged: bool) -> Array:
 def evaluate(c: Array, u: Array | float) -> Array:
     """Return polynomials c (M, K, n) at u (M,) or scalar, (M, n), or at u (G, M), (G, M, n)."""
     u = np.asarray(u)[..., None]
-    if u.ndim > 2:
-        out = np.repeat(c[None, :, -1], u.shape[0], axis=0)
-    else:
-        out = c[:, -1].copy()
+    out = np.repeat(c[None, :, -1], u.shape[0], axis=0) if u.ndim > 2 else c[:, -1].copy()
     for k in range(c.shape[1] - 2, -1, -1):
         out *= u
         out += c[:, k]
