@@ -44,7 +44,9 @@ _ROUNDING = 1e-6
 # Relative spread of the intervals up to which the clock counts as regular.
 _REGULAR = 0.1
 _UNIFORM = 1e-3
-_CHUNK = 50_000
+_CHUNK = 4000
+# Intervals up to which all polynomials are kept.
+_SHORT = 200
 # How much rougher than the noise of the gyro a motion must be to look for a step in it,
 # and how much smoother the stencil on one side.
 _ROUGH = 6.0
@@ -279,6 +281,16 @@ class Increments:
 
     def _polynomials(self, index: IntArray) -> Array:
         """Return coefficients (M, K, 6) of rate and force in powers of (t - start) / dt."""
+        if self.dt.size <= _SHORT:
+            return np.asarray(self._all_polynomials[index])
+        return self._fit(index)
+
+    @cached_property
+    def _all_polynomials(self) -> Array:
+        """All of them, of a short record: asked for again and again."""
+        return self._fit(np.arange(self.dt.size))
+
+    def _fit(self, index: IntArray) -> Array:
         arc = self.arc_of[index]
         first, last = self.arcs[arc, 0], self.arcs[arc, 1]
         width = self._width

@@ -53,9 +53,9 @@ def regular_interpolation(count: int, shift: int, averaged: bool) -> Array:
 
 
 def evaluate(c: Array, u: Array | float) -> Array:
-    """Return polynomials c (M, K, 6) at u (M,) or scalar."""
+    """Return polynomials c (M, K, n) at u (M,) or scalar, (M, n), or at u (G, M), (G, M, n)."""
     u = np.asarray(u)[..., None]
-    out = np.broadcast_to(c[:, -1], c[:, -1].shape).copy()
+    out = np.repeat(c[None, :, -1], u.shape[0], axis=0) if u.ndim > 2 else c[:, -1].copy()
     for k in range(c.shape[1] - 2, -1, -1):
         out *= u
         out += c[:, k]
@@ -79,8 +79,9 @@ def integrate(c: Array, dt: Array, u: Array | float) -> tuple[Array, Array]:
     """
     u = np.broadcast_to(np.asarray(u, dtype=float), dt.shape)
     h = (dt * u)[:, None]
-    at = [evaluate(c, u * node) for node in _GAUSS_NODES]
-    w1, w2, w3 = (x[:, :3] for x in at)
+    nodes = _GAUSS_NODES[:, None] * u
+    at = evaluate(c, nodes)
+    w1, w2, w3 = at[:, :, :3]
     a1 = h * w2
     a2 = (np.sqrt(15.0) / 3.0) * h * (w3 - w1)
     a3 = (10.0 / 3.0) * h * (w3 - 2.0 * w2 + w1)
@@ -91,11 +92,11 @@ def integrate(c: Array, dt: Array, u: Array | float) -> tuple[Array, Array]:
 
     power = np.arange(1, c.shape[1] + 1)
     integral = np.concatenate([np.zeros_like(c[:, :1, :3]), c[:, :, :3] / power[:, None]], axis=1)
-    dv = np.zeros_like(phi)
-    for node, weight, x in zip(_GAUSS_NODES, _GAUSS_WEIGHTS, at, strict=True):
-        turned = dt[:, None] * evaluate(integral, u * node)
-        force = x[:, 3:]
-        once = cross(turned, force)
-        twice = cross(turned, once)
-        dv += weight * (force + once + twice / 2.0 + cross(turned, twice) / 6.0)
-    return phi, h * dv
+    turned = dt[:, None] * evaluate(integral, nodes)
+    force = at[:, :, 3:]
+    once = cross(turned, force)
+    twice = cross(turned, once)
+    mean = np.tensordot(
+        _GAUSS_WEIGHTS, force + once + twice / 2.0 + cross(turned, twice) / 6.0, axes=1
+    )
+    return phi, h * mean

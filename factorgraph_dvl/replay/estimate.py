@@ -136,7 +136,7 @@ def calibration_of(
     free = [p for p in parameters if p.estimated]
     (gyro, gyro_bias), (accel, accel_bias) = biases
     if held.size:
-        values, gyro_bias, accel_bias, P = _at_prior(free, values, gyro_bias, accel_bias, P, held)
+        values, P = _at_prior(free, values, P, held)
     rows = in_order(
         [
             in_unit(gyro, gyro_bias),
@@ -162,27 +162,25 @@ def calibration_of(
 
 
 def _at_prior(
-    free: Sequence[Parameter],
-    values: Mapping[str, Array],
-    gyro_bias: Array,
-    accel_bias: Array,
-    P: Array,
-    held: Array,
-) -> tuple[dict[str, Array], Array, Array, Array]:
-    """Return values and covariance given that the prior holds along some directions."""
+    free: Sequence[Parameter], values: Mapping[str, Array], P: Array, held: Array
+) -> tuple[dict[str, Array], Array]:
+    """Return values and covariance given that the prior holds along some directions.
+
+    That a direction is held makes the biases no better known.
+    """
     root = prior_root(free)
     A = np.zeros((held.shape[1], P.shape[0]))
     A[:, _BIAS:] = held.T @ np.linalg.inv(root)
     off = np.concatenate([away(p, values[p.name], prior_mean(p)) for p in free])
     gain = np.linalg.solve(A @ P @ A.T, A @ P).T
     step = -gain @ (A[:, _BIAS:] @ off)
-    P = P - gain @ A @ P
-    spread = np.zeros((P.shape[0], held.shape[1]))
-    spread[_BIAS:] = root @ held
+    given = P - gain @ A @ P
+    given[_BIAS:, _BIAS:] += root @ held @ held.T @ root.T
+    given[:_BIAS, :_BIAS] = P[:_BIAS, :_BIAS]
     out = dict(values)
     at = _BIAS
     for p in free:
         part = step[at : at + p.mean.size]
         at += p.mean.size
         out[p.name] = out[p.name] @ exp_so3(part) if p.rotation else out[p.name] + part
-    return out, gyro_bias + step[3:6], accel_bias + step[:3], P + spread @ spread.T
+    return out, given

@@ -7,6 +7,7 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, field
 from datetime import datetime
+from functools import cached_property
 from typing import Annotated, Any, ClassVar, Protocol, Self, TypeVar, runtime_checkable
 
 import msgspec
@@ -144,7 +145,7 @@ class Parameter:
     joint: JointPrior | None = None
     nominal: Array | None = None
 
-    @property
+    @cached_property
     def name(self) -> str:
         """Name in calibration.json, with the unit, or the frame of directions."""
         if self.nominal is not None:
@@ -158,14 +159,14 @@ class Parameter:
         value = reported * self.si + 0.0 * self.mean
         return exp_so3(value) if self.rotation else value
 
-    @property
+    @cached_property
     def component_names(self) -> tuple[str, ...]:
         """Names of the components as in `covariance.order`."""
         parts = [(self.stem, label) if label else (self.stem,) for label in self.labels]
         tail = (self.unit,) if self.unit else ()
         return tuple("_".join((*part, *tail)) for part in parts)
 
-    @property
+    @cached_property
     def estimated(self) -> bool:
         """Whether any component is free."""
         return bool(np.any(self.sigma > 0.0))
