@@ -104,11 +104,11 @@ def initial_states(trial: Trial, frame: LocalFrame, seg: Segments) -> Start:
         time, p_n = _fixes(trial.gnss, frame)
         p_rough = _interpolate(seg.node_time, time, p_n)
         fixed = seg.increments.locate(time)[2]
-    if trial.initial_position is None and not fixed.any():
+    if trial.initial_position is None and trial.beacons is None and not fixed.any():
         raise DataError(
             "no position while the IMU runs",
             where=trial.imu.source,
-            expected="GNSS positions between its first and last sample, or initial.position",
+            expected="GNSS between its first and last sample, initial.position, or beacons",
             hint="Check that all clocks start together",
         )
     arcs = [arc_from_start(seg, a, frame, p_rough) for a in range(len(seg.arc_nodes))]

@@ -10,7 +10,7 @@ slow and makes GTSAM's optimisers copy all values.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -135,6 +135,7 @@ class Problem:
         else:
             self.graph.add(joint_pull(known, chain.bias_key(0), self.parameters, self._key))
         self.uncovered: dict[str, int] = {}
+        self.rejected: Mapping[str, Array] = {}
         self._start = {**self.prior_values(), **(start or {})}
         self._bound: list[_Bound] = []
         for observation in observations:
@@ -252,6 +253,33 @@ class Problem:
             residuals.append(residual)
             cost += 0.5 * float(np.vdot(residual, residual))
         return Evaluation(values, states, parameters, motions, residuals, cost)
+
+    def reject(self, rejected: Mapping[str, Array]) -> None:
+        """Use no measurements at the times (K,) that are given by label."""
+        self.rejected = rejected
+        for bound in self._bound:
+            times = rejected.get(bound.observation.label, np.empty(0))
+            bound.weight[np.isin(bound.observation.time, times)] = 0.0
+
+    def outliers(self, evaluation: Evaluation) -> dict[str, Array]:
+        """Return the times of measurements that miss by more than their gate, by label.
+
+        A sensor whose measurements may be none at all, as the range of an echo, has a `gate`
+        in standard deviations; others have none.
+        """
+        out = {}
+        for bound, motion in zip(self._bound, evaluation.motions, strict=True):
+            o = bound.observation
+            gate = getattr(o, "gate", None)
+            if gate is None:
+                continue
+            before = np.isin(o.time, self.rejected.get(o.label, np.empty(0)))
+            miss = o.residual(motion, evaluation.parameters)
+            far = np.abs(miss) > gate * o.sigma(motion, evaluation.parameters)
+            times = o.time[(before | (bound.weight[:, 0] > 0.0)) & far.any(axis=1)]
+            if times.size:
+                out[o.label] = times
+        return out
 
     def weigh(self, evaluation: Evaluation) -> None:
         """Set the weights of all measurements from their standard deviations there."""

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from factorgraph_dvl.conventions import DEG, Array, BodyAxes
 from factorgraph_dvl.directions import turned
+from factorgraph_dvl.earth import LocalFrame
 from factorgraph_dvl.sensors.protocol import DO_NOT_FIT, TOO_LARGE
 
 _FAR_FROM_PRIOR = 5.0
@@ -111,6 +112,26 @@ class Residuals:
 
 
 @dataclass(frozen=True)
+class Hypothesis:
+    """A trajectory that the data allow, or allowed for some time.
+
+    Parameters
+    ----------
+    weight : normalised likelihood at the end, among all hypotheses.
+    born : time of the last data when it was found, s.
+    died : time of the data since which its weight is nil, s; None if it still has some.
+    trajectory : the motion, up to the end or to its death; covariances are its own.
+    history : (H, 2) time, s, and weight.
+    """
+
+    weight: float
+    born: float
+    died: float | None
+    trajectory: Trajectory
+    history: Array
+
+
+@dataclass(frozen=True)
 class Solution:
     """What a solver found.
 
@@ -127,6 +148,9 @@ class Solution:
     trajectory : the motion.
     residuals : of each sensor.
     warnings : what the user must know.
+    hypotheses : where the data allow, or for some time allowed, more than one trajectory:
+        all of them, the heaviest first, which is the solution's; else empty.
+    rejected : measurements that are none, such as echoes.
     """
 
     trial: str
@@ -140,6 +164,8 @@ class Solution:
     trajectory: Trajectory
     residuals: tuple[Residuals, ...] = ()
     warnings: tuple[str, ...] = field(default_factory=tuple)
+    hypotheses: tuple[Hypothesis, ...] = ()
+    rejected: tuple[Residuals, ...] = ()
 
     @property
     def order(self) -> tuple[str, ...]:
@@ -235,3 +261,94 @@ def doubts(estimates: Sequence[Estimate], residuals: Sequence[Residuals]) -> lis
                 "deviation; the reported standard deviations are too small unless it is corrected"
             )
     return out
+
+
+def mixed(trajectories: Sequence[Trajectory], weights: Array) -> Trajectory:
+    """Return the first of some trajectories, with covariances that admit to the others.
+
+    With weights w, covariances P and differences d from the first, the mean square error of
+    the first is the sum of w (P + d dᵀ).
+
+    Parameters
+    ----------
+    trajectories : of the same epochs.
+    weights : (T,) likelihoods.
+    """
+    first = trajectories[0]
+    if len(trajectories) == 1:
+        return first
+    share = weights / weights.sum()
+    frame = LocalFrame(*first.geodetic[0])
+    p = [frame.position(*t.geodetic.T) for t in trajectories]
+
+    def spread(values: Sequence[Array], covs: Sequence[Array]) -> Array:
+        out = np.zeros_like(covs[0])
+        for w, value, cov in zip(share, values, covs, strict=True):
+            away = value - values[0]
+            out += w * (cov + away[:, :, None] * away[:, None, :])
+        return out
+
+    return replace(
+        first,
+        position_cov=spread(p, [t.position_cov for t in trajectories]),
+        velocity_cov=spread(
+            [t.velocity for t in trajectories], [t.velocity_cov for t in trajectories]
+        ),
+    )
+
+
+def ambiguity(hypotheses: Sequence[Hypothesis]) -> list[str]:
+    """Return a warning if more than one hypothesis is left."""
+    living = [h for h in hypotheses if h.died is None]
+    if len(living) < 2:
+        return []
+    weights = ", ".join(f"{h.weight:.2g}" for h in living)
+    first, second = living[:2]
+    frame = LocalFrame(*first.trajectory.geodetic[-1])
+    apart = float(np.linalg.norm(frame.position(*second.trajectory.geodetic[-1])))
+    return [
+        f"{len(living)} trajectories fit the data (weights {weights}), {apart:.3g} m apart at the "
+        "end: the answer is ambiguous. The standard deviations admit to all of them; a turn of "
+        "30 degrees or more, or `initial.position`, would tell"
+    ]
+
+
+def joined(
+    solutions: Sequence[Solution], against: Array, hypotheses: Sequence[Hypothesis]
+) -> Solution:
+    """Return the most likely of some solutions, with what is known of the others.
+
+    Parameters
+    ----------
+    solutions : of the living hypotheses.
+    against : (S,) negative logarithms of their likelihoods, relative to the best.
+    hypotheses : what the search for a start found: the living, in the order of `solutions`,
+        then the dead. Empty if there was no search.
+    """
+    if len(solutions) == 1 and len(hypotheses) < 2:
+        return solutions[0]
+    weights = np.exp(-against) / np.exp(-against).sum()
+    order = np.argsort(-weights)
+    living = [
+        replace(hypotheses[i], weight=float(weights[i]), trajectory=solutions[i].trajectory)
+        for i in order
+    ]
+    every = (*living, *hypotheses[len(solutions) :])
+    best = solutions[order[0]]
+    return replace(
+        best,
+        trajectory=mixed([solutions[i].trajectory for i in order], weights[order]),
+        hypotheses=every,
+        warnings=(*best.warnings, *ambiguity(every)),
+    )
+
+
+def mostly_rejected(used: Sequence[Residuals], rejected: Sequence[Residuals]) -> list[str]:
+    """Return a warning for each kind of measurement of which most were rejected."""
+    kept = {r.label: r.time.size for r in used}
+    return [
+        f"{r.label}: {r.time.size} of {r.time.size + kept.get(r.label, 0)} were rejected as "
+        "echoes: a place, a clock, a unit or a standard deviation may be wrong"
+        for r in rejected
+        if r.time.size > kept.get(r.label, 0)
+    ]

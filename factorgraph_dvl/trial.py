@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import ClassVar
 
 import numpy as np
 
@@ -10,10 +11,13 @@ from factorgraph_dvl.beam_geometry import as_dvl
 from factorgraph_dvl.conventions import Array, BodyAxes, frd_from_body
 from factorgraph_dvl.earth import LocalFrame
 from factorgraph_dvl.errors import DataError
+from factorgraph_dvl.sensors.beacon import Beacons
+from factorgraph_dvl.sensors.depth import Depth
 from factorgraph_dvl.sensors.dvl import Dvl
 from factorgraph_dvl.sensors.dvl_beams import DvlBeams
 from factorgraph_dvl.sensors.gnss import Gnss
 from factorgraph_dvl.sensors.imu import Imu
+from factorgraph_dvl.sensors.log import Heading, SpeedLog
 from factorgraph_dvl.sensors.protocol import Aid
 from factorgraph_dvl.sensors.turntable import Turntable
 
@@ -124,24 +128,76 @@ class Trial:
         """The sensors other than the IMU."""
         return tuple(aid for aid in (self.gnss, self.dvl, *self.others) if aid is not None)
 
+    @property
+    def beacons(self) -> Beacons | None:
+        """The ranging to beacons, None where the trial does not have it."""
+        return next((aid for aid in self.others if isinstance(aid, Beacons)), None)
+
+    @property
+    def depth(self) -> Depth | None:
+        """The depth sensor, None where the trial does not have it."""
+        return next((aid for aid in self.others if isinstance(aid, Depth)), None)
+
     def frame(self) -> LocalFrame:
-        """Return the tangent frame at the first known position.
+        """Return the tangent frame at the first known position, at worst a beacon's.
 
         Raises
         ------
         DataError
-            If neither GNSS nor `initial.position` gives a position.
+            If neither GNSS nor `initial.position` nor a beacon gives a position.
         """
         known = np.empty((0, 3))
         if self.initial_position is not None:
             known = self.initial_position.geodetic[None]
         elif self.gnss is not None:
             known = self.gnss.geodetic[~np.isnan(self.gnss.geodetic[:, 0])]
+        if not known.size and self.beacons is not None:
+            known = self.beacons.places
         if known.size:
             lat, lon, height = known[0]
             return LocalFrame(lat, lon, height, self.epoch)
         raise DataError(
             "the trial has no position",
             where="trial.yaml",
-            expected="a gnss section with positions, or initial.position",
+            expected="a gnss section with positions, initial.position, or beacons",
         )
+
+
+@dataclass(frozen=True)
+class PlanarTrial:
+    """A trial of a vehicle without a usable IMU: heading, speed, depth, and beacons.
+
+    Parameters
+    ----------
+    name : of the trial.
+    heading, log, depth, beacons : the records.
+    body_axes : axes in which lever arms are given.
+    initial_position : prior; None = found from the ranges.
+    reference : truth or a trusted solution, None if there is none.
+    calibration_truth : true values of what is estimated, by reported name, in reported
+        units; empty outside simulations.
+    notes : what was noticed while loading, for the user.
+    """
+
+    name: str
+    heading: Heading
+    log: SpeedLog
+    depth: Depth
+    beacons: Beacons
+    body_axes: BodyAxes = "RFU"
+    initial_position: InitialPosition | None = None
+    reference: Reference | None = None
+    calibration_truth: dict[str, Array] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+
+    gnss: ClassVar[None] = None
+    beams: ClassVar[None] = None
+
+    @property
+    def records(self) -> tuple[Heading, SpeedLog, Depth, Beacons]:
+        """All records."""
+        return self.heading, self.log, self.depth, self.beacons
+
+    def frame(self) -> LocalFrame:
+        """Return the tangent frame at the first beacon."""
+        return LocalFrame(*self.beacons.places[0])

@@ -26,6 +26,7 @@ LAYERS = (
     ("clock", "polynomials", "signals"),
     ("increments",),
     ("kalman",),
+    ("planar",),
     ("preintegration",),
     ("attitude",),
     ("keys",),
@@ -33,7 +34,7 @@ LAYERS = (
     ("priors",),
     ("arcs",),
     ("attitude_alignment",),
-    ("alignment", "mounting"),
+    ("alignment", "mounting", "anchoring"),
     ("graph",),
     ("solvers",),
     ("replay",),
@@ -55,7 +56,12 @@ FORBIDDEN = {
     ),
     "planning": ("kalman", "io", "replay"),
     "report": ("replay", "solvers", "graph", "keys", "preintegration", "simulation", "io"),
-    "alignment": ("mounting", "graph", "keys"),
+    "alignment": ("mounting", "anchoring", "graph", "keys"),
+    "anchoring": ("alignment", "mounting", "graph", "keys", "kalman"),
+    "planar": (
+        *("kalman", "io", "simulation", "clock", "polynomials", "signals", "increments"),
+        "replay",
+    ),
     "mounting": ("alignment", "graph", "keys", "preintegration"),
     "preintegration": ("keys",),
     "attitude": ("io", "simulation"),
@@ -143,14 +149,20 @@ def test_simulation_takes_no_measurement_model_from_the_sensors():
     settings = {kind.section_type.__name__ for kind in (Imu, *AIDS)}
     plain = {
         "Aid",
+        "BeaconPosition",
         "check_epoch",
+        "Heading",
+        "HeadingSettings",
+        "LogSettings",
         "NonNegative",
         "Positive",
         "Section",
         "SensorSection",
         "Sigma3",
+        "SpeedLog",
         "Vector3",
     }
+    plain |= {"Depth", "DepthSettings"}
     for parts in MODULES:
         if parts[0] == "simulation":
             for name in imported(read(parts)):

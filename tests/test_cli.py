@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 from builders import build_solution, build_trial, edit, write_trial
+from truth import CONFIGS
 
 import factorgraph_dvl.report.figures
 import factorgraph_dvl.solvers.batch
@@ -17,6 +18,7 @@ from factorgraph_dvl.cli import main
 from factorgraph_dvl.errors import SolveError
 from factorgraph_dvl.io.solution_folder import load_solution
 from factorgraph_dvl.io.trial_folder import load_trial
+from factorgraph_dvl.simulation import Scenario, load_scenario
 from factorgraph_dvl.solution import Solution
 from factorgraph_dvl.trial import Trial
 
@@ -230,8 +232,12 @@ def test_a_terminal_too_narrow_cuts_no_number(
 
 def test_the_table_comes_before_its_warnings_in_one_file(tmp_path: Path) -> None:
     trial = write_trial(tmp_path)
+    # Beams at the times of the pings: one instrument in two records.
+    times = [line.split(",")[0] for line in (trial / "dvl.csv").read_text().splitlines()[1:]]
+    rows = ["time_s,beam1_m_s,beam2_m_s,beam3_m_s,beam4_m_s", *(f"{t},0,0,0,0" for t in times)]
+    (trial / "dvl_beams.csv").write_text("\n".join(rows) + "\n")
     with (trial / "trial.yaml").open("a") as file:
-        file.write("beacons: {file: beacon.csv}\n")
+        file.write("dvl_beams: {slant_azimuth_deg: [[30, 45], [30, 135], [30, 225], [30, 315]]}\n")
     done = subprocess.run(
         [sys.executable, "-m", "factorgraph_dvl.cli", "inspect", str(trial)],
         stdout=subprocess.PIPE,
@@ -240,7 +246,7 @@ def test_the_table_comes_before_its_warnings_in_one_file(tmp_path: Path) -> None
         timeout=60,
         check=True,
     )
-    assert 0 < done.stdout.index("missing %") < done.stdout.index("warning: section `beacons`")
+    assert 0 < done.stdout.index("missing %") < done.stdout.index("warning: `dvl` and `dvl_beams`")
 
 
 @pytest.mark.parametrize(
@@ -286,13 +292,6 @@ def test_inspect_shows_records_and_findings(tmp_path: Path, run: Run) -> None:
         assert text in result.out
 
 
-def test_inspect_notes_what_is_not_used(tmp_path: Path, run: Run) -> None:
-    trial = write_trial(tmp_path)
-    with (trial / "trial.yaml").open("a") as file:
-        file.write("beacons: {file: beacon.csv}\n")
-    assert "section `beacons` of trial.yaml is not used" in run("inspect", trial).err
-
-
 @pytest.mark.parametrize("flag", [(), ("--parquet",)])
 def test_simulate_writes_a_trial(
     tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch, flag: tuple[str, ...]
@@ -302,14 +301,16 @@ def test_simulate_writes_a_trial(
     module = importlib.import_module("factorgraph_dvl.simulation")
     seeds = []
 
-    def simulate(scenario: Path, seed: int) -> Trial:
-        assert scenario == tmp_path / "scenario.yaml"
+    config = CONFIGS / "seed-a-phase-0.yaml"
+
+    def simulate(scenario: Scenario, seed: int) -> Trial:
+        assert scenario == load_scenario(config)
         seeds.append(seed)
         return build_trial()
 
     monkeypatch.setattr(module, "simulate", simulate)
     out = tmp_path / "out"
-    args = ("simulate", tmp_path / "scenario.yaml", "--out", out, *flag)
+    args = ("simulate", config, "--out", out, *flag)
     result = run(*args, "--seed", "7")
     assert result.code == 0
     assert str(out) in result.out

@@ -138,15 +138,6 @@ def test_a_trial_without_a_name_is_called_as_its_folder(tmp_path: Path) -> None:
     assert load_trial(path).name == "trial"
 
 
-def test_sections_that_are_not_used_are_noted(tmp_path: Path) -> None:
-    path = write_trial(tmp_path)
-    with (path / "trial.yaml").open("a") as file:
-        file.write("beacons: {file: beacons.csv}\n")
-    assert load_trial(path).notes == (
-        "section `beacons` of trial.yaml is not used by this version",
-    )
-
-
 BAD_SETTINGS = {
     "unknown key": ("misalignment_deg:", "misalinment_deg:", "dvl.misalinment_deg", "`misalignm"),
     "unknown section": ("gnss:\n", "gps:\n", "gps", "gnss"),

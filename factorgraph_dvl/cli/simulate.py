@@ -23,15 +23,20 @@ def simulate(
 ) -> None:
     """Simulate a trial with known truth."""
     from factorgraph_dvl.io.folders import check_output
+    from factorgraph_dvl.io.planar_folder import save_planar_trial
     from factorgraph_dvl.io.trial_folder import save_trial
+    from factorgraph_dvl.simulation import load_scenario, simulate_planar
     from factorgraph_dvl.simulation import simulate as run
 
     check_output(out, force=force)
     start = perf_counter()
-    trial = run(config, seed=seed)
-    save_trial(trial, out, force=force, parquet=parquet)
+    scenario = load_scenario(config)
+    if scenario.planar:
+        save_planar_trial(simulate_planar(scenario, seed), out, force=force, parquet=parquet)
+    else:
+        save_trial(run(scenario, seed), out, force=force, parquet=parquet)
     stdout().print(
-        f"Wrote trial {trial.name} to {out} in {perf_counter() - start:.1f} s",
+        f"Wrote trial {scenario.name} to {out} in {perf_counter() - start:.1f} s",
         markup=False,
         soft_wrap=True,
     )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, cast
 
 import typer
 from rich.text import Text
@@ -22,13 +22,15 @@ from factorgraph_dvl.cli.options import Force, NoFigures, Quiet, Rate, SolutionP
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from factorgraph_dvl.errors import ConfigError
     from factorgraph_dvl.kalman import History
+    from factorgraph_dvl.kalman.run import Method
     from factorgraph_dvl.solution import Solution
-    from factorgraph_dvl.trial import Trial
+    from factorgraph_dvl.trial import PlanarTrial, Trial
 
 
 class KalmanMethod(StrEnum):
-    """What `kalman` calibrates by which method: a DVL, or with `star` the gyros."""
+    """What `kalman` calibrates or navigates by which method: a DVL, gyros, a planar trial."""
 
     POINT_SET = "point-set"
     NINE_STATE = "nine-state"
@@ -36,6 +38,13 @@ class KalmanMethod(StrEnum):
     LEAST_SQUARES = "least-squares"
     STAR = "star"
     BEAMS = "beams"
+    TWO_OBSERVATIONS = "4sv-2ob"
+    THREE_OBSERVATIONS = "4sv-3ob"
+
+    @property
+    def planar(self) -> bool:
+        """Whether it filters planar trials."""
+        return self in (KalmanMethod.TWO_OBSERVATIONS, KalmanMethod.THREE_OBSERVATIONS)
 
 
 def solve(
@@ -54,34 +63,61 @@ def solve(
 
         return run_batch(trial, rate_hz=rate, progress=progress), None
 
-    _solve_into(out, trial_path, run, force=force, figures=not no_figures, quiet=quiet)
+    def run_planar(trial: PlanarTrial, progress: ProgressLine) -> tuple[Solution, None]:
+        from factorgraph_dvl.planar.solve import solve_planar
+
+        return solve_planar(trial, rate_hz=rate, progress=progress), None
+
+    _solve_into(out, trial_path, run, run_planar, force=force, figures=not no_figures, quiet=quiet)
 
 
 def kalman(
     trial_path: TrialPath,
     out: SolutionPath,
     method: Annotated[
-        KalmanMethod, typer.Option(help="How the DVL, or with star the gyros, are calibrated.")
-    ] = KalmanMethod.POINT_SET,
+        KalmanMethod | None,
+        typer.Option(
+            help="How the DVL, or with star the gyros, are calibrated (point-set by default), or "
+            "what a planar trial is filtered with (4sv-3ob)."
+        ),
+    ] = None,
     force: Force = False,
     no_figures: NoFigures = False,
     rate: Rate = 10.0,
     quiet: Quiet = False,
 ) -> None:
-    """Calibrate by a Kalman filter, to compare with `solve`."""
+    """Calibrate or navigate by a Kalman filter, to compare with `solve`."""
 
     def run(trial: Trial, progress: ProgressLine) -> tuple[Solution, History | None]:
         from factorgraph_dvl.kalman import calibrate
 
-        return calibrate(trial, method.value, rate_hz=rate, progress=progress)
+        chosen = method or KalmanMethod.POINT_SET
+        if chosen.planar:
+            raise _misplaced(chosen, "a planar trial, without an imu")
+        return calibrate(trial, cast("Method", chosen.value), rate_hz=rate, progress=progress)
 
-    _solve_into(out, trial_path, run, force=force, figures=not no_figures, quiet=quiet)
+    def run_planar(trial: PlanarTrial, progress: ProgressLine) -> tuple[Solution, History]:
+        from factorgraph_dvl.kalman.single_beacon import filter_planar
+
+        chosen = method or KalmanMethod.THREE_OBSERVATIONS
+        if not chosen.planar:
+            raise _misplaced(chosen, "a trial with imu, gnss and dvl")
+        return filter_planar(trial, chosen.value, progress=progress)
+
+    _solve_into(out, trial_path, run, run_planar, force=force, figures=not no_figures, quiet=quiet)
+
+
+def _misplaced(method: KalmanMethod, expected: str) -> ConfigError:
+    from factorgraph_dvl.errors import ConfigError
+
+    return ConfigError(f"method {method.value} does not fit this trial", expected=expected)
 
 
 def _solve_into(
     out: Path,
     trial_path: Path,
     run: Callable[[Trial, ProgressLine], tuple[Solution, History | None]],
+    run_planar: Callable[[PlanarTrial, ProgressLine], tuple[Solution, History | None]],
     *,
     force: bool,
     figures: bool,
@@ -89,17 +125,19 @@ def _solve_into(
 ) -> None:
     """Load a trial, run a solver on it, write and show its solution."""
     from factorgraph_dvl.io.folders import check_output
-    from factorgraph_dvl.io.solution_folder import (
-        FIGURES_FOLDER,
-        save_solution,
-        write_history,
-    )
+    from factorgraph_dvl.io.planar_folder import is_planar, load_planar_trial
+    from factorgraph_dvl.io.solution_folder import FIGURES_FOLDER, save_solution, write_history
     from factorgraph_dvl.io.trial_folder import load_trial
 
     check_output(out, force=force)
     with ProgressLine(quiet=quiet) as progress:
-        trial = load_trial(trial_path)
-        solution, history = run(trial, progress)
+        trial: Trial | PlanarTrial
+        if is_planar(trial_path):
+            trial = load_planar_trial(trial_path)
+            solution, history = run_planar(trial, progress)
+        else:
+            trial = load_trial(trial_path)
+            solution, history = run(trial, progress)
         progress("write", 0, None)
 
         def add(folder: Path) -> None:
@@ -128,7 +166,7 @@ def _solve_into(
         raise typer.Exit(1)
 
 
-def _write_beams(trial: Trial, solution: Solution, folder: Path) -> None:
+def _write_beams(trial: Trial | PlanarTrial, solution: Solution, folder: Path) -> None:
     """Write how the beams agree, if the trial has some and the solution calibrates them."""
     from factorgraph_dvl.analysis.beam_quality import beam_quality, calibrates, calibration_of
     from factorgraph_dvl.io.solution_folder import BEAMS_FILE
@@ -150,12 +188,17 @@ def _write_instrument(solution: Solution, folder: Path) -> None:
         (folder / INSTRUMENT_FILE).write_text(text, encoding="utf-8")
 
 
-def _print_solution(trial: Trial, solution: Solution) -> None:
+def _print_solution(trial: Trial | PlanarTrial, solution: Solution) -> None:
     from factorgraph_dvl.analysis.consistency import calibration_errors
-    from factorgraph_dvl.report.tables import calibration_table
+    from factorgraph_dvl.report.tables import calibration_table, hypothesis_table, rejected_line
 
     truth = trial.calibration_truth
-    errors = calibration_errors(solution, truth) if truth else None
-    print_table(calibration_table(solution, errors, width=stdout().width))
+    if solution.estimates:
+        errors = calibration_errors(solution, truth) if truth else None
+        print_table(calibration_table(solution, errors, width=stdout().width))
+    if solution.hypotheses:
+        print_table(hypothesis_table(solution))
+    if solution.rejected:
+        stdout().print(rejected_line(solution), markup=False, soft_wrap=True)
     for warning in solution.warnings:
         warn(warning)

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any, Literal
 
+import msgspec
 import numpy as np
 
 from factorgraph_dvl.conventions import DEG, GEODETIC_SI, Array
@@ -18,10 +20,13 @@ from factorgraph_dvl.io.motion_table import COLUMNS as MOTION_COLUMNS
 from factorgraph_dvl.io.motion_table import motion_columns
 from factorgraph_dvl.io.tables import read_table, write_table
 from factorgraph_dvl.sensors.protocol import stack
-from factorgraph_dvl.solution import Solution, Trajectory
+from factorgraph_dvl.solution import Hypothesis, Residuals, Solution, Trajectory
 
 TRAJECTORY_FILE = "trajectory.csv"
 HISTORY_FILE = "history.csv"
+HYPOTHESES_FILE = "hypotheses.json"
+HYPOTHESES_FOLDER = "hypotheses"
+REJECTED_FILE = "rejected.csv"
 LATENCY_FILE = "latency.csv"
 CONVERGENCE_FILE = "convergence.csv"
 INSTRUMENT_FILE = "instrument.yaml"
@@ -32,6 +37,20 @@ STD_COLUMNS = (
     *("vel_std_e_m_s", "vel_std_n_m_s", "vel_std_u_m_s"),
     *("roll_std_deg", "pitch_std_deg", "heading_std_deg"),
 )
+
+
+class _Hypothesis(msgspec.Struct):
+    weight: float
+    found_s: float
+    died_s: float | None
+    trajectory: str
+    history_s: list[float]
+    history_weight: list[float]
+
+
+class _Hypotheses(msgspec.Struct):
+    format: Literal[1]
+    hypotheses: list[_Hypothesis]
 
 
 def save_solution(
@@ -59,6 +78,7 @@ def save_solution(
     """
     owned = (
         *(CALIBRATION_FILE, TRAJECTORY_FILE, HISTORY_FILE, LATENCY_FILE, CONVERGENCE_FILE),
+        *(HYPOTHESES_FILE, HYPOTHESES_FOLDER, REJECTED_FILE),
         *(INSTRUMENT_FILE, BEAMS_FILE, FIGURES_FOLDER),
     )
     with new_folder(Path(path), force=force, owned=owned) as folder:
@@ -66,9 +86,39 @@ def save_solution(
         if smoothed is not None:
             columns |= _smoothed_columns(solution.trajectory, smoothed)
         write_table(folder / TRAJECTORY_FILE, columns)
+        if solution.hypotheses:
+            _write_hypotheses(folder, solution.hypotheses)
+        if solution.rejected:
+            write_table(folder / REJECTED_FILE, _rejected_columns(solution.rejected))
         if extra is not None:
             extra(folder)
         (folder / CALIBRATION_FILE).write_bytes(encode_calibration(solution))
+
+
+def _write_hypotheses(folder: Path, hypotheses: Sequence[Hypothesis]) -> None:
+    """Write what is known of each hypothesis, and its trajectory."""
+    (folder / HYPOTHESES_FOLDER).mkdir()
+    items = []
+    for i, h in enumerate(hypotheses, 1):
+        name = f"{HYPOTHESES_FOLDER}/{i}.csv"
+        write_table(folder / name, _trajectory_columns(h.trajectory))
+        time, weight = h.history.T.tolist()
+        items.append(_Hypothesis(h.weight, h.born, h.died, name, time, weight))
+    text = msgspec.json.format(msgspec.json.encode(_Hypotheses(1, items)), indent=2) + b"\n"
+    (folder / HYPOTHESES_FILE).write_bytes(text)
+
+
+def _rejected_columns(rejected: Sequence[Residuals]) -> dict[str, Any]:
+    """Return the rejected measurements as a table, by time."""
+    columns: dict[str, Any] = {
+        "time_s": np.concatenate([r.time for r in rejected]),
+        "measurement": np.concatenate([np.full(r.time.size, r.label) for r in rejected]),
+        "unit": np.concatenate([np.full(r.time.size, r.unit) for r in rejected]),
+        "residual": np.concatenate([r.residual[:, 0] for r in rejected]),
+        "std": np.concatenate([r.sigma[:, 0] for r in rejected]),
+    }
+    order = np.argsort(columns["time_s"], kind="stable")
+    return {name: values[order] for name, values in columns.items()}
 
 
 def write_history(

@@ -1,21 +1,25 @@
-"""CSV and Parquet tables: named columns of numbers."""
+"""CSV and Parquet tables: named columns of numbers, and a few of text."""
 
 from __future__ import annotations
 
 import csv
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.csv
 import pyarrow.parquet
+from numpy.typing import NDArray
 
 from factorgraph_dvl.conventions import Array
 from factorgraph_dvl.errors import DataError
 
 _EMPTY = ("", "nan", "NaN", "NAN")
 _PARQUET = (".parquet", ".pq")
+# Columns that hold text, in whatever table.
+TEXT = ("beacon", "measurement", "unit")
 
 
 def read_table(
@@ -24,8 +28,10 @@ def read_table(
     optional: Sequence[Sequence[str]] = (),
     *,
     source: str = "",
-) -> dict[str, Array]:
+) -> dict[str, Any]:
     """Read columns of numbers from a CSV or, by its suffix, a Parquet file.
+
+    Those in `TEXT` hold text.
 
     Parameters
     ----------
@@ -57,16 +63,25 @@ def read_table(
         reason = error.strerror or str(error)
         raise DataError(f"cannot be read ({reason})", where=source) from error
     absent = np.full(table.num_rows, np.nan)
-    columns = {name: _numbers(table, name) for name in names}
+    columns = {
+        name: _text(table, name) if name in TEXT else _numbers(table, name) for name in names
+    }
     return {name: columns.get(name, absent) for group in (required, *optional) for name in group}
 
 
-def write_table(path: Path, columns: Mapping[str, Array]) -> None:
-    """Write columns (N,) of numbers as CSV or, by its suffix, Parquet; nan as empty.
+def write_table(path: Path, columns: Mapping[str, NDArray[Any]]) -> None:
+    """Write columns (N,) of numbers or text as CSV or, by its suffix, Parquet; nan as empty.
 
     CSV cells have as many digits as it takes to read the same numbers back.
     """
-    table = pa.table({k: pa.array(v, pa.float64(), from_pandas=True) for k, v in columns.items()})
+    table = pa.table(
+        {
+            name: pa.array(values.tolist(), pa.string())
+            if values.dtype.kind == "U"
+            else pa.array(values, pa.float64(), from_pandas=True)
+            for name, values in columns.items()
+        }
+    )
     if path.suffix.lower() in _PARQUET:
         pyarrow.parquet.write_table(table, path)
         return
@@ -142,7 +157,9 @@ def _read_csv(path: Path, header: list[str], names: list[str], source: str) -> p
             path,
             read_options=pyarrow.csv.ReadOptions(column_names=unique, skip_rows=1),
             convert_options=pyarrow.csv.ConvertOptions(
-                column_types={name: pa.float64() for name in names},
+                column_types={
+                    name: pa.string() if name in TEXT else pa.float64() for name in names
+                },
                 include_columns=names,
                 null_values=list(_EMPTY),
             ),
@@ -172,7 +189,7 @@ def _explain_csv(
                         expected=f"{len(header)}, as in the header line",
                     )
                 for name, cell in zip(header, row, strict=True):
-                    if name in names and not _is_number(cell):
+                    if name in names and name not in TEXT and not _is_number(cell):
                         shown = cell if len(cell) <= 40 else cell[:40] + "…"
                         return DataError(f"{name} is '{shown}'", where=where, expected="a number")
         except csv.Error as csv_error:
@@ -204,6 +221,8 @@ def _parquet_header(path: Path, source: str) -> list[str]:
 def _read_parquet(path: Path, header: list[str], names: list[str], source: str) -> pa.Table:
     table = pyarrow.parquet.read_table(path, columns=names)
     for field in table.schema:
+        if field.name in TEXT:
+            continue
         if not (pa.types.is_floating(field.type) or pa.types.is_integer(field.type)):
             raise DataError(
                 f"column {field.name} holds {field.type}", where=source, expected="numbers"
@@ -215,3 +234,8 @@ def _numbers(table: pa.Table, name: str) -> Array:
     """Return a column, (N,), writable, with nan where it is null."""
     column = table.column(name).cast(pa.float64(), safe=False)
     return np.array(column.to_numpy(zero_copy_only=False), dtype=float)
+
+
+def _text(table: pa.Table, name: str) -> NDArray[np.str_]:
+    """Return a column of text, (N,); empty where it is null."""
+    return np.array([value or "" for value in table.column(name).cast(pa.string()).to_pylist()])

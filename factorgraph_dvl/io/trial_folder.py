@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import TypeVar, cast
+from typing import Any, TypeVar, cast
 
 import msgspec
 import numpy as np
@@ -18,16 +18,21 @@ from factorgraph_dvl.io.motion_table import motion_columns, read_reference
 from factorgraph_dvl.io.tables import read_table, write_table
 from factorgraph_dvl.io.trial_yaml import (
     InitialSettings,
+    PlanarInitialSettings,
+    PlanarSettings,
     PositionSettings,
     ReferenceSettings,
     TrialSettings,
     to_yaml,
 )
+from factorgraph_dvl.sensors.beacon import Beacons
 from factorgraph_dvl.sensors.catalogue import AIDS
+from factorgraph_dvl.sensors.depth import Depth
 from factorgraph_dvl.sensors.dvl import CALIBRATED, SCALE_ERROR, TIME_OFFSET, Dvl
 from factorgraph_dvl.sensors.dvl_beams import DvlBeams
 from factorgraph_dvl.sensors.gnss import Gnss
 from factorgraph_dvl.sensors.imu import Imu
+from factorgraph_dvl.sensors.log import Heading, SpeedLog
 from factorgraph_dvl.sensors.protocol import Aid, JointPrior, Record, SensorSection
 from factorgraph_dvl.solution import Calibration, Estimate
 from factorgraph_dvl.trial import InitialAttitude, InitialPosition, Reference, Trial
@@ -37,8 +42,9 @@ SETTINGS_FILE = "trial.yaml"
 TRUTH_FILE = "truth.json"
 # Where a trial that was loaded with a calibration of its DVL keeps it when it is saved.
 PRIOR_FILE = "dvl-calibration.json"
-_TABLES = ("imu", *(aid.section for aid in AIDS), "reference")
-_OWNED = (
+_PLANAR: tuple[type[Record], ...] = (Heading, SpeedLog, Depth, Beacons)
+_TABLES = dict.fromkeys(("imu", *(kind.section for kind in (*AIDS, *_PLANAR)), "reference"))
+OWNED = (
     SETTINGS_FILE,
     TRUTH_FILE,
     PRIOR_FILE,
@@ -75,15 +81,23 @@ def load_trial(path: Path | str) -> Trial:
     DataError
         If a table is missing or does not hold what it should.
     """
-    folder, file = _locate(Path(path))
-    settings = parse_yaml(read_text(file), TrialSettings, source=file.name)
+    folder, file = locate(Path(path))
+    text = read_text(file)
+    if looks_planar(text, file.name):
+        raise ConfigError(
+            "is a planar trial, without an imu",
+            where=file.name,
+            expected="an imu section",
+            hint="`solve` and `kalman` take planar trials",
+        )
+    settings = parse_yaml(text, TrialSettings, source=file.name)
     initial = settings.initial
     kinds = {aid.section: aid for aid in AIDS}
-    aids = {name: _read(folder, kinds[name], section) for name, section in settings.aids.items()}
+    aids = {
+        name: read_record(folder, kinds[name], section) for name, section in settings.aids.items()
+    }
     dvl = cast("Dvl | None", aids.pop(Dvl.section, None))
-    notes = [
-        f"section `{name}` of {file.name} is not used by this version" for name in settings.unused
-    ]
+    notes = []
     if dvl is not None and _share_pings(dvl, aids):
         notes.append(
             "`dvl` and `dvl_beams` have pings at the same times: if both are records of one "
@@ -91,16 +105,16 @@ def load_trial(path: Path | str) -> Trial:
         )
     return Trial(
         name=settings.name or folder.resolve().name,
-        imu=_read(folder, Imu, settings.imu),
+        imu=read_record(folder, Imu, settings.imu),
         gnss=cast("Gnss | None", aids.pop(Gnss.section, None)),
         dvl=dvl if dvl is None else _with_calibration(dvl, folder, settings.body_axes),
         others=tuple(aids.values()),
         body_axes=settings.body_axes,
         epoch=settings.epoch,
         initial_attitude=None if initial is UNSET else _attitude(initial),
-        initial_position=None if initial is UNSET else _position(initial),
-        reference=_reference(folder, settings),
-        calibration_truth=_read_truth(folder / TRUTH_FILE),
+        initial_position=None if initial is UNSET else position_of(initial),
+        reference=reference_of(folder, settings),
+        calibration_truth=read_truth(folder / TRUTH_FILE),
         notes=tuple(notes),
     )
 
@@ -122,9 +136,14 @@ def load_reference(path: Path | str) -> tuple[Reference | None, dict[str, Array]
     ConfigError, DataError
         As `load_trial`.
     """
-    folder, file = _locate(Path(path))
-    settings = parse_yaml(read_text(file), TrialSettings, source=file.name)
-    return _reference(folder, settings), _read_truth(folder / TRUTH_FILE)
+    folder, file = locate(Path(path))
+    text = read_text(file)
+    settings: TrialSettings | PlanarSettings
+    if looks_planar(text, file.name):
+        settings = parse_yaml(text, PlanarSettings, source=file.name)
+    else:
+        settings = parse_yaml(text, TrialSettings, source=file.name)
+    return reference_of(folder, settings), read_truth(folder / TRUTH_FILE)
 
 
 def save_trial(
@@ -146,13 +165,13 @@ def save_trial(
     """
     suffix = ".parquet" if parquet else ".csv"
 
-    with new_folder(Path(path), force=force, owned=_OWNED) as folder:
+    with new_folder(Path(path), force=force, owned=OWNED) as folder:
         for record in (trial.imu, *trial.aids):
             write_table(folder / f"{record.section}{suffix}", record.columns())
         if trial.reference is not None:
             write_table(folder / f"reference{suffix}", motion_columns(trial.reference))
         if trial.calibration_truth:
-            (folder / TRUTH_FILE).write_bytes(_truth_json(trial.calibration_truth))
+            (folder / TRUTH_FILE).write_bytes(truth_json(trial.calibration_truth))
         if trial.dvl is not None and trial.dvl.prior is not None:
             calibration = _calibration_of(trial.dvl.prior, trial)
             (folder / PRIOR_FILE).write_bytes(encode_calibration(calibration))
@@ -242,12 +261,24 @@ def _dvl(trial: Trial) -> Dvl:
     return trial.dvl
 
 
+class _Kind(msgspec.Struct):
+    imu: Any = None
+    heading: Any = None
+    log: Any = None
+
+
+def looks_planar(text: str, source: str) -> bool:
+    """Whether the text of a trial.yaml has heading or log, and no imu."""
+    kind = parse_yaml(text, _Kind, source=source)
+    return kind.imu is None and (kind.heading is not None or kind.log is not None)
+
+
 def _share_pings(dvl: Dvl, others: dict[str, Aid]) -> bool:
     beams = others.get(DvlBeams.section)
     return beams is not None and bool(np.mean(np.isin(beams.time, dvl.time)) > 0.5)
 
 
-def _locate(path: Path) -> tuple[Path, Path]:
+def locate(path: Path) -> tuple[Path, Path]:
     """Return a trial's folder and its trial.yaml."""
     if not path.exists():
         raise DataError("the trial does not exist", where=str(path), expected="a trial folder")
@@ -255,13 +286,15 @@ def _locate(path: Path) -> tuple[Path, Path]:
     return file.parent, file
 
 
-def _reference(folder: Path, settings: TrialSettings) -> Reference | None:
+def reference_of(folder: Path, settings: TrialSettings | PlanarSettings) -> Reference | None:
+    """Return the reference that the settings of a trial name, None if they name none."""
     if settings.reference is UNSET:
         return None
     return read_reference(folder / settings.reference.file, settings.reference.file)
 
 
-def _read(folder: Path, kind: type[_Sensor], settings: SensorSection) -> _Sensor:
+def read_record(folder: Path, kind: type[_Sensor], settings: SensorSection) -> _Sensor:
+    """Return the record of a sensor, from the table that its settings name."""
     required = (*kind.required, *settings.more_columns)
     columns = read_table(folder / settings.file, required, kind.optional, source=settings.file)
     return kind.from_columns(settings, columns, settings.file)
@@ -275,7 +308,8 @@ def _attitude(initial: InitialSettings) -> InitialAttitude | None:
     )
 
 
-def _position(initial: InitialSettings) -> InitialPosition | None:
+def position_of(initial: InitialSettings | PlanarInitialSettings) -> InitialPosition | None:
+    """Return the prior of the position that `initial` states, None if there is none."""
     position = initial.position
     if position is UNSET:
         return None
@@ -311,14 +345,20 @@ def _initial(trial: Trial) -> InitialSettings | msgspec.UnsetType:
         fields["roll_pitch_heading_deg"] = tuple((attitude.rph / DEG).tolist())
         fields["std_deg"] = tuple((attitude.std / DEG).tolist())
     if position is not None:
-        lat, lon, height = (position.geodetic / GEODETIC_SI).tolist()
-        fields["position"] = PositionSettings(
-            lat_deg=lat, lon_deg=lon, height_m=height, std_m=tuple(position.std.tolist())
-        )
+        fields["position"] = position_settings(position)
     return InitialSettings(**fields)  # type: ignore[arg-type]
 
 
-def _read_truth(path: Path) -> dict[str, Array]:
+def position_settings(position: InitialPosition) -> PositionSettings:
+    """Return the prior of the position as `initial` states it."""
+    lat, lon, height = (position.geodetic / GEODETIC_SI).tolist()
+    return PositionSettings(
+        lat_deg=lat, lon_deg=lon, height_m=height, std_m=tuple(position.std.tolist())
+    )
+
+
+def read_truth(path: Path) -> dict[str, Array]:
+    """Return the true calibration of a truth.json; empty if there is no such file."""
     if not path.exists():
         return {}
     try:
@@ -332,7 +372,8 @@ def _read_truth(path: Path) -> dict[str, Array]:
     return {name: np.array(item.value) for name, item in truth.parameters.items()}
 
 
-def _truth_json(truth: dict[str, Array]) -> bytes:
+def truth_json(truth: dict[str, Array]) -> bytes:
+    """Return the text of truth.json."""
     values = {
         name: _TruthValue(np.atleast_1d(np.asarray(value, dtype=float)).tolist())
         for name, value in truth.items()

@@ -8,12 +8,12 @@ import msgspec
 from msgspec import UNSET, Meta, UnsetType
 
 from factorgraph_dvl.conventions import BodyAxes
+from factorgraph_dvl.sensors.beacon import BeaconSettings
 from factorgraph_dvl.sensors.catalogue import AIDS
+from factorgraph_dvl.sensors.depth import DepthSettings
 from factorgraph_dvl.sensors.imu import ImuSettings
+from factorgraph_dvl.sensors.log import HeadingSettings, LogSettings
 from factorgraph_dvl.sensors.protocol import Section, SensorSection, Sigma3, check_epoch
-
-# Sections of format 1 whose sensors this version does not know.
-_UNKNOWN = sorted({"depth", "star", "beacons"} - {aid.section for aid in AIDS})
 
 _Latitude = Annotated[float, Meta(ge=-90, le=90)]
 _Longitude = Annotated[float, Meta(ge=-360, le=360)]
@@ -50,6 +50,26 @@ class ReferenceSettings(Section, frozen=True, kw_only=True):
     file: str = "reference.csv"
 
 
+class PlanarInitialSettings(Section, frozen=True, kw_only=True):
+    """Section `initial` of a planar trial.yaml."""
+
+    position: PositionSettings
+
+
+class PlanarSettings(Section, frozen=True, kw_only=True):
+    """The whole of a planar trial.yaml."""
+
+    format: Literal[1]
+    name: str = ""
+    body_axes: BodyAxes = "RFU"
+    heading: HeadingSettings
+    log: LogSettings
+    depth: DepthSettings
+    beacons: BeaconSettings
+    initial: PlanarInitialSettings | UnsetType = UNSET
+    reference: ReferenceSettings | UnsetType = UNSET
+
+
 class _Settings(Section, frozen=True, kw_only=True):
     format: Literal[1]
     name: str = ""
@@ -69,11 +89,6 @@ class _Settings(Section, frozen=True, kw_only=True):
         given = {aid.section: getattr(self, aid.section) for aid in AIDS}
         return {name: section for name, section in given.items() if section is not UNSET}
 
-    @property
-    def unused(self) -> tuple[str, ...]:
-        """Sections that are given, but that this version does not use."""
-        return tuple(name for name in _UNKNOWN if getattr(self, name) is not UNSET)
-
 
 if TYPE_CHECKING:
 
@@ -87,7 +102,6 @@ else:
         "TrialSettings",
         [
             *((aid.section, aid.section_type | UnsetType, UNSET) for aid in AIDS),
-            *((name, dict[str, Any] | UnsetType, UNSET) for name in _UNKNOWN),
         ],
         bases=(_Settings,),
         frozen=True,
@@ -96,7 +110,7 @@ else:
     )
 
 
-def to_yaml(settings: TrialSettings) -> str:
+def to_yaml(settings: TrialSettings | PlanarSettings) -> str:
     """Return the text of trial.yaml."""
     import yaml
 

@@ -119,6 +119,7 @@ def go_on(
     sensors = {
         name: msgspec.structs.replace(truth, **{f: () for f in _INTERRUPTED if hasattr(truth, f)})
         for name, truth in {"imu": scenario.imu, **scenario.aids}.items()
+        if truth is not None
     }
     if scenario.turntable is not None:
         turned = scenario.turntable.start_deg + sum(t.turn_deg for t in scenario.turntable.turns)

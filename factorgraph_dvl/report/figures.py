@@ -16,12 +16,12 @@ from factorgraph_dvl.report.drawing import save_figures
 from factorgraph_dvl.report.residual_figures import residuals_figure
 from factorgraph_dvl.report.trajectory_figures import motion_figure, track_figure
 from factorgraph_dvl.solution import Residuals, Solution, Trajectory
-from factorgraph_dvl.trial import Trial
+from factorgraph_dvl.trial import PlanarTrial, Trial
 
 _LARGEST_TRAJECTORY = 20_000
 
 
-def write_figures(trial: Trial, solution: Solution, folder: Path) -> list[Path]:
+def write_figures(trial: Trial | PlanarTrial, solution: Solution, folder: Path) -> list[Path]:
     """Draw a solution: track, motion, residuals, calibration, correlation.
 
     Figures for which there is nothing to draw are left out. Long lines are drawn as
@@ -46,7 +46,7 @@ def write_figures(trial: Trial, solution: Solution, folder: Path) -> list[Path]:
         errors = None
 
     figures = {
-        "track": track_figure(trial, thinned.trajectory, errors),
+        "track": track_figure(trial, thinned.trajectory, errors, solution.hypotheses[1:]),
         "motion": motion_figure(solution.trajectory, errors),
     }
     for sensor, group in _by_sensor(solution.residuals).items():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
@@ -11,6 +12,7 @@ from rich.text import Text
 from factorgraph_dvl.analysis.consistency import CalibrationErrors
 from factorgraph_dvl.analysis.convergence import Convergence
 from factorgraph_dvl.analysis.survey import Survey
+from factorgraph_dvl.earth import LocalFrame
 from factorgraph_dvl.report.text import at_precision, fixed, split_unit, with_std
 from factorgraph_dvl.solution import Solution
 
@@ -72,6 +74,36 @@ def _calibration_table(
                 row += ["", ""]
             table.add_row(*row, end_section=component == estimate.component_names[-1])
     return table
+
+
+def hypothesis_table(solution: Solution) -> Table:
+    """Render the trajectories that the data allow, or allowed until they did not."""
+    table = Table(title="Hypotheses")
+    for header in ("no.", "weight", "found at s", "until s", "from the first, m"):
+        add_column(table, header, numeric=True)
+    first = solution.hypotheses[0].trajectory
+    for i, h in enumerate(solution.hypotheses, 1):
+        end = h.trajectory.geodetic[-1]
+        same = int(np.argmin(np.abs(first.time - h.trajectory.time[-1])))
+        apart = np.linalg.norm(LocalFrame(*first.geodetic[same]).position(*end))
+        table.add_row(
+            f"{i}",
+            f"{h.weight:.3f}",
+            f"{h.born:.6g}",
+            Text("alive", "green") if h.died is None else f"{h.died:.6g}",
+            "" if i == 1 else f"{apart:.4g}",
+        )
+    return table
+
+
+def rejected_line(solution: Solution) -> str:
+    """Render how many measurements were rejected, by kind."""
+    used = {r.label: r.time.size for r in solution.residuals}
+    parts = [
+        f"{r.time.size} of {r.time.size + used.get(r.label, 0)} {r.label}"
+        for r in solution.rejected
+    ]
+    return f"Rejected: {', '.join(parts)}; rejected.csv names them"
 
 
 def convergence_table(found: Convergence) -> Table:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -28,15 +30,20 @@ from factorgraph_dvl.report.drawing import (
     new_grid,
     style,
 )
-from factorgraph_dvl.solution import Trajectory
-from factorgraph_dvl.trial import Reference, Trial
+from factorgraph_dvl.solution import Hypothesis, Trajectory
+from factorgraph_dvl.trial import PlanarTrial, Reference, Trial
 
 _CLOSE_UP_S = 10.0
 # At least so many to each side, if the trajectory has few epochs.
 _CLOSE_UP_INTERVALS = 20
 
 
-def track_figure(trial: Trial, trajectory: Trajectory, errors: TrajectoryErrors | None) -> Figure:
+def track_figure(
+    trial: Trial | PlanarTrial,
+    trajectory: Trajectory,
+    errors: TrajectoryErrors | None,
+    others: Sequence[Hypothesis] = (),
+) -> Figure:
     """Draw the track from above, and position errors (or standard deviations) over time."""
     figure = new_figure(11.0, 5.6)
     grid = new_grid(figure, 3, 2, width_ratios=(1.25, 1.0))
@@ -59,6 +66,13 @@ def track_figure(trial: Trial, trajectory: Trajectory, errors: TrajectoryErrors 
                 color=MEDIUM,
                 label="GNSS fixes",
             )
+    for i, other in enumerate(others):
+        other_n = frame.position(*other.trajectory.geodetic.T) * scale
+        label = "other hypotheses" if i == 0 else None
+        ax.plot(other_n[:, 0], other_n[:, 1], color=MEDIUM, lw=1.2, label=label)
+    if trial.beacons is not None:
+        beacons_n = frame.position(*trial.beacons.places.T) * scale
+        ax.plot(beacons_n[:, 0], beacons_n[:, 1], "^", color=DARK, markersize=8, label="beacon")
     ax.plot(track[:, 0] * scale, track[:, 1] * scale, color=ACCENT, lw=1.5, label="estimate")
     if trial.reference is not None:
         truth_n = _reference_track(trial.reference, trajectory, frame) * scale

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from factorgraph_dvl.sensors.beacon import Beacons
 from factorgraph_dvl.sensors.depth import Depth
 from factorgraph_dvl.sensors.dvl import Dvl
 from factorgraph_dvl.sensors.dvl_beams import DvlBeams
@@ -10,4 +11,4 @@ from factorgraph_dvl.sensors.protocol import Aid
 from factorgraph_dvl.sensors.star import Star
 from factorgraph_dvl.sensors.turntable import Turntable
 
-AIDS: tuple[type[Aid], ...] = (Gnss, Dvl, Star, Depth, DvlBeams, Turntable)
+AIDS: tuple[type[Aid], ...] = (Gnss, Dvl, Star, Depth, DvlBeams, Turntable, Beacons)

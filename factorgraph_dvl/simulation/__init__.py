@@ -14,6 +14,7 @@ from typing import cast
 import numpy as np
 
 from factorgraph_dvl.conventions import DEG, Array
+from factorgraph_dvl.errors import ConfigError
 from factorgraph_dvl.sensors.dvl import Dvl
 from factorgraph_dvl.sensors.gnss import Gnss
 from factorgraph_dvl.sensors.protocol import Aid
@@ -22,11 +23,29 @@ from factorgraph_dvl.simulation.depth import simulate_depth
 from factorgraph_dvl.simulation.measurements import displaced, simulate_dvl, simulate_gnss
 from factorgraph_dvl.simulation.measurements import simulate_imu as _simulate_imu
 from factorgraph_dvl.simulation.motion import Motion, plan_motion
+from factorgraph_dvl.simulation.ranging import (
+    simulate_beacons,
+    simulate_heading,
+    simulate_log,
+)
 from factorgraph_dvl.simulation.scenario import Scenario, load_scenario, parse_scenario
 from factorgraph_dvl.simulation.star import simulate_star
-from factorgraph_dvl.trial import InitialAttitude, InitialPosition, Reference, Trial
+from factorgraph_dvl.trial import (
+    InitialAttitude,
+    InitialPosition,
+    PlanarTrial,
+    Reference,
+    Trial,
+)
 
-__all__ = ["Scenario", "load_scenario", "parse_scenario", "plan_motion", "simulate"]
+__all__ = [
+    "Scenario",
+    "load_scenario",
+    "parse_scenario",
+    "plan_motion",
+    "simulate",
+    "simulate_planar",
+]
 
 # By section; the order is that of the random streams, so a new sensor comes last.
 _AIDS: dict[str, Callable[..., tuple[Aid, dict[str, Array]]]] = {
@@ -34,6 +53,7 @@ _AIDS: dict[str, Callable[..., tuple[Aid, dict[str, Array]]]] = {
     "dvl": simulate_dvl,
     "star": simulate_star,
     "depth": simulate_depth,
+    "beacons": simulate_beacons,
     "dvl_beams": simulate_beams,
     "turntable": simulate_turntable,
 }
@@ -51,10 +71,14 @@ def simulate(scenario: Scenario | str | PathLike[str], seed: int = 0) -> Trial:
     Raises
     ------
     ConfigError
-        If the scenario cannot be read or is not valid.
+        If the scenario cannot be read, is not valid, or has no IMU.
     """
     if not isinstance(scenario, Scenario):
         scenario = load_scenario(scenario)
+    if scenario.planar:
+        raise ConfigError(
+            "there is no imu", where=scenario.source, expected="`simulate_planar` for such a one"
+        )
     imu_rng, *aid_rngs = np.random.default_rng(seed).spawn(1 + len(_AIDS))
     motion = plan_motion(scenario)
     imu, truth = _simulate_imu(scenario, motion, imu_rng)
@@ -76,6 +100,43 @@ def simulate(scenario: Scenario | str | PathLike[str], seed: int = 0) -> Trial:
         initial_position=position,
         reference=_reference(motion, scenario.reference_rate_hz),
         calibration_truth=truth,
+    )
+
+
+def simulate_planar(scenario: Scenario | str | PathLike[str], seed: int = 0) -> PlanarTrial:
+    """Simulate a planar trial: heading, log, depth and beacons.
+
+    Parameters
+    ----------
+    scenario : a scenario without an IMU, or the path of its YAML file.
+    seed : of all that is random; each sensor draws from a stream of its own.
+
+    Raises
+    ------
+    ConfigError
+        If the scenario cannot be read, is not valid, or has an IMU.
+    """
+    if not isinstance(scenario, Scenario):
+        scenario = load_scenario(scenario)
+    if not scenario.planar:
+        raise ConfigError("there is an imu", where=scenario.source, expected="a planar scenario")
+    rngs = np.random.default_rng(seed).spawn(4)
+    motion = plan_motion(scenario)
+    heading, bias = simulate_heading(scenario, motion, rngs[0])
+    log, slip = simulate_log(scenario, motion, rngs[1])
+    depth, _ = simulate_depth(scenario, motion, rngs[2])
+    beacons, ranging = simulate_beacons(scenario, motion, rngs[3])
+    start = np.array([max(heading.time[0], log.time[0], depth.time[0])])
+    return PlanarTrial(
+        name=scenario.name,
+        heading=heading,
+        log=log,
+        depth=depth,
+        beacons=beacons,
+        body_axes=scenario.body_axes,
+        initial_position=_initial(scenario, motion, start)[1],
+        reference=_reference(motion, scenario.reference_rate_hz),
+        calibration_truth=bias | slip | ranging,
     )
 
 

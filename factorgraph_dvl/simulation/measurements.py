@@ -40,6 +40,7 @@ def simulate_imu(
     after a gap still averages over its own period only.
     """
     truth = scenario.imu
+    assert truth is not None
     jitter_rng, bias_rng, walk_rng, noise_rng = rng.spawn(4)
     # The interval of the first sample must not begin before the motion does.
     bounds = sample_times(truth, motion.duration, jitter_rng, first=0)

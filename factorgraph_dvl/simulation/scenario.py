@@ -26,8 +26,12 @@ gnss: {...}                        # GnssTruth, optional
 dvl: {...}                         # DvlTruth, optional
 depth: {...}                       # DepthTruth, optional
 star: {...}                        # StarTruth, optional
+beacons: {...}                     # BeaconTruth, optional
 dvl_beams: {...}                   # DvlBeamsTruth, optional
 turntable: {...}                   # TurntableTruth, optional: turns IMU and DVL on the ship
+heading: {...}                     # without imu: HeadingTruth, LogTruth, DepthTruth, and
+log: {...}                         # beacons make a planar trial
+depth: {...}
 trial:                             # what trial.yaml will claim
   imu: {gyro_bias_std_deg_h: 0.05, accel_bias_std_ug: 100}
   gnss: {}
@@ -74,7 +78,12 @@ from factorgraph_dvl.simulation.instruments import (
     TurntableTruth,
 )
 from factorgraph_dvl.simulation.manoeuvres import Manoeuvre, flatten
+from factorgraph_dvl.simulation.ranging_instruments import BeaconTruth, HeadingTruth, LogTruth
 from factorgraph_dvl.yaml_file import read_yaml
+
+# Sections of the simulated sensors: of any trial, and of a planar one alone.
+_PLANAR = ("heading", "log", "depth", "beacons")
+_SECTIONS = tuple(dict.fromkeys(("imu", *(aid.section for aid in AIDS), *_PLANAR)))
 
 Latitude = Annotated[float, msgspec.Meta(ge=-89, le=89)]
 Longitude = Annotated[float, msgspec.Meta(ge=-360, le=360)]
@@ -131,6 +140,9 @@ class Claims(Section, frozen=True, kw_only=True):
     gnss: dict[str, Any] = msgspec.field(default_factory=dict)
     dvl: dict[str, Any] = msgspec.field(default_factory=dict)
     star: dict[str, Any] = msgspec.field(default_factory=dict)
+    beacons: dict[str, Any] = msgspec.field(default_factory=dict)
+    heading: dict[str, Any] = msgspec.field(default_factory=dict)
+    log: dict[str, Any] = msgspec.field(default_factory=dict)
     depth: dict[str, Any] = msgspec.field(default_factory=dict)
     dvl_beams: dict[str, Any] = msgspec.field(default_factory=dict)
     turntable: dict[str, Any] = msgspec.field(default_factory=dict)
@@ -149,10 +161,13 @@ class Scenario(Section, frozen=True, kw_only=True):
     manoeuvres: list[dict[str, Any]]
     sway: SwaySettings = SwaySettings()
     current_m_s: Vector3 = (0.0, 0.0, 0.0)
-    imu: ImuTruth
+    imu: ImuTruth | None = None
     gnss: GnssTruth | None = None
     dvl: DvlTruth | None = None
     star: StarTruth | None = None
+    beacons: BeaconTruth | None = None
+    heading: HeadingTruth | None = None
+    log: LogTruth | None = None
     depth: DepthTruth | None = None
     dvl_beams: DvlBeamsTruth | None = None
     turntable: TurntableTruth | None = None
@@ -174,9 +189,14 @@ class Scenario(Section, frozen=True, kw_only=True):
         return flatten(self.manoeuvres, "manoeuvres", self.source)
 
     @property
+    def planar(self) -> bool:
+        """Whether it makes a planar trial: one without an IMU."""
+        return self.imu is None
+
+    @property
     def aids(self) -> dict[str, Instrument]:
         """The simulated sensors other than the IMU, by section."""
-        given = {aid.section: getattr(self, aid.section) for aid in AIDS}
+        given = {name: getattr(self, name) for name in _SECTIONS if name != "imu"}
         return {name: truth for name, truth in given.items() if truth is not None}
 
     def settings(self, section: str) -> SensorSection:
@@ -240,13 +260,40 @@ def parse_scenario(data: Mapping[str, Any], source: str = "scenario") -> Scenari
 def _checked(scenario: _S) -> _S:
     source = scenario.source
     scenario.plan()
-    for name in ("imu", *scenario.aids):
-        scenario.settings(name)
-    for name in (aid.section for aid in AIDS):
-        if name not in scenario.aids and getattr(scenario.trial, name):
+    _check_sections(scenario)
+    for name in _SECTIONS:
+        if getattr(scenario, name) is not None:
+            scenario.settings(name)
+        elif getattr(scenario.trial, name):
             raise ConfigError(
                 f"the trial claims a {name} that is not simulated",
                 where=f"{source} key trial.{name}",
                 expected=f"a section `{name}` beside it",
             )
     return scenario
+
+
+def _check_sections(scenario: Scenario) -> None:
+    """Raise ConfigError unless the sensors make a trial, with an IMU or planar."""
+    given = {name for name in _SECTIONS if getattr(scenario, name) is not None}
+    known = {aid.section for aid in AIDS}
+    wrong = sorted(given - known - {"imu"} if "imu" in given else given - set(_PLANAR))
+    missing = [] if "imu" in given else [name for name in _PLANAR if name not in given]
+    if wrong and "imu" in given:
+        raise ConfigError(
+            f"`{wrong[0]}` belongs to a planar trial, which has no imu",
+            where=f"{scenario.source} key {wrong[0]}",
+            expected="`imu`, or heading and log",
+        )
+    if missing and not given & {"heading", "log"}:
+        raise ConfigError(
+            "missing key `imu`",
+            where=scenario.source,
+            expected="this key; or, for a planar trial, heading, log, depth and beacons",
+        )
+    if missing or wrong:
+        raise ConfigError(
+            f"missing key `{missing[0]}`" if missing else f"`{wrong[0]}` needs an imu",
+            where=scenario.source,
+            expected="heading, log, depth and beacons for a planar trial, or an imu",
+        )

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from factorgraph_dvl.alignment import initial_states
+from factorgraph_dvl.anchoring import Anchors, anchored
 from factorgraph_dvl.attitude_alignment import attitudes, mean_mounting
 from factorgraph_dvl.chain import Chain, inertial_chain
 from factorgraph_dvl.conventions import Array
@@ -16,10 +18,11 @@ from factorgraph_dvl.errors import ConfigError
 from factorgraph_dvl.graph import Problem
 from factorgraph_dvl.increments import increments
 from factorgraph_dvl.mounting import calibrated, initial_values
+from factorgraph_dvl.planar.evidence import odds_against
 from factorgraph_dvl.preintegration import Segments, States, attach, motion_at, segments
 from factorgraph_dvl.priors import Known
 from factorgraph_dvl.sensors.protocol import Aid, Motion, Observation, Parameter
-from factorgraph_dvl.solution import Solution
+from factorgraph_dvl.solution import Solution, joined
 from factorgraph_dvl.solvers.covariance import Posterior, changes_with, considered, posterior
 from factorgraph_dvl.solvers.feigned import at_prior_along, told_of
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, Progress, minimise
@@ -34,6 +37,8 @@ _SAME_GRAVITY = 2.0
 _ROUGH = 1.0
 _ROUGH_ITERATIONS = 10
 _ROUNDS = 4
+# So long before and after a fix the motion without the DVL is good enough to mount it by, s.
+_HELD_BY_FIXES = 10.0
 
 
 @dataclass(frozen=True)
@@ -52,6 +57,18 @@ class Minimised:
     minimum: Minimum
     covariances: Posterior
     held: Array
+    notes: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class _Prepared:
+    """What every start has in common, and the starts."""
+
+    trial: Trial
+    frame: LocalFrame
+    seg: Segments
+    anchors: Anchors
+    mountings: dict[str, Array]
     notes: tuple[str, ...]
 
 
@@ -86,8 +103,15 @@ def solve(
         If no minimum can be searched for at all.
     """
     _check_above_zero("rate_hz", rate_hz)
-    found = minimised(trial, state_interval_s=state_interval_s, progress=progress)
-    return solution_of(found, rate_hz)
+    report = progress or (lambda stage, iteration, cost: None)
+    prepared = _prepare(trial, state_interval_s, report)
+    found = [
+        _described(*_descended(prepared, states, report), prepared.notes, report)
+        for states in prepared.anchors.states
+    ]
+    solutions = [solution_of(each, rate_hz) for each in found]
+    against = odds_against([_cost_terms(each) for each in found])
+    return joined(solutions, against, prepared.anchors.hypotheses)
 
 
 def solution_of(found: Minimised, rate_hz: float) -> Solution:
@@ -109,9 +133,15 @@ def minimised(
     progress: Progress | None = None,
 ) -> Minimised:
     """Minimise the problem of a trial; arguments and errors as of `solve`."""
-    _check_above_zero("state_interval_s", state_interval_s)
     report = progress or (lambda stage, iteration, cost: None)
     problem, minimum, notes = fit(trial, state_interval_s=state_interval_s, progress=report)
+    return _described(problem, minimum, notes, report)
+
+
+def _described(
+    problem: Problem, minimum: Minimum, notes: tuple[str, ...], report: Progress
+) -> Minimised:
+    """Return a minimum with its covariances, and without what the data cannot tell."""
     report("covariance", 0, None)
     covariances = posterior(problem, minimum)
     told = told_of(problem, minimum, covariances)
@@ -130,6 +160,21 @@ def minimised(
     return Minimised(problem, minimum, covariances, held, notes)
 
 
+def _cost_terms(found: Minimised) -> Array:
+    """Return the terms of the cost: of each measurement, of the rest at once."""
+    evaluation = found.minimum.evaluation
+    parts = []
+    total = 0.0
+    for observation, residual, weight in zip(
+        found.problem.observations, evaluation.residuals, found.problem.weights, strict=True
+    ):
+        own = 0.5 * np.sum(residual**2, axis=1)
+        total += own.sum()
+        gate = getattr(observation, "gate", 0.0)
+        parts.append(np.where(weight[:, 0] > 0.0, own, 0.5 * gate**2))
+    return np.concatenate([*parts, [evaluation.cost - total]])
+
+
 def fit(
     trial: Trial, *, state_interval_s: float, progress: Progress, known: Known | None = None
 ) -> tuple[Problem, Minimum, tuple[str, ...]]:
@@ -145,16 +190,34 @@ def fit(
     -------
     problem, minimum, notes : what was minimised, where it ended, what the user must know.
     """
+    prepared = _prepare(trial, state_interval_s, progress)
+    states = prepared.anchors.states[0]
+    problem, minimum = _descended(prepared, states, progress, known)
+    return problem, minimum, prepared.notes
+
+
+def _prepare(trial: Trial, state_interval_s: float, report: Progress) -> _Prepared:
+    _check_above_zero("state_interval_s", state_interval_s)
     frame = trial.frame()
-    progress("increments", 0, None)
+    report("increments", 0, None)
     inc, gaps = increments(trial.imu)
     seg = segments(inc, state_interval_s, dense_epochs(trial, frame, state_interval_s))
-    progress("alignment", 0, None)
+    report("alignment", 0, None)
     start = initial_states(trial, frame, seg)
-    notes = [*trial.notes, *gaps, *start.notes]
-    notes += [doubt for seen in attitudes(trial, frame) for doubt in seen.doubts]
+    if trial.beacons is not None:
+        report("ranges", 0, None)
+    anchors = anchored(trial, frame, seg, start.states)
+    doubts = [doubt for seen in attitudes(trial, frame) for doubt in seen.doubts]
+    notes = (*trial.notes, *gaps, *start.notes, *doubts, *anchors.notes)
+    return _Prepared(trial, frame, seg, anchors, start.mountings, notes)
 
-    states = start.states
+
+def _descended(
+    prepared: _Prepared, states: States, report: Progress, known: Known | None = None
+) -> tuple[Problem, Minimum]:
+    """Return the minimum that is reached from some states."""
+    trial, frame, seg = prepared.trial, prepared.frame, prepared.seg
+    rejected = prepared.anchors.rejected
     values = None if known is None else known.parameters
     iterations = 0
     p_gravity = np.full_like(states.p_n, np.inf)
@@ -166,21 +229,28 @@ def fit(
             # A DVL that is calibrated does no harm from the start.
             mounted = trial.dvl is not None and calibrated(trial.dvl)
             if trial.gnss is not None and not mounted:
-                coarse = _without_dvl(chain, states, start.mountings, progress)
+                coarse = _without_dvl(chain, states, prepared.mountings, report)
                 iterations += coarse.iterations
                 states = coarse.evaluation.states
-            progress("mounting", 0, None)
-            values = start.mountings | _mountings(trial, frame, seg, chain.gravity_n, states)
+            report("mounting", 0, None)
+            values = prepared.mountings | _mountings(trial, frame, seg, chain.gravity_n, states)
         problem = Problem(chain, *_sensors(trial.aids, frame), start=values, known=known)
+        problem.reject(rejected)
         at = problem.values(states, {**problem.prior_values(), **values})
-        minimum = minimise(problem, at, stage="all sensors", progress=progress)
+        minimum = minimise(problem, at, stage="all sensors", progress=report)
         iterations += minimum.iterations
         states, values = minimum.evaluation.states, minimum.evaluation.parameters
         same_gravity = np.sqrt(np.mean((states.p_n - p_gravity) ** 2)) <= _SAME_GRAVITY
         settled = not (problem.strayed(values) or problem.misweighed(minimum.evaluation))
-        if same_gravity and settled:
+        outliers = problem.outliers(minimum.evaluation)
+        if same_gravity and settled and _same(outliers, rejected):
             break
-    return problem, replace(minimum, iterations=iterations), tuple(notes)
+        rejected = outliers
+    return problem, replace(minimum, iterations=iterations)
+
+
+def _same(a: Mapping[str, Array], b: Mapping[str, Array]) -> bool:
+    return a.keys() == b.keys() and all(np.array_equal(a[k], b[k]) for k in a)
 
 
 def _check_above_zero(name: str, value: float) -> None:
@@ -220,6 +290,17 @@ def _sensors(aids: Sequence[Aid], frame: LocalFrame) -> tuple[list[Observation],
     return observations, parameters
 
 
+def _near_fixes(trial: Trial, time: Array) -> NDArray[np.bool_]:
+    """Whether GNSS holds the inertial motion at times; without any, all are as good."""
+    if trial.gnss is None:
+        return np.ones(time.size, dtype=bool)
+    known = ~np.isnan(trial.gnss.geodetic[:, 0]) | ~np.isnan(trial.gnss.velocity[:, 0])
+    fixes = np.concatenate([[-np.inf], trial.gnss.time[known], [np.inf]])
+    after = np.searchsorted(fixes, time)
+    nearest = np.minimum(time - fixes[after - 1], fixes[after] - time)
+    return np.asarray((nearest < _HELD_BY_FIXES) | (fixes.size == 2))
+
+
 def _mountings(
     trial: Trial, frame: LocalFrame, seg: Segments, gravity_n: np.ndarray, states: States
 ) -> dict[str, np.ndarray]:
@@ -229,7 +310,8 @@ def _mountings(
         index, since, covered = seg.increments.locate(time)
         inside = seg.increments.start[index] + np.clip(since, 0.0, seg.increments.dt[index])
         at = attach(seg, np.where(covered, time, inside), frame.earth_rate)
-        return motion_at(at, states, gravity_n, frame.earth_rate), covered
+        held = covered & _near_fixes(trial, time)
+        return motion_at(at, states, gravity_n, frame.earth_rate), held
 
     out = {}
     for seen in attitudes(trial, frame):

@@ -26,6 +26,7 @@ from factorgraph_dvl.solution import (
     Solution,
     Trajectory,
     doubts,
+    mostly_rejected,
     not_observable,
 )
 from factorgraph_dvl.solvers.covariance import Posterior
@@ -58,6 +59,7 @@ def summarise(
     estimates, covariance = calibration(problem, evaluation, covariances, held)
     trajectory = _trajectory(problem, evaluation.states, covariances.nodes, rate_hz)
     residuals = _residuals(problem, minimum)
+    rejected = _rejected(problem, minimum)
     warnings = [*notes]
     if not minimum.converged:
         warnings.append(
@@ -66,6 +68,7 @@ def summarise(
     for label, count in problem.uncovered.items():
         warnings.append(f"{label}: {count} measurements at times without IMU data were not used")
     warnings += doubts(estimates, residuals)
+    warnings += mostly_rejected(residuals, rejected)
     warnings += _unobservable(problem, estimates, evaluation.motions)
     return Solution(
         trial=trial.name,
@@ -79,6 +82,7 @@ def summarise(
         trajectory=trajectory,
         residuals=residuals,
         warnings=tuple(warnings),
+        rejected=rejected,
     )
 
 
@@ -256,6 +260,18 @@ def _residuals(problem: Problem, minimum: Minimum) -> tuple[Residuals, ...]:
                 sigma=1.0 / measured,
             )
         )
+    return tuple(out)
+
+
+def _rejected(problem: Problem, minimum: Minimum) -> tuple[Residuals, ...]:
+    out = []
+    evaluation = minimum.evaluation
+    for o, motion in zip(problem.observations, evaluation.motions, strict=True):
+        own = np.isin(o.time, problem.rejected.get(o.label, np.empty(0)))
+        if own.any():
+            residual = o.residual(motion, evaluation.parameters)[own]
+            sigma = o.sigma(motion, evaluation.parameters)[own]
+            out.append(Residuals(o.label, o.unit, o.components, o.time[own], residual, sigma))
     return tuple(out)
 
 

@@ -1,0 +1,191 @@
+"""From a planar trial to the problem that the smoother minimises."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from factorgraph_dvl.conventions import Array, rotation_from_rph
+from factorgraph_dvl.earth import LocalFrame
+from factorgraph_dvl.errors import DataError
+from factorgraph_dvl.planar.model import PlanarProblem, Ranging
+from factorgraph_dvl.planar.track import LEAST_PSD, Track, change_psd, reckon
+from factorgraph_dvl.sensors.beacon import Beacons
+from factorgraph_dvl.sensors.protocol import Parameter
+from factorgraph_dvl.trial import InitialPosition, PlanarTrial
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A problem, and what it was made from.
+
+    Parameters
+    ----------
+    problem : PlanarProblem
+    track : the reckoned track.
+    frame : its tangent frame.
+    rows : (m,) rows of the beacons' record that are in the problem.
+    uncovered : measurements at times without heading, speed or depth.
+    """
+
+    problem: PlanarProblem
+    track: Track
+    frame: LocalFrame
+    rows: NDArray[np.intp]
+    uncovered: int
+
+
+def reckoned(trial: PlanarTrial) -> Track:
+    """Return the track of a trial by heading, speed and depth.
+
+    Raises
+    ------
+    DataError
+        If one of them has no values, or they have no time in common.
+    """
+    heading, log, depth = trial.heading, trial.log, trial.depth
+    parts = []
+    for record, values in ((heading, heading.heading), (log, log.speed), (depth, depth.depth)):
+        known = ~np.isnan(values)
+        if not known.any():
+            raise DataError("no values", where=record.source, expected="at least one")
+        parts.append((record.time[known], values[known]))
+    start = max(time[0] for time, _ in parts)
+    end = min(time[-1] for time, _ in parts)
+    if not start < end:
+        raise DataError(
+            "heading, log and depth have no time in common",
+            where=f"{heading.source}, {log.source}, {depth.source}",
+            expected="records of the same time",
+            hint="Check that all clocks start together",
+        )
+    (log_time, speed), known = parts[1], ~np.isnan(log.speed)
+    starboard = np.nan_to_num(log.starboard[known])
+    extra = trial.beacons.time
+    return reckon(
+        (*parts[0], heading.settings.std_rad),
+        (log_time, speed, starboard, log.settings.speed_std_m_s),
+        (parts[2][0], depth.settings.sea_surface_height_m - parts[2][1]),
+        extra[(extra >= start) & (extra <= end)],
+    )
+
+
+def plan(trial: PlanarTrial) -> Plan:
+    """Return the problem of a planar trial.
+
+    Raises
+    ------
+    DataError
+        If there are no ranges at times when heading, speed and depth are known.
+    """
+    track = reckoned(trial)
+    parameters = (
+        *(p for p in trial.log.parameters() if p.stem == "current"),
+        *trial.beacons.parameters(),
+        *(p for p in trial.log.parameters() if p.stem != "current"),
+        *trial.heading.parameters(),
+    )
+    arm = np.array(trial.beacons.settings.lever_arm_m)
+    level = np.zeros((track.time.size, 3))
+    level[:, 2] = track.heading
+    arm_n = rotation_from_rph(level, trial.body_axes) @ arm
+    return problem_of(
+        track, arm_n, trial.beacons, parameters, trial.frame(), trial.initial_position
+    )
+
+
+def problem_of(
+    track: Track,
+    arm_n: Array,
+    beacons: Beacons,
+    parameters: tuple[Parameter, ...],
+    frame: LocalFrame,
+    initial: InitialPosition | None = None,
+) -> Plan:
+    """Return the problem of a reckoned track with beacons.
+
+    Parameters
+    ----------
+    track : on its grid.
+    arm_n : (G, 3) lever arm of the transponder on that grid, in n, m.
+    beacons : their record.
+    parameters : constants with priors.
+    frame : tangent frame.
+    initial : prior of the first position, None if there is none.
+
+    Raises
+    ------
+    DataError
+        If no measurement lies within the track.
+    """
+    grid = track.time
+    present = ~beacons.missing
+    covered = (beacons.time >= grid[0]) & (beacons.time <= grid[-1])
+    rows = np.flatnonzero(present & covered)
+    if not rows.size:
+        raise DataError(
+            "no range at a time when the vehicle's way is known",
+            where=beacons.source,
+            expected="ranges while the other sensors run",
+            hint="Check that all clocks start together",
+        )
+    time = np.union1d(beacons.time[rows], grid[[0, -1]])
+    at = track.at(time)
+    rate = np.gradient(arm_n, grid, axis=0)
+
+    def on_nodes(values: Array) -> Array:
+        return np.stack([np.interp(time, grid, values[:, i]) for i in range(3)], axis=1)
+
+    s = beacons.settings
+    places = np.array([place.geodetic for place in s.positions.values()])
+    # A bound, not knowledge: the vehicle is where it hears the beacons.
+    reach = 2.0 * float(np.nanmax(beacons.range[rows], initial=1e4))
+    mean, cov = np.mean(frame.position(*places.T)[:, :2], axis=0), reach**2 * np.eye(2)
+    if initial is not None:
+        mean = frame.position(*initial.geodetic)[:2]
+        cov = np.diag(np.maximum(initial.std[:2], 1e-3) ** 2)
+    names = list(s.positions)
+    dt = np.diff(time)
+    share = np.minimum(dt, track.interval)
+    psd = change_psd(track).reshape(grid.size, 4)
+    middle = 0.5 * (time[1:] + time[:-1])
+    changing = np.stack([np.interp(middle, grid, column) for column in psd.T], axis=1)
+    # What the noise at the ends of a step already accounts for.
+    counted = share[:, None, None] ** 2 * at.velocity_cov[:-1]
+    problem = PlanarProblem(
+        time=time,
+        step=np.diff(at.displacement, axis=0),
+        step_cov=_positive(np.diff(at.noise, axis=0) - counted, LEAST_PSD * dt),
+        share=share,
+        velocity=at.velocity,
+        velocity_cov=at.velocity_cov,
+        change_cov=changing.reshape(-1, 2, 2) * dt[:, None, None],
+        height=at.height - frame.height,
+        climb=at.climb,
+        arm=on_nodes(arm_n),
+        arm_velocity=on_nodes(rate),
+        place=frame.position(*places.T),
+        ranging=Ranging(
+            node=np.searchsorted(time, beacons.time[rows]),
+            beacon=np.array([names.index(name) for name in beacons.name[rows]]),
+            range=beacons.range[rows],
+            rate=beacons.range_rate[rows],
+            range_std=s.range_std_m,
+            rate_std=s.range_rate_std_m_s,
+        ),
+        parameters=parameters,
+        start_mean=mean,
+        start_cov=cov,
+        start_known=initial is not None,
+        tan_lat=0.0 if track.tangent else float(np.tan(frame.lat)),
+    )
+    return Plan(problem, track, frame, rows, int((present & ~covered).sum()))
+
+
+def _positive(matrices: Array, least: Array) -> Array:
+    """Return symmetric matrices (M, 2, 2) with eigenvalues of at least (M,)."""
+    values, vectors = np.linalg.eigh(matrices)
+    values = np.maximum(values, least[:, None])
+    return (vectors * values[:, None, :]) @ vectors.transpose(0, 2, 1)

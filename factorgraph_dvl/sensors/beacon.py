@@ -1,0 +1,357 @@
+"""Acoustic beacons: settings, record, and the range and range rate to each of them."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass
+from typing import Annotated, Any, ClassVar, Self
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from factorgraph_dvl.conventions import GEODETIC_SI, Array, rotate, skew
+from factorgraph_dvl.earth import LocalFrame
+from factorgraph_dvl.errors import DataError
+from factorgraph_dvl.sensors.protocol import (
+    Linearization,
+    Motion,
+    NonNegative,
+    Observation,
+    Parameter,
+    Positive,
+    Section,
+    SensorSection,
+    Values,
+    Vector3,
+    at_row,
+    check_range,
+    check_times,
+    lever_arm_sigma,
+)
+
+RANGE = "range_m"
+RANGE_RATE = "range_rate_m_s"
+NAME = "beacon"
+
+SOUND_SPEED_ERROR = "sound_speed_error"
+
+# A measurement this many standard deviations off is no measurement but an echo.
+GATE = 3.5
+
+_NAMES = re.compile(r"[A-Za-z0-9_-]+")
+
+
+class BeaconPosition(Section, frozen=True, kw_only=True):
+    """One of `beacons.positions` of trial.yaml."""
+
+    lat_deg: Annotated[float, msgspec.Meta(ge=-90, le=90)]
+    lon_deg: Annotated[float, msgspec.Meta(ge=-360, le=360)]
+    height_m: Annotated[float, msgspec.Meta(ge=-12e3, le=20e3)]
+    std_m: NonNegative = 0.0
+
+    @property
+    def geodetic(self) -> Array:
+        """Latitude, longitude (rad), ellipsoidal height (m), (3,)."""
+        return np.array([self.lat_deg, self.lon_deg, self.height_m]) * GEODETIC_SI
+
+
+class BeaconSettings(SensorSection, frozen=True, kw_only=True):
+    """Section `beacons` of trial.yaml."""
+
+    file: str = "beacon.csv"
+    range_std_m: Positive = 0.5
+    range_rate_std_m_s: Positive = 0.05
+    lever_arm_m: Vector3 = (0.0, 0.0, 0.0)
+    sound_speed_error_std: NonNegative = 0.0
+    positions: dict[str, BeaconPosition]
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not self.positions:
+            raise ValueError("`positions` must hold at least one beacon")
+        for name in self.positions:
+            if not _NAMES.fullmatch(name):
+                raise ValueError(f"`positions`: a name has letters, digits, _ and -, not {name!r}")
+
+
+@dataclass(frozen=True)
+class Beacons:
+    """Settings and record of the ranging to beacons of known place.
+
+    Parameters
+    ----------
+    settings : BeaconSettings
+    time : (M,) s, strictly increasing.
+    name : (M,) text, the beacon of each row.
+    range : (M,) slant range, m; nan where not measured.
+    range_rate : (M,) m/s, positive when the range grows; nan where not measured.
+    source : name of the file, for messages.
+    """
+
+    settings: BeaconSettings
+    time: Array
+    name: NDArray[np.str_]
+    range: Array
+    range_rate: Array
+    source: str = "beacons"
+    label: str = "Beacon"
+
+    section: ClassVar[str] = "beacons"
+    section_type: ClassVar[type[SensorSection]] = BeaconSettings
+    required: ClassVar[tuple[str, ...]] = ("time_s", NAME)
+    optional: ClassVar[tuple[tuple[str, ...], ...]] = ((RANGE,), (RANGE_RATE,))
+
+    def __post_init__(self) -> None:
+        check_times(self.time, self.source)
+        known = list(self.settings.positions)
+        bad = np.flatnonzero(~np.isin(self.name, known))
+        if bad.size:
+            raise DataError(
+                f"the beacon is '{self.name[bad[0]]}'",
+                where=at_row(self.source, bad[0]),
+                expected=f"one of beacons.positions: {', '.join(known)}",
+            )
+        check_range({RANGE: self.range}, 0.0, 1e6, "m", self.source)
+        check_range({RANGE_RATE: self.range_rate}, -100.0, 100.0, "m/s", self.source)
+
+    @classmethod
+    def from_columns(
+        cls, settings: BeaconSettings, columns: Mapping[str, Any], source: str
+    ) -> Self:
+        """Return the record that a table holds."""
+        return cls(
+            settings,
+            columns["time_s"],
+            columns[NAME],
+            columns[RANGE],
+            columns[RANGE_RATE],
+            source,
+        )
+
+    def columns(self) -> dict[str, Any]:
+        """Return the record as a table."""
+        table: dict[str, Any] = {"time_s": self.time, NAME: self.name, RANGE: self.range}
+        if not np.isnan(self.range_rate).all():
+            table[RANGE_RATE] = self.range_rate
+        return table
+
+    @property
+    def places(self) -> Array:
+        """Stated places of the beacons, (B, 3): latitude, longitude (rad), height (m)."""
+        return np.array([place.geodetic for place in self.settings.positions.values()])
+
+    @property
+    def missing(self) -> NDArray[Any]:
+        """Rows with neither range nor range rate, (M,) bool."""
+        return np.asarray(np.isnan(self.range) & np.isnan(self.range_rate))
+
+    def parameters(self) -> tuple[Parameter, ...]:
+        """Return the error of the sound speed, and how far each beacon is off its place."""
+        s = self.settings
+        return (
+            Parameter(
+                SOUND_SPEED_ERROR,
+                "",
+                1.0,
+                np.zeros(1),
+                np.array([s.sound_speed_error_std]),
+                labels=("",),
+            ),
+            *(
+                Parameter(
+                    f"beacon_{name}_offset",
+                    "m",
+                    1.0,
+                    np.zeros(3),
+                    np.full(3, position.std_m),
+                    labels=("e", "n", "u"),
+                )
+                for name, position in s.positions.items()
+            ),
+        )
+
+    def observations(self, frame: LocalFrame) -> tuple[Observation, ...]:
+        """Return ranges and range rates, beacon by beacon."""
+        s = self.settings
+        out: list[Observation] = []
+        for name, position in s.positions.items():
+            place_n = frame.position(*position.geodetic)
+            nRl = frame.level_from_tangent(*position.geodetic[:2]).T
+            for kind, values, std in (
+                (BeaconRange, self.range, s.range_std_m),
+                (BeaconRangeRate, self.range_rate, s.range_rate_std_m_s),
+            ):
+                m = (self.name == name) & ~np.isnan(values)
+                if m.any():
+                    arm = np.array(s.lever_arm_m)
+                    out.append(
+                        kind(self.time[m], values[m], std, place_n, nRl, arm, offset_name(name))
+                    )
+        return tuple(out)
+
+    def explain(self, parameter: str, component: int, motion: Motion | None) -> str:
+        """Say why a component could not be observed, given the motion of the trial."""
+        if motion is None or motion.v_n.shape[0] < 2:
+            return "there are hardly any ranges while the IMU runs"
+        travelled = float(np.linalg.norm(np.ptp(motion.p_n[:, :2], axis=0)))
+        if parameter == SOUND_SPEED_ERROR:
+            return (
+                "an error of the sound speed shows only against a distance that something else "
+                "measures: it takes GNSS, or a long way in several directions by a log without "
+                "scale error"
+            )
+        return (
+            f"the ranges were taken within {travelled:.3g} m: the place of a beacon shows only "
+            "from several sides, and from positions that something else knows"
+        )
+
+
+def offset_name(beacon: str) -> str:
+    """Return the name of the parameter that says how far a beacon is off its stated place."""
+    return f"beacon_{beacon}_offset_m"
+
+
+@dataclass(frozen=True)
+class _ToBeacon:
+    """What range and range rate to one beacon share.
+
+    Parameters
+    ----------
+    time : (M,) s.
+    measured : (M,) m or m/s.
+    std : of each, the same unit.
+    place_n : (3,) stated position of the beacon, m.
+    nRl : (3, 3) east, north, up at the beacon to n.
+    arm_b : (3,) lever arm of the vehicle's transponder, in body, m.
+    offset : name of the parameter of the beacon's own place.
+    """
+
+    time: Array
+    measured: Array
+    std: float
+    place_n: Array
+    nRl: Array
+    arm_b: Array
+    offset: str
+
+    gate: ClassVar[float] = GATE
+
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        """Names of the calibration parameters that the measurement depends on."""
+        return (SOUND_SPEED_ERROR, self.offset)
+
+    def true_time(self, values: Values) -> Array:
+        """Return the times of the measurements."""
+        return self.time
+
+    def _geometry(self, motion: Motion, values: Values) -> tuple[Array, Array]:
+        """Return distance (M,) and unit vector (M, 3) from the beacon to the transponder."""
+        place_n = self.place_n + self.nRl @ values[self.offset]
+        away = motion.p_n + motion.nRb @ self.arm_b - place_n
+        distance = np.maximum(np.linalg.norm(away, axis=1), 1e-3)
+        return distance, away / distance[:, None]
+
+
+@dataclass(frozen=True)
+class BeaconRange(_ToBeacon):
+    """Slant range to a beacon; zero error where
+
+        r = (1 + e) |p_n + nRb l - b_n|
+
+    with the beacon at b_n and 1 + e the ratio of the sound speed that the instrument
+    supposes to the effective one.
+    """
+
+    unit: str = "m"
+    components: tuple[str, ...] = ("range",)
+
+    @property
+    def label(self) -> str:
+        """Name of the measurement, for people."""
+        return f"Beacon {self.offset.removeprefix('beacon_').removesuffix('_offset_m')} range"
+
+    def sigma(self, motion: Motion, values: Values) -> Array:
+        """Return the standard deviations."""
+        return np.full((self.time.size, 1), self.std)
+
+    def residual(self, motion: Motion, values: Values) -> Array:
+        """Return predicted - measured, (M, 1), m."""
+        distance, _ = self._geometry(motion, values)
+        return ((1.0 + values[SOUND_SPEED_ERROR]) * distance - self.measured)[:, None]
+
+    def linearize(self, motion: Motion, values: Values, wanted: Collection[str]) -> Linearization:
+        """Return the residual and its Jacobians."""
+        distance, direction = self._geometry(motion, values)
+        scale = 1.0 + values[SOUND_SPEED_ERROR]
+        d_p = scale * direction[:, None, :]
+        derivatives: dict[str, Callable[[], Array]] = {
+            SOUND_SPEED_ERROR: lambda: distance[:, None, None],
+            self.offset: lambda: -d_p @ self.nRl,
+        }
+        return Linearization(
+            residual=(scale * distance - self.measured)[:, None],
+            d_theta=-d_p @ motion.nRb @ skew(self.arm_b),
+            d_p=d_p,
+            d_parameters={name: make() for name, make in derivatives.items() if name in wanted},
+        )
+
+
+@dataclass(frozen=True)
+class BeaconRangeRate(_ToBeacon):
+    """Range rate to a beacon, positive when the range grows; zero error where
+
+        dr/dt = (1 + e) uᵀ (v_n + nRb (omega_eb_b x l))
+
+    with the unit vector u from the beacon to the transponder. A Doppler shift, and the
+    difference of two ranges, both scale with the supposed sound speed as the range does:
+    so e is the same.
+    """
+
+    unit: str = "m/s"
+    components: tuple[str, ...] = ("range rate",)
+
+    @property
+    def label(self) -> str:
+        """Name of the measurement, for people."""
+        return f"Beacon {self.offset.removeprefix('beacon_').removesuffix('_offset_m')} range rate"
+
+    def sigma(self, motion: Motion, values: Values) -> Array:
+        """Return the standard deviations, the gyro's share through the lever arm included."""
+        return np.hypot(self.std, lever_arm_sigma(motion, self.arm_b))[:, None]
+
+    def residual(self, motion: Motion, values: Values) -> Array:
+        """Return predicted - measured, (M, 1), m/s."""
+        _, direction = self._geometry(motion, values)
+        speed = np.sum(direction * self._velocity(motion), axis=1)
+        return ((1.0 + values[SOUND_SPEED_ERROR]) * speed - self.measured)[:, None]
+
+    def linearize(self, motion: Motion, values: Values, wanted: Collection[str]) -> Linearization:
+        """Return the residual and its Jacobians."""
+        distance, direction = self._geometry(motion, values)
+        velocity_n = self._velocity(motion)
+        speed = np.sum(direction * velocity_n, axis=1)
+        scale = 1.0 + values[SOUND_SPEED_ERROR]
+        across = velocity_n - speed[:, None] * direction
+        d_p = (scale * across / distance[:, None])[:, None, :]
+        d_v = scale * direction[:, None, :]
+        d_arm = d_v @ motion.nRb
+        turning_b = np.cross(motion.omega_eb_b, self.arm_b)
+        derivatives: dict[str, Callable[[], Array]] = {
+            SOUND_SPEED_ERROR: lambda: speed[:, None, None],
+            self.offset: lambda: -d_p @ self.nRl,
+        }
+        return Linearization(
+            residual=(scale * speed - self.measured)[:, None],
+            d_theta=-d_p @ motion.nRb @ skew(self.arm_b) - d_arm @ skew(turning_b),
+            d_p=d_p,
+            d_v=d_v,
+            d_omega=-d_arm @ skew(self.arm_b),
+            d_parameters={name: make() for name, make in derivatives.items() if name in wanted},
+        )
+
+    def _velocity(self, motion: Motion) -> Array:
+        """Return the velocity of the transponder in n, (M, 3), m/s."""
+        return motion.v_n + rotate(motion.nRb, np.cross(motion.omega_eb_b, self.arm_b))

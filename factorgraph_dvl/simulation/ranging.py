@@ -1,0 +1,116 @@
+"""The simulated sensors of single-beacon navigation: beacons, heading and log."""
+
+from __future__ import annotations
+
+from typing import cast
+
+import numpy as np
+import pymap3d
+
+from factorgraph_dvl.conventions import DEG, Array, rotation_from_rph
+from factorgraph_dvl.sensors.beacon import Beacons, BeaconSettings
+from factorgraph_dvl.sensors.log import Heading, HeadingSettings, LogSettings, SpeedLog
+from factorgraph_dvl.simulation.measurements import displaced, sample_times, within
+from factorgraph_dvl.simulation.motion import Motion
+from factorgraph_dvl.simulation.scenario import Scenario
+
+
+def simulate_beacons(
+    scenario: Scenario, motion: Motion, rng: np.random.Generator
+) -> tuple[Beacons, dict[str, Array]]:
+    """Return ranges and range rates to the beacons, asked in turn, and their truth.
+
+    Distances are straight lines in Earth-centred coordinates, times 1 + e.
+    """
+    truth = scenario.beacons
+    assert truth is not None
+    jitter_rng, place_rng, noise_rng, fault_rng = rng.spawn(4)
+    time = sample_times(truth, motion.duration, jitter_rng)
+    names = list(truth.positions)
+    asked = np.arange(time.size) % len(names)
+    drawn = place_rng.standard_normal((len(names) + 1, 3))
+    stated = np.array([place.geodetic for place in truth.positions.values()])
+    offset = drawn[1:] * np.array([[place.std_m] for place in truth.positions.values()])
+    place = displaced(stated, offset)
+    error = truth.sound_speed_error
+    scale = 1.0 + (drawn[0, 0] * truth.sound_speed_error_std if error == "draw" else error)
+
+    state = motion.at(time)
+    nRb = rotation_from_rph(state.rph, scenario.body_axes)
+    arm = np.array(truth.lever_arm_m)
+    transponder = displaced(state.geodetic, nRb @ arm)
+    velocity = state.v_n + np.einsum("mij,mj->mi", nRb, np.cross(state.omega_eb_b, arm))
+    here = np.stack(pymap3d.geodetic2ecef(*transponder.T, deg=False), axis=1)
+    there = np.stack(pymap3d.geodetic2ecef(*place[asked].T, deg=False), axis=1)
+    away = here - there
+    distance = np.linalg.norm(away, axis=1)
+    lat, lon = state.geodetic[:, :2].T
+    direction = np.stack(pymap3d.ecef2enuv(*away.T, lat, lon, deg=False), axis=1)
+    ranges = scale * distance
+    rates = scale * np.sum(direction * velocity, axis=1) / distance
+    draws = noise_rng.standard_normal((time.size, 2))
+    lost, longer, length = fault_rng.uniform(size=(3, time.size))
+    if scenario.noise:
+        ranges = ranges + draws[:, 0] * truth.range_std_m
+        rates = rates + draws[:, 1] * (truth.range_rate_std_m_s or 0.0)
+        low, high = truth.multipath_m
+        ranges = ranges + (longer < truth.multipath) * (low + (high - low) * length)
+        ranges[lost < truth.missed] = np.nan
+    if truth.range_rate_std_m_s is None:
+        rates = np.full_like(rates, np.nan)
+    keep = ~within(time, truth.outages_s)
+    calibration = {"sound_speed_error": np.array([scale - 1.0])}
+    calibration |= {f"beacon_{n}_offset_m": offset[i] for i, n in enumerate(names)}
+    record = Beacons(
+        settings=cast("BeaconSettings", scenario.settings("beacons")),
+        time=time[keep],
+        name=np.array(names)[asked[keep]],
+        range=ranges[keep],
+        range_rate=rates[keep],
+    )
+    return record, calibration
+
+
+def simulate_heading(
+    scenario: Scenario, motion: Motion, rng: np.random.Generator
+) -> tuple[Heading, dict[str, Array]]:
+    """Return the compass's record and its bias."""
+    truth = scenario.heading
+    assert truth is not None
+    jitter_rng, noise_rng = rng.spawn(2)
+    time = sample_times(truth, motion.duration, jitter_rng, first=0)
+    drawn, *white = noise_rng.standard_normal(1 + time.size)
+    bias = drawn * truth.bias_std_deg if truth.bias_deg == "draw" else truth.bias_deg
+    heading = motion.at(time).rph[:, 2] + bias * DEG
+    if scenario.noise:
+        heading = heading + np.array(white) * truth.std_deg * DEG
+    settings = cast("HeadingSettings", scenario.settings("heading"))
+    record = Heading(settings, time, heading % (2.0 * np.pi))
+    return record, {"heading_bias_deg": np.array([bias])}
+
+
+def simulate_log(
+    scenario: Scenario, motion: Motion, rng: np.random.Generator
+) -> tuple[SpeedLog, dict[str, Array]]:
+    """Return the log's record, its scale error, and the current that it does not see."""
+    truth = scenario.log
+    assert truth is not None
+    jitter_rng, noise_rng = rng.spawn(2)
+    time = sample_times(truth, motion.duration, jitter_rng, first=0)
+    drawn = noise_rng.standard_normal()
+    white = noise_rng.standard_normal((2, time.size))
+    scale = drawn * truth.scale_error_std if truth.scale_error == "draw" else truth.scale_error
+    state = motion.at(time)
+    over_ground = truth.reference == "bottom"
+    current = np.zeros(3) if over_ground else np.array(scenario.current_m_s)
+    east, north, _ = (state.v_n - current).T
+    sine, cosine = np.sin(state.rph[:, 2]), np.cos(state.rph[:, 2])
+    speed = (1.0 + scale) * np.stack([east * sine + north * cosine, east * cosine - north * sine])
+    if scenario.noise:
+        speed = speed + white * truth.speed_std_m_s
+    starboard = speed[1] if over_ground else np.full(time.size, np.nan)
+    settings = cast("LogSettings", scenario.settings("log"))
+    calibration = {"log_scale_error": np.array([scale])}
+    if not over_ground:
+        calibration["current_m_s"] = np.array(scenario.current_m_s[:2])
+    return SpeedLog(settings, time, speed[0], starboard), calibration
