@@ -17,9 +17,11 @@ from factorgraph_dvl.earth import LocalFrame
 from factorgraph_dvl.errors import ConfigError
 from factorgraph_dvl.increments import increments
 from factorgraph_dvl.preintegration import States, attach, one_segment, segments
+from factorgraph_dvl.replay.estimate import Innovations
 from factorgraph_dvl.replay.factor import NodeMeasurements, Rows, measurement_factor
 from factorgraph_dvl.replay.gate import Gate
 from factorgraph_dvl.replay.samples import Samples
+from factorgraph_dvl.replay.silence import Silence
 from factorgraph_dvl.replay.smoother import Smoother
 from factorgraph_dvl.sensors.dvl import Dvl, DvlSettings, DvlVelocity
 from factorgraph_dvl.sensors.protocol import joined, rows_of
@@ -336,6 +338,29 @@ def test_the_gate_doubts_innovations_that_are_too_large():
     assert used.all()
     assert "too small" in message
     assert gate.doubted == {"DVL"}
+
+
+def test_the_gate_leaves_out_echoes_one_by_one():
+    gate = Gate()
+    rng = np.random.default_rng(0)
+    normalised = rng.normal(size=(200, 1))
+    normalised[::10] = 40.0
+    for row in normalised:
+        used, message = gate.passes("range", row[None])
+        assert used.all() == (row[0] < 6.0)
+        assert not message
+    assert not gate.doubted
+
+
+def test_a_missed_ping_is_no_silence():
+    silence = Silence()
+    heard = Innovations("range", "m", ("range",), *(np.zeros((1, 1)),) * 3, np.ones(1, dtype=bool))
+    said = []
+    for now in range(61):
+        arrived = now % 5 == 0 and now not in (20, 25)
+        each = [replace(heard, time=np.array([float(now)]))] if arrived and now < 40 else []
+        said += silence.listen(float(now), each)
+    assert said == ["range: nothing since 35.0 s; the estimate goes on without"]
 
 
 def test_convergence_is_the_last_time_that_a_limit_is_crossed():

@@ -127,3 +127,29 @@ def test_sensors_that_were_never_announced_are_refused_by_name():
     session = Replay(replace(trial, others=()))
     with pytest.raises(Exception, match="star"):
         session.add(rows_of(trial.others[0], [0]))
+
+
+def test_a_beacon_bounds_a_dive_and_its_echoes_are_left_out():
+    scene = config(
+        "dive-one-beacon",
+        manoeuvres=[*TURNS, {"straight_s": 20}, *TURNS[2:]],
+        gnss={"outages_s": [[50, 1e4]]},
+        beacons={"rate_hz": 0.5, "missed": 0.2, "multipath": 0.15, "outages_s": [[0, 45]]},
+        reference_rate_hz=50,
+    )
+    trial = simulate(scene, 2)
+    session = Replay(trial, rate_hz=1.0)
+    for aid in trial.aids:
+        session.add(aid)
+    updates = session.add_imu(trial.imu.time, trial.imu.gyro, trial.imu.accel) + session.finish()
+    said = [text for u in updates for text in u.messages if "Beacon" in text]
+    # Neither a missed ping nor an echo is worth a word; the count at the end is.
+    assert not said
+    assert any("Beacon B1 range" in text for text in session.counts())
+    batch = solve(trial)
+    end = updates[-1].state
+    apart = trial.frame().position(*end.geodetic.T) - trial.frame().position(
+        *batch.trajectory.geodetic[-1:].T
+    )
+    assert end.time[0] - batch.trajectory.time[-1] < 0.1
+    assert np.abs(apart / end.position_std).max() < 0.5

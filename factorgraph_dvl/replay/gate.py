@@ -50,7 +50,7 @@ class Gate:
         """
         last = self._last.setdefault(label, deque(maxlen=_LAST))
         beyond = np.any(np.abs(normalised) >= _BEYOND, axis=1)
-        squares = np.nanmean(np.minimum(normalised**2, 100.0 * _BEYOND**2), axis=1)
+        squares = np.nanmean(normalised**2, axis=1)
         last.extend(zip(beyond.tolist(), squares.tolist(), strict=True))
         message = self._judge(label, last)
         used = np.zeros_like(beyond) if label in self.shut else ~beyond
@@ -60,7 +60,9 @@ class Gate:
     def _judge(self, label: str, last: deque[tuple[bool, float]]) -> str:
         count = sum(beyond for beyond, _ in last)
         share = count / len(last)
-        rms = float(np.sqrt(np.mean([square for _, square in last])))
+        # Single ones that are beyond are left out one by one.
+        within = [square for beyond, square in last if not beyond]
+        rms = float(np.sqrt(np.mean(within))) if within else np.inf
         full = len(last) == _LAST
         if label in self.doubted:
             if full and share <= _GOOD and rms < _BELIEVE:
