@@ -127,3 +127,15 @@ def test_sensors_that_were_never_announced_are_refused_by_name():
     session = Replay(replace(trial, others=()))
     with pytest.raises(Exception, match="star"):
         session.add(rows_of(trial.others[0], [0]))
+
+
+@pytest.mark.parametrize("rows", ["none", "empty"])
+def test_a_sensor_that_is_first_heard_after_the_start(rows):
+    scene = config("seed-a-phase-90", manoeuvres=[*TURNS, *TURNS[1:]], reference_rate_hz=50)
+    trial = simulate(scene, 5)
+    dvl, heard = trial.dvl, trial.dvl.time > 40.0
+    if rows == "none":
+        dvl = rows_of(dvl, heard)
+    else:
+        dvl = replace(dvl, velocity=np.where(heard[:, None], dvl.velocity, np.nan))
+    as_the_batch(replace(trial, dvl=dvl))
