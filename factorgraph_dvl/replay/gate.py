@@ -60,7 +60,10 @@ class Gate:
     def _judge(self, label: str, last: deque[tuple[bool, float]]) -> str:
         count = sum(beyond for beyond, _ in last)
         share = count / len(last)
-        rms = float(np.sqrt(np.mean([square for _, square in last])))
+        # A few outliers, which are not used, raise no doubt of the others.
+        every = share > _GOOD or label in self.doubted
+        counted = [square for beyond, square in last if every or not beyond]
+        rms = float(np.sqrt(np.mean(counted))) if counted else 0.0
         full = len(last) == _LAST
         if label in self.doubted:
             if full and share <= _GOOD and rms < _BELIEVE:
@@ -80,9 +83,14 @@ class Gate:
         ):
             self.doubted.add(label)
             self.shut.add(label)
+            what = f"the last {_LAST} differ from the prediction by {rms:.1f} times what is stated"
+            if share > _BAD:
+                what = (
+                    f"{count} of the last {len(last)} contradict the prediction by more than "
+                    f"{_BEYOND:g} standard deviations"
+                )
             return (
-                f"{label}: {count} of the last {len(last)} contradict the prediction by more "
-                f"than {_BEYOND:g} standard deviations; not used until they agree. A clock that "
-                "has jumped, or a sensor that fails, looks like this"
+                f"{label}: {what}; not used until they agree. A clock that has jumped, or a "
+                "sensor that fails, looks like this"
             )
         return ""

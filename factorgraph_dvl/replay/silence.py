@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
+
 from factorgraph_dvl.replay.estimate import Innovations
 
 # Silence that is worth a message, s.
@@ -14,7 +16,8 @@ class Silence:
     """When each kind of measurement was heard last."""
 
     def __init__(self) -> None:
-        self._heard: dict[str, float] = {}
+        # When it arrived, and the latest time that it was of.
+        self._heard: dict[str, tuple[float, float]] = {}
         self._silent: set[str] = set()
 
     def forget(self) -> None:
@@ -26,15 +29,13 @@ class Silence:
         """Return which kinds have fallen silent by a time, s, and which are back."""
         messages = []
         for i in heard:
-            before = self._heard.get(i.label, now)
-            self._heard[i.label] = max(float(i.time[-1]), before)
+            arrived, of = self._heard.get(i.label, (now, -np.inf))
+            self._heard[i.label] = (now, max(float(i.time.max()), of))
             if i.label in self._silent:
                 self._silent.discard(i.label)
-                messages.append(f"{i.label}: back after {i.time[-1] - before:.1f} s")
-        for label, last in self._heard.items():
-            if now - last > _SILENT and label not in self._silent:
+                messages.append(f"{i.label}: back after {now - arrived:.1f} s")
+        for label, (arrived, of) in self._heard.items():
+            if now - arrived > _SILENT and label not in self._silent:
                 self._silent.add(label)
-                messages.append(
-                    f"{label}: nothing since {last:.1f} s; the estimate goes on without"
-                )
+                messages.append(f"{label}: nothing since {of:.1f} s; the estimate goes on without")
         return messages
