@@ -6,14 +6,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from rich.console import Console
 from truth import scenario
 
 from factorgraph_dvl import load_solution, save_trial, solve
 from factorgraph_dvl.analysis.consistency import calibration_errors, motion_errors
 from factorgraph_dvl.cli import main
-from factorgraph_dvl.errors import ConfigError, SolveError
+from factorgraph_dvl.errors import ConfigError, DataError, SolveError
 from factorgraph_dvl.io.tables import read_table
 from factorgraph_dvl.replay import Replay, replay
+from factorgraph_dvl.report.live import live_view
 from factorgraph_dvl.sensors.protocol import rows_of
 from factorgraph_dvl.simulation import simulate
 
@@ -100,6 +102,19 @@ def test_smoothed_states_are_better_than_filtered_ones(trial, run):
     assert np.mean(smoothed.velocity.error**2) < worse
 
 
+def test_what_comes_twice_counts_once(trial):
+    once, twice = Replay(trial, rate_hz=1.0), Replay(trial, rate_hz=1.0)
+    a = feed(once, trial, 0.0, 40.0)
+    feed(twice, trial, 0.0, 36.0)
+    for section in ("gnss", "dvl"):
+        aid = getattr(trial, section)
+        twice.add(rows_of(aid, (aid.time >= 30.0) & (aid.time < 36.0)))
+    b = feed(twice, trial, 36.0, 40.0)
+    ours, theirs = a[-1].calibration.covariance, b[-1].calibration.covariance
+    np.testing.assert_allclose(ours, theirs, rtol=1e-9)
+    assert any("came twice" in line for line in twice.counts())
+
+
 def test_nothing_is_known_before_it_was_measured(trial):
     whole = Replay(trial, rate_hz=1.0)
     a = feed(whole, trial, 0.0, 120.0)
@@ -150,9 +165,10 @@ def test_late_measurements_correct_and_later_ones_are_counted(trial):
     difference = values(a[-1].calibration) - values(b[-1].calibration)
     assert np.abs(difference / ours).max() < 0.05
     assert late.counts() == []
-    late.add(rows_of(trial.dvl, slice(0, 3)))
+    other = replace(trial.dvl, velocity=trial.dvl.velocity + 1e-9)
+    late.add(rows_of(other, slice(0, 3)))
     feed(late, trial, 80.0, 82.0)
-    assert any("DVL: 3 measurements came after" in line for line in late.counts())
+    assert any("DVL: 3 measurements came too late" in line for line in late.counts())
 
 
 def lost(trial, **changes):
@@ -189,6 +205,18 @@ def test_a_gap_of_the_imu_is_survived(trial):
     assert np.all(record.std[after] < 1.2 * record.std[before])
 
 
+def test_a_sensor_may_stay_silent_after_a_gap_of_the_imu(trial):
+    imu, dvl = trial.imu, trial.dvl
+    keep = (imu.time < 70.0) | (imu.time > 100.0)
+    short = replace(
+        trial, imu=replace(imu, time=imu.time[keep], gyro=imu.gyro[keep], accel=imu.accel[keep])
+    )
+    solution, record = replay(replace(short, dvl=without(dvl, 68.0, 112.0)), rate_hz=1.0)
+    within(solution, trial)
+    # What was known of its calibration stays known.
+    assert np.all(np.isfinite(record.std))
+
+
 def test_a_clock_that_jumps_is_not_believed(trial):
     time = np.where(trial.dvl.time > 60.0, trial.dvl.time + 1.37, trial.dvl.time)
     solution, record = replay(replace(trial, dvl=replace(trial.dvl, time=time)), rate_hz=1.0)
@@ -198,6 +226,24 @@ def test_a_clock_that_jumps_is_not_believed(trial):
     assert good.sum() > 20
     errors = calibration_errors(solution, trial.calibration_truth)
     assert np.nanmax(np.abs(errors.normalised)) < 5.0
+
+
+def test_a_clock_of_a_sensor_that_jumps_back_is_not_believed(trial):
+    session = Replay(trial, rate_hz=1.0)
+    feed(session, trial, 0.0, 36.0)
+    updates = []
+    for a in np.arange(36.0, 80.0):
+        for section, late in (("gnss", 0.0), ("dvl", 2.0)):
+            aid = getattr(trial, section)
+            now = rows_of(aid, (aid.time >= a) & (aid.time < a + 1.0))
+            session.add(replace(now, time=now.time - late))
+        updates += feed(session, trial, a, a + 1.0, sections=())
+    assert updates[-1].doubted == ("DVL velocity",)
+    truth = trial.calibration_truth
+    for e in updates[-1].calibration.estimates:
+        if e.name in ("misalignment_deg", "scale_error", "lever_arm_m"):
+            # Nor is it when all is solved again.
+            assert np.all(np.abs(e.value - truth[e.name]) < 4.0 * e.std)
 
 
 def test_a_clock_of_the_imu_that_jumps_ahead_is_no_gap(trial, run):
@@ -261,6 +307,8 @@ def test_what_never_starts_says_why():
     trial = simulate(scenario(noise=True, manoeuvres=[{"straight_s": 3}]), 0)
     with pytest.raises(SolveError, match="never sufficed"):
         replay(replace(trial, imu=rows_of(trial.imu, slice(0, 60))))
+    with pytest.raises(DataError, match="no position"):
+        replay(replace(trial, gnss=None))
     with pytest.raises(ConfigError, match="lag_s"):
         Replay(trial, lag_s=0.0)
     with pytest.raises(ConfigError, match="smoother"):
@@ -290,7 +338,33 @@ def test_the_command_writes_what_was_known_when(trial, tmp_path, capsys):
     assert there.sum() > 80
     assert read_table(out / "latency.csv", ["time_s", "latency_ms", "batch"])["batch"].sum() >= 1
     assert (out / "figures" / "convergence.png").stat().st_size > 10_000
+    assert (out / "instrument.yaml").is_file()
     assert (out / "convergence.csv").read_text().splitlines()[-1].startswith("all,")
     with pytest.raises(SystemExit) as end:
         main([*command, "--force", "--good-std", "lever_arm_m"])
     assert end.value.code == 2
+    with pytest.raises(SystemExit) as end:
+        main([*command, "--force", "--good-std", "current_m_s=1"])
+    assert end.value.code == 2
+    assert "'current_m_s'" in capsys.readouterr().err
+
+
+def test_what_matters_is_in_view_on_a_low_terminal(trial, run):
+    solution, _ = run
+    console = Console(width=80, height=24)
+    view = live_view(
+        "trial",
+        200.0,
+        solution.estimates,
+        rows_of(solution.trajectory, [0]),
+        latency=0.004,
+        speed=20.0,
+        doubted=("GNSS position",),
+        lacking=("misalignment_y_deg",),
+    )
+    lines = [s for line in console.render_lines(view) if (s := "".join(x.text for x in line))]
+    text = "\n".join(lines[: console.height - 1])
+    for expected in ("not good enough yet: misalignment_y", "in doubt: GNSS position"):
+        assert expected in text
+    for expected in ("position", "latency 4.0 ms, 20.0 times", "lever_arm_z"):
+        assert expected in text

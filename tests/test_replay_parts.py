@@ -11,7 +11,7 @@ from jacobians import differentiate
 from truth import exact_states, scenario
 
 from factorgraph_dvl import keys
-from factorgraph_dvl.analysis.convergence import convergence
+from factorgraph_dvl.analysis.convergence import check_limits, convergence, lacking
 from factorgraph_dvl.conventions import exp_so3
 from factorgraph_dvl.earth import LocalFrame
 from factorgraph_dvl.errors import ConfigError
@@ -23,6 +23,7 @@ from factorgraph_dvl.replay.gate import Gate
 from factorgraph_dvl.replay.samples import Samples
 from factorgraph_dvl.replay.silence import Silence
 from factorgraph_dvl.replay.smoother import Smoother
+from factorgraph_dvl.report.convergence_figures import convergence_figure
 from factorgraph_dvl.sensors.dvl import Dvl, DvlSettings, DvlVelocity
 from factorgraph_dvl.sensors.protocol import joined, rows_of
 from factorgraph_dvl.simulation import simulate
@@ -331,6 +332,36 @@ def test_the_gate_shuts_and_opens():
     assert not gate.doubted
 
 
+def test_an_outlier_is_left_out_and_nothing_else():
+    gate = Gate()
+    rng = np.random.default_rng(0)
+    gate.passes("GNSS", rng.normal(size=(50, 3)))
+    used, message = gate.passes("GNSS", np.array([[200.0, 0, 0]]))
+    assert not used.any()
+    assert not message
+    used, _ = gate.passes("GNSS", rng.normal(size=(5, 3)))
+    assert used.all()
+    assert not gate.doubted
+
+
+def test_a_kind_that_differs_throughout_is_shut_though_none_is_beyond():
+    gate = Gate()
+    _, message = gate.passes("GNSS", np.full((50, 3), 4.0))
+    assert gate.shut == {"GNSS"}
+    assert "the last 50 differ from the prediction by 4.0 times" in message
+
+
+def test_silence_is_that_of_arrivals():
+    def heard(time):
+        return [Innovations("GNSS", "m", ("e",), np.array([time]), *3 * (np.ones((1, 1)),))]
+
+    silence = Silence()
+    # As late as this receiver is: it is not silent.
+    assert not [m for t in range(20) for m in silence.listen(t + 8.0, heard(float(t)))]
+    assert silence.listen(34.0, []) == ["GNSS: nothing since 19.0 s; the estimate goes on without"]
+    assert silence.listen(35.0, heard(20.0)) == ["GNSS: back after 8.0 s"]
+
+
 def test_the_gate_doubts_innovations_that_are_too_large():
     gate = Gate()
     rng = np.random.default_rng(0)
@@ -382,8 +413,10 @@ def test_convergence_is_the_last_time_that_a_limit_is_crossed():
     never = convergence(time, values, std + 1.0, doubted, [one], {}, limits, limits)
     assert np.isnan(never.good_since)
     assert np.isnan(never.components[0].error_since)
-    with pytest.raises(ConfigError, match="speed"):
-        convergence(time, values, std, doubted, [one], {}, {"speed": 1.0}, {})
+    assert lacking([one], {"scale_error": 1e-5}) == ("scale_error",)
+    assert lacking([one], limits) == ()
+    with pytest.raises(ConfigError, match=r"'speed'.*misalignment_deg, scale_error, lever_arm_m"):
+        check_limits(simulate(scenario()), ["scale_error", "speed"])
 
 
 def test_rows_of_a_record_are_joined_in_the_order_of_time():
@@ -393,3 +426,18 @@ def test_rows_of_a_record_are_joined_in_the_order_of_time():
     np.testing.assert_array_equal(out.time, dvl.time[[0, 1, 2, 4]])
     np.testing.assert_array_equal(out.velocity, dvl.velocity[[0, 1, 2, 4]])
     assert isinstance(out.observations(LocalFrame(0.0, 0.0, 0.0))[0], DvlVelocity)
+
+
+def test_the_figure_has_every_beam_also_one_that_came_late():
+    n = 8
+    beams = Estimate(
+        "beam_scale_error",
+        tuple(f"beam_scale_error_{i + 1}" for i in range(n)),
+        *(np.full(n, x) for x in (0.001, 1e-4, 0.0, 0.1)),
+        np.full(n, True),
+    )
+    time = np.arange(20.0)
+    values = np.where(time[:, None] < 10.0, np.nan, np.full((20, n), 0.001))
+    figure = convergence_figure(time, values, 0.1 * values, [beams], {}, np.nan)
+    assert [ax.get_title(loc="left") for ax in figure.axes] == list(beams.component_names)
+    assert all(ax.get_ylim()[1] < 0.002 for ax in figure.axes)

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from copy import copy
 from dataclasses import fields, replace
 from typing import Any
 
 import numpy as np
 
 from factorgraph_dvl.conventions import Array
+from factorgraph_dvl.earth import LocalFrame
 from factorgraph_dvl.sensors.imu import Imu
 from factorgraph_dvl.sensors.protocol import Aid, joined, rows_of
 from factorgraph_dvl.trial import Trial
@@ -21,14 +24,23 @@ class Collected:
     known : trial with all but the records.
     longest : s of data that are kept.
     before : s for which rows are kept that were true before the first sample.
+    heard : sections of the sensors that were heard before, and whose calibration is known.
     """
 
-    def __init__(self, known: Trial, longest: float, before: float = 1.0) -> None:
+    def __init__(
+        self,
+        known: Trial,
+        longest: float,
+        before: float = 1.0,
+        heard: Sequence[str] = (),
+    ) -> None:
         self._known = known
         self._longest = longest
         self._before = before
+        self._heard = heard
         self._samples: list[Array] = []
         self._aids: dict[str, list[Aid]] = {}
+        self._refused: dict[str, list[Array]] = {}
 
     @property
     def start(self) -> float:
@@ -50,6 +62,28 @@ class Collected:
     def add_aid(self, record: Aid) -> None:
         """Add rows of a sensor."""
         self._aids.setdefault(record.section, []).append(record)
+
+    def refuse(self, label: str, time: Array) -> None:
+        """Note times, s, of measurements of a kind that are not believed."""
+        if time.size:
+            self._refused.setdefault(label, []).append(time)
+
+    def without_refused(self, frame: LocalFrame) -> Collected | None:
+        """Return the same without the rows that were refused, None if there are none."""
+        if not self._refused:
+            return None
+        out = copy(self)
+        out._refused = {}
+        out._aids = {}
+        for section, records in self._aids.items():
+            record = joined(records)
+            kinds = {o.label for o in record.observations(frame)} & self._refused.keys()
+            times = [time for kind in kinds for time in self._refused[kind]]
+            if times:
+                record = rows_of(record, ~np.isin(record.time, np.concatenate(times)))
+            if record.time.size:
+                out._aids[section] = [record]
+        return out
 
     @property
     def complete(self) -> bool:
@@ -100,6 +134,11 @@ class Collected:
             known = replace(known, initial_attitude=None, initial_position=None)
         # Sensors that were not heard yet are not known of: their records are of the future.
         heard: dict[str, Any] = dict.fromkeys(aid.section for aid in known.aids)
+        heard |= {
+            aid.section: rows_of(aid, [])
+            for aid in known.aids
+            if aid.section in self._heard and any(p.estimated for p in aid.parameters())
+        }
         heard |= aids
         named = {f.name: heard.pop(f.name) for f in fields(Trial) if f.name in heard}
         others = tuple(aid for aid in heard.values() if aid is not None)

@@ -11,13 +11,15 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from factorgraph_dvl.conventions import Array
-from factorgraph_dvl.errors import ConfigError, FactorgraphDvlError
+from factorgraph_dvl.earth import LocalFrame
+from factorgraph_dvl.errors import ConfigError, DataError, FactorgraphDvlError
 from factorgraph_dvl.priors import Known
 from factorgraph_dvl.replay.clocks import Clocks
 from factorgraph_dvl.replay.collected import Collected
 from factorgraph_dvl.replay.estimate import Update
 from factorgraph_dvl.replay.gate import Gate
 from factorgraph_dvl.replay.navigator import Navigator
+from factorgraph_dvl.replay.repeats import Repeats
 from factorgraph_dvl.replay.samples import Gap, Samples
 from factorgraph_dvl.replay.silence import Silence
 from factorgraph_dvl.replay.start import Start, begin
@@ -94,6 +96,7 @@ class Replay:
         self._gate = Gate()
         self._navigator: Navigator | None = None
         self._waiting = Waiting()
+        self._repeats = Repeats()
         self._clocks = Clocks()
         self._silence = Silence()
         self._gap: Gap | None = None
@@ -104,7 +107,9 @@ class Replay:
         self._solve_again = np.nan
         self._smoothed_to = 0
         self._messages: list[str] = []
+        self._why_not = ""
         self._too_late: dict[str, int] = {}
+        self._deferred: dict[str, int] = {}
 
     @property
     def delay(self) -> float:
@@ -131,8 +136,11 @@ class Replay:
         why = (
             (
                 self._too_late,
-                f"came after what they belong to had left the lag of {self._lag:g} s",
+                f"came too late: what they belong to had left the lag of {self._lag:g} s, or was "
+                "older than the last solution of all data",
             ),
+            (self._deferred, "came late, and would have been part of the next solution"),
+            (self._repeats.refused, "came twice"),
             (self._waiting.refused, f"were more than {AHEAD:g} s ahead of the IMU"),
             (self._gate.refused, "contradicted the prediction"),
         )
@@ -186,7 +194,9 @@ class Replay:
             raise ConfigError(
                 f"the trial has no sensor {record.section}", expected=", ".join(sections)
             )
-        self._waiting.add(self._clocks.on_time(record), self._samples.newest)
+        record = self._repeats.without(record)
+        if record.time.size:
+            self._waiting.add(self._clocks.on_time(record), self._samples.newest)
 
     def finish(self) -> list[Update]:
         """Return the updates that the last samples allow, without waiting for more."""
@@ -219,6 +229,9 @@ class Replay:
                 until += 2.0 * SAME_TIME
             aids = self._take(now, until)
             self._navigator.extend(seg, aids)
+            if self._collected is not None:
+                for i in self._navigator.innovations:
+                    self._collected.refuse(i.label, i.time[~i.used])
             self._samples.forget(self._navigator.time)
             out.append(self._update(began, solved=self._again(), end=end))
         if end and out and self._navigator is not None:
@@ -240,7 +253,7 @@ class Replay:
             self._prior = nav.known(length)
             here = InitialPosition(state.geodetic[0], np.hypot(state.position_std[0], reach))
             self._known = replace(self._known, initial_attitude=None, initial_position=here)
-            self._collected = Collected(self._known, _LONGEST, length + 1.0)
+            self._collected = Collected(self._known, _LONGEST, length + 1.0, nav.start.sections)
             self._collected.add_samples(self._samples.since(gap.after))
         self._gap = gap
         self._attempt = gap.after + _AFTER_GAP
@@ -282,6 +295,8 @@ class Replay:
     def _solve(self, until: float) -> bool:
         assert self._collected is not None
         start = self._begin(until)
+        if self._navigator is not None and self._contradicts(start):
+            start = self._without_refused(until, start)
         if self._gap is not None and self._contradicts(start):
             # Either there was a gap, or the IMU went on and its clock jumped.
             gap, by = self._gap, self._gap.after - self._gap.before - self._samples.dt
@@ -305,8 +320,12 @@ class Replay:
         if isinstance(start, str):
             if self._navigator is not None:
                 return False
-            self._messages.append(f"no start yet at {until:.1f} s: {start}")
+            if start != self._why_not:
+                self._messages.append(f"no start yet at {until:.1f} s: {start}")
+            self._why_not = start
             return False
+        self._why_not = ""
+        self._deferred.clear()
         self._gap = None
         self._usual_misfit = max(1.0, start.misfit)
         lag = self._lag if self._kind == "fixed-lag" else None
@@ -316,10 +335,30 @@ class Replay:
         self._smoothed_to = start.node + 1
         return True
 
+    def _without_refused(self, until: float, start: Start | str) -> Start | str:
+        """Return a better start without what the smoother did not believe, if there is one."""
+        assert self._navigator is not None
+        assert self._collected is not None
+        every = self._collected
+        fewer = every.without_refused(self._navigator.start.frame)
+        if fewer is None:
+            return start
+        self._collected = fewer
+        other = self._begin(until)
+        if isinstance(other, str) or (not isinstance(start, str) and other.misfit >= start.misfit):
+            self._collected = every
+            return start
+        return other
+
     def _begin(self, until: float) -> Start | str:
         assert self._collected is not None
+        trial = self._collected.trial(until)
         try:
-            return begin(self._collected.trial(until), self._prior, self._interval, self._progress)
+            trial.frame()
+        except DataError:
+            return "no position has been measured since" if self._gap else "no position yet"
+        try:
+            return begin(trial, self._prior, self._interval, self._progress)
         except FactorgraphDvlError as error:
             return str(error)
 
@@ -340,6 +379,8 @@ class Replay:
             self._solve_again = self._collected.start + _GROWTH * (now - self._collected.start)
             return False
         self._settle(before, self._navigator)
+        self._navigator.innovations = before.innovations
+        self._navigator.messages = before.messages
         return True
 
     def _moved(self, now: float) -> bool:
@@ -389,10 +430,17 @@ class Replay:
                 out.append(rows_of(record, now))
             for i in np.flatnonzero(~now).tolist():
                 k = self._navigator.node_before(float(true[i]))
-                if k is None:
+                one = rows_of(record, np.array([i]))
+                if k is not None:
+                    late.setdefault(k, []).append(one)
+                elif self._collected is None:
                     self._too_late[record.label] = self._too_late.get(record.label, 0) + 1
                 else:
-                    late.setdefault(k, []).append(rows_of(record, np.array([i])))
+                    # The next solution has it, unless the sensor is not believed.
+                    self._deferred[record.label] = self._deferred.get(record.label, 0) + 1
+                    for o in one.observations(self._navigator.start.frame):
+                        if o.label in self._gate.shut:
+                            self._collected.refuse(o.label, o.time)
         if late:
             self._navigator.correct(late)
         return out
@@ -400,12 +448,25 @@ class Replay:
     def _due(self, section: str, end: float) -> tuple[Aid, Array] | None:
         """Take what was true before a time out of what waits of a sensor; true times too."""
         nav = self._navigator
-        frame = None if nav is None else nav.start.frame
-        values = {} if nav is None else nav.values
+        frame, values = None, {}
+        # Of a sensor that was not heard before the start nothing is known yet.
+        if nav is not None and section in nav.start.sections:
+            frame, values = nav.start.frame, nav.values
         found = self._waiting.due(section, end, frame, values)
-        if found is not None and self._collected is not None:
+        if found is None or not self._measures(found[0]):
+            return None
+        if self._collected is not None:
             self._collected.add_aid(found[0])
         return found
+
+    def _measures(self, record: Aid) -> bool:
+        """Whether anything is in a record.
+
+        A sensor that only says that it cannot measure has not been heard: what it calibrates
+        must not be linearised at its prior.
+        """
+        anywhere = LocalFrame(0.0, 0.0, 0.0, self._known.epoch)
+        return not record.missing.all() or bool(record.observations(anywhere))
 
     def _update(self, began: float, *, solved: bool, end: bool) -> Update:
         nav = self._navigator
