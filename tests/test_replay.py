@@ -11,7 +11,7 @@ from truth import scenario
 from factorgraph_dvl import load_solution, save_trial, solve
 from factorgraph_dvl.analysis.consistency import calibration_errors, motion_errors
 from factorgraph_dvl.cli import main
-from factorgraph_dvl.errors import ConfigError, SolveError
+from factorgraph_dvl.errors import ConfigError, DataError, SolveError
 from factorgraph_dvl.io.tables import read_table
 from factorgraph_dvl.replay import Replay, replay
 from factorgraph_dvl.sensors.protocol import rows_of
@@ -189,6 +189,18 @@ def test_a_gap_of_the_imu_is_survived(trial):
     assert np.all(record.std[after] < 1.2 * record.std[before])
 
 
+def test_a_sensor_may_stay_silent_after_a_gap_of_the_imu(trial):
+    imu, dvl = trial.imu, trial.dvl
+    keep = (imu.time < 70.0) | (imu.time > 100.0)
+    short = replace(
+        trial, imu=replace(imu, time=imu.time[keep], gyro=imu.gyro[keep], accel=imu.accel[keep])
+    )
+    solution, record = replay(replace(short, dvl=without(dvl, 68.0, 112.0)), rate_hz=1.0)
+    within(solution, trial)
+    # What was known of its calibration stays known.
+    assert np.all(np.isfinite(record.std))
+
+
 def test_a_clock_that_jumps_is_not_believed(trial):
     time = np.where(trial.dvl.time > 60.0, trial.dvl.time + 1.37, trial.dvl.time)
     solution, record = replay(replace(trial, dvl=replace(trial.dvl, time=time)), rate_hz=1.0)
@@ -261,6 +273,8 @@ def test_what_never_starts_says_why():
     trial = simulate(scenario(noise=True, manoeuvres=[{"straight_s": 3}]), 0)
     with pytest.raises(SolveError, match="never sufficed"):
         replay(replace(trial, imu=rows_of(trial.imu, slice(0, 60))))
+    with pytest.raises(DataError, match="no position"):
+        replay(replace(trial, gnss=None))
     with pytest.raises(ConfigError, match="lag_s"):
         Replay(trial, lag_s=0.0)
     with pytest.raises(ConfigError, match="smoother"):

@@ -153,3 +153,15 @@ def test_a_beacon_bounds_a_dive_and_its_echoes_are_left_out():
     )
     assert end.time[0] - batch.trajectory.time[-1] < 0.1
     assert np.abs(apart / end.position_std).max() < 0.5
+
+
+@pytest.mark.parametrize("rows", ["none", "empty"])
+def test_a_sensor_that_is_first_heard_after_the_start(rows):
+    scene = config("seed-a-phase-90", manoeuvres=[*TURNS, *TURNS[1:]], reference_rate_hz=50)
+    trial = simulate(scene, 5)
+    dvl, heard = trial.dvl, trial.dvl.time > 40.0
+    if rows == "none":
+        dvl = rows_of(dvl, heard)
+    else:
+        dvl = replace(dvl, velocity=np.where(heard[:, None], dvl.velocity, np.nan))
+    as_the_batch(replace(trial, dvl=dvl))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import fields, replace
 from typing import Any
 
@@ -21,12 +22,20 @@ class Collected:
     known : trial with all but the records.
     longest : s of data that are kept.
     before : s for which rows are kept that were true before the first sample.
+    heard : sections of the sensors that were heard before, and whose calibration is known.
     """
 
-    def __init__(self, known: Trial, longest: float, before: float = 1.0) -> None:
+    def __init__(
+        self,
+        known: Trial,
+        longest: float,
+        before: float = 1.0,
+        heard: Sequence[str] = (),
+    ) -> None:
         self._known = known
         self._longest = longest
         self._before = before
+        self._heard = heard
         self._samples: list[Array] = []
         self._aids: dict[str, list[Aid]] = {}
 
@@ -100,6 +109,11 @@ class Collected:
             known = replace(known, initial_attitude=None, initial_position=None)
         # Sensors that were not heard yet are not known of: their records are of the future.
         heard: dict[str, Any] = dict.fromkeys(aid.section for aid in known.aids)
+        heard |= {
+            aid.section: rows_of(aid, [])
+            for aid in known.aids
+            if aid.section in self._heard and any(p.estimated for p in aid.parameters())
+        }
         heard |= aids
         named = {f.name: heard.pop(f.name) for f in fields(Trial) if f.name in heard}
         others = tuple(aid for aid in heard.values() if aid is not None)

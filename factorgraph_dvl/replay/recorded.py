@@ -30,7 +30,7 @@ class Record:
     solved : (H,) updates that include a batch solution.
     doubted : (H,) whether some measurements disagreed with the prediction.
     names : of the n calibration components, as in `covariance.order`.
-    values, std : (H, n) in reported units.
+    values, std : (H, n) in reported units; nan before the component was estimated.
     smoothed : states that later data made better.
     messages : time, s, and text.
     delay : by which estimates are behind the IMU, s.
@@ -75,9 +75,12 @@ def replay(
     ------
     ConfigError
         If an option is out of range.
+    DataError
+        If the trial has no position.
     SolveError
         If the data never sufficed to start.
     """
+    trial.frame()
     run = Replay(trial, smoother=smoother, lag_s=lag_s, rate_hz=rate_hz, progress=progress)
     tape = _Tape()
     imu = trial.imu
@@ -114,7 +117,8 @@ class _Tape:
 
     def __init__(self) -> None:
         self.last: Update | None = None
-        self._numbers = array("d")
+        # By what was estimated, which grows when a sensor is heard for the first time.
+        self._numbers: list[tuple[tuple[str, ...], array[float]]] = []
         self._states: list[Trajectory] = []
         self._smoothed: list[Trajectory] = []
         self._innovations: dict[str, list[Innovations]] = {}
@@ -124,10 +128,14 @@ class _Tape:
     def add(self, update: Update) -> None:
         self.last = update
         self.count += 1
-        values = np.concatenate([e.value for e in update.calibration.estimates])
-        std = np.concatenate([e.std for e in update.calibration.estimates])
+        estimates = update.calibration.estimates
+        names = tuple(name for e in estimates for name in e.component_names)
+        if not self._numbers or self._numbers[-1][0] != names:
+            self._numbers.append((names, array("d")))
+        values = np.concatenate([e.value for e in estimates])
+        std = np.concatenate([e.std for e in estimates])
         head = [update.time, update.latency, float(update.solved), float(bool(update.doubted))]
-        self._numbers.extend([*head, *values, *std])
+        self._numbers[-1][1].extend([*head, *values, *std])
         self._states.append(update.state)
         if update.smoothed is not None:
             self._smoothed.append(update.smoothed)
@@ -153,10 +161,9 @@ class _Tape:
 
     def record(self, run: Replay) -> Record:
         assert self.last is not None
-        estimates = self.last.calibration.estimates
-        names = tuple(name for e in estimates for name in e.component_names)
+        names = self._numbers[-1][0]
         n = len(names)
-        table = np.array(self._numbers).reshape(self.count, 4 + 2 * n)
+        table = np.vstack([_columns(np.array(x), there, names) for there, x in self._numbers])
         return Record(
             time=table[:, 0],
             latency=table[:, 1],
@@ -169,6 +176,20 @@ class _Tape:
             messages=tuple(self.messages),
             delay=run.delay,
         )
+
+
+def _columns(numbers: Array, there: tuple[str, ...], names: tuple[str, ...]) -> Array:
+    """Return rows of numbers for some components as rows for others, nan where there are none."""
+    table = numbers.reshape(-1, 4 + 2 * len(there))
+    if there == names:
+        return table
+    out = np.full((table.shape[0], 4 + 2 * len(names)), np.nan)
+    out[:, :4] = table[:, :4]
+    for i, name in enumerate(there):
+        if name in names:
+            j = names.index(name)
+            out[:, [4 + j, 4 + len(names) + j]] = table[:, [4 + i, 4 + len(there) + i]]
+    return out
 
 
 def _joined(parts: list[Trajectory]) -> Trajectory:

@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from factorgraph_dvl.conventions import Array
-from factorgraph_dvl.errors import ConfigError, FactorgraphDvlError
+from factorgraph_dvl.earth import LocalFrame
+from factorgraph_dvl.errors import ConfigError, DataError, FactorgraphDvlError
 from factorgraph_dvl.priors import Known
 from factorgraph_dvl.replay.clocks import Clocks
 from factorgraph_dvl.replay.collected import Collected
@@ -104,6 +105,7 @@ class Replay:
         self._solve_again = np.nan
         self._smoothed_to = 0
         self._messages: list[str] = []
+        self._why_not = ""
         self._too_late: dict[str, int] = {}
 
     @property
@@ -240,7 +242,7 @@ class Replay:
             self._prior = nav.known(length)
             here = InitialPosition(state.geodetic[0], np.hypot(state.position_std[0], reach))
             self._known = replace(self._known, initial_attitude=None, initial_position=here)
-            self._collected = Collected(self._known, _LONGEST, length + 1.0)
+            self._collected = Collected(self._known, _LONGEST, length + 1.0, nav.start.sections)
             self._collected.add_samples(self._samples.since(gap.after))
         self._gap = gap
         self._attempt = gap.after + _AFTER_GAP
@@ -305,8 +307,11 @@ class Replay:
         if isinstance(start, str):
             if self._navigator is not None:
                 return False
-            self._messages.append(f"no start yet at {until:.1f} s: {start}")
+            if start != self._why_not:
+                self._messages.append(f"no start yet at {until:.1f} s: {start}")
+            self._why_not = start
             return False
+        self._why_not = ""
         self._gap = None
         self._usual_misfit = max(1.0, start.misfit)
         lag = self._lag if self._kind == "fixed-lag" else None
@@ -318,8 +323,13 @@ class Replay:
 
     def _begin(self, until: float) -> Start | str:
         assert self._collected is not None
+        trial = self._collected.trial(until)
         try:
-            return begin(self._collected.trial(until), self._prior, self._interval, self._progress)
+            trial.frame()
+        except DataError:
+            return "no position has been measured since" if self._gap else "no position yet"
+        try:
+            return begin(trial, self._prior, self._interval, self._progress)
         except FactorgraphDvlError as error:
             return str(error)
 
@@ -400,12 +410,25 @@ class Replay:
     def _due(self, section: str, end: float) -> tuple[Aid, Array] | None:
         """Take what was true before a time out of what waits of a sensor; true times too."""
         nav = self._navigator
-        frame = None if nav is None else nav.start.frame
-        values = {} if nav is None else nav.values
+        frame, values = None, {}
+        # Of a sensor that was not heard before the start nothing is known yet.
+        if nav is not None and section in nav.start.sections:
+            frame, values = nav.start.frame, nav.values
         found = self._waiting.due(section, end, frame, values)
-        if found is not None and self._collected is not None:
+        if found is None or not self._measures(found[0]):
+            return None
+        if self._collected is not None:
             self._collected.add_aid(found[0])
         return found
+
+    def _measures(self, record: Aid) -> bool:
+        """Whether anything is in a record.
+
+        A sensor that only says that it cannot measure has not been heard: what it calibrates
+        must not be linearised at its prior.
+        """
+        anywhere = LocalFrame(0.0, 0.0, 0.0, self._known.epoch)
+        return not record.missing.all() or bool(record.observations(anywhere))
 
     def _update(self, began: float, *, solved: bool, end: bool) -> Update:
         nav = self._navigator
