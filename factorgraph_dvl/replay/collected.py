@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import fields, replace
 from typing import Any
 
 import numpy as np
 
 from factorgraph_dvl.conventions import Array
+from factorgraph_dvl.earth import LocalFrame
 from factorgraph_dvl.sensors.imu import Imu
 from factorgraph_dvl.sensors.protocol import Aid, joined, rows_of
 from factorgraph_dvl.trial import Trial
@@ -38,6 +40,7 @@ class Collected:
         self._heard = heard
         self._samples: list[Array] = []
         self._aids: dict[str, list[Aid]] = {}
+        self._refused: dict[str, list[Array]] = {}
 
     @property
     def start(self) -> float:
@@ -59,6 +62,28 @@ class Collected:
     def add_aid(self, record: Aid) -> None:
         """Add rows of a sensor."""
         self._aids.setdefault(record.section, []).append(record)
+
+    def refuse(self, label: str, time: Array) -> None:
+        """Note times, s, of measurements of a kind that are not believed."""
+        if time.size:
+            self._refused.setdefault(label, []).append(time)
+
+    def without_refused(self, frame: LocalFrame) -> Collected | None:
+        """Return the same without the rows that were refused, None if there are none."""
+        if not self._refused:
+            return None
+        out = copy(self)
+        out._refused = {}
+        out._aids = {}
+        for section, records in self._aids.items():
+            record = joined(records)
+            kinds = {o.label for o in record.observations(frame)} & self._refused.keys()
+            times = [time for kind in kinds for time in self._refused[kind]]
+            if times:
+                record = rows_of(record, ~np.isin(record.time, np.concatenate(times)))
+            if record.time.size:
+                out._aids[section] = [record]
+        return out
 
     @property
     def complete(self) -> bool:

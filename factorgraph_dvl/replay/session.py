@@ -107,6 +107,7 @@ class Replay:
         self._messages: list[str] = []
         self._why_not = ""
         self._too_late: dict[str, int] = {}
+        self._deferred: dict[str, int] = {}
 
     @property
     def delay(self) -> float:
@@ -133,8 +134,10 @@ class Replay:
         why = (
             (
                 self._too_late,
-                f"came after what they belong to had left the lag of {self._lag:g} s",
+                f"came too late: what they belong to had left the lag of {self._lag:g} s, or was "
+                "older than the last solution of all data",
             ),
+            (self._deferred, "came late, and would have been part of the next solution"),
             (self._waiting.refused, f"were more than {AHEAD:g} s ahead of the IMU"),
             (self._gate.refused, "contradicted the prediction"),
         )
@@ -221,6 +224,9 @@ class Replay:
                 until += 2.0 * SAME_TIME
             aids = self._take(now, until)
             self._navigator.extend(seg, aids)
+            if self._collected is not None:
+                for i in self._navigator.innovations:
+                    self._collected.refuse(i.label, i.time[~i.used])
             self._samples.forget(self._navigator.time)
             out.append(self._update(began, solved=self._again(), end=end))
         if end and out and self._navigator is not None:
@@ -284,6 +290,8 @@ class Replay:
     def _solve(self, until: float) -> bool:
         assert self._collected is not None
         start = self._begin(until)
+        if self._navigator is not None and self._contradicts(start):
+            start = self._without_refused(until, start)
         if self._gap is not None and self._contradicts(start):
             # Either there was a gap, or the IMU went on and its clock jumped.
             gap, by = self._gap, self._gap.after - self._gap.before - self._samples.dt
@@ -312,6 +320,7 @@ class Replay:
             self._why_not = start
             return False
         self._why_not = ""
+        self._deferred.clear()
         self._gap = None
         self._usual_misfit = max(1.0, start.misfit)
         lag = self._lag if self._kind == "fixed-lag" else None
@@ -320,6 +329,21 @@ class Replay:
         self._solve_again = self._collected.start + _GROWTH * (until - self._collected.start)
         self._smoothed_to = start.node + 1
         return True
+
+    def _without_refused(self, until: float, start: Start | str) -> Start | str:
+        """Return a better start without what the smoother did not believe, if there is one."""
+        assert self._navigator is not None
+        assert self._collected is not None
+        every = self._collected
+        fewer = every.without_refused(self._navigator.start.frame)
+        if fewer is None:
+            return start
+        self._collected = fewer
+        other = self._begin(until)
+        if isinstance(other, str) or (not isinstance(start, str) and other.misfit >= start.misfit):
+            self._collected = every
+            return start
+        return other
 
     def _begin(self, until: float) -> Start | str:
         assert self._collected is not None
@@ -350,6 +374,8 @@ class Replay:
             self._solve_again = self._collected.start + _GROWTH * (now - self._collected.start)
             return False
         self._settle(before, self._navigator)
+        self._navigator.innovations = before.innovations
+        self._navigator.messages = before.messages
         return True
 
     def _moved(self, now: float) -> bool:
@@ -399,10 +425,17 @@ class Replay:
                 out.append(rows_of(record, now))
             for i in np.flatnonzero(~now).tolist():
                 k = self._navigator.node_before(float(true[i]))
-                if k is None:
+                one = rows_of(record, np.array([i]))
+                if k is not None:
+                    late.setdefault(k, []).append(one)
+                elif self._collected is None:
                     self._too_late[record.label] = self._too_late.get(record.label, 0) + 1
                 else:
-                    late.setdefault(k, []).append(rows_of(record, np.array([i])))
+                    # The next solution has it, unless the sensor is not believed.
+                    self._deferred[record.label] = self._deferred.get(record.label, 0) + 1
+                    for o in one.observations(self._navigator.start.frame):
+                        if o.label in self._gate.shut:
+                            self._collected.refuse(o.label, o.time)
         if late:
             self._navigator.correct(late)
         return out
