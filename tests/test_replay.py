@@ -100,6 +100,19 @@ def test_smoothed_states_are_better_than_filtered_ones(trial, run):
     assert np.mean(smoothed.velocity.error**2) < worse
 
 
+def test_what_comes_twice_counts_once(trial):
+    once, twice = Replay(trial, rate_hz=1.0), Replay(trial, rate_hz=1.0)
+    a = feed(once, trial, 0.0, 40.0)
+    feed(twice, trial, 0.0, 36.0)
+    for section in ("gnss", "dvl"):
+        aid = getattr(trial, section)
+        twice.add(rows_of(aid, (aid.time >= 30.0) & (aid.time < 36.0)))
+    b = feed(twice, trial, 36.0, 40.0)
+    ours, theirs = a[-1].calibration.covariance, b[-1].calibration.covariance
+    np.testing.assert_allclose(ours, theirs, rtol=1e-9)
+    assert any("came twice" in line for line in twice.counts())
+
+
 def test_nothing_is_known_before_it_was_measured(trial):
     whole = Replay(trial, rate_hz=1.0)
     a = feed(whole, trial, 0.0, 120.0)
@@ -150,7 +163,8 @@ def test_late_measurements_correct_and_later_ones_are_counted(trial):
     difference = values(a[-1].calibration) - values(b[-1].calibration)
     assert np.abs(difference / ours).max() < 0.05
     assert late.counts() == []
-    late.add(rows_of(trial.dvl, slice(0, 3)))
+    other = replace(trial.dvl, velocity=trial.dvl.velocity + 1e-9)
+    late.add(rows_of(other, slice(0, 3)))
     feed(late, trial, 80.0, 82.0)
     assert any("DVL: 3 measurements came too late" in line for line in late.counts())
 

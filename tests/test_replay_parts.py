@@ -331,6 +331,36 @@ def test_the_gate_shuts_and_opens():
     assert not gate.doubted
 
 
+def test_an_outlier_is_left_out_and_nothing_else():
+    gate = Gate()
+    rng = np.random.default_rng(0)
+    gate.passes("GNSS", rng.normal(size=(50, 3)))
+    used, message = gate.passes("GNSS", np.array([[200.0, 0, 0]]))
+    assert not used.any()
+    assert not message
+    used, _ = gate.passes("GNSS", rng.normal(size=(5, 3)))
+    assert used.all()
+    assert not gate.doubted
+
+
+def test_a_kind_that_differs_throughout_is_shut_though_none_is_beyond():
+    gate = Gate()
+    _, message = gate.passes("GNSS", np.full((50, 3), 4.0))
+    assert gate.shut == {"GNSS"}
+    assert "the last 50 differ from the prediction by 4.0 times" in message
+
+
+def test_silence_is_that_of_arrivals():
+    def heard(time):
+        return [Innovations("GNSS", "m", ("e",), np.array([time]), *3 * (np.ones((1, 1)),))]
+
+    silence = Silence()
+    # As late as this receiver is: it is not silent.
+    assert not [m for t in range(20) for m in silence.listen(t + 8.0, heard(float(t)))]
+    assert silence.listen(34.0, []) == ["GNSS: nothing since 19.0 s; the estimate goes on without"]
+    assert silence.listen(35.0, heard(20.0)) == ["GNSS: back after 8.0 s"]
+
+
 def test_the_gate_doubts_innovations_that_are_too_large():
     gate = Gate()
     rng = np.random.default_rng(0)

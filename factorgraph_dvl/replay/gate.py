@@ -82,9 +82,14 @@ class Gate:
         ):
             self.doubted.add(label)
             self.shut.add(label)
+            what = f"the last {_LAST} differ from the prediction by {rms:.1f} times what is stated"
+            if share > _BAD:
+                what = (
+                    f"{count} of the last {len(last)} contradict the prediction by more than "
+                    f"{_BEYOND:g} standard deviations"
+                )
             return (
-                f"{label}: {count} of the last {len(last)} contradict the prediction by more "
-                f"than {_BEYOND:g} standard deviations; not used until they agree. A clock that "
-                "has jumped, or a sensor that fails, looks like this"
+                f"{label}: {what}; not used until they agree. A clock that has jumped, or a "
+                "sensor that fails, looks like this"
             )
         return ""

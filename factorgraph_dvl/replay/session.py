@@ -19,6 +19,7 @@ from factorgraph_dvl.replay.collected import Collected
 from factorgraph_dvl.replay.estimate import Update
 from factorgraph_dvl.replay.gate import Gate
 from factorgraph_dvl.replay.navigator import Navigator
+from factorgraph_dvl.replay.repeats import Repeats
 from factorgraph_dvl.replay.samples import Gap, Samples
 from factorgraph_dvl.replay.silence import Silence
 from factorgraph_dvl.replay.start import Start, begin
@@ -95,6 +96,7 @@ class Replay:
         self._gate = Gate()
         self._navigator: Navigator | None = None
         self._waiting = Waiting()
+        self._repeats = Repeats()
         self._clocks = Clocks()
         self._silence = Silence()
         self._gap: Gap | None = None
@@ -138,6 +140,7 @@ class Replay:
                 "older than the last solution of all data",
             ),
             (self._deferred, "came late, and would have been part of the next solution"),
+            (self._repeats.refused, "came twice"),
             (self._waiting.refused, f"were more than {AHEAD:g} s ahead of the IMU"),
             (self._gate.refused, "contradicted the prediction"),
         )
@@ -191,7 +194,9 @@ class Replay:
             raise ConfigError(
                 f"the trial has no sensor {record.section}", expected=", ".join(sections)
             )
-        self._waiting.add(self._clocks.on_time(record), self._samples.newest)
+        record = self._repeats.without(record)
+        if record.time.size:
+            self._waiting.add(self._clocks.on_time(record), self._samples.newest)
 
     def finish(self) -> list[Update]:
         """Return the updates that the last samples allow, without waiting for more."""

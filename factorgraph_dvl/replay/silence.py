@@ -17,7 +17,8 @@ class Silence:
     """When each kind of measurement was heard last."""
 
     def __init__(self) -> None:
-        self._heard: dict[str, float] = {}
+        # When it arrived, and the latest time that it was of.
+        self._heard: dict[str, tuple[float, float]] = {}
         self._usual: dict[str, float] = {}
         self._silent: set[str] = set()
 
@@ -30,19 +31,16 @@ class Silence:
         """Return which kinds have fallen silent by a time, s, and which are back."""
         messages = []
         for i in heard:
-            time = float(i.time[-1])
-            before = self._heard.get(i.label, time)
-            self._heard[i.label] = max(time, before)
-            if time > before:
-                self._usual[i.label] = min(time - before, self._usual.get(i.label, np.inf))
+            arrived, of = self._heard.get(i.label, (now, -np.inf))
+            self._heard[i.label] = (now, max(float(i.time.max()), of))
+            if now > arrived:
+                self._usual[i.label] = min(now - arrived, self._usual.get(i.label, np.inf))
             if i.label in self._silent:
                 self._silent.discard(i.label)
-                messages.append(f"{i.label}: back after {i.time[-1] - before:.1f} s")
-        for label, last in self._heard.items():
+                messages.append(f"{i.label}: back after {now - arrived:.1f} s")
+        for label, (arrived, of) in self._heard.items():
             longest = max(_SILENT, _MISSED * self._usual.get(label, 0.0))
-            if now - last > longest and label not in self._silent:
+            if now - arrived > longest and label not in self._silent:
                 self._silent.add(label)
-                messages.append(
-                    f"{label}: nothing since {last:.1f} s; the estimate goes on without"
-                )
+                messages.append(f"{label}: nothing since {of:.1f} s; the estimate goes on without")
         return messages

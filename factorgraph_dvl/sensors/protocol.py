@@ -351,7 +351,7 @@ _AnyRecord = TypeVar("_AnyRecord")
 
 def rows_of(record: _AnyRecord, rows: slice | NDArray[Any] | list[int]) -> _AnyRecord:
     """Return some rows of a sensor's record, in the order of time: of every array in it."""
-    return _with(record, {name: values[rows] for name, values in _arrays(record).items()})
+    return _with(record, {name: values[rows] for name, values in arrays_of(record).items()})
 
 
 def joined(records: Sequence[_AnyRecord]) -> _AnyRecord:
@@ -361,7 +361,7 @@ def joined(records: Sequence[_AnyRecord]) -> _AnyRecord:
     """
     if len(records) == 1:
         return records[0]
-    columns = [_arrays(record) for record in records]
+    columns = [arrays_of(record) for record in records]
     whole = {name: np.concatenate([c[name] for c in columns]) for name in columns[0]}
     _, rows = np.unique(whole["time"], return_index=True)
     return _with(records[0], {name: values[rows] for name, values in whole.items()})
@@ -375,7 +375,8 @@ def _with(record: _AnyRecord, arrays: Mapping[str, Array]) -> _AnyRecord:
     return out
 
 
-def _arrays(record: Any) -> dict[str, Array]:
+def arrays_of(record: Any) -> dict[str, Array]:
+    """Return the arrays of a record, by name; each has a row for each time."""
     return {name: value for name, value in vars(record).items() if isinstance(value, np.ndarray)}
 
 
