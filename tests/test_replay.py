@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from rich.console import Console
 from truth import scenario
 
 from factorgraph_dvl import load_solution, save_trial, solve
@@ -14,6 +15,7 @@ from factorgraph_dvl.cli import main
 from factorgraph_dvl.errors import ConfigError, DataError, SolveError
 from factorgraph_dvl.io.tables import read_table
 from factorgraph_dvl.replay import Replay, replay
+from factorgraph_dvl.report.live import live_view
 from factorgraph_dvl.sensors.protocol import rows_of
 from factorgraph_dvl.simulation import simulate
 
@@ -336,7 +338,33 @@ def test_the_command_writes_what_was_known_when(trial, tmp_path, capsys):
     assert there.sum() > 80
     assert read_table(out / "latency.csv", ["time_s", "latency_ms", "batch"])["batch"].sum() >= 1
     assert (out / "figures" / "convergence.png").stat().st_size > 10_000
+    assert (out / "instrument.yaml").is_file()
     assert (out / "convergence.csv").read_text().splitlines()[-1].startswith("all,")
     with pytest.raises(SystemExit) as end:
         main([*command, "--force", "--good-std", "lever_arm_m"])
     assert end.value.code == 2
+    with pytest.raises(SystemExit) as end:
+        main([*command, "--force", "--good-std", "current_m_s=1"])
+    assert end.value.code == 2
+    assert "'current_m_s'" in capsys.readouterr().err
+
+
+def test_what_matters_is_in_view_on_a_low_terminal(trial, run):
+    solution, _ = run
+    console = Console(width=80, height=24)
+    view = live_view(
+        "trial",
+        200.0,
+        solution.estimates,
+        rows_of(solution.trajectory, [0]),
+        latency=0.004,
+        speed=20.0,
+        doubted=("GNSS position",),
+        lacking=("misalignment_y_deg",),
+    )
+    lines = [s for line in console.render_lines(view) if (s := "".join(x.text for x in line))]
+    text = "\n".join(lines[: console.height - 1])
+    for expected in ("not good enough yet: misalignment_y", "in doubt: GNSS position"):
+        assert expected in text
+    for expected in ("position", "latency 4.0 ms, 20.0 times", "lever_arm_z"):
+        assert expected in text

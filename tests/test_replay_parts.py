@@ -11,7 +11,7 @@ from jacobians import differentiate
 from truth import exact_states, scenario
 
 from factorgraph_dvl import keys
-from factorgraph_dvl.analysis.convergence import convergence
+from factorgraph_dvl.analysis.convergence import check_limits, convergence, lacking
 from factorgraph_dvl.conventions import exp_so3
 from factorgraph_dvl.earth import LocalFrame
 from factorgraph_dvl.errors import ConfigError
@@ -412,8 +412,10 @@ def test_convergence_is_the_last_time_that_a_limit_is_crossed():
     never = convergence(time, values, std + 1.0, doubted, [one], {}, limits, limits)
     assert np.isnan(never.good_since)
     assert np.isnan(never.components[0].error_since)
-    with pytest.raises(ConfigError, match="speed"):
-        convergence(time, values, std, doubted, [one], {}, {"speed": 1.0}, {})
+    assert lacking([one], {"scale_error": 1e-5}) == ("scale_error",)
+    assert lacking([one], limits) == ()
+    with pytest.raises(ConfigError, match=r"'speed'.*misalignment_deg, scale_error, lever_arm_m"):
+        check_limits(simulate(scenario()), ["scale_error", "speed"])
 
 
 def test_rows_of_a_record_are_joined_in_the_order_of_time():

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,11 +12,18 @@ from factorgraph_dvl.analysis.consistency import true_value_of
 from factorgraph_dvl.conventions import Array
 from factorgraph_dvl.errors import ConfigError
 from factorgraph_dvl.solution import Estimate
+from factorgraph_dvl.trial import Trial
 
 # Standard deviations and errors that are good enough, by parameter, in reported units: what
 # leaves dead reckoning with 0.1 % of the distance.
-GOOD_STD: dict[str, float] = {"misalignment_deg": 0.03, "scale_error": 3e-4, "lever_arm_m": 0.03}
-GOOD_ERROR: dict[str, float] = {"misalignment_deg": 0.06, "scale_error": 6e-4, "lever_arm_m": 0.06}
+GOOD_STD: dict[str, float] = {
+    "misalignment_deg": 0.03,
+    "scale_error": 3e-4,
+    "beam_direction_b": 0.03,
+    "beam_scale_error": 3e-4,
+    "lever_arm_m": 0.03,
+}
+GOOD_ERROR: dict[str, float] = {name: 2.0 * std for name, std in GOOD_STD.items()}
 
 
 @dataclass(frozen=True)
@@ -75,17 +82,7 @@ def convergence(
     truth : true values by reported name; may be empty.
     good_std, good_error : limits by reported name, in its unit.
 
-    Raises
-    ------
-    ConfigError
-        If a limit is for something that was not estimated.
     """
-    known = {e.name for e in estimates}
-    for name in (*good_std, *good_error):
-        if name not in known and name not in GOOD_STD:
-            raise ConfigError(
-                f"no parameter {name!r} was estimated", expected=f"one of {', '.join(known)}"
-            )
     out, column = [], 0
     all_good = ~doubted
     for e in estimates:
@@ -106,6 +103,33 @@ def convergence(
             )
         column += len(e.component_names)
     return Convergence(tuple(out), _since(time, all_good) if out else np.nan)
+
+
+def check_limits(trial: Trial, limits: Iterable[str]) -> None:
+    """Raise ConfigError if a limit is for something that a trial does not calibrate.
+
+    Parameters
+    ----------
+    trial : whose sensors say what is estimated.
+    limits : reported names.
+    """
+    sensors = (trial.imu.parameters(0.0), *(aid.parameters() for aid in trial.aids))
+    known = [p.name for parameters in sensors for p in parameters if p.estimated]
+    for name in limits:
+        if name not in known:
+            raise ConfigError(
+                f"no parameter {name!r} is estimated", expected=f"one of {', '.join(known)}"
+            )
+
+
+def lacking(estimates: Sequence[Estimate], good_std: Mapping[str, float]) -> tuple[str, ...]:
+    """Return the components whose standard deviations are above their limits."""
+    return tuple(
+        name
+        for e in estimates
+        for i, name in enumerate(e.component_names)
+        if e.name in good_std and e.prior_std[i] > 0.0 and e.std[i] > good_std[e.name]
+    )
 
 
 def _since(time: Array, good: np.ndarray) -> float:

@@ -61,16 +61,26 @@ def replay(
     quiet: Quiet = False,
 ) -> None:
     """Feed a trial in the order of time, and show what was known when."""
-    from factorgraph_dvl.analysis.convergence import GOOD_ERROR, GOOD_STD, convergence
+    from factorgraph_dvl.analysis.convergence import (
+        GOOD_ERROR,
+        GOOD_STD,
+        check_limits,
+        convergence,
+    )
     from factorgraph_dvl.io.folders import check_output
     from factorgraph_dvl.io.trial_folder import load_trial
 
-    std_limits = GOOD_STD | _limits("--good-std", good_std)
-    error_limits = GOOD_ERROR | _limits("--good-error", good_error)
+    std_asked = _limits("--good-std", good_std)
+    error_asked = _limits("--good-error", good_error)
+    std_limits, error_limits = GOOD_STD | std_asked, GOOD_ERROR | error_asked
     check_output(out, force=force)
+    # Where nothing can be drawn over, lines of progress say as much.
+    live = live and stderr().is_terminal
     with ProgressLine(quiet=quiet or live) as progress:
         trial = load_trial(trial_path)
-        solution, record = _run(trial, smoother.value, lag, rate, progress, live=live)
+        check_limits(trial, (*std_asked, *error_asked))
+        good = std_limits if live else None
+        solution, record = _run(trial, smoother.value, lag, rate, progress, good)
         found = convergence(
             record.time,
             record.values,
@@ -109,8 +119,14 @@ def _limits(option: str, pairs: list[str] | None) -> dict[str, float]:
 
 
 def _run(
-    trial: Trial, smoother: str, lag: float, rate: float, progress: ProgressLine, *, live: bool
+    trial: Trial,
+    smoother: str,
+    lag: float,
+    rate: float,
+    progress: ProgressLine,
+    good_std: dict[str, float] | None,
 ) -> tuple[Solution, Record]:
+    """Run the replay; with limits, show whether they are kept as it goes."""
     from factorgraph_dvl.replay import KINDS, Update
     from factorgraph_dvl.replay import replay as run
 
@@ -122,16 +138,25 @@ def _run(
     def speed(update: Update) -> float:
         return (update.time - first) / max(perf_counter() - began, 1e-9)
 
-    if live:
+    if good_std is not None:
         from rich.live import Live
 
+        from factorgraph_dvl.analysis.convergence import lacking
         from factorgraph_dvl.report.live import live_view
 
+        since: float | None = None
+        waiting = Text(f"{trial.name}: collecting the first data")
+
         # The display costs more than an update.
-        with Live(console=stderr(), refresh_per_second=8, transient=True) as view:
+        with Live(waiting, console=stderr(), refresh_per_second=8, transient=True) as view:
 
             def show(update: Update) -> None:
-                nonlocal shown
+                nonlocal shown, since
+                bad = lacking(update.calibration.estimates, good_std)
+                if bad or update.doubted:
+                    since = None
+                elif since is None:
+                    since = update.time - first
                 now = perf_counter()
                 if now - shown > 0.1:
                     shown = now
@@ -144,6 +169,8 @@ def _run(
                             latency=update.latency,
                             speed=speed(update),
                             doubted=update.doubted,
+                            lacking=bad,
+                            good_since=since,
                         )
                     )
                 for message in update.messages:
@@ -173,6 +200,7 @@ def _write(
     force: bool,
     figures: bool,
 ) -> None:
+    from factorgraph_dvl.cli.solve import write_beams, write_instrument
     from factorgraph_dvl.io.solution_folder import (
         CONVERGENCE_FILE,
         FIGURES_FOLDER,
@@ -183,6 +211,8 @@ def _write(
     from factorgraph_dvl.report.convergence_file import to_csv
 
     def add(folder: Path) -> None:
+        write_beams(trial, solution, folder)
+        write_instrument(solution, folder)
         write_history(folder, record.time, record.names, record.values, record.std, record.latency)
         write_latency(folder, record.time, record.latency, record.solved)
         (folder / CONVERGENCE_FILE).write_text(to_csv(found), encoding="utf-8")
@@ -224,7 +254,8 @@ def _print(trial: Trial, solution: Solution, record: Record, found: Convergence)
     truth = trial.calibration_truth
     errors = calibration_errors(solution, truth) if truth else None
     print_table(calibration_table(solution, errors, width=console.width))
-    print_table(convergence_table(found))
+    start = float(trial.imu.time[0])
+    print_table(convergence_table(found, start))
     plain = 1e3 * record.latency[~record.solved]
     if plain.size:
         median, tail = np.percentile(plain, [50.0, 99.0])
@@ -236,6 +267,6 @@ def _print(trial: Trial, solution: Solution, record: Record, found: Convergence)
             highlight=False,
             soft_wrap=True,
         )
-    console.print(good_enough_line(found, float(trial.imu.time[0])), markup=False, highlight=False)
+    console.print(good_enough_line(found, start), markup=False, highlight=False)
     for warning in solution.warnings:
         warn(warning)

@@ -141,10 +141,10 @@ def _solve_into(
         progress("write", 0, None)
 
         def add(folder: Path) -> None:
-            _write_beams(trial, solution, folder)
+            write_beams(trial, solution, folder)
             if history is not None:
                 write_history(folder, history.time, history.names, history.values, history.std)
-            _write_instrument(solution, folder)
+            write_instrument(solution, folder)
             if not figures:
                 return
             from factorgraph_dvl.report.figures import write_figures
@@ -166,7 +166,7 @@ def _solve_into(
         raise typer.Exit(1)
 
 
-def _write_beams(trial: Trial | PlanarTrial, solution: Solution, folder: Path) -> None:
+def write_beams(trial: Trial | PlanarTrial, solution: Solution, folder: Path) -> None:
     """Write how the beams agree, if the trial has some and the solution calibrates them."""
     from factorgraph_dvl.analysis.beam_quality import beam_quality, calibrates, calibration_of
     from factorgraph_dvl.io.solution_folder import BEAMS_FILE
@@ -177,7 +177,7 @@ def _write_beams(trial: Trial | PlanarTrial, solution: Solution, folder: Path) -
         write_table(folder / BEAMS_FILE, quality.columns())
 
 
-def _write_instrument(solution: Solution, folder: Path) -> None:
+def write_instrument(solution: Solution, folder: Path) -> None:
     """Write the calibration as instruments take it, if there is one of a DVL."""
     from factorgraph_dvl.analysis.instrument import NEEDED, instrument_of
     from factorgraph_dvl.io.solution_folder import INSTRUMENT_FILE

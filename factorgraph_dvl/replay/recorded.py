@@ -211,6 +211,10 @@ def _solution(trial: Trial, run: Replay, tape: _Tape) -> Solution:
         if bad.size:
             names = ", ".join(e.component_names[i] for i in bad)
             warnings.append(f"{names} not observable in what was measured until the end")
+    known = {e.name for e in calibration.estimates}
+    for aid in trial.aids:
+        if any(p.estimated and p.name not in known for p in aid.parameters()):
+            warnings.append(f"{aid.label} was not heard in time to be calibrated")
     if trial.imu.settings.bias_walks:
         warnings.append(
             "a bias of the IMU walks: what is reported is its value at the end, where a solution "

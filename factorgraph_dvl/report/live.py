@@ -22,8 +22,12 @@ def live_view(
     latency: float,
     speed: float,
     doubted: Sequence[str],
+    lacking: Sequence[str] = (),
+    good_since: float | None = None,
 ) -> Group:
-    """Render calibration, position, latency and speed.
+    """Render whether it is good enough, position, latency, speed and calibration.
+
+    What matters most stands first: a terminal that is too low loses the end.
 
     Parameters
     ----------
@@ -34,8 +38,10 @@ def live_view(
     latency : of the last update, s.
     speed : relative to real time.
     doubted : kinds of measurements that disagree with the prediction.
+    lacking : components whose standard deviations are not good enough yet.
+    good_since : s, from which on all are; None = they are not.
     """
-    table = Table(title=Text(f"{trial}: {time:.1f} s"))
+    table = Table()
     table.add_column("parameter")
     for header in ("value", "σ", "unit"):
         table.add_column(header, justify="right")
@@ -53,6 +59,12 @@ def live_view(
             )
     lat, lon, height = state.geodetic[0]
     rph = np.degrees(state.rph[0])
+    if good_since is not None:
+        verdict = Text(f"{trial}: {time:.1f} s, good enough since {good_since:.0f} s", "green")
+    else:
+        why = ", ".join(split_unit(component)[0] for component in lacking)
+        why = why or "measurements are in doubt"
+        verdict = Text(f"{trial}: {time:.1f} s, not good enough yet: {why}")
     lines = [
         f"position {np.degrees(lat):.7f} {np.degrees(lon):.7f} deg, {height:.2f} m "
         f"(σ {_three(state.position_std[0])} m)",
@@ -60,10 +72,11 @@ def live_view(
         f"roll, pitch, heading {_three(rph)} deg (σ {_three(np.degrees(state.rph_std[0]))})",
         f"latency {1e3 * latency:.1f} ms, {speed:.1f} times real time",
     ]
-    parts: list[Table | Text] = [table, *(Text(line) for line in lines)]
+    parts: list[Table | Text] = [verdict]
     if doubted:
         parts.append(Text(f"in doubt: {', '.join(doubted)}", "red"))
-    return Group(*parts)
+    parts += [Text(line) for line in lines]
+    return Group(*parts, table)
 
 
 def _three(values: np.ndarray) -> str:

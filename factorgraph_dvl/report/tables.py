@@ -106,9 +106,15 @@ def rejected_line(solution: Solution) -> str:
     return f"Rejected: {', '.join(parts)}; rejected.csv names them"
 
 
-def convergence_table(found: Convergence) -> Table:
-    """Render from when each component was good enough."""
-    table = Table(title="Convergence: time from which on it stayed within")
+def convergence_table(found: Convergence, start: float) -> Table:
+    """Render from when each component was good enough.
+
+    Parameters
+    ----------
+    found : how it converged.
+    start : of the trial, s: what the times count from.
+    """
+    table = Table(title="Convergence: time since the start from which on it stayed within")
     add_column(table, "component")
     for header in ("σ below", "since s", "error below", "since s"):
         add_column(table, header, numeric=True)
@@ -118,9 +124,9 @@ def convergence_table(found: Convergence) -> Table:
         table.add_row(
             name,
             f"{c.good_std:.3g} {unit}",
-            _moment(c.std_since),
+            _moment(c.std_since - start),
             f"{c.good_error:.3g} {unit}" if truth else "–",
-            _moment(c.error_since) if truth else "–",
+            _moment(c.error_since - start) if truth else "–",
         )
     return table
 
