@@ -23,6 +23,7 @@ from factorgraph_dvl.replay.gate import Gate
 from factorgraph_dvl.replay.samples import Samples
 from factorgraph_dvl.replay.silence import Silence
 from factorgraph_dvl.replay.smoother import Smoother
+from factorgraph_dvl.report.convergence_figures import convergence_figure
 from factorgraph_dvl.sensors.dvl import Dvl, DvlSettings, DvlVelocity
 from factorgraph_dvl.sensors.protocol import joined, rows_of
 from factorgraph_dvl.simulation import simulate
@@ -425,3 +426,18 @@ def test_rows_of_a_record_are_joined_in_the_order_of_time():
     np.testing.assert_array_equal(out.time, dvl.time[[0, 1, 2, 4]])
     np.testing.assert_array_equal(out.velocity, dvl.velocity[[0, 1, 2, 4]])
     assert isinstance(out.observations(LocalFrame(0.0, 0.0, 0.0))[0], DvlVelocity)
+
+
+def test_the_figure_has_every_beam_also_one_that_came_late():
+    n = 8
+    beams = Estimate(
+        "beam_scale_error",
+        tuple(f"beam_scale_error_{i + 1}" for i in range(n)),
+        *(np.full(n, x) for x in (0.001, 1e-4, 0.0, 0.1)),
+        np.full(n, True),
+    )
+    time = np.arange(20.0)
+    values = np.where(time[:, None] < 10.0, np.nan, np.full((20, n), 0.001))
+    figure = convergence_figure(time, values, 0.1 * values, [beams], {}, np.nan)
+    assert [ax.get_title(loc="left") for ax in figure.axes] == list(beams.component_names)
+    assert all(ax.get_ylim()[1] < 0.002 for ax in figure.axes)

@@ -81,7 +81,13 @@ def convergence_figure(
     good_since : a moment to mark, s; nan for none.
     """
     columns = 3
-    rows = [e for e in estimates if np.any(e.prior_std > 0.0)]
+    free = [e for e in estimates if np.any(e.prior_std > 0.0)]
+    # Of four beams there are more components than columns.
+    rows = [
+        (e, list(range(len(e.component_names)))[first : first + columns])
+        for e in free
+        for first in range(0, len(e.component_names), columns)
+    ]
     figure = new_figure(11.0, 1.0 + 1.75 * len(rows))
     grid = new_grid(figure, len(rows), columns, top=0.85, gap=(0.45, 0.85))
     start, label = clock(time)
@@ -92,12 +98,12 @@ def convergence_figure(
         shown[e.name] = place
         place += len(e.component_names)
     known = False
-    for i, e in enumerate(rows):
+    for i, (e, part) in enumerate(rows):
         true_value = true_value_of(e, truth)
         known |= true_value is not None
-        for j, component in enumerate(e.component_names[:columns]):
+        for j, n in enumerate(part):
             ax = figure.add_subplot(grid[i, j])
-            c = shown[e.name] + j
+            c = shown[e.name] + n
             value, sigma = values[:, c], std[:, c]
             for k, alpha in ((3.0, 0.35), (1.0, 1.0)):
                 ax.fill_between(
@@ -105,17 +111,18 @@ def convergence_figure(
                 )
             ax.plot(x, value, color=ACCENT, lw=1.0)
             if true_value is not None:
-                ax.axhline(float(true_value[j]), color=DARK, lw=0.9, ls="--")
+                ax.axhline(float(true_value[n]), color=DARK, lw=0.9, ls="--")
             if np.isfinite(good_since):
                 ax.axvline(good_since - start, color=GREY, lw=0.9, ls=":")
             tail = slice(int(_SHOWN_FROM * x.size), None)
-            low = float((value - 3.0 * sigma)[tail].min())
-            high = float((value + 3.0 * sigma)[tail].max())
+            # Before its sensor was heard a component has no estimate.
+            low = float(np.nanmin((value - 3.0 * sigma)[tail]))
+            high = float(np.nanmax((value + 3.0 * sigma)[tail]))
             if true_value is not None:
-                low, high = min(low, float(true_value[j])), max(high, float(true_value[j]))
+                low, high = min(low, float(true_value[n])), max(high, float(true_value[n]))
             margin = 0.05 * (high - low) or 1.0
             ax.set_ylim(low - margin, high + margin)
-            name, unit = split_unit(component)
+            name, unit = split_unit(e.component_names[n])
             style(ax, label if i == len(rows) - 1 else "", "")
             ax.set_title(f"{name}, {unit}" if unit else name, fontsize=NORMAL, loc="left")
     handles = figure.axes[0]
@@ -128,7 +135,7 @@ def convergence_figure(
         legend += handles.plot([], [], color=DARK, lw=0.9, ls="--", label="truth")
     if np.isfinite(good_since):
         legend += handles.plot(
-            [], [], color=GREY, lw=0.9, ls=":", label=f"good enough, {good_since - start:.0f} s"
+            [], [], color=GREY, lw=0.9, ls=":", label="good enough from here on"
         )
     figure.legend(
         handles=legend,
