@@ -114,10 +114,12 @@ def convergence_figure(
                 ax.axhline(float(true_value[n]), color=DARK, lw=0.9, ls="--")
             if np.isfinite(good_since):
                 ax.axvline(good_since - start, color=GREY, lw=0.9, ls=":")
-            tail = slice(int(_SHOWN_FROM * x.size), None)
             # Before its sensor was heard a component has no estimate.
-            low = float(np.nanmin((value - 3.0 * sigma)[tail]))
-            high = float(np.nanmax((value + 3.0 * sigma)[tail]))
+            there = np.flatnonzero(np.isfinite(value))
+            tail = there[int(_SHOWN_FROM * there.size) :]
+            low = float((value - 3.0 * sigma)[tail].min())
+            high = float((value + 3.0 * sigma)[tail].max())
+            ax.set_xlim(x[0], x[-1] if x.size > 1 else x[0] + 1.0)
             if true_value is not None:
                 low, high = min(low, float(true_value[n])), max(high, float(true_value[n]))
             margin = 0.05 * (high - low) or 1.0
