@@ -96,6 +96,7 @@ def begin(trial: Trial, known: Known | None, interval: float, progress: Progress
     if not attitude < _ATTITUDE:
         return f"the attitude is known to {np.degrees(attitude):.2g} deg only"
     evaluation = minimum.evaluation
+    # The whole error, also what all states share: those to come will be linearised without it.
     feigned = feigned_information(problem, evaluation, covariances.nodes).sum(axis=0)
     last = problem.chain.segments.node_time.size - 1
     kept = [
