@@ -306,6 +306,15 @@ def test_echoes_are_named_and_lost_ranges_do_no_harm():
     assert rms[1] < max(1.3 * rms[0], 3.0)
 
 
+def test_a_range_at_the_very_end_but_for_rounding_is_no_step_of_its_own():
+    t = trial(**STRAIGHT)
+    b = t.beacons
+    ends = np.append(b.time[:-1], t.heading.time[-1] - 1e-12)
+    made = plan(replace(t, beacons=replace(b, time=ends)))
+    assert np.diff(made.problem.time).min() > 0.5
+    assert solve_planar(replace(t, beacons=replace(b, time=ends)), rate_hz=1.0).converged
+
+
 def test_too_few_ranges_are_no_position():
     t = trial()
     few = np.arange(t.beacons.time.size) < 4

@@ -16,6 +16,10 @@ from factorgraph_dvl.sensors.beacon import Beacons
 from factorgraph_dvl.sensors.protocol import Parameter
 from factorgraph_dvl.trial import InitialPosition, PlanarTrial
 
+# Times closer than this, s, are no two nodes: the information of a step between them has no
+# digits left for what the ranges tell.
+_LEAST_INTERVAL = 1e-3
+
 
 @dataclass(frozen=True)
 class Plan:
@@ -131,7 +135,8 @@ def problem_of(
             expected="ranges while the other sensors run",
             hint="Check that all clocks start together",
         )
-    time = np.union1d(beacons.time[rows], grid[[0, -1]])
+    ends = [t for t in grid[[0, -1]] if np.abs(beacons.time[rows] - t).min() > _LEAST_INTERVAL]
+    time = np.union1d(beacons.time[rows], ends)
     at = track.at(time)
     rate = np.gradient(arm_n, grid, axis=0)
 
@@ -147,7 +152,7 @@ def problem_of(
         mean = frame.position(*initial.geodetic)[:2]
         cov = np.diag(np.maximum(initial.std[:2], 1e-3) ** 2)
     names = list(s.positions)
-    dt = np.diff(time)
+    dt = np.maximum(np.diff(time), _LEAST_INTERVAL)
     share = np.minimum(dt, track.interval)
     psd = change_psd(track).reshape(grid.size, 4)
     middle = 0.5 * (time[1:] + time[:-1])

@@ -12,6 +12,7 @@ from factorgraph_dvl.conventions import DEG, Array
 from factorgraph_dvl.earth import LocalFrame
 from factorgraph_dvl.graph import Evaluation, Problem
 from factorgraph_dvl.priors import Known
+from factorgraph_dvl.sensors.beacon import Beacons
 from factorgraph_dvl.sensors.protocol import AttitudeAid, Parameter
 from factorgraph_dvl.solvers.batch import fit
 from factorgraph_dvl.solvers.covariance import posterior
@@ -86,15 +87,26 @@ def begin(trial: Trial, known: Known | None, interval: float, progress: Progress
     DataError, SolveError
         If the data collected so far cannot be solved.
     """
-    problem, minimum, notes = fit(
+    problem, minimum, notes, anchors = fit(
         trial, state_interval_s=STATE_INTERVAL, progress=progress, known=known
     )
+    if len(anchors.states) > 1:
+        return (
+            f"{len(anchors.states)} trajectories fit the ranges; a turn of 30 degrees or more, "
+            "or `initial.position`, would tell"
+        )
+    if anchors.notes:
+        return anchors.notes[0]
     if not minimum.converged:
         return "the solver did not converge"
     covariances = posterior(problem, minimum)
     attitude = float(np.sqrt(np.linalg.eigvalsh(covariances.nodes[-1][:3, :3])[-1]))
     if not attitude < _ATTITUDE:
         return f"the attitude is known to {np.degrees(attitude):.2g} deg only"
+    if trial.beacons is not None:
+        position = float(np.sqrt(np.linalg.eigvalsh(covariances.nodes[-1][3:6, 3:6])[-1]))
+        if not position < _straight(trial.beacons):
+            return f"the position is known to {position:.2g} m only"
     evaluation = minimum.evaluation
     # The whole error, also what all states share: those to come will be linearised without it.
     feigned = feigned_information(problem, evaluation, covariances.nodes).sum(axis=0)
@@ -129,6 +141,16 @@ def begin(trial: Trial, known: Known | None, interval: float, progress: Progress
         notes=notes,
         misfit=_misfit(problem, evaluation),
     )
+
+
+def _straight(beacons: Beacons) -> float:
+    """Return the standard deviation of a position, m, up to which ranges are linear in it.
+
+    A step s across the way to a beacon at a distance d changes it by s² / 2 d: here by the
+    standard deviation of a range.
+    """
+    nearest = float(np.nanmin(beacons.range, initial=np.inf))
+    return float(np.sqrt(2.0 * nearest * beacons.settings.range_std_m))
 
 
 def _own_states(trial: Trial, frame: LocalFrame, interval: float) -> tuple[str, ...]:
