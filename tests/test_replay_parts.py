@@ -374,13 +374,15 @@ def test_the_gate_doubts_innovations_that_are_too_large():
 def test_the_gate_leaves_out_echoes_one_by_one():
     gate = Gate()
     rng = np.random.default_rng(0)
-    normalised = rng.normal(size=(200, 1))
-    normalised[::10] = 40.0
-    for row in normalised:
-        used, message = gate.passes("range", row[None])
-        assert used.all() == (row[0] < 6.0)
+    normalised = np.where(rng.random(2000) < 0.2, 40.0, rng.normal(size=2000))
+    for value in normalised:
+        used, message = gate.passes("range", np.array([[value]]), 3.5)
+        assert used.all() == (abs(value) < 3.5)
         assert not message
     assert not gate.doubted
+    # A clock that has jumped is another matter.
+    messages = [gate.passes("range", np.array([[40.0]]), 3.5)[1] for _ in range(50)]
+    assert any("not used until" in text for text in messages)
 
 
 def test_a_missed_ping_is_no_silence():

@@ -346,7 +346,8 @@ class Navigator:
             there = np.isfinite(sigma[part])
             found = np.where(there, residual[part], np.nan).reshape(m, d)
             spread = np.where(there, total[part], np.nan).reshape(m, d)
-            used, message = self._gate.passes(r.observation.label, found / spread)
+            echoes = getattr(r.observation, "gate", None)
+            used, message = self._gate.passes(r.observation.label, found / spread, echoes)
             if message:
                 self.messages.append(message)
             weight[part] = (used[:, None] / sigma[part].reshape(m, d)).ravel()
@@ -376,7 +377,7 @@ class Navigator:
             own = weight[row : row + m * d].reshape(m, d)
             row += m * d
             wanted = [p for p in measured.parameters if p.name in r.observation.parameters]
-            used = np.count_nonzero(own.any(axis=1))
+            used = int(np.count_nonzero(own.any(axis=1)))
             if not wanted or not used:
                 continue
             label = r.observation.label
