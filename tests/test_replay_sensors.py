@@ -190,3 +190,11 @@ def test_no_start_while_a_mirror_image_fits_the_ranges():
     # Both tracks are one at first, of a position that is hardly known.
     assert any("the position is known to" in text for text in session.messages)
     assert any("2 trajectories fit the ranges" in text for text in session.messages)
+
+
+def test_a_beacon_out_of_reach_is_no_hindrance():
+    scene = config("dive-one-beacon", manoeuvres=TURNS, beacons={"outages_s": []})
+    trial = simulate(scene, 2)
+    late = replace(trial.beacons, time=trial.beacons.time + 1e4)
+    others = tuple(late if aid is trial.beacons else aid for aid in trial.others)
+    assert solve(replace(trial, others=others)).converged
