@@ -11,7 +11,7 @@ from factorgraph_dvl.conventions import Array, rotation_from_rph
 from factorgraph_dvl.earth import LocalFrame
 from factorgraph_dvl.errors import DataError
 from factorgraph_dvl.planar.model import PlanarProblem, Ranging
-from factorgraph_dvl.planar.track import LEAST_PSD, Track, change_psd, reckon
+from factorgraph_dvl.planar.track import LEAST_PSD, SLOPE_OVER, Track, change_psd, reckon
 from factorgraph_dvl.sensors.beacon import Beacons
 from factorgraph_dvl.sensors.protocol import Parameter
 from factorgraph_dvl.trial import InitialPosition, PlanarTrial
@@ -96,7 +96,13 @@ def plan(trial: PlanarTrial) -> Plan:
     level[:, 2] = track.heading
     arm_n = rotation_from_rph(level, trial.body_axes) @ arm
     return problem_of(
-        track, arm_n, trial.beacons, parameters, trial.frame(), trial.initial_position
+        track,
+        arm_n,
+        trial.beacons,
+        parameters,
+        trial.frame(),
+        trial.initial_position,
+        trial.depth.settings.std_m,
     )
 
 
@@ -107,6 +113,7 @@ def problem_of(
     parameters: tuple[Parameter, ...],
     frame: LocalFrame,
     initial: InitialPosition | None = None,
+    depth_std: float = 0.0,
 ) -> Plan:
     """Return the problem of a reckoned track with beacons.
 
@@ -118,6 +125,7 @@ def problem_of(
     parameters : constants with priors.
     frame : tangent frame.
     initial : prior of the first position, None if there is none.
+    depth_std : white noise of the height, m; its share in a range is the sine of the elevation.
 
     Raises
     ------
@@ -159,6 +167,12 @@ def problem_of(
     changing = np.stack([np.interp(middle, grid, column) for column in psd.T], axis=1)
     # What the noise at the ends of a step already accounts for.
     counted = share[:, None, None] ** 2 * at.velocity_cov[:-1]
+    node = np.searchsorted(time, beacons.time[rows])
+    beacon = np.array([names.index(name) for name in beacons.name[rows]])
+    place = frame.position(*places.T)
+    above = np.abs((at.height - frame.height)[node] - place[beacon, 2])
+    sine = np.clip(above / np.nan_to_num(beacons.range[rows], nan=reach), 0.0, 1.0)
+    climb_std = np.sqrt(2.0) * depth_std / SLOPE_OVER
     problem = PlanarProblem(
         time=time,
         step=np.diff(at.displacement, axis=0),
@@ -171,14 +185,14 @@ def problem_of(
         climb=at.climb,
         arm=on_nodes(arm_n),
         arm_velocity=on_nodes(rate),
-        place=frame.position(*places.T),
+        place=place,
         ranging=Ranging(
-            node=np.searchsorted(time, beacons.time[rows]),
-            beacon=np.array([names.index(name) for name in beacons.name[rows]]),
+            node=node,
+            beacon=beacon,
             range=beacons.range[rows],
             rate=beacons.range_rate[rows],
-            range_std=s.range_std_m,
-            rate_std=s.range_rate_std_m_s,
+            range_std=np.hypot(s.range_std_m, sine * depth_std),
+            rate_std=np.hypot(s.range_rate_std_m_s, sine * climb_std),
         ),
         parameters=parameters,
         start_mean=mean,
