@@ -22,7 +22,6 @@ from factorgraph_dvl.replay.factor import NodeMeasurements, Rows, measurement_fa
 from factorgraph_dvl.replay.gate import Gate
 from factorgraph_dvl.replay.smoother import Smoother
 from factorgraph_dvl.replay.start import Start
-from factorgraph_dvl.sensors.beacon import Beacons
 from factorgraph_dvl.sensors.imu import Imu
 from factorgraph_dvl.sensors.protocol import Aid, Motion, Parameter
 from factorgraph_dvl.solution import Trajectory
@@ -64,7 +63,7 @@ class Navigator:
             parameters=start.parameters,
             walking=start.walking,
             lag=lag,
-            ranges=Beacons.section in start.sections,
+            ranges=start.ranges,
         )
         self._prior_root = prior_root(start.parameters)
         self._feigned = start.feigned

@@ -12,7 +12,6 @@ from factorgraph_dvl.conventions import DEG, Array
 from factorgraph_dvl.earth import LocalFrame
 from factorgraph_dvl.graph import Evaluation, Problem
 from factorgraph_dvl.priors import Known
-from factorgraph_dvl.sensors.beacon import Beacons
 from factorgraph_dvl.sensors.protocol import AttitudeAid, Parameter
 from factorgraph_dvl.solvers.batch import fit
 from factorgraph_dvl.solvers.covariance import posterior
@@ -42,6 +41,7 @@ class Start:
     parameters, all_parameters : those that are estimated, and all.
     fixed : values of those that are not.
     sections : of the sensors that it knows.
+    ranges : whether there are any, to beacons.
     own_states : sections of the sensors whose every measurement needs a state of its own.
     windows : over which the IMU's samples are smoothed.
     feigned : (P, P) information on the parameters that only noise makes, in units of the
@@ -60,6 +60,7 @@ class Start:
     all_parameters: tuple[Parameter, ...]
     fixed: dict[str, Array]
     sections: tuple[str, ...]
+    ranges: bool
     own_states: tuple[str, ...]
     windows: tuple[int, int]
     feigned: Array
@@ -105,7 +106,7 @@ def begin(trial: Trial, known: Known | None, interval: float, progress: Progress
         return f"the attitude is known to {np.degrees(attitude):.2g} deg only"
     if trial.beacons is not None:
         position = float(np.sqrt(np.linalg.eigvalsh(covariances.nodes[-1][3:6, 3:6])[-1]))
-        if not position < _straight(trial.beacons):
+        if not position < _straight(trial.beacons.range, trial.beacons.settings.range_std_m):
             return f"the position is known to {position:.2g} m only"
     evaluation = minimum.evaluation
     # The whole error, also what all states share: those to come will be linearised without it.
@@ -134,6 +135,7 @@ def begin(trial: Trial, known: Known | None, interval: float, progress: Progress
             if not p.estimated
         },
         sections=tuple(aid.section for aid in trial.aids),
+        ranges=trial.beacons is not None,
         own_states=_own_states(trial, problem.chain.frame, interval),
         windows=problem.chain.segments.increments.chosen_windows,
         feigned=feigned,
@@ -143,14 +145,14 @@ def begin(trial: Trial, known: Known | None, interval: float, progress: Progress
     )
 
 
-def _straight(beacons: Beacons) -> float:
+def _straight(ranges: Array, std: float) -> float:
     """Return the standard deviation of a position, m, up to which ranges are linear in it.
 
     A step s across the way to a beacon at a distance d changes it by s² / 2 d: here by the
     standard deviation of a range.
     """
-    nearest = float(np.nanmin(beacons.range, initial=np.inf))
-    return float(np.sqrt(2.0 * nearest * beacons.settings.range_std_m))
+    nearest = float(np.nanmin(ranges, initial=np.inf))
+    return float(np.sqrt(2.0 * nearest * std))
 
 
 def _own_states(trial: Trial, frame: LocalFrame, interval: float) -> tuple[str, ...]:
