@@ -75,6 +75,11 @@ def anchored(trial: Trial, frame: LocalFrame, seg: Segments, states: States) -> 
     if first is None and trial.gnss is not None:
         geodetic = np.array(frame.geodetic(states.p_n[0]))
         first = InitialPosition(geodetic, np.full(3, _FIX))
+    heard = beacons.time[~beacons.missing]
+    if first is not None and not np.any(
+        (heard >= seg.node_time[0]) & (heard <= seg.node_time[-1])
+    ):
+        return Anchors((states,))
     made = _plan(trial, frame, seg, states, beacons, first)
     updates, searches = schedule(made.problem)
     found = follow(made.problem, updates, searches)

@@ -18,6 +18,8 @@ from factorgraph_dvl.replay import Replay, replay
 from factorgraph_dvl.report.live import live_view
 from factorgraph_dvl.sensors.protocol import rows_of
 from factorgraph_dvl.simulation import simulate
+from factorgraph_dvl.solvers.batch import minimised
+from factorgraph_dvl.solvers.feigned import feigned_information
 
 # 150 s with turns to both sides.
 MANOEUVRES = [
@@ -301,6 +303,25 @@ def test_what_a_straight_run_does_not_show_is_not_claimed():
     column = solution.order.index("misalignment_y_deg")
     assert record.std[:, column].min() > 60.0
     assert any("not observable" in w for w in solution.warnings)
+
+
+def test_what_noise_feigns_is_counted_at_whatever_rate_a_sensor_comes(trial):
+    seldom = rows_of(trial.dvl, np.arange(2, trial.dvl.time.size, 5))
+    early = replace(trial, imu=rows_of(trial.imu, trial.imu.time < 60.0), dvl=seldom)
+    session = Replay(early)
+    for aid in early.aids:
+        session.add(aid)
+    session.add_imu(early.imu.time, early.imu.gyro, early.imu.accel)
+    session.finish()
+    nav = session._navigator
+    found = minimised(early, state_interval_s=0.2)
+    by_node = feigned_information(
+        found.problem, found.minimum.evaluation, found.covariances.nodes
+    ).trace(axis1=1, axis2=2)
+    after = found.problem.chain.segments.node_time > nav.start.time
+    # The motion is known less well at the time than with hindsight.
+    grown = np.trace(nav.feigned - nav.start.feigned)
+    assert by_node[after].sum() < grown < 10.0 * by_node[after].sum()
 
 
 def test_what_never_starts_says_why():

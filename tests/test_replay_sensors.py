@@ -165,3 +165,36 @@ def test_a_sensor_that_is_first_heard_after_the_start(rows):
     else:
         dvl = replace(dvl, velocity=np.where(heard[:, None], dvl.velocity, np.nan))
     as_the_batch(replace(trial, dvl=dvl))
+
+
+def test_no_start_while_a_mirror_image_fits_the_ranges():
+    scene = config(
+        "dive-one-beacon",
+        start={"lat_deg": 24.995, "lon_deg": 134.997},
+        manoeuvres=[{"straight_s": 75}],
+        imu={
+            "gyro_bias_std_deg_h": 0.01,
+            "gyro_noise_deg_sqrt_h": 0.001,
+            "gyro_bias_walk_deg_h_sqrt_h": 0,
+            "accel_bias_std_ug": 50,
+            "accel_noise_ug_sqrt_hz": 10,
+        },
+        beacons={"rate_hz": 0.5, "missed": 0, "multipath": 0, "outages_s": []},
+    )
+    trial = replace(simulate(scene, 2), gnss=None)
+    session = Replay(trial, rate_hz=1.0)
+    for aid in trial.aids:
+        session.add(aid)
+    assert not session.add_imu(trial.imu.time, trial.imu.gyro, trial.imu.accel)
+    assert not session.started
+    # Both tracks are one at first, of a position that is hardly known.
+    assert any("the position is known to" in text for text in session.messages)
+    assert any("2 trajectories fit the ranges" in text for text in session.messages)
+
+
+def test_a_beacon_out_of_reach_is_no_hindrance():
+    scene = config("dive-one-beacon", manoeuvres=TURNS, beacons={"outages_s": []})
+    trial = simulate(scene, 2)
+    late = replace(trial.beacons, time=trial.beacons.time + 1e4)
+    others = tuple(late if aid is trial.beacons else aid for aid in trial.others)
+    assert solve(replace(trial, others=others)).converged

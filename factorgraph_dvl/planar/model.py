@@ -44,15 +44,15 @@ class Ranging:
     node : (M,) index of the node of each, not decreasing.
     beacon : (M,) index of the beacon.
     range, rate : (M,) m, m/s; nan where not measured.
-    range_std, rate_std : of each, m, m/s.
+    range_std, rate_std : (M,) of each, m, m/s, with what the noise of the depth does to it.
     """
 
     node: NDArray[np.intp]
     beacon: NDArray[np.intp]
     range: Array
     rate: Array
-    range_std: float
-    rate_std: float
+    range_std: Array
+    rate_std: Array
 
 
 @dataclass(frozen=True)
@@ -240,20 +240,21 @@ def evaluate(problem: PlanarProblem, x: Array, theta: Array) -> Evaluation:
         range_theta[own, place] = -scale * direction[own]
         rate_theta[own, place] = -scale * across[own]
 
-    rate_residual = (scale * speed - r.rate[:rows]) / r.rate_std
-    flat = scale * direction[:, :2] / r.rate_std
+    range_std, rate_std = r.range_std[:rows], r.rate_std[:rows]
+    rate_residual = (scale * speed - r.rate[:rows]) / rate_std
+    flat = scale * direction[:, :2] / rate_std[:, None]
     alone = rate_residual + np.sum(flat * x[node, 2:], axis=1)
     spread = 1.0 + np.einsum("mi,mij,mj->m", flat, problem.velocity_cov[node], flat)
     range_x = np.column_stack([scale * direction[:, :2], np.zeros((rows, 2))])
     rate_x = np.column_stack([scale * across[:, :2], -scale * direction[:, :2]])
     return Evaluation(
-        (scale * distance - r.range[:rows]) / r.range_std,
+        (scale * distance - r.range[:rows]) / range_std,
         rate_residual,
         alone / np.sqrt(spread),
-        range_x / r.range_std,
-        rate_x / r.rate_std,
-        range_theta / r.range_std,
-        rate_theta / r.rate_std,
+        range_x / range_std[:, None],
+        rate_x / rate_std[:, None],
+        range_theta / range_std[:, None],
+        rate_theta / rate_std[:, None],
     )
 
 

@@ -11,10 +11,14 @@ from factorgraph_dvl.conventions import Array, rotation_from_rph
 from factorgraph_dvl.earth import LocalFrame
 from factorgraph_dvl.errors import DataError
 from factorgraph_dvl.planar.model import PlanarProblem, Ranging
-from factorgraph_dvl.planar.track import LEAST_PSD, Track, change_psd, reckon
+from factorgraph_dvl.planar.track import LEAST_PSD, SLOPE_OVER, Track, change_psd, reckon
 from factorgraph_dvl.sensors.beacon import Beacons
 from factorgraph_dvl.sensors.protocol import Parameter
 from factorgraph_dvl.trial import InitialPosition, PlanarTrial
+
+# Times closer than this, s, are no two nodes: the information of a step between them has no
+# digits left for what the ranges tell.
+_LEAST_INTERVAL = 1e-3
 
 
 @dataclass(frozen=True)
@@ -92,7 +96,13 @@ def plan(trial: PlanarTrial) -> Plan:
     level[:, 2] = track.heading
     arm_n = rotation_from_rph(level, trial.body_axes) @ arm
     return problem_of(
-        track, arm_n, trial.beacons, parameters, trial.frame(), trial.initial_position
+        track,
+        arm_n,
+        trial.beacons,
+        parameters,
+        trial.frame(),
+        trial.initial_position,
+        trial.depth.settings.std_m,
     )
 
 
@@ -103,6 +113,7 @@ def problem_of(
     parameters: tuple[Parameter, ...],
     frame: LocalFrame,
     initial: InitialPosition | None = None,
+    depth_std: float = 0.0,
 ) -> Plan:
     """Return the problem of a reckoned track with beacons.
 
@@ -114,6 +125,7 @@ def problem_of(
     parameters : constants with priors.
     frame : tangent frame.
     initial : prior of the first position, None if there is none.
+    depth_std : white noise of the height, m; its share in a range is the sine of the elevation.
 
     Raises
     ------
@@ -131,7 +143,8 @@ def problem_of(
             expected="ranges while the other sensors run",
             hint="Check that all clocks start together",
         )
-    time = np.union1d(beacons.time[rows], grid[[0, -1]])
+    ends = [t for t in grid[[0, -1]] if np.abs(beacons.time[rows] - t).min() > _LEAST_INTERVAL]
+    time = np.union1d(beacons.time[rows], ends)
     at = track.at(time)
     rate = np.gradient(arm_n, grid, axis=0)
 
@@ -147,13 +160,19 @@ def problem_of(
         mean = frame.position(*initial.geodetic)[:2]
         cov = np.diag(np.maximum(initial.std[:2], 1e-3) ** 2)
     names = list(s.positions)
-    dt = np.diff(time)
+    dt = np.maximum(np.diff(time), _LEAST_INTERVAL)
     share = np.minimum(dt, track.interval)
     psd = change_psd(track).reshape(grid.size, 4)
     middle = 0.5 * (time[1:] + time[:-1])
     changing = np.stack([np.interp(middle, grid, column) for column in psd.T], axis=1)
     # What the noise at the ends of a step already accounts for.
     counted = share[:, None, None] ** 2 * at.velocity_cov[:-1]
+    node = np.searchsorted(time, beacons.time[rows])
+    beacon = np.array([names.index(name) for name in beacons.name[rows]])
+    place = frame.position(*places.T)
+    above = np.abs((at.height - frame.height)[node] - place[beacon, 2])
+    sine = np.clip(above / np.nan_to_num(beacons.range[rows], nan=reach), 0.0, 1.0)
+    climb_std = np.sqrt(2.0) * depth_std / SLOPE_OVER
     problem = PlanarProblem(
         time=time,
         step=np.diff(at.displacement, axis=0),
@@ -166,14 +185,14 @@ def problem_of(
         climb=at.climb,
         arm=on_nodes(arm_n),
         arm_velocity=on_nodes(rate),
-        place=frame.position(*places.T),
+        place=place,
         ranging=Ranging(
-            node=np.searchsorted(time, beacons.time[rows]),
-            beacon=np.array([names.index(name) for name in beacons.name[rows]]),
+            node=node,
+            beacon=beacon,
             range=beacons.range[rows],
             rate=beacons.range_rate[rows],
-            range_std=s.range_std_m,
-            rate_std=s.range_rate_std_m_s,
+            range_std=np.hypot(s.range_std_m, sine * depth_std),
+            rate_std=np.hypot(s.range_rate_std_m_s, sine * climb_std),
         ),
         parameters=parameters,
         start_mean=mean,

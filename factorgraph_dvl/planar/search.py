@@ -83,8 +83,9 @@ class _Seek:
         lost = problem.step_cov + problem.share[:, None, None] ** 2 * problem.velocity_cov[1:]
         wander = np.concatenate([[0.0], np.cumsum(np.trace(lost, axis1=1, axis2=2))])
         slack = self._slack(problem) * np.nan_to_num(self.range)
-        self.range_std = np.sqrt(r.range_std**2 + 0.5 * wander[node] + slack**2)
-        rate_var = r.rate_std**2 + 0.5 * np.trace(problem.velocity_cov[node], axis1=1, axis2=2)
+        self.range_std = np.sqrt(r.range_std[rows] ** 2 + 0.5 * wander[node] + slack**2)
+        rate_var = r.rate_std[rows] ** 2
+        rate_var = rate_var + 0.5 * np.trace(problem.velocity_cov[node], axis1=1, axis2=2)
         self.rate_std = np.sqrt(rate_var)
         drifts = "current" in problem.columns
         self.prior_sigma = problem.prior_sigma[problem.columns["current"]] if drifts else zero[:0]

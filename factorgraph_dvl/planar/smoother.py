@@ -133,8 +133,7 @@ def residuals(problem: PlanarProblem, solution: Fit) -> tuple[Array, Array, Arra
     """Return residuals of ranges (m,) and rates (m,), predicted - measured, and their sigmas."""
     at = evaluate(problem, solution.x, solution.theta)
     rows = at.range_residual.size
-    range_std = np.full(rows, problem.ranging.range_std)
-    rate_std = np.full(rows, problem.ranging.rate_std)
+    range_std, rate_std = problem.ranging.range_std[:rows], problem.ranging.rate_std[:rows]
     return at.range_residual * range_std, at.rate_residual * rate_std, range_std, rate_std
 
 

@@ -16,6 +16,9 @@ _BAD = 0.3
 _GOOD = 0.05
 _LAST = 50
 _LEAST = 10
+# The same shares where single measurements may be none, as the range of an echo.
+_BAD_ECHOES = 0.6
+_GOOD_ECHOES = 0.4
 # Root mean square of the last normalised innovations from which they are doubted, not used,
 # and believed again. That of 50 honest ones exceeds 1.3 once in 1e6.
 _DOUBT = 1.5
@@ -39,7 +42,9 @@ class Gate:
         self.shut: set[str] = set()
         self.refused: dict[str, int] = {}
 
-    def passes(self, label: str, normalised: Array) -> tuple[np.ndarray, str]:
+    def passes(
+        self, label: str, normalised: Array, echoes: float | None = None
+    ) -> tuple[np.ndarray, str]:
         """Return which of M measurements are used, and a message if that changes.
 
         Parameters
@@ -47,17 +52,23 @@ class Gate:
         label : of the kind.
         normalised : (M, d) innovations over their standard deviations; nan where a component
             was not measured.
+        echoes : standard deviations beyond which a measurement of this kind is none, if
+            single ones may be; None if not.
         """
         last = self._last.setdefault(label, deque(maxlen=_LAST))
-        beyond = np.any(np.abs(normalised) >= _BEYOND, axis=1)
+        limit = _BEYOND if echoes is None else echoes
+        beyond = np.any(np.abs(normalised) >= limit, axis=1)
         squares = np.nanmean(normalised**2, axis=1)
         last.extend(zip(beyond.tolist(), squares.tolist(), strict=True))
-        message = self._judge(label, last)
+        message = self._judge(label, last, limit, echoes is not None)
         used = np.zeros_like(beyond) if label in self.shut else ~beyond
         self.refused[label] = self.refused.get(label, 0) + int((~used).sum())
         return used, message
 
-    def _judge(self, label: str, last: deque[tuple[bool, float]]) -> str:
+    def _judge(
+        self, label: str, last: deque[tuple[bool, float]], limit: float, echoes: bool
+    ) -> str:
+        good, bad = (_GOOD_ECHOES, _BAD_ECHOES) if echoes else (_GOOD, _BAD)
         count = sum(beyond for beyond, _ in last)
         share = count / len(last)
         # Single ones that are beyond are left out one by one.
@@ -65,28 +76,28 @@ class Gate:
         rms = float(np.sqrt(np.mean(within))) if within else np.inf
         full = len(last) == _LAST
         if label in self.doubted:
-            if full and share <= _GOOD and rms < _BELIEVE:
+            if full and share <= good and rms < _BELIEVE:
                 self.doubted.discard(label)
                 self.shut.discard(label)
                 return f"{label}: agrees with the prediction again"
         elif full and rms > _DOUBT:
             self.doubted.add(label)
-            if rms <= _SHUT and share <= _BAD:
+            if rms <= _SHUT and share <= bad:
                 return (
                     f"{label}: the last {_LAST} differ from the prediction by {rms:.1f} times "
                     "what is stated; the standard deviations are too small. A clock that has "
                     "jumped, a time offset or a sensor that fails looks like this"
                 )
         if label not in self.shut and (
-            (len(last) >= _LEAST and share > _BAD) or (full and rms > _SHUT)
+            (len(last) >= _LEAST and share > bad) or (full and rms > _SHUT)
         ):
             self.doubted.add(label)
             self.shut.add(label)
             what = f"the last {_LAST} differ from the prediction by {rms:.1f} times what is stated"
-            if share > _BAD:
+            if share > bad:
                 what = (
                     f"{count} of the last {len(last)} contradict the prediction by more than "
-                    f"{_BEYOND:g} standard deviations"
+                    f"{limit:g} standard deviations"
                 )
             return (
                 f"{label}: {what}; not used until they agree. A clock that has jumped, or a "

@@ -31,6 +31,8 @@ from factorgraph_dvl.solvers.feigned import directions_not_told, feigned_by
 _NEAR = 100.0
 # Keeps the walk of a bias that does not walk regular.
 _LEAST_WALK = 1e-12
+# Time after which it is worked out anew what the motion's error feigns, s.
+_FEIGNED_EVERY = 1.0
 _STATE = 9
 
 
@@ -61,10 +63,13 @@ class Navigator:
             parameters=start.parameters,
             walking=start.walking,
             lag=lag,
+            ranges=start.ranges,
         )
         self._prior_root = prior_root(start.parameters)
         self._feigned = start.feigned
-        self._feigned_at = start.time
+        # By kind: when it was last worked out, and how many were used since.
+        self._feigned_at: dict[str, float] = {}
+        self._not_counted: dict[str, int] = {}
         self._near = np.full(3, np.inf)
         self._segments: dict[int, tuple[Segments, Array]] = {}
         self.innovations: list[Innovations] = []
@@ -113,6 +118,11 @@ class Navigator:
     def held(self) -> Array:
         """Directions of the parameters that are not observable, as `feigned_directions`."""
         return self._held
+
+    @property
+    def feigned(self) -> Array:
+        """Information that only noise makes, (P, P), as `Start.feigned`."""
+        return self._feigned
 
     @property
     def parameter_covariance(self) -> Array:
@@ -283,8 +293,7 @@ class Navigator:
             residual, matrix, motions = measured.linearize(states, self._values)
         sigma = measured.sigma(motions, self._values)
         weight = self._weigh(measured, residual, matrix, sigma)
-        if k == self.smoother.node and self.time - self._feigned_at >= 1.0:
-            self._feign(measured, motions, weight)
+        self._feign(measured, motions, weight)
         if not weight.any():
             return None
         s = self.smoother
@@ -338,7 +347,8 @@ class Navigator:
             there = np.isfinite(sigma[part])
             found = np.where(there, residual[part], np.nan).reshape(m, d)
             spread = np.where(there, total[part], np.nan).reshape(m, d)
-            used, message = self._gate.passes(r.observation.label, found / spread)
+            echoes = getattr(r.observation, "gate", None)
+            used, message = self._gate.passes(r.observation.label, found / spread, echoes)
             if message:
                 self.messages.append(message)
             weight[part] = (used[:, None] / sigma[part].reshape(m, d)).ravel()
@@ -349,11 +359,13 @@ class Navigator:
         return weight
 
     def _feign(self, measured: NodeMeasurements, motions: Sequence[Motion], weight: Array) -> None:
-        """Add the information that the motion's error feigns since it was last done."""
-        now = self.time
-        per_second = now - self._feigned_at
-        self._feigned_at = now
-        duration = float(self._segments[self.smoother.node][0].duration[0])
+        """Add the information that the motion's error feigns.
+
+        It is worked out for some measurements of each kind, once a second, and counts for
+        all that were used since: kinds come at rates of their own, and late. The error is
+        the whole one, not what is left where the parameters are known: each state is
+        linearised at what was known then, so an error that all states share changes too.
+        """
         start = {}
         at = 0
         for p in self.start.parameters:
@@ -366,7 +378,13 @@ class Navigator:
             own = weight[row : row + m * d].reshape(m, d)
             row += m * d
             wanted = [p for p in measured.parameters if p.name in r.observation.parameters]
-            if not wanted:
+            used = int(np.count_nonzero(own.any(axis=1)))
+            if not wanted or not used:
+                continue
+            label = r.observation.label
+            count = self._not_counted.get(label, 0) + used
+            self._not_counted[label] = count
+            if self.time - self._feigned_at.get(label, self.start.time) < _FEIGNED_EVERY:
                 continue
             columns = np.concatenate([start[p.name] + np.arange(p.mean.size) for p in wanted])
             part = feigned_by(
@@ -379,8 +397,9 @@ class Navigator:
                 [p.name for p in wanted],
             )
             root = self._prior_root[columns]
-            self._feigned += root.T @ part.sum(axis=0) @ root * max(per_second / duration, 1.0)
-        self._held = self._not_observable()
+            self._feigned = self._feigned + root.T @ part.sum(axis=0) @ root * (count / used)
+            self._feigned_at[label], self._not_counted[label] = self.time, 0
+            self._held = self._not_observable()
 
     def _not_observable(self) -> Array:
         size = len(self._prior_root)

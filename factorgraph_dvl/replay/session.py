@@ -207,8 +207,11 @@ class Replay:
         while True:
             began = perf_counter()
             if self._navigator is None:
-                solved = self._start(end=end)
-                if not solved:
+                before = self._attempt
+                if not self._start(end=end):
+                    arrived = self._samples.newest - self._samples.delay
+                    if self._attempt != before and arrived >= self._attempt:
+                        continue
                     break
                 out.append(self._update(began, solved=True, end=end))
                 continue

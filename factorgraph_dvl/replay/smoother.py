@@ -20,8 +20,10 @@ from factorgraph_dvl.sensors.protocol import Parameter
 from factorgraph_dvl.solvers.covariance import SquareRootInformation
 from factorgraph_dvl.solvers.levenberg_marquardt import eliminate
 
-# Steps after which a state is linearised anew: rad, m, m/s. Position enters linearly.
+# Steps after which a state is linearised anew: rad, m, m/s. Position enters linearly, but in
+# ranges: at 10 m from a beacon that last step changes one by 0.2 m more than it should.
 _STATE_STEP = np.repeat([1e-3, 1e2, 0.05], 3)
+_POSITION_STEP_BY_RANGES = 2.0
 # Preintegration is linear in the biases.
 _BIAS_STEP = np.full(6, 1e2)
 # In units of SI: a rotation, or what multiplies a velocity.
@@ -46,6 +48,7 @@ class Smoother:
     parameters : that are estimated, in the order of `keys.calibration`.
     walking : whether every state has a bias of its own.
     lag : s, after which states are marginalised; None = never.
+    ranges : whether there are ranges, which are not linear in the position.
     """
 
     def __init__(
@@ -58,6 +61,7 @@ class Smoother:
         parameters: Sequence[Parameter],
         walking: bool,
         lag: float | None,
+        ranges: bool = False,
     ) -> None:
         self.parameters = tuple(parameters)
         self.calibration_keys = [keys.calibration(i) for i in range(len(self.parameters))]
@@ -66,7 +70,11 @@ class Smoother:
         self._walking = walking
         self._lag = lag
         self._checked = time
-        self._isam = gtsam.ISAM2(_settings(self.parameters, fixed=lag is not None))
+        self._state_step = _STATE_STEP.copy()
+        if ranges:
+            self._state_step[3:6] = _POSITION_STEP_BY_RANGES
+        settings = _settings(self.parameters, self._state_step, fixed=lag is not None)
+        self._isam = gtsam.ISAM2(settings)
         self._sizes = {key: int(size) for key, size in values.dims().items()}
         self._update(prior, values, node)
 
@@ -210,7 +218,7 @@ class Smoother:
             key = keys.node(k)
             if (
                 delta.exists(key)
-                and np.any(np.abs(delta.at(key)) > _STATE_STEP)
+                and np.any(np.abs(delta.at(key)) > self._state_step)
                 and not fixed.count(key)
             ):
                 return k
@@ -228,7 +236,9 @@ class Smoother:
             del self._sizes[keys.bias(k)]
 
 
-def _settings(parameters: Sequence[Parameter], *, fixed: bool) -> gtsam.ISAM2Params:
+def _settings(
+    parameters: Sequence[Parameter], state_step: Array, *, fixed: bool
+) -> gtsam.ISAM2Params:
     settings = gtsam.ISAM2Params()
     # Cholesky has no digits left at navigation grade.
     settings.setFactorization("QR")
@@ -237,7 +247,7 @@ def _settings(parameters: Sequence[Parameter], *, fixed: bool) -> gtsam.ISAM2Par
     # Without it the list of factors grows for ever.
     settings.findUnusedFactorSlots = True
     thresholds = gtsam.ISAM2ThresholdMap()
-    thresholds.insert(("x", _STATE_STEP))
+    thresholds.insert(("x", state_step))
     thresholds.insert(("b", _BIAS_STEP))
     for i, p in enumerate(parameters):
         step = _NEVER if fixed else _CALIBRATION_STEP

@@ -41,6 +41,7 @@ class Start:
     parameters, all_parameters : those that are estimated, and all.
     fixed : values of those that are not.
     sections : of the sensors that it knows.
+    ranges : whether there are any, to beacons.
     own_states : sections of the sensors whose every measurement needs a state of its own.
     windows : over which the IMU's samples are smoothed.
     feigned : (P, P) information on the parameters that only noise makes, in units of the
@@ -59,6 +60,7 @@ class Start:
     all_parameters: tuple[Parameter, ...]
     fixed: dict[str, Array]
     sections: tuple[str, ...]
+    ranges: bool
     own_states: tuple[str, ...]
     windows: tuple[int, int]
     feigned: Array
@@ -86,16 +88,28 @@ def begin(trial: Trial, known: Known | None, interval: float, progress: Progress
     DataError, SolveError
         If the data collected so far cannot be solved.
     """
-    problem, minimum, notes = fit(
+    problem, minimum, notes, anchors = fit(
         trial, state_interval_s=STATE_INTERVAL, progress=progress, known=known
     )
+    if len(anchors.states) > 1:
+        return (
+            f"{len(anchors.states)} trajectories fit the ranges; a turn of 30 degrees or more, "
+            "or `initial.position`, would tell"
+        )
+    if anchors.notes:
+        return anchors.notes[0]
     if not minimum.converged:
         return "the solver did not converge"
     covariances = posterior(problem, minimum)
     attitude = float(np.sqrt(np.linalg.eigvalsh(covariances.nodes[-1][:3, :3])[-1]))
     if not attitude < _ATTITUDE:
         return f"the attitude is known to {np.degrees(attitude):.2g} deg only"
+    if trial.beacons is not None:
+        position = float(np.sqrt(np.linalg.eigvalsh(covariances.nodes[-1][3:6, 3:6])[-1]))
+        if not position < _straight(trial.beacons.range, trial.beacons.settings.range_std_m):
+            return f"the position is known to {position:.2g} m only"
     evaluation = minimum.evaluation
+    # The whole error, also what all states share: those to come will be linearised without it.
     feigned = feigned_information(problem, evaluation, covariances.nodes).sum(axis=0)
     last = problem.chain.segments.node_time.size - 1
     kept = [
@@ -121,6 +135,7 @@ def begin(trial: Trial, known: Known | None, interval: float, progress: Progress
             if not p.estimated
         },
         sections=tuple(aid.section for aid in trial.aids),
+        ranges=trial.beacons is not None,
         own_states=_own_states(trial, problem.chain.frame, interval),
         windows=problem.chain.segments.increments.chosen_windows,
         feigned=feigned,
@@ -128,6 +143,16 @@ def begin(trial: Trial, known: Known | None, interval: float, progress: Progress
         notes=notes,
         misfit=_misfit(problem, evaluation),
     )
+
+
+def _straight(ranges: Array, std: float) -> float:
+    """Return the standard deviation of a position, m, up to which ranges are linear in it.
+
+    A step s across the way to a beacon at a distance d changes it by s² / 2 d: here by the
+    standard deviation of a range.
+    """
+    nearest = float(np.nanmin(ranges, initial=np.inf))
+    return float(np.sqrt(2.0 * nearest * std))
 
 
 def _own_states(trial: Trial, frame: LocalFrame, interval: float) -> tuple[str, ...]:

@@ -22,7 +22,7 @@ from factorgraph_dvl.planar.evidence import odds_against
 from factorgraph_dvl.preintegration import Segments, States, attach, motion_at, segments
 from factorgraph_dvl.priors import Known
 from factorgraph_dvl.sensors.protocol import Aid, Motion, Observation, Parameter
-from factorgraph_dvl.solution import Solution, joined
+from factorgraph_dvl.solution import Solution, ambiguity, joined
 from factorgraph_dvl.solvers.covariance import Posterior, changes_with, considered, posterior
 from factorgraph_dvl.solvers.feigned import at_prior_along, told_of
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, Progress, minimise
@@ -134,7 +134,7 @@ def minimised(
 ) -> Minimised:
     """Minimise the problem of a trial; arguments and errors as of `solve`."""
     report = progress or (lambda stage, iteration, cost: None)
-    problem, minimum, notes = fit(trial, state_interval_s=state_interval_s, progress=report)
+    problem, minimum, notes, _ = fit(trial, state_interval_s=state_interval_s, progress=report)
     return _described(problem, minimum, notes, report)
 
 
@@ -177,7 +177,7 @@ def _cost_terms(found: Minimised) -> Array:
 
 def fit(
     trial: Trial, *, state_interval_s: float, progress: Progress, known: Known | None = None
-) -> tuple[Problem, Minimum, tuple[str, ...]]:
+) -> tuple[Problem, Minimum, tuple[str, ...], Anchors]:
     """Find the minimum of a trial's cost, from nothing but its data.
 
     Parameters
@@ -189,11 +189,13 @@ def fit(
     Returns
     -------
     problem, minimum, notes : what was minimised, where it ended, what the user must know.
+    anchors : where it may have begun; it did at the first.
     """
     prepared = _prepare(trial, state_interval_s, progress)
     states = prepared.anchors.states[0]
     problem, minimum = _descended(prepared, states, progress, known)
-    return problem, minimum, prepared.notes
+    notes = (*prepared.notes, *ambiguity(prepared.anchors.hypotheses))
+    return problem, minimum, notes, prepared.anchors
 
 
 def _prepare(trial: Trial, state_interval_s: float, report: Progress) -> _Prepared:
