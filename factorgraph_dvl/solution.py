@@ -344,11 +344,11 @@ def joined(
 
 
 def mostly_rejected(used: Sequence[Residuals], rejected: Sequence[Residuals]) -> list[str]:
-    """Return a warning for each kind of measurement of which most were rejected."""
+    """Return a warning for each kind of measurement of which over a third were rejected."""
     kept = {r.label: r.time.size for r in used}
     return [
         f"{r.label}: {r.time.size} of {r.time.size + kept.get(r.label, 0)} were rejected as "
         "echoes: a place, a clock, a unit or a standard deviation may be wrong"
         for r in rejected
-        if r.time.size > kept.get(r.label, 0)
+        if 2 * r.time.size > kept.get(r.label, 0)
     ]

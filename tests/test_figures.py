@@ -299,6 +299,17 @@ def titles(figure: Figure) -> list[str]:
     return [title for ax in figure.axes if (title := ax.get_title(loc="left"))]
 
 
+def test_what_nobody_measured_is_not_drawn(short: tuple[Trial, Solution]) -> None:
+    track = short[1].trajectory
+    rph, cov = track.rph.copy(), track.rph_cov.copy()
+    rph[:, :2], cov[:, :2, :2] = 0.0, np.nan
+    labels = [
+        a.get_ylabel() for a in motion_figure(replace(track, rph=rph, rph_cov=cov), None).axes
+    ]
+    assert "heading, deg" in labels
+    assert not {"roll, deg", "pitch, deg"} & set(labels)
+
+
 def test_a_swing_too_fast_for_the_whole_time_is_drawn_close_up(
     short: tuple[Trial, Solution], tmp_path: Path
 ) -> None:

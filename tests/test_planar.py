@@ -11,6 +11,7 @@ import pytest
 from builders import edit
 from truth import CONFIGS, merged
 
+from factorgraph_dvl.analysis.planar_survey import survey_planar
 from factorgraph_dvl.cli import main
 from factorgraph_dvl.errors import ConfigError, DataError, FactorgraphDvlError, SolveError
 from factorgraph_dvl.io.planar_folder import is_planar, load_planar_trial, save_planar_trial
@@ -22,10 +23,12 @@ from factorgraph_dvl.planar.evidence import evidence, odds_against
 from factorgraph_dvl.planar.model import GATE, evaluate, misfit, terms
 from factorgraph_dvl.planar.problem import plan, reckoned
 from factorgraph_dvl.planar.ridge import shares_of, stations
+from factorgraph_dvl.planar.sanity import implausible
 from factorgraph_dvl.planar.smoother import covariance, fit
 from factorgraph_dvl.planar.solve import solve_planar
 from factorgraph_dvl.planar.track import change_psd
 from factorgraph_dvl.simulation import parse_scenario, simulate, simulate_planar
+from factorgraph_dvl.solution import Residuals, mostly_rejected
 
 SEEDS = int(os.environ.get("FACTORGRAPH_DVL_SEEDS", "20"))
 _BASE = {
@@ -379,6 +382,85 @@ def test_files_and_commands(tmp_path, capsys):
     assert run(*wrong) == 2
 
 
+def test_more_than_a_third_of_echoes_is_doubtful():
+    def some(n):
+        return (
+            Residuals("Beacon B1 range", "m", ("range",), *np.ones((1, n)), *np.ones((2, n, 1))),
+        )
+
+    assert not mostly_rejected(some(80), some(20))
+    assert "40 of 100 were rejected" in mostly_rejected(some(60), some(40))[0]
+
+
+def without(record, first, last):
+    """Return the record of heading or log without what lies between two times."""
+    kept = (record.time <= first) | (record.time >= last)
+    name = "heading" if record.label == "Heading" else "speed"
+    out = {"time": record.time[kept], name: getattr(record, name)[kept]}
+    if name == "speed":
+        out["starboard"] = record.starboard[kept]
+    return replace(record, **out)
+
+
+def test_implausible_records_are_named():
+    t = trial()
+    assert not list(implausible(t))
+    place = {"B1": {"lat_deg": 25.0, "lon_deg": 135.0, "height_m": 80}}
+    above = simulate_planar(parse_scenario(merged(_BASE, {"beacons": {"positions": place}})), 0)
+    for wrong, label, says in (
+        (replace(t, heading=without(t.heading, 140, 180)), "Heading", "1 gap from 140 to 180 s"),
+        (replace(t, log=without(t.log, 20, 50)), "Log", "1 gap from 20 to 50 s"),
+        (
+            replace(t, heading=replace(t.heading, heading=t.heading.heading * np.pi / 180)),
+            "Heading",
+            "radians",
+        ),
+        (replace(t, log=replace(t.log, speed=-t.log.speed)), "Log", "astern"),
+        (replace(t, log=replace(t.log, speed=0.0 * t.log.speed)), "Log", "a circle"),
+        (replace(t, depth=replace(t.depth, depth=-t.depth.depth)), "Depth", "positive down"),
+        (above, "Beacon", "B1 is 80 m above the sea surface"),
+    ):
+        ((found, text),) = implausible(wrong)
+        assert found == label
+        assert says in text
+
+
+def test_a_gap_is_no_secret():
+    t = trial()
+    solution = solve_planar(replace(t, heading=without(t.heading, 140, 180)), rate_hz=1.0)
+    assert any(w.startswith("Heading: 1 gap from 140 to 180 s") for w in solution.warnings)
+
+
+def test_clocks_that_do_not_fit_are_refused():
+    t = trial()
+    late = replace(t, beacons=replace(t.beacons, time=t.beacons.time + 1e5))
+    with pytest.raises(DataError, match=r"1 to 315 s: they are from 100001 to 100315 s"):
+        plan(late)
+    with pytest.raises(DataError, match=r"one value every 1000 s; expected .* 60 s apart"):
+        plan(replace(t, heading=replace(t.heading, time=1e3 * t.heading.time)))
+    nothing = np.full(t.beacons.time.size, np.nan)
+    empty = replace(t, beacons=replace(t.beacons, range=nothing, range_rate=nothing))
+    with pytest.raises(DataError, match="no range and no range rate"):
+        plan(empty)
+    with pytest.raises(SolveError, match="0 ranges are too few"):
+        solve_planar(replace(t, beacons=replace(t.beacons, range=nothing)))
+
+
+def test_inspect_knows_planar_trials(tmp_path, capsys):
+    t = trial()
+    save_planar_trial(replace(t, heading=without(t.heading, 140, 180)), tmp_path / "t")
+    with pytest.raises(SystemExit) as exit_info:
+        main(["inspect", str(tmp_path / "t")])
+    out = capsys.readouterr().out
+    assert exit_info.value.code == 0
+    for text in ("Heading", "Log", "Depth", "Beacon", "speed 1.", "warning: Heading: 1 gap"):
+        assert text in out
+    late = replace(t, beacons=replace(t.beacons, time=t.beacons.time + 1e5))
+    (finding,) = survey_planar(late).problems
+    assert finding.severity == "error"
+    assert "do not overlap" in finding.text
+
+
 def test_hypotheses_are_written(tmp_path, capsys):
     save_planar_trial(trial(7, **STRAIGHT), tmp_path / "t")
     with pytest.raises(SystemExit) as exit_info:
@@ -398,6 +480,12 @@ def test_hypotheses_are_written(tmp_path, capsys):
     [
         ("trial.yaml", "heading: {", "headings: {", "unknown key `headings`"),
         ("trial.yaml", "reference: water", "reference: air", "expected water or bottom"),
+        (
+            "trial.yaml",
+            "sound_speed_error_std: 0.0",
+            "sound_speed_error_std: 1500",
+            "expected a number <= 0.5",
+        ),
         ("log.csv", "speed_m_s", "speed", "missing column speed_m_s"),
         ("heading.csv", "time_s,heading_deg\n0,", "time_s,heading_deg\n0,9", "out of range"),
     ],

@@ -8,16 +8,22 @@ from factorgraph_dvl.cli.options import TrialPath
 
 def inspect(trial_path: TrialPath) -> None:
     """Show what a trial holds, and check its units and signs."""
+    from factorgraph_dvl.analysis.planar_survey import survey_planar
     from factorgraph_dvl.analysis.survey import survey
+    from factorgraph_dvl.io.planar_folder import is_planar, load_planar_trial
     from factorgraph_dvl.io.trial_folder import load_trial
     from factorgraph_dvl.report.tables import finding_lines, motion_line, sensor_table
 
-    trial = load_trial(trial_path)
-    result = survey(trial)
+    if is_planar(trial_path):
+        planar = load_planar_trial(trial_path)
+        result, notes = survey_planar(planar), planar.notes
+    else:
+        trial = load_trial(trial_path)
+        result, notes = survey(trial), trial.notes
     console = stdout()
     print_table(sensor_table(result))
     console.print(motion_line(result), markup=False, soft_wrap=True)
-    for note in trial.notes:
+    for note in notes:
         warn(note)
     for line in finding_lines(result):
         console.print(line, soft_wrap=True)

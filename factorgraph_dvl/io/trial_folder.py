@@ -88,7 +88,7 @@ def load_trial(path: Path | str) -> Trial:
             "is a planar trial, without an imu",
             where=file.name,
             expected="an imu section",
-            hint="`solve` and `kalman` take planar trials",
+            hint="`inspect`, `solve` and `kalman` take planar trials",
         )
     settings = parse_yaml(text, TrialSettings, source=file.name)
     initial = settings.initial

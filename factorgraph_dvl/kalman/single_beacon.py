@@ -79,7 +79,7 @@ def filter_planar(
         raise DataError(
             "the trial has no position to start from",
             where="trial.yaml",
-            expected="initial.position",
+            expected="initial.position: {lat_deg, lon_deg, height_m, std_m}",
             hint="`solve` finds it from the ranges",
         )
     if progress is not None:

@@ -20,6 +20,9 @@ from factorgraph_dvl.trial import InitialPosition, PlanarTrial
 # digits left for what the ranges tell.
 _LEAST_INTERVAL = 1e-3
 
+# Of values further apart, s, none tells what the vehicle did in between.
+_SLOWEST_S = 60.0
+
 
 @dataclass(frozen=True)
 class Plan:
@@ -47,7 +50,7 @@ def reckoned(trial: PlanarTrial) -> Track:
     Raises
     ------
     DataError
-        If one of them has no values, or they have no time in common.
+        If one of them has no values or too few, or they have no time in common.
     """
     heading, log, depth = trial.heading, trial.log, trial.depth
     parts = []
@@ -65,6 +68,15 @@ def reckoned(trial: PlanarTrial) -> Track:
             expected="records of the same time",
             hint="Check that all clocks start together",
         )
+    for record, (time, _) in ((heading, parts[0]), (log, parts[1])):
+        apart = float(np.median(np.diff(time)))
+        if apart > _SLOWEST_S:
+            raise DataError(
+                f"one value every {apart:.4g} s",
+                where=record.source,
+                expected=f"values at most {_SLOWEST_S:g} s apart to reckon a way with",
+                hint="Check that time_s is in seconds",
+            )
     (log_time, speed), known = parts[1], ~np.isnan(log.speed)
     starboard = np.nan_to_num(log.starboard[known])
     extra = trial.beacons.time
@@ -136,12 +148,20 @@ def problem_of(
     present = ~beacons.missing
     covered = (beacons.time >= grid[0]) & (beacons.time <= grid[-1])
     rows = np.flatnonzero(present & covered)
-    if not rows.size:
+    if not present.any():
         raise DataError(
-            "no range at a time when the vehicle's way is known",
+            "there is no range and no range rate",
+            where=beacons.source,
+            expected="numbers in the column range_m or range_rate_m_s",
+        )
+    if not rows.size:
+        first, last = beacons.time[present][[0, -1]]
+        raise DataError(
+            f"no range at a time when the vehicle's way is known, {grid[0]:.10g} to "
+            f"{grid[-1]:.10g} s: they are from {first:.10g} to {last:.10g} s",
             where=beacons.source,
             expected="ranges while the other sensors run",
-            hint="Check that all clocks start together",
+            hint="Check that all clocks start together, and that all times are in seconds",
         )
     ends = [t for t in grid[[0, -1]] if np.abs(beacons.time[rows] - t).min() > _LEAST_INTERVAL]
     time = np.union1d(beacons.time[rows], ends)

@@ -12,6 +12,7 @@ from factorgraph_dvl.planar.hypotheses import Candidate, follow
 from factorgraph_dvl.planar.model import EARTH_RADIUS, PlanarProblem
 from factorgraph_dvl.planar.problem import Plan, plan
 from factorgraph_dvl.planar.ridge import shares_of, stations
+from factorgraph_dvl.planar.sanity import implausible
 from factorgraph_dvl.planar.smoother import (
     Fit,
     covariance,
@@ -83,8 +84,9 @@ def solve_planar(
     )
     living = [c for c in candidates if c.died is None]
     if not living:
+        count = int(np.isfinite(problem.ranging.range).sum())
         raise SolveError(
-            f"{made.rows.size} ranges are too few to find a position",
+            f"{count} {'range is' if count == 1 else 'ranges are'} too few to find a position",
             where=trial.beacons.source,
             hint="Give `initial.position` in trial.yaml, or a longer record",
         )
@@ -130,7 +132,7 @@ def _summary(
     joint = _mixture(values, covs, weights)
     estimates = _estimates(problem, values[0], joint)
     used, rejected = measurements(trial.beacons, made, best)
-    warnings = [*trial.notes]
+    warnings = [*trial.notes, *(f"{label}: {text}" for label, text in implausible(trial))]
     if not best.converged:
         warnings.append("the smoother did not converge: not to be used")
     if made.uncovered:

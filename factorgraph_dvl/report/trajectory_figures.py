@@ -120,20 +120,24 @@ def motion_figure(trajectory: Trajectory, errors: TrajectoryErrors | None) -> Fi
         (f"{name}, m/s", trajectory.velocity[:, i], trajectory.velocity_std[:, i], 1.0)
         for i, name in enumerate(("east", "north", "up"))
     ]
+    # A planar trial measures neither roll nor pitch.
+    shown = [i for i, row in enumerate(rows) if np.any(row[1]) or not np.isnan(row[2]).all()]
     close_up = _close_up(time) if any(is_dense(value) for _, value, _, _ in rows) else None
-    figure = new_figure(11.0 if close_up is None else 13.5, 9.0)
-    grid = new_grid(figure, 6, 2, width_ratios=(1.0 if close_up is None else 1.35, 1.0))
+    figure = new_figure(11.0 if close_up is None else 13.5, 1.5 * len(shown))
+    grid = new_grid(figure, len(shown), 2, width_ratios=(1.0 if close_up is None else 1.35, 1.0))
     columns: list[list[Axes]] = [[], [], []]
-    for i, (label, value, std, unit) in enumerate(rows):
-        row_label = time_label if i == 5 else ""
-        halves = grid[i, 0].subgridspec(1, 2, width_ratios=(2.4, 1.0), wspace=0.05)
-        cell = grid[i, 0] if close_up is None else halves[0]
-        left = _panel(figure, cell, columns[0], last=i == 5)
-        right = _panel(figure, grid[i, 1], columns[2], last=i == 5)
+    for k, i in enumerate(shown):
+        label, value, std, unit = rows[i]
+        last = i == shown[-1]
+        row_label = time_label if last else ""
+        halves = grid[k, 0].subgridspec(1, 2, width_ratios=(2.4, 1.0), wspace=0.05)
+        cell = grid[k, 0] if close_up is None else halves[0]
+        left = _panel(figure, cell, columns[0], last=last)
+        right = _panel(figure, grid[k, 1], columns[2], last=last)
         _draw_with_band(left, time, value, std)
         style(left, row_label, label)
         if close_up is not None:
-            middle = _panel(figure, halves[1], columns[1], last=i == 5, sharey=left)
+            middle = _panel(figure, halves[1], columns[1], last=last, sharey=left)
             _draw_with_band(middle, time[close_up], value[close_up], std[close_up], marker=".")
             style(middle, row_label, "")
             left.axvspan(time[close_up][0], time[close_up][-1], color=DARK, alpha=0.25, lw=0.7)
@@ -145,8 +149,8 @@ def motion_figure(trajectory: Trajectory, errors: TrajectoryErrors | None) -> Fi
         style(right, row_label, label)
     columns[0][0].set_title("Attitude and velocity, band ±3σ", fontsize=TITLE, loc="left")
     if close_up is not None:
-        shown = time[close_up][-1] - time[close_up][0]
-        columns[1][0].set_title(f"{shown:.3g} s of it", fontsize=TITLE, loc="left")
+        seconds = time[close_up][-1] - time[close_up][0]
+        columns[1][0].set_title(f"{seconds:.3g} s of it", fontsize=TITLE, loc="left")
     error_title(columns[2][0], "Error against the reference", "Attitude and velocity", errors)
     return figure
 

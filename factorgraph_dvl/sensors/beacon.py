@@ -64,7 +64,7 @@ class BeaconSettings(SensorSection, frozen=True, kw_only=True):
     range_std_m: Positive = 0.5
     range_rate_std_m_s: Positive = 0.05
     lever_arm_m: Vector3 = (0.0, 0.0, 0.0)
-    sound_speed_error_std: NonNegative = 0.0
+    sound_speed_error_std: Annotated[float, msgspec.Meta(ge=0, le=0.5)] = 0.0
     positions: dict[str, BeaconPosition]
 
     def __post_init__(self) -> None:

@@ -59,7 +59,7 @@ class BeaconTruth(Instrument, frozen=True, kw_only=True):
     range_rate_std_m_s: NonNegative | None = None
     lever_arm_m: Vector3 = (0.0, 0.0, 0.0)
     sound_speed_error: float | Literal["draw"] = 0.0
-    sound_speed_error_std: NonNegative = 0.0
+    sound_speed_error_std: Annotated[float, msgspec.Meta(ge=0, le=0.5)] = 0.0
     missed: Annotated[float, msgspec.Meta(ge=0, le=1)] = 0.0
     multipath: Annotated[float, msgspec.Meta(ge=0, le=1)] = 0.0
     multipath_m: tuple[float, float] = (10.0, 50.0)
