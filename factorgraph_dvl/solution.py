@@ -10,9 +10,11 @@ import numpy as np
 from factorgraph_dvl.conventions import DEG, Array, BodyAxes
 from factorgraph_dvl.directions import turned
 from factorgraph_dvl.earth import LocalFrame
-from factorgraph_dvl.sensors.protocol import DO_NOT_FIT, TOO_LARGE
+from factorgraph_dvl.sensors.protocol import DO_NOT_FIT, TOO_LARGE, Parameter
 
 _FAR_FROM_PRIOR = 5.0
+# The data observed a component if they at least halved what was unknown of it.
+OBSERVABLE = 0.5
 
 
 @dataclass(frozen=True)
@@ -228,6 +230,40 @@ def not_observable(estimate: Estimate, why: Callable[[int], str]) -> list[str]:
     for i in np.flatnonzero(~estimate.observable & (estimate.prior_std > 0.0)):
         reasons.setdefault(why(int(i)), []).append(estimate.component_names[i])
     return [f"{', '.join(names)} not observable: {reason}" for reason, names in reasons.items()]
+
+
+def as_estimates(
+    parameters: Sequence[Parameter],
+    values: Array,
+    covariance: Array,
+    unseparated: frozenset[str] = frozenset(),
+) -> tuple[Estimate, ...]:
+    """Return parameters with their values (n,) and covariance (n, n), in reported units.
+
+    Components of which the data tell only a sum are `unseparated`, so not observable.
+    """
+    std = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    estimates, at = [], 0
+    for p in parameters:
+        rows = slice(at, at + p.mean.size)
+        at += p.mean.size
+        prior = p.sigma / p.si
+        observable = (prior > 0.0) & (std[rows] <= OBSERVABLE * prior)
+        if unseparated:
+            observable &= [name not in unseparated for name in p.component_names]
+        estimates.append(
+            Estimate(
+                name=p.name,
+                component_names=p.component_names,
+                value=values[rows],
+                std=std[rows],
+                prior_value=p.mean / p.si,
+                prior_std=prior,
+                observable=observable,
+                nominal=p.nominal,
+            )
+        )
+    return tuple(estimates)
 
 
 def doubts(estimates: Sequence[Estimate], residuals: Sequence[Residuals]) -> list[str]:

@@ -98,3 +98,17 @@ def _of_parameter(
         return observation.residual(moved(motion, float(shift[0])), changed)
 
     return differentiate(at, parameter.mean.size)
+
+
+def random_motion(m=5, seed=3):
+    """Motion at m times that no vehicle makes."""
+    rng = np.random.default_rng(seed)
+    return Motion(
+        nRb=exp_so3(rng.normal(0.0, 1.5, (m, 3))),
+        p_n=rng.normal(0.0, 50.0, (m, 3)),
+        v_n=rng.normal(0.0, 3.0, (m, 3)),
+        omega_eb_b=rng.normal(0.0, 0.5, (m, 3)),
+        a_n=rng.normal(0.0, 1.0, (m, 3)),
+        alpha_b=rng.normal(0.0, 1.0, (m, 3)),
+        omega_sigma=np.full((m, 3), 1e-4),
+    )

@@ -7,16 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from builders import edit
-from jacobians import check_jacobians
+from jacobians import check_jacobians, random_motion
 from truth import exact_motion, scenario
 
-from factorgraph_dvl.conventions import exp_so3
 from factorgraph_dvl.earth import LocalFrame
 from factorgraph_dvl.errors import DataError, FactorgraphDvlError
 from factorgraph_dvl.io.solution_folder import save_solution
 from factorgraph_dvl.io.trial_folder import load_trial, save_trial
 from factorgraph_dvl.sensors.beacon import Beacons, BeaconSettings, offset_name
-from factorgraph_dvl.sensors.protocol import Motion
 from factorgraph_dvl.simulation import plan_motion, simulate
 from factorgraph_dvl.simulation.convert import convert
 from factorgraph_dvl.solvers.batch import solve
@@ -34,19 +32,6 @@ def beacons(**changes):
         "lever_arm_m": ARM,
         **changes,
     }
-
-
-def random_motion(m=5):
-    rng = np.random.default_rng(3)
-    return Motion(
-        nRb=exp_so3(rng.normal(0.0, 1.5, (m, 3))),
-        p_n=rng.normal(0.0, 50.0, (m, 3)),
-        v_n=rng.normal(0.0, 3.0, (m, 3)),
-        omega_eb_b=rng.normal(0.0, 0.5, (m, 3)),
-        a_n=rng.normal(0.0, 1.0, (m, 3)),
-        alpha_b=rng.normal(0.0, 1.0, (m, 3)),
-        omega_sigma=np.full((m, 3), 1e-4),
-    )
 
 
 def record(m=5):

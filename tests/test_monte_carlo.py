@@ -8,15 +8,14 @@ that number.
 
 from __future__ import annotations
 
-import multiprocessing
 import os
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
 import pytest
 from scipy.stats import chi2
 from truth import CONFIGS
+from workers import in_two_processes
 
 from factorgraph_dvl.analysis.consistency import (
     calibration_errors,
@@ -82,18 +81,7 @@ def one(job):
 
 @pytest.fixture(scope="module", params=["seed-a-phase-0", "seed-a-phase-90"])
 def runs(request):
-    # One thread each: the two workers share two cores.
-    before = os.environ.get("OMP_NUM_THREADS")
-    os.environ["OMP_NUM_THREADS"] = "1"
-    try:
-        context = multiprocessing.get_context("spawn")
-        with ProcessPoolExecutor(2, context) as pool:
-            return list(pool.map(one, [(request.param, seed) for seed in range(RUNS)]))
-    finally:
-        if before is None:
-            del os.environ["OMP_NUM_THREADS"]
-        else:
-            os.environ["OMP_NUM_THREADS"] = before
+    return in_two_processes(one, [(request.param, seed) for seed in range(RUNS)])
 
 
 def rms_band(dof):

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from jacobians import check_jacobians
+from jacobians import check_jacobians, random_motion
 from truth import exact_motion, scenario
 
 from factorgraph_dvl.conventions import DEG, exp_so3
@@ -97,19 +97,6 @@ def test_antenna_position_and_velocity_have_zero_error_at_the_truth():
     # away at most: 4 m/s times 6e-7 rad.
     error = velocity.residual(exact_motion(exact, frame, velocity.time), values)
     assert np.abs(error).max() < 5e-6
-
-
-def random_motion(m=5, seed=3):
-    rng = np.random.default_rng(seed)
-    return Motion(
-        nRb=exp_so3(rng.normal(0.0, 1.5, (m, 3))),
-        p_n=rng.normal(0.0, 50.0, (m, 3)),
-        v_n=rng.normal(0.0, 3.0, (m, 3)),
-        omega_eb_b=rng.normal(0.0, 0.5, (m, 3)),
-        a_n=rng.normal(0.0, 1.0, (m, 3)),
-        alpha_b=rng.normal(0.0, 1.0, (m, 3)),
-        omega_sigma=np.full((m, 3), 1e-4),
-    )
 
 
 @pytest.mark.parametrize("scale", [[0.03], [0.03, -0.2, 0.1]])

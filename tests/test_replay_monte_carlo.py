@@ -7,15 +7,14 @@ runs 20 seeds of each scenario; FACTORGRAPH_DVL_SEEDS runs another number.
 
 from __future__ import annotations
 
-import multiprocessing
 import os
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
 import pytest
 from truth import config
+from workers import in_two_processes
 
 from factorgraph_dvl.analysis.consistency import motion_errors, nees_band, true_value_of
 from factorgraph_dvl.replay import Replay
@@ -88,18 +87,7 @@ def one(job):
 
 @pytest.fixture(scope="module", params=TIMES)
 def runs(request):
-    # One thread each: the two workers share two cores.
-    before = os.environ.get("OMP_NUM_THREADS")
-    os.environ["OMP_NUM_THREADS"] = "1"
-    try:
-        context = multiprocessing.get_context("spawn")
-        with ProcessPoolExecutor(2, context) as pool:
-            return list(pool.map(one, [(request.param, seed) for seed in range(RUNS)]))
-    finally:
-        if before is None:
-            del os.environ["OMP_NUM_THREADS"]
-        else:
-            os.environ["OMP_NUM_THREADS"] = before
+    return in_two_processes(one, [(request.param, seed) for seed in range(RUNS)])
 
 
 def test_every_run_starts_soon_and_ends_where_the_batch_solver_does(runs):

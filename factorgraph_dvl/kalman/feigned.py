@@ -14,10 +14,10 @@ import numpy as np
 
 from factorgraph_dvl.conventions import Array, skew
 from factorgraph_dvl.kalman.points import Estimated, Points
+from factorgraph_dvl.solution import OBSERVABLE
 
 # Errors that stay the same for many pings add up to more, or less, than on average.
 _MARGIN = 5.0
-_OBSERVABLE = 0.5
 
 
 def without_feigned(points: Points, estimated: Estimated, lever_arm: Array) -> Estimated:
@@ -84,8 +84,8 @@ def widened(estimated: Estimated, information: Array, noise: Array) -> Estimated
     sigma = np.concatenate([p.sigma for p in estimated.parameters])
     seeming = _posterior(information, sigma)
     supported = _posterior(information - _MARGIN * noise, sigma)
-    before = np.sqrt(np.diag(seeming)) <= _OBSERVABLE * sigma
-    after = np.sqrt(np.diag(supported)) <= _OBSERVABLE * sigma
+    before = np.sqrt(np.diag(seeming)) <= OBSERVABLE * sigma
+    after = np.sqrt(np.diag(supported)) <= OBSERVABLE * sigma
     if np.all(after[before]):
         return estimated
     values, vectors = np.linalg.eigh(supported - seeming)

@@ -31,9 +31,9 @@ from factorgraph_dvl.kalman.star import (
     smooth,
 )
 from factorgraph_dvl.kalman.steps import Samples, prepare
-from factorgraph_dvl.kalman.summary import estimates_of, gnss_residuals
+from factorgraph_dvl.kalman.summary import gnss_residuals
 from factorgraph_dvl.sensors.star import Star
-from factorgraph_dvl.solution import Residuals, Solution, Trajectory, doubts
+from factorgraph_dvl.solution import Residuals, Solution, Trajectory, as_estimates, doubts
 from factorgraph_dvl.trial import InitialAttitude, Trial
 
 _ARCSEC = DEG / 3600.0
@@ -167,7 +167,7 @@ def _summary(
         initial = InitialAttitude(rph, np.full(3, _START))
     navigation = navigate(replace(trial, initial_attitude=initial), np.empty(0))
     values, covariance = estimated.reported()
-    estimates = estimates_of(estimated.parameters, values, covariance)
+    estimates = as_estimates(estimated.parameters, values, covariance)
     residuals = (_star_residuals(star, courses, seen), *gnss_residuals(trial, navigation))
     notes = [*navigation.notes, *star.doubts()]
     if np.any(np.array(star.settings.mounting_std_deg) > 0.0):

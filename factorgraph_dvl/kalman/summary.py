@@ -12,19 +12,18 @@ from factorgraph_dvl.earth import radii
 from factorgraph_dvl.kalman.navigation import Motion, Navigation, motion_at
 from factorgraph_dvl.kalman.points import Estimated, Outcome, Points, residuals
 from factorgraph_dvl.sensors.dvl import Dvl
-from factorgraph_dvl.sensors.protocol import Aid, Parameter
+from factorgraph_dvl.sensors.protocol import Aid
 from factorgraph_dvl.sensors.protocol import Motion as SensorMotion
 from factorgraph_dvl.solution import (
     Estimate,
     Residuals,
     Solution,
     Trajectory,
+    as_estimates,
     doubts,
     not_observable,
 )
 from factorgraph_dvl.trial import Trial
-
-_OBSERVABLE = 0.5
 
 
 def summarise(
@@ -58,7 +57,7 @@ def summarise(
     covariance[:n, :n], covariance[n:, n:] = dvl_covariance, imu_covariance
     parameters = [*outcome.estimated.parameters, *imu.parameters]
     values = np.concatenate([dvl_values, imu_values])
-    estimates = estimates_of(parameters, values, covariance, outcome.unseparated)
+    estimates = as_estimates(parameters, values, covariance, outcome.unseparated)
     all_residuals = (measured, *gnss_residuals(trial, navigation))
     warnings = [
         *notes,
@@ -78,38 +77,6 @@ def summarise(
         residuals=all_residuals,
         warnings=tuple(warnings),
     )
-
-
-def estimates_of(
-    parameters: Sequence[Parameter],
-    values: Array,
-    covariance: Array,
-    unseparated: frozenset[str] = frozenset(),
-) -> tuple[Estimate, ...]:
-    """Return parameters with their reported values (n,) and covariance (n, n).
-
-    Components of which the data tell only a sum are `unseparated`, so not observable.
-    """
-    std = np.sqrt(np.maximum(np.diag(covariance), 0.0))
-    estimates, at = [], 0
-    for p in parameters:
-        rows = slice(at, at + p.mean.size)
-        at += p.mean.size
-        prior = p.sigma / p.si
-        joined = np.array([name in unseparated for name in p.component_names])
-        estimates.append(
-            Estimate(
-                name=p.name,
-                component_names=p.component_names,
-                value=values[rows],
-                std=std[rows],
-                prior_value=p.mean / p.si,
-                prior_std=prior,
-                observable=(prior > 0.0) & (std[rows] <= _OBSERVABLE * prior) & ~joined,
-                nominal=p.nominal,
-            )
-        )
-    return tuple(estimates)
 
 
 def _imu_biases(trial: Trial, navigation: Navigation) -> Estimated:

@@ -27,6 +27,7 @@ from factorgraph_dvl.solution import (
     Solution,
     Trajectory,
     ambiguity,
+    as_estimates,
     doubts,
     mixed,
     mostly_rejected,
@@ -40,7 +41,6 @@ Progress = Callable[[str, int, float | None], None]
 _UPDATES = 40
 _SEARCHES = (0, 1, 2, 4, 8, 16, 28)
 _FIRST_ROWS = 8
-_OBSERVABLE = 0.5
 
 
 def solve_planar(
@@ -130,7 +130,7 @@ def _summary(
     values = [s.fit.theta / problem.si for s in every]
     covs = [s.parts[2] / np.outer(problem.si, problem.si) for s in every]
     joint = _mixture(values, covs, weights)
-    estimates = _estimates(problem, values[0], joint)
+    estimates = as_estimates(problem.constants, values[0], joint)
     used, rejected = measurements(trial.beacons, made, best)
     warnings = [*trial.notes, *(f"{label}: {text}" for label, text in implausible(trial))]
     if not best.converged:
@@ -180,26 +180,6 @@ def _mixture(values: Sequence[Array], covs: Sequence[Array], weights: Array) -> 
         away = value - values[0]
         out += weight * (cov + np.outer(away, away))
     return out
-
-
-def _estimates(problem: PlanarProblem, value: Array, cov: Array) -> tuple[Estimate, ...]:
-    std = np.sqrt(np.diag(cov))
-    out = []
-    for p in problem.constants:
-        place = problem.columns[p.stem]
-        prior = p.sigma / p.si
-        out.append(
-            Estimate(
-                name=p.name,
-                component_names=p.component_names,
-                value=value[place],
-                std=std[place],
-                prior_value=p.mean / p.si,
-                prior_std=prior,
-                observable=(prior > 0.0) & (std[place] <= _OBSERVABLE * prior),
-            )
-        )
-    return tuple(out)
 
 
 def _trajectory(

@@ -24,7 +24,7 @@ from factorgraph_dvl.priors import Known
 from factorgraph_dvl.sensors.protocol import Aid, Motion, Observation, Parameter
 from factorgraph_dvl.solution import Solution, ambiguity, joined
 from factorgraph_dvl.solvers.covariance import Posterior, changes_with, considered, posterior
-from factorgraph_dvl.solvers.feigned import at_prior_along, told_of
+from factorgraph_dvl.solvers.feigned import at_prior_along, parameter_information, told_of
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, Progress, minimise
 from factorgraph_dvl.solvers.state_times import STATE_INTERVAL, dense_epochs
 from factorgraph_dvl.solvers.summary import summarise
@@ -148,7 +148,8 @@ def _described(
     held = told.directions_not_told()
     if held.size:
         # How others go with what is held is linear here, where the directions belong.
-        changes = changes_with(problem, covariances, held, told.coupled(held))
+        full = parameter_information(problem, minimum.evaluation)
+        changes = changes_with(covariances, held, told.coupled(held, full))
         origin = at_prior_along(problem, minimum.evaluation.parameters, held)
         problem.hold(held, origin)
         at = problem.values(minimum.evaluation.states, origin)

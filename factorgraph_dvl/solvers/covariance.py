@@ -196,12 +196,17 @@ class Posterior:
     information : of all variables, the held directions taken as known.
     nodes : (K, 9, 9) covariances of the states, in GTSAM's tangent space, K Kᵀ included.
     given : (K, 9, 9) those that are left where the parameters are known.
+    parameters : (P, P) covariance of the parameters, in the coordinates u of a step S u, S
+        `Problem.prior_root`.
+    with_parameters : covariance of states and biases with them, (size, P) by key.
     considered : K of states and biases, (size, h) by key; empty where nothing is held.
     """
 
     information: SquareRootInformation
     nodes: Array
     given: Array
+    parameters: Array
+    with_parameters: dict[int, Array]
     considered: dict[int, Array]
 
 
@@ -214,31 +219,28 @@ def posterior(problem: Problem, minimum: Minimum) -> Posterior:
     marginals = information.marginals(wanted)
     nodes = np.stack([marginals[key] for key in wanted])
     if not problem.parameters:
-        return Posterior(information, nodes, nodes, {})
-    every = _whitened(problem)
+        return Posterior(information, nodes, nodes, np.zeros((0, 0)), {}, {})
+    whiten = np.asarray(np.linalg.inv(problem.prior_root), float)
+    every = {problem.key(name): whiten[:, place] for name, place in problem.columns.items()}
     with_every = information.covariance_with(every)
     cross = np.stack([with_every[key] for key in wanted])
     P = information.covariance_of([every])
     given = nodes - cross @ np.linalg.solve(P, cross.transpose(0, 2, 1))
-    return Posterior(information, nodes, given, {})
+    others = {key: out for key, out in with_every.items() if key not in every}
+    return Posterior(information, nodes, given, P, others, {})
 
 
-def changes_with(
-    problem: Problem, found: Posterior, held: Array, coupled: Array
-) -> dict[int, Array]:
+def changes_with(found: Posterior, held: Array, coupled: Array) -> dict[int, Array]:
     """Return the change K of states and biases with directions, (size, h) by key.
 
     Parameters
     ----------
-    problem, found : covariances where the directions are not held yet.
+    found : covariances where the directions are not held yet.
     held : (P, h) directions in the coordinates u of a step S u, S `Problem.prior_root`.
     coupled : (h, h) projection on those that others hang together with.
     """
-    every = _whitened(problem)
-    P = found.information.covariance_of([every])
-    own = held @ np.linalg.inv(held.T @ P @ held) @ coupled
-    with_every = found.information.covariance_with(every)
-    return {key: out @ own for key, out in with_every.items() if key not in every}
+    own = held @ np.linalg.inv(held.T @ found.parameters @ held) @ coupled
+    return {key: out @ own for key, out in found.with_parameters.items()}
 
 
 def considered(found: Posterior, changes: dict[int, Array]) -> Posterior:
@@ -248,12 +250,6 @@ def considered(found: Posterior, changes: dict[int, Array]) -> Posterior:
     return replace(
         found, nodes=found.nodes + change @ change.transpose(0, 2, 1), considered=changes
     )
-
-
-def _whitened(problem: Problem) -> dict[int, Array]:
-    """Return the functional that gives all parameters in the coordinates u of a step S u."""
-    whiten = np.asarray(np.linalg.inv(problem.prior_root), float)
-    return {problem.key(name): whiten[:, place] for name, place in problem.columns.items()}
 
 
 def _range(s: slice) -> np.ndarray:

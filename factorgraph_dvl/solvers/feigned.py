@@ -44,27 +44,30 @@ class Told:
     ----------
     data : (P, P) information once all other variables are eliminated.
     feigned : (P, P) share of it that the error of the motion is expected to feign.
-    full : (P, P) information where all other variables are known.
     """
 
     data: Array
     feigned: Array
-    full: Array
 
     def directions_not_told(self) -> Array:
         """Return the directions (P, h) that are not observable, if any is feigned."""
         return directions_not_told(self.data, self.feigned)
 
-    def coupled(self, held: Array) -> Array:
+    def coupled(self, held: Array, full: Array) -> Array:
         """Return the projection (h, h) on the held directions that other variables go with.
 
         The step K of the others that goes with one prior's sigma of a direction is worth
         |K|² in their own information: what they take of that on the direction. Noise
         feigns such steps too, as large as the information that it feigns.
+
+        Parameters
+        ----------
+        held : (P, h) directions.
+        full : `parameter_information`.
         """
         P = np.linalg.inv(self.data + np.eye(len(self.data)))
         own = np.eye(held.shape[1])
-        taken = held.T @ self.full @ held + own - np.linalg.inv(held.T @ P @ held)
+        taken = held.T @ full @ held + own - np.linalg.inv(held.T @ P @ held)
         L = np.linalg.cholesky(held.T @ self.feigned @ held + own)
         half = np.linalg.solve(L, taken)
         share, directions = np.linalg.eigh(np.linalg.solve(L, half.T))
@@ -85,19 +88,19 @@ def told_of(
     """
     size = len(problem.prior_root)
     if size == 0:
-        return Told(*[np.zeros((0, 0))] * 3)
-    functionals = [{problem.key(p.name): np.eye(p.mean.size)} for p in problem.parameters]
-    whiten = np.linalg.inv(problem.prior_root)
-    P = whiten @ covariances.information.covariance_of(functionals) @ whiten.T
-    data = np.linalg.inv(P) - np.eye(size)
+        return Told(*[np.zeros((0, 0))] * 2)
+    data = np.linalg.inv(covariances.parameters) - np.eye(size)
     feigned = feigned_information(problem, minimum.evaluation, covariances.given).sum(axis=0)
     if at_truth:
         data = data + feigned
-    return Told(data, feigned, _parameter_information(problem, minimum.evaluation))
+    return Told(data, feigned)
 
 
-def _parameter_information(problem: Problem, evaluation: Evaluation) -> Array:
-    """Return the information (P, P) of the measurements on the parameters, all else known."""
+def parameter_information(problem: Problem, evaluation: Evaluation) -> Array:
+    """Return the information (P, P) of the measurements on the parameters, all else known.
+
+    In the coordinates u of a step S u, S `Problem.prior_root`.
+    """
     root = problem.prior_root
     out = np.zeros((len(root), len(root)))
     for observation, motion, weight in zip(

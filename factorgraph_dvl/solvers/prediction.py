@@ -16,7 +16,7 @@ from factorgraph_dvl.preintegration import States, segments
 from factorgraph_dvl.solution import Solution
 from factorgraph_dvl.solvers.batch import Minimised, solution_of
 from factorgraph_dvl.solvers.covariance import changes_with, considered, posterior
-from factorgraph_dvl.solvers.feigned import told_of
+from factorgraph_dvl.solvers.feigned import parameter_information, told_of
 from factorgraph_dvl.solvers.information_history import (
     RATE_HZ,
     Frontier,
@@ -52,7 +52,8 @@ def predict_posterior(
     told = told_of(problem, minimum, covariances, at_truth=True)
     held = told.directions_not_told()
     if held.size:
-        changes = changes_with(problem, covariances, held, told.coupled(held))
+        full = parameter_information(problem, evaluation)
+        changes = changes_with(covariances, held, told.coupled(held, full))
         problem.hold(held, evaluation.parameters)
         evaluation = problem.evaluate(evaluation.values)
         minimum = _minimum(problem, evaluation)

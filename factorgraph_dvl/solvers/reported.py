@@ -14,10 +14,8 @@ from factorgraph_dvl.conventions import (
     reported_rotation_vector,
 )
 from factorgraph_dvl.sensors.protocol import Parameter
-from factorgraph_dvl.solution import Estimate
+from factorgraph_dvl.solution import Estimate, as_estimates
 
-# The data observed a component if they at least halved what was unknown of it.
-_OBSERVABLE = 0.5
 _FIRST = (
     *("beam_direction", "beam_scale_error", "misalignment", "scale_error", "lever_arm"),
     *("gyro_bias", "accel_bias"),
@@ -78,22 +76,5 @@ def estimates_of(
     covariance[np.ix_(is_free, is_free)] = joint
     known = np.concatenate([p.sigma == 0.0 for p, _ in rows])
     covariance[known] = covariance[:, known] = 0.0
-    std = np.sqrt(np.diag(covariance))
-    estimates, at = [], 0
-    for p, value in rows:
-        own = std[at : at + value.size]
-        at += value.size
-        prior = p.sigma / p.si
-        estimates.append(
-            Estimate(
-                name=p.name,
-                component_names=p.component_names,
-                value=np.array(value),
-                std=own,
-                prior_value=p.mean / p.si,
-                prior_std=prior,
-                observable=(prior > 0.0) & (own <= _OBSERVABLE * prior),
-                nominal=p.nominal,
-            )
-        )
-    return tuple(estimates), covariance
+    values = np.concatenate([value for _, value in rows])
+    return as_estimates([p for p, _ in rows], values, covariance), covariance
