@@ -1,23 +1,17 @@
 """Single-beacon navigation: the filters of Chen et al. (2021) and the factor graph.
 
-    python benchmarks/beacon_2021.py            # writes docs/chen-2021.md
+    python benchmarks/beacon_2021.py [--seeds 50] [--out DIR]
 
-Run it on a machine that does nothing else; 50 seeds take about half an hour on 2 cores.
+writes `chen-2021.md` into out/benchmarks, or with `--out docs` that of the documentation. 50 seeds
+take about half an hour on 2 cores.
 """
 
 from __future__ import annotations
 
-import argparse
-import os
 from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
-from pathlib import Path
 
-# Before NumPy is loaded: all matrices are small, and every worker has a core of its own.
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-os.environ.setdefault("OMP_NUM_THREADS", "1")
-
+import common
 import numpy as np
 
 from factorgraph_dvl.kalman.single_beacon import run_filter
@@ -27,7 +21,7 @@ from factorgraph_dvl.planar.solve import solve_planar
 from factorgraph_dvl.simulation import parse_scenario, simulate_planar
 from factorgraph_dvl.trial import PlanarTrial
 
-ROOT = Path(__file__).resolve().parents[1]
+PAGE = "chen-2021.md"
 UPDATES = 600
 THRESHOLD = 20.0
 BEACON = {"lat_deg": 25.0, "lon_deg": 135.0, "height_m": -80}
@@ -243,7 +237,7 @@ def row(name: str, by: dict[str, list[float]]) -> str:
 INTRODUCTION = """\
 # Single-beacon navigation: the filters of Chen et al. (2021) and the factor graph
 
-Written by `python benchmarks/beacon_2021.py --seeds {seeds}`; do not edit.
+{origin}
 
 Chen X., Shang F. and Lan Q., Journal of Unmanned Undersea Systems 29(4), 2021, add the range
 rate to slant range and depth: their extended Kalman filter 4SV-3OB converges after 150 updates
@@ -269,19 +263,19 @@ observations, and stay there.
 
 def main() -> None:
     """Run the study and write its page."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--seeds", type=int, default=50)
-    parser.add_argument("--jobs", type=int, default=os.cpu_count())
-    parser.add_argument("--out", type=Path, default=ROOT / "docs")
-    args = parser.parse_args()
+    args = common.parse(common.parser(__doc__, seeds=50))
     n = args.seeds
-    page = INTRODUCTION.format(seeds=n, threshold=THRESHOLD, updates=UPDATES).splitlines()
-    with ProcessPoolExecutor(args.jobs) as pool:
+    page = INTRODUCTION.format(
+        origin=args.origin, seeds=n, threshold=THRESHOLD, updates=UPDATES
+    ).splitlines()
+    first = {}
+    with common.pool(args.jobs) as pool:
         for std, range_std, names in CASES:
             results = {}
             for name in names:
                 tasks = [(name, std, range_std, s) for s in range(n)]
                 results[name] = list(pool.map(convergence, tasks))
+                first[name, std, range_std] = results[name][0]
                 print("\n".join(convergence_tables(results)), flush=True)
             title = f"Start wrong by {std:.0f} m, ranges to {range_std:.0f} m:"
             page += [title, "", *convergence_tables(results), ""]
@@ -291,7 +285,26 @@ def main() -> None:
         tail = hypothesis_page(turn, straight, echoes)
         print("\n".join(tail), flush=True)
     page += tail
-    (args.out / "chen-2021.md").write_text("\n".join(page) + "\n", encoding="utf-8")
+    page += common.sample_section(seed_table(first))
+    common.write_page(args.out / PAGE, page)
+
+
+def sample() -> list[str]:
+    """Return those lines of the page that one seed makes."""
+    cases = [(name, std, r) for std, r, names in CASES for name in names]
+    return seed_table({case: convergence((*case, common.SAMPLED_SEED)) for case in cases})
+
+
+def seed_table(runs: dict[tuple[str, float, float], dict[str, float]]) -> list[str]:
+    """Return the Markdown of one seed: updates until each method has settled."""
+    return [
+        f"| geometry, start wrong by, ranges to | {' | '.join(METHODS)} |",
+        "|---" * (len(METHODS) + 1) + "|",
+        *(
+            f"| {name}, {std:.0f} m, {r:.0f} m | {' | '.join(f'{run[m]:.0f}' for m in METHODS)} |"
+            for (name, std, r), run in runs.items()
+        ),
+    ]
 
 
 def hypothesis_page(turn: list[Solved], straight: list[Solved], echoes: list[Solved]) -> list[str]:

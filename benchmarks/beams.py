@@ -1,30 +1,23 @@
-"""Measure what the calibration of single beams is worth; write docs/beams-results.md.
+"""Measure what the calibration of single beams is worth.
 
-    python benchmarks/beams.py [--seeds 20] [--workers 1] [--out docs]
+    python benchmarks/beams.py [--seeds 20] [--jobs 1] [--out DIR]
 
+writes `beams-results.md` into out/benchmarks, or with `--out docs` that of the documentation.
 Takes about a minute for each seed on one core.
 """
 
 from __future__ import annotations
 
-import argparse
-import os
 from collections.abc import Callable, Iterator
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
-from multiprocessing import get_context
-from pathlib import Path
 from statistics import median
-from time import perf_counter
+from time import process_time
 from typing import Any
 
-# One process for each core: more threads only wait for one another.
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-os.environ.setdefault("OMP_NUM_THREADS", "1")
-
+import common
 import numpy as np
-import yaml
+from common import config
 
 from factorgraph_dvl.analysis.beam_quality import calibration_of
 from factorgraph_dvl.analysis.consistency import (
@@ -43,7 +36,7 @@ from factorgraph_dvl.solution import Solution
 from factorgraph_dvl.solvers.batch import solve
 from factorgraph_dvl.trial import Trial
 
-ROOT = Path(__file__).resolve().parents[1]
+PAGE = "beams-results.md"
 CALIBRATIONS = {"turntable": "beams-turntable", "no turntable": "cruise-beams"}
 OURS = ("beam_direction_b", "beam_scale_error", "lever_arm_m")
 WIDE = (10.0, 10.0, 10.0)
@@ -75,11 +68,6 @@ class Seed:
     kalman: Errors
     reckoning: dict[tuple[str, str], tuple[float, float]]
     misfit: float
-
-
-def config(name: str, **top: Any) -> dict[str, Any]:
-    text = (ROOT / "configs" / f"{name}.yaml").read_text(encoding="utf-8")
-    return {**yaml.safe_load(text), **top}
 
 
 def errors_of(solution: Solution, trial: Trial) -> Errors:
@@ -300,45 +288,61 @@ def navigate(task: tuple[int, int]) -> tuple[Array, Array, float, float, float]:
 
 
 def speed() -> Iterator[tuple[str, float]]:
-    """Time the 4800 s trial with four beams against the one with a 3-D velocity."""
+    """Time the 4800 s trial with four beams against the one with a 3-D velocity.
+
+    In processor time: the machine may do something else meanwhile.
+    """
     trials = {
-        "3-D velocity": simulate(ROOT / "configs" / "cruise.yaml", 1),
-        "four beams": simulate(ROOT / "configs" / "cruise-beams.yaml", 1),
+        "3-D velocity": simulate(parse_scenario(config("cruise")), 1),
+        "four beams": simulate(parse_scenario(config("cruise-beams")), 1),
     }
     times: dict[str, list[float]] = {name: [] for name in trials}
     for _ in range(ROUNDS):
         for name, trial in trials.items():
-            start = perf_counter()
+            start = process_time()
             solve(trial)
-            times[name].append(perf_counter() - start)
+            times[name].append(process_time() - start)
     for name, taken in times.items():
         yield name, min(taken)
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--seeds", type=int, default=20)
-    parser.add_argument("--workers", type=int, default=1)
-    parser.add_argument("--out", type=Path, default=ROOT / "docs")
-    args = parser.parse_args()
+    args = common.parse(common.parser(__doc__, seeds=20))
     seeds = range(args.seeds)
-    with ProcessPoolExecutor(args.workers, get_context("spawn")) as pool:
+    with common.pool(args.jobs) as pool:
         runs = list(pool.map(one_seed, seeds))
         tasks = [(seed, lost) for lost in range(4) for seed in seeds]
         lost_runs = list(pool.map(navigate, tasks))
     times = dict(speed())
     lines = [
         "# Single beams: measured\n",
-        f"Written by `python benchmarks/beams.py`, {args.seeds} seeds; do not edit. What it means "
-        "is in [beams.md](beams.md).",
+        f"{args.origin} What it means is in [beams.md](beams.md).",
         *calibration_section(runs),
         *reckoning_section(runs),
         *navigation_section(lost_runs, args.seeds),
         *speed_section(times),
+        *common.sample_section(seed_table(runs[0])),
     ]
-    path = args.out / "beams-results.md"
-    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
-    print(path.read_text(encoding="utf-8"))
+    print(common.write_page(args.out / PAGE, lines))
+
+
+def sample() -> list[str]:
+    """Return those lines of the page that one seed makes."""
+    return seed_table(one_seed(common.SAMPLED_SEED))
+
+
+def seed_table(run: Seed) -> list[str]:
+    """Return the Markdown of one seed: calibration and dead reckoning."""
+    rows = [
+        ("NEES, batch", f"{run.batch.nees:.2f}"),
+        ("NEES, Kalman", f"{run.kalman.nees:.2f}"),
+        ("largest error of a direction, batch, deg", f"{run.batch.largest_error:.4f}"),
+        *(
+            (f"{way}, {lost}: end point, largest, %", f"{end:.4f}, {largest:.4f}")
+            for (way, lost), (end, largest) in run.reckoning.items()
+        ),
+    ]
+    return ["| what | measured |", "|---|---|", *(f"| {what} | {x} |" for what, x in rows)]
 
 
 def calibration_section(runs: list[Seed]) -> Iterator[str]:
@@ -414,7 +418,10 @@ def navigation_section(runs: list[Any], seeds: int) -> Iterator[str]:
 
 def speed_section(times: dict[str, float]) -> Iterator[str]:
     yield "\n## Time for 4800 s\n"
-    yield f"Best of {ROUNDS} runs each, alternating, in one process.\n"
+    yield (
+        f"Processor time, best of {ROUNDS} runs each, alternating, in one process. Only the ratio "
+        f"is of use elsewhere: {common.machine()}.\n"
+    )
     yield "| trial | `solve`, s | ratio |"
     yield "|---|---|---|"
     base = times["3-D velocity"]

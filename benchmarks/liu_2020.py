@@ -1,27 +1,19 @@
 """Reproduce the simulation of Liu, Yu and Xu (2020), and hold it against the Cramér-Rao bound.
 
-    python benchmarks/liu_2020.py [--seeds 50] [--out docs]
+    python benchmarks/liu_2020.py [--seeds 50] [--dvl-seeds 20] [--out DIR]
 
-writes `liu-2020.md` and `images/liu-2020.png` there.
+writes `liu-2020.md` and `images/liu-2020.png` into out/benchmarks, or with `--out docs` those of
+the documentation.
 """
 
 from __future__ import annotations
 
-import argparse
-import os
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
-# One process for each core: more threads only wait for one another.
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-os.environ.setdefault("OMP_NUM_THREADS", "1")
-
+import common
 import numpy as np
-import yaml
-from luo_2024 import until
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
+from common import config, until
 from scipy.stats import norm
 
 from factorgraph_dvl.analysis.consistency import calibration_errors, nees_band
@@ -33,7 +25,7 @@ from factorgraph_dvl.simulation import parse_scenario, simulate
 from factorgraph_dvl.solution import Solution
 from factorgraph_dvl.solvers.batch import solve
 
-ROOT = Path(__file__).resolve().parents[1]
+PAGE = "liu-2020.md"
 DRIFTS = np.array([0.05, 0.1, 0.2])
 TIMES = (50, 100, 300)
 CURVE_TIMES = (10, 20, 30, 40, 50, 70, 100, 140, 180, 220, 260, 300)
@@ -64,12 +56,6 @@ class Run:
     @property
     def nees(self) -> float:
         return float(self.error @ np.linalg.solve(self.covariance, self.error))
-
-
-def config(name: str, **top: object) -> dict[str, object]:
-    """Return a scenario of configs/, with changes at the top level."""
-    text = (ROOT / "configs" / f"{name}.yaml").read_text(encoding="utf-8")
-    return {**yaml.safe_load(text), **top}
 
 
 def bound(duration: float) -> float:
@@ -152,8 +138,7 @@ def draw(
 ) -> None:
     """Draw drift, σ and accuracy over time."""
     history, value, std = found
-    figure = Figure(figsize=(10, 11), dpi=110)
-    FigureCanvasAgg(figure)
+    figure = common.new_figure(10, 11)
     axes = figure.subplots(3, 1, sharex=True)
     colours = ("#0b6cc0", "tab:orange", "tab:green")
     dense = np.linspace(5.0, 300.0, 600)
@@ -210,15 +195,13 @@ def draw(
     for ax in axes:
         ax.grid(color="0.92", which="both")
         ax.spines[["top", "right"]].set_visible(False)
-    figure.tight_layout()
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path)
+    common.save_figure(figure, path)
 
 
 INTRODUCTION = """\
 # The simulation of Liu, Yu and Xu (2020): gyro drift from a star tracker
 
-Written by `python benchmarks/liu_2020.py --seeds {seeds} --dvl-seeds {dvl_seeds}`; do not edit.
+{origin}
 
 A surfaced UUV floats and may not manoeuvre. The attitude of its SINS minus that of a star tracker
 tells the constant drift of the gyros. Scenario ([`configs/star.yaml`](../configs/star.yaml)):
@@ -426,17 +409,13 @@ def dvl(runs: dict[tuple[int, str], list[Run]]) -> list[str]:
 
 def main() -> None:
     """Run the study and write its page."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--seeds", type=int, default=50)
+    parser = common.parser(__doc__, seeds=50)
     parser.add_argument("--dvl-seeds", type=int, default=20)
-    parser.add_argument("--out", type=Path, default=ROOT / "docs")
-    args = parser.parse_args()
+    args = common.parse(parser)
     bounds = ", ".join(f"{bound(t):.4f} °/h after {t} s" for t in TIMES)
-    page = INTRODUCTION.format(
-        seeds=args.seeds, dvl_seeds=args.dvl_seeds, bounds=bounds
-    ).splitlines()
+    page = INTRODUCTION.format(origin=args.origin, bounds=bounds).splitlines()
     page.append("")
-    with ProcessPoolExecutor(os.cpu_count()) as pool:
+    with common.pool(args.jobs) as pool:
         runs = list(pool.map(one_seed, range(args.seeds)))
         page += results(runs) + claim(runs) + earth()
         print("\n".join(page))
@@ -449,7 +428,26 @@ def main() -> None:
             for stars in (NONE, KNOWN, UNKNOWN)
         }
     page += dvl(calibrated)
-    (args.out / "liu-2020.md").write_text("\n".join(page) + "\n", encoding="utf-8")
+    page += common.sample_section(seed_table(runs[0]))
+    common.write_page(args.out / PAGE, page)
+
+
+def sample() -> list[str]:
+    """Return those lines of the page that one seed makes."""
+    return seed_table(one_seed(common.SAMPLED_SEED))
+
+
+def seed_table(run: dict[tuple[str, int], Run]) -> list[str]:
+    """Return the Markdown of one seed: errors of the drifts by method and time."""
+    return [
+        "| method | after | error, °/h: x | y | z | NEES |",
+        "|---|---|---|---|---|---|",
+        *(
+            f"| {name} | {end} s | {' | '.join(f'{x:.5f}' for x in found.error)} "
+            f"| {found.nees:.2f} |"
+            for (name, end), found in run.items()
+        ),
+    ]
 
 
 if __name__ == "__main__":

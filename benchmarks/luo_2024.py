@@ -1,28 +1,20 @@
 """Reproduce the simulation of Luo et al. (2024) with its own method and with ours.
 
-    python benchmarks/luo_2024.py [--seeds 20] [--out docs]
+    python benchmarks/luo_2024.py [--seeds 20] [--out DIR]
 
-writes `luo-2024.md` and `images/luo-2024-convergence.png` there.
+writes `luo-2024.md` and `images/luo-2024-convergence.png` into out/benchmarks, or with
+`--out docs` those of the documentation.
 """
 
 from __future__ import annotations
 
-import argparse
-import os
 from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-# One process for each core: more threads only wait for one another.
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-os.environ.setdefault("OMP_NUM_THREADS", "1")
-
+import common
 import msgspec
 import numpy as np
-import yaml
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 
 from factorgraph_dvl.analysis.consistency import calibration_errors, nees_band, paper_accuracy
 from factorgraph_dvl.kalman import History, calibrate
@@ -31,7 +23,7 @@ from factorgraph_dvl.solution import Solution
 from factorgraph_dvl.solvers.batch import solve
 from factorgraph_dvl.trial import Trial
 
-ROOT = Path(__file__).resolve().parents[1]
+PAGE = "luo-2024.md"
 PHASES = (0, 90)
 SEVEN = ("misalignment_deg", "scale_error", "lever_arm_m")
 LABELS = ("α_x, deg", "α_y, deg", "α_z, deg", "δK", "l_x, m", "l_y, m", "l_z, m")
@@ -54,8 +46,7 @@ class Run:
 
 def config(phase: int, **top: object) -> dict[str, object]:
     """Return the scenario of one phase, with changes at the top level."""
-    text = (ROOT / "configs" / f"seed-a-phase-{phase}.yaml").read_text(encoding="utf-8")
-    return {**yaml.safe_load(text), **top}
+    return common.config(f"seed-a-phase-{phase}", **top)
 
 
 def summary(solution: Solution, trial: Trial) -> Run:
@@ -89,28 +80,6 @@ def cramer_rao(phase: int) -> np.ndarray:
     return summary(solve(trial), trial).std
 
 
-def until(trial: Trial, end: float) -> Trial:
-    """Return a trial's records up to a time."""
-
-    def cut(record: object) -> object:
-        keep = record.time <= end + 1e-6  # type: ignore[attr-defined]
-        arrays = {
-            name: value[keep]
-            for name, value in vars(record).items()
-            if isinstance(value, np.ndarray) and value.shape[:1] == keep.shape
-        }
-        return replace(record, **arrays)  # type: ignore[type-var]
-
-    return replace(
-        trial,
-        imu=cut(trial.imu),
-        gnss=None if trial.gnss is None else cut(trial.gnss),
-        dvl=None if trial.dvl is None else cut(trial.dvl),
-        others=tuple(cut(aid) for aid in trial.others),
-        reference=None,
-    )
-
-
 def values_and_std(solution: Solution) -> tuple[np.ndarray, np.ndarray]:
     """Return the seven values and their standard deviations."""
     picked = [solution.estimate(name) for name in SEVEN]
@@ -127,15 +96,14 @@ def convergence(phase: int) -> tuple[History, History, np.ndarray, np.ndarray, n
     nine = calibrate(replace(trial, dvl=replace(trial.dvl, settings=told)), "nine-state")[1]
     assert seven is not None
     assert nine is not None
-    solved = [values_and_std(solve(until(trial, t))) for t in GRAPH_TIMES]
+    solved = [values_and_std(solve(common.until(trial, t))) for t in GRAPH_TIMES]
     times = np.array(GRAPH_TIMES, dtype=float)
     return seven, nine, times, *(np.array(x) for x in zip(*solved, strict=True))
 
 
 def draw(curves: dict[int, tuple], path: Path) -> None:
     """Draw the convergence of all methods, as in figure 4 of the paper."""
-    figure = Figure(figsize=(11, 13), dpi=110)
-    FigureCanvasAgg(figure)
+    figure = common.new_figure(11, 13)
     axes = figure.subplots(7, len(curves), sharex=True, squeeze=False)
     for column, (phase, (seven, nine, times, value, std)) in enumerate(curves.items()):
         for row, label in enumerate(LABELS):
@@ -158,9 +126,7 @@ def draw(curves: dict[int, tuple], path: Path) -> None:
         axes[0, column].set_title(f"sway phase {phase}°")
         axes[-1, column].set_xlabel("time, s")
     axes[0, 0].legend(fontsize=8, ncols=2, loc="lower right")
-    figure.tight_layout()
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path)
+    common.save_figure(figure, path)
 
 
 def rms(runs: Sequence[Run]) -> np.ndarray:
@@ -173,24 +139,35 @@ def ratio(runs: Sequence[Run]) -> np.ndarray:
     return np.sqrt(np.mean([(r.error / r.std) ** 2 for r in runs], axis=0))
 
 
+def value_table(run: dict[str, Run]) -> list[str]:
+    """Return the Markdown of the values that one seed gives, beside those of the paper."""
+    kalman, graph = (TRUTH + run[name].error for name in ("Kalman point-set", "factor graph"))
+    return [
+        "| | truth | paper | Kalman point-set | factor graph |",
+        "|---|---|---|---|---|",
+        *(
+            f"| {label} | {TRUTH[i]:g} | {PAPER[i]:g} | {kalman[i]:.{d}f} | {graph[i]:.{d}f} |"
+            for i, (label, d) in enumerate(zip(LABELS, DIGITS, strict=True))
+        ),
+    ]
+
+
+def sample() -> list[str]:
+    """Return those lines of the page that one seed makes."""
+    return [line for phase in PHASES for line in value_table(one_seed((phase, 0)))]
+
+
 def table(phase: int, runs: list[dict[str, Run]], bound: np.ndarray) -> list[str]:
     """Return the Markdown of one phase."""
     by = {name: [r[name] for r in runs] for name in runs[0]}
     kalman, graph = by["Kalman point-set"], by["factor graph"]
-    first = {name: TRUTH + each[0].error for name, each in by.items()}
     low, high = nees_band(7, len(runs))
     out = [
         f"## Sway phase {phase}°",
         "",
         "Values: the paper's, and ours of seed 0.",
         "",
-        "| | truth | paper | Kalman point-set | factor graph |",
-        "|---|---|---|---|---|",
-    ]
-    out += [
-        f"| {label} | {TRUTH[i]:g} | {PAPER[i]:g} | {first['Kalman point-set'][i]:.{d}f} "
-        f"| {first['factor graph'][i]:.{d}f} |"
-        for i, (label, d) in enumerate(zip(LABELS, DIGITS, strict=True))
+        *value_table(runs[0]),
     ]
     paper = 100.0 * np.mean(1.0 - np.abs(PAPER - TRUTH) / TRUTH)
     out += [
@@ -226,7 +203,7 @@ def table(phase: int, runs: list[dict[str, Run]], bound: np.ndarray) -> list[str
 INTRODUCTION = """\
 # The simulation of Luo et al. (2024), by its method and by ours
 
-Written by `python benchmarks/luo_2024.py --seeds {seeds}`; do not edit.
+{origin}
 
 The scenario is that of the paper's table 4 (`configs/seed-a-phase-0.yaml` and `-90.yaml`; the
 paper does not state the phase between roll and pitch). *Kalman point-set* is the paper's
@@ -243,14 +220,13 @@ noise. It is correlated over tens of seconds, so pings do not average it away as
 
 def main() -> None:
     """Run the study and write its page."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--seeds", type=int, default=20)
-    parser.add_argument("--out", type=Path, default=ROOT / "docs")
-    args = parser.parse_args()
+    args = common.parse(common.parser(__doc__, seeds=20))
     chance = np.sqrt(np.array(nees_band(1, args.seeds, level=0.997)))
-    page = INTRODUCTION.format(seeds=args.seeds, low=chance[0], high=chance[1]).splitlines()
+    page = INTRODUCTION.format(
+        origin=args.origin, seeds=args.seeds, low=chance[0], high=chance[1]
+    ).splitlines()
     page.append("")
-    with ProcessPoolExecutor(os.cpu_count()) as pool:
+    with common.pool(args.jobs) as pool:
         curves = dict(zip(PHASES, pool.map(convergence, PHASES), strict=True))
         bounds = dict(zip(PHASES, pool.map(cramer_rao, PHASES), strict=True))
         for phase in PHASES:
@@ -266,7 +242,7 @@ def main() -> None:
         "",
         "![Estimates over time, by filter and factor graph](images/luo-2024-convergence.png)",
     ]
-    (args.out / "luo-2024.md").write_text("\n".join(page) + "\n", encoding="utf-8")
+    common.write_page(args.out / PAGE, page)
 
 
 if __name__ == "__main__":

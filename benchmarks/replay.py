@@ -1,25 +1,24 @@
 """Measure what an update of the replay costs, and whether that and memory stay flat.
 
-    python benchmarks/replay.py [--long] [--isam2] [--rate HZ]
+    python benchmarks/replay.py [--long] [--isam2] [--rate HZ] [--out DIR]
 
-writes benchmarks/replay.md. `--long` adds a trial of 8 h, which takes some minutes and a
-gigabyte of memory to simulate; `--isam2` the growth of full iSAM2.
+writes `replay.md` into out/benchmarks, or with `--out benchmarks` that of the repository. `--long`
+adds a trial of 8 h, which takes some minutes and a gigabyte of memory to simulate; `--isam2` the
+growth of full iSAM2.
 """
 
 from __future__ import annotations
 
-import argparse
 import gc
 import os
-import sys
 from collections.abc import Iterator
 from datetime import date
 from pathlib import Path
 from time import perf_counter, process_time
 
+import common
 import numpy as np
-import yaml
-from run import CRUISE, cpu_name
+from common import config
 
 from factorgraph_dvl.replay import Replay
 from factorgraph_dvl.sensors.protocol import rows_of
@@ -27,7 +26,7 @@ from factorgraph_dvl.simulation import parse_scenario, simulate
 from factorgraph_dvl.simulation.scenario import Scenario
 from factorgraph_dvl.trial import Trial
 
-RESULTS = Path(__file__).parent / "replay.md"
+PAGE = "replay.md"
 LONG = 8 * 3600.0
 # Without a lag updates grow, and 4800 s of them would take hours.
 GROWTH = 1200.0
@@ -36,20 +35,19 @@ LONG_TIMES = 7
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = common.parser(__doc__)
     parser.add_argument("--long", action="store_true", help="add 8 h")
     parser.add_argument("--isam2", action="store_true", help="add full iSAM2")
     parser.add_argument("--rate", type=float, default=5.0, help="states a second")
-    args = parser.parse_args()
-    load = os.getloadavg()[0]
-    trial = simulate(CRUISE, 1)
+    args = common.parse(parser)
+    machine = common.machine()
+    trial = simulate(parse_scenario(config("cruise")), 1)
     duration = float(trial.imu.time[-1])
     lines = [
         "# Cost of an update of the replay\n",
-        "Written by `python benchmarks/replay.py [--long] [--isam2]`; do not edit.\n",
+        f"{args.origin}\n",
         f"- date: {date.today().isoformat()}",
-        f"- machine: {cpu_name()}, {len(os.sched_getaffinity(0))} cores",
-        f"- load of the machine at the start, 1 min: {load:.1f}",
+        f"- machine at the start: {machine}",
         f"- states at {args.rate:g} Hz, lag 30 s\n",
         "| what | median | 99 % | processor time, median | 99 % | last / first steady tenth, "
         "of both | batch solutions | memory |",
@@ -65,12 +63,12 @@ def main() -> None:
             trial = simulate(long_cruise(), 1)
         lines.append(measure(trial, f"{name}, {seconds:.0f} s", kind, seconds, args.rate))
         print(lines[-1], flush=True)
-    RESULTS.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    common.write_page(args.out / PAGE, lines)
 
 
 def long_cruise() -> Scenario:
     """Return the cruise with its manoeuvres over and over for 8 h."""
-    data = yaml.safe_load(CRUISE.read_text(encoding="utf-8"))
+    data = config("cruise")
     data["manoeuvres"] = [{"repeat": LONG_TIMES, "manoeuvres": data["manoeuvres"]}]
     return parse_scenario(data)
 
@@ -132,7 +130,4 @@ def resident() -> int:
 
 
 if __name__ == "__main__":
-    threads = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
-    if not threads.keys() <= os.environ.keys():
-        os.execve(sys.executable, [sys.executable, *sys.argv], {**threads, **os.environ})
     main()

@@ -1,6 +1,8 @@
-"""Measure speed, memory and integration error; write benchmarks/results.md.
+"""Measure speed, memory and integration error.
 
-    python benchmarks/run.py [--long]
+    python benchmarks/run.py [--long] [--out DIR]
+
+writes `results.md` into out/benchmarks, or with `--out benchmarks` that of the repository.
 
 Figures that are compared with each other are measured in the same run, alternating, so
 that a busy machine does not favour either. `--long` adds a trial eight times as long,
@@ -9,7 +11,6 @@ which takes some minutes and about a gigabyte of disk.
 
 from __future__ import annotations
 
-import argparse
 import os
 import platform
 import re
@@ -27,8 +28,10 @@ from statistics import median
 from time import perf_counter
 from typing import Any
 
+import common
 import numpy as np
 import yaml
+from common import ROOT
 
 from factorgraph_dvl import load_trial
 from factorgraph_dvl.alignment import initial_states
@@ -46,8 +49,7 @@ from factorgraph_dvl.solvers.levenberg_marquardt import minimise, quick_step
 from factorgraph_dvl.solvers.state_times import STATE_INTERVAL
 from factorgraph_dvl.trial import Trial
 
-ROOT = Path(__file__).resolve().parent.parent
-RESULTS = ROOT / "benchmarks" / "results.md"
+PAGE = "results.md"
 SHIPPED = ROOT / "data" / "seed-a-phase-90"
 CRUISE = ROOT / "configs" / "cruise.yaml"
 CONING = ROOT / "configs" / "seed-a-phase-90.yaml"
@@ -69,9 +71,9 @@ class Run:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = common.parser(__doc__)
     parser.add_argument("--long", action="store_true", help="add the trial 8 times as long")
-    args = parser.parse_args()
+    args = common.parse(parser)
     load = os.getloadavg()[0]
     lines: list[str] = []
     for title, rows in (
@@ -84,29 +86,22 @@ def main() -> None:
         for row in rows:
             print("  " + " | ".join(row), flush=True)
             lines.append("| " + " | ".join(row) + " |")
-    RESULTS.write_text("\n".join([*header(load), *lines]) + "\n", encoding="utf-8")
-    print(f"\nwrote {RESULTS.relative_to(ROOT)}")
+    common.write_page(args.out / PAGE, [*header(args.origin, load), *lines])
+    print(f"\nwrote {args.out / PAGE}")
 
 
-def header(load: float) -> list[str]:
+def header(origin: str, load: float) -> list[str]:
     packages = ("factorgraph-dvl", "gtsam", "numpy", "scipy", "pyarrow", "matplotlib")
     return [
         "# Benchmark results\n",
-        "Written by `python benchmarks/run.py [--long]`; do not edit.\n",
+        f"{origin}\n",
         f"- date: {date.today().isoformat()}",
-        f"- machine: {cpu_name()}, {len(os.sched_getaffinity(0))} cores used of "
+        f"- machine: {common.cpu_name()}, {len(os.sched_getaffinity(0))} cores used of "
         f"{os.cpu_count()}, {total_memory() / 2**30:.0f} GiB",
         f"- load of the machine at the start, 1 min: {load:.1f}",
         f"- system: {platform.system()} {platform.machine()}, Python {platform.python_version()}",
         "- packages: " + ", ".join(f"{name} {version(name)}" for name in packages),
     ]
-
-
-def cpu_name() -> str:
-    for line in Path("/proc/cpuinfo").read_text().splitlines():
-        if line.startswith("model name"):
-            return line.split(":", 1)[1].strip()
-    return platform.processor() or "unknown CPU"
 
 
 def total_memory() -> int:
@@ -347,9 +342,4 @@ def temporary_folder() -> Iterator[Path]:
 
 
 if __name__ == "__main__":
-    # The command line's setting, for what is measured in this process; NumPy reads it when
-    # it is loaded.
-    threads = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
-    if not threads.keys() <= os.environ.keys():
-        os.execve(sys.executable, [sys.executable, *sys.argv], {**threads, **os.environ})
     main()

@@ -1,27 +1,20 @@
 """Calibrate, then dead-reckon and dive: what a calibration is worth, over many seeds.
 
-    python benchmarks/sea_trial.py [--seeds 20] [--jobs 2] [--out docs]
+    python benchmarks/sea_trial.py [--seeds 20] [--jobs 2] [--out DIR]
 
-writes `sea-trial.md` and its images there.
+writes `sea-trial.md` and its images into out/benchmarks, or with `--out docs` those of the
+documentation.
 """
 
 from __future__ import annotations
 
-import argparse
-import os
 from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-# One process for each core: more threads only wait for one another.
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-os.environ.setdefault("OMP_NUM_THREADS", "1")
-
+import common
 import numpy as np
-import yaml
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
+from common import config, rms
 
 from factorgraph_dvl.analysis.before_after import BeforeAfter, before_after
 from factorgraph_dvl.analysis.consistency import trajectory_errors
@@ -36,7 +29,7 @@ from factorgraph_dvl.solution import Calibration, Solution
 from factorgraph_dvl.solvers.batch import solve
 from factorgraph_dvl.trial import Trial
 
-ROOT = Path(__file__).resolve().parents[1]
+PAGE = "sea-trial.md"
 # Luo et al. (2024), table 7: end point and largest error, % of distance.
 PAPER_BEFORE, PAPER_AFTER = (7.95, 12.79), (0.087, 0.122)
 ALIGN_S = 300.0
@@ -77,14 +70,9 @@ class Seed:
     dive: dict[str, Dive]
 
 
-def scenario(name: str) -> dict[str, object]:
-    """Return a scenario as plain data."""
-    return yaml.safe_load((ROOT / "configs" / f"{name}.yaml").read_text(encoding="utf-8"))
-
-
 def calibrate(seed: int) -> Calibration:
     """Return the calibration from a cruise."""
-    solution = solve(simulate(ROOT / "configs" / "cruise.yaml", seed=seed))
+    solution = solve(simulate(parse_scenario(config("cruise")), seed=seed))
     names = (n for n in Calibration.__dataclass_fields__)
     return Calibration(**{n: getattr(solution, n) for n in names})
 
@@ -133,7 +121,7 @@ def summary(result: BeforeAfter) -> Transit:
 
 def dive(seed: int, calibration: Calibration, outage_end: float | None) -> Dive:
     """Smooth a dive with the calibration as prior, and dead-reckon it."""
-    data = scenario("dive")
+    data = config("dive")
     if outage_end is not None:
         data["gnss"]["outages_s"][-1][1] = outage_end  # type: ignore[index]
     trial = simulate(parse_scenario(data), seed=seed)
@@ -163,7 +151,7 @@ def short_dives(calibration: Calibration) -> float:
     The error of the height is one number a dive, that of the sea surface, so 20 dives
     leave much of its share within 2σ to chance.
     """
-    data = scenario("dive")
+    data = config("dive")
     data["manoeuvres"] = [*data["manoeuvres"][:7], {"straight_s": 60}]  # type: ignore[index]
     data["gnss"]["outages_s"][-1][1] = 1e5  # type: ignore[index]
     data["dvl"].pop("no_lock_s")  # type: ignore[attr-defined]
@@ -181,7 +169,7 @@ def one_seed(seed: int) -> Seed:
     """Calibrate on a cruise, then dead-reckon a transit and smooth two dives."""
     calibration = calibrate(seed)
     # Other noise than that of the cruise.
-    trial = simulate(ROOT / "configs" / "transit.yaml", seed=seed + 1000)
+    trial = simulate(parse_scenario(config("transit")), seed=seed + 1000)
     return Seed(
         {name: summary(r) for name, r in transits(trial, calibration).items()},
         {name: dive(seed + 2000, calibration, end) for name, end in DIVES.items()},
@@ -233,11 +221,6 @@ def transit_table(seeds: Sequence[Seed]) -> list[str]:
     return out
 
 
-def rms(values: Sequence[Array] | Array) -> float:
-    """Return the root mean square."""
-    return float(np.sqrt(np.mean(np.square(values))))
-
-
 def dive_table(seeds: Sequence[Seed]) -> list[str]:
     """Return the Markdown of the dives."""
     out = [
@@ -265,8 +248,7 @@ def dive_table(seeds: Sequence[Seed]) -> list[str]:
 
 def draw(seeds: Sequence[Seed], path: Path) -> None:
     """Draw RMS errors over seeds against the standard deviation that was claimed."""
-    figure = Figure(figsize=(11, 4.2), dpi=110)
-    FigureCanvasAgg(figure)
+    figure = common.new_figure(11, 4.2)
     for ax, name in zip(figure.subplots(1, len(DIVES), sharey=True), DIVES, strict=True):
         runs = [s.dive[name] for s in seeds]
         minutes = runs[0].time / 60.0
@@ -284,14 +266,13 @@ def draw(seeds: Sequence[Seed], path: Path) -> None:
         ax.spines[["top", "right"]].set_visible(False)
     figure.axes[0].set_ylabel(f"horizontal error, RMS of {len(seeds)} seeds, m")
     figure.axes[0].legend(fontsize=8)
-    figure.tight_layout()
-    figure.savefig(path)
+    common.save_figure(figure, path)
 
 
 INTRODUCTION = """\
 # What a calibration is worth: dead reckoning and dives
 
-Written by `python benchmarks/sea_trial.py --seeds {seeds}`; do not edit.
+{origin}
 
 Each seed calibrates a DVL on an 80-minute cruise (`configs/cruise.yaml`: α = [1.68 2.10 16.45]°,
 l = [−0.93 1.12 −0.34] m, δK = 0.0177, the values that Luo et al. (2024) found at sea), and then
@@ -314,24 +295,20 @@ is all that a vessel has that is about to lose GNSS; and the true one.
 
 def main() -> None:
     """Run the study and write its page."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--seeds", type=int, default=20)
-    parser.add_argument("--jobs", type=int, default=os.cpu_count())
-    parser.add_argument("--out", type=Path, default=ROOT / "docs")
-    args = parser.parse_args()
+    args = common.parse(common.parser(__doc__, seeds=20))
     seeds = []
-    with ProcessPoolExecutor(args.jobs) as pool:
+    with common.pool(args.jobs) as pool:
         for seed in pool.map(one_seed, range(args.seeds)):
             seeds.append(seed)
             print(len(seeds), seed.transit[ATTITUDES[0]].after, flush=True)
-    print(write_study(seeds, args.out))
+    print(write_study(seeds, args.out, args.origin))
 
 
-def write_study(seeds: Sequence[Seed], out: Path) -> str:
+def write_study(seeds: Sequence[Seed], out: Path, origin: str) -> str:
     """Write the page and its images; return its text."""
     images = out / "images"
     images.mkdir(parents=True, exist_ok=True)
-    trial = simulate(ROOT / "configs" / "transit.yaml", seed=1000)
+    trial = simulate(parse_scenario(config("transit")), seed=1000)
     calibration = calibrate(0)
     shown = before_after(trial, calibration.values, by_sins(trial).at)
     track = shown.calibrated.score
@@ -342,6 +319,7 @@ def write_study(seeds: Sequence[Seed], out: Path) -> str:
     save_figures(figures, images)
     draw(seeds, images / "sea-trial-dive.png")
     page = INTRODUCTION.format(
+        origin=origin,
         seeds=len(seeds),
         minutes=np.ptp(track.time),
         km=track.path.total / 1e3,
@@ -376,9 +354,31 @@ def write_study(seeds: Sequence[Seed], out: Path) -> str:
         "",
         "![Error and claimed standard deviation over the dive](images/sea-trial-dive.png)",
     ]
-    text = "\n".join(page) + "\n"
-    (out / "sea-trial.md").write_text(text, encoding="utf-8")
-    return text
+    page += common.sample_section(seed_table(seeds[0]))
+    return common.write_page(out / PAGE, page)
+
+
+def sample() -> list[str]:
+    """Return those lines of the page that one seed makes."""
+    return seed_table(one_seed(common.SAMPLED_SEED))
+
+
+def seed_table(seed: Seed) -> list[str]:
+    """Return the Markdown of one seed: dead reckoning by attitude, and the dives."""
+    return [
+        "| what | measured |",
+        "|---|---|",
+        *(
+            f"| dead reckoning, {name}: end point, largest, % | {run.after[0]:.4f}, "
+            f"{run.after[1]:.4f} |"
+            for name, run in seed.transit.items()
+        ),
+        *(
+            f"| dive, {name}: RMS of east and north errors, m; NEES | "
+            f"{rms(run.error[:, :2]):.3f}; {run.nees:.2f} |"
+            for name, run in seed.dive.items()
+        ),
+    ]
 
 
 if __name__ == "__main__":

@@ -1,0 +1,174 @@
+"""What the benchmarks have in common: threads, arguments, folder, origin of a page.
+
+Import it before NumPy, which reads the number of threads when it is loaded.
+"""
+
+from __future__ import annotations
+
+import os
+
+# One process for each core: more threads only wait for one another.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+import argparse
+import platform
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterable, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from factorgraph_dvl.trial import Trial
+
+ROOT = Path(__file__).resolve().parents[1]
+# Not tracked: a page of the documentation is only written where `--out` says so.
+OUT = ROOT / "out" / "benchmarks"
+# A sample of each page, which a test holds against the code: all of this seed.
+SAMPLED_SEED = 0
+
+
+def parser(doc: str | None, *, seeds: int | None = None) -> argparse.ArgumentParser:
+    """Return a parser with what every benchmark takes; `seeds` is the default number."""
+    out = argparse.ArgumentParser(
+        description=doc, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    out.add_argument("--out", type=Path, default=OUT, help="folder to write (out/benchmarks)")
+    if seeds is not None:
+        out.add_argument("--seeds", type=int, default=seeds, help=f"number ({seeds})")
+        out.add_argument("--jobs", type=int, default=os.cpu_count(), help="processes")
+    return out
+
+
+def parse(parser: argparse.ArgumentParser, argv: Sequence[str] | None = None) -> Any:
+    """Parse arguments, make the folder, and note in `origin` which code makes the page.
+
+    Both at the start: a folder that cannot be written must not show after minutes, and the
+    working tree may change meanwhile.
+    """
+    args = parser.parse_args(argv)
+    try:
+        args.out.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=args.out):
+            pass
+    except OSError as error:
+        parser.error(f"--out: {args.out} cannot be written: {error.strerror}")
+    options = {name: v for name, v in vars(args).items() if name not in ("out", "jobs")}
+    command = " ".join(["python", f"benchmarks/{Path(sys.argv[0]).name}", *_given(options)])
+    args.origin = f"Written by `{command}` from {commit()}; do not edit."
+    return args
+
+
+def _given(options: dict[str, Any]) -> Iterable[str]:
+    for name, value in options.items():
+        flag = "--" + name.replace("_", "-")
+        if value is True:
+            yield flag
+        elif value not in (None, False):
+            yield f"{flag} {value}"
+
+
+def commit() -> str:
+    """Return the commit of the code that runs, and whether tracked files were changed."""
+
+    def git(*command: str) -> str:
+        run = ["git", "-C", str(ROOT), *command]
+        return subprocess.run(run, capture_output=True, text=True, check=True).stdout.strip()
+
+    try:
+        changed = git("status", "--porcelain", "--untracked-files=no")
+        return f"commit {git('rev-parse', '--short=10', 'HEAD')} " + (
+            "with changes" if changed else "(clean tree)"
+        )
+    except (OSError, subprocess.CalledProcessError):
+        return "an unknown commit"
+
+
+def write_page(path: Path, lines: Iterable[str]) -> str:
+    """Write a page of Markdown; return its text."""
+    text = "\n".join(lines) + "\n"
+    path.write_text(text, encoding="utf-8")
+    return text
+
+
+def sample_section(lines: Sequence[str]) -> list[str]:
+    """Return the section with the numbers of one seed, which a test computes anew."""
+    return ["", f"## Seed {SAMPLED_SEED} alone", "", *lines]
+
+
+def config(name: str, **top: Any) -> dict[str, Any]:
+    """Return a scenario of configs/ as plain data, with changes at the top level."""
+    text = (ROOT / "configs" / f"{name}.yaml").read_text(encoding="utf-8")
+    return {**yaml.safe_load(text), **top}
+
+
+def pool(jobs: int | None) -> ProcessPoolExecutor:
+    """Return processes that start afresh."""
+    return ProcessPoolExecutor(jobs, get_context("spawn"))
+
+
+def new_figure(width: float, height: float) -> Figure:
+    """Return an empty figure, inches."""
+    figure = Figure(figsize=(width, height), dpi=110)
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def save_figure(figure: Figure, path: Path) -> None:
+    """Write a figure into a folder that may not be there yet."""
+    figure.tight_layout()
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path)
+
+
+def rms(values: Any) -> float:
+    """Return the root mean square."""
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+def until(trial: Trial, end: float) -> Trial:
+    """Return a trial's records up to a time."""
+
+    def cut(record: Any) -> Any:
+        keep = record.time <= end + 1e-6
+        arrays = {
+            name: value[keep]
+            for name, value in vars(record).items()
+            if isinstance(value, np.ndarray) and value.shape[:1] == keep.shape
+        }
+        return replace(record, **arrays)
+
+    def cut_if_there(record: Any) -> Any:
+        return None if record is None else cut(record)
+
+    return replace(
+        trial,
+        imu=cut(trial.imu),
+        gnss=cut_if_there(trial.gnss),
+        dvl=cut_if_there(trial.dvl),
+        others=tuple(cut(aid) for aid in trial.others),
+        reference=None,
+    )
+
+
+def cpu_name() -> str:
+    """Return the model of the processor."""
+    for line in Path("/proc/cpuinfo").read_text().splitlines():
+        if line.startswith("model name"):
+            return line.split(":", 1)[1].strip()
+    return platform.processor() or "unknown CPU"
+
+
+def machine() -> str:
+    """Return what a timing was measured on, and how busy that was."""
+    cores = len(os.sched_getaffinity(0))
+    return f"{cpu_name()}, {cores} of {os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}"
