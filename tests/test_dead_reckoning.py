@@ -15,6 +15,7 @@ from factorgraph_dvl.analysis.before_after import before_after
 from factorgraph_dvl.analysis.dead_reckoning import (
     Track,
     dead_reckon,
+    displaced,
     integrated,
     lever_arm_error,
     mounting_of,
@@ -105,6 +106,20 @@ def test_lever_arm_error_by_hand():
     np.testing.assert_allclose(
         lever_arm_error(about, np.array([2.0, 0.0, 0.0]))[1], [2.0, -2.0, 0.0], atol=1e-12
     )
+
+
+def test_the_error_of_the_first_fix_is_not_in_the_score():
+    trial = simulate(scenario(), 0)
+    geodetic = trial.gnss.geodetic.copy()
+    geodetic[:5] = displaced(geodetic[:5], np.full((5, 3), [8.0, -5.0, 3.0]))
+    off = replace(trial, gnss=replace(trial.gnss, geodetic=geodetic))
+    result = before_after(off, trial.calibration_truth, attitude_of(trial).at)
+    assert np.abs(result.calibrated.score.error).max() < 0.01
+    # What is compared starts at one point.
+    for run_of in (result.uncalibrated, result.without_lever_arm):
+        np.testing.assert_array_equal(
+            run_of.track.geodetic[0], result.calibrated.track.geodetic[0]
+        )
 
 
 def test_gaps_of_the_lock_are_bridged_and_counted():

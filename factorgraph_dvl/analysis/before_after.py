@@ -15,6 +15,7 @@ from factorgraph_dvl.analysis.dead_reckoning import (
     Track,
     antenna_removed,
     dead_reckon,
+    displaced,
     lever_arm_error,
     mounting_of,
 )
@@ -22,6 +23,10 @@ from factorgraph_dvl.analysis.track_score import Score, difference, score
 from factorgraph_dvl.beam_geometry import as_dvl
 from factorgraph_dvl.conventions import Array, rotation_from_rph
 from factorgraph_dvl.trial import Reference, Trial
+
+# Fixes of so many seconds tell where a track starts: many enough for their noise, and too short
+# a time for a calibrated DVL to drift.
+_START_S = 60.0
 
 
 @dataclass(frozen=True)
@@ -82,6 +87,10 @@ def before_after(
 ) -> BeforeAfter:
     """Dead-reckon a trial by a calibration, and by what trial.yaml says of the mounting.
 
+    All tracks start where the fixes of the first minute put the calibrated one: the error of a
+    single fix would stay in the whole track, and in its score. Without GNSS they start at
+    `initial.position`.
+
     Of a trial with beams and without a DVL beside them it is the beams that are calibrated.
 
     Parameters
@@ -97,7 +106,12 @@ def before_after(
     """
     truth, scored_by = _truth(trial, orientation_at)
     corrected, mounting = _calibrated(trial, values)
-    best = dead_reckon(corrected, mounting, orientation_at)
+    start = _start(trial, dead_reckon(corrected, mounting, orientation_at), orientation_at)
+
+    def reckon(trial: Trial, mounting: Mounting) -> Track:
+        return dead_reckon(trial, mounting, orientation_at, start)
+
+    best = reckon(corrected, mounting)
 
     def run(mounting: Mounting, track: Track) -> Run:
         return Run(mounting, track, None if truth is None else score(track, truth, along=best))
@@ -105,7 +119,7 @@ def before_after(
     nominal = mounting_of(trial)
     bare = replace(mounting, lever_arm=np.zeros(3))
     calibrated = run(mounting, best)
-    without = run(bare, dead_reckon(corrected, bare, orientation_at))
+    without = run(bare, reckon(corrected, bare))
     nRb = rotation_from_rph(best.rph, trial.body_axes)
     effect = LeverArmEffect(
         best.time,
@@ -114,11 +128,28 @@ def before_after(
     )
     return BeforeAfter(
         calibrated=calibrated,
-        uncalibrated=run(nominal, dead_reckon(trial, nominal, orientation_at)),
+        uncalibrated=run(nominal, reckon(trial, nominal)),
         without_lever_arm=without,
         lever_arm=effect,
         scored_by="nothing" if calibrated.score is None else scored_by,
     )
+
+
+def _start(trial: Trial, track: Track, orientation_at: OrientationAt) -> tuple[float, Array]:
+    """Return time and position of the start that fits the first fixes best.
+
+    Their median, by axis, because one of them may be an outlier.
+    """
+    first, position = float(track.time[0]), track.geodetic[0]
+    if trial.gnss is None:
+        return first, position
+    fixes = antenna_removed(trial.gnss, orientation_at)
+    last = min(first + _START_S, float(track.time[-1]))
+    early = (fixes.time >= first) & (fixes.time <= last)
+    if not early.any():
+        return first, position
+    off = np.median(difference(track, fixes.time[early], fixes.geodetic[early]), axis=0)
+    return first, displaced(position[None], -off[None])[0]
 
 
 def _calibrated(trial: Trial, values: Mapping[str, Array]) -> tuple[Trial, Mounting]:

@@ -93,8 +93,13 @@ def mounting_of(trial: Trial, values: Mapping[str, Array] | None = None) -> Moun
     )
 
 
-def dead_reckon(trial: Trial, mounting: Mounting, orientation_at: OrientationAt) -> Track:
-    """Integrate the corrected velocity of the DVL from the first GNSS fix on.
+def dead_reckon(
+    trial: Trial,
+    mounting: Mounting,
+    orientation_at: OrientationAt,
+    start: tuple[float, Array] | None = None,
+) -> Track:
+    """Integrate the corrected velocity of the DVL, by default from the first GNSS fix on.
 
         v_b = dRbᵀ ((v_d - beta) / (1 + k)) - omega_eb_b x l,    v_n = nRb v_b,
         dL/dt = v_n / (M + h),  dlon/dt = v_e / ((N + h) cos L),  dh/dt = v_u
@@ -109,6 +114,7 @@ def dead_reckon(trial: Trial, mounting: Mounting, orientation_at: OrientationAt)
     trial : its DVL, or what its beams amount to, and its first fix.
     mounting : that the velocity is corrected by.
     orientation_at : attitude and turn rate at times (M,).
+    start : time, s, and position of the IMU, (3,) as in `Track`, to start from instead.
 
     Raises
     ------
@@ -130,7 +136,9 @@ def dead_reckon(trial: Trial, mounting: Mounting, orientation_at: OrientationAt)
     turning = np.cross(orientation.omega_eb_b[used], mounting.lever_arm)
     v_b = unscaled @ mounting.dRb - turning
 
-    start_time, start = _start(trial, float(pings[0]), float(pings[-1]), orientation_at)
+    start_time, position = start or _start(
+        trial, float(pings[0]), float(pings[-1]), orientation_at
+    )
     time = _filled(pings[pings > start_time])
     time = np.concatenate([[start_time], time])
     there = orientation_at(time)
@@ -139,7 +147,7 @@ def dead_reckon(trial: Trial, mounting: Mounting, orientation_at: OrientationAt)
     v_n = rotate(nRb, np.stack([np.interp(time, knots, v) for v in velocity.T], axis=1))
     return Track(
         time=time,
-        geodetic=integrated(time, v_n, start),
+        geodetic=integrated(time, v_n, position),
         velocity=v_n,
         rph=rph_from_rotation(nRb, trial.body_axes),
         bridged=float(np.diff(gaps[gaps[:, 0] > start_time], axis=1).sum()),
