@@ -342,8 +342,9 @@ def write_study(seeds: Sequence[Seed], out: Path, origin: str) -> str:
         "at 50 m depth without, 120 s of it without bottom lock, then up. `factorgraph-dvl solve` "
         "with `dvl.calibration`, in two versions: GNSS returns at the surface, or does not. Dead "
         "reckoning starts where the fixes of the first minute put it, with the attitude of the "
-        "SINS that GNSS aided while it was there, or with that of the smoothed solution. Errors are horizontal, over all "
-        "epochs of all seeds; the ratio is that to dead reckoning with the attitude of the SINS.",
+        "SINS that GNSS aided while it was there, or with that of the smoothed solution. Errors "
+        "are horizontal, over all epochs of all seeds; the ratio is that to dead reckoning with "
+        "the attitude of the SINS.",
         "",
         *dive_table(seeds),
         "",

@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 
 from factorgraph_dvl.conventions import DEG
 from factorgraph_dvl.earth import LocalFrame
+from factorgraph_dvl.report.drawing import draw_band
 from factorgraph_dvl.report.figures import write_figures
 from factorgraph_dvl.report.residual_figures import residuals_figure
 from factorgraph_dvl.report.trajectory_figures import motion_figure
@@ -329,13 +330,67 @@ def test_a_swing_too_fast_for_the_whole_time_is_drawn_close_up(
     assert drawn(trial, solution, tmp_path) == ALL
 
 
-def test_a_band_beyond_the_panel_is_explained(short: tuple[Trial, Solution]) -> None:
+def test_residuals_are_drawn_in_their_own_sigma(short: tuple[Trial, Solution]) -> None:
     _, dvl = short[1].residuals
-    assert not residuals_figure([dvl]).texts
-    sigma = dvl.sigma.copy()
-    sigma[7:9] *= 12.0
-    (note,) = residuals_figure([replace(dvl, sigma=sigma)]).texts
-    assert "gyro's samples" in note.get_text()
+    # A residual of 4 of its own σ beside one whose σ is ten times as large.
+    residual, sigma = dvl.residual.copy(), dvl.sigma.copy()
+    sigma[8] *= 10.0
+    residual[7] = 4.0 * sigma[7]
+    figure = residuals_figure([replace(dvl, residual=residual, sigma=sigma)])
+    left = figure.axes[0]
+    drawn_points = np.concatenate([np.asarray(line.get_ydata()) for line in left.lines])
+    assert np.abs(drawn_points).max() == pytest.approx(4.0)
+    (band,) = left.patches
+    assert np.ptp(band.get_window_extent().intervaly) > 0.0
+    low, high = np.sort(left.transData.inverted().transform(band.get_window_extent())[:, 1])
+    assert (low, high) == pytest.approx((-3.0, 3.0))
+    assert any("σ from 0.008 to 0.08 m/s" in text.get_text() for text in left.texts)
+
+
+def test_residuals_beyond_the_panel_are_triangles_with_a_count(
+    short: tuple[Trial, Solution],
+) -> None:
+    _, dvl = short[1].residuals
+    residual = dvl.residual.copy()
+    residual[[3, 9], 0] = 50.0 * dvl.sigma[[3, 9], 0]
+    residual[20, 0] = -8.0 * dvl.sigma[20, 0]
+    left, right = residuals_figure([replace(dvl, residual=residual)]).axes[:2]
+    count = {line.get_marker(): np.size(line.get_xdata()) for line in left.lines}
+    assert (count["^"], count["v"]) == (2, 1)
+    said = [text.get_text() for text in left.texts]
+    assert "2 beyond the panel, up to 50 σ" in said
+    assert "1 beyond the panel, up to 8 σ" in said
+    # They are not put into the last bins, where they would look like many.
+    (bars,) = right.patches
+    values, edges, _ = bars.get_data()
+    share = float(values @ np.diff(edges))
+    assert share == pytest.approx(1.0 - 3.0 / dvl.time.size)
+    assert values[0] == 0.0
+    assert values[-1] == 0.0
+
+
+def test_a_swing_is_no_rectangle_and_a_band_that_is_not_seen_is_not_named() -> None:
+    _, solution = synthetic(900.0, trajectory_step=10)
+    track = solution.trajectory
+    left = motion_figure(track, None).axes[0]
+    assert left.get_ylabel() == "roll, deg"
+    assert not [c for c in left.collections if c.get_paths()]
+    low, high, mean = (np.asarray(line.get_ydata()) for line in left.lines[:3])
+    assert (low <= mean).all()
+    assert (mean <= high).all()
+    assert np.ptp(mean) < 0.6 * np.ptp(track.rph[:, 0] / DEG)
+    assert "largest in" in left.texts[0].get_text()
+    tight = replace(track, velocity_cov=1e-8 * track.velocity_cov, rph_cov=1e-8 * track.rph_cov)
+    assert titles(motion_figure(tight, None))[0] == "Attitude and velocity"
+
+
+def test_the_band_of_errors_is_nowhere_wider_than_a_neighbours_sigma() -> None:
+    figure = Figure()
+    ax = figure.add_subplot()
+    half = np.where(np.arange(10_000) % 10 == 0, 5.0, 1.0)
+    draw_band(ax, np.arange(10_000.0), half)
+    for line in ax.lines:
+        assert np.abs(np.asarray(line.get_ydata())).max() == 1.0
 
 
 def test_sensors_get_files_of_their_own(short: tuple[Trial, Solution], tmp_path: Path) -> None:

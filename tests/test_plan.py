@@ -15,11 +15,11 @@ from truth import CONFIGS, merged, scenario
 import factorgraph_dvl.planning.proposal as proposing
 from factorgraph_dvl.cli import main
 from factorgraph_dvl.errors import ConfigError
-from factorgraph_dvl.planning import load_plan, predict, propose, requirements
+from factorgraph_dvl.planning import predict, propose, requirements
 from factorgraph_dvl.planning.library import Item, Library, library
 from factorgraph_dvl.planning.prediction import go_on
 from factorgraph_dvl.report.plan_files import proposal_lines
-from factorgraph_dvl.simulation import parse_scenario, plan_motion, simulate
+from factorgraph_dvl.simulation import load_scenario, parse_scenario, plan_motion, simulate
 from factorgraph_dvl.solvers.batch import solve
 
 CALM = {"sway": {}, "current_m_s": [0.2, 0, 0]}
@@ -144,7 +144,7 @@ def test_wrong_requirements(value, tmp_path):
     file = tmp_path / "plan.yaml"
     file.write_text(text.partition("required:")[0] + f"required:\n  scale_error: {value}\n")
     with pytest.raises(ConfigError, match=r"plan.yaml.*required"):
-        load_plan(file)
+        load_scenario(file)
 
 
 def test_nothing_missed_nothing_proposed():
@@ -382,3 +382,11 @@ def test_plans_that_tell_nothing(name, tmp_path: Path, capsys) -> None:
     assert found["proposal"] is None
     for component in found["predicted"].values():
         assert component["std"] is not None
+
+
+def test_a_plan_is_simulated_like_any_scenario():
+    trial = simulate(CONFIGS / "plans" / "harbour.yaml", seed=3)
+    assert trial.dvl is not None
+    assert set(load_scenario(CONFIGS / "plans" / "harbour.yaml").required) == {
+        "misalignment_deg", "scale_error", "lever_arm_m",
+    }  # fmt: skip

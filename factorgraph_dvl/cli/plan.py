@@ -29,11 +29,12 @@ def plan(
     """Predict what a planned trial will tell, and what to add where that is not enough."""
     from factorgraph_dvl.analysis.observability import observability as look
     from factorgraph_dvl.io.folders import check_output, new_folder
-    from factorgraph_dvl.planning import load_plan, predict, propose, requirements
+    from factorgraph_dvl.planning import predict, propose, requirements
     from factorgraph_dvl.report.plan_files import OWNED, to_json
+    from factorgraph_dvl.simulation import load_scenario
 
     check_output(out, force=force)
-    planned = load_plan(source)
+    planned = load_scenario(source)
     with ProgressLine(quiet=quiet) as progress:
         progress("prediction", 0, None)
         prediction = predict(planned)

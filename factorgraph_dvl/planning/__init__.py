@@ -6,17 +6,14 @@ true motion with the noise that it claims: the posterior follows without solving
 
 from __future__ import annotations
 
-from factorgraph_dvl.planning.plan_file import Plan, load_plan
 from factorgraph_dvl.planning.prediction import Prediction, predict
 from factorgraph_dvl.planning.proposal import Proposal, propose
 from factorgraph_dvl.planning.requirements import Requirement, requirements
 
 __all__ = [
-    "Plan",
     "Prediction",
     "Proposal",
     "Requirement",
-    "load_plan",
     "predict",
     "propose",
     "requirements",

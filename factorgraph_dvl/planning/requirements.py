@@ -30,7 +30,7 @@ def requirements(
 
     Parameters
     ----------
-    required : as of `Plan`.
+    required : as of a scenario.
     estimates : of the prediction.
     source : name of the plan, for messages.
 

@@ -21,6 +21,7 @@ DARK = "#222222"
 GREY = "#8a8a8a"
 MEDIUM = "#b5b5b5"
 LIGHT = "#e9e9e9"
+PALE = "#f5f5f5"
 SMALL = 7.5
 NORMAL = 8.5
 TITLE = 10.5
@@ -141,10 +142,16 @@ def draw_line(
 
 
 def draw_band(ax: Axes, time: Array, half: Array) -> None:
-    """Draw a band about zero, of (M,) half widths."""
-    bucket_time, _, high = envelope(time, half)
-    ax.fill_between(bucket_time, -high, high, color=LIGHT, lw=0, zorder=0)
-    for edge in (-high, high):
+    """Draw a band about zero, of (M,) half widths.
+
+    Where they change within a bucket the band is as wide as the narrowest, and paler up to the
+    widest: an error that is outside its own σ never lies in the band of a neighbour.
+    """
+    bucket_time, low, high = envelope(time, half)
+    if low is not high:
+        ax.fill_between(bucket_time, -high, high, color=PALE, lw=0, zorder=-1)
+    ax.fill_between(bucket_time, -low, low, color=LIGHT, lw=0, zorder=0)
+    for edge in (-low, low):
         ax.plot(bucket_time, edge, color=GREY, lw=0.7)
 
 
@@ -160,13 +167,40 @@ def draw_std(ax: Axes, time: Array, std: Array) -> None:
     ax.set_ylim(0.0, 1.1 * float(std.max()) or 1.0)
 
 
+def draw_swing(ax: Axes, time: Array, value: Array) -> None:
+    """Draw a swing too fast for its panel: least, mean and largest of each bucket."""
+    edges = bucket_edges(value.size)
+    bucket_time, low, high = envelope(time, value)
+    mean = np.add.reduceat(value, edges) / np.diff(np.append(edges, value.size))
+    for line in (low, high):
+        ax.plot(bucket_time, line, color=ACCENT, lw=0.7)
+    ax.plot(bucket_time, np.append(mean, mean[-1]), color=DARK, lw=0.9)
+    seconds = float(time[edges[1]] - time[edges[0]])
+    ax.text(
+        0.99,
+        0.86,
+        f"least, mean, largest in {seconds:.2g} s",
+        transform=ax.transAxes,
+        ha="right",
+        va="top",
+        fontsize=SMALL,
+        color=DARK,
+        bbox={"facecolor": "white", "alpha": 0.75, "edgecolor": "none", "pad": 1.0},
+    )
+
+
+def bucket_edges(size: int, buckets: int = _WIDE_BUCKETS) -> Array:
+    """Return the first index of each bucket of `size` values."""
+    return np.linspace(0, size, min(buckets, size), endpoint=False).astype(int)
+
+
 def envelope(
     time: Array, value: Array, buckets: int = _WIDE_BUCKETS
 ) -> tuple[Array, Array, Array]:
     """Return times, least and largest of (M,) values in buckets; the values if M is small."""
     if value.size <= 2 * buckets:
         return time, value, value
-    edges = np.linspace(0, value.size, buckets, endpoint=False).astype(int)
+    edges = bucket_edges(value.size, buckets)
     low, high = np.minimum.reduceat(value, edges), np.maximum.reduceat(value, edges)
     return np.append(time[edges], time[-1]), np.append(low, low[-1]), np.append(high, high[-1])
 

@@ -23,6 +23,7 @@ from factorgraph_dvl.report.drawing import (
     draw_error,
     draw_line,
     draw_std,
+    draw_swing,
     envelope,
     error_title,
     is_dense,
@@ -34,6 +35,8 @@ from factorgraph_dvl.solution import Hypothesis, Trajectory
 from factorgraph_dvl.trial import PlanarTrial, Reference, Trial
 
 _CLOSE_UP_S = 10.0
+# A line is about so thick beside its panel.
+_SEEN = 0.005
 # At least so many to each side, if the trajectory has few epochs.
 _CLOSE_UP_INTERVALS = 20
 
@@ -147,7 +150,9 @@ def motion_figure(trajectory: Trajectory, errors: TrajectoryErrors | None) -> Fi
             vector = errors.attitude if i < 3 else errors.velocity
             draw_error(right, errors.time - start, vector, i % 3, unit)
         style(right, row_label, label)
-    columns[0][0].set_title("Attitude and velocity, band ±3σ", fontsize=TITLE, loc="left")
+    has_band = any(_band_is_seen(rows[i][1], rows[i][2]) for i in shown)
+    title = "Attitude and velocity" + (", band ±3σ" if has_band else "")
+    columns[0][0].set_title(title, fontsize=TITLE, loc="left")
     if close_up is not None:
         seconds = time[close_up][-1] - time[close_up][0]
         columns[1][0].set_title(f"{seconds:.3g} s of it", fontsize=TITLE, loc="left")
@@ -179,13 +184,23 @@ def _panel(
 
 
 def _draw_with_band(ax: Axes, time: Array, value: Array, std: Array, marker: str = "") -> None:
-    """Draw (M,) values and what lies within ±3σ of them."""
+    """Draw (M,) values and what lies within ±3σ of them, where that can be seen."""
+    if is_dense(value):
+        draw_swing(ax, time, value)
+        return
     draw_line(ax, time, value, marker=marker)
+    if not _band_is_seen(value, std):
+        return
     bucket_time, low, high = envelope(time, value)
     three_sigma = 3.0 * envelope(time, std)[2]
     ax.fill_between(
         bucket_time, low - three_sigma, high + three_sigma, color=LIGHT, lw=0, zorder=0
     )
+
+
+def _band_is_seen(value: Array, std: Array) -> bool:
+    """Whether ±3σ about (M,) values is wider than their line."""
+    return bool(3.0 * np.nanmax(std, initial=0.0) > _SEEN * np.ptp(value) and not is_dense(value))
 
 
 def _reference_track(reference: Reference, trajectory: Trajectory, frame: LocalFrame) -> Array:

@@ -51,7 +51,7 @@ from collections.abc import Mapping
 from datetime import date
 from os import PathLike
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any
 
 import msgspec
 
@@ -172,11 +172,20 @@ class Scenario(Section, frozen=True, kw_only=True):
     dvl_beams: DvlBeamsTruth | None = None
     turntable: TurntableTruth | None = None
     trial: Claims = Claims()
+    # A mapping of Any: a number, or a list of them, is checked below in one sentence.
+    required: dict[str, Any] = msgspec.field(default_factory=dict)
     source: str = ""
 
     def __post_init__(self) -> None:
         super().__post_init__()
         check_epoch(self.epoch)
+        for name, given in self.required.items():
+            numbers = given if isinstance(given, list) else [given]
+            if not numbers or not all(_is_sigma(number) for number in numbers):
+                raise ValueError(
+                    f"`required` must hold a number above 0 for each name, or a list of them; "
+                    f"{name} is {given}"
+                )
 
     def plan(self) -> list[Manoeuvre]:
         """Return the manoeuvres with repetitions written out.
@@ -214,7 +223,9 @@ class Scenario(Section, frozen=True, kw_only=True):
         )
 
 
-_S = TypeVar("_S", bound=Scenario)
+def _is_sigma(value: Any) -> bool:
+    is_number = isinstance(value, float | int) and not isinstance(value, bool)
+    return is_number and 0.0 < value < float("inf")
 
 
 def load_scenario(path: str | PathLike[str]) -> Scenario:
@@ -226,13 +237,8 @@ def load_scenario(path: str | PathLike[str]) -> Scenario:
         If the file is missing, is not YAML, or holds an unknown key, a wrong type or a
         value out of range; the message names file, line and key.
     """
-    return read_scenario(path, Scenario)
-
-
-def read_scenario(path: str | PathLike[str], kind: type[_S]) -> _S:
-    """Read a scenario, or what has more keys than one; otherwise as `load_scenario`."""
     path = Path(path)
-    scenario = read_yaml(path, kind, source=str(path))
+    scenario = read_yaml(path, Scenario, source=str(path))
     if scenario.source:
         raise ConfigError("unknown key `source`", where=str(path))
     return _checked(msgspec.structs.replace(scenario, source=str(path)))
@@ -257,7 +263,7 @@ def parse_scenario(data: Mapping[str, Any], source: str = "scenario") -> Scenari
     return _checked(convert({**data, "source": source}, Scenario, "", source))
 
 
-def _checked(scenario: _S) -> _S:
+def _checked(scenario: Scenario) -> Scenario:
     source = scenario.source
     scenario.plan()
     _check_sections(scenario)
