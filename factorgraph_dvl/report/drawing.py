@@ -10,6 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.gridspec import GridSpec
+from numpy.typing import NDArray
 
 from factorgraph_dvl.analysis.consistency import TrajectoryErrors, VectorErrors
 from factorgraph_dvl.conventions import Array
@@ -189,9 +190,9 @@ def draw_swing(ax: Axes, time: Array, value: Array) -> None:
     )
 
 
-def bucket_edges(size: int, buckets: int = _WIDE_BUCKETS) -> Array:
+def bucket_edges(size: int, buckets: int = _WIDE_BUCKETS) -> NDArray[np.intp]:
     """Return the first index of each bucket of `size` values."""
-    return np.linspace(0, size, min(buckets, size), endpoint=False).astype(int)
+    return np.linspace(0, size, min(buckets, size), endpoint=False).astype(np.intp)
 
 
 def envelope(
