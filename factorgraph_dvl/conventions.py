@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Literal, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 Array = NDArray[np.float64]
 BodyAxes = Literal["RFU", "FRD", "FLU"]
+_Angle = TypeVar("_Angle", float, Array)
 
 DEG = np.pi / 180.0
 HOUR = 3600.0
@@ -31,6 +32,11 @@ _ENU_FROM_NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 def frd_from_body(body_axes: BodyAxes) -> Array:
     """Return the (3, 3) matrix that takes body components to forward, right, down."""
     return _FRD_FROM_BODY[body_axes]
+
+
+def wrapped(angle: _Angle) -> _Angle:
+    """Return angles in [-pi, pi)."""
+    return (angle + np.pi) % (2.0 * np.pi) - np.pi
 
 
 def skew(v: ArrayLike) -> Array:

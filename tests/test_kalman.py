@@ -217,6 +217,21 @@ def test_after_a_gap_the_filter_starts_again():
     assert not np.any((solution.trajectory.time > 25.01) & (solution.trajectory.time < 39.9))
 
 
+def test_without_velocities_fixes_may_cross_180_degrees():
+    def solved(lon):
+        start = {"lat_deg": 36, "lon_deg": lon, "heading_deg": 90, "speed_m_s": 4}
+        trial = simulate(scenario(noise=True, start=start), 1)
+        assert lon == 121 or np.ptp(trial.gnss.geodetic[:, 1]) > 6
+        nothing = np.full_like(trial.gnss.velocity, np.nan)
+        return kalman(replace(trial, gnss=replace(trial.gnss, velocity=nothing)))
+
+    across, elsewhere = solved(179.9995), solved(121)
+    assert np.abs(across.trajectory.geodetic[:, 1]).max() <= np.pi
+    std = elsewhere.estimate("misalignment_deg").std
+    values = [s.estimate("misalignment_deg").value for s in (across, elsewhere)]
+    assert np.all(np.abs(values[0] - values[1]) < 0.1 * std)
+
+
 def test_walking_biases_are_reported_as_their_mean():
     walk = {"gyro_bias_walk_deg_h_sqrt_h": 0.1, "accel_bias_walk_ug_sqrt_h": 50}
     solution = kalman(simulate(scenario(noise=True, imu=walk), 1))

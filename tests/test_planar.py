@@ -354,6 +354,18 @@ def test_the_filters_start_from_a_position_only():
         assert np.all(np.diff(history.std[:, 0]) < 1e-3)
 
 
+def test_the_filters_pass_over_missing_headings_and_depths():
+    t = trial(5, trial={"initial": {"position_std_m": [5, 5, 1]}})
+    heading, depth = t.heading.heading.copy(), t.depth.depth.copy()
+    heading[5:8] = depth[5:8] = np.nan
+    lost = replace(
+        t, heading=replace(t.heading, heading=heading), depth=replace(t.depth, depth=depth)
+    )
+    motions = [filter_planar(x, "4sv-3ob")[0].trajectory for x in (t, lost)]
+    for name in ("rph", "geodetic", "velocity"):
+        np.testing.assert_allclose(*(getattr(m, name) for m in motions), atol=0.1)
+
+
 def test_files_and_commands(tmp_path, capsys):
     t = trial(6, beacons={"missed": 0.1}, trial={"initial": {"position_std_m": [50, 50, 1]}})
     save_planar_trial(t, tmp_path / "t")

@@ -16,6 +16,7 @@ from factorgraph_dvl.conventions import (
     log_so3,
     rotation_from_rph,
     rph_from_rotation,
+    wrapped,
 )
 from factorgraph_dvl.directions import turns_to
 from factorgraph_dvl.earth import radii
@@ -156,7 +157,7 @@ def motion_errors(trajectory: Trajectory, reference: Reference) -> TrajectoryErr
     height_true = truth.geodetic[:, 2]
     position = np.stack(
         [
-            _wrap(lon - truth.geodetic[:, 1])
+            wrapped(lon - truth.geodetic[:, 1])
             * (prime_vertical + height_true)
             * np.cos(truth.geodetic[:, 0]),
             (lat - truth.geodetic[:, 0]) * (meridian + height_true),
@@ -172,7 +173,7 @@ def motion_errors(trajectory: Trajectory, reference: Reference) -> TrajectoryErr
             trajectory.velocity[epochs] - truth.velocity, trajectory.velocity_cov[epochs]
         ),
         attitude=VectorErrors(
-            _wrap(trajectory.rph[epochs] - truth.rph), trajectory.rph_cov[epochs]
+            wrapped(trajectory.rph[epochs] - truth.rph), trajectory.rph_cov[epochs]
         ),
     )
 
@@ -299,11 +300,6 @@ def _nees(error: Array, covariance: Array) -> Array:
     return np.asarray(np.sum(z * weighted, axis=1))
 
 
-def _wrap(angle: Array) -> Array:
-    """Return angles in [-pi, pi)."""
-    return (angle + np.pi) % (2.0 * np.pi) - np.pi
-
-
 def nearest_rotation_vector(phi: Array, near: Array) -> Array:
     """Return the rotation vector (3,), deg, of the same rotation that is nearer to `near`.
 
@@ -343,7 +339,7 @@ def _reference_at(reference: Reference, time: Array) -> tuple[NDArray[np.intp], 
         # leave too few digits.
         origin = reference.geodetic[nodes[:, 0]]
         offset = reference.geodetic[nodes] - origin[:, None, :]
-        offset[..., 1] = _wrap(offset[..., 1])
+        offset[..., 1] = wrapped(offset[..., 1])
         geodetic[at] = origin + np.einsum("mk,mkc->mc", weights, offset)
         velocity[at] = np.einsum("mk,mkc->mc", weights, reference.velocity[nodes])
         # Roll, pitch and heading themselves wrap, and are not smooth at steep pitch.

@@ -17,6 +17,7 @@ from factorgraph_dvl.conventions import (
     rotation_from_rph,
     rph_jacobian,
     skew,
+    wrapped,
 )
 from factorgraph_dvl.earth import RATE, radii
 from factorgraph_dvl.errors import DataError
@@ -169,6 +170,8 @@ def motion_at(navigation: Navigation, time: Array) -> Motion:
     nRb = exp_so3(fraction[:, None] * turn_miss[at]) @ part[2]
     velocity = part[1] + fraction[:, None] * (track.velocity[used + 1] - whole[1])[at]
     geodetic = part[0] + fraction[:, None] * (track.geodetic[used + 1] - whole[0])[at]
+    # The filter adds up longitude beyond 180 deg.
+    geodetic[:, 1] = wrapped(geodetic[:, 1])
     P = track.covariance[before, :9, :9]
     P = P + fraction[:, None, None] * (track.covariance[before + 1, :9, :9] - P)
 
@@ -299,7 +302,9 @@ def _fixes_at(gnss: Gnss, samples: Samples, time: Array) -> Fixes:
 
 def _filled(geodetic: Array, time: Array) -> Array:
     known = ~np.isnan(geodetic[:, 0])
-    return np.stack([np.interp(time, time[known], x) for x in geodetic[known].T], axis=1)
+    lat, lon, height = geodetic[known].T
+    columns = (lat, np.unwrap(lon), height)
+    return np.stack([np.interp(time, time[known], x) for x in columns], axis=1)
 
 
 def _velocities(fixes: Fixes, time: Array) -> tuple[Array, Array]:
@@ -315,6 +320,7 @@ def _velocities(fixes: Fixes, time: Array) -> tuple[Array, Array]:
     metres = np.stack([(east * np.cos(place[:, 0])), meridian, np.ones_like(east)], axis=1)
     velocity, sigma = np.full((time.size, 3), np.nan), np.full((time.size, 3), np.nan)
     change = (place[b] - place[a])[:, [1, 0, 2]]
+    change[:, 0] = wrapped(change[:, 0])
     velocity[known] = np.where((b > a)[:, None], change * metres / span[:, None], np.nan)
     sigma[known] = np.sqrt(2.0 * fixes.position_variance[known]) / span[:, None]
     return velocity, sigma

@@ -89,7 +89,7 @@ def filter_planar(
     filtered = run_filter(trial, method, mean, trial.initial_position.std[:2])
     m = filtered.time.size
     surface = trial.depth.settings.sea_surface_height_m
-    height = surface - np.interp(filtered.time, trial.depth.time, trial.depth.depth)
+    height = surface - _depth_at(trial, filtered.time)
     p = np.column_stack([filtered.state[:, :2], height - frame.height])
     lat, lon, _ = frame.geodetic(p)
     position_cov, velocity_cov = np.zeros((m, 3, 3)), np.zeros((m, 3, 3))
@@ -97,7 +97,7 @@ def filter_planar(
     velocity_cov[:, :2, :2] = filtered.covariance[:, 2:, 2:]
     position_cov[:, 2, 2] = velocity_cov[:, 2, 2] = trial.depth.settings.std_m**2
     rph, rph_cov = np.zeros((m, 3)), np.full((m, 3, 3), np.nan)
-    rph[:, 2] = np.interp(filtered.time, trial.heading.time, np.unwrap(trial.heading.heading))
+    rph[:, 2] = np.interp(filtered.time, *_heading(trial))
     rph[:, 2] %= 2.0 * np.pi
     rph_cov[:, 2, 2] = trial.heading.settings.std_rad**2
     value, P = filtered.state[-1, 2:], filtered.covariance[-1, 2:, 2:]
@@ -154,8 +154,7 @@ def run_filter(trial: PlanarTrial, method: Method | str, mean: Array, std: Array
     x = np.array([*mean, 0.0, 0.0])
     P = np.diag([*std, *np.maximum(_current_std(trial), _LEAST_CURRENT)]) ** 2
     places = {n: frame.position(*place.geodetic) for n, place in settings.positions.items()}
-    depth = np.interp(beacons.time, trial.depth.time, trial.depth.depth)
-    height = trial.depth.settings.sea_surface_height_m - depth
+    height = trial.depth.settings.sea_surface_height_m - _depth_at(trial, beacons.time)
     now = drive.start
     times, states, covariances, velocities = [], [], [], []
     for i in range(beacons.time.size):
@@ -193,13 +192,24 @@ def _current_std(trial: PlanarTrial) -> Array:
     return np.array(trial.log.settings.current_std_m_s)
 
 
+def _heading(trial: PlanarTrial) -> tuple[Array, Array]:
+    """Return times and measured headings, unwrapped."""
+    known = ~np.isnan(trial.heading.heading)
+    return trial.heading.time[known], np.unwrap(trial.heading.heading[known])
+
+
+def _depth_at(trial: PlanarTrial, time: Array) -> Array:
+    known = ~np.isnan(trial.depth.depth)
+    return np.interp(time, trial.depth.time[known], trial.depth.depth[known])
+
+
 class _Drive:
     """Heading and speed: displacement and velocity, each with its noise."""
 
     def __init__(self, trial: PlanarTrial) -> None:
         heading, log = trial.heading, trial.log
-        known, measured = ~np.isnan(heading.heading), ~np.isnan(log.speed)
-        self._heading = heading.time[known], np.unwrap(heading.heading[known])
+        measured = ~np.isnan(log.speed)
+        self._heading = _heading(trial)
         starboard = np.nan_to_num(log.starboard[measured])
         self._speed = log.time[measured], log.speed[measured], starboard
         self._std = log.settings.speed_std_m_s, heading.settings.std_rad

@@ -18,7 +18,7 @@ from math import cos, sin, sqrt, tan
 
 import numpy as np
 
-from factorgraph_dvl.conventions import Array, exp_so3, log_so3, skew
+from factorgraph_dvl.conventions import Array, exp_so3, log_so3, skew, wrapped
 from factorgraph_dvl.earth import (
     ECCENTRICITY_SQUARED,
     RATE,
@@ -205,7 +205,7 @@ def run_filter(
                 measured = fixes.geodetic[k].tolist()
                 east = (east_radius + height) * cos(lat)
                 z[0:3] = (
-                    _wrapped(measured[1] - lon) * east,
+                    wrapped(measured[1] - lon) * east,
                     (measured[0] - lat) * (meridian + height),
                     measured[2] - height,
                 )
@@ -365,7 +365,3 @@ def _exp(phi: Array) -> Array:
         return exp_so3(phi)
     cross = _cross((x, y, z))
     return np.eye(3) + (1.0 - square / 6.0) * cross + (0.5 - square / 24.0) * (cross @ cross)
-
-
-def _wrapped(angle: float) -> float:
-    return (angle + np.pi) % (2.0 * np.pi) - np.pi

@@ -7,7 +7,7 @@ from functools import partial
 
 import numpy as np
 
-from factorgraph_dvl.conventions import Array, rotate, rph_from_rotation, rph_jacobian
+from factorgraph_dvl.conventions import Array, rotate, rph_from_rotation, rph_jacobian, wrapped
 from factorgraph_dvl.earth import radii
 from factorgraph_dvl.kalman.navigation import Motion, Navigation, motion_at
 from factorgraph_dvl.kalman.points import Estimated, Outcome, Points, residuals
@@ -153,7 +153,7 @@ def gnss_residuals(trial: Trial, navigation: Navigation) -> tuple[Residuals, ...
     meridian, east = radii(motion.geodetic[:, 0])
     height = motion.geodetic[:, 2]
     apart = motion.geodetic - gnss.geodetic
-    apart[:, 1] = (apart[:, 1] + np.pi) % (2.0 * np.pi) - np.pi
+    apart[:, 1] = wrapped(apart[:, 1])
     metres = np.stack(
         [
             apart[:, 1] * (east + height) * np.cos(motion.geodetic[:, 0]),
