@@ -43,8 +43,8 @@ def earth_from_inertial(epoch: str, time: Array, ut1_utc: float = 0.0) -> Array:
         # Years beyond the leap seconds that ERFA knows: a second is 1e-6 arcsec of precession.
         warnings.simplefilter("ignore", erfa.ErfaWarning)
         tt = erfa.taitt(*erfa.utctai(day, fraction))
-    first, last = float(time.min()), float(time.max())
-    grid = np.linspace(first, last, int(np.ceil((last - first) / _POLE_STEP)) + 1)
+    steps = np.unique(np.floor(time / _POLE_STEP))
+    grid = _POLE_STEP * np.union1d(steps, steps + 1.0)
     x, y, s = (
         np.interp(time, grid, value)
         for value in erfa.xys06a(tt[0], np.asarray(tt[1]) + grid / _DAY)

@@ -1,10 +1,43 @@
-"""The clock of an IMU: stamps that were rounded, samples that were lost."""
+"""The clock of an IMU: stamps that were rounded, samples that were lost, clocks that jump."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 
 from factorgraph_dvl.conventions import Array
+from factorgraph_dvl.sensors.protocol import rows_of
+from factorgraph_dvl.trial import Trial
+
+# No IMU rests for so long within a trial, s: its clock was set.
+JUMP = 3600.0
+
+
+def without_strays(trial: Trial) -> Trial:
+    """Return a trial without what its IMU recorded by another clock than all other sensors.
+
+    A logger that starts at 0 and takes GPS time later stamps its first samples by a clock of
+    their own. Stretches before and after such a jump stay where other sensors measured.
+    """
+    time = trial.imu.time
+    edges = np.concatenate([[0], np.flatnonzero(np.diff(time) > JUMP) + 1, [time.size]])
+    if edges.size == 2:
+        return trial
+    aids = [aid.time[np.logical_not(aid.missing)] for aid in trial.aids]
+    measured = np.sort(np.concatenate([np.empty(0), *aids]))
+    first, last = time[edges[:-1]], time[edges[1:] - 1]
+    kept = np.searchsorted(measured, last, "right") > np.searchsorted(measured, first)
+    if kept.all() or not kept.any():
+        return trial
+    notes = tuple(
+        f"{trial.imu.source}: time_s jumps there; no other sensor measured from {a:.3f} to "
+        f"{b:.3f} s, and the {n} samples of the IMU are not used. If its clock was set while it "
+        "ran, write all of time_s by one clock"
+        for a, b, n in zip(first[~kept], last[~kept], np.diff(edges)[~kept], strict=True)
+    )
+    rows = np.repeat(kept, np.diff(edges))
+    return replace(trial, imu=rows_of(trial.imu, rows), notes=(*trial.notes, *notes))
 
 
 def fill_lost(

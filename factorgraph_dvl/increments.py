@@ -17,7 +17,7 @@ from math import comb
 
 import numpy as np
 
-from factorgraph_dvl.clock import fill_lost, unrounded
+from factorgraph_dvl.clock import JUMP, fill_lost, unrounded
 from factorgraph_dvl.conventions import Array
 from factorgraph_dvl.errors import DataError
 from factorgraph_dvl.polynomials import (
@@ -117,6 +117,17 @@ class Increments:
     def end(self) -> Array:
         """End of the intervals, (N,), s."""
         return self.start + self.dt
+
+    def ticks(self, rate_hz: float) -> Array:
+        """Return the multiples of 1 / rate that the arcs cover, s; gaps cost nothing."""
+        runs = [
+            np.arange(np.ceil(first * rate_hz - 1e-6), np.floor(last * rate_hz + 1e-6) + 1)
+            for first, last in zip(
+                self.start[self.arcs[:, 0]], self.end[self.arcs[:, 1] - 1], strict=True
+            )
+        ]
+        time = np.unique(np.concatenate(runs)) / rate_hz
+        return np.asarray(time[self.locate(time)[2]] + 0.0)
 
     def locate(self, time: Array) -> tuple[IntArray, Array, np.ndarray]:
         """Return interval, time since its start (s) and whether an arc covers the time."""
@@ -400,10 +411,11 @@ def increments(
     start, length = np.concatenate(starts), np.concatenate(lengths)
     for (_, b), (c, _) in itertools.pairwise(arcs):
         end = start[b - 1] + length[b - 1]
-        notes.append(
-            f"{imu.source}: gap of {start[c] - end:.3f} s at {end:.3f} s: the inertial chain "
-            "breaks there"
-        )
+        if start[c] - end > JUMP:
+            what = f"time_s jumps from {end:.3f} to {start[c]:.3f} s, as where a clock is set"
+        else:
+            what = f"gap of {start[c] - end:.3f} s at {end:.3f} s"
+        notes.append(f"{imu.source}: {what}: the inertial chain breaks there")
     out = Increments(
         start=start,
         dt=length,

@@ -8,8 +8,14 @@ from test_batch import INITIAL, assert_exact
 from test_graph import SHORT, prior_cost, problem_of
 from truth import CONING, scenario
 
+from factorgraph_dvl.analysis.dead_reckoning import dead_reckon, mounting_of
+from factorgraph_dvl.analysis.manoeuvres import find_segments
+from factorgraph_dvl.attitude import Attitude
 from factorgraph_dvl.conventions import DEG, exp_so3
 from factorgraph_dvl.errors import DataError
+from factorgraph_dvl.kalman import kalman
+from factorgraph_dvl.kalman.sins import sins
+from factorgraph_dvl.replay import replay
 from factorgraph_dvl.simulation import simulate
 from factorgraph_dvl.solvers.batch import solve
 
@@ -103,3 +109,55 @@ def test_an_imu_gap_within_a_gnss_outage():
     # What is assumed of the motion across the gap is not what it was, within its sigma.
     assert_exact(trial, solve(trial), trajectory=0.4)
     # Not converged after 92 iterations at present, cost 167, calibration 16 sigma off.
+
+
+def with_jump(trial, sections):
+    """Stamp the IMU's first 10 s by a clock that starts at 0, the rest by one 1.3e9 s ahead.
+
+    Sensors in `sections` go with the IMU; others have the second clock throughout.
+    """
+
+    def moved(record):
+        first = record.time <= 10.0
+        keep = record.section == "imu" or record.section in sections
+        return replace(record, time=np.where(first & keep, record.time, record.time + 1.3e9))
+
+    return replace(
+        trial, imu=moved(trial.imu), gnss=moved(trial.gnss), dvl=moved(trial.dvl), reference=None
+    )
+
+
+@pytest.fixture(scope="module")
+def noisy():
+    return simulate(scenario(noise=True), 1)
+
+
+@pytest.fixture(scope="module")
+def undisturbed(noisy):
+    return solve(noisy)
+
+
+@pytest.mark.parametrize("sections", [(), ("gnss", "dvl")])
+@pytest.mark.parametrize("method", ["solve", "kalman", "replay"])
+def test_the_clock_of_a_logger_may_jump(noisy, undisturbed, sections, method):
+    trial = with_jump(noisy, sections)
+    run = {"solve": solve, "kalman": kalman, "replay": lambda t: replay(t)[0]}[method]
+    solution = run(trial)
+    assert solution.converged
+    said = [w for w in solution.warnings if "jump" in w]
+    assert len(said) == 1
+    assert "10.0" in said[0] or "1300000010" in said[0]
+    assert solution.trajectory.time.size < 1000
+    found, expected = (s.estimate("misalignment_deg") for s in (solution, undisturbed))
+    std = np.maximum(found.std, expected.std)
+    assert np.all(np.abs(found.value - [2, 2, 30]) < 6.0 * std)
+    assert np.all(found.std < 2.0 * expected.std)
+    assert len(find_segments(solution.trajectory)) < 50
+
+
+def test_dead_reckoning_bridges_no_jump_of_a_clock(noisy):
+    trial = with_jump(noisy, ("gnss", "dvl"))
+    motion, bias, _ = sins(trial)
+    attitude = Attitude(trial.imu, motion, trial.body_axes, bias)
+    with pytest.raises(DataError, match=r"no ping from 9.* to 1300000010"):
+        dead_reckon(trial, mounting_of(trial), attitude.at)

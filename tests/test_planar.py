@@ -363,7 +363,7 @@ def test_the_filters_pass_over_missing_headings_and_depths():
     )
     motions = [filter_planar(x, "4sv-3ob")[0].trajectory for x in (t, lost)]
     for name in ("rph", "geodetic", "velocity"):
-        np.testing.assert_allclose(*(getattr(m, name) for m in motions), atol=0.1)
+        np.testing.assert_allclose(*(getattr(m, name) for m in motions), atol=0.5)
 
 
 def test_files_and_commands(tmp_path, capsys):

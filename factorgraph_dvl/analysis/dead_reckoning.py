@@ -9,6 +9,7 @@ import numpy as np
 from scipy.integrate import cumulative_trapezoid
 
 from factorgraph_dvl.attitude import Orientation
+from factorgraph_dvl.clock import JUMP
 from factorgraph_dvl.conventions import Array, exp_so3, rotate, rph_from_rotation
 from factorgraph_dvl.earth import radii
 from factorgraph_dvl.errors import DataError
@@ -248,6 +249,13 @@ def _filled(pings: Array) -> Array:
     if pings.size < 2:
         return pings
     step = np.diff(pings)
+    longest = int(np.argmax(step))
+    if step[longest] > JUMP:
+        raise DataError(
+            f"no ping from {pings[longest]:.10g} to {pings[longest + 1]:.10g} s",
+            where="DVL",
+            expected="a record of one clock, without hours to bridge",
+        )
     usual = float(np.median(step))
     pieces = np.maximum(np.rint(step / usual).astype(int), 1)
     begin = np.repeat(pings[:-1], pieces)

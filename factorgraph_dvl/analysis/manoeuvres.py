@@ -13,8 +13,10 @@ from itertools import pairwise
 
 import numpy as np
 
+from factorgraph_dvl.clock import JUMP
 from factorgraph_dvl.conventions import DEG, Array
 from factorgraph_dvl.errors import ConfigError
+from factorgraph_dvl.sensors.protocol import rows_of
 from factorgraph_dvl.solution import Trajectory
 from factorgraph_dvl.trial import Reference
 
@@ -62,8 +64,21 @@ def find_segments(motion: Trajectory | Reference) -> tuple[Segment, ...]:
 
     Returns
     -------
-    Segments without gaps from the first epoch to the last.
+    Segments without gaps from the first epoch to the last. Hours without any motion, as
+    where a clock jumps, are one of them.
     """
+    jumps = np.flatnonzero(np.diff(motion.time) > JUMP) + 1
+    parts = [
+        _segments(rows_of(motion, rows)) for rows in np.split(np.arange(motion.time.size), jumps)
+    ]
+    out = [*parts[0]]
+    for part in parts[1:]:
+        out += [Segment(out[-1].end, part[0].start, "other"), *part]
+    return tuple(out)
+
+
+def _segments(motion: Trajectory | Reference) -> list[Segment]:
+    """Divide a motion without jumps."""
     first, last = float(motion.time[0]), float(motion.time[-1])
     count = max(round((last - first) / _STEP_S), 1) + 1
     time = np.linspace(first, last, count)
@@ -80,7 +95,7 @@ def find_segments(motion: Trajectory | Reference) -> tuple[Segment, ...]:
         turning = _covered(turns, start, end)
         accelerating = _covered(accelerations, start, end)
         out.append(Segment(start, end, _label(slow, turning, accelerating)))
-    return tuple(out)
+    return out
 
 
 def given_segments(

@@ -8,6 +8,7 @@ from typing import Literal, get_args
 
 import numpy as np
 
+from factorgraph_dvl.clock import JUMP, without_strays
 from factorgraph_dvl.conventions import Array
 from factorgraph_dvl.errors import ConfigError, DataError
 from factorgraph_dvl.kalman.beams import BeamPings, beam_filter, beam_residuals
@@ -120,6 +121,7 @@ def calibrate(
     if not (np.isfinite(rate_hz) and rate_hz > 0.0):
         raise ConfigError(f"rate_hz is {rate_hz}", expected="a number above 0")
     report = progress or (lambda stage, iteration, cost: None)
+    trial = without_strays(trial)
     if method == "star":
         report("SINS/stars", 0, None)
         solution, outcome = calibrate_gyros(trial, rate_hz=rate_hz)
@@ -181,8 +183,10 @@ def _outage(trial: Trial) -> list[str]:
     """Say that GNSS is missing for too long, if it is."""
     assert trial.gnss is not None
     fixes = trial.gnss.time[~np.isnan(trial.gnss.geodetic[:, 0])]
-    edges = np.concatenate([trial.imu.time[:1], fixes, trial.imu.time[-1:]])
-    longest = float(np.diff(edges).max())
+    time = trial.imu.time
+    jumps = np.flatnonzero(np.diff(time) > JUMP)
+    edges = np.sort(np.concatenate([time[:1], fixes, time[jumps], time[jumps + 1], time[-1:]]))
+    longest = float(np.diff(edges)[~np.isin(edges[:-1], time[jumps])].max())
     if longest <= _LONGEST_GAP:
         return []
     return [

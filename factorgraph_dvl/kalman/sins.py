@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from factorgraph_dvl.clock import without_strays
 from factorgraph_dvl.conventions import Array
 from factorgraph_dvl.errors import DataError
 from factorgraph_dvl.kalman.navigation import navigate
@@ -41,6 +42,7 @@ def sins(
     DataError
         If there is no GNSS position, or none while the IMU runs.
     """
+    trial = without_strays(replace(trial, notes=()))
     gnss = trial.gnss
     fixes = np.zeros(0) if gnss is None else gnss.time[~np.isnan(gnss.geodetic[:, 0])]
     if gnss is None or fixes.size == 0:
@@ -51,20 +53,28 @@ def sins(
             hint="Take the attitude of a solution, or of the reference: --attitude",
         )
     last = fixes[-1] if align_s is None else fixes[0] + align_s
-    held = _with_held_height(_rows(gnss, gnss.time <= last), float(trial.imu.time[-1]))
-    navigation = navigate(replace(trial, gnss=held, notes=()), np.zeros(0))
+    held = _with_held_height(_rows(gnss, gnss.time <= last), trial.imu.time)
+    navigation = navigate(replace(trial, gnss=held), np.zeros(0))
     bias = navigation.track.gyro_bias.mean(axis=0)
     return trajectory_of(trial, navigation, rate_hz), bias, navigation.notes
 
 
-def _with_held_height(gnss: Gnss, end: float) -> Gnss:
-    """Return a record with positions in its gaps that say nothing but a rough height."""
+def _with_held_height(gnss: Gnss, running: Array) -> Gnss:
+    """Return a record with positions in its gaps that say nothing but a rough height.
+
+    Parameters
+    ----------
+    gnss : with fixes.
+    running : (M,) times of the IMU's samples, s: elsewhere no height need be held.
+    """
     fixes = np.flatnonzero(~np.isnan(gnss.geodetic[:, 0]))
     time = gnss.time[fixes]
     added, source = [], []
-    for i, (a, b) in enumerate(zip(time, np.append(time[1:], end), strict=True)):
+    for i, (a, b) in enumerate(zip(time, np.append(time[1:], running[-1]), strict=True)):
         if b - a > _GAP:
-            times = np.arange(a + _HELD_EVERY, b, _HELD_EVERY)
+            inside = running[np.searchsorted(running, a) : np.searchsorted(running, b)]
+            times = a + _HELD_EVERY * np.unique(np.floor((inside - a) / _HELD_EVERY))
+            times = times[times > a]
             added.append(times)
             source.append(np.full(times.size, fixes[i]))
     if not added:

@@ -189,11 +189,7 @@ def _summary(
         if not seen_well
     ]
     first = residuals[0]
-    steps = np.arange(
-        np.ceil(courses[0].time[0] * rate_hz - 1e-6),
-        np.floor(courses[-1].time[-1] * rate_hz + 1e-6) + 1,
-    )
-    motion = motion_at(navigation, steps / rate_hz)
+    motion = motion_at(navigation, samples.increments.ticks(rate_hz))
     return Solution(
         trial=trial.name,
         solver="kalman-star",

@@ -90,7 +90,7 @@ def _imu_biases(trial: Trial, navigation: Navigation) -> Estimated:
     if not trial.imu.settings.bias_walks:
         values = (track.gyro_bias[-1], track.accel_bias[-1])
         return Estimated(parameters, values, track.covariance[-1, 9:, 9:])
-    step = np.diff(track.time)
+    step = np.where(np.diff(navigation.arc) == 0, np.diff(track.time), 0.0)
     weight = np.append(step, 0.0) + np.append(0.0, step)
     weight /= weight.sum()
     values = (weight @ track.gyro_bias, weight @ track.accel_bias)
@@ -100,9 +100,7 @@ def _imu_biases(trial: Trial, navigation: Navigation) -> Estimated:
 
 def trajectory_of(trial: Trial, navigation: Navigation, rate_hz: float) -> Trajectory:
     """Return the smoothed motion at the multiples of 1 / rate that it covers."""
-    first, last = navigation.track.time[0], navigation.track.time[-1]
-    time = np.arange(np.ceil(first * rate_hz - 1e-6), np.floor(last * rate_hz + 1e-6) + 1)
-    motion = motion_at(navigation, time / rate_hz)
+    motion = motion_at(navigation, navigation.samples.increments.ticks(rate_hz))
     at = motion.covered
     P = motion.covariance[at]
     rph = rph_from_rotation(motion.nRb[at], trial.body_axes)

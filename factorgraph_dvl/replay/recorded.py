@@ -9,6 +9,7 @@ from itertools import pairwise
 
 import numpy as np
 
+from factorgraph_dvl.clock import without_strays
 from factorgraph_dvl.conventions import Array
 from factorgraph_dvl.errors import SolveError
 from factorgraph_dvl.replay.estimate import Innovations, Update
@@ -80,13 +81,16 @@ def replay(
     SolveError
         If the data never sufficed to start.
     """
+    trial = without_strays(trial)
     trial.frame()
     run = Replay(trial, smoother=smoother, lag_s=lag_s, rate_hz=rate_hz, progress=progress)
     tape = _Tape()
     imu = trial.imu
     step = 1.0 / rate_hz
-    edges = np.arange(imu.time[0], imu.time[-1] + step, step)
-    edges = np.append(edges, np.inf)
+    # Gaps cost one step, whatever their length.
+    steps = np.unique(np.floor((imu.time - imu.time[0]) / step))
+    edges = imu.time[0] + step * np.union1d(steps, steps + 1.0)
+    edges[-1] = np.inf
     samples = np.searchsorted(imu.time, edges)
     rows = [np.searchsorted(aid.time, edges) for aid in trial.aids]
     for each in rows:

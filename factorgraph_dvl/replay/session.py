@@ -283,6 +283,12 @@ class Replay:
         until = self._samples.newest - self._samples.delay
         if np.isnan(self._attempt):
             self._attempt = self._collected.start + _FIRST
+        elif self._attempt <= self._collected.start:
+            self._messages.append(
+                f"what the IMU recorded before {self._collected.start:.3f} s is not used: before "
+                f"there was a start its clock jumped, or it was silent for over {_LONGEST:g} s"
+            )
+            self._attempt = self._collected.start + _FIRST
         if until >= self._attempt:
             # However many samples came at once.
             until = self._attempt

@@ -12,6 +12,7 @@ from factorgraph_dvl.alignment import initial_states
 from factorgraph_dvl.anchoring import Anchors, anchored
 from factorgraph_dvl.attitude_alignment import attitudes, mean_mounting
 from factorgraph_dvl.chain import Chain, inertial_chain
+from factorgraph_dvl.clock import without_strays
 from factorgraph_dvl.conventions import Array
 from factorgraph_dvl.earth import LocalFrame
 from factorgraph_dvl.errors import ConfigError
@@ -201,6 +202,7 @@ def fit(
 
 def _prepare(trial: Trial, state_interval_s: float, report: Progress) -> _Prepared:
     _check_above_zero("state_interval_s", state_interval_s)
+    trial = without_strays(trial)
     frame = trial.frame()
     report("increments", 0, None)
     inc, gaps = increments(trial.imu)

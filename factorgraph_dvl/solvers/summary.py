@@ -18,7 +18,7 @@ from factorgraph_dvl.conventions import (
     rph_jacobian,
 )
 from factorgraph_dvl.graph import Evaluation, Problem
-from factorgraph_dvl.preintegration import States, attach, motion_at, segment_ends
+from factorgraph_dvl.preintegration import Segments, States, attach, motion_at, segment_ends
 from factorgraph_dvl.sensors.protocol import Motion, Parameter
 from factorgraph_dvl.solution import (
     Estimate,
@@ -95,9 +95,9 @@ def reported(
     variables of the graph, by key; None for one that is fixed.
     """
     chain = problem.chain
-    time = chain.segments.node_time
-    weight = _mean_weights(time)
-    gyro, accel = chain.trial.imu.parameters(float(time[-1] - time[0]))
+    seg = chain.segments
+    weight = _mean_weights(seg)
+    gyro, accel = chain.trial.imu.parameters(float(seg.duration.sum()))
     states = evaluation.states
     rows: list[tuple[Parameter, Array, dict[int, Array] | None]] = []
     for parameter, bias, first in ((gyro, states.gyro_bias, 3), (accel, states.accel_bias, 0)):
@@ -169,17 +169,18 @@ def prior_along(
     return np.concatenate(parts)
 
 
-def _mean_weights(time: Array) -> Array:
-    """Return weights of the nodes in the mean over time."""
-    step = np.diff(time)
-    weight = np.concatenate([step, [0.0]]) + np.concatenate([[0.0], step])
+def _mean_weights(seg: Segments) -> Array:
+    """Return weights of the nodes in the mean over the time that the IMU recorded."""
+    weight = np.zeros(seg.node_time.size)
+    weight[seg.origin] += seg.duration
+    weight[seg.origin + 1] += seg.duration
     return np.asarray(weight / weight.sum())
 
 
 def _trajectory(problem: Problem, states: States, P: Array, rate_hz: float) -> Trajectory:
     chain = problem.chain
     seg, frame, body_axes = chain.segments, chain.frame, chain.trial.body_axes
-    time = _output_times(problem, rate_hz)
+    time = seg.increments.ticks(rate_hz)
     motion, fraction, node = _smoothed(problem, states, time)
     lat, lon, height = frame.geodetic(motion.p_n)
     lRn = frame.level_from_tangent(lat, lon)
@@ -205,15 +206,6 @@ def _trajectory(problem: Problem, states: States, P: Array, rate_hz: float) -> T
         velocity_cov=level(2),
         rph_cov=to_rph @ level(0) @ to_rph.transpose(0, 2, 1),
     )
-
-
-def _output_times(problem: Problem, rate_hz: float) -> Array:
-    """Return the multiples of 1 / rate that arcs cover."""
-    inc = problem.chain.segments.increments
-    first, last = inc.start[0], inc.end[-1]
-    time = np.arange(np.ceil(first * rate_hz - 1e-6), np.floor(last * rate_hz + 1e-6) + 1)
-    time = time / rate_hz
-    return np.asarray(time[inc.locate(time)[2]] + 0.0)
 
 
 def _smoothed(problem: Problem, states: States, time: Array) -> tuple[Motion, Array, np.ndarray]:
@@ -292,8 +284,7 @@ def _unobservable(
         )
         for name in observation.parameters
     }
-    time = problem.chain.segments.node_time
-    duration = float(time[-1] - time[0])
+    duration = float(problem.chain.segments.duration.sum())
     out = []
     calibrated = {p.name: p.joint for p in problem.all_parameters if p.joint is not None}
     kept = [n for e in estimates if e.name in calibrated and not e.observable.all()
