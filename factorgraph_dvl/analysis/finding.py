@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
+_UNUSABLE = ("time_unit", "no_overlap", "no_measurement", "zero_fixes", "radians", "no_epoch")
 Severity = Literal["ok", "warning", "error"]
 
 
@@ -17,8 +18,18 @@ class Finding:
     severity : `ok`, `warning`, or `error` where solving would give a wrong answer.
     sensor : label of the sensor.
     text : in plain language.
+    code : stable name of what is wrong, for programs; empty where nothing is.
     """
 
     severity: Severity
     sensor: str
     text: str
+    code: str = ""
+
+    @property
+    def unusable(self) -> bool:
+        """Whether there is nothing to solve with; else a fit contradicts the data."""
+        return self.severity == "error" and self.code in _UNUSABLE
+
+    def __str__(self) -> str:
+        return f"{self.sensor}: {self.text}"

@@ -47,16 +47,23 @@ def _findings(trial: PlanarTrial, sensors: tuple[SensorSurvey, ...]) -> Iterator
     names = "heading, log and depth"
     if not start < end:
         yield Finding(
-            "error", "Heading", f"{names} have no time in common: are they of one clock?"
+            "error",
+            "Heading",
+            f"{names} have no time in common: are they of one clock?",
+            "no_overlap",
         )
         return
     inside = min(beacons.end, end) - max(beacons.start, start)
-    if inside < 0.0:
+    if beacons.missing == 1.0:
+        text = "none of its rows holds a measurement"
+        yield Finding("error", beacons.label, text, "no_measurement")
+    elif inside < 0.0:
         yield Finding(
             "error",
             beacons.label,
             f"its times, {beacons.start:.10g} to {beacons.end:.10g} s, do not overlap those of "
             f"{names}, {start:.10g} to {end:.10g} s: are they of one clock, in seconds?",
+            "no_overlap",
         )
     elif inside < 0.5 * (beacons.end - beacons.start):
         yield Finding(

@@ -32,6 +32,7 @@ from factorgraph_dvl.conventions import (
 from factorgraph_dvl.sensors.dvl import MISALIGNMENT, Dvl
 from factorgraph_dvl.sensors.gnss import Gnss
 from factorgraph_dvl.sensors.imu import Imu
+from factorgraph_dvl.sensors.protocol import Aid
 from factorgraph_dvl.sensors.star import Star
 from factorgraph_dvl.trial import Trial
 
@@ -49,6 +50,7 @@ _SPEED_UNITS = {
 # What a ping takes, and which sign it has.
 _DVL_TERMS = ("a lock", "Moving along +x must give a positive x")
 _BEAM_TERMS = ("three beams", "Moving in the direction of a beam must give it a positive velocity")
+_RADIANS = "latitude and longitude look like radians, not deg"
 _AXIS_NAMES = ("+x", "+y", "+z", "-x", "-y", "-z")
 
 
@@ -60,7 +62,7 @@ def findings(trial: Trial, sensors: list[SensorSurvey]) -> Iterator[Finding]:
     trial : as loaded.
     sensors : its records, that of the IMU first.
     """
-    yield from _clock_findings(sensors)
+    yield from _clock_findings(trial, sensors)
     yield from _force_findings(trial.imu, trial.body_axes)
     yield from _gyro_findings(trial.imu)
     if trial.gnss is not None:
@@ -76,7 +78,7 @@ def findings(trial: Trial, sensors: list[SensorSurvey]) -> Iterator[Finding]:
             yield from star_findings(aid, trial)
 
 
-def _clock_findings(sensors: list[SensorSurvey]) -> Iterator[Finding]:
+def _clock_findings(trial: Trial, sensors: list[SensorSurvey]) -> Iterator[Finding]:
     imu, *aids = sensors
     interval = 1.0 / imu.rate
     if interval >= 0.5:
@@ -86,17 +88,24 @@ def _clock_findings(sensors: list[SensorSurvey]) -> Iterator[Finding]:
             "IMU",
             f"one sample every {interval:.4g} s: time_s must be in seconds{unit}; "
             "an IMU this slow does not resolve the motion",
+            "time_unit",
         )
     elif imu.rate > 2e4:
-        yield Finding("error", "IMU", f"{imu.rate:.4g} samples per second: is time_s in seconds?")
-    for aid in aids:
+        text = f"{imu.rate:.4g} samples per second: is time_s in seconds?"
+        yield Finding("error", "IMU", text, "time_unit")
+    for aid, record in zip(aids, trial.aids, strict=True):
+        if aid.missing == 1.0:
+            text = "none of its rows holds a measurement"
+            yield Finding("error", aid.label, text, "no_measurement")
+            continue
         inside = min(aid.end, imu.end) - max(aid.start, imu.start)
-        if inside <= 0.0:
+        if not _meets(record, trial.imu):
             yield Finding(
                 "error",
                 aid.label,
                 f"its times, {aid.start:.10g} to {aid.end:.10g} s, do not overlap those of the "
                 f"IMU, {imu.start:.10g} to {imu.end:.10g} s: are they of one clock, in seconds?",
+                "no_overlap",
             )
         elif inside < 0.5 * (aid.end - aid.start):
             yield Finding(
@@ -116,12 +125,22 @@ def _clock_findings(sensors: list[SensorSurvey]) -> Iterator[Finding]:
                 f"{sensor.gaps} gaps longer than {GAP_INTERVALS:g} sample intervals, the longest "
                 f"{sensor.longest_gap:.4g} s",
             )
-        if sensor.missing > 0.5:
+        if 0.5 < sensor.missing < 1.0:
             yield Finding(
                 "warning",
                 sensor.label,
                 f"{100.0 * sensor.missing:.3g} % of its rows hold no measurement",
             )
+
+
+def _meets(aid: Aid, imu: Imu) -> bool:
+    """Whether the IMU runs at any measurement of a sensor."""
+    time = aid.time[np.logical_not(aid.missing)] - getattr(aid.settings, "time_offset_s", 0.0)
+    after = np.searchsorted(imu.time, time)
+    edges = np.concatenate([[-np.inf], imu.time, [np.inf]])
+    away = np.minimum(time - edges[after], edges[after + 1] - time)
+    interval = float(np.median(np.diff(imu.time))) if imu.time.size > 1 else 0.0
+    return bool(np.any(away <= interval))
 
 
 def _force_findings(imu: Imu, body_axes: BodyAxes) -> Iterator[Finding]:
@@ -135,11 +154,11 @@ def _force_findings(imu: Imu, body_axes: BodyAxes) -> Iterator[Finding]:
         ("velocity increments; divide by the sample interval", STANDARD_GRAVITY * interval),
     ):
         if abs(size / gravity - 1.0) < 0.05:
-            yield Finding("error", "IMU", f"{looks}: it looks like {unit}")
+            yield Finding("error", "IMU", f"{looks}: it looks like {unit}", "force_unit")
             return
     if abs(size / STANDARD_GRAVITY - 1.0) > 0.05:
         removed = ": was gravity removed? Specific force includes it" if size < 3.0 else ""
-        yield Finding("error", "IMU", looks + removed)
+        yield Finding("error", "IMU", looks + removed, "force_unit")
         return
     yield Finding("ok", "IMU", f"specific force {size:.4g} m/s² in the median")
     yield from _axes_findings(imu, body_axes)
@@ -161,9 +180,8 @@ def _axes_findings(imu: Imu, body_axes: BodyAxes) -> Iterator[Finding]:
     )
     if tilt > 150.0:
         other = "RFU or FLU" if body_axes == "FRD" else "FRD"
-        yield Finding(
-            "error", "IMU", f"{text}: are the axes {other}, or is the force that of gravity?"
-        )
+        question = f"are the axes {other}, or is the force that of gravity?"
+        yield Finding("error", "IMU", f"{text}: {question}", "body_axes")
     else:
         yield Finding("warning", "IMU", f"{text}: is the IMU mounted {tilt:.0f} deg off level?")
 
@@ -171,7 +189,7 @@ def _axes_findings(imu: Imu, body_axes: BodyAxes) -> Iterator[Finding]:
 def _gyro_findings(imu: Imu) -> Iterator[Finding]:
     rms = float(np.sqrt(np.mean(np.sum(imu.gyro**2, axis=1))))
     if rms == 0.0:
-        yield Finding("error", "IMU", "the angular rate is zero throughout")
+        yield Finding("error", "IMU", "the angular rate is zero throughout", "gyro_frozen")
         return
     steady = _force_steadiness(imu, 1.0)
     rate = 1.0 / float(np.median(np.diff(imu.time))) if imu.time.size > 1 else 1.0
@@ -188,9 +206,11 @@ def _gyro_findings(imu: Imu) -> Iterator[Finding]:
             "error",
             "IMU",
             f"the angular rate does not turn the specific force as it should: it looks {best}",
+            "gyro_unit",
         )
     elif rms > 3.0:
-        yield Finding("error", "IMU", f"the angular rate is {rms:.3g} rad/s rms: is it in deg/s?")
+        text = f"the angular rate is {rms:.3g} rad/s rms: is it in deg/s?"
+        yield Finding("error", "IMU", text, "gyro_unit")
     else:
         yield Finding("ok", "IMU", f"angular rate {rms / DEG:.3g} deg/s rms, fits gravity")
 
@@ -217,9 +237,8 @@ def _force_steadiness(imu: Imu, factor: float) -> float:
 def _gnss_findings(gnss: Gnss) -> Iterator[Finding]:
     geodetic = gnss.geodetic[~np.isnan(gnss.geodetic[:, 0])]
     if geodetic.shape[0] and np.any(np.all(geodetic[:, :2] == 0.0, axis=1)):
-        yield Finding(
-            "error", gnss.label, "some fixes are at 0, 0: leave the cells of lost fixes empty"
-        )
+        text = "some fixes are at 0, 0: leave the cells of lost fixes empty"
+        yield Finding("error", gnss.label, text, "zero_fixes")
     begin, end, between = velocity_between_fixes(gnss)
     measured = ~np.isnan(gnss.velocity[:, 0])
     if begin.size < 3 or measured.sum() < 3:
@@ -262,7 +281,7 @@ def _compare_velocities(
     if np.abs(geodetic[:, 0]).max() < 90.0 * DEG**2 and _rms(
         mean[:, :2] - between[:, :2] / DEG
     ) < (0.1 * _rms(mean[:, :2]) + 3.0 * noise / DEG):
-        yield Finding("error", gnss.label, "latitude and longitude look like radians, not deg")
+        yield Finding("error", gnss.label, _RADIANS, "radians")
         return
     explained = {
         text: _rms(between[:, :2] - mean[:, :2] @ np.array(matrix, dtype=float).T)
@@ -274,6 +293,7 @@ def _compare_velocities(
         "error",
         gnss.label,
         f"velocities disagree with the differences of positions by {misfit:.3g} m/s rms{cause}",
+        "gnss_velocity",
     )
 
 
@@ -296,9 +316,8 @@ def _compare_vertical(gnss: Gnss, between: Array, mean: Array) -> Iterator[Findi
     if _rms(up) > 5.0 * noise + 0.05 and up @ measured < -0.5 * _rms(up) * up.size * _rms(
         measured
     ):
-        yield Finding(
-            "error", gnss.label, "vel_u_m_s has the opposite sign of the change of height"
-        )
+        text = "vel_u_m_s has the opposite sign of the change of height"
+        yield Finding("error", gnss.label, text, "gnss_velocity")
 
 
 def _dvl_findings(
@@ -307,7 +326,7 @@ def _dvl_findings(
     locked = dvl.locked
     lock, positive = terms
     if not locked.any():
-        yield Finding("error", dvl.label, f"there is no ping with {lock}")
+        yield Finding("warning", dvl.label, f"there is no ping with {lock}")
         return
     velocity = dvl.velocity[locked]
     std = float(np.median(dvl.sigma()[locked]))
@@ -319,7 +338,7 @@ def _dvl_findings(
             f"its standard deviation, {std:.2g} m/s, is large for a speed of {speed:.2g} m/s",
         )
     if np.all(velocity == velocity[0]) and velocity.shape[0] > 2:
-        yield Finding("error", dvl.label, "the velocity never changes")
+        yield Finding("error", dvl.label, "the velocity never changes", "dvl_frozen")
     if gnss is not None:
         yield from _speed_findings(dvl, gnss)
     yield from _sign_findings(dvl, body_axes, velocity, positive)
@@ -333,13 +352,18 @@ def _speed_findings(dvl: Dvl, gnss: Gnss) -> Iterator[Finding]:
     inside = (pings >= time[0]) & (pings <= time[-1])
     at_ping = np.column_stack([np.interp(pings[inside], time, column) for column in velocity.T])
     gnss_speed = np.linalg.norm(at_ping, axis=1)
+    dvl_speed = np.linalg.norm(dvl.velocity[dvl.locked][inside], axis=1)
+    if _in_radians(gnss, gnss_speed, dvl_speed):
+        yield Finding("error", gnss.label, _RADIANS, "radians")
+        return
     moving = gnss_speed > _MOVING_M_S
     if moving.sum() < 3:
         return
-    dvl_speed = np.linalg.norm(dvl.velocity[dvl.locked][inside], axis=1)
     ratio = float(np.median(dvl_speed[moving] / gnss_speed[moving]))
     allowed = 0.5 if dvl.settings.reference == "water" else 0.25
-    if abs(ratio - 1.0) <= allowed:
+    # Sway moves DVL and antenna by their lever arms, but not on the average.
+    steady = _steady_ratio(pings[inside], dvl.velocity[dvl.locked][inside], at_ping)
+    if min(abs(ratio - 1.0), abs(steady - 1.0)) <= allowed:
         yield Finding(
             "ok",
             dvl.label,
@@ -355,7 +379,33 @@ def _speed_findings(dvl: Dvl, gnss: Gnss) -> Iterator[Finding]:
         "error",
         dvl.label,
         f"its speed is {ratio:.4g} times that of the GNSS{cause or ': is it in m/s?'}",
+        "dvl_unit",
     )
+
+
+def _in_radians(gnss: Gnss, gnss_speed: Array, dvl_speed: Array) -> bool:
+    """Whether fixes without velocities move as slowly as radians in columns of degrees do."""
+    if not np.isnan(gnss.velocity).all():
+        return False
+    small = np.nanmax(np.abs(gnss.geodetic[:, 0]), initial=0.0) < 90.0 * DEG**2
+    moving = (dvl_speed > _MOVING_M_S) & (gnss_speed > 0.0)
+    ratio = dvl_speed[moving] / gnss_speed[moving] * DEG
+    return bool(small and moving.sum() > 3 and abs(np.median(ratio) - 1.0) < 0.2)
+
+
+def _steady_ratio(time: Array, dvl: Array, gnss: Array) -> float:
+    """Return the ratio of the speeds of velocities (M, 3) that are averaged over windows.
+
+    1 where the vessel does not get anywhere.
+    """
+    window = np.floor((time - time[0]) / WINDOW_S)
+    first = np.flatnonzero(np.diff(window, prepend=-1.0))
+    count = np.diff(np.append(first, time.size))[:, None]
+    mean_dvl, mean_gnss = (
+        np.linalg.norm(np.add.reduceat(v, first) / count, axis=1) for v in (dvl, gnss)
+    )
+    moving = mean_gnss > _MOVING_M_S
+    return float(np.median(mean_dvl[moving] / mean_gnss[moving])) if moving.any() else 1.0
 
 
 def _sign_findings(

@@ -38,10 +38,12 @@ def star_findings(star: Star, trial: Trial) -> Iterator[Finding]:
             "error",
             star.label,
             "trial.yaml has no `epoch`, and stars tell the attitude only at a known time",
+            "no_epoch",
         )
     for text in star.doubts():
         severity: Severity = "error" if star.misfit > _MISFIT else "warning"
-        yield Finding(severity, star.label, text.removeprefix(f"{star.label}: "))
+        text = text.removeprefix(f"{star.label}: ")
+        yield Finding(severity, star.label, text, "star_catalogue")
     convention = list(_convention(star, trial.imu))
     yield from convention
     # What mixes up the quaternion turns the vertical too.
@@ -67,6 +69,7 @@ def _vertical(star: Star, trial: Trial) -> Iterator[Finding]:
             star.label,
             f"its attitudes put the vertical {np.degrees(away):.1f} deg away from that of the "
             "specific force: are `epoch` (UTC of time_s = 0) and `mounting_deg` right?",
+            "star_vertical",
         )
 
 
@@ -118,6 +121,7 @@ def _convention(star: Star, imu: Imu) -> Iterator[Finding]:
         "error",
         star.label,
         f"its turns differ from those of the gyros by {100.0 * stated:.3g} %: {cause}",
+        "star_convention",
     )
 
 

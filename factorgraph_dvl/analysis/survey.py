@@ -35,6 +35,11 @@ class Survey:
     findings: tuple[Finding, ...]
 
     @property
+    def errors(self) -> tuple[Finding, ...]:
+        """The findings for which a solution is not to be used, or cannot be had."""
+        return tuple(f for f in self.findings if f.severity == "error")
+
+    @property
     def problems(self) -> tuple[Finding, ...]:
         """The findings that are not ok."""
         return tuple(f for f in self.findings if f.severity != "ok")

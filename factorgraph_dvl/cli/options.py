@@ -18,4 +18,5 @@ NoFigures = Annotated[bool, typer.Option("--no-figures", help="Draw no figures."
 Rate = Annotated[
     float, typer.Option(metavar="HZ", min=1e-3, max=1e4, help="Rate of the trajectory.")
 ]
+Anyway = Annotated[bool, typer.Option("--anyway", help="Go on where records cannot be used.")]
 Quiet = Annotated[bool, typer.Option("--quiet", help="Show no progress.")]

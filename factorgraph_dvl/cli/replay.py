@@ -18,7 +18,13 @@ from factorgraph_dvl.cli.console import (
     stdout,
     warn,
 )
-from factorgraph_dvl.cli.options import Force, NoFigures, Quiet, SolutionPath, TrialPath
+from factorgraph_dvl.cli.options import Anyway, Force, NoFigures, Quiet, SolutionPath, TrialPath
+from factorgraph_dvl.cli.plausibility import (
+    errors_in,
+    explaining,
+    print_contradiction,
+    with_findings,
+)
 from factorgraph_dvl.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -58,6 +64,7 @@ def replay(
     ] = None,
     force: Force = False,
     no_figures: NoFigures = False,
+    anyway: Anyway = False,
     quiet: Quiet = False,
 ) -> None:
     """Feed a trial in the order of time, and show what was known when."""
@@ -80,7 +87,10 @@ def replay(
         trial = load_trial(trial_path)
         check_limits(trial, (*std_asked, *error_asked))
         good = std_limits if live else None
-        solution, record = _run(trial, smoother.value, lag, rate, progress, good)
+        errors = errors_in(trial, anyway=anyway)
+        with explaining(errors):
+            solution, record = _run(trial, smoother.value, lag, rate, progress, good)
+        solution = with_findings(solution, errors)
         found = convergence(
             record.time,
             record.values,
@@ -92,12 +102,24 @@ def replay(
             error_limits,
         )
         progress("write", 0, None)
-        _write(trial, solution, record, found, out, force=force, figures=not no_figures)
+        _write(
+            trial,
+            solution,
+            record,
+            found,
+            out,
+            force=force,
+            figures=not no_figures,
+            instrument=not errors,
+        )
     _print(trial, solution, record, found)
     print_written(out)
     if not solution.converged:
         text = "error: measurements disagree with the prediction at the end; see the warnings"
         stderr().print(Text(text, "red"), soft_wrap=True)
+    if errors:
+        print_contradiction()
+    if errors or not solution.converged:
         raise typer.Exit(1)
 
 
@@ -199,6 +221,7 @@ def _write(
     *,
     force: bool,
     figures: bool,
+    instrument: bool,
 ) -> None:
     from factorgraph_dvl.cli.solve import write_beams, write_instrument
     from factorgraph_dvl.io.solution_folder import (
@@ -212,7 +235,8 @@ def _write(
 
     def add(folder: Path) -> None:
         write_beams(trial, solution, folder)
-        write_instrument(solution, folder)
+        if instrument:
+            write_instrument(solution, folder)
         write_history(folder, record.time, record.names, record.values, record.std, record.latency)
         write_latency(folder, record.time, record.latency, record.solved)
         (folder / CONVERGENCE_FILE).write_text(to_csv(found), encoding="utf-8")

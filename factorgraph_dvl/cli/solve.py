@@ -17,7 +17,21 @@ from factorgraph_dvl.cli.console import (
     stdout,
     warn,
 )
-from factorgraph_dvl.cli.options import Force, NoFigures, Quiet, Rate, SolutionPath, TrialPath
+from factorgraph_dvl.cli.options import (
+    Anyway,
+    Force,
+    NoFigures,
+    Quiet,
+    Rate,
+    SolutionPath,
+    TrialPath,
+)
+from factorgraph_dvl.cli.plausibility import (
+    errors_in,
+    explaining,
+    print_contradiction,
+    with_findings,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -53,6 +67,7 @@ def solve(
     force: Force = False,
     no_figures: NoFigures = False,
     rate: Rate = 10.0,
+    anyway: Anyway = False,
     quiet: Quiet = False,
 ) -> None:
     """Estimate calibration and trajectory from all data of a trial."""
@@ -68,7 +83,16 @@ def solve(
 
         return solve_planar(trial, rate_hz=rate, progress=progress), None
 
-    _solve_into(out, trial_path, run, run_planar, force=force, figures=not no_figures, quiet=quiet)
+    _solve_into(
+        out,
+        trial_path,
+        run,
+        run_planar,
+        force=force,
+        figures=not no_figures,
+        anyway=anyway,
+        quiet=quiet,
+    )
 
 
 def kalman(
@@ -84,6 +108,7 @@ def kalman(
     force: Force = False,
     no_figures: NoFigures = False,
     rate: Rate = 10.0,
+    anyway: Anyway = False,
     quiet: Quiet = False,
 ) -> None:
     """Calibrate or navigate by a Kalman filter, to compare with `solve`."""
@@ -104,7 +129,16 @@ def kalman(
             raise _misplaced(chosen, "a trial with imu, gnss and dvl")
         return filter_planar(trial, chosen.value, progress=progress)
 
-    _solve_into(out, trial_path, run, run_planar, force=force, figures=not no_figures, quiet=quiet)
+    _solve_into(
+        out,
+        trial_path,
+        run,
+        run_planar,
+        force=force,
+        figures=not no_figures,
+        anyway=anyway,
+        quiet=quiet,
+    )
 
 
 def _misplaced(method: KalmanMethod, expected: str) -> ConfigError:
@@ -121,6 +155,7 @@ def _solve_into(
     *,
     force: bool,
     figures: bool,
+    anyway: bool,
     quiet: bool,
 ) -> None:
     """Load a trial, run a solver on it, write and show its solution."""
@@ -134,17 +169,23 @@ def _solve_into(
         trial: Trial | PlanarTrial
         if is_planar(trial_path):
             trial = load_planar_trial(trial_path)
-            solution, history = run_planar(trial, progress)
+            errors = errors_in(trial, anyway=anyway)
+            with explaining(errors):
+                solution, history = run_planar(trial, progress)
         else:
             trial = load_trial(trial_path)
-            solution, history = run(trial, progress)
+            errors = errors_in(trial, anyway=anyway)
+            with explaining(errors):
+                solution, history = run(trial, progress)
+        solution = with_findings(solution, errors)
         progress("write", 0, None)
 
         def add(folder: Path) -> None:
             write_beams(trial, solution, folder)
             if history is not None:
                 write_history(folder, history.time, history.names, history.values, history.std)
-            write_instrument(solution, folder)
+            if not errors:
+                write_instrument(solution, folder)
             if not figures:
                 return
             from factorgraph_dvl.report.figures import write_figures
@@ -163,6 +204,9 @@ def _solve_into(
             Text(f"error: not converged after {solution.iterations} iterations", "red"),
             soft_wrap=True,
         )
+    if errors:
+        print_contradiction()
+    if errors or not solution.converged:
         raise typer.Exit(1)
 
 

@@ -189,8 +189,7 @@ def motion_line(survey: Survey) -> str:
 def finding_lines(survey: Survey) -> list[Text]:
     """Render the findings, one line each."""
     return [
-        Text.assemble((f"{f.severity}: ", _STYLES[f.severity]), f"{f.sensor}: {f.text}")
-        for f in survey.findings
+        Text.assemble((f"{f.severity}: ", _STYLES[f.severity]), str(f)) for f in survey.findings
     ]
 
 

@@ -1,0 +1,71 @@
+"""What `inspect` calls an error, before and after a trial is solved."""
+
+from __future__ import annotations
+
+from contextlib import contextmanager
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from rich.text import Text
+
+from factorgraph_dvl.cli.console import stderr, warn
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+    from factorgraph_dvl.analysis.finding import Finding
+    from factorgraph_dvl.solution import Solution
+    from factorgraph_dvl.trial import PlanarTrial, Trial
+
+
+def errors_in(trial: Trial | PlanarTrial, *, anyway: bool) -> tuple[Finding, ...]:
+    """Return the errors in the records of a trial.
+
+    Parameters
+    ----------
+    trial : as loaded.
+    anyway : go on where records cannot be used.
+
+    Raises
+    ------
+    DataError
+        If there are records that cannot be used, unless `anyway`.
+    """
+    from factorgraph_dvl.analysis.planar_survey import survey_planar
+    from factorgraph_dvl.analysis.survey import survey
+    from factorgraph_dvl.errors import DataError
+    from factorgraph_dvl.trial import PlanarTrial
+
+    found = survey_planar(trial) if isinstance(trial, PlanarTrial) else survey(trial)
+    unusable = [str(f) for f in found.errors if f.unusable]
+    if unusable and not anyway:
+        raise DataError(
+            "; ".join(unusable),
+            where=trial.name,
+            hint="Correct the record, remove its section from trial.yaml, or go on with --anyway",
+        )
+    return found.errors
+
+
+def with_findings(solution: Solution, errors: Sequence[Finding]) -> Solution:
+    """Return a solution that warns of errors in the records that it was made from."""
+    return replace(solution, warnings=(*map(str, errors), *solution.warnings))
+
+
+@contextmanager
+def explaining(errors: Sequence[Finding]) -> Iterator[None]:
+    """Show errors in the records if what is done with them fails."""
+    from factorgraph_dvl.errors import FactorgraphDvlError
+
+    try:
+        yield
+    except FactorgraphDvlError:
+        for error in errors:
+            warn(str(error))
+        raise
+
+
+def print_contradiction() -> None:
+    """Say that a solution was found that is not to be used."""
+    text = "error: records contradict each other or the model: not to be used; see the warnings"
+    stderr().print(Text(text, "red"), soft_wrap=True)
