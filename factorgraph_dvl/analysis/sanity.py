@@ -353,7 +353,7 @@ def _speed_findings(dvl: Dvl, gnss: Gnss) -> Iterator[Finding]:
     at_ping = np.column_stack([np.interp(pings[inside], time, column) for column in velocity.T])
     gnss_speed = np.linalg.norm(at_ping, axis=1)
     dvl_speed = np.linalg.norm(dvl.velocity[dvl.locked][inside], axis=1)
-    if _in_radians(gnss, gnss_speed, dvl_speed):
+    if _in_radians(gnss, np.linalg.norm(at_ping[:, :2], axis=1), dvl_speed):
         yield Finding("error", gnss.label, _RADIANS, "radians")
         return
     moving = gnss_speed > _MOVING_M_S
