@@ -399,6 +399,33 @@ def test_bad_results_from_elsewhere(tmp_path: Path, text: str, name: str, expect
     assert expected in str(caught.value)
 
 
+def test_every_parameter_of_a_sensor_may_come_from_elsewhere(tmp_path: Path) -> None:
+    text = """star_mounting_deg: [1, 2, 3]
+sound_speed_error: 0.002
+heading_bias_deg: 0.5
+log_scale_error: 0.01
+beacon_B1_offset_m: {value: [1, 2, 3], std: [0.1, 0.2, 0.3]}
+beam_scale_error: [0.001, 0.002, 0.003, 0.004]
+"""
+    b = foreign(tmp_path, text)
+    assert b.estimate("beacon_B1_offset_m").component_names == (
+        "beacon_B1_offset_e_m",
+        "beacon_B1_offset_n_m",
+        "beacon_B1_offset_u_m",
+    )
+    assert {f"beam_scale_error_{i}" for i in range(1, 5)} < set(b.order)
+    nested = {"parameters": {e.name: {"value": e.value.tolist()} for e in b.estimates}}
+    (tmp_path / "truth.json").write_text(json.dumps(nested))
+    truth = read_truth(tmp_path / "truth.json")
+    assert truth.keys() == {e.name for e in b.estimates}
+    for text, expected in (
+        ("beacon_B1_offset_m: [1, 2]", "must have 3 numbers, not 2"),
+        ("beacon_offset_m: [1, 2, 3]", "unknown key `beacon_offset_m`"),
+    ):
+        with pytest.raises(FactorgraphDvlError, match=expected):
+            foreign(tmp_path, text)
+
+
 def test_bad_sigmas_of_a_trajectory(tmp_path: Path) -> None:
     columns = motion_columns(build_solution().trajectory)
     for name in ("std_e_m", "std_n_m", "std_u_m"):

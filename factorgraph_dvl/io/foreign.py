@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
+from typing import Any, Union, cast
 
+import msgspec
 import numpy as np
 from msgspec import UNSET, UnsetType
 
@@ -25,6 +28,7 @@ from factorgraph_dvl.io.solution_folder import (
 )
 from factorgraph_dvl.io.tables import read_table
 from factorgraph_dvl.io.trial_folder import SETTINGS_FILE, TRUTH_FILE, load_reference
+from factorgraph_dvl.sensors.catalogue import every_parameter
 from factorgraph_dvl.sensors.protocol import Parameter, Section, check_range, stack
 from factorgraph_dvl.solution import Estimate, Solution, Trajectory
 from factorgraph_dvl.trial import Reference
@@ -35,26 +39,27 @@ _UNIT = 1e-3
 _TABLES = (".csv", ".parquet", ".pq")
 _TEXTS = (".json", ".yaml", ".yml")
 _STD_GROUPS = {"m": STD_COLUMNS[0:3], "m/s": STD_COLUMNS[3:6], "deg": STD_COLUMNS[6:9]}
-# Reported names: stem, unit, and the components that each possible number of them has.
-_KNOWN: dict[str, tuple[str, str, tuple[tuple[str, ...], ...]]] = {
-    "misalignment_deg": ("misalignment", "deg", (("x", "y", "z"),)),
-    "scale_error": ("scale_error", "", (("",), ("x", "y", "z"))),
-    "lever_arm_m": ("lever_arm", "m", (("x", "y", "z"),)),
-    "gyro_bias_deg_h": ("gyro_bias", "deg_h", (("x", "y", "z"),)),
-    "accel_bias_ug": ("accel_bias", "ug", (("x", "y", "z"),)),
-    "gnss_lever_arm_m": ("gnss_lever_arm", "m", (("x", "y", "z"),)),
-    "dvl_bias_m_s": ("dvl_bias", "m_s", (("x", "y", "z"),)),
-    "time_offset_s": ("time_offset", "s", (("",),)),
-    "current_m_s": ("current", "m_s", (("e", "n"),)),
-    "sea_surface_height_m": ("sea_surface_height", "m", (("",),)),
-    "beam_scale_error": (
-        "beam_scale_error",
-        "",
-        (("",), *(tuple(str(i + 1) for i in range(n)) for n in range(3, _MOST_BEAMS + 1))),
-    ),
-    "beam_misalignment_deg": ("beam_misalignment", "deg", (("x", "y", "z"),)),
-    "beam_lever_arm_m": ("beam_lever_arm", "m", (("x", "y", "z"),)),
-}
+# Stands for the name of any beacon.
+_ANY = "NAME"
+_BEACON = re.compile(r"beacon_([^\s\"':,{}]+)_offset_m\b")
+
+
+def _known(beacon: str = _ANY) -> dict[str, dict[int, Parameter]]:
+    """Return the parameters that a file may hold, by name and number of components."""
+    out: dict[str, dict[int, Parameter]] = {}
+    for p in every_parameter(_MOST_BEAMS, beacon):
+        if p.nominal is None:
+            out.setdefault(p.name, {})[p.mean.size] = p
+    return out
+
+
+def _choices(name: str) -> dict[int, Parameter]:
+    """Return what a parameter may be, by its number of components."""
+    beacon = _BEACON.fullmatch(name)
+    return _KNOWN[name] if beacon is None else _known(beacon[1])[name]
+
+
+_KNOWN = _known()
 # Directions are unit vectors, with standard deviations in pairs.
 _DIRECTIONS = "beam_direction_b"
 
@@ -98,32 +103,25 @@ class _Directions(Section, frozen=True, kw_only=True):
 
 
 class _Parameters(Section, frozen=True, kw_only=True):
-    misalignment_deg: _Given = UNSET
-    scale_error: _Given = UNSET
-    lever_arm_m: _Given = UNSET
-    gyro_bias_deg_h: _Given = UNSET
-    accel_bias_ug: _Given = UNSET
-    gnss_lever_arm_m: _Given = UNSET
-    dvl_bias_m_s: _Given = UNSET
-    time_offset_s: _Given = UNSET
-    current_m_s: _Given = UNSET
-    sea_surface_height_m: _Given = UNSET
-    beam_scale_error: _Given = UNSET
-    beam_misalignment_deg: _Given = UNSET
-    beam_lever_arm_m: _Given = UNSET
-    beam_direction_b: _Directions | UnsetType = UNSET
+    """Parameters by name; `_file_type` adds a field for each."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name, (_, _, choices) in _KNOWN.items():
-            given = getattr(self, name)
-            if given is not UNSET:
-                _check_sizes(name, _as_value(given), [len(labels) for labels in choices])
+        for name, given in self.given().items():
+            if name != _DIRECTIONS:
+                _check_sizes(name, given, list(_choices(name)))
 
     def given(self) -> dict[str, _Value | _Directions]:
         """Return what is there, by name."""
-        found = {name: getattr(self, name) for name in (*_KNOWN, _DIRECTIONS)}
-        return {name: _as_value(g) for name, g in found.items() if g is not UNSET}
+        found = {name: getattr(self, name, UNSET) for name in self.__struct_fields__}
+        return {
+            name: _as_value(given)
+            for name, given in found.items()
+            if given is not UNSET and name not in _ABOUT
+        }
+
+
+_ABOUT = ("trial", "solver", "body_axes", "trajectory", "parameters")
 
 
 class _File(_Parameters, frozen=True, kw_only=True):
@@ -132,6 +130,18 @@ class _File(_Parameters, frozen=True, kw_only=True):
     body_axes: BodyAxes | UnsetType = UNSET
     trajectory: str = ""
     parameters: _Parameters | UnsetType = UNSET
+
+
+def _file_type(text: str) -> type[_File]:
+    """Return the type of a file that may hold all parameters, and those of its beacons."""
+    names = [n for n in _KNOWN if _ANY not in n]
+    names += sorted({m[0] for m in _BEACON.finditer(text)})
+    fields: list[Any] = [(name, _Given, UNSET) for name in names]
+    fields.append((_DIRECTIONS, _Directions | UnsetType, UNSET))
+    options: dict[str, Any] = {"frozen": True, "kw_only": True}
+    nested = msgspec.defstruct("_Parameters", fields, bases=(_Parameters,), **options)
+    whole = [*fields, ("parameters", Union[nested, UnsetType], UNSET)]  # noqa: UP007
+    return cast("type[_File]", msgspec.defstruct("_File", whole, bases=(_File,), **options))
 
 
 def load_results(path_a: Path | str, path_b: Path | str) -> tuple[Solution, Solution]:
@@ -283,7 +293,7 @@ def read_calibration_values(path: Path | str, body_axes: BodyAxes) -> dict[str, 
     if whole:
         calibration = load_calibration(path, body_axes=body_axes)
         check_usable(calibration, body_axes, str(path))
-        values = {n: v for n, v in calibration.values.items() if n in (*_KNOWN, _DIRECTIONS)}
+        values = calibration.values
     else:
         values = read_truth(path)
         says = _read_calibration(path).body_axes
@@ -298,7 +308,7 @@ def _read_calibration(path: Path) -> _File:
     text = read_text(path)
     if path.suffix.lower() == ".json":
         text = _checked_json(text, path.name)
-    file = parse_yaml(text, _File, source=path.name)
+    file = parse_yaml(text, _file_type(text), source=path.name)
     top, nested = file.given(), file.parameters is not UNSET
     if top and nested:
         raise ConfigError(
@@ -352,12 +362,10 @@ def _estimate(name: str, given: _Value | _Directions) -> Estimate:
         return _direction_estimate(name, given)
     value, std = _array(given.value), _array(given.std)
     unknown = np.full(value.size, np.nan)
-    stem, unit, choices = _KNOWN[name]
-    labels = next(labels for labels in choices if len(labels) == value.size)
     observable = True if isinstance(given.observable, UnsetType) else given.observable
     return Estimate(
         name,
-        Parameter(stem, unit, 1.0, value, unknown, labels=labels).component_names,
+        _choices(name)[value.size].component_names,
         value,
         std if std.size else unknown,
         unknown,
