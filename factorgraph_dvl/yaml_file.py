@@ -12,7 +12,7 @@ import yaml
 
 from factorgraph_dvl.errors import ConfigError
 
-T = TypeVar("T", bound=msgspec.Struct)
+T = TypeVar("T")
 Key = str | int
 
 _MAX_NODES = 100_000

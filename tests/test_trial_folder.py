@@ -377,8 +377,7 @@ def test_nothing_appears_when_writing_fails(tmp_path: Path, exists: bool) -> Non
     if exists:
         assert [p.name for p in path.iterdir()] == ["old"]
     else:
-        assert not path.exists()
-        assert list(path.parent.iterdir()) == []
+        assert not path.parent.exists()
 
 
 def test_errors_have_one_base() -> None:

@@ -17,6 +17,7 @@ from factorgraph_dvl.cli.deadreckon import deadreckon
 from factorgraph_dvl.cli.inspect import inspect
 from factorgraph_dvl.cli.instrument import instrument
 from factorgraph_dvl.cli.observability import observability
+from factorgraph_dvl.cli.options import claims
 from factorgraph_dvl.cli.plan import plan
 from factorgraph_dvl.cli.replay import replay
 from factorgraph_dvl.cli.simulate import simulate
@@ -66,7 +67,8 @@ def main(argv: list[str] | None = None) -> NoReturn:
         if hasattr(stream, "reconfigure"):
             stream.reconfigure(errors="replace")
     try:
-        app(args=[arg for arg in args if arg != "--debug"], prog_name=_NAME)
+        with claims:
+            app(args=[arg for arg in args if arg != "--debug"], prog_name=_NAME)
     except FactorgraphDvlError as error:
         _fail(str(error), error.exit_code, args)
     except KeyboardInterrupt:

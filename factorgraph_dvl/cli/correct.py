@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from factorgraph_dvl.cli.console import print_written, stdout, warn
-from factorgraph_dvl.cli.options import Force, TrialPath
+from factorgraph_dvl.cli.options import Force, TrialPath, claim_output
 
 
 def correct(
@@ -25,11 +25,10 @@ def correct(
     from factorgraph_dvl.analysis.beam_quality import calibration_of, check_same_instrument
     from factorgraph_dvl.errors import DataError
     from factorgraph_dvl.io.calibration_file import check_usable, load_calibration
-    from factorgraph_dvl.io.corrected_record import save_corrected
-    from factorgraph_dvl.io.folders import check_output
-    from factorgraph_dvl.io.trial_folder import load_trial
+    from factorgraph_dvl.io.corrected_record import OWNED, save_corrected
+    from factorgraph_dvl.io.trial_folder import inputs_of, load_trial
 
-    check_output(out, force=force)
+    claim_output(out, force=force, owned=OWNED, inputs=(*inputs_of(trial_path), calibration))
     trial = load_trial(trial_path)
     if trial.beams is None:
         raise DataError(

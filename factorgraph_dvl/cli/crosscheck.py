@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from factorgraph_dvl.cli.console import print_table, print_written, stdout, warn
-from factorgraph_dvl.cli.options import Force, NoFigures
+from factorgraph_dvl.cli.options import Force, NoFigures, claim_output
 
 if TYPE_CHECKING:
     from factorgraph_dvl.analysis.crosscheck import CrossCheck
@@ -46,12 +46,15 @@ def crosscheck(
 ) -> None:
     """Hold two results of one trial against each other, and against the truth."""
     from factorgraph_dvl.analysis.crosscheck import crosscheck as compare
-    from factorgraph_dvl.io.folders import check_output, new_folder
+    from factorgraph_dvl.io.folders import new_folder
     from factorgraph_dvl.io.foreign import load_results, load_truth
     from factorgraph_dvl.io.tables import write_table
+    from factorgraph_dvl.io.trial_folder import inputs_of
     from factorgraph_dvl.report.crosscheck_files import OWNED, difference_columns, to_csv, to_json
 
-    check_output(out, force=force)
+    given = [path for path in (a, b, reference, truth) if path is not None]
+    read = [path for source in given for path in inputs_of(source)]
+    claim_output(out, force=force, owned=OWNED, inputs=read)
     result_a, result_b = load_results(a, b)
     true_motion, true_values = load_truth(reference, truth)
     check = compare(

@@ -14,7 +14,7 @@ from factorgraph_dvl.cli.console import (
     stdout,
     warn,
 )
-from factorgraph_dvl.cli.options import Force, NoFigures, Quiet, TrialPath
+from factorgraph_dvl.cli.options import Force, NoFigures, Quiet, TrialPath, claim_output
 
 if TYPE_CHECKING:
     from factorgraph_dvl.analysis.before_after import BeforeAfter
@@ -53,11 +53,11 @@ def deadreckon(
 ) -> None:
     """Integrate the DVL's velocity, before and after calibration, and score the track."""
     from factorgraph_dvl.analysis.before_after import before_after
-    from factorgraph_dvl.io.folders import check_output, new_folder
+    from factorgraph_dvl.io.folders import new_folder
     from factorgraph_dvl.io.foreign import read_calibration_values
     from factorgraph_dvl.io.motion_table import motion_columns
     from factorgraph_dvl.io.tables import write_table
-    from factorgraph_dvl.io.trial_folder import load_trial
+    from factorgraph_dvl.io.trial_folder import inputs_of, load_trial
     from factorgraph_dvl.report.dead_reckoning_files import (
         OWNED,
         RESULT_FILE,
@@ -67,7 +67,8 @@ def deadreckon(
         to_json,
     )
 
-    check_output(out, force=force)
+    read = (*inputs_of(trial_path), calibration, None if attitude is None else Path(attitude))
+    claim_output(out, force=force, owned=OWNED, inputs=read)
     with ProgressLine(quiet=quiet) as progress:
         trial = load_trial(trial_path)
         values = read_calibration_values(calibration, trial.body_axes)

@@ -16,7 +16,7 @@ from factorgraph_dvl.cli.console import (
     stdout,
     warn,
 )
-from factorgraph_dvl.cli.options import Force, NoFigures, Quiet
+from factorgraph_dvl.cli.options import Force, NoFigures, Quiet, claim_output
 
 if TYPE_CHECKING:
     from factorgraph_dvl.analysis.observability import Observability
@@ -37,11 +37,12 @@ def observability(
     quiet: Quiet = False,
 ) -> None:
     """Show what the data can tell, what they cannot, and which motion told it."""
-    from factorgraph_dvl.io.folders import check_output, new_folder
+    from factorgraph_dvl.io.folders import new_folder
     from factorgraph_dvl.io.segments_file import read_segments
+    from factorgraph_dvl.io.trial_folder import inputs_of
     from factorgraph_dvl.report.observability_files import OWNED
 
-    check_output(out, force=force)
+    claim_output(out, force=force, owned=OWNED, inputs=(*inputs_of(source), segments))
     given = () if segments is None else read_segments(segments)
     with ProgressLine(quiet=quiet) as progress:
         view, converged = _view(source, given, progress)
@@ -61,8 +62,9 @@ def _view(
     """Return the view of a trial, which is solved for that, or of a solution."""
     from factorgraph_dvl.analysis.observability import observability as look
     from factorgraph_dvl.io.calibration_file import CALIBRATION_FILE
+    from factorgraph_dvl.io.folders import SETTINGS_FILE
     from factorgraph_dvl.io.solution_folder import load_solution
-    from factorgraph_dvl.io.trial_folder import SETTINGS_FILE, load_trial
+    from factorgraph_dvl.io.trial_folder import load_trial
 
     if (source / CALIBRATION_FILE).exists() and not (source / SETTINGS_FILE).exists():
         solution = load_solution(source)

@@ -9,7 +9,7 @@ import typer
 
 from factorgraph_dvl.cli.console import ProgressLine, print_table, print_written, stdout
 from factorgraph_dvl.cli.observability import print_observability, write_observability
-from factorgraph_dvl.cli.options import Force, NoFigures, Quiet
+from factorgraph_dvl.cli.options import Force, NoFigures, Quiet, claim_output
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -28,12 +28,12 @@ def plan(
 ) -> None:
     """Predict what a planned trial will tell, and what to add where that is not enough."""
     from factorgraph_dvl.analysis.observability import observability as look
-    from factorgraph_dvl.io.folders import check_output, new_folder
+    from factorgraph_dvl.io.folders import new_folder
     from factorgraph_dvl.planning import predict, propose, requirements
     from factorgraph_dvl.report.plan_files import OWNED, to_json
     from factorgraph_dvl.simulation import load_scenario
 
-    check_output(out, force=force)
+    claim_output(out, force=force, owned=OWNED, inputs=(source,))
     planned = load_scenario(source)
     with ProgressLine(quiet=quiet) as progress:
         progress("prediction", 0, None)

@@ -18,7 +18,15 @@ from factorgraph_dvl.cli.console import (
     stdout,
     warn,
 )
-from factorgraph_dvl.cli.options import Anyway, Force, NoFigures, Quiet, SolutionPath, TrialPath
+from factorgraph_dvl.cli.options import (
+    Anyway,
+    Force,
+    NoFigures,
+    Quiet,
+    SolutionPath,
+    TrialPath,
+    claim_output,
+)
 from factorgraph_dvl.cli.plausibility import (
     errors_in,
     explaining,
@@ -74,13 +82,13 @@ def replay(
         check_limits,
         convergence,
     )
-    from factorgraph_dvl.io.folders import check_output
-    from factorgraph_dvl.io.trial_folder import load_trial
+    from factorgraph_dvl.io.solution_folder import OWNED
+    from factorgraph_dvl.io.trial_folder import inputs_of, load_trial
 
     std_asked = _limits("--good-std", good_std)
     error_asked = _limits("--good-error", good_error)
     std_limits, error_limits = GOOD_STD | std_asked, GOOD_ERROR | error_asked
-    check_output(out, force=force)
+    claim_output(out, force=force, owned=OWNED, inputs=inputs_of(trial_path))
     # Where nothing can be drawn over, lines of progress say as much.
     live = live and stderr().is_terminal
     with ProgressLine(quiet=quiet or live) as progress:

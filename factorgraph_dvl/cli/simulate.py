@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from factorgraph_dvl.cli.console import stdout
-from factorgraph_dvl.cli.options import Force
+from factorgraph_dvl.cli.options import Force, claim_output
 
 
 def simulate(
@@ -22,19 +22,21 @@ def simulate(
     ] = False,
 ) -> None:
     """Simulate a trial with known truth."""
-    from factorgraph_dvl.io.folders import check_output
     from factorgraph_dvl.io.planar_folder import save_planar_trial
-    from factorgraph_dvl.io.trial_folder import save_trial
+    from factorgraph_dvl.io.trial_folder import OWNED, check_simulated, save_trial
     from factorgraph_dvl.simulation import load_scenario, simulate_planar
     from factorgraph_dvl.simulation import simulate as run
 
-    check_output(out, force=force)
+    claim_output(out, force=force, owned=OWNED, inputs=(config,))
+    check_simulated(out)
     start = perf_counter()
     scenario = load_scenario(config)
     if scenario.planar:
-        save_planar_trial(simulate_planar(scenario, seed), out, force=force, parquet=parquet)
+        save_planar_trial(
+            simulate_planar(scenario, seed), out, force=force, parquet=parquet, seed=seed
+        )
     else:
-        save_trial(run(scenario, seed), out, force=force, parquet=parquet)
+        save_trial(run(scenario, seed), out, force=force, parquet=parquet, seed=seed)
     stdout().print(
         f"Wrote trial {scenario.name} to {out} in {perf_counter() - start:.1f} s",
         markup=False,

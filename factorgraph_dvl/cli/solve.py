@@ -25,6 +25,7 @@ from factorgraph_dvl.cli.options import (
     Rate,
     SolutionPath,
     TrialPath,
+    claim_output,
 )
 from factorgraph_dvl.cli.plausibility import (
     errors_in,
@@ -159,12 +160,16 @@ def _solve_into(
     quiet: bool,
 ) -> None:
     """Load a trial, run a solver on it, write and show its solution."""
-    from factorgraph_dvl.io.folders import check_output
     from factorgraph_dvl.io.planar_folder import is_planar, load_planar_trial
-    from factorgraph_dvl.io.solution_folder import FIGURES_FOLDER, save_solution, write_history
-    from factorgraph_dvl.io.trial_folder import load_trial
+    from factorgraph_dvl.io.solution_folder import (
+        FIGURES_FOLDER,
+        OWNED,
+        save_solution,
+        write_history,
+    )
+    from factorgraph_dvl.io.trial_folder import inputs_of, load_trial
 
-    check_output(out, force=force)
+    claim_output(out, force=force, owned=OWNED, inputs=inputs_of(trial_path))
     with ProgressLine(quiet=quiet) as progress:
         trial: Trial | PlanarTrial
         if is_planar(trial_path):

@@ -17,6 +17,7 @@ from factorgraph_dvl.sensors.dvl_beams import DvlBeams
 
 INSTRUMENT_FILE = "instrument.json"
 RECORD_FILE = "dvl.csv"
+OWNED = (INSTRUMENT_FILE, RECORD_FILE)
 
 
 def save_corrected(
@@ -61,7 +62,7 @@ def save_corrected(
         "error_velocity": error_rows(gain).tolist(),
         "dvl": msgspec.structs.replace(dvl.settings, file=RECORD_FILE),
     }
-    with new_folder(path, force=force, owned=(INSTRUMENT_FILE, RECORD_FILE)) as folder:
+    with new_folder(path, force=force, owned=OWNED) as folder:
         write_table(folder / RECORD_FILE, dvl.columns())
         text = msgspec.json.format(msgspec.json.encode(content), indent=2)
         (folder / INSTRUMENT_FILE).write_bytes(text + b"\n")

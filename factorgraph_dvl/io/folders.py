@@ -1,90 +1,329 @@
-"""Output folders that appear complete or not at all."""
+"""Output folders that appear complete or not at all, and that are replaced as a whole.
+
+A run writes to a working folder beside its output, `.NAME.factorgraph-dvl`, which it keeps
+locked: whoever gets the lock knows that no other run is writing, and that what it finds in
+there is left of one that was killed. The working folder holds
+
+- `partial`: a result that is being written; of the user's files it has links only;
+- `new`: a complete result that is about to trade places with the output;
+- `old`: the result that it replaced, or, if there is no output, is replacing;
+- `owned`: patterns of what the run writes. All other files are the user's.
+"""
 
 from __future__ import annotations
 
+import ctypes
+import errno
+import fcntl
 import os
 import shutil
-import tempfile
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from pathlib import Path
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from fnmatch import fnmatchcase
+from pathlib import Path, PurePath
 
 from factorgraph_dvl.errors import DataError
 
+SETTINGS_FILE = "trial.yaml"
+_PARTIAL, _NEW, _OLD, _OWNED = "partial", "new", "old", "owned"
+_AT_FDCWD, _RENAME_EXCHANGE = -100, 2
 
-def check_output(path: Path, *, force: bool = False) -> None:
-    """Raise DataError if a folder cannot be written to `path`.
+# Working folders that this process has locked, by the output that they belong to.
+_claimed: dict[Path, Path] = {}
+
+
+@contextmanager
+def claim(
+    path: Path, *, force: bool = False, owned: Sequence[str] = (), inputs: Iterable[Path] = ()
+) -> Iterator[Path]:
+    """Keep every other run from writing to an output folder, and yield its working folder.
+
+    What an earlier run left that was killed is cleaned up, and the result that it was
+    replacing put back. Within a claim, another one on the same folder does nothing.
 
     Parameters
     ----------
     path : of the folder to be written.
-    force : allow one that exists and holds files.
+    force : replace what an earlier run wrote there.
+    owned : names of what the run may write, as patterns relative to the folder. The first
+        is in every result.
+    inputs : files and folders that the run reads.
+
+    Raises
+    ------
+    DataError
+        If the folder holds inputs or, without `force`, anything; if another run is writing
+        to it; if it cannot be written or replaced.
     """
-    if path.exists() and not path.is_dir():
-        raise DataError("is a file", where=str(path), expected="a folder, or a new name")
-    if not force and path.is_dir() and any(path.iterdir()):
-        raise DataError(
-            "the folder exists and is not empty",
-            where=str(path),
-            expected="a new folder",
-            hint="Choose another, or replace its results with --force",
-        )
-    parent = path if path.is_dir() else path.absolute()
-    while not parent.exists():
-        parent = parent.parent
-    if not (parent.is_dir() and os.access(parent, os.W_OK | os.X_OK)):
-        raise DataError(
-            "cannot be written", where=str(path), expected=f"write permission in {parent}"
-        )
+    target = path.resolve()
+    if target in _claimed:
+        yield _claimed[target]
+        return
+    _check_inputs(path, target, owned, inputs)
+    _check_place(path, target)
+    made = [parent for parent in target.parents if not parent.exists()]
+    target.parent.mkdir(parents=True, exist_ok=True)
+    work = target.parent / f".{target.name}.factorgraph-dvl"
+    lock = _lock(work, path)
+    try:
+        _recover(work, target)
+        _check_content(path, target, force, owned)
+        _claimed[target] = work
+        yield work
+    finally:
+        _claimed.pop(target, None)
+        # What could not be cleared away stays there for the next run.
+        if not ((work / _OLD).exists() or (work / _NEW).exists()):
+            (work / _OWNED).unlink(missing_ok=True)
+        with suppress(OSError):
+            work.rmdir()
+        os.close(lock)
+        with suppress(OSError):
+            for parent in made:
+                parent.rmdir()
 
 
 @contextmanager
 def new_folder(path: Path, *, force: bool = False, owned: Sequence[str] = ()) -> Iterator[Path]:
     """Yield a temporary folder that becomes `path` when the block ends without an error.
 
-    A new folder appears by one rename. Into one that exists the files are moved one by
-    one: those in `owned` from an earlier run go first, its other files stay. The first
-    of `owned` is what makes the folder valid: it is the first to go and the last to come.
+    It appears there by one rename, and trades places with an earlier result by one, where
+    the file system can do that. Files that are not in `owned` stay.
 
     Parameters
     ----------
-    path : of the folder.
-    force : allow one that exists and holds files.
-    owned : names that an earlier run may have left there.
+    path, force, owned : as in `claim`.
 
     Raises
     ------
     DataError
-        If `path` is a file, or holds files and `force` is not set.
+        As `claim`, and if the folder was filled meanwhile and `force` is not set.
     """
-    check_output(path, force=force)
-    home = path if path.is_dir() else path.absolute().parent
-    home.mkdir(parents=True, exist_ok=True)
-    temporary = Path(tempfile.mkdtemp(prefix=".partial-", dir=home))
-    try:
-        yield temporary
-        if path.is_dir():
-            _replace(temporary, path, owned)
+    target = path.resolve()
+    with claim(path, force=force, owned=owned) as work:
+        (work / _OWNED).write_text("\n".join(owned), encoding="utf-8")
+        partial = work / _PARTIAL
+        partial.mkdir()
+        try:
+            yield partial
+            partial.chmod(target.stat().st_mode & 0o7777 if target.is_dir() else 0o777 & ~_umask())
+            try:
+                partial.rename(target)
+            except OSError as error:
+                if error.errno not in (errno.ENOTEMPTY, errno.EEXIST):
+                    raise
+                if not force:
+                    raise _occupied(path) from None
+                _replace(work, target, owned)
+        finally:
+            shutil.rmtree(partial, ignore_errors=True)
+
+
+def _check_inputs(path: Path, target: Path, owned: Sequence[str], inputs: Iterable[Path]) -> None:
+    """Raise DataError if a folder holds a trial that is no result, or anything that is read."""
+    if not target.is_dir():
+        return
+    if SETTINGS_FILE not in owned and (target / SETTINGS_FILE).exists():
+        raise DataError(
+            f"holds {SETTINGS_FILE}: it is a trial, and no result may replace its files",
+            where=str(path),
+            expected="another folder for results",
+        )
+    for given in inputs:
+        beside = [p for p in given.iterdir() if not p.is_dir()] if given.is_dir() else []
+        for item in (given, *beside):
+            if _lies_in(item, target):
+                raise DataError(
+                    f"holds {item}, which this command reads: its results may not replace that",
+                    where=str(path),
+                    expected="another folder for results",
+                )
+
+
+def _lies_in(item: Path, folder: Path) -> bool:
+    """Whether a file or folder lies in another, at any depth, by its own or its real name."""
+    for name in (item.absolute(), item.resolve()):
+        for parent in (name, *name.parents):
+            with suppress(OSError):
+                if parent.samefile(folder):
+                    return True
+    return False
+
+
+def _check_place(path: Path, target: Path) -> None:
+    """Raise DataError if no folder can be renamed to `target`."""
+    if target.exists() and not target.is_dir():
+        raise DataError("is a file", where=str(path), expected="a folder, or a new name")
+    parent = target.parent
+    while not parent.exists():
+        parent = parent.parent
+    if not (parent.is_dir() and os.access(parent, os.W_OK | os.X_OK)):
+        raise DataError(
+            "cannot be written",
+            where=str(path),
+            expected=f"write permission in {parent}",
+            hint=f"Choose a folder in it, such as {path / 'result'}" if target.is_dir() else "",
+        )
+    if target.is_dir() and (os.path.ismount(target) or _lies_in(Path.cwd(), target)):
+        what = "where a disk is mounted" if os.path.ismount(target) else "the working folder"
+        raise DataError(
+            f"is {what}, and cannot be replaced as a whole",
+            where=str(path),
+            expected="a folder that can be renamed",
+            hint=f"Choose a folder in it, such as {path / 'result'}",
+        )
+
+
+def _check_content(path: Path, target: Path, force: bool, owned: Sequence[str]) -> None:
+    """Raise DataError if a folder holds what may not be replaced."""
+    if not target.is_dir() or not any(target.iterdir()):
+        return
+    if not force:
+        raise _occupied(path)
+    if owned and not (target / owned[0]).exists():
+        # Without that file it is no result: what has such a name is someone else's.
+        for pattern in owned:
+            for found in sorted(target.glob(pattern)):
+                raise DataError(
+                    f"holds {found.relative_to(target)} but no {owned[0]}: it is no earlier "
+                    "result of this command, and --force does not replace what others wrote",
+                    where=str(path),
+                    expected="another folder",
+                )
+
+
+def _occupied(path: Path) -> DataError:
+    return DataError(
+        "the folder exists and is not empty",
+        where=str(path),
+        expected="a new folder",
+        hint="Choose another, or replace its results with --force",
+    )
+
+
+def _lock(work: Path, path: Path) -> int:
+    """Return the locked handle of the working folder, which is made if it is not there."""
+    while True:
+        work.mkdir(mode=0o700, exist_ok=True)
+        try:
+            handle = os.open(work, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
+        except FileNotFoundError:
+            # Its run ended just now.
+            continue
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if os.path.samestat(os.fstat(handle), work.stat()):
+                return handle
+        except FileNotFoundError:
+            pass
+        except BlockingIOError:
+            os.close(handle)
+            raise DataError(
+                "another run is writing to this folder",
+                where=str(path),
+                expected="one run at a time",
+                hint="Choose another folder, or wait until it has ended",
+            ) from None
+        except OSError as error:
+            os.close(handle)
+            raise DataError(
+                f"cannot be locked ({error.strerror})",
+                where=str(work),
+                expected="a file system with locks",
+                hint="Choose a folder on another disk",
+            ) from None
+        os.close(handle)
+
+
+def _recover(work: Path, target: Path) -> None:
+    """Clear away what a killed run left, and put back what it had set aside."""
+    file = work / _OWNED
+    owned = file.read_text(encoding="utf-8").splitlines() if file.exists() else []
+    shutil.rmtree(work / _PARTIAL, ignore_errors=True)
+    for aside in (work / _OLD, work / _NEW):
+        if aside.is_dir():
+            if target.exists():
+                _clear_away(aside, target, owned)
+            else:
+                aside.rename(target)
+
+
+def _replace(work: Path, target: Path, owned: Sequence[str]) -> None:
+    """Let a written folder take the place of the target, with the user's files in it."""
+    partial, new, old = work / _PARTIAL, work / _NEW, work / _OLD
+    for name in _of_others(target, owned):
+        source, copy = target / name, partial / name
+        if _is_folder(source):
+            copy.mkdir(parents=True, exist_ok=True)
+            shutil.copymode(source, copy)
         else:
-            temporary.chmod(0o777 & ~_umask())
-            temporary.rename(path)
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
-
-
-def _replace(new: Path, path: Path, owned: Sequence[str]) -> None:
-    for name in owned:
-        _remove(path / name)
-    for item in sorted(new.iterdir(), key=lambda item: item.name in owned[:1]):
-        _remove(path / item.name)
-        item.rename(path / item.name)
-
-
-def _remove(path: Path) -> None:
-    if path.is_dir() and not path.is_symlink():
-        shutil.rmtree(path)
+            copy.parent.mkdir(parents=True, exist_ok=True)
+            # What cannot be linked is moved afterwards.
+            with suppress(OSError):
+                os.link(source, copy, follow_symlinks=False)
+    partial.rename(new)
+    try:
+        _exchange(new, target)
+    except (OSError, AttributeError):
+        # Killed between these two, the next run puts the old result back.
+        target.rename(old)
+        try:
+            new.rename(target)
+        except OSError:
+            old.rename(target)
+            raise
     else:
-        path.unlink(missing_ok=True)
+        new.rename(old)
+    _clear_away(old, target, owned)
+
+
+def _exchange(a: Path, b: Path) -> None:
+    """Let two folders trade names at one instant."""
+    libc = ctypes.CDLL(None, use_errno=True)
+    names = os.fsencode(a), os.fsencode(b)
+    if libc.renameat2(_AT_FDCWD, names[0], _AT_FDCWD, names[1], _RENAME_EXCHANGE) != 0:
+        number = ctypes.get_errno()
+        raise OSError(number, os.strerror(number), str(b))
+
+
+def _clear_away(aside: Path, target: Path, owned: Sequence[str]) -> None:
+    """Remove a folder that was replaced; the user's files in it go to the target first."""
+    for name in _of_others(aside, owned):
+        source, place = aside / name, target / name
+        if _is_folder(source):
+            place.mkdir(parents=True, exist_ok=True)
+        elif not os.path.lexists(place) or _is_newer(source, place):
+            place.parent.mkdir(parents=True, exist_ok=True)
+            source.replace(place)
+    shutil.rmtree(aside)
+
+
+def _of_others(folder: Path, owned: Sequence[str], inside: str = "") -> list[PurePath]:
+    """Return what in a folder no pattern names, at any depth, folders before their content.
+
+    A folder that a pattern has files in counts only by what else is in it.
+    """
+    out: list[PurePath] = []
+    for item in sorted((folder / inside).iterdir()):
+        name = item.relative_to(folder)
+        if any(fnmatchcase(name.as_posix(), pattern) for pattern in owned):
+            continue
+        is_folder = _is_folder(item)
+        if not (is_folder and any(name == PurePath(pattern).parent for pattern in owned)):
+            out.append(name)
+        if is_folder:
+            out += _of_others(folder, owned, str(name))
+    return out
+
+
+def _is_folder(path: Path) -> bool:
+    return path.is_dir() and not path.is_symlink()
+
+
+def _is_newer(a: Path, b: Path) -> bool:
+    """Whether a file is another than b, and was written after it."""
+    one, other = a.lstat(), b.lstat()
+    return not os.path.samestat(one, other) and one.st_mtime_ns > other.st_mtime_ns
 
 
 def _umask() -> int:

@@ -20,6 +20,7 @@ from factorgraph_dvl.io.calibration_file import (
     check_values,
     load_calibration,
 )
+from factorgraph_dvl.io.folders import SETTINGS_FILE
 from factorgraph_dvl.io.motion_table import read_reference
 from factorgraph_dvl.io.solution_folder import (
     STD_COLUMNS,
@@ -27,7 +28,7 @@ from factorgraph_dvl.io.solution_folder import (
     load_solution,
 )
 from factorgraph_dvl.io.tables import read_table
-from factorgraph_dvl.io.trial_folder import SETTINGS_FILE, TRUTH_FILE, load_reference
+from factorgraph_dvl.io.trial_folder import TRUTH_FILE, load_reference
 from factorgraph_dvl.sensors.catalogue import every_parameter
 from factorgraph_dvl.sensors.protocol import Parameter, Section, check_range, stack
 from factorgraph_dvl.solution import Estimate, Solution, Trajectory

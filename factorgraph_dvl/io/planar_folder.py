@@ -12,7 +12,6 @@ from factorgraph_dvl.io.motion_table import motion_columns
 from factorgraph_dvl.io.tables import write_table
 from factorgraph_dvl.io.trial_folder import (
     OWNED,
-    SETTINGS_FILE,
     TRUTH_FILE,
     locate,
     looks_planar,
@@ -22,12 +21,12 @@ from factorgraph_dvl.io.trial_folder import (
     read_truth,
     reference_of,
     truth_json,
+    write_settings,
 )
 from factorgraph_dvl.io.trial_yaml import (
     PlanarInitialSettings,
     PlanarSettings,
     ReferenceSettings,
-    to_yaml,
 )
 from factorgraph_dvl.sensors.beacon import Beacons
 from factorgraph_dvl.sensors.depth import Depth
@@ -77,7 +76,12 @@ def load_planar_trial(path: Path | str) -> PlanarTrial:
 
 
 def save_planar_trial(
-    trial: PlanarTrial, path: Path | str, *, force: bool = False, parquet: bool = False
+    trial: PlanarTrial,
+    path: Path | str,
+    *,
+    force: bool = False,
+    parquet: bool = False,
+    seed: int | None = None,
 ) -> None:
     """Write the folder of a planar trial, complete or not at all; as `save_trial`."""
     suffix = ".parquet" if parquet else ".csv"
@@ -107,4 +111,4 @@ def save_planar_trial(
             write_table(folder / f"reference{suffix}", motion_columns(trial.reference))
         if trial.calibration_truth:
             (folder / TRUTH_FILE).write_bytes(truth_json(trial.calibration_truth))
-        (folder / SETTINGS_FILE).write_text(to_yaml(settings), encoding="utf-8")
+        write_settings(folder, settings, seed)

@@ -32,6 +32,18 @@ CONVERGENCE_FILE = "convergence.csv"
 INSTRUMENT_FILE = "instrument.yaml"
 BEAMS_FILE = "beams.csv"
 FIGURES_FOLDER = "figures"
+# What is written with a solution; the first is in every one.
+OWNED = (
+    *(CALIBRATION_FILE, TRAJECTORY_FILE, HISTORY_FILE, LATENCY_FILE, CONVERGENCE_FILE),
+    *(HYPOTHESES_FILE, f"{HYPOTHESES_FOLDER}/[0-9]*.csv", REJECTED_FILE),
+    *(INSTRUMENT_FILE, BEAMS_FILE),
+    *(
+        f"{FIGURES_FOLDER}/{name}.png"
+        for name in ("track", "motion", "calibration", "correlation")
+    ),
+    *(f"{FIGURES_FOLDER}/{name}.png" for name in ("*_residuals", "beam_quality")),
+    *(f"{FIGURES_FOLDER}/{name}.png" for name in ("convergence", "latency")),
+)
 STD_COLUMNS = (
     *("std_e_m", "std_n_m", "std_u_m"),
     *("vel_std_e_m_s", "vel_std_n_m_s", "vel_std_u_m_s"),
@@ -74,14 +86,9 @@ def save_solution(
     Raises
     ------
     DataError
-        If the folder exists, is not empty, and `force` is not set.
+        If the folder exists, is not empty, and `force` is not set; if it holds a trial.
     """
-    owned = (
-        *(CALIBRATION_FILE, TRAJECTORY_FILE, HISTORY_FILE, LATENCY_FILE, CONVERGENCE_FILE),
-        *(HYPOTHESES_FILE, HYPOTHESES_FOLDER, REJECTED_FILE),
-        *(INSTRUMENT_FILE, BEAMS_FILE, FIGURES_FOLDER),
-    )
-    with new_folder(Path(path), force=force, owned=owned) as folder:
+    with new_folder(Path(path), force=force, owned=OWNED) as folder:
         columns = _trajectory_columns(solution.trajectory)
         if smoothed is not None:
             columns |= _smoothed_columns(solution.trajectory, smoothed)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeVar, cast
@@ -13,7 +15,7 @@ from msgspec import UNSET, UnsetType
 from factorgraph_dvl.conventions import DEG, GEODETIC_SI, Array, BodyAxes
 from factorgraph_dvl.errors import ConfigError, DataError
 from factorgraph_dvl.io.calibration_file import check_usable, encode_calibration, load_calibration
-from factorgraph_dvl.io.folders import new_folder
+from factorgraph_dvl.io.folders import SETTINGS_FILE, new_folder
 from factorgraph_dvl.io.motion_table import motion_columns, read_reference
 from factorgraph_dvl.io.tables import read_table, write_table
 from factorgraph_dvl.io.trial_yaml import (
@@ -38,7 +40,6 @@ from factorgraph_dvl.solution import Calibration, Estimate
 from factorgraph_dvl.trial import InitialAttitude, InitialPosition, Reference, Trial
 from factorgraph_dvl.yaml_file import parse_yaml, read_text
 
-SETTINGS_FILE = "trial.yaml"
 TRUTH_FILE = "truth.json"
 # Where a trial that was loaded with a calibration of its DVL keeps it when it is saved.
 PRIOR_FILE = "dvl-calibration.json"
@@ -51,6 +52,11 @@ OWNED = (
     *(f"{table}{suffix}" for table in _TABLES for suffix in (".csv", ".parquet")),
 )
 
+
+# What trial.yaml begins with if `simulate` wrote it.
+_SIMULATED = "# Simulated by factorgraph-dvl"
+# Keys whose values are names of files.
+_NAMING = ("file", "calibration", "trajectory")
 
 # Numbers that a parameter of the DVL may have.
 _SIZES = {name: (3,) for name in CALIBRATED} | {SCALE_ERROR: (1, 3), TIME_OFFSET: (1,)}
@@ -147,7 +153,12 @@ def load_reference(path: Path | str) -> tuple[Reference | None, dict[str, Array]
 
 
 def save_trial(
-    trial: Trial, path: Path | str, *, force: bool = False, parquet: bool = False
+    trial: Trial,
+    path: Path | str,
+    *,
+    force: bool = False,
+    parquet: bool = False,
+    seed: int | None = None,
 ) -> None:
     """Write a trial folder, complete or not at all.
 
@@ -157,6 +168,7 @@ def save_trial(
     path : of the folder.
     force : replace the trial that is there.
     parquet : write the sensors' tables as Parquet.
+    seed : of a trial that was simulated: trial.yaml says so.
 
     Raises
     ------
@@ -177,7 +189,53 @@ def save_trial(
             (folder / PRIOR_FILE).write_bytes(encode_calibration(calibration))
             settings = msgspec.structs.replace(trial.dvl.settings, calibration=PRIOR_FILE)
             trial = replace(trial, dvl=replace(trial.dvl, settings=settings))
-        (folder / SETTINGS_FILE).write_text(to_yaml(_settings(trial, suffix)), encoding="utf-8")
+        write_settings(folder, _settings(trial, suffix), seed)
+
+
+def write_settings(
+    folder: Path, settings: TrialSettings | PlanarSettings, seed: int | None
+) -> None:
+    """Write trial.yaml, which says so if the trial was simulated with a seed."""
+    head = "" if seed is None else f"{_SIMULATED}, seed {seed}; simulate --force replaces it\n"
+    (folder / SETTINGS_FILE).write_text(head + to_yaml(settings), encoding="utf-8")
+
+
+def check_simulated(path: Path) -> None:
+    """Raise DataError if a folder holds a trial that was not written by `simulate`."""
+    file = path / SETTINGS_FILE
+    if file.exists() and not read_text(file).startswith(_SIMULATED):
+        raise DataError(
+            f"holds a {SETTINGS_FILE} that `simulate` did not write, and may not replace",
+            where=str(path),
+            expected=f"another folder, or one whose {SETTINGS_FILE} begins with `{_SIMULATED}`",
+        )
+
+
+def inputs_of(path: Path) -> list[Path]:
+    """Return what is read of a trial or of results: the folder, and all files that it names.
+
+    What cannot be read names none: that is found out when it is loaded.
+    """
+    file = path / SETTINGS_FILE if path.is_dir() else path
+    found = [path if path.is_dir() else file]
+    if path.is_dir() or file.name == SETTINGS_FILE:
+        found.append(file.parent)
+    if file.suffix.lower() not in (".yaml", ".yml", ".json"):
+        return found
+    with suppress(ConfigError):
+        named = parse_yaml(read_text(file), dict[str, Any], source=file.name)
+        found += [file.parent / name for name in _named(named)]
+    return found
+
+
+def _named(settings: Any) -> Iterator[str]:
+    """Yield the names of files in settings, at any depth."""
+    if isinstance(settings, dict):
+        for key, value in settings.items():
+            if key in _NAMING and isinstance(value, str):
+                yield value
+            else:
+                yield from _named(value)
 
 
 def _with_calibration(dvl: Dvl, folder: Path, body_axes: BodyAxes) -> Dvl:
