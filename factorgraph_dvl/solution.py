@@ -153,6 +153,7 @@ class Solution:
     hypotheses : where the data allow, or for some time allowed, more than one trajectory:
         all of them, the heaviest first, which is the solution's; else empty.
     rejected : measurements that are none, such as echoes.
+    inputs : fingerprints of the data that it came from.
     """
 
     trial: str
@@ -168,6 +169,7 @@ class Solution:
     warnings: tuple[str, ...] = field(default_factory=tuple)
     hypotheses: tuple[Hypothesis, ...] = ()
     rejected: tuple[Residuals, ...] = ()
+    inputs: tuple[str, ...] = ()
 
     @property
     def order(self) -> tuple[str, ...]:
@@ -201,6 +203,7 @@ class Calibration:
     estimates: tuple[Estimate, ...]
     covariance: Array
     warnings: tuple[str, ...] = ()
+    inputs: tuple[str, ...] = ()
 
     @property
     def order(self) -> tuple[str, ...]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import ClassVar
 
 import numpy as np
@@ -11,6 +12,7 @@ from factorgraph_dvl.beam_geometry import as_dvl
 from factorgraph_dvl.conventions import Array, BodyAxes, frd_from_body
 from factorgraph_dvl.earth import LocalFrame
 from factorgraph_dvl.errors import DataError
+from factorgraph_dvl.fingerprint import fingerprints, shared
 from factorgraph_dvl.sensors.beacon import Beacons
 from factorgraph_dvl.sensors.depth import Depth
 from factorgraph_dvl.sensors.dvl import Dvl
@@ -112,6 +114,32 @@ class Trial:
             if isinstance(aid, Turntable) and self.gnss is not None:
                 up = -frd_from_body(self.body_axes)[2]
                 object.__setattr__(self, "gnss", replace(self.gnss, turning=aid.turning(up)))
+        self._check_prior()
+
+    def _check_prior(self) -> None:
+        """Raise DataError if the prior of the DVL came from data of this trial."""
+        prior = None if self.dvl is None else self.dvl.prior
+        if prior is None or not prior.inputs:
+            return
+        section = shared(self._fingerprints, prior.inputs)
+        if section:
+            raise DataError(
+                f"the calibration came from the {section} data of this trial itself, which "
+                "would count twice and make every standard deviation too small",
+                where=f"dvl.calibration: {prior.source}",
+                expected="a calibration from other data",
+                hint="Leave the key out, or name the calibration of an earlier trial",
+            )
+
+    @cached_property
+    def _fingerprints(self) -> tuple[str, ...]:
+        return fingerprints((self.imu, *self.aids))
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        """Fingerprints of all data behind a result: the records, and those of the prior."""
+        prior = None if self.dvl is None else self.dvl.prior
+        return (*self._fingerprints, *(() if prior is None else prior.inputs))
 
     @property
     def beams(self) -> DvlBeams | None:

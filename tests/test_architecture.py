@@ -20,7 +20,7 @@ LAYERS = (
     ("earth", "celestial", "yaml_file", "directions", "turning"),
     ("gains",),
     ("sensors",),
-    ("beam_geometry",),
+    ("beam_geometry", "fingerprint"),
     ("trial", "solution", "information"),
     ("io", "simulation"),
     ("clock", "polynomials", "signals"),

@@ -27,8 +27,8 @@ def simulate(
     from factorgraph_dvl.simulation import load_scenario, simulate_planar
     from factorgraph_dvl.simulation import simulate as run
 
-    claim_output(out, force=force, owned=OWNED, inputs=(config,))
     check_simulated(out)
+    claim_output(out, force=force, owned=OWNED, inputs=(config,))
     start = perf_counter()
     scenario = load_scenario(config)
     if scenario.planar:

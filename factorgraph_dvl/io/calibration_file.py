@@ -6,7 +6,7 @@ import re
 from collections.abc import Iterator
 from itertools import islice
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import msgspec
 import numpy as np
@@ -15,6 +15,7 @@ from msgspec import UNSET, UnsetType
 from factorgraph_dvl.conventions import DEG, Array, BodyAxes
 from factorgraph_dvl.directions import turns_to
 from factorgraph_dvl.errors import DataError
+from factorgraph_dvl.fingerprint import PATTERN
 from factorgraph_dvl.sensors.dvl import CALIBRATED
 from factorgraph_dvl.solution import Calibration, Estimate, Solution
 
@@ -56,6 +57,7 @@ class _File(msgspec.Struct):
     cost: float | None = None
     body_axes: BodyAxes | UnsetType = UNSET
     warnings: list[str] = []
+    inputs: list[Annotated[str, msgspec.Meta(pattern=PATTERN)]] = []
 
 
 def load_calibration(path: Path | str, *, body_axes: BodyAxes = "RFU") -> Calibration:
@@ -90,6 +92,7 @@ def load_calibration(path: Path | str, *, body_axes: BodyAxes = "RFU") -> Calibr
         ),
         covariance=covariance,
         warnings=tuple(file.warnings),
+        inputs=tuple(file.inputs),
     )
 
 
@@ -133,6 +136,7 @@ def encode_calibration(solution: Solution | Calibration) -> bytes:
         cost=float(solution.cost),
         body_axes=solution.body_axes,
         warnings=list(solution.warnings),
+        inputs=list(solution.inputs),
     )
     # msgspec writes nan and infinity as null, and every float with the digits it takes.
     return msgspec.json.format(msgspec.json.encode(calibration), indent=2) + b"\n"

@@ -288,7 +288,8 @@ def calibrated_by(dvl: Dvl, calibration: Calibration, body_axes: BodyAxes, sourc
         raise DataError(
             "the calibration says nothing of the DVL", where=source, expected=", ".join(CALIBRATED)
         )
-    prior = JointPrior(source, values, calibration.covariance[np.ix_(rows, rows)])
+    covariance = calibration.covariance[np.ix_(rows, rows)]
+    prior = JointPrior(source, values, covariance, calibration.inputs)
     settings = msgspec.structs.replace(dvl.settings, calibration=source)
     return replace(dvl, settings=settings, prior=prior)
 
@@ -311,6 +312,7 @@ def _calibration_of(prior: JointPrior, trial: Trial) -> Calibration:
         cost=np.nan,
         estimates=tuple(estimates),
         covariance=prior.covariance,
+        inputs=prior.inputs,
     )
 
 

@@ -194,6 +194,7 @@ def _summary(
         trial=trial.name,
         solver="kalman-star",
         body_axes=trial.body_axes,
+        inputs=trial.inputs,
         converged=True,
         iterations=1,
         cost=0.5 * float(np.sum((first.residual / first.sigma) ** 2)),

@@ -68,6 +68,7 @@ def summarise(
         trial=trial.name,
         solver=solver,
         body_axes=trial.body_axes,
+        inputs=trial.inputs,
         converged=outcome.converged,
         iterations=outcome.iterations,
         cost=0.5 * float(np.nansum((measured.residual / measured.sigma) ** 2)),

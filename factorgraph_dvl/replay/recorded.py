@@ -229,6 +229,7 @@ def _solution(trial: Trial, run: Replay, tape: _Tape) -> Solution:
         trial=trial.name,
         solver="replay",
         body_axes=trial.body_axes,
+        inputs=trial.inputs,
         converged=run.started and not tape.last.doubted,
         iterations=tape.count,
         cost=cost,

@@ -70,6 +70,7 @@ class JointPrior:
     source : name of the file, for messages.
     values : (n,) by reported name, in reported units.
     covariance : (N, N) of all their components, in the order of `values`, in reported units.
+    inputs : fingerprints of the data that it came from.
 
     Raises
     ------
@@ -80,6 +81,7 @@ class JointPrior:
     source: str
     values: Mapping[str, Array]
     covariance: Array
+    inputs: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         for name, value in self.values.items():

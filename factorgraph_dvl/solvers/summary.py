@@ -74,6 +74,7 @@ def summarise(
         trial=trial.name,
         solver="batch",
         body_axes=trial.body_axes,
+        inputs=trial.inputs,
         converged=minimum.converged,
         iterations=minimum.iterations,
         cost=evaluation.cost,
