@@ -69,14 +69,20 @@ def fill_lost(
     )
 
 
-def unrounded(time: Array) -> Array:
+def unrounded(time: Array, number: Array | None = None) -> Array:
     """Return times since the first, regular where only rounding makes them irregular.
 
     At 128 Hz a stamp in milliseconds is wrong by up to 6 % of the interval, and in a roll
     of 50 deg/s a mean over the wrong interval by 0.02 deg. Times that a straight line fits
     to within the last decimal (or the last bit) that they are written with lie on it.
+
+    Parameters
+    ----------
+    time : (N,) s.
+    number : (N,) of the samples, lost ones counted; None = none was lost.
     """
-    count = np.arange(time.size) - 0.5 * (time.size - 1)
+    count = np.arange(time.size) if number is None else number
+    count = count - count.mean()
     since = time - time[0]
     slope = float(count @ since) / float(count @ count)
     line = since.mean() + slope * count

@@ -18,13 +18,19 @@ from factorgraph_dvl.errors import ConfigError
 from factorgraph_dvl.increments import increments
 from factorgraph_dvl.preintegration import States, attach, one_segment, segments
 from factorgraph_dvl.replay.estimate import Innovations
-from factorgraph_dvl.replay.factor import NodeMeasurements, Rows, measurement_factor
+from factorgraph_dvl.replay.factor import (
+    Linearized,
+    NodeMeasurements,
+    Rows,
+    measurement_factor,
+)
 from factorgraph_dvl.replay.gate import Gate
 from factorgraph_dvl.replay.samples import Samples
 from factorgraph_dvl.replay.silence import Silence
 from factorgraph_dvl.replay.smoother import Smoother
 from factorgraph_dvl.report.convergence_figures import convergence_figure
 from factorgraph_dvl.sensors.dvl import Dvl, DvlSettings, DvlVelocity
+from factorgraph_dvl.sensors.imu import ImuSettings
 from factorgraph_dvl.sensors.protocol import joined, rows_of
 from factorgraph_dvl.simulation import simulate
 from factorgraph_dvl.solution import Estimate
@@ -39,6 +45,13 @@ FREE = {
     },
     "gnss": {"lever_arm_std_m": [0.1, 0.1, 0.1]},
 }
+
+NOISE = ImuSettings(
+    gyro_noise_deg_sqrt_h=0.001,
+    gyro_bias_std_deg_h=0.1,
+    accel_noise_ug_sqrt_hz=20,
+    accel_bias_std_ug=100,
+)
 
 
 def node_measurements(time=20.0, **changes):
@@ -145,6 +158,28 @@ def test_the_factor_linearises_as_differences_do():
     scale = np.maximum(np.abs(numerical).max(axis=0), 1.0)
     # What transitions leave out: second order in the Earth's rate, 1e-4 of the bias's share.
     assert np.abs((A - numerical) / scale).max() < 2e-4
+
+
+def test_what_was_computed_elsewhere_is_not_taken():
+    """A range is not linear in the position, nor a velocity in the accelerometer's bias."""
+    measured, states, values = node_measurements(trial=FREE)
+    residual, jacobian, _ = measured.linearize(states, values)
+    computed = Linearized(states, values, residual + 100.0, jacobian)
+
+    def is_taken(states, values):
+        factor = factor_of(measured, computed)
+        at = gtsam_values(measured, states, values)
+        return bool(np.abs(factor.linearize(at).jacobian()[1]).max() > 50.0)
+
+    assert is_taken(states, values)
+    step = 1e-3
+    for name in ("p_n", "v_n", "gyro_bias", "accel_bias"):
+        assert not is_taken(replace(states, **{name: getattr(states, name) + step}), values), name
+    turned = replace(states, nRb=states.nRb @ exp_so3(np.full((1, 3), step)))
+    assert not is_taken(turned, values)
+    for p in measured.parameters:
+        if not p.rotation:
+            assert not is_taken(states, values | {p.name: values[p.name] + step}), p.name
 
 
 def test_a_stationary_vessel_reports_the_velocity_of_its_lever_arm():
@@ -352,9 +387,31 @@ def test_a_gap_ends_a_segment():
     gap = samples.gap_after(4.0)
     assert gap is not None
     assert (gap.before, gap.after) == pytest.approx((4.99, 6.01))
-    seg = samples.segment(4.8, 5.0)
+    seg = samples.segment_after(4.8, 0.2, np.inf, end=False)
     np.testing.assert_allclose(seg.node_time, [4.8, 4.99])
-    assert samples.segment(4.99, 5.2) is None
+    assert samples.segment_after(4.99, 0.2, np.inf, end=False) == gap
+
+
+@pytest.mark.parametrize("rate", [10.0, 73.1, 100.0, 128.0])
+@pytest.mark.parametrize("interval", [0.1, 0.2, 1.0])
+@pytest.mark.parametrize("decimals", [3, 6, 12])
+def test_every_segment_ends_after_its_start(rate, interval, decimals):
+    # Half-way between two samples, by a fast clock, and where attitudes want their own states.
+    time = np.round((np.arange(1, round(20 * rate)) + 0.5) / rate * (1.0 + 25e-6), decimals)
+    for wanted in (0.0, 0.07):
+        samples = Samples(NOISE)
+        samples.add(table(time))
+        begin = now = float(time[40])
+        states = 0
+        while seg := samples.segment_after(now, interval, now + wanted, end=True):
+            assert seg.node_time[1] > now
+            assert seg.node_time[1] < now + interval + 1.6 / rate
+            # Line by line the same clock.
+            assert abs(seg.node_time[0] - now) < 1e-4
+            now, states = float(seg.node_time[1]), states + 1
+        assert now == pytest.approx(time[-1], abs=1e-3)
+        if not wanted:
+            assert states <= (now - begin) / interval + 2.0
 
 
 def test_the_gate_shuts_and_opens():

@@ -135,6 +135,30 @@ class NodeMeasurements:
         )
 
 
+@dataclass(frozen=True)
+class Linearized:
+    """Residual (R,) and Jacobian (R, 15 + n) of measurements, and where they were computed.
+
+    Parameters
+    ----------
+    states, values : of the node and the parameters.
+    residual, jacobian : as `NodeMeasurements.linearize` returns them.
+    """
+
+    states: States
+    values: Mapping[str, Array]
+    residual: Array
+    jacobian: Array
+
+    def is_at(self, states: States, values: Mapping[str, Array]) -> bool:
+        """Whether it was computed at these very states and values."""
+        same = all(
+            np.array_equal(getattr(self.states, f.name), getattr(states, f.name))
+            for f in fields(States)
+        )
+        return same and all(np.array_equal(self.values[name], v) for name, v in values.items())
+
+
 class _Window:
     """A slice of a transition: what `node_jacobian` asks for, of some times only."""
 
@@ -152,7 +176,7 @@ def measurement_factor(
     node_key: int,
     bias_key: int,
     parameter_keys: Sequence[int],
-    first: tuple[States, Array, Array] | None = None,
+    first: Linearized | None = None,
 ) -> gtsam.CustomFactor:
     """Return the factor of what was measured after a node; zero error where it is predicted.
 
@@ -164,7 +188,7 @@ def measurement_factor(
     measured : rows R in all.
     weight : (R,) inverse standard deviations; 0 = not used.
     node_key, bias_key, parameter_keys : of the variables, parameters as in `measured`.
-    first : states at which GTSAM will linearise first, and residual and Jacobian there.
+    first : where GTSAM will linearise first.
     """
     kept = [first] if first is not None else []
     every = [node_key, bias_key, *parameter_keys]
@@ -182,7 +206,11 @@ def measurement_factor(
         }
         if jacobians is None:
             return weight * measured.residuals(states, values)
-        residual, matrix = _kept_at(kept, states) or measured.linearize(states, values)[:2]
+        once = kept.pop() if kept else None
+        if once is not None and once.is_at(states, values):
+            residual, matrix = once.residual, once.jacobian
+        else:
+            residual, matrix, _ = measured.linearize(states, values)
         if matrix.shape != (rows, edges[-1]) or len(jacobians) != len(sizes):
             raise ValueError(f"Jacobian of shape {matrix.shape}, expected {(rows, edges[-1])}")
         matrix = matrix * weight[:, None]
@@ -191,21 +219,6 @@ def measurement_factor(
         return weight * residual
 
     return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(rows), every, error)
-
-
-def _kept_at(
-    kept: list[tuple[States, Array, Array]], states: States
-) -> tuple[Array, Array] | None:
-    """Return, once, residual and Jacobian if they were computed at these very states."""
-    if not kept:
-        return None
-    at, residual, matrix = kept.pop()
-    same = (
-        np.array_equal(at.nRb, states.nRb)
-        and np.array_equal(at.v_n, states.v_n)
-        and np.array_equal(at.gyro_bias, states.gyro_bias)
-    )
-    return (residual, matrix) if same else None
 
 
 def state_of(state: gtsam.NavState, bias: gtsam.imuBias.ConstantBias) -> States:

@@ -18,7 +18,13 @@ from factorgraph_dvl.preintegration import (
 )
 from factorgraph_dvl.priors import Known, away, prior_root
 from factorgraph_dvl.replay.estimate import Calibration, Innovations, calibration_of, trajectory_of
-from factorgraph_dvl.replay.factor import NodeMeasurements, Rows, measurement_factor, state_of
+from factorgraph_dvl.replay.factor import (
+    Linearized,
+    NodeMeasurements,
+    Rows,
+    measurement_factor,
+    state_of,
+)
 from factorgraph_dvl.replay.gate import Gate
 from factorgraph_dvl.replay.smoother import Smoother
 from factorgraph_dvl.replay.start import Start
@@ -287,7 +293,7 @@ class Navigator:
             # Where GTSAM will linearise: so it is done once.
             states = state_of(*self._linear)
             residual, matrix, motions = measured.linearize(states, self._begun)
-            first = (states, residual, matrix)
+            first = Linearized(states, self._begun, residual, matrix)
             residual = residual + matrix @ self._away()[self._columns(parameters)]
         else:
             residual, matrix, motions = measured.linearize(states, self._values)

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from factorgraph_dvl.clock import unrounded
 from factorgraph_dvl.conventions import Array
 from factorgraph_dvl.increments import MAX_FILLED, increments
 from factorgraph_dvl.preintegration import Segments, one_segment
@@ -16,6 +17,9 @@ _SIDE = 8
 # Samples in a row that are older than those before, from which on the clock has jumped.
 _JUMPED = 20
 _LEAST = 6
+# Samples whose stamps tell the rate of the clock: stamps in milliseconds leave 1e-6 of it
+# open, where those of a single segment leave 4e-3.
+_CLOCK = 2000
 # Times closer than this, s, are the same.
 _SAME_TIME = 1e-6
 
@@ -118,38 +122,73 @@ class Samples:
         if self.dt == 0.0:
             return None
         t = self._table[:, 0]
-        wide = np.flatnonzero((np.diff(t) > (MAX_FILLED + 1.5) * self.dt) & (t[1:] > time))
+        wide = np.flatnonzero(self._wide(t) & (t > time))
         if wide.size == 0:
             return None
-        return Gap(float(t[wide[0]]), float(t[wide[0] + 1]))
+        return Gap(float(t[wide[0] - 1]), float(t[wide[0]]))
 
-    def segment(self, start: float, end: float) -> Segments | None:
-        """Return the segment between the samples nearest to two times, None if it is empty."""
+    def segment_after(
+        self, start: float, interval: float, wanted: float, *, end: bool
+    ) -> Segments | Gap | None:
+        """Return the segment from the sample nearest to a time to a later one.
+
+        Sample times t fall into cells, floor((t + dt / 2) / interval). A segment ends at the
+        first sample of a later cell than its start's, so it always ends after it: the same
+        rounding decides where it starts and where it ends.
+
+        Parameters
+        ----------
+        start : s.
+        interval : of the segments, s.
+        wanted : time, s, before which the segment ends if it is in it.
+        end : whether no more samples come.
+
+        Returns
+        -------
+        The segment; the gap that follows the start at once; None if the samples have not come
+        so far.
+        """
         t = self._table[:, 0]
         gap = self.gap_after(start)
         count = t.size if gap is None else int(np.searchsorted(t, gap.before, side="right"))
+        complete = end or gap is not None
         a = int(np.argmin(np.abs(t[:count] - start)))
-        b = int(np.argmin(np.abs(t[:count] - end)))
-        if b <= a:
+        if a + 1 >= count:
+            return gap
+        cell = np.floor((t[a:count] + 0.5 * self.dt) / interval)
+        later = np.flatnonzero(cell > cell[0])
+        if later.size == 0 and not complete:
             return None
-        low, high = max(a - self.side, 0), min(b + self.side + 1, count)
+        b = a + int(later[0]) if later.size else count - 1
+        before = int(np.searchsorted(t, wanted + _SAME_TIME, side="right")) - 1
+        if a < before < b:
+            b = before
+        if not complete and b + self.side >= count:
+            return None
+        begin = int(np.max(np.flatnonzero(self._wide(t[: a + 1])), initial=0))
+        low, high = max(a - self.side, begin), min(b + self.side + 1, count)
         if high - low < _LEAST:
-            return None
+            return gap
+        time = self._regular(t[begin:high])[low - begin :]
         part = self._table[low:high]
-        imu = Imu(self._settings, part[:, 0], part[:, 1:4], part[:, 4:7])
+        imu = Imu(self._settings, time, part[:, 1:4], part[:, 4:7])
         inc, _ = increments(imu, self.windows)
-        first = int(np.argmin(np.abs(inc.start - t[a])))
-        last = int(np.argmin(np.abs(inc.end - t[b]))) + 1
+        first = int(np.argmin(np.abs(inc.start - time[a - low])))
+        last = int(np.argmin(np.abs(inc.end - time[b - low]))) + 1
         return one_segment(inc, first, last)
 
-    def until(self, time: float) -> float:
-        """Return the time of the newest sample at or before a time, s."""
-        i = int(np.searchsorted(self._table[:, 0], time + _SAME_TIME, side="right"))
-        return float(self._table[i - 1, 0])
+    def _wide(self, time: Array) -> np.ndarray:
+        """Whether a gap is before each of some samples."""
+        return np.diff(time, prepend=time[:1]) > (MAX_FILLED + 1.5) * self.dt
+
+    def _regular(self, time: Array) -> Array:
+        """Return stamps without gaps as `increments` takes those of a whole record."""
+        steps = np.rint(np.diff(time, prepend=time[:1]) / self.dt)
+        return np.asarray(time[0] + unrounded(time, np.cumsum(np.maximum(steps, 1.0))))
 
     def forget(self, time: float) -> None:
         """Drop what no segment that starts at `time` or later needs."""
-        first = int(np.searchsorted(self._table[:, 0], time)) - self.side - 1
+        first = int(np.searchsorted(self._table[:, 0], time)) - max(_CLOCK, self.side + 1)
         if first > 0:
             self._table = self._table[first:]
 

@@ -216,15 +216,11 @@ class Replay:
                 out.append(self._update(began, solved=True, end=end))
                 continue
             now = self._navigator.time
-            target = self._next(now)
-            if not end and self._samples.newest < target + self._samples.delay:
-                break
-            seg = self._samples.segment(now, min(target, self._samples.newest))
+            seg = self._samples.segment_after(now, self._interval, self._wanted(now), end=end)
             if seg is None:
-                gap = self._samples.gap_after(now)
-                if gap is None:
-                    break
-                self._break(gap)
+                break
+            if isinstance(seg, Gap):
+                self._break(seg)
                 continue
             until = float(seg.node_time[1])
             if end and until > self._samples.newest - 0.5 * self._samples.dt:
@@ -264,16 +260,12 @@ class Replay:
         self._samples.forget(gap.after)
         self._navigator = None
 
-    def _next(self, now: float) -> float:
-        """Return the time of the next state: a multiple of the interval, or an attitude's."""
+    def _wanted(self, now: float) -> float:
+        """Return the time of the next attitude that needs a state of its own, s."""
         assert self._navigator is not None
-        dt = self._samples.dt
-        out = float((np.floor((now + 0.5 * dt) / self._interval) + 1.0) * self._interval)
-        for section in self._navigator.start.own_states:
-            wanted = self._waiting.first_after(section, now + CLOSEST)
-            if wanted < out:
-                out = self._samples.until(wanted)
-        return out
+        after = now + CLOSEST
+        wanted = (self._waiting.first_after(s, after) for s in self._navigator.start.own_states)
+        return min(wanted, default=np.inf)
 
     def _start(self, *, end: bool) -> bool:
         """Solve what was collected, if it is time to; return whether there is a start."""

@@ -1,0 +1,49 @@
+"""The replay against the batch solver at odd rates, phases and clocks.
+
+    pytest -m slow tests/test_replay_clocks.py
+
+runs all 40 trials in two processes.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from clocks import COUNT, odd_trial
+from workers import in_two_processes
+
+from factorgraph_dvl import solve
+from factorgraph_dvl.replay import replay
+
+# In standard deviations.
+_SAME = 0.2
+# Samples half-way between states; by a clock that is fast, in milliseconds; at a free rate.
+FEW = (0, 4, 6)
+
+
+def compared(seed, rate=5.0):
+    """Return time from the last state to the end in samples, and the largest difference in σ."""
+    trial = odd_trial(seed)
+    batch = solve(trial)
+    solution, record = replay(trial, rate_hz=rate)
+    assert batch.converged
+    assert solution.converged
+    a, b = (np.concatenate([e.value for e in s.estimates]) for s in (solution, batch))
+    apart = np.abs(a - b) / np.sqrt(np.diag(batch.covariance))
+    end = trial.imu.time[-1]
+    short = (end - record.time[-1]) / np.median(np.diff(trial.imu.time))
+    return short, apart.max()
+
+
+@pytest.mark.parametrize("seed", FEW)
+def test_a_replay_ends_as_the_batch_does(seed):
+    short, apart = compared(seed, 2.5)
+    assert abs(short) < 0.5
+    assert apart < _SAME
+
+
+@pytest.mark.slow
+def test_all_replays_end_as_the_batch_does():
+    short, apart = np.transpose(in_two_processes(compared, range(COUNT)))
+    assert np.abs(short).max() < 0.5
+    assert apart.max() < _SAME, apart
