@@ -22,7 +22,7 @@ FEW = (0, 4, 6)
 
 
 def compared(seed, rate=5.0):
-    """Return time from the last state to the end in samples, and the largest difference in σ."""
+    """Return samples from the last state to the end, and the largest difference in σ."""
     trial = odd_trial(seed)
     batch = solve(trial)
     solution, record = replay(trial, rate_hz=rate)
@@ -30,6 +30,7 @@ def compared(seed, rate=5.0):
     assert solution.converged
     a, b = (np.concatenate([e.value for e in s.estimates]) for s in (solution, batch))
     apart = np.abs(a - b) / np.sqrt(np.diag(batch.covariance))
+    np.testing.assert_array_equal(solution.trajectory.time, batch.trajectory.time)
     end = trial.imu.time[-1]
     short = (end - record.time[-1]) / np.median(np.diff(trial.imu.time))
     return short, apart.max()

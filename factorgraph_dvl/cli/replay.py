@@ -124,6 +124,8 @@ def replay(
     print_written(out)
     if not solution.converged:
         text = "error: measurements disagree with the prediction at the end; see the warnings"
+        if not record.doubted[-1]:
+            text = "error: the replay did not reach the end of the record; see the warnings"
         stderr().print(Text(text, "red"), soft_wrap=True)
     if errors:
         print_contradiction()

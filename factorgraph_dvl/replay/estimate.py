@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 
@@ -70,8 +70,9 @@ class Update:
     time : of the newest state, s.
     latency : time that the update took, s.
     state : the newest state, as a trajectory of one epoch.
+    trajectory : at the epochs of a batch solution since the update before.
     calibration : with its joint covariance.
-    smoothed : states that more data have made better, None if there are none this time.
+    smoothed : epochs that more data have made better, None if there are none this time.
     innovations : what was measured against what was predicted.
     messages : for the user.
     solved : whether the update includes a solution of all that was collected.
@@ -82,12 +83,20 @@ class Update:
     time: float
     latency: float
     state: Trajectory
+    trajectory: Trajectory
     calibration: Calibration
     smoothed: Trajectory | None
     innovations: tuple[Innovations, ...]
     messages: tuple[str, ...]
     solved: bool
     doubted: tuple[str, ...]
+
+
+def concatenated(parts: Sequence[Trajectory]) -> Trajectory:
+    """Return trajectories one after another."""
+    return Trajectory(
+        *(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Trajectory))
+    )
 
 
 def trajectory_of(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import fields
 
 import gtsam
 import numpy as np
@@ -17,7 +18,13 @@ from factorgraph_dvl.preintegration import (
     preintegrate,
 )
 from factorgraph_dvl.priors import Known, away, prior_root
-from factorgraph_dvl.replay.estimate import Calibration, Innovations, calibration_of, trajectory_of
+from factorgraph_dvl.replay.estimate import (
+    Calibration,
+    Innovations,
+    calibration_of,
+    concatenated,
+    trajectory_of,
+)
 from factorgraph_dvl.replay.factor import (
     Linearized,
     NodeMeasurements,
@@ -32,6 +39,7 @@ from factorgraph_dvl.sensors.imu import Imu
 from factorgraph_dvl.sensors.protocol import Aid, Motion, Parameter
 from factorgraph_dvl.solution import Trajectory
 from factorgraph_dvl.solvers.feigned import directions_not_told, feigned_by
+from factorgraph_dvl.solvers.summary import TRAJECTORY_RATE, epochs_between, trajectory_between
 
 # Distance, m, up to which gravity is taken as linear: to 3e-9 m/s².
 _NEAR = 100.0
@@ -167,6 +175,7 @@ class Navigator:
         s.extend(float(seg.node_time[1]), factors, values)
         if self._linear is not None:
             self._linear = (predicted, bias if self.start.walking else self._linear[1])
+        self._before = self._P[:_STATE, :_STATE]
         since = max(s.times[s.oldest], self.time - self._memory)
         while self._segments:
             old = next(iter(self._segments))
@@ -222,10 +231,27 @@ class Navigator:
         return self._trajectory([self.smoother.node], self._P[None, :_STATE, :_STATE], body_axes)
 
     def smoothed(self, first: int, last: int, body_axes: BodyAxes) -> Trajectory:
-        """Return states from index `first` to before `last`, given all that came since."""
-        wanted = [k for k in self.smoother.times if first <= k < last]
-        P = self.smoother.state_covariances(wanted)
-        return self._trajectory(wanted, np.stack([P[k] for k in wanted]), body_axes)
+        """Return the motion from state `first` to state `last`, given all that came since."""
+        wanted = [k for k in self._segments if first <= k < last]
+        P = self.smoother.state_covariances([*wanted, last])
+        parts = [self._between(k, np.stack([P[k], P[k + 1]]), body_axes) for k in wanted]
+        return concatenated(parts)
+
+    def passed(self, body_axes: BodyAxes) -> Trajectory:
+        """Return the motion from the state before the newest to the newest."""
+        P = np.stack([self._before, self._P[:_STATE, :_STATE]])
+        return self._between(self.smoother.node - 1, P, body_axes)
+
+    def _between(self, k: int, P: Array, body_axes: BodyAxes) -> Trajectory:
+        """Return the motion from state k to the next at the epochs of a batch solution."""
+        s = self.smoother
+        seg, gravity = self._segments[k]
+        time = epochs_between(s.times[k], s.times[k + 1], TRAJECTORY_RATE)
+        pair = [state_of(s.state(i), s.bias(i)) for i in (k, k + 1)]
+        states = States(
+            *(np.concatenate([getattr(x, f.name) for x in pair]) for f in fields(States))
+        )
+        return trajectory_between(seg, states, P, gravity, self.start.frame, body_axes, time)
 
     def _trajectory(self, nodes: Sequence[int], P: Array, body_axes: BodyAxes) -> Trajectory:
         found = [self.smoother.state(k) for k in nodes]

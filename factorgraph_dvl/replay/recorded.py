@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from array import array
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
@@ -12,7 +12,8 @@ import numpy as np
 from factorgraph_dvl.clock import without_strays
 from factorgraph_dvl.conventions import Array
 from factorgraph_dvl.errors import SolveError
-from factorgraph_dvl.replay.estimate import Innovations, Update
+from factorgraph_dvl.replay.estimate import Innovations, Update, concatenated
+from factorgraph_dvl.replay.samples import LEAST
 from factorgraph_dvl.replay.session import LAG, RATE, Kind, Replay
 from factorgraph_dvl.sensors.protocol import rows_of
 from factorgraph_dvl.solution import Residuals, Solution, Trajectory, doubts
@@ -32,7 +33,7 @@ class Record:
     doubted : (H,) whether some measurements disagreed with the prediction.
     names : of the n calibration components, as in `covariance.order`.
     values, std : (H, n) in reported units; nan before the component was estimated.
-    smoothed : states that later data made better.
+    smoothed : epochs of the trajectory that later data made better.
     messages : time, s, and text.
     delay : by which estimates are behind the IMU, s.
     """
@@ -123,7 +124,7 @@ class _Tape:
         self.last: Update | None = None
         # By what was estimated, which grows when a sensor is heard for the first time.
         self._numbers: list[tuple[tuple[str, ...], array[float]]] = []
-        self._states: list[Trajectory] = []
+        self._trajectory: list[Trajectory] = []
         self._smoothed: list[Trajectory] = []
         self._innovations: dict[str, list[Innovations]] = {}
         self.messages: list[tuple[float, str]] = []
@@ -140,7 +141,7 @@ class _Tape:
         std = np.concatenate([e.std for e in estimates])
         head = [update.time, update.latency, float(update.solved), float(bool(update.doubted))]
         self._numbers[-1][1].extend([*head, *values, *std])
-        self._states.append(update.state)
+        self._trajectory.append(update.trajectory)
         if update.smoothed is not None:
             self._smoothed.append(update.smoothed)
         for i in update.innovations:
@@ -148,7 +149,7 @@ class _Tape:
         self.messages += [(update.time, text) for text in update.messages]
 
     def trajectory(self) -> Trajectory:
-        return _joined(self._states)
+        return concatenated(self._trajectory)
 
     def residuals(self) -> tuple[Residuals, ...]:
         return tuple(
@@ -176,7 +177,9 @@ class _Tape:
             names=names,
             values=table[:, 4 : 4 + n],
             std=table[:, 4 + n :],
-            smoothed=_joined(self._smoothed) if self._smoothed else rows_of(self.last.state, []),
+            smoothed=concatenated(self._smoothed)
+            if self._smoothed
+            else rows_of(self.last.state, []),
             messages=tuple(self.messages),
             delay=run.delay,
         )
@@ -196,18 +199,17 @@ def _columns(numbers: Array, there: tuple[str, ...], names: tuple[str, ...]) -> 
     return out
 
 
-def _joined(parts: list[Trajectory]) -> Trajectory:
-    return Trajectory(
-        *(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Trajectory))
-    )
-
-
 def _solution(trial: Trial, run: Replay, tape: _Tape) -> Solution:
     assert tape.last is not None
     calibration = tape.last.calibration
     residuals = tape.residuals()
     warnings = [*trial.notes, *(f"{time:.1f} s: {text}" for time, text in tape.messages)]
     warnings += [f"at the end: {text}" for text in run.messages]
+    if run.unused:
+        warnings.append(
+            f"the replay ended at {tape.last.time:.3f} s: {run.unused} samples of the IMU follow, "
+            "and were not used with what was measured then"
+        )
     warnings += run.counts()
     warnings += doubts(calibration.estimates, residuals)
     for e in calibration.estimates:
@@ -230,7 +232,7 @@ def _solution(trial: Trial, run: Replay, tape: _Tape) -> Solution:
         solver="replay",
         body_axes=trial.body_axes,
         inputs=trial.inputs,
-        converged=run.started and not tape.last.doubted,
+        converged=run.unused < LEAST and not tape.last.doubted,
         iterations=tape.count,
         cost=cost,
         estimates=calibration.estimates,

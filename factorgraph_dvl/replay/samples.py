@@ -16,7 +16,8 @@ from factorgraph_dvl.sensors.imu import Imu, ImuSettings
 _SIDE = 8
 # Samples in a row that are older than those before, from which on the clock has jumped.
 _JUMPED = 20
-_LEAST = 6
+# Fewer samples than these cannot be integrated.
+LEAST = 6
 # Samples whose stamps tell the rate of the clock: stamps in milliseconds leave 1e-6 of it
 # open, where those of a single segment leave 4e-3.
 _CLOCK = 2000
@@ -48,6 +49,7 @@ class Samples:
         self.windows: tuple[int, int] = (0, 0)
         self.refused = 0
         self.duplicates = 0
+        self.interpolated = 0
 
     @property
     def newest(self) -> float:
@@ -167,7 +169,7 @@ class Samples:
             return None
         begin = int(np.max(np.flatnonzero(self._wide(t[: a + 1])), initial=0))
         low, high = max(a - self.side, begin), min(b + self.side + 1, count)
-        if high - low < _LEAST:
+        if high - low < LEAST:
             return gap
         time = self._regular(t[begin:high])[low - begin :]
         part = self._table[low:high]
@@ -175,6 +177,7 @@ class Samples:
         inc, _ = increments(imu, self.windows)
         first = int(np.argmin(np.abs(inc.start - time[a - low])))
         last = int(np.argmin(np.abs(inc.end - time[b - low]))) + 1
+        self.interpolated += last - first - (b - a)
         return one_segment(inc, first, last)
 
     def _wide(self, time: Array) -> np.ndarray:

@@ -108,6 +108,9 @@ class Replay:
         self._smoothed_to = 0
         self._messages: list[str] = []
         self._why_not = ""
+        # Notes that the user has seen.
+        self._noted = set(known.notes)
+        self._newest_state = -np.inf
         self._too_late: dict[str, int] = {}
         self._deferred: dict[str, int] = {}
 
@@ -131,6 +134,11 @@ class Replay:
         """Messages that no update has carried yet."""
         return tuple(self._messages)
 
+    @property
+    def unused(self) -> int:
+        """Number of the IMU's samples after the newest state."""
+        return self._samples.since(self._newest_state + 0.5 * self._samples.dt).shape[0]
+
     def counts(self) -> list[str]:
         """Say how many measurements were not used, and why."""
         why = (
@@ -149,6 +157,11 @@ class Replay:
         ]
         if self._samples.refused:
             out.append(f"IMU: {self._samples.refused} samples were out of order or not numbers")
+        if self._samples.interpolated:
+            out.append(
+                f"IMU: {self._samples.interpolated} samples that were lost after the start were "
+                "interpolated"
+            )
         return out
 
     def add_imu(self, time: ArrayLike, gyro: ArrayLike, accel: ArrayLike) -> list[Update]:
@@ -213,7 +226,7 @@ class Replay:
                     if self._attempt != before and arrived >= self._attempt:
                         continue
                     break
-                out.append(self._update(began, solved=True, end=end))
+                out.append(self._update(began, None, True, end=end))
                 continue
             now = self._navigator.time
             seg = self._samples.segment_after(now, self._interval, self._wanted(now), end=end)
@@ -232,7 +245,8 @@ class Replay:
                 for i in self._navigator.innovations:
                     self._collected.refuse(i.label, i.time[~i.used])
             self._samples.forget(self._navigator.time)
-            out.append(self._update(began, solved=self._again(), end=end))
+            passed = self._navigator.passed(self._known.body_axes)
+            out.append(self._update(began, passed, self._again(), end=end))
         if end and out and self._navigator is not None:
             out[-1] = replace(out[-1], smoothed=self._smooth(-1.0))
         return out
@@ -333,7 +347,9 @@ class Replay:
         self._navigator = Navigator(start, self._known.imu, self._gate, lag=lag, memory=self._lag)
         self._samples.windows = start.windows
         self._solve_again = self._collected.start + _GROWTH * (until - self._collected.start)
-        self._smoothed_to = start.node + 1
+        self._smoothed_to = start.node
+        self._messages += [note for note in start.notes if note not in self._noted]
+        self._noted.update(start.notes)
         return True
 
     def _without_refused(self, until: float, start: Start | str) -> Start | str:
@@ -359,7 +375,8 @@ class Replay:
         except DataError:
             return "no position has been measured since" if self._gap else "no position yet"
         try:
-            return begin(trial, self._prior, self._interval, self._progress)
+            since = np.inf if self._navigator is not None else self._newest_state
+            return begin(trial, self._prior, self._interval, since, self._progress)
         except FactorgraphDvlError as error:
             return str(error)
 
@@ -469,12 +486,16 @@ class Replay:
         anywhere = LocalFrame(0.0, 0.0, 0.0, self._known.epoch)
         return not record.missing.all() or bool(record.observations(anywhere))
 
-    def _update(self, began: float, *, solved: bool, end: bool) -> Update:
+    def _update(
+        self, began: float, passed: Trajectory | None, solved: bool, *, end: bool
+    ) -> Update:
+        """Return what is known now; `passed` since the update before, None = at a start."""
         nav = self._navigator
         assert nav is not None
         axes = self._known.body_axes
         smoothed = None
         s = nav.smoother
+        self._newest_state = nav.time
         late = s.times.get(self._smoothed_to)
         if late is not None and not end and nav.time - late > self._lag - 2.0 * self._interval:
             smoothed = self._smooth(0.5 * self._lag)
@@ -487,6 +508,7 @@ class Replay:
             time=nav.time,
             latency=perf_counter() - began,
             state=state,
+            trajectory=nav.start.trajectory if passed is None else passed,
             calibration=calibration,
             smoothed=smoothed,
             innovations=innovations,
@@ -496,13 +518,13 @@ class Replay:
         )
 
     def _smooth(self, age: float) -> Trajectory | None:
-        """Return the states older than an age, s, that were not returned before."""
+        """Return the motion before an age, s, that was not returned before."""
         nav = self._navigator
         assert nav is not None
         s = nav.smoother
-        after = next((k for k, t in s.times.items() if t > nav.time - age), s.node + 1)
-        if after <= self._smoothed_to:
+        last = next((k for k, t in s.times.items() if t > nav.time - age), s.node + 1) - 1
+        if last <= self._smoothed_to:
             return None
-        out = nav.smoothed(self._smoothed_to, after, self._known.body_axes)
-        self._smoothed_to = after
+        out = nav.smoothed(self._smoothed_to, last, self._known.body_axes)
+        self._smoothed_to = last
         return out

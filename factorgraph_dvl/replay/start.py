@@ -11,8 +11,10 @@ from factorgraph_dvl import keys
 from factorgraph_dvl.conventions import DEG, Array
 from factorgraph_dvl.earth import LocalFrame
 from factorgraph_dvl.graph import Evaluation, Problem
+from factorgraph_dvl.preintegration import States
 from factorgraph_dvl.priors import Known
 from factorgraph_dvl.sensors.protocol import AttitudeAid, Parameter
+from factorgraph_dvl.solution import Trajectory
 from factorgraph_dvl.solvers.batch import fit
 from factorgraph_dvl.solvers.covariance import posterior
 from factorgraph_dvl.solvers.feigned import (
@@ -20,6 +22,11 @@ from factorgraph_dvl.solvers.feigned import (
 )
 from factorgraph_dvl.solvers.levenberg_marquardt import Progress
 from factorgraph_dvl.solvers.state_times import STATE_INTERVAL, needs_states
+from factorgraph_dvl.solvers.summary import (
+    EPOCH_ROUNDING,
+    TRAJECTORY_RATE,
+    trajectory_between,
+)
 from factorgraph_dvl.trial import Trial
 
 # Standard deviation of the attitude up to which the equations may be linearised in it.
@@ -47,6 +54,7 @@ class Start:
     feigned : (P, P) information on the parameters that only noise makes, in units of the
         priors' standard deviations.
     walking : whether biases walk.
+    trajectory : of what was collected, as `begin` was asked for it.
     notes : for the user.
     misfit : largest root mean square of a kind of residuals over their standard deviations.
     """
@@ -65,11 +73,14 @@ class Start:
     windows: tuple[int, int]
     feigned: Array
     walking: bool
+    trajectory: Trajectory
     notes: tuple[str, ...]
     misfit: float
 
 
-def begin(trial: Trial, known: Known | None, interval: float, progress: Progress) -> Start | str:
+def begin(
+    trial: Trial, known: Known | None, interval: float, since: float, progress: Progress
+) -> Start | str:
     """Solve what was collected, and condense it to its last state.
 
     Parameters
@@ -77,6 +88,7 @@ def begin(trial: Trial, known: Known | None, interval: float, progress: Progress
     trial : what was collected.
     known : of biases and calibration from before, in place of the trial's priors.
     interval : of the states to come, s.
+    since : time, s, after which the trajectory is wanted.
     progress : called with stage, iteration and cost.
 
     Returns
@@ -140,8 +152,18 @@ def begin(trial: Trial, known: Known | None, interval: float, progress: Progress
         windows=problem.chain.segments.increments.chosen_windows,
         feigned=feigned,
         walking=problem.chain.walking,
+        trajectory=_trajectory(problem, evaluation.states, covariances.nodes, since),
         notes=notes,
         misfit=_misfit(problem, evaluation),
+    )
+
+
+def _trajectory(problem: Problem, states: States, P: Array, since: float) -> Trajectory:
+    chain = problem.chain
+    time = chain.segments.increments.ticks(TRAJECTORY_RATE)
+    time = time[time * TRAJECTORY_RATE > since * TRAJECTORY_RATE + EPOCH_ROUNDING]
+    return trajectory_between(
+        chain.segments, states, P, chain.gravity_n, chain.frame, chain.trial.body_axes, time
     )
 
 

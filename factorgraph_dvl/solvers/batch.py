@@ -28,7 +28,7 @@ from factorgraph_dvl.solvers.covariance import Posterior, changes_with, consider
 from factorgraph_dvl.solvers.feigned import at_prior_along, parameter_information, told_of
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, Progress, minimise
 from factorgraph_dvl.solvers.state_times import STATE_INTERVAL, dense_epochs
-from factorgraph_dvl.solvers.summary import summarise
+from factorgraph_dvl.solvers.summary import TRAJECTORY_RATE, summarise
 from factorgraph_dvl.trial import Trial
 
 # Root mean square error of the positions at which gravity was taken, m: 1 m turns it by
@@ -76,7 +76,7 @@ class _Prepared:
 def solve(
     trial: Trial,
     *,
-    rate_hz: float = 10.0,
+    rate_hz: float = TRAJECTORY_RATE,
     state_interval_s: float = STATE_INTERVAL,
     progress: Progress | None = None,
 ) -> Solution:

@@ -11,12 +11,14 @@ import numpy as np
 from factorgraph_dvl import keys
 from factorgraph_dvl.conventions import (
     Array,
+    BodyAxes,
     exp_so3,
     log_so3,
     rotate,
     rph_from_rotation,
     rph_jacobian,
 )
+from factorgraph_dvl.earth import LocalFrame
 from factorgraph_dvl.graph import Evaluation, Problem
 from factorgraph_dvl.preintegration import Segments, States, attach, motion_at, segment_ends
 from factorgraph_dvl.sensors.protocol import Motion, Parameter
@@ -32,6 +34,11 @@ from factorgraph_dvl.solution import (
 from factorgraph_dvl.solvers.covariance import Posterior
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum
 from factorgraph_dvl.solvers.reported import estimates_of, in_order, in_unit
+
+# Rate of trajectories, Hz, whatever the rate of the states.
+TRAJECTORY_RATE = 10.0
+# What rounding may add to a time, in periods of that rate.
+EPOCH_ROUNDING = 1e-6
 
 
 def summarise(
@@ -57,7 +64,15 @@ def summarise(
     trial = chain.trial
     evaluation = minimum.evaluation
     estimates, covariance = calibration(problem, evaluation, covariances, held)
-    trajectory = _trajectory(problem, evaluation.states, covariances.nodes, rate_hz)
+    trajectory = trajectory_between(
+        chain.segments,
+        evaluation.states,
+        covariances.nodes,
+        chain.gravity_n,
+        chain.frame,
+        trial.body_axes,
+        chain.segments.increments.ticks(rate_hz),
+    )
     residuals = _residuals(problem, minimum)
     rejected = _rejected(problem, minimum)
     warnings = [*notes]
@@ -178,11 +193,27 @@ def _mean_weights(seg: Segments) -> Array:
     return np.asarray(weight / weight.sum())
 
 
-def _trajectory(problem: Problem, states: States, P: Array, rate_hz: float) -> Trajectory:
-    chain = problem.chain
-    seg, frame, body_axes = chain.segments, chain.frame, chain.trial.body_axes
-    time = seg.increments.ticks(rate_hz)
-    motion, fraction, node = _smoothed(problem, states, time)
+def trajectory_between(
+    seg: Segments,
+    states: States,
+    P: Array,
+    gravity_n: Array,
+    frame: LocalFrame,
+    body_axes: BodyAxes,
+    time: Array,
+) -> Trajectory:
+    """Return the motion at times between the nodes of a chain.
+
+    Parameters
+    ----------
+    seg : of K nodes.
+    states : at the nodes.
+    P : (K, 9, 9) their covariances, in GTSAM's tangent space.
+    gravity_n : (S, 3) `LocalFrame.gravity_without_rotation` along the segments, m/s².
+    frame, body_axes : of the states, and of what is returned.
+    time : (M,) s.
+    """
+    motion, fraction, node = _smoothed(seg, states, gravity_n, frame.earth_rate, time)
     lat, lon, height = frame.geodetic(motion.p_n)
     lRn = frame.level_from_tangent(lat, lon)
     nRb = lRn @ motion.nRb
@@ -209,17 +240,23 @@ def _trajectory(problem: Problem, states: States, P: Array, rate_hz: float) -> T
     )
 
 
-def _smoothed(problem: Problem, states: States, time: Array) -> tuple[Motion, Array, np.ndarray]:
+def epochs_between(start: float, end: float, rate_hz: float) -> Array:
+    """Return the multiples of 1 / rate after a time and up to another, s."""
+    first, last = np.floor(np.array([start, end]) * rate_hz + EPOCH_ROUNDING)
+    return np.asarray(np.arange(first + 1.0, last + 1.0) / rate_hz + 0.0)
+
+
+def _smoothed(
+    seg: Segments, states: States, gravity_n: Array, earth_rate_n: Array, time: Array
+) -> tuple[Motion, Array, np.ndarray]:
     """Return the motion between the nodes, carried forward and closed onto the node after.
 
     What the IMU misses of the next node's state is its noise over the segment; it is
     spread in proportion to time.
     """
-    chain = problem.chain
-    seg, rate = chain.segments, chain.frame.earth_rate
-    at = attach(seg, time, rate)
-    motion = motion_at(at, states, chain.gravity_n, rate)
-    ends = motion_at(segment_ends(seg, rate), states, chain.gravity_n, rate)
+    at = attach(seg, time, earth_rate_n)
+    motion = motion_at(at, states, gravity_n, earth_rate_n)
+    ends = motion_at(segment_ends(seg, earth_rate_n), states, gravity_n, earth_rate_n)
     after = seg.origin + 1
     fraction = np.clip(at.tau / seg.duration[at.segment], 0.0, 1.0)
     part = fraction[:, None]
