@@ -370,6 +370,30 @@ def test_the_command_writes_what_was_known_when(trial, tmp_path, capsys):
     assert "'current_m_s'" in capsys.readouterr().err
 
 
+def test_lost_samples_and_an_end_that_is_not_reached_are_said(trial, tmp_path, capsys):
+    time = trial.imu.time
+    lost = (np.abs(time - 12.0) < 0.015) | (np.abs(time - 50.0) < 0.005)
+    gap = (time > 75.0) & (time < 77.0)
+    short = replace(trial, imu=rows_of(trial.imu, ~lost & ~gap & (time < 77.1)))
+    save_trial(short, tmp_path / "trial", parquet=True)
+    out = tmp_path / "out"
+    with pytest.raises(SystemExit) as end:
+        main(["replay", str(tmp_path / "trial"), "--out", str(out), "--rate", "1", "--no-figures"])
+    assert end.value.code == 1
+    solution = load_solution(out)
+    assert not solution.converged
+    assert solution.trajectory.time[-1] == pytest.approx(75.0, abs=0.11)
+    shown = " ".join(capsys.readouterr().err.split())
+    for text in (
+        "3 lost samples in 1 places were interpolated",
+        "1 samples that were lost after the start were interpolated",
+        "the replay ended at 75.0",
+    ):
+        assert any(text in w for w in solution.warnings), text
+        assert text in shown, text
+    assert "did not reach the end of the record" in shown
+
+
 def test_what_matters_is_in_view_on_a_low_terminal(trial, run):
     solution, _ = run
     console = Console(width=80, height=24)
