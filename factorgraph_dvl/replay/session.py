@@ -287,6 +287,8 @@ class Replay:
         if self._collected.empty or self._samples.dt == 0.0:
             return False
         until = self._samples.newest - self._samples.delay
+        if until < self._collected.start:
+            return False
         if np.isnan(self._attempt):
             self._attempt = self._collected.start + _FIRST
         elif self._attempt <= self._collected.start:
