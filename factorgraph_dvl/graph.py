@@ -127,7 +127,9 @@ class Problem:
         self.chain = chain
         self.all_parameters = tuple(parameters)
         self.parameters = tuple(p for p in parameters if p.estimated)
-        self._key = {p.name: keys.calibration(i) for i, p in enumerate(self.parameters)}
+        self._key = {
+            p.name: keys.calibration(i, p.mean.size) for i, p in enumerate(self.parameters)
+        }
         self._fixed = {p.name: prior_mean(p) for p in parameters if not p.estimated}
         self.graph = gtsam.NonlinearFactorGraph(chain.graph)
         if known is None:
@@ -276,7 +278,7 @@ class Problem:
             before = np.isin(o.time, self.rejected.get(o.label, np.empty(0)))
             miss = o.residual(motion, evaluation.parameters)
             far = np.abs(miss) > gate * o.sigma(motion, evaluation.parameters)
-            times = o.time[(before | (bound.weight[:, 0] > 0.0)) & far.any(axis=1)]
+            times = o.time[(before | (bound.weight > 0.0).any(axis=1)) & far.any(axis=1)]
             if times.size:
                 out[o.label] = times
         return out

@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+import string
+
 from gtsam import symbol
 from gtsam.symbol_shorthand import B, X
+
+# Those of states and biases are taken.
+_LETTERS = [c for c in string.ascii_letters + string.digits if c not in "bx"]
 
 
 def node(k: int) -> int:
@@ -16,9 +21,14 @@ def bias(k: int) -> int:
     return int(B(k))
 
 
-def calibration(i: int) -> int:
-    """Return the key of calibration parameter i, which has a letter of its own.
+def calibration(i: int, size: int) -> int:
+    """Return the key of calibration parameter i, which has `size` components."""
+    return int(symbol(letter(size), i))
+
+
+def letter(size: int) -> str:
+    """Return the letter of the calibration parameters that have `size` components.
 
     iSAM2's thresholds go by letters, and must have the dimension of the variable.
     """
-    return int(symbol(chr(ord("A") + i), 0))
+    return _LETTERS[size - 1]

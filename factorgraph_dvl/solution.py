@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from scipy.special import chdtrc
 
 from factorgraph_dvl.conventions import DEG, Array, BodyAxes
 from factorgraph_dvl.directions import turned
@@ -15,6 +16,10 @@ from factorgraph_dvl.sensors.protocol import DO_NOT_FIT, TOO_LARGE, Parameter
 _FAR_FROM_PRIOR = 5.0
 # The data observed a component if they at least halved what was unknown of it.
 OBSERVABLE = 0.5
+# Root mean square of normalised residuals from which on a filter has not converged, unless a
+# few of them are so large by chance, of this probability.
+CONTRADICTS = 2.0
+_CHANCE = 1e-3
 
 
 @dataclass(frozen=True)
@@ -302,6 +307,31 @@ def doubts(estimates: Sequence[Estimate], residuals: Sequence[Residuals]) -> lis
     return out
 
 
+def contradictions(residuals: Sequence[Residuals]) -> list[str]:
+    """Return a warning for each sensor whose residuals a filter's covariance does not explain.
+
+    Over the last half of them, when a filter should have converged. Residuals that are too
+    small are none of this: a filter may be more careful than it needs.
+
+    Parameters
+    ----------
+    residuals : with standard deviations that include those of the states, or innovations.
+    """
+    out = []
+    for r in residuals:
+        late = r.time >= np.median(r.time) if r.time.size else np.zeros(0, dtype=bool)
+        z = (r.residual / r.sigma)[late]
+        z = z[np.isfinite(z)]
+        square = float(z @ z)
+        if square > CONTRADICTS**2 * z.size and chdtrc(z.size, square) < _CHANCE:
+            out.append(
+                f"{r.label}: over the last half, residuals are {np.sqrt(square / z.size):.3g} "
+                "times as large as the filter's covariance allows: it has not converged, and "
+                "values and standard deviations are not to be used"
+            )
+    return out
+
+
 def mixed(trajectories: Sequence[Trajectory], weights: Array) -> Trajectory:
     """Return the first of some trajectories, with covariances that admit to the others.
 
@@ -376,6 +406,7 @@ def joined(
     best = solutions[order[0]]
     return replace(
         best,
+        converged=all(s.converged for s in solutions),
         trajectory=mixed([solutions[i].trajectory for i in order], weights[order]),
         hypotheses=every,
         warnings=(*best.warnings, *ambiguity(every)),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,7 +13,9 @@ from truth import CONING, config, scenario
 from factorgraph_dvl.analysis.consistency import calibration_errors, trajectory_errors
 from factorgraph_dvl.conventions import DEG
 from factorgraph_dvl.errors import ConfigError, DataError, SolveError
+from factorgraph_dvl.graph import Problem
 from factorgraph_dvl.simulation import simulate
+from factorgraph_dvl.solvers import batch
 from factorgraph_dvl.solvers.batch import solve
 from factorgraph_dvl.solvers.levenberg_marquardt import minimise
 
@@ -367,3 +370,43 @@ def test_noise_in_proportion_to_speed_leaves_the_scale_alone():
         errors += list((found.value - trial.calibration_truth["scale_error"]) / found.std)
     # By the measured speed it would be 0.005 too small.
     assert abs(np.mean(errors)) < 2.5 / np.sqrt(len(errors))
+
+
+def unsettled(monkeypatch, name, answer):
+    monkeypatch.setattr(Problem, name, answer)
+    return solve(simulate(scenario(manoeuvres=SHORT, noise=True), seed=1), rate_hz=1.0)
+
+
+def test_what_never_settles_is_named(monkeypatch):
+    solution = unsettled(monkeypatch, "misweighed", lambda *_: True)
+    assert not solution.converged
+    assert any("the weights of measurements still changed" in w for w in solution.warnings)
+
+
+def test_a_measurement_at_its_gate_is_used_and_named(monkeypatch):
+    def outliers(problem, _):
+        return {} if problem.rejected else {"DVL velocity": np.array([1.0])}
+
+    solution = unsettled(monkeypatch, "outliers", outliers)
+    assert solution.converged
+    assert any(w.startswith("DVL velocity: 1 at the gate") for w in solution.warnings)
+    assert not solution.rejected
+
+
+def test_outliers_that_never_repeat_do_not_settle(monkeypatch):
+    def outliers(problem, _):
+        times = problem.rejected.get("DVL velocity", np.zeros(0))
+        return {"DVL velocity": np.append(times, 1.0 + times.size)}
+
+    solution = unsettled(monkeypatch, "outliers", outliers)
+    assert not solution.converged
+    assert any("which measurements are echoes still changed" in w for w in solution.warnings)
+
+
+def test_a_ping_counts_as_evidence_by_any_of_its_beams():
+    residual = np.array([[0.0, 3.0, 4.0], [0.0, 0.0, 0.0]])
+    weight = np.array([[0.0, 1.0, 1.0], [0.0, 0.0, 0.0]])
+    problem = SimpleNamespace(observations=[SimpleNamespace(gate=2.0)], weights=[weight])
+    minimum = SimpleNamespace(evaluation=SimpleNamespace(residuals=[residual], cost=20.0))
+    terms = batch._cost_terms(SimpleNamespace(problem=problem, minimum=minimum))
+    np.testing.assert_allclose(terms, [12.5, 2.0, 7.5])

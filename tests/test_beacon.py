@@ -10,10 +10,15 @@ from builders import edit
 from jacobians import check_jacobians, random_motion
 from truth import exact_motion, scenario
 
+from factorgraph_dvl.chain import inertial_chain
 from factorgraph_dvl.earth import LocalFrame
 from factorgraph_dvl.errors import DataError, FactorgraphDvlError
+from factorgraph_dvl.graph import Problem
+from factorgraph_dvl.increments import increments
 from factorgraph_dvl.io.solution_folder import save_solution
 from factorgraph_dvl.io.trial_folder import load_trial, save_trial
+from factorgraph_dvl.preintegration import States, segments
+from factorgraph_dvl.replay.recorded import replay
 from factorgraph_dvl.sensors.beacon import Beacons, BeaconSettings, offset_name
 from factorgraph_dvl.simulation import plan_motion, simulate
 from factorgraph_dvl.simulation.convert import convert
@@ -239,3 +244,44 @@ def test_columns_of_either_measurement_may_be_absent(tmp_path):
                      "range_rate_m_s": np.full(5, np.nan)}, "beacon.csv"
     )  # fmt: skip
     assert [o.unit for o in none.observations(LocalFrame(0.6, 2.1, 0.0))] == ["m", "m"]
+
+
+def crowd(count):
+    """So many beacons of which the places are not known well, few ranges to each."""
+    places = {
+        f"B{i}": {"lat_deg": 36.002 + 1e-4 * (i % 20), "lon_deg": 121.003 + 1e-4 * (i // 20),
+                  "height_m": -60, "std_m": 1}
+        for i in range(count)
+    }  # fmt: skip
+    return simulate(
+        scenario(noise=True, beacons=beacons(positions=places, rate_hz=max(4.0, count / 20))),
+        seed=1,
+    )
+
+
+def test_forty_uncertain_beacons_are_estimated():
+    trial = crowd(40)
+    solution = solve(trial, rate_hz=1.0)
+    assert solution.converged
+    own = [e for e in solution.estimates if e.name.startswith("beacon_")]
+    assert len(own) == 40
+    away = np.concatenate([(e.value - trial.calibration_truth[e.name]) / e.std for e in own])
+    assert 0.7 < np.sqrt(np.mean(away**2)) < 1.3
+    live, _ = replay(trial, rate_hz=1.0)
+    assert sum(e.name.startswith("beacon_") for e in live.estimates) == 40
+
+
+def test_each_of_three_hundred_beacons_has_a_variable_of_its_own():
+    trial = crowd(300)
+    frame = trial.frame()
+    inc, _ = increments(trial.imu)
+    seg = segments(inc, 5.0, np.empty(0))
+    zero = np.zeros((seg.node_time.size, 3))
+    states = States(np.broadcast_to(np.eye(3), (zero.shape[0], 3, 3)), zero, zero, zero, zero)
+    beacon = trial.beacons
+    problem = Problem(
+        inertial_chain(trial, frame, seg, states), beacon.observations(frame), beacon.parameters()
+    )
+    values = problem.values(states, problem.prior_values())
+    assert values.size() == 300 + zero.shape[0] + 1
+    assert np.isfinite(problem.evaluate(values).cost)

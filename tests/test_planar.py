@@ -28,7 +28,8 @@ from factorgraph_dvl.planar.smoother import covariance, fit
 from factorgraph_dvl.planar.solve import solve_planar
 from factorgraph_dvl.planar.track import change_psd
 from factorgraph_dvl.simulation import parse_scenario, simulate, simulate_planar
-from factorgraph_dvl.solution import Residuals, mostly_rejected
+from factorgraph_dvl.solution import Residuals, contradictions, mostly_rejected
+from factorgraph_dvl.trial import InitialPosition
 
 SEEDS = int(os.environ.get("FACTORGRAPH_DVL_SEEDS", "20"))
 _BASE = {
@@ -562,3 +563,57 @@ def test_the_covariance_is_honest():
     assert np.mean(nees) == pytest.approx(2.0, abs=4.0 * np.sqrt(4.0 / SEEDS))
     assert np.mean(covered) > 0.95 - 4.0 * np.sqrt(0.05 / SEEDS)
     assert all(right)
+
+
+def test_a_fit_that_was_cut_short_has_not_converged():
+    made = plan(trial())
+    start = true_state(trial(), made.problem)
+    away = start[0] + np.array([30.0, -20.0, 0.0, 0.0])
+    assert not fit(made.problem, away, start[1], iterations=1).converged
+    whole = fit(made.problem, away, start[1])
+    assert whole.converged
+    again = fit(made.problem, whole.x, whole.theta, iterations=2)
+    assert again.converged
+    assert again.cost == pytest.approx(whole.cost, abs=1e-5)
+
+
+def placed(t, east, north, std):
+    """The trial with a start so far from the beacon, m."""
+    place = InitialPosition(
+        np.array([np.radians(25.0) + north / 6.37e6, np.radians(135.0) + east / 5.79e6, -40.0]),
+        np.array([std, std, 1.0]),
+    )
+    return replace(t, initial_position=place)
+
+
+def test_a_filter_that_went_to_a_mirror_image_has_not_converged(tmp_path, capsys):
+    t = placed(trial(5, **STRAIGHT), 1.0, 1.0, 600.0)
+    for method in ("4sv-2ob", "4sv-3ob"):
+        solution, _ = filter_planar(t, method)
+        assert not solution.converged
+        assert any("mirror image" in w for w in solution.warnings)
+    save_planar_trial(t, tmp_path / "t")
+    with pytest.raises(SystemExit) as exit_info:
+        main(["kalman", str(tmp_path / "t"), "--out", str(tmp_path / "k"), "--no-figures"])
+    assert exit_info.value.code == 1
+    assert "not converged" in capsys.readouterr().err
+
+
+def test_a_filter_whose_innovations_contradict_it_has_not_converged():
+    start = {"initial": {"position_std_m": [5, 5, 1]}}
+    assert filter_planar(trial(5, trial=start), "4sv-3ob")[0].converged
+    echoes = trial(5, trial=start, beacons={"multipath": 0.2})
+    solution, _ = filter_planar(echoes, "4sv-3ob")
+    assert not solution.converged
+    assert any(w.startswith("Beacon range: over the last half") for w in solution.warnings)
+
+
+def test_a_few_large_innovations_are_chance():
+    def seen(size, sigmas):
+        z = np.full((size, 1), sigmas)
+        return Residuals(
+            "Beacon range", "m", ("range",), np.arange(float(size)), z, np.ones_like(z)
+        )
+
+    assert not contradictions([seen(2, 2.5), seen(100, 1.5), seen(100, 0.1), seen(0, 1.0)])
+    assert len(contradictions([seen(100, 2.5)])) == 1

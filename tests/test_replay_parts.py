@@ -105,14 +105,14 @@ def gtsam_values(measured, states, values):
     out.insert(keys.bias(0), bias)
     for i, p in enumerate(measured.parameters):
         value = values[p.name]
-        out.insert(keys.calibration(i), gtsam.Rot3(value) if p.rotation else value)
+        out.insert(keys.calibration(i, p.mean.size), gtsam.Rot3(value) if p.rotation else value)
     return out
 
 
 def factor_of(measured, first=None):
     rows = sum(r.time.size * len(r.observation.components) for r in measured.rows)
     weight = np.linspace(1.0, 2.0, rows)
-    shared = [keys.calibration(i) for i in range(len(measured.parameters))]
+    shared = [keys.calibration(i, p.mean.size) for i, p in enumerate(measured.parameters)]
     return measurement_factor(measured, weight, keys.node(0), keys.bias(0), shared, first)
 
 

@@ -20,7 +20,7 @@ import numpy as np
 from factorgraph_dvl.conventions import Array
 from factorgraph_dvl.errors import ConfigError, DataError
 from factorgraph_dvl.kalman.run import History
-from factorgraph_dvl.solution import Estimate, Solution, Trajectory
+from factorgraph_dvl.solution import Estimate, Residuals, Solution, Trajectory, contradictions
 from factorgraph_dvl.trial import PlanarTrial
 
 Method = Literal["4sv-2ob", "4sv-3ob"]
@@ -28,6 +28,12 @@ METHODS: tuple[Method, ...] = get_args(Method)
 
 _NAMES = ("current_e_m_s", "current_n_m_s")
 _LEAST_CURRENT = 1e-6
+# Standard deviations by which the end may depend on one of the start.
+_FORGOTTEN = 3.0
+
+
+# State, covariance, innovation (predicted - measured) and its standard deviation.
+_Updated = tuple[Array, Array, float, float]
 
 
 @dataclass(frozen=True)
@@ -40,12 +46,14 @@ class Filtered:
     state : (U, 4) position in n, m, and current, m/s.
     covariance : (U, 4, 4).
     velocity : (U, 2) over ground, m/s.
+    innovations : predicted - measured, with the standard deviation of that.
     """
 
     time: Array
     state: Array
     covariance: Array
     velocity: Array
+    innovations: tuple[Residuals, ...]
 
 
 def filter_planar(
@@ -86,7 +94,12 @@ def filter_planar(
         progress(method, 0, None)
     frame = trial.frame()
     mean = frame.position(*trial.initial_position.geodetic)[:2]
-    filtered = run_filter(trial, method, mean, trial.initial_position.std[:2])
+    start_std = trial.initial_position.std[:2]
+    filtered = run_filter(trial, method, mean, start_std)
+    contradicted = [
+        *contradictions(filtered.innovations),
+        *_start_not_forgotten(trial, method, mean, start_std, filtered),
+    ]
     m = filtered.time.size
     surface = trial.depth.settings.sea_surface_height_m
     height = surface - _depth_at(trial, filtered.time)
@@ -110,7 +123,7 @@ def filter_planar(
         trial=trial.name,
         solver=f"kalman-{method}",
         body_axes=trial.body_axes,
-        converged=True,
+        converged=not contradicted,
         iterations=m,
         cost=np.nan,
         estimates=(estimate,),
@@ -126,6 +139,7 @@ def filter_planar(
         ),
         warnings=(
             *trial.notes,
+            *contradicted,
             f"{method} takes every range for a good one, and sound speed, log, heading and "
             "beacons for exact",
         ),
@@ -157,6 +171,7 @@ def run_filter(trial: PlanarTrial, method: Method | str, mean: Array, std: Array
     height = trial.depth.settings.sea_surface_height_m - _depth_at(trial, beacons.time)
     now = drive.start
     times, states, covariances, velocities = [], [], [], []
+    seen: dict[str, list[tuple[float, float, float]]] = {"range": [], "range rate": []}
     for i in range(beacons.time.size):
         time = float(beacons.time[i])
         if not drive.start <= time <= drive.end or beacons.missing[i]:
@@ -173,17 +188,58 @@ def run_filter(trial: PlanarTrial, method: Method | str, mean: Array, std: Array
         above = height[i] - frame.height - place[2]
         u, C = drive.velocity(time)
         if not np.isnan(beacons.range[i]):
-            x, P = _by_range(x, P, place, above, beacons.range[i], settings.range_std_m)
+            x, P, away, sigma = _by_range(
+                x, P, place, above, beacons.range[i], settings.range_std_m
+            )
+            seen["range"].append((time, away, sigma))
         if method == "4sv-3ob" and not np.isnan(beacons.range_rate[i]):
             rate, rate_std = beacons.range_rate[i], settings.range_rate_std_m_s
-            x, P = _by_rate(x, P, place, above, u, C, rate, rate_std)
+            x, P, away, sigma = _by_rate(x, P, place, above, u, C, rate, rate_std)
+            seen["range rate"].append((time, away, sigma))
         times.append(time)
         states.append(x)
         covariances.append(P)
         velocities.append(u + x[2:])
     if not times:
         raise DataError("no range while heading and log run", where=beacons.source)
-    return Filtered(np.array(times), np.array(states), np.array(covariances), np.array(velocities))
+    innovations = tuple(
+        Residuals(f"Beacon {kind}", unit, (kind,), rows[:, 0], rows[:, 1:2], rows[:, 2:3])
+        for (kind, values), unit in zip(seen.items(), ("m", "m/s"), strict=True)
+        if (rows := np.array(values)).size
+    )
+    return Filtered(
+        np.array(times),
+        np.array(states),
+        np.array(covariances),
+        np.array(velocities),
+        innovations,
+    )
+
+
+def _start_not_forgotten(
+    trial: PlanarTrial, method: Method | str, mean: Array, std: Array, found: Filtered
+) -> list[str]:
+    """Return a warning if the end depends more on the start than its covariance admits.
+
+    A start moved by one standard deviation moves the end of a linear filter by at most one of
+    its own. These filters are not linear, and go to either mirror image.
+    """
+    P = found.covariance[-1]
+    if not (np.isfinite(P).all() and np.linalg.eigvalsh(P)[0] > 0.0):
+        return ["the filter has diverged: its covariance is no longer one"]
+    apart, most = 0.0, 0.0
+    for move in (*np.diag(std), *-np.diag(std)):
+        away = run_filter(trial, method, mean + move, std).state[-1] - found.state[-1]
+        sigmas = float(np.sqrt(away @ np.linalg.solve(P, away)))
+        if not sigmas <= most:
+            most, apart = sigmas, float(np.hypot(*away[:2]))
+    if most <= _FORGOTTEN:
+        return []
+    return [
+        f"from a start that is one standard deviation away the filter ends {apart:.3g} m, or "
+        f"{most:.3g} standard deviations, from where it did: it has not converged, and may have "
+        "gone to a mirror image; `solve` follows all of them"
+    ]
 
 
 def _current_std(trial: PlanarTrial) -> Array:
@@ -243,8 +299,8 @@ class _Drive:
 
 def _by_range(
     x: Array, P: Array, place: Array, above: float, measured: float, std: float
-) -> tuple[Array, Array]:
-    """Return state and covariance after a slant range and the depth at that time.
+) -> _Updated:
+    """Return state, covariance and innovation after a slant range and the depth at that time.
 
     They give the horizontal distance d = sqrt(r² - z²), whose standard deviation is that of
     the range times r / d.
@@ -265,8 +321,8 @@ def _by_rate(
     C: Array,
     measured: float,
     std: float,
-) -> tuple[Array, Array]:
-    """Return state and covariance after a range rate; the vertical velocity is taken as 0."""
+) -> _Updated:
+    """Return what a range rate makes; the vertical velocity is taken as 0."""
     away = x[:2] - place[:2]
     distance = max(float(np.sqrt(away @ away + above**2)), 1e-3)
     direction = away / distance
@@ -276,10 +332,10 @@ def _by_rate(
     return _update(x, P, H, measured - rate, std**2 + float(direction @ C @ direction))
 
 
-def _update(
-    x: Array, P: Array, H: Array, innovation: float, variance: float
-) -> tuple[Array, Array]:
-    gain = P @ H / (H @ P @ H + variance)
+def _update(x: Array, P: Array, H: Array, innovation: float, variance: float) -> _Updated:
+    total = float(H @ P @ H) + variance
+    gain = P @ H / total
     keep = np.eye(4) - np.outer(gain, H)
     # Joseph's form: the covariance stays positive.
-    return x + gain * innovation, keep @ P @ keep.T + variance * np.outer(gain, gain)
+    covariance = keep @ P @ keep.T + variance * np.outer(gain, gain)
+    return x + gain * innovation, covariance, -innovation, float(np.sqrt(total))

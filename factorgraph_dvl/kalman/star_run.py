@@ -33,7 +33,14 @@ from factorgraph_dvl.kalman.star import (
 from factorgraph_dvl.kalman.steps import Samples, prepare
 from factorgraph_dvl.kalman.summary import gnss_residuals
 from factorgraph_dvl.sensors.star import Star
-from factorgraph_dvl.solution import Residuals, Solution, Trajectory, as_estimates, doubts
+from factorgraph_dvl.solution import (
+    Residuals,
+    Solution,
+    Trajectory,
+    as_estimates,
+    contradictions,
+    doubts,
+)
 from factorgraph_dvl.trial import InitialAttitude, Trial
 
 _ARCSEC = DEG / 3600.0
@@ -188,6 +195,7 @@ def _summary(
         for name, seen_well in zip(e.component_names, e.observable, strict=True)
         if not seen_well
     ]
+    contradicted = contradictions(residuals)
     first = residuals[0]
     motion = motion_at(navigation, samples.increments.ticks(rate_hz))
     return Solution(
@@ -195,14 +203,14 @@ def _summary(
         solver="kalman-star",
         body_axes=trial.body_axes,
         inputs=trial.inputs,
-        converged=True,
+        converged=not contradicted,
         iterations=1,
         cost=0.5 * float(np.sum((first.residual / first.sigma) ** 2)),
         estimates=estimates,
         covariance=covariance,
         trajectory=_trajectory(trial, star, samples, courses, motion),
         residuals=residuals,
-        warnings=(*notes, *doubts(estimates, residuals)),
+        warnings=(*notes, *contradicted, *doubts(estimates, residuals)),
     )
 
 

@@ -20,6 +20,7 @@ from factorgraph_dvl.solution import (
     Solution,
     Trajectory,
     as_estimates,
+    contradictions,
     doubts,
     not_observable,
 )
@@ -59,8 +60,10 @@ def summarise(
     values = np.concatenate([dvl_values, imu_values])
     estimates = as_estimates(parameters, values, covariance, outcome.unseparated)
     all_residuals = (measured, *gnss_residuals(trial, navigation))
+    contradicted = contradictions(all_residuals)
     warnings = [
         *notes,
+        *contradicted,
         *doubts(estimates, all_residuals),
         *_unobservable(aid, seen, estimates),
     ]
@@ -69,7 +72,7 @@ def summarise(
         solver=solver,
         body_axes=trial.body_axes,
         inputs=trial.inputs,
-        converged=outcome.converged,
+        converged=outcome.converged and not contradicted,
         iterations=outcome.iterations,
         cost=0.5 * float(np.nansum((measured.residual / measured.sigma) ** 2)),
         estimates=estimates,

@@ -11,6 +11,8 @@ from factorgraph_dvl.planar.elimination import System
 from factorgraph_dvl.planar.model import GATE, Evaluation, PlanarProblem, evaluate, terms
 
 _CONVERGED = 1e-6
+# Relative error of a cost.
+_ROUNDING = 1e-9
 # Steps, m, up to which a range is as good as linear.
 _STRAIGHT_M = 1.0
 # How far along a step its curvature is taken, and the largest ratio to the step that is believed.
@@ -28,7 +30,7 @@ class Fit:
     theta : (c,) constants.
     range_used, rate_used : (m,) weights 0 or 1 of the measurements; 0 where there is none.
     cost : half the sum of squared whitened residuals; a rejected one counts as the gate.
-    converged : whether the last step was small.
+    converged : whether a full step promised no more: the last one, undamped.
     """
 
     x: Array
@@ -70,6 +72,7 @@ def fit(
     at = evaluate(problem, x, theta)
     softness = _softness(at) if graduated else np.inf
     damping = 0.0
+    converged = False
     cost = _cost(problem, x, theta, at)
     for _ in range(iterations):
         weights = _weights(at, softness)
@@ -88,18 +91,19 @@ def fit(
             x, theta, at, cost = trial_x, trial_theta, trial_at, trial_cost
             softness = softness * 1.6 if softness < 100.0 else np.inf
             continue
-        if trial_cost <= cost + 1e-9:
+        if trial_cost <= cost + _ROUNDING * (1.0 + cost):
             gain = cost - trial_cost
             x, theta, at, cost = trial_x, trial_theta, trial_at, trial_cost
             damping = damping / 10.0 if damping > 1e-3 else 0.0
-            if gain < _CONVERGED and damping == 0.0:
+            converged = gain < _CONVERGED and damping == 0.0
+            if converged:
                 break
         else:
             damping = max(10.0 * damping, 1e-2)
             if damping > 1e8:
                 break
     hard = _weights(at, np.inf)
-    return Fit(x, theta, *hard, cost, damping == 0.0)
+    return Fit(x, theta, *hard, cost, converged)
 
 
 def graduated_weights(squares: Array, softness: float | Array) -> Array:

@@ -64,7 +64,9 @@ class Smoother:
         ranges: bool = False,
     ) -> None:
         self.parameters = tuple(parameters)
-        self.calibration_keys = [keys.calibration(i) for i in range(len(self.parameters))]
+        self.calibration_keys = [
+            keys.calibration(i, p.mean.size) for i, p in enumerate(self.parameters)
+        ]
         self.node = node
         self.times = {node: time}
         self._walking = walking
@@ -249,9 +251,9 @@ def _settings(
     thresholds = gtsam.ISAM2ThresholdMap()
     thresholds.insert(("x", state_step))
     thresholds.insert(("b", _BIAS_STEP))
-    for i, p in enumerate(parameters):
-        step = _NEVER if fixed else _CALIBRATION_STEP
-        thresholds.insert((chr(ord("A") + i), np.full(p.mean.size, step)))
+    step = _NEVER if fixed else _CALIBRATION_STEP
+    for size in {p.mean.size for p in parameters}:
+        thresholds.insert((keys.letter(size), np.full(size, step)))
     settings.setRelinearizeThreshold(thresholds)
     return settings
 

@@ -16,7 +16,7 @@ from factorgraph_dvl.clock import without_strays
 from factorgraph_dvl.conventions import Array
 from factorgraph_dvl.earth import LocalFrame
 from factorgraph_dvl.errors import ConfigError
-from factorgraph_dvl.graph import Problem
+from factorgraph_dvl.graph import Evaluation, Problem
 from factorgraph_dvl.increments import increments
 from factorgraph_dvl.mounting import calibrated, initial_values
 from factorgraph_dvl.planar.evidence import odds_against
@@ -37,7 +37,8 @@ _SAME_GRAVITY = 2.0
 # The first stage only prepares the second.
 _ROUGH = 1.0
 _ROUGH_ITERATIONS = 10
-_ROUNDS = 4
+# Most trials take one or two.
+_ROUNDS = 12
 # So long before and after a fix the motion without the DVL is good enough to mount it by, s.
 _HELD_BY_FIXES = 10.0
 
@@ -107,7 +108,7 @@ def solve(
     report = progress or (lambda stage, iteration, cost: None)
     prepared = _prepare(trial, state_interval_s, report)
     found = [
-        _described(*_descended(prepared, states, report), prepared.notes, report)
+        _described(*_descended(prepared, states, report), report, prepared.notes)
         for states in prepared.anchors.states
     ]
     solutions = [solution_of(each, rate_hz) for each in found]
@@ -140,7 +141,11 @@ def minimised(
 
 
 def _described(
-    problem: Problem, minimum: Minimum, notes: tuple[str, ...], report: Progress
+    problem: Problem,
+    minimum: Minimum,
+    own: tuple[str, ...],
+    report: Progress,
+    notes: tuple[str, ...] = (),
 ) -> Minimised:
     """Return a minimum with its covariances, and without what the data cannot tell."""
     report("covariance", 0, None)
@@ -157,9 +162,13 @@ def _described(
         again = minimise(
             problem, at, stage="all sensors, without what they cannot tell", progress=report
         )
-        minimum = replace(again, iterations=minimum.iterations + again.iterations)
+        minimum = replace(
+            again,
+            converged=minimum.converged and again.converged,
+            iterations=minimum.iterations + again.iterations,
+        )
         covariances = considered(posterior(problem, minimum), changes)
-    return Minimised(problem, minimum, covariances, held, notes)
+    return Minimised(problem, minimum, covariances, held, (*notes, *own))
 
 
 def _cost_terms(found: Minimised) -> Array:
@@ -173,7 +182,7 @@ def _cost_terms(found: Minimised) -> Array:
         own = 0.5 * np.sum(residual**2, axis=1)
         total += own.sum()
         gate = getattr(observation, "gate", 0.0)
-        parts.append(np.where(weight[:, 0] > 0.0, own, 0.5 * gate**2))
+        parts.append(np.where((weight > 0.0).any(axis=1), own, 0.5 * gate**2))
     return np.concatenate([*parts, [evaluation.cost - total]])
 
 
@@ -195,8 +204,8 @@ def fit(
     """
     prepared = _prepare(trial, state_interval_s, progress)
     states = prepared.anchors.states[0]
-    problem, minimum = _descended(prepared, states, progress, known)
-    notes = (*prepared.notes, *ambiguity(prepared.anchors.hypotheses))
+    problem, minimum, own = _descended(prepared, states, progress, known)
+    notes = (*prepared.notes, *own, *ambiguity(prepared.anchors.hypotheses))
     return problem, minimum, notes, prepared.anchors
 
 
@@ -219,12 +228,18 @@ def _prepare(trial: Trial, state_interval_s: float, report: Progress) -> _Prepar
 
 def _descended(
     prepared: _Prepared, states: States, report: Progress, known: Known | None = None
-) -> tuple[Problem, Minimum]:
-    """Return the minimum that is reached from some states."""
+) -> tuple[Problem, Minimum, tuple[str, ...]]:
+    """Return the minimum that is reached from some states, and notes of its own.
+
+    Gravity, weights, times and outliers are taken at the states before, so that minimum and
+    problem are made anew until nothing changes any more.
+    """
     trial, frame, seg = prepared.trial, prepared.frame, prepared.seg
     rejected = prepared.anchors.rejected
     values = None if known is None else known.parameters
     iterations = 0
+    tried: list[Mapping[str, Array]] = []
+    cycle: list[Mapping[str, Array]] = []
     p_gravity = np.full_like(states.p_n, np.inf)
     for _ in range(_ROUNDS):
         if np.sqrt(np.mean((states.p_n - p_gravity) ** 2)) > _SAME_GRAVITY:
@@ -245,13 +260,72 @@ def _descended(
         minimum = minimise(problem, at, stage="all sensors", progress=report)
         iterations += minimum.iterations
         states, values = minimum.evaluation.states, minimum.evaluation.parameters
-        same_gravity = np.sqrt(np.mean((states.p_n - p_gravity) ** 2)) <= _SAME_GRAVITY
-        settled = not (problem.strayed(values) or problem.misweighed(minimum.evaluation))
-        outliers = problem.outliers(minimum.evaluation)
-        if same_gravity and settled and _same(outliers, rejected):
+        changing = _changing(problem, minimum.evaluation, p_gravity)
+        if not (tried and _same(tried[-1], rejected)):
+            tried.append(rejected)
+        if not cycle:
+            outliers = problem.outliers(minimum.evaluation)
+            cycle = _cycle(tried, outliers)
+        if cycle:
+            outliers = min(cycle, key=_count)
+        if not _same(outliers, rejected):
+            changing.append("which measurements are echoes")
+        if not changing:
             break
         rejected = outliers
-    return problem, replace(minimum, iterations=iterations)
+    notes = _at_the_gate(cycle)
+    if changing:
+        notes += (
+            f"after {_ROUNDS} rounds {', '.join(changing)} still changed: the solution is none",
+        )
+    converged = minimum.converged and not changing
+    return problem, replace(minimum, converged=converged, iterations=iterations), notes
+
+
+def _changing(problem: Problem, evaluation: Evaluation, p_gravity: Array) -> list[str]:
+    """Return what of the problem would be another if it were made at an evaluation."""
+    away = np.sqrt(np.mean((evaluation.states.p_n - p_gravity) ** 2))
+    found = {
+        "gravity along the track": not away <= _SAME_GRAVITY,
+        "the times of measurements": problem.strayed(evaluation.parameters),
+        "the weights of measurements": problem.misweighed(evaluation),
+    }
+    return [name for name, changed in found.items() if changed]
+
+
+def _cycle(
+    tried: Sequence[Mapping[str, Array]], outliers: Mapping[str, Array]
+) -> list[Mapping[str, Array]]:
+    """Return the sets of outliers that follow each other for ever; none if they do not.
+
+    Each set made the next; the last of them made `outliers`. A measurement at its gate may
+    lie inside where it is left out, and outside where it is used.
+    """
+    for i, before in enumerate(tried[:-1]):
+        if _same(before, outliers):
+            return list(tried[i:])
+    return []
+
+
+def _count(rejected: Mapping[str, Array]) -> int:
+    return sum(times.size for times in rejected.values())
+
+
+def _at_the_gate(cycle: Sequence[Mapping[str, Array]]) -> tuple[str, ...]:
+    """Say how many measurements of a cycle may be echoes or not."""
+    if not cycle:
+        return ()
+    kept, none = min(cycle, key=_count), np.empty(0)
+    out = []
+    for label in dict.fromkeys(label for each in cycle for label in each):
+        ever = np.unique(np.concatenate([each.get(label, none) for each in cycle]))
+        open_ = np.setdiff1d(ever, kept.get(label, none)).size
+        if open_:
+            out.append(
+                f"{label}: {open_} at the gate would be rejected if they were used, and used if "
+                "they were rejected; they are used"
+            )
+    return tuple(out)
 
 
 def _same(a: Mapping[str, Array], b: Mapping[str, Array]) -> bool:
