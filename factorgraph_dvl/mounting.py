@@ -8,14 +8,17 @@ misalignment that is 180 degrees off is a local minimum.
 
 from __future__ import annotations
 
+from collections import ChainMap
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from factorgraph_dvl.beam_geometry import as_dvl
 from factorgraph_dvl.conventions import (
+    DEG,
     Array,
     exp_so3,
     inverse_right_jacobian,
@@ -38,6 +41,8 @@ from factorgraph_dvl.trial import Trial
 _VELOCITY_ERROR = 0.03
 _LEAST_SCALE = 0.2
 _STEPS = 30
+# Rotation, rad, from which on two minima are two.
+_APART = 20.0 * DEG
 _MAX_PINGS = 4000
 # The search for the time offset: a fraction of the period of a vessel's roll, then finer.
 _OFFSET_STEP = 0.04
@@ -69,25 +74,30 @@ class _Mounting:
 MotionAt = Callable[[np.ndarray, Array], tuple[Motion, np.ndarray]]
 
 
-def initial_values(trial: Trial, motion_at: MotionAt) -> dict[str, Array]:
+def initial_values(trial: Trial, motion_at: MotionAt) -> list[dict[str, Array]]:
     """Return values of parameters to start from, where the priors are not good enough.
 
-    Beams with directions of their own are near enough to the nominal ones.
+    The best first, then rivals: other local minima. Beams with directions of their own are
+    near enough to the nominal ones.
 
     Parameters
     ----------
     trial : its DVL, and beams with a common mounting.
     motion_at : as for `initial_mounting`.
     """
-    values: dict[str, Array] = {}
-    if trial.dvl is not None and not calibrated(trial.dvl):
-        values |= initial_mounting(trial.dvl, motion_at)
     beams = trial.beams
-    if beams is not None and beams.settings.parametrisation == "common":
-        found = initial_mounting(as_dvl(beams), motion_at)
-        for p in beams.parameters():
-            values[p.name] = found[p.name.removeprefix(beams.prefix)]
-    return values
+    common = beams is not None and beams.settings.parametrisation == "common"
+    logs: list[list[dict[str, Array]]] = []
+    if trial.dvl is not None and not calibrated(trial.dvl):
+        logs.append(initial_mountings(trial.dvl, motion_at))
+    if beams is not None and common:
+        logs.append(
+            [
+                {p.name: found[p.name.removeprefix(beams.prefix)] for p in beams.parameters()}
+                for found in initial_mountings(as_dvl(beams), motion_at)
+            ]
+        )
+    return [dict(ChainMap(*each)) for each in product(*logs)]
 
 
 def calibrated(dvl: Dvl) -> bool:
@@ -96,8 +106,10 @@ def calibrated(dvl: Dvl) -> bool:
     return any(p.joint for p in free) and all(p.joint or not p.rotation for p in free)
 
 
-def initial_mounting(dvl: Dvl, motion_at: MotionAt) -> dict[str, Array]:
+def initial_mountings(dvl: Dvl, motion_at: MotionAt) -> list[dict[str, Array]]:
     """Return values of the DVL's parameters to start from, rotations as matrices.
+
+    The best first, then those of other local minima of the misfit.
 
     Parameters
     ----------
@@ -109,7 +121,7 @@ def initial_mounting(dvl: Dvl, motion_at: MotionAt) -> dict[str, Array]:
     values = {p.name: exp_so3(p.mean) if p.rotation else p.mean for p in priors.values()}
     pings = np.flatnonzero(dvl.locked)
     if pings.size == 0:
-        return values
+        return [values]
     pings = pings[:: max(pings.size // _MAX_PINGS, 1)]
     sigma = np.hypot(dvl.sigma()[pings], _VELOCITY_ERROR)
 
@@ -137,13 +149,17 @@ def initial_mounting(dvl: Dvl, motion_at: MotionAt) -> dict[str, Array]:
         values[TIME_OFFSET] = np.array([offset])
     found = moments(offset)
     if found.share == 0.0:
-        return values
-    best = _best(found, priors)
-    values[MISALIGNMENT] = best.dRb
-    values[SCALE_ERROR] = best.scale - 1.0
-    values[LEVER_ARM] = best.lever_arm
-    values[BIAS] = best.bias
-    return values
+        return [values]
+    return [
+        values
+        | {
+            MISALIGNMENT: each.dRb,
+            SCALE_ERROR: each.scale - 1.0,
+            LEVER_ARM: each.lever_arm,
+            BIAS: each.bias,
+        }
+        for each in _minima(found, priors)
+    ]
 
 
 def _linear_misfit(moments: _Moments) -> float:
@@ -163,8 +179,8 @@ def _least_squares(moments: _Moments) -> Array:
     return np.asarray(np.linalg.solve(moments.xx + ridge, moments.xy).T, dtype=float)
 
 
-def _best(moments: _Moments, priors: dict[str, Parameter]) -> _Mounting:
-    """Return the best mounting of many starts."""
+def _minima(moments: _Moments, priors: dict[str, Parameter]) -> list[_Mounting]:
+    """Return the mountings that many starts lead to, the best first."""
     prior = _Mounting(
         exp_so3(priors[MISALIGNMENT].mean),
         1.0 + priors[SCALE_ERROR].mean,
@@ -177,7 +193,11 @@ def _best(moments: _Moments, priors: dict[str, Parameter]) -> _Mounting:
             _Mounting(R, prior.scale, prior.lever_arm, prior.bias)
             for R in Rotation.create_group("O").as_matrix()
         ]
-    return min((_descend(moments, s, priors) for s in starts), key=lambda r: r[0])[1]
+    out: list[_Mounting] = []
+    for _, found in sorted((_descend(moments, s, priors) for s in starts), key=lambda r: r[0]):
+        if all(np.linalg.norm(log_so3(found.dRb.T @ o.dRb)) > _APART for o in out):
+            out.append(found)
+    return out
 
 
 def _closed_form(moments: _Moments, prior: _Mounting) -> list[_Mounting]:

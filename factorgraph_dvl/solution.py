@@ -14,6 +14,8 @@ from factorgraph_dvl.earth import LocalFrame
 from factorgraph_dvl.sensors.protocol import DO_NOT_FIT, TOO_LARGE, Parameter
 
 _FAR_FROM_PRIOR = 5.0
+# Evidence against a minimum with which it is not worth a word: its probability is e^-15.
+_IMPOSSIBLE = 15.0
 # The data observed a component if they at least halved what was unknown of it.
 OBSERVABLE = 0.5
 # Root mean square of normalised residuals from which on a filter has not converged, unless a
@@ -349,6 +351,7 @@ def mixed(trajectories: Sequence[Trajectory], weights: Array) -> Trajectory:
     share = weights / weights.sum()
     frame = LocalFrame(*first.geodetic[0])
     p = [frame.position(*t.geodetic.T) for t in trajectories]
+    rph = [first.rph + _wrapped(t.rph - first.rph) for t in trajectories]
 
     def spread(values: Sequence[Array], covs: Sequence[Array]) -> Array:
         out = np.zeros_like(covs[0])
@@ -363,7 +366,12 @@ def mixed(trajectories: Sequence[Trajectory], weights: Array) -> Trajectory:
         velocity_cov=spread(
             [t.velocity for t in trajectories], [t.velocity_cov for t in trajectories]
         ),
+        rph_cov=spread(rph, [t.rph_cov for t in trajectories]),
     )
+
+
+def _wrapped(angle: Array) -> Array:
+    return (angle + np.pi) % (2.0 * np.pi) - np.pi
 
 
 def ambiguity(hypotheses: Sequence[Hypothesis]) -> list[str]:
@@ -410,6 +418,55 @@ def joined(
         trajectory=mixed([solutions[i].trajectory for i in order], weights[order]),
         hypotheses=every,
         warnings=(*best.warnings, *ambiguity(every)),
+    )
+
+
+def not_told_apart(solutions: Sequence[Solution], against: Array) -> Solution:
+    """Return the most probable of some minima of one problem, with the spread of the others.
+
+    Parameters
+    ----------
+    solutions : at the minima, with the same estimates and epochs.
+    against : (S,) negative logarithms of their probabilities.
+    """
+    order = [i for i in np.argsort(against) if against[i] - against.min() < _IMPOSSIBLE]
+    best = solutions[order[0]]
+    if len(order) == 1:
+        return best
+    weights = np.exp(against.min() - against[order])
+    weights /= weights.sum()
+    values = [np.concatenate([e.value for e in solutions[i].estimates]) for i in order]
+    covariance = np.zeros_like(best.covariance)
+    for i, weight, value in zip(order, weights, values, strict=True):
+        away = value - values[0]
+        covariance += weight * (solutions[i].covariance + np.outer(away, away))
+    std = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    estimates, at = [], 0
+    for k, e in enumerate(best.estimates):
+        own = std[at : at + e.std.size]
+        at += e.std.size
+        seen = np.all([solutions[i].estimates[k].observable for i in order], axis=0)
+        seen &= own <= OBSERVABLE * e.prior_std
+        estimates.append(replace(e, std=own, observable=seen))
+    shares = ", ".join(f"{w:.2g}" for w in weights)
+    turned = "; ".join(
+        f"{e.name} {np.round(e.value, 1).tolist()}"
+        for i in order[1:]
+        for e in solutions[i].estimates
+        if e.name.endswith("misalignment_deg")
+    )
+    return replace(
+        best,
+        converged=all(solutions[i].converged for i in order),
+        estimates=tuple(estimates),
+        covariance=covariance,
+        trajectory=mixed([solutions[i].trajectory for i in order], weights),
+        warnings=(
+            *best.warnings,
+            f"{len(order)} minima fit the data (weights {shares}), the others at {turned}: the "
+            "answer is ambiguous. The standard deviations admit to all of them; a longer trial "
+            "with turns and changes of speed would tell",
+        ),
     )
 
 

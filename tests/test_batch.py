@@ -15,6 +15,7 @@ from factorgraph_dvl.conventions import DEG
 from factorgraph_dvl.errors import ConfigError, DataError, SolveError
 from factorgraph_dvl.graph import Problem
 from factorgraph_dvl.simulation import simulate
+from factorgraph_dvl.solution import not_told_apart
 from factorgraph_dvl.solvers import batch
 from factorgraph_dvl.solvers.batch import solve
 from factorgraph_dvl.solvers.levenberg_marquardt import minimise
@@ -410,3 +411,30 @@ def test_a_ping_counts_as_evidence_by_any_of_its_beams():
     minimum = SimpleNamespace(evaluation=SimpleNamespace(residuals=[residual], cost=20.0))
     terms = batch._cost_terms(SimpleNamespace(problem=problem, minimum=minimum))
     np.testing.assert_allclose(terms, [12.5, 2.0, 7.5])
+
+
+@pytest.mark.parametrize(("mounting", "seed"), [([180, 0, 0], 1), ([180, 0, 0], 6)])
+def test_two_seconds_lead_to_no_mirrored_mounting(mounting, seed):
+    turn = [{"turn_deg_s": 6, "duration_s": 2, "ramp_s": 0.5}]
+    scene = scenario(noise=True, manoeuvres=turn, dvl={"misalignment_deg": mounting})
+    trial = simulate(scene, seed)
+    solution = solve(trial, rate_hz=1.0)
+    errors = calibration_errors(solution, trial.calibration_truth)
+    seen = np.concatenate([e.observable for e in solution.estimates])
+    assert np.all(np.abs(errors.error[seen]) < 5.0 * errors.std[seen])
+
+
+def test_minima_that_the_data_do_not_tell_apart_are_mixed():
+    trial = simulate(scenario(manoeuvres=SHORT, noise=True), seed=1)
+    one = solve(trial, rate_hz=1.0)
+    (first, *rest) = one.estimates
+    other = replace(
+        one, estimates=(replace(first, value=first.value + np.array([0, 0, 180])), *rest)
+    )
+    assert not_told_apart([one, other], np.array([0.0, 30.0])) is one
+    both = not_told_apart([other, one], np.array([1.0, 0.0]))
+    np.testing.assert_array_equal(both.estimates[0].value, first.value)
+    share = np.exp(-1.0) / (1.0 + np.exp(-1.0))
+    assert both.estimates[0].std[2] == pytest.approx(180.0 * np.sqrt(share), rel=0.01)
+    assert both.estimates[0].observable.tolist() == [True, True, False]
+    assert any("2 minima fit the data (weights 0.73, 0.27)" in w for w in both.warnings)

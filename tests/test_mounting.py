@@ -10,7 +10,7 @@ from truth import CONING, SWELL, exact_states, scenario
 
 from factorgraph_dvl.conventions import DEG, exp_so3, log_so3
 from factorgraph_dvl.increments import increments
-from factorgraph_dvl.mounting import initial_mounting
+from factorgraph_dvl.mounting import initial_mountings
 from factorgraph_dvl.preintegration import attach, motion_at, segments
 from factorgraph_dvl.simulation import simulate
 
@@ -33,7 +33,7 @@ def mounting_of(scene, *, waver=0.0, seed=1):
         at = attach(seg, np.where(covered, time, inside), frame.earth_rate)
         return motion_at(at, states, gravity_n, frame.earth_rate), covered
 
-    return initial_mounting(trial.dvl, motion)
+    return initial_mountings(trial.dvl, motion)[0]
 
 
 def turned_deg(values, misalignment_deg):

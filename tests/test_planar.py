@@ -368,7 +368,7 @@ def test_the_filters_pass_over_missing_headings_and_depths():
 
 
 def test_files_and_commands(tmp_path, capsys):
-    t = trial(6, beacons={"missed": 0.1}, trial={"initial": {"position_std_m": [50, 50, 1]}})
+    t = trial(6, beacons={"missed": 0.1}, trial={"initial": {"position_std_m": [5, 5, 1]}})
     save_planar_trial(t, tmp_path / "t")
     assert is_planar(tmp_path / "t")
     loaded = load_planar_trial(tmp_path / "t")

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation, RotationSpline
 from factorgraph_dvl.conventions import DEG, frd_from_body, log_so3, rotate, rotation_from_rph
 from factorgraph_dvl.earth import LocalFrame
 from factorgraph_dvl.kalman.navigation import motion_at, navigate
-from factorgraph_dvl.mounting import initial_mounting
+from factorgraph_dvl.mounting import initial_mountings
 from factorgraph_dvl.sensors.dvl import Dvl, DvlSettings
 from factorgraph_dvl.sensors.gnss import Gnss, GnssSettings
 from factorgraph_dvl.sensors.imu import Imu, ImuSettings
@@ -141,7 +141,7 @@ def test_mounting_of_an_auv(number):
         velocity,
         np.full_like(velocity, np.nan),
     )
-    found = initial_mounting(dvl, motion_at)
+    found = initial_mountings(dvl, motion_at)[0]
     assert found["time_offset_s"][0] == pytest.approx(-1.46, abs=0.06)
     assert found["lever_arm_m"][0] == pytest.approx(-1.84, abs=0.04)
     assert np.all(np.abs(found["lever_arm_m"][1:]) < 0.2)

@@ -13,7 +13,7 @@ from factorgraph_dvl.anchoring import Anchors, anchored
 from factorgraph_dvl.attitude_alignment import attitudes, mean_mounting
 from factorgraph_dvl.chain import Chain, inertial_chain
 from factorgraph_dvl.clock import without_strays
-from factorgraph_dvl.conventions import Array
+from factorgraph_dvl.conventions import DEG, Array, exp_so3, log_so3
 from factorgraph_dvl.earth import LocalFrame
 from factorgraph_dvl.errors import ConfigError
 from factorgraph_dvl.graph import Evaluation, Problem
@@ -23,7 +23,7 @@ from factorgraph_dvl.planar.evidence import odds_against
 from factorgraph_dvl.preintegration import Segments, States, attach, motion_at, segments
 from factorgraph_dvl.priors import Known
 from factorgraph_dvl.sensors.protocol import Aid, Motion, Observation, Parameter
-from factorgraph_dvl.solution import Solution, ambiguity, joined
+from factorgraph_dvl.solution import Solution, ambiguity, joined, not_told_apart
 from factorgraph_dvl.solvers.covariance import Posterior, changes_with, considered, posterior
 from factorgraph_dvl.solvers.feigned import at_prior_along, parameter_information, told_of
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, Progress, minimise
@@ -39,8 +39,24 @@ _ROUGH = 1.0
 _ROUGH_ITERATIONS = 10
 # Most trials take one or two.
 _ROUNDS = 12
+# Length, s, up to which start values may lead to a wrong minimum, and standard deviation, rad,
+# of a mounting from which on it may. Others are sought from the best of all local minima of
+# the mounting, at these headings.
+_SHORT = 30.0
+_ANY_ANGLE = 45.0 * DEG
+_HEADINGS = np.array([0.0, 90.0, 180.0, 270.0]) * DEG
+_RIVALS = 16
+_RIVAL_ITERATIONS = 15
+# Cost above the best one from which on a rough minimum is no rival, and angle, rad, from which on
+# it is not the same.
+_ROUGHLY_AS_GOOD = 30.0
+_APART = 15.0 * DEG
 # So long before and after a fix the motion without the DVL is good enough to mount it by, s.
 _HELD_BY_FIXES = 10.0
+
+
+# A problem, its minimum, and what is worth telling of that.
+_Found = tuple[Problem, Minimum, tuple[str, ...]]
 
 
 @dataclass(frozen=True)
@@ -107,11 +123,14 @@ def solve(
     _check_above_zero("rate_hz", rate_hz)
     report = progress or (lambda stage, iteration, cost: None)
     prepared = _prepare(trial, state_interval_s, report)
-    found = [
-        _described(*_descended(prepared, states, report), report, prepared.notes)
-        for states in prepared.anchors.states
-    ]
-    solutions = [solution_of(each, rate_hz) for each in found]
+    found, solutions = [], []
+    for states in prepared.anchors.states:
+        minima = [
+            _described(*each, report, prepared.notes) for each in _minima(prepared, states, report)
+        ]
+        against = np.array([_evidence_against(each) for each in minima])
+        solutions.append(not_told_apart([solution_of(each, rate_hz) for each in minima], against))
+        found.append(minima[int(np.argmin(against))])
     against = odds_against([_cost_terms(each) for each in found])
     return joined(solutions, against, prepared.anchors.hypotheses)
 
@@ -171,6 +190,15 @@ def _described(
     return Minimised(problem, minimum, covariances, held, (*notes, *own))
 
 
+def _evidence_against(found: Minimised) -> float:
+    """Return the negative logarithm of the posterior probability about a minimum.
+
+    Laplace's approximation: a minimum that is wide is more probable than a narrow one.
+    """
+    _, log_det = np.linalg.slogdet(found.covariances.parameters)
+    return found.minimum.evaluation.cost - 0.5 * float(log_det)
+
+
 def _cost_terms(found: Minimised) -> Array:
     """Return the terms of the cost: of each measurement, of the rest at once."""
     evaluation = found.minimum.evaluation
@@ -226,8 +254,87 @@ def _prepare(trial: Trial, state_interval_s: float, report: Progress) -> _Prepar
     return _Prepared(trial, frame, seg, anchors, start.mountings, notes)
 
 
+def _minima(prepared: _Prepared, states: States, report: Progress) -> list[_Found]:
+    """Return the minimum that is reached from some states, and others as probable.
+
+    In some seconds neither heading nor mounting are known before the DVL is used, and start
+    values lead to any of several minima. From longer trials they lead to the right one.
+    """
+    first = _descended(prepared, states, report)
+    out = [first]
+    time = prepared.seg.node_time
+    if time[-1] - time[0] > _SHORT or not _free(prepared.trial):
+        return out
+    report("other mountings", 0, None)
+    trial, frame, seg = prepared.trial, prepared.frame, prepared.seg
+    # One of their own: minimising weighs the measurements anew.
+    problem = Problem(
+        first[0].chain, *_sensors(trial.aids, frame), start=first[1].evaluation.parameters
+    )
+    mountings = _mountings(trial, frame, seg, problem.chain.gravity_n, states)
+    rotations = {p.name for p in problem.parameters if p.rotation}
+    starts = []
+    for angle in _HEADINGS:
+        turn = exp_so3(np.array([0.0, 0.0, angle]))
+        start = replace(states, nRb=turn @ states.nRb)
+        # What the sensors see stays as it is, at least at first.
+        back = states.nRb[0].T @ turn @ states.nRb[0]
+        for each in mountings:
+            own = {
+                name: value @ back if name in rotations else value for name, value in each.items()
+            }
+            at = problem.values(start, problem.prior_values() | prepared.mountings | own)
+            starts.append((problem.evaluate(at).cost, at))
+    rough = [
+        minimise(
+            problem,
+            at,
+            stage="other mountings",
+            max_iterations=_RIVAL_ITERATIONS,
+            tolerance=_ROUGH,
+            proven=False,
+        )
+        for _, at in sorted(starts, key=lambda s: s[0])[:_RIVALS]
+    ]
+    rough.sort(key=lambda m: m.evaluation.cost)
+    for each in rough:
+        found = each.evaluation
+        best = min(m.evaluation.cost for _, m, _ in out)
+        if found.cost > best + _ROUGHLY_AS_GOOD:
+            break
+        if any(_same_minimum(prepared, found, m.evaluation) for _, m, _ in out):
+            continue
+        other = _descended(prepared, found.states, report, values=found.parameters)
+        if not any(_same_minimum(prepared, other[1].evaluation, m.evaluation) for _, m, _ in out):
+            out.append(other)
+    return out
+
+
+def _free(trial: Trial) -> bool:
+    """Whether a mounting may be turned to anywhere."""
+    return any(
+        p.rotation and p.estimated and p.sigma.max() > _ANY_ANGLE
+        for aid in trial.aids
+        for p in aid.parameters()
+    )
+
+
+def _same_minimum(prepared: _Prepared, a: Evaluation, b: Evaluation) -> bool:
+    """Whether two minima have the same attitude and mountings, as far as angles tell."""
+    pairs = [(a.states.nRb[0], b.states.nRb[0])]
+    for aid in prepared.trial.aids:
+        for p in aid.parameters():
+            if p.rotation and p.estimated:
+                pairs.append((a.parameters[p.name], b.parameters[p.name]))
+    return all(float(np.linalg.norm(log_so3(x.T @ y))) < _APART for x, y in pairs)
+
+
 def _descended(
-    prepared: _Prepared, states: States, report: Progress, known: Known | None = None
+    prepared: _Prepared,
+    states: States,
+    report: Progress,
+    known: Known | None = None,
+    values: dict[str, Array] | None = None,
 ) -> tuple[Problem, Minimum, tuple[str, ...]]:
     """Return the minimum that is reached from some states, and notes of its own.
 
@@ -236,7 +343,8 @@ def _descended(
     """
     trial, frame, seg = prepared.trial, prepared.frame, prepared.seg
     rejected = prepared.anchors.rejected
-    values = None if known is None else known.parameters
+    if known is not None:
+        values = known.parameters
     iterations = 0
     tried: list[Mapping[str, Array]] = []
     cycle: list[Mapping[str, Array]] = []
@@ -253,7 +361,8 @@ def _descended(
                 iterations += coarse.iterations
                 states = coarse.evaluation.states
             report("mounting", 0, None)
-            values = prepared.mountings | _mountings(trial, frame, seg, chain.gravity_n, states)
+            (best, *_) = _mountings(trial, frame, seg, chain.gravity_n, states)
+            values = prepared.mountings | best
         problem = Problem(chain, *_sensors(trial.aids, frame), start=values, known=known)
         problem.reject(rejected)
         at = problem.values(states, {**problem.prior_values(), **values})
@@ -382,8 +491,11 @@ def _near_fixes(trial: Trial, time: Array) -> NDArray[np.bool_]:
 
 def _mountings(
     trial: Trial, frame: LocalFrame, seg: Segments, gravity_n: np.ndarray, states: States
-) -> dict[str, np.ndarray]:
-    """Return values of the sensors' mountings, rotations as matrices, by the motion."""
+) -> list[dict[str, np.ndarray]]:
+    """Return values of the sensors' mountings by the motion, rotations as matrices.
+
+    The best first, then rivals.
+    """
 
     def motion_by(time: np.ndarray) -> tuple[Motion, np.ndarray]:
         index, since, covered = seg.increments.locate(time)
@@ -397,4 +509,4 @@ def _mountings(
         if seen.mounting.estimated:
             motion, covered = motion_by(seen.time)
             out[seen.mounting.name] = mean_mounting(seen, motion.nRb * covered[:, None, None])
-    return out | initial_values(trial, lambda pings, time: motion_by(time))
+    return [out | each for each in initial_values(trial, lambda pings, time: motion_by(time))]
