@@ -279,9 +279,10 @@ def _minima(prepared: _Prepared, states: States, report: Progress) -> list[_Foun
         start = replace(states, nRb=turn @ states.nRb)
         # What the sensors see stays as it is, at least at first.
         back = states.nRb[0].T @ turn @ states.nRb[0]
-        for each in mountings:
+        for mounting in mountings:
             own = {
-                name: value @ back if name in rotations else value for name, value in each.items()
+                name: value @ back if name in rotations else value
+                for name, value in mounting.items()
             }
             at = problem.values(start, problem.prior_values() | prepared.mountings | own)
             starts.append((problem.evaluate(at).cost, at))
@@ -373,7 +374,7 @@ def _descended(
         if not (tried and _same(tried[-1], rejected)):
             tried.append(rejected)
         if not cycle:
-            outliers = problem.outliers(minimum.evaluation)
+            outliers: Mapping[str, Array] = problem.outliers(minimum.evaluation)
             cycle = _cycle(tried, outliers)
         if cycle:
             outliers = min(cycle, key=_count)
