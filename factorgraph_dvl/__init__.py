@@ -14,7 +14,6 @@ The DVL reports v_d = (1 + k) dRb (v_b + omega_eb_b x l) + beta, at its true tim
 from __future__ import annotations
 
 from importlib import import_module
-from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -26,7 +25,7 @@ if TYPE_CHECKING:
     from factorgraph_dvl.solvers.batch import solve
     from factorgraph_dvl.trial import Trial
 
-__version__ = version("factorgraph-dvl")
+    __version__: str
 
 _PUBLIC = {
     "Replay": "factorgraph_dvl.replay.session",
@@ -55,6 +54,10 @@ __all__ = [
 
 def __getattr__(name: str) -> Any:
     # GTSAM and SciPy take most of a second to load: only where they are used.
+    if name == "__version__":
+        from importlib.metadata import version
+
+        return version("factorgraph-dvl")
     if name in _PUBLIC:
         return getattr(import_module(_PUBLIC[name]), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from factorgraph_dvl.text import printable
+
 
 class FactorgraphDvlError(Exception):
     """Base of every error raised on purpose.
@@ -21,15 +23,14 @@ class FactorgraphDvlError(Exception):
     exit_code = 1
 
     def __init__(self, what: str, *, where: str = "", expected: str = "", hint: str = "") -> None:
-        self.what = what
-        self.where = where
-        self.expected = expected
-        self.hint = hint
-        text = f"{where}: {what}" if where else what
+        # Names, keys and cells in it are those of files, whatever these hold.
+        self.what, self.where = printable(what), printable(where)
+        self.expected, self.hint = printable(expected), printable(hint)
+        text = f"{self.where}: {self.what}" if where else self.what
         if expected:
-            text += f"; expected {expected}"
+            text += f"; expected {self.expected}"
         if hint:
-            text += f". {hint}"
+            text += f". {self.hint}"
         super().__init__(text)
 
 

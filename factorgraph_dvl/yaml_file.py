@@ -11,10 +11,12 @@ import msgspec
 import yaml
 
 from factorgraph_dvl.errors import ConfigError
+from factorgraph_dvl.files import MEGABYTE, read_bytes
 
 T = TypeVar("T")
 Key = str | int
 
+_MAX_BYTES = MEGABYTE
 _MAX_NODES = 100_000
 
 
@@ -59,14 +61,13 @@ def read_yaml(path: Path, kind: type[T], *, source: str = "") -> T:
 
 def read_text(path: Path) -> str:
     """Read a text file; raise ConfigError if there is none, or it is not text."""
+    content = read_bytes(path, limit=_MAX_BYTES, expected="YAML", kind=ConfigError)
     try:
-        return path.read_text(encoding="utf-8-sig")
-    except FileNotFoundError:
-        raise ConfigError("the file does not exist", where=str(path)) from None
+        return content.decode("utf-8-sig")
     except UnicodeDecodeError:
-        raise ConfigError("is not a text file", where=str(path), expected="YAML") from None
-    except OSError as error:
-        raise ConfigError(f"cannot be read ({error.strerror})", where=str(path)) from None
+        raise ConfigError(
+            "is not a text file", where=str(path), expected="YAML, in UTF-8"
+        ) from None
 
 
 def parse_yaml(text: str, kind: type[T], *, source: str) -> T:

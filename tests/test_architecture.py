@@ -16,7 +16,9 @@ PACKAGE = Path(factorgraph_dvl.__file__).parent
 # Each line may import from the lines before it, and from its own line only within one
 # package. `a.b` stands for a module or a whole package.
 LAYERS = (
+    ("text",),
     ("conventions", "errors"),
+    ("files", "ranges"),
     ("earth", "celestial", "yaml_file", "directions", "turning"),
     ("gains",),
     ("sensors",),
@@ -82,7 +84,7 @@ SENSOR_DATA = ("Imu", "ImuSettings", "Gnss", "Dvl", "Star", "Aid", "Parameter", 
 # The graph asks every sensor through the protocol and knows none but the IMU by name.
 NAMELESS = ("graph", "priors", "chain", "preintegration", "keys", "solvers", "replay")
 # Only where they are used: GTSAM, SciPy and Matplotlib take most of a second to load.
-LAZY_FOR_CLI = tuple(layer for line in LAYERS[1:-1] for layer in line)
+LAZY_FOR_CLI = tuple(layer for line in LAYERS[2:-1] for layer in line)
 
 LEVEL = {name: i for i, line in enumerate(LAYERS) for name in line}
 MODULES = sorted(

@@ -159,7 +159,7 @@ BAD_SETTINGS = {
         "scale_error_std: [0.01, 0.02, 0.03]",
         "scale_error_std: -0.1",
         "scale_error_std",
-        "0 or above",
+        "0 to 1000",
     ),
     "negative in a union": (
         "scale_error_std: [0.01, 0.02, 0.03]",
@@ -182,7 +182,7 @@ BAD_SETTINGS = {
     "scale": ("scale_error: 0.0", "scale_error: -1", "scale_error", "above -1"),
     "twice": ("body_axes: RFU", "body_axes: RFU\nbody_axes: RFU", "body_axes", "twice"),
     "empty section": ("reference: {", "depth:\nreference: {", "depth is empty", "a mapping"),
-    "latitude": ("lat_deg: 34.0", "lat_deg: 134", "initial.position.lat_deg", "<= 90"),
+    "latitude": ("lat_deg: 34.0", "lat_deg: 134", "initial.position.lat_deg", "-90 to 90 deg"),
     "syntax": ("body_axes: RFU", "body_axes: [RFU", "not valid YAML", "trial.yaml line"),
     "tab": ("body_axes: RFU", "\tbody_axes: RFU", "not valid YAML", "trial.yaml line"),
     "tag": ("body_axes: RFU", "body_axes: !!python/name:os.system RFU", "body_axes", "plain"),

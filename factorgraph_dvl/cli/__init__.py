@@ -2,6 +2,23 @@
 
 from __future__ import annotations
 
-from factorgraph_dvl.cli.app import main
+import sys
+from typing import NoReturn
 
-__all__ = ["main"]
+
+def main(argv: list[str] | None = None) -> NoReturn:
+    """Run the command line and exit: 0 done, 1 could not deliver, 2 bad input or usage.
+
+    Parameters
+    ----------
+    argv : arguments; by default those of the process.
+    """
+    try:
+        # Loading takes long enough to be interrupted.
+        from factorgraph_dvl.cli.app import run
+
+        run(sys.argv[1:] if argv is None else argv)
+    except KeyboardInterrupt:
+        if sys.stderr is not None:
+            sys.stderr.write("error: interrupted\n")
+        sys.exit(130)

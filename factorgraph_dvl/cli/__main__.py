@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from factorgraph_dvl.cli.app import main
+from factorgraph_dvl.cli import main
 
 if __name__ == "__main__":
     main()

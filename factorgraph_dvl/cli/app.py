@@ -16,13 +16,16 @@ from factorgraph_dvl.cli.crosscheck import crosscheck
 from factorgraph_dvl.cli.deadreckon import deadreckon
 from factorgraph_dvl.cli.inspect import inspect
 from factorgraph_dvl.cli.instrument import instrument
+from factorgraph_dvl.cli.memory import naming_memory
 from factorgraph_dvl.cli.observability import observability
 from factorgraph_dvl.cli.options import claims
 from factorgraph_dvl.cli.plan import plan
 from factorgraph_dvl.cli.replay import replay
 from factorgraph_dvl.cli.simulate import simulate
 from factorgraph_dvl.cli.solve import kalman, solve
+from factorgraph_dvl.cli.streams import guard_streams, output_failure
 from factorgraph_dvl.errors import FactorgraphDvlError
+from factorgraph_dvl.text import printable
 
 _NAME = "factorgraph-dvl"
 
@@ -48,44 +51,54 @@ for _command in (
     instrument,
     correct,
 ):
-    app.command()(_command)
+    app.command()(naming_memory(_command))
 
 
-def main(argv: list[str] | None = None) -> NoReturn:
-    """Run the command line and exit: 0 done, 1 could not deliver, 2 bad input or usage.
-
-    Parameters
-    ----------
-    argv : arguments; by default those of the process.
-    """
-    args = sys.argv[1:] if argv is None else argv
+def run(args: list[str]) -> NoReturn:
+    """Run a command and exit; see `factorgraph_dvl.cli.main`."""
     # All matrices are small: more threads only wait for one another.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     os.environ.setdefault("OMP_NUM_THREADS", "1")
-    for stream in (sys.stdout, sys.stderr):
-        # A terminal that knows no µ shall not fail a run.
-        if hasattr(stream, "reconfigure"):
-            stream.reconfigure(errors="replace")
+    guard_streams()
     try:
         with claims:
             app(args=[arg for arg in args if arg != "--debug"], prog_name=_NAME)
     except FactorgraphDvlError as error:
         _fail(str(error), error.exit_code, args)
-    except KeyboardInterrupt:
-        _fail("interrupted", 130, args)
     except OSError as error:
         name = error.filename if error.filename is not None else "a file"
         _fail(f"{name}: {error.strerror or error}", 2, args)
     except Exception as error:
+        if _interrupted(error):
+            raise KeyboardInterrupt from error
         hint = "" if "--debug" in args else ". Run with --debug to see where"
         _fail(f"internal error: {type(error).__name__}: {error}{hint}", 1, args)
+    except SystemExit as done:
+        failure = output_failure()
+        if failure is None or done.code:
+            raise
+        _fail(
+            f"standard output cannot be written ({failure.strerror}); files that this run "
+            "wrote are complete",
+            1,
+            args,
+        )
     sys.exit(0)
+
+
+def _interrupted(error: BaseException | None) -> bool:
+    """Whether an error came of an interrupt, as where a module was being loaded."""
+    while error is not None:
+        if isinstance(error, KeyboardInterrupt):
+            return True
+        error = error.__cause__ or error.__context__
+    return False
 
 
 def _fail(message: str, exit_code: int, args: list[str]) -> NoReturn:
     if "--debug" in args:
         stderr().print_exception()
-    stderr().print(Text(f"error: {message}", "red"), soft_wrap=True)
+    stderr().print(Text(f"error: {printable(message)}", "red"), soft_wrap=True)
     sys.exit(exit_code)
 
 

@@ -6,11 +6,13 @@ import sys
 from contextlib import suppress
 from pathlib import Path
 from time import perf_counter, time
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 from rich.text import Text
+
+from factorgraph_dvl.text import printable
 
 if TYPE_CHECKING:
     from types import TracebackType
@@ -20,6 +22,17 @@ if TYPE_CHECKING:
 _STARTED = time()
 # Tables that go to a file or a pipe are not cut to the 80 columns of no terminal.
 _PIPE_WIDTH = 180
+
+
+class _Console(Console):
+    """A console whose text, names of files included, gives a terminal no orders."""
+
+    def print(self, *objects: Any, **options: Any) -> None:
+        super().print(*(_lines(x) if isinstance(x, str) else x for x in objects), **options)
+
+
+def _lines(text: str) -> str:
+    return "\n".join(map(printable, text.split("\n")))
 
 
 class ProgressLine:
@@ -85,12 +98,12 @@ def print_table(table: Table) -> None:
 
 def warn(message: str) -> None:
     """Print a warning."""
-    stderr().print(Text(f"warning: {message}", "yellow"), soft_wrap=True)
+    stderr().print(Text(f"warning: {printable(message)}", "yellow"), soft_wrap=True)
 
 
 def stdout() -> Console:
     """Return the console for results."""
-    return Console(width=None if sys.stdout.isatty() else _PIPE_WIDTH)
+    return _Console(width=None if sys.stdout.isatty() else _PIPE_WIDTH)
 
 
 def stderr() -> Console:
@@ -98,4 +111,4 @@ def stderr() -> Console:
     # What was said first comes first, also where both streams end in one file.
     with suppress(OSError):
         sys.stdout.flush()
-    return Console(stderr=True)
+    return _Console(stderr=True)

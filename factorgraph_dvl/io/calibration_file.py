@@ -15,15 +15,20 @@ from msgspec import UNSET, UnsetType
 from factorgraph_dvl.conventions import DEG, Array, BodyAxes
 from factorgraph_dvl.directions import turns_to
 from factorgraph_dvl.errors import DataError
+from factorgraph_dvl.files import MEGABYTE, read_bytes
 from factorgraph_dvl.fingerprint import PATTERN
+from factorgraph_dvl.ranges import out_of_range
 from factorgraph_dvl.sensors.dvl import CALIBRATED
 from factorgraph_dvl.solution import Calibration, Estimate, Solution
+from factorgraph_dvl.text import printable
 
 CALIBRATION_FILE = "calibration.json"
 
 # Of components, in their order; those of beams are numbered.
 _LABELS = ("x", "y", "z", "e", "n", "u")
 _NUMBERED = re.compile(r"([1-9]\d?)([xy]?)")
+# The covariance of some hundred parameters.
+_MAX_BYTES = 64 * MEGABYTE
 # Of a variance, for files with few digits.
 _ROUNDING = 0.02
 # JSON knows no nan: null stands for it.
@@ -77,12 +82,12 @@ def load_calibration(path: Path | str, *, body_axes: BodyAxes = "RFU") -> Calibr
     path = path / CALIBRATION_FILE if path.is_dir() else path
     file = _decode(path)
     rows = _rows(file, str(path))
-    names = iter([file.covariance.order[i] for i in rows])
+    names = iter([printable(file.covariance.order[i]) for i in rows])
     covariance = _covariance(file)[np.ix_(rows, rows)]
     _check_std(file, covariance, str(path))
     return Calibration(
-        trial=file.trial,
-        solver=file.solver,
+        trial=printable(file.trial),
+        solver=printable(file.solver),
         body_axes=body_axes if file.body_axes is UNSET else file.body_axes,
         converged=file.converged,
         iterations=file.iterations,
@@ -91,7 +96,7 @@ def load_calibration(path: Path | str, *, body_axes: BodyAxes = "RFU") -> Calibr
             _estimate(name, parameter, names) for name, parameter in file.parameters.items()
         ),
         covariance=covariance,
-        warnings=tuple(file.warnings),
+        warnings=tuple(map(printable, file.warnings)),
         inputs=tuple(file.inputs),
     )
 
@@ -117,6 +122,8 @@ def check_values(name: str, value: Array, source: str) -> None:
     """Raise DataError unless the values of a parameter are numbers that can be."""
     if not np.isfinite(value).all():
         raise DataError(f"{name} holds no number", where=source, expected="finite values")
+    if wrong := out_of_range(name, np.ravel(value).tolist()):
+        raise DataError(wrong, where=source)
     if name.endswith("scale_error") and np.min(value) <= -1.0:
         raise DataError(f"{name} is {np.min(value):g}", where=source, expected="numbers above -1")
 
@@ -161,12 +168,8 @@ def _parameter(e: Estimate) -> _Parameter:
 
 def _decode(file: Path) -> _File:
     try:
-        calibration = msgspec.json.decode(file.read_bytes(), type=_File)
-    except FileNotFoundError:
-        raise DataError(
-            "the file does not exist", where=str(file), expected="a solution folder"
-        ) from None
-    except (msgspec.MsgspecError, UnicodeDecodeError) as error:
+        calibration = msgspec.json.decode(read_calibration_bytes(file), type=_File)
+    except (msgspec.MsgspecError, ValueError, RecursionError) as error:
         raise DataError(f"cannot be read ({error})", where=str(file)) from None
     for name, parameter in calibration.parameters.items():
         _check_sizes(name, parameter, str(file))
@@ -180,6 +183,11 @@ def _decode(file: Path) -> _File:
             expected=f"{size} names in `order`, and a {size} x {size} matrix",
         )
     return calibration
+
+
+def read_calibration_bytes(file: Path) -> bytes:
+    """Read calibration.json as it is; raise DataError if there is no such file."""
+    return read_bytes(file, limit=_MAX_BYTES, expected=f"the {CALIBRATION_FILE} of a solution")
 
 
 def _size(parameter: _Parameter) -> int:

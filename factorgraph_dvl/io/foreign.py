@@ -19,6 +19,7 @@ from factorgraph_dvl.io.calibration_file import (
     check_usable,
     check_values,
     load_calibration,
+    read_calibration_bytes,
 )
 from factorgraph_dvl.io.folders import SETTINGS_FILE
 from factorgraph_dvl.io.motion_table import read_reference
@@ -29,9 +30,11 @@ from factorgraph_dvl.io.solution_folder import (
 )
 from factorgraph_dvl.io.tables import read_table
 from factorgraph_dvl.io.trial_folder import TRUTH_FILE, load_reference
+from factorgraph_dvl.ranges import out_of_range
 from factorgraph_dvl.sensors.catalogue import every_parameter
 from factorgraph_dvl.sensors.protocol import Parameter, Section, check_range, stack
 from factorgraph_dvl.solution import Estimate, Solution, Trajectory
+from factorgraph_dvl.text import printable
 from factorgraph_dvl.trial import Reference
 from factorgraph_dvl.yaml_file import parse_yaml, read_text
 
@@ -111,6 +114,9 @@ class _Parameters(Section, frozen=True, kw_only=True):
         for name, given in self.given().items():
             if name != _DIRECTIONS:
                 _check_sizes(name, given, list(_choices(name)))
+                numbers = _array(given.value)
+                if wrong := out_of_range(name, numbers[~np.isnan(numbers)].tolist()):
+                    raise ValueError(wrong)
 
     def given(self) -> dict[str, _Value | _Directions]:
         """Return what is there, by name."""
@@ -290,7 +296,9 @@ def read_calibration_values(path: Path | str, body_axes: BodyAxes) -> dict[str, 
         converge.
     """
     path = Path(path)
-    whole = path.is_dir() or (path.suffix.lower() == ".json" and '"covariance"' in read_text(path))
+    whole = path.is_dir() or (
+        path.suffix.lower() == ".json" and b'"covariance"' in read_calibration_bytes(path)
+    )
     if whole:
         calibration = load_calibration(path, body_axes=body_axes)
         check_usable(calibration, body_axes, str(path))
@@ -346,8 +354,8 @@ def _elsewhere(file: _File, trajectory: Trajectory) -> Solution:
     estimates = tuple(_estimate(name, value) for name, value in _given(file).items())
     std = np.concatenate([np.zeros(0), *(e.std for e in estimates)])
     return Solution(
-        trial=file.trial,
-        solver=file.solver,
+        trial=printable(file.trial),
+        solver=printable(file.solver),
         body_axes="RFU" if isinstance(file.body_axes, UnsetType) else file.body_axes,
         converged=True,
         iterations=0,

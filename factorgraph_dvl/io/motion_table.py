@@ -8,7 +8,7 @@ import numpy as np
 
 from factorgraph_dvl.conventions import DEG, GEODETIC_SI, Array
 from factorgraph_dvl.io.tables import read_table
-from factorgraph_dvl.sensors.protocol import check_finite, check_range, check_times, stack
+from factorgraph_dvl.sensors.protocol import check_finite, check_possible, check_times, stack
 from factorgraph_dvl.solution import Trajectory
 from factorgraph_dvl.trial import Reference
 
@@ -37,8 +37,7 @@ def read_reference(path: Path, source: str = "") -> Reference:
     columns = read_table(path, COLUMNS, source=source)
     check_times(columns["time_s"], source)
     check_finite(columns, source)
-    check_range({"lat_deg": columns["lat_deg"]}, -90.0, 90.0, "deg", source)
-    check_range({"lon_deg": columns["lon_deg"]}, -360.0, 360.0, "deg", source)
+    check_possible(columns, source)
     return Reference(
         columns["time_s"],
         stack(columns, COLUMNS[1:4]) * GEODETIC_SI,

@@ -31,6 +31,7 @@ from factorgraph_dvl.io.trial_yaml import (
 from factorgraph_dvl.sensors.beacon import Beacons
 from factorgraph_dvl.sensors.depth import Depth
 from factorgraph_dvl.sensors.log import Heading, SpeedLog
+from factorgraph_dvl.text import printable
 from factorgraph_dvl.trial import PlanarTrial
 from factorgraph_dvl.yaml_file import parse_yaml, read_text
 
@@ -63,7 +64,7 @@ def load_planar_trial(path: Path | str) -> PlanarTrial:
     settings = parse_yaml(read_text(file), PlanarSettings, source=file.name)
     initial = settings.initial
     return PlanarTrial(
-        name=settings.name or folder.resolve().name,
+        name=printable(settings.name or folder.resolve().name),
         heading=read_record(folder, Heading, settings.heading),
         log=read_record(folder, SpeedLog, settings.log),
         depth=read_record(folder, Depth, settings.depth),

@@ -17,6 +17,7 @@ import msgspec
 
 from factorgraph_dvl.errors import ConfigError
 from factorgraph_dvl.sensors.protocol import Section
+from factorgraph_dvl.text import printable
 from factorgraph_dvl.yaml_file import read_yaml
 
 
@@ -53,4 +54,4 @@ def read_segments(path: Path) -> tuple[tuple[float, float, str], ...]:
                 where=f"{path.name} key segments",
                 expected="each to start where the one before has ended, or later",
             )
-    return tuple((s.start_s, s.end_s, s.label) for s in found)
+    return tuple((s.start_s, s.end_s, printable(s.label)) for s in found)

@@ -19,7 +19,7 @@ from factorgraph_dvl.io.folders import new_folder
 from factorgraph_dvl.io.motion_table import COLUMNS as MOTION_COLUMNS
 from factorgraph_dvl.io.motion_table import motion_columns
 from factorgraph_dvl.io.tables import read_table, write_table
-from factorgraph_dvl.sensors.protocol import stack
+from factorgraph_dvl.sensors.protocol import check_possible, check_times, stack
 from factorgraph_dvl.solution import Hypothesis, Residuals, Solution, Trajectory
 
 TRAJECTORY_FILE = "trajectory.csv"
@@ -209,6 +209,8 @@ def _smoothed_columns(trajectory: Trajectory, smoothed: Trajectory) -> dict[str,
 
 def _read_trajectory(file: Path) -> Trajectory:
     columns = read_table(file, (*MOTION_COLUMNS, *STD_COLUMNS), source=str(file))
+    check_times(columns["time_s"], str(file))
+    check_possible(columns, str(file))
     return Trajectory(
         time=columns["time_s"],
         geodetic=stack(columns, MOTION_COLUMNS[1:4]) * GEODETIC_SI,

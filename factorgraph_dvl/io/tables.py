@@ -56,17 +56,30 @@ def read_table(
         raise DataError(f"the file {what}", where=source, expected=f"a table at {path}")
     is_parquet = path.suffix.lower() in _PARQUET
     try:
-        header = _parquet_header(path, source) if is_parquet else _csv_header(path, source)
+        header = _parquet_header(path) if is_parquet else _csv_header(path, source)
         names = _choose(header, required, optional, source)
         table = (_read_parquet if is_parquet else _read_csv)(path, header, names, source)
-    except OSError as error:
-        reason = error.strerror or str(error)
-        raise DataError(f"cannot be read ({reason})", where=source) from error
+        columns = {
+            name: _text(table, name) if name in TEXT else _numbers(table, name) for name in names
+        }
+    except MemoryError:
+        raise
+    except (OSError, pa.ArrowException, UnicodeDecodeError) as error:
+        # Damage shows at any step, and Arrow says the same by many exceptions.
+        reason = getattr(error, "strerror", None) or str(error).partition("\n")[0]
+        expected = "a Parquet file that is whole" if is_parquet else ""
+        raise DataError(f"cannot be read ({reason})", where=source, expected=expected) from None
     absent = np.full(table.num_rows, np.nan)
-    columns = {
-        name: _text(table, name) if name in TEXT else _numbers(table, name) for name in names
-    }
     return {name: columns.get(name, absent) for group in (required, *optional) for name in group}
+
+
+def count_rows(path: Path) -> int:
+    """Return about how many rows a table has, without reading them."""
+    if path.suffix.lower() in _PARQUET:
+        return int(pyarrow.parquet.read_metadata(path).num_rows)
+    with path.open("rb") as file:
+        lines = sum(block.count(b"\n") for block in iter(lambda: file.read(1 << 20), b""))
+    return lines - 1
 
 
 def write_table(path: Path, columns: Mapping[str, NDArray[Any]]) -> None:
@@ -83,7 +96,7 @@ def write_table(path: Path, columns: Mapping[str, NDArray[Any]]) -> None:
         }
     )
     if path.suffix.lower() in _PARQUET:
-        pyarrow.parquet.write_table(table, path)
+        pyarrow.parquet.write_table(table, path, write_page_checksum=True)
         return
     with path.open("wb") as file:
         file.write((",".join(columns) + "\n").encode())
@@ -209,17 +222,12 @@ def _is_number(cell: str) -> bool:
     return True
 
 
-def _parquet_header(path: Path, source: str) -> list[str]:
-    try:
-        return list(pyarrow.parquet.read_schema(path).names)
-    except pa.ArrowInvalid as error:
-        raise DataError(
-            "is not a Parquet file", where=source, expected="a table of numbers"
-        ) from error
+def _parquet_header(path: Path) -> list[str]:
+    return list(pyarrow.parquet.read_schema(path).names)
 
 
 def _read_parquet(path: Path, header: list[str], names: list[str], source: str) -> pa.Table:
-    table = pyarrow.parquet.read_table(path, columns=names)
+    table = pyarrow.parquet.read_table(path, columns=names, page_checksum_verification=True)
     for field in table.schema:
         if field.name in TEXT:
             continue

@@ -14,7 +14,13 @@ from msgspec import UNSET, UnsetType
 
 from factorgraph_dvl.conventions import DEG, GEODETIC_SI, Array, BodyAxes
 from factorgraph_dvl.errors import ConfigError, DataError
-from factorgraph_dvl.io.calibration_file import check_usable, encode_calibration, load_calibration
+from factorgraph_dvl.files import MEGABYTE, read_bytes
+from factorgraph_dvl.io.calibration_file import (
+    check_usable,
+    check_values,
+    encode_calibration,
+    load_calibration,
+)
 from factorgraph_dvl.io.folders import SETTINGS_FILE, new_folder
 from factorgraph_dvl.io.motion_table import motion_columns, read_reference
 from factorgraph_dvl.io.tables import read_table, write_table
@@ -37,6 +43,7 @@ from factorgraph_dvl.sensors.imu import Imu
 from factorgraph_dvl.sensors.log import Heading, SpeedLog
 from factorgraph_dvl.sensors.protocol import Aid, JointPrior, Record, SensorSection
 from factorgraph_dvl.solution import Calibration, Estimate
+from factorgraph_dvl.text import printable
 from factorgraph_dvl.trial import InitialAttitude, InitialPosition, Reference, Trial
 from factorgraph_dvl.yaml_file import parse_yaml, read_text
 
@@ -110,7 +117,7 @@ def load_trial(path: Path | str) -> Trial:
             "instrument, its noise counts twice, and standard deviations come out too small"
         )
     return Trial(
-        name=settings.name or folder.resolve().name,
+        name=printable(settings.name or folder.resolve().name),
         imu=read_record(folder, Imu, settings.imu),
         gnss=cast("Gnss | None", aids.pop(Gnss.section, None)),
         dvl=dvl if dvl is None else _with_calibration(dvl, folder, settings.body_axes),
@@ -150,6 +157,19 @@ def load_reference(path: Path | str) -> tuple[Reference | None, dict[str, Array]
     else:
         settings = parse_yaml(text, TrialSettings, source=file.name)
     return reference_of(folder, settings), read_truth(folder / TRUTH_FILE)
+
+
+def record_files(path: Path) -> list[Path]:
+    """Return the tables of a trial's sensors, that of the IMU first.
+
+    Raises
+    ------
+    ConfigError, DataError
+        As `load_trial`.
+    """
+    folder, file = locate(path)
+    settings = parse_yaml(read_text(file), TrialSettings, source=file.name)
+    return [folder / section.file for section in (settings.imu, *settings.aids.values())]
 
 
 def save_trial(
@@ -421,15 +441,22 @@ def read_truth(path: Path) -> dict[str, Array]:
     """Return the true calibration of a truth.json; empty if there is no such file."""
     if not path.exists():
         return {}
+    expected = '{"parameters": {name: {"value": [numbers]}}}'
+    content = read_bytes(path, limit=MEGABYTE, expected=expected)
     try:
-        truth = msgspec.json.decode(path.read_bytes(), type=_Truth)
-    except (msgspec.MsgspecError, UnicodeDecodeError) as error:
-        raise DataError(
-            f"cannot be read ({error})",
-            where=path.name,
-            expected='{"parameters": {name: {"value": [numbers]}}}',
-        ) from None
-    return {name: np.array(item.value) for name, item in truth.parameters.items()}
+        truth = msgspec.json.decode(content, type=_Truth)
+    except (msgspec.MsgspecError, ValueError, RecursionError) as error:
+        raise DataError(f"cannot be read ({error})", where=path.name, expected=expected) from None
+    out = {}
+    for name, item in truth.parameters.items():
+        try:
+            out[printable(name)] = np.array(item.value, dtype=float)
+        except ValueError:
+            raise DataError(
+                f"{name}: the vectors differ in size", where=path.name, expected=expected
+            ) from None
+        check_values(name, out[printable(name)], path.name)
+    return out
 
 
 def truth_json(truth: dict[str, Array]) -> bytes:

@@ -15,26 +15,22 @@ from factorgraph_dvl.sensors.imu import ImuSettings
 from factorgraph_dvl.sensors.log import HeadingSettings, LogSettings
 from factorgraph_dvl.sensors.protocol import Section, SensorSection, Sigma3, check_epoch
 
-_Latitude = Annotated[float, Meta(ge=-90, le=90)]
-_Longitude = Annotated[float, Meta(ge=-360, le=360)]
-_Height = Annotated[float, Meta(ge=-12e3, le=20e3)]
-_Turn = Annotated[float, Meta(ge=-360, le=360)]
 _Pitch = Annotated[float, Meta(ge=-90, le=90)]
 
 
 class PositionSettings(Section, frozen=True, kw_only=True):
     """`initial.position` of trial.yaml."""
 
-    lat_deg: _Latitude
-    lon_deg: _Longitude
-    height_m: _Height
+    lat_deg: float
+    lon_deg: float
+    height_m: float
     std_m: Sigma3
 
 
 class InitialSettings(Section, frozen=True, kw_only=True):
     """Section `initial` of trial.yaml."""
 
-    roll_pitch_heading_deg: tuple[_Turn, _Pitch, _Turn] | UnsetType = UNSET
+    roll_pitch_heading_deg: tuple[float, _Pitch, float] | UnsetType = UNSET
     std_deg: Sigma3 | UnsetType = UNSET
     position: PositionSettings | UnsetType = UNSET
 

@@ -46,9 +46,9 @@ _NAMES = re.compile(r"[A-Za-z0-9_-]+")
 class BeaconPosition(Section, frozen=True, kw_only=True):
     """One of `beacons.positions` of trial.yaml."""
 
-    lat_deg: Annotated[float, msgspec.Meta(ge=-90, le=90)]
-    lon_deg: Annotated[float, msgspec.Meta(ge=-360, le=360)]
-    height_m: Annotated[float, msgspec.Meta(ge=-12e3, le=20e3)]
+    lat_deg: float
+    lon_deg: float
+    height_m: float
     std_m: NonNegative = 0.0
 
     @property

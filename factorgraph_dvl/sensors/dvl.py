@@ -60,7 +60,7 @@ class DvlSettings(SensorSection, frozen=True, kw_only=True):
     misalignment_std_deg: Sigma3 = (180.0, 180.0, 180.0)
     scale_error: float | Vector3 = 0.0
     # msgspec (0.22 at least) corrupts memory where a union holds a constrained number and
-    # a tuple of fixed length, so the number is checked below.
+    # a tuple of fixed length; the number is checked by its name.
     scale_error_std: float | Sigma3 = 0.1
     lever_arm_m: Vector3 = (0.0, 0.0, 0.0)
     lever_arm_std_m: Sigma3 = (10.0, 10.0, 10.0)
@@ -75,8 +75,6 @@ class DvlSettings(SensorSection, frozen=True, kw_only=True):
         scales = np.atleast_1d(self.scale_error)
         if np.any(scales <= -1.0):
             raise ValueError("`scale_error` must be above -1")
-        if np.any(np.atleast_1d(self.scale_error_std) < 0.0):
-            raise ValueError("`scale_error_std` must be 0 or above")
 
 
 @dataclass(frozen=True)

@@ -21,6 +21,7 @@ from factorgraph_dvl.sensors.protocol import (
     Values,
     Vector3,
     check_all_or_none,
+    check_possible,
     check_range,
     check_times,
     lever_arm_sigma,
@@ -90,21 +91,21 @@ class Gnss:
         check_all_or_none(position, self.source)
         velocity = named_columns(VELOCITY_COLUMNS, self.velocity)
         check_all_or_none(velocity, self.source)
-        degrees = {k: v / DEG for k, v in position.items()}
-        check_range({"lat_deg": degrees["lat_deg"]}, -90.0, 90.0, "deg", self.source)
-        check_range({"lon_deg": degrees["lon_deg"]}, -360.0, 360.0, "deg", self.source)
-        check_range({"height_m": position["height_m"]}, -12e3, 20e3, "m", self.source)
+        degrees = {k: position[k] / DEG for k in POSITION_COLUMNS[:2]}
+        check_possible(degrees | {"height_m": position["height_m"]}, self.source)
         check_range(velocity, -200.0, 200.0, "m/s", self.source)
         for names, std in (
             (POSITION_STD_COLUMNS, self.position_std),
             (VELOCITY_STD_COLUMNS, self.velocity_std),
         ):
             check_range(named_columns(names, std), 1e-6, 1e6, "above 0", self.source)
-        for std, default in (
-            (self.position_std, self.settings.position_std_m),
-            (self.velocity_std, self.settings.velocity_std_m_s),
+        for name, default in (
+            ("position_std", self.settings.position_std_m),
+            ("velocity_std", self.settings.velocity_std_m_s),
         ):
-            np.copyto(std, np.broadcast_to(default, std.shape), where=np.isnan(std))
+            std = getattr(self, name)
+            # A new array: the one that was given is the caller's.
+            object.__setattr__(self, name, np.where(np.isnan(std), default, std))
 
     @classmethod
     def from_columns(

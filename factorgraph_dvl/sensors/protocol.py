@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, field
 from datetime import datetime
@@ -18,6 +17,7 @@ from factorgraph_dvl.conventions import Array, exp_so3
 from factorgraph_dvl.directions import turns_to
 from factorgraph_dvl.earth import LocalFrame
 from factorgraph_dvl.errors import DataError
+from factorgraph_dvl.ranges import out_of_range, range_of
 
 Positive = Annotated[float, msgspec.Meta(gt=0)]
 NonNegative = Annotated[float, msgspec.Meta(ge=0)]
@@ -40,8 +40,8 @@ class Section(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
 
     def __post_init__(self) -> None:
         for name in self.__struct_fields__:
-            if not _finite(getattr(self, name)):
-                raise ValueError(f"`{name}` must be finite")
+            if wrong := out_of_range(name, _numbers(getattr(self, name))):
+                raise ValueError(wrong)
 
 
 def check_epoch(epoch: str) -> None:
@@ -53,12 +53,12 @@ def check_epoch(epoch: str) -> None:
         raise ValueError("`epoch` must be a date and time such as 2022-10-12T02:00:00Z") from None
 
 
-def _finite(value: Any) -> bool:
+def _numbers(value: Any) -> Iterator[float]:
     if isinstance(value, float):
-        return math.isfinite(value)
-    if isinstance(value, (tuple, list)):
-        return all(_finite(item) for item in value)
-    return True
+        yield value
+    elif isinstance(value, (tuple, list)):
+        for item in value:
+            yield from _numbers(item)
 
 
 @dataclass(frozen=True)
@@ -400,6 +400,7 @@ def check_times(time: Array, source: str) -> None:
     bad = np.flatnonzero(~np.isfinite(time))
     if bad.size:
         raise DataError("time_s is not a number", where=at_row(source, bad[0]))
+    check_possible({"time_s": time}, source)
     bad = np.flatnonzero(np.diff(time) <= 0.0)
     if bad.size:
         i = int(bad[0]) + 1
@@ -434,6 +435,13 @@ def check_range(
                 where=at_row(source, bad[0]),
                 expected=f"{low:g} to {high:g} {unit}",
             )
+
+
+def check_possible(columns: Mapping[str, Array], source: str) -> None:
+    """Raise DataError where a value that is present cannot be, by the name of its column."""
+    for name, values in columns.items():
+        if limits := range_of(name):
+            check_range({name: values}, limits.low, limits.high, limits.unit, source)
 
 
 def check_all_or_none(columns: Mapping[str, Array], source: str) -> None:
