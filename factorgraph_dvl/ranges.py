@@ -54,6 +54,11 @@ _VALUES = {
     "scale_error": Range(-10.0, 10.0, ""),
     "sound_speed_error": Range(-1.0, 1.0, ""),
     "ppm": Range(-1e6, 1e6, "ppm"),
+    **dict.fromkeys(("qw", "qx", "qy", "qz"), Range(-2.0, 2.0, "")),
+    **dict.fromkeys(
+        (*("body_x", "body_y", "body_z"), *("inertial_x", "inertial_y", "inertial_z")),
+        Range(-1e6, 1e6, ""),
+    ),
     "directions": Range(-2.0, 2.0, ""),
     "stars": Range(-1e6, 1e6, ""),
 }

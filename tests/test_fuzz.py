@@ -11,9 +11,12 @@ from dataclasses import replace
 from pathlib import Path
 from time import perf_counter
 
+import numpy as np
 import pytest
 import yaml
 from builders import build_solution, build_trial
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from truth import CONFIGS
 
 from factorgraph_dvl.analysis.planar_survey import survey_planar
@@ -23,9 +26,12 @@ from factorgraph_dvl.io.foreign import load_results, load_truth, read_calibratio
 from factorgraph_dvl.io.planar_folder import is_planar, load_planar_trial, save_planar_trial
 from factorgraph_dvl.io.segments_file import read_segments
 from factorgraph_dvl.io.solution_folder import load_solution, save_solution
-from factorgraph_dvl.io.trial_folder import load_trial, save_trial
+from factorgraph_dvl.io.trial_folder import load_trial, read_record, save_trial
+from factorgraph_dvl.io.trial_yaml import TrialSettings
 from factorgraph_dvl.planning import load_plan
+from factorgraph_dvl.sensors.depth import Depth, DepthSettings
 from factorgraph_dvl.simulation import load_scenario, parse_scenario, simulate, simulate_planar
+from factorgraph_dvl.yaml_file import parse_yaml
 
 SEED = 20240131
 # No file here takes longer than this to be refused; a hang takes for ever.
@@ -64,6 +70,12 @@ EVERYTHING = {
     "turntable": {"rate_hz": 1},
     "beacons": {"rate_hz": 1, "positions": {"B1": PLANAR["beacons"]["positions"]["B1"]}},
     "trial": {"imu": {"gyro_bias_std_deg_h": 1, "accel_bias_std_ug": 1000}},
+}
+IMU = {
+    "gyro_noise_deg_sqrt_h": 0.01,
+    "gyro_bias_std_deg_h": 1,
+    "accel_noise_ug_sqrt_hz": 100,
+    "accel_bias_std_ug": 1000,
 }
 SEGMENTS = "segments:\n  - {start_s: 0, end_s: 12, label: alongside}\n"
 TYPED_IN = (
@@ -219,3 +231,56 @@ def test_many_damaged_files_raise_nothing_else(cases: list[Case]) -> None:
     done, bad = fuzz(cases, 7000, 3600.0)
     assert done == 7000
     assert not bad, f"{len(bad)} of {done}\n" + "\n".join(bad)
+
+
+# Whatever YAML can hold, of moderate size.
+ANYTHING = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=20),
+    lambda inner: (
+        st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=10), inner, max_size=4)
+    ),
+    max_leaves=8,
+)
+
+
+@settings(
+    derandomize=True,
+    max_examples=60,
+    deadline=None,
+)
+@given(data=st.data())
+def test_any_value_of_any_key_is_read_or_refused(data: st.DataObject) -> None:
+    section = data.draw(st.sampled_from(sorted(EVERYTHING)))
+    value = data.draw(ANYTHING)
+    scenario = dict(EVERYTHING)
+    inner = scenario[section]
+    if isinstance(inner, dict) and data.draw(st.booleans()):
+        scenario[section] = inner | {data.draw(st.sampled_from(sorted(inner))): value}
+    else:
+        scenario[section] = value
+    with suppress(FactorgraphDvlError):
+        parse_scenario(scenario)
+
+
+@settings(derandomize=True, max_examples=60, deadline=None)
+@given(
+    key=st.sampled_from(("file", "std_m", "lever_arm_m", "sea_surface_height_m")), value=ANYTHING
+)
+def test_any_setting_of_a_trial_is_read_or_refused(key: str, value: object) -> None:
+    described = {"format": 1, "imu": IMU, "depth": {key: value}}
+    with suppress(FactorgraphDvlError):
+        parse_yaml(yaml.safe_dump(described), TrialSettings, source="trial.yaml")
+
+
+@settings(derandomize=True, max_examples=60, deadline=None)
+@given(cells=st.lists(st.tuples(st.floats(), st.floats()), min_size=1, max_size=5))
+def test_any_numbers_in_a_table_are_read_or_refused(
+    tmp_path_factory: pytest.TempPathFactory, cells: list[tuple[float, float]]
+) -> None:
+    path = tmp_path_factory.mktemp("tables")
+    rows = "".join(f"{time!r},{depth!r}\n" for time, depth in cells)
+    (path / "depth.csv").write_text("time_s,depth_m\n" + rows)
+    with suppress(FactorgraphDvlError):
+        record = read_record(path, Depth, DepthSettings())
+        assert np.all(np.diff(record.time) > 0.0)
+        assert np.all(np.isnan(record.depth) | (np.abs(record.depth) <= 12e3))

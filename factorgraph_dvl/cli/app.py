@@ -28,6 +28,8 @@ from factorgraph_dvl.errors import FactorgraphDvlError
 from factorgraph_dvl.text import printable
 
 _NAME = "factorgraph-dvl"
+# The exit code of an interrupt, also as Typer has it.
+_INTERRUPTED = 130
 
 # A command's module loads nothing heavy at its top: GTSAM, SciPy, Matplotlib and Arrow take
 # seconds, and --help shall answer at once.
@@ -74,6 +76,8 @@ def run(args: list[str]) -> NoReturn:
         hint = "" if "--debug" in args else ". Run with --debug to see where"
         _fail(f"internal error: {type(error).__name__}: {error}{hint}", 1, args)
     except SystemExit as done:
+        if done.code == _INTERRUPTED:
+            _fail("interrupted", _INTERRUPTED, args)
         failure = output_failure()
         if failure is None or done.code:
             raise

@@ -56,7 +56,7 @@ def read_table(
         raise DataError(f"the file {what}", where=source, expected=f"a table at {path}")
     is_parquet = path.suffix.lower() in _PARQUET
     try:
-        header = _parquet_header(path) if is_parquet else _csv_header(path, source)
+        header = _parquet_header(path, source) if is_parquet else _csv_header(path, source)
         names = _choose(header, required, optional, source)
         table = (_read_parquet if is_parquet else _read_csv)(path, header, names, source)
         columns = {
@@ -222,8 +222,13 @@ def _is_number(cell: str) -> bool:
     return True
 
 
-def _parquet_header(path: Path) -> list[str]:
-    return list(pyarrow.parquet.read_schema(path).names)
+def _parquet_header(path: Path, source: str) -> list[str]:
+    try:
+        return list(pyarrow.parquet.read_schema(path).names)
+    except pa.ArrowInvalid as error:
+        raise DataError(
+            "is not a Parquet file", where=source, expected="a table of numbers"
+        ) from error
 
 
 def _read_parquet(path: Path, header: list[str], names: list[str], source: str) -> pa.Table:

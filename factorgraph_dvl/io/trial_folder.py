@@ -41,7 +41,13 @@ from factorgraph_dvl.sensors.dvl_beams import DvlBeams
 from factorgraph_dvl.sensors.gnss import Gnss
 from factorgraph_dvl.sensors.imu import Imu
 from factorgraph_dvl.sensors.log import Heading, SpeedLog
-from factorgraph_dvl.sensors.protocol import Aid, JointPrior, Record, SensorSection
+from factorgraph_dvl.sensors.protocol import (
+    Aid,
+    JointPrior,
+    Record,
+    SensorSection,
+    check_possible,
+)
 from factorgraph_dvl.solution import Calibration, Estimate
 from factorgraph_dvl.text import printable
 from factorgraph_dvl.trial import InitialAttitude, InitialPosition, Reference, Trial
@@ -377,6 +383,7 @@ def read_record(folder: Path, kind: type[_Sensor], settings: SensorSection) -> _
     """Return the record of a sensor, from the table that its settings name."""
     required = (*kind.required, *settings.more_columns)
     columns = read_table(folder / settings.file, required, kind.optional, source=settings.file)
+    check_possible(columns, settings.file)
     return kind.from_columns(settings, columns, settings.file)
 
 

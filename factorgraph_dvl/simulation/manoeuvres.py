@@ -13,6 +13,7 @@ from factorgraph_dvl.simulation.convert import convert
 
 # More than any trial has, far fewer than would exhaust memory.
 _MAX_MANOEUVRES = 100_000
+_LONGEST_S = 1e7
 
 
 class Accelerate(Section, frozen=True, kw_only=True):
@@ -51,6 +52,8 @@ class FigureEight(Section, frozen=True, kw_only=True):
         super().__post_init__()
         if self.figure_eight_deg_s == 0.0:
             raise ValueError("`figure_eight_deg_s` must not be 0")
+        if self.circle_s > _LONGEST_S:
+            raise ValueError(f"`figure_eight_deg_s`: a circle takes longer than {_LONGEST_S:g} s")
         if self.ramp_s > self.circle_s:
             raise ValueError("`ramp_s` must not exceed the time of a circle")
 

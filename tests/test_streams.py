@@ -1,0 +1,103 @@
+"""What becomes of output that cannot be written, of interrupts, of too little memory."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from builders import build_trial, edit, write_trial
+
+from factorgraph_dvl.cli.memory import naming_memory
+from factorgraph_dvl.errors import SolveError
+
+CLI = (sys.executable, "-m", "factorgraph_dvl.cli")
+
+
+def inspect(trial: Path, **streams: object) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [*CLI, "inspect", str(trial)], text=True, timeout=120, check=False, **streams
+    )
+
+
+def test_output_that_cannot_be_written_is_said_and_exits_1(tmp_path: Path) -> None:
+    trial = write_trial(tmp_path)
+    with open("/dev/full", "w") as full:
+        done = inspect(trial, stdout=full, stderr=subprocess.PIPE)
+    assert done.returncode == 1
+    assert "standard output cannot be written (No space left on device)" in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_a_reader_that_has_enough_is_no_error(tmp_path: Path) -> None:
+    trial = write_trial(tmp_path)
+    read, write = os.pipe()
+    os.close(read)
+    try:
+        done = inspect(trial, stdout=write, stderr=subprocess.PIPE)
+    finally:
+        os.close(write)
+    assert done.returncode == 0
+    assert done.stderr == ""
+
+
+def test_messages_that_cannot_be_written_change_no_exit_code(tmp_path: Path) -> None:
+    with open("/dev/full", "w") as full:
+        assert inspect(tmp_path / "none", stdout=full, stderr=full).returncode == 2
+
+
+@pytest.mark.parametrize("module", ["rich", "pyarrow", "scipy"])
+def test_an_interrupt_while_modules_load_is_one_line(tmp_path: Path, module: str) -> None:
+    trial = write_trial(tmp_path)
+    # Loading that module stands still, as it may on a slow disk.
+    stall = (
+        "import sys, time\n"
+        "class Stall:\n"
+        "    def find_spec(self, name, path=None, target=None):\n"
+        f"        if name == {module!r}:\n"
+        "            print('stalled', flush=True)\n"
+        "            time.sleep(60)\n"
+        "sys.meta_path.insert(0, Stall())\n"
+        "from factorgraph_dvl.cli import main\n"
+        f"main(['inspect', {str(trial)!r}])\n"
+    )
+    with subprocess.Popen(
+        [sys.executable, "-c", stall], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "stalled\n"
+        time.sleep(0.05)
+        process.send_signal(signal.SIGINT)
+        _, err = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert err == "error: interrupted\n"
+
+
+def test_too_little_memory_says_what_the_trial_takes(tmp_path: Path) -> None:
+    trial = write_trial(tmp_path)
+
+    def command(trial_path: Path) -> None:
+        raise MemoryError
+
+    with pytest.raises(SolveError) as caught:
+        naming_memory(command)(trial_path=trial)
+    samples = build_trial().imu.time.size
+    assert f"{samples} IMU samples" in str(caught.value)
+    assert "about 0.3 GB" in str(caught.value)
+    assert "lower rate" in str(caught.value)
+    assert caught.value.exit_code == 1
+
+
+def test_names_give_a_terminal_no_orders(tmp_path: Path) -> None:
+    trial = write_trial(tmp_path)
+    edit(trial / "trial.yaml", "name: by hand", 'name: "a\\e[31m\\x9b2J\u202eb"')
+    done = inspect(trial, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    assert r"a\x1b[31m\x9b2J\u202eb" in done.stdout
+    edit(trial / "trial.yaml", "body_axes:", '"k\\e[2J": 1\nbody_axes:')
+    done = inspect(trial, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    assert r"unknown key `k\x1b[2J`" in done.stderr
+    assert not set("\x1b\x9b\u202e") & set(done.stdout + done.stderr)
