@@ -28,7 +28,6 @@ from factorgraph_dvl.io.segments_file import read_segments
 from factorgraph_dvl.io.solution_folder import load_solution, save_solution
 from factorgraph_dvl.io.trial_folder import load_trial, read_record, save_trial
 from factorgraph_dvl.io.trial_yaml import TrialSettings
-from factorgraph_dvl.planning import load_plan
 from factorgraph_dvl.sensors.depth import Depth, DepthSettings
 from factorgraph_dvl.simulation import load_scenario, parse_scenario, simulate, simulate_planar
 from factorgraph_dvl.yaml_file import parse_yaml
@@ -140,7 +139,7 @@ def cases(tmp_path_factory: pytest.TempPathFactory) -> list[Case]:
         alone("typed.yaml", lambda path: load_truth(None, path)),
         alone("typed.yaml", lambda path: read_calibration_values(path, "RFU")),
         alone("scenario.yaml", load_scenario),
-        alone("plan.yaml", load_plan),
+        alone("plan.yaml", load_scenario),
     ]
     table = home / "solution" / "trajectory.csv"
     out.append((table, table, lambda path: load_results(path, path)))
