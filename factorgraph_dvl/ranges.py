@@ -46,7 +46,7 @@ _VALUES = {
     "m_s": Range(-1e3, 1e3, "m/s"),
     "m_s2": Range(-1e3, 1e3, "m/s²"),
     "rad_s": Range(-100.0, 100.0, "rad/s"),
-    "hz": Range(1e-6, 1e5, "Hz"),
+    "hz": Range(1e-15, 1e5, "Hz"),
     **dict.fromkeys(("straight_s", "duration_s", "stop_s", "ramp_s"), Range(0.0, 1e7, "s")),
     "offset_s": Range(-_DAY_S, _DAY_S, "s"),
     # Seconds since 1970 or 1980 are times, too.
