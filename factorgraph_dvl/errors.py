@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from factorgraph_dvl.text import printable
+import unicodedata
 
 
 class FactorgraphDvlError(Exception):
@@ -50,3 +50,19 @@ class SolveError(FactorgraphDvlError):
     """The input was valid, but no trustworthy solution was found."""
 
     exit_code = 1
+
+
+def printable(text: str) -> str:
+    r"""Return text with what does not print escaped, such as `\x1b` and `\u202e`.
+
+    These are control characters, which a terminal obeys, marks that turn the direction of
+    writing, and line breaks. Spaces of all scripts stay.
+    """
+    if text.isprintable():
+        return text
+    return "".join(
+        c
+        if c.isprintable() or unicodedata.category(c) == "Zs"
+        else c.encode("unicode_escape").decode("ascii")
+        for c in text
+    )

@@ -16,7 +16,6 @@ PACKAGE = Path(factorgraph_dvl.__file__).parent
 # Each line may import from the lines before it, and from its own line only within one
 # package. `a.b` stands for a module or a whole package.
 LAYERS = (
-    ("text",),
     ("conventions", "errors"),
     ("files", "ranges"),
     ("earth", "celestial", "yaml_file", "directions", "turning"),

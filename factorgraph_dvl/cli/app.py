@@ -24,8 +24,7 @@ from factorgraph_dvl.cli.replay import replay
 from factorgraph_dvl.cli.simulate import simulate
 from factorgraph_dvl.cli.solve import kalman, solve
 from factorgraph_dvl.cli.streams import guard_streams, output_failure
-from factorgraph_dvl.errors import FactorgraphDvlError
-from factorgraph_dvl.text import printable
+from factorgraph_dvl.errors import FactorgraphDvlError, printable
 
 _NAME = "factorgraph-dvl"
 # The exit code of an interrupt, also as Typer has it.

@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 from rich.text import Text
 
-from factorgraph_dvl.text import printable
+from factorgraph_dvl.errors import printable
 
 if TYPE_CHECKING:
     from types import TracebackType

@@ -14,13 +14,12 @@ from msgspec import UNSET, UnsetType
 
 from factorgraph_dvl.conventions import DEG, Array, BodyAxes
 from factorgraph_dvl.directions import turns_to
-from factorgraph_dvl.errors import DataError
+from factorgraph_dvl.errors import DataError, printable
 from factorgraph_dvl.files import MEGABYTE, read_bytes
 from factorgraph_dvl.fingerprint import PATTERN
 from factorgraph_dvl.ranges import out_of_range
 from factorgraph_dvl.sensors.dvl import CALIBRATED
 from factorgraph_dvl.solution import Calibration, Estimate, Solution
-from factorgraph_dvl.text import printable
 
 CALIBRATION_FILE = "calibration.json"
 

@@ -13,7 +13,7 @@ import numpy as np
 from msgspec import UNSET, UnsetType
 
 from factorgraph_dvl.conventions import DEG, Array, BodyAxes
-from factorgraph_dvl.errors import ConfigError, DataError
+from factorgraph_dvl.errors import ConfigError, DataError, printable
 from factorgraph_dvl.io.calibration_file import (
     CALIBRATION_FILE,
     check_usable,
@@ -34,7 +34,6 @@ from factorgraph_dvl.ranges import out_of_range
 from factorgraph_dvl.sensors.catalogue import every_parameter
 from factorgraph_dvl.sensors.protocol import Parameter, Section, check_range, stack
 from factorgraph_dvl.solution import Estimate, Solution, Trajectory
-from factorgraph_dvl.text import printable
 from factorgraph_dvl.trial import Reference
 from factorgraph_dvl.yaml_file import parse_yaml, read_text
 

@@ -7,6 +7,7 @@ from pathlib import Path
 import msgspec
 from msgspec import UNSET
 
+from factorgraph_dvl.errors import printable
 from factorgraph_dvl.io.folders import new_folder
 from factorgraph_dvl.io.motion_table import motion_columns
 from factorgraph_dvl.io.tables import write_table
@@ -31,7 +32,6 @@ from factorgraph_dvl.io.trial_yaml import (
 from factorgraph_dvl.sensors.beacon import Beacons
 from factorgraph_dvl.sensors.depth import Depth
 from factorgraph_dvl.sensors.log import Heading, SpeedLog
-from factorgraph_dvl.text import printable
 from factorgraph_dvl.trial import PlanarTrial
 from factorgraph_dvl.yaml_file import parse_yaml, read_text
 

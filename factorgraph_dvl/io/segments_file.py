@@ -15,9 +15,8 @@ from typing import Annotated
 
 import msgspec
 
-from factorgraph_dvl.errors import ConfigError
+from factorgraph_dvl.errors import ConfigError, printable
 from factorgraph_dvl.sensors.protocol import Section
-from factorgraph_dvl.text import printable
 from factorgraph_dvl.yaml_file import read_yaml
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from msgspec import UNSET, UnsetType
 
 from factorgraph_dvl.conventions import DEG, GEODETIC_SI, Array, BodyAxes
-from factorgraph_dvl.errors import ConfigError, DataError
+from factorgraph_dvl.errors import ConfigError, DataError, printable
 from factorgraph_dvl.files import MEGABYTE, read_bytes
 from factorgraph_dvl.io.calibration_file import (
     check_usable,
@@ -49,7 +49,6 @@ from factorgraph_dvl.sensors.protocol import (
     check_possible,
 )
 from factorgraph_dvl.solution import Calibration, Estimate
-from factorgraph_dvl.text import printable
 from factorgraph_dvl.trial import InitialAttitude, InitialPosition, Reference, Trial
 from factorgraph_dvl.yaml_file import parse_yaml, read_text
 
