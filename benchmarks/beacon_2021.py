@@ -14,10 +14,10 @@ from dataclasses import dataclass
 import common
 import numpy as np
 
-from factorgraph_dvl.kalman.single_beacon import run_filter
-from factorgraph_dvl.planar.hypotheses import follow
-from factorgraph_dvl.planar.problem import plan
-from factorgraph_dvl.planar.solve import solve_planar
+from factorgraph_dvl.baselines.single_beacon import run_filter
+from factorgraph_dvl.ranging.hypotheses import follow
+from factorgraph_dvl.ranging.planar_solution import solve_planar
+from factorgraph_dvl.ranging.problem import plan
 from factorgraph_dvl.simulation import parse_scenario, simulate_planar
 from factorgraph_dvl.trial import PlanarTrial
 

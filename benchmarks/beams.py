@@ -20,16 +20,17 @@ import numpy as np
 from common import config
 
 from factorgraph_dvl.analysis.beam_quality import calibration_of
-from factorgraph_dvl.analysis.consistency import (
+from factorgraph_dvl.analysis.error_statistics import (
     calibration_errors,
     nees_band,
     trajectory_errors,
 )
-from factorgraph_dvl.beam_geometry import as_dvl
-from factorgraph_dvl.conventions import DEG, DEG_PER_HOUR, exp_so3, rotation_from_rph
-from factorgraph_dvl.directions import turns_to
-from factorgraph_dvl.earth import RATE, radii
-from factorgraph_dvl.kalman import calibrate
+from factorgraph_dvl.baselines import calibrate
+from factorgraph_dvl.geometry.earth import RATE, radii
+from factorgraph_dvl.geometry.rotations import exp_so3, rotation_from_rph
+from factorgraph_dvl.geometry.unit_vectors import turns_to
+from factorgraph_dvl.geometry.units import DEG, DEG_PER_HOUR
+from factorgraph_dvl.sensors.beam_geometry import as_dvl
 from factorgraph_dvl.sensors.dvl import Dvl
 from factorgraph_dvl.simulation import parse_scenario, simulate
 from factorgraph_dvl.solution import Solution

@@ -16,11 +16,12 @@ import numpy as np
 from common import config, until
 from scipy.stats import norm
 
-from factorgraph_dvl.analysis.consistency import calibration_errors, nees_band
-from factorgraph_dvl.celestial import earth_from_inertial
-from factorgraph_dvl.conventions import DEG_PER_HOUR, log_so3
-from factorgraph_dvl.earth import RATE
-from factorgraph_dvl.kalman import History, calibrate
+from factorgraph_dvl.analysis.error_statistics import calibration_errors, nees_band
+from factorgraph_dvl.baselines import History, calibrate
+from factorgraph_dvl.geometry.celestial import earth_from_inertial
+from factorgraph_dvl.geometry.earth import RATE
+from factorgraph_dvl.geometry.rotations import log_so3
+from factorgraph_dvl.geometry.units import DEG_PER_HOUR
 from factorgraph_dvl.simulation import parse_scenario, simulate
 from factorgraph_dvl.solution import Solution
 from factorgraph_dvl.solvers.batch import solve

@@ -16,8 +16,8 @@ import common
 import msgspec
 import numpy as np
 
-from factorgraph_dvl.analysis.consistency import calibration_errors, nees_band, paper_accuracy
-from factorgraph_dvl.kalman import History, calibrate
+from factorgraph_dvl.analysis.error_statistics import calibration_errors, nees_band, paper_accuracy
+from factorgraph_dvl.baselines import History, calibrate
 from factorgraph_dvl.simulation import parse_scenario, simulate
 from factorgraph_dvl.solution import Solution
 from factorgraph_dvl.solvers.batch import solve

@@ -34,13 +34,14 @@ import yaml
 from common import ROOT
 
 from factorgraph_dvl import load_trial
-from factorgraph_dvl.alignment import initial_states
-from factorgraph_dvl.chain import Chain, inertial_chain
-from factorgraph_dvl.conventions import DEG_PER_HOUR, exp_so3, log_so3, rotation_from_rph
-from factorgraph_dvl.earth import RATE, enu_from_ecef
-from factorgraph_dvl.graph import Problem
-from factorgraph_dvl.increments import increments
-from factorgraph_dvl.preintegration import States, segments
+from factorgraph_dvl.geometry.earth import RATE, enu_from_ecef
+from factorgraph_dvl.geometry.rotations import exp_so3, log_so3, rotation_from_rph
+from factorgraph_dvl.geometry.units import DEG_PER_HOUR
+from factorgraph_dvl.graph.inertial_chain import Chain, inertial_chain
+from factorgraph_dvl.graph.problem import Problem
+from factorgraph_dvl.imu.increments import increments
+from factorgraph_dvl.imu.preintegration import States, segments
+from factorgraph_dvl.initialization.in_motion_alignment import initial_states
 from factorgraph_dvl.sensors.protocol import Aid
 from factorgraph_dvl.simulation import parse_scenario, plan_motion, simulate
 from factorgraph_dvl.solvers.batch import solve

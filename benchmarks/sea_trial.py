@@ -16,14 +16,15 @@ import common
 import numpy as np
 from common import config, rms
 
-from factorgraph_dvl.analysis.before_after import BeforeAfter, before_after
-from factorgraph_dvl.analysis.consistency import trajectory_errors
-from factorgraph_dvl.attitude import Attitude
-from factorgraph_dvl.conventions import DEG_PER_HOUR, Array
+from factorgraph_dvl.analysis.dead_reckoning.before_after import BeforeAfter, before_after
+from factorgraph_dvl.analysis.error_statistics import trajectory_errors
+from factorgraph_dvl.baselines import sins
+from factorgraph_dvl.geometry.units import DEG_PER_HOUR
+from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.imu.attitude_history import AttitudeHistory
 from factorgraph_dvl.io.trial_folder import calibrated_by
-from factorgraph_dvl.kalman import sins
-from factorgraph_dvl.report.dead_reckoning_figures import errors_figure, lever_arm_figure
-from factorgraph_dvl.report.drawing import save_figures
+from factorgraph_dvl.report.figures.dead_reckoning import errors_figure, lever_arm_figure
+from factorgraph_dvl.report.figures.drawing import save_figures
 from factorgraph_dvl.simulation import parse_scenario, simulate
 from factorgraph_dvl.solution import Calibration, Solution
 from factorgraph_dvl.solvers.batch import solve
@@ -77,16 +78,16 @@ def calibrate(seed: int) -> Calibration:
     return Calibration(**{n: getattr(solution, n) for n in names})
 
 
-def by_sins(trial: Trial, align_s: float | None = None) -> Attitude:
+def by_sins(trial: Trial, align_s: float | None = None) -> AttitudeHistory:
     """Return the attitude of a SINS that GNSS aids while it is there, or for some time."""
     motion, bias, _ = sins(trial, align_s=align_s)
-    return Attitude(trial.imu, motion, trial.body_axes, bias)
+    return AttitudeHistory(trial.imu, motion, trial.body_axes, bias)
 
 
-def by_solution(trial: Trial, solution: Solution) -> Attitude:
+def by_solution(trial: Trial, solution: Solution) -> AttitudeHistory:
     """Return the attitude of a solution."""
     bias = solution.estimate("gyro_bias_deg_h").value * DEG_PER_HOUR
-    return Attitude(trial.imu, solution.trajectory, trial.body_axes, bias)
+    return AttitudeHistory(trial.imu, solution.trajectory, trial.body_axes, bias)
 
 
 def transits(trial: Trial, calibration: Calibration) -> dict[str, BeforeAfter]:
@@ -94,7 +95,7 @@ def transits(trial: Trial, calibration: Calibration) -> dict[str, BeforeAfter]:
     sources = (
         by_sins(trial),
         by_sins(trial, ALIGN_S),
-        Attitude(trial.imu, trial.reference, trial.body_axes, np.zeros(3)),
+        AttitudeHistory(trial.imu, trial.reference, trial.body_axes, np.zeros(3)),
     )
     return {
         name: before_after(trial, calibration.values, source.at)

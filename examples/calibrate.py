@@ -13,7 +13,8 @@ from pathlib import Path
 import numpy as np
 
 from factorgraph_dvl import load_trial, solve
-from factorgraph_dvl.conventions import DEG, exp_so3
+from factorgraph_dvl.geometry.rotations import exp_so3
+from factorgraph_dvl.geometry.units import DEG
 
 SHIPPED = Path(__file__).resolve().parent.parent / "data" / "seed-a-phase-90"
 

@@ -8,9 +8,11 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from scipy.special import chdtrc
 
-from factorgraph_dvl.conventions import DEG, Array, BodyAxes
-from factorgraph_dvl.directions import turned
-from factorgraph_dvl.earth import LocalFrame
+from factorgraph_dvl.geometry.earth import LocalFrame
+from factorgraph_dvl.geometry.rotations import BodyAxes
+from factorgraph_dvl.geometry.unit_vectors import turned
+from factorgraph_dvl.geometry.units import DEG
+from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.sensors.protocol import DO_NOT_FIT, TOO_LARGE, Parameter
 
 _FAR_FROM_PRIOR = 5.0
@@ -276,7 +278,9 @@ def as_estimates(
     return tuple(estimates)
 
 
-def doubts(estimates: Sequence[Estimate], residuals: Sequence[Residuals]) -> list[str]:
+def consistency_warnings(
+    estimates: Sequence[Estimate], residuals: Sequence[Residuals]
+) -> list[str]:
     """Return warnings where a solution contradicts what was stated before.
 
     Residuals that are larger than their standard deviations make every reported standard

@@ -8,19 +8,20 @@ from typing import ClassVar
 
 import numpy as np
 
-from factorgraph_dvl.beam_geometry import as_dvl
-from factorgraph_dvl.conventions import Array, BodyAxes, frd_from_body
-from factorgraph_dvl.earth import LocalFrame
 from factorgraph_dvl.errors import DataError
-from factorgraph_dvl.fingerprint import fingerprints, shared
+from factorgraph_dvl.geometry.earth import LocalFrame
+from factorgraph_dvl.geometry.rotations import BodyAxes, frd_from_body
+from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.sensors.beacon import Beacons
+from factorgraph_dvl.sensors.beam_geometry import as_dvl
 from factorgraph_dvl.sensors.depth import Depth
 from factorgraph_dvl.sensors.dvl import Dvl
 from factorgraph_dvl.sensors.dvl_beams import DvlBeams
+from factorgraph_dvl.sensors.fingerprint import fingerprints, shared
 from factorgraph_dvl.sensors.gnss import Gnss
 from factorgraph_dvl.sensors.imu import Imu
-from factorgraph_dvl.sensors.log import Heading, SpeedLog
 from factorgraph_dvl.sensors.protocol import Aid
+from factorgraph_dvl.sensors.speed_log import Heading, SpeedLog
 from factorgraph_dvl.sensors.turntable import Turntable
 
 

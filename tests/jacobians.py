@@ -7,7 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from factorgraph_dvl.conventions import Array, exp_so3
+from factorgraph_dvl.geometry.rotations import exp_so3
+from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.sensors.protocol import Motion, Observation, Parameter
 
 STEP = 1e-6

@@ -9,12 +9,14 @@ from typing import Any
 import numpy as np
 import yaml
 
-from factorgraph_dvl.conventions import DEG_PER_HOUR, MICRO_G, Array, rotate, rotation_from_rph
-from factorgraph_dvl.earth import LocalFrame
-from factorgraph_dvl.preintegration import States
+from factorgraph_dvl.geometry.earth import LocalFrame
+from factorgraph_dvl.geometry.rotations import rotation_from_rph
+from factorgraph_dvl.geometry.units import DEG_PER_HOUR, MICRO_G
+from factorgraph_dvl.geometry.vectors import Array, rotate
+from factorgraph_dvl.imu.preintegration import States
 from factorgraph_dvl.sensors.protocol import Motion
 from factorgraph_dvl.simulation import parse_scenario, plan_motion
-from factorgraph_dvl.simulation.motion import Motion as ExactMotion
+from factorgraph_dvl.simulation.motion import TrueMotion as ExactMotion
 from factorgraph_dvl.simulation.scenario import Scenario
 
 CONFIGS = Path(__file__).parent.parent / "configs"

@@ -8,15 +8,17 @@ from dataclasses import dataclass
 import numpy as np
 from msgspec import UnsetType
 
-from factorgraph_dvl.beam_geometry import (
+from factorgraph_dvl.errors import DataError
+from factorgraph_dvl.geometry.rotations import exp_so3
+from factorgraph_dvl.geometry.units import DEG
+from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.sensors.beam_geometry import (
     error_rows,
     error_velocity,
     group_velocities,
     groups,
     velocities,
 )
-from factorgraph_dvl.conventions import DEG, Array, exp_so3
-from factorgraph_dvl.errors import DataError
 from factorgraph_dvl.sensors.dvl_beams import DIRECTION, SCALE_ERROR, DvlBeams
 from factorgraph_dvl.solution import Calibration, Solution, values_of
 

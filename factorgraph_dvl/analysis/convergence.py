@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from factorgraph_dvl.analysis.consistency import true_value_of
-from factorgraph_dvl.conventions import Array
+from factorgraph_dvl.analysis.error_statistics import true_value_of
 from factorgraph_dvl.errors import ConfigError
+from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.solution import Estimate
 from factorgraph_dvl.trial import Trial
 

@@ -89,7 +89,7 @@ def print_written(out: Path) -> None:
 
 def print_table(table: Table) -> None:
     """Print a table whole: one wider than the terminal is wrapped by that, never cut."""
-    from factorgraph_dvl.report.tables import width_of
+    from factorgraph_dvl.report.terminal.tables import width_of
 
     console = stdout()
     console.width = max(console.width, width_of(table))

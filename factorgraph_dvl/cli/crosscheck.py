@@ -12,7 +12,7 @@ from factorgraph_dvl.cli.console import print_table, print_written, stdout, warn
 from factorgraph_dvl.cli.options import Force, NoFigures, claim_output
 
 if TYPE_CHECKING:
-    from factorgraph_dvl.analysis.crosscheck import CrossCheck
+    from factorgraph_dvl.analysis.comparison.crosscheck import CrossCheck
 
 
 class Side(StrEnum):
@@ -45,12 +45,12 @@ def crosscheck(
     no_figures: NoFigures = False,
 ) -> None:
     """Hold two results of one trial against each other, and against the truth."""
-    from factorgraph_dvl.analysis.crosscheck import crosscheck as compare
+    from factorgraph_dvl.analysis.comparison.crosscheck import crosscheck as compare
+    from factorgraph_dvl.io.external_results import load_results, load_truth
     from factorgraph_dvl.io.folders import new_folder
-    from factorgraph_dvl.io.foreign import load_results, load_truth
     from factorgraph_dvl.io.tables import write_table
     from factorgraph_dvl.io.trial_folder import inputs_of
-    from factorgraph_dvl.report.crosscheck_files import OWNED, difference_columns, to_csv, to_json
+    from factorgraph_dvl.report.files.crosscheck import OWNED, difference_columns, to_csv, to_json
 
     given = [path for path in (a, b, reference, truth) if path is not None]
     read = [path for source in given for path in inputs_of(source)]
@@ -76,7 +76,7 @@ def crosscheck(
 
 
 def _draw_crosscheck(check: CrossCheck, folder: Path) -> None:
-    from factorgraph_dvl.report.crosscheck_figures import write_crosscheck_figures
+    from factorgraph_dvl.report.figures.crosscheck import write_crosscheck_figures
 
     try:
         write_crosscheck_figures(check, folder)
@@ -85,7 +85,7 @@ def _draw_crosscheck(check: CrossCheck, folder: Path) -> None:
 
 
 def _print_crosscheck(check: CrossCheck, a: Path, b: Path) -> None:
-    from factorgraph_dvl.report import crosscheck_tables as tables
+    from factorgraph_dvl.report.terminal import crosscheck as tables
 
     console = stdout()
     for side, path, solution in (("A", a, check.a), ("B", b, check.b)):

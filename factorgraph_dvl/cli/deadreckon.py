@@ -7,18 +7,12 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from factorgraph_dvl.cli.console import (
-    ProgressLine,
-    print_table,
-    print_written,
-    stdout,
-    warn,
-)
+from factorgraph_dvl.cli.console import ProgressLine, print_table, print_written, stdout, warn
 from factorgraph_dvl.cli.options import Force, NoFigures, Quiet, TrialPath, claim_output
 
 if TYPE_CHECKING:
-    from factorgraph_dvl.analysis.before_after import BeforeAfter
-    from factorgraph_dvl.attitude import Attitude
+    from factorgraph_dvl.analysis.dead_reckoning.before_after import BeforeAfter
+    from factorgraph_dvl.imu.attitude_history import AttitudeHistory
     from factorgraph_dvl.trial import Trial
 
 
@@ -52,13 +46,13 @@ def deadreckon(
     quiet: Quiet = False,
 ) -> None:
     """Integrate the DVL's velocity, before and after calibration, and score the track."""
-    from factorgraph_dvl.analysis.before_after import before_after
+    from factorgraph_dvl.analysis.dead_reckoning.before_after import before_after
+    from factorgraph_dvl.io.external_results import read_calibration_values
     from factorgraph_dvl.io.folders import new_folder
-    from factorgraph_dvl.io.foreign import read_calibration_values
     from factorgraph_dvl.io.motion_table import motion_columns
     from factorgraph_dvl.io.tables import write_table
     from factorgraph_dvl.io.trial_folder import inputs_of, load_trial
-    from factorgraph_dvl.report.dead_reckoning_files import (
+    from factorgraph_dvl.report.files.dead_reckoning import (
         OWNED,
         RESULT_FILE,
         TRACK_FILE,
@@ -123,28 +117,30 @@ def _default_attitude(trial: Trial) -> str:
     return "reference" if trial.gnss is None and trial.reference is not None else "sins"
 
 
-def _attitude(trial: Trial, source: str, align: float | None) -> tuple[Attitude, tuple[str, ...]]:
+def _attitude(
+    trial: Trial, source: str, align: float | None
+) -> tuple[AttitudeHistory, tuple[str, ...]]:
     """Return whose attitude the track follows, and what is to be said of it."""
     import numpy as np
 
-    from factorgraph_dvl.attitude import Attitude
-    from factorgraph_dvl.conventions import DEG_PER_HOUR
     from factorgraph_dvl.errors import ConfigError
+    from factorgraph_dvl.geometry.units import DEG_PER_HOUR
+    from factorgraph_dvl.imu.attitude_history import AttitudeHistory
 
     if align is not None and source != "sins":
         raise ConfigError("goes with --attitude sins only", where="--align")
     if source == "sins":
-        from factorgraph_dvl.kalman import sins
+        from factorgraph_dvl.baselines import sins
 
         motion, bias, notes = sins(trial, align_s=align)
-        return Attitude(trial.imu, motion, trial.body_axes, bias), notes
+        return AttitudeHistory(trial.imu, motion, trial.body_axes, bias), notes
     if source == "reference":
         if trial.reference is None:
             raise ConfigError(
                 "the trial has no reference", where="--attitude reference",
                 expected="sins, or a solution folder",
             )  # fmt: skip
-        return Attitude(trial.imu, trial.reference, trial.body_axes, np.zeros(3)), ()
+        return AttitudeHistory(trial.imu, trial.reference, trial.body_axes, np.zeros(3)), ()
     from factorgraph_dvl.io.solution_folder import load_solution
 
     if not Path(source).is_dir():
@@ -160,11 +156,11 @@ def _attitude(trial: Trial, source: str, align: float | None) -> tuple[Attitude,
     bias = np.zeros(3)
     if "gyro_bias_deg_h" in names:
         bias = solution.estimate("gyro_bias_deg_h").value * DEG_PER_HOUR
-    return Attitude(trial.imu, solution.trajectory, solution.body_axes, bias), ()
+    return AttitudeHistory(trial.imu, solution.trajectory, solution.body_axes, bias), ()
 
 
 def _draw(trial: Trial, result: BeforeAfter, folder: Path) -> None:
-    from factorgraph_dvl.report.dead_reckoning_figures import write_dead_reckoning_figures
+    from factorgraph_dvl.report.figures.dead_reckoning import write_dead_reckoning_figures
 
     try:
         write_dead_reckoning_figures(trial, result, folder)

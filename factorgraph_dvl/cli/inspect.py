@@ -8,11 +8,11 @@ from factorgraph_dvl.cli.options import TrialPath
 
 def inspect(trial_path: TrialPath) -> None:
     """Show what a trial holds, and check its units and signs."""
-    from factorgraph_dvl.analysis.planar_survey import survey_planar
-    from factorgraph_dvl.analysis.survey import survey
     from factorgraph_dvl.io.planar_folder import is_planar, load_planar_trial
     from factorgraph_dvl.io.trial_folder import load_trial
-    from factorgraph_dvl.report.tables import finding_lines, motion_line, sensor_table
+    from factorgraph_dvl.quality.survey import survey
+    from factorgraph_dvl.quality.survey_planar import survey_planar
+    from factorgraph_dvl.report.terminal.tables import finding_lines, motion_line, sensor_table
 
     if is_planar(trial_path):
         planar = load_planar_trial(trial_path)

@@ -14,9 +14,9 @@ def instrument(
     ],
 ) -> None:
     """Print a calibration as instruments take it: angles, %, ppm, TRDI's EA and EI."""
-    from factorgraph_dvl.analysis.instrument import instrument_of
+    from factorgraph_dvl.analysis.instrument_terms import instrument_of
     from factorgraph_dvl.io.calibration_file import check_usable, load_calibration
-    from factorgraph_dvl.report.instrument_text import instrument_text
+    from factorgraph_dvl.report.files.instrument import instrument_text
 
     found = load_calibration(calibration)
     check_usable(found, found.body_axes, str(calibration))

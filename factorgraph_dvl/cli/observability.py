@@ -19,7 +19,7 @@ from factorgraph_dvl.cli.console import (
 from factorgraph_dvl.cli.options import Force, NoFigures, Quiet, claim_output
 
 if TYPE_CHECKING:
-    from factorgraph_dvl.analysis.observability import Observability
+    from factorgraph_dvl.analysis.information.observability import Observability
 
 
 def observability(
@@ -40,7 +40,7 @@ def observability(
     from factorgraph_dvl.io.folders import new_folder
     from factorgraph_dvl.io.segments_file import read_segments
     from factorgraph_dvl.io.trial_folder import inputs_of
-    from factorgraph_dvl.report.observability_files import OWNED
+    from factorgraph_dvl.report.files.observability import OWNED
 
     claim_output(out, force=force, owned=OWNED, inputs=(*inputs_of(source), segments))
     given = () if segments is None else read_segments(segments)
@@ -60,7 +60,7 @@ def _view(
     source: Path, given: tuple[tuple[float, float, str], ...], progress: ProgressLine
 ) -> tuple[Observability, bool]:
     """Return the view of a trial, which is solved for that, or of a solution."""
-    from factorgraph_dvl.analysis.observability import observability as look
+    from factorgraph_dvl.analysis.information.observability import observability as look
     from factorgraph_dvl.io.calibration_file import CALIBRATION_FILE
     from factorgraph_dvl.io.folders import SETTINGS_FILE
     from factorgraph_dvl.io.solution_folder import load_solution
@@ -80,7 +80,7 @@ def _view(
 def write_observability(view: Observability, folder: Path, source: str, *, figures: bool) -> None:
     """Write a view's JSON, tables and figures into a folder."""
     from factorgraph_dvl.io.tables import write_table
-    from factorgraph_dvl.report.observability_files import history_columns, to_csv, to_json
+    from factorgraph_dvl.report.files.observability import history_columns, to_csv, to_json
 
     (folder / "observability.csv").write_text(to_csv(view), encoding="utf-8")
     if view.history is not None:
@@ -91,7 +91,7 @@ def write_observability(view: Observability, folder: Path, source: str, *, figur
 
 
 def _draw(view: Observability, folder: Path) -> None:
-    from factorgraph_dvl.report.observability_figures import write_observability_figures
+    from factorgraph_dvl.report.figures.observability import write_observability_figures
 
     try:
         write_observability_figures(view, folder)
@@ -101,7 +101,7 @@ def _draw(view: Observability, folder: Path) -> None:
 
 def print_observability(view: Observability) -> None:
     """Print segments, marginals and weak directions."""
-    from factorgraph_dvl.report.observability_tables import (
+    from factorgraph_dvl.report.terminal.observability import (
         direction_lines,
         marginal_table,
         segment_table,

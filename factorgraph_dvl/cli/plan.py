@@ -27,10 +27,10 @@ def plan(
     quiet: Quiet = False,
 ) -> None:
     """Predict what a planned trial will tell, and what to add where that is not enough."""
-    from factorgraph_dvl.analysis.observability import observability as look
+    from factorgraph_dvl.analysis.information.observability import observability as look
     from factorgraph_dvl.io.folders import new_folder
     from factorgraph_dvl.planning import predict, propose, requirements
-    from factorgraph_dvl.report.plan_files import OWNED, to_json
+    from factorgraph_dvl.report.files.plan import OWNED, to_json
     from factorgraph_dvl.simulation import load_scenario
 
     claim_output(out, force=force, owned=OWNED, inputs=(source,))
@@ -54,7 +54,7 @@ def plan(
 
 
 def _print_requirements(required: Sequence[Requirement], proposal: Proposal | None) -> None:
-    from factorgraph_dvl.report.plan_files import proposal_lines, requirement_table
+    from factorgraph_dvl.report.files.plan import proposal_lines, requirement_table
 
     console = stdout()
     if required:

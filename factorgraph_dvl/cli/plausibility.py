@@ -13,7 +13,7 @@ from factorgraph_dvl.cli.console import stderr, warn
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from factorgraph_dvl.analysis.finding import Finding
+    from factorgraph_dvl.quality.finding import Finding
     from factorgraph_dvl.solution import Solution
     from factorgraph_dvl.trial import PlanarTrial, Trial
 
@@ -31,9 +31,9 @@ def errors_in(trial: Trial | PlanarTrial, *, anyway: bool) -> tuple[Finding, ...
     DataError
         If there are records that cannot be used, unless `anyway`.
     """
-    from factorgraph_dvl.analysis.planar_survey import survey_planar
-    from factorgraph_dvl.analysis.survey import survey
     from factorgraph_dvl.errors import DataError
+    from factorgraph_dvl.quality.survey import survey
+    from factorgraph_dvl.quality.survey_planar import survey_planar
     from factorgraph_dvl.trial import PlanarTrial
 
     found = survey_planar(trial) if isinstance(trial, PlanarTrial) else survey(trial)

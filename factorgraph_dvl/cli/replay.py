@@ -37,12 +37,12 @@ from factorgraph_dvl.errors import ConfigError
 
 if TYPE_CHECKING:
     from factorgraph_dvl.analysis.convergence import Convergence
-    from factorgraph_dvl.replay import Record
+    from factorgraph_dvl.replay import ReplayRecord
     from factorgraph_dvl.solution import Solution
     from factorgraph_dvl.trial import Trial
 
 
-class Smoother(StrEnum):
+class SmootherKind(StrEnum):
     """How far back states are corrected."""
 
     FIXED_LAG = "fixed-lag"
@@ -53,8 +53,8 @@ def replay(
     trial_path: TrialPath,
     out: SolutionPath,
     smoother: Annotated[
-        Smoother, typer.Option(help="Forget states after the lag, or never.")
-    ] = Smoother.FIXED_LAG,
+        SmootherKind, typer.Option(help="Forget states after the lag, or never.")
+    ] = SmootherKind.FIXED_LAG,
     lag: Annotated[
         float, typer.Option(metavar="S", min=1.0, max=1e4, help="Lag of the smoother, s.")
     ] = 30.0,
@@ -157,7 +157,7 @@ def _run(
     rate: float,
     progress: ProgressLine,
     good_std: dict[str, float] | None,
-) -> tuple[Solution, Record]:
+) -> tuple[Solution, ReplayRecord]:
     """Run the replay; with limits, show whether they are kept as it goes."""
     from factorgraph_dvl.replay import KINDS, Update
     from factorgraph_dvl.replay import replay as run
@@ -174,7 +174,7 @@ def _run(
         from rich.live import Live
 
         from factorgraph_dvl.analysis.convergence import lacking
-        from factorgraph_dvl.report.live import live_view
+        from factorgraph_dvl.report.terminal.live import live_view
 
         since: float | None = None
         waiting = Text(f"{trial.name}: collecting the first data")
@@ -225,7 +225,7 @@ def _run(
 def _write(
     trial: Trial,
     solution: Solution,
-    record: Record,
+    record: ReplayRecord,
     found: Convergence,
     out: Path,
     *,
@@ -241,7 +241,7 @@ def _write(
         write_history,
         write_latency,
     )
-    from factorgraph_dvl.report.convergence_file import to_csv
+    from factorgraph_dvl.report.files.convergence import to_csv
 
     def add(folder: Path) -> None:
         write_beams(trial, solution, folder)
@@ -252,8 +252,8 @@ def _write(
         (folder / CONVERGENCE_FILE).write_text(to_csv(found), encoding="utf-8")
         if not figures:
             return
-        from factorgraph_dvl.report.convergence_figures import write_convergence_figures
-        from factorgraph_dvl.report.figures import write_figures
+        from factorgraph_dvl.report.figures.convergence import write_convergence_figures
+        from factorgraph_dvl.report.figures.solution import write_figures
 
         try:
             write_figures(trial, solution, folder / FIGURES_FOLDER)
@@ -274,11 +274,11 @@ def _write(
     save_solution(solution, out, force=force, extra=add, smoothed=record.smoothed)
 
 
-def _print(trial: Trial, solution: Solution, record: Record, found: Convergence) -> None:
+def _print(trial: Trial, solution: Solution, record: ReplayRecord, found: Convergence) -> None:
     import numpy as np
 
-    from factorgraph_dvl.analysis.consistency import calibration_errors
-    from factorgraph_dvl.report.tables import (
+    from factorgraph_dvl.analysis.error_statistics import calibration_errors
+    from factorgraph_dvl.report.terminal.tables import (
         calibration_table,
         convergence_table,
         good_enough_line,

@@ -37,9 +37,9 @@ from factorgraph_dvl.cli.plausibility import (
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from factorgraph_dvl.baselines import History
+    from factorgraph_dvl.baselines.calibration import Method
     from factorgraph_dvl.errors import ConfigError
-    from factorgraph_dvl.kalman import History
-    from factorgraph_dvl.kalman.run import Method
     from factorgraph_dvl.solution import Solution
     from factorgraph_dvl.trial import PlanarTrial, Trial
 
@@ -80,7 +80,7 @@ def solve(
         return run_batch(trial, rate_hz=rate, progress=progress), None
 
     def run_planar(trial: PlanarTrial, progress: ProgressLine) -> tuple[Solution, None]:
-        from factorgraph_dvl.planar.solve import solve_planar
+        from factorgraph_dvl.ranging.planar_solution import solve_planar
 
         return solve_planar(trial, rate_hz=rate, progress=progress), None
 
@@ -115,7 +115,7 @@ def kalman(
     """Calibrate or navigate by a Kalman filter, to compare with `solve`."""
 
     def run(trial: Trial, progress: ProgressLine) -> tuple[Solution, History | None]:
-        from factorgraph_dvl.kalman import calibrate
+        from factorgraph_dvl.baselines import calibrate
 
         chosen = method or KalmanMethod.POINT_SET
         if chosen.planar:
@@ -123,7 +123,7 @@ def kalman(
         return calibrate(trial, cast("Method", chosen.value), rate_hz=rate, progress=progress)
 
     def run_planar(trial: PlanarTrial, progress: ProgressLine) -> tuple[Solution, History]:
-        from factorgraph_dvl.kalman.single_beacon import filter_planar
+        from factorgraph_dvl.baselines.single_beacon import filter_planar
 
         chosen = method or KalmanMethod.THREE_OBSERVATIONS
         if not chosen.planar:
@@ -193,7 +193,7 @@ def _solve_into(
                 write_instrument(solution, folder)
             if not figures:
                 return
-            from factorgraph_dvl.report.figures import write_figures
+            from factorgraph_dvl.report.figures.solution import write_figures
 
             try:
                 write_figures(trial, solution, folder / FIGURES_FOLDER)
@@ -228,9 +228,9 @@ def write_beams(trial: Trial | PlanarTrial, solution: Solution, folder: Path) ->
 
 def write_instrument(solution: Solution, folder: Path) -> None:
     """Write the calibration as instruments take it, if there is one of a DVL."""
-    from factorgraph_dvl.analysis.instrument import NEEDED, instrument_of
+    from factorgraph_dvl.analysis.instrument_terms import NEEDED, instrument_of
     from factorgraph_dvl.io.solution_folder import INSTRUMENT_FILE
-    from factorgraph_dvl.report.instrument_text import instrument_text
+    from factorgraph_dvl.report.files.instrument import instrument_text
 
     if solution.converged and set(NEEDED) <= {e.name for e in solution.estimates}:
         text = instrument_text(instrument_of(solution), solution.trial)
@@ -238,8 +238,12 @@ def write_instrument(solution: Solution, folder: Path) -> None:
 
 
 def _print_solution(trial: Trial | PlanarTrial, solution: Solution) -> None:
-    from factorgraph_dvl.analysis.consistency import calibration_errors
-    from factorgraph_dvl.report.tables import calibration_table, hypothesis_table, rejected_line
+    from factorgraph_dvl.analysis.error_statistics import calibration_errors
+    from factorgraph_dvl.report.terminal.tables import (
+        calibration_table,
+        hypothesis_table,
+        rejected_line,
+    )
 
     truth = trial.calibration_truth
     if solution.estimates:

@@ -12,13 +12,15 @@ import msgspec
 import numpy as np
 from msgspec import UNSET, UnsetType
 
-from factorgraph_dvl.conventions import DEG, Array, BodyAxes
-from factorgraph_dvl.directions import turns_to
 from factorgraph_dvl.errors import DataError, printable
-from factorgraph_dvl.files import MEGABYTE, read_bytes
-from factorgraph_dvl.fingerprint import PATTERN
-from factorgraph_dvl.ranges import out_of_range
+from factorgraph_dvl.geometry.rotations import BodyAxes
+from factorgraph_dvl.geometry.unit_vectors import turns_to
+from factorgraph_dvl.geometry.units import DEG
+from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.sensors.dvl import CALIBRATED
+from factorgraph_dvl.sensors.fingerprint import PATTERN
+from factorgraph_dvl.settings.files import MEGABYTE, read_bytes
+from factorgraph_dvl.settings.ranges import out_of_range
 from factorgraph_dvl.solution import Calibration, Estimate, Solution
 
 CALIBRATION_FILE = "calibration.json"

@@ -7,11 +7,13 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from factorgraph_dvl.beam_geometry import as_dvl, error_rows, instrument_matrix
-from factorgraph_dvl.conventions import DEG, Array, exp_so3
 from factorgraph_dvl.errors import DataError
+from factorgraph_dvl.geometry.rotations import exp_so3
+from factorgraph_dvl.geometry.units import DEG
+from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.io.folders import new_folder
 from factorgraph_dvl.io.tables import write_table
+from factorgraph_dvl.sensors.beam_geometry import as_dvl, error_rows, instrument_matrix
 from factorgraph_dvl.sensors.dvl import Dvl
 from factorgraph_dvl.sensors.dvl_beams import DvlBeams
 

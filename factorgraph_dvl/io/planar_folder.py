@@ -24,16 +24,12 @@ from factorgraph_dvl.io.trial_folder import (
     truth_json,
     write_settings,
 )
-from factorgraph_dvl.io.trial_yaml import (
-    PlanarInitialSettings,
-    PlanarSettings,
-    ReferenceSettings,
-)
+from factorgraph_dvl.io.trial_yaml import PlanarInitialSettings, PlanarSettings, ReferenceSettings
 from factorgraph_dvl.sensors.beacon import Beacons
 from factorgraph_dvl.sensors.depth import Depth
-from factorgraph_dvl.sensors.log import Heading, SpeedLog
+from factorgraph_dvl.sensors.speed_log import Heading, SpeedLog
+from factorgraph_dvl.settings.yaml_file import parse_yaml, read_text
 from factorgraph_dvl.trial import PlanarTrial
-from factorgraph_dvl.yaml_file import parse_yaml, read_text
 
 
 def is_planar(path: Path | str) -> bool:

@@ -17,7 +17,7 @@ import msgspec
 
 from factorgraph_dvl.errors import ConfigError, printable
 from factorgraph_dvl.sensors.protocol import Section
-from factorgraph_dvl.yaml_file import read_yaml
+from factorgraph_dvl.settings.yaml_file import read_yaml
 
 
 class SegmentSettings(Section, frozen=True, kw_only=True):

@@ -9,7 +9,8 @@ from typing import Any, Literal
 import msgspec
 import numpy as np
 
-from factorgraph_dvl.conventions import DEG, GEODETIC_SI, Array
+from factorgraph_dvl.geometry.units import DEG, GEODETIC_SI
+from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.io.calibration_file import (
     CALIBRATION_FILE,
     encode_calibration,

@@ -13,8 +13,8 @@ import pyarrow.csv
 import pyarrow.parquet
 from numpy.typing import NDArray
 
-from factorgraph_dvl.conventions import Array
 from factorgraph_dvl.errors import DataError
+from factorgraph_dvl.geometry.vectors import Array
 
 _EMPTY = ("", "nan", "NaN", "NAN")
 _PARQUET = (".parquet", ".pq")

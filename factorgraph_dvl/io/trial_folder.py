@@ -12,9 +12,10 @@ import msgspec
 import numpy as np
 from msgspec import UNSET, UnsetType
 
-from factorgraph_dvl.conventions import DEG, GEODETIC_SI, Array, BodyAxes
 from factorgraph_dvl.errors import ConfigError, DataError, printable
-from factorgraph_dvl.files import MEGABYTE, read_bytes
+from factorgraph_dvl.geometry.rotations import BodyAxes
+from factorgraph_dvl.geometry.units import DEG, GEODETIC_SI
+from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.io.calibration_file import (
     check_usable,
     check_values,
@@ -40,22 +41,23 @@ from factorgraph_dvl.sensors.dvl import CALIBRATED, SCALE_ERROR, TIME_OFFSET, Dv
 from factorgraph_dvl.sensors.dvl_beams import DvlBeams
 from factorgraph_dvl.sensors.gnss import Gnss
 from factorgraph_dvl.sensors.imu import Imu
-from factorgraph_dvl.sensors.log import Heading, SpeedLog
 from factorgraph_dvl.sensors.protocol import (
     Aid,
     JointPrior,
-    Record,
+    SensorRecord,
     SensorSection,
     check_possible,
 )
+from factorgraph_dvl.sensors.speed_log import Heading, SpeedLog
+from factorgraph_dvl.settings.files import MEGABYTE, read_bytes
+from factorgraph_dvl.settings.yaml_file import parse_yaml, read_text
 from factorgraph_dvl.solution import Calibration, Estimate
 from factorgraph_dvl.trial import InitialAttitude, InitialPosition, Reference, Trial
-from factorgraph_dvl.yaml_file import parse_yaml, read_text
 
 TRUTH_FILE = "truth.json"
 # Where a trial that was loaded with a calibration of its DVL keeps it when it is saved.
 PRIOR_FILE = "dvl-calibration.json"
-_PLANAR: tuple[type[Record], ...] = (Heading, SpeedLog, Depth, Beacons)
+_PLANAR: tuple[type[SensorRecord], ...] = (Heading, SpeedLog, Depth, Beacons)
 _TABLES = dict.fromkeys(("imu", *(kind.section for kind in (*AIDS, *_PLANAR)), "reference"))
 OWNED = (
     SETTINGS_FILE,
@@ -73,7 +75,7 @@ _NAMING = ("file", "calibration", "trajectory")
 # Numbers that a parameter of the DVL may have.
 _SIZES = {name: (3,) for name in CALIBRATED} | {SCALE_ERROR: (1, 3), TIME_OFFSET: (1,)}
 
-_Sensor = TypeVar("_Sensor", bound=Record)
+_Sensor = TypeVar("_Sensor", bound=SensorRecord)
 
 
 class _TruthValue(msgspec.Struct):

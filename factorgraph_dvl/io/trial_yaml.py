@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import msgspec
 from msgspec import UNSET, Meta, UnsetType
 
-from factorgraph_dvl.conventions import BodyAxes
+from factorgraph_dvl.geometry.rotations import BodyAxes
 from factorgraph_dvl.sensors.beacon import BeaconSettings
 from factorgraph_dvl.sensors.catalogue import AIDS
 from factorgraph_dvl.sensors.depth import DepthSettings
 from factorgraph_dvl.sensors.imu import ImuSettings
-from factorgraph_dvl.sensors.log import HeadingSettings, LogSettings
 from factorgraph_dvl.sensors.protocol import Section, SensorSection, Sigma3, check_epoch
+from factorgraph_dvl.sensors.speed_log import HeadingSettings, LogSettings
 
 _Pitch = Annotated[float, Meta(ge=-90, le=90)]
 

@@ -7,27 +7,18 @@ from dataclasses import dataclass, replace
 import msgspec
 import numpy as np
 
-from factorgraph_dvl.conventions import (
-    DEG,
-    DEG_PER_HOUR,
-    MICRO_G,
-    Array,
-    rotate,
-    rotation_from_rph,
-)
-from factorgraph_dvl.earth import LocalFrame
-from factorgraph_dvl.information import InformationHistory
-from factorgraph_dvl.preintegration import States
+from factorgraph_dvl.geometry.earth import LocalFrame
+from factorgraph_dvl.geometry.rotations import rotation_from_rph
+from factorgraph_dvl.geometry.units import DEG, DEG_PER_HOUR, MICRO_G
+from factorgraph_dvl.geometry.vectors import Array, rotate
+from factorgraph_dvl.imu.preintegration import States
 from factorgraph_dvl.simulation import plan_motion, simulate
-from factorgraph_dvl.simulation.motion import Motion
-from factorgraph_dvl.simulation.scenario import AngularSway, Heave, Scenario, Start
+from factorgraph_dvl.simulation.motion import TrueMotion
+from factorgraph_dvl.simulation.scenario import AngularSway, Heave, Scenario, StartSettings
 from factorgraph_dvl.solution import Solution
 from factorgraph_dvl.solvers.information_history import Frontier
-from factorgraph_dvl.solvers.prediction import (
-    TrueStates,
-    continue_posterior,
-    predict_posterior,
-)
+from factorgraph_dvl.solvers.prediction import TrueStates, continue_posterior, predict_posterior
+from factorgraph_dvl.statistics.information_history import InformationHistory
 from factorgraph_dvl.trial import Trial
 
 _INTERRUPTED = ("gaps_s", "outages_s", "no_lock_s", "lost")
@@ -44,7 +35,7 @@ class Ending:
     frontier : what is known there.
     """
 
-    start: Start
+    start: StartSettings
     time: float
     frontier: Frontier
 
@@ -139,11 +130,11 @@ def _later(part: AngularSway | Heave, time: float) -> AngularSway | Heave:
     return msgspec.structs.replace(part, phase_deg=phase % 360.0)
 
 
-def _ending(motion: Motion, frontier: Frontier, before: float) -> Ending:
+def _ending(motion: TrueMotion, frontier: Frontier, before: float) -> Ending:
     end = np.array([motion.duration])
     state = motion.at(end)
     # The mean motion: sway comes on top of it again.
-    start = Start(
+    start = StartSettings(
         lat_deg=float(state.geodetic[0, 0] / DEG),
         lon_deg=float(state.geodetic[0, 1] / DEG),
         height_m=float(motion.height(end)[0]) + float(motion.current_n[2]) * motion.duration,
@@ -153,7 +144,7 @@ def _ending(motion: Motion, frontier: Frontier, before: float) -> Ending:
     return Ending(start, before + motion.duration, frontier)
 
 
-def _true_states(motion: Motion, trial: Trial) -> TrueStates:
+def _true_states(motion: TrueMotion, trial: Trial) -> TrueStates:
     gyro = trial.calibration_truth["gyro_bias_deg_h"] * DEG_PER_HOUR
     accel = trial.calibration_truth["accel_bias_ug"] * MICRO_G
 

@@ -21,8 +21,8 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from factorgraph_dvl.conventions import Array
 from factorgraph_dvl.errors import ConfigError
+from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.planning.library import Item, Library, library
 from factorgraph_dvl.planning.prediction import Ending, Prediction, go_on, predict
 from factorgraph_dvl.planning.requirements import Requirement

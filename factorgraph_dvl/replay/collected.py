@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from factorgraph_dvl.conventions import Array
-from factorgraph_dvl.earth import LocalFrame
+from factorgraph_dvl.geometry.earth import LocalFrame
+from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.sensors.imu import Imu
 from factorgraph_dvl.sensors.protocol import Aid, joined, rows_of
 from factorgraph_dvl.trial import Trial

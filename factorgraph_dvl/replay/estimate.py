@@ -7,17 +7,11 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
-from factorgraph_dvl.conventions import (
-    Array,
-    BodyAxes,
-    exp_so3,
-    rotate,
-    rph_from_rotation,
-    rph_jacobian,
-)
-from factorgraph_dvl.earth import LocalFrame
-from factorgraph_dvl.preintegration import States
-from factorgraph_dvl.priors import away, prior_mean, prior_root
+from factorgraph_dvl.geometry.earth import LocalFrame
+from factorgraph_dvl.geometry.rotations import BodyAxes, exp_so3, rph_from_rotation, rph_jacobian
+from factorgraph_dvl.geometry.vectors import Array, rotate
+from factorgraph_dvl.graph.priors import local_coordinates, prior_mean, prior_root
+from factorgraph_dvl.imu.preintegration import States
 from factorgraph_dvl.sensors.protocol import Parameter
 from factorgraph_dvl.solution import Estimate, Trajectory
 from factorgraph_dvl.solvers.reported import estimates_of, in_order, in_unit
@@ -27,7 +21,7 @@ _BIAS = 6
 
 
 @dataclass(frozen=True)
-class Calibration:
+class CalibrationEstimate:
     """The calibration at one moment.
 
     Parameters
@@ -84,7 +78,7 @@ class Update:
     latency: float
     state: Trajectory
     trajectory: Trajectory
-    calibration: Calibration
+    calibration: CalibrationEstimate
     smoothed: Trajectory | None
     innovations: tuple[Innovations, ...]
     messages: tuple[str, ...]
@@ -129,7 +123,7 @@ def calibration_of(
     biases: tuple[tuple[Parameter, Array], tuple[Parameter, Array]],
     P: Array,
     held: Array,
-) -> Calibration:
+) -> CalibrationEstimate:
     """Return the calibration as reported.
 
     Parameters
@@ -167,7 +161,7 @@ def calibration_of(
         n, column = r.value.size, start[r.parameter.name]
         T[at : at + n, column : column + n] = r.derivative
         at += n
-    return Calibration(*estimates_of([(r.parameter, r.value) for r in rows], T @ P @ T.T))
+    return CalibrationEstimate(*estimates_of([(r.parameter, r.value) for r in rows], T @ P @ T.T))
 
 
 def _at_prior(
@@ -180,7 +174,7 @@ def _at_prior(
     root = prior_root(free)
     A = np.zeros((held.shape[1], P.shape[0]))
     A[:, _BIAS:] = held.T @ np.linalg.inv(root)
-    off = np.concatenate([away(p, values[p.name], prior_mean(p)) for p in free])
+    off = np.concatenate([local_coordinates(p, values[p.name], prior_mean(p)) for p in free])
     gain = np.linalg.solve(A @ P @ A.T, A @ P).T
     step = -gain @ (A[:, _BIAS:] @ off)
     given = P - gain @ A @ P

@@ -6,7 +6,7 @@ from collections import deque
 
 import numpy as np
 
-from factorgraph_dvl.conventions import Array
+from factorgraph_dvl.geometry.vectors import Array
 
 # Standard deviations beyond which a measurement is not used.
 _BEYOND = 6.0

@@ -8,45 +8,41 @@ from dataclasses import fields
 import gtsam
 import numpy as np
 
-from factorgraph_dvl import keys
-from factorgraph_dvl.chain import loose_diagonal
-from factorgraph_dvl.conventions import Array, BodyAxes
-from factorgraph_dvl.preintegration import (
-    Segments,
-    States,
-    attach,
-    preintegrate,
-)
-from factorgraph_dvl.priors import Known, away, prior_root
-from factorgraph_dvl.replay.estimate import (
-    Calibration,
-    Innovations,
-    calibration_of,
-    concatenated,
-    trajectory_of,
-)
-from factorgraph_dvl.replay.factor import (
+from factorgraph_dvl.geometry.rotations import BodyAxes
+from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.graph import keys
+from factorgraph_dvl.graph.inertial_chain import loose_diagonal
+from factorgraph_dvl.graph.priors import Known, local_coordinates, prior_root
+from factorgraph_dvl.graph.sensor_factor import (
     Linearized,
     NodeMeasurements,
     Rows,
     measurement_factor,
     state_of,
 )
+from factorgraph_dvl.imu.preintegration import Segments, States, attach, preintegrate
+from factorgraph_dvl.replay.estimate import (
+    CalibrationEstimate,
+    Innovations,
+    calibration_of,
+    concatenated,
+    trajectory_of,
+)
 from factorgraph_dvl.replay.gate import Gate
 from factorgraph_dvl.replay.smoother import Smoother
-from factorgraph_dvl.replay.start import Start
+from factorgraph_dvl.replay.start import ReplayStart
 from factorgraph_dvl.sensors.imu import Imu
 from factorgraph_dvl.sensors.protocol import Aid, Motion, Parameter
 from factorgraph_dvl.solution import Trajectory
-from factorgraph_dvl.solvers.feigned import directions_not_told, feigned_by
 from factorgraph_dvl.solvers.summary import TRAJECTORY_RATE, epochs_between, trajectory_between
+from factorgraph_dvl.statistics.spurious_information import spurious_by, undetermined_directions
 
 # Distance, m, up to which gravity is taken as linear: to 3e-9 m/s².
 _NEAR = 100.0
 # Keeps the walk of a bias that does not walk regular.
 _LEAST_WALK = 1e-12
 # Time after which it is worked out anew what the motion's error feigns, s.
-_FEIGNED_EVERY = 1.0
+_SPURIOUS_EVERY = 1.0
 _STATE = 9
 
 
@@ -63,7 +59,7 @@ class Navigator:
     """
 
     def __init__(
-        self, start: Start, imu: Imu, gate: Gate, *, lag: float | None, memory: float
+        self, start: ReplayStart, imu: Imu, gate: Gate, *, lag: float | None, memory: float
     ) -> None:
         self.start = start
         self._imu = imu
@@ -80,9 +76,9 @@ class Navigator:
             ranges=start.ranges,
         )
         self._prior_root = prior_root(start.parameters)
-        self._feigned = start.feigned
+        self._spurious = start.spurious
         # By kind: when it was last worked out, and how many were used since.
-        self._feigned_at: dict[str, float] = {}
+        self._spurious_at: dict[str, float] = {}
         self._not_counted: dict[str, int] = {}
         self._near = np.full(3, np.inf)
         self._segments: dict[int, tuple[Segments, Array]] = {}
@@ -121,7 +117,9 @@ class Navigator:
         """Angle by which a rotation among the parameters differs from the start's, rad."""
         return max(
             (
-                float(np.linalg.norm(away(p, self._values[p.name], self._begun[p.name])))
+                float(
+                    np.linalg.norm(local_coordinates(p, self._values[p.name], self._begun[p.name]))
+                )
                 for p in self.start.parameters
                 if p.rotation
             ),
@@ -134,9 +132,9 @@ class Navigator:
         return self._held
 
     @property
-    def feigned(self) -> Array:
-        """Information that only noise makes, (P, P), as `Start.feigned`."""
-        return self._feigned
+    def spurious(self) -> Array:
+        """Information that only noise makes, (P, P), as `Start.spurious`."""
+        return self._spurious
 
     @property
     def parameter_covariance(self) -> Array:
@@ -214,7 +212,7 @@ class Navigator:
                 return k if time < self.smoother.times[k + 1] else None
         return None
 
-    def calibration(self) -> Calibration:
+    def calibration(self) -> CalibrationEstimate:
         """Return the calibration as it is reported."""
         bias = self.smoother.bias(self.smoother.node).vector()
         gyro, accel = self._imu.parameters(0.0)
@@ -350,7 +348,7 @@ class Navigator:
             s.bias(k).vector() - bias.vector(),
         ]
         for p in self.start.parameters:
-            parts.append(away(p, self._values[p.name], self._begun[p.name]))
+            parts.append(local_coordinates(p, self._values[p.name], self._begun[p.name]))
         return np.concatenate(parts)
 
     def _columns(self, parameters: Sequence[Parameter]) -> list[int]:
@@ -416,10 +414,10 @@ class Navigator:
             label = r.observation.label
             count = self._not_counted.get(label, 0) + used
             self._not_counted[label] = count
-            if self.time - self._feigned_at.get(label, self.start.time) < _FEIGNED_EVERY:
+            if self.time - self._spurious_at.get(label, self.start.time) < _SPURIOUS_EVERY:
                 continue
             columns = np.concatenate([start[p.name] + np.arange(p.mean.size) for p in wanted])
-            part = feigned_by(
+            part = spurious_by(
                 r.observation,
                 measured.attachment_of(r),
                 motion,
@@ -429,8 +427,8 @@ class Navigator:
                 [p.name for p in wanted],
             )
             root = self._prior_root[columns]
-            self._feigned = self._feigned + root.T @ part.sum(axis=0) @ root * (count / used)
-            self._feigned_at[label], self._not_counted[label] = self.time, 0
+            self._spurious = self._spurious + root.T @ part.sum(axis=0) @ root * (count / used)
+            self._spurious_at[label], self._not_counted[label] = self.time, 0
             self._held = self._not_observable()
 
     def _not_observable(self) -> Array:
@@ -439,4 +437,4 @@ class Navigator:
             return np.zeros((0, 0))
         root = self._prior_root
         information = root.T @ np.linalg.inv(self._P[_STATE + 6 :, _STATE + 6 :]) @ root
-        return directions_not_told(information - np.eye(size), self._feigned)
+        return undetermined_directions(information - np.eye(size), self._spurious)

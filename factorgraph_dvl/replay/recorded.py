@@ -9,21 +9,21 @@ from itertools import pairwise
 
 import numpy as np
 
-from factorgraph_dvl.clock import without_strays
-from factorgraph_dvl.conventions import Array
 from factorgraph_dvl.errors import SolveError
+from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.imu.timestamps import without_strays
 from factorgraph_dvl.replay.estimate import Innovations, Update, concatenated
 from factorgraph_dvl.replay.samples import LEAST
 from factorgraph_dvl.replay.session import LAG, RATE, Kind, Replay
 from factorgraph_dvl.sensors.protocol import rows_of
-from factorgraph_dvl.solution import Residuals, Solution, Trajectory, doubts
+from factorgraph_dvl.solution import Residuals, Solution, Trajectory, consistency_warnings
 from factorgraph_dvl.trial import Trial
 
 Watch = Callable[[Update], None]
 
 
 @dataclass(frozen=True)
-class Record:
+class ReplayRecord:
     """What was known when.
 
     Parameters
@@ -58,7 +58,7 @@ def replay(
     rate_hz: float = RATE,
     progress: Callable[[str, int, float | None], None] | None = None,
     watch: Watch | None = None,
-) -> tuple[Solution, Record]:
+) -> tuple[Solution, ReplayRecord]:
     """Feed a recorded trial in the order of time, and show what was known when.
 
     Parameters
@@ -164,12 +164,12 @@ class _Tape:
             for label, parts in self._innovations.items()
         )
 
-    def record(self, run: Replay) -> Record:
+    def record(self, run: Replay) -> ReplayRecord:
         assert self.last is not None
         names = self._numbers[-1][0]
         n = len(names)
         table = np.vstack([_columns(np.array(x), there, names) for there, x in self._numbers])
-        return Record(
+        return ReplayRecord(
             time=table[:, 0],
             latency=table[:, 1],
             solved=table[:, 2] > 0.0,
@@ -211,7 +211,7 @@ def _solution(trial: Trial, run: Replay, tape: _Tape) -> Solution:
             "and were not used with what was measured then"
         )
     warnings += run.counts()
-    warnings += doubts(calibration.estimates, residuals)
+    warnings += consistency_warnings(calibration.estimates, residuals)
     for e in calibration.estimates:
         bad = np.flatnonzero(~e.observable & (e.prior_std > 0.0))
         if bad.size:

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from factorgraph_dvl.clock import unrounded
-from factorgraph_dvl.conventions import Array
-from factorgraph_dvl.increments import MAX_FILLED, increments
-from factorgraph_dvl.preintegration import Segments, one_segment
+from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.imu.increments import MAX_FILLED, increments
+from factorgraph_dvl.imu.preintegration import Segments, one_segment
+from factorgraph_dvl.imu.timestamps import unrounded
 from factorgraph_dvl.sensors.imu import Imu, ImuSettings
 
 # Samples on each side of a segment that its polynomials may reach for.
@@ -33,7 +33,7 @@ class Gap:
     after: float
 
 
-class Samples:
+class SampleBuffer:
     """A buffer of samples, as long as segments reach back.
 
     Parameters

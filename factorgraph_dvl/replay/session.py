@@ -10,19 +10,19 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from factorgraph_dvl.conventions import Array
-from factorgraph_dvl.earth import LocalFrame
 from factorgraph_dvl.errors import ConfigError, DataError, FactorgraphDvlError
-from factorgraph_dvl.priors import Known
+from factorgraph_dvl.geometry.earth import LocalFrame
+from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.graph.priors import Known
 from factorgraph_dvl.replay.clocks import Clocks
 from factorgraph_dvl.replay.collected import Collected
 from factorgraph_dvl.replay.estimate import Update
 from factorgraph_dvl.replay.gate import Gate
 from factorgraph_dvl.replay.navigator import Navigator
 from factorgraph_dvl.replay.repeats import Repeats
-from factorgraph_dvl.replay.samples import Gap, Samples
+from factorgraph_dvl.replay.samples import Gap, SampleBuffer
 from factorgraph_dvl.replay.silence import Silence
-from factorgraph_dvl.replay.start import Start, begin
+from factorgraph_dvl.replay.start import ReplayStart, begin
 from factorgraph_dvl.replay.waiting import AHEAD, SAME_TIME, Waiting
 from factorgraph_dvl.sensors.protocol import Aid, rows_of
 from factorgraph_dvl.solution import Trajectory
@@ -91,7 +91,7 @@ class Replay:
         self._lag = lag_s
         self._interval = 1.0 / rate_hz
         self._progress = progress or (lambda stage, iteration, cost: None)
-        self._samples = Samples(known.imu.settings)
+        self._samples = SampleBuffer(known.imu.settings)
         self._collected: Collected | None = Collected(known, _LONGEST)
         self._gate = Gate()
         self._navigator: Navigator | None = None
@@ -354,7 +354,7 @@ class Replay:
         self._noted.update(start.notes)
         return True
 
-    def _without_refused(self, until: float, start: Start | str) -> Start | str:
+    def _without_refused(self, until: float, start: ReplayStart | str) -> ReplayStart | str:
         """Return a better start without what the smoother did not believe, if there is one."""
         assert self._navigator is not None
         assert self._collected is not None
@@ -369,7 +369,7 @@ class Replay:
             return start
         return other
 
-    def _begin(self, until: float) -> Start | str:
+    def _begin(self, until: float) -> ReplayStart | str:
         assert self._collected is not None
         trial = self._collected.trial(until)
         try:
@@ -382,7 +382,7 @@ class Replay:
         except FactorgraphDvlError as error:
             return str(error)
 
-    def _contradicts(self, start: Start | str) -> bool:
+    def _contradicts(self, start: ReplayStart | str) -> bool:
         """Whether there is no start, or one whose residuals are larger than they were."""
         return isinstance(start, str) or start.misfit > _MISFIT * self._usual_misfit
 

@@ -14,11 +14,11 @@ from collections.abc import Sequence
 import gtsam
 import numpy as np
 
-from factorgraph_dvl import keys
-from factorgraph_dvl.conventions import Array
+from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.graph import keys
 from factorgraph_dvl.sensors.protocol import Parameter
-from factorgraph_dvl.solvers.covariance import SquareRootInformation
 from factorgraph_dvl.solvers.levenberg_marquardt import eliminate
+from factorgraph_dvl.solvers.posterior import SquareRootInformation
 
 # Steps after which a state is linearised anew: rad, m, m/s. Position enters linearly, but in
 # ranges: at 10 m from a beacon that last step changes one by 0.2 m more than it should.

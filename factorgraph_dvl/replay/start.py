@@ -7,26 +7,21 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 
-from factorgraph_dvl import keys
-from factorgraph_dvl.conventions import DEG, Array
-from factorgraph_dvl.earth import LocalFrame
-from factorgraph_dvl.graph import Evaluation, Problem
-from factorgraph_dvl.preintegration import States
-from factorgraph_dvl.priors import Known
+from factorgraph_dvl.geometry.earth import LocalFrame
+from factorgraph_dvl.geometry.units import DEG
+from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.graph import keys
+from factorgraph_dvl.graph.priors import Known
+from factorgraph_dvl.graph.problem import Evaluation, Problem
+from factorgraph_dvl.imu.preintegration import States
 from factorgraph_dvl.sensors.protocol import AttitudeAid, Parameter
 from factorgraph_dvl.solution import Trajectory
 from factorgraph_dvl.solvers.batch import fit
-from factorgraph_dvl.solvers.covariance import posterior
-from factorgraph_dvl.solvers.feigned import (
-    feigned_information,
-)
 from factorgraph_dvl.solvers.levenberg_marquardt import Progress
+from factorgraph_dvl.solvers.posterior import posterior
 from factorgraph_dvl.solvers.state_times import STATE_INTERVAL, needs_states
-from factorgraph_dvl.solvers.summary import (
-    EPOCH_ROUNDING,
-    TRAJECTORY_RATE,
-    trajectory_between,
-)
+from factorgraph_dvl.solvers.summary import EPOCH_ROUNDING, TRAJECTORY_RATE, trajectory_between
+from factorgraph_dvl.statistics.spurious_information import spurious_information
 from factorgraph_dvl.trial import Trial
 
 # Standard deviation of the attitude up to which the equations may be linearised in it.
@@ -36,7 +31,7 @@ _ENOUGH = 20
 
 
 @dataclass(frozen=True)
-class Start:
+class ReplayStart:
     """The last state of what was collected, and what is known of it.
 
     Parameters
@@ -51,7 +46,7 @@ class Start:
     ranges : whether there are any, to beacons.
     own_states : sections of the sensors whose every measurement needs a state of its own.
     windows : over which the IMU's samples are smoothed.
-    feigned : (P, P) information on the parameters that only noise makes, in units of the
+    spurious : (P, P) information on the parameters that only noise makes, in units of the
         priors' standard deviations.
     walking : whether biases walk.
     trajectory : of what was collected, as `begin` was asked for it.
@@ -71,7 +66,7 @@ class Start:
     ranges: bool
     own_states: tuple[str, ...]
     windows: tuple[int, int]
-    feigned: Array
+    spurious: Array
     walking: bool
     trajectory: Trajectory
     notes: tuple[str, ...]
@@ -80,7 +75,7 @@ class Start:
 
 def begin(
     trial: Trial, known: Known | None, interval: float, since: float, progress: Progress
-) -> Start | str:
+) -> ReplayStart | str:
     """Solve what was collected, and condense it to its last state.
 
     Parameters
@@ -100,16 +95,16 @@ def begin(
     DataError, SolveError
         If the data collected so far cannot be solved.
     """
-    problem, minimum, notes, anchors = fit(
+    problem, minimum, notes, start_positions = fit(
         trial, state_interval_s=STATE_INTERVAL, progress=progress, known=known
     )
-    if len(anchors.states) > 1:
+    if len(start_positions.states) > 1:
         return (
-            f"{len(anchors.states)} trajectories fit the ranges; a turn of 30 degrees or more, "
-            "or `initial.position`, would tell"
+            f"{len(start_positions.states)} trajectories fit the ranges; a turn of 30 degrees or "
+            "more, or `initial.position`, would tell"
         )
-    if anchors.notes:
-        return anchors.notes[0]
+    if start_positions.notes:
+        return start_positions.notes[0]
     if not minimum.converged:
         return "the solver did not converge"
     covariances = posterior(problem, minimum)
@@ -122,7 +117,7 @@ def begin(
             return f"the position is known to {position:.2g} m only"
     evaluation = minimum.evaluation
     # The whole error, also what all states share: those to come will be linearised without it.
-    feigned = feigned_information(problem, evaluation, covariances.nodes).sum(axis=0)
+    spurious = spurious_information(problem, evaluation, covariances.nodes).sum(axis=0)
     last = problem.chain.segments.node_time.size - 1
     kept = [
         keys.node(last),
@@ -133,7 +128,7 @@ def begin(
     gone = [key for key in evaluation.values.dims() if key not in kept]
     _, rest = gaussian.eliminatePartialMultifrontal(gone, gtsam.EliminateQR)
     values = _some(problem, evaluation.values, last)
-    return Start(
+    return ReplayStart(
         frame=problem.chain.frame,
         node=last,
         time=float(problem.chain.segments.node_time[-1]),
@@ -150,7 +145,7 @@ def begin(
         ranges=trial.beacons is not None,
         own_states=_own_states(trial, problem.chain.frame, interval),
         windows=problem.chain.segments.increments.chosen_windows,
-        feigned=feigned,
+        spurious=spurious,
         walking=problem.chain.walking,
         trajectory=_trajectory(problem, evaluation.states, covariances.nodes, since),
         notes=notes,

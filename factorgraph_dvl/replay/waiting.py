@@ -6,8 +6,8 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from factorgraph_dvl.conventions import Array
-from factorgraph_dvl.earth import LocalFrame
+from factorgraph_dvl.geometry.earth import LocalFrame
+from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.sensors.protocol import Aid, Observation, joined, rows_of
 
 # Times closer than this, s, are the same.

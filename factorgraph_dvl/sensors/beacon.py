@@ -11,9 +11,10 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from factorgraph_dvl.conventions import GEODETIC_SI, Array, rotate, skew
-from factorgraph_dvl.earth import LocalFrame
 from factorgraph_dvl.errors import DataError
+from factorgraph_dvl.geometry.earth import LocalFrame
+from factorgraph_dvl.geometry.units import GEODETIC_SI
+from factorgraph_dvl.geometry.vectors import Array, rotate, skew
 from factorgraph_dvl.sensors.protocol import (
     Linearization,
     Motion,

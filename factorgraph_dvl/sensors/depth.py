@@ -8,8 +8,8 @@ from typing import ClassVar, Self
 
 import numpy as np
 
-from factorgraph_dvl.conventions import Array, skew
-from factorgraph_dvl.earth import LocalFrame
+from factorgraph_dvl.geometry.earth import LocalFrame
+from factorgraph_dvl.geometry.vectors import Array, skew
 from factorgraph_dvl.sensors.protocol import (
     Linearization,
     Motion,

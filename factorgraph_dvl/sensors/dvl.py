@@ -10,9 +10,10 @@ import msgspec
 import numpy as np
 from msgspec import UNSET, UnsetType
 
-from factorgraph_dvl.conventions import DEG, Array, cross, rotate, skew
-from factorgraph_dvl.earth import LocalFrame
 from factorgraph_dvl.errors import ConfigError
+from factorgraph_dvl.geometry.earth import LocalFrame
+from factorgraph_dvl.geometry.units import DEG
+from factorgraph_dvl.geometry.vectors import Array, cross, rotate, skew
 from factorgraph_dvl.sensors.protocol import (
     JointPrior,
     Linearization,

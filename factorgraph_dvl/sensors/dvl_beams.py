@@ -10,9 +10,11 @@ import msgspec
 import numpy as np
 from msgspec import UNSET, UnsetType
 
-from factorgraph_dvl.conventions import DEG, Array, exp_so3, rotate, skew
-from factorgraph_dvl.earth import LocalFrame
-from factorgraph_dvl.gains import CommonGeometry, FreeGeometry, Geometry
+from factorgraph_dvl.geometry.earth import LocalFrame
+from factorgraph_dvl.geometry.rotations import exp_so3
+from factorgraph_dvl.geometry.units import DEG
+from factorgraph_dvl.geometry.vectors import Array, rotate, skew
+from factorgraph_dvl.sensors.beam_model import CommonGeometry, FreeGeometry, Geometry
 from factorgraph_dvl.sensors.protocol import (
     Linearization,
     Motion,

@@ -8,8 +8,9 @@ from typing import ClassVar, Self
 
 import numpy as np
 
-from factorgraph_dvl.conventions import DEG, GEODETIC_SI, Array, cross, rotate, skew
-from factorgraph_dvl.earth import LocalFrame
+from factorgraph_dvl.geometry.earth import LocalFrame
+from factorgraph_dvl.geometry.units import DEG, GEODETIC_SI
+from factorgraph_dvl.geometry.vectors import Array, cross, rotate, skew
 from factorgraph_dvl.sensors.protocol import (
     Linearization,
     Motion,
@@ -28,7 +29,7 @@ from factorgraph_dvl.sensors.protocol import (
     named_columns,
     stack,
 )
-from factorgraph_dvl.turning import Turning
+from factorgraph_dvl.sensors.turntable_motion import TurntableMotion
 
 POSITION_COLUMNS = ("lat_deg", "lon_deg", "height_m")
 VELOCITY_COLUMNS = ("vel_e_m_s", "vel_n_m_s", "vel_u_m_s")
@@ -74,7 +75,7 @@ class Gnss:
     velocity_std: Array
     source: str = "gnss"
     label: str = "GNSS"
-    turning: Turning | None = None
+    turning: TurntableMotion | None = None
 
     section: ClassVar[str] = "gnss"
     section_type: ClassVar[type[SensorSection]] = GnssSettings

@@ -8,13 +8,8 @@ from typing import ClassVar, Literal, Self
 
 import numpy as np
 
-from factorgraph_dvl.conventions import (
-    DEG_PER_HOUR,
-    DEG_PER_SQRT_HOUR,
-    HOUR,
-    MICRO_G,
-    Array,
-)
+from factorgraph_dvl.geometry.units import DEG_PER_HOUR, DEG_PER_SQRT_HOUR, HOUR, MICRO_G
+from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.sensors.protocol import (
     NonNegative,
     Parameter,

@@ -13,11 +13,12 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from factorgraph_dvl.conventions import Array, exp_so3
-from factorgraph_dvl.directions import turns_to
-from factorgraph_dvl.earth import LocalFrame
 from factorgraph_dvl.errors import DataError
-from factorgraph_dvl.ranges import out_of_range, range_of
+from factorgraph_dvl.geometry.earth import LocalFrame
+from factorgraph_dvl.geometry.rotations import exp_so3
+from factorgraph_dvl.geometry.unit_vectors import turns_to
+from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.settings.ranges import out_of_range, range_of
 
 Positive = Annotated[float, msgspec.Meta(gt=0)]
 NonNegative = Annotated[float, msgspec.Meta(ge=0)]
@@ -270,7 +271,7 @@ class SensorSection(Section, frozen=True, kw_only=True):
         return ()
 
 
-class Record(Protocol):
+class SensorRecord(Protocol):
     """A sensor's record, and how it stands in files.
 
     `section` names its part of trial.yaml and its table, `section_type` holds the
@@ -295,7 +296,7 @@ class Record(Protocol):
         """Return the record as a table."""
 
 
-class Aid(Record, Protocol):
+class Aid(SensorRecord, Protocol):
     """A sensor that observes the motion which the IMU integrates."""
 
     @property
@@ -330,14 +331,14 @@ class Attitudes:
     nRs : (M, 3, 3) attitude of the sensor's axes.
     sigma : (M,) standard deviation about the axis that is known best, rad.
     mounting : the parameter sRb, with its prior.
-    doubts : what the record says against itself, for people.
+    consistency_warnings : what the record says against itself, for people.
     """
 
     time: Array
     nRs: Array
     sigma: Array
     mounting: Parameter
-    doubts: tuple[str, ...] = ()
+    consistency_warnings: tuple[str, ...] = ()
 
 
 @runtime_checkable

@@ -11,21 +11,17 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from factorgraph_dvl.celestial import (
+from factorgraph_dvl.errors import ConfigError, DataError
+from factorgraph_dvl.geometry.celestial import (
     ARCSEC,
     attitudes_from_vectors,
     earth_from_inertial,
     spread,
 )
-from factorgraph_dvl.conventions import (
-    DEG,
-    Array,
-    inverse_right_jacobian,
-    log_so3,
-    rotate,
-)
-from factorgraph_dvl.earth import LocalFrame, enu_from_ecef
-from factorgraph_dvl.errors import ConfigError, DataError
+from factorgraph_dvl.geometry.earth import LocalFrame, enu_from_ecef
+from factorgraph_dvl.geometry.rotations import inverse_right_jacobian, log_so3
+from factorgraph_dvl.geometry.units import DEG
+from factorgraph_dvl.geometry.vectors import Array, rotate
 from factorgraph_dvl.sensors.protocol import (
     DO_NOT_FIT,
     TOO_LARGE,
@@ -245,7 +241,9 @@ class Star:
         eRi = earth_from_inertial(frame.epoch, time, self.settings.ut1_utc_s)
         best = np.linalg.eigvalsh(self.covariance[known])[:, 0]
         nRs = nRe @ eRi @ iRs
-        return Attitudes(time, nRs, np.sqrt(best), self.parameters()[0], self.doubts())
+        return Attitudes(
+            time, nRs, np.sqrt(best), self.parameters()[0], self.consistency_warnings()
+        )
 
     @property
     def misfit(self) -> float:
@@ -261,7 +259,7 @@ class Star:
         freedom = 2 * v.time.size - 3 * self.time.size
         return float(np.sqrt(np.sum(self._star_misfits() ** 2) / freedom))
 
-    def doubts(self) -> tuple[str, ...]:
+    def consistency_warnings(self) -> tuple[str, ...]:
         """Return a warning if the stars do not fit their catalogue, naming the worst of them."""
         v = self._seen
         if v is None or not self.misfit > TOO_LARGE:

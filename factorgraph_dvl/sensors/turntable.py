@@ -8,8 +8,9 @@ from typing import ClassVar, Self
 
 import numpy as np
 
-from factorgraph_dvl.conventions import DEG, Array
-from factorgraph_dvl.earth import LocalFrame
+from factorgraph_dvl.geometry.earth import LocalFrame
+from factorgraph_dvl.geometry.units import DEG
+from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.sensors.protocol import (
     Motion,
     Observation,
@@ -19,7 +20,7 @@ from factorgraph_dvl.sensors.protocol import (
     check_range,
     check_times,
 )
-from factorgraph_dvl.turning import Turning
+from factorgraph_dvl.sensors.turntable_motion import TurntableMotion
 
 
 class TurntableSettings(SensorSection, frozen=True, kw_only=True):
@@ -74,9 +75,9 @@ class Turntable:
         """No row, (M,) bool: none may be empty."""
         return np.zeros(self.time.size, dtype=bool)
 
-    def turning(self, up: Array) -> Turning:
+    def turning(self, up: Array) -> TurntableMotion:
         """Return how the body turns about its axis `up`, (3,)."""
-        return Turning(self.time, np.unwrap(self.angle), up)
+        return TurntableMotion(self.time, np.unwrap(self.angle), up)
 
     def parameters(self) -> tuple[Parameter, ...]:
         """Return nothing: the angle is taken as exact."""

@@ -13,8 +13,9 @@ from typing import cast
 
 import numpy as np
 
-from factorgraph_dvl.conventions import DEG, Array
 from factorgraph_dvl.errors import ConfigError
+from factorgraph_dvl.geometry.units import DEG
+from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.sensors.dvl import Dvl
 from factorgraph_dvl.sensors.gnss import Gnss
 from factorgraph_dvl.sensors.protocol import Aid
@@ -22,21 +23,11 @@ from factorgraph_dvl.simulation.beams import simulate_beams, simulate_turntable
 from factorgraph_dvl.simulation.depth import simulate_depth
 from factorgraph_dvl.simulation.measurements import displaced, simulate_dvl, simulate_gnss
 from factorgraph_dvl.simulation.measurements import simulate_imu as _simulate_imu
-from factorgraph_dvl.simulation.motion import Motion, plan_motion
-from factorgraph_dvl.simulation.ranging import (
-    simulate_beacons,
-    simulate_heading,
-    simulate_log,
-)
+from factorgraph_dvl.simulation.motion import TrueMotion, plan_motion
+from factorgraph_dvl.simulation.ranging import simulate_beacons, simulate_heading, simulate_log
 from factorgraph_dvl.simulation.scenario import Scenario, load_scenario, parse_scenario
 from factorgraph_dvl.simulation.star import simulate_star
-from factorgraph_dvl.trial import (
-    InitialAttitude,
-    InitialPosition,
-    PlanarTrial,
-    Reference,
-    Trial,
-)
+from factorgraph_dvl.trial import InitialAttitude, InitialPosition, PlanarTrial, Reference, Trial
 
 __all__ = [
     "Scenario",
@@ -141,7 +132,7 @@ def simulate_planar(scenario: Scenario | str | PathLike[str], seed: int = 0) -> 
 
 
 def _initial(
-    scenario: Scenario, motion: Motion, time: Array
+    scenario: Scenario, motion: TrueMotion, time: Array
 ) -> tuple[InitialAttitude | None, InitialPosition | None]:
     claim = scenario.trial.initial
     if claim is None:
@@ -157,7 +148,7 @@ def _initial(
     return attitude, position
 
 
-def _reference(motion: Motion, rate: float) -> Reference:
+def _reference(motion: TrueMotion, rate: float) -> Reference:
     # Divided, not multiplied by a period: then a time that a file can hold in few digits
     # is that number.
     time = np.arange(int(np.floor(motion.duration * rate + 1e-6)) + 1) / rate

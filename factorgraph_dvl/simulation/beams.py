@@ -7,17 +7,19 @@ from typing import cast
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from factorgraph_dvl.conventions import DEG, Array, rotation_from_rph
+from factorgraph_dvl.geometry.rotations import rotation_from_rph
+from factorgraph_dvl.geometry.units import DEG
+from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.sensors.dvl_beams import DvlBeams, DvlBeamsSettings
 from factorgraph_dvl.sensors.turntable import Turntable, TurntableSettings
 from factorgraph_dvl.simulation.instruments import DvlBeamsTruth
 from factorgraph_dvl.simulation.measurements import apply, sample_times, within
-from factorgraph_dvl.simulation.motion import Motion
+from factorgraph_dvl.simulation.motion import TrueMotion
 from factorgraph_dvl.simulation.scenario import Scenario
 
 
 def simulate_beams(
-    scenario: Scenario, motion: Motion, rng: np.random.Generator
+    scenario: Scenario, motion: TrueMotion, rng: np.random.Generator
 ) -> tuple[DvlBeams, dict[str, Array]]:
     """Return the record of the beams, and their calibration by reported name.
 
@@ -54,7 +56,7 @@ def simulate_beams(
 
 
 def simulate_turntable(
-    scenario: Scenario, motion: Motion, rng: np.random.Generator
+    scenario: Scenario, motion: TrueMotion, rng: np.random.Generator
 ) -> tuple[Turntable, dict[str, Array]]:
     """Return the record of the turntable, its angle without error."""
     truth = scenario.turntable

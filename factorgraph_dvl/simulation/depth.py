@@ -6,15 +6,16 @@ from typing import cast
 
 import numpy as np
 
-from factorgraph_dvl.conventions import Array, rotation_from_rph
+from factorgraph_dvl.geometry.rotations import rotation_from_rph
+from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.sensors.depth import Depth, DepthSettings
 from factorgraph_dvl.simulation.measurements import displaced, sample_times
-from factorgraph_dvl.simulation.motion import Motion
+from factorgraph_dvl.simulation.motion import TrueMotion
 from factorgraph_dvl.simulation.scenario import Scenario
 
 
 def simulate_depth(
-    scenario: Scenario, motion: Motion, rng: np.random.Generator
+    scenario: Scenario, motion: TrueMotion, rng: np.random.Generator
 ) -> tuple[Depth, dict[str, Array]]:
     """Return the sensor's record, and the height of the sea surface by reported name.
 

@@ -43,7 +43,7 @@ class Sampled(Section, frozen=True, kw_only=True):
             raise ValueError("`jitter_s` must be below half a period, 0.5 / rate_hz")
 
 
-class Instrument(Sampled, frozen=True, kw_only=True):
+class SimulatedInstrument(Sampled, frozen=True, kw_only=True):
     """A simulated sensor, and what trial.yaml claims of it unless told otherwise."""
 
     section_type: ClassVar[type[SensorSection]]
@@ -53,7 +53,7 @@ class Instrument(Sampled, frozen=True, kw_only=True):
         raise NotImplementedError
 
 
-class ImuTruth(Instrument, frozen=True, kw_only=True):
+class ImuTruth(SimulatedInstrument, frozen=True, kw_only=True):
     """The simulated IMU; `draw` takes a bias from N(0, std²), anew for each seed."""
 
     section_type: ClassVar[type[SensorSection]] = ImuSettings
@@ -91,7 +91,7 @@ class ImuTruth(Instrument, frozen=True, kw_only=True):
         return {name: getattr(self, name) for name in names if getattr(self, name) is not None}
 
 
-class GnssTruth(Instrument, frozen=True, kw_only=True):
+class GnssTruth(SimulatedInstrument, frozen=True, kw_only=True):
     """The simulated receiver; without velocity_std_m_s it measures no velocity."""
 
     section_type: ClassVar[type[SensorSection]] = GnssSettings
@@ -116,7 +116,7 @@ class GnssTruth(Instrument, frozen=True, kw_only=True):
         return out
 
 
-class DvlTruth(Instrument, frozen=True, kw_only=True):
+class DvlTruth(SimulatedInstrument, frozen=True, kw_only=True):
     """The simulated DVL; the noise variance is floor² + (fraction · |v|)²."""
 
     section_type: ClassVar[type[SensorSection]] = DvlSettings
@@ -143,7 +143,7 @@ class DvlTruth(Instrument, frozen=True, kw_only=True):
         return {name: getattr(self, name) for name in names}
 
 
-class StarTruth(Instrument, frozen=True, kw_only=True):
+class StarTruth(SimulatedInstrument, frozen=True, kw_only=True):
     """The simulated star tracker; with `stars` it reports their directions."""
 
     section_type: ClassVar[type[SensorSection]] = StarSettings
@@ -170,7 +170,7 @@ class StarTruth(Instrument, frozen=True, kw_only=True):
         return {name: getattr(self, name) for name in names}
 
 
-class DepthTruth(Instrument, frozen=True, kw_only=True):
+class DepthTruth(SimulatedInstrument, frozen=True, kw_only=True):
     """The simulated depth sensor; the sea surface is at a height above the ellipsoid."""
 
     section_type: ClassVar[type[SensorSection]] = DepthSettings
@@ -193,7 +193,7 @@ class LostBeam(Section, frozen=True, kw_only=True):
     to_s: float
 
 
-class DvlBeamsTruth(Instrument, frozen=True, kw_only=True):
+class DvlBeamsTruth(SimulatedInstrument, frozen=True, kw_only=True):
     """The simulated beams; `draw` takes errors anew for each seed, evenly up to a limit.
 
     The noise variance of a beam is floor² + (fraction · its velocity)².
@@ -264,7 +264,7 @@ class TableTurn(Section, frozen=True, kw_only=True):
             raise ValueError("`ramp_s` must not exceed half of `duration_s`")
 
 
-class TurntableTruth(Instrument, frozen=True, kw_only=True):
+class TurntableTruth(SimulatedInstrument, frozen=True, kw_only=True):
     """The turntable that carries IMU and DVL, and when it turns; it reports without error."""
 
     section_type: ClassVar[type[SensorSection]] = TurntableSettings

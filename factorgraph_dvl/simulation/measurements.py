@@ -11,28 +11,22 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from scipy.special import factorial
 
-from factorgraph_dvl.conventions import (
-    DEG,
-    DEG_PER_HOUR,
-    DEG_PER_SQRT_HOUR,
-    HOUR,
-    MICRO_G,
-    Array,
-    rotation_from_rph,
-)
 from factorgraph_dvl.errors import ConfigError
+from factorgraph_dvl.geometry.rotations import rotation_from_rph
+from factorgraph_dvl.geometry.units import DEG, DEG_PER_HOUR, DEG_PER_SQRT_HOUR, HOUR, MICRO_G
+from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.sensors.dvl import Dvl, DvlSettings
 from factorgraph_dvl.sensors.gnss import Gnss, GnssSettings
 from factorgraph_dvl.sensors.imu import Imu, ImuSettings
 from factorgraph_dvl.simulation.instruments import Interval, Sampled
-from factorgraph_dvl.simulation.motion import Motion, State
+from factorgraph_dvl.simulation.motion import TrueMotion, TrueState
 from factorgraph_dvl.simulation.scenario import Scenario
 
 _CHUNK = 32768
 
 
 def simulate_imu(
-    scenario: Scenario, motion: Motion, rng: np.random.Generator
+    scenario: Scenario, motion: TrueMotion, rng: np.random.Generator
 ) -> tuple[Imu, dict[str, Array]]:
     """Return the IMU's record, and its biases by reported name.
 
@@ -99,7 +93,7 @@ def simulate_imu(
 
 
 def simulate_gnss(
-    scenario: Scenario, motion: Motion, rng: np.random.Generator
+    scenario: Scenario, motion: TrueMotion, rng: np.random.Generator
 ) -> tuple[Gnss, dict[str, Array]]:
     """Return the receiver's record, position and velocity of the antenna, and its truth."""
     truth = scenario.gnss
@@ -131,7 +125,7 @@ def simulate_gnss(
 
 
 def simulate_dvl(
-    scenario: Scenario, motion: Motion, rng: np.random.Generator
+    scenario: Scenario, motion: TrueMotion, rng: np.random.Generator
 ) -> tuple[Dvl, dict[str, Array]]:
     """Return the DVL's record, and its calibration by reported name.
 
@@ -169,7 +163,7 @@ def simulate_dvl(
     return dvl, calibration
 
 
-def _dvl_velocity(scenario: Scenario, state: State) -> Array:
+def _dvl_velocity(scenario: Scenario, state: TrueState) -> Array:
     truth = scenario.dvl
     assert truth is not None
     current = np.array(scenario.current_m_s) if truth.reference == "water" else np.zeros(3)
@@ -215,7 +209,7 @@ def within(time: Array, intervals: Sequence[Interval]) -> NDArray[np.bool_]:
     return out
 
 
-def _instantaneous_samples(motion: Motion, time: Array) -> tuple[Array, Array]:
+def _instantaneous_samples(motion: TrueMotion, time: Array) -> tuple[Array, Array]:
     gyro, accel = np.empty((time.size, 3)), np.empty((time.size, 3))
     for begin in range(0, time.size, _CHUNK):
         part = slice(begin, begin + _CHUNK)
@@ -224,7 +218,7 @@ def _instantaneous_samples(motion: Motion, time: Array) -> tuple[Array, Array]:
     return gyro, accel
 
 
-def _mean_samples(motion: Motion, bounds: Array) -> tuple[Array, Array]:
+def _mean_samples(motion: TrueMotion, bounds: Array) -> tuple[Array, Array]:
     """Return averages of angular rate and specific force between bounds (N + 1,).
 
     Gauss-Legendre quadrature, on pieces between the kinks of the motion.

@@ -14,16 +14,16 @@ import numpy as np
 from scipy.interpolate import PPoly
 from scipy.spatial.transform import Rotation
 
-from factorgraph_dvl.conventions import (
-    DEG,
-    Array,
+from factorgraph_dvl.errors import ConfigError
+from factorgraph_dvl.geometry.earth import RATE, normal_gravity, radii
+from factorgraph_dvl.geometry.rotations import (
     BodyAxes,
     frd_from_body,
     rotation_from_rph,
     rph_from_rotation,
 )
-from factorgraph_dvl.earth import RATE, normal_gravity, radii
-from factorgraph_dvl.errors import ConfigError
+from factorgraph_dvl.geometry.units import DEG
+from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.simulation.manoeuvres import Accelerate, Climb, Manoeuvre, Stop, Straight
 from factorgraph_dvl.simulation.scenario import Scenario
 from factorgraph_dvl.simulation.table import table_angle
@@ -64,7 +64,7 @@ class Sway:
 
 
 @dataclass(frozen=True)
-class State:
+class TrueState:
     """Motion at M times.
 
     Parameters
@@ -87,7 +87,7 @@ class State:
 
 
 @dataclass(frozen=True)
-class Motion:
+class TrueMotion:
     """The motion of a scenario, exact at any time from 0 to `duration`.
 
     The vehicle moves through the water along its course; yaw sway turns the bow about
@@ -155,7 +155,7 @@ class Motion:
         drift = float(self.current_n[2]) * t
         return _evaluate(self.height, t) + drift + self.heave.derivatives(t)[0]
 
-    def at(self, t: Array) -> State:
+    def at(self, t: Array) -> TrueState:
         """Return the motion of the body at times (M,).
 
         On a turntable, components in the vehicle s are Rz(angle) times those in b, about the
@@ -170,7 +170,7 @@ class Motion:
         turn = Rotation.from_rotvec(angle[:, None] * up)
         nRs = rotation_from_rph(state.rph, self.body_axes)
         turning = rate[:, None] * up
-        return State(
+        return TrueState(
             geodetic=state.geodetic,
             v_n=state.v_n,
             a_n=state.a_n,
@@ -180,7 +180,7 @@ class Motion:
             f_b=turn.apply(state.f_b, inverse=True),
         )
 
-    def ship_at(self, t: Array) -> State:
+    def ship_at(self, t: Array) -> TrueState:
         """Return the motion of the vehicle at times (M,), in axes of its own like the body's.
 
         With M and N the radii of curvature, L the latitude and h the height,
@@ -221,7 +221,7 @@ class Motion:
             -pitch_rate * sr + heading_rate * cr * cp,
         )
         omega_eb_b = omega_nb_b + to_body(level_e, level_n, level_u)
-        return State(
+        return TrueState(
             geodetic=np.stack([lat, _wrapped(lon), height], axis=1),
             v_n=np.stack([v_e, v_n, v_u], axis=1),
             a_n=np.stack([a_e, a_n, a_u], axis=1),
@@ -257,7 +257,7 @@ class _LevelToBody:
         )
 
 
-def plan_motion(scenario: Scenario) -> Motion:
+def plan_motion(scenario: Scenario) -> TrueMotion:
     """Return the motion of a scenario.
 
     Raises
@@ -284,7 +284,7 @@ def plan_motion(scenario: Scenario) -> Motion:
     kinks = np.asarray(speed.x, dtype=float)
     if table is not None:
         kinks = np.union1d(kinks, table.x)
-    motion = Motion(
+    motion = TrueMotion(
         speed=speed,
         course=course,
         lat=still,
@@ -303,7 +303,7 @@ def plan_motion(scenario: Scenario) -> Motion:
     lat, lon = _integrate_position(
         motion, scenario.start.lat_deg * DEG, scenario.start.lon_deg * DEG, scenario.source
     )
-    return Motion(**{**vars(motion), "lat": lat, "lon": lon})
+    return TrueMotion(**{**vars(motion), "lat": lat, "lon": lon})
 
 
 def _profiles(
@@ -384,7 +384,7 @@ def _sway(parts: Iterable[tuple[float, float, float]]) -> Sway:
 
 
 def _integrate_position(
-    motion: Motion, lat0: float, lon0: float, source: str
+    motion: TrueMotion, lat0: float, lon0: float, source: str
 ) -> tuple[PPoly, PPoly]:
     """Integrate dL/dt = v_n / (M + h) and dlon/dt = v_e / ((N + h) cos L).
 

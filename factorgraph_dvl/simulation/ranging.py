@@ -7,16 +7,18 @@ from typing import cast
 import numpy as np
 import pymap3d
 
-from factorgraph_dvl.conventions import DEG, Array, rotation_from_rph
+from factorgraph_dvl.geometry.rotations import rotation_from_rph
+from factorgraph_dvl.geometry.units import DEG
+from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.sensors.beacon import Beacons, BeaconSettings
-from factorgraph_dvl.sensors.log import Heading, HeadingSettings, LogSettings, SpeedLog
+from factorgraph_dvl.sensors.speed_log import Heading, HeadingSettings, LogSettings, SpeedLog
 from factorgraph_dvl.simulation.measurements import displaced, sample_times, within
-from factorgraph_dvl.simulation.motion import Motion
+from factorgraph_dvl.simulation.motion import TrueMotion
 from factorgraph_dvl.simulation.scenario import Scenario
 
 
 def simulate_beacons(
-    scenario: Scenario, motion: Motion, rng: np.random.Generator
+    scenario: Scenario, motion: TrueMotion, rng: np.random.Generator
 ) -> tuple[Beacons, dict[str, Array]]:
     """Return ranges and range rates to the beacons, asked in turn, and their truth.
 
@@ -72,7 +74,7 @@ def simulate_beacons(
 
 
 def simulate_heading(
-    scenario: Scenario, motion: Motion, rng: np.random.Generator
+    scenario: Scenario, motion: TrueMotion, rng: np.random.Generator
 ) -> tuple[Heading, dict[str, Array]]:
     """Return the compass's record and its bias."""
     truth = scenario.heading
@@ -90,7 +92,7 @@ def simulate_heading(
 
 
 def simulate_log(
-    scenario: Scenario, motion: Motion, rng: np.random.Generator
+    scenario: Scenario, motion: TrueMotion, rng: np.random.Generator
 ) -> tuple[SpeedLog, dict[str, Array]]:
     """Return the log's record, its scale error, and the current that it does not see."""
     truth = scenario.log

@@ -7,12 +7,12 @@ from typing import Annotated, Any, ClassVar, Literal
 import msgspec
 
 from factorgraph_dvl.sensors.beacon import BeaconPosition, BeaconSettings
-from factorgraph_dvl.sensors.log import HeadingSettings, LogSettings
 from factorgraph_dvl.sensors.protocol import NonNegative, SensorSection, Vector3
-from factorgraph_dvl.simulation.instruments import Instrument, Interval, check_intervals
+from factorgraph_dvl.sensors.speed_log import HeadingSettings, LogSettings
+from factorgraph_dvl.simulation.instruments import Interval, SimulatedInstrument, check_intervals
 
 
-class HeadingTruth(Instrument, frozen=True, kw_only=True):
+class HeadingTruth(SimulatedInstrument, frozen=True, kw_only=True):
     """The simulated compass; `draw` takes its bias from N(0, std²), anew for each seed."""
 
     section_type: ClassVar[type[SensorSection]] = HeadingSettings
@@ -27,7 +27,7 @@ class HeadingTruth(Instrument, frozen=True, kw_only=True):
         return out | ({"std_deg": self.std_deg} if self.std_deg > 0.0 else {})
 
 
-class LogTruth(Instrument, frozen=True, kw_only=True):
+class LogTruth(SimulatedInstrument, frozen=True, kw_only=True):
     """The simulated log; `draw` takes its scale error from N(0, std²), anew for each seed."""
 
     section_type: ClassVar[type[SensorSection]] = LogSettings
@@ -43,7 +43,7 @@ class LogTruth(Instrument, frozen=True, kw_only=True):
         return out | ({"speed_std_m_s": self.speed_std_m_s} if self.speed_std_m_s > 0.0 else {})
 
 
-class BeaconTruth(Instrument, frozen=True, kw_only=True):
+class BeaconTruth(SimulatedInstrument, frozen=True, kw_only=True):
     """The simulated ranging; beacons are asked in turn.
 
     `positions` are the true places but for `std_m`: each seed draws a place around the

@@ -55,8 +55,8 @@ from typing import Annotated, Any
 
 import msgspec
 
-from factorgraph_dvl.conventions import BodyAxes
 from factorgraph_dvl.errors import ConfigError
+from factorgraph_dvl.geometry.rotations import BodyAxes
 from factorgraph_dvl.sensors.catalogue import AIDS
 from factorgraph_dvl.sensors.protocol import (
     NonNegative,
@@ -66,20 +66,20 @@ from factorgraph_dvl.sensors.protocol import (
     Vector3,
     check_epoch,
 )
-from factorgraph_dvl.simulation.convert import convert
+from factorgraph_dvl.settings.convert import convert
+from factorgraph_dvl.settings.yaml_file import read_yaml
 from factorgraph_dvl.simulation.instruments import (
     DepthTruth,
     DvlBeamsTruth,
     DvlTruth,
     GnssTruth,
     ImuTruth,
-    Instrument,
+    SimulatedInstrument,
     StarTruth,
     TurntableTruth,
 )
 from factorgraph_dvl.simulation.manoeuvres import Manoeuvre, flatten
 from factorgraph_dvl.simulation.ranging_instruments import BeaconTruth, HeadingTruth, LogTruth
-from factorgraph_dvl.yaml_file import read_yaml
 
 # Sections of the simulated sensors: of any trial, and of a planar one alone.
 _PLANAR = ("heading", "log", "depth", "beacons")
@@ -89,7 +89,7 @@ Latitude = Annotated[float, msgspec.Meta(ge=-89, le=89)]
 Longitude = Annotated[float, msgspec.Meta(ge=-360, le=360)]
 
 
-class Start(Section, frozen=True, kw_only=True):
+class StartSettings(Section, frozen=True, kw_only=True):
     """Where and how the vehicle is at time zero."""
 
     lat_deg: Latitude
@@ -157,7 +157,7 @@ class Scenario(Section, frozen=True, kw_only=True):
     epoch: str = ""
     noise: bool = True
     reference_rate_hz: Positive = 10.0
-    start: Start
+    start: StartSettings
     manoeuvres: list[dict[str, Any]]
     sway: SwaySettings = SwaySettings()
     current_m_s: Vector3 = (0.0, 0.0, 0.0)
@@ -203,7 +203,7 @@ class Scenario(Section, frozen=True, kw_only=True):
         return self.imu is None
 
     @property
-    def aids(self) -> dict[str, Instrument]:
+    def aids(self) -> dict[str, SimulatedInstrument]:
         """The simulated sensors other than the IMU, by section."""
         given = {name: getattr(self, name) for name in _SECTIONS if name != "imu"}
         return {name: truth for name, truth in given.items() if truth is not None}
@@ -216,7 +216,7 @@ class Scenario(Section, frozen=True, kw_only=True):
         ConfigError
             If a claim is not valid.
         """
-        truth: Instrument = getattr(self, section)
+        truth: SimulatedInstrument = getattr(self, section)
         claims = getattr(self.trial, section)
         return convert(
             truth.claimed() | claims, truth.section_type, f"trial.{section}", self.source

@@ -10,18 +10,20 @@ import erfa
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from factorgraph_dvl.conventions import DEG, Array, rotation_from_rph
 from factorgraph_dvl.errors import ConfigError
+from factorgraph_dvl.geometry.rotations import rotation_from_rph
+from factorgraph_dvl.geometry.units import DEG
+from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.sensors.star import Star, StarSettings
 from factorgraph_dvl.simulation.measurements import sample_times, within
-from factorgraph_dvl.simulation.motion import Motion, State
+from factorgraph_dvl.simulation.motion import TrueMotion, TrueState
 from factorgraph_dvl.simulation.scenario import Scenario
 
 _ARCSEC = DEG / 3600.0
 
 
 def simulate_star(
-    scenario: Scenario, motion: Motion, rng: np.random.Generator
+    scenario: Scenario, motion: TrueMotion, rng: np.random.Generator
 ) -> tuple[Star, dict[str, Array]]:
     """Return the tracker's record, quaternions or star vectors, and its mounting.
 
@@ -96,7 +98,7 @@ def _inertial_from_earth(epoch: str, time: Array, ut1_utc: float) -> Rotation:
     return Rotation.from_matrix(matrix).inv()
 
 
-def _earth_from_level(state: State) -> Rotation:
+def _earth_from_level(state: TrueState) -> Rotation:
     """Return the rotations from local-level east, north, up to ITRS."""
     lat, lon = state.geodetic[:, 0], state.geodetic[:, 1]
     # East, north, up at 0, 0 are the ITRS axes y, z, x; up then goes to the latitude, east

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from scipy.interpolate import PPoly
 
-from factorgraph_dvl.conventions import DEG
 from factorgraph_dvl.errors import ConfigError
+from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.simulation.scenario import Scenario
 
 

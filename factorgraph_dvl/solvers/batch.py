@@ -8,27 +8,33 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from factorgraph_dvl.alignment import initial_states
-from factorgraph_dvl.anchoring import Anchors, anchored
-from factorgraph_dvl.attitude_alignment import attitudes, mean_mounting
-from factorgraph_dvl.chain import Chain, inertial_chain
-from factorgraph_dvl.clock import without_strays
-from factorgraph_dvl.conventions import DEG, Array, exp_so3, log_so3
-from factorgraph_dvl.earth import LocalFrame
 from factorgraph_dvl.errors import ConfigError
-from factorgraph_dvl.graph import Evaluation, Problem
-from factorgraph_dvl.increments import increments
-from factorgraph_dvl.mounting import calibrated, initial_values
-from factorgraph_dvl.planar.evidence import odds_against
-from factorgraph_dvl.preintegration import Segments, States, attach, motion_at, segments
-from factorgraph_dvl.priors import Known
+from factorgraph_dvl.geometry.earth import LocalFrame
+from factorgraph_dvl.geometry.rotations import exp_so3, log_so3
+from factorgraph_dvl.geometry.units import DEG
+from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.graph.inertial_chain import Chain, inertial_chain
+from factorgraph_dvl.graph.priors import Known
+from factorgraph_dvl.graph.problem import Evaluation, Problem
+from factorgraph_dvl.imu.increments import increments
+from factorgraph_dvl.imu.preintegration import Segments, States, attach, motion_at, segments
+from factorgraph_dvl.imu.timestamps import without_strays
+from factorgraph_dvl.initialization.attitude_sensors import attitudes, mean_mounting
+from factorgraph_dvl.initialization.dvl_mounting import calibrated, initial_values
+from factorgraph_dvl.initialization.in_motion_alignment import initial_states
+from factorgraph_dvl.ranging.hypothesis_weights import odds_against
+from factorgraph_dvl.ranging.position_from_ranges import StartPositions, positions_from_ranges
 from factorgraph_dvl.sensors.protocol import Aid, Motion, Observation, Parameter
 from factorgraph_dvl.solution import Solution, ambiguity, joined, not_told_apart
-from factorgraph_dvl.solvers.covariance import Posterior, changes_with, considered, posterior
-from factorgraph_dvl.solvers.feigned import at_prior_along, parameter_information, told_of
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, Progress, minimise
+from factorgraph_dvl.solvers.posterior import Posterior, changes_with, considered, posterior
 from factorgraph_dvl.solvers.state_times import STATE_INTERVAL, dense_epochs
 from factorgraph_dvl.solvers.summary import TRAJECTORY_RATE, summarise
+from factorgraph_dvl.statistics.spurious_information import (
+    at_prior_along,
+    data_information,
+    parameter_information,
+)
 from factorgraph_dvl.trial import Trial
 
 # Root mean square error of the positions at which gravity was taken, m: 1 m turns it by
@@ -85,7 +91,7 @@ class _Prepared:
     trial: Trial
     frame: LocalFrame
     seg: Segments
-    anchors: Anchors
+    start_positions: StartPositions
     mountings: dict[str, Array]
     notes: tuple[str, ...]
 
@@ -124,7 +130,7 @@ def solve(
     report = progress or (lambda stage, iteration, cost: None)
     prepared = _prepare(trial, state_interval_s, report)
     found, solutions = [], []
-    for states in prepared.anchors.states:
+    for states in prepared.start_positions.states:
         minima = [
             _described(*each, report, prepared.notes) for each in _minima(prepared, states, report)
         ]
@@ -132,7 +138,7 @@ def solve(
         solutions.append(not_told_apart([solution_of(each, rate_hz) for each in minima], against))
         found.append(minima[int(np.argmin(against))])
     against = odds_against([_cost_terms(each) for each in found])
-    return joined(solutions, against, prepared.anchors.hypotheses)
+    return joined(solutions, against, prepared.start_positions.hypotheses)
 
 
 def solution_of(found: Minimised, rate_hz: float) -> Solution:
@@ -169,8 +175,8 @@ def _described(
     """Return a minimum with its covariances, and without what the data cannot tell."""
     report("covariance", 0, None)
     covariances = posterior(problem, minimum)
-    told = told_of(problem, minimum, covariances)
-    held = told.directions_not_told()
+    told = data_information(problem, minimum, covariances)
+    held = told.undetermined_directions()
     if held.size:
         # How others go with what is held is linear here, where the directions belong.
         full = parameter_information(problem, minimum.evaluation)
@@ -216,7 +222,7 @@ def _cost_terms(found: Minimised) -> Array:
 
 def fit(
     trial: Trial, *, state_interval_s: float, progress: Progress, known: Known | None = None
-) -> tuple[Problem, Minimum, tuple[str, ...], Anchors]:
+) -> tuple[Problem, Minimum, tuple[str, ...], StartPositions]:
     """Find the minimum of a trial's cost, from nothing but its data.
 
     Parameters
@@ -228,13 +234,13 @@ def fit(
     Returns
     -------
     problem, minimum, notes : what was minimised, where it ended, what the user must know.
-    anchors : where it may have begun; it did at the first.
+    start_positions : where it may have begun; it did at the first.
     """
     prepared = _prepare(trial, state_interval_s, progress)
-    states = prepared.anchors.states[0]
+    states = prepared.start_positions.states[0]
     problem, minimum, own = _descended(prepared, states, progress, known)
-    notes = (*prepared.notes, *own, *ambiguity(prepared.anchors.hypotheses))
-    return problem, minimum, notes, prepared.anchors
+    notes = (*prepared.notes, *own, *ambiguity(prepared.start_positions.hypotheses))
+    return problem, minimum, notes, prepared.start_positions
 
 
 def _prepare(trial: Trial, state_interval_s: float, report: Progress) -> _Prepared:
@@ -248,10 +254,12 @@ def _prepare(trial: Trial, state_interval_s: float, report: Progress) -> _Prepar
     start = initial_states(trial, frame, seg)
     if trial.beacons is not None:
         report("ranges", 0, None)
-    anchors = anchored(trial, frame, seg, start.states)
-    doubts = [doubt for seen in attitudes(trial, frame) for doubt in seen.doubts]
-    notes = (*trial.notes, *gaps, *start.notes, *doubts, *anchors.notes)
-    return _Prepared(trial, frame, seg, anchors, start.mountings, notes)
+    start_positions = positions_from_ranges(trial, frame, seg, start.states)
+    consistency_warnings = [
+        doubt for seen in attitudes(trial, frame) for doubt in seen.consistency_warnings
+    ]
+    notes = (*trial.notes, *gaps, *start.notes, *consistency_warnings, *start_positions.notes)
+    return _Prepared(trial, frame, seg, start_positions, start.mountings, notes)
 
 
 def _minima(prepared: _Prepared, states: States, report: Progress) -> list[_Found]:
@@ -343,7 +351,7 @@ def _descended(
     problem are made anew until nothing changes any more.
     """
     trial, frame, seg = prepared.trial, prepared.frame, prepared.seg
-    rejected = prepared.anchors.rejected
+    rejected = prepared.start_positions.rejected
     if known is not None:
         values = known.parameters
     iterations = 0
@@ -397,8 +405,8 @@ def _changing(problem: Problem, evaluation: Evaluation, p_gravity: Array) -> lis
     away = np.sqrt(np.mean((evaluation.states.p_n - p_gravity) ** 2))
     found = {
         "gravity along the track": not away <= _SAME_GRAVITY,
-        "the times of measurements": problem.strayed(evaluation.parameters),
-        "the weights of measurements": problem.misweighed(evaluation),
+        "the times of measurements": problem.needs_rebinding(evaluation.parameters),
+        "the weights of measurements": problem.needs_reweighting(evaluation),
     }
     return [name for name, changed in found.items() if changed]
 

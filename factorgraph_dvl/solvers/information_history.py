@@ -20,21 +20,21 @@ import gtsam
 import numpy as np
 from scipy.linalg.lapack import dgeqrf, dtrtri
 
-from factorgraph_dvl import keys
-from factorgraph_dvl.conventions import Array
-from factorgraph_dvl.graph import HELD_DIRECTION, Evaluation, Problem
-from factorgraph_dvl.information import InformationHistory
+from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.graph import keys
+from factorgraph_dvl.graph.problem import FIXED_DIRECTION_STD, Evaluation, Problem
 from factorgraph_dvl.solution import Solution
 from factorgraph_dvl.solvers.batch import minimised, solution_of
-from factorgraph_dvl.solvers.covariance import Posterior
-from factorgraph_dvl.solvers.feigned import (
-    FEIGNED,
-    directions_not_told,
-    feigned_information,
-    largest_feigned_share,
-)
 from factorgraph_dvl.solvers.levenberg_marquardt import Progress
+from factorgraph_dvl.solvers.posterior import Posterior
 from factorgraph_dvl.solvers.summary import prior_along, reported
+from factorgraph_dvl.statistics.information_history import InformationHistory
+from factorgraph_dvl.statistics.spurious_information import (
+    SPURIOUS,
+    largest_spurious_share,
+    spurious_information,
+    undetermined_directions,
+)
 from factorgraph_dvl.trial import Trial
 
 _STATE = 9
@@ -104,25 +104,25 @@ def information_history(
     covariances : of the held problem.
     """
     triangles, _ = run_filter(problem, evaluation)
-    not_told = _not_told(problem, evaluation, covariances.given, triangles)
-    return as_history(problem, evaluation, held, triangles, not_told)
+    undetermined = _undetermined(problem, evaluation, covariances.given, triangles)
+    return as_history(problem, evaluation, held, triangles, undetermined)
 
 
-def _not_told(
+def _undetermined(
     problem: Problem, evaluation: Evaluation, nodes: Array, triangles: Array
 ) -> dict[int, Array]:
     """Return the directions that are not told yet, by entry of the history."""
     size = len(problem.prior_root)
     if size == 0:
         return {}
-    feigned = np.zeros((nodes.shape[0], size, size))
-    np.cumsum(feigned_information(problem, evaluation, nodes)[:-1], axis=0, out=feigned[1:])
+    spurious = np.zeros((nodes.shape[0], size, size))
+    np.cumsum(spurious_information(problem, evaluation, nodes)[:-1], axis=0, out=spurious[1:])
     # The last columns are those of the parameters: their triangle has all else eliminated.
     root = triangles[:, -size:, -size:] @ problem.prior_root
     data = np.swapaxes(root, 1, 2) @ root - np.eye(size)
     # The last entry was judged by the solver.
-    doubtful = np.flatnonzero(largest_feigned_share(data, feigned)[:-1] >= FEIGNED)
-    found = {int(k): directions_not_told(data[k], feigned[k]) for k in doubtful}
+    doubtful = np.flatnonzero(largest_spurious_share(data, spurious)[:-1] >= SPURIOUS)
+    found = {int(k): undetermined_directions(data[k], spurious[k]) for k in doubtful}
     return {k: directions for k, directions in found.items() if directions.size}
 
 
@@ -178,7 +178,7 @@ def as_history(
     evaluation: Evaluation,
     held: Array,
     triangles: Array,
-    not_told: Mapping[int, Array],
+    undetermined: Mapping[int, Array],
 ) -> InformationHistory:
     """Return triangles over the constants in reported parametrisation and units.
 
@@ -187,7 +187,7 @@ def as_history(
     problem, evaluation : linearised there.
     held : as of `information_history`.
     triangles : of `run_filter`.
-    not_told : further directions that are at their prior, by entry.
+    undetermined : further directions that are at their prior, by entry.
     """
     layout, _ = _layout(problem)
     names: list[str] = []
@@ -217,11 +217,11 @@ def as_history(
     root = np.empty((triangles.shape[0], size, size))
     for k, triangle in enumerate(triangles):
         spread = at_prior
-        if k in not_told:
-            hold = np.zeros((not_told[k].shape[1], triangle.shape[0]))
-            hold[:, columns] = not_told[k].T @ whiten / HELD_DIRECTION
+        if k in undetermined:
+            hold = np.zeros((undetermined[k].shape[1], triangle.shape[0]))
+            hold[:, columns] = undetermined[k].T @ whiten / FIXED_DIRECTION_STD
             triangle = _triangle(np.concatenate([triangle, hold]), triangle.shape[0])
-            spread = np.hstack([at_prior, prior(not_told[k])])
+            spread = np.hstack([at_prior, prior(undetermined[k])])
         inverse, info = dtrtri(triangle)
         if info != 0:
             raise np.linalg.LinAlgError("a constant without a prior")

@@ -9,7 +9,7 @@ import gtsam
 import numpy as np
 
 from factorgraph_dvl.errors import SolveError
-from factorgraph_dvl.graph import Evaluation, Problem
+from factorgraph_dvl.graph.problem import Evaluation, Problem
 
 Progress = Callable[[str, int, float | None], None]
 

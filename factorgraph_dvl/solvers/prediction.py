@@ -6,25 +6,20 @@ from collections.abc import Callable
 
 import numpy as np
 
-from factorgraph_dvl.chain import inertial_chain
-from factorgraph_dvl.conventions import Array
-from factorgraph_dvl.earth import LocalFrame
-from factorgraph_dvl.graph import Evaluation, Problem
-from factorgraph_dvl.increments import increments
-from factorgraph_dvl.information import InformationHistory
-from factorgraph_dvl.preintegration import States, segments
+from factorgraph_dvl.geometry.earth import LocalFrame
+from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.graph.inertial_chain import inertial_chain
+from factorgraph_dvl.graph.problem import Evaluation, Problem
+from factorgraph_dvl.imu.increments import increments
+from factorgraph_dvl.imu.preintegration import States, segments
 from factorgraph_dvl.solution import Solution
 from factorgraph_dvl.solvers.batch import Minimised, solution_of
-from factorgraph_dvl.solvers.covariance import changes_with, considered, posterior
-from factorgraph_dvl.solvers.feigned import parameter_information, told_of
-from factorgraph_dvl.solvers.information_history import (
-    RATE_HZ,
-    Frontier,
-    as_history,
-    run_filter,
-)
+from factorgraph_dvl.solvers.information_history import RATE_HZ, Frontier, as_history, run_filter
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, eliminate
+from factorgraph_dvl.solvers.posterior import changes_with, considered, posterior
 from factorgraph_dvl.solvers.state_times import STATE_INTERVAL, dense_epochs
+from factorgraph_dvl.statistics.information_history import InformationHistory
+from factorgraph_dvl.statistics.spurious_information import data_information, parameter_information
 from factorgraph_dvl.trial import Trial
 
 TrueStates = Callable[[LocalFrame, Array], States]
@@ -49,8 +44,8 @@ def predict_posterior(
     triangles, frontier = run_filter(problem, evaluation)
     minimum = _minimum(problem, evaluation)
     covariances = posterior(problem, minimum)
-    told = told_of(problem, minimum, covariances, at_truth=True)
-    held = told.directions_not_told()
+    told = data_information(problem, minimum, covariances, at_truth=True)
+    held = told.undetermined_directions()
     if held.size:
         full = parameter_information(problem, evaluation)
         changes = changes_with(covariances, held, told.coupled(held, full))

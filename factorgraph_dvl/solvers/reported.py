@@ -8,11 +8,8 @@ from typing import TypeVar
 
 import numpy as np
 
-from factorgraph_dvl.conventions import (
-    Array,
-    inverse_right_jacobian,
-    reported_rotation_vector,
-)
+from factorgraph_dvl.geometry.rotations import inverse_right_jacobian, reported_rotation_vector
+from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.sensors.protocol import Parameter
 from factorgraph_dvl.solution import Estimate, as_estimates
 

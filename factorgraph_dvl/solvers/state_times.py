@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from factorgraph_dvl.attitude_alignment import attitudes
-from factorgraph_dvl.conventions import Array
-from factorgraph_dvl.earth import LocalFrame
+from factorgraph_dvl.geometry.earth import LocalFrame
+from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.initialization.attitude_sensors import attitudes
 from factorgraph_dvl.sensors.imu import ImuSettings
 from factorgraph_dvl.sensors.protocol import Attitudes
 from factorgraph_dvl.trial import Trial

@@ -8,31 +8,30 @@ from functools import partial
 
 import numpy as np
 
-from factorgraph_dvl import keys
-from factorgraph_dvl.conventions import (
-    Array,
+from factorgraph_dvl.geometry.earth import LocalFrame
+from factorgraph_dvl.geometry.rotations import (
     BodyAxes,
     exp_so3,
     log_so3,
-    rotate,
     rph_from_rotation,
     rph_jacobian,
 )
-from factorgraph_dvl.earth import LocalFrame
-from factorgraph_dvl.graph import Evaluation, Problem
-from factorgraph_dvl.preintegration import Segments, States, attach, motion_at, segment_ends
+from factorgraph_dvl.geometry.vectors import Array, rotate
+from factorgraph_dvl.graph import keys
+from factorgraph_dvl.graph.problem import Evaluation, Problem
+from factorgraph_dvl.imu.preintegration import Segments, States, attach, motion_at, segment_ends
 from factorgraph_dvl.sensors.protocol import Motion, Parameter
 from factorgraph_dvl.solution import (
     Estimate,
     Residuals,
     Solution,
     Trajectory,
-    doubts,
+    consistency_warnings,
     mostly_rejected,
     not_observable,
 )
-from factorgraph_dvl.solvers.covariance import Posterior
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum
+from factorgraph_dvl.solvers.posterior import Posterior
 from factorgraph_dvl.solvers.reported import estimates_of, in_order, in_unit
 
 # Rate of trajectories, Hz, whatever the rate of the states.
@@ -82,7 +81,7 @@ def summarise(
         )
     for label, count in problem.uncovered.items():
         warnings.append(f"{label}: {count} measurements at times without IMU data were not used")
-    warnings += doubts(estimates, residuals)
+    warnings += consistency_warnings(estimates, residuals)
     warnings += mostly_rejected(residuals, rejected)
     warnings += _unobservable(problem, estimates, evaluation.motions)
     return Solution(

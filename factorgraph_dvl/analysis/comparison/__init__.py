@@ -1,0 +1,1 @@
+"""Two results of one trial against each other and against the truth."""

@@ -1,0 +1,338 @@
+"""Two calibrations of the same data against each other."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import chdtrc, chdtri
+
+from factorgraph_dvl.analysis.error_statistics import (
+    ROTATION_VECTORS,
+    VectorErrors,
+    nearest_rotation_vector,
+)
+from factorgraph_dvl.geometry.rotations import exp_so3, log_so3
+from factorgraph_dvl.geometry.unit_vectors import turns_to
+from factorgraph_dvl.geometry.units import DEG
+from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.solution import Estimate, Solution
+
+Side = Literal["A", "B"]
+Verdict = Literal["agree", "differ", "not comparable"]
+Kind = Literal["upper bound", "Hausman", "A alone", "B alone", "none"]
+
+# As the bands of all figures: results that agree exceed it in 0.27 % of components.
+AGREE_SIGMAS = 3.0
+AGREE_PROBABILITY = 0.0027
+# Reported sigmas are good to some percent: below this ratio nothing but their errors
+# would be left of the difference of two variances.
+HAUSMAN_RATIO = 1.05
+
+_IN_BODY_AXES = (
+    *("misalignment_deg", "lever_arm_m", "gyro_bias_deg_h", "accel_bias_ug"),
+    *("gnss_lever_arm_m", "star_mounting_deg", "beam_direction_b"),
+    *("beam_misalignment_deg", "beam_lever_arm_m"),
+)
+
+
+@dataclass(frozen=True)
+class Component:
+    """A calibration component in two results, in its reported unit.
+
+    Parameters
+    ----------
+    parameter, name : as in calibration.json, and in its `covariance.order`.
+    a, b : the two values; nan where a result has none.
+    std_a, std_b : their standard deviations; nan where unknown, 0 where held fixed.
+    std_upper : √(σ_A² + σ_B²), at least the standard deviation of a - b if the errors
+        are not negatively correlated; nan where unknown.
+    std_hausman : √(σ² of the other - σ² of the efficient one); nan where not known or
+        not asked for.
+    std, kind : the standard deviation of a - b that is shown, and which it is.
+    verdict, reason : agree or differ by `std`, or why not comparable.
+    """
+
+    parameter: str
+    name: str
+    a: float
+    b: float
+    std_a: float
+    std_b: float
+    std_upper: float
+    std_hausman: float
+    std: float
+    kind: Kind
+    verdict: Verdict
+    reason: str
+
+    @property
+    def difference(self) -> float:
+        """Value of A - value of B."""
+        return self.a - self.b
+
+    @property
+    def in_sigmas(self) -> float:
+        """Difference over its standard deviation; nan where that is not known."""
+        return self.difference / self.std if self.std > 0.0 else float("nan")
+
+
+@dataclass(frozen=True)
+class Joint:
+    """Joint test of all comparable components by the upper-bound covariance.
+
+    Parameters
+    ----------
+    names : of the n components.
+    statistic : d' (P_A + P_B)^-1 d, with d = A - B.
+    limit : that chi² of n degrees exceeds with `AGREE_PROBABILITY`.
+    probability : that chi² of n degrees exceeds the statistic; of results that agree
+        it is at least this.
+    correlations : whether both results state correlations; else taken as none.
+    """
+
+    names: tuple[str, ...]
+    statistic: float
+    limit: float
+    probability: float
+    correlations: bool
+
+    @property
+    def verdict(self) -> Verdict:
+        """Whether the results agree as a whole."""
+        return "agree" if self.statistic <= self.limit else "differ"
+
+
+def compare_calibrations(
+    a: Solution, b: Solution, efficient: Side | None = None
+) -> tuple[Component, ...]:
+    """Return every calibration component of either result.
+
+    var(A - B) = σ_A² + σ_B² - 2 cov(A, B). Both used the same data, so the covariance
+    is unknown but not negative, and without it an upper bound remains. If one of them
+    is efficient its error is uncorrelated with A - B, and var(A - B) is the difference
+    of the variances: Hausman, Specification Tests in Econometrics, Econometrica 46(6),
+    1978, 1251-1271, lemma 2.1.
+
+    Of two rotation vectors of one rotation that of B is taken which is nearer to A's.
+
+    Parameters
+    ----------
+    a, b : the results.
+    efficient : which of them uses the data fully, by a model that is true.
+    """
+    of_a = {e.name: e for e in a.estimates}
+    of_b = {e.name: e for e in same_branch(b, a).estimates}
+    out: list[Component] = []
+    for name in dict.fromkeys((*of_a, *of_b)):
+        axes = a.body_axes == b.body_axes or name not in _IN_BODY_AXES
+        out += _compare(of_a.get(name), of_b.get(name), axes, efficient)
+    return tuple(out)
+
+
+def rotation_angles(a: Solution, b: Solution) -> dict[str, float]:
+    """Return the angles, deg, of the rotations that take B's to A's, by parameter."""
+    out = {}
+    for name in ROTATION_VECTORS:
+        found = [e.value for s in (a, b) for e in s.estimates if e.name == name]
+        if len(found) == 2 and a.body_axes == b.body_axes and np.isfinite(found).all():
+            relative = exp_so3(found[0] * DEG) @ exp_so3(found[1] * DEG).T
+            out[name] = float(np.linalg.norm(log_so3(relative))) / DEG
+    return out
+
+
+def joint_test(a: Solution, b: Solution, components: tuple[Component, ...]) -> Joint | None:
+    """Return the joint test of components with a verdict and both sigmas, None without.
+
+    Parameters
+    ----------
+    a, b : the results, for their covariances.
+    components : of `compare_calibrations`.
+    """
+    tested = [
+        c
+        for c in components
+        if c.verdict != "not comparable" and np.isfinite(c.std_upper) and c.std_upper > 0.0
+    ]
+    if not tested:
+        return None
+    names = tuple(c.name for c in tested)
+    p_a, p_b = _block(a, names), _block(same_branch(b, a), names)
+    difference = np.array([c.difference for c in tested])
+    statistic = float(VectorErrors(difference[None], (p_a + p_b)[None]).nees[0])
+    dof = float(len(names))
+    return Joint(
+        names,
+        statistic,
+        float(chdtri(dof, AGREE_PROBABILITY)),
+        float(chdtrc(dof, statistic)),
+        len(names) == 1 or (_correlated(p_a) and _correlated(p_b)),
+    )
+
+
+def same_branch(solution: Solution, other: Solution) -> Solution:
+    """Return a solution with the rotation vectors that are nearer to another's.
+
+    Directions become turns of the other's nominal ones.
+
+    With φ' = φ (1 - 2π / |φ|), the same rotation, J = (1 - 2π / |φ|) I + 2π φ φ' / |φ|³
+    takes its covariance along.
+    """
+    estimates = list(solution.estimates)
+    covariance = np.array(solution.covariance, dtype=float)
+    near = {e.name: e.value for e in other.estimates}
+    row = 0
+    for i, estimate in enumerate(estimates):
+        rows = slice(row, row + estimate.value.size)
+        row = rows.stop
+        if estimate.nominal is not None:
+            estimates[i] = _about_the_same(estimate, other)
+        if estimate.name not in ROTATION_VECTORS or estimate.name not in near:
+            continue
+        phi = estimate.value
+        if not np.isfinite([phi, near[estimate.name]]).all():
+            continue
+        moved = nearest_rotation_vector(phi, near[estimate.name])
+        if np.array_equal(moved, phi):
+            continue
+        angle = float(np.linalg.norm(phi))
+        jacobian = (1.0 - 360.0 / angle) * np.eye(3) + 360.0 * np.outer(phi, phi) / angle**3
+        covariance[rows] = jacobian @ covariance[rows]
+        covariance[:, rows] = covariance[:, rows] @ jacobian.T
+        std = np.sqrt(np.diagonal(covariance)[rows])
+        estimates[i] = replace(estimate, value=moved, std=std)
+    return replace(solution, estimates=tuple(estimates), covariance=covariance)
+
+
+def _about_the_same(estimate: Estimate, other: Solution) -> Estimate:
+    """Return directions as turns of the other's nominal ones; the same to first order."""
+    theirs = next((e for e in other.estimates if e.name == estimate.name), None)
+    if theirs is None or theirs.nominal is None or theirs.value.size != estimate.value.size:
+        return estimate
+    turns = turns_to(theirs.nominal, estimate.directions).ravel() / DEG
+    return replace(estimate, value=turns, nominal=theirs.nominal)
+
+
+def std_of_difference(
+    std_a: Array, std_b: Array, efficient: Side | None
+) -> tuple[Array, NDArray[np.float64]]:
+    """Return √(σ_A² + σ_B²), and the Hausman value where it has digits, else nan.
+
+    Parameters
+    ----------
+    std_a, std_b : (...) standard deviations.
+    efficient : which of the two is efficient; None = neither.
+    """
+    upper = np.hypot(std_a, std_b)
+    hausman = np.full(np.shape(upper), np.nan)
+    if efficient is not None:
+        best, other = (std_a, std_b) if efficient == "A" else (std_b, std_a)
+        has_digits = (other > HAUSMAN_RATIO * best) & (best > 0.0)
+        np.sqrt(other**2 - best**2, out=hausman, where=has_digits)
+    return upper, hausman
+
+
+def _compare(
+    a: Estimate | None, b: Estimate | None, same_axes: bool, efficient: Side | None
+) -> list[Component]:
+    some = a if b is None or (a is not None and a.value.size >= b.value.size) else b
+    assert some is not None
+    n = some.value.size
+    obstacle = _obstacle(a, b, same_axes)
+    value_a, std_a, seen_a = _columns(a, n)
+    value_b, std_b, seen_b = _columns(b, n)
+    upper, hausman = std_of_difference(std_a, std_b, efficient)
+    out = []
+    for i, name in enumerate(some.component_names):
+        std, kind = _shown(std_a[i], std_b[i], upper[i], hausman[i])
+        reason = obstacle or _component_obstacle(
+            (value_a[i], std_a[i], seen_a[i]), (value_b[i], std_b[i], seen_b[i])
+        )
+        if obstacle or not np.isfinite(value_a[i] - value_b[i]):
+            std, kind = float("nan"), "none"
+        verdict, reason = _judge(float(value_a[i] - value_b[i]), std, kind, reason)
+        out.append(
+            Component(
+                parameter=some.name,
+                name=name,
+                a=float(value_a[i]),
+                b=float(value_b[i]),
+                std_a=float(std_a[i]),
+                std_b=float(std_b[i]),
+                std_upper=float(upper[i]),
+                std_hausman=float(hausman[i]),
+                std=std,
+                kind=kind,
+                verdict=verdict,
+                reason=reason,
+            )
+        )
+    return out
+
+
+def _columns(estimate: Estimate | None, n: int) -> tuple[Array, Array, NDArray[np.bool_]]:
+    """Return values, standard deviations, observability (n,); one number for all is repeated."""
+    unknown = np.full(n, np.nan)
+    if estimate is None or estimate.value.size not in (1, n):
+        return unknown, unknown, np.ones(n, dtype=bool)
+    return (
+        np.broadcast_to(estimate.value, (n,)),
+        np.broadcast_to(estimate.std, (n,)),
+        np.broadcast_to(np.asarray(estimate.observable, dtype=bool), (n,)),
+    )
+
+
+def _obstacle(a: Estimate | None, b: Estimate | None, same_axes: bool) -> str:
+    if a is None or b is None:
+        return f"only in {'A' if b is None else 'B'}"
+    if a.value.size != b.value.size:
+        return f"other parametrisation: {a.value.size} in A, {b.value.size} in B"
+    return "" if same_axes else "other body axes"
+
+
+def _component_obstacle(a: tuple[float, float, np.bool_], b: tuple[float, float, np.bool_]) -> str:
+    for why, blocked in (
+        ("no value", [not np.isfinite(value) for value, _, _ in (a, b)]),
+        ("held fixed", [std == 0.0 for _, std, _ in (a, b)]),
+        ("not observable", [not seen for _, _, seen in (a, b)]),
+    ):
+        if any(blocked):
+            return f"{why} in {' and '.join(s for s, x in zip('AB', blocked, strict=True) if x)}"
+    return ""
+
+
+def _shown(std_a: float, std_b: float, upper: float, hausman: float) -> tuple[float, Kind]:
+    if np.isfinite(hausman):
+        return float(hausman), "Hausman"
+    if np.isfinite(upper):
+        return float(upper), "upper bound"
+    if np.isfinite(std_a):
+        return float(std_a), "A alone"
+    if np.isfinite(std_b):
+        return float(std_b), "B alone"
+    return float("nan"), "none"
+
+
+def _judge(difference: float, std: float, kind: Kind, reason: str) -> tuple[Verdict, str]:
+    if reason:
+        return "not comparable", reason
+    if kind == "none":
+        return "not comparable", "no σ in either: in units only"
+    if abs(difference) <= AGREE_SIGMAS * std:
+        return "agree", ""
+    if kind in ("A alone", "B alone"):
+        other = "B" if kind == "A alone" else "A"
+        return "not comparable", f"beyond {AGREE_SIGMAS:g}σ of {kind}, but {other} has no σ"
+    return "differ", ""
+
+
+def _block(solution: Solution, names: tuple[str, ...]) -> Array:
+    order = list(solution.order)
+    rows = [order.index(name) for name in names]
+    return np.asarray(solution.covariance)[np.ix_(rows, rows)]
+
+
+def _correlated(covariance: Array) -> bool:
+    return bool(np.any(covariance[~np.eye(len(covariance), dtype=bool)] != 0.0))

@@ -1,0 +1,175 @@
+"""Dead reckoning before and after calibration, and what the lever arm is worth."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from factorgraph_dvl.analysis.beam_quality import beam_calibration
+from factorgraph_dvl.analysis.dead_reckoning.integration import (
+    DeadReckonedTrack,
+    DvlMounting,
+    OrientationAt,
+    antenna_removed,
+    dead_reckon,
+    displaced,
+    lever_arm_error,
+    mounting_of,
+)
+from factorgraph_dvl.analysis.dead_reckoning.track_error import Score, difference, score
+from factorgraph_dvl.geometry.rotations import rotation_from_rph
+from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.sensors.beam_geometry import as_dvl
+from factorgraph_dvl.trial import Reference, Trial
+
+# Fixes of so many seconds tell where a track starts: many enough for their noise, and too short
+# a time for a calibrated DVL to drift.
+_START_S = 60.0
+
+
+@dataclass(frozen=True)
+class Run:
+    """A dead-reckoned track, and its errors; None where there is nothing to score it by."""
+
+    mounting: DvlMounting
+    track: DeadReckonedTrack
+    score: Score | None
+
+
+@dataclass(frozen=True)
+class LeverArmEffect:
+    """What a neglected lever arm does to the position, two ways.
+
+    Parameters
+    ----------
+    time : (M,) s.
+    measured : (M, 3) track without lever arm minus track with it, east, north, up, m.
+    closed_form : (M, 3) (C(t) - C(0)) l, m.
+    """
+
+    time: Array
+    measured: Array
+    closed_form: Array
+
+    @property
+    def largest(self) -> float:
+        """Largest horizontal effect, m."""
+        return float(np.hypot(self.closed_form[:, 0], self.closed_form[:, 1]).max())
+
+    @property
+    def disagreement(self) -> float:
+        """Largest distance between the two ways, m."""
+        return float(np.linalg.norm(self.measured - self.closed_form, axis=1).max())
+
+
+@dataclass(frozen=True)
+class BeforeAfter:
+    """Dead reckoning with the calibration, without, and with all of it but the lever arm.
+
+    Parameters
+    ----------
+    calibrated, uncalibrated, without_lever_arm : the runs.
+    lever_arm : difference of the first and the last.
+    scored_by : what the errors are against.
+    """
+
+    calibrated: Run
+    uncalibrated: Run
+    without_lever_arm: Run
+    lever_arm: LeverArmEffect
+    scored_by: Literal["reference", "GNSS", "nothing"]
+
+
+def before_after(
+    trial: Trial, values: Mapping[str, Array], orientation_at: OrientationAt
+) -> BeforeAfter:
+    """Dead-reckon a trial by a calibration, and by what trial.yaml says of the mounting.
+
+    All tracks start where the fixes of the first minute put the calibrated one: the error of a
+    single fix would stay in the whole track, and in its score. Without GNSS they start at
+    `initial.position`.
+
+    Of a trial with beams and without a DVL beside them it is the beams that are calibrated.
+
+    Parameters
+    ----------
+    trial : with DVL or beams; GNSS gives the start, and scores where there is no reference.
+    values : of the calibration, by name, in reported units; directions as (N, 3) vectors.
+    orientation_at : attitude and turn rate at times (M,).
+
+    Raises
+    ------
+    DataError
+        As `dead_reckon`, and if the calibration is one of other beams.
+    """
+    truth, scored_by = _truth(trial, orientation_at)
+    corrected, mounting = _calibrated(trial, values)
+    start = _start(trial, dead_reckon(corrected, mounting, orientation_at), orientation_at)
+
+    def reckon(trial: Trial, mounting: DvlMounting) -> DeadReckonedTrack:
+        return dead_reckon(trial, mounting, orientation_at, start)
+
+    best = reckon(corrected, mounting)
+
+    def run(mounting: DvlMounting, track: DeadReckonedTrack) -> Run:
+        return Run(mounting, track, None if truth is None else score(track, truth, along=best))
+
+    nominal = mounting_of(trial)
+    bare = replace(mounting, lever_arm=np.zeros(3))
+    calibrated = run(mounting, best)
+    without = run(bare, reckon(corrected, bare))
+    nRb = rotation_from_rph(best.rph, trial.body_axes)
+    effect = LeverArmEffect(
+        best.time,
+        difference(without.track, best.time, best.geodetic),
+        lever_arm_error(nRb, mounting.lever_arm),
+    )
+    return BeforeAfter(
+        calibrated=calibrated,
+        uncalibrated=run(nominal, reckon(trial, nominal)),
+        without_lever_arm=without,
+        lever_arm=effect,
+        scored_by="nothing" if calibrated.score is None else scored_by,
+    )
+
+
+def _start(
+    trial: Trial, track: DeadReckonedTrack, orientation_at: OrientationAt
+) -> tuple[float, Array]:
+    """Return time and position of the start that fits the first fixes best.
+
+    Their median, by axis, because one of them may be an outlier.
+    """
+    first, position = float(track.time[0]), track.geodetic[0]
+    if trial.gnss is None:
+        return first, position
+    fixes = antenna_removed(trial.gnss, orientation_at)
+    last = min(first + _START_S, float(track.time[-1]))
+    early = (fixes.time >= first) & (fixes.time <= last)
+    if not early.any():
+        return first, position
+    off = np.median(difference(track, fixes.time[early], fixes.geodetic[early]), axis=0)
+    return first, displaced(position[None], -off[None])[0]
+
+
+def _calibrated(trial: Trial, values: Mapping[str, Array]) -> tuple[Trial, DvlMounting]:
+    """Return the trial with the log that a calibration makes of it, and what is left to apply."""
+    if trial.dvl is not None or trial.beams is None:
+        return trial, mounting_of(trial, values)
+    found = beam_calibration(trial.beams, values)
+    log = as_dvl(trial.beams, (found.directions_b, found.scale_error, found.lever_arm))
+    corrected = replace(trial, dvl=log)
+    return corrected, mounting_of(corrected)
+
+
+def _truth(
+    trial: Trial, orientation_at: OrientationAt
+) -> tuple[Reference | None, Literal["reference", "GNSS", "nothing"]]:
+    if trial.reference is not None:
+        return trial.reference, "reference"
+    if trial.gnss is not None:
+        return antenna_removed(trial.gnss, orientation_at), "GNSS"
+    return None, "nothing"

@@ -1,0 +1,276 @@
+"""Dead reckoning: DVL velocity, corrected by a calibration, integrated on the ellipsoid."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.integrate import cumulative_trapezoid
+
+from factorgraph_dvl.errors import DataError
+from factorgraph_dvl.geometry.earth import radii
+from factorgraph_dvl.geometry.rotations import exp_so3, rph_from_rotation
+from factorgraph_dvl.geometry.vectors import Array, rotate
+from factorgraph_dvl.imu.attitude_history import Orientation
+from factorgraph_dvl.imu.timestamps import JUMP
+from factorgraph_dvl.sensors import dvl as dvl_names
+from factorgraph_dvl.sensors.dvl import Dvl
+from factorgraph_dvl.sensors.gnss import Gnss
+from factorgraph_dvl.trial import Reference, Trial
+
+OrientationAt = Callable[[Array], Orientation]
+
+# Intervals without a ping longer than this many usual ones are bridged, and counted.
+_GAP = 3.0
+# A velocity to bridge a gap with is the mean over as many seconds: a period of swell.
+_SWELL = 10.0
+# The latitude settles to the last digit: its rate depends on it by one part in 300 per radian.
+_ROUNDS = 4
+
+
+@dataclass(frozen=True)
+class DvlMounting:
+    """What takes the velocity of a DVL to that of the IMU.
+
+    Parameters
+    ----------
+    dRb : (3, 3) misalignment.
+    scale_error : (1,) or (3,).
+    lever_arm, bias : (3,) m, m/s.
+    time_offset : s.
+    """
+
+    dRb: Array
+    scale_error: Array
+    lever_arm: Array
+    bias: Array
+    time_offset: float
+
+
+@dataclass(frozen=True)
+class DeadReckonedTrack:
+    """A dead-reckoned track of the IMU.
+
+    Parameters
+    ----------
+    time : (M,) s.
+    geodetic : (M, 3) latitude, longitude (rad), ellipsoidal height (m).
+    velocity : (M, 3) local-level east, north, up, m/s.
+    rph : (M, 3) roll, pitch, heading, rad.
+    bridged : total time without bottom lock, s.
+    """
+
+    time: Array
+    geodetic: Array
+    velocity: Array
+    rph: Array
+    bridged: float
+
+    @property
+    def motion(self) -> Reference:
+        """The motion alone."""
+        return Reference(self.time, self.geodetic, self.velocity, self.rph)
+
+
+def mounting_of(trial: Trial, values: Mapping[str, Array] | None = None) -> DvlMounting:
+    """Return the mounting that reported values state, by default that of trial.yaml.
+
+    Parameters
+    ----------
+    trial : for units, and for what `values` do not have.
+    values : (n,) by name as in calibration.json, in reported units.
+    """
+    given = values or {}
+    si = {
+        p.name: np.asarray(given[p.name], dtype=float) * p.si if p.name in given else p.mean
+        for p in _log(trial).nominal().parameters()
+    }
+    return DvlMounting(
+        dRb=exp_so3(si[dvl_names.MISALIGNMENT]),
+        scale_error=np.atleast_1d(si[dvl_names.SCALE_ERROR]),
+        lever_arm=si[dvl_names.LEVER_ARM],
+        bias=si[dvl_names.BIAS],
+        time_offset=float(np.ravel(si[dvl_names.TIME_OFFSET])[0]),
+    )
+
+
+def dead_reckon(
+    trial: Trial,
+    mounting: DvlMounting,
+    orientation_at: OrientationAt,
+    start: tuple[float, Array] | None = None,
+) -> DeadReckonedTrack:
+    """Integrate the corrected velocity of the DVL, by default from the first GNSS fix on.
+
+        v_b = dRbᵀ ((v_d - beta) / (1 + k)) - omega_eb_b x l,    v_n = nRb v_b,
+        dL/dt = v_n / (M + h),  dlon/dt = v_e / ((N + h) cos L),  dh/dt = v_u
+
+    by the trapezoidal rule over the pings. Where there is no lock, the velocity in body is
+    interpolated between what it was on average for some seconds before and after, and turned
+    by the attitude. The fix is of the antenna, the track of the IMU. Without GNSS it starts
+    at `initial.position`, with the velocity of the first ping.
+
+    Parameters
+    ----------
+    trial : its DVL, or what its beams amount to, and its first fix.
+    mounting : that the velocity is corrected by.
+    orientation_at : attitude and turn rate at times (M,).
+    start : time, s, and position of the IMU, (3,), to start from instead.
+
+    Raises
+    ------
+    DataError
+        If there is no DVL, no lock while the attitude is known, or no position to start from.
+    """
+    dvl = _log(trial)
+    pings = dvl.time[dvl.locked] - mounting.time_offset
+    orientation = orientation_at(pings)
+    used = orientation.covered
+    if used.sum() < 2:
+        raise DataError(
+            "fewer than two pings with a lock while the attitude is known",
+            where=dvl.source,
+            expected="bottom lock at times that IMU and attitude cover",
+        )
+    pings = pings[used]
+    unscaled = (dvl.velocity[dvl.locked][used] - mounting.bias) / (1.0 + mounting.scale_error)
+    turning = np.cross(orientation.omega_eb_b[used], mounting.lever_arm)
+    v_b = unscaled @ mounting.dRb - turning
+
+    start_time, position = start or _start(
+        trial, float(pings[0]), float(pings[-1]), orientation_at
+    )
+    time = _filled(pings[pings > start_time])
+    time = np.concatenate([[start_time], time])
+    there = orientation_at(time)
+    time, nRb = time[there.covered], there.nRb[there.covered]
+    knots, velocity, gaps = _with_gaps(pings, v_b)
+    v_n = rotate(nRb, np.stack([np.interp(time, knots, v) for v in velocity.T], axis=1))
+    return DeadReckonedTrack(
+        time=time,
+        geodetic=integrated(time, v_n, position),
+        velocity=v_n,
+        rph=rph_from_rotation(nRb, trial.body_axes),
+        bridged=float(np.diff(gaps[gaps[:, 0] > start_time], axis=1).sum()),
+    )
+
+
+def _log(trial: Trial) -> Dvl:
+    log = trial.log
+    if log is None:
+        raise DataError(
+            "the trial has no DVL",
+            where="trial.yaml",
+            expected="a section `dvl` or `dvl_beams`",
+        )
+    return log
+
+
+def lever_arm_error(nRb: Array, lever_arm: Array) -> Array:
+    """Return the position error that a neglected lever arm causes, (M, 3), m.
+
+    d(C l)/dt = C (omega x l), so what is integrated by mistake is (C(t) - C(0)) l: bounded,
+    and tied to attitude alone.
+
+    Parameters
+    ----------
+    nRb : (M, 3, 3) attitude C over time.
+    lever_arm : (3,) l in body, m.
+    """
+    return np.asarray((nRb - nRb[0]) @ lever_arm)
+
+
+def antenna_removed(gnss: Gnss, orientation_at: OrientationAt) -> Reference:
+    """Return the positions of the IMU at the fixes; attitude and velocity are left at zero."""
+    has_fix = ~np.isnan(gnss.geodetic[:, 0])
+    time, geodetic = gnss.time[has_fix], gnss.geodetic[has_fix]
+    there = orientation_at(time)
+    arm_n = rotate(there.nRb[there.covered], gnss.lever_arm(time[there.covered])[0])
+    moved = displaced(geodetic[there.covered], -arm_n)
+    zero = np.zeros_like(moved)
+    return Reference(time[there.covered], moved, zero, zero)
+
+
+def displaced(geodetic: Array, enu: Array) -> Array:
+    """Return geodetic coordinates (M, 3) some metres east, north, up (M, 3) of others."""
+    lat, _, height = geodetic.T
+    meridian, east = radii(lat)
+    return geodetic + np.stack(
+        [
+            enu[:, 1] / (meridian + height),
+            enu[:, 0] / ((east + height) * np.cos(lat)),
+            enu[:, 2],
+        ],
+        axis=1,
+    )
+
+
+def _start(
+    trial: Trial, first: float, last: float, orientation_at: OrientationAt
+) -> tuple[float, Array]:
+    """Return time and position of the IMU at the first fix between the first and last ping."""
+    if trial.gnss is not None:
+        known = antenna_removed(trial.gnss, orientation_at)
+        inside = np.flatnonzero((known.time >= first) & (known.time < last))
+        if inside.size:
+            return float(known.time[inside[0]]), known.geodetic[inside[0]]
+    if trial.initial_position is not None:
+        return float(trial.imu.time[0]), trial.initial_position.geodetic
+    raise DataError(
+        "no position to start from",
+        where=trial.gnss.source if trial.gnss is not None else "trial.yaml",
+        expected="a GNSS position while the DVL has a lock, or initial.position",
+    )
+
+
+def _with_gaps(pings: Array, v_b: Array) -> tuple[Array, Array, Array]:
+    """Return knots to interpolate the velocity at, and the gaps, (G, 2), begin and end, s.
+
+    One ping is too noisy, and too much at the mercy of the swell, to bridge a gap with.
+    """
+    step = np.diff(pings)
+    before = np.flatnonzero(step > _GAP * np.median(step))
+    gaps = np.stack([pings[before], pings[before + 1]], axis=1)
+    inside = 1e-3 * step[before]
+    times, means = [pings], [v_b]
+    for (begin, end), inset in zip(gaps, inside, strict=True):
+        times.append(np.array([begin + inset, end - inset]))
+        means += [
+            v_b[(pings > begin - _SWELL) & (pings <= begin)].mean(axis=0, keepdims=True),
+            v_b[(pings >= end) & (pings < end + _SWELL)].mean(axis=0, keepdims=True),
+        ]
+    knots = np.concatenate(times)
+    order = np.argsort(knots)
+    return knots[order], np.concatenate(means)[order], gaps
+
+
+def _filled(pings: Array) -> Array:
+    """Return the times of the pings, and between them those of the ones that are missing."""
+    if pings.size < 2:
+        return pings
+    step = np.diff(pings)
+    longest = int(np.argmax(step))
+    if step[longest] > JUMP:
+        raise DataError(
+            f"no ping from {pings[longest]:.10g} to {pings[longest + 1]:.10g} s",
+            where="DVL",
+            expected="a record of one clock, without hours to bridge",
+        )
+    usual = float(np.median(step))
+    pieces = np.maximum(np.rint(step / usual).astype(int), 1)
+    begin = np.repeat(pings[:-1], pieces)
+    piece = np.arange(begin.size) - np.repeat(np.cumsum(pieces) - pieces, pieces)
+    return np.append(begin + piece * np.repeat(step / pieces, pieces), pings[-1])
+
+
+def integrated(time: Array, v_n: Array, start: Array) -> Array:
+    """Return geodetic positions, (M, 3), from velocities (M, 3) and the first position."""
+    height = start[2] + cumulative_trapezoid(v_n[:, 2], time, initial=0)
+    lat = np.full(time.size, start[0])
+    for _ in range(_ROUNDS):
+        rate = v_n[:, 1] / (radii(lat)[0] + height)
+        lat = start[0] + cumulative_trapezoid(rate, time, initial=0)
+    rate = v_n[:, 0] / ((radii(lat)[1] + height) * np.cos(lat))
+    lon = start[1] + cumulative_trapezoid(rate, time, initial=0)
+    return np.stack([lat, lon, height], axis=1)

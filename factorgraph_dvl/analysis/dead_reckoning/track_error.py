@@ -1,0 +1,218 @@
+"""How far a track is from the truth: end point, largest, along and across, straight stretches."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from scipy.integrate import cumulative_trapezoid
+from scipy.interpolate import CubicHermiteSpline
+
+from factorgraph_dvl.analysis.dead_reckoning.integration import DeadReckonedTrack
+from factorgraph_dvl.geometry.earth import radii
+from factorgraph_dvl.geometry.units import DEG
+from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.trial import Reference
+
+STRETCHES_M = (1e3, 5e3, 10e3)
+# The course is that of the displacement over this time, s, and known above this speed, m/s.
+_COURSE_S = 30.0
+_LEAST_SPEED = 0.25
+# A stretch is straight if its course stays within this range.
+_STRAIGHT = 10.0 * DEG
+
+
+@dataclass(frozen=True)
+class Stretches:
+    """Growth of the error over straight stretches of one length.
+
+    Parameters
+    ----------
+    length : m.
+    count : of stretches, one after the other; 0 = the trial has none, and the rest is nan.
+    median, largest : of the growth of the horizontal error, % of the length.
+    along, across : mean growth along the course and to its right, % of the length: what
+        a scale error and an error of the heading leave.
+    """
+
+    length: float
+    count: int
+    median: float
+    largest: float
+    along: float
+    across: float
+
+
+@dataclass(frozen=True)
+class Path:
+    """Where the vehicle went at M epochs.
+
+    Parameters
+    ----------
+    time : (M,) s.
+    distance : (M,) travelled since the first, horizontally, m.
+    course : (M,) over ground, unwrapped, rad.
+    """
+
+    time: Array
+    distance: Array
+    course: Array
+
+    @property
+    def total(self) -> float:
+        """Distance travelled, m."""
+        return float(self.distance[-1])
+
+
+@dataclass(frozen=True)
+class Score:
+    """Errors of a track, estimate - truth, at the epochs where the truth is known.
+
+    Parameters
+    ----------
+    path : at those epochs.
+    error : (M, 3) local-level east, north, up, m.
+    stretches : of `STRETCHES_M`.
+    """
+
+    path: Path
+    error: Array
+    stretches: tuple[Stretches, ...]
+
+    @property
+    def time(self) -> Array:
+        """Epochs, (M,), s."""
+        return self.path.time
+
+    @property
+    def horizontal(self) -> Array:
+        """Size of the horizontal error, (M,), m."""
+        return np.hypot(self.error[:, 0], self.error[:, 1])
+
+    @property
+    def along(self) -> Array:
+        """Error along the course over ground, (M,), m."""
+        return _along_across(self.error, self.path.course)[0]
+
+    @property
+    def across(self) -> Array:
+        """Error to the right of the course over ground, (M,), m."""
+        return _along_across(self.error, self.path.course)[1]
+
+    def percent(self, error_m: float) -> float:
+        """Return an error in % of the distance travelled."""
+        return 100.0 * error_m / self.path.total if self.path.total > 0.0 else float("nan")
+
+
+def path_of(track: DeadReckonedTrack, time: Array) -> Path:
+    """Return distance and course of a track at times (M,) within it."""
+    speed = np.hypot(track.velocity[:, 0], track.velocity[:, 1])
+    distance = cumulative_trapezoid(speed, track.time, initial=0)
+    east, north = (cumulative_trapezoid(track.velocity[:, i], track.time, initial=0)
+                   for i in (0, 1))  # fmt: skip
+
+    def shift(values: Array) -> Array:
+        ahead = np.interp(time + 0.5 * _COURSE_S, track.time, values)
+        return np.asarray(ahead - np.interp(time - 0.5 * _COURSE_S, track.time, values))
+
+    d_east, d_north = shift(east), shift(north)
+    moving = np.flatnonzero(np.hypot(d_east, d_north) > _LEAST_SPEED * _COURSE_S)
+    course = np.zeros(time.size)
+    if moving.size:
+        known = np.unwrap(np.arctan2(d_east[moving], d_north[moving]))
+        course = np.interp(time, time[moving], known)
+    at = np.interp(time, track.time, distance)
+    return Path(time, at - at[:1], course)
+
+
+def score(track: DeadReckonedTrack, truth: Reference, along: DeadReckonedTrack) -> Score | None:
+    """Hold a track against the truth; None where they have no epochs in common.
+
+    Parameters
+    ----------
+    track : to be scored.
+    truth : positions of the IMU.
+    along : the track whose distance and course count: the best there is.
+    """
+    first = max(track.time[0], along.time[0])
+    last = min(track.time[-1], along.time[-1])
+    inside = (truth.time >= first - 1e-6) & (truth.time <= last + 1e-6)
+    if inside.sum() < 2:
+        return None
+    time = np.clip(truth.time[inside], first, last)
+    error = difference(track, time, truth.geodetic[inside])
+    path = path_of(along, time)
+    stretches = tuple(_stretches(path, error, length) for length in STRETCHES_M)
+    return Score(path, error, stretches)
+
+
+def difference(track: DeadReckonedTrack, time: Array, geodetic: Array) -> Array:
+    """Return the track minus positions (M, 3) at times (M,), east, north, up, m."""
+    lat, _, height = track.geodetic.T
+    meridian, east = radii(lat)
+    ve, vn, vu = track.velocity.T
+    rate = np.stack([vn / (meridian + height), ve / ((east + height) * np.cos(lat)), vu], axis=1)
+    at = CubicHermiteSpline(track.time, track.geodetic, rate)(time)
+    away = at - geodetic
+    away[:, 1] = (away[:, 1] + np.pi) % (2.0 * np.pi) - np.pi
+    meridian, east = radii(geodetic[:, 0])
+    height = geodetic[:, 2]
+    return np.stack(
+        [
+            away[:, 1] * (east + height) * np.cos(geodetic[:, 0]),
+            away[:, 0] * (meridian + height),
+            away[:, 2],
+        ],
+        axis=1,
+    )
+
+
+def _along_across(error: Array, course: Array) -> tuple[Array, Array]:
+    sine, cosine = np.sin(course), np.cos(course)
+    return (
+        error[..., 0] * sine + error[..., 1] * cosine,
+        error[..., 0] * cosine - error[..., 1] * sine,
+    )
+
+
+def _stretches(path: Path, error: Array, length: float) -> Stretches:
+    growth, along, across = [], [], []
+    for a, b in _straight(path.course):
+        stops = np.arange(path.distance[a], path.distance[b - 1] + 1e-9, length)
+        at = a + np.searchsorted(path.distance[a:b], stops)
+        for i, j in pairwise(at):
+            grown = error[j] - error[i]
+            course = float(np.mean(path.course[i : j + 1]))
+            growth.append(float(np.hypot(grown[0], grown[1])))
+            ahead, right = _along_across(grown, np.asarray(course))
+            along.append(float(ahead))
+            across.append(float(right))
+    if not growth:
+        nothing = float("nan")
+        return Stretches(length, 0, nothing, nothing, nothing, nothing)
+
+    def percent(value: float) -> float:
+        return 100.0 * value / length
+
+    return Stretches(
+        length=length,
+        count=len(growth),
+        median=percent(float(np.median(growth))),
+        largest=percent(max(growth)),
+        along=percent(float(np.mean(along))),
+        across=percent(float(np.mean(across))),
+    )
+
+
+def _straight(course: Sequence[float] | Array) -> Iterator[tuple[int, int]]:
+    """Yield first and last-plus-one index of stretches whose course stays within a range."""
+    start = 0
+    low = high = course[0]
+    for i, value in enumerate(course):
+        low, high = min(low, value), max(high, value)
+        if high - low > _STRAIGHT:
+            yield start, i
+            start, low, high = i, value, value
+    yield start, len(course)

@@ -1,0 +1,360 @@
+"""Errors of a solution against the truth, and whether its covariance admits to them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.special import chdtri
+
+from factorgraph_dvl.geometry.earth import radii
+from factorgraph_dvl.geometry.rotations import (
+    exp_so3,
+    log_so3,
+    rotation_from_rph,
+    rph_from_rotation,
+    wrapped,
+)
+from factorgraph_dvl.geometry.unit_vectors import turns_to
+from factorgraph_dvl.geometry.units import DEG
+from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.solution import Estimate, Solution, Trajectory
+from factorgraph_dvl.trial import Reference
+
+_COINCIDENT_S = 1e-6
+_LONGEST_INTERVAL_S = 0.05
+ROTATION_VECTORS = ("misalignment_deg", "star_mounting_deg", "beam_misalignment_deg")
+_PAPER_PARAMETERS = ("misalignment_deg", "scale_error", "lever_arm_m")
+
+
+@dataclass(frozen=True)
+class VectorErrors:
+    """Errors of a vector over time, with the covariance that was claimed for them.
+
+    Parameters
+    ----------
+    error : (M, 3) estimate - truth.
+    covariance : (M, 3, 3) in the squared unit of `error`.
+    """
+
+    error: Array
+    covariance: Array
+
+    @property
+    def std(self) -> Array:
+        """Standard deviations, (M, 3)."""
+        return np.sqrt(np.maximum(np.diagonal(self.covariance, axis1=1, axis2=2), 0.0))
+
+    @property
+    def normalised(self) -> Array:
+        """Errors over their standard deviations, (M, 3)."""
+        return self.error / self.std
+
+    @property
+    def nees(self) -> Array:
+        """Normalised estimation errors squared, e' P^-1 e, (M,); 3 on average."""
+        return _nees(self.error, self.covariance)
+
+
+@dataclass(frozen=True)
+class TrajectoryErrors:
+    """Errors of a trajectory at the epochs where the truth is known.
+
+    Parameters
+    ----------
+    time : (M,) s.
+    epochs : (M,) indices of these epochs in the trajectory.
+    position : local-level east, north, up, m.
+    velocity : local-level east, north, up, m/s.
+    attitude : roll, pitch, heading, rad; each difference in [-pi, pi).
+    """
+
+    time: Array
+    epochs: NDArray[np.intp]
+    position: VectorErrors
+    velocity: VectorErrors
+    attitude: VectorErrors
+
+
+@dataclass(frozen=True)
+class CalibrationErrors:
+    """Errors of the calibration components whose truth is known.
+
+    Parameters
+    ----------
+    names : of the n components, as in `covariance.order`.
+    estimate, truth, error : (n,) in reported units; error = estimate - truth.
+    covariance : (n, n) joint covariance of the components.
+    observable : (n,) bool.
+    """
+
+    names: tuple[str, ...]
+    estimate: Array
+    truth: Array
+    error: Array
+    covariance: Array
+    observable: NDArray[np.bool_]
+
+    @property
+    def std(self) -> Array:
+        """Standard deviations, (n,), in reported units."""
+        return np.sqrt(np.maximum(np.diagonal(self.covariance), 0.0))
+
+    @property
+    def normalised(self) -> Array:
+        """Errors over their standard deviations, (n,); nan for components held fixed."""
+        std = self.std
+        out = np.full(std.shape, np.nan)
+        np.divide(self.error, std, out=out, where=std > 0.0)
+        return out
+
+    @property
+    def tested(self) -> NDArray[np.bool_]:
+        """Components that enter `nees`, (n,): observable and not held fixed."""
+        return np.asarray(self.observable & (self.std > 0.0))
+
+    @property
+    def dof(self) -> int:
+        """Number of components that enter `nees`, its mean."""
+        return int(self.tested.sum())
+
+    @property
+    def nees(self) -> float:
+        """Joint normalised estimation error squared of the tested components."""
+        m = self.tested
+        return float(_nees(self.error[None, m], self.covariance[np.ix_(m, m)][None])[0])
+
+
+def trajectory_errors(solution: Solution, reference: Reference) -> TrajectoryErrors:
+    """Return the errors of a trajectory against a reference.
+
+    Epochs within 1 µs of one of the reference are compared with it as it is. Between
+    epochs the reference is interpolated by cubics through its four surrounding epochs,
+    for the attitude in rotation vectors relative to one of them, and only where the
+    intervals between those four are shorter than 0.05 s: a longer one hides waves of an
+    amplitude above the errors sought. All other epochs are left out, so that there may
+    be none at all.
+
+    Parameters
+    ----------
+    solution : its trajectory has N epochs.
+    reference : truth or a trusted solution.
+
+    Returns
+    -------
+    TrajectoryErrors of M <= N epochs.
+    """
+    return motion_errors(solution.trajectory, reference)
+
+
+def motion_errors(trajectory: Trajectory, reference: Reference) -> TrajectoryErrors:
+    """Return the errors of a motion against another; see `trajectory_errors`."""
+    epochs, truth = _reference_at(reference, trajectory.time)
+    lat, lon, height = trajectory.geodetic[epochs].T
+    meridian, prime_vertical = radii(truth.geodetic[:, 0])
+    height_true = truth.geodetic[:, 2]
+    position = np.stack(
+        [
+            wrapped(lon - truth.geodetic[:, 1])
+            * (prime_vertical + height_true)
+            * np.cos(truth.geodetic[:, 0]),
+            (lat - truth.geodetic[:, 0]) * (meridian + height_true),
+            height - height_true,
+        ],
+        axis=1,
+    )
+    return TrajectoryErrors(
+        time=truth.time,
+        epochs=epochs,
+        position=VectorErrors(position, trajectory.position_cov[epochs]),
+        velocity=VectorErrors(
+            trajectory.velocity[epochs] - truth.velocity, trajectory.velocity_cov[epochs]
+        ),
+        attitude=VectorErrors(
+            wrapped(trajectory.rph[epochs] - truth.rph), trajectory.rph_cov[epochs]
+        ),
+    )
+
+
+def calibration_errors(solution: Solution, truth: Mapping[str, ArrayLike]) -> CalibrationErrors:
+    """Return the errors of the calibration against its truth.
+
+    Of the two rotation vectors of a true rotation, the one nearer to the estimate
+    counts: near 180 deg they differ by 360 deg and mean the same. A parameter whose
+    truth has another number of components than the estimate is left out, unless the
+    truth is a single number for all of them.
+
+    Parameters
+    ----------
+    solution : its estimates are compared.
+    truth : true values by reported name, (n,) each, in reported units.
+    """
+    names: list[str] = []
+    values: list[Array] = []
+    truths: list[Array] = []
+    observable: list[NDArray[np.bool_]] = []
+    rows: list[int] = []
+    start = 0
+    for estimate in solution.estimates:
+        n = len(estimate.component_names)
+        true_value = true_value_of(estimate, truth)
+        if true_value is not None:
+            names += estimate.component_names
+            values.append(estimate.value)
+            truths.append(true_value)
+            observable.append(np.asarray(estimate.observable, dtype=bool))
+            rows += range(start, start + n)
+        start += n
+    joined = np.concatenate([*values, np.zeros(0)])
+    joined_truth = np.concatenate([*truths, np.zeros(0)])
+    return CalibrationErrors(
+        names=tuple(names),
+        estimate=joined,
+        truth=joined_truth,
+        error=joined - joined_truth,
+        covariance=solution.covariance[np.ix_(rows, rows)],
+        observable=np.concatenate([*observable, np.zeros(0, dtype=bool)]),
+    )
+
+
+def true_value_of(estimate: Estimate, truth: Mapping[str, ArrayLike]) -> Array | None:
+    """Return the truth that an estimate is to be compared with, (n,), or None.
+
+    Parameters
+    ----------
+    estimate : of n components.
+    truth : true values by reported name, in reported units; of directions (N, 3) vectors.
+    """
+    if estimate.name not in truth:
+        return None
+    value = np.atleast_1d(np.asarray(truth[estimate.name], dtype=float))
+    if estimate.nominal is not None:
+        if value.size != estimate.nominal.size:
+            return None
+        return turns_to(estimate.nominal, value.reshape(-1, 3)).ravel() / DEG
+    if value.size not in (1, estimate.value.size):
+        return None
+    value = np.broadcast_to(value, estimate.value.shape).copy()
+    if estimate.name in ROTATION_VECTORS:
+        return nearest_rotation_vector(value, estimate.value)
+    return value
+
+
+def nees_band(dof: int, runs: int, level: float = 0.95) -> tuple[float, float]:
+    """Return the interval that holds the mean NEES of consistent runs.
+
+    The sum over independent runs follows chi² with dof · runs degrees of freedom:
+    Bar-Shalom, Li, Kirubarajan, Estimation with Applications to Tracking and
+    Navigation, section 5.4.
+
+    Parameters
+    ----------
+    dof : number of components.
+    runs : number of independent runs that the mean is taken over.
+    level : probability that the mean lies inside.
+    """
+    total = float(dof * runs)
+    tail = (1.0 - level) / 2.0
+    return float(chdtri(total, 1.0 - tail)) / runs, float(chdtri(total, tail)) / runs
+
+
+def paper_accuracy(estimates: Iterable[Estimate], truth: Mapping[str, ArrayLike]) -> float:
+    """Return the mean of 100 (1 - |error / truth|) over the DVL's components, %.
+
+    The components are those of misalignment, scale error and lever arm, seven with one
+    scale; those whose truth is zero have no relative error and are left out. The figure
+    of merit of Luo et al. (2024).
+
+    Parameters
+    ----------
+    estimates : those of other parameters are ignored.
+    truth : true values by reported name, in reported units.
+
+    Returns
+    -------
+    %; nan if no component can be compared.
+    """
+    accuracies: list[float] = []
+    for estimate in estimates:
+        if estimate.name not in _PAPER_PARAMETERS:
+            continue
+        true_value = true_value_of(estimate, truth)
+        if true_value is None:
+            continue
+        nonzero = true_value != 0.0
+        relative = np.abs(estimate.value[nonzero] / true_value[nonzero] - 1.0)
+        accuracies += (100.0 * (1.0 - relative)).tolist()
+    return float(np.mean(accuracies)) if accuracies else float("nan")
+
+
+def _nees(error: Array, covariance: Array) -> Array:
+    """Return e' P^-1 e, (M,), of errors (M, n) and covariances (M, n, n)."""
+    std = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+    z = error / std
+    # Components in different units span so many decades that only their correlation
+    # matrix can be factored without loss.
+    correlation = covariance / (std[:, :, None] * std[:, None, :])
+    weighted = np.linalg.solve(correlation, z[:, :, None])[:, :, 0]
+    return np.asarray(np.sum(z * weighted, axis=1))
+
+
+def nearest_rotation_vector(phi: Array, near: Array) -> Array:
+    """Return the rotation vector (3,), deg, of the same rotation that is nearer to `near`.
+
+    Near 180 deg two vectors, of opposite sign and 360 deg apart, mean the same.
+    """
+    angle = float(np.linalg.norm(phi))
+    if angle == 0.0:
+        return phi
+    other = phi * (1.0 - 360.0 / angle)
+    return other if np.linalg.norm(other - near) < np.linalg.norm(phi - near) else phi
+
+
+def _reference_at(reference: Reference, time: Array) -> tuple[NDArray[np.intp], Reference]:
+    """Return which of the times (N,) have a reference, (M,) indices, and the reference there."""
+    t = reference.time
+    left = np.searchsorted(t, time, side="right") - 1
+    before, after = np.clip(left, 0, t.size - 1), np.clip(left + 1, 0, t.size - 1)
+    nearest = np.where(np.abs(time - t[before]) <= np.abs(time - t[after]), before, after)
+    coincident = np.abs(time - t[nearest]) <= _COINCIDENT_S
+    between = ~coincident & (left >= 0) & (left < t.size - 1)
+    if t.size < 4:
+        between[:] = False
+    else:
+        first = np.clip(left - 1, 0, t.size - 4)
+        short = np.diff(t) < _LONGEST_INTERVAL_S
+        between &= short[first] & short[first + 1] & short[first + 2]
+
+    epochs = np.flatnonzero(coincident | between)
+    geodetic = reference.geodetic[nearest[epochs]]
+    velocity = reference.velocity[nearest[epochs]]
+    rph = reference.rph[nearest[epochs]]
+    at = np.flatnonzero(between[epochs])
+    if at.size:
+        nodes = first[epochs[at], None] + np.arange(4)
+        weights = _lagrange_weights(t[nodes] - t[nodes[:, :1]], time[epochs[at]] - t[nodes[:, 0]])
+        # Relative to one node: longitudes may wrap, and radians of the whole Earth
+        # leave too few digits.
+        origin = reference.geodetic[nodes[:, 0]]
+        offset = reference.geodetic[nodes] - origin[:, None, :]
+        offset[..., 1] = wrapped(offset[..., 1])
+        geodetic[at] = origin + np.einsum("mk,mkc->mc", weights, offset)
+        velocity[at] = np.einsum("mk,mkc->mc", weights, reference.velocity[nodes])
+        # Roll, pitch and heading themselves wrap, and are not smooth at steep pitch.
+        nRb = rotation_from_rph(reference.rph[nodes], "FRD")
+        phi = log_so3(np.swapaxes(nRb[:, :1], 2, 3) @ nRb)
+        turn = exp_so3(np.einsum("mk,mkc->mc", weights, phi))
+        rph[at] = rph_from_rotation(nRb[:, 0] @ turn, "FRD")
+    return epochs, Reference(time[epochs], geodetic, velocity, rph)
+
+
+def _lagrange_weights(nodes: Array, at: Array) -> Array:
+    """Return the weights (M, 4) of cubics through nodes (M, 4), evaluated at (M,)."""
+    weights = np.ones(nodes.shape)
+    for k in range(4):
+        for j in range(4):
+            if j != k:
+                weights[:, k] *= (at - nodes[:, j]) / (nodes[:, k] - nodes[:, j])
+    return weights

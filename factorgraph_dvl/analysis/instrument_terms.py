@@ -1,0 +1,145 @@
+"""A calibration in the terms of instruments: angles, %, ppm, TRDI's alignment commands."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from factorgraph_dvl.errors import DataError
+from factorgraph_dvl.geometry.rotations import BodyAxes, exp_so3, frd_from_body
+from factorgraph_dvl.geometry.units import DEG
+from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.sensors.dvl_beams import DIRECTION
+from factorgraph_dvl.solution import Calibration, Solution
+
+# Intrinsic orders: ZYX is yaw, then pitch, then roll; the angles are given as roll, pitch, yaw.
+Order = Literal["ZYX", "XYZ"]
+ORDERS: tuple[Order, ...] = ("ZYX", "XYZ")
+NEEDED = ("misalignment_deg", "scale_error", "lever_arm_m")
+_STEP = 1e-6
+
+
+@dataclass(frozen=True)
+class Angles:
+    """Roll, pitch, yaw of a rotation, deg, with standard deviations; nan if not known.
+
+    Roll is about the forward, pitch about the starboard, yaw about the downward axis:
+    starboard down, bow up and clockwise from above are positive, whatever the body axes.
+    """
+
+    value: Array
+    std: Array
+
+
+@dataclass(frozen=True)
+class InstrumentTerms:
+    """What can be typed into an instrument.
+
+    Parameters
+    ----------
+    dvl_in_body, body_to_dvl : by order, angles of C_d^b, the attitude of the DVL in the
+        vehicle, and of C_b^d.
+    scale_error, scale_std : (n,) dimensionless.
+    lever_arm, lever_arm_std : (3,) IMU to DVL, forward, starboard, down, m.
+    alignment : (3,) TRDI's EA, EI, EJ, deg: with the axes of TRDI's instrument coordinates
+        for d, C_b^d = Rz(-EA) Ry(EJ) Rx(EI) in forward, starboard, down.
+    alignment_std : (3,) deg.
+    """
+
+    dvl_in_body: dict[Order, Angles]
+    body_to_dvl: dict[Order, Angles]
+    scale_error: Array
+    scale_std: Array
+    lever_arm: Array
+    lever_arm_std: Array
+    alignment: Array
+    alignment_std: Array
+
+
+def instrument_of(calibration: Calibration | Solution) -> InstrumentTerms:
+    """Return a calibration in the terms of instruments.
+
+    Raises
+    ------
+    DataError
+        If it has no misalignment, scale error or lever arm.
+    """
+    parts: dict[str, tuple[Array, Array]] = {}
+    at = 0
+    for e in calibration.estimates:
+        rows = slice(at, at + e.value.size)
+        parts[e.name] = (e.value, calibration.covariance[rows, rows])
+        at = rows.stop
+    for name in NEEDED:
+        if name not in parts:
+            beams = DIRECTION in parts
+            raise DataError(
+                f"the calibration has no {name}{': it is one of single beams' if beams else ''}",
+                expected="that of a DVL",
+                hint="Their matrix is written by: factorgraph-dvl correct TRIAL CALIBRATION "
+                "--out DIR" if beams else "",
+            )  # fmt: skip
+    alpha, covariance = parts["misalignment_deg"]
+    frd = frd_from_body(calibration.body_axes)
+    # TRDI's instrument axes of a DVL that looks down, aligned: starboard, forward, up.
+    trdi = frd_from_body("RFU")
+
+    def angles(of: Callable[[Array], Array]) -> Angles:
+        """Return angles that depend on the rotation vector, and their standard deviations."""
+        value = of(alpha)
+        steps = np.eye(3) * _STEP
+        J = np.stack([_turned(of(alpha + h) - of(alpha - h)) for h in steps], axis=1) / (
+            2.0 * _STEP
+        )
+        return Angles(value, np.sqrt(np.maximum(np.diag(J @ covariance @ J.T), 0.0)))
+
+    def rpy(order: Order, *, inverse: bool) -> Angles:
+        def of(vector: Array) -> Array:
+            C = frd @ exp_so3(vector * DEG) @ frd.T
+            return euler(C.T if inverse else C, order)
+
+        return angles(of)
+
+    def trdi_angles(vector: Array) -> Array:
+        roll, pitch, yaw = euler(trdi @ exp_so3(vector * DEG) @ frd.T, "ZYX")
+        return np.array([-yaw, roll, pitch])
+
+    alignment = angles(trdi_angles)
+    lever_arm, lever_covariance = parts["lever_arm_m"]
+    scale, scale_covariance = parts["scale_error"]
+    return InstrumentTerms(
+        dvl_in_body={order: rpy(order, inverse=True) for order in ORDERS},
+        body_to_dvl={order: rpy(order, inverse=False) for order in ORDERS},
+        scale_error=scale,
+        scale_std=np.sqrt(np.diag(scale_covariance)),
+        lever_arm=frd @ lever_arm,
+        lever_arm_std=np.sqrt(np.diag(frd @ lever_covariance @ frd.T)),
+        alignment=alignment.value,
+        alignment_std=alignment.std,
+    )
+
+
+def euler(matrix: Array, order: Order) -> Array:
+    """Return roll, pitch, yaw (3,), deg, of a rotation in forward, starboard, down.
+
+    ZYX: Rz(yaw) Ry(pitch) Rx(roll). XYZ: Rx(roll) Ry(pitch) Rz(yaw).
+    """
+    found = Rotation.from_matrix(matrix).as_euler(order, degrees=True)
+    return np.asarray(found[::-1] if order == "ZYX" else found)
+
+
+def rotation_of(angles: Array, order: Order, body_axes: BodyAxes) -> Array:
+    """Return the rotation (3, 3) between body axes and axes named alike, of roll, pitch, yaw."""
+    given = angles[::-1] if order == "ZYX" else angles
+    frd = frd_from_body(body_axes)
+    matrix = Rotation.from_euler(order, given, degrees=True).as_matrix()
+    return np.asarray(frd.T @ matrix @ frd)
+
+
+def _turned(difference: Array) -> Array:
+    """Return differences of angles in [-180, 180)."""
+    return np.asarray((difference + 180.0) % 360.0 - 180.0)

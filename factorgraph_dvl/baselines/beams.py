@@ -1,0 +1,198 @@
+"""Extended Kalman filter of single beams against the velocity of SINS/GNSS.
+
+States: attitude error phi of SINS/GNSS (level axes, true nRb = Exp(phi) nRb), turns eta of
+the beams from their nominal directions, scale errors k, lever arm l; all constant but phi,
+whose smoothed error wanders about zero (first-order Gauss-Markov). Each beam that was
+received at a ping gives
+
+    z_i = (1 + k_i) d_i(eta_i)^T (v_b + omega_b x l),    v_b = nRb^T (v_n + [v_n x] phi).
+
+Attitude errors as states and all four beams in one filter as in the patent of Cao, Sun,
+Liu, Zhang and Liu (Harbin Engineering University); there the measurements are velocities
+from groups of three beams, whose errors are correlated. Single beams need no groups, and
+go on with two or one.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from factorgraph_dvl.baselines.navigation import NavigationMotion
+from factorgraph_dvl.baselines.point_sets import Estimated, Outcome, prior_of, rows_of_history
+from factorgraph_dvl.baselines.spurious_information import widened
+from factorgraph_dvl.geometry.unit_vectors import turned, turned_jacobian
+from factorgraph_dvl.geometry.vectors import Array, skew
+from factorgraph_dvl.sensors.protocol import Parameter
+
+# Over this time, s, smoothed errors of the attitude are taken to forget themselves.
+_WANDER_S = 300.0
+_PASSES = 6
+_SETTLED = 0.05
+
+
+@dataclass(frozen=True)
+class BeamPings:
+    """Radial velocities with the motion of the body at M pings.
+
+    Parameters
+    ----------
+    motion : smoothed.
+    nominal_b : (N, 3) directions that eta turns.
+    measured, sigma : (M, N) m/s; nan where a beam was lost.
+    """
+
+    motion: NavigationMotion
+    nominal_b: Array
+    measured: Array
+    sigma: Array
+
+
+@dataclass(frozen=True)
+class _Linear:
+    """Measurements linearised about a calibration: z = predicted + H (x - x0)."""
+
+    predicted: Array
+    by_state: Array
+    variance: Array
+
+
+def beam_filter(pings: BeamPings, parameters: tuple[Parameter, ...]) -> Outcome:
+    """Calibrate single beams.
+
+    The filter runs again over the data, linearised about what it found, until that no
+    longer changes; the first pass is the history.
+
+    Parameters
+    ----------
+    pings : BeamPings
+    parameters : directions, scale errors and lever arm, with their priors.
+    """
+    prior = prior_of(parameters)
+    at = np.concatenate(prior.values)
+    history: tuple[tuple[float, Estimated], ...] = ()
+    keep = set(rows_of_history(len(pings.measured)).tolist())
+    converged = False
+    for count in range(1, _PASSES + 1):
+        states = _filter(pings, prior, at, keep if count == 1 else set())
+        if count == 1:
+            history = tuple(
+                (float(pings.motion.time[i]), _estimated(parameters, x, P))
+                for i, x, P in states[:-1]
+            )
+        _, x, P = states[-1]
+        moved = np.abs(x - at) / np.sqrt(np.maximum(np.diag(P), 1e-30))
+        at = x
+        converged = float(moved[np.diag(P) > 0.0].max(initial=0.0)) <= _SETTLED
+        if converged:
+            break
+    return Outcome(_estimated(parameters, at, P), count, history, converged=converged)
+
+
+def beam_residuals(pings: BeamPings, estimated: Estimated) -> tuple[Array, Array]:
+    """Return predicted - measured and its standard deviation, (M, N), m/s."""
+    linear = _linearised(pings, np.concatenate(estimated.values))
+    attitude = np.einsum(
+        "mni,mij,mnj->mn",
+        linear.by_state[:, :, :3],
+        pings.motion.covariance[:, 6:9, 6:9],
+        linear.by_state[:, :, :3],
+    )
+    return linear.predicted - pings.measured, np.sqrt(linear.variance + attitude)
+
+
+def without_spurious_information(pings: BeamPings, estimated: Estimated) -> Estimated:
+    """Return the estimate, wider where only noise of the motion told directions and scales."""
+    if not len(pings.measured):
+        return estimated
+    at = np.concatenate(estimated.values)
+    linear = _linearised(pings, at)
+    n = pings.measured.shape[1]
+    weight = np.where(np.isnan(pings.measured), 0.0, 1.0 / linear.variance)
+    H = linear.by_state[:, :, 3:]
+    information = np.einsum("mni,mn,mnj->ij", H, np.nan_to_num(weight), H, optimize=True)
+    noise = np.zeros_like(information)
+    turns, scale, _ = np.split(at, [2 * n, 3 * n])
+    turns = turns.reshape(n, 2)
+    by_turn = (1.0 + scale)[:, None, None] * turned_jacobian(pings.nominal_b, turns)
+    directions = turned(pings.nominal_b, turns)
+    for i in range(n):
+        own = [2 * i, 2 * i + 1, 2 * n + i]
+        J = np.column_stack([by_turn[i], directions[i]])
+        spread = np.einsum("m,mij->ij", np.nan_to_num(weight[:, i]), pings.motion.v_b_covariance)
+        noise[np.ix_(own, own)] = J.T @ spread @ J
+    return widened(estimated, information, noise)
+
+
+def _estimated(parameters: tuple[Parameter, ...], x: Array, P: Array) -> Estimated:
+    ends = np.cumsum([p.mean.size for p in parameters])[:-1]
+    return Estimated(parameters, tuple(np.split(x, ends)), P)
+
+
+def _filter(
+    pings: BeamPings, prior: Estimated, at: Array, keep: set[int]
+) -> list[tuple[int, Array, Array]]:
+    """Return calibration and covariance after the pings to keep, and at the end."""
+    linear = _linearised(pings, at)
+    wander = pings.motion.covariance[:, 6:9, 6:9]
+    n = at.size
+    x = np.concatenate([np.zeros(3), np.concatenate(prior.values)])
+    P = np.zeros((n + 3, n + 3))
+    P[3:, 3:] = prior.covariance
+    origin = np.concatenate([np.zeros(3), at])
+    time = pings.motion.time
+    out = []
+    if time.size:
+        P[:3, :3] = wander[0]
+    for k in range(time.size):
+        if k:
+            # Between pings phi fades, and what it loses in variance comes back as noise.
+            fade = np.exp(-(time[k] - time[k - 1]) / _WANDER_S)
+            x[:3] *= fade
+            P[:3] *= fade
+            P[:, :3] *= fade
+            P[:3, :3] += (1.0 - fade**2) * wander[k]
+        valid = ~np.isnan(pings.measured[k])
+        H = linear.by_state[k, valid]
+        innovation = pings.measured[k, valid] - linear.predicted[k, valid] - H @ (x - origin)
+        PH = P @ H.T
+        S = H @ PH
+        S.flat[:: len(S) + 1] += linear.variance[k, valid]
+        K = np.linalg.solve(S, PH.T).T
+        x = x + K @ innovation
+        P = P - K @ PH.T
+        P = 0.5 * (P + P.T)
+        if k in keep:
+            out.append((k, x[3:].copy(), P[3:, 3:].copy()))
+    out.append((time.size, x[3:], P[3:, 3:]))
+    return out
+
+
+def _linearised(pings: BeamPings, at: Array) -> _Linear:
+    """Return predictions at a calibration, with phi = 0, and their derivatives.
+
+    Errors of the SINS/GNSS velocity count as if they were new at every ping.
+    """
+    motion = pings.motion
+    m, n = pings.measured.shape
+    turns, scale, arm = np.split(at, [2 * n, 3 * n])
+    turns = turns.reshape(n, 2)
+    directions = turned(pings.nominal_b, turns)
+    by_turn = turned_jacobian(pings.nominal_b, turns)
+    rows = (1.0 + scale)[:, None] * directions
+    bRn = motion.nRb.transpose(0, 2, 1)
+    at_dvl = motion.v_b + np.cross(motion.omega_b, arm)
+    by_state = np.zeros((m, n, 3 + at.size))
+    by_state[:, :, :3] = rows @ (bRn @ skew(motion.velocity))
+    each = np.arange(n)
+    for axis in range(2):
+        along = at_dvl @ ((1.0 + scale)[:, None] * by_turn[:, :, axis]).T
+        by_state[:, each, 3 + 2 * each + axis] = along
+    by_state[:, each, 3 + 2 * n + each] = at_dvl @ directions.T
+    by_state[:, :, 3 + 3 * n :] = rows @ skew(motion.omega_b)
+    velocity = bRn @ motion.covariance[:, 3:6, 3:6] @ motion.nRb
+    square = arm**2
+    shaken = 0.5 * (motion.omega_sigma**2 @ (square.sum() - square))
+    variance = np.einsum("ni,mij,nj->mn", rows, velocity, rows)
+    return _Linear(at_dvl @ rows.T, by_state, variance + pings.sigma**2 + shaken[:, None])

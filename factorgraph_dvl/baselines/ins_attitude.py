@@ -1,0 +1,103 @@
+"""The attitude of a strapdown INS that GNSS aids as long as it may."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from factorgraph_dvl.baselines.navigation import navigate
+from factorgraph_dvl.baselines.summary import trajectory_of
+from factorgraph_dvl.errors import DataError
+from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.imu.timestamps import without_strays
+from factorgraph_dvl.sensors.gnss import Gnss
+from factorgraph_dvl.solution import Trajectory
+from factorgraph_dvl.trial import Trial
+
+# Gaps of GNSS, s, from which on the height must be held: the vertical channel of an INS
+# diverges, by a factor of e in ten minutes, and takes the attitude with it.
+_GAP = 10.0
+_HELD_EVERY = 1.0
+_HELD_HEIGHT_STD = 100.0
+_ANYWHERE = 1e6
+
+
+def sins(
+    trial: Trial, *, align_s: float | None = None, rate_hz: float = 10.0
+) -> tuple[Trajectory, Array, tuple[str, ...]]:
+    """Return motion, gyro bias (3,), rad/s, and notes of an INS aided by GNSS alone.
+
+    Where GNSS is missing the INS runs free but for its height, which is held near that of
+    the last fix; its position drifts by kilometres in an hour, its attitude hardly.
+
+    Parameters
+    ----------
+    trial : with IMU and GNSS.
+    align_s : s from the first fix on of which GNSS is used; all by default.
+    rate_hz : of the motion.
+
+    Raises
+    ------
+    DataError
+        If there is no GNSS position, or none while the IMU runs.
+    """
+    trial = without_strays(replace(trial, notes=()))
+    gnss = trial.gnss
+    fixes = np.zeros(0) if gnss is None else gnss.time[~np.isnan(gnss.geodetic[:, 0])]
+    if gnss is None or fixes.size == 0:
+        raise DataError(
+            "the SINS has no GNSS to find its attitude with",
+            where="trial.yaml" if gnss is None else gnss.source,
+            expected="GNSS positions",
+            hint="Take the attitude of a solution, or of the reference: --attitude",
+        )
+    last = fixes[-1] if align_s is None else fixes[0] + align_s
+    held = _with_held_height(_rows(gnss, gnss.time <= last), trial.imu.time)
+    navigation = navigate(replace(trial, gnss=held), np.zeros(0))
+    bias = navigation.track.gyro_bias.mean(axis=0)
+    return trajectory_of(trial, navigation, rate_hz), bias, navigation.notes
+
+
+def _with_held_height(gnss: Gnss, running: Array) -> Gnss:
+    """Return a record with positions in its gaps that say nothing but a rough height.
+
+    Parameters
+    ----------
+    gnss : with fixes.
+    running : (M,) times of the IMU's samples, s: elsewhere no height need be held.
+    """
+    fixes = np.flatnonzero(~np.isnan(gnss.geodetic[:, 0]))
+    time = gnss.time[fixes]
+    added, source = [], []
+    for i, (a, b) in enumerate(zip(time, np.append(time[1:], running[-1]), strict=True)):
+        if b - a > _GAP:
+            inside = running[np.searchsorted(running, a) : np.searchsorted(running, b)]
+            times = a + _HELD_EVERY * np.unique(np.floor((inside - a) / _HELD_EVERY))
+            times = times[times > a]
+            added.append(times)
+            source.append(np.full(times.size, fixes[i]))
+    if not added:
+        return gnss
+    new, of = np.concatenate(added), np.concatenate(source)
+    new, kept = new[~np.isin(new, gnss.time)], of[~np.isin(new, gnss.time)]
+    order = np.argsort(np.concatenate([gnss.time, new]), kind="stable")
+    unknown = np.full((new.size, 3), np.nan)
+    std = np.tile([_ANYWHERE, _ANYWHERE, _HELD_HEIGHT_STD], (new.size, 1))
+
+    def merged(old: Array, other: Array) -> Array:
+        return np.concatenate([old, other])[order]
+
+    return replace(
+        gnss,
+        time=merged(gnss.time, new),
+        geodetic=merged(gnss.geodetic, gnss.geodetic[kept]),
+        velocity=merged(gnss.velocity, unknown),
+        position_std=merged(gnss.position_std, std),
+        velocity_std=merged(gnss.velocity_std, np.ones_like(std)),
+    )
+
+
+def _rows(gnss: Gnss, keep: np.ndarray) -> Gnss:
+    names = ("time", "geodetic", "velocity", "position_std", "velocity_std")
+    return replace(gnss, **{name: getattr(gnss, name)[keep] for name in names})

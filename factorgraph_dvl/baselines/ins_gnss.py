@@ -1,0 +1,363 @@
+"""Error-state Kalman filter of SINS and GNSS, and its Rauch-Tung-Striebel smoother.
+
+Fifteen states: position (east, north, up, m), velocity (m/s), attitude, gyro bias
+(rad/s), accelerometer bias (m/s²). The errors are true - estimated; that of the attitude
+is phi in nRb_true = Exp(phi) nRb, in local-level axes. The mechanisation is local-level
+on the ellipsoid, with Earth and transport rate, Coriolis and normal gravity; the filter
+feeds its estimates back at every measurement.
+
+Groves, Principles of GNSS, Inertial, and Multisensor Integrated Navigation Systems, 2nd
+ed., chapters 5 and 14. Left out of the error model, as below a micro-g and 1e-5 deg/h for
+positions known to some metres: the derivatives of gravity and Earth rate with position.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import cos, sin, sqrt, tan
+
+import numpy as np
+
+from factorgraph_dvl.baselines.strapdown import Steps
+from factorgraph_dvl.geometry.earth import ECCENTRICITY_SQUARED, RATE, SEMI_MAJOR, normal_gravity
+from factorgraph_dvl.geometry.rotations import exp_so3, log_so3, wrapped
+from factorgraph_dvl.geometry.vectors import Array, skew
+
+_CHUNK = 5000
+
+# Below this, rad, rotations add up to better than 1e-12.
+_SMALL_TURN = 1e-6
+
+
+@dataclass(frozen=True)
+class FilterState:
+    """Where an arc starts.
+
+    Parameters
+    ----------
+    geodetic : (3,) latitude, longitude (rad), height (m).
+    velocity : (3,) local-level, m/s.
+    nRb : (3, 3).
+    gyro_bias, accel_bias : (3,) rad/s, m/s².
+    covariance : (15, 15) of the errors.
+    """
+
+    geodetic: Array
+    velocity: Array
+    nRb: Array
+    gyro_bias: Array
+    accel_bias: Array
+    covariance: Array
+
+
+@dataclass(frozen=True)
+class Fixes:
+    """GNSS measurements at K events, nan where there are none.
+
+    Parameters
+    ----------
+    geodetic, velocity : (K, 3) of the antenna.
+    position_variance, velocity_variance : (K, 3) east, north, up.
+    turning : (K, 3) reading of the gyros, without what the body turns on its carrier, rad/s.
+    lever_arm : (3,) or (K, 3) of the antenna, in body, m.
+    """
+
+    geodetic: Array
+    velocity: Array
+    position_variance: Array
+    velocity_variance: Array
+    turning: Array
+    lever_arm: Array
+
+
+@dataclass(frozen=True)
+class FilteredTrack:
+    """Estimated states of K events of one arc, with their covariance.
+
+    Parameters
+    ----------
+    time : (K,) s.
+    geodetic, velocity, nRb, gyro_bias, accel_bias : (K, ...) as in `FilterState`.
+    covariance : (K, 15, 15).
+    pull : (K, 3) gravity less Coriolis terms over the step that follows, m/s².
+    spin : (K, 3) rate of the local-level axes over that step, rad/s.
+    """
+
+    time: Array
+    geodetic: Array
+    velocity: Array
+    nRb: Array
+    gyro_bias: Array
+    accel_bias: Array
+    covariance: Array
+    pull: Array
+    spin: Array
+
+
+@dataclass(frozen=True)
+class Forward:
+    """What the filter leaves for the smoother.
+
+    Parameters
+    ----------
+    track : filtered states, after the measurement of each event.
+    transition : (K, 15, 15) of the step that ends at each event; the first is not used.
+    predicted : (K, 15, 15) covariance before the measurement.
+    correction : (K, 15) errors that the measurement fed back.
+    """
+
+    track: FilteredTrack
+    transition: Array
+    predicted: Array
+    correction: Array
+
+
+def run_filter(
+    time: Array, steps: Steps, fixes: Fixes, start: FilterState, walk_psd: tuple[float, float]
+) -> Forward:
+    """Run the filter over the events of one arc.
+
+    Parameters
+    ----------
+    time : (K,) of the events, s.
+    steps : the K - 1 steps between them.
+    fixes : GNSS measurements at the events.
+    start : state at the first event.
+    walk_psd : power spectral densities of the random walks of gyro and accelerometer
+        bias, rad²/s³, m²/s⁵.
+    """
+    k_events = time.size
+    geodetic, velocity = np.empty((k_events, 3)), np.empty((k_events, 3))
+    nRb, biases = np.empty((k_events, 3, 3)), np.empty((k_events, 6))
+    filtered = np.empty((k_events, 15, 15))
+    predicted, transition = np.empty_like(filtered), np.empty_like(filtered)
+    correction = np.zeros((k_events, 15))
+    pull, spin = np.zeros((k_events, 3)), np.zeros((k_events, 3))
+
+    Q = _process_noise(steps, walk_psd)
+    by_gyro = skew(steps.dv * steps.duration[:, None] - steps.dp)
+    has_position = ~np.isnan(fixes.geodetic[:, 0])
+    has_velocity = ~np.isnan(fixes.velocity[:, 0])
+    lever_arm = np.broadcast_to(fixes.lever_arm, (k_events, 3))
+    durations = steps.duration.tolist()
+    eye = np.eye(3)
+
+    lat, lon, height = start.geodetic.tolist()
+    v, C, P = start.velocity.copy(), start.nRb.copy(), start.covariance.copy()
+    bg, ba = start.gyro_bias.copy(), start.accel_bias.copy()
+    F = np.eye(15)
+    for k in range(k_events):
+        if k:
+            j, T = k - 1, durations[k - 1]
+            bias_jacobian = steps.bias_jacobian[j]
+            CV = C @ (steps.dv[j] - bias_jacobian @ ba + by_gyro[j] @ bg)
+            CP = C @ (steps.dp[j] - (0.5 * T) * (bias_jacobian @ ba))
+            g = float(_gravity(lat, height))
+            v_mid = v + 0.5 * CV
+            v_mid[2] -= 0.5 * g * T
+            ve, vn, _ = v_mid.tolist()
+            meridian, east_radius, tangent = _radii(lat)
+            rm, re = meridian + height, east_radius + height
+            wn, wu = RATE * cos(lat), RATE * sin(lat)
+            transport = (-vn / rm, ve / re, ve * tangent / re)
+            rate = np.array((transport[0], wn + transport[1], wu + transport[2]))
+            coriolis = _cross((transport[0], 2 * wn + transport[1], 2 * wu + transport[2]))
+            acceleration = -(coriolis @ v_mid)
+            acceleration[2] -= g
+            # The axes turn while the force acts: on average by half of their turn.
+            acceleration -= 0.5 * (_cross(rate.tolist()) @ CV)
+            pull[j], spin[j] = acceleration, rate
+
+            moved = (v * T + CP + acceleration * (0.5 * T * T)).tolist()
+            v = v + CV + acceleration * T
+            CA = C @ bias_jacobian
+            F[0:3, 3:6] = T * eye
+            F[0:3, 6:9] = -_cross(CP.tolist())
+            F[0:3, 12:15] = CA * (-0.5 * T)
+            F[3:6, 3:6] = eye - coriolis * T
+            F[3:6, 6:9] = -_cross(CV.tolist())
+            F[3:6, 9:12] = C @ by_gyro[j]
+            F[3:6, 12:15] = -CA
+            turned = eye - _cross((rate * T).tolist())
+            F[6:9, 4] = (T / rm, 0.0, 0.0)
+            F[6:9, 3] = (0.0, -T / re, -T * tangent / re)
+            F[6:9, 6:9] = turned
+            F[6:9, 9:12] = -CA
+            C = _exp(-T * rate) @ C @ _exp(-(bias_jacobian @ bg)) @ steps.turn[j]
+            middle = lat + 0.5 * moved[1] / rm
+            lat += moved[1] / rm
+            lon += moved[0] / (re * cos(middle))
+            height += moved[2]
+            P = F @ P @ F.T + Q[j]
+            transition[k] = F
+        predicted[k] = P
+
+        if has_position[k] or has_velocity[k]:
+            H = np.zeros((6, 15))
+            z = np.zeros(6)
+            if has_position[k]:
+                arm = C @ lever_arm[k]
+                meridian, east_radius, _ = _radii(lat)
+                measured = fixes.geodetic[k].tolist()
+                east = (east_radius + height) * cos(lat)
+                z[0:3] = (
+                    wrapped(measured[1] - lon) * east,
+                    (measured[0] - lat) * (meridian + height),
+                    measured[2] - height,
+                )
+                z[0:3] -= arm
+                H[0:3, 0:3] = eye
+                H[0:3, 6:9] = -_cross(arm.tolist())
+            if has_velocity[k]:
+                earth = np.array((0.0, RATE * cos(lat), RATE * sin(lat)))
+                omega = fixes.turning[k] - bg - earth @ C
+                lever_cross = _cross(lever_arm[k].tolist())
+                turning = C @ -(lever_cross @ omega)
+                z[3:6] = fixes.velocity[k] - v - turning
+                H[3:6, 3:6] = eye
+                H[3:6, 6:9] = -_cross(turning.tolist())
+                H[3:6, 9:12] = C @ lever_cross
+            R = np.concatenate([fixes.position_variance[k], fixes.velocity_variance[k]])
+            if not (has_position[k] and has_velocity[k]):
+                rows = slice(0, 3) if has_position[k] else slice(3, 6)
+                H, z, R = H[rows], z[rows], R[rows]
+            PH = P @ H.T
+            S = H @ PH
+            S.flat[:: S.shape[0] + 1] += R
+            K = np.linalg.solve(S, PH.T).T
+            x = K @ z
+            P = P - K @ PH.T
+            P = 0.5 * (P + P.T)
+            correction[k] = x
+            meridian, east_radius, _ = _radii(lat)
+            lon += x[0] / ((east_radius + height) * cos(lat))
+            lat += x[1] / (meridian + height)
+            height += x[2]
+            v = v + x[3:6]
+            C = _exp(x[6:9]) @ C
+            bg, ba = bg + x[9:12], ba + x[12:15]
+        filtered[k] = P
+        geodetic[k] = lat, lon, height
+        velocity[k], nRb[k] = v, C
+        biases[k, :3], biases[k, 3:] = bg, ba
+    if k_events > 1:
+        pull[-1], spin[-1] = pull[-2], spin[-2]
+    track = FilteredTrack(
+        time, geodetic, velocity, nRb, biases[:, :3], biases[:, 3:], filtered, pull, spin
+    )
+    return Forward(track, transition, predicted, correction)
+
+
+def smooth(forward: Forward) -> FilteredTrack:
+    """Return the states given all measurements of the arc.
+
+    Rauch, Tung, Striebel, AIAA J. 3(8), 1965, on the errors: what the measurement at an
+    event fed back is part of what the smoother hands on to the event before.
+    """
+    track = forward.track
+    k_events = track.time.size
+    gains = _gains(forward)
+    error = np.zeros((k_events, 15))
+    smoothed = track.covariance.copy()
+    for k in range(k_events - 2, -1, -1):
+        G = gains[k]
+        fed_back = forward.correction[k + 1]
+        before = fed_back + error[k + 1]
+        if np.abs(fed_back[6:9]).max() > _SMALL_TURN:
+            # Feedback turned the attitude: rotations compose, they do not add.
+            turned = exp_so3(error[k + 1, 6:9]) @ exp_so3(fed_back[6:9])
+            before[6:9] = log_so3(turned)
+        error[k] = G @ before
+        P = smoothed[k] + G @ (smoothed[k + 1] - forward.predicted[k + 1]) @ G.T
+        smoothed[k] = 0.5 * (P + P.T)
+    return _corrected(track, error, smoothed)
+
+
+def _gains(forward: Forward) -> Array:
+    """Return P F' P⁻, (K - 1, 15, 15), with P⁻ factored as a correlation matrix."""
+    filtered, predicted = forward.track.covariance, forward.predicted
+    out = np.empty_like(filtered[:-1])
+    for a in range(0, out.shape[0], _CHUNK):
+        b = min(a + _CHUNK, out.shape[0])
+        PF = forward.transition[a + 1 : b + 1] @ filtered[a:b]
+        P = predicted[a + 1 : b + 1]
+        std = np.sqrt(np.diagonal(P, axis1=1, axis2=2))
+        correlation = P / (std[:, :, None] * std[:, None, :])
+        solved = np.linalg.solve(correlation, PF / std[:, :, None]) / std[:, :, None]
+        out[a:b] = solved.transpose(0, 2, 1)
+    return out
+
+
+def _corrected(track: FilteredTrack, error: Array, covariance: Array) -> FilteredTrack:
+    lat, lon, height = track.geodetic.T
+    meridian, east_radius = _radii_of(lat)
+    geodetic = np.stack(
+        [
+            lat + error[:, 1] / (meridian + height),
+            lon + error[:, 0] / ((east_radius + height) * np.cos(lat)),
+            height + error[:, 2],
+        ],
+        axis=1,
+    )
+    return FilteredTrack(
+        track.time,
+        geodetic,
+        track.velocity + error[:, 3:6],
+        exp_so3(error[:, 6:9]) @ track.nRb,
+        track.gyro_bias + error[:, 9:12],
+        track.accel_bias + error[:, 12:15],
+        covariance,
+        track.pull,
+        track.spin,
+    )
+
+
+def _process_noise(steps: Steps, walk_psd: tuple[float, float]) -> Array:
+    """Return (M, 15, 15): white noise of the sensors, and of what drives the biases.
+
+    What the noise of a gyro does to the velocity within a step, through tilted gravity,
+    is a hundredth of what the accelerometer's own does.
+    """
+    T, eye = steps.duration[:, None, None], np.eye(3)
+    accel = steps.accel_variance[:, None, None] * eye
+    out = np.zeros((steps.duration.size, 15, 15))
+    out[:, 0:3, 0:3] = accel * T**2 / 3.0
+    out[:, 0:3, 3:6] = out[:, 3:6, 0:3] = accel * T / 2.0
+    out[:, 3:6, 3:6] = accel
+    out[:, 6:9, 6:9] = steps.gyro_variance[:, None, None] * eye
+    out[:, 9:12, 9:12] = walk_psd[0] * T * eye
+    out[:, 12:15, 12:15] = walk_psd[1] * T * eye
+    return out
+
+
+def _gravity(lat: float, height: float) -> float:
+    return float(normal_gravity(lat, height))
+
+
+def _radii(lat: float) -> tuple[float, float, float]:
+    """Return meridian and prime-vertical radius, m, and the tangent of the latitude."""
+    root = 1.0 - ECCENTRICITY_SQUARED * sin(lat) ** 2
+    east = SEMI_MAJOR / sqrt(root)
+    return east * (1.0 - ECCENTRICITY_SQUARED) / root, east, tan(lat)
+
+
+def _radii_of(lat: Array) -> tuple[Array, Array]:
+    root = 1.0 - ECCENTRICITY_SQUARED * np.sin(lat) ** 2
+    east = SEMI_MAJOR / np.sqrt(root)
+    return east * (1.0 - ECCENTRICITY_SQUARED) / root, east
+
+
+def _cross(v: tuple[float, ...] | list[float]) -> Array:
+    """Return [v x] of one vector: `skew` without what it costs to serve many."""
+    x, y, z = v
+    return np.array(((0.0, -z, y), (z, 0.0, -x), (-y, x, 0.0)))
+
+
+def _exp(phi: Array) -> Array:
+    """Return Exp([phi x]) of one vector, quickly where it is small."""
+    x, y, z = phi.tolist()
+    square = x * x + y * y + z * z
+    if square > 1e-4:
+        return exp_so3(phi)
+    cross = _cross((x, y, z))
+    return np.eye(3) + (1.0 - square / 6.0) * cross + (0.5 - square / 24.0) * (cross @ cross)

@@ -1,0 +1,384 @@
+"""SINS/GNSS navigation of a whole trial: events, start, filter and smoother of every arc."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+
+from factorgraph_dvl.baselines.coarse_alignment import CoarseAttitude, coarse_attitude
+from factorgraph_dvl.baselines.ins_gnss import (
+    FilteredTrack,
+    FilterState,
+    Fixes,
+    run_filter,
+    smooth,
+)
+from factorgraph_dvl.baselines.strapdown import (
+    Steps,
+    StrapdownSamples,
+    at_times,
+    compose,
+    exp_small,
+    prepare,
+)
+from factorgraph_dvl.errors import DataError
+from factorgraph_dvl.geometry.earth import RATE, radii
+from factorgraph_dvl.geometry.rotations import (
+    exp_so3,
+    log_so3,
+    rotation_from_rph,
+    rph_jacobian,
+    wrapped,
+)
+from factorgraph_dvl.geometry.units import DEG, DEG_PER_HOUR, MICRO_G
+from factorgraph_dvl.geometry.vectors import Array, rotate, skew
+from factorgraph_dvl.imu.increments import increments
+from factorgraph_dvl.sensors.gnss import Gnss
+from factorgraph_dvl.trial import Trial
+
+LONGEST_STEP = 0.5
+_SAME_TIME = 1e-6
+# Fixes this far apart, s, give a velocity where the receiver reports none.
+_BASELINE = 5.0
+# Beyond this error of the attitude at the start, the filter runs once more from the better one.
+_CLOSE = 0.3 * DEG
+_PASSES = 4
+_POSITION_UNKNOWN = 10.0
+_VELOCITY_UNKNOWN = 3.0
+# An attitude prior wider than this is left to the alignment.
+_WIDE = 6.0 * DEG
+
+
+@dataclass(frozen=True)
+class Navigation:
+    """Smoothed motion of a trial.
+
+    Parameters
+    ----------
+    samples : increments of the IMU.
+    track : smoothed states at the events of all arcs, one after the other.
+    arc : (K,) arc of each event.
+    notes : what the user must know.
+    """
+
+    samples: StrapdownSamples
+    track: FilteredTrack
+    arc: np.ndarray
+    notes: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class NavigationMotion:
+    """Motion at M times.
+
+    Parameters
+    ----------
+    time : (M,) s.
+    geodetic, velocity, nRb : local-level, as in `FilteredTrack`.
+    covariance : (M, 9, 9) of the errors of position, velocity, attitude.
+    v_b : (M, 3) velocity over the Earth in body, m/s.
+    v_b_covariance : (M, 3, 3) m²/s².
+    omega_b : (M, 3) rate relative to the Earth, rad/s.
+    omega_sigma : (M, 3) its standard deviation from the gyro's noise and from motion that
+        the samples do not resolve, rad/s.
+    covered : (M,) whether the trial knows the motion there.
+    """
+
+    time: Array
+    geodetic: Array
+    velocity: Array
+    nRb: Array
+    covariance: Array
+    v_b: Array
+    v_b_covariance: Array
+    omega_b: Array
+    omega_sigma: Array
+    covered: np.ndarray
+
+
+def navigate(trial: Trial, pings: Array) -> Navigation:
+    """Return the smoothed motion of a trial, with states at fixes and pings.
+
+    Parameters
+    ----------
+    trial : with GNSS.
+    pings : (M,) true times of the pings, s.
+
+    Raises
+    ------
+    DataError
+        If there is no GNSS, or no fix while the IMU runs.
+    """
+    gnss = trial.gnss
+    if gnss is None or np.isnan(gnss.geodetic[:, 0]).all():
+        raise DataError(
+            "the SINS/GNSS filter needs GNSS positions, and the trial has none",
+            where=gnss.source if gnss is not None else "trial.yaml",
+            expected="a gnss section with positions",
+            hint="`solve` may do without",
+        )
+    inc, gaps = increments(trial.imu)
+    notes = [*trial.notes, *gaps]
+    samples = prepare(inc, trial.imu.settings)
+    if np.any(np.array(gnss.settings.lever_arm_std_m) > 0.0):
+        notes.append(
+            "the filter does not estimate the antenna's lever arm: its uncertainty is added to "
+            "the noise of the fixes"
+        )
+    tracks: list[FilteredTrack] = []
+    for a, b in inc.arcs:
+        span = (float(inc.start[a]), float(inc.end[b - 1]))
+        inside = (gnss.time >= span[0]) & (gnss.time <= span[1])
+        if not np.any(inside & ~np.isnan(gnss.geodetic[:, 0])):
+            notes.append(f"no GNSS position from {span[0]:.3f} to {span[1]:.3f} s: not used")
+            continue
+        if tracks:
+            notes.append(
+                f"the SINS/GNSS filter starts again at {span[0]:.3f} s, after the gap: position, "
+                "velocity and attitude anew, the biases from before"
+            )
+        track, note = _navigate_arc(trial, gnss, samples, span, pings, tracks)
+        tracks.append(track)
+        notes += [note] if note else []
+    if not tracks:
+        raise DataError(
+            "no GNSS position while the IMU runs",
+            where=gnss.source,
+            expected="times on the clock of the IMU",
+        )
+    joined = FilteredTrack(
+        *(np.concatenate([getattr(t, f.name) for t in tracks]) for f in fields(FilteredTrack))
+    )
+    arc = np.repeat(np.arange(len(tracks)), [t.time.size for t in tracks])
+    return Navigation(samples, joined, arc, tuple(notes))
+
+
+def motion_at(navigation: Navigation, time: Array) -> NavigationMotion:
+    """Return the motion at times (M,), carried from the event before by the increments.
+
+    What the carried motion misses of the next event's state is spread in proportion to
+    time, and the covariances are interpolated.
+    """
+    track, samples = navigation.track, navigation.samples
+    before = np.clip(
+        np.searchsorted(track.time, time + _SAME_TIME, side="right") - 1, 0, track.time.size - 2
+    )
+    # The last event of an arc belongs to the step before it.
+    ends = navigation.arc[before] != navigation.arc[before + 1]
+    before = np.where(ends, np.maximum(before - 1, 0), before)
+    first, last = track.time[before], track.time[before + 1]
+    covered = (time >= first - _SAME_TIME) & (time <= last + _SAME_TIME)
+    covered &= navigation.arc[before] == navigation.arc[before + 1]
+    inside = np.clip(time, first, last)
+
+    used = np.unique(before)
+    whole = _carry(track, used, compose(samples, track.time[used], track.time[used + 1]))
+    part = _carry(track, before, compose(samples, first, inside))
+    at = np.searchsorted(used, before)
+    fraction = (inside - first) / (last - first)
+    turn_miss = log_so3(track.nRb[used + 1] @ whole[2].transpose(0, 2, 1))
+    nRb = exp_so3(fraction[:, None] * turn_miss[at]) @ part[2]
+    velocity = part[1] + fraction[:, None] * (track.velocity[used + 1] - whole[1])[at]
+    geodetic = part[0] + fraction[:, None] * (track.geodetic[used + 1] - whole[0])[at]
+    # The filter adds up longitude beyond 180 deg.
+    geodetic[:, 1] = wrapped(geodetic[:, 1])
+    P = track.covariance[before, :9, :9]
+    P = P + fraction[:, None, None] * (track.covariance[before + 1, :9, :9] - P)
+
+    _, signal = at_times(samples, inside)
+    bias = track.gyro_bias[before] + fraction[:, None] * np.diff(track.gyro_bias, axis=0)[before]
+    bRn = nRb.transpose(0, 2, 1)
+    v_b = rotate(bRn, velocity)
+    J = np.concatenate([bRn, bRn @ skew(velocity)], axis=2)
+    return NavigationMotion(
+        time=time,
+        geodetic=geodetic,
+        velocity=velocity,
+        nRb=nRb,
+        covariance=P,
+        v_b=v_b,
+        v_b_covariance=J @ P[:, 3:, 3:] @ J.transpose(0, 2, 1),
+        omega_b=signal.omega - bias - rotate(bRn, _earth_rate(geodetic[:, 0])),
+        omega_sigma=signal.omega_sigma,
+        covered=covered,
+    )
+
+
+def _carry(track: FilteredTrack, index: np.ndarray, step: Steps) -> tuple[Array, Array, Array]:
+    """Return geodetic position, velocity and nRb, carried from events over steps."""
+    C, v = track.nRb[index], track.velocity[index]
+    T = step.duration[:, None]
+    free = rotate(step.bias_jacobian, track.accel_bias[index])
+    tilted = np.cross(step.dv * T - step.dp, track.gyro_bias[index])
+    pull = track.pull[index]
+    velocity = v + rotate(C, step.dv - free + tilted) + pull * T
+    moved = v * T + rotate(C, step.dp - 0.5 * T * free) + 0.5 * pull * T**2
+    lat, lon, height = track.geodetic[index].T
+    meridian, east = radii(lat)
+    place = np.stack(
+        [
+            lat + moved[:, 1] / (meridian + height),
+            lon + moved[:, 0] / ((east + height) * np.cos(lat)),
+            height + moved[:, 2],
+        ],
+        axis=1,
+    )
+    turned = exp_small(-T * track.spin[index]) @ C
+    leaning = exp_small(-rotate(step.bias_jacobian, track.gyro_bias[index]))
+    return place, velocity, turned @ leaning @ step.turn
+
+
+def _earth_rate(lat: Array) -> Array:
+    return RATE * np.stack([np.zeros_like(lat), np.cos(lat), np.sin(lat)], axis=1)
+
+
+def _events(span: tuple[float, float], times: Array) -> Array:
+    """Return the distinct times within a span, its ends, and no step longer than allowed."""
+    inside = times[(times > span[0]) & (times < span[1])]
+    events = np.unique(np.concatenate([span, inside]))
+    events = events[np.concatenate([[True], np.diff(events) > _SAME_TIME])]
+    gap = np.diff(events)
+    pieces = np.maximum(np.ceil(gap / LONGEST_STEP - 1e-9).astype(int), 1)
+    start = np.repeat(events[:-1], pieces)
+    piece = np.arange(start.size) - np.repeat(np.cumsum(pieces) - pieces, pieces)
+    return np.append(start + piece * np.repeat(gap / pieces, pieces), events[-1])
+
+
+def _navigate_arc(
+    trial: Trial,
+    gnss: Gnss,
+    samples: StrapdownSamples,
+    span: tuple[float, float],
+    pings: Array,
+    earlier: list[FilteredTrack],
+) -> tuple[FilteredTrack, str]:
+    time = _events(span, np.concatenate([gnss.time, pings]))
+    steps = compose(samples, time[:-1], time[1:])
+    fixes = _fixes_at(gnss, samples, time)
+    s = trial.imu.settings
+    walk = (s.gyro_bias_walk_root_psd**2, s.accel_bias_walk_root_psd**2)
+    given = trial.initial_attitude if not earlier else None
+    if given is not None and given.std.max() <= _WIDE:
+        nRb = rotation_from_rph(given.rph, trial.body_axes)
+        J = nRb @ np.linalg.inv(rph_jacobian(given.rph, trial.body_axes))
+        attitude = CoarseAttitude(nRb, J @ np.diag(given.std**2) @ J.T)
+        passes = 1
+    else:
+        velocity, sigma = _velocities(fixes, time)
+        attitude = coarse_attitude(
+            time,
+            steps,
+            _filled(fixes.geodetic, time),
+            velocity,
+            sigma,
+            np.cross(fixes.turning, fixes.lever_arm),
+            s,
+            trial.body_axes,
+        )
+        attitude = replace(
+            attitude, covariance=4.0 * attitude.covariance + (0.2 * DEG) ** 2 * np.eye(3)
+        )
+        passes = _PASSES
+    start = _start(trial, fixes, time, attitude, earlier, walk)
+    for _ in range(passes):
+        track = smooth(run_filter(time, steps, fixes, start, walk))
+        moved = np.linalg.norm(log_so3(track.nRb[0] @ start.nRb.T))
+        start = replace(start, nRb=track.nRb[0])
+        if moved < _CLOSE:
+            break
+    return track, attitude.note
+
+
+def _fixes_at(gnss: Gnss, samples: StrapdownSamples, time: Array) -> Fixes:
+    """Return the GNSS measurements at the events they belong to."""
+    inside = np.flatnonzero((gnss.time >= time[0] - _SAME_TIME) & (gnss.time <= time[-1]))
+    at = np.searchsorted(time, gnss.time[inside] + 2.0 * _SAME_TIME) - 1
+    out = {name: np.full((time.size, 3), np.nan) for name in ("p", "v", "sp", "sv")}
+    out["p"][at], out["v"][at] = gnss.geodetic[inside], gnss.velocity[inside]
+    lever_arm, omega_cb_b = gnss.lever_arm(time)
+    unsure = float(np.max(gnss.settings.lever_arm_std_m))
+    _, signal = at_times(samples, time)
+    omega_sigma = signal.omega_sigma
+    # Across the lever arm, where it is largest: half the trace of the covariance.
+    squares = lever_arm**2
+    across = squares.sum(axis=1, keepdims=True) - squares
+    shaken = 0.5 * np.sum(omega_sigma**2 * across, axis=1)
+    turned = unsure**2 * np.sum(signal.omega**2, axis=1)
+    out["sp"][at] = gnss.position_std[inside] ** 2 + unsure**2
+    out["sv"][at] = gnss.velocity_std[inside] ** 2 + (shaken + turned)[at, None]
+    turning = signal.omega - omega_cb_b
+    return Fixes(out["p"], out["v"], out["sp"], out["sv"], turning, lever_arm)
+
+
+def _filled(geodetic: Array, time: Array) -> Array:
+    known = ~np.isnan(geodetic[:, 0])
+    lat, lon, height = geodetic[known].T
+    columns = (lat, np.unwrap(lon), height)
+    return np.stack([np.interp(time, time[known], x) for x in columns], axis=1)
+
+
+def _velocities(fixes: Fixes, time: Array) -> tuple[Array, Array]:
+    """Return antenna velocities (K, 3), nan where unknown, and their standard deviations."""
+    if not np.isnan(fixes.velocity).all():
+        return fixes.velocity, np.sqrt(fixes.velocity_variance)
+    known = np.flatnonzero(~np.isnan(fixes.geodetic[:, 0]))
+    t, place = time[known], fixes.geodetic[known]
+    a = np.searchsorted(t, t - 0.5 * _BASELINE)
+    b = np.clip(np.searchsorted(t, t + 0.5 * _BASELINE), 0, t.size - 1)
+    span = np.maximum(t[b] - t[a], 1e-3)
+    meridian, east = radii(place[:, 0])
+    metres = np.stack([(east * np.cos(place[:, 0])), meridian, np.ones_like(east)], axis=1)
+    velocity, sigma = np.full((time.size, 3), np.nan), np.full((time.size, 3), np.nan)
+    change = (place[b] - place[a])[:, [1, 0, 2]]
+    change[:, 0] = wrapped(change[:, 0])
+    velocity[known] = np.where((b > a)[:, None], change * metres / span[:, None], np.nan)
+    sigma[known] = np.sqrt(2.0 * fixes.position_variance[known]) / span[:, None]
+    return velocity, sigma
+
+
+def _start(
+    trial: Trial,
+    fixes: Fixes,
+    time: Array,
+    attitude: CoarseAttitude,
+    earlier: list[FilteredTrack],
+    walk: tuple[float, float],
+) -> FilterState:
+    """Return the state at the first event: loose where the fixes will tell."""
+    P = np.zeros((15, 15))
+    velocity, _ = _velocities(fixes, time)
+    moving = np.flatnonzero(~np.isnan(velocity[:, 0]))
+    v = np.zeros(3)
+    waited = 0.0
+    if moving.size:
+        first = moving[0]
+        waited = float(time[first] - time[0])
+        v = velocity[first] - attitude.nRb @ np.cross(fixes.turning[first], fixes.lever_arm[first])
+    P[3:6, 3:6] = (_VELOCITY_UNKNOWN + waited) ** 2 * np.eye(3)
+    fix = np.flatnonzero(~np.isnan(fixes.geodetic[:, 0]))[0]
+    waited = float(time[fix] - time[0])
+    lat, lon, height = fixes.geodetic[fix]
+    meridian, east = radii(lat)
+    back = v * waited + attitude.nRb @ fixes.lever_arm[fix]
+    place = np.array(
+        [lat - back[1] / meridian, lon - back[0] / (east * np.cos(lat)), height - back[2]]
+    )
+    P[0:3, 0:3] = np.diag(fixes.position_variance[fix]) + (
+        _POSITION_UNKNOWN + _VELOCITY_UNKNOWN * waited
+    ) ** 2 * np.eye(3)
+    if trial.initial_position is not None and not earlier:
+        place = trial.initial_position.geodetic
+        P[0:3, 0:3] = np.diag(trial.initial_position.std**2)
+    P[6:9, 6:9] = attitude.covariance
+    s = trial.imu.settings
+    bg, ba = np.zeros(3), np.zeros(3)
+    if earlier:
+        last = earlier[-1]
+        gap = float(time[0] - last.time[-1])
+        bg, ba = last.gyro_bias[-1], last.accel_bias[-1]
+        P[9:, 9:] = last.covariance[-1, 9:, 9:] + np.diag(np.repeat(walk, 3)) * gap
+    else:
+        P[9:12, 9:12] = (s.gyro_bias_std_deg_h * DEG_PER_HOUR) ** 2 * np.eye(3)
+        P[12:15, 12:15] = (s.accel_bias_std_ug * MICRO_G) ** 2 * np.eye(3)
+    return FilterState(place, v, attitude.nRb, bg, ba, P)

@@ -1,0 +1,205 @@
+"""Nine-state filter: bias, per-axis scale error and misalignment of a DVL.
+
+    v_d,i = (1 + a_i) (v_ref,i + b_i) + eps_i(theta) + noise,
+
+with eps the misalignment acting on the reference velocity, eps = theta x v_ref to first
+order. The states are constant, so the linear Kalman filter is recursive least squares. For
+larger angles the model is (1 + a)(Exp(theta) v_ref + b), and the filter runs again over
+the data, linearised about what it found, until that no longer moves.
+
+The model has no lever arm: the trial's own value is taken off beforehand. In place of b the
+filter has beta = (1 + a) b for states, the bias of the trial format.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from factorgraph_dvl.baselines.point_sets import (
+    Estimated,
+    Outcome,
+    Points,
+    misfit,
+    prior_of,
+    rotation_starts,
+    rows_of_history,
+)
+from factorgraph_dvl.geometry.rotations import exp_so3, log_so3
+from factorgraph_dvl.geometry.vectors import Array, rotate, skew
+from factorgraph_dvl.sensors.protocol import Parameter
+
+# Standard deviation of the bias where the trial gives none: the method has it for a state.
+_BIAS_SIGMA = 0.5
+_PASSES = 50
+_HALVINGS = 12
+_SETTLED = 1e-3
+
+
+def nine_state(
+    points: Points,
+    misalignment: Parameter,
+    scale: Parameter,
+    bias: Parameter,
+    lever_arm: Array,
+    *,
+    iterated: bool = True,
+) -> Outcome:
+    """Calibrate with the nine-state filter.
+
+    Parameters
+    ----------
+    points : the two point sets.
+    misalignment, scale, bias : with their priors; the bias one gets a prior of 0.5 m/s
+        where the trial has none.
+    lever_arm : (3,) of the DVL, m, taken as known.
+    iterated : False = the plain linear filter, about the prior mean.
+    """
+    warnings = []
+    if not bias.estimated:
+        bias = replace(bias, sigma=np.full(3, _BIAS_SIGMA))
+        warnings.append(
+            f"the trial fixes the bias at zero, but the method estimates it: {_BIAS_SIGMA} m/s "
+            "taken for its prior standard deviation"
+        )
+    scale = replace(
+        scale,
+        mean=np.broadcast_to(scale.mean, 3).copy(),
+        sigma=np.broadcast_to(scale.sigma, 3).copy(),
+        labels=("x", "y", "z"),
+    )
+    parameters = (misalignment, scale, bias)
+    prior = prior_of(parameters)
+    free = np.flatnonzero(prior.covariance.diagonal() > 0.0)
+    starts = rotation_starts(misalignment) if iterated else rotation_starts(misalignment)[:1]
+    at = prior
+    if len(starts) > 1:
+        few = points.thinned()
+        ends = [
+            _iterate(few, prior, replace(prior, values=(R, *prior.values[1:])), lever_arm, free)[0]
+            for R in starts
+        ]
+        fits = [misfit(few, e, lever_arm) if e.values[1].min() > -0.5 else np.inf for e in ends]
+        at = ends[int(np.argmin(fits))]
+    if iterated:
+        at, passes, settled = _iterate(points, prior, at, lever_arm, free)
+    else:
+        passes, settled = 1, True
+    steps, covariances, data = _pass(points, prior, at, lever_arm, free)
+    after = [_moved(at, steps[i], covariances[i], free) for i in range(len(steps))]
+    rows = rows_of_history(len(points))
+    history = tuple((float(points.time[i]), after[k]) for k, i in enumerate(rows.tolist()))
+    names = [name for p in parameters for name in p.component_names]
+    sigma = np.concatenate([p.sigma for p in parameters])
+    unseparated = frozenset(names[i] for i in free[_alone(data, sigma[free])])
+    mixed = [n for n in names[3:] if n in unseparated]
+    if mixed:
+        warnings.append(
+            f"{', '.join(mixed)}: bias and scale separate only where the speed along the axis "
+            "varies, and here it does not vary enough"
+        )
+    final = after[-1] if after else at
+    return Outcome(final, passes, history, tuple(warnings), unseparated, settled)
+
+
+def _iterate(
+    points: Points,
+    prior: Estimated,
+    at: Estimated,
+    lever_arm: Array,
+    free: np.ndarray,
+    most: int = _PASSES,
+) -> tuple[Estimated, int, bool]:
+    """Return the fixed point of the filter, passes, and whether it was reached."""
+    # Weights that move with the estimate would make the cost jump.
+    R = points.covariance_d(at.values[0], lever_arm)
+    now = _linear(points, prior, at, lever_arm, free, R)
+    for count in range(1, most + 1):
+        P = np.linalg.inv(now.first + now.each.sum(axis=0))
+        step = P @ (now.pull + now.vector.sum(axis=0))
+        settled = bool(np.all(np.abs(step) < _SETTLED * np.sqrt(P.diagonal())))
+        for _ in range(_HALVINGS):
+            moved = _moved(at, step, P, free)
+            new = _linear(points, prior, moved, lever_arm, free, R)
+            if settled or new.cost < now.cost:
+                break
+            step = 0.5 * step
+        else:
+            return at, count, False
+        at, now = moved, new
+        if settled:
+            return at, count, True
+    return at, most, False
+
+
+@dataclass(frozen=True)
+class _Linear:
+    """Information and its vector about a point: of the prior, and of each ping."""
+
+    first: Array
+    pull: Array
+    each: Array
+    vector: Array
+    cost: float
+
+
+def _linear(
+    points: Points, prior: Estimated, at: Estimated, lever_arm: Array, free: np.ndarray, R: Array
+) -> _Linear:
+    """Return the filter's model about `at`, for noise of covariance R, (M, 3, 3)."""
+    dRb, a, b = at.values
+    v = rotate(dRb[None], points.at_dvl(lever_arm))
+    H = np.zeros((len(points), 3, 9))
+    H[:, :, 0:3] = -(1.0 + a)[:, None] * (dRb @ skew(points.at_dvl(lever_arm)))
+    H[:, :, 3:6] = v[:, :, None] * np.eye(3)
+    H[:, :, 6:9] = np.eye(3)
+    residual = points.v_d - (1.0 + a) * v - b
+    weighted = np.linalg.solve(R, H[:, :, free])
+    away = np.concatenate(
+        [log_so3(dRb.T @ prior.values[0]), prior.values[1] - a, prior.values[2] - b]
+    )
+    first = np.linalg.inv(prior.covariance[np.ix_(free, free)])
+    away = away[free]
+    fit = np.linalg.solve(R, residual[:, :, None])[:, :, 0]
+    return _Linear(
+        first=first,
+        pull=first @ away,
+        each=weighted.transpose(0, 2, 1) @ H[:, :, free],
+        vector=np.matmul(weighted.transpose(0, 2, 1), residual[:, :, None])[:, :, 0],
+        cost=float(away @ first @ away + np.sum(residual * fit)),
+    )
+
+
+def _pass(
+    points: Points, prior: Estimated, at: Estimated, lever_arm: Array, free: np.ndarray
+) -> tuple[Array, Array, Array]:
+    """Return steps and covariances of the filter after pings of a history, and data alone.
+
+    With constant states the filter adds up information, so its state after each ping is a
+    running sum away.
+    """
+    R = points.covariance_d(at.values[0], lever_arm)
+    model = _linear(points, prior, at, lever_arm, free, R)
+    rows = rows_of_history(len(points))
+    P = np.linalg.inv(model.first + np.cumsum(model.each, axis=0)[rows])
+    vector = model.pull + np.cumsum(model.vector, axis=0)[rows]
+    steps = np.matmul(P, vector[:, :, None])[:, :, 0]
+    return steps, P, model.each.sum(axis=0)
+
+
+def _moved(at: Estimated, step: Array, P: Array, free: np.ndarray) -> Estimated:
+    full = np.zeros(9)
+    full[free] = step
+    covariance = np.zeros((9, 9))
+    covariance[np.ix_(free, free)] = P
+    dRb, a, b = at.values
+    values = (dRb @ exp_so3(full[:3]), a + full[3:6], b + full[6:9])
+    return Estimated(at.parameters, values, covariance)
+
+
+def _alone(information: Array, sigma: Array) -> np.ndarray:
+    """Return which components the data alone do not tell better than half the prior."""
+    scaled = information * np.outer(sigma, sigma)
+    std = np.sqrt(np.diag(np.linalg.inv(scaled + 1e-6 * np.eye(sigma.size))))
+    return np.asarray(std > 0.5)

@@ -1,0 +1,264 @@
+"""From a trial to a solution by the six-state filter of gyro drift."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from factorgraph_dvl.baselines.navigation import NavigationMotion, motion_at, navigate
+from factorgraph_dvl.baselines.point_sets import Estimated, Outcome, rows_of_history
+from factorgraph_dvl.baselines.star_filter import (
+    AttitudeTrack,
+    StarAttitudes,
+    attitude_at,
+    attitude_before,
+    run_filter,
+    smooth,
+    star_attitudes,
+)
+from factorgraph_dvl.baselines.strapdown import StrapdownSamples, prepare
+from factorgraph_dvl.baselines.summary import gnss_residuals
+from factorgraph_dvl.errors import ConfigError, DataError
+from factorgraph_dvl.geometry.celestial import off_vertical
+from factorgraph_dvl.geometry.earth import enu_from_ecef
+from factorgraph_dvl.geometry.rotations import (
+    inverse_right_jacobian,
+    log_so3,
+    rph_from_rotation,
+    rph_jacobian,
+)
+from factorgraph_dvl.geometry.units import DEG
+from factorgraph_dvl.geometry.vectors import Array, skew
+from factorgraph_dvl.imu.increments import increments
+from factorgraph_dvl.sensors.star import Star
+from factorgraph_dvl.solution import (
+    Residuals,
+    Solution,
+    Trajectory,
+    as_estimates,
+    consistency_warnings,
+    contradictions,
+)
+from factorgraph_dvl.trial import InitialAttitude, Trial
+
+_ARCSEC = DEG / 3600.0
+# The SINS/GNSS filter, which gives position and velocity only, starts from the stars' attitude
+# as if known so well.
+_START = 0.3 * DEG
+# Standard deviation up to which a mounting that is not estimated is taken as it stands, deg.
+_KNOWN_DEG = 5.0
+# Angle between the stars' vertical and that of the specific force from which on epoch or
+# mounting are wrong, rad.
+_OFF_VERTICAL = 2.0 * DEG
+
+
+def calibrate_gyros(trial: Trial, *, rate_hz: float) -> tuple[Solution, Outcome]:
+    """Estimate the drift of the gyros from SINS and star tracker.
+
+    Position and velocity of the trajectory are those of SINS/GNSS.
+
+    Raises
+    ------
+    ConfigError, DataError
+        If the trial has no star tracker, no epoch, no GNSS, or too few attitudes.
+    """
+    star = next((aid for aid in trial.others if isinstance(aid, Star)), None)
+    if star is None:
+        raise DataError(
+            "the trial has no star tracker", where="trial.yaml", expected="a star section"
+        )
+    if not trial.epoch:
+        raise ConfigError(
+            "the trial has no `epoch`",
+            where="trial.yaml key epoch",
+            expected="UTC of time_s = 0, such as 2022-10-12T02:00:00Z",
+        )
+    settings = star.settings
+    if max(settings.mounting_std_deg) > _KNOWN_DEG:
+        raise ConfigError(
+            f"the mounting of the star tracker is not known ({max(settings.mounting_std_deg):g} "
+            "deg), and this filter does not estimate it",
+            where="trial.yaml star.mounting_std_deg",
+            expected=f"at most {_KNOWN_DEG:g}",
+            hint="`solve` estimates the mounting",
+        )
+    frame = trial.frame()
+    inc, _ = increments(trial.imu)
+    samples = prepare(inc, trial.imu.settings)
+    seen = star_attitudes(star, trial.epoch, frame.lat, frame.lon)
+    (gyro, _) = trial.imu.parameters(0.0)
+    drift, P = np.zeros(3), np.diag(gyro.sigma**2)
+    courses: list[AttitudeTrack] = []
+    history: list[tuple[float, Estimated]] = []
+    for a, b in inc.arcs:
+        mine = seen.within(float(inc.start[a]), float(inc.end[b - 1]))
+        if mine.time.size < 2:
+            continue
+        if courses:
+            gap = mine.time[0] - courses[-1].time[-1]
+            P = P + trial.imu.settings.gyro_bias_walk_root_psd**2 * gap * np.eye(3)
+        forward = run_filter(samples, mine, frame.lat, drift, P)
+        drift, P = forward.course.drift[-1], forward.course.covariance[-1, 3:, 3:]
+        courses.append(smooth(forward))
+        history += [
+            (float(t), Estimated((gyro,), (xi,), Q[3:, 3:]))
+            for t, xi, Q in zip(
+                forward.course.time, forward.course.drift, forward.course.covariance, strict=True
+            )
+        ]
+    if not courses:
+        raise DataError(
+            "there are no two star attitudes in a row while the IMU runs",
+            where=star.source,
+            expected="times on the clock of the IMU",
+        )
+    kept = [history[i] for i in rows_of_history(len(history))]
+    estimated = _drift(trial, courses, drift, P)
+    estimated = replace(estimated, covariance=estimated.covariance + _by_mounting(trial, star))
+    outcome = Outcome(estimated, 1, tuple(kept))
+    solution = _summary(trial, star, samples, courses, seen, estimated, frame.lat, rate_hz)
+    return solution, outcome
+
+
+def _drift(trial: Trial, courses: list[AttitudeTrack], drift: Array, P: Array) -> Estimated:
+    """Return the drift at the end if constant, else its mean over the trial.
+
+    The covariance of the mean of a random walk is taken as the mean covariance, which is
+    an upper bound.
+    """
+    begin, end = courses[0].time[0], courses[-1].time[-1]
+    parameter = trial.imu.parameters(float(end - begin))[0]
+    if trial.imu.settings.gyro_bias_walk_root_psd == 0.0:
+        return Estimated((parameter,), (drift,), P)
+    mean = np.concatenate([c.drift for c in courses]).mean(axis=0)
+    spread = np.concatenate([c.covariance[:, 3:, 3:] for c in courses]).mean(axis=0)
+    return Estimated((parameter,), (mean,), spread)
+
+
+def _mounting_covariance(star: Star) -> Array:
+    """Return the covariance, (3, 3), rad², of delta in sRb Exp(delta) by the prior."""
+    (mounting,) = star.parameters()
+    root = np.linalg.inv(inverse_right_jacobian(mounting.mean)) * mounting.sigma
+    return np.asarray(root @ root.T)
+
+
+def _by_mounting(trial: Trial, star: Star) -> Array:
+    """Return what the mounting's prior adds to the covariance of the drift.
+
+    By delta the stars see the rate turned, which looks like a drift of omega x delta. What
+    counts of a rate is its mean with the weights that fit a slope to white attitudes.
+    """
+    time = trial.imu.time
+    weight = (time - time[0]) * (time[-1] - time)
+    W = skew(weight @ trial.imu.gyro / weight.sum())
+    return np.asarray(W @ _mounting_covariance(star) @ W.T)
+
+
+def _summary(
+    trial: Trial,
+    star: Star,
+    samples: StrapdownSamples,
+    courses: list[AttitudeTrack],
+    seen: StarAttitudes,
+    estimated: Estimated,
+    lat: float,
+    rate_hz: float,
+) -> Solution:
+    begin = float(samples.increments.start[0])
+    initial = trial.initial_attitude
+    if courses[0].time[0] <= samples.increments.end[samples.increments.arcs[0, 1] - 1]:
+        nRb = attitude_before(samples, courses[0], lat, begin)
+        rph = rph_from_rotation(nRb, trial.body_axes)
+        initial = InitialAttitude(rph, np.full(3, _START))
+    navigation = navigate(replace(trial, initial_attitude=initial), np.empty(0))
+    values, covariance = estimated.reported()
+    estimates = as_estimates(estimated.parameters, values, covariance)
+    residuals = (_star_residuals(star, courses, seen), *gnss_residuals(trial, navigation))
+    notes = [*navigation.notes, *star.consistency_warnings()]
+    if np.any(np.array(star.settings.mounting_std_deg) > 0.0):
+        notes.append(
+            "star does not estimate star_mounting_deg: held at "
+            f"{np.round(star.settings.mounting_deg, 6).tolist()}"
+        )
+    away = off_vertical(seen.time, seen.nRb, trial.imu.time, trial.imu.accel)
+    if away > _OFF_VERTICAL:
+        notes.append(
+            f"{star.label}: its attitudes put the vertical {np.degrees(away):.1f} deg away from "
+            "that of the specific force: are `epoch` and `mounting_deg` right? "
+            "The attitude is not to be used before that is cleared up"
+        )
+    notes += [
+        f"{name} not observable: the arc is too short for these stars"
+        for e in estimates
+        for name, seen_well in zip(e.component_names, e.observable, strict=True)
+        if not seen_well
+    ]
+    contradicted = contradictions(residuals)
+    first = residuals[0]
+    motion = motion_at(navigation, samples.increments.ticks(rate_hz))
+    return Solution(
+        trial=trial.name,
+        solver="kalman-star",
+        body_axes=trial.body_axes,
+        inputs=trial.inputs,
+        converged=not contradicted,
+        iterations=1,
+        cost=0.5 * float(np.sum((first.residual / first.sigma) ** 2)),
+        estimates=estimates,
+        covariance=covariance,
+        trajectory=_trajectory(trial, star, samples, courses, motion),
+        residuals=residuals,
+        warnings=(*notes, *contradicted, *consistency_warnings(estimates, residuals)),
+    )
+
+
+def _star_residuals(star: Star, courses: list[AttitudeTrack], seen: StarAttitudes) -> Residuals:
+    """Return smoothed - measured attitude in body axes, arcsec."""
+    time = np.concatenate([c.time for c in courses])
+    nRb = np.concatenate([c.nRb for c in courses])
+    rows = np.searchsorted(seen.time, time)
+    residual = log_so3(seen.nRb[rows].transpose(0, 2, 1) @ nRb)
+    variance = np.diagonal(seen.covariance[rows], axis1=1, axis2=2)
+    return Residuals(
+        "Star attitude",
+        "arcsec",
+        ("x", "y", "z"),
+        time,
+        residual / _ARCSEC,
+        np.sqrt(variance) / _ARCSEC,
+    )
+
+
+def _trajectory(
+    trial: Trial,
+    star: Star,
+    samples: StrapdownSamples,
+    courses: list[AttitudeTrack],
+    motion: NavigationMotion,
+) -> Trajectory:
+    """Return position and velocity of SINS/GNSS with the attitude by the stars."""
+    frame = trial.frame()
+    nRb, P = motion.nRb.copy(), np.zeros_like(motion.nRb)
+    known = np.zeros(motion.time.size, dtype=bool)
+    mounting = _mounting_covariance(star)
+    for course in courses:
+        mine = (motion.time >= course.time[0]) & (motion.time <= course.time[-1])
+        mine &= motion.covered
+        nRb[mine], P[mine] = attitude_at(samples, course, frame.lat, motion.time[mine])
+        P[mine] += nRb[mine] @ mounting @ nRb[mine].transpose(0, 2, 1)
+        known |= mine
+    level = enu_from_ecef(motion.geodetic[known, 0], motion.geodetic[known, 1])
+    lRn = level @ enu_from_ecef(frame.lat, frame.lon).T
+    lRb = lRn @ nRb[known]
+    rph = rph_from_rotation(lRb, trial.body_axes)
+    J = rph_jacobian(rph, trial.body_axes) @ nRb[known].transpose(0, 2, 1)
+    return Trajectory(
+        time=motion.time[known],
+        geodetic=motion.geodetic[known],
+        velocity=motion.velocity[known],
+        rph=rph,
+        position_cov=motion.covariance[known, 0:3, 0:3],
+        velocity_cov=motion.covariance[known, 3:6, 3:6],
+        rph_cov=J @ P[known] @ J.transpose(0, 2, 1),
+    )

@@ -1,0 +1,219 @@
+"""Six-state filter of gyro drift: the attitude of SINS against that of a star tracker.
+
+States: dq, the vector part of the quaternion dQ = Q_SINS Q_true⁻¹ in the axes of n, and
+xi, the drift that the SINS does not yet take off its gyros, in body:
+
+    d(dq)/dt = -omega_in x dq + C xi / 2,      d(xi)/dt = 0,
+    z = vec(Q_SINS Q_stars⁻¹) = dq + noise.
+
+Liu, Yu and Xu (2020), eqs. 7 to 22. As printed, eq. 16 has + omega_nb x dq: the rates of
+SINS and truth are subtracted as if resolved in the same axes, though the two attitudes
+differ by dq; what is left of the term in n is the turn of n itself. H is printed 3 x 3, and
+is [I 0]; the gain of eq. 20 needs (H P Hᵀ + R)⁻¹ in place of R⁻¹; the state on the right of
+eq. 21 is the predicted one. What is estimated is fed back at once.
+"""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass
+from datetime import UTC, datetime
+
+import erfa
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from factorgraph_dvl.baselines.strapdown import StrapdownSamples, compose
+from factorgraph_dvl.geometry.earth import RATE, enu_from_ecef
+from factorgraph_dvl.geometry.rotations import exp_so3
+from factorgraph_dvl.geometry.units import DEG
+from factorgraph_dvl.geometry.vectors import Array, rotate
+from factorgraph_dvl.sensors.star import Star
+
+
+@dataclass(frozen=True)
+class StarAttitudes:
+    """Attitudes by the stars at M times.
+
+    Parameters
+    ----------
+    time : (M,) s.
+    nRb : (M, 3, 3) body to n, by the prior mounting.
+    covariance : (M, 3, 3) of phi in nRb Exp(phi), rad².
+    """
+
+    time: Array
+    nRb: Array
+    covariance: Array
+
+    def within(self, begin: float, end: float) -> StarAttitudes:
+        """Return those from `begin` to `end`, s."""
+        use = (self.time >= begin) & (self.time <= end)
+        return StarAttitudes(self.time[use], self.nRb[use], self.covariance[use])
+
+
+@dataclass(frozen=True)
+class AttitudeTrack:
+    """Attitude and drift at K times of one arc.
+
+    Parameters
+    ----------
+    time : (K,) s.
+    nRb : (K, 3, 3).
+    drift : (K, 3) of the gyros, rad/s.
+    covariance : (K, 6, 6) of dq and xi.
+    """
+
+    time: Array
+    nRb: Array
+    drift: Array
+    covariance: Array
+
+
+@dataclass(frozen=True)
+class FilteredDrift:
+    """What the filter leaves for the smoother.
+
+    Parameters
+    ----------
+    course : after the measurement at each time.
+    transition : (K, 6, 6) of the step that ends at each time; the first is not used.
+    predicted : (K, 6, 6) covariance before the measurement.
+    correction : (K, 6) what the measurement fed back.
+    """
+
+    course: AttitudeTrack
+    transition: Array
+    predicted: Array
+    correction: Array
+
+
+def star_attitudes(star: Star, epoch: str, lat: float, lon: float) -> StarAttitudes:
+    """Return the attitudes relative to east, north, up at a latitude and longitude (rad).
+
+    C_b^n = C_e^n C_i^e C_s^i C_b^s, with C_i^e by the equinox: apparent sidereal time and
+    the precession-nutation matrix.
+    """
+    known = np.logical_not(star.missing)
+    time = star.time[known]
+    iRs = Rotation.from_quat(star.quaternion[known][:, [1, 2, 3, 0]]).as_matrix()
+    sRb = Rotation.from_rotvec(np.array(star.settings.mounting_deg) * DEG).as_matrix()
+    eRi = _earth_from_stars(epoch, time, star.settings.ut1_utc_s)
+    nRb = enu_from_ecef(lat, lon) @ eRi @ iRs @ sRb
+    return StarAttitudes(time, nRb, sRb.T @ star.covariance[known] @ sRb)
+
+
+def _earth_from_stars(epoch: str, time: Array, ut1_utc: float) -> Array:
+    moment = datetime.fromisoformat(epoch)
+    moment = moment.replace(tzinfo=UTC) if moment.tzinfo is None else moment.astimezone(UTC)
+    unix_day, second = divmod(moment.timestamp(), 86400.0)
+    day, fraction = 2440587.5 + unix_day, second / 86400.0
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", erfa.ErfaWarning)
+        tai_day, tai_fraction = erfa.utctai(day, fraction)
+    tt_day, tt_fraction = erfa.taitt(tai_day, tai_fraction + time / 86400.0)
+    nutated = erfa.pnm06a(tt_day, tt_fraction)
+    sidereal = erfa.gst06(day, fraction + (time + ut1_utc) / 86400.0, tt_day, tt_fraction, nutated)
+    return np.asarray(erfa.c2teqx(nutated, sidereal, np.eye(3)))
+
+
+def run_filter(
+    samples: StrapdownSamples,
+    seen: StarAttitudes,
+    lat: float,
+    drift: Array,
+    drift_covariance: Array,
+) -> FilteredDrift:
+    """Run the filter over one arc, from its first attitude by the stars.
+
+    Parameters
+    ----------
+    samples : of the IMU.
+    seen : attitudes within the arc.
+    lat : latitude of n, rad; its rate is that of the Earth.
+    drift : (3,) known before, rad/s.
+    drift_covariance : (3, 3).
+    """
+    steps = compose(samples, seen.time[:-1], seen.time[1:])
+    walk = samples.settings.gyro_bias_walk_root_psd**2
+    omega_in = RATE * np.array([0.0, np.cos(lat), np.sin(lat)])
+    count, eye = seen.time.size, np.eye(3)
+    attitude, drifts = np.empty((count, 3, 3)), np.empty((count, 3))
+    filtered, predicted = np.empty((count, 6, 6)), np.empty((count, 6, 6))
+    transition, correction = np.zeros((count, 6, 6)), np.zeros((count, 6))
+    noise = 0.25 * seen.nRb @ seen.covariance @ seen.nRb.transpose(0, 2, 1)
+
+    C, xi = seen.nRb[0], drift.copy()
+    P = np.zeros((6, 6))
+    P[:3, :3], P[3:, 3:] = noise[0], drift_covariance
+    predicted[0] = P
+    F = np.eye(6)
+    for k in range(count):
+        if k:
+            T, bias_jacobian = steps.duration[k - 1], steps.bias_jacobian[k - 1]
+            spin = exp_so3(-T * omega_in)
+            F[:3, :3], F[:3, 3:] = spin, 0.5 * spin @ C @ bias_jacobian
+            C = spin @ C @ exp_so3(-bias_jacobian @ xi) @ steps.turn[k - 1]
+            P = F @ P @ F.T
+            P[:3, :3] += 0.25 * steps.gyro_variance[k - 1] * eye
+            P[3:, 3:] += walk * T * eye
+            transition[k], predicted[k] = F, P
+            error = Rotation.from_matrix(C @ seen.nRb[k].T).as_quat()
+            z = error[:3] * np.sign(error[3])
+            K = np.linalg.solve(P[:3, :3] + noise[k], P[:3]).T
+            x = K @ z
+            P = P - K @ P[:3]
+            P = 0.5 * (P + P.T)
+            C, xi, correction[k] = exp_so3(-2.0 * x[:3]) @ C, xi + x[3:], x
+        attitude[k], drifts[k], filtered[k] = C, xi, P
+    course = AttitudeTrack(seen.time, attitude, drifts, filtered)
+    return FilteredDrift(course, transition, predicted, correction)
+
+
+def smooth(filtered: FilteredDrift) -> AttitudeTrack:
+    """Return attitude and drift given all attitudes of the arc (Rauch, Tung, Striebel)."""
+    course = filtered.course
+    error, smoothed = np.zeros_like(filtered.correction), course.covariance.copy()
+    for k in range(course.time.size - 2, -1, -1):
+        after = filtered.predicted[k + 1]
+        G = np.linalg.solve(after, filtered.transition[k + 1] @ course.covariance[k]).T
+        error[k] = G @ (filtered.correction[k + 1] + error[k + 1])
+        P = smoothed[k] + G @ (smoothed[k + 1] - after) @ G.T
+        smoothed[k] = 0.5 * (P + P.T)
+    return AttitudeTrack(
+        course.time,
+        exp_so3(-2.0 * error[:, :3]) @ course.nRb,
+        course.drift + error[:, 3:],
+        smoothed,
+    )
+
+
+def attitude_at(
+    samples: StrapdownSamples, course: AttitudeTrack, lat: float, time: Array
+) -> tuple[Array, Array]:
+    """Return nRb and its covariance at times (M,) within a course, by the gyros in between.
+
+    Returns
+    -------
+    nRb : (M, 3, 3); covariance : (M, 3, 3) of phi in Exp(phi) nRb, rad².
+    """
+    omega_in = RATE * np.array([0.0, np.cos(lat), np.sin(lat)])
+    before = np.clip(np.searchsorted(course.time, time, side="right") - 1, 0, None)
+    step = compose(samples, course.time[before], time)
+    turned = exp_so3(-step.duration[:, None] * omega_in) @ course.nRb[before]
+    free = exp_so3(-rotate(step.bias_jacobian, course.drift[before]))
+    after = np.minimum(before + 1, course.time.size - 1)
+    span = np.maximum(course.time[after] - course.time[before], 1e-9)
+    part = ((time - course.time[before]) / span)[:, None, None]
+    P = course.covariance[:, :3, :3]
+    return turned @ free @ step.turn, 4.0 * (P[before] + part * (P[after] - P[before]))
+
+
+def attitude_before(
+    samples: StrapdownSamples, course: AttitudeTrack, lat: float, time: float
+) -> Array:
+    """Return nRb (3, 3) at a time before a course, in the same arc."""
+    omega_in = RATE * np.array([0.0, np.cos(lat), np.sin(lat)])
+    step = compose(samples, np.array([time]), course.time[:1])
+    moved = exp_so3(-step.bias_jacobian[0] @ course.drift[0]) @ step.turn[0]
+    return np.asarray(exp_so3(step.duration[0] * omega_in) @ course.nRb[0] @ moved.T)

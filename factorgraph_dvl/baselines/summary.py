@@ -1,0 +1,222 @@
+"""From smoothed motion and a calibration to a solution."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import partial
+
+import numpy as np
+
+from factorgraph_dvl.baselines.navigation import Navigation, NavigationMotion, motion_at
+from factorgraph_dvl.baselines.point_sets import Estimated, Outcome, Points, residuals
+from factorgraph_dvl.geometry.earth import radii
+from factorgraph_dvl.geometry.rotations import rph_from_rotation, rph_jacobian, wrapped
+from factorgraph_dvl.geometry.vectors import Array, rotate
+from factorgraph_dvl.sensors.dvl import Dvl
+from factorgraph_dvl.sensors.protocol import Aid
+from factorgraph_dvl.sensors.protocol import Motion as SensorMotion
+from factorgraph_dvl.solution import (
+    Estimate,
+    Residuals,
+    Solution,
+    Trajectory,
+    as_estimates,
+    consistency_warnings,
+    contradictions,
+    not_observable,
+)
+from factorgraph_dvl.trial import Trial
+
+
+def summarise(
+    trial: Trial,
+    navigation: Navigation,
+    outcome: Outcome,
+    *,
+    aid: Aid,
+    measured: Residuals,
+    seen: SensorMotion | None,
+    solver: str,
+    rate_hz: float,
+    notes: Sequence[str],
+) -> Solution:
+    """Return the solution of a calibrator.
+
+    Parameters
+    ----------
+    trial, navigation, outcome : what was solved, and how it ended.
+    aid, measured, seen : the sensor that was calibrated, its residuals, and the motion at
+        its measurements.
+    solver : name.
+    rate_hz : rate of the trajectory.
+    notes : what is already known to be worth telling.
+    """
+    dvl_values, dvl_covariance = outcome.estimated.reported()
+    imu = _imu_biases(trial, navigation)
+    imu_values, imu_covariance = imu.reported()
+    n = dvl_values.size
+    covariance = np.zeros((n + imu_values.size, n + imu_values.size))
+    covariance[:n, :n], covariance[n:, n:] = dvl_covariance, imu_covariance
+    parameters = [*outcome.estimated.parameters, *imu.parameters]
+    values = np.concatenate([dvl_values, imu_values])
+    estimates = as_estimates(parameters, values, covariance, outcome.unseparated)
+    all_residuals = (measured, *gnss_residuals(trial, navigation))
+    contradicted = contradictions(all_residuals)
+    warnings = [
+        *notes,
+        *contradicted,
+        *consistency_warnings(estimates, all_residuals),
+        *_unobservable(aid, seen, estimates),
+    ]
+    return Solution(
+        trial=trial.name,
+        solver=solver,
+        body_axes=trial.body_axes,
+        inputs=trial.inputs,
+        converged=outcome.converged and not contradicted,
+        iterations=outcome.iterations,
+        cost=0.5 * float(np.nansum((measured.residual / measured.sigma) ** 2)),
+        estimates=estimates,
+        covariance=covariance,
+        trajectory=trajectory_of(trial, navigation, rate_hz),
+        residuals=all_residuals,
+        warnings=tuple(warnings),
+    )
+
+
+def _imu_biases(trial: Trial, navigation: Navigation) -> Estimated:
+    """Return the biases: at the end if constant, else their mean over the trial.
+
+    The covariance of the mean of a random walk is taken as the mean covariance, which is
+    an upper bound.
+    """
+    track = navigation.track
+    parameters = trial.imu.parameters(float(track.time[-1] - track.time[0]))
+    if not trial.imu.settings.bias_walks:
+        values = (track.gyro_bias[-1], track.accel_bias[-1])
+        return Estimated(parameters, values, track.covariance[-1, 9:, 9:])
+    step = np.where(np.diff(navigation.arc) == 0, np.diff(track.time), 0.0)
+    weight = np.append(step, 0.0) + np.append(0.0, step)
+    weight /= weight.sum()
+    values = (weight @ track.gyro_bias, weight @ track.accel_bias)
+    P = np.einsum("k,kij->ij", weight, track.covariance[:, 9:, 9:])
+    return Estimated(parameters, values, P)
+
+
+def trajectory_of(trial: Trial, navigation: Navigation, rate_hz: float) -> Trajectory:
+    """Return the smoothed motion at the multiples of 1 / rate that it covers."""
+    motion = motion_at(navigation, navigation.samples.increments.ticks(rate_hz))
+    at = motion.covered
+    P = motion.covariance[at]
+    rph = rph_from_rotation(motion.nRb[at], trial.body_axes)
+    J = rph_jacobian(rph, trial.body_axes) @ motion.nRb[at].transpose(0, 2, 1)
+    return Trajectory(
+        time=motion.time[at],
+        geodetic=motion.geodetic[at],
+        velocity=motion.velocity[at],
+        rph=rph,
+        position_cov=P[:, 0:3, 0:3],
+        velocity_cov=P[:, 3:6, 3:6],
+        rph_cov=J @ P[:, 6:9, 6:9] @ J.transpose(0, 2, 1),
+    )
+
+
+def dvl_residuals(dvl: Dvl, navigation: Navigation, outcome: Outcome, points: Points) -> Residuals:
+    """Return the residuals of a DVL's velocity.
+
+    Parameters
+    ----------
+    dvl, navigation, outcome : what was calibrated against what, and how it ended.
+    points : the point sets at the prior's time offset.
+    """
+    prior = {p.stem: p.mean for p in dvl.parameters()}
+    before = float(prior["time_offset"][0])
+    offset = float(outcome.estimated.value("time_offset", prior["time_offset"])[0])
+    if offset != before:
+        motion = motion_at(navigation, points.time + before - offset)
+        points = Points(
+            motion.time,
+            motion.v_b,
+            motion.v_b_covariance,
+            motion.omega_b,
+            motion.omega_sigma,
+            points.v_d,
+            points.sigma_d,
+        )
+    residual, sigma = residuals(points, outcome.estimated, prior["lever_arm"])
+    return Residuals("DVL velocity", "m/s", ("x", "y", "z"), points.time + offset, residual, sigma)
+
+
+def gnss_residuals(trial: Trial, navigation: Navigation) -> tuple[Residuals, ...]:
+    """Return predicted - measured position and velocity of the antenna."""
+    gnss = trial.gnss
+    assert gnss is not None
+    motion: NavigationMotion = motion_at(navigation, gnss.time)
+    arm, omega_cb_b = gnss.lever_arm(gnss.time)
+    meridian, east = radii(motion.geodetic[:, 0])
+    height = motion.geodetic[:, 2]
+    apart = motion.geodetic - gnss.geodetic
+    apart[:, 1] = wrapped(apart[:, 1])
+    metres = np.stack(
+        [
+            apart[:, 1] * (east + height) * np.cos(motion.geodetic[:, 0]),
+            apart[:, 0] * (meridian + height),
+            apart[:, 2],
+        ],
+        axis=1,
+    )
+    position = metres + rotate(motion.nRb, arm)
+    turning = np.cross(motion.omega_b - omega_cb_b, arm)
+    velocity = motion.velocity + rotate(motion.nRb, turning) - gnss.velocity
+    out = []
+    for label, unit, residual, sigma in (
+        ("GNSS position", "m", position, gnss.position_std),
+        ("GNSS velocity", "m/s", velocity, gnss.velocity_std),
+    ):
+        known = motion.covered & ~np.isnan(residual[:, 0])
+        if known.any():
+            out.append(
+                Residuals(
+                    label,
+                    unit,
+                    ("east", "north", "up"),
+                    gnss.time[known],
+                    residual[known],
+                    sigma[known],
+                )
+            )
+    return tuple(out)
+
+
+def _unobservable(aid: Aid, seen: SensorMotion | None, estimates: Sequence[Estimate]) -> list[str]:
+    """Say which components the data did not determine, and why."""
+    own = {p.name for p in aid.parameters()}
+    out = []
+
+    def why(name: str, component: int) -> str:
+        if name in own:
+            return aid.explain(name, component, seen)
+        return (
+            "the trial does not tell it better than the prior; it takes longer, or turns and "
+            "changes of speed"
+        )
+
+    for e in estimates:
+        out += not_observable(e, partial(why, e.name))
+    return out
+
+
+def as_sensors_see(at: Points | NavigationMotion) -> SensorMotion | None:
+    """Return the motion at the pings, with the body's axes for n."""
+    if at.time.size == 0:
+        return None
+    zero: Array = np.zeros_like(at.v_b)
+    return SensorMotion(
+        nRb=np.broadcast_to(np.eye(3), (at.time.size, 3, 3)),
+        p_n=zero,
+        v_n=at.v_b,
+        omega_eb_b=at.omega_b,
+        a_n=zero,
+        alpha_b=zero,
+        omega_sigma=at.omega_sigma,
+    )

@@ -1,0 +1,1 @@
+"""Units, vectors, rotations, the Earth and the sky."""

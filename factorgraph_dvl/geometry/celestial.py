@@ -1,0 +1,128 @@
+"""The sky: the Earth's attitude in inertial space, and attitudes from star vectors."""
+
+from __future__ import annotations
+
+import warnings
+from datetime import UTC, datetime
+
+import erfa
+import numpy as np
+
+from factorgraph_dvl.errors import ConfigError
+from factorgraph_dvl.geometry.units import DEG
+from factorgraph_dvl.geometry.vectors import Array, rotate
+
+ARCSEC = DEG / 3600.0
+_DAY = 86400.0
+# Before that, UTC had no leap seconds.
+_FIRST_YEAR = 1972
+# The celestial pole is interpolated between epochs this far apart, s: nutation bends by less
+# than 1e-6 arcsec meanwhile.
+_POLE_STEP = 600.0
+
+
+def earth_from_inertial(epoch: str, time: Array, ut1_utc: float = 0.0) -> Array:
+    """Return the (M, 3, 3) rotations from GCRS to ITRS, without polar motion.
+
+    IAU 2006/2000A precession and nutation, and the Earth rotation angle of UT1 (IERS
+    Conventions 2010, chapter 5), by ERFA.
+
+    Parameters
+    ----------
+    epoch : UTC of time zero, ISO 8601.
+    time : (M,) SI seconds since then.
+    ut1_utc : UT1 - UTC at the epoch, s. UT1 is continuous: a leap second within the trial
+        changes nothing.
+
+    Raises
+    ------
+    ConfigError
+        If there is no epoch, or one before 1972.
+    """
+    day, fraction = _utc(epoch)
+    with warnings.catch_warnings():
+        # Years beyond the leap seconds that ERFA knows: a second is 1e-6 arcsec of precession.
+        warnings.simplefilter("ignore", erfa.ErfaWarning)
+        tt = erfa.taitt(*erfa.utctai(day, fraction))
+    steps = np.unique(np.floor(time / _POLE_STEP))
+    grid = _POLE_STEP * np.union1d(steps, steps + 1.0)
+    x, y, s = (
+        np.interp(time, grid, value)
+        for value in erfa.xys06a(tt[0], np.asarray(tt[1]) + grid / _DAY)
+    )
+    angle = erfa.era00(day, fraction + (time + ut1_utc) / _DAY)
+    return np.asarray(erfa.c2tcio(erfa.c2ixys(x, y, s), angle, np.eye(3)))
+
+
+def _utc(epoch: str) -> tuple[float, float]:
+    """Return the Julian day at midnight, and the fraction of the day, of an epoch."""
+    if not epoch:
+        raise ConfigError(
+            "the trial has no `epoch`, and stars tell the attitude only at a known time",
+            where="trial.yaml key epoch",
+            expected="UTC of time_s = 0, such as 2022-10-12T02:00:00Z",
+        )
+    moment = datetime.fromisoformat(epoch)
+    moment = moment.replace(tzinfo=UTC) if moment.tzinfo is None else moment.astimezone(UTC)
+    if moment.year < _FIRST_YEAR:
+        raise ConfigError(
+            f"`epoch` is in the year {moment.year}",
+            where="trial.yaml key epoch",
+            expected=f"UTC as it is since {_FIRST_YEAR}",
+        )
+    midnight = moment.replace(hour=0, minute=0, second=0, microsecond=0)
+    day = erfa.cal2jd(moment.year, moment.month, moment.day)
+    return float(day[0] + day[1]), (moment - midnight).total_seconds() / _DAY
+
+
+def attitudes_from_vectors(
+    measured: Array, catalogue: Array, first: np.ndarray
+) -> tuple[Array, Array]:
+    """Return the rotation from measured to catalogue directions, epoch by epoch.
+
+    Wahba's problem, sum |c - R m|² = min, by singular values (Markley, J. Astronautical
+    Sciences 36(3), 1988). With an error of sigma across each direction, per axis, the
+    covariance of phi in R Exp(phi) is sigma² P with P = (sum (I - m mᵀ))⁻¹ (Shuster and Oh,
+    J. Guidance and Control 4(1), 1981).
+
+    Parameters
+    ----------
+    measured, catalogue : (K, 3) unit vectors.
+    first : (M,) first row of each epoch.
+
+    Returns
+    -------
+    R : (M, 3, 3); P : (M, 3, 3).
+    """
+    moments = np.add.reduceat(catalogue[:, :, None] * measured[:, None, :], first)
+    u, _, vt = np.linalg.svd(moments)
+    u[:, :, 2] *= np.linalg.det(u @ vt)[:, None]
+    across = np.eye(3) - measured[:, :, None] * measured[:, None, :]
+    return u @ vt, np.linalg.inv(np.add.reduceat(across, first))
+
+
+def spread(directions: Array, first: np.ndarray) -> Array:
+    """Return how far directions (K, 3) leave one line, epoch by epoch, (M,), rad.
+
+    The smallest root mean square angle to any line: 0 where all are parallel or opposite.
+    """
+    outer = np.add.reduceat(directions[:, :, None] * directions[:, None, :], first)
+    count = np.diff(np.append(first, directions.shape[0]))
+    rest = np.linalg.eigvalsh(outer)[:, :2].sum(axis=1)
+    return np.sqrt(np.maximum(rest, 0.0) / count)
+
+
+def off_vertical(time: Array, nRb: Array, force_time: Array, force: Array) -> float:
+    """Return the angle between up and the mean specific force as attitudes turn it, rad.
+
+    The mean of nRb f is gravity's reaction but for the change of velocity: 0.01 m/s² of mean
+    acceleration turn it by 0.06 deg.
+
+    Parameters
+    ----------
+    time : (M,) s; nRb : (M, 3, 3) body to east, north, up.
+    force_time : (N,) s; force : (N, 3) specific force in body, m/s².
+    """
+    at = np.stack([np.interp(time, force_time, force[:, i]) for i in range(3)], axis=1)
+    mean = rotate(nRb, at).mean(axis=0)
+    return float(np.arctan2(np.hypot(mean[0], mean[1]), mean[2]))

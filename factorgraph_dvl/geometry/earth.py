@@ -1,0 +1,123 @@
+"""The Earth: WGS-84 ellipsoid, normal gravity, rotation, local tangent frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import pymap3d
+from numpy.typing import ArrayLike
+
+from factorgraph_dvl.geometry.vectors import Array, skew
+
+RATE = 7.292115e-5
+SEMI_MAJOR = 6378137.0
+FLATTENING = 1.0 / 298.257223563
+ECCENTRICITY_SQUARED = FLATTENING * (2.0 - FLATTENING)
+_GRAVITY_EQUATOR = 9.7803253359
+_GRAVITY_POLE = 9.8321849379
+_CENTRIFUGAL_RATIO = 0.00344978650684
+
+
+def radii(lat: ArrayLike) -> tuple[Array, Array]:
+    """Return the meridian and the prime-vertical radius of curvature, m.
+
+    Parameters
+    ----------
+    lat : (...) geodetic latitude, rad.
+    """
+    root = 1.0 - ECCENTRICITY_SQUARED * np.sin(lat) ** 2
+    east = SEMI_MAJOR / np.sqrt(root)
+    return east * (1.0 - ECCENTRICITY_SQUARED) / root, east
+
+
+def normal_gravity(lat: ArrayLike, height: ArrayLike) -> Array:
+    """Return the magnitude of normal gravity (gravitation and centrifugal), m/s².
+
+    Somigliana's formula with the second-order free-air reduction: NIMA TR8350.2,
+    third edition, eqs. 4-1 and 4-3.
+
+    Parameters
+    ----------
+    lat : (...) geodetic latitude, rad.
+    height : (...) above the ellipsoid, m.
+    """
+    s2 = np.sin(lat) ** 2
+    k = (1.0 - FLATTENING) * _GRAVITY_POLE / _GRAVITY_EQUATOR - 1.0
+    surface = _GRAVITY_EQUATOR * (1.0 + k * s2) / np.sqrt(1.0 - ECCENTRICITY_SQUARED * s2)
+    h = np.asarray(height, dtype=float) / SEMI_MAJOR
+    linear = 1.0 + FLATTENING + _CENTRIFUGAL_RATIO - 2.0 * FLATTENING * s2
+    return np.asarray(surface * (1.0 - 2.0 * linear * h + 3.0 * h**2))
+
+
+def enu_from_ecef(lat: ArrayLike, lon: ArrayLike) -> Array:
+    """Return the (..., 3, 3) rotation from ECEF to local-level ENU at lat, lon (rad)."""
+    lat, lon = np.broadcast_arrays(np.asarray(lat, float), np.asarray(lon, float))
+    sl, cl, so, co = np.sin(lat), np.cos(lat), np.sin(lon), np.cos(lon)
+    out = np.zeros((*lat.shape, 3, 3))
+    out[..., 0, 0], out[..., 0, 1] = -so, co
+    out[..., 1, 0], out[..., 1, 1], out[..., 1, 2] = -sl * co, -sl * so, cl
+    out[..., 2, 0], out[..., 2, 1], out[..., 2, 2] = cl * co, cl * so, sl
+    return out
+
+
+@dataclass(frozen=True)
+class LocalFrame:
+    """Tangent east-north-up frame, fixed to the Earth at an origin: the `n` of the graph.
+
+    Parameters
+    ----------
+    lat, lon : geodetic latitude and longitude of the origin, rad.
+    height : ellipsoidal height of the origin, m.
+    epoch : UTC of the trial's time zero, ISO 8601, which fixes how the frame lies among the
+        stars at any time; empty if not known.
+    """
+
+    lat: float
+    lon: float
+    height: float
+    epoch: str = ""
+
+    @cached_property
+    def _enu_from_ecef(self) -> Array:
+        return enu_from_ecef(self.lat, self.lon)
+
+    @cached_property
+    def earth_rate(self) -> Array:
+        """Earth rotation resolved in n, (3,), rad/s."""
+        return RATE * np.array([0.0, np.cos(self.lat), np.sin(self.lat)])
+
+    def position(self, lat: ArrayLike, lon: ArrayLike, height: ArrayLike) -> Array:
+        """Return positions in n, (..., 3), m, of geodetic coordinates (rad, rad, m)."""
+        enu = pymap3d.geodetic2enu(lat, lon, height, self.lat, self.lon, self.height, deg=False)
+        return np.stack([np.asarray(x, dtype=float) for x in enu], axis=-1)
+
+    def geodetic(self, p_n: ArrayLike) -> tuple[Array, Array, Array]:
+        """Return latitude, longitude (rad) and height (m) of positions (..., 3) in n."""
+        p_n = np.asarray(p_n, dtype=float)
+        lat, lon, height = pymap3d.enu2geodetic(
+            p_n[..., 0], p_n[..., 1], p_n[..., 2], self.lat, self.lon, self.height, deg=False
+        )
+        # A single position comes back with mixed shapes.
+        shape = p_n.shape[:-1]
+        return tuple(np.reshape(x, shape) for x in (lat, lon, height))  # type: ignore[return-value]
+
+    def level_from_tangent(self, lat: ArrayLike, lon: ArrayLike) -> Array:
+        """Return the (..., 3, 3) rotation from n to the local-level ENU at lat, lon (rad)."""
+        return enu_from_ecef(lat, lon) @ self._enu_from_ecef.T
+
+    def gravity(self, p_n: ArrayLike) -> Array:
+        """Return gravity at positions (..., 3) in n, resolved in n, m/s²."""
+        lat, lon, height = self.geodetic(p_n)
+        up = self.level_from_tangent(lat, lon)[..., 2, :]
+        return -normal_gravity(lat, height)[..., None] * up
+
+    def gravity_without_rotation(self, p_n: ArrayLike) -> Array:
+        """Return gravitation at p plus the centrifugal acceleration of the origin alone.
+
+        Equations of motion that carry the term -w x (w x p) themselves (GTSAM's, with
+        p from the origin) need gravity without it.
+        """
+        cross = skew(self.earth_rate)
+        return self.gravity(p_n) + np.asarray(p_n, dtype=float) @ (cross @ cross).T

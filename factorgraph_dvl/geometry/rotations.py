@@ -1,0 +1,156 @@
+"""Rotations: exponential map, Euler angles, body axes."""
+
+from __future__ import annotations
+
+from typing import Literal, TypeVar
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation
+
+from factorgraph_dvl.geometry.units import DEG
+from factorgraph_dvl.geometry.vectors import Array, skew
+
+BodyAxes = Literal["RFU", "FRD", "FLU"]
+_Angle = TypeVar("_Angle", float, Array)
+
+_FRD_FROM_BODY: dict[str, Array] = {
+    "FRD": np.eye(3),
+    "RFU": np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]]),
+    "FLU": np.diag([1.0, -1.0, -1.0]),
+}
+_ENU_FROM_NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+
+
+def frd_from_body(body_axes: BodyAxes) -> Array:
+    """Return the (3, 3) matrix that takes body components to forward, right, down."""
+    return _FRD_FROM_BODY[body_axes]
+
+
+def wrapped(angle: _Angle) -> _Angle:
+    """Return angles in [-pi, pi)."""
+    return (angle + np.pi) % (2.0 * np.pi) - np.pi
+
+
+def exp_so3(phi: ArrayLike) -> Array:
+    """Return the rotation matrices Exp([phi x]) of rotation vectors (..., 3), rad."""
+    phi = np.asarray(phi, dtype=float)
+    flat = Rotation.from_rotvec(phi.reshape(-1, 3)).as_matrix()
+    return flat.reshape(*phi.shape, 3)
+
+
+def log_so3(matrix: ArrayLike) -> Array:
+    """Return the rotation vectors (..., 3), rad, of rotation matrices (..., 3, 3)."""
+    matrix = np.asarray(matrix, dtype=float)
+    flat = Rotation.from_matrix(matrix.reshape(-1, 3, 3)).as_rotvec()
+    return flat.reshape(matrix.shape[:-1])
+
+
+def right_jacobian(phi: ArrayLike) -> Array:
+    """Return Jr(phi), (3, 3), of Exp(phi + d) = Exp(phi) Exp(Jr(phi) d).
+
+    Chirikjian, Stochastic Models, Information Theory, and Lie Groups 2, eq. 10.86.
+    """
+    phi = np.asarray(phi, dtype=float)
+    angle = float(np.linalg.norm(phi))
+    cross = skew(phi)
+    if angle < 1e-4:
+        return np.eye(3) - cross / 2.0 + cross @ cross / 6.0
+    return (
+        np.eye(3)
+        - (1.0 - np.cos(angle)) / angle**2 * cross
+        + (angle - np.sin(angle)) / angle**3 * cross @ cross
+    )
+
+
+def inverse_right_jacobian(phi: ArrayLike) -> Array:
+    """Return the inverses of `right_jacobian` of phi (..., 3), as (..., 3, 3).
+
+    Finite for |phi| < 2 pi.
+    """
+    phi = np.asarray(phi, dtype=float)
+    angle = np.linalg.norm(phi, axis=-1)[..., None, None]
+    cross = skew(phi)
+    small = angle < 1e-4
+    safe = np.where(small, 1.0, angle)
+    half = safe / 2.0
+    gain = np.where(small, 1.0 / 12.0, (1.0 - half / np.tan(half)) / safe**2)
+    return np.asarray(np.eye(3) + cross / 2.0 + gain * (cross @ cross))
+
+
+def reported_rotation_vector(matrix: ArrayLike, near: ArrayLike) -> Array:
+    """Return the rotation vector of a rotation, in the branch closest to `near`.
+
+    Close to 180 degrees two vectors of opposite sign describe almost the same
+    rotation. The one nearer to `near` is taken; where that does not decide, the one
+    whose largest component is positive, so that an estimate which scatters about
+    180 degrees does not jump between the two.
+
+    Parameters
+    ----------
+    matrix : (3, 3) rotation.
+    near : (3,) rotation vector, rad.
+    """
+    phi = log_so3(matrix)
+    angle = float(np.linalg.norm(phi))
+    if angle < 0.9 * np.pi:
+        return phi
+    other = phi * (1.0 - 2.0 * np.pi / angle)
+    near = np.asarray(near, dtype=float)
+    gain = float(np.linalg.norm(other - near) - np.linalg.norm(phi - near))
+    if abs(gain) > 0.2:
+        return other if gain < 0 else phi
+    if angle < np.pi - 5.0 * DEG:
+        return phi
+    return phi if phi[np.argmax(np.abs(phi))] > 0 else other
+
+
+def rotation_from_rph(rph: ArrayLike, body_axes: BodyAxes) -> Array:
+    """Return nRb (local-level ENU) from roll, pitch, heading.
+
+    nRb = E Rz(heading) Ry(pitch) Rx(roll) F, with F body to forward-right-down and E
+    north-east-down to east-north-up: heading clockwise from true north, pitch bow up,
+    roll starboard down.
+
+    Parameters
+    ----------
+    rph : (..., 3) roll, pitch, heading, rad.
+    body_axes : axes of the body frame.
+
+    Returns
+    -------
+    (..., 3, 3) rotation matrices.
+    """
+    rph = np.asarray(rph, dtype=float)
+    flat = Rotation.from_euler("ZYX", rph.reshape(-1, 3)[:, ::-1]).as_matrix()
+    nRb = _ENU_FROM_NED @ flat @ _FRD_FROM_BODY[body_axes]
+    return nRb.reshape(*rph.shape, 3)
+
+
+def rph_from_rotation(nRb: ArrayLike, body_axes: BodyAxes) -> Array:
+    """Return roll, pitch, heading (..., 3), rad, of nRb; heading in [0, 2 pi)."""
+    nRb = np.asarray(nRb, dtype=float)
+    frd = _ENU_FROM_NED.T @ nRb @ _FRD_FROM_BODY[body_axes].T
+    pitch = np.arcsin(np.clip(-frd[..., 2, 0], -1.0, 1.0))
+    roll = np.arctan2(frd[..., 2, 1], frd[..., 2, 2])
+    heading = np.arctan2(frd[..., 1, 0], frd[..., 0, 0]) % (2.0 * np.pi)
+    return np.stack([roll, pitch, heading], axis=-1)
+
+
+def rph_jacobian(rph: ArrayLike, body_axes: BodyAxes) -> Array:
+    """Return d(roll, pitch, heading) / d(theta), (..., 3, 3), for nRb Exp(theta).
+
+    The kinematic equation of the ZYX Euler angles; singular at a pitch of 90 degrees.
+    """
+    rph = np.asarray(rph, dtype=float)
+    sr, cr = np.sin(rph[..., 0]), np.cos(rph[..., 0])
+    tp, cp = np.tan(rph[..., 1]), np.cos(rph[..., 1])
+    out = np.zeros((*rph.shape, 3))
+    out[..., 0, 0] = 1.0
+    out[..., 0, 1] = sr * tp
+    out[..., 0, 2] = cr * tp
+    out[..., 1, 1] = cr
+    out[..., 1, 2] = -sr
+    out[..., 2, 1] = sr / cp
+    out[..., 2, 2] = cr / cp
+    return out @ _FRD_FROM_BODY[body_axes]

@@ -1,0 +1,14 @@
+"""Units of files and people in SI."""
+
+from __future__ import annotations
+
+import numpy as np
+
+DEG = np.pi / 180.0
+HOUR = 3600.0
+DEG_PER_HOUR = DEG / HOUR
+DEG_PER_SQRT_HOUR = DEG / np.sqrt(HOUR)
+STANDARD_GRAVITY = 9.80665
+MICRO_G = 1e-6 * STANDARD_GRAVITY
+# SI values of the units of latitude, longitude and height in files.
+GEODETIC_SI = np.array([DEG, DEG, 1.0])

@@ -1,0 +1,38 @@
+"""Vectors in arrays: products of many at once."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+
+
+def skew(v: ArrayLike) -> Array:
+    """Return the cross-product matrices [v x] of vectors (..., 3), as (..., 3, 3)."""
+    v = np.asarray(v, dtype=float)
+    out = np.zeros((*v.shape, 3))
+    out[..., 0, 1] = -v[..., 2]
+    out[..., 0, 2] = v[..., 1]
+    out[..., 1, 0] = v[..., 2]
+    out[..., 1, 2] = -v[..., 0]
+    out[..., 2, 0] = -v[..., 1]
+    out[..., 2, 1] = v[..., 0]
+    return out
+
+
+def cross(a: Array, b: Array) -> Array:
+    """Return the cross products of vectors (..., 3); for few of them faster than NumPy's."""
+    ax, ay, az = a[..., 0], a[..., 1], a[..., 2]
+    bx, by, bz = b[..., 0], b[..., 1], b[..., 2]
+    x = ay * bz - az * by
+    out = np.empty((*x.shape, 3))
+    out[..., 0] = x
+    out[..., 1] = az * bx - ax * bz
+    out[..., 2] = ax * by - ay * bx
+    return out
+
+
+def rotate(matrices: Array, vectors: Array) -> Array:
+    """Return the products of matrices (M, 3, 3) and vectors (M, 3) or (3,), as (M, 3)."""
+    return np.asarray(np.matmul(matrices, vectors[..., None])[..., 0])

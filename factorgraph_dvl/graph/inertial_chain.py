@@ -1,0 +1,173 @@
+"""The inertial part of the graph: IMU factors, walking biases, priors of the states."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import gtsam
+import numpy as np
+
+from factorgraph_dvl.geometry.earth import LocalFrame
+from factorgraph_dvl.geometry.rotations import (
+    exp_so3,
+    inverse_right_jacobian,
+    log_so3,
+    rotation_from_rph,
+    rph_jacobian,
+)
+from factorgraph_dvl.geometry.units import DEG
+from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.graph import keys
+from factorgraph_dvl.imu.preintegration import Segments, States, preintegrate
+from factorgraph_dvl.trial import Trial
+
+# Bounds, not knowledge: they keep an unaided chain from being singular.
+_FREE_ATTITUDE = np.pi
+_FREE_POSITION = 1e4
+_FREE_VELOCITY = 1e2
+# How a vessel may move while its IMU is silent: acceleration, m/s², turn rate, rad/s, and
+# the sway that even the shortest gap allows, m and rad.
+_GAP_ACCELERATION = 1.0
+_GAP_TURN = 10.0 * DEG
+_GAP_SWAY_M = 0.1
+_GAP_SWAY_RAD = 10.0 * DEG
+# What a standard deviation of 0 in `initial` stands for, rad; far below what is measured.
+_LEAST_STD = 1e-7
+# Keeps the walk of a bias that does not walk regular.
+_LEAST_WALK = 1e-12
+
+
+@dataclass(frozen=True)
+class Chain:
+    """The inertial part of a graph, common to every set of aiding sensors.
+
+    Parameters
+    ----------
+    trial, frame, segments : what it was made from.
+    gravity_n : (S, 3) along the segments, m/s².
+    graph : IMU factors, walks of the biases, priors of states and biases.
+    """
+
+    trial: Trial
+    frame: LocalFrame
+    segments: Segments
+    gravity_n: Array
+    graph: gtsam.NonlinearFactorGraph
+
+    @property
+    def walking(self) -> bool:
+        """Whether every node has a bias of its own."""
+        return self.trial.imu.settings.bias_walks
+
+    def bias_key(self, k: int) -> int:
+        """Return the key of the bias at node k."""
+        return keys.bias(k if self.walking else 0)
+
+
+def inertial_chain(
+    trial: Trial, frame: LocalFrame, seg: Segments, start: States, *, bias_prior: bool = True
+) -> Chain:
+    """Return the inertial part of the graph, with gravity at the positions of `start`."""
+    middle = 0.5 * (start.p_n[seg.origin] + start.p_n[seg.origin + 1])
+    gravity_n = frame.gravity_without_rotation(middle)
+    settings = trial.imu.settings
+    graph = gtsam.NonlinearFactorGraph()
+    chain = Chain(trial, frame, seg, gravity_n, graph)
+    pims = preintegrate(seg, settings, gravity_n, frame.earth_rate)
+    for k, pim in zip(seg.origin.tolist(), pims, strict=True):
+        graph.add(gtsam.GalileanImuFactor2(keys.node(k), keys.node(k + 1), chain.bias_key(k), pim))
+    gyro, accel = trial.imu.parameters(0.0)
+    sigmas = np.concatenate([accel.sigma, gyro.sigma])
+    if bias_prior:
+        none = gtsam.imuBias.ConstantBias()
+        graph.addPriorConstantBias(keys.bias(0), none, loose_diagonal(sigmas))
+    if chain.walking:
+        root_psd = np.repeat(
+            [settings.accel_bias_walk_root_psd, settings.gyro_bias_walk_root_psd], 3
+        )
+        step = np.diff(seg.node_time)
+        for k in range(step.size):
+            walk = np.maximum(root_psd * np.sqrt(step[k]), _LEAST_WALK)
+            graph.add(
+                gtsam.BetweenFactorConstantBias(
+                    keys.bias(k),
+                    keys.bias(k + 1),
+                    gtsam.imuBias.ConstantBias(),
+                    loose_diagonal(walk),
+                )
+            )
+    for a, (first, _) in enumerate(seg.arc_nodes):
+        mean, root = _state_prior(trial, frame, seg, start, int(first), known=a == 0)
+        graph.add(gtsam.PriorFactorNavState(keys.node(int(first)), mean, square_root(root)))
+    for (_, last), (first, _) in pairwise(seg.arc_nodes):
+        graph.add(_gap_factor(int(last), int(first), seg.node_time))
+    return chain
+
+
+def _state_prior(
+    trial: Trial, frame: LocalFrame, seg: Segments, start: States, k: int, *, known: bool
+) -> tuple[gtsam.NavState, Array]:
+    """Return mean and square-root information of an arc's first state."""
+    nRb, p_n = start.nRb[k], start.p_n[k]
+    root = np.diag(1.0 / np.repeat([_FREE_ATTITUDE, _FREE_POSITION, _FREE_VELOCITY], 3))
+    # The first mean sample ends where `initial` holds; the first node is where it begins.
+    back = exp_so3(-seg.phi[0]) if seg.increments.averaged else np.eye(3)
+    if known and trial.initial_attitude is not None:
+        rph = trial.initial_attitude.rph
+        nRb = rotation_from_rph(rph, trial.body_axes) @ back
+        std = np.maximum(trial.initial_attitude.std, _LEAST_STD)
+        root[:3, :3] = rph_jacobian(rph, trial.body_axes) @ back / std[:, None]
+    if known and trial.initial_position is not None:
+        p_n = frame.position(*trial.initial_position.geodetic)
+        if seg.increments.averaged:
+            p_n = p_n - start.v_n[k] * seg.increments.dt[0]
+        std = np.maximum(trial.initial_position.std, _LEAST_STD)
+        root[3:6, 3:6] = nRb / std[:, None]
+    return gtsam.NavState(gtsam.Rot3(nRb), p_n, start.v_n[k]), root
+
+
+def _gap_factor(before: int, after: int, node_time: Array) -> gtsam.CustomFactor:
+    """Return what is known of a vehicle across a gap of its IMU: it cannot jump.
+
+    Zero error where the velocity is the same on both sides, the displacement is the mean
+    velocity times the gap, and the attitude is the same; standard deviations from the
+    acceleration and the turn rate of a vessel.
+    """
+    gap = float(node_time[after] - node_time[before])
+    velocity = _GAP_ACCELERATION * gap
+    position = _GAP_ACCELERATION * gap**2 / 8.0 + _GAP_SWAY_M
+    attitude = min(_GAP_TURN * gap + _GAP_SWAY_RAD, _FREE_ATTITUDE)
+    sigma = np.repeat([attitude, position, velocity], 3)
+    node_keys = [keys.node(before), keys.node(after)]
+
+    def error(this: gtsam.CustomFactor, at: gtsam.Values, jacobians: list[Array] | None) -> Array:
+        a, b = (at.atNavState(key) for key in node_keys)
+        Ra, Rb = a.attitude().matrix(), b.attitude().matrix()
+        turn = log_so3(Ra.T @ Rb)
+        if jacobians is not None:
+            by_a, by_b = np.zeros((9, 9), order="F"), np.zeros((9, 9), order="F")
+            by_b[:3, :3] = inverse_right_jacobian(turn)
+            by_a[:3, :3] = -by_b[:3, :3] @ Rb.T @ Ra
+            by_a[3:6, 3:6], by_a[3:6, 6:] = -Ra, -0.5 * gap * Ra
+            by_b[3:6, 3:6], by_b[3:6, 6:] = Rb, -0.5 * gap * Rb
+            by_a[6:, 6:], by_b[6:, 6:] = -Ra, Rb
+            jacobians[0], jacobians[1] = by_a, by_b
+        mean_velocity = 0.5 * (a.velocity() + b.velocity())
+        shift = b.position() - a.position() - gap * mean_velocity
+        return np.concatenate([turn, shift, b.velocity() - a.velocity()])
+
+    return gtsam.CustomFactor(loose_diagonal(sigma), node_keys, error)
+
+
+def square_root(root: Array) -> gtsam.noiseModel.Gaussian:
+    """Return a noise model from square-root information (n, n), not squared on the way."""
+    return gtsam.noiseModel.Gaussian.SqrtInformation(np.linalg.qr(root, mode="r"), False)
+
+
+def loose_diagonal(sigmas: Array) -> gtsam.noiseModel.Diagonal:
+    """Return a diagonal noise model that stays one.
+
+    GTSAM's default takes a sigma below 1e-8, as of a good gyro's bias, for a constraint.
+    """
+    return gtsam.noiseModel.Diagonal.Sigmas(sigmas, False)

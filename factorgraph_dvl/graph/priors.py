@@ -1,0 +1,177 @@
+"""Priors of the calibration parameters: each for itself, or of several together."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+from scipy.linalg import block_diag
+
+from factorgraph_dvl.geometry.rotations import exp_so3, inverse_right_jacobian, right_jacobian
+from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.graph.inertial_chain import loose_diagonal, square_root
+from factorgraph_dvl.sensors.protocol import Parameter
+
+# Standard deviation that stands for zero in a parameter of which only some components
+# are held; in SI units, far below what can be measured.
+_HELD = 1e-7
+# A calibration may know a combination of parameters this much better than each, squared.
+_LEAST_EIGENVALUE = 1e-12
+_BIAS = 6
+
+
+@dataclass(frozen=True)
+class Known:
+    """What is known of biases and parameters beforehand, jointly, in place of their priors.
+
+    Parameters
+    ----------
+    bias : (6,) accelerometer and gyro bias at the first node, SI.
+    parameters : values of those that are estimated, rotations as matrices.
+    covariance : (6 + P, 6 + P) of biases and parameters, in the tangent space, SI.
+    """
+
+    bias: Array
+    parameters: dict[str, Array]
+    covariance: Array
+
+
+def add_priors(
+    graph: gtsam.NonlinearFactorGraph, parameters: Sequence[Parameter], key_of: Mapping[str, int]
+) -> None:
+    """Add the priors of parameters, those of one calibration as one factor."""
+    origin = {p.name: prior_mean(p) for p in parameters}
+    for group in _groups(parameters):
+        if group[0].joint is None:
+            _add_prior(graph, group[0], key_of[group[0].name])
+        else:
+            gain = np.asarray(np.linalg.inv(_root_of(group)), float)
+            graph.add(linear_prior(group, key_of, gain, origin))
+
+
+def prior_root(parameters: Sequence[Parameter]) -> Array:
+    """Return a square root S of the prior covariance S Sᵀ of parameters, (P, P), SI.
+
+    In the tangent space at the prior's mean. Priors are stated for the rotation vector:
+    Exp(alpha + a) = Exp(alpha) Exp(Jr(alpha) a).
+    """
+    ends = np.cumsum([p.mean.size for p in parameters], dtype=int)
+    rows = {p.name: np.arange(end - p.mean.size, end)
+            for p, end in zip(parameters, ends, strict=True)}  # fmt: skip
+    out = np.zeros((sum(p.mean.size for p in parameters),) * 2)
+    for group in _groups(parameters):
+        own = np.concatenate([rows[p.name] for p in group])
+        out[np.ix_(own, own)] = _root_of(group)
+    return out
+
+
+def linear_prior(
+    parameters: Sequence[Parameter],
+    key_of: Mapping[str, int],
+    gain: Array,
+    origin: Mapping[str, Array],
+) -> gtsam.CustomFactor:
+    """Return a factor of unit noise on gain times the difference of parameters to an origin.
+
+    The callback must not know the problem: GTSAM would keep it, and it GTSAM's graph, and
+    nothing would ever free the two.
+    """
+    ends = np.cumsum([p.mean.size for p in parameters])
+    columns = [gain[:, end - p.mean.size : end] for p, end in zip(parameters, ends, strict=True)]
+
+    def error(this: gtsam.CustomFactor, at: gtsam.Values, jacobians: list[Array] | None) -> Array:
+        total = np.zeros(gain.shape[0])
+        for i, (p, part) in enumerate(zip(parameters, columns, strict=True)):
+            off = local_coordinates(p, value_at(at, key_of[p.name], p), origin[p.name])
+            total += part @ off
+            if jacobians is not None:
+                by_step = part @ inverse_right_jacobian(off) if p.rotation else part
+                jacobians[i] = np.asfortranarray(by_step)
+        return total
+
+    noise = gtsam.noiseModel.Unit.Create(gain.shape[0])
+    return gtsam.CustomFactor(noise, [key_of[p.name] for p in parameters], error)
+
+
+def joint_linear_prior(
+    known: Known, bias_key: int, parameters: Sequence[Parameter], key_of: Mapping[str, int]
+) -> gtsam.CustomFactor:
+    """Return a factor on biases and parameters for what is known of them together."""
+    sigma = np.sqrt(np.diag(known.covariance))
+    correlation = known.covariance / np.outer(sigma, sigma)
+    gain = np.linalg.inv(np.linalg.cholesky(correlation)) / sigma
+    ends = np.cumsum([_BIAS, *(p.mean.size for p in parameters)])
+    columns = np.split(gain, ends[:-1], axis=1)
+
+    def error(this: gtsam.CustomFactor, at: gtsam.Values, jacobians: list[Array] | None) -> Array:
+        total = columns[0] @ (at.atConstantBias(bias_key).vector() - known.bias)
+        parts = [columns[0]]
+        for p, part in zip(parameters, columns[1:], strict=True):
+            off = local_coordinates(p, value_at(at, key_of[p.name], p), known.parameters[p.name])
+            total = total + part @ off
+            parts.append(part @ inverse_right_jacobian(off) if p.rotation else part)
+        if jacobians is not None:
+            for i, part in enumerate(parts):
+                jacobians[i] = np.asfortranarray(part)
+        return np.asarray(total)
+
+    every = [bias_key, *(key_of[p.name] for p in parameters)]
+    return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(sigma.size), every, error)
+
+
+def value_at(values: gtsam.Values, key: int, p: Parameter) -> Array:
+    """Return a parameter among values, a rotation as its matrix."""
+    return values.atRot3(key).matrix() if p.rotation else values.atVector(key)
+
+
+def local_coordinates(p: Parameter, value: Array, origin: Array) -> Array:
+    """Return a parameter minus an origin, in the origin's tangent space, SI."""
+    if p.rotation:
+        return np.asarray(gtsam.Rot3.Logmap(gtsam.Rot3(origin.T @ value)))
+    return value - origin
+
+
+def prior_mean(p: Parameter) -> Array:
+    """Return the mean of a prior, a rotation as its matrix."""
+    return exp_so3(p.mean) if p.rotation else p.mean
+
+
+def _groups(parameters: Sequence[Parameter]) -> list[list[Parameter]]:
+    """Return parameters in groups with a common prior."""
+    groups: dict[int, list[Parameter]] = {}
+    for p in parameters:
+        groups.setdefault(id(p.joint or p), []).append(p)
+    return list(groups.values())
+
+
+def _add_prior(graph: gtsam.NonlinearFactorGraph, p: Parameter, key: int) -> None:
+    sigma = np.maximum(p.sigma, _HELD)
+    if p.rotation:
+        # The prior is stated for the rotation vector, GTSAM's for its tangent space.
+        root = inverse_right_jacobian(p.mean) / sigma[:, None]
+        graph.addPriorRot3(key, gtsam.Rot3(exp_so3(p.mean)), square_root(root))
+    else:
+        graph.addPriorVector(key, p.mean, loose_diagonal(sigma))
+
+
+def _root_of(group: Sequence[Parameter]) -> Array:
+    """Return a square root of the prior covariance of parameters in their tangent space, SI."""
+    sigma = np.maximum(np.concatenate([p.sigma for p in group]), _HELD)
+    root = np.diag(sigma)
+    joint = group[0].joint
+    if joint is not None:
+        rows = np.concatenate(
+            [np.arange(len(joint.covariance))[joint.rows(p.name)] for p in group]
+        )
+        std = np.sqrt(np.diag(joint.covariance))[rows]
+        scale = np.where(std > 0.0, std, 1.0)
+        correlation = joint.covariance[np.ix_(rows, rows)] / np.outer(scale, scale)
+        correlation[np.diag_indices_from(correlation)] = 1.0
+        values, vectors = np.linalg.eigh(0.5 * (correlation + correlation.T))
+        root = sigma[:, None] * vectors * np.sqrt(np.maximum(values, _LEAST_EIGENVALUE))
+    to_tangent = block_diag(
+        *(right_jacobian(p.mean) if p.rotation else np.eye(p.mean.size) for p in group)
+    )
+    return np.asarray(to_tangent @ root)

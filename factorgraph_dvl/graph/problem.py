@@ -1,0 +1,487 @@
+"""A trial as a factor graph: native IMU factors, and sensors linearised in bulk.
+
+A measurement hangs on the node before it through the increments up to its own time.
+Each sensor states its residual in terms of the motion at that time; the chain rule
+takes it to the node. All measurements of a kind are evaluated in one NumPy pass and
+written into one Jacobian factor per node, because a Python callback per factor would be
+slow and makes GTSAM's optimisers copy all values.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import gtsam
+import numpy as np
+
+from factorgraph_dvl.geometry.rotations import exp_so3
+from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.graph import keys
+from factorgraph_dvl.graph.inertial_chain import Chain
+from factorgraph_dvl.graph.priors import (
+    Known,
+    add_priors,
+    joint_linear_prior,
+    linear_prior,
+    local_coordinates,
+    prior_mean,
+    prior_root,
+    value_at,
+)
+from factorgraph_dvl.imu.increments import IntArray
+from factorgraph_dvl.imu.preintegration import (
+    Attachment,
+    States,
+    Transition,
+    attach,
+    extrapolated,
+    motion_at,
+)
+from factorgraph_dvl.sensors.protocol import Linearization, Motion, Observation, Parameter
+
+# Standard deviation that stands for zero in a held direction, in those of the prior.
+FIXED_DIRECTION_STD = 1e-4
+# How far a time offset may move from its start, s, before measurements are bound anew.
+_TIME_MARGIN = 0.05
+# How far, s, a motion is extrapolated before its measurements are bound anew: 2 Hz sway of
+# 4 deg turns by 3e-6 rad/s otherwise than a straight line in the rate.
+_SAME_TIME = 2e-4
+# Change of a standard deviation, relative, from which on measurements are weighed anew.
+_SAME_WEIGHT = 0.2
+
+_STATE = 9
+_BIAS = 6
+
+
+@dataclass(eq=False)
+class _Bound:
+    """An observation tied to the chain."""
+
+    observation: Observation
+    attachment: Attachment
+    time: Array
+    weight: Array
+
+
+@dataclass
+class _Block:
+    """Observations with the same parameters: one factor per node for all of them.
+
+    `matrices` and `vectors` are views into `factors` and live no longer than they do.
+    """
+
+    bound: list[_Bound]
+    parameters: tuple[Parameter, ...]
+    order: IntArray | None = None
+    rows: list[slice] = field(default_factory=list)
+    factors: list[gtsam.JacobianFactor] = field(default_factory=list)
+    matrices: list[Array] = field(default_factory=list)
+    vectors: list[Array] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """All there is to know at one set of values, before linearising.
+
+    Parameters
+    ----------
+    values : GTSAM's.
+    states, parameters : the same as arrays; parameters by name, rotations as matrices.
+    motions, residuals : per observation; residuals whitened, (M, d).
+    cost : half the sum of all squared whitened residuals.
+    """
+
+    values: gtsam.Values
+    states: States
+    parameters: dict[str, Array]
+    motions: list[Motion]
+    residuals: list[Array]
+    cost: float
+
+
+class Problem:
+    """A chain with aiding sensors: what a solver minimises.
+
+    Parameters
+    ----------
+    chain : Chain
+    observations : of the aiding sensors.
+    parameters : of the aiding sensors, fixed ones included.
+    start : values of parameters, where they are known better than by their priors.
+    known : what stands in place of the priors; the chain then has none of the biases.
+    """
+
+    def __init__(
+        self,
+        chain: Chain,
+        observations: Sequence[Observation],
+        parameters: Sequence[Parameter],
+        start: dict[str, Array] | None = None,
+        known: Known | None = None,
+    ) -> None:
+        self.chain = chain
+        self.all_parameters = tuple(parameters)
+        self.parameters = tuple(p for p in parameters if p.estimated)
+        self._key = {
+            p.name: keys.calibration(i, p.mean.size) for i, p in enumerate(self.parameters)
+        }
+        self._fixed = {p.name: prior_mean(p) for p in parameters if not p.estimated}
+        self.graph = gtsam.NonlinearFactorGraph(chain.graph)
+        if known is None:
+            add_priors(self.graph, self.parameters, self._key)
+        else:
+            self.graph.add(
+                joint_linear_prior(known, chain.bias_key(0), self.parameters, self._key)
+            )
+        self.uncovered: dict[str, int] = {}
+        self.rejected: Mapping[str, Array] = {}
+        self._start = {**self.prior_values(), **(start or {})}
+        self._bound: list[_Bound] = []
+        for observation in observations:
+            self._bound.append(self._bind(observation))
+        blocks: dict[tuple[str, ...], _Block] = {}
+        for bound in self._bound:
+            used = tuple(p for p in self.parameters if p.name in bound.observation.parameters)
+            names = tuple(p.name for p in used)
+            blocks.setdefault(names, _Block([], used)).bound.append(bound)
+        self._blocks = list(blocks.values())
+        for block in self._blocks:
+            self._lay_out(block)
+
+    @property
+    def observations(self) -> tuple[Observation, ...]:
+        """The observations, in the order of `Evaluation.residuals`."""
+        return tuple(b.observation for b in self._bound)
+
+    @property
+    def attachments(self) -> tuple[Attachment, ...]:
+        """Where the observations hang on the chain."""
+        return tuple(b.attachment for b in self._bound)
+
+    @property
+    def weights(self) -> tuple[Array, ...]:
+        """Inverse standard deviations of the observations, (M, d) each; 0 = not used."""
+        return tuple(b.weight for b in self._bound)
+
+    def prior_values(self) -> dict[str, Array]:
+        """Return the prior means of all parameters, rotations as matrices."""
+        return {**self._fixed, **{p.name: prior_mean(p) for p in self.parameters}}
+
+    def values(self, states: States, parameters: dict[str, Array]) -> gtsam.Values:
+        """Return GTSAM's values of states and parameters."""
+        out = gtsam.Values()
+        n = states.nRb.shape[0]
+        for k in range(n):
+            out.insert(
+                keys.node(k),
+                gtsam.NavState(gtsam.Rot3(states.nRb[k]), states.p_n[k], states.v_n[k]),
+            )
+        for k in range(n if self.chain.walking else 1):
+            out.insert(
+                keys.bias(k),
+                gtsam.imuBias.ConstantBias(states.accel_bias[k], states.gyro_bias[k]),
+            )
+        for p in self.parameters:
+            value = parameters[p.name]
+            out.insert(self._key[p.name], gtsam.Rot3(value) if p.rotation else value)
+        return out
+
+    @property
+    def columns(self) -> dict[str, slice]:
+        """Place of every estimated parameter among all of them."""
+        ends = np.cumsum([p.mean.size for p in self.parameters])
+        return {
+            p.name: slice(int(end) - p.mean.size, int(end))
+            for p, end in zip(self.parameters, ends, strict=True)
+        }
+
+    @cached_property
+    def prior_root(self) -> Array:
+        """Square root S of the prior covariance S Sᵀ of all estimated parameters, (P, P), SI.
+
+        In the tangent space at the prior's mean. Priors are stated for the rotation vector:
+        Exp(alpha + a) = Exp(alpha) Exp(Jr(alpha) a).
+        """
+        return prior_root(self.parameters)
+
+    def difference(self, parameters: dict[str, Array], origin: dict[str, Array]) -> Array:
+        """Return parameters minus origin in the origin's tangent space, (P,), SI."""
+        return np.concatenate(
+            [local_coordinates(p, parameters[p.name], origin[p.name]) for p in self.parameters]
+        )
+
+    def moved(self, parameters: dict[str, Array], step: Array) -> dict[str, Array]:
+        """Return parameters after a step (P,) in their tangent space, SI."""
+        out = dict(parameters)
+        for p in self.parameters:
+            part = step[self.columns[p.name]]
+            value = parameters[p.name]
+            out[p.name] = value @ exp_so3(part) if p.rotation else value + part
+        return out
+
+    def hold(self, directions: Array, origin: dict[str, Array]) -> None:
+        """Hold combinations of the parameters at an origin.
+
+        Parameters
+        ----------
+        directions : (P, h) orthonormal, in the coordinates u of a step S u, S `prior_root`.
+        origin : values of the parameters there.
+        """
+        gain = directions.T @ np.linalg.inv(self.prior_root) / FIXED_DIRECTION_STD
+        self.graph.add(linear_prior(self.parameters, self._key, np.asarray(gain, float), origin))
+
+    def evaluate(self, values: gtsam.Values) -> Evaluation:
+        """Evaluate motion, residuals and cost."""
+        states = self._states(values)
+        parameters = {**self._fixed}
+        for p in self.parameters:
+            parameters[p.name] = self._parameter(values, p)
+        motions, residuals = [], []
+        known: dict[tuple[int, float], Motion] = {}
+        cost = self.graph.error(values)
+        rate = self.chain.frame.earth_rate
+        for bound in self._bound:
+            late = self._late(bound, parameters)
+            shared = (id(bound.attachment), late)
+            if shared not in known:
+                motion = motion_at(bound.attachment, states, self.chain.gravity_n, rate)
+                known[shared] = motion if late == 0.0 else extrapolated(motion, late)
+            motion = known[shared]
+            residual = bound.weight * bound.observation.residual(motion, parameters)
+            motions.append(motion)
+            residuals.append(residual)
+            cost += 0.5 * float(np.vdot(residual, residual))
+        return Evaluation(values, states, parameters, motions, residuals, cost)
+
+    def reject(self, rejected: Mapping[str, Array]) -> None:
+        """Use no measurements at the times (K,) that are given by label."""
+        self.rejected = rejected
+        for bound in self._bound:
+            times = rejected.get(bound.observation.label, np.empty(0))
+            bound.weight[np.isin(bound.observation.time, times)] = 0.0
+
+    def outliers(self, evaluation: Evaluation) -> dict[str, Array]:
+        """Return the times of measurements that miss by more than their gate, by label.
+
+        A sensor whose measurements may be none at all, as the range of an echo, has a `gate`
+        in standard deviations; others have none.
+        """
+        out = {}
+        for bound, motion in zip(self._bound, evaluation.motions, strict=True):
+            o = bound.observation
+            gate = getattr(o, "gate", None)
+            if gate is None:
+                continue
+            before = np.isin(o.time, self.rejected.get(o.label, np.empty(0)))
+            miss = o.residual(motion, evaluation.parameters)
+            far = np.abs(miss) > gate * o.sigma(motion, evaluation.parameters)
+            times = o.time[(before | (bound.weight > 0.0).any(axis=1)) & far.any(axis=1)]
+            if times.size:
+                out[o.label] = times
+        return out
+
+    def weigh(self, evaluation: Evaluation) -> None:
+        """Set the weights of all measurements from their standard deviations there."""
+        for bound, motion in zip(self._bound, evaluation.motions, strict=True):
+            sigma = bound.observation.sigma(motion, evaluation.parameters)
+            bound.weight = np.where(bound.weight > 0.0, 1.0 / sigma, 0.0)
+
+    def needs_reweighting(self, evaluation: Evaluation) -> bool:
+        """Whether standard deviations there are other than those that measurements count by."""
+        for bound, motion in zip(self._bound, evaluation.motions, strict=True):
+            used = bound.weight > 0.0
+            sigma = bound.observation.sigma(motion, evaluation.parameters)[used]
+            if np.any(np.abs(bound.weight[used] * sigma - 1.0) > _SAME_WEIGHT):
+                return True
+        return False
+
+    def linearize(self, evaluation: Evaluation) -> gtsam.GaussianFactorGraph:
+        """Return the Gaussian graph at an evaluation.
+
+        Its measurement factors are written in place at the next call.
+        """
+        gaussian = self.graph.linearize(evaluation.values)
+        rate = self.chain.frame.earth_rate
+        transitions = {
+            id(motion): Transition(b.attachment, evaluation.states, motion, rate)
+            for b, motion in zip(self._bound, evaluation.motions, strict=True)
+        }
+        for block in self._blocks:
+            matrix, vector = self._fill(block, transitions, evaluation)
+            for target, source, rows in zip(
+                block.matrices, block.vectors, block.rows, strict=True
+            ):
+                target[...] = matrix[rows]
+                source[...] = vector[rows]
+            for factor in block.factors:
+                gaussian.push_back(factor)
+        return gaussian
+
+    def ordering(self, gaussian: gtsam.GaussianFactorGraph) -> gtsam.Ordering:
+        """Return an elimination order in which biases and calibration come last."""
+        last = [self._key[p.name] for p in self.parameters]
+        if not self.chain.walking:
+            last.insert(0, keys.bias(0))
+        return gtsam.Ordering.ColamdConstrainedLastGaussianFactorGraph(gaussian, last)
+
+    def key(self, name: str) -> int:
+        """Return the key of an estimated parameter."""
+        return self._key[name]
+
+    def _parameter(self, values: gtsam.Values, p: Parameter) -> Array:
+        return value_at(values, self._key[p.name], p)
+
+    def _states(self, values: gtsam.Values) -> States:
+        n = self.chain.segments.node_time.size
+        nRb, p_n, v_n = np.empty((n, 3, 3)), np.empty((n, 3)), np.empty((n, 3))
+        for k in range(n):
+            state = values.atNavState(keys.node(k))
+            nRb[k] = state.attitude().matrix()
+            p_n[k] = state.position()
+            v_n[k] = state.velocity()
+        m = n if self.chain.walking else 1
+        bias = np.array([values.atConstantBias(keys.bias(k)).vector() for k in range(m)])
+        bias = np.broadcast_to(bias, (n, _BIAS))
+        return States(nRb, p_n, v_n, gyro_bias=bias[:, 3:], accel_bias=bias[:, :3])
+
+    def _bind(self, observation: Observation) -> _Bound:
+        time = observation.true_time(self._start)
+        later = observation.true_time(self.moved(self._start, self._prior_sigma()))
+        # A measurement whose time is yet to be found must not leave the record on the way.
+        margin = 0.0 if np.array_equal(time, later) else _TIME_MARGIN
+        locate = self.chain.segments.increments.locate
+        covered = locate(time)[2]
+        if margin > 0.0:
+            covered &= locate(time - margin)[2] & locate(time + margin)[2]
+        if not covered.all():
+            self.uncovered[observation.label] = int((~covered).sum())
+        weight = np.repeat(covered.astype(float)[:, None], len(observation.components), axis=1)
+        for other in self._bound:
+            if np.array_equal(other.time, time):
+                return _Bound(observation, other.attachment, time, weight)
+        return _Bound(observation, self._attach(time), time, weight)
+
+    def _prior_sigma(self) -> Array:
+        """Return the standard deviations of the priors of all estimated parameters, (P,), SI."""
+        return np.concatenate([np.empty(0), *(p.sigma for p in self.parameters)])
+
+    def needs_rebinding(self, parameters: dict[str, Array]) -> bool:
+        """Whether a time offset has moved measurements too far from where they were bound."""
+        return any(abs(self._late(b, parameters)) > _SAME_TIME for b in self._bound)
+
+    def _attach(self, time: Array) -> Attachment:
+        seg = self.chain.segments
+        index, since, covered = seg.increments.locate(time)
+        if not covered.all():
+            # They weigh nothing; they only need a place on the chain.
+            inside = np.clip(since, 0.0, seg.increments.dt[index])
+            time = np.where(covered, time, seg.increments.start[index] + inside)
+        return attach(seg, time, self.chain.frame.earth_rate)
+
+    def _late(self, bound: _Bound, parameters: dict[str, Array]) -> float:
+        """Return by how much a time offset has moved measurements since they were bound, s."""
+        return float((bound.observation.true_time(parameters) - bound.time)[0])
+
+    def _lay_out(self, block: _Block) -> None:
+        """Make a block's factors for the nodes that its measurements hang on now."""
+        depth = [len(b.observation.components) for b in block.bound]
+        row_node = np.concatenate(
+            [np.repeat(b.attachment.node, d) for b, d in zip(block.bound, depth, strict=True)]
+        )
+        in_order = bool(np.all(np.diff(row_node) >= 0))
+        block.order = None if in_order else np.argsort(row_node, kind="stable")
+        used, counts = np.unique(row_node, return_counts=True)
+        edges = np.concatenate([[0], np.cumsum(counts)])
+        block.rows = [slice(a, b) for a, b in itertools.pairwise(edges)]
+        sizes = [_STATE, _BIAS] + [p.mean.size for p in block.parameters]
+        shared = [self._key[p.name] for p in block.parameters]
+        block.matrices, block.vectors, block.factors = [], [], []
+        for k, rows in zip(used.tolist(), counts.tolist(), strict=True):
+            node_keys = [keys.node(k), self.chain.bias_key(k), *shared]
+            factor = _template(node_keys, sizes, rows)
+            block.factors.append(factor)
+            block.matrices.append(factor.getA())
+            block.vectors.append(factor.getb())
+
+    def _fill(
+        self, block: _Block, transitions: dict[int, Transition], evaluation: Evaluation
+    ) -> tuple[Array, Array]:
+        """Return the whitened Jacobian and right-hand side of a block, rows by node."""
+        columns = _STATE + _BIAS + sum(p.mean.size for p in block.parameters)
+        parts, rhs = [], []
+        for bound in block.bound:
+            motion = evaluation.motions[self._bound.index(bound)]
+            transition = transitions[id(motion)]
+            wanted = [p.name for p in block.parameters]
+            lin = bound.observation.linearize(transition.motion, evaluation.parameters, wanted)
+            matrix = node_jacobian(lin, transition)
+            m, d = lin.residual.shape
+            full = np.empty((m, d, columns))
+            full[:, :, : _STATE + _BIAS] = matrix
+            c = _STATE + _BIAS
+            for p in block.parameters:
+                full[:, :, c : c + p.mean.size] = lin.d_parameters[p.name]
+                c += p.mean.size
+            full *= bound.weight[:, :, None]
+            parts.append(full.reshape(m * d, columns))
+            rhs.append(-(bound.weight * lin.residual).ravel())
+        matrix = np.concatenate(parts) if len(parts) > 1 else parts[0]
+        vector = np.concatenate(rhs)
+        if block.order is None:
+            return matrix, vector
+        return matrix[block.order], vector[block.order]
+
+
+def node_jacobian(lin: Linearization, transition: Transition) -> Array:
+    """Return the derivative of residuals with respect to node and bias, (M, d, 15).
+
+    Columns: attitude, position, velocity in GTSAM's tangent space of NavState, then
+    accelerometer and gyro bias.
+
+    Parameters
+    ----------
+    lin : derivatives with respect to the motion at the M times.
+    transition : from the nodes to these times.
+    """
+    out = np.zeros((*lin.residual.shape, _STATE + _BIAS))
+    theta, p, v, accel, gyro = (out[:, :, i : i + 3] for i in range(0, 15, 3))
+    d_theta = lin.d_theta
+    if lin.d_omega is not None:
+        by_attitude = lin.d_omega @ transition.omega_theta
+        d_theta = by_attitude if d_theta is None else d_theta + by_attitude
+        gyro -= lin.d_omega
+    if d_theta is not None:
+        theta += d_theta @ transition.theta_theta
+        gyro += d_theta @ transition.theta_gyro
+    if lin.d_p is not None:
+        theta += lin.d_p @ transition.p_theta
+        p += lin.d_p @ transition.p_p
+        v += lin.d_p @ transition.p_v
+        accel += lin.d_p @ transition.p_accel
+        gyro += lin.d_p @ transition.p_gyro
+    if lin.d_v is not None:
+        theta += lin.d_v @ transition.v_theta
+        v += lin.d_v @ transition.v_v
+        accel += lin.d_v @ transition.v_accel
+        gyro += lin.d_v @ transition.v_gyro
+    return out
+
+
+def _template(node_keys: list[int], sizes: list[int], rows: int) -> gtsam.JacobianFactor:
+    """Return an empty Jacobian factor; only a custom factor makes one of any number of keys."""
+
+    def nothing(
+        this: gtsam.CustomFactor, at: gtsam.Values, jacobians: list[Array] | None
+    ) -> Array:
+        if jacobians is not None:
+            for i, size in enumerate(sizes):
+                jacobians[i] = np.zeros((rows, size), order="F")
+        return np.zeros(rows)
+
+    noise = gtsam.noiseModel.Unit.Create(rows)
+    factor = gtsam.CustomFactor(noise, node_keys, nothing).linearize(gtsam.Values())
+    assert isinstance(factor, gtsam.JacobianFactor)
+    return factor

@@ -1,0 +1,1 @@
+"""Samples of the IMU to increments, preintegrated segments and motion at any time."""

@@ -1,0 +1,157 @@
+"""Rate and force at any time, as smooth as the noise of the samples asks for.
+
+The increments between samples use every sample as it is: their noise averages out in the
+sum. A DVL with a lever arm sees the rate at one moment, and a time offset even its
+derivative, and there the noise of one sample of a cheap gyro is larger than the motion.
+Local cubics (Savitzky and Golay, Anal. Chem. 36 (1964)) over a window that is as wide as
+the motion allows take it down.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from scipy.interpolate import BSpline, make_interp_spline
+from scipy.signal import savgol_coeffs, savgol_filter
+
+from factorgraph_dvl.geometry.vectors import Array
+
+# Half-widths that are tried, samples; none is longer than this many seconds.
+_HALF_WIDTHS = (2, 3, 5, 8, 12, 18, 25)
+_LONGEST = 0.25
+_ORDER = 3
+# A look at so many samples tells what the motion allows.
+_ENOUGH = 60_000
+# Noise of a derivative between single samples, in units of sample noise over interval.
+_RAW_SLOPE = 2.0
+# Signals up to this length, samples, are smoothed by matrices that are kept: a replay smooths a
+# second at a time, and SciPy's filters take more time to begin than to filter so few.
+_SHORT = 300
+# Differences between a narrow and the chosen window beyond which the motion has a step.
+_STEP = 4.0
+
+
+@dataclass(frozen=True)
+class Smoothed:
+    """A signal of three axes over one arc without gaps.
+
+    Parameters
+    ----------
+    spline : value over time, None where the samples are best left alone.
+    misfit : what the window does not resolve, over time; None likewise.
+    sigma, slope_sigma : standard deviation of value and derivative from the noise.
+    window : number of samples that each value is made of, 0 where they are left alone.
+    """
+
+    spline: BSpline | None
+    misfit: BSpline | None
+    sigma: float
+    slope_sigma: float
+    window: int
+
+    def at(self, time: Array) -> tuple[Array, Array, Array]:
+        """Return value, derivative and what is not resolved at times, (M, 3) each."""
+        assert self.spline is not None
+        assert self.misfit is not None
+        return (
+            np.asarray(self.spline(time)),
+            np.asarray(self.spline(time, 1)),
+            np.asarray(np.abs(self.misfit(time))),
+        )
+
+
+def unsmoothed(dt: float, sigma: float) -> Smoothed:
+    """Return a signal that is not smoothed, with its noise."""
+    return Smoothed(None, None, sigma, _RAW_SLOPE * sigma / dt, 0)
+
+
+def best_window(values: Array, dt: float, sigma: float) -> int:
+    """Return the window with the least error of noise and motion together, 0 for none."""
+    few = values[:_ENOUGH]
+    best, width = sigma**2, 0
+    for half in _HALF_WIDTHS:
+        window = 2 * half + 1
+        if half * dt > _LONGEST or window >= few.shape[0]:
+            break
+        weights = savgol_coeffs(window, _ORDER)
+        kept = float(weights @ weights)
+        moved = np.mean((savgol_filter(few, window, _ORDER, axis=0) - few) ** 2)
+        by_motion = max(float(moved) - sigma**2 * (1.0 - 2.0 * weights[half] + kept), 0.0)
+        if by_motion + sigma**2 * kept < best:
+            best, width = by_motion + sigma**2 * kept, window
+    return width
+
+
+def smooth(
+    time: Array,
+    values: Array,
+    dt: float,
+    sigma: float,
+    *,
+    averaged: bool,
+    window: int | None = None,
+) -> Smoothed:
+    """Smooth a signal.
+
+    Parameters
+    ----------
+    time : (N,) s, regular: the samples', or the middles of the intervals of means.
+    values : (N, 3) samples.
+    dt : interval of the samples, s.
+    sigma : standard deviation of a sample.
+    averaged : whether samples are means over their intervals.
+    window : number of samples; None = `best_window`.
+    """
+    width = best_window(values, dt, sigma) if window is None else window
+    if width == 0 or width > values.shape[0]:
+        return unsmoothed(dt, sigma)
+    found = _local_cubics(values, width)
+    if averaged:
+        # The mean over an interval exceeds the value at its middle by a'' dt² / 24.
+        found = found - _local_cubics(values, width, deriv=2) / 24.0
+    narrow = 2 * _HALF_WIDTHS[0] + 1
+    noise = sigma * _gain(narrow, 0)
+    apart = np.abs(_local_cubics(values, narrow) - found)
+    misfit = np.where(apart > _STEP * noise, apart, 0.0)
+    return Smoothed(
+        spline=_interpolant(time, found, 3),
+        misfit=_interpolant(time, misfit, 1),
+        sigma=sigma * _gain(width, 0),
+        slope_sigma=sigma * _gain(width, 1) / dt,
+        window=width,
+    )
+
+
+@lru_cache(maxsize=64)
+def _gain(width: int, deriv: int) -> float:
+    """Return the standard deviation that a window leaves of unit noise, at unit intervals."""
+    return float(np.linalg.norm(savgol_coeffs(width, _ORDER, deriv)))
+
+
+def _local_cubics(values: Array, width: int, deriv: int = 0) -> Array:
+    """Return the values (N, 3), or a derivative at unit intervals, of local cubics."""
+    if values.shape[0] > _SHORT:
+        return np.asarray(savgol_filter(values, width, _ORDER, deriv=deriv, axis=0))
+    return np.asarray(_filter_matrix(values.shape[0], width, deriv) @ values)
+
+
+@lru_cache(maxsize=64)
+def _filter_matrix(count: int, width: int, deriv: int) -> Array:
+    return np.asarray(savgol_filter(np.eye(count), width, _ORDER, deriv=deriv, axis=0))
+
+
+def _interpolant(time: Array, values: Array, degree: int) -> BSpline:
+    """Return the spline through values (N, 3) at regular times."""
+    if time.size > _SHORT:
+        return make_interp_spline(time, values, k=degree)
+    knots, matrix = _spline_matrix(time.size, degree)
+    step = (time[-1] - time[0]) / (time.size - 1)
+    return BSpline.construct_fast(time[0] + step * knots, matrix @ values, degree)
+
+
+@lru_cache(maxsize=64)
+def _spline_matrix(count: int, degree: int) -> tuple[Array, Array]:
+    spline = make_interp_spline(np.arange(float(count)), np.eye(count), k=degree)
+    return spline.t, spline.c

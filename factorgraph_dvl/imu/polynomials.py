@@ -1,0 +1,102 @@
+"""Polynomials through IMU samples, and the rotation and velocity that they integrate to."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from math import factorial
+
+import numpy as np
+
+from factorgraph_dvl.geometry.vectors import Array, cross
+
+_GAUSS_NODES = np.array([0.5 - np.sqrt(15.0) / 10.0, 0.5, 0.5 + np.sqrt(15.0) / 10.0])
+_GAUSS_WEIGHTS = np.array([5.0, 8.0, 5.0]) / 18.0
+
+
+def highest_difference(values: Array, edges: Array, width: int, averaged: bool) -> Array:
+    """Return differences of order width - 1 of means over intervals or values at their ends.
+
+    As they would be at regular intervals: by divided differences, that of the integral
+    for means.
+    """
+    reach = 1 if averaged else 0
+    out = values
+    for order in range(1, width):
+        span = edges[order + reach :] - edges[: -order - reach]
+        out = np.diff(out, axis=0) / span[:, None]
+    factor = factorial(width) if averaged else factorial(width - 1)
+    return np.asarray(out * factor * float(np.median(np.diff(edges))) ** (width - 1))
+
+
+def interpolation(edges: Array, averaged: bool) -> Array:
+    """Return (B, K, K) matrices from samples to polynomial coefficients.
+
+    Parameters
+    ----------
+    edges : (B, E) ends of the intervals; K = E - 1 means over them, or K = E values.
+    averaged : which of the two.
+    """
+    power = np.arange(edges.shape[1] - 1 if averaged else edges.shape[1])
+    if averaged:
+        upper, lower = edges[:, 1:, None], edges[:, :-1, None]
+        rows = (upper ** (power + 1) - lower ** (power + 1)) / ((power + 1) * (upper - lower))
+    else:
+        rows = edges[:, :, None] ** power
+    return np.asarray(np.linalg.inv(rows))
+
+
+@lru_cache(maxsize=64)
+def regular_interpolation(count: int, shift: int, averaged: bool) -> Array:
+    """Return `interpolation` (K, K) at `count` edges one apart, from -shift on."""
+    edges = np.arange(count, dtype=float) - shift
+    return interpolation(edges[None], averaged)[0]
+
+
+def evaluate(c: Array, u: Array | float) -> Array:
+    """Return polynomials c (M, K, n) at u (M,) or scalar, (M, n), or at u (G, M), (G, M, n)."""
+    u = np.asarray(u)[..., None]
+    out = np.repeat(c[None, :, -1], u.shape[0], axis=0) if u.ndim > 2 else c[:, -1].copy()
+    for k in range(c.shape[1] - 2, -1, -1):
+        out *= u
+        out += c[:, k]
+    return out
+
+
+def rate_and_slope(c: Array, since: Array, dt: Array) -> tuple[Array, Array]:
+    """Return the rate and its derivative, (M, 3), `since` seconds into intervals."""
+    u = since / dt
+    rate = c[:, :, :3]
+    order = np.arange(1, c.shape[1])
+    return evaluate(rate, u), evaluate(rate[:, 1:] * order[:, None], u) / dt[:, None]
+
+
+def integrate(c: Array, dt: Array, u: Array | float) -> tuple[Array, Array]:
+    """Return rotation vector and velocity increment over [0, u] of intervals.
+
+    The rotation by the sixth-order Magnus expansion at Gauss points (Blanes, Casas,
+    Oteo, Ros, Phys. Rep. 470 (2009), eq. 253), the velocity by Gauss quadrature of the
+    force rotated to the start.
+    """
+    u = np.broadcast_to(np.asarray(u, dtype=float), dt.shape)
+    h = (dt * u)[:, None]
+    nodes = _GAUSS_NODES[:, None] * u
+    at = evaluate(c, nodes)
+    w1, w2, w3 = at[:, :, :3]
+    a1 = h * w2
+    a2 = (np.sqrt(15.0) / 3.0) * h * (w3 - w1)
+    a3 = (10.0 / 3.0) * h * (w3 - 2.0 * w2 + w1)
+    # R' = R [w x] mirrors the textbook's Y' = A Y: every commutator changes sign.
+    c1 = -cross(a1, a2)
+    c2 = cross(a1, 2.0 * a3 + c1) / 60.0
+    phi = a1 + a3 / 12.0 - cross(-20.0 * a1 - a3 + c1, a2 + c2) / 240.0
+
+    power = np.arange(1, c.shape[1] + 1)
+    integral = np.concatenate([np.zeros_like(c[:, :1, :3]), c[:, :, :3] / power[:, None]], axis=1)
+    turned = dt[:, None] * evaluate(integral, nodes)
+    force = at[:, :, 3:]
+    once = cross(turned, force)
+    twice = cross(turned, once)
+    mean = np.tensordot(
+        _GAUSS_WEIGHTS, force + once + twice / 2.0 + cross(turned, twice) / 6.0, axes=1
+    )
+    return phi, h * mean

@@ -1,6 +1,0 @@
-"""Kalman methods: SINS/GNSS, then the DVL against it; SINS against a star tracker."""
-
-from factorgraph_dvl.kalman.run import DVL_METHODS, METHODS, History, Method, calibrate, kalman
-from factorgraph_dvl.kalman.sins import sins
-
-__all__ = ["DVL_METHODS", "METHODS", "History", "Method", "calibrate", "kalman", "sins"]

@@ -1,0 +1,85 @@
+"""What is implausible about the records of a planar trial, before anything is solved."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from factorgraph_dvl.geometry.units import DEG
+from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.trial import PlanarTrial
+
+# Of so many intervals one is a gap, if it is also long enough for a vehicle to turn in.
+_GAP_INTERVALS = 3.0
+_GAP_S = 5.0
+# Tide, and a beacon's float.
+_ABOVE_SEA_M = 10.0
+_MOVING_M_S = 0.1
+_QUIET = 0.1
+
+
+def planar_findings(trial: PlanarTrial) -> Iterator[tuple[str, str]]:
+    """Yield label and text of what the user should know about the records of a trial.
+
+    Parameters
+    ----------
+    trial : as loaded.
+    """
+    heading, log, depth = trial.heading, trial.log, trial.depth
+    for record, values in ((heading, heading.heading), (log, log.speed), (depth, depth.depth)):
+        text = _gaps(record.time[~np.isnan(values)])
+        if text:
+            yield record.label, text
+    psi = heading.heading[~np.isnan(heading.heading)] / DEG
+    if psi.size > 2 and np.abs(psi).max() <= 2.0 * np.pi:
+        noise = float(np.median(np.abs(np.diff(psi))))
+        if noise < _QUIET * heading.settings.std_deg:
+            yield (
+                heading.label,
+                f"all of it is within {np.abs(psi).max():.2g} deg of north, and steadier than its "
+                f"standard deviation of {heading.settings.std_deg:g} deg: is it in radians?",
+            )
+    speed = float(np.nanmedian(log.speed)) if np.isfinite(log.speed).any() else 0.0
+    if speed < -_MOVING_M_S:
+        yield (
+            log.label,
+            f"the speed is {speed:.3g} m/s in the median, astern: speed_m_s is positive ahead",
+        )
+    if abs(speed) <= _MOVING_M_S and len(trial.beacons.settings.positions) == 1:
+        yield (
+            log.label,
+            f"the speed is {abs(speed):.2g} m/s in the median: of a vehicle at rest one beacon "
+            "tells a circle; of that the hypotheses are but examples",
+        )
+    below = float(np.nanmedian(depth.depth)) if np.isfinite(depth.depth).any() else 0.0
+    if below < -_ABOVE_SEA_M:
+        yield (
+            depth.label,
+            f"the depth is {below:.4g} m in the median, above the sea: depth_m is positive down",
+        )
+    sea = depth.settings.sea_surface_height_m
+    for name, place in trial.beacons.settings.positions.items():
+        above = place.height_m - sea
+        if above > _ABOVE_SEA_M + 3.0 * place.std_m:
+            yield (
+                trial.beacons.label,
+                f"{name} is {above:.4g} m above the sea surface: height_m is positive up, and "
+                "`depth.sea_surface_height_m` the height of the sea above the ellipsoid",
+            )
+
+
+def _gaps(time: Array) -> str:
+    """Return what to say of the gaps between (M,) times, nothing if there are none."""
+    steps = np.diff(time)
+    if not steps.size:
+        return ""
+    gaps = steps[steps > max(_GAP_S, _GAP_INTERVALS * float(np.median(steps)))]
+    if not gaps.size:
+        return ""
+    k = int(np.argmax(steps))
+    count = "1 gap" if gaps.size == 1 else f"{gaps.size} gaps, the longest"
+    return (
+        f"{count} from {time[k]:.10g} to {time[k + 1]:.10g} s: it is interpolated, as if the "
+        "vehicle had not manoeuvred, and the standard deviations do not know better"
+    )

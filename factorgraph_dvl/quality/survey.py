@@ -1,0 +1,66 @@
+"""What a trial holds: its records, its motion, and what is implausible about them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from factorgraph_dvl.quality.finding import Finding
+from factorgraph_dvl.quality.plausibility import findings
+from factorgraph_dvl.quality.records import SensorSurvey, record_of, travel
+from factorgraph_dvl.trial import Trial
+
+
+@dataclass(frozen=True)
+class Survey:
+    """What a trial holds.
+
+    Parameters
+    ----------
+    trial : name.
+    sensors : one entry for each.
+    duration : of the IMU's record, s.
+    distance : travelled, m; nan if neither GNSS nor DVL tell.
+    speed_min, speed_max : m/s; nan likewise.
+    findings : about units, signs, clocks and gaps.
+    """
+
+    trial: str
+    sensors: tuple[SensorSurvey, ...]
+    duration: float
+    distance: float
+    speed_min: float
+    speed_max: float
+    findings: tuple[Finding, ...]
+
+    @property
+    def errors(self) -> tuple[Finding, ...]:
+        """The findings for which a solution is not to be used, or cannot be had."""
+        return tuple(f for f in self.findings if f.severity == "error")
+
+    @property
+    def problems(self) -> tuple[Finding, ...]:
+        """The findings that are not ok."""
+        return tuple(f for f in self.findings if f.severity != "ok")
+
+
+def survey(trial: Trial) -> Survey:
+    """Survey a trial: rates, gaps, motion, and whether units and signs are plausible.
+
+    Parameters
+    ----------
+    trial : as loaded.
+    """
+    sensors = [record_of("IMU", trial.imu.time, np.zeros(trial.imu.time.size, dtype=bool))]
+    sensors += [record_of(aid.label, aid.time, aid.missing) for aid in trial.aids]
+    distance, speed = travel(trial.gnss, trial.log)
+    return Survey(
+        trial=trial.name,
+        sensors=tuple(sensors),
+        duration=float(trial.imu.time[-1] - trial.imu.time[0]),
+        distance=distance,
+        speed_min=float(speed.min()) if speed.size else np.nan,
+        speed_max=float(speed.max()) if speed.size else np.nan,
+        findings=tuple(findings(trial, sensors)),
+    )

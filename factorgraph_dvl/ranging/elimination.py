@@ -1,0 +1,158 @@
+"""Elimination of the planar graph: banded along the chain, with the constants as a border."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.linalg import cho_solve_banded, cholesky_banded
+
+from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.ranging.model import PlanarProblem, RangingEvaluation, changes, misfit
+
+# What a step is trusted for once one has failed, m; for the constants it is their prior sigma.
+_TRUSTED_M = 50.0
+
+
+class System:
+    """Normal equations: banded in the nodes' states, with the constants as a border."""
+
+    def __init__(
+        self,
+        problem: PlanarProblem,
+        x: Array,
+        theta: Array,
+        at: RangingEvaluation,
+        weights: tuple[Array, Array],
+        damping: float,
+    ) -> None:
+        n, c = x.shape[0], theta.size
+        diagonal, off = np.zeros((n, 4, 4)), np.zeros((n - 1, 4, 4))
+        border, g = np.zeros((n, 4, c)), np.zeros((n, 4))
+        corner = np.diag(1.0 / problem.prior_sigma**2)
+        h = theta / problem.prior_sigma**2
+
+        start = np.linalg.inv(problem.start_cov)
+        diagonal[0, :2, :2] += start
+        g[0, :2] += start @ (x[0, :2] - problem.start_mean)
+        noise = problem.velocity_info[:n]
+        diagonal[:, 2:, 2:] += noise
+        g[:, 2:] += np.einsum("kij,kj->ki", noise, x[:, 2:])
+
+        error, through = misfit(problem, x, theta)
+        info = problem.step_info[: n - 1]
+        half = 0.5 * problem.share[: n - 1, None, None] * np.eye(2)
+        one = np.broadcast_to(np.eye(2), half.shape)
+        before, after = (np.concatenate([sign * one, half], axis=2) for sign in (-1.0, 1.0))
+        by_theta = self._by_theta(problem, theta, through, np.diff(problem.time[:n]))
+        weighted = info @ by_theta
+        pull = np.einsum("kij,kj->ki", info, error)
+        for side, J in ((slice(0, n - 1), before), (slice(1, n), after)):
+            transposed = J.transpose(0, 2, 1)
+            diagonal[side] += transposed @ info @ J
+            border[side] += transposed @ weighted
+            g[side] += np.einsum("kij,kj->ki", transposed, pull)
+        off += before.transpose(0, 2, 1) @ info @ after
+        corner = corner + np.einsum("kic,kid->cd", by_theta, weighted)
+        h = h + np.einsum("kic,ki->c", by_theta, pull)
+
+        smooth = problem.change_info[: n - 1]
+        pull = np.einsum("kij,kj->ki", smooth, changes(problem, x))
+        diagonal[:-1, 2:, 2:] += smooth
+        diagonal[1:, 2:, 2:] += smooth
+        off[:, 2:, 2:] -= smooth
+        g[:-1, 2:] += pull
+        g[1:, 2:] -= pull
+
+        node = problem.ranging.node[: at.range_residual.size]
+        for residual, by_x, by_constants, weight in (
+            (at.range_residual, at.range_x, at.range_theta, weights[0]),
+            (at.rate_residual, at.rate_x, at.rate_theta, weights[1]),
+        ):
+            used = weight > 0.0
+            J, T, w = by_x[used], by_constants[used], weight[used]
+            e = residual[used] * w
+            # A node has one measurement of a kind: no index comes twice.
+            diagonal[node[used]] += w[:, None, None] * J[:, :, None] * J[:, None, :]
+            border[node[used]] += w[:, None, None] * J[:, :, None] * T[:, None, :]
+            g[node[used]] += J * e[:, None]
+            corner = corner + (T * w[:, None]).T @ T
+            h = h + T.T @ e
+
+        if damping > 0.0:
+            diagonal[:, :2, :2] += damping / _TRUSTED_M**2 * np.eye(2)
+            corner = corner + damping * np.diag(1.0 / problem.prior_sigma**2)
+        self._diagonal, self._off = diagonal, off
+        self._border = border.reshape(4 * n, c)
+        self._g, self._h = g.reshape(4 * n), h
+        self._factor = cholesky_banded(_banded(diagonal, off), check_finite=False)
+        self._influence = self._solve(self._border)
+        self._schur = corner - self._border.T @ self._influence
+
+    @staticmethod
+    def _by_theta(problem: PlanarProblem, theta: Array, through: Array, dt: Array) -> Array:
+        """Return the derivative of the steps' errors with respect to the constants."""
+        out = np.zeros((dt.size, 2, theta.size))
+        columns = problem.columns
+        if "current" in columns:
+            out[:, :, columns["current"]] = -dt[:, None, None] * np.eye(2)
+        if "log_scale_error" in columns:
+            place = columns["log_scale_error"]
+            out[:, :, place] = (through / (1.0 + theta[place]))[:, :, None]
+        if "heading_bias" in columns:
+            port = np.stack([-through[:, 1], through[:, 0]], axis=1)
+            out[:, :, columns["heading_bias"]] = -port[:, :, None]
+        return out
+
+    def _solve(self, right: Array) -> Array:
+        return np.asarray(cho_solve_banded((self._factor, False), right, check_finite=False))
+
+    def step(self) -> tuple[Array, Array]:
+        """Return the Gauss-Newton step of states and constants."""
+        return self.solve(self._g, self._h)
+
+    def solve(self, g: Array, h: Array) -> tuple[Array, Array]:
+        """Return the step against a gradient of states (4 n,) and constants (c,)."""
+        dtheta = -np.linalg.solve(self._schur, h - self._influence.T @ g)
+        dx = -self._solve(g) - self._influence @ dtheta
+        return dx.reshape(-1, 4), dtheta
+
+    def covariance(self, *, last_only: bool) -> tuple[Array, Array, Array]:
+        """Return covariances of states, of both, and of the constants."""
+        n, c = self._diagonal.shape[0], self._h.size
+        constants = np.linalg.inv(self._schur) if c else np.zeros((0, 0))
+        influence = self._influence.reshape(n, 4, c)
+        if last_only:
+            unit = np.zeros((4 * n, 4))
+            unit[-4:] = np.eye(4)
+            own, influence = self._solve(unit)[-4:][None], influence[-1:]
+        else:
+            own = _diagonal_of_inverse(self._diagonal, self._off)
+        states = own + influence @ constants @ influence.transpose(0, 2, 1)
+        return states, -influence @ constants, constants
+
+
+def _banded(diagonal: Array, off: Array) -> Array:
+    """Return a symmetric block-tridiagonal matrix in SciPy's upper banded form."""
+    n, size = diagonal.shape[:2]
+    above = 2 * size - 1
+    out = np.zeros((above + 1, n * size))
+    for i in range(size):
+        for j in range(size):
+            if j >= i:
+                out[above + i - j, j::size] = diagonal[:, i, j]
+            out[above - size + i - j, size + j :: size] = off[:, i, j]
+    return out
+
+
+def _diagonal_of_inverse(diagonal: Array, off: Array) -> Array:
+    """Return the diagonal blocks of the inverse of a block-tridiagonal matrix."""
+    n = diagonal.shape[0]
+    inverse = np.empty_like(diagonal)
+    inverse[0] = np.linalg.inv(diagonal[0])
+    for k in range(1, n):
+        before = off[k - 1]
+        inverse[k] = np.linalg.inv(diagonal[k] - before.T @ inverse[k - 1] @ before)
+    out = inverse.copy()
+    for k in range(n - 2, -1, -1):
+        gain = inverse[k] @ off[k]
+        out[k] += gain @ out[k + 1] @ gain.T
+    return out

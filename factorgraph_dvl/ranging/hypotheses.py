@@ -1,0 +1,168 @@
+"""All tracks that the ranges allow, from the first of them on, and when a wrong one dies.
+
+On a straight run ranges and range rates fit two tracks, mirror images about the line of
+motion. Both are followed; their weights are their likelihoods, exp(-cost), normalised, as
+far as their difference is more than chance. After a turn only the true one still fits.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from factorgraph_dvl.ranging.hypothesis_weights import HOPELESS, evidence
+from factorgraph_dvl.ranging.model import PlanarProblem
+from factorgraph_dvl.ranging.search import same_track, search
+from factorgraph_dvl.ranging.smoother import Fit, fit
+
+# Weight below which a hypothesis is dead, and above which it was one.
+DEAD = 1e-3
+_ALIVE = 0.05
+# Share of the newest measurements whose rejection is a sign of a track gone astray.
+_ASTRAY = 0.5
+
+
+@dataclass
+class Candidate:
+    """A track that the ranges allow.
+
+    Parameters
+    ----------
+    born : s, of the last data when it was found.
+    fit : with the data so far, or when it was last followed.
+    weight : normalised likelihood among all hypotheses, now.
+    highest : the highest weight that it ever had.
+    died : s, of the data since which its weight is below `DEAD`; None while it lives.
+    history : time (s) and weight at all updates.
+    """
+
+    born: float
+    fit: Fit
+    weight: float = 0.0
+    highest: float = 0.0
+    died: float | None = None
+    history: list[tuple[float, float]] = field(default_factory=list)
+
+
+def follow(
+    problem: PlanarProblem,
+    updates: Sequence[int],
+    searches: Sequence[int],
+    on_update: Callable[[int, list[Candidate]], object] | None = None,
+) -> list[Candidate]:
+    """Follow all hypotheses through growing data.
+
+    Parameters
+    ----------
+    problem : PlanarProblem
+    updates : numbers of nodes after which to fit, increasing.
+    searches : those of them after which to search for new hypotheses as well.
+    on_update : called with the number of nodes and the living hypotheses, heaviest first.
+
+    Returns
+    -------
+    All hypotheses that were ever likely, the living ones first, heaviest first; the fits of
+    these are of the last update.
+    """
+    living: list[Candidate] = []
+    gone: list[Candidate] = []
+    before = 0
+    for nodes in updates:
+        time = float(problem.time[nodes - 1])
+        last_weights = [(h, h.fit, h.weight) for h in living]
+        for h in living:
+            h.fit = _followed(problem, h.fit, nodes)
+        found = search(problem, nodes) if nodes in searches else []
+        if not living and problem.start_known:
+            found.append(_from_prior(problem, nodes))
+        for new in found:
+            if not any(same_track(problem, new, h.fit) for h in living):
+                living.append(Candidate(time, new))
+        living, dropped = _weighed(problem, living, time)
+        for h, earlier, weight in last_weights:
+            if h.weight < DEAD <= weight:
+                h.died = _death(problem, h, earlier, living, before, nodes)
+        gone += [h for h in dropped if h.died is not None]
+        if on_update is not None:
+            on_update(nodes, living)
+        before = nodes
+    likely = [h for h in (*living, *gone) if h.highest >= _ALIVE]
+    return sorted(likely, key=lambda h: (h.died is not None, -h.weight))
+
+
+def _followed(problem: PlanarProblem, earlier: Fit, nodes: int) -> Fit:
+    start = problem.carried(earlier.x, earlier.theta, nodes)
+    found = fit(problem, start, earlier.theta)
+    if _newly_rejected(problem, found, earlier) < _ASTRAY:
+        return found
+    # So many are no echoes: the track was carried past where they are believed.
+    other = fit(problem, start, earlier.theta, graduated=True, iterations=60)
+    return min(found, other, key=lambda f: f.cost)
+
+
+def _newly_rejected(problem: PlanarProblem, found: Fit, earlier: Fit) -> float:
+    """Return the larger share, of ranges and rates, of the newest that were rejected."""
+    new = slice(earlier.range_used.size, found.range_used.size)
+    shares = [0.0]
+    for values, used in (
+        (problem.ranging.range, found.range_used),
+        (problem.ranging.rate, found.rate_used),
+    ):
+        known = ~np.isnan(values[new])
+        if known.any():
+            shares.append(float(np.mean(used[new][known] == 0.0)))
+    return max(shares)
+
+
+def _from_prior(problem: PlanarProblem, nodes: int) -> Fit:
+    theta = np.zeros(problem.prior_sigma.size)
+    first = np.concatenate([problem.start_mean, np.zeros(2)])[None]
+    return fit(problem, problem.carried(first, theta, nodes), theta, graduated=True)
+
+
+def _weighed(
+    problem: PlanarProblem, hypotheses: list[Candidate], time: float
+) -> tuple[list[Candidate], list[Candidate]]:
+    """Return hypotheses by weight, and those that are dropped: hopeless, or found twice."""
+    kept: list[Candidate] = []
+    dropped: list[Candidate] = []
+    ordered = sorted(hypotheses, key=lambda h: h.fit.cost)
+    for h, against in zip(ordered, evidence(problem, [h.fit for h in ordered]), strict=True):
+        if against > HOPELESS or any(same_track(problem, h.fit, other.fit) for other in kept):
+            h.weight = 0.0
+            dropped.append(h)
+        else:
+            kept.append(h)
+    likelihood = np.exp(-evidence(problem, [h.fit for h in kept]))
+    for h, value in zip(kept, likelihood, strict=True):
+        h.weight = float(value / likelihood.sum())
+        h.highest = max(h.highest, h.weight)
+        if h.weight >= DEAD:
+            h.died = None
+    for h in (*kept, *dropped):
+        h.history.append((time, h.weight))
+    return kept, dropped
+
+
+def _death(
+    problem: PlanarProblem,
+    h: Candidate,
+    earlier: Fit,
+    living: Sequence[Candidate],
+    before: int,
+    after: int,
+) -> float:
+    """Return the time of the first data between two updates that leave no weight, s."""
+    others = [other.fit for other in living if other is not h]
+    while after - before > 1:
+        middle = (before + after) // 2
+        own = _followed(problem, earlier, middle)
+        fits = [own, *(fit(problem, o.x[:middle], o.theta) for o in others)]
+        likelihood = np.exp(-evidence(problem, fits))
+        if likelihood[0] / likelihood.sum() < DEAD:
+            after = middle
+        else:
+            before, earlier = middle, own
+    return float(problem.time[after - 1])

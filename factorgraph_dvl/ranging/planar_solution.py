@@ -1,0 +1,301 @@
+"""From a planar trial to a solution: all hypotheses, the heaviest of them as the answer."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from factorgraph_dvl.errors import ConfigError, SolveError
+from factorgraph_dvl.geometry.vectors import Array, rotate
+from factorgraph_dvl.quality.plausibility_planar import planar_findings
+from factorgraph_dvl.ranging.hypotheses import Candidate, follow
+from factorgraph_dvl.ranging.model import EARTH_RADIUS, PlanarProblem
+from factorgraph_dvl.ranging.problem import RangingTrial, plan
+from factorgraph_dvl.ranging.reckoned_track import SLOPE_OVER
+from factorgraph_dvl.ranging.smoother import Fit, covariance, residuals
+from factorgraph_dvl.ranging.weakest_direction import shares_of, stations
+from factorgraph_dvl.sensors.beacon import Beacons
+from factorgraph_dvl.solution import (
+    Estimate,
+    Hypothesis,
+    Residuals,
+    Solution,
+    Trajectory,
+    ambiguity,
+    as_estimates,
+    consistency_warnings,
+    mixed,
+    mostly_rejected,
+)
+from factorgraph_dvl.trial import PlanarTrial
+
+Progress = Callable[[str, int, float | None], None]
+
+# At so many times hypotheses are weighed; at some of them new ones are sought, more often
+# at first, when the ranges tell little.
+_UPDATES = 40
+_SEARCHES = (0, 1, 2, 4, 8, 16, 28)
+_FIRST_ROWS = 8
+
+
+def solve_planar(
+    trial: PlanarTrial, *, rate_hz: float = 10.0, progress: Progress | None = None
+) -> Solution:
+    """Estimate the track of a planar trial, with current and sound speed.
+
+    Parameters
+    ----------
+    trial : PlanarTrial
+    rate_hz : rate of the trajectory in the solution.
+    progress : called with stage, iteration and cost.
+
+    Returns
+    -------
+    Solution
+        The heaviest hypothesis; the others are in `Solution.hypotheses`, and the
+        covariances admit to them.
+
+    Raises
+    ------
+    ConfigError, DataError
+        If the trial cannot be solved as it is.
+    SolveError
+        If there are too few ranges to find a position.
+    """
+    if not (np.isfinite(rate_hz) and rate_hz > 0.0):
+        raise ConfigError(f"rate_hz is {rate_hz}", expected="a number above 0")
+    report = progress or (lambda stage, iteration, cost: None)
+    report("dead reckoning", 0, None)
+    made = plan(trial)
+    problem = made.problem
+    updates, searches = schedule(problem)
+    candidates = follow(
+        problem,
+        updates,
+        searches,
+        lambda nodes, living: report(
+            f"hypotheses {len(living)}", nodes, living[0].fit.cost if living else None
+        ),
+    )
+    living = [c for c in candidates if c.died is None]
+    if not living:
+        count = int(np.isfinite(problem.ranging.range).sum())
+        raise SolveError(
+            f"{count} {'range is' if count == 1 else 'ranges are'} too few to find a position",
+            where=trial.beacons.source,
+            hint="Give `initial.position` in trial.yaml, or a longer record",
+        )
+    report("covariance", 0, None)
+    return _summary(trial, made, candidates, rate_hz)
+
+
+def schedule(problem: PlanarProblem) -> tuple[list[int], list[int]]:
+    """Return the numbers of nodes at which to weigh hypotheses, and to seek new ones."""
+    rows = problem.ranging.node.size
+    counts = np.unique(np.linspace(min(_FIRST_ROWS, rows), rows, _UPDATES).astype(int))
+    updates = [int(problem.ranging.node[count - 1]) + 1 for count in counts]
+    updates[-1] = problem.time.size
+    return updates, [*(updates[i] for i in _SEARCHES if i < len(updates)), updates[-1]]
+
+
+def _summary(
+    trial: PlanarTrial, made: RangingTrial, candidates: Sequence[Candidate], rate_hz: float
+) -> Solution:
+    problem = made.problem
+    depth_std = trial.depth.settings.std_m
+    living = [c for c in candidates if c.died is None]
+    ridges = [stations(problem, c.fit) for c in living]
+    best = ridges[0][0].fit
+    along = [
+        [_trajectory(depth_std, made, s.fit, s.parts, rate_hz) for s in ridge] for ridge in ridges
+    ]
+    shares = [shares_of(ridge) for ridge in ridges]
+    tracks = [mixed(parts, share) for parts, share in zip(along, shares, strict=True)]
+    every = [station for ridge in ridges for station in ridge]
+    weights = np.concatenate([c.weight * share for c, share in zip(living, shares, strict=True)])
+    gone = [
+        _trajectory(depth_std, made, c.fit, covariance(problem, c.fit), rate_hz)
+        for c in candidates
+        if c.died is not None
+    ]
+    hypotheses = tuple(
+        Hypothesis(c.weight, c.born, c.died, track, _history(c))
+        for c, track in zip(candidates, [*tracks, *gone], strict=True)
+    )
+    values = [s.fit.theta / problem.si for s in every]
+    covs = [s.parts[2] / np.outer(problem.si, problem.si) for s in every]
+    joint = _mixture(values, covs, weights)
+    estimates = as_estimates(problem.constants, values[0], joint)
+    used, rejected = measurements(trial.beacons, made, best)
+    warnings = [*trial.notes, *(f"{label}: {text}" for label, text in planar_findings(trial))]
+    if not best.converged:
+        warnings.append("the smoother did not converge: not to be used")
+    if made.uncovered:
+        warnings.append(
+            f"Beacon: {made.uncovered} measurements at times without heading, speed or depth "
+            "were not used"
+        )
+    warnings += ambiguity(hypotheses)
+    warnings += consistency_warnings(estimates, used)
+    warnings += mostly_rejected(used, rejected)
+    warnings += _unobservable(trial, estimates)
+    return Solution(
+        trial=trial.name,
+        solver="planar",
+        body_axes=trial.body_axes,
+        converged=best.converged,
+        iterations=len(living[0].history),
+        cost=best.cost,
+        estimates=estimates,
+        covariance=joint,
+        trajectory=mixed([track for parts in along for track in parts], weights),
+        residuals=used,
+        warnings=tuple(warnings),
+        hypotheses=hypotheses if len(hypotheses) > 1 else (),
+        rejected=rejected,
+    )
+
+
+def hypothesis_of(made: RangingTrial, candidate: Candidate, depth_std: float) -> Hypothesis:
+    """Return a hypothesis with its track at 1 Hz."""
+    parts = covariance(made.problem, candidate.fit)
+    track = _trajectory(depth_std, made, candidate.fit, parts, 1.0)
+    weight, born, died = candidate.weight, candidate.born, candidate.died
+    return Hypothesis(weight, born, died, track, _history(candidate))
+
+
+def _history(candidate: Candidate) -> Array:
+    return np.array(candidate.history).reshape(-1, 2)
+
+
+def _mixture(values: Sequence[Array], covs: Sequence[Array], weights: Array) -> Array:
+    """Return the mean square error of the first of some values that have weights."""
+    out = np.zeros_like(covs[0])
+    for value, cov, weight in zip(values, covs, weights / weights.sum(), strict=True):
+        away = value - values[0]
+        out += weight * (cov + np.outer(away, away))
+    return out
+
+
+def _trajectory(
+    depth_std: float,
+    made: RangingTrial,
+    fit: Fit,
+    parts: tuple[Array, Array, Array],
+    rate_hz: float,
+) -> Trajectory:
+    """Return the motion between the nodes, reckoned on and closed onto the node after."""
+    problem, frame = made.problem, made.frame
+    states, cross, constants = parts
+    nodes = problem.time[: fit.x.shape[0]]
+    first, last = np.ceil(nodes[0] * rate_hz - 1e-6), np.floor(nodes[-1] * rate_hz + 1e-6)
+    time = np.arange(first, last + 1) / rate_hz + 0.0
+    time = np.clip(time, nodes[0], nodes[-1])
+    k = np.clip(np.searchsorted(nodes, time, side="right") - 1, 0, nodes.size - 2)
+    at, before = made.track.at(time), made.track.at(nodes)
+    current = problem.value(fit.theta, "current", 2)
+    since = time - nodes[k]
+    part = (since / np.diff(nodes)[k])[:, None]
+    moved = problem.turned(at.displacement - before.displacement[k], fit.p[k, 0], fit.theta)
+    ends, _ = problem.moves(fit.p[:-1, 0], fit.theta, slice(0, nodes.size - 1))
+    miss = np.diff(fit.p, axis=0) - ends
+    p = fit.p[k] + moved + current * since[:, None] + part * miss[k]
+    noise = fit.x[k, 2:] + part * (fit.x[k + 1, 2:] - fit.x[k, 2:])
+    through = problem.turned(at.velocity, p[:, 0], fit.theta)
+    v = np.column_stack([through - noise + current, at.climb])
+
+    down = np.sum(p**2, axis=1) / (2.0 * EARTH_RADIUS)
+    lat, lon, _ = frame.geodetic(np.column_stack([p, at.height - frame.height - down]))
+    lRn = frame.level_from_tangent(lat, lon)
+    bias = problem.value(fit.theta, "heading_bias")[0]
+    own = problem.columns.get("heading_bias", slice(0, 0))
+    heading_var = made.track.heading_std**2 + float(np.sum(constants[own, own]))
+    m = time.size
+    position_cov, velocity_cov = np.zeros((m, 3, 3)), np.zeros((m, 3, 3))
+
+    def between(values: Array) -> Array:
+        return values[k] + part[:, :, None] * (values[k + 1] - values[k])
+
+    position_cov[:, :2, :2] = between(states[:, :2, :2])
+    position_cov[:, 2, 2] = depth_std**2
+    velocity_cov[:, 2, 2] = 2.0 * (depth_std / SLOPE_OVER) ** 2
+    D = velocity_by_constants(problem, fit)
+    mixed_terms = D @ cross[:, 2:].transpose(0, 2, 1)
+    at_nodes = states[:, 2:, 2:] + D @ constants @ D.transpose(0, 2, 1)
+    velocity_cov[:, :2, :2] = between(at_nodes - mixed_terms - mixed_terms.transpose(0, 2, 1))
+    rph = np.zeros((m, 3))
+    rph[:, 2] = (at.heading - bias) % (2.0 * np.pi)
+    # Nothing measures roll and pitch.
+    rph_cov = np.full((m, 3, 3), np.nan)
+    rph_cov[:, 2, 2] = heading_var
+    return Trajectory(
+        time=time,
+        geodetic=np.stack([lat, lon, at.height], axis=1),
+        velocity=rotate(lRn, v),
+        rph=rph,
+        position_cov=lRn @ position_cov @ lRn.transpose(0, 2, 1),
+        velocity_cov=lRn @ velocity_cov @ lRn.transpose(0, 2, 1),
+        rph_cov=rph_cov,
+    )
+
+
+def velocity_by_constants(problem: PlanarProblem, fit: Fit) -> Array:
+    """Return the derivative of the velocity over ground by the constants, (n, 2, c)."""
+    n = fit.x.shape[0]
+    out = np.zeros((n, 2, fit.theta.size))
+    through = problem.turned(problem.velocity[:n], fit.p[:, 0], fit.theta)
+    columns = problem.columns
+    if "current" in columns:
+        out[:, :, columns["current"]] = np.eye(2)
+    if "log_scale_error" in columns:
+        place = columns["log_scale_error"]
+        out[:, :, place] = -(through / (1.0 + fit.theta[place]))[:, :, None]
+    if "heading_bias" in columns:
+        port = np.stack([-through[:, 1], through[:, 0]], axis=1)
+        out[:, :, columns["heading_bias"]] = port[:, :, None]
+    return out
+
+
+def measurements(
+    beacons: Beacons, made: RangingTrial, fit: Fit
+) -> tuple[tuple[Residuals, ...], tuple[Residuals, ...]]:
+    """Return residuals that were used, and those that were rejected, beacon by beacon."""
+    ranges, rates, range_std, rate_std = residuals(made.problem, fit)
+    time, names = beacons.time[made.rows], beacons.name[made.rows]
+    used: list[Residuals] = []
+    rejected: list[Residuals] = []
+    for name in beacons.settings.positions:
+        for kind, unit, values, std, weight in (
+            ("range", "m", ranges, range_std, fit.range_used),
+            ("range rate", "m/s", rates, rate_std, fit.rate_used),
+        ):
+            own = (names == name) & ~np.isnan(values)
+            for keep, out in ((weight > 0.0, used), (weight == 0.0, rejected)):
+                m = own & keep
+                if m.any():
+                    label = f"Beacon {name} {kind}"
+                    parts = (time[m], values[m, None], std[m, None])
+                    out.append(Residuals(label, unit, (kind,), *parts))
+    return tuple(used), tuple(rejected)
+
+
+def _unobservable(trial: PlanarTrial, estimates: Sequence[Estimate]) -> list[str]:
+    out = []
+    for e in estimates:
+        bad = np.flatnonzero(~e.observable & (e.prior_std > 0.0))
+        if not bad.size:
+            continue
+        names = ", ".join(e.component_names[i] for i in bad)
+        if e.name == "heading_bias_deg":
+            why = "ranges to one beacon stay the same if the whole track turns about it"
+        elif e.name == "current_m_s":
+            why = "it takes a turn: on a straight run current and mirror image go together"
+        elif e.name == "log_scale_error":
+            why = "a scale error separates from the current only over several headings"
+        elif e.name == "sound_speed_error":
+            why = "it shows only against a distance that log and heading measure well enough"
+        else:
+            why = "the place of a beacon shows only from several sides, and beside another beacon"
+        out.append(f"{names} not observable: {why}")
+    return out

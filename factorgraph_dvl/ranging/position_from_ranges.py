@@ -1,0 +1,175 @@
+"""Where a trial without a position begins: from the ranges to beacons.
+
+The states that alignment leaves are a dead-reckoned track from somewhere. Held against the
+ranges as a planar trial (`planar`), it gives all tracks that they allow, and the ranges that
+are none. With a position the same is done for the latter alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from factorgraph_dvl.geometry.earth import LocalFrame
+from factorgraph_dvl.geometry.rotations import exp_so3
+from factorgraph_dvl.geometry.units import DEG
+from factorgraph_dvl.geometry.vectors import Array, rotate
+from factorgraph_dvl.imu.preintegration import Segments, States
+from factorgraph_dvl.ranging.hypotheses import Candidate, follow
+from factorgraph_dvl.ranging.model import EARTH_RADIUS
+from factorgraph_dvl.ranging.planar_solution import hypothesis_of, measurements, schedule
+from factorgraph_dvl.ranging.problem import RangingTrial, problem_of
+from factorgraph_dvl.ranging.reckoned_track import ReckonedTrack
+from factorgraph_dvl.sensors.beacon import Beacons
+from factorgraph_dvl.sensors.protocol import Parameter
+from factorgraph_dvl.solution import Hypothesis
+from factorgraph_dvl.trial import InitialPosition, Trial
+
+# What dead reckoning before the solution may be off by: heading, rad, speed, as a fraction,
+# and noise of the velocity, m/s in 1 s.
+_HEADING = 2.0 * DEG
+_SCALE = 0.02
+_VELOCITY = 0.05
+_CURRENT = 0.5
+# Of a position from GNSS at the start, m, before anything is smoothed.
+_FIX = 10.0
+
+
+@dataclass(frozen=True)
+class StartPositions:
+    """Where a trial may begin.
+
+    Parameters
+    ----------
+    states : of each living hypothesis, heaviest first; at least one.
+    hypotheses : the living ones, in the same order, then the dead; empty if a position is
+        known.
+    rejected : times of the measurements that are none, by label.
+    notes : what the user must know.
+    """
+
+    states: tuple[States, ...]
+    hypotheses: tuple[Hypothesis, ...] = ()
+    rejected: Mapping[str, Array] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+
+
+def positions_from_ranges(
+    trial: Trial, frame: LocalFrame, seg: Segments, states: States
+) -> StartPositions:
+    """Return states that fit the ranges.
+
+    Parameters
+    ----------
+    trial, frame, seg : the trial, its tangent frame and segments.
+    states : from alignment; of a trial without a position, from anywhere.
+
+    Raises
+    ------
+    DataError
+        If there is no range while the IMU runs, and nothing else to begin with.
+    """
+    beacons = trial.beacons
+    if beacons is None:
+        return StartPositions((states,))
+    # A first fix, or a stated position, holds the track: it has been put there.
+    first = trial.initial_position
+    if first is None and trial.gnss is not None:
+        geodetic = np.array(frame.geodetic(states.p_n[0]))
+        first = InitialPosition(geodetic, np.full(3, _FIX))
+    heard = beacons.time[~beacons.missing]
+    if first is not None and not np.any(
+        (heard >= seg.node_time[0]) & (heard <= seg.node_time[-1])
+    ):
+        return StartPositions((states,))
+    made = _plan(trial, frame, seg, states, beacons, first)
+    updates, searches = schedule(made.problem)
+    found = follow(made.problem, updates, searches)
+    living = [c for c in found if c.died is None]
+    if not living:
+        return StartPositions((states,), notes=("too few ranges to find a position from them",))
+    rejected = {r.label: r.time for r in measurements(beacons, made, living[0].fit)[1]}
+    if trial.gnss is not None:
+        return StartPositions((states,), rejected=rejected)
+    return StartPositions(
+        tuple(_moved(made, c, states, seg.node_time) for c in living),
+        tuple(hypothesis_of(made, c, _depth_std(trial)) for c in found),
+        rejected,
+    )
+
+
+def _plan(
+    trial: Trial,
+    frame: LocalFrame,
+    seg: Segments,
+    states: States,
+    beacons: Beacons,
+    first: InitialPosition | None,
+) -> RangingTrial:
+    time = seg.node_time
+    height = _height(trial, frame, time, states)
+    bow = np.unwrap(np.arctan2(states.v_n[:, 0], states.v_n[:, 1]))
+    wander = (_VELOCITY**2 * np.eye(2)) * (time - time[0])[:, None, None]
+    track = ReckonedTrack(
+        time=time,
+        displacement=states.p_n[:, :2] - states.p_n[0, :2],
+        velocity=states.v_n[:, :2],
+        height=height,
+        climb=np.gradient(height, time),
+        noise=wander,
+        velocity_cov=np.broadcast_to(_VELOCITY**2 * np.eye(2), (time.size, 2, 2)),
+        heading=bow,
+        heading_std=_HEADING,
+        interval=1.0,
+        tangent=True,
+    )
+    drifts = trial.dvl is not None and trial.dvl.settings.reference == "water"
+    scale = np.array([_SCALE])
+    parameters = (
+        *beacons.parameters(),
+        Parameter("log_scale_error", "", 1.0, np.zeros(1), scale, labels=("",)),
+        Parameter("heading_bias", "deg", DEG, np.zeros(1), np.array([_HEADING]), labels=("",)),
+        Parameter(
+            "current", "m_s", 1.0, np.zeros(2), np.full(2, _CURRENT * drifts), labels=("e", "n")
+        ),
+    )
+    arm_n = states.nRb @ np.array(beacons.settings.lever_arm_m)
+    return problem_of(track, arm_n, beacons, parameters, frame, first)
+
+
+def _height(trial: Trial, frame: LocalFrame, time: Array, states: States) -> Array:
+    """Return heights above the ellipsoid: by the depth sensor, else as the states have them."""
+    depth = trial.depth
+    if depth is not None and not depth.missing.all():
+        known = np.logical_not(depth.missing)
+        surface = depth.settings.sea_surface_height_m
+        return surface - np.interp(time, depth.time[known], depth.depth[known])
+    height = frame.geodetic(states.p_n)[2]
+    if trial.gnss is None and trial.initial_position is None:
+        # From anywhere: a vehicle starts at the surface, for want of anything better.
+        return height - height[0]
+    return height
+
+
+def _depth_std(trial: Trial) -> float:
+    return trial.depth.settings.std_m if trial.depth is not None else np.nan
+
+
+def _moved(made: RangingTrial, candidate: Candidate, states: States, time: Array) -> States:
+    """Return states on the track of a hypothesis, turned by its error of the heading."""
+    problem, fit = made.problem, candidate.fit
+    reckoned = made.track.at(problem.time).displacement
+    away = np.column_stack(
+        [np.interp(time, problem.time, (fit.p - reckoned)[:, i]) for i in range(2)]
+    )
+    p_n = states.p_n.copy()
+    p_n[:, :2] = made.track.displacement + away
+    down = np.sum(p_n[:, :2] ** 2, axis=1) / (2.0 * EARTH_RADIUS)
+    p_n[:, 2] = made.track.height - made.frame.height - down
+    turn = exp_so3(np.array([0.0, 0.0, problem.value(fit.theta, "heading_bias")[0]]))
+    scale = 1.0 / (1.0 + problem.value(fit.theta, "log_scale_error")[0])
+    v_n = scale * rotate(np.broadcast_to(turn, states.nRb.shape), states.v_n)
+    v_n[:, :2] += problem.value(fit.theta, "current", 2)
+    return States(turn @ states.nRb, p_n, v_n, states.gyro_bias, states.accel_bias)

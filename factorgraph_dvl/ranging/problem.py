@@ -1,0 +1,237 @@
+"""From a planar trial to the problem that the smoother minimises."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from factorgraph_dvl.errors import DataError
+from factorgraph_dvl.geometry.earth import LocalFrame
+from factorgraph_dvl.geometry.rotations import rotation_from_rph
+from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.ranging.model import PlanarProblem, Ranging
+from factorgraph_dvl.ranging.reckoned_track import (
+    LEAST_PSD,
+    SLOPE_OVER,
+    ReckonedTrack,
+    change_psd,
+    reckon,
+)
+from factorgraph_dvl.sensors.beacon import Beacons
+from factorgraph_dvl.sensors.protocol import Parameter
+from factorgraph_dvl.trial import InitialPosition, PlanarTrial
+
+# Times closer than this, s, are no two nodes: the information of a step between them has no
+# digits left for what the ranges tell.
+_LEAST_INTERVAL = 1e-3
+
+# Of values further apart, s, none tells what the vehicle did in between.
+_SLOWEST_S = 60.0
+
+
+@dataclass(frozen=True)
+class RangingTrial:
+    """A problem, and what it was made from.
+
+    Parameters
+    ----------
+    problem : PlanarProblem
+    track : the reckoned track.
+    frame : its tangent frame.
+    rows : (m,) rows of the beacons' record that are in the problem.
+    uncovered : measurements at times without heading, speed or depth.
+    """
+
+    problem: PlanarProblem
+    track: ReckonedTrack
+    frame: LocalFrame
+    rows: NDArray[np.intp]
+    uncovered: int
+
+
+def reckoned(trial: PlanarTrial) -> ReckonedTrack:
+    """Return the track of a trial by heading, speed and depth.
+
+    Raises
+    ------
+    DataError
+        If one of them has no values or too few, or they have no time in common.
+    """
+    heading, log, depth = trial.heading, trial.log, trial.depth
+    parts = []
+    for record, values in ((heading, heading.heading), (log, log.speed), (depth, depth.depth)):
+        known = ~np.isnan(values)
+        if not known.any():
+            raise DataError("no values", where=record.source, expected="at least one")
+        parts.append((record.time[known], values[known]))
+    start = max(time[0] for time, _ in parts)
+    end = min(time[-1] for time, _ in parts)
+    if not start < end:
+        raise DataError(
+            "heading, log and depth have no time in common",
+            where=f"{heading.source}, {log.source}, {depth.source}",
+            expected="records of the same time",
+            hint="Check that all clocks start together",
+        )
+    for record, (time, _) in ((heading, parts[0]), (log, parts[1])):
+        apart = float(np.median(np.diff(time)))
+        if apart > _SLOWEST_S:
+            raise DataError(
+                f"one value every {apart:.4g} s",
+                where=record.source,
+                expected=f"values at most {_SLOWEST_S:g} s apart to reckon a way with",
+                hint="Check that time_s is in seconds",
+            )
+    (log_time, speed), known = parts[1], ~np.isnan(log.speed)
+    starboard = np.nan_to_num(log.starboard[known])
+    extra = trial.beacons.time
+    return reckon(
+        (*parts[0], heading.settings.std_rad),
+        (log_time, speed, starboard, log.settings.speed_std_m_s),
+        (parts[2][0], depth.settings.sea_surface_height_m - parts[2][1]),
+        extra[(extra >= start) & (extra <= end)],
+    )
+
+
+def plan(trial: PlanarTrial) -> RangingTrial:
+    """Return the problem of a planar trial.
+
+    Raises
+    ------
+    DataError
+        If there are no ranges at times when heading, speed and depth are known.
+    """
+    track = reckoned(trial)
+    parameters = (
+        *(p for p in trial.log.parameters() if p.stem == "current"),
+        *trial.beacons.parameters(),
+        *(p for p in trial.log.parameters() if p.stem != "current"),
+        *trial.heading.parameters(),
+    )
+    arm = np.array(trial.beacons.settings.lever_arm_m)
+    level = np.zeros((track.time.size, 3))
+    level[:, 2] = track.heading
+    arm_n = rotation_from_rph(level, trial.body_axes) @ arm
+    return problem_of(
+        track,
+        arm_n,
+        trial.beacons,
+        parameters,
+        trial.frame(),
+        trial.initial_position,
+        trial.depth.settings.std_m,
+    )
+
+
+def problem_of(
+    track: ReckonedTrack,
+    arm_n: Array,
+    beacons: Beacons,
+    parameters: tuple[Parameter, ...],
+    frame: LocalFrame,
+    initial: InitialPosition | None = None,
+    depth_std: float = 0.0,
+) -> RangingTrial:
+    """Return the problem of a reckoned track with beacons.
+
+    Parameters
+    ----------
+    track : on its grid.
+    arm_n : (G, 3) lever arm of the transponder on that grid, in n, m.
+    beacons : their record.
+    parameters : constants with priors.
+    frame : tangent frame.
+    initial : prior of the first position, None if there is none.
+    depth_std : white noise of the height, m; its share in a range is the sine of the elevation.
+
+    Raises
+    ------
+    DataError
+        If no measurement lies within the track.
+    """
+    grid = track.time
+    present = ~beacons.missing
+    covered = (beacons.time >= grid[0]) & (beacons.time <= grid[-1])
+    rows = np.flatnonzero(present & covered)
+    if not present.any():
+        raise DataError(
+            "there is no range and no range rate",
+            where=beacons.source,
+            expected="numbers in the column range_m or range_rate_m_s",
+        )
+    if not rows.size:
+        first, last = beacons.time[present][[0, -1]]
+        raise DataError(
+            f"no range at a time when the vehicle's way is known, {grid[0]:.10g} to "
+            f"{grid[-1]:.10g} s: they are from {first:.10g} to {last:.10g} s",
+            where=beacons.source,
+            expected="ranges while the other sensors run",
+            hint="Check that all clocks start together, and that all times are in seconds",
+        )
+    ends = [t for t in grid[[0, -1]] if np.abs(beacons.time[rows] - t).min() > _LEAST_INTERVAL]
+    time = np.union1d(beacons.time[rows], ends)
+    at = track.at(time)
+    rate = np.gradient(arm_n, grid, axis=0)
+
+    def on_nodes(values: Array) -> Array:
+        return np.stack([np.interp(time, grid, values[:, i]) for i in range(3)], axis=1)
+
+    s = beacons.settings
+    places = np.array([place.geodetic for place in s.positions.values()])
+    # A bound, not knowledge: the vehicle is where it hears the beacons.
+    reach = 2.0 * float(np.nanmax(beacons.range[rows], initial=1e4))
+    mean, cov = np.mean(frame.position(*places.T)[:, :2], axis=0), reach**2 * np.eye(2)
+    if initial is not None:
+        mean = frame.position(*initial.geodetic)[:2]
+        cov = np.diag(np.maximum(initial.std[:2], 1e-3) ** 2)
+    names = list(s.positions)
+    dt = np.maximum(np.diff(time), _LEAST_INTERVAL)
+    share = np.minimum(dt, track.interval)
+    psd = change_psd(track).reshape(grid.size, 4)
+    middle = 0.5 * (time[1:] + time[:-1])
+    changing = np.stack([np.interp(middle, grid, column) for column in psd.T], axis=1)
+    # What the noise at the ends of a step already accounts for.
+    counted = share[:, None, None] ** 2 * at.velocity_cov[:-1]
+    node = np.searchsorted(time, beacons.time[rows])
+    beacon = np.array([names.index(name) for name in beacons.name[rows]])
+    place = frame.position(*places.T)
+    above = np.abs((at.height - frame.height)[node] - place[beacon, 2])
+    sine = np.clip(above / np.nan_to_num(beacons.range[rows], nan=reach), 0.0, 1.0)
+    climb_std = np.sqrt(2.0) * depth_std / SLOPE_OVER
+    problem = PlanarProblem(
+        time=time,
+        step=np.diff(at.displacement, axis=0),
+        step_cov=_positive(np.diff(at.noise, axis=0) - counted, LEAST_PSD * dt),
+        share=share,
+        velocity=at.velocity,
+        velocity_cov=at.velocity_cov,
+        change_cov=changing.reshape(-1, 2, 2) * dt[:, None, None],
+        height=at.height - frame.height,
+        climb=at.climb,
+        arm=on_nodes(arm_n),
+        arm_velocity=on_nodes(rate),
+        place=place,
+        ranging=Ranging(
+            node=node,
+            beacon=beacon,
+            range=beacons.range[rows],
+            rate=beacons.range_rate[rows],
+            range_std=np.hypot(s.range_std_m, sine * depth_std),
+            rate_std=np.hypot(s.range_rate_std_m_s, sine * climb_std),
+        ),
+        parameters=parameters,
+        start_mean=mean,
+        start_cov=cov,
+        start_known=initial is not None,
+        tan_lat=0.0 if track.tangent else float(np.tan(frame.lat)),
+    )
+    return RangingTrial(problem, track, frame, rows, int((present & ~covered).sum()))
+
+
+def _positive(matrices: Array, least: Array) -> Array:
+    """Return symmetric matrices (M, 2, 2) with eigenvalues of at least (M,)."""
+    values, vectors = np.linalg.eigh(matrices)
+    values = np.maximum(values, least[:, None])
+    return (vectors * values[:, None, :]) @ vectors.transpose(0, 2, 1)

@@ -1,0 +1,202 @@
+"""Calibration, and the correlation of its components."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import LinearSegmentedColormap
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+from numpy.typing import ArrayLike, NDArray
+
+from factorgraph_dvl.analysis.error_statistics import true_value_of
+from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.report.figures.drawing import (
+    ACCENT,
+    DARK,
+    GREY,
+    LIGHT,
+    NORMAL,
+    SMALL,
+    TITLE,
+    new_figure,
+    new_grid,
+    number,
+    style,
+    typeset,
+)
+from factorgraph_dvl.report.text import split_unit, with_std
+from factorgraph_dvl.solution import Estimate, Solution
+
+_DIVERGING = LinearSegmentedColormap.from_list("correlation", ["#6b6b6b", "#ffffff", ACCENT])
+
+
+def calibration_figure(solution: Solution, truth: Mapping[str, ArrayLike]) -> Figure:
+    """Draw every calibration component with its uncertainty, prior and truth."""
+    rows = _calibration_rows(solution.estimates)
+    figure = new_figure(11.0, 0.75 + 1.12 * len(rows))
+    grid = new_grid(
+        figure, len(rows), 3, left=0.15, right=0.15, bottom=0.3, top=0.85, gap=(0.52, 0.4)
+    )
+    known = False
+    for i, row in enumerate(rows):
+        for j, (estimate, c) in enumerate(row):
+            true_value = true_value_of(estimate, truth)
+            known |= true_value is not None
+            ax = figure.add_subplot(grid[i, j])
+            _draw_component(ax, estimate, c, None if true_value is None else float(true_value[c]))
+    handles = figure.axes[0]
+    legend = [
+        *handles.plot([], [], "o", color=ACCENT, markersize=5, label="estimate"),
+        *handles.plot([], [], color=ACCENT, lw=4, label="±1σ"),
+        *handles.plot([], [], color=ACCENT, lw=1.2, label="±3σ"),
+        *handles.plot([], [], color=LIGHT, lw=9, label="prior ±1σ, where comparable"),
+    ]
+    if known:
+        legend += handles.plot(
+            [], [], "D", color=DARK, markerfacecolor="none", markersize=6, label="truth"
+        )
+    figure.legend(
+        handles=legend,
+        loc="upper left",
+        borderaxespad=0.3,
+        ncols=len(legend),
+        fontsize=NORMAL,
+        frameon=False,
+        title="Calibration",
+        title_fontsize=TITLE,
+        alignment="left",
+    )
+    return figure
+
+
+def _draw_component(ax: Axes, estimate: Estimate, c: int, truth: float | None) -> None:
+    """Draw one component as a horizontal error bar."""
+    value, std = float(estimate.value[c]), float(estimate.std[c])
+    prior, prior_std = float(estimate.prior_value[c]), float(estimate.prior_std[c])
+    observable = bool(estimate.observable[c])
+    fixed = std <= 0.0
+    color = ACCENT if observable and not fixed else GREY
+    half = 5.0 * std if not fixed else max(0.1 * abs(value), 1e-3)
+    low, high = value - half, value + half
+    if truth is not None:
+        low, high = min(low, truth - 0.2 * half), max(high, truth + 0.2 * half)
+    if not fixed and prior_std < 6.0 * std:
+        low, high = min(low, prior - 1.2 * prior_std), max(high, prior + 1.2 * prior_std)
+        ax.axvspan(prior - prior_std, prior + prior_std, color=LIGHT, lw=0, zorder=0)
+    ax.plot([value - 3.0 * std, value + 3.0 * std], [0.0, 0.0], color=color, lw=1.2)
+    ax.plot([value - std, value + std], [0.0, 0.0], color=color, lw=4, solid_capstyle="butt")
+    ax.plot(value, 0.0, "o", color=color, markersize=5)
+    if truth is not None:
+        ax.plot(truth, 0.0, "D", color=DARK, markerfacecolor="none", markersize=6)
+    ax.set_xlim(low, high)
+    ax.set_ylim(-1.0, 1.0)
+    ax.set_yticks([])
+    ticks, labels = _ticks(low, high)
+    ax.set_xticks(ticks, labels)
+    style(ax, "", "")
+    ax.grid(visible=False)
+    ax.spines["left"].set_visible(False)
+    name, unit = readable(estimate.component_names[c])
+    ax.set_title(f"{name}, {unit}" if unit else name, fontsize=NORMAL, loc="left", pad=3)
+    ax.set_title(typeset(with_std(value, std)), fontsize=NORMAL, loc="right", pad=3, color=color)
+    if fixed or not observable:
+        note = "held fixed" if fixed else "not observable"
+        ax.text(
+            0.5,
+            0.93,
+            note,
+            transform=ax.transAxes,
+            ha="center",
+            va="top",
+            fontsize=SMALL,
+            color=DARK,
+        )
+
+
+def correlation_figure(solution: Solution) -> Figure:
+    """Draw the correlation matrix of the calibration components."""
+    std = np.sqrt(np.maximum(np.diagonal(solution.covariance), 0.0))
+    free = std > 0.0
+    names = [name for name, shown in zip(solution.order, free, strict=True) if shown]
+    correlation = solution.covariance[np.ix_(free, free)] / np.outer(std[free], std[free])
+    return heat_map(names, correlation)
+
+
+def heat_map(components: Sequence[str], correlation: Array) -> Figure:
+    """Draw a correlation matrix (n, n) of components, with its numbers."""
+    names = [readable(name)[0] for name in components]
+    n = len(names)
+    cell = min(0.5, 13.0 / max(n, 1))
+    side = cell * max(n, 3)
+    size = min(NORMAL, 22.0 * cell)
+    label_size = min(NORMAL, 40.0 * cell)
+    margin = 0.2 + max(map(len, names), default=0) * 0.56 * label_size / 72.0
+    width, height = margin + side + 1.0, margin + side + 0.4
+    figure = new_figure(width, height)
+    ax = figure.add_axes((margin / width, margin / height, side / width, side / height))
+    image = ax.imshow(correlation, cmap=_DIVERGING, vmin=-1.0, vmax=1.0)
+    for i in range(n):
+        for j in range(i):
+            rho = correlation[i, j]
+            ax.text(
+                j,
+                i,
+                number(rho, 2),
+                ha="center",
+                va="center",
+                fontsize=size,
+                color="white" if abs(rho) > 0.6 else DARK,
+            )
+    ax.set_xticks(range(n), names, rotation=90, fontsize=label_size)
+    ax.set_yticks(range(n), names, fontsize=label_size)
+    ax.tick_params(length=0)
+    ax.spines[:].set_visible(False)
+    ax.set_title("Correlation of the calibration", fontsize=TITLE, loc="left")
+    bar_ax = figure.add_axes(
+        (
+            (margin + side + 0.3) / width,
+            (margin + 0.2 * side) / height,
+            0.15 / width,
+            0.6 * side / height,
+        )
+    )
+    bar = figure.colorbar(image, cax=bar_ax, ticks=[-1.0, -0.5, 0.0, 0.5, 1.0])
+    bar.ax.tick_params(labelsize=SMALL, length=2)
+    bar.outline.set_visible(False)
+    return figure
+
+
+def _calibration_rows(estimates: Sequence[Estimate]) -> list[list[tuple[Estimate, int]]]:
+    """Arrange components in rows of three: vectors in rows of their own, then scalars."""
+    rows: list[list[tuple[Estimate, int]]] = []
+    scalars: list[tuple[Estimate, int]] = []
+    for estimate in estimates:
+        components = [(estimate, c) for c in range(len(estimate.component_names))]
+        if len(components) == 1:
+            scalars += components
+        else:
+            rows += _chunks(components)
+    return rows + list(_chunks(scalars))
+
+
+def _chunks(components: list[tuple[Estimate, int]]) -> Iterator[list[tuple[Estimate, int]]]:
+    return (components[i : i + 3] for i in range(0, len(components), 3))
+
+
+def readable(component: str) -> tuple[str, str]:
+    """Split the name of a component into words and unit: `lever_arm_x_m`, `lever arm x`, `m`."""
+    name, unit = split_unit(component)
+    return name.replace("_", " "), unit
+
+
+def _ticks(low: float, high: float) -> tuple[NDArray[np.float64], list[str]]:
+    """Return a few round ticks inside an interval, and their labels without offset."""
+    ticks = np.asarray(MaxNLocator(nbins=5, steps=[1, 2, 2.5, 5, 10]).tick_values(low, high))
+    step = ticks[1] - ticks[0]
+    margin = 0.03 * (high - low)
+    ticks = ticks[(ticks >= low + margin) & (ticks <= high - margin)]
+    digits = next((d for d in range(12) if abs(round(step, d) / step - 1.0) < 1e-3), 12)
+    return ticks, [number(t, digits) for t in ticks]

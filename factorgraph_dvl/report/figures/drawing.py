@@ -1,0 +1,226 @@
+"""Axes, lines and bands that the figures have in common."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.gridspec import GridSpec
+from numpy.typing import NDArray
+
+from factorgraph_dvl.analysis.error_statistics import TrajectoryErrors, VectorErrors
+from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.report.text import fixed
+
+ACCENT = "#0a6ebd"
+ACCENT_LIGHT = "#bcd9f0"
+DARK = "#222222"
+GREY = "#8a8a8a"
+MEDIUM = "#b5b5b5"
+LIGHT = "#e9e9e9"
+PALE = "#f5f5f5"
+SMALL = 7.5
+NORMAL = 8.5
+TITLE = 10.5
+
+_DPI = 120
+_BUCKETS = 2_500
+# Filling a jagged area costs more than a line, and shows less.
+_WIDE_BUCKETS = 400
+# A panel has about as many pixels from left to right.
+_MOST_CROSSINGS = 500.0
+# The envelope of noise is jagged and reads like two lines: later.
+_MOST_CROSSINGS_OF_NOISE = 1600.0
+
+
+def save_figures(figures: Mapping[str, Figure], folder: Path) -> list[Path]:
+    """Write figures as PNG files under their names; return the paths."""
+    paths = []
+    for name, figure in figures.items():
+        path = folder / f"{name}.png"
+        # Unlike `savefig` this draws only once. The fastest compression level is good
+        # enough for line drawings.
+        canvas = FigureCanvasAgg(figure)
+        canvas.print_png(path, pil_kwargs={"compress_level": 1})  # type: ignore[no-untyped-call]
+        paths.append(path)
+    return paths
+
+
+def new_figure(width: float, height: float) -> Figure:
+    """Return an empty figure, inches."""
+    return Figure(figsize=(width, height), dpi=_DPI)
+
+
+def new_grid(
+    figure: Figure,
+    rows: int,
+    columns: int,
+    *,
+    left: float = 0.75,
+    right: float = 0.12,
+    bottom: float = 0.48,
+    top: float = 0.32,
+    gap: tuple[float, float] = (0.16, 0.85),
+    width_ratios: Sequence[float] | None = None,
+) -> GridSpec:
+    """Return a grid with margins and gaps (vertical, horizontal) in inches.
+
+    Margins of fixed size, because a layout that measures every label takes as long as
+    the drawing itself.
+    """
+    width, height = figure.get_size_inches()
+    cell_height = (height - bottom - top - (rows - 1) * gap[0]) / rows
+    cell_width = (width - left - right - (columns - 1) * gap[1]) / columns
+    return figure.add_gridspec(
+        rows,
+        columns,
+        left=left / width,
+        right=1.0 - right / width,
+        bottom=bottom / height,
+        top=1.0 - top / height,
+        hspace=gap[0] / cell_height,
+        wspace=gap[1] / cell_width,
+        width_ratios=width_ratios,
+    )
+
+
+def style(ax: Axes, xlabel: str, ylabel: str) -> None:
+    """Apply the common look to axes; global settings would leak into the caller's figures."""
+    ax.spines[["top", "right"]].set_visible(False)
+    ax.spines[["left", "bottom"]].set_color(GREY)
+    ax.tick_params(labelsize=SMALL, length=3, color=GREY)
+    ax.grid(color=LIGHT, lw=0.6)
+    ax.set_axisbelow(True)
+    ax.margins(x=0.01)
+    if xlabel:
+        ax.set_xlabel(xlabel, fontsize=NORMAL)
+    if ylabel:
+        ax.set_ylabel(ylabel, fontsize=NORMAL)
+        width = ax.get_position().width * ax.figure.get_figure(root=True).get_size_inches()[0]
+        ax.yaxis.set_label_coords(-0.58 / width, 0.5)
+
+
+def error_title(
+    ax: Axes, with_reference: str, without: str, errors: TrajectoryErrors | None
+) -> None:
+    """Write above axes whether they show errors or, without a reference, their claimed size."""
+    title = f"{without}: standard deviation" if errors is None else f"{with_reference}, ±3σ"
+    ax.set_title(title, fontsize=TITLE, loc="left")
+
+
+def is_dense(value: Array, most_crossings: float = _MOST_CROSSINGS) -> bool:
+    """Whether a line through (M,) values crosses its panel so often that only a block is seen."""
+    crossings = float(np.abs(np.diff(value)).sum()) / max(float(np.ptp(value)), 1e-300)
+    return crossings > most_crossings
+
+
+def draw_line(
+    ax: Axes,
+    time: Array,
+    value: Array,
+    *,
+    marker: str = "",
+    most_crossings: float = _MOST_CROSSINGS,
+) -> None:
+    """Draw a line through (M,) values; where that would be a solid block, its envelope."""
+    if is_dense(value, most_crossings):
+        bucket_time, low, high = envelope(time, value)
+        # The outline remains where the envelope is too narrow to be seen.
+        ax.fill_between(
+            bucket_time, low, high, facecolor=ACCENT_LIGHT, edgecolor=ACCENT, lw=0.7, zorder=2
+        )
+        return
+    bucket_time, low, high = envelope(time, value, _BUCKETS)
+    if low is high:
+        ax.plot(time, value, color=ACCENT, lw=0.9, marker=marker, ms=2.5)
+    else:
+        zigzag = np.stack([low, high], axis=1).ravel()
+        ax.plot(np.repeat(bucket_time, 2), zigzag, color=ACCENT, lw=0.9)
+
+
+def draw_band(ax: Axes, time: Array, half: Array) -> None:
+    """Draw a band about zero, of (M,) half widths.
+
+    Where they change within a bucket the band is as wide as the narrowest, and paler up to the
+    widest: an error that is outside its own σ never lies in the band of a neighbour.
+    """
+    bucket_time, low, high = envelope(time, half)
+    if low is not high:
+        ax.fill_between(bucket_time, -high, high, color=PALE, lw=0, zorder=-1)
+    ax.fill_between(bucket_time, -low, low, color=LIGHT, lw=0, zorder=0)
+    for edge in (-low, low):
+        ax.plot(bucket_time, edge, color=GREY, lw=0.7)
+
+
+def draw_error(ax: Axes, time: Array, errors: VectorErrors, c: int, scale: float) -> None:
+    """Draw a component of errors within ±3σ."""
+    draw_band(ax, time, 3.0 * scale * errors.std[:, c])
+    draw_line(ax, time, scale * errors.error[:, c], most_crossings=_MOST_CROSSINGS_OF_NOISE)
+
+
+def draw_std(ax: Axes, time: Array, std: Array) -> None:
+    """Draw a standard deviation."""
+    draw_line(ax, time, std)
+    ax.set_ylim(0.0, 1.1 * float(std.max()) or 1.0)
+
+
+def draw_swing(ax: Axes, time: Array, value: Array) -> None:
+    """Draw a swing too fast for its panel: least, mean and largest of each bucket."""
+    edges = bucket_edges(value.size)
+    bucket_time, low, high = envelope(time, value)
+    mean = np.add.reduceat(value, edges) / np.diff(np.append(edges, value.size))
+    for line in (low, high):
+        ax.plot(bucket_time, line, color=ACCENT, lw=0.7)
+    ax.plot(bucket_time, np.append(mean, mean[-1]), color=DARK, lw=0.9)
+    seconds = float(time[edges[1]] - time[edges[0]])
+    ax.text(
+        0.99,
+        0.86,
+        f"least, mean, largest in {seconds:.2g} s",
+        transform=ax.transAxes,
+        ha="right",
+        va="top",
+        fontsize=SMALL,
+        color=DARK,
+        bbox={"facecolor": "white", "alpha": 0.75, "edgecolor": "none", "pad": 1.0},
+    )
+
+
+def bucket_edges(size: int, buckets: int = _WIDE_BUCKETS) -> NDArray[np.intp]:
+    """Return the first index of each bucket of `size` values."""
+    return np.linspace(0, size, min(buckets, size), endpoint=False).astype(np.intp)
+
+
+def envelope(
+    time: Array, value: Array, buckets: int = _WIDE_BUCKETS
+) -> tuple[Array, Array, Array]:
+    """Return times, least and largest of (M,) values in buckets; the values if M is small."""
+    if value.size <= 2 * buckets:
+        return time, value, value
+    edges = bucket_edges(value.size, buckets)
+    low, high = np.minimum.reduceat(value, edges), np.maximum.reduceat(value, edges)
+    return np.append(time[edges], time[-1]), np.append(low, low[-1]), np.append(high, high[-1])
+
+
+def clock(time: Array) -> tuple[float, str]:
+    """Return the start of the time axis, s, and its label."""
+    first = float(time.min())
+    # Seconds since some epoch long ago do not fit on a tick.
+    if abs(first) < 1e5:
+        return 0.0, "time, s"
+    start = float(np.floor(first))
+    return start, f"time − {start:.0f}, s"
+
+
+def number(value: float, decimals: int) -> str:
+    """Write a number with so many decimals, as it is typeset."""
+    return typeset(fixed(float(value), decimals))
+
+
+def typeset(numbers: str) -> str:
+    """Replace hyphens by minus signs."""
+    return numbers.replace("-", "−")

@@ -1,0 +1,131 @@
+"""A plan's prediction as JSON, tables and lines."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from rich.table import Table
+from rich.text import Text
+
+from factorgraph_dvl.planning.proposal import Proposal
+from factorgraph_dvl.planning.requirements import Requirement
+from factorgraph_dvl.report.files.observability import OWNED as OF_THE_VIEW
+from factorgraph_dvl.report.files.observability import encode
+from factorgraph_dvl.report.terminal.tables import add_column
+from factorgraph_dvl.report.text import split_unit
+from factorgraph_dvl.solution import Solution
+
+# What the command writes; the first makes the folder valid.
+OWNED = ("plan.json", *OF_THE_VIEW)
+
+
+def to_json(
+    solution: Solution,
+    duration: float,
+    required: Sequence[Requirement],
+    proposal: Proposal | None,
+    source: str,
+) -> bytes:
+    """Return `plan.json`.
+
+    Parameters
+    ----------
+    solution : the prediction.
+    duration : of the plan, s.
+    required : what is required of it.
+    proposal : what to add; None if nothing is missed.
+    source : file that the plan was read from.
+    """
+    return encode(
+        {
+            "format": 1,
+            "source": source,
+            "plan": solution.trial,
+            "duration_s": duration,
+            "predicted": {
+                name: {
+                    "std": float(e.std[i]),
+                    "prior_std": float(e.prior_std[i]),
+                    "observable": bool(e.observable[i]),
+                }
+                for e in solution.estimates
+                for i, name in enumerate(e.component_names)
+            },
+            "required": [_requirement(r) for r in required],
+            "missed": [r.component for r in required if not r.met],
+            "proposal": None if proposal is None else _proposal(proposal),
+        }
+    )
+
+
+def _requirement(r: Requirement) -> dict[str, Any]:
+    return {
+        "component": r.component,
+        "required_std": r.required,
+        "predicted_std": r.predicted,
+        "met": r.met,
+    }
+
+
+def _proposal(p: Proposal) -> dict[str, Any]:
+    return {
+        "met": p.met,
+        "added_s": p.added,
+        "names": p.names,
+        "manoeuvres": p.manoeuvres,
+        "required": [_requirement(r) for r in p.requirements],
+        "missed": [r.component for r in p.missed],
+        "sequences_tried": p.tried,
+        "all_tried_up_to_s": p.limit,
+        "shortest": p.shortest,
+    }
+
+
+def requirement_table(required: Sequence[Requirement], proposal: Proposal | None) -> Table:
+    """Render required against predicted σ, of the plan and with the proposal."""
+    table = Table(title="Required")
+    add_column(table, "component")
+    add_column(table, "unit")
+    add_column(table, "required σ", numeric=True)
+    add_column(table, "predicted σ", numeric=True)
+    add_column(table, "met")
+    if proposal is not None:
+        add_column(table, "with the proposal", numeric=True)
+        add_column(table, "met")
+    for i, r in enumerate(required):
+        name, unit = split_unit(r.component)
+        row: list[str | Text] = [name, unit, f"{r.required:.3g}", f"{r.predicted:.3g}", _met(r)]
+        if proposal is not None:
+            after = proposal.requirements[i]
+            row += [f"{after.predicted:.3g}", _met(after)]
+        table.add_row(*row)
+    return table
+
+
+def proposal_lines(proposal: Proposal) -> list[str]:
+    """Render a proposal: what to add, as it stands in a plan, or that nothing suffices."""
+    tried = f"{proposal.tried} sequences were tried"
+    if proposal.shortest:
+        tried += ", all that are shorter among them"
+    else:
+        tried += f", all of up to {proposal.limit:.0f} s among them"
+    if proposal.met and not proposal.shortest:
+        tried += ": there may be a shorter one"
+    if proposal.met:
+        lines = [f"Add {proposal.added:.0f} s ({tried}): {', '.join(proposal.names)}."]
+    else:
+        missed = ", ".join(f"{r.component} ({r.predicted:.2g})" for r in proposal.missed)
+        lines = [
+            f"No sequence that was tried meets all that is required; {tried}. Still missed with "
+            f"the best of them, {proposal.added:.0f} s of {', '.join(proposal.names)}: {missed}."
+        ]
+    return lines + [f"  - {_as_yaml(m)}" for m in proposal.manoeuvres]
+
+
+def _as_yaml(manoeuvre: dict[str, Any]) -> str:
+    return "{" + ", ".join(f"{key}: {value:g}" for key, value in manoeuvre.items()) + "}"
+
+
+def _met(r: Requirement) -> Text:
+    return Text("yes", "green") if r.met else Text("no", "yellow")

@@ -1,0 +1,250 @@
+"""A cross-check for the terminal: tables, and what they mean in words."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from rich.table import Table
+from rich.text import Text
+
+from factorgraph_dvl.analysis.comparison.calibration_difference import AGREE_SIGMAS, Component
+from factorgraph_dvl.analysis.comparison.crosscheck import AgainstTruth, CrossCheck
+from factorgraph_dvl.analysis.comparison.motion_difference import (
+    TWO_SIGMA_SHARE,
+    MotionDifference,
+    error_spreads,
+    mean_nees,
+)
+from factorgraph_dvl.analysis.error_statistics import nees_band
+from factorgraph_dvl.report.terminal.tables import width_of
+from factorgraph_dvl.report.text import at_precision, split_unit, with_std
+
+_UNLIMITED = 10_000
+_STYLES = {"agree": "green", "differ": "red", "not comparable": "yellow"}
+
+
+def component_table(check: CrossCheck, *, width: int = _UNLIMITED) -> Table:
+    """Render every calibration component of both results, with its verdict.
+
+    Parameters
+    ----------
+    check : with the components.
+    width : columns that there are. If they are too few, only the differences are shown.
+    """
+    table = _full_table(check)
+    return table if width_of(table) <= width else _brief_table(check)
+
+
+def _brief_table(check: CrossCheck) -> Table:
+    table = Table(title="Calibration: A − B")
+    table.add_column("parameter", no_wrap=True)
+    table.add_column("A − B ± σ", justify="right", no_wrap=True)
+    table.add_column("in σ", justify="right", no_wrap=True)
+    table.add_column("verdict", no_wrap=True)
+    for c in check.components:
+        name, unit = split_unit(c.name)
+        table.add_row(
+            f"{name}, {unit}" if unit else name,
+            _value(c.difference, c.std, c.std),
+            _or_dash(c.in_sigmas, "+.2f"),
+            Text(c.verdict, _STYLES[c.verdict]),
+        )
+    return table
+
+
+def _full_table(check: CrossCheck) -> Table:
+    table = Table(title="Calibration: A − B")
+    table.add_column("parameter", no_wrap=True)
+    for header in ("A ± σ", "B ± σ", "A − B", "σ of A − B", "in σ"):
+        table.add_column(header, justify="right", no_wrap=True)
+    table.add_column("which σ", no_wrap=True)
+    table.add_column("unit", no_wrap=True)
+    table.add_column("verdict", no_wrap=True)
+    table.add_column("because", no_wrap=True)
+    components = check.components
+    for i, c in enumerate(components):
+        name, unit = split_unit(c.name)
+        scale = _resolution(c)
+        last = i + 1 == len(components) or components[i + 1].parameter != c.parameter
+        table.add_row(
+            name,
+            _value(c.a, c.std_a, scale),
+            _value(c.b, c.std_b, scale),
+            at_precision(c.difference, scale) if np.isfinite(c.difference) else "–",
+            _or_dash(c.std, ".2g"),
+            _or_dash(c.in_sigmas, "+.2f"),
+            "" if c.kind == "none" else c.kind,
+            unit,
+            Text(c.verdict, _STYLES[c.verdict]),
+            c.reason,
+            end_section=last,
+        )
+    return table
+
+
+def motion_table(motion: MotionDifference) -> Table:
+    """Render the differences of the trajectories, component by component."""
+    span = f"{motion.time.size} epochs, {motion.time[0] + 0.0:.10g} to {motion.time[-1]:.10g} s"
+    table = Table(title=f"Trajectory: A − B at {span}")
+    table.add_column("component", no_wrap=True)
+    for header in ("unit", "RMS", "largest", "at s", "RMS in σ", "largest in σ", "inside 2σ %"):
+        table.add_column(header, justify="left" if header == "unit" else "right", no_wrap=True)
+    table.add_column("which σ", no_wrap=True)
+    for i, (s, kind) in enumerate(zip(motion.spreads, motion.kinds, strict=True)):
+        name, unit = split_unit(s.name)
+        table.add_row(
+            name,
+            unit,
+            f"{s.rms:.3g}",
+            f"{s.largest:.3g}",
+            f"{s.time_of_largest:.10g}",
+            _or_dash(s.rms_sigmas, ".2f"),
+            _or_dash(s.largest_sigmas, ".2f"),
+            _or_dash(100.0 * s.within_2_sigma, ".1f"),
+            "" if kind == "none" else kind,
+            end_section=i % 3 == 2,
+        )
+    return table
+
+
+def truth_tables(check: CrossCheck) -> list[Table]:
+    """Render the errors of both results against the truth, as far as it is known."""
+    sides = (("A", check.truth_a), ("B", check.truth_b))
+    out = []
+    if any(side.calibration is not None for _, side in sides):
+        out.append(_calibration_truth(sides))
+    if any(side.trajectory is not None for _, side in sides):
+        out.append(_trajectory_truth(sides))
+    return out
+
+
+def paragraph(check: CrossCheck) -> str:
+    """Say which standard deviation is shown, what a verdict means, and the joint test."""
+    text = (
+        "Both results come from the same data, so their errors are correlated: var(A − B) = "
+        "σ_A² + σ_B² − 2 cov, with a covariance that neither states. As long as it is not "
+        "negative, as of two sound estimates of the same data, √(σ_A² + σ_B²) is an upper bound "
+        "of the σ of A − B: what differs by it differs, what agrees might differ by a sharper "
+        "test."
+    )
+    if check.efficient is None:
+        text += " This bound is shown; `--efficient A` or `B` asks for the sharper one."
+    else:
+        other = "B" if check.efficient == "A" else "A"
+        text += (
+            f" {check.efficient} was said to be efficient; then var(A − B) = σ_{other}² − "
+            f"σ_{check.efficient}² (Hausman 1978), which is shown where σ_{other} is the larger, "
+            "and the upper bound elsewhere."
+        )
+    text += f" Agree: within {AGREE_SIGMAS:g}σ of what is shown."
+    if any(c.kind in ("A alone", "B alone") for c in check.components):
+        text += (
+            " Where one result states no σ, that of the other alone is shown: inside it they "
+            "agree whatever the first one's is, beyond it nothing can be said."
+        )
+    joint = check.joint
+    if joint is not None:
+        text += (
+            f" Jointly over {len(joint.names)} components: χ² = {joint.statistic:.3g}, "
+            f"limit {joint.limit:.3g}, so they {joint.verdict}."
+        )
+        if not joint.correlations:
+            text += " One result states no correlations; they were taken as none."
+    for name, angle in check.angles.items():
+        text += f" Between the rotations of {name}: {angle:.3g}°."
+    return text
+
+
+def verdict_line(components: Sequence[Component]) -> str:
+    """Count the verdicts."""
+    counts = {v: sum(c.verdict == v for c in components) for v in _STYLES}
+    return ", ".join(f"{count} {verdict}" for verdict, count in counts.items() if count)
+
+
+def _calibration_truth(sides: Sequence[tuple[str, AgainstTruth]]) -> Table:
+    table = Table(title="Calibration: error against the truth")
+    table.add_column("parameter", no_wrap=True)
+    table.add_column("truth", justify="right", no_wrap=True)
+    for side, _ in sides:
+        table.add_column(f"error of {side}", justify="right", no_wrap=True)
+        table.add_column("in its σ", justify="right", no_wrap=True)
+    table.add_column("unit")
+    rows: dict[str, list[str]] = {}
+    for k, (_, against) in enumerate(sides):
+        errors = against.calibration
+        if errors is None:
+            continue
+        for i, name in enumerate(errors.names):
+            row = rows.setdefault(name, [f"{errors.truth[i]:.6g}", "–", "–", "–", "–"])
+            row[1 + 2 * k] = _or_dash(float(errors.error[i]), "+.3g")
+            row[2 + 2 * k] = _or_dash(float(errors.normalised[i]), "+.2f")
+    for name, row in rows.items():
+        short, unit = split_unit(name)
+        table.add_row(short, *row, unit)
+    table.add_section()
+    nees, inside = ["NEES (expected)", ""], ["inside 2σ (expected 95.4 %)", ""]
+    for _, against in sides:
+        errors = against.calibration
+        if errors is None or errors.dof == 0:
+            nees, inside = [*nees, "–", "–"], [*inside, "–", "–"]
+            continue
+        low, high = nees_band(errors.dof, 1)
+        nees += [f"{errors.nees:.3g}", f"{low:.3g} to {high:.3g}"]
+        z = np.abs(errors.normalised[errors.tested])
+        inside += [f"{int((z <= 2.0).sum())} of {z.size}", f"{100.0 * (z <= 2.0).mean():.0f} %"]
+    table.add_row(*nees, "")
+    table.add_row(*inside, "")
+    return table
+
+
+def _trajectory_truth(sides: Sequence[tuple[str, AgainstTruth]]) -> Table:
+    table = Table(title="Trajectory: error against the reference")
+    table.add_column("component", no_wrap=True)
+    table.add_column("unit", no_wrap=True)
+    for side, _ in sides:
+        for header in (f"RMS of {side}", f"largest of {side}", f"inside 2σ of {side} %"):
+            table.add_column(header, justify="right", no_wrap=True)
+    found = [
+        None if against.trajectory is None else error_spreads(against.trajectory)
+        for _, against in sides
+    ]
+    some = next(spreads for spreads in found if spreads is not None)
+    for i in range(len(some)):
+        name, unit = split_unit(some[i].name)
+        cells: list[str] = []
+        for spreads in found:
+            if spreads is None:
+                cells += ["–"] * 3
+                continue
+            s = spreads[i]
+            share = _or_dash(100.0 * s.within_2_sigma, ".1f")
+            cells += [f"{s.rms:.3g}", f"{s.largest:.3g}", share]
+        table.add_row(name, unit, *cells, end_section=i % 3 == 2)
+    for k, group in enumerate(("position", "velocity", "attitude")):
+        cells = []
+        for _, against in sides:
+            errors = against.trajectory
+            nees = "–" if errors is None else _or_dash(float(mean_nees(errors)[k]), ".2f")
+            cells += [nees, "", ""]
+        table.add_row(f"{group}: mean NEES (3 expected)", "", *cells)
+    table.caption = f"Expected inside 2σ: {100.0 * TWO_SIGMA_SHARE:.1f} %, over many trials"
+    return table
+
+
+def _or_dash(value: float, spec: str) -> str:
+    return format(value + 0.0, spec) if np.isfinite(value) else "–"
+
+
+def _resolution(c: Component) -> float:
+    """Return the σ whose digits are worth writing."""
+    known = [s for s in (c.std, c.std_a, c.std_b) if np.isfinite(s) and s > 0.0]
+    return min(known) if known else float("nan")
+
+
+def _value(value: float, std: float, resolution: float) -> str:
+    if not np.isfinite(value):
+        return "–"
+    if not np.isfinite(std):
+        return at_precision(value, resolution)
+    return with_std(value, std) if std > 0.0 else f"{value:.6g} fixed"

@@ -1,0 +1,120 @@
+"""What data can tell, as tables for the terminal."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from rich.table import Table
+from rich.text import Text
+
+from factorgraph_dvl.analysis.information.marginals import Marginals
+from factorgraph_dvl.analysis.information.observability import Observability
+from factorgraph_dvl.geometry.units import DEG
+from factorgraph_dvl.report.terminal.tables import add_column
+from factorgraph_dvl.report.text import fixed, split_unit, with_std
+
+_MOST_SEGMENTS = 16
+# Shares below this are not worth a word.
+_LITTLE = 0.1
+
+
+def segment_table(view: Observability) -> Table:
+    """Render the segments: how the vehicle moved, and what the DVL's rows show there."""
+    table = Table(title="Segments")
+    add_column(table, "motion")
+    for header in ("from s", "to s", "m/s", "turn deg", "rms rate deg/s"):
+        add_column(table, header, numeric=True)
+    point_set = view.point_set
+    if point_set is not None:
+        add_column(table, "observed")
+        add_column(table, "largest")
+        add_column(table, "weakest of them")
+        add_column(table, "in all")
+    shown = view.segments[:_MOST_SEGMENTS]
+    for k, m in enumerate(shown):
+        row = [
+            m.segment.label,
+            f"{m.segment.start:.1f}",
+            f"{m.segment.end:.1f}",
+            _number(m.speed, 2),
+            _number(m.turn / DEG, 0),
+            " ".join(_number(r / DEG, 2) for r in m.rates.tolist()),
+        ]
+        if point_set is not None:
+            stack, total = point_set.segments[k], point_set.cumulative[k]
+            n = len(point_set.states)
+            seen = np.flatnonzero(stack.observed)
+            row += [
+                f"{seen.size} of {n}",
+                _named(stack.values, stack.dominant(int(seen[0])), int(seen[0]))
+                if seen.size
+                else "–",
+                _named(stack.values, stack.dominant(int(seen[-1])), int(seen[-1]))
+                if seen.size
+                else "–",
+                f"{int(np.sum(total.observed))} of {n}",
+            ]
+        table.add_row(*(Text(text) for text in row))
+    left = len(view.segments) - len(shown)
+    if left:
+        table.caption = f"and {left} more, in observability.json"
+    return table
+
+
+def marginal_table(view: Observability) -> Table:
+    """Render posterior against prior, and which segment told most."""
+    m = view.marginals
+    assert m is not None
+    table = Table(title="What the data added")
+    add_column(table, "component")
+    add_column(table, "value ± std", numeric=True)
+    add_column(table, "unit")
+    add_column(table, "prior std", numeric=True)
+    add_column(table, "std/prior", numeric=True)
+    add_column(table, "observable")
+    if view.shares is not None:
+        add_column(table, "information from")
+    for i, component in enumerate(m.names):
+        name, unit = split_unit(component)
+        row: list[str | Text] = [
+            name,
+            with_std(float(m.value[i]), float(m.std[i])),
+            unit,
+            f"{float(m.prior_std[i]):.3g}",
+            f"{float(m.ratio[i]):.2g}",
+            Text("yes", "green") if m.observable[i] else Text("no", "yellow"),
+        ]
+        if view.shares is not None:
+            row.append(_sources(view, component))
+        table.add_row(*row)
+    return table
+
+
+def direction_lines(marginals: Marginals) -> list[str]:
+    """Render the weak directions, a sentence each."""
+    if not marginals.sentences:
+        return ["Every direction is observable: of none half of the prior's σ is left."]
+    return [f"- {sentence}." for sentence in marginals.sentences]
+
+
+def _sources(view: Observability, component: str) -> str:
+    shares = view.shares
+    assert shares is not None
+    if component not in shares.names:
+        return "–"
+    k = shares.names.index(component)
+    found: dict[str, float] = {"prior": float(shares.prior[k])}
+    for m, part in zip(view.segments, shares.segments[:, k], strict=True):
+        found[m.segment.label] = found.get(m.segment.label, 0.0) + float(part)
+    large = sorted(((v, name) for name, v in found.items() if v >= _LITTLE), reverse=True)
+    return ", ".join(f"{name} {100.0 * v:.0f} %" for v, name in large)
+
+
+def _named(values: np.ndarray, names: tuple[str, ...], i: int) -> str:
+    short = [split_unit(name)[0] for name in names[:2]]
+    return f"{values[i]:.3g} {', '.join(short)}" + ("…" if len(names) > 2 else "")
+
+
+def _number(value: float, decimals: int) -> str:
+    return fixed(value, decimals) if math.isfinite(value) else "–"

@@ -1,0 +1,198 @@
+"""Tables of results for the terminal."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from factorgraph_dvl.analysis.convergence import Convergence
+from factorgraph_dvl.analysis.error_statistics import CalibrationErrors
+from factorgraph_dvl.geometry.earth import LocalFrame
+from factorgraph_dvl.quality.survey import Survey
+from factorgraph_dvl.report.text import at_precision, fixed, split_unit, with_std
+from factorgraph_dvl.solution import Solution
+
+_STYLES = {"error": "red", "warning": "yellow", "ok": "green"}
+_UNLIMITED = 10_000
+
+
+def calibration_table(
+    solution: Solution, errors: CalibrationErrors | None = None, *, width: int = _UNLIMITED
+) -> Table:
+    """Render the calibration: value and standard deviation against the prior's.
+
+    Parameters
+    ----------
+    solution : with the estimates.
+    errors : against the truth, if that is known.
+    width : columns that there are. If they are too few for all of the table, the prior is
+        left out and the unit joins the name; if they still are, the table is wider.
+    """
+    table = _calibration_table(solution, errors, brief=False)
+    if width_of(table) > width:
+        return _calibration_table(solution, errors, brief=True)
+    return table
+
+
+def _calibration_table(
+    solution: Solution, errors: CalibrationErrors | None, *, brief: bool
+) -> Table:
+    known = {}
+    if errors is not None:
+        rows = zip(errors.truth.tolist(), errors.normalised.tolist(), strict=True)
+        known = dict(zip(errors.names, rows, strict=True))
+    table = Table(title="Calibration")
+    add_column(table, "parameter")
+    add_column(table, "value ± std", numeric=True)
+    if not brief:
+        add_column(table, "unit")
+        add_column(table, "prior std", numeric=True)
+    add_column(table, "observable")
+    if known:
+        add_column(table, "truth", numeric=True)
+        add_column(table, "error/σ", numeric=True)
+    for estimate in solution.estimates:
+        for i, component in enumerate(estimate.component_names):
+            name, unit = split_unit(component)
+            std = float(estimate.std[i])
+            value = with_std(float(estimate.value[i]), std)
+            row: list[str | Text]
+            if brief:
+                row = [f"{name}, {unit}" if unit else name, value]
+            else:
+                row = [name, value, unit, f"{float(estimate.prior_std[i]):.3g}"]
+            row.append(Text("yes", "green") if estimate.observable[i] else Text("no", "yellow"))
+            if component in known:
+                truth, normalised = known[component]
+                row.append(at_precision(truth, std))
+                row.append(fixed(normalised, 2, signed=True) if math.isfinite(normalised) else "–")
+            elif known:
+                row += ["", ""]
+            table.add_row(*row, end_section=component == estimate.component_names[-1])
+    return table
+
+
+def hypothesis_table(solution: Solution) -> Table:
+    """Render the trajectories that the data allow, or allowed until they did not."""
+    table = Table(title="Hypotheses")
+    for header in ("no.", "weight", "found at s", "until s", "from the first, m"):
+        add_column(table, header, numeric=True)
+    first = solution.hypotheses[0].trajectory
+    for i, h in enumerate(solution.hypotheses, 1):
+        end = h.trajectory.geodetic[-1]
+        same = int(np.argmin(np.abs(first.time - h.trajectory.time[-1])))
+        apart = np.linalg.norm(LocalFrame(*first.geodetic[same]).position(*end))
+        table.add_row(
+            f"{i}",
+            f"{h.weight:.3f}",
+            f"{h.born:.6g}",
+            Text("alive", "green") if h.died is None else f"{h.died:.6g}",
+            "" if i == 1 else f"{apart:.4g}",
+        )
+    return table
+
+
+def rejected_line(solution: Solution) -> str:
+    """Render how many measurements were rejected, by kind."""
+    used = {r.label: r.time.size for r in solution.residuals}
+    parts = [
+        f"{r.time.size} of {r.time.size + used.get(r.label, 0)} {r.label}"
+        for r in solution.rejected
+    ]
+    return f"Rejected: {', '.join(parts)}; rejected.csv names them"
+
+
+def convergence_table(found: Convergence, start: float) -> Table:
+    """Render from when each component was good enough.
+
+    Parameters
+    ----------
+    found : how it converged.
+    start : of the trial, s: what the times count from.
+    """
+    table = Table(title="Convergence: time since the start from which on it stayed within")
+    add_column(table, "component")
+    for header in ("σ below", "since s", "error below", "since s"):
+        add_column(table, header, numeric=True)
+    truth = any(math.isfinite(c.error_since) for c in found.components)
+    for c in found.components:
+        name, unit = split_unit(c.name)
+        table.add_row(
+            name,
+            f"{c.good_std:.3g} {unit}",
+            _moment(c.std_since - start),
+            f"{c.good_error:.3g} {unit}" if truth else "–",
+            _moment(c.error_since - start) if truth else "–",
+        )
+    return table
+
+
+def good_enough_line(found: Convergence, start: float) -> str:
+    """Say from when the calibration could have been stopped.
+
+    Parameters
+    ----------
+    found : how it converged.
+    start : of the trial, s.
+    """
+    if math.isfinite(found.good_since):
+        return f"good enough after {found.good_since - start:.0f} s"
+    if not found.components:
+        return "no limits apply to what was estimated"
+    late = [c.name for c in found.components if not math.isfinite(c.std_since)]
+    return f"not good enough until the end: {', '.join(late) or 'measurements were in doubt'}"
+
+
+def _moment(time: float) -> str:
+    return f"{time:.1f}" if math.isfinite(time) else "never"
+
+
+def sensor_table(survey: Survey) -> Table:
+    """Render what was recorded by each sensor."""
+    table = Table(title=Text(f"Trial {survey.trial}"))
+    add_column(table, "sensor")
+    for header in ("rate Hz", "samples", "from s", "to s", "gaps", "longest s", "missing %"):
+        add_column(table, header, numeric=True)
+    for s in survey.sensors:
+        table.add_row(
+            Text(s.label),
+            f"{s.rate:.4g}" if math.isfinite(s.rate) else "–",
+            f"{s.samples}",
+            f"{s.start:.10g}",
+            f"{s.end:.10g}",
+            f"{s.gaps}",
+            f"{s.longest_gap:.4g}" if s.gaps else "–",
+            f"{100.0 * s.missing:.3g}",
+        )
+    return table
+
+
+def width_of(table: Table) -> int:
+    """Return the columns that a table takes if nothing of it is cut."""
+    return Console(width=_UNLIMITED).measure(table).maximum
+
+
+def motion_line(survey: Survey) -> str:
+    """Render duration, distance and speed on one line."""
+    parts = [f"duration {survey.duration:.6g} s"]
+    if math.isfinite(survey.distance):
+        parts.append(f"distance {survey.distance:.6g} m")
+    if math.isfinite(survey.speed_max):
+        parts.append(f"speed {survey.speed_min:.3g} to {survey.speed_max:.3g} m/s")
+    return ", ".join(parts)
+
+
+def finding_lines(survey: Survey) -> list[Text]:
+    """Render the findings, one line each."""
+    return [
+        Text.assemble((f"{f.severity}: ", _STYLES[f.severity]), str(f)) for f in survey.findings
+    ]
+
+
+def add_column(table: Table, header: str, *, numeric: bool = False) -> None:
+    """Add a column that is never cut; numbers to the right."""
+    table.add_column(header, justify="right" if numeric else "left", no_wrap=True)

@@ -1,0 +1,149 @@
+"""Heading and speed log: what a vehicle without a usable IMU reckons its way with."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import ClassVar, Literal, Self
+
+import numpy as np
+
+from factorgraph_dvl.geometry.units import DEG
+from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.sensors.protocol import (
+    NonNegative,
+    Parameter,
+    Positive,
+    SensorSection,
+    check_range,
+    check_times,
+)
+
+HEADING_BIAS = "heading_bias_deg"
+SCALE_ERROR = "log_scale_error"
+CURRENT = "current_m_s"
+
+
+class HeadingSettings(SensorSection, frozen=True, kw_only=True):
+    """Section `heading` of a planar trial.yaml."""
+
+    file: str = "heading.csv"
+    std_deg: Positive = 0.5
+    bias_std_deg: NonNegative = 0.0
+
+    @property
+    def std_rad(self) -> float:
+        """Standard deviation of the noise, rad."""
+        return self.std_deg * DEG
+
+
+class LogSettings(SensorSection, frozen=True, kw_only=True):
+    """Section `log` of a planar trial.yaml."""
+
+    file: str = "log.csv"
+    speed_std_m_s: Positive = 0.05
+    scale_error_std: NonNegative = 0.0
+    reference: Literal["water", "bottom"] = "water"
+    current_std_m_s: tuple[NonNegative, NonNegative] = (0.5, 0.5)
+
+
+@dataclass(frozen=True)
+class Heading:
+    """Settings and record of a compass or gyrocompass.
+
+    Parameters
+    ----------
+    settings : HeadingSettings
+    time : (M,) s, strictly increasing.
+    heading : (M,) clockwise from true north, rad; nan where not measured.
+    source : name of the file, for messages.
+    """
+
+    settings: HeadingSettings
+    time: Array
+    heading: Array
+    source: str = "heading"
+    label: str = "Heading"
+
+    section: ClassVar[str] = "heading"
+    section_type: ClassVar[type[SensorSection]] = HeadingSettings
+    required: ClassVar[tuple[str, ...]] = ("time_s", "heading_deg")
+    optional: ClassVar[tuple[tuple[str, ...], ...]] = ()
+
+    def __post_init__(self) -> None:
+        check_times(self.time, self.source)
+        check_range({"heading_deg": self.heading / DEG}, -360.0, 360.0, "deg", self.source)
+
+    @classmethod
+    def from_columns(
+        cls, settings: HeadingSettings, columns: Mapping[str, Array], source: str
+    ) -> Self:
+        """Return the record that a table holds."""
+        return cls(settings, columns["time_s"], columns["heading_deg"] * DEG, source)
+
+    def columns(self) -> dict[str, Array]:
+        """Return the record as a table."""
+        return {"time_s": self.time, "heading_deg": self.heading / DEG}
+
+    def parameters(self) -> tuple[Parameter, ...]:
+        """Return the constant error of the heading."""
+        sigma = np.array([self.settings.bias_std_deg]) * DEG
+        return (Parameter("heading_bias", "deg", DEG, np.zeros(1), sigma, labels=("",)),)
+
+
+@dataclass(frozen=True)
+class SpeedLog:
+    """Settings and record of a log: speed through the water or over ground.
+
+    Parameters
+    ----------
+    settings : LogSettings
+    time : (M,) s, strictly increasing.
+    speed : (M,) ahead, m/s; nan where not measured.
+    starboard : (M,) to starboard, m/s; nan where not measured, which stands for none.
+    source : name of the file, for messages.
+    """
+
+    settings: LogSettings
+    time: Array
+    speed: Array
+    starboard: Array
+    source: str = "log"
+    label: str = "Log"
+
+    section: ClassVar[str] = "log"
+    section_type: ClassVar[type[SensorSection]] = LogSettings
+    required: ClassVar[tuple[str, ...]] = ("time_s", "speed_m_s")
+    optional: ClassVar[tuple[tuple[str, ...], ...]] = (("starboard_m_s",),)
+
+    def __post_init__(self) -> None:
+        check_times(self.time, self.source)
+        speeds = {"speed_m_s": self.speed, "starboard_m_s": self.starboard}
+        check_range(speeds, -50.0, 50.0, "m/s", self.source)
+
+    @classmethod
+    def from_columns(
+        cls, settings: LogSettings, columns: Mapping[str, Array], source: str
+    ) -> Self:
+        """Return the record that a table holds."""
+        return cls(
+            settings, columns["time_s"], columns["speed_m_s"], columns["starboard_m_s"], source
+        )
+
+    def columns(self) -> dict[str, Array]:
+        """Return the record as a table."""
+        table = {"time_s": self.time, "speed_m_s": self.speed}
+        if not np.isnan(self.starboard).all():
+            table["starboard_m_s"] = self.starboard
+        return table
+
+    def parameters(self) -> tuple[Parameter, ...]:
+        """Return scale error and, through the water, the current."""
+        s = self.settings
+        through_water = s.reference == "water"
+        current = np.array(s.current_std_m_s) if through_water else np.zeros(2)
+        scale = np.array([s.scale_error_std])
+        return (
+            Parameter("log_scale_error", "", 1.0, np.zeros(1), scale, labels=("",)),
+            Parameter("current", "m_s", 1.0, np.zeros(2), current, labels=("e", "n")),
+        )

@@ -1,0 +1,1 @@
+"""What residuals and information say of an estimate."""

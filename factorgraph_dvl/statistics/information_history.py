@@ -1,0 +1,37 @@
+"""What the data told of the calibration as time went on: plain numbers between layers."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from factorgraph_dvl.geometry.vectors import Array
+
+
+@dataclass(frozen=True)
+class InformationHistory:
+    """Joint covariance of the constants of a trial, given all data up to some times.
+
+    Parameters
+    ----------
+    time : (K,) s; the first before any data.
+    names : (P,) components as in `covariance.order`. Biases that walk are no constants,
+        and not among them.
+    root : (K, P, P) square roots S of the covariances S Sᵀ, in reported units. Kept as
+        roots because a product of priors of hundreds of degrees and posteriors of arc
+        seconds leaves a matrix of information few digits.
+    """
+
+    time: Array
+    names: tuple[str, ...]
+    root: Array
+
+    @property
+    def std(self) -> Array:
+        """Standard deviations, (K, P), in reported units."""
+        return np.asarray(np.linalg.norm(self.root, axis=2))
+
+    def covariance(self, k: int) -> Array:
+        """Return the covariance at entry k, (P, P)."""
+        return np.asarray(self.root[k] @ self.root[k].T)

@@ -1,0 +1,258 @@
+"""Information that only the noise of the motion feigns.
+
+A straight run does not show a rotation of the DVL about the velocity. Linearised at the
+estimated motion it seems to: the estimate wavers by its error, and the Jacobian takes
+that for changes of direction. Thousands of pings then add up to a standard deviation of
+some degrees where nothing is known, and the estimate follows the noise (in regression:
+errors in variables). The expected share of that error in the information is computed
+here; where it is most of it, the direction is not observable, and the prior is held.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from factorgraph_dvl.geometry.vectors import Array, rotate, skew
+from factorgraph_dvl.graph.problem import Evaluation, Problem
+from factorgraph_dvl.imu.preintegration import Attachment
+from factorgraph_dvl.sensors.protocol import Motion, Observation, Values
+from factorgraph_dvl.solvers.levenberg_marquardt import Minimum
+from factorgraph_dvl.solvers.posterior import Posterior
+
+# Share of the error of the motion in the information from which on it is not believed.
+SPURIOUS = 0.5
+# Information, in units of the prior's, that is not worth the question.
+_LITTLE = 0.1
+# Steps of other variables that go with a held direction are genuine from so many times
+# what noise feigns.
+_COUPLED = 10.0
+# Genuine information, in the same units, below which a direction is left to the prior once
+# some are feigned.
+_GENUINE = 0.5
+
+
+@dataclass(frozen=True)
+class DataInformation:
+    """What the data say of the parameters, beside the prior's identity.
+
+    All in the coordinates u of a step S u, S `Problem.prior_root`.
+
+    Parameters
+    ----------
+    data : (P, P) information once all other variables are eliminated.
+    spurious : (P, P) share of it that the error of the motion is expected to feign.
+    """
+
+    data: Array
+    spurious: Array
+
+    def undetermined_directions(self) -> Array:
+        """Return the directions (P, h) that are not observable, if any is feigned."""
+        return undetermined_directions(self.data, self.spurious)
+
+    def coupled(self, held: Array, full: Array) -> Array:
+        """Return the projection (h, h) on the held directions that other variables go with.
+
+        The step K of the others that goes with one prior's sigma of a direction is worth
+        |K|² in their own information: what they take of that on the direction. Noise
+        feigns such steps too, as large as the information that it feigns.
+
+        Parameters
+        ----------
+        held : (P, h) directions.
+        full : `parameter_information`.
+        """
+        P = np.linalg.inv(self.data + np.eye(len(self.data)))
+        own = np.eye(held.shape[1])
+        taken = held.T @ full @ held + own - np.linalg.inv(held.T @ P @ held)
+        L = np.linalg.cholesky(held.T @ self.spurious @ held + own)
+        half = np.linalg.solve(L, taken)
+        share, directions = np.linalg.eigh(np.linalg.solve(L, half.T))
+        spanned = np.linalg.qr(np.linalg.solve(L.T, directions[:, share > _COUPLED]))[0]
+        return np.asarray(spanned @ spanned.T)
+
+
+def data_information(
+    problem: Problem, minimum: Minimum, covariances: Posterior, *, at_truth: bool = False
+) -> DataInformation:
+    """Return what the data say of the parameters.
+
+    Parameters
+    ----------
+    problem, minimum, covariances : at the minimum.
+    at_truth : the motion there is the true one, and feigns nothing: return what will be
+        found once it is estimated.
+    """
+    size = len(problem.prior_root)
+    if size == 0:
+        return DataInformation(*[np.zeros((0, 0))] * 2)
+    data = np.linalg.inv(covariances.parameters) - np.eye(size)
+    spurious = spurious_information(problem, minimum.evaluation, covariances.given).sum(axis=0)
+    if at_truth:
+        data = data + spurious
+    return DataInformation(data, spurious)
+
+
+def parameter_information(problem: Problem, evaluation: Evaluation) -> Array:
+    """Return the information (P, P) of the measurements on the parameters, all else known.
+
+    In the coordinates u of a step S u, S `Problem.prior_root`.
+    """
+    root = problem.prior_root
+    out = np.zeros((len(root), len(root)))
+    for observation, motion, weight in zip(
+        problem.observations, evaluation.motions, problem.weights, strict=True
+    ):
+        wanted = [p.name for p in problem.parameters if p.name in observation.parameters]
+        if not wanted:
+            continue
+        found = observation.linearize(motion, evaluation.parameters, wanted).d_parameters
+        J = np.concatenate([found[name] for name in wanted], axis=2) * weight[:, :, None]
+        columns = np.concatenate([np.arange(len(root))[problem.columns[name]] for name in wanted])
+        out[np.ix_(columns, columns)] += np.einsum("mdi,mdj->ij", J, J)
+    return np.asarray(root.T @ out @ root)
+
+
+def spurious_information(problem: Problem, evaluation: Evaluation, nodes: Array) -> Array:
+    """Return the information that the error of the motion feigns, by node.
+
+    Parameters
+    ----------
+    problem, evaluation : linearised there.
+    nodes : (K, 9, 9) covariances of the states, in GTSAM's tangent space, where the
+        parameters are known: an error that all states share turns the Jacobians alike, and
+        feigns no change.
+
+    Returns
+    -------
+    (K, P, P) expected share of the measurements that hang on each node, in the coordinates
+    u of a step S u, S `Problem.prior_root`.
+    """
+    root = problem.prior_root
+    out = np.zeros((nodes.shape[0], len(root), len(root)))
+    for observation, attachment, motion, weight in zip(
+        problem.observations,
+        problem.attachments,
+        evaluation.motions,
+        problem.weights,
+        strict=True,
+    ):
+        names = [p.name for p in problem.parameters if p.name in observation.parameters]
+        if names:
+            part = spurious_by(
+                observation,
+                attachment,
+                motion,
+                weight,
+                nodes[attachment.node],
+                evaluation.parameters,
+                names,
+            )
+            places = [problem.columns[name] for name in names]
+            columns = np.concatenate([np.arange(p.start, p.stop) for p in places])
+            np.add.at(out, (attachment.node[:, None, None], columns[:, None], columns), part)
+    return np.asarray(root.T @ out @ root)
+
+
+def undetermined_directions(data: Array, spurious: Array) -> Array:
+    """Return the directions (P, h) that are not observable, if any is feigned.
+
+    Parameters
+    ----------
+    data : (P, P) information of the data, beside the prior's identity; what is feigned
+        included.
+    spurious : (P, P) that share of it.
+    """
+    if not data.size or not largest_spurious_share(data, spurious) >= SPURIOUS:
+        return np.zeros((data.shape[0], 0))
+    genuine, directions = np.linalg.eigh(data - spurious)
+    return np.asarray(directions[:, genuine < _GENUINE])
+
+
+def largest_spurious_share(data: Array, spurious: Array) -> Array:
+    """Return the largest share of feigned information in any direction, (...).
+
+    Parameters
+    ----------
+    data, spurious : (..., P, P) as of `undetermined_directions`.
+    """
+    data = 0.5 * (data + np.swapaxes(data, -1, -2))
+    L = np.linalg.cholesky(_positive(data) + _LITTLE * np.eye(data.shape[-1]))
+    half = np.linalg.solve(L, spurious)
+    whitened = np.linalg.solve(L, np.swapaxes(half, -1, -2))
+    return np.asarray(
+        np.linalg.eigvalsh(0.5 * (whitened + np.swapaxes(whitened, -1, -2)))[..., -1]
+    )
+
+
+def _positive(matrix: Array) -> Array:
+    """Return symmetric matrices without their negative eigenvalues."""
+    values, vectors = np.linalg.eigh(matrix)
+    kept = vectors * np.maximum(values, 0.0)[..., None, :]
+    return np.asarray(kept @ np.swapaxes(vectors, -1, -2))
+
+
+def at_prior_along(
+    problem: Problem, parameters: dict[str, Array], directions: Array
+) -> dict[str, Array]:
+    """Return parameters with the prior's value along directions (P, h)."""
+    prior = problem.prior_values()
+    root = problem.prior_root
+    for _ in range(10):
+        away = np.linalg.solve(root, problem.difference(parameters, prior))
+        step = -directions @ (directions.T @ away)
+        parameters = problem.moved(parameters, root @ step)
+    return parameters
+
+
+def spurious_by(
+    observation: Observation,
+    attachment: Attachment,
+    motion: Motion,
+    weight: Array,
+    P: Array,
+    values: Values,
+    wanted: Sequence[str],
+) -> Array:
+    """Return what the motion's error is expected to add by measurement, (M, p, p), SI.
+
+    Parameters
+    ----------
+    observation : of M measurements of d components.
+    attachment, motion : of them.
+    weight : (M, d) inverse standard deviations.
+    P : (M, 9, 9) covariances of the nodes before them, in GTSAM's tangent space.
+    values : of all parameters.
+    wanted : names of the parameters, of p columns, whose information is asked for.
+    """
+
+    def jacobian(at: Motion) -> Array:
+        found = observation.linearize(at, values, wanted).d_parameters
+        return np.concatenate([found[name] for name in wanted], axis=2)
+
+    base = jacobian(motion)
+    size = base.shape[2]
+    v_b = rotate(motion.nRb.transpose(0, 2, 1), motion.v_n)
+    by_state = np.concatenate(
+        [skew(v_b), np.zeros_like(motion.nRb), np.broadcast_to(np.eye(3), motion.nRb.shape)],
+        axis=2,
+    )
+    covariance = by_state @ P @ by_state.transpose(0, 2, 1)
+    root = np.linalg.cholesky(covariance + 1e-16 * np.eye(3))
+    out = np.zeros((attachment.node.size, size, size))
+    for k in range(3):
+        axis = np.eye(3)[k]
+        waver = rotate(motion.nRb, root[:, :, k])
+        push = rotate(motion.nRb, attachment.force_sigma[:, None] * axis)
+        for changed in (
+            replace(motion, v_n=motion.v_n + waver),
+            replace(motion, omega_eb_b=motion.omega_eb_b + motion.omega_sigma * axis),
+            replace(motion, a_n=motion.a_n + push),
+            replace(motion, alpha_b=motion.alpha_b + attachment.alpha_sigma[:, None] * axis),
+        ):
+            change = (jacobian(changed) - base) * weight[:, :, None]
+            out += change.transpose(0, 2, 1) @ change
+    return out

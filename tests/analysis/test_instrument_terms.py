@@ -1,0 +1,125 @@
+"""What is typed into instruments gives the misalignment back, with the signs it says."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import yaml
+from builders import build_solution
+from scipy.spatial.transform import Rotation
+
+from factorgraph_dvl.analysis.instrument_terms import ORDERS, instrument_of, rotation_of
+from factorgraph_dvl.errors import DataError
+from factorgraph_dvl.geometry.rotations import exp_so3, frd_from_body
+from factorgraph_dvl.geometry.units import DEG
+from factorgraph_dvl.report.files.instrument import instrument_text
+from factorgraph_dvl.solution import Estimate
+
+STD = np.array([0.02, 0.03, 0.04])
+
+
+def calibrated(alpha_deg, body_axes="RFU"):
+    def estimate(name, value, std):
+        n = np.size(value)
+        names = tuple(f"{name}_{i}" for i in range(n))
+        value, std = np.atleast_1d(value).astype(float), np.atleast_1d(std).astype(float)
+        return Estimate(name, names, value, std, value, std, np.ones(n, dtype=bool))
+
+    estimates = (
+        estimate("misalignment_deg", alpha_deg, STD),
+        estimate("scale_error", 0.0177, 1e-5),
+        estimate("lever_arm_m", [-0.93, 1.12, -0.34], [0.01, 0.02, 0.03]),
+    )
+    std = np.concatenate([e.std for e in estimates])
+    return replace(
+        build_solution(), body_axes=body_axes, estimates=estimates, covariance=np.diag(std**2)
+    )
+
+
+@pytest.mark.parametrize("body_axes", ["RFU", "FRD", "FLU"])
+@pytest.mark.parametrize("alpha", [[1.68, 2.10, 16.45], [-20.0, 35.0, 140.0], [0.0, 0.0, -90.0]])
+def test_angles_give_the_misalignment_back(alpha, body_axes):
+    dRb = exp_so3(np.array(alpha) * DEG)
+    found = instrument_of(calibrated(alpha, body_axes))
+    for order in ORDERS:
+        np.testing.assert_allclose(
+            rotation_of(found.body_to_dvl[order].value, order, body_axes), dRb, atol=1e-12
+        )
+        np.testing.assert_allclose(
+            rotation_of(found.dvl_in_body[order].value, order, body_axes), dRb.T, atol=1e-12
+        )
+
+
+@pytest.mark.parametrize("body_axes", ["RFU", "FRD", "FLU"])
+def test_trdi_commands_take_ship_to_instrument_coordinates(body_axes):
+    # Mounted as TRDI says: beam 3 turned 30 deg to starboard; level when the ship rolls 2 deg
+    # and pitches -1 deg. Written with elementary rotations, in starboard, forward, mast.
+    clockwise, roll, pitch = 30.0, 2.0, -1.0
+    about = {"starboard": "x", "forward": "y", "mast": "z"}
+
+    def turn(axis, angle):
+        return Rotation.from_euler(about[axis], angle, degrees=True).as_matrix()
+
+    # Heading of the ship seen from the instrument: 30 deg to port, mathematically positive.
+    ship_in_level = turn("mast", clockwise) @ turn("starboard", pitch) @ turn("forward", roll)
+    sRb = frd_from_body("RFU").T @ frd_from_body(body_axes)
+    alpha = Rotation.from_matrix(ship_in_level @ sRb).as_rotvec(degrees=True)
+    found = instrument_of(calibrated(alpha, body_axes))
+    np.testing.assert_allclose(found.alignment, [30.0, 2.0, -1.0], atol=1e-9)
+
+
+def test_signs_by_hand():
+    # A DVL that is turned to starboard sees a ship that moves ahead go to port.
+    found = instrument_of(calibrated([0.0, 0.0, 10.0]))
+    ahead_d = exp_so3(np.array([0.0, 0.0, 10.0]) * DEG) @ [0.0, 1.0, 0.0]
+    assert ahead_d[0] < 0.0
+    assert found.dvl_in_body["ZYX"].value == pytest.approx([0.0, 0.0, 10.0])
+    assert found.alignment == pytest.approx([10.0, 0.0, 0.0])
+    np.testing.assert_allclose(found.lever_arm, [1.12, -0.93, 0.34])
+
+
+def test_standard_deviations_are_those_of_the_angles():
+    alpha = np.array([10.0, -25.0, 60.0])
+    found = instrument_of(calibrated(alpha))
+    rng = np.random.default_rng(0)
+    draws = [
+        instrument_of(calibrated(alpha + STD * rng.standard_normal(3))) for _ in range(400)
+    ]  # fmt: skip
+    for spread, std in (
+        (np.std([d.alignment for d in draws], axis=0), found.alignment_std),
+        (
+            np.std([d.dvl_in_body["XYZ"].value for d in draws], axis=0),
+            found.dvl_in_body["XYZ"].std,
+        ),
+    ):
+        # 400 draws: chance is 3.5 %.
+        np.testing.assert_allclose(spread, std, rtol=0.15)
+
+
+def test_text_is_yaml_and_states_the_commands():
+    text = instrument_text(instrument_of(calibrated([0.0, 0.0, 16.45])), "cruise")
+    data = yaml.safe_load(text)
+    assert data["trdi"] == {"EA": 1645, "EI": 0, "EJ": 0}
+    assert "EA+01645" in text
+    assert "#EI+00000" in text
+    assert data["scale_error_percent"] == [1.77]
+    assert data["scale_error_ppm"] == [17700]
+    assert data["scale_factor"] == pytest.approx([1.0 / 1.0177], abs=1e-6)
+
+
+def test_axes_that_cannot_be_trdi_s_are_named():
+    for body_axes, said in (("RFU", False), ("FRD", True)):
+        text = instrument_text(instrument_of(calibrated([0.0, 0.0, 45.0], body_axes)), "a trial")
+        assert ("NOT TO BE TYPED IN" in text) == said
+
+
+def test_half_a_turn_is_within_the_range_of_the_command():
+    text = instrument_text(instrument_of(calibrated([0.0, 0.0, -180.0])), "cruise")
+    assert yaml.safe_load(text)["trdi"]["EA"] == 18000
+
+
+def test_a_calibration_without_a_dvl_is_refused():
+    with pytest.raises(DataError, match="no lever_arm_m"):
+        instrument_of(build_solution())

@@ -1,0 +1,175 @@
+"""What `inspect` calls an error, the commands that solve say in the same words."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from builders import write_trial
+from planar import trial as planar_trial
+from truth import scenario
+
+from factorgraph_dvl.cli import main
+from factorgraph_dvl.geometry.units import DEG
+from factorgraph_dvl.io.calibration_file import load_calibration
+from factorgraph_dvl.io.planar_folder import save_planar_trial
+from factorgraph_dvl.quality.finding import Finding
+from factorgraph_dvl.quality.survey import survey
+from factorgraph_dvl.simulation import simulate
+
+
+@pytest.fixture(scope="module")
+def honest():
+    return simulate(scenario(noise=True), 1)
+
+
+def late(trial):
+    return replace(trial, dvl=replace(trial.dvl, time=trial.dvl.time + 1000.0))
+
+
+def in_a_gap(trial):
+    """Every ping lies where the IMU did not run."""
+    imu, dvl = trial.imu, trial.dvl
+    runs = (imu.time < 30.0) | (imu.time > 40.0)
+    pings = (dvl.time > 31.0) & (dvl.time < 39.0)
+    return replace(
+        trial,
+        imu=replace(imu, time=imu.time[runs], gyro=imu.gyro[runs], accel=imu.accel[runs]),
+        dvl=replace(dvl, time=dvl.time[pings], velocity=dvl.velocity[pings], std=dvl.std[pings]),
+    )
+
+
+def silent(trial):
+    nothing = np.full_like(trial.dvl.velocity, np.nan)
+    return replace(trial, dvl=replace(trial.dvl, velocity=nothing))
+
+
+def radians(trial):
+    geodetic = trial.gnss.geodetic * [DEG, DEG, 1.0]
+    return replace(trial, gnss=replace(trial.gnss, geodetic=geodetic))
+
+
+def radians_without_velocity(trial):
+    spoilt = radians(trial)
+    nothing = np.full_like(trial.gnss.velocity, np.nan)
+    return replace(spoilt, gnss=replace(spoilt.gnss, velocity=nothing))
+
+
+def zeros(trial):
+    geodetic = trial.gnss.geodetic.copy()
+    geodetic[7] = 0.0
+    return replace(trial, gnss=replace(trial.gnss, geodetic=geodetic))
+
+
+def east_mirrored(trial):
+    return replace(
+        trial, gnss=replace(trial.gnss, velocity=trial.gnss.velocity * [-1.0, 1.0, 1.0])
+    )
+
+
+def upside_down(trial):
+    return replace(trial, body_axes="FRD")
+
+
+@pytest.fixture
+def run(capsys):
+    def run(*args):
+        with pytest.raises(SystemExit) as exit_info:
+            main([*map(str, args)])
+        captured = capsys.readouterr()
+        return exit_info.value.code, captured.out, captured.err
+
+    return run
+
+
+def errors_of(run, trial_path):
+    code, out, _ = run("inspect", trial_path)
+    assert code == 0
+    return [line.removeprefix("error: ") for line in out.splitlines() if line.startswith("error")]
+
+
+@pytest.mark.parametrize("command", ["solve", "replay", "kalman"])
+@pytest.mark.parametrize(
+    "spoil", [late, in_a_gap, silent, radians, radians_without_velocity, zeros]
+)
+def test_records_that_cannot_be_used_are_refused(command, spoil, honest, tmp_path, run):
+    spoilt = spoil(honest)
+    trial = write_trial(tmp_path, spoilt)
+    said = [str(f) for f in survey(spoilt).errors if f.unusable]
+    assert said
+    assert set(said) <= set(errors_of(run, trial))
+    code, _, err = run(command, trial, "--out", tmp_path / "out", "--no-figures", "--quiet")
+    assert code == 2
+    assert all(text in err for text in said)
+    assert "--anyway" in err
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_refusal_is_overridden(honest, tmp_path, run):
+    trial = write_trial(tmp_path, late(honest))
+    (said,) = errors_of(run, trial)
+    out = tmp_path / "out"
+    code, _, err = run("solve", trial, "--out", out, "--no-figures", "--quiet", "--anyway")
+    assert code == 1
+    assert said in err
+    assert said in load_calibration(out).warnings
+    assert not (out / "instrument.yaml").exists()
+
+
+@pytest.mark.parametrize("command", ["solve", "replay", "kalman"])
+@pytest.mark.parametrize("spoil", [east_mirrored, upside_down])
+def test_what_contradicts_is_a_finding_of_the_result(command, spoil, honest, tmp_path, run):
+    trial = write_trial(tmp_path, spoil(honest))
+    said = errors_of(run, trial)
+    assert said
+    code, _, err = run(command, trial, "--out", tmp_path / "out", "--no-figures", "--quiet")
+    assert code == 1
+    assert all(text in err for text in said)
+    if (tmp_path / "out").exists():
+        assert set(said) <= set(load_calibration(tmp_path / "out").warnings)
+        assert not (tmp_path / "out" / "instrument.yaml").exists()
+
+
+def test_an_honest_trial_is_neither(honest, tmp_path, run):
+    trial = write_trial(tmp_path, honest)
+    code, _, err = run("solve", trial, "--out", tmp_path / "out", "--no-figures", "--quiet")
+    assert (code, "error" in err) == (0, False)
+    assert (tmp_path / "out" / "instrument.yaml").exists()
+
+
+def test_beacons_of_another_time_are_refused_in_the_plane(tmp_path, run):
+    t = planar_trial(6)
+    moved = replace(t, beacons=replace(t.beacons, time=t.beacons.time + 1e5))
+    save_planar_trial(moved, tmp_path / "t")
+    (said,) = errors_of(run, tmp_path / "t")
+    code, _, err = run("solve", tmp_path / "t", "--out", tmp_path / "out", "--quiet")
+    assert code == 2
+    assert said in err
+
+
+def test_a_stated_clock_offset_counts(honest):
+    settings = type(honest.dvl.settings)(time_offset_s=1000.0)
+    dvl = replace(honest.dvl, time=honest.dvl.time + 1000.0, settings=settings)
+    assert not survey(replace(honest, dvl=dvl)).errors
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_sway_of_a_slow_vessel_is_no_wrong_unit(seed):
+    sway = {
+        "roll": [{"amplitude_deg": 8, "frequency_hz": 0.25}],
+        "pitch": [{"amplitude_deg": 5, "frequency_hz": 0.3, "phase_deg": 60}],
+    }
+    slow = {"lat_deg": 36, "lon_deg": 121, "heading_deg": 30, "speed_m_s": 0.5}
+    scene = scenario(
+        noise=True, start=slow, manoeuvres=[{"straight_s": 90}], sway=sway,
+        dvl={"lever_arm_m": [3, 2, -6]},
+    )  # fmt: skip
+    assert survey(simulate(scene, seed)).errors == ()
+
+
+def test_every_error_has_a_code(honest):
+    for spoil in (late, silent, radians, zeros, east_mirrored, upside_down):
+        errors = survey(spoil(honest)).errors
+        assert errors
+        assert all(isinstance(f, Finding) and f.code for f in errors)

@@ -1,0 +1,73 @@
+"""Benchmarks start safely, name what made a page, and their pages still hold."""
+
+from __future__ import annotations
+
+import importlib
+import re
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+SCRIPTS = sorted(p.stem for p in (ROOT / "benchmarks").glob("*.py") if p.stem != "common")
+# Where a page of the repository is, of those with a sample that is made anew below.
+SAMPLED = ("luo_2024", "liu_2020", "beams", "beacon_2021", "sea_trial")
+
+
+@pytest.fixture
+def benchmark(monkeypatch):
+    monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
+    return importlib.import_module
+
+
+@pytest.mark.parametrize("name", SCRIPTS)
+def test_a_folder_that_cannot_be_written_is_refused_before_any_work(
+    name, benchmark, monkeypatch, tmp_path, capsys
+):
+    (tmp_path / "file").touch()
+    monkeypatch.setattr(sys, "argv", [f"{name}.py", "--out", str(tmp_path / "file" / "deep")])
+    with pytest.raises(SystemExit) as caught:
+        benchmark(name).main()
+    assert caught.value.code == 2
+    assert "--out" in capsys.readouterr().err
+
+
+def test_the_folder_is_made_and_by_default_no_page_is_replaced(benchmark, monkeypatch, tmp_path):
+    common = benchmark("common")
+    monkeypatch.setattr(common.sys, "argv", ["luo_2024.py"])
+    args = common.parse(common.parser("", seeds=4), ["--out", str(tmp_path / "a" / "b")])
+    assert (tmp_path / "a" / "b").is_dir()
+    assert re.fullmatch(
+        r"Written by `python benchmarks/luo_2024\.py --seeds 4` from "
+        r"(commit [0-9a-f]{10} (\(clean tree\)|with changes)|an unknown commit); do not edit\.",
+        args.origin,
+    )
+    assert common.parser("").parse_args([]).out == ROOT / "out" / "benchmarks"
+    assert "/out*/" in (ROOT / ".gitignore").read_text(encoding="utf-8").splitlines()
+
+
+def test_a_changed_tree_is_named(benchmark, monkeypatch):
+    common = benchmark("common")
+
+    class Finished:
+        def __init__(self, stdout):
+            self.stdout = stdout
+
+    def git(command, **_):
+        return Finished(" M solvers/batch.py\n" if "status" in command else "0123456789\n")
+
+    monkeypatch.setattr(common.subprocess, "run", git)
+    assert common.commit() == "commit 0123456789 with changes"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", SAMPLED)
+def test_the_numbers_of_one_seed_are_those_of_the_page(name, benchmark):
+    module = benchmark(name)
+    page = (ROOT / "docs" / module.PAGE).read_text(encoding="utf-8")
+    if "from commit" not in page:
+        pytest.xfail(f"{module.PAGE} was made before pages named their commit: make it anew")
+    printed = page.splitlines()
+    missing = [line for line in module.sample() if line not in printed]
+    assert not missing, f"docs/{module.PAGE} is out of date; run benchmarks/{name}.py --out docs"

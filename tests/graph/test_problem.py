@@ -1,0 +1,248 @@
+"""The graph: bulk-linearised blocks, cost, rows, arcs, biases, priors."""
+
+from __future__ import annotations
+
+import gtsam
+import numpy as np
+import pytest
+from problems import ALL_FREE, SHORT, prior_cost, problem_of, walking
+from truth import scenario
+
+from factorgraph_dvl.geometry.rotations import exp_so3, rotation_from_rph
+from factorgraph_dvl.geometry.units import DEG
+from factorgraph_dvl.graph import keys
+from factorgraph_dvl.simulation import simulate
+
+
+def measurement_factors(problem, gaussian):
+    return [gaussian.at(i) for i in range(problem.graph.size(), gaussian.size())]
+
+
+def rows_by_factor(problem):
+    """Which whitened residuals stand in which measurement factor, in their order.
+
+    One factor per node and set of parameters, its measurements in the order of the
+    observations: the layout that `Problem` documents.
+    """
+    groups = {}
+    for i, (o, at) in enumerate(zip(problem.observations, problem.attachments, strict=True)):
+        names = tuple(p.name for p in problem.parameters if p.name in o.parameters)
+        groups.setdefault(names, []).append((i, at.node))
+    out = []
+    for names, members in groups.items():
+        for k in np.unique(np.concatenate([node for _, node in members])):
+            out.append((names, int(k), [(i, np.flatnonzero(node == k)) for i, node in members]))
+    return out
+
+
+def stacked(evaluation, members):
+    return np.concatenate([evaluation.residuals[i][rows].ravel() for i, rows in members])
+
+
+def keyed(problem, names, k):
+    return [keys.node(k), problem.chain.bias_key(k), *(problem.key(n) for n in names)]
+
+
+@pytest.mark.parametrize("walks", [False, True])
+def test_blocks_equal_custom_factors_with_numerical_jacobians(walks):
+    scene = walking() if walks else scenario(manoeuvres=SHORT, trial=ALL_FREE)
+    problem, values = problem_of(scene)
+    assert problem.chain.walking == walks
+    problem.weigh(problem.evaluate(values))
+    evaluation = problem.evaluate(values)
+    factors = measurement_factors(problem, problem.linearize(evaluation))
+    layout = rows_by_factor(problem)
+    assert len(factors) == len(layout)
+    dims = values.dims()
+
+    def whitened(members, key, h):
+        delta = gtsam.VectorValues()
+        delta.insert(key, h)
+        return stacked(problem.evaluate(values.retract(delta)), members)
+
+    checked = 0
+    # One node in turns with every kind of measurement, and the first.
+    for factor, (names, k, members) in zip(factors, layout, strict=True):
+        if k not in (0, 5):
+            continue
+        checked += 1
+        wanted = keyed(problem, names, k)
+        assert list(factor.keys()) == wanted
+
+        def error(this, at, jacobians, members=members, wanted=wanted):
+            if jacobians is not None:
+                for i, key in enumerate(wanted):
+                    columns = []
+                    # States are known to 1e-3; the bias of a gyro shifts them by 1e-6.
+                    for j in range(dims[key]):
+                        h = np.zeros(dims[key])
+                        h[j] = 1e-5
+                        ahead, behind = whitened(members, key, h), whitened(members, key, -h)
+                        columns.append((ahead - behind) / 2e-5)
+                    jacobians[i] = np.asfortranarray(np.stack(columns, axis=1))
+            return stacked(problem.evaluate(at), members)
+
+        noise = gtsam.noiseModel.Unit.Create(factor.rows())
+        custom = gtsam.CustomFactor(noise, wanted, error).linearize(values)
+        np.testing.assert_allclose(factor.getb(), custom.getb(), atol=1e-9)
+        scale = np.maximum(np.abs(custom.getA()).max(axis=0), 1.0)
+        # The derivative by the gyro bias is that of a motion of constant rate and force;
+        # the Earth's rate times what a bias moves in a segment is left out: 1e-4.
+        assert (np.abs(factor.getA() - custom.getA()) / scale).max() < 2e-4
+    assert checked == 4
+    problem.evaluate(values)
+
+
+def test_cost_is_the_sum_of_squares_by_hand():
+    problem, values = problem_of(scenario(manoeuvres=SHORT, trial=ALL_FREE))
+    problem.weigh(problem.evaluate(values))
+    evaluation = problem.evaluate(values)
+    by_hand = sum(problem.graph.at(i).error(values) for i in range(problem.graph.size()))
+    for o, motion, weight in zip(
+        problem.observations, evaluation.motions, problem.weights, strict=True
+    ):
+        sigma = o.sigma(motion, evaluation.parameters)
+        used = weight[:, 0] > 0.0
+        # The offset is to be found: the ping at the very end could leave the record.
+        assert (~used).sum() == (1 if o.label == "DVL velocity" else 0)
+        np.testing.assert_allclose(weight[used], 1.0 / sigma[used])
+        residual = o.residual(motion, evaluation.parameters)
+        by_hand += 0.5 * np.sum((residual / sigma)[used] ** 2)
+    assert evaluation.cost == pytest.approx(by_hand, rel=1e-12)
+    gaussian = problem.linearize(evaluation)
+    zero = gtsam.VectorValues.Zero(gtsam.VectorValues())
+    for key, size in values.dims().items():
+        zero.insert(key, np.zeros(size))
+    assert gaussian.error(zero) == pytest.approx(by_hand, rel=1e-9)
+
+
+@pytest.mark.parametrize("gap", [None, (3.0, 5.0)])
+def test_every_measurement_has_its_rows_once(gap):
+    imu = {} if gap is None else {"gaps_s": [list(gap)]}
+    scene = scenario(manoeuvres=SHORT, imu=imu, trial=ALL_FREE)
+    problem, values = problem_of(scene)
+    trial_end = problem.chain.segments.node_time[-1]
+    problem.weigh(problem.evaluate(values))
+    evaluation = problem.evaluate(values)
+    factors = measurement_factors(problem, problem.linearize(evaluation))
+    b = np.sort(np.concatenate([-f.getb() for f in factors]))
+    expected = np.sort(np.concatenate([r.ravel() for r in evaluation.residuals]))
+    np.testing.assert_allclose(b, expected, atol=1e-12)
+    for o, weight in zip(problem.observations, problem.weights, strict=True):
+        # The sample at the end of a gap averages over its own period only.
+        time = o.true_time(evaluation.parameters)
+        covered = np.ones(time.size, dtype=bool)
+        if gap is not None:
+            covered = ~((time > gap[0] - 0.005) & (time < gap[1] - 0.005))
+        # Pings, whose offset is to be found, keep a distance from the ends of the record.
+        margin = 0.06 if o.label == "DVL velocity" else 0.02
+        ends = np.array([0.0, trial_end, *(gap or ())])
+        far = np.min(np.abs(time[:, None] - ends), axis=1) > margin
+        if o.label != "DVL velocity":
+            far |= np.min(np.abs(time[:, None] - ends[:2]), axis=1) < margin
+        assert np.all((weight[:, 0] > 0.0)[far] == covered[far])
+        assert problem.uncovered.get(o.label, 0) == int((weight[:, 0] == 0.0).sum())
+    if gap is not None:
+        assert len(problem.chain.segments.arc_nodes) == 2
+    expected = {"DVL velocity"} if gap is None else {o.label for o in problem.observations}
+    assert set(problem.uncovered) == expected
+
+
+def kinds(graph):
+    out = {}
+    for i in range(graph.size()):
+        name = type(graph.at(i)).__name__
+        out.setdefault(name, []).append(list(graph.at(i).keys()))
+    return out
+
+
+def test_arcs_are_chains_of_their_own():
+    scene = scenario(manoeuvres=SHORT, imu={"gaps_s": [[3.0, 5.0]]})
+    problem, _ = problem_of(scene)
+    seg = problem.chain.segments
+    (a, b), (c, d) = seg.arc_nodes
+    assert (a, c) == (0, b + 1)
+    found = kinds(problem.graph)
+    bound = sorted(k[:2] for k in found["GalileanImuFactor2"])
+    expected = [*range(a, b), *range(c, d)]
+    assert bound == [[keys.node(k), keys.node(k + 1)] for k in expected]
+    assert found["PriorFactorNavState"] == [[keys.node(0)], [keys.node(c)]]
+    assert len(found["PriorFactorConstantBias"]) == 1
+    assert "BetweenFactorConstantBias" not in found
+
+
+def test_walking_biases_have_a_node_each_and_walk_over_gaps():
+    scene = walking({"imu": {"gyro_bias_walk_deg_h_sqrt_h": 1.0, "gaps_s": [[3.0, 5.0]]}})
+    problem, values = problem_of(scene)
+    n = problem.chain.segments.node_time.size
+    found = kinds(problem.graph)
+    steps = found["BetweenFactorConstantBias"]
+    assert steps == [[keys.bias(k), keys.bias(k + 1)] for k in range(n - 1)]
+    used = [k[2] for k in found["GalileanImuFactor2"]]
+    origin = problem.chain.segments.origin
+    assert used == [keys.bias(k) for k in origin.tolist()]
+    # 1 deg/h in an hour: over 1 s a 60th, over the gap of 2 s more.
+    step = np.diff(problem.chain.segments.node_time)
+    bias = gtsam.imuBias.ConstantBias(np.zeros(3), np.array([1e-6, 0.0, 0.0]))
+    moved = gtsam.Values()
+    moved.insert(keys.bias(0), gtsam.imuBias.ConstantBias())
+    for k in range(1, n):
+        moved.insert(keys.bias(k), bias)
+    between = [
+        problem.graph.at(i)
+        for i in range(problem.graph.size())
+        if type(problem.graph.at(i)).__name__ == "BetweenFactorConstantBias"
+    ]
+    sigma = 1.0 * DEG / 3600.0 * np.sqrt(step[0] / 3600.0)
+    assert between[0].error(moved) == pytest.approx(0.5 * (1e-6 / sigma) ** 2, rel=1e-9)
+    assert problem.evaluate(values).cost > 0.0
+
+
+@pytest.mark.parametrize("mean", [[0, 0, 0], [5, 30, -10], [0, 30, 0], [-100, 80, 40]], ids=str)
+def test_misalignment_prior_is_that_of_the_rotation_vector(mean):
+    sigma = np.array([1.0, 4.0, 0.2])
+    claims = {"dvl": {"misalignment_deg": mean, "misalignment_std_deg": sigma.tolist()}}
+    problem, _ = problem_of(scenario(manoeuvres=SHORT, trial=claims))
+    rng = np.random.default_rng(0)
+    for _ in range(5):
+        # First order: a thousandth of sigma.
+        step = rng.normal(0.0, 1e-3, 3) * sigma
+        value = exp_so3((np.array(mean) + step) * DEG)
+        expected = 0.5 * np.sum((step / sigma) ** 2)
+        found = prior_cost(problem, "misalignment_deg", value)
+        assert found == pytest.approx(expected, rel=2e-3)
+
+
+def test_initial_priors_are_east_north_up_and_roll_pitch_heading():
+    claims = {"initial": {"attitude_std_deg": [0.5, 1.0, 5.0], "position_std_m": [5.0, 3.0, 1.0]}}
+    scene = scenario(manoeuvres=SHORT, trial=claims, start={"heading_deg": 137})
+    trial = simulate(scene)
+    problem, _ = problem_of(scene, trial)
+    (prior,) = [
+        problem.graph.at(i)
+        for i in range(problem.graph.size())
+        if type(problem.graph.at(i)).__name__ == "PriorFactorNavState"
+    ]
+    nRb = prior.prior().attitude().matrix()
+    for axis, sigma in enumerate([5.0, 3.0, 1.0]):
+        shift = np.zeros(3)
+        shift[axis] = 2.0
+        state = gtsam.NavState(
+            gtsam.Rot3(nRb), prior.prior().position() + shift, prior.prior().velocity()
+        )
+        values = gtsam.Values()
+        values.insert(keys.node(0), state)
+        assert prior.error(values) == pytest.approx(0.5 * (2.0 / sigma) ** 2, rel=1e-6)
+    rph = trial.initial_attitude.rph
+    # The prior holds at the end of the first sample, the node is at its start.
+    back = exp_so3(-problem.chain.segments.phi[0])
+    for axis, sigma in enumerate([0.5, 1.0, 5.0]):
+        step = np.zeros(3)
+        step[axis] = 1e-3 * sigma
+        turned = rotation_from_rph(rph + step * DEG, "RFU")
+        state = gtsam.NavState(
+            gtsam.Rot3(turned @ back), prior.prior().position(), prior.prior().velocity()
+        )
+        values = gtsam.Values()
+        values.insert(keys.node(0), state)
+        assert prior.error(values) == pytest.approx(0.5e-6, rel=1e-3)

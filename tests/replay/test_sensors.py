@@ -1,0 +1,200 @@
+"""Whatever sensor a trial has, the replay takes it through the protocol and ends as the batch."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from truth import config
+
+from factorgraph_dvl.analysis.error_statistics import motion_errors
+from factorgraph_dvl.replay import Replay, replay
+from factorgraph_dvl.sensors.protocol import rows_of
+from factorgraph_dvl.sensors.star import Star
+from factorgraph_dvl.simulation import simulate
+from factorgraph_dvl.solvers.batch import minimised, solve
+
+TURNS = [
+    {"accelerate_m_s2": 1, "to_m_s": 4},
+    {"straight_s": 15},
+    {"turn_deg_s": -6, "duration_s": 15, "ramp_s": 4},
+    {"turn_deg_s": 8, "duration_s": 15, "ramp_s": 4},
+]
+SINKS = [
+    {"accelerate_m_s2": 0.4, "to_m_s": 2},
+    {"straight_s": 10},
+    {"turn_deg_s": -6, "duration_s": 30, "ramp_s": 5},
+    {"climb_m_s": -0.5, "to_height_m": 0},
+    {"straight_s": 10},
+]
+NOISY = {
+    "imu": {
+        "gyro_noise_deg_sqrt_h": 0.1,
+        "gyro_bias_deg_h": "draw",
+        "gyro_bias_std_deg_h": 5,
+    },
+    "trial": {"imu": {"gyro_bias_std_deg_h": 5}},
+}
+MOUNTED = {
+    "star": {"mounting_deg": [3, 2, 5]},
+    "trial": {"star": {"mounting_deg": [0, 0, 0], "mounting_std_deg": [10, 10, 10]}},
+}
+
+
+def as_the_batch(trial, rate=1.0):
+    """Replay a trial, and hold its end against the batch solver and its way against the truth."""
+    solution, _ = replay(trial, rate_hz=rate)
+    batch = solve(trial)
+    assert solution.order == batch.order
+    a, b = (np.concatenate([e.value for e in s.estimates]) for s in (solution, batch))
+    std = np.sqrt(np.diag(batch.covariance))
+    free = std > 0.0
+    assert np.abs((a - b)[free] / std[free]).max() < 0.3
+    ours = np.sqrt(np.diag(solution.covariance))
+    np.testing.assert_allclose(ours[free], std[free], rtol=0.05)
+    assert solution.converged
+    motion = motion_errors(solution.trajectory, trial.reference)
+    for v in (motion.position, motion.velocity, motion.attitude):
+        assert np.abs(v.normalised).max() < 6.0
+    return solution
+
+
+@pytest.mark.parametrize("changes", [MOUNTED, NOISY], ids=["mounting", "noisy gyros"])
+def test_a_star_tracker(changes):
+    trial = simulate(config("seed-a-star", manoeuvres=TURNS, reference_rate_hz=100, **changes), 1)
+    solution = as_the_batch(trial)
+    assert {"Star attitude"} <= {r.label for r in solution.residuals}
+
+
+def test_a_vessel_that_floats_under_the_stars():
+    scene = config("star", manoeuvres=[{"straight_s": 70}], reference_rate_hz=50)
+    as_the_batch(simulate(scene, 1))
+
+
+def test_a_depth_sensor_beyond_gnss():
+    changes = {"outages_s": [[45, 400]]}
+    trial = simulate(config("dive", manoeuvres=SINKS, reference_rate_hz=100, gnss=changes), 1)
+    solution = as_the_batch(trial)
+    assert solution.estimate("sea_surface_height_m").observable.all()
+
+
+def test_single_beams():
+    trial = simulate(config("cruise-beams", manoeuvres=TURNS, reference_rate_hz=100), 1)
+    as_the_batch(trial)
+
+
+def test_star_vectors_one_epoch_at_a_time():
+    trial = simulate(config("seed-a-star", manoeuvres=TURNS), 1)
+    (star,) = trial.others
+    rng = np.random.default_rng(0)
+    body = rng.normal(size=(star.time.size, 2, 3))
+    iRs = Rotation.from_quat(np.roll(star.quaternion, -1, axis=1))
+    inertial = np.stack([iRs.apply(body[:, i]) for i in range(2)], axis=1)
+    time = np.repeat(star.time, 2)
+    seen = Star.from_vectors(
+        star.settings, time, body.reshape(-1, 3), inertial.reshape(-1, 3), "star"
+    )
+    assert rows_of(seen, [3, 4]).consistency_warnings() == ()
+    early = trial.imu.time < 34.0
+    trial = replace(trial, imu=rows_of(trial.imu, early), others=(seen,))
+    solution, _ = replay(trial, rate_hz=1.0)
+    assert {"Star attitude"} <= {r.label for r in solution.residuals}
+
+
+def test_a_bias_that_walks_is_reported_as_it_is_at_the_end():
+    walk = {"gyro_bias_walk_deg_h_sqrt_h": 20.0}
+    scene = config(
+        "seed-a-phase-90",
+        manoeuvres=TURNS,
+        imu={**walk, "gyro_noise_deg_sqrt_h": 0.002},
+        trial={"imu": walk},
+    )
+    trial = simulate(scene, 1)
+    solution, _ = replay(trial, rate_hz=1.0)
+    found = minimised(trial, state_interval_s=1.0)
+    last = np.degrees(found.minimum.evaluation.states.gyro_bias[-1]) * 3600.0
+    e = solution.estimate("gyro_bias_deg_h")
+    assert np.all(np.abs(e.value - last) < 0.3 * e.std)
+    # What is known of the mean is not what is known of the end.
+    assert np.all(e.std > 1.2 * solve(trial).estimate("gyro_bias_deg_h").std)
+    assert any("walks" in w for w in solution.warnings)
+
+
+def test_sensors_that_were_never_announced_are_refused_by_name():
+    trial = simulate(config("seed-a-star", manoeuvres=TURNS), 1)
+    session = Replay(replace(trial, others=()))
+    with pytest.raises(Exception, match="star"):
+        session.add(rows_of(trial.others[0], [0]))
+
+
+def test_a_beacon_bounds_a_dive_and_its_echoes_are_left_out():
+    scene = config(
+        "dive-one-beacon",
+        manoeuvres=[*TURNS, {"straight_s": 20}, *TURNS[2:]],
+        gnss={"outages_s": [[50, 1e4]]},
+        beacons={"rate_hz": 0.5, "missed": 0.2, "multipath": 0.15, "outages_s": [[0, 45]]},
+        reference_rate_hz=50,
+    )
+    trial = simulate(scene, 2)
+    session = Replay(trial, rate_hz=1.0)
+    for aid in trial.aids:
+        session.add(aid)
+    updates = session.add_imu(trial.imu.time, trial.imu.gyro, trial.imu.accel) + session.finish()
+    said = [text for u in updates for text in u.messages if "Beacon" in text]
+    # Neither a missed ping nor an echo is worth a word; the count at the end is.
+    assert not said
+    assert any("Beacon B1 range" in text for text in session.counts())
+    batch = solve(trial)
+    end = updates[-1].state
+    apart = trial.frame().position(*end.geodetic.T) - trial.frame().position(
+        *batch.trajectory.geodetic[-1:].T
+    )
+    assert end.time[0] - batch.trajectory.time[-1] < 0.1
+    assert np.abs(apart / end.position_std).max() < 0.5
+
+
+@pytest.mark.parametrize("rows", ["none", "empty"])
+def test_a_sensor_that_is_first_heard_after_the_start(rows):
+    scene = config("seed-a-phase-90", manoeuvres=[*TURNS, *TURNS[1:]], reference_rate_hz=50)
+    trial = simulate(scene, 5)
+    dvl, heard = trial.dvl, trial.dvl.time > 40.0
+    if rows == "none":
+        dvl = rows_of(dvl, heard)
+    else:
+        dvl = replace(dvl, velocity=np.where(heard[:, None], dvl.velocity, np.nan))
+    as_the_batch(replace(trial, dvl=dvl))
+
+
+def test_no_start_while_a_mirror_image_fits_the_ranges():
+    scene = config(
+        "dive-one-beacon",
+        start={"lat_deg": 24.995, "lon_deg": 134.997},
+        manoeuvres=[{"straight_s": 75}],
+        imu={
+            "gyro_bias_std_deg_h": 0.01,
+            "gyro_noise_deg_sqrt_h": 0.001,
+            "gyro_bias_walk_deg_h_sqrt_h": 0,
+            "accel_bias_std_ug": 50,
+            "accel_noise_ug_sqrt_hz": 10,
+        },
+        beacons={"rate_hz": 0.5, "missed": 0, "multipath": 0, "outages_s": []},
+    )
+    trial = replace(simulate(scene, 2), gnss=None)
+    session = Replay(trial, rate_hz=1.0)
+    for aid in trial.aids:
+        session.add(aid)
+    assert not session.add_imu(trial.imu.time, trial.imu.gyro, trial.imu.accel)
+    assert not session.started
+    # Both tracks are one at first, of a position that is hardly known.
+    assert any("the position is known to" in text for text in session.messages)
+    assert any("2 trajectories fit the ranges" in text for text in session.messages)
+
+
+def test_a_beacon_out_of_reach_is_no_hindrance():
+    scene = config("dive-one-beacon", manoeuvres=TURNS, beacons={"outages_s": []})
+    trial = simulate(scene, 2)
+    late = replace(trial.beacons, time=trial.beacons.time + 1e4)
+    others = tuple(late if aid is trial.beacons else aid for aid in trial.others)
+    assert solve(replace(trial, others=others)).converged

@@ -1,0 +1,80 @@
+from __future__ import annotations
+
+from dataclasses import replace
+from io import StringIO
+
+import numpy as np
+import pytest
+from builders import build_solution, build_trial
+from rich.console import Console
+from rich.table import Table
+
+from factorgraph_dvl.analysis.error_statistics import calibration_errors
+from factorgraph_dvl.quality.survey import survey
+from factorgraph_dvl.report.terminal.tables import calibration_table, sensor_table, width_of
+from factorgraph_dvl.report.text import at_precision, fixed, split_unit, with_std
+
+TRUTH = {"misalignment_deg": [1.0, 2.0, 3.0], "scale_error": [0.005]}
+
+
+def printed(table: Table, width: int) -> str:
+    file = StringIO()
+    Console(file=file, width=max(width, width_of(table))).print(table)
+    return file.getvalue()
+
+
+@pytest.mark.parametrize("width", [160, 80, 60, 20])
+@pytest.mark.parametrize("known", [True, False])
+def test_no_name_and_no_number_is_cut(width: int, known: bool) -> None:
+    solution = build_solution()
+    errors = calibration_errors(solution, TRUTH) if known else None
+    text = printed(calibration_table(solution, errors, width=width), width)
+    assert "…" not in text
+    rows = {line.split()[1].rstrip(","): line for line in text.splitlines() if " ± " in line[20:]}
+    assert "0.005123 ± 0.000033" in rows["scale_error"]
+    assert "deg" in rows["misalignment_x"]
+    assert "no" in rows["misalignment_z"]
+    if known:
+        assert "0.005000" in rows["scale_error"]
+        assert "+3.70" in rows["scale_error"]
+
+
+def test_what_a_narrow_terminal_leaves_out() -> None:
+    solution = build_solution()
+    errors = calibration_errors(solution, TRUTH)
+    assert width_of(calibration_table(solution, errors, width=80)) <= 80
+    assert width_of(calibration_table(solution, width=60)) <= 60
+    assert "prior std" in printed(calibration_table(solution, errors), 160)
+    assert "prior std" not in printed(calibration_table(solution, errors, width=80), 80)
+
+
+def test_records_with_large_clock_readings_are_not_cut() -> None:
+    trial = build_trial(name="[of] Unix time")
+    trial = replace(trial, imu=replace(trial.imu, time=trial.imu.time + 1.7e9))
+    text = printed(sensor_table(survey(trial)), 60)
+    assert "1700000060" in text
+    assert "[of] Unix time" in text
+    assert "…" not in text
+
+
+def test_zeros_have_no_sign() -> None:
+    assert with_std(-0.3, 180.0) == "0 ± 180"
+    assert with_std(-0.0, 0.0) == "0 ± 0"
+    assert at_precision(-0.0004, 0.1) == "0.00"
+    assert fixed(-0.001, 2, signed=True) == "+0.00"
+    assert fixed(-0.01, 2, signed=True) == "-0.01"
+    first, *rest = build_solution().estimates
+    estimate = replace(first, value=np.array([-0.3, -0.001, -0.0]), std=np.array([180.0, 0.1, 0]))
+    solution = build_solution(estimates=(estimate, *rest))
+    errors = calibration_errors(solution, {"misalignment_deg": np.zeros(3)})
+    text = printed(calibration_table(solution, errors), 160)
+    assert "-0 " not in text
+    assert "-0.00 " not in text
+
+
+def test_precision_and_units() -> None:
+    assert with_std(29.99321, 0.0050) == "29.9932 ± 0.0050"
+    assert with_std(1234.5, 0.0) == "1234.5 ± 0"
+    assert at_precision(float("nan"), 1.0) == "nan"
+    assert split_unit("gyro_bias_x_deg_h") == ("gyro_bias_x", "deg/h")
+    assert split_unit("scale_error") == ("scale_error", "")

@@ -1,0 +1,274 @@
+"""Measurement models: zero error at the truth, Jacobians, numbers by hand, wrong rotations."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from jacobians import check_jacobians, random_motion
+from offsets import OFFSET_RAD
+from truth import exact_motion, scenario
+
+from factorgraph_dvl.geometry.earth import LocalFrame
+from factorgraph_dvl.geometry.rotations import exp_so3
+from factorgraph_dvl.geometry.units import DEG
+from factorgraph_dvl.sensors.dvl import Dvl, DvlSettings, DvlVelocity
+from factorgraph_dvl.sensors.gnss import AntennaPosition, AntennaVelocity, Gnss, GnssSettings
+from factorgraph_dvl.sensors.protocol import Motion, lever_arm_sigma
+from factorgraph_dvl.simulation import plan_motion, simulate
+
+MISALIGNMENT_DEG = [10.0, -25.0, 130.0]
+
+
+def dvl_values(**changes):
+    return {
+        "misalignment_deg": exp_so3(np.array(MISALIGNMENT_DEG) * DEG),
+        "scale_error": np.array([0.03]),
+        "lever_arm_m": np.array([1.0, -1.2, 1.4]),
+        "dvl_bias_m_s": np.array([0.01, -0.02, 0.03]),
+        "time_offset_s": np.array([0.08]),
+        "current_m_s": np.zeros(2),
+    } | changes
+
+
+def scene(*, scale=0.03, reference="bottom", body_axes="RFU"):
+    claims = {
+        "velocity_std_m_s": 0.001,
+        "bias_std_m_s": [1, 1, 1],
+        "time_offset_std_s": 1,
+        "scale_error_std": 0.1 if np.ndim(scale) == 0 else [0.1, 0.1, 0.1],
+    }
+    return scenario(
+        body_axes=body_axes,
+        current_m_s=[0.3, -0.2, 0.0],
+        gnss={"lever_arm_m": [0.3, -1.5, 4.0]},
+        dvl={
+            "rate_hz": 7,
+            "phase_s": 0.05,
+            "misalignment_deg": MISALIGNMENT_DEG,
+            "scale_error": scale,
+            "lever_arm_m": [1.0, -1.2, 1.4],
+            "bias_m_s": [0.01, -0.02, 0.03],
+            "time_offset_s": 0.08,
+            "reference": reference,
+        },
+        trial={"dvl": claims},
+    )
+
+
+def observed(scn):
+    """Return exact motion, frame and observations by label."""
+    trial = simulate(scn)
+    fix = trial.gnss.geodetic[0]
+    frame = LocalFrame(fix[0] - OFFSET_RAD, fix[1] + OFFSET_RAD, 0.0)
+    out = {o.label: o for aid in trial.aids for o in aid.observations(frame)}
+    return plan_motion(scn), frame, out
+
+
+@pytest.mark.parametrize("body_axes", ["RFU", "FRD", "FLU"])
+@pytest.mark.parametrize(
+    ("scale", "reference"),
+    [(0.03, "bottom"), ([0.03, -0.02, 0.01], "bottom"), (0.03, "water")],
+)
+def test_dvl_velocity_has_zero_error_at_the_truth(scale, reference, body_axes):
+    exact, frame, observations = observed(
+        scene(scale=scale, reference=reference, body_axes=body_axes)
+    )
+    o = observations["DVL velocity"]
+    values = dvl_values(scale_error=np.atleast_1d(scale))
+    if reference == "water":
+        values["current_m_s"] = np.array([0.3, -0.2])
+    motion = exact_motion(exact, frame, o.true_time(values))
+    # Through the water, the current keeps its east and north at the vehicle; the model
+    # means those of the origin, 85 km away: 0.36 m/s times 0.0135 rad.
+    limit = 1e-13 if reference == "bottom" else 5e-3
+    assert np.abs(o.residual(motion, values)).max() < limit
+
+
+def test_antenna_position_and_velocity_have_zero_error_at_the_truth():
+    exact, frame, observations = observed(scene())
+    values = {"gnss_lever_arm_m": np.array([0.3, -1.5, 4.0])}
+    position, velocity = observations["GNSS position"], observations["GNSS velocity"]
+    # Limited by geodetic coordinates in double precision: 1e-9 m each.
+    error = position.residual(exact_motion(exact, frame, position.time), values)
+    assert np.abs(error).max() < 1e-8
+    # Velocity refers to the axes at the antenna, and the truth to those at the IMU, 4 m
+    # away at most: 4 m/s times 6e-7 rad.
+    error = velocity.residual(exact_motion(exact, frame, velocity.time), values)
+    assert np.abs(error).max() < 5e-6
+
+
+@pytest.mark.parametrize("scale", [[0.03], [0.03, -0.2, 0.1]])
+@pytest.mark.parametrize("misalignment", [[0, 0, 0], MISALIGNMENT_DEG, [0, 0, 180]])
+def test_dvl_velocity_jacobians(scale, misalignment):
+    rng = np.random.default_rng(0)
+    settings = DvlSettings(
+        scale_error=scale[0] if len(scale) == 1 else tuple(scale), reference="water"
+    )
+    time = np.arange(5.0)
+    dvl = Dvl(settings, time, rng.normal(0.0, 3.0, (5, 3)), np.full((5, 3), 0.01))
+    (o,) = dvl.observations(LocalFrame(0.6, 2.1, 0.0))
+    values = dvl_values(
+        scale_error=np.array(scale),
+        misalignment_deg=exp_so3(np.array(misalignment) * DEG),
+        current_m_s=np.array([0.4, -0.6]),
+    )
+    check_jacobians(o, random_motion(), values, dvl.parameters())
+
+
+def test_time_offset_derivative_is_that_of_the_true_motion():
+    exact, frame, observations = observed(scene())
+    o = observations["DVL velocity"]
+    values = dvl_values()
+    time = o.true_time(values)
+    smooth = np.min(np.abs(time[:, None] - exact.kinks), axis=1) > 0.01
+    o = replace(o, time=o.time[smooth], measured_d=o.measured_d[smooth], std=o.std[smooth])
+    lin = o.linearize(exact_motion(exact, frame, time[smooth]), values, ["time_offset_s"])
+    h = 1e-4
+    later, earlier = (
+        o.residual(exact_motion(exact, frame, time[smooth] - s), values) for s in (h, -h)
+    )
+    # Third derivatives times h²/6, and 1e-10 of the differentiated acceleration.
+    numerical = (later - earlier) / (2.0 * h)
+    assert np.abs(lin.d_parameters["time_offset_s"][:, :, 0] - numerical).max() < 1e-7
+    assert np.abs(numerical).max() > 0.5
+
+
+def test_antenna_jacobians():
+    rng = np.random.default_rng(1)
+    geodetic = np.array([0.6, 2.1, 5.0]) + rng.normal(0.0, 0.05, (5, 3)) * [1, 1, 0]
+    unknown = np.full((5, 3), np.nan)
+    gnss = Gnss(
+        GnssSettings(),
+        np.arange(5.0),
+        geodetic,
+        rng.normal(0.0, 3.0, (5, 3)),
+        unknown,
+        unknown.copy(),
+    )
+    motion = random_motion()
+    values = {"gnss_lever_arm_m": np.array([0.3, -1.5, 4.0])}
+    for o in gnss.observations(LocalFrame(0.6, 2.1, 0.0)):
+        # Positions of 3e5 m leave central differences of 1e-6 with 1e-4 of noise.
+        shift = 0.0 if o.label == "GNSS velocity" else o.measured_n
+        near = replace(motion, p_n=motion.p_n + shift)
+        check_jacobians(o, near, values, gnss.parameters(), tolerance=1e-4)
+
+
+# Heading east: right is south, forward is east, up is up. Columns are the body axes in n.
+EAST = np.array([[[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]])
+QUARTER = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+
+
+def hand_motion():
+    zero = np.zeros((1, 3))
+    return Motion(
+        nRb=EAST,
+        p_n=np.array([[10.0, 20.0, 30.0]]),
+        v_n=np.array([[2.0, 0.0, 0.0]]),
+        omega_eb_b=np.array([[0.0, 0.0, 0.1]]),
+        a_n=zero,
+        alpha_b=zero,
+        omega_sigma=zero + 1e-3,
+    )
+
+
+def test_dvl_velocity_by_hand():
+    # 2 m/s east is (0, 2, 0) in body. w x l = (0, 0, 0.1) x (1, 2, 3) = (-0.2, 0.1, 0).
+    # Sum (-0.2, 2.1, 0). A quarter turn about z takes (x, y) to (-y, x): (-2.1, -0.2, 0).
+    # Times 1.01: (-2.121, -0.202, 0). Plus the bias (0.001, 0.002, 0.003):
+    # (-2.12, -0.2, 0.003).
+    values = dvl_values(
+        misalignment_deg=QUARTER,
+        scale_error=np.array([0.01]),
+        lever_arm_m=np.array([1.0, 2.0, 3.0]),
+        dvl_bias_m_s=np.array([0.001, 0.002, 0.003]),
+    )
+    measured = np.array([[-2.0, 0.0, 0.0]])
+    o = DvlVelocity(np.array([7.0]), measured, np.full((1, 3), 0.01))
+    np.testing.assert_allclose(o.residual(hand_motion(), values), [[-0.12, -0.2, 0.003]])
+    # The file's time is 80 ms late.
+    np.testing.assert_allclose(o.true_time(values), [6.92])
+    # Per axis, the x scale acts on d's x: -2.1 · 1.1 = -2.31, -0.2 · 1 = -0.2, 0 · 0.9.
+    values["scale_error"] = np.array([0.1, 0.0, -0.1])
+    np.testing.assert_allclose(o.residual(hand_motion(), values), [[-0.309, -0.198, 0.003]])
+    # Through water that flows 0.5 m/s east the bow moves at 1.5 m/s: (-0.2, 1.6, 0) in
+    # body, (-1.6, -0.2, 0) in d.
+    values["scale_error"] = np.array([0.0])
+    values["current_m_s"] = np.array([0.5, 0.0])
+    np.testing.assert_allclose(o.residual(hand_motion(), values), [[0.401, -0.198, 0.003]])
+
+
+def test_antenna_by_hand():
+    values = {"gnss_lever_arm_m": np.array([1.0, 2.0, 3.0])}
+    std = np.full((1, 3), 0.5)
+    # 1 m right is 1 m south, 2 m forward is 2 m east: the antenna is at (12, 19, 33).
+    # Measured a metre further west; n's east is the level frame's -north.
+    level = QUARTER.T[None]
+    position = AntennaPosition(np.zeros(1), np.array([[11.0, 19.0, 33.0]]), level, std)
+    np.testing.assert_allclose(
+        position.residual(hand_motion(), values), [[0.0, -1.0, 0.0]], atol=1e-14
+    )
+    # w x l = (-0.2, 0.1, 0) in body: 0.2 m/s north and 0.1 m/s east. With 2 m/s east:
+    # (2.1, 0.2, 0) in n, (0.2, -2.1, 0) in level axes.
+    velocity = AntennaVelocity(np.zeros(1), np.zeros((1, 3)), level, std)
+    np.testing.assert_allclose(
+        velocity.residual(hand_motion(), values), [[0.2, -2.1, 0.0]], atol=1e-14
+    )
+
+
+def test_uncertain_rates_add_to_the_noise_through_the_lever_arm():
+    # 1e-3 rad/s on every axis and l = (1, 2, 3): the covariance of w x l has the trace
+    # 1e-6 · 2 · 14, half of which stands across l.
+    values = dvl_values(lever_arm_m=np.array([1.0, 2.0, 3.0]))
+    o = DvlVelocity(np.zeros(1), np.zeros((1, 3)), np.full((1, 3), 3e-3))
+    expected = np.sqrt(9e-6 + 14e-6)
+    np.testing.assert_allclose(o.sigma(hand_motion(), values), np.full((1, 3), expected))
+    draws = np.random.default_rng(0).normal(0.0, 1e-3, (100_000, 3))
+    swept = np.cross(draws, values["lever_arm_m"])
+    across = swept @ np.linalg.svd(values["lever_arm_m"][None])[2][1]
+    found = lever_arm_sigma(hand_motion(), values["lever_arm_m"])
+    np.testing.assert_allclose(found, across.std(), rtol=0.01)
+
+
+def test_a_transposed_rotation_shows():
+    exact, frame, observations = observed(scene())
+    values = dvl_values() | {"gnss_lever_arm_m": np.array([0.3, -1.5, 4.0])}
+
+    def worst(o, motion, changed=None):
+        return np.abs(o.residual(motion, changed or values)).max()
+
+    for label in ("DVL velocity", "GNSS position", "GNSS velocity"):
+        o = observations[label]
+        motion = exact_motion(exact, frame, o.true_time(values))
+        assert worst(o, motion) < 1e-5
+        assert worst(o, replace(motion, nRb=motion.nRb.transpose(0, 2, 1))) > 0.5
+        if label == "DVL velocity":
+            wrong = {**values, "misalignment_deg": values["misalignment_deg"].T}
+            assert worst(o, motion, wrong) > 0.5
+        else:
+            # lRn turns by half a degree here: 4 m/s · 0.02; of a position, whose axes are
+            # those of n, only its residual turns.
+            shifted = replace(motion, p_n=motion.p_n + 100.0)
+            transposed = replace(o, lRn=o.lRn.transpose(0, 2, 1))
+            turned = transposed.residual(shifted, values) - o.residual(shifted, values)
+            assert np.abs(turned).max() > 0.02
+
+
+def test_a_receiver_without_position_keeps_the_level_axes_of_its_last_fix():
+    frame = LocalFrame(0.6, 2.1, 0.0)
+    nan = np.nan
+    geodetic = np.array([[nan] * 3, [0.61, 2.12, 0.0], [nan] * 3])
+    gnss = Gnss(
+        GnssSettings(),
+        np.arange(3.0),
+        geodetic,
+        np.ones((3, 3)),
+        np.full((3, 3), nan),
+        np.full((3, 3), nan),
+    )
+    position, velocity = gnss.observations(frame)
+    assert position.time.tolist() == [1.0]
+    expected = frame.level_from_tangent(0.61, 2.12)
+    np.testing.assert_allclose(velocity.lRn, np.tile(expected, (3, 1, 1)))

@@ -1,0 +1,108 @@
+"""Whether what a replay claims is honest along the way: many seeds, at several times.
+
+    pytest -m slow tests/test_replay_monte_carlo.py
+
+runs 20 seeds of each scenario; FACTORGRAPH_DVL_SEEDS runs another number.
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from truth import config
+from workers import in_two_processes
+
+from factorgraph_dvl.analysis.error_statistics import motion_errors, nees_band, true_value_of
+from factorgraph_dvl.replay import Replay
+from factorgraph_dvl.sensors.protocol import rows_of
+from factorgraph_dvl.simulation import simulate
+from factorgraph_dvl.solvers.batch import solve
+
+pytestmark = pytest.mark.slow
+
+RUNS = int(os.environ.get("FACTORGRAPH_DVL_SEEDS", "20"))
+# Two-sided probability that the mean NEES of an honest filter leaves its band.
+_RARE = 0.003
+TIMES = {
+    "seed-a-phase-0": (40.0, 60.0, 90.0, 130.0, 180.0, 250.0, 350.0, 453.0),
+    "seed-a-phase-90": (40.0, 60.0, 90.0, 130.0, 180.0, 250.0, 350.0, 453.0),
+    "cruise": (60.0, 100.0, 200.0, 300.0, 450.0, 600.0, 900.0, 1200.0),
+}
+# Of 4800 s.
+END = 1200.0
+DVL = 7
+
+
+@dataclass(frozen=True)
+class Run:
+    """Of one seed: NEES of the DVL's components and of the motion at some times, and the end."""
+
+    nees: np.ndarray
+    motion: np.ndarray
+    apart: np.ndarray
+    started: float
+
+
+def up_to(trial, end):
+    gnss, dvl = (rows_of(aid, aid.time < end) for aid in (trial.gnss, trial.dvl))
+    return replace(trial, imu=rows_of(trial.imu, trial.imu.time < end), gnss=gnss, dvl=dvl)
+
+
+def one(job):
+    name, seed = job
+    trial = up_to(simulate(config(name, reference_rate_hz=100), seed), END)
+    session, updates = Replay(trial, rate_hz=1.0), []
+    imu = trial.imu
+    edges = np.arange(0.0, imu.time[-1] + 1.0, 1.0)
+    for a, b in pairwise(edges):
+        for section in ("gnss", "dvl"):
+            aid = getattr(trial, section)
+            inside = np.flatnonzero((aid.time > a) & (aid.time <= b))
+            if inside.size:
+                session.add(rows_of(aid, inside))
+        inside = (imu.time > a) & (imu.time <= b)
+        updates += session.add_imu(imu.time[inside], imu.gyro[inside], imu.accel[inside])
+    updates += session.finish()
+    time = np.array([u.time for u in updates])
+    nees, motion = [], []
+    for at in TIMES[name]:
+        u = updates[int(np.argmin(np.abs(time - at)))]
+        estimates = u.calibration.estimates
+        truth = [true_value_of(e, trial.calibration_truth) for e in estimates]
+        error = np.concatenate([e.value - t for e, t in zip(estimates, truth, strict=True)])[:DVL]
+        P = u.calibration.covariance[:DVL, :DVL]
+        nees.append(error @ np.linalg.solve(P, error))
+        errors = motion_errors(u.state, trial.reference)
+        motion.append([v.nees[0] for v in (errors.position, errors.velocity, errors.attitude)])
+    batch = solve(trial)
+    value = np.concatenate([e.value for e in batch.estimates])
+    last = np.concatenate([e.value for e in updates[-1].calibration.estimates])
+    apart = (last - value) / np.sqrt(np.diag(batch.covariance))
+    return Run(np.array(nees), np.array(motion), apart, time[0])
+
+
+@pytest.fixture(scope="module", params=TIMES)
+def runs(request):
+    return in_two_processes(one, [(request.param, seed) for seed in range(RUNS)])
+
+
+def test_every_run_starts_soon_and_ends_where_the_batch_solver_does(runs):
+    assert max(r.started for r in runs) < 40.0
+    worst = np.max(np.abs([r.apart for r in runs]), axis=0)
+    assert np.all(worst < 0.3), worst
+
+
+def test_the_calibration_is_as_good_as_stated_all_along(runs):
+    low, high = nees_band(DVL, len(runs), 1.0 - _RARE)
+    mean = np.mean([r.nees for r in runs], axis=0)
+    assert np.all((mean > low) & (mean < high)), mean
+
+
+def test_the_motion_is_as_good_as_stated_all_along(runs):
+    low, high = nees_band(3, len(runs), 1.0 - _RARE)
+    mean = np.mean([r.motion for r in runs], axis=0)
+    assert np.all((mean > low) & (mean < high)), mean
