@@ -32,13 +32,19 @@ class Trajectory:
 
     Parameters
     ----------
-    time : (M,) s.
-    geodetic : (M, 3) latitude, longitude (rad), ellipsoidal height (m).
-    velocity : (M, 3) local-level east, north, up, m/s.
-    rph : (M, 3) roll, pitch, heading, rad.
-    position_cov : (M, 3, 3) local-level east, north, up, m².
-    velocity_cov : (M, 3, 3) local-level east, north, up, m²/s².
-    rph_cov : (M, 3, 3) roll, pitch, heading, rad².
+    time : ndarray, shape (M,), s
+    geodetic : ndarray, shape (M, 3)
+        Latitude, longitude (rad), ellipsoidal height (m).
+    velocity : ndarray, shape (M, 3)
+        Local-level east, north, up, m/s.
+    rph : ndarray, shape (M, 3)
+        Roll, pitch, heading, rad.
+    position_cov : ndarray, shape (M, 3, 3)
+        Local-level east, north, up, m².
+    velocity_cov : ndarray, shape (M, 3, 3)
+        Local-level east, north, up, m²/s².
+    rph_cov : ndarray, shape (M, 3, 3)
+        Roll, pitch, heading, rad².
     """
 
     time: Array
@@ -75,14 +81,19 @@ class Estimate:
 
     Parameters
     ----------
-    name : as in calibration.json, e.g. `misalignment_deg`.
-    component_names : as in `covariance.order`.
-    value, std : (n,) in the unit of the name.
-    prior_value, prior_std : (n,) what was known before.
-    observable : (n,) bool, whether the data at least halved the prior's standard
-        deviation.
-    nominal : (N, 3) unit vectors, if the parameter is N directions: the n = 2 N components
-        turn them, in deg (`directions`). None for all other parameters.
+    name : str
+        As in calibration.json, e.g. `misalignment_deg`.
+    component_names : tuple of str
+        As in `covariance.order`.
+    value, std : ndarray, shape (n,)
+        In the unit of the name.
+    prior_value, prior_std : ndarray, shape (n,)
+        What was known before.
+    observable : ndarray, shape (n,)
+        Bool, whether the data at least halved the prior's standard deviation.
+    nominal : ndarray, shape (N, 3), optional
+        Unit vectors, if the parameter is N directions: the n = 2 N components turn them, in deg
+        (`directions`). None for all other parameters.
     """
 
     name: str
@@ -107,11 +118,15 @@ class Residuals:
 
     Parameters
     ----------
-    label, unit : of the measurement.
-    components : names of the d components.
-    time : (M,) s.
-    residual : (M, d) predicted - measured; nan where a component was not measured.
-    sigma : (M, d) standard deviation of the measurement; likewise.
+    label, unit : str
+        Of the measurement.
+    components : tuple of str
+        Names of the d components.
+    time : ndarray, shape (M,), s
+    residual : ndarray, shape (M, d)
+        Predicted - measured; nan where a component was not measured.
+    sigma : ndarray, shape (M, d)
+        Standard deviation of the measurement; likewise.
     """
 
     label: str
@@ -128,11 +143,16 @@ class Hypothesis:
 
     Parameters
     ----------
-    weight : normalised likelihood at the end, among all hypotheses.
-    born : time of the last data when it was found, s.
-    died : time of the data since which its weight is nil, s; None if it still has some.
-    trajectory : the motion, up to the end or to its death; covariances are its own.
-    history : (H, 2) time, s, and weight.
+    weight : float
+        Normalised likelihood at the end, among all hypotheses.
+    born : float
+        Time of the last data when it was found, s.
+    died : float or None
+        Time of the data since which its weight is nil, s; None if it still has some.
+    trajectory : Trajectory
+        The motion, up to the end or to its death; covariances are its own.
+    history : ndarray, shape (H, 2)
+        Time, s, and weight.
     """
 
     weight: float
@@ -148,21 +168,33 @@ class Solution:
 
     Parameters
     ----------
-    trial, solver : names.
-    body_axes : axes of the body quantities.
-    converged : whether the solver reached a minimum.
-    iterations : that it took.
-    cost : half the sum of squared whitened residuals, at the solution.
-    estimates : the calibration parameters that were estimated.
-    covariance : (P, P) joint covariance of all their components, in reported units, in
-        the order of `estimates`.
-    trajectory : the motion.
-    residuals : of each sensor.
-    warnings : what the user must know.
-    hypotheses : where the data allow, or for some time allowed, more than one trajectory:
-        all of them, the heaviest first, which is the solution's; else empty.
-    rejected : measurements that are none, such as echoes.
-    inputs : fingerprints of the data that it came from.
+    trial, solver : str
+        Names.
+    body_axes : BodyAxes
+        Axes of the body quantities.
+    converged : bool
+        Whether the solver reached a minimum.
+    iterations : int
+        That it took.
+    cost : float
+        Half the sum of squared whitened residuals, at the solution.
+    estimates : tuple of Estimate
+        The calibration parameters that were estimated.
+    covariance : ndarray, shape (P, P)
+        Joint covariance of all their components, in reported units, in the order of `estimates`.
+    trajectory : Trajectory
+        The motion.
+    residuals : tuple of Residuals, optional
+        Of each sensor.
+    warnings : tuple of str, optional
+        What the user must know.
+    hypotheses : tuple of Hypothesis, optional
+        Where the data allow, or for some time allowed, more than one trajectory: all of them, the
+        heaviest first, which is the solution's; else empty.
+    rejected : tuple of Residuals, optional
+        Measurements that are none, such as echoes.
+    inputs : tuple of str, optional
+        Fingerprints of the data that it came from.
     """
 
     trial: str
@@ -235,8 +267,10 @@ def not_observable(estimate: Estimate, why: Callable[[int], str]) -> list[str]:
 
     Parameters
     ----------
-    estimate : of which components that were held are left out.
-    why : the reason of a component, by its index.
+    estimate : Estimate
+        Of which components that were held are left out.
+    why : callable of int, str
+        The reason of a component, by its index.
     """
     reasons: dict[str, list[str]] = {}
     for i in np.flatnonzero(~estimate.observable & (estimate.prior_std > 0.0)):
@@ -321,7 +355,8 @@ def contradictions(residuals: Sequence[Residuals]) -> list[str]:
 
     Parameters
     ----------
-    residuals : with standard deviations that include those of the states, or innovations.
+    residuals : sequence of Residuals
+        With standard deviations that include those of the states, or innovations.
     """
     out = []
     for r in residuals:
@@ -346,8 +381,10 @@ def mixed(trajectories: Sequence[Trajectory], weights: Array) -> Trajectory:
 
     Parameters
     ----------
-    trajectories : of the same epochs.
-    weights : (T,) likelihoods.
+    trajectories : sequence of Trajectory
+        Of the same epochs.
+    weights : ndarray, shape (T,)
+        Likelihoods.
     """
     first = trajectories[0]
     if len(trajectories) == 1:
@@ -401,10 +438,13 @@ def joined(
 
     Parameters
     ----------
-    solutions : of the living hypotheses.
-    against : (S,) negative logarithms of their likelihoods, relative to the best.
-    hypotheses : what the search for a start found: the living, in the order of `solutions`,
-        then the dead. Empty if there was no search.
+    solutions : sequence of Solution
+        Of the living hypotheses.
+    against : ndarray, shape (S,)
+        Negative logarithms of their likelihoods, relative to the best.
+    hypotheses : sequence of Hypothesis
+        What the search for a start found: the living, in the order of `solutions`, then the dead.
+        Empty if there was no search.
     """
     if len(solutions) == 1 and len(hypotheses) < 2:
         return solutions[0]
@@ -430,8 +470,10 @@ def not_told_apart(solutions: Sequence[Solution], against: Array) -> Solution:
 
     Parameters
     ----------
-    solutions : at the minima, with the same estimates and epochs.
-    against : (S,) negative logarithms of their probabilities.
+    solutions : sequence of Solution
+        At the minima, with the same estimates and epochs.
+    against : ndarray, shape (S,)
+        Negative logarithms of their probabilities.
     """
     order = [i for i in np.argsort(against) if against[i] - against.min() < _IMPOSSIBLE]
     best = solutions[order[0]]

@@ -31,8 +31,10 @@ class InitialPosition:
 
     Parameters
     ----------
-    geodetic : (3,) latitude, longitude (rad), ellipsoidal height (m).
-    std : (3,) east, north, up, m.
+    geodetic : ndarray, shape (3,)
+        Latitude, longitude (rad), ellipsoidal height (m).
+    std : ndarray, shape (3,)
+        East, north, up, m.
     """
 
     geodetic: Array
@@ -45,8 +47,9 @@ class InitialAttitude:
 
     Parameters
     ----------
-    rph : (3,) roll, pitch, heading, rad.
-    std : (3,) rad.
+    rph : ndarray, shape (3,)
+        Roll, pitch, heading, rad.
+    std : ndarray, shape (3,), rad
     """
 
     rph: Array
@@ -59,10 +62,13 @@ class Reference:
 
     Parameters
     ----------
-    time : (M,) s.
-    geodetic : (M, 3) latitude, longitude (rad), ellipsoidal height (m) of the IMU.
-    velocity : (M, 3) local-level east, north, up, m/s.
-    rph : (M, 3) roll, pitch, heading, rad.
+    time : ndarray, shape (M,), s
+    geodetic : ndarray, shape (M, 3)
+        Latitude, longitude (rad), ellipsoidal height (m) of the IMU.
+    velocity : ndarray, shape (M, 3)
+        Local-level east, north, up, m/s.
+    rph : ndarray, shape (M, 3)
+        Roll, pitch, heading, rad.
     """
 
     time: Array
@@ -77,18 +83,26 @@ class Trial:
 
     Parameters
     ----------
-    name : of the trial.
-    imu : the IMU; a trial without one cannot be smoothed.
-    gnss, dvl : the sensors that a calibration needs, None where the trial does not have
-        them.
-    others : all further sensors.
-    body_axes : axes in which all body quantities are given.
-    epoch : UTC of time zero, ISO 8601; empty if not given.
+    name : str
+        Of the trial.
+    imu : Imu
+        The IMU; a trial without one cannot be smoothed.
+    gnss, dvl : Gnss or Dvl
+        The sensors that a calibration needs, None where the trial does not have them.
+    others : tuple of Aid, optional
+        All further sensors.
+    body_axes : BodyAxes, optional
+        Axes in which all body quantities are given.
+    epoch : str, optional
+        UTC of time zero, ISO 8601; empty if not given.
     initial_attitude, initial_position : priors; None = found from the data.
-    reference : truth or a trusted solution, None if there is none.
-    calibration_truth : true values of calibration parameters by reported name, in
-        reported units; empty outside simulations.
-    notes : what was noticed while loading, for the user.
+    reference : Reference, optional
+        Truth or a trusted solution, None if there is none.
+    calibration_truth : dict of str to ndarray, optional
+        True values of calibration parameters by reported name, in reported units; empty outside
+        simulations.
+    notes : tuple of str, optional
+        What was noticed while loading, for the user.
     """
 
     name: str
@@ -198,14 +212,20 @@ class PlanarTrial:
 
     Parameters
     ----------
-    name : of the trial.
+    name : str
+        Of the trial.
     heading, log, depth, beacons : the records.
-    body_axes : axes in which lever arms are given.
-    initial_position : prior; None = found from the ranges.
-    reference : truth or a trusted solution, None if there is none.
-    calibration_truth : true values of what is estimated, by reported name, in reported
-        units; empty outside simulations.
-    notes : what was noticed while loading, for the user.
+    body_axes : BodyAxes, optional
+        Axes in which lever arms are given.
+    initial_position : InitialPosition, optional
+        Prior; None = found from the ranges.
+    reference : Reference, optional
+        Truth or a trusted solution, None if there is none.
+    calibration_truth : dict of str to ndarray, optional
+        True values of what is estimated, by reported name, in reported units; empty outside
+        simulations.
+    notes : tuple of str, optional
+        What was noticed while loading, for the user.
     """
 
     name: str

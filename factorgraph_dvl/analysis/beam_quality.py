@@ -33,10 +33,11 @@ class BeamCalibration:
 
     Parameters
     ----------
-    directions_d, directions_b : (N, 3) unit vectors in the instrument's axes and in body;
-        between both is the nominal misalignment.
-    scale_error : (N,).
-    lever_arm : (3,) m.
+    directions_d, directions_b : ndarray, shape (N, 3)
+        Unit vectors in the instrument's axes and in body; between both is the nominal
+        misalignment.
+    scale_error : ndarray, shape (N,)
+    lever_arm : ndarray, shape (3,), m
     """
 
     directions_d: Array
@@ -56,13 +57,19 @@ class BeamQuality:
 
     Parameters
     ----------
-    time : (M,) s.
-    valid : (M,) number of beams that were received.
-    velocity : (M, 3) by least squares over all of them, in d, m/s; nan below three.
-    groups : names of the groups of three beams, such as `123`.
-    group_velocity : (M, G, 3) in d, m/s; nan where a beam of the group was lost.
-    error_velocity : (M,) m/s; nan below four beams.
-    error_sigma : (M,) what the noise of the beams makes of it.
+    time : ndarray, shape (M,), s
+    valid : ndarray, shape (M,)
+        Number of beams that were received.
+    velocity : ndarray, shape (M, 3)
+        By least squares over all of them, in d, m/s; nan below three.
+    groups : tuple of str
+        Names of the groups of three beams, such as `123`.
+    group_velocity : ndarray, shape (M, G, 3)
+        In d, m/s; nan where a beam of the group was lost.
+    error_velocity : ndarray, shape (M,)
+        m/s; nan below four beams.
+    error_sigma : ndarray, shape (M,)
+        What the noise of the beams makes of it.
     """
 
     time: Array
@@ -94,8 +101,10 @@ def calibration_of(beams: DvlBeams, solution: Solution | Calibration) -> BeamCal
 
     Parameters
     ----------
-    beams : of the trial.
-    solution : of it, in either parametrisation.
+    beams : DvlBeams
+        Of the trial.
+    solution : Solution or Calibration
+        Of it, in either parametrisation.
 
     Raises
     ------
@@ -112,10 +121,12 @@ def beam_calibration(
 
     Parameters
     ----------
-    beams : of the trial; what `values` leave out of scale and lever arm is as its settings
-        have it.
-    values : by name as in calibration.json, in reported units; directions as (N, 3) vectors.
-    source : of the values, for messages.
+    beams : DvlBeams
+        Of the trial; what `values` leave out of scale and lever arm is as its settings have it.
+    values : mapping of str to ndarray
+        By name as in calibration.json, in reported units; directions as (N, 3) vectors.
+    source : str, default 'calibration'
+        Of the values, for messages.
 
     Raises
     ------
@@ -160,9 +171,12 @@ def check_same_instrument(beams: DvlBeams, calibration: BeamCalibration, source:
 
     Parameters
     ----------
-    beams : of the trial, with nominal directions and what they may be off by.
-    calibration : of them, or of another instrument.
-    source : of the calibration, for messages.
+    beams : DvlBeams
+        Of the trial, with nominal directions and what they may be off by.
+    calibration : BeamCalibration
+        Of them, or of another instrument.
+    source : str
+        Of the calibration, for messages.
     """
     s = beams.settings
     std = s.misalignment_std_deg
@@ -185,8 +199,10 @@ def beam_quality(beams: DvlBeams, calibration: BeamCalibration) -> BeamQuality:
 
     Parameters
     ----------
-    beams : the record.
-    calibration : of them.
+    beams : DvlBeams
+        The record.
+    calibration : BeamCalibration
+        Of them.
     """
     gain, sigma = calibration.gain_d, beams.sigma()
     # Unit rows across all beams spread the error velocity's variance over them evenly.

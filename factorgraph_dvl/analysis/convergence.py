@@ -32,11 +32,14 @@ class ComponentConvergence:
 
     Parameters
     ----------
-    name : of the component.
-    good_std, good_error : limits, in its unit.
-    std_since : time from which on its standard deviation stayed below the limit, s; nan =
-        never.
-    error_since : the same of its error against the truth; nan also where that is unknown.
+    name : str
+        Of the component.
+    good_std, good_error : float
+        Limits, in its unit.
+    std_since : float
+        Time from which on its standard deviation stayed below the limit, s; nan = never.
+    error_since : float
+        The same of its error against the truth; nan also where that is unknown.
     """
 
     name: str
@@ -52,9 +55,11 @@ class Convergence:
 
     Parameters
     ----------
-    components : those with a limit.
-    good_since : time from which on all standard deviations stayed below their limits, and no
-        measurements were in doubt, s; nan = never.
+    components : tuple of ComponentConvergence
+        Those with a limit.
+    good_since : float
+        Time from which on all standard deviations stayed below their limits, and no measurements
+        were in doubt, s; nan = never.
     """
 
     components: tuple[ComponentConvergence, ...]
@@ -75,12 +80,17 @@ def convergence(
 
     Parameters
     ----------
-    time : (H,) s.
-    values, std : (H, n) what was known then, in the order of `estimates`.
-    doubted : (H,) whether the standard deviations were not to be trusted.
-    estimates : at the end.
-    truth : true values by reported name; may be empty.
-    good_std, good_error : limits by reported name, in its unit.
+    time : ndarray, shape (H,), s
+    values, std : ndarray, shape (H, n)
+        What was known then, in the order of `estimates`.
+    doubted : ndarray, shape (H,)
+        Whether the standard deviations were not to be trusted.
+    estimates : sequence of Estimate
+        At the end.
+    truth : mapping of str to array_like
+        True values by reported name; may be empty.
+    good_std, good_error : mapping of str to float
+        Limits by reported name, in its unit.
 
     """
     out, column = [], 0
@@ -110,8 +120,10 @@ def check_limits(trial: Trial, limits: Iterable[str]) -> None:
 
     Parameters
     ----------
-    trial : whose sensors say what is estimated.
-    limits : reported names.
+    trial : Trial
+        Whose sensors say what is estimated.
+    limits : iterable of str
+        Reported names.
     """
     sensors = (trial.imu.parameters(0.0), *(aid.parameters() for aid in trial.aids))
     known = [p.name for parameters in sensors for p in parameters if p.estimated]

@@ -35,8 +35,10 @@ class VectorErrors:
 
     Parameters
     ----------
-    error : (M, 3) estimate - truth.
-    covariance : (M, 3, 3) in the squared unit of `error`.
+    error : ndarray, shape (M, 3)
+        Estimate - truth.
+    covariance : ndarray, shape (M, 3, 3)
+        In the squared unit of `error`.
     """
 
     error: Array
@@ -64,11 +66,15 @@ class TrajectoryErrors:
 
     Parameters
     ----------
-    time : (M,) s.
-    epochs : (M,) indices of these epochs in the trajectory.
-    position : local-level east, north, up, m.
-    velocity : local-level east, north, up, m/s.
-    attitude : roll, pitch, heading, rad; each difference in [-pi, pi).
+    time : ndarray, shape (M,), s
+    epochs : ndarray of np.intp, shape (M,)
+        Indices of these epochs in the trajectory.
+    position : VectorErrors
+        Local-level east, north, up, m.
+    velocity : VectorErrors
+        Local-level east, north, up, m/s.
+    attitude : VectorErrors
+        Roll, pitch, heading, rad; each difference in [-pi, pi).
     """
 
     time: Array
@@ -84,10 +90,14 @@ class CalibrationErrors:
 
     Parameters
     ----------
-    names : of the n components, as in `covariance.order`.
-    estimate, truth, error : (n,) in reported units; error = estimate - truth.
-    covariance : (n, n) joint covariance of the components.
-    observable : (n,) bool.
+    names : tuple of str
+        Of the n components, as in `covariance.order`.
+    estimate, truth, error : ndarray, shape (n,)
+        In reported units; error = estimate - truth.
+    covariance : ndarray, shape (n, n)
+        Joint covariance of the components.
+    observable : ndarray of bool, shape (n,)
+        Bool.
     """
 
     names: tuple[str, ...]
@@ -139,8 +149,10 @@ def trajectory_errors(solution: Solution, reference: Reference) -> TrajectoryErr
 
     Parameters
     ----------
-    solution : its trajectory has N epochs.
-    reference : truth or a trusted solution.
+    solution : Solution
+        Its trajectory has N epochs.
+    reference : Reference
+        Truth or a trusted solution.
 
     Returns
     -------
@@ -188,8 +200,10 @@ def calibration_errors(solution: Solution, truth: Mapping[str, ArrayLike]) -> Ca
 
     Parameters
     ----------
-    solution : its estimates are compared.
-    truth : true values by reported name, (n,) each, in reported units.
+    solution : Solution
+        Its estimates are compared.
+    truth : mapping of str to array_like
+        True values by reported name, (n,) each, in reported units.
     """
     names: list[str] = []
     values: list[Array] = []
@@ -224,8 +238,10 @@ def true_value_of(estimate: Estimate, truth: Mapping[str, ArrayLike]) -> Array |
 
     Parameters
     ----------
-    estimate : of n components.
-    truth : true values by reported name, in reported units; of directions (N, 3) vectors.
+    estimate : Estimate
+        Of n components.
+    truth : mapping of str to array_like
+        True values by reported name, in reported units; of directions (N, 3) vectors.
     """
     if estimate.name not in truth:
         return None
@@ -251,9 +267,12 @@ def nees_band(dof: int, runs: int, level: float = 0.95) -> tuple[float, float]:
 
     Parameters
     ----------
-    dof : number of components.
-    runs : number of independent runs that the mean is taken over.
-    level : probability that the mean lies inside.
+    dof : int
+        Number of components.
+    runs : int
+        Number of independent runs that the mean is taken over.
+    level : float, default 0.95
+        Probability that the mean lies inside.
     """
     total = float(dof * runs)
     tail = (1.0 - level) / 2.0
@@ -269,8 +288,10 @@ def paper_accuracy(estimates: Iterable[Estimate], truth: Mapping[str, ArrayLike]
 
     Parameters
     ----------
-    estimates : those of other parameters are ignored.
-    truth : true values by reported name, in reported units.
+    estimates : iterable of Estimate
+        Those of other parameters are ignored.
+    truth : mapping of str to array_like
+        True values by reported name, in reported units.
 
     Returns
     -------

@@ -41,13 +41,16 @@ class InstrumentTerms:
 
     Parameters
     ----------
-    dvl_in_body, body_to_dvl : by order, angles of C_d^b, the attitude of the DVL in the
-        vehicle, and of C_b^d.
-    scale_error, scale_std : (n,) dimensionless.
-    lever_arm, lever_arm_std : (3,) IMU to DVL, forward, starboard, down, m.
-    alignment : (3,) TRDI's EA, EI, EJ, deg: with the axes of TRDI's instrument coordinates
-        for d, C_b^d = Rz(-EA) Ry(EJ) Rx(EI) in forward, starboard, down.
-    alignment_std : (3,) deg.
+    dvl_in_body, body_to_dvl : dict of Order to Angles
+        By order, angles of C_d^b, the attitude of the DVL in the vehicle, and of C_b^d.
+    scale_error, scale_std : ndarray, shape (n,)
+        Dimensionless.
+    lever_arm, lever_arm_std : ndarray, shape (3,)
+        IMU to DVL, forward, starboard, down, m.
+    alignment : ndarray, shape (3,)
+        TRDI's EA, EI, EJ, deg: with the axes of TRDI's instrument coordinates for d, C_b^d =
+        Rz(-EA) Ry(EJ) Rx(EI) in forward, starboard, down.
+    alignment_std : ndarray, shape (3,), deg
     """
 
     dvl_in_body: dict[Order, Angles]

@@ -38,9 +38,12 @@ class BeamPings:
 
     Parameters
     ----------
-    motion : smoothed.
-    nominal_b : (N, 3) directions that eta turns.
-    measured, sigma : (M, N) m/s; nan where a beam was lost.
+    motion : NavigationMotion
+        Smoothed.
+    nominal_b : ndarray, shape (N, 3)
+        Directions that eta turns.
+    measured, sigma : ndarray, shape (M, N)
+        m/s; nan where a beam was lost.
     """
 
     motion: NavigationMotion
@@ -67,7 +70,8 @@ def beam_filter(pings: BeamPings, parameters: tuple[Parameter, ...]) -> Outcome:
     Parameters
     ----------
     pings : BeamPings
-    parameters : directions, scale errors and lever arm, with their priors.
+    parameters : tuple of Parameter
+        Directions, scale errors and lever arm, with their priors.
     """
     prior = prior_of(parameters)
     at = np.concatenate(prior.values)

@@ -61,9 +61,11 @@ class History:
 
     Parameters
     ----------
-    time : (H,) s.
-    names : of the n components, as in `covariance.order`.
-    values, std : (H, n) in reported units.
+    time : ndarray, shape (H,), s
+    names : tuple of str
+        Of the n components, as in `covariance.order`.
+    values, std : ndarray, shape (H, n)
+        In reported units.
     """
 
     time: Array
@@ -100,12 +102,16 @@ def calibrate(
 
     Parameters
     ----------
-    trial : with IMU, GNSS and DVL, or its beams, or star tracker.
-    method : `point-set` (seven states), `nine-state`, `wahba` or `least-squares`, which
-        take beams without a DVL beside them for the velocity that they amount to; `star`;
-        or `beams`, an extended Kalman filter of single beams.
-    rate_hz : rate of the trajectory in the solution.
-    progress : called with stage, iteration and cost (always None here).
+    trial : Trial
+        With IMU, GNSS and DVL, or its beams, or star tracker.
+    method : Method, default 'point-set'
+        `point-set` (seven states), `nine-state`, `wahba` or `least-squares`, which take beams
+        without a DVL beside them for the velocity that they amount to; `star`; or `beams`, an
+        extended Kalman filter of single beams.
+    rate_hz : float, default 10.0
+        Rate of the trajectory in the solution.
+    progress : callable, optional
+        Called with stage, iteration and cost (always None here).
 
     Returns
     -------

@@ -35,9 +35,12 @@ class CoarseAttitude:
 
     Parameters
     ----------
-    nRb : (3, 3), local-level.
-    covariance : (3, 3) of phi in Exp(phi) nRb, rad².
-    note : what the user must know of it; may be empty.
+    nRb : ndarray, shape (3, 3)
+        Local-level.
+    covariance : ndarray, shape (3, 3), rad²
+        Of phi in Exp(phi) nRb.
+    note : str, optional
+        What the user must know of it; may be empty.
     """
 
     nRb: Array
@@ -59,14 +62,19 @@ def coarse_attitude(
 
     Parameters
     ----------
-    time : (K,) s.
-    steps : the K - 1 steps between.
-    geodetic : (K, 3) positions, to 100 m.
-    velocity, sigma : (K, 3) velocities of the antenna, nan where there are none, and the
-        standard deviations, m/s.
-    turning : (K, 3) velocity of the antenna relative to the IMU, in body, m/s.
-    settings : of the IMU.
-    body_axes : of the IMU.
+    time : ndarray, shape (K,), s
+    steps : Steps
+        The K - 1 steps between.
+    geodetic : ndarray, shape (K, 3)
+        Positions, to 100 m.
+    velocity, sigma : ndarray, shape (K, 3)
+        Velocities of the antenna, nan where there are none, and the standard deviations, m/s.
+    turning : ndarray, shape (K, 3)
+        Velocity of the antenna relative to the IMU, in body, m/s.
+    settings : ImuSettings
+        Of the IMU.
+    body_axes : BodyAxes
+        Of the IMU.
     """
     body, turn = _in_first_body_axes(steps)
     body = body + rotate(turn, turning)

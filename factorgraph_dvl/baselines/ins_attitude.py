@@ -33,9 +33,12 @@ def sins(
 
     Parameters
     ----------
-    trial : with IMU and GNSS.
-    align_s : s from the first fix on of which GNSS is used; all by default.
-    rate_hz : of the motion.
+    trial : Trial
+        With IMU and GNSS.
+    align_s : float, optional
+        S from the first fix on of which GNSS is used; all by default.
+    rate_hz : float, default 10.0
+        Of the motion.
 
     Raises
     ------
@@ -64,8 +67,10 @@ def _with_held_height(gnss: Gnss, running: Array) -> Gnss:
 
     Parameters
     ----------
-    gnss : with fixes.
-    running : (M,) times of the IMU's samples, s: elsewhere no height need be held.
+    gnss : Gnss
+        With fixes.
+    running : ndarray, shape (M,)
+        Times of the IMU's samples, s: elsewhere no height need be held.
     """
     fixes = np.flatnonzero(~np.isnan(gnss.geodetic[:, 0]))
     time = gnss.time[fixes]

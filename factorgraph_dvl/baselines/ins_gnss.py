@@ -35,11 +35,15 @@ class FilterState:
 
     Parameters
     ----------
-    geodetic : (3,) latitude, longitude (rad), height (m).
-    velocity : (3,) local-level, m/s.
-    nRb : (3, 3).
-    gyro_bias, accel_bias : (3,) rad/s, m/s².
-    covariance : (15, 15) of the errors.
+    geodetic : ndarray, shape (3,)
+        Latitude, longitude (rad), height (m).
+    velocity : ndarray, shape (3,), m/s
+        Local-level.
+    nRb : ndarray, shape (3, 3)
+    gyro_bias, accel_bias : ndarray, shape (3,), m/s²
+        rad/s.
+    covariance : ndarray, shape (15, 15)
+        Of the errors.
     """
 
     geodetic: Array
@@ -56,10 +60,14 @@ class Fixes:
 
     Parameters
     ----------
-    geodetic, velocity : (K, 3) of the antenna.
-    position_variance, velocity_variance : (K, 3) east, north, up.
-    turning : (K, 3) reading of the gyros, without what the body turns on its carrier, rad/s.
-    lever_arm : (3,) or (K, 3) of the antenna, in body, m.
+    geodetic, velocity : ndarray, shape (K, 3)
+        Of the antenna.
+    position_variance, velocity_variance : ndarray, shape (K, 3)
+        East, north, up.
+    turning : ndarray, shape (K, 3)
+        Reading of the gyros, without what the body turns on its carrier, rad/s.
+    lever_arm : ndarray, shape (3,) or (K, 3)
+        Of the antenna, in body, m.
     """
 
     geodetic: Array
@@ -76,11 +84,14 @@ class FilteredTrack:
 
     Parameters
     ----------
-    time : (K,) s.
-    geodetic, velocity, nRb, gyro_bias, accel_bias : (K, ...) as in `FilterState`.
-    covariance : (K, 15, 15).
-    pull : (K, 3) gravity less Coriolis terms over the step that follows, m/s².
-    spin : (K, 3) rate of the local-level axes over that step, rad/s.
+    time : ndarray, shape (K,), s
+    geodetic, velocity, nRb, gyro_bias, accel_bias : ndarray, shape (K, ...)
+        As in `FilterState`.
+    covariance : ndarray, shape (K, 15, 15)
+    pull : ndarray, shape (K, 3), m/s²
+        Gravity less Coriolis terms over the step that follows.
+    spin : ndarray, shape (K, 3), rad/s
+        Rate of the local-level axes over that step.
     """
 
     time: Array
@@ -100,10 +111,14 @@ class Forward:
 
     Parameters
     ----------
-    track : filtered states, after the measurement of each event.
-    transition : (K, 15, 15) of the step that ends at each event; the first is not used.
-    predicted : (K, 15, 15) covariance before the measurement.
-    correction : (K, 15) errors that the measurement fed back.
+    track : FilteredTrack
+        Filtered states, after the measurement of each event.
+    transition : ndarray, shape (K, 15, 15)
+        Of the step that ends at each event; the first is not used.
+    predicted : ndarray, shape (K, 15, 15)
+        Covariance before the measurement.
+    correction : ndarray, shape (K, 15)
+        Errors that the measurement fed back.
     """
 
     track: FilteredTrack
@@ -119,12 +134,17 @@ def run_filter(
 
     Parameters
     ----------
-    time : (K,) of the events, s.
-    steps : the K - 1 steps between them.
-    fixes : GNSS measurements at the events.
-    start : state at the first event.
-    walk_psd : power spectral densities of the random walks of gyro and accelerometer
-        bias, rad²/s³, m²/s⁵.
+    time : ndarray, shape (K,), s
+        Of the events.
+    steps : Steps
+        The K - 1 steps between them.
+    fixes : Fixes
+        GNSS measurements at the events.
+    start : FilterState
+        State at the first event.
+    walk_psd : tuple of (float, float)
+        Power spectral densities of the random walks of gyro and accelerometer bias, rad²/s³,
+        m²/s⁵.
     """
     k_events = time.size
     geodetic, velocity = np.empty((k_events, 3)), np.empty((k_events, 3))

@@ -126,9 +126,11 @@ def least_squares(points_at: PointsAt, parameters: Sequence[Parameter]) -> Outco
 
     Parameters
     ----------
-    points_at : returns the point sets for a time offset, s.
-    parameters : misalignment, scale error, lever arm, bias and time offset, with their
-        priors; those with a standard deviation of zero are held.
+    points_at : PointsAt
+        Returns the point sets for a time offset, s.
+    parameters : sequence of Parameter
+        Misalignment, scale error, lever arm, bias and time offset, with their priors; those with a
+        standard deviation of zero are held.
     """
     parameters = tuple(parameters)
     prior = prior_of(parameters)

@@ -56,10 +56,14 @@ class Navigation:
 
     Parameters
     ----------
-    samples : increments of the IMU.
-    track : smoothed states at the events of all arcs, one after the other.
-    arc : (K,) arc of each event.
-    notes : what the user must know.
+    samples : StrapdownSamples
+        Increments of the IMU.
+    track : FilteredTrack
+        Smoothed states at the events of all arcs, one after the other.
+    arc : ndarray, shape (K,)
+        Arc of each event.
+    notes : tuple of str
+        What the user must know.
     """
 
     samples: StrapdownSamples
@@ -74,15 +78,21 @@ class NavigationMotion:
 
     Parameters
     ----------
-    time : (M,) s.
-    geodetic, velocity, nRb : local-level, as in `FilteredTrack`.
-    covariance : (M, 9, 9) of the errors of position, velocity, attitude.
-    v_b : (M, 3) velocity over the Earth in body, m/s.
-    v_b_covariance : (M, 3, 3) m²/s².
-    omega_b : (M, 3) rate relative to the Earth, rad/s.
-    omega_sigma : (M, 3) its standard deviation from the gyro's noise and from motion that
-        the samples do not resolve, rad/s.
-    covered : (M,) whether the trial knows the motion there.
+    time : ndarray, shape (M,), s
+    geodetic, velocity, nRb : ndarray
+        Local-level, as in `FilteredTrack`.
+    covariance : ndarray, shape (M, 9, 9)
+        Of the errors of position, velocity, attitude.
+    v_b : ndarray, shape (M, 3), m/s
+        Velocity over the Earth in body.
+    v_b_covariance : ndarray, shape (M, 3, 3), m²/s²
+    omega_b : ndarray, shape (M, 3), rad/s
+        Rate relative to the Earth.
+    omega_sigma : ndarray, shape (M, 3), rad/s
+        Its standard deviation from the gyro's noise and from motion that the samples do not
+        resolve.
+    covered : ndarray, shape (M,)
+        Whether the trial knows the motion there.
     """
 
     time: Array
@@ -102,8 +112,10 @@ def navigate(trial: Trial, pings: Array) -> Navigation:
 
     Parameters
     ----------
-    trial : with GNSS.
-    pings : (M,) true times of the pings, s.
+    trial : Trial
+        With GNSS.
+    pings : ndarray, shape (M,), s
+        True times of the pings.
 
     Raises
     ------

@@ -50,11 +50,14 @@ def nine_state(
 
     Parameters
     ----------
-    points : the two point sets.
-    misalignment, scale, bias : with their priors; the bias one gets a prior of 0.5 m/s
-        where the trial has none.
-    lever_arm : (3,) of the DVL, m, taken as known.
-    iterated : False = the plain linear filter, about the prior mean.
+    points : Points
+        The two point sets.
+    misalignment, scale, bias : Parameter
+        With their priors; the bias one gets a prior of 0.5 m/s where the trial has none.
+    lever_arm : ndarray, shape (3,)
+        Of the DVL, m, taken as known.
+    iterated : bool, default True
+        False = the plain linear filter, about the prior mean.
     """
     warnings = []
     if not bias.estimated:

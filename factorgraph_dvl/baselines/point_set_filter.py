@@ -56,8 +56,10 @@ def point_set(
 
     Parameters
     ----------
-    points : the two point sets.
-    misalignment, scale, lever_arm : with their priors; one scale for the three axes.
+    points : Points
+        The two point sets.
+    misalignment, scale, lever_arm : Parameter
+        With their priors; one scale for the three axes.
     """
     parameters = (misalignment, scale, lever_arm)
     starts = rotation_starts(misalignment)
@@ -97,8 +99,10 @@ def measurement_matrix(v_b: Array, omega_b: Array) -> Array:
 
     Parameters
     ----------
-    v_b : (M, 3) velocity over the Earth, in body, m/s.
-    omega_b : (M, 3) rate relative to the Earth, rad/s.
+    v_b : ndarray, shape (M, 3)
+        Velocity over the Earth, in body, m/s.
+    omega_b : ndarray, shape (M, 3), rad/s
+        Rate relative to the Earth.
     """
     return np.concatenate([-skew(v_b), v_b[:, :, None], skew(omega_b)], axis=2)
 

@@ -31,13 +31,18 @@ class Points:
 
     Parameters
     ----------
-    time : (M,) true times, s.
-    v_b : (M, 3) velocity of the IMU over the Earth, in body, m/s.
-    v_b_covariance : (M, 3, 3).
-    omega_b : (M, 3) rate relative to the Earth, rad/s.
-    omega_sigma : (M, 3) its standard deviation.
-    v_d : (M, 3) reported by the DVL, in its own axes, m/s.
-    sigma_d : (M, 3).
+    time : ndarray, shape (M,), s
+        True times.
+    v_b : ndarray, shape (M, 3)
+        Velocity of the IMU over the Earth, in body, m/s.
+    v_b_covariance : ndarray, shape (M, 3, 3)
+    omega_b : ndarray, shape (M, 3), rad/s
+        Rate relative to the Earth.
+    omega_sigma : ndarray, shape (M, 3)
+        Its standard deviation.
+    v_d : ndarray, shape (M, 3)
+        Reported by the DVL, in its own axes, m/s.
+    sigma_d : ndarray, shape (M, 3)
     """
 
     time: Array
@@ -86,9 +91,12 @@ class Estimated:
 
     Parameters
     ----------
-    parameters : with their priors.
-    values : of each, (n,); a rotation as its matrix.
-    covariance : joint, stacked; of a rotation R, of delta in R Exp(delta).
+    parameters : tuple of Parameter
+        With their priors.
+    values : tuple of ndarray
+        Of each, (n,); a rotation as its matrix.
+    covariance : ndarray
+        Joint, stacked; of a rotation R, of delta in R Exp(delta).
     """
 
     parameters: tuple[Parameter, ...]
@@ -127,12 +135,18 @@ class Outcome:
 
     Parameters
     ----------
-    estimated : at the end.
-    iterations : passes over the data, or rotations of them.
-    history : time and estimate after some of the pings; empty for closed forms.
-    warnings : what the user must know.
-    unseparated : component names that the data alone do not separate.
-    converged : whether the method reached its end.
+    estimated : Estimated
+        At the end.
+    iterations : int
+        Passes over the data, or rotations of them.
+    history : tuple of tuple of (float, Estimated), optional
+        Time and estimate after some of the pings; empty for closed forms.
+    warnings : tuple of str, optional
+        What the user must know.
+    unseparated : frozenset of str, optional
+        Component names that the data alone do not separate.
+    converged : bool, optional
+        Whether the method reached its end.
     """
 
     estimated: Estimated
@@ -182,8 +196,10 @@ def residuals(points: Points, estimated: Estimated, lever_arm: Array) -> tuple[A
 
     Parameters
     ----------
-    points, estimated : the pings and the calibration.
-    lever_arm : where the calibration has none.
+    points, estimated : Points or Estimated
+        The pings and the calibration.
+    lever_arm : ndarray
+        Where the calibration has none.
     """
     dRb = estimated.value("misalignment", np.eye(3))
     scale = 1.0 + estimated.value("scale_error", np.zeros(1))

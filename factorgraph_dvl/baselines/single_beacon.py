@@ -42,11 +42,14 @@ class Filtered:
 
     Parameters
     ----------
-    time : (U,) s.
-    state : (U, 4) position in n, m, and current, m/s.
-    covariance : (U, 4, 4).
-    velocity : (U, 2) over ground, m/s.
-    innovations : predicted - measured, with the standard deviation of that.
+    time : ndarray, shape (U,), s
+    state : ndarray, shape (U, 4)
+        Position in n, m, and current, m/s.
+    covariance : ndarray, shape (U, 4, 4)
+    velocity : ndarray, shape (U, 2), m/s
+        Over ground.
+    innovations : tuple of Residuals
+        Predicted - measured, with the standard deviation of that.
     """
 
     time: Array
@@ -66,9 +69,12 @@ def filter_planar(
 
     Parameters
     ----------
-    trial : with `initial.position`: the filters cannot find it.
-    method : `4sv-2ob` or `4sv-3ob`.
-    progress : called with stage, iteration and cost.
+    trial : PlanarTrial
+        With `initial.position`: the filters cannot find it.
+    method : Method or str
+        `4sv-2ob` or `4sv-3ob`.
+    progress : callable of str, int, float or None, None, optional
+        Called with stage, iteration and cost.
 
     Returns
     -------
@@ -154,8 +160,10 @@ def run_filter(trial: PlanarTrial, method: Method | str, mean: Array, std: Array
     Parameters
     ----------
     trial : PlanarTrial
-    method : `4sv-2ob` or `4sv-3ob`.
-    mean, std : (2,) position at the start in the trial's frame and its standard deviation, m.
+    method : Method or str
+        `4sv-2ob` or `4sv-3ob`.
+    mean, std : ndarray, shape (2,), m
+        Position at the start in the trial's frame and its standard deviation.
 
     Returns
     -------

@@ -29,8 +29,10 @@ def without_spurious_information(
 
     Parameters
     ----------
-    points, estimated : the pings and the calibration.
-    lever_arm : of the DVL where the calibration has none, m.
+    points, estimated : Points or Estimated
+        The pings and the calibration.
+    lever_arm : ndarray
+        Of the DVL where the calibration has none, m.
     """
     if len(points) == 0:
         return estimated
@@ -79,9 +81,12 @@ def widened(estimated: Estimated, information: Array, noise: Array) -> Estimated
 
     Parameters
     ----------
-    estimated : n components.
-    information : (n, n) of the data, as it seems.
-    noise : (n, n) what noise of the motion adds to it, on average.
+    estimated : Estimated
+        N components.
+    information : ndarray, shape (n, n)
+        Of the data, as it seems.
+    noise : ndarray, shape (n, n)
+        What noise of the motion adds to it, on average.
     """
     sigma = np.concatenate([p.sigma for p in estimated.parameters])
     seeming = _posterior(information, sigma)

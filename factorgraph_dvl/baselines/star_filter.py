@@ -37,9 +37,11 @@ class StarAttitudes:
 
     Parameters
     ----------
-    time : (M,) s.
-    nRb : (M, 3, 3) body to n, by the prior mounting.
-    covariance : (M, 3, 3) of phi in nRb Exp(phi), rad².
+    time : ndarray, shape (M,), s
+    nRb : ndarray, shape (M, 3, 3)
+        Body to n, by the prior mounting.
+    covariance : ndarray, shape (M, 3, 3), rad²
+        Of phi in nRb Exp(phi).
     """
 
     time: Array
@@ -58,10 +60,12 @@ class AttitudeTrack:
 
     Parameters
     ----------
-    time : (K,) s.
-    nRb : (K, 3, 3).
-    drift : (K, 3) of the gyros, rad/s.
-    covariance : (K, 6, 6) of dq and xi.
+    time : ndarray, shape (K,), s
+    nRb : ndarray, shape (K, 3, 3)
+    drift : ndarray, shape (K, 3), rad/s
+        Of the gyros.
+    covariance : ndarray, shape (K, 6, 6)
+        Of dq and xi.
     """
 
     time: Array
@@ -76,10 +80,14 @@ class FilteredDrift:
 
     Parameters
     ----------
-    course : after the measurement at each time.
-    transition : (K, 6, 6) of the step that ends at each time; the first is not used.
-    predicted : (K, 6, 6) covariance before the measurement.
-    correction : (K, 6) what the measurement fed back.
+    course : AttitudeTrack
+        After the measurement at each time.
+    transition : ndarray, shape (K, 6, 6)
+        Of the step that ends at each time; the first is not used.
+    predicted : ndarray, shape (K, 6, 6)
+        Covariance before the measurement.
+    correction : ndarray, shape (K, 6)
+        What the measurement fed back.
     """
 
     course: AttitudeTrack
@@ -128,11 +136,15 @@ def run_filter(
 
     Parameters
     ----------
-    samples : of the IMU.
-    seen : attitudes within the arc.
-    lat : latitude of n, rad; its rate is that of the Earth.
-    drift : (3,) known before, rad/s.
-    drift_covariance : (3, 3).
+    samples : StrapdownSamples
+        Of the IMU.
+    seen : StarAttitudes
+        Attitudes within the arc.
+    lat : float
+        Latitude of n, rad; its rate is that of the Earth.
+    drift : ndarray, shape (3,), rad/s
+        Known before.
+    drift_covariance : ndarray, shape (3, 3)
     """
     steps = compose(samples, seen.time[:-1], seen.time[1:])
     walk = samples.settings.gyro_bias_walk_root_psd**2

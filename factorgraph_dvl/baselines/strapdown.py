@@ -18,12 +18,17 @@ class StrapdownSamples:
 
     Parameters
     ----------
-    increments : Increments of N intervals.
-    turn : (N, 3, 3) rotation over each interval, end to start.
-    dv : (N, 3) velocity increment in the axes at the start, m/s.
-    open_variance : (N + 1, 2) sum, before each interval, of the variances of rotation
-        (rad²) and velocity (m²/s²) that the samples leave open.
-    settings : of the IMU, for its noise.
+    increments : Increments
+        Increments of N intervals.
+    turn : ndarray, shape (N, 3, 3)
+        Rotation over each interval, end to start.
+    dv : ndarray, shape (N, 3), m/s
+        Velocity increment in the axes at the start.
+    open_variance : ndarray, shape (N + 1, 2)
+        Sum, before each interval, of the variances of rotation (rad²) and velocity (m²/s²) that
+        the samples leave open.
+    settings : ImuSettings
+        Of the IMU, for its noise.
     """
 
     increments: Increments
@@ -39,11 +44,15 @@ class Steps:
 
     Parameters
     ----------
-    duration : (M,) s.
-    turn : (M, 3, 3) rotation, body axes at the end to those at the start.
-    dv, dp : (M, 3) first and second integral of the specific force, m/s, m.
-    bias_jacobian : (M, 3, 3) integral of the rotation to the start, s: what a bias adds up to.
-    gyro_variance, accel_variance : (M,) of rotation (rad²) and velocity (m²/s²), per axis.
+    duration : ndarray, shape (M,), s
+    turn : ndarray, shape (M, 3, 3)
+        Rotation, body axes at the end to those at the start.
+    dv, dp : ndarray, shape (M, 3)
+        First and second integral of the specific force, m/s, m.
+    bias_jacobian : ndarray, shape (M, 3, 3)
+        Integral of the rotation to the start, s: what a bias adds up to.
+    gyro_variance, accel_variance : ndarray, shape (M,)
+        Of rotation (rad²) and velocity (m²/s²), per axis.
     """
 
     duration: Array

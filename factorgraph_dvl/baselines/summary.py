@@ -47,9 +47,12 @@ def summarise(
     trial, navigation, outcome : what was solved, and how it ended.
     aid, measured, seen : the sensor that was calibrated, its residuals, and the motion at
         its measurements.
-    solver : name.
-    rate_hz : rate of the trajectory.
-    notes : what is already known to be worth telling.
+    solver : str
+        Name.
+    rate_hz : float
+        Rate of the trajectory.
+    notes : sequence of str
+        What is already known to be worth telling.
     """
     dvl_values, dvl_covariance = outcome.estimated.reported()
     imu = _imu_biases(trial, navigation)
@@ -127,7 +130,8 @@ def dvl_residuals(dvl: Dvl, navigation: Navigation, outcome: Outcome, points: Po
     Parameters
     ----------
     dvl, navigation, outcome : what was calibrated against what, and how it ended.
-    points : the point sets at the prior's time offset.
+    points : Points
+        The point sets at the prior's time offset.
     """
     prior = {p.stem: p.mean for p in dvl.parameters()}
     before = float(prior["time_offset"][0])

@@ -24,9 +24,12 @@ def wahba(points: Points, misalignment: Parameter, scale: Parameter, lever_arm: 
 
     Parameters
     ----------
-    points : the two point sets.
-    misalignment, scale : with their priors.
-    lever_arm : (3,) of the DVL, m, taken as known.
+    points : Points
+        The two point sets.
+    misalignment, scale : Parameter
+        With their priors.
+    lever_arm : ndarray, shape (3,)
+        Of the DVL, m, taken as known.
     """
     parameters = (misalignment, scale)
     prior = prior_of(parameters)

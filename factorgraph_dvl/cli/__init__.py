@@ -11,7 +11,8 @@ def main(argv: list[str] | None = None) -> NoReturn:
 
     Parameters
     ----------
-    argv : arguments; by default those of the process.
+    argv : list of str, optional
+        Arguments; by default those of the process.
     """
     try:
         # Loading takes long enough to be interrupted.

@@ -23,8 +23,10 @@ def errors_in(trial: Trial | PlanarTrial, *, anyway: bool) -> tuple[Finding, ...
 
     Parameters
     ----------
-    trial : as loaded.
-    anyway : go on where records cannot be used.
+    trial : Trial or PlanarTrial
+        As loaded.
+    anyway : bool
+        Go on where records cannot be used.
 
     Raises
     ------

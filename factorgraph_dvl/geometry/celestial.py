@@ -29,10 +29,13 @@ def earth_from_inertial(epoch: str, time: Array, ut1_utc: float = 0.0) -> Array:
 
     Parameters
     ----------
-    epoch : UTC of time zero, ISO 8601.
-    time : (M,) SI seconds since then.
-    ut1_utc : UT1 - UTC at the epoch, s. UT1 is continuous: a leap second within the trial
-        changes nothing.
+    epoch : str
+        UTC of time zero, ISO 8601.
+    time : ndarray, shape (M,)
+        SI seconds since then.
+    ut1_utc : float, default 0.0
+        UT1 - UTC at the epoch, s. UT1 is continuous: a leap second within the trial changes
+        nothing.
 
     Raises
     ------
@@ -87,8 +90,10 @@ def attitudes_from_vectors(
 
     Parameters
     ----------
-    measured, catalogue : (K, 3) unit vectors.
-    first : (M,) first row of each epoch.
+    measured, catalogue : ndarray, shape (K, 3)
+        Unit vectors.
+    first : ndarray, shape (M,)
+        First row of each epoch.
 
     Returns
     -------
@@ -120,8 +125,12 @@ def off_vertical(time: Array, nRb: Array, force_time: Array, force: Array) -> fl
 
     Parameters
     ----------
-    time : (M,) s; nRb : (M, 3, 3) body to east, north, up.
-    force_time : (N,) s; force : (N, 3) specific force in body, m/s².
+    time : ndarray, shape (M,), s
+    nRb : ndarray, shape (M, 3, 3)
+        Body to east, north, up.
+    force_time : ndarray, shape (N,), s
+    force : ndarray, shape (N, 3), m/s²
+        Specific force in body.
     """
     at = np.stack([np.interp(time, force_time, force[:, i]) for i in range(3)], axis=1)
     mean = rotate(nRb, at).mean(axis=0)

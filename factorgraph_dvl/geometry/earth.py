@@ -25,7 +25,8 @@ def radii(lat: ArrayLike) -> tuple[Array, Array]:
 
     Parameters
     ----------
-    lat : (...) geodetic latitude, rad.
+    lat : array_like
+        (...) geodetic latitude, rad.
     """
     root = 1.0 - ECCENTRICITY_SQUARED * np.sin(lat) ** 2
     east = SEMI_MAJOR / np.sqrt(root)
@@ -40,8 +41,10 @@ def normal_gravity(lat: ArrayLike, height: ArrayLike) -> Array:
 
     Parameters
     ----------
-    lat : (...) geodetic latitude, rad.
-    height : (...) above the ellipsoid, m.
+    lat : array_like
+        (...) geodetic latitude, rad.
+    height : array_like
+        (...) above the ellipsoid, m.
     """
     s2 = np.sin(lat) ** 2
     k = (1.0 - FLATTENING) * _GRAVITY_POLE / _GRAVITY_EQUATOR - 1.0
@@ -68,10 +71,13 @@ class LocalFrame:
 
     Parameters
     ----------
-    lat, lon : geodetic latitude and longitude of the origin, rad.
-    height : ellipsoidal height of the origin, m.
-    epoch : UTC of the trial's time zero, ISO 8601, which fixes how the frame lies among the
-        stars at any time; empty if not known.
+    lat, lon : float
+        Geodetic latitude and longitude of the origin, rad.
+    height : float
+        Ellipsoidal height of the origin, m.
+    epoch : str, optional
+        UTC of the trial's time zero, ISO 8601, which fixes how the frame lies among the stars at
+        any time; empty if not known.
     """
 
     lat: float

@@ -88,8 +88,10 @@ def reported_rotation_vector(matrix: ArrayLike, near: ArrayLike) -> Array:
 
     Parameters
     ----------
-    matrix : (3, 3) rotation.
-    near : (3,) rotation vector, rad.
+    matrix : array_like
+        (3, 3) rotation.
+    near : array_like
+        (3,) rotation vector, rad.
     """
     phi = log_so3(matrix)
     angle = float(np.linalg.norm(phi))
@@ -114,8 +116,10 @@ def rotation_from_rph(rph: ArrayLike, body_axes: BodyAxes) -> Array:
 
     Parameters
     ----------
-    rph : (..., 3) roll, pitch, heading, rad.
-    body_axes : axes of the body frame.
+    rph : array_like
+        (..., 3) roll, pitch, heading, rad.
+    body_axes : BodyAxes
+        Axes of the body frame.
 
     Returns
     -------

@@ -45,8 +45,10 @@ class Chain:
     Parameters
     ----------
     trial, frame, segments : what it was made from.
-    gravity_n : (S, 3) along the segments, m/s².
-    graph : IMU factors, walks of the biases, priors of states and biases.
+    gravity_n : ndarray, shape (S, 3), m/s²
+        Along the segments.
+    graph : gtsam.NonlinearFactorGraph
+        IMU factors, walks of the biases, priors of states and biases.
     """
 
     trial: Trial

@@ -28,9 +28,12 @@ class Known:
 
     Parameters
     ----------
-    bias : (6,) accelerometer and gyro bias at the first node, SI.
-    parameters : values of those that are estimated, rotations as matrices.
-    covariance : (6 + P, 6 + P) of biases and parameters, in the tangent space, SI.
+    bias : ndarray, shape (6,), SI
+        Accelerometer and gyro bias at the first node.
+    parameters : dict of str to ndarray
+        Values of those that are estimated, rotations as matrices.
+    covariance : ndarray, shape (6 + P, 6 + P)
+        Of biases and parameters, in the tangent space, SI.
     """
 
     bias: Array

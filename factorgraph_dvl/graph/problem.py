@@ -88,10 +88,14 @@ class Evaluation:
 
     Parameters
     ----------
-    values : GTSAM's.
-    states, parameters : the same as arrays; parameters by name, rotations as matrices.
-    motions, residuals : per observation; residuals whitened, (M, d).
-    cost : half the sum of all squared whitened residuals.
+    values : gtsam.Values
+        GTSAM's.
+    states, parameters : States or dict of str to ndarray
+        The same as arrays; parameters by name, rotations as matrices.
+    motions, residuals : list of Motion or list of ndarray
+        Per observation; residuals whitened, (M, d).
+    cost : float
+        Half the sum of all squared whitened residuals.
     """
 
     values: gtsam.Values
@@ -108,10 +112,14 @@ class Problem:
     Parameters
     ----------
     chain : Chain
-    observations : of the aiding sensors.
-    parameters : of the aiding sensors, fixed ones included.
-    start : values of parameters, where they are known better than by their priors.
-    known : what stands in place of the priors; the chain then has none of the biases.
+    observations : sequence of Observation
+        Of the aiding sensors.
+    parameters : sequence of Parameter
+        Of the aiding sensors, fixed ones included.
+    start : dict of str to ndarray, optional
+        Values of parameters, where they are known better than by their priors.
+    known : Known, optional
+        What stands in place of the priors; the chain then has none of the biases.
     """
 
     def __init__(
@@ -227,8 +235,10 @@ class Problem:
 
         Parameters
         ----------
-        directions : (P, h) orthonormal, in the coordinates u of a step S u, S `prior_root`.
-        origin : values of the parameters there.
+        directions : ndarray, shape (P, h)
+            Orthonormal, in the coordinates u of a step S u, S `prior_root`.
+        origin : dict of str to ndarray
+            Values of the parameters there.
         """
         gain = directions.T @ np.linalg.inv(self.prior_root) / FIXED_DIRECTION_STD
         self.graph.add(linear_prior(self.parameters, self._key, np.asarray(gain, float), origin))
@@ -443,8 +453,10 @@ def node_jacobian(lin: Linearization, transition: Transition) -> Array:
 
     Parameters
     ----------
-    lin : derivatives with respect to the motion at the M times.
-    transition : from the nodes to these times.
+    lin : Linearization
+        Derivatives with respect to the motion at the M times.
+    transition : Transition
+        From the nodes to these times.
     """
     out = np.zeros((*lin.residual.shape, _STATE + _BIAS))
     theta, p, v, accel, gyro = (out[:, :, i : i + 3] for i in range(0, 15, 3))

@@ -34,9 +34,12 @@ class Rows:
 
     Parameters
     ----------
-    observation : M measurements.
-    at : slice of the node's attachment.
-    time : (M,) s, for which they were attached.
+    observation : Observation
+        M measurements.
+    at : slice
+        Slice of the node's attachment.
+    time : ndarray, shape (M,)
+        S, for which they were attached.
     """
 
     observation: Observation
@@ -50,12 +53,17 @@ class NodeMeasurements:
 
     Parameters
     ----------
-    attachment : of all measurement times, to a node that counts as the first.
-    rows : the measurements.
-    parameters : those that are estimated and that the measurements depend on.
-    fixed : values of those that are not.
-    gravity_n : (1, 3) `LocalFrame.gravity_without_rotation`, m/s².
-    earth_rate_n : (3,) rad/s.
+    attachment : Attachment
+        Of all measurement times, to a node that counts as the first.
+    rows : tuple of Rows
+        The measurements.
+    parameters : tuple of Parameter
+        Those that are estimated and that the measurements depend on.
+    fixed : mapping of str to ndarray
+        Values of those that are not.
+    gravity_n : ndarray, shape (1, 3)
+        `LocalFrame.gravity_without_rotation`, m/s².
+    earth_rate_n : ndarray, shape (3,), rad/s
     """
 
     attachment: Attachment
@@ -141,8 +149,10 @@ class Linearized:
 
     Parameters
     ----------
-    states, values : of the node and the parameters.
-    residual, jacobian : as `NodeMeasurements.linearize` returns them.
+    states, values : States or mapping of str to ndarray
+        Of the node and the parameters.
+    residual, jacobian : ndarray
+        As `NodeMeasurements.linearize` returns them.
     """
 
     states: States
@@ -185,10 +195,14 @@ def measurement_factor(
 
     Parameters
     ----------
-    measured : rows R in all.
-    weight : (R,) inverse standard deviations; 0 = not used.
-    node_key, bias_key, parameter_keys : of the variables, parameters as in `measured`.
-    first : where GTSAM will linearise first.
+    measured : NodeMeasurements
+        Rows R in all.
+    weight : ndarray, shape (R,)
+        Inverse standard deviations; 0 = not used.
+    node_key, bias_key, parameter_keys : int or sequence of int
+        Of the variables, parameters as in `measured`.
+    first : Linearized, optional
+        Where GTSAM will linearise first.
     """
     kept = [first] if first is not None else []
     every = [node_key, bias_key, *parameter_keys]

@@ -30,9 +30,12 @@ class Orientation:
 
     Parameters
     ----------
-    nRb : (M, 3, 3) body to local-level east, north, up.
-    omega_eb_b : (M, 3) rate relative to the Earth, rad/s.
-    covered : (M,) whether both are known there.
+    nRb : ndarray, shape (M, 3, 3)
+        Body to local-level east, north, up.
+    omega_eb_b : ndarray, shape (M, 3), rad/s
+        Rate relative to the Earth.
+    covered : ndarray, shape (M,)
+        Whether both are known there.
     """
 
     nRb: Array
@@ -45,11 +48,14 @@ class AttitudeHistory:
 
     Parameters
     ----------
-    imu : whose gyros carry the attitude between the epochs.
-    motion : the source; its roll, pitch, heading and latitude are used.
-    body_axes : of the body.
-    gyro_bias : (3,) rad/s; zero if not known: through a lever arm of 1 m, 10 deg/h are
-        0.05 mm/s.
+    imu : Imu
+        Whose gyros carry the attitude between the epochs.
+    motion : Trajectory or Reference
+        The source; its roll, pitch, heading and latitude are used.
+    body_axes : BodyAxes
+        Of the body.
+    gyro_bias : ndarray, shape (3,)
+        rad/s; zero if not known: through a lever arm of 1 m, 10 deg/h are 0.05 mm/s.
     """
 
     def __init__(

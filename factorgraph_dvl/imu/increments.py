@@ -61,12 +61,17 @@ class Partial:
 
     Parameters
     ----------
-    phi : (M, 3) rotation vector, rad.
-    dv : (M, 3) velocity increment in the axes at the start of the interval, m/s.
-    omega, alpha, force : (M, 3) rate, its derivative, specific force at the end.
-    omega_sigma : (M, 3) standard deviation of omega from noise, and from motion that the
-        samples do not resolve, rad/s.
-    alpha_sigma, force_sigma : (M,) standard deviation of alpha and force from noise.
+    phi : ndarray, shape (M, 3), rad
+        Rotation vector.
+    dv : ndarray, shape (M, 3), m/s
+        Velocity increment in the axes at the start of the interval.
+    omega, alpha, force : ndarray, shape (M, 3)
+        Rate, its derivative, specific force at the end.
+    omega_sigma : ndarray, shape (M, 3)
+        Standard deviation of omega from noise, and from motion that the samples do not resolve,
+        rad/s.
+    alpha_sigma, force_sigma : ndarray, shape (M,)
+        Standard deviation of alpha and force from noise.
     """
 
     phi: Array
@@ -85,16 +90,24 @@ class Increments:
 
     Parameters
     ----------
-    start, dt : (N,) start and length of the intervals, s.
-    arcs : (A, 2) first and last-plus-one interval of each arc.
-    samples : (S, 6) rate and specific force that the polynomials pass through: the means
-        over the intervals, or the values at their ends.
-    first_sample : (A,) index in `samples` of each arc's first.
-    averaged : whether `samples` are means over the intervals.
-    open_sigma : (N, 6) standard deviation of the mean rate and force over an interval where
-        the samples leave it open: lost ones, or a step between two of them; else 0.
-    gyro_sigma, accel_sigma : standard deviation of one sample from its noise, SI.
-    windows : samples over which rate and force are smoothed; None = chosen from the record.
+    start, dt : ndarray, shape (N,), s
+        Start and length of the intervals.
+    arcs : ndarray of int, shape (A, 2)
+        First and last-plus-one interval of each arc.
+    samples : ndarray, shape (S, 6)
+        Rate and specific force that the polynomials pass through: the means over the intervals, or
+        the values at their ends.
+    first_sample : ndarray of int, shape (A,)
+        Index in `samples` of each arc's first.
+    averaged : bool
+        Whether `samples` are means over the intervals.
+    open_sigma : ndarray, shape (N, 6)
+        Standard deviation of the mean rate and force over an interval where the samples leave it
+        open: lost ones, or a step between two of them; else 0.
+    gyro_sigma, accel_sigma : float
+        Standard deviation of one sample from its noise, SI.
+    windows : tuple of (int, int), optional
+        Samples over which rate and force are smoothed; None = chosen from the record.
     """
 
     start: Array
@@ -337,7 +350,8 @@ def increments(
     Parameters
     ----------
     imu : Imu
-    windows : see `Increments`.
+    windows : tuple of (int, int), optional
+        See `Increments`.
 
     Returns
     -------
@@ -443,8 +457,10 @@ def _steps(inc: Increments, noise: Array) -> Array:
 
     Parameters
     ----------
-    inc : Increments of instantaneous samples.
-    noise : (6,) standard deviation of the samples.
+    inc : Increments
+        Increments of instantaneous samples.
+    noise : ndarray, shape (6,)
+        Standard deviation of the samples.
     """
     width = 6
     sigma = noise * np.sqrt(comb(2 * width - 2, width - 1))

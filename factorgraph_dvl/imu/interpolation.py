@@ -39,10 +39,14 @@ class Smoothed:
 
     Parameters
     ----------
-    spline : value over time, None where the samples are best left alone.
-    misfit : what the window does not resolve, over time; None likewise.
-    sigma, slope_sigma : standard deviation of value and derivative from the noise.
-    window : number of samples that each value is made of, 0 where they are left alone.
+    spline : BSpline or None
+        Value over time, None where the samples are best left alone.
+    misfit : BSpline or None
+        What the window does not resolve, over time; None likewise.
+    sigma, slope_sigma : float
+        Standard deviation of value and derivative from the noise.
+    window : int
+        Number of samples that each value is made of, 0 where they are left alone.
     """
 
     spline: BSpline | None
@@ -97,12 +101,18 @@ def smooth(
 
     Parameters
     ----------
-    time : (N,) s, regular: the samples', or the middles of the intervals of means.
-    values : (N, 3) samples.
-    dt : interval of the samples, s.
-    sigma : standard deviation of a sample.
-    averaged : whether samples are means over their intervals.
-    window : number of samples; None = `best_window`.
+    time : ndarray, shape (N,)
+        S, regular: the samples', or the middles of the intervals of means.
+    values : ndarray, shape (N, 3)
+        Samples.
+    dt : float
+        Interval of the samples, s.
+    sigma : float
+        Standard deviation of a sample.
+    averaged : bool
+        Whether samples are means over their intervals.
+    window : int, optional
+        Number of samples; None = `best_window`.
     """
     width = best_window(values, dt, sigma) if window is None else window
     if width == 0 or width > values.shape[0]:

@@ -33,8 +33,10 @@ def interpolation(edges: Array, averaged: bool) -> Array:
 
     Parameters
     ----------
-    edges : (B, E) ends of the intervals; K = E - 1 means over them, or K = E values.
-    averaged : which of the two.
+    edges : ndarray, shape (B, E)
+        Ends of the intervals; K = E - 1 means over them, or K = E values.
+    averaged : bool
+        Which of the two.
     """
     power = np.arange(edges.shape[1] - 1 if averaged else edges.shape[1])
     if averaged:

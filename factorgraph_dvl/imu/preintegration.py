@@ -24,7 +24,9 @@ class States:
 
     Parameters
     ----------
-    nRb : (K, 3, 3); p_n, v_n : (K, 3); gyro_bias, accel_bias : (K, 3), SI.
+    nRb : ndarray, shape (K, 3, 3)
+    p_n, v_n : ndarray, shape (K, 3)
+    gyro_bias, accel_bias : ndarray, shape (K, 3), SI
     """
 
     nRb: Array
@@ -41,14 +43,21 @@ class Segments:
     Parameters
     ----------
     increments : Increments
-    node_time : (K,) s.
-    first, last : (S,) first and last-plus-one interval of each segment.
-    origin : (S,) node at the start of each segment; the node at its end is the next one.
-    arc_nodes : (A, 2) first and last node of each arc.
-    phi, dv : (N, 3) increments over the intervals.
-    dR : (N, 3, 3); dV, dP : (N, 3) since the segment's start, at the start of each
-        interval, in the axes at the segment's start.
-    dA : (N, 3, 3) integral of dR, s.
+    node_time : ndarray, shape (K,), s
+    first, last : ndarray of int, shape (S,)
+        First and last-plus-one interval of each segment.
+    origin : ndarray of int, shape (S,)
+        Node at the start of each segment; the node at its end is the next one.
+    arc_nodes : ndarray of int, shape (A, 2)
+        First and last node of each arc.
+    phi, dv : ndarray, shape (N, 3)
+        Increments over the intervals.
+    dR : ndarray, shape (N, 3, 3)
+    dV, dP : ndarray, shape (N, 3)
+        Since the segment's start, at the start of each interval, in the axes at the segment's
+        start.
+    dA : ndarray, shape (N, 3, 3), s
+        Integral of dR.
     """
 
     increments: Increments
@@ -87,9 +96,11 @@ def segments(inc: Increments, interval: float, epochs: Array | None = None) -> S
     Parameters
     ----------
     inc : Increments
-    interval : length of the segments, s.
-    epochs : (M,) times, s, of which each has a node at most a sample before it; the
-        segments between them are no longer than `interval`. None: no such times.
+    interval : float
+        Length of the segments, s.
+    epochs : ndarray, shape (M,), optional
+        Times, s, of which each has a node at most a sample before it; the segments between them
+        are no longer than `interval`. None: no such times.
     """
     first, last, origin, arc_nodes, node_time = [], [], [], [], []
     n_nodes = 0
@@ -213,9 +224,11 @@ def preintegrate(
     Parameters
     ----------
     seg : Segments
-    settings : noise of the IMU.
-    gravity_n : (S, 3) `LocalFrame.gravity_without_rotation` along the segments, m/s².
-    earth_rate_n : (3,) rad/s.
+    settings : ImuSettings
+        Noise of the IMU.
+    gravity_n : ndarray, shape (S, 3)
+        `LocalFrame.gravity_without_rotation` along the segments, m/s².
+    earth_rate_n : ndarray, shape (3,), rad/s
     """
     inc = seg.increments
     dt = inc.dt[:, None]
@@ -255,13 +268,23 @@ class Attachment:
 
     Parameters
     ----------
-    segment : (M,) segment; node : (M,) node at its start.
-    tau : (M,) time since that node, s.
-    dR, dA : (M, 3, 3); dV, dP : (M, 3) increments up to the time.
-    gyro, alpha, force : (M, 3) rate (rad/s), its derivative, specific force at the time.
-    omega_sigma : (M, 3) standard deviation of the rate, rad/s.
-    alpha_sigma, force_sigma : (M,) standard deviation of alpha and force from noise.
-    turn : (M, 3, 3) Exp(-earth_rate tau).
+    segment : ndarray of int, shape (M,)
+        Segment.
+    node : ndarray of int, shape (M,)
+        Node at its start.
+    tau : ndarray, shape (M,), s
+        Time since that node.
+    dR, dA : ndarray, shape (M, 3, 3)
+    dV, dP : ndarray, shape (M, 3)
+        Increments up to the time.
+    gyro, alpha, force : ndarray, shape (M, 3)
+        Rate (rad/s), its derivative, specific force at the time.
+    omega_sigma : ndarray, shape (M, 3), rad/s
+        Standard deviation of the rate.
+    alpha_sigma, force_sigma : ndarray, shape (M,)
+        Standard deviation of alpha and force from noise.
+    turn : ndarray, shape (M, 3, 3)
+        Exp(-earth_rate tau).
     """
 
     segment: IntArray
@@ -332,10 +355,13 @@ class Transition:
 
     Parameters
     ----------
-    at : Attachment of the M times.
-    states : at the nodes.
-    motion : at the times.
-    earth_rate_n : (3,) rad/s.
+    at : Attachment
+        Attachment of the M times.
+    states : States
+        At the nodes.
+    motion : Motion
+        At the times.
+    earth_rate_n : ndarray, shape (3,), rad/s
     """
 
     at: Attachment
@@ -435,10 +461,14 @@ def motion_at(at: Attachment, states: States, gravity_n: Array, earth_rate_n: Ar
 
     Parameters
     ----------
-    at : Attachment of M times.
-    states : at the K nodes.
-    gravity_n : (S, 3) `LocalFrame.gravity_without_rotation` along the segments, m/s².
-    earth_rate_n : (3,) w, rad/s.
+    at : Attachment
+        Attachment of M times.
+    states : States
+        At the K nodes.
+    gravity_n : ndarray, shape (S, 3)
+        `LocalFrame.gravity_without_rotation` along the segments, m/s².
+    earth_rate_n : ndarray, shape (3,), rad/s
+        W.
     """
     k = at.node
     R, p, v = states.nRb[k], states.p_n[k], states.v_n[k]

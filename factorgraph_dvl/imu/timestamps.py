@@ -78,8 +78,9 @@ def unrounded(time: Array, number: Array | None = None) -> Array:
 
     Parameters
     ----------
-    time : (N,) s.
-    number : (N,) of the samples, lost ones counted; None = none was lost.
+    time : ndarray, shape (N,), s
+    number : ndarray, shape (N,), optional
+        Of the samples, lost ones counted; None = none was lost.
     """
     count = np.arange(time.size) if number is None else number
     count = count - count.mean()

@@ -76,8 +76,10 @@ def initial_values(trial: Trial, motion_at: MotionAt) -> list[dict[str, Array]]:
 
     Parameters
     ----------
-    trial : its DVL, and beams with a common mounting.
-    motion_at : as for `initial_mounting`.
+    trial : Trial
+        Its DVL, and beams with a common mounting.
+    motion_at : MotionAt
+        As for `initial_mounting`.
     """
     beams = trial.beams
     common = beams is not None and beams.settings.parametrisation == "common"
@@ -108,8 +110,9 @@ def initial_mountings(dvl: Dvl, motion_at: MotionAt) -> list[dict[str, Array]]:
     Parameters
     ----------
     dvl : Dvl
-    motion_at : returns motion, and which are covered, at given times (M,) of the pings
-        with a lock whose indices are given.
+    motion_at : MotionAt
+        Returns motion, and which are covered, at given times (M,) of the pings with a lock whose
+        indices are given.
     """
     priors = {p.name: p for p in dvl.parameters()}
     values = {p.name: exp_so3(p.mean) if p.rotation else p.mean for p in priors.values()}

@@ -56,9 +56,12 @@ class AlignedStates:
 
     Parameters
     ----------
-    states : at the nodes.
-    mountings : by parameter name, sRb of sensors of attitude where the gyros tell it.
-    notes : what the user must know of how they were found.
+    states : States
+        At the nodes.
+    mountings : dict of str to ndarray
+        By parameter name, sRb of sensors of attitude where the gyros tell it.
+    notes : tuple of str
+        What the user must know of how they were found.
     """
 
     states: States

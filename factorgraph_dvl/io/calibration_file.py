@@ -71,8 +71,10 @@ def load_calibration(path: Path | str, *, body_axes: BodyAxes = "RFU") -> Calibr
 
     Parameters
     ----------
-    path : of the file, or of the solution folder that holds it.
-    body_axes : that it is in where it does not say so.
+    path : path-like
+        Of the file, or of the solution folder that holds it.
+    body_axes : BodyAxes, default 'RFU'
+        That it is in where it does not say so.
 
     Raises
     ------

@@ -35,10 +35,14 @@ def save_corrected(
 
     Parameters
     ----------
-    beams : the record.
-    directions_b, scale_error, lever_arm : (N, 3) in body, (N,), (3,) m: the calibration.
-    path : of the folder.
-    force : replace what is there.
+    beams : DvlBeams
+        The record.
+    directions_b, scale_error, lever_arm : ndarray, shape (N, 3)
+        In body, (N,), (3,) m: the calibration.
+    path : path-like
+        Of the folder.
+    force : bool, default False
+        Replace what is there.
 
     Raises
     ------

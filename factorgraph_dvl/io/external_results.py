@@ -153,9 +153,10 @@ def load_results(path_a: Path | str, path_b: Path | str) -> tuple[Solution, Solu
 
     Parameters
     ----------
-    path_a, path_b : each of a solution folder; of a CSV or Parquet table with the columns of
-        `reference` and, optionally, those of the standard deviations; or of a JSON or
-        YAML file of calibration values.
+    path_a, path_b : path-like
+        Each of a solution folder; of a CSV or Parquet table with the columns of `reference` and,
+        optionally, those of the standard deviations; or of a JSON or YAML file of calibration
+        values.
 
     Returns
     -------
@@ -217,9 +218,11 @@ def load_truth(
 
     Parameters
     ----------
-    reference : a trial folder, for its reference and its true calibration, or a table
-        with the columns of `reference`.
-    truth : a file of true calibration values, which win over those of the trial folder.
+    reference : path-like or None
+        A trial folder, for its reference and its true calibration, or a table with the columns of
+        `reference`.
+    truth : path-like or None
+        A file of true calibration values, which win over those of the trial folder.
 
     Returns
     -------
@@ -252,7 +255,8 @@ def read_truth(path: Path | str) -> dict[str, Array]:
 
     Parameters
     ----------
-    path : of a JSON or YAML file, such as the `truth.json` of a trial folder.
+    path : path-like
+        Of a JSON or YAML file, such as the `truth.json` of a trial folder.
 
     Returns
     -------
@@ -278,9 +282,11 @@ def read_calibration_values(path: Path | str, body_axes: BodyAxes) -> dict[str, 
 
     Parameters
     ----------
-    path : of a calibration.json, of the solution folder that holds it, or of a JSON or YAML
-        file of calibration values.
-    body_axes : that the values must be in.
+    path : path-like
+        Of a calibration.json, of the solution folder that holds it, or of a JSON or YAML file of
+        calibration values.
+    body_axes : BodyAxes
+        That the values must be in.
 
     Returns
     -------

@@ -43,11 +43,15 @@ def claim(
 
     Parameters
     ----------
-    path : of the folder to be written.
-    force : replace what an earlier run wrote there.
-    owned : names of what the run may write, as patterns relative to the folder. The first
-        is in every result.
-    inputs : files and folders that the run reads.
+    path : path-like
+        Of the folder to be written.
+    force : bool, default False
+        Replace what an earlier run wrote there.
+    owned : sequence of str, optional
+        Names of what the run may write, as patterns relative to the folder. The first is in every
+        result.
+    inputs : iterable of path-like, optional
+        Files and folders that the run reads.
 
     Raises
     ------

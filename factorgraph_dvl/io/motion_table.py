@@ -26,8 +26,10 @@ def read_reference(path: Path, source: str = "") -> Reference:
 
     Parameters
     ----------
-    path : of the file.
-    source : its name in messages.
+    path : path-like
+        Of the file.
+    source : str, optional
+        Its name in messages.
 
     Raises
     ------

@@ -49,7 +49,8 @@ def load_planar_trial(path: Path | str) -> PlanarTrial:
 
     Parameters
     ----------
-    path : of the folder, or of the trial.yaml in it.
+    path : path-like
+        Of the folder, or of the trial.yaml in it.
 
     Raises
     ------

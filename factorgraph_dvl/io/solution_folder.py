@@ -78,11 +78,16 @@ def save_solution(
 
     Parameters
     ----------
-    solution : to write.
-    path : of the folder.
-    force : replace the solution that is there.
-    extra : called with the folder before it appears under `path`, to add files.
-    smoothed : what later data made of states of the trajectory; more columns of it.
+    solution : Solution
+        To write.
+    path : path-like
+        Of the folder.
+    force : bool, default False
+        Replace the solution that is there.
+    extra : callable of path-like, object, optional
+        Called with the folder before it appears under `path`, to add files.
+    smoothed : Trajectory, optional
+        What later data made of states of the trajectory; more columns of it.
 
     Raises
     ------
@@ -141,11 +146,15 @@ def write_history(
 
     Parameters
     ----------
-    folder : to write into.
-    time : (H,) s.
-    names : of the n components, as in `covariance.order`.
-    values, std : (H, n) in reported units.
-    latency : (H,) time that each update took, s, if it was measured.
+    folder : path-like
+        To write into.
+    time : ndarray, shape (H,), s
+    names : sequence of str
+        Of the n components, as in `covariance.order`.
+    values, std : ndarray, shape (H, n)
+        In reported units.
+    latency : ndarray, shape (H,), optional
+        Time that each update took, s, if it was measured.
     """
     columns = {"time_s": time}
     if latency is not None:
@@ -160,9 +169,11 @@ def write_latency(folder: Path, time: Array, latency: Array, solved: np.ndarray)
 
     Parameters
     ----------
-    folder : to write into.
-    time, latency : (H,) s.
-    solved : (H,) updates that include a batch solution of what was collected.
+    folder : path-like
+        To write into.
+    time, latency : ndarray, shape (H,), s
+    solved : ndarray, shape (H,)
+        Updates that include a batch solution of what was collected.
     """
     columns = {"time_s": time, "latency_ms": 1e3 * latency, "batch": solved.astype(float)}
     write_table(folder / LATENCY_FILE, columns)
@@ -176,7 +187,8 @@ def load_solution(path: Path | str) -> Solution:
 
     Parameters
     ----------
-    path : of the folder.
+    path : path-like
+        Of the folder.
 
     Raises
     ------

@@ -35,10 +35,14 @@ def read_table(
 
     Parameters
     ----------
-    path : of the file. A CSV has one header line; a cell that is empty or `nan` is nan.
-    required : columns that must be there. Others than those asked for are not read.
-    optional : groups of columns; of each, all or none are there. Absent ones are nan.
-    source : name of the file in messages; by default that of `path`.
+    path : path-like
+        Of the file. A CSV has one header line; a cell that is empty or `nan` is nan.
+    required : sequence of str
+        Columns that must be there. Others than those asked for are not read.
+    optional : sequence of sequence of str, optional
+        Groups of columns; of each, all or none are there. Absent ones are nan.
+    source : str, optional
+        Name of the file in messages; by default that of `path`.
 
     Returns
     -------

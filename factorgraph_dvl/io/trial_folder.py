@@ -91,7 +91,8 @@ def load_trial(path: Path | str) -> Trial:
 
     Parameters
     ----------
-    path : of the folder, or of the trial.yaml in it.
+    path : path-like
+        Of the folder, or of the trial.yaml in it.
 
     Raises
     ------
@@ -144,7 +145,8 @@ def load_reference(path: Path | str) -> tuple[Reference | None, dict[str, Array]
 
     Parameters
     ----------
-    path : of the folder, or of the trial.yaml in it.
+    path : path-like
+        Of the folder, or of the trial.yaml in it.
 
     Returns
     -------
@@ -191,11 +193,16 @@ def save_trial(
 
     Parameters
     ----------
-    trial : to write.
-    path : of the folder.
-    force : replace the trial that is there.
-    parquet : write the sensors' tables as Parquet.
-    seed : of a trial that was simulated: trial.yaml says so.
+    trial : Trial
+        To write.
+    path : path-like
+        Of the folder.
+    force : bool, default False
+        Replace the trial that is there.
+    parquet : bool, default False
+        Write the sensors' tables as Parquet.
+    seed : int, optional
+        Of a trial that was simulated: trial.yaml says so.
 
     Raises
     ------
@@ -287,10 +294,14 @@ def calibrated_by(dvl: Dvl, calibration: Calibration, body_axes: BodyAxes, sourc
 
     Parameters
     ----------
-    dvl : without a calibration.
-    calibration : of the same DVL, mounted as it is now.
-    body_axes : of the trial.
-    source : name of the calibration, for messages.
+    dvl : Dvl
+        Without a calibration.
+    calibration : Calibration
+        Of the same DVL, mounted as it is now.
+    body_axes : BodyAxes
+        Of the trial.
+    source : str
+        Name of the calibration, for messages.
 
     Raises
     ------

@@ -28,9 +28,12 @@ class Item:
 
     Parameters
     ----------
-    name : what it is.
-    manoeuvres : as in a scenario.
-    duration : s.
+    name : str
+        What it is.
+    manoeuvres : tuple of dict of str to object
+        As in a scenario.
+    duration : float
+        S.
     """
 
     name: str
@@ -51,8 +54,10 @@ def library(scenario: Scenario, speed_at_end: float) -> Library:
 
     Parameters
     ----------
-    scenario : the plan.
-    speed_at_end : through the water, m/s.
+    scenario : Scenario
+        The plan.
+    speed_at_end : float
+        Through the water, m/s.
     """
     plan = scenario.plan()
     rate = max((abs(m.turn_deg_s) for m in plan if isinstance(m, Turn)), default=0.0)

@@ -30,9 +30,12 @@ class Ending:
 
     Parameters
     ----------
-    start : position, heading and speed there.
-    time : since the sea's phase was zero, s.
-    frontier : what is known there.
+    start : StartSettings
+        Position, heading and speed there.
+    time : float
+        Since the sea's phase was zero, s.
+    frontier : Frontier
+        What is known there.
     """
 
     start: StartSettings
@@ -46,11 +49,16 @@ class Prediction:
 
     Parameters
     ----------
-    scenario, trial : what was planned; its records without noise.
-    solution : values are the truth, covariances what a solver will claim.
-    history : information along the trial.
-    duration : s.
-    ending : to go on from.
+    scenario, trial : Scenario or Trial
+        What was planned; its records without noise.
+    solution : Solution
+        Values are the truth, covariances what a solver will claim.
+    history : InformationHistory
+        Information along the trial.
+    duration : float
+        S.
+    ending : Ending
+        To go on from.
     """
 
     scenario: Scenario
@@ -90,9 +98,12 @@ def go_on(
 
     Parameters
     ----------
-    scenario : the sea and the sensors.
-    manoeuvres : to add, as in a scenario.
-    ending : where to begin.
+    scenario : Scenario
+        The sea and the sensors.
+    manoeuvres : list of dict of str to object
+        To add, as in a scenario.
+    ending : Ending
+        Where to begin.
 
     Returns
     -------

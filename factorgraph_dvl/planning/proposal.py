@@ -45,14 +45,21 @@ class Proposal:
 
     Parameters
     ----------
-    names : of the manoeuvres in it.
-    manoeuvres : as in a scenario, to be added at the end.
-    added : its duration, s.
-    requirements : with what is predicted for plan and addition together.
-    met : whether all are met; if not, this is the best that was found.
-    tried : number of sequences.
-    limit : duration up to which all sequences were tried, s; if all is met and it is not
-        below `added`, there is none shorter.
+    names : tuple of str
+        Of the manoeuvres in it.
+    manoeuvres : tuple of dict of str to object
+        As in a scenario, to be added at the end.
+    added : float
+        Its duration, s.
+    requirements : tuple of Requirement
+        With what is predicted for plan and addition together.
+    met : bool
+        Whether all are met; if not, this is the best that was found.
+    tried : int
+        Number of sequences.
+    limit : float
+        Duration up to which all sequences were tried, s; if all is met and it is not below
+        `added`, there is none shorter.
     """
 
     names: tuple[str, ...]
@@ -189,9 +196,12 @@ def propose(
 
     Parameters
     ----------
-    prediction : of the plan.
-    required : of `requirements`, with the predictions for the plan alone.
-    progress : called for each sequence that is tried.
+    prediction : Prediction
+        Of the plan.
+    required : sequence of Requirement
+        Of `requirements`, with the predictions for the plan alone.
+    progress : callable, optional
+        Called for each sequence that is tried.
     """
     if all(r.met for r in required):
         return None
@@ -246,9 +256,12 @@ def _shorter(
 
     Parameters
     ----------
-    search : what was tried before, which is not tried again.
-    found : nothing that takes as long is looked at; None if there is none yet.
-    deepest : number of entries of a sequence at most.
+    search : _Search
+        What was tried before, which is not tried again.
+    found : Proposal or None
+        Nothing that takes as long is looked at; None if there is none yet.
+    deepest : int or None
+        Number of entries of a sequence at most.
 
     Returns
     -------

@@ -30,9 +30,12 @@ def requirements(
 
     Parameters
     ----------
-    required : as of a scenario.
-    estimates : of the prediction.
-    source : name of the plan, for messages.
+    required : mapping of str to float or sequence of float
+        As of a scenario.
+    estimates : sequence of Estimate
+        Of the prediction.
+    source : str
+        Name of the plan, for messages.
 
     Raises
     ------

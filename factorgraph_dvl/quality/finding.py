@@ -15,10 +15,14 @@ class Finding:
 
     Parameters
     ----------
-    severity : `ok`, `warning`, or `error` where solving would give a wrong answer.
-    sensor : label of the sensor.
-    text : in plain language.
-    code : stable name of what is wrong, for programs; empty where nothing is.
+    severity : Severity
+        `ok`, `warning`, or `error` where solving would give a wrong answer.
+    sensor : str
+        Label of the sensor.
+    text : str
+        In plain language.
+    code : str, optional
+        Stable name of what is wrong, for programs; empty where nothing is.
     """
 
     severity: Severity

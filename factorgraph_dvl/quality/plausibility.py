@@ -54,8 +54,10 @@ def findings(trial: Trial, sensors: list[SensorSurvey]) -> Iterator[Finding]:
 
     Parameters
     ----------
-    trial : as loaded.
-    sensors : its records, that of the IMU first.
+    trial : Trial
+        As loaded.
+    sensors : list of SensorSurvey
+        Its records, that of the IMU first.
     """
     yield from _clock_findings(trial, sensors)
     yield from _force_findings(trial.imu, trial.body_axes)

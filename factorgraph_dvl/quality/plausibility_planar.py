@@ -24,7 +24,8 @@ def planar_findings(trial: PlanarTrial) -> Iterator[tuple[str, str]]:
 
     Parameters
     ----------
-    trial : as loaded.
+    trial : PlanarTrial
+        As loaded.
     """
     heading, log, depth = trial.heading, trial.log, trial.depth
     for record, values in ((heading, heading.heading), (log, log.speed), (depth, depth.depth)):

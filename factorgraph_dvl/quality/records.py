@@ -21,13 +21,20 @@ class SensorSurvey:
 
     Parameters
     ----------
-    label : of the sensor.
-    rate : median, Hz; nan for a single sample.
-    samples : number of rows.
-    start, end : first and last time, s.
-    gaps : number of intervals longer than three median ones.
-    longest_gap : longest of them, s; 0 if there are none.
-    missing : fraction of rows without a measurement (no lock, no fix).
+    label : str
+        Of the sensor.
+    rate : float
+        Median, Hz; nan for a single sample.
+    samples : int
+        Number of rows.
+    start, end : float
+        First and last time, s.
+    gaps : int
+        Number of intervals longer than three median ones.
+    longest_gap : float
+        Longest of them, s; 0 if there are none.
+    missing : float
+        Fraction of rows without a measurement (no lock, no fix).
     """
 
     label: str
@@ -45,9 +52,11 @@ def record_of(label: str, time: Array, missing: Array) -> SensorSurvey:
 
     Parameters
     ----------
-    label : of the sensor.
-    time : (N,) s.
-    missing : (N,) bool, rows without a measurement.
+    label : str
+        Of the sensor.
+    time : ndarray, shape (N,), s
+    missing : ndarray, shape (N,)
+        Bool, rows without a measurement.
     """
     intervals = np.diff(time)
     median = float(np.median(intervals)) if intervals.size else np.nan

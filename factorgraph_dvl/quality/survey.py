@@ -18,12 +18,18 @@ class Survey:
 
     Parameters
     ----------
-    trial : name.
-    sensors : one entry for each.
-    duration : of the IMU's record, s.
-    distance : travelled, m; nan if neither GNSS nor DVL tell.
-    speed_min, speed_max : m/s; nan likewise.
-    findings : about units, signs, clocks and gaps.
+    trial : str
+        Name.
+    sensors : tuple of SensorSurvey
+        One entry for each.
+    duration : float
+        Of the IMU's record, s.
+    distance : float
+        Travelled, m; nan if neither GNSS nor DVL tell.
+    speed_min, speed_max : float
+        m/s; nan likewise.
+    findings : tuple of Finding
+        About units, signs, clocks and gaps.
     """
 
     trial: str
@@ -50,7 +56,8 @@ def survey(trial: Trial) -> Survey:
 
     Parameters
     ----------
-    trial : as loaded.
+    trial : Trial
+        As loaded.
     """
     sensors = [record_of("IMU", trial.imu.time, np.zeros(trial.imu.time.size, dtype=bool))]
     sensors += [record_of(aid.label, aid.time, aid.missing) for aid in trial.aids]

@@ -18,7 +18,8 @@ def survey_planar(trial: PlanarTrial) -> Survey:
 
     Parameters
     ----------
-    trial : as loaded.
+    trial : PlanarTrial
+        As loaded.
     """
     heading, log, depth, beacons = trial.records
     sensors = (

@@ -30,12 +30,18 @@ class Candidate:
 
     Parameters
     ----------
-    born : s, of the last data when it was found.
-    fit : with the data so far, or when it was last followed.
-    weight : normalised likelihood among all hypotheses, now.
-    highest : the highest weight that it ever had.
-    died : s, of the data since which its weight is below `DEAD`; None while it lives.
-    history : time (s) and weight at all updates.
+    born : float
+        S, of the last data when it was found.
+    fit : Fit
+        With the data so far, or when it was last followed.
+    weight : float, optional
+        Normalised likelihood among all hypotheses, now.
+    highest : float, optional
+        The highest weight that it ever had.
+    died : float, optional
+        S, of the data since which its weight is below `DEAD`; None while it lives.
+    history : list of tuple of (float, float), optional
+        Time (s) and weight at all updates.
     """
 
     born: float
@@ -57,9 +63,12 @@ def follow(
     Parameters
     ----------
     problem : PlanarProblem
-    updates : numbers of nodes after which to fit, increasing.
-    searches : those of them after which to search for new hypotheses as well.
-    on_update : called with the number of nodes and the living hypotheses, heaviest first.
+    updates : sequence of int
+        Numbers of nodes after which to fit, increasing.
+    searches : sequence of int
+        Those of them after which to search for new hypotheses as well.
+    on_update : callable of int, list of Candidate, object, optional
+        Called with the number of nodes and the living hypotheses, heaviest first.
 
     Returns
     -------

@@ -47,7 +47,8 @@ def odds_against(single: Sequence[Array]) -> Array:
 
     Parameters
     ----------
-    single : of each fit, the terms (T,) of its cost.
+    single : sequence of ndarray
+        Of each fit, the terms (T,) of its cost.
     """
     if not single:
         return np.empty(0)

@@ -41,10 +41,14 @@ class Ranging:
 
     Parameters
     ----------
-    node : (M,) index of the node of each, not decreasing.
-    beacon : (M,) index of the beacon.
-    range, rate : (M,) m, m/s; nan where not measured.
-    range_std, rate_std : (M,) of each, m, m/s, with what the noise of the depth does to it.
+    node : ndarray of np.intp, shape (M,)
+        Index of the node of each, not decreasing.
+    beacon : ndarray of np.intp, shape (M,)
+        Index of the beacon.
+    range, rate : ndarray, shape (M,)
+        M, m/s; nan where not measured.
+    range_std, rate_std : ndarray, shape (M,)
+        Of each, m, m/s, with what the noise of the depth does to it.
     """
 
     node: NDArray[np.intp]
@@ -61,20 +65,33 @@ class PlanarProblem:
 
     Parameters
     ----------
-    time : (N,) of the nodes, s.
-    step : (N - 1, 2) reckoned displacements, m.
-    step_cov : (N - 1, 2, 2) that of the noise n at its ends not included, m².
-    share : (N - 1,) tau of the steps, s.
-    velocity, velocity_cov : (N, 2), (N, 2, 2) reckoned velocity and its noise.
-    change_cov : (N - 1, 2, 2) of the change of the true velocity over a step, m²/s².
-    height, climb : (N,) above the frame's origin and its rate, m, m/s.
-    arm, arm_velocity : (N, 3) of the transponder from the reference point, in n.
-    place : (B, 3) stated positions of the beacons in n, m.
+    time : ndarray, shape (N,), s
+        Of the nodes.
+    step : ndarray, shape (N - 1, 2), m
+        Reckoned displacements.
+    step_cov : ndarray, shape (N - 1, 2, 2), m²
+        That of the noise n at its ends not included.
+    share : ndarray, shape (N - 1,), s
+        Tau of the steps.
+    velocity, velocity_cov : ndarray, shape (N, 2)
+        (N, 2, 2) reckoned velocity and its noise.
+    change_cov : ndarray, shape (N - 1, 2, 2), m²/s²
+        Of the change of the true velocity over a step.
+    height, climb : ndarray, shape (N,)
+        Above the frame's origin and its rate, m, m/s.
+    arm, arm_velocity : ndarray, shape (N, 3)
+        Of the transponder from the reference point, in n.
+    place : ndarray, shape (B, 3), m
+        Stated positions of the beacons in n.
     ranging : Ranging
-    parameters : constants with priors, fixed ones included.
-    start_mean, start_cov : (2,), (2, 2) prior of the first position, m.
-    start_known : whether that is more than a bound.
-    tan_lat : tangent of the latitude, for the convergence of the meridians.
+    parameters : tuple of Parameter
+        Constants with priors, fixed ones included.
+    start_mean, start_cov : ndarray, shape (2,)
+        (2, 2) prior of the first position, m.
+    start_known : bool
+        Whether that is more than a bound.
+    tan_lat : float
+        Tangent of the latitude, for the convergence of the meridians.
     """
 
     time: Array
@@ -197,8 +214,10 @@ def evaluate(problem: PlanarProblem, x: Array, theta: Array) -> RangingEvaluatio
     Parameters
     ----------
     problem : PlanarProblem
-    x : (n, 4) positions, m, and noise of the velocity, m/s.
-    theta : (c,) constants.
+    x : ndarray, shape (n, 4)
+        Positions, m, and noise of the velocity, m/s.
+    theta : ndarray
+        (c,) constants.
     """
     r = problem.ranging
     rows = problem.rows(x.shape[0])

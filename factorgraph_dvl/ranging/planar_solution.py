@@ -47,8 +47,10 @@ def solve_planar(
     Parameters
     ----------
     trial : PlanarTrial
-    rate_hz : rate of the trajectory in the solution.
-    progress : called with stage, iteration and cost.
+    rate_hz : float, default 10.0
+        Rate of the trajectory in the solution.
+    progress : callable, optional
+        Called with stage, iteration and cost.
 
     Returns
     -------

@@ -43,11 +43,14 @@ class StartPositions:
 
     Parameters
     ----------
-    states : of each living hypothesis, heaviest first; at least one.
-    hypotheses : the living ones, in the same order, then the dead; empty if a position is
-        known.
-    rejected : times of the measurements that are none, by label.
-    notes : what the user must know.
+    states : tuple of States
+        Of each living hypothesis, heaviest first; at least one.
+    hypotheses : tuple of Hypothesis, optional
+        The living ones, in the same order, then the dead; empty if a position is known.
+    rejected : mapping of str to ndarray, optional
+        Times of the measurements that are none, by label.
+    notes : tuple of str, optional
+        What the user must know.
     """
 
     states: tuple[States, ...]
@@ -64,7 +67,8 @@ def positions_from_ranges(
     Parameters
     ----------
     trial, frame, seg : the trial, its tangent frame and segments.
-    states : from alignment; of a trial without a position, from anywhere.
+    states : States
+        From alignment; of a trial without a position, from anywhere.
 
     Raises
     ------

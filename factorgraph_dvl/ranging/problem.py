@@ -38,10 +38,14 @@ class RangingTrial:
     Parameters
     ----------
     problem : PlanarProblem
-    track : the reckoned track.
-    frame : its tangent frame.
-    rows : (m,) rows of the beacons' record that are in the problem.
-    uncovered : measurements at times without heading, speed or depth.
+    track : ReckonedTrack
+        The reckoned track.
+    frame : LocalFrame
+        Its tangent frame.
+    rows : ndarray of np.intp, shape (m,)
+        Rows of the beacons' record that are in the problem.
+    uncovered : int
+        Measurements at times without heading, speed or depth.
     """
 
     problem: PlanarProblem
@@ -138,13 +142,20 @@ def problem_of(
 
     Parameters
     ----------
-    track : on its grid.
-    arm_n : (G, 3) lever arm of the transponder on that grid, in n, m.
-    beacons : their record.
-    parameters : constants with priors.
-    frame : tangent frame.
-    initial : prior of the first position, None if there is none.
-    depth_std : white noise of the height, m; its share in a range is the sine of the elevation.
+    track : ReckonedTrack
+        On its grid.
+    arm_n : ndarray, shape (G, 3)
+        Lever arm of the transponder on that grid, in n, m.
+    beacons : Beacons
+        Their record.
+    parameters : tuple of Parameter
+        Constants with priors.
+    frame : LocalFrame
+        Tangent frame.
+    initial : InitialPosition, optional
+        Prior of the first position, None if there is none.
+    depth_std : float, default 0.0
+        White noise of the height, m; its share in a range is the sine of the elevation.
 
     Raises
     ------

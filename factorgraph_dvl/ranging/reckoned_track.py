@@ -26,17 +26,26 @@ class ReckonedTrack:
 
     Parameters
     ----------
-    time : (G,) s.
-    displacement : (G, 2) from the start, east and north, through the water or over ground, m.
-    velocity : (G, 2) its derivative, m/s.
-    height, climb : (G,) above the ellipsoid and its rate, m, m/s.
-    noise : (G, 2, 2) covariance of the displacement since the start, m².
-    velocity_cov : (G, 2, 2) noise of the velocity, m²/s².
-    heading : (G,) clockwise from north, unwrapped, rad.
-    heading_std : white noise of the heading, rad.
-    interval : time over which a sample stands for the velocity, s.
-    tangent : whether displacement and velocity are in the tangent frame already, and not
-        relative to north where the vehicle is.
+    time : ndarray, shape (G,), s
+    displacement : ndarray, shape (G, 2)
+        From the start, east and north, through the water or over ground, m.
+    velocity : ndarray, shape (G, 2), m/s
+        Its derivative.
+    height, climb : ndarray, shape (G,)
+        Above the ellipsoid and its rate, m, m/s.
+    noise : ndarray, shape (G, 2, 2), m²
+        Covariance of the displacement since the start.
+    velocity_cov : ndarray, shape (G, 2, 2), m²/s²
+        Noise of the velocity.
+    heading : ndarray, shape (G,)
+        Clockwise from north, unwrapped, rad.
+    heading_std : float
+        White noise of the heading, rad.
+    interval : float
+        Time over which a sample stands for the velocity, s.
+    tangent : bool, optional
+        Whether displacement and velocity are in the tangent frame already, and not relative to
+        north where the vehicle is.
     """
 
     time: Array
@@ -89,10 +98,14 @@ def reckon(
 
     Parameters
     ----------
-    heading : times (s), values (rad), standard deviation (rad).
-    speed : times (s), ahead u and to starboard w (m/s), standard deviation of each (m/s).
-    height : times (s) and heights (m).
-    extra : (M,) times that must be on the grid, within all three records.
+    heading : tuple of (ndarray, ndarray, float)
+        Times (s), values (rad), standard deviation (rad).
+    speed : tuple of (ndarray, ndarray, ndarray, float)
+        Times (s), ahead u and to starboard w (m/s), standard deviation of each (m/s).
+    height : tuple of (ndarray, ndarray)
+        Times (s) and heights (m).
+    extra : ndarray, shape (M,)
+        Times that must be on the grid, within all three records.
     """
     heading_time, psi, heading_std = heading
     speed_time, u, w, speed_std = speed

@@ -26,11 +26,16 @@ class Fit:
 
     Parameters
     ----------
-    x : (n, 4) positions, m, and noise of the velocity, m/s.
-    theta : (c,) constants.
-    range_used, rate_used : (m,) weights 0 or 1 of the measurements; 0 where there is none.
-    cost : half the sum of squared whitened residuals; a rejected one counts as the gate.
-    converged : whether a full step promised no more: the last one, undamped.
+    x : ndarray, shape (n, 4)
+        Positions, m, and noise of the velocity, m/s.
+    theta : ndarray
+        (c,) constants.
+    range_used, rate_used : ndarray, shape (m,)
+        Weights 0 or 1 of the measurements; 0 where there is none.
+    cost : float
+        Half the sum of squared whitened residuals; a rejected one counts as the gate.
+    converged : bool
+        Whether a full step promised no more: the last one, undamped.
     """
 
     x: Array
@@ -64,10 +69,14 @@ def fit(
     Parameters
     ----------
     problem : PlanarProblem
-    x : (n, 4) start; the first n nodes are fitted.
-    theta : (c,) start of the constants.
-    graduated : whether to begin with the surrogate.
-    iterations : at most so many steps.
+    x : ndarray, shape (n, 4)
+        Start; the first n nodes are fitted.
+    theta : ndarray
+        (c,) start of the constants.
+    graduated : bool, default False
+        Whether to begin with the surrogate.
+    iterations : int, default 30
+        At most so many steps.
     """
     at = evaluate(problem, x, theta)
     softness = _softness(at) if graduated else np.inf

@@ -36,9 +36,12 @@ class Station:
 
     Parameters
     ----------
-    fit : the most probable one at this place.
-    parts : its covariances at this place, as of `smoother.covariance`.
-    cost : of the whole data, without what holds it at its place.
+    fit : Fit
+        The most probable one at this place.
+    parts : tuple of (ndarray, ndarray, ndarray)
+        Its covariances at this place, as of `smoother.covariance`.
+    cost : float
+        Of the whole data, without what holds it at its place.
     """
 
     fit: Fit

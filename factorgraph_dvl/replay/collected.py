@@ -21,10 +21,14 @@ class Collected:
 
     Parameters
     ----------
-    known : trial with all but the records.
-    longest : s of data that are kept.
-    before : s for which rows are kept that were true before the first sample.
-    heard : sections of the sensors that were heard before, and whose calibration is known.
+    known : Trial
+        Trial with all but the records.
+    longest : float
+        S of data that are kept.
+    before : float, default 1.0
+        S for which rows are kept that were true before the first sample.
+    heard : sequence of str, optional
+        Sections of the sensors that were heard before, and whose calibration is known.
     """
 
     def __init__(

@@ -26,8 +26,10 @@ class CalibrationEstimate:
 
     Parameters
     ----------
-    estimates : as in a solution.
-    covariance : (P, P) joint covariance of all their components, in reported units.
+    estimates : tuple of Estimate
+        As in a solution.
+    covariance : ndarray, shape (P, P)
+        Joint covariance of all their components, in reported units.
     """
 
     estimates: tuple[Estimate, ...]
@@ -40,10 +42,13 @@ class Innovations:
 
     Parameters
     ----------
-    label, unit, components : of the kind.
-    time : (M,) s.
-    residual, sigma : (M, d) predicted - measured, and its standard deviation.
-    used : (M,) bool.
+    label, unit, components : str or tuple of str
+        Of the kind.
+    time : ndarray, shape (M,), s
+    residual, sigma : ndarray, shape (M, d)
+        Predicted - measured, and its standard deviation.
+    used : ndarray, shape (M,)
+        Bool.
     """
 
     label: str
@@ -61,17 +66,27 @@ class Update:
 
     Parameters
     ----------
-    time : of the newest state, s.
-    latency : time that the update took, s.
-    state : the newest state, as a trajectory of one epoch.
-    trajectory : at the epochs of a batch solution since the update before.
-    calibration : with its joint covariance.
-    smoothed : epochs that more data have made better, None if there are none this time.
-    innovations : what was measured against what was predicted.
-    messages : for the user.
-    solved : whether the update includes a solution of all that was collected.
-    doubted : kinds of measurements that disagree with the prediction, so that the standard
-        deviations are not to be trusted.
+    time : float
+        Of the newest state, s.
+    latency : float
+        Time that the update took, s.
+    state : Trajectory
+        The newest state, as a trajectory of one epoch.
+    trajectory : Trajectory
+        At the epochs of a batch solution since the update before.
+    calibration : CalibrationEstimate
+        With its joint covariance.
+    smoothed : Trajectory or None
+        Epochs that more data have made better, None if there are none this time.
+    innovations : tuple of Innovations
+        What was measured against what was predicted.
+    messages : tuple of str
+        For the user.
+    solved : bool
+        Whether the update includes a solution of all that was collected.
+    doubted : tuple of str
+        Kinds of measurements that disagree with the prediction, so that the standard deviations
+        are not to be trusted.
     """
 
     time: float
@@ -128,13 +143,18 @@ def calibration_of(
 
     Parameters
     ----------
-    parameters : all, those that are not estimated included.
-    values : of them; rotations as matrices.
-    biases : parameters and values of gyro and accelerometer.
-    P : (6 + n, 6 + n) joint covariance of accelerometer bias, gyro bias and the parameters
-        that are estimated, in GTSAM's tangent space, SI.
-    held : (n, h) directions that are not observable, as `feigned_directions` returns them:
-        the prior is reported there.
+    parameters : sequence of Parameter
+        All, those that are not estimated included.
+    values : mapping of str to ndarray
+        Of them; rotations as matrices.
+    biases : tuple of (tuple of (Parameter, ndarray), tuple of (Parameter, ndarray))
+        Parameters and values of gyro and accelerometer.
+    P : ndarray, shape (6 + n, 6 + n)
+        Joint covariance of accelerometer bias, gyro bias and the parameters that are estimated, in
+        GTSAM's tangent space, SI.
+    held : ndarray, shape (n, h)
+        Directions that are not observable, as `feigned_directions` returns them: the prior is
+        reported there.
     """
     free = [p for p in parameters if p.estimated]
     (gyro, gyro_bias), (accel, accel_bias) = biases

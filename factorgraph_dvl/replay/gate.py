@@ -49,11 +49,13 @@ class Gate:
 
         Parameters
         ----------
-        label : of the kind.
-        normalised : (M, d) innovations over their standard deviations; nan where a component
-            was not measured.
-        echoes : standard deviations beyond which a measurement of this kind is none, if
-            single ones may be; None if not.
+        label : str
+            Of the kind.
+        normalised : ndarray, shape (M, d)
+            Innovations over their standard deviations; nan where a component was not measured.
+        echoes : float, optional
+            Standard deviations beyond which a measurement of this kind is none, if single ones may
+            be; None if not.
         """
         last = self._last.setdefault(label, deque(maxlen=_LAST))
         limit = _BEYOND if echoes is None else echoes

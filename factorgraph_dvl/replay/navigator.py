@@ -51,11 +51,16 @@ class Navigator:
 
     Parameters
     ----------
-    start : what it starts from.
-    imu : for its settings.
-    gate : what decides which measurements are used.
-    lag : s, of the smoother; None = none.
-    memory : s, for which segments are kept for measurements that arrive late.
+    start : ReplayStart
+        What it starts from.
+    imu : Imu
+        For its settings.
+    gate : Gate
+        What decides which measurements are used.
+    lag : float or None
+        S, of the smoother; None = none.
+    memory : float
+        S, for which segments are kept for measurements that arrive late.
     """
 
     def __init__(

@@ -28,14 +28,22 @@ class ReplayRecord:
 
     Parameters
     ----------
-    time, latency : (H,) of the updates, s.
-    solved : (H,) updates that include a batch solution.
-    doubted : (H,) whether some measurements disagreed with the prediction.
-    names : of the n calibration components, as in `covariance.order`.
-    values, std : (H, n) in reported units; nan before the component was estimated.
-    smoothed : epochs of the trajectory that later data made better.
-    messages : time, s, and text.
-    delay : by which estimates are behind the IMU, s.
+    time, latency : ndarray, shape (H,), s
+        Of the updates.
+    solved : ndarray, shape (H,)
+        Updates that include a batch solution.
+    doubted : ndarray, shape (H,)
+        Whether some measurements disagreed with the prediction.
+    names : tuple of str
+        Of the n calibration components, as in `covariance.order`.
+    values, std : ndarray, shape (H, n)
+        In reported units; nan before the component was estimated.
+    smoothed : Trajectory
+        Epochs of the trajectory that later data made better.
+    messages : tuple of tuple of (float, str)
+        Time, s, and text.
+    delay : float
+        By which estimates are behind the IMU, s.
     """
 
     time: Array
@@ -63,9 +71,11 @@ def replay(
 
     Parameters
     ----------
-    trial : recorded.
+    trial : Trial
+        Recorded.
     smoother, lag_s, rate_hz, progress : see `Replay`.
-    watch : called with every update.
+    watch : Watch, optional
+        Called with every update.
 
     Returns
     -------

@@ -38,7 +38,8 @@ class SampleBuffer:
 
     Parameters
     ----------
-    settings : of the IMU.
+    settings : ImuSettings
+        Of the IMU.
     """
 
     def __init__(self, settings: ImuSettings) -> None:
@@ -140,10 +141,14 @@ class SampleBuffer:
 
         Parameters
         ----------
-        start : s.
-        interval : of the segments, s.
-        wanted : time, s, before which the segment ends if it is in it.
-        end : whether no more samples come.
+        start : float
+            S.
+        interval : float
+            Of the segments, s.
+        wanted : float
+            Time, s, before which the segment ends if it is in it.
+        end : bool
+            Whether no more samples come.
 
         Returns
         -------

@@ -65,11 +65,16 @@ class Replay:
 
     Parameters
     ----------
-    known : trial of which everything but the records counts: settings, axes, priors.
-    smoother : `fixed-lag` or `isam2`.
-    lag_s : states older than this are no longer corrected.
-    rate_hz : states a second.
-    progress : called with stage, iteration and cost while a start is solved.
+    known : Trial
+        Trial of which everything but the records counts: settings, axes, priors.
+    smoother : Kind, default 'fixed-lag'
+        `fixed-lag` or `isam2`.
+    lag_s : float, optional
+        States older than this are no longer corrected.
+    rate_hz : float, optional
+        States a second.
+    progress : callable of str, int, float or None, None, optional
+        Called with stage, iteration and cost while a start is solved.
     """
 
     def __init__(
@@ -169,8 +174,10 @@ class Replay:
 
         Parameters
         ----------
-        time : () or (N,) s.
-        gyro, accel : (3,) or (N, 3) angular rate, rad/s, and specific force, m/s², in body.
+        time : array_like
+            () or (N,) s.
+        gyro, accel : array_like
+            (3,) or (N, 3) angular rate, rad/s, and specific force, m/s², in body.
         """
         table = np.column_stack(
             [
@@ -195,7 +202,8 @@ class Replay:
 
         Parameters
         ----------
-        record : of a `Gnss`, `Dvl`, ...; one row or more.
+        record : Aid
+            Of a `Gnss`, `Dvl`, ...; one row or more.
 
         Raises
         ------

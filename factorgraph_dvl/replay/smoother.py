@@ -42,13 +42,20 @@ class Smoother:
 
     Parameters
     ----------
-    prior, values : graph and start values of the first state, its bias, the calibration.
-    node : index of the first state.
-    time : of it, s.
-    parameters : that are estimated, in the order of `keys.calibration`.
-    walking : whether every state has a bias of its own.
-    lag : s, after which states are marginalised; None = never.
-    ranges : whether there are ranges, which are not linear in the position.
+    prior, values : gtsam.NonlinearFactorGraph or gtsam.Values
+        Graph and start values of the first state, its bias, the calibration.
+    node : int
+        Index of the first state.
+    time : float
+        Of it, s.
+    parameters : sequence of Parameter
+        That are estimated, in the order of `keys.calibration`.
+    walking : bool
+        Whether every state has a bias of its own.
+    lag : float or None
+        S, after which states are marginalised; None = never.
+    ranges : bool, default False
+        Whether there are ranges, which are not linear in the position.
     """
 
     def __init__(
@@ -96,9 +103,12 @@ class Smoother:
 
         Parameters
         ----------
-        time : of the new state, s.
-        factors : that tie it to the one before, and measurements after that one.
-        values : start values of the new state, and of its bias if that walks.
+        time : float
+            Of the new state, s.
+        factors : gtsam.NonlinearFactorGraph
+            That tie it to the one before, and measurements after that one.
+        values : gtsam.Values
+            Start values of the new state, and of its bias if that walks.
         """
         if self._lag is not None:
             gone = [k for k, t in self.times.items() if t < time - self._lag and k < self.node]

@@ -36,22 +36,37 @@ class ReplayStart:
 
     Parameters
     ----------
-    frame : in which positions are.
-    node, time : index of the state, and its time, s.
-    prior : linear factors on state, bias and parameters: all that was collected.
-    values : at which they are linear, and start from.
-    parameters, all_parameters : those that are estimated, and all.
-    fixed : values of those that are not.
-    sections : of the sensors that it knows.
-    ranges : whether there are any, to beacons.
-    own_states : sections of the sensors whose every measurement needs a state of its own.
-    windows : over which the IMU's samples are smoothed.
-    spurious : (P, P) information on the parameters that only noise makes, in units of the
-        priors' standard deviations.
-    walking : whether biases walk.
-    trajectory : of what was collected, as `begin` was asked for it.
-    notes : for the user.
-    misfit : largest root mean square of a kind of residuals over their standard deviations.
+    frame : LocalFrame
+        In which positions are.
+    node, time : int or float
+        Index of the state, and its time, s.
+    prior : gtsam.NonlinearFactorGraph
+        Linear factors on state, bias and parameters: all that was collected.
+    values : gtsam.Values
+        At which they are linear, and start from.
+    parameters, all_parameters : tuple of Parameter
+        Those that are estimated, and all.
+    fixed : dict of str to ndarray
+        Values of those that are not.
+    sections : tuple of str
+        Of the sensors that it knows.
+    ranges : bool
+        Whether there are any, to beacons.
+    own_states : tuple of str
+        Sections of the sensors whose every measurement needs a state of its own.
+    windows : tuple of (int, int)
+        Over which the IMU's samples are smoothed.
+    spurious : ndarray, shape (P, P)
+        Information on the parameters that only noise makes, in units of the priors' standard
+        deviations.
+    walking : bool
+        Whether biases walk.
+    trajectory : Trajectory
+        Of what was collected, as `begin` was asked for it.
+    notes : tuple of str
+        For the user.
+    misfit : float
+        Largest root mean square of a kind of residuals over their standard deviations.
     """
 
     frame: LocalFrame
@@ -80,11 +95,16 @@ def begin(
 
     Parameters
     ----------
-    trial : what was collected.
-    known : of biases and calibration from before, in place of the trial's priors.
-    interval : of the states to come, s.
-    since : time, s, after which the trajectory is wanted.
-    progress : called with stage, iteration and cost.
+    trial : Trial
+        What was collected.
+    known : Known or None
+        Of biases and calibration from before, in place of the trial's priors.
+    interval : float
+        Of the states to come, s.
+    since : float
+        Time, s, after which the trajectory is wanted.
+    progress : callable
+        Called with stage, iteration and cost.
 
     Returns
     -------

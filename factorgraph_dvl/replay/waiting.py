@@ -51,10 +51,14 @@ class Waiting:
 
         Parameters
         ----------
-        section : of the sensor.
-        end : s.
-        frame : in which measurements are, None as long as there is none.
-        values : of the parameters.
+        section : str
+            Of the sensor.
+        end : float
+            S.
+        frame : LocalFrame or None
+            In which measurements are, None as long as there is none.
+        values : mapping of str to ndarray
+            Of the parameters.
         """
         record = joined(self._records.pop(section))
         true = record.time - (0.0 if frame is None else self._late(record, frame, values))

@@ -84,11 +84,16 @@ class Beacons:
     Parameters
     ----------
     settings : BeaconSettings
-    time : (M,) s, strictly increasing.
-    name : (M,) text, the beacon of each row.
-    range : (M,) slant range, m; nan where not measured.
-    range_rate : (M,) m/s, positive when the range grows; nan where not measured.
-    source : name of the file, for messages.
+    time : ndarray, shape (M,)
+        S, strictly increasing.
+    name : ndarray of np.str_, shape (M,)
+        Text, the beacon of each row.
+    range : ndarray, shape (M,)
+        Slant range, m; nan where not measured.
+    range_rate : ndarray, shape (M,)
+        m/s, positive when the range grows; nan where not measured.
+    source : str, optional
+        Name of the file, for messages.
     """
 
     settings: BeaconSettings
@@ -220,13 +225,19 @@ class _ToBeacon:
 
     Parameters
     ----------
-    time : (M,) s.
-    measured : (M,) m or m/s.
-    std : of each, the same unit.
-    place_n : (3,) stated position of the beacon, m.
-    nRl : (3, 3) east, north, up at the beacon to n.
-    arm_b : (3,) lever arm of the vehicle's transponder, in body, m.
-    offset : name of the parameter of the beacon's own place.
+    time : ndarray, shape (M,), s
+    measured : ndarray, shape (M,)
+        M or m/s.
+    std : float
+        Of each, the same unit.
+    place_n : ndarray, shape (3,), m
+        Stated position of the beacon.
+    nRl : ndarray, shape (3, 3)
+        East, north, up at the beacon to n.
+    arm_b : ndarray, shape (3,)
+        Lever arm of the vehicle's transponder, in body, m.
+    offset : str
+        Name of the parameter of the beacon's own place.
     """
 
     time: Array

@@ -28,7 +28,8 @@ def instrument_matrix(gain: Array) -> Array:
 
     Parameters
     ----------
-    gain : (N, 3) rows (1 + k_i) d_i^T, N >= 3.
+    gain : ndarray, shape (N, 3)
+        Rows (1 + k_i) d_i^T, N >= 3.
     """
     return np.asarray(np.linalg.pinv(gain))
 
@@ -50,9 +51,12 @@ def velocities(gain: Array, beams: Array, sigma: Array) -> tuple[Array, Array]:
 
     Parameters
     ----------
-    gain : (N, 3) rows (1 + k_i) d_i^T.
-    beams : (M, N) m/s, nan where lost.
-    sigma : (M, N) m/s; of lost beams ignored.
+    gain : ndarray, shape (N, 3)
+        Rows (1 + k_i) d_i^T.
+    beams : ndarray, shape (M, N)
+        m/s, nan where lost.
+    sigma : ndarray, shape (M, N)
+        m/s; of lost beams ignored.
 
     Returns
     -------
@@ -104,9 +108,10 @@ def as_dvl(beams: DvlBeams, calibration: tuple[Array, Array, Array] | None = Non
     Parameters
     ----------
     beams : DvlBeams
-    calibration : directions in body (N, 3), scale errors (N,) and lever arm (3,), m. What
-        is left between body and d is then the nominal misalignment, exactly, and nothing
-        is to be estimated. None = nominal beams, and the priors of the beams.
+    calibration : tuple of (ndarray, ndarray, ndarray), optional
+        Directions in body (N, 3), scale errors (N,) and lever arm (3,), m. What is left between
+        body and d is then the nominal misalignment, exactly, and nothing is to be estimated. None
+        = nominal beams, and the priors of the beams.
     """
     s = beams.settings
     common = s.parametrisation == "common"

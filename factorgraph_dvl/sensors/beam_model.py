@@ -32,8 +32,10 @@ class FreeGeometry:
 
     Parameters
     ----------
-    nominal_b : (N, 3) unit vectors in body, of which the directions are turns.
-    direction, scale : names of the parameters, (2N,) and (N,).
+    nominal_b : ndarray, shape (N, 3)
+        Unit vectors in body, of which the directions are turns.
+    direction, scale : str
+        Names of the parameters, (2N,) and (N,).
     """
 
     nominal_b: Array
@@ -69,8 +71,10 @@ class CommonGeometry:
 
     Parameters
     ----------
-    nominal_d : (N, 3) unit vectors in d.
-    misalignment, scale : names of the parameters, a rotation and one number.
+    nominal_d : ndarray, shape (N, 3)
+        Unit vectors in d.
+    misalignment, scale : str
+        Names of the parameters, a rotation and one number.
     """
 
     nominal_d: Array

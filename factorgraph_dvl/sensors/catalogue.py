@@ -25,8 +25,10 @@ def every_parameter(beams: int, beacon: str) -> tuple[Parameter, ...]:
 
     Parameters
     ----------
-    beams : the most that a DVL may have.
-    beacon : name of the one whose parameters are returned.
+    beams : int
+        The most that a DVL may have.
+    beacon : str
+        Name of the one whose parameters are returned.
     """
     imu = ImuSettings(
         gyro_noise_deg_sqrt_h=1.0,

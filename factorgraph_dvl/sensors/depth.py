@@ -47,9 +47,12 @@ class Depth:
     Parameters
     ----------
     settings : DepthSettings
-    time : (M,) s, strictly increasing.
-    depth : (M,) below the sea surface, positive down, m; nan where not measured.
-    source : name of the file, for messages.
+    time : ndarray, shape (M,)
+        S, strictly increasing.
+    depth : ndarray, shape (M,)
+        Below the sea surface, positive down, m; nan where not measured.
+    source : str, optional
+        Name of the file, for messages.
     """
 
     settings: DepthSettings
@@ -116,11 +119,15 @@ class DepthBelowSurface:
 
     Parameters
     ----------
-    time : (M,) s.
-    measured : (M,) m, positive down.
-    std : m.
-    lever_arm : (3,) IMU to sensor, in body, m.
-    frame : of n.
+    time : ndarray, shape (M,), s
+    measured : ndarray, shape (M,)
+        M, positive down.
+    std : float
+        M.
+    lever_arm : ndarray, shape (3,)
+        IMU to sensor, in body, m.
+    frame : LocalFrame
+        Of n.
     """
 
     time: Array

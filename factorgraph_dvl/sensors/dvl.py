@@ -85,13 +85,18 @@ class Dvl:
     Parameters
     ----------
     settings : DvlSettings
-    time : (M,) s, strictly increasing; true time plus the time offset.
-    velocity : (M, 3) velocity of the DVL over the seabed (or through the water), in
-        its own axes d, m/s; nan = no lock.
-    std : (M, 3) m/s; nan where the record has none.
-    source : name of the file, for messages.
-    prior : what the calibration that `settings` name knows; it takes the place of the keys
-        for the parameters that it has.
+    time : ndarray, shape (M,)
+        S, strictly increasing; true time plus the time offset.
+    velocity : ndarray, shape (M, 3)
+        Velocity of the DVL over the seabed (or through the water), in its own axes d, m/s; nan =
+        no lock.
+    std : ndarray, shape (M, 3)
+        m/s; nan where the record has none.
+    source : str, optional
+        Name of the file, for messages.
+    prior : JointPrior, optional
+        What the calibration that `settings` name knows; it takes the place of the keys for the
+        parameters that it has.
     """
 
     settings: DvlSettings
@@ -276,10 +281,13 @@ class DvlVelocity:
 
     Parameters
     ----------
-    time : (M,) s, as in the file.
-    measured_d : (M, 3) m/s.
-    std : (M, 3) m/s; nan where it follows from `noise`.
-    noise : floor, m/s, and fraction of the speed.
+    time : ndarray, shape (M,)
+        S, as in the file.
+    measured_d : ndarray, shape (M, 3), m/s
+    std : ndarray, shape (M, 3)
+        m/s; nan where it follows from `noise`.
+    noise : tuple of (float, float), optional
+        Floor, m/s, and fraction of the speed.
     """
 
     time: Array

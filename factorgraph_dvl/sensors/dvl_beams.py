@@ -150,11 +150,14 @@ class DvlBeams:
     Parameters
     ----------
     settings : DvlBeamsSettings
-    time : (M,) s, strictly increasing.
-    velocity : (M, N) velocity of the transducer along each beam's outward direction, m/s;
-        nan = beam lost.
-    source : name of the file, for messages.
-    prefix : of the parameters that a `dvl` beside it has under the same names.
+    time : ndarray, shape (M,)
+        S, strictly increasing.
+    velocity : ndarray, shape (M, N)
+        Velocity of the transducer along each beam's outward direction, m/s; nan = beam lost.
+    source : str, optional
+        Name of the file, for messages.
+    prefix : str, optional
+        Of the parameters that a `dvl` beside it has under the same names.
     """
 
     settings: DvlBeamsSettings
@@ -315,12 +318,17 @@ class BeamVelocity:
 
     Parameters
     ----------
-    time : (M,) s.
-    measured : (M, N) m/s; any number where lost.
-    lost : (M, N) bool.
-    noise : floor, m/s, and fraction of the beam's velocity.
-    geometry : directions and scales.
-    lever_arm : name of the parameter.
+    time : ndarray, shape (M,), s
+    measured : ndarray, shape (M, N)
+        m/s; any number where lost.
+    lost : ndarray, shape (M, N)
+        Bool.
+    noise : tuple of (float, float)
+        Floor, m/s, and fraction of the beam's velocity.
+    geometry : Geometry
+        Directions and scales.
+    lever_arm : str
+        Name of the parameter.
     """
 
     time: Array

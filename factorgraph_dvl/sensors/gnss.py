@@ -56,15 +56,19 @@ class Gnss:
     Parameters
     ----------
     settings : GnssSettings
-    time : (M,) s, strictly increasing.
-    geodetic : (M, 3) latitude, longitude (rad), ellipsoidal height (m) of the antenna;
-        nan where not measured.
-    velocity : (M, 3) east, north, up, m/s; nan where not measured.
-    position_std, velocity_std : (M, 3) standard deviations, east, north, up; the
-        settings' where the record has none (nan).
-    source : name of the file, for messages.
-    turning : of the body relative to the ship that carries the antenna; None = the antenna
-        is fixed to the body.
+    time : ndarray, shape (M,)
+        S, strictly increasing.
+    geodetic : ndarray, shape (M, 3)
+        Latitude, longitude (rad), ellipsoidal height (m) of the antenna; nan where not measured.
+    velocity : ndarray, shape (M, 3)
+        East, north, up, m/s; nan where not measured.
+    position_std, velocity_std : ndarray, shape (M, 3)
+        Standard deviations, east, north, up; the settings' where the record has none (nan).
+    source : str, optional
+        Name of the file, for messages.
+    turning : TurntableMotion, optional
+        Of the body relative to the ship that carries the antenna; None = the antenna is fixed to
+        the body.
     """
 
     settings: GnssSettings
@@ -204,11 +208,15 @@ class AntennaPosition:
 
     Parameters
     ----------
-    time : (M,) s.
-    measured_n : (M, 3) position in n, m.
-    lRn : (M, 3, 3) n to the local-level axes in which `std` holds.
-    std : (M, 3) east, north, up, m.
-    bRc : (M, 3, 3) or (3, 3), axes of the antenna's carrier to body.
+    time : ndarray, shape (M,), s
+    measured_n : ndarray, shape (M, 3), m
+        Position in n.
+    lRn : ndarray, shape (M, 3, 3)
+        N to the local-level axes in which `std` holds.
+    std : ndarray, shape (M, 3)
+        East, north, up, m.
+    bRc : ndarray, shape (M, 3, 3) or (3, 3), optional
+        Axes of the antenna's carrier to body.
     """
 
     time: Array
@@ -253,12 +261,16 @@ class AntennaVelocity:
 
     Parameters
     ----------
-    time : (M,) s.
-    measured_l : (M, 3) east, north, up at the vehicle, m/s.
-    lRn : (M, 3, 3) n to local-level axes.
-    std : (M, 3) m/s.
-    bRc : (M, 3, 3) or (3, 3), axes of the antenna's carrier to body.
-    omega_cb_b : (M, 3) or (3,) rate of the body relative to that carrier, rad/s.
+    time : ndarray, shape (M,), s
+    measured_l : ndarray, shape (M, 3)
+        East, north, up at the vehicle, m/s.
+    lRn : ndarray, shape (M, 3, 3)
+        N to local-level axes.
+    std : ndarray, shape (M, 3), m/s
+    bRc : ndarray, shape (M, 3, 3) or (3, 3), optional
+        Axes of the antenna's carrier to body.
+    omega_cb_b : ndarray, shape (M, 3) or (3,), rad/s, optional
+        Rate of the body relative to that carrier.
     """
 
     time: Array

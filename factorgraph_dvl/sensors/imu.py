@@ -84,10 +84,14 @@ class Imu:
     Parameters
     ----------
     settings : ImuSettings
-    time : (N,) s, strictly increasing.
-    gyro : (N, 3) angular rate relative to inertial space, in body, rad/s.
-    accel : (N, 3) specific force in body, m/s².
-    source : name of the file, for messages.
+    time : ndarray, shape (N,)
+        S, strictly increasing.
+    gyro : ndarray, shape (N, 3)
+        Angular rate relative to inertial space, in body, rad/s.
+    accel : ndarray, shape (N, 3), m/s²
+        Specific force in body.
+    source : str, optional
+        Name of the file, for messages.
     """
 
     settings: ImuSettings

@@ -68,10 +68,14 @@ class JointPrior:
 
     Parameters
     ----------
-    source : name of the file, for messages.
-    values : (n,) by reported name, in reported units.
-    covariance : (N, N) of all their components, in the order of `values`, in reported units.
-    inputs : fingerprints of the data that it came from.
+    source : str
+        Name of the file, for messages.
+    values : mapping of str to ndarray, shape (n,)
+        By reported name, in reported units.
+    covariance : ndarray, shape (N, N)
+        Of all their components, in the order of `values`, in reported units.
+    inputs : tuple of str, optional
+        Fingerprints of the data that it came from.
 
     Raises
     ------
@@ -126,16 +130,22 @@ class Parameter:
 
     Parameters
     ----------
-    stem, unit : reported name without unit, and the unit (empty if dimensionless).
-    si : SI value of one reported unit.
-    mean, sigma : (n,) prior mean and standard deviation, SI. A component with sigma 0
-        is held at its mean.
-    rotation : the value is a rotation, `mean` its rotation vector and `sigma` that of
-        the components of the rotation vector.
-    labels : component names; empty for a scalar.
-    joint : where mean and sigma come from a calibration of several parameters: all of it.
-    nominal : (N, 3) unit vectors in body, if the parameter is N directions: the components
-        then turn them, two each (`directions`). Files hold the directions.
+    stem, unit : str
+        Reported name without unit, and the unit (empty if dimensionless).
+    si : float
+        SI value of one reported unit.
+    mean, sigma : ndarray, shape (n,)
+        Prior mean and standard deviation, SI. A component with sigma 0 is held at its mean.
+    rotation : bool, optional
+        The value is a rotation, `mean` its rotation vector and `sigma` that of the components of
+        the rotation vector.
+    labels : tuple of str, optional
+        Component names; empty for a scalar.
+    joint : JointPrior, optional
+        Where mean and sigma come from a calibration of several parameters: all of it.
+    nominal : ndarray, shape (N, 3), optional
+        Unit vectors in body, if the parameter is N directions: the components then turn them, two
+        each (`directions`). Files hold the directions.
     """
 
     stem: str
@@ -181,13 +191,19 @@ class Motion:
 
     Parameters
     ----------
-    nRb : (M, 3, 3) attitude, body to n.
-    p_n, v_n : (M, 3) position and Earth-relative velocity of the IMU in n, m, m/s.
-    omega_eb_b : (M, 3) angular rate of the body relative to the Earth, rad/s.
-    a_n : (M, 3) Earth-relative acceleration, dv_n/dt, m/s².
-    alpha_b : (M, 3) time derivative of the angular rate, rad/s².
-    omega_sigma : (M, 3) standard deviation of omega_eb_b from the gyro's noise and
-        from motion that its samples do not resolve, rad/s.
+    nRb : ndarray, shape (M, 3, 3)
+        Attitude, body to n.
+    p_n, v_n : ndarray, shape (M, 3)
+        Position and Earth-relative velocity of the IMU in n, m, m/s.
+    omega_eb_b : ndarray, shape (M, 3), rad/s
+        Angular rate of the body relative to the Earth.
+    a_n : ndarray, shape (M, 3)
+        Earth-relative acceleration, dv_n/dt, m/s².
+    alpha_b : ndarray, shape (M, 3), rad/s²
+        Time derivative of the angular rate.
+    omega_sigma : ndarray, shape (M, 3), rad/s
+        Standard deviation of omega_eb_b from the gyro's noise and from motion that its samples do
+        not resolve.
     """
 
     nRb: Array
@@ -205,12 +221,15 @@ class Linearization:
 
     Parameters
     ----------
-    residual : (M, d).
-    d_theta : (M, d, 3) with respect to theta in nRb Exp(theta).
-    d_p, d_v : (M, d, 3) with respect to p_n and v_n.
-    d_omega : (M, d, 3) with respect to omega_eb_b.
-    d_parameters : name to (M, d, n); for a rotation, with respect to delta in
-        R Exp(delta).
+    residual : ndarray, shape (M, d)
+    d_theta : ndarray, shape (M, d, 3), optional
+        With respect to theta in nRb Exp(theta).
+    d_p, d_v : ndarray, shape (M, d, 3), optional
+        With respect to p_n and v_n.
+    d_omega : ndarray, shape (M, d, 3), optional
+        With respect to omega_eb_b.
+    d_parameters : dict of str to ndarray, optional
+        Name to (M, d, n); for a rotation, with respect to delta in R Exp(delta).
     """
 
     residual: Array
@@ -327,11 +346,15 @@ class Attitudes:
 
     Parameters
     ----------
-    time : (M,) s.
-    nRs : (M, 3, 3) attitude of the sensor's axes.
-    sigma : (M,) standard deviation about the axis that is known best, rad.
-    mounting : the parameter sRb, with its prior.
-    consistency_warnings : what the record says against itself, for people.
+    time : ndarray, shape (M,), s
+    nRs : ndarray, shape (M, 3, 3)
+        Attitude of the sensor's axes.
+    sigma : ndarray, shape (M,), rad
+        Standard deviation about the axis that is known best.
+    mounting : Parameter
+        The parameter sRb, with its prior.
+    consistency_warnings : tuple of str, optional
+        What the record says against itself, for people.
     """
 
     time: Array

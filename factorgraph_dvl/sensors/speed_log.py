@@ -54,9 +54,12 @@ class Heading:
     Parameters
     ----------
     settings : HeadingSettings
-    time : (M,) s, strictly increasing.
-    heading : (M,) clockwise from true north, rad; nan where not measured.
-    source : name of the file, for messages.
+    time : ndarray, shape (M,)
+        S, strictly increasing.
+    heading : ndarray, shape (M,)
+        Clockwise from true north, rad; nan where not measured.
+    source : str, optional
+        Name of the file, for messages.
     """
 
     settings: HeadingSettings
@@ -98,10 +101,14 @@ class SpeedLog:
     Parameters
     ----------
     settings : LogSettings
-    time : (M,) s, strictly increasing.
-    speed : (M,) ahead, m/s; nan where not measured.
-    starboard : (M,) to starboard, m/s; nan where not measured, which stands for none.
-    source : name of the file, for messages.
+    time : ndarray, shape (M,)
+        S, strictly increasing.
+    speed : ndarray, shape (M,)
+        Ahead, m/s; nan where not measured.
+    starboard : ndarray, shape (M,)
+        To starboard, m/s; nan where not measured, which stands for none.
+    source : str, optional
+        Name of the file, for messages.
     """
 
     settings: LogSettings

@@ -77,8 +77,10 @@ class StarVectors:
 
     Parameters
     ----------
-    time : (K,) s, not decreasing; rows of one time belong together.
-    body, inertial : (K, 3) unit vectors in the tracker's axes and in GCRS.
+    time : ndarray, shape (K,)
+        S, not decreasing; rows of one time belong together.
+    body, inertial : ndarray, shape (K, 3)
+        Unit vectors in the tracker's axes and in GCRS.
     """
 
     time: Array
@@ -98,12 +100,16 @@ class Star:
     Parameters
     ----------
     settings : StarSettings
-    time : (M,) s, strictly increasing.
-    quaternion : (M, 4) scalar first, of iRs: the tracker's axes to GCRS; nan where not
-        measured.
-    covariance : (M, 3, 3) of phi in iRs Exp(phi), rad².
-    source : name of the file, for messages.
-    vectors : what the attitudes were found from, None if they were measured as such.
+    time : ndarray, shape (M,)
+        S, strictly increasing.
+    quaternion : ndarray, shape (M, 4)
+        Scalar first, of iRs: the tracker's axes to GCRS; nan where not measured.
+    covariance : ndarray, shape (M, 3, 3), rad²
+        Of phi in iRs Exp(phi).
+    source : str, optional
+        Name of the file, for messages.
+    vectors : StarVectors, optional
+        What the attitudes were found from, None if they were measured as such.
     """
 
     settings: StarSettings
@@ -164,9 +170,12 @@ class Star:
         ----------
         settings : StarSettings; its standard deviation is that of a direction, per axis
             across it.
-        time : (K,) s; rows of the same time belong together.
-        body, inertial : (K, 3) directions in the tracker's axes and in GCRS, of any length.
-        source : name of the file, for messages.
+        time : ndarray, shape (K,)
+            S; rows of the same time belong together.
+        body, inertial : ndarray, shape (K, 3)
+            Directions in the tracker's axes and in GCRS, of any length.
+        source : str
+            Name of the file, for messages.
 
         Raises
         ------
@@ -376,11 +385,15 @@ class StarAttitude:
 
     Parameters
     ----------
-    time : (M,) s.
-    nRs : (M, 3, 3) measured.
-    axes : (M, 3, 3) principal axes of the covariance, in the tracker's.
-    std : (M, 3) arcsec, along them.
-    components : names of the axes.
+    time : ndarray, shape (M,), s
+    nRs : ndarray, shape (M, 3, 3)
+        Measured.
+    axes : ndarray, shape (M, 3, 3)
+        Principal axes of the covariance, in the tracker's.
+    std : ndarray, shape (M, 3)
+        Arcsec, along them.
+    components : tuple of str, optional
+        Names of the axes.
     """
 
     time: Array

@@ -36,10 +36,13 @@ class Turntable:
     Parameters
     ----------
     settings : TurntableSettings
-    time : (M,) s, strictly increasing.
-    angle : (M,) rotation of IMU and DVL relative to the ship, counter-clockwise seen from
-        above, rad; it may wrap.
-    source : name of the file, for messages.
+    time : ndarray, shape (M,)
+        S, strictly increasing.
+    angle : ndarray, shape (M,)
+        Rotation of IMU and DVL relative to the ship, counter-clockwise seen from above, rad; it
+        may wrap.
+    source : str, optional
+        Name of the file, for messages.
     """
 
     settings: TurntableSettings

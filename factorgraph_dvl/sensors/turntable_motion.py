@@ -20,9 +20,12 @@ class TurntableMotion:
 
     Parameters
     ----------
-    time : (K,) s, strictly increasing.
-    angle : (K,) rad, counter-clockwise seen from above; without jumps.
-    up : (3,) unit vector along the axis, upwards, in body and in c.
+    time : ndarray, shape (K,)
+        S, strictly increasing.
+    angle : ndarray, shape (K,)
+        Rad, counter-clockwise seen from above; without jumps.
+    up : ndarray, shape (3,)
+        Unit vector along the axis, upwards, in body and in c.
     """
 
     time: Array

@@ -24,10 +24,14 @@ def read_bytes(
 
     Parameters
     ----------
-    path : of the file.
-    limit : of its size, bytes.
-    expected : what it should hold, for messages.
-    kind : of the error.
+    path : path-like
+        Of the file.
+    limit : int
+        Of its size, bytes.
+    expected : str
+        What it should hold, for messages.
+    kind : type of ConfigError or DataError, optional
+        Of the error.
 
     Raises
     ------

@@ -46,9 +46,12 @@ def read_yaml(path: Path, kind: type[T], *, source: str = "") -> T:
 
     Parameters
     ----------
-    path : of the file.
-    kind : the type; it should forbid unknown fields.
-    source : name of the file in messages; by default that of `path`.
+    path : path-like
+        Of the file.
+    kind : type of T
+        The type; it should forbid unknown fields.
+    source : str, optional
+        Name of the file in messages; by default that of `path`.
 
     Raises
     ------

@@ -55,9 +55,11 @@ def simulate(scenario: Scenario | str | PathLike[str], seed: int = 0) -> Trial:
 
     Parameters
     ----------
-    scenario : a scenario, or the path of its YAML file.
-    seed : of all that is random. Each sensor draws from a stream of its own, so that
-        adding or changing one leaves the others as they were.
+    scenario : Scenario or path-like of str
+        A scenario, or the path of its YAML file.
+    seed : int, default 0
+        Of all that is random. Each sensor draws from a stream of its own, so that adding or
+        changing one leaves the others as they were.
 
     Raises
     ------
@@ -99,8 +101,10 @@ def simulate_planar(scenario: Scenario | str | PathLike[str], seed: int = 0) -> 
 
     Parameters
     ----------
-    scenario : a scenario without an IMU, or the path of its YAML file.
-    seed : of all that is random; each sensor draws from a stream of its own.
+    scenario : Scenario or path-like of str
+        A scenario without an IMU, or the path of its YAML file.
+    seed : int, default 0
+        Of all that is random; each sensor draws from a stream of its own.
 
     Raises
     ------

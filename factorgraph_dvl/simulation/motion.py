@@ -38,8 +38,8 @@ class Sway:
 
     Parameters
     ----------
-    amplitude, frequency, phase : (K,) of amplitude · sin(frequency t + phase); the
-        frequency in rad/s.
+    amplitude, frequency, phase : ndarray, shape (K,)
+        Of amplitude · sin(frequency t + phase); the frequency in rad/s.
     """
 
     amplitude: Array
@@ -69,12 +69,18 @@ class TrueState:
 
     Parameters
     ----------
-    geodetic : (M, 3) latitude, longitude (rad), ellipsoidal height (m).
-    v_n, a_n : (M, 3) velocity over ground and its derivative, local-level ENU.
-    rph : (M, 3) roll, pitch, heading, rad; the heading is not wrapped.
-    omega_eb_b : (M, 3) angular rate relative to the Earth, rad/s.
-    omega_ib_b : (M, 3) angular rate relative to inertial space, rad/s.
-    f_b : (M, 3) specific force, m/s².
+    geodetic : ndarray, shape (M, 3)
+        Latitude, longitude (rad), ellipsoidal height (m).
+    v_n, a_n : ndarray, shape (M, 3)
+        Velocity over ground and its derivative, local-level ENU.
+    rph : ndarray, shape (M, 3)
+        Roll, pitch, heading, rad; the heading is not wrapped.
+    omega_eb_b : ndarray, shape (M, 3), rad/s
+        Angular rate relative to the Earth.
+    omega_ib_b : ndarray, shape (M, 3), rad/s
+        Angular rate relative to inertial space.
+    f_b : ndarray, shape (M, 3), m/s²
+        Specific force.
     """
 
     geodetic: Array
@@ -95,17 +101,27 @@ class TrueMotion:
 
     Parameters
     ----------
-    speed : through the water, m/s.
-    course : clockwise from north, rad.
-    lat, lon : rad.
-    height : without heave and current, m.
-    current_n : (3,) ENU, m/s.
-    roll, pitch, yaw, heave : sway, rad and m.
-    kinks : (K,) times at which acceleration or turn rate change abruptly, s.
-    duration : s.
-    body_axes : axes of the body frame.
-    table : angle of the turntable that carries the body on the vehicle, counter-clockwise
-        seen from above, rad; None without one. Its axis passes through the IMU.
+    speed : PPoly
+        Through the water, m/s.
+    course : PPoly
+        Clockwise from north, rad.
+    lat, lon : PPoly
+        Rad.
+    height : PPoly
+        Without heave and current, m.
+    current_n : ndarray, shape (3,), m/s
+        ENU.
+    roll, pitch, yaw, heave : Sway
+        Sway, rad and m.
+    kinks : ndarray, shape (K,), s
+        Times at which acceleration or turn rate change abruptly.
+    duration : float
+        S.
+    body_axes : BodyAxes
+        Axes of the body frame.
+    table : PPoly, optional
+        Angle of the turntable that carries the body on the vehicle, counter-clockwise seen from
+        above, rad; None without one. Its axis passes through the IMU.
     """
 
     speed: PPoly

@@ -249,8 +249,10 @@ def parse_scenario(data: Mapping[str, Any], source: str = "scenario") -> Scenari
 
     Parameters
     ----------
-    data : keys and values as in the file.
-    source : name of their origin, for messages.
+    data : mapping of str to object
+        Keys and values as in the file.
+    source : str, default 'scenario'
+        Name of their origin, for messages.
 
     Raises
     ------

@@ -72,9 +72,10 @@ class Minimised:
     Parameters
     ----------
     problem, minimum, covariances : what was minimised, and where it ended.
-    held : (P, h) directions that are not observable, in units of the priors' standard
-        deviations.
-    notes : what is worth telling.
+    held : ndarray, shape (P, h)
+        Directions that are not observable, in units of the priors' standard deviations.
+    notes : tuple of str
+        What is worth telling.
     """
 
     problem: Problem
@@ -108,11 +109,13 @@ def solve(
     Parameters
     ----------
     trial : Trial
-    rate_hz : rate of the trajectory in the solution; the solver's states are independent
-        of it.
-    state_interval_s : time between the states of the graph; less where the noise of the
-        gyros in between matters to a sensor of attitude.
-    progress : called with stage, iteration and cost (None where there is none yet).
+    rate_hz : float, optional
+        Rate of the trajectory in the solution; the solver's states are independent of it.
+    state_interval_s : float, optional
+        Time between the states of the graph; less where the noise of the gyros in between matters
+        to a sensor of attitude.
+    progress : callable, optional
+        Called with stage, iteration and cost (None where there is none yet).
 
     Returns
     -------
@@ -227,9 +230,12 @@ def fit(
 
     Parameters
     ----------
-    trial, state_interval_s : as for `solve`.
-    progress : called with stage, iteration and cost.
-    known : of biases and calibration, in place of the trial's priors.
+    trial, state_interval_s : Trial or float
+        As for `solve`.
+    progress : callable
+        Called with stage, iteration and cost.
+    known : Known, optional
+        Of biases and calibration, in place of the trial's priors.
 
     Returns
     -------

@@ -47,7 +47,8 @@ class Frontier:
 
     Parameters
     ----------
-    root : (n, n) upper triangle; columns: state, its bias where biases walk, constants.
+    root : ndarray, shape (n, n)
+        Upper triangle; columns: state, its bias where biases walk, constants.
     """
 
     root: Array
@@ -98,10 +99,13 @@ def information_history(
 
     Parameters
     ----------
-    problem, evaluation : linearised there.
-    held : (P, h) directions of the parameters that the problem holds, as
-        `feigned_directions` returns them: they stay at the prior all the time.
-    covariances : of the held problem.
+    problem, evaluation : Problem or Evaluation
+        Linearised there.
+    held : ndarray, shape (P, h)
+        Directions of the parameters that the problem holds, as `feigned_directions` returns them:
+        they stay at the prior all the time.
+    covariances : Posterior
+        Of the held problem.
     """
     triangles, _ = run_filter(problem, evaluation)
     undetermined = _undetermined(problem, evaluation, covariances.given, triangles)
@@ -133,9 +137,11 @@ def run_filter(
 
     Parameters
     ----------
-    problem, evaluation : linearised there.
-    start : what is known at the first node; by default the priors in the graph. If it is
-        given, they are left out: it holds them already.
+    problem, evaluation : Problem or Evaluation
+        Linearised there.
+    start : Frontier, optional
+        What is known at the first node; by default the priors in the graph. If it is given, they
+        are left out: it holds them already.
 
     Returns
     -------
@@ -184,10 +190,14 @@ def as_history(
 
     Parameters
     ----------
-    problem, evaluation : linearised there.
-    held : as of `information_history`.
-    triangles : of `run_filter`.
-    undetermined : further directions that are at their prior, by entry.
+    problem, evaluation : Problem or Evaluation
+        Linearised there.
+    held : ndarray
+        As of `information_history`.
+    triangles : ndarray
+        Of `run_filter`.
+    undetermined : mapping of int to ndarray
+        Further directions that are at their prior, by entry.
     """
     layout, _ = _layout(problem)
     names: list[str] = []

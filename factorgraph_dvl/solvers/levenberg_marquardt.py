@@ -31,11 +31,15 @@ class Minimum:
 
     Parameters
     ----------
-    evaluation : at the last values.
-    tree : Bayes tree from QR there, up to the last step, which was small if `converged`;
-        None if no proof was asked for.
-    converged : whether the linear model promises no more.
-    iterations : accepted and refused steps.
+    evaluation : Evaluation
+        At the last values.
+    tree : gtsam.GaussianBayesTree or None
+        Bayes tree from QR there, up to the last step, which was small if `converged`; None if no
+        proof was asked for.
+    converged : bool
+        Whether the linear model promises no more.
+    iterations : int
+        Accepted and refused steps.
     """
 
     evaluation: Evaluation
@@ -67,12 +71,18 @@ def minimise(
     Parameters
     ----------
     problem : Problem
-    values : where to start.
-    stage : name, for the progress.
-    progress : called with stage, iteration and cost.
-    max_iterations : steps after which to give up.
-    tolerance : promised decrease of the cost below which the minimum is reached.
-    proven : whether QR must confirm the minimum.
+    values : gtsam.Values
+        Where to start.
+    stage : str
+        Name, for the progress.
+    progress : callable, optional
+        Called with stage, iteration and cost.
+    max_iterations : int, default 50
+        Steps after which to give up.
+    tolerance : float, optional
+        Promised decrease of the cost below which the minimum is reached.
+    proven : bool, default True
+        Whether QR must confirm the minimum.
 
     Raises
     ------

@@ -36,8 +36,10 @@ class SquareRootInformation:
 
     Parameters
     ----------
-    tree : Bayes tree from QR elimination.
-    sizes : dimension of every variable by key.
+    tree : gtsam.GaussianBayesTree
+        Bayes tree from QR elimination.
+    sizes : mapping of int to int
+        Dimension of every variable by key.
     """
 
     def __init__(self, tree: gtsam.GaussianBayesTree, sizes: Mapping[int, int]) -> None:
@@ -72,7 +74,8 @@ class SquareRootInformation:
 
         Parameters
         ----------
-        functional : keys to (n, size) matrices.
+        functional : mapping of int to ndarray
+            Keys to (n, size) matrices.
 
         Returns
         -------
@@ -111,7 +114,8 @@ class SquareRootInformation:
 
         Parameters
         ----------
-        functionals : each maps keys to (n, size) matrices; values add up over keys.
+        functionals : sequence of mapping of int to ndarray
+            Each maps keys to (n, size) matrices; values add up over keys.
 
         Returns
         -------
@@ -193,13 +197,18 @@ class Posterior:
 
     Parameters
     ----------
-    information : of all variables, the held directions taken as known.
-    nodes : (K, 9, 9) covariances of the states, in GTSAM's tangent space, K Kᵀ included.
-    given : (K, 9, 9) those that are left where the parameters are known.
-    parameters : (P, P) covariance of the parameters, in the coordinates u of a step S u, S
-        `Problem.prior_root`.
-    with_parameters : covariance of states and biases with them, (size, P) by key.
-    considered : K of states and biases, (size, h) by key; empty where nothing is held.
+    information : SquareRootInformation
+        Of all variables, the held directions taken as known.
+    nodes : ndarray, shape (K, 9, 9)
+        Covariances of the states, in GTSAM's tangent space, K Kᵀ included.
+    given : ndarray, shape (K, 9, 9)
+        Those that are left where the parameters are known.
+    parameters : ndarray, shape (P, P)
+        Covariance of the parameters, in the coordinates u of a step S u, S `Problem.prior_root`.
+    with_parameters : dict of int to ndarray
+        Covariance of states and biases with them, (size, P) by key.
+    considered : dict of int to ndarray
+        K of states and biases, (size, h) by key; empty where nothing is held.
     """
 
     information: SquareRootInformation
@@ -235,9 +244,12 @@ def changes_with(found: Posterior, held: Array, coupled: Array) -> dict[int, Arr
 
     Parameters
     ----------
-    found : covariances where the directions are not held yet.
-    held : (P, h) directions in the coordinates u of a step S u, S `Problem.prior_root`.
-    coupled : (h, h) projection on those that others hang together with.
+    found : Posterior
+        Covariances where the directions are not held yet.
+    held : ndarray, shape (P, h)
+        Directions in the coordinates u of a step S u, S `Problem.prior_root`.
+    coupled : ndarray, shape (h, h)
+        Projection on those that others hang together with.
     """
     own = held @ np.linalg.inv(held.T @ found.parameters @ held) @ coupled
     return {key: out @ own for key, out in found.with_parameters.items()}

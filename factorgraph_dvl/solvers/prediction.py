@@ -32,8 +32,10 @@ def predict_posterior(
 
     Parameters
     ----------
-    trial : its records without noise, its true calibration, and the noise that it claims.
-    true_states : returns the states at (K,) times in a frame.
+    trial : Trial
+        Its records without noise, its true calibration, and the noise that it claims.
+    true_states : TrueStates
+        Returns the states at (K,) times in a frame.
 
     Returns
     -------
@@ -66,8 +68,10 @@ def continue_posterior(
 
     Parameters
     ----------
-    trial, true_states : as of `predict_posterior`; its priors are not used.
-    start : at the first node.
+    trial, true_states : Trial or TrueStates
+        As of `predict_posterior`; its priors are not used.
+    start : Frontier
+        At the first node.
     """
     problem, evaluation = _at_truth(trial, true_states)
     triangles, frontier = run_filter(problem, evaluation, start)

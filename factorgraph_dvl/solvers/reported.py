@@ -27,9 +27,12 @@ class Reported:
 
     Parameters
     ----------
-    parameter : what it is.
-    value : (n,) in its unit.
-    derivative : (n, n) of `value` by the parameter's tangent space, SI.
+    parameter : Parameter
+        What it is.
+    value : ndarray, shape (n,)
+        In its unit.
+    derivative : ndarray, shape (n, n), SI
+        Of `value` by the parameter's tangent space.
     """
 
     parameter: Parameter
@@ -64,8 +67,10 @@ def estimates_of(
 
     Parameters
     ----------
-    rows : parameters with their values in reported units, in order.
-    joint : (F, F) covariance of those that were estimated, in reported units.
+    rows : sequence of tuple of (Parameter, ndarray)
+        Parameters with their values in reported units, in order.
+    joint : ndarray, shape (F, F)
+        Covariance of those that were estimated, in reported units.
     """
     total = sum(value.size for _, value in rows)
     covariance = np.zeros((total, total))

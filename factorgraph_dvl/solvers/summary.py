@@ -54,10 +54,13 @@ def summarise(
     Parameters
     ----------
     problem, minimum, covariances : what was minimised, and where it ended.
-    held : (P, h) directions of the parameters in which the prior was held because the
-        data say nothing, as `feigned_directions` returns them.
-    rate_hz : rate of the trajectory.
-    notes : what is already known to be worth telling.
+    held : ndarray, shape (P, h)
+        Directions of the parameters in which the prior was held because the data say nothing, as
+        `feigned_directions` returns them.
+    rate_hz : float
+        Rate of the trajectory.
+    notes : sequence of str
+        What is already known to be worth telling.
     """
     chain = problem.chain
     trial = chain.trial
@@ -138,7 +141,8 @@ def calibration(
     Parameters
     ----------
     problem, evaluation, covariances : at the minimum.
-    held : as of `summarise`.
+    held : ndarray
+        As of `summarise`.
     """
     rows = reported(problem, evaluation)
     free = [f for _, _, f in rows if f is not None]
@@ -168,7 +172,8 @@ def prior_along(
     Parameters
     ----------
     problem, held, functionals : of what.
-    considered : change of other variables with the directions, as of `Posterior`.
+    considered : mapping of int to ndarray
+        Change of other variables with the directions, as of `Posterior`.
     """
     spread = problem.prior_root @ held
     by_key = {problem.key(name): spread[place] for name, place in problem.columns.items()}
@@ -205,12 +210,17 @@ def trajectory_between(
 
     Parameters
     ----------
-    seg : of K nodes.
-    states : at the nodes.
-    P : (K, 9, 9) their covariances, in GTSAM's tangent space.
-    gravity_n : (S, 3) `LocalFrame.gravity_without_rotation` along the segments, m/s².
-    frame, body_axes : of the states, and of what is returned.
-    time : (M,) s.
+    seg : Segments
+        Of K nodes.
+    states : States
+        At the nodes.
+    P : ndarray, shape (K, 9, 9)
+        Their covariances, in GTSAM's tangent space.
+    gravity_n : ndarray, shape (S, 3)
+        `LocalFrame.gravity_without_rotation` along the segments, m/s².
+    frame, body_axes : LocalFrame or BodyAxes
+        Of the states, and of what is returned.
+    time : ndarray, shape (M,), s
     """
     motion, fraction, node = _smoothed(seg, states, gravity_n, frame.earth_rate, time)
     lat, lon, height = frame.geodetic(motion.p_n)

@@ -15,12 +15,15 @@ class InformationHistory:
 
     Parameters
     ----------
-    time : (K,) s; the first before any data.
-    names : (P,) components as in `covariance.order`. Biases that walk are no constants,
-        and not among them.
-    root : (K, P, P) square roots S of the covariances S Sᵀ, in reported units. Kept as
-        roots because a product of priors of hundreds of degrees and posteriors of arc
-        seconds leaves a matrix of information few digits.
+    time : ndarray, shape (K,)
+        S; the first before any data.
+    names : tuple of str
+        (P,) components as in `covariance.order`. Biases that walk are no constants, and not among
+        them.
+    root : ndarray, shape (K, P, P)
+        Square roots S of the covariances S Sᵀ, in reported units. Kept as roots because a product
+        of priors of hundreds of degrees and posteriors of arc seconds leaves a matrix of
+        information few digits.
     """
 
     time: Array

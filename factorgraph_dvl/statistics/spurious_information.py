@@ -42,8 +42,10 @@ class DataInformation:
 
     Parameters
     ----------
-    data : (P, P) information once all other variables are eliminated.
-    spurious : (P, P) share of it that the error of the motion is expected to feign.
+    data : ndarray, shape (P, P)
+        Information once all other variables are eliminated.
+    spurious : ndarray, shape (P, P)
+        Share of it that the error of the motion is expected to feign.
     """
 
     data: Array
@@ -62,8 +64,10 @@ class DataInformation:
 
         Parameters
         ----------
-        held : (P, h) directions.
-        full : `parameter_information`.
+        held : ndarray, shape (P, h)
+            Directions.
+        full : ndarray
+            `parameter_information`.
         """
         P = np.linalg.inv(self.data + np.eye(len(self.data)))
         own = np.eye(held.shape[1])
@@ -83,8 +87,9 @@ def data_information(
     Parameters
     ----------
     problem, minimum, covariances : at the minimum.
-    at_truth : the motion there is the true one, and feigns nothing: return what will be
-        found once it is estimated.
+    at_truth : bool, default False
+        The motion there is the true one, and feigns nothing: return what will be found once it is
+        estimated.
     """
     size = len(problem.prior_root)
     if size == 0:
@@ -121,10 +126,11 @@ def spurious_information(problem: Problem, evaluation: Evaluation, nodes: Array)
 
     Parameters
     ----------
-    problem, evaluation : linearised there.
-    nodes : (K, 9, 9) covariances of the states, in GTSAM's tangent space, where the
-        parameters are known: an error that all states share turns the Jacobians alike, and
-        feigns no change.
+    problem, evaluation : Problem or Evaluation
+        Linearised there.
+    nodes : ndarray, shape (K, 9, 9)
+        Covariances of the states, in GTSAM's tangent space, where the parameters are known: an
+        error that all states share turns the Jacobians alike, and feigns no change.
 
     Returns
     -------
@@ -162,9 +168,10 @@ def undetermined_directions(data: Array, spurious: Array) -> Array:
 
     Parameters
     ----------
-    data : (P, P) information of the data, beside the prior's identity; what is feigned
-        included.
-    spurious : (P, P) that share of it.
+    data : ndarray, shape (P, P)
+        Information of the data, beside the prior's identity; what is feigned included.
+    spurious : ndarray, shape (P, P)
+        That share of it.
     """
     if not data.size or not largest_spurious_share(data, spurious) >= SPURIOUS:
         return np.zeros((data.shape[0], 0))
@@ -177,7 +184,8 @@ def largest_spurious_share(data: Array, spurious: Array) -> Array:
 
     Parameters
     ----------
-    data, spurious : (..., P, P) as of `undetermined_directions`.
+    data, spurious : ndarray, shape (..., P, P)
+        As of `undetermined_directions`.
     """
     data = 0.5 * (data + np.swapaxes(data, -1, -2))
     L = np.linalg.cholesky(_positive(data) + _LITTLE * np.eye(data.shape[-1]))
@@ -221,12 +229,18 @@ def spurious_by(
 
     Parameters
     ----------
-    observation : of M measurements of d components.
-    attachment, motion : of them.
-    weight : (M, d) inverse standard deviations.
-    P : (M, 9, 9) covariances of the nodes before them, in GTSAM's tangent space.
-    values : of all parameters.
-    wanted : names of the parameters, of p columns, whose information is asked for.
+    observation : Observation
+        Of M measurements of d components.
+    attachment, motion : Attachment or Motion
+        Of them.
+    weight : ndarray, shape (M, d)
+        Inverse standard deviations.
+    P : ndarray, shape (M, 9, 9)
+        Covariances of the nodes before them, in GTSAM's tangent space.
+    values : Values
+        Of all parameters.
+    wanted : sequence of str
+        Names of the parameters, of p columns, whose information is asked for.
     """
 
     def jacobian(at: Motion) -> Array:

@@ -44,15 +44,21 @@ class Component:
 
     Parameters
     ----------
-    parameter, name : as in calibration.json, and in its `covariance.order`.
-    a, b : the two values; nan where a result has none.
-    std_a, std_b : their standard deviations; nan where unknown, 0 where held fixed.
-    std_upper : √(σ_A² + σ_B²), at least the standard deviation of a - b if the errors
-        are not negatively correlated; nan where unknown.
-    std_hausman : √(σ² of the other - σ² of the efficient one); nan where not known or
-        not asked for.
-    std, kind : the standard deviation of a - b that is shown, and which it is.
-    verdict, reason : agree or differ by `std`, or why not comparable.
+    parameter, name : str
+        As in calibration.json, and in its `covariance.order`.
+    a, b : float
+        The two values; nan where a result has none.
+    std_a, std_b : float
+        Their standard deviations; nan where unknown, 0 where held fixed.
+    std_upper : float
+        √(σ_A² + σ_B²), at least the standard deviation of a - b if the errors are not negatively
+        correlated; nan where unknown.
+    std_hausman : float
+        √(σ² of the other - σ² of the efficient one); nan where not known or not asked for.
+    std, kind : float or Kind
+        The standard deviation of a - b that is shown, and which it is.
+    verdict, reason : Verdict or str
+        Agree or differ by `std`, or why not comparable.
     """
 
     parameter: str
@@ -85,12 +91,16 @@ class Joint:
 
     Parameters
     ----------
-    names : of the n components.
-    statistic : d' (P_A + P_B)^-1 d, with d = A - B.
-    limit : that chi² of n degrees exceeds with `AGREE_PROBABILITY`.
-    probability : that chi² of n degrees exceeds the statistic; of results that agree
-        it is at least this.
-    correlations : whether both results state correlations; else taken as none.
+    names : tuple of str
+        Of the n components.
+    statistic : float
+        d' (P_A + P_B)^-1 d, with d = A - B.
+    limit : float
+        That chi² of n degrees exceeds with `AGREE_PROBABILITY`.
+    probability : float
+        That chi² of n degrees exceeds the statistic; of results that agree it is at least this.
+    correlations : bool
+        Whether both results state correlations; else taken as none.
     """
 
     names: tuple[str, ...]
@@ -120,8 +130,10 @@ def compare_calibrations(
 
     Parameters
     ----------
-    a, b : the results.
-    efficient : which of them uses the data fully, by a model that is true.
+    a, b : Solution
+        The results.
+    efficient : Side, optional
+        Which of them uses the data fully, by a model that is true.
     """
     of_a = {e.name: e for e in a.estimates}
     of_b = {e.name: e for e in same_branch(b, a).estimates}
@@ -148,8 +160,10 @@ def joint_test(a: Solution, b: Solution, components: tuple[Component, ...]) -> J
 
     Parameters
     ----------
-    a, b : the results, for their covariances.
-    components : of `compare_calibrations`.
+    a, b : Solution
+        The results, for their covariances.
+    components : tuple of Component
+        Of `compare_calibrations`.
     """
     tested = [
         c
@@ -222,8 +236,10 @@ def std_of_difference(
 
     Parameters
     ----------
-    std_a, std_b : (...) standard deviations.
-    efficient : which of the two is efficient; None = neither.
+    std_a, std_b : ndarray, shape (...)
+        Standard deviations.
+    efficient : Side or None
+        Which of the two is efficient; None = neither.
     """
     upper = np.hypot(std_a, std_b)
     hausman = np.full(np.shape(upper), np.nan)

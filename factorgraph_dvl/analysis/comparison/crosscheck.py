@@ -35,8 +35,10 @@ class AgainstTruth:
 
     Parameters
     ----------
-    calibration : of its components whose truth is known.
-    trajectory : at the epochs of the reference.
+    calibration : CalibrationErrors or None
+        Of its components whose truth is known.
+    trajectory : TrajectoryErrors or None
+        At the epochs of the reference.
     """
 
     calibration: CalibrationErrors | None
@@ -49,15 +51,24 @@ class CrossCheck:
 
     Parameters
     ----------
-    a, b : the results.
-    efficient : which of them was taken to be efficient, None = neither.
-    components : every calibration component of either.
-    angles : deg, between the rotations of A and B, by parameter.
-    joint : test of all comparable components; None if there are none.
-    motion : difference of the trajectories; None without common epochs.
-    truth_a, truth_b : errors of each.
-    explanation : candidate reasons for what differs.
-    notes : what limits the comparison.
+    a, b : Solution
+        The results.
+    efficient : Side or None
+        Which of them was taken to be efficient, None = neither.
+    components : tuple of Component
+        Every calibration component of either.
+    angles : dict of str to float
+        Deg, between the rotations of A and B, by parameter.
+    joint : Joint or None
+        Test of all comparable components; None if there are none.
+    motion : MotionDifference or None
+        Difference of the trajectories; None without common epochs.
+    truth_a, truth_b : AgainstTruth
+        Errors of each.
+    explanation : tuple of str
+        Candidate reasons for what differs.
+    notes : tuple of str
+        What limits the comparison.
     """
 
     a: Solution
@@ -96,10 +107,13 @@ def crosscheck(
     ----------
     a, b : Solutions; those from elsewhere may lack estimates, epochs, or (nan) standard
         deviations.
-    efficient : which of them uses all data by a true model, so that its errors are
-        uncorrelated with the difference; ignored where the trials are not the same.
-    truth : true calibration by reported name, in reported units.
-    reference : true trajectory.
+    efficient : Side, optional
+        Which of them uses all data by a true model, so that its errors are uncorrelated with the
+        difference; ignored where the trials are not the same.
+    truth : mapping of str to array_like, optional
+        True calibration by reported name, in reported units.
+    reference : Reference, optional
+        True trajectory.
 
     Raises
     ------

@@ -39,9 +39,12 @@ def explain(
 
     Parameters
     ----------
-    a, b : the results.
-    components : of `compare_calibrations`.
-    efficient : which result was said to be efficient.
+    a, b : Solution
+        The results.
+    components : sequence of Component
+        Of `compare_calibrations`.
+    efficient : Side, optional
+        Which result was said to be efficient.
     """
     differing = [c for c in components if c.verdict == "differ"]
     if not differing:

@@ -35,11 +35,16 @@ class Spread:
 
     Parameters
     ----------
-    name : of `COMPONENTS`.
-    rms, largest : of the absolute values.
-    time_of_largest : s.
-    rms_sigmas, largest_sigmas : of the absolute values over their standard deviations.
-    within_2_sigma : share of epochs.
+    name : str
+        Of `COMPONENTS`.
+    rms, largest : float
+        Of the absolute values.
+    time_of_largest : float
+        S.
+    rms_sigmas, largest_sigmas : float
+        Of the absolute values over their standard deviations.
+    within_2_sigma : float
+        Share of epochs.
     """
 
     name: str
@@ -57,10 +62,13 @@ class MotionDifference:
 
     Parameters
     ----------
-    time : (M,) s.
-    difference : (M, 9) `COMPONENTS`, in reported units.
-    std : (M, 9) standard deviation of the difference that is shown; nan where unknown.
-    kinds : which it is, of each component.
+    time : ndarray, shape (M,), s
+    difference : ndarray, shape (M, 9)
+        `COMPONENTS`, in reported units.
+    std : ndarray, shape (M, 9)
+        Standard deviation of the difference that is shown; nan where unknown.
+    kinds : tuple of Kind
+        Which it is, of each component.
     """
 
     time: Array
@@ -84,8 +92,10 @@ def compare_motions(
 
     Parameters
     ----------
-    a, b : the trajectories.
-    efficient : whose errors are uncorrelated with the difference; None = neither's.
+    a, b : Trajectory
+        The trajectories.
+    efficient : Side, optional
+        Whose errors are uncorrelated with the difference; None = neither's.
     """
     if a.time.size == 0 or b.time.size == 0:
         return None

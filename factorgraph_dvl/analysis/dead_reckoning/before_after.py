@@ -45,9 +45,11 @@ class LeverArmEffect:
 
     Parameters
     ----------
-    time : (M,) s.
-    measured : (M, 3) track without lever arm minus track with it, east, north, up, m.
-    closed_form : (M, 3) (C(t) - C(0)) l, m.
+    time : ndarray, shape (M,), s
+    measured : ndarray, shape (M, 3)
+        Track without lever arm minus track with it, east, north, up, m.
+    closed_form : ndarray, shape (M, 3), m
+        (C(t) - C(0)) l.
     """
 
     time: Array
@@ -71,9 +73,12 @@ class BeforeAfter:
 
     Parameters
     ----------
-    calibrated, uncalibrated, without_lever_arm : the runs.
-    lever_arm : difference of the first and the last.
-    scored_by : what the errors are against.
+    calibrated, uncalibrated, without_lever_arm : Run
+        The runs.
+    lever_arm : LeverArmEffect
+        Difference of the first and the last.
+    scored_by : {reference, GNSS, nothing}
+        What the errors are against.
     """
 
     calibrated: Run
@@ -96,9 +101,12 @@ def before_after(
 
     Parameters
     ----------
-    trial : with DVL or beams; GNSS gives the start, and scores where there is no reference.
-    values : of the calibration, by name, in reported units; directions as (N, 3) vectors.
-    orientation_at : attitude and turn rate at times (M,).
+    trial : Trial
+        With DVL or beams; GNSS gives the start, and scores where there is no reference.
+    values : mapping of str to ndarray
+        Of the calibration, by name, in reported units; directions as (N, 3) vectors.
+    orientation_at : OrientationAt
+        Attitude and turn rate at times (M,).
 
     Raises
     ------

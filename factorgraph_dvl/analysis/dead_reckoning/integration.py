@@ -35,10 +35,13 @@ class DvlMounting:
 
     Parameters
     ----------
-    dRb : (3, 3) misalignment.
-    scale_error : (1,) or (3,).
-    lever_arm, bias : (3,) m, m/s.
-    time_offset : s.
+    dRb : ndarray, shape (3, 3)
+        Misalignment.
+    scale_error : ndarray, shape (1,) or (3,)
+    lever_arm, bias : ndarray, shape (3,), m/s
+        M.
+    time_offset : float
+        S.
     """
 
     dRb: Array
@@ -54,11 +57,15 @@ class DeadReckonedTrack:
 
     Parameters
     ----------
-    time : (M,) s.
-    geodetic : (M, 3) latitude, longitude (rad), ellipsoidal height (m).
-    velocity : (M, 3) local-level east, north, up, m/s.
-    rph : (M, 3) roll, pitch, heading, rad.
-    bridged : total time without bottom lock, s.
+    time : ndarray, shape (M,), s
+    geodetic : ndarray, shape (M, 3)
+        Latitude, longitude (rad), ellipsoidal height (m).
+    velocity : ndarray, shape (M, 3)
+        Local-level east, north, up, m/s.
+    rph : ndarray, shape (M, 3)
+        Roll, pitch, heading, rad.
+    bridged : float
+        Total time without bottom lock, s.
     """
 
     time: Array
@@ -78,8 +85,10 @@ def mounting_of(trial: Trial, values: Mapping[str, Array] | None = None) -> DvlM
 
     Parameters
     ----------
-    trial : for units, and for what `values` do not have.
-    values : (n,) by name as in calibration.json, in reported units.
+    trial : Trial
+        For units, and for what `values` do not have.
+    values : mapping of str to ndarray, shape (n,), optional
+        By name as in calibration.json, in reported units.
     """
     given = values or {}
     si = {
@@ -113,10 +122,14 @@ def dead_reckon(
 
     Parameters
     ----------
-    trial : its DVL, or what its beams amount to, and its first fix.
-    mounting : that the velocity is corrected by.
-    orientation_at : attitude and turn rate at times (M,).
-    start : time, s, and position of the IMU, (3,), to start from instead.
+    trial : Trial
+        Its DVL, or what its beams amount to, and its first fix.
+    mounting : DvlMounting
+        That the velocity is corrected by.
+    orientation_at : OrientationAt
+        Attitude and turn rate at times (M,).
+    start : tuple of (float, ndarray), optional
+        Time, s, and position of the IMU, (3,), to start from instead.
 
     Raises
     ------
@@ -175,8 +188,10 @@ def lever_arm_error(nRb: Array, lever_arm: Array) -> Array:
 
     Parameters
     ----------
-    nRb : (M, 3, 3) attitude C over time.
-    lever_arm : (3,) l in body, m.
+    nRb : ndarray, shape (M, 3, 3)
+        Attitude C over time.
+    lever_arm : ndarray, shape (3,), m
+        L in body.
     """
     return np.asarray((nRb - nRb[0]) @ lever_arm)
 

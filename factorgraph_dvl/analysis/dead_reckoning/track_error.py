@@ -30,11 +30,15 @@ class Stretches:
 
     Parameters
     ----------
-    length : m.
-    count : of stretches, one after the other; 0 = the trial has none, and the rest is nan.
-    median, largest : of the growth of the horizontal error, % of the length.
-    along, across : mean growth along the course and to its right, % of the length: what
-        a scale error and an error of the heading leave.
+    length : float
+        M.
+    count : int
+        Of stretches, one after the other; 0 = the trial has none, and the rest is nan.
+    median, largest : float
+        Of the growth of the horizontal error, % of the length.
+    along, across : float
+        Mean growth along the course and to its right, % of the length: what a scale error and an
+        error of the heading leave.
     """
 
     length: float
@@ -51,9 +55,11 @@ class Path:
 
     Parameters
     ----------
-    time : (M,) s.
-    distance : (M,) travelled since the first, horizontally, m.
-    course : (M,) over ground, unwrapped, rad.
+    time : ndarray, shape (M,), s
+    distance : ndarray, shape (M,)
+        Travelled since the first, horizontally, m.
+    course : ndarray, shape (M,)
+        Over ground, unwrapped, rad.
     """
 
     time: Array
@@ -72,9 +78,12 @@ class Score:
 
     Parameters
     ----------
-    path : at those epochs.
-    error : (M, 3) local-level east, north, up, m.
-    stretches : of `STRETCHES_M`.
+    path : path-like
+        At those epochs.
+    error : ndarray, shape (M, 3)
+        Local-level east, north, up, m.
+    stretches : tuple of Stretches
+        Of `STRETCHES_M`.
     """
 
     path: Path
@@ -132,9 +141,12 @@ def score(track: DeadReckonedTrack, truth: Reference, along: DeadReckonedTrack) 
 
     Parameters
     ----------
-    track : to be scored.
-    truth : positions of the IMU.
-    along : the track whose distance and course count: the best there is.
+    track : DeadReckonedTrack
+        To be scored.
+    truth : Reference
+        Positions of the IMU.
+    along : DeadReckonedTrack
+        The track whose distance and course count: the best there is.
     """
     first = max(track.time[0], along.time[0])
     last = min(track.time[-1], along.time[-1])

@@ -68,10 +68,14 @@ class PointSet:
 
     Parameters
     ----------
-    states : names of the columns.
-    scale : (n,) what each column is in units of, reported units.
-    scaling : how numbers were made comparable, in words.
-    segments, cumulative : of each segment, and of all up to its end.
+    states : tuple of str
+        Names of the columns.
+    scale : ndarray, shape (n,)
+        What each column is in units of, reported units.
+    scaling : str
+        How numbers were made comparable, in words.
+    segments, cumulative : tuple of SingularValues
+        Of each segment, and of all up to its end.
     """
 
     states: tuple[str, ...]
@@ -95,10 +99,14 @@ def point_set(
 
     Parameters
     ----------
-    solution : with a trajectory of at least two epochs.
-    trial : that it came from; without it the times and noise of the pings are assumed.
-    segments : to stack.
-    margin : as of `pwcs.singular_values`.
+    solution : Solution
+        With a trajectory of at least two epochs.
+    trial : Trial or None
+        That it came from; without it the times and noise of the pings are assumed.
+    segments : sequence of Segment
+        To stack.
+    margin : float
+        As of `pwcs.singular_values`.
     """
     by_name = {e.name: e for e in solution.estimates}
     if trial is not None and trial.log is None:

@@ -43,8 +43,10 @@ class Segment:
 
     Parameters
     ----------
-    start, end : s.
-    label : kind of motion, or what the user called it.
+    start, end : float
+        S.
+    label : str
+        Kind of motion, or what the user called it.
     """
 
     start: float
@@ -61,7 +63,8 @@ def find_segments(motion: Trajectory | Reference) -> tuple[Segment, ...]:
 
     Parameters
     ----------
-    motion : of the whole trial.
+    motion : Trajectory or Reference
+        Of the whole trial.
 
     Returns
     -------
@@ -106,8 +109,10 @@ def given_segments(
 
     Parameters
     ----------
-    parts : start and end, s, and label, in the order of time.
-    first, last : of the trial, s; what reaches beyond is cut off.
+    parts : sequence of tuple of (float, float, str)
+        Start and end, s, and label, in the order of time.
+    first, last : float
+        Of the trial, s; what reaches beyond is cut off.
 
     Raises
     ------

@@ -27,10 +27,14 @@ class Direction:
 
     Parameters
     ----------
-    ratio : posterior over prior standard deviation along it.
-    information : posterior over prior information, 1 / ratio²: the generalised eigenvalue.
-    vector : (P,) of unit length, in units of the priors' standard deviations.
-    names : of the components that dominate it, the largest first.
+    ratio : float
+        Posterior over prior standard deviation along it.
+    information : float
+        Posterior over prior information, 1 / ratio²: the generalised eigenvalue.
+    vector : ndarray, shape (P,)
+        Of unit length, in units of the priors' standard deviations.
+    names : tuple of str
+        Of the components that dominate it, the largest first.
     """
 
     ratio: float
@@ -45,12 +49,17 @@ class Marginals:
 
     Parameters
     ----------
-    names : (P,) components that were estimated, in reported units.
-    value, std, prior_std : (P,).
-    observable : (P,) bool, whether the data at least halved the prior's σ.
-    correlation : (P, P) of the posterior.
-    directions : P directions, the weakest first.
-    sentences : the weak directions in words.
+    names : tuple of str
+        (P,) components that were estimated, in reported units.
+    value, std, prior_std : ndarray, shape (P,)
+    observable : ndarray, shape (P,)
+        Bool, whether the data at least halved the prior's σ.
+    correlation : ndarray, shape (P, P)
+        Of the posterior.
+    directions : tuple of Direction
+        P directions, the weakest first.
+    sentences : tuple of str
+        The weak directions in words.
     """
 
     names: tuple[str, ...]
@@ -73,8 +82,10 @@ def marginals(estimates: Sequence[Estimate], covariance: Array) -> Marginals | N
 
     Parameters
     ----------
-    estimates : the calibration.
-    covariance : joint covariance of all components, in reported units.
+    estimates : sequence of Estimate
+        The calibration.
+    covariance : ndarray
+        Joint covariance of all components, in reported units.
     """
     names = np.array([n for e in estimates for n in e.component_names], dtype=object)
     value, std, prior, observable = (

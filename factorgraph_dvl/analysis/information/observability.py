@@ -27,10 +27,14 @@ class SegmentMotion:
 
     Parameters
     ----------
-    segment : when.
-    speed : mean over ground, m/s.
-    turn : of the heading from its start to its end, to starboard, rad.
-    rates : (3,) RMS of the angular rate about the body axes, rad/s.
+    segment : Segment
+        When.
+    speed : float
+        Mean over ground, m/s.
+    turn : float
+        Of the heading from its start to its end, to starboard, rad.
+    rates : ndarray, shape (3,), rad/s
+        RMS of the angular rate about the body axes.
     """
 
     segment: Segment
@@ -45,14 +49,21 @@ class Observability:
 
     Parameters
     ----------
-    name : of the trial.
-    kind : `trial`, `solution` or `plan`.
-    segments : motion of each.
-    point_set : singular values; None where there is no DVL or no motion.
-    marginals : posterior against prior; None where nothing was estimated.
+    name : str
+        Of the trial.
+    kind : str
+        `trial`, `solution` or `plan`.
+    segments : tuple of SegmentMotion
+        Motion of each.
+    point_set : PointSet or None
+        Singular values; None where there is no DVL or no motion.
+    marginals : Marginals or None
+        Posterior against prior; None where nothing was estimated.
     history, shares : along the trial; None where only a solution is known.
-    missing : views that are left out, and why.
-    warnings : of the solution.
+    missing : tuple of str
+        Views that are left out, and why.
+    warnings : tuple of str
+        Of the solution.
     """
 
     name: str
@@ -78,11 +89,16 @@ def observability(
 
     Parameters
     ----------
-    solution : with its calibration and trajectory.
-    trial : that it came from; without it the times and noise of the pings are assumed.
-    history : information along the trial.
-    given : segments, start and end in s and label; by default they are found.
-    kind : what it is, if it is not obvious.
+    solution : Solution
+        With its calibration and trajectory.
+    trial : Trial, optional
+        That it came from; without it the times and noise of the pings are assumed.
+    history : InformationHistory, optional
+        Information along the trial.
+    given : sequence of tuple of (float, float, str), optional
+        Segments, start and end in s and label; by default they are found.
+    kind : str, optional
+        What it is, if it is not obvious.
     """
     trajectory = solution.trajectory
     missing = []

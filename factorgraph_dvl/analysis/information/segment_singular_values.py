@@ -56,9 +56,11 @@ class BodyMotion:
 
     Parameters
     ----------
-    time : (M,) s.
-    v_b : (M, 3) velocity of the IMU over ground, or through the water, m/s.
-    omega_b : (M, 3) angular rate relative to the Earth, rad/s.
+    time : ndarray, shape (M,), s
+    v_b : ndarray, shape (M, 3)
+        Velocity of the IMU over ground, or through the water, m/s.
+    omega_b : ndarray, shape (M, 3), rad/s
+        Angular rate relative to the Earth.
     """
 
     time: Array
@@ -82,9 +84,10 @@ class MountingModel:
 
     Parameters
     ----------
-    misalignment : (3,) rotation vector of C_b^d, rad.
-    scale_error : (1,) or (3,).
-    lever_arm : (3,) m.
+    misalignment : ndarray, shape (3,), rad
+        Rotation vector of C_b^d.
+    scale_error : ndarray, shape (1,) or (3,)
+    lever_arm : ndarray, shape (3,), m
     """
 
     misalignment: Array
@@ -103,10 +106,12 @@ class BeamMounting:
 
     Parameters
     ----------
-    nominal_b : (N, 3) unit vectors in body.
-    turns : (2N,) of them, rad.
-    scale_error : (N,).
-    lever_arm : (3,) m.
+    nominal_b : ndarray, shape (N, 3)
+        Unit vectors in body.
+    turns : ndarray, shape (2N,), rad
+        Of them.
+    scale_error : ndarray, shape (N,)
+    lever_arm : ndarray, shape (3,), m
     """
 
     nominal_b: Array
@@ -127,14 +132,19 @@ class SingularValues:
 
     Parameters
     ----------
-    segment : that it covers.
-    pings : number of pings in it.
-    values : (n,) singular values, falling. One of 1 means that the data know a direction
-        as well as the prior does.
-    directions : (n, n) right singular vectors as rows, in units of the priors' σ.
-    spurious : (n,) share of the squared singular value that the errors of the motion are
-        expected to feign.
-    states : names of the columns.
+    segment : Segment
+        That it covers.
+    pings : int
+        Number of pings in it.
+    values : ndarray, shape (n,)
+        Singular values, falling. One of 1 means that the data know a direction as well as the
+        prior does.
+    directions : ndarray, shape (n, n)
+        Right singular vectors as rows, in units of the priors' σ.
+    spurious : ndarray, shape (n,)
+        Share of the squared singular value that the errors of the motion are expected to feign.
+    states : tuple of str
+        Names of the columns.
     """
 
     segment: Segment
@@ -169,8 +179,10 @@ def body_motion(motion: Trajectory | Reference, body_axes: BodyAxes) -> BodyMoti
 
     Parameters
     ----------
-    motion : epochs with local-level velocity and attitude.
-    body_axes : axes of the body frame.
+    motion : Trajectory or Reference
+        Epochs with local-level velocity and attitude.
+    body_axes : BodyAxes
+        Axes of the body frame.
     """
     nRb = rotation_from_rph(motion.rph, body_axes)
     v_b = rotate(nRb.transpose(0, 2, 1), motion.velocity)
@@ -221,8 +233,10 @@ def point_set_rows(motion: BodyMotion, mounting: MountingModel) -> Array:
 
     Parameters
     ----------
-    motion : at M pings.
-    mounting : where to linearise.
+    motion : BodyMotion
+        At M pings.
+    mounting : MountingModel
+        Where to linearise.
     """
     u_b = motion.v_b + np.cross(motion.omega_b, mounting.lever_arm)
     u_d = u_b @ exp_so3(mounting.misalignment).T
@@ -250,8 +264,10 @@ def beam_rows(motion: BodyMotion, mounting: BeamMounting) -> Array:
 
     Parameters
     ----------
-    motion : at M pings.
-    mounting : where to linearise.
+    motion : BodyMotion
+        At M pings.
+    mounting : BeamMounting
+        Where to linearise.
     """
     u_b = motion.v_b + np.cross(motion.omega_b, mounting.lever_arm)
     geometry = FreeGeometry(mounting.nominal_b, "turns", "scale")
@@ -291,17 +307,23 @@ def singular_values(
 
     Parameters
     ----------
-    rows : (M, 3, n) in units of the measurements' and of the priors' standard deviations,
-        or plain.
-    time : (M,) of the pings, s.
-    segments : to stack.
-    states : names of the n columns.
-    spurious : (M, n, n) expectation of what errors of the motion add to rowsᵀ rows.
-    nothing : singular values up to here are as good as zero; their directions are only
-        defined together, and given in a readable basis.
-    margin : s; pings this close to the border between two segments are left out of each
-        alone, so that the first of a turn does not stand with the straight run before it.
-        At most a fifth of a segment.
+    rows : ndarray, shape (M, 3, n)
+        In units of the measurements' and of the priors' standard deviations, or plain.
+    time : ndarray, shape (M,), s
+        Of the pings.
+    segments : sequence of Segment
+        To stack.
+    states : sequence of str
+        Names of the n columns.
+    spurious : ndarray, shape (M, n, n), optional
+        Expectation of what errors of the motion add to rowsᵀ rows.
+    nothing : float, default 0.0
+        Singular values up to here are as good as zero; their directions are only defined together,
+        and given in a readable basis.
+    margin : float, default 0.0
+        S; pings this close to the border between two segments are left out of each alone, so that
+        the first of a turn does not stand with the straight run before it. At most a fifth of a
+        segment.
     """
     n = rows.shape[2]
     single, cumulative = [], []
@@ -354,7 +376,8 @@ def readable_basis(directions: Array) -> Array:
 
     Parameters
     ----------
-    directions : (r, n) orthonormal rows.
+    directions : ndarray, shape (r, n)
+        Orthonormal rows.
 
     Returns
     -------

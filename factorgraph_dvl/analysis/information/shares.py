@@ -29,9 +29,12 @@ class Shares:
 
     Parameters
     ----------
-    names : (P,) components.
-    prior : (P,) of the prior.
-    segments : (S, P) of each segment.
+    names : tuple of str
+        (P,) components.
+    prior : ndarray, shape (P,)
+        Of the prior.
+    segments : ndarray, shape (S, P)
+        Of each segment.
     """
 
     names: tuple[str, ...]
@@ -44,9 +47,11 @@ def information_shares(history: InformationHistory, segments: Sequence[Segment])
 
     Parameters
     ----------
-    history : of the whole trial.
-    segments : one after the other; what comes before the first counts with it, what comes
-        after the last with that.
+    history : InformationHistory
+        Of the whole trial.
+    segments : sequence of Segment
+        One after the other; what comes before the first counts with it, what comes after the last
+        with that.
     """
     last = history.root[-1]
     P = last @ last.T

@@ -31,7 +31,8 @@ def beam_quality_figure(quality: BeamQuality) -> Figure:
 
     Parameters
     ----------
-    quality : of beams of which four or more were received together at least once.
+    quality : BeamQuality
+        Of beams of which four or more were received together at least once.
     """
     figure = new_figure(11.0, 5.6)
     grid = new_grid(figure, 4, 1, gap=(0.3, 0.0), right=0.9)

@@ -47,13 +47,18 @@ def write_convergence_figures(
 
     Parameters
     ----------
-    time : (H,) s.
-    values, std : (H, n) what was known then, in the order of `estimates`.
-    latency : (H,) s.
-    estimates : at the end.
-    truth : true values by reported name; may be empty.
-    found : when they were good enough.
-    folder : where the files go.
+    time : ndarray, shape (H,), s
+    values, std : ndarray, shape (H, n)
+        What was known then, in the order of `estimates`.
+    latency : ndarray, shape (H,), s
+    estimates : sequence of Estimate
+        At the end.
+    truth : mapping of str to array_like
+        True values by reported name; may be empty.
+    found : Convergence
+        When they were good enough.
+    folder : path-like
+        Where the files go.
     """
     pick = np.unique(np.linspace(0, time.size - 1, min(time.size, _POINTS)).astype(int))
     figures = {
@@ -78,7 +83,8 @@ def convergence_figure(
     Parameters
     ----------
     time, values, std, estimates, truth : see `write_convergence_figures`.
-    good_since : a moment to mark, s; nan for none.
+    good_since : float
+        A moment to mark, s; nan for none.
     """
     columns = 3
     free = [e for e in estimates if np.any(e.prior_std > 0.0)]

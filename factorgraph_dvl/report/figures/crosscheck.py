@@ -47,8 +47,10 @@ def write_crosscheck_figures(check: CrossCheck, folder: Path) -> list[Path]:
 
     Parameters
     ----------
-    check : what to draw.
-    folder : where the PNG files go; created if needed.
+    check : CrossCheck
+        What to draw.
+    folder : path-like
+        Where the PNG files go; created if needed.
 
     Returns
     -------

@@ -72,8 +72,10 @@ def write_observability_figures(view: Observability, folder: Path) -> list[Path]
 
     Parameters
     ----------
-    view : what to draw.
-    folder : where the PNG files go.
+    view : Observability
+        What to draw.
+    folder : path-like
+        Where the PNG files go.
     """
     figures: dict[str, Figure] = {}
     segments = [m.segment for m in view.segments]

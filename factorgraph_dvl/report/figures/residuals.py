@@ -38,7 +38,8 @@ def residuals_figure(group: Sequence[Residuals]) -> Figure:
 
     Parameters
     ----------
-    group : of one sensor, a measurement each.
+    group : sequence of Residuals
+        Of one sensor, a measurement each.
     """
     rows = [(r, c) for r in group for c in range(len(r.components)) if _measured(r, c).any()]
     figure = new_figure(11.0, 0.8 + 1.6 * len(rows))

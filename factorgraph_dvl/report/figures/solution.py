@@ -29,9 +29,12 @@ def write_figures(trial: Trial | PlanarTrial, solution: Solution, folder: Path) 
 
     Parameters
     ----------
-    trial : for its GNSS fixes, reference and true calibration.
-    solution : what to draw.
-    folder : where the PNG files go; created if needed.
+    trial : Trial or PlanarTrial
+        For its GNSS fixes, reference and true calibration.
+    solution : Solution
+        What to draw.
+    folder : path-like
+        Where the PNG files go; created if needed.
 
     Returns
     -------

@@ -109,8 +109,10 @@ def motion_figure(trajectory: Trajectory, errors: TrajectoryErrors | None) -> Fi
 
     Parameters
     ----------
-    trajectory : with all its epochs: of fewer, a swing may look like another.
-    errors : of the same or of fewer epochs, if there is a reference.
+    trajectory : Trajectory
+        With all its epochs: of fewer, a swing may look like another.
+    errors : TrajectoryErrors or None
+        Of the same or of fewer epochs, if there is a reference.
     """
     start, time_label = clock(trajectory.time)
     time = trajectory.time - start

@@ -43,8 +43,10 @@ def to_json(check: CrossCheck, names: Mapping[str, str]) -> bytes:
 
     Parameters
     ----------
-    check : to write.
-    names : of the files that A and B were read from.
+    check : CrossCheck
+        To write.
+    names : mapping of str to str
+        Of the files that A and B were read from.
     """
     content = {
         "format": 1,

@@ -26,8 +26,10 @@ def to_json(result: BeforeAfter, about: Mapping[str, Any]) -> bytes:
 
     Parameters
     ----------
-    result : to write.
-    about : names of trial and calibration, source of the attitude, …
+    result : BeforeAfter
+        To write.
+    about : mapping of str to object
+        Names of trial and calibration, source of the attitude, ….
     """
     content = {
         "format": 1,

@@ -21,8 +21,10 @@ def instrument_text(instrument: InstrumentTerms, name: str) -> str:
 
     Parameters
     ----------
-    instrument : to write.
-    name : of the trial that the calibration comes from.
+    instrument : InstrumentTerms
+        To write.
+    name : str
+        Of the trial that the calibration comes from.
     """
     i = instrument
     lines = [

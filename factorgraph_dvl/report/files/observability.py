@@ -31,8 +31,10 @@ def to_json(view: Observability, source: str) -> bytes:
 
     Parameters
     ----------
-    view : to write.
-    source : folder that it was made from.
+    view : Observability
+        To write.
+    source : str
+        Folder that it was made from.
     """
     return encode({"format": 1, "source": source, **content(view)})
 

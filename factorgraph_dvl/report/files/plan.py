@@ -31,11 +31,16 @@ def to_json(
 
     Parameters
     ----------
-    solution : the prediction.
-    duration : of the plan, s.
-    required : what is required of it.
-    proposal : what to add; None if nothing is missed.
-    source : file that the plan was read from.
+    solution : Solution
+        The prediction.
+    duration : float
+        Of the plan, s.
+    required : sequence of Requirement
+        What is required of it.
+    proposal : Proposal or None
+        What to add; None if nothing is missed.
+    source : str
+        File that the plan was read from.
     """
     return encode(
         {

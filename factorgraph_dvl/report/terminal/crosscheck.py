@@ -29,8 +29,10 @@ def component_table(check: CrossCheck, *, width: int = _UNLIMITED) -> Table:
 
     Parameters
     ----------
-    check : with the components.
-    width : columns that there are. If they are too few, only the differences are shown.
+    check : CrossCheck
+        With the components.
+    width : int, optional
+        Columns that there are. If they are too few, only the differences are shown.
     """
     table = _full_table(check)
     return table if width_of(table) <= width else _brief_table(check)

@@ -31,15 +31,24 @@ def live_view(
 
     Parameters
     ----------
-    trial : name.
-    time : since its start, s.
-    estimates : of the calibration.
-    state : of one epoch.
-    latency : of the last update, s.
-    speed : relative to real time.
-    doubted : kinds of measurements that disagree with the prediction.
-    lacking : components whose standard deviations are not good enough yet.
-    good_since : s, from which on all are; None = they are not.
+    trial : str
+        Name.
+    time : float
+        Since its start, s.
+    estimates : sequence of Estimate
+        Of the calibration.
+    state : Trajectory
+        Of one epoch.
+    latency : float
+        Of the last update, s.
+    speed : float
+        Relative to real time.
+    doubted : sequence of str
+        Kinds of measurements that disagree with the prediction.
+    lacking : sequence of str, optional
+        Components whose standard deviations are not good enough yet.
+    good_since : float, optional
+        S, from which on all are; None = they are not.
     """
     table = Table()
     table.add_column("parameter")

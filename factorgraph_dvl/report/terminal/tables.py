@@ -27,10 +27,13 @@ def calibration_table(
 
     Parameters
     ----------
-    solution : with the estimates.
-    errors : against the truth, if that is known.
-    width : columns that there are. If they are too few for all of the table, the prior is
-        left out and the unit joins the name; if they still are, the table is wider.
+    solution : Solution
+        With the estimates.
+    errors : CalibrationErrors, optional
+        Against the truth, if that is known.
+    width : int, optional
+        Columns that there are. If they are too few for all of the table, the prior is left out and
+        the unit joins the name; if they still are, the table is wider.
     """
     table = _calibration_table(solution, errors, brief=False)
     if width_of(table) > width:
@@ -111,8 +114,10 @@ def convergence_table(found: Convergence, start: float) -> Table:
 
     Parameters
     ----------
-    found : how it converged.
-    start : of the trial, s: what the times count from.
+    found : Convergence
+        How it converged.
+    start : float
+        Of the trial, s: what the times count from.
     """
     table = Table(title="Convergence: time since the start from which on it stayed within")
     add_column(table, "component")
@@ -136,8 +141,10 @@ def good_enough_line(found: Convergence, start: float) -> str:
 
     Parameters
     ----------
-    found : how it converged.
-    start : of the trial, s.
+    found : Convergence
+        How it converged.
+    start : float
+        Of the trial, s.
     """
     if math.isfinite(found.good_since):
         return f"good enough after {found.good_since - start:.0f} s"
