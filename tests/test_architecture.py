@@ -1,91 +1,25 @@
-"""Imports go down the layers only, never up: the order is stated here, as data."""
+"""The layout of the package: what may import what, and the map of it in CONTRIBUTING."""
 
 from __future__ import annotations
 
 import ast
+import os
 from pathlib import Path
 
-import pytest
+import package_map
+from importlinter.cli import lint_imports
 
 import factorgraph_dvl
 from factorgraph_dvl.sensors.catalogue import AIDS
 from factorgraph_dvl.sensors.imu import Imu
 
 PACKAGE = Path(factorgraph_dvl.__file__).parent
-
-# Each line may import from the lines before it, and from its own line only within one
-# package. `a.b` stands for a module or a whole package.
-LAYERS = (
-    ("conventions", "errors"),
-    ("files", "ranges"),
-    ("earth", "celestial", "yaml_file", "directions", "turning"),
-    ("gains",),
-    ("sensors",),
-    ("beam_geometry", "fingerprint"),
-    ("trial", "solution", "information"),
-    ("io", "simulation"),
-    ("clock", "polynomials", "signals"),
-    ("increments",),
-    ("kalman",),
-    ("planar",),
-    ("preintegration",),
-    ("attitude",),
-    ("keys",),
-    ("chain",),
-    ("priors",),
-    ("arcs",),
-    ("attitude_alignment",),
-    ("alignment", "mounting", "anchoring"),
-    ("graph",),
-    ("solvers",),
-    ("replay",),
-    ("analysis",),
-    ("planning",),
-    ("report",),
-    ("cli",),
-)
-# On top of the order: what must not know of each other.
-FORBIDDEN = {
-    "io": ("simulation", "increments"),
-    "simulation": ("io", "increments", "preintegration", "graph", "solvers", "analysis"),
-    "kalman": ("io", "simulation", "gains"),
-    "solvers": ("io", "simulation", "analysis", "report"),
-    "replay": ("io", "simulation", "analysis", "report"),
-    "analysis": (
-        *("replay", "solvers", "graph", "keys", "preintegration", "increments"),
-        *("simulation", "io"),
-    ),
-    "planning": ("kalman", "io", "replay"),
-    "report": ("replay", "solvers", "graph", "keys", "preintegration", "simulation", "io"),
-    "alignment": ("mounting", "anchoring", "graph", "keys"),
-    "anchoring": ("alignment", "mounting", "graph", "keys", "kalman"),
-    "planar": (
-        *("kalman", "io", "simulation", "clock", "polynomials", "signals", "increments"),
-        "replay",
-    ),
-    "mounting": ("alignment", "graph", "keys", "preintegration"),
-    "preintegration": ("keys",),
-    "attitude": ("io", "simulation"),
-    "information": ("sensors", "earth"),
-}
-# What is held against the factor graph shares nothing with it: the cross-check and all
-# that would use it know only its solutions.
-FORBIDDEN |= {
-    name: (*FORBIDDEN.get(name, ()), "kalman")
-    for name in (
-        *("preintegration", "keys", "chain", "arcs", "attitude_alignment", "alignment"),
-        *("mounting", "graph", "solvers", "replay", "attitude", "priors"),
-        *("analysis", "report"),
-    )
-}
+ROOT = PACKAGE.parent
 # Data classes of the sensors: no measurement equation is among them.
 SENSOR_DATA = ("Imu", "ImuSettings", "Gnss", "Dvl", "Star", "Aid", "Parameter", "Motion")
-# The graph asks every sensor through the protocol and knows none but the IMU by name.
-NAMELESS = ("graph", "priors", "chain", "preintegration", "keys", "solvers", "replay")
-# Only where they are used: GTSAM, SciPy and Matplotlib take most of a second to load.
-LAZY_FOR_CLI = tuple(layer for line in LAYERS[2:-1] for layer in line)
-
-LEVEL = {name: i for i, line in enumerate(LAYERS) for name in line}
+# GTSAM, SciPy and Matplotlib take most of a second to load: only what needs none of them may
+# be imported where the command line starts.
+LIGHT = ("errors", "settings", "cli")
 MODULES = sorted(
     path.relative_to(PACKAGE).with_suffix("").parts
     for path in PACKAGE.rglob("*.py")
@@ -119,30 +53,23 @@ def layer_of(name):
     return name.split(".")[0]
 
 
-def test_every_module_has_a_layer():
-    assert {parts[0] for parts in MODULES} == set(LEVEL)
+def test_contracts_of_imports_are_kept(monkeypatch):
+    monkeypatch.chdir(ROOT)
+    assert lint_imports(config_filename="pyproject.toml", no_cache=True) == os.EX_OK
 
 
-@pytest.mark.parametrize("parts", MODULES, ids=".".join)
-def test_imports_go_down(parts):
-    own = parts[0]
-    for name in imported(read(parts)):
-        other = layer_of(name)
-        if other == "__version__":
-            continue
-        where = f"{'.'.join(parts)} imports {name}"
-        assert other in LEVEL, where
-        assert other == own or LEVEL[other] < LEVEL[own], where
-        assert other not in FORBIDDEN.get(own, ()), where
-        if own in NAMELESS and other == "sensors":
-            assert name.startswith(("sensors.protocol.", "sensors.imu.")), where
+def test_the_map_of_the_package_is_that_of_the_tree():
+    assert package_map.written() == package_map.drawn(), "run python tests/package_map.py"
 
 
-def test_sensors_know_only_the_protocol():
-    for parts in MODULES:
-        if parts[0] == "sensors" and parts[1] != "catalogue":
-            others = [n for n in imported(read(parts)) if layer_of(n) == "sensors"]
-            assert all(n.startswith("sensors.protocol.") for n in others), parts
+def test_the_top_holds_no_module_without_a_home():
+    loose = {parts[0] for parts in MODULES if len(parts) == 1}
+    assert loose == {"errors", "solution", "trial"}
+
+
+def test_no_package_hides_a_public_function():
+    packages = {part for parts in MODULES for part in parts[:-1]}
+    assert not packages & set(factorgraph_dvl.__all__)
 
 
 def test_simulation_takes_no_measurement_model_from_the_sensors():
@@ -175,18 +102,12 @@ def test_simulation_takes_no_measurement_model_from_the_sensors():
 
 def test_kalman_shares_no_measurement_equation_with_the_factors():
     for parts in MODULES:
-        if parts[0] == "kalman":
+        if parts[0] == "baselines":
             for name in imported(read(parts)):
                 if name.startswith("sensors."):
                     assert name.endswith(SENSOR_DATA), f"{'.'.join(parts)} imports {name}"
             source = PACKAGE.joinpath(*parts).with_suffix(".py").read_text(encoding="utf-8")
             assert "gtsam" not in source.lower(), parts
-
-
-def test_nothing_but_the_command_line_imports_it():
-    for parts in [*MODULES, ("__init__",)]:
-        if parts[0] != "cli":
-            assert "cli" not in map(layer_of, imported(read(parts))), parts
 
 
 def test_the_command_line_and_the_package_load_lazily():
@@ -196,11 +117,11 @@ def test_the_command_line_and_the_package_load_lazily():
             [],
         )
         eager = set(map(layer_of, imported(at_the_top)))
-        assert not eager & set(LAZY_FOR_CLI), parts
+        assert eager <= {*LIGHT, "__version__"}, parts
 
 
 def test_only_keys_makes_symbols():
     for parts in MODULES:
         source = PACKAGE.joinpath(*parts).with_suffix(".py").read_text(encoding="utf-8")
-        if parts != ("keys",):
+        if parts != ("graph", "keys"):
             assert "symbol" not in source.replace("no symbol", ""), parts

@@ -80,9 +80,13 @@ def solve(
         return run_batch(trial, rate_hz=rate, progress=progress), None
 
     def run_planar(trial: PlanarTrial, progress: ProgressLine) -> tuple[Solution, None]:
+        from factorgraph_dvl.quality.finding import Finding
+        from factorgraph_dvl.quality.plausibility_planar import planar_findings
         from factorgraph_dvl.ranging.planar_solution import solve_planar
 
-        return solve_planar(trial, rate_hz=rate, progress=progress), None
+        solution = solve_planar(trial, rate_hz=rate, progress=progress)
+        doubtful = [Finding("warning", *found) for found in planar_findings(trial)]
+        return with_findings(solution, doubtful), None
 
     _solve_into(
         out,

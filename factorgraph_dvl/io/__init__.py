@@ -1,1 +1,1 @@
-"""."""
+"""Files to trials and solutions, and back."""

@@ -8,7 +8,6 @@ import numpy as np
 
 from factorgraph_dvl.errors import ConfigError, SolveError
 from factorgraph_dvl.geometry.vectors import Array, rotate
-from factorgraph_dvl.quality.plausibility_planar import planar_findings
 from factorgraph_dvl.ranging.hypotheses import Candidate, follow
 from factorgraph_dvl.ranging.model import EARTH_RADIUS, PlanarProblem
 from factorgraph_dvl.ranging.problem import RangingTrial, plan
@@ -130,7 +129,7 @@ def _summary(
     joint = _mixture(values, covs, weights)
     estimates = as_estimates(problem.constants, values[0], joint)
     used, rejected = measurements(trial.beacons, made, best)
-    warnings = [*trial.notes, *(f"{label}: {text}" for label, text in planar_findings(trial))]
+    warnings = [*trial.notes]
     if not best.converged:
         warnings.append("the smoother did not converge: not to be used")
     if made.uncovered:

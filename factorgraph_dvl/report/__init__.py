@@ -1,1 +1,1 @@
-"""."""
+"""Rendering of results."""

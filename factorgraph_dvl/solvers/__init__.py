@@ -1,1 +1,1 @@
-"""."""
+"""Minimisation, covariance and summary."""

@@ -178,7 +178,7 @@ def _described(
     """Return a minimum with its covariances, and without what the data cannot tell."""
     report("covariance", 0, None)
     covariances = posterior(problem, minimum)
-    told = data_information(problem, minimum, covariances)
+    told = data_information(problem, minimum.evaluation, covariances.parameters, covariances.given)
     held = told.undetermined_directions()
     if held.size:
         # How others go with what is held is linear here, where the directions belong.

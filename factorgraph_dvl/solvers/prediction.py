@@ -46,7 +46,9 @@ def predict_posterior(
     triangles, frontier = run_filter(problem, evaluation)
     minimum = _minimum(problem, evaluation)
     covariances = posterior(problem, minimum)
-    told = data_information(problem, minimum, covariances, at_truth=True)
+    told = data_information(
+        problem, evaluation, covariances.parameters, covariances.given, at_truth=True
+    )
     held = told.undetermined_directions()
     if held.size:
         full = parameter_information(problem, evaluation)

@@ -19,8 +19,6 @@ from factorgraph_dvl.geometry.vectors import Array, rotate, skew
 from factorgraph_dvl.graph.problem import Evaluation, Problem
 from factorgraph_dvl.imu.preintegration import Attachment
 from factorgraph_dvl.sensors.protocol import Motion, Observation, Values
-from factorgraph_dvl.solvers.levenberg_marquardt import Minimum
-from factorgraph_dvl.solvers.posterior import Posterior
 
 # Share of the error of the motion in the information from which on it is not believed.
 SPURIOUS = 0.5
@@ -80,13 +78,24 @@ class DataInformation:
 
 
 def data_information(
-    problem: Problem, minimum: Minimum, covariances: Posterior, *, at_truth: bool = False
+    problem: Problem,
+    evaluation: Evaluation,
+    parameter_covariance: Array,
+    state_covariances: Array,
+    *,
+    at_truth: bool = False,
 ) -> DataInformation:
     """Return what the data say of the parameters.
 
     Parameters
     ----------
-    problem, minimum, covariances : at the minimum.
+    problem : Problem
+    evaluation : Evaluation
+        At the minimum.
+    parameter_covariance : ndarray, shape (P, P)
+        In the coordinates u of a step S u, S `Problem.prior_root`.
+    state_covariances : ndarray, shape (K, 9, 9)
+        Of the states where the parameters are known, in GTSAM's tangent space.
     at_truth : bool, default False
         The motion there is the true one, and feigns nothing: return what will be found once it is
         estimated.
@@ -94,8 +103,8 @@ def data_information(
     size = len(problem.prior_root)
     if size == 0:
         return DataInformation(*[np.zeros((0, 0))] * 2)
-    data = np.linalg.inv(covariances.parameters) - np.eye(size)
-    spurious = spurious_information(problem, minimum.evaluation, covariances.given).sum(axis=0)
+    data = np.linalg.inv(parameter_covariance) - np.eye(size)
+    spurious = spurious_information(problem, evaluation, state_covariances).sum(axis=0)
     if at_truth:
         data = data + spurious
     return DataInformation(data, spurious)
