@@ -23,7 +23,7 @@ _BIAS = 6
 
 
 @dataclass(frozen=True)
-class Known:
+class ConstantsPrior:
     """What is known of biases and parameters beforehand, jointly, in place of their priors.
 
     Parameters
@@ -99,7 +99,10 @@ def linear_prior(
 
 
 def joint_linear_prior(
-    known: Known, bias_key: int, parameters: Sequence[Parameter], key_of: Mapping[str, int]
+    known: ConstantsPrior,
+    bias_key: int,
+    parameters: Sequence[Parameter],
+    key_of: Mapping[str, int],
 ) -> gtsam.CustomFactor:
     """Return a factor on biases and parameters for what is known of them together."""
     sigma = np.sqrt(np.diag(known.covariance))

@@ -22,7 +22,7 @@ from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph import keys
 from factorgraph_dvl.graph.inertial_chain import Chain
 from factorgraph_dvl.graph.priors import (
-    Known,
+    ConstantsPrior,
     add_priors,
     joint_linear_prior,
     linear_prior,
@@ -118,7 +118,7 @@ class Problem:
         Of the aiding sensors, fixed ones included.
     start : dict of str to ndarray, optional
         Values of parameters, where they are known better than by their priors.
-    known : Known, optional
+    known : ConstantsPrior, optional
         What stands in place of the priors; the chain then has none of the biases.
     """
 
@@ -128,7 +128,7 @@ class Problem:
         observations: Sequence[Observation],
         parameters: Sequence[Parameter],
         start: dict[str, Array] | None = None,
-        known: Known | None = None,
+        known: ConstantsPrior | None = None,
     ) -> None:
         self.chain = chain
         self.all_parameters = tuple(parameters)
@@ -230,7 +230,7 @@ class Problem:
             out[p.name] = value @ exp_so3(part) if p.rotation else value + part
         return out
 
-    def hold(self, directions: Array, origin: dict[str, Array]) -> None:
+    def fix_directions(self, directions: Array, origin: dict[str, Array]) -> None:
         """Hold combinations of the parameters at an origin.
 
         Parameters

@@ -12,7 +12,7 @@ from factorgraph_dvl.geometry.rotations import BodyAxes
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph import keys
 from factorgraph_dvl.graph.inertial_chain import loose_diagonal
-from factorgraph_dvl.graph.priors import Known, local_coordinates, prior_root
+from factorgraph_dvl.graph.priors import ConstantsPrior, local_coordinates, prior_root
 from factorgraph_dvl.graph.sensor_factor import (
     Linearized,
     NodeMeasurements,
@@ -34,7 +34,7 @@ from factorgraph_dvl.replay.start import ReplayStart
 from factorgraph_dvl.sensors.imu import Imu
 from factorgraph_dvl.sensors.protocol import Aid, Motion, Parameter
 from factorgraph_dvl.solution import Trajectory
-from factorgraph_dvl.solvers.summary import TRAJECTORY_RATE, epochs_between, trajectory_between
+from factorgraph_dvl.solvers.trajectory import TRAJECTORY_RATE, epochs_between, trajectory_between
 from factorgraph_dvl.statistics.spurious_information import spurious_by, undetermined_directions
 
 # Distance, m, up to which gravity is taken as linear: to 3e-9 m/s².
@@ -200,13 +200,13 @@ class Navigator:
             self.smoother.correct(factors, min(aids))
             self._refresh()
 
-    def known(self, later: float) -> Known:
+    def known(self, later: float) -> ConstantsPrior:
         """Return what is known of biases and parameters, `later` seconds from now."""
         P = self.parameter_covariance.copy()
         s = self._imu.settings
         walk = np.repeat([s.accel_bias_walk_root_psd, s.gyro_bias_walk_root_psd], 3)
         P[:6, :6] += np.diag(walk**2) * later
-        return Known(
+        return ConstantsPrior(
             self.smoother.bias(self.smoother.node).vector(), self.smoother.calibration(), P
         )
 

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from factorgraph_dvl.errors import ConfigError, DataError, FactorgraphDvlError
 from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.vectors import Array
-from factorgraph_dvl.graph.priors import Known
+from factorgraph_dvl.graph.priors import ConstantsPrior
 from factorgraph_dvl.replay.clocks import Clocks
 from factorgraph_dvl.replay.collected import Collected
 from factorgraph_dvl.replay.estimate import Update
@@ -107,7 +107,7 @@ class Replay:
         self._gap: Gap | None = None
         self._usual_misfit = 1.0
         self._attempt = np.nan
-        self._prior: Known | None = None
+        self._prior: ConstantsPrior | None = None
         self._solved_at = np.nan
         self._solve_again = np.nan
         self._smoothed_to = 0

@@ -11,7 +11,7 @@ from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph import keys
-from factorgraph_dvl.graph.priors import Known
+from factorgraph_dvl.graph.priors import ConstantsPrior
 from factorgraph_dvl.graph.problem import Evaluation, Problem
 from factorgraph_dvl.imu.preintegration import States
 from factorgraph_dvl.sensors.protocol import AttitudeAid, Parameter
@@ -20,7 +20,7 @@ from factorgraph_dvl.solvers.batch import fit
 from factorgraph_dvl.solvers.levenberg_marquardt import Progress
 from factorgraph_dvl.solvers.posterior import posterior
 from factorgraph_dvl.solvers.state_times import STATE_INTERVAL, needs_states
-from factorgraph_dvl.solvers.summary import EPOCH_ROUNDING, TRAJECTORY_RATE, trajectory_between
+from factorgraph_dvl.solvers.trajectory import EPOCH_ROUNDING, TRAJECTORY_RATE, trajectory_between
 from factorgraph_dvl.statistics.spurious_information import spurious_information
 from factorgraph_dvl.trial import Trial
 
@@ -89,7 +89,7 @@ class ReplayStart:
 
 
 def begin(
-    trial: Trial, known: Known | None, interval: float, since: float, progress: Progress
+    trial: Trial, known: ConstantsPrior | None, interval: float, since: float, progress: Progress
 ) -> ReplayStart | str:
     """Solve what was collected, and condense it to its last state.
 
@@ -97,7 +97,7 @@ def begin(
     ----------
     trial : Trial
         What was collected.
-    known : Known or None
+    known : ConstantsPrior or None
         Of biases and calibration from before, in place of the trial's priors.
     interval : float
         Of the states to come, s.

@@ -14,7 +14,7 @@ from factorgraph_dvl.geometry.rotations import exp_so3, log_so3
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph.inertial_chain import Chain, inertial_chain
-from factorgraph_dvl.graph.priors import Known
+from factorgraph_dvl.graph.priors import ConstantsPrior
 from factorgraph_dvl.graph.problem import Evaluation, Problem
 from factorgraph_dvl.imu.increments import increments
 from factorgraph_dvl.imu.preintegration import Segments, States, attach, motion_at, segments
@@ -29,7 +29,8 @@ from factorgraph_dvl.solution import Solution, ambiguity, joined, not_told_apart
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, Progress, minimise
 from factorgraph_dvl.solvers.posterior import Posterior, changes_with, considered, posterior
 from factorgraph_dvl.solvers.state_times import STATE_INTERVAL, dense_epochs
-from factorgraph_dvl.solvers.summary import TRAJECTORY_RATE, summarise
+from factorgraph_dvl.solvers.summary import summarise
+from factorgraph_dvl.solvers.trajectory import TRAJECTORY_RATE
 from factorgraph_dvl.statistics.spurious_information import (
     at_prior_along,
     data_information,
@@ -66,7 +67,7 @@ _Found = tuple[Problem, Minimum, tuple[str, ...]]
 
 
 @dataclass(frozen=True)
-class Minimised:
+class SolvedProblem:
     """A trial at its minimum, before it is summarised.
 
     Parameters
@@ -144,7 +145,7 @@ def solve(
     return joined(solutions, against, prepared.start_positions.hypotheses)
 
 
-def solution_of(found: Minimised, rate_hz: float) -> Solution:
+def solution_of(found: SolvedProblem, rate_hz: float) -> Solution:
     """Return the solution at a minimum, with a trajectory of so many Hz."""
     return summarise(
         found.problem,
@@ -156,12 +157,12 @@ def solution_of(found: Minimised, rate_hz: float) -> Solution:
     )
 
 
-def minimised(
+def solved_problem(
     trial: Trial,
     *,
     state_interval_s: float = STATE_INTERVAL,
     progress: Progress | None = None,
-) -> Minimised:
+) -> SolvedProblem:
     """Minimise the problem of a trial; arguments and errors as of `solve`."""
     report = progress or (lambda stage, iteration, cost: None)
     problem, minimum, notes, _ = fit(trial, state_interval_s=state_interval_s, progress=report)
@@ -174,7 +175,7 @@ def _described(
     own: tuple[str, ...],
     report: Progress,
     notes: tuple[str, ...] = (),
-) -> Minimised:
+) -> SolvedProblem:
     """Return a minimum with its covariances, and without what the data cannot tell."""
     report("covariance", 0, None)
     covariances = posterior(problem, minimum)
@@ -185,7 +186,7 @@ def _described(
         full = parameter_information(problem, minimum.evaluation)
         changes = changes_with(covariances, held, told.coupled(held, full))
         origin = at_prior_along(problem, minimum.evaluation.parameters, held)
-        problem.hold(held, origin)
+        problem.fix_directions(held, origin)
         at = problem.values(minimum.evaluation.states, origin)
         again = minimise(
             problem, at, stage="all sensors, without what they cannot tell", progress=report
@@ -196,10 +197,10 @@ def _described(
             iterations=minimum.iterations + again.iterations,
         )
         covariances = considered(posterior(problem, minimum), changes)
-    return Minimised(problem, minimum, covariances, held, (*notes, *own))
+    return SolvedProblem(problem, minimum, covariances, held, (*notes, *own))
 
 
-def _evidence_against(found: Minimised) -> float:
+def _evidence_against(found: SolvedProblem) -> float:
     """Return the negative logarithm of the posterior probability about a minimum.
 
     Laplace's approximation: a minimum that is wide is more probable than a narrow one.
@@ -208,7 +209,7 @@ def _evidence_against(found: Minimised) -> float:
     return found.minimum.evaluation.cost - 0.5 * float(log_det)
 
 
-def _cost_terms(found: Minimised) -> Array:
+def _cost_terms(found: SolvedProblem) -> Array:
     """Return the terms of the cost: of each measurement, of the rest at once."""
     evaluation = found.minimum.evaluation
     parts = []
@@ -224,7 +225,11 @@ def _cost_terms(found: Minimised) -> Array:
 
 
 def fit(
-    trial: Trial, *, state_interval_s: float, progress: Progress, known: Known | None = None
+    trial: Trial,
+    *,
+    state_interval_s: float,
+    progress: Progress,
+    known: ConstantsPrior | None = None,
 ) -> tuple[Problem, Minimum, tuple[str, ...], StartPositions]:
     """Find the minimum of a trial's cost, from nothing but its data.
 
@@ -234,7 +239,7 @@ def fit(
         As for `solve`.
     progress : callable
         Called with stage, iteration and cost.
-    known : Known, optional
+    known : ConstantsPrior, optional
         Of biases and calibration, in place of the trial's priors.
 
     Returns
@@ -348,7 +353,7 @@ def _descended(
     prepared: _Prepared,
     states: States,
     report: Progress,
-    known: Known | None = None,
+    known: ConstantsPrior | None = None,
     values: dict[str, Array] | None = None,
 ) -> tuple[Problem, Minimum, tuple[str, ...]]:
     """Return the minimum that is reached from some states, and notes of its own.

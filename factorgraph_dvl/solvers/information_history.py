@@ -24,7 +24,7 @@ from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph import keys
 from factorgraph_dvl.graph.problem import FIXED_DIRECTION_STD, Evaluation, Problem
 from factorgraph_dvl.solution import Solution
-from factorgraph_dvl.solvers.batch import minimised, solution_of
+from factorgraph_dvl.solvers.batch import solution_of, solved_problem
 from factorgraph_dvl.solvers.levenberg_marquardt import Progress
 from factorgraph_dvl.solvers.posterior import Posterior
 from factorgraph_dvl.solvers.summary import prior_along, reported
@@ -80,7 +80,7 @@ def solve_with_history(
 
     Parameters and errors as of `solvers.batch.solve`.
     """
-    found = minimised(trial, progress=progress)
+    found = solved_problem(trial, progress=progress)
     if progress:
         progress("information along the trial", 0, None)
     history = information_history(

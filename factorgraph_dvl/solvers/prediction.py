@@ -13,7 +13,7 @@ from factorgraph_dvl.graph.problem import Evaluation, Problem
 from factorgraph_dvl.imu.increments import increments
 from factorgraph_dvl.imu.preintegration import States, segments
 from factorgraph_dvl.solution import Solution
-from factorgraph_dvl.solvers.batch import Minimised, solution_of
+from factorgraph_dvl.solvers.batch import SolvedProblem, solution_of
 from factorgraph_dvl.solvers.information_history import RATE_HZ, Frontier, as_history, run_filter
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, eliminate
 from factorgraph_dvl.solvers.posterior import changes_with, considered, posterior
@@ -53,12 +53,12 @@ def predict_posterior(
     if held.size:
         full = parameter_information(problem, evaluation)
         changes = changes_with(covariances, held, told.coupled(held, full))
-        problem.hold(held, evaluation.parameters)
+        problem.fix_directions(held, evaluation.parameters)
         evaluation = problem.evaluate(evaluation.values)
         minimum = _minimum(problem, evaluation)
         covariances = considered(posterior(problem, minimum), changes)
         triangles, _ = run_filter(problem, evaluation)
-    found = Minimised(problem, minimum, covariances, held, trial.notes)
+    found = SolvedProblem(problem, minimum, covariances, held, trial.notes)
     history = as_history(problem, evaluation, held, triangles, {})
     return solution_of(found, RATE_HZ), history, frontier
 

@@ -252,7 +252,7 @@ def test_a_problem_with_a_joint_prior_is_freed():
     # GTSAM would keep a callback that knows the problem, and with it all its arrays.
     scene = scenario(manoeuvres=SHORT)
     problem, values = problem_of(scene, with_prior(simulate(scene), calibration()))
-    problem.hold(np.eye(7)[:, :1], problem.prior_values())
+    problem.fix_directions(np.eye(7)[:, :1], problem.prior_values())
     problem.evaluate(values)
     known = weakref.ref(problem)
     del problem

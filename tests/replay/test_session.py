@@ -18,7 +18,7 @@ from factorgraph_dvl.replay import Replay, replay
 from factorgraph_dvl.report.terminal.live import live_view
 from factorgraph_dvl.sensors.protocol import rows_of
 from factorgraph_dvl.simulation import simulate
-from factorgraph_dvl.solvers.batch import minimised
+from factorgraph_dvl.solvers.batch import solved_problem
 from factorgraph_dvl.statistics.spurious_information import spurious_information
 
 # 150 s with turns to both sides.
@@ -314,7 +314,7 @@ def test_what_noise_feigns_is_counted_at_whatever_rate_a_sensor_comes(trial):
     session.add_imu(early.imu.time, early.imu.gyro, early.imu.accel)
     session.finish()
     nav = session._navigator
-    found = minimised(early, state_interval_s=0.2)
+    found = solved_problem(early, state_interval_s=0.2)
     by_node = spurious_information(
         found.problem, found.minimum.evaluation, found.covariances.nodes
     ).trace(axis1=1, axis2=2)

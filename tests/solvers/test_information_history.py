@@ -16,7 +16,7 @@ from factorgraph_dvl.geometry.rotations import exp_so3, log_so3
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.graph import keys
 from factorgraph_dvl.simulation import simulate
-from factorgraph_dvl.solvers.batch import minimised, solution_of
+from factorgraph_dvl.solvers.batch import solution_of, solved_problem
 from factorgraph_dvl.solvers.information_history import information_history, run_filter
 from factorgraph_dvl.statistics.information_history import InformationHistory
 
@@ -24,7 +24,7 @@ CALM = {"sway": {}, "current_m_s": [0.3, -0.1, 0]}
 
 
 def history_of(scene, seed=1):
-    found = minimised(simulate(scene, seed))
+    found = solved_problem(simulate(scene, seed))
     history = information_history(
         found.problem, found.minimum.evaluation, found.held, found.covariances
     )
@@ -195,7 +195,7 @@ def test_gaps_and_outages_do_no_harm():
 
 def test_a_trial_without_a_dvl_has_the_biases():
     trial = replace(simulate(scenario(noise=True), 1), dvl=None)
-    found = minimised(trial)
+    found = solved_problem(trial)
     history = information_history(
         found.problem, found.minimum.evaluation, found.held, found.covariances
     )
