@@ -21,7 +21,7 @@ import numpy as np
 from common import config
 
 from factorgraph_dvl.replay import Replay
-from factorgraph_dvl.sensors.protocol import rows_of
+from factorgraph_dvl.sensors.records import rows_of
 from factorgraph_dvl.simulation import parse_scenario, simulate
 from factorgraph_dvl.simulation.scenario import Scenario
 from factorgraph_dvl.trial import Trial

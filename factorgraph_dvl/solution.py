@@ -13,7 +13,8 @@ from factorgraph_dvl.geometry.rotations import BodyAxes
 from factorgraph_dvl.geometry.unit_vectors import turned
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array
-from factorgraph_dvl.sensors.protocol import DO_NOT_FIT, TOO_LARGE, Parameter
+from factorgraph_dvl.sensors.parameters import Parameter
+from factorgraph_dvl.sensors.protocol import DO_NOT_FIT, TOO_LARGE
 
 _FAR_FROM_PRIOR = 5.0
 # Evidence against a minimum with which it is not worth a word: its probability is e^-15.

@@ -9,7 +9,8 @@ import numpy as np
 
 from factorgraph_dvl.geometry.rotations import exp_so3
 from factorgraph_dvl.geometry.vectors import Array
-from factorgraph_dvl.sensors.protocol import Motion, Observation, Parameter
+from factorgraph_dvl.sensors.parameters import Parameter
+from factorgraph_dvl.sensors.protocol import Motion, Observation
 
 STEP = 1e-6
 

@@ -24,7 +24,7 @@ from factorgraph_dvl.baselines.point_sets import Estimated, Outcome, prior_of, r
 from factorgraph_dvl.baselines.spurious_information import widened
 from factorgraph_dvl.geometry.unit_vectors import turned, turned_jacobian
 from factorgraph_dvl.geometry.vectors import Array, skew
-from factorgraph_dvl.sensors.protocol import Parameter
+from factorgraph_dvl.sensors.parameters import Parameter
 
 # Over this time, s, smoothed errors of the attitude are taken to forget themselves.
 _WANDER_S = 300.0

@@ -25,7 +25,7 @@ from factorgraph_dvl.errors import ConfigError, DataError
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.imu.timestamps import JUMP, without_strays
 from factorgraph_dvl.sensors.dvl import Dvl
-from factorgraph_dvl.sensors.protocol import Parameter
+from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.solution import Residuals, Solution
 from factorgraph_dvl.trial import Trial
 

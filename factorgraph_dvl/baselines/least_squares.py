@@ -30,7 +30,7 @@ from factorgraph_dvl.geometry.rotations import (
     right_jacobian,
 )
 from factorgraph_dvl.geometry.vectors import Array, skew
-from factorgraph_dvl.sensors.protocol import Parameter
+from factorgraph_dvl.sensors.parameters import Parameter
 
 # The search for the time offset: a fraction of the period of a vessel's roll.
 _OFFSET_STEP = 0.04

@@ -28,7 +28,7 @@ from factorgraph_dvl.baselines.point_sets import (
 )
 from factorgraph_dvl.geometry.rotations import exp_so3, log_so3
 from factorgraph_dvl.geometry.vectors import Array, rotate, skew
-from factorgraph_dvl.sensors.protocol import Parameter
+from factorgraph_dvl.sensors.parameters import Parameter
 
 # Standard deviation of the bias where the trial gives none: the method has it for a state.
 _BIAS_SIGMA = 0.5

@@ -25,7 +25,7 @@ from factorgraph_dvl.baselines.point_sets import (
 from factorgraph_dvl.geometry.rotations import exp_so3, log_so3, right_jacobian
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array, skew
-from factorgraph_dvl.sensors.protocol import Parameter
+from factorgraph_dvl.sensors.parameters import Parameter
 
 THRESHOLD = 0.05 * DEG
 # An angle that noise explains is no reason to rotate the data.

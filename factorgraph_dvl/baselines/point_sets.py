@@ -16,7 +16,7 @@ from factorgraph_dvl.geometry.rotations import (
 )
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array, rotate
-from factorgraph_dvl.sensors.protocol import Parameter
+from factorgraph_dvl.sensors.parameters import Parameter
 
 # Beyond this prior standard deviation a misalignment may be anything.
 _WIDE = 30.0 * DEG

@@ -13,7 +13,7 @@ import numpy as np
 
 from factorgraph_dvl.baselines.point_sets import Estimated, Outcome, Points, prior_of
 from factorgraph_dvl.geometry.vectors import Array, rotate, skew
-from factorgraph_dvl.sensors.protocol import Parameter
+from factorgraph_dvl.sensors.parameters import Parameter
 
 
 def wahba(points: Points, misalignment: Parameter, scale: Parameter, lever_arm: Array) -> Outcome:

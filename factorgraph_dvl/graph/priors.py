@@ -12,7 +12,7 @@ from scipy.linalg import block_diag
 from factorgraph_dvl.geometry.rotations import exp_so3, inverse_right_jacobian, right_jacobian
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph.inertial_chain import loose_diagonal, square_root
-from factorgraph_dvl.sensors.protocol import Parameter
+from factorgraph_dvl.sensors.parameters import Parameter
 
 # Standard deviation that stands for zero in a parameter of which only some components
 # are held; in SI units, far below what can be measured.

@@ -40,7 +40,8 @@ from factorgraph_dvl.imu.preintegration import (
     extrapolated,
     motion_at,
 )
-from factorgraph_dvl.sensors.protocol import Linearization, Motion, Observation, Parameter
+from factorgraph_dvl.sensors.parameters import Parameter
+from factorgraph_dvl.sensors.protocol import Linearization, Motion, Observation
 
 # Standard deviation that stands for zero in a held direction, in those of the prior.
 FIXED_DIRECTION_STD = 1e-4
@@ -282,12 +283,11 @@ class Problem:
         out = {}
         for bound, motion in zip(self._bound, evaluation.motions, strict=True):
             o = bound.observation
-            gate = getattr(o, "gate", None)
-            if gate is None:
+            if o.gate is None:
                 continue
             before = np.isin(o.time, self.rejected.get(o.label, np.empty(0)))
             miss = o.residual(motion, evaluation.parameters)
-            far = np.abs(miss) > gate * o.sigma(motion, evaluation.parameters)
+            far = np.abs(miss) > o.gate * o.sigma(motion, evaluation.parameters)
             times = o.time[(before | (bound.weight > 0.0).any(axis=1)) & far.any(axis=1)]
             if times.size:
                 out[o.label] = times

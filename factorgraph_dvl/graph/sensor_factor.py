@@ -22,7 +22,8 @@ from factorgraph_dvl.imu.preintegration import (
     extrapolated,
     motion_at,
 )
-from factorgraph_dvl.sensors.protocol import Motion, Observation, Parameter
+from factorgraph_dvl.sensors.parameters import Parameter
+from factorgraph_dvl.sensors.protocol import Motion, Observation
 
 _STATE = 9
 _BIAS = 6

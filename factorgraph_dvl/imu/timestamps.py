@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from factorgraph_dvl.geometry.vectors import Array
-from factorgraph_dvl.sensors.protocol import rows_of
+from factorgraph_dvl.sensors.records import rows_of
 from factorgraph_dvl.trial import Trial
 
 # No IMU rests for so long within a trial, s: its clock was set.

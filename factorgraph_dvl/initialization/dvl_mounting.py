@@ -28,7 +28,8 @@ from factorgraph_dvl.sensors.dvl import (
     TIME_OFFSET,
     Dvl,
 )
-from factorgraph_dvl.sensors.protocol import Motion, Parameter
+from factorgraph_dvl.sensors.parameters import Parameter
+from factorgraph_dvl.sensors.protocol import Motion
 from factorgraph_dvl.trial import Trial
 
 # Error of the velocity that comes from IMU and GNSS, m/s.

@@ -29,8 +29,10 @@ from factorgraph_dvl.io.solution_folder import STD_COLUMNS, TRAJECTORY_FILE, loa
 from factorgraph_dvl.io.tables import read_table
 from factorgraph_dvl.io.trial_folder import TRUTH_FILE, load_reference
 from factorgraph_dvl.sensors.catalogue import every_parameter
-from factorgraph_dvl.sensors.protocol import Parameter, Section, check_range, stack
+from factorgraph_dvl.sensors.parameters import Parameter
+from factorgraph_dvl.sensors.records import check_range, stack
 from factorgraph_dvl.settings.ranges import out_of_range
+from factorgraph_dvl.settings.sections import Section
 from factorgraph_dvl.settings.yaml_file import parse_yaml, read_text
 from factorgraph_dvl.solution import Estimate, Solution, Trajectory
 from factorgraph_dvl.trial import Reference

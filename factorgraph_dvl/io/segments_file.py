@@ -16,7 +16,7 @@ from typing import Annotated
 import msgspec
 
 from factorgraph_dvl.errors import ConfigError, printable
-from factorgraph_dvl.sensors.protocol import Section
+from factorgraph_dvl.settings.sections import Section
 from factorgraph_dvl.settings.yaml_file import read_yaml
 
 

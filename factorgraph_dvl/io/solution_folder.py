@@ -20,7 +20,7 @@ from factorgraph_dvl.io.folders import new_folder
 from factorgraph_dvl.io.motion_table import COLUMNS as MOTION_COLUMNS
 from factorgraph_dvl.io.motion_table import motion_columns
 from factorgraph_dvl.io.tables import read_table, write_table
-from factorgraph_dvl.sensors.protocol import check_possible, check_times, stack
+from factorgraph_dvl.sensors.records import check_possible, check_times, stack
 from factorgraph_dvl.solution import Hypothesis, Residuals, Solution, Trajectory
 
 TRAJECTORY_FILE = "trajectory.csv"

@@ -41,13 +41,9 @@ from factorgraph_dvl.sensors.dvl import CALIBRATED, SCALE_ERROR, TIME_OFFSET, Dv
 from factorgraph_dvl.sensors.dvl_beams import DvlBeams
 from factorgraph_dvl.sensors.gnss import Gnss
 from factorgraph_dvl.sensors.imu import Imu
-from factorgraph_dvl.sensors.protocol import (
-    Aid,
-    JointPrior,
-    SensorRecord,
-    SensorSection,
-    check_possible,
-)
+from factorgraph_dvl.sensors.parameters import JointPrior
+from factorgraph_dvl.sensors.protocol import Aid, SensorRecord, SensorSection
+from factorgraph_dvl.sensors.records import check_possible
 from factorgraph_dvl.sensors.speed_log import Heading, SpeedLog
 from factorgraph_dvl.settings.files import MEGABYTE, read_bytes
 from factorgraph_dvl.settings.yaml_file import parse_yaml, read_text

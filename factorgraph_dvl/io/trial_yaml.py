@@ -12,8 +12,9 @@ from factorgraph_dvl.sensors.beacon import BeaconSettings
 from factorgraph_dvl.sensors.catalogue import AIDS
 from factorgraph_dvl.sensors.depth import DepthSettings
 from factorgraph_dvl.sensors.imu import ImuSettings
-from factorgraph_dvl.sensors.protocol import Section, SensorSection, Sigma3, check_epoch
+from factorgraph_dvl.sensors.protocol import SensorSection
 from factorgraph_dvl.sensors.speed_log import HeadingSettings, LogSettings
+from factorgraph_dvl.settings.sections import Section, Sigma3, check_epoch
 
 _Pitch = Annotated[float, Meta(ge=-90, le=90)]
 

@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factorgraph_dvl.geometry.vectors import Array
-from factorgraph_dvl.sensors.protocol import Parameter
+from factorgraph_dvl.sensors.parameters import Parameter
 
 # A measurement this many standard deviations off is no measurement: of a thousand good ones
 # half a one is lost, and a multipath of three sigma of a range is found.

@@ -23,7 +23,7 @@ from factorgraph_dvl.ranging.planar_solution import hypothesis_of, measurements,
 from factorgraph_dvl.ranging.problem import RangingTrial, problem_of
 from factorgraph_dvl.ranging.reckoned_track import ReckonedTrack
 from factorgraph_dvl.sensors.beacon import Beacons
-from factorgraph_dvl.sensors.protocol import Parameter
+from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.solution import Hypothesis
 from factorgraph_dvl.trial import InitialPosition, Trial
 

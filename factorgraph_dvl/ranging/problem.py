@@ -20,7 +20,7 @@ from factorgraph_dvl.ranging.reckoned_track import (
     reckon,
 )
 from factorgraph_dvl.sensors.beacon import Beacons
-from factorgraph_dvl.sensors.protocol import Parameter
+from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.trial import InitialPosition, PlanarTrial
 
 # Times closer than this, s, are no two nodes: the information of a step between them has no

@@ -12,7 +12,8 @@ import numpy as np
 from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.sensors.imu import Imu
-from factorgraph_dvl.sensors.protocol import Aid, joined, rows_of
+from factorgraph_dvl.sensors.protocol import Aid
+from factorgraph_dvl.sensors.records import joined, rows_of
 from factorgraph_dvl.trial import Trial
 
 

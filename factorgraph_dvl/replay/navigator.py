@@ -32,7 +32,8 @@ from factorgraph_dvl.replay.gate import Gate
 from factorgraph_dvl.replay.smoother import Smoother
 from factorgraph_dvl.replay.start import ReplayStart
 from factorgraph_dvl.sensors.imu import Imu
-from factorgraph_dvl.sensors.protocol import Aid, Motion, Parameter
+from factorgraph_dvl.sensors.parameters import Parameter
+from factorgraph_dvl.sensors.protocol import Aid, Motion
 from factorgraph_dvl.solution import Trajectory
 from factorgraph_dvl.solvers.trajectory import TRAJECTORY_RATE, epochs_between, trajectory_between
 from factorgraph_dvl.statistics.spurious_information import spurious_by, undetermined_directions
@@ -382,8 +383,9 @@ class Navigator:
             there = np.isfinite(sigma[part])
             found = np.where(there, residual[part], np.nan).reshape(m, d)
             spread = np.where(there, total[part], np.nan).reshape(m, d)
-            echoes = getattr(r.observation, "gate", None)
-            used, message = self._gate.passes(r.observation.label, found / spread, echoes)
+            used, message = self._gate.passes(
+                r.observation.label, found / spread, r.observation.gate
+            )
             if message:
                 self.messages.append(message)
             weight[part] = (used[:, None] / sigma[part].reshape(m, d)).ravel()

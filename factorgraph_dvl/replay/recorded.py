@@ -15,7 +15,7 @@ from factorgraph_dvl.imu.timestamps import without_strays
 from factorgraph_dvl.replay.estimate import Innovations, Update, concatenated
 from factorgraph_dvl.replay.samples import LEAST
 from factorgraph_dvl.replay.session import LAG, RATE, Kind, Replay
-from factorgraph_dvl.sensors.protocol import rows_of
+from factorgraph_dvl.sensors.records import rows_of
 from factorgraph_dvl.solution import Residuals, Solution, Trajectory, consistency_warnings
 from factorgraph_dvl.trial import Trial
 

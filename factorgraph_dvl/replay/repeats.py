@@ -7,7 +7,8 @@ from typing import TypeVar
 
 import numpy as np
 
-from factorgraph_dvl.sensors.protocol import Aid, arrays_of, rows_of
+from factorgraph_dvl.sensors.protocol import Aid
+from factorgraph_dvl.sensors.records import arrays_of, rows_of
 
 # Rows of each sensor that are remembered.
 _ROWS = 5000

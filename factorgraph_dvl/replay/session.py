@@ -24,7 +24,8 @@ from factorgraph_dvl.replay.samples import Gap, SampleBuffer
 from factorgraph_dvl.replay.silence import Silence
 from factorgraph_dvl.replay.start import ReplayStart, begin
 from factorgraph_dvl.replay.waiting import AHEAD, SAME_TIME, Waiting
-from factorgraph_dvl.sensors.protocol import Aid, rows_of
+from factorgraph_dvl.sensors.protocol import Aid
+from factorgraph_dvl.sensors.records import rows_of
 from factorgraph_dvl.solution import Trajectory
 from factorgraph_dvl.solvers.state_times import CLOSEST
 from factorgraph_dvl.trial import InitialPosition, Trial

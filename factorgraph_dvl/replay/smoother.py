@@ -16,7 +16,7 @@ import numpy as np
 
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph import keys
-from factorgraph_dvl.sensors.protocol import Parameter
+from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.solvers.levenberg_marquardt import eliminate
 from factorgraph_dvl.solvers.posterior import SquareRootInformation
 

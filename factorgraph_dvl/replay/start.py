@@ -14,7 +14,8 @@ from factorgraph_dvl.graph import keys
 from factorgraph_dvl.graph.priors import ConstantsPrior
 from factorgraph_dvl.graph.problem import Evaluation, Problem
 from factorgraph_dvl.imu.preintegration import States
-from factorgraph_dvl.sensors.protocol import AttitudeAid, Parameter
+from factorgraph_dvl.sensors.parameters import Parameter
+from factorgraph_dvl.sensors.protocol import AttitudeAid
 from factorgraph_dvl.solution import Trajectory
 from factorgraph_dvl.solvers.batch import fit
 from factorgraph_dvl.solvers.levenberg_marquardt import Progress

@@ -8,7 +8,8 @@ import numpy as np
 
 from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.vectors import Array
-from factorgraph_dvl.sensors.protocol import Aid, Observation, joined, rows_of
+from factorgraph_dvl.sensors.protocol import Aid, Observation
+from factorgraph_dvl.sensors.records import joined, rows_of
 
 # Times closer than this, s, are the same.
 SAME_TIME = 1e-6

@@ -15,22 +15,17 @@ from factorgraph_dvl.errors import DataError
 from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.units import GEODETIC_SI
 from factorgraph_dvl.geometry.vectors import Array, rotate, skew
+from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.sensors.protocol import (
     Linearization,
     Motion,
-    NonNegative,
     Observation,
-    Parameter,
-    Positive,
-    Section,
     SensorSection,
     Values,
-    Vector3,
-    at_row,
-    check_range,
-    check_times,
     lever_arm_sigma,
 )
+from factorgraph_dvl.sensors.records import at_row, check_range, check_times
+from factorgraph_dvl.settings.sections import NonNegative, Positive, Section, Vector3
 
 RANGE = "range_m"
 RANGE_RATE = "range_rate_m_s"
@@ -248,7 +243,10 @@ class _ToBeacon:
     arm_b: Array
     offset: str
 
-    gate: ClassVar[float] = GATE
+    @property
+    def gate(self) -> float | None:
+        """Standard deviations from which on a range is that of an echo."""
+        return GATE
 
     @property
     def parameters(self) -> tuple[str, ...]:

@@ -12,7 +12,8 @@ from factorgraph_dvl.sensors.dvl import Dvl, DvlSettings
 from factorgraph_dvl.sensors.dvl_beams import DvlBeams, DvlBeamsSettings
 from factorgraph_dvl.sensors.gnss import Gnss, GnssSettings
 from factorgraph_dvl.sensors.imu import Imu, ImuSettings
-from factorgraph_dvl.sensors.protocol import Aid, Parameter
+from factorgraph_dvl.sensors.parameters import Parameter
+from factorgraph_dvl.sensors.protocol import Aid
 from factorgraph_dvl.sensors.speed_log import Heading, HeadingSettings, LogSettings, SpeedLog
 from factorgraph_dvl.sensors.star import Star, StarSettings
 from factorgraph_dvl.sensors.turntable import Turntable

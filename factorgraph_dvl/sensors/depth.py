@@ -10,19 +10,16 @@ import numpy as np
 
 from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.vectors import Array, skew
+from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.sensors.protocol import (
     Linearization,
     Motion,
-    NonNegative,
     Observation,
-    Parameter,
-    Positive,
     SensorSection,
     Values,
-    Vector3,
-    check_range,
-    check_times,
 )
+from factorgraph_dvl.sensors.records import check_range, check_times
+from factorgraph_dvl.settings.sections import NonNegative, Positive, Vector3
 
 SEA_SURFACE_HEIGHT = "sea_surface_height_m"
 
@@ -138,6 +135,7 @@ class DepthBelowSurface:
     label: str = "Depth"
     unit: str = "m"
     components: tuple[str, ...] = ("down",)
+    gate: float | None = None
     parameters: tuple[str, ...] = (SEA_SURFACE_HEIGHT,)
 
     def true_time(self, values: Values) -> Array:

@@ -14,24 +14,23 @@ from factorgraph_dvl.errors import ConfigError
 from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array, cross, rotate, skew
+from factorgraph_dvl.sensors.parameters import JointPrior, Parameter
 from factorgraph_dvl.sensors.protocol import (
-    JointPrior,
     Linearization,
     Motion,
-    NonNegative,
     Observation,
-    Parameter,
     SensorSection,
-    Sigma3,
     Values,
-    Vector3,
+    lever_arm_sigma,
+)
+from factorgraph_dvl.sensors.records import (
     check_all_or_none,
     check_range,
     check_times,
-    lever_arm_sigma,
     named_columns,
     stack,
 )
+from factorgraph_dvl.settings.sections import NonNegative, Sigma3, Vector3
 
 VELOCITY_COLUMNS = ("vel_x_m_s", "vel_y_m_s", "vel_z_m_s")
 STD_COLUMNS = ("std_x_m_s", "std_y_m_s", "std_z_m_s")
@@ -297,6 +296,7 @@ class DvlVelocity:
     label: str = "DVL velocity"
     unit: str = "m/s"
     components: tuple[str, ...] = ("x", "y", "z")
+    gate: float | None = None
     parameters: tuple[str, ...] = (
         MISALIGNMENT,
         SCALE_ERROR,

@@ -15,22 +15,17 @@ from factorgraph_dvl.geometry.rotations import exp_so3
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array, rotate, skew
 from factorgraph_dvl.sensors.beam_model import CommonGeometry, FreeGeometry, Geometry
+from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.sensors.protocol import (
     Linearization,
     Motion,
-    NonNegative,
     Observation,
-    Parameter,
     SensorSection,
-    Sigma3,
     Values,
-    Vector3,
-    check_range,
-    check_times,
     lever_arm_sigma,
-    named_columns,
-    stack,
 )
+from factorgraph_dvl.sensors.records import check_range, check_times, named_columns, stack
+from factorgraph_dvl.settings.sections import NonNegative, Sigma3, Vector3
 
 # Names of the parameters of beams that have directions and scales of their own.
 DIRECTION = "beam_direction_b"
@@ -339,6 +334,7 @@ class BeamVelocity:
     lever_arm: str
     label: str = "Beam velocity"
     unit: str = "m/s"
+    gate: float | None = None
 
     @property
     def components(self) -> tuple[str, ...]:

@@ -11,25 +11,25 @@ import numpy as np
 from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.units import DEG, GEODETIC_SI
 from factorgraph_dvl.geometry.vectors import Array, cross, rotate, skew
+from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.sensors.protocol import (
     Linearization,
     Motion,
     Observation,
-    Parameter,
-    Positive,
     SensorSection,
-    Sigma3,
     Values,
-    Vector3,
+    lever_arm_sigma,
+)
+from factorgraph_dvl.sensors.records import (
     check_all_or_none,
     check_possible,
     check_range,
     check_times,
-    lever_arm_sigma,
     named_columns,
     stack,
 )
 from factorgraph_dvl.sensors.turntable_motion import TurntableMotion
+from factorgraph_dvl.settings.sections import Positive, Sigma3, Vector3
 
 POSITION_COLUMNS = ("lat_deg", "lon_deg", "height_m")
 VELOCITY_COLUMNS = ("vel_e_m_s", "vel_n_m_s", "vel_u_m_s")
@@ -227,6 +227,7 @@ class AntennaPosition:
     label: str = "GNSS position"
     unit: str = "m"
     components: tuple[str, ...] = ("east", "north", "up")
+    gate: float | None = None
     parameters: tuple[str, ...] = (LEVER_ARM,)
 
     def true_time(self, values: Values) -> Array:
@@ -282,6 +283,7 @@ class AntennaVelocity:
     label: str = "GNSS velocity"
     unit: str = "m/s"
     components: tuple[str, ...] = ("east", "north", "up")
+    gate: float | None = None
     parameters: tuple[str, ...] = (LEVER_ARM,)
 
     def true_time(self, values: Values) -> Array:

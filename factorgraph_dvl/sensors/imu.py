@@ -10,17 +10,16 @@ import numpy as np
 
 from factorgraph_dvl.geometry.units import DEG_PER_HOUR, DEG_PER_SQRT_HOUR, HOUR, MICRO_G
 from factorgraph_dvl.geometry.vectors import Array
-from factorgraph_dvl.sensors.protocol import (
-    NonNegative,
-    Parameter,
-    Positive,
-    SensorSection,
+from factorgraph_dvl.sensors.parameters import Parameter
+from factorgraph_dvl.sensors.protocol import SensorSection
+from factorgraph_dvl.sensors.records import (
     check_finite,
     check_range,
     check_times,
     named_columns,
     stack,
 )
+from factorgraph_dvl.settings.sections import NonNegative, Positive
 
 COLUMNS = (
     "time_s",

@@ -10,14 +10,10 @@ import numpy as np
 
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array
-from factorgraph_dvl.sensors.protocol import (
-    NonNegative,
-    Parameter,
-    Positive,
-    SensorSection,
-    check_range,
-    check_times,
-)
+from factorgraph_dvl.sensors.parameters import Parameter
+from factorgraph_dvl.sensors.protocol import SensorSection
+from factorgraph_dvl.sensors.records import check_range, check_times
+from factorgraph_dvl.settings.sections import NonNegative, Positive
 
 HEADING_BIAS = "heading_bias_deg"
 SCALE_ERROR = "log_scale_error"

@@ -22,6 +22,7 @@ from factorgraph_dvl.geometry.earth import LocalFrame, enu_from_ecef
 from factorgraph_dvl.geometry.rotations import inverse_right_jacobian, log_so3
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array, rotate
+from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.sensors.protocol import (
     DO_NOT_FIT,
     TOO_LARGE,
@@ -29,11 +30,10 @@ from factorgraph_dvl.sensors.protocol import (
     Linearization,
     Motion,
     Observation,
-    Parameter,
     SensorSection,
-    Sigma3,
     Values,
-    Vector3,
+)
+from factorgraph_dvl.sensors.records import (
     at_row,
     check_all_or_none,
     check_finite,
@@ -41,6 +41,7 @@ from factorgraph_dvl.sensors.protocol import (
     named_columns,
     stack,
 )
+from factorgraph_dvl.settings.sections import Sigma3, Vector3
 
 QUATERNION_COLUMNS = ("qw", "qx", "qy", "qz")
 VECTOR_COLUMNS = ("body_x", "body_y", "body_z", "inertial_x", "inertial_y", "inertial_z")
@@ -401,6 +402,7 @@ class StarAttitude:
     axes: Array
     std: Array
     components: tuple[str, ...] = ("x", "y", "z")
+    gate: float | None = None
     label: str = "Star attitude"
     unit: str = "arcsec"
     parameters: tuple[str, ...] = (MOUNTING,)

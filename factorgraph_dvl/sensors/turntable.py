@@ -11,15 +11,9 @@ import numpy as np
 from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array
-from factorgraph_dvl.sensors.protocol import (
-    Motion,
-    Observation,
-    Parameter,
-    SensorSection,
-    check_finite,
-    check_range,
-    check_times,
-)
+from factorgraph_dvl.sensors.parameters import Parameter
+from factorgraph_dvl.sensors.protocol import Motion, Observation, SensorSection
+from factorgraph_dvl.sensors.records import check_finite, check_range, check_times
 from factorgraph_dvl.sensors.turntable_motion import TurntableMotion
 
 

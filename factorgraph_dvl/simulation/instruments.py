@@ -14,16 +14,10 @@ from factorgraph_dvl.sensors.dvl import DvlSettings
 from factorgraph_dvl.sensors.dvl_beams import DvlBeamsSettings
 from factorgraph_dvl.sensors.gnss import GnssSettings
 from factorgraph_dvl.sensors.imu import ImuSettings
-from factorgraph_dvl.sensors.protocol import (
-    NonNegative,
-    Positive,
-    Section,
-    SensorSection,
-    Sigma3,
-    Vector3,
-)
+from factorgraph_dvl.sensors.protocol import SensorSection
 from factorgraph_dvl.sensors.star import StarSettings
 from factorgraph_dvl.sensors.turntable import TurntableSettings
+from factorgraph_dvl.settings.sections import NonNegative, Positive, Section, Sigma3, Vector3
 
 Interval = tuple[float, float]
 

@@ -8,8 +8,8 @@ from typing import Annotated, Any
 import msgspec
 
 from factorgraph_dvl.errors import ConfigError
-from factorgraph_dvl.sensors.protocol import NonNegative, Positive, Section
 from factorgraph_dvl.settings.convert import convert
+from factorgraph_dvl.settings.sections import NonNegative, Positive, Section
 
 # More than any trial has, far fewer than would exhaust memory.
 _MAX_MANOEUVRES = 100_000

@@ -7,8 +7,9 @@ from typing import Annotated, Any, ClassVar, Literal
 import msgspec
 
 from factorgraph_dvl.sensors.beacon import BeaconPosition, BeaconSettings
-from factorgraph_dvl.sensors.protocol import NonNegative, SensorSection, Vector3
+from factorgraph_dvl.sensors.protocol import SensorSection
 from factorgraph_dvl.sensors.speed_log import HeadingSettings, LogSettings
+from factorgraph_dvl.settings.sections import NonNegative, Vector3
 from factorgraph_dvl.simulation.instruments import Interval, SimulatedInstrument, check_intervals
 
 

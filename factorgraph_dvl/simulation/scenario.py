@@ -58,15 +58,9 @@ import msgspec
 from factorgraph_dvl.errors import ConfigError
 from factorgraph_dvl.geometry.rotations import BodyAxes
 from factorgraph_dvl.sensors.catalogue import AIDS
-from factorgraph_dvl.sensors.protocol import (
-    NonNegative,
-    Positive,
-    Section,
-    SensorSection,
-    Vector3,
-    check_epoch,
-)
+from factorgraph_dvl.sensors.protocol import SensorSection
 from factorgraph_dvl.settings.convert import convert
+from factorgraph_dvl.settings.sections import NonNegative, Positive, Section, Vector3, check_epoch
 from factorgraph_dvl.settings.yaml_file import read_yaml
 from factorgraph_dvl.simulation.instruments import (
     DepthTruth,

@@ -24,7 +24,8 @@ from factorgraph_dvl.initialization.dvl_mounting import calibrated, initial_valu
 from factorgraph_dvl.initialization.in_motion_alignment import initial_states
 from factorgraph_dvl.ranging.hypothesis_weights import odds_against
 from factorgraph_dvl.ranging.position_from_ranges import StartPositions, positions_from_ranges
-from factorgraph_dvl.sensors.protocol import Aid, Motion, Observation, Parameter
+from factorgraph_dvl.sensors.parameters import Parameter
+from factorgraph_dvl.sensors.protocol import Aid, Motion, Observation
 from factorgraph_dvl.solution import Solution, ambiguity, joined, not_told_apart
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, Progress, minimise
 from factorgraph_dvl.solvers.posterior import Posterior, changes_with, considered, posterior
@@ -219,7 +220,7 @@ def _cost_terms(found: SolvedProblem) -> Array:
     ):
         own = 0.5 * np.sum(residual**2, axis=1)
         total += own.sum()
-        gate = getattr(observation, "gate", 0.0)
+        gate = observation.gate or 0.0
         parts.append(np.where((weight > 0.0).any(axis=1), own, 0.5 * gate**2))
     return np.concatenate([*parts, [evaluation.cost - total]])
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from factorgraph_dvl.geometry.rotations import inverse_right_jacobian, reported_rotation_vector
 from factorgraph_dvl.geometry.vectors import Array
-from factorgraph_dvl.sensors.protocol import Parameter
+from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.solution import Estimate, as_estimates
 
 _FIRST = (

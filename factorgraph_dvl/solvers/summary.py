@@ -12,7 +12,8 @@ from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph import keys
 from factorgraph_dvl.graph.problem import Evaluation, Problem
 from factorgraph_dvl.imu.preintegration import Segments
-from factorgraph_dvl.sensors.protocol import Motion, Parameter
+from factorgraph_dvl.sensors.parameters import Parameter
+from factorgraph_dvl.sensors.protocol import Motion
 from factorgraph_dvl.solution import (
     Estimate,
     Residuals,

@@ -31,7 +31,7 @@ from factorgraph_dvl.replay.smoother import Smoother
 from factorgraph_dvl.report.figures.convergence import convergence_figure
 from factorgraph_dvl.sensors.dvl import Dvl, DvlSettings, DvlVelocity
 from factorgraph_dvl.sensors.imu import ImuSettings
-from factorgraph_dvl.sensors.protocol import joined, rows_of
+from factorgraph_dvl.sensors.records import joined, rows_of
 from factorgraph_dvl.simulation import simulate
 from factorgraph_dvl.solution import Estimate
 

@@ -11,7 +11,7 @@ from truth import config
 
 from factorgraph_dvl.analysis.error_statistics import motion_errors
 from factorgraph_dvl.replay import Replay, replay
-from factorgraph_dvl.sensors.protocol import rows_of
+from factorgraph_dvl.sensors.records import rows_of
 from factorgraph_dvl.sensors.star import Star
 from factorgraph_dvl.simulation import simulate
 from factorgraph_dvl.solvers.batch import solve, solved_problem

@@ -16,7 +16,7 @@ from factorgraph_dvl.errors import ConfigError, DataError, SolveError
 from factorgraph_dvl.io.tables import read_table
 from factorgraph_dvl.replay import Replay, replay
 from factorgraph_dvl.report.terminal.live import live_view
-from factorgraph_dvl.sensors.protocol import rows_of
+from factorgraph_dvl.sensors.records import rows_of
 from factorgraph_dvl.simulation import simulate
 from factorgraph_dvl.solvers.batch import solved_problem
 from factorgraph_dvl.statistics.spurious_information import spurious_information

@@ -19,7 +19,7 @@ from factorgraph_dvl.errors import ConfigError, DataError
 from factorgraph_dvl.io.trial_folder import load_trial
 from factorgraph_dvl.sensors.catalogue import AIDS
 from factorgraph_dvl.sensors.imu import Imu
-from factorgraph_dvl.sensors.protocol import arrays_of
+from factorgraph_dvl.sensors.records import arrays_of
 from factorgraph_dvl.sensors.speed_log import Heading, SpeedLog
 from factorgraph_dvl.settings.ranges import out_of_range, range_of
 from factorgraph_dvl.simulation import parse_scenario, simulate, simulate_planar

@@ -18,7 +18,7 @@ from workers import in_two_processes
 
 from factorgraph_dvl.analysis.error_statistics import motion_errors, nees_band, true_value_of
 from factorgraph_dvl.replay import Replay
-from factorgraph_dvl.sensors.protocol import rows_of
+from factorgraph_dvl.sensors.records import rows_of
 from factorgraph_dvl.simulation import simulate
 from factorgraph_dvl.solvers.batch import solve
 

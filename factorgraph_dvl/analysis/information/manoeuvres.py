@@ -17,7 +17,7 @@ from factorgraph_dvl.errors import ConfigError
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.imu.timestamps import JUMP
-from factorgraph_dvl.sensors.protocol import rows_of
+from factorgraph_dvl.sensors.records import rows_of
 from factorgraph_dvl.solution import Trajectory
 from factorgraph_dvl.trial import Reference
 
