@@ -14,7 +14,7 @@ import numpy as np
 
 from factorgraph_dvl.baselines.strapdown import Steps
 from factorgraph_dvl.geometry.earth import RATE, enu_from_ecef, normal_gravity
-from factorgraph_dvl.geometry.rotations import BodyAxes, exp_so3, frd_from_body
+from factorgraph_dvl.geometry.rotations import BodyAxes, best_rotation, exp_so3, frd_from_body
 from factorgraph_dvl.geometry.units import DEG, DEG_PER_HOUR, MICRO_G, STANDARD_GRAVITY
 from factorgraph_dvl.geometry.vectors import Array, rotate
 from factorgraph_dvl.sensors.imu import ImuSettings
@@ -166,9 +166,7 @@ def _wahba(body: Array, space: Array, noise: float, system: float) -> tuple[Arra
     reduce it.
     """
     x, y = body - body.mean(axis=0), space - space.mean(axis=0)
-    u, _, vt = np.linalg.svd(y.T @ x)
-    R = u @ np.diag([1.0, 1.0, np.linalg.det(u) * np.linalg.det(vt)]) @ vt
     moment = y.T @ y
     information = (np.trace(moment) * np.eye(3) - moment) / (noise**2 + len(x) * system**2)
     # A turn by a radian is as good as unknown.
-    return R, np.linalg.inv(information + np.eye(3))
+    return best_rotation(y.T @ x), np.linalg.inv(information + np.eye(3))

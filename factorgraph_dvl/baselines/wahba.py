@@ -12,6 +12,7 @@ from __future__ import annotations
 import numpy as np
 
 from factorgraph_dvl.baselines.point_sets import Estimated, Outcome, Points, prior_of
+from factorgraph_dvl.geometry.rotations import best_rotation
 from factorgraph_dvl.geometry.vectors import Array, rotate, skew
 from factorgraph_dvl.sensors.parameters import Parameter
 
@@ -42,10 +43,9 @@ def wahba(points: Points, misalignment: Parameter, scale: Parameter, lever_arm: 
     power = float(weight @ np.sum(v**2, axis=1))
     if power == 0.0:
         return Outcome(prior, 1)
-    u, s, vt = np.linalg.svd((points.v_d * weight[:, None]).T @ v)
-    sign = np.array([1.0, 1.0, np.sign(np.linalg.det(u) * np.linalg.det(vt))])
-    dRb = (u * sign) @ vt
-    k = float(s @ sign) / power
+    moments = (points.v_d * weight[:, None]).T @ v
+    dRb = best_rotation(moments)
+    k = float(np.sum(dRb * moments)) / power
     residual = k * rotate(dRb[None], v) - points.v_d
     H = (
         np.concatenate([-k * dRb @ skew(v), rotate(dRb[None], v)[:, :, None]], axis=2)

@@ -9,6 +9,7 @@ import erfa
 import numpy as np
 
 from factorgraph_dvl.errors import ConfigError
+from factorgraph_dvl.geometry.rotations import best_rotation
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array, rotate
 
@@ -83,10 +84,9 @@ def attitudes_from_vectors(
 ) -> tuple[Array, Array]:
     """Return the rotation from measured to catalogue directions, epoch by epoch.
 
-    Wahba's problem, sum |c - R m|² = min, by singular values (Markley, J. Astronautical
-    Sciences 36(3), 1988). With an error of sigma across each direction, per axis, the
-    covariance of phi in R Exp(phi) is sigma² P with P = (sum (I - m mᵀ))⁻¹ (Shuster and Oh,
-    J. Guidance and Control 4(1), 1981).
+    Wahba's problem, sum |c - R m|² = min. With an error of sigma across each direction, per
+    axis, the covariance of phi in R Exp(phi) is sigma² P with P = (sum (I - m mᵀ))⁻¹ (Shuster
+    and Oh, J. Guidance and Control 4(1), 1981).
 
     Parameters
     ----------
@@ -100,10 +100,8 @@ def attitudes_from_vectors(
     R : (M, 3, 3); P : (M, 3, 3).
     """
     moments = np.add.reduceat(catalogue[:, :, None] * measured[:, None, :], first)
-    u, _, vt = np.linalg.svd(moments)
-    u[:, :, 2] *= np.linalg.det(u @ vt)[:, None]
     across = np.eye(3) - measured[:, :, None] * measured[:, None, :]
-    return u @ vt, np.linalg.inv(np.add.reduceat(across, first))
+    return best_rotation(moments), np.linalg.inv(np.add.reduceat(across, first))
 
 
 def spread(directions: Array, first: np.ndarray) -> Array:

@@ -32,6 +32,18 @@ def wrapped(angle: _Angle) -> _Angle:
     return (angle + np.pi) % (2.0 * np.pi) - np.pi
 
 
+def best_rotation(moments: Array) -> Array:
+    """Return the rotations R, (..., 3, 3), that maximise tr(Rᵀ M) of matrices M (..., 3, 3).
+
+    With M = sum w y xᵀ it is the rotation that best takes vectors x to y, sum w |y - R x|² = min:
+    Wahba's problem, by singular values (Markley, J. Astronautical Sciences 36(3), 1988). With
+    any M it is the rotation that is nearest in the Frobenius norm.
+    """
+    u, _, vt = np.linalg.svd(moments)
+    u[..., 2] *= np.sign(np.linalg.det(u @ vt))[..., None]
+    return np.asarray(u @ vt)
+
+
 def exp_so3(phi: ArrayLike) -> Array:
     """Return the rotation matrices Exp([phi x]) of rotation vectors (..., 3), rad."""
     phi = np.asarray(phi, dtype=float)

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from factorgraph_dvl.geometry.earth import LocalFrame
-from factorgraph_dvl.geometry.rotations import exp_so3, log_so3
+from factorgraph_dvl.geometry.rotations import best_rotation, exp_so3, log_so3
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.initialization.dead_reckoned_spans import DeadReckonedSpan
@@ -31,12 +31,7 @@ def attitudes(trial: Trial, frame: LocalFrame) -> tuple[Attitudes, ...]:
 
 def mean_mounting(seen: Attitudes, nRb: Array) -> Array:
     """Return the mean of nRsᵀ nRb, (3, 3): the mounting sRb by attitudes (M, 3, 3) there."""
-    return _nearest_rotation(np.sum(seen.nRs.transpose(0, 2, 1) @ nRb, axis=0))
-
-
-def _nearest_rotation(matrix: Array) -> Array:
-    u, _, vt = np.linalg.svd(matrix)
-    return np.asarray(u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt)
+    return best_rotation(np.sum(seen.nRs.transpose(0, 2, 1) @ nRb, axis=0))
 
 
 def known_mountings(
@@ -74,7 +69,7 @@ def known_mountings(
         moments = np.concatenate(theirs)[small].T @ turns[small]
         second = np.linalg.svd(moments, compute_uv=False)[1] / max(small.sum(), 1)
         if np.sqrt(second) > _LEAST_TURN:
-            out[name] = _nearest_rotation(moments)
+            out[name] = best_rotation(moments)
     return out
 
 

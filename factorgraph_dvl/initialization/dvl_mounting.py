@@ -16,7 +16,12 @@ from itertools import product
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from factorgraph_dvl.geometry.rotations import exp_so3, inverse_right_jacobian, log_so3
+from factorgraph_dvl.geometry.rotations import (
+    best_rotation,
+    exp_so3,
+    inverse_right_jacobian,
+    log_so3,
+)
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array, rotate, skew
 from factorgraph_dvl.sensors.beam_geometry import as_dvl
@@ -205,7 +210,7 @@ def _closed_form(moments: _Moments, prior: _Mounting) -> list[_Mounting]:
     """
     theta = _least_squares(moments)
     M, N = theta[:, :3], theta[:, 3:6]
-    u, s, vt = np.linalg.svd(M)
+    s = np.linalg.svd(M, compute_uv=False)
     if s[2] < _LEAST_SCALE or np.linalg.det(M) < 0:
         return []
     cross = -np.linalg.solve(M, N)
@@ -213,7 +218,7 @@ def _closed_form(moments: _Moments, prior: _Mounting) -> list[_Mounting]:
         [cross[2, 1] - cross[1, 2], cross[0, 2] - cross[2, 0], cross[1, 0] - cross[0, 1]]
     )
     scale = np.full_like(prior.scale, s.mean())
-    return [_Mounting(u @ vt, scale, lever_arm, prior.bias)]
+    return [_Mounting(best_rotation(M), scale, lever_arm, prior.bias)]
 
 
 def _descend(

@@ -19,7 +19,12 @@ import numpy as np
 
 from factorgraph_dvl.errors import DataError
 from factorgraph_dvl.geometry.earth import LocalFrame
-from factorgraph_dvl.geometry.rotations import exp_so3, frd_from_body, rotation_from_rph
+from factorgraph_dvl.geometry.rotations import (
+    best_rotation,
+    exp_so3,
+    frd_from_body,
+    rotation_from_rph,
+)
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array, rotate
 from factorgraph_dvl.imu.preintegration import Segments, States
@@ -270,8 +275,7 @@ def _wahba(pairs: _Pairs, use: np.ndarray) -> tuple[Array, float]:
     weight_sum = weight.sum()
     body = pairs.body[use] - weight @ pairs.body[use] / weight_sum
     space = pairs.space[use] - weight @ pairs.space[use] / weight_sum
-    u, _, vt = np.linalg.svd((space * weight[:, None]).T @ body)
-    rotation = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+    rotation = best_rotation((space * weight[:, None]).T @ body)
     turned = body @ rotation.T
     outer = (turned * weight[:, None]).T @ turned
     information = np.trace(outer) * np.eye(3) - outer
