@@ -9,7 +9,7 @@ import numpy as np
 from scipy.special import chdtrc
 
 from factorgraph_dvl.geometry.earth import LocalFrame
-from factorgraph_dvl.geometry.rotations import BodyAxes
+from factorgraph_dvl.geometry.rotations import BodyAxes, wrapped
 from factorgraph_dvl.geometry.unit_vectors import turned
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array
@@ -393,7 +393,7 @@ def mixed(trajectories: Sequence[Trajectory], weights: Array) -> Trajectory:
     share = weights / weights.sum()
     frame = LocalFrame(*first.geodetic[0])
     p = [frame.position(*t.geodetic.T) for t in trajectories]
-    rph = [first.rph + _wrapped(t.rph - first.rph) for t in trajectories]
+    rph = [first.rph + wrapped(t.rph - first.rph) for t in trajectories]
 
     def spread(values: Sequence[Array], covs: Sequence[Array]) -> Array:
         out = np.zeros_like(covs[0])
@@ -410,10 +410,6 @@ def mixed(trajectories: Sequence[Trajectory], weights: Array) -> Trajectory:
         ),
         rph_cov=spread(rph, [t.rph_cov for t in trajectories]),
     )
-
-
-def _wrapped(angle: Array) -> Array:
-    return (angle + np.pi) % (2.0 * np.pi) - np.pi
 
 
 def ambiguity(hypotheses: Sequence[Hypothesis]) -> list[str]:

@@ -1,4 +1,4 @@
-"""Solutions of noiseless trials."""
+"""How close results are: of noiseless trials to the truth, of covariances to each other."""
 
 from __future__ import annotations
 
@@ -32,3 +32,9 @@ def assert_exact(trial, solution, *, limit=0.05, trajectory=0.05):
     assert errors.time.size == solution.trajectory.time.size
     for vector in (errors.position, errors.velocity, errors.attitude):
         assert np.sqrt(np.mean(vector.normalised**2)) < trajectory
+
+
+def worst_relative(found, expected):
+    """Largest difference in units of the standard deviations."""
+    std = np.sqrt(np.diag(expected))
+    return float(np.abs((found - expected) / np.outer(std, std)).max())

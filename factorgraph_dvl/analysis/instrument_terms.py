@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from factorgraph_dvl.errors import DataError
-from factorgraph_dvl.geometry.rotations import BodyAxes, exp_so3, frd_from_body
+from factorgraph_dvl.geometry.rotations import BodyAxes, exp_so3, frd_from_body, wrapped
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.sensors.dvl_beams import DIRECTION
@@ -95,9 +95,9 @@ def instrument_of(calibration: Calibration | Solution) -> InstrumentTerms:
         """Return angles that depend on the rotation vector, and their standard deviations."""
         value = of(alpha)
         steps = np.eye(3) * _STEP
-        J = np.stack([_turned(of(alpha + h) - of(alpha - h)) for h in steps], axis=1) / (
-            2.0 * _STEP
-        )
+        J = np.stack(
+            [wrapped((of(alpha + h) - of(alpha - h)) * DEG) / DEG for h in steps], axis=1
+        ) / (2.0 * _STEP)
         return Angles(value, np.sqrt(np.maximum(np.diag(J @ covariance @ J.T), 0.0)))
 
     def rpy(order: Order, *, inverse: bool) -> Angles:
@@ -141,8 +141,3 @@ def rotation_of(angles: Array, order: Order, body_axes: BodyAxes) -> Array:
     frd = frd_from_body(body_axes)
     matrix = Rotation.from_euler(order, given, degrees=True).as_matrix()
     return np.asarray(frd.T @ matrix @ frd)
-
-
-def _turned(difference: Array) -> Array:
-    """Return differences of angles in [-180, 180)."""
-    return np.asarray((difference + 180.0) % 360.0 - 180.0)

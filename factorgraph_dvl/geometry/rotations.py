@@ -28,8 +28,8 @@ def frd_from_body(body_axes: BodyAxes) -> Array:
 
 
 def wrapped(angle: _Angle) -> _Angle:
-    """Return angles in [-pi, pi)."""
-    return (angle + np.pi) % (2.0 * np.pi) - np.pi
+    """Return angles, rad, in [-pi, pi); those that are there already to the last digit."""
+    return angle - 2.0 * np.pi * np.floor((angle + np.pi) / (2.0 * np.pi))
 
 
 def best_rotation(moments: Array) -> Array:

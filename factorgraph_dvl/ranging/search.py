@@ -11,6 +11,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from factorgraph_dvl.geometry.rotations import wrapped
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.ranging.hypothesis_weights import HOPELESS, evidence
 from factorgraph_dvl.ranging.model import GATE, PlanarProblem
@@ -218,5 +219,5 @@ def same_track(problem: PlanarProblem, a: Fit, b: Fit) -> bool:
     distance = max(float(np.hypot(*one)), 1.0)
     across = np.array([one[1], -one[0]]) / distance
     turn = np.arctan2(other[0], other[1]) - np.arctan2(one[0], one[1])
-    arc = distance * abs((turn + np.pi) % (2.0 * np.pi) - np.pi)
+    arc = distance * abs(wrapped(turn))
     return bool(arc < 3.0 * np.sqrt(across @ P @ across))

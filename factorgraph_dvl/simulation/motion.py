@@ -21,6 +21,7 @@ from factorgraph_dvl.geometry.rotations import (
     frd_from_body,
     rotation_from_rph,
     rph_from_rotation,
+    wrapped,
 )
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array
@@ -238,7 +239,7 @@ class TrueMotion:
         )
         omega_eb_b = omega_nb_b + to_body(level_e, level_n, level_u)
         return TrueState(
-            geodetic=np.stack([lat, _wrapped(lon), height], axis=1),
+            geodetic=np.stack([lat, wrapped(lon), height], axis=1),
             v_n=np.stack([v_e, v_n, v_u], axis=1),
             a_n=np.stack([a_e, a_n, a_u], axis=1),
             rph=np.stack([roll, pitch, heading], axis=1),
@@ -459,7 +460,3 @@ def _polynomial(edges: Array, begin: Array, rate_coefficients: Array) -> PPoly:
 
 def _evaluate(polynomial: PPoly, t: Array, derivative: int = 0) -> Array:
     return np.asarray(polynomial(t, derivative), dtype=float)
-
-
-def _wrapped(lon: Array) -> Array:
-    return np.where(np.abs(lon) > np.pi, (lon + np.pi) % (2.0 * np.pi) - np.pi, lon)

@@ -12,6 +12,7 @@ from scipy.interpolate import CubicHermiteSpline
 
 from factorgraph_dvl.analysis.dead_reckoning.integration import DeadReckonedTrack
 from factorgraph_dvl.geometry.earth import radii
+from factorgraph_dvl.geometry.rotations import wrapped
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.trial import Reference
@@ -168,7 +169,7 @@ def difference(track: DeadReckonedTrack, time: Array, geodetic: Array) -> Array:
     rate = np.stack([vn / (meridian + height), ve / ((east + height) * np.cos(lat)), vu], axis=1)
     at = CubicHermiteSpline(track.time, track.geodetic, rate)(time)
     away = at - geodetic
-    away[:, 1] = (away[:, 1] + np.pi) % (2.0 * np.pi) - np.pi
+    away[:, 1] = wrapped(away[:, 1])
     meridian, east = radii(geodetic[:, 0])
     height = geodetic[:, 2]
     return np.stack(
