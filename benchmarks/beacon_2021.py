@@ -17,7 +17,7 @@ import numpy as np
 from factorgraph_dvl.baselines.single_beacon import run_filter
 from factorgraph_dvl.ranging.hypotheses import follow
 from factorgraph_dvl.ranging.planar_solution import solve_planar
-from factorgraph_dvl.ranging.problem import plan
+from factorgraph_dvl.ranging.problem import planar_setup
 from factorgraph_dvl.simulation import parse_scenario, simulate_planar
 from factorgraph_dvl.trial import PlanarTrial
 
@@ -118,7 +118,7 @@ def settled(error: np.ndarray, threshold: float = THRESHOLD) -> float:
 
 def replay(trial: PlanarTrial) -> tuple[np.ndarray, np.ndarray]:
     """Return times and positions of the heaviest hypothesis, with the data so far."""
-    problem = plan(trial).problem
+    problem = planar_setup(trial).problem
     nodes = list(range(EVERY + 1, problem.time.size + 1, EVERY))
     times, positions = [], []
 

@@ -6,9 +6,15 @@ import numpy as np
 from scipy.linalg import cho_solve_banded, cholesky_banded
 
 from factorgraph_dvl.geometry.vectors import Array
-from factorgraph_dvl.ranging.model import PlanarProblem, RangingEvaluation, changes, misfit
+from factorgraph_dvl.ranging.model import (
+    PlanarProblem,
+    RangingEvaluation,
+    step_errors,
+    velocity_changes,
+)
 
-# What a step is trusted for once one has failed, m; for the constants it is their prior sigma.
+# Chosen: radius of the trust region of positions, m, at a damping of 1; of constants it is their
+# prior sigma.
 _TRUSTED_M = 50.0
 
 
@@ -37,30 +43,30 @@ class System:
         diagonal[:, 2:, 2:] += noise
         g[:, 2:] += np.einsum("kij,kj->ki", noise, x[:, 2:])
 
-        error, through = misfit(problem, x, theta)
+        error, through = step_errors(problem, x, theta)
         info = problem.step_info[: n - 1]
         half = 0.5 * problem.share[: n - 1, None, None] * np.eye(2)
         one = np.broadcast_to(np.eye(2), half.shape)
         before, after = (np.concatenate([sign * one, half], axis=2) for sign in (-1.0, 1.0))
-        by_theta = self._by_theta(problem, theta, through, np.diff(problem.time[:n]))
+        by_theta = -problem.by_constants(through, theta, np.diff(problem.time[:n]))
         weighted = info @ by_theta
-        pull = np.einsum("kij,kj->ki", info, error)
+        weighted_error = np.einsum("kij,kj->ki", info, error)
         for side, J in ((slice(0, n - 1), before), (slice(1, n), after)):
             transposed = J.transpose(0, 2, 1)
             diagonal[side] += transposed @ info @ J
             border[side] += transposed @ weighted
-            g[side] += np.einsum("kij,kj->ki", transposed, pull)
+            g[side] += np.einsum("kij,kj->ki", transposed, weighted_error)
         off += before.transpose(0, 2, 1) @ info @ after
         corner = corner + np.einsum("kic,kid->cd", by_theta, weighted)
-        h = h + np.einsum("kic,ki->c", by_theta, pull)
+        h = h + np.einsum("kic,ki->c", by_theta, weighted_error)
 
         smooth = problem.change_info[: n - 1]
-        pull = np.einsum("kij,kj->ki", smooth, changes(problem, x))
+        weighted_error = np.einsum("kij,kj->ki", smooth, velocity_changes(problem, x))
         diagonal[:-1, 2:, 2:] += smooth
         diagonal[1:, 2:, 2:] += smooth
         off[:, 2:, 2:] -= smooth
-        g[:-1, 2:] += pull
-        g[1:, 2:] -= pull
+        g[:-1, 2:] += weighted_error
+        g[1:, 2:] -= weighted_error
 
         node = problem.ranging.node[: at.range_residual.size]
         for residual, by_x, by_constants, weight in (
@@ -86,21 +92,6 @@ class System:
         self._factor = cholesky_banded(_banded(diagonal, off), check_finite=False)
         self._influence = self._solve(self._border)
         self._schur = corner - self._border.T @ self._influence
-
-    @staticmethod
-    def _by_theta(problem: PlanarProblem, theta: Array, through: Array, dt: Array) -> Array:
-        """Return the derivative of the steps' errors with respect to the constants."""
-        out = np.zeros((dt.size, 2, theta.size))
-        columns = problem.columns
-        if "current" in columns:
-            out[:, :, columns["current"]] = -dt[:, None, None] * np.eye(2)
-        if "log_scale_error" in columns:
-            place = columns["log_scale_error"]
-            out[:, :, place] = (through / (1.0 + theta[place]))[:, :, None]
-        if "heading_bias" in columns:
-            port = np.stack([-through[:, 1], through[:, 0]], axis=1)
-            out[:, :, columns["heading_bias"]] = -port[:, :, None]
-        return out
 
     def _solve(self, right: Array) -> Array:
         return np.asarray(cho_solve_banded((self._factor, False), right, check_finite=False))

@@ -1,8 +1,8 @@
-"""All tracks that the ranges allow, from the first of them on, and when a wrong one dies.
+"""All tracks that the ranges allow, followed as the data grow.
 
 On a straight run ranges and range rates fit two tracks, mirror images about the line of
-motion. Both are followed; their weights are their likelihoods, exp(-cost), normalised, as
-far as their difference is more than chance. After a turn only the true one still fits.
+motion. Both are followed. Their weights are the normalised likelihoods, exp(-cost), without the
+differences that chance explains. After a turn only the true one still fits.
 """
 
 from __future__ import annotations
@@ -12,20 +12,21 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from factorgraph_dvl.ranging.hypothesis_weights import HOPELESS, evidence
+from factorgraph_dvl.ranging.hypothesis_weights import NEGLIGIBLE, hypothesis_costs
 from factorgraph_dvl.ranging.model import PlanarProblem
 from factorgraph_dvl.ranging.search import same_track, search
 from factorgraph_dvl.ranging.smoother import Fit, fit
 
-# Weight below which a hypothesis is dead, and above which it was one.
+# Chosen: weight below which a hypothesis is dead: one in a thousand.
 DEAD = 1e-3
-_ALIVE = 0.05
-# Share of the newest measurements whose rejection is a sign of a track gone astray.
-_ASTRAY = 0.5
+# Chosen: a hypothesis is reported if its weight ever reached this.
+_LIKELY = 0.05
+# Chosen: share of rejected measurements among the newest from which on the track is fitted anew.
+_MOSTLY_REJECTED = 0.5
 
 
 @dataclass
-class Candidate:
+class TrackedHypothesis:
     """A track that the ranges allow.
 
     Parameters
@@ -56,8 +57,8 @@ def follow(
     problem: PlanarProblem,
     updates: Sequence[int],
     searches: Sequence[int],
-    on_update: Callable[[int, list[Candidate]], object] | None = None,
-) -> list[Candidate]:
+    on_update: Callable[[int, list[TrackedHypothesis]], object] | None = None,
+) -> list[TrackedHypothesis]:
     """Follow all hypotheses through growing data.
 
     Parameters
@@ -67,46 +68,46 @@ def follow(
         Numbers of nodes after which to fit, increasing.
     searches : sequence of int
         Those of them after which to search for new hypotheses as well.
-    on_update : callable of int, list of Candidate, object, optional
-        Called with the number of nodes and the living hypotheses, heaviest first.
+    on_update : callable of int, list of TrackedHypothesis, object, optional
+        Called with the number of nodes and the living hypotheses, most probable first.
 
     Returns
     -------
-    All hypotheses that were ever likely, the living ones first, heaviest first; the fits of
+    All hypotheses that were ever likely, the living ones first, most probable first; the fits of
     these are of the last update.
     """
-    living: list[Candidate] = []
-    gone: list[Candidate] = []
+    living: list[TrackedHypothesis] = []
+    gone: list[TrackedHypothesis] = []
     before = 0
     for nodes in updates:
         time = float(problem.time[nodes - 1])
         last_weights = [(h, h.fit, h.weight) for h in living]
         for h in living:
-            h.fit = _followed(problem, h.fit, nodes)
+            h.fit = _refitted(problem, h.fit, nodes)
         found = search(problem, nodes) if nodes in searches else []
         if not living and problem.start_known:
             found.append(_from_prior(problem, nodes))
         for new in found:
             if not any(same_track(problem, new, h.fit) for h in living):
-                living.append(Candidate(time, new))
-        living, dropped = _weighed(problem, living, time)
+                living.append(TrackedHypothesis(time, new))
+        living, dropped = _weighted(problem, living, time)
         for h, earlier, weight in last_weights:
             if h.weight < DEAD <= weight:
-                h.died = _death(problem, h, earlier, living, before, nodes)
+                h.died = _time_of_death(problem, h, earlier, living, before, nodes)
         gone += [h for h in dropped if h.died is not None]
         if on_update is not None:
             on_update(nodes, living)
         before = nodes
-    likely = [h for h in (*living, *gone) if h.highest >= _ALIVE]
+    likely = [h for h in (*living, *gone) if h.highest >= _LIKELY]
     return sorted(likely, key=lambda h: (h.died is not None, -h.weight))
 
 
-def _followed(problem: PlanarProblem, earlier: Fit, nodes: int) -> Fit:
+def _refitted(problem: PlanarProblem, earlier: Fit, nodes: int) -> Fit:
     start = problem.carried(earlier.x, earlier.theta, nodes)
     found = fit(problem, start, earlier.theta)
-    if _newly_rejected(problem, found, earlier) < _ASTRAY:
+    if _newly_rejected(problem, found, earlier) < _MOSTLY_REJECTED:
         return found
-    # So many are no echoes: the track was carried past where they are believed.
+    # So many are not outliers: dead reckoning has left the region in which they pass the gate.
     other = fit(problem, start, earlier.theta, graduated=True, iterations=60)
     return min(found, other, key=lambda f: f.cost)
 
@@ -131,20 +132,22 @@ def _from_prior(problem: PlanarProblem, nodes: int) -> Fit:
     return fit(problem, problem.carried(first, theta, nodes), theta, graduated=True)
 
 
-def _weighed(
-    problem: PlanarProblem, hypotheses: list[Candidate], time: float
-) -> tuple[list[Candidate], list[Candidate]]:
-    """Return hypotheses by weight, and those that are dropped: hopeless, or found twice."""
-    kept: list[Candidate] = []
-    dropped: list[Candidate] = []
+def _weighted(
+    problem: PlanarProblem, hypotheses: list[TrackedHypothesis], time: float
+) -> tuple[list[TrackedHypothesis], list[TrackedHypothesis]]:
+    """Return hypotheses by weight, and those that are dropped: negligible, or found twice."""
+    kept: list[TrackedHypothesis] = []
+    dropped: list[TrackedHypothesis] = []
     ordered = sorted(hypotheses, key=lambda h: h.fit.cost)
-    for h, against in zip(ordered, evidence(problem, [h.fit for h in ordered]), strict=True):
-        if against > HOPELESS or any(same_track(problem, h.fit, other.fit) for other in kept):
+    for h, against in zip(
+        ordered, hypothesis_costs(problem, [h.fit for h in ordered]), strict=True
+    ):
+        if against > NEGLIGIBLE or any(same_track(problem, h.fit, other.fit) for other in kept):
             h.weight = 0.0
             dropped.append(h)
         else:
             kept.append(h)
-    likelihood = np.exp(-evidence(problem, [h.fit for h in kept]))
+    likelihood = np.exp(-hypothesis_costs(problem, [h.fit for h in kept]))
     for h, value in zip(kept, likelihood, strict=True):
         h.weight = float(value / likelihood.sum())
         h.highest = max(h.highest, h.weight)
@@ -155,11 +158,11 @@ def _weighed(
     return kept, dropped
 
 
-def _death(
+def _time_of_death(
     problem: PlanarProblem,
-    h: Candidate,
+    h: TrackedHypothesis,
     earlier: Fit,
-    living: Sequence[Candidate],
+    living: Sequence[TrackedHypothesis],
     before: int,
     after: int,
 ) -> float:
@@ -167,9 +170,9 @@ def _death(
     others = [other.fit for other in living if other is not h]
     while after - before > 1:
         middle = (before + after) // 2
-        own = _followed(problem, earlier, middle)
+        own = _refitted(problem, earlier, middle)
         fits = [own, *(fit(problem, o.x[:middle], o.theta) for o in others)]
-        likelihood = np.exp(-evidence(problem, fits))
+        likelihood = np.exp(-hypothesis_costs(problem, fits))
         if likelihood[0] / likelihood.sum() < DEAD:
             after = middle
         else:

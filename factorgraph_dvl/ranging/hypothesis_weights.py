@@ -1,4 +1,4 @@
-"""What speaks against a hypothesis, as far as it is more than chance."""
+"""Costs of hypotheses relative to the best, as far as they are more than chance."""
 
 from __future__ import annotations
 
@@ -11,39 +11,39 @@ from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.ranging.model import PlanarProblem
 from factorgraph_dvl.ranging.smoother import Fit, cost_terms
 
-# Evidence against a hypothesis with which it is given up: its likelihood is e^-20.
-HOPELESS = 20.0
-# Difference of a single term that is none of noise, if there are several; and standard deviations
-# of the sum of the others that are.
+# Chosen: relative cost at which a hypothesis is dropped, a likelihood of e^-20.
+NEGLIGIBLE = 20.0
+# Chosen: difference of a single term that noise does not explain, if several terms reach it.
 _STRONG = 4.0
 _SEVERAL = 3
+# Chosen: standard deviations of the sum of the others that chance explains.
 _CHANCE = 2.0
 
 
-def evidence(problem: PlanarProblem, fits: Sequence[Fit]) -> Array:
-    """Return what speaks against each fit of the same data.
+def hypothesis_costs(problem: PlanarProblem, fits: Sequence[Fit]) -> Array:
+    """Return the costs of fits of the same data relative to the best, (F,).
 
-    By `odds_against`, and by the priors as they are: these do not add up by chance.
+    Those of the data by `significant_costs`; those of the priors as they are, since few terms
+    do not add up by chance.
     """
     if not fits:
         return np.empty(0)
     single = [cost_terms(problem, f) for f in fits]
     priors = problem.prior_sigma.size + 1
-    against = odds_against([terms[:-priors] for terms in single])
+    against = significant_costs([terms[:-priors] for terms in single])
     against = against + np.array([terms[-priors:].sum() for terms in single])
     return np.asarray(against - against.min())
 
 
-def odds_against(single: Sequence[Array]) -> Array:
-    """Return what speaks against each fit: negative log likelihoods, relative to the best.
+def significant_costs(single: Sequence[Array]) -> Array:
+    """Return negative log likelihoods of fits relative to the best, without what chance explains.
 
-    They differ by the sum of the differences of their terms. But a heading that only its noise
-    turns takes sides as well, for one mirror image now and for the other then; so the sum of
-    many small differences walks at random, on a long straight run as far as one likes. Of
-    these no more is believed than the odds of so large a sum D by chance, whose variance is
-    the sum of the squares (Vuong, Likelihood ratio tests for model selection and non-nested
-    hypotheses, Econometrica 57(2), 1989), and nothing below two of its standard deviations. A
-    few measurements that fit one and miss the other, as after a turn, count as they are.
+    The costs of two fits differ by the sum of the differences of their terms. On a long straight
+    run the noise of the heading favours one mirror image now and the other then, so the sum of
+    many small differences is a random walk. A sum D counts only as the log odds that chance does
+    not reach it, its variance being the sum of squares (Vuong, Likelihood ratio tests for model
+    selection and non-nested hypotheses, Econometrica 57(2), 1989), and not at all below two
+    standard deviations. A few large differences, as after a turn, count in full.
 
     Parameters
     ----------
@@ -61,8 +61,8 @@ def odds_against(single: Sequence[Array]) -> Array:
         small = apart[~strong]
         total = float(small.sum())
         z = abs(total) / max(float(np.linalg.norm(small)), 1e-12)
-        believed = min(abs(total), max(_log_odds(z) - _log_odds(_CHANCE), 0.0))
-        out.append(float(apart[strong].sum()) + np.sign(total) * believed)
+        counted = min(abs(total), max(_log_odds(z) - _log_odds(_CHANCE), 0.0))
+        out.append(float(apart[strong].sum()) + np.sign(total) * counted)
     against = np.array(out)
     return against - against.min()
 

@@ -6,15 +6,15 @@
 
     w_{k+1} - n_{k+1} = w_k - n_k + N(0, Q_k)
 
-with the reckoned displacement d and velocity w, the log's scale error s, the heading's bias
-b (R(b) turns clockwise), the current c, the error of the sound speed e and each beacon's
-offset. The noise n of heading and log at a node is in the way that is reckoned with it,
-tau being their sampling interval, and in the velocity that its range rate is held against:
-taken for two noises, it feigns information on the direction of the current. So it does if nothing
-is said of the vehicle: then every jitter of heading and log may be a motion, and range rates
-without it tell the beacon's direction, falsely. So the velocity through the water is smooth, as
-smooth as it is seen to be (`track.change_psd`). Nodes are eliminated in order, the constants
-last: a banded factorisation with a border.
+with the dead-reckoned displacement d and velocity w, the log's scale error s, the heading's
+bias b (R(b) turns clockwise), the current c, the relative error of the sound speed e and each
+beacon's offset. The noise n of heading and log at a node enters both the displacement (tau is
+their sampling interval) and the velocity that predicts the range rate. Two independent noises
+would give spurious information on the direction of the current. So would a velocity that may
+change at will: noise of heading and log would count as motion, which range rates contradict.
+So the velocity through the water is as smooth as the records show it to be
+(`planar_track.velocity_change_psd`). Nodes are eliminated in order, the constants last: a banded
+factorisation with a border.
 """
 
 from __future__ import annotations
@@ -28,10 +28,11 @@ from numpy.typing import NDArray
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.sensors.parameters import Parameter
 
-# A measurement this many standard deviations off is no measurement: of a thousand good ones
-# half a one is lost, and a multipath of three sigma of a range is found.
+# Chosen: a measurement this many standard deviations off is rejected, as are 0.05 % of good ones.
 GATE = 3.5
+# Defined: mean radius of the Earth, m; over 10 km a sphere errs by 3 cm in height.
 EARTH_RADIUS = 6.371e6
+# Chosen: keeps directions finite at a beacon, m.
 _LEAST_DISTANCE = 1e-3
 
 
@@ -46,9 +47,9 @@ class Ranging:
     beacon : ndarray of np.intp, shape (M,)
         Index of the beacon.
     range, rate : ndarray, shape (M,)
-        M, m/s; nan where not measured.
+        Range, m, and range rate, m/s; nan where not measured.
     range_std, rate_std : ndarray, shape (M,)
-        Of each, m, m/s, with what the noise of the depth does to it.
+        Standard deviations, m and m/s, with the noise of the depth.
     """
 
     node: NDArray[np.intp]
@@ -68,13 +69,15 @@ class PlanarProblem:
     time : ndarray, shape (N,), s
         Of the nodes.
     step : ndarray, shape (N - 1, 2), m
-        Reckoned displacements.
+        Dead-reckoned displacements, east and north.
     step_cov : ndarray, shape (N - 1, 2, 2), m²
-        That of the noise n at its ends not included.
+        Their covariance without the noise n at the ends.
     share : ndarray, shape (N - 1,), s
         Tau of the steps.
-    velocity, velocity_cov : ndarray, shape (N, 2)
-        (N, 2, 2) reckoned velocity and its noise.
+    velocity : ndarray, shape (N, 2), m/s
+        Dead-reckoned velocity, east and north.
+    velocity_cov : ndarray, shape (N, 2, 2), m²/s²
+        Covariance of its noise.
     change_cov : ndarray, shape (N - 1, 2, 2), m²/s²
         Of the change of the true velocity over a step.
     height, climb : ndarray, shape (N,)
@@ -86,10 +89,12 @@ class PlanarProblem:
     ranging : Ranging
     parameters : tuple of Parameter
         Constants with priors, fixed ones included.
-    start_mean, start_cov : ndarray, shape (2,)
-        (2, 2) prior of the first position, m.
+    start_mean : ndarray, shape (2,), m
+        Prior mean of the first position, east and north.
+    start_cov : ndarray, shape (2, 2), m²
+        Prior covariance of the first position.
     start_known : bool
-        Whether that is more than a bound.
+        Whether that prior is measured, not a mere bound.
     tan_lat : float
         Tangent of the latitude, for the convergence of the meridians.
     """
@@ -164,7 +169,7 @@ class PlanarProblem:
         return theta[place] if place is not None else np.zeros(size)
 
     def carried(self, x: Array, theta: Array, nodes: int) -> Array:
-        """Return the states (n, 4) of at least one node, reckoned on to (nodes, 4)."""
+        """Return the states (n, 4) of at least one node, dead-reckoned on to (nodes, 4)."""
         n = x.shape[0]
         out = np.zeros((nodes, 4))
         out[: min(n, nodes)] = x[:nodes]
@@ -183,25 +188,48 @@ class PlanarProblem:
         return through + current * dt[:, None], through
 
     def turned(self, vectors: Array, east: Array, theta: Array) -> Array:
-        """Return reckoned vectors (n, 2), scaled and turned by the heading's errors into n."""
+        """Return dead-reckoned vectors (n, 2), scaled and turned by the heading's errors."""
         angle = self.value(theta, "heading_bias")[0] + east / EARTH_RADIUS * self.tan_lat
         sine, cosine = np.sin(angle), np.cos(angle)
         scale = 1.0 / (1.0 + self.value(theta, "log_scale_error")[0])
         x, y = vectors.T
         return np.asarray(scale * np.stack([cosine * x - sine * y, cosine * y + sine * x], axis=1))
 
+    def by_constants(self, through: Array, theta: Array, span: Array) -> Array:
+        """Return the derivative of through + current * span by the constants, (n, 2, c).
+
+        Parameters
+        ----------
+        through : ndarray, shape (n, 2)
+            Displacements or velocities through the water, as `turned` returns them.
+        theta : ndarray, shape (c,)
+            Constants.
+        span : ndarray, shape (n,)
+            Time over which the current acts, s; 1 for a velocity.
+        """
+        out = np.zeros((through.shape[0], 2, theta.size))
+        if "current" in self.columns:
+            out[:, :, self.columns["current"]] = span[:, None, None] * np.eye(2)
+        if "log_scale_error" in self.columns:
+            column = self.columns["log_scale_error"]
+            out[:, :, column] = -(through / (1.0 + theta[column]))[:, :, None]
+        if "heading_bias" in self.columns:
+            port = np.stack([-through[:, 1], through[:, 0]], axis=1)
+            out[:, :, self.columns["heading_bias"]] = port[:, :, None]
+        return out
+
 
 @dataclass(frozen=True)
 class RangingEvaluation:
-    """Whitened residuals and Jacobians of the measurements; nan residuals where none.
+    """Whitened residuals and Jacobians of the measurements; residuals are nan where none.
 
-    `rate_alone` are those of the rates without the noise of the velocity at their nodes, over
-    the standard deviations that they then have: by these it is judged whether they are any.
+    `rate_gate` are the residuals of the rates with the noise of the velocity in their standard
+    deviations in place of the state: the gate judges by these.
     """
 
     range_residual: Array
     rate_residual: Array
-    rate_alone: Array
+    rate_gate: Array
     range_x: Array
     rate_x: Array
     range_theta: Array
@@ -216,8 +244,8 @@ def evaluate(problem: PlanarProblem, x: Array, theta: Array) -> RangingEvaluatio
     problem : PlanarProblem
     x : ndarray, shape (n, 4)
         Positions, m, and noise of the velocity, m/s.
-    theta : ndarray
-        (c,) constants.
+    theta : ndarray, shape (c,)
+        Constants.
     """
     r = problem.ranging
     rows = problem.rows(x.shape[0])
@@ -225,10 +253,10 @@ def evaluate(problem: PlanarProblem, x: Array, theta: Array) -> RangingEvaluatio
     at = x[node, :2]
     down = np.sum(at**2, axis=1) / (2.0 * EARTH_RADIUS)
     offsets, offset_columns = _offsets(problem, theta)
-    away = np.column_stack([at, problem.height[node] - down])
-    away = away + problem.arm[node] - (problem.place + offsets)[beacon]
-    distance = np.maximum(np.linalg.norm(away, axis=1), _LEAST_DISTANCE)
-    direction = away / distance[:, None]
+    from_beacon = np.column_stack([at, problem.height[node] - down])
+    from_beacon = from_beacon + problem.arm[node] - (problem.place + offsets)[beacon]
+    distance = np.maximum(np.linalg.norm(from_beacon, axis=1), _LEAST_DISTANCE)
+    direction = from_beacon / distance[:, None]
     through = problem.turned(problem.velocity[node], at[:, 0], theta)
     current = problem.value(theta, "current", 2)
     velocity = np.column_stack([through - x[node, 2:] + current, problem.climb[node]])
@@ -237,20 +265,10 @@ def evaluate(problem: PlanarProblem, x: Array, theta: Array) -> RangingEvaluatio
     scale = 1.0 + problem.value(theta, "sound_speed_error")[0]
     across = (velocity - speed[:, None] * direction) / distance[:, None]
 
-    range_theta, rate_theta = (np.zeros((rows, theta.size)) for _ in range(2))
     columns = problem.columns
-    if "current" in columns:
-        rate_theta[:, columns["current"]] = scale * direction[:, :2]
-    if "log_scale_error" in columns:
-        factor = 1.0 + theta[columns["log_scale_error"]]
-        rate_theta[:, columns["log_scale_error"]] = (
-            -scale * np.sum(direction[:, :2] * through, axis=1) / factor
-        )[:, None]
-    if "heading_bias" in columns:
-        port = np.stack([-through[:, 1], through[:, 0]], axis=1)
-        rate_theta[:, columns["heading_bias"]] = (scale * np.sum(direction[:, :2] * port, axis=1))[
-            :, None
-        ]
+    range_theta = np.zeros((rows, theta.size))
+    by_constants = problem.by_constants(through, theta, np.ones(rows))
+    rate_theta = scale * np.einsum("mi,mic->mc", direction[:, :2], by_constants)
     if "sound_speed_error" in columns:
         range_theta[:, columns["sound_speed_error"]] = distance[:, None]
         rate_theta[:, columns["sound_speed_error"]] = speed[:, None]
@@ -288,7 +306,7 @@ def _offsets(problem: PlanarProblem, theta: Array) -> tuple[Array, dict[int, sli
     return out, columns
 
 
-def misfit(problem: PlanarProblem, x: Array, theta: Array) -> tuple[Array, Array]:
+def step_errors(problem: PlanarProblem, x: Array, theta: Array) -> tuple[Array, Array]:
     """Return errors of the steps (n - 1, 2), and the displacements through the water."""
     n = x.shape[0]
     moves, through = problem.moves(x[:-1, 0], theta, slice(0, n - 1))
@@ -296,7 +314,7 @@ def misfit(problem: PlanarProblem, x: Array, theta: Array) -> tuple[Array, Array
     return np.diff(x[:, :2], axis=0) - moves + wander, through
 
 
-def changes(problem: PlanarProblem, x: Array) -> Array:
+def velocity_changes(problem: PlanarProblem, x: Array) -> Array:
     """Return the changes of the velocity through the water between nodes, (n - 1, 2), m/s."""
     return np.diff(problem.velocity[: x.shape[0]] - x[:, 2:], axis=0)
 
@@ -304,17 +322,17 @@ def changes(problem: PlanarProblem, x: Array) -> Array:
 def terms(problem: PlanarProblem, x: Array, theta: Array, at: RangingEvaluation) -> Array:
     """Return the terms of the cost: rows, steps, noise and changes of the velocity, priors."""
     squares = np.nan_to_num(np.concatenate([at.range_residual, at.rate_residual])) ** 2
-    judged = np.nan_to_num(np.concatenate([at.range_residual, at.rate_alone])) ** 2
-    error, _ = misfit(problem, x, theta)
+    judged = np.nan_to_num(np.concatenate([at.range_residual, at.rate_gate])) ** 2
+    error, _ = step_errors(problem, x, theta)
     info = problem.step_info[: error.shape[0]]
-    change = changes(problem, x)
-    away = x[0, :2] - problem.start_mean
+    change = velocity_changes(problem, x)
+    from_mean = x[0, :2] - problem.start_mean
     parts = [
         np.where(judged > GATE**2, GATE**2, squares),
         np.einsum("ki,kij,kj->k", error, info, error),
         np.einsum("ki,kij,kj->k", x[:, 2:], problem.velocity_info[: x.shape[0]], x[:, 2:]),
         np.einsum("ki,kij,kj->k", change, problem.change_info[: change.shape[0]], change),
         (theta / problem.prior_sigma) ** 2,
-        [away @ np.linalg.solve(problem.start_cov, away)],
+        [from_mean @ np.linalg.solve(problem.start_cov, from_mean)],
     ]
     return 0.5 * np.concatenate(parts)

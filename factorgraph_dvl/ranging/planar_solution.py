@@ -1,4 +1,4 @@
-"""From a planar trial to a solution: all hypotheses, the heaviest of them as the answer."""
+"""From a planar trial to a solution: all hypotheses; the most probable one is the answer."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ import numpy as np
 
 from factorgraph_dvl.errors import ConfigError, SolveError
 from factorgraph_dvl.geometry.vectors import Array, rotate
-from factorgraph_dvl.ranging.hypotheses import Candidate, follow
+from factorgraph_dvl.ranging.hypotheses import TrackedHypothesis, follow
+from factorgraph_dvl.ranging.marginal_posterior import grid_points, posterior_weights
 from factorgraph_dvl.ranging.model import EARTH_RADIUS, PlanarProblem
-from factorgraph_dvl.ranging.problem import RangingTrial, plan
-from factorgraph_dvl.ranging.reckoned_track import SLOPE_OVER
+from factorgraph_dvl.ranging.planar_track import SLOPE_OVER
+from factorgraph_dvl.ranging.problem import RangingSetup, planar_setup
 from factorgraph_dvl.ranging.smoother import Fit, covariance, residuals
-from factorgraph_dvl.ranging.weakest_direction import shares_of, stations
 from factorgraph_dvl.sensors.beacon import Beacons
 from factorgraph_dvl.solution import (
     Estimate,
@@ -31,10 +31,12 @@ from factorgraph_dvl.trial import PlanarTrial
 
 Progress = Callable[[str, int, float | None], None]
 
-# At so many times hypotheses are weighed; at some of them new ones are sought, more often
-# at first, when the ranges tell little.
+# Chosen: number of times at which hypotheses are fitted and weighed.
 _UPDATES = 40
+# Chosen: indices of those at which to search for new hypotheses as well, denser at first, when
+# the ranges determine little.
 _SEARCHES = (0, 1, 2, 4, 8, 16, 28)
+# Chosen: rows before the first of them; a start and a current have four unknowns.
 _FIRST_ROWS = 8
 
 
@@ -54,8 +56,8 @@ def solve_planar(
     Returns
     -------
     Solution
-        The heaviest hypothesis; the others are in `Solution.hypotheses`, and the
-        covariances admit to them.
+        Of the most probable hypothesis. The others are in `Solution.hypotheses`; the
+        covariances include their spread.
 
     Raises
     ------
@@ -68,10 +70,10 @@ def solve_planar(
         raise ConfigError(f"rate_hz is {rate_hz}", expected="a number above 0")
     report = progress or (lambda stage, iteration, cost: None)
     report("dead reckoning", 0, None)
-    made = plan(trial)
-    problem = made.problem
+    setup = planar_setup(trial)
+    problem = setup.problem
     updates, searches = schedule(problem)
-    candidates = follow(
+    hypotheses = follow(
         problem,
         updates,
         searches,
@@ -79,7 +81,7 @@ def solve_planar(
             f"hypotheses {len(living)}", nodes, living[0].fit.cost if living else None
         ),
     )
-    living = [c for c in candidates if c.died is None]
+    living = [c for c in hypotheses if c.died is None]
     if not living:
         count = int(np.isfinite(problem.ranging.range).sum())
         raise SolveError(
@@ -88,11 +90,11 @@ def solve_planar(
             hint="Give `initial.position` in trial.yaml, or a longer record",
         )
     report("covariance", 0, None)
-    return _summary(trial, made, candidates, rate_hz)
+    return _summary(trial, setup, hypotheses, rate_hz)
 
 
 def schedule(problem: PlanarProblem) -> tuple[list[int], list[int]]:
-    """Return the numbers of nodes at which to weigh hypotheses, and to seek new ones."""
+    """Return the numbers of nodes at which to weigh hypotheses, and to search for new ones."""
     rows = problem.ranging.node.size
     counts = np.unique(np.linspace(min(_FIRST_ROWS, rows), rows, _UPDATES).astype(int))
     updates = [int(problem.ranging.node[count - 1]) + 1 for count in counts]
@@ -101,43 +103,46 @@ def schedule(problem: PlanarProblem) -> tuple[list[int], list[int]]:
 
 
 def _summary(
-    trial: PlanarTrial, made: RangingTrial, candidates: Sequence[Candidate], rate_hz: float
+    trial: PlanarTrial,
+    setup: RangingSetup,
+    hypotheses: Sequence[TrackedHypothesis],
+    rate_hz: float,
 ) -> Solution:
-    problem = made.problem
+    problem = setup.problem
     depth_std = trial.depth.settings.std_m
-    living = [c for c in candidates if c.died is None]
-    ridges = [stations(problem, c.fit) for c in living]
-    best = ridges[0][0].fit
+    living = [c for c in hypotheses if c.died is None]
+    grids = [grid_points(problem, c.fit) for c in living]
+    best = grids[0][0].fit
     along = [
-        [_trajectory(depth_std, made, s.fit, s.parts, rate_hz) for s in ridge] for ridge in ridges
+        [_trajectory(depth_std, setup, s.fit, s.parts, rate_hz) for s in grid] for grid in grids
     ]
-    shares = [shares_of(ridge) for ridge in ridges]
+    shares = [posterior_weights(grid) for grid in grids]
     tracks = [mixed(parts, share) for parts, share in zip(along, shares, strict=True)]
-    every = [station for ridge in ridges for station in ridge]
+    every = [point for grid in grids for point in grid]
     weights = np.concatenate([c.weight * share for c, share in zip(living, shares, strict=True)])
     gone = [
-        _trajectory(depth_std, made, c.fit, covariance(problem, c.fit), rate_hz)
-        for c in candidates
+        _trajectory(depth_std, setup, c.fit, covariance(problem, c.fit), rate_hz)
+        for c in hypotheses
         if c.died is not None
     ]
-    hypotheses = tuple(
+    reported = tuple(
         Hypothesis(c.weight, c.born, c.died, track, _history(c))
-        for c, track in zip(candidates, [*tracks, *gone], strict=True)
+        for c, track in zip(hypotheses, [*tracks, *gone], strict=True)
     )
     values = [s.fit.theta / problem.si for s in every]
     covs = [s.parts[2] / np.outer(problem.si, problem.si) for s in every]
     joint = _mixture(values, covs, weights)
     estimates = as_estimates(problem.constants, values[0], joint)
-    used, rejected = measurements(trial.beacons, made, best)
+    used, rejected = measurements(trial.beacons, setup, best)
     warnings = [*trial.notes]
     if not best.converged:
-        warnings.append("the smoother did not converge: not to be used")
-    if made.uncovered:
+        warnings.append("the smoother did not converge: do not use this result")
+    if setup.uncovered:
         warnings.append(
-            f"Beacon: {made.uncovered} measurements at times without heading, speed or depth "
+            f"Beacon: {setup.uncovered} measurements at times without heading, speed or depth "
             "were not used"
         )
-    warnings += ambiguity(hypotheses)
+    warnings += ambiguity(reported)
     warnings += consistency_warnings(estimates, used)
     warnings += mostly_rejected(used, rejected)
     warnings += _unobservable(trial, estimates)
@@ -153,55 +158,57 @@ def _summary(
         trajectory=mixed([track for parts in along for track in parts], weights),
         residuals=used,
         warnings=tuple(warnings),
-        hypotheses=hypotheses if len(hypotheses) > 1 else (),
+        hypotheses=reported if len(reported) > 1 else (),
         rejected=rejected,
     )
 
 
-def hypothesis_of(made: RangingTrial, candidate: Candidate, depth_std: float) -> Hypothesis:
+def reported_hypothesis(
+    setup: RangingSetup, hypothesis: TrackedHypothesis, depth_std: float
+) -> Hypothesis:
     """Return a hypothesis with its track at 1 Hz."""
-    parts = covariance(made.problem, candidate.fit)
-    track = _trajectory(depth_std, made, candidate.fit, parts, 1.0)
-    weight, born, died = candidate.weight, candidate.born, candidate.died
-    return Hypothesis(weight, born, died, track, _history(candidate))
+    parts = covariance(setup.problem, hypothesis.fit)
+    track = _trajectory(depth_std, setup, hypothesis.fit, parts, 1.0)
+    weight, born, died = hypothesis.weight, hypothesis.born, hypothesis.died
+    return Hypothesis(weight, born, died, track, _history(hypothesis))
 
 
-def _history(candidate: Candidate) -> Array:
-    return np.array(candidate.history).reshape(-1, 2)
+def _history(hypothesis: TrackedHypothesis) -> Array:
+    return np.array(hypothesis.history).reshape(-1, 2)
 
 
 def _mixture(values: Sequence[Array], covs: Sequence[Array], weights: Array) -> Array:
     """Return the mean square error of the first of some values that have weights."""
     out = np.zeros_like(covs[0])
     for value, cov, weight in zip(values, covs, weights / weights.sum(), strict=True):
-        away = value - values[0]
-        out += weight * (cov + np.outer(away, away))
+        error = value - values[0]
+        out += weight * (cov + np.outer(error, error))
     return out
 
 
 def _trajectory(
     depth_std: float,
-    made: RangingTrial,
+    setup: RangingSetup,
     fit: Fit,
     parts: tuple[Array, Array, Array],
     rate_hz: float,
 ) -> Trajectory:
-    """Return the motion between the nodes, reckoned on and closed onto the node after."""
-    problem, frame = made.problem, made.frame
+    """Return the motion between the nodes, dead-reckoned and closed onto the node after."""
+    problem, frame = setup.problem, setup.frame
     states, cross, constants = parts
     nodes = problem.time[: fit.x.shape[0]]
     first, last = np.ceil(nodes[0] * rate_hz - 1e-6), np.floor(nodes[-1] * rate_hz + 1e-6)
     time = np.arange(first, last + 1) / rate_hz + 0.0
     time = np.clip(time, nodes[0], nodes[-1])
     k = np.clip(np.searchsorted(nodes, time, side="right") - 1, 0, nodes.size - 2)
-    at, before = made.track.at(time), made.track.at(nodes)
+    at, before = setup.track.at(time), setup.track.at(nodes)
     current = problem.value(fit.theta, "current", 2)
     since = time - nodes[k]
     part = (since / np.diff(nodes)[k])[:, None]
     moved = problem.turned(at.displacement - before.displacement[k], fit.p[k, 0], fit.theta)
     ends, _ = problem.moves(fit.p[:-1, 0], fit.theta, slice(0, nodes.size - 1))
-    miss = np.diff(fit.p, axis=0) - ends
-    p = fit.p[k] + moved + current * since[:, None] + part * miss[k]
+    closing_error = np.diff(fit.p, axis=0) - ends
+    p = fit.p[k] + moved + current * since[:, None] + part * closing_error[k]
     noise = fit.x[k, 2:] + part * (fit.x[k + 1, 2:] - fit.x[k, 2:])
     through = problem.turned(at.velocity, p[:, 0], fit.theta)
     v = np.column_stack([through - noise + current, at.climb])
@@ -211,7 +218,7 @@ def _trajectory(
     lRn = frame.level_from_tangent(lat, lon)
     bias = problem.value(fit.theta, "heading_bias")[0]
     own = problem.columns.get("heading_bias", slice(0, 0))
-    heading_var = made.track.heading_std**2 + float(np.sum(constants[own, own]))
+    heading_var = setup.track.heading_std**2 + float(np.sum(constants[own, own]))
     m = time.size
     position_cov, velocity_cov = np.zeros((m, 3, 3)), np.zeros((m, 3, 3))
 
@@ -221,7 +228,8 @@ def _trajectory(
     position_cov[:, :2, :2] = between(states[:, :2, :2])
     position_cov[:, 2, 2] = depth_std**2
     velocity_cov[:, 2, 2] = 2.0 * (depth_std / SLOPE_OVER) ** 2
-    D = velocity_by_constants(problem, fit)
+    through_water = problem.turned(problem.velocity[: fit.x.shape[0]], fit.p[:, 0], fit.theta)
+    D = problem.by_constants(through_water, fit.theta, np.ones(fit.x.shape[0]))
     mixed_terms = D @ cross[:, 2:].transpose(0, 2, 1)
     at_nodes = states[:, 2:, 2:] + D @ constants @ D.transpose(0, 2, 1)
     velocity_cov[:, :2, :2] = between(at_nodes - mixed_terms - mixed_terms.transpose(0, 2, 1))
@@ -241,29 +249,12 @@ def _trajectory(
     )
 
 
-def velocity_by_constants(problem: PlanarProblem, fit: Fit) -> Array:
-    """Return the derivative of the velocity over ground by the constants, (n, 2, c)."""
-    n = fit.x.shape[0]
-    out = np.zeros((n, 2, fit.theta.size))
-    through = problem.turned(problem.velocity[:n], fit.p[:, 0], fit.theta)
-    columns = problem.columns
-    if "current" in columns:
-        out[:, :, columns["current"]] = np.eye(2)
-    if "log_scale_error" in columns:
-        place = columns["log_scale_error"]
-        out[:, :, place] = -(through / (1.0 + fit.theta[place]))[:, :, None]
-    if "heading_bias" in columns:
-        port = np.stack([-through[:, 1], through[:, 0]], axis=1)
-        out[:, :, columns["heading_bias"]] = port[:, :, None]
-    return out
-
-
 def measurements(
-    beacons: Beacons, made: RangingTrial, fit: Fit
+    beacons: Beacons, setup: RangingSetup, fit: Fit
 ) -> tuple[tuple[Residuals, ...], tuple[Residuals, ...]]:
     """Return residuals that were used, and those that were rejected, beacon by beacon."""
-    ranges, rates, range_std, rate_std = residuals(made.problem, fit)
-    time, names = beacons.time[made.rows], beacons.name[made.rows]
+    ranges, rates, range_std, rate_std = residuals(setup.problem, fit)
+    time, names = beacons.time[setup.rows], beacons.name[setup.rows]
     used: list[Residuals] = []
     rejected: list[Residuals] = []
     for name in beacons.settings.positions:
@@ -289,14 +280,14 @@ def _unobservable(trial: PlanarTrial, estimates: Sequence[Estimate]) -> list[str
             continue
         names = ", ".join(e.component_names[i] for i in bad)
         if e.name == "heading_bias_deg":
-            why = "ranges to one beacon stay the same if the whole track turns about it"
+            why = "a rotation of the track about the only beacon changes no range"
         elif e.name == "current_m_s":
-            why = "it takes a turn: on a straight run current and mirror image go together"
+            why = "on a straight run the mirror image fits another current; add a turn"
         elif e.name == "log_scale_error":
             why = "a scale error separates from the current only over several headings"
         elif e.name == "sound_speed_error":
-            why = "it shows only against a distance that log and heading measure well enough"
+            why = "it needs a longer distance by log and heading to compare with"
         else:
-            why = "the place of a beacon shows only from several sides, and beside another beacon"
+            why = "it needs ranges from several sides, and a second beacon"
         out.append(f"{names} not observable: {why}")
     return out

@@ -1,8 +1,8 @@
-"""Where a trial without a position begins: from the ranges to beacons.
+"""The first position of a trial from the ranges to beacons.
 
-The states that alignment leaves are a dead-reckoned track from somewhere. Held against the
-ranges as a planar trial (`planar`), it gives all tracks that they allow, and the ranges that
-are none. With a position the same is done for the latter alone.
+Alignment leaves a dead-reckoned track without a position. Solved with the ranges as a planar
+problem, it gives all tracks that they allow and the ranges that are outliers. Where the position
+is known, only the latter are of use.
 """
 
 from __future__ import annotations
@@ -17,38 +17,39 @@ from factorgraph_dvl.geometry.rotations import exp_so3
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array, rotate
 from factorgraph_dvl.imu.preintegration import Segments, States
-from factorgraph_dvl.ranging.hypotheses import Candidate, follow
+from factorgraph_dvl.ranging.hypotheses import TrackedHypothesis, follow
 from factorgraph_dvl.ranging.model import EARTH_RADIUS
-from factorgraph_dvl.ranging.planar_solution import hypothesis_of, measurements, schedule
-from factorgraph_dvl.ranging.problem import RangingTrial, problem_of
-from factorgraph_dvl.ranging.reckoned_track import ReckonedTrack
+from factorgraph_dvl.ranging.planar_solution import measurements, reported_hypothesis, schedule
+from factorgraph_dvl.ranging.planar_track import PlanarTrack
+from factorgraph_dvl.ranging.problem import RangingSetup, ranging_setup
 from factorgraph_dvl.sensors.beacon import Beacons
 from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.solution import Hypothesis
 from factorgraph_dvl.trial import InitialPosition, Trial
 
-# What dead reckoning before the solution may be off by: heading, rad, speed, as a fraction,
-# and noise of the velocity, m/s in 1 s.
+# Chosen: standard deviations of dead reckoning before anything is solved, wide of what alignment
+# and a DVL's data sheet promise: heading, rad, scale of the speed, noise of the velocity, m/s in
+# 1 s, and current, m/s.
 _HEADING = 2.0 * DEG
 _SCALE = 0.02
 _VELOCITY = 0.05
 _CURRENT = 0.5
-# Of a position from GNSS at the start, m, before anything is smoothed.
+# Chosen: standard deviation of a first fix of GNSS, m, that of a single fix without corrections.
 _FIX = 10.0
 
 
 @dataclass(frozen=True)
 class StartPositions:
-    """Where a trial may begin.
+    """Possible first positions of a trial.
 
     Parameters
     ----------
     states : tuple of States
-        Of each living hypothesis, heaviest first; at least one.
+        Of each living hypothesis, most probable first; at least one.
     hypotheses : tuple of Hypothesis, optional
         The living ones, in the same order, then the dead; empty if a position is known.
     rejected : mapping of str to ndarray, optional
-        Times of the measurements that are none, by label.
+        Times of the outliers, by label.
     notes : tuple of str, optional
         What the user must know.
     """
@@ -66,9 +67,13 @@ def positions_from_ranges(
 
     Parameters
     ----------
-    trial, frame, seg : the trial, its tangent frame and segments.
+    trial : Trial
+    frame : LocalFrame
+        Tangent frame of the trial.
+    seg : Segments
+        Preintegrated segments of the IMU.
     states : States
-        From alignment; of a trial without a position, from anywhere.
+        From alignment; without a known position, from an arbitrary one.
 
     Raises
     ------
@@ -78,7 +83,7 @@ def positions_from_ranges(
     beacons = trial.beacons
     if beacons is None:
         return StartPositions((states,))
-    # A first fix, or a stated position, holds the track: it has been put there.
+    # A first fix or a stated position is where the track already starts.
     first = trial.initial_position
     if first is None and trial.gnss is not None:
         geodetic = np.array(frame.geodetic(states.p_n[0]))
@@ -88,35 +93,35 @@ def positions_from_ranges(
         (heard >= seg.node_time[0]) & (heard <= seg.node_time[-1])
     ):
         return StartPositions((states,))
-    made = _plan(trial, frame, seg, states, beacons, first)
-    updates, searches = schedule(made.problem)
-    found = follow(made.problem, updates, searches)
+    setup = _setup_of(trial, frame, seg, states, beacons, first)
+    updates, searches = schedule(setup.problem)
+    found = follow(setup.problem, updates, searches)
     living = [c for c in found if c.died is None]
     if not living:
         return StartPositions((states,), notes=("too few ranges to find a position from them",))
-    rejected = {r.label: r.time for r in measurements(beacons, made, living[0].fit)[1]}
+    rejected = {r.label: r.time for r in measurements(beacons, setup, living[0].fit)[1]}
     if trial.gnss is not None:
         return StartPositions((states,), rejected=rejected)
     return StartPositions(
-        tuple(_moved(made, c, states, seg.node_time) for c in living),
-        tuple(hypothesis_of(made, c, _depth_std(trial)) for c in found),
+        tuple(_moved(setup, c, states, seg.node_time) for c in living),
+        tuple(reported_hypothesis(setup, c, _depth_std(trial)) for c in found),
         rejected,
     )
 
 
-def _plan(
+def _setup_of(
     trial: Trial,
     frame: LocalFrame,
     seg: Segments,
     states: States,
     beacons: Beacons,
     first: InitialPosition | None,
-) -> RangingTrial:
+) -> RangingSetup:
     time = seg.node_time
     height = _height(trial, frame, time, states)
     bow = np.unwrap(np.arctan2(states.v_n[:, 0], states.v_n[:, 1]))
     wander = (_VELOCITY**2 * np.eye(2)) * (time - time[0])[:, None, None]
-    track = ReckonedTrack(
+    track = PlanarTrack(
         time=time,
         displacement=states.p_n[:, :2] - states.p_n[0, :2],
         velocity=states.v_n[:, :2],
@@ -140,7 +145,7 @@ def _plan(
         ),
     )
     arm_n = states.nRb @ np.array(beacons.settings.lever_arm_m)
-    return problem_of(track, arm_n, beacons, parameters, frame, first)
+    return ranging_setup(track, arm_n, beacons, parameters, frame, first)
 
 
 def _height(trial: Trial, frame: LocalFrame, time: Array, states: States) -> Array:
@@ -152,7 +157,7 @@ def _height(trial: Trial, frame: LocalFrame, time: Array, states: States) -> Arr
         return surface - np.interp(time, depth.time[known], depth.depth[known])
     height = frame.geodetic(states.p_n)[2]
     if trial.gnss is None and trial.initial_position is None:
-        # From anywhere: a vehicle starts at the surface, for want of anything better.
+        # Nothing gives a height: take the start to be at the surface.
         return height - height[0]
     return height
 
@@ -161,17 +166,19 @@ def _depth_std(trial: Trial) -> float:
     return trial.depth.settings.std_m if trial.depth is not None else np.nan
 
 
-def _moved(made: RangingTrial, candidate: Candidate, states: States, time: Array) -> States:
+def _moved(
+    setup: RangingSetup, hypothesis: TrackedHypothesis, states: States, time: Array
+) -> States:
     """Return states on the track of a hypothesis, turned by its error of the heading."""
-    problem, fit = made.problem, candidate.fit
-    reckoned = made.track.at(problem.time).displacement
-    away = np.column_stack(
-        [np.interp(time, problem.time, (fit.p - reckoned)[:, i]) for i in range(2)]
+    problem, fit = setup.problem, hypothesis.fit
+    dead_reckoned = setup.track.at(problem.time).displacement
+    correction = np.column_stack(
+        [np.interp(time, problem.time, (fit.p - dead_reckoned)[:, i]) for i in range(2)]
     )
     p_n = states.p_n.copy()
-    p_n[:, :2] = made.track.displacement + away
+    p_n[:, :2] = setup.track.displacement + correction
     down = np.sum(p_n[:, :2] ** 2, axis=1) / (2.0 * EARTH_RADIUS)
-    p_n[:, 2] = made.track.height - made.frame.height - down
+    p_n[:, 2] = setup.track.height - setup.frame.height - down
     turn = exp_so3(np.array([0.0, 0.0, problem.value(fit.theta, "heading_bias")[0]]))
     scale = 1.0 / (1.0 + problem.value(fit.theta, "log_scale_error")[0])
     v_n = scale * rotate(np.broadcast_to(turn, states.nRb.shape), states.v_n)

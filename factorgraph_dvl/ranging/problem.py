@@ -12,36 +12,35 @@ from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.rotations import rotation_from_rph
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.ranging.model import PlanarProblem, Ranging
-from factorgraph_dvl.ranging.reckoned_track import (
+from factorgraph_dvl.ranging.planar_track import (
     LEAST_PSD,
     SLOPE_OVER,
-    ReckonedTrack,
-    change_psd,
-    reckon,
+    PlanarTrack,
+    track_from_records,
+    velocity_change_psd,
 )
 from factorgraph_dvl.sensors.beacon import Beacons
 from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.trial import InitialPosition, PlanarTrial
 
-# Times closer than this, s, are no two nodes: the information of a step between them has no
-# digits left for what the ranges tell.
+# Chosen: times closer than this, s, are one node. The information of a shorter step leaves no
+# digits for that of the ranges.
 _LEAST_INTERVAL = 1e-3
-
-# Of values further apart, s, none tells what the vehicle did in between.
+# Chosen: values further apart, s, miss a whole turn of a vehicle.
 _SLOWEST_S = 60.0
 
 
 @dataclass(frozen=True)
-class RangingTrial:
+class RangingSetup:
     """A problem, and what it was made from.
 
     Parameters
     ----------
     problem : PlanarProblem
-    track : ReckonedTrack
-        The reckoned track.
+    track : PlanarTrack
+        Dead-reckoned.
     frame : LocalFrame
-        Its tangent frame.
+        Tangent frame of the problem.
     rows : ndarray of np.intp, shape (m,)
         Rows of the beacons' record that are in the problem.
     uncovered : int
@@ -49,13 +48,13 @@ class RangingTrial:
     """
 
     problem: PlanarProblem
-    track: ReckonedTrack
+    track: PlanarTrack
     frame: LocalFrame
     rows: NDArray[np.intp]
     uncovered: int
 
 
-def reckoned(trial: PlanarTrial) -> ReckonedTrack:
+def dead_reckoned(trial: PlanarTrial) -> PlanarTrack:
     """Return the track of a trial by heading, speed and depth.
 
     Raises
@@ -85,13 +84,13 @@ def reckoned(trial: PlanarTrial) -> ReckonedTrack:
             raise DataError(
                 f"one value every {apart:.4g} s",
                 where=record.source,
-                expected=f"values at most {_SLOWEST_S:g} s apart to reckon a way with",
+                expected=f"values at most {_SLOWEST_S:g} s apart for dead reckoning",
                 hint="Check that time_s is in seconds",
             )
     (log_time, speed), known = parts[1], ~np.isnan(log.speed)
     starboard = np.nan_to_num(log.starboard[known])
     extra = trial.beacons.time
-    return reckon(
+    return track_from_records(
         (*parts[0], heading.settings.std_rad),
         (log_time, speed, starboard, log.settings.speed_std_m_s),
         (parts[2][0], depth.settings.sea_surface_height_m - parts[2][1]),
@@ -99,7 +98,7 @@ def reckoned(trial: PlanarTrial) -> ReckonedTrack:
     )
 
 
-def plan(trial: PlanarTrial) -> RangingTrial:
+def planar_setup(trial: PlanarTrial) -> RangingSetup:
     """Return the problem of a planar trial.
 
     Raises
@@ -107,7 +106,7 @@ def plan(trial: PlanarTrial) -> RangingTrial:
     DataError
         If there are no ranges at times when heading, speed and depth are known.
     """
-    track = reckoned(trial)
+    track = dead_reckoned(trial)
     parameters = (
         *(p for p in trial.log.parameters() if p.stem == "current"),
         *trial.beacons.parameters(),
@@ -118,7 +117,7 @@ def plan(trial: PlanarTrial) -> RangingTrial:
     level = np.zeros((track.time.size, 3))
     level[:, 2] = track.heading
     arm_n = rotation_from_rph(level, trial.body_axes) @ arm
-    return problem_of(
+    return ranging_setup(
         track,
         arm_n,
         trial.beacons,
@@ -129,20 +128,20 @@ def plan(trial: PlanarTrial) -> RangingTrial:
     )
 
 
-def problem_of(
-    track: ReckonedTrack,
+def ranging_setup(
+    track: PlanarTrack,
     arm_n: Array,
     beacons: Beacons,
     parameters: tuple[Parameter, ...],
     frame: LocalFrame,
     initial: InitialPosition | None = None,
     depth_std: float = 0.0,
-) -> RangingTrial:
-    """Return the problem of a reckoned track with beacons.
+) -> RangingSetup:
+    """Return the problem of a dead-reckoned track with beacons.
 
     Parameters
     ----------
-    track : ReckonedTrack
+    track : PlanarTrack
         On its grid.
     arm_n : ndarray, shape (G, 3)
         Lever arm of the transponder on that grid, in n, m.
@@ -175,7 +174,7 @@ def problem_of(
     if not rows.size:
         first, last = beacons.time[present][[0, -1]]
         raise DataError(
-            f"no range at a time when the vehicle's way is known, {grid[0]:.10g} to "
+            f"no range within the dead-reckoned track, {grid[0]:.10g} to "
             f"{grid[-1]:.10g} s: they are from {first:.10g} to {last:.10g} s",
             where=beacons.source,
             expected="ranges while the other sensors run",
@@ -191,7 +190,7 @@ def problem_of(
 
     s = beacons.settings
     places = np.array([place.geodetic for place in s.positions.values()])
-    # A bound, not knowledge: the vehicle is where it hears the beacons.
+    # A bound only: the vehicle is within hearing of the beacons.
     reach = 2.0 * float(np.nanmax(beacons.range[rows], initial=1e4))
     mean, cov = np.mean(frame.position(*places.T)[:, :2], axis=0), reach**2 * np.eye(2)
     if initial is not None:
@@ -200,7 +199,7 @@ def problem_of(
     names = list(s.positions)
     dt = np.maximum(np.diff(time), _LEAST_INTERVAL)
     share = np.minimum(dt, track.interval)
-    psd = change_psd(track).reshape(grid.size, 4)
+    psd = velocity_change_psd(track).reshape(grid.size, 4)
     middle = 0.5 * (time[1:] + time[:-1])
     changing = np.stack([np.interp(middle, grid, column) for column in psd.T], axis=1)
     # What the noise at the ends of a step already accounts for.
@@ -238,7 +237,7 @@ def problem_of(
         start_known=initial is not None,
         tan_lat=0.0 if track.tangent else float(np.tan(frame.lat)),
     )
-    return RangingTrial(problem, track, frame, rows, int((present & ~covered).sum()))
+    return RangingSetup(problem, track, frame, rows, int((present & ~covered).sum()))
 
 
 def _positive(matrices: Array, least: Array) -> Array:

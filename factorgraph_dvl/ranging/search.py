@@ -1,4 +1,4 @@
-"""Where a track may begin: all starts that fit, found without knowing any.
+"""Global search for the first position of a track.
 
 With the speed v over ground and the range rate r', the beacon bears acos(-r'/v) off the course
 to either side (Chen, Shang and Lan, Journal of Unmanned Undersea Systems 29(4), 2021, fig. 3):
@@ -13,17 +13,18 @@ from numpy.typing import NDArray
 
 from factorgraph_dvl.geometry.rotations import wrapped
 from factorgraph_dvl.geometry.vectors import Array
-from factorgraph_dvl.ranging.hypothesis_weights import HOPELESS, evidence
+from factorgraph_dvl.ranging.hypothesis_weights import NEGLIGIBLE, hypothesis_costs
 from factorgraph_dvl.ranging.model import GATE, PlanarProblem
-from factorgraph_dvl.ranging.smoother import Fit, covariance, fit, graduated_weights
+from factorgraph_dvl.ranging.smoother import Fit, covariance, fit, truncation_weights
 
-# Rows that the search for starts looks at, and those of them that give starts.
+# Chosen: rows that the coarse search uses, and rows of them whose range rate gives starts.
 _SEARCHED = 120
 _GIVE_STARTS = 12
+# Chosen: bearings around the beacon to start from, 15 degrees apart.
 _BEARINGS = 24
-# Steps of the search.
+# Chosen: steps of the coarse search; the control parameter grows 1.3-fold at each.
 _STEPS = 40
-# Rows before which nothing is fitted: as many unknowns as a start has.
+# Chosen: least rows to fit; a start has four unknowns.
 _LEAST_ROWS = 6
 
 
@@ -37,13 +38,13 @@ def search(problem: PlanarProblem, nodes: int) -> list[Fit]:
     if total < _LEAST_ROWS:
         return []
     rows = np.unique(np.linspace(0, total - 1, _SEARCHED).astype(int))
-    seek = _Seek(problem, rows)
-    x = seek.descend(seek.starts())
-    cost = seek.cost(x)
+    coarse = _CoarseSearch(problem, rows)
+    x = coarse.descend(coarse.starts())
+    cost = coarse.cost(x)
     found: list[Fit] = []
     tried: list[Array] = []
     for i in np.argsort(cost):
-        if cost[i] > cost.min() + 3.0 * HOPELESS:
+        if cost[i] > cost.min() + 3.0 * NEGLIGIBLE:
             break
         start = x[i, :2]
         if any(np.hypot(*(start - other)) < 1.0 for other in tried):
@@ -53,19 +54,19 @@ def search(problem: PlanarProblem, nodes: int) -> list[Fit]:
         if "current" in problem.columns:
             theta[problem.columns["current"]] = x[i, 2:]
         first = np.concatenate([start, np.zeros(2)])[None]
-        candidate = fit(
+        hypothesis = fit(
             problem, problem.carried(first, theta, nodes), theta, graduated=True, iterations=60
         )
-        if not any(same_track(problem, candidate, f) for f in found):
-            found.append(candidate)
-    against = evidence(problem, found)
-    return [f for f, value in zip(found, against, strict=True) if value < HOPELESS]
+        if not any(same_track(problem, hypothesis, f) for f in found):
+            found.append(hypothesis)
+    against = hypothesis_costs(problem, found)
+    return [f for f, value in zip(found, against, strict=True) if value < NEGLIGIBLE]
 
 
-class _Seek:
+class _CoarseSearch:
     """Start and current from some rows, for many starts at once.
 
-    The noise of the reckoned track is taken as noise of the measurements.
+    The noise of dead reckoning is taken as noise of the measurements.
     """
 
     def __init__(self, problem: PlanarProblem, rows: NDArray[np.intp]) -> None:
@@ -122,8 +123,8 @@ class _Seek:
         course = np.arctan2(v[:, 0], v[:, 1])
         for side in (-1.0, 1.0):
             bearing = course + side * off
-            away = level[:, None] * np.stack([np.sin(bearing), np.cos(bearing)], axis=1)
-            out.append(self.place[rows] + away - self.moved[rows])
+            from_beacon = level[:, None] * np.stack([np.sin(bearing), np.cos(bearing)], axis=1)
+            out.append(self.place[rows] + from_beacon - self.moved[rows])
         p = np.concatenate(out) if out else np.zeros((0, 2))
         return np.column_stack([p, np.zeros((p.shape[0], self.prior_sigma.size))])
 
@@ -155,11 +156,11 @@ class _Seek:
     def cost(self, x: Array) -> Array:
         """Return the truncated cost of each start, (S,)."""
         e, _ = self._residuals(x)
-        away = x[:, :2] - self.start_mean
+        from_mean = x[:, :2] - self.start_mean
         return 0.5 * (
             np.sum(np.minimum(e**2, GATE**2), axis=1)
             + np.sum((x[:, 2:] / self.prior_sigma) ** 2, axis=1)
-            + np.einsum("si,ij,sj->s", away, self.start_info, away)
+            + np.einsum("si,ij,sj->s", from_mean, self.start_info, from_mean)
         )
 
     def descend(self, x: Array) -> Array:
@@ -172,13 +173,13 @@ class _Seek:
         scale = np.diag([1.0 / 100.0**2] * 2 + [1.0] * (size - 2))
         e, J = self._residuals(x)
         largest = np.maximum(np.max(e**2, axis=1), GATE**2)
-        softness = GATE**2 / (2.0 * largest - GATE**2)
+        control = GATE**2 / (2.0 * largest - GATE**2)
         damping = np.full(x.shape[0], 1.0)
         cost = np.full(x.shape[0], np.inf)
         best = x.copy()
         for step in range(_STEPS):
-            mu = softness[:, None] if step < _STEPS - 8 else np.full((x.shape[0], 1), np.inf)
-            w = graduated_weights(e**2, np.broadcast_to(mu, e.shape))
+            mu = control[:, None] if step < _STEPS - 8 else np.full((x.shape[0], 1), np.inf)
+            w = truncation_weights(e**2, np.broadcast_to(mu, e.shape))
             now = 0.5 * np.sum(w * e**2, axis=1)
             # With other weights it is another cost: only a gross failure is taken back.
             worse = now > 4.0 * cost + 10.0
@@ -187,24 +188,26 @@ class _Seek:
             best, cost = x, np.where(worse, cost, now)
             if worse.any():
                 e, J = self._residuals(x)
-                w = graduated_weights(e**2, np.broadcast_to(mu, e.shape))
+                w = truncation_weights(e**2, np.broadcast_to(mu, e.shape))
             weighted = J * w[..., None]
             H = J.transpose(0, 2, 1) @ weighted + prior + damping[:, None, None] * scale
             g = np.sum(weighted * e[..., None], axis=1) + (x - mean) @ prior
             dx = -np.linalg.solve(H, g[..., None])[..., 0]
-            # As in the smoother: the valley bends around the beacon.
-            ahead, _ = self._residuals(x + 0.1 * dx)
-            bend = 20.0 * ((ahead - e) / 0.1 - np.einsum("skj,sj->sk", J, dx))
-            ddx = -np.linalg.solve(H, np.einsum("skj,sk->sj", weighted, bend)[..., None])[..., 0]
+            # Geodesic acceleration, as in the smoother.
+            probe, _ = self._residuals(x + 0.1 * dx)
+            curvature = 20.0 * ((probe - e) / 0.1 - np.einsum("skj,sj->sk", J, dx))
+            ddx = -np.linalg.solve(H, np.einsum("skj,sk->sj", weighted, curvature)[..., None])[
+                ..., 0
+            ]
             lengths = [np.hypot(*d[:, :2].T) for d in (dx, ddx)]
             x = x + dx + 0.5 * ddx * (lengths[1] <= 0.75 * lengths[0])[:, None]
             e, J = self._residuals(x)
-            softness = np.minimum(softness * 1.3, 1e3)
+            control = np.minimum(control * 1.3, 1e3)
         return x
 
 
 def same_track(problem: PlanarProblem, a: Fit, b: Fit) -> bool:
-    """Whether two fits are the same track as far as the data tell.
+    """Whether two fits are the same track as far as the data can tell.
 
     They are if at the end of the shorter they bear from the beacon in directions that differ
     by less than three standard deviations. (Their distances to it agree, being measured.)

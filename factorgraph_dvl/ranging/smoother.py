@@ -1,4 +1,4 @@
-"""The most probable track near a start, its covariance, and the ranges that are none."""
+"""The most probable track near a start, its covariance, and which ranges are outliers."""
 
 from __future__ import annotations
 
@@ -10,14 +10,16 @@ from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.ranging.elimination import System
 from factorgraph_dvl.ranging.model import GATE, PlanarProblem, RangingEvaluation, evaluate, terms
 
+# Chosen: decrease of the cost at which the iteration ends; half a unit is one sigma.
 _CONVERGED = 1e-6
-# Relative error of a cost.
+# Chosen: relative increase of a cost that rounding explains.
 _ROUNDING = 1e-9
-# Steps, m, up to which a range is as good as linear.
+# Chosen: steps, m, up to which ranges are taken as linear; at 100 m the curvature adds 5 mm.
 _STRAIGHT_M = 1.0
-# How far along a step its curvature is taken, and the largest ratio to the step that is believed.
-_AHEAD = 0.1
-_MOST_BENT = 0.75
+# Chosen after Transtrum and Sethna: fraction of a step at which its curvature is taken, and the
+# largest acceptable ratio of acceleration to velocity.
+_PROBE = 0.1
+_LARGEST_ACCELERATION = 0.75
 
 
 @dataclass(frozen=True)
@@ -28,14 +30,14 @@ class Fit:
     ----------
     x : ndarray, shape (n, 4)
         Positions, m, and noise of the velocity, m/s.
-    theta : ndarray
-        (c,) constants.
+    theta : ndarray, shape (c,)
+        Constants.
     range_used, rate_used : ndarray, shape (m,)
         Weights 0 or 1 of the measurements; 0 where there is none.
     cost : float
         Half the sum of squared whitened residuals; a rejected one counts as the gate.
     converged : bool
-        Whether a full step promised no more: the last one, undamped.
+        Whether the last step, undamped, no longer lowered the cost.
     """
 
     x: Array
@@ -71,20 +73,20 @@ def fit(
     problem : PlanarProblem
     x : ndarray, shape (n, 4)
         Start; the first n nodes are fitted.
-    theta : ndarray
-        (c,) start of the constants.
+    theta : ndarray, shape (c,)
+        Start of the constants.
     graduated : bool, default False
         Whether to begin with the surrogate.
     iterations : int, default 30
         At most so many steps.
     """
     at = evaluate(problem, x, theta)
-    softness = _softness(at) if graduated else np.inf
+    control = _first_control(at) if graduated else np.inf
     damping = 0.0
     converged = False
     cost = _cost(problem, x, theta, at)
     for _ in range(iterations):
-        weights = _weights(at, softness)
+        weights = _weights(at, control)
         try:
             system = System(problem, x, theta, at, weights, damping)
         except np.linalg.LinAlgError:
@@ -92,13 +94,13 @@ def fit(
             continue
         dx, dtheta = system.step()
         if np.abs(dx[:, :2]).max() > _STRAIGHT_M:
-            dx, dtheta = _bent(problem, x, theta, at, weights, system, dx, dtheta)
+            dx, dtheta = _along_geodesic(problem, x, theta, at, weights, system, dx, dtheta)
         trial_x, trial_theta = x + dx, theta + dtheta
         trial_at = evaluate(problem, trial_x, trial_theta)
         trial_cost = _cost(problem, trial_x, trial_theta, trial_at)
-        if np.isfinite(softness):
+        if np.isfinite(control):
             x, theta, at, cost = trial_x, trial_theta, trial_at, trial_cost
-            softness = softness * 1.6 if softness < 100.0 else np.inf
+            control = control * 1.6 if control < 100.0 else np.inf
             continue
         if trial_cost <= cost + _ROUNDING * (1.0 + cost):
             gain = cost - trial_cost
@@ -115,11 +117,11 @@ def fit(
     return Fit(x, theta, *hard, cost, converged)
 
 
-def graduated_weights(squares: Array, softness: float | Array) -> Array:
-    """Return weights of squared whitened residuals for a softness; inf = 0 or 1 by the gate."""
+def truncation_weights(squares: Array, control: float | Array) -> Array:
+    """Return weights of squared whitened residuals; an infinite control parameter truncates."""
     gate = GATE**2
-    hard = np.isinf(softness)
-    mu = np.where(hard, 1.0, softness)
+    hard = np.isinf(control)
+    mu = np.where(hard, 1.0, control)
     with np.errstate(divide="ignore"):
         soft = GATE / np.sqrt(squares) * np.sqrt(mu * (mu + 1.0)) - mu
     return np.where(hard, squares <= gate, np.clip(soft, 0.0, 1.0))
@@ -132,9 +134,11 @@ def covariance(
 
     Returns
     -------
-    states : (n, 4, 4) of all nodes, or (1, 4, 4) of the last.
-    cross : (n or 1, 4, c) of states and constants.
-    constants : (c, c).
+    states : ndarray, shape (n, 4, 4)
+        Of all nodes, or (1, 4, 4) of the last.
+    cross : ndarray, shape (n, 4, c)
+        Of states and constants.
+    constants : ndarray, shape (c, c)
     """
     at = evaluate(problem, solution.x, solution.theta)
     weights = (solution.range_used, solution.rate_used)
@@ -156,7 +160,7 @@ def cost_terms(problem: PlanarProblem, solution: Fit) -> Array:
     return terms(problem, solution.x, solution.theta, at)
 
 
-def _bent(
+def _along_geodesic(
     problem: PlanarProblem,
     x: Array,
     theta: Array,
@@ -166,47 +170,47 @@ def _bent(
     dx: Array,
     dtheta: Array,
 ) -> tuple[Array, Array]:
-    """Return a step that follows the valley: with its acceleration along the geodesic.
+    """Return the step with its geodesic acceleration.
 
-    While the current is hardly known, the cost is a narrow valley that bends around the
-    beacon, and straight steps down it are tiny. Transtrum and Sethna, Improvements to the
+    While the current is hardly known, the cost has a narrow minimum, curved around the beacon,
+    along which straight steps are tiny. Transtrum and Sethna, Improvements to the
     Levenberg-Marquardt algorithm for nonlinear least-squares minimization, arXiv:1201.5885.
     """
-    ahead = evaluate(problem, x + _AHEAD * dx, theta + _AHEAD * dtheta)
+    probe = evaluate(problem, x + _PROBE * dx, theta + _PROBE * dtheta)
     node = problem.ranging.node[: at.range_residual.size]
     second = []
     for here, there, by_x, by_theta, weight in (
-        (at.range_residual, ahead.range_residual, at.range_x, at.range_theta, weights[0]),
-        (at.rate_residual, ahead.rate_residual, at.rate_x, at.rate_theta, weights[1]),
+        (at.range_residual, probe.range_residual, at.range_x, at.range_theta, weights[0]),
+        (at.rate_residual, probe.rate_residual, at.rate_x, at.rate_theta, weights[1]),
     ):
         linear = np.sum(by_x * dx[node], axis=1) + by_theta @ dtheta
-        bend = 2.0 / _AHEAD * ((there - here) / _AHEAD - linear)
-        second.append(np.where(weight > 0.0, bend, 0.0))
+        curvature = 2.0 / _PROBE * ((there - here) / _PROBE - linear)
+        second.append(np.where(weight > 0.0, curvature, 0.0))
     g, h = np.zeros_like(x), np.zeros_like(theta)
-    for bend, by_x, by_theta, weight in (
+    for curvature, by_x, by_theta, weight in (
         (second[0], at.range_x, at.range_theta, weights[0]),
         (second[1], at.rate_x, at.rate_theta, weights[1]),
     ):
-        g[node] += (weight * bend)[:, None] * by_x
-        h += by_theta.T @ (weight * bend)
+        g[node] += (weight * curvature)[:, None] * by_x
+        h += by_theta.T @ (weight * curvature)
     ddx, ddtheta = system.solve(g.ravel(), h)
-    if np.linalg.norm(ddx[:, :2]) > _MOST_BENT * np.linalg.norm(dx[:, :2]):
+    if np.linalg.norm(ddx[:, :2]) > _LARGEST_ACCELERATION * np.linalg.norm(dx[:, :2]):
         return dx, dtheta
     return dx + 0.5 * ddx, dtheta + 0.5 * ddtheta
 
 
-def _softness(at: RangingEvaluation) -> float:
-    squares = np.concatenate([at.range_residual, at.rate_alone]) ** 2
+def _first_control(at: RangingEvaluation) -> float:
+    squares = np.concatenate([at.range_residual, at.rate_gate]) ** 2
     largest = float(np.nanmax(squares, initial=0.0))
     return GATE**2 / (2.0 * largest - GATE**2) if largest > GATE**2 else np.inf
 
 
-def _weights(at: RangingEvaluation, softness: float) -> tuple[Array, Array]:
+def _weights(at: RangingEvaluation, control: float) -> tuple[Array, Array]:
     out = []
-    for residual in (at.range_residual, at.rate_alone):
+    for residual in (at.range_residual, at.rate_gate):
         known = ~np.isnan(residual)
         squares = np.where(known, residual, 0.0) ** 2
-        out.append(np.where(known, graduated_weights(squares, softness), 0.0))
+        out.append(np.where(known, truncation_weights(squares, control), 0.0))
     return out[0], out[1]
 
 

@@ -22,7 +22,7 @@ from factorgraph_dvl.imu.timestamps import without_strays
 from factorgraph_dvl.initialization.attitude_sensors import attitudes, mean_mounting
 from factorgraph_dvl.initialization.dvl_mounting import calibrated, initial_values
 from factorgraph_dvl.initialization.in_motion_alignment import initial_states
-from factorgraph_dvl.ranging.hypothesis_weights import odds_against
+from factorgraph_dvl.ranging.hypothesis_weights import significant_costs
 from factorgraph_dvl.ranging.position_from_ranges import StartPositions, positions_from_ranges
 from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.sensors.protocol import Aid, Motion, Observation
@@ -142,7 +142,7 @@ def solve(
         against = np.array([_evidence_against(each) for each in minima])
         solutions.append(not_told_apart([solution_of(each, rate_hz) for each in minima], against))
         found.append(minima[int(np.argmin(against))])
-    against = odds_against([_cost_terms(each) for each in found])
+    against = significant_costs([_cost_terms(each) for each in found])
     return joined(solutions, against, prepared.start_positions.hypotheses)
 
 

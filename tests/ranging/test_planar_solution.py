@@ -21,13 +21,13 @@ from factorgraph_dvl.io.trial_folder import load_trial
 from factorgraph_dvl.quality.plausibility_planar import planar_findings
 from factorgraph_dvl.quality.survey_planar import survey_planar
 from factorgraph_dvl.ranging.elimination import System
-from factorgraph_dvl.ranging.hypothesis_weights import evidence, odds_against
-from factorgraph_dvl.ranging.model import GATE, evaluate, misfit, terms
+from factorgraph_dvl.ranging.hypothesis_weights import hypothesis_costs, significant_costs
+from factorgraph_dvl.ranging.marginal_posterior import grid_points, posterior_weights
+from factorgraph_dvl.ranging.model import GATE, evaluate, step_errors, terms
 from factorgraph_dvl.ranging.planar_solution import solve_planar
-from factorgraph_dvl.ranging.problem import plan, reckoned
-from factorgraph_dvl.ranging.reckoned_track import change_psd
+from factorgraph_dvl.ranging.planar_track import velocity_change_psd
+from factorgraph_dvl.ranging.problem import dead_reckoned, planar_setup
 from factorgraph_dvl.ranging.smoother import covariance, fit
-from factorgraph_dvl.ranging.weakest_direction import shares_of, stations
 from factorgraph_dvl.simulation import parse_scenario, simulate, simulate_planar
 from factorgraph_dvl.solution import Residuals, contradictions, mostly_rejected
 from factorgraph_dvl.trial import InitialPosition
@@ -71,10 +71,10 @@ def test_zero_error_at_the_truth(constant):
     # The lever arm lies along the heading as it is measured, so not both at once.
     others = {name: ALL_CONSTANTS[name] for name in ("log", constant)}
     t = trial(noise=False, **others)
-    problem = plan(t).problem
+    problem = planar_setup(t).problem
     x, theta = true_state(t, problem)
     at = evaluate(problem, x, theta)
-    error, _ = misfit(problem, x, theta)
+    error, _ = step_errors(problem, x, theta)
     r = problem.ranging
     # The turn is abrupt: where it begins and ends, halfway between samples, the trapezoid
     # misses by centimetres; the reference is interpolated as well.
@@ -86,7 +86,7 @@ def test_zero_error_at_the_truth(constant):
 
 def test_jacobians_against_differences():
     t = trial(**ALL_CONSTANTS)
-    problem = plan(t).problem
+    problem = planar_setup(t).problem
     x, theta = true_state(t, problem)
     n = 20
     rng = np.random.default_rng(1)
@@ -108,9 +108,9 @@ def test_jacobians_against_differences():
         for name, by in (("range_residual", at.range_theta), ("rate_residual", at.rate_theta)):
             found = (getattr(a, name) - getattr(b, name)) / (2 * h[i])
             np.testing.assert_allclose(by[:, i], found, atol=2e-6 * max(1, np.abs(found).max()))
-        c, d = (misfit(problem, x, theta + s * h)[0] for s in (1, -1))
-        _, through = misfit(problem, x, theta)
-        by = System._by_theta(problem, theta, through, np.diff(problem.time[:n]))[:, :, i]
+        c, d = (step_errors(problem, x, theta + s * h)[0] for s in (1, -1))
+        _, through = step_errors(problem, x, theta)
+        by = -problem.by_constants(through, theta, np.diff(problem.time[:n]))[:, :, i]
         found = (c - d) / (2 * h[i])
         np.testing.assert_allclose(by, found, atol=2e-6 * max(1, np.abs(found).max()))
     assert node.size >= n - 1
@@ -118,14 +118,14 @@ def test_jacobians_against_differences():
 
 def test_the_gradient_is_that_of_the_cost():
     t = trial(**ALL_CONSTANTS)
-    problem = plan(t).problem
+    problem = planar_setup(t).problem
     x, theta = true_state(t, problem)
     # Over the beginning of the turn too, where the velocity changes.
     n = 160
     rng = np.random.default_rng(4)
     x = x[:n] + rng.normal(0.0, [0.3, 0.3, 0.02, 0.02], (n, 4))
     at = evaluate(problem, x, theta)
-    used = tuple((np.abs(r) <= GATE).astype(float) for r in (at.range_residual, at.rate_alone))
+    used = tuple((np.abs(r) <= GATE).astype(float) for r in (at.range_residual, at.rate_gate))
     assert sum(u.sum() for u in used) > 2 * n - 10
     system = System(problem, x, theta, at, used, 0.0)
 
@@ -142,14 +142,14 @@ def test_the_gradient_is_that_of_the_cost():
 
 def test_a_vehicle_is_as_smooth_as_it_is_seen_to_be():
     quiet, turning = trial(**STRAIGHT), trial()
-    psd = change_psd(reckoned(quiet))
+    psd = velocity_change_psd(dead_reckoned(quiet))
     root = np.sqrt(np.trace(psd, axis1=1, axis2=2))
     # Within half a minute no more than a few of the centimetres per second of the mean's noise.
     assert np.median(root[40:-40]) * np.sqrt(30.0) < 0.03
-    track = reckoned(turning)
+    track = dead_reckoned(turning)
     at = np.argmin(np.abs(track.time - 157.0))
     # 2 m/s turning by 2 degrees in a second: no less in any direction.
-    assert np.linalg.eigvalsh(change_psd(track)[at]).min() > (2.0 * np.radians(2.0)) ** 2
+    assert np.linalg.eigvalsh(velocity_change_psd(track)[at]).min() > (2.0 * np.radians(2.0)) ** 2
     # A line of slope a, by hand: W a²; the trapezoid makes its slope larger by 2 (1 s / W)².
     line = replace(
         track,
@@ -157,18 +157,18 @@ def test_a_vehicle_is_as_smooth_as_it_is_seen_to_be():
         velocity_cov=np.zeros_like(track.velocity_cov),
     )
     by_hand = 60.0 * (0.005 * (1.0 + 2.0 / 60.0**2)) ** 2
-    np.testing.assert_allclose(change_psd(line)[at], by_hand * np.eye(2), rtol=1e-6)
+    np.testing.assert_allclose(velocity_change_psd(line)[at], by_hand * np.eye(2), rtol=1e-6)
 
 
 def test_a_straight_run_tells_no_more_of_the_current_than_its_prior():
     t = trial(1, **STRAIGHT)
-    problem = plan(t).problem
+    problem = planar_setup(t).problem
     x, theta = true_state(t, problem)
     best = fit(problem, x, theta, iterations=100)
-    ridge = stations(problem, best)
-    assert len(ridge) > 5
-    share = shares_of(ridge)
-    first = np.array([s.fit.p[0] for s in ridge])
+    grid = grid_points(problem, best)
+    assert len(grid) > 5
+    share = posterior_weights(grid)
+    first = np.array([s.fit.p[0] for s in grid])
     beacon = problem.place[0, :2]
     # All on an arc about the beacon: its range is known, the bearing is not.
     radius = np.hypot(*(first - beacon).T)
@@ -182,24 +182,24 @@ def test_a_straight_run_tells_no_more_of_the_current_than_its_prior():
 def test_what_counts_as_evidence():
     rng = np.random.default_rng(0)
     base = 0.5 * rng.normal(size=1000) ** 2
-    walk = [odds_against([base, base + rng.normal(0.0, 0.5, 1000)])[1] for _ in range(200)]
+    walk = [significant_costs([base, base + rng.normal(0.0, 0.5, 1000)])[1] for _ in range(200)]
     # Sums of 16 by chance are not believed.
     assert np.mean(np.abs(walk) < 3.0) > 0.95
     turn = base.copy()
     turn[:5] += 8.0
-    np.testing.assert_allclose(odds_against([base, turn]), [0.0, 40.0])
+    np.testing.assert_allclose(significant_costs([base, turn]), [0.0, 40.0])
     # A current that ten standard deviations of its prior speak against, and nothing else does.
     t = trial(1, **STRAIGHT)
-    problem = plan(t).problem
+    problem = planar_setup(t).problem
     x, theta = true_state(t, problem)
     good = fit(problem, x, theta)
     bad = replace(good, theta=good.theta + 3.0)
-    assert evidence(problem, [good, bad])[1] > 50.0
+    assert hypothesis_costs(problem, [good, bad])[1] > 50.0
 
 
 def test_covariance_against_a_dense_inverse():
     t = trial(**ALL_CONSTANTS)
-    problem = plan(t).problem
+    problem = planar_setup(t).problem
     x, theta = true_state(t, problem)
     solution = fit(problem, x[:30], theta)
     states, cross, constants = covariance(problem, solution)
@@ -285,8 +285,8 @@ def test_a_range_at_the_very_end_but_for_rounding_is_no_step_of_its_own():
     t = trial(**STRAIGHT)
     b = t.beacons
     ends = np.append(b.time[:-1], t.heading.time[-1] - 1e-12)
-    made = plan(replace(t, beacons=replace(b, time=ends)))
-    assert np.diff(made.problem.time).min() > 0.5
+    setup = planar_setup(replace(t, beacons=replace(b, time=ends)))
+    assert np.diff(setup.problem.time).min() > 0.5
     assert solve_planar(replace(t, beacons=replace(b, time=ends)), rate_hz=1.0).converged
 
 
@@ -420,13 +420,13 @@ def test_clocks_that_do_not_fit_are_refused():
     t = trial()
     late = replace(t, beacons=replace(t.beacons, time=t.beacons.time + 1e5))
     with pytest.raises(DataError, match=r"1 to 315 s: they are from 100001 to 100315 s"):
-        plan(late)
+        planar_setup(late)
     with pytest.raises(DataError, match=r"one value every 1000 s; expected .* 60 s apart"):
-        plan(replace(t, heading=replace(t.heading, time=1e3 * t.heading.time)))
+        planar_setup(replace(t, heading=replace(t.heading, time=1e3 * t.heading.time)))
     nothing = np.full(t.beacons.time.size, np.nan)
     empty = replace(t, beacons=replace(t.beacons, range=nothing, range_rate=nothing))
     with pytest.raises(DataError, match="no range and no range rate"):
-        plan(empty)
+        planar_setup(empty)
     with pytest.raises(SolveError, match="0 ranges are too few"):
         solve_planar(replace(t, beacons=replace(t.beacons, range=nothing)))
 
@@ -538,13 +538,13 @@ def test_the_covariance_is_honest():
 
 
 def test_a_fit_that_was_cut_short_has_not_converged():
-    made = plan(trial())
-    start = true_state(trial(), made.problem)
+    setup = planar_setup(trial())
+    start = true_state(trial(), setup.problem)
     away = start[0] + np.array([30.0, -20.0, 0.0, 0.0])
-    assert not fit(made.problem, away, start[1], iterations=1).converged
-    whole = fit(made.problem, away, start[1])
+    assert not fit(setup.problem, away, start[1], iterations=1).converged
+    whole = fit(setup.problem, away, start[1])
     assert whole.converged
-    again = fit(made.problem, whole.x, whole.theta, iterations=2)
+    again = fit(setup.problem, whole.x, whole.theta, iterations=2)
     assert again.converged
     assert again.cost == pytest.approx(whole.cost, abs=1e-5)
 

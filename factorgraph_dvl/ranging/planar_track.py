@@ -8,20 +8,22 @@ import numpy as np
 
 from factorgraph_dvl.geometry.vectors import Array
 
-# Power spectral density of displacement, m²/s, below which a chain has no digits: 3 mm in 1 s.
+# Chosen: least power spectral density of displacement, m²/s, 3 mm in 1 s; the normal equations
+# lose their digits below it.
 LEAST_PSD = 1e-5
-# Keeps the noise of the velocity regular, m²/s².
+# Chosen: keeps the covariance of the velocity regular, m²/s².
 _LEAST_VELOCITY_VARIANCE = 1e-6
-# Time over which the rate of climb is taken, s.
+# Chosen: time over which the rate of climb is taken, s; between two depths it is noise.
 SLOPE_OVER = 10.0
-# Times over which it is seen how smoothly a vehicle moves, s, the longest first; and in standard
-# deviations what is seen over one of the shorter.
+# Chosen: times over which the smoothness of the motion is estimated, s, the longest first: from a
+# slow turn to a quick one.
 _SMOOTH_OVER = (60.0, 20.0, 6.0)
-_SEEN = 3.0
+# Chosen: slopes over the shorter times count from this many standard deviations on.
+_SIGNIFICANT = 3.0
 
 
 @dataclass(frozen=True)
-class ReckonedTrack:
+class PlanarTrack:
     """A dead-reckoned track, on a grid on which everything is linear in time.
 
     Parameters
@@ -60,7 +62,7 @@ class ReckonedTrack:
     interval: float
     tangent: bool = False
 
-    def at(self, time: Array) -> ReckonedTrack:
+    def at(self, time: Array) -> PlanarTrack:
         """Return the track at times (M,) within it."""
 
         def pick(values: Array) -> Array:
@@ -68,7 +70,7 @@ class ReckonedTrack:
             out = np.stack([np.interp(time, self.time, column) for column in flat.T], axis=1)
             return out.reshape(time.size, *values.shape[1:])
 
-        return ReckonedTrack(
+        return PlanarTrack(
             time,
             pick(self.displacement),
             pick(self.velocity),
@@ -83,13 +85,13 @@ class ReckonedTrack:
         )
 
 
-def reckon(
+def track_from_records(
     heading: tuple[Array, Array, float],
     speed: tuple[Array, Array, Array, float],
     height: tuple[Array, Array],
     extra: Array,
-) -> ReckonedTrack:
-    """Reckon a track from heading, speed and height.
+) -> PlanarTrack:
+    """Return the dead-reckoned track of heading, speed and height.
 
     Velocity u [sin psi, cos psi] + w [cos psi, -sin psi], between samples linear in heading
     and speeds, integrated by the trapezoidal rule. White noise of samples dt apart, of
@@ -125,7 +127,7 @@ def reckon(
     if np.any(w):
         by_speed = by_speed + speed_std**2 * abeam[:, :, None] * abeam[:, None, :]
     psd = _interval(speed_time) * by_speed + _interval(heading_time) * by_heading
-    return ReckonedTrack(
+    return PlanarTrack(
         time=grid,
         displacement=_integral(velocity, grid),
         velocity=velocity,
@@ -139,13 +141,13 @@ def reckon(
     )
 
 
-def change_psd(track: ReckonedTrack) -> Array:
-    """Return the density of the changes of the true velocity at the grid, (G, 2, 2), m²/s³.
+def velocity_change_psd(track: PlanarTrack) -> Array:
+    """Return the power spectral density of changes of the true velocity, (G, 2, 2), m²/s³.
 
     A straight line through the velocities of a time W around a moment has a slope a, of
     covariance S by their noise: so within W the velocity changes by W² (|a|² I + S), at most, as
     a random walk of density W (|a|² I + S). Of lines through shorter times, which see short
-    turns, only slopes count that are none of noise.
+    turns, only slopes count that noise does not explain.
     """
     longest, *shorter = _SMOOTH_OVER
     slope, width, noise = _slopes(track, longest)
@@ -153,12 +155,12 @@ def change_psd(track: ReckonedTrack) -> Array:
     for over in shorter:
         slope, each, spread = _slopes(track, over)
         size = np.sum(slope**2, axis=1)
-        seen = size > _SEEN**2 * np.trace(spread, axis1=1, axis2=2)
-        square = np.maximum(square, np.where(seen, each * size, 0.0))
+        significant = size > _SIGNIFICANT**2 * np.trace(spread, axis1=1, axis2=2)
+        square = np.maximum(square, np.where(significant, each * size, 0.0))
     return square[:, None, None] * np.eye(2) + width[:, None, None] * noise
 
 
-def _slopes(track: ReckonedTrack, over: float) -> tuple[Array, Array, Array]:
+def _slopes(track: PlanarTrack, over: float) -> tuple[Array, Array, Array]:
     """Return slopes (G, 2) of lines through velocities, their widths (G,) and covariances."""
     time, v = track.time, track.velocity
     low, high = np.maximum(time - 0.5 * over, time[0]), np.minimum(time + 0.5 * over, time[-1])
