@@ -40,7 +40,8 @@ from factorgraph_dvl.geometry.units import DEG_PER_HOUR
 from factorgraph_dvl.graph.inertial_chain import Chain, inertial_chain
 from factorgraph_dvl.graph.problem import Problem
 from factorgraph_dvl.imu.increments import increments
-from factorgraph_dvl.imu.preintegration import States, segments
+from factorgraph_dvl.imu.preintegration import segments
+from factorgraph_dvl.imu.propagation import States
 from factorgraph_dvl.initialization.in_motion_alignment import initial_states
 from factorgraph_dvl.sensors.protocol import Aid
 from factorgraph_dvl.simulation import parse_scenario, plan_motion, simulate

@@ -13,7 +13,7 @@ from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.rotations import rotation_from_rph
 from factorgraph_dvl.geometry.units import DEG_PER_HOUR, MICRO_G
 from factorgraph_dvl.geometry.vectors import Array, rotate
-from factorgraph_dvl.imu.preintegration import States
+from factorgraph_dvl.imu.propagation import States
 from factorgraph_dvl.sensors.protocol import Motion
 from factorgraph_dvl.simulation import parse_scenario, plan_motion
 from factorgraph_dvl.simulation.motion import TrueMotion as ExactMotion

@@ -19,7 +19,8 @@ from factorgraph_dvl.geometry.rotations import (
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph import keys
-from factorgraph_dvl.imu.preintegration import Segments, States, preintegrate
+from factorgraph_dvl.imu.preintegration import Segments, preintegrate
+from factorgraph_dvl.imu.propagation import States
 from factorgraph_dvl.trial import Trial
 
 # Bounds, not knowledge: they keep an unaided chain from being singular.

@@ -32,7 +32,7 @@ from factorgraph_dvl.graph.priors import (
     value_at,
 )
 from factorgraph_dvl.imu.increments import IntArray
-from factorgraph_dvl.imu.preintegration import (
+from factorgraph_dvl.imu.propagation import (
     Attachment,
     States,
     Transition,

@@ -15,13 +15,7 @@ import numpy as np
 
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph.problem import node_jacobian
-from factorgraph_dvl.imu.preintegration import (
-    Attachment,
-    States,
-    Transition,
-    extrapolated,
-    motion_at,
-)
+from factorgraph_dvl.imu.propagation import Attachment, States, Transition, extrapolated, motion_at
 from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.sensors.protocol import Motion, Observation
 

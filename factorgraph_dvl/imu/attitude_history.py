@@ -14,7 +14,8 @@ from factorgraph_dvl.geometry.earth import RATE
 from factorgraph_dvl.geometry.rotations import BodyAxes, exp_so3, log_so3, rotation_from_rph
 from factorgraph_dvl.geometry.vectors import Array, rotate
 from factorgraph_dvl.imu.increments import increments
-from factorgraph_dvl.imu.preintegration import Segments, attach, segments
+from factorgraph_dvl.imu.preintegration import Segments, segments
+from factorgraph_dvl.imu.propagation import attach
 from factorgraph_dvl.sensors.imu import Imu
 from factorgraph_dvl.solution import Trajectory
 from factorgraph_dvl.trial import Reference

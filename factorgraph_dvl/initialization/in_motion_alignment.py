@@ -27,7 +27,8 @@ from factorgraph_dvl.geometry.rotations import (
 )
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array, rotate
-from factorgraph_dvl.imu.preintegration import Segments, States
+from factorgraph_dvl.imu.preintegration import Segments
+from factorgraph_dvl.imu.propagation import States
 from factorgraph_dvl.initialization.attitude_sensors import attitude_at_start, known_mountings
 from factorgraph_dvl.initialization.dead_reckoned_spans import DeadReckonedSpan, arc_from_start
 from factorgraph_dvl.sensors.dvl import (

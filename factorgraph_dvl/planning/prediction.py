@@ -11,7 +11,7 @@ from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.rotations import rotation_from_rph
 from factorgraph_dvl.geometry.units import DEG, DEG_PER_HOUR, MICRO_G
 from factorgraph_dvl.geometry.vectors import Array, rotate
-from factorgraph_dvl.imu.preintegration import States
+from factorgraph_dvl.imu.propagation import States
 from factorgraph_dvl.simulation import plan_motion, simulate
 from factorgraph_dvl.simulation.motion import TrueMotion
 from factorgraph_dvl.simulation.scenario import AngularSway, Heave, Scenario, StartSettings

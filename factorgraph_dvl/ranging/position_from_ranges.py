@@ -16,7 +16,8 @@ from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.rotations import exp_so3
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array, rotate
-from factorgraph_dvl.imu.preintegration import Segments, States
+from factorgraph_dvl.imu.preintegration import Segments
+from factorgraph_dvl.imu.propagation import States
 from factorgraph_dvl.ranging.hypotheses import TrackedHypothesis, follow
 from factorgraph_dvl.ranging.model import EARTH_RADIUS
 from factorgraph_dvl.ranging.planar_solution import measurements, reported_hypothesis, schedule

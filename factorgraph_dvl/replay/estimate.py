@@ -11,7 +11,7 @@ from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.rotations import BodyAxes, exp_so3, rph_from_rotation, rph_jacobian
 from factorgraph_dvl.geometry.vectors import Array, rotate
 from factorgraph_dvl.graph.priors import local_coordinates, prior_mean, prior_root
-from factorgraph_dvl.imu.preintegration import States
+from factorgraph_dvl.imu.propagation import States
 from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.solution import Estimate, Trajectory
 from factorgraph_dvl.solvers.reported import estimates_of, in_order, in_unit

@@ -20,7 +20,8 @@ from factorgraph_dvl.graph.sensor_factor import (
     measurement_factor,
     state_of,
 )
-from factorgraph_dvl.imu.preintegration import Segments, States, attach, preintegrate
+from factorgraph_dvl.imu.preintegration import Segments, preintegrate
+from factorgraph_dvl.imu.propagation import States, attach
 from factorgraph_dvl.replay.estimate import (
     CalibrationEstimate,
     Innovations,

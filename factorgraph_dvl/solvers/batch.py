@@ -17,7 +17,8 @@ from factorgraph_dvl.graph.inertial_chain import Chain, inertial_chain
 from factorgraph_dvl.graph.priors import ConstantsPrior
 from factorgraph_dvl.graph.problem import Evaluation, Problem
 from factorgraph_dvl.imu.increments import increments
-from factorgraph_dvl.imu.preintegration import Segments, States, attach, motion_at, segments
+from factorgraph_dvl.imu.preintegration import Segments, segments
+from factorgraph_dvl.imu.propagation import States, attach, motion_at
 from factorgraph_dvl.imu.timestamps import without_strays
 from factorgraph_dvl.initialization.attitude_sensors import attitudes, mean_mounting
 from factorgraph_dvl.initialization.dvl_mounting import calibrated, initial_values

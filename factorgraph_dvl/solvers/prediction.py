@@ -11,7 +11,8 @@ from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph.inertial_chain import inertial_chain
 from factorgraph_dvl.graph.problem import Evaluation, Problem
 from factorgraph_dvl.imu.increments import increments
-from factorgraph_dvl.imu.preintegration import States, segments
+from factorgraph_dvl.imu.preintegration import segments
+from factorgraph_dvl.imu.propagation import States
 from factorgraph_dvl.solution import Solution
 from factorgraph_dvl.solvers.batch import SolvedProblem, solution_of
 from factorgraph_dvl.solvers.information_history import RATE_HZ, Frontier, as_history, run_filter

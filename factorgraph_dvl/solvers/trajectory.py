@@ -13,7 +13,8 @@ from factorgraph_dvl.geometry.rotations import (
     rph_jacobian,
 )
 from factorgraph_dvl.geometry.vectors import Array, rotate
-from factorgraph_dvl.imu.preintegration import Segments, States, attach, motion_at, segment_ends
+from factorgraph_dvl.imu.preintegration import Segments
+from factorgraph_dvl.imu.propagation import States, attach, motion_at, segment_ends
 from factorgraph_dvl.sensors.protocol import Motion
 from factorgraph_dvl.solution import Trajectory
 

@@ -17,7 +17,7 @@ import numpy as np
 
 from factorgraph_dvl.geometry.vectors import Array, rotate, skew
 from factorgraph_dvl.graph.problem import Evaluation, Problem
-from factorgraph_dvl.imu.preintegration import Attachment
+from factorgraph_dvl.imu.propagation import Attachment
 from factorgraph_dvl.sensors.protocol import Motion, Observation, Values
 
 # Share of the error of the motion in the information from which on it is not believed.

@@ -17,16 +17,8 @@ from factorgraph_dvl.geometry.units import DEG, HOUR
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph.problem import node_jacobian
 from factorgraph_dvl.imu.increments import increments
-from factorgraph_dvl.imu.preintegration import (
-    Segments,
-    States,
-    Transition,
-    attach,
-    motion_at,
-    preintegrate,
-    segment_ends,
-    segments,
-)
+from factorgraph_dvl.imu.preintegration import Segments, preintegrate, segments
+from factorgraph_dvl.imu.propagation import States, Transition, attach, motion_at, segment_ends
 from factorgraph_dvl.sensors.protocol import Linearization
 from factorgraph_dvl.simulation import plan_motion, simulate
 from factorgraph_dvl.simulation.motion import TrueMotion as ExactMotion

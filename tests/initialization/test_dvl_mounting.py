@@ -11,7 +11,8 @@ from truth import CONING, SWELL, exact_states, scenario
 from factorgraph_dvl.geometry.rotations import exp_so3, log_so3
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.imu.increments import increments
-from factorgraph_dvl.imu.preintegration import attach, motion_at, segments
+from factorgraph_dvl.imu.preintegration import segments
+from factorgraph_dvl.imu.propagation import attach, motion_at
 from factorgraph_dvl.initialization.dvl_mounting import initial_mountings
 from factorgraph_dvl.simulation import simulate
 

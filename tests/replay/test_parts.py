@@ -22,7 +22,8 @@ from factorgraph_dvl.graph.sensor_factor import (
     measurement_factor,
 )
 from factorgraph_dvl.imu.increments import increments
-from factorgraph_dvl.imu.preintegration import States, attach, one_segment, segments
+from factorgraph_dvl.imu.preintegration import one_segment, segments
+from factorgraph_dvl.imu.propagation import States, attach
 from factorgraph_dvl.replay.estimate import Innovations
 from factorgraph_dvl.replay.gate import Gate
 from factorgraph_dvl.replay.samples import SampleBuffer

@@ -15,7 +15,8 @@ from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.graph.inertial_chain import inertial_chain
 from factorgraph_dvl.graph.problem import Problem
 from factorgraph_dvl.imu.increments import increments
-from factorgraph_dvl.imu.preintegration import States, segments
+from factorgraph_dvl.imu.preintegration import segments
+from factorgraph_dvl.imu.propagation import States
 from factorgraph_dvl.io.solution_folder import save_solution
 from factorgraph_dvl.io.trial_folder import load_trial, save_trial
 from factorgraph_dvl.replay.recorded import replay

@@ -1,0 +1,297 @@
+"""Motion at any time: carried forward from the node before, and its derivatives."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from factorgraph_dvl.geometry.rotations import exp_so3
+from factorgraph_dvl.geometry.vectors import Array, cross, rotate, skew
+from factorgraph_dvl.imu.increments import IntArray
+from factorgraph_dvl.imu.preintegration import Segments
+from factorgraph_dvl.sensors.protocol import Motion
+
+
+@dataclass(frozen=True)
+class States:
+    """Navigation states and IMU biases at the K nodes.
+
+    Parameters
+    ----------
+    nRb : ndarray, shape (K, 3, 3)
+    p_n, v_n : ndarray, shape (K, 3)
+    gyro_bias, accel_bias : ndarray, shape (K, 3), SI
+    """
+
+    nRb: Array
+    p_n: Array
+    v_n: Array
+    gyro_bias: Array
+    accel_bias: Array
+
+
+@dataclass(frozen=True)
+class Attachment:
+    """Where M measurement times hang on the chain, and the increments up to them.
+
+    Parameters
+    ----------
+    segment : ndarray of int, shape (M,)
+        Segment.
+    node : ndarray of int, shape (M,)
+        Node at its start.
+    tau : ndarray, shape (M,), s
+        Time since that node.
+    dR, dA : ndarray, shape (M, 3, 3)
+    dV, dP : ndarray, shape (M, 3)
+        Increments up to the time.
+    gyro, alpha, force : ndarray, shape (M, 3)
+        Rate (rad/s), its derivative, specific force at the time.
+    omega_sigma : ndarray, shape (M, 3), rad/s
+        Standard deviation of the rate.
+    alpha_sigma, force_sigma : ndarray, shape (M,)
+        Standard deviation of alpha and force from noise.
+    turn : ndarray, shape (M, 3, 3)
+        Exp(-earth_rate tau).
+    """
+
+    segment: IntArray
+    node: IntArray
+    tau: Array
+    dR: Array
+    dA: Array
+    dV: Array
+    dP: Array
+    gyro: Array
+    alpha: Array
+    force: Array
+    omega_sigma: Array
+    alpha_sigma: Array
+    force_sigma: Array
+    turn: Array
+
+
+def attach(seg: Segments, time: Array, earth_rate_n: Array) -> Attachment:
+    """Attach times (M,), all covered by arcs, to the chain."""
+    index, since, _ = seg.increments.locate(time)
+    # A time on the edge of the chain may be off it by rounding.
+    inside = np.clip(index, seg.first[0], seg.last[-1] - 1)
+    since = np.where(inside == index, since, time - seg.increments.start[inside])
+    return _attach(seg, inside, since, earth_rate_n)
+
+
+def segment_ends(seg: Segments, earth_rate_n: Array) -> Attachment:
+    """Attach the ends of all segments to the nodes at their starts."""
+    index = seg.last - 1
+    return _attach(seg, index, seg.increments.dt[index], earth_rate_n)
+
+
+def _attach(seg: Segments, index: IntArray, since: Array, earth_rate_n: Array) -> Attachment:
+    inc = seg.increments
+    part = inc.partial(index, since)
+    segment = np.searchsorted(seg.first, index, side="right") - 1
+    node = seg.origin[segment]
+    dR = seg.dR[index]
+    turned = rotate(dR, part.dv)
+    h = since[:, None]
+    tau = inc.start[index] + since - seg.node_time[node]
+    return Attachment(
+        segment=segment,
+        node=node,
+        tau=tau,
+        dR=dR @ exp_so3(part.phi),
+        dA=seg.dA[index] + dR @ (np.eye(3) + 0.5 * skew(part.phi)) * h[:, :, None],
+        dV=seg.dV[index] + turned,
+        dP=seg.dP[index] + seg.dV[index] * h + 0.5 * turned * h,
+        gyro=part.omega,
+        alpha=part.alpha,
+        force=part.force,
+        omega_sigma=part.omega_sigma,
+        alpha_sigma=part.alpha_sigma,
+        force_sigma=part.force_sigma,
+        turn=exp_so3(-tau[:, None] * earth_rate_n),
+    )
+
+
+@dataclass(frozen=True)
+class Transition:
+    """Derivatives of the motion at M times with respect to the node before.
+
+    The node's tangent space is GTSAM's: theta in nRb Exp(theta), and position and
+    velocity in body axes. A block is computed when a sensor asks for it. What is left out is
+    of second order in the Earth's rate, or below 1e-4 of the bias's share.
+
+    Parameters
+    ----------
+    at : Attachment
+        Attachment of the M times.
+    states : States
+        At the nodes.
+    motion : Motion
+        At the times.
+    earth_rate_n : ndarray, shape (3,), rad/s
+    """
+
+    at: Attachment
+    states: States
+    motion: Motion
+    earth_rate_n: Array
+
+    @cached_property
+    def _turned(self) -> Array:
+        return self.at.turn @ self.states.nRb[self.at.node]
+
+    @cached_property
+    def _increments(self) -> tuple[Array, Array, Array]:
+        k = self.at.node
+        return _with_bias(self.at, self.states.gyro_bias[k], self.states.accel_bias[k])
+
+    @cached_property
+    def _cross_rate(self) -> Array:
+        return skew(self.earth_rate_n)
+
+    @property
+    def _tau(self) -> Array:
+        return self.at.tau[:, None, None]
+
+    @cached_property
+    def theta_theta(self) -> Array:
+        """Attitude by attitude, (M, 3, 3)."""
+        return self._increments[0].transpose(0, 2, 1)
+
+    @cached_property
+    def theta_gyro(self) -> Array:
+        """Attitude by gyro bias."""
+        return -self.theta_theta @ self.at.dA
+
+    @cached_property
+    def omega_theta(self) -> Array:
+        """Rate relative to the Earth by attitude at the time; by gyro bias it is -I."""
+        return -skew(rotate(self.motion.nRb.transpose(0, 2, 1), self.earth_rate_n))
+
+    @cached_property
+    def p_theta(self) -> Array:
+        """Position by attitude."""
+        return -self._turned @ skew(self._increments[2])
+
+    @cached_property
+    def p_p(self) -> Array:
+        """Position by position."""
+        R = self.states.nRb[self.at.node]
+        return self._turned + self._tau * (self.at.turn @ (self._cross_rate @ R))
+
+    @cached_property
+    def p_v(self) -> Array:
+        """Position by velocity."""
+        return self._tau * self._turned
+
+    @cached_property
+    def p_gyro(self) -> Array:
+        """Position by gyro bias."""
+        return self.v_gyro * (self._tau / 3.0)
+
+    @cached_property
+    def p_accel(self) -> Array:
+        """Position by accelerometer bias."""
+        return self.v_accel * (self._tau / 2.0)
+
+    @cached_property
+    def v_theta(self) -> Array:
+        """Velocity by attitude."""
+        return -self._turned @ skew(self._increments[1]) - self._cross_rate @ self.p_theta
+
+    @cached_property
+    def v_v(self) -> Array:
+        """Velocity by velocity."""
+        return self._turned - self._cross_rate @ self.p_v
+
+    @cached_property
+    def v_gyro(self) -> Array:
+        """Velocity by gyro bias, for force and rate constant since the node."""
+        return self._turned @ (0.5 * skew(self.at.dV) @ self.at.dA)
+
+    @cached_property
+    def v_accel(self) -> Array:
+        """Velocity by accelerometer bias."""
+        return -self._turned @ self.at.dA
+
+
+def motion_at(at: Attachment, states: States, gravity_n: Array, earth_rate_n: Array) -> Motion:
+    """Return the motion at attached times, carried forward from the nodes before.
+
+    Motion over a rotating Earth in closed form: in axes that keep their direction in
+    space while they follow the origin of n, with position p_J and velocity
+    v_J = v + w x p at the node,
+
+        p_J(tau) = p_J + v_J tau + nRb dP + g tau²/2 + w x g tau³/6
+        p(tau)   = Exp(-w tau) p_J(tau),   v(tau) = Exp(-w tau) v_J(tau) - w x p(tau)
+        nRb(tau) = Exp(-w tau) nRb dR.
+
+    Parameters
+    ----------
+    at : Attachment
+        Attachment of M times.
+    states : States
+        At the K nodes.
+    gravity_n : ndarray, shape (S, 3)
+        `LocalFrame.gravity_without_rotation` along the segments, m/s².
+    earth_rate_n : ndarray, shape (3,), rad/s
+        W.
+    """
+    k = at.node
+    R, p, v = states.nRb[k], states.p_n[k], states.v_n[k]
+    bg, ba = states.gyro_bias[k], states.accel_bias[k]
+    g = gravity_n[at.segment]
+    w = earth_rate_n
+    tau = at.tau[:, None]
+    dR, dV, dP = _with_bias(at, bg, ba)
+    v_J = v + cross(w, p)
+    wg = cross(w, g)
+    p_end = rotate(
+        at.turn, p + v_J * tau + rotate(R, dP) + g * (tau**2 / 2.0) + wg * (tau**3 / 6.0)
+    )
+    v_end = rotate(at.turn, v_J + rotate(R, dV) + g * tau + wg * (tau**2 / 2.0))
+    v_end = v_end - cross(w, p_end)
+    nRb = at.turn @ R @ dR
+    a_n = rotate(nRb, at.force - ba) + g - 2.0 * cross(w, v_end) - cross(w, cross(w, p_end))
+    return Motion(
+        nRb=nRb,
+        p_n=p_end,
+        v_n=v_end,
+        omega_eb_b=at.gyro - bg - rotate(nRb.transpose(0, 2, 1), np.broadcast_to(w, v.shape)),
+        a_n=a_n,
+        alpha_b=at.alpha,
+        omega_sigma=at.omega_sigma,
+    )
+
+
+def extrapolated(motion: Motion, late: float) -> Motion:
+    """Return a motion `late` seconds later, to first order in all that changes.
+
+    Smooth in time where the increments are as rough as the noise of the samples: so a time
+    offset has a minimum to converge to.
+    """
+    omega = motion.omega_eb_b + motion.alpha_b * late
+    mean_rate = 0.5 * (motion.omega_eb_b + omega)
+    return replace(
+        motion,
+        nRb=motion.nRb @ exp_so3(mean_rate * late),
+        p_n=motion.p_n + motion.v_n * late + 0.5 * motion.a_n * late**2,
+        v_n=motion.v_n + motion.a_n * late,
+        omega_eb_b=omega,
+    )
+
+
+def _with_bias(at: Attachment, bg: Array, ba: Array) -> tuple[Array, Array, Array]:
+    """Return dR, dV, dP corrected to first order for the biases."""
+    turned = rotate(at.dA, bg)
+    v_gyro = 0.5 * cross(at.dV, turned)
+    v_accel = rotate(at.dA, ba)
+    tau = at.tau[:, None]
+    return (
+        at.dR @ exp_so3(-rotate(at.dR.transpose(0, 2, 1), turned)),
+        at.dV + v_gyro - v_accel,
+        at.dP + v_gyro * (tau / 3.0) - 0.5 * tau * v_accel,
+    )
