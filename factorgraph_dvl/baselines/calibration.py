@@ -3,42 +3,40 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Literal, get_args
 
 import numpy as np
 
-from factorgraph_dvl.baselines.beams import BeamPings, beam_filter, beam_residuals
-from factorgraph_dvl.baselines.beams import (
-    without_spurious_information as without_spurious_information_of_beams,
-)
+from factorgraph_dvl.baselines.beam_calibration import calibrate_beams
 from factorgraph_dvl.baselines.least_squares import least_squares
 from factorgraph_dvl.baselines.navigation import Navigation, motion_at, navigate
 from factorgraph_dvl.baselines.nine_state import nine_state
+from factorgraph_dvl.baselines.outcome import History, Outcome, history_of
 from factorgraph_dvl.baselines.point_set_filter import point_set
-from factorgraph_dvl.baselines.point_sets import Outcome, Points
+from factorgraph_dvl.baselines.point_sets import Points
 from factorgraph_dvl.baselines.spurious_information import without_spurious_information
 from factorgraph_dvl.baselines.star_calibration import calibrate_gyros
-from factorgraph_dvl.baselines.summary import as_sensors_see, dvl_residuals, summarise
+from factorgraph_dvl.baselines.summary import (
+    WHITE_NOISE,
+    Progress,
+    dvl_residuals,
+    sensor_motion,
+    summarise,
+)
 from factorgraph_dvl.baselines.wahba import wahba
 from factorgraph_dvl.errors import ConfigError, DataError
-from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.imu.timestamps import JUMP, without_strays
 from factorgraph_dvl.sensors.dvl import Dvl
 from factorgraph_dvl.sensors.parameters import Parameter
-from factorgraph_dvl.solution import Residuals, Solution
+from factorgraph_dvl.solution import Solution
 from factorgraph_dvl.trial import Trial
 
 DvlMethod = Literal["point-set", "nine-state", "wahba", "least-squares"]
 DVL_METHODS: tuple[DvlMethod, ...] = get_args(DvlMethod)
 Method = DvlMethod | Literal["star", "beams"]
 METHODS: tuple[Method, ...] = (*DVL_METHODS, "star", "beams")
-Progress = Callable[[str, int, float | None], None]
 
-_WHITE = (
-    "the error of the SINS/GNSS velocity is taken for white noise; it is correlated in time, so "
-    "the standard deviations of the DVL's parameters are too small"
-)
 _UNCORRELATED = (
     "of the calibration in dvl.calibration values and standard deviations are the prior; these "
     "methods take no correlations"
@@ -49,29 +47,10 @@ _NEGLECTED: dict[DvlMethod, tuple[str, ...]] = {
     "wahba": ("lever_arm", "dvl_bias", "time_offset"),
     "least-squares": (),
 }
-# GNSS that is missing for longer, s, leaves an INS to drift beyond what its filter models.
+# Chosen: longest gap of GNSS, s. Over a longer one the INS drifts beyond the linear error model.
 _LONGEST_GAP = 300.0
-# Offsets that a search may try must stay within the IMU's record, s.
+# Chosen: time offsets that a search may try, s; pings nearer to the ends are not used.
 _MARGIN = 1.0
-
-
-@dataclass(frozen=True)
-class History:
-    """How a recursive filter converged.
-
-    Parameters
-    ----------
-    time : ndarray, shape (H,), s
-    names : tuple of str
-        Of the n components, as in `covariance.order`.
-    values, std : ndarray, shape (H, n)
-        In reported units.
-    """
-
-    time: Array
-    names: tuple[str, ...]
-    values: Array
-    std: Array
 
 
 def kalman(
@@ -92,11 +71,11 @@ def calibrate(
     rate_hz: float = 10.0,
     progress: Progress | None = None,
 ) -> tuple[Solution, History | None]:
-    """Calibrate a DVL or gyros against a Kalman filter, and tell how it converged.
+    """Calibrate a DVL or gyros against a Kalman filter, and return how it converged.
 
-    First IMU and GNSS are filtered and smoothed without the DVL; then its velocities are
-    held against the smoothed ones. So the joint covariance has two blocks, DVL and IMU:
-    correlations between them exist, but this approach cannot know them.
+    IMU and GNSS are filtered and smoothed without the DVL, whose velocities are then compared
+    with the smoothed ones. So the joint covariance has two blocks, DVL and IMU: the approach
+    neglects the correlations between them.
 
     The method `star` estimates the drift of the gyros against a star tracker instead.
 
@@ -115,8 +94,9 @@ def calibrate(
 
     Returns
     -------
-    Solution
-    History
+    solution : Solution
+        Trajectory, calibration and covariance.
+    history : History or None
         None for the methods that are not recursive.
 
     Raises
@@ -133,9 +113,10 @@ def calibrate(
     if method == "star":
         report("SINS/stars", 0, None)
         solution, outcome = calibrate_gyros(trial, rate_hz=rate_hz)
-        return solution, _history(outcome)
+        return solution, history_of(outcome)
     if method == "beams":
-        return _calibrate_beams(trial, rate_hz, report)
+        solution, outcome = calibrate_beams(trial, rate_hz=rate_hz, report=report)
+        return solution, history_of(outcome)
     dvl = trial.log
     if dvl is None:
         raise DataError(
@@ -170,7 +151,7 @@ def calibrate(
         *_outage(trial),
         *joint,
         *outcome.warnings,
-        _WHITE,
+        WHITE_NOISE,
         *_neglects(method, dvl),
     ]
     if unused:
@@ -181,12 +162,12 @@ def calibrate(
         outcome,
         aid=dvl,
         measured=dvl_residuals(dvl, navigation, outcome, points),
-        seen=as_sensors_see(points),
+        motion=sensor_motion(points),
         solver=f"kalman-{method}",
         rate_hz=rate_hz,
         notes=notes,
     )
-    return solution, _history(outcome)
+    return solution, history_of(outcome)
 
 
 def _outage(trial: Trial) -> list[str]:
@@ -203,54 +184,6 @@ def _outage(trial: Trial) -> list[str]:
         f"GNSS is missing for {longest:.0f} s: the SINS/GNSS filter drifts there, and neither its "
         "motion nor the calibration is to be used; `solve` bridges it"
     ]
-
-
-def _calibrate_beams(
-    trial: Trial, rate_hz: float, report: Progress
-) -> tuple[Solution, History | None]:
-    sensor = trial.beams
-    if sensor is None:
-        raise DataError(
-            "the trial has no beams", where="trial.yaml", expected="a dvl_beams section"
-        )
-    if sensor.settings.parametrisation != "beams":
-        raise ConfigError(
-            "the filter estimates every beam on its own",
-            where="trial.yaml dvl_beams.parametrisation",
-            expected="beams",
-            hint="For a common misalignment and scale take another --method",
-        )
-    report("SINS/GNSS", 0, None)
-    received = np.logical_not(sensor.missing)
-    navigation = navigate(trial, sensor.time[received])
-    report("beams", 0, None)
-    covered = motion_at(navigation, sensor.time).covered
-    used = received & covered
-    motion = motion_at(navigation, sensor.time[used])
-    pings = BeamPings(motion, sensor.nominal_b, sensor.velocity[used], sensor.sigma()[used])
-    outcome = beam_filter(pings, sensor.parameters())
-    report("summary", 0, None)
-    outcome = replace(
-        outcome, estimated=without_spurious_information_of_beams(pings, outcome.estimated)
-    )
-    residual, sigma = beam_residuals(pings, outcome.estimated)
-    components = tuple(f"beam {i}" for i in range(1, residual.shape[1] + 1))
-    notes = [*navigation.notes, _WHITE]
-    unused = int(np.sum(received & ~covered))
-    if unused:
-        notes.append(f"{sensor.label}: {unused} pings at times without SINS/GNSS were not used")
-    solution = summarise(
-        trial,
-        navigation,
-        outcome,
-        aid=sensor,
-        measured=Residuals("Beam velocity", "m/s", components, motion.time, residual, sigma),
-        seen=as_sensors_see(motion),
-        solver="kalman-beams",
-        rate_hz=rate_hz,
-        notes=notes,
-    )
-    return solution, _history(outcome)
 
 
 def _point_sets(navigation: Navigation, dvl: Dvl) -> tuple[Callable[[float], Points], int]:
@@ -311,23 +244,10 @@ def _neglects(method: DvlMethod, dvl: Dvl) -> list[str]:
     """Say which parameters of the trial the method does not estimate."""
     parameters = {p.stem: p for p in dvl.parameters()}
     out = [
-        f"{method} does not estimate {p.name}: held at {np.round(p.mean / p.si, 6).tolist()}"
+        f"{method} does not estimate {p.name}: fixed at {np.round(p.mean / p.si, 6).tolist()}"
         for p in (parameters[stem] for stem in _NEGLECTED[method])
         if p.estimated
     ]
     if method in ("point-set", "wahba") and parameters["scale_error"].mean.size == 3:
         out.append(f"{method} estimates one scale error for the three axes")
     return out
-
-
-def _history(outcome: Outcome) -> History | None:
-    if not outcome.history:
-        return None
-    reported = [estimated.reported() for _, estimated in outcome.history]
-    names = tuple(n for p in outcome.estimated.parameters for n in p.component_names)
-    return History(
-        time=np.array([time for time, _ in outcome.history]),
-        names=names,
-        values=np.stack([values for values, _ in reported]),
-        std=np.stack([np.sqrt(np.maximum(np.diag(P), 0.0)) for _, P in reported]),
-    )

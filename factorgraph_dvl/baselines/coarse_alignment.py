@@ -2,8 +2,8 @@
 
 In axes that do not turn, the velocity that the specific force adds up to, resolved in the
 body axes at the start, and the same velocity from GNSS and gravity differ by one rotation
-(Wu and Pan, IEEE Trans. AES 49(2), 2013). A gyro bias bends the first of them, so only a
-window is used: the one that tells the heading best.
+(Wu and Pan, IEEE Trans. AES 49(2), 2013). A gyro bias rotates the first of them over time, so
+only a window is used: the one that determines the heading best.
 """
 
 from __future__ import annotations
@@ -19,13 +19,17 @@ from factorgraph_dvl.geometry.units import DEG, DEG_PER_HOUR, MICRO_G, STANDARD_
 from factorgraph_dvl.geometry.vectors import Array, rotate
 from factorgraph_dvl.sensors.imu import ImuSettings
 
-# Velocity, m/s, by which the bias of a gyro may bend a window, and its limits, s.
-_BENT = 0.2
+# Chosen: error of the integrated velocity, m/s, that the gyro bias may cause within a window.
+_WINDOW_ERROR = 0.2
+# Chosen: limits of the window, s.
 _WINDOW_LIMITS = (30.0, 300.0)
+# Chosen: speed, m/s, from which on a course counts.
 _LEAST_SPEED = 0.5
-# Standard deviations of a heading that the data do not tell, and of a course taken for it.
+# Chosen: standard deviations of an undetermined heading, and of a course taken for the heading;
+# drift angles of vessels stay within it.
 _NO_HEADING = 60.0 * DEG
 _COURSE = 15.0 * DEG
+# Chosen: standard deviation of the heading from which on the course is better.
 _HEADING_LIMIT = 20.0 * DEG
 
 
@@ -40,7 +44,7 @@ class CoarseAttitude:
     covariance : ndarray, shape (3, 3), rad²
         Of phi in Exp(phi) nRb.
     note : str, optional
-        What the user must know of it; may be empty.
+        For the user; may be empty.
     """
 
     nRb: Array
@@ -63,6 +67,7 @@ def coarse_attitude(
     Parameters
     ----------
     time : ndarray, shape (K,), s
+        Of the events.
     steps : Steps
         The K - 1 steps between.
     geodetic : ndarray, shape (K, 3)
@@ -86,15 +91,15 @@ def coarse_attitude(
     # d/dt of the velocity over the Earth, seen from axes that do not turn with it.
     coriolis = np.cross(np.array([0.0, 0.0, RATE]), space)
     gravity = -normal_gravity(lat, height)[:, None] * to_space[:, :, 2]
-    pull = gravity - coriolis
+    gravity_coriolis = gravity - coriolis
     span = np.diff(t)[:, None]
-    space[1:] -= np.cumsum(0.5 * (pull[1:] + pull[:-1]) * span, axis=0)
+    space[1:] -= np.cumsum(0.5 * (gravity_coriolis[1:] + gravity_coriolis[:-1]) * span, axis=0)
     body, noise = body[known], np.sqrt(np.mean(sigma[known] ** 2))
 
     drift = settings.gyro_bias_std_deg_h * DEG_PER_HOUR
     level = settings.accel_bias_std_ug * MICRO_G
-    bent = np.sqrt(2.0 * _BENT / (STANDARD_GRAVITY * drift))
-    window = float(np.clip(bent, *_WINDOW_LIMITS))
+    longest = np.sqrt(2.0 * _WINDOW_ERROR / (STANDARD_GRAVITY * drift))
+    window = float(np.clip(longest, *_WINDOW_LIMITS))
     up = enu_from_ecef(*geodetic[0, :2])[2]
     best, least = None, np.inf
     for begin in np.arange(0.0, max(t[-1] - 0.5 * window, 1e-3), 0.5 * window):
@@ -134,7 +139,10 @@ def _by_course(
     if moving.size == 0:
         spread[2] = _NO_HEADING
         return CoarseAttitude(
-            nRb, np.diag(spread**2), "the data do not tell the heading: at rest, with these gyros"
+            nRb,
+            np.diag(spread**2),
+            "the data do not determine the heading: the vehicle is at rest, and its gyros are "
+            "too coarse for gyrocompassing",
         )
     k = moving[0]
     forward = nRb @ turn[k] @ frd_from_body(body_axes)[0]
@@ -144,7 +152,7 @@ def _by_course(
     return CoarseAttitude(
         exp_so3([0.0, 0.0, angle]) @ nRb,
         np.diag(spread**2),
-        "the heading to start from is the course: the motion does not tell it otherwise",
+        "the initial heading is the course over ground: the motion does not determine it better",
     )
 
 

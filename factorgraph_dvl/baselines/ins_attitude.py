@@ -1,4 +1,4 @@
-"""The attitude of a strapdown INS that GNSS aids as long as it may."""
+"""The attitude of a strapdown INS aided by GNSS, and by a rough height without it."""
 
 from __future__ import annotations
 
@@ -15,12 +15,14 @@ from factorgraph_dvl.sensors.gnss import Gnss
 from factorgraph_dvl.solution import Trajectory
 from factorgraph_dvl.trial import Trial
 
-# Gaps of GNSS, s, from which on the height must be held: the vertical channel of an INS
-# diverges, by a factor of e in ten minutes, and takes the attitude with it.
+# Chosen: gap of GNSS, s, from which on the height is aided. The vertical channel of an INS
+# diverges by a factor of e in ten minutes, and corrupts the attitude.
 _GAP = 10.0
-_HELD_EVERY = 1.0
-_HELD_HEIGHT_STD = 100.0
-_ANYWHERE = 1e6
+# Chosen: interval, s, and standard deviation, m, of the aiding by the height of the last fix.
+_HEIGHT_INTERVAL = 1.0
+_HEIGHT_STD = 100.0
+# Chosen: standard deviation, m, of the horizontal position there: it carries no information.
+_UNKNOWN_POSITION = 1e6
 
 
 def sins(
@@ -28,15 +30,15 @@ def sins(
 ) -> tuple[Trajectory, Array, tuple[str, ...]]:
     """Return motion, gyro bias (3,), rad/s, and notes of an INS aided by GNSS alone.
 
-    Where GNSS is missing the INS runs free but for its height, which is held near that of
-    the last fix; its position drifts by kilometres in an hour, its attitude hardly.
+    Where GNSS is missing the INS runs free but for its height, which is aided by that of
+    the last fix. Its position drifts by kilometres in an hour, its attitude hardly.
 
     Parameters
     ----------
     trial : Trial
         With IMU and GNSS.
     align_s : float, optional
-        S from the first fix on of which GNSS is used; all by default.
+        Time from the first fix on during which GNSS is used, s; all by default.
     rate_hz : float, default 10.0
         Of the motion.
 
@@ -50,27 +52,27 @@ def sins(
     fixes = np.zeros(0) if gnss is None else gnss.time[~np.isnan(gnss.geodetic[:, 0])]
     if gnss is None or fixes.size == 0:
         raise DataError(
-            "the SINS has no GNSS to find its attitude with",
+            "alignment of the SINS needs GNSS positions, and the trial has none",
             where="trial.yaml" if gnss is None else gnss.source,
             expected="GNSS positions",
             hint="Take the attitude of a solution, or of the reference: --attitude",
         )
     last = fixes[-1] if align_s is None else fixes[0] + align_s
-    held = _with_held_height(_rows(gnss, gnss.time <= last), trial.imu.time)
-    navigation = navigate(replace(trial, gnss=held), np.zeros(0))
+    aided = _with_height_aiding(_rows(gnss, gnss.time <= last), trial.imu.time)
+    navigation = navigate(replace(trial, gnss=aided), np.zeros(0))
     bias = navigation.track.gyro_bias.mean(axis=0)
     return trajectory_of(trial, navigation, rate_hz), bias, navigation.notes
 
 
-def _with_held_height(gnss: Gnss, running: Array) -> Gnss:
-    """Return a record with positions in its gaps that say nothing but a rough height.
+def _with_height_aiding(gnss: Gnss, running: Array) -> Gnss:
+    """Return a record with positions in its gaps that carry a rough height only.
 
     Parameters
     ----------
     gnss : Gnss
         With fixes.
     running : ndarray, shape (M,)
-        Times of the IMU's samples, s: elsewhere no height need be held.
+        Times of the IMU's samples, s: elsewhere no aiding is needed.
     """
     fixes = np.flatnonzero(~np.isnan(gnss.geodetic[:, 0]))
     time = gnss.time[fixes]
@@ -78,7 +80,7 @@ def _with_held_height(gnss: Gnss, running: Array) -> Gnss:
     for i, (a, b) in enumerate(zip(time, np.append(time[1:], running[-1]), strict=True)):
         if b - a > _GAP:
             inside = running[np.searchsorted(running, a) : np.searchsorted(running, b)]
-            times = a + _HELD_EVERY * np.unique(np.floor((inside - a) / _HELD_EVERY))
+            times = a + _HEIGHT_INTERVAL * np.unique(np.floor((inside - a) / _HEIGHT_INTERVAL))
             times = times[times > a]
             added.append(times)
             source.append(np.full(times.size, fixes[i]))
@@ -88,7 +90,7 @@ def _with_held_height(gnss: Gnss, running: Array) -> Gnss:
     new, kept = new[~np.isin(new, gnss.time)], of[~np.isin(new, gnss.time)]
     order = np.argsort(np.concatenate([gnss.time, new]), kind="stable")
     unknown = np.full((new.size, 3), np.nan)
-    std = np.tile([_ANYWHERE, _ANYWHERE, _HELD_HEIGHT_STD], (new.size, 1))
+    std = np.tile([_UNKNOWN_POSITION, _UNKNOWN_POSITION, _HEIGHT_STD], (new.size, 1))
 
     def merged(old: Array, other: Array) -> Array:
         return np.concatenate([old, other])[order]

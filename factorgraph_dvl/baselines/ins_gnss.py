@@ -18,20 +18,25 @@ from math import cos, sin, sqrt, tan
 
 import numpy as np
 
+from factorgraph_dvl.baselines.kalman_filter import ForwardPass, smoothed_errors, update
 from factorgraph_dvl.baselines.strapdown import Steps
-from factorgraph_dvl.geometry.earth import ECCENTRICITY_SQUARED, RATE, SEMI_MAJOR, normal_gravity
+from factorgraph_dvl.geometry.earth import (
+    ECCENTRICITY_SQUARED,
+    RATE,
+    SEMI_MAJOR,
+    normal_gravity,
+    radii,
+)
 from factorgraph_dvl.geometry.rotations import exp_so3, log_so3, wrapped
 from factorgraph_dvl.geometry.vectors import Array, skew
 
-_CHUNK = 5000
-
-# Below this, rad, rotations add up to better than 1e-12.
+# Chosen: below this, rad, rotations add up to better than 1e-12.
 _SMALL_TURN = 1e-6
 
 
 @dataclass(frozen=True)
 class FilterState:
-    """Where an arc starts.
+    """The state at the start of an arc.
 
     Parameters
     ----------
@@ -40,8 +45,11 @@ class FilterState:
     velocity : ndarray, shape (3,), m/s
         Local-level.
     nRb : ndarray, shape (3, 3)
-    gyro_bias, accel_bias : ndarray, shape (3,), m/s²
-        rad/s.
+        Attitude, body to local-level.
+    gyro_bias : ndarray, shape (3,), rad/s
+        In body axes.
+    accel_bias : ndarray, shape (3,), m/s²
+        In body axes.
     covariance : ndarray, shape (15, 15)
         Of the errors.
     """
@@ -64,8 +72,8 @@ class Fixes:
         Of the antenna.
     position_variance, velocity_variance : ndarray, shape (K, 3)
         East, north, up.
-    turning : ndarray, shape (K, 3)
-        Reading of the gyros, without what the body turns on its carrier, rad/s.
+    turning : ndarray, shape (K, 3), rad/s
+        Reading of the gyros less the rate of the body on its carrier.
     lever_arm : ndarray, shape (3,) or (K, 3)
         Of the antenna, in body, m.
     """
@@ -85,12 +93,14 @@ class FilteredTrack:
     Parameters
     ----------
     time : ndarray, shape (K,), s
+        Of the events.
     geodetic, velocity, nRb, gyro_bias, accel_bias : ndarray, shape (K, ...)
         As in `FilterState`.
     covariance : ndarray, shape (K, 15, 15)
-    pull : ndarray, shape (K, 3), m/s²
+        Of the errors.
+    apparent_gravity : ndarray, shape (K, 3), m/s²
         Gravity less Coriolis terms over the step that follows.
-    spin : ndarray, shape (K, 3), rad/s
+    frame_rate : ndarray, shape (K, 3), rad/s
         Rate of the local-level axes over that step.
     """
 
@@ -101,35 +111,13 @@ class FilteredTrack:
     gyro_bias: Array
     accel_bias: Array
     covariance: Array
-    pull: Array
-    spin: Array
-
-
-@dataclass(frozen=True)
-class Forward:
-    """What the filter leaves for the smoother.
-
-    Parameters
-    ----------
-    track : FilteredTrack
-        Filtered states, after the measurement of each event.
-    transition : ndarray, shape (K, 15, 15)
-        Of the step that ends at each event; the first is not used.
-    predicted : ndarray, shape (K, 15, 15)
-        Covariance before the measurement.
-    correction : ndarray, shape (K, 15)
-        Errors that the measurement fed back.
-    """
-
-    track: FilteredTrack
-    transition: Array
-    predicted: Array
-    correction: Array
+    apparent_gravity: Array
+    frame_rate: Array
 
 
 def run_filter(
     time: Array, steps: Steps, fixes: Fixes, start: FilterState, walk_psd: tuple[float, float]
-) -> Forward:
+) -> ForwardPass[FilteredTrack]:
     """Run the filter over the events of one arc.
 
     Parameters
@@ -152,7 +140,7 @@ def run_filter(
     filtered = np.empty((k_events, 15, 15))
     predicted, transition = np.empty_like(filtered), np.empty_like(filtered)
     correction = np.zeros((k_events, 15))
-    pull, spin = np.zeros((k_events, 3)), np.zeros((k_events, 3))
+    apparent_gravity, frame_rate = np.zeros((k_events, 3)), np.zeros((k_events, 3))
 
     Q = _process_noise(steps, walk_psd)
     by_gyro = skew(steps.dv * steps.duration[:, None] - steps.dp)
@@ -172,7 +160,7 @@ def run_filter(
             bias_jacobian = steps.bias_jacobian[j]
             CV = C @ (steps.dv[j] - bias_jacobian @ ba + by_gyro[j] @ bg)
             CP = C @ (steps.dp[j] - (0.5 * T) * (bias_jacobian @ ba))
-            g = float(_gravity(lat, height))
+            g = float(normal_gravity(lat, height))
             v_mid = v + 0.5 * CV
             v_mid[2] -= 0.5 * g * T
             ve, vn, _ = v_mid.tolist()
@@ -186,7 +174,7 @@ def run_filter(
             acceleration[2] -= g
             # The axes turn while the force acts: on average by half of their turn.
             acceleration -= 0.5 * (_cross(rate.tolist()) @ CV)
-            pull[j], spin[j] = acceleration, rate
+            apparent_gravity[j], frame_rate[j] = acceleration, rate
 
             moved = (v * T + CP + acceleration * (0.5 * T * T)).tolist()
             v = v + CV + acceleration * T
@@ -241,13 +229,8 @@ def run_filter(
             if not (has_position[k] and has_velocity[k]):
                 rows = slice(0, 3) if has_position[k] else slice(3, 6)
                 H, z, R = H[rows], z[rows], R[rows]
-            PH = P @ H.T
-            S = H @ PH
-            S.flat[:: S.shape[0] + 1] += R
-            K = np.linalg.solve(S, PH.T).T
+            K, P = update(P, H, R)
             x = K @ z
-            P = P - K @ PH.T
-            P = 0.5 * (P + P.T)
             correction[k] = x
             meridian, east_radius, _ = _radii(lat)
             lon += x[0] / ((east_radius + height) * cos(lat))
@@ -261,56 +244,30 @@ def run_filter(
         velocity[k], nRb[k] = v, C
         biases[k, :3], biases[k, 3:] = bg, ba
     if k_events > 1:
-        pull[-1], spin[-1] = pull[-2], spin[-2]
-    track = FilteredTrack(
-        time, geodetic, velocity, nRb, biases[:, :3], biases[:, 3:], filtered, pull, spin
-    )
-    return Forward(track, transition, predicted, correction)
+        apparent_gravity[-1], frame_rate[-1] = apparent_gravity[-2], frame_rate[-2]
+    gyro_bias, accel_bias = biases[:, :3], biases[:, 3:]
+    motion = (time, geodetic, velocity, nRb, gyro_bias, accel_bias)
+    track = FilteredTrack(*motion, filtered, apparent_gravity, frame_rate)
+    return ForwardPass(track, transition, predicted, correction)
 
 
-def smooth(forward: Forward) -> FilteredTrack:
-    """Return the states given all measurements of the arc.
-
-    Rauch, Tung, Striebel, AIAA J. 3(8), 1965, on the errors: what the measurement at an
-    event fed back is part of what the smoother hands on to the event before.
-    """
-    track = forward.track
-    k_events = track.time.size
-    gains = _gains(forward)
-    error = np.zeros((k_events, 15))
-    smoothed = track.covariance.copy()
-    for k in range(k_events - 2, -1, -1):
-        G = gains[k]
-        fed_back = forward.correction[k + 1]
-        before = fed_back + error[k + 1]
-        if np.abs(fed_back[6:9]).max() > _SMALL_TURN:
-            # Feedback turned the attitude: rotations compose, they do not add.
-            turned = exp_so3(error[k + 1, 6:9]) @ exp_so3(fed_back[6:9])
-            before[6:9] = log_so3(turned)
-        error[k] = G @ before
-        P = smoothed[k] + G @ (smoothed[k + 1] - forward.predicted[k + 1]) @ G.T
-        smoothed[k] = 0.5 * (P + P.T)
-    return _corrected(track, error, smoothed)
+def smooth(forward: ForwardPass[FilteredTrack]) -> FilteredTrack:
+    """Return the states given all measurements of the arc (Rauch, Tung, Striebel)."""
+    return _corrected(forward.track, *smoothed_errors(forward, _sum_of_errors))
 
 
-def _gains(forward: Forward) -> Array:
-    """Return P F' P⁻, (K - 1, 15, 15), with P⁻ factored as a correlation matrix."""
-    filtered, predicted = forward.track.covariance, forward.predicted
-    out = np.empty_like(filtered[:-1])
-    for a in range(0, out.shape[0], _CHUNK):
-        b = min(a + _CHUNK, out.shape[0])
-        PF = forward.transition[a + 1 : b + 1] @ filtered[a:b]
-        P = predicted[a + 1 : b + 1]
-        std = np.sqrt(np.diagonal(P, axis1=1, axis2=2))
-        correlation = P / (std[:, :, None] * std[:, None, :])
-        solved = np.linalg.solve(correlation, PF / std[:, :, None]) / std[:, :, None]
-        out[a:b] = solved.transpose(0, 2, 1)
-    return out
+def _sum_of_errors(fed_back: Array, error: Array) -> Array:
+    """Return what two errors amount to, one after the other."""
+    total = fed_back + error
+    if np.abs(fed_back[6:9]).max() > _SMALL_TURN:
+        # Rotations compose, they do not add.
+        total[6:9] = log_so3(exp_so3(error[6:9]) @ exp_so3(fed_back[6:9]))
+    return total
 
 
 def _corrected(track: FilteredTrack, error: Array, covariance: Array) -> FilteredTrack:
     lat, lon, height = track.geodetic.T
-    meridian, east_radius = _radii_of(lat)
+    meridian, east_radius = radii(lat)
     geodetic = np.stack(
         [
             lat + error[:, 1] / (meridian + height),
@@ -327,8 +284,8 @@ def _corrected(track: FilteredTrack, error: Array, covariance: Array) -> Filtere
         track.gyro_bias + error[:, 9:12],
         track.accel_bias + error[:, 12:15],
         covariance,
-        track.pull,
-        track.spin,
+        track.apparent_gravity,
+        track.frame_rate,
     )
 
 
@@ -350,21 +307,11 @@ def _process_noise(steps: Steps, walk_psd: tuple[float, float]) -> Array:
     return out
 
 
-def _gravity(lat: float, height: float) -> float:
-    return float(normal_gravity(lat, height))
-
-
 def _radii(lat: float) -> tuple[float, float, float]:
     """Return meridian and prime-vertical radius, m, and the tangent of the latitude."""
     root = 1.0 - ECCENTRICITY_SQUARED * sin(lat) ** 2
     east = SEMI_MAJOR / sqrt(root)
     return east * (1.0 - ECCENTRICITY_SQUARED) / root, east, tan(lat)
-
-
-def _radii_of(lat: Array) -> tuple[Array, Array]:
-    root = 1.0 - ECCENTRICITY_SQUARED * np.sin(lat) ** 2
-    east = SEMI_MAJOR / np.sqrt(root)
-    return east * (1.0 - ECCENTRICITY_SQUARED) / root, east
 
 
 def _cross(v: tuple[float, ...] | list[float]) -> Array:

@@ -16,13 +16,8 @@ from functools import lru_cache
 import numpy as np
 from scipy import optimize
 
-from factorgraph_dvl.baselines.point_sets import (
-    Estimated,
-    Outcome,
-    PointsAt,
-    prior_of,
-    rotation_starts,
-)
+from factorgraph_dvl.baselines.outcome import Estimated, Outcome, prior_of
+from factorgraph_dvl.baselines.point_sets import PointsAt, rotation_starts
 from factorgraph_dvl.geometry.rotations import (
     exp_so3,
     inverse_right_jacobian,
@@ -32,10 +27,11 @@ from factorgraph_dvl.geometry.rotations import (
 from factorgraph_dvl.geometry.vectors import Array, skew
 from factorgraph_dvl.sensors.parameters import Parameter
 
-# The search for the time offset: a fraction of the period of a vessel's roll.
+# Chosen: step, s, and reach, s, of the coarse search for the time offset; the step is a small
+# fraction of the period of a vessel's roll.
 _OFFSET_STEP = 0.04
 _OFFSET_REACH = 1.0
-# Half the span, s, over which the change of the motion with time is taken.
+# Chosen: half the span, s, of the difference quotient in time.
 _STEP = 1e-3
 
 
@@ -73,13 +69,13 @@ class _Problem:
             value - p.mean
             for p, value in zip(self.parameters[1:], (scale, arm, bias, offset), strict=True)
         )
-        deviation = np.concatenate([self.away(dRb), *others])[self.free]
+        deviation = np.concatenate([self.deviation_from_prior(dRb), *others])[self.free]
         prior_sigma = np.concatenate([p.sigma for p in self.parameters])[self.free]
         return np.concatenate(
             [((predicted - points.v_d) / sigma).ravel(), deviation / prior_sigma]
         )
 
-    def away(self, dRb: Array) -> Array:
+    def deviation_from_prior(self, dRb: Array) -> Array:
         """Return how far a rotation is from the prior's, to first order in it, (3,), rad."""
         mean = self.parameters[0].mean
         return inverse_right_jacobian(mean) @ log_so3(exp_so3(mean).T @ dRb)
@@ -108,10 +104,10 @@ class _Problem:
         ]
         J = np.concatenate(columns, axis=2) / sigma[:, :, None]
         prior = np.eye(J.shape[2])
-        here = self.away(dRb)
+        here = self.deviation_from_prior(dRb)
         for i in range(3):
             nudge = Jr @ (1e-6 * np.eye(3)[i])
-            prior[:3, i] = (self.away(dRb @ exp_so3(nudge)) - here) / 1e-6
+            prior[:3, i] = (self.deviation_from_prior(dRb @ exp_so3(nudge)) - here) / 1e-6
         prior_sigma = np.concatenate([p.sigma for p in self.parameters])[self.free]
         whitened = prior[np.ix_(self.free, self.free)] / prior_sigma[:, None]
         return np.concatenate([J[:, :, self.free].reshape(-1, self.free.size), whitened])
@@ -130,7 +126,7 @@ def least_squares(points_at: PointsAt, parameters: Sequence[Parameter]) -> Outco
         Returns the point sets for a time offset, s.
     parameters : sequence of Parameter
         Misalignment, scale error, lever arm, bias and time offset, with their priors; those with a
-        standard deviation of zero are held.
+        standard deviation of zero are fixed.
     """
     parameters = tuple(parameters)
     prior = prior_of(parameters)

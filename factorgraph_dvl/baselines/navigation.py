@@ -1,4 +1,4 @@
-"""SINS/GNSS navigation of a whole trial: events, start, filter and smoother of every arc."""
+"""SINS/GNSS navigation of a complete trial: events, start, filter and smoother of every arc."""
 
 from __future__ import annotations
 
@@ -37,16 +37,20 @@ from factorgraph_dvl.imu.increments import increments
 from factorgraph_dvl.sensors.gnss import Gnss
 from factorgraph_dvl.trial import Trial
 
-LONGEST_STEP = 0.5
+# Chosen: longest step, s, over which gravity and Coriolis terms count as constant.
+_LONGEST_STEP = 0.5
+# Chosen: times closer than this, s, are one.
 _SAME_TIME = 1e-6
-# Fixes this far apart, s, give a velocity where the receiver reports none.
+# Chosen: span, s, of the difference of fixes that stands for a velocity that is not reported.
 _BASELINE = 5.0
-# Beyond this error of the attitude at the start, the filter runs once more from the better one.
+# Chosen: change of the initial attitude from which on the filter runs again; linearisation errors
+# are below it squared.
 _CLOSE = 0.3 * DEG
 _PASSES = 4
+# Chosen: standard deviations of the initial position, m, and velocity, m/s, beyond the fix's own.
 _POSITION_UNKNOWN = 10.0
 _VELOCITY_UNKNOWN = 3.0
-# An attitude prior wider than this is left to the alignment.
+# Chosen: standard deviation of an attitude prior beyond which alignment is better.
 _WIDE = 6.0 * DEG
 
 
@@ -63,7 +67,7 @@ class Navigation:
     arc : ndarray, shape (K,)
         Arc of each event.
     notes : tuple of str
-        What the user must know.
+        For the user.
     """
 
     samples: StrapdownSamples
@@ -79,6 +83,7 @@ class NavigationMotion:
     Parameters
     ----------
     time : ndarray, shape (M,), s
+        On the clock of the IMU.
     geodetic, velocity, nRb : ndarray
         Local-level, as in `FilteredTrack`.
     covariance : ndarray, shape (M, 9, 9)
@@ -86,13 +91,14 @@ class NavigationMotion:
     v_b : ndarray, shape (M, 3), m/s
         Velocity over the Earth in body.
     v_b_covariance : ndarray, shape (M, 3, 3), m²/s²
+        Covariance of `v_b`.
     omega_b : ndarray, shape (M, 3), rad/s
         Rate relative to the Earth.
     omega_sigma : ndarray, shape (M, 3), rad/s
         Its standard deviation from the gyro's noise and from motion that the samples do not
         resolve.
     covered : ndarray, shape (M,)
-        Whether the trial knows the motion there.
+        Whether the arcs of the trial cover the time.
     """
 
     time: Array
@@ -128,7 +134,7 @@ def navigate(trial: Trial, pings: Array) -> Navigation:
             "the SINS/GNSS filter needs GNSS positions, and the trial has none",
             where=gnss.source if gnss is not None else "trial.yaml",
             expected="a gnss section with positions",
-            hint="`solve` may do without",
+            hint="`solve` does not need them",
         )
     inc, gaps = increments(trial.imu)
     notes = [*trial.notes, *gaps]
@@ -169,8 +175,8 @@ def navigate(trial: Trial, pings: Array) -> Navigation:
 def motion_at(navigation: Navigation, time: Array) -> NavigationMotion:
     """Return the motion at times (M,), carried from the event before by the increments.
 
-    What the carried motion misses of the next event's state is spread in proportion to
-    time, and the covariances are interpolated.
+    The difference to the state at the next event is distributed in proportion to time; the
+    covariances are interpolated.
     """
     track, samples = navigation.track, navigation.samples
     before = np.clip(
@@ -185,14 +191,14 @@ def motion_at(navigation: Navigation, time: Array) -> NavigationMotion:
     inside = np.clip(time, first, last)
 
     used = np.unique(before)
-    whole = _carry(track, used, compose(samples, track.time[used], track.time[used + 1]))
-    part = _carry(track, before, compose(samples, first, inside))
+    complete = _carry(track, used, compose(samples, track.time[used], track.time[used + 1]))
+    partial = _carry(track, before, compose(samples, first, inside))
     at = np.searchsorted(used, before)
     fraction = (inside - first) / (last - first)
-    turn_miss = log_so3(track.nRb[used + 1] @ whole[2].transpose(0, 2, 1))
-    nRb = exp_so3(fraction[:, None] * turn_miss[at]) @ part[2]
-    velocity = part[1] + fraction[:, None] * (track.velocity[used + 1] - whole[1])[at]
-    geodetic = part[0] + fraction[:, None] * (track.geodetic[used + 1] - whole[0])[at]
+    turn_miss = log_so3(track.nRb[used + 1] @ complete[2].transpose(0, 2, 1))
+    nRb = exp_so3(fraction[:, None] * turn_miss[at]) @ partial[2]
+    velocity = partial[1] + fraction[:, None] * (track.velocity[used + 1] - complete[1])[at]
+    geodetic = partial[0] + fraction[:, None] * (track.geodetic[used + 1] - complete[0])[at]
     # The filter adds up longitude beyond 180 deg.
     geodetic[:, 1] = wrapped(geodetic[:, 1])
     P = track.covariance[before, :9, :9]
@@ -223,9 +229,9 @@ def _carry(track: FilteredTrack, index: np.ndarray, step: Steps) -> tuple[Array,
     T = step.duration[:, None]
     free = rotate(step.bias_jacobian, track.accel_bias[index])
     tilted = np.cross(step.dv * T - step.dp, track.gyro_bias[index])
-    pull = track.pull[index]
-    velocity = v + rotate(C, step.dv - free + tilted) + pull * T
-    moved = v * T + rotate(C, step.dp - 0.5 * T * free) + 0.5 * pull * T**2
+    gravity = track.apparent_gravity[index]
+    velocity = v + rotate(C, step.dv - free + tilted) + gravity * T
+    moved = v * T + rotate(C, step.dp - 0.5 * T * free) + 0.5 * gravity * T**2
     lat, lon, height = track.geodetic[index].T
     meridian, east = radii(lat)
     place = np.stack(
@@ -236,9 +242,9 @@ def _carry(track: FilteredTrack, index: np.ndarray, step: Steps) -> tuple[Array,
         ],
         axis=1,
     )
-    turned = exp_small(-T * track.spin[index]) @ C
-    leaning = exp_small(-rotate(step.bias_jacobian, track.gyro_bias[index]))
-    return place, velocity, turned @ leaning @ step.turn
+    turned = exp_small(-T * track.frame_rate[index]) @ C
+    bias_turn = exp_small(-rotate(step.bias_jacobian, track.gyro_bias[index]))
+    return place, velocity, turned @ bias_turn @ step.turn
 
 
 def _earth_rate(lat: Array) -> Array:
@@ -251,7 +257,7 @@ def _events(span: tuple[float, float], times: Array) -> Array:
     events = np.unique(np.concatenate([span, inside]))
     events = events[np.concatenate([[True], np.diff(events) > _SAME_TIME])]
     gap = np.diff(events)
-    pieces = np.maximum(np.ceil(gap / LONGEST_STEP - 1e-9).astype(int), 1)
+    pieces = np.maximum(np.ceil(gap / _LONGEST_STEP - 1e-9).astype(int), 1)
     start = np.repeat(events[:-1], pieces)
     piece = np.arange(start.size) - np.repeat(np.cumsum(pieces) - pieces, pieces)
     return np.append(start + piece * np.repeat(gap / pieces, pieces), events[-1])
@@ -309,16 +315,16 @@ def _fixes_at(gnss: Gnss, samples: StrapdownSamples, time: Array) -> Fixes:
     out = {name: np.full((time.size, 3), np.nan) for name in ("p", "v", "sp", "sv")}
     out["p"][at], out["v"][at] = gnss.geodetic[inside], gnss.velocity[inside]
     lever_arm, omega_cb_b = gnss.lever_arm(time)
-    unsure = float(np.max(gnss.settings.lever_arm_std_m))
+    arm_std = float(np.max(gnss.settings.lever_arm_std_m))
     _, signal = at_times(samples, time)
     omega_sigma = signal.omega_sigma
     # Across the lever arm, where it is largest: half the trace of the covariance.
     squares = lever_arm**2
     across = squares.sum(axis=1, keepdims=True) - squares
-    shaken = 0.5 * np.sum(omega_sigma**2 * across, axis=1)
-    turned = unsure**2 * np.sum(signal.omega**2, axis=1)
-    out["sp"][at] = gnss.position_std[inside] ** 2 + unsure**2
-    out["sv"][at] = gnss.velocity_std[inside] ** 2 + (shaken + turned)[at, None]
+    gyro_noise = 0.5 * np.sum(omega_sigma**2 * across, axis=1)
+    turned = arm_std**2 * np.sum(signal.omega**2, axis=1)
+    out["sp"][at] = gnss.position_std[inside] ** 2 + arm_std**2
+    out["sv"][at] = gnss.velocity_std[inside] ** 2 + (gyro_noise + turned)[at, None]
     turning = signal.omega - omega_cb_b
     return Fixes(out["p"], out["v"], out["sp"], out["sv"], turning, lever_arm)
 
@@ -357,7 +363,7 @@ def _start(
     earlier: list[FilteredTrack],
     walk: tuple[float, float],
 ) -> FilterState:
-    """Return the state at the first event: loose where the fixes will tell."""
+    """Return the state at the first event: wide, as the fixes determine it."""
     P = np.zeros((15, 15))
     velocity, _ = _velocities(fixes, time)
     moving = np.flatnonzero(~np.isnan(velocity[:, 0]))

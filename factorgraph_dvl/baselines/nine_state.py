@@ -5,7 +5,7 @@
 with eps the misalignment acting on the reference velocity, eps = theta x v_ref to first
 order. The states are constant, so the linear Kalman filter is recursive least squares. For
 larger angles the model is (1 + a)(Exp(theta) v_ref + b), and the filter runs again over
-the data, linearised about what it found, until that no longer moves.
+the data, linearised about its estimate, until that no longer changes.
 
 The model has no lever arm: the trial's own value is taken off beforehand. In place of b the
 filter has beta = (1 + a) b for states, the bias of the trial format.
@@ -17,24 +17,20 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from factorgraph_dvl.baselines.point_sets import (
-    Estimated,
-    Outcome,
-    Points,
-    misfit,
-    prior_of,
-    rotation_starts,
-    rows_of_history,
-)
+from factorgraph_dvl.baselines.outcome import Estimated, Outcome, history_rows, prior_of
+from factorgraph_dvl.baselines.point_sets import Points, misfit, rotation_starts
 from factorgraph_dvl.geometry.rotations import exp_so3, log_so3
 from factorgraph_dvl.geometry.vectors import Array, rotate, skew
 from factorgraph_dvl.sensors.parameters import Parameter
 
-# Standard deviation of the bias where the trial gives none: the method has it for a state.
+# Chosen: prior standard deviation of the bias, m/s, where the trial fixes it: the method
+# estimates it always.
 _BIAS_SIGMA = 0.5
+# Chosen: passes over the data at most, and halvings of a step that does not lower the cost.
 _PASSES = 50
 _HALVINGS = 12
-_SETTLED = 1e-3
+# Chosen: step, in standard deviations, at which the filter has converged.
+_CONVERGED = 1e-3
 
 
 def nine_state(
@@ -86,16 +82,16 @@ def nine_state(
         fits = [misfit(few, e, lever_arm) if e.values[1].min() > -0.5 else np.inf for e in ends]
         at = ends[int(np.argmin(fits))]
     if iterated:
-        at, passes, settled = _iterate(points, prior, at, lever_arm, free)
+        at, passes, converged = _iterate(points, prior, at, lever_arm, free)
     else:
-        passes, settled = 1, True
+        passes, converged = 1, True
     steps, covariances, data = _pass(points, prior, at, lever_arm, free)
     after = [_moved(at, steps[i], covariances[i], free) for i in range(len(steps))]
-    rows = rows_of_history(len(points))
+    rows = history_rows(len(points))
     history = tuple((float(points.time[i]), after[k]) for k, i in enumerate(rows.tolist()))
     names = [name for p in parameters for name in p.component_names]
     sigma = np.concatenate([p.sigma for p in parameters])
-    unseparated = frozenset(names[i] for i in free[_alone(data, sigma[free])])
+    unseparated = frozenset(names[i] for i in free[_undetermined(data, sigma[free])])
     mixed = [n for n in names[3:] if n in unseparated]
     if mixed:
         warnings.append(
@@ -103,7 +99,7 @@ def nine_state(
             "varies, and here it does not vary enough"
         )
     final = after[-1] if after else at
-    return Outcome(final, passes, history, tuple(warnings), unseparated, settled)
+    return Outcome(final, passes, history, tuple(warnings), unseparated, converged)
 
 
 def _iterate(
@@ -114,24 +110,24 @@ def _iterate(
     free: np.ndarray,
     most: int = _PASSES,
 ) -> tuple[Estimated, int, bool]:
-    """Return the fixed point of the filter, passes, and whether it was reached."""
+    """Return the fixed point of the filter, passes, and whether it has converged."""
     # Weights that move with the estimate would make the cost jump.
     R = points.covariance_d(at.values[0], lever_arm)
     now = _linear(points, prior, at, lever_arm, free, R)
     for count in range(1, most + 1):
-        P = np.linalg.inv(now.first + now.each.sum(axis=0))
-        step = P @ (now.pull + now.vector.sum(axis=0))
-        settled = bool(np.all(np.abs(step) < _SETTLED * np.sqrt(P.diagonal())))
+        P = np.linalg.inv(now.prior_information + now.each.sum(axis=0))
+        step = P @ (now.prior_vector + now.vector.sum(axis=0))
+        converged = bool(np.all(np.abs(step) < _CONVERGED * np.sqrt(P.diagonal())))
         for _ in range(_HALVINGS):
             moved = _moved(at, step, P, free)
             new = _linear(points, prior, moved, lever_arm, free, R)
-            if settled or new.cost < now.cost:
+            if converged or new.cost < now.cost:
                 break
             step = 0.5 * step
         else:
             return at, count, False
         at, now = moved, new
-        if settled:
+        if converged:
             return at, count, True
     return at, most, False
 
@@ -140,8 +136,8 @@ def _iterate(
 class _Linear:
     """Information and its vector about a point: of the prior, and of each ping."""
 
-    first: Array
-    pull: Array
+    prior_information: Array
+    prior_vector: Array
     each: Array
     vector: Array
     cost: float
@@ -159,18 +155,18 @@ def _linear(
     H[:, :, 6:9] = np.eye(3)
     residual = points.v_d - (1.0 + a) * v - b
     weighted = np.linalg.solve(R, H[:, :, free])
-    away = np.concatenate(
+    from_prior = np.concatenate(
         [log_so3(dRb.T @ prior.values[0]), prior.values[1] - a, prior.values[2] - b]
     )
     first = np.linalg.inv(prior.covariance[np.ix_(free, free)])
-    away = away[free]
+    from_prior = from_prior[free]
     fit = np.linalg.solve(R, residual[:, :, None])[:, :, 0]
     return _Linear(
-        first=first,
-        pull=first @ away,
+        prior_information=first,
+        prior_vector=first @ from_prior,
         each=weighted.transpose(0, 2, 1) @ H[:, :, free],
         vector=np.matmul(weighted.transpose(0, 2, 1), residual[:, :, None])[:, :, 0],
-        cost=float(away @ first @ away + np.sum(residual * fit)),
+        cost=float(from_prior @ first @ from_prior + np.sum(residual * fit)),
     )
 
 
@@ -180,13 +176,13 @@ def _pass(
     """Return steps and covariances of the filter after pings of a history, and data alone.
 
     With constant states the filter adds up information, so its state after each ping is a
-    running sum away.
+    running sum from_prior.
     """
     R = points.covariance_d(at.values[0], lever_arm)
     model = _linear(points, prior, at, lever_arm, free, R)
-    rows = rows_of_history(len(points))
-    P = np.linalg.inv(model.first + np.cumsum(model.each, axis=0)[rows])
-    vector = model.pull + np.cumsum(model.vector, axis=0)[rows]
+    rows = history_rows(len(points))
+    P = np.linalg.inv(model.prior_information + np.cumsum(model.each, axis=0)[rows])
+    vector = model.prior_vector + np.cumsum(model.vector, axis=0)[rows]
     steps = np.matmul(P, vector[:, :, None])[:, :, 0]
     return steps, P, model.each.sum(axis=0)
 
@@ -201,8 +197,8 @@ def _moved(at: Estimated, step: Array, P: Array, free: np.ndarray) -> Estimated:
     return Estimated(at.parameters, values, covariance)
 
 
-def _alone(information: Array, sigma: Array) -> np.ndarray:
-    """Return which components the data alone do not tell better than half the prior."""
+def _undetermined(information: Array, sigma: Array) -> np.ndarray:
+    """Return which components the data alone determine no better than to half the prior."""
     scaled = information * np.outer(sigma, sigma)
     std = np.sqrt(np.diag(np.linalg.inv(scaled + 1e-6 * np.eye(sigma.size))))
     return np.asarray(std > 0.5)

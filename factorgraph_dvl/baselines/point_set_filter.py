@@ -5,7 +5,7 @@ v_d = (1 + k)(I + [alpha x])(v_b + omega x l), to first order in all of them,
 
     z = v_d - v_b = -[v_b x] alpha + v_b k + [omega x] l.
 
-A large misalignment is taken off step by step: when the estimated angle passes a
+A large misalignment is removed step by step: when the estimated angle passes a
 threshold, the data of the DVL are rotated by it, and the filter goes on with what is left.
 """
 
@@ -13,31 +13,29 @@ from __future__ import annotations
 
 import numpy as np
 
-from factorgraph_dvl.baselines.point_sets import (
-    Estimated,
-    Outcome,
-    Points,
-    misfit,
-    prior_of,
-    rotation_starts,
-    rows_of_history,
-)
+from factorgraph_dvl.baselines.kalman_filter import update
+from factorgraph_dvl.baselines.outcome import Estimated, Outcome, history_rows, prior_of
+from factorgraph_dvl.baselines.point_sets import Points, misfit, rotation_starts
 from factorgraph_dvl.geometry.rotations import exp_so3, log_so3, right_jacobian
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array, skew
 from factorgraph_dvl.sensors.parameters import Parameter
 
-THRESHOLD = 0.05 * DEG
-# An angle that noise explains is no reason to rotate the data.
+# Chosen: angle from which on the data are rotated; Luo et al. leave the threshold open.
+_THRESHOLD = 0.05 * DEG
+# Chosen: standard deviations from which on an angle is more than noise.
 _SIGNIFICANT = 3.0
-# Scale errors and misfits at which the filter has run into the mirror image.
+# Chosen: scale error, halfway between 0 and that of the mirror image, and mean square of the
+# normalised residuals at which the filter starts once more.
 _MIRRORED = -0.5
 _POOR_FIT = 9.0
+# Chosen: passes over the data at most, and change of the rotation, in standard deviations, at
+# which they end.
 _PASSES = 10
 _SETTLED = 0.05
-# Rotations that change by more standard deviations than this from pass to pass have no end.
+# Chosen: change in the last pass, in standard deviations, up to which the filter has converged.
 _STILL_MOVING = 1.0
-# A prior wider than this does not hold the angle back.
+# Chosen: prior standard deviation beyond which a misalignment may be anything.
 _WIDE = 30.0 * DEG
 
 
@@ -75,7 +73,7 @@ def point_set(
         other = _estimated(parameters, again[-1])
         if mirrored or misfit(points, other, arm) < misfit(points, best, arm):
             states, best = again, other
-    rows = rows_of_history(len(points))
+    rows = history_rows(len(points))
     history = tuple(
         (float(points.time[i]), _estimated(parameters, states[i + 1])) for i in rows.tolist()
     )
@@ -125,17 +123,14 @@ def _filter(points: Points, parameters: tuple[Parameter, ...], start: Array) -> 
     for k in range(len(points)):
         H = each[k]
         square = x[4:7] ** 2 + P.diagonal()[4:7]
-        shaken = 0.5 * float(points.omega_sigma[k] ** 2 @ (square.sum() - square))
+        arm_variance = 0.5 * float(points.omega_sigma[k] ** 2 @ (square.sum() - square))
         R = (D.T * points.sigma_d[k] ** 2) @ D + points.v_b_covariance[k]
-        R.flat[::4] += shaken
+        R.flat[::4] += arm_variance
         z = D.T @ points.v_d[k] - points.v_b[k]
-        PH = P @ H.T
-        K = np.linalg.solve(H @ PH + R, PH.T).T
+        K, P = update(P, H, R)
         x = x + K @ (z - H @ x)
-        P = P - K @ PH.T
-        P = 0.5 * (P + P.T)
         alpha = x[:3]
-        past = np.abs(alpha) > np.maximum(THRESHOLD, _SIGNIFICANT * np.sqrt(P.diagonal()[:3]))
+        past = np.abs(alpha) > np.maximum(_THRESHOLD, _SIGNIFICANT * np.sqrt(P.diagonal()[:3]))
         if past.any():
             D, x, P = _rotated(D, x, P, unknown)
         states.append((D, x, P))

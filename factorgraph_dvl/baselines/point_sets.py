@@ -1,28 +1,25 @@
-"""The two point sets of a calibration, and what a calibrator makes of them."""
+"""The two point sets of a calibration, and their residuals."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from factorgraph_dvl.baselines.outcome import Estimated
 from factorgraph_dvl.geometry.rotations import (
     exp_so3,
-    inverse_right_jacobian,
-    reported_rotation_vector,
-    right_jacobian,
 )
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array, rotate
 from factorgraph_dvl.sensors.parameters import Parameter
 
-# Beyond this prior standard deviation a misalignment may be anything.
+# Chosen: prior standard deviation beyond which a misalignment may be anything.
 _WIDE = 30.0 * DEG
-# Pings that tell which of several starts is the best, and rows of a history.
+# Chosen: pings that compare several starts; more change no decision.
 _FEW = 1500
-_ROWS = 2000
 
 
 @dataclass(frozen=True)
@@ -35,14 +32,16 @@ class Points:
         True times.
     v_b : ndarray, shape (M, 3)
         Velocity of the IMU over the Earth, in body, m/s.
-    v_b_covariance : ndarray, shape (M, 3, 3)
+    v_b_covariance : ndarray, shape (M, 3, 3), m²/s²
+        Covariance of `v_b`.
     omega_b : ndarray, shape (M, 3), rad/s
         Rate relative to the Earth.
     omega_sigma : ndarray, shape (M, 3)
         Its standard deviation.
     v_d : ndarray, shape (M, 3)
         Reported by the DVL, in its own axes, m/s.
-    sigma_d : ndarray, shape (M, 3)
+    sigma_d : ndarray, shape (M, 3), m/s
+        Standard deviation of `v_d`.
     """
 
     time: Array
@@ -61,7 +60,7 @@ class Points:
         return Points(*(getattr(self, name)[which] for name in self.__dataclass_fields__))
 
     def thinned(self) -> Points:
-        """Return as many pings as tell good starts from bad ones."""
+        """Return as many pings as it takes to compare starts."""
         return self.take(slice(None, None, max(len(self) // _FEW, 1)))
 
     def at_dvl(self, lever_arm: Array) -> Array:
@@ -83,93 +82,6 @@ class Points:
         out = dRb @ self.v_b_covariance @ dRb.T
         diagonal = self.sigma_d**2 + self.lever_arm_variance(lever_arm**2)[:, None]
         return out + diagonal[:, :, None] * np.eye(3)
-
-
-@dataclass(frozen=True)
-class Estimated:
-    """Calibration parameters with their joint covariance, SI.
-
-    Parameters
-    ----------
-    parameters : tuple of Parameter
-        With their priors.
-    values : tuple of ndarray
-        Of each, (n,); a rotation as its matrix.
-    covariance : ndarray
-        Joint, stacked; of a rotation R, of delta in R Exp(delta).
-    """
-
-    parameters: tuple[Parameter, ...]
-    values: tuple[Array, ...]
-    covariance: Array
-
-    def value(self, stem: str, default: Array) -> Array:
-        """Return the value of a parameter, or `default` where it was not estimated."""
-        stems = [p.stem for p in self.parameters]
-        return self.values[stems.index(stem)] if stem in stems else default
-
-    def reported(self) -> tuple[Array, Array]:
-        """Return all components and their covariance, in reported parametrisation and units."""
-        values, blocks = [], []
-        for p, value in zip(self.parameters, self.values, strict=True):
-            derivative = np.eye(p.mean.size)
-            if p.rotation:
-                value = reported_rotation_vector(value, p.mean)
-                derivative = inverse_right_jacobian(value)
-            values.append(value / p.si)
-            blocks.append(derivative / p.si)
-        size = self.covariance.shape[0]
-        J, at = np.zeros((size, size)), 0
-        for block in blocks:
-            J[at : at + len(block), at : at + len(block)] = block
-            at += len(block)
-        covariance = J @ self.covariance @ J.T
-        known = np.concatenate([p.sigma == 0.0 for p in self.parameters])
-        covariance[known] = covariance[:, known] = 0.0
-        return np.concatenate(values), covariance
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """What a calibrator found.
-
-    Parameters
-    ----------
-    estimated : Estimated
-        At the end.
-    iterations : int
-        Passes over the data, or rotations of them.
-    history : tuple of tuple of (float, Estimated), optional
-        Time and estimate after some of the pings; empty for closed forms.
-    warnings : tuple of str, optional
-        What the user must know.
-    unseparated : frozenset of str, optional
-        Component names that the data alone do not separate.
-    converged : bool, optional
-        Whether the method reached its end.
-    """
-
-    estimated: Estimated
-    iterations: int
-    history: tuple[tuple[float, Estimated], ...] = ()
-    warnings: tuple[str, ...] = ()
-    unseparated: frozenset[str] = frozenset()
-    converged: bool = True
-
-
-def prior_of(parameters: Sequence[Parameter]) -> Estimated:
-    """Return the priors as if they were estimates."""
-    values, blocks = [], []
-    for p in parameters:
-        values.append(exp_so3(p.mean) if p.rotation else p.mean)
-        J = right_jacobian(p.mean) if p.rotation else np.eye(p.mean.size)
-        blocks.append(J @ np.diag(p.sigma**2) @ J.T)
-    size = sum(len(b) for b in blocks)
-    covariance, at = np.zeros((size, size)), 0
-    for block in blocks:
-        covariance[at : at + len(block), at : at + len(block)] = block
-        at += len(block)
-    return Estimated(tuple(parameters), tuple(values), covariance)
 
 
 def rotation_starts(misalignment: Parameter) -> list[Array]:
@@ -208,13 +120,6 @@ def residuals(points: Points, estimated: Estimated, lever_arm: Array) -> tuple[A
     residual = scale * rotate(dRb[None], points.at_dvl(arm)) + bias - points.v_d
     P = points.covariance_d(dRb, arm)
     return residual, np.sqrt(np.diagonal(P, axis1=1, axis2=2))
-
-
-def rows_of_history(count: int) -> np.ndarray:
-    """Return which of `count` pings a history keeps: the first, the last, some between."""
-    if count == 0:
-        return np.zeros(0, dtype=int)
-    return np.unique(np.linspace(0, count - 1, min(count, _ROWS)).round().astype(int))
 
 
 PointsAt = Callable[[float], Points]

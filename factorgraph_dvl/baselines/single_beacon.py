@@ -5,8 +5,8 @@ Journal of Unmanned Undersea Systems 29(4), 2021. Four state variables: position
 the beacon and current, east and north; heading and speed drive them. Two observations, slant
 range and depth, which give the horizontal distance; the third is the range rate.
 
-They hold what they were told as it is: no sound speed, scale error, heading bias or offset
-of a beacon, and no outliers. That is what they are here for, to be compared with.
+They model no error of sound speed, scale, heading or beacon position, and no outliers: the
+baseline to compare with.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from factorgraph_dvl.baselines.calibration import History
+from factorgraph_dvl.baselines.outcome import History
 from factorgraph_dvl.errors import ConfigError, DataError
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.solution import Estimate, Residuals, Solution, Trajectory, contradictions
@@ -27,9 +27,11 @@ Method = Literal["4sv-2ob", "4sv-3ob"]
 METHODS: tuple[Method, ...] = get_args(Method)
 
 _NAMES = ("current_e_m_s", "current_n_m_s")
+# Chosen: least prior standard deviation of the current, m/s; keeps its covariance regular.
 _LEAST_CURRENT = 1e-6
-# Standard deviations by which the end may depend on one of the start.
-_FORGOTTEN = 3.0
+# Chosen: largest effect on the end, in its standard deviations, of one standard deviation at the
+# start; a linear filter has at most 1.
+_LARGEST_EFFECT = 3.0
 
 
 # State, covariance, innovation (predicted - measured) and its standard deviation.
@@ -43,9 +45,11 @@ class Filtered:
     Parameters
     ----------
     time : ndarray, shape (U,), s
+        Of the updates.
     state : ndarray, shape (U, 4)
         Position in n, m, and current, m/s.
     covariance : ndarray, shape (U, 4, 4)
+        Of the state.
     velocity : ndarray, shape (U, 2), m/s
         Over ground.
     innovations : tuple of Residuals
@@ -78,9 +82,10 @@ def filter_planar(
 
     Returns
     -------
-    Solution
+    solution : Solution
         Its trajectory is filtered, not smoothed: an epoch for each update.
-    History
+    history : History
+        Of the current.
 
     Raises
     ------
@@ -104,7 +109,7 @@ def filter_planar(
     filtered = run_filter(trial, method, mean, start_std)
     contradicted = [
         *contradictions(filtered.innovations),
-        *_start_not_forgotten(trial, method, mean, start_std, filtered),
+        *_depends_on_start(trial, method, mean, start_std, filtered),
     ]
     m = filtered.time.size
     surface = trial.depth.settings.sea_surface_height_m
@@ -146,7 +151,7 @@ def filter_planar(
         warnings=(
             *trial.notes,
             *contradicted,
-            f"{method} takes every range for a good one, and sound speed, log, heading and "
+            f"{method} takes no range for an outlier, and sound speed, log, heading and "
             "beacons for exact",
         ),
     )
@@ -160,6 +165,7 @@ def run_filter(trial: PlanarTrial, method: Method | str, mean: Array, std: Array
     Parameters
     ----------
     trial : PlanarTrial
+        With heading, log, depth and beacons.
     method : Method or str
         `4sv-2ob` or `4sv-3ob`.
     mean, std : ndarray, shape (2,), m
@@ -172,19 +178,19 @@ def run_filter(trial: PlanarTrial, method: Method | str, mean: Array, std: Array
     """
     beacons, frame = trial.beacons, trial.frame()
     settings = beacons.settings
-    drive = _Drive(trial)
+    dead_reckoning = _DeadReckoning(trial)
     x = np.array([*mean, 0.0, 0.0])
     P = np.diag([*std, *np.maximum(_current_std(trial), _LEAST_CURRENT)]) ** 2
     places = {n: frame.position(*place.geodetic) for n, place in settings.positions.items()}
     height = trial.depth.settings.sea_surface_height_m - _depth_at(trial, beacons.time)
-    now = drive.start
+    now = dead_reckoning.start
     times, states, covariances, velocities = [], [], [], []
-    seen: dict[str, list[tuple[float, float, float]]] = {"range": [], "range rate": []}
+    innovations_of: dict[str, list[tuple[float, float, float]]] = {"range": [], "range rate": []}
     for i in range(beacons.time.size):
         time = float(beacons.time[i])
-        if not drive.start <= time <= drive.end or beacons.missing[i]:
+        if not dead_reckoning.start <= time <= dead_reckoning.end or beacons.missing[i]:
             continue
-        moved, Q = drive.between(now, time)
+        moved, Q = dead_reckoning.between(now, time)
         F = np.eye(4)
         F[0, 2] = F[1, 3] = time - now
         x = F @ x
@@ -194,16 +200,16 @@ def run_filter(trial: PlanarTrial, method: Method | str, mean: Array, std: Array
         now = time
         place = places[str(beacons.name[i])]
         above = height[i] - frame.height - place[2]
-        u, C = drive.velocity(time)
+        u, C = dead_reckoning.velocity(time)
         if not np.isnan(beacons.range[i]):
             x, P, away, sigma = _by_range(
                 x, P, place, above, beacons.range[i], settings.range_std_m
             )
-            seen["range"].append((time, away, sigma))
+            innovations_of["range"].append((time, away, sigma))
         if method == "4sv-3ob" and not np.isnan(beacons.range_rate[i]):
             rate, rate_std = beacons.range_rate[i], settings.range_rate_std_m_s
             x, P, away, sigma = _by_rate(x, P, place, above, u, C, rate, rate_std)
-            seen["range rate"].append((time, away, sigma))
+            innovations_of["range rate"].append((time, away, sigma))
         times.append(time)
         states.append(x)
         covariances.append(P)
@@ -212,7 +218,7 @@ def run_filter(trial: PlanarTrial, method: Method | str, mean: Array, std: Array
         raise DataError("no range while heading and log run", where=beacons.source)
     innovations = tuple(
         Residuals(f"Beacon {kind}", unit, (kind,), rows[:, 0], rows[:, 1:2], rows[:, 2:3])
-        for (kind, values), unit in zip(seen.items(), ("m", "m/s"), strict=True)
+        for (kind, values), unit in zip(innovations_of.items(), ("m", "m/s"), strict=True)
         if (rows := np.array(values)).size
     )
     return Filtered(
@@ -224,24 +230,24 @@ def run_filter(trial: PlanarTrial, method: Method | str, mean: Array, std: Array
     )
 
 
-def _start_not_forgotten(
+def _depends_on_start(
     trial: PlanarTrial, method: Method | str, mean: Array, std: Array, found: Filtered
 ) -> list[str]:
-    """Return a warning if the end depends more on the start than its covariance admits.
+    """Return a warning if the end depends more on the start than its covariance allows.
 
     A start moved by one standard deviation moves the end of a linear filter by at most one of
     its own. These filters are not linear, and go to either mirror image.
     """
     P = found.covariance[-1]
     if not (np.isfinite(P).all() and np.linalg.eigvalsh(P)[0] > 0.0):
-        return ["the filter has diverged: its covariance is no longer one"]
+        return ["the filter has diverged: its covariance is not positive definite"]
     apart, most = 0.0, 0.0
     for move in (*np.diag(std), *-np.diag(std)):
         away = run_filter(trial, method, mean + move, std).state[-1] - found.state[-1]
         sigmas = float(np.sqrt(away @ np.linalg.solve(P, away)))
         if not sigmas <= most:
             most, apart = sigmas, float(np.hypot(*away[:2]))
-    if most <= _FORGOTTEN:
+    if most <= _LARGEST_EFFECT:
         return []
     return [
         f"from a start that is one standard deviation away the filter ends {apart:.3g} m, or "
@@ -267,7 +273,7 @@ def _depth_at(trial: PlanarTrial, time: Array) -> Array:
     return np.interp(time, trial.depth.time[known], trial.depth.depth[known])
 
 
-class _Drive:
+class _DeadReckoning:
     """Heading and speed: displacement and velocity, each with its noise."""
 
     def __init__(self, trial: PlanarTrial) -> None:

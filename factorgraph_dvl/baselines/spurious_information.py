@@ -1,9 +1,8 @@
-"""Observability that only the noise of the SINS/GNSS velocity feigns.
+"""Spurious information: observability that only noise of the SINS/GNSS velocity explains.
 
 The point-set methods take v_b for the regressor as if it were exact. On a straight run its
-noise turns the velocity about in the body, ping by ping, and the pings then seem to tell
-even the angle about the velocity. What the noise adds to the information is known on
-average, and is taken off here.
+noise rotates the velocity in the body from ping to ping, which seems to determine even the
+angle about the velocity. The mean of this spurious information is known, and is subtracted here.
 """
 
 from __future__ import annotations
@@ -12,20 +11,21 @@ from dataclasses import replace
 
 import numpy as np
 
-from factorgraph_dvl.baselines.point_sets import Estimated, Points
+from factorgraph_dvl.baselines.outcome import Estimated
+from factorgraph_dvl.baselines.point_sets import Points
 from factorgraph_dvl.geometry.vectors import Array, skew
 from factorgraph_dvl.solution import OBSERVABLE
 
-# Errors that stay the same for many pings add up to more, or less, than on average.
+# Chosen: multiple of the mean that is subtracted; correlated errors add up to more than the mean.
 _MARGIN = 5.0
 
 
 def without_spurious_information(
     points: Points, estimated: Estimated, lever_arm: Array
 ) -> Estimated:
-    """Return the estimate, with a wider covariance where the data seemed to tell too much.
+    """Return the estimate, with a wider covariance where its information is spurious.
 
-    Unchanged where the motion itself still tells every component that the data told.
+    Unchanged where every observable component stays so without the spurious information.
 
     Parameters
     ----------
@@ -77,16 +77,16 @@ def without_spurious_information(
 
 
 def widened(estimated: Estimated, information: Array, noise: Array) -> Estimated:
-    """Return the estimate with a wider covariance, where noise feigned what was told.
+    """Return the estimate with a wider covariance, where its information is spurious.
 
     Parameters
     ----------
     estimated : Estimated
         N components.
     information : ndarray, shape (n, n)
-        Of the data, as it seems.
+        Of the data, with the spurious part.
     noise : ndarray, shape (n, n)
-        What noise of the motion adds to it, on average.
+        Mean of the spurious part.
     """
     sigma = np.concatenate([p.sigma for p in estimated.parameters])
     seeming = _posterior(information, sigma)

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from factorgraph_dvl.baselines.navigation import NavigationMotion, motion_at, navigate
-from factorgraph_dvl.baselines.point_sets import Estimated, Outcome, rows_of_history
+from factorgraph_dvl.baselines.outcome import Estimated, Outcome, history_rows
 from factorgraph_dvl.baselines.star_filter import (
     AttitudeTrack,
     StarAttitudes,
@@ -20,7 +20,7 @@ from factorgraph_dvl.baselines.star_filter import (
 from factorgraph_dvl.baselines.strapdown import StrapdownSamples, prepare
 from factorgraph_dvl.baselines.summary import gnss_residuals
 from factorgraph_dvl.errors import ConfigError, DataError
-from factorgraph_dvl.geometry.celestial import off_vertical
+from factorgraph_dvl.geometry.celestial import ARCSEC, off_vertical
 from factorgraph_dvl.geometry.earth import enu_from_ecef
 from factorgraph_dvl.geometry.rotations import (
     inverse_right_jacobian,
@@ -42,14 +42,13 @@ from factorgraph_dvl.solution import (
 )
 from factorgraph_dvl.trial import InitialAttitude, Trial
 
-_ARCSEC = DEG / 3600.0
-# The SINS/GNSS filter, which gives position and velocity only, starts from the stars' attitude
-# as if known so well.
+# Chosen: standard deviation of the stars' attitude as the prior of the SINS/GNSS filter, which
+# gives position and velocity only.
 _START = 0.3 * DEG
-# Standard deviation up to which a mounting that is not estimated is taken as it stands, deg.
+# Chosen: standard deviation, deg, up to which the mounting is taken as known.
 _KNOWN_DEG = 5.0
-# Angle between the stars' vertical and that of the specific force from which on epoch or
-# mounting are wrong, rad.
+# Chosen: angle, rad, between the vertical of the stars and that of the specific force from which
+# on epoch or mounting must be wrong; waves stay below it on average.
 _OFF_VERTICAL = 2.0 * DEG
 
 
@@ -86,53 +85,53 @@ def calibrate_gyros(trial: Trial, *, rate_hz: float) -> tuple[Solution, Outcome]
     frame = trial.frame()
     inc, _ = increments(trial.imu)
     samples = prepare(inc, trial.imu.settings)
-    seen = star_attitudes(star, trial.epoch, frame.lat, frame.lon)
+    attitudes = star_attitudes(star, trial.epoch, frame.lat, frame.lon)
     (gyro, _) = trial.imu.parameters(0.0)
     drift, P = np.zeros(3), np.diag(gyro.sigma**2)
-    courses: list[AttitudeTrack] = []
+    tracks: list[AttitudeTrack] = []
     history: list[tuple[float, Estimated]] = []
     for a, b in inc.arcs:
-        mine = seen.within(float(inc.start[a]), float(inc.end[b - 1]))
-        if mine.time.size < 2:
+        inside = attitudes.within(float(inc.start[a]), float(inc.end[b - 1]))
+        if inside.time.size < 2:
             continue
-        if courses:
-            gap = mine.time[0] - courses[-1].time[-1]
+        if tracks:
+            gap = inside.time[0] - tracks[-1].time[-1]
             P = P + trial.imu.settings.gyro_bias_walk_root_psd**2 * gap * np.eye(3)
-        forward = run_filter(samples, mine, frame.lat, drift, P)
-        drift, P = forward.course.drift[-1], forward.course.covariance[-1, 3:, 3:]
-        courses.append(smooth(forward))
+        forward = run_filter(samples, inside, frame.lat, drift, P)
+        drift, P = forward.track.drift[-1], forward.track.covariance[-1, 3:, 3:]
+        tracks.append(smooth(forward))
         history += [
             (float(t), Estimated((gyro,), (xi,), Q[3:, 3:]))
             for t, xi, Q in zip(
-                forward.course.time, forward.course.drift, forward.course.covariance, strict=True
+                forward.track.time, forward.track.drift, forward.track.covariance, strict=True
             )
         ]
-    if not courses:
+    if not tracks:
         raise DataError(
             "there are no two star attitudes in a row while the IMU runs",
             where=star.source,
             expected="times on the clock of the IMU",
         )
-    kept = [history[i] for i in rows_of_history(len(history))]
-    estimated = _drift(trial, courses, drift, P)
+    kept = [history[i] for i in history_rows(len(history))]
+    estimated = _drift(trial, tracks, drift, P)
     estimated = replace(estimated, covariance=estimated.covariance + _by_mounting(trial, star))
     outcome = Outcome(estimated, 1, tuple(kept))
-    solution = _summary(trial, star, samples, courses, seen, estimated, frame.lat, rate_hz)
+    solution = _summary(trial, star, samples, tracks, attitudes, estimated, frame.lat, rate_hz)
     return solution, outcome
 
 
-def _drift(trial: Trial, courses: list[AttitudeTrack], drift: Array, P: Array) -> Estimated:
+def _drift(trial: Trial, tracks: list[AttitudeTrack], drift: Array, P: Array) -> Estimated:
     """Return the drift at the end if constant, else its mean over the trial.
 
     The covariance of the mean of a random walk is taken as the mean covariance, which is
     an upper bound.
     """
-    begin, end = courses[0].time[0], courses[-1].time[-1]
+    begin, end = tracks[0].time[0], tracks[-1].time[-1]
     parameter = trial.imu.parameters(float(end - begin))[0]
     if trial.imu.settings.gyro_bias_walk_root_psd == 0.0:
         return Estimated((parameter,), (drift,), P)
-    mean = np.concatenate([c.drift for c in courses]).mean(axis=0)
-    spread = np.concatenate([c.covariance[:, 3:, 3:] for c in courses]).mean(axis=0)
+    mean = np.concatenate([c.drift for c in tracks]).mean(axis=0)
+    spread = np.concatenate([c.covariance[:, 3:, 3:] for c in tracks]).mean(axis=0)
     return Estimated((parameter,), (mean,), spread)
 
 
@@ -159,40 +158,40 @@ def _summary(
     trial: Trial,
     star: Star,
     samples: StrapdownSamples,
-    courses: list[AttitudeTrack],
-    seen: StarAttitudes,
+    tracks: list[AttitudeTrack],
+    attitudes: StarAttitudes,
     estimated: Estimated,
     lat: float,
     rate_hz: float,
 ) -> Solution:
     begin = float(samples.increments.start[0])
     initial = trial.initial_attitude
-    if courses[0].time[0] <= samples.increments.end[samples.increments.arcs[0, 1] - 1]:
-        nRb = attitude_before(samples, courses[0], lat, begin)
+    if tracks[0].time[0] <= samples.increments.end[samples.increments.arcs[0, 1] - 1]:
+        nRb = attitude_before(samples, tracks[0], lat, begin)
         rph = rph_from_rotation(nRb, trial.body_axes)
         initial = InitialAttitude(rph, np.full(3, _START))
     navigation = navigate(replace(trial, initial_attitude=initial), np.empty(0))
     values, covariance = estimated.reported()
     estimates = as_estimates(estimated.parameters, values, covariance)
-    residuals = (_star_residuals(star, courses, seen), *gnss_residuals(trial, navigation))
+    residuals = (_star_residuals(tracks, attitudes), *gnss_residuals(trial, navigation))
     notes = [*navigation.notes, *star.consistency_warnings()]
     if np.any(np.array(star.settings.mounting_std_deg) > 0.0):
         notes.append(
-            "star does not estimate star_mounting_deg: held at "
+            "star does not estimate star_mounting_deg: fixed at "
             f"{np.round(star.settings.mounting_deg, 6).tolist()}"
         )
-    away = off_vertical(seen.time, seen.nRb, trial.imu.time, trial.imu.accel)
-    if away > _OFF_VERTICAL:
+    tilt = off_vertical(attitudes.time, attitudes.nRb, trial.imu.time, trial.imu.accel)
+    if tilt > _OFF_VERTICAL:
         notes.append(
-            f"{star.label}: its attitudes put the vertical {np.degrees(away):.1f} deg away from "
+            f"{star.label}: its attitudes put the vertical {np.degrees(tilt):.1f} deg away from "
             "that of the specific force: are `epoch` and `mounting_deg` right? "
-            "The attitude is not to be used before that is cleared up"
+            "Do not use the attitude before they are corrected"
         )
     notes += [
         f"{name} not observable: the arc is too short for these stars"
         for e in estimates
-        for name, seen_well in zip(e.component_names, e.observable, strict=True)
-        if not seen_well
+        for name, observable in zip(e.component_names, e.observable, strict=True)
+        if not observable
     ]
     contradicted = contradictions(residuals)
     first = residuals[0]
@@ -207,26 +206,26 @@ def _summary(
         cost=0.5 * float(np.sum((first.residual / first.sigma) ** 2)),
         estimates=estimates,
         covariance=covariance,
-        trajectory=_trajectory(trial, star, samples, courses, motion),
+        trajectory=_trajectory(trial, star, samples, tracks, motion),
         residuals=residuals,
         warnings=(*notes, *contradicted, *consistency_warnings(estimates, residuals)),
     )
 
 
-def _star_residuals(star: Star, courses: list[AttitudeTrack], seen: StarAttitudes) -> Residuals:
+def _star_residuals(tracks: list[AttitudeTrack], attitudes: StarAttitudes) -> Residuals:
     """Return smoothed - measured attitude in body axes, arcsec."""
-    time = np.concatenate([c.time for c in courses])
-    nRb = np.concatenate([c.nRb for c in courses])
-    rows = np.searchsorted(seen.time, time)
-    residual = log_so3(seen.nRb[rows].transpose(0, 2, 1) @ nRb)
-    variance = np.diagonal(seen.covariance[rows], axis1=1, axis2=2)
+    time = np.concatenate([c.time for c in tracks])
+    nRb = np.concatenate([c.nRb for c in tracks])
+    rows = np.searchsorted(attitudes.time, time)
+    residual = log_so3(attitudes.nRb[rows].transpose(0, 2, 1) @ nRb)
+    variance = np.diagonal(attitudes.covariance[rows], axis1=1, axis2=2)
     return Residuals(
         "Star attitude",
         "arcsec",
         ("x", "y", "z"),
         time,
-        residual / _ARCSEC,
-        np.sqrt(variance) / _ARCSEC,
+        residual / ARCSEC,
+        np.sqrt(variance) / ARCSEC,
     )
 
 
@@ -234,7 +233,7 @@ def _trajectory(
     trial: Trial,
     star: Star,
     samples: StrapdownSamples,
-    courses: list[AttitudeTrack],
+    tracks: list[AttitudeTrack],
     motion: NavigationMotion,
 ) -> Trajectory:
     """Return position and velocity of SINS/GNSS with the attitude by the stars."""
@@ -242,12 +241,12 @@ def _trajectory(
     nRb, P = motion.nRb.copy(), np.zeros_like(motion.nRb)
     known = np.zeros(motion.time.size, dtype=bool)
     mounting = _mounting_covariance(star)
-    for course in courses:
-        mine = (motion.time >= course.time[0]) & (motion.time <= course.time[-1])
-        mine &= motion.covered
-        nRb[mine], P[mine] = attitude_at(samples, course, frame.lat, motion.time[mine])
-        P[mine] += nRb[mine] @ mounting @ nRb[mine].transpose(0, 2, 1)
-        known |= mine
+    for track in tracks:
+        inside = (motion.time >= track.time[0]) & (motion.time <= track.time[-1])
+        inside &= motion.covered
+        nRb[inside], P[inside] = attitude_at(samples, track, frame.lat, motion.time[inside])
+        P[inside] += nRb[inside] @ mounting @ nRb[inside].transpose(0, 2, 1)
+        known |= inside
     level = enu_from_ecef(motion.geodetic[known, 0], motion.geodetic[known, 1])
     lRn = level @ enu_from_ecef(frame.lat, frame.lon).T
     lRb = lRn @ nRb[known]

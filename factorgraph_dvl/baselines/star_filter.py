@@ -23,6 +23,7 @@ import erfa
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from factorgraph_dvl.baselines.kalman_filter import ForwardPass, smoothed_errors, update
 from factorgraph_dvl.baselines.strapdown import StrapdownSamples, compose
 from factorgraph_dvl.geometry.earth import RATE, enu_from_ecef
 from factorgraph_dvl.geometry.rotations import exp_so3
@@ -38,6 +39,7 @@ class StarAttitudes:
     Parameters
     ----------
     time : ndarray, shape (M,), s
+        On the clock of the IMU.
     nRb : ndarray, shape (M, 3, 3)
         Body to n, by the prior mounting.
     covariance : ndarray, shape (M, 3, 3), rad²
@@ -61,7 +63,9 @@ class AttitudeTrack:
     Parameters
     ----------
     time : ndarray, shape (K,), s
+        On the clock of the IMU.
     nRb : ndarray, shape (K, 3, 3)
+        Body to n.
     drift : ndarray, shape (K, 3), rad/s
         Of the gyros.
     covariance : ndarray, shape (K, 6, 6)
@@ -72,28 +76,6 @@ class AttitudeTrack:
     nRb: Array
     drift: Array
     covariance: Array
-
-
-@dataclass(frozen=True)
-class FilteredDrift:
-    """What the filter leaves for the smoother.
-
-    Parameters
-    ----------
-    course : AttitudeTrack
-        After the measurement at each time.
-    transition : ndarray, shape (K, 6, 6)
-        Of the step that ends at each time; the first is not used.
-    predicted : ndarray, shape (K, 6, 6)
-        Covariance before the measurement.
-    correction : ndarray, shape (K, 6)
-        What the measurement fed back.
-    """
-
-    course: AttitudeTrack
-    transition: Array
-    predicted: Array
-    correction: Array
 
 
 def star_attitudes(star: Star, epoch: str, lat: float, lon: float) -> StarAttitudes:
@@ -127,105 +109,97 @@ def _earth_from_stars(epoch: str, time: Array, ut1_utc: float) -> Array:
 
 def run_filter(
     samples: StrapdownSamples,
-    seen: StarAttitudes,
+    attitudes: StarAttitudes,
     lat: float,
     drift: Array,
     drift_covariance: Array,
-) -> FilteredDrift:
+) -> ForwardPass[AttitudeTrack]:
     """Run the filter over one arc, from its first attitude by the stars.
 
     Parameters
     ----------
     samples : StrapdownSamples
         Of the IMU.
-    seen : StarAttitudes
+    attitudes : StarAttitudes
         Attitudes within the arc.
     lat : float
         Latitude of n, rad; its rate is that of the Earth.
     drift : ndarray, shape (3,), rad/s
         Known before.
-    drift_covariance : ndarray, shape (3, 3)
+    drift_covariance : ndarray, shape (3, 3), rad²/s²
+        Of that.
     """
-    steps = compose(samples, seen.time[:-1], seen.time[1:])
+    steps = compose(samples, attitudes.time[:-1], attitudes.time[1:])
     walk = samples.settings.gyro_bias_walk_root_psd**2
     omega_in = RATE * np.array([0.0, np.cos(lat), np.sin(lat)])
-    count, eye = seen.time.size, np.eye(3)
+    count, eye = attitudes.time.size, np.eye(3)
     attitude, drifts = np.empty((count, 3, 3)), np.empty((count, 3))
     filtered, predicted = np.empty((count, 6, 6)), np.empty((count, 6, 6))
     transition, correction = np.zeros((count, 6, 6)), np.zeros((count, 6))
-    noise = 0.25 * seen.nRb @ seen.covariance @ seen.nRb.transpose(0, 2, 1)
+    noise = 0.25 * attitudes.nRb @ attitudes.covariance @ attitudes.nRb.transpose(0, 2, 1)
 
-    C, xi = seen.nRb[0], drift.copy()
+    C, xi = attitudes.nRb[0], drift.copy()
     P = np.zeros((6, 6))
     P[:3, :3], P[3:, 3:] = noise[0], drift_covariance
     predicted[0] = P
-    F = np.eye(6)
+    F, H = np.eye(6), np.eye(3, 6)
     for k in range(count):
         if k:
             T, bias_jacobian = steps.duration[k - 1], steps.bias_jacobian[k - 1]
-            spin = exp_so3(-T * omega_in)
-            F[:3, :3], F[:3, 3:] = spin, 0.5 * spin @ C @ bias_jacobian
-            C = spin @ C @ exp_so3(-bias_jacobian @ xi) @ steps.turn[k - 1]
+            turn_of_n = exp_so3(-T * omega_in)
+            F[:3, :3], F[:3, 3:] = turn_of_n, 0.5 * turn_of_n @ C @ bias_jacobian
+            C = turn_of_n @ C @ exp_so3(-bias_jacobian @ xi) @ steps.turn[k - 1]
             P = F @ P @ F.T
             P[:3, :3] += 0.25 * steps.gyro_variance[k - 1] * eye
             P[3:, 3:] += walk * T * eye
             transition[k], predicted[k] = F, P
-            error = Rotation.from_matrix(C @ seen.nRb[k].T).as_quat()
+            error = Rotation.from_matrix(C @ attitudes.nRb[k].T).as_quat()
             z = error[:3] * np.sign(error[3])
-            K = np.linalg.solve(P[:3, :3] + noise[k], P[:3]).T
+            K, P = update(P, H, noise[k])
             x = K @ z
-            P = P - K @ P[:3]
-            P = 0.5 * (P + P.T)
             C, xi, correction[k] = exp_so3(-2.0 * x[:3]) @ C, xi + x[3:], x
         attitude[k], drifts[k], filtered[k] = C, xi, P
-    course = AttitudeTrack(seen.time, attitude, drifts, filtered)
-    return FilteredDrift(course, transition, predicted, correction)
+    track = AttitudeTrack(attitudes.time, attitude, drifts, filtered)
+    return ForwardPass(track, transition, predicted, correction)
 
 
-def smooth(filtered: FilteredDrift) -> AttitudeTrack:
+def smooth(forward: ForwardPass[AttitudeTrack]) -> AttitudeTrack:
     """Return attitude and drift given all attitudes of the arc (Rauch, Tung, Striebel)."""
-    course = filtered.course
-    error, smoothed = np.zeros_like(filtered.correction), course.covariance.copy()
-    for k in range(course.time.size - 2, -1, -1):
-        after = filtered.predicted[k + 1]
-        G = np.linalg.solve(after, filtered.transition[k + 1] @ course.covariance[k]).T
-        error[k] = G @ (filtered.correction[k + 1] + error[k + 1])
-        P = smoothed[k] + G @ (smoothed[k + 1] - after) @ G.T
-        smoothed[k] = 0.5 * (P + P.T)
-    return AttitudeTrack(
-        course.time,
-        exp_so3(-2.0 * error[:, :3]) @ course.nRb,
-        course.drift + error[:, 3:],
-        smoothed,
-    )
+    track = forward.track
+    error, covariance = smoothed_errors(forward)
+    nRb = exp_so3(-2.0 * error[:, :3]) @ track.nRb
+    return AttitudeTrack(track.time, nRb, track.drift + error[:, 3:], covariance)
 
 
 def attitude_at(
-    samples: StrapdownSamples, course: AttitudeTrack, lat: float, time: Array
+    samples: StrapdownSamples, track: AttitudeTrack, lat: float, time: Array
 ) -> tuple[Array, Array]:
-    """Return nRb and its covariance at times (M,) within a course, by the gyros in between.
+    """Return nRb and its covariance at times (M,) within a track, by the gyros in between.
 
     Returns
     -------
-    nRb : (M, 3, 3); covariance : (M, 3, 3) of phi in Exp(phi) nRb, rad².
+    nRb : ndarray, shape (M, 3, 3)
+        Body to n.
+    covariance : ndarray, shape (M, 3, 3), rad²
+        Of phi in Exp(phi) nRb.
     """
     omega_in = RATE * np.array([0.0, np.cos(lat), np.sin(lat)])
-    before = np.clip(np.searchsorted(course.time, time, side="right") - 1, 0, None)
-    step = compose(samples, course.time[before], time)
-    turned = exp_so3(-step.duration[:, None] * omega_in) @ course.nRb[before]
-    free = exp_so3(-rotate(step.bias_jacobian, course.drift[before]))
-    after = np.minimum(before + 1, course.time.size - 1)
-    span = np.maximum(course.time[after] - course.time[before], 1e-9)
-    part = ((time - course.time[before]) / span)[:, None, None]
-    P = course.covariance[:, :3, :3]
+    before = np.clip(np.searchsorted(track.time, time, side="right") - 1, 0, None)
+    step = compose(samples, track.time[before], time)
+    turned = exp_so3(-step.duration[:, None] * omega_in) @ track.nRb[before]
+    free = exp_so3(-rotate(step.bias_jacobian, track.drift[before]))
+    after = np.minimum(before + 1, track.time.size - 1)
+    span = np.maximum(track.time[after] - track.time[before], 1e-9)
+    part = ((time - track.time[before]) / span)[:, None, None]
+    P = track.covariance[:, :3, :3]
     return turned @ free @ step.turn, 4.0 * (P[before] + part * (P[after] - P[before]))
 
 
 def attitude_before(
-    samples: StrapdownSamples, course: AttitudeTrack, lat: float, time: float
+    samples: StrapdownSamples, track: AttitudeTrack, lat: float, time: float
 ) -> Array:
-    """Return nRb (3, 3) at a time before a course, in the same arc."""
+    """Return nRb (3, 3) at a time before a track, in the same arc."""
     omega_in = RATE * np.array([0.0, np.cos(lat), np.sin(lat)])
-    step = compose(samples, np.array([time]), course.time[:1])
-    moved = exp_so3(-step.bias_jacobian[0] @ course.drift[0]) @ step.turn[0]
-    return np.asarray(exp_so3(step.duration[0] * omega_in) @ course.nRb[0] @ moved.T)
+    step = compose(samples, np.array([time]), track.time[:1])
+    moved = exp_so3(-step.bias_jacobian[0] @ track.drift[0]) @ step.turn[0]
+    return np.asarray(exp_so3(step.duration[0] * omega_in) @ track.nRb[0] @ moved.T)

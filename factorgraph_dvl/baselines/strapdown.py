@@ -45,6 +45,7 @@ class Steps:
     Parameters
     ----------
     duration : ndarray, shape (M,), s
+        Of the steps.
     turn : ndarray, shape (M, 3, 3)
         Rotation, body axes at the end to those at the start.
     dv, dp : ndarray, shape (M, 3)

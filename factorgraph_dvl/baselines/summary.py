@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 
 import numpy as np
 
 from factorgraph_dvl.baselines.navigation import Navigation, NavigationMotion, motion_at
-from factorgraph_dvl.baselines.point_sets import Estimated, Outcome, Points, residuals
+from factorgraph_dvl.baselines.outcome import Estimated, Outcome
+from factorgraph_dvl.baselines.point_sets import Points, residuals
 from factorgraph_dvl.geometry.earth import radii
 from factorgraph_dvl.geometry.rotations import rph_from_rotation, rph_jacobian, wrapped
 from factorgraph_dvl.geometry.vectors import Array, rotate
@@ -27,6 +28,13 @@ from factorgraph_dvl.solution import (
 )
 from factorgraph_dvl.trial import Trial
 
+Progress = Callable[[str, int, float | None], None]
+
+WHITE_NOISE = (
+    "the error of the SINS/GNSS velocity is taken for white noise; it is correlated in time, so "
+    "the standard deviations of the DVL's parameters are too small"
+)
+
 
 def summarise(
     trial: Trial,
@@ -35,7 +43,7 @@ def summarise(
     *,
     aid: Aid,
     measured: Residuals,
-    seen: SensorMotion | None,
+    motion: SensorMotion | None,
     solver: str,
     rate_hz: float,
     notes: Sequence[str],
@@ -44,15 +52,24 @@ def summarise(
 
     Parameters
     ----------
-    trial, navigation, outcome : what was solved, and how it ended.
-    aid, measured, seen : the sensor that was calibrated, its residuals, and the motion at
-        its measurements.
+    trial : Trial
+        That was solved.
+    navigation : Navigation
+        Of SINS/GNSS.
+    outcome : Outcome
+        Of the calibrator.
+    aid : Aid
+        The sensor that was calibrated.
+    measured : Residuals
+        Of that sensor.
+    motion : Motion or None
+        At its measurements.
     solver : str
         Name.
     rate_hz : float
         Rate of the trajectory.
     notes : sequence of str
-        What is already known to be worth telling.
+        Warnings so far.
     """
     dvl_values, dvl_covariance = outcome.estimated.reported()
     imu = _imu_biases(trial, navigation)
@@ -69,7 +86,7 @@ def summarise(
         *notes,
         *contradicted,
         *consistency_warnings(estimates, all_residuals),
-        *_unobservable(aid, seen, estimates),
+        *_unobservable(aid, motion, estimates),
     ]
     return Solution(
         trial=trial.name,
@@ -129,7 +146,12 @@ def dvl_residuals(dvl: Dvl, navigation: Navigation, outcome: Outcome, points: Po
 
     Parameters
     ----------
-    dvl, navigation, outcome : what was calibrated against what, and how it ended.
+    dvl : Dvl
+        That was calibrated.
+    navigation : Navigation
+        Of SINS/GNSS.
+    outcome : Outcome
+        Of the calibrator.
     points : Points
         The point sets at the prior's time offset.
     """
@@ -192,17 +214,19 @@ def gnss_residuals(trial: Trial, navigation: Navigation) -> tuple[Residuals, ...
     return tuple(out)
 
 
-def _unobservable(aid: Aid, seen: SensorMotion | None, estimates: Sequence[Estimate]) -> list[str]:
+def _unobservable(
+    aid: Aid, motion: SensorMotion | None, estimates: Sequence[Estimate]
+) -> list[str]:
     """Say which components the data did not determine, and why."""
     own = {p.name for p in aid.parameters()}
     out = []
 
     def why(name: str, component: int) -> str:
         if name in own:
-            return aid.explain(name, component, seen)
+            return aid.explain(name, component, motion)
         return (
-            "the trial does not tell it better than the prior; it takes longer, or turns and "
-            "changes of speed"
+            "the data determine it no better than the prior; make the trial longer, or add "
+            "turns and changes of speed"
         )
 
     for e in estimates:
@@ -210,7 +234,7 @@ def _unobservable(aid: Aid, seen: SensorMotion | None, estimates: Sequence[Estim
     return out
 
 
-def as_sensors_see(at: Points | NavigationMotion) -> SensorMotion | None:
+def sensor_motion(at: Points | NavigationMotion) -> SensorMotion | None:
     """Return the motion at the pings, with the body's axes for n."""
     if at.time.size == 0:
         return None

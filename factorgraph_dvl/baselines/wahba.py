@@ -11,7 +11,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from factorgraph_dvl.baselines.point_sets import Estimated, Outcome, Points, prior_of
+from factorgraph_dvl.baselines.outcome import Estimated, Outcome, prior_of
+from factorgraph_dvl.baselines.point_sets import Points
 from factorgraph_dvl.geometry.rotations import best_rotation
 from factorgraph_dvl.geometry.vectors import Array, rotate, skew
 from factorgraph_dvl.sensors.parameters import Parameter

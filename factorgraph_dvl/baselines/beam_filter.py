@@ -2,7 +2,7 @@
 
 States: attitude error phi of SINS/GNSS (level axes, true nRb = Exp(phi) nRb), turns eta of
 the beams from their nominal directions, scale errors k, lever arm l; all constant but phi,
-whose smoothed error wanders about zero (first-order Gauss-Markov). Each beam that was
+a first-order Gauss-Markov process. Each beam that was
 received at a ping gives
 
     z_i = (1 + k_i) d_i(eta_i)^T (v_b + omega_b x l),    v_b = nRb^T (v_n + [v_n x] phi).
@@ -19,17 +19,20 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from factorgraph_dvl.baselines.kalman_filter import update
 from factorgraph_dvl.baselines.navigation import NavigationMotion
-from factorgraph_dvl.baselines.point_sets import Estimated, Outcome, prior_of, rows_of_history
+from factorgraph_dvl.baselines.outcome import Estimated, Outcome, history_rows, prior_of
 from factorgraph_dvl.baselines.spurious_information import widened
 from factorgraph_dvl.geometry.unit_vectors import turned, turned_jacobian
 from factorgraph_dvl.geometry.vectors import Array, skew
 from factorgraph_dvl.sensors.parameters import Parameter
 
-# Over this time, s, smoothed errors of the attitude are taken to forget themselves.
-_WANDER_S = 300.0
+# Chosen: correlation time of the smoothed errors of the attitude, s.
+_CORRELATION_TIME = 300.0
+# Chosen: passes over the data at most.
 _PASSES = 6
-_SETTLED = 0.05
+# Chosen: change from pass to pass, in standard deviations, at which the filter has converged.
+_CONVERGED = 0.05
 
 
 @dataclass(frozen=True)
@@ -39,11 +42,11 @@ class BeamPings:
     Parameters
     ----------
     motion : NavigationMotion
-        Smoothed.
+        Smoothed, at the pings.
     nominal_b : ndarray, shape (N, 3)
-        Directions that eta turns.
+        Nominal directions of the beams in body.
     measured, sigma : ndarray, shape (M, N)
-        m/s; nan where a beam was lost.
+        Radial velocities and their standard deviations, m/s; nan where a beam was lost.
     """
 
     motion: NavigationMotion
@@ -70,13 +73,14 @@ def beam_filter(pings: BeamPings, parameters: tuple[Parameter, ...]) -> Outcome:
     Parameters
     ----------
     pings : BeamPings
+        Radial velocities and motion.
     parameters : tuple of Parameter
         Directions, scale errors and lever arm, with their priors.
     """
     prior = prior_of(parameters)
     at = np.concatenate(prior.values)
     history: tuple[tuple[float, Estimated], ...] = ()
-    keep = set(rows_of_history(len(pings.measured)).tolist())
+    keep = set(history_rows(len(pings.measured)).tolist())
     converged = False
     for count in range(1, _PASSES + 1):
         states = _filter(pings, prior, at, keep if count == 1 else set())
@@ -88,7 +92,7 @@ def beam_filter(pings: BeamPings, parameters: tuple[Parameter, ...]) -> Outcome:
         _, x, P = states[-1]
         moved = np.abs(x - at) / np.sqrt(np.maximum(np.diag(P), 1e-30))
         at = x
-        converged = float(moved[np.diag(P) > 0.0].max(initial=0.0)) <= _SETTLED
+        converged = float(moved[np.diag(P) > 0.0].max(initial=0.0)) <= _CONVERGED
         if converged:
             break
     return Outcome(_estimated(parameters, at, P), count, history, converged=converged)
@@ -107,7 +111,7 @@ def beam_residuals(pings: BeamPings, estimated: Estimated) -> tuple[Array, Array
 
 
 def without_spurious_information(pings: BeamPings, estimated: Estimated) -> Estimated:
-    """Return the estimate, wider where only noise of the motion told directions and scales."""
+    """Return the estimate, wider where its information on directions and scales is spurious."""
     if not len(pings.measured):
         return estimated
     at = np.concatenate(estimated.values)
@@ -151,8 +155,8 @@ def _filter(
         P[:3, :3] = wander[0]
     for k in range(time.size):
         if k:
-            # Between pings phi fades, and what it loses in variance comes back as noise.
-            fade = np.exp(-(time[k] - time[k - 1]) / _WANDER_S)
+            # The noise of the process keeps the variance of phi.
+            fade = np.exp(-(time[k] - time[k - 1]) / _CORRELATION_TIME)
             x[:3] *= fade
             P[:3] *= fade
             P[:, :3] *= fade
@@ -160,13 +164,8 @@ def _filter(
         valid = ~np.isnan(pings.measured[k])
         H = linear.by_state[k, valid]
         innovation = pings.measured[k, valid] - linear.predicted[k, valid] - H @ (x - origin)
-        PH = P @ H.T
-        S = H @ PH
-        S.flat[:: len(S) + 1] += linear.variance[k, valid]
-        K = np.linalg.solve(S, PH.T).T
+        K, P = update(P, H, linear.variance[k, valid])
         x = x + K @ innovation
-        P = P - K @ PH.T
-        P = 0.5 * (P + P.T)
         if k in keep:
             out.append((k, x[3:].copy(), P[3:, 3:].copy()))
     out.append((time.size, x[3:], P[3:, 3:]))

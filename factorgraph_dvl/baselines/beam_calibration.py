@@ -1,0 +1,80 @@
+"""From a trial to a solution by the filter of single beams."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from factorgraph_dvl.baselines.beam_filter import (
+    BeamPings,
+    beam_filter,
+    beam_residuals,
+    without_spurious_information,
+)
+from factorgraph_dvl.baselines.navigation import motion_at, navigate
+from factorgraph_dvl.baselines.outcome import Outcome
+from factorgraph_dvl.baselines.summary import WHITE_NOISE, Progress, sensor_motion, summarise
+from factorgraph_dvl.errors import ConfigError, DataError
+from factorgraph_dvl.solution import Residuals, Solution
+from factorgraph_dvl.trial import Trial
+
+
+def calibrate_beams(trial: Trial, *, rate_hz: float, report: Progress) -> tuple[Solution, Outcome]:
+    """Calibrate single beams against the velocity of SINS/GNSS.
+
+    Parameters
+    ----------
+    trial : Trial
+        With IMU, GNSS and beams.
+    rate_hz : float
+        Rate of the trajectory in the solution.
+    report : callable
+        Called with stage, iteration and cost.
+
+    Raises
+    ------
+    ConfigError, DataError
+        If the trial has no beams, or a parametrisation other than single beams.
+    """
+    sensor = trial.beams
+    if sensor is None:
+        raise DataError(
+            "the trial has no beams", where="trial.yaml", expected="a dvl_beams section"
+        )
+    if sensor.settings.parametrisation != "beams":
+        raise ConfigError(
+            "the filter estimates every beam on its own",
+            where="trial.yaml dvl_beams.parametrisation",
+            expected="beams",
+            hint="For a common misalignment and scale take another --method",
+        )
+    report("SINS/GNSS", 0, None)
+    received = np.logical_not(sensor.missing)
+    navigation = navigate(trial, sensor.time[received])
+    report("beams", 0, None)
+    covered = motion_at(navigation, sensor.time).covered
+    used = received & covered
+    motion = motion_at(navigation, sensor.time[used])
+    pings = BeamPings(motion, sensor.nominal_b, sensor.velocity[used], sensor.sigma()[used])
+    outcome = beam_filter(pings, sensor.parameters())
+    report("summary", 0, None)
+    outcome = replace(outcome, estimated=without_spurious_information(pings, outcome.estimated))
+    residual, sigma = beam_residuals(pings, outcome.estimated)
+    components = tuple(f"beam {i}" for i in range(1, residual.shape[1] + 1))
+    notes = [*navigation.notes, WHITE_NOISE]
+    unused = int(np.sum(received & ~covered))
+    if unused:
+        notes.append(f"{sensor.label}: {unused} pings at times without SINS/GNSS were not used")
+    solution = summarise(
+        trial,
+        navigation,
+        outcome,
+        aid=sensor,
+        measured=Residuals("Beam velocity", "m/s", components, motion.time, residual, sigma),
+        motion=sensor_motion(motion),
+        solver="kalman-beams",
+        rate_hz=rate_hz,
+        notes=notes,
+    )
+    return solution, outcome
