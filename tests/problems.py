@@ -12,7 +12,7 @@ from factorgraph_dvl.geometry.rotations import (
     exp_so3,
 )
 from factorgraph_dvl.graph.inertial_chain import inertial_chain
-from factorgraph_dvl.graph.problem import Problem
+from factorgraph_dvl.graph.problem import Problem, observed
 from factorgraph_dvl.imu.increments import increments
 from factorgraph_dvl.imu.preintegration import segments
 from factorgraph_dvl.simulation import simulate
@@ -42,8 +42,7 @@ def problem_of(scene, trial=None):
     seg = segments(inc, 1.0)
     states = exact_states(scene, frame, seg.node_time)
     chain = inertial_chain(trial, frame, seg, states)
-    observations = [o for aid in trial.aids for o in aid.observations(frame)]
-    parameters = [p for aid in trial.aids for p in aid.parameters()]
+    observations, parameters = observed(trial.aids, frame)
     prior = Problem(chain, observations, parameters)
     rng = np.random.default_rng(0)
     n = seg.node_time.size

@@ -21,6 +21,7 @@ from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph import keys
 from factorgraph_dvl.imu.preintegration import Segments, preintegrate
 from factorgraph_dvl.imu.propagation import States
+from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.trial import Trial
 
 # Bounds, not knowledge: they keep an unaided chain from being singular.
@@ -45,23 +46,26 @@ class Chain:
 
     Parameters
     ----------
-    trial, frame, segments : what it was made from.
-    gravity_n : ndarray, shape (S, 3), m/s²
-        Along the segments.
+    frame : LocalFrame
+        Tangent frame n.
+    segments : Segments
+        Increments of the IMU between the nodes.
+    gravity_n : ndarray, shape (S, 3)
+        `LocalFrame.gravity_without_rotation` along the segments, m/s².
+    biases : tuple of (Parameter, Parameter)
+        Gyro and accelerometer bias, as their mean over the trial is reported.
+    walking : bool
+        Whether every node has a bias of its own.
     graph : gtsam.NonlinearFactorGraph
         IMU factors, walks of the biases, priors of states and biases.
     """
 
-    trial: Trial
     frame: LocalFrame
     segments: Segments
     gravity_n: Array
+    biases: tuple[Parameter, Parameter]
+    walking: bool
     graph: gtsam.NonlinearFactorGraph
-
-    @property
-    def walking(self) -> bool:
-        """Whether every node has a bias of its own."""
-        return self.trial.imu.settings.bias_walks
 
     def bias_key(self, k: int) -> int:
         """Return the key of the bias at node k."""
@@ -76,7 +80,8 @@ def inertial_chain(
     gravity_n = frame.gravity_without_rotation(middle)
     settings = trial.imu.settings
     graph = gtsam.NonlinearFactorGraph()
-    chain = Chain(trial, frame, seg, gravity_n, graph)
+    biases = trial.imu.parameters(float(seg.duration.sum()))
+    chain = Chain(frame, seg, gravity_n, biases, settings.bias_walks, graph)
     pims = preintegrate(seg, settings, gravity_n, frame.earth_rate)
     for k, pim in zip(seg.origin.tolist(), pims, strict=True):
         graph.add(gtsam.GalileanImuFactor2(keys.node(k), keys.node(k + 1), chain.bias_key(k), pim))

@@ -17,6 +17,7 @@ from functools import cached_property
 import gtsam
 import numpy as np
 
+from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.rotations import exp_so3
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph import keys
@@ -36,12 +37,12 @@ from factorgraph_dvl.imu.propagation import (
     Attachment,
     States,
     Transition,
-    attach,
+    attach_inside,
     extrapolated,
     motion_at,
 )
 from factorgraph_dvl.sensors.parameters import Parameter
-from factorgraph_dvl.sensors.protocol import Linearization, Motion, Observation
+from factorgraph_dvl.sensors.protocol import Aid, Linearization, Motion, Observation
 
 # Standard deviation that stands for zero in a held direction, in those of the prior.
 FIXED_DIRECTION_STD = 1e-4
@@ -107,6 +108,14 @@ class Evaluation:
     cost: float
 
 
+def observed(
+    aids: Sequence[Aid], frame: LocalFrame
+) -> tuple[tuple[Observation, ...], tuple[Parameter, ...]]:
+    """Return the measurements and the calibration parameters of aiding sensors."""
+    observations = tuple(o for aid in aids for o in aid.observations(frame))
+    return observations, tuple(p for aid in aids for p in aid.parameters())
+
+
 class Problem:
     """A chain with aiding sensors: what a solver minimises.
 
@@ -119,7 +128,7 @@ class Problem:
         Of the aiding sensors, fixed ones included.
     start : dict of str to ndarray, optional
         Values of parameters, where they are known better than by their priors.
-    known : ConstantsPrior, optional
+    constants_prior : ConstantsPrior, optional
         What stands in place of the priors; the chain then has none of the biases.
     """
 
@@ -129,7 +138,7 @@ class Problem:
         observations: Sequence[Observation],
         parameters: Sequence[Parameter],
         start: dict[str, Array] | None = None,
-        known: ConstantsPrior | None = None,
+        constants_prior: ConstantsPrior | None = None,
     ) -> None:
         self.chain = chain
         self.all_parameters = tuple(parameters)
@@ -139,11 +148,11 @@ class Problem:
         }
         self._fixed = {p.name: prior_mean(p) for p in parameters if not p.estimated}
         self.graph = gtsam.NonlinearFactorGraph(chain.graph)
-        if known is None:
+        if constants_prior is None:
             add_priors(self.graph, self.parameters, self._key)
         else:
             self.graph.add(
-                joint_linear_prior(known, chain.bias_key(0), self.parameters, self._key)
+                joint_linear_prior(constants_prior, chain.bias_key(0), self.parameters, self._key)
             )
         self.uncovered: dict[str, int] = {}
         self.rejected: Mapping[str, Array] = {}
@@ -372,7 +381,9 @@ class Problem:
         for other in self._bound:
             if np.array_equal(other.time, time):
                 return _Bound(observation, other.attachment, time, weight)
-        return _Bound(observation, self._attach(time), time, weight)
+        at, _ = attach_inside(self.chain.segments, time, self.chain.frame.earth_rate)
+        # Times that are not covered weigh nothing; they only need a place on the chain.
+        return _Bound(observation, at, time, weight)
 
     def _prior_sigma(self) -> Array:
         """Return the standard deviations of the priors of all estimated parameters, (P,), SI."""
@@ -381,15 +392,6 @@ class Problem:
     def needs_rebinding(self, parameters: dict[str, Array]) -> bool:
         """Whether a time offset has moved measurements too far from where they were bound."""
         return any(abs(self._late(b, parameters)) > _SAME_TIME for b in self._bound)
-
-    def _attach(self, time: Array) -> Attachment:
-        seg = self.chain.segments
-        index, since, covered = seg.increments.locate(time)
-        if not covered.all():
-            # They weigh nothing; they only need a place on the chain.
-            inside = np.clip(since, 0.0, seg.increments.dt[index])
-            time = np.where(covered, time, seg.increments.start[index] + inside)
-        return attach(seg, time, self.chain.frame.earth_rate)
 
     def _late(self, bound: _Bound, parameters: dict[str, Array]) -> float:
         """Return by how much a time offset has moved measurements since they were bound, s."""

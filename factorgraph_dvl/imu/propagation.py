@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 
 from factorgraph_dvl.geometry.rotations import exp_so3
 from factorgraph_dvl.geometry.vectors import Array, cross, rotate, skew
@@ -80,6 +81,16 @@ def attach(seg: Segments, time: Array, earth_rate_n: Array) -> Attachment:
     inside = np.clip(index, seg.first[0], seg.last[-1] - 1)
     since = np.where(inside == index, since, time - seg.increments.start[inside])
     return _attach(seg, inside, since, earth_rate_n)
+
+
+def attach_inside(
+    seg: Segments, time: Array, earth_rate_n: Array
+) -> tuple[Attachment, NDArray[np.bool_]]:
+    """Attach times (M,) to the chain where it is nearest, and tell which it covers."""
+    inc = seg.increments
+    index, since, covered = inc.locate(time)
+    nearest = inc.start[index] + np.clip(since, 0.0, inc.dt[index])
+    return attach(seg, np.where(covered, time, nearest), earth_rate_n), covered
 
 
 def segment_ends(seg: Segments, earth_rate_n: Array) -> Attachment:

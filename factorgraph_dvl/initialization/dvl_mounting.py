@@ -8,12 +8,11 @@ misalignment that is 180 degrees off is a local minimum.
 
 from __future__ import annotations
 
-from collections import ChainMap
 from collections.abc import Callable
 from dataclasses import dataclass
-from itertools import product
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from factorgraph_dvl.geometry.rotations import (
@@ -24,7 +23,6 @@ from factorgraph_dvl.geometry.rotations import (
 )
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array, rotate, skew
-from factorgraph_dvl.sensors.beam_geometry import as_dvl
 from factorgraph_dvl.sensors.dvl import (
     BIAS,
     LEVER_ARM,
@@ -35,7 +33,6 @@ from factorgraph_dvl.sensors.dvl import (
 )
 from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.sensors.protocol import Motion
-from factorgraph_dvl.trial import Trial
 
 # Error of the velocity that comes from IMU and GNSS, m/s.
 _VELOCITY_ERROR = 0.03
@@ -71,41 +68,7 @@ class _Mounting:
     bias: Array
 
 
-MotionAt = Callable[[np.ndarray, Array], tuple[Motion, np.ndarray]]
-
-
-def initial_values(trial: Trial, motion_at: MotionAt) -> list[dict[str, Array]]:
-    """Return values of parameters to start from, where the priors are not good enough.
-
-    The best first, then rivals: other local minima. Beams with directions of their own are
-    near enough to the nominal ones.
-
-    Parameters
-    ----------
-    trial : Trial
-        Its DVL, and beams with a common mounting.
-    motion_at : MotionAt
-        As for `initial_mounting`.
-    """
-    beams = trial.beams
-    common = beams is not None and beams.settings.parametrisation == "common"
-    logs: list[list[dict[str, Array]]] = []
-    if trial.dvl is not None and not calibrated(trial.dvl):
-        logs.append(initial_mountings(trial.dvl, motion_at))
-    if beams is not None and common:
-        logs.append(
-            [
-                {p.name: found[p.name.removeprefix(beams.prefix)] for p in beams.parameters()}
-                for found in initial_mountings(as_dvl(beams), motion_at)
-            ]
-        )
-    return [dict(ChainMap(*each)) for each in product(*logs)]
-
-
-def calibrated(dvl: Dvl) -> bool:
-    """Whether an earlier calibration knows all of the mounting that is to be estimated."""
-    free = [p for p in dvl.parameters() if p.estimated]
-    return any(p.joint for p in free) and all(p.joint or not p.rotation for p in free)
+MotionAt = Callable[[Array], tuple[Motion, NDArray[np.bool_]]]
 
 
 def initial_mountings(dvl: Dvl, motion_at: MotionAt) -> list[dict[str, Array]]:
@@ -116,9 +79,9 @@ def initial_mountings(dvl: Dvl, motion_at: MotionAt) -> list[dict[str, Array]]:
     Parameters
     ----------
     dvl : Dvl
-    motion_at : MotionAt
-        Returns motion, and which are covered, at given times (M,) of the pings with a lock whose
-        indices are given.
+        Its record and its priors.
+    motion_at : callable
+        Returns the motion at times (M,), s, and at which of them it is known.
     """
     priors = {p.name: p for p in dvl.parameters()}
     values = {p.name: exp_so3(p.mean) if p.rotation else p.mean for p in priors.values()}
@@ -129,7 +92,7 @@ def initial_mountings(dvl: Dvl, motion_at: MotionAt) -> list[dict[str, Array]]:
     sigma = np.hypot(dvl.sigma()[pings], _VELOCITY_ERROR)
 
     def moments(offset: float) -> _Moments:
-        motion, covered = motion_at(pings, dvl.time[pings] - offset)
+        motion, covered = motion_at(dvl.time[pings] - offset)
         v_b = rotate(motion.nRb.transpose(0, 2, 1), motion.v_n)
         x = np.hstack([v_b, motion.omega_eb_b, np.ones((pings.size, 1))])
         weight = covered / (sigma**2).mean(axis=1)

@@ -8,6 +8,7 @@ import gtsam
 import numpy as np
 
 from factorgraph_dvl.geometry.earth import LocalFrame
+from factorgraph_dvl.geometry.rotations import BodyAxes
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph import keys
@@ -17,10 +18,10 @@ from factorgraph_dvl.imu.propagation import States
 from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.sensors.protocol import AttitudeAid
 from factorgraph_dvl.solution import Trajectory
-from factorgraph_dvl.solvers.batch import fit
+from factorgraph_dvl.solvers.batch import settled_minimum
 from factorgraph_dvl.solvers.levenberg_marquardt import Progress
 from factorgraph_dvl.solvers.posterior import posterior
-from factorgraph_dvl.solvers.state_times import STATE_INTERVAL, needs_states
+from factorgraph_dvl.solvers.state_times import needs_states
 from factorgraph_dvl.solvers.trajectory import EPOCH_ROUNDING, TRAJECTORY_RATE, trajectory_between
 from factorgraph_dvl.statistics.spurious_information import spurious_information
 from factorgraph_dvl.trial import Trial
@@ -116,9 +117,8 @@ def begin(
     DataError, SolveError
         If the data collected so far cannot be solved.
     """
-    problem, minimum, notes, start_positions = fit(
-        trial, state_interval_s=STATE_INTERVAL, progress=progress, known=known
-    )
+    settled, start_positions = settled_minimum(trial, progress=progress, constants_prior=known)
+    problem, minimum = settled.problem, settled.minimum
     if len(start_positions.states) > 1:
         return (
             f"{len(start_positions.states)} trajectories fit the ranges; a turn of 30 degrees or "
@@ -168,18 +168,22 @@ def begin(
         windows=problem.chain.segments.increments.chosen_windows,
         spurious=spurious,
         walking=problem.chain.walking,
-        trajectory=_trajectory(problem, evaluation.states, covariances.nodes, since),
-        notes=notes,
+        trajectory=_trajectory(
+            problem, evaluation.states, covariances.nodes, trial.body_axes, since
+        ),
+        notes=settled.notes,
         misfit=_misfit(problem, evaluation),
     )
 
 
-def _trajectory(problem: Problem, states: States, P: Array, since: float) -> Trajectory:
+def _trajectory(
+    problem: Problem, states: States, P: Array, body_axes: BodyAxes, since: float
+) -> Trajectory:
     chain = problem.chain
     time = chain.segments.increments.ticks(TRAJECTORY_RATE)
     time = time[time * TRAJECTORY_RATE > since * TRAJECTORY_RATE + EPOCH_ROUNDING]
     return trajectory_between(
-        chain.segments, states, P, chain.gravity_n, chain.frame, chain.trial.body_axes, time
+        chain.segments, states, P, chain.gravity_n, chain.frame, body_axes, time
     )
 
 

@@ -24,10 +24,11 @@ from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph import keys
 from factorgraph_dvl.graph.problem import FIXED_DIRECTION_STD, Evaluation, Problem
 from factorgraph_dvl.solution import Solution
-from factorgraph_dvl.solvers.batch import solution_of, solved_problem
+from factorgraph_dvl.solvers.batch import solved_problem
+from factorgraph_dvl.solvers.calibration import prior_along, reported
+from factorgraph_dvl.solvers.fixed_directions import SolvedProblem
 from factorgraph_dvl.solvers.levenberg_marquardt import Progress
-from factorgraph_dvl.solvers.posterior import Posterior
-from factorgraph_dvl.solvers.summary import prior_along, reported
+from factorgraph_dvl.solvers.summary import summarise
 from factorgraph_dvl.statistics.information_history import InformationHistory
 from factorgraph_dvl.statistics.spurious_information import (
     SPURIOUS,
@@ -83,33 +84,20 @@ def solve_with_history(
     found = solved_problem(trial, progress=progress)
     if progress:
         progress("information along the trial", 0, None)
-    history = information_history(
-        found.problem, found.minimum.evaluation, found.held, found.covariances
-    )
-    return solution_of(found, RATE_HZ), history
+    return summarise(trial, found, rate_hz=RATE_HZ), information_history(found)
 
 
-def information_history(
-    problem: Problem, evaluation: Evaluation, held: Array, covariances: Posterior
-) -> InformationHistory:
+def information_history(found: SolvedProblem) -> InformationHistory:
     """Return the covariance of all constants given the data up to each node.
 
-    Information that only the noise of the motion feigns is no more believed half-way than
-    it is at the end: where it prevails, a direction stays at its prior.
-
-    Parameters
-    ----------
-    problem, evaluation : Problem or Evaluation
-        Linearised there.
-    held : ndarray, shape (P, h)
-        Directions of the parameters that the problem holds, as `feigned_directions` returns them:
-        they stay at the prior all the time.
-    covariances : Posterior
-        Of the held problem.
+    Information that only the noise of the motion makes is no more believed half-way than it
+    is at the end: where it prevails, a direction stays at its prior. Directions that are
+    fixed in the problem stay there all the time.
     """
+    problem, evaluation = found.problem, found.minimum.evaluation
     triangles, _ = run_filter(problem, evaluation)
-    undetermined = _undetermined(problem, evaluation, covariances.given, triangles)
-    return as_history(problem, evaluation, held, triangles, undetermined)
+    undetermined = _undetermined(problem, evaluation, found.covariances.given, triangles)
+    return as_history(problem, evaluation, found.fixed, triangles, undetermined)
 
 
 def _undetermined(

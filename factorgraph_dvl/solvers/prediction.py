@@ -4,23 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+import gtsam
 import numpy as np
 
 from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph.inertial_chain import inertial_chain
-from factorgraph_dvl.graph.problem import Evaluation, Problem
+from factorgraph_dvl.graph.problem import Evaluation, Problem, observed
 from factorgraph_dvl.imu.increments import increments
 from factorgraph_dvl.imu.preintegration import segments
 from factorgraph_dvl.imu.propagation import States
 from factorgraph_dvl.solution import Solution
-from factorgraph_dvl.solvers.batch import SolvedProblem, solution_of
+from factorgraph_dvl.solvers.fixed_directions import with_covariances
 from factorgraph_dvl.solvers.information_history import RATE_HZ, Frontier, as_history, run_filter
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, eliminate
-from factorgraph_dvl.solvers.posterior import changes_with, considered, posterior
 from factorgraph_dvl.solvers.state_times import STATE_INTERVAL, dense_epochs
+from factorgraph_dvl.solvers.summary import summarise
 from factorgraph_dvl.statistics.information_history import InformationHistory
-from factorgraph_dvl.statistics.spurious_information import data_information, parameter_information
 from factorgraph_dvl.trial import Trial
 
 TrueStates = Callable[[LocalFrame, Array], States]
@@ -45,23 +45,18 @@ def predict_posterior(
     """
     problem, evaluation = _at_truth(trial, true_states)
     triangles, frontier = run_filter(problem, evaluation)
-    minimum = _minimum(problem, evaluation)
-    covariances = posterior(problem, minimum)
-    told = data_information(
-        problem, evaluation, covariances.parameters, covariances.given, at_truth=True
+
+    def linearised_at(values: gtsam.Values) -> Minimum:
+        return _minimum(problem, problem.evaluate(values))
+
+    found = with_covariances(
+        problem, _minimum(problem, evaluation), linearised_at, notes=trial.notes, at_truth=True
     )
-    held = told.undetermined_directions()
-    if held.size:
-        full = parameter_information(problem, evaluation)
-        changes = changes_with(covariances, held, told.coupled(held, full))
-        problem.fix_directions(held, evaluation.parameters)
-        evaluation = problem.evaluate(evaluation.values)
-        minimum = _minimum(problem, evaluation)
-        covariances = considered(posterior(problem, minimum), changes)
+    evaluation = found.minimum.evaluation
+    if found.fixed.size:
         triangles, _ = run_filter(problem, evaluation)
-    found = SolvedProblem(problem, minimum, covariances, held, trial.notes)
-    history = as_history(problem, evaluation, held, triangles, {})
-    return solution_of(found, RATE_HZ), history, frontier
+    history = as_history(problem, evaluation, found.fixed, triangles, {})
+    return summarise(trial, found, rate_hz=RATE_HZ), history, frontier
 
 
 def continue_posterior(
@@ -78,8 +73,8 @@ def continue_posterior(
     """
     problem, evaluation = _at_truth(trial, true_states)
     triangles, frontier = run_filter(problem, evaluation, start)
-    nothing_held = np.zeros((len(problem.prior_root), 0))
-    return as_history(problem, evaluation, nothing_held, triangles[-1:], {}), frontier
+    none_fixed = np.zeros((len(problem.prior_root), 0))
+    return as_history(problem, evaluation, none_fixed, triangles[-1:], {}), frontier
 
 
 def _at_truth(trial: Trial, true_states: TrueStates) -> tuple[Problem, Evaluation]:
@@ -88,8 +83,7 @@ def _at_truth(trial: Trial, true_states: TrueStates) -> tuple[Problem, Evaluatio
     seg = segments(inc, STATE_INTERVAL, dense_epochs(trial, frame, STATE_INTERVAL))
     states = true_states(frame, seg.node_time)
     chain = inertial_chain(trial, frame, seg, states)
-    observations = [o for aid in trial.aids for o in aid.observations(frame)]
-    parameters = [p for aid in trial.aids for p in aid.parameters()]
+    observations, parameters = observed(trial.aids, frame)
     truth: dict[str, Array] = {}
     for p in parameters:
         value = trial.calibration_truth.get(p.name)

@@ -1,18 +1,14 @@
-"""From a minimum to a solution: covariances, reported parametrisation, warnings."""
+"""From a minimum to a solution: calibration, trajectory, residuals, warnings."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import fields
 from functools import partial
 
 import numpy as np
 
-from factorgraph_dvl.geometry.vectors import Array
-from factorgraph_dvl.graph import keys
-from factorgraph_dvl.graph.problem import Evaluation, Problem
-from factorgraph_dvl.imu.preintegration import Segments
-from factorgraph_dvl.sensors.parameters import Parameter
+from factorgraph_dvl.graph.problem import Problem
 from factorgraph_dvl.sensors.protocol import Motion
 from factorgraph_dvl.solution import (
     Estimate,
@@ -22,42 +18,32 @@ from factorgraph_dvl.solution import (
     mostly_rejected,
     not_observable,
 )
+from factorgraph_dvl.solvers.calibration import calibration
+from factorgraph_dvl.solvers.fixed_directions import SolvedProblem
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum
-from factorgraph_dvl.solvers.posterior import Posterior
-from factorgraph_dvl.solvers.reported import estimates_of, in_order, in_unit
 from factorgraph_dvl.solvers.trajectory import trajectory_between
+from factorgraph_dvl.trial import Trial
 
 
-def summarise(
-    problem: Problem,
-    minimum: Minimum,
-    covariances: Posterior,
-    *,
-    held: Array,
-    rate_hz: float,
-    notes: Sequence[str],
-) -> Solution:
+def summarise(trial: Trial, found: SolvedProblem, *, rate_hz: float) -> Solution:
     """Return the solution at a minimum.
 
     Parameters
     ----------
-    problem, minimum, covariances : what was minimised, and where it ended.
-    held : ndarray, shape (P, h)
-        Directions of the parameters in which the prior was held because the data say nothing, as
-        `feigned_directions` returns them.
+    trial : Trial
+        What was solved.
+    found : SolvedProblem
+        Its problem at the minimum, with covariances.
     rate_hz : float
-        Rate of the trajectory.
-    notes : sequence of str
-        What is already known to be worth telling.
+        Rate of the trajectory, Hz.
     """
-    chain = problem.chain
-    trial = chain.trial
+    problem, minimum, chain = found.problem, found.minimum, found.problem.chain
     evaluation = minimum.evaluation
-    estimates, covariance = calibration(problem, evaluation, covariances, held)
+    estimates, covariance = calibration(found)
     trajectory = trajectory_between(
         chain.segments,
         evaluation.states,
-        covariances.nodes,
+        found.covariances.nodes,
         chain.gravity_n,
         chain.frame,
         trial.body_axes,
@@ -65,7 +51,7 @@ def summarise(
     )
     residuals = _residuals(problem, minimum)
     rejected = _rejected(problem, minimum)
-    warnings = [*notes]
+    warnings = [*found.notes]
     if not minimum.converged:
         warnings.append(
             f"the solver did not converge in {minimum.iterations} iterations: not to be used"
@@ -74,7 +60,7 @@ def summarise(
         warnings.append(f"{label}: {count} measurements at times without IMU data were not used")
     warnings += consistency_warnings(estimates, residuals)
     warnings += mostly_rejected(residuals, rejected)
-    warnings += _unobservable(problem, estimates, evaluation.motions)
+    warnings += _unobservable(trial, problem, estimates, evaluation.motions)
     return Solution(
         trial=trial.name,
         solver="batch",
@@ -90,99 +76,6 @@ def summarise(
         warnings=tuple(warnings),
         rejected=rejected,
     )
-
-
-def reported(
-    problem: Problem, evaluation: Evaluation
-) -> list[tuple[Parameter, Array, dict[int, Array] | None]]:
-    """Return all calibration parameters in the order in which they are reported.
-
-    Each with its value in reported units and the derivatives of that with respect to the
-    variables of the graph, by key; None for one that is fixed.
-    """
-    chain = problem.chain
-    seg = chain.segments
-    weight = _mean_weights(seg)
-    gyro, accel = chain.trial.imu.parameters(float(seg.duration.sum()))
-    states = evaluation.states
-    rows: list[tuple[Parameter, Array, dict[int, Array] | None]] = []
-    for parameter, bias, first in ((gyro, states.gyro_bias, 3), (accel, states.accel_bias, 0)):
-        select = np.eye(6)[first : first + 3] / parameter.si
-        functional = (
-            {keys.bias(k): w * select for k, w in enumerate(weight)}
-            if chain.walking
-            else {keys.bias(0): select}
-        )
-        rows.append((parameter, weight @ bias / parameter.si, functional))
-    for p in problem.all_parameters:
-        row = in_unit(p, evaluation.parameters[p.name])
-        own = {problem.key(p.name): row.derivative} if p.estimated else None
-        rows.append((p, row.value, own))
-    return in_order(rows, lambda r: r[0])
-
-
-def calibration(
-    problem: Problem, evaluation: Evaluation, covariances: Posterior, held: Array
-) -> tuple[tuple[Estimate, ...], Array]:
-    """Return the calibration with its joint covariance, in reported units.
-
-    Parameters
-    ----------
-    problem, evaluation, covariances : at the minimum.
-    held : ndarray
-        As of `summarise`.
-    """
-    rows = reported(problem, evaluation)
-    free = [f for _, _, f in rows if f is not None]
-    joint = covariances.information.covariance_of(free)
-    spread = prior_along(problem, held, free, covariances.considered)
-    if covariances.considered:
-        # Linear over a hundred degrees, a bias would change by more than its prior allows.
-        prior = np.concatenate([p.sigma / p.si for p, _, f in rows if f is not None])
-        room = np.sqrt(np.maximum(prior**2 - np.diag(joint), 0.0))
-        size = np.maximum(np.linalg.norm(spread, axis=1), room)
-        own = np.concatenate(
-            [np.full(p.mean.size, p.name in problem.columns) for p, _, f in rows if f is not None]
-        )
-        spread *= np.where(own, 1.0, room / np.maximum(size, np.finfo(float).tiny))[:, None]
-    joint = joint + spread @ spread.T
-    return estimates_of([(p, value) for p, value, _ in rows], joint)
-
-
-def prior_along(
-    problem: Problem,
-    held: Array,
-    functionals: Sequence[dict[int, Array]],
-    considered: Mapping[int, Array],
-) -> Array:
-    """Return a root (n, h) of the prior covariance of functionals along held directions.
-
-    Parameters
-    ----------
-    problem, held, functionals : of what.
-    considered : mapping of int to ndarray
-        Change of other variables with the directions, as of `Posterior`.
-    """
-    spread = problem.prior_root @ held
-    by_key = {problem.key(name): spread[place] for name, place in problem.columns.items()}
-    by_key |= considered
-    parts = []
-    for functional in functionals:
-        rows = next(iter(functional.values())).shape[0]
-        part = np.zeros((rows, held.shape[1]))
-        for key, matrix in functional.items():
-            if key in by_key:
-                part += matrix @ by_key[key]
-        parts.append(part)
-    return np.concatenate(parts)
-
-
-def _mean_weights(seg: Segments) -> Array:
-    """Return weights of the nodes in the mean over the time that the IMU recorded."""
-    weight = np.zeros(seg.node_time.size)
-    weight[seg.origin] += seg.duration
-    weight[seg.origin + 1] += seg.duration
-    return np.asarray(weight / weight.sum())
 
 
 def _residuals(problem: Problem, minimum: Minimum) -> tuple[Residuals, ...]:
@@ -222,10 +115,9 @@ def _subset(motion: Motion, used: np.ndarray) -> Motion:
 
 
 def _unobservable(
-    problem: Problem, estimates: Sequence[Estimate], motions: Sequence[Motion]
+    trial: Trial, problem: Problem, estimates: Sequence[Estimate], motions: Sequence[Motion]
 ) -> list[str]:
     """Say which components the data did not determine, and why."""
-    trial = problem.chain.trial
     by_name = {p.name: aid for aid in trial.aids for p in aid.parameters()}
     seen = {
         name: _subset(motion, np.any(weight > 0.0, axis=1))

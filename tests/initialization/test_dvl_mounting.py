@@ -12,7 +12,7 @@ from factorgraph_dvl.geometry.rotations import exp_so3, log_so3
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.imu.increments import increments
 from factorgraph_dvl.imu.preintegration import segments
-from factorgraph_dvl.imu.propagation import attach, motion_at
+from factorgraph_dvl.imu.propagation import attach_inside, motion_at
 from factorgraph_dvl.initialization.dvl_mounting import initial_mountings
 from factorgraph_dvl.simulation import simulate
 
@@ -28,11 +28,8 @@ def mounting_of(scene, *, waver=0.0, seed=1):
     states = replace(states, v_n=states.v_n + waver * noise)
     gravity_n = frame.gravity_without_rotation(states.p_n[seg.origin])
 
-    def motion(pings, time):
-        assert pings.shape == time.shape
-        index, since, covered = inc.locate(time)
-        inside = inc.start[index] + np.clip(since, 0.0, inc.dt[index])
-        at = attach(seg, np.where(covered, time, inside), frame.earth_rate)
+    def motion(time):
+        at, covered = attach_inside(seg, time, frame.earth_rate)
         return motion_at(at, states, gravity_n, frame.earth_rate), covered
 
     return initial_mountings(trial.dvl, motion)[0]

@@ -17,7 +17,7 @@ from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.graph.problem import Problem
 from factorgraph_dvl.simulation import simulate
 from factorgraph_dvl.solution import not_told_apart
-from factorgraph_dvl.solvers import batch
+from factorgraph_dvl.solvers import minima
 from factorgraph_dvl.solvers.batch import solve
 from factorgraph_dvl.solvers.levenberg_marquardt import minimise
 
@@ -384,7 +384,7 @@ def test_a_ping_counts_as_evidence_by_any_of_its_beams():
     weight = np.array([[0.0, 1.0, 1.0], [0.0, 0.0, 0.0]])
     problem = SimpleNamespace(observations=[SimpleNamespace(gate=2.0)], weights=[weight])
     minimum = SimpleNamespace(evaluation=SimpleNamespace(residuals=[residual], cost=20.0))
-    terms = batch._cost_terms(SimpleNamespace(problem=problem, minimum=minimum))
+    terms = minima.cost_terms(SimpleNamespace(problem=problem, minimum=minimum))
     np.testing.assert_allclose(terms, [12.5, 2.0, 7.5])
 
 

@@ -16,8 +16,12 @@ from factorgraph_dvl.geometry.rotations import exp_so3, log_so3
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.graph import keys
 from factorgraph_dvl.simulation import simulate
-from factorgraph_dvl.solvers.batch import solution_of, solved_problem
-from factorgraph_dvl.solvers.information_history import information_history, run_filter
+from factorgraph_dvl.solvers.batch import solved_problem
+from factorgraph_dvl.solvers.information_history import (
+    information_history,
+    run_filter,
+    solve_with_history,
+)
 from factorgraph_dvl.statistics.information_history import InformationHistory
 
 CALM = {"sway": {}, "current_m_s": [0.3, -0.1, 0]}
@@ -25,9 +29,7 @@ CALM = {"sway": {}, "current_m_s": [0.3, -0.1, 0]}
 
 def history_of(scene, seed=1):
     found = solved_problem(simulate(scene, seed))
-    history = information_history(
-        found.problem, found.minimum.evaluation, found.held, found.covariances
-    )
+    history = information_history(found)
     return found, history
 
 
@@ -88,8 +90,8 @@ def test_the_last_entry_is_the_solution(name):
     turning = [{"straight_s": 20}, {"turn_deg_s": 6, "duration_s": 30}, {"straight_s": 10}]
     walk = {"gyro_bias_walk_deg_h_sqrt_h": 1.0, "accel_bias_walk_ug_sqrt_h": 50.0}
     imu = walk | {"gyro_noise_deg_sqrt_h": 0.1} if name == "walking" else {}
-    found, history = history_of(scenario(noise=True, manoeuvres=turning, imu=imu))
-    solution = solution_of(found, 10.0)
+    scene = scenario(noise=True, manoeuvres=turning, imu=imu)
+    solution, history = solve_with_history(simulate(scene, 1))
     index = [solution.order.index(n) for n in history.names]
     P = solution.covariance[np.ix_(index, index)]
     std = np.sqrt(np.diag(P))
@@ -131,7 +133,7 @@ def along_velocity(found, history, k):
 def test_a_straight_run_gives_no_confident_number_at_any_time():
     straight = {"manoeuvres": [{"straight_s": 100}], "noise": True, **CALM}
     found, history = history_of(scenario(**straight))
-    assert found.held.shape[1] == 4
+    assert found.fixed.shape[1] == 4
     for k in range(len(history.time)):
         assert along_velocity(found, history, k) > 0.95 * np.pi
         assert np.all(history.std[k, 4:7] > 9.9)
@@ -143,7 +145,7 @@ def test_a_straight_run_gives_no_confident_number_at_any_time():
 def test_noise_feigns_nothing_before_the_turn_that_shows_it():
     parts = [{"straight_s": 80}, {"turn_deg_s": 6, "duration_s": 30}, {"straight_s": 10}]
     found, history = history_of(scenario(manoeuvres=parts, noise=True, **CALM))
-    assert found.held.shape[1] == 0
+    assert found.fixed.shape[1] == 0
     before = int(np.searchsorted(history.time, 79.0))
     assert along_velocity(found, history, before) > 0.9 * np.pi
     assert np.all(history.std[before, 4:7] > 9.9)
@@ -187,8 +189,7 @@ def test_shares_of_independent_measurements_by_hand():
 
 def test_gaps_and_outages_do_no_harm():
     gaps = {"imu": {"gaps_s": [[30.0, 33.0]]}, "gnss": {"outages_s": [[20, 60]]}}
-    found, history = history_of(scenario(noise=True, **gaps))
-    solution = solution_of(found, 10.0)
+    solution, history = solve_with_history(simulate(scenario(noise=True, **gaps), 1))
     std = np.sqrt(np.diag(solution.covariance))
     np.testing.assert_allclose(history.std[-1], std, rtol=1e-3)
 
@@ -196,9 +197,7 @@ def test_gaps_and_outages_do_no_harm():
 def test_a_trial_without_a_dvl_has_the_biases():
     trial = replace(simulate(scenario(noise=True), 1), dvl=None)
     found = solved_problem(trial)
-    history = information_history(
-        found.problem, found.minimum.evaluation, found.held, found.covariances
-    )
+    history = information_history(found)
     assert len(history.names) == 6
     assert all("_bias_" in name for name in history.names)
     assert history.std[-1, history.names.index("accel_bias_z_ug")] < 50.0

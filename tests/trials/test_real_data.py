@@ -115,7 +115,7 @@ def test_mounting_of_an_auv(number):
     v_ned = CubicSpline(time, truth[:, 4:7])
     attitude = RotationSpline(time, Rotation.from_matrix(rotation_from_rph(rph(time), "FRD")))
 
-    def motion_at(pings, at):
+    def motion_at(at):
         covered = (at >= time[0]) & (at <= time[-1])
         inside = np.clip(at, time[0], time[-1])
         north, east, down = v_ned(inside).T

@@ -1,0 +1,107 @@
+"""The calibration at a minimum, with its joint covariance, in the order and units of reports."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.graph import keys
+from factorgraph_dvl.graph.problem import Evaluation, Problem
+from factorgraph_dvl.imu.preintegration import Segments
+from factorgraph_dvl.sensors.parameters import Parameter
+from factorgraph_dvl.solution import Estimate
+from factorgraph_dvl.solvers.fixed_directions import SolvedProblem
+from factorgraph_dvl.solvers.reported import estimates_of, in_order, in_unit
+
+
+def reported(
+    problem: Problem, evaluation: Evaluation
+) -> list[tuple[Parameter, Array, dict[int, Array] | None]]:
+    """Return all calibration parameters in the order in which they are reported.
+
+    Each with its value in reported units and the derivatives of that with respect to the
+    variables of the graph, by key; None for one that is fixed.
+    """
+    chain = problem.chain
+    weight = _mean_weights(chain.segments)
+    gyro, accel = chain.biases
+    states = evaluation.states
+    rows: list[tuple[Parameter, Array, dict[int, Array] | None]] = []
+    for parameter, bias, first in ((gyro, states.gyro_bias, 3), (accel, states.accel_bias, 0)):
+        select = np.eye(6)[first : first + 3] / parameter.si
+        functional = (
+            {keys.bias(k): w * select for k, w in enumerate(weight)}
+            if chain.walking
+            else {keys.bias(0): select}
+        )
+        rows.append((parameter, weight @ bias / parameter.si, functional))
+    for p in problem.all_parameters:
+        row = in_unit(p, evaluation.parameters[p.name])
+        own = {problem.key(p.name): row.derivative} if p.estimated else None
+        rows.append((p, row.value, own))
+    return in_order(rows, lambda r: r[0])
+
+
+def calibration(found: SolvedProblem) -> tuple[tuple[Estimate, ...], Array]:
+    """Return the calibration with its joint covariance, in reported units."""
+    problem, covariances = found.problem, found.covariances
+    rows = reported(problem, found.minimum.evaluation)
+    free = [(p, derivatives) for p, _, derivatives in rows if derivatives is not None]
+    functionals = [derivatives for _, derivatives in free]
+    joint = covariances.information.covariance_of(functionals)
+    spread = prior_along(problem, found.fixed, functionals, covariances.considered)
+    if covariances.considered:
+        # Linear over a hundred degrees, a bias would change by more than its prior allows.
+        prior = np.concatenate([p.sigma / p.si for p, _ in free])
+        room = np.sqrt(np.maximum(prior**2 - np.diag(joint), 0.0))
+        size = np.maximum(np.linalg.norm(spread, axis=1), room)
+        of_sensors = np.concatenate(
+            [np.full(p.mean.size, p.name in problem.columns) for p, _ in free]
+        )
+        allowed = room / np.maximum(size, np.finfo(float).tiny)
+        spread *= np.where(of_sensors, 1.0, allowed)[:, None]
+    joint = joint + spread @ spread.T
+    return estimates_of([(p, value) for p, value, _ in rows], joint)
+
+
+def prior_along(
+    problem: Problem,
+    fixed: Array,
+    functionals: Sequence[dict[int, Array]],
+    considered: Mapping[int, Array],
+) -> Array:
+    """Return a root (n, h) of the prior covariance of functionals along fixed directions.
+
+    Parameters
+    ----------
+    problem : Problem
+        Its parameters have the priors.
+    fixed : ndarray, shape (P, h)
+        Directions of the parameters, in units of the priors' standard deviations.
+    functionals : sequence of dict of int to ndarray
+        Derivatives of the functionals with respect to variables, by key.
+    considered : mapping of int to ndarray
+        Change of other variables with the directions, as of `Posterior`.
+    """
+    spread = problem.prior_root @ fixed
+    by_key = {problem.key(name): spread[place] for name, place in problem.columns.items()}
+    by_key |= considered
+    parts = []
+    for functional in functionals:
+        rows = next(iter(functional.values())).shape[0]
+        part = np.zeros((rows, fixed.shape[1]))
+        for key, matrix in functional.items():
+            if key in by_key:
+                part += matrix @ by_key[key]
+        parts.append(part)
+    return np.concatenate(parts)
+
+
+def _mean_weights(seg: Segments) -> Array:
+    """Return weights of the nodes in the mean over the time that the IMU recorded."""
+    weight = np.zeros(seg.node_time.size)
+    weight[seg.origin] += seg.duration
+    weight[seg.origin + 1] += seg.duration
+    return np.asarray(weight / weight.sum())

@@ -1,0 +1,86 @@
+"""A minimum with its covariances, and with what the data do not determine fixed at the prior."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import gtsam
+
+from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.graph.problem import Problem
+from factorgraph_dvl.solvers.levenberg_marquardt import Minimum
+from factorgraph_dvl.solvers.posterior import Posterior, changes_with, considered, posterior
+from factorgraph_dvl.statistics.spurious_information import (
+    at_prior_along,
+    data_information,
+    parameter_information,
+)
+
+
+@dataclass(frozen=True)
+class SolvedProblem:
+    """A problem at its minimum, with its covariances.
+
+    Parameters
+    ----------
+    problem : Problem
+        What was minimised.
+    minimum : Minimum
+        Where it ended.
+    covariances : Posterior
+        Covariances there.
+    fixed : ndarray, shape (P, h)
+        Directions of the parameters that the data do not determine, in units of the priors'
+        standard deviations.
+    notes : tuple of str, optional
+        What the user must know.
+    """
+
+    problem: Problem
+    minimum: Minimum
+    covariances: Posterior
+    fixed: Array
+    notes: tuple[str, ...] = ()
+
+
+def with_covariances(
+    problem: Problem,
+    minimum: Minimum,
+    minimise_again: Callable[[gtsam.Values], Minimum],
+    *,
+    notes: tuple[str, ...] = (),
+    at_truth: bool = False,
+) -> SolvedProblem:
+    """Return a minimum with its covariances, undetermined directions fixed at the prior.
+
+    Parameters
+    ----------
+    problem : Problem
+        What was minimised; directions are fixed in it.
+    minimum : Minimum
+        Where it ended.
+    minimise_again : callable
+        Returns the minimum from values on, once directions are fixed.
+    notes : tuple of str, optional
+        What the user must know.
+    at_truth : bool, default False
+        Whether the minimum is the truth: the parameters then stay there.
+    """
+    evaluation = minimum.evaluation
+    covariances = posterior(problem, minimum)
+    information = data_information(
+        problem, evaluation, covariances.parameters, covariances.given, at_truth=at_truth
+    )
+    fixed = information.undetermined_directions()
+    if fixed.size:
+        # How other variables change with the directions is linear here, where these belong.
+        full = parameter_information(problem, evaluation)
+        changes = changes_with(covariances, fixed, information.coupled(fixed, full))
+        origin = evaluation.parameters
+        if not at_truth:
+            origin = at_prior_along(problem, origin, fixed)
+        problem.fix_directions(fixed, origin)
+        minimum = minimise_again(problem.values(evaluation.states, origin))
+        covariances = considered(posterior(problem, minimum), changes)
+    return SolvedProblem(problem, minimum, covariances, fixed, notes)

@@ -1,0 +1,147 @@
+"""Several minima of one trial: how short trials reach others, and which is more probable."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from factorgraph_dvl.geometry.rotations import exp_so3, log_so3
+from factorgraph_dvl.geometry.units import DEG
+from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.graph.problem import Evaluation, Problem
+from factorgraph_dvl.imu.propagation import States
+from factorgraph_dvl.sensors.parameters import Parameter
+from factorgraph_dvl.solvers.fixed_directions import SolvedProblem
+from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, Progress, minimise
+from factorgraph_dvl.solvers.preparation import ROUGH_TOLERANCE, Preparation
+from factorgraph_dvl.solvers.rounds import SettledMinimum, settle
+
+# Length, s, up to which start values may lead to a wrong minimum, and standard deviation, rad,
+# of a mounting from which on it may. Measured: simulated turns of 2 s and more.
+_SHORT = 30.0
+_ANY_ANGLE = 45.0 * DEG
+# Headings to start from, rad. Chosen: no heading is more than 45 degrees from one of them.
+_HEADINGS = np.array([0.0, 90.0, 180.0, 270.0]) * DEG
+# Starts that are minimised roughly, those of the lowest cost, and steps for each. Chosen: the
+# search then takes about as long as the solution.
+_STARTS = 16
+_START_ITERATIONS = 15
+# Cost above the best one from which on a rough minimum is not followed, and angle, rad, up to
+# which two minima are the same. Chosen: a likelihood of e^-30; a third of what separates headings.
+_ROUGHLY_AS_GOOD = 30.0
+_SAME_ANGLE = 15.0 * DEG
+
+
+def competing_minima(
+    prepared: Preparation, states: States, report: Progress
+) -> list[SettledMinimum]:
+    """Return the minimum that some states lead to, then others that are about as probable.
+
+    In some seconds neither heading nor mounting is known before the DVL is used, and start
+    values lead to any of several minima. From longer trials they lead to the right one.
+
+    Parameters
+    ----------
+    prepared : Preparation
+        Segments, measurements and parameters.
+    states : States
+        Where to start.
+    report : callable
+        Called with stage, iteration and cost.
+    """
+    first = settle(prepared, states, report)
+    rotations = [p for p in prepared.parameters if p.rotation and p.estimated]
+    time = prepared.segments.node_time
+    is_free = any(p.sigma.max() > _ANY_ANGLE for p in rotations)
+    if time[-1] - time[0] > _SHORT or not is_free:
+        return [first]
+    report("other mountings", 0, None)
+    out = [first]
+    for each in _rough_minima(prepared, first, states):
+        found = each.evaluation
+        if found.cost > min(m.minimum.evaluation.cost for m in out) + _ROUGHLY_AS_GOOD:
+            break
+        if _is_among(out, found, rotations):
+            continue
+        other = settle(prepared, found.states, report, values=found.parameters)
+        if not _is_among(out, other.minimum.evaluation, rotations):
+            out.append(other)
+    return out
+
+
+def _rough_minima(prepared: Preparation, first: SettledMinimum, states: States) -> list[Minimum]:
+    """Return minima from all headings and mountings, the lowest first."""
+    chain = first.problem.chain
+    # A problem of their own: minimising weighs the measurements anew.
+    problem = Problem(
+        chain,
+        prepared.observations,
+        prepared.parameters,
+        start=first.minimum.evaluation.parameters,
+    )
+    rotations = {p.name for p in problem.parameters if p.rotation}
+    mountings = prepared.mountings_at(chain, states)
+    starts = []
+    for angle in _HEADINGS:
+        turn = exp_so3(np.array([0.0, 0.0, angle]))
+        turned = replace(states, nRb=turn @ states.nRb)
+        # The sensors keep their attitude in n, at least at first.
+        back = states.nRb[0].T @ turn @ states.nRb[0]
+        for mounting in mountings:
+            values = prepared.mountings | {
+                name: value @ back if name in rotations else value
+                for name, value in mounting.items()
+            }
+            at = problem.values(turned, problem.prior_values() | values)
+            starts.append((problem.evaluate(at).cost, at))
+    rough = [
+        minimise(
+            problem,
+            at,
+            stage="other mountings",
+            max_iterations=_START_ITERATIONS,
+            tolerance=ROUGH_TOLERANCE,
+            proven=False,
+        )
+        for _, at in sorted(starts, key=lambda s: s[0])[:_STARTS]
+    ]
+    return sorted(rough, key=lambda m: m.evaluation.cost)
+
+
+def _is_among(
+    minima: Sequence[SettledMinimum], one: Evaluation, rotations: Sequence[Parameter]
+) -> bool:
+    """Whether attitude and mountings are those of another minimum, as far as angles tell."""
+    for each in minima:
+        other = each.minimum.evaluation
+        pairs = [(one.parameters[p.name], other.parameters[p.name]) for p in rotations]
+        pairs.append((one.states.nRb[0], other.states.nRb[0]))
+        if all(float(np.linalg.norm(log_so3(a.T @ b))) < _SAME_ANGLE for a, b in pairs):
+            return True
+    return False
+
+
+def evidence_against(found: SolvedProblem) -> float:
+    """Return the negative logarithm of the posterior probability about a minimum.
+
+    Laplace's approximation: a minimum that is wide is more probable than a narrow one.
+    """
+    _, log_det = np.linalg.slogdet(found.covariances.parameters)
+    return found.minimum.evaluation.cost - 0.5 * float(log_det)
+
+
+def cost_terms(found: SolvedProblem) -> Array:
+    """Return the terms of the cost: one for each measurement, and one for all priors."""
+    evaluation = found.minimum.evaluation
+    parts = []
+    total = 0.0
+    for observation, residual, weight in zip(
+        found.problem.observations, evaluation.residuals, found.problem.weights, strict=True
+    ):
+        own = 0.5 * np.sum(residual**2, axis=1)
+        total += own.sum()
+        gate = observation.gate or 0.0
+        parts.append(np.where((weight > 0.0).any(axis=1), own, 0.5 * gate**2))
+    return np.concatenate([*parts, [evaluation.cost - total]])

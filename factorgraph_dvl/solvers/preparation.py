@@ -1,0 +1,140 @@
+"""From a trial to where its minimisation starts: segments, states, values of the mountings."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from factorgraph_dvl.geometry.earth import LocalFrame
+from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.graph.inertial_chain import Chain, inertial_chain
+from factorgraph_dvl.graph.problem import Problem, observed
+from factorgraph_dvl.imu.increments import increments
+from factorgraph_dvl.imu.preintegration import Segments, segments
+from factorgraph_dvl.imu.propagation import States
+from factorgraph_dvl.imu.timestamps import without_strays
+from factorgraph_dvl.initialization.attitude_sensors import attitudes
+from factorgraph_dvl.initialization.in_motion_alignment import initial_states
+from factorgraph_dvl.initialization.mountings import mounted_aids, mountings_from_motion
+from factorgraph_dvl.ranging.position_from_ranges import StartPositions, positions_from_ranges
+from factorgraph_dvl.sensors.parameters import Parameter
+from factorgraph_dvl.sensors.protocol import Observation
+from factorgraph_dvl.solvers.levenberg_marquardt import Progress, minimise
+from factorgraph_dvl.solvers.state_times import dense_epochs
+from factorgraph_dvl.trial import Trial
+
+# The stage without the DVL only finds its mounting: it ends where the cost falls by less than
+# this, or after so many steps. Chosen: the next stage goes on from there.
+ROUGH_TOLERANCE = 1.0
+_ROUGH_ITERATIONS = 10
+
+
+@dataclass(frozen=True)
+class Preparation:
+    """What every minimisation of a trial starts from.
+
+    Parameters
+    ----------
+    trial : Trial
+        The trial, without rows of impossible times.
+    frame : LocalFrame
+        Tangent frame n.
+    segments : Segments
+        Increments of the IMU between the nodes.
+    observations : tuple of Observation
+        Measurements of all sensors.
+    parameters : tuple of Parameter
+        Calibration parameters of all sensors, fixed ones included.
+    start_positions : StartPositions
+        States to start from, one set for each position that the ranges allow.
+    mountings : dict of str to ndarray
+        Mountings of attitude sensors that the gyros tell, by parameter name.
+    notes : tuple of str
+        What the user must know.
+    """
+
+    trial: Trial
+    frame: LocalFrame
+    segments: Segments
+    observations: tuple[Observation, ...]
+    parameters: tuple[Parameter, ...]
+    start_positions: StartPositions
+    mountings: dict[str, Array]
+    notes: tuple[str, ...]
+
+    def chain(self, states: States, *, bias_prior: bool = True) -> Chain:
+        """Return the inertial part of the graph, with gravity along the track of states."""
+        return inertial_chain(self.trial, self.frame, self.segments, states, bias_prior=bias_prior)
+
+    def mountings_at(self, chain: Chain, states: States) -> list[dict[str, Array]]:
+        """Return values of the mountings that fit the motion of states, the best first."""
+        return mountings_from_motion(
+            self.trial, self.frame, self.segments, chain.gravity_n, states
+        )
+
+
+def prepare(trial: Trial, state_interval_s: float, report: Progress) -> Preparation:
+    """Return segments, start states and measurements of a trial.
+
+    Parameters
+    ----------
+    trial : Trial
+        The trial as it was recorded.
+    state_interval_s : float
+        Time between the states of the graph, s.
+    report : callable
+        Called with stage, iteration and cost.
+
+    Raises
+    ------
+    DataError
+        If the records do not tell where and how the trial starts.
+    """
+    trial = without_strays(trial)
+    frame = trial.frame()
+    report("increments", 0, None)
+    inc, gaps = increments(trial.imu)
+    seg = segments(inc, state_interval_s, dense_epochs(trial, frame, state_interval_s))
+    report("alignment", 0, None)
+    start = initial_states(trial, frame, seg)
+    if trial.beacons is not None:
+        report("ranges", 0, None)
+    start_positions = positions_from_ranges(trial, frame, seg, start.states)
+    warnings = [w for seen in attitudes(trial, frame) for w in seen.consistency_warnings]
+    observations, parameters = observed(trial.aids, frame)
+    return Preparation(
+        trial=trial,
+        frame=frame,
+        segments=seg,
+        observations=observations,
+        parameters=parameters,
+        start_positions=start_positions,
+        mountings=start.mountings,
+        notes=(*trial.notes, *gaps, *start.notes, *warnings, *start_positions.notes),
+    )
+
+
+def mounted_start(
+    prepared: Preparation, chain: Chain, states: States, report: Progress
+) -> tuple[States, dict[str, Array], int]:
+    """Return states, values of the mountings that fit them, and the iterations it took.
+
+    GNSS and IMU alone smooth the motion first, unless the DVL is calibrated: such a one does
+    no harm from the start.
+    """
+    iterations = 0
+    aids = mounted_aids(prepared.trial, prepared.mountings)
+    if aids is not None:
+        problem = Problem(chain, *observed(aids, prepared.frame), start=prepared.mountings)
+        coarse = minimise(
+            problem,
+            problem.values(states, problem.prior_values() | prepared.mountings),
+            stage="inertial and GNSS",
+            progress=report,
+            max_iterations=_ROUGH_ITERATIONS,
+            tolerance=ROUGH_TOLERANCE,
+            proven=False,
+        )
+        states, iterations = coarse.evaluation.states, coarse.iterations
+    report("mounting", 0, None)
+    (best, *_) = prepared.mountings_at(chain, states)
+    return states, prepared.mountings | best, iterations

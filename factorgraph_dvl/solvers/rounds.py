@@ -1,0 +1,167 @@
+"""Rounds of minimisation until gravity, weights, times and outliers no longer change.
+
+All four are taken at the states before a round and are constant within it, so that the cost
+has a minimum.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.graph.priors import ConstantsPrior
+from factorgraph_dvl.graph.problem import Evaluation, Problem
+from factorgraph_dvl.imu.propagation import States
+from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, Progress, minimise
+from factorgraph_dvl.solvers.preparation import Preparation, mounted_start
+
+# Root mean square change of the positions, m, from which on gravity is taken anew. Chosen: 1 m
+# turns it by 0.16 micro-g.
+_SAME_GRAVITY = 2.0
+# Rounds after which the problem counts as not settled. Measured: most trials take one or two.
+_ROUNDS = 12
+
+
+@dataclass(frozen=True)
+class SettledMinimum:
+    """A minimum at which the problem itself no longer changes, if `minimum.converged`.
+
+    Parameters
+    ----------
+    problem : Problem
+        What the last round minimised.
+    minimum : Minimum
+        Where it ended, with the iterations of all rounds.
+    notes : tuple of str
+        What the user must know.
+    """
+
+    problem: Problem
+    minimum: Minimum
+    notes: tuple[str, ...]
+
+
+def settle(
+    prepared: Preparation,
+    states: States,
+    report: Progress,
+    *,
+    constants_prior: ConstantsPrior | None = None,
+    values: dict[str, Array] | None = None,
+) -> SettledMinimum:
+    """Return the minimum that some states lead to.
+
+    Parameters
+    ----------
+    prepared : Preparation
+        Segments, measurements and parameters.
+    states : States
+        Where to start.
+    report : callable
+        Called with stage, iteration and cost.
+    constants_prior : ConstantsPrior, optional
+        Joint prior of biases and calibration; it takes the place of the trial's priors, and
+        its values are those to start from.
+    values : dict of str to ndarray, optional
+        Parameters to start from; by default mountings that fit the motion.
+    """
+    chain = prepared.chain(states, bias_prior=constants_prior is None)
+    p_gravity = states.p_n
+    if constants_prior is not None:
+        values = constants_prior.parameters
+    iterations = 0
+    if values is None:
+        states, values, iterations = mounted_start(prepared, chain, states, report)
+    rejected = prepared.start_positions.rejected
+    tried: list[Mapping[str, Array]] = []
+    cycle: list[Mapping[str, Array]] = []
+    for _ in range(_ROUNDS):
+        problem = Problem(
+            chain,
+            prepared.observations,
+            prepared.parameters,
+            start=values,
+            constants_prior=constants_prior,
+        )
+        problem.reject(rejected)
+        at = problem.values(states, problem.prior_values() | values)
+        minimum = minimise(problem, at, stage="all sensors", progress=report)
+        iterations += minimum.iterations
+        states, values = minimum.evaluation.states, minimum.evaluation.parameters
+        changing = _changing(problem, minimum.evaluation)
+        if np.sqrt(np.mean((states.p_n - p_gravity) ** 2)) > _SAME_GRAVITY:
+            changing.insert(0, "gravity along the track")
+            chain = prepared.chain(states, bias_prior=constants_prior is None)
+            p_gravity = states.p_n
+        if not cycle:
+            if not (tried and _same(tried[-1], rejected)):
+                tried.append(rejected)
+            outliers: Mapping[str, Array] = problem.outliers(minimum.evaluation)
+            cycle = _cycle(tried, outliers)
+        if cycle:
+            outliers = min(cycle, key=_count)
+        if not _same(outliers, rejected):
+            changing.append("which measurements are echoes")
+        if not changing:
+            break
+        rejected = outliers
+    notes = _at_the_gate(cycle)
+    if changing:
+        notes += (
+            f"after {_ROUNDS} rounds {', '.join(changing)} still changed: the solution is none",
+        )
+    converged = minimum.converged and not changing
+    return SettledMinimum(
+        problem, replace(minimum, converged=converged, iterations=iterations), notes
+    )
+
+
+def _changing(problem: Problem, evaluation: Evaluation) -> list[str]:
+    """Return what of the measurements would be other if the problem were made here."""
+    found = {
+        "the times of measurements": problem.needs_rebinding(evaluation.parameters),
+        "the weights of measurements": problem.needs_reweighting(evaluation),
+    }
+    return [name for name, changed in found.items() if changed]
+
+
+def _cycle(
+    tried: Sequence[Mapping[str, Array]], outliers: Mapping[str, Array]
+) -> list[Mapping[str, Array]]:
+    """Return the sets of outliers that follow each other for ever; none if they do not.
+
+    Each set led to the next; the last of them led to `outliers`. A measurement at its gate may
+    lie inside where it is left out, and outside where it is used.
+    """
+    for i, before in enumerate(tried[:-1]):
+        if _same(before, outliers):
+            return list(tried[i:])
+    return []
+
+
+def _count(rejected: Mapping[str, Array]) -> int:
+    return sum(times.size for times in rejected.values())
+
+
+def _at_the_gate(cycle: Sequence[Mapping[str, Array]]) -> tuple[str, ...]:
+    """Say how many measurements of a cycle may be echoes or not."""
+    if not cycle:
+        return ()
+    kept, none = min(cycle, key=_count), np.empty(0)
+    out = []
+    for label in dict.fromkeys(label for each in cycle for label in each):
+        ever = np.unique(np.concatenate([each.get(label, none) for each in cycle]))
+        undecided = np.setdiff1d(ever, kept.get(label, none)).size
+        if undecided:
+            out.append(
+                f"{label}: {undecided} at the gate would be rejected if they were used, and used "
+                "if they were rejected; they are used"
+            )
+    return tuple(out)
+
+
+def _same(a: Mapping[str, Array], b: Mapping[str, Array]) -> bool:
+    return a.keys() == b.keys() and all(np.array_equal(a[k], b[k]) for k in a)
