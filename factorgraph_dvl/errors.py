@@ -52,6 +52,12 @@ class SolveError(FactorgraphDvlError):
     exit_code = 1
 
 
+class OutputError(FactorgraphDvlError):
+    """Results were found, and could not be written."""
+
+    exit_code = 1
+
+
 def printable(text: str) -> str:
     r"""Return text with what does not print escaped, such as `\x1b` and `\u202e`.
 

@@ -22,10 +22,11 @@ from contextlib import contextmanager, suppress
 from fnmatch import fnmatchcase
 from pathlib import Path, PurePath
 
-from factorgraph_dvl.errors import DataError
+from factorgraph_dvl.errors import DataError, OutputError
 
 SETTINGS_FILE = "trial.yaml"
 _PARTIAL, _NEW, _OLD, _OWNED = "partial", "new", "old", "owned"
+_NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
 _AT_FDCWD, _RENAME_EXCHANGE = -100, 2
 
 # Working folders that this process has locked, by the output that they belong to.
@@ -102,6 +103,8 @@ def new_folder(path: Path, *, force: bool = False, owned: Sequence[str] = ()) ->
     ------
     DataError
         As `claim`, and if the folder was filled meanwhile and `force` is not set.
+    OutputError
+        If the disk is full or fails.
     """
     target = path.resolve()
     with claim(path, force=force, owned=owned) as work:
@@ -119,6 +122,14 @@ def new_folder(path: Path, *, force: bool = False, owned: Sequence[str] = ()) ->
                 if not force:
                     raise _occupied(path) from None
                 _replace(work, target, owned)
+        except OSError as error:
+            if error.errno not in _NO_ROOM:
+                raise
+            raise OutputError(
+                f"cannot be written: {error.strerror}; nothing was changed there",
+                where=str(path),
+                hint="Make room, or choose another folder",
+            ) from error
         finally:
             shutil.rmtree(partial, ignore_errors=True)
 

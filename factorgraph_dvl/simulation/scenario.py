@@ -55,7 +55,7 @@ from typing import Annotated, Any
 
 import msgspec
 
-from factorgraph_dvl.errors import ConfigError
+from factorgraph_dvl.errors import ConfigError, printable
 from factorgraph_dvl.geometry.rotations import BodyAxes
 from factorgraph_dvl.sensors.catalogue import AIDS
 from factorgraph_dvl.sensors.protocol import SensorSection
@@ -256,7 +256,8 @@ def parse_scenario(data: Mapping[str, Any], source: str = "scenario") -> Scenari
     if isinstance(data.get("epoch"), date):
         # A type of YAML 1.1, which this format has as text.
         data = {**data, "epoch": data["epoch"].isoformat()}
-    return _checked(convert({**data, "source": source}, Scenario, "", source))
+    scenario = convert({**data, "source": source}, Scenario, "", source)
+    return _checked(msgspec.structs.replace(scenario, name=printable(scenario.name)))
 
 
 def _checked(scenario: Scenario) -> Scenario:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import resource
 import signal
 import subprocess
 import sys
@@ -11,6 +12,7 @@ from pathlib import Path
 
 import pytest
 from builders import build_trial, edit, write_trial
+from truth import scenario
 
 from factorgraph_dvl.cli.memory import naming_memory
 from factorgraph_dvl.errors import SolveError
@@ -101,3 +103,27 @@ def test_names_give_a_terminal_no_orders(tmp_path: Path) -> None:
     done = inspect(trial, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
     assert r"unknown key `k\x1b[2J`" in done.stderr
     assert not set("\x1b\x9b\u202e") & set(done.stdout + done.stderr)
+
+
+def test_a_full_disk_is_named_with_the_output_and_leaves_nothing(tmp_path: Path) -> None:
+    def little_room() -> None:
+        # A file may grow to 4 kB only, as on a disk that is nearly full.
+        resource.setrlimit(resource.RLIMIT_FSIZE, (4096, 4096))
+
+    config = Path(__file__).resolve().parents[2] / "configs" / "seed-a-phase-0.yaml"
+    done = subprocess.run(
+        [*CLI, "simulate", str(config), "--out", str(tmp_path / "out")],
+        preexec_fn=little_room,
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+    assert done.returncode == 1
+    assert f"{tmp_path / 'out'}: cannot be written: File too large" in done.stderr
+    assert "Traceback" not in done.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_names_of_scenarios_give_a_terminal_no_orders() -> None:
+    assert scenario(name="a\x1b[31m").name == r"a\x1b[31m"
