@@ -1,1 +1,1 @@
-"""What trials and solutions say."""
+"""Analyses of trials and solutions."""

@@ -22,22 +22,24 @@ from factorgraph_dvl.sensors.beam_geometry import (
 from factorgraph_dvl.sensors.dvl_beams import DIRECTION, SCALE_ERROR, DvlBeams
 from factorgraph_dvl.solution import Calibration, Solution, values_of
 
-# From how many standard deviations on a beam is another one; and from how many deg, at least.
+# Chosen: a beam further from its nominal direction than this many standard deviations, and
+# than this many deg, belongs to another instrument; good beams stay within 3.
 _FAR = 5.0
 _LEAST_DEG = 1.0
 
 
 @dataclass(frozen=True)
 class BeamCalibration:
-    """Beams as a solution has them.
+    """Calibrated beams of a DVL.
 
     Parameters
     ----------
     directions_d, directions_b : ndarray, shape (N, 3)
-        Unit vectors in the instrument's axes and in body; between both is the nominal
-        misalignment.
+        Unit vectors in the DVL's nominal axes d, and in body axes b.
     scale_error : ndarray, shape (N,)
+        Scale error of each beam.
     lever_arm : ndarray, shape (3,), m
+        From the IMU to the DVL, in body.
     """
 
     directions_d: Array
@@ -53,23 +55,24 @@ class BeamCalibration:
 
 @dataclass(frozen=True)
 class BeamQuality:
-    """How well the beams of each ping agree, with their calibration.
+    """Consistency of the beams of each ping, given their calibration.
 
     Parameters
     ----------
     time : ndarray, shape (M,), s
+        Times of the pings.
     valid : ndarray, shape (M,)
         Number of beams that were received.
     velocity : ndarray, shape (M, 3)
-        By least squares over all of them, in d, m/s; nan below three.
+        Least-squares velocity in d, m/s; nan with fewer than three beams.
     groups : tuple of str
         Names of the groups of three beams, such as `123`.
     group_velocity : ndarray, shape (M, G, 3)
         In d, m/s; nan where a beam of the group was lost.
     error_velocity : ndarray, shape (M,)
-        m/s; nan below four beams.
+        Error velocity, m/s; nan with fewer than four beams.
     error_sigma : ndarray, shape (M,)
-        What the noise of the beams makes of it.
+        Standard deviation of the error velocity from the noise of the beams, m/s.
     """
 
     time: Array
@@ -81,7 +84,7 @@ class BeamQuality:
     error_sigma: Array
 
     def columns(self) -> dict[str, Array]:
-        """Return all of it as a table."""
+        """Return the columns of `beams.csv`."""
         table = {"time_s": self.time, "beams": self.valid}
         table |= {f"vel_{x}_m_s": v for x, v in zip("xyz", self.velocity.T, strict=True)}
         table["error_velocity_m_s"] = self.error_velocity
@@ -92,24 +95,24 @@ class BeamQuality:
 
 
 def calibrates(solution: Solution | Calibration, beams: DvlBeams) -> bool:
-    """Whether a solution is one of a DVL's beams, and not of something else in the trial."""
+    """Whether a solution calibrates these beams."""
     return any(e.name == f"{beams.prefix}lever_arm_m" for e in solution.estimates)
 
 
 def calibration_of(beams: DvlBeams, solution: Solution | Calibration) -> BeamCalibration:
-    """Return the beams as a solution has them.
+    """Return the beams that a solution calibrates.
 
     Parameters
     ----------
     beams : DvlBeams
-        Of the trial.
+        Beams of the trial.
     solution : Solution or Calibration
-        Of it, in either parametrisation.
+        Solution of that trial, in either parametrisation.
 
     Raises
     ------
     DataError
-        If the solution is not one of these beams.
+        If the solution does not calibrate these beams.
     """
     return beam_calibration(beams, values_of(solution.estimates), solution.trial)
 
@@ -117,21 +120,21 @@ def calibration_of(beams: DvlBeams, solution: Solution | Calibration) -> BeamCal
 def beam_calibration(
     beams: DvlBeams, values: Mapping[str, Array], source: str = "calibration"
 ) -> BeamCalibration:
-    """Return the beams as reported values have them.
+    """Return the beams that reported values describe.
 
     Parameters
     ----------
     beams : DvlBeams
-        Of the trial; what `values` leave out of scale and lever arm is as its settings have it.
+        Beams of the trial; their settings give scale and lever arm where `values` do not.
     values : mapping of str to ndarray
-        By name as in calibration.json, in reported units; directions as (N, 3) vectors.
+        Values by name as in calibration.json, in reported units; directions as (N, 3) vectors.
     source : str, default 'calibration'
-        Of the values, for messages.
+        Name of the origin of the values, for messages.
 
     Raises
     ------
     DataError
-        If the values are not of these beams.
+        If the values do not describe these beams.
     """
     s = beams.settings
     n = len(s.nominal_d)
@@ -167,45 +170,45 @@ def beam_calibration(
 
 
 def check_same_instrument(beams: DvlBeams, calibration: BeamCalibration, source: str) -> None:
-    """Raise DataError where a calibration's beams are not those that a trial describes.
+    """Raise DataError if a calibration belongs to other beams than those of a trial.
 
     Parameters
     ----------
     beams : DvlBeams
-        Of the trial, with nominal directions and what they may be off by.
+        Beams of the trial, with nominal directions and their standard deviations.
     calibration : BeamCalibration
-        Of them, or of another instrument.
+        Calibration to check.
     source : str
-        Of the calibration, for messages.
+        Name of the file of the calibration, for messages.
     """
     s = beams.settings
     std = s.misalignment_std_deg
     sigma = s.direction_std_deg if isinstance(std, UnsetType) else max(std)
     allowed = max(_FAR * np.sqrt(2.0) * sigma, _LEAST_DEG)
     apart = np.linalg.norm(calibration.directions_b - beams.nominal_b, axis=1)
-    away = 2.0 * np.arcsin(np.minimum(0.5 * apart, 1.0)) / DEG
-    if away.max() > allowed:
+    angle = 2.0 * np.arcsin(np.minimum(0.5 * apart, 1.0)) / DEG
+    if angle.max() > allowed:
         raise DataError(
-            f"beam {np.argmax(away) + 1} of the calibration points {away.max():.3g} deg away from "
-            "where the trial has it",
+            f"beam {np.argmax(angle) + 1} of the calibration is {angle.max():.3g} deg from its "
+            "nominal direction in the trial",
             where=source,
-            expected=f"at most {allowed:.3g} deg, by what the trial says that it may be off by",
-            hint="Is it the same instrument, mounted as it was, and nominally described alike?",
+            expected=f"at most {allowed:.3g} deg, from the standard deviations in the trial",
+            hint="Check that it is the same instrument, mounted and described in the same way",
         )
 
 
 def beam_quality(beams: DvlBeams, calibration: BeamCalibration) -> BeamQuality:
-    """Return how well the beams of each ping agree.
+    """Return the consistency of the beams of each ping.
 
     Parameters
     ----------
     beams : DvlBeams
-        The record.
+        Record of the beams.
     calibration : BeamCalibration
-        Of them.
+        Calibration of the beams.
     """
     gain, sigma = calibration.gain_d, beams.sigma()
-    # Unit rows across all beams spread the error velocity's variance over them evenly.
+    # The rows have unit length, so each beam contributes its share of the variance.
     spread = np.mean(error_rows(gain) ** 2, axis=0) if len(gain) > 3 else np.zeros(len(gain))
     share = np.where(np.isnan(beams.velocity), 0.0, spread)
     variance = np.sum(share * np.nan_to_num(sigma) ** 2, axis=1)

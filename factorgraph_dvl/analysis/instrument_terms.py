@@ -20,6 +20,7 @@ from factorgraph_dvl.solution import Calibration, Solution
 Order = Literal["ZYX", "XYZ"]
 ORDERS: tuple[Order, ...] = ("ZYX", "XYZ")
 NEEDED = ("misalignment_deg", "scale_error", "lever_arm_m")
+# Chosen: step, deg, of the numerical derivative; the cube root of a double's precision.
 _STEP = 1e-6
 
 
@@ -37,12 +38,12 @@ class Angles:
 
 @dataclass(frozen=True)
 class InstrumentTerms:
-    """What can be typed into an instrument.
+    """Mounting angles, scale and lever arm as instruments define them.
 
     Parameters
     ----------
     dvl_in_body, body_to_dvl : dict of Order to Angles
-        By order, angles of C_d^b, the attitude of the DVL in the vehicle, and of C_b^d.
+        Angles of C_d^b, the attitude of the DVL in the vehicle, and of C_b^d, by order.
     scale_error, scale_std : ndarray, shape (n,)
         Dimensionless.
     lever_arm, lever_arm_std : ndarray, shape (3,)
@@ -51,6 +52,7 @@ class InstrumentTerms:
         TRDI's EA, EI, EJ, deg: with the axes of TRDI's instrument coordinates for d, C_b^d =
         Rz(-EA) Ry(EJ) Rx(EI) in forward, starboard, down.
     alignment_std : ndarray, shape (3,), deg
+        Standard deviations of `alignment`.
     """
 
     dvl_in_body: dict[Order, Angles]
@@ -81,10 +83,10 @@ def instrument_of(calibration: Calibration | Solution) -> InstrumentTerms:
         if name not in parts:
             beams = DIRECTION in parts
             raise DataError(
-                f"the calibration has no {name}{': it is one of single beams' if beams else ''}",
-                expected="that of a DVL",
-                hint="Their matrix is written by: factorgraph-dvl correct TRIAL CALIBRATION "
-                "--out DIR" if beams else "",
+                f"the calibration has no {name}{': it calibrates single beams' if beams else ''}",
+                expected="the calibration of a DVL",
+                hint="Write the matrix of the beams with: factorgraph-dvl correct TRIAL "
+                "CALIBRATION --out DIR" if beams else "",
             )  # fmt: skip
     alpha, covariance = parts["misalignment_deg"]
     frd = frd_from_body(calibration.body_axes)
@@ -136,7 +138,7 @@ def euler(matrix: Array, order: Order) -> Array:
 
 
 def rotation_of(angles: Array, order: Order, body_axes: BodyAxes) -> Array:
-    """Return the rotation (3, 3) between body axes and axes named alike, of roll, pitch, yaw."""
+    """Return the rotation (3, 3), in body axes, of roll, pitch and yaw (3,), deg."""
     given = angles[::-1] if order == "ZYX" else angles
     frd = frd_from_body(body_axes)
     matrix = Rotation.from_euler(order, given, degrees=True).as_matrix()

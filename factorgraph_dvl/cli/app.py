@@ -27,11 +27,11 @@ from factorgraph_dvl.cli.streams import guard_streams, output_failure
 from factorgraph_dvl.errors import FactorgraphDvlError, printable
 
 _NAME = "factorgraph-dvl"
-# The exit code of an interrupt, also as Typer has it.
+# The exit code of an interrupt, as in Typer.
 _INTERRUPTED = 130
 
-# A command's module loads nothing heavy at its top: GTSAM, SciPy, Matplotlib and Arrow take
-# seconds, and --help shall answer at once.
+# A command's module imports heavy packages (GTSAM, SciPy, Matplotlib, Arrow) only when it runs,
+# so that --help answers at once.
 app = typer.Typer(
     name=_NAME,
     help="Calibrate a Doppler velocity log, jointly with the trajectory of its vehicle.",
@@ -57,7 +57,7 @@ for _command in (
 
 def run(args: list[str]) -> NoReturn:
     """Run a command and exit; see `factorgraph_dvl.cli.main`."""
-    # All matrices are small: more threads only wait for one another.
+    # All matrices are small: more threads only slow each other down.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     guard_streams()
@@ -81,8 +81,8 @@ def run(args: list[str]) -> NoReturn:
         if failure is None or done.code:
             raise
         _fail(
-            f"standard output cannot be written ({failure.strerror}); files that this run "
-            "wrote are complete",
+            f"standard output cannot be written ({failure.strerror}); the files of this run "
+            "are complete",
             1,
             args,
         )
@@ -90,7 +90,7 @@ def run(args: list[str]) -> NoReturn:
 
 
 def _interrupted(error: BaseException | None) -> bool:
-    """Whether an error came of an interrupt, as where a module was being loaded."""
+    """Return whether an error was caused by an interrupt, as during an import."""
     while error is not None:
         if isinstance(error, KeyboardInterrupt):
             return True

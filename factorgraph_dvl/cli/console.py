@@ -1,4 +1,4 @@
-"""What the commands print: progress, tables, warnings."""
+"""Output of the commands: progress, tables, warnings."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ if TYPE_CHECKING:
     from rich.table import Table
 
 _STARTED = time()
-# Tables that go to a file or a pipe are not cut to the 80 columns of no terminal.
+# Chosen: width of tables in a file or a pipe, columns; wide enough for every table.
 _PIPE_WIDTH = 180
 
 
 class _Console(Console):
-    """A console whose text, names of files included, gives a terminal no orders."""
+    """A console that removes control characters, as from names of files."""
 
     def print(self, *objects: Any, **options: Any) -> None:
         super().print(*(_lines(x) if isinstance(x, str) else x for x in objects), **options)
@@ -36,7 +36,7 @@ def _lines(text: str) -> str:
 
 
 class ProgressLine:
-    """Stage, iteration, cost and time: live on a terminal, else a line for each."""
+    """Stage, iteration, cost and time: live on a terminal, otherwise a line for each."""
 
     def __init__(self, *, quiet: bool) -> None:
         self._quiet = quiet
@@ -65,11 +65,11 @@ class ProgressLine:
         self._live.stop()
 
     def __call__(self, stage: str, iteration: int = 0, cost: float | None = None) -> None:
-        """Show where the work stands."""
+        """Show the present stage."""
         text = stage
         if iteration:
             text += f", iteration {iteration}"
-            # That of the start values is huge, and says nothing.
+            # The cost of the start values is huge and uninformative.
             if cost is not None:
                 text += f", cost {cost:.4g}"
         if self._console.is_terminal:
@@ -80,15 +80,15 @@ class ProgressLine:
 
 
 def print_written(out: Path) -> None:
-    """Name the files that this run wrote to a folder."""
-    # A folder that was replaced by --force may hold files of others.
+    """List the files that this run wrote to a folder."""
+    # A folder that --force replaced may contain other files.
     new = (p for p in out.rglob("*") if p.is_file() and p.stat().st_mtime >= _STARTED - 1.0)
     written = sorted(path.relative_to(out) for path in new)
     stdout().print(f"Wrote {', '.join(map(str, written))} to {out}", markup=False, soft_wrap=True)
 
 
 def print_table(table: Table) -> None:
-    """Print a table whole: one wider than the terminal is wrapped by that, never cut."""
+    """Print a table uncut; a terminal wraps one that is too wide."""
     from factorgraph_dvl.report.terminal.tables import width_of
 
     console = stdout()
@@ -108,7 +108,7 @@ def stdout() -> Console:
 
 def stderr() -> Console:
     """Return the console for progress, warnings and errors."""
-    # What was said first comes first, also where both streams end in one file.
+    # Keep the order where both streams go to one file.
     with suppress(OSError):
         sys.stdout.flush()
     return _Console(stderr=True)

@@ -1,4 +1,4 @@
-"""The command `correct`: calibrated beams as the instrument that they amount to."""
+"""The command `correct`: calibrated beams as an equivalent DVL."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def correct(
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder to write.")],
     force: Force = False,
 ) -> None:
-    """Turn a trial's beams, calibrated, into a DVL record; write the matrix that does so."""
+    """Convert the calibrated beams of a trial to a DVL record, and write the matrix for it."""
     import numpy as np
 
     from factorgraph_dvl.analysis.beam_quality import calibration_of, check_same_instrument
@@ -51,7 +51,9 @@ def correct(
         for name in np.array(e.component_names)[~e.observable & (e.prior_std > 0.0)]
     ]
     if unknown:
-        warn(f"not observable in the calibration, and no better here: {', '.join(unknown)}")
+        warn(
+            f"the calibration could not determine {', '.join(unknown)}: the record uses the prior"
+        )
     pings = f"{record.locked.sum()} of {record.time.size} pings have a velocity"
     stdout().print(pings, markup=False, highlight=False)
     print_written(out)

@@ -25,26 +25,30 @@ class Side(StrEnum):
 def crosscheck(
     a: Annotated[
         Path,
-        typer.Argument(metavar="A", help="Solution folder, or results from elsewhere: a file."),
+        typer.Argument(metavar="A", help="Solution folder, or a file of external results."),
     ],
-    b: Annotated[Path, typer.Argument(metavar="B", help="Likewise.")],
+    b: Annotated[
+        Path, typer.Argument(metavar="B", help="Solution folder, or a file of external results.")
+    ],
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder to write.")],
     reference: Annotated[
         Path | None,
-        typer.Option(metavar="REF", help="Trial folder or table: the true trajectory."),
+        typer.Option(metavar="REF", help="True trajectory: trial folder or table."),
     ] = None,
     truth: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="True calibration, JSON or YAML; before the trial's."),
+        typer.Option(
+            metavar="FILE", help="True calibration, JSON or YAML; replaces the truth of the trial."
+        ),
     ] = None,
     efficient: Annotated[
         Side | None,
-        typer.Option(case_sensitive=False, help="Which result uses all data by a true model."),
+        typer.Option(case_sensitive=False, help="Result that uses all data with a correct model."),
     ] = None,
     force: Force = False,
     no_figures: NoFigures = False,
 ) -> None:
-    """Hold two results of one trial against each other, and against the truth."""
+    """Compare two results of one trial with each other and with the truth."""
     from factorgraph_dvl.analysis.comparison.crosscheck import crosscheck as compare
     from factorgraph_dvl.io.external_results import load_results, load_truth
     from factorgraph_dvl.io.folders import new_folder
@@ -101,7 +105,7 @@ def _print_crosscheck(check: CrossCheck, a: Path, b: Path) -> None:
         warn(note)
     console.print(tables.paragraph(check), markup=False, highlight=False)
     if check.explanation:
-        console.print("Where they differ:", markup=False)
+        console.print("Possible reasons for the differences:", markup=False)
         for sentence in check.explanation:
             console.print(f"- {sentence}", markup=False, highlight=False)
     if check.components:

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from factorgraph_dvl.trial import Trial
 
 
-# Of a track, s, that may be left unscored without a word.
+# Chosen: a longer unscored end of a track, s, gets a warning; records rarely end together.
 _UNSCORED_S = 10.0
 
 
@@ -24,22 +24,20 @@ def deadreckon(
     trial_path: TrialPath,
     calibration: Annotated[
         Path,
-        typer.Option(
-            metavar="FILE", help="calibration.json, its folder, or a file of values typed in."
-        ),
+        typer.Option(metavar="FILE", help="calibration.json, its folder, or a file of values."),
     ],
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder to write.")],
     attitude: Annotated[
         str | None,
         typer.Option(
             metavar="SOURCE",
-            help="Whose: sins, reference, or a solution folder. By default sins, and without "
-            "GNSS reference.",
+            help="Source of the attitude: sins (default), reference (default without GNSS), or a "
+            "solution folder.",
         ),
     ] = None,
     align: Annotated[
         float | None,
-        typer.Option(metavar="S", min=1.0, help="With sins: seconds of GNSS it may use."),
+        typer.Option(metavar="S", min=1.0, help="Time of GNSS that sins may use, s."),
     ] = None,
     force: Force = False,
     no_figures: NoFigures = False,
@@ -88,27 +86,27 @@ def deadreckon(
             }
             (folder / RESULT_FILE).write_bytes(to_json(result, about))
     if result.calibrated.score is None:
-        warn("neither a reference nor GNSS covers the track: it is not scored")
+        warn("neither a reference nor GNSS covers the track: its errors are unknown")
     else:
         print_table(error_table(result))
         distance = result.calibrated.score.path.total
         stdout().print(
-            f"{distance:.6g} m, scored by {result.scored_by}", markup=False, soft_wrap=True
+            f"{distance:.6g} m, compared with {result.scored_by}", markup=False, soft_wrap=True
         )
         end, last = result.calibrated.score.time[-1], result.calibrated.track.time[-1]
         if last - end > _UNSCORED_S:
             warn(
-                f"{result.scored_by} ends at {end:.1f} s and the track at {last:.1f} s: distance "
-                "and errors are those up to there"
+                f"{result.scored_by} ends at {end:.1f} s, before the track ({last:.1f} s): "
+                f"distance and errors are those up to {end:.1f} s"
             )
     for note in (*trial.notes, *notes):
         warn(note)
     if trial.dvl is not None and trial.dvl.settings.reference == "water":
-        warn("the DVL measures through the water: so does the track, and the current is its error")
+        warn("the DVL measures velocity through the water: the track drifts with the current")
     if result.calibrated.track.bridged > 0.0:
         warn(
-            f"{result.calibrated.track.bridged:.1f} s without bottom lock were bridged by the "
-            "velocity in body before and after"
+            f"{result.calibrated.track.bridged:.1f} s without bottom lock were bridged with the "
+            "velocity before and after"
         )
     print_written(out)
 
@@ -120,7 +118,7 @@ def _default_attitude(trial: Trial) -> str:
 def _attitude(
     trial: Trial, source: str, align: float | None
 ) -> tuple[AttitudeHistory, tuple[str, ...]]:
-    """Return whose attitude the track follows, and what is to be said of it."""
+    """Return the attitude for the track, and notes on it."""
     import numpy as np
 
     from factorgraph_dvl.errors import ConfigError
@@ -128,7 +126,7 @@ def _attitude(
     from factorgraph_dvl.imu.attitude_history import AttitudeHistory
 
     if align is not None and source != "sins":
-        raise ConfigError("goes with --attitude sins only", where="--align")
+        raise ConfigError("applies only to --attitude sins", where="--align")
     if source == "sins":
         from factorgraph_dvl.baselines import sins
 
@@ -151,7 +149,7 @@ def _attitude(
         )
     solution = load_solution(source)
     if solution.trial != trial.name:
-        warn(f"the attitude in {source} is that of trial {solution.trial}, not of {trial.name}")
+        warn(f"the attitude in {source} is from trial {solution.trial}, not {trial.name}")
     names = [e.name for e in solution.estimates]
     bias = np.zeros(3)
     if "gyro_bias_deg_h" in names:

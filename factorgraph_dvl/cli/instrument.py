@@ -13,7 +13,7 @@ def instrument(
         Path, typer.Argument(metavar="CALIBRATION", help="calibration.json, or its folder.")
     ],
 ) -> None:
-    """Print a calibration as instruments take it: angles, %, ppm, TRDI's EA and EI."""
+    """Print a calibration in the terms of instruments: angles, %, ppm, TRDI's EA and EI."""
     from factorgraph_dvl.analysis.instrument_terms import instrument_of
     from factorgraph_dvl.io.calibration_file import check_usable, load_calibration
     from factorgraph_dvl.report.files.instrument import instrument_text

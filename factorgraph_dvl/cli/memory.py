@@ -1,4 +1,4 @@
-"""What a run that ran out of memory says."""
+"""Error message of a run without enough memory."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _GB_PER_ROW = 7.7e-6
 
 
 def naming_memory(command: Callable[_P, _R]) -> Callable[_P, _R]:
-    """Return a command that says how much memory its trial takes where there is too little."""
+    """Return a command that reports the memory it needs if there is too little."""
 
     @wraps(command)
     def run(*args: _P.args, **kwargs: _P.kwargs) -> _R:
@@ -29,15 +29,14 @@ def naming_memory(command: Callable[_P, _R]) -> Callable[_P, _R]:
             return command(*args, **kwargs)
         except MemoryError:
             trial = kwargs.get("trial_path")
-        # Here, what the command had allocated is free again.
+        # The memory of the command is free again here.
         samples, rows = _sizes(trial) if isinstance(trial, Path) else (0, 0)
         need = ""
         if samples:
             size = _BASE_GB + _GB_PER_SAMPLE * samples + _GB_PER_ROW * rows
             need = (
-                f": to solve a trial of {samples} IMU samples and {rows} other measurements takes "
-                f"about {size:.1f} GB, besides the {_LIBRARIES_GB:g} GB of address space that "
-                "libraries reserve"
+                f": a trial of {samples} IMU samples and {rows} other measurements needs about "
+                f"{size:.1f} GB, and libraries reserve {_LIBRARIES_GB:g} GB of address space"
             )
         raise SolveError(
             f"there is not enough memory{need}",
@@ -48,13 +47,13 @@ def naming_memory(command: Callable[_P, _R]) -> Callable[_P, _R]:
 
 
 def _sizes(trial_path: Path) -> tuple[int, int]:
-    """Return the rows of a trial's IMU and of its other sensors, 0 where they cannot be told."""
+    """Return the rows of a trial's IMU and of its other sensors; 0 if unknown."""
     from factorgraph_dvl.io.tables import count_rows
     from factorgraph_dvl.io.trial_folder import record_files
 
     try:
         imu, *others = (count_rows(file) for file in record_files(trial_path))
     except Exception:
-        # It is a help within an error: no other error shall come of it.
+        # The estimate is optional: it must not replace the error.
         return 0, 0
     return imu, sum(others)

@@ -30,13 +30,15 @@ def observability(
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder to write.")],
     segments: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="Segments, a YAML file; by default they are found."),
+        typer.Option(
+            metavar="FILE", help="Segments, a YAML file; by default found from the motion."
+        ),
     ] = None,
     force: Force = False,
     no_figures: NoFigures = False,
     quiet: Quiet = False,
 ) -> None:
-    """Show what the data can tell, what they cannot, and which motion told it."""
+    """Show which parameters the data determine, and which motion contributes to them."""
     from factorgraph_dvl.io.folders import new_folder
     from factorgraph_dvl.io.segments_file import read_segments
     from factorgraph_dvl.io.trial_folder import inputs_of
@@ -59,7 +61,7 @@ def observability(
 def _view(
     source: Path, given: tuple[tuple[float, float, str], ...], progress: ProgressLine
 ) -> tuple[Observability, bool]:
-    """Return the view of a trial, which is solved for that, or of a solution."""
+    """Return the observability of a trial, which is solved first, or of a solution."""
     from factorgraph_dvl.analysis.information.observability import observability as look
     from factorgraph_dvl.io.calibration_file import CALIBRATION_FILE
     from factorgraph_dvl.io.folders import SETTINGS_FILE
@@ -70,7 +72,7 @@ def _view(
         solution = load_solution(source)
         return look(solution, given=given), solution.converged
     trial = load_trial(source)
-    # The solver takes longest to load: after what is most often wrong.
+    # The solver is slow to import: do so after the checks of the input.
     from factorgraph_dvl.solvers.information_history import solve_with_history
 
     solution, history = solve_with_history(trial, progress=progress)
@@ -78,7 +80,7 @@ def _view(
 
 
 def write_observability(view: Observability, folder: Path, source: str, *, figures: bool) -> None:
-    """Write a view's JSON, tables and figures into a folder."""
+    """Write JSON, tables and figures to a folder."""
     from factorgraph_dvl.io.tables import write_table
     from factorgraph_dvl.report.files.observability import history_columns, to_csv, to_json
 
@@ -119,4 +121,4 @@ def print_observability(view: Observability) -> None:
     for warning in view.warnings:
         warn(warning)
     for text in view.missing:
-        warn(f"left out: {text}")
+        warn(f"omitted: {text}")

@@ -15,22 +15,24 @@ TrialPath = Annotated[
 SolutionPath = Annotated[
     Path, typer.Option("--out", metavar="DIR", help="Solution folder to write.")
 ]
-Force = Annotated[bool, typer.Option("--force", help="Replace results that are there.")]
-NoFigures = Annotated[bool, typer.Option("--no-figures", help="Draw no figures.")]
+Force = Annotated[bool, typer.Option("--force", help="Replace existing results.")]
+NoFigures = Annotated[bool, typer.Option("--no-figures", help="Do not draw figures.")]
 Rate = Annotated[
     float, typer.Option(metavar="HZ", min=1e-3, max=1e4, help="Rate of the trajectory.")
 ]
-Anyway = Annotated[bool, typer.Option("--anyway", help="Go on where records cannot be used.")]
-Quiet = Annotated[bool, typer.Option("--quiet", help="Show no progress.")]
+Anyway = Annotated[
+    bool, typer.Option("--anyway", help="Continue although records are implausible.")
+]
+Quiet = Annotated[bool, typer.Option("--quiet", help="Do not show progress.")]
 
-# Output folders of the command that runs; `main` gives them up when it ends.
+# Output folders of the running command; released when it ends.
 claims = ExitStack()
 
 
 def claim_output(
     out: Path, *, force: bool, owned: Sequence[str], inputs: Iterable[Path | None]
 ) -> None:
-    """Keep the output folder for this command until it ends; the parameters as of `claim`."""
+    """Reserve the output folder until the command ends; the parameters are those of `claim`."""
     from factorgraph_dvl.io.folders import claim
 
     given = [path for path in inputs if path is not None]

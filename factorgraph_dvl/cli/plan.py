@@ -19,14 +19,14 @@ if TYPE_CHECKING:
 
 def plan(
     source: Annotated[
-        Path, typer.Argument(metavar="PLAN", help="Scenario with what is required, a YAML file.")
+        Path, typer.Argument(metavar="PLAN", help="Scenario with requirements, a YAML file.")
     ],
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder to write.")],
     force: Force = False,
     no_figures: NoFigures = False,
     quiet: Quiet = False,
 ) -> None:
-    """Predict what a planned trial will tell, and what to add where that is not enough."""
+    """Predict the σ of a planned trial, and propose manoeuvres if requirements are missed."""
     from factorgraph_dvl.analysis.information.observability import observability as look
     from factorgraph_dvl.io.folders import new_folder
     from factorgraph_dvl.planning import predict, propose, requirements
@@ -63,4 +63,4 @@ def _print_requirements(required: Sequence[Requirement], proposal: Proposal | No
         for line in proposal_lines(proposal):
             console.print(line, markup=False, highlight=False, soft_wrap=True)
     elif required:
-        console.print("All that is required is met.", markup=False)
+        console.print("All requirements are met.", markup=False)

@@ -15,7 +15,7 @@ from factorgraph_dvl.cli.options import Force, claim_output
 def simulate(
     config: Annotated[Path, typer.Argument(metavar="CONFIG", help="Scenario, a YAML file.")],
     out: Annotated[Path, typer.Option("--out", metavar="TRIAL", help="Trial folder to write.")],
-    seed: Annotated[int, typer.Option(min=0, help="Of all that is random.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Random seed.")] = 0,
     force: Force = False,
     parquet: Annotated[
         bool, typer.Option("--parquet", help="Write tables as Parquet instead of CSV.")

@@ -45,7 +45,7 @@ if TYPE_CHECKING:
 
 
 class KalmanMethod(StrEnum):
-    """What `kalman` calibrates or navigates by which method: a DVL, gyros, a planar trial."""
+    """Method of `kalman`: for a DVL, for gyros with a star tracker, or for a planar trial."""
 
     POINT_SET = "point-set"
     NINE_STATE = "nine-state"
@@ -58,7 +58,7 @@ class KalmanMethod(StrEnum):
 
     @property
     def planar(self) -> bool:
-        """Whether it filters planar trials."""
+        """Whether the method filters planar trials."""
         return self in (KalmanMethod.TWO_OBSERVATIONS, KalmanMethod.THREE_OBSERVATIONS)
 
 
@@ -74,7 +74,7 @@ def solve(
     """Estimate calibration and trajectory from all data of a trial."""
 
     def run(trial: Trial, progress: ProgressLine) -> tuple[Solution, None]:
-        # The solver takes longest to load: after what is most often wrong.
+        # The solver is slow to import: do so after the checks of the input.
         from factorgraph_dvl.solvers.batch import solve as run_batch
 
         return run_batch(trial, rate_hz=rate, progress=progress), None
@@ -106,8 +106,8 @@ def kalman(
     method: Annotated[
         KalmanMethod | None,
         typer.Option(
-            help="How the DVL, or with star the gyros, are calibrated (point-set by default), or "
-            "what a planar trial is filtered with (4sv-3ob)."
+            help="Method: for a DVL (default point-set), for gyros (star), or for a planar trial "
+            "(default 4sv-3ob)."
         ),
     ] = None,
     force: Force = False,
@@ -116,7 +116,7 @@ def kalman(
     anyway: Anyway = False,
     quiet: Quiet = False,
 ) -> None:
-    """Calibrate or navigate by a Kalman filter, to compare with `solve`."""
+    """Calibrate or navigate with a Kalman filter, for comparison with `solve`."""
 
     def run(trial: Trial, progress: ProgressLine) -> tuple[Solution, History | None]:
         from factorgraph_dvl.baselines import calibrate
@@ -163,7 +163,7 @@ def _solve_into(
     anyway: bool,
     quiet: bool,
 ) -> None:
-    """Load a trial, run a solver on it, write and show its solution."""
+    """Load a trial, run a solver, write and show its solution."""
     from factorgraph_dvl.io.planar_folder import is_planar, load_planar_trial
     from factorgraph_dvl.io.solution_folder import (
         FIGURES_FOLDER,
@@ -202,7 +202,7 @@ def _solve_into(
             try:
                 write_figures(trial, solution, folder / FIGURES_FOLDER)
             except Exception as error:
-                # A figure is not worth the solution.
+                # The solution is complete without figures.
                 warn(f"figures could not be drawn: {type(error).__name__}: {error}")
 
         save_solution(solution, out, force=force, extra=add)
@@ -220,7 +220,7 @@ def _solve_into(
 
 
 def write_beams(trial: Trial | PlanarTrial, solution: Solution, folder: Path) -> None:
-    """Write how the beams agree, if the trial has some and the solution calibrates them."""
+    """Write the consistency of the beams, if the solution calibrates beams."""
     from factorgraph_dvl.analysis.beam_quality import beam_quality, calibrates, calibration_of
     from factorgraph_dvl.io.solution_folder import BEAMS_FILE
     from factorgraph_dvl.io.tables import write_table
@@ -231,7 +231,7 @@ def write_beams(trial: Trial | PlanarTrial, solution: Solution, folder: Path) ->
 
 
 def write_instrument(solution: Solution, folder: Path) -> None:
-    """Write the calibration as instruments take it, if there is one of a DVL."""
+    """Write the calibration in the terms of instruments, if it calibrates a DVL."""
     from factorgraph_dvl.analysis.instrument_terms import NEEDED, instrument_of
     from factorgraph_dvl.io.solution_folder import INSTRUMENT_FILE
     from factorgraph_dvl.report.files.instrument import instrument_text

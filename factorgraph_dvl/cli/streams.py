@@ -1,4 +1,4 @@
-"""Standard output and standard error that fail no run."""
+"""Standard output and standard error whose failures do not stop a run."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 
 
 class _Stream(io.FileIO):
-    """A descriptor whose first failure ends the writing, and is kept instead of raised."""
+    """A descriptor that stores its first failure instead of raising it, and then drops output."""
 
     failure: OSError | None = None
 
@@ -23,9 +23,9 @@ class _Stream(io.FileIO):
 
 
 def guard_streams() -> None:
-    """Let no print fail a run: what cannot be written is dropped.
+    """Drop output that cannot be written instead of failing.
 
-    A stream that a caller has replaced is left alone, one that is closed goes nowhere.
+    A stream that a caller has replaced is not changed; a closed one discards its output.
     """
     for name, number in (("stdout", 1), ("stderr", 2)):
         stream = getattr(sys, name)
@@ -37,7 +37,7 @@ def guard_streams() -> None:
             stream.flush()
         guarded = io.TextIOWrapper(
             io.BufferedWriter(_Stream(number, "w", closefd=False)),
-            # A terminal that knows no µ shall not fail a run.
+            # A terminal without µ must not fail a run.
             encoding=getattr(stream, "encoding", "utf-8"),
             errors="replace",
             line_buffering=os.isatty(number) or number == 2,
@@ -55,9 +55,9 @@ def _raw(stream: Any) -> Any:
 
 
 def output_failure() -> OSError | None:
-    """Return why results could not be printed, None if they were.
+    """Return why results could not be printed; None if they were.
 
-    A reader that had enough, such as `head`, is no failure.
+    A reader that closes the pipe, such as `head`, is not a failure.
     """
     if not _is_guarded(sys.stdout):
         return None
@@ -67,7 +67,7 @@ def output_failure() -> OSError | None:
 
 
 def _occupy(number: int) -> None:
-    # A descriptor that is free would be that of the next file to be opened.
+    # Otherwise the next file to be opened would get this descriptor.
     nowhere = os.open(os.devnull, os.O_WRONLY)
     if nowhere != number:
         os.dup2(nowhere, number)

@@ -1,7 +1,7 @@
-"""Plans: what a trial will tell before anyone goes to sea, and what to add to it.
+"""Plans: the predicted posterior of a trial, and manoeuvres to add to it.
 
-A plan is a scenario without noise draws. It becomes a trial, which is linearised at its
-true motion with the noise that it claims: the posterior follows without solving.
+A plan is a scenario without noise draws. It becomes a trial, which is linearised at its true
+motion with its stated noise: the posterior follows without solving.
 """
 
 from __future__ import annotations

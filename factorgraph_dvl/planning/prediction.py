@@ -1,4 +1,4 @@
-"""From a planned motion to the posterior of the trial."""
+"""Prediction of the posterior of a planned trial."""
 
 from __future__ import annotations
 
@@ -21,21 +21,22 @@ from factorgraph_dvl.solvers.prediction import TrueStates, continue_posterior, p
 from factorgraph_dvl.statistics.information_history import InformationHistory
 from factorgraph_dvl.trial import Trial
 
-_INTERRUPTED = ("gaps_s", "outages_s", "no_lock_s", "lost")
+# Settings of the interruptions of sensors.
+_INTERRUPTIONS = ("gaps_s", "outages_s", "no_lock_s", "lost")
 
 
 @dataclass(frozen=True)
 class Ending:
-    """Where a motion ends, to go on from.
+    """End of a motion, from which further manoeuvres continue.
 
     Parameters
     ----------
     start : StartSettings
-        Position, heading and speed there.
+        Position, heading and speed at the end.
     time : float
-        Since the sea's phase was zero, s.
+        Time since the start of the plan, s, for the phase of the sway.
     frontier : Frontier
-        What is known there.
+        Posterior at the end.
     """
 
     start: StartSettings
@@ -45,20 +46,20 @@ class Ending:
 
 @dataclass(frozen=True)
 class Prediction:
-    """What a planned trial will tell.
+    """Predicted posterior of a planned trial.
 
     Parameters
     ----------
     scenario, trial : Scenario or Trial
-        What was planned; its records without noise.
+        The plan, and its records without noise.
     solution : Solution
-        Values are the truth, covariances what a solver will claim.
+        Solution with true values and predicted covariances.
     history : InformationHistory
         Information along the trial.
     duration : float
-        S.
+        Duration, s.
     ending : Ending
-        To go on from.
+        End of the motion.
     """
 
     scenario: Scenario
@@ -70,7 +71,7 @@ class Prediction:
 
 
 def predict(scenario: Scenario) -> Prediction:
-    """Predict the posterior of a scenario; nothing is drawn, nothing is solved.
+    """Predict the posterior of a scenario, without noise and without solving.
 
     Raises
     ------
@@ -91,23 +92,26 @@ def predict(scenario: Scenario) -> Prediction:
     )
 
 
-def go_on(
+def extend(
     scenario: Scenario, manoeuvres: list[dict[str, object]], ending: Ending
 ) -> tuple[InformationHistory, Ending]:
-    """Predict what further manoeuvres add, from where a motion ended.
+    """Predict the posterior after further manoeuvres.
 
     Parameters
     ----------
     scenario : Scenario
-        The sea and the sensors.
+        Scenario of the plan, with its sway and sensors.
     manoeuvres : list of dict of str to object
-        To add, as in a scenario.
+        Manoeuvres to add, as in a scenario.
     ending : Ending
-        Where to begin.
+        End of the motion so far.
 
     Returns
     -------
-    The information at their end, and where that is.
+    history : InformationHistory
+        Information along the added part.
+    ending : Ending
+        End of the added part.
     """
     sway = scenario.sway
     shifted = msgspec.structs.replace(
@@ -117,9 +121,11 @@ def go_on(
             for name in ("roll", "pitch", "yaw", "heave")
         },
     )
-    # Interruptions were planned for the time before.
+    # Interruptions and turns of the turntable belong to the time before.
     sensors = {
-        name: msgspec.structs.replace(truth, **{f: () for f in _INTERRUPTED if hasattr(truth, f)})
+        name: msgspec.structs.replace(
+            truth, **{f: () for f in _INTERRUPTIONS if hasattr(truth, f)}
+        )
         for name, truth in {"imu": scenario.imu, **scenario.aids}.items()
         if truth is not None
     }
@@ -144,7 +150,7 @@ def _later(part: AngularSway | Heave, time: float) -> AngularSway | Heave:
 def _ending(motion: TrueMotion, frontier: Frontier, before: float) -> Ending:
     end = np.array([motion.duration])
     state = motion.at(end)
-    # The mean motion: sway comes on top of it again.
+    # The mean motion, to which sway is added again.
     start = StartSettings(
         lat_deg=float(state.geodetic[0, 0] / DEG),
         lon_deg=float(state.geodetic[0, 1] / DEG),

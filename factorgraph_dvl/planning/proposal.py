@@ -1,14 +1,14 @@
-"""The shortest addition to a plan that meets what is required.
+"""The shortest addition to a plan that meets its requirements.
 
-Sequences of the library's manoeuvres are tried, each by going on from what is known where
-the sequence without its last entry ended:
+The search tries sequences of the library's manoeuvres. Each extends the posterior at the end
+of the sequence without its last entry:
 
-1. one after another, the entry that brings most per second is added until all is met;
-2. all sequences of up to two entries, in the order of their duration, that are shorter;
-3. all sequences, likewise.
+1. greedy: the entry with the largest gain per second is added until all requirements are met;
+2. all shorter sequences of up to two entries, in the order of their duration;
+3. all shorter sequences, in the order of their duration.
 
-The first that is found in 3 is the shortest there is. Where their number ends the search
-before, what 1 or 2 found is proposed, with the duration up to which all were tried.
+The first solution in step 3 is the shortest one. If the number of trials ends the search
+earlier, the result of step 1 or 2 is proposed, with the duration up to which all were tried.
 """
 
 from __future__ import annotations
@@ -24,18 +24,21 @@ import numpy as np
 from factorgraph_dvl.errors import ConfigError
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.planning.library import Item, Library, library
-from factorgraph_dvl.planning.prediction import Ending, Prediction, go_on, predict
+from factorgraph_dvl.planning.prediction import Ending, Prediction, extend, predict
 from factorgraph_dvl.planning.requirements import Requirement
 
-# Called with what was tried last and its number.
+# Called with the last sequence and its number.
 Progress = Callable[[str, int, float | None], None]
 
-_MOST_TRIED = 300
-# Of sequences that have to be predicted with the plan from its start, which takes longer.
-_MOST_PREDICTED = 60
+# Chosen: limits the search to minutes; a sequence takes about a tenth of a second.
+_MAX_TRIED = 300
+# Chosen: fewer, because each is predicted with the whole plan from its start.
+_MAX_PREDICTED = 60
+# Chosen: nobody adds more than an hour, s, to a plan.
 _LONGEST_S = 3600.0
-_FEW = 2
-# σ that differ by less are the same.
+# Chosen: all sequences of up to this many entries are few enough to try first.
+_SHORT = 2
+# Chosen: σ that differ by less than 1 % are equal in practice.
 _SAME = 1.01
 
 
@@ -46,20 +49,20 @@ class Proposal:
     Parameters
     ----------
     names : tuple of str
-        Of the manoeuvres in it.
+        Names of its manoeuvres.
     manoeuvres : tuple of dict of str to object
-        As in a scenario, to be added at the end.
+        Manoeuvres to add at the end, as in a scenario.
     added : float
-        Its duration, s.
+        Duration of the addition, s.
     requirements : tuple of Requirement
-        With what is predicted for plan and addition together.
+        Requirements with the predictions for plan and addition together.
     met : bool
-        Whether all are met; if not, this is the best that was found.
+        Whether all requirements are met; if not, this is the best addition found.
     tried : int
-        Number of sequences.
+        Number of sequences tried.
     limit : float
-        Duration up to which all sequences were tried, s; if all is met and it is not below
-        `added`, there is none shorter.
+        Duration up to which all sequences were tried, s; if all requirements are met and it is
+        not below `added`, no shorter addition exists.
     """
 
     names: tuple[str, ...]
@@ -72,18 +75,18 @@ class Proposal:
 
     @property
     def shortest(self) -> bool:
-        """Whether it meets all, and all shorter sequences of the library were tried."""
+        """Whether all requirements are met and all shorter sequences were tried."""
         return self.met and self.limit > self.added - 1e-3
 
     @property
     def missed(self) -> tuple[Requirement, ...]:
-        """What is not met."""
+        """Requirements that are not met."""
         return tuple(r for r in self.requirements if not r.met)
 
 
 @dataclass(frozen=True)
 class _Tried:
-    """A sequence, where it ends (None if that was not asked for), σ in units of those required."""
+    """A sequence, its end (None if not needed), and σ in units of the required ones."""
 
     items: tuple[int, ...]
     ending: Ending | None
@@ -91,13 +94,13 @@ class _Tried:
 
     @property
     def badness(self) -> float:
-        """By how much all that is required is missed; 0 if nothing is."""
+        """Sum of the logarithms of missed σ over required ones; 0 if all are met."""
         return float(np.sum(np.log(np.maximum(self.excess, 1.0))))
 
 
 @dataclass
 class _Search:
-    """What was tried so far, None where it cannot be sailed."""
+    """Sequences tried so far; None for those that cannot be carried out."""
 
     prediction: Prediction
     required: Sequence[Requirement]
@@ -107,16 +110,16 @@ class _Search:
 
     @property
     def walking(self) -> bool:
-        """Whether something that is required is no constant: only a whole prediction has it."""
+        """Whether a requirement is on a random walk, which only a whole prediction contains."""
         return not {r.component for r in self.required} <= set(self.prediction.history.names)
 
     @property
     def left(self) -> int:
-        """How many more may be tried."""
-        return (_MOST_PREDICTED if self.walking else _MOST_TRIED) - len(self.tried)
+        """Number of sequences that may still be tried."""
+        return (_MAX_PREDICTED if self.walking else _MAX_TRIED) - len(self.tried)
 
     def chosen(self, items: tuple[int, ...]) -> list[Item]:
-        """Return the entries of a sequence, with what gets the vessel under way."""
+        """Return the entries of a sequence, with the one to get under way."""
         first = [] if self.shelf.under_way is None else [self.shelf.under_way]
         return [*first, *(self.shelf.items[i] for i in items)]
 
@@ -125,7 +128,7 @@ class _Search:
         return sum(item.duration for item in self.chosen(items))
 
     def sail(self, items: tuple[int, ...]) -> _Tried | None:
-        """Try a sequence whose beginning was tried; None if it cannot be sailed."""
+        """Try a sequence whose beginning was tried; None if it cannot be carried out."""
         if items not in self.tried:
             try:
                 self.tried[items] = self._whole(items) if self.walking else self._last(items)
@@ -144,7 +147,7 @@ class _Search:
         else:
             ending, new = before.ending, [self.shelf.items[items[-1]]]
         manoeuvres = [m for item in new for m in item.manoeuvres]
-        history, after = go_on(self.prediction.scenario, manoeuvres, ending)
+        history, after = extend(self.prediction.scenario, manoeuvres, ending)
         std = dict(zip(history.names, history.std[-1].tolist(), strict=True))
         return _Tried(items, after, _excess(self.required, std))
 
@@ -166,7 +169,7 @@ class _Search:
         after = tuple(
             Requirement(r.component, r.required, std[r.component]) for r in self.required
         )
-        # What noise feigns is judged here only.
+        # Only a whole prediction accounts for spurious information.
         self.tried[items] = replace(self.known(items), excess=_excess(self.required, std))
         chosen = self.chosen(items)
         return Proposal(
@@ -180,7 +183,7 @@ class _Search:
         )
 
     def known(self, items: tuple[int, ...]) -> _Tried:
-        """Return a sequence that was sailed."""
+        """Return a sequence that was carried out."""
         found = self.tried[items]
         assert found is not None
         return found
@@ -192,23 +195,23 @@ def propose(
     *,
     progress: Progress | None = None,
 ) -> Proposal | None:
-    """Return the shortest addition that meets what is required; None if nothing is missed.
+    """Return the shortest addition that meets all requirements; None if the plan meets them.
 
     Parameters
     ----------
     prediction : Prediction
-        Of the plan.
+        Prediction of the plan.
     required : sequence of Requirement
-        Of `requirements`, with the predictions for the plan alone.
+        Result of `requirements` for the plan alone.
     progress : callable, optional
-        Called for each sequence that is tried.
+        Function called for each sequence.
     """
     if all(r.met for r in required):
         return None
     shelf = library(prediction.scenario, prediction.ending.start.speed_m_s)
     search = _Search(prediction, required, shelf, progress)
     found = _one_by_one(search)
-    few, _ = _shorter(search, found, _FEW)
+    few, _ = _shorter(search, found, _SHORT)
     found = few or found
     shortest, limit = _shorter(search, found, None)
     found = shortest or found
@@ -225,7 +228,7 @@ def propose(
 
 
 def _one_by_one(search: _Search) -> Proposal | None:
-    """Add the entry that brings most per second until all is met; None if that leads nowhere."""
+    """Add the entry with the largest gain per second until all are met; None if this fails."""
     items: tuple[int, ...] = ()
     badness = float(np.sum(np.log([max(r.predicted / r.required, 1.0) for r in search.required])))
     while search.left >= len(search.shelf.items):
@@ -252,20 +255,23 @@ def _one_by_one(search: _Search) -> Proposal | None:
 def _shorter(
     search: _Search, found: Proposal | None, deepest: int | None
 ) -> tuple[Proposal | None, float]:
-    """Return the first sequence that meets all, in the order of their duration.
+    """Return the first sequence, in the order of duration, that meets all requirements.
 
     Parameters
     ----------
     search : _Search
-        What was tried before, which is not tried again.
+        Search, which tries no sequence twice.
     found : Proposal or None
-        Nothing that takes as long is looked at; None if there is none yet.
+        Proposal so far; only shorter sequences are tried.
     deepest : int or None
-        Number of entries of a sequence at most.
+        Largest number of entries; None = unlimited.
 
     Returns
     -------
-    It, None if there is none; and the duration up to which all were tried.
+    proposal : Proposal or None
+        Proposal with that sequence; None if there is none.
+    limit : float
+        Duration up to which all were tried, s.
     """
     end = _LONGEST_S if found is None else found.added - 1e-6
     queue: list[tuple[float, tuple[int, ...]]] = [

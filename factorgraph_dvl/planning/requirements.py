@@ -1,4 +1,4 @@
-"""Which standard deviations are required, and which are met."""
+"""Required standard deviations, and whether a prediction meets them."""
 
 from __future__ import annotations
 
@@ -19,28 +19,28 @@ class Requirement:
 
     @property
     def met(self) -> bool:
-        """Whether the prediction is as small as required."""
+        """Whether the predicted standard deviation is at most the required one."""
         return self.predicted <= self.required
 
 
 def requirements(
     required: Mapping[str, float | Sequence[float]], estimates: Sequence[Estimate], source: str
 ) -> tuple[Requirement, ...]:
-    """Hold what is required against a prediction.
+    """Return the requirements of a plan with their predictions.
 
     Parameters
     ----------
     required : mapping of str to float or sequence of float
-        As of a scenario.
+        Required standard deviations, as in a scenario.
     estimates : sequence of Estimate
-        Of the prediction.
+        Estimates of the prediction.
     source : str
         Name of the plan, for messages.
 
     Raises
     ------
     ConfigError
-        If a name is not one of the estimated parameters, or the count of numbers is wrong.
+        If a name is not an estimated parameter, or the number of values is wrong.
     """
     components = {
         n: float(e.std[i])
@@ -62,13 +62,13 @@ def requirements(
             )
         if len(values) not in (1, len(names)):
             raise ConfigError(
-                f"there are {len(values)} numbers",
+                f"{len(values)} numbers are given",
                 where=f"{source} key required.{name}",
                 expected=f"1, or {len(names)}: {', '.join(names)}",
             )
         spread = values * len(names) if len(values) == 1 else values
         for component, value in zip(names, spread, strict=True):
-            # A component's own requirement wins over that of the whole.
+            # The requirement of a component overrides that of the whole parameter.
             if component not in required or name == component:
                 sigma[component] = value
     return tuple(Requirement(n, s, components[n]) for n, s in sigma.items())

@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 
 _UNITS = {"deg_h": "deg/h", "m_s": "m/s", "deg": "deg", "ug": "µg", "m": "m", "s": "s"}
-_MOST_DECIMALS = 12
+# Chosen: fewer than the digits of a double.
+_MAX_DECIMALS = 12
 
 
 def split_unit(component: str) -> tuple[str, str]:
@@ -25,7 +26,7 @@ def at_precision(value: float, std: float) -> str:
     """Write a number to the second digit of its standard deviation."""
     if not (math.isfinite(std) and std > 0.0 and math.isfinite(value)):
         return f"{value + 0.0:.6g}"
-    return fixed(value, min(max(1 - math.floor(math.log10(std)), 0), _MOST_DECIMALS))
+    return fixed(value, min(max(1 - math.floor(math.log10(std)), 0), _MAX_DECIMALS))
 
 
 def with_std(value: float, std: float) -> str:

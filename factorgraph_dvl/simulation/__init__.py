@@ -58,8 +58,8 @@ def simulate(scenario: Scenario | str | PathLike[str], seed: int = 0) -> Trial:
     scenario : Scenario or path-like of str
         A scenario, or the path of its YAML file.
     seed : int, default 0
-        Of all that is random. Each sensor draws from a stream of its own, so that adding or
-        changing one leaves the others as they were.
+        Random seed. Each sensor has a random stream of its own, so adding or changing a sensor
+        does not change the others.
 
     Raises
     ------
@@ -70,7 +70,9 @@ def simulate(scenario: Scenario | str | PathLike[str], seed: int = 0) -> Trial:
         scenario = load_scenario(scenario)
     if scenario.planar:
         raise ConfigError(
-            "there is no imu", where=scenario.source, expected="`simulate_planar` for such a one"
+            "there is no imu",
+            where=scenario.source,
+            expected="an imu, or `simulate_planar` for a planar scenario",
         )
     imu_rng, *aid_rngs = np.random.default_rng(seed).spawn(1 + len(_AIDS))
     motion = plan_motion(scenario)
@@ -104,7 +106,7 @@ def simulate_planar(scenario: Scenario | str | PathLike[str], seed: int = 0) -> 
     scenario : Scenario or path-like of str
         A scenario without an IMU, or the path of its YAML file.
     seed : int, default 0
-        Of all that is random; each sensor draws from a stream of its own.
+        Random seed. Each sensor has a random stream of its own.
 
     Raises
     ------
@@ -153,8 +155,7 @@ def _initial(
 
 
 def _reference(motion: TrueMotion, rate: float) -> Reference:
-    # Divided, not multiplied by a period: then a time that a file can hold in few digits
-    # is that number.
+    # Divided by the rate, not multiplied by the period, so that times have few digits.
     time = np.arange(int(np.floor(motion.duration * rate + 1e-6)) + 1) / rate
     state = motion.at(time)
     rph = state.rph.copy()

@@ -1,4 +1,4 @@
-"""What the beams of a simulated DVL report, and the turntable that may carry it."""
+"""Simulated beams of a DVL, and the turntable that may carry it."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def _drawn(truth: DvlBeamsTruth, rng: np.random.Generator) -> tuple[Array, Array
     """Return the true directions in body (N, 3), and scale errors (N,)."""
     nominal_d = truth.nominal.nominal_d
     n = len(nominal_d)
-    # Drawn whether used or not, so that one setting does not move the other draws.
+    # Always drawn, so that a setting does not change the other draws.
     radius, bearing, part = rng.uniform(size=n), rng.uniform(size=n), rng.uniform(-1.0, 1.0, n)
     if truth.direction_error_deg == "draw":
         reach = (truth.direction_error_up_to_deg or 0.0) * np.sqrt(radius)
@@ -90,10 +90,10 @@ def _drawn(truth: DvlBeamsTruth, rng: np.random.Generator) -> tuple[Array, Array
 
 
 def _turned(nominal: Array, by: Array) -> Array:
-    """Return a unit vector, turned by two angles towards its two axes.
+    """Return a unit vector turned by two angles towards its two axes.
 
-    These are the body's x and y, taken along by the shortest rotation from z, or from -z if
-    that is nearer, to the vector.
+    The axes are the body's x and y, rotated by the shortest rotation from z (or -z, if nearer)
+    to the vector.
     """
     pole = np.array([0.0, 0.0, -1.0 if nominal[2] < 0.0 else 1.0])
     across = np.cross(pole, nominal)

@@ -1,4 +1,4 @@
-"""What a simulated depth sensor reports."""
+"""Simulated depth sensor."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ def simulate_depth(
 ) -> tuple[Depth, dict[str, Array]]:
     """Return the sensor's record, and the height of the sea surface by reported name.
 
-    How far the sensor, which the lever arm displaces from the IMU over the ellipsoid, is
-    below the sea surface.
+    The depth is the distance of the sensor, at its lever arm from the IMU, below the sea
+    surface.
     """
     truth = scenario.depth
     assert truth is not None

@@ -38,7 +38,7 @@ class Sampled(Section, frozen=True, kw_only=True):
 
 
 class SimulatedInstrument(Sampled, frozen=True, kw_only=True):
-    """A simulated sensor, and what trial.yaml claims of it unless told otherwise."""
+    """A simulated sensor, and the settings of trial.yaml that follow from it by default."""
 
     section_type: ClassVar[type[SensorSection]]
 
@@ -132,7 +132,7 @@ class DvlTruth(SimulatedInstrument, frozen=True, kw_only=True):
             raise ValueError("`scale_error` must be above -1")
 
     def claimed(self) -> dict[str, Any]:
-        """Return noise and the kind of lock as simulated; the mounting is to be found."""
+        """Return noise and the kind of lock as simulated, but not the mounting."""
         names = ("velocity_std_m_s", "velocity_std_fraction", "reference")
         return {name: getattr(self, name) for name in names}
 
@@ -174,7 +174,7 @@ class DepthTruth(SimulatedInstrument, frozen=True, kw_only=True):
     sea_surface_height_m: float = 0.0
 
     def claimed(self) -> dict[str, Any]:
-        """Return noise and lever arm as simulated; the height of the sea is to be found."""
+        """Return noise and lever arm as simulated, but not the height of the sea surface."""
         out: dict[str, Any] = {"lever_arm_m": self.lever_arm_m}
         return out | ({"std_m": self.std_m} if self.std_m > 0.0 else {})
 

@@ -11,8 +11,9 @@ from factorgraph_dvl.errors import ConfigError
 from factorgraph_dvl.settings.convert import convert
 from factorgraph_dvl.settings.sections import NonNegative, Positive, Section
 
-# More than any trial has, far fewer than would exhaust memory.
+# Chosen: more than any trial has, far fewer than would exhaust memory.
 _MAX_MANOEUVRES = 100_000
+# Chosen: longest circle, s; four months, so a longer one is a typing error.
 _LONGEST_S = 1e7
 
 
@@ -43,7 +44,7 @@ class Turn(Section, frozen=True, kw_only=True):
 
 
 class FigureEight(Section, frozen=True, kw_only=True):
-    """Turn a full circle and then one to the other side; to starboard first where positive."""
+    """Turn a full circle to each side, first to starboard if positive."""
 
     figure_eight_deg_s: float
     ramp_s: NonNegative = 0.0
@@ -72,14 +73,14 @@ class FigureEight(Section, frozen=True, kw_only=True):
 
 
 class Stop(Section, frozen=True, kw_only=True):
-    """Come to rest in the water, stay for `stop_s`, and go on at the speed before."""
+    """Stop in the water for `stop_s`, and return to the speed before."""
 
     stop_s: NonNegative
     acceleration_m_s2: Positive = 0.2
 
 
 class Climb(Section, frozen=True, kw_only=True):
-    """Change the height at a vertical speed that builds up over ramp_s, and down again."""
+    """Change the height at a vertical speed with ramps of `ramp_s` at both ends."""
 
     climb_m_s: float
     to_height_m: float

@@ -1,4 +1,4 @@
-"""What the sensors of a simulated vehicle report."""
+"""Simulated records of IMU, GNSS and DVL."""
 
 from __future__ import annotations
 
@@ -22,6 +22,7 @@ from factorgraph_dvl.simulation.instruments import Interval, Sampled
 from factorgraph_dvl.simulation.motion import TrueMotion, TrueState
 from factorgraph_dvl.simulation.scenario import Scenario
 
+# Chosen: samples computed at a time; limits memory to some megabytes.
 _CHUNK = 32768
 
 
@@ -36,7 +37,7 @@ def simulate_imu(
     truth = scenario.imu
     assert truth is not None
     jitter_rng, bias_rng, walk_rng, noise_rng = rng.spawn(4)
-    # The interval of the first sample must not begin before the motion does.
+    # The interval of the first sample must not begin before the motion.
     bounds = sample_times(truth, motion.duration, jitter_rng, first=0)
     time, interval = bounds[1:], np.diff(bounds)
     if time.size == 0:
@@ -71,7 +72,7 @@ def simulate_imu(
             truth.accel_noise_ug_sqrt_hz * MICRO_G,
         ),
     ):
-        # Drawn whether used or not, so that one setting does not move the other draws.
+        # Always drawn, so that a setting does not change the other draws.
         drawn = bias_rng.standard_normal(3) * (std or 0.0)
         bias = np.broadcast_to(drawn if constant == "draw" else np.array(constant), gyro.shape)
         if scenario.noise and walk > 0.0:
@@ -100,7 +101,7 @@ def simulate_gnss(
     assert truth is not None
     jitter_rng, position_rng, velocity_rng = rng.spawn(3)
     time = sample_times(truth, motion.duration, jitter_rng)
-    # On the ship, also where a turntable turns the IMU.
+    # The antenna is on the ship, even if a turntable turns the IMU.
     state = motion.ship_at(time)
     nRs = rotation_from_rph(state.rph, scenario.body_axes)
     arm_n = apply(nRs, np.array(truth.lever_arm_m))
@@ -131,8 +132,8 @@ def simulate_dvl(
 
         v_d = (1 + k) C_b^d (v_b + omega_eb_b x l) + beta + noise,
 
-    at the true time of the ping; the record's time is later by the time offset. Through
-    the water, v_b lacks the current.
+    at the true time of the ping; the recorded time is later by the time offset. Through the
+    water, v_b excludes the current.
     """
     truth = scenario.dvl
     assert truth is not None

@@ -29,7 +29,9 @@ from factorgraph_dvl.simulation.manoeuvres import Accelerate, Climb, Manoeuvre, 
 from factorgraph_dvl.simulation.scenario import Scenario
 from factorgraph_dvl.simulation.table import table_angle
 
+# Chosen: reaches the precision of a double with steps of half a second.
 _COLLOCATION_NODES = 6
+# Chosen: east and north are undefined at the poles.
 _MAX_LATITUDE = 89.5 * DEG
 
 
@@ -40,7 +42,7 @@ class Sway:
     Parameters
     ----------
     amplitude, frequency, phase : ndarray, shape (K,)
-        Of amplitude · sin(frequency t + phase); the frequency in rad/s.
+        Terms amplitude · sin(frequency t + phase); the frequency in rad/s.
     """
 
     amplitude: Array
@@ -97,27 +99,27 @@ class TrueState:
 class TrueMotion:
     """The motion of a scenario, exact at any time from 0 to `duration`.
 
-    The vehicle moves through the water along its course; yaw sway turns the bow about
-    the course, so that it makes the vehicle slip sideways, as waves do.
+    The vehicle moves through the water along its course; yaw sway turns the bow about the
+    course, so the vehicle slips sideways, as in waves.
 
     Parameters
     ----------
     speed : PPoly
-        Through the water, m/s.
+        Speed through the water, m/s.
     course : PPoly
-        Clockwise from north, rad.
+        Course through the water, clockwise from north, rad.
     lat, lon : PPoly
-        Rad.
+        Latitude and longitude, rad.
     height : PPoly
-        Without heave and current, m.
+        Ellipsoidal height without heave and current, m.
     current_n : ndarray, shape (3,), m/s
-        ENU.
+        Current, ENU.
     roll, pitch, yaw, heave : Sway
         Sway, rad and m.
     kinks : ndarray, shape (K,), s
         Times at which acceleration or turn rate change abruptly.
     duration : float
-        S.
+        Duration, s.
     body_axes : BodyAxes
         Axes of the body frame.
     table : PPoly, optional

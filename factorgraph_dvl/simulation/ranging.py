@@ -44,10 +44,10 @@ def simulate_beacons(
     velocity = state.v_n + np.einsum("mij,mj->mi", nRb, np.cross(state.omega_eb_b, arm))
     here = np.stack(pymap3d.geodetic2ecef(*transponder.T, deg=False), axis=1)
     there = np.stack(pymap3d.geodetic2ecef(*place[asked].T, deg=False), axis=1)
-    away = here - there
-    distance = np.linalg.norm(away, axis=1)
+    separation = here - there
+    distance = np.linalg.norm(separation, axis=1)
     lat, lon = state.geodetic[:, :2].T
-    direction = np.stack(pymap3d.ecef2enuv(*away.T, lat, lon, deg=False), axis=1)
+    direction = np.stack(pymap3d.ecef2enuv(*separation.T, lat, lon, deg=False), axis=1)
     ranges = scale * distance
     rates = scale * np.sum(direction * velocity, axis=1) / distance
     draws = noise_rng.standard_normal((time.size, 2))
@@ -94,7 +94,7 @@ def simulate_heading(
 def simulate_log(
     scenario: Scenario, motion: TrueMotion, rng: np.random.Generator
 ) -> tuple[SpeedLog, dict[str, Array]]:
-    """Return the log's record, its scale error, and the current that it does not see."""
+    """Return the log's record, its scale error, and the current that it does not measure."""
     truth = scenario.log
     assert truth is not None
     jitter_rng, noise_rng = rng.spawn(2)

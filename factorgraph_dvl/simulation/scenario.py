@@ -1,4 +1,4 @@
-"""Scenarios: what a simulated trial is, as typed settings read from YAML.
+"""Scenarios of simulated trials, as typed settings read from YAML.
 
 ```yaml
 name: harbour
@@ -84,7 +84,7 @@ Longitude = Annotated[float, msgspec.Meta(ge=-360, le=360)]
 
 
 class StartSettings(Section, frozen=True, kw_only=True):
-    """Where and how the vehicle is at time zero."""
+    """Position, heading and speed of the vehicle at time zero."""
 
     lat_deg: Latitude
     lon_deg: Longitude
@@ -110,7 +110,7 @@ class Heave(Section, frozen=True, kw_only=True):
 
 
 class SwaySettings(Section, frozen=True, kw_only=True):
-    """What the sea does to the vehicle."""
+    """Sway of the vehicle by the sea."""
 
     roll: tuple[AngularSway, ...] = ()
     pitch: tuple[AngularSway, ...] = ()
@@ -128,7 +128,7 @@ class InitialClaim(Section, frozen=True, kw_only=True):
 
 
 class Claims(Section, frozen=True, kw_only=True):
-    """What trial.yaml will say; sensor sections as in trial.yaml."""
+    """Settings of the written trial.yaml; sensor sections as there."""
 
     imu: dict[str, Any] = msgspec.field(default_factory=dict)
     gnss: dict[str, Any] = msgspec.field(default_factory=dict)
@@ -193,7 +193,7 @@ class Scenario(Section, frozen=True, kw_only=True):
 
     @property
     def planar(self) -> bool:
-        """Whether it makes a planar trial: one without an IMU."""
+        """Whether the trial is planar: without an IMU."""
         return self.imu is None
 
     @property
@@ -203,7 +203,7 @@ class Scenario(Section, frozen=True, kw_only=True):
         return {name: truth for name, truth in given.items() if truth is not None}
 
     def settings(self, section: str) -> SensorSection:
-        """Return a sensor's section of the trial: as simulated, but for what it claims.
+        """Return a sensor's section of the trial: as simulated, except for its claims.
 
         Raises
         ------
@@ -246,7 +246,7 @@ def parse_scenario(data: Mapping[str, Any], source: str = "scenario") -> Scenari
     data : mapping of str to object
         Keys and values as in the file.
     source : str, default 'scenario'
-        Name of their origin, for messages.
+        Name of the origin of the data, for messages.
 
     Raises
     ------

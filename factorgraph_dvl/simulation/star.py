@@ -1,4 +1,4 @@
-"""What a simulated star tracker reports."""
+"""Simulated star tracker."""
 
 from __future__ import annotations
 

@@ -81,7 +81,7 @@ UNOBSERVABLE = {
     "three scales": lambda: under_way(**THREE_SCALES),
     "walking biases": lambda: under_way(**WALKING),
     "no current": lambda: adrift(current_m_s=[0, 0, 0]),
-    "held fixed": lambda: under_way(
+    "fixed": lambda: under_way(
         trial={
             "dvl": {
                 "misalignment_deg": [2, 2, 30],
@@ -120,7 +120,7 @@ def test_nothing_unobservable_stops_it(name: str, tmp_path: Path, run: Run) -> N
         total = np.array(shares["prior"]) + np.sum(shares["segments"], axis=0)
         np.testing.assert_allclose(total, 1.0, atol=1e-6)
         assert np.min([shares["prior"], *shares["segments"]]) >= -1e-9
-    if trial.dvl is None or not trial.dvl.locked.any() or name == "held fixed":
+    if trial.dvl is None or not trial.dvl.locked.any() or name == "fixed":
         assert found["singular_values"] is None
         assert any("singular values" in text for text in found["missing"])
     else:
@@ -148,7 +148,7 @@ def test_a_straight_run_names_its_four_directions(tmp_path: Path, run: Run) -> N
     open_ones = [d["dominant"] for d in found["marginals"]["directions"][:10]]
     for name in named:
         assert name in open_ones
-        assert f"{name[0]} is not told by the data" in text
+        assert f"{name[0]} is not determined by the data" in text
     components = found["marginals"]["components"]
     for name in ("misalignment_x_deg", "misalignment_z_deg", "scale_error"):
         assert components[name]["observable"]
@@ -194,7 +194,7 @@ def test_a_solution_alone(tmp_path: Path, run: Run) -> None:
     found = strict(out / "observability.json")
     assert found["kind"] == "solution"
     assert found["shares"] is None
-    assert "they take the trial itself" in err
+    assert "they need the trial itself" in err
     assert "assumed σ" in found["singular_values"]["scaling"]
     assert not (out / "history.csv").exists()
     labels = [s["label"] for s in found["segments"]]
@@ -219,7 +219,7 @@ def test_a_bare_solution_says_what_it_lacks() -> None:
     view = observability(bare)
     assert view.marginals is None
     assert view.point_set is None
-    assert any("marginal view" in text for text in view.missing)
+    assert any("posterior against prior" in text for text in view.missing)
     assert json.loads(to_json(view, "x"))["marginals"] is None
 
 

@@ -17,7 +17,7 @@ from factorgraph_dvl.cli import main
 from factorgraph_dvl.errors import ConfigError
 from factorgraph_dvl.planning import predict, propose, requirements
 from factorgraph_dvl.planning.library import Item, Library, library
-from factorgraph_dvl.planning.prediction import go_on
+from factorgraph_dvl.planning.prediction import extend
 from factorgraph_dvl.report.files.plan import proposal_lines
 from factorgraph_dvl.simulation import load_scenario, parse_scenario, plan_motion, simulate
 from factorgraph_dvl.solvers.batch import solve
@@ -66,7 +66,7 @@ def test_one_scale_for_an_instrument_that_has_three():
     solved = solve(simulate(msgspec.structs.replace(scene, noise=True), 1))
     claimed = std_of(solved)["scale_error"]
     assert std_of(predicted.solution)["scale_error"] == pytest.approx(claimed, rel=0.02)
-    history, _ = go_on(predicted.scenario, [{"straight_s": 10}], predicted.ending)
+    history, _ = extend(predicted.scenario, [{"straight_s": 10}], predicted.ending)
     assert np.isfinite(history.std).all()
 
 
@@ -74,8 +74,8 @@ def test_going_on_is_as_good_as_starting_again():
     scene = scenario(current_m_s=[0.2, 0.1, 0])
     more = [{"turn_deg_s": 3, "duration_s": 30}, {"straight_s": 20}]
     first = predict(scene)
-    history, ending = go_on(first.scenario, more, first.ending)
-    second, ending = go_on(first.scenario, [{"straight_s": 20}], ending)
+    history, ending = extend(first.scenario, more, first.ending)
+    second, ending = extend(first.scenario, [{"straight_s": 20}], ending)
     whole = predict(
         msgspec.structs.replace(scene, manoeuvres=[*scene.manoeuvres, *more, {"straight_s": 20}])
     )
@@ -191,7 +191,7 @@ def test_no_sequence_of_up_to_three_entries_is_shorter(monkeypatch):
     def remembered(scene, manoeuvres, ending):
         key = (json.dumps(manoeuvres), id(ending))
         if key not in sailed:
-            sailed[key] = go_on(scene, manoeuvres, ending)
+            sailed[key] = extend(scene, manoeuvres, ending)
         return sailed[key]
 
     def predicted(scene):
@@ -200,7 +200,7 @@ def test_no_sequence_of_up_to_three_entries_is_shorter(monkeypatch):
             planned[key] = predict(scene)
         return planned[key]
 
-    monkeypatch.setattr(proposing, "go_on", remembered)
+    monkeypatch.setattr(proposing, "extend", remembered)
     monkeypatch.setattr(proposing, "predict", predicted)
     ends, std, duration = {(): prediction.ending}, {}, {}
     for depth in (1, 2, 3):
@@ -243,8 +243,8 @@ def test_the_order_of_a_sequence_matters():
     # "straight, turn" is another result than "turn, straight".
     prediction = predict(scenario(**STRAIGHT))
     turn, straight = {"turn_deg_s": 3, "duration_s": 30}, {"straight_s": 60}
-    history, _ = go_on(prediction.scenario, [turn, straight], prediction.ending)
-    other, _ = go_on(prediction.scenario, [straight, turn], prediction.ending)
+    history, _ = extend(prediction.scenario, [turn, straight], prediction.ending)
+    other, _ = extend(prediction.scenario, [straight, turn], prediction.ending)
     at = history.names.index("misalignment_y_deg")
     assert history.std[-1, at] < 0.9 * other.std[-1, at]
     required = required_of(prediction, misalignment_y_deg=1.005 * float(history.std[-1, at]))
@@ -255,9 +255,9 @@ def test_the_order_of_a_sequence_matters():
 
 
 def test_a_search_that_ends_early_says_so(monkeypatch):
-    monkeypatch.setattr(proposing, "_MOST_TRIED", 20)
+    monkeypatch.setattr(proposing, "_MAX_TRIED", 20)
     prediction = predict(scenario(**STRAIGHT))
-    history, _ = go_on(
+    history, _ = extend(
         prediction.scenario, [{"turn_deg_s": 3, "duration_s": 150}], prediction.ending
     )
     at = history.names.index("misalignment_y_deg")
@@ -268,7 +268,7 @@ def test_a_search_that_ends_early_says_so(monkeypatch):
     assert not found.shortest
     assert found.limit < 150.0
     (line, *_) = proposal_lines(found)
-    assert f"all of up to {found.limit:.0f} s among them" in line
+    assert f"including all of up to {found.limit:.0f} s" in line
 
 
 def test_a_bias_that_walks_is_searched_for():
@@ -288,7 +288,7 @@ def test_a_bias_that_walks_is_searched_for():
 
 def test_what_no_manoeuvre_shows_is_said_to_be_missed(monkeypatch):
     # Without sway nothing rolls or pitches: no lever arm z.
-    monkeypatch.setattr(proposing, "_MOST_TRIED", 12)
+    monkeypatch.setattr(proposing, "_MAX_TRIED", 12)
     prediction = predict(scenario(**STRAIGHT))
     found = propose(prediction, required_of(prediction, lever_arm_x_m=0.3, lever_arm_z_m=0.3))
     assert found is not None

@@ -33,7 +33,7 @@ from factorgraph_dvl.imu.attitude_history import AttitudeHistory
 from factorgraph_dvl.io.external_results import read_truth
 from factorgraph_dvl.io.solution_folder import load_solution, save_solution
 from factorgraph_dvl.io.trial_folder import load_trial, save_trial
-from factorgraph_dvl.planning.prediction import go_on, predict
+from factorgraph_dvl.planning.prediction import extend, predict
 from factorgraph_dvl.quality.survey import survey
 from factorgraph_dvl.report.figures.observability import (
     history_figure,
@@ -881,5 +881,5 @@ def test_a_plan_foresees_what_beams_will_be_known_to(solved):
 def test_a_plan_goes_on_with_the_turntable_where_it_stands():
     planned = noisy()
     first = predict(planned)
-    history, _ = go_on(planned, [{"straight_s": 30}], first.ending)
+    history, _ = extend(planned, [{"straight_s": 30}], first.ending)
     assert history.names == first.history.names

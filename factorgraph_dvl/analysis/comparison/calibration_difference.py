@@ -24,11 +24,11 @@ Side = Literal["A", "B"]
 Verdict = Literal["agree", "differ", "not comparable"]
 Kind = Literal["upper bound", "Hausman", "A alone", "B alone", "none"]
 
-# As the bands of all figures: results that agree exceed it in 0.27 % of components.
+# Chosen: three standard deviations, as in all figures; 0.27 % of a normal distribution is beyond.
 AGREE_SIGMAS = 3.0
 AGREE_PROBABILITY = 0.0027
-# Reported sigmas are good to some percent: below this ratio nothing but their errors
-# would be left of the difference of two variances.
+# Chosen: reported σ are accurate to some percent; below this ratio the difference of two
+# variances would be their error.
 HAUSMAN_RATIO = 1.05
 
 _IN_BODY_AXES = (
@@ -49,16 +49,16 @@ class Component:
     a, b : float
         The two values; nan where a result has none.
     std_a, std_b : float
-        Their standard deviations; nan where unknown, 0 where held fixed.
+        Their standard deviations; nan where unknown, 0 where fixed.
     std_upper : float
         √(σ_A² + σ_B²), at least the standard deviation of a - b if the errors are not negatively
         correlated; nan where unknown.
     std_hausman : float
-        √(σ² of the other - σ² of the efficient one); nan where not known or not asked for.
+        √(σ² of the other - σ² of the efficient one); nan where unknown or not requested.
     std, kind : float or Kind
-        The standard deviation of a - b that is shown, and which it is.
+        Standard deviation of a - b that is shown, and its kind.
     verdict, reason : Verdict or str
-        Agree or differ by `std`, or why not comparable.
+        Whether a and b agree given `std`, and why they are not comparable if they are not.
     """
 
     parameter: str
@@ -81,7 +81,7 @@ class Component:
 
     @property
     def in_sigmas(self) -> float:
-        """Difference over its standard deviation; nan where that is not known."""
+        """Difference over its standard deviation; nan where unknown."""
         return self.difference / self.std if self.std > 0.0 else float("nan")
 
 
@@ -92,15 +92,16 @@ class Joint:
     Parameters
     ----------
     names : tuple of str
-        Of the n components.
+        Names of the n components.
     statistic : float
-        d' (P_A + P_B)^-1 d, with d = A - B.
+        The test statistic, d' (P_A + P_B)^-1 d with d = A - B.
     limit : float
-        That chi² of n degrees exceeds with `AGREE_PROBABILITY`.
+        Value that chi² with n degrees of freedom exceeds with `AGREE_PROBABILITY`.
     probability : float
-        That chi² of n degrees exceeds the statistic; of results that agree it is at least this.
+        Probability that chi² with n degrees of freedom exceeds the statistic; a lower bound for
+        results that agree.
     correlations : bool
-        Whether both results state correlations; else taken as none.
+        Whether both results state correlations; otherwise zero is assumed.
     """
 
     names: tuple[str, ...]
@@ -126,14 +127,14 @@ def compare_calibrations(
     of the variances: Hausman, Specification Tests in Econometrics, Econometrica 46(6),
     1978, 1251-1271, lemma 2.1.
 
-    Of two rotation vectors of one rotation that of B is taken which is nearer to A's.
+    Of the two rotation vectors of B's rotation, the one nearer to A's is compared.
 
     Parameters
     ----------
     a, b : Solution
         The results.
     efficient : Side, optional
-        Which of them uses the data fully, by a model that is true.
+        The result that uses all data with a correct model.
     """
     of_a = {e.name: e for e in a.estimates}
     of_b = {e.name: e for e in same_branch(b, a).estimates}
@@ -145,7 +146,7 @@ def compare_calibrations(
 
 
 def rotation_angles(a: Solution, b: Solution) -> dict[str, float]:
-    """Return the angles, deg, of the rotations that take B's to A's, by parameter."""
+    """Return the angles between the rotations of A and B, deg, by parameter."""
     out = {}
     for name in ROTATION_VECTORS:
         found = [e.value for s in (a, b) for e in s.estimates if e.name == name]
@@ -156,14 +157,14 @@ def rotation_angles(a: Solution, b: Solution) -> dict[str, float]:
 
 
 def joint_test(a: Solution, b: Solution, components: tuple[Component, ...]) -> Joint | None:
-    """Return the joint test of components with a verdict and both sigmas, None without.
+    """Return the joint test of the comparable components; None if there are none.
 
     Parameters
     ----------
     a, b : Solution
         The results, for their covariances.
     components : tuple of Component
-        Of `compare_calibrations`.
+        Result of `compare_calibrations`.
     """
     tested = [
         c
@@ -187,12 +188,12 @@ def joint_test(a: Solution, b: Solution, components: tuple[Component, ...]) -> J
 
 
 def same_branch(solution: Solution, other: Solution) -> Solution:
-    """Return a solution with the rotation vectors that are nearer to another's.
+    """Return a solution with its rotation vectors on the same branch as another's.
 
-    Directions become turns of the other's nominal ones.
+    Beam directions become turns of the other's nominal directions.
 
-    With φ' = φ (1 - 2π / |φ|), the same rotation, J = (1 - 2π / |φ|) I + 2π φ φ' / |φ|³
-    takes its covariance along.
+    φ' = φ (1 - 2π / |φ|) is the same rotation; J = (1 - 2π / |φ|) I + 2π φ φᵀ / |φ|³
+    transforms its covariance.
     """
     estimates = list(solution.estimates)
     covariance = np.array(solution.covariance, dtype=float)
@@ -221,7 +222,7 @@ def same_branch(solution: Solution, other: Solution) -> Solution:
 
 
 def _about_the_same(estimate: Estimate, other: Solution) -> Estimate:
-    """Return directions as turns of the other's nominal ones; the same to first order."""
+    """Return directions as turns of the other's nominal ones, to first order."""
     theirs = next((e for e in other.estimates if e.name == estimate.name), None)
     if theirs is None or theirs.nominal is None or theirs.value.size != estimate.value.size:
         return estimate
@@ -232,21 +233,21 @@ def _about_the_same(estimate: Estimate, other: Solution) -> Estimate:
 def std_of_difference(
     std_a: Array, std_b: Array, efficient: Side | None
 ) -> tuple[Array, NDArray[np.float64]]:
-    """Return √(σ_A² + σ_B²), and the Hausman value where it has digits, else nan.
+    """Return √(σ_A² + σ_B²), and the Hausman value where it is significant, otherwise nan.
 
     Parameters
     ----------
     std_a, std_b : ndarray, shape (...)
         Standard deviations.
     efficient : Side or None
-        Which of the two is efficient; None = neither.
+        The efficient result; None = neither.
     """
     upper = np.hypot(std_a, std_b)
     hausman = np.full(np.shape(upper), np.nan)
     if efficient is not None:
         best, other = (std_a, std_b) if efficient == "A" else (std_b, std_a)
-        has_digits = (other > HAUSMAN_RATIO * best) & (best > 0.0)
-        np.sqrt(other**2 - best**2, out=hausman, where=has_digits)
+        significant = (other > HAUSMAN_RATIO * best) & (best > 0.0)
+        np.sqrt(other**2 - best**2, out=hausman, where=significant)
     return upper, hausman
 
 
@@ -257,14 +258,14 @@ def _compare(
     assert some is not None
     n = some.value.size
     obstacle = _obstacle(a, b, same_axes)
-    value_a, std_a, seen_a = _columns(a, n)
-    value_b, std_b, seen_b = _columns(b, n)
+    value_a, std_a, observable_a = _columns(a, n)
+    value_b, std_b, observable_b = _columns(b, n)
     upper, hausman = std_of_difference(std_a, std_b, efficient)
     out = []
     for i, name in enumerate(some.component_names):
         std, kind = _shown(std_a[i], std_b[i], upper[i], hausman[i])
         reason = obstacle or _component_obstacle(
-            (value_a[i], std_a[i], seen_a[i]), (value_b[i], std_b[i], seen_b[i])
+            (value_a[i], std_a[i], observable_a[i]), (value_b[i], std_b[i], observable_b[i])
         )
         if obstacle or not np.isfinite(value_a[i] - value_b[i]):
             std, kind = float("nan"), "none"
@@ -289,7 +290,7 @@ def _compare(
 
 
 def _columns(estimate: Estimate | None, n: int) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """Return values, standard deviations, observability (n,); one number for all is repeated."""
+    """Return values, standard deviations and observability, (n,); one number is repeated."""
     unknown = np.full(n, np.nan)
     if estimate is None or estimate.value.size not in (1, n):
         return unknown, unknown, np.ones(n, dtype=bool)
@@ -304,15 +305,15 @@ def _obstacle(a: Estimate | None, b: Estimate | None, same_axes: bool) -> str:
     if a is None or b is None:
         return f"only in {'A' if b is None else 'B'}"
     if a.value.size != b.value.size:
-        return f"other parametrisation: {a.value.size} in A, {b.value.size} in B"
-    return "" if same_axes else "other body axes"
+        return f"different parametrisation: {a.value.size} in A, {b.value.size} in B"
+    return "" if same_axes else "different body axes"
 
 
 def _component_obstacle(a: tuple[float, float, np.bool_], b: tuple[float, float, np.bool_]) -> str:
     for why, blocked in (
         ("no value", [not np.isfinite(value) for value, _, _ in (a, b)]),
-        ("held fixed", [std == 0.0 for _, std, _ in (a, b)]),
-        ("not observable", [not seen for _, _, seen in (a, b)]),
+        ("fixed", [std == 0.0 for _, std, _ in (a, b)]),
+        ("not observable", [not observable for _, _, observable in (a, b)]),
     ):
         if any(blocked):
             return f"{why} in {' and '.join(s for s, x in zip('AB', blocked, strict=True) if x)}"
@@ -335,12 +336,12 @@ def _judge(difference: float, std: float, kind: Kind, reason: str) -> tuple[Verd
     if reason:
         return "not comparable", reason
     if kind == "none":
-        return "not comparable", "no σ in either: in units only"
+        return "not comparable", "neither states a σ"
     if abs(difference) <= AGREE_SIGMAS * std:
         return "agree", ""
     if kind in ("A alone", "B alone"):
         other = "B" if kind == "A alone" else "A"
-        return "not comparable", f"beyond {AGREE_SIGMAS:g}σ of {kind}, but {other} has no σ"
+        return "not comparable", f"beyond {AGREE_SIGMAS:g}σ of {kind}, but {other} states no σ"
     return "differ", ""
 
 

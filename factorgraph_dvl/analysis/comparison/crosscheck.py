@@ -36,9 +36,9 @@ class AgainstTruth:
     Parameters
     ----------
     calibration : CalibrationErrors or None
-        Of its components whose truth is known.
+        Errors of the components whose truth is known.
     trajectory : TrajectoryErrors or None
-        At the epochs of the reference.
+        Errors at the epochs of the reference.
     """
 
     calibration: CalibrationErrors | None
@@ -54,21 +54,21 @@ class CrossCheck:
     a, b : Solution
         The results.
     efficient : Side or None
-        Which of them was taken to be efficient, None = neither.
+        The result that was declared efficient; None = neither.
     components : tuple of Component
-        Every calibration component of either.
+        Every calibration component of either result.
     angles : dict of str to float
-        Deg, between the rotations of A and B, by parameter.
+        Angles between the rotations of A and B, deg, by parameter.
     joint : Joint or None
         Test of all comparable components; None if there are none.
     motion : MotionDifference or None
         Difference of the trajectories; None without common epochs.
     truth_a, truth_b : AgainstTruth
-        Errors of each.
+        Errors of each result.
     explanation : tuple of str
-        Candidate reasons for what differs.
+        Candidate reasons for the differences.
     notes : tuple of str
-        What limits the comparison.
+        Limits of the comparison.
     """
 
     a: Solution
@@ -105,11 +105,12 @@ def crosscheck(
 
     Parameters
     ----------
-    a, b : Solutions; those from elsewhere may lack estimates, epochs, or (nan) standard
-        deviations.
+    a, b : Solution
+        The results; external ones may have no estimates, no epochs, or no standard deviations
+        (nan).
     efficient : Side, optional
-        Which of them uses all data by a true model, so that its errors are uncorrelated with the
-        difference; ignored where the trials are not the same.
+        The result that uses all data with a correct model, so that its errors are uncorrelated
+        with the difference; ignored if the trials differ.
     truth : mapping of str to array_like, optional
         True calibration by reported name, in reported units.
     reference : Reference, optional
@@ -123,13 +124,15 @@ def crosscheck(
     notes = [f"{side} did not converge" for side, s in (("A", a), ("B", b)) if not s.converged]
     if a.trial and b.trial and a.trial != b.trial:
         notes.append(
-            f"A is of trial {a.trial}, B of {b.trial}: other data, another installation perhaps"
+            f"A is from trial {a.trial}, B from {b.trial}: data and perhaps mounting differ"
         )
         if efficient is not None:
-            notes.append("the Hausman variance needs the same data: upper bounds are shown")
+            notes.append(
+                "the Hausman variance needs the same data: the upper bounds are shown instead"
+            )
             efficient = None
     if a.body_axes != b.body_axes:
-        notes.append(f"A is in {a.body_axes}, B in {b.body_axes}")
+        notes.append(f"A has body axes {a.body_axes}, B {b.body_axes}")
     components = compare_calibrations(a, b, efficient)
     motion = compare_motions(a.trajectory, b.trajectory, efficient)
     if motion is None and a.trajectory.time.size and b.trajectory.time.size:

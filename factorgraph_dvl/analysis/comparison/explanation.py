@@ -1,4 +1,4 @@
-"""Why two calibrations differ, as far as the two results themselves tell."""
+"""Candidate reasons why two calibrations differ, from the two results alone."""
 
 from __future__ import annotations
 
@@ -15,15 +15,17 @@ from factorgraph_dvl.geometry.rotations import log_so3, rotation_from_rph
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.solution import Estimate, Solution, Trajectory
 
-# What the DVL's measurement equation holds: a result that lacks one of these puts its
-# effect into the others.
+# Parameters of the DVL's measurement equation: if a result omits one, its effect biases the
+# others.
 _OF_THE_DVL = ("lever_arm_m", "dvl_bias_m_s", "time_offset_s", "current_m_s")
 _CALIBRATED = ("misalignment_deg", "scale_error", "lever_arm_m")
 _WITHOUT_LEVER_ARM = ("kalman-wahba", "kalman-nine-state")
-# All of them hold the DVL against velocities that an inertial filter has smoothed.
+# These compare the DVL with velocities that an inertial filter has smoothed.
 _WHITE_NOISE = "kalman-"
-# Differences of reported angles are the angular rate only over short intervals.
+# Chosen: over longer intervals, differences of reported angles average out the sway.
 _LONGEST_INTERVAL_S = 0.5
+# Chosen: reported σ are accurate to some percent.
+_SMALLER = 0.95
 
 
 def explain(
@@ -34,17 +36,17 @@ def explain(
 ) -> tuple[str, ...]:
     """Return candidate reasons for the components that differ, a sentence or two each.
 
-    Only what the two results state is used, so that each is a candidate and no proof;
-    nothing is returned if nothing differs.
+    They come from the two results alone, so none of them is proven. The tuple is empty if
+    nothing differs.
 
     Parameters
     ----------
     a, b : Solution
         The results.
     components : sequence of Component
-        Of `compare_calibrations`.
+        Result of `compare_calibrations`.
     efficient : Side, optional
-        Which result was said to be efficient.
+        The result that was declared efficient.
     """
     differing = [c for c in components if c.verdict == "differ"]
     if not differing:
@@ -57,18 +59,18 @@ def explain(
         out += _neglected(side, own, other)
     out += _parametrisation(components)
     for side, own, _ in sides:
-        # What is not observable is not compared, and no reason.
-        told = (w for w in own.warnings if "not observable" not in w)
-        out += [f"{side} itself warns: {warning}." for warning in told]
+        # Components that are not observable are not compared.
+        relevant = (w for w in own.warnings if "not observable" not in w)
+        out += [f"{side} has the warning: {warning}." for warning in relevant]
     return tuple(out) or (
-        "The two results hold nothing that explains it: look at the data, the noise that was "
-        "stated for them, and the residuals.",
+        "Nothing in the two results explains the difference: check the data, the stated noise and "
+        "the residuals.",
     )
 
 
 def _not_converged(side: Side, own: Solution) -> Iterator[str]:
     if not own.converged:
-        yield f"{side} did not converge: its numbers are not to be used."
+        yield f"{side} did not converge: do not use its numbers."
 
 
 def _white_noise(side: Side, own: Solution, differing: Sequence[Component]) -> Iterator[str]:
@@ -78,47 +80,49 @@ def _white_noise(side: Side, own: Solution, differing: Sequence[Component]) -> I
     stds = [(c.std_a, c.std_b) if side == "A" else (c.std_b, c.std_a) for c in touched]
     ratios = [mine / other for mine, other in stds if mine > 0.0 and other > 0.0]
     measured = (
-        f" For what differs it claims {_span(ratios)} times the σ of the other." if ratios else ""
+        f" Where they differ, its σ are {_span(ratios)} times those of the other."
+        if ratios
+        else ""
     )
     yield (
-        f"{side} ({own.solver}) takes the error of its inertial velocity for white noise, though "
-        "it is correlated in time: its σ does not contain that and is too small, and with it the "
-        f"σ of the difference.{measured}"
+        f"{side} ({own.solver}) models the error of its inertial velocity as white noise, but it "
+        "is correlated in time: its σ is too small, and so is the σ of the difference."
+        f"{measured}"
     )
 
 
 def _neglected(side: Side, own: Solution, other: Solution) -> Iterator[str]:
     for name in _OF_THE_DVL:
         found = _significant(other, name)
-        if found is None or not _is_held(own, name):
+        if found is None or not _is_fixed(own, name):
             continue
         if name == "lever_arm_m":
             yield _neglected_lever_arm(side, own, other, found)
         else:
             values = ", ".join(f"{v:.4g}" for v in found.value)
             yield (
-                f"{side} does not estimate {name}, which the other finds to be {values}: what it "
-                "does to the velocity goes into the parameters that are there."
+                f"{side} does not estimate {name}, which the other estimates as {values}: its "
+                f"effect on the velocity biases the parameters that {side} estimates."
             )
 
 
 def _neglected_lever_arm(side: Side, own: Solution, other: Solution, found: Estimate) -> str:
-    held = next((e.value for e in own.estimates if e.name == found.name), np.zeros(3))
-    missing = found.value - np.nan_to_num(held)
+    fixed = next((e.value for e in own.estimates if e.name == found.name), np.zeros(3))
+    missing = found.value - np.nan_to_num(fixed)
     length = float(np.linalg.norm(missing))
     by_design = f" ({own.solver})" if own.solver in _WITHOUT_LEVER_ARM else ""
     text = (
-        f"{side}{by_design} does not estimate the lever arm, and is {length:.3g} m off from what "
-        "the other finds."
+        f"{side}{by_design} does not estimate the lever arm; the one it uses differs by "
+        f"{length:.3g} m from the estimate of the other."
     )
     for solution in (other, own):
         neglected = _velocity_of(missing, solution)
         if neglected is not None:
             speed, share = neglected
             return text + (
-                f" With the angular rates of the trajectory that is a velocity of {speed:.2g} m/s "
-                f"RMS, {100.0 * share:.2g} % of the vehicle's, which goes into misalignment and "
-                "scale as far as it repeats in turns, and into the noise otherwise."
+                f" At the angular rates of the trajectory this is a velocity error of {speed:.2g} "
+                f"m/s RMS, {100.0 * share:.2g} % of the speed: it biases misalignment and scale "
+                "where it repeats in turns, and adds noise elsewhere."
             )
     return text
 
@@ -145,37 +149,37 @@ def _angular_rate(trajectory: Trajectory, solution: Solution) -> Array:
 
 
 def _parametrisation(components: Sequence[Component]) -> Iterator[str]:
-    told = set()
+    reported = set()
     for c in components:
-        if c.reason.startswith("other parametrisation") and c.parameter not in told:
-            told.add(c.parameter)
+        if c.reason.startswith("different parametrisation") and c.parameter not in reported:
+            reported.add(c.parameter)
             yield (
                 f"The results have {c.parameter} in different parametrisations "
-                f"({c.reason.split(': ')[-1]}): what the "
-                "fewer numbers cannot follow goes into other parameters."
+                f"({c.reason.split(': ')[-1]}): "
+                "what the smaller set cannot represent biases other parameters."
             )
 
 
 def too_sure(components: Sequence[Component], efficient: Side | None) -> Iterator[str]:
-    """Yield where a result claims more than the efficient one can know."""
+    """Yield a sentence if a result claims smaller σ than the efficient one."""
     if efficient is None:
         return
     other = "B" if efficient == "A" else "A"
     names = []
     for c in components:
         best, claimed = (c.std_a, c.std_b) if efficient == "A" else (c.std_b, c.std_a)
-        if c.verdict != "not comparable" and 0.0 < claimed < 0.95 * best:
+        if c.verdict != "not comparable" and 0.0 < claimed < _SMALLER * best:
             names.append(c.name)
     if names:
         yield (
-            f"{other} claims smaller σ than {efficient}, which is said to be efficient, for "
-            f"{', '.join(names)}. No unbiased estimate of the same data can have that: either the "
-            f"σ of {other} is too small or {efficient} is not efficient."
+            f"{other} states a smaller σ than {efficient}, which was declared efficient, for "
+            f"{', '.join(names)}. No unbiased estimate from the same data can be better: either "
+            f"the σ of {other} is too small, or {efficient} is not efficient."
         )
 
 
 def _significant(solution: Solution, name: str) -> Estimate | None:
-    """Return a parameter that is estimated and not zero."""
+    """Return a parameter whose estimate differs significantly from zero; None otherwise."""
     for e in solution.estimates:
         if e.name == name:
             known = np.asarray(e.observable, dtype=bool) & (e.std > 0.0)
@@ -184,8 +188,8 @@ def _significant(solution: Solution, name: str) -> Estimate | None:
     return None
 
 
-def _is_held(solution: Solution, name: str) -> bool:
-    """Whether a calibration does not estimate a parameter; a bare trajectory has none to hold."""
+def _is_fixed(solution: Solution, name: str) -> bool:
+    """Whether a calibration does not estimate a parameter; False for a bare trajectory."""
     if not solution.estimates:
         return False
     found = [e for e in solution.estimates if e.name == name]

@@ -31,20 +31,20 @@ _REPORTED = np.repeat([1.0, 1.0, 1.0 / DEG], 3)
 
 @dataclass(frozen=True)
 class Spread:
-    """What a component is over time, in its unit and in standard deviations.
+    """Size of a component over time, in its unit and in standard deviations.
 
     Parameters
     ----------
     name : str
-        Of `COMPONENTS`.
+        One of `COMPONENTS`.
     rms, largest : float
-        Of the absolute values.
+        RMS and maximum of the absolute value.
     time_of_largest : float
-        S.
+        Time of the maximum, s.
     rms_sigmas, largest_sigmas : float
-        Of the absolute values over their standard deviations.
+        RMS and maximum of the absolute value over its standard deviation.
     within_2_sigma : float
-        Share of epochs.
+        Share of epochs within two standard deviations.
     """
 
     name: str
@@ -63,12 +63,13 @@ class MotionDifference:
     Parameters
     ----------
     time : ndarray, shape (M,), s
+        Common epochs.
     difference : ndarray, shape (M, 9)
-        `COMPONENTS`, in reported units.
+        Difference of each of `COMPONENTS`, in reported units.
     std : ndarray, shape (M, 9)
-        Standard deviation of the difference that is shown; nan where unknown.
+        Standard deviation of the difference; nan where unknown.
     kinds : tuple of Kind
-        Which it is, of each component.
+        Kind of that standard deviation, for each component.
     """
 
     time: Array
@@ -78,7 +79,7 @@ class MotionDifference:
 
     @property
     def spreads(self) -> tuple[Spread, ...]:
-        """Every component over time."""
+        """Size of every component over time."""
         return _spreads(self.time, self.difference, self.std)
 
 
@@ -87,15 +88,15 @@ def compare_motions(
 ) -> MotionDifference | None:
     """Return the differences of two trajectories; None if no epochs are common.
 
-    Epochs within 1 µs of one another are compared as they are, others as
-    `trajectory_errors` compares with a reference; the denser one is interpolated.
+    Epochs within 1 µs of one another are compared directly. At other epochs the denser
+    trajectory is interpolated, as in `trajectory_errors`.
 
     Parameters
     ----------
     a, b : Trajectory
         The trajectories.
     efficient : Side, optional
-        Whose errors are uncorrelated with the difference; None = neither's.
+        The result whose errors are uncorrelated with the difference; None = neither.
     """
     if a.time.size == 0 or b.time.size == 0:
         return None
@@ -111,8 +112,8 @@ def compare_motions(
     std_a = _std(a)[errors.epochs]
     std_b = _std(b)[of_b]
     upper, hausman = std_of_difference(std_a, std_b, efficient)
-    # One kind for position, velocity, attitude each: a band that changes its meaning on
-    # the way would look like a change of accuracy.
+    # One kind each for position, velocity and attitude: a band that changes its meaning in
+    # time would look like a change of accuracy.
     vectors = (bool(np.isfinite(hausman[:, i : i + 3]).all()) for i in (0, 3, 6))
     sharp = [kind for kind in vectors for _ in range(3)]
     known = [bool(np.isfinite(column).any()) for column in upper.T]
@@ -132,8 +133,8 @@ def error_spreads(errors: TrajectoryErrors) -> tuple[Spread, ...]:
 def mean_nees(errors: TrajectoryErrors) -> Array:
     """Return the mean NEES of position, velocity and attitude, (3,); 3 if consistent.
 
-    Only of standard deviations: a trajectory read from a file states no correlations.
-    The mean is 3 without them too.
+    Only standard deviations are used, because a trajectory read from a file has no
+    correlations. The expected mean is 3 without them too.
     """
     share = [np.sum((v.error / _nonzero(v.std)) ** 2, axis=1) for v in _vectors(errors)]
     return np.array([float(s.mean()) for s in share])

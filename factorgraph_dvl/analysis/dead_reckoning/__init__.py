@@ -1,1 +1,1 @@
-"""What a calibration is worth in dead reckoning."""
+"""Effect of a calibration on dead reckoning."""

@@ -1,4 +1,4 @@
-"""Dead reckoning before and after calibration, and what the lever arm is worth."""
+"""Dead reckoning before and after calibration, and the effect of the lever arm."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.sensors.beam_geometry import as_dvl
 from factorgraph_dvl.trial import Reference, Trial
 
-# Fixes of so many seconds tell where a track starts: many enough for their noise, and too short
-# a time for a calibrated DVL to drift.
+# Chosen: the fixes of this time give the start of a track; their noise averages out, and a
+# calibrated DVL hardly drifts.
 _START_S = 60.0
 
 
 @dataclass(frozen=True)
 class Run:
-    """A dead-reckoned track, and its errors; None where there is nothing to score it by."""
+    """A dead-reckoned track and its errors; None without reference or GNSS."""
 
     mounting: DvlMounting
     track: DeadReckonedTrack
@@ -41,15 +41,16 @@ class Run:
 
 @dataclass(frozen=True)
 class LeverArmEffect:
-    """What a neglected lever arm does to the position, two ways.
+    """Position error from a neglected lever arm, computed in two ways.
 
     Parameters
     ----------
     time : ndarray, shape (M,), s
+        Epochs of the track.
     measured : ndarray, shape (M, 3)
         Track without lever arm minus track with it, east, north, up, m.
     closed_form : ndarray, shape (M, 3), m
-        (C(t) - C(0)) l.
+        The error (C(t) - C(0)) l, east, north, up.
     """
 
     time: Array
@@ -69,16 +70,16 @@ class LeverArmEffect:
 
 @dataclass(frozen=True)
 class BeforeAfter:
-    """Dead reckoning with the calibration, without, and with all of it but the lever arm.
+    """Dead reckoning with the calibration, without it, and without the lever arm alone.
 
     Parameters
     ----------
     calibrated, uncalibrated, without_lever_arm : Run
-        The runs.
+        The three runs.
     lever_arm : LeverArmEffect
         Difference of the first and the last.
     scored_by : {reference, GNSS, nothing}
-        What the errors are against.
+        Source of the positions that the tracks are compared with.
     """
 
     calibrated: Run
@@ -91,27 +92,26 @@ class BeforeAfter:
 def before_after(
     trial: Trial, values: Mapping[str, Array], orientation_at: OrientationAt
 ) -> BeforeAfter:
-    """Dead-reckon a trial by a calibration, and by what trial.yaml says of the mounting.
+    """Dead-reckon a trial with a calibration, and with the mounting in trial.yaml.
 
-    All tracks start where the fixes of the first minute put the calibrated one: the error of a
-    single fix would stay in the whole track, and in its score. Without GNSS they start at
-    `initial.position`.
-
-    Of a trial with beams and without a DVL beside them it is the beams that are calibrated.
+    All tracks start at the position that fits the calibrated track to the fixes of the first
+    minute: the error of a single fix would remain in the whole track and its score. Without
+    GNSS they start at `initial.position`. In a trial with beams but no DVL, the beams are
+    calibrated.
 
     Parameters
     ----------
     trial : Trial
-        With DVL or beams; GNSS gives the start, and scores where there is no reference.
+        Trial with DVL or beams; GNSS gives the start, and the truth if there is no reference.
     values : mapping of str to ndarray
-        Of the calibration, by name, in reported units; directions as (N, 3) vectors.
+        Calibration by name, in reported units; directions as (N, 3) vectors.
     orientation_at : OrientationAt
         Attitude and turn rate at times (M,).
 
     Raises
     ------
     DataError
-        As `dead_reckon`, and if the calibration is one of other beams.
+        As `dead_reckon`, and if the calibration belongs to other beams.
     """
     truth, scored_by = _truth(trial, orientation_at)
     corrected, mounting = _calibrated(trial, values)
@@ -149,7 +149,7 @@ def _start(
 ) -> tuple[float, Array]:
     """Return time and position of the start that fits the first fixes best.
 
-    Their median, by axis, because one of them may be an outlier.
+    The median by axis is used because a fix may be an outlier.
     """
     first, position = float(track.time[0]), track.geodetic[0]
     if trial.gnss is None:
@@ -164,7 +164,7 @@ def _start(
 
 
 def _calibrated(trial: Trial, values: Mapping[str, Array]) -> tuple[Trial, DvlMounting]:
-    """Return the trial with the log that a calibration makes of it, and what is left to apply."""
+    """Return the trial with its beams converted to a DVL, and the mounting that remains."""
     if trial.dvl is not None or trial.beams is None:
         return trial, mounting_of(trial, values)
     found = beam_calibration(trial.beams, values)

@@ -21,27 +21,29 @@ from factorgraph_dvl.trial import Reference, Trial
 
 OrientationAt = Callable[[Array], Orientation]
 
-# Intervals without a ping longer than this many usual ones are bridged, and counted.
+# Chosen: two lost pings are common; a longer interval counts as a gap and is bridged.
 _GAP = 3.0
-# A velocity to bridge a gap with is the mean over as many seconds: a period of swell.
+# Chosen: gaps are bridged with the mean velocity over a period of swell, s.
 _SWELL = 10.0
-# The latitude settles to the last digit: its rate depends on it by one part in 300 per radian.
+# Chosen: each round divides the error by 300 or more, as the rate depends on the latitude by one
+# part in 300 per radian; four reach the last digit.
 _ROUNDS = 4
 
 
 @dataclass(frozen=True)
 class DvlMounting:
-    """What takes the velocity of a DVL to that of the IMU.
+    """Mounting of a DVL: converts its velocity to that of the IMU.
 
     Parameters
     ----------
     dRb : ndarray, shape (3, 3)
-        Misalignment.
+        Misalignment, body to DVL.
     scale_error : ndarray, shape (1,) or (3,)
-    lever_arm, bias : ndarray, shape (3,), m/s
-        M.
+        Scale error, common or for each axis.
+    lever_arm, bias : ndarray, shape (3,)
+        Lever arm in body, m, and bias of the velocity in d, m/s.
     time_offset : float
-        S.
+        Delay of the DVL's times, s.
     """
 
     dRb: Array
@@ -58,6 +60,7 @@ class DeadReckonedTrack:
     Parameters
     ----------
     time : ndarray, shape (M,), s
+        Epochs.
     geodetic : ndarray, shape (M, 3)
         Latitude, longitude (rad), ellipsoidal height (m).
     velocity : ndarray, shape (M, 3)
@@ -76,7 +79,7 @@ class DeadReckonedTrack:
 
     @property
     def motion(self) -> Reference:
-        """The motion alone."""
+        """Positions, velocities and attitudes as a reference."""
         return Reference(self.time, self.geodetic, self.velocity, self.rph)
 
 
@@ -86,9 +89,9 @@ def mounting_of(trial: Trial, values: Mapping[str, Array] | None = None) -> DvlM
     Parameters
     ----------
     trial : Trial
-        For units, and for what `values` do not have.
+        Trial with a DVL; its settings give the parameters that `values` omit.
     values : mapping of str to ndarray, shape (n,), optional
-        By name as in calibration.json, in reported units.
+        Values by name as in calibration.json, in reported units.
     """
     given = values or {}
     si = {
@@ -115,21 +118,21 @@ def dead_reckon(
         v_b = dRbᵀ ((v_d - beta) / (1 + k)) - omega_eb_b x l,    v_n = nRb v_b,
         dL/dt = v_n / (M + h),  dlon/dt = v_e / ((N + h) cos L),  dh/dt = v_u
 
-    by the trapezoidal rule over the pings. Where there is no lock, the velocity in body is
-    interpolated between what it was on average for some seconds before and after, and turned
-    by the attitude. The fix is of the antenna, the track of the IMU. Without GNSS it starts
-    at `initial.position`, with the velocity of the first ping.
+    by the trapezoidal rule over the pings. Without lock, the velocity in body is interpolated
+    between its means some seconds before and after, and rotated by the attitude. The track is
+    that of the IMU; the antenna's lever arm is removed from the fix. Without GNSS the track
+    starts at `initial.position`, with the velocity of the first ping.
 
     Parameters
     ----------
     trial : Trial
-        Its DVL, or what its beams amount to, and its first fix.
+        Trial with DVL or beams, and a start.
     mounting : DvlMounting
-        That the velocity is corrected by.
+        Mounting that corrects the velocity.
     orientation_at : OrientationAt
         Attitude and turn rate at times (M,).
     start : tuple of (float, ndarray), optional
-        Time, s, and position of the IMU, (3,), to start from instead.
+        Time, s, and geodetic position, (3,), of the IMU to start from instead.
 
     Raises
     ------
@@ -142,14 +145,14 @@ def dead_reckon(
     used = orientation.covered
     if used.sum() < 2:
         raise DataError(
-            "fewer than two pings with a lock while the attitude is known",
+            "fewer than two pings have a lock while the attitude is known",
             where=dvl.source,
             expected="bottom lock at times that IMU and attitude cover",
         )
     pings = pings[used]
     unscaled = (dvl.velocity[dvl.locked][used] - mounting.bias) / (1.0 + mounting.scale_error)
-    turning = np.cross(orientation.omega_eb_b[used], mounting.lever_arm)
-    v_b = unscaled @ mounting.dRb - turning
+    rotation = np.cross(orientation.omega_eb_b[used], mounting.lever_arm)
+    v_b = unscaled @ mounting.dRb - rotation
 
     start_time, position = start or _start(
         trial, float(pings[0]), float(pings[-1]), orientation_at
@@ -183,21 +186,21 @@ def _log(trial: Trial) -> Dvl:
 def lever_arm_error(nRb: Array, lever_arm: Array) -> Array:
     """Return the position error that a neglected lever arm causes, (M, 3), m.
 
-    d(C l)/dt = C (omega x l), so what is integrated by mistake is (C(t) - C(0)) l: bounded,
-    and tied to attitude alone.
+    Since d(C l)/dt = C (omega x l), the integrated error is (C(t) - C(0)) l: it is bounded
+    and depends on attitude alone.
 
     Parameters
     ----------
     nRb : ndarray, shape (M, 3, 3)
         Attitude C over time.
     lever_arm : ndarray, shape (3,), m
-        L in body.
+        Lever arm l in body.
     """
     return np.asarray((nRb - nRb[0]) @ lever_arm)
 
 
 def antenna_removed(gnss: Gnss, orientation_at: OrientationAt) -> Reference:
-    """Return the positions of the IMU at the fixes; attitude and velocity are left at zero."""
+    """Return the positions of the IMU at the fixes; attitude and velocity are zero."""
     has_fix = ~np.isnan(gnss.geodetic[:, 0])
     time, geodetic = gnss.time[has_fix], gnss.geodetic[has_fix]
     there = orientation_at(time)
@@ -208,7 +211,7 @@ def antenna_removed(gnss: Gnss, orientation_at: OrientationAt) -> Reference:
 
 
 def displaced(geodetic: Array, enu: Array) -> Array:
-    """Return geodetic coordinates (M, 3) some metres east, north, up (M, 3) of others."""
+    """Return geodetic coordinates (M, 3) moved by east, north, up (M, 3), m."""
     lat, _, height = geodetic.T
     meridian, east = radii(lat)
     return geodetic + np.stack(
@@ -242,7 +245,7 @@ def _start(
 def _with_gaps(pings: Array, v_b: Array) -> tuple[Array, Array, Array]:
     """Return knots to interpolate the velocity at, and the gaps, (G, 2), begin and end, s.
 
-    One ping is too noisy, and too much at the mercy of the swell, to bridge a gap with.
+    A single ping has too much noise and swell to bridge a gap.
     """
     step = np.diff(pings)
     before = np.flatnonzero(step > _GAP * np.median(step))
@@ -261,7 +264,7 @@ def _with_gaps(pings: Array, v_b: Array) -> tuple[Array, Array, Array]:
 
 
 def _filled(pings: Array) -> Array:
-    """Return the times of the pings, and between them those of the ones that are missing."""
+    """Return the times of the pings and of the missing pings between them."""
     if pings.size < 2:
         return pings
     step = np.diff(pings)
@@ -270,7 +273,7 @@ def _filled(pings: Array) -> Array:
         raise DataError(
             f"no ping from {pings[longest]:.10g} to {pings[longest + 1]:.10g} s",
             where="DVL",
-            expected="a record of one clock, without hours to bridge",
+            expected="a record without jumps of the clock and without gaps of hours",
         )
     usual = float(np.median(step))
     pieces = np.maximum(np.rint(step / usual).astype(int), 1)

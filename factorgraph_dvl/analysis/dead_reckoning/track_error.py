@@ -1,4 +1,4 @@
-"""How far a track is from the truth: end point, largest, along and across, straight stretches."""
+"""Errors of a track: end point, largest, along and across, growth on straight stretches."""
 
 from __future__ import annotations
 
@@ -17,11 +17,14 @@ from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.trial import Reference
 
+# Chosen: the lengths that DVL data sheets and surveys state errors for.
 STRETCHES_M = (1e3, 5e3, 10e3)
-# The course is that of the displacement over this time, s, and known above this speed, m/s.
+# Chosen: the course is that of the displacement over this time, s, longer than the sway; below
+# this mean speed, m/s, it is undefined.
 _COURSE_S = 30.0
 _LEAST_SPEED = 0.25
-# A stretch is straight if its course stays within this range.
+# Chosen: a stretch is straight if its course stays within this range, wider than a helmsman's
+# deviations.
 _STRAIGHT = 10.0 * DEG
 
 
@@ -32,14 +35,14 @@ class Stretches:
     Parameters
     ----------
     length : float
-        M.
+        Length of a stretch, m.
     count : int
-        Of stretches, one after the other; 0 = the trial has none, and the rest is nan.
+        Number of consecutive stretches; if 0, the other fields are nan.
     median, largest : float
-        Of the growth of the horizontal error, % of the length.
+        Growth of the horizontal error, % of the length.
     along, across : float
-        Mean growth along the course and to its right, % of the length: what a scale error and an
-        error of the heading leave.
+        Mean growth along the course and to its right, % of the length: the effects of a scale
+        error and of a heading error.
     """
 
     length: float
@@ -52,15 +55,16 @@ class Stretches:
 
 @dataclass(frozen=True)
 class Path:
-    """Where the vehicle went at M epochs.
+    """Distance and course of the vehicle at M epochs.
 
     Parameters
     ----------
     time : ndarray, shape (M,), s
+        Epochs.
     distance : ndarray, shape (M,)
-        Travelled since the first, horizontally, m.
+        Horizontal distance travelled since the first epoch, m.
     course : ndarray, shape (M,)
-        Over ground, unwrapped, rad.
+        Course over ground, unwrapped, rad.
     """
 
     time: Array
@@ -79,12 +83,12 @@ class Score:
 
     Parameters
     ----------
-    path : path-like
-        At those epochs.
+    path : Path
+        Distance and course at those epochs.
     error : ndarray, shape (M, 3)
-        Local-level east, north, up, m.
+        Error in local-level east, north, up, m.
     stretches : tuple of Stretches
-        Of `STRETCHES_M`.
+        Growth of the error for each of `STRETCHES_M`.
     """
 
     path: Path
@@ -138,16 +142,16 @@ def path_of(track: DeadReckonedTrack, time: Array) -> Path:
 
 
 def score(track: DeadReckonedTrack, truth: Reference, along: DeadReckonedTrack) -> Score | None:
-    """Hold a track against the truth; None where they have no epochs in common.
+    """Return the errors of a track; None if it has no epochs in common with the truth.
 
     Parameters
     ----------
     track : DeadReckonedTrack
-        To be scored.
+        Track to score.
     truth : Reference
-        Positions of the IMU.
+        True positions of the IMU.
     along : DeadReckonedTrack
-        The track whose distance and course count: the best there is.
+        Track that gives distance and course: the most accurate one.
     """
     first = max(track.time[0], along.time[0])
     last = min(track.time[-1], along.time[-1])
@@ -168,15 +172,15 @@ def difference(track: DeadReckonedTrack, time: Array, geodetic: Array) -> Array:
     ve, vn, vu = track.velocity.T
     rate = np.stack([vn / (meridian + height), ve / ((east + height) * np.cos(lat)), vu], axis=1)
     at = CubicHermiteSpline(track.time, track.geodetic, rate)(time)
-    away = at - geodetic
-    away[:, 1] = wrapped(away[:, 1])
+    offset = at - geodetic
+    offset[:, 1] = wrapped(offset[:, 1])
     meridian, east = radii(geodetic[:, 0])
     height = geodetic[:, 2]
     return np.stack(
         [
-            away[:, 1] * (east + height) * np.cos(geodetic[:, 0]),
-            away[:, 0] * (meridian + height),
-            away[:, 2],
+            offset[:, 1] * (east + height) * np.cos(geodetic[:, 0]),
+            offset[:, 0] * (meridian + height),
+            offset[:, 2],
         ],
         axis=1,
     )

@@ -1,1 +1,1 @@
-"""What the data of a trial can determine."""
+"""Observability: which parameters the data of a trial determine."""

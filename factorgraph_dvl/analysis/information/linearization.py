@@ -1,4 +1,4 @@
-"""Singular values of a solution's DVL rows: where to linearise, units, noise of the motion."""
+"""Measurement matrix of a solution's DVL: linearisation point, units, noise of the motion."""
 
 from __future__ import annotations
 
@@ -38,13 +38,13 @@ from factorgraph_dvl.sensors.dvl_beams import SCALE_ERROR as BEAM_SCALE_ERROR
 from factorgraph_dvl.solution import Estimate, Solution, Trajectory
 from factorgraph_dvl.trial import Trial
 
-# The calibration of the paper, that of single beams, and what has columns where it is
-# estimated too.
+# Parameters of a DVL, of single beams, and those that have columns only if they are estimated.
 _ALWAYS = (MISALIGNMENT, SCALE_ERROR, LEVER_ARM)
 _OF_BEAMS = (BEAM_DIRECTION, BEAM_SCALE_ERROR, LEVER_ARM)
 _IF_ESTIMATED = (BIAS, CURRENT)
 _SI = {MISALIGNMENT: DEG, BEAM_DIRECTION: DEG}
-# In reported units, where a solution does not say what its priors were.
+# Chosen: scales of the columns, in reported units, for a solution that states no priors; they
+# are about what installers know beforehand.
 _WITHOUT_PRIOR = {
     MISALIGNMENT: (1.0, "1 deg"),
     SCALE_ERROR: (0.01, "0.01"),
@@ -54,28 +54,29 @@ _WITHOUT_PRIOR = {
     BIAS: (0.1, "0.1 m/s"),
     CURRENT: (0.5, "0.5 m/s"),
 }
+# Chosen: a tenth of a millimetre per second, below the noise of any DVL.
 _LEAST_SIGMA = 1e-4
-# A singular value that leaves 96 % of the prior's σ tells nothing.
+# Chosen: a singular value below this leaves 96 % of the prior's σ and counts as zero.
 _NOTHING = 0.3
-# Order of the differences of rates that are taken for noise: of a motion with five epochs
-# in a period 9 % remain, with ten 0.2 %.
+# Chosen: differences of rates of this order count as noise; they retain 9 % of a motion with
+# five epochs per period, 0.2 % with ten.
 _ORDER = 6
 
 
 @dataclass(frozen=True)
 class PointSet:
-    """The PWCS view.
+    """Singular values of a trial's segments (piece-wise constant system).
 
     Parameters
     ----------
     states : tuple of str
         Names of the columns.
     scale : ndarray, shape (n,)
-        What each column is in units of, reported units.
+        Unit of each column, in reported units.
     scaling : str
-        How numbers were made comparable, in words.
+        Description of the scaling of rows and columns.
     segments, cumulative : tuple of SingularValues
-        Of each segment, and of all up to its end.
+        Singular values of each segment alone, and of all data up to its end.
     """
 
     states: tuple[str, ...]
@@ -88,25 +89,25 @@ class PointSet:
 def point_set(
     solution: Solution, trial: Trial | None, segments: Sequence[Segment], margin: float
 ) -> tuple[PointSet | None, list[str]]:
-    """Return the singular values of the DVL's rows, and what they leave out and why.
+    """Return the singular values of the DVL's rows, and a list of what they omit.
 
-    The rows are those of `pwcs.point_set_rows`, for the velocity relative to what the DVL
-    measures against, with further columns where these are estimated:
+    The rows are those of `point_set_rows`, for the velocity relative to the ground or the
+    water, with further columns if these are estimated:
 
         bias: I,        current: -(1 + k) D bRn (e, n);
 
-    for single beams without a DVL beside them those of `pwcs.beam_rows`.
+    for single beams without a DVL, those of `beam_rows`.
 
     Parameters
     ----------
     solution : Solution
-        With a trajectory of at least two epochs.
+        Solution with a trajectory of at least two epochs.
     trial : Trial or None
-        That it came from; without it the times and noise of the pings are assumed.
+        Trial of the solution; without it, times and noise of the pings are assumed.
     segments : sequence of Segment
-        To stack.
+        Segments of the trial.
     margin : float
-        As of `pwcs.singular_values`.
+        Argument of `singular_values`, s.
     """
     by_name = {e.name: e for e in solution.estimates}
     if trial is not None and trial.log is None:
@@ -114,17 +115,17 @@ def point_set(
     of_beams = by_name.keys() >= set(_OF_BEAMS) and (trial is None or trial.dvl is None)
     always = _OF_BEAMS if of_beams else _ALWAYS
     if not by_name.keys() >= set(always):
-        return None, ["singular values: the solution has no calibration of a DVL"]
+        return None, ["singular values: the solution does not calibrate a DVL"]
     parts = [by_name[name] for name in always]
     parts += [by_name[n] for n in _IF_ESTIMATED if n in by_name and _is_estimated(by_name[n])]
     if not all(np.isfinite(e.value).all() for e in parts):
-        return None, ["singular values: the calibration is not known where to linearise"]
+        return None, ["singular values: the calibration has no values to linearise at"]
     names = tuple(n for e in parts for n in e.component_names)
     scale, how = _prior_scale(parts)
     si = np.concatenate([np.full(e.value.size, _SI.get(e.name, 1.0)) for e in parts])
     free = scale > 0.0
     if not free.any():
-        return None, ["singular values: the calibration of the DVL is held fixed"]
+        return None, ["singular values: the calibration of the DVL is fixed"]
     values = [by_name[n].value * _SI.get(n, 1.0) for n in always]
     nominal = parts[0].nominal
     mounting = MountingModel(*values) if nominal is None else BeamMounting(nominal, *values)
@@ -133,7 +134,7 @@ def point_set(
     motion = body_motion(relative, axes)
     at, sigma, source = _pings(solution, trial, motion, mounting)
     if at.time.size == 0:
-        return None, ["singular values: no ping has a lock while the IMU runs"]
+        return None, ["singular values: no ping has a lock within the record of the IMU"]
     bRn = rotation_from_rph(relative.rph, axes).transpose(0, 2, 1)
     level = CubicSpline(motion.time, bRn[:, :, :2])(at.time)
     further = [e.name for e in parts[len(always) :]]
@@ -158,8 +159,8 @@ def point_set(
     epoch = np.clip(np.searchsorted(motion.time, at.time - 1e-6), 0, motion.time.size - 1)
     velocity_root = _root(bRn @ relative.velocity_cov @ bRn.transpose(0, 2, 1))[epoch]
     to_body = np.linalg.inv(rph_jacobian(relative.rph, axes))
-    wavering = _wavering(relative.rph_cov)
-    attitude_root = _root(to_body @ wavering @ to_body.transpose(0, 2, 1))[epoch]
+    varying = _varying(relative.rph_cov)
+    attitude_root = _root(to_body @ varying @ to_body.transpose(0, 2, 1))[epoch]
     rate_sigma = _rate_sigma(trial, relative, axes)
     spurious = np.zeros((at.time.size, len(states), len(states)))
     for k in range(3):
@@ -189,24 +190,24 @@ def _is_estimated(e: Estimate) -> bool:
 
 
 def _taken_as_known(by_name: Mapping[str, Estimate], trial: Trial | None) -> list[str]:
-    """Say what the rows have no column for."""
+    """Return the estimated parameters that the rows treat as known."""
     out = []
     if TIME_OFFSET in by_name and _is_estimated(by_name[TIME_OFFSET]):
-        out.append(f"{TIME_OFFSET} in the singular values: it is taken as known there")
+        out.append(f"{TIME_OFFSET} in the singular values: it is treated as known")
     dvl = None if trial is None else trial.dvl
     through_water = dvl is not None and dvl.settings.reference == "water"
     if through_water and CURRENT not in by_name:
         out.append(
-            f"{CURRENT} in the singular values: it was not estimated, so that they are those of "
-            "the velocity over ground"
+            f"{CURRENT} in the singular values: it was not estimated, so they use the velocity "
+            "over ground"
         )
     return out
 
 
 def _relative(solution: Solution) -> Trajectory:
-    """Return the trajectory with the velocity relative to what the DVL measures against.
+    """Return the trajectory with the velocity relative to the ground or the water.
 
-    The errors of velocity and current add up, as if they were independent.
+    The variances of velocity and current are added, as if their errors were independent.
     """
     trajectory = solution.trajectory
     found = [e for e in solution.estimates if e.name == CURRENT]
@@ -223,11 +224,11 @@ def _relative(solution: Solution) -> Trajectory:
     )
 
 
-def _wavering(rph_cov: Array) -> Array:
-    """Return covariances (M, 3, 3) of attitudes without what all headings have in common.
+def _varying(rph_cov: Array) -> Array:
+    """Return covariances (M, 3, 3) of attitudes without the error that all headings share.
 
-    A heading that is wrong by the same angle all the time turns all rows alike, and feigns
-    no change. Where the heading is known best, its error is taken for that.
+    A constant heading error rotates all rows alike and adds no spurious information. The
+    smallest variance of the heading is taken as that constant part.
     """
     variance = rph_cov[:, 2, 2]
     scale = np.ones((variance.size, 3))
@@ -243,11 +244,11 @@ def _root(covariance: Array) -> Array:
 
 
 def _rate_sigma(trial: Trial | None, trajectory: Trajectory, body_axes: BodyAxes) -> Array:
-    """Return the standard deviations of rates that are taken from attitudes, (3,), rad/s.
+    """Return the standard deviations of the angular rates, (3,), rad/s.
 
-    Those of the gyro; without the trial, the scatter of the mean rates from epoch to epoch,
-    which a body of inertia cannot have: their differences of sixth order, divided by
-    sqrt(924), the factor by which these make white noise larger.
+    With the trial, those of the gyro. Without it, the scatter of the mean rates between
+    epochs: their differences of sixth order, divided by sqrt(924), the factor by which these
+    amplify white noise.
     """
     step = np.diff(trajectory.time)
     interval = float(np.median(step))
@@ -256,7 +257,7 @@ def _rate_sigma(trial: Trial | None, trajectory: Trajectory, body_axes: BodyAxes
         return np.full(3, float(sigma))
     nRb = rotation_from_rph(trajectory.rph, body_axes)
     rates = log_so3(nRb[:-1].transpose(0, 2, 1) @ nRb[1:]) / step[:, None]
-    # Of fewer epochs all may be noise.
+    # With fewer epochs, all of it may be noise.
     order = min(_ORDER, step.size - 1)
     whole = np.convolve(step > GAP * interval, np.ones(order + 1), mode="valid") < 0.5
     if not whole.any():
@@ -271,7 +272,7 @@ def _prior_scale(parts: Sequence[Estimate]) -> tuple[Array, str]:
         return scale, "columns in units of the priors' σ"
     stated = [np.full(e.value.size, _WITHOUT_PRIOR[e.name][0]) for e in parts]
     units = ", ".join(_WITHOUT_PRIOR[e.name][1] for e in parts)
-    return np.concatenate(stated), f"columns in units of {units} (no priors are known)"
+    return np.concatenate(stated), f"columns in units of {units} (the priors are unknown)"
 
 
 def _pings(
@@ -296,7 +297,7 @@ def _pings(
         measured = np.linalg.norm(measured, axis=1, keepdims=True) * np.ones(3)
     sigma = np.hypot(settings.velocity_std_m_s, settings.velocity_std_fraction * measured)
     text = (
-        "rows in units of an assumed σ, as the pings are not known: one ping for each epoch of "
+        "rows in units of an assumed σ, because the pings are unknown: one ping per epoch of "
         f"the trajectory, {1000.0 * settings.velocity_std_m_s:g} mm/s and "
         f"{100.0 * settings.velocity_std_fraction:g} % of "
         + ("each beam's velocity" if of_beams else "the speed")

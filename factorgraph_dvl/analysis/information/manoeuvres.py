@@ -1,8 +1,8 @@
 """Segments of a trial by motion: drifting, steady, accelerating, turning, and mixtures.
 
-The sea is filtered out: a manoeuvre changes heading or speed for good, sway does not. So
-both are smoothed over longer than any wave, manoeuvres are found as lasting changes, and
-only then their ends, which smoothing blurs, from the signal itself.
+A manoeuvre changes heading or speed permanently, sway does not. So both signals are smoothed
+over longer than any wave, manoeuvres are found as lasting changes, and their ends, which
+smoothing blurs, are then found in the signal itself.
 """
 
 from __future__ import annotations
@@ -21,19 +21,24 @@ from factorgraph_dvl.sensors.records import rows_of
 from factorgraph_dvl.solution import Trajectory
 from factorgraph_dvl.trial import Reference
 
-# Hann window, s: it passes nothing of a period below half its length.
+# Chosen: a Hann window, s, removes periods below half its length; most waves are shorter than
+# 10 s, and the short window only removes noise.
 _WINDOW_S = 20.0
 _SHORT_WINDOW_S = 2.0
+# Chosen: short against any manoeuvre, s.
 _STEP_S = 0.1
-# What is a manoeuvre: rate and total change of heading and of speed.
+# Chosen: least rate and total change of heading and of speed of a manoeuvre; slow turns of ships
+# exceed them, drift and swell do not.
 _TURN_RATE = 0.25 * DEG
 _LEAST_TURN = 10.0 * DEG
 _ACCELERATION = 0.01
 _LEAST_CHANGE = 0.4
-# A turn that shows the current, because speed through the water is kept in it.
+# Chosen: a turn this wide determines the current from the speed through the water, which is
+# constant in it.
 _WIDE_TURN = 60.0 * DEG
-# Speed through the water, m/s, below which a vessel drifts.
+# Chosen: a vessel below this speed through the water, m/s, drifts: it has no steerage way.
 _DRIFTING = 0.5
+# Chosen: shorter segments, s, hold too few pings.
 _LEAST_S = 3.0
 
 
@@ -44,9 +49,9 @@ class Segment:
     Parameters
     ----------
     start, end : float
-        S.
+        Time, s.
     label : str
-        Kind of motion, or what the user called it.
+        Kind of motion, or the name that the user gave.
     """
 
     start: float
@@ -54,7 +59,7 @@ class Segment:
     label: str
 
     def covers(self, time: Array) -> np.ndarray:
-        """Whether times (M,) lie in it; the start does not, the end does."""
+        """Return which times (M,) lie in the segment: after its start, up to its end."""
         return (time > self.start) & (time <= self.end)
 
 
@@ -64,12 +69,13 @@ def find_segments(motion: Trajectory | Reference) -> tuple[Segment, ...]:
     Parameters
     ----------
     motion : Trajectory or Reference
-        Of the whole trial.
+        Motion of the whole trial.
 
     Returns
     -------
-    Segments without gaps from the first epoch to the last. Hours without any motion, as
-    where a clock jumps, are one of them.
+    tuple of Segment
+        Segments without gaps from the first epoch to the last. Hours without data, as at a
+        jump of a clock, are a segment.
     """
     jumps = np.flatnonzero(np.diff(motion.time) > JUMP) + 1
     parts = [
@@ -105,14 +111,14 @@ def _segments(motion: Trajectory | Reference) -> list[Segment]:
 def given_segments(
     parts: Sequence[tuple[float, float, str]], first: float, last: float
 ) -> tuple[Segment, ...]:
-    """Return segments that were given, with the times between them as `other`.
+    """Return the segments of the user, with the times between them as `other`.
 
     Parameters
     ----------
     parts : sequence of tuple of (float, float, str)
         Start and end, s, and label, in the order of time.
     first, last : float
-        Of the trial, s; what reaches beyond is cut off.
+        Start and end of the trial, s; segments are cut there.
 
     Raises
     ------
@@ -150,7 +156,7 @@ def _label(slow: bool, turning: bool, accelerating: bool) -> str:
 
 
 def _changes(time: Array, value: Array, rate: float, least: float) -> list[tuple[float, float]]:
-    """Return when a signal (M,) changes for good: by `least` at the least, at `rate` or faster."""
+    """Return when a signal (M,) changes permanently, by `least` and at `rate` or more."""
     smoothed = _smooth(time, value, _WINDOW_S)
     fine = _smooth(time, value, _SHORT_WINDOW_S)
     slope = np.gradient(smoothed, time)
@@ -161,7 +167,7 @@ def _changes(time: Array, value: Array, rate: float, least: float) -> list[tuple
         change = float(smoothed[b - 1] - smoothed[a])
         if sign[a] == 0.0 or abs(change) < least:
             continue
-        # How far the change is; the smoothed signal, that it begins at 0 and ends at 1.
+        # Fraction of the change that is complete.
         done = (fine[a:b] - smoothed[a]) / change
         begun = float(time[a + int(np.argmax(done > 0.1))])
         ended = float(time[b - 1 - int(np.argmax(done[::-1] < 0.9))])
@@ -173,7 +179,7 @@ def _changes(time: Array, value: Array, rate: float, least: float) -> list[tuple
 
 
 def _smooth(time: Array, value: Array, window: float) -> Array:
-    """Return a signal (M,) smoothed by a Hann window, odd reflections at both ends."""
+    """Return a signal (M,) smoothed by a Hann window, with odd reflection at both ends."""
     step = float(time[1] - time[0])
     half = min(round(0.5 * window / step), (value.size - 1) // 2)
     if half < 1:
@@ -188,7 +194,7 @@ def _smooth(time: Array, value: Array, window: float) -> Array:
 def _current(
     time: Array, heading: Array, velocity: Array, turns: Sequence[tuple[float, float]]
 ) -> Array:
-    """Return the current (2,), m/s, that keeps the speed through the water in each wide turn.
+    """Return the current (2,), m/s, for which the speed in each wide turn is constant.
 
     |v - c|² = s² of each turn is linear in c and |c|² - s²: |v|² = 2 v·c + d.
     """
@@ -211,7 +217,7 @@ def _current(
 
 
 def _separate(edges: Sequence[float]) -> list[float]:
-    """Return sorted edges of which no two are closer than the shortest segment."""
+    """Return sorted edges, at least the shortest segment apart."""
     ordered = sorted(edges)
     out = [ordered[0]]
     for edge in ordered[1:-1]:

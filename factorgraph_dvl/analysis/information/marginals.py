@@ -1,4 +1,4 @@
-"""Posterior against prior: what the data added, and which directions stay open."""
+"""Posterior against prior: information of the data, and undetermined directions."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from factorgraph_dvl.analysis.information.segment_singular_values import dominan
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.solution import Estimate
 
-# A direction of which the data left this share of the prior's σ, or more, is open; above
-# the second they told nothing of it.
+# Chosen: a direction is undetermined if at least half of the prior's σ remains; above the second
+# share the data do not inform it at all.
 OPEN = 0.5
 _NOTHING = 0.98
-# Correlation from which on two components are called hard to tell apart.
-_HARD = 0.9
-# Components of a sentence; with more it is none.
+# Chosen: from this correlation on, σ of a component is twice its σ given the other.
+_CORRELATED = 0.9
+# Chosen: more coefficients make a sentence unreadable.
 _MOST_NAMED = 4
 
 
@@ -32,9 +32,9 @@ class Direction:
     information : float
         Posterior over prior information, 1 / ratio²: the generalised eigenvalue.
     vector : ndarray, shape (P,)
-        Of unit length, in units of the priors' standard deviations.
+        Unit vector, in units of the priors' standard deviations.
     names : tuple of str
-        Of the components that dominate it, the largest first.
+        Names of the dominant components, the largest first.
     """
 
     ratio: float
@@ -45,21 +45,22 @@ class Direction:
 
 @dataclass(frozen=True)
 class Marginals:
-    """The marginal view of a calibration.
+    """Posterior of a calibration against its prior.
 
     Parameters
     ----------
     names : tuple of str
-        (P,) components that were estimated, in reported units.
+        Names of the P estimated components.
     value, std, prior_std : ndarray, shape (P,)
-    observable : ndarray, shape (P,)
-        Bool, whether the data at least halved the prior's σ.
+        Value, posterior and prior standard deviation, in reported units.
+    observable : ndarray of bool, shape (P,)
+        Whether the data at least halved the prior's σ.
     correlation : ndarray, shape (P, P)
-        Of the posterior.
+        Correlation of the posterior.
     directions : tuple of Direction
         P directions, the weakest first.
     sentences : tuple of str
-        The weak directions in words.
+        A sentence for each weak direction.
     """
 
     names: tuple[str, ...]
@@ -78,12 +79,12 @@ class Marginals:
 
 
 def marginals(estimates: Sequence[Estimate], covariance: Array) -> Marginals | None:
-    """Return the marginal view; None if nothing was estimated from a known prior.
+    """Return posterior against prior; None if nothing was estimated from a known prior.
 
     Parameters
     ----------
     estimates : sequence of Estimate
-        The calibration.
+        Estimates of the calibration.
     covariance : ndarray
         Joint covariance of all components, in reported units.
     """
@@ -109,8 +110,8 @@ def marginals(estimates: Sequence[Estimate], covariance: Array) -> Marginals | N
         correlation=correlation,
         directions=directions,
         sentences=(
-            *_open_sentences(directions, shown, prior[free], P),
-            *_hard_sentences(shown, P, correlation, std[free], prior[free]),
+            *_undetermined_sentences(directions, shown, prior[free], P),
+            *_correlated_sentences(shown, P, correlation, std[free], prior[free]),
         ),
     )
 
@@ -118,14 +119,14 @@ def marginals(estimates: Sequence[Estimate], covariance: Array) -> Marginals | N
 def _directions(scaled: Array, names: tuple[str, ...]) -> tuple[Direction, ...]:
     values, vectors = np.linalg.eigh(0.5 * (scaled + scaled.T))
     values, rows = values[::-1], vectors.T[::-1]
-    untold = np.sqrt(np.maximum(values, 0.0)) > _NOTHING
-    if untold.any():
-        rows = np.concatenate([readable_basis(rows[untold]), rows[~untold]])
+    uninformed = np.sqrt(np.maximum(values, 0.0)) > _NOTHING
+    if uninformed.any():
+        rows = np.concatenate([readable_basis(rows[uninformed]), rows[~uninformed]])
     return tuple(_direction(row, scaled, names) for row in rows)
 
 
 def _direction(row: Array, scaled: Array, names: tuple[str, ...]) -> Direction:
-    # Eigenvectors have no sign: the largest component shall be positive.
+    # The sign of an eigenvector is arbitrary: make the largest component positive.
     vector = row * np.sign(row[np.argmax(np.abs(row))])
     variance = max(float(vector @ scaled @ vector), 1e-300)
     return Direction(
@@ -136,13 +137,13 @@ def _direction(row: Array, scaled: Array, names: tuple[str, ...]) -> Direction:
     )
 
 
-def _open_sentences(
+def _undetermined_sentences(
     directions: Sequence[Direction], names: tuple[str, ...], prior: Array, P: Array
 ) -> list[str]:
-    """Say which directions the data left open.
+    """Return a sentence for each direction that the data do not determine.
 
-    Together they span a subspace; of two open combinations of two components, each of
-    these is open.
+    These directions span a subspace: two undetermined combinations of two components leave
+    both components undetermined.
     """
     vectors = [d.vector for d in directions if d.ratio >= OPEN]
     if not vectors:
@@ -151,19 +152,19 @@ def _open_sentences(
     basis = readable_basis(np.linalg.qr(np.array(vectors).T)[0].T)
     for row in basis:
         d = _direction(row, P / np.outer(prior, prior), names)
-        left = f"{100.0 * min(d.ratio, 1.0):.0f} % of the prior's σ is left"
+        left = f"{100.0 * min(d.ratio, 1.0):.0f} % of the prior's σ remains"
         index = [names.index(name) for name in d.names]
         if len(index) == 1:
-            told = "is not told" if d.ratio > _NOTHING else "is hardly told"
-            out.append(f"{d.names[0]} {told} by the data: {left}")
+            verdict = "is not" if d.ratio > _NOTHING else "is hardly"
+            out.append(f"{d.names[0]} {verdict} determined by the data: {left}")
         elif len(index) > _MOST_NAMED:
-            out.append(f"{', '.join(d.names)} cannot be told apart: {left} of a combination")
+            out.append(f"{_listed(d.names)} cannot be separated: {left} in a combination")
         else:
             step = d.vector[index] * prior[index]
             moves = " and ".join(
                 f"{name} by {s / step[0]:.3g}" for name, s in zip(d.names, step, strict=True)
             )
-            text = f"{_listed(d.names)} cannot be told apart: {left} where {moves} move together"
+            text = f"{_listed(d.names)} cannot be separated: {left} if {moves} change together"
             if len(index) == 2:
                 text += _known_combination(index[0], index[1], step, names, prior, P)
             out.append(text)
@@ -173,7 +174,7 @@ def _open_sentences(
 def _known_combination(
     i: int, j: int, step: Array, names: Sequence[str], prior: Array, P: Array
 ) -> str:
-    """Say what the data know across a direction of two components, if anything."""
+    """Return the combination of two components that the data determine, if there is one."""
     slope = float(step[0] / step[1])
     variance = float(P[i, i] - 2.0 * slope * P[i, j] + slope**2 * P[j, j])
     before = float(prior[i] ** 2 + (slope * prior[j]) ** 2)
@@ -185,21 +186,21 @@ def _known_combination(
     )
 
 
-def _hard_sentences(
+def _correlated_sentences(
     names: Sequence[str], P: Array, correlation: Array, std: Array, prior: Array
 ) -> list[str]:
-    """Say which components are known, but mostly together."""
+    """Return a sentence for each pair of known but strongly correlated components."""
     out = []
     known = std < OPEN * prior
     for i in range(len(names)):
         for j in range(i + 1, len(names)):
             rho = float(correlation[i, j])
-            if abs(rho) < _HARD or not (known[i] and known[j]):
+            if abs(rho) < _CORRELATED or not (known[i] and known[j]):
                 continue
             slope = float(P[i, j] / P[j, j])
             rest = float(std[i]) * np.sqrt(max(1.0 - rho**2, 0.0))
             out.append(
-                f"{names[i]} and {names[j]} are hard to tell apart (correlation {rho:.3f}): "
+                f"{names[i]} and {names[j]} are hard to separate (correlation {rho:.3f}): "
                 f"{names[i]} {_signed(-slope)} · {names[j]} is known to {rest:.2g}, "
                 f"{names[i]} alone to {std[i]:.2g}"
             )

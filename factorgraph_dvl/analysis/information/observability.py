@@ -1,4 +1,4 @@
-"""What a trial, a solution or a plan can tell: segments, singular values, marginals, shares."""
+"""Observability of a trial, solution or plan: segments, singular values, marginals, shares."""
 
 from __future__ import annotations
 
@@ -17,22 +17,22 @@ from factorgraph_dvl.solution import Solution
 from factorgraph_dvl.statistics.information_history import InformationHistory
 from factorgraph_dvl.trial import Trial
 
-# Where segments that were found begin and end, s: half of a slow ramp.
+# Chosen: uncertainty of the ends of segments that were found, s: half of a slow ramp.
 _MARGIN_S = 5.0
 
 
 @dataclass(frozen=True)
 class SegmentMotion:
-    """How the vehicle moved in a segment.
+    """Motion of the vehicle in a segment.
 
     Parameters
     ----------
     segment : Segment
-        When.
+        The segment.
     speed : float
-        Mean over ground, m/s.
+        Mean speed over ground, m/s.
     turn : float
-        Of the heading from its start to its end, to starboard, rad.
+        Change of heading from start to end, positive to starboard, rad.
     rates : ndarray, shape (3,), rad/s
         RMS of the angular rate about the body axes.
     """
@@ -45,25 +45,26 @@ class SegmentMotion:
 
 @dataclass(frozen=True)
 class Observability:
-    """Three views of what data can tell.
+    """Observability: singular values, marginals, and information along the trial.
 
     Parameters
     ----------
     name : str
-        Of the trial.
+        Name of the trial.
     kind : str
-        `trial`, `solution` or `plan`.
+        Source: `trial`, `solution` or `plan`.
     segments : tuple of SegmentMotion
-        Motion of each.
+        Segments and the motion in each.
     point_set : PointSet or None
-        Singular values; None where there is no DVL or no motion.
+        Singular values; None without DVL or motion.
     marginals : Marginals or None
-        Posterior against prior; None where nothing was estimated.
-    history, shares : along the trial; None where only a solution is known.
+        Posterior against prior; None if nothing was estimated.
+    history, shares : InformationHistory, Shares or None
+        Information along the trial; None if only a solution is given.
     missing : tuple of str
-        Views that are left out, and why.
+        Omitted parts, and why.
     warnings : tuple of str
-        Of the solution.
+        Warnings of the solution.
     """
 
     name: str
@@ -85,20 +86,20 @@ def observability(
     given: Sequence[tuple[float, float, str]] = (),
     kind: str = "",
 ) -> Observability:
-    """Return what a solution, and the trial that it came from, can tell.
+    """Return the observability of a solution, and of its trial if that is given.
 
     Parameters
     ----------
     solution : Solution
-        With its calibration and trajectory.
+        Solution with calibration and trajectory.
     trial : Trial, optional
-        That it came from; without it the times and noise of the pings are assumed.
+        Trial of the solution; without it, times and noise of the pings are assumed.
     history : InformationHistory, optional
         Information along the trial.
     given : sequence of tuple of (float, float, str), optional
-        Segments, start and end in s and label; by default they are found.
+        Segments: start and end, s, and label; by default they are found from the motion.
     kind : str, optional
-        What it is, if it is not obvious.
+        Source; by default `trial` or `solution`.
     """
     trajectory = solution.trajectory
     missing = []
@@ -113,22 +114,22 @@ def observability(
         motion = body_motion(trajectory, solution.body_axes)
         heading = np.unwrap(trajectory.rph[:, 2])
         motions = tuple(_describe(s, motion, heading) for s in segments)
-        # Who gives the segments knows where they begin.
+        # The ends of the user's segments are exact.
         margin = 0.0 if given else _MARGIN_S
         points, why = point_set(solution, trial, segments, margin)
         missing += why
     view = marginals(solution.estimates, solution.covariance)
     if view is None:
-        missing.append("marginal view: nothing was estimated from a prior that is known")
+        missing.append("posterior against prior: nothing was estimated from a known prior")
     shares = None
     if history is None:
-        missing.append("σ along the trial and shares of the segments: they take the trial itself")
+        missing.append("σ along the trial and shares of the segments: they need the trial itself")
     elif segments and history.names:
         shares = information_shares(history, segments)
-        walking = set(view.names if view is not None else ()) - set(history.names)
-        if walking:
+        varying = set(view.names if view is not None else ()) - set(history.names)
+        if varying:
             missing.append(
-                f"σ along the trial of {', '.join(sorted(walking))}: a bias that walks is no "
+                f"σ along the trial of {', '.join(sorted(varying))}: a random-walk bias is not "
                 "constant"
             )
     return Observability(

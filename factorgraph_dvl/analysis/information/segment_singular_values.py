@@ -1,12 +1,12 @@
 """Observability of a DVL's calibration by segments: stacked matrices and singular values.
 
-The states are constant, so that a segment's observability matrix is its measurement rows
-stacked (the powers of F = I add nothing). Luo et al. (2024), eq. 10, rotate the data by
-what is known of the misalignment and take
+The states are constant, so a segment's observability matrix is the stack of its measurement
+rows (the powers of F = I add nothing). Luo et al. (2024), eq. 10, rotate the data by the
+known part of the misalignment and use
 
     H = [-[v_b x], v_b, [omega x]]        for (alpha, scale error, lever arm).
 
-Here the same rows are taken of the whole model v_d = (1 + k) D (v_b + omega x l), whose
+Here the same rows are derived from the full model v_d = (1 + k) D (v_b + omega x l), whose
 misalignment D may be large.
 """
 
@@ -33,20 +33,18 @@ from factorgraph_dvl.sensors.beam_model import FreeGeometry
 from factorgraph_dvl.solution import Trajectory
 from factorgraph_dvl.trial import Reference
 
-# With this singular value a direction's standard deviation is half its prior's:
-# 1 / sqrt(1 + s²) = 1 / 2.
+# Chosen: the posterior standard deviation is half the prior's, 1 / sqrt(1 + s²) = 1 / 2.
 OBSERVABLE = np.sqrt(3.0)
-# Share from which on a singular value is taken for the error of the motion.
+# Chosen: from this share of spurious information on, a direction counts as undetermined.
 SPURIOUS = 0.5
-# Components of a direction this large, relative to its largest, are named.
+# Chosen: components at least this large, relative to the largest, are named.
 _NAMED = 0.4
-# Singular values this small, relative to the largest, are as good as zero, and their
-# directions are only defined together.
+# Chosen: smaller singular values, relative to the largest, are rounding errors.
 _NOTHING = 1e-9
-# Differences of sixth order of what is zero in the middle: centred, and to one side.
+# Coefficients of first derivatives of sixth order where the value is zero: centred, one-sided.
 _CENTRED = np.array([45.0, -9.0, 1.0]) / 60.0
 _ONE_SIDED = np.array([360.0, -450.0, 400.0, -225.0, 72.0, -10.0]) / 60.0
-# Epochs further apart than this many intervals have a gap between them.
+# Chosen: epochs further apart than this many median intervals have a gap between them.
 GAP = 1.5
 
 
@@ -57,6 +55,7 @@ class BodyMotion:
     Parameters
     ----------
     time : ndarray, shape (M,), s
+        Epochs.
     v_b : ndarray, shape (M, 3)
         Velocity of the IMU over ground, or through the water, m/s.
     omega_b : ndarray, shape (M, 3), rad/s
@@ -80,14 +79,16 @@ class BodyMotion:
 
 @dataclass(frozen=True)
 class MountingModel:
-    """Where the model is linearised.
+    """Linearisation point of the model.
 
     Parameters
     ----------
     misalignment : ndarray, shape (3,), rad
         Rotation vector of C_b^d.
     scale_error : ndarray, shape (1,) or (3,)
+        Scale error, common or for each axis.
     lever_arm : ndarray, shape (3,), m
+        From the IMU to the DVL, in body.
     """
 
     misalignment: Array
@@ -96,22 +97,24 @@ class MountingModel:
 
     @property
     def gain(self) -> Array:
-        """What takes a velocity from b to the DVL's reading: (1 + k) D, (3, 3)."""
+        """Matrix from the velocity in body to the DVL's reading: (1 + k) D, (3, 3)."""
         return np.broadcast_to(1.0 + self.scale_error, (3,))[:, None] * exp_so3(self.misalignment)
 
 
 @dataclass(frozen=True)
 class BeamMounting:
-    """Where the model of single beams is linearised.
+    """Linearisation point of the model of single beams.
 
     Parameters
     ----------
     nominal_b : ndarray, shape (N, 3)
-        Unit vectors in body.
+        Nominal unit vectors in body.
     turns : ndarray, shape (2N,), rad
-        Of them.
+        Two angles that turn each nominal vector to the actual one.
     scale_error : ndarray, shape (N,)
+        Scale error of each beam.
     lever_arm : ndarray, shape (3,), m
+        From the IMU to the DVL, in body.
     """
 
     nominal_b: Array
@@ -121,28 +124,29 @@ class BeamMounting:
 
     @property
     def gain(self) -> Array:
-        """What takes a velocity from b to those of the beams, (N, 3)."""
+        """Matrix from the velocity in body to the beam velocities, (N, 3)."""
         directions = turned(self.nominal_b, self.turns.reshape(-1, 2))
         return np.asarray((1.0 + self.scale_error)[:, None] * directions)
 
 
 @dataclass(frozen=True)
 class SingularValues:
-    """What a stack of rows says of the states.
+    """Singular values of a stack of measurement rows.
 
     Parameters
     ----------
     segment : Segment
-        That it covers.
+        Segment of the rows.
     pings : int
-        Number of pings in it.
+        Number of pings in the segment.
     values : ndarray, shape (n,)
-        Singular values, falling. One of 1 means that the data know a direction as well as the
+        Singular values in descending order. At 1, the data inform a direction as much as the
         prior does.
     directions : ndarray, shape (n, n)
         Right singular vectors as rows, in units of the priors' σ.
     spurious : ndarray, shape (n,)
-        Share of the squared singular value that the errors of the motion are expected to feign.
+        Expected share of spurious information, from errors of the motion, in each squared
+        singular value.
     states : tuple of str
         Names of the columns.
     """
@@ -156,7 +160,7 @@ class SingularValues:
 
     @property
     def observed(self) -> np.ndarray:
-        """Directions whose prior σ the data at least halve, (n,) bool, by more than noise."""
+        """Directions whose prior σ the data at least halve, not by noise, (n,) bool."""
         return (self.values >= OBSERVABLE) & (self.spurious < SPURIOUS)
 
     def dominant(self, i: int) -> tuple[str, ...]:
@@ -165,7 +169,7 @@ class SingularValues:
 
 
 def dominant(direction: Array, names: Sequence[str]) -> tuple[str, ...]:
-    """Return the names of the large components of a direction, the largest first."""
+    """Return the names of the dominant components of a direction, the largest first."""
     size = np.abs(direction)
     order = np.argsort(-size, kind="stable")
     return tuple(names[i] for i in order if size[i] >= _NAMED * size.max())
@@ -199,7 +203,7 @@ def body_motion(motion: Trajectory | Reference, body_axes: BodyAxes) -> BodyMoti
 def _rates(nRb: Array, time: Array) -> Array:
     n = time.size
     if n < 2 * _ONE_SIDED.size:
-        # Too few for more than the mean between two epochs.
+        # Too few epochs for more than the mean rate between two of them.
         omega = np.zeros((n, 3))
         if n > 1:
             omega[1:] = log_so3(nRb[:-1].transpose(0, 2, 1) @ nRb[1:]) / np.diff(time)[:, None]
@@ -224,19 +228,19 @@ def _rates(nRb: Array, time: Array) -> Array:
 def point_set_rows(motion: BodyMotion, mounting: MountingModel) -> Array:
     """Return the measurement rows H in d, (M, 3, 6 + scales).
 
-    Of v_d = (1 + k) D (v_b + omega x l) with u = v_b + omega x l:
+    For v_d = (1 + k) D (v_b + omega x l) with u = v_b + omega x l:
 
         H = [-(1 + k) D [u x] J_r(alpha), diag(D u) or D u, (1 + k) D [omega x]],
 
-    alpha being the rotation vector itself, as it is reported. With D = I, k = 0 and l = 0
-    these are the rows of Luo et al. (2024), eq. 10.
+    where alpha is the rotation vector as reported. With D = I, k = 0 and l = 0 these are the
+    rows of Luo et al. (2024), eq. 10.
 
     Parameters
     ----------
     motion : BodyMotion
-        At M pings.
+        Motion at M pings.
     mounting : MountingModel
-        Where to linearise.
+        Linearisation point.
     """
     u_b = motion.v_b + np.cross(motion.omega_b, mounting.lever_arm)
     u_d = u_b @ exp_so3(mounting.misalignment).T
@@ -255,7 +259,7 @@ def point_set_rows(motion: BodyMotion, mounting: MountingModel) -> Array:
 def beam_rows(motion: BodyMotion, mounting: BeamMounting) -> Array:
     """Return the measurement rows H of beams, (M, N, 3N + 3).
 
-    Of v_i = (1 + k_i) d_i^T u with u = v_b + omega x l, for the turns of the directions,
+    For v_i = (1 + k_i) d_i^T u with u = v_b + omega x l, for the turns of the directions,
     the scale errors and the lever arm:
 
         h_i = [(1 + k_i) u^T dd_i/deta_i, d_i^T u, (1 + k_i) d_i^T [omega x]],
@@ -265,9 +269,9 @@ def beam_rows(motion: BodyMotion, mounting: BeamMounting) -> Array:
     Parameters
     ----------
     motion : BodyMotion
-        At M pings.
+        Motion at M pings.
     mounting : BeamMounting
-        Where to linearise.
+        Linearisation point.
     """
     u_b = motion.v_b + np.cross(motion.omega_b, mounting.lever_arm)
     geometry = FreeGeometry(mounting.nominal_b, "turns", "scale")
@@ -279,7 +283,7 @@ def beam_rows(motion: BodyMotion, mounting: BeamMounting) -> Array:
 
 @dataclass(frozen=True)
 class _Stack:
-    """Rows as their triangle, with the information that errors of the motion feign."""
+    """QR triangle of rows, with the spurious information in them."""
 
     root: Array
     spurious: Array
@@ -303,26 +307,26 @@ def singular_values(
     nothing: float = 0.0,
     margin: float = 0.0,
 ) -> tuple[tuple[SingularValues, ...], tuple[SingularValues, ...]]:
-    """Return singular values of each segment, and of all up to its end.
+    """Return singular values of each segment, and of all data up to its end.
 
     Parameters
     ----------
     rows : ndarray, shape (M, 3, n)
-        In units of the measurements' and of the priors' standard deviations, or plain.
+        Rows in units of the measurements' and the priors' standard deviations, or unscaled.
     time : ndarray, shape (M,), s
-        Of the pings.
+        Times of the pings.
     segments : sequence of Segment
-        To stack.
+        Segments of the trial.
     states : sequence of str
         Names of the n columns.
     spurious : ndarray, shape (M, n, n), optional
-        Expectation of what errors of the motion add to rowsᵀ rows.
+        Spurious information: expected contribution of errors of the motion to rowsᵀ rows.
     nothing : float, default 0.0
-        Singular values up to here are as good as zero; their directions are only defined together,
-        and given in a readable basis.
+        Singular values up to this one count as zero; their directions are given in a readable
+        basis of their subspace.
     margin : float, default 0.0
-        S; pings this close to the border between two segments are left out of each alone, so that
-        the first of a turn does not stand with the straight run before it. At most a fifth of a
+        Pings closer than this, s, to the border of two segments are omitted from the single
+        segments, so that a straight run excludes the start of a turn. At most a fifth of a
         segment.
     """
     n = rows.shape[2]
@@ -368,11 +372,11 @@ def _decompose(
 
 
 def readable_basis(directions: Array) -> Array:
-    """Return a basis of the same subspace with as few states in each direction as it has.
+    """Return a basis of the same subspace with few states in each direction.
 
-    The reduced echelon form, with pivots taken where the subspace is largest. A subspace
-    that the data leave open has no basis of its own: this one names single states where
-    single states are open.
+    The reduced echelon form, with pivots at the largest components of the subspace. The
+    basis of an undetermined subspace is arbitrary: this one names single states if single
+    states are undetermined.
 
     Parameters
     ----------
@@ -381,15 +385,16 @@ def readable_basis(directions: Array) -> Array:
 
     Returns
     -------
-    (r, n) rows of unit length, in general not orthogonal.
+    ndarray, shape (r, n)
+        Rows of unit length, in general not orthogonal.
     """
-    rest = directions.copy()
+    remainder = directions.copy()
     pivots: list[int] = []
-    for _ in range(rest.shape[0]):
-        pivot = int(np.argmax(np.linalg.norm(rest, axis=0)))
+    for _ in range(remainder.shape[0]):
+        pivot = int(np.argmax(np.linalg.norm(remainder, axis=0)))
         pivots.append(pivot)
-        along = rest[:, pivot] / np.linalg.norm(rest[:, pivot])
-        rest = rest - np.outer(along, along @ rest)
+        along = remainder[:, pivot] / np.linalg.norm(remainder[:, pivot])
+        remainder = remainder - np.outer(along, along @ remainder)
     pivots.sort()
     out = np.linalg.solve(directions[:, pivots], directions)
     out[np.abs(out) < 1e-9] = 0.0

@@ -1,14 +1,13 @@
-"""Which part of a trial told how much of a parameter.
+"""Share of each part of a trial in the information on a parameter.
 
-Information adds up over independent data given all else. With everything else eliminated,
-what remains on the constants at time t is their marginal information L(t), which only
-grows; so dL = L(end) - L(start) >= 0 is what a segment brought, and with the prior's L(0)
-the parts add up to the whole. For component i with the final covariance P,
+The marginal information L(t) on the constants, given the data up to time t, only grows. So
+dL = L(end) - L(start) >= 0 is the contribution of a segment, and with the prior's L(0) the
+parts add up to the whole. For component i with the final covariance P,
 
     1 = e_iᵀ P L P e_i / P_ii = sum over parts of (P e_i)ᵀ dL (P e_i) / P_ii.
 
-Each part is also -d ln P_ii / dw when that part's information is weighted by w: by how many
-per cent the variance falls if there is one per cent more of it.
+Each part is also -d ln P_ii / dw if its information is weighted by w: the relative decrease
+of the variance per relative increase of that part.
 """
 
 from __future__ import annotations
@@ -25,16 +24,16 @@ from factorgraph_dvl.statistics.information_history import InformationHistory
 
 @dataclass(frozen=True)
 class Shares:
-    """Shares in the information on each component; they add up to 1.
+    """Shares of the information on each component; they add up to 1.
 
     Parameters
     ----------
     names : tuple of str
-        (P,) components.
+        Names of the P components.
     prior : ndarray, shape (P,)
-        Of the prior.
+        Share of the prior.
     segments : ndarray, shape (S, P)
-        Of each segment.
+        Share of each segment.
     """
 
     names: tuple[str, ...]
@@ -48,10 +47,9 @@ def information_shares(history: InformationHistory, segments: Sequence[Segment])
     Parameters
     ----------
     history : InformationHistory
-        Of the whole trial.
+        Information along the whole trial.
     segments : sequence of Segment
-        One after the other; what comes before the first counts with it, what comes after the last
-        with that.
+        Consecutive segments; data before the first and after the last count with these.
     """
     last = history.root[-1]
     P = last @ last.T

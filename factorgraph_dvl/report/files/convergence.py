@@ -12,7 +12,7 @@ _COLUMNS = ("component", "good_std", "std_since_s", "good_error", "error_since_s
 
 
 def to_csv(found: Convergence) -> str:
-    """Return one row for each component, and one named `all`; empty = never, or not known."""
+    """Return a row for each component, and one named `all`; empty = never, or unknown."""
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
     writer.writerow(_COLUMNS)

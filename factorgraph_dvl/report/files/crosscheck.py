@@ -27,7 +27,7 @@ from factorgraph_dvl.analysis.error_statistics import (
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.solution import Solution
 
-# What a cross-check writes; the first makes the folder valid.
+# Files of a cross-check; the first makes the folder valid.
 OWNED = (
     *("crosscheck.json", "crosscheck.csv", "differences.csv"),
     *("parameters.png", "differences.png", "errors.png"),
@@ -39,14 +39,14 @@ _COLUMNS = (
 
 
 def to_json(check: CrossCheck, names: Mapping[str, str]) -> bytes:
-    """Return `crosscheck.json`: strict JSON, in which null stands for what is not known.
+    """Return `crosscheck.json`: strict JSON, with null for unknown values.
 
     Parameters
     ----------
     check : CrossCheck
-        To write.
+        Cross-check to write.
     names : mapping of str to str
-        Of the files that A and B were read from.
+        Names of the files of A and B.
     """
     content = {
         "format": 1,
@@ -80,7 +80,7 @@ def to_json(check: CrossCheck, names: Mapping[str, str]) -> bytes:
 
 
 def to_csv(check: CrossCheck) -> str:
-    """Return `crosscheck.csv`: a row for each calibration component; empty = not known."""
+    """Return `crosscheck.csv`: a row for each calibration component; empty = unknown."""
     out = io.StringIO()
     writer = csv.DictWriter(out, _COLUMNS, lineterminator="\n")
     writer.writeheader()

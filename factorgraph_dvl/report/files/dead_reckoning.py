@@ -17,19 +17,19 @@ from factorgraph_dvl.report.text import fixed
 RESULT_FILE = "deadreckon.json"
 TRACK_FILE = "track.csv"
 UNCALIBRATED_FILE = "track-uncalibrated.csv"
-# What `deadreckon` writes; the first makes the folder valid.
+# Files of `deadreckon`; the first makes the folder valid.
 OWNED = (RESULT_FILE, TRACK_FILE, UNCALIBRATED_FILE, "tracks.png", "errors.png", "lever_arm.png")
 
 
 def to_json(result: BeforeAfter, about: Mapping[str, Any]) -> bytes:
-    """Return `deadreckon.json`: strict JSON, in which null stands for what is not known.
+    """Return `deadreckon.json`: strict JSON, with null for unknown values.
 
     Parameters
     ----------
     result : BeforeAfter
-        To write.
+        Result to write.
     about : mapping of str to object
-        Names of trial and calibration, source of the attitude, ….
+        Names of trial and calibration, source of the attitude, and the like.
     """
     content = {
         "format": 1,
@@ -89,7 +89,7 @@ def _stretches(stretches: Stretches) -> dict[str, Any]:
 
 
 def error_table(result: BeforeAfter) -> Table:
-    """Render the errors before and after calibration, side by side."""
+    """Return a table of the errors before and after calibration."""
     table = Table(title="Dead reckoning")
     table.add_column("error", no_wrap=True)
     scores = [r.score for r in (result.uncalibrated, result.calibrated)]

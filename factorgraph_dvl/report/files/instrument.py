@@ -1,4 +1,4 @@
-"""A calibration as people type it into instruments: YAML, with the sign rules beside it."""
+"""A calibration in the terms of instruments, as YAML with sign rules."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ def instrument_text(instrument: InstrumentTerms, name: str) -> str:
     Parameters
     ----------
     instrument : InstrumentTerms
-        To write.
+        Terms to write.
     name : str
-        Of the trial that the calibration comes from.
+        Name of the calibrated trial.
     """
     i = instrument
     lines = [
@@ -72,7 +72,7 @@ def instrument_text(instrument: InstrumentTerms, name: str) -> str:
     return "\n".join(lines) + "\n"
 
 
-# No DVL that looks down is mounted with more.
+# Chosen: a DVL that looks down has a smaller roll and pitch.
 _UPSIDE_DOWN_DEG = 90.0
 _NOT_TRDI = (
     "# NOT TO BE TYPED IN: with these the instrument would look up. The DVL's data in this",

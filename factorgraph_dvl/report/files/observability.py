@@ -1,4 +1,4 @@
-"""What data can tell, as JSON and CSV."""
+"""Observability as JSON and CSV."""
 
 from __future__ import annotations
 
@@ -22,31 +22,31 @@ FIGURES = tuple(
     f"{name}.png"
     for name in ("singular_values", "std_along_trial", "correlation", "directions", "shares")
 )
-# What the command writes; the first makes the folder valid.
+# Files of the command; the first makes the folder valid.
 OWNED = ("observability.json", "observability.csv", "history.csv", *FIGURES)
 
 
 def to_json(view: Observability, source: str) -> bytes:
-    """Return `observability.json`: strict JSON, in which null stands for what is not known.
+    """Return `observability.json`: strict JSON, with null for unknown values.
 
     Parameters
     ----------
     view : Observability
-        To write.
+        Observability to write.
     source : str
-        Folder that it was made from.
+        Folder of the trial or solution.
     """
     return encode({"format": 1, "source": source, **content(view)})
 
 
 def encode(values: dict[str, Any]) -> bytes:
-    """Return strict JSON, laid out for people."""
+    """Return strict JSON, indented."""
     # msgspec writes nan and infinity as null.
     return msgspec.json.format(msgspec.json.encode(values), indent=2) + b"\n"
 
 
 def content(view: Observability) -> dict[str, Any]:
-    """Return what `observability.json` holds."""
+    """Return the content of `observability.json`."""
     return {
         "trial": view.name,
         "kind": view.kind,
@@ -67,7 +67,7 @@ def content(view: Observability) -> dict[str, Any]:
 
 
 def to_csv(view: Observability) -> str:
-    """Return `observability.csv`: a row for each component; empty = not known."""
+    """Return `observability.csv`: a row for each component; empty = unknown."""
     shares = view.shares
     parts = [f"share_{i + 1}" for i in range(len(view.segments))] if shares else []
     out = io.StringIO()
@@ -104,7 +104,7 @@ def to_csv(view: Observability) -> str:
 
 
 def history_columns(history: InformationHistory) -> dict[str, Array]:
-    """Return the columns of `history.csv`: σ of each constant given the data up to a time."""
+    """Return the columns of `history.csv`: σ of each constant, given the data up to a time."""
     std = history.std
     columns = {"time_s": history.time}
     return columns | {f"{name}_std": std[:, i] for i, name in enumerate(history.names)}
@@ -145,7 +145,7 @@ def _stack(s: SingularValues) -> dict[str, Any]:
                 "dominant": s.dominant(i),
                 "vector": s.directions[i].tolist(),
                 "observed": bool(s.observed[i]),
-                "feigned_share": float(s.spurious[i]),
+                "spurious_share": float(s.spurious[i]),
             }
             for i in range(s.values.size)
         ],

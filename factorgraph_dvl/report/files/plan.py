@@ -1,4 +1,4 @@
-"""A plan's prediction as JSON, tables and lines."""
+"""The prediction of a plan as JSON, table and lines."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from factorgraph_dvl.report.terminal.tables import add_column
 from factorgraph_dvl.report.text import split_unit
 from factorgraph_dvl.solution import Solution
 
-# What the command writes; the first makes the folder valid.
+# Files of the command; the first makes the folder valid.
 OWNED = ("plan.json", *OF_THE_VIEW)
 
 
@@ -32,15 +32,15 @@ def to_json(
     Parameters
     ----------
     solution : Solution
-        The prediction.
+        Predicted solution.
     duration : float
-        Of the plan, s.
+        Duration of the plan, s.
     required : sequence of Requirement
-        What is required of it.
+        Requirements of the plan.
     proposal : Proposal or None
-        What to add; None if nothing is missed.
+        Proposed addition; None if all requirements are met.
     source : str
-        File that the plan was read from.
+        File of the plan.
     """
     return encode(
         {
@@ -88,8 +88,8 @@ def _proposal(p: Proposal) -> dict[str, Any]:
 
 
 def requirement_table(required: Sequence[Requirement], proposal: Proposal | None) -> Table:
-    """Render required against predicted σ, of the plan and with the proposal."""
-    table = Table(title="Required")
+    """Return a table of required against predicted σ, without and with the proposal."""
+    table = Table(title="Requirements")
     add_column(table, "component")
     add_column(table, "unit")
     add_column(table, "required σ", numeric=True)
@@ -109,21 +109,21 @@ def requirement_table(required: Sequence[Requirement], proposal: Proposal | None
 
 
 def proposal_lines(proposal: Proposal) -> list[str]:
-    """Render a proposal: what to add, as it stands in a plan, or that nothing suffices."""
+    """Return the lines of a proposal: manoeuvres to add, as in a plan, or the best attempt."""
     tried = f"{proposal.tried} sequences were tried"
     if proposal.shortest:
-        tried += ", all that are shorter among them"
+        tried += ", including all shorter ones"
     else:
-        tried += f", all of up to {proposal.limit:.0f} s among them"
+        tried += f", including all of up to {proposal.limit:.0f} s"
     if proposal.met and not proposal.shortest:
-        tried += ": there may be a shorter one"
+        tried += "; a shorter one may exist"
     if proposal.met:
         lines = [f"Add {proposal.added:.0f} s ({tried}): {', '.join(proposal.names)}."]
     else:
         missed = ", ".join(f"{r.component} ({r.predicted:.2g})" for r in proposal.missed)
         lines = [
-            f"No sequence that was tried meets all that is required; {tried}. Still missed with "
-            f"the best of them, {proposal.added:.0f} s of {', '.join(proposal.names)}: {missed}."
+            f"No sequence meets all requirements ({tried}). The best one, "
+            f"{proposal.added:.0f} s of {', '.join(proposal.names)}, still misses: {missed}."
         ]
     return lines + [f"  - {_as_yaml(m)}" for m in proposal.manoeuvres]
 

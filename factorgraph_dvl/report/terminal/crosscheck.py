@@ -1,4 +1,4 @@
-"""A cross-check for the terminal: tables, and what they mean in words."""
+"""A cross-check for the terminal: tables, and an explanation of them."""
 
 from __future__ import annotations
 
@@ -20,19 +20,20 @@ from factorgraph_dvl.analysis.error_statistics import nees_band
 from factorgraph_dvl.report.terminal.tables import width_of
 from factorgraph_dvl.report.text import at_precision, split_unit, with_std
 
+# Chosen: wider than any table, in columns.
 _UNLIMITED = 10_000
 _STYLES = {"agree": "green", "differ": "red", "not comparable": "yellow"}
 
 
 def component_table(check: CrossCheck, *, width: int = _UNLIMITED) -> Table:
-    """Render every calibration component of both results, with its verdict.
+    """Return a table of every calibration component of both results, with its verdict.
 
     Parameters
     ----------
     check : CrossCheck
-        With the components.
+        Cross-check to show.
     width : int, optional
-        Columns that there are. If they are too few, only the differences are shown.
+        Columns of the terminal. If they are too few, only the differences are shown.
     """
     table = _full_table(check)
     return table if width_of(table) <= width else _brief_table(check)
@@ -63,7 +64,7 @@ def _full_table(check: CrossCheck) -> Table:
     table.add_column("which σ", no_wrap=True)
     table.add_column("unit", no_wrap=True)
     table.add_column("verdict", no_wrap=True)
-    table.add_column("because", no_wrap=True)
+    table.add_column("reason", no_wrap=True)
     components = check.components
     for i, c in enumerate(components):
         name, unit = split_unit(c.name)
@@ -86,11 +87,11 @@ def _full_table(check: CrossCheck) -> Table:
 
 
 def motion_table(motion: MotionDifference) -> Table:
-    """Render the differences of the trajectories, component by component."""
+    """Return a table of the differences of the trajectories, component by component."""
     span = f"{motion.time.size} epochs, {motion.time[0] + 0.0:.10g} to {motion.time[-1]:.10g} s"
     table = Table(title=f"Trajectory: A − B at {span}")
     table.add_column("component", no_wrap=True)
-    for header in ("unit", "RMS", "largest", "at s", "RMS in σ", "largest in σ", "inside 2σ %"):
+    for header in ("unit", "RMS", "largest", "at s", "RMS in σ", "largest in σ", "within 2σ %"):
         table.add_column(header, justify="left" if header == "unit" else "right", no_wrap=True)
     table.add_column("which σ", no_wrap=True)
     for i, (s, kind) in enumerate(zip(motion.spreads, motion.kinds, strict=True)):
@@ -111,7 +112,7 @@ def motion_table(motion: MotionDifference) -> Table:
 
 
 def truth_tables(check: CrossCheck) -> list[Table]:
-    """Render the errors of both results against the truth, as far as it is known."""
+    """Return tables of the errors of both results against the known truth."""
     sides = (("A", check.truth_a), ("B", check.truth_b))
     out = []
     if any(side.calibration is not None for _, side in sides):
@@ -122,44 +123,43 @@ def truth_tables(check: CrossCheck) -> list[Table]:
 
 
 def paragraph(check: CrossCheck) -> str:
-    """Say which standard deviation is shown, what a verdict means, and the joint test."""
+    """Return text that explains the standard deviation, the verdicts and the joint test."""
     text = (
         "Both results come from the same data, so their errors are correlated: var(A − B) = "
-        "σ_A² + σ_B² − 2 cov, with a covariance that neither states. As long as it is not "
-        "negative, as of two sound estimates of the same data, √(σ_A² + σ_B²) is an upper bound "
-        "of the σ of A − B: what differs by it differs, what agrees might differ by a sharper "
-        "test."
+        "σ_A² + σ_B² − 2 cov, with an unknown covariance. It is not negative for two sound "
+        "estimates from the same data, so √(σ_A² + σ_B²) is an upper bound of the σ of A − B: a "
+        "difference flagged here is significant; agreement may still fail a sharper test."
     )
     if check.efficient is None:
-        text += " This bound is shown; `--efficient A` or `B` asks for the sharper one."
+        text += " The table shows this bound; `--efficient A` or `B` selects the sharper test."
     else:
         other = "B" if check.efficient == "A" else "A"
         text += (
-            f" {check.efficient} was said to be efficient; then var(A − B) = σ_{other}² − "
-            f"σ_{check.efficient}² (Hausman 1978), which is shown where σ_{other} is the larger, "
+            f" {check.efficient} was declared efficient, so var(A − B) = σ_{other}² − "
+            f"σ_{check.efficient}² (Hausman 1978). The table shows it where σ_{other} is larger, "
             "and the upper bound elsewhere."
         )
-    text += f" Agree: within {AGREE_SIGMAS:g}σ of what is shown."
+    text += f" Results agree within {AGREE_SIGMAS:g} times the σ shown."
     if any(c.kind in ("A alone", "B alone") for c in check.components):
         text += (
-            " Where one result states no σ, that of the other alone is shown: inside it they "
-            "agree whatever the first one's is, beyond it nothing can be said."
+            " If one result states no σ, the σ of the other alone is shown: within it the results "
+            "agree, beyond it they cannot be compared."
         )
     joint = check.joint
     if joint is not None:
         text += (
-            f" Jointly over {len(joint.names)} components: χ² = {joint.statistic:.3g}, "
-            f"limit {joint.limit:.3g}, so they {joint.verdict}."
+            f" Joint test of {len(joint.names)} components: χ² = {joint.statistic:.3g}, "
+            f"limit {joint.limit:.3g}: they {joint.verdict}."
         )
         if not joint.correlations:
-            text += " One result states no correlations; they were taken as none."
+            text += " One result states no correlations; they were taken as zero."
     for name, angle in check.angles.items():
-        text += f" Between the rotations of {name}: {angle:.3g}°."
+        text += f" Angle between the rotations of {name}: {angle:.3g}°."
     return text
 
 
 def verdict_line(components: Sequence[Component]) -> str:
-    """Count the verdicts."""
+    """Return the number of components with each verdict."""
     counts = {v: sum(c.verdict == v for c in components) for v in _STYLES}
     return ", ".join(f"{count} {verdict}" for verdict, count in counts.items() if count)
 
@@ -185,7 +185,7 @@ def _calibration_truth(sides: Sequence[tuple[str, AgainstTruth]]) -> Table:
         short, unit = split_unit(name)
         table.add_row(short, *row, unit)
     table.add_section()
-    nees, inside = ["NEES (expected)", ""], ["inside 2σ (expected 95.4 %)", ""]
+    nees, inside = ["NEES (expected)", ""], ["within 2σ (expected 95.4 %)", ""]
     for _, against in sides:
         errors = against.calibration
         if errors is None or errors.dof == 0:
@@ -205,15 +205,15 @@ def _trajectory_truth(sides: Sequence[tuple[str, AgainstTruth]]) -> Table:
     table.add_column("component", no_wrap=True)
     table.add_column("unit", no_wrap=True)
     for side, _ in sides:
-        for header in (f"RMS of {side}", f"largest of {side}", f"inside 2σ of {side} %"):
+        for header in (f"RMS of {side}", f"largest of {side}", f"within 2σ of {side} %"):
             table.add_column(header, justify="right", no_wrap=True)
     found = [
         None if against.trajectory is None else error_spreads(against.trajectory)
         for _, against in sides
     ]
-    some = next(spreads for spreads in found if spreads is not None)
-    for i in range(len(some)):
-        name, unit = split_unit(some[i].name)
+    known = next(spreads for spreads in found if spreads is not None)
+    for i in range(len(known)):
+        name, unit = split_unit(known[i].name)
         cells: list[str] = []
         for spreads in found:
             if spreads is None:
@@ -230,7 +230,7 @@ def _trajectory_truth(sides: Sequence[tuple[str, AgainstTruth]]) -> Table:
             nees = "–" if errors is None else _or_dash(float(mean_nees(errors)[k]), ".2f")
             cells += [nees, "", ""]
         table.add_row(f"{group}: mean NEES (3 expected)", "", *cells)
-    table.caption = f"Expected inside 2σ: {100.0 * TWO_SIGMA_SHARE:.1f} %, over many trials"
+    table.caption = f"Expected within 2σ: {100.0 * TWO_SIGMA_SHARE:.1f} %, over many trials"
     return table
 
 
@@ -239,7 +239,7 @@ def _or_dash(value: float, spec: str) -> str:
 
 
 def _resolution(c: Component) -> float:
-    """Return the σ whose digits are worth writing."""
+    """Return the σ that determines the digits to show."""
     known = [s for s in (c.std, c.std_a, c.std_b) if np.isfinite(s) and s > 0.0]
     return min(known) if known else float("nan")
 

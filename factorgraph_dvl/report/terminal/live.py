@@ -1,4 +1,4 @@
-"""What is known at one moment, for a terminal that shows it as it changes."""
+"""The present estimate of a replay, for a live display in the terminal."""
 
 from __future__ import annotations
 
@@ -25,30 +25,30 @@ def live_view(
     lacking: Sequence[str] = (),
     good_since: float | None = None,
 ) -> Group:
-    """Render whether it is good enough, position, latency, speed and calibration.
+    """Return verdict, position, latency, speed and calibration.
 
-    What matters most stands first: a terminal that is too low loses the end.
+    The most important lines come first, because a small terminal cuts off the end.
 
     Parameters
     ----------
     trial : str
-        Name.
+        Name of the trial.
     time : float
-        Since its start, s.
+        Time since the start of the trial, s.
     estimates : sequence of Estimate
-        Of the calibration.
+        Estimates of the calibration.
     state : Trajectory
-        Of one epoch.
+        Trajectory of one epoch.
     latency : float
-        Of the last update, s.
+        Latency of the last update, s.
     speed : float
-        Relative to real time.
+        Speed of the replay relative to real time.
     doubted : sequence of str
         Kinds of measurements that disagree with the prediction.
     lacking : sequence of str, optional
-        Components whose standard deviations are not good enough yet.
+        Components whose standard deviations exceed their limits.
     good_since : float, optional
-        S, from which on all are; None = they are not.
+        Time from which no standard deviation exceeds its limit, s; None = some do.
     """
     table = Table()
     table.add_column("parameter")

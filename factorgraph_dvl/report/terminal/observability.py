@@ -1,4 +1,4 @@
-"""What data can tell, as tables for the terminal."""
+"""Observability as tables for the terminal."""
 
 from __future__ import annotations
 
@@ -14,24 +14,25 @@ from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.report.terminal.tables import add_column
 from factorgraph_dvl.report.text import fixed, split_unit, with_std
 
-_MOST_SEGMENTS = 16
-# Shares below this are not worth a word.
-_LITTLE = 0.1
+# Chosen: more rows do not fit on a screen.
+_MAX_SEGMENTS = 16
+# Chosen: smaller shares are not listed, so that the sources fit in a column.
+_MIN_SHARE = 0.1
 
 
 def segment_table(view: Observability) -> Table:
-    """Render the segments: how the vehicle moved, and what the DVL's rows show there."""
+    """Return a table of the segments: motion and determined directions of the DVL."""
     table = Table(title="Segments")
     add_column(table, "motion")
     for header in ("from s", "to s", "m/s", "turn deg", "rms rate deg/s"):
         add_column(table, header, numeric=True)
     point_set = view.point_set
     if point_set is not None:
-        add_column(table, "observed")
-        add_column(table, "largest")
-        add_column(table, "weakest of them")
-        add_column(table, "in all")
-    shown = view.segments[:_MOST_SEGMENTS]
+        add_column(table, "determined")
+        add_column(table, "strongest")
+        add_column(table, "weakest")
+        add_column(table, "up to its end")
+    shown = view.segments[:_MAX_SEGMENTS]
     for k, m in enumerate(shown):
         row = [
             m.segment.label,
@@ -44,29 +45,29 @@ def segment_table(view: Observability) -> Table:
         if point_set is not None:
             stack, total = point_set.segments[k], point_set.cumulative[k]
             n = len(point_set.states)
-            seen = np.flatnonzero(stack.observed)
+            observed = np.flatnonzero(stack.observed)
             row += [
-                f"{seen.size} of {n}",
-                _named(stack.values, stack.dominant(int(seen[0])), int(seen[0]))
-                if seen.size
+                f"{observed.size} of {n}",
+                _named(stack.values, stack.dominant(int(observed[0])), int(observed[0]))
+                if observed.size
                 else "–",
-                _named(stack.values, stack.dominant(int(seen[-1])), int(seen[-1]))
-                if seen.size
+                _named(stack.values, stack.dominant(int(observed[-1])), int(observed[-1]))
+                if observed.size
                 else "–",
                 f"{int(np.sum(total.observed))} of {n}",
             ]
         table.add_row(*(Text(text) for text in row))
-    left = len(view.segments) - len(shown)
-    if left:
-        table.caption = f"and {left} more, in observability.json"
+    omitted = len(view.segments) - len(shown)
+    if omitted:
+        table.caption = f"and {omitted} more, in observability.json"
     return table
 
 
 def marginal_table(view: Observability) -> Table:
-    """Render posterior against prior, and which segment told most."""
+    """Return a table of posterior against prior, and of the sources of the information."""
     m = view.marginals
     assert m is not None
-    table = Table(title="What the data added")
+    table = Table(title="Posterior against prior")
     add_column(table, "component")
     add_column(table, "value ± std", numeric=True)
     add_column(table, "unit")
@@ -92,9 +93,9 @@ def marginal_table(view: Observability) -> Table:
 
 
 def direction_lines(marginals: Marginals) -> list[str]:
-    """Render the weak directions, a sentence each."""
+    """Return a line for each weak direction."""
     if not marginals.sentences:
-        return ["Every direction is observable: of none half of the prior's σ is left."]
+        return ["All directions are observable: the data at least halve the prior's σ of each."]
     return [f"- {sentence}." for sentence in marginals.sentences]
 
 
@@ -107,7 +108,7 @@ def _sources(view: Observability, component: str) -> str:
     found: dict[str, float] = {"prior": float(shares.prior[k])}
     for m, part in zip(view.segments, shares.segments[:, k], strict=True):
         found[m.segment.label] = found.get(m.segment.label, 0.0) + float(part)
-    large = sorted(((v, name) for name, v in found.items() if v >= _LITTLE), reverse=True)
+    large = sorted(((v, name) for name, v in found.items() if v >= _MIN_SHARE), reverse=True)
     return ", ".join(f"{name} {100.0 * v:.0f} %" for v, name in large)
 
 

@@ -17,23 +17,24 @@ from factorgraph_dvl.report.text import at_precision, fixed, split_unit, with_st
 from factorgraph_dvl.solution import Solution
 
 _STYLES = {"error": "red", "warning": "yellow", "ok": "green"}
+# Chosen: wider than any table, in columns.
 _UNLIMITED = 10_000
 
 
 def calibration_table(
     solution: Solution, errors: CalibrationErrors | None = None, *, width: int = _UNLIMITED
 ) -> Table:
-    """Render the calibration: value and standard deviation against the prior's.
+    """Return a table of the calibration: value, and standard deviation against the prior's.
 
     Parameters
     ----------
     solution : Solution
-        With the estimates.
+        Solution with the estimates.
     errors : CalibrationErrors, optional
-        Against the truth, if that is known.
+        Errors against the truth, if that is known.
     width : int, optional
-        Columns that there are. If they are too few for all of the table, the prior is left out and
-        the unit joins the name; if they still are, the table is wider.
+        Columns of the terminal. If they are too few, the prior is omitted and the unit joins the
+        name; the table may still be wider.
     """
     table = _calibration_table(solution, errors, brief=False)
     if width_of(table) > width:
@@ -80,7 +81,7 @@ def _calibration_table(
 
 
 def hypothesis_table(solution: Solution) -> Table:
-    """Render the trajectories that the data allow, or allowed until they did not."""
+    """Return a table of the hypotheses: trajectories that the data allow, or allowed at first."""
     table = Table(title="Hypotheses")
     for header in ("no.", "weight", "found at s", "until s", "from the first, m"):
         add_column(table, header, numeric=True)
@@ -100,26 +101,26 @@ def hypothesis_table(solution: Solution) -> Table:
 
 
 def rejected_line(solution: Solution) -> str:
-    """Render how many measurements were rejected, by kind."""
+    """Return the number of rejected measurements, by kind."""
     used = {r.label: r.time.size for r in solution.residuals}
     parts = [
         f"{r.time.size} of {r.time.size + used.get(r.label, 0)} {r.label}"
         for r in solution.rejected
     ]
-    return f"Rejected: {', '.join(parts)}; rejected.csv names them"
+    return f"Rejected: {', '.join(parts)}; rejected.csv lists them"
 
 
 def convergence_table(found: Convergence, start: float) -> Table:
-    """Render from when each component was good enough.
+    """Return a table of the times from which each component stayed within its limits.
 
     Parameters
     ----------
     found : Convergence
-        How it converged.
+        Convergence of the calibration.
     start : float
-        Of the trial, s: what the times count from.
+        Start of the trial, s: the origin of the times shown.
     """
-    table = Table(title="Convergence: time since the start from which on it stayed within")
+    table = Table(title="Convergence: time after which each component stayed within its limits")
     add_column(table, "component")
     for header in ("σ below", "since s", "error below", "since s"):
         add_column(table, header, numeric=True)
@@ -137,14 +138,14 @@ def convergence_table(found: Convergence, start: float) -> Table:
 
 
 def good_enough_line(found: Convergence, start: float) -> str:
-    """Say from when the calibration could have been stopped.
+    """Return the time after which the calibration stayed within its limits, as a sentence.
 
     Parameters
     ----------
     found : Convergence
-        How it converged.
+        Convergence of the calibration.
     start : float
-        Of the trial, s.
+        Start of the trial, s.
     """
     if math.isfinite(found.good_since):
         return f"good enough after {found.good_since - start:.0f} s"
@@ -159,7 +160,7 @@ def _moment(time: float) -> str:
 
 
 def sensor_table(survey: Survey) -> Table:
-    """Render what was recorded by each sensor."""
+    """Return a table of the record of each sensor."""
     table = Table(title=Text(f"Trial {survey.trial}"))
     add_column(table, "sensor")
     for header in ("rate Hz", "samples", "from s", "to s", "gaps", "longest s", "missing %"):
@@ -179,12 +180,12 @@ def sensor_table(survey: Survey) -> Table:
 
 
 def width_of(table: Table) -> int:
-    """Return the columns that a table takes if nothing of it is cut."""
+    """Return the width of an uncut table, columns."""
     return Console(width=_UNLIMITED).measure(table).maximum
 
 
 def motion_line(survey: Survey) -> str:
-    """Render duration, distance and speed on one line."""
+    """Return duration, distance and speed on one line."""
     parts = [f"duration {survey.duration:.6g} s"]
     if math.isfinite(survey.distance):
         parts.append(f"distance {survey.distance:.6g} m")
@@ -194,12 +195,12 @@ def motion_line(survey: Survey) -> str:
 
 
 def finding_lines(survey: Survey) -> list[Text]:
-    """Render the findings, one line each."""
+    """Return a line for each finding."""
     return [
         Text.assemble((f"{f.severity}: ", _STYLES[f.severity]), str(f)) for f in survey.findings
     ]
 
 
 def add_column(table: Table, header: str, *, numeric: bool = False) -> None:
-    """Add a column that is never cut; numbers to the right."""
+    """Add a column that is never cut; numbers are aligned to the right."""
     table.add_column(header, justify="right" if numeric else "left", no_wrap=True)

@@ -113,12 +113,16 @@ def test_upper_bound_covers_whatever_the_positive_correlation() -> None:
     [
         (result(), scale(1.0, 1.0), "only in B"),
         (scale(1.0, 1.0), result(), "only in A"),
-        (scale(0.1, 0.1), scale([0.1, 0.2, 0.3], [0.1] * 3), "other parametrisation: 1 in A, 3"),
-        (scale(1.0, 0.0), scale(1.0, 1.0), "held fixed in A"),
-        (scale(1.0, 0.0), scale(1.0, 0.0), "held fixed in A and B"),
+        (
+            scale(0.1, 0.1),
+            scale([0.1, 0.2, 0.3], [0.1] * 3),
+            "different parametrisation: 1 in A, 3",
+        ),
+        (scale(1.0, 0.0), scale(1.0, 1.0), "fixed in A"),
+        (scale(1.0, 0.0), scale(1.0, 0.0), "fixed in A and B"),
         (scale(np.nan, 1.0), scale(1.0, 1.0), "no value in A"),
-        (scale(1.0, np.nan), scale(1.0, np.nan), "no σ in either: in units only"),
-        (scale(9.0, 1.0), scale(1.0, np.nan), "beyond 3σ of A alone, but B has no σ"),
+        (scale(1.0, np.nan), scale(1.0, np.nan), "neither states a σ"),
+        (scale(9.0, 1.0), scale(1.0, np.nan), "beyond 3σ of A alone, but B states no σ"),
         (
             result(estimate("scale_error", 1.0, 1.0, False)),
             scale(1.0, 1.0),
@@ -127,7 +131,7 @@ def test_upper_bound_covers_whatever_the_positive_correlation() -> None:
         (
             result(estimate("lever_arm_m", [1.0, 2.0, 3.0], [1.0] * 3)),
             result(estimate("lever_arm_m", [1.0, 2.0, 3.0], [1.0] * 3), body_axes="FRD"),
-            "other body axes",
+            "different body axes",
         ),
     ],
 )
@@ -272,21 +276,26 @@ def test_explanations_come_from_the_results() -> None:
 
     off = estimate("scale_error", 9.0, 0.05)
     assert told(result(estimate("scale_error", 1.0, 0.1))) == ""
-    assert "hold nothing that explains it" in told(result(off, lever_arm([1.0, 0.0, 0.0])))
+    assert "Nothing in the two results explains" in told(result(off, lever_arm([1.0, 0.0, 0.0])))
     assert "B did not converge" in told(result(off, converged=False))
     white = told(result(off, solver="kalman-point-set"))
-    assert "B (kalman-point-set) takes the error of its inertial velocity for white" in white
-    assert "0.5 times the σ" in white
+    assert "B (kalman-point-set) models the error of its inertial velocity as white" in white
+    assert "its σ are 0.5 times those of the other" in white
     neglected = told(result(off, solver="kalman-wahba"))
-    assert "B (kalman-wahba) does not estimate the lever arm, and is 1 m off" in neglected
+    assert (
+        "B (kalman-wahba) does not estimate the lever arm; the one it uses differs by 1 m"
+        in neglected
+    )
     assert "B does not estimate the lever arm" in told(result(off, lever_arm([0, 0, 0], 0.0)))
     sure = estimate("scale_error", 1.0, 0.05)
-    assert "B claims smaller σ than A" in "".join(crosscheck(a, result(sure), efficient="A").notes)
-    assert "B itself warns: residuals too large." in told(
+    assert "B states a smaller σ than A" in "".join(
+        crosscheck(a, result(sure), efficient="A").notes
+    )
+    assert "B has the warning: residuals too large." in told(
         result(off, warnings=("residuals too large",))
     )
     bias = estimate("dvl_bias_m_s", [0.1, 0.0, 0.0], [0.01] * 3)
-    assert "A does not estimate dvl_bias_m_s, which the other finds" in told(result(off, bias))
+    assert "A does not estimate dvl_bias_m_s, which the other estimates" in told(result(off, bias))
 
 
 def test_a_neglected_lever_arm_is_given_as_a_velocity() -> None:
@@ -299,14 +308,14 @@ def test_a_neglected_lever_arm_is_given_as_a_velocity() -> None:
     b = result(estimate("scale_error", 9.0, 0.1), trajectory=turning)
     (text,) = crosscheck(a, b).explanation
     # 0.2 rad/s about the vertical, 5 m from it.
-    assert "a velocity of 1 m/s RMS, 25 % of the vehicle's" in text
+    assert "a velocity error of 1 m/s RMS, 25 % of the speed" in text
 
 
 def test_other_trials_are_not_the_same_data() -> None:
     check = crosscheck(scale(1.0, 1.0), scale(1.0, 2.0, trial="another"), efficient="A")
     assert check.efficient is None
     assert one(check).kind == "upper bound"
-    assert "A is of trial by hand, B of another" in check.notes[0]
+    assert "A is from trial by hand, B from another" in check.notes[0]
 
 
 def test_nothing_in_common_is_an_error() -> None:
@@ -512,7 +521,7 @@ def test_command(tmp_path: Path, run: Run, folders: tuple[Path, Path]) -> None:
     assert names == files | {"parameters.png", "differences.png", "errors.png"}
     for shown in ("upper bound", "Hausman 1978", "2 agree, 1 differ"):
         assert shown in text
-    assert "takes the error of its inertial velocity for white noise" in text
+    assert "models the error of its inertial velocity as white noise" in text
     found = json.loads((out / "crosscheck.json").read_text(), parse_constant=reject)
     assert found["b"] == {
         "file": str(folders[1]),

@@ -296,7 +296,7 @@ def test_command_takes_the_attitude_of_a_solution_or_the_reference(run, folder, 
         )  # fmt: skip
         assert result.code == 0, result.err
         found[source] = json.loads((out / "deadreckon.json").read_text())["end_point_error_m"]
-        assert ("is that of trial" in result.err) == (source != "reference")
+        assert ("is from trial" in result.err) == (source != "reference")
     assert np.ptp(list(found.values())) < 1e-6
 
 
