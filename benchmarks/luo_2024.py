@@ -92,8 +92,8 @@ def convergence(phase: int) -> tuple[History, History, np.ndarray, np.ndarray, n
     seven = calibrate(trial, "point-set")[1]
     assert trial.dvl is not None
     # The nine-state model has no lever arm: without that of the truth it is lost in sway.
-    told = msgspec.structs.replace(trial.dvl.settings, lever_arm_m=tuple(TRUTH[4:]))
-    nine = calibrate(replace(trial, dvl=replace(trial.dvl, settings=told)), "nine-state")[1]
+    known = msgspec.structs.replace(trial.dvl.settings, lever_arm_m=tuple(TRUTH[4:]))
+    nine = calibrate(replace(trial, dvl=replace(trial.dvl, settings=known)), "nine-state")[1]
     assert seven is not None
     assert nine is not None
     solved = [values_and_std(solve(common.until(trial, t))) for t in GRAPH_TIMES]

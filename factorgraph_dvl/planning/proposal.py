@@ -34,7 +34,7 @@ Progress = Callable[[str, int, float | None], None]
 _MAX_TRIED = 300
 # Chosen: fewer, because each is predicted with the whole plan from its start.
 _MAX_PREDICTED = 60
-# Chosen: nobody adds more than an hour, s, to a plan.
+# Chosen: additions longer than an hour, s, are impractical.
 _LONGEST_S = 3600.0
 # Chosen: all sequences of up to this many entries are few enough to try first.
 _SHORT = 2
@@ -93,7 +93,7 @@ class _Tried:
     excess: Array
 
     @property
-    def badness(self) -> float:
+    def shortfall(self) -> float:
         """Sum of the logarithms of missed σ over required ones; 0 if all are met."""
         return float(np.sum(np.log(np.maximum(self.excess, 1.0))))
 
@@ -104,7 +104,7 @@ class _Search:
 
     prediction: Prediction
     required: Sequence[Requirement]
-    shelf: Library
+    library: Library
     progress: Progress | None
     tried: dict[tuple[int, ...], _Tried | None] = field(default_factory=dict)
 
@@ -120,14 +120,14 @@ class _Search:
 
     def chosen(self, items: tuple[int, ...]) -> list[Item]:
         """Return the entries of a sequence, with the one to get under way."""
-        first = [] if self.shelf.under_way is None else [self.shelf.under_way]
-        return [*first, *(self.shelf.items[i] for i in items)]
+        first = [] if self.library.under_way is None else [self.library.under_way]
+        return [*first, *(self.library.items[i] for i in items)]
 
     def duration(self, items: tuple[int, ...]) -> float:
         """Return the duration of a sequence, s."""
         return sum(item.duration for item in self.chosen(items))
 
-    def sail(self, items: tuple[int, ...]) -> _Tried | None:
+    def attempt(self, items: tuple[int, ...]) -> _Tried | None:
         """Try a sequence whose beginning was tried; None if it cannot be carried out."""
         if items not in self.tried:
             try:
@@ -145,7 +145,7 @@ class _Search:
         if before is None or before.ending is None:
             ending, new = self.prediction.ending, self.chosen(items)
         else:
-            ending, new = before.ending, [self.shelf.items[items[-1]]]
+            ending, new = before.ending, [self.library.items[items[-1]]]
         manoeuvres = [m for item in new for m in item.manoeuvres]
         history, after = extend(self.prediction.scenario, manoeuvres, ending)
         std = dict(zip(history.names, history.std[-1].tolist(), strict=True))
@@ -208,20 +208,20 @@ def propose(
     """
     if all(r.met for r in required):
         return None
-    shelf = library(prediction.scenario, prediction.ending.start.speed_m_s)
-    search = _Search(prediction, required, shelf, progress)
+    entries = library(prediction.scenario, prediction.ending.start.speed_m_s)
+    search = _Search(prediction, required, entries, progress)
     found = _one_by_one(search)
     few, _ = _shorter(search, found, _SHORT)
     found = few or found
     shortest, limit = _shorter(search, found, None)
     found = shortest or found
     if found is None:
-        sailed = [t for t in search.tried.values() if t is not None]
-        if not sailed:
+        feasible = [t for t in search.tried.values() if t is not None]
+        if not feasible:
             return None
         best = min(
-            sailed,
-            key=lambda t: (round(t.badness / np.log(_SAME)), search.duration(t.items)),
+            feasible,
+            key=lambda t: (round(t.shortfall / np.log(_SAME)), search.duration(t.items)),
         )
         found = search.proposal(best.items)
     return replace(found, tried=len(search.tried), limit=limit)
@@ -230,25 +230,27 @@ def propose(
 def _one_by_one(search: _Search) -> Proposal | None:
     """Add the entry with the largest gain per second until all are met; None if this fails."""
     items: tuple[int, ...] = ()
-    badness = float(np.sum(np.log([max(r.predicted / r.required, 1.0) for r in search.required])))
-    while search.left >= len(search.shelf.items):
-        further = [search.sail((*items, i)) for i in range(len(search.shelf.items))]
-        sailed = [t for t in further if t is not None]
-        if not sailed:
+    shortfall = float(
+        np.sum(np.log([max(r.predicted / r.required, 1.0) for r in search.required]))
+    )
+    while search.left >= len(search.library.items):
+        further = [search.attempt((*items, i)) for i in range(len(search.library.items))]
+        feasible = [t for t in further if t is not None]
+        if not feasible:
             return None
 
-        def gain(t: _Tried, before: float = badness) -> float:
-            return (before - t.badness) / search.shelf.items[t.items[-1]].duration
+        def gain(t: _Tried, before: float = shortfall) -> float:
+            return (before - t.shortfall) / search.library.items[t.items[-1]].duration
 
-        best = max(sailed, key=gain)
+        best = max(feasible, key=gain)
         if gain(best) <= 0.0 or search.duration(best.items) > _LONGEST_S:
             return None
-        items, badness = best.items, best.badness
-        if badness == 0.0:
+        items, shortfall = best.items, best.shortfall
+        if shortfall == 0.0:
             found = search.proposal(items)
             if found.met:
                 return found
-            badness = search.known(items).badness
+            shortfall = search.known(items).shortfall
     return None
 
 
@@ -275,7 +277,7 @@ def _shorter(
     """
     end = _LONGEST_S if found is None else found.added - 1e-6
     queue: list[tuple[float, tuple[int, ...]]] = [
-        (search.duration((i,)), (i,)) for i in range(len(search.shelf.items))
+        (search.duration((i,)), (i,)) for i in range(len(search.library.items))
     ]
     heapq.heapify(queue)
     limit = 0.0
@@ -283,16 +285,16 @@ def _shorter(
         duration, items = heapq.heappop(queue)
         if search.left <= 0 and items not in search.tried:
             return None, limit
-        tried = search.sail(items)
+        tried = search.attempt(items)
         limit = duration
         if tried is None:
             continue
-        if tried.badness == 0.0:
+        if tried.shortfall == 0.0:
             proposal = search.proposal(items)
             if proposal.met:
                 return proposal, limit
         if deepest is None or len(items) < deepest:
-            for i in range(len(search.shelf.items)):
+            for i in range(len(search.library.items)):
                 heapq.heappush(queue, (search.duration((*items, i)), (*items, i)))
     return None, end if found is None else found.added
 

@@ -1,4 +1,4 @@
-"""The posterior of a trial that is not sailed yet: linearised at its true motion."""
+"""The posterior of a planned trial: linearised at its true motion."""
 
 from __future__ import annotations
 

@@ -134,7 +134,7 @@ def test_requirements():
     assert [r.component for r in found if r.met] == ["lever_arm_z_m"]
     with pytest.raises(ConfigError, match=r"required\.lever_arm: .* is not estimated"):
         required_of(prediction, lever_arm=0.1)
-    with pytest.raises(ConfigError, match="there are 2 numbers; expected 1, or 3"):
+    with pytest.raises(ConfigError, match="2 numbers are given; expected 1, or 3"):
         required_of(prediction, lever_arm_m=(0.1, 0.1))
 
 
@@ -185,14 +185,14 @@ def test_no_sequence_of_up_to_three_entries_is_shorter(monkeypatch):
         Item("stop", ({"stop_s": 5, "acceleration_m_s2": 0.8},), 15.0),
     )
     monkeypatch.setattr(proposing, "library", lambda *_: Library(items, None))
-    # Sailed once for all searches.
-    sailed, planned = {}, {}
+    # Computed once for all searches.
+    tried, planned = {}, {}
 
     def remembered(scene, manoeuvres, ending):
         key = (json.dumps(manoeuvres), id(ending))
-        if key not in sailed:
-            sailed[key] = extend(scene, manoeuvres, ending)
-        return sailed[key]
+        if key not in tried:
+            tried[key] = extend(scene, manoeuvres, ending)
+        return tried[key]
 
     def predicted(scene):
         key = json.dumps(scene.manoeuvres)
@@ -299,16 +299,16 @@ def test_what_no_manoeuvre_shows_is_said_to_be_missed(monkeypatch):
     assert missed.predicted > 9.9
 
 
-def test_every_entry_of_the_library_can_be_sailed_from_its_end():
+def test_every_entry_of_the_library_is_feasible_from_its_end():
     for start in (0.0, 3.0):
         scene = scenario(start={"speed_m_s": start}, manoeuvres=[{"straight_s": 10}], **CALM)
-        shelf = library(scene, start)
-        assert (shelf.under_way is None) == (start > 0.0)
-        before = [] if shelf.under_way is None else list(shelf.under_way.manoeuvres)
-        for item in shelf.items:
+        found = library(scene, start)
+        assert (found.under_way is None) == (start > 0.0)
+        before = [] if found.under_way is None else list(found.under_way.manoeuvres)
+        for item in found.items:
             twice = [*scene.manoeuvres, *before, *item.manoeuvres, *item.manoeuvres]
             motion = plan_motion(msgspec.structs.replace(scene, manoeuvres=twice))
-            extra = 0.0 if shelf.under_way is None else shelf.under_way.duration
+            extra = 0.0 if found.under_way is None else found.under_way.duration
             assert motion.duration == pytest.approx(10.0 + extra + 2.0 * item.duration)
 
 
