@@ -15,6 +15,7 @@ import common
 import numpy as np
 
 from factorgraph_dvl.baselines.single_beacon import run_filter
+from factorgraph_dvl.geometry.vectors import interpolate
 from factorgraph_dvl.ranging.hypotheses import follow
 from factorgraph_dvl.ranging.planar_solution import solve_planar
 from factorgraph_dvl.ranging.problem import planar_setup
@@ -104,8 +105,7 @@ def scenario(
 def truth(trial: PlanarTrial, time: np.ndarray) -> np.ndarray:
     """Return the true positions in the trial's frame, (M, 2), m."""
     r = trial.reference
-    geodetic = [np.interp(time, r.time, r.geodetic[:, i]) for i in range(3)]
-    return trial.frame().position(*geodetic)[:, :2]
+    return trial.frame().position(*interpolate(time, r.time, r.geodetic).T)[:, :2]
 
 
 def settled(error: np.ndarray, threshold: float = THRESHOLD) -> float:

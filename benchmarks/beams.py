@@ -30,6 +30,7 @@ from factorgraph_dvl.geometry.earth import RATE, radii
 from factorgraph_dvl.geometry.rotations import exp_so3, rotation_from_rph
 from factorgraph_dvl.geometry.unit_vectors import turns_to
 from factorgraph_dvl.geometry.units import DEG, DEG_PER_HOUR
+from factorgraph_dvl.geometry.vectors import interpolate
 from factorgraph_dvl.sensors.beam_geometry import as_dvl
 from factorgraph_dvl.sensors.dvl import Dvl
 from factorgraph_dvl.simulation import parse_scenario, simulate
@@ -213,17 +214,13 @@ def reckon(trial: Trial, velocity_b: Array, lever_arm: Array) -> tuple[float, fl
     at = np.searchsorted(truth.time, beams.time - 1e-6)
     nRb = rotation_from_rph(truth.rph[at], trial.body_axes)
     lat, height = truth.geodetic[at, 0], truth.geodetic[at, 2]
-    gyro = np.stack(
-        [np.interp(beams.time, trial.imu.time - 0.005, x) for x in trial.imu.gyro.T], axis=1
-    )
+    gyro = interpolate(beams.time, trial.imu.time - 0.005, trial.imu.gyro)
     earth = RATE * np.stack([0.0 * lat, np.cos(lat), np.sin(lat)], axis=1)
     bias = trial.calibration_truth["gyro_bias_deg_h"] * DEG_PER_HOUR
     omega = gyro - bias - np.einsum("mji,mj->mi", nRb, earth)
     known = ~np.isnan(velocity_b[:, 0])
     velocity_n = np.einsum("mij,mj->mi", nRb, velocity_b - np.cross(omega, lever_arm))
-    velocity_n = np.stack(
-        [np.interp(beams.time, beams.time[known], v) for v in velocity_n[known].T], axis=1
-    )
+    velocity_n = interpolate(beams.time, beams.time[known], velocity_n[known])
     meridian, east = radii(lat)
     wanted = truth.geodetic[at]
     apart = np.stack(

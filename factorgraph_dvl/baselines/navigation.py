@@ -32,7 +32,7 @@ from factorgraph_dvl.geometry.rotations import (
     wrapped,
 )
 from factorgraph_dvl.geometry.units import DEG, DEG_PER_HOUR, MICRO_G
-from factorgraph_dvl.geometry.vectors import Array, rotate, skew
+from factorgraph_dvl.geometry.vectors import Array, interpolate, rotate, skew
 from factorgraph_dvl.imu.increments import increments
 from factorgraph_dvl.sensors.gnss import Gnss
 from factorgraph_dvl.trial import Trial
@@ -332,8 +332,7 @@ def _fixes_at(gnss: Gnss, samples: StrapdownSamples, time: Array) -> Fixes:
 def _filled(geodetic: Array, time: Array) -> Array:
     known = ~np.isnan(geodetic[:, 0])
     lat, lon, height = geodetic[known].T
-    columns = (lat, np.unwrap(lon), height)
-    return np.stack([np.interp(time, time[known], x) for x in columns], axis=1)
+    return interpolate(time, time[known], np.stack([lat, np.unwrap(lon), height], axis=1))
 
 
 def _velocities(fixes: Fixes, time: Array) -> tuple[Array, Array]:

@@ -11,7 +11,7 @@ import numpy as np
 from factorgraph_dvl.errors import ConfigError
 from factorgraph_dvl.geometry.rotations import best_rotation
 from factorgraph_dvl.geometry.units import DEG
-from factorgraph_dvl.geometry.vectors import Array, rotate
+from factorgraph_dvl.geometry.vectors import Array, interpolate, rotate
 
 ARCSEC = DEG / 3600.0
 _DAY = 86400.0
@@ -50,10 +50,8 @@ def earth_from_inertial(epoch: str, time: Array, ut1_utc: float = 0.0) -> Array:
         tt = erfa.taitt(*erfa.utctai(day, fraction))
     steps = np.unique(np.floor(time / _POLE_STEP))
     grid = _POLE_STEP * np.union1d(steps, steps + 1.0)
-    x, y, s = (
-        np.interp(time, grid, value)
-        for value in erfa.xys06a(tt[0], np.asarray(tt[1]) + grid / _DAY)
-    )
+    pole = np.stack(erfa.xys06a(tt[0], np.asarray(tt[1]) + grid / _DAY), axis=1)
+    x, y, s = interpolate(time, grid, pole).T
     angle = erfa.era00(day, fraction + (time + ut1_utc) / _DAY)
     return np.asarray(erfa.c2tcio(erfa.c2ixys(x, y, s), angle, np.eye(3)))
 
@@ -130,6 +128,6 @@ def off_vertical(time: Array, nRb: Array, force_time: Array, force: Array) -> fl
     force : ndarray, shape (N, 3), m/s²
         Specific force in body.
     """
-    at = np.stack([np.interp(time, force_time, force[:, i]) for i in range(3)], axis=1)
+    at = interpolate(time, force_time, force)
     mean = rotate(nRb, at).mean(axis=0)
     return float(np.arctan2(np.hypot(mean[0], mean[1]), mean[2]))

@@ -1,4 +1,4 @@
-"""Vectors in arrays: products of many at once."""
+"""Vectors in arrays: products of many at once, linear interpolation."""
 
 from __future__ import annotations
 
@@ -31,6 +31,13 @@ def cross(a: Array, b: Array) -> Array:
     out[..., 1] = az * bx - ax * bz
     out[..., 2] = ax * by - ay * bx
     return out
+
+
+def interpolate(time: Array, knots: Array, values: Array) -> Array:
+    """Return values (K, ...) at times (M,), linear between knots (K,), constant beyond them."""
+    columns = values.reshape(knots.size, -1).T
+    at = np.stack([np.interp(time, knots, column) for column in columns], axis=1)
+    return at.reshape(time.size, *values.shape[1:])
 
 
 def rotate(matrices: Array, vectors: Array) -> Array:

@@ -16,6 +16,7 @@ import itertools
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.integrate import cumulative_trapezoid
 
 from factorgraph_dvl.errors import DataError
 from factorgraph_dvl.geometry.earth import LocalFrame
@@ -26,7 +27,7 @@ from factorgraph_dvl.geometry.rotations import (
     rotation_from_rph,
 )
 from factorgraph_dvl.geometry.units import DEG
-from factorgraph_dvl.geometry.vectors import Array, rotate
+from factorgraph_dvl.geometry.vectors import Array, interpolate, rotate
 from factorgraph_dvl.imu.preintegration import Segments
 from factorgraph_dvl.imu.propagation import States
 from factorgraph_dvl.initialization.attitude_sensors import attitude_at_start, known_mountings
@@ -344,8 +345,7 @@ def _kinematics(trial: Trial, frame: LocalFrame, seg: Segments, nRb: Array) -> t
         omega = seg.increments.partial(index, since).omega
         v_b = _interpolate(time, ping_time, _nominal_velocity(dvl, dvl.locked, omega))
         v_n = np.where(far[:, None], rotate(nRb, v_b), v_n)
-    step = np.diff(time)[:, None]
-    p_n = np.concatenate([np.zeros((1, 3)), np.cumsum(0.5 * (v_n[1:] + v_n[:-1]) * step, axis=0)])
+    p_n = cumulative_trapezoid(v_n, time, axis=0, initial=0)
     if gnss is not None and fix_time.size:
         arm_n = rotate(nRb, gnss.lever_arm(time)[0])
         miss = fix - _interpolate(fix_time, time, p_n + arm_n)
@@ -363,7 +363,7 @@ def _interpolate(time: Array, at: Array, values: Array) -> Array:
     """Return values (M, 3) at times by linear interpolation; the origin if there are none."""
     if at.size == 0:
         return np.zeros((time.size, 3))
-    return np.stack([np.interp(time, at, values[:, i]) for i in range(3)], axis=1)
+    return interpolate(time, at, values)
 
 
 def _distance(time: Array, grid: Array) -> Array:

@@ -9,10 +9,11 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
+from scipy.integrate import cumulative_trapezoid
 
 from factorgraph_dvl.geometry.rotations import BodyAxes, exp_so3, frd_from_body
 from factorgraph_dvl.geometry.units import DEG, STANDARD_GRAVITY
-from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.geometry.vectors import Array, interpolate
 from factorgraph_dvl.quality.finding import Finding
 from factorgraph_dvl.quality.plausibility_beams import beam_findings
 from factorgraph_dvl.quality.plausibility_star import star_findings
@@ -250,15 +251,9 @@ def _gnss_findings(gnss: Gnss) -> Iterator[Finding]:
 
 def _interval_means(time: Array, values: Array, begin: Array, end: Array) -> Array:
     """Return the means of values (N, 3) over intervals, (M, 3), by trapezoids."""
-    steps = 0.5 * (values[1:] + values[:-1]) * np.diff(time)[:, None]
-    integral = np.vstack([np.zeros(values.shape[1]), np.cumsum(steps, axis=0)])
-    duration = np.maximum(end - begin, 1e-9)
-    return np.column_stack(
-        [
-            (np.interp(end, time, column) - np.interp(begin, time, column)) / duration
-            for column in integral.T
-        ]
-    )
+    integral = cumulative_trapezoid(values, time, axis=0, initial=0)
+    duration = np.maximum(end - begin, 1e-9)[:, None]
+    return (interpolate(end, time, integral) - interpolate(begin, time, integral)) / duration
 
 
 def _compare_velocities(
@@ -347,7 +342,7 @@ def _speed_findings(dvl: Dvl, gnss: Gnss) -> Iterator[Finding]:
         return
     pings = dvl.time[dvl.locked]
     inside = (pings >= time[0]) & (pings <= time[-1])
-    at_ping = np.column_stack([np.interp(pings[inside], time, column) for column in velocity.T])
+    at_ping = interpolate(pings[inside], time, velocity)
     gnss_speed = np.linalg.norm(at_ping, axis=1)
     dvl_speed = np.linalg.norm(dvl.velocity[dvl.locked][inside], axis=1)
     if _in_radians(gnss, np.linalg.norm(at_ping[:, :2], axis=1), dvl_speed):
@@ -384,7 +379,7 @@ def _in_radians(gnss: Gnss, gnss_speed: Array, dvl_speed: Array) -> bool:
     """Whether fixes without velocities move as slowly as radians in columns of degrees do."""
     if not np.isnan(gnss.velocity).all():
         return False
-    small = np.nanmax(np.abs(gnss.geodetic[:, 0]), initial=0.0) < 90.0 * DEG**2
+    small = np.nanmax(np.abs(gnss.geodetic[:, 0]), initial=0) < 90.0 * DEG**2
     moving = (dvl_speed > _MOVING_M_S) & (gnss_speed > 0.0)
     ratio = dvl_speed[moving] / gnss_speed[moving] * DEG
     return bool(small and moving.sum() > 3 and abs(np.median(ratio) - 1.0) < 0.2)

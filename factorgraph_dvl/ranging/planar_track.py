@@ -5,8 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.integrate import cumulative_trapezoid
 
-from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.geometry.vectors import Array, interpolate
 
 # Chosen: least power spectral density of displacement, m²/s, 3 mm in 1 s; the normal equations
 # lose their digits below it.
@@ -66,9 +67,7 @@ class PlanarTrack:
         """Return the track at times (M,) within it."""
 
         def pick(values: Array) -> Array:
-            flat = values.reshape(self.time.size, -1)
-            out = np.stack([np.interp(time, self.time, column) for column in flat.T], axis=1)
-            return out.reshape(time.size, *values.shape[1:])
+            return interpolate(time, self.time, values)
 
         return PlanarTrack(
             time,
@@ -129,11 +128,11 @@ def track_from_records(
     psd = _interval(speed_time) * by_speed + _interval(heading_time) * by_heading
     return PlanarTrack(
         time=grid,
-        displacement=_integral(velocity, grid),
+        displacement=cumulative_trapezoid(velocity, grid, axis=0, initial=0),
         velocity=velocity,
         height=np.interp(grid, height_time, h),
         climb=np.interp(grid, height_time, _slope(height_time, h)),
-        noise=_integral(psd + LEAST_PSD * np.eye(2), grid),
+        noise=cumulative_trapezoid(psd + LEAST_PSD * np.eye(2), grid, axis=0, initial=0),
         velocity_cov=by_speed + by_heading + _LEAST_VELOCITY_VARIANCE * np.eye(2),
         heading=psi_at,
         heading_std=heading_std,
@@ -167,23 +166,15 @@ def _slopes(track: PlanarTrack, over: float) -> tuple[Array, Array, Array]:
     width = np.maximum(high - low, 2.0 * track.interval)
     middle = 0.5 * (low + high)
     # A line through a piecewise linear function: slope = 12 / W³ ∫ (t - m) v dt.
-    zeroth = _integral(v, time)
-    first = _integral((time - time[0])[:, None] * v, time)
+    zeroth = cumulative_trapezoid(v, time, axis=0, initial=0)
+    first = cumulative_trapezoid((time - time[0])[:, None] * v, time, axis=0, initial=0)
 
     def between(integral: Array) -> Array:
-        ends = [np.stack([np.interp(t, time, c) for c in integral.T], axis=1) for t in (low, high)]
-        return ends[1] - ends[0]
+        return interpolate(high, time, integral) - interpolate(low, time, integral)
 
     moment = between(first) - (middle - time[0])[:, None] * between(zeroth)
     slope = 12.0 * moment / width[:, None] ** 3
     return slope, width, (12.0 * track.interval / width**3)[:, None, None] * track.velocity_cov
-
-
-def _integral(values: Array, time: Array) -> Array:
-    flat = values.reshape(time.size, -1)
-    steps = 0.5 * (flat[1:] + flat[:-1]) * np.diff(time)[:, None]
-    total = np.concatenate([np.zeros((1, flat.shape[1])), np.cumsum(steps, axis=0)])
-    return total.reshape(values.shape)
 
 
 def _interval(time: Array) -> float:

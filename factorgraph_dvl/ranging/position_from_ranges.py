@@ -15,7 +15,7 @@ import numpy as np
 from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.rotations import exp_so3
 from factorgraph_dvl.geometry.units import DEG
-from factorgraph_dvl.geometry.vectors import Array, rotate
+from factorgraph_dvl.geometry.vectors import Array, interpolate, rotate
 from factorgraph_dvl.imu.preintegration import Segments
 from factorgraph_dvl.imu.propagation import States
 from factorgraph_dvl.ranging.hypotheses import TrackedHypothesis, follow
@@ -173,9 +173,7 @@ def _moved(
     """Return states on the track of a hypothesis, turned by its error of the heading."""
     problem, fit = setup.problem, hypothesis.fit
     dead_reckoned = setup.track.at(problem.time).displacement
-    correction = np.column_stack(
-        [np.interp(time, problem.time, (fit.p - dead_reckoned)[:, i]) for i in range(2)]
-    )
+    correction = interpolate(time, problem.time, fit.p - dead_reckoned)
     p_n = states.p_n.copy()
     p_n[:, :2] = setup.track.displacement + correction
     down = np.sum(p_n[:, :2] ** 2, axis=1) / (2.0 * EARTH_RADIUS)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from factorgraph_dvl.errors import DataError
 from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.rotations import rotation_from_rph
-from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.geometry.vectors import Array, interpolate
 from factorgraph_dvl.ranging.model import PlanarProblem, Ranging
 from factorgraph_dvl.ranging.planar_track import (
     LEAST_PSD,
@@ -185,9 +185,6 @@ def ranging_setup(
     at = track.at(time)
     rate = np.gradient(arm_n, grid, axis=0)
 
-    def on_nodes(values: Array) -> Array:
-        return np.stack([np.interp(time, grid, values[:, i]) for i in range(3)], axis=1)
-
     s = beacons.settings
     places = np.array([place.geodetic for place in s.positions.values()])
     # A bound only: the vehicle is within hearing of the beacons.
@@ -199,9 +196,7 @@ def ranging_setup(
     names = list(s.positions)
     dt = np.maximum(np.diff(time), _LEAST_INTERVAL)
     share = np.minimum(dt, track.interval)
-    psd = velocity_change_psd(track).reshape(grid.size, 4)
-    middle = 0.5 * (time[1:] + time[:-1])
-    changing = np.stack([np.interp(middle, grid, column) for column in psd.T], axis=1)
+    changing = interpolate(0.5 * (time[1:] + time[:-1]), grid, velocity_change_psd(track))
     # What the noise at the ends of a step already accounts for.
     counted = share[:, None, None] ** 2 * at.velocity_cov[:-1]
     node = np.searchsorted(time, beacons.time[rows])
@@ -217,11 +212,11 @@ def ranging_setup(
         share=share,
         velocity=at.velocity,
         velocity_cov=at.velocity_cov,
-        change_cov=changing.reshape(-1, 2, 2) * dt[:, None, None],
+        change_cov=changing * dt[:, None, None],
         height=at.height - frame.height,
         climb=at.climb,
-        arm=on_nodes(arm_n),
-        arm_velocity=on_nodes(rate),
+        arm=interpolate(time, grid, arm_n),
+        arm_velocity=interpolate(time, grid, rate),
         place=place,
         ranging=Ranging(
             node=node,

@@ -15,6 +15,7 @@ from truth import CONFIGS, merged
 from factorgraph_dvl.baselines.single_beacon import filter_planar
 from factorgraph_dvl.cli import main
 from factorgraph_dvl.errors import ConfigError, DataError, FactorgraphDvlError, SolveError
+from factorgraph_dvl.geometry.vectors import interpolate
 from factorgraph_dvl.io.planar_folder import is_planar, load_planar_trial, save_planar_trial
 from factorgraph_dvl.io.solution_folder import load_solution
 from factorgraph_dvl.io.trial_folder import load_trial
@@ -51,8 +52,7 @@ STRAIGHT = {"manoeuvres": [{"straight_s": 300}]}
 
 def truth(t, time):
     r = t.reference
-    geodetic = [np.interp(time, r.time, r.geodetic[:, i]) for i in range(3)]
-    return t.frame().position(*geodetic)[:, :2]
+    return t.frame().position(*interpolate(time, r.time, r.geodetic).T)[:, :2]
 
 
 def true_state(t, problem):

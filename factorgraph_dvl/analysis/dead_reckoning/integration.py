@@ -11,7 +11,7 @@ from scipy.integrate import cumulative_trapezoid
 from factorgraph_dvl.errors import DataError
 from factorgraph_dvl.geometry.earth import radii
 from factorgraph_dvl.geometry.rotations import exp_so3, rph_from_rotation
-from factorgraph_dvl.geometry.vectors import Array, rotate
+from factorgraph_dvl.geometry.vectors import Array, interpolate, rotate
 from factorgraph_dvl.imu.attitude_history import Orientation
 from factorgraph_dvl.imu.timestamps import JUMP
 from factorgraph_dvl.sensors import dvl as dvl_names
@@ -162,7 +162,7 @@ def dead_reckon(
     there = orientation_at(time)
     time, nRb = time[there.covered], there.nRb[there.covered]
     knots, velocity, gaps = _with_gaps(pings, v_b)
-    v_n = rotate(nRb, np.stack([np.interp(time, knots, v) for v in velocity.T], axis=1))
+    v_n = rotate(nRb, interpolate(time, knots, velocity))
     return DeadReckonedTrack(
         time=time,
         geodetic=integrated(time, v_n, position),

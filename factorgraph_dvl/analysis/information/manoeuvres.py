@@ -15,7 +15,7 @@ import numpy as np
 
 from factorgraph_dvl.errors import ConfigError
 from factorgraph_dvl.geometry.units import DEG
-from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.geometry.vectors import Array, interpolate
 from factorgraph_dvl.imu.timestamps import JUMP
 from factorgraph_dvl.sensors.records import rows_of
 from factorgraph_dvl.solution import Trajectory
@@ -93,7 +93,7 @@ def _segments(motion: Trajectory | Reference) -> list[Segment]:
     count = max(round((last - first) / _STEP_S), 1) + 1
     time = np.linspace(first, last, count)
     heading = np.interp(time, motion.time, np.unwrap(motion.rph[:, 2]))
-    level = np.stack([np.interp(time, motion.time, motion.velocity[:, i]) for i in (0, 1)], 1)
+    level = interpolate(time, motion.time, motion.velocity[:, :2])
     turns = _changes(time, heading, _TURN_RATE, _LEAST_TURN)
     speed = np.linalg.norm(level - _current(time, heading, level, turns), axis=1)
     accelerations = _changes(time, speed, _ACCELERATION, _LEAST_CHANGE)
