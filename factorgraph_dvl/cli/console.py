@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import sys
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from time import perf_counter, time
 from typing import TYPE_CHECKING, Any
@@ -99,6 +100,15 @@ def print_table(table: Table) -> None:
 def warn(message: str) -> None:
     """Print a warning."""
     stderr().print(Text(f"warning: {printable(message)}", "yellow"), soft_wrap=True)
+
+
+@contextmanager
+def drawing() -> Iterator[None]:
+    """Turn whatever fails while figures are drawn into a warning: results are worth more."""
+    try:
+        yield
+    except Exception as error:
+        warn(f"figures could not be drawn: {type(error).__name__}: {error}")
 
 
 def stdout() -> Console:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from factorgraph_dvl.cli.console import print_table, print_written, stdout, warn
+from factorgraph_dvl.cli.console import drawing, print_table, print_written, stdout, warn
 from factorgraph_dvl.cli.options import Force, NoFigures, claim_output
 
 if TYPE_CHECKING:
@@ -82,10 +82,8 @@ def crosscheck(
 def _draw_crosscheck(check: CrossCheck, folder: Path) -> None:
     from factorgraph_dvl.report.figures.crosscheck import write_crosscheck_figures
 
-    try:
+    with drawing():
         write_crosscheck_figures(check, folder)
-    except Exception as error:
-        warn(f"figures could not be drawn: {type(error).__name__}: {error}")
 
 
 def _print_crosscheck(check: CrossCheck, a: Path, b: Path) -> None:

@@ -7,7 +7,14 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from factorgraph_dvl.cli.console import ProgressLine, print_table, print_written, stdout, warn
+from factorgraph_dvl.cli.console import (
+    ProgressLine,
+    drawing,
+    print_table,
+    print_written,
+    stdout,
+    warn,
+)
 from factorgraph_dvl.cli.options import Force, NoFigures, Quiet, TrialPath, claim_output
 
 if TYPE_CHECKING:
@@ -160,7 +167,5 @@ def _attitude(
 def _draw(trial: Trial, result: BeforeAfter, folder: Path) -> None:
     from factorgraph_dvl.report.figures.dead_reckoning import write_dead_reckoning_figures
 
-    try:
+    with drawing():
         write_dead_reckoning_figures(trial, result, folder)
-    except Exception as error:
-        warn(f"figures could not be drawn: {type(error).__name__}: {error}")

@@ -10,6 +10,7 @@ from rich.text import Text
 
 from factorgraph_dvl.cli.console import (
     ProgressLine,
+    drawing,
     print_table,
     print_written,
     stderr,
@@ -95,10 +96,8 @@ def write_observability(view: Observability, folder: Path, source: str, *, figur
 def _draw(view: Observability, folder: Path) -> None:
     from factorgraph_dvl.report.figures.observability import write_observability_figures
 
-    try:
+    with drawing():
         write_observability_figures(view, folder)
-    except Exception as error:
-        warn(f"figures could not be drawn: {type(error).__name__}: {error}")
 
 
 def print_observability(view: Observability) -> None:

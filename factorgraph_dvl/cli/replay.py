@@ -12,6 +12,7 @@ from rich.text import Text
 
 from factorgraph_dvl.cli.console import (
     ProgressLine,
+    drawing,
     print_table,
     print_written,
     stderr,
@@ -255,7 +256,7 @@ def _write(
         from factorgraph_dvl.report.figures.convergence import write_convergence_figures
         from factorgraph_dvl.report.figures.solution import write_figures
 
-        try:
+        with drawing():
             write_figures(trial, solution, folder / FIGURES_FOLDER)
             write_convergence_figures(
                 record.time,
@@ -267,9 +268,6 @@ def _write(
                 found,
                 folder / FIGURES_FOLDER,
             )
-        except Exception as error:
-            # A figure is not worth the solution.
-            warn(f"figures could not be drawn: {type(error).__name__}: {error}")
 
     save_solution(solution, out, force=force, extra=add, smoothed=record.smoothed)
 

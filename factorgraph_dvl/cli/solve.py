@@ -11,6 +11,7 @@ from rich.text import Text
 
 from factorgraph_dvl.cli.console import (
     ProgressLine,
+    drawing,
     print_table,
     print_written,
     stderr,
@@ -199,11 +200,8 @@ def _solve_into(
                 return
             from factorgraph_dvl.report.figures.solution import write_figures
 
-            try:
+            with drawing():
                 write_figures(trial, solution, folder / FIGURES_FOLDER)
-            except Exception as error:
-                # The solution is complete without figures.
-                warn(f"figures could not be drawn: {type(error).__name__}: {error}")
 
         save_solution(solution, out, force=force, extra=add)
     _print_solution(trial, solution)
