@@ -16,6 +16,9 @@ from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.sensors.protocol import DO_NOT_FIT, TOO_LARGE
 
+# Called on the way to a solution: with the stage, what is counted in it, and the cost if any.
+Progress = Callable[[str, int, float | None], None]
+
 _FAR_FROM_PRIOR = 5.0
 # Evidence against a minimum with which it is not worth a word: its probability is e^-15.
 _IMPOSSIBLE = 15.0

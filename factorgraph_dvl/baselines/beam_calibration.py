@@ -14,9 +14,9 @@ from factorgraph_dvl.baselines.beam_filter import (
 )
 from factorgraph_dvl.baselines.navigation import motion_at, navigate
 from factorgraph_dvl.baselines.outcome import Outcome
-from factorgraph_dvl.baselines.summary import WHITE_NOISE, Progress, sensor_motion, summarise
+from factorgraph_dvl.baselines.summary import WHITE_NOISE, sensor_motion, summarise
 from factorgraph_dvl.errors import ConfigError, DataError
-from factorgraph_dvl.solution import Residuals, Solution
+from factorgraph_dvl.solution import Progress, Residuals, Solution
 from factorgraph_dvl.trial import Trial
 
 

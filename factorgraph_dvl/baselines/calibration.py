@@ -17,19 +17,13 @@ from factorgraph_dvl.baselines.point_set_filter import point_set
 from factorgraph_dvl.baselines.point_sets import Points
 from factorgraph_dvl.baselines.spurious_information import without_spurious_information
 from factorgraph_dvl.baselines.star_calibration import calibrate_gyros
-from factorgraph_dvl.baselines.summary import (
-    WHITE_NOISE,
-    Progress,
-    dvl_residuals,
-    sensor_motion,
-    summarise,
-)
+from factorgraph_dvl.baselines.summary import WHITE_NOISE, dvl_residuals, sensor_motion, summarise
 from factorgraph_dvl.baselines.wahba import wahba
 from factorgraph_dvl.errors import ConfigError, DataError
 from factorgraph_dvl.imu.timestamps import JUMP, without_strays
 from factorgraph_dvl.sensors.dvl import Dvl
 from factorgraph_dvl.sensors.parameters import Parameter
-from factorgraph_dvl.solution import Solution
+from factorgraph_dvl.solution import Progress, Solution
 from factorgraph_dvl.trial import Trial
 
 DvlMethod = Literal["point-set", "nine-state", "wahba", "least-squares"]

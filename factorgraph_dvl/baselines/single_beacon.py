@@ -11,7 +11,6 @@ baseline to compare with.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal, get_args
 
@@ -20,7 +19,14 @@ import numpy as np
 from factorgraph_dvl.baselines.outcome import History
 from factorgraph_dvl.errors import ConfigError, DataError
 from factorgraph_dvl.geometry.vectors import Array
-from factorgraph_dvl.solution import Estimate, Residuals, Solution, Trajectory, contradictions
+from factorgraph_dvl.solution import (
+    Estimate,
+    Progress,
+    Residuals,
+    Solution,
+    Trajectory,
+    contradictions,
+)
 from factorgraph_dvl.trial import PlanarTrial
 
 Method = Literal["4sv-2ob", "4sv-3ob"]
@@ -67,7 +73,7 @@ def filter_planar(
     trial: PlanarTrial,
     method: Method | str,
     *,
-    progress: Callable[[str, int, float | None], None] | None = None,
+    progress: Progress | None = None,
 ) -> tuple[Solution, History]:
     """Filter a planar trial by 4SV-2OB or 4SV-3OB.
 
@@ -77,7 +83,7 @@ def filter_planar(
         With `initial.position`: the filters cannot find it.
     method : Method or str
         `4sv-2ob` or `4sv-3ob`.
-    progress : callable of str, int, float or None, None, optional
+    progress : callable, optional
         Called with stage, iteration and cost.
 
     Returns

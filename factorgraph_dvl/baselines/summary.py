@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
 
 import numpy as np
@@ -27,8 +27,6 @@ from factorgraph_dvl.solution import (
     not_observable,
 )
 from factorgraph_dvl.trial import Trial
-
-Progress = Callable[[str, int, float | None], None]
 
 WHITE_NOISE = (
     "the error of the SINS/GNSS velocity is taken for white noise; it is correlated in time, so "

@@ -14,7 +14,7 @@ earlier, the result of step 1 or 2 is proposed, with the duration up to which al
 from __future__ import annotations
 
 import heapq
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -26,9 +26,9 @@ from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.planning.library import Item, Library, library
 from factorgraph_dvl.planning.prediction import Ending, Prediction, extend, predict
 from factorgraph_dvl.planning.requirements import Requirement
+from factorgraph_dvl.solution import Progress
 
 # Called with the last sequence and its number.
-Progress = Callable[[str, int, float | None], None]
 
 # Chosen: limits the search to minutes; a sequence takes about a tenth of a second.
 _MAX_TRIED = 300

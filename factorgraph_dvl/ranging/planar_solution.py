@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -18,6 +18,7 @@ from factorgraph_dvl.sensors.beacon import Beacons
 from factorgraph_dvl.solution import (
     Estimate,
     Hypothesis,
+    Progress,
     Residuals,
     Solution,
     Trajectory,
@@ -28,8 +29,6 @@ from factorgraph_dvl.solution import (
     mostly_rejected,
 )
 from factorgraph_dvl.trial import PlanarTrial
-
-Progress = Callable[[str, int, float | None], None]
 
 # Chosen: number of times at which hypotheses are fitted and weighed.
 _UPDATES = 40

@@ -16,7 +16,13 @@ from factorgraph_dvl.replay.estimate import Innovations, Update, concatenated
 from factorgraph_dvl.replay.samples import LEAST
 from factorgraph_dvl.replay.session import LAG, RATE, Kind, Replay
 from factorgraph_dvl.sensors.records import rows_of
-from factorgraph_dvl.solution import Residuals, Solution, Trajectory, consistency_warnings
+from factorgraph_dvl.solution import (
+    Progress,
+    Residuals,
+    Solution,
+    Trajectory,
+    consistency_warnings,
+)
 from factorgraph_dvl.trial import Trial
 
 Watch = Callable[[Update], None]
@@ -64,7 +70,7 @@ def replay(
     smoother: Kind = "fixed-lag",
     lag_s: float = LAG,
     rate_hz: float = RATE,
-    progress: Callable[[str, int, float | None], None] | None = None,
+    progress: Progress | None = None,
     watch: Watch | None = None,
 ) -> tuple[Solution, ReplayRecord]:
     """Feed a recorded trial in the order of time, and show what was known when.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from time import perf_counter
 from typing import Literal
@@ -26,7 +25,7 @@ from factorgraph_dvl.replay.start import ReplayStart, begin
 from factorgraph_dvl.replay.waiting import AHEAD, SAME_TIME, Waiting
 from factorgraph_dvl.sensors.protocol import Aid
 from factorgraph_dvl.sensors.records import rows_of
-from factorgraph_dvl.solution import Trajectory
+from factorgraph_dvl.solution import Progress, Trajectory
 from factorgraph_dvl.solvers.state_times import CLOSEST
 from factorgraph_dvl.trial import InitialPosition, Trial
 
@@ -74,7 +73,7 @@ class Replay:
         States older than this are no longer corrected.
     rate_hz : float, optional
         States a second.
-    progress : callable of str, int, float or None, None, optional
+    progress : callable, optional
         Called with stage, iteration and cost while a start is solved.
     """
 
@@ -85,7 +84,7 @@ class Replay:
         smoother: Kind = "fixed-lag",
         lag_s: float = LAG,
         rate_hz: float = RATE,
-        progress: Callable[[str, int, float | None], None] | None = None,
+        progress: Progress | None = None,
     ) -> None:
         if smoother not in KINDS:
             raise ConfigError(f"smoother is {smoother!r}", expected=f"one of {', '.join(KINDS)}")

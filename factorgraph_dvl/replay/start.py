@@ -17,9 +17,8 @@ from factorgraph_dvl.graph.problem import Evaluation, Problem
 from factorgraph_dvl.imu.propagation import States
 from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.sensors.protocol import AttitudeAid
-from factorgraph_dvl.solution import Trajectory
+from factorgraph_dvl.solution import Progress, Trajectory
 from factorgraph_dvl.solvers.batch import settled_minimum
-from factorgraph_dvl.solvers.levenberg_marquardt import Progress
 from factorgraph_dvl.solvers.posterior import posterior
 from factorgraph_dvl.solvers.state_times import needs_states
 from factorgraph_dvl.solvers.trajectory import EPOCH_ROUNDING, TRAJECTORY_RATE, trajectory_between

@@ -11,9 +11,9 @@ from factorgraph_dvl.errors import ConfigError
 from factorgraph_dvl.graph.priors import ConstantsPrior
 from factorgraph_dvl.ranging.hypothesis_weights import significant_costs
 from factorgraph_dvl.ranging.position_from_ranges import StartPositions
-from factorgraph_dvl.solution import Solution, ambiguity, joined, not_told_apart
+from factorgraph_dvl.solution import Progress, Solution, ambiguity, joined, not_told_apart
 from factorgraph_dvl.solvers.fixed_directions import SolvedProblem, with_covariances
-from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, Progress, minimise
+from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, minimise
 from factorgraph_dvl.solvers.minima import competing_minima, cost_terms, evidence_against
 from factorgraph_dvl.solvers.preparation import Preparation, prepare
 from factorgraph_dvl.solvers.rounds import SettledMinimum, settle

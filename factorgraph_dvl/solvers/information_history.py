@@ -23,11 +23,10 @@ from scipy.linalg.lapack import dgeqrf, dtrtri
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph import keys
 from factorgraph_dvl.graph.problem import FIXED_DIRECTION_STD, Evaluation, Problem
-from factorgraph_dvl.solution import Solution
+from factorgraph_dvl.solution import Progress, Solution
 from factorgraph_dvl.solvers.batch import solved_problem
 from factorgraph_dvl.solvers.calibration import prior_along, reported
 from factorgraph_dvl.solvers.fixed_directions import SolvedProblem
-from factorgraph_dvl.solvers.levenberg_marquardt import Progress
 from factorgraph_dvl.solvers.summary import summarise
 from factorgraph_dvl.statistics.information_history import InformationHistory
 from factorgraph_dvl.statistics.spurious_information import (

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import gtsam
@@ -10,8 +9,7 @@ import numpy as np
 
 from factorgraph_dvl.errors import SolveError
 from factorgraph_dvl.graph.problem import Evaluation, Problem
-
-Progress = Callable[[str, int, float | None], None]
+from factorgraph_dvl.solution import Progress
 
 # A step is small when all of it together is this many standard deviations, squared and
 # halved: the decrease of the cost that the linear model still promises.

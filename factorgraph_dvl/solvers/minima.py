@@ -13,8 +13,9 @@ from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph.problem import Evaluation, Problem
 from factorgraph_dvl.imu.propagation import States
 from factorgraph_dvl.sensors.parameters import Parameter
+from factorgraph_dvl.solution import Progress
 from factorgraph_dvl.solvers.fixed_directions import SolvedProblem
-from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, Progress, minimise
+from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, minimise
 from factorgraph_dvl.solvers.preparation import ROUGH_TOLERANCE, Preparation
 from factorgraph_dvl.solvers.rounds import SettledMinimum, settle
 

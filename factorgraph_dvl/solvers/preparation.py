@@ -18,7 +18,8 @@ from factorgraph_dvl.initialization.mountings import mounted_aids, mountings_fro
 from factorgraph_dvl.ranging.position_from_ranges import StartPositions, positions_from_ranges
 from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.sensors.protocol import Observation
-from factorgraph_dvl.solvers.levenberg_marquardt import Progress, minimise
+from factorgraph_dvl.solution import Progress
+from factorgraph_dvl.solvers.levenberg_marquardt import minimise
 from factorgraph_dvl.solvers.state_times import dense_epochs
 from factorgraph_dvl.trial import Trial
 

@@ -15,7 +15,8 @@ from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph.priors import ConstantsPrior
 from factorgraph_dvl.graph.problem import Evaluation, Problem
 from factorgraph_dvl.imu.propagation import States
-from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, Progress, minimise
+from factorgraph_dvl.solution import Progress
+from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, minimise
 from factorgraph_dvl.solvers.preparation import Preparation, mounted_start
 
 # Root mean square change of the positions, m, from which on gravity is taken anew. Chosen: 1 m
