@@ -1,0 +1,154 @@
+"""Where whole records lie in a stream of bytes, damaged or not, in bounded memory."""
+
+from __future__ import annotations
+
+import math
+import mmap
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from factorgraph_dvl.errors import DataError
+
+# What every reader takes: a memory map of a file, or bytes in memory.
+Source = bytes | mmap.mmap
+Bytes = NDArray[np.uint8]
+Index = NDArray[np.int64]
+# Structured arrays of named fields.
+Records = NDArray[Any]
+
+WINDOW = 1 << 21
+# Text without a line end for longer than this is no text.
+LONGEST_LINE = 1 << 16
+
+
+def map_file(path: Path) -> Source:
+    """Map a file into memory, read-only.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+
+    Returns
+    -------
+    Source
+        Its bytes; pages are read when they are used.
+
+    Raises
+    ------
+    DataError
+        If it is missing, a folder or unreadable.
+    """
+    if not path.is_file():
+        what = "is a folder" if path.is_dir() else "does not exist"
+        raise DataError(f"the file {what}", where=path.name, expected=f"a file at {path}")
+    try:
+        with path.open("rb") as file:
+            if path.stat().st_size == 0:
+                return b""
+            return mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+    except OSError as error:
+        reason = error.strerror or str(error)
+        raise DataError(f"cannot be read ({reason})", where=path.name) from error
+
+
+def as_bytes(source: Source, start: int, stop: int) -> Bytes:
+    """Return bytes [start, stop) of a source, or what it has of them."""
+    return np.frombuffer(source[start:stop], np.uint8)
+
+
+def u16(data: Bytes, at: Index) -> Index:
+    """Return little-endian 16-bit unsigned integers at positions (N,)."""
+    return data[at].astype(np.int64) | data[at + 1].astype(np.int64) << 8
+
+
+def summed_frames(
+    source: Source,
+    sync: bytes,
+    length: Callable[[Bytes, Index], Index],
+    shortest: int,
+    longest: int,
+) -> Iterator[Index]:
+    """Find frames that end with the sum of all their bytes, modulo 65536.
+
+    Frames do not overlap. Bytes that belong to none are passed over, so that every
+    frame that is whole is found, whatever precedes it.
+
+    Parameters
+    ----------
+    source : Source
+        The stream.
+    sync : bytes
+        Two bytes that every frame starts with.
+    length : callable
+        Given a window and positions (N,) in it with `shortest` bytes behind each,
+        returns the numbers (N,) of bytes from the sync to the checksum; 0 where no
+        frame can start.
+    shortest, longest : int
+        Bounds of these numbers.
+
+    Yields
+    ------
+    (K, 2) starts and stops (checksum excluded) of frames; one block for each window.
+    """
+    free = 0
+    size = len(source)
+    for begin in range(0, size, WINDOW):
+        data = as_bytes(source, begin, begin + WINDOW + longest + 2)
+        last = min(WINDOW, len(data) - shortest - 1)
+        if last <= 0:
+            continue
+        at = np.flatnonzero((data[:last] == sync[0]) & (data[1 : last + 1] == sync[1]))
+        if not len(at):
+            continue
+        stop = at + length(data, at)
+        fits = (stop >= at + shortest) & (stop <= at + longest) & (stop + 2 <= len(data))
+        at, stop = at[fits], stop[fits]
+        # Sums that wrap at 2**32 are still right modulo 2**16.
+        total = np.concatenate([np.zeros(1, np.uint32), np.cumsum(data, dtype=np.uint32)])
+        whole = ((total[stop] - total[at]) & 0xFFFF) == u16(data, stop)
+        found = []
+        for first, end in (np.stack([at, stop], axis=1)[whole] + begin).tolist():
+            if first >= free:
+                found.append((first, end))
+                free = end + 2
+        if found:
+            yield np.array(found, np.int64)
+
+
+def lines(source: Source) -> Iterator[tuple[int, bytes]]:
+    """Split text into lines.
+
+    Parameters
+    ----------
+    source : Source
+        The text.
+
+    Yields
+    ------
+    Position and content of each line, without its end; lines over `LONGEST_LINE` bytes,
+    which no format here has, are left out.
+    """
+    start = 0
+    size = len(source)
+    while start < size:
+        stop = source.find(b"\n", start)
+        stop = size if stop < 0 else stop
+        if stop - start <= LONGEST_LINE:
+            yield start, source[start:stop].rstrip(b"\r")
+        start = stop + 1
+
+
+def number(text: bytes | str) -> float:
+    """Return a decimal number, or nan for whatever is none."""
+    try:
+        value = float(text)
+    except ValueError:
+        return math.nan
+    # Python also reads "1_000" and "nan".
+    is_plain = (b"_" if isinstance(text, bytes) else "_") not in text  # type: ignore[operator]
+    return value if is_plain and math.isfinite(value) else math.nan

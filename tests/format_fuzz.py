@@ -1,0 +1,231 @@
+"""Feed readers damaged input: `python tests/format_fuzz.py COUNT [SEED [READERS]]`.
+
+COUNT inputs of at most 64 kB for each reader, or for those named (with commas between).
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+import tracemalloc
+import warnings
+from datetime import UTC, datetime
+from pathlib import Path
+
+import format_samples as samples
+import format_writers as writers
+import numpy as np
+
+from factorgraph_dvl.errors import FactorgraphDvlError
+from factorgraph_dvl.io.formats import (
+    ad2cp,
+    dvl_sentences,
+    nmea,
+    pd0,
+    pd4,
+    pd6,
+    rowe,
+    rtklib,
+    sbet,
+    water_linked,
+)
+
+DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
+LIMIT = 1 << 16
+WHEN = datetime(2021, 3, 4, 5, 6, 7, 120000, UTC)
+
+
+def head(path, count=LIMIT):
+    path = DATA / path
+    return path.read_bytes()[:count] if path.exists() else b""
+
+
+def seeds():
+    more = [
+        writers.winriver_gga(0.4, "120953.25", 44.9, -66.9, 2, 9.3, -28.1),
+        writers.winriver_text(
+            204, 0.1, writers.nmea("GPGGA,123519,4807.0,N,01131.0,E,1,8,1,5,M,1,M,,")
+        ),
+    ]
+    vm = writers.vmdas(
+        datetime(2020, 8, 20),
+        (1.0, 48, -123),
+        (2.0, 48, -123),
+        0,
+        datetime(2020, 8, 20),
+        3.0,
+        1.0,
+        0x7FF,
+    )
+    made = b"".join(samples.ensemble(i, more=[*more, vm]) for i in range(20))
+    text = "".join(
+        writers.nmea(t).decode()
+        for i in range(60)
+        for t in (
+            f"GPGGA,1235{i:02d},4807.038,N,01131.000,E,4,08,0.9,545.4,M,46.9,M,1.5,0001",
+            f"GPRMC,1235{i:02d},A,2246.08,N,15755.97,W,0.05,253.92,250722,9.9,E,D",
+            "GPVTG,253.92,T,243.98,M,0.05,N,0.10,K,D",
+            f"GPZDA,1235{i:02d}.00,25,07,2022,00,00",
+            f"GPGST,1235{i:02d}.00,0.30,0.28,0.17,19.72,0.27,0.19,0.45",
+            "PASHR,085335.000,224.19,T,-01.26,+00.83,+00.01,0.101,0.113,0.267,1,0",
+            "PRDID,1,2,3",
+            "PIXSE,ATITUD,1,2",
+            "PIXSE,TIME__,123456.7",
+            "PADCP,1,20200820,010203.4,-0.5",
+        )
+    ).encode()
+    echo = head("adcp_raw/VelEchoBT01.ad2cp")
+    own = b"".join(
+        writers.ad2cp(
+            0x17,
+            writers.df20(
+                WHEN, (1.5, 2, 3, 4), (10, 11, 12, 13), (1, 2, 3, 4), ahrs=np.arange(16.0)
+            ),
+        )
+        for _ in range(50)
+    )
+    nortek = b"".join(
+        writers.nmea(f"PNORBT7,145224491{i % 10}.75,1,2,0.1,0.2,0.3,0.01,1,2,3,4")
+        + writers.nmea(
+            f"PNORBT1,BEAM={i % 4 + 1},DATE=040721,TIME=131335.1,DT1=0,DT2=0,BV=1,FM=0.1,"
+            "DIST=1,STAT=0x1"
+        )
+        for i in range(100)
+    )
+    dvext = "DVEXT,T,A,3333,1.5,-2.5,90.0,0,0.01,5.5,1.25,-0.75,48.1,-123.0,0.1,1,0,0,0,6,6,6,6,"
+    dvext += "T,T,F,T,0.1,0.2,0.3,0.4,5,6,7,8,"
+    cerulean = (
+        writers.nmea("DVPDL,101234000,50000,0.0,-0.0,-0.7,0.0,0.001,-0.005,100")
+        + writers.nmea(dvext)
+    ) * 50
+    pd4s = b"".join(
+        writers.pd4(i % 4, (0.1, 0.2, 0.3, 0.0), (1, 2, 3, 4), (1, 2, 3, 4), long=i % 2 == 0)
+        for i in range(200)
+    )
+    beam = {"id": 0, "velocity": 0.1, "distance": 1.0, "beam_valid": True}
+    report = {"time": 100.0, "vx": 0.5, "vy": 0.1, "vz": 0.2, "fom": 0.01, "altitude": 1.0}
+    report |= {"transducers": [beam], "velocity_valid": True, "type": "velocity"}
+    report |= {"time_of_validity": 1638191471563017}
+    json_lines = (json.dumps(report).encode() + b"\n") * 50
+    smooth = writers.sbet(samples.rows(200))
+    pos = (
+        samples.HEADER
+        + b"%  GPST "
+        + samples.COLUMNS
+        + b"\n"
+        + b"".join(
+            b"2019/06/08 08:04:%02d.500" % (i % 60) + samples.VALUES + b"\n" for i in range(100)
+        )
+    )
+    return {
+        "nmea": (nmea.read_nmea, [text]),
+        "pd0": (
+            pd0.read_pd0,
+            [
+                made,
+                head("nenana_river/nenana_2010-09-23.PD0"),
+                head("adcp_raw/vmdas01_wh.ENX"),
+                head("adcp_raw/winriver01.PD0"),
+            ],
+        ),
+        "ad2cp": (ad2cp.read_ad2cp, [own, echo]),
+        "pd4": (pd4.read_pd4, [pd4s]),
+        "pd6": (pd6.read_pd6, [samples.PD13.encode() * 40]),
+        "nortek": (dvl_sentences.read_nortek, [nortek]),
+        "cerulean": (dvl_sentences.read_cerulean, [cerulean]),
+        "water_linked": (water_linked.read_water_linked, [samples.SERIAL * 20, json_lines]),
+        "rowe": (
+            rowe.read_rowe,
+            [b"".join(samples.rowe_ensemble(i, writers.nmea("GPHDT,85.5,T")) for i in range(30))],
+        ),
+        "sbet": (sbet.read_sbet, [smooth]),
+        "smrmsg": (sbet.read_smrmsg, [smooth]),
+        "rtklib": (rtklib.read_rtklib, [pos]),
+    }
+
+
+def damage(data, rng):
+    data = bytearray(data)
+    if rng.random() < 0.5 and len(data) > 2000:
+        at = int(rng.integers(0, len(data) - 1000))
+        data = data[at : at + int(rng.integers(500, len(data) - at))]
+    for _ in range(int(rng.integers(1, 4))):
+        kind = int(rng.integers(0, 7))
+        size = max(len(data), 1)
+        at = int(rng.integers(0, size))
+        if kind == 0:
+            for i in rng.integers(0, size, int(rng.integers(1, 200))):
+                if i < len(data):
+                    data[i] ^= 1 << int(rng.integers(0, 8))
+        elif kind == 1:
+            del data[at:]
+        elif kind == 2:
+            data[at:at] = rng.bytes(int(rng.integers(1, 3000)))
+        elif kind == 3:
+            del data[at : at + int(rng.integers(1, 500))]
+        elif kind == 4:
+            data += data[: int(rng.integers(1, 20000))]
+        elif kind == 5:
+            data[at : at + 300] = bytes(
+                [int(rng.choice([0, 0x7F, 0xA5, 0x80, 0xFF, 0x24, 0x7B, 0x0A]))]
+            ) * int(rng.integers(1, 3000))
+        else:
+            for i in rng.integers(0, size, 20):
+                if i < len(data):
+                    data[i] = int(rng.choice([0, 1, 0x7F, 0x80, 0xFF]))
+    return bytes(data[:LIMIT])
+
+
+def consume(reader, data):
+    total = 0
+    for block in reader(data):
+        parts = (
+            [block.pings, block.water, block.vmdas] if isinstance(block, pd0.Block) else [block]
+        )
+        if isinstance(block, dict):
+            parts = list(block.values())
+        if isinstance(block, ad2cp.Ad2cp):
+            parts = [block.bottom]
+        total += sum(getattr(p, "nbytes", 0) for p in parts)
+    return total
+
+
+def run(name, reader, bases, count, seed):
+    """Return the number refused, the slowest, s, and the most memory, bytes, of `count` inputs."""
+    rng = np.random.default_rng([seed, *name.encode()])
+    bases = [base for base in bases if base]
+    slowest, most, refused = 0.0, 0, 0
+    for index in range(count):
+        data = damage(bases[index % len(bases)], rng)
+        start = time.process_time()
+        is_measured = index % 20 == 0
+        if is_measured:
+            tracemalloc.start()
+        try:
+            consume(reader, data)
+        except FactorgraphDvlError:
+            refused += 1
+        if is_measured:
+            most = max(most, tracemalloc.get_traced_memory()[1])
+            tracemalloc.stop()
+        else:
+            slowest = max(slowest, time.process_time() - start)
+    return refused, slowest, most
+
+
+def main():
+    count, seed = int(sys.argv[1]), int(sys.argv[2]) if len(sys.argv) > 2 else 0
+    readers = seeds()
+    warnings.simplefilter("error")
+    for name in sys.argv[3].split(",") if len(sys.argv) > 3 else readers:
+        refused, slowest, most = run(name, *readers[name], count, seed)
+        print(
+            f"{name:13} {count} inputs, {refused} refused, slowest {slowest * 1e3:.0f} ms, "
+            f"at most {most >> 10} kB",
+            flush=True,
+        )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,84 @@
+"""Samples of files, in the words of the documents."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime, timedelta
+
+import format_writers as writers
+import numpy as np
+
+WHEN = datetime(2021, 3, 4, 5, 6, 7, 120000, UTC)
+
+
+def ensemble(number=1, velocity=(0.1, -0.2, 0.3, 0.4), more=(), **leader):
+    when = WHEN + timedelta(seconds=number)
+    names = ("heading", "pitch", "roll", "century")
+    variable = {name: leader.pop(name) for name in names if name in leader}
+    return writers.pd0(
+        [
+            writers.fixed_leader(**leader),
+            writers.variable_leader(number, when, **variable),
+            writers.water_profile([(4464, -4464, 3, -32768), (5, 6, 7, 8)]),
+            writers.bottom_track(velocity, (10.0, 700.0, 12.34, 0.0)),
+            *more,
+        ]
+    )
+
+
+def rows(count, start=1000.0):
+    rng = np.random.default_rng(2)
+    values = rng.uniform(0.01, 1.0, (count, 17)) * np.where(
+        rng.random((count, 17)) < 0.5, -1.0, 1.0
+    )
+    values[:, 0] = start + 0.005 * np.arange(count)
+    return values
+
+
+HEADER = b"""% program   : RTKLIB ver.demo5 b31
+% obs start : 2019/06/08 08:03:55.5 GPST (week2056 547435.5s)
+%
+% (lat/lon/height=WGS84/ellipsoidal,Q=1:fix,2:float,3:sbas,4:dgps,5:single,6:ppp)
+"""
+
+
+COLUMNS = b"latitude(deg) longitude(deg)  height(m)   Q  ns   sdn(m)   sde(m)   sdu(m)"
+
+
+VALUES = b"   47.060027749   -1.350495019    84.8600   1  12   0.0031   0.0025   0.0068"
+
+
+WHEN = datetime(2021, 3, 4, 5, 6, 7, 120000, UTC)
+
+
+SERIAL = b"""wrz,0.120,-0.400,2.000,y,1.30,1.855,1e-07;0;1.4;0;1.2;0;0.2;0;1e+09,7,14,123.00,1*50
+wru,0,0.070,1.10,-40,-95*9c
+wru,1,-0.500,1.25,-62,-104*f0
+wru,2,2.200,1.40,-56,-98*18
+wru,3,1.800,1.35,-58,-96*a3
+wrx,1075.51,0.000,0.000,0.000,2.707,-1.00,n,1*04
+wrp,49056.809,0.41,0.15,1.23,0.4,53.9,13.0,19.3,0*de
+wrz,9.120,-0.400,2.000,y,1.30,1.855,1e-07;0;1.4;0;1.2;0;0.2;0;1e+09,7,14,123.00,1*50
+"""
+
+
+def rowe_ensemble(number=1, sentence=b""):
+    ranges, other = [10.0, 0.0, 11.0, 12.0], [1.0] * 12
+    beams, instrument, earth = (
+        [0.1, 88.888, 0.3, 0.4],
+        [0.5, -0.6, 0.7, 0.01],
+        [1.0, 2.0, 3.0, 0.0],
+    )
+    count = [1.0] * 4
+    return writers.rowe(
+        number, WHEN, ranges + other + beams + count + instrument + count + earth + count, sentence
+    )
+
+
+PD13 = """:SA, +1.50, -2.25,181.02
+:TS,21030405060712,35.0,+10.5,  12.3,1501.0,  0
+:RA,101.30, 100.50,  99.00,   0.00, 101.25
+:BI, +123, -456, +1000,   +2,A
+:BS, +456, +123, +1000,A
+:BE, +1, +2, +3,A
+:BD,     +1.00,     +2.00,     +3.00,  10.10,  0.00
+"""
