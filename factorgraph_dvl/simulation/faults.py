@@ -1,0 +1,348 @@
+"""Errors of real instruments, added to a simulated trial one by one.
+
+Each fault is a function `fault(trial, rng) -> trial` made by one of the functions below;
+`with_faults` applies several. They change records as an instrument or its user would and share
+no model with the estimator. The true calibration moves along where a fault changes it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.simulation.measurements import displaced
+from factorgraph_dvl.trial import Trial
+
+Fault = Callable[[Trial, np.random.Generator], Trial]
+
+
+def with_faults(trial: Trial, faults: Sequence[Fault], seed: int = 0) -> Trial:
+    """Return a trial with faults, in their order.
+
+    Parameters
+    ----------
+    trial : Trial
+        A simulated trial.
+    faults : sequence of Fault
+        What to add. Each draws from a random stream of its own, so that one more fault at the
+        end leaves the others as they were.
+    seed : int, default 0
+        Random seed.
+    """
+    rngs = np.random.default_rng(seed).spawn(len(faults))
+    for fault, rng in zip(faults, rngs, strict=True):
+        trial = fault(trial, rng)
+    return trial
+
+
+def gauss_markov(time: Array, tau_s: float, components: int, rng: np.random.Generator) -> Array:
+    """Return a stationary first-order Gauss-Markov process of unit variance, (M, components).
+
+    Exact at any times: c(t + d) = exp(-d / tau) c(t) + sqrt(1 - exp(-2 d / tau)) w.
+    """
+    decay = np.exp(-np.diff(time) / tau_s)
+    noise = rng.standard_normal((time.size, components))
+    noise[1:] *= np.sqrt(1.0 - decay**2)[:, None]
+    for k, phi in enumerate(decay.tolist()):
+        noise[k + 1] += phi * noise[k]
+    return noise
+
+
+def late(section: str, delay_s: float) -> Fault:
+    """Stamp the record of a sensor late by a constant time, s.
+
+    A late IMU makes all other sensors early.
+    """
+
+    def fault(trial: Trial, rng: np.random.Generator) -> Trial:
+        return _stamped(trial, section, lambda time: time + delay_s, {"offset": delay_s})
+
+    return fault
+
+
+def clock_rate(section: str, rate_ppm: float) -> Fault:
+    """Let the clock of a sensor run fast by a rate, right at the middle of the trial."""
+
+    def fault(trial: Trial, rng: np.random.Generator) -> Trial:
+        middle = 0.5 * (trial.imu.time[0] + trial.imu.time[-1])
+        return _stamped(trial, section, lambda t: t + 1e-6 * rate_ppm * (t - middle), {})
+
+    return fault
+
+
+def jitter(section: str, std_s: float) -> Fault:
+    """Scatter the stamps of a sensor; they stay in order."""
+
+    def fault(trial: Trial, rng: np.random.Generator) -> Trial:
+        def scattered(time: Array) -> Array:
+            moved = np.sort(time + std_s * rng.standard_normal(time.size))
+            return moved + 1e-9 * np.arange(time.size)
+
+        return _stamped(trial, section, scattered, {})
+
+    return fault
+
+
+def correlated_gnss(
+    position_std_m: Sequence[float] = (0.0, 0.0, 0.0),
+    velocity_std_m_s: Sequence[float] = (0.0, 0.0, 0.0),
+    position_tau_s: float = 100.0,
+    velocity_tau_s: float = 2.0,
+) -> Fault:
+    """Add Gauss-Markov errors to position and velocity of GNSS, east, north and up."""
+
+    def fault(trial: Trial, rng: np.random.Generator) -> Trial:
+        gnss = _record(trial, "gnss")
+        wander = gauss_markov(gnss.time, position_tau_s, 3, rng) * position_std_m
+        change = gauss_markov(gnss.time, velocity_tau_s, 3, rng) * velocity_std_m_s
+        return _with(
+            trial,
+            "gnss",
+            geodetic=displaced(gnss.geodetic, wander),
+            velocity=gnss.velocity + change,
+        )
+
+    return fault
+
+
+def gnss_jumps(size_m: float = 10.0, duration_s: float = 30.0, count: int = 3) -> Fault:
+    """Move the position of GNSS to a random side, some times for a while."""
+
+    def fault(trial: Trial, rng: np.random.Generator) -> Trial:
+        gnss = _record(trial, "gnss")
+        moved = np.zeros_like(gnss.geodetic)
+        for inside in _spans(gnss.time, duration_s, count, rng):
+            side = rng.uniform(0.0, 2.0 * np.pi)
+            moved[inside, :2] = size_m * np.array([np.cos(side), np.sin(side)])
+        return _with(trial, "gnss", geodetic=displaced(gnss.geodetic, moved))
+
+    return fault
+
+
+def gnss_outliers(share: float = 0.1, sigmas: tuple[float, float] = (10.0, 100.0)) -> Fault:
+    """Move a share of the fixes by so many stated standard deviations, in random directions."""
+
+    def fault(trial: Trial, rng: np.random.Generator) -> Trial:
+        gnss = _record(trial, "gnss")
+        step = _gross(gnss.time.size, share, sigmas, rng) * gnss.settings.position_std_m
+        return _with(trial, "gnss", geodetic=displaced(gnss.geodetic, step))
+
+    return fault
+
+
+def wrong_antenna(error_m: Sequence[float]) -> Fault:
+    """State a lever arm of the antenna that is off by a vector in body axes."""
+
+    def fault(trial: Trial, rng: np.random.Generator) -> Trial:
+        settings = _record(trial, "gnss").settings
+        stated = tuple((np.array(settings.lever_arm_m) + error_m).tolist())
+        return _with(trial, "gnss", settings=msgspec.structs.replace(settings, lever_arm_m=stated))
+
+    return fault
+
+
+def dvl_bias(bias_m_s: Sequence[float]) -> Fault:
+    """Add a constant velocity in the axes of the DVL."""
+
+    def fault(trial: Trial, rng: np.random.Generator) -> Trial:
+        dvl = _record(trial, "dvl")
+        out = _with(trial, "dvl", velocity=dvl.velocity + np.asarray(bias_m_s))
+        return _truth(out, "dvl_bias_m_s", np.asarray(bias_m_s, float))
+
+    return fault
+
+
+def dvl_scale_drift(total: float) -> Fault:
+    """Let the scale of the DVL grow linearly by a total over the trial, zero at the middle."""
+
+    def fault(trial: Trial, rng: np.random.Generator) -> Trial:
+        dvl = _record(trial, "dvl")
+        drift = total * ((dvl.time - dvl.time.mean()) / np.ptp(dvl.time))
+        return _with(trial, "dvl", velocity=dvl.velocity * (1.0 + drift)[:, None])
+
+    return fault
+
+
+def correlated_dvl(std_m_s: float, tau_s: float = 5.0) -> Fault:
+    """Add a first-order Gauss-Markov error to each axis of the DVL."""
+
+    def fault(trial: Trial, rng: np.random.Generator) -> Trial:
+        dvl = _record(trial, "dvl")
+        error = std_m_s * gauss_markov(dvl.time, tau_s, 3, rng)
+        return _with(trial, "dvl", velocity=dvl.velocity + error)
+
+    return fault
+
+
+def dvl_outliers(share: float = 0.1, sigmas: tuple[float, float] = (10.0, 300.0)) -> Fault:
+    """Move a share of the pings by so many stated standard deviations, in random directions."""
+
+    def fault(trial: Trial, rng: np.random.Generator) -> Trial:
+        dvl = _record(trial, "dvl")
+        speed = np.linalg.norm(dvl.velocity, axis=1, keepdims=True)
+        stated = dvl.settings
+        std = np.hypot(stated.velocity_std_m_s, stated.velocity_std_fraction * speed)
+        step = _gross(dvl.time.size, share, sigmas, rng) * std
+        return _with(trial, "dvl", velocity=dvl.velocity + step)
+
+    return fault
+
+
+def dvl_false_lock(speed_m_s: float = 0.3, duration_s: float = 60.0) -> Fault:
+    """Lock on something that moves, such as a layer of fish: a constant velocity for a while."""
+
+    def fault(trial: Trial, rng: np.random.Generator) -> Trial:
+        dvl = _record(trial, "dvl")
+        (inside,) = _spans(dvl.time, duration_s, 1, rng)
+        moving = speed_m_s * _directions(1, rng)
+        return _with(trial, "dvl", velocity=dvl.velocity + moving * inside[:, None])
+
+    return fault
+
+
+def frozen(section: str, duration_s: float = 30.0, field: str = "velocity") -> Fault:
+    """Repeat the value that a sensor had at the start of a random span."""
+
+    def fault(trial: Trial, rng: np.random.Generator) -> Trial:
+        record = _record(trial, section)
+        values = getattr(record, field).copy()
+        (inside,) = _spans(record.time, duration_s, 1, rng)
+        values[inside] = values[np.argmax(inside)]
+        return _with(trial, section, **{field: values})
+
+    return fault
+
+
+def filled(section: str, share: float, value: float = 0.0, field: str = "velocity") -> Fault:
+    """Replace a share of the measurements by one value, as instruments do where they have none."""
+
+    def fault(trial: Trial, rng: np.random.Generator) -> Trial:
+        record = _record(trial, section)
+        values = getattr(record, field).copy()
+        values[rng.uniform(size=record.time.size) < share] = value
+        return _with(trial, section, **{field: values})
+
+    return fault
+
+
+def axes_changed(section: str, matrix: Sequence[Sequence[float]], *fields: str) -> Fault:
+    """Multiply vectors of a sensor by a matrix: mirrored or swapped axes, signs, units.
+
+    Parameters
+    ----------
+    section : str
+        Sensor, `imu` included.
+    matrix : sequence of sequence of float
+        Takes what was measured to what is recorded, (3, 3).
+    *fields : str
+        Arrays of the record; `gyro` and `accel` of the IMU where none is named, else `velocity`.
+    """
+
+    def fault(trial: Trial, rng: np.random.Generator) -> Trial:
+        record = _record(trial, section)
+        names = fields or (("gyro", "accel") if section == "imu" else ("velocity",))
+        turned = {name: getattr(record, name) @ np.asarray(matrix, float).T for name in names}
+        return _with(trial, section, **turned)
+
+    return fault
+
+
+def imu_errors(
+    gyro: Sequence[Sequence[float]],
+    g_sensitivity: Sequence[Sequence[float]],
+    accel: Sequence[Sequence[float]],
+) -> Fault:
+    """Add scale factors, axis misalignment and g-sensitivity to the samples of the IMU.
+
+    Parameters
+    ----------
+    gyro, accel : sequence of sequence of float
+        (3, 3); what is recorded = (I + matrix) what is true, scale factors on the diagonal.
+    g_sensitivity : sequence of sequence of float
+        (3, 3), (rad/s)/(m/s²): what each component of the specific force adds to the gyros.
+    """
+
+    def fault(trial: Trial, rng: np.random.Generator) -> Trial:
+        imu = trial.imu
+        added = imu.gyro @ np.transpose(gyro) + imu.accel @ np.transpose(g_sensitivity)
+        return _with(
+            trial, "imu", gyro=imu.gyro + added, accel=imu.accel + imu.accel @ np.transpose(accel)
+        )
+
+    return fault
+
+
+def saturated(gyro_rad_s: float = np.inf, accel_m_s2: float = np.inf) -> Fault:
+    """Clip the samples of the IMU at the ends of its range."""
+
+    def fault(trial: Trial, rng: np.random.Generator) -> Trial:
+        imu = trial.imu
+        return _with(
+            trial,
+            "imu",
+            gyro=np.clip(imu.gyro, -gyro_rad_s, gyro_rad_s),
+            accel=np.clip(imu.accel, -accel_m_s2, accel_m_s2),
+        )
+
+    return fault
+
+
+def _stamped(
+    trial: Trial, section: str, clock: Callable[[Array], Array], known: dict[str, float]
+) -> Trial:
+    out = _with(trial, section, time=clock(_record(trial, section).time))
+    offset = known.get("offset", 0.0)
+    if section == "dvl":
+        out = _truth(out, "time_offset_s", np.array([offset]))
+    elif section == "imu":
+        out = _truth(out, "time_offset_s", np.array([-offset]))
+    return out
+
+
+def _truth(trial: Trial, name: str, change: Array) -> Trial:
+    """Return a trial whose true parameter, if it is known, has changed."""
+    truth = dict(trial.calibration_truth)
+    if name in truth:
+        truth[name] = truth[name] + change
+    return replace(trial, calibration_truth=truth)
+
+
+def _record(trial: Trial, section: str) -> Any:
+    records = {"imu": trial.imu, **{aid.section: aid for aid in trial.aids}}
+    return records[section]
+
+
+def _with(trial: Trial, section: str, **arrays: Any) -> Trial:
+    record = replace(_record(trial, section), **arrays)
+    if section in ("imu", "gnss", "dvl"):
+        return replace(trial, **{section: record})
+    others = tuple(record if aid.section == section else aid for aid in trial.others)
+    return replace(trial, others=others)
+
+
+def _spans(
+    time: Array, duration_s: float, count: int, rng: np.random.Generator
+) -> Iterator[Array]:
+    """Yield which times (M,) are inside spans, one in each part of the record."""
+    part = np.ptp(time) / count
+    for i in range(count):
+        start = time[0] + (i + rng.uniform(0.2, 0.8)) * part
+        yield (time >= start) & (time < start + duration_s)
+
+
+def _gross(
+    size: int, share: float, sigmas: tuple[float, float], rng: np.random.Generator
+) -> Array:
+    bad = rng.uniform(size=size) < share
+    length = rng.uniform(*sigmas, size) * bad
+    return np.asarray(_directions(size, rng) * length[:, None])
+
+
+def _directions(size: int, rng: np.random.Generator) -> Array:
+    out = rng.standard_normal((size, 3))
+    return np.asarray(out / np.linalg.norm(out, axis=1, keepdims=True))
