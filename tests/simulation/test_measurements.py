@@ -2,113 +2,16 @@
 
 from __future__ import annotations
 
-import copy
-from pathlib import Path
-
 import numpy as np
 import pandas as pd
 import pytest
-import yaml
 from pyins import strapdown
-from scipy.integrate import quad, solve_ivp
+from simulated import SWELL, constant, motion_of, run, scenario_dict
 
-from factorgraph_dvl.errors import ConfigError
-from factorgraph_dvl.geometry.earth import RATE, LocalFrame, enu_from_ecef, normal_gravity, radii
-from factorgraph_dvl.geometry.rotations import frd_from_body, rotation_from_rph
+from factorgraph_dvl.geometry.earth import RATE, LocalFrame, normal_gravity
+from factorgraph_dvl.geometry.rotations import frd_from_body
 from factorgraph_dvl.geometry.units import DEG, DEG_PER_HOUR, DEG_PER_SQRT_HOUR, HOUR, MICRO_G
-from factorgraph_dvl.geometry.vectors import skew
-from factorgraph_dvl.simulation import load_scenario, parse_scenario, plan_motion, simulate
-
-CONFIGS = Path(__file__).resolve().parents[2] / "configs"
-SWELL = {
-    "roll": [{"amplitude_deg": 3, "frequency_hz": 0.12}],
-    "pitch": [{"amplitude_deg": 1.5, "frequency_hz": 0.15, "phase_deg": 40}],
-    "yaw": [{"amplitude_deg": 0.8, "frequency_hz": 0.1, "phase_deg": 120}],
-    "heave": [{"amplitude_m": 0.3, "frequency_hz": 0.12, "phase_deg": 30}],
-}
-MANOEUVRES = [
-    {"straight_s": 5},
-    {"accelerate_m_s2": 0.5, "to_m_s": 4},
-    {"turn_deg_s": -6, "duration_s": 15, "ramp_s": 3},
-    {"accelerate_m_s2": -1, "to_m_s": 2},
-    {"turn_deg_s": 9, "duration_s": 10},
-    {"straight_s": 5},
-]
-
-
-def scenario_dict(**changes):
-    data = {
-        "name": "test",
-        "noise": False,
-        "start": {"lat_deg": 36, "lon_deg": 121, "height_m": 10, "heading_deg": 30},
-        "manoeuvres": MANOEUVRES,
-        "imu": {"rate_hz": 100},
-        "gnss": {"rate_hz": 5, "position_std_m": [1, 1, 2], "velocity_std_m_s": [0.1, 0.1, 0.1]},
-        "dvl": {"rate_hz": 5, "velocity_std_fraction": 0.002},
-        "trial": {"imu": {"gyro_bias_std_deg_h": 1, "accel_bias_std_ug": 100}},
-    }
-    for key, value in changes.items():
-        if key in ("start", "imu", "gnss", "dvl", "trial") and value is not None:
-            data[key] = data[key] | value
-        else:
-            data[key] = value
-    return copy.deepcopy({k: v for k, v in data.items() if v is not None})
-
-
-def run(seed=0, **changes):
-    return simulate(parse_scenario(scenario_dict(**changes)), seed)
-
-
-def motion_of(**changes):
-    return plan_motion(parse_scenario(scenario_dict(**changes)))
-
-
-def constant(degrees):
-    """Return a sway that is constant for all practical purposes."""
-    return [{"amplitude_deg": degrees, "frequency_hz": 1e-12, "phase_deg": 90}]
-
-
-def tangent_states(motion, frame, t):
-    """Return attitude, position, velocity in the tangent frame, (M, 15)."""
-    state = motion.at(t)
-    level = frame.level_from_tangent(state.geodetic[:, 0], state.geodetic[:, 1])
-    nRb = np.swapaxes(level, 1, 2) @ rotation_from_rph(state.rph, motion.body_axes)
-    v_n = np.einsum("mji,mj->mi", level, state.v_n)
-    p_n = frame.position(*state.geodetic.T)
-    return np.hstack([nRb.reshape(-1, 9), p_n, v_n])
-
-
-@pytest.mark.parametrize(
-    ("body_axes", "lat", "lon"),
-    [("RFU", 36.0, 121.0), ("FRD", -33.0, -70.0), ("FLU", 60.0, 179.9999)],
-)
-def test_rates_and_forces_drive_a_tangent_frame_integration_along_the_truth(body_axes, lat, lon):
-    motion = motion_of(
-        body_axes=body_axes,
-        start={"lat_deg": lat, "lon_deg": lon},
-        sway=SWELL,
-        current_m_s=[0.3, -0.2, 0.05],
-    )
-    frame = LocalFrame(lat * DEG, lon * DEG, 10.0)
-    earth = skew(frame.earth_rate)
-
-    def derivative(t, y):
-        state = motion.at(np.array([np.clip(t, inside[0], inside[1])]))
-        nRb = y[:9].reshape(3, 3)
-        turn = nRb @ skew(state.omega_ib_b[0]) - earth @ nRb
-        # gravity() is that at a fixed point: it includes the centrifugal acceleration.
-        acceleration = nRb @ state.f_b[0] + frame.gravity(y[9:12]) - 2.0 * earth @ y[12:]
-        return np.concatenate([turn.ravel(), y[12:], acceleration])
-
-    y = tangent_states(motion, frame, np.zeros(1))[0]
-    for begin, end in zip(motion.kinks[:-1], motion.kinks[1:], strict=True):
-        # Rates jump at the ends of a piece: each is integrated with its own.
-        inside = (begin, np.nextafter(end, begin))
-        y = solve_ivp(derivative, (begin, end), y, "DOP853", rtol=1e-10, atol=1e-11).y[:, -1]
-    error = y - tangent_states(motion, frame, motion.kinks[-1:])[0]
-    assert np.max(np.abs(error[:9])) < 1e-10
-    assert np.max(np.abs(error[9:12])) < 1e-7
-    assert np.max(np.abs(error[12:])) < 1e-8
+from factorgraph_dvl.simulation import parse_scenario, simulate
 
 
 @pytest.mark.filterwarnings("ignore:The copy keyword")
@@ -202,53 +105,6 @@ def test_instantaneous_samples_are_values_at_their_time():
     assert trial.imu.settings.sampling == "instantaneous"
 
 
-def test_position_attitude_and_velocity_are_derivatives_of_each_other():
-    motion = motion_of(sway=SWELL, current_m_s=[0.3, -0.2, 0.1])
-    t = np.arange(2.0, motion.duration - 1.0, 0.37)
-    t = t[np.min(np.abs(t[:, None] - motion.kinks), axis=1) > 0.02]
-    step = 0.01
-    before, now, after = (motion.at(t + d) for d in (-step, 0.0, step))
-    meridian, prime = radii(now.geodetic[:, 0])
-    height = now.geodetic[:, 2]
-    scale = [
-        (prime + height) * np.cos(now.geodetic[:, 0]),
-        meridian + height,
-        np.ones_like(height),
-    ]
-    moved = (after.geodetic - before.geodetic)[:, [1, 0, 2]] * np.transpose(scale)
-    np.testing.assert_allclose(moved / (2 * step), now.v_n, rtol=0, atol=2e-5)
-    np.testing.assert_allclose((after.v_n - before.v_n) / (2 * step), now.a_n, rtol=0, atol=5e-5)
-
-    def eRb(state):
-        lat, lon = state.geodetic[:, 0], state.geodetic[:, 1]
-        return np.swapaxes(enu_from_ecef(lat, lon), 1, 2) @ rotation_from_rph(state.rph, "RFU")
-
-    rate = (eRb(after) - eRb(before)) / (2 * step)
-    cross = np.swapaxes(eRb(now), 1, 2) @ rate
-    omega = np.stack([cross[:, 2, 1], cross[:, 0, 2], cross[:, 1, 0]], axis=1)
-    np.testing.assert_allclose(omega, now.omega_eb_b, rtol=0, atol=2e-6)
-
-
-def test_a_long_leg_follows_the_meridian_to_a_micrometre():
-    legs = {"start": {"heading_deg": 0, "height_m": 0, "speed_m_s": 12}}
-    motion = motion_of(manoeuvres=[{"straight_s": 5000}], **legs)
-    lat0, lat1 = motion.at(np.array([0.0, 5000.0])).geodetic[:, 0]
-    arc, _ = quad(lambda lat: float(radii(lat)[0]), lat0, lat1, epsabs=1e-9)
-    assert arc == pytest.approx(60e3, abs=1e-6)
-
-
-@pytest.mark.parametrize("lat", [-54.0, 0.0, 36.0])
-def test_a_long_leg_east_follows_the_parallel(lat):
-    start = {"lat_deg": lat, "lon_deg": 179.9, "heading_deg": 90, "height_m": 0, "speed_m_s": 12}
-    end = motion_of(manoeuvres=[{"straight_s": 5000}], start=start).at(np.array([5000.0]))
-    radius = float(radii(lat * DEG)[1]) * np.cos(lat * DEG)
-    turned = (end.geodetic[0, 1] - 179.9 * DEG) % (2 * np.pi)
-    assert turned * radius == pytest.approx(60e3, abs=1e-6)
-    # Heading 90 degrees to within 1e-16: the drift north is nothing that a metre shows.
-    assert end.geodetic[0, 0] == pytest.approx(lat * DEG, abs=1e-15)
-    assert end.geodetic[0, 1] < -np.pi + 1.0
-
-
 @pytest.mark.parametrize(
     ("body_axes", "force", "rate_axis"),
     [("RFU", [0, 0, 1], 1), ("FRD", [0, 0, -1], 0), ("FLU", [0, 0, 1], 0)],
@@ -262,29 +118,6 @@ def test_at_rest_the_imu_feels_gravity_and_the_earth(body_axes, force, rate_axis
     expected[rate_axis] = RATE * np.cos(30 * DEG)
     expected -= RATE * np.sin(30 * DEG) * np.array(force)
     np.testing.assert_allclose(trial.imu.gyro[50], expected, rtol=0, atol=1e-17)
-
-
-def test_roll_is_starboard_down_and_pitch_bow_up():
-    at_rest = [{"straight_s": 1}]
-    gravity = float(normal_gravity(36 * DEG, 10.0))
-    rolled = run(manoeuvres=at_rest, sway={"roll": constant(30)}).imu.accel[0]
-    np.testing.assert_allclose(rolled, gravity * np.array([-0.5, 0, np.sqrt(0.75)]), atol=1e-12)
-    pitched = run(manoeuvres=at_rest, sway={"pitch": constant(30)}).imu.accel[0]
-    np.testing.assert_allclose(pitched, gravity * np.array([0, 0.5, np.sqrt(0.75)]), atol=1e-12)
-
-
-@pytest.mark.parametrize("ramp", [0, 4, 10])
-def test_a_positive_turn_goes_to_starboard_by_rate_times_duration(ramp):
-    turn = [{"turn_deg_s": 4, "duration_s": 10, "ramp_s": ramp}, {"straight_s": 20}]
-    trial = run(start={"heading_deg": 350, "speed_m_s": 2}, manoeuvres=turn)
-    reference = trial.reference
-    assert reference.time[-1] == 30 + ramp
-    assert reference.rph[-1, 2] / DEG == pytest.approx(30.0)
-    np.testing.assert_allclose(
-        reference.velocity[-1], [2 * np.sin(30 * DEG), 2 * np.cos(30 * DEG), 0], atol=1e-12
-    )
-    # Clockwise seen from above is negative about the up axis.
-    assert trial.imu.gyro[:, 2].sum() * 0.01 / DEG == pytest.approx(-40.0, abs=0.2)
 
 
 @pytest.mark.parametrize(
@@ -334,18 +167,6 @@ def test_lever_arms_swing_with_the_turn():
     frame = LocalFrame(*trial.reference.geodetic[100])
     np.testing.assert_allclose(frame.position(*trial.gnss.geodetic[i]), [2, 0, 0], atol=1e-8)
     np.testing.assert_allclose(trial.gnss.velocity[i], [0, -0.3141592653589793, 0], atol=1e-12)
-
-
-def test_body_axes_describe_the_same_motion():
-    common = {"sway": SWELL, "current_m_s": [0.2, 0.1, 0]}
-    frd = run(body_axes="FRD", dvl={"lever_arm_m": [1.2, 1, -1.4]}, **common)
-    for axes, lever_arm in (("RFU", [1, 1.2, 1.4]), ("FLU", [1.2, -1, 1.4])):
-        other = run(body_axes=axes, dvl={"lever_arm_m": lever_arm}, **common)
-        to_frd = frd_from_body(axes).T
-        np.testing.assert_allclose(other.imu.gyro @ to_frd, frd.imu.gyro, atol=1e-15)
-        np.testing.assert_allclose(other.imu.accel @ to_frd, frd.imu.accel, atol=1e-13)
-        np.testing.assert_allclose(other.dvl.velocity @ to_frd, frd.dvl.velocity, atol=1e-13)
-        np.testing.assert_array_equal(other.reference.geodetic, frd.reference.geodetic)
 
 
 def test_a_late_clock_reports_past_velocities():
@@ -513,155 +334,6 @@ def test_drawn_biases_scatter_by_their_standard_deviation():
     assert np.std(biases) == pytest.approx(10, rel=0.1)
 
 
-def test_the_trial_claims_what_is_simulated_unless_told_otherwise():
-    trial = run(
-        gnss={"lever_arm_m": [0.3, -1.5, 4]},
-        imu={"gyro_noise_deg_sqrt_h": 0.3},
-        trial={
-            "imu": {"gyro_bias_std_deg_h": 1, "accel_bias_std_ug": 7, "accel_noise_ug_sqrt_hz": 9},
-            "dvl": {"velocity_std_m_s": 0.01, "lever_arm_std_m": [1, 1, 0]},
-        },
-    )
-    assert trial.imu.settings.gyro_noise_deg_sqrt_h == 0.3
-    assert trial.imu.settings.accel_noise_ug_sqrt_hz == 9
-    assert trial.gnss.settings.lever_arm_m == (0.3, -1.5, 4)
-    np.testing.assert_array_equal(trial.gnss.position_std[0], [1, 1, 2])
-    assert trial.dvl.settings.velocity_std_fraction == 0.002
-    assert trial.dvl.settings.velocity_std_m_s == 0.01
-    assert trial.dvl.settings.lever_arm_std_m == (1, 1, 0)
-    assert trial.initial_attitude is None
-
-
-def test_an_initial_claim_is_the_truth_plus_its_error():
-    claim = {
-        "attitude_error_deg": [0.5, 0.5, 2],
-        "attitude_std_deg": [0.5, 0.5, 2],
-        "position_error_m": [3, 0, -1],
-        "position_std_m": [3, 3, 3],
-    }
-    at_rest = {"manoeuvres": [{"straight_s": 1}], "sway": {"roll": constant(1)}}
-    trial = run(
-        trial={"imu": {"gyro_bias_std_deg_h": 1, "accel_bias_std_ug": 100}, "initial": claim},
-        **at_rest,
-    )
-    np.testing.assert_allclose(trial.initial_attitude.rph / DEG, [1.5, 0.5, 32])
-    frame = LocalFrame(*trial.reference.geodetic[0])
-    offset = frame.position(*trial.initial_position.geodetic)
-    np.testing.assert_allclose(offset, [3, 0, -1], atol=1e-6)
-
-
 def test_a_receiver_without_velocity_reports_none():
     trial = run(gnss={"velocity_std_m_s": None})
     assert np.isnan(trial.gnss.velocity).all()
-
-
-def test_the_scenario_of_luo_et_al():
-    trial = simulate(CONFIGS / "seed-a-phase-90.yaml", seed=1)
-    assert (trial.imu.time.size, trial.gnss.time.size, trial.dvl.time.size) == (45300, 2265, 2265)
-    assert trial.reference.time[-1] == 453
-    heading = np.interp([50, 170, 300, 451], trial.reference.time, trial.reference.rph[:, 2] / DEG)
-    np.testing.assert_allclose(heading, [0, 270, 0, 90], atol=1e-9)
-    np.testing.assert_allclose(trial.reference.velocity[-1], [0.1, 0.1, 0], atol=1e-12)
-    np.testing.assert_array_equal(trial.calibration_truth["misalignment_deg"], [2, 2, 30])
-    np.testing.assert_allclose(np.max(trial.reference.rph[:, :2], axis=0) / DEG, [4, 4], atol=0.3)
-
-
-@pytest.mark.parametrize("path", sorted(CONFIGS.glob("*.yaml")), ids=lambda p: p.stem)
-def test_shipped_scenarios_are_valid(path):
-    data = yaml.safe_load(path.read_text())
-    if "manoeuvres" not in data:
-        pytest.skip("not a scenario")
-    scenario = load_scenario(path)
-    assert scenario.name == path.stem
-    duration = plan_motion(scenario).duration
-    if path.stem.startswith("cruise"):
-        assert duration == pytest.approx(4800, abs=1e-9)
-
-
-BAD = {
-    "unknown key": (lambda d: d.update(speed=1), r"line \d+: unknown key `speed`"),
-    "unknown inner key": (lambda d: d["imu"].update(rate=1), r"line \d+: unknown key `imu.rate`"),
-    "missing": (lambda d: d.pop("start"), "missing key `start`"),
-    "wrong type": (
-        lambda d: d["imu"].update(rate_hz="x"),
-        r"line \d+: imu.rate_hz is .x.; expected a number",
-    ),
-    "out of range": (
-        lambda d: d["start"].update(lat_deg=95),
-        r"line \d+: start.lat_deg is 95; expected .*89",
-    ),
-    "not finite": (
-        lambda d: d["start"].update(height_m=float("nan")),
-        r"line \d+: start.*height_m.*finite",
-    ),
-    "no manoeuvre": (lambda d: d.update(manoeuvres=[]), "key manoeuvres: there is no"),
-    "strange manoeuvre": (lambda d: d["manoeuvres"].append({"jump_m": 1}), r"manoeuvres\[6\]"),
-    "ambiguous manoeuvre": (
-        lambda d: d["manoeuvres"].append({"straight_s": 1, "turn_deg_s": 2}),
-        r"manoeuvres\[6\].*exactly one of",
-    ),
-    "inner manoeuvre": (
-        lambda d: d["manoeuvres"].append({"repeat": 2, "manoeuvres": [{"straight_s": -1}]}),
-        r"manoeuvres\[6\]\.manoeuvres\[0\]\.straight_s",
-    ),
-    "endless": (
-        lambda d: d["manoeuvres"].append({"repeat": 10**9, "manoeuvres": [{"straight_s": 1}]}),
-        "too many",
-    ),
-    "long ramp": (
-        lambda d: d["manoeuvres"].append({"turn_deg_s": 1, "duration_s": 2, "ramp_s": 3}),
-        "ramp_s",
-    ),
-    "reversed gap": (lambda d: d["imu"].update(gaps_s=[[2, 1]]), "gaps_s"),
-    "wide jitter": (lambda d: d["imu"].update(jitter_s=0.005), "jitter_s"),
-    "draw without std": (lambda d: d["imu"].update(gyro_bias_deg_h="draw"), "gyro_bias_std_deg_h"),
-    "bad claim": (lambda d: d["trial"].update(dvl={"scale": 1}), "key trial.dvl: .*`scale`"),
-    "missing claim": (lambda d: d.pop("trial"), "key trial.imu: .*gyro_bias_std_deg_h"),
-    "claim without sensor": (
-        lambda d: (d.pop("gnss"), d["trial"].update(gnss={"lever_arm_m": [0, 0, 0]})),
-        "key trial.gnss",
-    ),
-    "internal name": (lambda d: d.update(source="x"), "unknown key `source`"),
-}
-
-
-@pytest.mark.parametrize("case", BAD)
-def test_bad_scenarios_name_file_and_key(case, tmp_path):
-    spoil, message = BAD[case]
-    data = scenario_dict()
-    spoil(data)
-    path = tmp_path / "bad.yaml"
-    path.write_text(yaml.safe_dump(data))
-    with pytest.raises(ConfigError, match=message) as caught:
-        load_scenario(path)
-    assert str(path) in str(caught.value)
-
-
-def test_numbers_may_be_written_as_engineers_do(tmp_path):
-    path = tmp_path / "scenario.yaml"
-    path.write_text(yaml.safe_dump(scenario_dict()) + "reference_rate_hz: 1e-1\n")
-    assert load_scenario(path).reference_rate_hz == 0.1
-
-
-def test_impossible_motion_is_refused():
-    with pytest.raises(ConfigError, match="does not lead from 0 to 4"):
-        run(manoeuvres=[{"accelerate_m_s2": -1, "to_m_s": 4}])
-    with pytest.raises(ConfigError, match="pole"):
-        run(
-            start={"lat_deg": 89, "heading_deg": 0, "speed_m_s": 50},
-            manoeuvres=[{"straight_s": 5000}],
-        )
-    with pytest.raises(ConfigError, match="shorter than one IMU period"):
-        run(manoeuvres=[{"straight_s": 0.001}])
-
-
-def test_unreadable_files_are_refused(tmp_path):
-    with pytest.raises(ConfigError, match=r"none\.yaml"):
-        load_scenario(tmp_path / "none.yaml")
-    path = tmp_path / "bad.yaml"
-    path.write_text("a: [1\nb: 2")
-    with pytest.raises(ConfigError, match="line 2"):
-        load_scenario(path)
-    path.write_text("- 1")
-    with pytest.raises(ConfigError, match="is not a mapping"):
-        load_scenario(path)
