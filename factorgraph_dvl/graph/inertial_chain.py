@@ -24,19 +24,20 @@ from factorgraph_dvl.imu.propagation import States
 from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.trial import Trial
 
-# Bounds, not knowledge: they keep an unaided chain from being singular.
+# Standard deviations of a first state that nothing else tells, rad, m, m/s. Chosen: so large
+# that they only keep an unaided chain from being singular.
 _FREE_ATTITUDE = np.pi
 _FREE_POSITION = 1e4
 _FREE_VELOCITY = 1e2
 # How a vessel may move while its IMU is silent: acceleration, m/s², turn rate, rad/s, and
-# the sway that even the shortest gap allows, m and rad.
+# the sway that even the shortest gap allows, m and rad. Chosen: what ships do at most.
 _GAP_ACCELERATION = 1.0
 _GAP_TURN = 10.0 * DEG
 _GAP_SWAY_M = 0.1
 _GAP_SWAY_RAD = 10.0 * DEG
-# What a standard deviation of 0 in `initial` stands for, rad; far below what is measured.
+# Stands for a standard deviation of 0 in `initial`, rad or m. Chosen: far below what is measured.
 _LEAST_STD = 1e-7
-# Keeps the walk of a bias that does not walk regular.
+# Step of a bias that does not walk, SI. Chosen: regular, and no walk.
 _LEAST_WALK = 1e-12
 
 
@@ -106,7 +107,7 @@ def inertial_chain(
                 )
             )
     for a, (first, _) in enumerate(seg.arc_nodes):
-        mean, root = _state_prior(trial, frame, seg, start, int(first), known=a == 0)
+        mean, root = _state_prior(trial, frame, seg, start, int(first), is_first=a == 0)
         graph.add(gtsam.PriorFactorNavState(keys.node(int(first)), mean, square_root(root)))
     for (_, last), (first, _) in pairwise(seg.arc_nodes):
         graph.add(_gap_factor(int(last), int(first), seg.node_time))
@@ -114,19 +115,19 @@ def inertial_chain(
 
 
 def _state_prior(
-    trial: Trial, frame: LocalFrame, seg: Segments, start: States, k: int, *, known: bool
+    trial: Trial, frame: LocalFrame, seg: Segments, start: States, k: int, *, is_first: bool
 ) -> tuple[gtsam.NavState, Array]:
     """Return mean and square-root information of an arc's first state."""
     nRb, p_n = start.nRb[k], start.p_n[k]
     root = np.diag(1.0 / np.repeat([_FREE_ATTITUDE, _FREE_POSITION, _FREE_VELOCITY], 3))
     # The first mean sample ends where `initial` holds; the first node is where it begins.
     back = exp_so3(-seg.phi[0]) if seg.increments.averaged else np.eye(3)
-    if known and trial.initial_attitude is not None:
+    if is_first and trial.initial_attitude is not None:
         rph = trial.initial_attitude.rph
         nRb = rotation_from_rph(rph, trial.body_axes) @ back
         std = np.maximum(trial.initial_attitude.std, _LEAST_STD)
         root[:3, :3] = rph_jacobian(rph, trial.body_axes) @ back / std[:, None]
-    if known and trial.initial_position is not None:
+    if is_first and trial.initial_position is not None:
         p_n = frame.position(*trial.initial_position.geodetic)
         if seg.increments.averaged:
             p_n = p_n - start.v_n[k] * seg.increments.dt[0]
@@ -136,7 +137,7 @@ def _state_prior(
 
 
 def _gap_factor(before: int, after: int, node_time: Array) -> gtsam.CustomFactor:
-    """Return what is known of a vehicle across a gap of its IMU: it cannot jump.
+    """Return a factor across a gap of the IMU: a vehicle does not jump.
 
     Zero error where the velocity is the same on both sides, the displacement is the mean
     velocity times the gap, and the attitude is the same; standard deviations from the

@@ -7,7 +7,7 @@ import string
 from gtsam import symbol
 from gtsam.symbol_shorthand import B, X
 
-# Those of states and biases are taken.
+# Chosen: all letters but those of states and biases.
 _LETTERS = [c for c in string.ascii_letters + string.digits if c not in "bx"]
 
 

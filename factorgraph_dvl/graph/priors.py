@@ -14,26 +14,27 @@ from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph.inertial_chain import loose_diagonal, square_root
 from factorgraph_dvl.sensors.parameters import Parameter
 
-# Standard deviation that stands for zero in a parameter of which only some components
-# are held; in SI units, far below what can be measured.
-_HELD = 1e-7
-# A calibration may know a combination of parameters this much better than each, squared.
+# Stands for a standard deviation of 0 in a parameter of which other components are estimated,
+# SI. Chosen: far below what is measured.
+_FIXED_STD = 1e-7
+# Least eigenvalue of the correlations of a calibration. Chosen: it may know a combination of
+# parameters a million times better than each.
 _LEAST_EIGENVALUE = 1e-12
 _BIAS = 6
 
 
 @dataclass(frozen=True)
 class ConstantsPrior:
-    """What is known of biases and parameters beforehand, jointly, in place of their priors.
+    """Joint prior of biases and calibration parameters, in place of their own priors.
 
     Parameters
     ----------
     bias : ndarray, shape (6,), SI
-        Accelerometer and gyro bias at the first node.
+        Mean of accelerometer and gyro bias at the first node.
     parameters : dict of str to ndarray
-        Values of those that are estimated, rotations as matrices.
+        Means of the parameters that are estimated, rotations as matrices.
     covariance : ndarray, shape (6 + P, 6 + P)
-        Of biases and parameters, in the tangent space, SI.
+        Covariance of biases and parameters, in the tangent space at the mean, SI.
     """
 
     bias: Array
@@ -99,23 +100,23 @@ def linear_prior(
 
 
 def joint_linear_prior(
-    known: ConstantsPrior,
+    prior: ConstantsPrior,
     bias_key: int,
     parameters: Sequence[Parameter],
     key_of: Mapping[str, int],
 ) -> gtsam.CustomFactor:
-    """Return a factor on biases and parameters for what is known of them together."""
-    sigma = np.sqrt(np.diag(known.covariance))
-    correlation = known.covariance / np.outer(sigma, sigma)
+    """Return the joint prior of biases and parameters as one factor."""
+    sigma = np.sqrt(np.diag(prior.covariance))
+    correlation = prior.covariance / np.outer(sigma, sigma)
     gain = np.linalg.inv(np.linalg.cholesky(correlation)) / sigma
     ends = np.cumsum([_BIAS, *(p.mean.size for p in parameters)])
     columns = np.split(gain, ends[:-1], axis=1)
 
     def error(this: gtsam.CustomFactor, at: gtsam.Values, jacobians: list[Array] | None) -> Array:
-        total = columns[0] @ (at.atConstantBias(bias_key).vector() - known.bias)
+        total = columns[0] @ (at.atConstantBias(bias_key).vector() - prior.bias)
         parts = [columns[0]]
         for p, part in zip(parameters, columns[1:], strict=True):
-            off = local_coordinates(p, value_at(at, key_of[p.name], p), known.parameters[p.name])
+            off = local_coordinates(p, value_at(at, key_of[p.name], p), prior.parameters[p.name])
             total = total + part @ off
             parts.append(part @ inverse_right_jacobian(off) if p.rotation else part)
         if jacobians is not None:
@@ -153,7 +154,7 @@ def _groups(parameters: Sequence[Parameter]) -> list[list[Parameter]]:
 
 
 def _add_prior(graph: gtsam.NonlinearFactorGraph, p: Parameter, key: int) -> None:
-    sigma = np.maximum(p.sigma, _HELD)
+    sigma = np.maximum(p.sigma, _FIXED_STD)
     if p.rotation:
         # The prior is stated for the rotation vector, GTSAM's for its tangent space.
         root = inverse_right_jacobian(p.mean) / sigma[:, None]
@@ -164,7 +165,7 @@ def _add_prior(graph: gtsam.NonlinearFactorGraph, p: Parameter, key: int) -> Non
 
 def _root_of(group: Sequence[Parameter]) -> Array:
     """Return a square root of the prior covariance of parameters in their tangent space, SI."""
-    sigma = np.maximum(np.concatenate([p.sigma for p in group]), _HELD)
+    sigma = np.maximum(np.concatenate([p.sigma for p in group]), _FIXED_STD)
     root = np.diag(sigma)
     joint = group[0].joint
     if joint is not None:

@@ -44,14 +44,17 @@ from factorgraph_dvl.imu.propagation import (
 from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.sensors.protocol import Aid, Linearization, Motion, Observation
 
-# Standard deviation that stands for zero in a held direction, in those of the prior.
+# Stands for zero in a fixed direction, in standard deviations of the prior. Chosen: what data
+# that do not determine the direction cannot move.
 FIXED_DIRECTION_STD = 1e-4
-# How far a time offset may move from its start, s, before measurements are bound anew.
+# Distance from the ends of the record, s, that measurements of unknown time must have. Chosen:
+# the start value of a time offset is better than this.
 _TIME_MARGIN = 0.05
-# How far, s, a motion is extrapolated before its measurements are bound anew: 2 Hz sway of
-# 4 deg turns by 3e-6 rad/s otherwise than a straight line in the rate.
+# How far, s, a motion is extrapolated before its measurements are bound anew. Measured: 2 Hz
+# sway of 4 deg then differs by 3e-6 rad/s from a straight line in the rate.
 _SAME_TIME = 2e-4
-# Change of a standard deviation, relative, from which on measurements are weighed anew.
+# Relative change of a standard deviation from which on measurements are weighed anew. Chosen:
+# less hardly moves the minimum.
 _SAME_WEIGHT = 0.2
 
 _STATE = 9
@@ -86,12 +89,12 @@ class _Block:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """All there is to know at one set of values, before linearising.
+    """Motion, residuals and cost at one set of values.
 
     Parameters
     ----------
     values : gtsam.Values
-        GTSAM's.
+        Values of all variables, as GTSAM has them.
     states, parameters : States or dict of str to ndarray
         The same as arrays; parameters by name, rotations as matrices.
     motions, residuals : list of Motion or list of ndarray
@@ -122,14 +125,16 @@ class Problem:
     Parameters
     ----------
     chain : Chain
+        Inertial part of the graph.
     observations : sequence of Observation
-        Of the aiding sensors.
+        Measurements of the aiding sensors.
     parameters : sequence of Parameter
-        Of the aiding sensors, fixed ones included.
+        Calibration parameters of the aiding sensors, fixed ones included.
     start : dict of str to ndarray, optional
-        Values of parameters, where they are known better than by their priors.
+        Values of parameters near which the solution is expected; by default the prior means.
     constants_prior : ConstantsPrior, optional
-        What stands in place of the priors; the chain then has none of the biases.
+        Joint prior of biases and parameters, in place of their own; the chain then has none of
+        the biases.
     """
 
     def __init__(
@@ -241,7 +246,7 @@ class Problem:
         return out
 
     def fix_directions(self, directions: Array, origin: dict[str, Array]) -> None:
-        """Hold combinations of the parameters at an origin.
+        """Fix combinations of the parameters at an origin.
 
         Parameters
         ----------
@@ -260,16 +265,16 @@ class Problem:
         for p in self.parameters:
             parameters[p.name] = self._parameter(values, p)
         motions, residuals = [], []
-        known: dict[tuple[int, float], Motion] = {}
+        computed: dict[tuple[int, float], Motion] = {}
         cost = self.graph.error(values)
         rate = self.chain.frame.earth_rate
         for bound in self._bound:
             late = self._late(bound, parameters)
             shared = (id(bound.attachment), late)
-            if shared not in known:
+            if shared not in computed:
                 motion = motion_at(bound.attachment, states, self.chain.gravity_n, rate)
-                known[shared] = motion if late == 0.0 else extrapolated(motion, late)
-            motion = known[shared]
+                computed[shared] = motion if late == 0.0 else extrapolated(motion, late)
+            motion = computed[shared]
             residual = bound.weight * bound.observation.residual(motion, parameters)
             motions.append(motion)
             residuals.append(residual)

@@ -1,4 +1,4 @@
-"""Initial attitude from a sensor that measures it, whose mounting the gyros may tell."""
+"""Initial attitude from a sensor that measures it, its mounting from the gyros if need be."""
 
 from __future__ import annotations
 
@@ -14,10 +14,13 @@ from factorgraph_dvl.initialization.dead_reckoned_spans import DeadReckonedSpan
 from factorgraph_dvl.sensors.protocol import AttitudeAid, Attitudes
 from factorgraph_dvl.trial import Trial
 
-# Prior standard deviation up to which a mounting is taken as it stands.
+# Prior standard deviation up to which a mounting is taken as it stands. Chosen: the solver
+# converges from there.
 _KNOWN = 5.0 * DEG
-# Turns over these intervals, s, tell a mounting by the gyros; root mean square about the
-# second axis, rad, from which on they do, and the longest turn that is used.
+# Turns over these intervals, s, tell a mounting by the gyros. Chosen: from sway to slow turns.
+# Then: root mean square about the
+# second axis, rad, from which on they do, and the longest turn that is used. Chosen: above the
+# noise of a star tracker; below half a turn.
 _LAGS = (1.0, 3.0, 10.0)
 _LEAST_TURN = 0.2 * DEG
 _LONGEST_TURN = 2.5

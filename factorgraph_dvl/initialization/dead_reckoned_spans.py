@@ -19,7 +19,7 @@ class DeadReckonedSpan:
     """An arc seen from its start: body axes there, and n at that moment, kept in space.
 
     `turn`, `speed`, `place` are rotation, velocity and displacement by the specific force
-    alone, at the nodes; `pull1`, `pull2` the first and second integral of gravity;
+    alone, at the nodes; `gravity1`, `gravity2` the first and second integral of gravity;
     `gravity` its value in space along the segments.
     """
 
@@ -31,8 +31,8 @@ class DeadReckonedSpan:
     speed: Array
     place: Array
     gravity: Array
-    pull1: Array
-    pull2: Array
+    gravity1: Array
+    gravity2: Array
 
     @property
     def start(self) -> float:
@@ -54,14 +54,14 @@ class DeadReckonedSpan:
         )
         return at, self.turn[k] @ at.dR, velocity, displacement
 
-    def pull(self, at: Attachment) -> tuple[Array, Array]:
+    def gravity_integrals(self, at: Attachment) -> tuple[Array, Array]:
         """Return the first and second integral of gravity, in space."""
         k = at.node - self.nodes[0]
         tau = at.tau[:, None]
         g = self.gravity[k]
         return (
-            self.pull1[k] + g * tau,
-            self.pull2[k] + self.pull1[k] * tau + g * (tau**2 / 2.0),
+            self.gravity1[k] + g * tau,
+            self.gravity2[k] + self.gravity1[k] * tau + g * (tau**2 / 2.0),
         )
 
     def to_space(self, time: Array) -> Array:
@@ -83,12 +83,14 @@ def arc_from_start(seg: Segments, a: int, frame: LocalFrame, p_n: Array) -> Dead
     gravity = rotate(exp_so3(halfway[:, None] * rate), frame.gravity_without_rotation(middle))
     m = nodes.size
     turn = np.tile(np.eye(3), (m, 1, 1))
-    speed, place, pull1, pull2 = (np.zeros((m, 3)) for _ in range(4))
+    speed, place, gravity1, gravity2 = (np.zeros((m, 3)) for _ in range(4))
     for j in range(m - 1):
         turn[j + 1] = turn[j] @ dR[j]
         place[j + 1] = place[j] + speed[j] * step[j] + turn[j] @ dP[j]
         speed[j + 1] = speed[j] + turn[j] @ dV[j]
-        pull2[j + 1] = pull2[j] + pull1[j] * step[j] + gravity[j] * step[j] ** 2 / 2.0
-        pull1[j + 1] = pull1[j] + gravity[j] * step[j]
+        gravity2[j + 1] = gravity2[j] + gravity1[j] * step[j] + gravity[j] * step[j] ** 2 / 2.0
+        gravity1[j + 1] = gravity1[j] + gravity[j] * step[j]
     gravity = np.concatenate([gravity, gravity[-1:]])
-    return DeadReckonedSpan(seg, rate, nodes, since, turn, speed, place, gravity, pull1, pull2)
+    return DeadReckonedSpan(
+        seg, rate, nodes, since, turn, speed, place, gravity, gravity1, gravity2
+    )

@@ -34,14 +34,17 @@ from factorgraph_dvl.sensors.dvl import (
 from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.sensors.protocol import Motion
 
-# Error of the velocity that comes from IMU and GNSS, m/s.
+# Error of the velocity that comes from IMU and GNSS, m/s. Chosen: a good receiver's, smoothed.
 _VELOCITY_ERROR = 0.03
+# Least scale of a DVL, and steps of a descent. Chosen: far off what instruments do and need.
 _LEAST_SCALE = 0.2
 _STEPS = 30
-# Rotation, rad, from which on two minima are two.
+# Rotation, rad, from which on two minima are two. Chosen: less than half of what divides starts.
 _APART = 20.0 * DEG
+# Pings that are summed up at most. Chosen: far more than the unknowns ask for.
 _MAX_PINGS = 4000
-# The search for the time offset: a fraction of the period of a vessel's roll, then finer.
+# Steps of the search for the time offset, and its reach, s. Chosen: a fraction of the period of
+# a vessel's roll, then finer.
 _OFFSET_STEP = 0.04
 _OFFSET_FINE = 0.005
 _OFFSET_REACH = 1.0
@@ -108,9 +111,9 @@ def initial_mountings(dvl: Dvl, motion_at: MotionAt) -> list[dict[str, Array]]:
         for step in (_OFFSET_STEP, _OFFSET_FINE):
             count = int(np.ceil(reach / step))
             grid = offset + np.arange(-count, count + 1) * step
-            away = 0.5 * ((grid - offset_prior.mean) / offset_prior.sigma) ** 2
+            prior_cost = 0.5 * ((grid - offset_prior.mean) / offset_prior.sigma) ** 2
             misfit = [_linear_misfit(moments(t)) for t in grid]
-            offset = float(grid[np.argmin(misfit + away)])
+            offset = float(grid[np.argmin(misfit + prior_cost)])
             reach = 2.0 * step
         values[TIME_OFFSET] = np.array([offset])
     found = moments(offset)

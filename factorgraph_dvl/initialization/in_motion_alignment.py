@@ -43,17 +43,22 @@ from factorgraph_dvl.sensors.dvl import (
 from factorgraph_dvl.sensors.gnss import Gnss
 from factorgraph_dvl.trial import Trial
 
-# Velocity error, m/s, that a gyro bias may cause over a window through tilted gravity.
+# Velocity error, m/s, that a gyro bias may cause over a window through tilted gravity, and
+# lengths of windows, s. Chosen: small against the changes of a vessel's velocity.
 _WINDOW_ERROR = 0.2
 _WINDOW_LIMITS = (30.0, 1000.0)
-# Heading standard deviation up to which a window's heading is taken.
+# Heading standard deviation, rad, up to which a window's heading is taken. Chosen: the solver
+# converges from there.
 _HEADING_LIMIT = 5.0 * DEG
-# Fixes this far apart, s, give a mean velocity where the receiver reports none.
+# Fixes this far apart, s, give a mean velocity where the receiver reports none. Chosen: a
+# metre of noise is then 0.3 m/s.
 _BASELINE = 5.0
-# Below this speed, m/s, the course says nothing about the heading.
+# Below this speed, m/s, the course says nothing about the heading. Chosen: drift by wind and sea.
 _LEAST_SPEED = 0.3
-# Between fixes further apart than this, s, the DVL gives the velocity to start from.
+# Between fixes further apart than this, s, the DVL gives the velocity to start from. Chosen:
+# GNSS at 1 Hz may lose two fixes.
 _GNSS_GAP = 3.0
+# Velocities that an alignment takes at least. Chosen.
 _LEAST_PAIRS = 10
 
 
@@ -180,7 +185,7 @@ def _from_velocity(gnss: Gnss, frame: LocalFrame, arc: DeadReckonedSpan) -> _Pai
     return _Pairs(
         time,
         velocity + rotate(body_R, turning),
-        space - arc.pull(at)[0],
+        space - arc.gravity_integrals(at)[0],
         np.sqrt((gnss.velocity_std[use] ** 2).mean(axis=1)),
         v_n,
     )
@@ -199,7 +204,7 @@ def _from_position(gnss: Gnss, frame: LocalFrame, arc: DeadReckonedSpan) -> _Pai
     span = (time[later] - time[earlier])[:, None]
     at, body_R, _, displacement = arc.carry(time)
     body = displacement + rotate(body_R, gnss.lever_arm(time)[0])
-    space = rotate(arc.to_space(time), p_n) - arc.pull(at)[1]
+    space = rotate(arc.to_space(time), p_n) - arc.gravity_integrals(at)[1]
     sigma = np.sqrt((gnss.position_std**2).mean()) * np.sqrt(2.0) / span[:, 0]
     return _Pairs(
         0.5 * (time[later] + time[earlier]),
@@ -226,7 +231,7 @@ def _from_dvl(dvl: Dvl, arc: DeadReckonedSpan) -> _Pairs | None:
     return _Pairs(
         time,
         velocity - rotate(body_R, v_b),
-        -arc.pull(at)[0],
+        -arc.gravity_integrals(at)[0],
         sigma,
         np.zeros_like(v_b),
     )

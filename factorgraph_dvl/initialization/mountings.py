@@ -1,4 +1,4 @@
-"""Where the mountings of the sensors start: from the motion that the others tell."""
+"""Start values of the sensors' mountings, from the motion without these sensors."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _NEAR_FIX = 10.0
 
 
 def mounted_aids(trial: Trial, mountings: dict[str, Array]) -> list[Aid] | None:
-    """Return the sensors that tell the motion before the others have a mounting.
+    """Return the sensors that the motion can be estimated with before the others are mounted.
 
     None where no such motion is needed, because the DVL is calibrated, or not to be had,
     because there is no GNSS.

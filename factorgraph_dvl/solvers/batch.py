@@ -121,7 +121,7 @@ def _prepare(trial: Trial, state_interval_s: float, report: Progress) -> Prepara
 def _with_covariances(
     settled: SettledMinimum, notes: tuple[str, ...], report: Progress
 ) -> SolvedProblem:
-    """Return a minimum with its covariances, and without what the data cannot tell."""
+    """Return a minimum with its covariances, and with undetermined directions fixed."""
     problem, before = settled.problem, settled.minimum
 
     def minimise_again(values: gtsam.Values) -> Minimum:

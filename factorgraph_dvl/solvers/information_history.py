@@ -6,7 +6,7 @@ state with all constants behind it:
     rows = [R over (x_k, c); factors between x_k, x_{k+1} and c]  --QR-->  R' over (x_{k+1}, c).
 
 x_k is eliminated first, so that the triangle that is left over c is the square root of the
-information that all data so far hold on the constants, whatever the states were: their
+information of all data so far on the constants, whatever the states were: their
 marginal information. Nothing is squared (Bierman, Factorization Methods for Discrete
 Sequential Estimation, 1977, ch. VI). At the end it is what the smoother has.
 """
@@ -43,7 +43,7 @@ _BIAS = 6
 
 @dataclass(frozen=True)
 class Frontier:
-    """What is known at a node: square-root information over its state and all constants.
+    """Square-root information at a node over its state and all constants.
 
     Parameters
     ----------
@@ -69,7 +69,8 @@ class _Layout:
         return (index - k) * self.own + offset
 
 
-# Of the trajectory, Hz: angular rates are taken from its attitudes, under sway of some hertz.
+# Rate of the trajectory, Hz. Chosen: angular rates are taken from its attitudes, under sway of
+# some hertz.
 RATE_HZ = 20.0
 
 
@@ -102,7 +103,7 @@ def information_history(found: SolvedProblem) -> InformationHistory:
 def _undetermined(
     problem: Problem, evaluation: Evaluation, nodes: Array, triangles: Array
 ) -> dict[int, Array]:
-    """Return the directions that are not told yet, by entry of the history."""
+    """Return the directions that the data do not determine yet, by entry of the history."""
     size = len(problem.prior_root)
     if size == 0:
         return {}
@@ -127,12 +128,15 @@ def run_filter(
     problem, evaluation : Problem or Evaluation
         Linearised there.
     start : Frontier, optional
-        What is known at the first node; by default the priors in the graph. If it is given, they
-        are left out: it holds them already.
+        Information at the first node; by default the priors in the graph. If it is given, they
+        are left out: it contains them.
 
     Returns
     -------
-    (K, c, c) triangles, and the frontier at the last node.
+    triangles : ndarray, shape (K, c, c)
+        Square-root information on the constants.
+    frontier : Frontier
+        Information at the last node.
     """
     layout, node = _layout(problem)
     nodes = problem.chain.segments.node_time.size
@@ -169,7 +173,7 @@ def _of_one_node(rows: Array, layout: _Layout) -> Array:
 def as_history(
     problem: Problem,
     evaluation: Evaluation,
-    held: Array,
+    fixed: Array,
     triangles: Array,
     undetermined: Mapping[int, Array],
 ) -> InformationHistory:
@@ -179,8 +183,8 @@ def as_history(
     ----------
     problem, evaluation : Problem or Evaluation
         Linearised there.
-    held : ndarray
-        As of `information_history`.
+    fixed : ndarray, shape (P, h)
+        Directions of the parameters that are fixed in the problem.
     triangles : ndarray
         Of `run_filter`.
     undetermined : mapping of int to ndarray
@@ -209,15 +213,15 @@ def as_history(
     def prior(directions: Array) -> Array:
         return prior_along(problem, directions, kept, {})[is_free]
 
-    at_prior = prior(held)
+    at_prior = prior(fixed)
     size = int(is_free.sum())
     root = np.empty((triangles.shape[0], size, size))
     for k, triangle in enumerate(triangles):
         spread = at_prior
         if k in undetermined:
-            hold = np.zeros((undetermined[k].shape[1], triangle.shape[0]))
-            hold[:, columns] = undetermined[k].T @ whiten / FIXED_DIRECTION_STD
-            triangle = _triangle(np.concatenate([triangle, hold]), triangle.shape[0])
+            rows_fixed = np.zeros((undetermined[k].shape[1], triangle.shape[0]))
+            rows_fixed[:, columns] = undetermined[k].T @ whiten / FIXED_DIRECTION_STD
+            triangle = _triangle(np.concatenate([triangle, rows_fixed]), triangle.shape[0])
             spread = np.hstack([at_prior, prior(undetermined[k])])
         inverse, info = dtrtri(triangle)
         if info != 0:

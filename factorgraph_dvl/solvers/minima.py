@@ -20,17 +20,19 @@ from factorgraph_dvl.solvers.preparation import ROUGH_TOLERANCE, Preparation
 from factorgraph_dvl.solvers.rounds import SettledMinimum, settle
 
 # Length, s, up to which start values may lead to a wrong minimum, and standard deviation, rad,
-# of a mounting from which on it may. Measured: simulated turns of 2 s and more.
+# of a mounting from which on it may. Chosen:
+# in so short a time neither heading nor mounting may be known without the DVL.
 _SHORT = 30.0
 _ANY_ANGLE = 45.0 * DEG
 # Headings to start from, rad. Chosen: no heading is more than 45 degrees from one of them.
 _HEADINGS = np.array([0.0, 90.0, 180.0, 270.0]) * DEG
 # Starts that are minimised roughly, those of the lowest cost, and steps for each. Chosen: the
-# search then takes about as long as the solution.
+# four best mountings for each heading.
 _STARTS = 16
 _START_ITERATIONS = 15
 # Cost above the best one from which on a rough minimum is not followed, and angle, rad, up to
-# which two minima are the same. Chosen: a likelihood of e^-30; a third of what separates headings.
+# which two minima are the same. Chosen: a likelihood of e^-30; a sixth of what
+# separates the headings.
 _ROUGHLY_AS_GOOD = 30.0
 _SAME_ANGLE = 15.0 * DEG
 

@@ -79,7 +79,8 @@ class SquareRootInformation:
 
         Returns
         -------
-        Keys to (size, n).
+        dict of int to ndarray
+            Keys to (size, n) matrices.
         """
         width = next(iter(functional.values())).shape[0]
         pending = {key: matrix.T for key, matrix in functional.items()}
@@ -119,7 +120,8 @@ class SquareRootInformation:
 
         Returns
         -------
-        (sum n, sum n) covariance.
+        ndarray, shape (sum n, sum n)
+            Covariance.
         """
         widths = [next(iter(f.values())).shape[0] for f in functionals]
         total = sum(widths)
@@ -189,26 +191,26 @@ class SquareRootInformation:
 class Posterior:
     """Covariances at a minimum.
 
-    Where directions of the parameters are held at their prior because the data do not tell
-    them, motion and biases were estimated as if they were known there. What hangs together
-    with one of them is no better known than it: P + K Kᵀ, with K the change with each
-    direction, for one standard deviation of its prior (Schmidt's consider analysis; Bierman,
+    Directions of the parameters that the data do not determine are fixed at their prior, and
+    motion and biases estimated as if they were exact there. What depends on them has a
+    covariance P + K Kᵀ, with K the change with each direction, for one standard deviation of
+    its prior (Schmidt's consider analysis; Bierman,
     Factorization Methods for Discrete Sequential Estimation, 1977, ch. VIII).
 
     Parameters
     ----------
     information : SquareRootInformation
-        Of all variables, the held directions taken as known.
+        Information on all variables, the fixed directions taken as exact.
     nodes : ndarray, shape (K, 9, 9)
         Covariances of the states, in GTSAM's tangent space, K Kᵀ included.
     given : ndarray, shape (K, 9, 9)
-        Those that are left where the parameters are known.
+        Covariances of the states that are left where the parameters are exact.
     parameters : ndarray, shape (P, P)
         Covariance of the parameters, in the coordinates u of a step S u, S `Problem.prior_root`.
     with_parameters : dict of int to ndarray
         Covariance of states and biases with them, (size, P) by key.
     considered : dict of int to ndarray
-        K of states and biases, (size, h) by key; empty where nothing is held.
+        K of states and biases, (size, h) by key; empty where nothing is fixed.
     """
 
     information: SquareRootInformation
@@ -220,7 +222,7 @@ class Posterior:
 
 
 def posterior(problem: Problem, minimum: Minimum) -> Posterior:
-    """Return the covariances at a minimum that was proven, held directions taken as known."""
+    """Return the covariances at a minimum that was proven, fixed directions taken as exact."""
     assert minimum.tree is not None
     sizes = minimum.evaluation.values.dims()
     information = SquareRootInformation(minimum.tree, sizes)
@@ -239,24 +241,25 @@ def posterior(problem: Problem, minimum: Minimum) -> Posterior:
     return Posterior(information, nodes, given, P, others, {})
 
 
-def changes_with(found: Posterior, held: Array, coupled: Array) -> dict[int, Array]:
+def changes_with(found: Posterior, directions: Array, coupled: Array) -> dict[int, Array]:
     """Return the change K of states and biases with directions, (size, h) by key.
 
     Parameters
     ----------
     found : Posterior
-        Covariances where the directions are not held yet.
-    held : ndarray, shape (P, h)
+        Covariances where the directions are not fixed yet.
+    directions : ndarray, shape (P, h)
         Directions in the coordinates u of a step S u, S `Problem.prior_root`.
     coupled : ndarray, shape (h, h)
-        Projection on those that others hang together with.
+        Projection on those that others depend on.
     """
-    own = held @ np.linalg.inv(held.T @ found.parameters @ held) @ coupled
+    P = directions.T @ found.parameters @ directions
+    own = directions @ np.linalg.inv(P) @ coupled
     return {key: out @ own for key, out in found.with_parameters.items()}
 
 
 def considered(found: Posterior, changes: dict[int, Array]) -> Posterior:
-    """Return covariances where directions are held, with what hangs together with them."""
+    """Return covariances where directions are fixed, with what depends on them."""
     nodes = range(found.nodes.shape[0])
     change = np.stack([changes[keys.node(k)] for k in nodes])
     return replace(

@@ -40,8 +40,12 @@ def predict_posterior(
 
     Returns
     -------
-    A solution whose values are the truth; the information along the trial; what is known
-    at the last node, to go on from.
+    solution : Solution
+        Its values are the truth.
+    history : InformationHistory
+        The information along the trial.
+    frontier : Frontier
+        Information at the last node, to go on from.
     """
     problem, evaluation = _at_truth(trial, true_states)
     triangles, frontier = run_filter(problem, evaluation)
@@ -62,7 +66,7 @@ def predict_posterior(
 def continue_posterior(
     trial: Trial, true_states: TrueStates, start: Frontier
 ) -> tuple[InformationHistory, Frontier]:
-    """Go on from what is known at the end of a trial through another that follows it.
+    """Go on from the information at the end of a trial through another that follows it.
 
     Parameters
     ----------

@@ -13,6 +13,7 @@ from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.solution import Estimate, as_estimates
 
+# Chosen: the DVL first, then the IMU; other parameters follow.
 _FIRST = (
     *("beam_direction", "beam_scale_error", "misalignment", "scale_error", "lever_arm"),
     *("gyro_bias", "accel_bias"),
@@ -76,7 +77,7 @@ def estimates_of(
     covariance = np.zeros((total, total))
     is_free = np.concatenate([np.full(value.size, p.estimated) for p, value in rows])
     covariance[np.ix_(is_free, is_free)] = joint
-    known = np.concatenate([p.sigma == 0.0 for p, _ in rows])
-    covariance[known] = covariance[:, known] = 0.0
+    exact = np.concatenate([p.sigma == 0.0 for p, _ in rows])
+    covariance[exact] = covariance[:, exact] = 0.0
     values = np.concatenate([value for _, value in rows])
     return as_estimates([p for p, _ in rows], values, covariance), covariance

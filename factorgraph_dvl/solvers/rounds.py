@@ -121,7 +121,7 @@ def settle(
 
 
 def _changing(problem: Problem, evaluation: Evaluation) -> list[str]:
-    """Return what of the measurements would be other if the problem were made here."""
+    """Return what of the measurements would differ in a problem that starts here."""
     found = {
         "the times of measurements": problem.needs_rebinding(evaluation.parameters),
         "the weights of measurements": problem.needs_reweighting(evaluation),

@@ -11,14 +11,14 @@ from factorgraph_dvl.sensors.imu import ImuSettings
 from factorgraph_dvl.sensors.protocol import Attitudes
 from factorgraph_dvl.trial import Trial
 
-# States this far apart, s, are as good as denser ones for positions and velocities: every
+# States this far apart, s. Measured: as good as denser ones for positions and velocities: every
 # measurement hangs on the state before it through the increments up to its own time, and
 # the noise of these is left out.
 STATE_INTERVAL = 1.0
 # Share of the variance of the attitudes between two states up to which the noise of the
-# gyros may be left out.
+# gyros may be left out. Chosen: 1 % of a standard deviation.
 _SHARE = 0.02
-# States are not closer than this, s.
+# Least distance of states, s. Chosen: some samples of the IMU.
 CLOSEST = 0.05
 
 

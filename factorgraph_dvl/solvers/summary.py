@@ -142,7 +142,7 @@ def _unobservable(
         if trial.gnss is None:
             return "without GNSS nothing separates the errors of the IMU from the motion"
         return (
-            f"{duration:.0f} s with these manoeuvres do not tell it better than the prior; "
+            f"{duration:.0f} s with these manoeuvres add little to the prior; "
             "it takes longer, or turns and changes of speed"
         )
 

@@ -48,6 +48,7 @@ def trajectory_between(
     frame, body_axes : LocalFrame or BodyAxes
         Of the states, and of what is returned.
     time : ndarray, shape (M,), s
+        When the motion is wanted.
     """
     motion, fraction, node = _smoothed(seg, states, gravity_n, frame.earth_rate, time)
     lat, lon, height = frame.geodetic(motion.p_n)
@@ -87,8 +88,8 @@ def _smoothed(
 ) -> tuple[Motion, Array, np.ndarray]:
     """Return the motion between the nodes, carried forward and closed onto the node after.
 
-    What the IMU misses of the next node's state is its noise over the segment; it is
-    spread in proportion to time.
+    What the IMU is off at the next node is its noise over the segment; it is spread in
+    proportion to time.
     """
     at = attach(seg, time, earth_rate_n)
     motion = motion_at(at, states, gravity_n, earth_rate_n)
@@ -96,9 +97,9 @@ def _smoothed(
     after = seg.origin + 1
     fraction = np.clip(at.tau / seg.duration[at.segment], 0.0, 1.0)
     part = fraction[:, None]
-    miss = log_so3(states.nRb[after] @ ends.nRb.transpose(0, 2, 1))
+    closing = log_so3(states.nRb[after] @ ends.nRb.transpose(0, 2, 1))
     closed = Motion(
-        nRb=exp_so3(part * miss[at.segment]) @ motion.nRb,
+        nRb=exp_so3(part * closing[at.segment]) @ motion.nRb,
         p_n=motion.p_n + part * (states.p_n[after] - ends.p_n)[at.segment],
         v_n=motion.v_n + part * (states.v_n[after] - ends.v_n)[at.segment],
         omega_eb_b=motion.omega_eb_b,

@@ -1,4 +1,4 @@
-"""What the data told of the calibration as time went on: plain numbers between layers."""
+"""Information of the data on the calibration as it grows along a trial."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ class InformationHistory:
     Parameters
     ----------
     time : ndarray, shape (K,)
-        S; the first before any data.
+        Time of the entries, s; the first is before any data.
     names : tuple of str
         (P,) components as in `covariance.order`. Biases that walk are no constants, and not among
         them.

@@ -1,11 +1,11 @@
-"""Information that only the noise of the motion feigns.
+"""Spurious information: what only the noise of the motion adds.
 
 A straight run does not show a rotation of the DVL about the velocity. Linearised at the
-estimated motion it seems to: the estimate wavers by its error, and the Jacobian takes
-that for changes of direction. Thousands of pings then add up to a standard deviation of
-some degrees where nothing is known, and the estimate follows the noise (in regression:
+estimated motion it seems to: the estimate has errors, and the Jacobian takes them for
+changes of direction. Thousands of pings then add up to a standard deviation of
+some degrees where the data say nothing, and the estimate follows the noise (in regression:
 errors in variables). The expected share of that error in the information is computed
-here; where it is most of it, the direction is not observable, and the prior is held.
+here; where it is most of it, the direction is not observable, and stays at the prior.
 """
 
 from __future__ import annotations
@@ -20,15 +20,16 @@ from factorgraph_dvl.graph.problem import Evaluation, Problem
 from factorgraph_dvl.imu.propagation import Attachment
 from factorgraph_dvl.sensors.protocol import Motion, Observation, Values
 
-# Share of the error of the motion in the information from which on it is not believed.
+# Share of spurious information from which on a direction is not observable. Chosen: most of it.
 SPURIOUS = 0.5
-# Information, in units of the prior's, that is not worth the question.
+# Information, in units of the prior's, up to which no share is asked for. Chosen: 5 % of a
+# standard deviation.
 _LITTLE = 0.1
-# Steps of other variables that go with a held direction are genuine from so many times
-# what noise feigns.
+# Steps of other variables with a fixed direction are genuine from so many times the spurious
+# information on. Chosen: three standard deviations.
 _COUPLED = 10.0
-# Genuine information, in the same units, below which a direction is left to the prior once
-# some are feigned.
+# Genuine information, in units of the prior's, below which a direction is left to the prior
+# once some are spurious. Chosen: it leaves 80 % of the prior's standard deviation.
 _GENUINE = 0.5
 
 
@@ -43,37 +44,38 @@ class DataInformation:
     data : ndarray, shape (P, P)
         Information once all other variables are eliminated.
     spurious : ndarray, shape (P, P)
-        Share of it that the error of the motion is expected to feign.
+        Part of it that the error of the motion is expected to add.
     """
 
     data: Array
     spurious: Array
 
     def undetermined_directions(self) -> Array:
-        """Return the directions (P, h) that are not observable, if any is feigned."""
+        """Return the directions (P, h) that are not observable, if any is spurious."""
         return undetermined_directions(self.data, self.spurious)
 
-    def coupled(self, held: Array, full: Array) -> Array:
-        """Return the projection (h, h) on the held directions that other variables go with.
+    def coupled(self, directions: Array, full: Array) -> Array:
+        """Return the projection (h, h) on the directions that other variables depend on.
 
         The step K of the others that goes with one prior's sigma of a direction is worth
-        |K|² in their own information: what they take of that on the direction. Noise
-        feigns such steps too, as large as the information that it feigns.
+        |K|² in their own information: what they take of that on the direction. Noise makes
+        such steps too, as large as its spurious information.
 
         Parameters
         ----------
-        held : ndarray, shape (P, h)
-            Directions.
+        directions : ndarray, shape (P, h)
+            Orthonormal.
         full : ndarray
             `parameter_information`.
         """
         P = np.linalg.inv(self.data + np.eye(len(self.data)))
-        own = np.eye(held.shape[1])
-        taken = held.T @ full @ held + own - np.linalg.inv(held.T @ P @ held)
-        L = np.linalg.cholesky(held.T @ self.spurious @ held + own)
+        own = np.eye(directions.shape[1])
+        taken = directions.T @ full @ directions + own
+        taken -= np.linalg.inv(directions.T @ P @ directions)
+        L = np.linalg.cholesky(directions.T @ self.spurious @ directions + own)
         half = np.linalg.solve(L, taken)
-        share, directions = np.linalg.eigh(np.linalg.solve(L, half.T))
-        spanned = np.linalg.qr(np.linalg.solve(L.T, directions[:, share > _COUPLED]))[0]
+        ratio, vectors = np.linalg.eigh(np.linalg.solve(L, half.T))
+        spanned = np.linalg.qr(np.linalg.solve(L.T, vectors[:, ratio > _COUPLED]))[0]
         return np.asarray(spanned @ spanned.T)
 
 
@@ -90,15 +92,16 @@ def data_information(
     Parameters
     ----------
     problem : Problem
+        What was minimised.
     evaluation : Evaluation
-        At the minimum.
+        Its minimum.
     parameter_covariance : ndarray, shape (P, P)
         In the coordinates u of a step S u, S `Problem.prior_root`.
     state_covariances : ndarray, shape (K, 9, 9)
-        Of the states where the parameters are known, in GTSAM's tangent space.
+        Covariances of the states where the parameters are exact, in GTSAM's tangent space.
     at_truth : bool, default False
-        The motion there is the true one, and feigns nothing: return what will be found once it is
-        estimated.
+        Whether the motion there is the true one, which adds nothing spurious: return what will be
+        found once it is estimated.
     """
     size = len(problem.prior_root)
     if size == 0:
@@ -111,7 +114,7 @@ def data_information(
 
 
 def parameter_information(problem: Problem, evaluation: Evaluation) -> Array:
-    """Return the information (P, P) of the measurements on the parameters, all else known.
+    """Return the information (P, P) of the measurements on the parameters, all else exact.
 
     In the coordinates u of a step S u, S `Problem.prior_root`.
     """
@@ -131,20 +134,21 @@ def parameter_information(problem: Problem, evaluation: Evaluation) -> Array:
 
 
 def spurious_information(problem: Problem, evaluation: Evaluation, nodes: Array) -> Array:
-    """Return the information that the error of the motion feigns, by node.
+    """Return the spurious information by node.
 
     Parameters
     ----------
     problem, evaluation : Problem or Evaluation
         Linearised there.
     nodes : ndarray, shape (K, 9, 9)
-        Covariances of the states, in GTSAM's tangent space, where the parameters are known: an
-        error that all states share turns the Jacobians alike, and feigns no change.
+        Covariances of the states, in GTSAM's tangent space, where the parameters are exact: an
+        error that all states share turns the Jacobians alike, and adds nothing.
 
     Returns
     -------
-    (K, P, P) expected share of the measurements that hang on each node, in the coordinates
-    u of a step S u, S `Problem.prior_root`.
+    ndarray, shape (K, P, P)
+        Expected information of the measurements that depend on each node, in the coordinates u
+        of a step S u, S `Problem.prior_root`.
     """
     root = problem.prior_root
     out = np.zeros((nodes.shape[0], len(root), len(root)))
@@ -173,14 +177,14 @@ def spurious_information(problem: Problem, evaluation: Evaluation, nodes: Array)
 
 
 def undetermined_directions(data: Array, spurious: Array) -> Array:
-    """Return the directions (P, h) that are not observable, if any is feigned.
+    """Return the directions (P, h) that are not observable, if any is spurious.
 
     Parameters
     ----------
     data : ndarray, shape (P, P)
-        Information of the data, beside the prior's identity; what is feigned included.
+        Information of the data, beside the prior's identity; what is spurious included.
     spurious : ndarray, shape (P, P)
-        That share of it.
+        That part of it.
     """
     if not data.size or not largest_spurious_share(data, spurious) >= SPURIOUS:
         return np.zeros((data.shape[0], 0))
@@ -189,7 +193,7 @@ def undetermined_directions(data: Array, spurious: Array) -> Array:
 
 
 def largest_spurious_share(data: Array, spurious: Array) -> Array:
-    """Return the largest share of feigned information in any direction, (...).
+    """Return the largest share of spurious information in any direction, (...).
 
     Parameters
     ----------
@@ -219,8 +223,8 @@ def at_prior_along(
     prior = problem.prior_values()
     root = problem.prior_root
     for _ in range(10):
-        away = np.linalg.solve(root, problem.difference(parameters, prior))
-        step = -directions @ (directions.T @ away)
+        offset = np.linalg.solve(root, problem.difference(parameters, prior))
+        step = -directions @ (directions.T @ offset)
         parameters = problem.moved(parameters, root @ step)
     return parameters
 
@@ -234,7 +238,7 @@ def spurious_by(
     values: Values,
     wanted: Sequence[str],
 ) -> Array:
-    """Return what the motion's error is expected to add by measurement, (M, p, p), SI.
+    """Return the spurious information by measurement, (M, p, p), SI.
 
     Parameters
     ----------
@@ -268,12 +272,12 @@ def spurious_by(
     out = np.zeros((attachment.node.size, size, size))
     for k in range(3):
         axis = np.eye(3)[k]
-        waver = rotate(motion.nRb, root[:, :, k])
-        push = rotate(motion.nRb, attachment.force_sigma[:, None] * axis)
+        velocity_error = rotate(motion.nRb, root[:, :, k])
+        acceleration_error = rotate(motion.nRb, attachment.force_sigma[:, None] * axis)
         for changed in (
-            replace(motion, v_n=motion.v_n + waver),
+            replace(motion, v_n=motion.v_n + velocity_error),
             replace(motion, omega_eb_b=motion.omega_eb_b + motion.omega_sigma * axis),
-            replace(motion, a_n=motion.a_n + push),
+            replace(motion, a_n=motion.a_n + acceleration_error),
             replace(motion, alpha_b=motion.alpha_b + attachment.alpha_sigma[:, None] * axis),
         ):
             change = (jacobian(changed) - base) * weight[:, :, None]

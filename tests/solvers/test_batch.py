@@ -3,23 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from exactness import INITIAL, assert_exact, pull
-from problems import SHORT, problem_of
+from problems import SHORT
 from truth import CONING, config, scenario
 
 from factorgraph_dvl.analysis.error_statistics import calibration_errors, trajectory_errors
-from factorgraph_dvl.errors import ConfigError, DataError, SolveError
+from factorgraph_dvl.errors import ConfigError, DataError
 from factorgraph_dvl.geometry.units import DEG
-from factorgraph_dvl.graph.problem import Problem
 from factorgraph_dvl.simulation import simulate
 from factorgraph_dvl.solution import not_told_apart
-from factorgraph_dvl.solvers import minima
 from factorgraph_dvl.solvers.batch import solve
-from factorgraph_dvl.solvers.levenberg_marquardt import minimise
 
 STRAIGHT = {"manoeuvres": [{"straight_s": 60}], "sway": {}}
 
@@ -249,34 +245,6 @@ def test_residuals_of_an_honest_trial_are_white_and_unit():
         assert abs(z.mean()) * np.sqrt(z.size) < 4.0
 
 
-def test_giving_up_is_reported():
-    problem, values = problem_of(scenario(manoeuvres=SHORT))
-    minimum = minimise(problem, values, stage="test", max_iterations=1)
-    assert not minimum.converged
-    assert minimum.iterations == 1
-    calls = []
-    minimum = minimise(
-        problem, values, stage="test", progress=lambda *a: calls.append(a), max_iterations=30
-    )
-    assert minimum.converged
-    assert calls[0][:2] == ("test", 0)
-    costs = np.array([c[2] for c in calls])
-    assert np.all(np.diff(costs) <= 1e-12 * costs[:-1])
-    assert minimum.evaluation.cost == pytest.approx(costs[-1])
-    # Once more from there, it stays.
-    again = minimise(problem, minimum.evaluation.values, stage="test")
-    assert again.iterations == 1
-    assert again.evaluation.cost == pytest.approx(minimum.evaluation.cost, abs=1e-5)
-
-
-def test_a_cost_that_is_not_finite_is_refused():
-    problem, values = problem_of(scenario(manoeuvres=SHORT))
-    name = problem.parameters[1].name
-    values.update(problem.key(name), np.full(problem.parameters[1].mean.size, np.nan))
-    with pytest.raises(SolveError, match="not finite"):
-        minimise(problem, values, stage="test")
-
-
 @pytest.mark.parametrize("name", ["rate_hz", "state_interval_s"])
 @pytest.mark.parametrize("value", [0.0, -1.0, np.nan, np.inf])
 def test_settings_out_of_range_are_refused(name, value):
@@ -346,57 +314,6 @@ def test_noise_in_proportion_to_speed_leaves_the_scale_alone():
         errors += list((found.value - trial.calibration_truth["scale_error"]) / found.std)
     # By the measured speed it would be 0.005 too small.
     assert abs(np.mean(errors)) < 2.5 / np.sqrt(len(errors))
-
-
-def unsettled(monkeypatch, name, answer):
-    monkeypatch.setattr(Problem, name, answer)
-    return solve(simulate(scenario(manoeuvres=SHORT, noise=True), seed=1), rate_hz=1.0)
-
-
-def test_what_never_settles_is_named(monkeypatch):
-    solution = unsettled(monkeypatch, "needs_reweighting", lambda *_: True)
-    assert not solution.converged
-    assert any("the weights of measurements still changed" in w for w in solution.warnings)
-
-
-def test_a_measurement_at_its_gate_is_used_and_named(monkeypatch):
-    def outliers(problem, _):
-        return {} if problem.rejected else {"DVL velocity": np.array([1.0])}
-
-    solution = unsettled(monkeypatch, "outliers", outliers)
-    assert solution.converged
-    assert any(w.startswith("DVL velocity: 1 at the gate") for w in solution.warnings)
-    assert not solution.rejected
-
-
-def test_outliers_that_never_repeat_do_not_settle(monkeypatch):
-    def outliers(problem, _):
-        times = problem.rejected.get("DVL velocity", np.zeros(0))
-        return {"DVL velocity": np.append(times, 1.0 + times.size)}
-
-    solution = unsettled(monkeypatch, "outliers", outliers)
-    assert not solution.converged
-    assert any("which measurements are echoes still changed" in w for w in solution.warnings)
-
-
-def test_a_ping_counts_as_evidence_by_any_of_its_beams():
-    residual = np.array([[0.0, 3.0, 4.0], [0.0, 0.0, 0.0]])
-    weight = np.array([[0.0, 1.0, 1.0], [0.0, 0.0, 0.0]])
-    problem = SimpleNamespace(observations=[SimpleNamespace(gate=2.0)], weights=[weight])
-    minimum = SimpleNamespace(evaluation=SimpleNamespace(residuals=[residual], cost=20.0))
-    terms = minima.cost_terms(SimpleNamespace(problem=problem, minimum=minimum))
-    np.testing.assert_allclose(terms, [12.5, 2.0, 7.5])
-
-
-@pytest.mark.parametrize(("mounting", "seed"), [([180, 0, 0], 1), ([180, 0, 0], 6)])
-def test_two_seconds_lead_to_no_mirrored_mounting(mounting, seed):
-    turn = [{"turn_deg_s": 6, "duration_s": 2, "ramp_s": 0.5}]
-    scene = scenario(noise=True, manoeuvres=turn, dvl={"misalignment_deg": mounting})
-    trial = simulate(scene, seed)
-    solution = solve(trial, rate_hz=1.0)
-    errors = calibration_errors(solution, trial.calibration_truth)
-    seen = np.concatenate([e.observable for e in solution.estimates])
-    assert np.all(np.abs(errors.error[seen]) < 5.0 * errors.std[seen])
 
 
 def test_minima_that_the_data_do_not_tell_apart_are_mixed():

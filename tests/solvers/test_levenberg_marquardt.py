@@ -1,0 +1,39 @@
+"""Levenberg-Marquardt: costs that fall, giving up, costs that are no numbers."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from problems import SHORT, problem_of
+from truth import scenario
+
+from factorgraph_dvl.errors import SolveError
+from factorgraph_dvl.solvers.levenberg_marquardt import minimise
+
+
+def test_giving_up_is_reported():
+    problem, values = problem_of(scenario(manoeuvres=SHORT))
+    minimum = minimise(problem, values, stage="test", max_iterations=1)
+    assert not minimum.converged
+    assert minimum.iterations == 1
+    calls = []
+    minimum = minimise(
+        problem, values, stage="test", progress=lambda *a: calls.append(a), max_iterations=30
+    )
+    assert minimum.converged
+    assert calls[0][:2] == ("test", 0)
+    costs = np.array([c[2] for c in calls])
+    assert np.all(np.diff(costs) <= 1e-12 * costs[:-1])
+    assert minimum.evaluation.cost == pytest.approx(costs[-1])
+    # Once more from there, it stays.
+    again = minimise(problem, minimum.evaluation.values, stage="test")
+    assert again.iterations == 1
+    assert again.evaluation.cost == pytest.approx(minimum.evaluation.cost, abs=1e-5)
+
+
+def test_a_cost_that_is_not_finite_is_refused():
+    problem, values = problem_of(scenario(manoeuvres=SHORT))
+    name = problem.parameters[1].name
+    values.update(problem.key(name), np.full(problem.parameters[1].mean.size, np.nan))
+    with pytest.raises(SolveError, match="not finite"):
+        minimise(problem, values, stage="test")

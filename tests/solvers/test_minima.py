@@ -1,0 +1,34 @@
+"""Several minima of short trials, and the evidence for each."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from truth import scenario
+
+from factorgraph_dvl.analysis.error_statistics import calibration_errors
+from factorgraph_dvl.simulation import simulate
+from factorgraph_dvl.solvers import minima
+from factorgraph_dvl.solvers.batch import solve
+
+
+def test_a_ping_counts_as_evidence_by_any_of_its_beams():
+    residual = np.array([[0.0, 3.0, 4.0], [0.0, 0.0, 0.0]])
+    weight = np.array([[0.0, 1.0, 1.0], [0.0, 0.0, 0.0]])
+    problem = SimpleNamespace(observations=[SimpleNamespace(gate=2.0)], weights=[weight])
+    minimum = SimpleNamespace(evaluation=SimpleNamespace(residuals=[residual], cost=20.0))
+    terms = minima.cost_terms(SimpleNamespace(problem=problem, minimum=minimum))
+    np.testing.assert_allclose(terms, [12.5, 2.0, 7.5])
+
+
+@pytest.mark.parametrize(("mounting", "seed"), [([180, 0, 0], 1), ([180, 0, 0], 6)])
+def test_two_seconds_lead_to_no_mirrored_mounting(mounting, seed):
+    turn = [{"turn_deg_s": 6, "duration_s": 2, "ramp_s": 0.5}]
+    scene = scenario(noise=True, manoeuvres=turn, dvl={"misalignment_deg": mounting})
+    trial = simulate(scene, seed)
+    solution = solve(trial, rate_hz=1.0)
+    errors = calibration_errors(solution, trial.calibration_truth)
+    seen = np.concatenate([e.observable for e in solution.estimates])
+    assert np.all(np.abs(errors.error[seen]) < 5.0 * errors.std[seen])
