@@ -32,7 +32,7 @@ from factorgraph_dvl.geometry.rotations import (
     wrapped,
 )
 from factorgraph_dvl.geometry.units import DEG, DEG_PER_HOUR, MICRO_G
-from factorgraph_dvl.geometry.vectors import Array, interpolate, rotate, skew
+from factorgraph_dvl.geometry.vectors import Array, cross_variance, interpolate, rotate, skew
 from factorgraph_dvl.imu.increments import increments
 from factorgraph_dvl.sensors.gnss import Gnss
 from factorgraph_dvl.trial import Trial
@@ -318,10 +318,7 @@ def _fixes_at(gnss: Gnss, samples: StrapdownSamples, time: Array) -> Fixes:
     arm_std = float(np.max(gnss.settings.lever_arm_std_m))
     _, signal = at_times(samples, time)
     omega_sigma = signal.omega_sigma
-    # Across the lever arm, where it is largest: half the trace of the covariance.
-    squares = lever_arm**2
-    across = squares.sum(axis=1, keepdims=True) - squares
-    gyro_noise = 0.5 * np.sum(omega_sigma**2 * across, axis=1)
+    gyro_noise = cross_variance(omega_sigma, lever_arm**2)
     turned = arm_std**2 * np.sum(signal.omega**2, axis=1)
     out["sp"][at] = gnss.position_std[inside] ** 2 + arm_std**2
     out["sv"][at] = gnss.velocity_std[inside] ** 2 + (gyro_noise + turned)[at, None]

@@ -13,7 +13,7 @@ from factorgraph_dvl.geometry.rotations import (
     exp_so3,
 )
 from factorgraph_dvl.geometry.units import DEG
-from factorgraph_dvl.geometry.vectors import Array, rotate
+from factorgraph_dvl.geometry.vectors import Array, cross_variance, rotate
 from factorgraph_dvl.sensors.parameters import Parameter
 
 # Chosen: prior standard deviation beyond which a misalignment may be anything.
@@ -67,20 +67,13 @@ class Points:
         """Return the velocity at the DVL, in body, (M, 3)."""
         return self.v_b + np.cross(self.omega_b, lever_arm)
 
-    def lever_arm_variance(self, square: Array) -> Array:
-        """Return the variance of omega x l, (M,), for squared components `square` of l.
-
-        Across the lever arm, where it is largest: half the trace of the covariance.
-        """
-        return 0.5 * (self.omega_sigma**2 @ (square.sum() - square))
-
     def covariance_d(self, dRb: Array, lever_arm: Array) -> Array:
         """Return the covariance (M, 3, 3) of measured - predicted, in d.
 
         The error of SINS/GNSS counts as if it were new at every ping.
         """
         out = dRb @ self.v_b_covariance @ dRb.T
-        diagonal = self.sigma_d**2 + self.lever_arm_variance(lever_arm**2)[:, None]
+        diagonal = self.sigma_d**2 + cross_variance(self.omega_sigma, lever_arm**2)[:, None]
         return out + diagonal[:, :, None] * np.eye(3)
 
 

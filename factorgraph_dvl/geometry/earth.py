@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 
 from factorgraph_dvl.geometry.vectors import Array, skew
 
+# Defining and derived constants of WGS-84, SI: NIMA TR8350.2, third edition, chapter 3.
 RATE = 7.292115e-5
 SEMI_MAJOR = 6378137.0
 FLATTENING = 1.0 / 298.257223563

@@ -40,6 +40,16 @@ def interpolate(time: Array, knots: Array, values: Array) -> Array:
     return at.reshape(time.size, *values.shape[1:])
 
 
+def cross_variance(omega_sigma: Array, squares: Array) -> Array:
+    """Return the variance, (M,), of omega x l across l, where it is largest.
+
+    Half the trace of the covariance, by standard deviations of omega (M, 3) and the squared
+    components of l, (3,) or (M, 3).
+    """
+    across = squares.sum(axis=-1, keepdims=True) - squares
+    return np.asarray(0.5 * np.sum(omega_sigma**2 * across, axis=1))
+
+
 def rotate(matrices: Array, vectors: Array) -> Array:
     """Return the products of matrices (M, 3, 3) and vectors (M, 3) or (3,), as (M, 3)."""
     return np.asarray(np.matmul(matrices, vectors[..., None])[..., 0])

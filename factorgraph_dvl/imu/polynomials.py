@@ -9,6 +9,7 @@ import numpy as np
 
 from factorgraph_dvl.geometry.vectors import Array, cross
 
+# Gauss-Legendre quadrature with three nodes on [0, 1]: exact up to degree five.
 _GAUSS_NODES = np.array([0.5 - np.sqrt(15.0) / 10.0, 0.5, 0.5 + np.sqrt(15.0) / 10.0])
 _GAUSS_WEIGHTS = np.array([5.0, 8.0, 5.0]) / 18.0
 

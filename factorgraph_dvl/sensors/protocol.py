@@ -9,7 +9,7 @@ from typing import Any, ClassVar, Protocol, Self, runtime_checkable
 import numpy as np
 
 from factorgraph_dvl.geometry.earth import LocalFrame
-from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.geometry.vectors import Array, cross_variance
 from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.settings.sections import Section
 
@@ -215,9 +215,6 @@ class AttitudeAid(Aid, Protocol):
 def lever_arm_sigma(motion: Motion, lever_arm: Array) -> Array:
     """Return the standard deviation, (M,), m/s, of omega x l from that of omega.
 
-    Across the lever arm, (3,) or (M, 3), where it is largest: half the trace of the
-    covariance.
+    Across the lever arm, (3,) or (M, 3), where it is largest.
     """
-    l2 = lever_arm**2
-    across = l2.sum(axis=-1, keepdims=True) - l2
-    return np.asarray(np.sqrt(0.5 * np.sum(motion.omega_sigma**2 * across, axis=1)))
+    return np.sqrt(cross_variance(motion.omega_sigma, lever_arm**2))
