@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
+import numpy as np
 from truth import merged
 
 from factorgraph_dvl.simulation import parse_scenario, simulate_planar
 
-_BASE = {
+BASE = {
     "name": "test",
     "start": {
         "lat_deg": 24.9955,
@@ -35,4 +38,49 @@ _BASE = {
 
 
 def trial(seed=0, **changes):
-    return simulate_planar(parse_scenario(merged(_BASE, changes)), seed)
+    return simulate_planar(parse_scenario(merged(BASE, changes)), seed)
+
+
+ALL_CONSTANTS = {
+    "heading": {"bias_deg": 1.0, "bias_std_deg": 2.0},
+    "log": {"scale_error": 0.02, "scale_error_std": 0.03},
+    "beacons": {
+        "positions": {
+            "B1": {"lat_deg": 25.0, "lon_deg": 135.0, "height_m": -80},
+            "B2": {"lat_deg": 25.004, "lon_deg": 135.004, "height_m": -90, "std_m": 2},
+        },
+        "sound_speed_error": 0.003,
+        "sound_speed_error_std": 0.004,
+        "lever_arm_m": [0.5, 2.0, -1.0],
+    },
+}
+
+
+STRAIGHT = {"manoeuvres": [{"straight_s": 300}]}
+
+
+def truth(t, time):
+    r = t.reference
+    geodetic = [np.interp(time, r.time, r.geodetic[:, i]) for i in range(3)]
+    return t.frame().position(*geodetic)[:, :2]
+
+
+def true_state(t, problem):
+    p = truth(t, problem.time)
+    parts = [t.calibration_truth[c.name] * c.si for c in problem.constants]
+    return np.column_stack([p, np.zeros_like(p)]), np.concatenate(parts)
+
+
+def error_of(t, solution):
+    track = solution.trajectory
+    return t.frame().position(*track.geodetic.T)[:, :2] - truth(t, track.time)
+
+
+def without(record, first, last):
+    """Return the record of heading or log without what lies between two times."""
+    kept = (record.time <= first) | (record.time >= last)
+    name = "heading" if record.label == "Heading" else "speed"
+    out = {"time": record.time[kept], name: getattr(record, name)[kept]}
+    if name == "speed":
+        out["starboard"] = record.starboard[kept]
+    return replace(record, **out)

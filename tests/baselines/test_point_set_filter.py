@@ -1,0 +1,81 @@
+"""The seven-state filter: its measurement matrix, its accuracy on the published scenario."""
+
+from __future__ import annotations
+
+import os
+
+import numpy as np
+import pytest
+from kalman_trials import LEVER_ARM, MISALIGNMENT, SCALE, exact_points
+from truth import config
+
+from factorgraph_dvl.analysis.error_statistics import (
+    calibration_errors,
+    paper_accuracy,
+)
+from factorgraph_dvl.baselines import calibrate, kalman
+from factorgraph_dvl.baselines.point_set_filter import measurement_matrix, point_set
+from factorgraph_dvl.geometry.rotations import exp_so3
+from factorgraph_dvl.simulation import simulate
+
+SEEDS = int(os.environ.get("FACTORGRAPH_DVL_SEEDS", "50"))
+
+
+def test_the_measurement_matrix_is_that_of_the_format():
+    rng = np.random.default_rng(1)
+    v, omega = rng.normal(size=3), rng.normal(size=3)
+
+    def z(x):
+        return (1 + x[3]) * exp_so3(x[:3]) @ (v + np.cross(omega, x[4:])) - v
+
+    step = 1e-6
+    numeric = np.stack([(z(step * e) - z(-step * e)) / (2 * step) for e in np.eye(7)], axis=1)
+    np.testing.assert_allclose(measurement_matrix(v[None], omega[None])[0], numeric, atol=1e-8)
+
+
+@pytest.mark.parametrize("phase", ["0", "90"])
+def test_seven_states_reach_the_accuracy_of_the_paper(phase):
+    trial = simulate(config(f"seed-a-phase-{phase}"), 0)
+    solution, history = calibrate(trial)
+    assert paper_accuracy(solution.estimates, trial.calibration_truth) > 97.3
+    assert history.names[:4] == (
+        "misalignment_x_deg",
+        "misalignment_y_deg",
+        "misalignment_z_deg",
+        "scale_error",
+    )
+    assert np.all(np.diff(history.time) > 0)
+    assert history.std[-1, 2] < 1e-3 * history.std[0, 2]
+    np.testing.assert_allclose(history.values[-1, 2], 30.0, atol=0.2)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("phase", ["0", "90"])
+def test_seven_states_over_seeds(phase):
+    accuracy, normalised = [], []
+    for seed in range(min(SEEDS, 20)):
+        trial = simulate(config(f"seed-a-phase-{phase}"), seed)
+        solution = kalman(trial)
+        accuracy.append(paper_accuracy(solution.estimates, trial.calibration_truth))
+        errors = calibration_errors(solution, trial.calibration_truth)
+        normalised.append(errors.normalised)
+    assert np.mean(accuracy) > 98.5
+    ratio = np.sqrt(np.mean(np.square(normalised), axis=0))
+    # The heading error of SINS/GNSS stays the same from ping to ping, and the filter takes
+    # it for new each time.
+    assert ratio[2] > 2.0
+    # The SINS/GNSS filter itself is honest.
+    assert np.all(ratio[7:] < 1.6)
+
+
+@pytest.mark.parametrize("turn", [[0.05, 0.02, -0.03], [0.0, 0.0, 3.0]], ids=str)
+def test_without_noise_it_is_exact(turn):
+    arm = np.array([1.0, -0.5, 2.0])
+    points = exact_points(misalignment=turn, scale=0.02, arm=arm)
+    outcome = point_set(points, MISALIGNMENT, SCALE, LEVER_ARM)
+    assert outcome.converged
+    dRb, scale, found = outcome.estimated.values
+    # The priors of 0.1 and 10 m draw by less than these.
+    np.testing.assert_allclose(dRb, exp_so3(turn), atol=1e-4)
+    np.testing.assert_allclose(scale, 0.02, atol=1e-5)
+    np.testing.assert_allclose(found, arm, atol=1e-3)
