@@ -85,7 +85,9 @@ def run(*args):
 
 
 def test_command_line(tmp_path, capsys):
-    trial = write_trial(tmp_path, simulate(scenario(noise=True), 0))
+    # Wahba takes the lever arm as known.
+    claims = {"dvl": {"lever_arm_m": [1, 1.2, 1.4]}}
+    trial = write_trial(tmp_path, simulate(scenario(noise=True, trial=claims), 0))
     out = tmp_path / "out"
     assert [m.value for m in KalmanMethod if not m.planar] == list(METHODS)
     assert run("kalman", trial, "--out", out, "--quiet", "--no-figures", "--rate", "5") == 0
