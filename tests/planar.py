@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 from truth import merged
 
+from factorgraph_dvl.geometry.vectors import interpolate
 from factorgraph_dvl.simulation import parse_scenario, simulate_planar
 
 BASE = {
@@ -61,8 +62,7 @@ STRAIGHT = {"manoeuvres": [{"straight_s": 300}]}
 
 def truth(t, time):
     r = t.reference
-    geodetic = [np.interp(time, r.time, r.geodetic[:, i]) for i in range(3)]
-    return t.frame().position(*geodetic)[:, :2]
+    return t.frame().position(*interpolate(time, r.time, r.geodetic).T)[:, :2]
 
 
 def true_state(t, problem):
