@@ -163,8 +163,9 @@ class Problem:
         self.rejected: Mapping[str, Array] = {}
         self._start = {**self.prior_values(), **(start or {})}
         self._bound: list[_Bound] = []
+        moved = self.moved(self._start, self._prior_sigma())
         for observation in observations:
-            self._bound.append(self._bind(observation))
+            self._bound.append(self._bind(observation, moved))
         blocks: dict[tuple[str, ...], _Block] = {}
         for bound in self._bound:
             used = tuple(p for p in self.parameters if p.name in bound.observation.parameters)
@@ -212,7 +213,7 @@ class Problem:
             out.insert(self._key[p.name], gtsam.Rot3(value) if p.rotation else value)
         return out
 
-    @property
+    @cached_property
     def columns(self) -> dict[str, slice]:
         """Place of every estimated parameter among all of them."""
         ends = np.cumsum([p.mean.size for p in self.parameters])
@@ -256,6 +257,8 @@ class Problem:
             Values of the parameters there.
         """
         gain = directions.T @ np.linalg.inv(self.prior_root) / FIXED_DIRECTION_STD
+        # Copies of the problem stay as they are.
+        self.graph = gtsam.NonlinearFactorGraph(self.graph)
         self.graph.add(linear_prior(self.parameters, self._key, np.asarray(gain, float), origin))
 
     def evaluate(self, values: gtsam.Values) -> Evaluation:
@@ -371,9 +374,9 @@ class Problem:
         bias = np.broadcast_to(bias, (n, _BIAS))
         return States(nRb, p_n, v_n, gyro_bias=bias[:, 3:], accel_bias=bias[:, :3])
 
-    def _bind(self, observation: Observation) -> _Bound:
+    def _bind(self, observation: Observation, moved: dict[str, Array]) -> _Bound:
         time = observation.true_time(self._start)
-        later = observation.true_time(self.moved(self._start, self._prior_sigma()))
+        later = observation.true_time(moved)
         # A measurement whose time is yet to be found must not leave the record on the way.
         margin = 0.0 if np.array_equal(time, later) else _TIME_MARGIN
         locate = self.chain.segments.increments.locate

@@ -38,7 +38,8 @@ def star_findings(star: Star, trial: Trial) -> Iterator[Finding]:
         yield Finding(
             "error",
             star.label,
-            "trial.yaml has no `epoch`, and stars tell the attitude only at a known time",
+            "trial.yaml has no `epoch` (UTC of time_s = 0), and stars tell the attitude only at a "
+            "known time",
             "no_epoch",
         )
     for text in star.consistency_warnings():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import replace
 
 import gtsam
@@ -12,9 +13,18 @@ from factorgraph_dvl.graph.priors import ConstantsPrior
 from factorgraph_dvl.ranging.hypothesis_weights import significant_costs
 from factorgraph_dvl.ranging.position_from_ranges import StartPositions
 from factorgraph_dvl.solution import Progress, Solution, ambiguity, joined, not_told_apart
-from factorgraph_dvl.solvers.fixed_directions import SolvedProblem, with_covariances
+from factorgraph_dvl.solvers.fixed_directions import (
+    SolvedProblem,
+    undetermined_there,
+    with_covariances,
+)
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, minimise
-from factorgraph_dvl.solvers.minima import competing_minima, cost_terms, evidence_against
+from factorgraph_dvl.solvers.minima import (
+    competing_minima,
+    cost_terms,
+    distinct,
+    evidence_against,
+)
 from factorgraph_dvl.solvers.preparation import Preparation, prepare
 from factorgraph_dvl.solvers.rounds import SettledMinimum, settle
 from factorgraph_dvl.solvers.state_times import STATE_INTERVAL
@@ -61,10 +71,13 @@ def solve(
     prepared = _prepare(trial, state_interval_s, report)
     solutions, terms = [], []
     for states in prepared.start_positions.states:
-        minima = [
-            _with_covariances(each, prepared.notes, report)
-            for each in competing_minima(prepared, states, report)
-        ]
+        minima = distinct(
+            prepared,
+            [
+                _with_covariances(each, prepared.notes, report)
+                for each in competing_minima(prepared, states, report)
+            ],
+        )
         against = np.array([evidence_against(each) for each in minima])
         summaries = [summarise(trial, each, rate_hz=rate_hz) for each in minima]
         solutions.append(not_told_apart(summaries, against))
@@ -129,13 +142,17 @@ def _with_covariances(
         again = minimise(problem, values, stage=stage, progress=report)
         return replace(
             again,
-            converged=before.converged and again.converged,
             iterations=before.iterations + again.iterations,
         )
 
     report("covariance", 0, None)
     notes = (*notes, *settled.notes)
-    return with_covariances(problem, before, minimise_again, notes=notes)
+    free = copy(problem)
+    solved = with_covariances(problem, before, minimise_again, notes=notes)
+    if before.converged or not solved.minimum.converged:
+        return solved
+    converged = settled.settled and undetermined_there(solved, free)
+    return replace(solved, minimum=replace(solved.minimum, converged=converged))
 
 
 def _silent(stage: str, iteration: int, cost: float | None) -> None:

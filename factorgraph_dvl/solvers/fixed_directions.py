@@ -3,19 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import gtsam
+import numpy as np
 
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph.problem import Problem
-from factorgraph_dvl.solvers.levenberg_marquardt import Minimum
+from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, eliminate
 from factorgraph_dvl.solvers.posterior import Posterior, changes_with, considered, posterior
 from factorgraph_dvl.statistics.spurious_information import (
     at_prior_along,
     data_information,
     parameter_information,
 )
+
+# Cosine of the largest angle between spans of directions that are the same. Chosen: 26 degrees.
+_SAME_DIRECTIONS = 0.9
 
 
 @dataclass(frozen=True)
@@ -84,3 +88,28 @@ def with_covariances(
         minimum = minimise_again(problem.values(evaluation.states, origin))
         covariances = considered(posterior(problem, minimum), changes)
     return SolvedProblem(problem, minimum, covariances, fixed, notes)
+
+
+def undetermined_there(solved: SolvedProblem, free: Problem) -> bool:
+    """Whether the directions that are fixed, and no others, are undetermined at a minimum.
+
+    Where descent did not end they were found short of one: along what only noise shows, it
+    may go on for ever.
+
+    Parameters
+    ----------
+    solved : SolvedProblem
+        With fixed directions.
+    free : Problem
+        The same problem without.
+    """
+    evaluation = solved.minimum.evaluation
+    gaussian = free.linearize(evaluation)
+    tree = eliminate(gaussian, free.ordering(gaussian))
+    covariances = posterior(free, replace(solved.minimum, tree=tree))
+    information = data_information(free, evaluation, covariances.parameters, covariances.given)
+    directions = information.undetermined_directions()
+    if directions.shape != solved.fixed.shape:
+        return False
+    cosines = np.linalg.svd(directions.T @ solved.fixed, compute_uv=False)
+    return bool(cosines.min() > _SAME_DIRECTIONS)

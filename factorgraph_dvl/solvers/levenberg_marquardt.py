@@ -20,6 +20,11 @@ _TRUSTED_STATE = np.repeat([0.05, 5.0, 0.5], 3)
 # Damping that a failed step begins with, and at which the search ends. Chosen: from hardly any
 # to no step at all.
 _FIRST_DAMPING = 1e-4
+# Share of the promised decrease above which a step is damped less next time, and below which more
+# (Marquardt's usual choice). In between the damping is right: along a direction that is hardly
+# observable, each step with less damping goes too far.
+_GOOD_GAIN = 0.75
+_POOR_GAIN = 0.25
 _MAX_DAMPING = 1e12
 # Relative error of a cost that sums up 1e5 squares. Chosen: above that of double precision.
 _ROUNDING = 1e-12
@@ -121,13 +126,17 @@ def minimise(
         lower = trial.cost <= evaluation.cost * (1.0 + _ROUNDING)
         small = promised < tolerance
         if np.isfinite(trial.cost) and (lower or small):
+            gain = (evaluation.cost - trial.cost) / promised if promised > 0.0 else 1.0
             if lower:
                 evaluation = trial
             if progress:
                 progress(stage, iteration, evaluation.cost)
             if small and damping == 0.0 and (tree is not None or not proven):
                 return Minimum(evaluation, tree, True, iteration)
-            damping = damping / 10.0 if damping > _FIRST_DAMPING else 0.0
+            if small or gain > _GOOD_GAIN:
+                damping = damping / 10.0 if damping > _FIRST_DAMPING else 0.0
+            elif gain < _POOR_GAIN:
+                damping *= 10.0
             gaussian = problem.linearize(evaluation)
         elif not careful and tree is None:
             # The step may have been bad for want of digits only.

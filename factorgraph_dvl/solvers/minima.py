@@ -114,7 +114,9 @@ def _rough_minima(prepared: Preparation, first: SettledMinimum, states: States) 
 
 
 def _is_among(
-    minima: Sequence[SettledMinimum], one: Evaluation, rotations: Sequence[Parameter]
+    minima: Sequence[SettledMinimum] | Sequence[SolvedProblem],
+    one: Evaluation,
+    rotations: Sequence[Parameter],
 ) -> bool:
     """Whether attitude and mountings are those of another minimum, as far as angles tell."""
     for each in minima:
@@ -124,6 +126,26 @@ def _is_among(
         if all(float(np.linalg.norm(log_so3(a.T @ b))) < _SAME_ANGLE for a, b in pairs):
             return True
     return False
+
+
+def distinct(prepared: Preparation, minima: Sequence[SolvedProblem]) -> list[SolvedProblem]:
+    """Return the most probable of the minima that are the same now, once for each.
+
+    Some differed only along what the data do not determine, which is fixed at the prior since.
+
+    Parameters
+    ----------
+    prepared : Preparation
+        What all started from.
+    minima : sequence of SolvedProblem
+        With their covariances.
+    """
+    rotations = [p for p in prepared.parameters if p.rotation and p.estimated]
+    out: list[SolvedProblem] = []
+    for each in sorted(minima, key=evidence_against):
+        if not _is_among(out, each.minimum.evaluation, rotations):
+            out.append(each)
+    return out
 
 
 def evidence_against(found: SolvedProblem) -> float:

@@ -36,12 +36,15 @@ class SettledMinimum:
         What the last round minimised.
     minimum : Minimum
         Where it ended, with the iterations of all rounds.
+    settled : bool
+        Whether the problem no longer changes, whatever the minimum.
     notes : tuple of str
         What the user must know.
     """
 
     problem: Problem
     minimum: Minimum
+    settled: bool
     notes: tuple[str, ...]
 
 
@@ -115,9 +118,8 @@ def settle(
             f"after {_ROUNDS} rounds {', '.join(changing)} still changed: the solution is none",
         )
     converged = minimum.converged and not changing
-    return SettledMinimum(
-        problem, replace(minimum, converged=converged, iterations=iterations), notes
-    )
+    minimum = replace(minimum, converged=converged, iterations=iterations)
+    return SettledMinimum(problem, minimum, not changing, notes)
 
 
 def _changing(problem: Problem, evaluation: Evaluation) -> list[str]:

@@ -516,6 +516,9 @@ def test_no_epoch(folder, tmp_path, capsys, command):
     (folder / "trial.yaml").write_text("\n".join(x for x in lines if not x.startswith("epoch")))
     code, shown = run(capsys, *command, folder, "--out", tmp_path / "out", "--quiet")
     assert code == 2
+    assert "trial.yaml has no `epoch`" in shown.err
+    code, shown = run(capsys, *command, folder, "--out", tmp_path / "out", "--quiet", "--anyway")
+    assert code == 2
     assert "key epoch" in shown.err
     assert not (tmp_path / "out").exists()
     assert any("epoch" in f.text for f in survey(load_trial(folder)).problems)
