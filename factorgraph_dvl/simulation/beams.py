@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from factorgraph_dvl.geometry.rotations import rotation_from_rph
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array
-from factorgraph_dvl.sensors.dvl_beams import BEAM_PREFIX, DvlBeams, DvlBeamsSettings
+from factorgraph_dvl.sensors.dvl_beams import DvlBeams, DvlBeamsSettings
 from factorgraph_dvl.sensors.turntable import Turntable, TurntableSettings
 from factorgraph_dvl.simulation.instruments import DvlBeamsTruth
 from factorgraph_dvl.simulation.measurements import apply, sample_times, within
@@ -44,7 +44,7 @@ def simulate_beams(
     for item in truth.lost:
         velocity[within(time, [(item.from_s, item.to_s)]), item.beam - 1] = np.nan
     settings = cast("DvlBeamsSettings", scenario.settings("dvl_beams"))
-    prefix = BEAM_PREFIX if scenario.dvl is not None else ""
+    prefix = "beam_" if scenario.dvl is not None else ""
     calibration = {f"{prefix}lever_arm_m": np.array(truth.lever_arm_m)}
     if settings.parametrisation == "beams":
         calibration |= {"beam_direction_b": directions, "beam_scale_error": scale}
