@@ -13,7 +13,8 @@ from factorgraph_dvl.geometry.rotations import BodyAxes, wrapped
 from factorgraph_dvl.geometry.unit_vectors import turned
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array
-from factorgraph_dvl.sensors.parameters import Parameter
+from factorgraph_dvl.sensors.catalogue import specs_of
+from factorgraph_dvl.sensors.parameters import SCALAR, Parameter, ParameterSpec
 from factorgraph_dvl.sensors.protocol import DO_NOT_FIT, TOO_LARGE
 
 # Called on the way to a solution: with the stage, what is counted in it, and the cost if any.
@@ -108,6 +109,14 @@ class Estimate:
     prior_std: Array
     observable: np.ndarray
     nominal: Array | None = None
+
+    @property
+    def spec(self) -> ParameterSpec:
+        """What the parameter is; one that no sensor has is a number without a unit."""
+        found = specs_of(self.name)
+        return found.get(self.value.size) or next(
+            iter(found.values()), ParameterSpec(self.name, labels=SCALAR)
+        )
 
     @property
     def directions(self) -> Array:
@@ -499,7 +508,7 @@ def not_told_apart(solutions: Sequence[Solution], against: Array) -> Solution:
         f"{e.name} {np.round(e.value, 1).tolist()}"
         for i in order[1:]
         for e in solutions[i].estimates
-        if e.name.endswith("misalignment_deg")
+        if e.spec.kind == "rotation"
     )
     return replace(
         best,

@@ -16,7 +16,7 @@ from factorgraph_dvl.sensors.beacon import Beacons
 from factorgraph_dvl.sensors.beam_geometry import as_dvl
 from factorgraph_dvl.sensors.depth import Depth
 from factorgraph_dvl.sensors.dvl import Dvl
-from factorgraph_dvl.sensors.dvl_beams import DvlBeams
+from factorgraph_dvl.sensors.dvl_beams import BEAM_PREFIX, DvlBeams
 from factorgraph_dvl.sensors.fingerprint import fingerprints, shared
 from factorgraph_dvl.sensors.gnss import Gnss
 from factorgraph_dvl.sensors.imu import Imu
@@ -120,7 +120,7 @@ class Trial:
 
     def __post_init__(self) -> None:
         # What a sensor must know of another is set here, whoever made or changed the trial.
-        prefix = "beam_" if self.dvl is not None else ""
+        prefix = BEAM_PREFIX if self.dvl is not None else ""
         for i, aid in enumerate(self.others):
             if isinstance(aid, DvlBeams) and aid.prefix != prefix:
                 renamed = replace(aid, prefix=prefix)

@@ -16,7 +16,10 @@ from factorgraph_dvl.sensors.imu import Imu
 PACKAGE = Path(factorgraph_dvl.__file__).parent
 ROOT = PACKAGE.parent
 # Data classes of the sensors: no measurement equation is among them.
-SENSOR_DATA = ("Imu", "ImuSettings", "Gnss", "Dvl", "Star", "Aid", "Parameter", "Motion")
+SENSOR_DATA = (
+    *("Imu", "ImuSettings", "Gnss", "Dvl", "Star", "Aid", "Motion"),
+    *("Parameter", "SPEC"),
+)
 # GTSAM, SciPy and Matplotlib take most of a second to load: only what needs none of them may
 # be imported where the command line starts.
 LIGHT = ("errors", "settings", "cli")

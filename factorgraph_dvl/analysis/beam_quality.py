@@ -19,7 +19,7 @@ from factorgraph_dvl.sensors.beam_geometry import (
     groups,
     velocities,
 )
-from factorgraph_dvl.sensors.dvl_beams import DIRECTION, SCALE_ERROR, DvlBeams
+from factorgraph_dvl.sensors.dvl_beams import BEAM_PREFIX, DIRECTION, SCALE_ERROR, DvlBeams
 from factorgraph_dvl.solution import Calibration, Solution, values_of
 
 # Chosen: a beam further from its nominal direction than this many standard deviations, and
@@ -139,7 +139,7 @@ def beam_calibration(
     s = beams.settings
     n = len(s.nominal_d)
     # Of beams beside a DVL, the names without a prefix are those of the DVL.
-    prefix = "beam_" if "beam_lever_arm_m" in values else beams.prefix
+    prefix = BEAM_PREFIX if "beam_lever_arm_m" in values else beams.prefix
     if DIRECTION in values:
         prefix = prefix if f"{prefix}lever_arm_m" in values else ""
         rows = values[DIRECTION]

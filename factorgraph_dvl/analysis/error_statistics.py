@@ -20,6 +20,7 @@ from factorgraph_dvl.geometry.rotations import (
 from factorgraph_dvl.geometry.unit_vectors import turns_to
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.sensors.dvl import LEVER_ARM, MISALIGNMENT, SCALE_ERROR
 from factorgraph_dvl.solution import Estimate, Solution, Trajectory
 from factorgraph_dvl.trial import Reference
 
@@ -27,8 +28,7 @@ from factorgraph_dvl.trial import Reference
 _COINCIDENT_S = 1e-6
 # Chosen: at 20 Hz, cubics follow a wave of 1 Hz to 0.03 % of its amplitude.
 _LONGEST_INTERVAL_S = 0.05
-ROTATION_VECTORS = ("misalignment_deg", "star_mounting_deg", "beam_misalignment_deg")
-_PAPER_PARAMETERS = ("misalignment_deg", "scale_error", "lever_arm_m")
+_PAPER_PARAMETERS = (MISALIGNMENT, SCALE_ERROR, LEVER_ARM)
 
 
 @dataclass(frozen=True)
@@ -255,7 +255,7 @@ def true_value_of(estimate: Estimate, truth: Mapping[str, ArrayLike]) -> Array |
     if value.size not in (1, estimate.value.size):
         return None
     value = np.broadcast_to(value, estimate.value.shape).copy()
-    if estimate.name in ROTATION_VECTORS:
+    if estimate.spec.kind == "rotation":
         return nearest_rotation_vector(value, estimate.value)
     return value
 

@@ -13,13 +13,14 @@ from factorgraph_dvl.errors import DataError
 from factorgraph_dvl.geometry.rotations import BodyAxes, exp_so3, frd_from_body, wrapped
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.sensors.dvl import LEVER_ARM, MISALIGNMENT, SCALE_ERROR
 from factorgraph_dvl.sensors.dvl_beams import DIRECTION
 from factorgraph_dvl.solution import Calibration, Solution
 
 # Intrinsic orders: ZYX is yaw, then pitch, then roll; the angles are given as roll, pitch, yaw.
 Order = Literal["ZYX", "XYZ"]
 ORDERS: tuple[Order, ...] = ("ZYX", "XYZ")
-NEEDED = ("misalignment_deg", "scale_error", "lever_arm_m")
+NEEDED = (MISALIGNMENT, SCALE_ERROR, LEVER_ARM)
 # Chosen: step, deg, of the numerical derivative; the cube root of a double's precision.
 _STEP = 1e-6
 
@@ -88,7 +89,7 @@ def instrument_of(calibration: Calibration | Solution) -> InstrumentTerms:
                 hint="Write the matrix of the beams with: factorgraph-dvl correct TRIAL "
                 "CALIBRATION --out DIR" if beams else "",
             )  # fmt: skip
-    alpha, covariance = parts["misalignment_deg"]
+    alpha, covariance = parts[MISALIGNMENT]
     frd = frd_from_body(calibration.body_axes)
     # TRDI's instrument axes of a DVL that looks down, aligned: starboard, forward, up.
     trdi = frd_from_body("RFU")
@@ -114,8 +115,8 @@ def instrument_of(calibration: Calibration | Solution) -> InstrumentTerms:
         return np.array([-yaw, roll, pitch])
 
     alignment = angles(trdi_angles)
-    lever_arm, lever_covariance = parts["lever_arm_m"]
-    scale, scale_covariance = parts["scale_error"]
+    lever_arm, lever_covariance = parts[LEVER_ARM]
+    scale, scale_covariance = parts[SCALE_ERROR]
     return InstrumentTerms(
         dvl_in_body={order: rpy(order, inverse=True) for order in ORDERS},
         body_to_dvl={order: rpy(order, inverse=False) for order in ORDERS},

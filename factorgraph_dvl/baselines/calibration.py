@@ -21,7 +21,7 @@ from factorgraph_dvl.baselines.summary import WHITE_NOISE, dvl_residuals, sensor
 from factorgraph_dvl.baselines.wahba import wahba
 from factorgraph_dvl.errors import ConfigError, DataError
 from factorgraph_dvl.imu.timestamps import JUMP, without_strays
-from factorgraph_dvl.sensors.dvl import Dvl
+from factorgraph_dvl.sensors.dvl import SCALE_SPEC, Dvl
 from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.solution import Progress, Solution
 from factorgraph_dvl.trial import Trial
@@ -224,14 +224,7 @@ def _calibrate(method: DvlMethod, points_at: Callable[[float], Points], dvl: Dvl
 
 def _single(scale: Parameter) -> Parameter:
     """Return one scale error for all axes."""
-    return Parameter(
-        scale.stem,
-        scale.unit,
-        scale.si,
-        np.array([scale.mean.mean()]),
-        np.array([scale.sigma.max()]),
-        labels=("",),
-    )
+    return Parameter(SCALE_SPEC, np.array([scale.mean.mean()]), np.array([scale.sigma.max()]))
 
 
 def _neglects(method: DvlMethod, dvl: Dvl) -> list[str]:

@@ -21,6 +21,7 @@ from factorgraph_dvl.baselines.outcome import Estimated, Outcome, history_rows, 
 from factorgraph_dvl.baselines.point_sets import Points, misfit, rotation_starts
 from factorgraph_dvl.geometry.rotations import exp_so3, log_so3
 from factorgraph_dvl.geometry.vectors import Array, rotate, skew
+from factorgraph_dvl.sensors.dvl import SCALES_SPEC
 from factorgraph_dvl.sensors.parameters import Parameter
 
 # Chosen: prior standard deviation of the bias, m/s, where the trial fixes it: the method
@@ -66,7 +67,7 @@ def nine_state(
         scale,
         mean=np.broadcast_to(scale.mean, 3).copy(),
         sigma=np.broadcast_to(scale.sigma, 3).copy(),
-        labels=("x", "y", "z"),
+        spec=SCALES_SPEC,
     )
     parameters = (misalignment, scale, bias)
     prior = prior_of(parameters)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator
 from itertools import islice
 from pathlib import Path
@@ -17,6 +16,7 @@ from factorgraph_dvl.geometry.rotations import BodyAxes
 from factorgraph_dvl.geometry.unit_vectors import turns_to
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.sensors.catalogue import specs_of
 from factorgraph_dvl.sensors.dvl import CALIBRATED
 from factorgraph_dvl.sensors.fingerprint import PATTERN
 from factorgraph_dvl.settings.files import MEGABYTE, read_bytes
@@ -25,9 +25,6 @@ from factorgraph_dvl.solution import Calibration, Estimate, Solution
 
 CALIBRATION_FILE = "calibration.json"
 
-# Of components, in their order; those of beams are numbered.
-_LABELS = ("x", "y", "z", "e", "n", "u")
-_NUMBERED = re.compile(r"([1-9]\d?)([xy]?)")
 # The covariance of some hundred parameters.
 _MAX_BYTES = 64 * MEGABYTE
 # Of a variance, for files with few digits.
@@ -127,8 +124,11 @@ def check_values(name: str, value: Array, source: str) -> None:
         raise DataError(f"{name} holds no number", where=source, expected="finite values")
     if wrong := out_of_range(name, np.ravel(value).tolist()):
         raise DataError(wrong, where=source)
-    if name.endswith("scale_error") and np.min(value) <= -1.0:
-        raise DataError(f"{name} is {np.min(value):g}", where=source, expected="numbers above -1")
+    above = max((spec.above for spec in specs_of(name).values()), default=-np.inf)
+    if np.min(value) <= above:
+        raise DataError(
+            f"{name} is {np.min(value):g}", where=source, expected=f"numbers above {above:g}"
+        )
 
 
 def encode_calibration(solution: Solution | Calibration) -> bytes:
@@ -228,36 +228,28 @@ def _check_sizes(name: str, parameter: _Parameter, source: str) -> None:
 
 
 def _rows(calibration: _File, source: str) -> list[int]:
-    """Return the rows of the covariance in the order of the parameters, by their names."""
-    left = dict(enumerate(calibration.covariance.order))
+    """Return the rows of the covariance in the order of the parameters, by their names.
+
+    Of a parameter that no sensor has, the components stand together, and where it does.
+    """
+    row = {name: i for i, name in enumerate(calibration.covariance.order)}
     out: list[int] = []
+    known = {n: specs_of(n).get(_size(p)) for n, p in calibration.parameters.items()}
+    claimed = {name for spec in known.values() if spec for name in spec.component_names}
+    others = iter([i for name, i in row.items() if name not in claimed])
     for name, parameter in calibration.parameters.items():
-        own = {i: label for i, n in left.items() if (label := _label(n, name)) is not None}
-        if len(own) != _size(parameter) or len(set(own.values())) != len(own):
+        spec = known[name]
+        size = _size(parameter)
+        own = map(row.get, spec.component_names) if spec else islice(others, size)
+        found = [i for i in own if i is not None]
+        if len(found) != size:
             raise DataError(
                 f"`covariance.order` does not name the components of {name}",
                 where=source,
                 expected="each once, such as lever_arm_x_m, lever_arm_y_m, lever_arm_z_m",
             )
-        out += sorted(own, key=lambda i: own[i])
-        left = {i: n for i, n in left.items() if i not in own}
+        out += found
     return out
-
-
-def _label(component: str, name: str) -> int | None:
-    """Return the place of a component in its parameter, None if it is not one of it."""
-    if component == name:
-        return 0
-    # Directions have a frame where other parameters have a unit.
-    name = f"{name.removesuffix('_b')}_deg" if name.endswith("_b") else name
-    parts = component.split("_")
-    for i, label in enumerate(parts):
-        if "_".join(parts[:i] + parts[i + 1 :]) == name:
-            if label in _LABELS:
-                return _LABELS.index(label)
-            if numbered := _NUMBERED.fullmatch(label):
-                return 2 * int(numbered[1]) + (numbered[2] == "y")
-    return None
 
 
 def _check_std(calibration: _File, covariance: Array, source: str) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Union, cast
@@ -28,8 +27,9 @@ from factorgraph_dvl.io.motion_table import read_reference
 from factorgraph_dvl.io.solution_folder import STD_COLUMNS, TRAJECTORY_FILE, load_solution
 from factorgraph_dvl.io.tables import read_table
 from factorgraph_dvl.io.trial_folder import TRUTH_FILE, load_reference
-from factorgraph_dvl.sensors.catalogue import every_parameter
-from factorgraph_dvl.sensors.parameters import Parameter
+from factorgraph_dvl.sensors.beacon import ANY_BEACON, offset_name
+from factorgraph_dvl.sensors.catalogue import BEACON_OFFSET, every_spec, specs_of
+from factorgraph_dvl.sensors.dvl_beams import DIRECTION, direction_spec
 from factorgraph_dvl.sensors.records import check_range, stack
 from factorgraph_dvl.settings.ranges import out_of_range
 from factorgraph_dvl.settings.sections import Section
@@ -37,34 +37,12 @@ from factorgraph_dvl.settings.yaml_file import parse_yaml, read_text
 from factorgraph_dvl.solution import Estimate, Solution, Trajectory
 from factorgraph_dvl.trial import Reference
 
-_MOST_BEAMS = 16
 _UNIT = 1e-3
 _TABLES = (".csv", ".parquet", ".pq")
 _TEXTS = (".json", ".yaml", ".yml")
 _STD_GROUPS = {"m": STD_COLUMNS[0:3], "m/s": STD_COLUMNS[3:6], "deg": STD_COLUMNS[6:9]}
-# Stands for the name of any beacon.
-_ANY = "NAME"
-_BEACON = re.compile(r"beacon_([^\s\"':,{}]+)_offset_m\b")
-
-
-def _known(beacon: str = _ANY) -> dict[str, dict[int, Parameter]]:
-    """Return the parameters that a file may hold, by name and number of components."""
-    out: dict[str, dict[int, Parameter]] = {}
-    for p in every_parameter(_MOST_BEAMS, beacon):
-        if p.nominal is None:
-            out.setdefault(p.name, {})[p.mean.size] = p
-    return out
-
-
-def _choices(name: str) -> dict[int, Parameter]:
-    """Return what a parameter may be, by its number of components."""
-    beacon = _BEACON.fullmatch(name)
-    return _KNOWN[name] if beacon is None else _known(beacon[1])[name]
-
-
-_KNOWN = _known()
-# Directions are unit vectors, with standard deviations in pairs.
-_DIRECTIONS = "beam_direction_b"
+# Names of parameters that a file may hold; those of beacons are in its text.
+_KNOWN = tuple(dict.fromkeys(s.name for s in every_spec() if s.kind != "directions"))
 
 _Numbers = float | list[float | None]
 _Vectors = list[tuple[float, float, float]]
@@ -111,8 +89,8 @@ class _Parameters(Section, frozen=True, kw_only=True):
     def __post_init__(self) -> None:
         super().__post_init__()
         for name, given in self.given().items():
-            if name != _DIRECTIONS:
-                _check_sizes(name, given, list(_choices(name)))
+            if name != DIRECTION:
+                _check_sizes(name, given, list(specs_of(name)))
                 numbers = _array(given.value)
                 if wrong := out_of_range(name, numbers[~np.isnan(numbers)].tolist()):
                     raise ValueError(wrong)
@@ -140,10 +118,10 @@ class _File(_Parameters, frozen=True, kw_only=True):
 
 def _file_type(text: str) -> type[_File]:
     """Return the type of a file that may hold all parameters, and those of its beacons."""
-    names = [n for n in _KNOWN if _ANY not in n]
-    names += sorted({m[0] for m in _BEACON.finditer(text)})
+    names = [name for name in _KNOWN if name != offset_name(ANY_BEACON)]
+    names += sorted({m[0] for m in BEACON_OFFSET.finditer(text)})
     fields: list[Any] = [(name, _Given, UNSET) for name in names]
-    fields.append((_DIRECTIONS, _Directions | UnsetType, UNSET))
+    fields.append((DIRECTION, _Directions | UnsetType, UNSET))
     options: dict[str, Any] = {"frozen": True, "kw_only": True}
     nested = msgspec.defstruct("_Parameters", fields, bases=(_Parameters,), **options)
     whole = [*fields, ("parameters", Union[nested, UnsetType], UNSET)]  # noqa: UP007
@@ -379,7 +357,7 @@ def _estimate(name: str, given: _Value | _Directions) -> Estimate:
     observable = True if isinstance(given.observable, UnsetType) else given.observable
     return Estimate(
         name,
-        _choices(name)[value.size].component_names,
+        specs_of(name)[value.size].component_names,
         value,
         std if std.size else unknown,
         unknown,
@@ -396,7 +374,7 @@ def _direction_estimate(name: str, given: _Directions) -> Estimate:
     observable = True if isinstance(given.observable, UnsetType) else given.observable
     return Estimate(
         name,
-        tuple(f"beam_direction_{i + 1}{axis}_deg" for i in range(n) for axis in "xy"),
+        direction_spec(n).component_names,
         np.zeros(2 * n),
         unknown if isinstance(given.std, UnsetType) else _array(given.std).ravel(),
         unknown,

@@ -34,17 +34,14 @@ from factorgraph_dvl.io.trial_yaml import (
     TrialSettings,
     to_yaml,
 )
-from factorgraph_dvl.sensors.beacon import Beacons
-from factorgraph_dvl.sensors.catalogue import AIDS
-from factorgraph_dvl.sensors.depth import Depth
-from factorgraph_dvl.sensors.dvl import CALIBRATED, SCALE_ERROR, TIME_OFFSET, Dvl
+from factorgraph_dvl.sensors.catalogue import AIDS, PLANAR, specs_of
+from factorgraph_dvl.sensors.dvl import CALIBRATED, Dvl
 from factorgraph_dvl.sensors.dvl_beams import DvlBeams
 from factorgraph_dvl.sensors.gnss import Gnss
 from factorgraph_dvl.sensors.imu import Imu
 from factorgraph_dvl.sensors.parameters import JointPrior
 from factorgraph_dvl.sensors.protocol import Aid, SensorRecord, SensorSection
 from factorgraph_dvl.sensors.records import check_possible
-from factorgraph_dvl.sensors.speed_log import Heading, SpeedLog
 from factorgraph_dvl.settings.files import MEGABYTE, read_bytes
 from factorgraph_dvl.settings.yaml_file import parse_yaml, read_text
 from factorgraph_dvl.solution import Calibration, Estimate
@@ -53,8 +50,7 @@ from factorgraph_dvl.trial import InitialAttitude, InitialPosition, Reference, T
 TRUTH_FILE = "truth.json"
 # Where a trial that was loaded with a calibration of its DVL keeps it when it is saved.
 PRIOR_FILE = "dvl-calibration.json"
-_PLANAR: tuple[type[SensorRecord], ...] = (Heading, SpeedLog, Depth, Beacons)
-_TABLES = dict.fromkeys(("imu", *(kind.section for kind in (*AIDS, *_PLANAR)), "reference"))
+_TABLES = dict.fromkeys(("imu", *(kind.section for kind in (*AIDS, *PLANAR)), "reference"))
 OWNED = (
     SETTINGS_FILE,
     TRUTH_FILE,
@@ -67,9 +63,6 @@ OWNED = (
 _SIMULATED = "# Simulated by factorgraph-dvl"
 # Keys whose values are names of files.
 _NAMING = ("file", "calibration", "trajectory")
-
-# Numbers that a parameter of the DVL may have.
-_SIZES = {name: (3,) for name in CALIBRATED} | {SCALE_ERROR: (1, 3), TIME_OFFSET: (1,)}
 
 _Sensor = TypeVar("_Sensor", bound=SensorRecord)
 
@@ -310,10 +303,12 @@ def calibrated_by(dvl: Dvl, calibration: Calibration, body_axes: BodyAxes, sourc
     at = 0
     for e in calibration.estimates:
         if e.name in CALIBRATED:
-            if e.value.size not in _SIZES[e.name]:
-                expected = " or ".join(map(str, _SIZES[e.name]))
+            sizes = specs_of(e.name)
+            if e.value.size not in sizes:
                 raise DataError(
-                    f"{e.name} has {e.value.size} numbers", where=source, expected=expected
+                    f"{e.name} has {e.value.size} numbers",
+                    where=source,
+                    expected=" or ".join(map(str, sizes)),
                 )
             values[e.name] = e.value
             rows += range(at, at + e.value.size)
@@ -333,7 +328,7 @@ def _calibration_of(prior: JointPrior, trial: Trial) -> Calibration:
     estimates = []
     for name, value in prior.values.items():
         std = prior.std(name)
-        names = next(p for p in _dvl(trial).parameters() if p.name == name).component_names
+        names = specs_of(name)[value.size].component_names
         known = np.ones(value.size, dtype=bool)
         unknown = np.full(value.size, np.nan)
         estimates.append(Estimate(name, names, value, std, unknown, unknown, known))
@@ -348,11 +343,6 @@ def _calibration_of(prior: JointPrior, trial: Trial) -> Calibration:
         covariance=prior.covariance,
         inputs=prior.inputs,
     )
-
-
-def _dvl(trial: Trial) -> Dvl:
-    assert trial.dvl is not None
-    return trial.dvl
 
 
 class _Kind(msgspec.Struct):

@@ -24,7 +24,9 @@ from factorgraph_dvl.ranging.planar_solution import measurements, reported_hypot
 from factorgraph_dvl.ranging.planar_track import PlanarTrack
 from factorgraph_dvl.ranging.problem import RangingSetup, ranging_setup
 from factorgraph_dvl.sensors.beacon import Beacons
+from factorgraph_dvl.sensors.dvl import CURRENT_SPEC
 from factorgraph_dvl.sensors.parameters import Parameter
+from factorgraph_dvl.sensors.speed_log import HEADING_BIAS_SPEC, LOG_SCALE_SPEC
 from factorgraph_dvl.solution import Hypothesis
 from factorgraph_dvl.trial import InitialPosition, Trial
 
@@ -139,11 +141,9 @@ def _setup_of(
     scale = np.array([_SCALE])
     parameters = (
         *beacons.parameters(),
-        Parameter("log_scale_error", "", 1.0, np.zeros(1), scale, labels=("",)),
-        Parameter("heading_bias", "deg", DEG, np.zeros(1), np.array([_HEADING]), labels=("",)),
-        Parameter(
-            "current", "m_s", 1.0, np.zeros(2), np.full(2, _CURRENT * drifts), labels=("e", "n")
-        ),
+        Parameter(LOG_SCALE_SPEC, np.zeros(1), scale),
+        Parameter(HEADING_BIAS_SPEC, np.zeros(1), np.array([_HEADING])),
+        Parameter(CURRENT_SPEC, np.zeros(2), np.full(2, _CURRENT * drifts)),
     )
     arm_n = states.nRb @ np.array(beacons.settings.lever_arm_m)
     return ranging_setup(track, arm_n, beacons, parameters, frame, first)

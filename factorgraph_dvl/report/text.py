@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import math
 
-_UNITS = {"deg_h": "deg/h", "m_s": "m/s", "deg": "deg", "ug": "µg", "m": "m", "s": "s"}
+from factorgraph_dvl.sensors.parameters import UNITS
+
 # Chosen: fewer than the digits of a double.
 _MAX_DECIMALS = 12
 
 
 def split_unit(component: str) -> tuple[str, str]:
     """Split `lever_arm_x_m` into `lever_arm_x` and a unit to show, empty if there is none."""
-    for suffix, unit in _UNITS.items():
-        if component.endswith(f"_{suffix}"):
-            return component.removesuffix(f"_{suffix}"), unit
+    parts = component.split("_")
+    for i in range(1, len(parts)):
+        unit = UNITS.get("_".join(parts[i:]))
+        if unit is not None:
+            return "_".join(parts[:i]), unit.text
     return component, ""
 
 

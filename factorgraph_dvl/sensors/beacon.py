@@ -15,7 +15,7 @@ from factorgraph_dvl.errors import DataError
 from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.units import GEODETIC_SI
 from factorgraph_dvl.geometry.vectors import Array, rotate, skew
-from factorgraph_dvl.sensors.parameters import Parameter
+from factorgraph_dvl.sensors.parameters import SCALAR, Parameter, ParameterSpec
 from factorgraph_dvl.sensors.protocol import (
     Linearization,
     Motion,
@@ -31,12 +31,25 @@ RANGE = "range_m"
 RANGE_RATE = "range_rate_m_s"
 NAME = "beacon"
 
-SOUND_SPEED_ERROR = "sound_speed_error"
+_SOUND_SPEED = ParameterSpec("sound_speed_error", labels=SCALAR)
+SOUND_SPEED_ERROR = _SOUND_SPEED.name
 
 # A measurement this many standard deviations off is no measurement but an echo.
 GATE = 3.5
 
 _NAMES = re.compile(r"[A-Za-z0-9_-]+")
+# Stands for the name of any beacon in the names of parameters.
+ANY_BEACON = "NAME"
+
+
+def _offset_spec(beacon: str) -> ParameterSpec:
+    """Return what the error of a beacon's stated place is."""
+    return ParameterSpec(f"beacon_{beacon}_offset", "m", labels=("e", "n", "u"), frame="n")
+
+
+def offset_name(beacon: str) -> str:
+    """Return the name of the parameter that says how far a beacon is off its stated place."""
+    return _offset_spec(beacon).name
 
 
 class BeaconPosition(Section, frozen=True, kw_only=True):
@@ -103,6 +116,7 @@ class Beacons:
     section_type: ClassVar[type[SensorSection]] = BeaconSettings
     required: ClassVar[tuple[str, ...]] = ("time_s", NAME)
     optional: ClassVar[tuple[tuple[str, ...], ...]] = ((RANGE,), (RANGE_RATE,))
+    specs: ClassVar[tuple[ParameterSpec, ...]] = (_SOUND_SPEED, _offset_spec(ANY_BEACON))
 
     def __post_init__(self) -> None:
         check_times(self.time, self.source)
@@ -152,23 +166,9 @@ class Beacons:
         """Return the error of the sound speed, and how far each beacon is off its place."""
         s = self.settings
         return (
-            Parameter(
-                SOUND_SPEED_ERROR,
-                "",
-                1.0,
-                np.zeros(1),
-                np.array([s.sound_speed_error_std]),
-                labels=("",),
-            ),
+            Parameter(_SOUND_SPEED, np.zeros(1), np.array([s.sound_speed_error_std])),
             *(
-                Parameter(
-                    f"beacon_{name}_offset",
-                    "m",
-                    1.0,
-                    np.zeros(3),
-                    np.full(3, position.std_m),
-                    labels=("e", "n", "u"),
-                )
+                Parameter(_offset_spec(name), np.zeros(3), np.full(3, position.std_m))
                 for name, position in s.positions.items()
             ),
         )
@@ -187,9 +187,7 @@ class Beacons:
                 m = (self.name == name) & ~np.isnan(values)
                 if m.any():
                     arm = np.array(s.lever_arm_m)
-                    out.append(
-                        kind(self.time[m], values[m], std, place_n, nRl, arm, offset_name(name))
-                    )
+                    out.append(kind(self.time[m], values[m], std, place_n, nRl, arm, name))
         return tuple(out)
 
     def explain(self, parameter: str, component: int, motion: Motion | None) -> str:
@@ -209,11 +207,6 @@ class Beacons:
         )
 
 
-def offset_name(beacon: str) -> str:
-    """Return the name of the parameter that says how far a beacon is off its stated place."""
-    return f"beacon_{beacon}_offset_m"
-
-
 @dataclass(frozen=True)
 class _ToBeacon:
     """What range and range rate to one beacon share.
@@ -231,8 +224,8 @@ class _ToBeacon:
         East, north, up at the beacon to n.
     arm_b : ndarray, shape (3,)
         Lever arm of the vehicle's transponder, in body, m.
-    offset : str
-        Name of the parameter of the beacon's own place.
+    beacon : str
+        Its name.
     """
 
     time: Array
@@ -241,12 +234,17 @@ class _ToBeacon:
     place_n: Array
     nRl: Array
     arm_b: Array
-    offset: str
+    beacon: str
 
     @property
     def gate(self) -> float | None:
         """Standard deviations from which on a range is that of an echo."""
         return GATE
+
+    @property
+    def offset(self) -> str:
+        """Name of the parameter of the beacon's own place."""
+        return offset_name(self.beacon)
 
     @property
     def parameters(self) -> tuple[str, ...]:
@@ -281,7 +279,7 @@ class BeaconRange(_ToBeacon):
     @property
     def label(self) -> str:
         """Name of the measurement, for people."""
-        return f"Beacon {self.offset.removeprefix('beacon_').removesuffix('_offset_m')} range"
+        return f"Beacon {self.beacon} range"
 
     def sigma(self, motion: Motion, values: Values) -> Array:
         """Return the standard deviations."""
@@ -326,7 +324,7 @@ class BeaconRangeRate(_ToBeacon):
     @property
     def label(self) -> str:
         """Name of the measurement, for people."""
-        return f"Beacon {self.offset.removeprefix('beacon_').removesuffix('_offset_m')} range rate"
+        return f"Beacon {self.beacon} range rate"
 
     def sigma(self, motion: Motion, values: Values) -> Array:
         """Return the standard deviations, the gyro's share through the lever arm included."""

@@ -2,71 +2,46 @@
 
 from __future__ import annotations
 
-from typing import Any
+import re
+from dataclasses import replace
 
-import numpy as np
-
-from factorgraph_dvl.sensors.beacon import BeaconPosition, Beacons, BeaconSettings
-from factorgraph_dvl.sensors.depth import Depth, DepthSettings
-from factorgraph_dvl.sensors.dvl import Dvl, DvlSettings
-from factorgraph_dvl.sensors.dvl_beams import DvlBeams, DvlBeamsSettings
-from factorgraph_dvl.sensors.gnss import Gnss, GnssSettings
-from factorgraph_dvl.sensors.imu import Imu, ImuSettings
-from factorgraph_dvl.sensors.parameters import Parameter
-from factorgraph_dvl.sensors.protocol import Aid
-from factorgraph_dvl.sensors.speed_log import Heading, HeadingSettings, LogSettings, SpeedLog
-from factorgraph_dvl.sensors.star import Star, StarSettings
+from factorgraph_dvl.sensors.beacon import ANY_BEACON, Beacons, offset_name
+from factorgraph_dvl.sensors.depth import Depth
+from factorgraph_dvl.sensors.dvl import Dvl
+from factorgraph_dvl.sensors.dvl_beams import DvlBeams
+from factorgraph_dvl.sensors.gnss import Gnss
+from factorgraph_dvl.sensors.imu import Imu
+from factorgraph_dvl.sensors.parameters import ParameterSpec
+from factorgraph_dvl.sensors.protocol import Aid, SensorRecord
+from factorgraph_dvl.sensors.speed_log import Heading, SpeedLog
+from factorgraph_dvl.sensors.star import Star
 from factorgraph_dvl.sensors.turntable import Turntable
 
 AIDS: tuple[type[Aid], ...] = (Gnss, Dvl, Star, Depth, DvlBeams, Turntable, Beacons)
 
 
-def every_parameter(beams: int, beacon: str) -> tuple[Parameter, ...]:
-    """Return the parameters that sensors may have, with each number of components.
-
-    Parameters
-    ----------
-    beams : int
-        The most that a DVL may have.
-    beacon : str
-        Name of the one whose parameters are returned.
-    """
-    imu = ImuSettings(
-        gyro_noise_deg_sqrt_h=1.0,
-        gyro_bias_std_deg_h=1.0,
-        accel_noise_ug_sqrt_hz=1.0,
-        accel_bias_std_ug=1.0,
-    )
-    place = BeaconPosition(lat_deg=0.0, lon_deg=0.0, height_m=0.0)
-    common = DvlBeamsSettings(directions=_fan(3), parametrisation="common")
-    sensors = [
-        _bare(Dvl, DvlSettings(scale_error_std=0.1)),
-        _bare(Dvl, DvlSettings(scale_error_std=(0.1, 0.1, 0.1))),
-        _bare(Gnss, GnssSettings()),
-        _bare(DvlBeams, common, prefix="beam_"),
-        *(
-            _bare(DvlBeams, DvlBeamsSettings(directions=_fan(n)), prefix="beam_")
-            for n in range(3, beams + 1)
-        ),
-        _bare(Star, StarSettings()),
-        _bare(Depth, DepthSettings()),
-        _bare(Beacons, BeaconSettings(positions={beacon: place})),
-        _bare(Heading, HeadingSettings()),
-        _bare(SpeedLog, LogSettings()),
-    ]
-    aided = (p for sensor in sensors for p in sensor.parameters())
-    return (*_bare(Imu, imu).parameters(0.0), *aided)
+# Records of a planar trial, which has no IMU.
+PLANAR: tuple[type[SensorRecord], ...] = (Heading, SpeedLog, Depth, Beacons)
 
 
-def _bare(kind: type, settings: Any, **more: Any) -> Any:
-    """Return a sensor without a record: its parameters are those of its settings."""
-    out: Any = object.__new__(kind)
-    for name, value in {"settings": settings, **more}.items():
-        object.__setattr__(out, name, value)
-    return out
+# Offsets of beacons, whose names are the user's, from any text around them.
+BEACON_OFFSET = re.compile(offset_name(r"([^\s\"':,{}]+)") + r"\b")
 
 
-def _fan(n: int) -> tuple[tuple[float, float, float], ...]:
-    """Return n directions on a cone."""
-    angle = np.arange(n) * 2.0 * np.pi / n
-    return tuple((0.6 * float(np.cos(a)), 0.6 * float(np.sin(a)), -0.8) for a in angle)
+def every_spec() -> tuple[ParameterSpec, ...]:
+    """Return the parameters of all sensors, with each number of components."""
+    kinds: tuple[type[SensorRecord], ...] = (Imu, *AIDS, *PLANAR)
+    return tuple(dict.fromkeys(spec for kind in kinds for spec in kind.specs))
+
+
+def specs_of(name: str) -> dict[int, ParameterSpec]:
+    """Return what a parameter may be, by its number of components; empty if none knows it."""
+    found = {spec.size: spec for spec in every_spec() if spec.name == name}
+    beacon = BEACON_OFFSET.fullmatch(name)
+    if found or beacon is None:
+        return found
+    offsets = specs_of(offset_name(ANY_BEACON))
+    return {
+        n: replace(spec, stem=spec.stem.replace(ANY_BEACON, beacon[1]))
+        for n, spec in offsets.items()
+    }

@@ -10,7 +10,7 @@ import numpy as np
 
 from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.vectors import Array, skew
-from factorgraph_dvl.sensors.parameters import Parameter
+from factorgraph_dvl.sensors.parameters import SCALAR, Parameter, ParameterSpec
 from factorgraph_dvl.sensors.protocol import (
     Linearization,
     Motion,
@@ -21,7 +21,8 @@ from factorgraph_dvl.sensors.protocol import (
 from factorgraph_dvl.sensors.records import check_range, check_times
 from factorgraph_dvl.settings.sections import NonNegative, Positive, Vector3
 
-SEA_SURFACE_HEIGHT = "sea_surface_height_m"
+_SEA_SURFACE = ParameterSpec("sea_surface_height", "m", labels=SCALAR)
+SEA_SURFACE_HEIGHT = _SEA_SURFACE.name
 
 
 class DepthSettings(SensorSection, frozen=True, kw_only=True):
@@ -62,6 +63,7 @@ class Depth:
     section_type: ClassVar[type[SensorSection]] = DepthSettings
     required: ClassVar[tuple[str, ...]] = ("time_s", "depth_m")
     optional: ClassVar[tuple[tuple[str, ...], ...]] = ()
+    specs: ClassVar[tuple[ParameterSpec, ...]] = (_SEA_SURFACE,)
 
     def __post_init__(self) -> None:
         check_times(self.time, self.source)
@@ -87,11 +89,7 @@ class Depth:
         """Return the height of the sea surface above the ellipsoid."""
         s = self.settings
         mean, sigma = s.sea_surface_height_m, s.sea_surface_height_std_m
-        return (
-            Parameter(
-                "sea_surface_height", "m", 1.0, np.array([mean]), np.array([sigma]), labels=("",)
-            ),
-        )
+        return (Parameter(_SEA_SURFACE, np.array([mean]), np.array([sigma])),)
 
     def observations(self, frame: LocalFrame) -> tuple[Observation, ...]:
         """Return the depths, where there are any."""

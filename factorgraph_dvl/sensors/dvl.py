@@ -14,7 +14,7 @@ from factorgraph_dvl.errors import ConfigError
 from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array, cross, rotate, skew
-from factorgraph_dvl.sensors.parameters import JointPrior, Parameter
+from factorgraph_dvl.sensors.parameters import SCALAR, XYZ, JointPrior, Parameter, ParameterSpec
 from factorgraph_dvl.sensors.protocol import (
     Linearization,
     Motion,
@@ -35,12 +35,22 @@ from factorgraph_dvl.settings.sections import NonNegative, Sigma3, Vector3
 VELOCITY_COLUMNS = ("vel_x_m_s", "vel_y_m_s", "vel_z_m_s")
 STD_COLUMNS = ("std_x_m_s", "std_y_m_s", "std_z_m_s")
 
-MISALIGNMENT = "misalignment_deg"
-SCALE_ERROR = "scale_error"
-LEVER_ARM = "lever_arm_m"
-BIAS = "dvl_bias_m_s"
-TIME_OFFSET = "time_offset_s"
-CURRENT = "current_m_s"
+MISALIGNMENT_SPEC = ParameterSpec(
+    "misalignment", "deg", kind="rotation", frame="b", place=2, good_std=0.03
+)
+SCALE_SPEC = ParameterSpec("scale_error", labels=SCALAR, place=3, good_std=3e-4, above=-1.0)
+SCALES_SPEC = replace(SCALE_SPEC, labels=XYZ, frame="d")
+LEVER_ARM_SPEC = ParameterSpec("lever_arm", "m", frame="b", place=4, good_std=0.03)
+BIAS_SPEC = ParameterSpec("dvl_bias", "m_s", frame="d")
+TIME_OFFSET_SPEC = ParameterSpec("time_offset", "s", labels=SCALAR)
+CURRENT_SPEC = ParameterSpec("current", "m_s", labels=("e", "n"), frame="n")
+
+MISALIGNMENT = MISALIGNMENT_SPEC.name
+SCALE_ERROR = SCALE_SPEC.name
+LEVER_ARM = LEVER_ARM_SPEC.name
+BIAS = BIAS_SPEC.name
+TIME_OFFSET = TIME_OFFSET_SPEC.name
+CURRENT = CURRENT_SPEC.name
 
 # What a calibration says of the DVL, and not of the sea that day.
 CALIBRATED = (MISALIGNMENT, SCALE_ERROR, LEVER_ARM, BIAS, TIME_OFFSET)
@@ -110,6 +120,10 @@ class Dvl:
     section_type: ClassVar[type[SensorSection]] = DvlSettings
     required: ClassVar[tuple[str, ...]] = ("time_s", *VELOCITY_COLUMNS)
     optional: ClassVar[tuple[tuple[str, ...], ...]] = (STD_COLUMNS,)
+    specs: ClassVar[tuple[ParameterSpec, ...]] = (
+        *(MISALIGNMENT_SPEC, SCALE_SPEC, SCALES_SPEC, LEVER_ARM_SPEC),
+        *(BIAS_SPEC, TIME_OFFSET_SPEC, CURRENT_SPEC),
+    )
 
     def __post_init__(self) -> None:
         check_times(self.time, self.source)
@@ -190,37 +204,25 @@ class Dvl:
         mean = np.atleast_1d(np.array(s.scale_error, dtype=float))
         sigma = np.atleast_1d(np.array(s.scale_error_std, dtype=float))
         axes = max(mean.size, sigma.size)
-        zero = np.zeros(3)
         through_water = s.reference == "water"
         current = np.array(s.current_std_m_s) if through_water else np.zeros(2)
         return (
             Parameter(
-                "misalignment",
-                "deg",
-                DEG,
+                MISALIGNMENT_SPEC,
                 np.array(s.misalignment_deg) * DEG,
                 np.array(s.misalignment_std_deg) * DEG,
-                rotation=True,
             ),
             Parameter(
-                "scale_error",
-                "",
-                1.0,
+                _scale_spec(axes),
                 np.broadcast_to(mean, axes).copy(),
                 np.broadcast_to(sigma, axes).copy(),
-                labels=("x", "y", "z") if axes == 3 else ("",),
             ),
-            Parameter("lever_arm", "m", 1.0, np.array(s.lever_arm_m), np.array(s.lever_arm_std_m)),
-            Parameter("dvl_bias", "m_s", 1.0, zero, np.array(s.bias_std_m_s)),
+            Parameter(LEVER_ARM_SPEC, np.array(s.lever_arm_m), np.array(s.lever_arm_std_m)),
+            Parameter(BIAS_SPEC, np.zeros(3), np.array(s.bias_std_m_s)),
             Parameter(
-                "time_offset",
-                "s",
-                1.0,
-                np.array([s.time_offset_s]),
-                np.array([s.time_offset_std_s]),
-                labels=("",),
+                TIME_OFFSET_SPEC, np.array([s.time_offset_s]), np.array([s.time_offset_std_s])
             ),
-            Parameter("current", "m_s", 1.0, np.zeros(2), current, labels=("e", "n")),
+            Parameter(CURRENT_SPEC, np.zeros(2), current),
         )
 
     def observations(self, frame: LocalFrame) -> tuple[Observation, ...]:
@@ -367,15 +369,16 @@ class DvlVelocity:
         )
 
 
+def _scale_spec(axes: int) -> ParameterSpec:
+    """Return what a scale error is: one number, or one for each axis."""
+    return SCALES_SPEC if axes == 3 else SCALE_SPEC
+
+
 def _from_joint(p: Parameter, joint: JointPrior) -> Parameter:
     """Return a parameter with the mean and the standard deviations of a calibration."""
     value = joint.values[p.name]
-    labels = p.labels
-    if p.name == SCALE_ERROR:
-        labels = ("x", "y", "z") if value.size == 3 else ("",)
-    return replace(
-        p, mean=value * p.si, sigma=joint.std(p.name) * p.si, labels=labels, joint=joint
-    )
+    spec = _scale_spec(value.size) if p.name == SCALE_ERROR else p.spec
+    return Parameter(spec, value * p.si, joint.std(p.name) * p.si, joint)
 
 
 def _velocity_at_dvl(motion: Motion, values: Values) -> tuple[Array, Array]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, ClassVar, Literal, Self
 
 import msgspec
@@ -15,7 +15,8 @@ from factorgraph_dvl.geometry.rotations import exp_so3
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array, rotate, skew
 from factorgraph_dvl.sensors.beam_model import CommonGeometry, FreeGeometry, Geometry
-from factorgraph_dvl.sensors.parameters import Parameter
+from factorgraph_dvl.sensors.dvl import LEVER_ARM_SPEC, MISALIGNMENT_SPEC, SCALE_SPEC
+from factorgraph_dvl.sensors.parameters import SCALAR, Parameter, ParameterSpec
 from factorgraph_dvl.sensors.protocol import (
     Linearization,
     Motion,
@@ -27,9 +28,37 @@ from factorgraph_dvl.sensors.protocol import (
 from factorgraph_dvl.sensors.records import check_range, check_times, named_columns, stack
 from factorgraph_dvl.settings.sections import NonNegative, Sigma3, Vector3
 
+# Chosen: no instrument has more.
+MOST_BEAMS = 16
+
+
+def direction_spec(count: int) -> ParameterSpec:
+    """Return what the directions of so many beams are."""
+    labels = tuple(f"{i}{axis}" for i in range(1, count + 1) for axis in "xy")
+    return ParameterSpec(
+        "beam_direction", "deg", labels, kind="directions", frame="b", place=0, good_std=0.03
+    )
+
+
+def scale_spec(count: int) -> ParameterSpec:
+    """Return what the scale errors of so many beams are."""
+    labels = tuple(str(i) for i in range(1, count + 1))
+    return ParameterSpec("beam_scale_error", "", labels, place=1, good_std=3e-4, above=-1.0)
+
+
+def of_beams(spec: ParameterSpec, prefix: str) -> ParameterSpec:
+    """Return a parameter of a DVL as that of its beams, which a prefix tells from the other's."""
+    stem = f"{prefix}{spec.stem}"
+    if stem == scale_spec(1).stem:
+        return replace(scale_spec(1), labels=SCALAR)
+    return replace(spec, stem=stem, place=None, good_std=None) if prefix else spec
+
+
 # Names of the parameters of beams that have directions and scales of their own.
-DIRECTION = "beam_direction_b"
-SCALE_ERROR = "beam_scale_error"
+DIRECTION = direction_spec(1).name
+SCALE_ERROR = scale_spec(1).name
+# Of the parameters that a DVL beside the beams has under the same names.
+BEAM_PREFIX = "beam_"
 
 Angle = Annotated[float, msgspec.Meta(ge=-360, le=360)]
 Acute = Annotated[float, msgspec.Meta(ge=0, le=90)]
@@ -166,6 +195,11 @@ class DvlBeams:
     section_type: ClassVar[type[SensorSection]] = DvlBeamsSettings
     required: ClassVar[tuple[str, ...]] = ("time_s",)
     optional: ClassVar[tuple[tuple[str, ...], ...]] = ()
+    specs: ClassVar[tuple[ParameterSpec, ...]] = (
+        *(of_beams(spec, BEAM_PREFIX) for spec in (MISALIGNMENT_SPEC, SCALE_SPEC, LEVER_ARM_SPEC)),
+        *(direction_spec(count) for count in range(3, MOST_BEAMS + 1)),
+        *(scale_spec(count) for count in range(3, MOST_BEAMS + 1)),
+    )
 
     def __post_init__(self) -> None:
         check_times(self.time, self.source)
@@ -207,9 +241,7 @@ class DvlBeams:
         """Return directions and scale errors, or misalignment and scale error; lever arm."""
         s = self.settings
         lever_arm = Parameter(
-            f"{self.prefix}lever_arm",
-            "m",
-            1.0,
+            of_beams(LEVER_ARM_SPEC, self.prefix),
             np.array(s.lever_arm_m),
             np.array(s.lever_arm_std_m),
         )
@@ -218,43 +250,27 @@ class DvlBeams:
             sigma = [s.direction_std_deg] * 3 if isinstance(std, UnsetType) else std
             return (
                 Parameter(
-                    f"{self.prefix}misalignment",
-                    "deg",
-                    DEG,
+                    of_beams(MISALIGNMENT_SPEC, self.prefix),
                     np.array(s.misalignment_deg) * DEG,
                     np.array(sigma) * DEG,
-                    rotation=True,
                 ),
                 Parameter(
-                    f"{self.prefix}scale_error",
-                    "",
-                    1.0,
+                    of_beams(SCALE_SPEC, self.prefix),
                     np.atleast_1d(np.array(s.scale_error, dtype=float)),
                     np.array([s.scale_error_std]),
-                    labels=("",),
                 ),
                 lever_arm,
             )
-        numbers = range(1, len(self.nominal_b) + 1)
-        scale = np.broadcast_to(np.array(s.scale_error, dtype=float), (len(numbers),))
+        n = len(self.nominal_b)
+        scale = np.broadcast_to(np.array(s.scale_error, dtype=float), (n,))
         return (
             Parameter(
-                "beam_direction",
-                "deg",
-                DEG,
-                np.zeros(2 * len(numbers)),
-                np.full(2 * len(numbers), s.direction_std_deg * DEG),
-                labels=tuple(f"{i}{axis}" for i in numbers for axis in "xy"),
+                direction_spec(n),
+                np.zeros(2 * n),
+                np.full(2 * n, s.direction_std_deg * DEG),
                 nominal=self.nominal_b,
             ),
-            Parameter(
-                "beam_scale_error",
-                "",
-                1.0,
-                scale.copy(),
-                np.full(len(numbers), s.scale_error_std),
-                labels=tuple(map(str, numbers)),
-            ),
+            Parameter(scale_spec(n), scale.copy(), np.full(n, s.scale_error_std)),
             lever_arm,
         )
 
@@ -280,7 +296,7 @@ class DvlBeams:
         if motion is None or motion.v_n.shape[0] < 2:
             return "the trial has no ping with a beam while the IMU runs, or only one"
         received = np.flatnonzero(~np.isnan(self.velocity).all(axis=0)) + 1
-        if parameter.endswith("lever_arm_m"):
+        if parameter == of_beams(LEVER_ARM_SPEC, self.prefix).name:
             if received.size < 3:
                 return f"too few beams were ever received: {' and '.join(map(str, received))}"
             x, y, z = np.degrees(np.std(motion.omega_eb_b, axis=0))

@@ -11,7 +11,7 @@ import numpy as np
 from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.units import DEG, GEODETIC_SI
 from factorgraph_dvl.geometry.vectors import Array, cross, rotate, skew
-from factorgraph_dvl.sensors.parameters import Parameter
+from factorgraph_dvl.sensors.parameters import Parameter, ParameterSpec
 from factorgraph_dvl.sensors.protocol import (
     Linearization,
     Motion,
@@ -37,6 +37,8 @@ POSITION_STD_COLUMNS = ("std_e_m", "std_n_m", "std_u_m")
 VELOCITY_STD_COLUMNS = ("vel_std_e_m_s", "vel_std_n_m_s", "vel_std_u_m_s")
 
 LEVER_ARM = "gnss_lever_arm_m"
+
+_LEVER_ARM = ParameterSpec("gnss_lever_arm", "m", frame="b")
 
 
 class GnssSettings(SensorSection, frozen=True, kw_only=True):
@@ -89,6 +91,7 @@ class Gnss:
         POSITION_STD_COLUMNS,
         VELOCITY_STD_COLUMNS,
     )
+    specs: ClassVar[tuple[ParameterSpec, ...]] = (_LEVER_ARM,)
 
     def __post_init__(self) -> None:
         check_times(self.time, self.source)
@@ -157,11 +160,7 @@ class Gnss:
     def parameters(self) -> tuple[Parameter, ...]:
         """Return the antenna's lever arm."""
         s = self.settings
-        return (
-            Parameter(
-                "gnss_lever_arm", "m", 1.0, np.array(s.lever_arm_m), np.array(s.lever_arm_std_m)
-            ),
-        )
+        return (Parameter(_LEVER_ARM, np.array(s.lever_arm_m), np.array(s.lever_arm_std_m)),)
 
     def observations(self, frame: LocalFrame) -> tuple[Observation, ...]:
         """Return position and velocity measurements, where there are any."""

@@ -10,7 +10,7 @@ import numpy as np
 
 from factorgraph_dvl.geometry.units import DEG_PER_HOUR, DEG_PER_SQRT_HOUR, HOUR, MICRO_G
 from factorgraph_dvl.geometry.vectors import Array
-from factorgraph_dvl.sensors.parameters import Parameter
+from factorgraph_dvl.sensors.parameters import Parameter, ParameterSpec
 from factorgraph_dvl.sensors.protocol import SensorSection
 from factorgraph_dvl.sensors.records import (
     check_finite,
@@ -36,6 +36,9 @@ _LEAST_GYRO_NOISE = 1e-6 * DEG_PER_SQRT_HOUR
 _LEAST_ACCEL_NOISE = 0.01 * MICRO_G
 _MAX_RATE_RAD_S = 100.0
 _MAX_FORCE_M_S2 = 1000.0
+
+_GYRO_BIAS = ParameterSpec("gyro_bias", "deg_h", frame="b", place=5)
+_ACCEL_BIAS = ParameterSpec("accel_bias", "ug", frame="b", place=6)
 
 
 class ImuSettings(SensorSection, frozen=True, kw_only=True):
@@ -103,6 +106,7 @@ class Imu:
     section_type: ClassVar[type[SensorSection]] = ImuSettings
     required: ClassVar[tuple[str, ...]] = COLUMNS
     optional: ClassVar[tuple[tuple[str, ...], ...]] = ()
+    specs: ClassVar[tuple[ParameterSpec, ...]] = (_GYRO_BIAS, _ACCEL_BIAS)
 
     def __post_init__(self) -> None:
         check_times(self.time, self.source)
@@ -141,6 +145,6 @@ class Imu:
         )
         zero = np.zeros(3)
         return (
-            Parameter("gyro_bias", "deg_h", DEG_PER_HOUR, zero, np.full(3, gyro_sigma)),
-            Parameter("accel_bias", "ug", MICRO_G, zero, np.full(3, accel_sigma)),
+            Parameter(_GYRO_BIAS, zero, np.full(3, gyro_sigma)),
+            Parameter(_ACCEL_BIAS, zero, np.full(3, accel_sigma)),
         )

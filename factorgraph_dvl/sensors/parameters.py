@@ -2,19 +2,107 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Literal, NamedTuple
 
 import numpy as np
 
 from factorgraph_dvl.errors import DataError
 from factorgraph_dvl.geometry.rotations import exp_so3
 from factorgraph_dvl.geometry.unit_vectors import turns_to
+from factorgraph_dvl.geometry.units import DEG, DEG_PER_HOUR, MICRO_G
 from factorgraph_dvl.geometry.vectors import Array
 
 # Rounding may leave a correlation matrix with an eigenvalue this far below zero.
 _NEGATIVE = 1e-6
+
+
+XYZ = ("x", "y", "z")
+SCALAR = ("",)
+
+Kind = Literal["vector", "rotation", "directions"]
+Frame = Literal["b", "d", "n", ""]
+
+
+class Unit(NamedTuple):
+    """SI value of a unit, and how it is shown to people."""
+
+    si: float
+    text: str
+
+
+# Units of parameters, as their names state them.
+UNITS = {
+    "": Unit(1.0, ""),
+    "deg": Unit(DEG, "deg"),
+    "deg_h": Unit(DEG_PER_HOUR, "deg/h"),
+    "ug": Unit(MICRO_G, "µg"),
+    "m": Unit(1.0, "m"),
+    "m_s": Unit(1.0, "m/s"),
+    "s": Unit(1.0, "s"),
+}
+
+
+@dataclass(frozen=True)
+class ParameterSpec:
+    """What a calibration parameter is: its names, unit, frame, and place in reports.
+
+    Parameters
+    ----------
+    stem : str
+        Name without unit.
+    unit : str, optional
+        One of `UNITS`.
+    labels : tuple of str, optional
+        Of the n components, `SCALAR` for a number.
+    kind : Kind, optional
+        How the components are to be understood: as they are, as a rotation vector, or as turns
+        of unit vectors, two each.
+    frame : Frame, optional
+        Axes of the components: body, DVL, or east, north, up; empty if there are none.
+    place : int, optional
+        Place in reports. One without is reported after the others, and only if it was estimated.
+    good_std : float, optional
+        Standard deviation that leaves dead reckoning with 0.1 % of the distance, in `unit`.
+    above : float, optional
+        Every component is above this, in `unit`.
+    """
+
+    stem: str
+    unit: str = ""
+    labels: tuple[str, ...] = XYZ
+    kind: Kind = "vector"
+    frame: Frame = ""
+    place: int | None = None
+    good_std: float | None = None
+    above: float = -math.inf
+
+    @cached_property
+    def name(self) -> str:
+        """Name in calibration.json, with the unit, or the frame of directions."""
+        tail = self.frame if self.kind == "directions" else self.unit
+        return f"{self.stem}_{tail}" if tail else self.stem
+
+    @cached_property
+    def component_names(self) -> tuple[str, ...]:
+        """Names of the components as in `covariance.order`."""
+        return tuple(
+            "_".join(part for part in (self.stem, label, self.unit) if part)
+            for label in self.labels
+        )
+
+    @property
+    def si(self) -> float:
+        """SI value of one reported unit."""
+        return UNITS[self.unit].si
+
+    @property
+    def size(self) -> int:
+        """Number of components."""
+        return len(self.labels)
 
 
 @dataclass(frozen=True)
@@ -85,56 +173,57 @@ class Parameter:
 
     Parameters
     ----------
-    stem, unit : str
-        Reported name without unit, and the unit (empty if dimensionless).
-    si : float
-        SI value of one reported unit.
+    spec : ParameterSpec
+        What it is.
     mean, sigma : ndarray, shape (n,)
-        Prior mean and standard deviation, SI. A component with sigma 0 is held at its mean.
-    rotation : bool, optional
-        The value is a rotation, `mean` its rotation vector and `sigma` that of the components of
-        the rotation vector.
-    labels : tuple of str, optional
-        Component names; empty for a scalar.
+        Prior mean and standard deviation, SI. A component with sigma 0 is fixed at its mean. Of a
+        rotation, `mean` is the rotation vector and `sigma` that of its components.
     joint : JointPrior, optional
-        Where mean and sigma come from a calibration of several parameters: all of it.
+        The calibration of several parameters that mean and sigma come from.
     nominal : ndarray, shape (N, 3), optional
-        Unit vectors in body, if the parameter is N directions: the components then turn them, two
-        each (`directions`). Files hold the directions.
+        Of directions: unit vectors in body, which the components turn, two each. Files hold the
+        directions.
     """
 
-    stem: str
-    unit: str
-    si: float
+    spec: ParameterSpec
     mean: Array
     sigma: Array
-    rotation: bool = False
-    labels: tuple[str, ...] = ("x", "y", "z")
     joint: JointPrior | None = None
     nominal: Array | None = None
 
-    @cached_property
+    @property
     def name(self) -> str:
-        """Name in calibration.json, with the unit, or the frame of directions."""
-        if self.nominal is not None:
-            return f"{self.stem}_b"
-        return f"{self.stem}_{self.unit}" if self.unit else self.stem
+        """Name in calibration.json."""
+        return self.spec.name
 
-    def internal(self, reported: Array) -> Array:
-        """Return a value as solvers hold it: SI, a rotation's matrix, turns of directions."""
-        if self.nominal is not None:
-            return turns_to(self.nominal, reported.reshape(-1, 3)).ravel()
-        value = reported * self.si + 0.0 * self.mean
-        return exp_so3(value) if self.rotation else value
+    @property
+    def stem(self) -> str:
+        """Name without the unit."""
+        return self.spec.stem
 
-    @cached_property
+    @property
     def component_names(self) -> tuple[str, ...]:
         """Names of the components as in `covariance.order`."""
-        parts = [(self.stem, label) if label else (self.stem,) for label in self.labels]
-        tail = (self.unit,) if self.unit else ()
-        return tuple("_".join((*part, *tail)) for part in parts)
+        return self.spec.component_names
+
+    @property
+    def si(self) -> float:
+        """SI value of one reported unit."""
+        return self.spec.si
+
+    @property
+    def rotation(self) -> bool:
+        """Whether the value is a rotation."""
+        return self.spec.kind == "rotation"
 
     @cached_property
     def estimated(self) -> bool:
         """Whether any component is free."""
         return bool(np.any(self.sigma > 0.0))
+
+    def internal(self, reported: Array) -> Array:
+        """Return a value as solvers have it: SI, a rotation's matrix, turns of directions."""
+        if self.nominal is not None:
+            return turns_to(self.nominal, reported.reshape(-1, 3)).ravel()
+        value = reported * self.si + 0.0 * self.mean
+        return exp_so3(value) if self.rotation else value

@@ -10,7 +10,7 @@ import numpy as np
 
 from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.vectors import Array, cross_variance
-from factorgraph_dvl.sensors.parameters import Parameter
+from factorgraph_dvl.sensors.parameters import Parameter, ParameterSpec
 from factorgraph_dvl.settings.sections import Section
 
 Values = Mapping[str, Array]
@@ -134,14 +134,16 @@ class SensorRecord(Protocol):
     """A sensor's record, and how it stands in files.
 
     `section` names its part of trial.yaml and its table, `section_type` holds the
-    settings; of the columns, `required` and the settings' `more_columns` must be there,
-    and of each group of `optional` ones all or none.
+    settings, `specs` lists what can be calibrated, with each number of components. Of the
+    columns, `required` and the settings' `more_columns` must be there, and of each group of
+    `optional` ones all or none.
     """
 
     section: ClassVar[str]
     section_type: ClassVar[type[SensorSection]]
     required: ClassVar[tuple[str, ...]]
     optional: ClassVar[tuple[tuple[str, ...], ...]]
+    specs: ClassVar[tuple[ParameterSpec, ...]]
 
     @property
     def settings(self) -> SensorSection:

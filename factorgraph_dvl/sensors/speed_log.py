@@ -10,7 +10,8 @@ import numpy as np
 
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array
-from factorgraph_dvl.sensors.parameters import Parameter
+from factorgraph_dvl.sensors.dvl import CURRENT_SPEC
+from factorgraph_dvl.sensors.parameters import SCALAR, Parameter, ParameterSpec
 from factorgraph_dvl.sensors.protocol import SensorSection
 from factorgraph_dvl.sensors.records import check_range, check_times
 from factorgraph_dvl.settings.sections import NonNegative, Positive
@@ -18,6 +19,9 @@ from factorgraph_dvl.settings.sections import NonNegative, Positive
 HEADING_BIAS = "heading_bias_deg"
 SCALE_ERROR = "log_scale_error"
 CURRENT = "current_m_s"
+
+HEADING_BIAS_SPEC = ParameterSpec("heading_bias", "deg", labels=SCALAR)
+LOG_SCALE_SPEC = ParameterSpec("log_scale_error", labels=SCALAR, above=-1.0)
 
 
 class HeadingSettings(SensorSection, frozen=True, kw_only=True):
@@ -68,6 +72,7 @@ class Heading:
     section_type: ClassVar[type[SensorSection]] = HeadingSettings
     required: ClassVar[tuple[str, ...]] = ("time_s", "heading_deg")
     optional: ClassVar[tuple[tuple[str, ...], ...]] = ()
+    specs: ClassVar[tuple[ParameterSpec, ...]] = (HEADING_BIAS_SPEC,)
 
     def __post_init__(self) -> None:
         check_times(self.time, self.source)
@@ -87,7 +92,7 @@ class Heading:
     def parameters(self) -> tuple[Parameter, ...]:
         """Return the constant error of the heading."""
         sigma = np.array([self.settings.bias_std_deg]) * DEG
-        return (Parameter("heading_bias", "deg", DEG, np.zeros(1), sigma, labels=("",)),)
+        return (Parameter(HEADING_BIAS_SPEC, np.zeros(1), sigma),)
 
 
 @dataclass(frozen=True)
@@ -118,6 +123,7 @@ class SpeedLog:
     section_type: ClassVar[type[SensorSection]] = LogSettings
     required: ClassVar[tuple[str, ...]] = ("time_s", "speed_m_s")
     optional: ClassVar[tuple[tuple[str, ...], ...]] = (("starboard_m_s",),)
+    specs: ClassVar[tuple[ParameterSpec, ...]] = (LOG_SCALE_SPEC, CURRENT_SPEC)
 
     def __post_init__(self) -> None:
         check_times(self.time, self.source)
@@ -147,6 +153,6 @@ class SpeedLog:
         current = np.array(s.current_std_m_s) if through_water else np.zeros(2)
         scale = np.array([s.scale_error_std])
         return (
-            Parameter("log_scale_error", "", 1.0, np.zeros(1), scale, labels=("",)),
-            Parameter("current", "m_s", 1.0, np.zeros(2), current, labels=("e", "n")),
+            Parameter(LOG_SCALE_SPEC, np.zeros(1), scale),
+            Parameter(CURRENT_SPEC, np.zeros(2), current),
         )

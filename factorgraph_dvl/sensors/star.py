@@ -22,7 +22,7 @@ from factorgraph_dvl.geometry.earth import LocalFrame, enu_from_ecef
 from factorgraph_dvl.geometry.rotations import inverse_right_jacobian, log_so3
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array, rotate
-from factorgraph_dvl.sensors.parameters import Parameter
+from factorgraph_dvl.sensors.parameters import Parameter, ParameterSpec
 from factorgraph_dvl.sensors.protocol import (
     DO_NOT_FIT,
     TOO_LARGE,
@@ -46,7 +46,8 @@ from factorgraph_dvl.settings.sections import Sigma3, Vector3
 QUATERNION_COLUMNS = ("qw", "qx", "qy", "qz")
 VECTOR_COLUMNS = ("body_x", "body_y", "body_z", "inertial_x", "inertial_y", "inertial_z")
 
-MOUNTING = "star_mounting_deg"
+_MOUNTING = ParameterSpec("star_mounting", "deg", kind="rotation", frame="b")
+MOUNTING = _MOUNTING.name
 
 # By how much the norm of a quaternion may differ from 1: what four decimals leave of it.
 _NORM = 1e-3
@@ -125,6 +126,7 @@ class Star:
     section_type: ClassVar[type[SensorSection]] = StarSettings
     required: ClassVar[tuple[str, ...]] = ("time_s",)
     optional: ClassVar[tuple[tuple[str, ...], ...]] = (QUATERNION_COLUMNS, VECTOR_COLUMNS)
+    specs: ClassVar[tuple[ParameterSpec, ...]] = (_MOUNTING,)
 
     def __post_init__(self) -> None:
         check_times(self.time, self.source)
@@ -234,7 +236,7 @@ class Star:
         """Return the mounting, the rotation vector of C_b^s."""
         s = self.settings
         mean, sigma = np.array(s.mounting_deg) * DEG, np.array(s.mounting_std_deg) * DEG
-        return (Parameter("star_mounting", "deg", DEG, mean, sigma, rotation=True),)
+        return (Parameter(_MOUNTING, mean, sigma),)
 
     def attitudes(self, frame: LocalFrame) -> Attitudes:
         """Return the tracker's attitude in `frame`, and how it is mounted.

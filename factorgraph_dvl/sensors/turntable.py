@@ -11,7 +11,7 @@ import numpy as np
 from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array
-from factorgraph_dvl.sensors.parameters import Parameter
+from factorgraph_dvl.sensors.parameters import Parameter, ParameterSpec
 from factorgraph_dvl.sensors.protocol import Motion, Observation, SensorSection
 from factorgraph_dvl.sensors.records import check_finite, check_range, check_times
 from factorgraph_dvl.sensors.turntable_motion import TurntableMotion
@@ -49,6 +49,7 @@ class Turntable:
     section_type: ClassVar[type[SensorSection]] = TurntableSettings
     required: ClassVar[tuple[str, ...]] = ("time_s", "angle_deg")
     optional: ClassVar[tuple[tuple[str, ...], ...]] = ()
+    specs: ClassVar[tuple[ParameterSpec, ...]] = ()
 
     def __post_init__(self) -> None:
         check_times(self.time, self.source)

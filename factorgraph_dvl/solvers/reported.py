@@ -13,12 +13,6 @@ from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.solution import Estimate, as_estimates
 
-# Chosen: the DVL first, then the IMU; other parameters follow.
-_FIRST = (
-    *("beam_direction", "beam_scale_error", "misalignment", "scale_error", "lever_arm"),
-    *("gyro_bias", "accel_bias"),
-)
-
 _Row = TypeVar("_Row")
 
 
@@ -52,12 +46,12 @@ def in_unit(p: Parameter, value: Array) -> Reported:
 
 def in_order(rows: Iterable[_Row], parameter: Callable[[_Row], Parameter]) -> list[_Row]:
     """Return what is reported in its order: DVL, IMU, others that were estimated."""
-    kept = [r for r in rows if parameter(r).estimated or parameter(r).stem in _FIRST]
 
-    def place(row: _Row) -> int:
-        stem = parameter(row).stem
-        return _FIRST.index(stem) if stem in _FIRST else len(_FIRST)
+    def place(row: _Row) -> float:
+        own = parameter(row).spec.place
+        return np.inf if own is None else own
 
+    kept = (r for r in rows if parameter(r).estimated or np.isfinite(place(r)))
     return sorted(kept, key=place)
 
 

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from scipy.special import chdtrc, chdtri
 
 from factorgraph_dvl.analysis.error_statistics import (
-    ROTATION_VECTORS,
     VectorErrors,
     nearest_rotation_vector,
 )
@@ -30,12 +29,6 @@ AGREE_PROBABILITY = 0.0027
 # Chosen: reported σ are accurate to some percent; below this ratio the difference of two
 # variances would be their error.
 HAUSMAN_RATIO = 1.05
-
-_IN_BODY_AXES = (
-    *("misalignment_deg", "lever_arm_m", "gyro_bias_deg_h", "accel_bias_ug"),
-    *("gnss_lever_arm_m", "star_mounting_deg", "beam_direction_b"),
-    *("beam_misalignment_deg", "beam_lever_arm_m"),
-)
 
 
 @dataclass(frozen=True)
@@ -140,15 +133,16 @@ def compare_calibrations(
     of_b = {e.name: e for e in same_branch(b, a).estimates}
     out: list[Component] = []
     for name in dict.fromkeys((*of_a, *of_b)):
-        axes = a.body_axes == b.body_axes or name not in _IN_BODY_AXES
-        out += _compare(of_a.get(name), of_b.get(name), axes, efficient)
+        frame = (of_a.get(name) or of_b[name]).spec.frame
+        same_axes = a.body_axes == b.body_axes or frame != "b"
+        out += _compare(of_a.get(name), of_b.get(name), same_axes, efficient)
     return tuple(out)
 
 
 def rotation_angles(a: Solution, b: Solution) -> dict[str, float]:
     """Return the angles between the rotations of A and B, deg, by parameter."""
     out = {}
-    for name in ROTATION_VECTORS:
+    for name in (e.name for e in a.estimates if e.spec.kind == "rotation"):
         found = [e.value for s in (a, b) for e in s.estimates if e.name == name]
         if len(found) == 2 and a.body_axes == b.body_axes and np.isfinite(found).all():
             relative = exp_so3(found[0] * DEG) @ exp_so3(found[1] * DEG).T
@@ -204,7 +198,7 @@ def same_branch(solution: Solution, other: Solution) -> Solution:
         row = rows.stop
         if estimate.nominal is not None:
             estimates[i] = _about_the_same(estimate, other)
-        if estimate.name not in ROTATION_VECTORS or estimate.name not in near:
+        if estimate.spec.kind != "rotation" or estimate.name not in near:
             continue
         phi = estimate.value
         if not np.isfinite([phi, near[estimate.name]]).all():

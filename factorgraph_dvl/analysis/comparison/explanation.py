@@ -13,12 +13,20 @@ from factorgraph_dvl.analysis.comparison.calibration_difference import (
 )
 from factorgraph_dvl.geometry.rotations import log_so3, rotation_from_rph
 from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.sensors.dvl import (
+    BIAS,
+    CURRENT,
+    LEVER_ARM,
+    MISALIGNMENT,
+    SCALE_ERROR,
+    TIME_OFFSET,
+)
 from factorgraph_dvl.solution import Estimate, Solution, Trajectory
 
 # Parameters of the DVL's measurement equation: if a result omits one, its effect biases the
 # others.
-_OF_THE_DVL = ("lever_arm_m", "dvl_bias_m_s", "time_offset_s", "current_m_s")
-_CALIBRATED = ("misalignment_deg", "scale_error", "lever_arm_m")
+_OF_THE_DVL = (LEVER_ARM, BIAS, TIME_OFFSET, CURRENT)
+_CALIBRATED = (MISALIGNMENT, SCALE_ERROR, LEVER_ARM)
 _WITHOUT_LEVER_ARM = ("kalman-wahba", "kalman-nine-state")
 # These compare the DVL with velocities that an inertial filter has smoothed.
 _WHITE_NOISE = "kalman-"
@@ -96,7 +104,7 @@ def _neglected(side: Side, own: Solution, other: Solution) -> Iterator[str]:
         found = _significant(other, name)
         if found is None or not _is_fixed(own, name):
             continue
-        if name == "lever_arm_m":
+        if name == LEVER_ARM:
             yield _neglected_lever_arm(side, own, other, found)
         else:
             values = ", ".join(f"{v:.4g}" for v in found.value)
