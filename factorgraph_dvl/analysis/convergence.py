@@ -66,7 +66,7 @@ def convergence(
     time: Array,
     values: Array,
     std: Array,
-    doubted: np.ndarray,
+    inconsistent: np.ndarray,
     estimates: Sequence[Estimate],
     truth: Mapping[str, ArrayLike],
     good_std: Mapping[str, float],
@@ -79,7 +79,7 @@ def convergence(
     time : ndarray, shape (H,), s
     values, std : ndarray, shape (H, n)
         What was known then, in the order of `estimates`.
-    doubted : ndarray, shape (H,)
+    inconsistent : ndarray, shape (H,)
         Whether the standard deviations were not to be trusted.
     estimates : sequence of Estimate
         At the end.
@@ -90,7 +90,7 @@ def convergence(
 
     """
     out, column = [], 0
-    all_good = ~doubted
+    all_good = ~inconsistent
     for e in estimates:
         true_value = true_value_of(e, truth)
         for i, name in enumerate(e.component_names):

@@ -104,7 +104,7 @@ def replay(
             record.time,
             record.values,
             record.std,
-            record.doubted,
+            record.inconsistent,
             solution.estimates,
             trial.calibration_truth,
             std_limits,
@@ -125,7 +125,7 @@ def replay(
     print_written(out)
     if not solution.converged:
         text = "error: measurements disagree with the prediction at the end; see the warnings"
-        if not record.doubted[-1]:
+        if not record.inconsistent[-1]:
             text = "error: the replay did not reach the end of the record; see the warnings"
         stderr().print(Text(text, "red"), soft_wrap=True)
     if errors:
@@ -186,7 +186,7 @@ def _run(
             def show(update: Update) -> None:
                 nonlocal shown, since
                 bad = lacking(update.calibration.estimates, good_std)
-                if bad or update.doubted:
+                if bad or update.inconsistent:
                     since = None
                 elif since is None:
                     since = update.time - first
@@ -201,7 +201,7 @@ def _run(
                             update.state,
                             latency=update.latency,
                             speed=speed(update),
-                            doubted=update.doubted,
+                            inconsistent=update.inconsistent,
                             lacking=bad,
                             good_since=since,
                         )

@@ -1,4 +1,4 @@
-"""The clocks of the sensors against the one on which the replay runs."""
+"""Clock corrections: offsets of the sensors' clocks after jumps."""
 
 from __future__ import annotations
 
@@ -10,11 +10,12 @@ from factorgraph_dvl.sensors.protocol import Aid
 
 
 class Clocks:
-    """What is added to the times of each sensor.
+    """Offsets that bring the times of all sensors onto the clock of the replay.
 
     Attributes
     ----------
-    imu : of the IMU, s.
+    imu : float
+        Offset added to the times of the IMU, s.
     """
 
     def __init__(self) -> None:
@@ -24,18 +25,18 @@ class Clocks:
         self._newest: dict[str, float] = {}
 
     def jumped_back(self, by: float) -> None:
-        """Note that the clock of the IMU jumped back by some seconds."""
+        """Correct for a jump of the IMU's clock back by some seconds."""
         self.imu += by
         self._back += by
 
     def jumped_ahead(self, by: float) -> None:
-        """Note that the clock of the IMU alone jumped ahead by some seconds."""
+        """Correct for a jump of the IMU's clock alone, ahead by some seconds."""
         self.imu -= by
 
-    def on_time(self, record: Aid) -> Aid:
+    def corrected(self, record: Aid) -> Aid:
         """Return a record on the clock of the replay.
 
-        When the IMU's clock has jumped back, a sensor's has too if its own times did.
+        When the IMU's clock has jumped back, a sensor's clock has too if its own times did.
         """
         section = record.section
         clock = self._aids.get(section, 0.0)
@@ -45,6 +46,4 @@ class Clocks:
             clock = self._aids[section] = self._back
             newest = -np.inf
         self._newest[section] = max(newest, float(record.time[-1]))
-        if clock:
-            record = replace(record, time=record.time + clock)  # type: ignore[type-var]
-        return record
+        return replace(record, time=record.time + clock) if clock else record  # type: ignore[type-var]

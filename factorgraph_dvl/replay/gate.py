@@ -1,108 +1,124 @@
-"""Measurements that contradict what is predicted, one by one and in the long run."""
+"""Innovation gate: rejects single outliers, and whole kinds that contradict the prediction."""
 
 from __future__ import annotations
 
-from collections import deque
+from collections import Counter, deque
 
 import numpy as np
 
 from factorgraph_dvl.geometry.vectors import Array
 
-# Standard deviations beyond which a measurement is not used.
-_BEYOND = 6.0
-# Share of the last measurements beyond, from which a kind is not used at all, and share
-# at which it is used again.
-_BAD = 0.3
-_GOOD = 0.05
-_LAST = 50
+# Standard deviations beyond which a measurement is rejected; chosen: 2e-9 of Gaussian errors.
+_LIMIT = 6.0
+# Measurements of a kind that are judged together, and fewest that suffice to exclude it; chosen:
+# 5 s of a DVL at 10 Hz, and 1 s.
+_WINDOW = 50
 _LEAST = 10
-# The same shares where single measurements may be none, as the range of an echo.
-_BAD_ECHOES = 0.6
-_GOOD_ECHOES = 0.4
-# Root mean square of the last normalised innovations from which they are doubted, not used,
-# and believed again. That of 50 honest ones exceeds 1.3 once in 1e6.
-_DOUBT = 1.5
-_SHUT = 3.0
-_BELIEVE = 1.3
+# Share of the window beyond the limit from which a kind is excluded, and up to which it is used
+# again; chosen: far above single outliers, and far below that of a faulty sensor.
+_EXCLUDE_SHARE = 0.3
+_READMIT_SHARE = 0.05
+# The same for kinds with outliers of their own, such as echoes; chosen: half may be echoes.
+_EXCLUDE_SHARE_ECHOES = 0.6
+_READMIT_SHARE_ECHOES = 0.4
+# RMS of the window's normalised innovations from which a kind is inconsistent, excluded, and
+# consistent again; chosen. Measured on Gaussian innovations: the RMS of 50 exceeds 1.3 in 1e-6.
+_INCONSISTENT_RMS = 1.5
+_EXCLUDE_RMS = 3.0
+_CONSISTENT_RMS = 1.3
 
 
-class Gate:
-    """Decides for each kind of measurement what is used, and says so.
+class InnovationGate:
+    """Decides for each kind of measurement which are used, by their normalised innovations.
 
     Attributes
     ----------
-    refused : number of measurements that were not used, by kind.
-    doubted, shut : kinds that disagree with the prediction at the moment, and those among
-        them that are not used.
+    rejected : Counter
+        Number of measurements that were not used, by kind.
+    inconsistent : set of str
+        Kinds whose innovations are larger than predicted at the moment.
+    excluded : set of str
+        Those among them of which nothing is used.
     """
 
     def __init__(self) -> None:
-        self._last: dict[str, deque[tuple[bool, float]]] = {}
-        self.doubted: set[str] = set()
-        self.shut: set[str] = set()
-        self.refused: dict[str, int] = {}
+        self._windows: dict[str, deque[tuple[bool, float]]] = {}
+        self.inconsistent: set[str] = set()
+        self.excluded: set[str] = set()
+        self.rejected: Counter[str] = Counter()
 
-    def passes(
-        self, label: str, normalised: Array, echoes: float | None = None
+    def accept(
+        self, label: str, normalised: Array, echo_limit: float | None = None
     ) -> tuple[np.ndarray, str]:
-        """Return which of M measurements are used, and a message if that changes.
+        """Return which of M measurements are used, and a message if a kind's status changes.
 
         Parameters
         ----------
         label : str
-            Of the kind.
+            Name of the kind.
         normalised : ndarray, shape (M, d)
             Innovations over their standard deviations; nan where a component was not measured.
-        echoes : float, optional
-            Standard deviations beyond which a measurement of this kind is none, if single ones may
-            be; None if not.
+        echo_limit : float, optional
+            Standard deviations beyond which a measurement is an outlier of the kind, such as an
+            echo; None for kinds without.
+
+        Returns
+        -------
+        ndarray, shape (M,)
+            Whether each measurement is used.
+        str
+            Message for the user; empty if nothing changed.
         """
-        last = self._last.setdefault(label, deque(maxlen=_LAST))
-        limit = _BEYOND if echoes is None else echoes
+        window = self._windows.setdefault(label, deque(maxlen=_WINDOW))
+        limit = _LIMIT if echo_limit is None else echo_limit
         beyond = np.any(np.abs(normalised) >= limit, axis=1)
         squares = np.nanmean(normalised**2, axis=1)
-        last.extend(zip(beyond.tolist(), squares.tolist(), strict=True))
-        message = self._judge(label, last, limit, echoes is not None)
-        used = np.zeros_like(beyond) if label in self.shut else ~beyond
-        self.refused[label] = self.refused.get(label, 0) + int((~used).sum())
+        window.extend(zip(beyond.tolist(), squares.tolist(), strict=True))
+        message = self._judge(label, window, limit, echo_limit is not None)
+        used = np.zeros_like(beyond) if label in self.excluded else ~beyond
+        self.rejected[label] += int((~used).sum())
         return used, message
 
     def _judge(
-        self, label: str, last: deque[tuple[bool, float]], limit: float, echoes: bool
+        self, label: str, window: deque[tuple[bool, float]], limit: float, echoes: bool
     ) -> str:
-        good, bad = (_GOOD_ECHOES, _BAD_ECHOES) if echoes else (_GOOD, _BAD)
-        count = sum(beyond for beyond, _ in last)
-        share = count / len(last)
-        # Single ones that are beyond are left out one by one.
-        within = [square for beyond, square in last if not beyond]
+        readmit, exclude = (
+            (_READMIT_SHARE_ECHOES, _EXCLUDE_SHARE_ECHOES)
+            if echoes
+            else (_READMIT_SHARE, _EXCLUDE_SHARE)
+        )
+        count = sum(beyond for beyond, _ in window)
+        share = count / len(window)
+        # Outliers are rejected one by one and say nothing of the others.
+        within = [square for beyond, square in window if not beyond]
         rms = float(np.sqrt(np.mean(within))) if within else np.inf
-        full = len(last) == _LAST
-        if label in self.doubted:
-            if full and share <= good and rms < _BELIEVE:
-                self.doubted.discard(label)
-                self.shut.discard(label)
-                return f"{label}: agrees with the prediction again"
-        elif full and rms > _DOUBT:
-            self.doubted.add(label)
-            if rms <= _SHUT and share <= bad:
+        full = len(window) == _WINDOW
+        if label in self.inconsistent:
+            if full and share <= readmit and rms < _CONSISTENT_RMS:
+                self.inconsistent.discard(label)
+                self.excluded.discard(label)
+                return f"{label}: consistent with the prediction again, and used"
+        elif full and rms > _INCONSISTENT_RMS:
+            self.inconsistent.add(label)
+            if rms <= _EXCLUDE_RMS and share <= exclude:
                 return (
-                    f"{label}: the last {_LAST} differ from the prediction by {rms:.1f} times "
-                    "what is stated; the standard deviations are too small. A clock that has "
-                    "jumped, a time offset or a sensor that fails looks like this"
+                    f"{label}: the last {_WINDOW} innovations are {rms:.1f} times as large as "
+                    "predicted, so the standard deviations are too small. Check the stated noise, "
+                    "the clock and the mounting of this sensor"
                 )
-        if label not in self.shut and (
-            (len(last) >= _LEAST and share > bad) or (full and rms > _SHUT)
+        if label not in self.excluded and (
+            (len(window) >= _LEAST and share > exclude) or (full and rms > _EXCLUDE_RMS)
         ):
-            self.doubted.add(label)
-            self.shut.add(label)
-            what = f"the last {_LAST} differ from the prediction by {rms:.1f} times what is stated"
-            if share > bad:
+            self.inconsistent.add(label)
+            self.excluded.add(label)
+            what = f"the last {_WINDOW} innovations are {rms:.1f} times as large as predicted"
+            if share > exclude:
                 what = (
-                    f"{count} of the last {len(last)} contradict the prediction by more than "
-                    f"{limit:g} standard deviations"
+                    f"{count} of the last {len(window)} measurements are more than {limit:g} "
+                    "standard deviations from the prediction"
                 )
             return (
-                f"{label}: {what}; not used until they agree. A clock that has jumped, or a "
-                "sensor that fails, looks like this"
+                f"{label}: {what}; none are used until they are consistent again. A clock that "
+                "has jumped or a faulty sensor does this: check both"
             )
         return ""

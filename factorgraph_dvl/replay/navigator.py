@@ -1,72 +1,89 @@
-"""From segment to segment: predict, compare, update."""
+"""Navigation from segment to segment: predict, compare, update."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import fields
+from dataclasses import dataclass, fields
 
 import gtsam
 import numpy as np
 
-from factorgraph_dvl.geometry.rotations import BodyAxes
-from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.geometry.rotations import BodyAxes, rph_from_rotation, rph_jacobian
+from factorgraph_dvl.geometry.vectors import Array, rotate
 from factorgraph_dvl.graph import keys
 from factorgraph_dvl.graph.inertial_chain import loose_diagonal
-from factorgraph_dvl.graph.priors import ConstantsPrior, local_coordinates, prior_root
-from factorgraph_dvl.graph.sensor_factor import (
-    Linearized,
-    NodeMeasurements,
-    Rows,
-    measurement_factor,
-    state_of,
-)
+from factorgraph_dvl.graph.priors import ConstantsPrior, local_coordinates, value_at
+from factorgraph_dvl.graph.sensor_factor import Linearized, measurement_factor, state_of
 from factorgraph_dvl.imu.preintegration import Segments, preintegrate
-from factorgraph_dvl.imu.propagation import States, attach
-from factorgraph_dvl.replay.estimate import (
-    CalibrationEstimate,
-    Innovations,
-    calibration_of,
-    concatenated,
-    trajectory_of,
-)
-from factorgraph_dvl.replay.gate import Gate
+from factorgraph_dvl.imu.propagation import States
+from factorgraph_dvl.replay.calibration import CalibrationEstimate, calibration_of
+from factorgraph_dvl.replay.gate import InnovationGate
+from factorgraph_dvl.replay.gravity import LocalGravity
+from factorgraph_dvl.replay.measurements import attached, gated
 from factorgraph_dvl.replay.smoother import Smoother
+from factorgraph_dvl.replay.spurious import SpuriousInformation
 from factorgraph_dvl.replay.start import ReplayStart
+from factorgraph_dvl.replay.update import Innovations
 from factorgraph_dvl.sensors.imu import Imu
 from factorgraph_dvl.sensors.parameters import Parameter
-from factorgraph_dvl.sensors.protocol import Aid, Motion
+from factorgraph_dvl.sensors.protocol import Aid
 from factorgraph_dvl.solution import Trajectory
 from factorgraph_dvl.solvers.trajectory import TRAJECTORY_RATE, epochs_between, trajectory_between
-from factorgraph_dvl.statistics.spurious_information import spurious_by, undetermined_directions
 
-# Distance, m, up to which gravity is taken as linear: to 3e-9 m/s².
-_NEAR = 100.0
-# Keeps the walk of a bias that does not walk regular.
+# Standard deviation of the walk of a bias that does not walk, SI; chosen: regular, and far below
+# what can be measured.
 _LEAST_WALK = 1e-12
-# Time after which it is worked out anew what the motion's error feigns, s.
-_SPURIOUS_EVERY = 1.0
 _STATE = 9
+_BIAS = 6
+
+
+@dataclass(frozen=True)
+class _LinearizationPoint:
+    """Where GTSAM linearises the newest state, its bias and the parameters."""
+
+    state: gtsam.NavState
+    bias: gtsam.imuBias.ConstantBias
+    parameters: Mapping[str, Array]
 
 
 class Navigator:
-    """The smoother between two starts.
+    """Navigation between two batch solutions.
 
     Parameters
     ----------
     start : ReplayStart
-        What it starts from.
+        State, covariance and parameters to start from.
     imu : Imu
-        For its settings.
-    gate : Gate
-        What decides which measurements are used.
+        IMU, of which the settings count.
+    gate : InnovationGate
+        Gate that decides which measurements are used.
     lag : float or None
-        S, of the smoother; None = none.
+        Lag of the smoother, s; None to correct all states for ever.
     memory : float
-        S, for which segments are kept for measurements that arrive late.
+        Span for which segments are kept for measurements that arrive late, s.
+
+    Attributes
+    ----------
+    smoother : Smoother
+        Incremental smoother.
+    values : dict of str to ndarray
+        Values of all parameters, SI; rotations as matrices.
+    undetermined : ndarray, shape (P, h)
+        Directions of the parameters that are not observable.
+    innovations : list of Innovations
+        Innovations since they were last taken.
+    messages : list of str
+        Messages for the user since they were last taken.
     """
 
     def __init__(
-        self, start: ReplayStart, imu: Imu, gate: Gate, *, lag: float | None, memory: float
+        self,
+        start: ReplayStart,
+        imu: Imu,
+        gate: InnovationGate,
+        *,
+        lag: float | None,
+        memory: float,
     ) -> None:
         self.start = start
         self._imu = imu
@@ -82,27 +99,23 @@ class Navigator:
             lag=lag,
             ranges=start.ranges,
         )
-        self._prior_root = prior_root(start.parameters)
-        self._spurious = start.spurious
-        # By kind: when it was last worked out, and how many were used since.
-        self._spurious_at: dict[str, float] = {}
-        self._not_counted: dict[str, int] = {}
-        self._near = np.full(3, np.inf)
+        self._gravity = LocalGravity(start.frame)
         self._segments: dict[int, tuple[Segments, Array]] = {}
         self.innovations: list[Innovations] = []
         self.messages: list[str] = []
         self._refresh()
-        first = keys.node(start.node)
-        self._begun = {
-            p.name: start.values.atRot3(key).matrix() if p.rotation else start.values.atVector(key)
+        self._start_values = {
+            p.name: value_at(start.values, key, p)
             for p, key in zip(start.parameters, self.smoother.calibration_keys, strict=True)
-        } | start.fixed
-        self._held = self._not_observable()
-        # Of the newest state; without a lag GTSAM moves it on its own account.
-        self._linear: tuple[gtsam.NavState, gtsam.imuBias.ConstantBias] | None = None
+        }
+        self.spurious = SpuriousInformation(start)
+        self.undetermined = self.spurious.undetermined(self._parameter_covariance)
+        # Without a lag GTSAM moves the linearisation point by itself.
+        self._linear: _LinearizationPoint | None = None
         if lag is not None:
             bias = start.values.atConstantBias(self.smoother.bias_key(start.node))
-            self._linear = (start.values.atNavState(first), bias)
+            state = start.values.atNavState(keys.node(start.node))
+            self._linear = _LinearizationPoint(state, bias, self._start_values)
 
     @property
     def time(self) -> float:
@@ -110,50 +123,23 @@ class Navigator:
         return self.smoother.times[self.smoother.node]
 
     @property
-    def oldest(self) -> float:
-        """Time from which on measurements are still of use, s."""
-        return self.smoother.times[next(iter(self._segments), self.smoother.node)]
-
-    @property
-    def values(self) -> dict[str, Array]:
-        """Values of all parameters, rotations as matrices."""
-        return self._values
-
-    @property
-    def turned(self) -> float:
-        """Angle by which a rotation among the parameters differs from the start's, rad."""
-        return max(
-            (
-                float(
-                    np.linalg.norm(local_coordinates(p, self._values[p.name], self._begun[p.name]))
-                )
-                for p in self.start.parameters
-                if p.rotation
-            ),
-            default=0.0,
+    def rotation_change(self) -> float:
+        """Largest change of a rotation among the parameters since the start, rad."""
+        changes = (
+            local_coordinates(p, self.values[p.name], self._start_values[p.name])
+            for p in self.start.parameters
+            if p.rotation
         )
+        return max((float(np.linalg.norm(change)) for change in changes), default=0.0)
 
     @property
-    def held(self) -> Array:
-        """Directions of the parameters that are not observable, as `feigned_directions`."""
-        return self._held
-
-    @property
-    def spurious(self) -> Array:
-        """Information that only noise makes, (P, P), as `Start.spurious`."""
-        return self._spurious
-
-    @property
-    def parameter_covariance(self) -> Array:
-        """Joint covariance of accelerometer bias, gyro bias and parameters, SI."""
-        return self._P[_STATE:, _STATE:]
+    def _parameter_covariance(self) -> Array:
+        return self._P[_STATE + _BIAS :, _STATE + _BIAS :]
 
     def covariance_of(self, parameter: Parameter) -> Array:
         """Return the covariance of a parameter in its tangent space, SI."""
-        before = self.start.parameters[: self.start.parameters.index(parameter)]
-        a = _STATE + 6 + sum(p.mean.size for p in before)
-        b = a + parameter.mean.size
-        return self._P[a:b, a:b]
+        own = self.start.columns([parameter.name])
+        return self._parameter_covariance[np.ix_(own, own)]
 
     def extend(self, seg: Segments, aids: Sequence[Aid]) -> None:
         """Add the segment after the newest state, and what was measured in it."""
@@ -161,26 +147,33 @@ class Navigator:
         k = s.node
         state, bias = s.state(k), s.bias(k)
         states = state_of(state, bias)
-        earth = self.start.frame.earth_rate
         duration = float(seg.duration[0])
-        gravity = self._gravity(states.p_n + 0.5 * duration * states.v_n)
+        gravity = self._gravity.at(states.p_n + 0.5 * duration * states.v_n)
 
         factors, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-        pim = preintegrate(seg, self._imu.settings, gravity, earth)[0]
+        pim = preintegrate(seg, self._imu.settings, gravity, self.start.frame.earth_rate)[0]
         factors.add(gtsam.GalileanImuFactor2(keys.node(k), keys.node(k + 1), s.bias_key(k), pim))
         predicted = pim.predict(state, bias)
         values.insert(keys.node(k + 1), predicted)
         if self.start.walking:
-            factors.add(self._walk(k, duration))
+            walk = np.maximum(self._walk_root_psd * np.sqrt(duration), _LEAST_WALK)
+            none = gtsam.imuBias.ConstantBias()
+            factors.add(
+                gtsam.BetweenFactorConstantBias(
+                    keys.bias(k), keys.bias(k + 1), none, loose_diagonal(walk)
+                )
+            )
             values.insert(keys.bias(k + 1), bias)
         self._segments[k] = (seg, gravity)
-        measured = self._measured(k, aids, states)
+        measured = self._measurement_factor(k, aids)
         if measured is not None:
             factors.add(measured)
         s.extend(float(seg.node_time[1]), factors, values)
         if self._linear is not None:
-            self._linear = (predicted, bias if self.start.walking else self._linear[1])
-        self._before = self._P[:_STATE, :_STATE]
+            if not self.start.walking:
+                bias = self._linear.bias
+            self._linear = _LinearizationPoint(predicted, bias, self._start_values)
+        self._P_before = self._P[:_STATE, :_STATE]
         since = max(s.times[s.oldest], self.time - self._memory)
         while self._segments:
             old = next(iter(self._segments))
@@ -193,9 +186,7 @@ class Navigator:
         """Add measurements that arrived late, by the index of the state before them."""
         factors = gtsam.NonlinearFactorGraph()
         for k, records in aids.items():
-            measured = self._measured(
-                k, records, state_of(self.smoother.state(k), self.smoother.bias(k))
-            )
+            measured = self._measurement_factor(k, records)
             if measured is not None:
                 factors.add(measured)
         if factors.size():
@@ -203,17 +194,14 @@ class Navigator:
             self._refresh()
 
     def known(self, later: float) -> ConstantsPrior:
-        """Return what is known of biases and parameters, `later` seconds from now."""
-        P = self.parameter_covariance.copy()
-        s = self._imu.settings
-        walk = np.repeat([s.accel_bias_walk_root_psd, s.gyro_bias_walk_root_psd], 3)
-        P[:6, :6] += np.diag(walk**2) * later
-        return ConstantsPrior(
-            self.smoother.bias(self.smoother.node).vector(), self.smoother.calibration(), P
-        )
+        """Return what will be known of biases and parameters `later` seconds from now."""
+        P = self._P[_STATE:, _STATE:].copy()
+        P[:_BIAS, :_BIAS] += np.diag(self._walk_root_psd**2) * later
+        bias = self.smoother.bias(self.smoother.node).vector()
+        return ConstantsPrior(bias, self.smoother.calibration(), P)
 
     def node_before(self, time: float) -> int | None:
-        """Return the state whose segment holds a time, None if it is gone or yet to come."""
+        """Return the state whose segment contains a time, None if it is gone or yet to come."""
         for k in reversed(self._segments):
             if self.smoother.times[k] <= time:
                 return k if time < self.smoother.times[k + 1] else None
@@ -225,224 +213,118 @@ class Navigator:
         gyro, accel = self._imu.parameters(0.0)
         return calibration_of(
             self.start.all_parameters,
-            self._values,
+            self.values,
             ((gyro, bias[3:]), (accel, bias[:3])),
-            self.parameter_covariance,
-            self._held,
+            self._P[_STATE:, _STATE:],
+            self.undetermined,
         )
 
     def filtered(self, body_axes: BodyAxes) -> Trajectory:
-        """Return the newest state."""
-        return self._trajectory([self.smoother.node], self._P[None, :_STATE, :_STATE], body_axes)
+        """Return the newest state, as a trajectory of one epoch."""
+        k = self.smoother.node
+        states = state_of(self.smoother.state(k), self.smoother.bias(k))
+        frame = self.start.frame
+        lat, lon, height = frame.geodetic(states.p_n)
+        lRn = frame.level_from_tangent(lat, lon)
+        lRb = lRn @ states.nRb
+        rph = rph_from_rotation(lRb, body_axes)
+        to_rph = rph_jacobian(rph, body_axes)
+
+        def covariance(i: int, jacobian: Array) -> Array:
+            return jacobian @ self._P[i : i + 3, i : i + 3] @ jacobian.transpose(0, 2, 1)
+
+        return Trajectory(
+            time=np.array([self.time]),
+            geodetic=np.stack([lat, lon, height], axis=1),
+            velocity=rotate(lRn, states.v_n),
+            rph=rph,
+            position_cov=covariance(3, lRb),
+            velocity_cov=covariance(6, lRb),
+            rph_cov=covariance(0, to_rph),
+        )
 
     def smoothed(self, first: int, last: int, body_axes: BodyAxes) -> Trajectory:
-        """Return the motion from state `first` to state `last`, given all that came since."""
+        """Return the motion from state `first` to state `last`, smoothed with later data."""
         wanted = [k for k in self._segments if first <= k < last]
         P = self.smoother.state_covariances([*wanted, last])
-        parts = [self._between(k, np.stack([P[k], P[k + 1]]), body_axes) for k in wanted]
-        return concatenated(parts)
+        times = self.smoother.times
+        parts = [self._between(k, np.stack([P[k], P[k + 1]]), body_axes, times[k]) for k in wanted]
+        return Trajectory(
+            *(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Trajectory))
+        )
 
-    def passed(self, body_axes: BodyAxes) -> Trajectory:
-        """Return the motion from the state before the newest to the newest."""
-        P = np.stack([self._before, self._P[:_STATE, :_STATE]])
-        return self._between(self.smoother.node - 1, P, body_axes)
+    def last_segment(self, body_axes: BodyAxes, since: float) -> Trajectory:
+        """Return the motion up to the newest state, at the epochs after a time, s.
 
-    def _between(self, k: int, P: Array, body_axes: BodyAxes) -> Trajectory:
+        The time is that of the state before it, but for what stamps have been corrected since.
+        """
+        P = np.stack([self._P_before, self._P[:_STATE, :_STATE]])
+        return self._between(self.smoother.node - 1, P, body_axes, since)
+
+    def _between(self, k: int, P: Array, body_axes: BodyAxes, since: float) -> Trajectory:
         """Return the motion from state k to the next at the epochs of a batch solution."""
         s = self.smoother
         seg, gravity = self._segments[k]
-        time = epochs_between(s.times[k], s.times[k + 1], TRAJECTORY_RATE)
+        time = epochs_between(since, s.times[k + 1], TRAJECTORY_RATE)
         pair = [state_of(s.state(i), s.bias(i)) for i in (k, k + 1)]
         states = States(
             *(np.concatenate([getattr(x, f.name) for x in pair]) for f in fields(States))
         )
         return trajectory_between(seg, states, P, gravity, self.start.frame, body_axes, time)
 
-    def _trajectory(self, nodes: Sequence[int], P: Array, body_axes: BodyAxes) -> Trajectory:
-        found = [self.smoother.state(k) for k in nodes]
-        zero = np.zeros((len(nodes), 3))
-        states = States(
-            np.stack([x.attitude().matrix() for x in found]),
-            np.stack([x.position() for x in found]),
-            np.stack([x.velocity() for x in found]),
-            zero,
-            zero,
-        )
-        time = np.array([self.smoother.times[k] for k in nodes])
-        return trajectory_of(time, states, P, self.start.frame, body_axes)
-
-    def _gravity(self, p_n: Array) -> Array:
-        """Return gravity at a position (1, 3), linear about one that is near."""
-        if np.linalg.norm(p_n - self._near) > _NEAR:
-            self._near = p_n[0]
-            at = p_n + _NEAR * np.vstack([np.zeros(3), np.eye(3)])
-            found = self.start.frame.gravity_without_rotation(at)
-            self._near_gravity, self._gradient = found[0], (found[1:] - found[0]) / _NEAR
-        return self._near_gravity + (p_n - self._near) @ self._gradient
+    @property
+    def _walk_root_psd(self) -> Array:
+        s = self._imu.settings
+        return np.repeat([s.accel_bias_walk_root_psd, s.gyro_bias_walk_root_psd], 3)
 
     def _refresh(self) -> None:
         self._P = self.smoother.joint_covariance()
-        self._values = {**self.start.fixed, **self.smoother.calibration()}
+        self.values = {**self.start.fixed, **self.smoother.calibration()}
 
-    def _walk(self, k: int, duration: float) -> gtsam.BetweenFactorConstantBias:
-        s = self._imu.settings
-        root_psd = np.repeat([s.accel_bias_walk_root_psd, s.gyro_bias_walk_root_psd], 3)
-        walk = np.maximum(root_psd * np.sqrt(duration), _LEAST_WALK)
-        return gtsam.BetweenFactorConstantBias(
-            keys.bias(k), keys.bias(k + 1), gtsam.imuBias.ConstantBias(), loose_diagonal(walk)
-        )
-
-    def _measured(self, k: int, aids: Sequence[Aid], states: States) -> gtsam.CustomFactor | None:
-        """Return the factor of measurements after state k that pass the gate."""
-        observations = [o for aid in aids for o in aid.observations(self.start.frame)]
-        if not observations:
+    def _measurement_factor(self, k: int, aids: Sequence[Aid]) -> gtsam.CustomFactor | None:
+        """Return the factor of measurements after state k that the gate accepts."""
+        s = self.smoother
+        measured = attached(aids, *self._segments[k], self.start, self.values)
+        if measured is None:
             return None
-        seg, gravity = self._segments[k]
-        rows: list[Rows] = []
-        times: list[Array] = []
-        count = 0
-        for o in observations:
-            time = o.true_time(self._values)
-            if rows and np.array_equal(time, rows[-1].time):
-                rows.append(Rows(o, rows[-1].at, time))
-                continue
-            rows.append(Rows(o, slice(count, count + time.size), time))
-            times.append(time)
-            count += time.size
-        used = {name for o in observations for name in o.parameters}
-        parameters = tuple(p for p in self.start.parameters if p.name in used)
-        measured = NodeMeasurements(
-            attachment=attach(seg, np.concatenate(times), self.start.frame.earth_rate),
-            rows=tuple(rows),
-            parameters=parameters,
-            fixed=self.start.fixed,
-            gravity_n=gravity,
-            earth_rate_n=self.start.frame.earth_rate,
-        )
+        names = [p.name for p in measured.parameters]
+        own = np.r_[: _STATE + _BIAS, _STATE + _BIAS + self.start.columns(names)]
         first = None
-        if self._linear is not None and k == self.smoother.node:
-            # Where GTSAM will linearise: so it is done once.
-            states = state_of(*self._linear)
-            residual, matrix, motions = measured.linearize(states, self._begun)
-            first = Linearized(states, self._begun, residual, matrix)
-            residual = residual + matrix @ self._away()[self._columns(parameters)]
+        if self._linear is not None and k == s.node:
+            # Where GTSAM will linearise, so this is done once only.
+            at = self._linear
+            states = state_of(at.state, at.bias)
+            residual, matrix, motions = measured.linearize(states, at.parameters)
+            first = Linearized(states, at.parameters, residual, matrix)
+            residual = residual + matrix @ self._local_coordinates(at)[own]
         else:
-            residual, matrix, motions = measured.linearize(states, self._values)
-        sigma = measured.sigma(motions, self._values)
-        weight = self._weigh(measured, residual, matrix, sigma)
-        self._feign(measured, motions, weight)
+            states = state_of(s.state(k), s.bias(k))
+            residual, matrix, motions = measured.linearize(states, self.values)
+        sigma = measured.sigma(motions, self.values)
+        weights, innovations, messages = gated(
+            measured, residual, matrix, sigma, self._P[np.ix_(own, own)], self._gate
+        )
+        self.innovations += innovations
+        self.messages += messages
+        state_P = self._P[:_STATE, :_STATE]
+        if self.spurious.add(measured, motions, weights, self.values, state_P, self.time):
+            self.undetermined = self.spurious.undetermined(self._parameter_covariance)
+        weight = np.concatenate([w.ravel() for w in weights])
         if not weight.any():
             return None
-        s = self.smoother
-        index = [self.start.parameters.index(p) for p in parameters]
-        return measurement_factor(
-            measured,
-            weight,
-            keys.node(k),
-            s.bias_key(k),
-            [s.calibration_keys[i] for i in index],
-            first,
-        )
+        every = dict(zip((p.name for p in self.start.parameters), s.calibration_keys, strict=True))
+        shared = [every[name] for name in names]
+        return measurement_factor(measured, weight, keys.node(k), s.bias_key(k), shared, first)
 
-    def _away(self) -> Array:
-        """Return newest state, bias and parameters minus where they are linearised."""
-        assert self._linear is not None
-        state, bias = self._linear
+    def _local_coordinates(self, origin: _LinearizationPoint) -> Array:
+        """Return newest state, bias and parameters in the tangent space at a point."""
         s = self.smoother
-        k = s.node
         parts = [
-            state.localCoordinates(s.state(k)),
-            s.bias(k).vector() - bias.vector(),
+            origin.state.localCoordinates(s.state(s.node)),
+            s.bias(s.node).vector() - origin.bias.vector(),
         ]
-        for p in self.start.parameters:
-            parts.append(local_coordinates(p, self._values[p.name], self._begun[p.name]))
+        parts += [
+            local_coordinates(p, self.values[p.name], origin.parameters[p.name])
+            for p in self.start.parameters
+        ]
         return np.concatenate(parts)
-
-    def _columns(self, parameters: Sequence[Parameter]) -> list[int]:
-        """Return the place of state, bias and some parameters among all."""
-        columns = list(range(_STATE + 6))
-        at = _STATE + 6
-        for p in self.start.parameters:
-            if p in parameters:
-                columns += range(at, at + p.mean.size)
-            at += p.mean.size
-        return columns
-
-    def _weigh(
-        self, measured: NodeMeasurements, residual: Array, matrix: Array, sigma: Array
-    ) -> Array:
-        """Return inverse standard deviations, 0 for what the gate does not let pass."""
-        columns = self._columns(measured.parameters)
-        P = self._P[np.ix_(columns, columns)]
-        total = np.sqrt(np.sum((matrix @ P) * matrix, axis=1) + sigma**2)
-        weight = np.empty_like(sigma)
-        row = 0
-        for r in measured.rows:
-            m, d = r.time.size, len(r.observation.components)
-            part = slice(row, row + m * d)
-            row += m * d
-            there = np.isfinite(sigma[part])
-            found = np.where(there, residual[part], np.nan).reshape(m, d)
-            spread = np.where(there, total[part], np.nan).reshape(m, d)
-            used, message = self._gate.passes(
-                r.observation.label, found / spread, r.observation.gate
-            )
-            if message:
-                self.messages.append(message)
-            weight[part] = (used[:, None] / sigma[part].reshape(m, d)).ravel()
-            o = r.observation
-            self.innovations.append(
-                Innovations(o.label, o.unit, o.components, o.time, found, spread, used)
-            )
-        return weight
-
-    def _feign(self, measured: NodeMeasurements, motions: Sequence[Motion], weight: Array) -> None:
-        """Add the information that the motion's error feigns.
-
-        It is worked out for some measurements of each kind, once a second, and counts for
-        all that were used since: kinds come at rates of their own, and late. The error is
-        the whole one, not what is left where the parameters are known: each state is
-        linearised at what was known then, so an error that all states share changes too.
-        """
-        start = {}
-        at = 0
-        for p in self.start.parameters:
-            start[p.name] = at
-            at += p.mean.size
-        values = {**self.start.fixed, **self._values}
-        row = 0
-        for r, motion in zip(measured.rows, motions, strict=True):
-            m, d = r.time.size, len(r.observation.components)
-            own = weight[row : row + m * d].reshape(m, d)
-            row += m * d
-            wanted = [p for p in measured.parameters if p.name in r.observation.parameters]
-            used = int(np.count_nonzero(own.any(axis=1)))
-            if not wanted or not used:
-                continue
-            label = r.observation.label
-            count = self._not_counted.get(label, 0) + used
-            self._not_counted[label] = count
-            if self.time - self._spurious_at.get(label, self.start.time) < _SPURIOUS_EVERY:
-                continue
-            columns = np.concatenate([start[p.name] + np.arange(p.mean.size) for p in wanted])
-            part = spurious_by(
-                r.observation,
-                measured.attachment_of(r),
-                motion,
-                own,
-                np.broadcast_to(self._P[:_STATE, :_STATE], (m, _STATE, _STATE)),
-                values,
-                [p.name for p in wanted],
-            )
-            root = self._prior_root[columns]
-            self._spurious = self._spurious + root.T @ part.sum(axis=0) @ root * (count / used)
-            self._spurious_at[label], self._not_counted[label] = self.time, 0
-            self._held = self._not_observable()
-
-    def _not_observable(self) -> Array:
-        size = len(self._prior_root)
-        if size == 0:
-            return np.zeros((0, 0))
-        root = self._prior_root
-        information = root.T @ np.linalg.inv(self._P[_STATE + 6 :, _STATE + 6 :]) @ root
-        return undetermined_directions(information - np.eye(size), self._spurious)

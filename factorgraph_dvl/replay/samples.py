@@ -1,4 +1,4 @@
-"""The IMU's samples as they arrive: put in order, checked, and cut into segments."""
+"""Samples of the IMU as they arrive: put in order, checked, and cut into segments."""
 
 from __future__ import annotations
 
@@ -12,34 +12,52 @@ from factorgraph_dvl.imu.preintegration import Segments, one_segment
 from factorgraph_dvl.imu.timestamps import unrounded
 from factorgraph_dvl.sensors.imu import Imu, ImuSettings
 
-# Samples on each side of a segment that its polynomials may reach for.
+# Samples on each side of a segment that its polynomials may use; chosen: twice their degree.
 _SIDE = 8
-# Samples in a row that are older than those before, from which on the clock has jumped.
+# Consecutive samples older than those before that show a jump of the clock; chosen: samples that
+# merely come out of order are fewer.
 _JUMPED = 20
-# Fewer samples than these cannot be integrated.
+# Fewest samples that can be integrated; the polynomials need them.
 LEAST = 6
-# Samples whose stamps tell the rate of the clock: stamps in milliseconds leave 1e-6 of it
-# open, where those of a single segment leave 4e-3.
+# Samples by which the sample interval is first estimated; chosen: 1 s at 100 Hz.
+_INTERVAL = 100
+# Samples whose stamps give the rate of the clock. Measured: stamps in milliseconds leave 1e-6 of
+# it open, where those of a single segment leave 4e-3.
 _CLOCK = 2000
-# Times closer than this, s, are the same.
+# Times closer than this, s, are the same; chosen: the resolution of stamps in microseconds.
 _SAME_TIME = 1e-6
 
 
 @dataclass(frozen=True)
 class Gap:
-    """A gap of the record: times of the samples before and after, s."""
+    """A gap of the record.
+
+    Parameters
+    ----------
+    before, after : float
+        Times of the samples before and after it, s.
+    """
 
     before: float
     after: float
 
 
 class SampleBuffer:
-    """A buffer of samples, as long as segments reach back.
+    """Buffer of samples, as long as segments reach back.
 
     Parameters
     ----------
     settings : ImuSettings
-        Of the IMU.
+        Settings of the IMU.
+
+    Attributes
+    ----------
+    dt : float
+        Sample interval, s; 0 until it is known.
+    windows : tuple of (int, int)
+        Widths in samples over which gyros and accelerometers are smoothed.
+    rejected, interpolated : int
+        Number of samples that were not used, and of those that were lost and interpolated.
     """
 
     def __init__(self, settings: ImuSettings) -> None:
@@ -48,8 +66,7 @@ class SampleBuffer:
         self._stale: list[Array] = []
         self.dt = 0.0
         self.windows: tuple[int, int] = (0, 0)
-        self.refused = 0
-        self.duplicates = 0
+        self.rejected = 0
         self.interpolated = 0
 
     @property
@@ -64,19 +81,21 @@ class SampleBuffer:
 
     @property
     def delay(self) -> float:
-        """The same in time, s."""
+        """Time needed after a segment before it can be integrated, s."""
         return self.side * self.dt
 
     def add(self, table: Array) -> tuple[Array, float]:
-        """Take samples (N, 7): time, rate, force.
+        """Add samples (N, 7): time, angular rate, specific force.
 
         Returns
         -------
-        those that are used, (M, 7), and by how much the clock was found to have jumped back,
-        s; 0 = not.
+        ndarray, shape (M, 7)
+            Those that are used.
+        float
+            Jump of the clock back, s; 0 if there was none.
         """
         good = np.all(np.isfinite(table), axis=1)
-        self.refused += int((~good).sum())
+        self.rejected += int((~good).sum())
         table = table[good]
         if table.shape[0] == 0:
             return table, 0.0
@@ -85,12 +104,12 @@ class SampleBuffer:
             table, jump = self._ordered(table)
         if table.shape[0]:
             self._table = np.concatenate([self._table, table])
-            if self.dt == 0.0 and self._table.shape[0] >= 100:
+            if self.dt == 0.0 and self._table.shape[0] >= _INTERVAL:
                 self.dt = float(np.median(np.diff(self._table[:, 0])))
         return table, jump
 
     def _ordered(self, table: Array) -> tuple[Array, float]:
-        """Return samples that are newer than all before, once the clock has been set right."""
+        """Return samples newer than all before, after correction of jumps of the clock back."""
         kept: list[Array] = []
         newest, jump = self.newest, 0.0
         for row in table:
@@ -102,17 +121,16 @@ class SampleBuffer:
                 self._stale.clear()
                 continue
             if row[0] == newest:
-                self.duplicates += 1
                 continue
             if self._stale and row[0] <= self._stale[-1][0]:
                 self._stale.clear()
             self._stale.append(row)
-            self.refused += 1
+            self.rejected += 1
             if len(self._stale) >= _JUMPED:
-                # They go on as if they had followed at once.
-                jump += newest + self.dt - float(self._stale[0][0])
-                self.refused -= len(self._stale)
+                # Continue as if they had followed at once.
                 shift = newest + self.dt - float(self._stale[0][0])
+                jump += shift
+                self.rejected -= len(self._stale)
                 for old in self._stale:
                     old[0] += shift
                     kept.append(old)
@@ -142,18 +160,19 @@ class SampleBuffer:
         Parameters
         ----------
         start : float
-            S.
+            Time, s.
         interval : float
-            Of the segments, s.
+            Interval of the segments, s.
         wanted : float
-            Time, s, before which the segment ends if it is in it.
+            Time of an attitude that needs a state, s: a segment that contains it ends there.
         end : bool
             Whether no more samples come.
 
         Returns
         -------
-        The segment; the gap that follows the start at once; None if the samples have not come
-        so far.
+        Segments or Gap or None
+            The segment; the gap that follows the start at once; None if the samples have not
+            come so far.
         """
         t = self._table[:, 0]
         gap = self.gap_after(start)
@@ -186,7 +205,7 @@ class SampleBuffer:
         return one_segment(inc, first, last)
 
     def _wide(self, time: Array) -> np.ndarray:
-        """Whether a gap is before each of some samples."""
+        """Return whether there is a gap before each of some samples."""
         return np.diff(time, prepend=time[:1]) > (MAX_FILLED + 1.5) * self.dt
 
     def _regular(self, time: Array) -> Array:
@@ -200,11 +219,11 @@ class SampleBuffer:
         if first > 0:
             self._table = self._table[first:]
 
-    def set_back(self, since: float, by: float) -> None:
-        """Move the samples at and after a time by some seconds into the past."""
+    def shift(self, since: float, by: float) -> None:
+        """Move the samples at and after a time by some seconds."""
         later = self._table[:, 0] >= since
         self._table = self._table.copy()
-        self._table[later, 0] -= by
+        self._table[later, 0] += by
 
     def since(self, time: float) -> Array:
         """Return the samples at and after a time, (M, 7)."""

@@ -1,7 +1,8 @@
-"""Collect, align, go: from a batch solution of what was collected to a smoother's first state."""
+"""The start of a smoother: a batch solution, condensed to its last state."""
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass
 
 import gtsam
@@ -12,7 +13,7 @@ from factorgraph_dvl.geometry.rotations import BodyAxes
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph import keys
-from factorgraph_dvl.graph.priors import ConstantsPrior
+from factorgraph_dvl.graph.priors import ConstantsPrior, prior_mean
 from factorgraph_dvl.graph.problem import Evaluation, Problem
 from factorgraph_dvl.imu.propagation import States
 from factorgraph_dvl.sensors.parameters import Parameter
@@ -25,49 +26,51 @@ from factorgraph_dvl.solvers.trajectory import EPOCH_ROUNDING, TRAJECTORY_RATE, 
 from factorgraph_dvl.statistics.spurious_information import spurious_information
 from factorgraph_dvl.trial import Trial
 
-# Standard deviation of the attitude up to which the equations may be linearised in it.
+# Standard deviation of the attitude up to which the smoother may be linearised in it; chosen: what
+# is left out is second order, 0.4 % of a velocity.
 _ATTITUDE = 5.0 * DEG
-# Residuals whose root mean square says something.
+# Fewest residuals of a kind whose RMS is judged; chosen: it then varies by 16 %.
 _ENOUGH = 20
 
 
 @dataclass(frozen=True)
 class ReplayStart:
-    """The last state of what was collected, and what is known of it.
+    """The last state of a batch solution, with all that the records say of it.
 
     Parameters
     ----------
     frame : LocalFrame
-        In which positions are.
-    node, time : int or float
-        Index of the state, and its time, s.
+        Navigation frame of the states.
+    node : int
+        Index of the state.
+    time : float
+        Its time, s.
     prior : gtsam.NonlinearFactorGraph
-        Linear factors on state, bias and parameters: all that was collected.
+        Linear factors on state, bias and parameters that stand for all records so far.
     values : gtsam.Values
-        At which they are linear, and start from.
+        Values at which they are linear.
     parameters, all_parameters : tuple of Parameter
         Those that are estimated, and all.
     fixed : dict of str to ndarray
-        Values of those that are not.
+        Values of those that are not estimated, SI.
     sections : tuple of str
-        Of the sensors that it knows.
+        Sections of the sensors that have reported.
     ranges : bool
-        Whether there are any, to beacons.
+        Whether there are ranges to beacons.
     own_states : tuple of str
         Sections of the sensors whose every measurement needs a state of its own.
     windows : tuple of (int, int)
-        Over which the IMU's samples are smoothed.
+        Widths in samples over which gyros and accelerometers are smoothed.
     spurious : ndarray, shape (P, P)
-        Information on the parameters that only noise makes, in units of the priors' standard
-        deviations.
+        Spurious information on the parameters, in units of the priors' standard deviations.
     walking : bool
         Whether biases walk.
     trajectory : Trajectory
-        Of what was collected, as `begin` was asked for it.
+        Motion after the time that `solve_start` was given.
     notes : tuple of str
-        For the user.
+        Messages for the user.
     misfit : float
-        Largest root mean square of a kind of residuals over their standard deviations.
+        Largest RMS normalised residual of any kind of measurement.
     """
 
     frame: LocalFrame
@@ -88,85 +91,88 @@ class ReplayStart:
     notes: tuple[str, ...]
     misfit: float
 
+    def columns(self, names: Collection[str]) -> np.ndarray:
+        """Return the indices of some parameters' components among those of all estimated."""
+        ends = np.cumsum([p.mean.size for p in self.parameters])
+        own = [
+            np.arange(end - p.mean.size, end)
+            for p, end in zip(self.parameters, ends, strict=True)
+            if p.name in names
+        ]
+        return np.concatenate([np.empty(0, dtype=int), *own])
 
-def begin(
+
+def solve_start(
     trial: Trial, known: ConstantsPrior | None, interval: float, since: float, progress: Progress
 ) -> ReplayStart | str:
-    """Solve what was collected, and condense it to its last state.
+    """Solve the records so far, and condense them to their last state.
 
     Parameters
     ----------
     trial : Trial
-        What was collected.
+        Records so far.
     known : ConstantsPrior or None
-        Of biases and calibration from before, in place of the trial's priors.
+        Biases and calibration known from before, in place of the trial's priors.
     interval : float
-        Of the states to come, s.
+        Interval of the states to come, s.
     since : float
-        Time, s, after which the trajectory is wanted.
+        Time after which the trajectory is wanted, s.
     progress : callable
         Called with stage, iteration and cost.
 
     Returns
     -------
-    Start, or why there is none yet.
+    ReplayStart or str
+        Start, or why there is none yet.
 
     Raises
     ------
     DataError, SolveError
-        If the data collected so far cannot be solved.
+        If the data so far cannot be solved.
     """
     settled, start_positions = settled_minimum(trial, progress=progress, constants_prior=known)
     problem, minimum = settled.problem, settled.minimum
     if len(start_positions.states) > 1:
         return (
-            f"{len(start_positions.states)} trajectories fit the ranges; a turn of 30 degrees or "
-            "more, or `initial.position`, would tell"
+            f"{len(start_positions.states)} trajectories fit the ranges; turn by 30 degrees or "
+            "more, or give `initial.position`"
         )
     if start_positions.notes:
         return start_positions.notes[0]
     if not minimum.converged:
-        return "the solver did not converge"
+        return "the batch solution did not converge"
     covariances = posterior(problem, minimum)
     attitude = float(np.sqrt(np.linalg.eigvalsh(covariances.nodes[-1][:3, :3])[-1]))
     if not attitude < _ATTITUDE:
         return f"the attitude is known to {np.degrees(attitude):.2g} deg only"
     if trial.beacons is not None:
         position = float(np.sqrt(np.linalg.eigvalsh(covariances.nodes[-1][3:6, 3:6])[-1]))
-        if not position < _straight(trial.beacons.range, trial.beacons.settings.range_std_m):
+        if not position < _linear_std(trial.beacons.range, trial.beacons.settings.range_std_m):
             return f"the position is known to {position:.2g} m only"
     evaluation = minimum.evaluation
-    # The whole error, also what all states share: those to come will be linearised without it.
+    # The whole error, also what all states share: the smoother linearises later states without it.
     spurious = spurious_information(problem, evaluation, covariances.nodes).sum(axis=0)
-    last = problem.chain.segments.node_time.size - 1
-    kept = [
-        keys.node(last),
-        problem.chain.bias_key(last),
-        *(problem.key(p.name) for p in problem.parameters),
-    ]
+    chain = problem.chain
+    last = chain.segments.node_time.size - 1
+    values = _last_values(problem, evaluation.values, last)
     gaussian = problem.linearize(evaluation)
-    gone = [key for key in evaluation.values.dims() if key not in kept]
-    _, rest = gaussian.eliminatePartialMultifrontal(gone, gtsam.EliminateQR)
-    values = _some(problem, evaluation.values, last)
+    eliminated = [key for key in evaluation.values.dims() if not values.exists(key)]
+    _, rest = gaussian.eliminatePartialMultifrontal(eliminated, gtsam.EliminateQR)
     return ReplayStart(
-        frame=problem.chain.frame,
+        frame=chain.frame,
         node=last,
-        time=float(problem.chain.segments.node_time[-1]),
+        time=float(chain.segments.node_time[-1]),
         prior=gtsam.LinearContainerFactor.ConvertLinearGraph(rest, values),
         values=values,
         parameters=problem.parameters,
         all_parameters=problem.all_parameters,
-        fixed={
-            p.name: problem.prior_values()[p.name]
-            for p in problem.all_parameters
-            if not p.estimated
-        },
+        fixed={p.name: prior_mean(p) for p in problem.all_parameters if not p.estimated},
         sections=tuple(aid.section for aid in trial.aids),
         ranges=trial.beacons is not None,
-        own_states=_own_states(trial, problem.chain.frame, interval),
-        windows=problem.chain.segments.increments.chosen_windows,
+        own_states=_own_states(trial, chain.frame, interval),
+        windows=chain.segments.increments.chosen_windows,
         spurious=spurious,
-        walking=problem.chain.walking,
+        walking=chain.walking,
         trajectory=_trajectory(
             problem, evaluation.states, covariances.nodes, trial.body_axes, since
         ),
@@ -186,11 +192,11 @@ def _trajectory(
     )
 
 
-def _straight(ranges: Array, std: float) -> float:
+def _linear_std(ranges: Array, std: float) -> float:
     """Return the standard deviation of a position, m, up to which ranges are linear in it.
 
-    A step s across the way to a beacon at a distance d changes it by s² / 2 d: here by the
-    standard deviation of a range.
+    A step s across the line of sight to a beacon at a distance d changes the range by s² / 2 d,
+    which may be the standard deviation of a range.
     """
     nearest = float(np.nanmin(ranges, initial=np.inf))
     return float(np.sqrt(2.0 * nearest * std))
@@ -215,7 +221,8 @@ def _misfit(problem: Problem, evaluation: Evaluation) -> float:
     return out
 
 
-def _some(problem: Problem, values: gtsam.Values, last: int) -> gtsam.Values:
+def _last_values(problem: Problem, values: gtsam.Values, last: int) -> gtsam.Values:
+    """Return the values of the last state, its bias and the parameters."""
     out = gtsam.Values()
     out.insert(keys.node(last), values.atNavState(keys.node(last)))
     bias = problem.chain.bias_key(last)

@@ -1,6 +1,6 @@
 """The replay against the batch solver at odd rates, phases and clocks.
 
-    pytest -m slow tests/test_replay_clocks.py
+    pytest -m slow tests/replay/test_clock_rates.py
 
 runs all 40 trials in two processes.
 """

@@ -187,7 +187,7 @@ def test_gnss_and_bottom_lock_may_fail(trial):
         solution, _ = replay(replace(trial, **{section: aid}), rate_hz=1.0)
         within(solution, trial)
         text = "\n".join(solution.warnings)
-        assert f"{label}: nothing since" in text
+        assert f"{label}: no measurements since" in text
         assert f"{label}: back after" in text
 
 
@@ -224,7 +224,7 @@ def test_a_clock_that_jumps_is_not_believed(trial):
     solution, record = replay(replace(trial, dvl=replace(trial.dvl, time=time)), rate_hz=1.0)
     assert any("DVL velocity" in w and "jumped" in w for w in solution.warnings)
     assert not solution.converged
-    good = ~record.doubted
+    good = ~record.inconsistent
     assert good.sum() > 20
     errors = calibration_errors(solution, trial.calibration_truth)
     assert np.nanmax(np.abs(errors.normalised)) < 5.0
@@ -240,7 +240,7 @@ def test_a_clock_of_a_sensor_that_jumps_back_is_not_believed(trial):
             now = rows_of(aid, (aid.time >= a) & (aid.time < a + 1.0))
             session.add(replace(now, time=now.time - late))
         updates += feed(session, trial, a, a + 1.0, sections=())
-    assert updates[-1].doubted == ("DVL velocity",)
+    assert updates[-1].inconsistent == ("DVL velocity",)
     truth = trial.calibration_truth
     for e in updates[-1].calibration.estimates:
         if e.name in ("misalignment_deg", "scale_error", "lever_arm_m"):
@@ -275,7 +275,7 @@ def test_a_clock_of_the_imu_alone_that_jumps_back_is_set_right(trial):
     assert updates[-1].time > 77.0
     for v in (motion.position, motion.velocity, motion.attitude):
         assert np.abs(v.normalised).max() < 6.0
-    assert not updates[-1].doubted
+    assert not updates[-1].inconsistent
 
 
 def test_a_clock_that_jumps_back_is_set_right(trial):
@@ -305,7 +305,7 @@ def test_what_a_straight_run_does_not_show_is_not_claimed():
     assert any("not observable" in w for w in solution.warnings)
 
 
-def test_what_noise_feigns_is_counted_at_whatever_rate_a_sensor_comes(trial):
+def test_spurious_information_is_counted_at_whatever_rate_a_sensor_comes(trial):
     seldom = rows_of(trial.dvl, np.arange(2, trial.dvl.time.size, 5))
     early = replace(trial, imu=rows_of(trial.imu, trial.imu.time < 60.0), dvl=seldom)
     session = Replay(early)
@@ -320,7 +320,7 @@ def test_what_noise_feigns_is_counted_at_whatever_rate_a_sensor_comes(trial):
     ).trace(axis1=1, axis2=2)
     after = found.problem.chain.segments.node_time > nav.start.time
     # The motion is known less well at the time than with hindsight.
-    grown = np.trace(nav.spurious - nav.start.spurious)
+    grown = np.trace(nav.spurious.information - nav.start.spurious)
     assert by_node[after].sum() < grown < 10.0 * by_node[after].sum()
 
 
@@ -404,7 +404,7 @@ def test_what_matters_is_in_view_on_a_low_terminal(trial, run):
         rows_of(solution.trajectory, [0]),
         latency=0.004,
         speed=20.0,
-        doubted=("GNSS position",),
+        inconsistent=("GNSS position",),
         lacking=("misalignment_y_deg",),
     )
     lines = [s for line in console.render_lines(view) if (s := "".join(x.text for x in line))]

@@ -19,7 +19,7 @@ from factorgraph_dvl.imu.preintegration import segments
 from factorgraph_dvl.imu.propagation import States
 from factorgraph_dvl.io.solution_folder import save_solution
 from factorgraph_dvl.io.trial_folder import load_trial, save_trial
-from factorgraph_dvl.replay.recorded import replay
+from factorgraph_dvl.replay import replay
 from factorgraph_dvl.sensors.beacon import Beacons, BeaconSettings, offset_name
 from factorgraph_dvl.settings.convert import convert
 from factorgraph_dvl.simulation import plan_motion, simulate

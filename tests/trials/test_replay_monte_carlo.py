@@ -1,6 +1,6 @@
 """Whether what a replay claims is honest along the way: many seeds, at several times.
 
-    pytest -m slow tests/test_replay_monte_carlo.py
+    pytest -m slow tests/trials/test_replay_monte_carlo.py
 
 runs 20 seeds of each scenario; FACTORGRAPH_DVL_SEEDS runs another number.
 """

@@ -21,7 +21,7 @@ def live_view(
     *,
     latency: float,
     speed: float,
-    doubted: Sequence[str],
+    inconsistent: Sequence[str],
     lacking: Sequence[str] = (),
     good_since: float | None = None,
 ) -> Group:
@@ -42,8 +42,8 @@ def live_view(
     latency : float
         Latency of the last update, s.
     speed : float
-        Speed of the replay relative to real time.
-    doubted : sequence of str
+        Relative to real time.
+    inconsistent : sequence of str
         Kinds of measurements that disagree with the prediction.
     lacking : sequence of str, optional
         Components whose standard deviations exceed their limits.
@@ -82,8 +82,8 @@ def live_view(
         f"latency {1e3 * latency:.1f} ms, {speed:.1f} times real time",
     ]
     parts: list[Table | Text] = [verdict]
-    if doubted:
-        parts.append(Text(f"in doubt: {', '.join(doubted)}", "red"))
+    if inconsistent:
+        parts.append(Text(f"in doubt: {', '.join(inconsistent)}", "red"))
     parts += [Text(line) for line in lines]
     return Group(*parts, table)
 

@@ -1,7 +1,8 @@
-"""Measurements that have arrived before the IMU has come so far."""
+"""Pending measurements: those that arrived before the IMU has reached their time."""
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping
 
 import numpy as np
@@ -11,35 +12,37 @@ from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.sensors.protocol import Aid, Observation
 from factorgraph_dvl.sensors.records import joined, rows_of
 
-# Times closer than this, s, are the same.
+# Times closer than this, s, are the same; chosen: the resolution of stamps in microseconds.
 SAME_TIME = 1e-6
-# Measurements that are ahead of the IMU by more than this, s, are not kept.
+# Measurements ahead of the IMU by more than this, s, are discarded; chosen: such a lead is a wrong
+# clock, not a feed that delivers out of order.
 AHEAD = 60.0
 
 
-class Waiting:
-    """Records by sensor, until their time comes.
+class PendingMeasurements:
+    """Records by sensor, until the IMU reaches their time.
 
     Attributes
     ----------
-    refused : number of measurements that were too far ahead, by sensor.
+    rejected : Counter
+        Number of measurements that were too far ahead, by label of the sensor.
     """
 
     def __init__(self) -> None:
         self._records: dict[str, list[Aid]] = {}
         self._example: dict[str, Observation] = {}
-        self.refused: dict[str, int] = {}
+        self.rejected: Counter[str] = Counter()
 
     @property
     def sections(self) -> tuple[str, ...]:
-        """Sections of the sensors of which something waits."""
+        """Sections of the sensors that have pending measurements."""
         return tuple(self._records)
 
     def add(self, record: Aid, newest: float = np.inf) -> None:
-        """Take a record whose rows are not too far ahead of the IMU's newest sample, s."""
+        """Add rows that are not too far ahead of the IMU's newest sample, s."""
         ahead = record.time > newest + AHEAD
         if ahead.any() and newest > -np.inf:
-            self.refused[record.label] = self.refused.get(record.label, 0) + int(ahead.sum())
+            self.rejected[record.label] += int(ahead.sum())
             if ahead.all():
                 return
             record = rows_of(record, ~ahead)
@@ -48,32 +51,37 @@ class Waiting:
     def due(
         self, section: str, end: float, frame: LocalFrame | None, values: Mapping[str, Array]
     ) -> tuple[Aid, Array] | None:
-        """Take out what was true before a time, and return it with its true times.
+        """Remove what was true before a time, and return it with its true times.
 
         Parameters
         ----------
         section : str
-            Of the sensor.
+            Section of the sensor.
         end : float
-            S.
+            Time, s.
         frame : LocalFrame or None
-            In which measurements are, None as long as there is none.
+            Navigation frame of the measurements; None as long as there is none.
         values : mapping of str to ndarray
-            Of the parameters.
+            Values of the parameters, SI.
+
+        Returns
+        -------
+        tuple of (Aid, ndarray) or None
+            Rows and their true times, s; None if nothing is due.
         """
         record = joined(self._records.pop(section))
-        true = record.time - (0.0 if frame is None else self._late(record, frame, values))
+        true = record.time - (0.0 if frame is None else self._time_offset(record, frame, values))
         due = true < end - SAME_TIME
         if not due.all():
             self._records[section] = [rows_of(record, ~due)]
         return (rows_of(record, due), true[due]) if due.any() else None
 
     def first_after(self, section: str, time: float) -> float:
-        """Return the first time of a waiting row after a time, s; infinite if there is none."""
+        """Return the first time of a pending row after a time, s; infinite if there is none."""
         later = [r.time[r.time > time] for r in self._records.get(section, [])]
         return min((float(t.min()) for t in later if t.size), default=np.inf)
 
-    def _late(self, record: Aid, frame: LocalFrame, values: Mapping[str, Array]) -> float:
+    def _time_offset(self, record: Aid, frame: LocalFrame, values: Mapping[str, Array]) -> float:
         """Return by how much the clock of a sensor is ahead, s."""
         section = record.section
         if section not in self._example:

@@ -1,8 +1,8 @@
-"""Measurements that a feed delivers more than once."""
+"""Duplicates: measurements that a feed delivers more than once."""
 
 from __future__ import annotations
 
-from collections import deque
+from collections import Counter, deque
 from typing import TypeVar
 
 import numpy as np
@@ -10,27 +10,28 @@ import numpy as np
 from factorgraph_dvl.sensors.protocol import Aid
 from factorgraph_dvl.sensors.records import arrays_of, rows_of
 
-# Rows of each sensor that are remembered.
+# Rows of each sensor that are remembered; chosen: 8 minutes of a DVL at 10 Hz, below 1 MB.
 _ROWS = 5000
 
 _AnyAid = TypeVar("_AnyAid", bound=Aid)
 
 
-class Repeats:
-    """The last rows of each sensor, to know them again: used twice, they would count twice.
+class Duplicates:
+    """The last rows of each sensor: a row used twice would count as two measurements.
 
     Attributes
     ----------
-    refused : number of rows that had come before, by sensor.
+    rejected : Counter
+        Number of rows that had come before, by label of the sensor.
     """
 
     def __init__(self) -> None:
         self._order: dict[str, deque[bytes]] = {}
         self._known: dict[str, set[bytes]] = {}
-        self.refused: dict[str, int] = {}
+        self.rejected: Counter[str] = Counter()
 
     def without(self, record: _AnyAid) -> _AnyAid:
-        """Return the rows that have not come before; those are equal in every number."""
+        """Return a record without rows that equal an earlier one in every number."""
         order = self._order.setdefault(record.section, deque())
         known = self._known.setdefault(record.section, set())
         columns = list(arrays_of(record).values())
@@ -46,5 +47,5 @@ class Repeats:
                 known.discard(order.popleft())
         if new.all():
             return record
-        self.refused[record.label] = self.refused.get(record.label, 0) + int((~new).sum())
+        self.rejected[record.label] += int((~new).sum())
         return rows_of(record, new)

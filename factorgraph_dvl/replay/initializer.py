@@ -1,0 +1,285 @@
+"""Batch solutions of the records so far, from which the smoother starts."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from factorgraph_dvl.errors import DataError, FactorgraphDvlError
+from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.graph.priors import ConstantsPrior
+from factorgraph_dvl.replay.history import RecordHistory
+from factorgraph_dvl.replay.navigator import Navigator
+from factorgraph_dvl.replay.samples import Gap
+from factorgraph_dvl.replay.start import ReplayStart, solve_start
+from factorgraph_dvl.solution import Progress
+from factorgraph_dvl.trial import InitialPosition, Trial
+
+# Data before the first attempt to start, s; chosen: in-motion alignment needs some turns or sway.
+_FIRST = 30.0
+# The same after a gap of the IMU, s; chosen: biases and calibration are known by then.
+_AFTER_GAP = 10.0
+# Growth of the time since the start until the next attempt, and until the next batch solution of a
+# smoother that runs; chosen: the cost of all solutions stays a small multiple of the last.
+_RETRY = 1.2
+_GROWTH = 1.5
+# Shortest time between two attempts, and between two solutions of a smoother that runs, s; chosen.
+_RETRY_AFTER = 1.0
+_SOLVE_AFTER = 10.0
+# Ratio of the largest RMS normalised residual to what it was before a gap of the IMU, from which
+# on the IMU's clock may have jumped; chosen: noise changes it by a few percent.
+_MISFIT = 1.5
+# Motion of a vessel during a gap: acceleration, m/s², and sway, m; chosen, generous for ships.
+_ACCELERATION = 1.0
+_SWAY = 0.5
+# Span of data that is kept for a start, s; chosen: 30 minutes at 100 Hz are 10 MB.
+_LONGEST = 1800.0
+# Agreement of smoother and batch solution, in standard deviations, and standard deviation of
+# rotations, rad, from which on linearising once is enough; chosen. Measured: final estimates are
+# then within 0.1 standard deviations of those of a batch solution.
+_AGREEMENT = 0.1
+_SETTLED_ROTATION = np.radians(0.2)
+# Change of a rotation since it was linearised that asks for a new batch solution, rad; chosen:
+# second-order terms are then 5e-5 of a velocity.
+_ROTATION_CHANGE = 0.01
+
+
+@dataclass(frozen=True)
+class ClockJump:
+    """A jump of the IMU's clock ahead.
+
+    Parameters
+    ----------
+    since : float
+        Time of the first sample after it, s, on the wrong clock.
+    by : float
+        Size of the jump, s.
+    """
+
+    since: float
+    by: float
+
+
+class Initializer:
+    """Keeps the records, decides when to solve them as a batch, and does.
+
+    Parameters
+    ----------
+    settings : Trial
+        Trial of which all but the records counts.
+    interval : float
+        Interval of the states to come, s.
+    progress : callable
+        Called with stage, iteration and cost.
+
+    Attributes
+    ----------
+    history : RecordHistory or None
+        Records so far; None once no batch solution is needed any more.
+    messages : list of str
+        Messages for the user since they were last taken.
+    """
+
+    def __init__(self, settings: Trial, interval: float, progress: Progress) -> None:
+        self.history: RecordHistory | None = RecordHistory(settings, _LONGEST)
+        self.messages: list[str] = []
+        self._settings = settings
+        self._interval = interval
+        self._progress = progress
+        self._gap: Gap | None = None
+        self._prior: ConstantsPrior | None = None
+        self._usual_misfit = 1.0
+        self._attempt = np.nan
+        self._solved_at = np.nan
+        self._solve_at = np.nan
+        self._reason = ""
+        self._noted = set(settings.notes)
+
+    def restart(self, gap: Gap, navigator: Navigator, samples: Array) -> None:
+        """Begin again after a gap of the IMU, with what is known of biases and calibration.
+
+        Parameters
+        ----------
+        gap : Gap
+            Gap of the IMU.
+        navigator : Navigator
+            Navigator at the gap.
+        samples : ndarray, shape (N, 7)
+            IMU samples after the gap.
+        """
+        length = gap.after - gap.before
+        self.messages.append(
+            f"gap of {length:.2f} s in the IMU at {gap.before:.2f} s: the attitude is aligned "
+            f"again, from the {_AFTER_GAP:g} s after it"
+        )
+        if self.history is None:
+            state = navigator.filtered(self._settings.body_axes)
+            speed = float(np.linalg.norm(state.velocity[0]))
+            reach = speed * length + 0.5 * _ACCELERATION * length**2 + _SWAY
+            self._prior = navigator.known(length)
+            here = InitialPosition(state.geodetic[0], np.hypot(state.position_std[0], reach))
+            self._settings = replace(self._settings, initial_attitude=None, initial_position=here)
+            sections = navigator.start.sections
+            self.history = RecordHistory(self._settings, _LONGEST, length + 1.0, sections)
+            self.history.add_samples(samples)
+        self._gap = gap
+        self._attempt = gap.after + _AFTER_GAP
+
+    def attempt_due(self, arrived: float, *, end: bool) -> float | None:
+        """Return the time up to which a start is to be attempted, None if it is too early.
+
+        Parameters
+        ----------
+        arrived : float
+            Time up to which IMU samples have arrived, s.
+        end : bool
+            Whether no more samples come.
+        """
+        assert self.history is not None
+        start = self.history.start
+        if arrived < start:
+            return None
+        if np.isnan(self._attempt):
+            self._attempt = start + _FIRST
+        elif self._attempt <= start:
+            self.messages.append(
+                f"IMU samples before {start:.3f} s are not used: before there was a start, its "
+                f"clock jumped or it was silent for more than {_LONGEST:g} s"
+            )
+            self._attempt = start + _FIRST
+        if arrived < self._attempt and not end:
+            return None
+        # However many samples came at once.
+        until = min(arrived, self._attempt)
+        self._attempt = until + max((_RETRY - 1.0) * (until - start), _RETRY_AFTER)
+        return until
+
+    def solve_by(self, time: float) -> None:
+        """Solve again soon after a time, s, as a sensor reports for the first time."""
+        self._solve_at = min(self._solve_at, time + _SOLVE_AFTER)
+
+    def solve_due(self, navigator: Navigator) -> bool:
+        """Whether a smoother that runs is to be replaced by a new batch solution."""
+        if self.history is None:
+            return False
+        now = navigator.time
+        turned = now > self._solved_at + _SOLVE_AFTER and (
+            navigator.rotation_change > _ROTATION_CHANGE
+        )
+        return now >= self._solve_at or turned
+
+    def solve(
+        self, until: float, dt: float, since: float, navigator: Navigator | None
+    ) -> tuple[ReplayStart | None, ClockJump | None]:
+        """Solve the records up to a time as a batch.
+
+        Parameters
+        ----------
+        until : float
+            Time, s.
+        dt : float
+            Sample interval of the IMU, s.
+        since : float
+            Time after which the trajectory is wanted, s.
+        navigator : Navigator or None
+            Navigator that runs, and that the solution is to replace.
+
+        Returns
+        -------
+        ReplayStart or None
+            Start, None if the data do not allow one yet.
+        ClockJump or None
+            Jump of the IMU's clock, if that explains the data and a gap does not.
+        """
+        assert self.history is not None
+        start, jump = self._begin(until, since), None
+        if navigator is not None and self._contradicts(start):
+            start = self._without_rejected(until, since, start, navigator)
+        if self._gap is not None and self._contradicts(start):
+            start, jump = self._with_clock_jump(until, since, start, self._gap, dt)
+            until -= jump.by if jump else 0.0
+        self._solved_at = until
+        self._solve_at = self.history.start + _GROWTH * (until - self.history.start)
+        if isinstance(start, str):
+            if navigator is None:
+                if start != self._reason:
+                    self.messages.append(f"no start yet at {until:.1f} s: {start}")
+                self._reason = start
+            return None, jump
+        self._reason = ""
+        self._gap = None
+        self._usual_misfit = max(1.0, start.misfit)
+        self.messages += [note for note in start.notes if note not in self._noted]
+        self._noted.update(start.notes)
+        return start, jump
+
+    def release_if_settled(self, before: Navigator, after: Navigator) -> None:
+        """Release the history if the smoother found the same as the batch solution after it."""
+        assert self.history is not None
+        if not self.history.complete or before.start.sections != after.start.sections:
+            return
+        old, new = before.calibration(), after.calibration()
+        std = np.sqrt(np.diag(new.covariance))
+        free = std > 0.0
+        moved = np.concatenate(
+            [a.value - b.value for a, b in zip(old.estimates, new.estimates, strict=True)]
+        )
+        agrees = bool(np.all(np.abs(moved[free]) < _AGREEMENT * std[free]))
+        known = all(
+            np.all(np.diag(after.covariance_of(p)) < _SETTLED_ROTATION**2)
+            for p in after.start.parameters
+            if p.rotation
+        )
+        if agrees and known and not after.undetermined.size:
+            self.history = None
+
+    def _begin(self, until: float, since: float) -> ReplayStart | str:
+        assert self.history is not None
+        trial = self.history.trial(until)
+        try:
+            trial.frame()
+        except DataError:
+            return "no position has been measured since" if self._gap else "no position yet"
+        try:
+            return solve_start(trial, self._prior, self._interval, since, self._progress)
+        except FactorgraphDvlError as error:
+            return str(error)
+
+    def _contradicts(self, start: ReplayStart | str) -> bool:
+        """Whether there is no start, or one whose residuals are larger than they were."""
+        return isinstance(start, str) or start.misfit > _MISFIT * self._usual_misfit
+
+    def _without_rejected(
+        self, until: float, since: float, start: ReplayStart | str, navigator: Navigator
+    ) -> ReplayStart | str:
+        """Return a better start without what the innovation gate rejected, if there is one."""
+        whole = self.history
+        assert whole is not None
+        fewer = whole.without_rejected(navigator.start.frame)
+        if fewer is None:
+            return start
+        self.history = fewer
+        other = self._begin(until, since)
+        if isinstance(other, str) or (not isinstance(start, str) and other.misfit >= start.misfit):
+            self.history = whole
+            return start
+        return other
+
+    def _with_clock_jump(
+        self, until: float, since: float, start: ReplayStart | str, gap: Gap, dt: float
+    ) -> tuple[ReplayStart | str, ClockJump | None]:
+        """Solve as if the IMU went on through a gap, and its clock jumped."""
+        assert self.history is not None
+        jump = ClockJump(gap.after, gap.after - gap.before - dt)
+        self.history.shift_samples(gap.after, -jump.by)
+        other = self._begin(until - jump.by, since)
+        if self._contradicts(other):
+            self.history.shift_samples(gap.before + 0.5 * dt, jump.by)
+            why = start if isinstance(start, str) else f"misfit of {start.misfit:.1f}"
+            return f"after the gap the IMU contradicts the other sensors ({why})", None
+        self.messages.append(
+            f"no gap in the IMU at {gap.before:.2f} s, its clock jumped ahead by {jump.by:.2f} s: "
+            "later samples are shifted back by that. Check the clock of the logger"
+        )
+        return other, jump

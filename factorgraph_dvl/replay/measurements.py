@@ -1,0 +1,114 @@
+"""Measurements of one segment: attached to the state before it, and gated."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.graph.sensor_factor import NodeMeasurements, Rows
+from factorgraph_dvl.imu.preintegration import Segments
+from factorgraph_dvl.imu.propagation import attach
+from factorgraph_dvl.replay.gate import InnovationGate
+from factorgraph_dvl.replay.start import ReplayStart
+from factorgraph_dvl.replay.update import Innovations
+from factorgraph_dvl.sensors.protocol import Aid
+
+
+def attached(
+    aids: Sequence[Aid],
+    seg: Segments,
+    gravity_n: Array,
+    start: ReplayStart,
+    values: Mapping[str, Array],
+) -> NodeMeasurements | None:
+    """Return what was measured in a segment, None if there are no measurements.
+
+    Parameters
+    ----------
+    aids : sequence of Aid
+        Records of the sensors.
+    seg : Segments
+        The segment.
+    gravity_n : ndarray, shape (1, 3)
+        `LocalFrame.gravity_without_rotation` along it, m/s².
+    start : ReplayStart
+        Frame and parameters.
+    values : mapping of str to ndarray
+        Values of all parameters, SI.
+    """
+    observations = [o for aid in aids for o in aid.observations(start.frame)]
+    if not observations:
+        return None
+    rows: list[Rows] = []
+    times: list[Array] = []
+    count = 0
+    for o in observations:
+        time = o.true_time(values)
+        if rows and np.array_equal(time, rows[-1].time):
+            # Of one sensor, such as position and velocity of GNSS.
+            rows.append(Rows(o, rows[-1].at, time))
+            continue
+        rows.append(Rows(o, slice(count, count + time.size), time))
+        times.append(time)
+        count += time.size
+    used = {name for o in observations for name in o.parameters}
+    return NodeMeasurements(
+        attachment=attach(seg, np.concatenate(times), start.frame.earth_rate),
+        rows=tuple(rows),
+        parameters=tuple(p for p in start.parameters if p.name in used),
+        fixed=start.fixed,
+        gravity_n=gravity_n,
+        earth_rate_n=start.frame.earth_rate,
+    )
+
+
+def gated(
+    measured: NodeMeasurements,
+    residual: Array,
+    jacobian: Array,
+    sigma: Array,
+    P: Array,
+    gate: InnovationGate,
+) -> tuple[list[Array], list[Innovations], list[str]]:
+    """Return inverse standard deviations of measurements, 0 for those that the gate rejects.
+
+    Parameters
+    ----------
+    measured : NodeMeasurements
+        Measurements of R components in all.
+    residual, sigma : ndarray, shape (R,)
+        Predicted - measured, and its standard deviation without that of the prediction.
+    jacobian : ndarray, shape (R, 15 + n)
+        Derivatives with respect to state, bias and the n parameters.
+    P : ndarray, shape (15 + n, 15 + n)
+        Joint covariance of these.
+    gate : InnovationGate
+        Gate, which remembers what it sees.
+
+    Returns
+    -------
+    weights : list of ndarray, each (M, d)
+        Inverse standard deviations of each kind.
+    innovations : list of Innovations
+        Innovations of each kind.
+    messages : list of str
+        Messages of the gate for the user.
+    """
+    total = np.sqrt(np.sum((jacobian @ P) * jacobian, axis=1) + sigma**2)
+    weights, innovations, messages = [], [], []
+    first = 0
+    for r in measured.rows:
+        o = r.observation
+        shape = r.time.size, len(o.components)
+        part = slice(first, first + shape[0] * shape[1])
+        first = part.stop
+        there = np.isfinite(sigma[part])
+        found = np.where(there, residual[part], np.nan).reshape(shape)
+        spread = np.where(there, total[part], np.nan).reshape(shape)
+        used, message = gate.accept(o.label, found / spread, o.gate)
+        messages += [message] if message else []
+        weights.append(used[:, None] / sigma[part].reshape(shape))
+        innovations.append(Innovations(o.label, o.unit, o.components, o.time, found, spread, used))
+    return weights, innovations, messages

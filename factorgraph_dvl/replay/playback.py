@@ -1,0 +1,147 @@
+"""Playback of a recorded trial in the order of time, and the solution at its end."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from itertools import pairwise
+
+import numpy as np
+
+from factorgraph_dvl.errors import SolveError
+from factorgraph_dvl.imu.timestamps import without_strays
+from factorgraph_dvl.replay.record import Recorder, ReplayRecord
+from factorgraph_dvl.replay.samples import LEAST
+from factorgraph_dvl.replay.session import LAG, RATE, Kind, Replay
+from factorgraph_dvl.replay.update import Update
+from factorgraph_dvl.sensors.records import rows_of
+from factorgraph_dvl.solution import Progress, Solution, consistency_warnings
+from factorgraph_dvl.trial import Trial
+
+Watch = Callable[[Update], None]
+
+
+def replay(
+    trial: Trial,
+    *,
+    smoother: Kind = "fixed-lag",
+    lag_s: float = LAG,
+    rate_hz: float = RATE,
+    progress: Progress | None = None,
+    watch: Watch | None = None,
+) -> tuple[Solution, ReplayRecord]:
+    """Feed a recorded trial in the order of time, and record what was known when.
+
+    Parameters
+    ----------
+    trial : Trial
+        Trial with its records.
+    smoother : Kind, default 'fixed-lag'
+        Smoother: `fixed-lag` or `isam2`.
+    lag_s : float, optional
+        Age beyond which states are no longer corrected, s.
+    rate_hz : float, optional
+        States a second.
+    progress : callable, optional
+        Called with stage, iteration and cost while a batch solution runs.
+    watch : Watch, optional
+        Called with every update.
+
+    Returns
+    -------
+    Solution
+        The calibration at the end, and the trajectory as it was known at each time.
+    ReplayRecord
+        The calibration over time.
+
+    Raises
+    ------
+    ConfigError
+        If an option is out of range.
+    DataError
+        If the trial has no position.
+    SolveError
+        If the data never sufficed to start.
+    """
+    trial = without_strays(trial)
+    # Fails early if the trial has no position.
+    trial.frame()
+    run = Replay(trial, smoother=smoother, lag_s=lag_s, rate_hz=rate_hz, progress=progress)
+    recorder = Recorder()
+    imu = trial.imu
+    step = 1.0 / rate_hz
+    # Gaps cost one step, whatever their length.
+    steps = np.unique(np.floor((imu.time - imu.time[0]) / step))
+    edges = imu.time[0] + step * np.union1d(steps, steps + 1.0)
+    edges[-1] = np.inf
+    samples = np.searchsorted(imu.time, edges)
+    rows = [np.searchsorted(aid.time, edges) for aid in trial.aids]
+    for each in rows:
+        each[0] = 0
+
+    def take(updates: list[Update]) -> None:
+        for update in updates:
+            recorder.add(update)
+            if watch is not None:
+                watch(update)
+
+    for j, (a, b) in enumerate(pairwise(samples.tolist())):
+        for aid, each in zip(trial.aids, rows, strict=True):
+            first, last = each[j : j + 2].tolist()
+            if last > first:
+                run.add(rows_of(aid, slice(first, last)))
+        if b > a:
+            take(run.add_imu(imu.time[a:b], imu.gyro[a:b], imu.accel[a:b]))
+    take(run.finish())
+    if recorder.last is None:
+        why = "; ".join(run.messages) or "the record is too short"
+        raise SolveError(f"the data never sufficed to start: {why}", where=trial.name)
+    return _solution(trial, run, recorder, recorder.last), recorder.record(run.delay)
+
+
+def _solution(trial: Trial, run: Replay, recorder: Recorder, last: Update) -> Solution:
+    calibration = last.calibration
+    residuals = recorder.residuals()
+    warnings = [*trial.notes, *(f"{time:.1f} s: {text}" for time, text in recorder.messages)]
+    warnings += [f"at the end: {text}" for text in run.messages]
+    if run.unused:
+        warnings.append(
+            f"the replay ended at {last.time:.3f} s: {run.unused} IMU samples follow, but too few "
+            "to start again after a gap; they and what was measured then were not used"
+        )
+    warnings += run.counts()
+    warnings += consistency_warnings(calibration.estimates, residuals)
+    for e in calibration.estimates:
+        open_ = np.flatnonzero(~e.observable & (e.prior_std > 0.0))
+        if open_.size:
+            names = ", ".join(e.component_names[i] for i in open_)
+            warnings.append(
+                f"{names} not observable in these data: the prior is reported; turns and changes "
+                "of speed make more of it observable"
+            )
+    known = {e.name for e in calibration.estimates}
+    for aid in trial.aids:
+        if any(p.estimated and p.name not in known for p in aid.parameters()):
+            warnings.append(
+                f"{aid.label} delivered nothing in time to be calibrated; check its record, or "
+                "feed more data"
+            )
+    if trial.imu.settings.bias_walks:
+        warnings.append(
+            "a bias of the IMU walks: reported is its value at the end, where `solve` reports the "
+            "mean over the trial"
+        )
+    cost = 0.5 * sum(float(np.nansum((r.residual / r.sigma) ** 2)) for r in residuals)
+    return Solution(
+        trial=trial.name,
+        solver="replay",
+        body_axes=trial.body_axes,
+        inputs=trial.inputs,
+        converged=run.unused < LEAST and not last.inconsistent,
+        iterations=recorder.count,
+        cost=cost,
+        estimates=calibration.estimates,
+        covariance=calibration.covariance,
+        trajectory=recorder.trajectory(),
+        residuals=residuals,
+        warnings=tuple(warnings),
+    )

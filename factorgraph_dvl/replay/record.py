@@ -1,0 +1,149 @@
+"""The record of a replay: what was known when, in compact arrays."""
+
+from __future__ import annotations
+
+from array import array
+from dataclasses import dataclass, fields
+from math import prod
+
+import numpy as np
+
+from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.replay.update import Innovations, Update
+from factorgraph_dvl.solution import Residuals, Trajectory
+
+# Numbers of an update before its estimates: time, latency, solved, inconsistent.
+_HEAD = 4
+
+
+@dataclass(frozen=True)
+class ReplayRecord:
+    """What was known when.
+
+    Parameters
+    ----------
+    time, latency : ndarray, shape (H,), s
+        Times of the updates, and how long each took to compute.
+    solved : ndarray, shape (H,)
+        Whether an update includes a batch solution.
+    inconsistent : ndarray, shape (H,)
+        Whether some measurements were inconsistent with the prediction.
+    names : tuple of str
+        Names of the n calibration components, as in `Solution.order`.
+    values, std : ndarray, shape (H, n)
+        Estimates and standard deviations in reported units; nan before a component was estimated.
+    smoothed : Trajectory
+        Epochs of the trajectory, smoothed with later data.
+    messages : tuple of tuple of (float, str)
+        Time, s, and text of each message.
+    delay : float
+        Time by which estimates are behind the newest IMU sample, s.
+    """
+
+    time: Array
+    latency: Array
+    solved: np.ndarray
+    inconsistent: np.ndarray
+    names: tuple[str, ...]
+    values: Array
+    std: Array
+    smoothed: Trajectory
+    messages: tuple[tuple[float, str], ...]
+    delay: float
+
+
+class Recorder:
+    """Keeps updates as rows of numbers: an object for each would fill the memory in hours."""
+
+    def __init__(self) -> None:
+        self.last: Update | None = None
+        self.count = 0
+        self.messages: list[tuple[float, str]] = []
+        # By what was estimated, which grows when a sensor first reports.
+        self._estimates: list[tuple[tuple[str, ...], array[float]]] = []
+        self._trajectory: array[float] = array("d")
+        self._smoothed: array[float] = array("d")
+        self._residuals: dict[str, tuple[Innovations, array[float]]] = {}
+
+    def add(self, update: Update) -> None:
+        """Append one update."""
+        self.last = update
+        self.count += 1
+        estimates = update.calibration.estimates
+        names = tuple(name for e in estimates for name in e.component_names)
+        if not self._estimates or self._estimates[-1][0] != names:
+            self._estimates.append((names, array("d")))
+        values = np.concatenate([e.value for e in estimates])
+        std = np.concatenate([e.std for e in estimates])
+        head = [update.time, update.latency, update.solved, bool(update.inconsistent)]
+        self._estimates[-1][1].extend([*head, *values, *std])
+        _append(self._trajectory, update.trajectory)
+        if update.smoothed is not None:
+            _append(self._smoothed, update.smoothed)
+        for i in update.innovations:
+            _, rows = self._residuals.setdefault(i.label, (i, array("d")))
+            rows.frombytes(np.column_stack([i.time, i.residual, i.sigma])[i.used].tobytes())
+        self.messages += [(update.time, text) for text in update.messages]
+
+    def trajectory(self) -> Trajectory:
+        """Return the trajectory as it was known at each time."""
+        return self._read(self._trajectory)
+
+    def residuals(self) -> tuple[Residuals, ...]:
+        """Return the innovations of the measurements that were used."""
+        out = []
+        for i, rows in self._residuals.values():
+            d = len(i.components)
+            table = np.frombuffer(rows).reshape(-1, 1 + 2 * d)
+            time, residual, sigma = np.split(table, [1, 1 + d], axis=1)
+            out.append(Residuals(i.label, i.unit, i.components, time[:, 0], residual, sigma))
+        return tuple(out)
+
+    def record(self, delay: float) -> ReplayRecord:
+        """Return the record; `delay` is that of the estimates behind the IMU, s."""
+        names = self._estimates[-1][0]
+        table = np.vstack([_columns(np.frombuffer(x), own, names) for own, x in self._estimates])
+        values, std = np.split(table[:, _HEAD:], 2, axis=1)
+        return ReplayRecord(
+            time=table[:, 0],
+            latency=table[:, 1],
+            solved=table[:, 2] > 0.0,
+            inconsistent=table[:, 3] > 0.0,
+            names=names,
+            values=values,
+            std=std,
+            smoothed=self._read(self._smoothed),
+            messages=tuple(self.messages),
+            delay=delay,
+        )
+
+    def _read(self, rows: array[float]) -> Trajectory:
+        """Return rows as a trajectory, with the shapes of the last one."""
+        assert self.last is not None
+        shapes = [getattr(self.last.trajectory, f.name).shape[1:] for f in fields(Trajectory)]
+        ends = np.cumsum([prod(shape) for shape in shapes])
+        parts = np.split(np.frombuffer(rows).reshape(-1, ends[-1]), ends[:-1], axis=1)
+        return Trajectory(
+            *(p.reshape(-1, *shape).copy() for p, shape in zip(parts, shapes, strict=True))
+        )
+
+
+def _append(rows: array[float], trajectory: Trajectory) -> None:
+    count = trajectory.time.size
+    if count:
+        parts = [getattr(trajectory, f.name).reshape(count, -1) for f in fields(Trajectory)]
+        rows.frombytes(np.concatenate(parts, axis=1).tobytes())
+
+
+def _columns(numbers: Array, own: tuple[str, ...], names: tuple[str, ...]) -> Array:
+    """Return rows for some components as rows for `names`, nan where there are none."""
+    table = numbers.reshape(-1, _HEAD + 2 * len(own))
+    out = np.full((table.shape[0], _HEAD + 2 * len(names)), np.nan)
+    out[:, :_HEAD] = table[:, :_HEAD]
+    for i, name in enumerate(own):
+        if name in names:
+            j = names.index(name)
+            out[:, [_HEAD + j, _HEAD + len(names) + j]] = table[
+                :, [_HEAD + i, _HEAD + len(own) + i]
+            ]
+    return out

@@ -1,0 +1,79 @@
+"""Updates of a replay: what is known after each segment."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.replay.calibration import CalibrationEstimate
+from factorgraph_dvl.solution import Trajectory
+
+
+@dataclass(frozen=True)
+class Innovations:
+    """Innovations of M measurements of one kind.
+
+    Parameters
+    ----------
+    label, unit : str
+        Name of the kind, and unit of its residuals.
+    components : tuple of str
+        Names of the d components.
+    time : ndarray, shape (M,), s
+        Times as in the record.
+    residual, sigma : ndarray, shape (M, d)
+        Predicted - measured, and its standard deviation; nan where a component was not measured.
+    used : ndarray, shape (M,)
+        Whether the innovation gate accepted the measurement.
+    """
+
+    label: str
+    unit: str
+    components: tuple[str, ...]
+    time: Array
+    residual: Array
+    sigma: Array
+    used: np.ndarray
+
+
+@dataclass(frozen=True)
+class Update:
+    """What is known after one more segment.
+
+    Parameters
+    ----------
+    time : float
+        Time of the newest state, s.
+    latency : float
+        Time that the update took to compute, s.
+    state : Trajectory
+        The newest state, as a trajectory of one epoch.
+    trajectory : Trajectory
+        The motion since the update before, at the epochs of a batch solution.
+    calibration : CalibrationEstimate
+        The calibration with its joint covariance.
+    smoothed : Trajectory or None
+        Earlier epochs, smoothed with later data; None if there are none this time.
+    innovations : tuple of Innovations
+        Measured against predicted, one entry for each kind of measurement.
+    messages : tuple of str
+        Messages for the user.
+    solved : bool
+        Whether the update includes a batch solution.
+    inconsistent : tuple of str
+        Kinds of measurements whose innovations are larger than predicted: do not trust the
+        standard deviations while there are any.
+    """
+
+    time: float
+    latency: float
+    state: Trajectory
+    trajectory: Trajectory
+    calibration: CalibrationEstimate
+    smoothed: Trajectory | None
+    innovations: tuple[Innovations, ...]
+    messages: tuple[str, ...]
+    solved: bool
+    inconsistent: tuple[str, ...]

@@ -1,0 +1,127 @@
+"""The incremental smoother against GTSAM's own."""
+
+from __future__ import annotations
+
+import gtsam
+import numpy as np
+
+from factorgraph_dvl.graph import keys
+from factorgraph_dvl.replay.smoother import Smoother
+
+
+def chain_of_states(count):
+    """A prior, and for each further state a factor to the one before and a measurement."""
+    prior, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    bias = gtsam.imuBias.ConstantBias()
+    state = gtsam.NavState()
+    loose = gtsam.noiseModel.Isotropic.Sigma
+    prior.add(gtsam.PriorFactorNavState(keys.node(0), state, loose(9, 0.1)))
+    prior.add(gtsam.PriorFactorConstantBias(keys.bias(0), bias, loose(6, 1e-3)))
+    values.insert(keys.node(0), state)
+    values.insert(keys.bias(0), bias)
+    params = gtsam.PreintegrationParams.MakeSharedU(9.8)
+    params.setGyroscopeCovariance(1e-6 * np.eye(3))
+    params.setAccelerometerCovariance(1e-4 * np.eye(3))
+    params.setIntegrationCovariance(1e-8 * np.eye(3))
+    pim = gtsam.PreintegratedImuMeasurementsG(params)
+    for _ in range(20):
+        pim.integrateMeasurement(np.array([0.3, 0.1, 9.9]), np.array([0.05, 0.1, 0.2]), 0.01)
+    rng = np.random.default_rng(1)
+    steps = []
+    for k in range(1, count):
+        graph, new = gtsam.NonlinearFactorGraph(), gtsam.Values()
+        graph.add(gtsam.GalileanImuFactor2(keys.node(k - 1), keys.node(k), keys.bias(0), pim))
+        state = pim.predict(state, bias)
+        noisy = state.retract(rng.normal(0.0, 0.05, 9))
+        graph.add(gtsam.PriorFactorNavState(keys.node(k), noisy, loose(9, 0.1)))
+        new.insert(keys.node(k), state)
+        steps.append((0.2 * k, graph, new))
+    return prior, values, steps
+
+
+def test_the_lag_is_that_of_the_incremental_fixed_lag_smoother():
+    prior, values, steps = chain_of_states(60)
+    ours = Smoother(prior, values, node=0, time=0.0, parameters=(), walking=False, lag=4.0)
+    settings = gtsam.ISAM2Params()
+    settings.setFactorization("QR")
+    settings.relinearizeSkip = 1
+    settings.setRelinearizeThreshold(1e-3)
+    theirs = gtsam.IncrementalFixedLagSmoother(4.0, settings)
+    bias = keys.bias(0)
+    theirs.update(prior, values, {keys.node(0): 0.0, bias: 0.0})
+    for k, (time, graph, new) in enumerate(steps, start=1):
+        ours.extend(time, graph, new)
+        theirs.update(graph, new, {keys.node(k): time, bias: time})
+    k = len(steps)
+    sigma = np.sqrt(np.diag(theirs.marginalCovariance(keys.node(k))))
+    P = ours.joint_covariance()
+    np.testing.assert_allclose(np.sqrt(np.diag(P))[:9], sigma, rtol=1e-3)
+    apart = theirs.calculateEstimateNavState(keys.node(k)).localCoordinates(ours.state(k))
+    assert np.abs(apart / sigma).max() < 0.02
+    assert len(ours.times) == len(theirs.timestamps()) - 1
+    old = ours.oldest + 3
+    found = ours.state_covariances([old])[old]
+    np.testing.assert_allclose(
+        np.sqrt(np.diag(found)),
+        np.sqrt(np.diag(theirs.marginalCovariance(keys.node(old)))),
+        rtol=1e-3,
+    )
+
+
+def test_a_range_is_linearised_where_the_position_is_found_to_be():
+    """A vehicle 30 m off its reckoned place hears two beacons after a long outages."""
+    sigma = 0.5
+
+    def range_of_100_m(beacon):
+        def error(this, at, jacobians):
+            state = at.atNavState(keys.node(0))
+            away = state.position() - beacon
+            distance = np.linalg.norm(away)
+            if jacobians is not None:
+                J = np.zeros((1, 9))
+                J[0, 3:6] = away / distance @ state.attitude().matrix()
+                jacobians[0] = np.asfortranarray(J / sigma)
+            return np.array([(distance - 100.0) / sigma])
+
+        return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(1), [keys.node(0)], error)
+
+    diagonal = gtsam.noiseModel.Diagonal.Sigmas
+    bias = gtsam.imuBias.ConstantBias()
+    prior, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    begun = gtsam.NavState(gtsam.Rot3(), np.array([0.0, 30.0, 0.0]), np.zeros(3))
+    known = np.full(3, 1e-3)
+    sigmas = np.concatenate([known, [5.0, 40.0, 1e-3], known])
+    prior.add(gtsam.PriorFactorNavState(keys.node(0), begun, diagonal(sigmas)))
+    prior.add(gtsam.PriorFactorConstantBias(keys.bias(0), bias, diagonal(np.full(6, 1e-3))))
+    values.insert(keys.node(0), begun)
+    values.insert(keys.bias(0), bias)
+    smoother = Smoother(
+        prior, values, node=0, time=0.0, parameters=(), walking=False, lag=30.0, ranges=True
+    )
+    for k in range(1, 6):
+        graph, new = gtsam.NonlinearFactorGraph(), gtsam.Values()
+        still = diagonal(np.full(9, 1e-3))
+        graph.add(
+            gtsam.BetweenFactorNavState(keys.node(k - 1), keys.node(k), gtsam.NavState(), still)
+        )
+        if k == 1:
+            for place in ([100.0, 0.0, 0.0], [0.0, -100.0, 0.0]):
+                graph.add(range_of_100_m(np.array(place)))
+        new.insert(keys.node(k), smoother.state(k - 1))
+        smoother.extend(float(k), graph, new)
+    # Linearised at the reckoned place, it ends 4 m off.
+    assert np.abs(smoother.state(5).position()).max() < sigma
+
+
+def test_the_oldest_state_stays_a_leaf_when_old_states_are_corrected():
+    prior, values, steps = chain_of_states(80)
+    smoother = Smoother(prior, values, node=0, time=0.0, parameters=(), walking=False, lag=4.0)
+    for k, (time, graph, new) in enumerate(steps, start=1):
+        smoother.extend(time, graph, new)
+        late = gtsam.NonlinearFactorGraph()
+        old = max(smoother.oldest + k % 15, 0)
+        if old <= smoother.node:
+            noise = gtsam.noiseModel.Isotropic.Sigma(9, 0.5)
+            late.add(gtsam.PriorFactorNavState(keys.node(old), smoother.state(old), noise))
+            smoother.correct(late, old)
+    assert len(smoother.times) == 21
