@@ -122,7 +122,7 @@ def test_the_factor_linearises_as_differences_do():
         accel_bias=states.accel_bias + 1e-2,
     )
     for p in measured.parameters:
-        step = rng.normal(0.0, 1e-5 if p.unit == "s" else 0.1, p.mean.size)
+        step = rng.normal(0.0, 1e-5 if p.spec.unit == "s" else 0.1, p.mean.size)
         value = values[p.name]
         values[p.name] = value @ exp_so3(step) if p.rotation else value + step
     at = gtsam_values(measured, states, values)
