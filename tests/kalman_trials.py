@@ -9,7 +9,7 @@ from factorgraph_dvl.baselines.strapdown import prepare
 from factorgraph_dvl.geometry.rotations import exp_so3, log_so3
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.imu.increments import increments
-from factorgraph_dvl.sensors.parameters import Parameter
+from factorgraph_dvl.sensors.parameters import Parameter, ParameterSpec
 
 STILL = {"manoeuvres": [{"straight_s": 40}], "sway": {}}
 
@@ -39,7 +39,8 @@ def samples_of(trial):
 
 
 def parameter(stem, mean, sigma, **options):
-    return Parameter(stem, "", 1.0, np.array(mean, float), np.array(sigma, float), **options)
+    spec = ParameterSpec(stem, **options)
+    return Parameter(spec, np.array(mean, float), np.array(sigma, float))
 
 
 def exact_points(count=200, *, misalignment=(0.0, 0.0, 0.0), scale=0.0, arm=(0, 0, 0), bias=0.0):
@@ -53,6 +54,6 @@ def exact_points(count=200, *, misalignment=(0.0, 0.0, 0.0), scale=0.0, arm=(0, 
     return Points(np.arange(float(count)), v, P, omega, np.zeros((count, 3)), v_d, sigma)
 
 
-MISALIGNMENT = parameter("misalignment", np.zeros(3), np.full(3, 3.0), rotation=True)
+MISALIGNMENT = parameter("misalignment", np.zeros(3), np.full(3, 3.0), kind="rotation")
 SCALE = parameter("scale_error", [0.0], [0.1], labels=("",))
 LEVER_ARM = parameter("lever_arm", np.zeros(3), np.full(3, 10.0))

@@ -105,11 +105,16 @@ def test_command_line(tmp_path, capsys):
     assert history["misalignment_z_deg_std"][-1] < history["misalignment_z_deg_std"][0]
     again = ("kalman", trial, "--out", out, "--method", "wahba", "--no-figures")
     assert run(*again) == 2
-    # It has no lever arm, and the sway shows one of 1 m: it writes its answer, but warns of it.
-    assert run(*again, "--force") == 1
-    assert "the model does not fit the data" in capsys.readouterr().err
+    assert run(*again, "--force") == 0
     assert not (out / "history.csv").exists()
     assert run("kalman", trial, "--out", tmp_path / "x", "--method", "ukf") == 2
     (trial / "gnss.csv").write_text("time_s,lat_deg,lon_deg,height_m\n1,,,\n2,,,\n")
     assert run("kalman", trial, "--out", tmp_path / "y") == 2
     assert "none of its rows holds a measurement" in " ".join(capsys.readouterr().err.split())
+    # Without its lever arm the motion contradicts the answer, which is written all the same.
+    (tmp_path / "no-arm").mkdir()
+    unknown = write_trial(tmp_path / "no-arm", simulate(scenario(noise=True), 0))
+    wahba = ("kalman", unknown, "--out", tmp_path / "z", "--method", "wahba", "--no-figures")
+    assert run(*wahba) == 1
+    assert "the model does not fit the data" in capsys.readouterr().err
+    assert (tmp_path / "z" / "calibration.json").exists()

@@ -16,14 +16,14 @@ from factorgraph_dvl.geometry.rotations import exp_so3
 
 
 def test_a_prior_comes_back_as_it_was_stated():
-    turned = parameter("misalignment", [0.1, -0.2, 0.5], [0.01, 0.02, 0.03], rotation=True)
+    turned = parameter("misalignment", [0.1, -0.2, 0.5], [0.01, 0.02, 0.03], kind="rotation")
     values, covariance = prior_of((turned, SCALE)).reported()
     np.testing.assert_allclose(values, [0.1, -0.2, 0.5, 0.0], atol=1e-12)
     np.testing.assert_allclose(covariance, np.diag([1e-4, 4e-4, 9e-4, 1e-2]), atol=1e-15)
 
 
 def test_a_fixed_component_has_no_variance():
-    fixed = parameter("misalignment", [0.1, 0.0, 0.3], [0.1, 0.0, 0.1], rotation=True)
+    fixed = parameter("misalignment", [0.1, 0.0, 0.3], [0.1, 0.0, 0.1], kind="rotation")
     estimated = Estimated((fixed,), (exp_so3([0.2, 0.0, 0.4]),), 0.01 * np.eye(3))
     _, covariance = estimated.reported()
     assert not covariance[1].any()

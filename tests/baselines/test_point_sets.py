@@ -29,9 +29,17 @@ def test_no_residual_at_the_truth():
 
 
 def test_the_rate_shakes_the_lever_arm_across_it():
-    points = replace(exact_points(1), omega_sigma=np.array([[0.1, 0.2, 0.3]]))
-    # By hand: 1/2 (0.1² + 0.2²) 4.
-    np.testing.assert_allclose(points.lever_arm_variance(np.array([0.0, 0.0, 4.0])), 0.1)
+    no_noise = np.zeros((1, 3))
+    still = np.zeros((1, 3, 3))
+    points = replace(
+        exact_points(1),
+        v_b_covariance=still,
+        sigma_d=no_noise,
+        omega_sigma=np.array([[0.1, 0.2, 0.3]]),
+    )
+    # By hand: 1/2 (0.1² + 0.2²) 2².
+    found = points.covariance_d(np.eye(3), np.array([0.0, 0.0, 2.0]))
+    np.testing.assert_allclose(found, 0.1 * np.eye(3)[None])
 
 
 def test_no_rotation_is_further_than_63_degrees_from_a_start():
