@@ -782,7 +782,7 @@ def test_a_record_is_not_made_of_another_instrument_or_of_nothing(solved, tmp_pa
     two = trial.beams.velocity * [1, 1, np.nan, np.nan]
     for i, (changes, message) in enumerate(
         (
-            ({"settings": mounted}, "deg away from where the trial has it"),
+            ({"settings": mounted}, "Check that it is the same instrument"),
             ({"velocity": two}, "dvl_beams.csv: no ping has a velocity"),
         )
     ):
