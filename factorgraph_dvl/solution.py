@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.special import chdtrc
@@ -14,6 +14,7 @@ from factorgraph_dvl.geometry.unit_vectors import turned
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.sensors.catalogue import specs_of
+from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.sensors.parameters import SCALAR, Parameter, ParameterSpec
 from factorgraph_dvl.sensors.protocol import DO_NOT_FIT, TOO_LARGE
 
@@ -199,8 +200,8 @@ class Solution:
         The motion.
     residuals : tuple of Residuals, optional
         Of each sensor.
-    warnings : tuple of str, optional
-        What the user must know.
+    findings : tuple of Finding, optional
+        What the user must know of the records and the result.
     hypotheses : tuple of Hypothesis, optional
         Where the data allow, or for some time allowed, more than one trajectory: all of them, the
         heaviest first, which is the solution's; else empty.
@@ -220,15 +221,24 @@ class Solution:
     covariance: Array
     trajectory: Trajectory
     residuals: tuple[Residuals, ...] = ()
-    warnings: tuple[str, ...] = field(default_factory=tuple)
+    findings: tuple[Finding, ...] = ()
     hypotheses: tuple[Hypothesis, ...] = ()
     rejected: tuple[Residuals, ...] = ()
     inputs: tuple[str, ...] = ()
 
     @property
+    def warnings(self) -> tuple[str, ...]:
+        """The findings as texts."""
+        return tuple(map(str, self.findings))
+
+    @property
     def order(self) -> tuple[str, ...]:
         """Component names of the rows of `covariance`."""
         return tuple(name for e in self.estimates for name in e.component_names)
+
+    def with_findings(self, findings: Iterable[Finding]) -> Solution:
+        """Return the solution with findings before its own, each once."""
+        return replace(self, findings=tuple(dict.fromkeys((*findings, *self.findings))))
 
     def estimate(self, name: str) -> Estimate:
         """Return a parameter by its name in calibration.json.
@@ -256,8 +266,13 @@ class Calibration:
     cost: float
     estimates: tuple[Estimate, ...]
     covariance: Array
-    warnings: tuple[str, ...] = ()
+    findings: tuple[Finding, ...] = ()
     inputs: tuple[str, ...] = ()
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """The findings as texts."""
+        return tuple(map(str, self.findings))
 
     @property
     def order(self) -> tuple[str, ...]:
@@ -275,20 +290,27 @@ def values_of(estimates: Sequence[Estimate]) -> dict[str, Array]:
     return {e.name: e.value if e.nominal is None else e.directions for e in estimates}
 
 
-def not_observable(estimate: Estimate, why: Callable[[int], str]) -> list[str]:
-    """Return a warning for each reason why components of an estimate are not observable.
+def not_observable(estimate: Estimate, why: Callable[[int], str]) -> list[Finding]:
+    """Return a finding for each reason why components of an estimate are not observable.
 
     Parameters
     ----------
     estimate : Estimate
-        Of which components that were held are left out.
+        Components that are fixed are left out.
     why : callable of int, str
         The reason of a component, by its index.
     """
     reasons: dict[str, list[str]] = {}
     for i in np.flatnonzero(~estimate.observable & (estimate.prior_std > 0.0)):
         reasons.setdefault(why(int(i)), []).append(estimate.component_names[i])
-    return [f"{', '.join(names)} not observable: {reason}" for reason, names in reasons.items()]
+    return [
+        Finding(
+            Code.NOT_OBSERVABLE,
+            f"{', '.join(names)} not observable: {reason}",
+            parameter=estimate.name,
+        )
+        for reason, names in reasons.items()
+    ]
 
 
 def as_estimates(
@@ -325,10 +347,10 @@ def as_estimates(
     return tuple(estimates)
 
 
-def consistency_warnings(
+def consistency_findings(
     estimates: Sequence[Estimate], residuals: Sequence[Residuals]
-) -> list[str]:
-    """Return warnings where a solution contradicts what was stated before.
+) -> list[Finding]:
+    """Return findings where a solution contradicts what was stated before.
 
     Residuals that are larger than their standard deviations make every reported standard
     deviation too small; a value far outside its prior says that prior or data are wrong.
@@ -340,28 +362,40 @@ def consistency_warnings(
         if away.size and away.max() > _FAR_FROM_PRIOR:
             name = np.array(e.component_names)[known][np.argmax(away)]
             out.append(
-                f"{name} is {away.max():.0f} prior standard deviations from its prior: the prior "
-                "is too tight, or a unit, an axis or the model is wrong; do not trust the values "
-                "before that is cleared up"
+                Finding(
+                    Code.FAR_FROM_PRIOR,
+                    f"{name} is {away.max():.0f} prior standard deviations from its prior: the "
+                    "prior is too tight, or a unit, an axis or the model is wrong; do not trust "
+                    "the values before you know which",
+                    parameter=e.name,
+                )
             )
     for r in residuals:
         rms = float(np.sqrt(np.nanmean((r.residual / r.sigma) ** 2))) if r.time.size else 0.0
         if rms > DO_NOT_FIT:
             out.append(
-                f"{r.label}: residuals are {rms:.0f} times as large as their stated standard "
-                "deviation: the model does not fit the data, and the values are not to be used. "
-                "A lever arm, a clock offset, a unit or an axis may be missing or wrong"
+                Finding(
+                    Code.DOES_NOT_FIT,
+                    f"residuals are {rms:.0f} times as large as their stated standard deviation: "
+                    "the model does not fit the data, so do not use the values. A lever arm, a "
+                    "clock offset, a unit or an axis may be missing or wrong",
+                    sensor=r.label,
+                )
             )
         elif rms > TOO_LARGE:
             out.append(
-                f"{r.label}: residuals are {rms:.1f} times as large as their stated standard "
-                "deviation; the reported standard deviations are too small unless it is corrected"
+                Finding(
+                    Code.LARGE_RESIDUALS,
+                    f"residuals are {rms:.1f} times as large as their stated standard deviation; "
+                    "the reported standard deviations are too small until you correct it",
+                    sensor=r.label,
+                )
             )
     return out
 
 
-def contradictions(residuals: Sequence[Residuals]) -> list[str]:
-    """Return a warning for each sensor whose residuals a filter's covariance does not explain.
+def contradictions(residuals: Sequence[Residuals]) -> list[Finding]:
+    """Return a finding for each sensor whose residuals a filter's covariance does not explain.
 
     Over the last half of them, when a filter should have converged. Residuals that are too
     small are none of this: a filter may be more careful than it needs.
@@ -379,9 +413,13 @@ def contradictions(residuals: Sequence[Residuals]) -> list[str]:
         square = float(z @ z)
         if square > CONTRADICTS**2 * z.size and chdtrc(z.size, square) < _CHANCE:
             out.append(
-                f"{r.label}: over the last half, residuals are {np.sqrt(square / z.size):.3g} "
-                "times as large as the filter's covariance allows: it has not converged, and "
-                "values and standard deviations are not to be used"
+                Finding(
+                    Code.FILTER_CONTRADICTED,
+                    f"over the last half, residuals are {np.sqrt(square / z.size):.3g} times as "
+                    "large as the filter's covariance allows: it has not converged, so do not use "
+                    "its values and standard deviations",
+                    sensor=r.label,
+                )
             )
     return out
 
@@ -424,8 +462,8 @@ def mixed(trajectories: Sequence[Trajectory], weights: Array) -> Trajectory:
     )
 
 
-def ambiguity(hypotheses: Sequence[Hypothesis]) -> list[str]:
-    """Return a warning if more than one hypothesis is left."""
+def ambiguity(hypotheses: Sequence[Hypothesis]) -> list[Finding]:
+    """Return a finding if more than one hypothesis is left."""
     living = [h for h in hypotheses if h.died is None]
     if len(living) < 2:
         return []
@@ -434,9 +472,12 @@ def ambiguity(hypotheses: Sequence[Hypothesis]) -> list[str]:
     frame = LocalFrame(*first.trajectory.geodetic[-1])
     apart = float(np.linalg.norm(frame.position(*second.trajectory.geodetic[-1])))
     return [
-        f"{len(living)} trajectories fit the data (weights {weights}), {apart:.3g} m apart at the "
-        "end: the answer is ambiguous. The standard deviations admit to all of them; a turn of "
-        "30 degrees or more, or `initial.position`, would tell"
+        Finding(
+            Code.AMBIGUOUS,
+            f"{len(living)} trajectories fit the data (weights {weights}), {apart:.3g} m apart at "
+            "the end: the answer is ambiguous. The standard deviations contain all of them; a "
+            "turn of 30 degrees or more, or `initial.position`, would tell which is right",
+        )
     ]
 
 
@@ -470,7 +511,7 @@ def joined(
         converged=all(s.converged for s in solutions),
         trajectory=mixed([solutions[i].trajectory for i in order], weights[order]),
         hypotheses=every,
-        warnings=(*best.warnings, *ambiguity(every)),
+        findings=(*best.findings, *ambiguity(every)),
     )
 
 
@@ -516,21 +557,28 @@ def not_told_apart(solutions: Sequence[Solution], against: Array) -> Solution:
         estimates=tuple(estimates),
         covariance=covariance,
         trajectory=mixed([solutions[i].trajectory for i in order], weights),
-        warnings=(
-            *best.warnings,
-            f"{len(order)} minima fit the data (weights {shares}), the others at {turned}: the "
-            "answer is ambiguous. The standard deviations admit to all of them; a longer trial "
-            "with turns and changes of speed would tell",
+        findings=(
+            *best.findings,
+            Finding(
+                Code.AMBIGUOUS,
+                f"{len(order)} minima fit the data (weights {shares}), the others at {turned}: "
+                "the answer is ambiguous. The standard deviations contain all of them; a longer "
+                "trial with turns and changes of speed would tell which is right",
+            ),
         ),
     )
 
 
-def mostly_rejected(used: Sequence[Residuals], rejected: Sequence[Residuals]) -> list[str]:
-    """Return a warning for each kind of measurement of which over a third were rejected."""
+def mostly_rejected(used: Sequence[Residuals], rejected: Sequence[Residuals]) -> list[Finding]:
+    """Return a finding for each kind of measurement of which over a third were rejected."""
     kept = {r.label: r.time.size for r in used}
     return [
-        f"{r.label}: {r.time.size} of {r.time.size + kept.get(r.label, 0)} were rejected as "
-        "echoes: a place, a clock, a unit or a standard deviation may be wrong"
+        Finding(
+            Code.MANY_REJECTED,
+            f"{r.time.size} of {r.time.size + kept.get(r.label, 0)} were rejected as echoes: a "
+            "place, a clock, a unit or a standard deviation may be wrong",
+            sensor=r.label,
+        )
         for r in rejected
         if 2 * r.time.size > kept.get(r.label, 0)
     ]

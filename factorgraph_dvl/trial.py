@@ -17,6 +17,7 @@ from factorgraph_dvl.sensors.beam_geometry import as_dvl
 from factorgraph_dvl.sensors.depth import Depth
 from factorgraph_dvl.sensors.dvl import Dvl
 from factorgraph_dvl.sensors.dvl_beams import BEAM_PREFIX, DvlBeams
+from factorgraph_dvl.sensors.finding import Finding
 from factorgraph_dvl.sensors.fingerprint import fingerprints, shared
 from factorgraph_dvl.sensors.gnss import Gnss
 from factorgraph_dvl.sensors.imu import Imu
@@ -101,7 +102,7 @@ class Trial:
     calibration_truth : dict of str to ndarray, optional
         True values of calibration parameters by reported name, in reported units; empty outside
         simulations.
-    notes : tuple of str, optional
+    notes : tuple of Finding, optional
         What was noticed while loading, for the user.
     """
 
@@ -116,7 +117,7 @@ class Trial:
     initial_position: InitialPosition | None = None
     reference: Reference | None = None
     calibration_truth: dict[str, Array] = field(default_factory=dict)
-    notes: tuple[str, ...] = ()
+    notes: tuple[Finding, ...] = ()
 
     def __post_init__(self) -> None:
         # What a sensor must know of another is set here, whoever made or changed the trial.
@@ -224,7 +225,7 @@ class PlanarTrial:
     calibration_truth : dict of str to ndarray, optional
         True values of what is estimated, by reported name, in reported units; empty outside
         simulations.
-    notes : tuple of str, optional
+    notes : tuple of Finding, optional
         What was noticed while loading, for the user.
     """
 
@@ -237,7 +238,7 @@ class PlanarTrial:
     initial_position: InitialPosition | None = None
     reference: Reference | None = None
     calibration_truth: dict[str, Array] = field(default_factory=dict)
-    notes: tuple[str, ...] = ()
+    notes: tuple[Finding, ...] = ()
 
     gnss: ClassVar[None] = None
     beams: ClassVar[None] = None

@@ -14,6 +14,7 @@ from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.io.trial_folder import save_trial
 from factorgraph_dvl.sensors.dvl import Dvl, DvlSettings
+from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.sensors.gnss import Gnss, GnssSettings
 from factorgraph_dvl.sensors.imu import Imu, ImuSettings
 from factorgraph_dvl.solution import Estimate, Solution, Trajectory
@@ -143,7 +144,13 @@ def build_solution(*, converged: bool = True, **changes: Any) -> Solution:
             spread(0.01),
             spread(0.001),
         ),
-        warnings=("misalignment_z_deg was not observable",),
+        findings=(
+            Finding(
+                Code.NOT_OBSERVABLE,
+                "misalignment_z_deg was not observable",
+                parameter="misalignment_deg",
+            ),
+        ),
     )
     return replace(solution, **changes)
 

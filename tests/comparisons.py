@@ -23,7 +23,7 @@ def estimate(name: str, value: Any, std: Any, observable: Any = True) -> Estimat
 
 def result(*estimates: Estimate, **changes: Any) -> Solution:
     std = np.concatenate([np.zeros(0), *(e.std for e in estimates)])
-    fields = {"warnings": (), "body_axes": "RFU", "covariance": np.diag(std**2)} | changes
+    fields = {"findings": (), "body_axes": "RFU", "covariance": np.diag(std**2)} | changes
     return build_solution(estimates=estimates, **fields)
 
 

@@ -14,7 +14,12 @@ from factorgraph_dvl.baselines.beam_filter import (
 )
 from factorgraph_dvl.baselines.navigation import motion_at, navigate
 from factorgraph_dvl.baselines.outcome import Outcome
-from factorgraph_dvl.baselines.summary import WHITE_NOISE, sensor_motion, summarise
+from factorgraph_dvl.baselines.summary import (
+    WHITE_NOISE,
+    left_out,
+    sensor_motion,
+    summarise,
+)
 from factorgraph_dvl.errors import ConfigError, DataError
 from factorgraph_dvl.solution import Progress, Residuals, Solution
 from factorgraph_dvl.trial import Trial
@@ -62,10 +67,10 @@ def calibrate_beams(trial: Trial, *, rate_hz: float, report: Progress) -> tuple[
     outcome = replace(outcome, estimated=without_spurious_information(pings, outcome.estimated))
     residual, sigma = beam_residuals(pings, outcome.estimated)
     components = tuple(f"beam {i}" for i in range(1, residual.shape[1] + 1))
-    notes = [*navigation.notes, WHITE_NOISE]
+    findings = [*navigation.findings, WHITE_NOISE]
     unused = int(np.sum(received & ~covered))
     if unused:
-        notes.append(f"{sensor.label}: {unused} pings at times without SINS/GNSS were not used")
+        findings.append(left_out(sensor, unused))
     solution = summarise(
         trial,
         navigation,
@@ -75,6 +80,6 @@ def calibrate_beams(trial: Trial, *, rate_hz: float, report: Progress) -> tuple[
         motion=sensor_motion(motion),
         solver="kalman-beams",
         rate_hz=rate_hz,
-        notes=notes,
+        findings=findings,
     )
     return solution, outcome

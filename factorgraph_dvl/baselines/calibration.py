@@ -17,11 +17,18 @@ from factorgraph_dvl.baselines.point_set_filter import point_set
 from factorgraph_dvl.baselines.point_sets import Points
 from factorgraph_dvl.baselines.spurious_information import without_spurious_information
 from factorgraph_dvl.baselines.star_calibration import calibrate_gyros
-from factorgraph_dvl.baselines.summary import WHITE_NOISE, dvl_residuals, sensor_motion, summarise
+from factorgraph_dvl.baselines.summary import (
+    WHITE_NOISE,
+    dvl_residuals,
+    left_out,
+    sensor_motion,
+    summarise,
+)
 from factorgraph_dvl.baselines.wahba import wahba
 from factorgraph_dvl.errors import ConfigError, DataError
 from factorgraph_dvl.imu.timestamps import JUMP, without_strays
 from factorgraph_dvl.sensors.dvl import SCALE_SPEC, Dvl
+from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.solution import Progress, Solution
 from factorgraph_dvl.trial import Trial
@@ -31,9 +38,10 @@ DVL_METHODS: tuple[DvlMethod, ...] = get_args(DvlMethod)
 Method = DvlMethod | Literal["star", "beams"]
 METHODS: tuple[Method, ...] = (*DVL_METHODS, "star", "beams")
 
-_UNCORRELATED = (
+_UNCORRELATED = Finding(
+    Code.METHOD_LIMITS,
     "of the calibration in dvl.calibration values and standard deviations are the prior; these "
-    "methods take no correlations"
+    "methods take no correlations",
 )
 _NEGLECTED: dict[DvlMethod, tuple[str, ...]] = {
     "point-set": ("dvl_bias", "time_offset"),
@@ -140,16 +148,16 @@ def calibrate(
         outcome, estimated=without_spurious_information(points, outcome.estimated, arm)
     )
     joint = [_UNCORRELATED] if dvl.prior is not None else []
-    notes = [
-        *navigation.notes,
+    findings = [
+        *navigation.findings,
         *_outage(trial),
         *joint,
-        *outcome.warnings,
+        *outcome.findings,
         WHITE_NOISE,
         *_neglects(method, dvl),
     ]
     if unused:
-        notes.append(f"DVL: {unused} pings at times without SINS/GNSS were not used")
+        findings.append(left_out(dvl, unused))
     solution = summarise(
         trial,
         navigation,
@@ -159,12 +167,12 @@ def calibrate(
         motion=sensor_motion(points),
         solver=f"kalman-{method}",
         rate_hz=rate_hz,
-        notes=notes,
+        findings=findings,
     )
     return solution, history_of(outcome)
 
 
-def _outage(trial: Trial) -> list[str]:
+def _outage(trial: Trial) -> list[Finding]:
     """Say that GNSS is missing for too long, if it is."""
     assert trial.gnss is not None
     fixes = trial.gnss.time[~np.isnan(trial.gnss.geodetic[:, 0])]
@@ -175,8 +183,11 @@ def _outage(trial: Trial) -> list[str]:
     if longest <= _LONGEST_GAP:
         return []
     return [
-        f"GNSS is missing for {longest:.0f} s: the SINS/GNSS filter drifts there, and neither its "
-        "motion nor the calibration is to be used; `solve` bridges it"
+        Finding(
+            Code.GNSS_OUTAGE,
+            f"GNSS is missing for {longest:.0f} s: the SINS/GNSS filter drifts there, so use "
+            "neither its motion nor the calibration; `solve` bridges it",
+        )
     ]
 
 
@@ -227,14 +238,19 @@ def _single(scale: Parameter) -> Parameter:
     return Parameter(SCALE_SPEC, np.array([scale.mean.mean()]), np.array([scale.sigma.max()]))
 
 
-def _neglects(method: DvlMethod, dvl: Dvl) -> list[str]:
+def _neglects(method: DvlMethod, dvl: Dvl) -> list[Finding]:
     """Say which parameters of the trial the method does not estimate."""
     parameters = {p.stem: p for p in dvl.parameters()}
     out = [
-        f"{method} does not estimate {p.name}: fixed at {np.round(p.mean / p.si, 6).tolist()}"
+        Finding(
+            Code.METHOD_LIMITS,
+            f"{method} does not estimate {p.name}: fixed at {np.round(p.mean / p.si, 6).tolist()}",
+            parameter=p.name,
+        )
         for p in (parameters[stem] for stem in _NEGLECTED[method])
         if p.estimated
     ]
     if method in ("point-set", "wahba") and parameters["scale_error"].mean.size == 3:
-        out.append(f"{method} estimates one scale error for the three axes")
+        text = f"{method} estimates one scale error for the three axes"
+        out.append(Finding(Code.METHOD_LIMITS, text, parameter=parameters["scale_error"].name))
     return out

@@ -11,6 +11,7 @@ from factorgraph_dvl.baselines.summary import trajectory_of
 from factorgraph_dvl.errors import DataError
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.imu.timestamps import without_strays
+from factorgraph_dvl.sensors.finding import Finding
 from factorgraph_dvl.sensors.gnss import Gnss
 from factorgraph_dvl.solution import Trajectory
 from factorgraph_dvl.trial import Trial
@@ -27,8 +28,8 @@ _UNKNOWN_POSITION = 1e6
 
 def sins(
     trial: Trial, *, align_s: float | None = None, rate_hz: float = 10.0
-) -> tuple[Trajectory, Array, tuple[str, ...]]:
-    """Return motion, gyro bias (3,), rad/s, and notes of an INS aided by GNSS alone.
+) -> tuple[Trajectory, Array, tuple[Finding, ...]]:
+    """Return motion, gyro bias (3,), rad/s, and findings of an INS aided by GNSS alone.
 
     Where GNSS is missing the INS runs free but for its height, which is aided by that of
     the last fix. Its position drifts by kilometres in an hour, its attitude hardly.
@@ -61,7 +62,7 @@ def sins(
     aided = _with_height_aiding(_rows(gnss, gnss.time <= last), trial.imu.time)
     navigation = navigate(replace(trial, gnss=aided), np.zeros(0))
     bias = navigation.track.gyro_bias.mean(axis=0)
-    return trajectory_of(trial, navigation, rate_hz), bias, navigation.notes
+    return trajectory_of(trial, navigation, rate_hz), bias, navigation.findings
 
 
 def _with_height_aiding(gnss: Gnss, running: Array) -> Gnss:

@@ -34,6 +34,7 @@ from factorgraph_dvl.geometry.rotations import (
 from factorgraph_dvl.geometry.units import DEG, DEG_PER_HOUR, MICRO_G
 from factorgraph_dvl.geometry.vectors import Array, cross_variance, interpolate, rotate, skew
 from factorgraph_dvl.imu.increments import increments
+from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.sensors.gnss import Gnss
 from factorgraph_dvl.trial import Trial
 
@@ -66,14 +67,14 @@ class Navigation:
         Smoothed states at the events of all arcs, one after the other.
     arc : ndarray, shape (K,)
         Arc of each event.
-    notes : tuple of str
-        For the user.
+    findings : tuple of Finding
+        What the user must know.
     """
 
     samples: StrapdownSamples
     track: FilteredTrack
     arc: np.ndarray
-    notes: tuple[str, ...]
+    findings: tuple[Finding, ...]
 
 
 @dataclass(frozen=True)
@@ -137,28 +138,36 @@ def navigate(trial: Trial, pings: Array) -> Navigation:
             hint="`solve` does not need them",
         )
     inc, gaps = increments(trial.imu)
-    notes = [*trial.notes, *gaps]
+    findings = [*trial.notes, *gaps]
     samples = prepare(inc, trial.imu.settings)
     if np.any(np.array(gnss.settings.lever_arm_std_m) > 0.0):
-        notes.append(
-            "the filter does not estimate the antenna's lever arm: its uncertainty is added to "
-            "the noise of the fixes"
+        findings.append(
+            Finding(
+                Code.METHOD_LIMITS,
+                "the filter does not estimate the antenna's lever arm: its uncertainty is added "
+                "to the noise of the fixes",
+                sensor=gnss.label,
+            )
         )
     tracks: list[FilteredTrack] = []
     for a, b in inc.arcs:
         span = (float(inc.start[a]), float(inc.end[b - 1]))
         inside = (gnss.time >= span[0]) & (gnss.time <= span[1])
         if not np.any(inside & ~np.isnan(gnss.geodetic[:, 0])):
-            notes.append(f"no GNSS position from {span[0]:.3f} to {span[1]:.3f} s: not used")
+            text = f"no position from {span[0]:.3f} to {span[1]:.3f} s, which is not used"
+            findings.append(Finding(Code.UNUSED, text, sensor=gnss.label))
             continue
         if tracks:
-            notes.append(
-                f"the SINS/GNSS filter starts again at {span[0]:.3f} s, after the gap: position, "
-                "velocity and attitude anew, the biases from before"
+            findings.append(
+                Finding(
+                    Code.FILTER_RESTARTED,
+                    f"the SINS/GNSS filter starts again at {span[0]:.3f} s, after the gap: "
+                    "position, velocity and attitude anew, the biases from before",
+                )
             )
         track, note = _navigate_arc(trial, gnss, samples, span, pings, tracks)
         tracks.append(track)
-        notes += [note] if note else []
+        findings += [Finding(Code.HEADING_UNKNOWN, note)] if note else []
     if not tracks:
         raise DataError(
             "no GNSS position while the IMU runs",
@@ -169,7 +178,7 @@ def navigate(trial: Trial, pings: Array) -> Navigation:
         *(np.concatenate([getattr(t, f.name) for t in tracks]) for f in fields(FilteredTrack))
     )
     arc = np.repeat(np.arange(len(tracks)), [t.time.size for t in tracks])
-    return Navigation(samples, joined, arc, tuple(notes))
+    return Navigation(samples, joined, arc, tuple(findings))
 
 
 def motion_at(navigation: Navigation, time: Array) -> NavigationMotion:

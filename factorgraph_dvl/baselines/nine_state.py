@@ -22,6 +22,7 @@ from factorgraph_dvl.baselines.point_sets import Points, misfit, rotation_starts
 from factorgraph_dvl.geometry.rotations import exp_so3, log_so3
 from factorgraph_dvl.geometry.vectors import Array, rotate, skew
 from factorgraph_dvl.sensors.dvl import SCALES_SPEC
+from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.sensors.parameters import Parameter
 
 # Chosen: prior standard deviation of the bias, m/s, where the trial fixes it: the method
@@ -56,12 +57,16 @@ def nine_state(
     iterated : bool, default True
         False = the plain linear filter, about the prior mean.
     """
-    warnings = []
+    findings = []
     if not bias.estimated:
         bias = replace(bias, sigma=np.full(3, _BIAS_SIGMA))
-        warnings.append(
-            f"the trial fixes the bias at zero, but the method estimates it: {_BIAS_SIGMA} m/s "
-            "taken for its prior standard deviation"
+        findings.append(
+            Finding(
+                Code.METHOD_LIMITS,
+                f"the trial fixes the bias at zero, but the method estimates it: {_BIAS_SIGMA} "
+                "m/s taken for its prior standard deviation",
+                parameter=bias.name,
+            )
         )
     scale = replace(
         scale,
@@ -95,12 +100,16 @@ def nine_state(
     unseparated = frozenset(names[i] for i in free[_undetermined(data, sigma[free])])
     mixed = [n for n in names[3:] if n in unseparated]
     if mixed:
-        warnings.append(
-            f"{', '.join(mixed)}: bias and scale separate only where the speed along the axis "
-            "varies, and here it does not vary enough"
+        findings.append(
+            Finding(
+                Code.NOT_OBSERVABLE,
+                f"{', '.join(mixed)} not observable: bias and scale separate only where the speed "
+                "along the axis varies, and here it does not vary enough",
+                parameter=bias.name,
+            )
         )
     final = after[-1] if after else at
-    return Outcome(final, passes, history, tuple(warnings), unseparated, converged)
+    return Outcome(final, passes, history, tuple(findings), unseparated, converged)
 
 
 def _iterate(

@@ -14,6 +14,7 @@ from factorgraph_dvl.geometry.rotations import (
     right_jacobian,
 )
 from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.sensors.finding import Finding
 from factorgraph_dvl.sensors.parameters import Parameter
 
 # Chosen: rows of a history, as many as a figure can show.
@@ -96,7 +97,7 @@ class Outcome:
         Passes over the data, or rotations of them.
     history : tuple of tuple of (float, Estimated), optional
         Time and estimate after some of the pings; empty for closed forms.
-    warnings : tuple of str, optional
+    findings : tuple of Finding, optional
         For the user.
     unseparated : frozenset of str, optional
         Component names that the data alone do not separate.
@@ -107,7 +108,7 @@ class Outcome:
     estimated: Estimated
     iterations: int
     history: tuple[tuple[float, Estimated], ...] = ()
-    warnings: tuple[str, ...] = ()
+    findings: tuple[Finding, ...] = ()
     unseparated: frozenset[str] = frozenset()
     converged: bool = True
 

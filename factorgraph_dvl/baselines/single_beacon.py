@@ -19,6 +19,7 @@ import numpy as np
 from factorgraph_dvl.baselines.outcome import History
 from factorgraph_dvl.errors import ConfigError, DataError
 from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.solution import (
     Estimate,
     Progress,
@@ -154,11 +155,14 @@ def filter_planar(
             velocity_cov=velocity_cov,
             rph_cov=rph_cov,
         ),
-        warnings=(
+        findings=(
             *trial.notes,
             *contradicted,
-            f"{method} takes no range for an outlier, and sound speed, log, heading and "
-            "beacons for exact",
+            Finding(
+                Code.METHOD_LIMITS,
+                f"{method} takes no range for an outlier, and sound speed, log, heading and "
+                "beacons for exact",
+            ),
         ),
     )
     stds = np.sqrt(np.diagonal(filtered.covariance, axis1=1, axis2=2))
@@ -238,15 +242,16 @@ def run_filter(trial: PlanarTrial, method: Method | str, mean: Array, std: Array
 
 def _depends_on_start(
     trial: PlanarTrial, method: Method | str, mean: Array, std: Array, found: Filtered
-) -> list[str]:
-    """Return a warning if the end depends more on the start than its covariance allows.
+) -> list[Finding]:
+    """Return a finding if the end depends more on the start than its covariance allows.
 
     A start moved by one standard deviation moves the end of a linear filter by at most one of
     its own. These filters are not linear, and go to either mirror image.
     """
     P = found.covariance[-1]
     if not (np.isfinite(P).all() and np.linalg.eigvalsh(P)[0] > 0.0):
-        return ["the filter has diverged: its covariance is not positive definite"]
+        text = "the filter has diverged: its covariance is not positive definite"
+        return [Finding(Code.FILTER_CONTRADICTED, text)]
     apart, most = 0.0, 0.0
     for move in (*np.diag(std), *-np.diag(std)):
         away = run_filter(trial, method, mean + move, std).state[-1] - found.state[-1]
@@ -256,9 +261,12 @@ def _depends_on_start(
     if most <= _LARGEST_EFFECT:
         return []
     return [
-        f"from a start that is one standard deviation away the filter ends {apart:.3g} m, or "
-        f"{most:.3g} standard deviations, from where it did: it has not converged, and may have "
-        "gone to a mirror image; `solve` follows all of them"
+        Finding(
+            Code.FILTER_CONTRADICTED,
+            f"from a start that is one standard deviation away the filter ends {apart:.3g} m, or "
+            f"{most:.3g} standard deviations, from where it did: it has not converged, and may "
+            "have gone to a mirror image; `solve` follows all of them",
+        )
     ]
 
 

@@ -31,14 +31,16 @@ from factorgraph_dvl.geometry.rotations import (
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array, skew
 from factorgraph_dvl.imu.increments import increments
+from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.sensors.star import Star
 from factorgraph_dvl.solution import (
     Residuals,
     Solution,
     Trajectory,
     as_estimates,
-    consistency_warnings,
+    consistency_findings,
     contradictions,
+    not_observable,
 )
 from factorgraph_dvl.trial import InitialAttitude, Trial
 
@@ -174,25 +176,24 @@ def _summary(
     values, covariance = estimated.reported()
     estimates = as_estimates(estimated.parameters, values, covariance)
     residuals = (_star_residuals(tracks, attitudes), *gnss_residuals(trial, navigation))
-    notes = [*navigation.notes, *star.consistency_warnings()]
+    findings = [*navigation.findings, *star.findings()]
     if np.any(np.array(star.settings.mounting_std_deg) > 0.0):
-        notes.append(
-            "star does not estimate star_mounting_deg: fixed at "
-            f"{np.round(star.settings.mounting_deg, 6).tolist()}"
-        )
+        at = np.round(star.settings.mounting_deg, 6).tolist()
+        text = f"star does not estimate star_mounting_deg: fixed at {at}"
+        findings.append(Finding(Code.METHOD_LIMITS, text, parameter="star_mounting_deg"))
     tilt = off_vertical(attitudes.time, attitudes.nRb, trial.imu.time, trial.imu.accel)
     if tilt > _OFF_VERTICAL:
-        notes.append(
-            f"{star.label}: its attitudes put the vertical {np.degrees(tilt):.1f} deg away from "
-            "that of the specific force: are `epoch` and `mounting_deg` right? "
-            "Do not use the attitude before they are corrected"
+        findings.append(
+            Finding(
+                Code.STAR_VERTICAL,
+                f"its attitudes put the vertical {np.degrees(tilt):.1f} deg away from that of the "
+                "specific force: are `epoch` and `mounting_deg` right? Do not use the attitude "
+                "before they are corrected",
+                sensor=star.label,
+            )
         )
-    notes += [
-        f"{name} not observable: the arc is too short for these stars"
-        for e in estimates
-        for name, observable in zip(e.component_names, e.observable, strict=True)
-        if not observable
-    ]
+    for e in estimates:
+        findings += not_observable(e, lambda _: "the arc is too short for these stars")
     contradicted = contradictions(residuals)
     first = residuals[0]
     motion = motion_at(navigation, samples.increments.ticks(rate_hz))
@@ -208,7 +209,7 @@ def _summary(
         covariance=covariance,
         trajectory=_trajectory(trial, star, samples, tracks, motion),
         residuals=residuals,
-        warnings=(*notes, *contradicted, *consistency_warnings(estimates, residuals)),
+        findings=(*findings, *contradicted, *consistency_findings(estimates, residuals)),
     )
 
 

@@ -14,6 +14,7 @@ from factorgraph_dvl.geometry.earth import radii
 from factorgraph_dvl.geometry.rotations import rph_from_rotation, rph_jacobian, wrapped
 from factorgraph_dvl.geometry.vectors import Array, rotate
 from factorgraph_dvl.sensors.dvl import Dvl
+from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.sensors.protocol import Aid
 from factorgraph_dvl.sensors.protocol import Motion as SensorMotion
 from factorgraph_dvl.solution import (
@@ -22,15 +23,16 @@ from factorgraph_dvl.solution import (
     Solution,
     Trajectory,
     as_estimates,
-    consistency_warnings,
+    consistency_findings,
     contradictions,
     not_observable,
 )
 from factorgraph_dvl.trial import Trial
 
-WHITE_NOISE = (
+WHITE_NOISE = Finding(
+    Code.METHOD_LIMITS,
     "the error of the SINS/GNSS velocity is taken for white noise; it is correlated in time, so "
-    "the standard deviations of the DVL's parameters are too small"
+    "the standard deviations of the DVL's parameters are too small",
 )
 
 
@@ -44,7 +46,7 @@ def summarise(
     motion: SensorMotion | None,
     solver: str,
     rate_hz: float,
-    notes: Sequence[str],
+    findings: Sequence[Finding],
 ) -> Solution:
     """Return the solution of a calibrator.
 
@@ -66,8 +68,8 @@ def summarise(
         Name.
     rate_hz : float
         Rate of the trajectory.
-    notes : sequence of str
-        Warnings so far.
+    findings : sequence of Finding
+        What is already known.
     """
     dvl_values, dvl_covariance = outcome.estimated.reported()
     imu = _imu_biases(trial, navigation)
@@ -80,12 +82,12 @@ def summarise(
     estimates = as_estimates(parameters, values, covariance, outcome.unseparated)
     all_residuals = (measured, *gnss_residuals(trial, navigation))
     contradicted = contradictions(all_residuals)
-    warnings = [
-        *notes,
+    found = (
+        *findings,
         *contradicted,
-        *consistency_warnings(estimates, all_residuals),
+        *consistency_findings(estimates, all_residuals),
         *_unobservable(aid, motion, estimates),
-    ]
+    )
     return Solution(
         trial=trial.name,
         solver=solver,
@@ -98,7 +100,7 @@ def summarise(
         covariance=covariance,
         trajectory=trajectory_of(trial, navigation, rate_hz),
         residuals=all_residuals,
-        warnings=tuple(warnings),
+        findings=found,
     )
 
 
@@ -212,12 +214,18 @@ def gnss_residuals(trial: Trial, navigation: Navigation) -> tuple[Residuals, ...
     return tuple(out)
 
 
+def left_out(sensor: Aid, pings: int) -> Finding:
+    """Return that so many pings of a sensor were not used."""
+    text = f"{pings} pings at times without SINS/GNSS were not used"
+    return Finding(Code.UNUSED, text, sensor=sensor.label)
+
+
 def _unobservable(
     aid: Aid, motion: SensorMotion | None, estimates: Sequence[Estimate]
-) -> list[str]:
+) -> list[Finding]:
     """Say which components the data did not determine, and why."""
     own = {p.name for p in aid.parameters()}
-    out = []
+    out: list[Finding] = []
 
     def why(name: str, component: int) -> str:
         if name in own:

@@ -41,8 +41,8 @@ def correct(
     record = save_corrected(
         trial.beams, beams.directions_b, beams.scale_error, beams.lever_arm, out, force=force
     )
-    for note in trial.notes:
-        warn(note)
+    for finding in trial.notes:
+        warn(str(finding))
     own = {p.name for p in trial.beams.parameters()}
     unknown = [
         name

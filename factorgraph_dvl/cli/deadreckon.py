@@ -20,6 +20,7 @@ from factorgraph_dvl.cli.options import Force, NoFigures, Quiet, TrialPath, clai
 if TYPE_CHECKING:
     from factorgraph_dvl.analysis.dead_reckoning.before_after import BeforeAfter
     from factorgraph_dvl.imu.attitude_history import AttitudeHistory
+    from factorgraph_dvl.sensors.finding import Finding
     from factorgraph_dvl.trial import Trial
 
 
@@ -73,7 +74,7 @@ def deadreckon(
         values = read_calibration_values(calibration, trial.body_axes)
         progress("attitude")
         attitude = attitude or _default_attitude(trial)
-        source, notes = _attitude(trial, attitude, align)
+        source, findings = _attitude(trial, attitude, align)
         progress("dead reckoning")
         result = before_after(trial, values, source.at)
         progress("write")
@@ -106,8 +107,8 @@ def deadreckon(
                 f"{result.scored_by} ends at {end:.1f} s, before the track ({last:.1f} s): "
                 f"distance and errors are those up to {end:.1f} s"
             )
-    for note in (*trial.notes, *notes):
-        warn(note)
+    for finding in (*trial.notes, *findings):
+        warn(str(finding))
     if trial.dvl is not None and trial.dvl.settings.reference == "water":
         warn("the DVL measures velocity through the water: the track drifts with the current")
     if result.calibrated.track.bridged > 0.0:
@@ -124,8 +125,8 @@ def _default_attitude(trial: Trial) -> str:
 
 def _attitude(
     trial: Trial, source: str, align: float | None
-) -> tuple[AttitudeHistory, tuple[str, ...]]:
-    """Return the attitude for the track, and notes on it."""
+) -> tuple[AttitudeHistory, tuple[Finding, ...]]:
+    """Return the attitude for the track, and findings about it."""
     import numpy as np
 
     from factorgraph_dvl.errors import ConfigError
@@ -137,8 +138,8 @@ def _attitude(
     if source == "sins":
         from factorgraph_dvl.baselines import sins
 
-        motion, bias, notes = sins(trial, align_s=align)
-        return AttitudeHistory(trial.imu, motion, trial.body_axes, bias), notes
+        motion, bias, findings = sins(trial, align_s=align)
+        return AttitudeHistory(trial.imu, motion, trial.body_axes, bias), findings
     if source == "reference":
         if trial.reference is None:
             raise ConfigError(

@@ -24,6 +24,6 @@ def inspect(trial_path: TrialPath) -> None:
     print_table(sensor_table(result))
     console.print(motion_line(result), markup=False, soft_wrap=True)
     for note in notes:
-        warn(note)
+        warn(str(note))
     for line in finding_lines(result):
         console.print(line, soft_wrap=True)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from contextlib import contextmanager
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from rich.text import Text
@@ -13,8 +12,7 @@ from factorgraph_dvl.cli.console import stderr, warn
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from factorgraph_dvl.quality.finding import Finding
-    from factorgraph_dvl.solution import Solution
+    from factorgraph_dvl.sensors.finding import Finding
     from factorgraph_dvl.trial import PlanarTrial, Trial
 
 
@@ -47,11 +45,6 @@ def errors_in(trial: Trial | PlanarTrial, *, anyway: bool) -> tuple[Finding, ...
             hint="Correct the record, remove its section from trial.yaml, or go on with --anyway",
         )
     return found.errors
-
-
-def with_findings(solution: Solution, errors: Sequence[Finding]) -> Solution:
-    """Return a solution that warns of errors in the records that it was made from."""
-    return replace(solution, warnings=(*map(str, errors), *solution.warnings))
 
 
 @contextmanager

@@ -32,7 +32,6 @@ from factorgraph_dvl.cli.plausibility import (
     errors_in,
     explaining,
     print_contradiction,
-    with_findings,
 )
 from factorgraph_dvl.errors import ConfigError
 
@@ -99,7 +98,7 @@ def replay(
         errors = errors_in(trial, anyway=anyway)
         with explaining(errors):
             solution, record = _run(trial, smoother.value, lag, rate, progress, good)
-        solution = with_findings(solution, errors)
+        solution = solution.with_findings(errors)
         found = convergence(
             record.time,
             record.values,
@@ -206,9 +205,9 @@ def _run(
                             good_since=since,
                         )
                     )
-                for message in update.messages:
+                for finding in update.findings:
                     view.console.print(
-                        f"{update.time:.1f} s: {message}", markup=False, soft_wrap=True
+                        f"{update.time:.1f} s: {finding}", markup=False, soft_wrap=True
                     )
 
             return run(trial, smoother=kind, lag_s=lag, rate_hz=rate, watch=show)

@@ -32,7 +32,6 @@ from factorgraph_dvl.cli.plausibility import (
     errors_in,
     explaining,
     print_contradiction,
-    with_findings,
 )
 
 if TYPE_CHECKING:
@@ -81,13 +80,11 @@ def solve(
         return run_batch(trial, rate_hz=rate, progress=progress), None
 
     def run_planar(trial: PlanarTrial, progress: ProgressLine) -> tuple[Solution, None]:
-        from factorgraph_dvl.quality.finding import Finding
         from factorgraph_dvl.quality.plausibility_planar import planar_findings
         from factorgraph_dvl.ranging.planar_solution import solve_planar
 
         solution = solve_planar(trial, rate_hz=rate, progress=progress)
-        doubtful = [Finding("warning", *found) for found in planar_findings(trial)]
-        return with_findings(solution, doubtful), None
+        return solution.with_findings(planar_findings(trial)), None
 
     _solve_into(
         out,
@@ -187,7 +184,7 @@ def _solve_into(
             errors = errors_in(trial, anyway=anyway)
             with explaining(errors):
                 solution, history = run(trial, progress)
-        solution = with_findings(solution, errors)
+        solution = solution.with_findings(errors)
         progress("write", 0, None)
 
         def add(folder: Path) -> None:

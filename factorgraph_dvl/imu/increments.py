@@ -29,6 +29,7 @@ from factorgraph_dvl.imu.polynomials import (
     regular_interpolation,
 )
 from factorgraph_dvl.imu.timestamps import JUMP, fill_lost, unrounded
+from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.sensors.imu import Imu
 
 IntArray = np.ndarray
@@ -344,7 +345,7 @@ class Increments:
 
 def increments(
     imu: Imu, windows: tuple[int, int] | None = None
-) -> tuple[Increments, tuple[str, ...]]:
+) -> tuple[Increments, tuple[Finding, ...]]:
     """Return increments between the samples of an IMU, and what had to be bridged.
 
     Parameters
@@ -356,7 +357,8 @@ def increments(
     Returns
     -------
     Increments
-    notes : tuple of str, for the user.
+    findings : tuple of Finding
+        What was lost, filled or left out.
 
     Raises
     ------
@@ -380,7 +382,7 @@ def increments(
             hint="Is time_s in seconds?",
         )
     filled_sigma = np.zeros_like(samples)
-    notes: list[str] = []
+    findings: list[Finding] = []
 
     lost = np.zeros(step.size, dtype=int)
     if np.quantile(np.abs(step / dt - 1.0), 0.9) < _REGULAR:
@@ -389,9 +391,13 @@ def increments(
     broken = (lost > MAX_FILLED) | (step > (MAX_FILLED + _LOST) * dt)
     if bridged.any():
         time, samples, filled_sigma, broken = fill_lost(time, samples, lost, bridged, broken)
-        notes.append(
-            f"{imu.source}: {int(lost[bridged].sum())} lost samples in {int(bridged.sum())} "
-            f"places were interpolated, the first after {imu.time[np.argmax(bridged)]:.3f} s"
+        findings.append(
+            Finding(
+                Code.LOST_SAMPLES,
+                f"{int(lost[bridged].sum())} lost samples in {int(bridged.sum())} places were "
+                f"interpolated, the first after {imu.time[np.argmax(bridged)]:.3f} s",
+                sensor="IMU",
+            )
         )
 
     bounds = np.concatenate([[0], np.flatnonzero(broken) + 1, [time.size]])
@@ -399,9 +405,13 @@ def increments(
     n_intervals = n_samples = 0
     for a, b in itertools.pairwise(bounds):
         if b - a < least:
-            notes.append(
-                f"{imu.source}: {b - a} samples at {time[a]:.3f} s stand alone between gaps "
-                "and were not used"
+            findings.append(
+                Finding(
+                    Code.UNUSED,
+                    f"{b - a} samples at {time[a]:.3f} s stand alone between gaps and were not "
+                    "used",
+                    sensor="IMU",
+                )
             )
             continue
         # Since the first sample: seconds of an epoch leave a double 1e-7 s only.
@@ -425,11 +435,11 @@ def increments(
     start, length = np.concatenate(starts), np.concatenate(lengths)
     for (_, b), (c, _) in itertools.pairwise(arcs):
         end = start[b - 1] + length[b - 1]
+        code, what = Code.IMU_GAP, f"gap of {start[c] - end:.3f} s at {end:.3f} s"
         if start[c] - end > JUMP:
+            code = Code.CLOCK_JUMP
             what = f"time_s jumps from {end:.3f} to {start[c]:.3f} s, as where a clock is set"
-        else:
-            what = f"gap of {start[c] - end:.3f} s at {end:.3f} s"
-        notes.append(f"{imu.source}: {what}: the inertial chain breaks there")
+        findings.append(Finding(code, f"{what}: the inertial chain breaks there", sensor="IMU"))
     out = Increments(
         start=start,
         dt=length,
@@ -445,7 +455,7 @@ def increments(
     if not averaged:
         noise = np.repeat([out.gyro_sigma, out.accel_sigma], 3)
         np.hypot(out.open_sigma, _steps(out, noise), out=out.open_sigma)
-    return out, tuple(notes)
+    return out, tuple(findings)
 
 
 def _steps(inc: Increments, noise: Array) -> Array:

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.sensors.records import rows_of
 from factorgraph_dvl.trial import Trial
 
@@ -31,9 +32,13 @@ def without_strays(trial: Trial) -> Trial:
     if kept.all() or not kept.any():
         return trial
     notes = tuple(
-        f"{trial.imu.source}: time_s jumps there; no other sensor measured from {a:.3f} to "
-        f"{b:.3f} s, and the {n} samples of the IMU are not used. If its clock was set while it "
-        "ran, write all of time_s by one clock"
+        Finding(
+            Code.CLOCK_RESTARTED,
+            f"time_s jumps there; no other sensor measured from {a:.3f} to {b:.3f} s, and the {n} "
+            "samples of the IMU are not used. If its clock was set while it ran, write all of "
+            "time_s by one clock",
+            sensor="IMU",
+        )
         for a, b, n in zip(first[~kept], last[~kept], np.diff(edges)[~kept], strict=True)
     )
     rows = np.repeat(kept, np.diff(edges))

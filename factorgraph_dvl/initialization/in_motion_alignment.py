@@ -40,6 +40,7 @@ from factorgraph_dvl.sensors.dvl import (
     TIME_OFFSET,
     Dvl,
 )
+from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.sensors.gnss import Gnss
 from factorgraph_dvl.trial import Trial
 
@@ -72,13 +73,13 @@ class AlignedStates:
         At the nodes.
     mountings : dict of str to ndarray
         By parameter name, sRb of sensors of attitude where the gyros tell it.
-    notes : tuple of str
+    findings : tuple of Finding
         What the user must know of how they were found.
     """
 
     states: States
     mountings: dict[str, Array]
-    notes: tuple[str, ...]
+    findings: tuple[Finding, ...]
 
 
 @dataclass(frozen=True)
@@ -107,7 +108,7 @@ def initial_states(trial: Trial, frame: LocalFrame, seg: Segments) -> AlignedSta
     """
     n = seg.node_time.size
     nRb = np.empty((n, 3, 3))
-    notes: list[str] = []
+    findings: list[Finding] = []
     p_rough = np.zeros((n, 3))
     fixed = np.zeros(n, dtype=bool)
     if trial.gnss is not None:
@@ -149,13 +150,16 @@ def initial_states(trial: Trial, frame: LocalFrame, seg: Segments) -> AlignedSta
         aligned, found = _align(trial, arc, pairs, before)
         nRb[arc.nodes] = spin @ aligned @ arc.turn
         if not found and before is None:
-            notes.append(
-                f"from {arc.start:z.0f} s on the velocity changes too little to find the heading: "
-                "the solver starts from the course over ground"
+            findings.append(
+                Finding(
+                    Code.HEADING_UNKNOWN,
+                    f"from {arc.start:z.0f} s on the velocity changes too little to find the "
+                    "heading: the solver starts from the course over ground",
+                )
             )
     p_n, v_n = _kinematics(trial, frame, seg, nRb)
     zero = np.zeros((n, 3))
-    return AlignedStates(States(nRb, p_n, v_n, zero, zero), mountings, tuple(notes))
+    return AlignedStates(States(nRb, p_n, v_n, zero, zero), mountings, tuple(findings))
 
 
 def _pairs(trial: Trial, frame: LocalFrame, arc: DeadReckonedSpan) -> _Pairs | None:

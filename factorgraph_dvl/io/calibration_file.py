@@ -18,6 +18,7 @@ from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.sensors.catalogue import specs_of
 from factorgraph_dvl.sensors.dvl import CALIBRATED
+from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.sensors.fingerprint import PATTERN
 from factorgraph_dvl.settings.files import MEGABYTE, read_bytes
 from factorgraph_dvl.settings.ranges import out_of_range
@@ -49,6 +50,14 @@ class _Covariance(msgspec.Struct):
     matrix: list[_Numbers]
 
 
+class _Finding(msgspec.Struct):
+    code: str
+    severity: Literal["warning", "error"]
+    sensor: str
+    parameter: str
+    text: str
+
+
 class _File(msgspec.Struct):
     format: Literal[1]
     trial: str
@@ -60,6 +69,7 @@ class _File(msgspec.Struct):
     cost: float | None = None
     body_axes: BodyAxes | UnsetType = UNSET
     warnings: list[str] = []
+    findings: list[_Finding] = []
     inputs: list[Annotated[str, msgspec.Meta(pattern=PATTERN)]] = []
 
 
@@ -96,9 +106,20 @@ def load_calibration(path: Path | str, *, body_axes: BodyAxes = "RFU") -> Calibr
             _estimate(name, parameter, names) for name, parameter in file.parameters.items()
         ),
         covariance=covariance,
-        warnings=tuple(map(printable, file.warnings)),
+        findings=tuple(_findings(file)),
         inputs=tuple(file.inputs),
     )
+
+
+def _findings(file: _File) -> Iterator[Finding]:
+    """Yield the findings of a file, and the warnings of one that has no findings."""
+    known = {str(code): code for code in Code}
+    for f in file.findings:
+        code = known.get(f.code, Code.UNCLASSIFIED)
+        text, sensor, parameter = map(printable, (f.text, f.sensor, f.parameter))
+        yield Finding(code, text, sensor, parameter, f.severity)
+    if not file.findings:
+        yield from (Finding(Code.UNCLASSIFIED, printable(text)) for text in file.warnings)
 
 
 def check_usable(calibration: Calibration, body_axes: BodyAxes, source: str) -> None:
@@ -145,7 +166,17 @@ def encode_calibration(solution: Solution | Calibration) -> bytes:
         ),
         cost=float(solution.cost),
         body_axes=solution.body_axes,
-        warnings=list(solution.warnings),
+        warnings=list(map(str, solution.findings)),
+        findings=[
+            _Finding(
+                f.code,
+                "error" if f.severity == "error" else "warning",
+                f.sensor,
+                f.parameter,
+                f.text,
+            )
+            for f in solution.findings
+        ],
         inputs=list(solution.inputs),
     )
     # msgspec writes nan and infinity as null, and every float with the digits it takes.

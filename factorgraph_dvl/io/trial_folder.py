@@ -37,6 +37,7 @@ from factorgraph_dvl.io.trial_yaml import (
 from factorgraph_dvl.sensors.catalogue import AIDS, PLANAR, specs_of
 from factorgraph_dvl.sensors.dvl import CALIBRATED, Dvl
 from factorgraph_dvl.sensors.dvl_beams import DvlBeams
+from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.sensors.gnss import Gnss
 from factorgraph_dvl.sensors.imu import Imu
 from factorgraph_dvl.sensors.parameters import JointPrior
@@ -110,8 +111,11 @@ def load_trial(path: Path | str) -> Trial:
     notes = []
     if dvl is not None and _share_pings(dvl, aids):
         notes.append(
-            "`dvl` and `dvl_beams` have pings at the same times: if both are records of one "
-            "instrument, its noise counts twice, and standard deviations come out too small"
+            Finding(
+                Code.COUNTED_TWICE,
+                "`dvl` and `dvl_beams` have pings at the same times: if both are records of one "
+                "instrument, its noise counts twice, and standard deviations come out too small",
+            )
         )
     return Trial(
         name=printable(settings.name or folder.resolve().name),

@@ -14,7 +14,6 @@ from scipy.integrate import cumulative_trapezoid
 from factorgraph_dvl.geometry.rotations import BodyAxes, exp_so3, frd_from_body
 from factorgraph_dvl.geometry.units import DEG, STANDARD_GRAVITY
 from factorgraph_dvl.geometry.vectors import Array, interpolate
-from factorgraph_dvl.quality.finding import Finding
 from factorgraph_dvl.quality.plausibility_beams import beam_findings
 from factorgraph_dvl.quality.plausibility_star import star_findings
 from factorgraph_dvl.quality.records import (
@@ -26,6 +25,7 @@ from factorgraph_dvl.quality.records import (
 )
 from factorgraph_dvl.sensors.beam_geometry import as_dvl
 from factorgraph_dvl.sensors.dvl import MISALIGNMENT, Dvl
+from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.sensors.gnss import Gnss
 from factorgraph_dvl.sensors.imu import Imu
 from factorgraph_dvl.sensors.protocol import Aid
@@ -82,52 +82,54 @@ def _clock_findings(trial: Trial, sensors: list[SensorSurvey]) -> Iterator[Findi
     if interval >= 0.5:
         unit = f", or milliseconds ({1000.0 / interval:.4g} Hz)" if interval >= 1.0 else ""
         yield Finding(
-            "error",
-            "IMU",
+            Code.TIME_UNIT,
             f"one sample every {interval:.4g} s: time_s must be in seconds{unit}; "
             "an IMU this slow does not resolve the motion",
-            "time_unit",
+            "IMU",
+            severity="error",
         )
     elif imu.rate > 2e4:
         text = f"{imu.rate:.4g} samples per second: is time_s in seconds?"
-        yield Finding("error", "IMU", text, "time_unit")
+        yield Finding(Code.TIME_UNIT, text, "IMU", severity="error")
     for aid, record in zip(aids, trial.aids, strict=True):
         if aid.missing == 1.0:
             text = "none of its rows holds a measurement"
-            yield Finding("error", aid.label, text, "no_measurement")
+            yield Finding(Code.NO_MEASUREMENT, text, aid.label, severity="error")
             continue
         inside = min(aid.end, imu.end) - max(aid.start, imu.start)
         if not _meets(record, trial.imu):
             yield Finding(
-                "error",
-                aid.label,
+                Code.NO_OVERLAP,
                 f"its times, {aid.start:.10g} to {aid.end:.10g} s, do not overlap those of the "
                 f"IMU, {imu.start:.10g} to {imu.end:.10g} s: are they of one clock, in seconds?",
-                "no_overlap",
+                aid.label,
+                severity="error",
             )
         elif inside < 0.5 * (aid.end - aid.start):
             yield Finding(
-                "warning", aid.label, "more than half of its record lies outside that of the IMU"
+                Code.PARTIAL_OVERLAP,
+                "more than half of its record lies outside that of the IMU",
+                aid.label,
             )
         elif inside < 0.5 * (imu.end - imu.start):
             yield Finding(
-                "warning",
-                aid.label,
+                Code.PARTIAL_OVERLAP,
                 f"it covers {100.0 * inside / (imu.end - imu.start):.3g} % of the IMU's record",
+                aid.label,
             )
     for sensor in sensors:
         if sensor.gaps:
             yield Finding(
-                "warning",
-                sensor.label,
+                Code.GAPS,
                 f"{sensor.gaps} gaps longer than {GAP_INTERVALS:g} sample intervals, the longest "
                 f"{sensor.longest_gap:.4g} s",
+                sensor.label,
             )
         if 0.5 < sensor.missing < 1.0:
             yield Finding(
-                "warning",
-                sensor.label,
+                Code.MISSING,
                 f"{100.0 * sensor.missing:.3g} % of its rows hold no measurement",
+                sensor.label,
             )
 
 
@@ -152,13 +154,17 @@ def _force_findings(imu: Imu, body_axes: BodyAxes) -> Iterator[Finding]:
         ("velocity increments; divide by the sample interval", STANDARD_GRAVITY * interval),
     ):
         if abs(size / gravity - 1.0) < 0.05:
-            yield Finding("error", "IMU", f"{looks}: it looks like {unit}", "force_unit")
+            yield Finding(
+                Code.FORCE_UNIT, f"{looks}: it looks like {unit}", "IMU", severity="error"
+            )
             return
     if abs(size / STANDARD_GRAVITY - 1.0) > 0.05:
         removed = ": was gravity removed? Specific force includes it" if size < 3.0 else ""
-        yield Finding("error", "IMU", looks + removed, "force_unit")
+        yield Finding(Code.FORCE_UNIT, looks + removed, "IMU", severity="error")
         return
-    yield Finding("ok", "IMU", f"specific force {size:.4g} m/s² in the median")
+    yield Finding(
+        Code.FORCE_UNIT, f"specific force {size:.4g} m/s² in the median", "IMU", severity="ok"
+    )
     yield from _axes_findings(imu, body_axes)
 
 
@@ -168,7 +174,12 @@ def _axes_findings(imu: Imu, body_axes: BodyAxes) -> Iterator[Finding]:
     up_b = -frd_from_body(body_axes)[2]
     tilt = float(np.degrees(np.arccos(np.clip(mean @ up_b, -1.0, 1.0))))
     if tilt < 30.0:
-        yield Finding("ok", "IMU", f"gravity fits body_axes {body_axes} to {tilt:.2g} deg")
+        yield Finding(
+            Code.BODY_AXES,
+            f"gravity fits body_axes {body_axes} to {tilt:.2g} deg",
+            "IMU",
+            severity="ok",
+        )
         return
     k = int(np.argmax(np.concatenate([mean, -mean])))
     expected = _AXIS_NAMES[int(np.argmax(np.concatenate([up_b, -up_b])))]
@@ -179,15 +190,19 @@ def _axes_findings(imu: Imu, body_axes: BodyAxes) -> Iterator[Finding]:
     if tilt > 150.0:
         other = "RFU or FLU" if body_axes == "FRD" else "FRD"
         question = f"are the axes {other}, or is the force that of gravity?"
-        yield Finding("error", "IMU", f"{text}: {question}", "body_axes")
+        yield Finding(Code.BODY_AXES, f"{text}: {question}", "IMU", severity="error")
     else:
-        yield Finding("warning", "IMU", f"{text}: is the IMU mounted {tilt:.0f} deg off level?")
+        yield Finding(
+            Code.BODY_AXES, f"{text}: is the IMU mounted {tilt:.0f} deg off level?", "IMU"
+        )
 
 
 def _gyro_findings(imu: Imu) -> Iterator[Finding]:
     rms = float(np.sqrt(np.mean(np.sum(imu.gyro**2, axis=1))))
     if rms == 0.0:
-        yield Finding("error", "IMU", "the angular rate is zero throughout", "gyro_frozen")
+        yield Finding(
+            Code.GYRO_FROZEN, "the angular rate is zero throughout", "IMU", severity="error"
+        )
         return
     steady = _force_steadiness(imu, 1.0)
     rate = 1.0 / float(np.median(np.diff(imu.time))) if imu.time.size > 1 else 1.0
@@ -201,16 +216,21 @@ def _gyro_findings(imu: Imu) -> Iterator[Finding]:
     # Turned by a right gyro, the force keeps the direction of gravity.
     if 1.0 - steady > 0.001 and 1.0 - steady > 4.0 * losses[best]:
         yield Finding(
-            "error",
-            "IMU",
+            Code.GYRO_UNIT,
             f"the angular rate does not turn the specific force as it should: it looks {best}",
-            "gyro_unit",
+            "IMU",
+            severity="error",
         )
     elif rms > 3.0:
         text = f"the angular rate is {rms:.3g} rad/s rms: is it in deg/s?"
-        yield Finding("error", "IMU", text, "gyro_unit")
+        yield Finding(Code.GYRO_UNIT, text, "IMU", severity="error")
     else:
-        yield Finding("ok", "IMU", f"angular rate {rms / DEG:.3g} deg/s rms, fits gravity")
+        yield Finding(
+            Code.GYRO_UNIT,
+            f"angular rate {rms / DEG:.3g} deg/s rms, fits gravity",
+            "IMU",
+            severity="ok",
+        )
 
 
 def _force_steadiness(imu: Imu, factor: float) -> float:
@@ -236,7 +256,7 @@ def _gnss_findings(gnss: Gnss) -> Iterator[Finding]:
     geodetic = gnss.geodetic[~np.isnan(gnss.geodetic[:, 0])]
     if geodetic.shape[0] and np.any(np.all(geodetic[:, :2] == 0.0, axis=1)):
         text = "some fixes are at 0, 0: leave the cells of lost fixes empty"
-        yield Finding("error", gnss.label, text, "zero_fixes")
+        yield Finding(Code.ZERO_FIXES, text, gnss.label, severity="error")
     begin, end, between = velocity_between_fixes(gnss)
     measured = ~np.isnan(gnss.velocity[:, 0])
     if begin.size < 3 or measured.sum() < 3:
@@ -266,14 +286,17 @@ def _compare_velocities(
     if misfit <= tolerance:
         if speed > _MOVING_M_S:
             yield Finding(
-                "ok", gnss.label, f"velocities agree with positions to {misfit:.2g} m/s rms"
+                Code.GNSS_VELOCITY,
+                f"velocities agree with positions to {misfit:.2g} m/s rms",
+                gnss.label,
+                severity="ok",
             )
         yield from _compare_vertical(gnss, between, mean)
         return
     if np.abs(geodetic[:, 0]).max() < 90.0 * DEG**2 and _rms(
         mean[:, :2] - between[:, :2] / DEG
     ) < (0.1 * _rms(mean[:, :2]) + 3.0 * noise / DEG):
-        yield Finding("error", gnss.label, _RADIANS, "radians")
+        yield Finding(Code.RADIANS, _RADIANS, gnss.label, severity="error")
         return
     explained = {
         text: _rms(between[:, :2] - mean[:, :2] @ np.array(matrix, dtype=float).T)
@@ -282,10 +305,10 @@ def _compare_velocities(
     best = min(explained, key=lambda text: explained[text])
     cause = f": {best}" if explained[best] <= tolerance else ""
     yield Finding(
-        "error",
-        gnss.label,
+        Code.GNSS_VELOCITY,
         f"velocities disagree with the differences of positions by {misfit:.3g} m/s rms{cause}",
-        "gnss_velocity",
+        gnss.label,
+        severity="error",
     )
 
 
@@ -309,7 +332,7 @@ def _compare_vertical(gnss: Gnss, between: Array, mean: Array) -> Iterator[Findi
         measured
     ):
         text = "vel_u_m_s has the opposite sign of the change of height"
-        yield Finding("error", gnss.label, text, "gnss_velocity")
+        yield Finding(Code.GNSS_VELOCITY, text, gnss.label, severity="error")
 
 
 def _dvl_findings(
@@ -318,19 +341,19 @@ def _dvl_findings(
     locked = dvl.locked
     lock, positive = terms
     if not locked.any():
-        yield Finding("warning", dvl.label, f"there is no ping with {lock}")
+        yield Finding(Code.NO_MEASUREMENT, f"there is no ping with {lock}", dvl.label)
         return
     velocity = dvl.velocity[locked]
     std = float(np.median(dvl.sigma()[locked]))
     speed = float(np.median(np.linalg.norm(velocity, axis=1)))
     if std > max(0.3 * speed, 0.1):
         yield Finding(
-            "warning",
-            dvl.label,
+            Code.DVL_STD,
             f"its standard deviation, {std:.2g} m/s, is large for a speed of {speed:.2g} m/s",
+            dvl.label,
         )
     if np.all(velocity == velocity[0]) and velocity.shape[0] > 2:
-        yield Finding("error", dvl.label, "the velocity never changes", "dvl_frozen")
+        yield Finding(Code.DVL_FROZEN, "the velocity never changes", dvl.label, severity="error")
     if gnss is not None:
         yield from _speed_findings(dvl, gnss)
     yield from _sign_findings(dvl, body_axes, velocity, positive)
@@ -346,7 +369,7 @@ def _speed_findings(dvl: Dvl, gnss: Gnss) -> Iterator[Finding]:
     gnss_speed = np.linalg.norm(at_ping, axis=1)
     dvl_speed = np.linalg.norm(dvl.velocity[dvl.locked][inside], axis=1)
     if _in_radians(gnss, np.linalg.norm(at_ping[:, :2], axis=1), dvl_speed):
-        yield Finding("error", gnss.label, _RADIANS, "radians")
+        yield Finding(Code.RADIANS, _RADIANS, gnss.label, severity="error")
         return
     moving = gnss_speed > _MOVING_M_S
     if moving.sum() < 3:
@@ -357,10 +380,11 @@ def _speed_findings(dvl: Dvl, gnss: Gnss) -> Iterator[Finding]:
     steady = _steady_ratio(pings[inside], dvl.velocity[dvl.locked][inside], at_ping)
     if min(abs(ratio - 1.0), abs(steady - 1.0)) <= allowed:
         yield Finding(
-            "ok",
-            dvl.label,
+            Code.DVL_UNIT,
             f"its unit is plausible: speed {ratio:.3g} times that of the GNSS, which is not its "
             "scale error: the lever arm, in sway and turns, contributes",
+            dvl.label,
+            severity="ok",
         )
         return
     cause = ""
@@ -368,10 +392,10 @@ def _speed_findings(dvl: Dvl, gnss: Gnss) -> Iterator[Finding]:
         if abs(ratio * factor - 1.0) < 0.1:
             cause = f": it looks like {unit}"
     yield Finding(
-        "error",
-        dvl.label,
+        Code.DVL_UNIT,
         f"its speed is {ratio:.4g} times that of the GNSS{cause or ': is it in m/s?'}",
-        "dvl_unit",
+        dvl.label,
+        severity="error",
     )
 
 
@@ -416,13 +440,18 @@ def _sign_findings(
     ahead = float(np.median(frd[moving, 0] / horizontal[moving]))
     if ahead < -0.5:
         yield Finding(
-            "warning",
-            dvl.label,
+            Code.DVL_SIGN,
             "by its prior misalignment the vehicle moves astern most of the time: is the sign "
             f"that of PD0? {positive}",
+            dvl.label,
         )
     elif ahead > 0.5:
-        yield Finding("ok", dvl.label, "by its prior misalignment the vehicle moves ahead")
+        yield Finding(
+            Code.DVL_SIGN,
+            "by its prior misalignment the vehicle moves ahead",
+            dvl.label,
+            severity="ok",
+        )
 
 
 def _rms(vectors: Array) -> float:

@@ -7,9 +7,9 @@ from collections.abc import Iterator
 import numpy as np
 
 from factorgraph_dvl.geometry.units import DEG
-from factorgraph_dvl.quality.finding import Finding
 from factorgraph_dvl.sensors.beam_geometry import as_dvl, error_velocity
 from factorgraph_dvl.sensors.dvl_beams import DvlBeams
+from factorgraph_dvl.sensors.finding import Code, Finding
 
 # Of what noise and priors make of the error velocity.
 _TOO_LARGE = 3.0
@@ -22,9 +22,10 @@ def beam_findings(beams: DvlBeams) -> Iterator[Finding]:
     if lost.any():
         shares = ", ".join(f"{100.0 * share:.3g}" for share in lost)
         yield Finding(
-            "warning" if lost.max() > _MOSTLY else "ok",
-            beams.label,
+            Code.BEAMS_LOST,
             f"lost at {shares} % of the pings, beam by beam",
+            beams.label,
+            severity="warning" if lost.max() > _MOSTLY else "ok",
         )
     yield from _agreement(beams)
 
@@ -45,10 +46,15 @@ def _agreement(beams: DvlBeams) -> Iterator[Finding]:
     text = f"with nominal directions the beams contradict each other by {rms:.2g} m/s rms"
     if rms > _TOO_LARGE * np.hypot(noise, prior):
         yield Finding(
-            "warning",
-            beams.label,
+            Code.BEAMS_DISAGREE,
             f"{text}, at {speed:.2g} m/s more than noise and priors explain: is their order, "
             "the sign of one, or a direction wrong?",
+            beams.label,
         )
     else:
-        yield Finding("ok", beams.label, f"{text}, no more than noise and priors explain")
+        yield Finding(
+            Code.BEAMS_DISAGREE,
+            f"{text}, no more than noise and priors explain",
+            beams.label,
+            severity="ok",
+        )

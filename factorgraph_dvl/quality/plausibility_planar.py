@@ -8,6 +8,7 @@ import numpy as np
 
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.trial import PlanarTrial
 
 # Of so many intervals one is a gap, if it is also long enough for a vehicle to turn in.
@@ -19,8 +20,8 @@ _MOVING_M_S = 0.1
 _QUIET = 0.1
 
 
-def planar_findings(trial: PlanarTrial) -> Iterator[tuple[str, str]]:
-    """Yield label and text of what the user should know about the records of a trial.
+def planar_findings(trial: PlanarTrial) -> Iterator[Finding]:
+    """Check gaps, units and signs of the records of a trial.
 
     Parameters
     ----------
@@ -31,42 +32,47 @@ def planar_findings(trial: PlanarTrial) -> Iterator[tuple[str, str]]:
     for record, values in ((heading, heading.heading), (log, log.speed), (depth, depth.depth)):
         text = _gaps(record.time[~np.isnan(values)])
         if text:
-            yield record.label, text
+            yield Finding(Code.GAPS, text, record.label)
     psi = heading.heading[~np.isnan(heading.heading)] / DEG
     if psi.size > 2 and np.abs(psi).max() <= 2.0 * np.pi:
         noise = float(np.median(np.abs(np.diff(psi))))
         if noise < _QUIET * heading.settings.std_deg:
-            yield (
-                heading.label,
+            yield Finding(
+                Code.HEADING_UNIT,
                 f"all of it is within {np.abs(psi).max():.2g} deg of north, and steadier than its "
                 f"standard deviation of {heading.settings.std_deg:g} deg: is it in radians?",
+                heading.label,
             )
     speed = float(np.nanmedian(log.speed)) if np.isfinite(log.speed).any() else 0.0
     if speed < -_MOVING_M_S:
-        yield (
-            log.label,
+        yield Finding(
+            Code.LOG_SIGN,
             f"the speed is {speed:.3g} m/s in the median, astern: speed_m_s is positive ahead",
+            log.label,
         )
     if abs(speed) <= _MOVING_M_S and len(trial.beacons.settings.positions) == 1:
-        yield (
-            log.label,
+        yield Finding(
+            Code.AT_REST,
             f"the speed is {abs(speed):.2g} m/s in the median: of a vehicle at rest one beacon "
             "tells a circle; of that the hypotheses are but examples",
+            log.label,
         )
     below = float(np.nanmedian(depth.depth)) if np.isfinite(depth.depth).any() else 0.0
     if below < -_ABOVE_SEA_M:
-        yield (
-            depth.label,
+        yield Finding(
+            Code.DEPTH_SIGN,
             f"the depth is {below:.4g} m in the median, above the sea: depth_m is positive down",
+            depth.label,
         )
     sea = depth.settings.sea_surface_height_m
     for name, place in trial.beacons.settings.positions.items():
         above = place.height_m - sea
         if above > _ABOVE_SEA_M + 3.0 * place.std_m:
-            yield (
-                trial.beacons.label,
+            yield Finding(
+                Code.BEACON_HEIGHT,
                 f"{name} is {above:.4g} m above the sea surface: height_m is positive up, and "
                 "`depth.sea_surface_height_m` the height of the sea above the ellipsoid",
+                trial.beacons.label,
             )
 
 

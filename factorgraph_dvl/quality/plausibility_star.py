@@ -10,8 +10,8 @@ from scipy.spatial.transform import Rotation
 from factorgraph_dvl.geometry.celestial import off_vertical
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array
-from factorgraph_dvl.quality.finding import Finding, Severity
 from factorgraph_dvl.quality.records import GAP_INTERVALS
+from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.sensors.imu import Imu
 from factorgraph_dvl.sensors.star import Star
 from factorgraph_dvl.trial import Trial
@@ -28,24 +28,19 @@ _AGREE = 0.2
 # The same of the vertical, rad, where the mounting is known at least so well, deg.
 _OFF_VERTICAL = 2.0 * DEG
 _KNOWN_MOUNTING_DEG = 0.5
-# Misfit of stars to their catalogue from which on it is more than a sigma stated too small.
-_MISFIT = 3.0
 
 
 def star_findings(star: Star, trial: Trial) -> Iterator[Finding]:
     """Check epoch, stars and convention of a star tracker."""
     if not trial.epoch:
         yield Finding(
-            "error",
-            star.label,
+            Code.NO_EPOCH,
             "trial.yaml has no `epoch` (UTC of time_s = 0), and stars tell the attitude only at a "
             "known time",
-            "no_epoch",
+            star.label,
+            severity="error",
         )
-    for text in star.consistency_warnings():
-        severity: Severity = "error" if star.misfit > _MISFIT else "warning"
-        text = text.removeprefix(f"{star.label}: ")
-        yield Finding(severity, star.label, text, "star_catalogue")
+    yield from star.findings()
     convention = list(_convention(star, trial.imu))
     yield from convention
     # What mixes up the quaternion turns the vertical too.
@@ -67,11 +62,11 @@ def _vertical(star: Star, trial: Trial) -> Iterator[Finding]:
     away = off_vertical(seen.time[use], seen.nRs[use] @ sRb, imu.time, imu.accel)
     if away > _OFF_VERTICAL:
         yield Finding(
-            "error",
-            star.label,
+            Code.STAR_VERTICAL,
             f"its attitudes put the vertical {np.degrees(away):.1f} deg away from that of the "
             "specific force: are `epoch` (UTC of time_s = 0) and `mounting_deg` right?",
-            "star_vertical",
+            star.label,
+            severity="error",
         )
 
 
@@ -110,7 +105,7 @@ def _convention(star: Star, imu: Imu) -> Iterator[Finding]:
     stated = misfit(right, False)
     if stated < limit:
         text = f"its turns agree with those of the gyros to {100.0 * stated:.2g} %"
-        yield Finding("ok", star.label, text)
+        yield Finding(Code.STAR_CONVENTION, text, star.label, severity="ok")
         return
     candidates = {
         "is it that of inertial to body, the inverse?": misfit(right, True),
@@ -120,10 +115,10 @@ def _convention(star: Star, imu: Imu) -> Iterator[Finding]:
     best = min(candidates, key=lambda text: candidates[text])
     cause = best if candidates[best] < limit else "is `mounting_deg` right?"
     yield Finding(
-        "error",
-        star.label,
+        Code.STAR_CONVENTION,
         f"its turns differ from those of the gyros by {100.0 * stated:.3g} %: {cause}",
-        "star_convention",
+        star.label,
+        severity="error",
     )
 
 

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from factorgraph_dvl.quality.finding import Finding
 from factorgraph_dvl.quality.plausibility import findings
 from factorgraph_dvl.quality.records import SensorSurvey, record_of, travel
+from factorgraph_dvl.sensors.finding import Finding, errors_of
 from factorgraph_dvl.trial import Trial
 
 
@@ -43,7 +43,7 @@ class Survey:
     @property
     def errors(self) -> tuple[Finding, ...]:
         """The findings for which a solution is not to be used, or cannot be had."""
-        return tuple(f for f in self.findings if f.severity == "error")
+        return errors_of(self.findings)
 
     @property
     def problems(self) -> tuple[Finding, ...]:

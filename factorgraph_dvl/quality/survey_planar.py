@@ -6,10 +6,10 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from factorgraph_dvl.quality.finding import Finding
 from factorgraph_dvl.quality.plausibility_planar import planar_findings
 from factorgraph_dvl.quality.records import SensorSurvey, record_of
 from factorgraph_dvl.quality.survey import Survey
+from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.trial import PlanarTrial
 
 
@@ -48,27 +48,28 @@ def _findings(trial: PlanarTrial, sensors: tuple[SensorSurvey, ...]) -> Iterator
     names = "heading, log and depth"
     if not start < end:
         yield Finding(
-            "error",
-            "Heading",
+            Code.NO_OVERLAP,
             f"{names} have no time in common: are they of one clock?",
-            "no_overlap",
+            "Heading",
+            severity="error",
         )
         return
     inside = min(beacons.end, end) - max(beacons.start, start)
     if beacons.missing == 1.0:
         text = "none of its rows holds a measurement"
-        yield Finding("error", beacons.label, text, "no_measurement")
+        yield Finding(Code.NO_MEASUREMENT, text, beacons.label, severity="error")
     elif inside < 0.0:
         yield Finding(
-            "error",
-            beacons.label,
+            Code.NO_OVERLAP,
             f"its times, {beacons.start:.10g} to {beacons.end:.10g} s, do not overlap those of "
             f"{names}, {start:.10g} to {end:.10g} s: are they of one clock, in seconds?",
-            "no_overlap",
+            beacons.label,
+            severity="error",
         )
     elif inside < 0.5 * (beacons.end - beacons.start):
         yield Finding(
-            "warning", beacons.label, f"more than half of its record lies outside that of {names}"
+            Code.PARTIAL_OVERLAP,
+            f"more than half of its record lies outside that of {names}",
+            beacons.label,
         )
-    for label, text in planar_findings(trial):
-        yield Finding("warning", label, text)
+    yield from planar_findings(trial)

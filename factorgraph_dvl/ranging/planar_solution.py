@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 
 import numpy as np
 
@@ -15,6 +16,7 @@ from factorgraph_dvl.ranging.planar_track import SLOPE_OVER
 from factorgraph_dvl.ranging.problem import RangingSetup, planar_setup
 from factorgraph_dvl.ranging.smoother import Fit, covariance, residuals
 from factorgraph_dvl.sensors.beacon import Beacons
+from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.solution import (
     Estimate,
     Hypothesis,
@@ -24,9 +26,10 @@ from factorgraph_dvl.solution import (
     Trajectory,
     ambiguity,
     as_estimates,
-    consistency_warnings,
+    consistency_findings,
     mixed,
     mostly_rejected,
+    not_observable,
 )
 from factorgraph_dvl.trial import PlanarTrial
 
@@ -37,6 +40,15 @@ _UPDATES = 40
 _SEARCHES = (0, 1, 2, 4, 8, 16, 28)
 # Chosen: rows before the first of them; a start and a current have four unknowns.
 _FIRST_ROWS = 8
+
+# Why the data do not tell a constant, by its reported name; else it is the place of a beacon.
+_NOT_OBSERVABLE = {
+    "heading_bias_deg": "a rotation of the track about the only beacon changes no range",
+    "current_m_s": "on a straight run the mirror image fits another current; add a turn",
+    "log_scale_error": "a scale error separates from the current only over several headings",
+    "sound_speed_error": "it needs a longer distance by log and heading to compare with",
+}
+_PLACE_NOT_OBSERVABLE = "it needs ranges from several sides, and a second beacon"
 
 
 def solve_planar(
@@ -133,18 +145,17 @@ def _summary(
     joint = _mixture(values, covs, weights)
     estimates = as_estimates(problem.constants, values[0], joint)
     used, rejected = measurements(trial.beacons, setup, best)
-    warnings = [*trial.notes]
+    findings = [*trial.notes]
     if not best.converged:
-        warnings.append("the smoother did not converge: do not use this result")
+        text = "the smoother did not converge: do not use this result"
+        findings.append(Finding(Code.NOT_CONVERGED, text, severity="error"))
     if setup.uncovered:
-        warnings.append(
-            f"Beacon: {setup.uncovered} measurements at times without heading, speed or depth "
-            "were not used"
-        )
-    warnings += ambiguity(reported)
-    warnings += consistency_warnings(estimates, used)
-    warnings += mostly_rejected(used, rejected)
-    warnings += _unobservable(trial, estimates)
+        text = f"{setup.uncovered} measurements at times without heading, speed or depth"
+        findings.append(Finding(Code.UNUSED, f"{text} were not used", sensor="Beacon"))
+    findings += ambiguity(reported)
+    findings += consistency_findings(estimates, used)
+    findings += mostly_rejected(used, rejected)
+    findings += _unobservable(estimates)
     return Solution(
         trial=trial.name,
         solver="planar",
@@ -156,7 +167,7 @@ def _summary(
         covariance=joint,
         trajectory=mixed([track for parts in along for track in parts], weights),
         residuals=used,
-        warnings=tuple(warnings),
+        findings=tuple(findings),
         hypotheses=reported if len(reported) > 1 else (),
         rejected=rejected,
     )
@@ -271,22 +282,8 @@ def measurements(
     return tuple(used), tuple(rejected)
 
 
-def _unobservable(trial: PlanarTrial, estimates: Sequence[Estimate]) -> list[str]:
-    out = []
-    for e in estimates:
-        bad = np.flatnonzero(~e.observable & (e.prior_std > 0.0))
-        if not bad.size:
-            continue
-        names = ", ".join(e.component_names[i] for i in bad)
-        if e.name == "heading_bias_deg":
-            why = "a rotation of the track about the only beacon changes no range"
-        elif e.name == "current_m_s":
-            why = "on a straight run the mirror image fits another current; add a turn"
-        elif e.name == "log_scale_error":
-            why = "a scale error separates from the current only over several headings"
-        elif e.name == "sound_speed_error":
-            why = "it needs a longer distance by log and heading to compare with"
-        else:
-            why = "it needs ranges from several sides, and a second beacon"
-        out.append(f"{names} not observable: {why}")
-    return out
+def _unobservable(estimates: Sequence[Estimate]) -> list[Finding]:
+    def why(name: str, _: int) -> str:
+        return _NOT_OBSERVABLE.get(name, _PLACE_NOT_OBSERVABLE)
+
+    return [f for e in estimates for f in not_observable(e, partial(why, e.name))]

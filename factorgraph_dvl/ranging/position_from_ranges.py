@@ -25,6 +25,7 @@ from factorgraph_dvl.ranging.planar_track import PlanarTrack
 from factorgraph_dvl.ranging.problem import RangingSetup, ranging_setup
 from factorgraph_dvl.sensors.beacon import Beacons
 from factorgraph_dvl.sensors.dvl import CURRENT_SPEC
+from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.sensors.speed_log import HEADING_BIAS_SPEC, LOG_SCALE_SPEC
 from factorgraph_dvl.solution import Hypothesis
@@ -53,14 +54,14 @@ class StartPositions:
         The living ones, in the same order, then the dead; empty if a position is known.
     rejected : mapping of str to ndarray, optional
         Times of the outliers, by label.
-    notes : tuple of str, optional
+    findings : tuple of Finding, optional
         What the user must know.
     """
 
     states: tuple[States, ...]
     hypotheses: tuple[Hypothesis, ...] = ()
     rejected: Mapping[str, Array] = field(default_factory=dict)
-    notes: tuple[str, ...] = ()
+    findings: tuple[Finding, ...] = ()
 
 
 def positions_from_ranges(
@@ -101,7 +102,8 @@ def positions_from_ranges(
     found = follow(setup.problem, updates, searches)
     living = [c for c in found if c.died is None]
     if not living:
-        return StartPositions((states,), notes=("too few ranges to find a position from them",))
+        few = Finding(Code.FEW_RANGES, "too few ranges to find a position from them")
+        return StartPositions((states,), findings=(few,))
     rejected = {r.label: r.time for r in measurements(beacons, setup, living[0].fit)[1]}
     if trial.gnss is not None:
         return StartPositions((states,), rejected=rejected)

@@ -7,6 +7,7 @@ from collections import Counter, deque
 import numpy as np
 
 from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.sensors.finding import Code, Finding
 
 # Standard deviations beyond which a measurement is rejected; chosen: 2e-9 of Gaussian errors.
 _LIMIT = 6.0
@@ -49,8 +50,8 @@ class InnovationGate:
 
     def accept(
         self, label: str, normalised: Array, echo_limit: float | None = None
-    ) -> tuple[np.ndarray, str]:
-        """Return which of M measurements are used, and a message if a kind's status changes.
+    ) -> tuple[np.ndarray, Finding | None]:
+        """Return which of M measurements are used, and a finding if a kind's status changes.
 
         Parameters
         ----------
@@ -66,22 +67,22 @@ class InnovationGate:
         -------
         ndarray, shape (M,)
             Whether each measurement is used.
-        str
-            Message for the user; empty if nothing changed.
+        Finding or None
+            What changed; None if nothing did.
         """
         window = self._windows.setdefault(label, deque(maxlen=_WINDOW))
         limit = _LIMIT if echo_limit is None else echo_limit
         beyond = np.any(np.abs(normalised) >= limit, axis=1)
         squares = np.nanmean(normalised**2, axis=1)
         window.extend(zip(beyond.tolist(), squares.tolist(), strict=True))
-        message = self._judge(label, window, limit, echo_limit is not None)
+        finding = self._judge(label, window, limit, echo_limit is not None)
         used = np.zeros_like(beyond) if label in self.excluded else ~beyond
         self.rejected[label] += int((~used).sum())
-        return used, message
+        return used, finding
 
     def _judge(
         self, label: str, window: deque[tuple[bool, float]], limit: float, echoes: bool
-    ) -> str:
+    ) -> Finding | None:
         readmit, exclude = (
             (_READMIT_SHARE_ECHOES, _EXCLUDE_SHARE_ECHOES)
             if echoes
@@ -97,14 +98,18 @@ class InnovationGate:
             if full and share <= readmit and rms < _CONSISTENT_RMS:
                 self.inconsistent.discard(label)
                 self.excluded.discard(label)
-                return f"{label}: consistent with the prediction again, and used"
+                return Finding(
+                    Code.HEARD_AGAIN, "consistent with the prediction again, and used", label
+                )
         elif full and rms > _INCONSISTENT_RMS:
             self.inconsistent.add(label)
             if rms <= _EXCLUDE_RMS and share <= exclude:
-                return (
-                    f"{label}: the last {_WINDOW} innovations are {rms:.1f} times as large as "
-                    "predicted, so the standard deviations are too small. Check the stated noise, "
-                    "the clock and the mounting of this sensor"
+                return Finding(
+                    Code.CONTRADICTS,
+                    f"the last {_WINDOW} innovations are {rms:.1f} times as large as predicted, "
+                    "so the standard deviations are too small. Check the stated noise, the clock "
+                    "and the mounting of this sensor",
+                    label,
                 )
         if label not in self.excluded and (
             (len(window) >= _LEAST and share > exclude) or (full and rms > _EXCLUDE_RMS)
@@ -117,8 +122,10 @@ class InnovationGate:
                     f"{count} of the last {len(window)} measurements are more than {limit:g} "
                     "standard deviations from the prediction"
                 )
-            return (
-                f"{label}: {what}; none are used until they are consistent again. A clock that "
-                "has jumped or a faulty sensor does this: check both"
+            return Finding(
+                Code.CONTRADICTS,
+                f"{what}; none are used until they are consistent again. A clock that has jumped "
+                "or a faulty sensor does this: check both",
+                label,
             )
-        return ""
+        return None

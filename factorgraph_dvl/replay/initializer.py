@@ -13,6 +13,7 @@ from factorgraph_dvl.replay.history import RecordHistory
 from factorgraph_dvl.replay.navigator import Navigator
 from factorgraph_dvl.replay.samples import Gap
 from factorgraph_dvl.replay.start import ReplayStart, solve_start
+from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.solution import Progress
 from factorgraph_dvl.trial import InitialPosition, Trial
 
@@ -77,13 +78,13 @@ class Initializer:
     ----------
     history : RecordHistory or None
         Records so far; None once no batch solution is needed any more.
-    messages : list of str
-        Messages for the user since they were last taken.
+    findings : list of Finding
+        Findings since they were last taken.
     """
 
     def __init__(self, settings: Trial, interval: float, progress: Progress) -> None:
         self.history: RecordHistory | None = RecordHistory(settings, _LONGEST)
-        self.messages: list[str] = []
+        self.findings: list[Finding] = []
         self._settings = settings
         self._interval = interval
         self._progress = progress
@@ -109,9 +110,13 @@ class Initializer:
             IMU samples after the gap.
         """
         length = gap.after - gap.before
-        self.messages.append(
-            f"gap of {length:.2f} s in the IMU at {gap.before:.2f} s: the attitude is aligned "
-            f"again, from the {_AFTER_GAP:g} s after it"
+        self.findings.append(
+            Finding(
+                Code.IMU_GAP,
+                f"gap of {length:.2f} s at {gap.before:.2f} s: the attitude is aligned again, "
+                f"from the {_AFTER_GAP:g} s after it",
+                "IMU",
+            )
         )
         if self.history is None:
             state = navigator.filtered(self._settings.body_axes)
@@ -143,9 +148,13 @@ class Initializer:
         if np.isnan(self._attempt):
             self._attempt = start + _FIRST
         elif self._attempt <= start:
-            self.messages.append(
-                f"IMU samples before {start:.3f} s are not used: before there was a start, its "
-                f"clock jumped or it was silent for more than {_LONGEST:g} s"
+            self.findings.append(
+                Finding(
+                    Code.UNUSED,
+                    f"samples before {start:.3f} s are not used: before there was a start, the "
+                    f"clock jumped or nothing came for more than {_LONGEST:g} s",
+                    "IMU",
+                )
             )
             self._attempt = start + _FIRST
         if arrived < self._attempt and not end:
@@ -204,14 +213,15 @@ class Initializer:
         if isinstance(start, str):
             if navigator is None:
                 if start != self._reason:
-                    self.messages.append(f"no start yet at {until:.1f} s: {start}")
+                    text = f"no start yet at {until:.1f} s: {start}"
+                    self.findings.append(Finding(Code.NOT_STARTED, text))
                 self._reason = start
             return None, jump
         self._reason = ""
         self._gap = None
         self._usual_misfit = max(1.0, start.misfit)
-        self.messages += [note for note in start.notes if note not in self._noted]
-        self._noted.update(start.notes)
+        self.findings += [f for f in start.findings if f not in self._noted]
+        self._noted.update(start.findings)
         return start, jump
 
     def release_if_settled(self, before: Navigator, after: Navigator) -> None:
@@ -278,8 +288,12 @@ class Initializer:
             self.history.shift_samples(gap.before + 0.5 * dt, jump.by)
             why = start if isinstance(start, str) else f"misfit of {start.misfit:.1f}"
             return f"after the gap the IMU contradicts the other sensors ({why})", None
-        self.messages.append(
-            f"no gap in the IMU at {gap.before:.2f} s, its clock jumped ahead by {jump.by:.2f} s: "
-            "later samples are shifted back by that. Check the clock of the logger"
+        self.findings.append(
+            Finding(
+                Code.CLOCK_JUMP,
+                f"no gap at {gap.before:.2f} s, the clock jumped ahead by {jump.by:.2f} s: later "
+                "samples are shifted back by that. Check the clock of the logger",
+                "IMU",
+            )
         )
         return other, jump

@@ -13,6 +13,7 @@ from factorgraph_dvl.imu.propagation import attach
 from factorgraph_dvl.replay.gate import InnovationGate
 from factorgraph_dvl.replay.start import ReplayStart
 from factorgraph_dvl.replay.update import Innovations
+from factorgraph_dvl.sensors.finding import Finding
 from factorgraph_dvl.sensors.protocol import Aid
 
 
@@ -71,7 +72,7 @@ def gated(
     sigma: Array,
     P: Array,
     gate: InnovationGate,
-) -> tuple[list[Array], list[Innovations], list[str]]:
+) -> tuple[list[Array], list[Innovations], list[Finding]]:
     """Return inverse standard deviations of measurements, 0 for those that the gate rejects.
 
     Parameters
@@ -93,11 +94,11 @@ def gated(
         Inverse standard deviations of each kind.
     innovations : list of Innovations
         Innovations of each kind.
-    messages : list of str
-        Messages of the gate for the user.
+    findings : list of Finding
+        What the gate noticed.
     """
     total = np.sqrt(np.sum((jacobian @ P) * jacobian, axis=1) + sigma**2)
-    weights, innovations, messages = [], [], []
+    weights, innovations, findings = [], [], []
     first = 0
     for r in measured.rows:
         o = r.observation
@@ -107,8 +108,8 @@ def gated(
         there = np.isfinite(sigma[part])
         found = np.where(there, residual[part], np.nan).reshape(shape)
         spread = np.where(there, total[part], np.nan).reshape(shape)
-        used, message = gate.accept(o.label, found / spread, o.gate)
-        messages += [message] if message else []
+        used, finding = gate.accept(o.label, found / spread, o.gate)
+        findings += [] if finding is None else [finding]
         weights.append(used[:, None] / sigma[part].reshape(shape))
         innovations.append(Innovations(o.label, o.unit, o.components, o.time, found, spread, used))
-    return weights, innovations, messages
+    return weights, innovations, findings

@@ -24,6 +24,7 @@ from factorgraph_dvl.replay.smoother import Smoother
 from factorgraph_dvl.replay.spurious import SpuriousInformation
 from factorgraph_dvl.replay.start import ReplayStart
 from factorgraph_dvl.replay.update import Innovations
+from factorgraph_dvl.sensors.finding import Finding
 from factorgraph_dvl.sensors.imu import Imu
 from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.sensors.protocol import Aid
@@ -72,8 +73,8 @@ class Navigator:
         Directions of the parameters that are not observable.
     innovations : list of Innovations
         Innovations since they were last taken.
-    messages : list of str
-        Messages for the user since they were last taken.
+    findings : list of Finding
+        Findings since they were last taken.
     """
 
     def __init__(
@@ -102,7 +103,7 @@ class Navigator:
         self._gravity = LocalGravity(start.frame)
         self._segments: dict[int, tuple[Segments, Array]] = {}
         self.innovations: list[Innovations] = []
-        self.messages: list[str] = []
+        self.findings: list[Finding] = []
         self._refresh()
         self._start_values = {
             p.name: value_at(start.values, key, p)
@@ -301,11 +302,11 @@ class Navigator:
             states = state_of(s.state(k), s.bias(k))
             residual, matrix, motions = measured.linearize(states, self.values)
         sigma = measured.sigma(motions, self.values)
-        weights, innovations, messages = gated(
+        weights, innovations, findings = gated(
             measured, residual, matrix, sigma, self._P[np.ix_(own, own)], self._gate
         )
         self.innovations += innovations
-        self.messages += messages
+        self.findings += findings
         state_P = self._P[:_STATE, :_STATE]
         if self.spurious.add(measured, motions, weights, self.values, state_P, self.time):
             self.undetermined = self.spurious.undetermined(self._parameter_covariance)

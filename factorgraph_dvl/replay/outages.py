@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from factorgraph_dvl.replay.update import Innovations
+from factorgraph_dvl.sensors.finding import Code, Finding
 
 # Silence, s, that counts as an outage; chosen: several pings, and short against the time over
 # which an INS drifts.
@@ -29,8 +30,8 @@ class Outages:
         self._last.clear()
         self._out.clear()
 
-    def messages(self, now: float, arrived: Sequence[Innovations]) -> list[str]:
-        """Return which kinds have stopped by a time, s, and which are back, for the user."""
+    def findings(self, now: float, arrived: Sequence[Innovations]) -> list[Finding]:
+        """Return which kinds have stopped by a time, s, and which are back."""
         out = []
         for i in arrived:
             time = float(i.time.max())
@@ -40,13 +41,18 @@ class Outages:
                 self._interval[i.label] = min(now - before, self._interval.get(i.label, np.inf))
             if i.label in self._out:
                 self._out.discard(i.label)
-                out.append(f"{i.label}: back after {now - before:.1f} s")
+                text = f"back after {now - before:.1f} s"
+                out.append(Finding(Code.HEARD_AGAIN, text, i.label))
         for label, (before, newest) in self._last.items():
             longest = max(_OUTAGE, _INTERVALS * self._interval.get(label, 0.0))
             if now - before > longest and label not in self._out:
                 self._out.add(label)
                 out.append(
-                    f"{label}: no measurements since {newest:.1f} s; the estimate continues "
-                    "without, and its standard deviations grow"
+                    Finding(
+                        Code.SILENT,
+                        f"no measurements since {newest:.1f} s; the estimate continues without, "
+                        "and its standard deviations grow",
+                        label,
+                    )
                 )
         return out

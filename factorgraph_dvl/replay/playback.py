@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -13,8 +14,9 @@ from factorgraph_dvl.replay.record import Recorder, ReplayRecord
 from factorgraph_dvl.replay.samples import LEAST
 from factorgraph_dvl.replay.session import LAG, RATE, Kind, Replay
 from factorgraph_dvl.replay.update import Update
+from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.sensors.records import rows_of
-from factorgraph_dvl.solution import Progress, Solution, consistency_warnings
+from factorgraph_dvl.solution import Progress, Solution, consistency_findings, not_observable
 from factorgraph_dvl.trial import Trial
 
 Watch = Callable[[Update], None]
@@ -93,7 +95,7 @@ def replay(
             take(run.add_imu(imu.time[a:b], imu.gyro[a:b], imu.accel[a:b]))
     take(run.finish())
     if recorder.last is None:
-        why = "; ".join(run.messages) or "the record is too short"
+        why = "; ".join(map(str, run.findings)) or "the record is too short"
         raise SolveError(f"the data never sufficed to start: {why}", where=trial.name)
     return _solution(trial, run, recorder, recorder.last), recorder.record(run.delay)
 
@@ -101,34 +103,42 @@ def replay(
 def _solution(trial: Trial, run: Replay, recorder: Recorder, last: Update) -> Solution:
     calibration = last.calibration
     residuals = recorder.residuals()
-    warnings = [*trial.notes, *(f"{time:.1f} s: {text}" for time, text in recorder.messages)]
-    warnings += [f"at the end: {text}" for text in run.messages]
+    findings = [*trial.notes]
+    findings += [replace(f, text=f"at {time:.1f} s: {f.text}") for time, f in recorder.findings]
+    findings += [replace(f, text=f"at the end: {f.text}") for f in run.findings]
     if run.unused:
-        warnings.append(
-            f"the replay ended at {last.time:.3f} s: {run.unused} IMU samples follow, but too few "
-            "to start again after a gap; they and what was measured then were not used"
-        )
-    warnings += run.counts()
-    warnings += consistency_warnings(calibration.estimates, residuals)
-    for e in calibration.estimates:
-        open_ = np.flatnonzero(~e.observable & (e.prior_std > 0.0))
-        if open_.size:
-            names = ", ".join(e.component_names[i] for i in open_)
-            warnings.append(
-                f"{names} not observable in these data: the prior is reported; turns and changes "
-                "of speed make more of it observable"
+        findings.append(
+            Finding(
+                Code.UNUSED,
+                f"the replay ended at {last.time:.3f} s: {run.unused} samples follow, but too few "
+                "to start again after a gap; they and what was measured then were not used",
+                "IMU",
             )
+        )
+    findings += run.counts()
+    findings += consistency_findings(calibration.estimates, residuals)
+    why = "the prior is reported; turns and changes of speed make more of it observable"
+    for e in calibration.estimates:
+        findings += not_observable(e, lambda _: why)
     known = {e.name for e in calibration.estimates}
     for aid in trial.aids:
         if any(p.estimated and p.name not in known for p in aid.parameters()):
-            warnings.append(
-                f"{aid.label} delivered nothing in time to be calibrated; check its record, or "
-                "feed more data"
+            findings.append(
+                Finding(
+                    Code.SILENT,
+                    "delivered nothing in time to be calibrated; check its record, or feed more "
+                    "data",
+                    aid.label,
+                )
             )
     if trial.imu.settings.bias_walks:
-        warnings.append(
-            "a bias of the IMU walks: reported is its value at the end, where `solve` reports the "
-            "mean over the trial"
+        findings.append(
+            Finding(
+                Code.MEAN_OR_LAST,
+                "a bias walks: reported is its value at the end, where `solve` reports the mean "
+                "over the trial",
+                "IMU",
+            )
         )
     cost = 0.5 * sum(float(np.nansum((r.residual / r.sigma) ** 2)) for r in residuals)
     return Solution(
@@ -143,5 +153,5 @@ def _solution(trial: Trial, run: Replay, recorder: Recorder, last: Update) -> So
         covariance=calibration.covariance,
         trajectory=recorder.trajectory(),
         residuals=residuals,
-        warnings=tuple(warnings),
+        findings=tuple(findings),
     )

@@ -10,6 +10,7 @@ import numpy as np
 
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.replay.update import Innovations, Update
+from factorgraph_dvl.sensors.finding import Finding
 from factorgraph_dvl.solution import Residuals, Trajectory
 
 # Numbers of an update before its estimates: time, latency, solved, inconsistent.
@@ -34,8 +35,8 @@ class ReplayRecord:
         Estimates and standard deviations in reported units; nan before a component was estimated.
     smoothed : Trajectory
         Epochs of the trajectory, smoothed with later data.
-    messages : tuple of tuple of (float, str)
-        Time, s, and text of each message.
+    findings : tuple of tuple of (float, Finding)
+        Findings, each with its time, s.
     delay : float
         Time by which estimates are behind the newest IMU sample, s.
     """
@@ -48,7 +49,7 @@ class ReplayRecord:
     values: Array
     std: Array
     smoothed: Trajectory
-    messages: tuple[tuple[float, str], ...]
+    findings: tuple[tuple[float, Finding], ...]
     delay: float
 
 
@@ -58,7 +59,7 @@ class Recorder:
     def __init__(self) -> None:
         self.last: Update | None = None
         self.count = 0
-        self.messages: list[tuple[float, str]] = []
+        self.findings: list[tuple[float, Finding]] = []
         # By what was estimated, which grows when a sensor first reports.
         self._estimates: list[tuple[tuple[str, ...], array[float]]] = []
         self._trajectory: array[float] = array("d")
@@ -83,7 +84,7 @@ class Recorder:
         for i in update.innovations:
             _, rows = self._residuals.setdefault(i.label, (i, array("d")))
             rows.frombytes(np.column_stack([i.time, i.residual, i.sigma])[i.used].tobytes())
-        self.messages += [(update.time, text) for text in update.messages]
+        self.findings += [(update.time, finding) for finding in update.findings]
 
     def trajectory(self) -> Trajectory:
         """Return the trajectory as it was known at each time."""
@@ -113,7 +114,7 @@ class Recorder:
             values=values,
             std=std,
             smoothed=self._read(self._smoothed),
-            messages=tuple(self.messages),
+            findings=tuple(self.findings),
             delay=delay,
         )
 

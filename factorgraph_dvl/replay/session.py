@@ -23,6 +23,7 @@ from factorgraph_dvl.replay.outages import Outages
 from factorgraph_dvl.replay.pending import AHEAD, SAME_TIME, PendingMeasurements
 from factorgraph_dvl.replay.samples import Gap, SampleBuffer
 from factorgraph_dvl.replay.update import Update
+from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.sensors.protocol import Aid
 from factorgraph_dvl.sensors.records import rows_of
 from factorgraph_dvl.solution import Progress, Trajectory
@@ -86,7 +87,7 @@ class Replay:
         self._duplicates = Duplicates()
         self._clocks = Clocks()
         self._outages = Outages()
-        self._messages: list[str] = []
+        self._findings: list[Finding] = []
         self._smoothed_to = 0
         self._newest_state = -np.inf
         # End of the trajectory that updates have carried: a new batch solution corrects rounded
@@ -111,17 +112,17 @@ class Replay:
         return self._initializer.history is None
 
     @property
-    def messages(self) -> tuple[str, ...]:
-        """Messages that no update has carried yet."""
-        return (*self._messages, *self._initializer.messages)
+    def findings(self) -> tuple[Finding, ...]:
+        """Findings that no update has carried yet."""
+        return (*self._findings, *self._initializer.findings)
 
     @property
     def unused(self) -> int:
         """Number of the IMU's samples after the newest state."""
         return self._samples.since(self._newest_state + 0.5 * self._samples.dt).shape[0]
 
-    def counts(self) -> list[str]:
-        """Return how many measurements were not used, and why, for the user."""
+    def counts(self) -> list[Finding]:
+        """Return how many measurements were not used, and why."""
         reasons = (
             (
                 self._too_late,
@@ -137,21 +138,21 @@ class Replay:
             (self._gate.rejected, "contradicted the prediction and were not used"),
         )
         out = [
-            f"{label}: {n} measurements {why}"
+            Finding(Code.UNUSED, f"{n} measurements {why}", label)
             for counts, why in reasons
             for label, n in counts.items()
             if n
         ]
         if self._samples.rejected:
-            out.append(
-                f"IMU: {self._samples.rejected} samples were out of order or not numbers, and not "
+            text = (
+                f"{self._samples.rejected} samples were out of order or not numbers, and not "
                 "used; check the logger"
             )
+            out.append(Finding(Code.UNUSED, text, "IMU"))
         if self._samples.interpolated:
-            out.append(
-                f"IMU: {self._samples.interpolated} samples that were lost after the start were "
-                "interpolated"
-            )
+            n = self._samples.interpolated
+            text = f"{n} samples that were lost after the start were interpolated"
+            out.append(Finding(Code.LOST_SAMPLES, text, "IMU"))
         return out
 
     def add_imu(self, time: ArrayLike, gyro: ArrayLike, accel: ArrayLike) -> list[Update]:
@@ -171,9 +172,13 @@ class Replay:
         used, jump = self._samples.add(table)
         if jump:
             self._clocks.jumped_back(jump)
-            self._messages.append(
-                f"the clock of the IMU jumped back by {jump:.3f} s at {self._samples.newest:.3f} "
-                "s: later samples are shifted by that. Check the clock of the logger"
+            self._findings.append(
+                Finding(
+                    Code.CLOCK_JUMP,
+                    f"the clock jumped back by {jump:.3f} s at {self._samples.newest:.3f} s: "
+                    "later samples are shifted by that. Check the clock of the logger",
+                    "IMU",
+                )
             )
         if self._initializer.history is not None:
             self._initializer.history.add_samples(used)
@@ -295,7 +300,7 @@ class Replay:
         after = self._solve(before.time, np.inf)
         if after is not None:
             self._initializer.release_if_settled(before, after)
-            after.innovations, after.messages = before.innovations, before.messages
+            after.innovations, after.findings = before.innovations, before.findings
         return after
 
     def _take(self, nav: Navigator, end: float) -> list[Aid]:
@@ -368,13 +373,13 @@ class Replay:
         oldest = nav.smoother.times.get(self._smoothed_to, np.inf)
         if not end and nav.time - oldest > self._lag - 2.0 * self._interval:
             smoothed = self._smooth(nav, 0.5 * self._lag)
-        messages = (
-            *self.messages,
-            *self._outages.messages(nav.time, nav.innovations),
-            *nav.messages,
+        findings = (
+            *self.findings,
+            *self._outages.findings(nav.time, nav.innovations),
+            *nav.findings,
         )
         innovations = tuple(nav.innovations)
-        for taken in (self._messages, self._initializer.messages, nav.messages, nav.innovations):
+        for taken in (self._findings, self._initializer.findings, nav.findings, nav.innovations):
             taken.clear()
         state, calibration = nav.filtered(axes), nav.calibration()
         return Update(
@@ -385,7 +390,7 @@ class Replay:
             calibration=calibration,
             smoothed=smoothed,
             innovations=innovations,
-            messages=messages,
+            findings=findings,
             solved=solved,
             inconsistent=tuple(sorted(self._gate.inconsistent)),
         )

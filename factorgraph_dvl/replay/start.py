@@ -16,6 +16,7 @@ from factorgraph_dvl.graph import keys
 from factorgraph_dvl.graph.priors import ConstantsPrior, prior_mean
 from factorgraph_dvl.graph.problem import Evaluation, Problem
 from factorgraph_dvl.imu.propagation import States
+from factorgraph_dvl.sensors.finding import Finding
 from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.sensors.protocol import AttitudeAid
 from factorgraph_dvl.solution import Progress, Trajectory
@@ -67,8 +68,8 @@ class ReplayStart:
         Whether biases walk.
     trajectory : Trajectory
         Motion after the time that `solve_start` was given.
-    notes : tuple of str
-        Messages for the user.
+    findings : tuple of Finding
+        What the user must know.
     misfit : float
         Largest RMS normalised residual of any kind of measurement.
     """
@@ -88,7 +89,7 @@ class ReplayStart:
     spurious: Array
     walking: bool
     trajectory: Trajectory
-    notes: tuple[str, ...]
+    findings: tuple[Finding, ...]
     misfit: float
 
     def columns(self, names: Collection[str]) -> np.ndarray:
@@ -137,8 +138,8 @@ def solve_start(
             f"{len(start_positions.states)} trajectories fit the ranges; turn by 30 degrees or "
             "more, or give `initial.position`"
         )
-    if start_positions.notes:
-        return start_positions.notes[0]
+    if start_positions.findings:
+        return start_positions.findings[0].text
     if not minimum.converged:
         return "the batch solution did not converge"
     covariances = posterior(problem, minimum)
@@ -176,7 +177,7 @@ def solve_start(
         trajectory=_trajectory(
             problem, evaluation.states, covariances.nodes, trial.body_axes, since
         ),
-        notes=settled.notes,
+        findings=settled.findings,
         misfit=_misfit(problem, evaluation),
     )
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.replay.calibration import CalibrationEstimate
+from factorgraph_dvl.sensors.finding import Finding
 from factorgraph_dvl.solution import Trajectory
 
 
@@ -58,8 +59,8 @@ class Update:
         Earlier epochs, smoothed with later data; None if there are none this time.
     innovations : tuple of Innovations
         Measured against predicted, one entry for each kind of measurement.
-    messages : tuple of str
-        Messages for the user.
+    findings : tuple of Finding
+        What the user must know since the update before.
     solved : bool
         Whether the update includes a batch solution.
     inconsistent : tuple of str
@@ -74,6 +75,6 @@ class Update:
     calibration: CalibrationEstimate
     smoothed: Trajectory | None
     innovations: tuple[Innovations, ...]
-    messages: tuple[str, ...]
+    findings: tuple[Finding, ...]
     solved: bool
     inconsistent: tuple[str, ...]

@@ -10,6 +10,7 @@ import numpy as np
 
 from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.vectors import Array, cross_variance
+from factorgraph_dvl.sensors.finding import Finding
 from factorgraph_dvl.sensors.parameters import Parameter, ParameterSpec
 from factorgraph_dvl.settings.sections import Section
 
@@ -195,7 +196,7 @@ class Attitudes:
         Standard deviation about the axis that is known best.
     mounting : Parameter
         The parameter sRb, with its prior.
-    consistency_warnings : tuple of str, optional
+    findings : tuple of Finding, optional
         What the record says against itself, for people.
     """
 
@@ -203,7 +204,7 @@ class Attitudes:
     nRs: Array
     sigma: Array
     mounting: Parameter
-    consistency_warnings: tuple[str, ...] = ()
+    findings: tuple[Finding, ...] = ()
 
 
 @runtime_checkable

@@ -22,9 +22,9 @@ from factorgraph_dvl.geometry.earth import LocalFrame, enu_from_ecef
 from factorgraph_dvl.geometry.rotations import inverse_right_jacobian, log_so3
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array, rotate
+from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.sensors.parameters import Parameter, ParameterSpec
 from factorgraph_dvl.sensors.protocol import (
-    DO_NOT_FIT,
     TOO_LARGE,
     Attitudes,
     Linearization,
@@ -56,6 +56,8 @@ _NORM = 1e-3
 _PARALLEL = 1e-3
 # Probability of a misfit of stars below which it is no chance.
 _BY_CHANCE = 1e-4
+# Misfit of stars to their catalogue that no standard deviation stated too small explains: chosen.
+_WRONG_STARS = 3.0
 
 
 class StarSettings(SensorSection, frozen=True, kw_only=True):
@@ -253,9 +255,7 @@ class Star:
         eRi = earth_from_inertial(frame.epoch, time, self.settings.ut1_utc_s)
         best = np.linalg.eigvalsh(self.covariance[known])[:, 0]
         nRs = nRe @ eRi @ iRs
-        return Attitudes(
-            time, nRs, np.sqrt(best), self.parameters()[0], self.consistency_warnings()
-        )
+        return Attitudes(time, nRs, np.sqrt(best), self.parameters()[0], self.findings())
 
     @property
     def misfit(self) -> float:
@@ -271,8 +271,8 @@ class Star:
         freedom = 2 * v.time.size - 3 * self.time.size
         return float(np.sqrt(np.sum(self._star_misfits() ** 2) / freedom))
 
-    def consistency_warnings(self) -> tuple[str, ...]:
-        """Return a warning if the stars do not fit their catalogue, naming the worst of them."""
+    def findings(self) -> tuple[Finding, ...]:
+        """Return a finding if the stars do not fit their catalogue, naming the worst of them."""
         v = self._seen
         if v is None or not self.misfit > TOO_LARGE:
             return ()
@@ -286,16 +286,22 @@ class Star:
         each = np.bincount(which.ravel(), square) / np.bincount(which.ravel())
         worst = int(np.argmax(each))
         x, y, z = stars[worst]
+        wrong = self.misfit > _WRONG_STARS
         consequence = (
             "the stars are not those of the catalogue, and the attitudes are not to be used"
-            if self.misfit > DO_NOT_FIT
+            if wrong
             else "the reported standard deviations are too small unless it is corrected"
         )
         return (
-            f"{self.label}: the angles between stars differ from the catalogue's by "
-            f"{self.misfit:.3g} times what `std_arcsec` lets expect, most at the star towards "
-            f"inertial ({x:.4f}, {y:.4f}, {z:.4f}), first in {at_row(self.source, row[worst])}: "
-            f"is it another one, are columns mixed up, or is aberration left in? {consequence}",
+            Finding(
+                Code.STAR_CATALOGUE,
+                f"the angles between stars differ from the catalogue's by {self.misfit:.3g} times "
+                "what `std_arcsec` lets expect, most at the star towards inertial "
+                f"({x:.4f}, {y:.4f}, {z:.4f}), first in {at_row(self.source, row[worst])}: is it "
+                "another one, are columns mixed up, or is aberration left in? " + consequence,
+                sensor=self.label,
+                severity="error" if wrong else "warning",
+            ),
         )
 
     @property

@@ -12,6 +12,7 @@ from factorgraph_dvl.errors import ConfigError
 from factorgraph_dvl.graph.priors import ConstantsPrior
 from factorgraph_dvl.ranging.hypothesis_weights import significant_costs
 from factorgraph_dvl.ranging.position_from_ranges import StartPositions
+from factorgraph_dvl.sensors.finding import Finding
 from factorgraph_dvl.solution import Progress, Solution, ambiguity, joined, not_told_apart
 from factorgraph_dvl.solvers.fixed_directions import (
     SolvedProblem,
@@ -74,7 +75,7 @@ def solve(
         minima = distinct(
             prepared,
             [
-                _with_covariances(each, prepared.notes, report)
+                _with_covariances(each, prepared.findings, report)
                 for each in competing_minima(prepared, states, report)
             ],
         )
@@ -122,8 +123,8 @@ def settled_minimum(
     prepared = _prepare(trial, state_interval_s, report)
     start = prepared.start_positions
     settled = settle(prepared, start.states[0], report, constants_prior=constants_prior)
-    notes = (*prepared.notes, *settled.notes, *ambiguity(start.hypotheses))
-    return replace(settled, notes=notes), start
+    findings = (*prepared.findings, *settled.findings, *ambiguity(start.hypotheses))
+    return replace(settled, findings=findings), start
 
 
 def _prepare(trial: Trial, state_interval_s: float, report: Progress) -> Preparation:
@@ -132,7 +133,7 @@ def _prepare(trial: Trial, state_interval_s: float, report: Progress) -> Prepara
 
 
 def _with_covariances(
-    settled: SettledMinimum, notes: tuple[str, ...], report: Progress
+    settled: SettledMinimum, findings: tuple[Finding, ...], report: Progress
 ) -> SolvedProblem:
     """Return a minimum with its covariances, and with undetermined directions fixed."""
     problem, before = settled.problem, settled.minimum
@@ -146,9 +147,9 @@ def _with_covariances(
         )
 
     report("covariance", 0, None)
-    notes = (*notes, *settled.notes)
+    findings = (*findings, *settled.findings)
     free = copy(problem)
-    solved = with_covariances(problem, before, minimise_again, notes=notes)
+    solved = with_covariances(problem, before, minimise_again, findings=findings)
     if before.converged or not solved.minimum.converged:
         return solved
     converged = settled.settled and undetermined_there(solved, free)

@@ -10,6 +10,7 @@ import numpy as np
 
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph.problem import Problem
+from factorgraph_dvl.sensors.finding import Finding
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, eliminate
 from factorgraph_dvl.solvers.posterior import Posterior, changes_with, considered, posterior
 from factorgraph_dvl.statistics.spurious_information import (
@@ -37,7 +38,7 @@ class SolvedProblem:
     fixed : ndarray, shape (P, h)
         Directions of the parameters that the data do not determine, in units of the priors'
         standard deviations.
-    notes : tuple of str, optional
+    findings : tuple of Finding, optional
         What the user must know.
     """
 
@@ -45,7 +46,7 @@ class SolvedProblem:
     minimum: Minimum
     covariances: Posterior
     fixed: Array
-    notes: tuple[str, ...] = ()
+    findings: tuple[Finding, ...] = ()
 
 
 def with_covariances(
@@ -53,7 +54,7 @@ def with_covariances(
     minimum: Minimum,
     minimise_again: Callable[[gtsam.Values], Minimum],
     *,
-    notes: tuple[str, ...] = (),
+    findings: tuple[Finding, ...] = (),
     at_truth: bool = False,
 ) -> SolvedProblem:
     """Return a minimum with its covariances, undetermined directions fixed at the prior.
@@ -66,7 +67,7 @@ def with_covariances(
         Where it ended.
     minimise_again : callable
         Returns the minimum from values on, once directions are fixed.
-    notes : tuple of str, optional
+    findings : tuple of Finding, optional
         What the user must know.
     at_truth : bool, default False
         Whether the minimum is the truth: the parameters then stay there.
@@ -87,7 +88,7 @@ def with_covariances(
         problem.fix_directions(fixed, origin)
         minimum = minimise_again(problem.values(evaluation.states, origin))
         covariances = considered(posterior(problem, minimum), changes)
-    return SolvedProblem(problem, minimum, covariances, fixed, notes)
+    return SolvedProblem(problem, minimum, covariances, fixed, findings)
 
 
 def undetermined_there(solved: SolvedProblem, free: Problem) -> bool:

@@ -54,7 +54,7 @@ def predict_posterior(
         return _minimum(problem, problem.evaluate(values))
 
     found = with_covariances(
-        problem, _minimum(problem, evaluation), linearised_at, notes=trial.notes, at_truth=True
+        problem, _minimum(problem, evaluation), linearised_at, findings=trial.notes, at_truth=True
     )
     evaluation = found.minimum.evaluation
     if found.fixed.size:

@@ -16,6 +16,7 @@ from factorgraph_dvl.initialization.attitude_sensors import attitudes
 from factorgraph_dvl.initialization.in_motion_alignment import initial_states
 from factorgraph_dvl.initialization.mountings import mounted_aids, mountings_from_motion
 from factorgraph_dvl.ranging.position_from_ranges import StartPositions, positions_from_ranges
+from factorgraph_dvl.sensors.finding import Finding
 from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.sensors.protocol import Observation
 from factorgraph_dvl.solution import Progress
@@ -49,7 +50,7 @@ class Preparation:
         States to start from, one set for each position that the ranges allow.
     mountings : dict of str to ndarray
         Mountings of attitude sensors that the gyros tell, by parameter name.
-    notes : tuple of str
+    findings : tuple of Finding
         What the user must know.
     """
 
@@ -60,7 +61,7 @@ class Preparation:
     parameters: tuple[Parameter, ...]
     start_positions: StartPositions
     mountings: dict[str, Array]
-    notes: tuple[str, ...]
+    findings: tuple[Finding, ...]
 
     def chain(self, states: States, *, bias_prior: bool = True) -> Chain:
         """Return the inertial part of the graph, with gravity along the track of states."""
@@ -100,7 +101,7 @@ def prepare(trial: Trial, state_interval_s: float, report: Progress) -> Preparat
     if trial.beacons is not None:
         report("ranges", 0, None)
     start_positions = positions_from_ranges(trial, frame, seg, start.states)
-    warnings = [w for seen in attitudes(trial, frame) for w in seen.consistency_warnings]
+    seen = [finding for each in attitudes(trial, frame) for finding in each.findings]
     observations, parameters = observed(trial.aids, frame)
     return Preparation(
         trial=trial,
@@ -110,7 +111,7 @@ def prepare(trial: Trial, state_interval_s: float, report: Progress) -> Preparat
         parameters=parameters,
         start_positions=start_positions,
         mountings=start.mountings,
-        notes=(*trial.notes, *gaps, *start.notes, *warnings, *start_positions.notes),
+        findings=(*trial.notes, *gaps, *start.findings, *seen, *start_positions.findings),
     )
 
 

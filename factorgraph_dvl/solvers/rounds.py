@@ -15,6 +15,7 @@ from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph.priors import ConstantsPrior
 from factorgraph_dvl.graph.problem import Evaluation, Problem
 from factorgraph_dvl.imu.propagation import States
+from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.solution import Progress
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, minimise
 from factorgraph_dvl.solvers.preparation import Preparation, mounted_start
@@ -38,14 +39,14 @@ class SettledMinimum:
         Where it ended, with the iterations of all rounds.
     settled : bool
         Whether the problem no longer changes, whatever the minimum.
-    notes : tuple of str
+    findings : tuple of Finding
         What the user must know.
     """
 
     problem: Problem
     minimum: Minimum
     settled: bool
-    notes: tuple[str, ...]
+    findings: tuple[Finding, ...]
 
 
 def settle(
@@ -112,14 +113,13 @@ def settle(
         if not changing:
             break
         rejected = outliers
-    notes = _at_the_gate(cycle)
+    findings = _at_the_gate(cycle)
     if changing:
-        notes += (
-            f"after {_ROUNDS} rounds {', '.join(changing)} still changed: the solution is none",
-        )
+        text = f"after {_ROUNDS} rounds {', '.join(changing)} still changed: do not use the result"
+        findings += (Finding(Code.NOT_CONVERGED, text, severity="error"),)
     converged = minimum.converged and not changing
     minimum = replace(minimum, converged=converged, iterations=iterations)
-    return SettledMinimum(problem, minimum, not changing, notes)
+    return SettledMinimum(problem, minimum, not changing, findings)
 
 
 def _changing(problem: Problem, evaluation: Evaluation) -> list[str]:
@@ -149,7 +149,7 @@ def _count(rejected: Mapping[str, Array]) -> int:
     return sum(times.size for times in rejected.values())
 
 
-def _at_the_gate(cycle: Sequence[Mapping[str, Array]]) -> tuple[str, ...]:
+def _at_the_gate(cycle: Sequence[Mapping[str, Array]]) -> tuple[Finding, ...]:
     """Say how many measurements of a cycle may be echoes or not."""
     if not cycle:
         return ()
@@ -160,8 +160,12 @@ def _at_the_gate(cycle: Sequence[Mapping[str, Array]]) -> tuple[str, ...]:
         undecided = np.setdiff1d(ever, kept.get(label, none)).size
         if undecided:
             out.append(
-                f"{label}: {undecided} at the gate would be rejected if they were used, and used "
-                "if they were rejected; they are used"
+                Finding(
+                    Code.AT_THE_GATE,
+                    f"{undecided} at the gate would be rejected if they were used, and used if "
+                    "they were rejected; they are used",
+                    sensor=label,
+                )
             )
     return tuple(out)
 

@@ -1,4 +1,4 @@
-"""From a minimum to a solution: calibration, trajectory, residuals, warnings."""
+"""From a minimum to a solution: calibration, trajectory, residuals, findings."""
 
 from __future__ import annotations
 
@@ -9,12 +9,13 @@ from functools import partial
 import numpy as np
 
 from factorgraph_dvl.graph.problem import Problem
+from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.sensors.protocol import Motion
 from factorgraph_dvl.solution import (
     Estimate,
     Residuals,
     Solution,
-    consistency_warnings,
+    consistency_findings,
     mostly_rejected,
     not_observable,
 )
@@ -51,16 +52,18 @@ def summarise(trial: Trial, found: SolvedProblem, *, rate_hz: float) -> Solution
     )
     residuals = _residuals(problem, minimum)
     rejected = _rejected(problem, minimum)
-    warnings = [*found.notes]
+    findings = [*found.findings]
     if not minimum.converged:
-        warnings.append(
-            f"the solver did not converge in {minimum.iterations} iterations: not to be used"
+        text = f"the solver did not converge in {minimum.iterations} iterations"
+        findings.append(
+            Finding(Code.NOT_CONVERGED, f"{text}: do not use the result", severity="error")
         )
     for label, count in problem.uncovered.items():
-        warnings.append(f"{label}: {count} measurements at times without IMU data were not used")
-    warnings += consistency_warnings(estimates, residuals)
-    warnings += mostly_rejected(residuals, rejected)
-    warnings += _unobservable(trial, problem, estimates, evaluation.motions)
+        text = f"{count} measurements at times without IMU data were not used"
+        findings.append(Finding(Code.UNUSED, text, sensor=label))
+    findings += consistency_findings(estimates, residuals)
+    findings += mostly_rejected(residuals, rejected)
+    findings += _unobservable(trial, problem, estimates, evaluation.motions)
     return Solution(
         trial=trial.name,
         solver="batch",
@@ -73,7 +76,7 @@ def summarise(trial: Trial, found: SolvedProblem, *, rate_hz: float) -> Solution
         covariance=covariance,
         trajectory=trajectory,
         residuals=residuals,
-        warnings=tuple(warnings),
+        findings=tuple(findings),
         rejected=rejected,
     )
 
@@ -116,7 +119,7 @@ def _subset(motion: Motion, used: np.ndarray) -> Motion:
 
 def _unobservable(
     trial: Trial, problem: Problem, estimates: Sequence[Estimate], motions: Sequence[Motion]
-) -> list[str]:
+) -> list[Finding]:
     """Say which components the data did not determine, and why."""
     by_name = {p.name: aid for aid in trial.aids for p in aid.parameters()}
     seen = {
@@ -127,13 +130,14 @@ def _unobservable(
         for name in observation.parameters
     }
     duration = float(problem.chain.segments.duration.sum())
-    out = []
+    out: list[Finding] = []
     calibrated = {p.name: p.joint for p in problem.all_parameters if p.joint is not None}
     kept = [n for e in estimates if e.name in calibrated and not e.observable.all()
             for n in np.array(e.component_names)[~e.observable]]  # fmt: skip
     if kept:
         source = next(iter(calibrated.values())).source
-        out.append(f"{', '.join(kept)}: as in {source}; this trial adds little or nothing to that")
+        text = f"{', '.join(kept)}: as in {source}; this trial adds little or nothing to that"
+        out.append(Finding(Code.PRIOR_KEPT, text, sensor="DVL"))
 
     def why(name: str, component: int) -> str:
         if name in by_name:

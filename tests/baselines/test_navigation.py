@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from findings import of_code
 from kalman_trials import VARIED, angle_between
 from truth import scenario
 
@@ -15,6 +16,7 @@ from factorgraph_dvl.analysis.error_statistics import (
 from factorgraph_dvl.baselines import kalman
 from factorgraph_dvl.baselines.navigation import motion_at, navigate
 from factorgraph_dvl.geometry.rotations import log_so3, rotation_from_rph
+from factorgraph_dvl.sensors.finding import Code
 from factorgraph_dvl.simulation import simulate
 
 
@@ -61,7 +63,8 @@ def test_navigation_is_honest():
 def test_after_a_gap_the_filter_starts_again():
     trial = simulate(scenario(imu={"gaps_s": [[25.0, 40.0]]}))
     solution = kalman(trial)
-    assert "starts again at 40" in " ".join(solution.warnings)
+    (text,) = of_code(solution.findings, Code.FILTER_RESTARTED)
+    assert "starts again at 40" in text
     assert angle_between(solution, [2, 2, 30]) < 0.01
     assert not np.any((solution.trajectory.time > 25.01) & (solution.trajectory.time < 39.9))
 

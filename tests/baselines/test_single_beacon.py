@@ -6,12 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from findings import of_code
 from planar import STRAIGHT, error_of, trial
 
 from factorgraph_dvl.baselines.single_beacon import filter_planar
 from factorgraph_dvl.cli import main
 from factorgraph_dvl.errors import DataError
 from factorgraph_dvl.io.planar_folder import save_planar_trial
+from factorgraph_dvl.sensors.finding import Code
 from factorgraph_dvl.solution import Residuals, contradictions
 from factorgraph_dvl.trial import InitialPosition
 
@@ -55,7 +57,7 @@ def test_a_filter_that_went_to_a_mirror_image_has_not_converged(tmp_path, capsys
     for method in ("4sv-2ob", "4sv-3ob"):
         solution, _ = filter_planar(t, method)
         assert not solution.converged
-        assert any("mirror image" in w for w in solution.warnings)
+        assert of_code(solution.findings, Code.FILTER_CONTRADICTED)
     save_planar_trial(t, tmp_path / "t")
     with pytest.raises(SystemExit) as exit_info:
         main(["kalman", str(tmp_path / "t"), "--out", str(tmp_path / "k"), "--no-figures"])
@@ -69,7 +71,8 @@ def test_a_filter_whose_innovations_contradict_it_has_not_converged():
     echoes = trial(5, trial=start, beacons={"multipath": 0.2})
     solution, _ = filter_planar(echoes, "4sv-3ob")
     assert not solution.converged
-    assert any(w.startswith("Beacon range: over the last half") for w in solution.warnings)
+    (text,) = of_code(solution.findings, Code.FILTER_CONTRADICTED)
+    assert text.startswith("Beacon range: ")
 
 
 def test_a_few_large_innovations_are_chance():

@@ -14,8 +14,8 @@ from factorgraph_dvl.cli import main
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.io.calibration_file import load_calibration
 from factorgraph_dvl.io.planar_folder import save_planar_trial
-from factorgraph_dvl.quality.finding import Finding
 from factorgraph_dvl.quality.survey import survey
+from factorgraph_dvl.sensors.finding import Finding
 from factorgraph_dvl.simulation import simulate
 
 

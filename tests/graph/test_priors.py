@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from builders import build_trial, edit, write_trial
 from calibrations import ALPHA_DEG, calibration
+from findings import of_code
 from jacobians import differentiate
 from problems import SHORT, problem_of
 from truth import TURNING, scenario
@@ -21,6 +22,7 @@ from factorgraph_dvl.errors import ConfigError, DataError
 from factorgraph_dvl.geometry.rotations import exp_so3
 from factorgraph_dvl.io.calibration_file import encode_calibration
 from factorgraph_dvl.io.trial_folder import calibrated_by, load_trial, save_trial
+from factorgraph_dvl.sensors.finding import Code
 from factorgraph_dvl.sensors.parameters import JointPrior
 from factorgraph_dvl.simulation import simulate
 from factorgraph_dvl.solution import Calibration
@@ -109,9 +111,11 @@ def test_what_a_short_trial_cannot_refine_is_kept():
     assert solution.converged
     misalignment = solution.estimate("misalignment_deg")
     assert (misalignment.std <= misalignment.prior_std * (1 + 1e-6)).all()
-    (note,) = [w for w in solution.warnings if "before.json" in w]
-    assert "lever_arm_z_m" in note
-    assert not any("not observable: the velocity" in w for w in solution.warnings)
+    (text,) = of_code(solution.findings, Code.PRIOR_KEPT)
+    assert "before.json" in text
+    assert "lever_arm_z_m" in text
+    unseen = [f.parameter for f in solution.findings if f.code == Code.NOT_OBSERVABLE]
+    assert "misalignment_deg" not in unseen
     # Biases of the IMU are those of the day.
     assert solution.estimate("gyro_bias_deg_h").prior_value == pytest.approx(np.zeros(3))
 
@@ -122,7 +126,9 @@ def test_kalman_takes_values_and_standard_deviations():
     solution, _ = calibrate(with_prior(trial, found))
     estimate = solution.estimate("misalignment_deg")
     np.testing.assert_allclose(estimate.prior_std, [0.1, 0.2, 0.3])
-    assert any("no correlations" in w for w in solution.warnings)
+    assert any(
+        "no correlations" in text for text in of_code(solution.findings, Code.METHOD_LIMITS)
+    )
 
 
 def write_calibrated(folder, found, key="calibration: ../before.json"):

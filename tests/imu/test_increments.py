@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from findings import of_code
 from scipy.spatial.transform import Rotation
 
 from factorgraph_dvl.errors import DataError
@@ -11,6 +12,7 @@ from factorgraph_dvl.geometry.rotations import exp_so3, log_so3
 from factorgraph_dvl.geometry.units import DEG, HOUR
 from factorgraph_dvl.geometry.vectors import rotate
 from factorgraph_dvl.imu.increments import increments
+from factorgraph_dvl.sensors.finding import Code
 from factorgraph_dvl.sensors.imu import Imu, ImuSettings
 
 GRAVITY = np.array([0.0, 0.0, -9.8])
@@ -103,8 +105,8 @@ def errors_over(inc):
 @pytest.mark.parametrize(("hertz", "drift"), [(50, 0.015), (100, 3e-4), (200, 5e-6)])
 def test_coning_and_sculling_vanish(sampling, hertz, drift):
     imu = record(np.arange(30 * hertz + 1) / hertz, sampling)
-    inc, notes = increments(imu)
-    assert notes == ()
+    inc, findings = increments(imu)
+    assert findings == ()
     turned, drifted, length = errors_over(inc)
     # Measured at 100 Hz: 1.6e-4 deg/h; it falls with the sixth power of the interval, as
     # the error of polynomials through five or six samples does.
@@ -126,8 +128,8 @@ def test_irregular_samples(sampling, drift):
     rng = np.random.default_rng(0)
     edges = np.arange(3001) / 100.0
     edges[1:-1] += rng.uniform(-0.003, 0.003, 2999)
-    inc, notes = increments(record(edges, sampling))
-    assert notes == ()
+    inc, findings = increments(record(edges, sampling))
+    assert findings == ()
     assert np.all(inc.open_sigma == 0.0)
     turned, drifted, length = errors_over(inc)
     assert np.abs(turned).max() / length / DEG_H < drift
@@ -215,12 +217,11 @@ def test_the_rate_is_continuous_over_the_edges(sampling):
 @pytest.mark.parametrize("lost", [[1000], [1000, 1001], [1000, 1001, 1002]])
 def test_a_few_lost_samples_are_interpolated(sampling, lost):
     imu = record(np.arange(2001) / 100.0, sampling)
-    inc, notes = increments(without(imu, [*lost, 1500]))
+    inc, findings = increments(without(imu, [*lost, 1500]))
     assert len(inc.arcs) == 1
     assert inc.dt.size == (2000 if sampling == "mean" else 1999)
-    (note,) = notes
-    assert note.startswith("imu: ")
-    assert f"{len(lost) + 1} lost samples in 2 places" in note
+    (text,) = of_code(findings, Code.LOST_SAMPLES)
+    assert f"{len(lost) + 1} lost samples in 2 places" in text
     first = lost[0] if sampling == "mean" else lost[0] - 1
     opened = np.flatnonzero(inc.open_sigma.any(axis=1))
     expected = [*range(first, first + len(lost)), 1500 if sampling == "mean" else 1499]
@@ -235,12 +236,12 @@ def test_a_few_lost_samples_are_interpolated(sampling, lost):
 @pytest.mark.parametrize("sampling", ["mean", "instantaneous"])
 def test_a_gap_breaks_the_chain_and_says_where(sampling):
     imu = record(np.arange(2001) / 100.0, sampling)
-    inc, notes = increments(without(imu, range(1000, 1004)))
+    inc, findings = increments(without(imu, range(1000, 1004)))
     assert len(inc.arcs) == 2
-    (note,) = notes
+    (text,) = of_code(findings, Code.IMU_GAP)
     # The last sample before is that at 10.00 s; the mean at 10.05 s begins at 10.04 s.
     length = 0.04 if sampling == "mean" else 0.05
-    assert note == f"imu: gap of {length:.3f} s at 10.000 s: the inertial chain breaks there"
+    assert text == f"IMU: gap of {length:.3f} s at 10.000 s: the inertial chain breaks there"
     index, _, covered = inc.locate(np.array([9.995, 10.02, 10.06, 19.99, 20.5]))
     assert covered.tolist() == [True, False, True, True, False]
     assert inc.arc_of[index].tolist() == [0, 0, 1, 1, 1]
@@ -252,10 +253,11 @@ def test_a_gap_breaks_the_chain_and_says_where(sampling):
 
 def test_samples_between_two_gaps_are_dropped_and_said_so():
     imu = record(np.arange(2001) / 100.0)
-    inc, notes = increments(without(imu, [*range(500, 600), *range(605, 700)]))
+    inc, findings = increments(without(imu, [*range(500, 600), *range(605, 700)]))
     assert len(inc.arcs) == 2
-    assert notes[0] == ("imu: 5 samples at 6.010 s stand alone between gaps and were not used")
-    assert "at 5.000 s" in notes[1]
+    assert [f.code for f in findings] == [Code.UNUSED, Code.IMU_GAP]
+    assert findings[0].text.startswith("5 samples at 6.010 s")
+    assert "at 5.000 s" in findings[1].text
 
 
 def test_records_that_are_too_short_are_refused():

@@ -32,7 +32,17 @@ def test_the_files_are_those_of_the_format(tmp_path: Path) -> None:
     assert content["converged"] is True
     assert content["iterations"] == 5
     assert content["cost"] == 123.456
-    assert content["warnings"] == ["misalignment_z_deg was not observable"]
+    text = "misalignment_z_deg was not observable"
+    assert content["warnings"] == [text]
+    assert content["findings"] == [
+        {
+            "code": "not_observable",
+            "severity": "warning",
+            "sensor": "",
+            "parameter": "misalignment_deg",
+            "text": text,
+        }
+    ]
     assert list(content["parameters"]) == ["misalignment_deg", "scale_error"]
     scale = content["parameters"]["scale_error"]
     assert scale["value"] == [0.00512345678901234]
@@ -69,7 +79,7 @@ def test_a_saved_solution_loads_as_it_was(tmp_path: Path) -> None:
     solution = build_solution()
     save_solution(solution, tmp_path / "s")
     loaded = load_solution(str(tmp_path / "s"))
-    for name in ("trial", "solver", "body_axes", "converged", "iterations", "cost", "warnings"):
+    for name in ("trial", "solver", "body_axes", "converged", "iterations", "cost", "findings"):
         assert getattr(loaded, name) == getattr(solution, name)
     assert loaded.order == solution.order
     for one, other in zip(solution.estimates, loaded.estimates, strict=True):

@@ -13,6 +13,7 @@ from factorgraph_dvl.cli import main
 from factorgraph_dvl.io.planar_folder import save_planar_trial
 from factorgraph_dvl.quality.plausibility_planar import planar_findings
 from factorgraph_dvl.quality.survey_planar import survey_planar
+from factorgraph_dvl.sensors.finding import Code
 from factorgraph_dvl.simulation import parse_scenario, simulate_planar
 
 
@@ -34,16 +35,16 @@ def test_implausible_records_are_named():
         (replace(t, depth=replace(t.depth, depth=-t.depth.depth)), "Depth", "positive down"),
         (above, "Beacon", "B1 is 80 m above the sea surface"),
     ):
-        ((found, text),) = planar_findings(wrong)
-        assert found == label
-        assert says in text
+        (found,) = planar_findings(wrong)
+        assert found.sensor == label
+        assert says in found.text
 
 
 def test_a_gap_is_no_secret():
     t = trial()
-    ((label, text),) = planar_findings(replace(t, heading=without(t.heading, 140, 180)))
-    assert label == "Heading"
-    assert text.startswith("1 gap from 140 to 180 s")
+    (found,) = planar_findings(replace(t, heading=without(t.heading, 140, 180)))
+    assert (found.sensor, found.code) == ("Heading", Code.GAPS)
+    assert found.text.startswith("1 gap from 140 to 180 s")
 
 
 def test_inspect_knows_planar_trials(tmp_path, capsys):
@@ -57,5 +58,4 @@ def test_inspect_knows_planar_trials(tmp_path, capsys):
         assert text in out
     late = replace(t, beacons=replace(t.beacons, time=t.beacons.time + 1e5))
     (finding,) = survey_planar(late).problems
-    assert finding.severity == "error"
-    assert "do not overlap" in finding.text
+    assert (finding.severity, finding.code) == ("error", Code.NO_OVERLAP)

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from findings import of_code
 from planar import STRAIGHT, error_of, trial, truth
 
 from factorgraph_dvl.ranging.planar_solution import solve_planar
+from factorgraph_dvl.sensors.finding import Code
 
 
 def test_a_straight_run_leaves_both_mirror_images_and_admits_to_it():
@@ -16,7 +18,7 @@ def test_a_straight_run_leaves_both_mirror_images_and_admits_to_it():
     assert len(living) == 2
     assert sum(h.weight for h in living) == pytest.approx(1.0)
     assert living[1].weight > 0.02
-    assert any("ambiguous" in w for w in solution.warnings)
+    assert of_code(solution.findings, Code.AMBIGUOUS)
     end = truth(t, np.array([t.reference.time[-1]]))[0]
     ends = [t.frame().position(*h.trajectory.geodetic[-1])[:2] for h in living]
     near = min(ends, key=lambda e: np.hypot(*(e - end)))
@@ -34,5 +36,5 @@ def test_after_a_turn_by_30_degrees_the_wrong_one_is_dead():
     first, second = solution.hypotheses[:2]
     assert first.died is None
     assert 150.0 < second.died < 175.0
-    assert not any("ambiguous" in w for w in solution.warnings)
+    assert not of_code(solution.findings, Code.AMBIGUOUS)
     assert np.hypot(*error_of(t, solution).T).max() < 15.0

@@ -100,7 +100,7 @@ def test_more_than_a_third_of_echoes_is_doubtful():
         )
 
     assert not mostly_rejected(some(80), some(20))
-    assert "40 of 100 were rejected" in mostly_rejected(some(60), some(40))[0]
+    assert "40 of 100 were rejected" in mostly_rejected(some(60), some(40))[0].text
 
 
 def test_hypotheses_are_written(tmp_path, capsys):

@@ -8,6 +8,7 @@ import numpy as np
 
 from factorgraph_dvl.replay.outages import Outages
 from factorgraph_dvl.replay.update import Innovations
+from factorgraph_dvl.sensors.finding import Code, Finding
 
 
 def test_outages_is_that_of_arrivals():
@@ -16,14 +17,16 @@ def test_outages_is_that_of_arrivals():
 
     outages = Outages()
     # As late as this receiver is: it is not silent.
-    assert not [m for t in range(20) for m in outages.messages(t + 8.0, heard(float(t)))]
-    assert outages.messages(34.0, []) == [
+    assert not [m for t in range(20) for m in outages.findings(t + 8.0, heard(float(t)))]
+    assert [*map(str, outages.findings(34.0, []))] == [
         (
             "GNSS: no measurements since 19.0 s; the estimate continues without, and its "
             "standard deviations grow"
         )
     ]
-    assert outages.messages(35.0, heard(20.0)) == ["GNSS: back after 8.0 s"]
+    assert outages.findings(35.0, heard(20.0)) == [
+        Finding(Code.HEARD_AGAIN, "back after 8.0 s", "GNSS")
+    ]
 
 
 def test_a_missed_ping_is_no_outages():
@@ -33,8 +36,9 @@ def test_a_missed_ping_is_no_outages():
     for now in range(61):
         arrived = now % 5 == 0 and now not in (20, 25)
         each = [replace(heard, time=np.array([float(now)]))] if arrived and now < 40 else []
-        said += outages.messages(float(now), each)
-    assert said == [
+        said += outages.findings(float(now), each)
+    assert [f.code for f in said] == [Code.SILENT]
+    assert [*map(str, said)] == [
         (
             "range: no measurements since 35.0 s; the estimate continues without, and its "
             "standard deviations grow"

@@ -9,6 +9,7 @@ import numpy as np
 from factorgraph_dvl.replay.calibration import CalibrationEstimate
 from factorgraph_dvl.replay.record import Recorder
 from factorgraph_dvl.replay.update import Innovations, Update
+from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.solution import Estimate, Trajectory
 
 
@@ -17,6 +18,10 @@ def trajectory(time):
     vector = time[:, None] + np.arange(3.0)
     matrix = time[:, None, None] + np.arange(9.0).reshape(3, 3)
     return Trajectory(time, vector, vector + 1, vector + 2, matrix, matrix + 1, matrix + 2)
+
+
+def note(time):
+    return Finding(Code.UNUSED, f"at {time}")
 
 
 def update(time, names, *, epochs, smoothed=None, used=True):
@@ -32,7 +37,7 @@ def update(time, names, *, epochs, smoothed=None, used=True):
     )  # fmt: skip
     return Update(
         time, 0.01, trajectory([time]), trajectory(epochs), calibration, smoothed,
-        (innovation,), (f"at {time}",), False, (),
+        (innovation,), (note(time),), False, (),
     )  # fmt: skip
 
 
@@ -47,7 +52,7 @@ def test_the_record_is_what_the_updates_were():
     np.testing.assert_array_equal(record.time, [1.0, 2.0, 3.0])
     np.testing.assert_array_equal(record.values, [[np.nan, 1.0], [np.nan, 2.0], [3.0, 3.0]])
     np.testing.assert_array_equal(record.std[-1], [0.1, 0.1])
-    assert record.messages == ((1.0, "at 1.0"), (2.0, "at 2.0"), (3.0, "at 3.0"))
+    assert record.findings == tuple((time, note(time)) for time in (1.0, 2.0, 3.0))
     assert record.delay == 0.25
     for found, expected in (
         (recorder.trajectory(), trajectory([0.9, 1.0, 2.5])),

@@ -6,11 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from findings import of_code
 from scipy.spatial.transform import Rotation
 from truth import config
 
 from factorgraph_dvl.analysis.error_statistics import motion_errors
 from factorgraph_dvl.replay import Replay, replay
+from factorgraph_dvl.sensors.finding import Code
 from factorgraph_dvl.sensors.records import rows_of
 from factorgraph_dvl.sensors.star import Star
 from factorgraph_dvl.simulation import simulate
@@ -96,7 +98,7 @@ def test_star_vectors_one_epoch_at_a_time():
     seen = Star.from_vectors(
         star.settings, time, body.reshape(-1, 3), inertial.reshape(-1, 3), "star"
     )
-    assert rows_of(seen, [3, 4]).consistency_warnings() == ()
+    assert rows_of(seen, [3, 4]).findings() == ()
     early = trial.imu.time < 34.0
     trial = replace(trial, imu=rows_of(trial.imu, early), others=(seen,))
     solution, _ = replay(trial, rate_hz=1.0)
@@ -119,7 +121,7 @@ def test_a_bias_that_walks_is_reported_as_it_is_at_the_end():
     assert np.all(np.abs(e.value - last) < 0.3 * e.std)
     # What is known of the mean is not what is known of the end.
     assert np.all(e.std > 1.2 * solve(trial).estimate("gyro_bias_deg_h").std)
-    assert any("walks" in w for w in solution.warnings)
+    assert of_code(solution.findings, Code.MEAN_OR_LAST)
 
 
 def test_sensors_that_were_never_announced_are_refused_by_name():
@@ -142,10 +144,10 @@ def test_a_beacon_bounds_a_dive_and_its_echoes_are_left_out():
     for aid in trial.aids:
         session.add(aid)
     updates = session.add_imu(trial.imu.time, trial.imu.gyro, trial.imu.accel) + session.finish()
-    said = [text for u in updates for text in u.messages if "Beacon" in text]
+    said = [str(f) for u in updates for f in u.findings if f.sensor.startswith("Beacon")]
     # Neither a missed ping nor an echo is worth a word; the count at the end is.
     assert not said
-    assert any("Beacon B1 range" in text for text in session.counts())
+    assert any(f.sensor == "Beacon B1 range" for f in session.counts())
     batch = solve(trial)
     end = updates[-1].state
     apart = trial.frame().position(*end.geodetic.T) - trial.frame().position(
@@ -188,8 +190,9 @@ def test_no_start_while_a_mirror_image_fits_the_ranges():
     assert not session.add_imu(trial.imu.time, trial.imu.gyro, trial.imu.accel)
     assert not session.started
     # Both tracks are one at first, of a position that is hardly known.
-    assert any("the position is known to" in text for text in session.messages)
-    assert any("2 trajectories fit the ranges" in text for text in session.messages)
+    waits = of_code(session.findings, Code.NOT_STARTED)
+    assert any("the position is known to" in text for text in waits)
+    assert any("2 trajectories fit the ranges" in text for text in waits)
 
 
 def test_a_beacon_out_of_reach_is_no_hindrance():

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from findings import of_code
 from rich.console import Console
 from truth import scenario
 
@@ -16,6 +17,7 @@ from factorgraph_dvl.errors import ConfigError, DataError, SolveError
 from factorgraph_dvl.io.tables import read_table
 from factorgraph_dvl.replay import Replay, replay
 from factorgraph_dvl.report.terminal.live import live_view
+from factorgraph_dvl.sensors.finding import Code
 from factorgraph_dvl.sensors.records import rows_of
 from factorgraph_dvl.simulation import simulate
 from factorgraph_dvl.solvers.batch import solved_problem
@@ -114,7 +116,7 @@ def test_what_comes_twice_counts_once(trial):
     b = feed(twice, trial, 36.0, 40.0)
     ours, theirs = a[-1].calibration.covariance, b[-1].calibration.covariance
     np.testing.assert_allclose(ours, theirs, rtol=1e-9)
-    assert any("came twice" in line for line in twice.counts())
+    assert any("came twice" in f.text for f in twice.counts())
 
 
 def test_nothing_is_known_before_it_was_measured(trial):
@@ -170,7 +172,7 @@ def test_late_measurements_correct_and_later_ones_are_counted(trial):
     other = replace(trial.dvl, velocity=trial.dvl.velocity + 1e-9)
     late.add(rows_of(other, slice(0, 3)))
     feed(late, trial, 80.0, 82.0)
-    assert any("DVL: 3 measurements came too late" in line for line in late.counts())
+    assert any("DVL: 3 measurements came too late" in str(f) for f in late.counts())
 
 
 def lost(trial, **changes):
@@ -186,9 +188,8 @@ def test_gnss_and_bottom_lock_may_fail(trial):
         aid = without(getattr(trial, section), 70.0, 110.0)
         solution, _ = replay(replace(trial, **{section: aid}), rate_hz=1.0)
         within(solution, trial)
-        text = "\n".join(solution.warnings)
-        assert f"{label}: no measurements since" in text
-        assert f"{label}: back after" in text
+        noticed = [f.code for f in solution.findings if f.sensor == label]
+        assert noticed == [Code.SILENT, Code.HEARD_AGAIN]
 
 
 def test_a_gap_of_the_imu_is_survived(trial):
@@ -199,7 +200,8 @@ def test_a_gap_of_the_imu_is_survived(trial):
     )
     solution, record = replay(short, rate_hz=1.0)
     within(solution, trial)
-    assert any("gap of 30.0" in w for w in solution.warnings)
+    (text,) = of_code(solution.findings, Code.IMU_GAP)
+    assert "gap of 30.0" in text
     before = np.searchsorted(record.time, 70.0) - 1
     # What was known of the calibration before the gap is known after it.
     after = before + 1
@@ -222,7 +224,7 @@ def test_a_sensor_may_stay_silent_after_a_gap_of_the_imu(trial):
 def test_a_clock_that_jumps_is_not_believed(trial):
     time = np.where(trial.dvl.time > 60.0, trial.dvl.time + 1.37, trial.dvl.time)
     solution, record = replay(replace(trial, dvl=replace(trial.dvl, time=time)), rate_hz=1.0)
-    assert any("DVL velocity" in w and "jumped" in w for w in solution.warnings)
+    assert ("DVL velocity", Code.CONTRADICTS) in {(f.sensor, f.code) for f in solution.findings}
     assert not solution.converged
     good = ~record.inconsistent
     assert good.sum() > 20
@@ -251,7 +253,8 @@ def test_a_clock_of_a_sensor_that_jumps_back_is_not_believed(trial):
 def test_a_clock_of_the_imu_that_jumps_ahead_is_no_gap(trial, run):
     time = np.where(trial.imu.time > 62.0, trial.imu.time + 1.37, trial.imu.time)
     solution, record = replay(replace(trial, imu=replace(trial.imu, time=time)), rate_hz=1.0)
-    assert any("clock jumped ahead by 1.37" in w for w in solution.warnings)
+    (text,) = of_code(solution.findings, Code.CLOCK_JUMP)
+    assert "jumped ahead by 1.37" in text
     assert solution.converged
     within(solution, trial)
     assert record.time[-1] == pytest.approx(run[1].time[-1], abs=1e-6)
@@ -270,7 +273,8 @@ def test_a_clock_of_the_imu_alone_that_jumps_back_is_set_right(trial):
         inside = (trial.imu.time >= a) & (trial.imu.time < a + 1.0)
         i = trial.imu
         updates += session.add_imu(i.time[inside] - 5.0, i.gyro[inside], i.accel[inside])
-    assert any("jumped back by 5.0" in m for u in updates for m in u.messages)
+    (text,) = (t for u in updates for t in of_code(u.findings, Code.CLOCK_JUMP))
+    assert "jumped back by 5.0" in text
     motion = motion_errors(updates[-1].state, trial.reference)
     assert updates[-1].time > 77.0
     for v in (motion.position, motion.velocity, motion.attitude):
@@ -286,7 +290,7 @@ def test_a_clock_that_jumps_back_is_set_right(trial):
         aid = getattr(trial, section)
         back = replace(back, **{section: replace(aid, time=aid.time - 50.0)})
     updates = feed(session, back, 10.0, 30.0)
-    assert any("jumped back" in m for u in updates for m in u.messages)
+    assert any(of_code(u.findings, Code.CLOCK_JUMP) for u in updates)
     assert updates[-1].time == pytest.approx(79.0, abs=1.1)
     motion = motion_errors(updates[-1].state, trial.reference)
     for v in (motion.position, motion.velocity, motion.attitude):
@@ -302,7 +306,7 @@ def test_what_a_straight_run_does_not_show_is_not_claimed():
     # Roll about the direction of the velocity, all along.
     column = solution.order.index("misalignment_y_deg")
     assert record.std[:, column].min() > 60.0
-    assert any("not observable" in w for w in solution.warnings)
+    assert of_code(solution.findings, Code.NOT_OBSERVABLE)
 
 
 def test_spurious_information_is_counted_at_whatever_rate_a_sensor_comes(trial):
@@ -384,12 +388,12 @@ def test_lost_samples_and_an_end_that_is_not_reached_are_said(trial, tmp_path, c
     assert not solution.converged
     assert solution.trajectory.time[-1] == pytest.approx(75.0, abs=0.11)
     shown = " ".join(capsys.readouterr().err.split())
-    for text in (
-        "3 lost samples in 1 places were interpolated",
-        "1 samples that were lost after the start were interpolated",
-        "the replay ended at 75.0",
+    for code, text in (
+        (Code.LOST_SAMPLES, "3 lost samples in 1 places were interpolated"),
+        (Code.LOST_SAMPLES, "1 samples that were lost after the start were interpolated"),
+        (Code.UNUSED, "the replay ended at 75.0"),
     ):
-        assert any(text in w for w in solution.warnings), text
+        assert any(text in w for w in of_code(solution.findings, code)), text
         assert text in shown, text
     assert "did not reach the end of the record" in shown
 

@@ -224,7 +224,12 @@ def test_files(tmp_path):
         ("beacons.csv", "beacon,", "buoy,", "missing column beacon"),
         ("trial.yaml", "B1:", "B 1:", "a name has letters"),
         ("trial.yaml", "range_std_m: 0.5", "range_std_m: 0", "range_std_m is 0"),
-        ("trial.yaml", "lat_deg: 36.002", "lat_deg: 136", "`lat_deg` must be -90 to 90 deg, not 136"),
+        (
+            "trial.yaml",
+            "lat_deg: 36.002",
+            "lat_deg: 136",
+            "`lat_deg` must be -90 to 90 deg, not 136",
+        ),
         ("trial.yaml", "positions:", "places:", "places"),
     ],
 )

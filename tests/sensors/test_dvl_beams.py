@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import yaml
 from beam_statistics import nees_of
+from findings import of_code
 from jacobians import check_jacobians, differentiate, random_motion
 from scipy.stats import chi2
 from truth import exact_motion, scenario
@@ -50,6 +51,7 @@ from factorgraph_dvl.sensors.beam_geometry import (
     velocities,
 )
 from factorgraph_dvl.sensors.dvl_beams import DvlBeams, DvlBeamsSettings
+from factorgraph_dvl.sensors.finding import Code
 from factorgraph_dvl.sensors.protocol import Motion
 from factorgraph_dvl.simulation import plan_motion, simulate
 from factorgraph_dvl.solvers.batch import solve
@@ -443,6 +445,10 @@ def test_noise_in_proportion_to_velocity_leaves_the_scales_alone():
     assert abs(np.mean(errors)) < 2.5 / np.sqrt(np.size(errors))
 
 
+def unseen(solution):
+    return of_code(solution.findings, Code.NOT_OBSERVABLE)
+
+
 def test_a_beam_that_was_never_received_is_named():
     trial = simulate(noisy(), 1)
     trial.beams.velocity[:, 2] = np.nan
@@ -450,11 +456,11 @@ def test_a_beam_that_was_never_received_is_named():
     seen = solution.estimate("beam_direction_b").observable
     assert seen.tolist() == [True] * 4 + [False] * 2 + [True] * 2
     said = "beam_direction_3x_deg, beam_direction_3y_deg not observable: beam 3 was never received"
-    assert any(w.startswith(said) for w in solution.warnings)
+    assert any(text.startswith(said) for text in unseen(solution))
     trial.beams.velocity[:, 0] = np.nan
     for i in (1, 3):
         said = f"beam_direction_{i}x_deg, beam_direction_{i}y_deg not observable: beam {i} was"
-        assert any(w.startswith(said) for w in solve(trial).warnings)
+        assert any(text.startswith(said) for text in unseen(solve(trial)))
 
 
 def test_each_beam_that_was_never_received_is_named(tmp_path):
@@ -463,8 +469,8 @@ def test_each_beam_that_was_never_received_is_named(tmp_path):
     solution = solve(trial)
     for beam in (2, 3, 4):
         said = f"beam_scale_error_{beam} not observable: beam {beam} was never received"
-        assert said in solution.warnings
-    arm = next(w for w in solution.warnings if w.startswith("lever_arm"))
+        assert said in unseen(solution)
+    arm = next(f.text for f in solution.findings if f.parameter == "lever_arm_m")
     assert arm.endswith("too few beams were ever received: 1")
     # Nothing says how beams agree of which there is one.
     drawn = {file.name for file in write_figures(trial, solution, tmp_path)}
@@ -559,7 +565,7 @@ def test_one_instrument_in_two_records_is_suspected(tmp_path):
     dvl = {"rate_hz": 5, "velocity_std_m_s": 0.005}
     claims = {"imu": {"gyro_bias_std_deg_h": 0.05, "accel_bias_std_ug": 100}}
     save_trial(simulate(noisy(dvl=dvl, trial=claims), 1), tmp_path / "same")
-    assert any("counts twice" in note for note in load_trial(tmp_path / "same").notes)
+    assert [f.code for f in load_trial(tmp_path / "same").notes] == [Code.COUNTED_TWICE]
     apart = dvl | {"phase_s": 0.07}
     save_trial(simulate(noisy(dvl=apart, trial=claims), 1), tmp_path / "apart")
     assert load_trial(tmp_path / "apart").notes == ()
@@ -576,7 +582,7 @@ def test_without_another_direction_of_motion_the_beams_are_not_observable():
     # Along x and the vertical nothing moves: of each beam only what the bow's way shows.
     assert not seen.observable[0::2].any()
     assert seen_turned.observable.all()
-    assert any("turntable" in w and "beam_direction_1x_deg" in w for w in alone.warnings)
+    assert any("turntable" in w and "beam_direction_1x_deg" in w for w in unseen(alone))
 
 
 def table_of(truth):

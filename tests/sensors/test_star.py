@@ -9,6 +9,7 @@ import erfa
 import numpy as np
 import pytest
 from builders import edit
+from findings import of_code
 from jacobians import check_jacobians, random_motion
 from msgspec.structs import replace as replace_settings
 from scipy.spatial.transform import Rotation
@@ -38,6 +39,7 @@ from factorgraph_dvl.io.solution_folder import load_solution
 from factorgraph_dvl.io.tables import read_table
 from factorgraph_dvl.io.trial_folder import load_trial, save_trial
 from factorgraph_dvl.quality.survey import survey
+from factorgraph_dvl.sensors.finding import Code
 from factorgraph_dvl.sensors.star import Star, StarAttitude, StarSettings
 from factorgraph_dvl.simulation import plan_motion, simulate
 from factorgraph_dvl.solvers.batch import solve
@@ -319,7 +321,7 @@ def test_a_vessel_at_rest_starts_at_any_heading(heading):
     assert solution.converged
     away = trajectory_errors(solution, trial.reference).attitude
     assert np.abs(away.error).max() < 30.0 * ARCSEC
-    assert not any("heading" in warning for warning in solution.warnings)
+    assert not of_code(solution.findings, Code.HEADING_UNKNOWN)
 
 
 def test_an_unknown_mounting_is_found_from_the_sea():
@@ -344,7 +346,10 @@ def test_a_mounting_that_nothing_tells_is_not_claimed():
     found = solution.estimate("star_mounting_deg")
     # Gravity tells two components; heading and mounting about the vertical are one.
     assert not found.observable.all()
-    assert any("star_mounting" in w and "turns about two axes" in w for w in solution.warnings)
+    assert any(
+        "star_mounting" in w and "turns about two axes" in w
+        for w in of_code(solution.findings, Code.NOT_OBSERVABLE)
+    )
     assert np.abs((found.value - [1, -2, 1.5]) / found.std).max() < 4.0
 
 
@@ -464,7 +469,10 @@ def test_errors_grow_as_the_filter_says():
 def test_the_filter_says_what_it_does_not_estimate():
     trial = simulate(config("star", **SHORT, trial={"star": {"mounting_std_deg": [1, 1, 1]}}), 1)
     solution, history = calibrate(trial, "star")
-    assert any("does not estimate star_mounting_deg" in w for w in solution.warnings)
+    assert any(
+        f.code == Code.METHOD_LIMITS and f.parameter == "star_mounting_deg"
+        for f in solution.findings
+    )
     assert history.names == tuple(f"gyro_bias_{a}_deg_h" for a in "xyz")
     assert history.time[[0, -1]].tolist() == [0.5, 50.0]
     assert np.all(np.diff(history.std[5:], axis=0) < 0.0)
@@ -619,7 +627,8 @@ def test_good_attitudes_are_not_suspected(name, changes):
     trial = simulate(config(name, **(SHORT if name == "star" else {}), **changes), 0)
     found = survey(trial)
     assert not found.problems
-    assert any("its turns agree" in f.text for f in found.findings)
+    (convention,) = (f for f in found.findings if f.code == Code.STAR_CONVENTION)
+    assert convention.severity == "ok"
     star = star_of(trial)
     inverse = replace(star, quaternion=star.quaternion * [1, -1, -1, -1])
     problems = survey(replace(trial, others=(inverse,))).problems
@@ -641,8 +650,8 @@ def test_mixed_up_stars_are_noticed():
 def test_a_wrong_epoch_is_noticed(floating):
     late = replace(floating, epoch="2018-12-01T06:30:00Z")
     assert any("`epoch`" in f.text for f in survey(late).problems)
-    assert any("`epoch`" in w for w in calibrate(late, "star")[0].warnings)
-    assert not any("`epoch`" in w for w in calibrate(floating, "star")[0].warnings)
+    assert of_code(calibrate(late, "star")[0].findings, Code.STAR_VERTICAL)
+    assert not of_code(calibrate(floating, "star")[0].findings, Code.STAR_VERTICAL)
 
 
 def test_an_unknown_mounting_is_not_for_the_filter(tmp_path, capsys):
@@ -699,7 +708,7 @@ def test_a_star_that_does_not_fit_its_catalogue_is_named(off_arcsec, severity):
     trial = simulate(config("star", **SHORT, star={"stars": bright}), 0)
     star = star_of(trial)
     assert star.misfit == pytest.approx(1.0, abs=0.1)
-    assert star.consistency_warnings() == ()
+    assert star.findings() == ()
     v = star.vectors
     moved = v.inertial.copy()
     moved[2::5] = Rotation.from_rotvec([0, off_arcsec * ARCSEC, 0]).apply(moved[2::5])
@@ -707,7 +716,7 @@ def test_a_star_that_does_not_fit_its_catalogue_is_named(off_arcsec, severity):
     trial = replace(trial, others=(wrong,))
     expected = "not to be used" if severity == "error" else "too small"
     for solution in (solve(trial), calibrate(trial, "star")[0]):
-        (said,) = (w for w in solution.warnings if "catalogue" in w)
+        (said,) = of_code(solution.findings, Code.STAR_CATALOGUE)
         assert "star.csv line 4" in said
         assert expected in said
     (problem,) = survey(trial).problems
@@ -721,7 +730,7 @@ def test_a_few_stars_may_scatter_more():
     body = catalogue + rng.normal(0.0, 2.0 * 5.0 * ARCSEC, catalogue.shape)
     # Twice as much, but of one degree of freedom.
     star = Star.from_vectors(StarSettings(), np.zeros(2), body, catalogue, "star.csv")
-    assert star.consistency_warnings() == ()
+    assert star.findings() == ()
 
 
 # Monte Carlo

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
+from findings import of_code
 from problems import SHORT
 from truth import scenario
 
 from factorgraph_dvl.graph.problem import Problem
+from factorgraph_dvl.sensors.finding import Code
 from factorgraph_dvl.simulation import simulate
 from factorgraph_dvl.solvers.batch import solve
 
@@ -19,7 +21,8 @@ def unsettled(monkeypatch, name, answer):
 def test_what_never_settles_is_named(monkeypatch):
     solution = unsettled(monkeypatch, "needs_reweighting", lambda *_: True)
     assert not solution.converged
-    assert any("the weights of measurements still changed" in w for w in solution.warnings)
+    text, *_ = of_code(solution.findings, Code.NOT_CONVERGED)
+    assert "the weights of measurements still changed" in text
 
 
 def test_a_measurement_at_its_gate_is_used_and_named(monkeypatch):
@@ -28,7 +31,8 @@ def test_a_measurement_at_its_gate_is_used_and_named(monkeypatch):
 
     solution = unsettled(monkeypatch, "outliers", outliers)
     assert solution.converged
-    assert any(w.startswith("DVL velocity: 1 at the gate") for w in solution.warnings)
+    (text,) = of_code(solution.findings, Code.AT_THE_GATE)
+    assert text.startswith("DVL velocity: 1 ")
     assert not solution.rejected
 
 
@@ -39,4 +43,5 @@ def test_outliers_that_never_repeat_do_not_settle(monkeypatch):
 
     solution = unsettled(monkeypatch, "outliers", outliers)
     assert not solution.converged
-    assert any("which measurements are echoes still changed" in w for w in solution.warnings)
+    text, *_ = of_code(solution.findings, Code.NOT_CONVERGED)
+    assert "which measurements are echoes still changed" in text

@@ -21,6 +21,7 @@ from factorgraph_dvl.sensors.dvl import (
     SCALE_ERROR,
     TIME_OFFSET,
 )
+from factorgraph_dvl.sensors.finding import Code
 from factorgraph_dvl.solution import Estimate, Solution, Trajectory
 
 # Parameters of the DVL's measurement equation: if a result omits one, its effect biases the
@@ -68,8 +69,8 @@ def explain(
     out += _parametrisation(components)
     for side, own, _ in sides:
         # Components that are not observable are not compared.
-        relevant = (w for w in own.warnings if "not observable" not in w)
-        out += [f"{side} has the warning: {warning}." for warning in relevant]
+        relevant = (f for f in own.findings if f.code != Code.NOT_OBSERVABLE)
+        out += [f"{side} has the warning: {finding}." for finding in relevant]
     return tuple(out) or (
         "Nothing in the two results explains the difference: check the data, the stated noise and "
         "the residuals.",

@@ -6,6 +6,7 @@ import numpy as np
 from comparisons import estimate, lever_arm, result
 
 from factorgraph_dvl.analysis.comparison.crosscheck import crosscheck
+from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.solution import Solution, Trajectory
 
 
@@ -33,7 +34,7 @@ def test_explanations_come_from_the_results() -> None:
         crosscheck(a, result(sure), efficient="A").notes
     )
     assert "B has the warning: residuals too large." in told(
-        result(off, warnings=("residuals too large",))
+        result(off, findings=(Finding(Code.LARGE_RESIDUALS, "residuals too large"),))
     )
     bias = estimate("dvl_bias_m_s", [0.1, 0.0, 0.0], [0.01] * 3)
     assert "A does not estimate dvl_bias_m_s, which the other estimates" in told(result(off, bias))
