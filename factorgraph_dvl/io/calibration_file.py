@@ -141,7 +141,7 @@ def check_usable(calibration: Calibration, body_axes: BodyAxes, source: str) -> 
 
 def check_values(name: str, value: Array, source: str) -> None:
     """Raise DataError unless the values of a parameter are numbers that can be."""
-    if not np.isfinite(value).all():
+    if not (value.size and np.isfinite(value).all()):
         raise DataError(f"{name} holds no number", where=source, expected="finite values")
     if wrong := out_of_range(name, np.ravel(value).tolist()):
         raise DataError(wrong, where=source)

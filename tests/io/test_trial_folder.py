@@ -331,7 +331,10 @@ def test_files_without_a_table_are_errors(
     assert expected in str(caught.value)
 
 
-@pytest.mark.parametrize("text", ["{", '{"parameters": {"a": 1}}', "[]", "\xff"])
+EMPTY_TRUTH = '{"parameters": {"lever_arm_m": {"value": []}}}'
+
+
+@pytest.mark.parametrize("text", ["{", '{"parameters": {"a": 1}}', "[]", "\xff", EMPTY_TRUTH])
 def test_bad_truth_is_an_error(tmp_path: Path, text: str) -> None:
     path = write_trial(tmp_path)
     (path / "truth.json").write_text(text)
