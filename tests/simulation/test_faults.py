@@ -151,3 +151,13 @@ def test_errors_of_the_imu_by_hand(trial):
     assert out.imu.gyro[:, 2] == pytest.approx(gyro[:, 2] + 1e-4 * accel[:, 1])
     assert np.array_equal(out.imu.accel, accel)
     assert np.max(np.abs(one(trial, faults.saturated(accel_m_s2=9.0)).imu.accel)) == 9.0
+
+
+def test_gnss_wanders_by_the_stated_amounts():
+    trial = simulate(scenario(noise=False, manoeuvres=[{"straight_s": 1000}]))
+    out = one(trial, faults.correlated_gnss((2.0, 0.0, 0.0), (0.0, 0.3, 0.0), 10.0, 2.0))
+    moved = moved_m(out.gnss.geodetic, trial.gnss.geodetic)
+    assert np.sqrt(np.mean(moved**2)) == pytest.approx(2.0, rel=0.3)
+    change = out.gnss.velocity - trial.gnss.velocity
+    assert np.all(change[:, [0, 2]] == 0.0)
+    assert np.std(change[:, 1]) == pytest.approx(0.3, rel=0.2)

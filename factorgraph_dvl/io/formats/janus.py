@@ -71,11 +71,6 @@ def to_beams(velocity: Array, beam_angle: ArrayLike, convex: ArrayLike = True) -
     )
 
 
-def gimballed_pitch(pitch: Array, roll: Array) -> Array:
-    """Return the pitch (N,) that goes with roll, rad, of what a fixed tilt sensor measured."""
-    return np.arctan(np.tan(pitch) * np.cos(roll))
-
-
 def instrument_to_outer(
     coordinates: ArrayLike,
     roll: Array,

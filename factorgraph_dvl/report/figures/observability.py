@@ -126,7 +126,7 @@ def singular_value_figure(point_set: PointSet) -> Figure:
             ax.tick_params(labelbottom=False)
     handles = [
         *(Line2D([], [], ls="", marker="o", color=colours[k], label=k) for k in kinds),
-        Line2D([], [], ls="", marker="o", color=GREY, mfc="none", label="feigned by noise"),
+        Line2D([], [], ls="", marker="o", color=GREY, mfc="none", label="spurious, from noise"),
         Line2D([], [], ls="", marker="v", color=GREY, label=f"below {_FLOOR:g}"),
         Line2D([], [], color=GREY, lw=0.9, label="prior σ halved"),
     ]
