@@ -11,16 +11,22 @@ Severity = Literal["ok", "warning", "error"]
 
 
 class Code(StrEnum):
-    """Stable names of findings, each with what it means and what to do about it."""
+    """Stable names of findings: what each means, why it matters, and what to do about it.
+
+    `python tests/findings_page.py` writes them to docs/findings.md, in the groups of the
+    comments.
+    """
 
     meaning: str
+    why: str
     action: str
 
-    def __new__(cls, value: str, meaning: str, action: str) -> Self:
-        """Return a code with its meaning and action."""
+    def __new__(cls, value: str, meaning: str, why: str, action: str) -> Self:
+        """Return a code with its meaning, why it matters, and the action."""
         code = str.__new__(cls, value)
         code._value_ = value
         code.meaning = meaning
+        code.why = why
         code.action = action
         return code
 
@@ -28,264 +34,343 @@ class Code(StrEnum):
     TIME_UNIT = (
         "time_unit",
         "The samples are too far apart, or too close together, for an IMU.",
+        "Every rate, noise density and lag in the trial is per second: nothing can be solved.",
         "Write time_s in seconds.",
     )
     NO_OVERLAP = (
         "no_overlap",
         "A sensor measured nothing while the others did.",
+        "Nothing ties the sensor to the motion: it cannot be used.",
         "Write all time_s by one clock, in seconds.",
     )
     PARTIAL_OVERLAP = (
         "partial_overlap",
         "Record and IMU cover each other only in part; the rest is not used.",
+        "The calibration rests on less data than the files hold.",
         "Check the clocks, or record all sensors at once.",
     )
     GAPS = (
         "gaps",
         "A record has gaps.",
+        "Nothing is measured there: standard deviations grow, and turns in a gap are lost.",
         "Check the logger; of a planar trial keep straight on during a gap.",
     )
     CLOCK_RESTARTED = (
         "clock_restarted",
         "The IMU recorded a stretch by another clock than all other sensors; it is not used.",
+        "The true time of that stretch is unknown, and so is the motion in it.",
         "Write all of time_s by one clock.",
     )
     CLOCK_JUMP = (
         "clock_jump",
         "The clock of the IMU jumps.",
+        "The time that really passed is unknown: the inertial chain breaks there.",
         "Write all of time_s by one clock.",
     )
     IMU_GAP = (
         "imu_gap",
         "The IMU's record has a gap, which the inertial chain does not bridge.",
+        "Each part has biases in common but a motion of its own, known less well at its ends.",
         "Nothing, if the rest is long enough; else record anew.",
     )
     LOST_SAMPLES = (
         "lost_samples",
         "Few lost samples of the IMU were interpolated.",
+        "The motion in between is a guess, good while the gaps are few samples long.",
         "Nothing, if they are few.",
     )
     UNUSED = (
         "unused",
         "Measurements were not used.",
+        "The calibration rests on less data than the files hold.",
         "Check the clocks; the text says how many there are, and why.",
     )
     # What a record holds.
     NO_MEASUREMENT = (
         "no_measurement",
         "A record holds no measurement.",
+        "A sensor that measured nothing adds nothing: most often a conversion failed.",
         "Remove its section from trial.yaml, or correct the record.",
     )
     MISSING = (
         "missing",
         "More than half of the rows hold no measurement.",
+        "Parameters are known less well, and what is left may be the doubtful part.",
         "Check bottom lock, fixes and the conversion of the record.",
     )
     COUNTED_TWICE = (
         "counted_twice",
         "dvl and dvl_beams seem to be records of one instrument, whose noise counts twice.",
+        "Standard deviations come out too small, by up to the square root of two.",
         "Remove one of the two sections.",
     )
     # Units, signs and axes.
     FORCE_UNIT = (
         "force_unit",
         "The specific force is not about 9.8 m/s².",
+        "Velocity and attitude follow from the force: the solution would be wrong throughout.",
         "Convert it to m/s², with gravity.",
     )
     BODY_AXES = (
         "body_axes",
         "Gravity does not point where body_axes says.",
+        "Roll, pitch and all lever arms would be those of other axes.",
         "Correct body_axes, or the sign of the force.",
     )
     GYRO_UNIT = (
         "gyro_unit",
         "The angular rate does not turn the specific force as it should.",
+        "Attitude follows from the rate: the solution would be wrong throughout.",
         "Convert it to rad/s, in the axes of the force.",
     )
-    GYRO_FROZEN = ("gyro_frozen", "The angular rate is zero throughout.", "Correct the record.")
+    GYRO_FROZEN = (
+        "gyro_frozen",
+        "The angular rate is zero throughout.",
+        "Without rates there is neither attitude nor lever arm.",
+        "Correct the record.",
+    )
     ZERO_FIXES = (
         "zero_fixes",
         "Some fixes are at latitude and longitude 0.",
+        "A fix that was lost would draw the track into the Gulf of Guinea.",
         "Leave the cells of lost fixes empty.",
     )
     RADIANS = (
         "radians",
         "Latitude and longitude look like radians.",
+        "The track would be 57 times too short, and near latitude and longitude 0.",
         "Convert them to degrees.",
     )
     GNSS_VELOCITY = (
         "gnss_velocity",
         "GNSS velocities disagree with the differences of positions.",
+        "Heading, misalignment and scale error follow from this velocity.",
         "Correct unit, order or sign of the velocity.",
     )
     DVL_UNIT = (
         "dvl_unit",
         "The DVL's speed is far from that of the GNSS.",
+        "The unit would be taken for a scale error.",
         "Convert it to m/s.",
     )
-    DVL_FROZEN = ("dvl_frozen", "The DVL's velocity never changes.", "Correct the record.")
+    DVL_FROZEN = (
+        "dvl_frozen",
+        "The DVL's velocity never changes.",
+        "A frozen value is taken for a measurement, and looks most precise.",
+        "Correct the record.",
+    )
     DVL_STD = (
         "dvl_std",
         "The DVL's standard deviation is large for its speed.",
+        "The DVL hardly counts: its parameters stay near their priors.",
         "Correct velocity_std_m_s, or the columns std.",
     )
     DVL_SIGN = (
         "dvl_sign",
         "By its prior misalignment the vehicle moves astern.",
+        "The misalignment is searched for around the wrong direction.",
         "Invert the velocity of a PD0 record, or correct misalignment_deg.",
     )
     BEAMS_LOST = (
         "beams_lost",
         "A beam is lost at most pings.",
+        "The direction and scale of that beam rest on few pings.",
         "Check the transducer; its values are known less well.",
     )
     BEAMS_DISAGREE = (
         "beams_disagree",
         "Beams contradict each other by more than noise and priors explain.",
+        "A beam under another's number moves every parameter.",
         "Check their order, signs and directions.",
     )
     NO_EPOCH = (
         "no_epoch",
         "Stars tell the attitude only at a known time, and the trial has none.",
+        "The Earth turns by 15 degrees an hour under the stars.",
         "Give epoch, the UTC of time_s = 0.",
     )
     STAR_CATALOGUE = (
         "star_catalogue",
         "The angles between stars differ from those of the catalogue.",
+        "A wrong star makes an attitude that looks as good as a right one.",
         "Check identification and columns, or raise std_arcsec.",
     )
     STAR_VERTICAL = (
         "star_vertical",
         "The vertical by the stars is not that of the specific force.",
+        "A wrong time or mounting is taken for an attitude, and for gyro bias.",
         "Check epoch and mounting_deg.",
     )
     STAR_CONVENTION = (
         "star_convention",
         "The star tracker turns otherwise than the gyros.",
+        "An inverse or reordered quaternion contradicts the gyros at every turn.",
         "Write C_b^i as a quaternion with the scalar first; check mounting_deg.",
     )
     HEADING_UNIT = (
         "heading_unit",
         "The heading stays close to north, steadier than it should.",
+        "The dead-reckoned track would run north whatever the vehicle did.",
         "Convert it to degrees.",
     )
-    LOG_SIGN = ("log_sign", "The log's speed is astern.", "Write speed_m_s positive ahead.")
-    DEPTH_SIGN = ("depth_sign", "The depth is above the sea.", "Write depth_m positive down.")
+    LOG_SIGN = (
+        "log_sign",
+        "The log's speed is astern.",
+        "The dead-reckoned track would run backwards.",
+        "Write speed_m_s positive ahead.",
+    )
+    DEPTH_SIGN = (
+        "depth_sign",
+        "The depth is above the sea.",
+        "Heights, and with them slant ranges, would be mirrored at the surface.",
+        "Write depth_m positive down.",
+    )
     BEACON_HEIGHT = (
         "beacon_height",
         "A beacon is above the sea.",
+        "Horizontal distances follow from ranges and heights.",
         "Write height_m positive up; check depth.sea_surface_height_m.",
     )
     AT_REST = (
         "at_rest",
         "The vehicle rests, so that one beacon tells only a circle.",
+        "The trajectory is one of many that the ranges allow.",
         "Move, or add a beacon.",
     )
     # Where a solver starts.
     HEADING_UNKNOWN = (
         "heading_unknown",
         "The velocity changes too little to find the heading before solving.",
+        "The solver starts from a heading that may be far off.",
         "Change speed or course, or give `initial`.",
     )
     FEW_RANGES = (
         "few_ranges",
         "There are too few ranges to find a position from them.",
+        "The solver starts from a position that may be far off.",
         "Give initial.position, or stay in reach of the beacons for longer.",
     )
     NOT_STARTED = (
         "not_started",
         "The replay cannot start yet.",
+        "There is no estimate yet; the records so far are kept.",
         "Wait, manoeuvre, or give `initial`.",
     )
     # What a solver found.
     NOT_CONVERGED = (
         "not_converged",
         "The solver did not converge, so that its numbers are not to be used.",
+        "Values and standard deviations hold at a minimum of the cost only.",
         "Look at the other findings, units and priors first.",
     )
     NOT_OBSERVABLE = (
         "not_observable",
         "The data do not determine a parameter better than its prior.",
+        "Its value is the prior's, not one that was measured.",
         "Do the manoeuvres that the text names, or fix the parameter.",
     )
     PRIOR_KEPT = (
         "prior_kept",
         "The trial adds little to the calibration that it starts from.",
+        "The values are those of the earlier calibration: this trial does not confirm them.",
         "Nothing.",
     )
     AMBIGUOUS = (
         "ambiguous",
         "More than one answer fits the data; the standard deviations contain all of them.",
+        "The value that is given may be that of the wrong answer.",
         "Turn by 30 degrees or more, change speed, or give initial.position.",
     )
     FAR_FROM_PRIOR = (
         "far_from_prior",
         "A value is far outside its prior.",
+        "Either the prior is wrong, which draws all values with it, or the data are.",
         "Check prior, units and axes before you use any value.",
     )
     DOES_NOT_FIT = (
         "does_not_fit",
         "Residuals are so large that the model does not fit the data.",
+        "Values and standard deviations are those of a model that the data contradict.",
         "Check lever arm, clock, units and axes; do not use the values.",
     )
     LARGE_RESIDUALS = (
         "large_residuals",
         "Residuals are larger than their standard deviation says.",
+        "The reported standard deviations are too small in about the same ratio.",
         "Raise the standard deviation of the sensor.",
     )
     MANY_REJECTED = (
         "many_rejected",
         "Over a third of the measurements were rejected.",
+        "Single echoes are few: a cause common to all of them is more likely.",
         "Check place, clock, unit and standard deviation.",
     )
     AT_THE_GATE = (
         "at_the_gate",
         "Some measurements are as likely echoes as not; they are used.",
+        "Results would change a little if they were left out.",
         "Nothing, if they are few.",
     )
     FILTER_CONTRADICTED = (
         "filter_contradicted",
         "Residuals are larger than the filter's covariance allows: it has not converged.",
+        "Values and standard deviations of a filter that diverged mean nothing.",
         "Use `solve`.",
     )
     METHOD_LIMITS = (
         "method_limits",
         "The method neglects, fixes or assumes something that `solve` does not.",
+        "Values may be biased, and standard deviations too small.",
         "Use `solve` if it matters.",
     )
     GNSS_OUTAGE = (
         "gnss_outage",
         "GNSS is missing for so long that the filter drifts.",
+        "What the filter learns of the DVL in the outage is worth little.",
         "Use `solve`, which bridges it.",
     )
     FILTER_RESTARTED = (
         "filter_restarted",
         "The filter starts again after a gap.",
+        "Both sides of the gap are known less well than together.",
         "Use `solve`, which joins the parts.",
     )
     MEAN_OR_LAST = (
         "mean_or_last",
         "A bias walks: a replay reports its last value, `solve` the mean.",
+        "The two values differ, and neither is wrong.",
         "Nothing.",
     )
     # What a replay noticed.
-    SILENT = ("silent", "A sensor has fallen silent.", "Check its cable, power and clock.")
-    HEARD_AGAIN = ("heard_again", "A sensor is back, or agrees again.", "Nothing.")
+    SILENT = (
+        "silent",
+        "A sensor has fallen silent.",
+        "The estimate continues without it, and its standard deviations grow.",
+        "Check its cable, power and clock.",
+    )
+    HEARD_AGAIN = (
+        "heard_again",
+        "A sensor is back, or agrees again.",
+        "From here on its measurements are used again.",
+        "Nothing.",
+    )
     CONTRADICTS = (
         "contradicts",
         "Measurements contradict the prediction.",
+        "Used, they would move the estimate by many standard deviations.",
         "Check clock, time offset and sensor.",
     )
     # Results from files.
     UNCLASSIFIED = (
         "unclassified",
         "A warning in a file of another version, without a code that this one knows.",
+        "What it means for the result is known to the version that wrote it only.",
         "Read its text.",
     )
 
 
 # Errors with which there is nothing to solve; with the others a fit contradicts the data.
-_UNUSABLE = frozenset(
+UNUSABLE = frozenset(
     {
         Code.TIME_UNIT,
         Code.NO_OVERLAP,
@@ -324,7 +409,7 @@ class Finding:
     @property
     def unusable(self) -> bool:
         """Whether there is nothing to solve with; else a fit contradicts the data."""
-        return self.severity == "error" and self.code in _UNUSABLE
+        return self.severity == "error" and self.code in UNUSABLE
 
     def __str__(self) -> str:
         return f"{self.sensor}: {self.text}" if self.sensor else self.text
