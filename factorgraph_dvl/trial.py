@@ -7,6 +7,7 @@ from functools import cached_property
 from typing import ClassVar
 
 import numpy as np
+from msgspec import UnsetType
 
 from factorgraph_dvl.errors import DataError
 from factorgraph_dvl.geometry.earth import LocalFrame
@@ -21,7 +22,7 @@ from factorgraph_dvl.sensors.finding import Finding
 from factorgraph_dvl.sensors.fingerprint import fingerprints, shared
 from factorgraph_dvl.sensors.gnss import Gnss
 from factorgraph_dvl.sensors.imu import Imu
-from factorgraph_dvl.sensors.protocol import Aid
+from factorgraph_dvl.sensors.protocol import Aid, NoiseModel, SensorRecord
 from factorgraph_dvl.sensors.speed_log import Heading, SpeedLog
 from factorgraph_dvl.sensors.turntable import Turntable
 
@@ -96,6 +97,8 @@ class Trial:
         Axes in which all body quantities are given.
     epoch : str, optional
         UTC of time zero, ISO 8601; empty if not given.
+    noise : {'estimated', 'stated'}, optional
+        Whether the stated noise of sensors that do not say so themselves is final.
     initial_attitude, initial_position : priors; None = found from the data.
     reference : Reference, optional
         Truth or a trusted solution, None if there is none.
@@ -113,6 +116,7 @@ class Trial:
     others: tuple[Aid, ...] = ()
     body_axes: BodyAxes = "RFU"
     epoch: str = ""
+    noise: NoiseModel = "estimated"
     initial_attitude: InitialAttitude | None = None
     initial_position: InitialPosition | None = None
     reference: Reference | None = None
@@ -156,6 +160,11 @@ class Trial:
         """Fingerprints of all data behind a result: the records, and those of the prior."""
         prior = None if self.dvl is None else self.dvl.prior
         return (*self._fingerprints, *(() if prior is None else prior.inputs))
+
+    def estimates_noise(self, record: SensorRecord) -> bool:
+        """Whether the stated noise of a sensor is a start value; if not, it is final."""
+        stated = record.settings.noise
+        return (self.noise if isinstance(stated, UnsetType) else stated) == "estimated"
 
     @property
     def beams(self) -> DvlBeams | None:

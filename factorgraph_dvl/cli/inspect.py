@@ -12,18 +12,25 @@ def inspect(trial_path: TrialPath) -> None:
     from factorgraph_dvl.io.trial_folder import load_trial
     from factorgraph_dvl.quality.survey import survey
     from factorgraph_dvl.quality.survey_planar import survey_planar
-    from factorgraph_dvl.report.terminal.tables import finding_lines, motion_line, sensor_table
+    from factorgraph_dvl.report.terminal.tables import (
+        finding_lines,
+        imu_lines,
+        motion_line,
+        sensor_table,
+    )
 
     if is_planar(trial_path):
         planar = load_planar_trial(trial_path)
-        result, notes = survey_planar(planar), planar.notes
+        result, notes, assumed = survey_planar(planar), planar.notes, []
     else:
         trial = load_trial(trial_path)
         result, notes = survey(trial), trial.notes
+        assumed = imu_lines(trial.imu.settings)
     console = stdout()
     print_table(sensor_table(result))
-    console.print(motion_line(result), markup=False, soft_wrap=True)
+    for line in (motion_line(result), *assumed):
+        console.print(line, markup=False, soft_wrap=True)
     for note in notes:
         warn(str(note))
-    for line in finding_lines(result):
-        console.print(line, soft_wrap=True)
+    for finding in finding_lines(result):
+        console.print(finding, soft_wrap=True)

@@ -125,6 +125,7 @@ def load_trial(path: Path | str) -> Trial:
         others=tuple(aids.values()),
         body_axes=settings.body_axes,
         epoch=settings.epoch,
+        noise=settings.noise,
         initial_attitude=None if initial is UNSET else _attitude(initial),
         initial_position=None if initial is UNSET else position_of(initial),
         reference=reference_of(folder, settings),
@@ -412,6 +413,7 @@ def _settings(trial: Trial, suffix: str) -> TrialSettings:
         name=trial.name,
         body_axes=trial.body_axes,
         epoch=trial.epoch,
+        noise=trial.noise,
         **{
             record.section: msgspec.structs.replace(
                 record.settings, file=f"{record.section}{suffix}"

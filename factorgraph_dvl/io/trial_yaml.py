@@ -12,7 +12,7 @@ from factorgraph_dvl.sensors.beacon import BeaconSettings
 from factorgraph_dvl.sensors.catalogue import AIDS
 from factorgraph_dvl.sensors.depth import DepthSettings
 from factorgraph_dvl.sensors.imu import ImuSettings
-from factorgraph_dvl.sensors.protocol import SensorSection
+from factorgraph_dvl.sensors.protocol import NoiseModel, SensorSection
 from factorgraph_dvl.sensors.speed_log import HeadingSettings, LogSettings
 from factorgraph_dvl.settings.sections import Section, Sigma3, check_epoch
 
@@ -72,6 +72,7 @@ class _Settings(Section, frozen=True, kw_only=True):
     name: str = ""
     body_axes: BodyAxes = "RFU"
     epoch: str = ""
+    noise: NoiseModel = "estimated"
     imu: ImuSettings
     initial: InitialSettings | UnsetType = UNSET
     reference: ReferenceSettings | UnsetType = UNSET

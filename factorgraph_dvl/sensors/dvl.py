@@ -30,7 +30,7 @@ from factorgraph_dvl.sensors.records import (
     named_columns,
     stack,
 )
-from factorgraph_dvl.settings.sections import NonNegative, Sigma3, Vector3
+from factorgraph_dvl.settings.sections import NonNegative, Positive, Sigma3, Vector3
 
 VELOCITY_COLUMNS = ("vel_x_m_s", "vel_y_m_s", "vel_z_m_s")
 STD_COLUMNS = ("std_x_m_s", "std_y_m_s", "std_z_m_s")
@@ -77,6 +77,9 @@ class DvlSettings(SensorSection, frozen=True, kw_only=True):
     bias_std_m_s: Sigma3 = (0.0, 0.0, 0.0)
     time_offset_s: float = 0.0
     time_offset_std_s: NonNegative = 0.0
+    correlation_time_s: Positive | UnsetType = UNSET
+    correlated_std_m_s: float | Sigma3 | UnsetType = UNSET
+    scale_walk_std_sqrt_h: NonNegative = 0.0
     reference: Literal["bottom", "water"] = "bottom"
     current_std_m_s: tuple[NonNegative, NonNegative] = (0.5, 0.5)
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import ClassVar, Self
 
 import numpy as np
+from msgspec import UNSET, UnsetType
 
 from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.units import DEG, GEODETIC_SI
@@ -49,6 +50,10 @@ class GnssSettings(SensorSection, frozen=True, kw_only=True):
     velocity_std_m_s: tuple[Positive, Positive, Positive] = (0.1, 0.1, 0.1)
     lever_arm_m: Vector3 = (0.0, 0.0, 0.0)
     lever_arm_std_m: Sigma3 = (0.0, 0.0, 0.0)
+    correlation_time_s: Positive | UnsetType = UNSET
+    correlated_std_m: Sigma3 | UnsetType = UNSET
+    velocity_correlation_time_s: Positive | UnsetType = UNSET
+    correlated_velocity_std_m_s: Sigma3 | UnsetType = UNSET
 
 
 @dataclass(frozen=True)

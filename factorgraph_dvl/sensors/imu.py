@@ -2,14 +2,25 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar, Literal, Self
 
+import msgspec
 import numpy as np
+from msgspec import UNSET, UnsetType
 
-from factorgraph_dvl.geometry.units import DEG_PER_HOUR, DEG_PER_SQRT_HOUR, HOUR, MICRO_G
+from factorgraph_dvl.geometry.units import (
+    DEG,
+    DEG_PER_HOUR,
+    DEG_PER_SQRT_HOUR,
+    HOUR,
+    MICRO_G,
+    STANDARD_GRAVITY,
+)
 from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.sensors.imu_grades import TYPICAL, ZERO_WITHOUT_GRADE, Grade
 from factorgraph_dvl.sensors.parameters import Parameter, ParameterSpec
 from factorgraph_dvl.sensors.protocol import SensorSection
 from factorgraph_dvl.sensors.records import (
@@ -36,22 +47,85 @@ _LEAST_GYRO_NOISE = 1e-6 * DEG_PER_SQRT_HOUR
 _LEAST_ACCEL_NOISE = 0.01 * MICRO_G
 _MAX_RATE_RAD_S = 100.0
 _MAX_FORCE_M_S2 = 1000.0
+_PPM = 1e-6
+# Stands for a key that is not stated, until the grade or zero takes its place; as a value in a
+# file it is refused.
+_NOT_STATED = math.nan
 
 _GYRO_BIAS = ParameterSpec("gyro_bias", "deg_h", frame="b", place=5)
 _ACCEL_BIAS = ParameterSpec("accel_bias", "ug", frame="b", place=6)
 
 
+@dataclass(frozen=True)
+class ImuErrorStd:
+    """Standard deviations of the errors of an IMU that grow with rate and force, SI.
+
+        gyro = (I + Mg) omega + Gg f + bias,    accel = (I + Ma) f + bias
+
+    with the scale errors on the diagonals. Every off-diagonal element of Mg has the stated
+    standard deviation; Ma is a lower triangle, as the accelerometer triad defines the body.
+
+    Parameters
+    ----------
+    gyro_scale : float
+        Of a diagonal element of Mg.
+    gyro_misalignment : float
+        Of an off-diagonal element of Mg, rad.
+    gyro_g_sensitivity : float
+        Of an element of Gg, (rad/s)/(m/s²).
+    accel_scale : float
+        Of a diagonal element of Ma.
+    accel_misalignment : float
+        Of an element of Ma below the diagonal, rad.
+    """
+
+    gyro_scale: float = 0.0
+    gyro_misalignment: float = 0.0
+    gyro_g_sensitivity: float = 0.0
+    accel_scale: float = 0.0
+    accel_misalignment: float = 0.0
+
+
 class ImuSettings(SensorSection, frozen=True, kw_only=True):
-    """Section `imu` of trial.yaml."""
+    """Section `imu` of trial.yaml; what it does not state has the value typical of the grade."""
 
     file: str = "imu.csv"
     sampling: Literal["mean", "instantaneous"] = "mean"
-    gyro_noise_deg_sqrt_h: NonNegative
-    gyro_bias_std_deg_h: Positive
-    gyro_bias_walk_deg_h_sqrt_h: NonNegative = 0.0
-    accel_noise_ug_sqrt_hz: NonNegative
-    accel_bias_std_ug: Positive
-    accel_bias_walk_ug_sqrt_h: NonNegative = 0.0
+    grade: Grade | UnsetType = UNSET
+    gyro_noise_deg_sqrt_h: NonNegative = _NOT_STATED
+    gyro_bias_std_deg_h: Positive = _NOT_STATED
+    gyro_bias_walk_deg_h_sqrt_h: NonNegative = _NOT_STATED
+    accel_noise_ug_sqrt_hz: NonNegative = _NOT_STATED
+    accel_bias_std_ug: Positive = _NOT_STATED
+    accel_bias_walk_ug_sqrt_h: NonNegative = _NOT_STATED
+    gyro_scale_std_ppm: NonNegative = _NOT_STATED
+    gyro_misalignment_std_deg: NonNegative = _NOT_STATED
+    gyro_g_sensitivity_std_deg_h_g: NonNegative = _NOT_STATED
+    accel_scale_std_ppm: NonNegative = _NOT_STATED
+    accel_misalignment_std_deg: NonNegative = _NOT_STATED
+
+    def __post_init__(self) -> None:
+        typical = {} if isinstance(self.grade, UnsetType) else TYPICAL[self.grade]
+        for name in next(iter(TYPICAL.values())):
+            if not math.isnan(getattr(self, name)):
+                continue
+            if not typical and name not in ZERO_WITHOUT_GRADE:
+                raise ValueError(f"Object missing required field `{name}`, or `grade`")
+            msgspec.structs.force_setattr(self, name, typical.get(name, 0.0))
+        super().__post_init__()
+
+    @property
+    def error_std(self) -> ImuErrorStd:
+        """Standard deviations of scale, axes and g-sensitivity, SI."""
+        return ImuErrorStd(
+            gyro_scale=self.gyro_scale_std_ppm * _PPM,
+            gyro_misalignment=self.gyro_misalignment_std_deg * DEG,
+            gyro_g_sensitivity=(
+                self.gyro_g_sensitivity_std_deg_h_g * DEG_PER_HOUR / STANDARD_GRAVITY
+            ),
+            accel_scale=self.accel_scale_std_ppm * _PPM,
+            accel_misalignment=self.accel_misalignment_std_deg * DEG,
+        )
 
     @property
     def gyro_noise_root_psd(self) -> float:
@@ -127,6 +201,11 @@ class Imu:
     def columns(self) -> dict[str, Array]:
         """Return the record as a table."""
         return named_columns(COLUMNS, np.column_stack([self.time, self.gyro, self.accel]))
+
+    @property
+    def error_std(self) -> ImuErrorStd:
+        """Standard deviations of scale, axes and g-sensitivity, SI."""
+        return self.settings.error_std
 
     def parameters(self, duration: float) -> tuple[Parameter, Parameter]:
         """Return gyro and accelerometer bias; a walking one as its mean over `duration` s.

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, Protocol, Self, runtime_checkable
+from typing import Any, ClassVar, Literal, Protocol, Self, runtime_checkable
 
 import numpy as np
+from msgspec import UNSET, UnsetType
 
 from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.vectors import Array, cross_variance
@@ -15,6 +16,9 @@ from factorgraph_dvl.sensors.parameters import Parameter, ParameterSpec
 from factorgraph_dvl.settings.sections import Section
 
 Values = Mapping[str, Array]
+
+# Whether the noise of a sensor is estimated from its residuals, or final as it is stated.
+NoiseModel = Literal["estimated", "stated"]
 
 # Residuals larger than stated by this factor make every standard deviation too small, and by
 # the second the model is another than the data's.
@@ -121,9 +125,13 @@ class Observation(Protocol):
 
 
 class SensorSection(Section, frozen=True, kw_only=True):
-    """A sensor's section of trial.yaml, with the table that holds its record."""
+    """A sensor's section of trial.yaml, with the table that holds its record.
+
+    `noise` says whether the stated noise is a start value or final; unset = as the trial says.
+    """
 
     file: str
+    noise: NoiseModel | UnsetType = UNSET
 
     @property
     def more_columns(self) -> tuple[str, ...]:

@@ -82,12 +82,13 @@ _STD = {
     "s": 1e10,
     "fraction": 10.0,
     "error": 1e3,
+    "sqrt_h": 1e3,
 }
 _UNITS = {
     **{"deg_sqrt_h": "deg/√h", "deg_h": "deg/h", "deg_h_sqrt_h": "deg/h/√h", "ug": "µg"},
     "deg_h_g": "deg/h/g",
     **{"ug_sqrt_hz": "µg/√Hz", "ug_sqrt_h": "µg/√h", "m_s": "m/s", "lever_arm_m": "m"},
-    **{"fraction": "", "error": ""},
+    **{"fraction": "", "error": "", "sqrt_h": "1/√h"},
 }
 _SPREADS = frozenset({"std", "noise", "walk"})
 

@@ -152,7 +152,7 @@ class _Builder:
 
 
 _UNKNOWN = re.compile(r"Object contains unknown field `(?P<name>.*)`")
-_MISSING = re.compile(r"Object missing required field `(?P<name>.*)`")
+_MISSING = re.compile(r"Object missing required field `(?P<name>\w*)`(?P<instead>.*)")
 _NAMES = {
     "float": "a number",
     "int": "an integer",
@@ -187,7 +187,7 @@ def _explain(message: str, root: yaml.Node, value: Any, kind: Any, source: str) 
         return ConfigError(
             f"missing key `{_dotted((*path, match['name']))}`",
             where=where(path) if path else source,
-            expected="this key",
+            expected=f"this key{match['instead']}",
         )
     if not reason.startswith(("Expected", "Invalid enum")):
         for name in re.findall(r"`(\w+)`", reason):

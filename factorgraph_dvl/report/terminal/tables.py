@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from msgspec import UnsetType
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
@@ -14,6 +15,7 @@ from factorgraph_dvl.analysis.error_statistics import CalibrationErrors
 from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.quality.survey import Survey
 from factorgraph_dvl.report.text import at_precision, fixed, split_unit, with_std
+from factorgraph_dvl.sensors.imu import ImuSettings
 from factorgraph_dvl.solution import Solution
 
 _STYLES = {"error": "red", "warning": "yellow", "ok": "green"}
@@ -192,6 +194,21 @@ def motion_line(survey: Survey) -> str:
     if math.isfinite(survey.speed_max):
         parts.append(f"speed {survey.speed_min:.3g} to {survey.speed_max:.3g} m/s")
     return ", ".join(parts)
+
+
+def imu_lines(settings: ImuSettings) -> list[str]:
+    """Return what a trial assumes of its gyros and accelerometers, one line each."""
+    s = settings
+    grade = "" if isinstance(s.grade, UnsetType) else f" ({s.grade} where not stated)"
+    return [
+        f"gyros{grade}: noise {s.gyro_noise_deg_sqrt_h:.4g} deg/√h, "
+        f"bias {s.gyro_bias_std_deg_h:.4g} deg/h, walk {s.gyro_bias_walk_deg_h_sqrt_h:.4g} "
+        f"deg/h/√h, scale {s.gyro_scale_std_ppm:.4g} ppm, axes {s.gyro_misalignment_std_deg:.4g} "
+        f"deg, g-sensitivity {s.gyro_g_sensitivity_std_deg_h_g:.4g} deg/h/g",
+        f"accelerometers{grade}: noise {s.accel_noise_ug_sqrt_hz:.4g} µg/√Hz, "
+        f"bias {s.accel_bias_std_ug:.4g} µg, walk {s.accel_bias_walk_ug_sqrt_h:.4g} µg/√h, "
+        f"scale {s.accel_scale_std_ppm:.4g} ppm, axes {s.accel_misalignment_std_deg:.4g} deg",
+    ]
 
 
 def finding_lines(survey: Survey) -> list[Text]:
