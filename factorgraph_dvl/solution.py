@@ -39,6 +39,7 @@ class Trajectory:
     Parameters
     ----------
     time : ndarray, shape (M,), s
+        Of the epochs.
     geodetic : ndarray, shape (M, 3)
         Latitude, longitude (rad), ellipsoidal height (m).
     velocity : ndarray, shape (M, 3)
@@ -95,8 +96,8 @@ class Estimate:
         In the unit of the name.
     prior_value, prior_std : ndarray, shape (n,)
         What was known before.
-    observable : ndarray, shape (n,)
-        Bool, whether the data at least halved the prior's standard deviation.
+    observable : ndarray of bool, shape (n,)
+        Whether the data at least halved the prior's standard deviation.
     nominal : ndarray, shape (N, 3), optional
         Unit vectors, if the parameter is N directions: the n = 2 N components turn them, in deg
         (`directions`). None for all other parameters.
@@ -137,6 +138,7 @@ class Residuals:
     components : tuple of str
         Names of the d components.
     time : ndarray, shape (M,), s
+        Of the epochs.
     residual : ndarray, shape (M, d)
         Predicted - measured; nan where a component was not measured.
     sigma : ndarray, shape (M, d)

@@ -52,6 +52,7 @@ class InitialAttitude:
     rph : ndarray, shape (3,)
         Roll, pitch, heading, rad.
     std : ndarray, shape (3,), rad
+        Of roll, pitch, heading.
     """
 
     rph: Array
@@ -65,6 +66,7 @@ class Reference:
     Parameters
     ----------
     time : ndarray, shape (M,), s
+        Of the epochs.
     geodetic : ndarray, shape (M, 3)
         Latitude, longitude (rad), ellipsoidal height (m) of the IMU.
     velocity : ndarray, shape (M, 3)
@@ -99,7 +101,10 @@ class Trial:
         UTC of time zero, ISO 8601; empty if not given.
     noise : {'estimated', 'stated'}, optional
         Whether the stated noise of sensors that do not say so themselves is final.
-    initial_attitude, initial_position : priors; None = found from the data.
+    initial_attitude : InitialAttitude, optional
+        Prior; None = found from the data.
+    initial_position : InitialPosition, optional
+        Prior; None = found from the data.
     reference : Reference, optional
         Truth or a trusted solution, None if there is none.
     calibration_truth : dict of str to ndarray, optional
@@ -224,7 +229,14 @@ class PlanarTrial:
     ----------
     name : str
         Of the trial.
-    heading, log, depth, beacons : the records.
+    heading : Heading
+        Record of the compass.
+    log : SpeedLog
+        Record of the log.
+    depth : Depth
+        Record of the depth sensor.
+    beacons : Beacons
+        Record of the ranges.
     body_axes : BodyAxes, optional
         Axes in which lever arms are given.
     initial_position : InitialPosition, optional

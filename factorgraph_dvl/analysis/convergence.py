@@ -77,6 +77,7 @@ def convergence(
     Parameters
     ----------
     time : ndarray, shape (H,), s
+        Of the updates.
     values, std : ndarray, shape (H, n)
         What was known then, in the order of `estimates`.
     inconsistent : ndarray, shape (H,)
@@ -87,7 +88,6 @@ def convergence(
         True values by reported name; may be empty.
     good_std, good_error : mapping of str to float
         Limits by reported name, in its unit.
-
     """
     out, column = [], 0
     all_good = ~inconsistent

@@ -95,7 +95,10 @@ def attitudes_from_vectors(
 
     Returns
     -------
-    R : (M, 3, 3); P : (M, 3, 3).
+    R : ndarray, shape (M, 3, 3)
+        Rotations.
+    P : ndarray, shape (M, 3, 3)
+        As above.
     """
     moments = np.add.reduceat(catalogue[:, :, None] * measured[:, None, :], first)
     across = np.eye(3) - measured[:, :, None] * measured[:, None, :]
@@ -122,9 +125,11 @@ def off_vertical(time: Array, nRb: Array, force_time: Array, force: Array) -> fl
     Parameters
     ----------
     time : ndarray, shape (M,), s
+        Of the attitudes.
     nRb : ndarray, shape (M, 3, 3)
         Body to east, north, up.
     force_time : ndarray, shape (N,), s
+        Of the specific force.
     force : ndarray, shape (N, 3), m/s²
         Specific force in body.
     """

@@ -135,7 +135,8 @@ def rotation_from_rph(rph: ArrayLike, body_axes: BodyAxes) -> Array:
 
     Returns
     -------
-    (..., 3, 3) rotation matrices.
+    ndarray, shape (..., 3, 3)
+        Rotation matrices.
     """
     rph = np.asarray(rph, dtype=float)
     flat = Rotation.from_euler("ZYX", rph.reshape(-1, 3)[:, ::-1]).as_matrix()

@@ -34,7 +34,7 @@ class Rows:
     at : slice
         Slice of the node's attachment.
     time : ndarray, shape (M,)
-        S, for which they were attached.
+        Times for which they were attached, s.
     """
 
     observation: Observation
@@ -59,6 +59,7 @@ class NodeMeasurements:
     gravity_n : ndarray, shape (1, 3)
         `LocalFrame.gravity_without_rotation`, m/s².
     earth_rate_n : ndarray, shape (3,), rad/s
+        Earth rate in n.
     """
 
     attachment: Attachment

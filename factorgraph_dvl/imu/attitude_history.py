@@ -55,8 +55,8 @@ class AttitudeHistory:
         The source; its roll, pitch, heading and latitude are used.
     body_axes : BodyAxes
         Of the body.
-    gyro_bias : ndarray, shape (3,)
-        rad/s; zero if not known: through a lever arm of 1 m, 10 deg/h are 0.05 mm/s.
+    gyro_bias : ndarray, shape (3,), rad/s
+        Zero if not known: through a lever arm of 1 m, 10 deg/h are 0.05 mm/s.
     """
 
     def __init__(

@@ -351,12 +351,14 @@ def increments(
     Parameters
     ----------
     imu : Imu
+        Record of the IMU.
     windows : tuple of (int, int), optional
         See `Increments`.
 
     Returns
     -------
-    Increments
+    increments : Increments
+        Of all arcs.
     findings : tuple of Finding
         What was lost, filled or left out.
 

@@ -102,7 +102,7 @@ def smooth(
     Parameters
     ----------
     time : ndarray, shape (N,)
-        S, regular: the samples', or the middles of the intervals of means.
+        Regular: those of the samples, or the middles of the intervals of means, s.
     values : ndarray, shape (N, 3)
         Samples.
     dt : float

@@ -23,7 +23,9 @@ class Segments:
     Parameters
     ----------
     increments : Increments
+        Of all arcs.
     node_time : ndarray, shape (K,), s
+        Of the nodes.
     first, last : ndarray of int, shape (S,)
         First and last-plus-one interval of each segment.
     origin : ndarray of int, shape (S,)
@@ -33,6 +35,7 @@ class Segments:
     phi, dv : ndarray, shape (N, 3)
         Increments over the intervals.
     dR : ndarray, shape (N, 3, 3)
+        Rotation since the segment's start, at the start of each interval.
     dV, dP : ndarray, shape (N, 3)
         Since the segment's start, at the start of each interval, in the axes at the segment's
         start.
@@ -76,6 +79,7 @@ def segments(inc: Increments, interval: float, epochs: Array | None = None) -> S
     Parameters
     ----------
     inc : Increments
+        Increments of all arcs.
     interval : float
         Length of the segments, s.
     epochs : ndarray, shape (M,), optional
@@ -204,11 +208,13 @@ def preintegrate(
     Parameters
     ----------
     seg : Segments
+        Increments between the nodes.
     settings : ImuSettings
         Noise of the IMU.
     gravity_n : ndarray, shape (S, 3)
         `LocalFrame.gravity_without_rotation` along the segments, m/s².
     earth_rate_n : ndarray, shape (3,), rad/s
+        Earth rate in n.
     """
     inc = seg.increments
     dt = inc.dt[:, None]

@@ -22,8 +22,11 @@ class States:
     Parameters
     ----------
     nRb : ndarray, shape (K, 3, 3)
+        Attitude, body to n.
     p_n, v_n : ndarray, shape (K, 3)
-    gyro_bias, accel_bias : ndarray, shape (K, 3), SI
+        Position and Earth-relative velocity in n, m, m/s.
+    gyro_bias, accel_bias : ndarray, shape (K, 3)
+        Biases in body, rad/s, m/s².
     """
 
     nRb: Array
@@ -46,6 +49,7 @@ class Attachment:
     tau : ndarray, shape (M,), s
         Time since that node.
     dR, dA : ndarray, shape (M, 3, 3)
+        Rotation up to the time, and its integral, s.
     dV, dP : ndarray, shape (M, 3)
         Increments up to the time.
     gyro, alpha, force : ndarray, shape (M, 3)
@@ -143,6 +147,7 @@ class Transition:
     motion : Motion
         At the times.
     earth_rate_n : ndarray, shape (3,), rad/s
+        Earth rate in n.
     """
 
     at: Attachment

@@ -84,6 +84,7 @@ def unrounded(time: Array, number: Array | None = None) -> Array:
     Parameters
     ----------
     time : ndarray, shape (N,), s
+        Stamps of the samples.
     number : ndarray, shape (N,), optional
         Of the samples, lost ones counted; None = none was lost.
     """

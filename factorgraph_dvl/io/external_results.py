@@ -140,9 +140,12 @@ def load_results(path_a: Path | str, path_b: Path | str) -> tuple[Solution, Solu
 
     Returns
     -------
-    Two Solutions. One from elsewhere has nan for what the file does not say, no epochs
-    without a table, no estimates without calibration values, no correlations, and the
-    body axes of the other result unless the file says which.
+    a : Solution
+        One from elsewhere has nan for what the file does not say, no epochs without a table, no
+        estimates without calibration values, no correlations, and the body axes of the other
+        result unless the file says which.
+    b : Solution
+        The other.
 
     Raises
     ------
@@ -206,7 +209,10 @@ def load_truth(
 
     Returns
     -------
-    The true trajectory, or None, and the true calibration by reported name.
+    reference : Reference or None
+        The true trajectory.
+    truth : dict of str to ndarray
+        The true calibration by reported name.
 
     Raises
     ------
@@ -240,7 +246,8 @@ def read_truth(path: Path | str) -> dict[str, Array]:
 
     Returns
     -------
-    Name to (n,) values, in reported units. Standard deviations are ignored.
+    dict of str to ndarray, shape (n,)
+        Values by name, in reported units. Standard deviations are ignored.
 
     Raises
     ------
@@ -270,7 +277,8 @@ def read_calibration_values(path: Path | str, body_axes: BodyAxes) -> dict[str, 
 
     Returns
     -------
-    Name to (n,) values, in reported units; of directions (N, 3) vectors.
+    dict of str to ndarray, shape (n,)
+        Values by name, in reported units; of directions (N, 3) vectors.
 
     Raises
     ------

@@ -97,7 +97,8 @@ def new_folder(path: Path, *, force: bool = False, owned: Sequence[str] = ()) ->
 
     Parameters
     ----------
-    path, force, owned : as in `claim`.
+    path, force, owned : path-like, bool, sequence of str
+        As in `claim`.
 
     Raises
     ------

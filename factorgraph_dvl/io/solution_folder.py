@@ -149,6 +149,7 @@ def write_history(
     folder : path-like
         To write into.
     time : ndarray, shape (H,), s
+        Of the updates.
     names : sequence of str
         Of the n components, as in `covariance.order`.
     values, std : ndarray, shape (H, n)
@@ -172,6 +173,7 @@ def write_latency(folder: Path, time: Array, latency: Array, solved: np.ndarray)
     folder : path-like
         To write into.
     time, latency : ndarray, shape (H,), s
+        When the updates came, and how long each took.
     solved : ndarray, shape (H,)
         Updates that include a batch solution of what was collected.
     """

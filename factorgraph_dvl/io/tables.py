@@ -46,7 +46,8 @@ def read_table(
 
     Returns
     -------
-    Name to (N,) array, for every required and optional column.
+    dict of str to ndarray, shape (N,)
+        Every required and optional column by its name.
 
     Raises
     ------

@@ -144,8 +144,10 @@ def load_reference(path: Path | str) -> tuple[Reference | None, dict[str, Array]
 
     Returns
     -------
-    The reference, None if there is none, and the true calibration, empty if there is
-    none.
+    reference : Reference or None
+        None if there is none.
+    truth : dict of str to ndarray
+        The true calibration by reported name; empty if there is none.
 
     Raises
     ------

@@ -105,6 +105,7 @@ else:
         frozen=True,
         kw_only=True,
         forbid_unknown_fields=True,
+        namespace={"__doc__": "The whole of trial.yaml; sections that are absent are unset."},
     )
 
 

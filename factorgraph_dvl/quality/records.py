@@ -55,8 +55,9 @@ def record_of(label: str, time: Array, missing: Array) -> SensorSurvey:
     label : str
         Of the sensor.
     time : ndarray, shape (N,), s
-    missing : ndarray, shape (N,)
-        Bool, rows without a measurement.
+        Of the rows.
+    missing : ndarray of bool, shape (N,)
+        Rows without a measurement.
     """
     intervals = np.diff(time)
     median = float(np.median(intervals)) if intervals.size else np.nan

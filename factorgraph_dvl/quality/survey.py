@@ -27,7 +27,7 @@ class Survey:
     distance : float
         Travelled, m; nan if neither GNSS nor DVL tell.
     speed_min, speed_max : float
-        m/s; nan likewise.
+        Slowest and fastest, m/s; nan likewise.
     findings : tuple of Finding
         About units, signs, clocks and gaps.
     """

@@ -32,7 +32,7 @@ class TrackedHypothesis:
     Parameters
     ----------
     born : float
-        S, of the last data when it was found.
+        Time of the last data when it was found, s.
     fit : Fit
         With the data so far, or when it was last followed.
     weight : float, optional
@@ -40,7 +40,7 @@ class TrackedHypothesis:
     highest : float, optional
         The highest weight that it ever had.
     died : float, optional
-        S, of the data since which its weight is below `DEAD`; None while it lives.
+        Time of the data since which its weight is below `DEAD`, s; None while it lives.
     history : list of tuple of (float, float), optional
         Time (s) and weight at all updates.
     """
@@ -64,6 +64,7 @@ def follow(
     Parameters
     ----------
     problem : PlanarProblem
+        Of the whole trial.
     updates : sequence of int
         Numbers of nodes after which to fit, increasing.
     searches : sequence of int
@@ -73,8 +74,9 @@ def follow(
 
     Returns
     -------
-    All hypotheses that were ever likely, the living ones first, most probable first; the fits of
-    these are of the last update.
+    list of TrackedHypothesis
+        All that were ever likely, the living ones first, most probable first; their fits are of
+        the last update.
     """
     living: list[TrackedHypothesis] = []
     gone: list[TrackedHypothesis] = []

@@ -87,6 +87,7 @@ class PlanarProblem:
     place : ndarray, shape (B, 3), m
         Stated positions of the beacons in n.
     ranging : Ranging
+        Ranges and range rates.
     parameters : tuple of Parameter
         Constants with priors, fixed ones included.
     start_mean : ndarray, shape (2,), m
@@ -242,6 +243,7 @@ def evaluate(problem: PlanarProblem, x: Array, theta: Array) -> RangingEvaluatio
     Parameters
     ----------
     problem : PlanarProblem
+        Of at least n nodes.
     x : ndarray, shape (n, 4)
         Positions, m, and noise of the velocity, m/s.
     theta : ndarray, shape (c,)

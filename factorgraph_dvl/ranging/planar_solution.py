@@ -59,6 +59,7 @@ def solve_planar(
     Parameters
     ----------
     trial : PlanarTrial
+        Records of heading, log, depth and beacons, with their priors.
     rate_hz : float, default 10.0
         Rate of the trajectory in the solution.
     progress : callable, optional

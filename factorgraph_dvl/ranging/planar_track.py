@@ -30,6 +30,7 @@ class PlanarTrack:
     Parameters
     ----------
     time : ndarray, shape (G,), s
+        Of the grid.
     displacement : ndarray, shape (G, 2)
         From the start, east and north, through the water or over ground, m.
     velocity : ndarray, shape (G, 2), m/s

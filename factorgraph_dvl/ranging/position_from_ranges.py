@@ -72,6 +72,7 @@ def positions_from_ranges(
     Parameters
     ----------
     trial : Trial
+        With a record of ranges, or with a known position.
     frame : LocalFrame
         Tangent frame of the trial.
     seg : Segments

@@ -37,6 +37,7 @@ class RangingSetup:
     Parameters
     ----------
     problem : PlanarProblem
+        What the smoother minimises.
     track : PlanarTrack
         Dead-reckoned.
     frame : LocalFrame

@@ -71,6 +71,7 @@ def fit(
     Parameters
     ----------
     problem : PlanarProblem
+        Of at least n nodes.
     x : ndarray, shape (n, 4)
         Start; the first n nodes are fitted.
     theta : ndarray, shape (c,)
@@ -139,6 +140,7 @@ def covariance(
     cross : ndarray, shape (n, 4, c)
         Of states and constants.
     constants : ndarray, shape (c, c)
+        Of the constants.
     """
     at = evaluate(problem, solution.x, solution.theta)
     weights = (solution.range_used, solution.rate_used)

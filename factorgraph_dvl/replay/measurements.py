@@ -79,10 +79,12 @@ def gated(
     ----------
     measured : NodeMeasurements
         Measurements of R components in all.
-    residual, sigma : ndarray, shape (R,)
-        Predicted - measured, and its standard deviation without that of the prediction.
+    residual : ndarray, shape (R,)
+        Predicted - measured.
     jacobian : ndarray, shape (R, 15 + n)
         Derivatives with respect to state, bias and the n parameters.
+    sigma : ndarray, shape (R,)
+        Standard deviation of the residual without that of the prediction.
     P : ndarray, shape (15 + n, 15 + n)
         Joint covariance of these.
     gate : InnovationGate

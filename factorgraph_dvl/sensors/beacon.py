@@ -92,14 +92,15 @@ class Beacons:
     Parameters
     ----------
     settings : BeaconSettings
-    time : ndarray, shape (M,)
-        S, strictly increasing.
+        Section `beacons` of trial.yaml.
+    time : ndarray, shape (M,), s
+        Strictly increasing.
     name : ndarray of np.str_, shape (M,)
-        Text, the beacon of each row.
+        Beacon of each row.
     range : ndarray, shape (M,)
         Slant range, m; nan where not measured.
-    range_rate : ndarray, shape (M,)
-        m/s, positive when the range grows; nan where not measured.
+    range_rate : ndarray, shape (M,), m/s
+        Positive when the range grows; nan where not measured.
     source : str, optional
         Name of the file, for messages.
     """
@@ -265,7 +266,9 @@ class _ToBeacon:
 
 @dataclass(frozen=True)
 class BeaconRange(_ToBeacon):
-    """Slant range to a beacon; zero error where
+    """Slant range to a beacon.
+
+    The error is zero where
 
         r = (1 + e) |p_n + nRb l - b_n|
 
@@ -309,7 +312,9 @@ class BeaconRange(_ToBeacon):
 
 @dataclass(frozen=True)
 class BeaconRangeRate(_ToBeacon):
-    """Range rate to a beacon, positive when the range grows; zero error where
+    """Range rate to a beacon, positive when the range grows.
+
+    The error is zero where
 
         dr/dt = (1 + e) uᵀ (v_n + nRb (omega_eb_b x l))
 

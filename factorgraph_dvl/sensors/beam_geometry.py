@@ -53,14 +53,17 @@ def velocities(gain: Array, beams: Array, sigma: Array) -> tuple[Array, Array]:
     ----------
     gain : ndarray, shape (N, 3)
         Rows (1 + k_i) d_i^T.
-    beams : ndarray, shape (M, N)
-        m/s, nan where lost.
-    sigma : ndarray, shape (M, N)
-        m/s; of lost beams ignored.
+    beams : ndarray, shape (M, N), m/s
+        Velocities along the beams; nan where lost.
+    sigma : ndarray, shape (M, N), m/s
+        Their standard deviations; those of lost beams are ignored.
 
     Returns
     -------
-    (M, 3) each, nan where the valid beams do not span three axes.
+    velocity : ndarray, shape (M, 3), m/s
+        Least squares; nan where the valid beams do not span three axes.
+    std : ndarray, shape (M, 3), m/s
+        Standard deviations, likewise.
     """
     out, std = np.full((len(beams), 3), np.nan), np.full((len(beams), 3), np.nan)
     for valid, pings in _by_pattern(beams):
@@ -108,6 +111,7 @@ def as_dvl(beams: DvlBeams, calibration: tuple[Array, Array, Array] | None = Non
     Parameters
     ----------
     beams : DvlBeams
+        Record of the beams.
     calibration : tuple of (ndarray, ndarray, ndarray), optional
         Directions in body (N, 3), scale errors (N,) and lever arm (3,), m. What is left between
         body and d is then the nominal misalignment, exactly, and nothing is to be estimated. None

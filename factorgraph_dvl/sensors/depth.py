@@ -45,8 +45,9 @@ class Depth:
     Parameters
     ----------
     settings : DepthSettings
-    time : ndarray, shape (M,)
-        S, strictly increasing.
+        Section `depth` of trial.yaml.
+    time : ndarray, shape (M,), s
+        Strictly increasing.
     depth : ndarray, shape (M,)
         Below the sea surface, positive down, m; nan where not measured.
     source : str, optional
@@ -106,7 +107,9 @@ class Depth:
 
 @dataclass(frozen=True)
 class DepthBelowSurface:
-    """Depth of a sensor; zero error where
+    """Depth of a sensor.
+
+    The error is zero where
 
         depth = h_surface - h(p_n + nRb l)
 
@@ -115,10 +118,11 @@ class DepthBelowSurface:
     Parameters
     ----------
     time : ndarray, shape (M,), s
-    measured : ndarray, shape (M,)
-        M, positive down.
+        Of the measurements.
+    measured : ndarray, shape (M,), m
+        Positive down.
     std : float
-        M.
+        Standard deviation, m.
     lever_arm : ndarray, shape (3,)
         IMU to sensor, in body, m.
     frame : LocalFrame

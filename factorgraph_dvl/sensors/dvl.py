@@ -97,13 +97,14 @@ class Dvl:
     Parameters
     ----------
     settings : DvlSettings
-    time : ndarray, shape (M,)
-        S, strictly increasing; true time plus the time offset.
+        Section `dvl` of trial.yaml.
+    time : ndarray, shape (M,), s
+        Strictly increasing; true time plus the time offset.
     velocity : ndarray, shape (M, 3)
         Velocity of the DVL over the seabed (or through the water), in its own axes d, m/s; nan =
         no lock.
-    std : ndarray, shape (M, 3)
-        m/s; nan where the record has none.
+    std : ndarray, shape (M, 3), m/s
+        Standard deviations; nan where the record has none.
     source : str, optional
         Name of the file, for messages.
     prior : JointPrior, optional
@@ -275,7 +276,9 @@ class Dvl:
 
 @dataclass(frozen=True)
 class DvlVelocity:
-    """Velocity reported by a DVL; zero error where
+    """Velocity reported by a DVL.
+
+    The error is zero where
 
         v_d = (1 + k) dRb (nRbᵀ (v_n - c_n) + omega_eb_b x l) + beta,
 
@@ -285,11 +288,12 @@ class DvlVelocity:
 
     Parameters
     ----------
-    time : ndarray, shape (M,)
-        S, as in the file.
+    time : ndarray, shape (M,), s
+        As in the file.
     measured_d : ndarray, shape (M, 3), m/s
-    std : ndarray, shape (M, 3)
-        m/s; nan where it follows from `noise`.
+        Velocity in d.
+    std : ndarray, shape (M, 3), m/s
+        Standard deviations; nan where they follow from `noise`.
     noise : tuple of (float, float), optional
         Floor, m/s, and fraction of the speed.
     """

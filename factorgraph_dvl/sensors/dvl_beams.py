@@ -174,8 +174,9 @@ class DvlBeams:
     Parameters
     ----------
     settings : DvlBeamsSettings
-    time : ndarray, shape (M,)
-        S, strictly increasing.
+        Section `dvl_beams` of trial.yaml.
+    time : ndarray, shape (M,), s
+        Strictly increasing.
     velocity : ndarray, shape (M, N)
         Velocity of the transducer along each beam's outward direction, m/s; nan = beam lost.
     source : str, optional
@@ -320,7 +321,9 @@ class DvlBeams:
 
 @dataclass(frozen=True)
 class BeamVelocity:
-    """Radial velocities of the beams of a DVL; zero error where
+    """Radial velocities of the beams of a DVL.
+
+    The error is zero where
 
         v_i = (1 + k_i) d_i^T (nRb^T v_n + omega_eb_b x l)
 
@@ -330,10 +333,11 @@ class BeamVelocity:
     Parameters
     ----------
     time : ndarray, shape (M,), s
-    measured : ndarray, shape (M, N)
-        m/s; any number where lost.
-    lost : ndarray, shape (M, N)
-        Bool.
+        Of the pings.
+    measured : ndarray, shape (M, N), m/s
+        Velocities along the beams; any number where lost.
+    lost : ndarray of bool, shape (M, N)
+        Whether a beam was lost.
     noise : tuple of (float, float)
         Floor, m/s, and fraction of the beam's velocity.
     geometry : Geometry

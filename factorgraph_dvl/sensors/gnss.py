@@ -63,8 +63,9 @@ class Gnss:
     Parameters
     ----------
     settings : GnssSettings
-    time : ndarray, shape (M,)
-        S, strictly increasing.
+        Section `gnss` of trial.yaml.
+    time : ndarray, shape (M,), s
+        Strictly increasing.
     geodetic : ndarray, shape (M, 3)
         Latitude, longitude (rad), ellipsoidal height (m) of the antenna; nan where not measured.
     velocity : ndarray, shape (M, 3)
@@ -213,6 +214,7 @@ class AntennaPosition:
     Parameters
     ----------
     time : ndarray, shape (M,), s
+        Of the fixes.
     measured_n : ndarray, shape (M, 3), m
         Position in n.
     lRn : ndarray, shape (M, 3, 3)
@@ -260,18 +262,22 @@ class AntennaPosition:
 
 @dataclass(frozen=True)
 class AntennaVelocity:
-    """Velocity of the antenna; zero error where
+    """Velocity of the antenna.
+
+    The error is zero where
 
         measured = v_n + nRb (omega_ec_b x bRc l),    omega_ec_b = omega_eb_b - omega_cb_b.
 
     Parameters
     ----------
     time : ndarray, shape (M,), s
+        Of the fixes.
     measured_l : ndarray, shape (M, 3)
         East, north, up at the vehicle, m/s.
     lRn : ndarray, shape (M, 3, 3)
         N to local-level axes.
     std : ndarray, shape (M, 3), m/s
+        East, north, up.
     bRc : ndarray, shape (M, 3, 3) or (3, 3), optional
         Axes of the antenna's carrier to body.
     omega_cb_b : ndarray, shape (M, 3) or (3,), rad/s, optional

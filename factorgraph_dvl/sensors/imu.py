@@ -160,8 +160,9 @@ class Imu:
     Parameters
     ----------
     settings : ImuSettings
-    time : ndarray, shape (N,)
-        S, strictly increasing.
+        Section `imu` of trial.yaml.
+    time : ndarray, shape (N,), s
+        Strictly increasing.
     gyro : ndarray, shape (N, 3)
         Angular rate relative to inertial space, in body, rad/s.
     accel : ndarray, shape (N, 3), m/s²

@@ -63,6 +63,7 @@ class Linearization:
     Parameters
     ----------
     residual : ndarray, shape (M, d)
+        In the unit of the measurement.
     d_theta : ndarray, shape (M, d, 3), optional
         With respect to theta in nRb Exp(theta).
     d_p, d_v : ndarray, shape (M, d, 3), optional
@@ -198,6 +199,7 @@ class Attitudes:
     Parameters
     ----------
     time : ndarray, shape (M,), s
+        Of the attitudes.
     nRs : ndarray, shape (M, 3, 3)
         Attitude of the sensor's axes.
     sigma : ndarray, shape (M,), rad

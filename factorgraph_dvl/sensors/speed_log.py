@@ -54,8 +54,9 @@ class Heading:
     Parameters
     ----------
     settings : HeadingSettings
-    time : ndarray, shape (M,)
-        S, strictly increasing.
+        Section `heading` of trial.yaml.
+    time : ndarray, shape (M,), s
+        Strictly increasing.
     heading : ndarray, shape (M,)
         Clockwise from true north, rad; nan where not measured.
     source : str, optional
@@ -102,8 +103,9 @@ class SpeedLog:
     Parameters
     ----------
     settings : LogSettings
-    time : ndarray, shape (M,)
-        S, strictly increasing.
+        Section `log` of trial.yaml.
+    time : ndarray, shape (M,), s
+        Strictly increasing.
     speed : ndarray, shape (M,)
         Ahead, m/s; nan where not measured.
     starboard : ndarray, shape (M,)

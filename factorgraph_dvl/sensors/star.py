@@ -82,7 +82,7 @@ class StarVectors:
     Parameters
     ----------
     time : ndarray, shape (K,)
-        S, not decreasing; rows of one time belong together.
+        Not decreasing, s; rows of one time belong together.
     body, inertial : ndarray, shape (K, 3)
         Unit vectors in the tracker's axes and in GCRS.
     """
@@ -104,8 +104,9 @@ class Star:
     Parameters
     ----------
     settings : StarSettings
-    time : ndarray, shape (M,)
-        S, strictly increasing.
+        Section `star` of trial.yaml.
+    time : ndarray, shape (M,), s
+        Strictly increasing.
     quaternion : ndarray, shape (M, 4)
         Scalar first, of iRs: the tracker's axes to GCRS; nan where not measured.
     covariance : ndarray, shape (M, 3, 3), rad²
@@ -173,10 +174,10 @@ class Star:
 
         Parameters
         ----------
-        settings : StarSettings; its standard deviation is that of a direction, per axis
-            across it.
+        settings : StarSettings
+            Its standard deviation is that of a direction, per axis across it.
         time : ndarray, shape (K,)
-            S; rows of the same time belong together.
+            Not decreasing, s; rows of one time belong together.
         body, inertial : ndarray, shape (K, 3)
             Directions in the tracker's axes and in GCRS, of any length.
         source : str
@@ -383,7 +384,9 @@ def _check_vectors(time: Array, body: Array, inertial: Array, source: str) -> No
 
 @dataclass(frozen=True)
 class StarAttitude:
-    """Attitude from a star tracker; zero error where
+    """Attitude from a star tracker.
+
+    The error is zero where
 
         nRs = nRb sRbᵀ,
 
@@ -395,12 +398,13 @@ class StarAttitude:
     Parameters
     ----------
     time : ndarray, shape (M,), s
+        Of the attitudes.
     nRs : ndarray, shape (M, 3, 3)
         Measured.
     axes : ndarray, shape (M, 3, 3)
         Principal axes of the covariance, in the tracker's.
-    std : ndarray, shape (M, 3)
-        Arcsec, along them.
+    std : ndarray, shape (M, 3), arcsec
+        Standard deviations along them.
     components : tuple of str, optional
         Names of the axes.
     """

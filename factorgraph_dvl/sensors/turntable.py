@@ -30,8 +30,9 @@ class Turntable:
     Parameters
     ----------
     settings : TurntableSettings
-    time : ndarray, shape (M,)
-        S, strictly increasing.
+        Section `turntable` of trial.yaml.
+    time : ndarray, shape (M,), s
+        Strictly increasing.
     angle : ndarray, shape (M,)
         Rotation of IMU and DVL relative to the ship, counter-clockwise seen from above, rad; it
         may wrap.

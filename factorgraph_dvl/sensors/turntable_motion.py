@@ -20,10 +20,10 @@ class TurntableMotion:
 
     Parameters
     ----------
-    time : ndarray, shape (K,)
-        S, strictly increasing.
-    angle : ndarray, shape (K,)
-        Rad, counter-clockwise seen from above; without jumps.
+    time : ndarray, shape (K,), s
+        Strictly increasing.
+    angle : ndarray, shape (K,), rad
+        Counter-clockwise seen from above; without jumps.
     up : ndarray, shape (3,)
         Unit vector along the axis, upwards, in body and in c.
     """

@@ -261,10 +261,12 @@ def imu_errors(
 
     Parameters
     ----------
-    gyro, accel : sequence of sequence of float
-        (3, 3); what is recorded = (I + matrix) what is true, scale factors on the diagonal.
-    g_sensitivity : sequence of sequence of float
-        (3, 3), (rad/s)/(m/s²): what each component of the specific force adds to the gyros.
+    gyro : sequence of sequence of float, shape (3, 3)
+        What is recorded = (I + matrix) what is true, scale factors on the diagonal.
+    g_sensitivity : sequence of sequence of float, shape (3, 3)
+        What each component of the specific force adds to the gyros, (rad/s)/(m/s²).
+    accel : sequence of sequence of float, shape (3, 3)
+        As `gyro`.
     """
 
     def fault(trial: Trial, rng: np.random.Generator) -> Trial:

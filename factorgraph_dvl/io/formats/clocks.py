@@ -39,13 +39,15 @@ def posix(
 
     Parameters
     ----------
-    year, month, day, hour, minute : (N,) integers
+    year, month, day, hour, minute : array_like of int, shape (N,) or ()
         Years of two digits are taken as 1980 to 2079.
-    second : (N,) floats
+    second : array_like, shape (N,) or ()
+        Seconds of the minute.
 
     Returns
     -------
-    (N,) seconds; nan where the time does not exist, as an unset clock writes it.
+    ndarray, shape (N,), s
+        Nan where the time does not exist, as an unset clock writes it.
     """
     year, month, day, hour, minute = (
         np.atleast_1d(np.asarray(part, np.int64)) for part in (year, month, day, hour, minute)
@@ -73,13 +75,16 @@ def in_order(second_of_day: Array, date: Array) -> Array:
 
     Parameters
     ----------
-    second_of_day : (N,) seconds of the day, in the order of their arrival; nan: unknown.
-    date : (N,) seconds since 1970 of the day's start; nan where it was not given.
+    second_of_day : ndarray, shape (N,), s
+        In the order of their arrival; nan where not known.
+    date : ndarray, shape (N,), s
+        Since 1970, of the day's start; nan where it was not given.
 
     Returns
     -------
-    (N,) seconds since 1970. The date in force is the last that was given, or the first,
-    plus one day for each passage of midnight since. All nan if there is no date.
+    ndarray, shape (N,), s
+        Since 1970. The date in force is the last that was given, or the first, plus one day for
+        each passage of midnight since. All nan if there is no date.
     """
     out = np.full(len(second_of_day), np.nan)
     at = np.flatnonzero(np.isfinite(second_of_day))

@@ -29,10 +29,13 @@ def from_beams(beams: Array, beam_angle: ArrayLike, convex: ArrayLike = True) ->
 
     Parameters
     ----------
-    beams : (N, 4) velocities along beams. One that is nan is replaced by what makes the
-        error velocity zero; the error velocity is then nan.
-    beam_angle : (N,) or scalar, from the vertical, rad.
-    convex : (N,) or scalar, whether beams point outwards.
+    beams : ndarray, shape (N, 4)
+        Velocities along beams. One that is nan is replaced by what makes the error velocity zero;
+        the error velocity is then nan.
+    beam_angle : array_like, shape (N,) or (), rad
+        From the vertical.
+    convex : array_like of bool, shape (N,) or ()
+        Whether beams point outwards.
     """
     lost = np.isnan(beams)
     one_lost = lost.sum(axis=1) == 1
@@ -84,13 +87,17 @@ def instrument_to_outer(
 
     Parameters
     ----------
-    coordinates : (N,) `BEAM`, `INSTRUMENT`, `SHIP` or `EARTH`. The first two give unity.
-    roll, pitch, heading : (N,) of the instrument, rad. Heading counts for `EARTH` only.
-    alignment : (N,) EA, beam 3 clockwise from the bow, rad; counts for `SHIP` only, as the
-        heading is beam 3's.
-    tilts_used : (N,) whether the instrument applied roll and pitch; an instrument that
-        looks up is turned over all the same.
-    up : (N,) whether it looks up.
+    coordinates : ndarray, shape (N,)
+        `BEAM`, `INSTRUMENT`, `SHIP` or `EARTH`. The first two give unity.
+    roll, pitch, heading : ndarray, shape (N,), rad
+        Of the instrument. Heading counts for `EARTH` only.
+    alignment : ndarray, shape (N,), rad
+        EA, beam 3 clockwise from the bow; counts for `SHIP` only, as the heading is beam 3's.
+    tilts_used : ndarray of bool, shape (N,)
+        Whether the instrument applied roll and pitch; an instrument that looks up is turned over
+        all the same.
+    up : ndarray of bool, shape (N,)
+        Whether it looks up.
     """
     count = len(roll)
     system = np.broadcast_to(np.asarray(coordinates), count)

@@ -107,7 +107,8 @@ def utc(records: dict[str, Records], kind: str) -> Array:
 
     Returns
     -------
-    (N,) seconds; nan if no sentence has a date.
+    ndarray, shape (N,), s
+        Nan if no sentence has a date.
     """
     wanted = records[kind]
     dated = [records[name] for name in ("RMC", "ZDA") if name != kind]

@@ -85,12 +85,15 @@ def vmdas_fixes(
     ----------
     data : Bytes
         What the ensembles lie in.
-    frames : (K, 2) starts and stops of ensembles.
-    begin, end, present : (K,) where the data type stands, as listed in the header.
+    frames : ndarray of int, shape (K, 2)
+        Starts and stops of ensembles.
+    begin, end, present : ndarray, shape (K,)
+        Where the data type stands, as listed in the header.
 
     Returns
     -------
-    (M,) records of `VMDAS`, nan where the flags call a value invalid.
+    Records, shape (M,)
+        Of type `VMDAS`; nan where the flags call a value invalid.
     """
     start, stop = frames[:, 0], frames[:, 1]
     # Some versions do not list it: it is then the last of the ensemble.
@@ -136,14 +139,17 @@ def embedded_sentences(
     ----------
     data : Bytes
         What the ensembles lie in.
-    identity, begin, end : (K, J) kind and place of each data type.
-    pings : (K,) records with `time`.
+    identity, begin, end : ndarray of int, shape (K, J)
+        Kind and place of each data type.
+    pings : Records, shape (K,)
+        With `time`.
     offset : int
         Position of `data` in the file.
 
     Returns
     -------
-    dict of str to Records, as `read_nmea` returns them.
+    dict of str to Records
+        As `read_nmea` returns them.
     """
     parts: dict[str, list[tuple[object, ...]]] = {name: [] for name in KINDS}
     where = np.nonzero((identity == _GENERAL) | np.isin(identity, _TEXT))

@@ -48,9 +48,11 @@ def write_convergence_figures(
     Parameters
     ----------
     time : ndarray, shape (H,), s
+        Of the updates.
     values, std : ndarray, shape (H, n)
         What was known then, in the order of `estimates`.
     latency : ndarray, shape (H,), s
+        Time that each update took.
     estimates : sequence of Estimate
         At the end.
     truth : mapping of str to array_like
@@ -82,7 +84,8 @@ def convergence_figure(
 
     Parameters
     ----------
-    time, values, std, estimates, truth : see `write_convergence_figures`.
+    time, values, std, estimates, truth : ndarray, sequence of Estimate, mapping
+        As of `write_convergence_figures`.
     good_since : float
         A moment to mark, s; nan for none.
     """

@@ -54,7 +54,8 @@ def write_crosscheck_figures(check: CrossCheck, folder: Path) -> list[Path]:
 
     Returns
     -------
-    Paths of the files: `parameters.png`, `differences.png`, `errors.png`.
+    list of Path
+        The files: `parameters.png`, `differences.png`, `errors.png`.
     """
     folder.mkdir(parents=True, exist_ok=True)
     figures = {}

@@ -38,8 +38,9 @@ def write_figures(trial: Trial | PlanarTrial, solution: Solution, folder: Path) 
 
     Returns
     -------
-    Paths of the files: `track.png`, `motion.png`, `<sensor>_residuals.png` of each
-    sensor with residuals, `beam_quality.png`, `calibration.png`, `correlation.png`.
+    list of Path
+        The files: `track.png`, `motion.png`, `<sensor>_residuals.png` of each sensor with
+        residuals, `beam_quality.png`, `calibration.png`, `correlation.png`.
     """
     folder.mkdir(parents=True, exist_ok=True)
     thinned = replace(solution, trajectory=_thinned(solution.trajectory))
