@@ -1,4 +1,4 @@
-"""Smoothing by iSAM2, with or without a lag: the newest state at the root of the tree.
+"""Smoothing by iSAM2, with or without a lag: newest state at the root, the oldest a leaf.
 
 `gtsam.IncrementalFixedLagSmoother` eliminates its whole window anew at every update, because
 it leaves the order of the variables in it open. With the newest state and the calibration
