@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.special import chdtrc
@@ -14,13 +14,17 @@ from factorgraph_dvl.geometry.unit_vectors import turned
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.sensors.catalogue import specs_of
-from factorgraph_dvl.sensors.finding import Code, Finding
+from factorgraph_dvl.sensors.finding import Code, Finding, Verdict, verdict_of
+from factorgraph_dvl.sensors.grades import DEFAULT_LIMITS, Grade, grades
 from factorgraph_dvl.sensors.parameters import SCALAR, Parameter, ParameterSpec
 from factorgraph_dvl.sensors.protocol import DO_NOT_FIT, TOO_LARGE
 
 # Called on the way to a solution: with the stage, what is counted in it, and the cost if any.
 Progress = Callable[[str, int, float | None], None]
 
+# Stems of the parameters that every dead-reckoned track depends on; of a lever arm it only
+# does in turns.
+DEAD_RECKONING = ("misalignment", "scale_error", "beam_direction", "beam_scale_error")
 _FAR_FROM_PRIOR = 5.0
 # Evidence against a minimum with which it is not worth a word: its probability is e^-15.
 _IMPOSSIBLE = 15.0
@@ -178,8 +182,68 @@ class Hypothesis:
     history: Array
 
 
+class Judged:
+    """What a result's findings and standard deviations amount to."""
+
+    converged: bool
+    iterations: int
+    estimates: tuple[Estimate, ...]
+    findings: tuple[Finding, ...]
+    limits: Mapping[str, float]
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """The reasons of the verdict as texts."""
+        return tuple(map(str, self.verdict.reasons))
+
+    @property
+    def order(self) -> tuple[str, ...]:
+        """Component names of the rows of `covariance`."""
+        return tuple(name for e in self.estimates for name in e.component_names)
+
+    @property
+    def grades(self) -> dict[str, tuple[Grade, ...]]:
+        """Grade of each component of each parameter, by reported name."""
+        return {
+            e.name: grades(e.std, e.observable, self.limits.get(e.name, np.inf))
+            for e in self.estimates
+        }
+
+    @property
+    def verdict(self) -> Verdict:
+        """Whether the result can be used, from its findings and grades."""
+        found = [*self.findings, *self._uncertain()]
+        if not self.converged and not any(f.severity == "error" for f in found):
+            text = f"the solver did not converge in {self.iterations} iterations"
+            found.append(Finding(Code.NOT_CONVERGED, text))
+        return verdict_of(found)
+
+    def _uncertain(self) -> list[Finding]:
+        """Return a finding for each misalignment or scale error that is red, or unknown.
+
+        A component that the trial did not determine, but that was known well enough before it,
+        is no reason.
+        """
+        out = []
+        said = {f.parameter for f in self.findings if f.code == Code.UNCERTAIN}
+        own = self.grades
+        for e in self.estimates:
+            limit = self.limits.get(e.name)
+            if limit is None or e.name in said or e.spec.stem not in DEAD_RECKONING:
+                continue
+            poor = [
+                f"{name} (±{std:.2g})"
+                for name, std, grade in zip(e.component_names, e.std, own[e.name], strict=True)
+                if grade in ("red", "grey") and std > limit
+            ]
+            if poor:
+                text = f"{', '.join(poor)} above the limit of {limit:g} {e.spec.unit}".rstrip()
+                out.append(Finding(Code.UNCERTAIN, text, parameter=e.name))
+        return out
+
+
 @dataclass(frozen=True)
-class Solution:
+class Solution(Judged):
     """What a solver found.
 
     Parameters
@@ -211,6 +275,8 @@ class Solution:
         Measurements that are none, such as echoes.
     inputs : tuple of str, optional
         Fingerprints of the data that it came from.
+    limits : mapping of str to float, optional
+        Standard deviations that are good enough, by parameter, in reported units.
     """
 
     trial: str
@@ -227,16 +293,7 @@ class Solution:
     hypotheses: tuple[Hypothesis, ...] = ()
     rejected: tuple[Residuals, ...] = ()
     inputs: tuple[str, ...] = ()
-
-    @property
-    def warnings(self) -> tuple[str, ...]:
-        """The findings as texts."""
-        return tuple(map(str, self.findings))
-
-    @property
-    def order(self) -> tuple[str, ...]:
-        """Component names of the rows of `covariance`."""
-        return tuple(name for e in self.estimates for name in e.component_names)
+    limits: Mapping[str, float] = field(default_factory=lambda: DEFAULT_LIMITS)
 
     def with_findings(self, findings: Iterable[Finding]) -> Solution:
         """Return the solution with findings before its own, each once."""
@@ -257,7 +314,7 @@ class Solution:
 
 
 @dataclass(frozen=True)
-class Calibration:
+class Calibration(Judged):
     """What a solver found of the sensors alone; the fields are those of `Solution`."""
 
     trial: str
@@ -270,16 +327,7 @@ class Calibration:
     covariance: Array
     findings: tuple[Finding, ...] = ()
     inputs: tuple[str, ...] = ()
-
-    @property
-    def warnings(self) -> tuple[str, ...]:
-        """The findings as texts."""
-        return tuple(map(str, self.findings))
-
-    @property
-    def order(self) -> tuple[str, ...]:
-        """Component names of the rows of `covariance`."""
-        return tuple(name for e in self.estimates for name in e.component_names)
+    limits: Mapping[str, float] = field(default_factory=lambda: DEFAULT_LIMITS)
 
     @property
     def values(self) -> dict[str, Array]:

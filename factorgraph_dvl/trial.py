@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import ClassVar
@@ -21,6 +22,7 @@ from factorgraph_dvl.sensors.dvl_beams import BEAM_PREFIX, DvlBeams
 from factorgraph_dvl.sensors.finding import Finding
 from factorgraph_dvl.sensors.fingerprint import fingerprints, shared
 from factorgraph_dvl.sensors.gnss import Gnss
+from factorgraph_dvl.sensors.grades import DEFAULT_LIMITS
 from factorgraph_dvl.sensors.imu import Imu
 from factorgraph_dvl.sensors.protocol import Aid, NoiseModel, SensorRecord
 from factorgraph_dvl.sensors.speed_log import Heading, SpeedLog
@@ -112,6 +114,8 @@ class Trial:
         simulations.
     notes : tuple of Finding, optional
         What was noticed while loading, for the user.
+    limits : mapping of str to float, optional
+        Standard deviations that are good enough, by parameter, in reported units.
     """
 
     name: str
@@ -127,6 +131,7 @@ class Trial:
     reference: Reference | None = None
     calibration_truth: dict[str, Array] = field(default_factory=dict)
     notes: tuple[Finding, ...] = ()
+    limits: Mapping[str, float] = field(default_factory=lambda: DEFAULT_LIMITS)
 
     def __post_init__(self) -> None:
         # What a sensor must know of another is set here, whoever made or changed the trial.

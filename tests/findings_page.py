@@ -11,7 +11,11 @@ from factorgraph_dvl.sensors.finding import UNUSABLE, Code
 
 DOCUMENT = Path(__file__).parent.parent / "docs" / "findings.md"
 BEGIN, END = "<!-- findings: begin -->", "<!-- findings: end -->"
-HEAD = ["| code | what it means | why it matters | what to do |", "|---|---|---|---|"]
+HEAD = [
+    "| code | verdict | what it means | why it matters | what to do |",
+    "|---|---|---|---|---|",
+]
+VERDICTS = {"note": "–", "warning": "doubtful", "error": "do not use"}
 
 
 def drawn() -> str:
@@ -24,7 +28,8 @@ def drawn() -> str:
         if name:
             code = Code[name]
             mark = " *refused*" if code in UNUSABLE else ""
-            lines.append(f"| `{code}`{mark} | {code.meaning} | {code.why} | {code.action} |")
+            texts = (VERDICTS[code.severity], code.meaning, code.why, code.action)
+            lines.append(f"| `{code}`{mark} | {' | '.join(texts)} |")
     return "\n".join([*lines, "", END])
 
 

@@ -11,15 +11,8 @@ from numpy.typing import ArrayLike
 from factorgraph_dvl.analysis.error_statistics import true_value_of
 from factorgraph_dvl.errors import ConfigError
 from factorgraph_dvl.geometry.vectors import Array
-from factorgraph_dvl.sensors.catalogue import every_spec
 from factorgraph_dvl.solution import Estimate
 from factorgraph_dvl.trial import Trial
-
-# Standard deviations and errors that are good enough, by parameter, in reported units.
-GOOD_STD: dict[str, float] = {
-    spec.name: spec.good_std for spec in every_spec() if spec.good_std is not None
-}
-GOOD_ERROR: dict[str, float] = {name: 2.0 * std for name, std in GOOD_STD.items()}
 
 
 @dataclass(frozen=True)

@@ -101,6 +101,7 @@ def summarise(
         trajectory=trajectory_of(trial, navigation, rate_hz),
         residuals=all_residuals,
         findings=found,
+        limits=trial.limits,
     )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from enum import StrEnum
 from pathlib import Path
 from time import perf_counter
@@ -76,28 +77,24 @@ def replay(
     quiet: Quiet = False,
 ) -> None:
     """Feed a trial in the order of time, and show what was known when."""
-    from factorgraph_dvl.analysis.convergence import (
-        GOOD_ERROR,
-        GOOD_STD,
-        check_limits,
-        convergence,
-    )
+    from factorgraph_dvl.analysis.convergence import check_limits, convergence
     from factorgraph_dvl.io.solution_folder import OWNED
     from factorgraph_dvl.io.trial_folder import inputs_of, load_trial
 
     std_asked = _limits("--good-std", good_std)
     error_asked = _limits("--good-error", good_error)
-    std_limits, error_limits = GOOD_STD | std_asked, GOOD_ERROR | error_asked
     claim_output(out, force=force, owned=OWNED, inputs=inputs_of(trial_path))
     # Where nothing can be drawn over, lines of progress say as much.
     live = live and stderr().is_terminal
     with ProgressLine(quiet=quiet or live) as progress:
         trial = load_trial(trial_path)
         check_limits(trial, (*std_asked, *error_asked))
-        good = std_limits if live else None
+        trial = replace(trial, limits={**trial.limits, **std_asked})
+        # Two standard deviations hold 95 % of the errors.
+        error_limits = {name: 2.0 * std for name, std in trial.limits.items()} | error_asked
         errors = errors_in(trial, anyway=anyway)
         with explaining(errors):
-            solution, record = _run(trial, smoother.value, lag, rate, progress, good)
+            solution, record = _run(trial, smoother.value, lag, rate, progress, live=live)
         solution = solution.with_findings(errors)
         found = convergence(
             record.time,
@@ -106,7 +103,7 @@ def replay(
             record.inconsistent,
             solution.estimates,
             trial.calibration_truth,
-            std_limits,
+            trial.limits,
             error_limits,
         )
         progress("write", 0, None)
@@ -156,9 +153,10 @@ def _run(
     lag: float,
     rate: float,
     progress: ProgressLine,
-    good_std: dict[str, float] | None,
+    *,
+    live: bool,
 ) -> tuple[Solution, ReplayRecord]:
-    """Run the replay; with limits, show whether they are kept as it goes."""
+    """Run the replay; if live, show what is known and whether it is good enough as it goes."""
     from factorgraph_dvl.replay import KINDS, Update
     from factorgraph_dvl.replay import replay as run
 
@@ -170,7 +168,7 @@ def _run(
     def speed(update: Update) -> float:
         return (update.time - first) / max(perf_counter() - began, 1e-9)
 
-    if good_std is not None:
+    if live:
         from rich.live import Live
 
         from factorgraph_dvl.analysis.convergence import lacking
@@ -184,7 +182,7 @@ def _run(
 
             def show(update: Update) -> None:
                 nonlocal shown, since
-                bad = lacking(update.calibration.estimates, good_std)
+                bad = lacking(update.calibration.estimates, trial.limits)
                 if bad or update.inconsistent:
                     since = None
                 elif since is None:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -18,14 +19,16 @@ from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.sensors.catalogue import specs_of
 from factorgraph_dvl.sensors.dvl import CALIBRATED
-from factorgraph_dvl.sensors.finding import Code, Finding
+from factorgraph_dvl.sensors.finding import Code, Finding, Severity, VerdictGrade
 from factorgraph_dvl.sensors.fingerprint import PATTERN
+from factorgraph_dvl.sensors.grades import DEFAULT_LIMITS, Grade
 from factorgraph_dvl.settings.files import MEGABYTE, read_bytes
 from factorgraph_dvl.settings.ranges import out_of_range
 from factorgraph_dvl.solution import Calibration, Estimate, Solution
 
 CALIBRATION_FILE = "calibration.json"
 
+_CODES = {str(code): code for code in Code}
 # The covariance of some hundred parameters.
 _MAX_BYTES = 64 * MEGABYTE
 # Of a variance, for files with few digits.
@@ -43,6 +46,7 @@ class _Parameter(msgspec.Struct):
     observable: list[bool | list[bool]]
     prior_value: _Entries = []
     prior_std: _Entries = []
+    grade: list[Grade | list[Grade]] = []
 
 
 class _Covariance(msgspec.Struct):
@@ -52,10 +56,23 @@ class _Covariance(msgspec.Struct):
 
 class _Finding(msgspec.Struct):
     code: str
-    severity: Literal["warning", "error"]
+    severity: Literal["note", "warning", "error"]
     sensor: str
     parameter: str
     text: str
+
+
+class _Reason(msgspec.Struct):
+    code: str
+    text: str
+    sensor: str = ""
+    parameter: str = ""
+    action: str = ""
+
+
+class _Verdict(msgspec.Struct):
+    grade: VerdictGrade
+    reasons: list[_Reason] = []
 
 
 class _File(msgspec.Struct):
@@ -66,6 +83,8 @@ class _File(msgspec.Struct):
     iterations: int
     parameters: dict[str, _Parameter]
     covariance: _Covariance
+    verdict: _Verdict | UnsetType = UNSET
+    limits: dict[str, float] | UnsetType = UNSET
     cost: float | None = None
     body_axes: BodyAxes | UnsetType = UNSET
     warnings: list[str] = []
@@ -95,7 +114,7 @@ def load_calibration(path: Path | str, *, body_axes: BodyAxes = "RFU") -> Calibr
     names = iter([printable(file.covariance.order[i]) for i in rows])
     covariance = _covariance(file)[np.ix_(rows, rows)]
     _check_std(file, covariance, str(path))
-    return Calibration(
+    found = Calibration(
         trial=printable(file.trial),
         solver=printable(file.solver),
         body_axes=body_axes if file.body_axes is UNSET else file.body_axes,
@@ -108,35 +127,79 @@ def load_calibration(path: Path | str, *, body_axes: BodyAxes = "RFU") -> Calibr
         covariance=covariance,
         findings=tuple(_findings(file)),
         inputs=tuple(file.inputs),
+        limits=_limits(file, str(path)),
     )
+    return found if isinstance(file.verdict, UnsetType) else _with_verdict(found, file.verdict)
+
+
+def _limits(file: _File, source: str) -> Mapping[str, float]:
+    if isinstance(file.limits, UnsetType):
+        return DEFAULT_LIMITS
+    for name, limit in file.limits.items():
+        if not limit > 0.0:
+            raise DataError(
+                f"limits: {printable(name)} is {limit:g}", where=source, expected="above 0"
+            )
+    return file.limits
 
 
 def _findings(file: _File) -> Iterator[Finding]:
     """Yield the findings of a file, and the warnings of one that has no findings."""
-    known = {str(code): code for code in Code}
     for f in file.findings:
-        code = known.get(f.code, Code.UNCLASSIFIED)
-        text, sensor, parameter = map(printable, (f.text, f.sensor, f.parameter))
-        yield Finding(code, text, sensor, parameter, f.severity)
-    if not file.findings:
+        # Before there were verdicts, whatever was no error was called a warning.
+        old = file.verdict is UNSET and f.severity != "error"
+        yield _finding(f, None if old else f.severity)
+    if not file.findings and file.verdict is UNSET:
         yield from (Finding(Code.UNCLASSIFIED, printable(text)) for text in file.warnings)
 
 
-def check_usable(calibration: Calibration, body_axes: BodyAxes, source: str) -> None:
-    """Raise DataError unless a calibration converged, is in these body axes, and is one."""
+def _with_verdict(calibration: Calibration, stated: _Verdict) -> Calibration:
+    """Return a calibration with what its file's verdict says beyond the findings."""
+    severity: Severity = "error" if stated.grade == "do not use" else "warning"
+    own = calibration.verdict
+    said = {(f.code, f.text) for f in own.reasons}
+    found = [_finding(reason, severity) for reason in stated.reasons]
+    more = [f for f in found if (f.code, f.text) not in said]
+    if severity == "error" and own.grade != stated.grade and not more:
+        more = [Finding(Code.UNCLASSIFIED, "no reason is given", severity="error")]
+    return replace(calibration, findings=(*calibration.findings, *more))
+
+
+def _finding(stored: _Finding | _Reason, severity: Severity | None) -> Finding:
+    code = _CODES.get(stored.code, Code.UNCLASSIFIED)
+    text, sensor, parameter = map(printable, (stored.text, stored.sensor, stored.parameter))
+    return Finding(code, text, sensor, parameter, severity or code.severity)
+
+
+def check_usable(
+    calibration: Calibration, body_axes: BodyAxes, source: str, *, anyway: bool = False
+) -> None:
+    """Raise DataError unless a calibration is one, and is in these body axes.
+
+    And unless it is fit to be used, or to be used `anyway`.
+    """
     for e in calibration.estimates:
         if e.name in CALIBRATED:
             check_values(e.name, e.value, source)
-    if not calibration.converged:
-        raise DataError(
-            "the calibration did not converge, its numbers are not to be used", where=source,
-            expected="`converged` true",
-        )  # fmt: skip
+    check_verdict(calibration, source, anyway=anyway)
     if calibration.body_axes != body_axes:
         raise DataError(
             f"the calibration is in {calibration.body_axes} axes", where=source,
             expected=f"{body_axes}, as the trial has them",
         )  # fmt: skip
+
+
+def check_verdict(result: Solution | Calibration, source: str, *, anyway: bool = False) -> None:
+    """Raise DataError if a result is graded `do not use`, unless it is used `anyway`."""
+    verdict = result.verdict
+    if verdict.grade == "do not use" and not anyway:
+        reason = verdict.reasons[0]
+        raise DataError(
+            f"the calibration is graded `do not use`: {reason}",
+            where=source,
+            expected="a calibration graded good or doubtful",
+            hint=f"{reason.code.action} To use it all the same, add --anyway",
+        )
 
 
 def check_values(name: str, value: Array, source: str) -> None:
@@ -160,22 +223,25 @@ def encode_calibration(solution: Solution | Calibration) -> bytes:
         solver=solution.solver,
         converged=bool(solution.converged),
         iterations=int(solution.iterations),
-        parameters={e.name: _parameter(e) for e in solution.estimates},
+        parameters={e.name: _parameter(e, solution.grades[e.name]) for e in solution.estimates},
         covariance=_Covariance(
             list(solution.order), [_numbers(row) for row in np.asarray(solution.covariance)]
         ),
         cost=float(solution.cost),
         body_axes=solution.body_axes,
-        warnings=list(map(str, solution.findings)),
+        verdict=_Verdict(
+            solution.verdict.grade,
+            [
+                _Reason(f.code, f.text, f.sensor, f.parameter, f.code.action)
+                for f in solution.verdict.reasons
+            ],
+        ),
+        limits=dict(solution.limits),
+        warnings=list(solution.warnings),
         findings=[
-            _Finding(
-                f.code,
-                "error" if f.severity == "error" else "warning",
-                f.sensor,
-                f.parameter,
-                f.text,
-            )
+            _Finding(f.code, f.severity, f.sensor, f.parameter, f.text)
             for f in solution.findings
+            if f.severity != "ok"
         ],
         inputs=list(solution.inputs),
     )
@@ -183,13 +249,13 @@ def encode_calibration(solution: Solution | Calibration) -> bytes:
     return msgspec.json.format(msgspec.json.encode(calibration), indent=2) + b"\n"
 
 
-def _parameter(e: Estimate) -> _Parameter:
+def _parameter(e: Estimate, grades: tuple[Grade, ...]) -> _Parameter:
     value, prior_value, shape = e.value, e.prior_value, np.shape(e.std)
     if e.nominal is not None:
         value, prior_value, shape = e.directions, e.nominal, (-1, 2)
     entries: list[Any] = [
         np.reshape(x, shape).tolist()
-        for x in (e.std, np.asarray(e.observable, dtype=bool), e.prior_std)
+        for x in (e.std, np.asarray(e.observable, dtype=bool), e.prior_std, grades)
     ]
     return _Parameter(
         value=np.asarray(value).tolist(),
@@ -197,6 +263,7 @@ def _parameter(e: Estimate) -> _Parameter:
         observable=entries[1],
         prior_value=np.asarray(prior_value).tolist(),
         prior_std=entries[2],
+        grade=entries[3],
     )
 
 

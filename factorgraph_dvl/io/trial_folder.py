@@ -27,6 +27,7 @@ from factorgraph_dvl.io.motion_table import motion_columns, read_reference
 from factorgraph_dvl.io.tables import read_table, write_table
 from factorgraph_dvl.io.trial_yaml import (
     InitialSettings,
+    LimitSettings,
     PlanarInitialSettings,
     PlanarSettings,
     PositionSettings,
@@ -39,6 +40,7 @@ from factorgraph_dvl.sensors.dvl import CALIBRATED, Dvl
 from factorgraph_dvl.sensors.dvl_beams import DvlBeams
 from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.sensors.gnss import Gnss
+from factorgraph_dvl.sensors.grades import DEFAULT_LIMITS
 from factorgraph_dvl.sensors.imu import Imu
 from factorgraph_dvl.sensors.parameters import JointPrior
 from factorgraph_dvl.sensors.protocol import Aid, SensorRecord, SensorSection
@@ -131,6 +133,7 @@ def load_trial(path: Path | str) -> Trial:
         reference=reference_of(folder, settings),
         calibration_truth=read_truth(folder / TRUTH_FILE),
         notes=tuple(notes),
+        limits={**DEFAULT_LIMITS, **({} if settings.limits is UNSET else settings.limits.stated)},
     )
 
 
@@ -422,11 +425,17 @@ def _settings(trial: Trial, suffix: str) -> TrialSettings:
             )
             for record in (trial.imu, *trial.aids)
         },
+        limits=_limits(trial),
         initial=_initial(trial),
         reference=(
             UNSET if trial.reference is None else ReferenceSettings(file=f"reference{suffix}")
         ),
     )
+
+
+def _limits(trial: Trial) -> LimitSettings | msgspec.UnsetType:
+    stated = {n: limit for n, limit in trial.limits.items() if limit != DEFAULT_LIMITS.get(n)}
+    return LimitSettings(**stated) if stated else UNSET
 
 
 def _initial(trial: Trial) -> InitialSettings | msgspec.UnsetType:

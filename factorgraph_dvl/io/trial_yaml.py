@@ -14,7 +14,7 @@ from factorgraph_dvl.sensors.depth import DepthSettings
 from factorgraph_dvl.sensors.imu import ImuSettings
 from factorgraph_dvl.sensors.protocol import NoiseModel, SensorSection
 from factorgraph_dvl.sensors.speed_log import HeadingSettings, LogSettings
-from factorgraph_dvl.settings.sections import Section, Sigma3, check_epoch
+from factorgraph_dvl.settings.sections import Positive, Section, Sigma3, check_epoch
 
 _Pitch = Annotated[float, Meta(ge=-90, le=90)]
 
@@ -47,6 +47,22 @@ class ReferenceSettings(Section, frozen=True, kw_only=True):
     file: str = "reference.csv"
 
 
+class LimitSettings(Section, frozen=True, kw_only=True):
+    """Section `limits` of trial.yaml: standard deviations that are good enough."""
+
+    misalignment_deg: Positive | UnsetType = UNSET
+    scale_error: Positive | UnsetType = UNSET
+    lever_arm_m: Positive | UnsetType = UNSET
+    beam_direction_b: Positive | UnsetType = UNSET
+    beam_scale_error: Positive | UnsetType = UNSET
+
+    @property
+    def stated(self) -> dict[str, float]:
+        """Limits by parameter, without those that are unset."""
+        found = msgspec.structs.asdict(self)
+        return {name: limit for name, limit in found.items() if limit is not UNSET}
+
+
 class PlanarInitialSettings(Section, frozen=True, kw_only=True):
     """Section `initial` of a planar trial.yaml."""
 
@@ -74,6 +90,7 @@ class _Settings(Section, frozen=True, kw_only=True):
     epoch: str = ""
     noise: NoiseModel = "estimated"
     imu: ImuSettings
+    limits: LimitSettings | UnsetType = UNSET
     initial: InitialSettings | UnsetType = UNSET
     reference: ReferenceSettings | UnsetType = UNSET
 

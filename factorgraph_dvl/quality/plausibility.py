@@ -193,7 +193,10 @@ def _axes_findings(imu: Imu, body_axes: BodyAxes) -> Iterator[Finding]:
         yield Finding(Code.BODY_AXES, f"{text}: {question}", "IMU", severity="error")
     else:
         yield Finding(
-            Code.BODY_AXES, f"{text}: is the IMU mounted {tilt:.0f} deg off level?", "IMU"
+            Code.BODY_AXES,
+            f"{text}: is the IMU mounted {tilt:.0f} deg off level?",
+            "IMU",
+            severity="warning",
         )
 
 
@@ -341,7 +344,8 @@ def _dvl_findings(
     locked = dvl.locked
     lock, positive = terms
     if not locked.any():
-        yield Finding(Code.NO_MEASUREMENT, f"there is no ping with {lock}", dvl.label)
+        text = f"there is no ping with {lock}"
+        yield Finding(Code.NO_MEASUREMENT, text, dvl.label, severity="warning")
         return
     velocity = dvl.velocity[locked]
     std = float(np.median(dvl.sigma()[locked]))

@@ -25,7 +25,7 @@ def beam_findings(beams: DvlBeams) -> Iterator[Finding]:
             Code.BEAMS_LOST,
             f"lost at {shares} % of the pings, beam by beam",
             beams.label,
-            severity="warning" if lost.max() > _MOSTLY else "ok",
+            severity="note" if lost.max() > _MOSTLY else "ok",
         )
     yield from _agreement(beams)
 

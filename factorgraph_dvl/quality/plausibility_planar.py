@@ -32,7 +32,7 @@ def planar_findings(trial: PlanarTrial) -> Iterator[Finding]:
     for record, values in ((heading, heading.heading), (log, log.speed), (depth, depth.depth)):
         text = _gaps(record.time[~np.isnan(values)])
         if text:
-            yield Finding(Code.GAPS, text, record.label)
+            yield Finding(Code.GAPS, text, record.label, severity="warning")
     psi = heading.heading[~np.isnan(heading.heading)] / DEG
     if psi.size > 2 and np.abs(psi).max() <= 2.0 * np.pi:
         noise = float(np.median(np.abs(np.diff(psi))))

@@ -154,4 +154,5 @@ def _solution(trial: Trial, run: Replay, recorder: Recorder, last: Update) -> So
         trajectory=recorder.trajectory(),
         residuals=residuals,
         findings=tuple(findings),
+        limits=trial.limits,
     )

@@ -36,11 +36,11 @@ VELOCITY_COLUMNS = ("vel_x_m_s", "vel_y_m_s", "vel_z_m_s")
 STD_COLUMNS = ("std_x_m_s", "std_y_m_s", "std_z_m_s")
 
 MISALIGNMENT_SPEC = ParameterSpec(
-    "misalignment", "deg", kind="rotation", frame="b", place=2, good_std=0.03
+    "misalignment", "deg", kind="rotation", frame="b", place=2, limit=0.1
 )
-SCALE_SPEC = ParameterSpec("scale_error", labels=SCALAR, place=3, good_std=3e-4, above=-1.0)
+SCALE_SPEC = ParameterSpec("scale_error", labels=SCALAR, place=3, limit=1e-3, above=-1.0)
 SCALES_SPEC = replace(SCALE_SPEC, labels=XYZ, frame="d")
-LEVER_ARM_SPEC = ParameterSpec("lever_arm", "m", frame="b", place=4, good_std=0.03)
+LEVER_ARM_SPEC = ParameterSpec("lever_arm", "m", frame="b", place=4, limit=0.1)
 BIAS_SPEC = ParameterSpec("dvl_bias", "m_s", frame="d")
 TIME_OFFSET_SPEC = ParameterSpec("time_offset", "s", labels=SCALAR)
 CURRENT_SPEC = ParameterSpec("current", "m_s", labels=("e", "n"), frame="n")

@@ -36,14 +36,14 @@ def direction_spec(count: int) -> ParameterSpec:
     """Return what the directions of so many beams are."""
     labels = tuple(f"{i}{axis}" for i in range(1, count + 1) for axis in "xy")
     return ParameterSpec(
-        "beam_direction", "deg", labels, kind="directions", frame="b", place=0, good_std=0.03
+        "beam_direction", "deg", labels, kind="directions", frame="b", place=0, limit=0.1
     )
 
 
 def scale_spec(count: int) -> ParameterSpec:
     """Return what the scale errors of so many beams are."""
     labels = tuple(str(i) for i in range(1, count + 1))
-    return ParameterSpec("beam_scale_error", "", labels, place=1, good_std=3e-4, above=-1.0)
+    return ParameterSpec("beam_scale_error", "", labels, place=1, limit=1e-3, above=-1.0)
 
 
 def of_beams(spec: ParameterSpec, prefix: str) -> ParameterSpec:
@@ -51,7 +51,7 @@ def of_beams(spec: ParameterSpec, prefix: str) -> ParameterSpec:
     stem = f"{prefix}{spec.stem}"
     if stem == scale_spec(1).stem:
         return replace(scale_spec(1), labels=SCALAR)
-    return replace(spec, stem=stem, place=None, good_std=None) if prefix else spec
+    return replace(spec, stem=stem, place=None, limit=None) if prefix else spec
 
 
 # Names of the parameters of beams that have directions and scales of their own.

@@ -5,13 +5,18 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Literal, Self
+from typing import Literal, Self, cast
 
-Severity = Literal["ok", "warning", "error"]
+# A check that was passed; something to know; a reason to doubt a result; one not to use it.
+Severity = Literal["ok", "note", "warning", "error"]
+VerdictGrade = Literal["good", "doubtful", "do not use"]
 
 
 class Code(StrEnum):
     """Stable names of findings: what each means, why it matters, and what to do about it.
+
+    They stand in the order in which a verdict lists its reasons: causes before symptoms. Each
+    has a severity, which a finding may override.
 
     `python tests/findings_page.py` writes them to docs/findings.md, in the groups of the
     comments.
@@ -20,15 +25,24 @@ class Code(StrEnum):
     meaning: str
     why: str
     action: str
+    severity: Severity
 
-    def __new__(cls, value: str, meaning: str, why: str, action: str) -> Self:
-        """Return a code with its meaning, why it matters, and the action."""
+    def __new__(
+        cls, value: str, meaning: str, why: str, action: str, severity: Severity = "warning"
+    ) -> Self:
+        """Return a code with its meaning, why it matters, the action and the usual severity."""
         code = str.__new__(cls, value)
         code._value_ = value
         code.meaning = meaning
         code.why = why
         code.action = action
+        code.severity = severity
         return code
+
+    @property
+    def rank(self) -> int:
+        """Place among the reasons of a verdict."""
+        return list(Code).index(self)
 
     # Clocks and gaps.
     TIME_UNIT = (
@@ -36,24 +50,28 @@ class Code(StrEnum):
         "The samples are too far apart, or too close together, for an IMU.",
         "Every rate, noise density and lag in the trial is per second: nothing can be solved.",
         "Write time_s in seconds.",
+        "error",
     )
     NO_OVERLAP = (
         "no_overlap",
         "A sensor measured nothing while the others did.",
         "Nothing ties the sensor to the motion: it cannot be used.",
         "Write all time_s by one clock, in seconds.",
+        "error",
     )
     PARTIAL_OVERLAP = (
         "partial_overlap",
         "Record and IMU cover each other only in part; the rest is not used.",
         "The calibration rests on less data than the files hold.",
         "Check the clocks, or record all sensors at once.",
+        "note",
     )
     GAPS = (
         "gaps",
         "A record has gaps.",
         "Nothing is measured there: standard deviations grow, and turns in a gap are lost.",
         "Check the logger; of a planar trial keep straight on during a gap.",
+        "note",
     )
     CLOCK_RESTARTED = (
         "clock_restarted",
@@ -72,18 +90,21 @@ class Code(StrEnum):
         "The IMU's record has a gap, which the inertial chain does not bridge.",
         "Each part has biases in common but a motion of its own, known less well at its ends.",
         "Nothing, if the rest is long enough; else record anew.",
+        "note",
     )
     LOST_SAMPLES = (
         "lost_samples",
         "Few lost samples of the IMU were interpolated.",
         "The motion in between is a guess, good while the gaps are few samples long.",
         "Nothing, if they are few.",
+        "note",
     )
     UNUSED = (
         "unused",
         "Measurements were not used.",
         "The calibration rests on less data than the files hold.",
         "Check the clocks; the text says how many there are, and why.",
+        "note",
     )
     # What a record holds.
     NO_MEASUREMENT = (
@@ -91,12 +112,14 @@ class Code(StrEnum):
         "A record holds no measurement.",
         "A sensor that measured nothing adds nothing: most often a conversion failed.",
         "Remove its section from trial.yaml, or correct the record.",
+        "error",
     )
     MISSING = (
         "missing",
         "More than half of the rows hold no measurement.",
         "Parameters are known less well, and what is left may be the doubtful part.",
         "Check bottom lock, fixes and the conversion of the record.",
+        "note",
     )
     COUNTED_TWICE = (
         "counted_twice",
@@ -110,54 +133,63 @@ class Code(StrEnum):
         "The specific force is not about 9.8 m/s².",
         "Velocity and attitude follow from the force: the solution would be wrong throughout.",
         "Convert it to m/s², with gravity.",
+        "error",
     )
     BODY_AXES = (
         "body_axes",
         "Gravity does not point where body_axes says.",
         "Roll, pitch and all lever arms would be those of other axes.",
         "Correct body_axes, or the sign of the force.",
+        "error",
     )
     GYRO_UNIT = (
         "gyro_unit",
         "The angular rate does not turn the specific force as it should.",
         "Attitude follows from the rate: the solution would be wrong throughout.",
         "Convert it to rad/s, in the axes of the force.",
+        "error",
     )
     GYRO_FROZEN = (
         "gyro_frozen",
         "The angular rate is zero throughout.",
         "Without rates there is neither attitude nor lever arm.",
         "Correct the record.",
+        "error",
     )
     ZERO_FIXES = (
         "zero_fixes",
         "Some fixes are at latitude and longitude 0.",
         "A fix that was lost would draw the track into the Gulf of Guinea.",
         "Leave the cells of lost fixes empty.",
+        "error",
     )
     RADIANS = (
         "radians",
         "Latitude and longitude look like radians.",
         "The track would be 57 times too short, and near latitude and longitude 0.",
         "Convert them to degrees.",
+        "error",
     )
     GNSS_VELOCITY = (
         "gnss_velocity",
         "GNSS velocities disagree with the differences of positions.",
         "Heading, misalignment and scale error follow from this velocity.",
         "Correct unit, order or sign of the velocity.",
+        "error",
     )
     DVL_UNIT = (
         "dvl_unit",
         "The DVL's speed is far from that of the GNSS.",
         "The unit would be taken for a scale error.",
         "Convert it to m/s.",
+        "error",
     )
     DVL_FROZEN = (
         "dvl_frozen",
         "The DVL's velocity never changes.",
         "A frozen value is taken for a measurement, and looks most precise.",
         "Correct the record.",
+        "error",
     )
     DVL_STD = (
         "dvl_std",
@@ -176,6 +208,7 @@ class Code(StrEnum):
         "A beam is lost at most pings.",
         "The direction and scale of that beam rest on few pings.",
         "Check the transducer; its values are known less well.",
+        "note",
     )
     BEAMS_DISAGREE = (
         "beams_disagree",
@@ -188,6 +221,7 @@ class Code(StrEnum):
         "Stars tell the attitude only at a known time, and the trial has none.",
         "The Earth turns by 15 degrees an hour under the stars.",
         "Give epoch, the UTC of time_s = 0.",
+        "error",
     )
     STAR_CATALOGUE = (
         "star_catalogue",
@@ -200,12 +234,14 @@ class Code(StrEnum):
         "The vertical by the stars is not that of the specific force.",
         "A wrong time or mounting is taken for an attitude, and for gyro bias.",
         "Check epoch and mounting_deg.",
+        "error",
     )
     STAR_CONVENTION = (
         "star_convention",
         "The star tracker turns otherwise than the gyros.",
         "An inverse or reordered quaternion contradicts the gyros at every turn.",
         "Write C_b^i as a quaternion with the scalar first; check mounting_deg.",
+        "error",
     )
     HEADING_UNIT = (
         "heading_unit",
@@ -236,6 +272,7 @@ class Code(StrEnum):
         "The vehicle rests, so that one beacon tells only a circle.",
         "The trajectory is one of many that the ranges allow.",
         "Move, or add a beacon.",
+        "note",
     )
     # Where a solver starts.
     HEADING_UNKNOWN = (
@@ -255,32 +292,9 @@ class Code(StrEnum):
         "The replay cannot start yet.",
         "There is no estimate yet; the records so far are kept.",
         "Wait, manoeuvre, or give `initial`.",
+        "note",
     )
     # What a solver found.
-    NOT_CONVERGED = (
-        "not_converged",
-        "The solver did not converge, so that its numbers are not to be used.",
-        "Values and standard deviations hold at a minimum of the cost only.",
-        "Look at the other findings, units and priors first.",
-    )
-    NOT_OBSERVABLE = (
-        "not_observable",
-        "The data do not determine a parameter better than its prior.",
-        "Its value is the prior's, not one that was measured.",
-        "Do the manoeuvres that the text names, or fix the parameter.",
-    )
-    PRIOR_KEPT = (
-        "prior_kept",
-        "The trial adds little to the calibration that it starts from.",
-        "The values are those of the earlier calibration: this trial does not confirm them.",
-        "Nothing.",
-    )
-    AMBIGUOUS = (
-        "ambiguous",
-        "More than one answer fits the data; the standard deviations contain all of them.",
-        "The value that is given may be that of the wrong answer.",
-        "Turn by 30 degrees or more, change speed, or give initial.position.",
-    )
     FAR_FROM_PRIOR = (
         "far_from_prior",
         "A value is far outside its prior.",
@@ -292,6 +306,7 @@ class Code(StrEnum):
         "Residuals are so large that the model does not fit the data.",
         "Values and standard deviations are those of a model that the data contradict.",
         "Check lever arm, clock, units and axes; do not use the values.",
+        "error",
     )
     LARGE_RESIDUALS = (
         "large_residuals",
@@ -310,18 +325,54 @@ class Code(StrEnum):
         "Some measurements are as likely echoes as not; they are used.",
         "Results would change a little if they were left out.",
         "Nothing, if they are few.",
+        "note",
+    )
+    AMBIGUOUS = (
+        "ambiguous",
+        "More than one answer fits the data; the standard deviations contain all of them.",
+        "The value that is given may be that of the wrong answer.",
+        "Turn by 30 degrees or more, change speed, or give initial.position.",
+    )
+    NOT_CONVERGED = (
+        "not_converged",
+        "The solver did not converge, so that its numbers are not to be used.",
+        "Values and standard deviations hold at a minimum of the cost only.",
+        "Look at the other findings, units and priors first.",
+        "error",
+    )
+    NOT_OBSERVABLE = (
+        "not_observable",
+        "The data do not determine a parameter better than its prior.",
+        "Its value is the prior's, not one that was measured.",
+        "Do the manoeuvres that the text names, or fix the parameter.",
+        "note",
+    )
+    PRIOR_KEPT = (
+        "prior_kept",
+        "The trial adds little to the calibration that it starts from.",
+        "The values are those of the earlier calibration: this trial does not confirm them.",
+        "Nothing.",
+        "note",
+    )
+    UNCERTAIN = (
+        "uncertain",
+        "A misalignment or scale error is known less well than the limits ask.",
+        "Dead reckoning with it drifts by more than the limits allow.",
+        "Turn to both sides and change speed; `plan` proposes the manoeuvre that is missing.",
     )
     FILTER_CONTRADICTED = (
         "filter_contradicted",
         "Residuals are larger than the filter's covariance allows: it has not converged.",
         "Values and standard deviations of a filter that diverged mean nothing.",
         "Use `solve`.",
+        "error",
     )
     METHOD_LIMITS = (
         "method_limits",
         "The method neglects, fixes or assumes something that `solve` does not.",
         "Values may be biased, and standard deviations too small.",
         "Use `solve` if it matters.",
+        "note",
     )
     GNSS_OUTAGE = (
         "gnss_outage",
@@ -334,12 +385,14 @@ class Code(StrEnum):
         "The filter starts again after a gap.",
         "Both sides of the gap are known less well than together.",
         "Use `solve`, which joins the parts.",
+        "note",
     )
     MEAN_OR_LAST = (
         "mean_or_last",
         "A bias walks: a replay reports its last value, `solve` the mean.",
         "The two values differ, and neither is wrong.",
         "Nothing.",
+        "note",
     )
     # What a replay noticed.
     SILENT = (
@@ -347,12 +400,14 @@ class Code(StrEnum):
         "A sensor has fallen silent.",
         "The estimate continues without it, and its standard deviations grow.",
         "Check its cable, power and clock.",
+        "note",
     )
     HEARD_AGAIN = (
         "heard_again",
         "A sensor is back, or agrees again.",
         "From here on its measurements are used again.",
         "Nothing.",
+        "note",
     )
     CONTRADICTS = (
         "contradicts",
@@ -366,6 +421,7 @@ class Code(StrEnum):
         "A warning in a file of another version, without a code that this one knows.",
         "What it means for the result is known to the version that wrote it only.",
         "Read its text.",
+        "note",
     )
 
 
@@ -380,6 +436,10 @@ UNUSABLE = frozenset(
         Code.NO_EPOCH,
     }
 )
+
+
+# In place of a severity: that of the code.
+_OF_THE_CODE = cast("Severity", "")
 
 
 @dataclass(frozen=True)
@@ -397,14 +457,18 @@ class Finding:
     parameter : str, optional
         Name as in calibration.json; empty if it is about none.
     severity : Severity, optional
-        `ok` for a check that was passed, `error` where a solution is not to be used.
+        `ok` for a check that was passed, `note` for what is no reason to doubt a result, `warning`
+        for a reason, `error` where a result is not to be used. That of the code if not given.
     """
 
     code: Code
     text: str
     sensor: str = ""
     parameter: str = ""
-    severity: Severity = "warning"
+    severity: Severity = _OF_THE_CODE
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "severity", self.severity or self.code.severity)
 
     @property
     def unusable(self) -> bool:
@@ -413,6 +477,34 @@ class Finding:
 
     def __str__(self) -> str:
         return f"{self.sensor}: {self.text}" if self.sensor else self.text
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """Whether a result can be used, and why not.
+
+    Parameters
+    ----------
+    grade : VerdictGrade
+        `do not use`: the data contradict the model. `doubtful`: there is something to check.
+    reasons : tuple of Finding
+        The worst first, and of equal ones causes before symptoms. Empty if the grade is good.
+    """
+
+    grade: VerdictGrade
+    reasons: tuple[Finding, ...]
+
+    def __str__(self) -> str:
+        return f"{self.grade}: {self.reasons[0]}" if self.reasons else self.grade
+
+
+def verdict_of(findings: Iterable[Finding]) -> Verdict:
+    """Return the verdict on a result with these findings."""
+    found = dict.fromkeys(findings)
+    errors = [f for f in found if f.severity == "error"]
+    warnings = [f for f in found if f.severity == "warning"]
+    reasons = [f for group in (errors, warnings) for f in sorted(group, key=lambda f: f.code.rank)]
+    return Verdict("do not use" if errors else "doubtful" if warnings else "good", tuple(reasons))
 
 
 def errors_of(findings: Iterable[Finding]) -> tuple[Finding, ...]:

@@ -65,8 +65,8 @@ class ParameterSpec:
         Axes of the components: body, DVL, or east, north, up; empty if there are none.
     place : int, optional
         Place in reports. One without is reported after the others, and only if it was estimated.
-    good_std : float, optional
-        Standard deviation that leaves dead reckoning with 0.1 % of the distance, in `unit`.
+    limit : float, optional
+        Standard deviation that is good enough, unless a trial states another, in `unit`.
     above : float, optional
         Every component is above this, in `unit`.
     """
@@ -77,7 +77,7 @@ class ParameterSpec:
     kind: Kind = "vector"
     frame: Frame = ""
     place: int | None = None
-    good_std: float | None = None
+    limit: float | None = None
     above: float = -math.inf
 
     @cached_property

@@ -78,6 +78,7 @@ def summarise(trial: Trial, found: SolvedProblem, *, rate_hz: float) -> Solution
         residuals=residuals,
         findings=tuple(findings),
         rejected=rejected,
+        limits=trial.limits,
     )
 
 

@@ -12,6 +12,7 @@ from builders import build_solution
 
 from factorgraph_dvl.errors import DataError
 from factorgraph_dvl.io.solution_folder import load_solution, save_solution
+from factorgraph_dvl.sensors.finding import Code
 
 
 def reject(text: str) -> float:
@@ -32,17 +33,25 @@ def test_the_files_are_those_of_the_format(tmp_path: Path) -> None:
     assert content["converged"] is True
     assert content["iterations"] == 5
     assert content["cost"] == 123.456
-    text = "misalignment_z_deg was not observable"
+    text = "misalignment_z_deg (±4) above the limit of 0.1 deg"
     assert content["warnings"] == [text]
     assert content["findings"] == [
         {
             "code": "not_observable",
-            "severity": "warning",
+            "severity": "note",
             "sensor": "",
             "parameter": "misalignment_deg",
-            "text": text,
+            "text": "misalignment_z_deg was not observable",
         }
     ]
+    (reason,) = content["verdict"]["reasons"]
+    assert content["verdict"]["grade"] == "doubtful"
+    assert reason["code"] == "uncertain"
+    assert reason["parameter"] == "misalignment_deg"
+    assert reason["text"] == text
+    assert reason["action"] == Code.UNCERTAIN.action
+    assert content["limits"]["scale_error"] == 1e-3
+    assert content["parameters"]["misalignment_deg"]["grade"] == ["green", "orange", "grey"]
     assert list(content["parameters"]) == ["misalignment_deg", "scale_error"]
     scale = content["parameters"]["scale_error"]
     assert scale["value"] == [0.00512345678901234]
@@ -79,7 +88,8 @@ def test_a_saved_solution_loads_as_it_was(tmp_path: Path) -> None:
     solution = build_solution()
     save_solution(solution, tmp_path / "s")
     loaded = load_solution(str(tmp_path / "s"))
-    for name in ("trial", "solver", "body_axes", "converged", "iterations", "cost", "findings"):
+    same = ("trial", "solver", "body_axes", "converged", "iterations", "cost", "findings")
+    for name in (*same, "limits", "grades", "verdict"):
         assert getattr(loaded, name) == getattr(solution, name)
     assert loaded.order == solution.order
     for one, other in zip(solution.estimates, loaded.estimates, strict=True):
@@ -106,6 +116,33 @@ def test_what_is_not_a_number_is_null(tmp_path: Path) -> None:
     loaded = load_solution(tmp_path / "s")
     assert np.isnan(loaded.cost)
     assert np.isnan(loaded.covariance).all()
+
+
+@pytest.mark.parametrize(
+    ("verdict", "grade", "text"),
+    [
+        ({"grade": "do not use"}, "do not use", "no reason is given"),
+        (
+            {"grade": "do not use", "reasons": [{"code": "of_the_future", "text": "worn out"}]},
+            "do not use",
+            "worn out",
+        ),
+        ({"grade": "good"}, "doubtful", "misalignment_z_deg (±4) above the limit of 0.1 deg"),
+        (None, "doubtful", "misalignment_z_deg (±4) above the limit of 0.1 deg"),
+    ],
+)
+def test_the_verdict_of_a_file_counts(tmp_path: Path, verdict: Any, grade: str, text: str) -> None:
+    save_solution(build_solution(), tmp_path / "s")
+    content = read_json(tmp_path / "s")
+    content["verdict"] = verdict
+    if verdict is None:
+        del content["verdict"], content["limits"]
+        for finding in content["findings"]:
+            finding["severity"] = "warning"
+    (tmp_path / "s" / "calibration.json").write_text(json.dumps(content))
+    found = load_solution(tmp_path / "s").verdict
+    assert found.grade == grade
+    assert found.reasons[0].text == text
 
 
 def test_a_solution_without_estimates_is_saved(tmp_path: Path) -> None:

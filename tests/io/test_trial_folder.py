@@ -385,3 +385,20 @@ def test_nothing_appears_when_writing_fails(tmp_path: Path, exists: bool) -> Non
 
 def test_errors_have_one_base() -> None:
     assert issubclass(ConfigError, FactorgraphDvlError)
+
+
+def test_limits_are_read_checked_and_kept(tmp_path: Path) -> None:
+    path = write_trial(tmp_path)
+    assert "limits" not in (path / "trial.yaml").read_text()
+    edit(path / "trial.yaml", "imu:", "limits: {misalignment_deg: 0.03}\nimu:")
+    trial = load_trial(path)
+    assert trial.limits["misalignment_deg"] == 0.03
+    assert trial.limits["lever_arm_m"] == 0.1
+    save_trial(trial, tmp_path / "again")
+    assert load_trial(tmp_path / "again").limits == trial.limits
+    line = edit(path / "trial.yaml", "misalignment_deg: 0.03", "misalignment_deg: 0")
+    with pytest.raises(ConfigError, match=f"line {line}.*misalignment_deg"):
+        load_trial(path)
+    edit(path / "trial.yaml", "misalignment_deg: 0}", "misalignment: 0.1}")
+    with pytest.raises(ConfigError, match=r"unknown key `limits.misalignment`"):
+        load_trial(path)

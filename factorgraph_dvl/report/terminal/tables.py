@@ -18,7 +18,7 @@ from factorgraph_dvl.report.text import at_precision, fixed, split_unit, with_st
 from factorgraph_dvl.sensors.imu import ImuSettings
 from factorgraph_dvl.solution import Solution
 
-_STYLES = {"error": "red", "warning": "yellow", "ok": "green"}
+_STYLES = {"error": "red", "warning": "yellow", "note": "", "ok": "green"}
 # Chosen: wider than any table, in columns.
 _UNLIMITED = 10_000
 
