@@ -62,6 +62,21 @@ class InitialAttitude:
 
 
 @dataclass(frozen=True)
+class InitialVelocity:
+    """Prior of the velocity at the first IMU sample.
+
+    Parameters
+    ----------
+    velocity : ndarray, shape (3,), m/s
+        Local-level east, north, up, of the IMU.
+    std : ndarray, shape (3,), m/s
+    """
+
+    velocity: Array
+    std: Array
+
+
+@dataclass(frozen=True)
 class Reference:
     """Truth or a trusted solution; never used to solve.
 
@@ -107,6 +122,8 @@ class Trial:
         Prior; None = found from the data.
     initial_position : InitialPosition, optional
         Prior; None = found from the data.
+    initial_velocity : InitialVelocity, optional
+        Prior; None = found from the data.
     reference : Reference, optional
         Truth or a trusted solution, None if there is none.
     calibration_truth : dict of str to ndarray, optional
@@ -128,6 +145,7 @@ class Trial:
     noise: NoiseModel = "estimated"
     initial_attitude: InitialAttitude | None = None
     initial_position: InitialPosition | None = None
+    initial_velocity: InitialVelocity | None = None
     reference: Reference | None = None
     calibration_truth: dict[str, Array] = field(default_factory=dict)
     notes: tuple[Finding, ...] = ()

@@ -18,7 +18,13 @@ from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.sensors.gnss import Gnss, GnssSettings
 from factorgraph_dvl.sensors.imu import Imu, ImuSettings
 from factorgraph_dvl.solution import Estimate, Solution, Trajectory
-from factorgraph_dvl.trial import InitialAttitude, InitialPosition, Reference, Trial
+from factorgraph_dvl.trial import (
+    InitialAttitude,
+    InitialPosition,
+    InitialVelocity,
+    Reference,
+    Trial,
+)
 
 ORIGIN = LocalFrame(34.0 * DEG, 108.0 * DEG, 10.0)
 _ROLL = 6.0 * DEG
@@ -82,6 +88,7 @@ def build_trial(*, seconds: float = 60.0, **changes: Any) -> Trial:
         initial_position=InitialPosition(
             np.array([34.0 * DEG, 108.0 * DEG, 10.0]), np.array([1.0, 1.0, 2.0])
         ),
+        initial_velocity=InitialVelocity(np.array([1.2, 1.6, 0.1]), np.array([0.1, 0.2, 0.3])),
         reference=Reference(
             fixes,
             np.stack(ORIGIN.geodetic(p_n), axis=1),

@@ -10,6 +10,7 @@ import numpy as np
 
 from factorgraph_dvl.baselines.beam_calibration import calibrate_beams
 from factorgraph_dvl.baselines.least_squares import least_squares
+from factorgraph_dvl.baselines.luo_2024 import as_printed
 from factorgraph_dvl.baselines.navigation import Navigation, motion_at, navigate
 from factorgraph_dvl.baselines.nine_state import nine_state
 from factorgraph_dvl.baselines.outcome import History, Outcome, history_of
@@ -33,7 +34,7 @@ from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.solution import Progress, Solution
 from factorgraph_dvl.trial import Trial
 
-DvlMethod = Literal["point-set", "nine-state", "wahba", "least-squares"]
+DvlMethod = Literal["point-set", "luo-2024", "nine-state", "wahba", "least-squares"]
 DVL_METHODS: tuple[DvlMethod, ...] = get_args(DvlMethod)
 Method = DvlMethod | Literal["star", "beams"]
 METHODS: tuple[Method, ...] = (*DVL_METHODS, "star", "beams")
@@ -45,6 +46,7 @@ _UNCORRELATED = Finding(
 )
 _NEGLECTED: dict[DvlMethod, tuple[str, ...]] = {
     "point-set": ("dvl_bias", "time_offset"),
+    "luo-2024": ("dvl_bias", "time_offset"),
     "nine-state": ("lever_arm", "time_offset"),
     "wahba": ("lever_arm", "dvl_bias", "time_offset"),
     "least-squares": (),
@@ -86,9 +88,9 @@ def calibrate(
     trial : Trial
         With IMU, GNSS and DVL, or its beams, or star tracker.
     method : Method, default 'point-set'
-        `point-set` (seven states), `nine-state`, `wahba` or `least-squares`, which take beams
-        without a DVL beside them for the velocity that they amount to; `star`; or `beams`, an
-        extended Kalman filter of single beams.
+        `point-set` (seven states), `luo-2024` (the same as printed), `nine-state`, `wahba` or
+        `least-squares`, which take beams without a DVL beside them for the velocity that they
+        amount to; `star`; or `beams`, an extended Kalman filter of single beams.
     rate_hz : float, default 10.0
         Rate of the trajectory in the solution.
     progress : callable, optional
@@ -137,7 +139,8 @@ def calibrate(
     report("SINS/GNSS", 0, None)
     prior = {p.stem: p for p in dvl.parameters()}
     offset = float(prior["time_offset"].mean[0])
-    navigation = navigate(trial, dvl.time[dvl.locked] - offset)
+    pings = dvl.time[dvl.locked] - offset
+    navigation = navigate(trial, pings, smoothed=method != "luo-2024")
     report(method, 0, None)
     points_at, unused = _point_sets(navigation, dvl)
     outcome = _calibrate(method, points_at, dvl)
@@ -230,6 +233,8 @@ def _calibrate(method: DvlMethod, points_at: Callable[[float], Points], dvl: Dvl
     single = _single(scale)
     if method == "wahba":
         return wahba(points, misalignment, single, arm.mean)
+    if method == "luo-2024":
+        return as_printed(points, misalignment, single, arm)
     return point_set(points, misalignment, single, arm)
 
 
@@ -250,7 +255,7 @@ def _neglects(method: DvlMethod, dvl: Dvl) -> list[Finding]:
         for p in (parameters[stem] for stem in _NEGLECTED[method])
         if p.estimated
     ]
-    if method in ("point-set", "wahba") and parameters["scale_error"].mean.size == 3:
+    if method in ("point-set", "luo-2024", "wahba") and parameters["scale_error"].mean.size == 3:
         text = f"{method} estimates one scale error for the three axes"
         out.append(Finding(Code.METHOD_LIMITS, text, parameter=parameters["scale_error"].name))
     return out

@@ -57,14 +57,14 @@ _WIDE = 6.0 * DEG
 
 @dataclass(frozen=True)
 class Navigation:
-    """Smoothed motion of a trial.
+    """Motion of a trial, smoothed unless that was not wanted.
 
     Parameters
     ----------
     samples : StrapdownSamples
         Increments of the IMU.
     track : FilteredTrack
-        Smoothed states at the events of all arcs, one after the other.
+        States at the events of all arcs, one after the other.
     arc : ndarray, shape (K,)
         Arc of each event.
     findings : tuple of Finding
@@ -114,7 +114,7 @@ class NavigationMotion:
     covered: np.ndarray
 
 
-def navigate(trial: Trial, pings: Array) -> Navigation:
+def navigate(trial: Trial, pings: Array, *, smoothed: bool = True) -> Navigation:
     """Return the smoothed motion of a trial, with states at fixes and pings.
 
     Parameters
@@ -123,6 +123,8 @@ def navigate(trial: Trial, pings: Array) -> Navigation:
         With GNSS.
     pings : ndarray, shape (M,), s
         True times of the pings.
+    smoothed : bool, default True
+        False = the motion as the filter knew it at each time.
 
     Raises
     ------
@@ -165,7 +167,7 @@ def navigate(trial: Trial, pings: Array) -> Navigation:
                     "position, velocity and attitude anew, the biases from before",
                 )
             )
-        track, note = _navigate_arc(trial, gnss, samples, span, pings, tracks)
+        track, note = _navigate_arc(trial, gnss, samples, span, pings, tracks, smoothed)
         tracks.append(track)
         findings += [Finding(Code.HEADING_UNKNOWN, note)] if note else []
     if not tracks:
@@ -279,6 +281,7 @@ def _navigate_arc(
     span: tuple[float, float],
     pings: Array,
     earlier: list[FilteredTrack],
+    smoothed: bool,
 ) -> tuple[FilteredTrack, str]:
     time = _events(span, np.concatenate([gnss.time, pings]))
     steps = compose(samples, time[:-1], time[1:])
@@ -309,12 +312,13 @@ def _navigate_arc(
         passes = _PASSES
     start = _start(trial, fixes, time, attitude, earlier, walk)
     for _ in range(passes):
-        track = smooth(run_filter(time, steps, fixes, start, walk))
+        forward = run_filter(time, steps, fixes, start, walk)
+        track = smooth(forward)
         moved = np.linalg.norm(log_so3(track.nRb[0] @ start.nRb.T))
         start = replace(start, nRb=track.nRb[0])
         if moved < _CLOSE:
             break
-    return track, attitude.note
+    return track if smoothed else forward.track, attitude.note
 
 
 def _fixes_at(gnss: Gnss, samples: StrapdownSamples, time: Array) -> Fixes:
@@ -393,6 +397,9 @@ def _start(
     if trial.initial_position is not None and not earlier:
         place = trial.initial_position.geodetic
         P[0:3, 0:3] = np.diag(trial.initial_position.std**2)
+    if trial.initial_velocity is not None and not earlier:
+        v = trial.initial_velocity.velocity
+        P[3:6, 3:6] = np.diag(trial.initial_velocity.std**2)
     P[6:9, 6:9] = attitude.covariance
     s = trial.imu.settings
     bg, ba = np.zeros(3), np.zeros(3)

@@ -48,6 +48,7 @@ class KalmanMethod(StrEnum):
     """Method of `kalman`: for a DVL, for gyros with a star tracker, or for a planar trial."""
 
     POINT_SET = "point-set"
+    LUO_2024 = "luo-2024"
     NINE_STATE = "nine-state"
     WAHBA = "wahba"
     LEAST_SQUARES = "least-squares"

@@ -133,7 +133,14 @@ def _state_prior(
             p_n = p_n - start.v_n[k] * seg.increments.dt[0]
         std = np.maximum(trial.initial_position.std, _LEAST_STD)
         root[3:6, 3:6] = nRb / std[:, None]
-    return gtsam.NavState(gtsam.Rot3(nRb), p_n, start.v_n[k]), root
+    v_n = start.v_n[k]
+    if is_first and trial.initial_velocity is not None:
+        v_n = trial.initial_velocity.velocity
+        if seg.increments.averaged:
+            v_n = v_n - nRb @ seg.dv[0] - frame.gravity(p_n) * seg.increments.dt[0]
+        std = np.maximum(trial.initial_velocity.std, _LEAST_STD)
+        root[6:9, 6:9] = nRb / std[:, None]
+    return gtsam.NavState(gtsam.Rot3(nRb), p_n, v_n), root
 
 
 def _gap_factor(before: int, after: int, node_time: Array) -> gtsam.CustomFactor:

@@ -33,6 +33,7 @@ from factorgraph_dvl.io.trial_yaml import (
     PositionSettings,
     ReferenceSettings,
     TrialSettings,
+    VelocitySettings,
     to_yaml,
 )
 from factorgraph_dvl.sensors.catalogue import AIDS, PLANAR, specs_of
@@ -48,7 +49,13 @@ from factorgraph_dvl.sensors.records import check_possible
 from factorgraph_dvl.settings.files import MEGABYTE, read_bytes
 from factorgraph_dvl.settings.yaml_file import parse_yaml, read_text
 from factorgraph_dvl.solution import Calibration, Estimate
-from factorgraph_dvl.trial import InitialAttitude, InitialPosition, Reference, Trial
+from factorgraph_dvl.trial import (
+    InitialAttitude,
+    InitialPosition,
+    InitialVelocity,
+    Reference,
+    Trial,
+)
 
 TRUTH_FILE = "truth.json"
 # Where a trial that was loaded with a calibration of its DVL keeps it when it is saved.
@@ -130,6 +137,7 @@ def load_trial(path: Path | str) -> Trial:
         noise=settings.noise,
         initial_attitude=None if initial is UNSET else _attitude(initial),
         initial_position=None if initial is UNSET else position_of(initial),
+        initial_velocity=None if initial is UNSET else _velocity(initial),
         reference=reference_of(folder, settings),
         calibration_truth=read_truth(folder / TRUTH_FILE),
         notes=tuple(notes),
@@ -403,6 +411,13 @@ def _attitude(initial: InitialSettings) -> InitialAttitude | None:
     )
 
 
+def _velocity(initial: InitialSettings) -> InitialVelocity | None:
+    velocity = initial.velocity
+    if velocity is UNSET:
+        return None
+    return InitialVelocity(np.array(velocity.east_north_up_m_s), np.array(velocity.std_m_s))
+
+
 def position_of(initial: InitialSettings | PlanarInitialSettings) -> InitialPosition | None:
     """Return the prior of the position that `initial` states, None if there is none."""
     position = initial.position
@@ -440,7 +455,8 @@ def _limits(trial: Trial) -> LimitSettings | msgspec.UnsetType:
 
 def _initial(trial: Trial) -> InitialSettings | msgspec.UnsetType:
     attitude, position = trial.initial_attitude, trial.initial_position
-    if attitude is None and position is None:
+    velocity = trial.initial_velocity
+    if attitude is None and position is None and velocity is None:
         return UNSET
     fields: dict[str, object] = {}
     if attitude is not None:
@@ -448,6 +464,11 @@ def _initial(trial: Trial) -> InitialSettings | msgspec.UnsetType:
         fields["std_deg"] = tuple((attitude.std / DEG).tolist())
     if position is not None:
         fields["position"] = position_settings(position)
+    if velocity is not None:
+        fields["velocity"] = VelocitySettings(
+            east_north_up_m_s=tuple(velocity.velocity.tolist()),
+            std_m_s=tuple(velocity.std.tolist()),
+        )
     return InitialSettings(**fields)  # type: ignore[arg-type]
 
 

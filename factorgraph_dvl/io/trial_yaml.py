@@ -17,6 +17,7 @@ from factorgraph_dvl.sensors.speed_log import HeadingSettings, LogSettings
 from factorgraph_dvl.settings.sections import Positive, Section, Sigma3, check_epoch
 
 _Pitch = Annotated[float, Meta(ge=-90, le=90)]
+_Speed = Annotated[float, Meta(ge=-200, le=200)]
 
 
 class PositionSettings(Section, frozen=True, kw_only=True):
@@ -28,12 +29,20 @@ class PositionSettings(Section, frozen=True, kw_only=True):
     std_m: Sigma3
 
 
+class VelocitySettings(Section, frozen=True, kw_only=True):
+    """`initial.velocity` of trial.yaml."""
+
+    east_north_up_m_s: tuple[_Speed, _Speed, _Speed]
+    std_m_s: Sigma3
+
+
 class InitialSettings(Section, frozen=True, kw_only=True):
     """Section `initial` of trial.yaml."""
 
     roll_pitch_heading_deg: tuple[float, _Pitch, float] | UnsetType = UNSET
     std_deg: Sigma3 | UnsetType = UNSET
     position: PositionSettings | UnsetType = UNSET
+    velocity: VelocitySettings | UnsetType = UNSET
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -135,8 +135,10 @@ class RecordHistory:
             source=settings.imu.source,
         )
         if settings.imu.time[0] < samples[0, 0] - 1.0:
-            # The given initial position and attitude are of a start that has been dropped.
-            settings = replace(settings, initial_attitude=None, initial_position=None)
+            # What `initial` states is of a start that has been dropped.
+            settings = replace(
+                settings, initial_attitude=None, initial_position=None, initial_velocity=None
+            )
         # A sensor that has not reported yet must not be known of: its record is of the future.
         known: dict[str, Any] = dict.fromkeys(aid.section for aid in settings.aids)
         known |= {

@@ -124,7 +124,12 @@ class Initializer:
             reach = speed * length + 0.5 * _ACCELERATION * length**2 + _SWAY
             self._prior = navigator.known(length)
             here = InitialPosition(state.geodetic[0], np.hypot(state.position_std[0], reach))
-            self._settings = replace(self._settings, initial_attitude=None, initial_position=here)
+            self._settings = replace(
+                self._settings,
+                initial_attitude=None,
+                initial_position=here,
+                initial_velocity=None,
+            )
             sections = navigator.start.sections
             self.history = RecordHistory(self._settings, _LONGEST, length + 1.0, sections)
             self.history.add_samples(samples)

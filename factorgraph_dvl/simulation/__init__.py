@@ -27,7 +27,14 @@ from factorgraph_dvl.simulation.motion import TrueMotion, plan_motion
 from factorgraph_dvl.simulation.ranging import simulate_beacons, simulate_heading, simulate_log
 from factorgraph_dvl.simulation.scenario import Scenario, load_scenario, parse_scenario
 from factorgraph_dvl.simulation.star import simulate_star
-from factorgraph_dvl.trial import InitialAttitude, InitialPosition, PlanarTrial, Reference, Trial
+from factorgraph_dvl.trial import (
+    InitialAttitude,
+    InitialPosition,
+    InitialVelocity,
+    PlanarTrial,
+    Reference,
+    Trial,
+)
 
 __all__ = [
     "Scenario",
@@ -82,7 +89,7 @@ def simulate(scenario: Scenario | str | PathLike[str], seed: int = 0) -> Trial:
         if section in scenario.aids:
             aids[section], calibration = run(scenario, motion, rng)
             truth |= calibration
-    attitude, position = _initial(scenario, motion, imu.time[:1])
+    attitude, position, velocity = _initial(scenario, motion, imu.time[:1])
     return Trial(
         name=scenario.name,
         imu=imu,
@@ -93,6 +100,7 @@ def simulate(scenario: Scenario | str | PathLike[str], seed: int = 0) -> Trial:
         epoch=scenario.epoch,
         initial_attitude=attitude,
         initial_position=position,
+        initial_velocity=velocity,
         reference=_reference(motion, scenario.reference_rate_hz),
         calibration_truth=truth,
     )
@@ -139,19 +147,22 @@ def simulate_planar(scenario: Scenario | str | PathLike[str], seed: int = 0) -> 
 
 def _initial(
     scenario: Scenario, motion: TrueMotion, time: Array
-) -> tuple[InitialAttitude | None, InitialPosition | None]:
+) -> tuple[InitialAttitude | None, InitialPosition | None, InitialVelocity | None]:
     claim = scenario.trial.initial
     if claim is None:
-        return None, None
+        return None, None, None
     state = motion.at(time)
-    attitude = position = None
+    attitude = position = velocity = None
     if claim.attitude_std_deg is not None:
         rph = state.rph[0] + np.array(claim.attitude_error_deg) * DEG
         attitude = InitialAttitude(rph=rph, std=np.array(claim.attitude_std_deg) * DEG)
     if claim.position_std_m is not None:
         geodetic = displaced(state.geodetic, np.array([claim.position_error_m]))[0]
         position = InitialPosition(geodetic=geodetic, std=np.array(claim.position_std_m))
-    return attitude, position
+    if claim.velocity_std_m_s is not None:
+        known = state.v_n[0] + np.array(claim.velocity_error_m_s)
+        velocity = InitialVelocity(velocity=known, std=np.array(claim.velocity_std_m_s))
+    return attitude, position, velocity
 
 
 def _reference(motion: TrueMotion, rate: float) -> Reference:

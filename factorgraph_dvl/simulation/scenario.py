@@ -125,6 +125,8 @@ class InitialClaim(Section, frozen=True, kw_only=True):
     attitude_std_deg: tuple[Positive, Positive, Positive] | None = None
     position_error_m: Vector3 = (0.0, 0.0, 0.0)
     position_std_m: tuple[Positive, Positive, Positive] | None = None
+    velocity_error_m_s: Vector3 = (0.0, 0.0, 0.0)
+    velocity_std_m_s: tuple[Positive, Positive, Positive] | None = None
 
 
 class Claims(Section, frozen=True, kw_only=True):

@@ -29,7 +29,7 @@ from factorgraph_dvl.simulation import simulate
         {"body_axes": "FRD", "start": {"heading_deg": 190}},
         {"gnss": {"rate_hz": 1, "phase_s": 0.37, "jitter_s": 0.1}},
         {"gnss": {"outages_s": [[20, 35]]}},
-        {"trial": {"initial": {"attitude_std_deg": [0.5, 0.5, 2]}}},
+        {"trial": {"initial": {"attitude_std_deg": [0.5, 0.5, 2], "velocity_std_m_s": [0.1] * 3}}},
     ],
     ids=["plain", "antenna", "no velocity", "axes", "clock", "outage", "prior"],
 )

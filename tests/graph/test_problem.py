@@ -214,7 +214,14 @@ def test_misalignment_prior_is_that_of_the_rotation_vector(mean):
 
 
 def test_initial_priors_are_east_north_up_and_roll_pitch_heading():
-    claims = {"initial": {"attitude_std_deg": [0.5, 1.0, 5.0], "position_std_m": [5.0, 3.0, 1.0]}}
+    claims = {
+        "initial": {
+            "attitude_std_deg": [0.5, 1.0, 5.0],
+            "position_std_m": [5.0, 3.0, 1.0],
+            "velocity_error_m_s": [0.3, -0.2, 0.1],
+            "velocity_std_m_s": [0.5, 0.2, 0.1],
+        }
+    }
     scene = scenario(manoeuvres=SHORT, trial=claims, start={"heading_deg": 137})
     trial = simulate(scene)
     problem, _ = problem_of(scene, trial)
@@ -233,6 +240,18 @@ def test_initial_priors_are_east_north_up_and_roll_pitch_heading():
         values = gtsam.Values()
         values.insert(keys.node(0), state)
         assert prior.error(values) == pytest.approx(0.5 * (2.0 / sigma) ** 2, rel=1e-6)
+    for axis, sigma in enumerate([0.5, 0.2, 0.1]):
+        shift = np.zeros(3)
+        shift[axis] = 0.05
+        state = gtsam.NavState(
+            gtsam.Rot3(nRb), prior.prior().position(), prior.prior().velocity() + shift
+        )
+        values = gtsam.Values()
+        values.insert(keys.node(0), state)
+        assert prior.error(values) == pytest.approx(0.5 * (0.05 / sigma) ** 2, rel=1e-6)
+    # At the start of the first sample, 10 ms before: the vessel accelerates by less than 1 m/s².
+    known = trial.reference.velocity[0] + [0.3, -0.2, 0.1]
+    np.testing.assert_allclose(prior.prior().velocity(), known, atol=0.01)
     rph = trial.initial_attitude.rph
     # The prior holds at the end of the first sample, the node is at its start.
     back = exp_so3(-problem.chain.segments.phi[0])

@@ -27,7 +27,7 @@ def assert_same(a: Trial, b: Trial) -> None:
         for name, value in vars(one).items():
             if isinstance(value, np.ndarray):
                 np.testing.assert_allclose(getattr(other, name), value, rtol=1e-15, atol=0)
-    for hub in ("initial_attitude", "initial_position", "reference"):
+    for hub in ("initial_attitude", "initial_position", "initial_velocity", "reference"):
         one, other = getattr(a, hub), getattr(b, hub)
         assert (one is None) == (other is None)
         for name, value in vars(one).items() if one is not None else ():
@@ -59,6 +59,7 @@ def test_optional_parts_may_be_absent(tmp_path: Path) -> None:
         epoch="",
         initial_attitude=None,
         initial_position=None,
+        initial_velocity=None,
         reference=None,
         calibration_truth={},
     )

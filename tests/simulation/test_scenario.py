@@ -82,6 +82,8 @@ def test_an_initial_claim_is_the_truth_plus_its_error():
         "attitude_std_deg": [0.5, 0.5, 2],
         "position_error_m": [3, 0, -1],
         "position_std_m": [3, 3, 3],
+        "velocity_error_m_s": [0.1, 0, -0.2],
+        "velocity_std_m_s": [0.1, 0.1, 0.1],
     }
     at_rest = {"manoeuvres": [{"straight_s": 1}], "sway": {"roll": constant(1)}}
     trial = run(
@@ -92,6 +94,8 @@ def test_an_initial_claim_is_the_truth_plus_its_error():
     frame = LocalFrame(*trial.reference.geodetic[0])
     offset = frame.position(*trial.initial_position.geodetic)
     np.testing.assert_allclose(offset, [3, 0, -1], atol=1e-6)
+    off = trial.initial_velocity.velocity - trial.reference.velocity[0]
+    np.testing.assert_allclose(off, [0.1, 0, -0.2], atol=1e-9)
 
 
 def test_the_scenario_of_luo_et_al():
