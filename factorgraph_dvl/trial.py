@@ -70,6 +70,7 @@ class InitialVelocity:
     velocity : ndarray, shape (3,), m/s
         Local-level east, north, up, of the IMU.
     std : ndarray, shape (3,), m/s
+        Of east, north, up.
     """
 
     velocity: Array
