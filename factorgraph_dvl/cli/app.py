@@ -21,6 +21,7 @@ from factorgraph_dvl.cli.observability import observability
 from factorgraph_dvl.cli.options import claims
 from factorgraph_dvl.cli.plan import plan
 from factorgraph_dvl.cli.replay import replay
+from factorgraph_dvl.cli.reproduce import reproduce
 from factorgraph_dvl.cli.simulate import simulate
 from factorgraph_dvl.cli.solve import kalman, solve
 from factorgraph_dvl.cli.streams import guard_streams, output_failure
@@ -51,6 +52,7 @@ for _command in (
     deadreckon,
     instrument,
     correct,
+    reproduce,
 ):
     app.command()(naming_memory(_command))
 

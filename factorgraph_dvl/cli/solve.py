@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from enum import StrEnum
+from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, cast
 
@@ -200,6 +201,8 @@ def _solve_into(
 
             with drawing():
                 write_figures(trial, solution, folder / FIGURES_FOLDER)
+                if history is not None:
+                    draw_history(trial, solution, history, folder / FIGURES_FOLDER)
 
         save_solution(solution, out, force=force, extra=add)
     _print_solution(trial, solution)
@@ -213,6 +216,20 @@ def _solve_into(
         print_contradiction()
     if errors or not solution.converged:
         raise typer.Exit(1)
+
+
+def draw_history(
+    trial: Trial | PlanarTrial, solution: Solution, history: History, folder: Path
+) -> None:
+    """Draw how a recursive filter converged."""
+    from factorgraph_dvl.report.figures.convergence import convergence_figure
+    from factorgraph_dvl.report.figures.drawing import save_figures
+
+    estimates = [e for e in solution.estimates if set(e.component_names) <= set(history.names)]
+    figure = convergence_figure(
+        history.time, history.values, history.std, estimates, trial.calibration_truth, float("nan")
+    )
+    save_figures({"convergence": figure}, folder)
 
 
 def write_beams(trial: Trial | PlanarTrial, solution: Solution, folder: Path) -> None:
@@ -238,7 +255,7 @@ def write_instrument(solution: Solution, folder: Path) -> None:
 
 
 def _print_solution(trial: Trial | PlanarTrial, solution: Solution) -> None:
-    from factorgraph_dvl.analysis.error_statistics import calibration_errors
+    from factorgraph_dvl.analysis.error_statistics import calibration_errors, paper_accuracy
     from factorgraph_dvl.report.terminal.tables import (
         calibration_table,
         hypothesis_table,
@@ -249,6 +266,10 @@ def _print_solution(trial: Trial | PlanarTrial, solution: Solution) -> None:
     if solution.estimates:
         errors = calibration_errors(solution, truth) if truth else None
         print_table(calibration_table(solution, errors, width=stdout().width))
+        accuracy = paper_accuracy(solution.estimates, truth)
+        if isfinite(accuracy):
+            text = "Accuracy, mean of 1 − |error / truth| of misalignment, scale and lever arm: "
+            stdout().print(f"{text}{accuracy:.2f} %", markup=False, soft_wrap=True)
     if solution.hypotheses:
         print_table(hypothesis_table(solution))
     if solution.rejected:

@@ -1,0 +1,61 @@
+"""The command `reproduce`: a publication's equations, tables, figures and claims, measured."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from factorgraph_dvl.cli.console import ProgressLine, print_written, stdout
+from factorgraph_dvl.cli.options import Force, Quiet, claim_output
+
+
+class PaperName(StrEnum):
+    """The publications, by the names of their methods."""
+
+    LUO_2024 = "luo-2024"
+
+
+def reproduce(
+    paper: Annotated[PaperName, typer.Argument(metavar="PAPER", help=", ".join(PaperName))],
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder to write.")],
+    figure: Annotated[
+        int | None, typer.Option(metavar="N", min=1, help="This figure alone.")
+    ] = None,
+    table: Annotated[
+        int | None, typer.Option(metavar="N", min=1, help="This table alone.")
+    ] = None,
+    seeds: Annotated[
+        int, typer.Option(metavar="N", min=1, max=1000, help="Number of simulated trials.")
+    ] = 5,
+    force: Force = False,
+    quiet: Quiet = False,
+) -> None:
+    """Measure what a publication states: each equation, table, figure and claim."""
+    from factorgraph_dvl.errors import ConfigError
+    from factorgraph_dvl.io.folders import new_folder
+    from factorgraph_dvl.reproduce import PAPERS
+    from factorgraph_dvl.reproduce.page import selected, write_page
+
+    found = PAPERS[paper.value]
+    entries = selected(found, figure=figure, table=table)
+    if not entries:
+        labels = [e.label for e in found.entries if e.label.startswith(("figure", "table"))]
+        raise ConfigError(
+            f"{paper.value} has no such figure or table", expected=", ".join(labels) or "neither"
+        )
+    owned = (f"{paper.value}.md", "figure-*.png", "table-*.png", "claim-*.png")
+    claim_output(out, force=force, owned=owned, inputs=())
+    results = []
+    with ProgressLine(quiet=quiet) as progress:
+        for entry in entries:
+            progress(entry.label, 0, None)
+            results.append((entry, entry.check(seeds)))
+    with new_folder(out, force=force, owned=owned) as folder:
+        write_page(found, results, seeds, folder)
+    for entry, result in results:
+        text = f"{entry.label}: {result.measured}: {result.verdict}"
+        stdout().print(text, markup=False, soft_wrap=True)
+    print_written(out)

@@ -1,0 +1,84 @@
+"""The command `reproduce`: every item of a publication has a result and a verdict."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+from markdown_tables import faults
+from running import run  # noqa: F401
+
+from factorgraph_dvl.reproduce import PAPERS
+from factorgraph_dvl.reproduce.page import label_of
+
+# Numbered items of each publication: equations, tables, figures.
+NUMBERED = {
+    "luo-2024": (16, 7, 7),
+}
+VERDICTS = {"reproduced", "corrected", "not reproducible"}
+
+
+def numbers(name: str, kind: str) -> set[int]:
+    labels = [label_of(x) for e in PAPERS[name].entries for x in e.label.split(", ")]
+    return {int(x.split()[1]) for x in labels if x.startswith(f"{kind} ")}
+
+
+@pytest.mark.parametrize("name", sorted(PAPERS))
+def test_every_numbered_item_has_an_entry(name):
+    for kind, count in zip(("eq.", "table", "figure"), NUMBERED[name], strict=True):
+        assert numbers(name, kind) == set(range(1, count + 1)), kind
+    assert any(e.label.startswith("claim") for e in PAPERS[name].entries)
+
+
+@pytest.mark.parametrize("name", sorted(PAPERS))
+def test_modules_and_configurations_that_entries_name_are_there(name):
+    root = Path(__file__).resolve().parents[2]
+    for entry in PAPERS[name].entries:
+        for where in re.findall(r"`([a-z_]+/[^`]+)`", entry.where):
+            inside = "." if where.startswith(("configs/", "examples/")) else "factorgraph_dvl"
+            pattern = where if "." in where else f"{where}*"
+            assert list((root / inside).glob(pattern)), entry.where
+
+
+def test_one_table(run, tmp_path):  # noqa: F811
+    result = run("reproduce", "luo-2024", "--table", "3", "--out", tmp_path / "out", "--quiet")
+    assert result.code == 0, result.err
+    assert "table 3: steady motion has three singular values of 57" in result.out
+    page = (tmp_path / "out" / "luo-2024.md").read_text(encoding="utf-8")
+    assert "| steady | 4, 4, 4, 0, 0, 0, 0 |" in page
+    assert faults(page) == []
+    again = run("reproduce", "luo-2024", "--table", "3", "--out", tmp_path / "out", "--quiet")
+    assert again.code == 2
+    assert "--force" in again.err
+
+
+def test_one_figure(run, tmp_path):  # noqa: F811
+    result = run("reproduce", "luo-2024", "--figure", "3", "--out", tmp_path / "out", "--quiet")
+    assert result.code == 0, result.err
+    assert {p.name for p in (tmp_path / "out").iterdir()} == {"luo-2024.md", "figure-3.png"}
+
+
+def test_a_figure_that_is_not_there_is_refused(run, tmp_path):  # noqa: F811
+    result = run("reproduce", "luo-2024", "--figure", "8", "--out", tmp_path / "out")
+    assert result.code == 2
+    assert "figure 1, table 2" in result.err
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", sorted(PAPERS))
+def test_every_item_has_a_verdict(name, run, tmp_path):  # noqa: F811
+    result = run("reproduce", name, "--seeds", "1", "--out", tmp_path / "out", "--quiet")
+    assert result.code == 0, result.err
+    page = (tmp_path / "out" / f"{name}.md").read_text(encoding="utf-8")
+    assert faults(page) == []
+    for entry in PAPERS[name].entries:
+        (line,) = [
+            x for x in page.splitlines() if x.startswith(f"| {entry.label} | {entry.says} ")
+        ]
+        *_, measured, verdict = line.strip("| ").split(" | ")
+        assert verdict in VERDICTS
+        assert re.search(r"\d|nothing to compute|not published", measured), line
+    for image in re.findall(r"\]\((\S+\.png)\)", page):
+        assert (tmp_path / "out" / image).stat().st_size > 1000
