@@ -333,14 +333,14 @@ def _equation_13(seeds: int) -> Result:
     full = np.linalg.svd(np.concatenate(powers), compute_uv=False)
     return _misfit(
         "singular values of Q against those of the rows H alone, as F = 0",
-        _apart(full, np.linalg.svd(rows, compute_uv=False)),
+        _apart(full, np.asarray(np.linalg.svd(rows, compute_uv=False), dtype=float)),
     )
 
 
 def _equation_16(seeds: int) -> Result:
     rows = _stack("luo-2024-turning")
     U, S, W = np.linalg.svd(rows)
-    again = _apart(np.asarray(U[:, :7] * S @ W), rows)
+    again = _apart(np.asarray(U[:, :7] * S @ W, dtype=float), np.asarray(rows, dtype=float))
     right = U.shape[0] == rows.shape[0] and W.shape[0] == 7
     return Result(
         f"U is {U.shape[0]} × {U.shape[0]} (rows), W 7 × 7 (states): the print has the sizes "
@@ -418,14 +418,14 @@ def _table_4(seeds: int) -> Result:
     printed = _recomputed()
     rows.append(["mean accuracy", "", f"{printed:.2f} %", *(f"{mean[k]:.2f} %" for k in first)])
     header = ["", "true", "paper", *(f"{methods[m]}, {p}°" for p in _PHASES for m in methods)]
-    ours = float(np.mean([mean[p, "luo-2024"] for p in _PHASES]))
+    reached = float(np.mean([mean[p, "luo-2024"] for p in _PHASES]))
     settled = [_run(p, s, "point-set") for p in _PHASES for s in range(seeds)]
     return Result(
-        f"mean accuracy {ours:.2f} % as printed (paper {printed:.2f} %), "
+        f"mean accuracy {reached:.2f} % as printed (paper {printed:.2f} %), "
         f"{np.mean([r.accuracy for r in settled]):.2f} % by the filter that settles "
         f"({sum(r.converged for r in settled)} of {len(settled)} trials), "
         f"{np.mean([mean[p, 'solve'] for p in _PHASES]):.2f} % by the factor graph",
-        judged(abs(ours - printed) <= _SAME_ACCURACY),
+        judged(abs(reached - printed) <= _SAME_ACCURACY),
         (
             *table(header, rows),
             "",
