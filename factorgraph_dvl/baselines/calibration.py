@@ -12,7 +12,8 @@ from factorgraph_dvl.baselines.beam_calibration import calibrate_beams
 from factorgraph_dvl.baselines.least_squares import least_squares
 from factorgraph_dvl.baselines.luo_2024 import as_printed
 from factorgraph_dvl.baselines.navigation import Navigation, motion_at, navigate
-from factorgraph_dvl.baselines.nine_state import nine_state
+from factorgraph_dvl.baselines.nine_state import nine_state, with_bias
+from factorgraph_dvl.baselines.nine_state_ukf import unscented
 from factorgraph_dvl.baselines.outcome import History, Outcome, history_of
 from factorgraph_dvl.baselines.point_set_filter import point_set
 from factorgraph_dvl.baselines.point_sets import Points
@@ -34,10 +35,18 @@ from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.solution import Progress, Solution
 from factorgraph_dvl.trial import Trial
 
-DvlMethod = Literal["point-set", "luo-2024", "nine-state", "wahba", "least-squares"]
+DvlMethod = Literal[
+    "point-set",
+    "luo-2024",
+    "nine-state",
+    "nine-state-linear",
+    "nine-state-ukf",
+    "wahba",
+    "least-squares",
+]
 DVL_METHODS: tuple[DvlMethod, ...] = get_args(DvlMethod)
-Method = DvlMethod | Literal["star", "beams"]
-METHODS: tuple[Method, ...] = (*DVL_METHODS, "star", "beams")
+Method = DvlMethod | Literal["star", "liu-2020", "beams"]
+METHODS: tuple[Method, ...] = (*DVL_METHODS, "star", "liu-2020", "beams")
 
 _UNCORRELATED = Finding(
     Code.METHOD_LIMITS,
@@ -48,6 +57,8 @@ _NEGLECTED: dict[DvlMethod, tuple[str, ...]] = {
     "point-set": ("dvl_bias", "time_offset"),
     "luo-2024": ("dvl_bias", "time_offset"),
     "nine-state": ("lever_arm", "time_offset"),
+    "nine-state-linear": ("lever_arm", "time_offset"),
+    "nine-state-ukf": ("lever_arm", "time_offset"),
     "wahba": ("lever_arm", "dvl_bias", "time_offset"),
     "least-squares": (),
 }
@@ -81,16 +92,18 @@ def calibrate(
     with the smoothed ones. So the joint covariance has two blocks, DVL and IMU: the approach
     neglects the correlations between them.
 
-    The method `star` estimates the drift of the gyros against a star tracker instead.
+    The methods `star` and `liu-2020` estimate the drift of the gyros against a star tracker
+    instead.
 
     Parameters
     ----------
     trial : Trial
         With IMU, GNSS and DVL, or its beams, or star tracker.
     method : Method, default 'point-set'
-        `point-set` (seven states), `luo-2024` (the same as printed), `nine-state`, `wahba` or
-        `least-squares`, which take beams without a DVL beside them for the velocity that they
-        amount to; `star`; or `beams`, an extended Kalman filter of single beams.
+        `point-set` (seven states), `luo-2024` (the same as printed), `nine-state`,
+        `nine-state-linear` (as printed), `nine-state-ukf`, `wahba` or `least-squares`, which take
+        beams without a DVL beside them for the velocity that they amount to; `star`, or
+        `liu-2020` as printed; or `beams`, an extended Kalman filter of single beams.
     rate_hz : float, default 10.0
         Rate of the trajectory in the solution.
     progress : callable, optional
@@ -114,9 +127,9 @@ def calibrate(
         raise ConfigError(f"rate_hz is {rate_hz}", expected="a number above 0")
     report = progress or (lambda stage, iteration, cost: None)
     trial = without_strays(trial)
-    if method == "star":
+    if method == "star" or method == "liu-2020":
         report("SINS/stars", 0, None)
-        solution, outcome = calibrate_gyros(trial, rate_hz=rate_hz)
+        solution, outcome = calibrate_gyros(trial, rate_hz=rate_hz, printed=method == "liu-2020")
         return solution, history_of(outcome)
     if method == "beams":
         solution, outcome = calibrate_beams(trial, rate_hz=rate_hz, report=report)
@@ -228,8 +241,12 @@ def _calibrate(method: DvlMethod, points_at: Callable[[float], Points], dvl: Dvl
     if method == "least-squares":
         return least_squares(points_at, (misalignment, scale, arm, bias, offset))
     points = points_at(float(offset.mean[0]))
-    if method == "nine-state":
-        return nine_state(points, misalignment, scale, bias, arm.mean)
+    if method == "nine-state-ukf":
+        three, findings = with_bias(misalignment, scale, bias)
+        return unscented(points, three, arm.mean, findings)
+    if method in ("nine-state", "nine-state-linear"):
+        iterated = method == "nine-state"
+        return nine_state(points, misalignment, scale, bias, arm.mean, iterated=iterated)
     single = _single(scale)
     if method == "wahba":
         return wahba(points, misalignment, single, arm.mean)

@@ -57,24 +57,7 @@ def nine_state(
     iterated : bool, default True
         False = the plain linear filter, about the prior mean.
     """
-    findings = []
-    if not bias.estimated:
-        bias = replace(bias, sigma=np.full(3, _BIAS_SIGMA))
-        findings.append(
-            Finding(
-                Code.METHOD_LIMITS,
-                f"the trial fixes the bias at zero, but the method estimates it: {_BIAS_SIGMA} "
-                "m/s taken for its prior standard deviation",
-                parameter=bias.name,
-            )
-        )
-    scale = replace(
-        scale,
-        mean=np.broadcast_to(scale.mean, 3).copy(),
-        sigma=np.broadcast_to(scale.sigma, 3).copy(),
-        spec=SCALES_SPEC,
-    )
-    parameters = (misalignment, scale, bias)
+    parameters, findings = with_bias(misalignment, scale, bias)
     prior = prior_of(parameters)
     free = np.flatnonzero(prior.covariance.diagonal() > 0.0)
     starts = rotation_starts(misalignment) if iterated else rotation_starts(misalignment)[:1]
@@ -110,6 +93,30 @@ def nine_state(
         )
     final = after[-1] if after else at
     return Outcome(final, passes, history, tuple(findings), unseparated, converged)
+
+
+def with_bias(
+    misalignment: Parameter, scale: Parameter, bias: Parameter
+) -> tuple[tuple[Parameter, Parameter, Parameter], list[Finding]]:
+    """Return the parameters of the nine states, and what the user must know of them."""
+    findings = []
+    if not bias.estimated:
+        bias = replace(bias, sigma=np.full(3, _BIAS_SIGMA))
+        findings.append(
+            Finding(
+                Code.METHOD_LIMITS,
+                f"the trial fixes the bias at zero, but the method estimates it: {_BIAS_SIGMA} "
+                "m/s taken for its prior standard deviation",
+                parameter=bias.name,
+            )
+        )
+    scale = replace(
+        scale,
+        mean=np.broadcast_to(scale.mean, 3).copy(),
+        sigma=np.broadcast_to(scale.sigma, 3).copy(),
+        spec=SCALES_SPEC,
+    )
+    return (misalignment, scale, bias), findings
 
 
 def _iterate(

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from factorgraph_dvl.baselines.liu_2020 import run_printed
 from factorgraph_dvl.baselines.navigation import NavigationMotion, motion_at, navigate
 from factorgraph_dvl.baselines.outcome import Estimated, Outcome, history_rows
 from factorgraph_dvl.baselines.star_filter import (
@@ -52,12 +53,28 @@ _KNOWN_DEG = 5.0
 # Chosen: angle, rad, between the vertical of the stars and that of the specific force from which
 # on epoch or mounting must be wrong; waves stay below it on average.
 _OFF_VERTICAL = 2.0 * DEG
+_IN_N = Finding(
+    Code.METHOD_LIMITS,
+    "liu-2020 takes the drift for constant in n, as printed: the drift of a vessel that heads "
+    "elsewhere than north is that of its gyros, rotated; the method `star` has it in body",
+)
 
 
-def calibrate_gyros(trial: Trial, *, rate_hz: float) -> tuple[Solution, Outcome]:
+def calibrate_gyros(
+    trial: Trial, *, rate_hz: float, printed: bool = False
+) -> tuple[Solution, Outcome]:
     """Estimate the drift of the gyros from SINS and star tracker.
 
     Position and velocity of the trajectory are those of SINS/GNSS.
+
+    Parameters
+    ----------
+    trial : Trial
+        With IMU, GNSS and star tracker.
+    rate_hz : float
+        Rate of the trajectory in the solution.
+    printed : bool, default False
+        By the filter as Liu et al. (2020) print it.
 
     Raises
     ------
@@ -99,14 +116,17 @@ def calibrate_gyros(trial: Trial, *, rate_hz: float) -> tuple[Solution, Outcome]
         if tracks:
             gap = inside.time[0] - tracks[-1].time[-1]
             P = P + trial.imu.settings.gyro_bias_walk_root_psd**2 * gap * np.eye(3)
-        forward = run_filter(samples, inside, frame.lat, drift, P)
-        drift, P = forward.track.drift[-1], forward.track.covariance[-1, 3:, 3:]
-        tracks.append(smooth(forward))
+        if printed:
+            filtered = run_printed(samples, inside, frame.lat, np.diag(gyro.sigma**2))
+            tracks.append(filtered)
+        else:
+            forward = run_filter(samples, inside, frame.lat, drift, P)
+            filtered = forward.track
+            tracks.append(smooth(forward))
+        drift, P = filtered.drift[-1], filtered.covariance[-1, 3:, 3:]
         history += [
             (float(t), Estimated((gyro,), (xi,), Q[3:, 3:]))
-            for t, xi, Q in zip(
-                forward.track.time, forward.track.drift, forward.track.covariance, strict=True
-            )
+            for t, xi, Q in zip(filtered.time, filtered.drift, filtered.covariance, strict=True)
         ]
     if not tracks:
         raise DataError(
@@ -119,6 +139,10 @@ def calibrate_gyros(trial: Trial, *, rate_hz: float) -> tuple[Solution, Outcome]
     estimated = replace(estimated, covariance=estimated.covariance + _by_mounting(trial, star))
     outcome = Outcome(estimated, 1, tuple(kept))
     solution = _summary(trial, star, samples, tracks, attitudes, estimated, frame.lat, rate_hz)
+    if printed:
+        solution = replace(
+            solution, solver="kalman-liu-2020", findings=(*solution.findings, _IN_N)
+        )
     return solution, outcome
 
 

@@ -16,6 +16,8 @@ class PaperName(StrEnum):
     """The publications, by the names of their methods."""
 
     LUO_2024 = "luo-2024"
+    LIU_2020 = "liu-2020"
+    NINE_STATE = "nine-state"
 
 
 def reproduce(

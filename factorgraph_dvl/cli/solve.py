@@ -51,9 +51,11 @@ class KalmanMethod(StrEnum):
     POINT_SET = "point-set"
     LUO_2024 = "luo-2024"
     NINE_STATE = "nine-state"
+    NINE_STATE_UKF = "nine-state-ukf"
     WAHBA = "wahba"
     LEAST_SQUARES = "least-squares"
     STAR = "star"
+    LIU_2020 = "liu-2020"
     BEAMS = "beams"
     TWO_OBSERVATIONS = "4sv-2ob"
     THREE_OBSERVATIONS = "4sv-3ob"
@@ -110,6 +112,9 @@ def kalman(
             "(default 4sv-3ob)."
         ),
     ] = None,
+    linear: Annotated[
+        bool, typer.Option("--linear", help="With nine-state: the linear filter, as published.")
+    ] = False,
     force: Force = False,
     no_figures: NoFigures = False,
     rate: Rate = 10.0,
@@ -117,6 +122,10 @@ def kalman(
     quiet: Quiet = False,
 ) -> None:
     """Calibrate or navigate with a Kalman filter, for comparison with `solve`."""
+    if linear and method is not KalmanMethod.NINE_STATE:
+        from factorgraph_dvl.errors import ConfigError
+
+        raise ConfigError("--linear belongs to one method", expected="--method nine-state")
 
     def run(trial: Trial, progress: ProgressLine) -> tuple[Solution, History | None]:
         from factorgraph_dvl.baselines import calibrate
@@ -124,7 +133,8 @@ def kalman(
         chosen = method or KalmanMethod.POINT_SET
         if chosen.planar:
             raise _misplaced(chosen, "a planar trial, without an imu")
-        return calibrate(trial, cast("Method", chosen.value), rate_hz=rate, progress=progress)
+        name = f"{chosen.value}-linear" if linear else chosen.value
+        return calibrate(trial, cast("Method", name), rate_hz=rate, progress=progress)
 
     def run_planar(trial: PlanarTrial, progress: ProgressLine) -> tuple[Solution, History]:
         from factorgraph_dvl.baselines.single_beacon import filter_planar

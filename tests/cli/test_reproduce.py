@@ -15,6 +15,8 @@ from factorgraph_dvl.reproduce.page import label_of
 # Numbered items of each publication: equations, tables, figures.
 NUMBERED = {
     "luo-2024": (16, 7, 7),
+    "liu-2020": (22, 0, 4),
+    "nine-state": (0, 0, 0),
 }
 VERDICTS = {"reproduced", "corrected", "not reproducible"}
 
