@@ -122,22 +122,35 @@ def smooth(
         # The mean over an interval exceeds the value at its middle by a'' dt² / 24.
         found = found - _local_cubics(values, width, deriv=2) / 24.0
     narrow = 2 * _HALF_WIDTHS[0] + 1
-    noise = sigma * _gain(narrow, 0)
+    noise = sigma * _gain(narrow)
     apart = np.abs(_local_cubics(values, narrow) - found)
     misfit = np.where(apart > _STEP * noise, apart, 0.0)
     return Smoothed(
         spline=_interpolant(time, found, 3),
         misfit=_interpolant(time, misfit, 1),
-        sigma=sigma * _gain(width, 0),
-        slope_sigma=sigma * _gain(width, 1) / dt,
+        sigma=sigma * _gain(width),
+        slope_sigma=sigma * _slope_gain(width) / dt,
         window=width,
     )
 
 
 @lru_cache(maxsize=64)
-def _gain(width: int, deriv: int) -> float:
-    """Return the standard deviation that a window leaves of unit noise, at unit intervals."""
-    return float(np.linalg.norm(savgol_coeffs(width, _ORDER, deriv)))
+def _gain(width: int) -> float:
+    """Return the standard deviation that a window leaves of unit noise."""
+    return float(np.linalg.norm(savgol_coeffs(width, _ORDER)))
+
+
+@lru_cache(maxsize=64)
+def _slope_gain(width: int) -> float:
+    """Return that of the derivative of the spline, at unit intervals, between the samples.
+
+    Smoothed values are correlated, and a window ends with a step: a wide one leaves twice the
+    noise that the derivative of its own cubic would have.
+    """
+    count = 2 * width + 1
+    knots, matrix = _spline_matrix(count, 3)
+    spline = BSpline(knots, matrix @ _filter_matrix(count, width, 0), 3)
+    return float(np.linalg.norm(spline(width + 0.25, 1)))
 
 
 def _local_cubics(values: Array, width: int, deriv: int = 0) -> Array:

@@ -1,0 +1,65 @@
+"""Rate and force at any time, as smooth as the noise asks for."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from factorgraph_dvl.imu.interpolation import best_window, smooth, unsmoothed
+
+DT = 0.01
+TIME = np.arange(0.0, 10.0, DT)
+
+
+def noise(sigma):
+    return np.random.default_rng(2).normal(0.0, sigma, (TIME.size, 3))
+
+
+def test_the_more_motion_the_narrower_the_window():
+    white = noise(1e-3)
+    slow, fast = (np.sin(2 * np.pi * f * TIME)[:, None] * np.ones(3) + white for f in (0.2, 8.0))
+    assert best_window(white, DT, 1e-3) == 51
+    assert best_window(white, DT, 1e-3) >= best_window(slow, DT, 1e-3)
+    assert best_window(slow, DT, 1e-3) > best_window(fast, DT, 1e-3)
+    assert best_window(fast, DT, 1e-9) == 0
+
+
+@pytest.mark.parametrize("count", [TIME.size, 200])
+def test_a_cubic_is_left_as_it_is(count):
+    """Also by the matrices that are kept for short signals."""
+    time = TIME[:count]
+    values = np.stack([1.0 + 0.0 * time, 2.0 * time, time**3], axis=1)
+    found = smooth(time, values, DT, 1e-3, averaged=False, window=11)
+    at = np.array([0.5, 1.234])
+    value, slope, misfit = found.at(at)
+    np.testing.assert_allclose(value, np.stack([[1, 1], 2 * at, at**3], axis=1), atol=1e-9)
+    np.testing.assert_allclose(slope[:, 2], 3 * at**2, atol=1e-6)
+    np.testing.assert_array_equal(misfit, 0.0)
+
+
+def test_means_are_corrected_to_the_value_at_the_middle():
+    # The mean of t² over an interval exceeds its middle's by dt² / 12.
+    values = np.repeat((TIME**2 + DT**2 / 12.0)[:, None], 3, axis=1)
+    found = smooth(TIME, values, DT, 1e-3, averaged=True, window=11)
+    np.testing.assert_allclose(found.at(np.array([5.0]))[0], 25.0, rtol=1e-12)
+
+
+def test_the_noise_that_is_left_is_as_stated():
+    found = smooth(TIME, noise(1e-3), DT, 1e-3, averaged=False, window=51)
+    value, slope, _ = found.at(TIME[60:-60])
+    assert np.std(value) == pytest.approx(found.sigma, rel=0.25)
+    assert np.std(slope) == pytest.approx(found.slope_sigma, rel=0.25)
+    assert found.sigma < 0.25e-3
+
+
+def test_a_step_is_named_as_not_resolved():
+    values = np.where(TIME < 5.0, 0.0, 1.0)[:, None] * np.ones(3)
+    found = smooth(TIME, values, DT, 1e-3, averaged=False, window=25)
+    assert found.at(np.array([5.0]))[2].min() > 0.1
+    assert found.at(np.array([2.0]))[2].max() == 0.0
+
+
+def test_samples_that_are_left_alone_have_their_own_noise():
+    assert unsmoothed(DT, 1e-3).spline is None
+    assert unsmoothed(DT, 1e-3).slope_sigma == pytest.approx(0.2)
+    assert smooth(TIME[:5], noise(1.0)[:5], DT, 1.0, averaged=False, window=11).window == 0
