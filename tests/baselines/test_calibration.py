@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import msgspec
 import numpy as np
 import pytest
 from builders import write_trial
@@ -21,17 +22,21 @@ from factorgraph_dvl.sensors.finding import Code
 from factorgraph_dvl.simulation import simulate
 
 
-@pytest.mark.parametrize(
-    "misalignment", [[0, 0, 30], [0, 0, 90], [0, 0, 180], [0, 180, 0], [100, -80, 60]], ids=str
-)
+@pytest.fixture(scope="module", params=[[0, 0, 180], [0, 180, 0], [100, -80, 60]], ids=str)
+def turned(request):
+    """A trial without noise, and its large misalignment."""
+    dvl = {"misalignment_deg": request.param}
+    return simulate(scenario(manoeuvres=VARIED, dvl=dvl)), request.param
+
+
 @pytest.mark.parametrize("method", DVL_METHODS)
-def test_without_noise_large_misalignments_are_exact(method, misalignment):
+def test_without_noise_large_misalignments_are_exact(method, turned):
+    trial, misalignment = turned
     knows_arm = method in ("nine-state", "wahba")
-    claims = {"lever_arm_m": [1, 1.2, 1.4]} if knows_arm else {}
-    scene = scenario(
-        manoeuvres=VARIED, dvl={"misalignment_deg": misalignment}, trial={"dvl": claims}
-    )
-    solution = kalman(simulate(scene), method)
+    if knows_arm:
+        known = msgspec.structs.replace(trial.dvl.settings, lever_arm_m=(1, 1.2, 1.4))
+        trial = replace(trial, dvl=replace(trial.dvl, settings=known))
+    solution = kalman(trial, method)
     assert solution.converged
     assert solution.solver == f"kalman-{method}"
     assert angle_between(solution, misalignment) < 1e-3
@@ -42,19 +47,24 @@ def test_without_noise_large_misalignments_are_exact(method, misalignment):
         )
 
 
-@pytest.mark.parametrize("method", DVL_METHODS)
-@pytest.mark.parametrize(
-    "changes",
-    [
+@pytest.fixture(
+    scope="module",
+    params=[
         STILL,
         {**STILL, "start": {"speed_m_s": 0}},
         {"dvl": {"no_lock_s": [[0.0, 100.0]]}},
         {"trial": {"dvl": {"misalignment_std_deg": [0, 0, 0], "scale_error_std": 0}}},
     ],
-    ids=["straight", "at rest", "no lock", "held"],
+    ids=["straight", "at rest", "no lock", "fixed"],
 )
-def test_what_is_not_observable_is_said(method, changes):
-    solution = kalman(simulate(scenario(noise=True, **changes), 1), method)
+def uninformed(request):
+    """A trial that does not determine the misalignment."""
+    return simulate(scenario(noise=True, **request.param), 1)
+
+
+@pytest.mark.parametrize("method", DVL_METHODS)
+def test_what_is_not_observable_is_said(method, uninformed):
+    solution = kalman(uninformed, method)
     assert np.all(np.isfinite(solution.covariance))
     assert not solution.estimate("misalignment_deg").observable.all()
     assert all(np.all(np.isfinite(e.value)) for e in solution.estimates)

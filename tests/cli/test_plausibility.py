@@ -117,8 +117,10 @@ def test_a_refusal_is_overridden(honest, tmp_path, run):
     assert not (out / "instrument.yaml").exists()
 
 
-@pytest.mark.parametrize("command", ["solve", "replay", "kalman"])
-@pytest.mark.parametrize("spoil", [east_mirrored, upside_down])
+@pytest.mark.parametrize(
+    ("command", "spoil"),
+    [("solve", east_mirrored), ("replay", upside_down), ("kalman", east_mirrored)],
+)
 def test_what_contradicts_is_a_finding_of_the_result(command, spoil, honest, tmp_path, run):
     trial = write_trial(tmp_path, spoil(honest))
     said = errors_of(run, trial)

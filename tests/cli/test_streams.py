@@ -57,7 +57,9 @@ def test_an_interrupt_while_modules_load_is_one_line(tmp_path: Path, module: str
     trial = write_trial(tmp_path)
     # Loading that module stands still, as it may on a slow disk.
     stall = (
-        "import sys, time\n"
+        "import signal, sys, time\n"
+        # Also where the tests run in the background, which ignores interrupts.
+        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
         "class Stall:\n"
         "    def find_spec(self, name, path=None, target=None):\n"
         f"        if name == {module!r}:\n"

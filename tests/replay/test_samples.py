@@ -61,12 +61,12 @@ def test_a_gap_ends_a_segment():
     assert samples.segment_after(4.99, 0.2, np.inf, end=False) == gap
 
 
-@pytest.mark.parametrize("rate", [10.0, 73.1, 100.0, 128.0])
-@pytest.mark.parametrize("interval", [0.1, 0.2, 1.0])
-@pytest.mark.parametrize("decimals", [3, 6, 12])
+@pytest.mark.parametrize("rate", [10.0, 73.1, 128.0])
+@pytest.mark.parametrize("interval", [0.1, 1.0])
+@pytest.mark.parametrize("decimals", [3, 12])
 def test_every_segment_ends_after_its_start(rate, interval, decimals):
     # Half-way between two samples, by a fast clock, and where attitudes want their own states.
-    time = np.round((np.arange(1, round(20 * rate)) + 0.5) / rate * (1.0 + 25e-6), decimals)
+    time = np.round((np.arange(1, round(12 * rate)) + 0.5) / rate * (1.0 + 25e-6), decimals)
     for wanted in (0.0, 0.07):
         samples = SampleBuffer(NOISE)
         samples.add(table(time))

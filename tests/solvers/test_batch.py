@@ -96,14 +96,14 @@ def test_the_same_trial_gives_the_same_numbers():
     assert one.findings == two.findings
 
 
-@pytest.mark.parametrize("rate", [1.0, 10.0, 100.0])
+@pytest.mark.parametrize("rate", [1.0, 100.0])
 def test_the_trajectory_comes_at_the_rate_asked_for(rate):
     trial = simulate(scenario(manoeuvres=SHORT))
     time = solve(trial, rate_hz=rate).trajectory.time
     np.testing.assert_allclose(np.diff(time), 1.0 / rate)
 
 
-@pytest.mark.parametrize("interval", [0.2, 1.0, 2.0])
+@pytest.mark.parametrize("interval", [0.2, 2.0])
 def test_the_states_may_be_denser_or_sparser(interval):
     trial = simulate(scenario(sway=CONING))
     assert_exact(trial, solve(trial, state_interval_s=interval))

@@ -78,7 +78,7 @@ def test_at_rest_in_the_water_a_current_shows_no_mounting():
 
 
 def test_a_current_that_was_not_estimated_is_named():
-    trial = straight(20.0, **WATER)
+    trial = straight(35.0, **WATER)
     solution = solve(trial)
     kept = tuple(e for e in solution.estimates if e.name != "current_m_s")
     size = sum(e.value.size for e in kept)
@@ -103,15 +103,15 @@ def test_an_estimated_bias_takes_the_scale_from_a_straight_run():
 
 
 def test_a_time_offset_is_named_as_taken_for_known():
-    trial = straight(20.0, trial={"dvl": {"time_offset_std_s": 0.1}})
+    trial = straight(35.0, trial={"dvl": {"time_offset_std_s": 0.1}})
     view = observability(solve(trial), trial=trial)
     assert any("time_offset_s in the singular values" in text for text in view.missing)
     assert not any(
-        "in the singular values" in t for t in observability(solve(straight(20.0))).missing
+        "in the singular values" in t for t in observability(solve(straight(35.0))).missing
     )
 
 
-@pytest.mark.parametrize("rate_hz", [5.0, 10.0, 20.0])
+@pytest.mark.parametrize("rate_hz", [5.0, 20.0])
 def test_noise_of_rates_is_no_lever_arm(rate_hz):
     solution = solve(straight(120.0, **MEMS), rate_hz=rate_hz)
     view = observability(solution)

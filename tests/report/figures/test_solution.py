@@ -266,8 +266,9 @@ def test_unobservable_and_fixed_components(short: tuple[Trial, Solution], tmp_pa
         observable=np.array([True, False, False]),
     )
     stds = np.concatenate([std, *(e.std for e in rest)])
-    changed = replace(solution, estimates=(odd, *rest), covariance=np.diag(stds**2))
-    assert drawn(trial, changed, tmp_path) == ALL
+    changed = replace(solution, estimates=(odd, *rest), covariance=np.diag(stds**2), residuals=())
+    expected = ALL - {"gnss_residuals.png", "dvl_residuals.png"}
+    assert drawn(replace(trial, reference=None), changed, tmp_path) == expected
 
 
 def test_nothing_estimated_and_no_residuals(short: tuple[Trial, Solution], tmp_path: Path) -> None:
@@ -327,7 +328,8 @@ def test_a_swing_too_fast_for_the_whole_time_is_drawn_close_up(
     assert seconds[-1] == pytest.approx(455.0)
     shown = np.isin(solution.trajectory.time, seconds)
     np.testing.assert_allclose(roll, solution.trajectory.rph[shown, 0] / DEG)
-    assert drawn(trial, solution, tmp_path) == ALL
+    bare = without_calibration(replace(solution, residuals=()))
+    assert drawn(replace(trial, reference=None), bare, tmp_path) == {"track.png", "motion.png"}
 
 
 def test_residuals_are_drawn_in_their_own_sigma(short: tuple[Trial, Solution]) -> None:
