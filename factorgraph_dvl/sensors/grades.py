@@ -31,8 +31,8 @@ def grades(std: Array, observable: np.ndarray, limit: float = np.inf) -> tuple[G
     ----------
     std : ndarray, shape (n,)
         Standard deviations, in reported units.
-    observable : ndarray, shape (n,)
-        Bool.
+    observable : ndarray of bool, shape (n,)
+        Whether the data determine a component.
     limit : float, optional
         What is good enough; there is none if infinite.
     """
