@@ -2,8 +2,8 @@
 
 The nine states and the model of `nine_state`, v_d = (1 + a) Exp(theta) v_ref + beta, for angles
 that are too large for a linear filter. Each ping sends the estimate and 18 sigma points, at
-sqrt(3) standard deviations about it, through the model (Julier and Uhlmann, Proc. IEEE 92(3), 2004, with
-n + kappa = 3, alpha = 1, beta = 2). theta is the angle that is left of the rotation so far.
+sqrt(3) standard deviations about it, through the model (Julier and Uhlmann, Proc. IEEE 92(3),
+2004, with n + kappa = 3, alpha = 1, beta = 2). theta is what is left of the rotation so far.
 """
 
 from __future__ import annotations
