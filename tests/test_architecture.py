@@ -85,6 +85,7 @@ def test_simulation_takes_no_measurement_model_from_the_sensors():
         "Heading",
         "HeadingSettings",
         "LogSettings",
+        "NoiseModel",
         "NonNegative",
         "Positive",
         "Section",

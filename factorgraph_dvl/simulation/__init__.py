@@ -27,6 +27,7 @@ from factorgraph_dvl.simulation.motion import TrueMotion, plan_motion
 from factorgraph_dvl.simulation.ranging import simulate_beacons, simulate_heading, simulate_log
 from factorgraph_dvl.simulation.scenario import Scenario, load_scenario, parse_scenario
 from factorgraph_dvl.simulation.star import simulate_star
+from factorgraph_dvl.simulation.stated_errors import with_stated_errors
 from factorgraph_dvl.trial import (
     InitialAttitude,
     InitialPosition,
@@ -65,8 +66,8 @@ def simulate(scenario: Scenario | str | PathLike[str], seed: int = 0) -> Trial:
     scenario : Scenario or path-like of str
         A scenario, or the path of its YAML file.
     seed : int, default 0
-        Random seed. Each sensor has a random stream of its own, so adding or changing a sensor
-        does not change the others.
+        Random seed. Each sensor has a random stream of its own, and so has each of its errors but
+        white noise, bias and beams: adding or changing one does not change the others.
 
     Raises
     ------
@@ -90,7 +91,7 @@ def simulate(scenario: Scenario | str | PathLike[str], seed: int = 0) -> Trial:
             aids[section], calibration = run(scenario, motion, rng)
             truth |= calibration
     attitude, position, velocity = _initial(scenario, motion, imu.time[:1])
-    return Trial(
+    trial = Trial(
         name=scenario.name,
         imu=imu,
         gnss=cast("Gnss | None", aids.pop("gnss", None)),
@@ -98,12 +99,14 @@ def simulate(scenario: Scenario | str | PathLike[str], seed: int = 0) -> Trial:
         others=tuple(aids.values()),
         body_axes=scenario.body_axes,
         epoch=scenario.epoch,
+        noise=scenario.trial.noise,
         initial_attitude=attitude,
         initial_position=position,
         initial_velocity=velocity,
         reference=_reference(motion, scenario.reference_rate_hz),
         calibration_truth=truth,
     )
+    return with_stated_errors(trial, scenario, seed)
 
 
 def simulate_planar(scenario: Scenario | str | PathLike[str], seed: int = 0) -> PlanarTrial:

@@ -14,6 +14,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
+from factorgraph_dvl.geometry.units import DEG_PER_HOUR, HOUR, MICRO_G
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.simulation.measurements import displaced
 from factorgraph_dvl.trial import Trial
@@ -40,15 +41,19 @@ def with_faults(trial: Trial, faults: Sequence[Fault], seed: int = 0) -> Trial:
     return trial
 
 
-def gauss_markov(time: Array, tau_s: float, components: int, rng: np.random.Generator) -> Array:
+def gauss_markov(
+    time: Array, tau_s: float | Sequence[float], components: int, rng: np.random.Generator
+) -> Array:
     """Return a stationary first-order Gauss-Markov process of unit variance, (M, components).
 
-    Exact at any times: c(t + d) = exp(-d / tau) c(t) + sqrt(1 - exp(-2 d / tau)) w.
+    Exact at any times: c(t + d) = exp(-d / tau) c(t) + sqrt(1 - exp(-2 d / tau)) w. Of tau there
+    may be one for each component.
     """
-    decay = np.exp(-np.diff(time) / tau_s)
+    tau = np.broadcast_to(np.asarray(tau_s, dtype=float), components)
+    decay = np.exp(-np.diff(time)[:, None] / tau)
     noise = rng.standard_normal((time.size, components))
-    noise[1:] *= np.sqrt(1.0 - decay**2)[:, None]
-    for k, phi in enumerate(decay.tolist()):
+    noise[1:] *= np.sqrt(1.0 - decay**2)
+    for k, phi in enumerate(decay):
         noise[k + 1] += phi * noise[k]
     return noise
 
@@ -56,11 +61,12 @@ def gauss_markov(time: Array, tau_s: float, components: int, rng: np.random.Gene
 def late(section: str, delay_s: float) -> Fault:
     """Stamp the record of a sensor late by a constant time, s.
 
-    A late IMU makes all other sensors early.
+    A late IMU makes all other sensors early. The reference goes with it: the clock of the IMU is
+    that of a solution.
     """
 
     def fault(trial: Trial, rng: np.random.Generator) -> Trial:
-        return _stamped(trial, section, lambda time: time + delay_s, {"offset": delay_s})
+        return _stamped(trial, section, lambda time: time + delay_s, offset_s=delay_s)
 
     return fault
 
@@ -70,7 +76,9 @@ def clock_rate(section: str, rate_ppm: float) -> Fault:
 
     def fault(trial: Trial, rng: np.random.Generator) -> Trial:
         middle = 0.5 * (trial.imu.time[0] + trial.imu.time[-1])
-        return _stamped(trial, section, lambda t: t + 1e-6 * rate_ppm * (t - middle), {})
+        return _stamped(
+            trial, section, lambda t: t + 1e-6 * rate_ppm * (t - middle), rate_ppm=rate_ppm
+        )
 
     return fault
 
@@ -83,7 +91,7 @@ def jitter(section: str, std_s: float) -> Fault:
             moved = np.sort(time + std_s * rng.standard_normal(time.size))
             return moved + 1e-9 * np.arange(time.size)
 
-        return _stamped(trial, section, scattered, {})
+        return _with(trial, section, time=scattered(_record(trial, section).time))
 
     return fault
 
@@ -91,8 +99,8 @@ def jitter(section: str, std_s: float) -> Fault:
 def correlated_gnss(
     position_std_m: Sequence[float] = (0.0, 0.0, 0.0),
     velocity_std_m_s: Sequence[float] = (0.0, 0.0, 0.0),
-    position_tau_s: float = 100.0,
-    velocity_tau_s: float = 2.0,
+    position_tau_s: float | Sequence[float] = 100.0,
+    velocity_tau_s: float | Sequence[float] = 2.0,
 ) -> Fault:
     """Add Gauss-Markov errors to position and velocity of GNSS, east, north and up."""
 
@@ -100,12 +108,9 @@ def correlated_gnss(
         gnss = _record(trial, "gnss")
         wander = gauss_markov(gnss.time, position_tau_s, 3, rng) * position_std_m
         change = gauss_markov(gnss.time, velocity_tau_s, 3, rng) * velocity_std_m_s
-        return _with(
-            trial,
-            "gnss",
-            geodetic=displaced(gnss.geodetic, wander),
-            velocity=gnss.velocity + change,
-        )
+        # A displacement by zero would change the last digits.
+        geodetic = displaced(gnss.geodetic, wander) if wander.any() else gnss.geodetic
+        return _with(trial, "gnss", geodetic=geodetic, velocity=gnss.velocity + change)
 
     return fault
 
@@ -168,12 +173,31 @@ def dvl_scale_drift(total: float) -> Fault:
     return fault
 
 
-def correlated_dvl(std_m_s: float, tau_s: float = 5.0) -> Fault:
-    """Add a first-order Gauss-Markov error to each axis of the DVL."""
+def dvl_scale_walk(std_sqrt_h: float) -> Fault:
+    """Let the scale of the DVL walk at random, by a standard deviation per √h, zero on average."""
 
     def fault(trial: Trial, rng: np.random.Generator) -> Trial:
         dvl = _record(trial, "dvl")
-        error = std_m_s * gauss_markov(dvl.time, tau_s, 3, rng)
+        steps = rng.standard_normal(dvl.time.size) * std_sqrt_h
+        steps[1:] *= np.sqrt(np.diff(dvl.time) / HOUR)
+        steps[0] = 0.0
+        walk = np.cumsum(steps)
+        return _with(trial, "dvl", velocity=dvl.velocity * (1.0 + walk - walk.mean())[:, None])
+
+    return fault
+
+
+def correlated_dvl(std_m_s: float, tau_s: float = 5.0, std_fraction: float = 0.0) -> Fault:
+    """Add a first-order Gauss-Markov error to each axis of the DVL.
+
+    Its variance is std_m_s² + (std_fraction · speed)², as that of the white noise.
+    """
+
+    def fault(trial: Trial, rng: np.random.Generator) -> Trial:
+        dvl = _record(trial, "dvl")
+        speed = np.linalg.norm(dvl.velocity, axis=1, keepdims=True)
+        std = np.hypot(std_m_s, std_fraction * speed)
+        error = std * gauss_markov(dvl.time, tau_s, 3, rng)
         return _with(trial, "dvl", velocity=dvl.velocity + error)
 
     return fault
@@ -270,11 +294,17 @@ def imu_errors(
     """
 
     def fault(trial: Trial, rng: np.random.Generator) -> Trial:
-        imu = trial.imu
+        imu, truth = trial.imu, trial.calibration_truth
         added = imu.gyro @ np.transpose(gyro) + imu.accel @ np.transpose(g_sensitivity)
-        return _with(
+        out = _with(
             trial, "imu", gyro=imu.gyro + added, accel=imu.accel + imu.accel @ np.transpose(accel)
         )
+        # The biases in the samples are changed as well.
+        gyro_bias = np.asarray(truth.get("gyro_bias_deg_h", np.zeros(3)))
+        accel_bias = np.asarray(truth.get("accel_bias_ug", np.zeros(3)))
+        leaked = np.asarray(g_sensitivity) @ accel_bias * (MICRO_G / DEG_PER_HOUR)
+        out = _truth(out, "gyro_bias_deg_h", np.asarray(gyro) @ gyro_bias + leaked)
+        return _truth(out, "accel_bias_ug", np.asarray(accel) @ accel_bias)
 
     return fault
 
@@ -295,22 +325,41 @@ def saturated(gyro_rad_s: float = np.inf, accel_m_s2: float = np.inf) -> Fault:
 
 
 def _stamped(
-    trial: Trial, section: str, clock: Callable[[Array], Array], known: dict[str, float]
+    trial: Trial,
+    section: str,
+    clock: Callable[[Array], Array],
+    *,
+    offset_s: float = 0.0,
+    rate_ppm: float = 0.0,
 ) -> Trial:
     out = _with(trial, section, time=clock(_record(trial, section).time))
-    offset = known.get("offset", 0.0)
-    if section == "dvl":
-        out = _truth(out, "time_offset_s", np.array([offset]))
-    elif section == "imu":
-        out = _truth(out, "time_offset_s", np.array([-offset]))
+    moved = {section: 1.0}
+    if section == "imu":
+        moved = {aid.section: -1.0 for aid in trial.aids}
+        if out.reference is not None:
+            reference = replace(out.reference, time=clock(out.reference.time))
+            out = replace(out, reference=reference)
+    for aid, sign in moved.items():
+        offset, rate = _clock_names(trial, aid)
+        out = _truth(out, offset, np.array([sign * offset_s]))
+        out = _truth(out, rate, np.array([sign * rate_ppm]))
     return out
 
 
+def _clock_names(trial: Trial, section: str) -> tuple[str, str]:
+    """Return the reported names of the offset and the rate of a sensor's clock."""
+    if section == "dvl" or (section == "dvl_beams" and trial.dvl is None):
+        return "time_offset_s", "dvl_clock_rate_ppm"
+    stem = {"dvl_beams": "beam", "beacons": "beacon"}.get(section, section)
+    return f"{stem}_time_offset_s", f"{stem}_clock_rate_ppm"
+
+
 def _truth(trial: Trial, name: str, change: Array) -> Trial:
-    """Return a trial whose true parameter, if it is known, has changed."""
+    """Return a trial whose true parameter has changed; one without a truth was zero before."""
+    if not np.any(change):
+        return trial
     truth = dict(trial.calibration_truth)
-    if name in truth:
-        truth[name] = truth[name] + change
+    truth[name] = truth.get(name, 0.0) + change
     return replace(trial, calibration_truth=truth)
 
 

@@ -20,6 +20,11 @@ from factorgraph_dvl.sensors.turntable import TurntableSettings
 from factorgraph_dvl.settings.sections import NonNegative, Positive, Section, Sigma3, Vector3
 
 Interval = tuple[float, float]
+Share = Annotated[float, msgspec.Meta(ge=0, le=1)]
+Draw = Literal["draw"]
+# Elements of a matrix by rows: off the diagonal, and all.
+_OffDiagonal = tuple[float, float, float, float, float, float]
+_Matrix = tuple[Vector3, Vector3, Vector3]
 
 
 class Sampled(Section, frozen=True, kw_only=True):
@@ -47,10 +52,63 @@ class SimulatedInstrument(Sampled, frozen=True, kw_only=True):
         raise NotImplementedError
 
 
-class ImuTruth(SimulatedInstrument, frozen=True, kw_only=True):
-    """The simulated IMU; `draw` takes a bias from N(0, std²), anew for each seed."""
+class ClockedInstrument(SimulatedInstrument, frozen=True, kw_only=True):
+    """A simulated sensor whose stamps are late by an offset, and run fast by a rate."""
+
+    # Errors that may be drawn, and the keys of the standard deviations that this takes.
+    drawn: ClassVar[dict[str, str]] = {"time_offset_s": "time_offset_std_s"}
+
+    time_offset_s: float | Draw = 0.0
+    time_offset_std_s: Positive | None = None
+    clock_rate_ppm: float = 0.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name, std in self.drawn.items():
+            if getattr(self, name) == "draw" and getattr(self, std) is None:
+                raise ValueError(f"`{name}: draw` needs `{std}`")
+
+
+class Outliers(Section, frozen=True, kw_only=True):
+    """Gross errors of a share of the measurements, so many stated standard deviations long."""
+
+    share: Share
+    sigmas: tuple[NonNegative, NonNegative] = (10.0, 100.0)
+
+
+class Jumps(Section, frozen=True, kw_only=True):
+    """Positions that jump aside for a while, as a receiver's do under a bridge."""
+
+    size_m: Positive = 10.0
+    duration_s: Positive = 30.0
+    count: Annotated[int, msgspec.Meta(ge=1)] = 3
+
+
+class FalseLock(Section, frozen=True, kw_only=True):
+    """A lock on something that moves, such as a layer of fish, for a while."""
+
+    speed_m_s: Positive = 0.3
+    duration_s: Positive = 60.0
+
+
+class ImuTruth(ClockedInstrument, frozen=True, kw_only=True):
+    """The simulated IMU; `draw` takes an error from N(0, std²), anew for each seed."""
 
     section_type: ClassVar[type[SensorSection]] = ImuSettings
+    # Errors of the samples that grow with rate and force.
+    matrices: ClassVar[dict[str, str]] = {
+        "gyro_scale_ppm": "gyro_scale_std_ppm",
+        "gyro_misalignment_deg": "gyro_misalignment_std_deg",
+        "gyro_g_sensitivity_deg_h_g": "gyro_g_sensitivity_std_deg_h_g",
+        "accel_scale_ppm": "accel_scale_std_ppm",
+        "accel_misalignment_deg": "accel_misalignment_std_deg",
+    }
+    drawn: ClassVar[dict[str, str]] = {
+        **ClockedInstrument.drawn,
+        **matrices,
+        "gyro_bias_deg_h": "gyro_bias_std_deg_h",
+        "accel_bias_ug": "accel_bias_std_ug",
+    }
 
     sampling: Literal["mean", "instantaneous"] = "mean"
     gaps_s: tuple[Interval, ...] = ()
@@ -62,17 +120,23 @@ class ImuTruth(SimulatedInstrument, frozen=True, kw_only=True):
     accel_bias_std_ug: Positive | None = None
     accel_bias_walk_ug_sqrt_h: NonNegative = 0.0
     accel_noise_ug_sqrt_hz: NonNegative = 0.0
+    gyro_scale_ppm: Vector3 | Draw = (0.0, 0.0, 0.0)
+    gyro_scale_std_ppm: Positive | None = None
+    gyro_misalignment_deg: _OffDiagonal | Draw = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    gyro_misalignment_std_deg: Positive | None = None
+    gyro_g_sensitivity_deg_h_g: _Matrix | Draw = ((0.0, 0.0, 0.0),) * 3
+    gyro_g_sensitivity_std_deg_h_g: Positive | None = None
+    accel_scale_ppm: Vector3 | Draw = (0.0, 0.0, 0.0)
+    accel_scale_std_ppm: Positive | None = None
+    accel_misalignment_deg: Vector3 | Draw = (0.0, 0.0, 0.0)
+    accel_misalignment_std_deg: Positive | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
         check_intervals("gaps_s", self.gaps_s)
-        if self.gyro_bias_deg_h == "draw" and self.gyro_bias_std_deg_h is None:
-            raise ValueError("`gyro_bias_deg_h: draw` needs `gyro_bias_std_deg_h`")
-        if self.accel_bias_ug == "draw" and self.accel_bias_std_ug is None:
-            raise ValueError("`accel_bias_ug: draw` needs `accel_bias_std_ug`")
 
     def claimed(self) -> dict[str, Any]:
-        """Return sampling, noise and bias as simulated."""
+        """Return sampling, noise, and standard deviations of errors as simulated."""
         names = (
             "sampling",
             "gyro_noise_deg_sqrt_h",
@@ -81,26 +145,46 @@ class ImuTruth(SimulatedInstrument, frozen=True, kw_only=True):
             "accel_noise_ug_sqrt_hz",
             "accel_bias_walk_ug_sqrt_h",
             "accel_bias_std_ug",
+            *self.matrices.values(),
         )
         return {name: getattr(self, name) for name in names if getattr(self, name) is not None}
 
 
-class GnssTruth(SimulatedInstrument, frozen=True, kw_only=True):
-    """The simulated receiver; without velocity_std_m_s it measures no velocity."""
+class GnssTruth(ClockedInstrument, frozen=True, kw_only=True):
+    """The simulated receiver; without velocity_std_m_s it measures no velocity.
+
+    Shares are those of the variance of position and velocity that belong to a first-order
+    Gauss-Markov process; the rest is white.
+    """
 
     section_type: ClassVar[type[SensorSection]] = GnssSettings
+    drawn: ClassVar[dict[str, str]] = {
+        **ClockedInstrument.drawn,
+        "lever_arm_error_m": "lever_arm_error_std_m",
+    }
 
     position_std_m: Sigma3
     velocity_std_m_s: Sigma3 | None = None
     lever_arm_m: Vector3 = (0.0, 0.0, 0.0)
+    lever_arm_error_m: Vector3 | Draw = (0.0, 0.0, 0.0)
+    lever_arm_error_std_m: Positive | None = None
+    correlated_share: Share = 0.0
+    correlation_time_s: float | Vector3 = 100.0
+    velocity_correlated_share: Share = 0.0
+    velocity_correlation_time_s: float | Vector3 = 2.0
+    outliers: Outliers | None = None
+    jumps: Jumps | None = None
     outages_s: tuple[Interval, ...] = ()
 
     def __post_init__(self) -> None:
         super().__post_init__()
         check_intervals("outages_s", self.outages_s)
+        for name in ("correlation_time_s", "velocity_correlation_time_s"):
+            if np.min(getattr(self, name)) <= 0.0:
+                raise ValueError(f"`{name}` must be above 0")
 
     def claimed(self) -> dict[str, Any]:
-        """Return noise and antenna lever arm as simulated."""
+        """Return noise and antenna lever arm as simulated; its error comes on top."""
         out: dict[str, Any] = {
             "position_std_m": self.position_std_m,
             "lever_arm_m": self.lever_arm_m,
@@ -110,18 +194,28 @@ class GnssTruth(SimulatedInstrument, frozen=True, kw_only=True):
         return out
 
 
-class DvlTruth(SimulatedInstrument, frozen=True, kw_only=True):
+class DvlTruth(ClockedInstrument, frozen=True, kw_only=True):
     """The simulated DVL; the noise variance is floor² + (fraction · |v|)²."""
 
     section_type: ClassVar[type[SensorSection]] = DvlSettings
+    drawn: ClassVar[dict[str, str]] = {
+        **ClockedInstrument.drawn,
+        "bias_m_s": "bias_std_m_s",
+    }
 
     misalignment_deg: Vector3 = (0.0, 0.0, 0.0)
     scale_error: float | Vector3 = 0.0
     lever_arm_m: Vector3 = (0.0, 0.0, 0.0)
-    bias_m_s: Vector3 = (0.0, 0.0, 0.0)
-    time_offset_s: float = 0.0
+    bias_m_s: Vector3 | Draw = (0.0, 0.0, 0.0)
+    bias_std_m_s: Positive | None = None
     velocity_std_m_s: NonNegative = 0.0
     velocity_std_fraction: NonNegative = 0.0
+    correlated_share: Share = 0.0
+    correlation_time_s: Positive = 5.0
+    scale_drift: float = 0.0
+    scale_walk_sqrt_h: NonNegative = 0.0
+    outliers: Outliers | None = None
+    false_lock: FalseLock | None = None
     reference: Literal["bottom", "water"] = "bottom"
     no_lock_s: tuple[Interval, ...] = ()
 
@@ -187,7 +281,7 @@ class LostBeam(Section, frozen=True, kw_only=True):
     to_s: float
 
 
-class DvlBeamsTruth(SimulatedInstrument, frozen=True, kw_only=True):
+class DvlBeamsTruth(ClockedInstrument, frozen=True, kw_only=True):
     """The simulated beams; `draw` takes errors anew for each seed, evenly up to a limit.
 
     The noise variance of a beam is floor² + (fraction · its velocity)².

@@ -96,7 +96,10 @@ def simulate_imu(
 def simulate_gnss(
     scenario: Scenario, motion: TrueMotion, rng: np.random.Generator
 ) -> tuple[Gnss, dict[str, Array]]:
-    """Return the receiver's record, position and velocity of the antenna, and its truth."""
+    """Return the receiver's record, position and velocity of the antenna, and its truth.
+
+    Of the noise, only the white part.
+    """
     truth = scenario.gnss
     assert truth is not None
     jitter_rng, position_rng, velocity_rng = rng.spawn(3)
@@ -106,12 +109,14 @@ def simulate_gnss(
     nRs = rotation_from_rph(state.rph, scenario.body_axes)
     arm_n = apply(nRs, np.array(truth.lever_arm_m))
     velocity = state.v_n + apply(nRs, np.cross(state.omega_eb_b, truth.lever_arm_m))
-    error = position_rng.standard_normal(arm_n.shape) * truth.position_std_m
+    white = position_rng.standard_normal(arm_n.shape) * truth.position_std_m
+    error = np.sqrt(1.0 - truth.correlated_share) * white
     geodetic = displaced(state.geodetic, arm_n + error if scenario.noise else arm_n)
     if truth.velocity_std_m_s is None:
         velocity = np.full_like(velocity, np.nan)
     elif scenario.noise:
-        velocity += velocity_rng.standard_normal(velocity.shape) * truth.velocity_std_m_s
+        white = velocity_rng.standard_normal(velocity.shape) * truth.velocity_std_m_s
+        velocity += np.sqrt(1.0 - truth.velocity_correlated_share) * white
     keep = ~within(time, truth.outages_s)
     unknown = np.full((int(keep.sum()), 3), np.nan)
     gnss = Gnss(
@@ -130,10 +135,9 @@ def simulate_dvl(
 ) -> tuple[Dvl, dict[str, Array]]:
     """Return the DVL's record, and its calibration by reported name.
 
-        v_d = (1 + k) C_b^d (v_b + omega_eb_b x l) + beta + noise,
+        v_d = (1 + k) C_b^d (v_b + omega_eb_b x l) + noise,
 
-    at the true time of the ping; the recorded time is later by the time offset. Through the
-    water, v_b excludes the current.
+    at the true time of the ping. Through the water, v_b excludes the current.
     """
     truth = scenario.dvl
     assert truth is not None
@@ -144,11 +148,12 @@ def simulate_dvl(
     if scenario.noise:
         speed = np.linalg.norm(velocity, axis=1, keepdims=True)
         sigma = np.hypot(truth.velocity_std_m_s, truth.velocity_std_fraction * speed)
+        sigma *= np.sqrt(1.0 - truth.correlated_share)
         velocity += sigma * noise_rng.standard_normal(velocity.shape)
     velocity[within(time, truth.no_lock_s)] = np.nan
     dvl = Dvl(
         settings=cast("DvlSettings", scenario.settings("dvl")),
-        time=time + truth.time_offset_s,
+        time=time,
         velocity=velocity,
         std=np.full_like(velocity, np.nan),
     )
@@ -156,8 +161,8 @@ def simulate_dvl(
         "misalignment_deg": np.array(truth.misalignment_deg),
         "scale_error": np.atleast_1d(np.array(truth.scale_error, dtype=float)),
         "lever_arm_m": np.array(truth.lever_arm_m),
-        "dvl_bias_m_s": np.array(truth.bias_m_s),
-        "time_offset_s": np.array([truth.time_offset_s]),
+        "dvl_bias_m_s": np.zeros(3),
+        "time_offset_s": np.zeros(1),
     }
     if truth.reference == "water":
         calibration["current_m_s"] = np.array(scenario.current_m_s[:2])
@@ -172,7 +177,7 @@ def _dvl_velocity(scenario: Scenario, state: TrueState) -> Array:
     at_imu = apply(bRn, state.v_n - current)
     at_dvl = at_imu + np.cross(state.omega_eb_b, truth.lever_arm_m)
     misalignment = Rotation.from_rotvec(np.array(truth.misalignment_deg) * DEG)
-    return (1.0 + np.array(truth.scale_error)) * misalignment.apply(at_dvl) + truth.bias_m_s
+    return np.asarray((1.0 + np.array(truth.scale_error)) * misalignment.apply(at_dvl))
 
 
 def displaced(geodetic: Array, enu: Array) -> Array:

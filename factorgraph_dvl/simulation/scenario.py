@@ -58,7 +58,7 @@ import msgspec
 from factorgraph_dvl.errors import ConfigError, printable
 from factorgraph_dvl.geometry.rotations import BodyAxes
 from factorgraph_dvl.sensors.catalogue import AIDS
-from factorgraph_dvl.sensors.protocol import SensorSection
+from factorgraph_dvl.sensors.protocol import NoiseModel, SensorSection
 from factorgraph_dvl.settings.convert import convert
 from factorgraph_dvl.settings.sections import NonNegative, Positive, Section, Vector3, check_epoch
 from factorgraph_dvl.settings.yaml_file import read_yaml
@@ -142,6 +142,7 @@ class Claims(Section, frozen=True, kw_only=True):
     depth: dict[str, Any] = msgspec.field(default_factory=dict)
     dvl_beams: dict[str, Any] = msgspec.field(default_factory=dict)
     turntable: dict[str, Any] = msgspec.field(default_factory=dict)
+    noise: NoiseModel = "estimated"
     initial: InitialClaim | None = None
 
 
