@@ -10,7 +10,7 @@ import typer
 from rich.text import Text
 
 from factorgraph_dvl import __version__
-from factorgraph_dvl.cli.console import stderr
+from factorgraph_dvl.cli.console import stderr, warn
 from factorgraph_dvl.cli.correct import correct
 from factorgraph_dvl.cli.crosscheck import crosscheck
 from factorgraph_dvl.cli.deadreckon import deadreckon
@@ -67,6 +67,8 @@ def run(args: list[str]) -> NoReturn:
         with claims:
             app(args=[arg for arg in args if arg != "--debug"], prog_name=_NAME)
     except FactorgraphDvlError as error:
+        for note in getattr(error, "__notes__", ()):
+            warn(note)
         _fail(str(error), error.exit_code, args)
     except OSError as error:
         name = error.filename if error.filename is not None else "a file"

@@ -15,7 +15,15 @@ from factorgraph_dvl.cli.console import (
     stdout,
     warn,
 )
-from factorgraph_dvl.cli.options import Force, NoFigures, Quiet, TrialPath, claim_output
+from factorgraph_dvl.cli.options import (
+    Anyway,
+    Force,
+    NoFigures,
+    Quiet,
+    TrialPath,
+    claim_output,
+)
+from factorgraph_dvl.cli.plausibility import errors_in, print_contradiction
 
 if TYPE_CHECKING:
     from factorgraph_dvl.analysis.dead_reckoning.before_after import BeforeAfter
@@ -49,6 +57,7 @@ def deadreckon(
     ] = None,
     force: Force = False,
     no_figures: NoFigures = False,
+    anyway: Anyway = False,
     quiet: Quiet = False,
 ) -> None:
     """Integrate the DVL's velocity, before and after calibration, and score the track."""
@@ -58,6 +67,7 @@ def deadreckon(
     from factorgraph_dvl.io.motion_table import motion_columns
     from factorgraph_dvl.io.tables import write_table
     from factorgraph_dvl.io.trial_folder import inputs_of, load_trial
+    from factorgraph_dvl.quality.refusal import explained
     from factorgraph_dvl.report.files.dead_reckoning import (
         OWNED,
         RESULT_FILE,
@@ -72,11 +82,13 @@ def deadreckon(
     with ProgressLine(quiet=quiet) as progress:
         trial = load_trial(trial_path)
         values = read_calibration_values(calibration, trial.body_axes)
-        progress("attitude")
+        errors = errors_in(trial, anyway=anyway)
         attitude = attitude or _default_attitude(trial)
-        source, findings = _attitude(trial, attitude, align)
-        progress("dead reckoning")
-        result = before_after(trial, values, source.at)
+        with explained(errors):
+            progress("attitude")
+            source, findings = _attitude(trial, attitude, align)
+            progress("dead reckoning")
+            result = before_after(trial, values, source.at)
         progress("write")
         with new_folder(out, force=force, owned=OWNED) as folder:
             for name, run in (
@@ -91,6 +103,7 @@ def deadreckon(
                 "calibration": str(calibration),
                 "attitude": attitude,
                 "align_s": align,
+                "errors": list(map(str, errors)),
             }
             (folder / RESULT_FILE).write_bytes(to_json(result, about))
     if result.calibrated.score is None:
@@ -107,7 +120,7 @@ def deadreckon(
                 f"{result.scored_by} ends at {end:.1f} s, before the track ({last:.1f} s): "
                 f"distance and errors are those up to {end:.1f} s"
             )
-    for finding in (*trial.notes, *findings):
+    for finding in (*errors, *trial.notes, *findings):
         warn(str(finding))
     if trial.dvl is not None and trial.dvl.settings.reference == "water":
         warn("the DVL measures velocity through the water: the track drifts with the current")
@@ -117,6 +130,9 @@ def deadreckon(
             "velocity before and after"
         )
     print_written(out)
+    if errors:
+        print_contradiction()
+        raise typer.Exit(1)
 
 
 def _default_attitude(trial: Trial) -> str:

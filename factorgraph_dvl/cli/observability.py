@@ -17,10 +17,12 @@ from factorgraph_dvl.cli.console import (
     stdout,
     warn,
 )
-from factorgraph_dvl.cli.options import Force, NoFigures, Quiet, claim_output
+from factorgraph_dvl.cli.options import Anyway, Force, NoFigures, Quiet, claim_output
+from factorgraph_dvl.cli.plausibility import contradicted, print_contradiction
 
 if TYPE_CHECKING:
     from factorgraph_dvl.analysis.information.observability import Observability
+    from factorgraph_dvl.solution import Solution
 
 
 def observability(
@@ -37,6 +39,7 @@ def observability(
     ] = None,
     force: Force = False,
     no_figures: NoFigures = False,
+    anyway: Anyway = False,
     quiet: Quiet = False,
 ) -> None:
     """Show which parameters the data determine, and which motion contributes to them."""
@@ -48,21 +51,28 @@ def observability(
     claim_output(out, force=force, owned=OWNED, inputs=(*inputs_of(source), segments))
     given = () if segments is None else read_segments(segments)
     with ProgressLine(quiet=quiet) as progress:
-        view, converged = _view(source, given, progress)
+        solution, view = _view(source, given, anyway, progress)
         progress("write", 0, None)
         with new_folder(out, force=force, owned=OWNED) as folder:
             write_observability(view, folder, str(source), figures=not no_figures)
     print_observability(view)
     print_written(out)
-    if not converged:
+    if not solution.converged:
         stderr().print(Text("error: the solution did not converge", "red"), soft_wrap=True)
+    unfit = contradicted(solution.findings)
+    if unfit:
+        print_contradiction()
+    if unfit or not solution.converged:
         raise typer.Exit(1)
 
 
 def _view(
-    source: Path, given: tuple[tuple[float, float, str], ...], progress: ProgressLine
-) -> tuple[Observability, bool]:
-    """Return the observability of a trial, which is solved first, or of a solution."""
+    source: Path,
+    given: tuple[tuple[float, float, str], ...],
+    anyway: bool,
+    progress: ProgressLine,
+) -> tuple[Solution, Observability]:
+    """Return a solution, that of a trial or that in a folder, and its observability."""
     from factorgraph_dvl.analysis.information.observability import observability as look
     from factorgraph_dvl.io.calibration_file import CALIBRATION_FILE
     from factorgraph_dvl.io.folders import SETTINGS_FILE
@@ -71,13 +81,13 @@ def _view(
 
     if (source / CALIBRATION_FILE).exists() and not (source / SETTINGS_FILE).exists():
         solution = load_solution(source)
-        return look(solution, given=given), solution.converged
+        return solution, look(solution, given=given)
     trial = load_trial(source)
     # The solver is slow to import: do so after the checks of the input.
     from factorgraph_dvl.solvers.information_history import solve_with_history
 
-    solution, history = solve_with_history(trial, progress=progress)
-    return look(solution, trial=trial, history=history, given=given), solution.converged
+    solution, history = solve_with_history(trial, anyway=anyway, progress=progress)
+    return solution, look(solution, trial=trial, history=history, given=given)
 
 
 def write_observability(view: Observability, folder: Path, source: str, *, figures: bool) -> None:

@@ -9,7 +9,8 @@ import typer
 
 from factorgraph_dvl.cli.console import ProgressLine, print_table, print_written, stdout
 from factorgraph_dvl.cli.observability import print_observability, write_observability
-from factorgraph_dvl.cli.options import Force, NoFigures, Quiet, claim_output
+from factorgraph_dvl.cli.options import Anyway, Force, NoFigures, Quiet, claim_output
+from factorgraph_dvl.cli.plausibility import errors_in, print_contradiction
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -24,6 +25,7 @@ def plan(
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder to write.")],
     force: Force = False,
     no_figures: NoFigures = False,
+    anyway: Anyway = False,
     quiet: Quiet = False,
 ) -> None:
     """Predict the σ of a planned trial, and propose manoeuvres if requirements are missed."""
@@ -38,7 +40,8 @@ def plan(
     with ProgressLine(quiet=quiet) as progress:
         progress("prediction", 0, None)
         prediction = predict(planned)
-        solution = prediction.solution
+        errors = errors_in(prediction.trial, anyway=anyway)
+        solution = prediction.solution.with_findings(errors)
         required = requirements(planned.required, solution.estimates, str(source))
         view = look(solution, trial=prediction.trial, history=prediction.history, kind="plan")
         proposal = propose(prediction, required, progress=progress)
@@ -51,6 +54,9 @@ def plan(
     print_observability(view)
     _print_requirements(required, proposal)
     print_written(out)
+    if errors:
+        print_contradiction()
+        raise typer.Exit(1)
 
 
 def _print_requirements(required: Sequence[Requirement], proposal: Proposal | None) -> None:

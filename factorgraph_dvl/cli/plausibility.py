@@ -1,16 +1,15 @@
-"""What `inspect` calls an error, before and after a trial is solved."""
+"""What `inspect` calls an error, before and after something is found from a trial."""
 
 from __future__ import annotations
 
-from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 from rich.text import Text
 
-from factorgraph_dvl.cli.console import stderr, warn
+from factorgraph_dvl.cli.console import stderr
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Iterable
 
     from factorgraph_dvl.sensors.finding import Finding
     from factorgraph_dvl.trial import PlanarTrial, Trial
@@ -31,36 +30,23 @@ def errors_in(trial: Trial | PlanarTrial, *, anyway: bool) -> tuple[Finding, ...
     DataError
         If there are records that cannot be used, unless `anyway`.
     """
-    from factorgraph_dvl.errors import DataError
+    from factorgraph_dvl.quality.refusal import accepted_errors
     from factorgraph_dvl.quality.survey import survey
     from factorgraph_dvl.quality.survey_planar import survey_planar
     from factorgraph_dvl.trial import PlanarTrial
 
     found = survey_planar(trial) if isinstance(trial, PlanarTrial) else survey(trial)
-    unusable = [str(f) for f in found.errors if f.unusable]
-    if unusable and not anyway:
-        raise DataError(
-            "; ".join(unusable),
-            where=trial.name,
-            hint="Correct the record, remove its section from trial.yaml, or go on with --anyway",
-        )
-    return found.errors
+    return accepted_errors(found, anyway=anyway)
 
 
-@contextmanager
-def explaining(errors: Sequence[Finding]) -> Iterator[None]:
-    """Show errors in the records if what is done with them fails."""
-    from factorgraph_dvl.errors import FactorgraphDvlError
+def contradicted(findings: Iterable[Finding]) -> bool:
+    """Whether a result is not to be used for another reason than that it did not converge."""
+    from factorgraph_dvl.sensors.finding import Code, errors_of
 
-    try:
-        yield
-    except FactorgraphDvlError:
-        for error in errors:
-            warn(str(error))
-        raise
+    return any(f.code != Code.NOT_CONVERGED for f in errors_of(findings))
 
 
 def print_contradiction() -> None:
-    """Say that a solution was found that is not to be used."""
+    """Say that a result was found that is not to be used."""
     text = "error: records contradict each other or the model: not to be used; see the warnings"
     stderr().print(Text(text, "red"), soft_wrap=True)

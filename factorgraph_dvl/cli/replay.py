@@ -29,11 +29,7 @@ from factorgraph_dvl.cli.options import (
     TrialPath,
     claim_output,
 )
-from factorgraph_dvl.cli.plausibility import (
-    errors_in,
-    explaining,
-    print_contradiction,
-)
+from factorgraph_dvl.cli.plausibility import contradicted, print_contradiction
 from factorgraph_dvl.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -92,10 +88,8 @@ def replay(
         trial = replace(trial, limits={**trial.limits, **std_asked})
         # Two standard deviations hold 95 % of the errors.
         error_limits = {name: 2.0 * std for name, std in trial.limits.items()} | error_asked
-        errors = errors_in(trial, anyway=anyway)
-        with explaining(errors):
-            solution, record = _run(trial, smoother.value, lag, rate, progress, live=live)
-        solution = solution.with_findings(errors)
+        solution, record = _run(trial, smoother.value, lag, rate, anyway, progress, live=live)
+        unfit = contradicted(solution.findings)
         found = convergence(
             record.time,
             record.values,
@@ -115,7 +109,7 @@ def replay(
             out,
             force=force,
             figures=not no_figures,
-            instrument=not errors,
+            instrument=not unfit,
         )
     _print(trial, solution, record, found)
     print_written(out)
@@ -124,9 +118,9 @@ def replay(
         if not record.inconsistent[-1]:
             text = "error: the replay did not reach the end of the record; see the warnings"
         stderr().print(Text(text, "red"), soft_wrap=True)
-    if errors:
+    if unfit:
         print_contradiction()
-    if errors or not solution.converged:
+    if unfit or not solution.converged:
         raise typer.Exit(1)
 
 
@@ -152,6 +146,7 @@ def _run(
     smoother: str,
     lag: float,
     rate: float,
+    anyway: bool,
     progress: ProgressLine,
     *,
     live: bool,
@@ -208,7 +203,7 @@ def _run(
                         f"{update.time:.1f} s: {finding}", markup=False, soft_wrap=True
                     )
 
-            return run(trial, smoother=kind, lag_s=lag, rate_hz=rate, watch=show)
+            return run(trial, smoother=kind, lag_s=lag, rate_hz=rate, anyway=anyway, watch=show)
 
     def tell(update: Update) -> None:
         nonlocal shown
@@ -217,7 +212,7 @@ def _run(
             shown = now
             progress(f"at {update.time - first:.0f} s, {speed(update):.0f} times real time")
 
-    return run(trial, smoother=kind, lag_s=lag, rate_hz=rate, watch=tell)
+    return run(trial, smoother=kind, lag_s=lag, rate_hz=rate, anyway=anyway, watch=tell)
 
 
 def _write(

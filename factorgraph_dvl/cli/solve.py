@@ -29,11 +29,7 @@ from factorgraph_dvl.cli.options import (
     TrialPath,
     claim_output,
 )
-from factorgraph_dvl.cli.plausibility import (
-    errors_in,
-    explaining,
-    print_contradiction,
-)
+from factorgraph_dvl.cli.plausibility import contradicted, errors_in, print_contradiction
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -81,14 +77,17 @@ def solve(
         # The solver is slow to import: do so after the checks of the input.
         from factorgraph_dvl.solvers.batch import solve as run_batch
 
-        return run_batch(trial, rate_hz=rate, progress=progress), None
+        return run_batch(trial, rate_hz=rate, anyway=anyway, progress=progress), None
 
     def run_planar(trial: PlanarTrial, progress: ProgressLine) -> tuple[Solution, None]:
         from factorgraph_dvl.quality.plausibility_planar import planar_findings
+        from factorgraph_dvl.quality.refusal import explained
         from factorgraph_dvl.ranging.planar_solution import solve_planar
 
-        solution = solve_planar(trial, rate_hz=rate, progress=progress)
-        return solution.with_findings(planar_findings(trial)), None
+        errors = errors_in(trial, anyway=anyway)
+        with explained(errors):
+            solution = solve_planar(trial, rate_hz=rate, progress=progress)
+        return solution.with_findings((*errors, *planar_findings(trial))), None
 
     _solve_into(
         out,
@@ -97,7 +96,6 @@ def solve(
         run_planar,
         force=force,
         figures=not no_figures,
-        anyway=anyway,
         quiet=quiet,
     )
 
@@ -129,20 +127,30 @@ def kalman(
 
     def run(trial: Trial, progress: ProgressLine) -> tuple[Solution, History | None]:
         from factorgraph_dvl.baselines import calibrate
+        from factorgraph_dvl.quality.refusal import explained
 
         chosen = method or KalmanMethod.POINT_SET
         if chosen.planar:
             raise _misplaced(chosen, "a planar trial, without an imu")
         name = f"{chosen.value}-linear" if linear else chosen.value
-        return calibrate(trial, cast("Method", name), rate_hz=rate, progress=progress)
+        errors = errors_in(trial, anyway=anyway)
+        with explained(errors):
+            solution, history = calibrate(
+                trial, cast("Method", name), rate_hz=rate, progress=progress
+            )
+        return solution.with_findings(errors), history
 
     def run_planar(trial: PlanarTrial, progress: ProgressLine) -> tuple[Solution, History]:
         from factorgraph_dvl.baselines.single_beacon import filter_planar
+        from factorgraph_dvl.quality.refusal import explained
 
         chosen = method or KalmanMethod.THREE_OBSERVATIONS
         if not chosen.planar:
             raise _misplaced(chosen, "a trial with imu, gnss and dvl")
-        return filter_planar(trial, chosen.value, progress=progress)
+        errors = errors_in(trial, anyway=anyway)
+        with explained(errors):
+            solution, history = filter_planar(trial, chosen.value, progress=progress)
+        return solution.with_findings(errors), history
 
     _solve_into(
         out,
@@ -151,7 +159,6 @@ def kalman(
         run_planar,
         force=force,
         figures=not no_figures,
-        anyway=anyway,
         quiet=quiet,
     )
 
@@ -170,7 +177,6 @@ def _solve_into(
     *,
     force: bool,
     figures: bool,
-    anyway: bool,
     quiet: bool,
 ) -> None:
     """Load a trial, run a solver, write and show its solution."""
@@ -188,22 +194,18 @@ def _solve_into(
         trial: Trial | PlanarTrial
         if is_planar(trial_path):
             trial = load_planar_trial(trial_path)
-            errors = errors_in(trial, anyway=anyway)
-            with explaining(errors):
-                solution, history = run_planar(trial, progress)
+            solution, history = run_planar(trial, progress)
         else:
             trial = load_trial(trial_path)
-            errors = errors_in(trial, anyway=anyway)
-            with explaining(errors):
-                solution, history = run(trial, progress)
-        solution = solution.with_findings(errors)
+            solution, history = run(trial, progress)
+        unfit = contradicted(solution.findings)
         progress("write", 0, None)
 
         def add(folder: Path) -> None:
             write_beams(trial, solution, folder)
             if history is not None:
                 write_history(folder, history.time, history.names, history.values, history.std)
-            if not errors:
+            if not unfit:
                 write_instrument(solution, folder)
             if not figures:
                 return
@@ -222,9 +224,9 @@ def _solve_into(
             Text(f"error: not converged after {solution.iterations} iterations", "red"),
             soft_wrap=True,
         )
-    if errors:
+    if unfit:
         print_contradiction()
-    if errors or not solution.converged:
+    if unfit or not solution.converged:
         raise typer.Exit(1)
 
 

@@ -214,10 +214,12 @@ def _gyro_findings(imu: Imu) -> Iterator[Finding]:
         "in angle increments; divide by the sample interval": rate,
         "of the opposite sign, or in other axes than the specific force": -1.0,
     }
-    losses = {text: 1.0 - _force_steadiness(imu, factor) for text, factor in candidates.items()}
-    best = min(losses, key=lambda text: losses[text])
+    best, least = "", np.inf
     # Turned by a right gyro, the force keeps the direction of gravity.
-    if 1.0 - steady > 0.001 and 1.0 - steady > 4.0 * losses[best]:
+    if 1.0 - steady > 0.001:
+        losses = {text: 1.0 - _force_steadiness(imu, f) for text, f in candidates.items()}
+        best, least = min(losses.items(), key=lambda item: item[1])
+    if 1.0 - steady > 4.0 * least:
         yield Finding(
             Code.GYRO_UNIT,
             f"the angular rate does not turn the specific force as it should: it looks {best}",

@@ -10,6 +10,8 @@ import numpy as np
 
 from factorgraph_dvl.errors import SolveError
 from factorgraph_dvl.imu.timestamps import without_strays
+from factorgraph_dvl.quality.refusal import accepted_errors, explained
+from factorgraph_dvl.quality.survey import survey
 from factorgraph_dvl.replay.record import Recorder, ReplayRecord
 from factorgraph_dvl.replay.samples import LEAST
 from factorgraph_dvl.replay.session import LAG, RATE, Kind, Replay
@@ -28,6 +30,7 @@ def replay(
     smoother: Kind = "fixed-lag",
     lag_s: float = LAG,
     rate_hz: float = RATE,
+    anyway: bool = False,
     progress: Progress | None = None,
     watch: Watch | None = None,
 ) -> tuple[Solution, ReplayRecord]:
@@ -43,6 +46,8 @@ def replay(
         Age beyond which states are no longer corrected, s.
     rate_hz : float, optional
         States a second.
+    anyway : bool, optional
+        Run although there are records that cannot be used.
     progress : callable, optional
         Called with stage, iteration and cost while a batch solution runs.
     watch : Watch, optional
@@ -60,11 +65,33 @@ def replay(
     ConfigError
         If an option is out of range.
     DataError
-        If the trial has no position.
+        If the trial has no position, or records that cannot be used.
     SolveError
         If the data never sufficed to start.
     """
-    trial = without_strays(trial)
+    errors = accepted_errors(survey(trial), anyway=anyway)
+    with explained(errors):
+        solution, record = _played(
+            without_strays(trial),
+            smoother=smoother,
+            lag_s=lag_s,
+            rate_hz=rate_hz,
+            progress=progress,
+            watch=watch,
+        )
+    return solution.with_findings(errors), record
+
+
+def _played(
+    trial: Trial,
+    *,
+    smoother: Kind,
+    lag_s: float,
+    rate_hz: float,
+    progress: Progress | None,
+    watch: Watch | None,
+) -> tuple[Solution, ReplayRecord]:
+    """Feed a trial without impossible times; the parameters are those of `replay`."""
     # Fails early if the trial has no position.
     trial.frame()
     run = Replay(trial, smoother=smoother, lag_s=lag_s, rate_hz=rate_hz, progress=progress)

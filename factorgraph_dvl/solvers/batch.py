@@ -10,6 +10,8 @@ import numpy as np
 
 from factorgraph_dvl.errors import ConfigError
 from factorgraph_dvl.graph.priors import ConstantsPrior
+from factorgraph_dvl.quality.refusal import accepted_errors, explained
+from factorgraph_dvl.quality.survey import survey
 from factorgraph_dvl.ranging.hypothesis_weights import significant_costs
 from factorgraph_dvl.ranging.position_from_ranges import StartPositions
 from factorgraph_dvl.sensors.finding import Finding
@@ -26,7 +28,7 @@ from factorgraph_dvl.solvers.minima import (
     distinct,
     evidence_against,
 )
-from factorgraph_dvl.solvers.preparation import Preparation, prepare
+from factorgraph_dvl.solvers.preparation import prepare
 from factorgraph_dvl.solvers.rounds import SettledMinimum, settle
 from factorgraph_dvl.solvers.state_times import STATE_INTERVAL
 from factorgraph_dvl.solvers.summary import summarise
@@ -39,6 +41,7 @@ def solve(
     *,
     rate_hz: float = TRAJECTORY_RATE,
     state_interval_s: float = STATE_INTERVAL,
+    anyway: bool = False,
     progress: Progress | None = None,
 ) -> Solution:
     """Estimate trajectory and calibration of a trial with their joint covariance.
@@ -52,24 +55,37 @@ def solve(
     state_interval_s : float, optional
         Time between the states of the graph, s; less where the noise of the gyros in between
         matters to a sensor of attitude.
+    anyway : bool, optional
+        Solve although there are records that cannot be used.
     progress : callable, optional
         Called with stage, iteration and cost (None where there is none yet).
 
     Returns
     -------
     Solution
-        Also where the solver did not converge: `Solution.converged` says so.
+        Also where the solver did not converge: `Solution.converged` says so. Not to be used if its
+        findings contain one of severity `error`, such as records that contradict each other.
 
     Raises
     ------
     ConfigError, DataError
-        If the trial cannot be solved as it is.
+        If the trial cannot be solved as it is, or has records that cannot be used.
     SolveError
         If no minimum can be searched for at all.
     """
     _check_above_zero("rate_hz", rate_hz)
-    report = progress or _silent
-    prepared = _prepare(trial, state_interval_s, report)
+    _check_above_zero("state_interval_s", state_interval_s)
+    errors = accepted_errors(survey(trial), anyway=anyway)
+    with explained(errors):
+        found = _most_probable(trial, rate_hz, state_interval_s, progress or _silent)
+    return found.with_findings(errors)
+
+
+def _most_probable(
+    trial: Trial, rate_hz: float, state_interval_s: float, report: Progress
+) -> Solution:
+    """Return the most probable of all minima from all positions, with the spread of the others."""
+    prepared = prepare(trial, state_interval_s, report)
     solutions, terms = [], []
     for states in prepared.start_positions.states:
         minima = distinct(
@@ -120,16 +136,12 @@ def settled_minimum(
         Joint prior of biases and calibration, in place of the trial's priors.
     """
     report = progress or _silent
-    prepared = _prepare(trial, state_interval_s, report)
+    _check_above_zero("state_interval_s", state_interval_s)
+    prepared = prepare(trial, state_interval_s, report)
     start = prepared.start_positions
     settled = settle(prepared, start.states[0], report, constants_prior=constants_prior)
     findings = (*prepared.findings, *settled.findings, *ambiguity(start.hypotheses))
     return replace(settled, findings=findings), start
-
-
-def _prepare(trial: Trial, state_interval_s: float, report: Progress) -> Preparation:
-    _check_above_zero("state_interval_s", state_interval_s)
-    return prepare(trial, state_interval_s, report)
 
 
 def _with_covariances(

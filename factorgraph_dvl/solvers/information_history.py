@@ -23,6 +23,8 @@ from scipy.linalg.lapack import dgeqrf, dtrtri
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph import keys
 from factorgraph_dvl.graph.problem import FIXED_DIRECTION_STD, Evaluation, Problem
+from factorgraph_dvl.quality.refusal import accepted_errors, explained
+from factorgraph_dvl.quality.survey import survey
 from factorgraph_dvl.solution import Progress, Solution
 from factorgraph_dvl.solvers.batch import solved_problem
 from factorgraph_dvl.solvers.calibration import prior_along, reported
@@ -75,16 +77,19 @@ RATE_HZ = 20.0
 
 
 def solve_with_history(
-    trial: Trial, *, progress: Progress | None = None
+    trial: Trial, *, anyway: bool = False, progress: Progress | None = None
 ) -> tuple[Solution, InformationHistory]:
     """Solve a trial, and follow the information on its constants along it.
 
     Parameters and errors as of `solvers.batch.solve`.
     """
-    found = solved_problem(trial, progress=progress)
+    errors = accepted_errors(survey(trial), anyway=anyway)
+    with explained(errors):
+        found = solved_problem(trial, progress=progress)
     if progress:
         progress("information along the trial", 0, None)
-    return summarise(trial, found, rate_hz=RATE_HZ), information_history(found)
+    solution = summarise(trial, found, rate_hz=RATE_HZ).with_findings(errors)
+    return solution, information_history(found)
 
 
 def information_history(found: SolvedProblem) -> InformationHistory:

@@ -6,15 +6,21 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from builders import write_trial
+import yaml
+from builders import build_solution, write_trial
 from planar import trial as planar_trial
-from truth import scenario
+from truth import CONFIGS, scenario
 
+from factorgraph_dvl import solve
 from factorgraph_dvl.cli import main
+from factorgraph_dvl.errors import DataError, SolveError
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.io.calibration_file import load_calibration
 from factorgraph_dvl.io.planar_folder import save_planar_trial
+from factorgraph_dvl.io.solution_folder import save_solution
+from factorgraph_dvl.quality.refusal import explained
 from factorgraph_dvl.quality.survey import survey
+from factorgraph_dvl.replay import replay
 from factorgraph_dvl.sensors.finding import Finding
 from factorgraph_dvl.simulation import simulate
 
@@ -131,6 +137,90 @@ def test_what_contradicts_is_a_finding_of_the_result(command, spoil, honest, tmp
     if (tmp_path / "out").exists():
         assert set(said) <= set(load_calibration(tmp_path / "out").warnings)
         assert not (tmp_path / "out" / "instrument.yaml").exists()
+
+
+@pytest.fixture(scope="module")
+def values(tmp_path_factory):
+    """A file of calibration values."""
+    path = tmp_path_factory.mktemp("values") / "values.json"
+    path.write_text('{"misalignment_deg": [2, 2, 30], "lever_arm_m": [1, 1.2, 1.4]}')
+    return path
+
+
+@pytest.mark.parametrize("command", ["observability", "deadreckon"])
+def test_what_is_made_of_a_trial_repeats_its_errors(command, honest, values, tmp_path, run):
+    trial = write_trial(tmp_path, upside_down(honest))
+    more = ("--calibration", values) if command == "deadreckon" else ()
+    arguments = (command, trial, *more, "--no-figures", "--quiet")
+    (said,) = errors_of(run, trial)
+    code, _, err = run(*arguments, "--out", tmp_path / "out")
+    assert code == 1
+    assert said in err
+    assert "not to be used" in err
+    spoilt = write_trial(tmp_path / "late", late(honest))
+    code, _, err = run(command, spoilt, *more, "--no-figures", "--out", tmp_path / "none")
+    assert code == 2
+    assert "do not overlap" in err
+    assert not (tmp_path / "none").exists()
+
+
+def test_the_observability_of_a_contradicted_solution_is_one(honest, tmp_path, run):
+    spoilt = build_solution().with_findings(survey(upside_down(honest)).errors)
+    save_solution(spoilt, tmp_path / "solved")
+    code, _, err = run("observability", tmp_path / "solved", "--out", tmp_path / "out", "--quiet")
+    assert code == 1
+    assert "not to be used" in err
+
+
+def test_a_plan_is_checked_as_a_trial_is(tmp_path, run):
+    plan = yaml.safe_load((CONFIGS / "plans" / "harbour.yaml").read_text(encoding="utf-8"))
+    del plan["required"]
+    plan["dvl"]["no_lock_s"] = [[0, 1000]]
+    (tmp_path / "plan.yaml").write_text(yaml.safe_dump(plan), encoding="utf-8")
+    arguments = ("plan", tmp_path / "plan.yaml", "--no-figures", "--quiet")
+    code, _, err = run(*arguments, "--out", tmp_path / "out")
+    assert code == 2
+    assert "DVL: none of its rows holds a measurement" in err
+    assert not (tmp_path / "out").exists()
+    code, _, err = run(*arguments, "--out", tmp_path / "out", "--anyway")
+    assert code == 1
+    assert "DVL: none of its rows" in err
+
+
+def test_a_steady_plan_is_not_frozen(tmp_path, run):
+    plan = yaml.safe_load((CONFIGS / "plans" / "harbour.yaml").read_text(encoding="utf-8"))
+    del plan["required"]
+    steady = {"manoeuvres": [{"straight_s": 60}], "sway": {}, "current_m_s": [0, 0, 0]}
+    plan["start"]["speed_m_s"] = 2
+    (tmp_path / "plan.yaml").write_text(yaml.safe_dump(plan | steady), encoding="utf-8")
+    arguments = ("plan", tmp_path / "plan.yaml", "--no-figures", "--quiet")
+    code, _, err = run(*arguments, "--out", tmp_path / "out")
+    assert (code, "not to be used" in err) == (0, False)
+
+
+def test_python_refuses_what_the_commands_refuse(honest):
+    for spoilt in (late(honest), zeros(honest)):
+        for run in (solve, replay):
+            with pytest.raises(DataError, match="anyway=True"):
+                run(spoilt)
+    assert errors_in(solve(late(honest), anyway=True)) == errors_in(survey(late(honest)))
+
+
+def test_a_solution_repeats_the_errors_of_its_records(honest):
+    spoilt = east_mirrored(honest)
+    assert errors_in(survey(spoilt))
+    assert errors_in(solve(spoilt))[:1] == errors_in(survey(spoilt))
+
+
+def test_a_failure_names_the_errors_of_the_records(honest):
+    errors = survey(upside_down(honest)).errors
+    with pytest.raises(SolveError) as caught, explained(errors):
+        raise SolveError("no minimum")
+    assert caught.value.__notes__ == list(map(str, errors))
+
+
+def errors_in(found):
+    return tuple(f for f in found.findings if f.severity == "error")
 
 
 def test_an_honest_trial_is_neither(honest, tmp_path, run):
