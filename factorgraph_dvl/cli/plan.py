@@ -33,14 +33,15 @@ def plan(
     from factorgraph_dvl.io.folders import new_folder
     from factorgraph_dvl.planning import predict, propose, requirements
     from factorgraph_dvl.report.files.plan import OWNED, to_json
-    from factorgraph_dvl.simulation import load_scenario
+    from factorgraph_dvl.simulation import load_scenario, simulate
 
     claim_output(out, force=force, owned=OWNED, inputs=(source,))
     planned = load_scenario(source)
     with ProgressLine(quiet=quiet) as progress:
         progress("prediction", 0, None)
         prediction = predict(planned)
-        errors = errors_in(prediction.trial, anyway=anyway)
+        # A record without noise may well repeat one value.
+        errors = errors_in(simulate(planned), anyway=anyway)
         solution = prediction.solution.with_findings(errors)
         required = requirements(planned.required, solution.estimates, str(source))
         view = look(solution, trial=prediction.trial, history=prediction.history, kind="plan")

@@ -8,6 +8,7 @@ import numpy as np
 
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.imu.timestamps import JUMP
 from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.trial import PlanarTrial
 
@@ -30,9 +31,7 @@ def planar_findings(trial: PlanarTrial) -> Iterator[Finding]:
     """
     heading, log, depth = trial.heading, trial.log, trial.depth
     for record, values in ((heading, heading.heading), (log, log.speed), (depth, depth.depth)):
-        text = _gaps(record.time[~np.isnan(values)])
-        if text:
-            yield Finding(Code.GAPS, text, record.label, severity="warning")
+        yield from _gaps(record.time[~np.isnan(values)], record.label)
     psi = heading.heading[~np.isnan(heading.heading)] / DEG
     if psi.size > 2 and np.abs(psi).max() <= 2.0 * np.pi:
         noise = float(np.median(np.abs(np.diff(psi))))
@@ -76,17 +75,28 @@ def planar_findings(trial: PlanarTrial) -> Iterator[Finding]:
             )
 
 
-def _gaps(time: Array) -> str:
-    """Return what to say of the gaps between (M,) times, nothing if there are none."""
+def _gaps(time: Array, label: str) -> Iterator[Finding]:
+    """Yield what to say of jumps and gaps between (M,) times."""
     steps = np.diff(time)
+    for k in np.flatnonzero(steps > JUMP).tolist():
+        yield Finding(
+            Code.CLOCK_JUMP,
+            f"time_s jumps from {time[k]:.10g} to {time[k + 1]:.10g} s; only the part between "
+            "jumps with most ranges is used. Write all of time_s by one clock",
+            label,
+            severity="warning",
+        )
+    steps = np.where(steps > JUMP, 0.0, steps)
     if not steps.size:
-        return ""
+        return
     gaps = steps[steps > max(_GAP_S, _GAP_INTERVALS * float(np.median(steps)))]
-    if not gaps.size:
-        return ""
-    k = int(np.argmax(steps))
-    count = "1 gap" if gaps.size == 1 else f"{gaps.size} gaps, the longest"
-    return (
-        f"{count} from {time[k]:.10g} to {time[k + 1]:.10g} s: it is interpolated, as if the "
-        "vehicle had not manoeuvred, and the standard deviations do not know better"
-    )
+    if gaps.size:
+        k = int(np.argmax(steps))
+        count = "1 gap" if gaps.size == 1 else f"{gaps.size} gaps, the longest"
+        yield Finding(
+            Code.GAPS,
+            f"{count} from {time[k]:.10g} to {time[k + 1]:.10g} s: it is interpolated, as if the "
+            "vehicle had not manoeuvred, and the standard deviations do not know better",
+            label,
+            severity="warning",
+        )

@@ -57,8 +57,10 @@ class System:
             border[side] += transposed @ weighted
             g[side] += np.einsum("kij,kj->ki", transposed, weighted_error)
         off += before.transpose(0, 2, 1) @ info @ after
-        corner = corner + np.einsum("kic,kid->cd", by_theta, weighted)
-        h = h + np.einsum("kic,ki->c", by_theta, weighted_error)
+        # Products of matrices, as einsum does not use BLAS.
+        stacked = by_theta.reshape(2 * (n - 1), c)
+        corner += stacked.T @ weighted.reshape(2 * (n - 1), c)
+        h += stacked.T @ weighted_error.reshape(2 * (n - 1))
 
         smooth = problem.change_info[: n - 1]
         weighted_error = np.einsum("kij,kj->ki", smooth, velocity_changes(problem, x))

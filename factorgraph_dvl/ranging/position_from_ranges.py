@@ -28,7 +28,7 @@ from factorgraph_dvl.sensors.dvl import CURRENT_SPEC
 from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.sensors.speed_log import HEADING_BIAS_SPEC, LOG_SCALE_SPEC
-from factorgraph_dvl.solution import Hypothesis
+from factorgraph_dvl.solution import Hypothesis, mostly_rejected
 from factorgraph_dvl.trial import InitialPosition, Trial
 
 # Chosen: standard deviations of dead reckoning before anything is solved, wide of what alignment
@@ -99,6 +99,8 @@ def positions_from_ranges(
     ):
         return StartPositions((states,))
     setup = _setup_of(trial, frame, seg, states, beacons, first)
+    if trial.gnss is not None:
+        return StartPositions((states,), rejected=_outliers(beacons, setup))
     updates, searches = schedule(setup.problem)
     found = follow(setup.problem, updates, searches)
     living = [c for c in found if c.died is None]
@@ -106,13 +108,23 @@ def positions_from_ranges(
         few = Finding(Code.FEW_RANGES, "too few ranges to find a position from them")
         return StartPositions((states,), findings=(few,))
     rejected = {r.label: r.time for r in measurements(beacons, setup, living[0].fit)[1]}
-    if trial.gnss is not None:
-        return StartPositions((states,), rejected=rejected)
     return StartPositions(
         tuple(_moved(setup, c, states, seg.node_time) for c in living),
         tuple(reported_hypothesis(setup, c, _depth_std(trial)) for c in found),
         rejected,
     )
+
+
+def _outliers(beacons: Beacons, setup: RangingSetup) -> dict[str, Array]:
+    """Return times of outliers, by label, on the only track that starts where GNSS says."""
+    updates, _ = schedule(setup.problem)
+    # Where dead reckoning is good, one fit of all data tells them; else the track is followed.
+    for steps in (updates[-1:], updates):
+        (found,) = follow(setup.problem, steps, ())
+        used, rejected = measurements(beacons, setup, found.fit)
+        if found.fit.converged and not mostly_rejected(used, rejected):
+            break
+    return {r.label: r.time for r in rejected}
 
 
 def _setup_of(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,6 +13,7 @@ from factorgraph_dvl.errors import DataError
 from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.rotations import rotation_from_rph
 from factorgraph_dvl.geometry.vectors import Array, interpolate
+from factorgraph_dvl.imu.timestamps import JUMP
 from factorgraph_dvl.ranging.model import PlanarProblem, Ranging
 from factorgraph_dvl.ranging.planar_track import (
     LEAST_PSD,
@@ -70,8 +73,9 @@ def dead_reckoned(trial: PlanarTrial) -> PlanarTrack:
         if not known.any():
             raise DataError("no values", where=record.source, expected="at least one")
         parts.append((record.time[known], values[known]))
-    start = max(time[0] for time, _ in parts)
-    end = min(time[-1] for time, _ in parts)
+    first, last = _between_jumps([time for time, _ in parts], trial.beacons.time)
+    start = max(first, *(time[0] for time, _ in parts))
+    end = min(last, *(time[-1] for time, _ in parts))
     if not start < end:
         raise DataError(
             "heading, log and depth have no time in common",
@@ -88,15 +92,34 @@ def dead_reckoned(trial: PlanarTrial) -> PlanarTrack:
                 expected=f"values at most {_SLOWEST_S:g} s apart for dead reckoning",
                 hint="Check that time_s is in seconds",
             )
-    (log_time, speed), known = parts[1], ~np.isnan(log.speed)
-    starboard = np.nan_to_num(log.starboard[known])
+    inside = [(time >= first) & (time <= last) for time, _ in parts]
+    (heading_time, psi), (log_time, speed), (depth_time, below) = (
+        (time[own], values[own]) for (time, values), own in zip(parts, inside, strict=True)
+    )
+    starboard = np.nan_to_num(log.starboard[~np.isnan(log.speed)])[inside[1]]
     extra = trial.beacons.time
     return track_from_records(
-        (*parts[0], heading.settings.std_rad),
+        (heading_time, psi, heading.settings.std_rad),
         (log_time, speed, starboard, log.settings.speed_std_m_s),
-        (parts[2][0], depth.settings.sea_surface_height_m - parts[2][1]),
+        (depth_time, depth.settings.sea_surface_height_m - below),
         extra[(extra >= start) & (extra <= end)],
     )
+
+
+def _between_jumps(records: Sequence[Array], beacons: Array) -> tuple[float, float]:
+    """Return the span without a jump of the clock of any record with most rows of the beacons."""
+    jumps = [
+        (float(time[k]), float(time[k + 1]))
+        for time in records
+        for k in np.flatnonzero(np.diff(time) > JUMP)
+    ]
+    edges = np.unique([-np.inf, *itertools.chain(*jumps), np.inf])
+    first, last = edges[:-1], edges[1:]
+    rows = np.searchsorted(beacons, last, "right") - np.searchsorted(beacons, first)
+    for before, after in jumps:
+        rows[(first >= before) & (last <= after)] = -1
+    k = int(np.argmax(rows))
+    return float(first[k]), float(last[k])
 
 
 def planar_setup(trial: PlanarTrial) -> RangingSetup:

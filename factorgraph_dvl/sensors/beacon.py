@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from factorgraph_dvl.errors import DataError
 from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.units import GEODETIC_SI
-from factorgraph_dvl.geometry.vectors import Array, rotate, skew
+from factorgraph_dvl.geometry.vectors import Array, cross, rotate, skew
 from factorgraph_dvl.sensors.parameters import SCALAR, Parameter, ParameterSpec
 from factorgraph_dvl.sensors.protocol import (
     Linearization,
@@ -351,7 +351,7 @@ class BeaconRangeRate(_ToBeacon):
         d_p = (scale * across / distance[:, None])[:, None, :]
         d_v = scale * direction[:, None, :]
         d_arm = d_v @ motion.nRb
-        turning_b = np.cross(motion.omega_eb_b, self.arm_b)
+        turning_b = cross(motion.omega_eb_b, self.arm_b)
         derivatives: dict[str, Callable[[], Array]] = {
             SOUND_SPEED_ERROR: lambda: speed[:, None, None],
             self.offset: lambda: -d_p @ self.nRl,
@@ -367,4 +367,4 @@ class BeaconRangeRate(_ToBeacon):
 
     def _velocity(self, motion: Motion) -> Array:
         """Return the velocity of the transponder in n, (M, 3), m/s."""
-        return motion.v_n + rotate(motion.nRb, np.cross(motion.omega_eb_b, self.arm_b))
+        return motion.v_n + rotate(motion.nRb, cross(motion.omega_eb_b, self.arm_b))

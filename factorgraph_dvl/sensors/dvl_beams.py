@@ -13,7 +13,7 @@ from msgspec import UNSET, UnsetType
 from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.rotations import exp_so3
 from factorgraph_dvl.geometry.units import DEG
-from factorgraph_dvl.geometry.vectors import Array, rotate, skew
+from factorgraph_dvl.geometry.vectors import Array, cross, rotate, skew
 from factorgraph_dvl.sensors.beam_model import CommonGeometry, FreeGeometry, Geometry
 from factorgraph_dvl.sensors.dvl import LEVER_ARM_SPEC, MISALIGNMENT_SPEC, SCALE_SPEC
 from factorgraph_dvl.sensors.parameters import SCALAR, Parameter, ParameterSpec
@@ -405,4 +405,4 @@ class BeamVelocity:
     def _velocities(self, motion: Motion, values: Values) -> tuple[Array, Array]:
         """Return the velocities of DVL and IMU in body, (M, 3)."""
         imu_b = rotate(motion.nRb.transpose(0, 2, 1), motion.v_n)
-        return imu_b + np.cross(motion.omega_eb_b, values[self.lever_arm]), imu_b
+        return imu_b + cross(motion.omega_eb_b, values[self.lever_arm]), imu_b

@@ -81,8 +81,8 @@ class Code(StrEnum):
     )
     CLOCK_JUMP = (
         "clock_jump",
-        "The clock of the IMU jumps.",
-        "The time that really passed is unknown: the inertial chain breaks there.",
+        "The clock of a record jumps.",
+        "The time that really passed is unknown: dead reckoning breaks there.",
         "Write all of time_s by one clock.",
     )
     IMU_GAP = (

@@ -146,8 +146,8 @@ class Gnss:
 
     @property
     def missing(self) -> Array:
-        """Epochs without a position, (M,) bool."""
-        return np.isnan(self.geodetic[:, 0])
+        """Epochs with neither position nor velocity, (M,) bool."""
+        return np.asarray(np.isnan(self.geodetic[:, 0]) & np.isnan(self.velocity[:, 0]))
 
     def carrier(self, time: Array) -> tuple[Array, Array]:
         """Return bRc (M, 3, 3), axes of what carries the antenna to body, and omega_cb_b (M, 3).

@@ -27,7 +27,9 @@ def stub(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
     """A solver that answers what it is told, and notes what it was asked."""
     state: dict[str, Any] = {"solution": build_solution(), "raises": None}
 
-    def solve(trial: Trial, *, rate_hz: float, progress: Callable[..., None]) -> Solution:
+    def solve(
+        trial: Trial, *, rate_hz: float, anyway: bool, progress: Callable[..., None]
+    ) -> Solution:
         state["trial"], state["rate"] = trial, rate_hz
         progress("alignment", 0, None)
         progress("batch", 0, 9.87e12)

@@ -10,6 +10,7 @@ from builders import build_trial
 
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.quality.survey import Survey, survey
+from factorgraph_dvl.sensors.finding import Code
 from factorgraph_dvl.trial import Trial
 
 
@@ -28,8 +29,18 @@ def test_a_speed_ratio_is_not_taken_for_a_scale_error() -> None:
         assert contributor in text
 
 
+def test_a_fix_of_the_velocity_alone_is_a_measurement() -> None:
+    trial = build_trial()
+    nowhere = np.full_like(trial.gnss.geodetic, np.nan)
+    found = survey(replace(trial, gnss=replace(trial.gnss, geodetic=nowhere)))
+    assert Code.NO_MEASUREMENT not in [f.code for f in found.errors]
+
+
 def test_rates_gaps_and_motion_are_those_of_the_record() -> None:
-    result = survey(build_trial())
+    trial = build_trial()
+    velocity = trial.gnss.velocity.copy()
+    velocity[np.isnan(trial.gnss.geodetic[:, 0])] = np.nan
+    result = survey(replace(trial, gnss=replace(trial.gnss, velocity=velocity)))
     imu, gnss, dvl = result.sensors
     assert (imu.rate, imu.samples) == (pytest.approx(50.0), 3000)
     assert (gnss.rate, gnss.missing) == (pytest.approx(1.0), pytest.approx(1 / 60))

@@ -9,7 +9,9 @@ from truth import exact_states, scenario
 
 from factorgraph_dvl.imu.increments import increments
 from factorgraph_dvl.imu.preintegration import segments
+from factorgraph_dvl.ranging import hypotheses
 from factorgraph_dvl.ranging.position_from_ranges import positions_from_ranges
+from factorgraph_dvl.ranging.smoother import fit
 from factorgraph_dvl.simulation import simulate
 
 BEACONS = {
@@ -39,7 +41,15 @@ def test_without_ranges_the_states_stay():
     assert found.states == (states,)
 
 
-def test_with_gnss_only_outliers_are_sought():
+def test_with_gnss_only_outliers_are_sought(monkeypatch):
+    fits = []
+
+    def counted(*args, **options):
+        fits.append(args)
+        return fit(*args, **options)
+
+    monkeypatch.setattr(hypotheses, "search", None)
+    monkeypatch.setattr(hypotheses, "fit", counted)
     trial, frame, seg, states = prepared()
     beacons = trial.beacons
     wrong = np.arange(20, beacons.time.size, 20)
@@ -50,3 +60,5 @@ def test_with_gnss_only_outliers_are_sought():
     rejected = found.rejected["Beacon B1 range"]
     assert np.isin(beacons.time[wrong], rejected).all()
     assert rejected.size <= wrong.size + 2
+    # The only track needs no search, and is fitted once.
+    assert len(fits) == 1

@@ -9,8 +9,12 @@ import pytest
 from planar import STRAIGHT, trial
 
 from factorgraph_dvl.errors import DataError, SolveError
+from factorgraph_dvl.quality.survey_planar import survey_planar
 from factorgraph_dvl.ranging.planar_solution import solve_planar
 from factorgraph_dvl.ranging.problem import planar_setup
+from factorgraph_dvl.sensors.finding import Code
+
+SHORT = {"manoeuvres": [{"straight_s": 30}, {"turn_deg_s": 2, "duration_s": 30}]}
 
 
 def test_a_range_at_the_very_end_but_for_rounding_is_no_step_of_its_own():
@@ -35,3 +39,35 @@ def test_clocks_that_do_not_fit_are_refused():
         planar_setup(empty)
     with pytest.raises(SolveError, match="0 ranges are too few"):
         solve_planar(replace(t, beacons=replace(t.beacons, range=nothing)))
+
+
+def jumping(t, at, by):
+    """Return a trial whose clock is set while it runs."""
+    late = {
+        r.section: replace(r, time=np.where(r.time >= at, r.time + by, r.time)) for r in t.records
+    }
+    return replace(t, **late)
+
+
+@pytest.mark.parametrize(("at", "kept"), [(20.0, (20.0, 315.0)), (250.0, (0.0, 250.0))])
+def test_only_the_part_between_jumps_with_most_ranges_is_used(at, kept):
+    t = jumping(trial(), at, 1.3e9)
+    setup = planar_setup(t)
+    first, last = np.array(kept) + (1.3e9 if at < 100.0 else 0.0)
+    assert first <= setup.problem.time[0] <= first + 1.0
+    assert last - 1.0 <= setup.problem.time[-1] <= last
+    codes = [f.code for f in survey_planar(t).findings]
+    assert codes.count(Code.CLOCK_JUMP) == 3
+    assert Code.GAPS not in codes
+
+
+def test_a_long_trial_before_a_jump_is_no_gap():
+    t = trial()
+    slow = replace(t, **{r.section: replace(r, time=20.0 * r.time) for r in t.records})
+    setup = planar_setup(jumping(slow, 6000.0, 1.3e9))
+    assert np.ptp(setup.problem.time) > 5900.0
+
+
+def test_the_trajectory_of_a_trial_with_a_jump_is_no_longer_than_its_records():
+    found = solve_planar(jumping(trial(**SHORT), 5.0, 1.3e9), rate_hz=1.0)
+    assert found.trajectory.time.size < 70

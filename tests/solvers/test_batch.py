@@ -143,7 +143,10 @@ def test_a_very_short_trial():
     assert not solution.estimate("accel_bias_ug").observable[:2].any()
     imu, t = trial.imu, trial.imu.time
     with pytest.raises(DataError, match="only 5 samples"):
-        solve(replace(trial, imu=replace(imu, time=t[:5], gyro=imu.gyro[:5], accel=imu.accel[:5])))
+        solve(
+            replace(trial, imu=replace(imu, time=t[:5], gyro=imu.gyro[:5], accel=imu.accel[:5])),
+            anyway=True,
+        )
 
 
 def test_without_gnss_but_with_a_start():
@@ -170,7 +173,7 @@ def test_without_any_position_there_is_no_frame():
 
 def test_a_dvl_that_never_locks_and_no_dvl():
     trial = simulate(scenario(dvl={"no_lock_s": [[0.0, 100.0]]}))
-    solution = solve(trial)
+    solution = solve(trial, anyway=True)
     assert solution.converged
     joined = " ".join(of_code(solution.findings, Code.NOT_OBSERVABLE))
     assert joined.count("the trial has no ping with a lock") == 3
