@@ -104,14 +104,14 @@ class System:
 
     def solve(self, g: Array, h: Array) -> tuple[Array, Array]:
         """Return the step against a gradient of states (4 n,) and constants (c,)."""
-        dtheta = -np.linalg.solve(self._schur, h - self._influence.T @ g)
+        dtheta = np.asarray(np.linalg.solve(self._schur, self._influence.T @ g - h), dtype=float)
         dx = -self._solve(g) - self._influence @ dtheta
         return dx.reshape(-1, 4), dtheta
 
     def covariance(self, *, last_only: bool) -> tuple[Array, Array, Array]:
         """Return covariances of states, of both, and of the constants."""
         n, c = self._diagonal.shape[0], self._h.size
-        constants = np.linalg.inv(self._schur) if c else np.zeros((0, 0))
+        constants = np.asarray(np.linalg.inv(self._schur) if c else np.zeros((0, 0)), dtype=float)
         influence = self._influence.reshape(n, 4, c)
         if last_only:
             unit = np.zeros((4 * n, 4))
