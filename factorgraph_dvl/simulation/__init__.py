@@ -7,9 +7,9 @@ conventions and the Earth model, so that an error in one does not cancel in the 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Mapping
 from os import PathLike
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 
@@ -18,15 +18,11 @@ from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.sensors.dvl import Dvl
 from factorgraph_dvl.sensors.gnss import Gnss
-from factorgraph_dvl.sensors.protocol import Aid
-from factorgraph_dvl.simulation.beams import simulate_beams, simulate_turntable
-from factorgraph_dvl.simulation.depth import simulate_depth
-from factorgraph_dvl.simulation.measurements import displaced, simulate_dvl, simulate_gnss
-from factorgraph_dvl.simulation.measurements import simulate_imu as _simulate_imu
+from factorgraph_dvl.sensors.imu import Imu
+from factorgraph_dvl.simulation.catalogue import INSTRUMENTS, PLANAR_INSTRUMENTS, Instrument
+from factorgraph_dvl.simulation.measurements import displaced
 from factorgraph_dvl.simulation.motion import TrueMotion, plan_motion
-from factorgraph_dvl.simulation.ranging import simulate_beacons, simulate_heading, simulate_log
 from factorgraph_dvl.simulation.scenario import Scenario, load_scenario, parse_scenario
-from factorgraph_dvl.simulation.star import simulate_star
 from factorgraph_dvl.simulation.stated_errors import with_stated_errors
 from factorgraph_dvl.trial import (
     InitialAttitude,
@@ -45,17 +41,6 @@ __all__ = [
     "simulate",
     "simulate_planar",
 ]
-
-# By section; the order is that of the random streams, so a new sensor comes last.
-_AIDS: dict[str, Callable[..., tuple[Aid, dict[str, Array]]]] = {
-    "gnss": simulate_gnss,
-    "dvl": simulate_dvl,
-    "star": simulate_star,
-    "depth": simulate_depth,
-    "beacons": simulate_beacons,
-    "dvl_beams": simulate_beams,
-    "turntable": simulate_turntable,
-}
 
 
 def simulate(scenario: Scenario | str | PathLike[str], seed: int = 0) -> Trial:
@@ -82,14 +67,9 @@ def simulate(scenario: Scenario | str | PathLike[str], seed: int = 0) -> Trial:
             where=scenario.source,
             expected="an imu, or `simulate_planar` for a planar scenario",
         )
-    imu_rng, *aid_rngs = np.random.default_rng(seed).spawn(1 + len(_AIDS))
     motion = plan_motion(scenario)
-    imu, truth = _simulate_imu(scenario, motion, imu_rng)
-    aids: dict[str, Aid] = {}
-    for (section, run), rng in zip(_AIDS.items(), aid_rngs, strict=True):
-        if section in scenario.aids:
-            aids[section], calibration = run(scenario, motion, rng)
-            truth |= calibration
+    aids, truth = _records(INSTRUMENTS, scenario, motion, seed)
+    imu: Imu = aids.pop("imu")
     attitude, position, velocity = _initial(scenario, motion, imu.time[:1])
     trial = Trial(
         name=scenario.name,
@@ -128,24 +108,33 @@ def simulate_planar(scenario: Scenario | str | PathLike[str], seed: int = 0) -> 
         scenario = load_scenario(scenario)
     if not scenario.planar:
         raise ConfigError("there is an imu", where=scenario.source, expected="a planar scenario")
-    rngs = np.random.default_rng(seed).spawn(4)
     motion = plan_motion(scenario)
-    heading, bias = simulate_heading(scenario, motion, rngs[0])
-    log, slip = simulate_log(scenario, motion, rngs[1])
-    depth, _ = simulate_depth(scenario, motion, rngs[2])
-    beacons, ranging = simulate_beacons(scenario, motion, rngs[3])
-    start = np.array([max(heading.time[0], log.time[0], depth.time[0])])
+    records, truth = _records(PLANAR_INSTRUMENTS, scenario, motion, seed)
+    # In the plane the height of the sea surface is as stated.
+    truth.pop("sea_surface_height_m")
+    start = np.array([max(records[name].time[0] for name in ("heading", "log", "depth"))])
     return PlanarTrial(
         name=scenario.name,
-        heading=heading,
-        log=log,
-        depth=depth,
-        beacons=beacons,
+        **records,
         body_axes=scenario.body_axes,
         initial_position=_initial(scenario, motion, start)[1],
         reference=_reference(motion, scenario.reference_rate_hz),
-        calibration_truth=bias | slip | ranging,
+        calibration_truth=truth,
     )
+
+
+def _records(
+    instruments: Mapping[str, Instrument], scenario: Scenario, motion: TrueMotion, seed: int
+) -> tuple[dict[str, Any], dict[str, Array]]:
+    """Return the records of a scenario's instruments by section, and their calibration."""
+    records: dict[str, Any] = {}
+    truth: dict[str, Array] = {}
+    rngs = np.random.default_rng(seed).spawn(len(instruments))
+    for (section, instrument), rng in zip(instruments.items(), rngs, strict=True):
+        if getattr(scenario, section) is not None:
+            records[section], calibration = instrument.simulate(scenario, motion, rng)
+            truth |= calibration
+    return records, truth
 
 
 def _initial(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import cast
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -12,10 +12,12 @@ from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.sensors.dvl_beams import DvlBeams, DvlBeamsSettings
 from factorgraph_dvl.sensors.turntable import Turntable, TurntableSettings
-from factorgraph_dvl.simulation.instruments import DvlBeamsTruth
+from factorgraph_dvl.simulation.instruments import DvlBeamsTruth, TurntableTruth
 from factorgraph_dvl.simulation.measurements import apply, sample_times, within
 from factorgraph_dvl.simulation.motion import TrueMotion
-from factorgraph_dvl.simulation.scenario import Scenario
+
+if TYPE_CHECKING:
+    from factorgraph_dvl.simulation.scenario import Scenario
 
 
 def simulate_beams(
@@ -25,8 +27,7 @@ def simulate_beams(
 
     v_i = (1 + k_i) d_i . (v_b + omega_eb_b x l) + noise.
     """
-    truth = scenario.dvl_beams
-    assert truth is not None
+    truth: DvlBeamsTruth = scenario.dvl_beams
     jitter_rng, error_rng, noise_rng, lost_rng = rng.spawn(4)
     directions, scale = _drawn(truth, error_rng)
     time = sample_times(truth, motion.duration, jitter_rng)
@@ -59,8 +60,7 @@ def simulate_turntable(
     scenario: Scenario, motion: TrueMotion, rng: np.random.Generator
 ) -> tuple[Turntable, dict[str, Array]]:
     """Return the record of the turntable, its angle without error."""
-    truth = scenario.turntable
-    assert truth is not None
+    truth: TurntableTruth = scenario.turntable
     assert motion.table is not None
     time = sample_times(truth, motion.duration, rng)
     angle = np.asarray(motion.table(time), dtype=float)

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
-from typing import cast
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
 from factorgraph_dvl.geometry.rotations import rotation_from_rph
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.sensors.depth import Depth, DepthSettings
+from factorgraph_dvl.simulation.instruments import DepthTruth
 from factorgraph_dvl.simulation.measurements import displaced, sample_times
 from factorgraph_dvl.simulation.motion import TrueMotion
-from factorgraph_dvl.simulation.scenario import Scenario
+
+if TYPE_CHECKING:
+    from factorgraph_dvl.simulation.scenario import Scenario
 
 
 def simulate_depth(
@@ -22,8 +25,7 @@ def simulate_depth(
     The depth is the distance of the sensor, at its lever arm from the IMU, below the sea
     surface.
     """
-    truth = scenario.depth
-    assert truth is not None
+    truth: DepthTruth = scenario.depth
     jitter_rng, noise_rng = rng.spawn(2)
     time = sample_times(truth, motion.duration, jitter_rng)
     state = motion.at(time)

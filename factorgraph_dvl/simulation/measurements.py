@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import cast
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 import pymap3d
@@ -18,9 +18,11 @@ from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.sensors.dvl import Dvl, DvlSettings
 from factorgraph_dvl.sensors.gnss import Gnss, GnssSettings
 from factorgraph_dvl.sensors.imu import Imu, ImuSettings
-from factorgraph_dvl.simulation.instruments import Interval, Sampled
+from factorgraph_dvl.simulation.instruments import DvlTruth, GnssTruth, Interval, Sampled
 from factorgraph_dvl.simulation.motion import TrueMotion, TrueState
-from factorgraph_dvl.simulation.scenario import Scenario
+
+if TYPE_CHECKING:
+    from factorgraph_dvl.simulation.scenario import Scenario
 
 # Chosen: samples computed at a time; limits memory to some megabytes.
 _CHUNK = 32768
@@ -100,8 +102,7 @@ def simulate_gnss(
 
     Of the noise, only the white part.
     """
-    truth = scenario.gnss
-    assert truth is not None
+    truth: GnssTruth = scenario.gnss
     jitter_rng, position_rng, velocity_rng = rng.spawn(3)
     time = sample_times(truth, motion.duration, jitter_rng)
     # The antenna is on the ship, even if a turntable turns the IMU.
@@ -139,8 +140,7 @@ def simulate_dvl(
 
     at the true time of the ping. Through the water, v_b excludes the current.
     """
-    truth = scenario.dvl
-    assert truth is not None
+    truth: DvlTruth = scenario.dvl
     jitter_rng, noise_rng = rng.spawn(2)
     time = sample_times(truth, motion.duration, jitter_rng)
     state = motion.at(time)
@@ -170,8 +170,7 @@ def simulate_dvl(
 
 
 def _dvl_velocity(scenario: Scenario, state: TrueState) -> Array:
-    truth = scenario.dvl
-    assert truth is not None
+    truth: DvlTruth = scenario.dvl
     current = np.array(scenario.current_m_s) if truth.reference == "water" else np.zeros(3)
     bRn = np.swapaxes(rotation_from_rph(state.rph, scenario.body_axes), 1, 2)
     at_imu = apply(bRn, state.v_n - current)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.interpolate import PPoly
@@ -26,8 +27,10 @@ from factorgraph_dvl.geometry.rotations import (
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.simulation.manoeuvres import Accelerate, Climb, Manoeuvre, Stop, Straight
-from factorgraph_dvl.simulation.scenario import Scenario
 from factorgraph_dvl.simulation.table import table_angle
+
+if TYPE_CHECKING:
+    from factorgraph_dvl.simulation.scenario import Scenario
 
 # Chosen: reaches the precision of a double with steps of half a second.
 _COLLOCATION_NODES = 6

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import cast
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 import pymap3d
@@ -14,7 +14,10 @@ from factorgraph_dvl.sensors.beacon import Beacons, BeaconSettings
 from factorgraph_dvl.sensors.speed_log import Heading, HeadingSettings, LogSettings, SpeedLog
 from factorgraph_dvl.simulation.measurements import displaced, sample_times, within
 from factorgraph_dvl.simulation.motion import TrueMotion
-from factorgraph_dvl.simulation.scenario import Scenario
+from factorgraph_dvl.simulation.ranging_instruments import BeaconTruth, HeadingTruth, LogTruth
+
+if TYPE_CHECKING:
+    from factorgraph_dvl.simulation.scenario import Scenario
 
 
 def simulate_beacons(
@@ -24,8 +27,7 @@ def simulate_beacons(
 
     Distances are straight lines in Earth-centred coordinates, times 1 + e.
     """
-    truth = scenario.beacons
-    assert truth is not None
+    truth: BeaconTruth = scenario.beacons
     jitter_rng, place_rng, noise_rng, fault_rng = rng.spawn(4)
     time = sample_times(truth, motion.duration, jitter_rng)
     names = list(truth.positions)
@@ -77,8 +79,7 @@ def simulate_heading(
     scenario: Scenario, motion: TrueMotion, rng: np.random.Generator
 ) -> tuple[Heading, dict[str, Array]]:
     """Return the compass's record and its bias."""
-    truth = scenario.heading
-    assert truth is not None
+    truth: HeadingTruth = scenario.heading
     jitter_rng, noise_rng = rng.spawn(2)
     time = sample_times(truth, motion.duration, jitter_rng, first=0)
     drawn, *white = noise_rng.standard_normal(1 + time.size)
@@ -95,8 +96,7 @@ def simulate_log(
     scenario: Scenario, motion: TrueMotion, rng: np.random.Generator
 ) -> tuple[SpeedLog, dict[str, Array]]:
     """Return the log's record, its scale error, and the current that it does not measure."""
-    truth = scenario.log
-    assert truth is not None
+    truth: LogTruth = scenario.log
     jitter_rng, noise_rng = rng.spawn(2)
     time = sample_times(truth, motion.duration, jitter_rng, first=0)
     drawn = noise_rng.standard_normal()

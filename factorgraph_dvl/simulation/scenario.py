@@ -51,33 +51,22 @@ from collections.abc import Mapping
 from datetime import date
 from os import PathLike
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import msgspec
 
 from factorgraph_dvl.errors import ConfigError, printable
 from factorgraph_dvl.geometry.rotations import BodyAxes
-from factorgraph_dvl.sensors.catalogue import AIDS
 from factorgraph_dvl.sensors.protocol import NoiseModel, SensorSection
 from factorgraph_dvl.settings.convert import convert
 from factorgraph_dvl.settings.sections import NonNegative, Positive, Section, Vector3, check_epoch
 from factorgraph_dvl.settings.yaml_file import read_yaml
-from factorgraph_dvl.simulation.instruments import (
-    DepthTruth,
-    DvlBeamsTruth,
-    DvlTruth,
-    GnssTruth,
-    ImuTruth,
-    SimulatedInstrument,
-    StarTruth,
-    TurntableTruth,
-)
+from factorgraph_dvl.simulation.catalogue import INSTRUMENTS, PLANAR_INSTRUMENTS
+from factorgraph_dvl.simulation.instruments import ImuTruth, SimulatedInstrument
 from factorgraph_dvl.simulation.manoeuvres import Manoeuvre, flatten
-from factorgraph_dvl.simulation.ranging_instruments import BeaconTruth, HeadingTruth, LogTruth
 
-# Sections of the simulated sensors: of any trial, and of a planar one alone.
-_PLANAR = ("heading", "log", "depth", "beacons")
-_SECTIONS = tuple(dict.fromkeys(("imu", *(aid.section for aid in AIDS), *_PLANAR)))
+# Every simulated sensor, by section.
+_INSTRUMENTS = {**INSTRUMENTS, **PLANAR_INSTRUMENTS}
 
 Latitude = Annotated[float, msgspec.Meta(ge=-89, le=89)]
 Longitude = Annotated[float, msgspec.Meta(ge=-360, le=360)]
@@ -129,24 +118,32 @@ class InitialClaim(Section, frozen=True, kw_only=True):
     velocity_std_m_s: tuple[Positive, Positive, Positive] | None = None
 
 
-class Claims(Section, frozen=True, kw_only=True):
+class _Claims(Section, frozen=True, kw_only=True):
     """Settings of the written trial.yaml; sensor sections as there."""
 
-    imu: dict[str, Any] = msgspec.field(default_factory=dict)
-    gnss: dict[str, Any] = msgspec.field(default_factory=dict)
-    dvl: dict[str, Any] = msgspec.field(default_factory=dict)
-    star: dict[str, Any] = msgspec.field(default_factory=dict)
-    beacons: dict[str, Any] = msgspec.field(default_factory=dict)
-    heading: dict[str, Any] = msgspec.field(default_factory=dict)
-    log: dict[str, Any] = msgspec.field(default_factory=dict)
-    depth: dict[str, Any] = msgspec.field(default_factory=dict)
-    dvl_beams: dict[str, Any] = msgspec.field(default_factory=dict)
-    turntable: dict[str, Any] = msgspec.field(default_factory=dict)
     noise: NoiseModel = "estimated"
     initial: InitialClaim | None = None
 
 
-class Scenario(Section, frozen=True, kw_only=True):
+if TYPE_CHECKING:
+
+    class Claims(_Claims, frozen=True, kw_only=True):
+        """Settings of the written trial.yaml; sensor sections as there."""
+
+else:
+    Claims = msgspec.defstruct(
+        "Claims",
+        [(name, dict[str, Any], msgspec.field(default_factory=dict)) for name in _INSTRUMENTS],
+        bases=(_Claims,),
+        frozen=True,
+        kw_only=True,
+        forbid_unknown_fields=True,
+        module=__name__,
+        namespace={"__doc__": "Settings of the written trial.yaml; sensor sections as there."},
+    )
+
+
+class _Scenario(Section, frozen=True, kw_only=True):
     """A simulated trial; see the module's docstring for the file."""
 
     name: str
@@ -159,15 +156,6 @@ class Scenario(Section, frozen=True, kw_only=True):
     sway: SwaySettings = SwaySettings()
     current_m_s: Vector3 = (0.0, 0.0, 0.0)
     imu: ImuTruth | None = None
-    gnss: GnssTruth | None = None
-    dvl: DvlTruth | None = None
-    star: StarTruth | None = None
-    beacons: BeaconTruth | None = None
-    heading: HeadingTruth | None = None
-    log: LogTruth | None = None
-    depth: DepthTruth | None = None
-    dvl_beams: DvlBeamsTruth | None = None
-    turntable: TurntableTruth | None = None
     trial: Claims = Claims()
     # A mapping of Any: a number, or a list of them, is checked below in one sentence.
     required: dict[str, Any] = msgspec.field(default_factory=dict)
@@ -202,7 +190,7 @@ class Scenario(Section, frozen=True, kw_only=True):
     @property
     def aids(self) -> dict[str, SimulatedInstrument]:
         """The simulated sensors other than the IMU, by section."""
-        given = {name: getattr(self, name) for name in _SECTIONS if name != "imu"}
+        given = {name: getattr(self, name) for name in _INSTRUMENTS if name != "imu"}
         return {name: truth for name, truth in given.items() if truth is not None}
 
     def settings(self, section: str) -> SensorSection:
@@ -218,6 +206,26 @@ class Scenario(Section, frozen=True, kw_only=True):
         return convert(
             truth.claimed() | claims, truth.section_type, f"trial.{section}", self.source
         )
+
+
+if TYPE_CHECKING:
+
+    class Scenario(_Scenario, frozen=True, kw_only=True):
+        """A simulated trial; see the module's docstring for the file."""
+
+        def __getattr__(self, section: str) -> Any: ...
+
+else:
+    Scenario = msgspec.defstruct(
+        "Scenario",
+        [(name, each.truth | None, None) for name, each in _INSTRUMENTS.items() if name != "imu"],
+        bases=(_Scenario,),
+        frozen=True,
+        kw_only=True,
+        forbid_unknown_fields=True,
+        module=__name__,
+        namespace={"__doc__": "A simulated trial; see the module's docstring for the file."},
+    )
 
 
 def _is_sigma(value: Any) -> bool:
@@ -267,7 +275,7 @@ def _checked(scenario: Scenario) -> Scenario:
     source = scenario.source
     scenario.plan()
     _check_sections(scenario)
-    for name in _SECTIONS:
+    for name in _INSTRUMENTS:
         if getattr(scenario, name) is not None:
             scenario.settings(name)
         elif getattr(scenario.trial, name):
@@ -281,10 +289,10 @@ def _checked(scenario: Scenario) -> Scenario:
 
 def _check_sections(scenario: Scenario) -> None:
     """Raise ConfigError unless the sensors make a trial, with an IMU or planar."""
-    given = {name for name in _SECTIONS if getattr(scenario, name) is not None}
-    known = {aid.section for aid in AIDS}
-    wrong = sorted(given - known - {"imu"} if "imu" in given else given - set(_PLANAR))
-    missing = [] if "imu" in given else [name for name in _PLANAR if name not in given]
+    given = {name for name in _INSTRUMENTS if getattr(scenario, name) is not None}
+    known = INSTRUMENTS.keys()
+    wrong = sorted(given - known - {"imu"} if "imu" in given else given - set(PLANAR_INSTRUMENTS))
+    missing = [] if "imu" in given else [name for name in PLANAR_INSTRUMENTS if name not in given]
     if wrong and "imu" in given:
         raise ConfigError(
             f"`{wrong[0]}` belongs to a planar trial, which has no imu",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from datetime import UTC, datetime
-from typing import cast
+from typing import TYPE_CHECKING, cast
 
 import erfa
 import numpy as np
@@ -15,9 +15,12 @@ from factorgraph_dvl.geometry.rotations import rotation_from_rph
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.sensors.star import Star, StarSettings
+from factorgraph_dvl.simulation.instruments import StarTruth
 from factorgraph_dvl.simulation.measurements import sample_times, within
 from factorgraph_dvl.simulation.motion import TrueMotion, TrueState
-from factorgraph_dvl.simulation.scenario import Scenario
+
+if TYPE_CHECKING:
+    from factorgraph_dvl.simulation.scenario import Scenario
 
 _ARCSEC = DEG / 3600.0
 
@@ -31,8 +34,7 @@ def simulate_star(
     GCRS by ERFA's whole transformation at every sample. The noise turns the tracker's axes;
     that of a vector turns the vector, across itself.
     """
-    truth = scenario.star
-    assert truth is not None
+    truth: StarTruth = scenario.star
     if not scenario.epoch:
         raise ConfigError(
             "a star tracker is simulated without `epoch`",

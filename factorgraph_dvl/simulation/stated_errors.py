@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import TYPE_CHECKING
 from zlib import crc32
 
 import numpy as np
@@ -12,8 +13,10 @@ from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.simulation import faults
 from factorgraph_dvl.simulation.faults import Fault
 from factorgraph_dvl.simulation.instruments import DvlTruth, GnssTruth, ImuTruth
-from factorgraph_dvl.simulation.scenario import Scenario
 from factorgraph_dvl.trial import Trial
+
+if TYPE_CHECKING:
+    from factorgraph_dvl.simulation.scenario import Scenario
 
 _PPM = 1e-6
 _PER_G = DEG_PER_HOUR / STANDARD_GRAVITY

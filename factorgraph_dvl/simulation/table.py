@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 from scipy.interpolate import PPoly
 
 from factorgraph_dvl.errors import ConfigError
 from factorgraph_dvl.geometry.units import DEG
-from factorgraph_dvl.simulation.scenario import Scenario
+
+if TYPE_CHECKING:
+    from factorgraph_dvl.simulation.scenario import Scenario
 
 
 def table_angle(scenario: Scenario, duration: float) -> PPoly | None:
