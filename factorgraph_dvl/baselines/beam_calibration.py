@@ -8,6 +8,7 @@ import numpy as np
 
 from factorgraph_dvl.baselines.beam_filter import (
     BeamPings,
+    attitude_errors,
     beam_filter,
     beam_residuals,
     without_spurious_information,
@@ -21,7 +22,15 @@ from factorgraph_dvl.baselines.summary import (
     summarise,
 )
 from factorgraph_dvl.errors import ConfigError, DataError
-from factorgraph_dvl.solution import Progress, Residuals, Solution
+from factorgraph_dvl.geometry.rotations import (
+    BodyAxes,
+    exp_so3,
+    rotation_from_rph,
+    rph_from_rotation,
+    rph_jacobian,
+)
+from factorgraph_dvl.geometry.vectors import Array, interpolate
+from factorgraph_dvl.solution import Progress, Residuals, Solution, Trajectory
 from factorgraph_dvl.trial import Trial
 
 
@@ -82,4 +91,26 @@ def calibrate_beams(trial: Trial, *, rate_hz: float, report: Progress) -> tuple[
         rate_hz=rate_hz,
         findings=findings,
     )
-    return solution, outcome
+    time, phi, covariance = attitude_errors(pings, outcome.estimated)
+    corrected = _with_attitude(solution.trajectory, trial.body_axes, time, phi, covariance)
+    return replace(solution, trajectory=corrected), outcome
+
+
+def _with_attitude(
+    trajectory: Trajectory, axes: BodyAxes, time: Array, phi: Array, covariance: Array
+) -> Trajectory:
+    """Return a trajectory with the attitude errors taken off that the filter found at times (H,).
+
+    Before the first ping and after the last one the attitude is that of SINS/GNSS.
+    """
+    if time.size < 2:
+        return trajectory
+    at = np.flatnonzero((trajectory.time >= time[0]) & (trajectory.time <= time[-1]))
+    t = trajectory.time[at]
+    nRb = exp_so3(interpolate(t, time, phi)) @ rotation_from_rph(trajectory.rph[at], axes)
+    rph, rph_cov = trajectory.rph.copy(), trajectory.rph_cov.copy()
+    rph[at] = rph_from_rotation(nRb, axes)
+    J = rph_jacobian(rph[at], axes) @ nRb.transpose(0, 2, 1)
+    P = interpolate(t, time, covariance.reshape(-1, 9)).reshape(-1, 3, 3)
+    rph_cov[at] = J @ P @ J.transpose(0, 2, 1)
+    return replace(trajectory, rph=rph, rph_cov=rph_cov)

@@ -86,16 +86,36 @@ def beam_filter(pings: BeamPings, parameters: tuple[Parameter, ...]) -> Outcome:
         states = _filter(pings, prior, at, keep if count == 1 else set())
         if count == 1:
             history = tuple(
-                (float(pings.motion.time[i]), _estimated(parameters, x, P))
+                (float(pings.motion.time[i]), _estimated(parameters, x[3:], P[3:, 3:]))
                 for i, x, P in states[:-1]
             )
-        _, x, P = states[-1]
+        x, P = states[-1][1][3:], states[-1][2][3:, 3:]
         moved = np.abs(x - at) / np.sqrt(np.maximum(np.diag(P), 1e-30))
         at = x
         converged = float(moved[np.diag(P) > 0.0].max(initial=0.0)) <= _CONVERGED
         if converged:
             break
     return Outcome(_estimated(parameters, at, P), count, history, converged=converged)
+
+
+def attitude_errors(pings: BeamPings, estimated: Estimated) -> tuple[Array, Array, Array]:
+    """Return what the filter finds of the attitude errors, linearised about a calibration.
+
+    Returns
+    -------
+    time : ndarray, shape (H,), s
+        Of the pings of a history.
+    phi : ndarray, shape (H, 3), rad
+        In true nRb = Exp(phi) nRb.
+    covariance : ndarray, shape (H, 3, 3), rad²
+        Of phi.
+    """
+    rows = history_rows(len(pings.measured))
+    prior = prior_of(estimated.parameters)
+    states = _filter(pings, prior, np.concatenate(estimated.values), set(rows.tolist()))[:-1]
+    phi = np.array([x[:3] for _, x, _ in states]).reshape(-1, 3)
+    covariance = np.array([P[:3, :3] for _, _, P in states]).reshape(-1, 3, 3)
+    return pings.motion.time[rows], phi, covariance
 
 
 def beam_residuals(pings: BeamPings, estimated: Estimated) -> tuple[Array, Array]:
@@ -141,7 +161,7 @@ def _estimated(parameters: tuple[Parameter, ...], x: Array, P: Array) -> Estimat
 def _filter(
     pings: BeamPings, prior: Estimated, at: Array, keep: set[int]
 ) -> list[tuple[int, Array, Array]]:
-    """Return calibration and covariance after the pings to keep, and at the end."""
+    """Return states and covariance after the pings to keep, and at the end."""
     linear = _linearised(pings, at)
     wander = pings.motion.covariance[:, 6:9, 6:9]
     n = at.size
@@ -167,8 +187,8 @@ def _filter(
         K, P = update(P, H, linear.variance[k, valid])
         x = x + K @ innovation
         if k in keep:
-            out.append((k, x[3:].copy(), P[3:, 3:].copy()))
-    out.append((time.size, x[3:], P[3:, 3:]))
+            out.append((k, x.copy(), P.copy()))
+    out.append((time.size, x, P))
     return out
 
 

@@ -18,6 +18,7 @@ class PaperName(StrEnum):
     LUO_2024 = "luo-2024"
     LIU_2020 = "liu-2020"
     NINE_STATE = "nine-state"
+    BEAMS = "beams"
     CHEN_2021 = "chen-2021"
 
 

@@ -245,14 +245,17 @@ def draw_history(
 
 
 def write_beams(trial: Trial | PlanarTrial, solution: Solution, folder: Path) -> None:
-    """Write the consistency of the beams, if the solution calibrates beams."""
+    """Write consistency and angles of the beams, if the solution calibrates beams."""
+    from factorgraph_dvl.analysis.beam_angles import beam_angles
     from factorgraph_dvl.analysis.beam_quality import beam_quality, calibrates, calibration_of
-    from factorgraph_dvl.io.solution_folder import BEAMS_FILE
+    from factorgraph_dvl.io.solution_folder import BEAM_ANGLES_FILE, BEAMS_FILE
     from factorgraph_dvl.io.tables import write_table
 
     if trial.beams is not None and calibrates(solution, trial.beams):
         quality = beam_quality(trial.beams, calibration_of(trial.beams, solution))
         write_table(folder / BEAMS_FILE, quality.columns())
+    if (angles := beam_angles(solution)) is not None:
+        write_table(folder / BEAM_ANGLES_FILE, angles.columns())
 
 
 def write_instrument(solution: Solution, folder: Path) -> None:

@@ -17,6 +17,7 @@ NUMBERED = {
     "luo-2024": (16, 7, 7),
     "liu-2020": (22, 0, 4),
     "nine-state": (0, 0, 0),
+    "beams": (0, 0, 0),
     "chen-2021": (0, 1, 5),
 }
 VERDICTS = {"reproduced", "corrected", "not reproducible"}
