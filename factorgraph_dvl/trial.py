@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import ClassVar
+from typing import ClassVar, TypeVar
 
 import numpy as np
 from msgspec import UnsetType
@@ -27,6 +27,8 @@ from factorgraph_dvl.sensors.imu import Imu
 from factorgraph_dvl.sensors.protocol import Aid, NoiseModel, SensorRecord
 from factorgraph_dvl.sensors.speed_log import Heading, SpeedLog
 from factorgraph_dvl.sensors.turntable import Turntable
+
+_Sensor = TypeVar("_Sensor", bound=Aid)
 
 
 @dataclass(frozen=True)
@@ -195,10 +197,14 @@ class Trial:
         stated = record.settings.noise
         return (self.noise if isinstance(stated, UnsetType) else stated) == "estimated"
 
+    def find(self, kind: type[_Sensor]) -> _Sensor | None:
+        """Return the sensor of a type, None where the trial does not have it."""
+        return next((aid for aid in self.aids if isinstance(aid, kind)), None)
+
     @property
     def beams(self) -> DvlBeams | None:
         """The beams of a DVL, None where the trial does not have them."""
-        return next((aid for aid in self.others if isinstance(aid, DvlBeams)), None)
+        return self.find(DvlBeams)
 
     @property
     def log(self) -> Dvl | None:
@@ -213,12 +219,12 @@ class Trial:
     @property
     def beacons(self) -> Beacons | None:
         """The ranging to beacons, None where the trial does not have it."""
-        return next((aid for aid in self.others if isinstance(aid, Beacons)), None)
+        return self.find(Beacons)
 
     @property
     def depth(self) -> Depth | None:
         """The depth sensor, None where the trial does not have it."""
-        return next((aid for aid in self.others if isinstance(aid, Depth)), None)
+        return self.find(Depth)
 
     def frame(self) -> LocalFrame:
         """Return the tangent frame at the first known position, at worst a beacon's.

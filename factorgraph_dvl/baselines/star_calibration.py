@@ -81,7 +81,7 @@ def calibrate_gyros(
     ConfigError, DataError
         If the trial has no star tracker, no epoch, no GNSS, or too few attitudes.
     """
-    star = next((aid for aid in trial.others if isinstance(aid, Star)), None)
+    star = trial.find(Star)
     if star is None:
         raise DataError(
             "the trial has no star tracker", where="trial.yaml", expected="a star section"

@@ -38,7 +38,7 @@ _GAP_SWAY_RAD = 10.0 * DEG
 # Stands for a standard deviation of 0 in `initial`, rad or m. Chosen: far below what is measured.
 _LEAST_STD = 1e-7
 # Step of a bias that does not walk, SI. Chosen: regular, and no walk.
-_LEAST_WALK = 1e-12
+LEAST_WALK = 1e-12
 
 
 @dataclass(frozen=True)
@@ -97,7 +97,7 @@ def inertial_chain(
         )
         step = np.diff(seg.node_time)
         for k in range(step.size):
-            walk = np.maximum(root_psd * np.sqrt(step[k]), _LEAST_WALK)
+            walk = np.maximum(root_psd * np.sqrt(step[k]), LEAST_WALK)
             graph.add(
                 gtsam.BetweenFactorConstantBias(
                     keys.bias(k),

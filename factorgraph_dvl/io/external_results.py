@@ -13,7 +13,6 @@ from msgspec import UNSET, UnsetType
 
 from factorgraph_dvl.errors import ConfigError, DataError, printable
 from factorgraph_dvl.geometry.rotations import BodyAxes
-from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.io.calibration_file import (
     CALIBRATION_FILE,
@@ -23,14 +22,19 @@ from factorgraph_dvl.io.calibration_file import (
     read_calibration_bytes,
 )
 from factorgraph_dvl.io.folders import SETTINGS_FILE
-from factorgraph_dvl.io.motion_table import read_reference
-from factorgraph_dvl.io.solution_folder import STD_COLUMNS, TRAJECTORY_FILE, load_solution
-from factorgraph_dvl.io.tables import read_table
+from factorgraph_dvl.io.motion_table import (
+    COLUMNS,
+    STD_COLUMNS,
+    as_trajectory,
+    read_motion,
+    read_reference,
+)
+from factorgraph_dvl.io.solution_folder import TRAJECTORY_FILE, load_solution
 from factorgraph_dvl.io.trial_folder import TRUTH_FILE, load_reference
 from factorgraph_dvl.sensors.beacon import ANY_BEACON, offset_name
 from factorgraph_dvl.sensors.catalogue import BEACON_OFFSET, every_spec, specs_of
 from factorgraph_dvl.sensors.dvl_beams import DIRECTION, direction_spec
-from factorgraph_dvl.sensors.records import check_range, stack
+from factorgraph_dvl.sensors.records import check_finite, check_range
 from factorgraph_dvl.settings.ranges import out_of_range
 from factorgraph_dvl.settings.sections import Section
 from factorgraph_dvl.settings.yaml_file import parse_yaml, read_text
@@ -393,25 +397,16 @@ def _direction_estimate(name: str, given: _Directions) -> Estimate:
 
 
 def _read_trajectory(path: Path) -> Trajectory:
-    motion = read_reference(path)
-    columns = read_table(path, ("time_s",), tuple(_STD_GROUPS.values()))
+    columns = read_motion(path, optional=tuple(_STD_GROUPS.values()))
+    check_finite({name: columns[name] for name in COLUMNS}, path.name)
     for unit, group in _STD_GROUPS.items():
         check_range({name: columns[name] for name in group}, 1e-12, 1e6, unit, path.name)
-    position, velocity, rph = (_diagonal(stack(columns, g)) for g in _STD_GROUPS.values())
-    return Trajectory(
-        motion.time, motion.geodetic, motion.velocity, motion.rph, position, velocity, rph * DEG**2
-    )
+    return as_trajectory(columns)
 
 
 def _no_trajectory() -> Trajectory:
     none, square = np.zeros((0, 3)), np.zeros((0, 3, 3))
     return Trajectory(np.zeros(0), none, none, none, square, square, square)
-
-
-def _diagonal(std: Array) -> Array:
-    out = np.zeros((*std.shape, 3))
-    out[:, range(3), range(3)] = std**2
-    return out
 
 
 def _check_sizes(name: str, value: _Value | _Directions, sizes: list[int]) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +19,11 @@ COLUMNS = (
     *("lat_deg", "lon_deg", "height_m"),
     *("vel_e_m_s", "vel_n_m_s", "vel_u_m_s"),
     *("roll_deg", "pitch_deg", "heading_deg"),
+)
+STD_COLUMNS = (
+    *("std_e_m", "std_n_m", "std_u_m"),
+    *("vel_std_e_m_s", "vel_std_n_m_s", "vel_std_u_m_s"),
+    *("roll_std_deg", "pitch_std_deg", "heading_std_deg"),
 )
 
 
@@ -36,12 +42,45 @@ def read_reference(path: Path, source: str = "") -> Reference:
     DataError
         If a column is missing, or a value is not a number or out of range.
     """
+    columns = read_motion(path, source)
+    check_finite(columns, source or path.name)
+    return Reference(*_motion(columns))
+
+
+def read_motion(
+    path: Path,
+    source: str = "",
+    required: Sequence[str] = (),
+    optional: Sequence[Sequence[str]] = (),
+) -> dict[str, Array]:
+    """Read the columns of `reference` and others, with times in order and values in range.
+
+    Parameters
+    ----------
+    path : path-like
+        Of the file.
+    source : str, optional
+        Its name in messages.
+    required, optional : sequence of str, sequence of sequence of str, optional
+        Further columns, as of `read_table`.
+    """
     source = source or path.name
-    columns = read_table(path, COLUMNS, source=source)
+    columns = read_table(path, (*COLUMNS, *required), optional, source=source)
     check_times(columns["time_s"], source)
-    check_finite(columns, source)
     check_possible(columns, source)
-    return Reference(
+    return columns
+
+
+def as_trajectory(columns: Mapping[str, Array]) -> Trajectory:
+    """Return the trajectory that columns hold, with covariances that are diagonal."""
+    std = stack(columns, STD_COLUMNS) * np.repeat([1.0, 1.0, DEG], 3)
+    covariances = np.zeros((len(std), 9, 3))
+    covariances[:, np.arange(9), np.arange(9) % 3] = std**2
+    return Trajectory(*_motion(columns), *np.split(covariances, 3, axis=1))
+
+
+def _motion(columns: Mapping[str, Array]) -> tuple[Array, Array, Array, Array]:
+    return (
         columns["time_s"],
         stack(columns, COLUMNS[1:4]) * GEODETIC_SI,
         stack(columns, COLUMNS[4:7]),

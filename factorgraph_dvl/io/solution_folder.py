@@ -9,7 +9,7 @@ from typing import Any, Literal
 import msgspec
 import numpy as np
 
-from factorgraph_dvl.geometry.units import DEG, GEODETIC_SI
+from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.io.calibration_file import (
     CALIBRATION_FILE,
@@ -17,10 +17,13 @@ from factorgraph_dvl.io.calibration_file import (
     load_calibration,
 )
 from factorgraph_dvl.io.folders import new_folder
-from factorgraph_dvl.io.motion_table import COLUMNS as MOTION_COLUMNS
-from factorgraph_dvl.io.motion_table import motion_columns
-from factorgraph_dvl.io.tables import read_table, write_table
-from factorgraph_dvl.sensors.records import check_possible, check_times, stack
+from factorgraph_dvl.io.motion_table import (
+    STD_COLUMNS,
+    as_trajectory,
+    motion_columns,
+    read_motion,
+)
+from factorgraph_dvl.io.tables import write_table
 from factorgraph_dvl.solution import Hypothesis, Residuals, Solution, Trajectory
 
 TRAJECTORY_FILE = "trajectory.csv"
@@ -45,11 +48,6 @@ OWNED = (
     ),
     *(f"{FIGURES_FOLDER}/{name}.png" for name in ("*_residuals", "beam_quality")),
     *(f"{FIGURES_FOLDER}/{name}.png" for name in ("convergence", "latency")),
-)
-STD_COLUMNS = (
-    *("std_e_m", "std_n_m", "std_u_m"),
-    *("vel_std_e_m_s", "vel_std_n_m_s", "vel_std_u_m_s"),
-    *("roll_std_deg", "pitch_std_deg", "heading_std_deg"),
 )
 
 
@@ -201,7 +199,9 @@ def load_solution(path: Path | str) -> Solution:
     folder = Path(path)
     calibration = load_calibration(folder / CALIBRATION_FILE)
     fields = {name: getattr(calibration, name) for name in calibration.__dataclass_fields__}
-    return Solution(**fields, trajectory=_read_trajectory(folder / TRAJECTORY_FILE))
+    file = folder / TRAJECTORY_FILE
+    trajectory = as_trajectory(read_motion(file, str(file), STD_COLUMNS))
+    return Solution(**fields, trajectory=trajectory)
 
 
 def _trajectory_columns(trajectory: Trajectory) -> dict[str, Array]:
@@ -221,22 +221,3 @@ def _smoothed_columns(trajectory: Trajectory, smoothed: Trajectory) -> dict[str,
             column[row] = values
             out[f"smoothed_{name}"] = column
     return out
-
-
-def _read_trajectory(file: Path) -> Trajectory:
-    columns = read_table(file, (*MOTION_COLUMNS, *STD_COLUMNS), source=str(file))
-    check_times(columns["time_s"], str(file))
-    check_possible(columns, str(file))
-    return Trajectory(
-        time=columns["time_s"],
-        geodetic=stack(columns, MOTION_COLUMNS[1:4]) * GEODETIC_SI,
-        velocity=stack(columns, MOTION_COLUMNS[4:7]),
-        rph=stack(columns, MOTION_COLUMNS[7:10]) * DEG,
-        position_cov=_diagonal(stack(columns, STD_COLUMNS[0:3])),
-        velocity_cov=_diagonal(stack(columns, STD_COLUMNS[3:6])),
-        rph_cov=_diagonal(stack(columns, STD_COLUMNS[6:9]) * DEG),
-    )
-
-
-def _diagonal(std: Array) -> Array:
-    return (std**2)[:, :, None] * np.eye(3)

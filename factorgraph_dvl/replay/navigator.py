@@ -11,7 +11,7 @@ import numpy as np
 from factorgraph_dvl.geometry.rotations import BodyAxes, rph_from_rotation, rph_jacobian
 from factorgraph_dvl.geometry.vectors import Array, rotate
 from factorgraph_dvl.graph import keys
-from factorgraph_dvl.graph.inertial_chain import loose_diagonal
+from factorgraph_dvl.graph.inertial_chain import LEAST_WALK, loose_diagonal
 from factorgraph_dvl.graph.priors import ConstantsPrior, local_coordinates, value_at
 from factorgraph_dvl.graph.sensor_factor import Linearized, measurement_factor, state_of
 from factorgraph_dvl.imu.preintegration import Segments, preintegrate
@@ -31,9 +31,6 @@ from factorgraph_dvl.sensors.protocol import Aid
 from factorgraph_dvl.solution import Trajectory
 from factorgraph_dvl.solvers.trajectory import TRAJECTORY_RATE, epochs_between, trajectory_between
 
-# Standard deviation of the walk of a bias that does not walk, SI; chosen: regular, and far below
-# what can be measured.
-_LEAST_WALK = 1e-12
 _STATE = 9
 _BIAS = 6
 
@@ -157,7 +154,7 @@ class Navigator:
         predicted = pim.predict(state, bias)
         values.insert(keys.node(k + 1), predicted)
         if self.start.walking:
-            walk = np.maximum(self._walk_root_psd * np.sqrt(duration), _LEAST_WALK)
+            walk = np.maximum(self._walk_root_psd * np.sqrt(duration), LEAST_WALK)
             none = gtsam.imuBias.ConstantBias()
             factors.add(
                 gtsam.BetweenFactorConstantBias(
