@@ -158,6 +158,27 @@ class Residuals:
 
 
 @dataclass(frozen=True)
+class Noise:
+    """Noise of a measurement against what is stated of it.
+
+    Parameters
+    ----------
+    name : str
+        As in calibration.json, e.g. `dvl_velocity`.
+    factor : ndarray, shape (d,)
+        On the stated standard deviations, by component.
+    """
+
+    name: str
+    factor: Array
+
+
+def noise_name(label: str) -> str:
+    """Return the name in calibration.json of a measurement's noise."""
+    return label.lower().replace(" ", "_")
+
+
+@dataclass(frozen=True)
 class Hypothesis:
     """A trajectory that the data allow, or allowed for some time.
 
@@ -277,6 +298,8 @@ class Solution(Judged):
         Fingerprints of the data that it came from.
     limits : mapping of str to float, optional
         Standard deviations that are good enough, by parameter, in reported units.
+    noise : tuple of Noise, optional
+        Of the measurements whose noise was estimated.
     """
 
     trial: str
@@ -294,6 +317,7 @@ class Solution(Judged):
     rejected: tuple[Residuals, ...] = ()
     inputs: tuple[str, ...] = ()
     limits: Mapping[str, float] = field(default_factory=lambda: DEFAULT_LIMITS)
+    noise: tuple[Noise, ...] = ()
 
     def with_findings(self, findings: Iterable[Finding]) -> Solution:
         """Return the solution with findings before its own, each once."""
@@ -328,6 +352,7 @@ class Calibration(Judged):
     findings: tuple[Finding, ...] = ()
     inputs: tuple[str, ...] = ()
     limits: Mapping[str, float] = field(default_factory=lambda: DEFAULT_LIMITS)
+    noise: tuple[Noise, ...] = ()
 
     @property
     def values(self) -> dict[str, Array]:
@@ -398,13 +423,15 @@ def as_estimates(
 
 
 def consistency_findings(
-    estimates: Sequence[Estimate], residuals: Sequence[Residuals]
+    estimates: Sequence[Estimate], residuals: Sequence[Residuals], noise: Sequence[Noise] = ()
 ) -> list[Finding]:
     """Return findings where a solution contradicts what was stated before.
 
-    Residuals that are larger than their standard deviations make every reported standard
-    deviation too small; a value far outside its prior says that prior or data are wrong.
+    Residuals that are larger than stated make every reported standard deviation too small,
+    unless their noise was estimated; a value far outside its prior says that prior or data are
+    wrong.
     """
+    factors = {n.name: n.factor for n in noise}
     out = []
     for e in estimates:
         known = e.prior_std > 0.0
@@ -421,7 +448,9 @@ def consistency_findings(
                 )
             )
     for r in residuals:
-        rms = float(np.sqrt(np.nanmean((r.residual / r.sigma) ** 2))) if r.time.size else 0.0
+        factor = factors.get(noise_name(r.label))
+        stated = r.sigma if factor is None else r.sigma / factor
+        rms = float(np.sqrt(np.nanmean((r.residual / stated) ** 2))) if r.time.size else 0.0
         if rms > DO_NOT_FIT:
             out.append(
                 Finding(
@@ -433,11 +462,14 @@ def consistency_findings(
                 )
             )
         elif rms > TOO_LARGE:
+            effect = "are too small until you correct it"
+            if factor is not None:
+                effect = "allow for that, as far as it is noise and no lasting error"
             out.append(
                 Finding(
                     Code.LARGE_RESIDUALS,
                     f"residuals are {rms:.1f} times as large as their stated standard deviation; "
-                    "the reported standard deviations are too small until you correct it",
+                    f"the reported standard deviations {effect}",
                     sensor=r.label,
                 )
             )

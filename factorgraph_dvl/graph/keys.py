@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import string
 
-from gtsam import symbol
+from gtsam import symbol, symbolChr
 from gtsam.symbol_shorthand import B, X
 
 # Chosen: all letters but those of states and biases.
@@ -24,6 +24,11 @@ def bias(k: int) -> int:
 def calibration(i: int, size: int) -> int:
     """Return the key of calibration parameter i, which has `size` components."""
     return int(symbol(letter(size), i))
+
+
+def letter_of(key: int) -> str:
+    """Return the letter of a key: `x` of states, `b` of biases."""
+    return chr(symbolChr(key))
 
 
 def letter(size: int) -> str:

@@ -10,7 +10,7 @@ slow and makes GTSAM's optimisers copy all values.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -63,11 +63,12 @@ _BIAS = 6
 
 @dataclass(eq=False)
 class _Bound:
-    """An observation tied to the chain."""
+    """An observation tied to the chain; `usable` measurements (M,) are covered by the IMU."""
 
     observation: Observation
     attachment: Attachment
     time: Array
+    usable: Array
     weight: Array
 
 
@@ -111,6 +112,34 @@ class Evaluation:
     cost: float
 
 
+@dataclass(frozen=True)
+class Rows:
+    """Whitened rows of the linearised graph, in M items of d rows; each row has unit noise.
+
+    Parameters
+    ----------
+    source : str
+        Where the noise comes from.
+    components : tuple of str
+        Names of the d rows of an item.
+    keys : ndarray, shape (M, k)
+        Variables of each item.
+    sizes : tuple of int
+        Dimensions of the k variables.
+    matrix : ndarray, shape (M, d, n)
+        Jacobian with respect to these variables side by side.
+    vector : ndarray, shape (M, d)
+        Residual.
+    """
+
+    source: str
+    components: tuple[str, ...]
+    keys: IntArray
+    sizes: tuple[int, ...]
+    matrix: Array
+    vector: Array
+
+
 def observed(
     aids: Sequence[Aid], frame: LocalFrame
 ) -> tuple[tuple[Observation, ...], tuple[Parameter, ...]]:
@@ -135,6 +164,14 @@ class Problem:
     constants_prior : ConstantsPrior, optional
         Joint prior of biases and parameters, in place of their own; the chain then has none of
         the biases.
+
+    Attributes
+    ----------
+    noise_factors : mapping of str to ndarray
+        By label, factors (d,) on the standard deviations that sensors state for their own noise;
+        1 where there are none. `weigh` applies them.
+    robust_weights : mapping of str to ndarray
+        By label, weights (M,) from 0 to 1 on the squares of residuals; likewise.
     """
 
     def __init__(
@@ -161,6 +198,8 @@ class Problem:
             )
         self.uncovered: dict[str, int] = {}
         self.rejected: Mapping[str, Array] = {}
+        self.noise_factors: Mapping[str, Array] = {}
+        self.robust_weights: Mapping[str, Array] = {}
         self._start = {**self.prior_values(), **(start or {})}
         self._bound: list[_Bound] = []
         moved = self.moved(self._start, self._prior_sigma())
@@ -289,7 +328,9 @@ class Problem:
         self.rejected = rejected
         for bound in self._bound:
             times = rejected.get(bound.observation.label, np.empty(0))
-            bound.weight[np.isin(bound.observation.time, times)] = 0.0
+            left_out = np.isin(bound.observation.time, times)
+            bound.usable[left_out] = False
+            bound.weight[left_out] = 0.0
 
     def outliers(self, evaluation: Evaluation) -> dict[str, Array]:
         """Return the times of measurements that miss by more than their gate, by label.
@@ -312,18 +353,59 @@ class Problem:
 
     def weigh(self, evaluation: Evaluation) -> None:
         """Set the weights of all measurements from their standard deviations there."""
-        for bound, motion in zip(self._bound, evaluation.motions, strict=True):
-            sigma = bound.observation.sigma(motion, evaluation.parameters)
-            bound.weight = np.where(bound.weight > 0.0, 1.0 / sigma, 0.0)
+        for bound, weight in zip(self._bound, self._weights(evaluation), strict=True):
+            bound.weight = weight
 
     def needs_reweighting(self, evaluation: Evaluation) -> bool:
         """Whether standard deviations there are other than those that measurements count by."""
-        for bound, motion in zip(self._bound, evaluation.motions, strict=True):
-            used = bound.weight > 0.0
-            sigma = bound.observation.sigma(motion, evaluation.parameters)[used]
-            if np.any(np.abs(bound.weight[used] * sigma - 1.0) > _SAME_WEIGHT):
+        for bound, weight in zip(self._bound, self._weights(evaluation), strict=True):
+            used = weight > 0.0
+            if np.any(np.abs(bound.weight[used] / weight[used] - 1.0) > _SAME_WEIGHT):
                 return True
         return False
+
+    def sigma(
+        self, evaluation: Evaluation, factors: Mapping[str, Array | float] | None = None
+    ) -> list[Array]:
+        """Return the standard deviations of all observations, (M, d) each.
+
+        Infinite where a component was not measured.
+
+        Parameters
+        ----------
+        evaluation : Evaluation
+            Where they are taken.
+        factors : mapping of str to ndarray, optional
+            Factors (d,) by label, by default `noise_factors`.
+        """
+        factors = self.noise_factors if factors is None else factors
+        return [
+            b.observation.sigma(
+                motion, evaluation.parameters, factors.get(b.observation.label, 1.0)
+            )
+            for b, motion in zip(self._bound, evaluation.motions, strict=True)
+        ]
+
+    def log_sigma(self, evaluation: Evaluation) -> list[Array]:
+        """Return the sums of the logarithms of the standard deviations of measurements, (M,) each.
+
+        Costs of minima whose measurements weigh differently compare with these added. Zero where
+        a measurement cannot be used.
+        """
+        return [
+            bound.usable * np.sum(np.log(np.where(np.isfinite(sigma), sigma, 1.0)), axis=1)
+            for bound, sigma in zip(self._bound, self.sigma(evaluation), strict=True)
+        ]
+
+    def _weights(self, evaluation: Evaluation) -> list[Array]:
+        """Return the weights that measurements have by their standard deviations there."""
+        out = []
+        for bound, sigma in zip(self._bound, self.sigma(evaluation), strict=True):
+            root = bound.usable * np.sqrt(
+                self.robust_weights.get(bound.observation.label, np.ones(bound.time.size))
+            )
+            out.append(root[:, None] / sigma)
+        return out
 
     def linearize(self, evaluation: Evaluation) -> gtsam.GaussianFactorGraph:
         """Return the Gaussian graph at an evaluation.
@@ -331,11 +413,7 @@ class Problem:
         Its measurement factors are written in place at the next call.
         """
         gaussian = self.graph.linearize(evaluation.values)
-        rate = self.chain.frame.earth_rate
-        transitions = {
-            id(motion): Transition(b.attachment, evaluation.states, motion, rate)
-            for b, motion in zip(self._bound, evaluation.motions, strict=True)
-        }
+        transitions = self._transitions(evaluation)
         for block in self._blocks:
             matrix, vector = self._fill(block, transitions, evaluation)
             for target, source, rows in zip(
@@ -346,6 +424,19 @@ class Problem:
             for factor in block.factors:
                 gaussian.push_back(factor)
         return gaussian
+
+    def observation_rows(self, evaluation: Evaluation) -> Iterator[Rows]:
+        """Yield the rows of each observation, unused ones included: these are zero."""
+        transitions = self._transitions(evaluation)
+        for block in self._blocks:
+            sizes = (_STATE, _BIAS, *(p.mean.size for p in block.parameters))
+            shared = [self._key[p.name] for p in block.parameters]
+            for bound in block.bound:
+                matrix, vector = self._jacobian(bound, block.parameters, transitions, evaluation)
+                nodes = bound.attachment.node.tolist()
+                every = [[keys.node(k), self.chain.bias_key(k), *shared] for k in nodes]
+                o = bound.observation
+                yield Rows(o.label, o.components, np.array(every), sizes, matrix, vector)
 
     def ordering(self, gaussian: gtsam.GaussianFactorGraph) -> gtsam.Ordering:
         """Return an elimination order in which biases and calibration come last."""
@@ -388,10 +479,10 @@ class Problem:
         weight = np.repeat(covered.astype(float)[:, None], len(observation.components), axis=1)
         for other in self._bound:
             if np.array_equal(other.time, time):
-                return _Bound(observation, other.attachment, time, weight)
+                return _Bound(observation, other.attachment, time, covered, weight)
         at, _ = attach_inside(self.chain.segments, time, self.chain.frame.earth_rate)
         # Times that are not covered weigh nothing; they only need a place on the chain.
-        return _Bound(observation, at, time, weight)
+        return _Bound(observation, at, time, covered, weight)
 
     def _prior_sigma(self) -> Array:
         """Return the standard deviations of the priors of all estimated parameters, (P,), SI."""
@@ -430,29 +521,48 @@ class Problem:
         self, block: _Block, transitions: dict[int, Transition], evaluation: Evaluation
     ) -> tuple[Array, Array]:
         """Return the whitened Jacobian and right-hand side of a block, rows by node."""
-        columns = _STATE + _BIAS + sum(p.mean.size for p in block.parameters)
         parts, rhs = [], []
         for bound in block.bound:
-            motion = evaluation.motions[self._bound.index(bound)]
-            transition = transitions[id(motion)]
-            wanted = [p.name for p in block.parameters]
-            lin = bound.observation.linearize(transition.motion, evaluation.parameters, wanted)
-            matrix = node_jacobian(lin, transition)
-            m, d = lin.residual.shape
-            full = np.empty((m, d, columns))
-            full[:, :, : _STATE + _BIAS] = matrix
-            c = _STATE + _BIAS
-            for p in block.parameters:
-                full[:, :, c : c + p.mean.size] = lin.d_parameters[p.name]
-                c += p.mean.size
-            full *= bound.weight[:, :, None]
-            parts.append(full.reshape(m * d, columns))
-            rhs.append(-(bound.weight * lin.residual).ravel())
+            full, residual = self._jacobian(bound, block.parameters, transitions, evaluation)
+            parts.append(full.reshape(-1, full.shape[2]))
+            rhs.append(-residual.ravel())
         matrix = np.concatenate(parts) if len(parts) > 1 else parts[0]
         vector = np.concatenate(rhs)
         if block.order is None:
             return matrix, vector
         return matrix[block.order], vector[block.order]
+
+    def _transitions(self, evaluation: Evaluation) -> dict[int, Transition]:
+        """Return the transitions from the nodes to the times of each motion, by its identity."""
+        rate = self.chain.frame.earth_rate
+        return {
+            id(motion): Transition(b.attachment, evaluation.states, motion, rate)
+            for b, motion in zip(self._bound, evaluation.motions, strict=True)
+        }
+
+    def _jacobian(
+        self,
+        bound: _Bound,
+        parameters: Sequence[Parameter],
+        transitions: dict[int, Transition],
+        evaluation: Evaluation,
+    ) -> tuple[Array, Array]:
+        """Return the whitened Jacobian (M, d, n) and residual (M, d) of an observation.
+
+        Columns: state, bias, parameters.
+        """
+        transition = transitions[id(evaluation.motions[self._bound.index(bound)])]
+        wanted = [p.name for p in parameters]
+        lin = bound.observation.linearize(transition.motion, evaluation.parameters, wanted)
+        columns = _STATE + _BIAS + sum(p.mean.size for p in parameters)
+        full = np.empty((*lin.residual.shape, columns))
+        full[:, :, : _STATE + _BIAS] = node_jacobian(lin, transition)
+        c = _STATE + _BIAS
+        for p in parameters:
+            full[:, :, c : c + p.mean.size] = lin.d_parameters[p.name]
+            c += p.mean.size
+        full *= bound.weight[:, :, None]
+        return full, bound.weight * lin.residual
 
 
 def node_jacobian(lin: Linearization, transition: Transition) -> Array:

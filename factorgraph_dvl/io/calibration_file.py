@@ -24,7 +24,7 @@ from factorgraph_dvl.sensors.fingerprint import PATTERN
 from factorgraph_dvl.sensors.grades import DEFAULT_LIMITS, Grade
 from factorgraph_dvl.settings.files import MEGABYTE, read_bytes
 from factorgraph_dvl.settings.ranges import out_of_range
-from factorgraph_dvl.solution import Calibration, Estimate, Solution
+from factorgraph_dvl.solution import Calibration, Estimate, Noise, Solution
 
 CALIBRATION_FILE = "calibration.json"
 
@@ -75,6 +75,10 @@ class _Verdict(msgspec.Struct):
     reasons: list[_Reason] = []
 
 
+class _Noise(msgspec.Struct):
+    factor: _Numbers
+
+
 class _File(msgspec.Struct):
     format: Literal[1]
     trial: str
@@ -90,6 +94,7 @@ class _File(msgspec.Struct):
     warnings: list[str] = []
     findings: list[_Finding] = []
     inputs: list[Annotated[str, msgspec.Meta(pattern=PATTERN)]] = []
+    noise: dict[str, _Noise] = {}
 
 
 def load_calibration(path: Path | str, *, body_axes: BodyAxes = "RFU") -> Calibration:
@@ -128,6 +133,10 @@ def load_calibration(path: Path | str, *, body_axes: BodyAxes = "RFU") -> Calibr
         findings=tuple(_findings(file)),
         inputs=tuple(file.inputs),
         limits=_limits(file, str(path)),
+        noise=tuple(
+            Noise(printable(name), np.array(n.factor, dtype=float))
+            for name, n in file.noise.items()
+        ),
     )
     return found if isinstance(file.verdict, UnsetType) else _with_verdict(found, file.verdict)
 
@@ -244,6 +253,7 @@ def encode_calibration(solution: Solution | Calibration) -> bytes:
             if f.severity != "ok"
         ],
         inputs=list(solution.inputs),
+        noise={n.name: _Noise(_numbers(n.factor)) for n in solution.noise},
     )
     # msgspec writes nan and infinity as null, and every float with the digits it takes.
     return msgspec.json.format(msgspec.json.encode(calibration), indent=2) + b"\n"

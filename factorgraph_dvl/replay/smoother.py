@@ -18,7 +18,7 @@ from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph import keys
 from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.solvers.levenberg_marquardt import eliminate
-from factorgraph_dvl.solvers.posterior import SquareRootInformation
+from factorgraph_dvl.statistics.square_root_information import SquareRootInformation
 
 # Steps after which a state is linearised anew: rad, m, m/s; chosen. Positions enter linearly, but
 # for ranges: at 10 m from a beacon the last step changes one by 0.2 m more than it should.

@@ -131,7 +131,10 @@ def solve_start(
     DataError, SolveError
         If the data so far cannot be solved.
     """
-    settled, start_positions = settled_minimum(trial, progress=progress, constants_prior=known)
+    # The smoother goes on with the noise that is stated.
+    settled, start_positions = settled_minimum(
+        trial, progress=progress, constants_prior=known, estimate_noise=False
+    )
     problem, minimum = settled.problem, settled.minimum
     if len(start_positions.states) > 1:
         return (

@@ -243,6 +243,11 @@ class _ToBeacon:
         return GATE
 
     @property
+    def noise_groups(self) -> tuple[tuple[int, ...], ...]:
+        """None: the gate goes by the standard deviation that is stated."""
+        return ()
+
+    @property
     def offset(self) -> str:
         """Name of the parameter of the beacon's own place."""
         return offset_name(self.beacon)
@@ -284,9 +289,9 @@ class BeaconRange(_ToBeacon):
         """Name of the measurement, for people."""
         return f"Beacon {self.beacon} range"
 
-    def sigma(self, motion: Motion, values: Values) -> Array:
+    def sigma(self, motion: Motion, values: Values, factor: Array | float = 1.0) -> Array:
         """Return the standard deviations."""
-        return np.full((self.time.size, 1), self.std)
+        return np.full((self.time.size, 1), self.std * factor)
 
     def residual(self, motion: Motion, values: Values) -> Array:
         """Return predicted - measured, (M, 1), m."""
@@ -331,9 +336,9 @@ class BeaconRangeRate(_ToBeacon):
         """Name of the measurement, for people."""
         return f"Beacon {self.beacon} range rate"
 
-    def sigma(self, motion: Motion, values: Values) -> Array:
+    def sigma(self, motion: Motion, values: Values, factor: Array | float = 1.0) -> Array:
         """Return the standard deviations, the gyro's share through the lever arm included."""
-        return np.hypot(self.std, lever_arm_sigma(motion, self.arm_b))[:, None]
+        return np.hypot(self.std * factor, lever_arm_sigma(motion, self.arm_b)[:, None])
 
     def residual(self, motion: Motion, values: Values) -> Array:
         """Return predicted - measured, (M, 1), m/s."""

@@ -138,15 +138,16 @@ class DepthBelowSurface:
     unit: str = "m"
     components: tuple[str, ...] = ("down",)
     gate: float | None = None
+    noise_groups: tuple[tuple[int, ...], ...] = ((0,),)
     parameters: tuple[str, ...] = (SEA_SURFACE_HEIGHT,)
 
     def true_time(self, values: Values) -> Array:
         """Return the times of the measurements."""
         return self.time
 
-    def sigma(self, motion: Motion, values: Values) -> Array:
+    def sigma(self, motion: Motion, values: Values, factor: Array | float = 1.0) -> Array:
         """Return the standard deviation, (M, 1), m."""
-        return np.full((self.time.size, 1), self.std)
+        return np.full((self.time.size, 1), self.std * factor)
 
     def residual(self, motion: Motion, values: Values) -> Array:
         """Return predicted - measured, (M, 1), m."""

@@ -306,6 +306,7 @@ class DvlVelocity:
     unit: str = "m/s"
     components: tuple[str, ...] = ("x", "y", "z")
     gate: float | None = None
+    noise_groups: tuple[tuple[int, ...], ...] = ((0,), (1,), (2,))
     parameters: tuple[str, ...] = (
         MISALIGNMENT,
         SCALE_ERROR,
@@ -319,7 +320,7 @@ class DvlVelocity:
         """Return the times of the pings on the trial's clock."""
         return self.time - values[TIME_OFFSET][0]
 
-    def sigma(self, motion: Motion, values: Values) -> Array:
+    def sigma(self, motion: Motion, values: Values, factor: Array | float = 1.0) -> Array:
         """Return the standard deviations, the gyro's share through the lever arm included.
 
         By the predicted speed: by the measured one, pings whose noise makes them smaller
@@ -329,7 +330,7 @@ class DvlVelocity:
         predicted = self.residual(motion, values) + self.measured_d
         speed = np.linalg.norm(predicted, axis=1, keepdims=True)
         std = np.where(np.isnan(self.std), np.hypot(floor, fraction * speed), self.std)
-        std = np.maximum(std, _LEAST_SIGMA)
+        std = np.maximum(std, _LEAST_SIGMA) * factor
         return np.hypot(std, lever_arm_sigma(motion, values[LEVER_ARM])[:, None])
 
     def residual(self, motion: Motion, values: Values) -> Array:

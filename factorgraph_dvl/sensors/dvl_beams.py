@@ -362,6 +362,11 @@ class BeamVelocity:
         return tuple(f"beam {i}" for i in range(1, self.measured.shape[1] + 1))
 
     @property
+    def noise_groups(self) -> tuple[tuple[int, ...], ...]:
+        """Each beam by itself."""
+        return tuple((i,) for i in range(self.measured.shape[1]))
+
+    @property
     def parameters(self) -> tuple[str, ...]:
         """Names of directions or misalignment, scale and lever arm."""
         return (*self.geometry.parameters, self.lever_arm)
@@ -370,7 +375,7 @@ class BeamVelocity:
         """Return the times of the pings."""
         return self.time
 
-    def sigma(self, motion: Motion, values: Values) -> Array:
+    def sigma(self, motion: Motion, values: Values, factor: Array | float = 1.0) -> Array:
         """Return the standard deviations, the gyro's share through the lever arm included.
 
         By the predicted velocity: by the measured one, pings whose noise makes them smaller
@@ -379,7 +384,7 @@ class BeamVelocity:
         floor, fraction = self.noise
         predicted = self.residual(motion, values) + self.measured
         std = np.maximum(np.hypot(floor, fraction * predicted), _LEAST_SIGMA)
-        std = np.hypot(std, lever_arm_sigma(motion, values[self.lever_arm])[:, None])
+        std = np.hypot(std * factor, lever_arm_sigma(motion, values[self.lever_arm])[:, None])
         return np.where(self.lost, np.inf, std)
 
     def residual(self, motion: Motion, values: Values) -> Array:

@@ -311,8 +311,14 @@ class Code(StrEnum):
     LARGE_RESIDUALS = (
         "large_residuals",
         "Residuals are larger than their standard deviation says.",
-        "The reported standard deviations are too small in about the same ratio.",
-        "Raise the standard deviation of the sensor.",
+        "Standard deviations allow for it where the noise was estimated; else they are too small.",
+        "Correct the standard deviation of the sensor; check clock and lever arm.",
+    )
+    NOISE_NOT_SETTLED = (
+        "noise_not_settled",
+        "The noise of a sensor comes out the larger the more of it is allowed for.",
+        "What the IMU measured contradicts the sensor: errors of the IMU are larger than stated.",
+        "Raise the noise of the IMU, or give its grade; check clocks and lever arms.",
     )
     MANY_REJECTED = (
         "many_rejected",

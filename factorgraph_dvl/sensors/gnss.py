@@ -39,6 +39,9 @@ VELOCITY_STD_COLUMNS = ("vel_std_e_m_s", "vel_std_n_m_s", "vel_std_u_m_s")
 
 LEVER_ARM = "gnss_lever_arm_m"
 
+# Components whose noise is alike: a fix is as good to the east as to the north, on the whole.
+HORIZONTAL_AND_UP = ((0, 1), (2,))
+
 _LEVER_ARM = ParameterSpec("gnss_lever_arm", "m", frame="b")
 
 
@@ -234,15 +237,16 @@ class AntennaPosition:
     unit: str = "m"
     components: tuple[str, ...] = ("east", "north", "up")
     gate: float | None = None
+    noise_groups: tuple[tuple[int, ...], ...] = HORIZONTAL_AND_UP
     parameters: tuple[str, ...] = (LEVER_ARM,)
 
     def true_time(self, values: Values) -> Array:
         """Return the times of the measurements."""
         return self.time
 
-    def sigma(self, motion: Motion, values: Values) -> Array:
+    def sigma(self, motion: Motion, values: Values, factor: Array | float = 1.0) -> Array:
         """Return the receiver's standard deviations, (M, 3), m."""
-        return self.std
+        return self.std * factor
 
     def residual(self, motion: Motion, values: Values) -> Array:
         """Return predicted - measured in local-level east, north, up, (M, 3), m."""
@@ -294,16 +298,17 @@ class AntennaVelocity:
     unit: str = "m/s"
     components: tuple[str, ...] = ("east", "north", "up")
     gate: float | None = None
+    noise_groups: tuple[tuple[int, ...], ...] = HORIZONTAL_AND_UP
     parameters: tuple[str, ...] = (LEVER_ARM,)
 
     def true_time(self, values: Values) -> Array:
         """Return the times of the measurements."""
         return self.time
 
-    def sigma(self, motion: Motion, values: Values) -> Array:
+    def sigma(self, motion: Motion, values: Values, factor: Array | float = 1.0) -> Array:
         """Return the standard deviations, the gyro's share through the lever arm included."""
         arm_b = self.bRc @ values[LEVER_ARM]
-        return np.hypot(self.std, lever_arm_sigma(motion, arm_b)[:, None])
+        return np.hypot(self.std * factor, lever_arm_sigma(motion, arm_b)[:, None])
 
     def residual(self, motion: Motion, values: Values) -> Array:
         """Return predicted - measured in local-level east, north, up, (M, 3), m/s."""

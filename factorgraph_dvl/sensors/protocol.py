@@ -109,13 +109,22 @@ class Observation(Protocol):
     def gate(self) -> float | None:
         """Standard deviations from which on a measurement is an echo; None = never."""
 
+    @property
+    def noise_groups(self) -> tuple[tuple[int, ...], ...]:
+        """Components that share a factor on their stated standard deviation.
+
+        The factors are estimated from the data. Components that are in no group have the
+        standard deviation that is stated.
+        """
+
     def true_time(self, values: Values) -> Array:
         """Return the (M,) times at which the measurements were true, s."""
 
-    def sigma(self, motion: Motion, values: Values) -> Array:
+    def sigma(self, motion: Motion, values: Values, factor: Array | float = 1.0) -> Array:
         """Return the (M, d) standard deviations of the residual.
 
-        Infinite where a component was not measured; its residual need only be finite.
+        Infinite where a component was not measured; its residual need only be finite. A factor,
+        (d,), multiplies the noise of the sensor itself, and not what the gyro adds.
         """
 
     def residual(self, motion: Motion, values: Values) -> Array:

@@ -415,6 +415,7 @@ class StarAttitude:
     std: Array
     components: tuple[str, ...] = ("x", "y", "z")
     gate: float | None = None
+    noise_groups: tuple[tuple[int, ...], ...] = ()
     label: str = "Star attitude"
     unit: str = "arcsec"
     parameters: tuple[str, ...] = (MOUNTING,)
@@ -423,9 +424,9 @@ class StarAttitude:
         """Return the times of the measurements."""
         return self.time
 
-    def sigma(self, motion: Motion, values: Values) -> Array:
+    def sigma(self, motion: Motion, values: Values, factor: Array | float = 1.0) -> Array:
         """Return the standard deviations along the axes, (M, 3), arcsec."""
-        return self.std
+        return self.std * factor
 
     def residual(self, motion: Motion, values: Values) -> Array:
         """Return predicted - measured along the axes, (M, 3), arcsec."""

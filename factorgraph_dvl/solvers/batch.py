@@ -119,6 +119,7 @@ def settled_minimum(
     state_interval_s: float = STATE_INTERVAL,
     progress: Progress | None = None,
     constants_prior: ConstantsPrior | None = None,
+    estimate_noise: bool = True,
 ) -> tuple[SettledMinimum, StartPositions]:
     """Return the minimum of a trial's cost, and all positions where it may have started.
 
@@ -134,12 +135,20 @@ def settled_minimum(
         Called with stage, iteration and cost.
     constants_prior : ConstantsPrior, optional
         Joint prior of biases and calibration, in place of the trial's priors.
+    estimate_noise : bool, default True
+        As of `settle`.
     """
     report = progress or _silent
     _check_above_zero("state_interval_s", state_interval_s)
     prepared = prepare(trial, state_interval_s, report)
     start = prepared.start_positions
-    settled = settle(prepared, start.states[0], report, constants_prior=constants_prior)
+    settled = settle(
+        prepared,
+        start.states[0],
+        report,
+        constants_prior=constants_prior,
+        estimate_noise=estimate_noise,
+    )
     findings = (*prepared.findings, *settled.findings, *ambiguity(start.hypotheses))
     return replace(settled, findings=findings), start
 

@@ -62,9 +62,11 @@ def competing_minima(
         return [first]
     report("other mountings", 0, None)
     out = [first]
-    for each in _rough_minima(prepared, first, states):
+    rough, rough_minima = _rough_minima(prepared, first, states)
+    for each in rough_minima:
         found = each.evaluation
-        if found.cost > min(m.minimum.evaluation.cost for m in out) + _ROUGHLY_AS_GOOD:
+        best = min(_against(m.problem, m.minimum.evaluation) for m in out)
+        if _against(rough, found) > best + _ROUGHLY_AS_GOOD:
             break
         if _is_among(out, found, rotations):
             continue
@@ -74,8 +76,10 @@ def competing_minima(
     return out
 
 
-def _rough_minima(prepared: Preparation, first: SettledMinimum, states: States) -> list[Minimum]:
-    """Return minima from all headings and mountings, the lowest first."""
+def _rough_minima(
+    prepared: Preparation, first: SettledMinimum, states: States
+) -> tuple[Problem, list[Minimum]]:
+    """Return a problem, and its minima from all headings and mountings, the lowest first."""
     chain = first.problem.chain
     # A problem of their own: minimising weighs the measurements anew.
     problem = Problem(
@@ -84,6 +88,7 @@ def _rough_minima(prepared: Preparation, first: SettledMinimum, states: States) 
         prepared.parameters,
         start=first.minimum.evaluation.parameters,
     )
+    problem.noise_factors = first.problem.noise_factors
     rotations = {p.name for p in problem.parameters if p.rotation}
     mountings = prepared.mountings_at(chain, states)
     starts = []
@@ -110,7 +115,7 @@ def _rough_minima(prepared: Preparation, first: SettledMinimum, states: States) 
         )
         for _, at in sorted(starts, key=lambda s: s[0])[:_STARTS]
     ]
-    return sorted(rough, key=lambda m: m.evaluation.cost)
+    return problem, sorted(rough, key=lambda m: m.evaluation.cost)
 
 
 def _is_among(
@@ -154,19 +159,29 @@ def evidence_against(found: SolvedProblem) -> float:
     Laplace's approximation: a minimum that is wide is more probable than a narrow one.
     """
     _, log_det = np.linalg.slogdet(found.covariances.parameters)
-    return found.minimum.evaluation.cost - 0.5 * float(log_det)
+    return _against(found.problem, found.minimum.evaluation) - 0.5 * float(log_det)
+
+
+def _against(problem: Problem, evaluation: Evaluation) -> float:
+    """Return the negative logarithm of the posterior density, but for a constant."""
+    log_sigma = problem.log_sigma(evaluation)
+    return evaluation.cost + sum(float(part.sum()) for part in log_sigma)
 
 
 def cost_terms(found: SolvedProblem) -> Array:
-    """Return the terms of the cost: one for each measurement, and one for all priors."""
-    evaluation = found.minimum.evaluation
+    """Return the terms of the negative log posterior: of each measurement, and of all priors."""
+    problem, evaluation = found.problem, found.minimum.evaluation
     parts = []
     total = 0.0
-    for observation, residual, weight in zip(
-        found.problem.observations, evaluation.residuals, found.problem.weights, strict=True
+    for observation, residual, weight, log_sigma in zip(
+        problem.observations,
+        evaluation.residuals,
+        problem.weights,
+        problem.log_sigma(evaluation),
+        strict=True,
     ):
         own = 0.5 * np.sum(residual**2, axis=1)
         total += own.sum()
         gate = observation.gate or 0.0
-        parts.append(np.where((weight > 0.0).any(axis=1), own, 0.5 * gate**2))
+        parts.append(np.where((weight > 0.0).any(axis=1), own, 0.5 * gate**2) + log_sigma)
     return np.concatenate([*parts, [evaluation.cost - total]])

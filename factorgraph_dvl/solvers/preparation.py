@@ -46,6 +46,8 @@ class Preparation:
         Measurements of all sensors.
     parameters : tuple of Parameter
         Calibration parameters of all sensors, fixed ones included.
+    estimated_noise : frozenset of str
+        Labels of the observations whose stated noise is only where to start.
     start_positions : StartPositions
         States to start from, one set for each position that the ranges allow.
     mountings : dict of str to ndarray
@@ -59,6 +61,7 @@ class Preparation:
     segments: Segments
     observations: tuple[Observation, ...]
     parameters: tuple[Parameter, ...]
+    estimated_noise: frozenset[str]
     start_positions: StartPositions
     mountings: dict[str, Array]
     findings: tuple[Finding, ...]
@@ -102,13 +105,19 @@ def prepare(trial: Trial, state_interval_s: float, report: Progress) -> Preparat
         report("ranges", 0, None)
     start_positions = positions_from_ranges(trial, frame, seg, start.states)
     seen = [finding for each in attitudes(trial, frame) for finding in each.findings]
-    observations, parameters = observed(trial.aids, frame)
+    by_aid = [(aid, *observed([aid], frame)) for aid in trial.aids]
     return Preparation(
         trial=trial,
         frame=frame,
         segments=seg,
-        observations=observations,
-        parameters=parameters,
+        observations=tuple(o for _, observations, _ in by_aid for o in observations),
+        parameters=tuple(p for _, _, parameters in by_aid for p in parameters),
+        estimated_noise=frozenset(
+            o.label
+            for aid, observations, _ in by_aid
+            if trial.estimates_noise(aid)
+            for o in observations
+        ),
         start_positions=start_positions,
         mountings=start.mountings,
         findings=(*trial.notes, *gaps, *start.findings, *seen, *start_positions.findings),

@@ -1,7 +1,8 @@
-"""Rounds of minimisation until gravity, weights, times and outliers no longer change.
+"""Rounds of minimisation until gravity, weights, times, outliers and noise no longer change.
 
-All four are taken at the states before a round and are constant within it, so that the cost
-has a minimum.
+All of these are taken at the states before a round and are constant within it, so that the cost
+has a minimum. The noise of the sensors comes last: it follows from residuals of what else has
+settled.
 """
 
 from __future__ import annotations
@@ -19,12 +20,18 @@ from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.solution import Progress
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, minimise
 from factorgraph_dvl.solvers.preparation import Preparation, mounted_start
+from factorgraph_dvl.statistics.square_root_information import SquareRootInformation
+from factorgraph_dvl.statistics.variance_components import noise_factors
 
 # Root mean square change of the positions, m, from which on gravity is taken anew. Chosen: 1 m
 # turns it by 0.16 micro-g.
 _SAME_GRAVITY = 2.0
 # Rounds after which the problem counts as not settled. Measured: most trials take one or two.
 _ROUNDS = 12
+# Rounds after which noise counts as not settled. Measured: a factor of five takes two.
+_NOISE_ROUNDS = 4
+# What of a problem changes without a new one.
+_NOISE = "the noise of the sensors"
 
 
 @dataclass(frozen=True)
@@ -56,6 +63,7 @@ def settle(
     *,
     constants_prior: ConstantsPrior | None = None,
     values: dict[str, Array] | None = None,
+    estimate_noise: bool = True,
 ) -> SettledMinimum:
     """Return the minimum that some states lead to.
 
@@ -72,6 +80,9 @@ def settle(
         its values are those to start from.
     values : dict of str to ndarray, optional
         Parameters to start from; by default mountings that fit the motion.
+    estimate_noise : bool, default True
+        Whether to estimate the noise of sensors from their residuals, where the trial does not
+        say that it is as stated.
     """
     chain = prepared.chain(states, bias_prior=constants_prior is None)
     p_gravity = states.p_n
@@ -83,15 +94,25 @@ def settle(
     rejected = prepared.start_positions.rejected
     tried: list[Mapping[str, Array]] = []
     cycle: list[Mapping[str, Array]] = []
+    estimated = prepared.estimated_noise if estimate_noise else frozenset()
+    as_stated = {
+        o.label: np.ones(len(o.components))
+        for o in prepared.observations
+        if o.label in estimated and o.noise_groups
+    }
+    levels = _NoiseLevels((as_stated,), bool(as_stated))
+    changing: list[str] = ["all"]
     for _ in range(_ROUNDS):
-        problem = Problem(
-            chain,
-            prepared.observations,
-            prepared.parameters,
-            start=values,
-            constants_prior=constants_prior,
-        )
-        problem.reject(rejected)
+        if changing != [_NOISE]:
+            problem = Problem(
+                chain,
+                prepared.observations,
+                prepared.parameters,
+                start=values,
+                constants_prior=constants_prior,
+            )
+            problem.reject(rejected)
+        problem.noise_factors = levels.factors[-1]
         at = problem.values(states, problem.prior_values() | values)
         minimum = minimise(problem, at, stage="all sensors", progress=report)
         iterations += minimum.iterations
@@ -110,16 +131,57 @@ def settle(
             outliers = min(cycle, key=_count)
         if not _same(outliers, rejected):
             changing.append("which measurements are echoes")
+        if not changing and levels.estimated and minimum.converged:
+            levels = _next_noise(levels, problem, minimum)
+            if not _same(levels.factors[-1], levels.factors[-2]):
+                changing.append(_NOISE)
         if not changing:
             break
         rejected = outliers
-    findings = _at_the_gate(cycle)
+    findings = (*_at_the_gate(cycle), *levels.findings)
     if changing:
         text = f"after {_ROUNDS} rounds {', '.join(changing)} still changed: do not use the result"
         findings += (Finding(Code.NOT_CONVERGED, text, severity="error"),)
     converged = minimum.converged and not changing
     minimum = replace(minimum, converged=converged, iterations=iterations)
     return SettledMinimum(problem, minimum, not changing, findings)
+
+
+@dataclass(frozen=True)
+class _NoiseLevels:
+    """Factors on stated noise that were applied, and whether to estimate more of them."""
+
+    factors: tuple[Mapping[str, Array], ...]
+    estimated: bool
+    findings: tuple[Finding, ...] = ()
+
+
+def _next_noise(levels: _NoiseLevels, problem: Problem, minimum: Minimum) -> _NoiseLevels:
+    """Return the factors that residuals ask for; noise that never settles is as stated.
+
+    It grows for ever where it takes the place of errors of the IMU: the less a sensor counts, the
+    more the motion is the IMU's, and the larger are the residuals.
+    """
+    assert minimum.tree is not None
+    evaluation = minimum.evaluation
+    information = SquareRootInformation(minimum.tree, evaluation.values.dims())
+    found = noise_factors(problem, evaluation, information)
+    last = levels.factors[-1]
+    latest = {label: f.after(last[label]) for label, f in found.items()}
+    if len(levels.factors) <= _NOISE_ROUNDS or _same(latest, last):
+        return replace(levels, factors=(*levels.factors, latest))
+    unsettled = [name for name in latest if not np.array_equal(latest[name], last[name])]
+    findings = tuple(
+        Finding(
+            Code.NOISE_NOT_SETTLED,
+            f"the noise comes out as {np.max(latest[label]):.2g} times the stated, and larger the "
+            "more of it is allowed for, so that it is no noise; it is taken as stated",
+            sensor=label,
+        )
+        for label in unsettled
+    )
+    first = {name: f for name, f in levels.factors[1].items() if name not in unsettled}
+    return _NoiseLevels((*levels.factors, first), False, findings)
 
 
 def _changing(problem: Problem, evaluation: Evaluation) -> list[str]:

@@ -13,10 +13,12 @@ from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.sensors.protocol import Motion
 from factorgraph_dvl.solution import (
     Estimate,
+    Noise,
     Residuals,
     Solution,
     consistency_findings,
     mostly_rejected,
+    noise_name,
     not_observable,
 )
 from factorgraph_dvl.solvers.calibration import calibration
@@ -61,7 +63,8 @@ def summarise(trial: Trial, found: SolvedProblem, *, rate_hz: float) -> Solution
     for label, count in problem.uncovered.items():
         text = f"{count} measurements at times without IMU data were not used"
         findings.append(Finding(Code.UNUSED, text, sensor=label))
-    findings += consistency_findings(estimates, residuals)
+    noise = tuple(Noise(noise_name(n), f) for n, f in problem.noise_factors.items())
+    findings += consistency_findings(estimates, residuals, noise)
     findings += mostly_rejected(residuals, rejected)
     findings += _unobservable(trial, problem, estimates, evaluation.motions)
     return Solution(
@@ -79,6 +82,7 @@ def summarise(trial: Trial, found: SolvedProblem, *, rate_hz: float) -> Solution
         findings=tuple(findings),
         rejected=rejected,
         limits=trial.limits,
+        noise=noise,
     )
 
 

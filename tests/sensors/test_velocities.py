@@ -225,6 +225,10 @@ def test_uncertain_rates_add_to_the_noise_through_the_lever_arm():
     o = DvlVelocity(np.zeros(1), np.zeros((1, 3)), np.full((1, 3), 3e-3))
     expected = np.sqrt(9e-6 + 14e-6)
     np.testing.assert_allclose(o.sigma(hand_motion(), values), np.full((1, 3), expected))
+    # A factor is on the noise of the sensor itself.
+    twice = np.sqrt([9e-6 + 14e-6, 4 * 9e-6 + 14e-6, 14e-6])
+    found = o.sigma(hand_motion(), values, np.array([1.0, 2.0, 0.0]))
+    np.testing.assert_allclose(found, twice[None])
     draws = np.random.default_rng(0).normal(0.0, 1e-3, (100_000, 3))
     swept = np.cross(draws, values["lever_arm_m"])
     across = swept @ np.linalg.svd(values["lever_arm_m"][None])[2][1]

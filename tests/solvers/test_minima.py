@@ -17,10 +17,14 @@ from factorgraph_dvl.solvers.batch import solve
 def test_a_ping_counts_as_evidence_by_any_of_its_beams():
     residual = np.array([[0.0, 3.0, 4.0], [0.0, 0.0, 0.0]])
     weight = np.array([[0.0, 1.0, 1.0], [0.0, 0.0, 0.0]])
-    problem = SimpleNamespace(observations=[SimpleNamespace(gate=2.0)], weights=[weight])
+    problem = SimpleNamespace(
+        observations=[SimpleNamespace(gate=2.0)],
+        weights=[weight],
+        log_sigma=lambda _: [np.array([3.0, 0.0])],
+    )
     minimum = SimpleNamespace(evaluation=SimpleNamespace(residuals=[residual], cost=20.0))
     terms = minima.cost_terms(SimpleNamespace(problem=problem, minimum=minimum))
-    np.testing.assert_allclose(terms, [12.5, 2.0, 7.5])
+    np.testing.assert_allclose(terms, [15.5, 2.0, 7.5])
 
 
 @pytest.mark.parametrize(("mounting", "seed"), [([180, 0, 0], 1), ([180, 0, 0], 6)])

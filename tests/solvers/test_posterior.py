@@ -11,7 +11,7 @@ from truth import scenario
 
 from factorgraph_dvl.graph import keys
 from factorgraph_dvl.solvers.levenberg_marquardt import eliminate
-from factorgraph_dvl.solvers.posterior import SquareRootInformation
+from factorgraph_dvl.statistics.square_root_information import SquareRootInformation
 
 
 @pytest.fixture(scope="module", params=["constant", "walking"])

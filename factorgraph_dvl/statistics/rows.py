@@ -1,0 +1,120 @@
+"""Rows of the linearised graph by source of noise, and products with them.
+
+Each whitened row has unit noise of its own, so the covariance of all variables is a sum over
+rows: P = P (sum JᵀJ) P. Whatever asks what a source of noise does starts from these rows.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+
+import numpy as np
+
+from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.graph import keys
+from factorgraph_dvl.graph.problem import Evaluation, Problem, Rows
+
+IMU_NOISE = "IMU noise"
+FIRST_STATE = "prior of the first state"
+GAP = "motion while the IMU is silent"
+_PRIOR = "prior of {}"
+_WALK = "random walk of {}"
+
+# Items whose products are taken at once. Chosen: some ten megabytes.
+_CHUNK = 4096
+
+
+def rows_by_source(problem: Problem, evaluation: Evaluation) -> Iterator[Rows]:
+    """Yield all rows of the linearised graph: of the IMU, of priors, of observations.
+
+    The source of an observation is its label; those of others are words.
+    """
+    yield from _native_rows(problem, evaluation)
+    yield from problem.observation_rows(evaluation)
+
+
+def product(rows: Rows, columns: Mapping[int, Array]) -> Array:
+    """Return the Jacobian times columns (size, n) of its variables by key, (M, d, n)."""
+    parts = []
+    for chunk in _chunks(rows):
+        total: Array | float = 0.0
+        for own, matrix in _by_variable(rows, chunk):
+            different, place = np.unique(own, return_inverse=True)
+            known = np.stack([columns[key] for key in different.tolist()])
+            total = total + matrix @ (known[0] if different.size == 1 else known[place])
+        parts.append(np.asarray(total))
+    return np.concatenate(parts)
+
+
+def add_transposed_product(rows: Rows, factors: Array, sums: dict[int, Array]) -> None:
+    """Add factorsᵀ times the Jacobian to sums (n, size) by key.
+
+    Parameters
+    ----------
+    rows : Rows
+        M items of d rows.
+    factors : ndarray, shape (M, d, n)
+        Of each row.
+    sums : dict of int to ndarray
+        By key; changed.
+    """
+    for chunk in _chunks(rows):
+        turned = factors[chunk].transpose(0, 2, 1)
+        for own, matrix in _by_variable(rows, chunk):
+            order = np.argsort(own, kind="stable")
+            different, first = np.unique(own[order], return_index=True)
+            added = np.add.reduceat((turned @ matrix)[order], first, axis=0)
+            for key, part in zip(different.tolist(), added, strict=True):
+                sums[key] = sums[key] + part if key in sums else part
+
+
+def _chunks(rows: Rows) -> Iterator[slice]:
+    count = len(rows.matrix)
+    return (slice(first, first + _CHUNK) for first in range(0, max(count, 1), _CHUNK))
+
+
+def _by_variable(rows: Rows, chunk: slice) -> Iterator[tuple[Array, Array]]:
+    """Yield keys (M,) and Jacobian (M, d, size) of each variable of some items."""
+    edges = np.cumsum([0, *rows.sizes])
+    for i in range(len(rows.sizes)):
+        yield rows.keys[chunk, i], rows.matrix[chunk, :, edges[i] : edges[i + 1]]
+
+
+def _native_rows(problem: Problem, evaluation: Evaluation) -> Iterator[Rows]:
+    """Yield the rows of the factors that GTSAM linearises itself, those of one source together."""
+    gaussian = problem.graph.linearize(evaluation.values)
+    sizes = evaluation.values.dims()
+    names = {problem.key(p.name): p.name for p in problem.parameters}
+    found: dict[tuple[str, tuple[int, ...]], list[tuple[list[int], Array]]] = {}
+    for i in range(gaussian.size()):
+        factor = gaussian.at(i)
+        own = list(factor.keys())
+        kind = (_source(own, names), tuple(sizes[key] for key in own))
+        found.setdefault(kind, []).append((own, np.array(factor.augmentedJacobian())))
+    gyro, accel = (p.name for p in problem.chain.biases)
+    for (source, shape), items in found.items():
+        variables = np.array([own for own, _ in items])
+        matrix = np.stack([augmented for _, augmented in items])
+        parts = {source: slice(None)}
+        if source in (_PRIOR, _WALK):
+            # GTSAM's order; the rows are independent of each other.
+            parts = {source.format(accel): slice(0, 3), source.format(gyro): slice(3, 6)}
+        for name, own_rows in parts.items():
+            part = matrix[:, own_rows]
+            yield Rows(
+                name, ("",) * part.shape[1], variables, shape, part[..., :-1], -part[..., -1]
+            )
+
+
+def _source(own: list[int], names: Mapping[int, str]) -> str:
+    """Return the source of a factor's noise, from its variables."""
+    calibration = [names[key] for key in own if key in names]
+    if calibration:
+        return _PRIOR.format(", ".join(calibration))
+    return {
+        "xxb": IMU_NOISE,
+        "bb": _WALK,
+        "b": _PRIOR,
+        "x": FIRST_STATE,
+        "xx": GAP,
+    }["".join(map(keys.letter_of, own))]

@@ -1,0 +1,195 @@
+"""Covariances of any variables from the square root of an information matrix.
+
+The Bayes tree that QR elimination leaves holds the square root R of the information
+matrix clique by clique. Everything here is built from R: squaring it first would lose
+the digits that navigation-grade gyros need.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+from scipy.linalg.lapack import dtrtrs
+
+from factorgraph_dvl.geometry.vectors import Array
+
+
+@dataclass(frozen=True)
+class _Clique:
+    """Frontal variables F given separators S: R x_F + T x_S = noise of unit variance."""
+
+    parent: int
+    frontals: tuple[int, ...]
+    separators: tuple[int, ...]
+    R: Array
+    T: Array
+
+
+class SquareRootInformation:
+    """Square-root information of a Gaussian graph.
+
+    Parameters
+    ----------
+    tree : gtsam.GaussianBayesTree
+        Bayes tree from QR elimination.
+    sizes : mapping of int to int
+        Dimension of every variable by key.
+    """
+
+    def __init__(self, tree: gtsam.GaussianBayesTree, sizes: Mapping[int, int]) -> None:
+        self._sizes = sizes
+        self._cliques: list[_Clique] = []
+        stack = [(root, -1) for root in tree.roots()]
+        while stack:
+            clique, parent = stack.pop()
+            conditional = clique.conditional()
+            keys = conditional.keys()
+            R = np.array(conditional.R())
+            n = count = 0
+            while n < R.shape[0]:
+                n += sizes[keys[count]]
+                count += 1
+            self._cliques.append(
+                _Clique(
+                    parent,
+                    tuple(keys[:count]),
+                    tuple(keys[count:]),
+                    R,
+                    np.array(conditional.S()),
+                )
+            )
+            index = len(self._cliques) - 1
+            stack += [(clique[i], index) for i in range(clique.nrChildren())]
+
+    def covariance_with(self, functional: Mapping[int, Array]) -> dict[int, Array]:
+        """Return the covariance of every variable with a linear functional.
+
+        P Wᵀ = R⁻¹ R⁻ᵀ Wᵀ: from the leaves to the root, and back.
+
+        Parameters
+        ----------
+        functional : mapping of int to ndarray
+            Keys to (n, size) matrices.
+
+        Returns
+        -------
+        dict of int to ndarray
+            Keys to (size, n) matrices.
+        """
+        width = next(iter(functional.values())).shape[0]
+        pending = {key: matrix.T for key, matrix in functional.items()}
+        halfway: list[Array] = []
+        for clique in reversed(self._cliques):
+            w = np.concatenate(
+                [pending.pop(key, np.zeros((self._sizes[key], width))) for key in clique.frontals]
+            )
+            z = _solve(clique.R, w, transposed=True)
+            halfway.append(z)
+            passed = -clique.T.T @ z
+            row = 0
+            for key in clique.separators:
+                size = self._sizes[key]
+                pending[key] = pending.get(key, 0.0) + passed[row : row + size]
+                row += size
+        out: dict[int, Array] = {}
+        for clique, z in zip(self._cliques, reversed(halfway), strict=True):
+            if clique.separators:
+                z = z - clique.T @ np.concatenate([out[key] for key in clique.separators])
+            x = _solve(clique.R, z, transposed=False)
+            row = 0
+            for key in clique.frontals:
+                out[key] = x[row : row + self._sizes[key]]
+                row += self._sizes[key]
+        return out
+
+    def covariance_of(self, functionals: Sequence[Mapping[int, Array]]) -> Array:
+        """Return the joint covariance of linear functionals of the variables.
+
+        With W the functionals, W P Wᵀ = zᵀz with Rᵀ z = Wᵀ, from the leaves to the root.
+
+        Parameters
+        ----------
+        functionals : sequence of mapping of int to ndarray
+            Each maps keys to (n, size) matrices; values add up over keys.
+
+        Returns
+        -------
+        ndarray, shape (sum n, sum n)
+            Covariance.
+        """
+        widths = [next(iter(f.values())).shape[0] for f in functionals]
+        total = sum(widths)
+        pending: dict[int, Array] = {}
+        column = 0
+        for functional, width in zip(functionals, widths, strict=True):
+            for key, matrix in functional.items():
+                block = pending.setdefault(key, np.zeros((self._sizes[key], total)))
+                block[:, column : column + width] += matrix.T
+            column += width
+        out = np.zeros((total, total))
+        for clique in reversed(self._cliques):
+            if not any(key in pending for key in clique.frontals):
+                continue
+            w = np.concatenate(
+                [pending.pop(key, np.zeros((self._sizes[key], total))) for key in clique.frontals]
+            )
+            z = _solve(clique.R, w, transposed=True)
+            out += z.T @ z
+            passed = -clique.T.T @ z
+            row = 0
+            for key in clique.separators:
+                size = self._sizes[key]
+                pending[key] = pending.get(key, 0.0) + passed[row : row + size]
+                row += size
+        return 0.5 * (out + out.T)
+
+    def marginals(self, wanted: Sequence[int]) -> dict[int, Array]:
+        """Return the marginal covariances of variables by key.
+
+        From the root down, each clique's joint covariance follows from that of its
+        separators: P_FS = -R⁻¹ T P_SS, P_FF = R⁻¹R⁻ᵀ - P_FS (R⁻¹ T)ᵀ.
+        """
+        left = set(wanted)
+        out: dict[int, Array] = {}
+        joint: list[tuple[dict[int, slice], Array]] = []
+        for clique in self._cliques:
+            f = clique.R.shape[0]
+            identity = np.eye(f)
+            solved = _solve(clique.R, np.hstack([identity, clique.T]), transposed=False)
+            inverse, gain = solved[:, :f], solved[:, f:]
+            s = clique.T.shape[1]
+            P = np.empty((f + s, f + s))
+            if s:
+                where, parent = joint[clique.parent]
+                rows = np.concatenate([_range(where[key]) for key in clique.separators])
+                P_SS = parent[np.ix_(rows, rows)]
+                P_FS = -gain @ P_SS
+                P[:f, :f] = inverse @ inverse.T - P_FS @ gain.T
+                P[:f, f:], P[f:, :f], P[f:, f:] = P_FS, P_FS.T, P_SS
+            else:
+                P[:] = inverse @ inverse.T
+            place: dict[int, slice] = {}
+            row = 0
+            for key in (*clique.frontals, *clique.separators):
+                place[key] = slice(row, row + self._sizes[key])
+                row += self._sizes[key]
+            joint.append((place, P))
+            for key in clique.frontals:
+                if key in left:
+                    block = P[place[key], place[key]]
+                    out[key] = 0.5 * (block + block.T)
+        return out
+
+
+def _range(s: slice) -> np.ndarray:
+    return np.arange(s.start, s.stop)
+
+
+def _solve(R: Array, rhs: Array, *, transposed: bool) -> Array:
+    solution, info = dtrtrs(R, rhs, trans=int(transposed))
+    if info != 0:
+        raise np.linalg.LinAlgError("the square root of the information matrix is singular")
+    return np.asarray(solution)

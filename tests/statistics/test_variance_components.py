@@ -1,0 +1,82 @@
+"""Noise of sensors from their residuals."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import msgspec
+import numpy as np
+import pytest
+from truth import CONING, merged, scenario
+
+from factorgraph_dvl.sensors.finding import Code
+from factorgraph_dvl.simulation import simulate
+from factorgraph_dvl.solvers.batch import solve
+
+SCENE = {
+    "noise": True,
+    "sway": merged({}, CONING),
+    "imu": {"rate_hz": 50, "gyro_noise_deg_sqrt_h": 0.01},
+    "dvl": {"rate_hz": 5, "velocity_std_m_s": 0.002},
+    "trial": {"dvl": {"velocity_std_m_s": 0.002}},
+}
+
+
+@pytest.fixture(scope="module")
+def trial():
+    return simulate(scenario(**SCENE), 1)
+
+
+@pytest.fixture(scope="module")
+def honest(trial):
+    return solve(trial, rate_hz=1.0)
+
+
+def stated(trial, factor_dvl=1.0, factor_gnss=1.0, **settings):
+    """State noise that is wrong by factors."""
+    dvl, gnss = trial.dvl.settings, trial.gnss
+    dvl = msgspec.structs.replace(
+        dvl,
+        velocity_std_m_s=factor_dvl * dvl.velocity_std_m_s,
+        velocity_std_fraction=factor_dvl * dvl.velocity_std_fraction,
+        **settings,
+    )
+    gnss = replace(
+        gnss,
+        position_std=factor_gnss * gnss.position_std,
+        velocity_std=factor_gnss * gnss.velocity_std,
+    )
+    return replace(trial, dvl=replace(trial.dvl, settings=dvl), gnss=gnss)
+
+
+def factors(solution):
+    return {n.name: n.factor for n in solution.noise}
+
+
+def test_noise_as_stated_stays_as_stated(trial, honest):
+    assert set(factors(honest)) == {"gnss_position", "gnss_velocity", "dvl_velocity"}
+    assert all(np.all(np.abs(f - 1.0) < 0.15) for f in factors(honest).values())
+    exact = solve(replace(trial, noise="stated"), rate_hz=1.0)
+    assert not exact.noise
+    ratio = np.sqrt(np.diag(honest.covariance) / np.diag(exact.covariance))
+    np.testing.assert_allclose(ratio, 1.0, atol=0.02)
+
+
+@pytest.mark.parametrize("wrong", [5.0, 0.2])
+@pytest.mark.parametrize("sensor", ["dvl", "gnss"])
+def test_stated_noise_wrong_by_five_is_recovered(trial, honest, sensor, wrong):
+    solution = solve(stated(trial, **{f"factor_{sensor}": wrong}), rate_hz=1.0)
+    assert solution.converged
+    for name, found in factors(solution).items():
+        np.testing.assert_allclose(found, 1.0 / wrong if sensor in name else 1.0, rtol=0.15)
+    ratio = np.sqrt(np.diag(solution.covariance) / np.diag(honest.covariance))
+    np.testing.assert_allclose(ratio, 1.0, atol=0.1)
+    large = {f.sensor for f in solution.findings if f.code == Code.LARGE_RESIDUALS}
+    assert bool(large) == (wrong < 1.0)
+
+
+def test_a_sensor_whose_noise_is_stated_keeps_it(trial):
+    solution = solve(stated(trial, factor_dvl=0.2, noise="stated"), rate_hz=1.0)
+    assert "dvl_velocity" not in factors(solution)
+    (finding,) = (f for f in solution.findings if f.code == Code.LARGE_RESIDUALS)
+    assert "too small until you correct it" in finding.text
