@@ -1,0 +1,61 @@
+"""Measure what five publications state: each equation, table, figure and claim.
+
+    python benchmarks/papers.py [--seeds 2] [--out DIR]
+
+writes `papers.md` into out/benchmarks, or with `--out docs` that of the documentation. One
+publication alone, with its figures: `factorgraph-dvl reproduce PAPER --out DIR`.
+"""
+
+from __future__ import annotations
+
+import common
+
+from factorgraph_dvl.reproduce import PAPERS
+from factorgraph_dvl.reproduce.page import summary_lines
+
+PAGE = "papers.md"
+INTRODUCTION = """\
+# Five publications, item by item
+
+{origin}
+
+Each numbered equation, table, figure and claim, where it is in this package, what was measured over {seeds} seeds, and
+what becomes of it: *reproduced* as printed, *corrected* with the argument in the measurement, or *not
+reproducible* with the reason. One command makes a publication's items with their figures:
+
+```sh
+factorgraph-dvl reproduce luo-2024 --out DIR --table 3     # or --figure N; liu-2020, nine-state, beams, chen-2021
+```
+
+Continuous integration runs all of them with one seed.
+"""
+
+
+def main() -> None:
+    """Run all publications and write the page."""
+    args = common.parse(common.parser(__doc__, seeds=2))
+    lines = INTRODUCTION.format(origin=args.origin, seeds=args.seeds).splitlines()
+    verdicts: dict[str, int] = {}
+    for paper in PAPERS.values():
+        results = []
+        for entry in paper.entries:
+            results.append((entry, entry.check(args.seeds)))
+            verdict = results[-1][1].verdict
+            verdicts[verdict] = verdicts.get(verdict, 0) + 1
+            print(f"{paper.name}: {entry.label}: {results[-1][1].measured}", flush=True)
+        lines += ["", f"## {paper.reference}", "", *summary_lines(results)]
+        for entry, result in results:
+            if result.details:
+                lines += [
+                    "",
+                    f"### {entry.label[0].upper()}{entry.label[1:]}",
+                    "",
+                    *result.details,
+                ]
+    total = ", ".join(f"{count} {name}" for name, count in sorted(verdicts.items()))
+    lines += ["", "## In all", "", f"{sum(verdicts.values())} items: {total}. None is open."]
+    common.write_page(args.out / PAGE, lines)
+
+
+if __name__ == "__main__":
+    main()
