@@ -208,7 +208,8 @@ INTRODUCTION = """\
 The scenario is that of the paper's table 4 (`configs/seed-a-phase-0.yaml` and `-90.yaml`; the
 paper does not state the phase between roll and pitch). *Kalman point-set* is a filter of the
 paper's seven states over SINS/GNSS velocities that settles (`kalman`; the printed one is
-`kalman --method luo-2024`, [`kalman.md`](kalman.md)); *factor graph* is `factorgraph-dvl solve`; *least squares* fits the same point sets by Gauss-Newton. None of them
+`kalman --method luo-2024`, [`kalman.md`](kalman.md)); *factor graph* is
+`factorgraph-dvl solve`; *least squares* fits the same point sets by Gauss-Newton. None of them
 is told the initial attitude. The *bound* is the covariance of the joint estimate at the
 noise-free solution: no unbiased estimator from all the data does better.
 

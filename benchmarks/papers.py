@@ -19,13 +19,16 @@ INTRODUCTION = """\
 
 {origin}
 
-Each numbered equation, table, figure and claim, where it is in this package, what was measured over {seeds} seeds, and
-what becomes of it: *reproduced* as printed, *corrected* with the argument in the measurement, or *not
-reproducible* with the reason. One command makes a publication's items with their figures:
+Each numbered equation, table, figure and claim, where it is in this package, what was measured
+over {seeds} seeds, and what becomes of it: *reproduced* as printed, *corrected* with the argument
+in the measurement, or *not reproducible* with the reason. One command makes a publication's items
+with their figures:
 
 ```sh
-factorgraph-dvl reproduce luo-2024 --out DIR --table 3     # or --figure N; liu-2020, nine-state, beams, chen-2021
+factorgraph-dvl reproduce luo-2024 --out DIR --table 3     # or --figure N, or neither for all
 ```
+
+The others are `liu-2020`, `nine-state`, `beams` and `chen-2021`.
 
 Continuous integration runs all of them with one seed.
 """

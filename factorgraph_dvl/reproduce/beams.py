@@ -171,8 +171,8 @@ def _step_5(seeds: int) -> Result:
         f"{1e3 * rms_after:.2f}e-3°, mean NEES {nees:.1f} (3 expected)",
         judged(rms_after < rms_before),
         (
-            "SINS/GNSS is smoothed over the whole trial and knows its attitude to thousandths of a "
-            "degree already; the beams, whose own directions are unknown, add nothing to that.",
+            "SINS/GNSS is smoothed over the whole trial and knows its attitude to thousandths of "
+            "a degree already; beams whose own directions are unknown add nothing to that.",
         ),
     )
 
