@@ -45,11 +45,11 @@ def test_standard_deviations_are_those_of_drawn_turns():
     eta = rng.normal(0.0, 0.5, 8)
     found = beam_angles(calibration(eta, P))
     drawn = [
-        beam_angles(calibration(eta + x, P)) for x in rng.multivariate_normal(np.zeros(8), P, 2000)
+        beam_angles(calibration(eta + x, P)) for x in rng.multivariate_normal(np.zeros(8), P, 500)
     ]
     for name in ("alpha", "theta"):
         std = np.std([getattr(d, name) for d in drawn], axis=0)
-        np.testing.assert_allclose(getattr(found, f"{name}_std"), std, rtol=0.08)
+        np.testing.assert_allclose(getattr(found, f"{name}_std"), std, rtol=0.15)
 
 
 def test_without_beams_there_are_none():
