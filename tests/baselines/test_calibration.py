@@ -21,7 +21,6 @@ from factorgraph_dvl.io.tables import read_table
 from factorgraph_dvl.sensors.finding import Code
 from factorgraph_dvl.simulation import simulate
 
-
 # As published they are for small angles, or know the misalignment roughly.
 SMALL_ANGLES = ("luo-2024", "nine-state-linear", "nine-state-ukf")
 
