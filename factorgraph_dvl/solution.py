@@ -173,6 +173,26 @@ class Noise:
     factor: Array
 
 
+@dataclass(frozen=True)
+class Cause:
+    """What one cause adds to the standard deviations of a calibration.
+
+    Parameters
+    ----------
+    cause : str
+        Such as the noise of a sensor, or the prior of a parameter.
+    assumed : str
+        What is assumed of it, with its unit; empty where there is no number.
+    adds : ndarray, shape (P,)
+        Standard deviations in the order of the covariance, in reported units; their squares add
+        up over causes to the variances.
+    """
+
+    cause: str
+    assumed: str
+    adds: Array
+
+
 def noise_name(label: str) -> str:
     """Return the name in calibration.json of a measurement's noise."""
     return label.lower().replace(" ", "_")
@@ -300,6 +320,8 @@ class Solution(Judged):
         Standard deviations that are good enough, by parameter, in reported units.
     noise : tuple of Noise, optional
         Of the measurements whose noise was estimated.
+    error_budget : tuple of Cause, optional
+        What makes up the standard deviations, the largest causes first.
     """
 
     trial: str
@@ -318,6 +340,7 @@ class Solution(Judged):
     inputs: tuple[str, ...] = ()
     limits: Mapping[str, float] = field(default_factory=lambda: DEFAULT_LIMITS)
     noise: tuple[Noise, ...] = ()
+    error_budget: tuple[Cause, ...] = ()
 
     def with_findings(self, findings: Iterable[Finding]) -> Solution:
         """Return the solution with findings before its own, each once."""
@@ -353,6 +376,7 @@ class Calibration(Judged):
     inputs: tuple[str, ...] = ()
     limits: Mapping[str, float] = field(default_factory=lambda: DEFAULT_LIMITS)
     noise: tuple[Noise, ...] = ()
+    error_budget: tuple[Cause, ...] = ()
 
     @property
     def values(self) -> dict[str, Array]:
@@ -636,6 +660,8 @@ def not_told_apart(solutions: Sequence[Solution], against: Array) -> Solution:
     return replace(
         best,
         converged=all(solutions[i].converged for i in order),
+        # That of one minimum does not explain the spread of all.
+        error_budget=(),
         estimates=tuple(estimates),
         covariance=covariance,
         trajectory=mixed([solutions[i].trajectory for i in order], weights),

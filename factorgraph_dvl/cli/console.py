@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 
     from rich.table import Table
 
+    from factorgraph_dvl.solution import Solution
+
 _STARTED = time()
 # Chosen: width of tables in a file or a pipe, columns; wide enough for every table.
 _PIPE_WIDTH = 180
@@ -95,6 +97,14 @@ def print_table(table: Table) -> None:
     console = stdout()
     console.width = max(console.width, width_of(table))
     console.print(table)
+
+
+def print_error_budget(solution: Solution) -> None:
+    """Print the largest causes of each standard deviation, if they are known."""
+    from factorgraph_dvl.report.terminal.error_budget import error_budget_table
+
+    if solution.error_budget:
+        print_table(error_budget_table(solution))
 
 
 def warn(message: str) -> None:

@@ -7,7 +7,13 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from factorgraph_dvl.cli.console import ProgressLine, print_table, print_written, stdout
+from factorgraph_dvl.cli.console import (
+    ProgressLine,
+    print_error_budget,
+    print_table,
+    print_written,
+    stdout,
+)
 from factorgraph_dvl.cli.observability import print_observability, write_observability
 from factorgraph_dvl.cli.options import Anyway, Force, NoFigures, Quiet, claim_output
 from factorgraph_dvl.cli.plausibility import errors_in, print_contradiction
@@ -53,6 +59,7 @@ def plan(
                 to_json(solution, prediction.duration, required, proposal, str(source))
             )
     print_observability(view)
+    print_error_budget(solution)
     _print_requirements(required, proposal)
     print_written(out)
     if errors:

@@ -13,6 +13,7 @@ from rich.text import Text
 from factorgraph_dvl.cli.console import (
     ProgressLine,
     drawing,
+    print_error_budget,
     print_table,
     print_written,
     stderr,
@@ -281,6 +282,7 @@ def _print_solution(trial: Trial | PlanarTrial, solution: Solution) -> None:
     if solution.estimates:
         errors = calibration_errors(solution, truth) if truth else None
         print_table(calibration_table(solution, errors, width=stdout().width))
+        print_error_budget(solution)
         accuracy = paper_accuracy(solution.estimates, truth)
         if isfinite(accuracy):
             text = "Accuracy, mean of 1 − |error / truth| of misalignment, scale and lever arm: "

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
@@ -24,7 +24,7 @@ from factorgraph_dvl.sensors.fingerprint import PATTERN
 from factorgraph_dvl.sensors.grades import DEFAULT_LIMITS, Grade
 from factorgraph_dvl.settings.files import MEGABYTE, read_bytes
 from factorgraph_dvl.settings.ranges import out_of_range
-from factorgraph_dvl.solution import Calibration, Estimate, Noise, Solution
+from factorgraph_dvl.solution import Calibration, Cause, Estimate, Noise, Solution
 
 CALIBRATION_FILE = "calibration.json"
 
@@ -79,6 +79,12 @@ class _Noise(msgspec.Struct):
     factor: _Numbers
 
 
+class _Cause(msgspec.Struct):
+    cause: str
+    assumed: str
+    adds: dict[str, float | None]
+
+
 class _File(msgspec.Struct):
     format: Literal[1]
     trial: str
@@ -95,6 +101,7 @@ class _File(msgspec.Struct):
     findings: list[_Finding] = []
     inputs: list[Annotated[str, msgspec.Meta(pattern=PATTERN)]] = []
     noise: dict[str, _Noise] = {}
+    error_budget: list[_Cause] = []
 
 
 def load_calibration(path: Path | str, *, body_axes: BodyAxes = "RFU") -> Calibration:
@@ -137,8 +144,17 @@ def load_calibration(path: Path | str, *, body_axes: BodyAxes = "RFU") -> Calibr
             Noise(printable(name), np.array(n.factor, dtype=float))
             for name, n in file.noise.items()
         ),
+        error_budget=tuple(
+            Cause(printable(c.cause), printable(c.assumed), _adds(c, file.covariance.order, rows))
+            for c in file.error_budget
+        ),
     )
     return found if isinstance(file.verdict, UnsetType) else _with_verdict(found, file.verdict)
+
+
+def _adds(cause: _Cause, order: Sequence[str], rows: Sequence[int]) -> Array:
+    """Return what a cause adds to each component, in the order of the parameters."""
+    return np.array([cause.adds.get(order[i], 0.0) for i in rows], dtype=float)
 
 
 def _limits(file: _File, source: str) -> Mapping[str, float]:
@@ -254,6 +270,10 @@ def encode_calibration(solution: Solution | Calibration) -> bytes:
         ],
         inputs=list(solution.inputs),
         noise={n.name: _Noise(_numbers(n.factor)) for n in solution.noise},
+        error_budget=[
+            _Cause(c.cause, c.assumed, dict(zip(solution.order, c.adds.tolist(), strict=True)))
+            for c in solution.error_budget
+        ],
     )
     # msgspec writes nan and infinity as null, and every float with the digits it takes.
     return msgspec.json.format(msgspec.json.encode(calibration), indent=2) + b"\n"

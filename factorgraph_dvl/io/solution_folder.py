@@ -44,7 +44,7 @@ OWNED = (
     *(INSTRUMENT_FILE, BEAMS_FILE, BEAM_ANGLES_FILE),
     *(
         f"{FIGURES_FOLDER}/{name}.png"
-        for name in ("track", "motion", "calibration", "correlation")
+        for name in ("track", "motion", "calibration", "correlation", "error_budget")
     ),
     *(f"{FIGURES_FOLDER}/{name}.png" for name in ("*_residuals", "beam_quality")),
     *(f"{FIGURES_FOLDER}/{name}.png" for name in ("convergence", "latency")),

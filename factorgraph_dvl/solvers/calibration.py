@@ -51,6 +51,27 @@ def calibration(found: SolvedProblem) -> tuple[tuple[Estimate, ...], Array]:
     free = [(p, derivatives) for p, _, derivatives in rows if derivatives is not None]
     functionals = [derivatives for _, derivatives in free]
     joint = covariances.information.covariance_of(functionals)
+    spread = _spread(found, free, joint)
+    joint = joint + spread @ spread.T
+    return estimates_of([(p, value) for p, value, _ in rows], joint)
+
+
+def spread_of_fixed(found: SolvedProblem) -> Array:
+    """Return a root (n, h) of what fixed directions add to the covariance of what is estimated.
+
+    In the order of `reported`, and in its units.
+    """
+    rows = reported(found.problem, found.minimum.evaluation)
+    free = [(p, derivatives) for p, _, derivatives in rows if derivatives is not None]
+    functionals = [derivatives for _, derivatives in free]
+    return _spread(found, free, found.covariances.information.covariance_of(functionals))
+
+
+def _spread(
+    found: SolvedProblem, free: Sequence[tuple[Parameter, dict[int, Array]]], joint: Array
+) -> Array:
+    problem, covariances = found.problem, found.covariances
+    functionals = [derivatives for _, derivatives in free]
     spread = prior_along(problem, found.fixed, functionals, covariances.considered)
     if covariances.considered:
         # Linear over a hundred degrees, a bias would change by more than its prior allows.
@@ -62,8 +83,7 @@ def calibration(found: SolvedProblem) -> tuple[tuple[Estimate, ...], Array]:
         )
         allowed = room / np.maximum(size, np.finfo(float).tiny)
         spread *= np.where(of_sensors, 1.0, allowed)[:, None]
-    joint = joint + spread @ spread.T
-    return estimates_of([(p, value) for p, value, _ in rows], joint)
+    return spread
 
 
 def prior_along(

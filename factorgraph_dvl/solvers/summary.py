@@ -22,6 +22,7 @@ from factorgraph_dvl.solution import (
     not_observable,
 )
 from factorgraph_dvl.solvers.calibration import calibration
+from factorgraph_dvl.solvers.causes import causes
 from factorgraph_dvl.solvers.fixed_directions import SolvedProblem
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum
 from factorgraph_dvl.solvers.trajectory import trajectory_between
@@ -83,6 +84,7 @@ def summarise(trial: Trial, found: SolvedProblem, *, rate_hz: float) -> Solution
         rejected=rejected,
         limits=trial.limits,
         noise=noise,
+        error_budget=causes(found, trial.imu.settings),
     )
 
 

@@ -17,8 +17,8 @@ from factorgraph_dvl.graph.problem import Evaluation, Problem, Rows
 IMU_NOISE = "IMU noise"
 FIRST_STATE = "prior of the first state"
 GAP = "motion while the IMU is silent"
-_PRIOR = "prior of {}"
-_WALK = "random walk of {}"
+PRIOR = "prior of {}"
+WALK = "random walk of {}"
 
 # Items whose products are taken at once. Chosen: some ten megabytes.
 _CHUNK = 4096
@@ -96,7 +96,7 @@ def _native_rows(problem: Problem, evaluation: Evaluation) -> Iterator[Rows]:
         variables = np.array([own for own, _ in items])
         matrix = np.stack([augmented for _, augmented in items])
         parts = {source: slice(None)}
-        if source in (_PRIOR, _WALK):
+        if source in (PRIOR, WALK):
             # GTSAM's order; the rows are independent of each other.
             parts = {source.format(accel): slice(0, 3), source.format(gyro): slice(3, 6)}
         for name, own_rows in parts.items():
@@ -110,11 +110,11 @@ def _source(own: list[int], names: Mapping[int, str]) -> str:
     """Return the source of a factor's noise, from its variables."""
     calibration = [names[key] for key in own if key in names]
     if calibration:
-        return _PRIOR.format(", ".join(calibration))
+        return PRIOR.format(", ".join(calibration))
     return {
         "xxb": IMU_NOISE,
-        "bb": _WALK,
-        "b": _PRIOR,
+        "bb": WALK,
+        "b": PRIOR,
         "x": FIRST_STATE,
         "xx": GAP,
     }["".join(map(keys.letter_of, own))]

@@ -13,6 +13,7 @@ from factorgraph_dvl.analysis.error_statistics import trajectory_errors
 from factorgraph_dvl.report.figures.beams import beam_quality_figure
 from factorgraph_dvl.report.figures.calibration import calibration_figure, correlation_figure
 from factorgraph_dvl.report.figures.drawing import save_figures
+from factorgraph_dvl.report.figures.error_budget import error_budget_figure
 from factorgraph_dvl.report.figures.residuals import residuals_figure
 from factorgraph_dvl.report.figures.trajectory import motion_figure, track_figure
 from factorgraph_dvl.solution import Residuals, Solution, Trajectory
@@ -40,7 +41,8 @@ def write_figures(trial: Trial | PlanarTrial, solution: Solution, folder: Path) 
     -------
     list of Path
         The files: `track.png`, `motion.png`, `<sensor>_residuals.png` of each sensor with
-        residuals, `beam_quality.png`, `calibration.png`, `correlation.png`.
+        residuals, `beam_quality.png`, `calibration.png`, `correlation.png`,
+        `error_budget.png`.
     """
     folder.mkdir(parents=True, exist_ok=True)
     thinned = replace(solution, trajectory=_thinned(solution.trajectory))
@@ -63,6 +65,8 @@ def write_figures(trial: Trial | PlanarTrial, solution: Solution, folder: Path) 
         figures["calibration"] = calibration_figure(solution, trial.calibration_truth)
     if np.count_nonzero(np.diagonal(solution.covariance) > 0.0) > 1:
         figures["correlation"] = correlation_figure(solution)
+    if solution.error_budget:
+        figures["error_budget"] = error_budget_figure(solution)
 
     return save_figures(figures, folder)
 

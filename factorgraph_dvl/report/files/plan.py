@@ -57,6 +57,14 @@ def to_json(
                 for e in solution.estimates
                 for i, name in enumerate(e.component_names)
             },
+            "error_budget": [
+                {
+                    "cause": c.cause,
+                    "assumed": c.assumed,
+                    "adds": dict(zip(solution.order, c.adds.tolist(), strict=True)),
+                }
+                for c in solution.error_budget
+            ],
             "required": [_requirement(r) for r in required],
             "missed": [r.component for r in required if not r.met],
             "proposal": None if proposal is None else _proposal(proposal),

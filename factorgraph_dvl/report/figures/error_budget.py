@@ -1,0 +1,43 @@
+"""The error budget of a calibration: shares of each variance by cause."""
+
+from __future__ import annotations
+
+import matplotlib
+import numpy as np
+from matplotlib.figure import Figure
+
+from factorgraph_dvl.report.figures.calibration import readable
+from factorgraph_dvl.report.figures.drawing import LIGHT, SMALL, TITLE, new_figure, new_grid, style
+from factorgraph_dvl.solution import Solution
+
+# Causes with a colour of their own; the others share one. Chosen: as many as can be told apart.
+_SHOWN = 9
+
+
+def error_budget_figure(solution: Solution) -> Figure:
+    """Draw what share of the variance of each component every cause has."""
+    std = np.concatenate([e.std for e in solution.estimates])
+    free = np.flatnonzero(std > 0.0)
+    variance = np.stack([c.adds[free] ** 2 for c in solution.error_budget])
+    share = 100.0 * variance / variance.sum(axis=0)
+    figure = new_figure(11.0, 1.4 + 0.24 * free.size)
+    grid = new_grid(figure, 1, 1, left=1.5, right=3.4, bottom=0.5, top=0.35)
+    ax = figure.add_subplot(grid[0, 0])
+    y = np.arange(free.size)
+    left = np.zeros(free.size)
+    colors = matplotlib.colormaps["tab10"]
+    for i, cause in enumerate(solution.error_budget[:_SHOWN]):
+        label = f"{cause.cause} ({cause.assumed})" if cause.assumed else cause.cause
+        ax.barh(y, share[i], left=left, color=colors(i), height=0.7, label=label)
+        left += share[i]
+    if len(share) > _SHOWN:
+        ax.barh(y, 100.0 - left, left=left, color=LIGHT, height=0.7, label="all others")
+    names = [f"{readable(solution.order[i])[0]}  {std[i]:.2g}" for i in free]
+    ax.set_yticks(y, names, fontsize=SMALL)
+    ax.invert_yaxis()
+    ax.set_xlim(0.0, 100.0)
+    style(ax, "share of the variance, %", "")
+    ax.grid(visible=False)
+    ax.set_title("Error budget", fontsize=TITLE, loc="left")
+    ax.legend(loc="upper left", bbox_to_anchor=(1.01, 1.0), fontsize=SMALL, frameon=False)
+    return figure

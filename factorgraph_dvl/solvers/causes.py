@@ -1,0 +1,85 @@
+"""Causes of the standard deviations of a calibration: its error budget in reported units."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.graph.problem import Problem
+from factorgraph_dvl.sensors.imu import ImuSettings
+from factorgraph_dvl.sensors.parameters import UNITS, Parameter
+from factorgraph_dvl.solution import Cause
+from factorgraph_dvl.solvers.calibration import reported, spread_of_fixed
+from factorgraph_dvl.solvers.fixed_directions import SolvedProblem
+from factorgraph_dvl.statistics.error_budget import error_budget
+from factorgraph_dvl.statistics.rows import IMU_NOISE, PRIOR, WALK, rows_by_source
+
+
+def causes(found: SolvedProblem, imu: ImuSettings) -> tuple[Cause, ...]:
+    """Return what each cause adds to the standard deviations of a calibration.
+
+    The squares of all causes add up to the variances that are reported.
+
+    Parameters
+    ----------
+    found : SolvedProblem
+        Problem at its minimum, with covariances.
+    imu : ImuSettings
+        What is stated of the IMU.
+    """
+    problem, evaluation = found.problem, found.minimum.evaluation
+    rows = reported(problem, evaluation)
+    functionals = [derivatives for _, _, derivatives in rows if derivatives is not None]
+    if not functionals:
+        return ()
+    parts = error_budget(
+        rows_by_source(problem, evaluation), found.covariances.information, functionals
+    )
+    variances = {source: np.diag(part) for source, part in parts.items()}
+    spread = spread_of_fixed(found)
+    if spread.size:
+        variances["directions that the data do not determine"] = np.sum(spread**2, axis=1)
+    is_free = np.concatenate([np.full(v.size, d is not None) for _, v, d in rows])
+    exact = np.concatenate([p.sigma == 0.0 for p, _, _ in rows])
+    assumed = _assumed(found, imu, [p for p, _, _ in rows])
+    labels = {o.label for o in problem.observations}
+    out = []
+    for source, variance in variances.items():
+        adds = np.zeros(is_free.size)
+        adds[is_free] = np.sqrt(np.maximum(variance, 0.0))
+        adds[exact] = 0.0
+        text = f"noise of {source}" if source in labels else source
+        out.append(Cause(text, assumed.get(source, ""), adds))
+    total = np.maximum(np.sum([c.adds**2 for c in out], axis=0), np.finfo(float).tiny)
+    return tuple(sorted(out, key=lambda c: -float(np.max(c.adds**2 / total))))
+
+
+def _assumed(
+    found: SolvedProblem, imu: ImuSettings, parameters: list[Parameter]
+) -> dict[str, str]:
+    """Return what is assumed of each source, as text."""
+    problem: Problem = found.problem
+    out = {
+        IMU_NOISE: f"{imu.gyro_noise_deg_sqrt_h:.3g} deg/√h, "
+        f"{imu.accel_noise_ug_sqrt_hz:.3g} µg/√Hz"
+    }
+    for o, weight in zip(problem.observations, problem.weights, strict=True):
+        sigma = 1.0 / np.where(weight > 0.0, weight, np.nan)
+        if (weight > 0.0).any():
+            middle = [float(np.nanmedian(s)) for s in sigma.T if np.isfinite(s).any()]
+            out[o.label] = _numbers(np.array(middle), o.unit)
+    priors = [*problem.chain.biases, *(p for p in parameters if p.name in problem.columns)]
+    for p in priors:
+        unit = UNITS[p.spec.unit].text
+        out[PRIOR.format(p.name)] = _numbers(p.sigma / p.si, unit)
+    gyro, accel = problem.chain.biases
+    out[WALK.format(gyro.name)] = f"{imu.gyro_bias_walk_deg_h_sqrt_h:.3g} deg/h/√h"
+    out[WALK.format(accel.name)] = f"{imu.accel_bias_walk_ug_sqrt_h:.3g} µg/√h"
+    return out
+
+
+def _numbers(values: Array, unit: str) -> str:
+    """Return numbers with their unit, once if they are all the same."""
+    texts = list(dict.fromkeys(f"{value:.2g}" for value in values))
+    numbers = texts[0] if len(texts) == 1 else ", ".join(f"{value:.2g}" for value in values)
+    return f"{numbers} {unit}".rstrip()
