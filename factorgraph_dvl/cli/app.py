@@ -10,6 +10,7 @@ import typer
 from rich.text import Text
 
 from factorgraph_dvl import __version__
+from factorgraph_dvl.cli.allan import allan
 from factorgraph_dvl.cli.console import stderr, warn
 from factorgraph_dvl.cli.correct import correct
 from factorgraph_dvl.cli.crosscheck import crosscheck
@@ -52,6 +53,7 @@ for _command in (
     deadreckon,
     instrument,
     correct,
+    allan,
     reproduce,
 ):
     app.command()(naming_memory(_command))
