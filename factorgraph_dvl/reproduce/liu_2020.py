@@ -328,9 +328,8 @@ def _equation_21(seeds: int) -> Result:
     printed, _ = _linear_filter(gain=True, predicted=False)
     right, _ = _linear_filter(gain=True, predicted=True)
     return Result(
-        f"without noise: from X at k−1|k−1 it finds {printed:.3f} times the drift, from X at "
-        "k|k−1 "
-        f"{right:.4f} times",
+        f"without noise: from the state before the prediction it finds {printed:.3f} times the "
+        f"drift, from the predicted state {right:.4f} times",
         judged(abs(printed - 1.0) < 0.01, abs(right - 1.0) < 0.01),
     )
 
