@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
     from rich.table import Table
 
+    from factorgraph_dvl.sensors.finding import Finding
     from factorgraph_dvl.solution import Solution
 
 _STARTED = time()
@@ -110,6 +111,17 @@ def print_error_budget(solution: Solution) -> None:
 def warn(message: str) -> None:
     """Print a warning."""
     stderr().print(Text(f"warning: {printable(message)}", "yellow"), soft_wrap=True)
+
+
+def say(finding: Finding) -> None:
+    """Print a finding, and what to do about it if there is something."""
+    from factorgraph_dvl.report.terminal.tables import STYLES
+
+    line = printable(f"{finding.severity}: {finding}")
+    stderr().print(Text(line, STYLES[finding.severity]), soft_wrap=True)
+    action = finding.code.action
+    if finding.severity != "note":
+        stderr().print(f"  {action}", markup=False, highlight=False, soft_wrap=True)
 
 
 @contextmanager

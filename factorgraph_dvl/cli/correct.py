@@ -7,8 +7,8 @@ from typing import Annotated
 
 import typer
 
-from factorgraph_dvl.cli.console import print_written, stdout, warn
-from factorgraph_dvl.cli.options import Force, TrialPath, claim_output
+from factorgraph_dvl.cli.console import print_written, say, stdout, warn
+from factorgraph_dvl.cli.options import Anyway, Force, TrialPath, claim_output
 
 
 def correct(
@@ -18,6 +18,7 @@ def correct(
     ],
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder to write.")],
     force: Force = False,
+    anyway: Anyway = False,
 ) -> None:
     """Convert the calibrated beams of a trial to a DVL record, and write the matrix for it."""
     import numpy as np
@@ -29,20 +30,20 @@ def correct(
     from factorgraph_dvl.io.trial_folder import inputs_of, load_trial
 
     claim_output(out, force=force, owned=OWNED, inputs=(*inputs_of(trial_path), calibration))
-    trial = load_trial(trial_path)
+    trial = load_trial(trial_path, anyway=anyway)
     if trial.beams is None:
         raise DataError(
             "the trial has no beams", where=str(trial_path), expected="a dvl_beams section"
         )
     found = load_calibration(calibration, body_axes=trial.body_axes)
-    check_usable(found, trial.body_axes, str(calibration))
+    check_usable(found, trial.body_axes, str(calibration), anyway=anyway)
     beams = calibration_of(trial.beams, found)
     check_same_instrument(trial.beams, beams, str(calibration))
     record = save_corrected(
         trial.beams, beams.directions_b, beams.scale_error, beams.lever_arm, out, force=force
     )
     for finding in trial.notes:
-        warn(str(finding))
+        say(finding)
     own = {p.name for p in trial.beams.parameters()}
     unknown = [
         name

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from factorgraph_dvl.cli.console import drawing, print_table, print_written, stdout, warn
-from factorgraph_dvl.cli.options import Force, NoFigures, claim_output
+from factorgraph_dvl.cli.options import Anyway, Force, NoFigures, claim_output
 
 if TYPE_CHECKING:
     from factorgraph_dvl.analysis.comparison.crosscheck import CrossCheck
@@ -46,10 +46,12 @@ def crosscheck(
         typer.Option(case_sensitive=False, help="Result that uses all data with a correct model."),
     ] = None,
     force: Force = False,
+    anyway: Anyway = False,
     no_figures: NoFigures = False,
 ) -> None:
     """Compare two results of one trial with each other and with the truth."""
     from factorgraph_dvl.analysis.comparison.crosscheck import crosscheck as compare
+    from factorgraph_dvl.io.calibration_file import check_verdict
     from factorgraph_dvl.io.external_results import load_results, load_truth
     from factorgraph_dvl.io.folders import new_folder
     from factorgraph_dvl.io.tables import write_table
@@ -60,6 +62,8 @@ def crosscheck(
     read = [path for source in given for path in inputs_of(source)]
     claim_output(out, force=force, owned=OWNED, inputs=read)
     result_a, result_b = load_results(a, b)
+    for path, result in ((a, result_a), (b, result_b)):
+        check_verdict(result, str(path), anyway=anyway)
     true_motion, true_values = load_truth(reference, truth)
     check = compare(
         result_a,
@@ -92,7 +96,9 @@ def _print_crosscheck(check: CrossCheck, a: Path, b: Path) -> None:
     console = stdout()
     for side, path, solution in (("A", a, check.a), ("B", b, check.b)):
         solver = f" ({solution.solver})" if solution.solver else ""
-        console.print(f"{side}: {path}{solver}", markup=False, soft_wrap=True)
+        verdict = solution.verdict
+        grade = "" if verdict.grade == "good" else f", {verdict}"
+        console.print(f"{side}: {path}{solver}{grade}", markup=False, soft_wrap=True)
     if check.components:
         print_table(tables.component_table(check, width=console.width))
     if check.motion is not None:

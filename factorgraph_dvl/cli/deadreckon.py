@@ -12,6 +12,7 @@ from factorgraph_dvl.cli.console import (
     drawing,
     print_table,
     print_written,
+    say,
     stdout,
     warn,
 )
@@ -23,7 +24,8 @@ from factorgraph_dvl.cli.options import (
     TrialPath,
     claim_output,
 )
-from factorgraph_dvl.cli.plausibility import errors_in, print_contradiction
+from factorgraph_dvl.cli.plausibility import errors_in
+from factorgraph_dvl.cli.verdict import end_with
 
 if TYPE_CHECKING:
     from factorgraph_dvl.analysis.dead_reckoning.before_after import BeforeAfter
@@ -76,17 +78,18 @@ def deadreckon(
         error_table,
         to_json,
     )
+    from factorgraph_dvl.sensors.finding import verdict_of
 
     read = (*inputs_of(trial_path), calibration, None if attitude is None else Path(attitude))
     claim_output(out, force=force, owned=OWNED, inputs=read)
     with ProgressLine(quiet=quiet) as progress:
-        trial = load_trial(trial_path)
-        values = read_calibration_values(calibration, trial.body_axes)
+        trial = load_trial(trial_path, anyway=anyway)
+        values = read_calibration_values(calibration, trial.body_axes, anyway=anyway)
         errors = errors_in(trial, anyway=anyway)
         attitude = attitude or _default_attitude(trial)
         with explained(errors):
             progress("attitude")
-            source, findings = _attitude(trial, attitude, align)
+            source, findings = _attitude(trial, attitude, align, anyway=anyway)
             progress("dead reckoning")
             result = before_after(trial, values, source.at)
         progress("write")
@@ -121,7 +124,7 @@ def deadreckon(
                 f"distance and errors are those up to {end:.1f} s"
             )
     for finding in (*errors, *trial.notes, *findings):
-        warn(str(finding))
+        say(finding)
     if trial.dvl is not None and trial.dvl.settings.reference == "water":
         warn("the DVL measures velocity through the water: the track drifts with the current")
     if result.calibrated.track.bridged > 0.0:
@@ -130,9 +133,7 @@ def deadreckon(
             "velocity before and after"
         )
     print_written(out)
-    if errors:
-        print_contradiction()
-        raise typer.Exit(1)
+    end_with(verdict_of(errors))
 
 
 def _default_attitude(trial: Trial) -> str:
@@ -140,7 +141,7 @@ def _default_attitude(trial: Trial) -> str:
 
 
 def _attitude(
-    trial: Trial, source: str, align: float | None
+    trial: Trial, source: str, align: float | None, *, anyway: bool
 ) -> tuple[AttitudeHistory, tuple[Finding, ...]]:
     """Return the attitude for the track, and findings about it."""
     import numpy as np
@@ -163,6 +164,7 @@ def _attitude(
                 expected="sins, or a solution folder",
             )  # fmt: skip
         return AttitudeHistory(trial.imu, trial.reference, trial.body_axes, np.zeros(3)), ()
+    from factorgraph_dvl.io.calibration_file import check_verdict
     from factorgraph_dvl.io.solution_folder import load_solution
 
     if not Path(source).is_dir():
@@ -172,6 +174,7 @@ def _attitude(
             expected="sins, reference, or a solution folder",
         )
     solution = load_solution(source)
+    check_verdict(solution, source, anyway=anyway)
     if solution.trial != trial.name:
         warn(f"the attitude in {source} is from trial {solution.trial}, not {trial.name}")
     names = [e.name for e in solution.estimates]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from factorgraph_dvl.cli.console import print_table, stdout, warn
+from factorgraph_dvl.cli.console import print_table, say, stdout
 from factorgraph_dvl.cli.options import TrialPath
 
 
@@ -23,7 +23,7 @@ def inspect(trial_path: TrialPath) -> None:
         planar = load_planar_trial(trial_path)
         result, notes, assumed = survey_planar(planar), planar.notes, []
     else:
-        trial = load_trial(trial_path)
+        trial = load_trial(trial_path, anyway=True)
         result, notes = survey(trial), trial.notes
         assumed = imu_lines(trial.imu.settings)
     console = stdout()
@@ -31,6 +31,6 @@ def inspect(trial_path: TrialPath) -> None:
     for line in (motion_line(result), *assumed):
         console.print(line, markup=False, soft_wrap=True)
     for note in notes:
-        warn(str(note))
+        say(note)
     for finding in finding_lines(result):
         console.print(finding, soft_wrap=True)

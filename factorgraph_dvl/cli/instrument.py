@@ -7,11 +7,14 @@ from typing import Annotated
 
 import typer
 
+from factorgraph_dvl.cli.options import Anyway
+
 
 def instrument(
     calibration: Annotated[
         Path, typer.Argument(metavar="CALIBRATION", help="calibration.json, or its folder.")
     ],
+    anyway: Anyway = False,
 ) -> None:
     """Print a calibration in the terms of instruments: angles, %, ppm, TRDI's EA and EI."""
     from factorgraph_dvl.analysis.instrument_terms import instrument_of
@@ -19,5 +22,5 @@ def instrument(
     from factorgraph_dvl.report.files.instrument import instrument_text
 
     found = load_calibration(calibration)
-    check_usable(found, found.body_axes, str(calibration))
+    check_usable(found, found.body_axes, str(calibration), anyway=anyway)
     typer.echo(instrument_text(instrument_of(found), found.trial), nl=False)

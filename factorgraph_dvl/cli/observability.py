@@ -6,19 +6,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.text import Text
 
 from factorgraph_dvl.cli.console import (
     ProgressLine,
     drawing,
     print_table,
     print_written,
-    stderr,
     stdout,
     warn,
 )
 from factorgraph_dvl.cli.options import Anyway, Force, NoFigures, Quiet, claim_output
-from factorgraph_dvl.cli.plausibility import contradicted, print_contradiction
+from factorgraph_dvl.cli.verdict import end_with
 
 if TYPE_CHECKING:
     from factorgraph_dvl.analysis.information.observability import Observability
@@ -57,13 +55,7 @@ def observability(
             write_observability(view, folder, str(source), figures=not no_figures)
     print_observability(view)
     print_written(out)
-    if not solution.converged:
-        stderr().print(Text("error: the solution did not converge", "red"), soft_wrap=True)
-    unfit = contradicted(solution.findings)
-    if unfit:
-        print_contradiction()
-    if unfit or not solution.converged:
-        raise typer.Exit(1)
+    end_with(solution.verdict)
 
 
 def _view(
@@ -82,7 +74,7 @@ def _view(
     if (source / CALIBRATION_FILE).exists() and not (source / SETTINGS_FILE).exists():
         solution = load_solution(source)
         return solution, look(solution, given=given)
-    trial = load_trial(source)
+    trial = load_trial(source, anyway=anyway)
     # The solver is slow to import: do so after the checks of the input.
     from factorgraph_dvl.solvers.information_history import solve_with_history
 

@@ -21,7 +21,7 @@ Rate = Annotated[
     float, typer.Option(metavar="HZ", min=1e-3, max=1e4, help="Rate of the trajectory.")
 ]
 Anyway = Annotated[
-    bool, typer.Option("--anyway", help="Continue although records are implausible.")
+    bool, typer.Option("--anyway", help="Use records and calibrations that are refused.")
 ]
 Quiet = Annotated[bool, typer.Option("--quiet", help="Do not show progress.")]
 

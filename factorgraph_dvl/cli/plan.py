@@ -16,7 +16,8 @@ from factorgraph_dvl.cli.console import (
 )
 from factorgraph_dvl.cli.observability import print_observability, write_observability
 from factorgraph_dvl.cli.options import Anyway, Force, NoFigures, Quiet, claim_output
-from factorgraph_dvl.cli.plausibility import errors_in, print_contradiction
+from factorgraph_dvl.cli.plausibility import errors_in
+from factorgraph_dvl.cli.verdict import end_with
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -62,9 +63,7 @@ def plan(
     print_error_budget(solution)
     _print_requirements(required, proposal)
     print_written(out)
-    if errors:
-        print_contradiction()
-        raise typer.Exit(1)
+    end_with(solution.verdict)
 
 
 def _print_requirements(required: Sequence[Requirement], proposal: Proposal | None) -> None:

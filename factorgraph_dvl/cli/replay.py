@@ -18,7 +18,6 @@ from factorgraph_dvl.cli.console import (
     print_written,
     stderr,
     stdout,
-    warn,
 )
 from factorgraph_dvl.cli.options import (
     Anyway,
@@ -29,7 +28,7 @@ from factorgraph_dvl.cli.options import (
     TrialPath,
     claim_output,
 )
-from factorgraph_dvl.cli.plausibility import contradicted, print_contradiction
+from factorgraph_dvl.cli.verdict import end_with, print_findings, print_verdict
 from factorgraph_dvl.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -83,13 +82,12 @@ def replay(
     # Where nothing can be drawn over, lines of progress say as much.
     live = live and stderr().is_terminal
     with ProgressLine(quiet=quiet or live) as progress:
-        trial = load_trial(trial_path)
+        trial = load_trial(trial_path, anyway=anyway)
         check_limits(trial, (*std_asked, *error_asked))
         trial = replace(trial, limits={**trial.limits, **std_asked})
         # Two standard deviations hold 95 % of the errors.
         error_limits = {name: 2.0 * std for name, std in trial.limits.items()} | error_asked
         solution, record = _run(trial, smoother.value, lag, rate, anyway, progress, live=live)
-        unfit = contradicted(solution.findings)
         found = convergence(
             record.time,
             record.values,
@@ -109,19 +107,10 @@ def replay(
             out,
             force=force,
             figures=not no_figures,
-            instrument=not unfit,
         )
     _print(trial, solution, record, found)
     print_written(out)
-    if not solution.converged:
-        text = "error: measurements disagree with the prediction at the end; see the warnings"
-        if not record.inconsistent[-1]:
-            text = "error: the replay did not reach the end of the record; see the warnings"
-        stderr().print(Text(text, "red"), soft_wrap=True)
-    if unfit:
-        print_contradiction()
-    if unfit or not solution.converged:
-        raise typer.Exit(1)
+    end_with(solution.verdict)
 
 
 def _limits(option: str, pairs: list[str] | None) -> dict[str, float]:
@@ -224,7 +213,6 @@ def _write(
     *,
     force: bool,
     figures: bool,
-    instrument: bool,
 ) -> None:
     from factorgraph_dvl.cli.solve import write_beams, write_instrument
     from factorgraph_dvl.io.solution_folder import (
@@ -238,8 +226,7 @@ def _write(
 
     def add(folder: Path) -> None:
         write_beams(trial, solution, folder)
-        if instrument:
-            write_instrument(solution, folder)
+        write_instrument(solution, folder)
         write_history(folder, record.time, record.names, record.values, record.std, record.latency)
         write_latency(folder, record.time, record.latency, record.solved)
         (folder / CONVERGENCE_FILE).write_text(to_csv(found), encoding="utf-8")
@@ -274,6 +261,7 @@ def _print(trial: Trial, solution: Solution, record: ReplayRecord, found: Conver
         good_enough_line,
     )
 
+    print_verdict(solution)
     console = stdout()
     truth = trial.calibration_truth
     errors = calibration_errors(solution, truth) if truth else None
@@ -292,5 +280,4 @@ def _print(trial: Trial, solution: Solution, record: ReplayRecord, found: Conver
             soft_wrap=True,
         )
     console.print(good_enough_line(found, start), markup=False, highlight=False)
-    for warning in solution.warnings:
-        warn(warning)
+    print_findings(solution)

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, cast
 
 import typer
-from rich.text import Text
 
 from factorgraph_dvl.cli.console import (
     ProgressLine,
@@ -16,9 +15,7 @@ from factorgraph_dvl.cli.console import (
     print_error_budget,
     print_table,
     print_written,
-    stderr,
     stdout,
-    warn,
 )
 from factorgraph_dvl.cli.options import (
     Anyway,
@@ -30,7 +27,8 @@ from factorgraph_dvl.cli.options import (
     TrialPath,
     claim_output,
 )
-from factorgraph_dvl.cli.plausibility import contradicted, errors_in, print_contradiction
+from factorgraph_dvl.cli.plausibility import errors_in
+from factorgraph_dvl.cli.verdict import end_with, print_findings, print_verdict
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -97,6 +95,7 @@ def solve(
         run_planar,
         force=force,
         figures=not no_figures,
+        anyway=anyway,
         quiet=quiet,
     )
 
@@ -160,6 +159,7 @@ def kalman(
         run_planar,
         force=force,
         figures=not no_figures,
+        anyway=anyway,
         quiet=quiet,
     )
 
@@ -178,6 +178,7 @@ def _solve_into(
     *,
     force: bool,
     figures: bool,
+    anyway: bool,
     quiet: bool,
 ) -> None:
     """Load a trial, run a solver, write and show its solution."""
@@ -197,17 +198,15 @@ def _solve_into(
             trial = load_planar_trial(trial_path)
             solution, history = run_planar(trial, progress)
         else:
-            trial = load_trial(trial_path)
+            trial = load_trial(trial_path, anyway=anyway)
             solution, history = run(trial, progress)
-        unfit = contradicted(solution.findings)
         progress("write", 0, None)
 
         def add(folder: Path) -> None:
             write_beams(trial, solution, folder)
             if history is not None:
                 write_history(folder, history.time, history.names, history.values, history.std)
-            if not unfit:
-                write_instrument(solution, folder)
+            write_instrument(solution, folder)
             if not figures:
                 return
             from factorgraph_dvl.report.figures.solution import write_figures
@@ -220,15 +219,7 @@ def _solve_into(
         save_solution(solution, out, force=force, extra=add)
     _print_solution(trial, solution)
     print_written(out)
-    if not solution.converged:
-        stderr().print(
-            Text(f"error: not converged after {solution.iterations} iterations", "red"),
-            soft_wrap=True,
-        )
-    if unfit:
-        print_contradiction()
-    if unfit or not solution.converged:
-        raise typer.Exit(1)
+    end_with(solution.verdict)
 
 
 def draw_history(
@@ -260,12 +251,13 @@ def write_beams(trial: Trial | PlanarTrial, solution: Solution, folder: Path) ->
 
 
 def write_instrument(solution: Solution, folder: Path) -> None:
-    """Write the calibration in the terms of instruments, if it calibrates a DVL."""
+    """Write the calibration of a DVL in the terms of instruments, if it can be used."""
     from factorgraph_dvl.analysis.instrument_terms import NEEDED, instrument_of
     from factorgraph_dvl.io.solution_folder import INSTRUMENT_FILE
     from factorgraph_dvl.report.files.instrument import instrument_text
 
-    if solution.converged and set(NEEDED) <= {e.name for e in solution.estimates}:
+    usable = solution.verdict.grade != "do not use"
+    if usable and set(NEEDED) <= {e.name for e in solution.estimates}:
         text = instrument_text(instrument_of(solution), solution.trial)
         (folder / INSTRUMENT_FILE).write_text(text, encoding="utf-8")
 
@@ -278,6 +270,7 @@ def _print_solution(trial: Trial | PlanarTrial, solution: Solution) -> None:
         rejected_line,
     )
 
+    print_verdict(solution)
     truth = trial.calibration_truth
     if solution.estimates:
         errors = calibration_errors(solution, truth) if truth else None
@@ -291,5 +284,4 @@ def _print_solution(trial: Trial | PlanarTrial, solution: Solution) -> None:
         print_table(hypothesis_table(solution))
     if solution.rejected:
         stdout().print(rejected_line(solution), markup=False, soft_wrap=True)
-    for warning in solution.warnings:
-        warn(warning)
+    print_findings(solution)

@@ -219,11 +219,12 @@ def check_verdict(result: Solution | Calibration, source: str, *, anyway: bool =
     verdict = result.verdict
     if verdict.grade == "do not use" and not anyway:
         reason = verdict.reasons[0]
+        overrule = "To use it all the same, add --anyway (in Python anyway=True)"
         raise DataError(
-            f"the calibration is graded `do not use`: {reason}",
+            f"graded `do not use`: {reason}",
             where=source,
-            expected="a calibration graded good or doubtful",
-            hint=f"{reason.code.action} To use it all the same, add --anyway",
+            expected="a result graded good or doubtful",
+            hint=f"{reason.code.action} {overrule}",
         )
 
 

@@ -268,7 +268,9 @@ def read_truth(path: Path | str) -> dict[str, Array]:
     return {name: _array(value.value) for name, value in _given(_read_calibration(path)).items()}
 
 
-def read_calibration_values(path: Path | str, body_axes: BodyAxes) -> dict[str, Array]:
+def read_calibration_values(
+    path: Path | str, body_axes: BodyAxes, *, anyway: bool = False
+) -> dict[str, Array]:
     """Read the values of a calibration, of this program or typed in by hand.
 
     Parameters
@@ -278,6 +280,8 @@ def read_calibration_values(path: Path | str, body_axes: BodyAxes) -> dict[str, 
         calibration values.
     body_axes : BodyAxes
         That the values must be in.
+    anyway : bool, default False
+        Read them also if they are graded `do not use`.
 
     Returns
     -------
@@ -287,8 +291,7 @@ def read_calibration_values(path: Path | str, body_axes: BodyAxes) -> dict[str, 
     Raises
     ------
     ConfigError, DataError
-        If there are no such values, they are in other axes, or their solver did not
-        converge.
+        If there are no such values, they are in other axes, or not to be used.
     """
     path = Path(path)
     whole = path.is_dir() or (
@@ -296,7 +299,7 @@ def read_calibration_values(path: Path | str, body_axes: BodyAxes) -> dict[str, 
     )
     if whole:
         calibration = load_calibration(path, body_axes=body_axes)
-        check_usable(calibration, body_axes, str(path))
+        check_usable(calibration, body_axes, str(path), anyway=anyway)
         values = calibration.values
     else:
         values = read_truth(path)

@@ -85,13 +85,16 @@ class _Truth(msgspec.Struct):
     parameters: dict[str, _TruthValue]
 
 
-def load_trial(path: Path | str) -> Trial:
+def load_trial(path: Path | str, *, anyway: bool = False) -> Trial:
     """Read a trial folder.
 
     Parameters
     ----------
     path : path-like
         Of the folder, or of the trial.yaml in it.
+    anyway : bool, default False
+        Start from the calibration in `dvl.calibration` also if it is graded `do not use`; the
+        trial notes it.
 
     Raises
     ------
@@ -118,6 +121,14 @@ def load_trial(path: Path | str) -> Trial:
     }
     dvl = cast("Dvl | None", aids.pop(Dvl.section, None))
     notes = []
+    calibration = None if dvl is None else _calibration_for(dvl, folder, settings.body_axes)
+    if dvl is not None and calibration is not None:
+        source = str(dvl.settings.calibration)
+        dvl = calibrated_by(dvl, calibration, settings.body_axes, source, anyway=anyway)
+        verdict = calibration.verdict
+        if verdict.grade == "do not use":
+            text = f"{source} is graded `do not use`: {verdict.reasons[0]}"
+            notes.append(Finding(Code.UNUSABLE_PRIOR, text, sensor=dvl.label))
     if dvl is not None and _share_pings(dvl, aids):
         notes.append(
             Finding(
@@ -130,7 +141,7 @@ def load_trial(path: Path | str) -> Trial:
         name=printable(settings.name or folder.resolve().name),
         imu=read_record(folder, Imu, settings.imu),
         gnss=cast("Gnss | None", aids.pop(Gnss.section, None)),
-        dvl=dvl if dvl is None else _with_calibration(dvl, folder, settings.body_axes),
+        dvl=dvl,
         others=tuple(aids.values()),
         body_axes=settings.body_axes,
         epoch=settings.epoch,
@@ -279,11 +290,11 @@ def _named(settings: Any) -> Iterator[str]:
                 yield from _named(value)
 
 
-def _with_calibration(dvl: Dvl, folder: Path, body_axes: BodyAxes) -> Dvl:
-    """Return a DVL with the calibration that its settings name, if any, as its prior."""
+def _calibration_for(dvl: Dvl, folder: Path, body_axes: BodyAxes) -> Calibration | None:
+    """Return the calibration that the settings of a DVL name, None if they name none."""
     name = dvl.settings.calibration
     if isinstance(name, UnsetType):
-        return dvl
+        return None
     path = folder / name
     if not path.exists():
         raise ConfigError(
@@ -291,10 +302,12 @@ def _with_calibration(dvl: Dvl, folder: Path, body_axes: BodyAxes) -> Dvl:
             where=SETTINGS_FILE,
             expected=f"a calibration.json at {path}",
         )
-    return calibrated_by(dvl, load_calibration(path, body_axes=body_axes), body_axes, source=name)
+    return load_calibration(path, body_axes=body_axes)
 
 
-def calibrated_by(dvl: Dvl, calibration: Calibration, body_axes: BodyAxes, source: str) -> Dvl:
+def calibrated_by(
+    dvl: Dvl, calibration: Calibration, body_axes: BodyAxes, source: str, *, anyway: bool = False
+) -> Dvl:
     """Return a DVL whose prior is what a calibration says of it, correlations included.
 
     What belongs to the day is left out: biases of the IMU, the current.
@@ -309,13 +322,15 @@ def calibrated_by(dvl: Dvl, calibration: Calibration, body_axes: BodyAxes, sourc
         Of the trial.
     source : str
         Name of the calibration, for messages.
+    anyway : bool, default False
+        Take it also if it is graded `do not use`.
 
     Raises
     ------
     DataError
-        If the calibration did not converge, is in other axes, or says nothing of the DVL.
+        If the calibration is not to be used, is in other axes, or says nothing of the DVL.
     """
-    check_usable(calibration, body_axes, source)
+    check_usable(calibration, body_axes, source, anyway=anyway)
     values: dict[str, Array] = {}
     rows: list[int] = []
     at = 0

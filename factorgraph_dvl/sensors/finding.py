@@ -275,6 +275,12 @@ class Code(StrEnum):
         "note",
     )
     # Where a solver starts.
+    UNUSABLE_PRIOR = (
+        "unusable_prior",
+        "The calibration that the trial starts from is graded `do not use`.",
+        "What was wrong there is carried into this trial.",
+        "Calibrate anew, and name that result in dvl.calibration.",
+    )
     HEADING_UNKNOWN = (
         "heading_unknown",
         "The velocity changes too little to find the heading before solving.",

@@ -141,7 +141,7 @@ def observability(
         history=history,
         shares=shares,
         missing=tuple(missing),
-        warnings=solution.warnings,
+        warnings=tuple(map(str, solution.findings)),
     )
 
 

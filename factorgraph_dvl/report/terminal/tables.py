@@ -12,13 +12,18 @@ from rich.text import Text
 
 from factorgraph_dvl.analysis.convergence import Convergence
 from factorgraph_dvl.analysis.error_statistics import CalibrationErrors
+from factorgraph_dvl.errors import printable
 from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.quality.survey import Survey
 from factorgraph_dvl.report.text import at_precision, fixed, split_unit, with_std
+from factorgraph_dvl.sensors.finding import Verdict
 from factorgraph_dvl.sensors.imu import ImuSettings
 from factorgraph_dvl.solution import Solution
 
-_STYLES = {"error": "red", "warning": "yellow", "note": "", "ok": "green"}
+# Of findings, by severity.
+STYLES = {"error": "red", "warning": "yellow", "note": "", "ok": "green"}
+_VERDICTS = {"good": "green", "doubtful": "yellow", "do not use": "red"}
+_GRADES = {"green": "green", "orange": "yellow", "red": "red", "grey": "dim"}
 # Chosen: wider than any table, in columns.
 _UNLIMITED = 10_000
 
@@ -57,10 +62,11 @@ def _calibration_table(
     if not brief:
         add_column(table, "unit")
         add_column(table, "prior std", numeric=True)
-    add_column(table, "observable")
+    add_column(table, "grade")
     if known:
         add_column(table, "truth", numeric=True)
         add_column(table, "error/σ", numeric=True)
+    grades = solution.grades
     for estimate in solution.estimates:
         for i, component in enumerate(estimate.component_names):
             name, unit = split_unit(component)
@@ -71,7 +77,8 @@ def _calibration_table(
                 row = [f"{name}, {unit}" if unit else name, value]
             else:
                 row = [name, value, unit, f"{float(estimate.prior_std[i]):.3g}"]
-            row.append(Text("yes", "green") if estimate.observable[i] else Text("no", "yellow"))
+            grade = grades[estimate.name][i]
+            row.append(Text(grade, _GRADES[grade]))
             if component in known:
                 truth, normalised = known[component]
                 row.append(at_precision(truth, std))
@@ -80,6 +87,17 @@ def _calibration_table(
                 row += ["", ""]
             table.add_row(*row, end_section=component == estimate.component_names[-1])
     return table
+
+
+def verdict_line(verdict: Verdict) -> Text:
+    """Return the verdict on a result, its first reason, and what to do about it."""
+    line = Text.assemble("Verdict: ", (verdict.grade, _VERDICTS[verdict.grade]))
+    if verdict.reasons:
+        first, *others = verdict.reasons
+        line.append(f": {printable(str(first))}. {first.code.action}")
+        if others:
+            line.append(f" (Further reasons: {len(others)}.)")
+    return line
 
 
 def hypothesis_table(solution: Solution) -> Table:
@@ -214,7 +232,7 @@ def imu_lines(settings: ImuSettings) -> list[str]:
 def finding_lines(survey: Survey) -> list[Text]:
     """Return a line for each finding."""
     return [
-        Text.assemble((f"{f.severity}: ", _STYLES[f.severity]), str(f)) for f in survey.findings
+        Text.assemble((f"{f.severity}: ", STYLES[f.severity]), str(f)) for f in survey.findings
     ]
 
 
