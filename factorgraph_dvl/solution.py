@@ -25,7 +25,14 @@ Progress = Callable[[str, int, float | None], None]
 # Stems of the parameters that every dead-reckoned track depends on; of a lever arm it only
 # does in turns.
 DEAD_RECKONING = ("misalignment", "scale_error", "beam_direction", "beam_scale_error")
+# Standard deviations between prior and data that are no chance: it is 6e-7.
 _FAR_FROM_PRIOR = 5.0
+# Standard deviations by which a wrong prior may draw a value. Chosen: one is within what is
+# claimed.
+_DRAWS = 1.0
+# Share of the prior's standard deviation that is left where the data tell something. Chosen:
+# far from rounding.
+_TOLD = 0.9999
 # Evidence against a minimum with which it is not worth a word: its probability is e^-15.
 _IMPOSSIBLE = 15.0
 # The data observed a component if they at least halved what was unknown of it.
@@ -458,19 +465,7 @@ def consistency_findings(
     factors = {n.name: n.factor for n in noise}
     out = []
     for e in estimates:
-        known = e.prior_std > 0.0
-        away = np.abs(e.value - e.prior_value)[known] / e.prior_std[known]
-        if away.size and away.max() > _FAR_FROM_PRIOR:
-            name = np.array(e.component_names)[known][np.argmax(away)]
-            out.append(
-                Finding(
-                    Code.FAR_FROM_PRIOR,
-                    f"{name} is {away.max():.0f} prior standard deviations from its prior: the "
-                    "prior is too tight, or a unit, an axis or the model is wrong; do not trust "
-                    "the values before you know which",
-                    parameter=e.name,
-                )
-            )
+        out += _far_from_prior(e)
     for r in residuals:
         factor = factors.get(noise_name(r.label))
         stated = r.sigma if factor is None else r.sigma / factor
@@ -498,6 +493,41 @@ def consistency_findings(
                 )
             )
     return out
+
+
+def _far_from_prior(e: Estimate) -> list[Finding]:
+    """Return a finding if a component is far from its prior, by the data alone.
+
+    The difference x - x0 of posterior and prior has the variance σ0² - σ²; without the prior
+    x would be (x - x0) σ² / (σ0² - σ²) further away. The standard deviations by which other
+    parameters would move are fewer.
+    """
+    told = e.std < _TOLD * e.prior_std
+    if not told.any():
+        return []
+    moved = np.abs(e.value - e.prior_value)[told]
+    rest = (e.prior_std**2 - e.std**2)[told]
+    apart = moved / np.sqrt(rest)
+    worst = int(np.argmax(apart))
+    if not apart[worst] > _FAR_FROM_PRIOR:
+        return []
+    draws = float((moved * e.std[told] / rest)[worst])
+    name = np.array(e.component_names)[told][worst]
+    effect = (
+        f"it draws the value by {draws:.1f} of its standard deviations: do not use the values"
+        if draws > _DRAWS
+        else "the data outweigh it, but a unit, an axis or the model may be wrong"
+    )
+    return [
+        Finding(
+            Code.FAR_FROM_PRIOR,
+            f"{name} is {e.value[told][worst]:.4g}, {apart[worst]:.0f} standard deviations from "
+            f"its prior, {e.prior_value[told][worst]:.4g} ± {e.prior_std[told][worst]:.2g}; "
+            + effect,
+            parameter=e.name,
+            severity="error" if draws > _DRAWS else "warning",
+        )
+    ]
 
 
 def contradictions(residuals: Sequence[Residuals]) -> list[Finding]:

@@ -10,6 +10,7 @@ import numpy as np
 
 from factorgraph_dvl.errors import SolveError
 from factorgraph_dvl.imu.timestamps import without_strays
+from factorgraph_dvl.quality.earlier_calibration import prior_findings
 from factorgraph_dvl.quality.refusal import accepted_errors, explained
 from factorgraph_dvl.quality.survey import survey
 from factorgraph_dvl.replay.record import Recorder, ReplayRecord
@@ -144,6 +145,7 @@ def _solution(trial: Trial, run: Replay, recorder: Recorder, last: Update) -> So
         )
     findings += run.counts()
     findings += consistency_findings(calibration.estimates, residuals)
+    findings += prior_findings(trial, calibration.estimates, calibration.covariance)
     why = "the prior is reported; turns and changes of speed make more of it observable"
     for e in calibration.estimates:
         findings += not_observable(e, lambda _: why)

@@ -301,6 +301,12 @@ class Code(StrEnum):
         "note",
     )
     # What a solver found.
+    PRIOR_CONTRADICTED = (
+        "prior_contradicted",
+        "The calibration that the trial starts from contradicts its data.",
+        "The result lies between the two, and fits neither.",
+        "Leave dvl.calibration out if the DVL was mounted anew; else look for what differs.",
+    )
     FAR_FROM_PRIOR = (
         "far_from_prior",
         "A value is far outside its prior.",

@@ -9,6 +9,7 @@ from functools import partial
 import numpy as np
 
 from factorgraph_dvl.graph.problem import Problem
+from factorgraph_dvl.quality.earlier_calibration import prior_findings
 from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.sensors.protocol import Motion
 from factorgraph_dvl.solution import (
@@ -66,6 +67,7 @@ def summarise(trial: Trial, found: SolvedProblem, *, rate_hz: float) -> Solution
         findings.append(Finding(Code.UNUSED, text, sensor=label))
     noise = tuple(Noise(noise_name(n), f) for n, f in problem.noise_factors.items())
     findings += consistency_findings(estimates, residuals, noise)
+    findings += prior_findings(trial, estimates, covariance)
     findings += mostly_rejected(residuals, rejected)
     findings += _unobservable(trial, problem, estimates, evaluation.motions)
     return Solution(
