@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from enum import StrEnum
 from math import isfinite
 from pathlib import Path
@@ -33,11 +34,21 @@ from factorgraph_dvl.cli.verdict import end_with, print_findings, print_verdict
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from factorgraph_dvl.analysis.comparison.halves import Halves
     from factorgraph_dvl.baselines import History
     from factorgraph_dvl.baselines.calibration import Method
     from factorgraph_dvl.errors import ConfigError
     from factorgraph_dvl.solution import Solution
     from factorgraph_dvl.trial import PlanarTrial, Trial
+
+
+@dataclass(frozen=True)
+class _Found:
+    """What a run found: the solution, how a filter converged, and the trial's halves."""
+
+    solution: Solution
+    history: History | None = None
+    halves: Halves | None = None
 
 
 class KalmanMethod(StrEnum):
@@ -67,26 +78,36 @@ def solve(
     force: Force = False,
     no_figures: NoFigures = False,
     rate: Rate = 10.0,
+    halves: Annotated[
+        bool, typer.Option("--halves", help="Solve the trial's halves too, and compare them.")
+    ] = False,
     anyway: Anyway = False,
     quiet: Quiet = False,
 ) -> None:
     """Estimate calibration and trajectory from all data of a trial."""
 
-    def run(trial: Trial, progress: ProgressLine) -> tuple[Solution, None]:
+    def run(trial: Trial, progress: ProgressLine) -> _Found:
         # The solver is slow to import: do so after the checks of the input.
+        from factorgraph_dvl.analysis.comparison.halves import halves_of
         from factorgraph_dvl.solvers.batch import solve as run_batch
 
-        return run_batch(trial, rate_hz=rate, anyway=anyway, progress=progress), None
+        parts = halves_of(trial) if halves else None
+        solution = run_batch(trial, rate_hz=rate, anyway=anyway, progress=progress)
+        if parts is None:
+            return _Found(solution)
+        return _with_halves(trial, solution, parts, progress)
 
-    def run_planar(trial: PlanarTrial, progress: ProgressLine) -> tuple[Solution, None]:
+    def run_planar(trial: PlanarTrial, progress: ProgressLine) -> _Found:
         from factorgraph_dvl.quality.plausibility_planar import planar_findings
         from factorgraph_dvl.quality.refusal import explained
         from factorgraph_dvl.ranging.planar_solution import solve_planar
 
+        if halves:
+            raise _misplaced("--halves", "a trial with an imu")
         errors = errors_in(trial, anyway=anyway)
         with explained(errors):
             solution = solve_planar(trial, rate_hz=rate, progress=progress)
-        return solution.with_findings((*errors, *planar_findings(trial))), None
+        return _Found(solution.with_findings((*errors, *planar_findings(trial))))
 
     _solve_into(
         out,
@@ -125,32 +146,32 @@ def kalman(
 
         raise ConfigError("--linear belongs to one method", expected="--method nine-state")
 
-    def run(trial: Trial, progress: ProgressLine) -> tuple[Solution, History | None]:
+    def run(trial: Trial, progress: ProgressLine) -> _Found:
         from factorgraph_dvl.baselines import calibrate
         from factorgraph_dvl.quality.refusal import explained
 
         chosen = method or KalmanMethod.POINT_SET
         if chosen.planar:
-            raise _misplaced(chosen, "a planar trial, without an imu")
+            raise _misplaced(f"method {chosen.value}", "a planar trial, without an imu")
         name = f"{chosen.value}-linear" if linear else chosen.value
         errors = errors_in(trial, anyway=anyway)
         with explained(errors):
             solution, history = calibrate(
                 trial, cast("Method", name), rate_hz=rate, progress=progress
             )
-        return solution.with_findings(errors), history
+        return _Found(solution.with_findings(errors), history)
 
-    def run_planar(trial: PlanarTrial, progress: ProgressLine) -> tuple[Solution, History]:
+    def run_planar(trial: PlanarTrial, progress: ProgressLine) -> _Found:
         from factorgraph_dvl.baselines.single_beacon import filter_planar
         from factorgraph_dvl.quality.refusal import explained
 
         chosen = method or KalmanMethod.THREE_OBSERVATIONS
         if not chosen.planar:
-            raise _misplaced(chosen, "a trial with imu, gnss and dvl")
+            raise _misplaced(f"method {chosen.value}", "a trial with imu, gnss and dvl")
         errors = errors_in(trial, anyway=anyway)
         with explained(errors):
             solution, history = filter_planar(trial, chosen.value, progress=progress)
-        return solution.with_findings(errors), history
+        return _Found(solution.with_findings(errors), history)
 
     _solve_into(
         out,
@@ -164,17 +185,36 @@ def kalman(
     )
 
 
-def _misplaced(method: KalmanMethod, expected: str) -> ConfigError:
+def _with_halves(
+    trial: Trial, solution: Solution, parts: tuple[Trial, Trial], progress: ProgressLine
+) -> _Found:
+    """Return a solution with the difference of the trial's halves, if they can be solved."""
+    from factorgraph_dvl.analysis.comparison.halves import compare_halves
+    from factorgraph_dvl.errors import FactorgraphDvlError
+    from factorgraph_dvl.sensors.finding import Code, Finding
+    from factorgraph_dvl.solvers.batch import solve as run_batch
+
+    try:
+        first, second = (run_batch(part, anyway=True, progress=progress) for part in parts)
+    except FactorgraphDvlError as error:
+        text = f"a half of the trial cannot be solved: {error}"
+        note = Finding(Code.HALVES_DIFFER, text, severity="note")
+        return _Found(solution.with_findings((note,)))
+    halves = compare_halves(trial, first, second)
+    return _Found(solution.with_findings(halves.findings()), halves=halves)
+
+
+def _misplaced(what: str, expected: str) -> ConfigError:
     from factorgraph_dvl.errors import ConfigError
 
-    return ConfigError(f"method {method.value} does not fit this trial", expected=expected)
+    return ConfigError(f"{what} does not fit this trial", expected=expected)
 
 
 def _solve_into(
     out: Path,
     trial_path: Path,
-    run: Callable[[Trial, ProgressLine], tuple[Solution, History | None]],
-    run_planar: Callable[[PlanarTrial, ProgressLine], tuple[Solution, History | None]],
+    run: Callable[[Trial, ProgressLine], _Found],
+    run_planar: Callable[[PlanarTrial, ProgressLine], _Found],
     *,
     force: bool,
     figures: bool,
@@ -185,10 +225,12 @@ def _solve_into(
     from factorgraph_dvl.io.planar_folder import is_planar, load_planar_trial
     from factorgraph_dvl.io.solution_folder import (
         FIGURES_FOLDER,
+        HALVES_FILE,
         OWNED,
         save_solution,
         write_history,
     )
+    from factorgraph_dvl.io.tables import write_table
     from factorgraph_dvl.io.trial_folder import inputs_of, load_trial
 
     claim_output(out, force=force, owned=OWNED, inputs=inputs_of(trial_path))
@@ -196,16 +238,19 @@ def _solve_into(
         trial: Trial | PlanarTrial
         if is_planar(trial_path):
             trial = load_planar_trial(trial_path)
-            solution, history = run_planar(trial, progress)
+            found = run_planar(trial, progress)
         else:
             trial = load_trial(trial_path, anyway=anyway)
-            solution, history = run(trial, progress)
+            found = run(trial, progress)
+        solution, history = found.solution, found.history
         progress("write", 0, None)
 
         def add(folder: Path) -> None:
             write_beams(trial, solution, folder)
             if history is not None:
                 write_history(folder, history.time, history.names, history.values, history.std)
+            if found.halves is not None:
+                write_table(folder / HALVES_FILE, found.halves.columns())
             write_instrument(solution, folder)
             if not figures:
                 return
@@ -217,7 +262,7 @@ def _solve_into(
                     draw_history(trial, solution, history, folder / FIGURES_FOLDER)
 
         save_solution(solution, out, force=force, extra=add)
-    _print_solution(trial, solution)
+    _print_solution(trial, found)
     print_written(out)
     end_with(solution.verdict)
 
@@ -262,14 +307,16 @@ def write_instrument(solution: Solution, folder: Path) -> None:
         (folder / INSTRUMENT_FILE).write_text(text, encoding="utf-8")
 
 
-def _print_solution(trial: Trial | PlanarTrial, solution: Solution) -> None:
+def _print_solution(trial: Trial | PlanarTrial, found: _Found) -> None:
     from factorgraph_dvl.analysis.error_statistics import calibration_errors, paper_accuracy
     from factorgraph_dvl.report.terminal.tables import (
         calibration_table,
+        halves_table,
         hypothesis_table,
         rejected_line,
     )
 
+    solution = found.solution
     print_verdict(solution)
     truth = trial.calibration_truth
     if solution.estimates:
@@ -280,6 +327,8 @@ def _print_solution(trial: Trial | PlanarTrial, solution: Solution) -> None:
         if isfinite(accuracy):
             text = "Accuracy, mean of 1 − |error / truth| of misalignment, scale and lever arm: "
             stdout().print(f"{text}{accuracy:.2f} %", markup=False, soft_wrap=True)
+    if found.halves is not None:
+        print_table(halves_table(found.halves))
     if solution.hypotheses:
         print_table(hypothesis_table(solution))
     if solution.rejected:

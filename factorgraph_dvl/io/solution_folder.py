@@ -36,12 +36,13 @@ CONVERGENCE_FILE = "convergence.csv"
 INSTRUMENT_FILE = "instrument.yaml"
 BEAMS_FILE = "beams.csv"
 BEAM_ANGLES_FILE = "beam_angles.csv"
+HALVES_FILE = "halves.csv"
 FIGURES_FOLDER = "figures"
 # What is written with a solution; the first is in every one.
 OWNED = (
     *(CALIBRATION_FILE, TRAJECTORY_FILE, HISTORY_FILE, LATENCY_FILE, CONVERGENCE_FILE),
     *(HYPOTHESES_FILE, f"{HYPOTHESES_FOLDER}/[0-9]*.csv", REJECTED_FILE),
-    *(INSTRUMENT_FILE, BEAMS_FILE, BEAM_ANGLES_FILE),
+    *(INSTRUMENT_FILE, BEAMS_FILE, BEAM_ANGLES_FILE, HALVES_FILE),
     *(
         f"{FIGURES_FOLDER}/{name}.png"
         for name in ("track", "motion", "calibration", "correlation", "error_budget")

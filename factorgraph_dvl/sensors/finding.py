@@ -307,6 +307,12 @@ class Code(StrEnum):
         "The result lies between the two, and fits neither.",
         "Leave dvl.calibration out if the DVL was mounted anew; else look for what differs.",
     )
+    HALVES_DIFFER = (
+        "halves_differ",
+        "The two halves of the trial, solved apart, differ by more than chance.",
+        "A mount or a scale that changes has no one value: the result is a mean.",
+        "Check the mount; calibrate again after it was fixed, or solve shorter trials.",
+    )
     FAR_FROM_PRIOR = (
         "far_from_prior",
         "A value is far outside its prior.",

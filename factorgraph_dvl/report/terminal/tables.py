@@ -10,6 +10,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from factorgraph_dvl.analysis.comparison.halves import Halves
 from factorgraph_dvl.analysis.convergence import Convergence
 from factorgraph_dvl.analysis.error_statistics import CalibrationErrors
 from factorgraph_dvl.errors import printable
@@ -98,6 +99,41 @@ def verdict_line(verdict: Verdict) -> Text:
         if others:
             line.append(f" (Further reasons: {len(others)}.)")
     return line
+
+
+def halves_table(halves: Halves) -> Table:
+    """Return a table of the two halves of a trial against each other."""
+    table = Table(title="Halves of the trial, solved apart")
+    add_column(table, "parameter")
+    for header in ("first", "second", "difference"):
+        add_column(table, header, numeric=True)
+    add_column(table, "unit")
+    add_column(table, "difference/σ", numeric=True)
+    rows = zip(
+        halves.names,
+        halves.first,
+        halves.first_std,
+        halves.second,
+        halves.second_std,
+        halves.difference,
+        halves.std,
+        strict=True,
+    )
+    for component, first, first_std, second, second_std, difference, std in rows:
+        name, unit = split_unit(component)
+        table.add_row(
+            name,
+            with_std(float(first), float(first_std)),
+            with_std(float(second), float(second_std)),
+            with_std(float(difference), float(std)),
+            unit,
+            fixed(float(difference / std), 2, signed=True) if std > 0.0 else "–",
+        )
+    table.caption = (
+        f"χ² {halves.statistic:.1f} with {halves.freedom} degrees of freedom, "
+        f"by chance {halves.probability:.2g}"
+    )
+    return table
 
 
 def hypothesis_table(solution: Solution) -> Table:
