@@ -246,6 +246,7 @@ def _write(
                 trial.calibration_truth,
                 found,
                 folder / FIGURES_FOLDER,
+                solution.verdict,
             )
 
     save_solution(solution, out, force=force, extra=add, smoothed=record.smoothed)

@@ -278,7 +278,7 @@ def draw_history(
     figure = convergence_figure(
         history.time, history.values, history.std, estimates, trial.calibration_truth, float("nan")
     )
-    save_figures({"convergence": figure}, folder)
+    save_figures({"convergence": figure}, folder, solution.verdict)
 
 
 def write_beams(trial: Trial | PlanarTrial, solution: Solution, folder: Path) -> None:

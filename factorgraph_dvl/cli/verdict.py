@@ -8,6 +8,7 @@ import typer
 from rich.text import Text
 
 from factorgraph_dvl.cli.console import say, stderr, stdout
+from factorgraph_dvl.errors import printable
 
 if TYPE_CHECKING:
     from factorgraph_dvl.sensors.finding import Verdict
@@ -37,6 +38,6 @@ def print_findings(solution: Solution) -> None:
 def end_with(verdict: Verdict) -> None:
     """End the command with exit code 1 if a result is not to be used."""
     if verdict.grade == "do not use":
-        text = "error: do not use this result, for the reasons above"
+        text = printable(f"error: not to be used: {verdict.reasons[0]}")
         stderr().print(Text(text, "red"), soft_wrap=True)
         raise typer.Exit(1)

@@ -17,6 +17,7 @@ import factorgraph_dvl.solvers.batch
 from factorgraph_dvl.errors import SolveError
 from factorgraph_dvl.io.solution_folder import load_solution
 from factorgraph_dvl.io.trial_folder import load_trial
+from factorgraph_dvl.sensors.finding import Code
 from factorgraph_dvl.simulation import Scenario, load_scenario
 from factorgraph_dvl.solution import Solution
 from factorgraph_dvl.trial import Trial
@@ -58,12 +59,15 @@ def test_solve_writes_a_solution_and_shows_it(
     assert stub["rate"] == 10.0
     assert stub["trial"].name == "by hand"
     row = next(line for line in result.out.splitlines() if "scale_error" in line)
-    for text in ("0.005123 ± 0.000033", "0.1", "yes", "0.005000", "+3.70"):
+    for text in ("0.005123 ± 0.000033", "0.1", "green", "0.005000", "+3.70"):
         assert text in row
     assert "3.3 ± 4.0" in result.out
     for name in ("calibration.json", "trajectory.csv", "track.png"):
         assert name in result.out
-    assert "warning: misalignment_z_deg was not observable" in result.err
+    reason = "misalignment_z_deg (±4) above the limit of 0.1 deg"
+    assert result.out.startswith(f"Verdict: doubtful: {reason}. {Code.UNCERTAIN.action}")
+    assert f"warning: {reason}" in result.err
+    assert "note: misalignment_z_deg was not observable" in result.err
     steps = [line.partition(" s  ")[2] for line in result.err.splitlines() if " s  " in line]
     assert steps == ["alignment", "batch", "batch, iteration 1, cost 12.51", "write"]
 
@@ -86,7 +90,9 @@ def test_a_solution_that_did_not_converge_is_written_and_exits_1(
     out = tmp_path / "out"
     result = run("solve", write_trial(tmp_path), "--out", out)
     assert result.code == 1
-    assert "error: not converged after 5 iterations" in result.err
+    assert result.out.startswith("Verdict: do not use: the solver did not converge in 5 iter")
+    assert "error: not to be used: the solver did not converge in 5 iterations" in result.err
+    assert not (out / "instrument.yaml").exists()
     assert json.loads((out / "calibration.json").read_text())["converged"] is False
 
 

@@ -26,6 +26,7 @@ from factorgraph_dvl.report.figures.drawing import (
     style,
 )
 from factorgraph_dvl.report.text import split_unit
+from factorgraph_dvl.sensors.finding import Verdict
 from factorgraph_dvl.solution import Estimate
 
 _POINTS = 2000
@@ -42,6 +43,7 @@ def write_convergence_figures(
     truth: Mapping[str, ArrayLike],
     found: Convergence,
     folder: Path,
+    verdict: Verdict,
 ) -> list[Path]:
     """Draw `convergence.png` and `latency.png`.
 
@@ -61,6 +63,8 @@ def write_convergence_figures(
         When they were good enough.
     folder : path-like
         Where the files go.
+    verdict : Verdict
+        On the calibration.
     """
     pick = np.unique(np.linspace(0, time.size - 1, min(time.size, _POINTS)).astype(int))
     figures = {
@@ -69,7 +73,7 @@ def write_convergence_figures(
         ),
         "latency": latency_figure(time, latency),
     }
-    return save_figures(figures, folder)
+    return save_figures(figures, folder, verdict)
 
 
 def convergence_figure(

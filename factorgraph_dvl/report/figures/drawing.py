@@ -13,6 +13,7 @@ from matplotlib.gridspec import GridSpec
 from numpy.typing import NDArray
 
 from factorgraph_dvl.analysis.error_statistics import TrajectoryErrors, VectorErrors
+from factorgraph_dvl.sensors.finding import Verdict
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.report.text import fixed
 
@@ -23,6 +24,7 @@ GREY = "#8a8a8a"
 MEDIUM = "#b5b5b5"
 LIGHT = "#e9e9e9"
 PALE = "#f5f5f5"
+VERDICT_COLOURS = {"good": "#2e7d32", "doubtful": "#b26a00", "do not use": "#c62828"}
 SMALL = 7.5
 NORMAL = 8.5
 TITLE = 10.5
@@ -37,10 +39,19 @@ _MOST_CROSSINGS = 500.0
 _MOST_CROSSINGS_OF_NOISE = 1600.0
 
 
-def save_figures(figures: Mapping[str, Figure], folder: Path) -> list[Path]:
-    """Write figures as PNG files under their names; return the paths."""
+def save_figures(
+    figures: Mapping[str, Figure], folder: Path, verdict: Verdict | None = None
+) -> list[Path]:
+    """Write figures as PNG files under their names; return the paths.
+
+    The verdict on what they show, if there is one, stands in the upper right corner.
+    """
     paths = []
     for name, figure in figures.items():
+        if verdict is not None:
+            label = ": ".join([verdict.grade, *(r.code for r in verdict.reasons[:1])])
+            colour = VERDICT_COLOURS[verdict.grade]
+            figure.text(0.997, 0.995, label, ha="right", va="top", fontsize=SMALL, color=colour)
         path = folder / f"{name}.png"
         # Unlike `savefig` this draws only once. The fastest compression level is good
         # enough for line drawings.

@@ -68,7 +68,7 @@ def write_figures(trial: Trial | PlanarTrial, solution: Solution, folder: Path) 
     if solution.error_budget:
         figures["error_budget"] = error_budget_figure(solution)
 
-    return save_figures(figures, folder)
+    return save_figures(figures, folder, solution.verdict)
 
 
 def _thinned(trajectory: Trajectory) -> Trajectory:

@@ -1,0 +1,84 @@
+"""What is graded `do not use` is refused, wherever a result is used."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from builders import build_solution, build_trial, edit, write_trial
+from running import Run
+
+from factorgraph_dvl.errors import DataError
+from factorgraph_dvl.io.solution_folder import save_solution
+from factorgraph_dvl.io.trial_folder import load_trial
+from factorgraph_dvl.sensors.finding import Code, Finding
+from factorgraph_dvl.solution import Estimate
+
+REASON = "DVL velocity: residuals are 14 times as large as stated"
+REFUSAL = f"graded `do not use`: {REASON}"
+
+
+def condemned():
+    """A complete calibration that the data contradict."""
+    arm = Estimate(
+        "lever_arm_m",
+        ("lever_arm_x_m", "lever_arm_y_m", "lever_arm_z_m"),
+        *(np.ones(3), np.full(3, 0.01), np.zeros(3), np.full(3, 10.0), np.ones(3, bool)),
+    )
+    solution = build_solution(body_axes="RFU")
+    estimates = (*solution.estimates, arm)
+    std = np.concatenate([e.std for e in estimates])
+    sensor, _, text = REASON.partition(": ")
+    return replace(
+        solution,
+        estimates=estimates,
+        covariance=np.diag(std**2),
+        findings=(Finding(Code.DOES_NOT_FIT, text, sensor=sensor),),
+    )
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A trial, and results that are not to be used."""
+    root = tmp_path_factory.mktemp("verdict")
+    write_trial(root, build_trial(seconds=20.0, calibration_truth={}))
+    save_solution(condemned(), root / "bad")
+    return root
+
+
+def commands(root: Path, out: Path) -> dict[str, list[object]]:
+    written = ["--out", out, "--no-figures"]
+    reckon = ["deadreckon", root / "trial", "--quiet", *written, "--calibration"]
+    return {
+        "instrument": ["instrument", root / "bad"],
+        "crosscheck": ["crosscheck", root / "bad", root / "bad", *written],
+        "deadreckon": [*reckon, root / "bad", "--attitude", "reference"],
+        "attitude": [*reckon, root / "values.json", "--attitude", root / "bad"],
+    }
+
+
+@pytest.mark.parametrize("name", ["instrument", "crosscheck", "deadreckon", "attitude"])
+def test_a_result_that_is_not_to_be_used_is_refused(
+    name: str, folder: Path, tmp_path: Path, run: Run
+) -> None:
+    (folder / "values.json").write_text('{"misalignment_deg": [1, 2, 3]}')
+    command = commands(folder, tmp_path / "out")[name]
+    refused = run(*command)
+    assert refused.code == 2
+    assert REFUSAL in refused.err
+    assert "--anyway" in refused.err
+    assert not (tmp_path / "out").exists()
+    assert REFUSAL not in run(*command, "--anyway").err
+
+
+def test_a_prior_that_is_not_to_be_used_is_refused(folder: Path, tmp_path: Path) -> None:
+    path = write_trial(tmp_path, build_trial(seconds=20.0))
+    calibration = folder / "bad" / "calibration.json"
+    edit(path / "trial.yaml", "dvl:\n", f"dvl:\n  calibration: {calibration}\n")
+    with pytest.raises(DataError, match="graded `do not use`: DVL velocity"):
+        load_trial(path)
+    (note,) = load_trial(path, anyway=True).notes
+    assert (note.code, note.severity) == (Code.UNUSABLE_PRIOR, "warning")
+    assert REASON in note.text
