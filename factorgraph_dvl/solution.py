@@ -230,6 +230,11 @@ class Hypothesis:
     history: Array
 
 
+def grades_of(estimate: Estimate, limits: Mapping[str, float]) -> tuple[Grade, ...]:
+    """Return the grade of each component of a parameter against its limit, if it has one."""
+    return grades(estimate.std, estimate.observable, limits.get(estimate.name, np.inf))
+
+
 class Judged:
     """What a result's findings and standard deviations amount to."""
 
@@ -252,10 +257,7 @@ class Judged:
     @property
     def grades(self) -> dict[str, tuple[Grade, ...]]:
         """Grade of each component of each parameter, by reported name."""
-        return {
-            e.name: grades(e.std, e.observable, self.limits.get(e.name, np.inf))
-            for e in self.estimates
-        }
+        return {e.name: grades_of(e, self.limits) for e in self.estimates}
 
     @property
     def verdict(self) -> Verdict:

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from factorgraph_dvl.analysis.information.segment_singular_values import dominant, readable_basis
 from factorgraph_dvl.geometry.vectors import Array
-from factorgraph_dvl.solution import Estimate
+from factorgraph_dvl.sensors.grades import DEFAULT_LIMITS, Grade
+from factorgraph_dvl.solution import Estimate, grades_of
 
 # Chosen: a direction is undetermined if at least half of the prior's σ remains; above the second
 # share the data do not inform it at all.
@@ -55,6 +56,8 @@ class Marginals:
         Value, posterior and prior standard deviation, in reported units.
     observable : ndarray of bool, shape (P,)
         Whether the data at least halved the prior's σ.
+    grade : tuple of Grade
+        Of the posterior standard deviation against its limit.
     correlation : ndarray, shape (P, P)
         Correlation of the posterior.
     directions : tuple of Direction
@@ -68,6 +71,7 @@ class Marginals:
     std: Array
     prior_std: Array
     observable: np.ndarray
+    grade: tuple[Grade, ...]
     correlation: Array
     directions: tuple[Direction, ...]
     sentences: tuple[str, ...]
@@ -78,7 +82,11 @@ class Marginals:
         return self.std / self.prior_std
 
 
-def marginals(estimates: Sequence[Estimate], covariance: Array) -> Marginals | None:
+def marginals(
+    estimates: Sequence[Estimate],
+    covariance: Array,
+    limits: Mapping[str, float] = DEFAULT_LIMITS,
+) -> Marginals | None:
     """Return posterior against prior; None if nothing was estimated from a known prior.
 
     Parameters
@@ -87,12 +95,15 @@ def marginals(estimates: Sequence[Estimate], covariance: Array) -> Marginals | N
         Estimates of the calibration.
     covariance : ndarray
         Joint covariance of all components, in reported units.
+    limits : mapping of str to float, optional
+        Standard deviations that are good enough, by parameter.
     """
     names = np.array([n for e in estimates for n in e.component_names], dtype=object)
     value, std, prior, observable = (
         np.concatenate([np.empty(0), *(np.asarray(getattr(e, field)) for e in estimates)])
         for field in ("value", "std", "prior_std", "observable")
     )
+    grade = [g for e in estimates for g in grades_of(e, limits)]
     free = np.isfinite(std) & (std > 0.0) & np.isfinite(prior) & (prior > 0.0)
     if not free.any():
         return None
@@ -107,6 +118,7 @@ def marginals(estimates: Sequence[Estimate], covariance: Array) -> Marginals | N
         std=std[free],
         prior_std=prior[free],
         observable=observable[free].astype(bool),
+        grade=tuple(grade[i] for i in np.flatnonzero(free)),
         correlation=correlation,
         directions=directions,
         sentences=(

@@ -118,7 +118,7 @@ def observability(
         margin = 0.0 if given else _MARGIN_S
         points, why = point_set(solution, trial, segments, margin)
         missing += why
-    view = marginals(solution.estimates, solution.covariance)
+    view = marginals(solution.estimates, solution.covariance, solution.limits)
     if view is None:
         missing.append("posterior against prior: nothing was estimated from a known prior")
     shares = None

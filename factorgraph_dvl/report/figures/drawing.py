@@ -13,9 +13,9 @@ from matplotlib.gridspec import GridSpec
 from numpy.typing import NDArray
 
 from factorgraph_dvl.analysis.error_statistics import TrajectoryErrors, VectorErrors
-from factorgraph_dvl.sensors.finding import Verdict
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.report.text import fixed
+from factorgraph_dvl.sensors.finding import Verdict
 
 ACCENT = "#0a6ebd"
 ACCENT_LIGHT = "#bcd9f0"

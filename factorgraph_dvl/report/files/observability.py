@@ -161,6 +161,7 @@ def _marginals(m: Marginals) -> dict[str, Any]:
                 "prior_std": float(m.prior_std[i]),
                 "std_over_prior": float(m.ratio[i]),
                 "observable": bool(m.observable[i]),
+                "grade": m.grade[i],
             }
             for i, name in enumerate(m.names)
         },

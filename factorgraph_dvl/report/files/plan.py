@@ -53,6 +53,7 @@ def to_json(
                     "std": float(e.std[i]),
                     "prior_std": float(e.prior_std[i]),
                     "observable": bool(e.observable[i]),
+                    "grade": solution.grades[e.name][i],
                 }
                 for e in solution.estimates
                 for i, name in enumerate(e.component_names)

@@ -11,7 +11,7 @@ from rich.text import Text
 from factorgraph_dvl.analysis.information.marginals import Marginals
 from factorgraph_dvl.analysis.information.observability import Observability
 from factorgraph_dvl.geometry.units import DEG
-from factorgraph_dvl.report.terminal.tables import add_column
+from factorgraph_dvl.report.terminal.tables import GRADES, add_column
 from factorgraph_dvl.report.text import fixed, split_unit, with_std
 
 # Chosen: more rows do not fit on a screen.
@@ -74,6 +74,7 @@ def marginal_table(view: Observability) -> Table:
     add_column(table, "prior std", numeric=True)
     add_column(table, "std/prior", numeric=True)
     add_column(table, "observable")
+    add_column(table, "grade")
     if view.shares is not None:
         add_column(table, "information from")
     for i, component in enumerate(m.names):
@@ -85,6 +86,7 @@ def marginal_table(view: Observability) -> Table:
             f"{float(m.prior_std[i]):.3g}",
             f"{float(m.ratio[i]):.2g}",
             Text("yes", "green") if m.observable[i] else Text("no", "yellow"),
+            Text(m.grade[i], GRADES[m.grade[i]]),
         ]
         if view.shares is not None:
             row.append(_sources(view, component))

@@ -23,8 +23,9 @@ from factorgraph_dvl.solution import Solution
 
 # Of findings, by severity.
 STYLES = {"error": "red", "warning": "yellow", "note": "", "ok": "green"}
+# Of verdicts and grades.
 _VERDICTS = {"good": "green", "doubtful": "yellow", "do not use": "red"}
-_GRADES = {"green": "green", "orange": "yellow", "red": "red", "grey": "dim"}
+GRADES = {"green": "green", "orange": "yellow", "red": "red", "grey": "dim"}
 # Chosen: wider than any table, in columns.
 _UNLIMITED = 10_000
 
@@ -79,7 +80,7 @@ def _calibration_table(
             else:
                 row = [name, value, unit, f"{float(estimate.prior_std[i]):.3g}"]
             grade = grades[estimate.name][i]
-            row.append(Text(grade, _GRADES[grade]))
+            row.append(Text(grade, GRADES[grade]))
             if component in known:
                 truth, normalised = known[component]
                 row.append(at_precision(truth, std))
