@@ -30,9 +30,10 @@ _FAR_FROM_PRIOR = 5.0
 # Standard deviations by which a wrong prior may draw a value. Chosen: one is within what is
 # claimed.
 _DRAWS = 1.0
-# Share of the prior's standard deviation that is left where the data tell something. Chosen:
-# far from rounding.
-_TOLD = 0.9999
+# Share of the prior's standard deviation that may be left for the data to say anything. Chosen:
+# they are then at most three times less sharp than the prior; of less, errors of the model that
+# hardly matter make a contradiction.
+_TOLD = 0.95
 # Evidence against a minimum with which it is not worth a word: its probability is e^-15.
 _IMPOSSIBLE = 15.0
 # The data observed a component if they at least halved what was unknown of it.
@@ -513,19 +514,21 @@ def _far_from_prior(e: Estimate) -> list[Finding]:
     worst = int(np.argmax(apart))
     if not apart[worst] > _FAR_FROM_PRIOR:
         return []
-    draws = float((moved * e.std[told] / rest)[worst])
+    mean, prior_std, std = (x[told][worst] for x in (e.prior_value, e.prior_std, e.std))
+    gain = prior_std**2 / rest[worst]
+    alone = mean + gain * (e.value[told][worst] - mean)
+    draws = moved[worst] * std / rest[worst]
     name = np.array(e.component_names)[told][worst]
     effect = (
-        f"it draws the value by {draws:.1f} of its standard deviations: do not use the values"
+        f"it draws the value by {draws:.2g} of its standard deviations, and others with it"
         if draws > _DRAWS
         else "the data outweigh it, but a unit, an axis or the model may be wrong"
     )
     return [
         Finding(
             Code.FAR_FROM_PRIOR,
-            f"{name} is {e.value[told][worst]:.4g}, {apart[worst]:.0f} standard deviations from "
-            f"its prior, {e.prior_value[told][worst]:.4g} ± {e.prior_std[told][worst]:.2g}; "
-            + effect,
+            f"the data say {name} {alone:.3g} ± {std * np.sqrt(gain):.1g}, {apart[worst]:.0f} "
+            f"standard deviations from its prior, {mean:.3g} ± {prior_std:.2g}; {effect}",
             parameter=e.name,
             severity="error" if draws > _DRAWS else "warning",
         )

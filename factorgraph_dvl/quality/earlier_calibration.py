@@ -18,9 +18,9 @@ from factorgraph_dvl.trial import Trial
 DOUBTFUL_P = 1e-3
 CONTRADICTED_P = 1e-6
 # Share of the prior's variance that the data must take away along a direction for them to say
-# anything about it. Chosen: far above rounding, and a prior that is a hundred times sharper
-# than the data is still tested.
-_LEAST_SHARE = 1e-4
+# anything about it. Chosen: a prior that is ten times sharper than the data is still tested; of
+# less, errors of the model that hardly matter make a contradiction.
+_LEAST_SHARE = 0.01
 
 
 @dataclass(frozen=True)

@@ -313,18 +313,18 @@ class Code(StrEnum):
         "A mount or a scale that changes has no one value: the result is a mean.",
         "Check the mount; calibrate again after it was fixed, or solve shorter trials.",
     )
-    FAR_FROM_PRIOR = (
-        "far_from_prior",
-        "A value is far outside its prior.",
-        "Either the prior is wrong, which draws all values with it, or the data are.",
-        "Check prior, units and axes before you use any value.",
-    )
     DOES_NOT_FIT = (
         "does_not_fit",
         "Residuals are so large that the model does not fit the data.",
         "Values and standard deviations are those of a model that the data contradict.",
         "Check lever arm, clock, units and axes; do not use the values.",
         "error",
+    )
+    FAR_FROM_PRIOR = (
+        "far_from_prior",
+        "A value is far outside its prior.",
+        "Either the prior is wrong, which draws all values with it, or the data are.",
+        "Check clocks, units, axes and lever arms, and then the prior itself.",
     )
     LARGE_RESIDUALS = (
         "large_residuals",
