@@ -30,6 +30,8 @@ _FAR_FROM_PRIOR = 5.0
 # Standard deviations by which a wrong prior may draw a value. Chosen: one is within what is
 # claimed.
 _DRAWS = 1.0
+# Factors on a stated noise that no one need look into. Chosen: data sheets are as far off.
+NOISE_FACTORS = (0.5, 2.0)
 # Share of the prior's standard deviation that may be left for the data to say anything. Chosen:
 # they are then at most three times less sharp than the prior; of less, errors of the model that
 # hardly matter make a contradiction.
@@ -487,14 +489,19 @@ def consistency_findings(
             effect = "are too small until you correct it"
             if factor is not None:
                 effect = "allow for that, as far as it is noise and no lasting error"
+            allowed = factor is not None and np.nanmax(factor) <= NOISE_FACTORS[1]
             out.append(
                 Finding(
                     Code.LARGE_RESIDUALS,
                     f"residuals are {rms:.1f} times as large as their stated standard deviation; "
                     f"the reported standard deviations {effect}",
                     sensor=r.label,
+                    severity="note" if allowed else "warning",
                 )
             )
+        if factor is not None and np.nanmin(factor) < NOISE_FACTORS[0]:
+            text = f"the noise is {np.nanmin(factor):.2g} times its stated standard deviation"
+            out.append(Finding(Code.SMALL_RESIDUALS, text, sensor=r.label))
     return out
 
 

@@ -332,6 +332,12 @@ class Code(StrEnum):
         "Standard deviations allow for it where the noise was estimated; else they are too small.",
         "Correct the standard deviation of the sensor; check clock and lever arm.",
     )
+    SMALL_RESIDUALS = (
+        "small_residuals",
+        "The noise of a sensor is less than half of what is stated.",
+        "Errors that wander, as those of GNSS do, hide in the trajectory and leave little noise.",
+        "Correct the standard deviation of the sensor; state what wanders as correlated.",
+    )
     NOISE_NOT_SETTLED = (
         "noise_not_settled",
         "The noise of a sensor comes out the larger the more of it is allowed for.",

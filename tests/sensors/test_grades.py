@@ -12,6 +12,7 @@ from builders import build_solution
 from factorgraph_dvl.io.trial_yaml import LimitSettings
 from factorgraph_dvl.sensors.finding import Code, Finding, verdict_of
 from factorgraph_dvl.sensors.grades import DEFAULT_LIMITS, grades
+from factorgraph_dvl.solution import Noise, Residuals, consistency_findings
 
 
 def test_grades_compare_with_the_limit():
@@ -72,3 +73,26 @@ def test_without_convergence_nothing_is_to_be_used(findings):
     verdict = replace(known(), converged=False, findings=findings).verdict
     assert verdict.grade == "do not use"
     assert verdict.reasons[0].code == (Code.DOES_NOT_FIT if findings else Code.NOT_CONVERGED)
+
+
+@pytest.mark.parametrize(
+    ("size", "factor", "found"),
+    [
+        (1.0, (1.0, 1.0), []),
+        (1.6, (1.5, 1.7), [(Code.LARGE_RESIDUALS, "note")]),
+        (1.6, None, [(Code.LARGE_RESIDUALS, "warning")]),
+        (2.0, (1.5, 2.2), [(Code.LARGE_RESIDUALS, "warning")]),
+        (0.5, (0.4, 0.6), [(Code.SMALL_RESIDUALS, "warning")]),
+        (11.0, None, [(Code.DOES_NOT_FIT, "error")]),
+    ],
+)
+def test_noise_is_a_reason_where_it_is_far_from_what_is_stated(size, factor, found):
+    scale = 1.0 if factor is None else np.array(factor)
+    residuals = Residuals(
+        *("DVL velocity", "m/s", ("x", "y"), np.arange(50.0)),
+        residual=np.full((50, 2), size),
+        sigma=np.ones((50, 2)) * scale,
+    )
+    noise = [] if factor is None else [Noise("dvl_velocity", np.array(factor))]
+    findings = consistency_findings([], [residuals], noise)
+    assert [(f.code, f.severity) for f in findings] == found
