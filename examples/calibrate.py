@@ -33,8 +33,9 @@ def main(path: Path) -> None:
         ):
             remark = "" if observable else "  (not observable)"
             print(f"{name:>22} = {value:10.5f} ± {std:.5f}{remark}")
-    for warning in solution.warnings:
-        print(f"warning: {warning}")
+    print(f"verdict: {solution.verdict.grade}")
+    for reason in solution.verdict.reasons:
+        print(f"- {reason}. {reason.code.action}")
 
     if trial.dvl is not None:
         # C_b^d takes body components to DVL components; its transpose brings them back.

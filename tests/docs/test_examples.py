@@ -34,7 +34,9 @@ def test_python_of_the_readme(monkeypatch, tmp_path, capsys):
         (tmp_path / name).symlink_to(ROOT / name)
     monkeypatch.chdir(tmp_path)
     exec(compile(blocks[0], "README.md", "exec"), {})
-    assert "observable: [ True  True  True]" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "observable: [ True  True  True]" in printed
+    assert "verdict: good\n" in printed
     assert load_solution(tmp_path / "out-python").converged
 
 
