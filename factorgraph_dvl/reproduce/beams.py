@@ -270,7 +270,7 @@ BEAMS = Paper(
         Entry("claim 6, step 4", "error equations, EKF", "`baselines/beam_filter`", _step_4),
         Entry("step 5", "the filter corrects the SINS", _FILTER, _step_5),
         Entry("claim 1, step 6", "corrected α_i, θ_i", "`analysis/beam_angles`", _step_6),
-        Entry("claim 7 (background)", "beams are not symmetric", "`solve`", _asymmetry),
-        Entry("claim 8 (step 2)", "velocity from GPS", _FILTER, _gnss),
+        Entry("background", "beams are not symmetric", "`solve`", _asymmetry),
+        Entry("step 2 (GPS)", "velocity from GPS", _FILTER, _gnss),
     ),
 )

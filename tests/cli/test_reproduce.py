@@ -45,6 +45,16 @@ def test_modules_and_configurations_that_entries_name_are_there(name):
             assert list((root / inside).glob(pattern)), entry.where
 
 
+@pytest.mark.parametrize("name", sorted(PAPERS))
+def test_the_page_of_all_publications_has_every_item(name):
+    page = Path(__file__).resolve().parents[2] / "docs" / "papers.md"
+    lines = page.read_text(encoding="utf-8").splitlines()
+    for entry in PAPERS[name].entries:
+        found = [x for x in lines if x.startswith(f"| {entry.label} | {entry.says} | ")]
+        assert found, f"{name}, {entry.label}: run benchmarks/papers.py --out docs"
+        assert found[0].rpartition(" | ")[2].strip(" |") in VERDICTS
+
+
 def test_one_table(run, tmp_path):  # noqa: F811
     result = run("reproduce", "luo-2024", "--table", "3", "--out", tmp_path / "out", "--quiet")
     assert result.code == 0, result.err
