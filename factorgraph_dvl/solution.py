@@ -432,7 +432,7 @@ def as_estimates(
 ) -> tuple[Estimate, ...]:
     """Return parameters with their values (n,) and covariance (n, n), in reported units.
 
-    Components of which the data tell only a sum are `unseparated`, so not observable.
+    Components of which the data determine only a sum are `unseparated`, so not observable.
     """
     std = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     estimates, at = [], 0
@@ -509,7 +509,7 @@ def _far_from_prior(e: Estimate) -> list[Finding]:
     """Return a finding if a component is far from its prior, by the data alone.
 
     The difference x - x0 of posterior and prior has the variance σ0² - σ²; without the prior
-    x would be (x - x0) σ² / (σ0² - σ²) further away. The standard deviations by which other
+    x would be (x - x0) σ² / (σ0² - σ²) further deviation. The standard deviations by which other
     parameters would move are fewer.
     """
     told = e.std < _TOLD * e.prior_std
@@ -573,7 +573,7 @@ def contradictions(residuals: Sequence[Residuals]) -> list[Finding]:
 
 
 def mixed(trajectories: Sequence[Trajectory], weights: Array) -> Trajectory:
-    """Return the first of some trajectories, with covariances that admit to the others.
+    """Return the first of some trajectories, with covariances that include the others.
 
     With weights w, covariances P and differences d from the first, the mean square error of
     the first is the sum of w (P + d dᵀ).
@@ -596,8 +596,8 @@ def mixed(trajectories: Sequence[Trajectory], weights: Array) -> Trajectory:
     def spread(values: Sequence[Array], covs: Sequence[Array]) -> Array:
         out = np.zeros_like(covs[0])
         for w, value, cov in zip(share, values, covs, strict=True):
-            away = value - values[0]
-            out += w * (cov + away[:, :, None] * away[:, None, :])
+            deviation = value - values[0]
+            out += w * (cov + deviation[:, :, None] * deviation[:, None, :])
         return out
 
     return replace(
@@ -624,7 +624,7 @@ def ambiguity(hypotheses: Sequence[Hypothesis]) -> list[Finding]:
             Code.AMBIGUOUS,
             f"{len(living)} trajectories fit the data (weights {weights}), {apart:.3g} m apart at "
             "the end: the answer is ambiguous. The standard deviations contain all of them; a "
-            "turn of 30 degrees or more, or `initial.position`, would tell which is right",
+            "turn of 30 degrees or more, or `initial.position`, would show which is right",
         )
     ]
 
@@ -663,7 +663,7 @@ def joined(
     )
 
 
-def not_told_apart(solutions: Sequence[Solution], against: Array) -> Solution:
+def most_probable_minimum(solutions: Sequence[Solution], against: Array) -> Solution:
     """Return the most probable of some minima of one problem, with the spread of the others.
 
     Parameters
@@ -682,8 +682,8 @@ def not_told_apart(solutions: Sequence[Solution], against: Array) -> Solution:
     values = [np.concatenate([e.value for e in solutions[i].estimates]) for i in order]
     covariance = np.zeros_like(best.covariance)
     for i, weight, value in zip(order, weights, values, strict=True):
-        away = value - values[0]
-        covariance += weight * (solutions[i].covariance + np.outer(away, away))
+        deviation = value - values[0]
+        covariance += weight * (solutions[i].covariance + np.outer(deviation, deviation))
     std = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     estimates, at = [], 0
     for k, e in enumerate(best.estimates):
@@ -713,7 +713,7 @@ def not_told_apart(solutions: Sequence[Solution], against: Array) -> Solution:
                 Code.AMBIGUOUS,
                 f"{len(order)} minima fit the data (weights {shares}), the others at {turned}: "
                 "the answer is ambiguous. The standard deviations contain all of them; a longer "
-                "trial with turns and changes of speed would tell which is right",
+                "trial with turns and changes of speed would show which is right",
             ),
         ),
     )

@@ -9,10 +9,15 @@ PACKAGE = Path(__file__).parent.parent / "factorgraph_dvl"
 
 # Word that must not occur, and the term to use instead.
 REPLACED = {
+    "admit": "allow",
+    "admits": "allows",
     "anchoring": "position from ranges",
+    "away": "deviation",
     "badness": "shortfall",
+    "doubt": "contradiction",
     "doubts": "consistency warnings",
     "foreign": "external",
+    "lacking": "short of limits",
     "lean": "bias Jacobian",
     "misweighed": "needs reweighting",
     "sailed": "carried out",
@@ -20,6 +25,9 @@ REPLACED = {
     "shelf": "library",
     "slid": "extrapolated",
     "strayed": "needs rebinding",
+    "tell": "show, determine",
+    "tells": "shows, determines",
+    "told": "informed",
     "untold": "uninformed",
     "wavering": "varying",
 }

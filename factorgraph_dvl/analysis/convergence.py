@@ -48,7 +48,7 @@ class Convergence:
         Those with a limit.
     good_since : float
         Time from which on all standard deviations stayed below their limits, and no measurements
-        were in doubt, s; nan = never.
+        were contradictory, s; nan = never.
     """
 
     components: tuple[ComponentConvergence, ...]
@@ -123,7 +123,9 @@ def check_limits(trial: Trial, limits: Iterable[str]) -> None:
             )
 
 
-def lacking(estimates: Sequence[Estimate], good_std: Mapping[str, float]) -> tuple[str, ...]:
+def short_of_limits(
+    estimates: Sequence[Estimate], good_std: Mapping[str, float]
+) -> tuple[str, ...]:
     """Return the components whose standard deviations are above their limits."""
     return tuple(
         name

@@ -50,7 +50,7 @@ def point_set(
 ) -> Outcome:
     """Calibrate with the seven-state filter.
 
-    From more than 90 degrees away the small-angle model ends in the mirror image, turned
+    From more than 90 degrees off the small-angle model ends in the mirror image, turned
     by 180 degrees with a scale error near -2. The filter then starts once more, from the
     best of the 24 rotations of a cube.
 
@@ -151,7 +151,7 @@ def _filter(
 
 
 def _settle(sums: _Sums, prior: Estimated, at: Array) -> tuple[Estimated, bool]:
-    """Return the estimate from which no step leads away, and whether there is one."""
+    """Return the estimate at which steps end, and whether there is one."""
     for _ in range(_STEPS):
         estimated, moved = _step(sums, prior, at)
         at = estimated.values[0]

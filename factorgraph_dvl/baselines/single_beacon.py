@@ -212,14 +212,14 @@ def run_filter(trial: PlanarTrial, method: Method | str, mean: Array, std: Array
         above = height[i] - frame.height - place[2]
         u, C = dead_reckoning.velocity(time)
         if not np.isnan(beacons.range[i]):
-            x, P, away, sigma = _by_range(
+            x, P, innovation, sigma = _by_range(
                 x, P, place, above, beacons.range[i], settings.range_std_m
             )
-            innovations_of["range"].append((time, away, sigma))
+            innovations_of["range"].append((time, innovation, sigma))
         if method == "4sv-3ob" and not np.isnan(beacons.range_rate[i]):
             rate, rate_std = beacons.range_rate[i], settings.range_rate_std_m_s
-            x, P, away, sigma = _by_rate(x, P, place, above, u, C, rate, rate_std)
-            innovations_of["range rate"].append((time, away, sigma))
+            x, P, innovation, sigma = _by_rate(x, P, place, above, u, C, rate, rate_std)
+            innovations_of["range rate"].append((time, innovation, sigma))
         times.append(time)
         states.append(x)
         covariances.append(P)
@@ -254,16 +254,16 @@ def _depends_on_start(
         return [Finding(Code.FILTER_CONTRADICTED, text)]
     apart, most = 0.0, 0.0
     for move in (*np.diag(std), *-np.diag(std)):
-        away = run_filter(trial, method, mean + move, std).state[-1] - found.state[-1]
-        sigmas = float(np.sqrt(away @ np.linalg.solve(P, away)))
+        moved = run_filter(trial, method, mean + move, std).state[-1] - found.state[-1]
+        sigmas = float(np.sqrt(moved @ np.linalg.solve(P, moved)))
         if not sigmas <= most:
-            most, apart = sigmas, float(np.hypot(*away[:2]))
+            most, apart = sigmas, float(np.hypot(*moved[:2]))
     if most <= _LARGEST_EFFECT:
         return []
     return [
         Finding(
             Code.FILTER_CONTRADICTED,
-            f"from a start that is one standard deviation away the filter ends {apart:.3g} m, or "
+            f"from a start that is one standard deviation off the filter ends {apart:.3g} m, or "
             f"{most:.3g} standard deviations, from where it did: it has not converged, and may "
             "have gone to a mirror image; `solve` follows all of them",
         )
@@ -334,9 +334,9 @@ def _by_range(
     the range times r / d.
     """
     distance = np.sqrt(max(measured**2 - above**2, 1.0))
-    away = x[:2] - place[:2]
-    predicted = max(float(np.hypot(*away)), 1e-3)
-    H = np.array([*(away / predicted), 0.0, 0.0])
+    separation = x[:2] - place[:2]
+    predicted = max(float(np.hypot(*separation)), 1e-3)
+    H = np.array([*(separation / predicted), 0.0, 0.0])
     return _update(x, P, H, distance - predicted, (std * measured / distance) ** 2)
 
 
@@ -351,9 +351,9 @@ def _by_rate(
     std: float,
 ) -> _Updated:
     """Return what a range rate makes; the vertical velocity is taken as 0."""
-    away = x[:2] - place[:2]
-    distance = max(float(np.sqrt(away @ away + above**2)), 1e-3)
-    direction = away / distance
+    separation = x[:2] - place[:2]
+    distance = max(float(np.sqrt(separation @ separation + above**2)), 1e-3)
+    direction = separation / distance
     v = u + x[2:]
     rate = float(direction @ v)
     H = np.concatenate([(v - rate * direction) / distance, direction])

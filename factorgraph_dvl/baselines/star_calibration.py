@@ -210,7 +210,7 @@ def _summary(
         findings.append(
             Finding(
                 Code.STAR_VERTICAL,
-                f"its attitudes put the vertical {np.degrees(tilt):.1f} deg away from that of the "
+                f"its attitudes put the vertical {np.degrees(tilt):.1f} deg from that of the "
                 "specific force: are `epoch` and `mounting_deg` right? Do not use the attitude "
                 "before they are corrected",
                 sensor=star.label,

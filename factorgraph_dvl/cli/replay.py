@@ -155,7 +155,7 @@ def _run(
     if live:
         from rich.live import Live
 
-        from factorgraph_dvl.analysis.convergence import lacking
+        from factorgraph_dvl.analysis.convergence import short_of_limits
         from factorgraph_dvl.report.terminal.live import live_view
 
         since: float | None = None
@@ -166,7 +166,7 @@ def _run(
 
             def show(update: Update) -> None:
                 nonlocal shown, since
-                bad = lacking(update.calibration.estimates, trial.limits)
+                bad = short_of_limits(update.calibration.estimates, trial.limits)
                 if bad or update.inconsistent:
                     since = None
                 elif since is None:
@@ -183,7 +183,7 @@ def _run(
                             latency=update.latency,
                             speed=speed(update),
                             inconsistent=update.inconsistent,
-                            lacking=bad,
+                            short_of_limits=bad,
                             good_since=since,
                         )
                     )
@@ -194,14 +194,14 @@ def _run(
 
             return run(trial, smoother=kind, lag_s=lag, rate_hz=rate, anyway=anyway, watch=show)
 
-    def tell(update: Update) -> None:
+    def print_update(update: Update) -> None:
         nonlocal shown
         now = perf_counter()
         if now - shown > 2.0:
             shown = now
             progress(f"at {update.time - first:.0f} s, {speed(update):.0f} times real time")
 
-    return run(trial, smoother=kind, lag_s=lag, rate_hz=rate, anyway=anyway, watch=tell)
+    return run(trial, smoother=kind, lag_s=lag, rate_hz=rate, anyway=anyway, watch=print_update)
 
 
 def _write(

@@ -60,7 +60,7 @@ def _utc(epoch: str) -> tuple[float, float]:
     """Return the Julian day at midnight, and the fraction of the day, of an epoch."""
     if not epoch:
         raise ConfigError(
-            "the trial has no `epoch`, and stars tell the attitude only at a known time",
+            "the trial has no `epoch`, and stars give the attitude only at a known time",
             where="trial.yaml key epoch",
             expected="UTC of time_s = 0, such as 2022-10-12T02:00:00Z",
         )

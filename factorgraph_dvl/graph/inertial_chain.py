@@ -24,7 +24,7 @@ from factorgraph_dvl.imu.propagation import States
 from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.trial import Trial
 
-# Standard deviations of a first state that nothing else tells, rad, m, m/s. Chosen: so large
+# Standard deviations of a first state that nothing else determines, rad, m, m/s. Chosen: so large
 # that they only keep an unaided chain from being singular.
 _FREE_ATTITUDE = np.pi
 _FREE_POSITION = 1e4

@@ -463,7 +463,7 @@ def increments(
 def _steps(inc: Increments, noise: Array) -> Array:
     """Return the standard deviation of means, (N, 6), over intervals in which a signal steps.
 
-    Two instantaneous samples do not tell when between them a signal stepped from the one
+    Two instantaneous samples do not show when between them a signal stepped from the one
     value to the other: the mean is uniform between the two. A step shows as an interval
     that is rough in every stencil that holds it, while the stencils beside it are smooth.
 

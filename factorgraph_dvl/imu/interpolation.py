@@ -22,7 +22,7 @@ from factorgraph_dvl.geometry.vectors import Array
 _HALF_WIDTHS = (2, 3, 5, 8, 12, 18, 25)
 _LONGEST = 0.25
 _ORDER = 3
-# A look at so many samples tells what the motion allows.
+# Samples that the window is chosen from. Chosen: minutes of motion, searched in milliseconds.
 _ENOUGH = 60_000
 # Noise of a derivative between single samples, in units of sample noise over interval.
 _RAW_SLOPE = 2.0

@@ -90,7 +90,7 @@ def attach(seg: Segments, time: Array, earth_rate_n: Array) -> Attachment:
 def attach_inside(
     seg: Segments, time: Array, earth_rate_n: Array
 ) -> tuple[Attachment, NDArray[np.bool_]]:
-    """Attach times (M,) to the chain where it is nearest, and tell which it covers."""
+    """Attach times (M,) to the chain where it is nearest, and return which it covers."""
     inc = seg.increments
     index, since, covered = inc.locate(time)
     nearest = inc.start[index] + np.clip(since, 0.0, inc.dt[index])

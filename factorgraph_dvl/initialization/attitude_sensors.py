@@ -17,12 +17,12 @@ from factorgraph_dvl.trial import Trial
 # Prior standard deviation up to which a mounting is taken as it stands. Chosen: the solver
 # converges from there.
 _KNOWN = 5.0 * DEG
-# Turns over these intervals, s, tell a mounting by the gyros. Chosen: from sway to slow turns.
-# Then: root mean square about the
-# second axis, rad, from which on they do, and the longest turn that is used. Chosen: above the
-# noise of a star tracker; below half a turn.
+# Turns over these intervals, s, are compared with the gyros'. Chosen: from sway to slow turns.
 _LAGS = (1.0, 3.0, 10.0)
+# Root mean square about the second axis, rad, from which on turns determine a mounting. Chosen:
+# above the noise of a star tracker.
 _LEAST_TURN = 0.2 * DEG
+# The longest turn that is used, rad. Chosen: below half a turn, which has no single axis.
 _LONGEST_TURN = 2.5
 
 

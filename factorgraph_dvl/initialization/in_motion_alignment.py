@@ -6,7 +6,7 @@ its start and the accelerometers the velocity change in the body axes at its sta
 rotation between the two sets of vectors is Wahba's problem (Wu and Pan,
 Velocity/position integration formula, IEEE T-AES 49(2), 2013).
 
-A sensor of attitude tells it at once, at rest too. If its mounting is not known, the
+A sensor of attitude gives it at once, at rest too. If its mounting is not known, the
 rotations that it sees are those of the gyros in other axes, which gives the mounting.
 """
 
@@ -72,7 +72,7 @@ class AlignedStates:
     states : States
         At the nodes.
     mountings : dict of str to ndarray
-        By parameter name, sRb of sensors of attitude where the gyros tell it.
+        By parameter name, sRb of sensors of attitude where the gyros determine it.
     findings : tuple of Finding
         What the user must know of how they were found.
     """
@@ -253,8 +253,8 @@ def _align(
 ) -> tuple[Array, bool]:
     """Return the attitude at the start as each node sees it, and whether heading is found.
 
-    Gyro biases turn the body axes of the start away with time: so each window has its own
-    rotation, and windows that do not tell the heading take that of the nearest which does.
+    Gyro biases turn the body axes of the start with time: so each window has its own
+    rotation, and windows that do not show the heading take that of the nearest which does.
     """
     bias = trial.imu.settings.gyro_bias_std_deg_h * DEG / 3600.0
     length = float(np.clip(np.sqrt(12.0 * _WINDOW_ERROR / (9.8 * bias)), *_WINDOW_LIMITS))

@@ -77,7 +77,7 @@ def claim(
         yield work
     finally:
         _claimed.pop(target, None)
-        # What could not be cleared away stays there for the next run.
+        # What could not be removed stays there for the next run.
         if not ((work / _OLD).exists() or (work / _NEW).exists()):
             (work / _OWNED).unlink(missing_ok=True)
         with suppress(OSError):
@@ -252,7 +252,7 @@ def _lock(work: Path, path: Path) -> int:
 
 
 def _recover(work: Path, target: Path) -> None:
-    """Clear away what a killed run left, and put back what it had set aside."""
+    """Remove what a killed run left, and put back what it had set aside."""
     file = work / _OWNED
     owned = file.read_text(encoding="utf-8").splitlines() if file.exists() else []
     shutil.rmtree(work / _PARTIAL, ignore_errors=True)

@@ -31,7 +31,7 @@ def beam_findings(beams: DvlBeams) -> Iterator[Finding]:
 
 
 def _agreement(beams: DvlBeams) -> Iterator[Finding]:
-    """Compare the error velocity with what noise, and errors as the priors admit, make of it."""
+    """Compare the error velocity with what noise, and errors as the priors allow, make of it."""
     s = beams.settings
     scale = np.broadcast_to(np.array(s.scale_error, dtype=float), (len(s.nominal_d),))
     error = error_velocity((1.0 + scale)[:, None] * s.nominal_d, beams.velocity)

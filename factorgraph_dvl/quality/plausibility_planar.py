@@ -53,7 +53,7 @@ def planar_findings(trial: PlanarTrial) -> Iterator[Finding]:
         yield Finding(
             Code.AT_REST,
             f"the speed is {abs(speed):.2g} m/s in the median: of a vehicle at rest one beacon "
-            "tells a circle; of that the hypotheses are but examples",
+            "gives only a circle, and the hypotheses are examples of that",
             log.label,
         )
     below = float(np.nanmedian(depth.depth)) if np.isfinite(depth.depth).any() else 0.0

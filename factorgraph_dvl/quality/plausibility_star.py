@@ -20,9 +20,9 @@ from factorgraph_dvl.trial import Trial
 # 1 s apart; none further apart than the last.
 _SPANS = (0.0, 1.0)
 _LONGEST = 1.6
-# Noise of a turn between two attitudes, relative to the turns, that still tells conventions.
+# Noise of a turn between two attitudes, relative to the turns, at which conventions still differ.
 _QUIET = 0.5
-# Least rms turn rate, rad/s, that tells conventions apart: the Earth's alone does not.
+# Least rms turn rate, rad/s, at which conventions differ: the Earth's alone is too small.
 _TURNING = 0.05 * DEG
 _AGREE = 0.2
 # The same of the vertical, rad, where the mounting is known at least so well, deg.
@@ -35,7 +35,7 @@ def star_findings(star: Star, trial: Trial) -> Iterator[Finding]:
     if not trial.epoch:
         yield Finding(
             Code.NO_EPOCH,
-            "trial.yaml has no `epoch` (UTC of time_s = 0), and stars tell the attitude only at a "
+            "trial.yaml has no `epoch` (UTC of time_s = 0), and stars give the attitude only at a "
             "known time",
             star.label,
             severity="error",
@@ -59,11 +59,11 @@ def _vertical(star: Star, trial: Trial) -> Iterator[Finding]:
     if not use.any():
         return
     sRb = Rotation.from_rotvec(np.array(star.settings.mounting_deg) * DEG).as_matrix()
-    away = off_vertical(seen.time[use], seen.nRs[use] @ sRb, imu.time, imu.accel)
-    if away > _OFF_VERTICAL:
+    tilt = off_vertical(seen.time[use], seen.nRs[use] @ sRb, imu.time, imu.accel)
+    if tilt > _OFF_VERTICAL:
         yield Finding(
             Code.STAR_VERTICAL,
-            f"its attitudes put the vertical {np.degrees(away):.1f} deg away from that of the "
+            f"its attitudes put the vertical {np.degrees(tilt):.1f} deg from that of the "
             "specific force: are `epoch` (UTC of time_s = 0) and `mounting_deg` right?",
             star.label,
             severity="error",

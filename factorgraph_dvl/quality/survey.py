@@ -25,7 +25,7 @@ class Survey:
     duration : float
         Of the IMU's record, s.
     distance : float
-        Travelled, m; nan if neither GNSS nor DVL tell.
+        Travelled, m; nan without GNSS and DVL.
     speed_min, speed_max : float
         Slowest and fastest, m/s; nan likewise.
     findings : tuple of Finding

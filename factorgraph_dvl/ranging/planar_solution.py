@@ -41,7 +41,7 @@ _SEARCHES = (0, 1, 2, 4, 8, 16, 28)
 # Chosen: rows before the first of them; a start and a current have four unknowns.
 _FIRST_ROWS = 8
 
-# Why the data do not tell a constant, by its reported name; else it is the place of a beacon.
+# Why the data do not determine a constant, by its reported name; else it is the place of a beacon.
 _NOT_OBSERVABLE = {
     "heading_bias_deg": "a rotation of the track about the only beacon changes no range",
     "current_m_s": "on a straight run the mirror image fits another current; add a turn",

@@ -118,7 +118,7 @@ def positions_from_ranges(
 def _outliers(beacons: Beacons, setup: RangingSetup) -> dict[str, Array]:
     """Return times of outliers, by label, on the only track that starts where GNSS says."""
     updates, _ = schedule(setup.problem)
-    # Where dead reckoning is good, one fit of all data tells them; else the track is followed.
+    # Where dead reckoning is good, one fit of all data finds them; else the track is followed.
     for steps in (updates[-1:], updates):
         (found,) = follow(setup.problem, steps, ())
         used, rejected = measurements(beacons, setup, found.fit)

@@ -207,7 +207,7 @@ class _CoarseSearch:
 
 
 def same_track(problem: PlanarProblem, a: Fit, b: Fit) -> bool:
-    """Whether two fits are the same track as far as the data can tell.
+    """Whether two fits are the same track, judged by the data.
 
     They are if at the end of the shorter they bear from the beacon in directions that differ
     by less than three standard deviations. (Their distances to it agree, being measured.)

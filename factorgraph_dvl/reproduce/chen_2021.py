@@ -54,7 +54,7 @@ _GEOMETRIES: dict[str, tuple[tuple[float, float, float], list[dict[str, float]]]
         [{"straight_s": 200}, {"turn_deg_s": 0.9, "duration_s": 520}],
     ),
 }
-# Of the sweep: noise of ranges, m, and standard deviation that the filter is told of its start, m.
+# Of the sweep: noise of ranges, m, and standard deviation of its start that the filter assumes, m.
 _RANGE_STD, _START_STD = (1.0, 10.0), (50.0, 500.0)
 # Of starts near the truth: their standard deviation, m, and the noise of ranges, m.
 _NEAR_STD, _NEAR_RANGE_STD = 50.0, (1.0, 10.0, 30.0)
@@ -100,8 +100,8 @@ def _truth(trial: PlanarTrial, time: Array) -> Array:
 
 
 def _error(trial: PlanarTrial, found: Filtered) -> Array:
-    away = found.state[:, :2] - _truth(trial, found.time)
-    return np.nan_to_num(np.hypot(*away.T), nan=np.inf)[:_UPDATES]
+    difference = found.state[:, :2] - _truth(trial, found.time)
+    return np.nan_to_num(np.hypot(*difference.T), nan=np.inf)[:_UPDATES]
 
 
 def _converged(error: Array) -> float:

@@ -167,13 +167,13 @@ def _equation_5(seeds: int) -> Result:
     unit = _STARS / length[:, None]
     body = unit @ iRb
     found = best_rotation(unit.T @ body)
-    away = float(np.linalg.norm(log_so3(found.T @ iRb))) / _ARCSEC
+    difference = float(np.linalg.norm(log_so3(found.T @ iRb))) / _ARCSEC
     drifts = _run("liu-2020-vectors", 0, "star")
     return Result(
         f"the printed vectors have norms {', '.join(f'{x:.3f}' for x in length)}, the first is "
         f"{length[0] / length[1]:.3f} of the second ({angle:.4f}° apart); smallest singular value "
-        f"{values[2]:.0e}: U_b U_bᵀ has no inverse. Wahba's problem: {away:.0e}″",
-        judged(values[2] > 0.01, away < 1e-3),
+        f"{values[2]:.0e}: U_b U_bᵀ has no inverse. Wahba's problem: {difference:.0e}″",
+        judged(values[2] > 0.01, difference < 1e-3),
         (
             "With these vectors (`configs/liu-2020-vectors.yaml`) the corrected filter finds "
             f"{np.round(drifts.value, 4).tolist()} °/h after 300 s, σ "
@@ -191,8 +191,8 @@ def _equation_6(seeds: int) -> Result:
     row = np.searchsorted(trial.reference.time, found.time + 1e-6) - 1
     same = np.abs(trial.reference.time[row] - found.time) < 1e-6
     truth = rotation_from_rph(trial.reference.rph[row[same]], trial.body_axes)
-    away = log_so3(truth.transpose(0, 2, 1) @ found.nRb[same])
-    worst = float(np.abs(away).max()) / _ARCSEC
+    difference = log_so3(truth.transpose(0, 2, 1) @ found.nRb[same])
+    worst = float(np.abs(difference).max()) / _ARCSEC
     # The noise-free tangent frame stands at the first fix, which has no error here.
     return Result(
         f"C_e^n C_i^e C_b^i against the true attitude: {worst:.1e}″", judged(worst < 0.1)

@@ -125,13 +125,13 @@ def _equation_1(seeds: int) -> Result:
 def _equation_2(seeds: int) -> Result:
     v, omega, arm = _random()
 
-    def away(size: float) -> float:
+    def error_after(size: float) -> float:
         turn = size * np.array([1.0, -1.0, 1.0])
         full = (1.0 + size) * rotate(exp_so3(turn)[None], v + np.cross(omega, size * arm))
         linear = v + np.cross(turn, v) + size * v + np.cross(omega, size * arm)
         return float(np.max(np.abs(full - linear)))
 
-    order = np.log10(away(1e-3) / away(1e-4))
+    order = np.log10(error_after(1e-3) / error_after(1e-4))
     return Result(
         f"error falls as the {order:.2f} power of α, δK and l together: first order is right",
         judged(abs(order - 2.0) < 0.05),

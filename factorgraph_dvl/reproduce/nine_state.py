@@ -181,7 +181,7 @@ def _separation(seeds: int) -> Result:
             "",
             "The source does not say so: at one speed only (1 + a) v + b is seen, and bias and "
             "scale "
-            "cannot be told apart.",
+            "cannot be separated.",
         ),
     )
 

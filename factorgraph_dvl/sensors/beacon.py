@@ -264,9 +264,9 @@ class _ToBeacon:
     def _geometry(self, motion: Motion, values: Values) -> tuple[Array, Array]:
         """Return distance (M,) and unit vector (M, 3) from the beacon to the transponder."""
         place_n = self.place_n + self.nRl @ values[self.offset]
-        away = motion.p_n + motion.nRb @ self.arm_b - place_n
-        distance = np.maximum(np.linalg.norm(away, axis=1), 1e-3)
-        return distance, away / distance[:, None]
+        separation = motion.p_n + motion.nRb @ self.arm_b - place_n
+        distance = np.maximum(np.linalg.norm(separation, axis=1), 1e-3)
+        return distance, separation / distance[:, None]
 
 
 @dataclass(frozen=True)

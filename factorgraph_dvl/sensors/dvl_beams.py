@@ -47,7 +47,7 @@ def scale_spec(count: int) -> ParameterSpec:
 
 
 def of_beams(spec: ParameterSpec, prefix: str) -> ParameterSpec:
-    """Return a parameter of a DVL as that of its beams, which a prefix tells from the other's."""
+    """Return a parameter of a DVL as that of its beams, with a prefix before its name."""
     stem = f"{prefix}{spec.stem}"
     if stem == scale_spec(1).stem:
         return replace(scale_spec(1), labels=SCALAR)
@@ -63,7 +63,7 @@ BEAM_PREFIX = "beam_"
 Angle = Annotated[float, msgspec.Meta(ge=-360, le=360)]
 Acute = Annotated[float, msgspec.Meta(ge=0, le=90)]
 
-# Beams that lie in one plane, to this sine of an angle, do not tell a velocity.
+# Beams that lie in one plane, to this sine of an angle, do not determine a velocity.
 _LEAST_SPREAD = 0.05
 _UNIT = 0.05
 _LEAST_SIGMA = 1e-4

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Literal, Self, cast
 
-# A check that was passed; something to know; a reason to doubt a result; one not to use it.
+# A check that was passed; something to know; a reason for caution; one not to use it.
 Severity = Literal["ok", "note", "warning", "error"]
 VerdictGrade = Literal["good", "doubtful", "do not use"]
 
@@ -218,7 +218,7 @@ class Code(StrEnum):
     )
     NO_EPOCH = (
         "no_epoch",
-        "Stars tell the attitude only at a known time, and the trial has none.",
+        "Stars give the attitude only at a known time, and the trial has none.",
         "The Earth turns by 15 degrees an hour under the stars.",
         "Give epoch, the UTC of time_s = 0.",
         "error",
@@ -269,7 +269,7 @@ class Code(StrEnum):
     )
     AT_REST = (
         "at_rest",
-        "The vehicle rests, so that one beacon tells only a circle.",
+        "The vehicle rests, so that one beacon gives only a circle.",
         "The trajectory is one of many that the ranges allow.",
         "Move, or add a beacon.",
         "note",
@@ -487,7 +487,7 @@ class Finding:
     parameter : str, optional
         Name as in calibration.json; empty if it is about none.
     severity : Severity, optional
-        `ok` for a check that was passed, `note` for what is no reason to doubt a result, `warning`
+        `ok` for a check that was passed, `note` for what is no reason for caution, `warning`
         for a reason, `error` where a result is not to be used. That of the code if not given.
     """
 

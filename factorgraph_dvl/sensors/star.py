@@ -324,8 +324,8 @@ class Star:
         assert v is not None
         count = np.diff(np.append(v.first, v.time.size))
         iRs = Rotation.from_quat(np.repeat(self.quaternion[:, [1, 2, 3, 0]], count, axis=0))
-        away = np.linalg.norm(iRs.apply(v.body) - v.inertial, axis=1)
-        return away / (float(np.max(self.settings.std_arcsec)) * ARCSEC)
+        apart = np.linalg.norm(iRs.apply(v.body) - v.inertial, axis=1)
+        return apart / (float(np.max(self.settings.std_arcsec)) * ARCSEC)
 
     def observations(self, frame: LocalFrame) -> tuple[Observation, ...]:
         """Return the attitudes that were measured.
@@ -355,7 +355,7 @@ class Star:
         return (
             "the mounting separates from the attitude only where the body turns about two axes, "
             f"and it hardly does (rms rate {x:.2g}, {y:.2g}, {z:.2g} deg/s about x, y, z), or "
-            "where manoeuvres tell the attitude without stars"
+            "where manoeuvres show the attitude without stars"
         )
 
 
@@ -430,19 +430,19 @@ class StarAttitude:
 
     def residual(self, motion: Motion, values: Values) -> Array:
         """Return predicted - measured along the axes, (M, 3), arcsec."""
-        return rotate(self.axes.transpose(0, 2, 1), self._away(motion, values)) / ARCSEC
+        return rotate(self.axes.transpose(0, 2, 1), self._rotation_error(motion, values)) / ARCSEC
 
     def linearize(self, motion: Motion, values: Values, wanted: Collection[str]) -> Linearization:
         """Return the residual and its Jacobians."""
-        away = self._away(motion, values)
+        apart = self._rotation_error(motion, values)
         to_axes = self.axes.transpose(0, 2, 1) / ARCSEC
-        turned = to_axes @ inverse_right_jacobian(away) @ values[MOUNTING]
+        turned = to_axes @ inverse_right_jacobian(apart) @ values[MOUNTING]
         return Linearization(
-            residual=rotate(to_axes, away),
+            residual=rotate(to_axes, apart),
             d_theta=turned,
             d_parameters={MOUNTING: -turned},
         )
 
-    def _away(self, motion: Motion, values: Values) -> Array:
+    def _rotation_error(self, motion: Motion, values: Values) -> Array:
         """Return Log(nRsᵀ nRb sRbᵀ), (M, 3), rad."""
         return log_so3(self.nRs.transpose(0, 2, 1) @ motion.nRb @ values[MOUNTING].T)

@@ -25,7 +25,7 @@ class TurntableSettings(SensorSection, frozen=True, kw_only=True):
 
 @dataclass(frozen=True)
 class Turntable:
-    """Record of a turntable: it observes nothing, but tells where the antenna is.
+    """Record of a turntable: it observes nothing, but gives the place of the antenna.
 
     Parameters
     ----------

@@ -15,7 +15,7 @@ from factorgraph_dvl.quality.survey import survey
 from factorgraph_dvl.ranging.hypothesis_weights import significant_costs
 from factorgraph_dvl.ranging.position_from_ranges import StartPositions
 from factorgraph_dvl.sensors.finding import Finding
-from factorgraph_dvl.solution import Progress, Solution, ambiguity, joined, not_told_apart
+from factorgraph_dvl.solution import Progress, Solution, ambiguity, joined, most_probable_minimum
 from factorgraph_dvl.solvers.fixed_directions import (
     SolvedProblem,
     undetermined_there,
@@ -97,7 +97,7 @@ def _most_probable(
         )
         against = np.array([evidence_against(each) for each in minima])
         summaries = [summarise(trial, each, rate_hz=rate_hz) for each in minima]
-        solutions.append(not_told_apart(summaries, against))
+        solutions.append(most_probable_minimum(summaries, against))
         terms.append(cost_terms(minima[int(np.argmin(against))]))
     return joined(solutions, significant_costs(terms), prepared.start_positions.hypotheses)
 
@@ -160,7 +160,7 @@ def _with_covariances(
     problem, before = settled.problem, settled.minimum
 
     def minimise_again(values: gtsam.Values) -> Minimum:
-        stage = "all sensors, without what they cannot tell"
+        stage = "all sensors, without undetermined directions"
         again = minimise(problem, values, stage=stage, progress=report)
         return replace(
             again,

@@ -123,7 +123,7 @@ def _is_among(
     one: Evaluation,
     rotations: Sequence[Parameter],
 ) -> bool:
-    """Whether attitude and mountings are those of another minimum, as far as angles tell."""
+    """Whether attitude and mountings are those of another minimum, judged by angles."""
     for each in minima:
         other = each.minimum.evaluation
         pairs = [(one.parameters[p.name], other.parameters[p.name]) for p in rotations]

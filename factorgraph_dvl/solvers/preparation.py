@@ -51,7 +51,7 @@ class Preparation:
     start_positions : StartPositions
         States to start from, one set for each position that the ranges allow.
     mountings : dict of str to ndarray
-        Mountings of attitude sensors that the gyros tell, by parameter name.
+        Mountings of attitude sensors found by the gyros, by parameter name.
     findings : tuple of Finding
         What the user must know.
     """
@@ -92,7 +92,7 @@ def prepare(trial: Trial, state_interval_s: float, report: Progress) -> Preparat
     Raises
     ------
     DataError
-        If the records do not tell where and how the trial starts.
+        If the records do not determine where and how the trial starts.
     """
     trial = without_strays(trial)
     frame = trial.frame()

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from truth import scenario
 
-from factorgraph_dvl.analysis.convergence import check_limits, convergence, lacking
+from factorgraph_dvl.analysis.convergence import check_limits, convergence, short_of_limits
 from factorgraph_dvl.errors import ConfigError
 from factorgraph_dvl.simulation import simulate
 from factorgraph_dvl.solution import Estimate
@@ -31,7 +31,7 @@ def test_convergence_is_the_last_time_that_a_limit_is_crossed():
     never = convergence(time, values, std + 1.0, inconsistent, [one], {}, limits, limits)
     assert np.isnan(never.good_since)
     assert np.isnan(never.components[0].error_since)
-    assert lacking([one], {"scale_error": 1e-5}) == ("scale_error",)
-    assert lacking([one], limits) == ()
+    assert short_of_limits([one], {"scale_error": 1e-5}) == ("scale_error",)
+    assert short_of_limits([one], limits) == ()
     with pytest.raises(ConfigError, match=r"'speed'.*misalignment_deg, scale_error, lever_arm_m"):
         check_limits(simulate(scenario()), ["scale_error", "speed"])

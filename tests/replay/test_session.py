@@ -401,11 +401,11 @@ def test_what_matters_is_in_view_on_a_low_terminal(trial, run):
         latency=0.004,
         speed=20.0,
         inconsistent=("GNSS position",),
-        lacking=("misalignment_y_deg",),
+        short_of_limits=("misalignment_y_deg",),
     )
     lines = [s for line in console.render_lines(view) if (s := "".join(x.text for x in line))]
     text = "\n".join(lines[: console.height - 1])
-    for expected in ("not good enough yet: misalignment_y", "in doubt: GNSS position"):
+    for expected in ("not good enough yet: misalignment_y", "contradictory: GNSS position"):
         assert expected in text
     for expected in ("position", "latency 4.0 ms, 20.0 times", "lever_arm_z"):
         assert expected in text

@@ -16,7 +16,7 @@ from factorgraph_dvl.errors import ConfigError, DataError
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.sensors.finding import Code
 from factorgraph_dvl.simulation import simulate
-from factorgraph_dvl.solution import not_told_apart
+from factorgraph_dvl.solution import most_probable_minimum
 from factorgraph_dvl.solvers.batch import solve
 
 STRAIGHT = {"manoeuvres": [{"straight_s": 60}], "sway": {}}
@@ -327,8 +327,8 @@ def test_minima_that_the_data_do_not_tell_apart_are_mixed():
     other = replace(
         one, estimates=(replace(first, value=first.value + np.array([0, 0, 180])), *rest)
     )
-    assert not_told_apart([one, other], np.array([0.0, 30.0])) is one
-    both = not_told_apart([other, one], np.array([1.0, 0.0]))
+    assert most_probable_minimum([one, other], np.array([0.0, 30.0])) is one
+    both = most_probable_minimum([other, one], np.array([1.0, 0.0]))
     np.testing.assert_array_equal(both.estimates[0].value, first.value)
     share = np.exp(-1.0) / (1.0 + np.exp(-1.0))
     assert both.estimates[0].std[2] == pytest.approx(180.0 * np.sqrt(share), rel=0.01)

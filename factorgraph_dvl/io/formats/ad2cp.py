@@ -33,7 +33,7 @@ _UNITS = {
     "acceleration": 9.81 / 16384.0,
 }
 _FIELDS = ((1 << 5, "velocity", "<i4"), (1 << 8, "distance", "<i4"), (1 << 9, "merit", "<u2"))
-# What tells a velocity of nothing from a fast one: the widest velocity range is 30 m/s.
+# Above this a velocity is one of nothing: the widest velocity range is 30 m/s.
 _FASTEST = 50.0
 
 PING = np.dtype(

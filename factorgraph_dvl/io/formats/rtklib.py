@@ -100,7 +100,7 @@ def read_rtklib(source: Source, block: int = BLOCK) -> Iterator[Records]:
 
 
 def is_geodetic(source: Source) -> bool:
-    """Tell whether heights are above the geoid, as the header says."""
+    """Return whether heights are above the geoid, as the header says."""
     return b"/geodetic" in source[: 1 << 16]
 
 

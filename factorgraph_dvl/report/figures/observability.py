@@ -1,4 +1,4 @@
-"""Figures of what data can tell: singular values, σ along the trial, weak directions, shares."""
+"""Figures of observability: singular values, σ along the trial, weak directions, shares."""
 
 from __future__ import annotations
 

@@ -22,7 +22,7 @@ def live_view(
     latency: float,
     speed: float,
     inconsistent: Sequence[str],
-    lacking: Sequence[str] = (),
+    short_of_limits: Sequence[str] = (),
     good_since: float | None = None,
 ) -> Group:
     """Return verdict, position, latency, speed and calibration.
@@ -45,7 +45,7 @@ def live_view(
         Relative to real time.
     inconsistent : sequence of str
         Kinds of measurements that disagree with the prediction.
-    lacking : sequence of str, optional
+    short_of_limits : sequence of str, optional
         Components whose standard deviations exceed their limits.
     good_since : float, optional
         Time from which no standard deviation exceeds its limit, s; None = some do.
@@ -71,8 +71,8 @@ def live_view(
     if good_since is not None:
         verdict = Text(f"{trial}: {time:.1f} s, good enough since {good_since:.0f} s", "green")
     else:
-        why = ", ".join(split_unit(component)[0] for component in lacking)
-        why = why or "measurements are in doubt"
+        why = ", ".join(split_unit(component)[0] for component in short_of_limits)
+        why = why or "measurements contradict the estimate"
         verdict = Text(f"{trial}: {time:.1f} s, not good enough yet: {why}")
     lines = [
         f"position {np.degrees(lat):.7f} {np.degrees(lon):.7f} deg, {height:.2f} m "
@@ -83,7 +83,7 @@ def live_view(
     ]
     parts: list[Table | Text] = [verdict]
     if inconsistent:
-        parts.append(Text(f"in doubt: {', '.join(inconsistent)}", "red"))
+        parts.append(Text(f"contradictory: {', '.join(inconsistent)}", "red"))
     parts += [Text(line) for line in lines]
     return Group(*parts, table)
 

@@ -209,7 +209,8 @@ def good_enough_line(found: Convergence, start: float) -> str:
     if not found.components:
         return "no limits apply to what was estimated"
     late = [c.name for c in found.components if not math.isfinite(c.std_since)]
-    return f"not good enough until the end: {', '.join(late) or 'measurements were in doubt'}"
+    why = ", ".join(late) or "measurements contradicted the estimate"
+    return f"not good enough until the end: {why}"
 
 
 def _moment(time: float) -> str:
