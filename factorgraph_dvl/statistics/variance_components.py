@@ -67,7 +67,7 @@ def noise_factors(
     Parameters
     ----------
     problem : Problem
-        What was minimised, with the factors that were applied: they tell which to estimate.
+        What was minimised, with the factors that were applied: they say which to estimate.
     evaluation : Evaluation
         Its minimum.
     information : SquareRootInformation

@@ -10,7 +10,7 @@ from factorgraph_dvl.report.figures.calibration import readable
 from factorgraph_dvl.report.figures.drawing import LIGHT, SMALL, TITLE, new_figure, new_grid, style
 from factorgraph_dvl.solution import Solution
 
-# Causes with a colour of their own; the others share one. Chosen: as many as can be told apart.
+# Causes with a colour of their own; the others share one. Chosen: as many as the eye separates.
 _SHOWN = 9
 
 
