@@ -259,7 +259,7 @@ def _recover(work: Path, target: Path) -> None:
     for aside in (work / _OLD, work / _NEW):
         if aside.is_dir():
             if target.exists():
-                _clear_away(aside, target, owned)
+                _remove_leftovers(aside, target, owned)
             else:
                 aside.rename(target)
 
@@ -290,7 +290,7 @@ def _replace(work: Path, target: Path, owned: Sequence[str]) -> None:
             raise
     else:
         new.rename(old)
-    _clear_away(old, target, owned)
+    _remove_leftovers(old, target, owned)
 
 
 def _exchange(a: Path, b: Path) -> None:
@@ -302,7 +302,7 @@ def _exchange(a: Path, b: Path) -> None:
         raise OSError(number, os.strerror(number), str(b))
 
 
-def _clear_away(aside: Path, target: Path, owned: Sequence[str]) -> None:
+def _remove_leftovers(aside: Path, target: Path, owned: Sequence[str]) -> None:
     """Remove a folder that was replaced; the user's files in it go to the target first."""
     for name in _of_others(aside, owned):
         source, place = aside / name, target / name
