@@ -35,7 +35,7 @@ NOISE_FACTORS = (0.5, 2.0)
 # Share of the prior's standard deviation that may be left for the data to say anything. Chosen:
 # they are then at most three times less sharp than the prior; of less, errors of the model that
 # hardly matter make a contradiction.
-_TOLD = 0.95
+_INFORMED = 0.95
 # Evidence against a minimum with which it is not worth a word: its probability is e^-15.
 _IMPOSSIBLE = 15.0
 # The data observed a component if they at least halved what was unknown of it.
@@ -512,20 +512,20 @@ def _far_from_prior(e: Estimate) -> list[Finding]:
     x would be (x - x0) σ² / (σ0² - σ²) further deviation. The standard deviations by which other
     parameters would move are fewer.
     """
-    told = e.std < _TOLD * e.prior_std
-    if not told.any():
+    informed = e.std < _INFORMED * e.prior_std
+    if not informed.any():
         return []
-    moved = np.abs(e.value - e.prior_value)[told]
-    rest = (e.prior_std**2 - e.std**2)[told]
+    moved = np.abs(e.value - e.prior_value)[informed]
+    rest = (e.prior_std**2 - e.std**2)[informed]
     apart = moved / np.sqrt(rest)
     worst = int(np.argmax(apart))
     if not apart[worst] > _FAR_FROM_PRIOR:
         return []
-    mean, prior_std, std = (x[told][worst] for x in (e.prior_value, e.prior_std, e.std))
+    mean, prior_std, std = (x[informed][worst] for x in (e.prior_value, e.prior_std, e.std))
     gain = prior_std**2 / rest[worst]
-    alone = mean + gain * (e.value[told][worst] - mean)
+    alone = mean + gain * (e.value[informed][worst] - mean)
     draws = moved[worst] * std / rest[worst]
-    name = np.array(e.component_names)[told][worst]
+    name = np.array(e.component_names)[informed][worst]
     effect = (
         f"it draws the value by {draws:.2g} of its standard deviations, and others with it"
         if draws > _DRAWS

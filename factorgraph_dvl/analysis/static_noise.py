@@ -20,7 +20,7 @@ _SHORTEST_TAU = 0.1
 _LONGEST_SHARE = 0.2
 # Chosen: relative deviation of real noise from the three terms of the model.
 _MODEL_ERROR = 0.02
-# Chosen, s: a shorter record tells nothing but white noise, and that badly.
+# Chosen, s: a shorter record shows nothing but white noise, and that badly.
 _SHORTEST_RECORD = 60.0
 # Chosen: samples that are later than this many intervals were preceded by lost ones.
 _LOST = 1.5

@@ -17,7 +17,7 @@ from factorgraph_dvl.trial import Trial
 # it makes a result useless.
 DOUBTFUL_P = 1e-3
 CONTRADICTED_P = 1e-6
-# Share of the prior's variance that the data must take away along a direction for them to say
+# Share of the prior's variance that the data must remove along a direction for them to say
 # anything about it. Chosen: a prior that is ten times sharper than the data is still tested; of
 # less, errors of the model that hardly matter make a contradiction.
 _LEAST_SHARE = 0.01
@@ -32,9 +32,9 @@ class PriorAgainstData:
     statistic : float
         Chi-square.
     freedom : int
-        Directions that the data tell something about.
+        Directions that the data inform on.
     value, std : ndarray, shape (n,)
-        What the data alone say; std is infinite along what they do not tell.
+        What the data alone say; std is infinite along what they leave open.
     """
 
     statistic: float
@@ -71,15 +71,15 @@ def prior_against_data(
     root = scale[:, None] * directions[:, known] * np.sqrt(variances[known])
     inverse = np.linalg.pinv(root)
     share, turn = np.linalg.eigh(np.eye(root.shape[1]) - inverse @ covariance @ inverse.T)
-    told = share > _LEAST_SHARE
+    informed = share > _LEAST_SHARE
     along = turn.T @ inverse @ (value - prior)
     back = root @ turn
-    gain = np.where(told, 1.0 / np.where(told, share, 1.0), 0.0)
-    unknown = np.abs(back[:, ~told]).max(axis=1, initial=0.0) > 1e-6 * scale
+    gain = np.where(informed, 1.0 / np.where(informed, share, 1.0), 0.0)
+    unknown = np.abs(back[:, ~informed]).max(axis=1, initial=0.0) > 1e-6 * scale
     variance = back**2 @ np.maximum(gain - 1.0, 0.0)
     return PriorAgainstData(
         float(gain @ along**2),
-        int(told.sum()),
+        int(informed.sum()),
         prior + back @ (gain * along),
         np.where(unknown, np.inf, np.sqrt(variance)),
     )

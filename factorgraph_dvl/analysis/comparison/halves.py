@@ -20,7 +20,7 @@ from factorgraph_dvl.solution import Solution
 from factorgraph_dvl.trial import Trial
 
 # Share of the sum of both variances that is left in that of the difference where the data of a
-# half tell something. Chosen: far above rounding.
+# half are informative. Chosen: far above rounding.
 _LEAST_SHARE = 1e-4
 
 
@@ -154,11 +154,11 @@ def compare_halves(trial: Trial, first: Solution, second: Solution) -> Halves:
     P1, P2 = (_covariance(s, names) for s in (first, second))
     common = P1 @ np.linalg.pinv(P0[np.ix_(free, free)], hermitian=True) @ P2
     V = P1 + P2 - common - common.T
-    # Where neither half tells anything, both stay at the prior, and nothing is left of P1 + P2.
+    # Where neither half is informative, both stay at the prior, and nothing is left of P1 + P2.
     scale = np.sqrt(np.diag(P1 + P2))
     root = scale[:, None] * np.linalg.cholesky((P1 + P2) / np.outer(scale, scale))
     share, directions = np.linalg.eigh(np.linalg.solve(root, np.linalg.solve(root, V).T))
-    told = share > _LEAST_SHARE
+    informed = share > _LEAST_SHARE
     along = directions.T @ np.linalg.solve(root, after - before)
     return Halves(
         tuple(names),
@@ -167,8 +167,8 @@ def compare_halves(trial: Trial, first: Solution, second: Solution) -> Halves:
         np.sqrt(np.diag(P1)),
         np.sqrt(np.diag(P2)),
         np.sqrt(np.maximum(np.diag(V), 0.0)),
-        float(np.sum(along[told] ** 2 / share[told])),
-        int(told.sum()),
+        float(np.sum(along[informed] ** 2 / share[informed])),
+        int(informed.sum()),
     )
 
 
