@@ -169,6 +169,12 @@ def _solution(trial: Trial, run: Replay, recorder: Recorder, last: Update) -> So
                 "IMU",
             )
         )
+    if run.unused >= LEAST:
+        findings.append(Finding(Code.NOT_CONVERGED, "the replay did not reach the end"))
+    elif last.inconsistent:
+        kinds = ", ".join(sorted(last.inconsistent))
+        text = f"at the end the prediction still disagrees with {kinds}"
+        findings.append(Finding(Code.NOT_CONVERGED, text))
     cost = 0.5 * sum(float(np.nansum((r.residual / r.sigma) ** 2)) for r in residuals)
     return Solution(
         trial=trial.name,
