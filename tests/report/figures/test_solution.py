@@ -410,7 +410,7 @@ def test_lines_of_a_long_trial_are_drawn_with_few_points(
 ) -> None:
     drawn_points: list[int] = []
 
-    def keep(figures: dict[str, Figure], folder: Path) -> list[Path]:
+    def keep(figures: dict[str, Figure], folder: Path, verdict: object) -> list[Path]:
         for figure in figures.values():
             lines = [line for axes in figure.axes for line in axes.get_lines()]
             drawn_points.extend(np.size(line.get_xdata()) for line in lines)
