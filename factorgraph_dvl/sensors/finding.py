@@ -99,6 +99,12 @@ class Code(StrEnum):
         "Nothing, if they are few.",
         "note",
     )
+    IMU_NOISE = (
+        "imu_noise",
+        "The record of the IMU is noisier at high frequencies than trial.yaml states.",
+        "The stated noise would make standard deviations too small; that of the record is used.",
+        "State the noise of a static record, or `noise: stated` where the IMU only vibrates.",
+    )
     UNUSED = (
         "unused",
         "Measurements were not used.",

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph.inertial_chain import Chain, inertial_chain
 from factorgraph_dvl.graph.problem import Problem, observed
 from factorgraph_dvl.imu.increments import increments
+from factorgraph_dvl.imu.noise import with_recorded_noise
 from factorgraph_dvl.imu.preintegration import Segments, segments
 from factorgraph_dvl.imu.propagation import States
 from factorgraph_dvl.imu.timestamps import without_strays
@@ -95,6 +96,10 @@ def prepare(trial: Trial, state_interval_s: float, report: Progress) -> Preparat
         If the records do not determine where and how the trial starts.
     """
     trial = without_strays(trial)
+    louder: tuple[Finding, ...] = ()
+    if trial.estimates_noise(trial.imu):
+        imu, louder = with_recorded_noise(trial.imu)
+        trial = replace(trial, imu=imu)
     frame = trial.frame()
     report("increments", 0, None)
     inc, gaps = increments(trial.imu)
@@ -120,7 +125,7 @@ def prepare(trial: Trial, state_interval_s: float, report: Progress) -> Preparat
         ),
         start_positions=start_positions,
         mountings=start.mountings,
-        findings=(*trial.notes, *gaps, *start.findings, *seen, *start_positions.findings),
+        findings=(*trial.notes, *louder, *gaps, *start.findings, *seen, *start_positions.findings),
     )
 
 
