@@ -184,7 +184,8 @@ class Trial:
 
     @cached_property
     def _fingerprints(self) -> tuple[str, ...]:
-        return fingerprints((self.imu, *self.aids))
+        # A turntable's angle is that of its program, which two trials may share.
+        return fingerprints((self.imu, *(a for a in self.aids if not isinstance(a, Turntable))))
 
     @property
     def inputs(self) -> tuple[str, ...]:
@@ -298,6 +299,11 @@ class PlanarTrial:
     def records(self) -> tuple[Heading, SpeedLog, Depth, Beacons]:
         """All records."""
         return self.heading, self.log, self.depth, self.beacons
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        """Fingerprints of all data behind a result."""
+        return fingerprints(self.records)
 
     def frame(self) -> LocalFrame:
         """Return the tangent frame at the first beacon."""

@@ -139,6 +139,7 @@ def filter_planar(
     )
     solution = Solution(
         trial=trial.name,
+        inputs=trial.inputs,
         solver=f"kalman-{method}",
         body_axes=trial.body_axes,
         converged=not contradicted,

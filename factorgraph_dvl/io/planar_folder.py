@@ -14,6 +14,7 @@ from factorgraph_dvl.io.tables import write_table
 from factorgraph_dvl.io.trial_folder import (
     OWNED,
     TRUTH_FILE,
+    check_saved,
     locate,
     looks_planar,
     position_of,
@@ -102,6 +103,7 @@ def save_planar_trial(
             UNSET if trial.reference is None else ReferenceSettings(file=f"reference{suffix}")
         ),
     )
+    check_saved(Path(path))
     with new_folder(Path(path), force=force, owned=OWNED) as folder:
         for record in trial.records:
             write_table(folder / f"{record.section}{suffix}", record.columns())

@@ -69,8 +69,9 @@ OWNED = (
 )
 
 
-# What trial.yaml begins with if `simulate` wrote it.
+# What trial.yaml begins with if `simulate` wrote it, or `save_trial`.
 _SIMULATED = "# Simulated by factorgraph-dvl"
+_SAVED = "# Saved by factorgraph_dvl"
 # Keys whose values are names of files.
 _NAMING = ("file", "calibration", "trajectory")
 
@@ -216,7 +217,8 @@ def save_trial(
     path : path-like
         Of the folder.
     force : bool, default False
-        Replace the trial that is there.
+        Replace a trial that `save_trial` or `simulate` wrote; never another one, whose tables may
+        be the only ones.
     parquet : bool, default False
         Write the sensors' tables as Parquet.
     seed : int, optional
@@ -225,10 +227,11 @@ def save_trial(
     Raises
     ------
     DataError
-        If the folder exists, is not empty, and `force` is not set.
+        If the folder exists, is not empty, and `force` is not set, or holds a trial that was
+        written otherwise.
     """
     suffix = ".parquet" if parquet else ".csv"
-
+    check_saved(Path(path))
     with new_folder(Path(path), force=force, owned=OWNED) as folder:
         for record in (trial.imu, *trial.aids):
             write_table(folder / f"{record.section}{suffix}", record.columns())
@@ -247,19 +250,30 @@ def save_trial(
 def write_settings(
     folder: Path, settings: TrialSettings | PlanarSettings, seed: int | None
 ) -> None:
-    """Write trial.yaml, which says so if the trial was simulated with a seed."""
-    head = "" if seed is None else f"{_SIMULATED}, seed {seed}; simulate --force replaces it\n"
+    """Write trial.yaml, which says what wrote it, and the seed of a simulated trial."""
+    head = f"{_SAVED}; it may replace this folder\n"
+    if seed is not None:
+        head = f"{_SIMULATED}, seed {seed}; simulate --force replaces it\n"
     (folder / SETTINGS_FILE).write_text(head + to_yaml(settings), encoding="utf-8")
 
 
 def check_simulated(path: Path) -> None:
     """Raise DataError if a folder holds a trial that was not written by `simulate`."""
+    _check_written(path, "simulate", (_SIMULATED,))
+
+
+def check_saved(path: Path) -> None:
+    """Raise DataError if a folder holds a trial whose tables may be the user's only ones."""
+    _check_written(path, "save_trial", (_SAVED, _SIMULATED))
+
+
+def _check_written(path: Path, by: str, heads: tuple[str, ...]) -> None:
     file = path / SETTINGS_FILE
-    if file.exists() and not read_text(file).startswith(_SIMULATED):
+    if file.exists() and not read_text(file).startswith(heads):
         raise DataError(
-            f"holds a {SETTINGS_FILE} that `simulate` did not write, and may not replace",
+            f"holds a {SETTINGS_FILE} that `{by}` did not write, and may not replace",
             where=str(path),
-            expected=f"another folder, or one whose {SETTINGS_FILE} begins with `{_SIMULATED}`",
+            expected=f"another folder, or one whose {SETTINGS_FILE} begins with `{heads[0]}`",
         )
 
 

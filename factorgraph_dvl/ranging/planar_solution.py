@@ -160,6 +160,7 @@ def _summary(
     return Solution(
         trial=trial.name,
         solver="planar",
+        inputs=trial.inputs,
         body_axes=trial.body_axes,
         converged=best.converged,
         iterations=len(living[0].history),

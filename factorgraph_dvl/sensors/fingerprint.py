@@ -11,14 +11,17 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.sensors.protocol import SensorRecord
 
 PATTERN = r"^[a-z_]+:([0-9a-f]{16})+$"
 # Hashes that a fingerprint has at most, and the share of them that makes records the same.
 _SIZE = 128
 _SAME = 0.5
-# Records with fewer measured columns, such as depth, have equal rows by chance.
+# Chosen: of records with fewer measured columns, such as depth, rows are equal by chance, and so
+# many of them count as one, unless they hold the same values.
 _FEWEST_COLUMNS = 3
+_TOGETHER = 16
 _MIXERS = (np.uint64(0x9E3779B97F4A7C15), np.uint64(0xBF58476D1CE4E5B9))
 
 
@@ -42,8 +45,9 @@ def _fingerprint(record: SensorRecord) -> str:
     columns = record.columns()
     names = dict.fromkeys((*record.required, *record.settings.more_columns))
     rows = [columns[name] for name in names if columns[name].dtype.kind == "f"]
-    if len(rows) <= _FEWEST_COLUMNS:
-        return ""
+    if len(rows) == 1:
+        # Of beacons either measurement may be absent.
+        rows = [column for column in columns.values() if column.dtype.kind == "f"]
     known = ~np.all(np.isnan(rows[1:]), axis=0)
     hashes = np.zeros(int(known.sum()), dtype=np.uint64)
     for column in rows:
@@ -53,8 +57,23 @@ def _fingerprint(record: SensorRecord) -> str:
         for mixer in _MIXERS:
             hashes *= mixer
             hashes ^= hashes >> np.uint64(31)
+    if len(rows) <= _FEWEST_COLUMNS:
+        hashes = _joined(hashes, [column[known] for column in rows[1:]])
     smallest = np.unique(hashes)[:_SIZE].astype("<u8")
     return f"{record.section}:{smallest.tobytes().hex()}" if smallest.size else ""
+
+
+def _joined(hashes: NDArray[np.uint64], columns: list[Array]) -> NDArray[np.uint64]:
+    """Return one hash for every run of rows in which a column changes."""
+    count = hashes.size - _TOGETHER + 1
+    if count < 1:
+        return hashes[:0]
+    out = np.zeros(count, dtype=np.uint64)
+    for i in range(_TOGETHER):
+        out = out * _MIXERS[0] ^ hashes[i : i + count]
+    changes = np.any([np.diff(np.nan_to_num(column)) != 0.0 for column in columns], axis=0)
+    before = np.concatenate([[0], np.cumsum(changes)])
+    return out[before[_TOGETHER - 1 :] > before[:count]]
 
 
 def _decode(text: str) -> NDArray[np.uint64]:

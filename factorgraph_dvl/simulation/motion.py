@@ -27,6 +27,7 @@ from factorgraph_dvl.geometry.rotations import (
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.simulation.manoeuvres import Accelerate, Climb, Manoeuvre, Stop, Straight
+from factorgraph_dvl.simulation.size import check_size
 from factorgraph_dvl.simulation.table import table_angle
 
 if TYPE_CHECKING:
@@ -322,6 +323,7 @@ def plan_motion(scenario: Scenario) -> TrueMotion:
         body_axes=scenario.body_axes,
         table=table,
     )
+    check_size(scenario, duration, duration / _step(motion))
     lat, lon = _integrate_position(
         motion, scenario.start.lat_deg * DEG, scenario.start.lon_deg * DEG, scenario.source
     )
@@ -405,6 +407,11 @@ def _sway(parts: Iterable[tuple[float, float, float]]) -> Sway:
     return Sway(table[:, 0], 2.0 * np.pi * table[:, 1], table[:, 2] * DEG)
 
 
+def _step(motion: TrueMotion) -> float:
+    """Return the longest step of the integration, s."""
+    return min(0.5, 0.5 / max(motion.highest_rate(), 1e-9))
+
+
 def _integrate_position(
     motion: TrueMotion, lat0: float, lon0: float, source: str
 ) -> tuple[PPoly, PPoly]:
@@ -414,8 +421,7 @@ def _integrate_position(
     polynomial; as they depend on the latitude, the whole is iterated to its fixed point,
     which contracts by the fraction of the Earth's radius that was travelled.
     """
-    step = min(0.5, 0.5 / max(motion.highest_rate(), 1e-9))
-    counts = np.maximum(np.ceil(np.diff(motion.kinks) / step), 1).astype(int)
+    counts = np.maximum(np.ceil(np.diff(motion.kinks) / _step(motion)), 1).astype(int)
     pieces = [
         np.linspace(a, b, n, endpoint=False)
         for a, b, n in zip(motion.kinks[:-1], motion.kinks[1:], counts, strict=True)

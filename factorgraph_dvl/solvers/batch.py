@@ -10,6 +10,7 @@ import numpy as np
 
 from factorgraph_dvl.errors import ConfigError
 from factorgraph_dvl.graph.priors import ConstantsPrior
+from factorgraph_dvl.imu.propagation import States
 from factorgraph_dvl.quality.refusal import accepted_errors, explained
 from factorgraph_dvl.quality.survey import survey
 from factorgraph_dvl.ranging.hypothesis_weights import significant_costs
@@ -28,7 +29,7 @@ from factorgraph_dvl.solvers.minima import (
     distinct,
     evidence_against,
 )
-from factorgraph_dvl.solvers.preparation import prepare
+from factorgraph_dvl.solvers.preparation import Preparation, prepare
 from factorgraph_dvl.solvers.rounds import SettledMinimum, settle
 from factorgraph_dvl.solvers.state_times import STATE_INTERVAL
 from factorgraph_dvl.solvers.summary import summarise
@@ -88,29 +89,38 @@ def _most_probable(
     prepared = prepare(trial, state_interval_s, report)
     solutions, terms = [], []
     for states in prepared.start_positions.states:
-        minima = distinct(
-            prepared,
-            [
-                _with_covariances(each, prepared.findings, report)
-                for each in competing_minima(prepared, states, report)
-            ],
-        )
+        minima = _minima(prepared, states, prepared.findings, report)
         against = np.array([evidence_against(each) for each in minima])
         summaries = [summarise(trial, each, rate_hz=rate_hz) for each in minima]
         solutions.append(most_probable_minimum(summaries, against))
-        terms.append(cost_terms(minima[int(np.argmin(against))]))
+        terms.append(cost_terms(minima[0]))
     return joined(solutions, significant_costs(terms), prepared.start_positions.hypotheses)
 
 
-def solved_problem(
+def solved_problems(
     trial: Trial,
     *,
     state_interval_s: float = STATE_INTERVAL,
     progress: Progress | None = None,
-) -> SolvedProblem:
-    """Return the problem of a trial at its minimum; parameters and errors as of `solve`."""
-    settled, _ = settled_minimum(trial, state_interval_s=state_interval_s, progress=progress)
-    return _with_covariances(settled, (), progress or _silent)
+) -> list[SolvedProblem]:
+    """Return the problem of a trial at all its minima, from the most probable position.
+
+    The most probable one comes first; parameters and errors are those of `solve`.
+    """
+    report = progress or _silent
+    _check_above_zero("state_interval_s", state_interval_s)
+    prepared = prepare(trial, state_interval_s, report)
+    start = prepared.start_positions
+    findings = (*prepared.findings, *ambiguity(start.hypotheses))
+    return _minima(prepared, start.states[0], findings, report)
+
+
+def _minima(
+    prepared: Preparation, states: States, findings: tuple[Finding, ...], report: Progress
+) -> list[SolvedProblem]:
+    """Return the minima near some states and their rivals, the most probable first."""
+    found = competing_minima(prepared, states, report)
+    return distinct(prepared, [_with_covariances(each, findings, report) for each in found])
 
 
 def settled_minimum(

@@ -25,10 +25,11 @@ from factorgraph_dvl.graph import keys
 from factorgraph_dvl.graph.problem import FIXED_DIRECTION_STD, Evaluation, Problem
 from factorgraph_dvl.quality.refusal import accepted_errors, explained
 from factorgraph_dvl.quality.survey import survey
-from factorgraph_dvl.solution import Progress, Solution
-from factorgraph_dvl.solvers.batch import solved_problem
+from factorgraph_dvl.solution import Progress, Solution, most_probable_minimum
+from factorgraph_dvl.solvers.batch import solved_problems
 from factorgraph_dvl.solvers.calibration import prior_along, reported
 from factorgraph_dvl.solvers.fixed_directions import SolvedProblem
+from factorgraph_dvl.solvers.minima import evidence_against
 from factorgraph_dvl.solvers.summary import summarise
 from factorgraph_dvl.statistics.information_history import InformationHistory
 from factorgraph_dvl.statistics.spurious_information import (
@@ -85,11 +86,14 @@ def solve_with_history(
     """
     errors = accepted_errors(survey(trial), anyway=anyway)
     with explained(errors):
-        found = solved_problem(trial, progress=progress)
+        minima = solved_problems(trial, progress=progress)
     if progress:
         progress("information along the trial", 0, None)
-    solution = summarise(trial, found, rate_hz=RATE_HZ).with_findings(errors)
-    return solution, information_history(found)
+    solution = most_probable_minimum(
+        [summarise(trial, each, rate_hz=RATE_HZ) for each in minima],
+        np.array([evidence_against(each) for each in minima]),
+    )
+    return solution.with_findings(errors), information_history(minima[0])
 
 
 def information_history(found: SolvedProblem) -> InformationHistory:

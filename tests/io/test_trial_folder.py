@@ -7,9 +7,11 @@ import msgspec
 import numpy as np
 import pytest
 from builders import build_trial, edit, write_trial
+from planar import trial as planar_trial
 
 from factorgraph_dvl.errors import ConfigError, DataError, FactorgraphDvlError
 from factorgraph_dvl.io.folders import new_folder
+from factorgraph_dvl.io.planar_folder import save_planar_trial
 from factorgraph_dvl.io.tables import read_table, write_table
 from factorgraph_dvl.io.trial_folder import load_trial, save_trial
 from factorgraph_dvl.trial import Trial
@@ -352,6 +354,20 @@ def test_an_existing_folder_is_kept_without_force(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(DataError, match="is a file"):
         save_trial(build_trial(), tmp_path / "file", force=True)
+
+
+def test_force_replaces_no_trial_that_someone_else_wrote(tmp_path: Path) -> None:
+    path = write_trial(tmp_path)
+    settings = path / "trial.yaml"
+    first, _, rest = settings.read_text().partition("\n")
+    assert first.startswith("# Saved by factorgraph_dvl")
+    settings.write_text(rest)
+    before = {p.name: p.read_bytes() for p in path.iterdir()}
+    with pytest.raises(DataError, match="`save_trial` did not write"):
+        save_trial(build_trial(), path, force=True)
+    with pytest.raises(DataError, match="`save_trial` did not write"):
+        save_planar_trial(planar_trial(), path, force=True)
+    assert {p.name: p.read_bytes() for p in path.iterdir()} == before
 
 
 def test_force_replaces_a_trial_but_no_other_file(tmp_path: Path) -> None:

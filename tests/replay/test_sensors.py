@@ -16,7 +16,7 @@ from factorgraph_dvl.sensors.finding import Code
 from factorgraph_dvl.sensors.records import rows_of
 from factorgraph_dvl.sensors.star import Star
 from factorgraph_dvl.simulation import simulate
-from factorgraph_dvl.solvers.batch import solve, solved_problem
+from factorgraph_dvl.solvers.batch import solve, solved_problems
 
 TURNS = [
     {"accelerate_m_s2": 1, "to_m_s": 4},
@@ -116,7 +116,7 @@ def test_a_bias_that_walks_is_reported_as_it_is_at_the_end():
     )
     trial = simulate(scene, 1)
     solution, _ = replay(trial, rate_hz=1.0)
-    found = solved_problem(trial, state_interval_s=1.0)
+    found = solved_problems(trial, state_interval_s=1.0)[0]
     last = np.degrees(found.minimum.evaluation.states.gyro_bias[-1]) * 3600.0
     e = solution.estimate("gyro_bias_deg_h")
     assert np.all(np.abs(e.value - last) < 0.3 * e.std)

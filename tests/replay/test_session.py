@@ -20,7 +20,7 @@ from factorgraph_dvl.report.terminal.live import live_view
 from factorgraph_dvl.sensors.finding import Code
 from factorgraph_dvl.sensors.records import rows_of
 from factorgraph_dvl.simulation import simulate
-from factorgraph_dvl.solvers.batch import solved_problem
+from factorgraph_dvl.solvers.batch import solved_problems
 from factorgraph_dvl.statistics.spurious_information import spurious_information
 
 # 150 s with turns to both sides.
@@ -309,7 +309,7 @@ def test_spurious_information_is_counted_at_whatever_rate_a_sensor_comes(trial):
     session.add_imu(early.imu.time, early.imu.gyro, early.imu.accel)
     session.finish()
     nav = session._navigator
-    found = solved_problem(early, state_interval_s=0.2)
+    found = solved_problems(early, state_interval_s=0.2)[0]
     by_node = spurious_information(
         found.problem, found.minimum.evaluation, found.covariances.nodes
     ).trace(axis1=1, axis2=2)

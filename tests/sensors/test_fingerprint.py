@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from builders import build_solution, build_trial, edit
 from calibrations import calibration
+from planar import trial as planar_trial
 from truth import TURNING, scenario
 
 from factorgraph_dvl.baselines import calibrate
@@ -80,6 +81,39 @@ def test_a_part_of_a_record_is_recognised(trial, other, rows):
         cut = fingerprints([thinned])
     assert shared(whole, cut) == shared(cut, whole) == "imu"
     assert shared(fingerprints([other.imu]), cut) == ""
+
+
+def dive(seed):
+    scene = scenario(
+        manoeuvres=TURNING, noise=True, depth={"rate_hz": 2, "std_m": 0.05},
+        turntable={"rate_hz": 10, "turns": [{"at_s": 10, "turn_deg": 90, "duration_s": 20}]},
+    )  # fmt: skip
+    return simulate(scene, seed)
+
+
+def test_narrow_tables_are_recognised_by_runs_of_rows():
+    a, b = dive(1), dive(2)
+    sections = {text.partition(":")[0] for text in a.inputs}
+    # The turntable turns by the same program in both.
+    assert sections == {"imu", "gnss", "dvl", "depth"}
+    assert shared(a.inputs, b.inputs) == ""
+    depth = a.depth
+    rows = slice(20, 120)
+    later = replace(depth, time=depth.time[rows], depth=depth.depth[rows])
+    assert shared(fingerprints([later]), a.inputs) == "depth"
+
+
+def test_a_depth_that_stays_is_no_sign_of_the_same_data():
+    depth = dive(1).depth
+    calm = replace(depth, depth=np.zeros(depth.time.size))
+    assert fingerprints([calm]) == ()
+
+
+def test_planar_trials_have_fingerprints():
+    a, b = planar_trial(1), planar_trial(2)
+    assert {text.partition(":")[0] for text in a.inputs} == {"heading", "log", "depth", "beacons"}
+    assert shared(a.inputs, planar_trial(1).inputs)
+    assert shared(a.inputs, b.inputs) == ""
 
 
 def test_a_short_stretch_in_common_is_none_of_the_data(trial, other):

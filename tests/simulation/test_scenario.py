@@ -3,7 +3,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import yaml
+from planar import trial as planar_trial
 from simulated import CONFIGS, constant, run, scenario_dict
+from truth import scenario
 
 from factorgraph_dvl.errors import ConfigError
 from factorgraph_dvl.geometry.earth import LocalFrame
@@ -119,6 +121,25 @@ def test_shipped_scenarios_are_valid(path):
     duration = plan_motion(scenario).duration
     if path.stem.startswith("cruise"):
         assert duration == pytest.approx(4800, abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("change", "key"),
+    [
+        ({"sway": {"roll": [{"amplitude_deg": 1, "frequency_hz": 1e4}]}}, "sway"),
+        ({"imu": {"rate_hz": 1e5}}, "imu.rate_hz"),
+        ({"reference_rate_hz": 1e5}, "reference_rate_hz"),
+        ({"dvl": {"rate_hz": 1e5}}, "dvl.rate_hz"),
+    ],
+)
+def test_what_cannot_be_in_memory_is_refused(change, key):
+    with pytest.raises(ConfigError, match=rf"key {key}: .* GB of memory, and there are .* GB"):
+        simulate(scenario(manoeuvres=[{"straight_s": 1e7}], **change))
+
+
+def test_a_planar_trial_that_cannot_be_in_memory_is_refused():
+    with pytest.raises(ConfigError, match=r"key log\.rate_hz: .* steps"):
+        planar_trial(manoeuvres=[{"straight_s": 1e7}], log={"rate_hz": 1e5})
 
 
 @pytest.mark.parametrize("case", BAD)

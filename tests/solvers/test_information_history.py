@@ -16,7 +16,7 @@ from factorgraph_dvl.geometry.rotations import exp_so3, log_so3
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.graph import keys
 from factorgraph_dvl.simulation import simulate
-from factorgraph_dvl.solvers.batch import solved_problem
+from factorgraph_dvl.solvers.batch import solved_problems
 from factorgraph_dvl.solvers.information_history import (
     information_history,
     run_filter,
@@ -28,7 +28,7 @@ CALM = {"sway": {}, "current_m_s": [0.3, -0.1, 0]}
 
 
 def history_of(scene, seed=1):
-    found = solved_problem(simulate(scene, seed))
+    found = solved_problems(simulate(scene, seed))[0]
     history = information_history(found)
     return found, history
 
@@ -196,7 +196,7 @@ def test_gaps_and_outages_do_no_harm():
 
 def test_a_trial_without_a_dvl_has_the_biases():
     trial = replace(simulate(scenario(noise=True), 1), dvl=None)
-    found = solved_problem(trial)
+    found = solved_problems(trial)[0]
     history = information_history(found)
     assert len(history.names) == 6
     assert all("_bias_" in name for name in history.names)
