@@ -44,6 +44,12 @@ OBSERVABLE = 0.5
 # few of them are so large by chance, of this probability.
 CONTRADICTS = 2.0
 _CHANCE = 1e-3
+# Share of outliers from which on they are a reason to doubt. Chosen: a good log has some.
+_MANY_OUTLIERS = 0.02
+# Windows of outliers that a finding lists, and time between two of them, s. Chosen: a line's
+# length, and the time in which rejected measurements make a window.
+_LISTED = 5
+_APART = 10.0
 
 
 @dataclass(frozen=True)
@@ -157,6 +163,8 @@ class Residuals:
         Predicted - measured; nan where a component was not measured.
     sigma : ndarray, shape (M, d)
         Standard deviation of the measurement; likewise.
+    reason : {'echo', 'outlier', 'window'}, optional
+        Why they were rejected, if they were: `window` if those about them are wrong together.
     """
 
     label: str
@@ -165,6 +173,7 @@ class Residuals:
     time: Array
     residual: Array
     sigma: Array
+    reason: str = "echo"
 
 
 @dataclass(frozen=True)
@@ -717,6 +726,35 @@ def most_probable_minimum(solutions: Sequence[Solution], against: Array) -> Solu
             ),
         ),
     )
+
+
+def outlier_findings(used: Sequence[Residuals], rejected: Sequence[Residuals]) -> list[Finding]:
+    """Return a finding for each kind of measurement of which some are outliers."""
+    kept = {r.label: r.time.size for r in used}
+    out = []
+    for label in dict.fromkeys(r.label for r in rejected):
+        own = [r for r in rejected if r.label == label]
+        count = sum(r.time.size for r in own)
+        total = count + kept.get(label, 0)
+        text = f"{count} of {total} are outliers and were not used; rejected.csv lists them"
+        spans = [span for r in own if r.reason == "window" for span in _spans(r.time)]
+        if spans:
+            listed = ", ".join(f"{a:.1f} to {b:.1f} s" for a, b in spans[:_LISTED])
+            more = f" and {len(spans) - _LISTED} more" if len(spans) > _LISTED else ""
+            text += f". They are wrong together from {listed}{more}"
+        severe = count > _MANY_OUTLIERS * total or bool(spans)
+        out.append(
+            Finding(Code.OUTLIERS, text, sensor=label, severity="warning" if severe else "note")
+        )
+    return out
+
+
+def _spans(time: Array) -> list[tuple[float, float]]:
+    """Return begin and end of the windows that times (M,) form."""
+    ends = np.flatnonzero(np.diff(time) > _APART)
+    first = np.concatenate([[0], ends + 1])
+    last = np.concatenate([ends, [time.size - 1]])
+    return [(float(time[a]), float(time[b])) for a, b in zip(first, last, strict=True)]
 
 
 def mostly_rejected(used: Sequence[Residuals], rejected: Sequence[Residuals]) -> list[Finding]:

@@ -171,7 +171,7 @@ class Problem:
         By label, factors (d,) on the standard deviations that sensors state for their own noise;
         1 where there are none. `weigh` applies them.
     robust_weights : mapping of str to ndarray
-        By label, weights (M,) from 0 to 1 on the squares of residuals; likewise.
+        By label, weights from 0 to 1 on the squares of residuals, (M, d) or (M, 1); likewise.
     """
 
     def __init__(
@@ -401,10 +401,8 @@ class Problem:
         """Return the weights that measurements have by their standard deviations there."""
         out = []
         for bound, sigma in zip(self._bound, self.sigma(evaluation), strict=True):
-            root = bound.usable * np.sqrt(
-                self.robust_weights.get(bound.observation.label, np.ones(bound.time.size))
-            )
-            out.append(root[:, None] / sigma)
+            root = np.sqrt(self.robust_weights.get(bound.observation.label, 1.0))
+            out.append(bound.usable[:, None] * root / sigma)
         return out
 
     def linearize(self, evaluation: Evaluation) -> gtsam.GaussianFactorGraph:

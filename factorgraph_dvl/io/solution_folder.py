@@ -123,13 +123,22 @@ def _write_hypotheses(folder: Path, hypotheses: Sequence[Hypothesis]) -> None:
 
 def _rejected_columns(rejected: Sequence[Residuals]) -> dict[str, Any]:
     """Return the rejected measurements as a table, by time."""
-    columns: dict[str, Any] = {
-        "time_s": np.concatenate([r.time for r in rejected]),
-        "measurement": np.concatenate([np.full(r.time.size, r.label) for r in rejected]),
-        "unit": np.concatenate([np.full(r.time.size, r.unit) for r in rejected]),
-        "residual": np.concatenate([r.residual[:, 0] for r in rejected]),
-        "std": np.concatenate([r.sigma[:, 0] for r in rejected]),
-    }
+    parts = []
+    for r in rejected:
+        row, component = np.nonzero(np.isfinite(r.residual))
+        names = np.array(r.components)
+        parts.append(
+            {
+                "time_s": r.time[row],
+                "sensor": np.full(row.size, r.label),
+                "component": names[component],
+                "reason": np.full(row.size, r.reason),
+                "residual": r.residual[row, component],
+                "std": r.sigma[row, component],
+                "unit": np.full(row.size, r.unit),
+            }
+        )
+    columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     order = np.argsort(columns["time_s"], kind="stable")
     return {name: values[order] for name, values in columns.items()}
 

@@ -248,6 +248,11 @@ class _ToBeacon:
         return ()
 
     @property
+    def independent(self) -> bool:
+        """Whether components are measured apart; there is one."""
+        return False
+
+    @property
     def offset(self) -> str:
         """Name of the parameter of the beacon's own place."""
         return offset_name(self.beacon)

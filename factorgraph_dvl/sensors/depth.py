@@ -139,6 +139,7 @@ class DepthBelowSurface:
     components: tuple[str, ...] = ("down",)
     gate: float | None = None
     noise_groups: tuple[tuple[int, ...], ...] = ((0,),)
+    independent: bool = False
     parameters: tuple[str, ...] = (SEA_SURFACE_HEIGHT,)
 
     def true_time(self, values: Values) -> Array:

@@ -307,6 +307,7 @@ class DvlVelocity:
     components: tuple[str, ...] = ("x", "y", "z")
     gate: float | None = None
     noise_groups: tuple[tuple[int, ...], ...] = ((0,), (1,), (2,))
+    independent: bool = False
     parameters: tuple[str, ...] = (
         MISALIGNMENT,
         SCALE_ERROR,

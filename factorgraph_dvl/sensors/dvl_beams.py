@@ -362,6 +362,11 @@ class BeamVelocity:
         return tuple(f"beam {i}" for i in range(1, self.measured.shape[1] + 1))
 
     @property
+    def independent(self) -> bool:
+        """Whether components are measured apart: one beam may lock on a fish alone."""
+        return True
+
+    @property
     def noise_groups(self) -> tuple[tuple[int, ...], ...]:
         """Each beam by itself."""
         return tuple((i,) for i in range(self.measured.shape[1]))

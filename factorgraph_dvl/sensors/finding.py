@@ -344,6 +344,12 @@ class Code(StrEnum):
         "Errors that wander, as those of GNSS do, hide in the trajectory and leave little noise.",
         "Correct the standard deviation of the sensor; state what wanders as correlated.",
     )
+    OUTLIERS = (
+        "outliers",
+        "Some measurements are far from what all others say, and are not used.",
+        "Values and standard deviations come from the rest; smaller errors may have passed.",
+        "Look at rejected.csv; check bottom lock and fixes at these times.",
+    )
     NOISE_NOT_SETTLED = (
         "noise_not_settled",
         "The noise of a sensor comes out the larger the more of it is allowed for.",

@@ -238,6 +238,7 @@ class AntennaPosition:
     components: tuple[str, ...] = ("east", "north", "up")
     gate: float | None = None
     noise_groups: tuple[tuple[int, ...], ...] = HORIZONTAL_AND_UP
+    independent: bool = False
     parameters: tuple[str, ...] = (LEVER_ARM,)
 
     def true_time(self, values: Values) -> Array:
@@ -299,6 +300,7 @@ class AntennaVelocity:
     components: tuple[str, ...] = ("east", "north", "up")
     gate: float | None = None
     noise_groups: tuple[tuple[int, ...], ...] = HORIZONTAL_AND_UP
+    independent: bool = False
     parameters: tuple[str, ...] = (LEVER_ARM,)
 
     def true_time(self, values: Values) -> Array:

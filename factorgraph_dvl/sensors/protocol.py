@@ -117,6 +117,10 @@ class Observation(Protocol):
         standard deviation that is stated.
         """
 
+    @property
+    def independent(self) -> bool:
+        """Whether components are measured apart, so that one may be an outlier alone."""
+
     def true_time(self, values: Values) -> Array:
         """Return the (M,) times at which the measurements were true, s."""
 

@@ -416,6 +416,7 @@ class StarAttitude:
     components: tuple[str, ...] = ("x", "y", "z")
     gate: float | None = None
     noise_groups: tuple[tuple[int, ...], ...] = ()
+    independent: bool = False
     label: str = "Star attitude"
     unit: str = "arcsec"
     parameters: tuple[str, ...] = (MOUNTING,)

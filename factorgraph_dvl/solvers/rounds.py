@@ -19,6 +19,7 @@ from factorgraph_dvl.imu.propagation import States
 from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.solution import Progress
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, minimise
+from factorgraph_dvl.solvers.outliers import robust_weights
 from factorgraph_dvl.solvers.preparation import Preparation, mounted_start
 from factorgraph_dvl.statistics.square_root_information import SquareRootInformation
 from factorgraph_dvl.statistics.variance_components import noise_factors
@@ -32,6 +33,9 @@ _ROUNDS = 12
 _NOISE_ROUNDS = 4
 # What of a problem changes without a new one.
 _NOISE = "the noise of the sensors"
+_OUTLIERS = "which measurements are outliers"
+# Searches for outliers. Chosen: the second finds those that the first could not see.
+_SEARCHES = 2
 
 
 @dataclass(frozen=True)
@@ -100,10 +104,12 @@ def settle(
         for o in prepared.observations
         if o.label in estimated and o.noise_groups
     }
+    robust: dict[str, Array] = {}
+    searches = 0
     levels = _NoiseLevels((as_stated,), bool(as_stated))
     changing: list[str] = ["all"]
     for _ in range(_ROUNDS):
-        if changing != [_NOISE]:
+        if changing not in ([_NOISE], [_OUTLIERS]):
             problem = Problem(
                 chain,
                 prepared.observations,
@@ -113,6 +119,7 @@ def settle(
             )
             problem.reject(rejected)
         problem.noise_factors = levels.factors[-1]
+        problem.robust_weights = robust
         at = problem.values(states, problem.prior_values() | values)
         minimum = minimise(problem, at, stage="all sensors", progress=report)
         iterations += minimum.iterations
@@ -131,6 +138,13 @@ def settle(
             outliers = min(cycle, key=_count)
         if not _same(outliers, rejected):
             changing.append("which measurements are echoes")
+        if not changing and searches < _SEARCHES:
+            searches += 1
+            outliers_found = robust_weights(problem, minimum.evaluation)
+            if outliers_found is not None:
+                changing.append(_OUTLIERS)
+                robust, evaluation = outliers_found
+                states, values = evaluation.states, evaluation.parameters
         if not changing and levels.estimated and minimum.converged:
             levels = _next_noise(levels, problem, minimum)
             if not _same(levels.factors[-1], levels.factors[-2]):

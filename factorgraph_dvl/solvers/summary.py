@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import fields
 from functools import partial
 
 import numpy as np
 
-from factorgraph_dvl.graph.problem import Problem
+from factorgraph_dvl.graph.problem import Evaluation, Problem
 from factorgraph_dvl.quality.earlier_calibration import prior_findings
 from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.sensors.protocol import Motion
@@ -21,12 +21,14 @@ from factorgraph_dvl.solution import (
     mostly_rejected,
     noise_name,
     not_observable,
+    outlier_findings,
 )
 from factorgraph_dvl.solvers.calibration import calibration
 from factorgraph_dvl.solvers.causes import causes
 from factorgraph_dvl.solvers.fixed_directions import SolvedProblem
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum
 from factorgraph_dvl.solvers.trajectory import trajectory_between
+from factorgraph_dvl.statistics.robust_weights import windows
 from factorgraph_dvl.trial import Trial
 
 
@@ -68,7 +70,8 @@ def summarise(trial: Trial, found: SolvedProblem, *, rate_hz: float) -> Solution
     noise = tuple(Noise(noise_name(n), f) for n, f in problem.noise_factors.items())
     findings += consistency_findings(estimates, residuals, noise)
     findings += prior_findings(trial, estimates, covariance)
-    findings += mostly_rejected(residuals, rejected)
+    findings += mostly_rejected(residuals, [r for r in rejected if r.reason == "echo"])
+    findings += outlier_findings(residuals, [r for r in rejected if r.reason != "echo"])
     findings += _unobservable(trial, problem, estimates, evaluation.motions)
     return Solution(
         trial=trial.name,
@@ -119,7 +122,38 @@ def _rejected(problem: Problem, minimum: Minimum) -> tuple[Residuals, ...]:
             residual = o.residual(motion, evaluation.parameters)[own]
             sigma = o.sigma(motion, evaluation.parameters)[own]
             out.append(Residuals(o.label, o.unit, o.components, o.time[own], residual, sigma))
-    return tuple(out)
+    return (*out, *_outliers(problem, evaluation))
+
+
+def _outliers(problem: Problem, evaluation: Evaluation) -> Iterator[Residuals]:
+    """Yield what robust weights leave out, single measurements and windows apart."""
+    for o, motion, sigma in zip(
+        problem.observations, evaluation.motions, problem.sigma(evaluation), strict=True
+    ):
+        if o.label not in problem.robust_weights:
+            continue
+        residual = o.residual(motion, evaluation.parameters)
+        weights = np.broadcast_to(problem.robust_weights[o.label], residual.shape)
+        measured = np.isfinite(sigma)
+        left_out = np.asarray(measured & (weights == 0.0))
+        together = np.stack(
+            [windows(o.time, c, m) for c, m in zip(left_out.T, measured.T, strict=True)], axis=1
+        )
+        for reason, kind in (
+            ("outlier", left_out & ~together),
+            ("window", left_out & together),
+        ):
+            rows = kind.any(axis=1)
+            if rows.any():
+                yield Residuals(
+                    label=o.label,
+                    unit=o.unit,
+                    components=o.components,
+                    time=o.time[rows],
+                    residual=np.where(kind, residual, np.nan)[rows],
+                    sigma=np.where(kind, sigma, np.nan)[rows],
+                    reason=reason,
+                )
 
 
 def _subset(motion: Motion, used: np.ndarray) -> Motion:

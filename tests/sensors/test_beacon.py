@@ -202,8 +202,8 @@ def test_a_trial_without_a_position_is_solved_and_echoes_are_named(tmp_path):
     np.testing.assert_array_equal(rejected.time, trial.beacons.time[echo])
     save_solution(solution, tmp_path / "out")
     lines = (tmp_path / "out" / "rejected.csv").read_text().splitlines()
-    assert lines[0] == "time_s,measurement,unit,residual,std"
-    assert '"Beacon B1 range"' in lines[1]
+    assert lines[0] == "time_s,sensor,component,reason,residual,std,unit"
+    assert '"Beacon B1 range","range","echo"' in lines[1]
     assert (tmp_path / "out" / "hypotheses" / "2.csv").exists()
 
 

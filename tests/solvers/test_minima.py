@@ -21,7 +21,8 @@ def test_a_ping_counts_as_evidence_by_any_of_its_beams():
     residual = np.array([[0.0, 3.0, 4.0], [0.0, 0.0, 0.0]])
     weight = np.array([[0.0, 1.0, 1.0], [0.0, 0.0, 0.0]])
     problem = SimpleNamespace(
-        observations=[SimpleNamespace(gate=2.0)],
+        observations=[SimpleNamespace(gate=2.0, label="Range", time=np.zeros(2))],
+        robust_weights={},
         weights=[weight],
         log_sigma=lambda _: [np.array([3.0, 0.0])],
     )

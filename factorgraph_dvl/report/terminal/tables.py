@@ -159,11 +159,11 @@ def hypothesis_table(solution: Solution) -> Table:
 
 def rejected_line(solution: Solution) -> str:
     """Return the number of rejected measurements, by kind."""
-    used = {r.label: r.time.size for r in solution.residuals}
-    parts = [
-        f"{r.time.size} of {r.time.size + used.get(r.label, 0)} {r.label}"
-        for r in solution.rejected
-    ]
+    total = {r.label: r.time.size for r in solution.residuals}
+    count: dict[str, int] = {}
+    for r in solution.rejected:
+        count[r.label] = count.get(r.label, 0) + r.time.size
+    parts = [f"{n} of {n + total.get(label, 0)} {label}" for label, n in count.items()]
     return f"Rejected: {', '.join(parts)}; rejected.csv lists them"
 
 

@@ -1,0 +1,103 @@
+"""Outliers among measurements, by graduated truncation around Gauss-Newton steps."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.graph.problem import Evaluation, Problem
+from factorgraph_dvl.solvers.levenberg_marquardt import eliminate, quick_step
+from factorgraph_dvl.statistics.robust_weights import BoolArray, Truncation, windows
+
+# Share of the measurements of a kind from which on it is the model that is wrong, and none is
+# rejected. Chosen: more than all gross errors of a bad trial together.
+_TOO_MANY = 0.4
+
+
+def robust_weights(
+    problem: Problem, evaluation: Evaluation
+) -> tuple[dict[str, Array], Evaluation] | None:
+    """Return weights 0 or 1 by label, and where the rest leads; None if there is no outlier.
+
+    Parameters
+    ----------
+    problem : Problem
+        Its robust weights are replaced.
+    evaluation : Evaluation
+        At a minimum.
+    """
+    groups = {o.label: i for i, o in enumerate(problem.observations) if o.noise_groups}
+    if not any(t.worth_it for t in _searches(problem, evaluation, groups).values()):
+        return None
+    problem.robust_weights = {}
+    problem.weigh(evaluation)
+    used = _used(problem, groups)
+    residuals = _normalised(problem, evaluation, used, groups)
+    search = _searches(problem, evaluation, groups)
+    search = {label: truncation for label, truncation in search.items() if truncation.worth_it}
+    weights: dict[str, Array] = {}
+    while not all(truncation.done for truncation in search.values()):
+        for label, truncation in search.items():
+            if not truncation.done:
+                weights[label] = truncation.weights(residuals[label])
+        problem.robust_weights = weights
+        problem.weigh(evaluation)
+        gaussian = problem.linearize(evaluation)
+        ordering = problem.ordering(gaussian)
+        step = quick_step(gaussian, ordering)
+        if step is None:
+            step = eliminate(gaussian, ordering).optimize()
+        after = problem.evaluate(evaluation.values.retract(step))
+        if not np.isfinite(after.cost):
+            break
+        evaluation = after
+        residuals = _normalised(problem, evaluation, used, groups)
+    final = {label: t.outliers(residuals[label]) for label, t in search.items()}
+    found = {
+        label: 1.0 - _with_windows(problem.observations[groups[label]].time, out, used[label])
+        for label, out in final.items()
+        if out.any() and (out & used[label]).sum() < _TOO_MANY * used[label].sum()
+    }
+    problem.robust_weights = found
+    return found, evaluation
+
+
+def _searches(
+    problem: Problem, evaluation: Evaluation, groups: Mapping[str, int]
+) -> dict[str, Truncation]:
+    """Return searches among what is used now, by label."""
+    used = _used(problem, groups)
+    residuals = _normalised(problem, evaluation, used, groups)
+    return {
+        label: Truncation(residuals[label], apart=problem.observations[i].independent)
+        for label, i in groups.items()
+        if used[label].any()
+    }
+
+
+def _used(problem: Problem, groups: Mapping[str, int]) -> dict[str, BoolArray]:
+    return {label: problem.weights[i] > 0.0 for label, i in groups.items()}
+
+
+def _normalised(
+    problem: Problem,
+    evaluation: Evaluation,
+    used: Mapping[str, BoolArray],
+    groups: Mapping[str, int],
+) -> dict[str, Array]:
+    """Return residuals in standard deviations by label, (M, d); nan where unused."""
+    sigma = problem.sigma(evaluation)
+    out = {}
+    for label, i in groups.items():
+        residual = problem.observations[i].residual(evaluation.motions[i], evaluation.parameters)
+        out[label] = np.where(used[label], residual / sigma[i], np.nan)
+    return out
+
+
+def _with_windows(time: Array, out: BoolArray, used: BoolArray) -> Array:
+    """Return outliers with what lies between those that are wrong together, same shape, 0 or 1."""
+    known = used if out.shape[1] > 1 else np.asarray(used.any(axis=1, keepdims=True))
+    whole = [o | windows(time, o & k, k) for o, k in zip(out.T, known.T, strict=True)]
+    return np.stack(whole, axis=1).astype(float)

@@ -1,0 +1,123 @@
+"""Robust weights: outliers by truncated least squares, and windows of them."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+from factorgraph_dvl.geometry.vectors import Array
+
+BoolArray = NDArray[np.bool_]
+
+# Probability with which a good measurement passes the gate. Chosen: one in a thousand is lost.
+_GATE = 0.999
+# Square of a residual, in gates, up to which nothing is worth a search for outliers. Chosen: twice
+# the gate is reached by chance once in 1e13 measurements.
+_WORTH = 4.0
+# Least scale of residuals, in stated standard deviations. Chosen: records without noise have none.
+_LEAST_SCALE = 0.2
+# Growth of the convexity parameter in a step. Chosen: some ten steps to the end.
+_GROWTH = 3.0
+# From which on weights are 0 or 1. Chosen: a band of 1 % about the gate is left.
+_LARGEST_MU = 50.0
+# Rejected measurements that make a window, s in which they lie, and the least share of all
+# measurements in between. Chosen: locks that are wrong together reject nearly all.
+_RUN = 5
+_RUN_TIME = 10.0
+_RUN_SHARE = 0.5
+
+
+def robust_scale(residuals: Array) -> Array:
+    """Return the standard deviation (d,) of white noise in residuals (M, d), nan where unused.
+
+    From the median absolute deviation of first differences over sqrt(2): neither outliers nor
+    what is slow, as errors of the model or correlated noise, count.
+    """
+    step = np.diff(residuals, axis=0) / np.sqrt(2.0)
+    out = np.ones(residuals.shape[1])
+    for i, column in enumerate(step.T):
+        known = column[np.isfinite(column)]
+        if known.size:
+            out[i] = 1.4826 * np.median(np.abs(known - np.median(known)))
+    return np.maximum(out, _LEAST_SCALE)
+
+
+class Truncation:
+    """Graduated truncation of squared residuals, from nearly least squares to the gate.
+
+    Yang, Antonante, Tzoumas and Carlone, Graduated non-convexity for robust spatial perception,
+    IEEE Robotics and Automation Letters 5(2), 2020, eqs. 14 and remark 5.
+
+    Parameters
+    ----------
+    residuals : ndarray, shape (M, d)
+        At the start, in stated standard deviations; nan where a component is not used. Their
+        scale is frozen there.
+    apart : bool
+        Whether components are outliers each for itself.
+    """
+
+    def __init__(self, residuals: Array, *, apart: bool) -> None:
+        self._scale = robust_scale(residuals)
+        self._apart = apart
+        used = np.isfinite(residuals)
+        freedom = np.ones(used.shape) if apart else used.sum(axis=1, keepdims=True)
+        self._gate = chi2.isf(1.0 - _GATE, np.maximum(freedom, 1))
+        largest = float(np.max(self.squares(residuals) / self._gate, initial=0.0))
+        self.worth_it = largest > _WORTH
+        self._mu = 1.0 / max(2.0 * largest - 1.0, 1e-9)
+
+    @property
+    def done(self) -> bool:
+        """Whether weights are as good as 0 or 1."""
+        return not self.worth_it or self._mu > _LARGEST_MU
+
+    def squares(self, residuals: Array) -> Array:
+        """Return squared residuals by what may be an outlier, (M, d) or (M, 1)."""
+        squares = np.nan_to_num((residuals / self._scale) ** 2)
+        return squares if self._apart else squares.sum(axis=1, keepdims=True)
+
+    def weights(self, residuals: Array) -> Array:
+        """Return the weights of squared residuals, (M, d) or (M, 1), and go one step on."""
+        mu, ratio = self._mu, self.squares(residuals) / self._gate
+        between = np.sqrt(mu * (mu + 1.0) / np.maximum(ratio, np.finfo(float).tiny)) - mu
+        self._mu *= _GROWTH
+        return np.clip(between, 0.0, 1.0)
+
+    def outliers(self, residuals: Array) -> BoolArray:
+        """Return what lies beyond the gate, (M, d) or (M, 1) bool."""
+        return np.asarray(self.squares(residuals) > self._gate)
+
+
+def rejection_cost(weights: Array, components: int) -> Array:
+    """Return what rejected measurements cost in place of their residuals, (M,): half the gate.
+
+    Parameters
+    ----------
+    weights : ndarray, shape (M, d) or (M, 1)
+        0 where rejected, else 1.
+    components : int
+        Number d of components.
+    """
+    freedom = 1 if weights.shape[1] == components else components
+    return 0.5 * chi2.isf(1.0 - _GATE, freedom) * np.sum(1.0 - weights, axis=1)
+
+
+def windows(time: Array, rejected: BoolArray, used: BoolArray) -> BoolArray:
+    """Return which measurements (M,) lie between rejected ones that are wrong together.
+
+    Parameters
+    ----------
+    time : ndarray, shape (M,), s
+    rejected, used : ndarray, shape (M,)
+        Bool; rejected measurements are among the used ones.
+    """
+    inside = np.zeros(time.size, dtype=bool)
+    at = np.flatnonzero(rejected)
+    before = np.concatenate([[0], np.cumsum(used)])
+    for first, last in zip(at[: -_RUN + 1], at[_RUN - 1 :], strict=False):
+        count = before[last + 1] - before[first]
+        if time[last] - time[first] <= _RUN_TIME and count * _RUN_SHARE <= _RUN:
+            inside[first : last + 1] = True
+    return inside & used

@@ -1,0 +1,120 @@
+"""Trials with gross errors: what is named, what is lost, what comes out."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from monte_carlo import RUNS
+from truth import TURNING, config, scenario
+
+from factorgraph_dvl.analysis.error_statistics import calibration_errors
+from factorgraph_dvl.sensors.finding import Code
+from factorgraph_dvl.simulation import faults, simulate
+from factorgraph_dvl.solvers.batch import solve
+
+CASES = {
+    "pings": [faults.dvl_outliers()],
+    "fixes": [faults.gnss_outliers()],
+    "false lock": [faults.dvl_false_lock()],
+    "jumps": [faults.gnss_jumps()],
+    "all": [
+        faults.dvl_outliers(),
+        faults.gnss_outliers(),
+        faults.dvl_false_lock(),
+        faults.gnss_jumps(),
+    ],
+}
+
+
+def wrong(before, after):
+    """Rows that a fault changed, by measurement; displacing fixes by nothing rounds them."""
+    moved = np.abs(after.gnss.geodetic - before.gnss.geodetic) * [6.4e6, 6.4e6, 1.0]
+    return {
+        "DVL velocity": (
+            before.dvl.time,
+            np.any(after.dvl.velocity != before.dvl.velocity, axis=1),
+        ),
+        "GNSS position": (before.gnss.time, np.any(moved > 1e-3, axis=1)),
+    }
+
+
+def judged(clean, seed, case):
+    """Return the normalised errors, shares named and lost, and the solution."""
+    trial = faults.with_faults(clean, CASES[case], seed)
+    solution = solve(trial, rate_hz=1.0)
+    named, bad_ones, lost, good_ones = 0, 0, 0, 0
+    for label, (time, bad) in wrong(clean, trial).items():
+        rejected = [r.time for r in solution.rejected if r.label == label]
+        out = np.isin(time, np.concatenate([np.empty(0), *rejected]))
+        named, bad_ones = named + (out & bad).sum(), bad_ones + bad.sum()
+        lost, good_ones = lost + (out & ~bad).sum(), good_ones + (~bad).sum()
+    errors = calibration_errors(solution, trial.calibration_truth)
+    return errors, named / bad_ones, lost / good_ones, solution
+
+
+@pytest.fixture(scope="module")
+def clean():
+    scene = scenario(
+        noise=True,
+        manoeuvres=[*TURNING, TURNING[1], TURNING[3]],
+        imu={"rate_hz": 50},
+        dvl={"rate_hz": 5},
+    )
+    return simulate(scene, 3)
+
+
+@pytest.mark.parametrize("case", ["pings", "fixes"])
+def test_gross_errors_are_named_and_harmless(clean, case):
+    errors, named, lost, solution = judged(clean, 3, case)
+    assert solution.converged
+    assert named >= 0.95
+    assert lost <= 0.01
+    assert np.all(np.abs(errors.normalised[:7]) < 4.0)
+    assert any(f.code == Code.OUTLIERS for f in solution.findings)
+    assert all(np.all(np.abs(n.factor - 1.0) < 0.2) for n in solution.noise)
+
+
+def test_a_clean_trial_loses_nothing(clean):
+    solution = solve(clean, rate_hz=1.0)
+    assert not solution.rejected
+    assert not any(f.code == Code.OUTLIERS for f in solution.findings)
+
+
+def test_one_beam_is_left_out_alone():
+    scene = config("cruise-beams", manoeuvres=TURNING, start={"speed_m_s": 4}, imu={"rate_hz": 50})
+    trial = simulate(scene, 1)
+    beams = trial.beams
+    velocity = beams.velocity.copy()
+    velocity[10:300:20, 1] += 0.5
+    others = tuple(
+        replace(aid, velocity=velocity) if aid.section == beams.section else aid
+        for aid in trial.others
+    )
+    solution = solve(replace(trial, others=others), rate_hz=1.0)
+    (rejected,) = (r for r in solution.rejected if r.label == "Beam velocity")
+    assert rejected.reason == "outlier"
+    bad = np.isin(rejected.time, beams.time[10:300:20])
+    assert bad.sum() == beams.time[10:300:20].size
+    assert np.all(np.isfinite(rejected.residual[bad]) == [False, True, False, False])
+    # One in a thousand good ones is beyond the gate.
+    assert (~bad).sum() <= 5
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("case", list(CASES))
+def test_errors_are_those_of_clean_data(case):
+    own, reference, shares = [], [], []
+    for seed in range(RUNS):
+        trial = simulate(config("seed-a-phase-90"), seed)
+        errors, named, lost, _ = judged(trial, seed, case)
+        exact = solve(trial, rate_hz=1.0)
+        reference.append(calibration_errors(exact, trial.calibration_truth).error[:7])
+        own.append(errors.error[:7])
+        shares.append((named, lost))
+    named, lost = np.mean(shares, axis=0)
+    assert named >= 0.95
+    assert lost <= 0.005
+    rms = np.sqrt(np.mean(np.square(own), axis=0) / np.mean(np.square(reference), axis=0))
+    assert np.all(rms < 1.5)

@@ -1,0 +1,87 @@
+"""Truncated least squares: scale, weights, windows."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from factorgraph_dvl.statistics.robust_weights import (
+    Truncation,
+    rejection_cost,
+    robust_scale,
+    windows,
+)
+
+
+def noise(count=400, sigma=1.0):
+    return np.random.default_rng(0).normal(0.0, sigma, (count, 3))
+
+
+def test_scale_sees_neither_outliers_nor_what_is_slow():
+    residuals = noise(sigma=2.0)
+    slow = 10.0 * np.sin(np.linspace(0.0, 6.0, 400))[:, None]
+    gross = np.zeros((400, 3))
+    gross[::10] = 100.0
+    np.testing.assert_allclose(robust_scale(residuals + slow), 2.0, rtol=0.15)
+    # One difference in five contains an outlier.
+    assert np.all(robust_scale(residuals + gross) < 3.0)
+    assert np.all(robust_scale(np.zeros((400, 3))) == 0.2)
+
+
+def test_good_residuals_are_not_worth_a_search():
+    search = Truncation(noise(), apart=False)
+    assert not search.worth_it
+    assert search.done
+
+
+@pytest.mark.parametrize("apart", [False, True])
+def test_a_mean_is_found_among_outliers(apart):
+    """The mean of what stays, where least squares is drawn away by several sigma."""
+    data = noise()
+    bad = np.zeros((400, 3), dtype=bool)
+    bad[::7] = True if not apart else [True, False, False]
+    data[bad] += 30.0
+    mean = data.mean(axis=0)
+    search = Truncation(data - mean, apart=apart)
+    assert search.worth_it
+    steps = 0
+    while not search.done:
+        weights = np.broadcast_to(search.weights(data - mean), data.shape)
+        mean = np.sum(weights * data, axis=0) / weights.sum(axis=0)
+        steps += 1
+    assert steps < 30
+    found = np.broadcast_to(search.outliers(data - mean), data.shape)
+    assert found[bad].all()
+    assert found[~bad].mean() < 0.005
+    assert np.all(np.abs(mean) < 0.2)
+
+
+def test_unused_components_count_nothing():
+    data = noise()
+    data[5] = np.nan
+    data[7] = [50.0, np.nan, np.nan]
+    search = Truncation(data, apart=False)
+    found = search.outliers(data)
+    assert found[7, 0]
+    assert not found[5, 0]
+
+
+def test_windows_join_what_is_wrong_together():
+    time = np.arange(200) * 0.2
+    rejected = np.zeros(200, dtype=bool)
+    rejected[50:80] = True
+    rejected[60:63] = False
+    rejected[[10, 120, 140, 160, 190]] = True
+    used = np.ones(200, dtype=bool)
+    inside = windows(time, rejected, used)
+    assert inside[50:80].all()
+    assert inside.sum() == 30
+    # Few and far between, as of a sensor that measures seldom, they are no window.
+    assert not windows(20.0 * time, rejected, used).any()
+
+
+def test_a_rejected_measurement_costs_half_the_gate():
+    np.testing.assert_allclose(
+        rejection_cost(np.array([[1.0], [0.0]]), 3), [0.0, 8.133], rtol=1e-3
+    )
+    np.testing.assert_allclose(rejection_cost(np.array([[1.0, 0.0]]), 2), [5.414], rtol=1e-3)
