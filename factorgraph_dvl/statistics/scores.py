@@ -1,0 +1,116 @@
+"""Score tests of parameters that are taken as known: would they explain the misfit."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+from scipy.stats import chi2
+
+from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.statistics.square_root_information import SquareRootInformation
+
+
+@dataclass(frozen=True)
+class Score:
+    """Test of some parameters that were taken as known.
+
+    Parameters
+    ----------
+    chi2 : float
+        Twice the fall of the cost if they were free.
+    freedom : int
+        Number of their components.
+    step, std : ndarray, shape (freedom,), SI
+        Where they would go in their tangent space, and how well that would be known, all other
+        candidates being right.
+    """
+
+    chi2: float
+    freedom: int
+    step: Array
+    std: Array
+
+    @property
+    def log10_p(self) -> float:
+        """Logarithm of the probability of a larger chi2 by chance; -inf where it underflows."""
+        return float(chi2.logsf(self.chi2, self.freedom) / np.log(10.0))
+
+    def evidence(self, count: int) -> float:
+        """Return what ranks causes: chi2, less what each component costs for a count of data.
+
+        As probabilities underflow for several at once (Schwarz, Estimating the dimension of a
+        model, Annals of Statistics 6(2), 1978).
+        """
+        return self.chi2 - self.freedom * float(np.log(count))
+
+
+@dataclass(frozen=True)
+class Scores:
+    """Scores S and information I of all candidates, everything else eliminated.
+
+    Parameters
+    ----------
+    places : mapping of str to slice
+        Components of each candidate among all.
+    score : ndarray, shape (C,)
+        Downward gradient of the cost, 1/SI.
+    information : ndarray, shape (C, C)
+        Of the data, 1/SI².
+    """
+
+    places: Mapping[str, slice]
+    score: Array
+    information: Array
+
+    def test(self, names: Sequence[str]) -> Score:
+        """Return the test of some candidates together, all others being right."""
+        rows = np.concatenate([np.arange(self.score.size)[self.places[name]] for name in names])
+        own, score = self.information[np.ix_(rows, rows)], self.score[rows]
+        inverse = np.linalg.inv(own)
+        step = inverse @ score
+        return Score(float(score @ step), rows.size, step, np.sqrt(np.diag(inverse)))
+
+
+def scores(
+    tree: gtsam.GaussianBayesTree,
+    information: SquareRootInformation,
+    candidates: Mapping[str, tuple[int, Array]],
+) -> Scores:
+    """Return scores and information of parameters that were taken as known.
+
+    The graph holds them as variables with a wide prior, linearised where the fit without them
+    ended, their priors' means being the values there. With P their covariance, the step delta
+    that the tree promises, and Lambda the information of the priors,
+
+        I = P⁻¹ - Lambda,    S = P⁻¹ delta,    chi² = Sᵀ I⁻¹ S
+
+    (Rao, Large sample tests of statistical hypotheses, 1948; Engle, Wald, likelihood ratio, and
+    Lagrange multiplier tests in econometrics, 1984).
+
+    Parameters
+    ----------
+    tree : gtsam.GaussianBayesTree
+        From QR.
+    information : SquareRootInformation
+        Of that tree.
+    candidates : mapping of str to tuple of (int, ndarray)
+        By name, key and standard deviations (n,) of the wide prior.
+    """
+    delta = tree.optimize()
+    sizes = [sigma.size for _, sigma in candidates.values()]
+    edges = np.cumsum([0, *sizes])
+    P = information.covariance_of(
+        [{key: np.eye(sigma.size)} for key, sigma in candidates.values()]
+    )
+    sigma = np.concatenate([sigma for _, sigma in candidates.values()])
+    step = np.concatenate([delta.at(key) for key, _ in candidates.values()])
+    # In units of the wide priors, that parameters of all sizes keep their digits.
+    whole = np.linalg.inv(P / np.outer(sigma, sigma))
+    return Scores(
+        {name: slice(a, b) for name, a, b in zip(candidates, edges, edges[1:], strict=False)},
+        whole @ (step / sigma) / sigma,
+        (whole - np.eye(sigma.size)) / np.outer(sigma, sigma),
+    )
