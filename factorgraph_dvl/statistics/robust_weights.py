@@ -25,7 +25,7 @@ _LARGEST_MU = 50.0
 # measurements in between. Chosen: locks that are wrong together reject nearly all.
 _RUN = 5
 _RUN_TIME = 10.0
-_RUN_SHARE = 0.5
+_RUN_SHARE = 0.75
 
 
 def robust_scale(residuals: Array) -> Array:
@@ -110,8 +110,9 @@ def windows(time: Array, rejected: BoolArray, used: BoolArray) -> BoolArray:
     Parameters
     ----------
     time : ndarray, shape (M,), s
-    rejected, used : ndarray, shape (M,)
-        Bool; rejected measurements are among the used ones.
+        Times, increasing.
+    rejected, used : ndarray of bool, shape (M,)
+        What was rejected, and what else there was with it.
     """
     inside = np.zeros(time.size, dtype=bool)
     at = np.flatnonzero(rejected)
