@@ -14,6 +14,8 @@ from factorgraph_dvl.statistics.robust_weights import BoolArray, Truncation, win
 # Share of the measurements of a kind from which on it is the model that is wrong, and none is
 # rejected. Chosen: more than all gross errors of a bad trial together.
 _TOO_MANY = 0.4
+# Measurements from which on outliers are searched. Chosen: fewer do not tell their own scale.
+_FEWEST = 20
 
 
 def robust_weights(
@@ -73,7 +75,7 @@ def _searches(
     return {
         label: Truncation(residuals[label], apart=problem.observations[i].independent)
         for label, i in groups.items()
-        if used[label].any()
+        if np.count_nonzero(used[label].any(axis=1)) >= _FEWEST
     }
 
 

@@ -81,7 +81,7 @@ class Truncation:
     def weights(self, residuals: Array) -> Array:
         """Return the weights of squared residuals, (M, d) or (M, 1), and go one step on."""
         mu, ratio = self._mu, self.squares(residuals) / self._gate
-        between = np.sqrt(mu * (mu + 1.0) / np.maximum(ratio, np.finfo(float).tiny)) - mu
+        between = np.sqrt(mu * (mu + 1.0) / np.maximum(ratio, 1e-12)) - mu
         self._mu *= _GROWTH
         return np.clip(between, 0.0, 1.0)
 
