@@ -43,6 +43,7 @@ from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.sensors.gnss import Gnss
 from factorgraph_dvl.sensors.grades import DEFAULT_LIMITS
 from factorgraph_dvl.sensors.imu import Imu
+from factorgraph_dvl.sensors.invalid_values import without_invalid_values
 from factorgraph_dvl.sensors.parameters import JointPrior
 from factorgraph_dvl.sensors.protocol import Aid, SensorRecord, SensorSection
 from factorgraph_dvl.sensors.records import check_possible
@@ -117,11 +118,13 @@ def load_trial(path: Path | str, *, anyway: bool = False) -> Trial:
     settings = parse_yaml(text, TrialSettings, source=file.name)
     initial = settings.initial
     kinds = {aid.section: aid for aid in AIDS}
+    notes: list[Finding] = []
+    imu = read_record(folder, Imu, settings.imu, notes)
     aids = {
-        name: read_record(folder, kinds[name], section) for name, section in settings.aids.items()
+        name: read_record(folder, kinds[name], section, notes)
+        for name, section in settings.aids.items()
     }
     dvl = cast("Dvl | None", aids.pop(Dvl.section, None))
-    notes = []
     calibration = None if dvl is None else _calibration_for(dvl, folder, settings.body_axes)
     if dvl is not None and calibration is not None:
         source = str(dvl.settings.calibration)
@@ -140,7 +143,7 @@ def load_trial(path: Path | str, *, anyway: bool = False) -> Trial:
         )
     return Trial(
         name=printable(settings.name or folder.resolve().name),
-        imu=read_record(folder, Imu, settings.imu),
+        imu=imu,
         gnss=cast("Gnss | None", aids.pop(Gnss.section, None)),
         dvl=dvl,
         others=tuple(aids.values()),
@@ -424,10 +427,18 @@ def reference_of(folder: Path, settings: TrialSettings | PlanarSettings) -> Refe
     return read_reference(folder / settings.reference.file, settings.reference.file)
 
 
-def read_record(folder: Path, kind: type[_Sensor], settings: SensorSection) -> _Sensor:
-    """Return the record of a sensor, from the table that its settings name."""
+def read_record(
+    folder: Path, kind: type[_Sensor], settings: SensorSection, notes: list[Finding] | None = None
+) -> _Sensor:
+    """Return the record of a sensor, from the table that its settings name.
+
+    Invalid values are missing in it; `notes` takes in how many there were.
+    """
     required = (*kind.required, *settings.more_columns)
-    columns = read_table(folder / settings.file, required, kind.optional, source=settings.file)
+    table = read_table(folder / settings.file, required, kind.optional, source=settings.file)
+    columns, found = without_invalid_values(kind.section, table, settings.file)
+    if notes is not None:
+        notes += found
     check_possible(columns, settings.file)
     return kind.from_columns(settings, columns, settings.file)
 

@@ -105,6 +105,38 @@ class Code(StrEnum):
         "The stated noise would make standard deviations too small; that of the record is used.",
         "State the noise of a static record, or `noise: stated` where the IMU only vibrates.",
     )
+    CLOCK_OFFSET = (
+        "clock_offset",
+        "The clock of a sensor differs from that of the IMU.",
+        "In turns and sway it moves misalignment and lever arm by many standard deviations.",
+        "State it as time_offset_s of the sensor, or write all time_s by one clock.",
+    )
+    CLOCK_DRIFT = (
+        "clock_drift",
+        "The clock of a sensor runs faster or slower than that of the IMU.",
+        "No single time offset is right for the whole trial.",
+        "Write time_s from the instruments' own stamps, all by one clock.",
+    )
+    CLOCK_STEP = (
+        "clock_step",
+        "The clock of a sensor jumps against that of the IMU.",
+        "No single time offset is right for the whole trial.",
+        "Write time_s by one clock, or solve the parts before and after the jump apart.",
+    )
+    LEAP_SECONDS = (
+        "leap_seconds",
+        "Stamps differ by the leap seconds between GPS time and UTC.",
+        "The sensor would be compared with motion of another time.",
+        "Write all time_s in UTC, or all in GPS time.",
+        "error",
+    )
+    LOCAL_TIME = (
+        "local_time",
+        "Stamps differ by whole hours, as local time and UTC do.",
+        "Nothing ties the sensor to the motion: it cannot be used.",
+        "Write all time_s in UTC.",
+        "error",
+    )
     UNUSED = (
         "unused",
         "Measurements were not used.",
@@ -113,6 +145,27 @@ class Code(StrEnum):
         "note",
     )
     # What a record holds.
+    INVALID_VALUES = (
+        "invalid_values",
+        "Values with which an instrument marks what it has not measured were taken as missing.",
+        "As measurements they would be gross errors.",
+        "Nothing, if they are few; else leave such cells empty.",
+        "note",
+    )
+    FROZEN_VALUES = (
+        "frozen_values",
+        "A record repeats its values for a while.",
+        "What it repeats is not the motion of that time.",
+        "Check the logger, and leave such rows out.",
+        "error",
+    )
+    IMU_CHANNEL = (
+        "imu_channel",
+        "A channel of the IMU does not measure.",
+        "Without it there is no attitude, and nothing can be solved.",
+        "Check cable and conversion of the record.",
+        "error",
+    )
     NO_MEASUREMENT = (
         "no_measurement",
         "A record holds no measurement.",
@@ -160,6 +213,53 @@ class Code(StrEnum):
         "The angular rate is zero throughout.",
         "Without rates there is neither attitude nor lever arm.",
         "Correct the record.",
+        "error",
+    )
+    IMU_AXES = (
+        "imu_axes",
+        "Axes of the IMU are mirrored or swapped.",
+        "Turns are integrated to the wrong side: the solution would be wrong throughout.",
+        "Invert or swap the columns of imu that the text names.",
+        "error",
+    )
+    GYRO_AXES = (
+        "gyro_axes",
+        "The gyros measure in other axes, or with another sign, than the accelerometers.",
+        "Attitude follows from the rate: the solution would be wrong throughout.",
+        "Invert or swap the columns of the gyros that the text names.",
+        "error",
+    )
+    ACCEL_AXES = (
+        "accel_axes",
+        "The accelerometers measure in other axes, or with another sign, than the gyros.",
+        "Velocity follows from the force: the solution would be wrong throughout.",
+        "Invert or swap the columns of the accelerometers that the text names.",
+        "error",
+    )
+    COURSE = (
+        "course",
+        "The bow by body_axes does not point where the vehicle goes.",
+        "Roll, pitch, heading and the misalignment would be given in other axes than they seem.",
+        "Correct body_axes; if the vehicle did move like that, nothing.",
+    )
+    ANTENNA = (
+        "antenna",
+        "The antenna is elsewhere than gnss.lever_arm_m says.",
+        "In turns the error goes into the lever arm and the misalignment of the DVL.",
+        "Measure and correct gnss.lever_arm_m, or give lever_arm_std_m.",
+    )
+    GNSS_AXES = (
+        "gnss_axes",
+        "GNSS moves otherwise than the IMU.",
+        "Heading, and all that follows from it, would be wrong.",
+        "Correct order and sign of the columns of gnss that the text names.",
+        "error",
+    )
+    DVL_AXES = (
+        "dvl_axes",
+        "Axes of the DVL are mirrored, which no mounting does.",
+        "The misalignment would be a rotation that fits as badly as all others.",
+        "Invert the components that the text names; all three of a PD0 record.",
         "error",
     )
     ZERO_FIXES = (
@@ -472,6 +572,7 @@ UNUSABLE = frozenset(
     {
         Code.TIME_UNIT,
         Code.NO_OVERLAP,
+        Code.LOCAL_TIME,
         Code.NO_MEASUREMENT,
         Code.ZERO_FIXES,
         Code.RADIANS,

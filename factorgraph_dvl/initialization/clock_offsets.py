@@ -1,0 +1,355 @@
+"""Offsets of the clocks of GNSS and DVL from that of the IMU, before anything is solved.
+
+The IMU, carried through windows, says how velocity and attitude change; a clock is off by what
+makes the other sensor's velocities fit these changes. A scan finds the offset, Gauss-Newton steps
+refine it together with a rate or a jump, and the scatter of short blocks gives the standard
+deviation, whatever the noise is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol, Self
+
+import numpy as np
+
+from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.initialization.carried_windows import MARGIN_S
+
+# Steps of the scan, s, halved near its middle. Chosen: the width of a minimum under sway at 2 Hz.
+_STEP_S = 0.1
+# Reach that is scanned first, s, and the misfit, in stated noise, from which on the rest is too.
+# Chosen: most clocks are that good, and a scan costs as much as all else.
+_NEAR_S = 1.0
+_FITS = 2.5
+# Windows that are scanned, of each third of the record. Chosen: those with the largest changes
+# of velocity tell nearly all.
+_SCANNED = 3
+# Half of the difference in time by which residuals are differentiated, s.
+_DIFFERENCE_S = 0.02
+_ITERATIONS = 6
+# Halvings of a step that does not gain.
+_HALVINGS = 3
+# Minima of the scan that are refined. Chosen: under sway at 2 Hz they lie every 0.25 s.
+_MINIMA = 3
+# Blocks of measurements whose errors are independent, s. Chosen: several times the correlation
+# time of GNSS velocities.
+_BLOCK_S = 10.0
+# Fewer blocks say nothing of the scatter between them.
+_LEAST_BLOCKS = 6
+# A rate or a jump is one where it is so many standard deviations, and better than none by this
+# much of the log-likelihood. Chosen: chance gives neither in 10 000 trials.
+_CERTAIN = 6.0
+_BETTER = 20.0
+# Height of the score process, in standard deviations, from which on a rate or a jump is tried.
+# Chosen: without a change it stays below 3.2 in 99 % (Andrews 1993).
+_CHANGES = 3.2
+# Largest step of Gauss-Newton, s. Chosen: a minimum's width under sway.
+_LARGEST_STEP_S = 0.3
+# Misfit below which nothing is gained, m/s. Chosen: finer than any receiver's or DVL's digits.
+_LEAST_MISFIT = 1e-3
+
+
+class Comparison(Protocol):
+    """Velocities of a sensor against the carried IMU, in W windows of n."""
+
+    @property
+    def time(self) -> Array:
+        """Times as in the record, (W, n), s."""
+
+    @property
+    def inside(self) -> np.ndarray:
+        """Which of them are meant, (W, n) bool."""
+
+    @property
+    def count(self) -> Array:
+        """Degrees of freedom of each window, (W,)."""
+
+    @property
+    def signal(self) -> Array:
+        """Sum of squares of the changes of velocity in each window, (W,)."""
+
+    @property
+    def noise(self) -> float:
+        """Stated standard deviation of a component, m/s."""
+
+    def only(self, lines: np.ndarray) -> Self:
+        """Return some of the windows."""
+
+    def residual(self, offset: float | Array) -> Array:
+        """Return what is left if the sensor is late by an offset, (W, n, 3)."""
+
+
+@dataclass(frozen=True)
+class ClockOffset:
+    """How late a sensor's stamps are: offset + rate (t - middle), or another after a jump.
+
+    Parameters
+    ----------
+    offset, sigma : float, s
+        At `middle`; before the jump if there is one.
+    rate, rate_sigma : float
+        s/s; 0 where a rate is not certain.
+    jump, jump_sigma : float, s
+        0 where a jump is not certain.
+    jump_time : float, s
+        When; nan if never.
+    middle : float, s
+    gain : float
+        Log-likelihood that it gains against an offset `around`, its noise correlated as it is.
+    unexplained : float
+        Share of the changes of velocity that the IMU leaves, as a ratio of sums of squares.
+    """
+
+    offset: float
+    sigma: float
+    rate: float
+    rate_sigma: float
+    jump: float
+    jump_sigma: float
+    jump_time: float
+    middle: float
+    gain: float
+    unexplained: float
+
+    def late(self, time: Array) -> Array:
+        """Return by how much stamps (M,) are late, s."""
+        late = self.offset + self.rate * (time - self.middle)
+        return late + np.where(time > self.jump_time, self.jump, 0.0)
+
+
+def clock_offset(
+    comparison: Comparison, around: float = 0.0, reach: float = MARGIN_S
+) -> ClockOffset | None:
+    """Return how late a sensor's stamps are.
+
+    Parameters
+    ----------
+    comparison : Comparison
+    around : float
+        Middle of the scan, s.
+    reach : float
+        Of the scan to both sides, s.
+
+    Returns
+    -------
+    ClockOffset, None where there are too few data.
+    """
+    if np.unique(_blocks(comparison)).size < _LEAST_BLOCKS:
+        return None
+    time = comparison.time
+    middle = float(np.mean(time[comparison.inside]))
+    whole, first, last = _scan(comparison, around, reach)
+    one = np.ones_like(time)
+    constant = _refined(comparison, one[..., None], np.array([whole]))
+    best, rate, jump, jump_time = constant, (0.0, 0.0), (0.0, 0.0), np.nan
+    slopes, at = _changes(comparison, constant)
+    span = float(np.ptp(time[comparison.inside]))
+    if slopes or abs(last - first) > _STEP_S:
+        slope = 1.5 * (last - first) / span
+        design = np.stack([one, time - middle], axis=-1)
+        starts = [(constant.values[0], 0.0), (0.5 * (first + last), slope)]
+        found = _first_of(comparison, design, starts)
+        if found.better_than(best):
+            best, rate = found, (float(found.values[1]), float(found.sigma[1]))
+        design = np.stack([one, (time > at).astype(float)], axis=-1)
+        starts = [(constant.values[0], 0.0), (first, last - first)]
+        found = _first_of(comparison, design, starts)
+        if found.better_than(best):
+            best, rate = found, (0.0, 0.0)
+            jump, jump_time = (float(found.values[1]), float(found.sigma[1])), at
+    zero = comparison.residual(around)
+    return ClockOffset(
+        offset=float(best.values[0]),
+        sigma=float(best.sigma[0]),
+        rate=rate[0],
+        rate_sigma=rate[1],
+        jump=jump[0],
+        jump_sigma=jump[1],
+        jump_time=float(jump_time),
+        middle=middle,
+        gain=(best.likelihood - _likelihood(comparison, zero)) / best.inflation,
+        unexplained=float(np.sum(best.residual**2)) / _signal(comparison),
+    )
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """Clock parameters `values`, `sigma` (c,); `inflation`: variance by the scatter of
+    blocks over that of white noise; `score`, `information` (W, n) of the offset.
+    """
+
+    values: Array
+    sigma: Array
+    inflation: float
+    likelihood: float
+    residual: Array
+    score: Array
+    information: Array
+
+    def better_than(self, other: _Fit) -> bool:
+        """Whether its last parameter is certain, and the likelihood better for it."""
+        certain = abs(self.values[-1]) > _CERTAIN * self.sigma[-1]
+        gain = (self.likelihood - other.likelihood) / self.inflation
+        return bool(certain and gain > _BETTER)
+
+
+def _scan(comparison: Comparison, around: float, reach: float) -> tuple[float, float, float]:
+    """Return the best offset of a scan, and those of the first and the last third."""
+    some, parts = _telling(comparison)
+    grid = np.unique([*_grid(around, 0.5, 0.5 * _STEP_S), *_grid(around, _NEAR_S, _STEP_S)])
+    misfits = _misfits_at(some, grid)
+    minima = _lowest(grid, misfits.sum(axis=1))
+    best = _first_of(some, np.ones_like(some.time)[..., None], [(offset,) for offset in minima])
+    freedom = max(float(some.count.sum()), 1.0)
+    fits = np.sum(best.residual**2) < freedom * (_FITS * some.noise) ** 2
+    inside = abs(best.values[0] - around) < _NEAR_S - _STEP_S
+    if reach > _NEAR_S and not (fits and inside):
+        grid = _grid(around, reach, _STEP_S)
+        misfits = _misfits_at(some, grid)
+        starts = [(offset,) for offset in _lowest(grid, misfits.sum(axis=1))]
+        wide = _first_of(some, np.ones_like(some.time)[..., None], starts)
+        best = wide if wide.likelihood > best.likelihood else best
+    thirds = [float(grid[np.argmin(misfits[:, part].sum(axis=1))]) for part in parts]
+    return float(best.values[0]), thirds[0], thirds[-1]
+
+
+def _lowest(grid: Array, misfit: Array) -> list[float]:
+    """Return the lowest minima of a misfit on a grid."""
+    beyond = np.pad(misfit, 1, constant_values=np.inf)
+    minima = np.flatnonzero((misfit <= beyond[:-2]) & (misfit <= beyond[2:]))
+    return [float(x) for x in grid[minima[np.argsort(misfit[minima])[:_MINIMA]]]]
+
+
+def least_misfit(comparison: Comparison, around: float, reach: float) -> tuple[float, float]:
+    """Return what is left of the changes of velocity at the best offset, and minus its likelihood.
+
+    The first is the ratio of sums of squares, 1 where the IMU explains nothing.
+    """
+    some, _ = _telling(comparison)
+    grid = _grid(around, reach, _STEP_S)
+    misfits = _misfits_at(some, grid).sum(axis=1)
+    best = int(np.argmin(misfits))
+    residual = some.residual(float(grid[best]))
+    return float(np.sum(residual**2)) / _signal(some), float(misfits[best])
+
+
+def noise_share(comparison: Comparison) -> float:
+    """Return the share of the changes of velocity that stated noise makes."""
+    return comparison.noise**2 * float(comparison.count.sum()) / _signal(comparison)
+
+
+def _signal(comparison: Comparison) -> float:
+    return max(float(comparison.signal.sum()), 1e-12)
+
+
+def _grid(around: float, reach: float, step: float) -> Array:
+    steps = int(np.ceil(reach / step))
+    return np.asarray(around + step * np.arange(-steps, steps + 1), dtype=float)
+
+
+def _telling(comparison: Comparison) -> tuple[Comparison, list[slice]]:
+    """Return the windows that tell most, and which of them are in each third."""
+    signal = comparison.signal
+    thirds = [part for part in np.array_split(np.arange(signal.size), 3) if part.size]
+    chosen = [np.sort(part[np.argsort(signal[part])[-_SCANNED:]]) for part in thirds]
+    edges = np.cumsum([0, *(part.size for part in chosen)]).tolist()
+    return comparison.only(np.concatenate(chosen)), list(map(slice, edges[:-1], edges[1:]))
+
+
+def _misfits_at(comparison: Comparison, grid: Array) -> Array:
+    return np.array(
+        [_misfits(comparison, comparison.residual(float(o))) for o in grid], dtype=float
+    )
+
+
+def _refined(comparison: Comparison, design: Array, start: Array) -> _Fit:
+    """Return clock parameters by Gauss-Newton; `design` (W, n, c) takes them to offsets."""
+    values = start
+    residual = comparison.residual(design @ values)
+    likelihood = _likelihood(comparison, residual)
+    blocks = _blocks(comparison)
+    count = int(blocks.max()) + 1
+    for _ in range(_ITERATIONS):
+        later, sooner = (
+            comparison.residual(design @ values + step) for step in (_DIFFERENCE_S, -_DIFFERENCE_S)
+        )
+        slope = (later - sooner) / (2.0 * _DIFFERENCE_S)
+        squares = np.maximum(np.sum(residual**2, axis=(1, 2)), 1e-12)
+        weight = (np.maximum(comparison.count, 1.0) / squares)[:, None]
+        a = np.sum(slope**2, axis=2) * weight
+        b = np.sum(slope * residual, axis=2) * weight
+        information = np.einsum("wn,wni,wnj->ij", a, design, design)
+        information += 1e-12 * np.diag(np.maximum(np.diag(information), 1e-12))
+        inverse = np.linalg.inv(information)
+        step = -inverse @ np.einsum("wn,wni->i", b, design)
+        largest = float(np.max(np.abs(design @ step)))
+        step *= min(1.0, _LARGEST_STEP_S / max(largest, 1e-12))
+        for _ in range(_HALVINGS):
+            trial = comparison.residual(design @ (values + step))
+            new = _likelihood(comparison, trial)
+            if new > likelihood:
+                break
+            step = 0.5 * step
+        if new <= likelihood:
+            break
+        done = new - likelihood < 0.01
+        values, residual, likelihood = values + step, trial, new
+        if done:
+            break
+    scores = np.stack(
+        [np.bincount(blocks.ravel(), (b * d).ravel(), count) for d in np.moveaxis(design, -1, 0)]
+    )
+    used = np.bincount(blocks.ravel(), comparison.inside.ravel(), count) > 0
+    spread = scores @ scores.T * (used.sum() / max(used.sum() - start.size, 1))
+    covariance = inverse @ spread @ inverse
+    variance = np.maximum(np.diag(covariance), np.diag(inverse))
+    return _Fit(
+        values=values,
+        sigma=np.sqrt(variance),
+        inflation=float(variance[-1] / inverse[-1, -1]),
+        likelihood=likelihood,
+        residual=residual,
+        score=b,
+        information=a,
+    )
+
+
+def _first_of(comparison: Comparison, design: Array, starts: Sequence[tuple[float, ...]]) -> _Fit:
+    """Return the best of the fits from several starts."""
+    fits = [_refined(comparison, design, np.array(start)) for start in starts]
+    return max(fits, key=lambda fit: fit.likelihood)
+
+
+def _changes(comparison: Comparison, fit: _Fit) -> tuple[bool, float]:
+    """Return whether the offset seems to change, and when it changes most, by its scores."""
+    order = np.argsort(comparison.time, axis=None)
+    score = fit.score.ravel()[order]
+    share = np.cumsum(fit.information.ravel()[order])
+    share /= max(share[-1], 1e-12)
+    process = np.cumsum(score)
+    process -= share * process[-1]
+    blocks = np.bincount(_blocks(comparison).ravel(), fit.score.ravel())
+    scale = float(np.sqrt(np.sum(blocks**2)))
+    inner = (share > 0.1) & (share < 0.9)
+    height = np.abs(process) / np.sqrt(np.maximum(share * (1.0 - share), 0.01)) * inner
+    k = int(np.argmax(height))
+    return bool(height[k] > _CHANGES * max(scale, 1e-12)), float(comparison.time.ravel()[order][k])
+
+
+def _blocks(comparison: Comparison) -> np.ndarray:
+    """Return in which block each measurement is, (W, n), numbered from 0."""
+    time = comparison.time
+    return np.asarray(np.floor((time - time.min()) / _BLOCK_S), dtype=int)
+
+
+def _misfits(comparison: Comparison, residual: Array) -> Array:
+    """Return minus the log-likelihood of each window, (W,), its noise unknown."""
+    squares = np.sum(residual**2, axis=(1, 2))
+    freedom = np.maximum(comparison.count, 1.0)
+    return np.asarray(0.5 * freedom * np.log(squares / freedom + _LEAST_MISFIT**2))
+
+
+def _likelihood(comparison: Comparison, residual: Array) -> float:
+    return -float(np.sum(_misfits(comparison, residual)))

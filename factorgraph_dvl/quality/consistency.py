@@ -1,0 +1,307 @@
+"""IMU, GNSS and DVL against each other: axes, clocks and places that contradict.
+
+What is found wrong with the IMU is set right before the next question, so that several mistakes
+are named at once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from factorgraph_dvl.geometry.rotations import BodyAxes, frd_from_body
+from factorgraph_dvl.geometry.units import DEG
+from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.initialization.carried_windows import CarriedWindows, carried_windows
+from factorgraph_dvl.initialization.clock_offsets import (
+    ClockOffset,
+    Comparison,
+    clock_offset,
+    least_misfit,
+    noise_share,
+)
+from factorgraph_dvl.initialization.dvl_windows import DvlWindows, dvl_windows
+from factorgraph_dvl.initialization.gnss_windows import GnssWindows, WindowFit, gnss_windows
+from factorgraph_dvl.quality.axis_permutations import in_words
+from factorgraph_dvl.quality.bow_and_course import (
+    BodyDirections,
+    axes_that_fit,
+    body_directions,
+    off_course,
+    relabelling,
+)
+from factorgraph_dvl.quality.dvl_axes import handedness_findings
+from factorgraph_dvl.quality.imu_axes import HANDEDNESS, Candidate, diagnosis
+from factorgraph_dvl.quality.sensor_clocks import (
+    LEAP_SECONDS,
+    clock_findings,
+    far_clock_finding,
+)
+from factorgraph_dvl.sensors.dvl import Dvl
+from factorgraph_dvl.sensors.finding import Code, Finding
+from factorgraph_dvl.sensors.gnss import Gnss
+from factorgraph_dvl.trial import Trial
+
+# Angle between bow and course from which on axes are wrong, and course change from which on it is
+# no accident. Chosen: current and wind make less; a vehicle that goes sideways does not turn so.
+_OFF_COURSE = 50.0 * DEG
+_TURNED = 30.0 * DEG
+# Error of the antenna's place that is said, m, and times σ. Chosen: what taking a wrong antenna
+# for the right one makes; the scatter of correlated receivers.
+_ARM_M = 0.3
+_ARM_SIGMAS = 12.0
+# Share of velocity changes that neither IMU nor noise explains, from which on axes are tried, and
+# clocks that are off by far. Chosen: what good trials leave, and what wrong ones do.
+_CONTRADICTS = 0.1
+_UNEXPLAINED = 0.3
+# Share of it that a cause may leave.
+_LEFT = 0.5
+# Offsets around which clocks that are off by far are looked for, and the reach, s. Chosen: a
+# minute, after the leap seconds.
+_FAR_S = (LEAP_SECONDS, -LEAP_SECONDS, *(s * k for k in range(9, 60, 9) for s in (1.0, -1.0)))
+_REACH_S = 5.0
+# What sets velocities right whose third component is positive down.
+_DOWN = np.diag([1.0, 1.0, -1.0])
+# Errors of single sensors that leave nothing to compare.
+_NO_IMU = frozenset(
+    {Code.TIME_UNIT, Code.FORCE_UNIT, Code.GYRO_FROZEN, Code.IMU_CHANNEL, Code.FROZEN_VALUES}
+)
+
+
+def consistency_findings(trial: Trial, errors: Sequence[Finding]) -> Iterator[Finding]:
+    """Yield what is wrong with sensors relative to each other.
+
+    Parameters
+    ----------
+    trial : Trial
+    errors : sequence of Finding
+        What is wrong with single sensors; those are left out.
+    """
+    if any(f.code in _NO_IMU for f in errors):
+        return
+    left_out = {f.sensor for f in errors}
+    sensors = [s for s in (trial.gnss, trial.log) if s is not None and s.label not in left_out]
+    windows = carried_windows(trial.imu)
+    if windows is None or not sensors:
+        return
+
+    def compare(windows: CarriedWindows) -> list[tuple[Comparison, float]]:
+        made = [(_compared(windows, s, _stated(s)), _stated(s)) for s in sensors]
+        return [(comparison, around) for comparison, around in made if comparison is not None]
+
+    views = _views(windows, sensors)
+    wrong: list[Candidate] = []
+    if max((view.excess for view in views), default=0.0) > _CONTRADICTS:
+        wrong = diagnosis(compare, trial.imu)
+    if wrong:
+        corrected = carried_windows(wrong[0].corrected(trial.imu))
+        views = _views(corrected or windows, sensors)
+        directions = next((v.directions() for v in views if isinstance(v, _GnssView)), None)
+        yield _imu_finding(wrong, directions, trial.body_axes)
+    for view in views:
+        found = _far(view) if view.excess > _UNEXPLAINED else view
+        yield from found.findings()
+        if isinstance(found, _GnssView) and not wrong:
+            yield from _course_findings(found.directions(), trial.body_axes)
+
+
+def _stated(sensor: Gnss | Dvl) -> float:
+    return float(getattr(sensor.settings, "time_offset_s", 0.0))
+
+
+def _compared(
+    windows: CarriedWindows, sensor: Gnss | Dvl, around: float
+) -> GnssWindows | DvlWindows | None:
+    if isinstance(sensor, Gnss):
+        return gnss_windows(windows, sensor, around)
+    return dvl_windows(windows, sensor, around)
+
+
+def _views(windows: CarriedWindows, sensors: Sequence[Gnss | Dvl]) -> list[_GnssView | _DvlView]:
+    made = (_view(windows, sensor, _stated(sensor)) for sensor in sensors)
+    return [view for view in made if view is not None]
+
+
+def _view(
+    windows: CarriedWindows, sensor: Gnss | Dvl, around: float
+) -> _GnssView | _DvlView | None:
+    if isinstance(sensor, Gnss):
+        gnss = gnss_windows(windows, sensor, around)
+        clock = None if gnss is None else clock_offset(gnss, around)
+        return None if gnss is None else _GnssView(sensor, windows, gnss, clock, around)
+    dvl = dvl_windows(windows, sensor, around)
+    clock = None if dvl is None else clock_offset(dvl, around)
+    return None if dvl is None else _DvlView(sensor, windows, dvl, clock, around)
+
+
+@dataclass(frozen=True)
+class _GnssView:
+    """GNSS against the IMU; `clock` is None where there are too few data; `around`, s."""
+
+    sensor: Gnss
+    windows: CarriedWindows
+    compared: GnssWindows
+    clock: ClockOffset | None
+    around: float
+
+    @property
+    def excess(self) -> float:
+        """Share of the changes of velocity that neither IMU nor noise explains."""
+        return _excess(self.compared, self.clock)
+
+    def fit(self) -> WindowFit:
+        """Return the fit with the clock set right."""
+        return self.compared.fit(_late(self.compared, self.clock, self.around))
+
+    def directions(self) -> BodyDirections:
+        """Return vertical and course in body axes."""
+        late = _late(self.compared, self.clock, self.around)
+        return body_directions(self.compared, late, self.compared.fit(late))
+
+    def findings(self) -> Iterator[Finding]:
+        """Yield what is wrong with axes, clock and antenna."""
+        mistake = _gnss_mistake(self) if self.excess > _CONTRADICTS else ""
+        if mistake:
+            yield Finding(Code.GNSS_AXES, mistake, self.sensor.label, severity="error")
+        elif self.clock is not None:
+            yield from _clock(self.sensor, self.clock, self.around)
+            yield from self._antenna()
+
+    def _antenna(self) -> Iterator[Finding]:
+        fit = self.fit()
+        sigma = np.sqrt(np.diag(fit.arm_covariance))
+        stated = np.array(self.sensor.settings.lever_arm_m)
+        free = 3.0 * np.array(self.sensor.settings.lever_arm_std_m)
+        if np.any(np.abs(fit.arm_error) > np.maximum(_ARM_SIGMAS * sigma, _ARM_M) + free):
+            said, found = (
+                ", ".join(f"{x:z.1f}" for x in each) for each in (stated, stated + fit.arm_error)
+            )
+            yield Finding(
+                Code.ANTENNA,
+                f"turns show its antenna at [{found}] m from the IMU (± {sigma.max():.2g} m), not "
+                f"at the [{said}] m of gnss.lever_arm_m",
+                self.sensor.label,
+            )
+
+
+@dataclass(frozen=True)
+class _DvlView:
+    """A DVL against the IMU; `clock` is None where there are too few data; `around`, s."""
+
+    sensor: Dvl
+    windows: CarriedWindows
+    compared: DvlWindows
+    clock: ClockOffset | None
+    around: float
+
+    @property
+    def excess(self) -> float:
+        """Share of the changes of velocity that neither IMU nor noise explains."""
+        return _excess(self.compared, self.clock)
+
+    def findings(self) -> Iterator[Finding]:
+        """Yield what is wrong with axes and clock."""
+        late = _late(self.compared, self.clock, self.around)
+        yield from handedness_findings(self.sensor, self.compared.fit(late))
+        if self.clock is not None:
+            yield from _clock(self.sensor, self.clock, self.around)
+
+
+def _excess(comparison: Comparison, clock: ClockOffset | None) -> float:
+    return 0.0 if clock is None else clock.unexplained - 1.5 * noise_share(comparison)
+
+
+def _late(comparison: Comparison, clock: ClockOffset | None, around: float) -> float | Array:
+    return around if clock is None else clock.late(comparison.time)
+
+
+def _clock(sensor: Gnss | Dvl, clock: ClockOffset, around: float) -> Iterator[Finding]:
+    if around == _stated(sensor):
+        yield from clock_findings(sensor, clock, float(np.ptp(sensor.time)))
+    else:
+        yield far_clock_finding(sensor, clock.offset)
+
+
+def _far(view: _GnssView | _DvlView) -> _GnssView | _DvlView:
+    """Return a view with a clock that is off by far, the same if no such clock explains more."""
+    for later in _FAR_S:
+        around = view.around + later
+        moved = _compared(view.windows, view.sensor, around)
+        if moved is None:
+            continue
+        share, _ = least_misfit(moved, around, _REACH_S)
+        if share - 1.5 * noise_share(moved) < _LEFT * view.excess:
+            return _view(view.windows, view.sensor, around) or view
+    return view
+
+
+def _gnss_mistake(view: _GnssView) -> str:
+    """Return what is wrong with order or sign of the axes of GNSS, empty if that explains nothing.
+
+    East and north swapped are, but for the unknown heading, one of them mirrored.
+    """
+    velocities = view.compared.velocities
+    for text, matrix in (
+        (
+            "latitude and longitude (east and north) look swapped, or one of the wrong sign",
+            np.eye(3)[[1, 0, 2]],
+        ),
+        ("up looks of the wrong sign: height_m and vel_u_m_s are positive up", _DOWN),
+    ):
+        turned = replace(velocities, velocity=velocities.velocity @ matrix.T)
+        other = replace(view.compared, velocities=turned)
+        share, _ = least_misfit(other, view.around, _REACH_S)
+        if share - 1.5 * noise_share(other) < _LEFT * view.excess:
+            return text
+    return ""
+
+
+def _course_findings(directions: BodyDirections, body_axes: BodyAxes) -> Iterator[Finding]:
+    angle = off_course(directions, body_axes)
+    upright = -frd_from_body(body_axes)[2] @ directions.up > 0.7
+    if angle is None or not upright or abs(angle) < _OFF_COURSE:
+        return
+    degrees = angle / DEG
+    fit = [axes for axes in axes_that_fit(directions) if axes != body_axes]
+    cause = (
+        f": the axes look like {' or '.join(fit)}"
+        if fit
+        else ": is the IMU mounted turned about the vertical?"
+    )
+    side = "starboard" if degrees > 0 else "port"
+    where = "astern" if abs(degrees) > 150.0 else f"{abs(degrees):.0f} deg to {side} of the bow"
+    yield Finding(
+        Code.COURSE,
+        f"by body_axes {body_axes} the vehicle goes {where} most of the time{cause}",
+        "IMU",
+        severity="error" if directions.turned > _TURNED else "warning",
+    )
+
+
+def _imu_finding(
+    wrong: Sequence[Candidate], directions: BodyDirections | None, body_axes: BodyAxes
+) -> Finding:
+    """Return which axes or units of the IMU are wrong."""
+    first = wrong[0]
+    fits = "turns and changes of velocity fit only if"
+    if first.code == Code.GYRO_UNIT:
+        text = first.text
+    elif first is HANDEDNESS:
+        found: list[Array] = []
+        if directions is not None:
+            back = HANDEDNESS.accel
+            course = None if directions.course is None else back @ directions.course
+            recorded = replace(directions, up=back @ directions.up, course=course)
+            found = relabelling(recorded, body_axes, -1)
+        cause = (
+            in_words(found[0])
+            if len(found) == 1
+            else "one axis is mirrored, or two are swapped (the course would tell which)"
+        )
+        text = f"{fits}, of gyros and accelerometers, {cause}"
+    else:
+        causes = " or ".join(candidate.text for candidate in wrong if candidate is not HANDEDNESS)
+        text = f"{fits} {causes}"
+    return Finding(first.code, text, "IMU", severity="error")

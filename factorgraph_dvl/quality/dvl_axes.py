@@ -1,0 +1,58 @@
+"""Whether axes of a DVL are mirrored, as the signs of PD0 are, and which."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from factorgraph_dvl.geometry.rotations import exp_so3, log_so3
+from factorgraph_dvl.geometry.units import DEG
+from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.initialization.dvl_windows import DvlFit
+from factorgraph_dvl.quality.axis_permutations import in_words, mirrored, swapped
+from factorgraph_dvl.sensors.dvl import MISALIGNMENT, Dvl
+from factorgraph_dvl.sensors.finding import Code, Finding
+
+# Sum of squares of the best right-handed axes, relative to that of mirrored ones, and scale, from
+# which on the latter are believed. Chosen: factors that noise and poor motion do not make.
+_TIMES = 4.0
+_LARGEST_SCALE_ERROR = 0.5
+# Misalignments that differ by less, rad, are equally likely by their size. Chosen.
+_ALIKE = 20.0 * DEG
+
+
+def handedness_findings(dvl: Dvl, fit: DvlFit) -> Iterator[Finding]:
+    """Yield an error where the DVL's axes can only be mirrored ones.
+
+    Parameters
+    ----------
+    dvl : Dvl
+    fit : DvlFit
+        Of its pings to the carried IMU.
+    """
+    mirror = np.linalg.det(fit.dRb) < 0.0
+    plausible = abs(fit.scale_error) < _LARGEST_SCALE_ERROR
+    if not mirror or not plausible or fit.squares_other < _TIMES * fit.squares:
+        return
+    prior = next(p for p in dvl.parameters() if p.name == MISALIGNMENT)
+    explained = []
+    for P in (-np.eye(3), *(mirrored(k) for k in range(3)), *(swapped(k) for k in range(3))):
+        dRb = P @ fit.dRb
+        away = float(np.linalg.norm(log_so3(exp_so3(prior.mean).T @ dRb)))
+        explained.append((away, P, log_so3(dRb) / DEG))
+    least = min(away for away, _, _ in explained)
+    likely = [each for each in explained if each[0] < least + _ALIKE]
+    yield Finding(
+        Code.DVL_AXES,
+        "turns and changes of speed show that its axes are mirrored, which no mounting does: "
+        + ", or ".join(_cause(P, angles) for _, P, angles in likely),
+        dvl.label,
+        severity="error",
+    )
+
+
+def _cause(P: Array, angles: Array) -> str:
+    degrees = ", ".join(f"{angle:z.0f}" for angle in angles)
+    sign = ", as in PD0" if np.array_equal(P, -np.eye(3)) else ""
+    return f"{in_words(P)}{sign} (misalignment_deg is then [{degrees}])"

@@ -1,0 +1,142 @@
+"""Whether unit and sign of a DVL agree with GNSS and its mounting."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from factorgraph_dvl.geometry.rotations import BodyAxes, exp_so3, frd_from_body
+from factorgraph_dvl.geometry.units import DEG
+from factorgraph_dvl.geometry.vectors import Array, interpolate
+from factorgraph_dvl.quality.gnss_units import RADIANS
+from factorgraph_dvl.quality.records import WINDOW_S, gnss_velocity
+from factorgraph_dvl.quality.speed_units import MOVING_M_S, SPEED_UNITS
+from factorgraph_dvl.sensors.dvl import MISALIGNMENT, Dvl
+from factorgraph_dvl.sensors.finding import Code, Finding
+from factorgraph_dvl.sensors.gnss import Gnss
+
+# What a ping takes, and which sign it has.
+DVL_TERMS = ("a lock", "Moving along +x must give a positive x")
+BEAM_TERMS = ("three beams", "Moving in the direction of a beam must give it a positive velocity")
+
+
+def dvl_findings(
+    dvl: Dvl, gnss: Gnss | None, body_axes: BodyAxes, terms: tuple[str, str]
+) -> Iterator[Finding]:
+    """Yield whether unit and sign of a DVL are plausible; `terms` as DVL_TERMS."""
+    locked = dvl.locked
+    lock, positive = terms
+    if not locked.any():
+        text = f"there is no ping with {lock}"
+        yield Finding(Code.NO_MEASUREMENT, text, dvl.label, severity="warning")
+        return
+    velocity = dvl.velocity[locked]
+    std = float(np.median(dvl.sigma()[locked]))
+    speed = float(np.median(np.linalg.norm(velocity, axis=1)))
+    if std > max(0.3 * speed, 0.1):
+        yield Finding(
+            Code.DVL_STD,
+            f"its standard deviation, {std:.2g} m/s, is large for a speed of {speed:.2g} m/s",
+            dvl.label,
+        )
+    if np.all(velocity == velocity[0]) and velocity.shape[0] > 2:
+        yield Finding(Code.DVL_FROZEN, "the velocity never changes", dvl.label, severity="error")
+    if gnss is not None:
+        yield from _speed_findings(dvl, gnss)
+    yield from _sign_findings(dvl, body_axes, velocity, positive)
+
+
+def _speed_findings(dvl: Dvl, gnss: Gnss) -> Iterator[Finding]:
+    time, velocity = gnss_velocity(gnss)
+    if time.size < 2:
+        return
+    pings = dvl.time[dvl.locked]
+    inside = (pings >= time[0]) & (pings <= time[-1])
+    at_ping = interpolate(pings[inside], time, velocity)
+    gnss_speed = np.linalg.norm(at_ping, axis=1)
+    dvl_speed = np.linalg.norm(dvl.velocity[dvl.locked][inside], axis=1)
+    if _in_radians(gnss, np.linalg.norm(at_ping[:, :2], axis=1), dvl_speed):
+        yield Finding(Code.RADIANS, RADIANS, gnss.label, severity="error")
+        return
+    moving = gnss_speed > MOVING_M_S
+    if moving.sum() < 3:
+        return
+    ratio = float(np.median(dvl_speed[moving] / gnss_speed[moving]))
+    allowed = 0.5 if dvl.settings.reference == "water" else 0.25
+    # Sway moves DVL and antenna by their lever arms, but not on the average.
+    steady = _steady_ratio(pings[inside], dvl.velocity[dvl.locked][inside], at_ping)
+    if min(abs(ratio - 1.0), abs(steady - 1.0)) <= allowed:
+        yield Finding(
+            Code.DVL_UNIT,
+            f"its unit is plausible: speed {ratio:.3g} times that of the GNSS, which is not its "
+            "scale error: the lever arm, in sway and turns, contributes",
+            dvl.label,
+            severity="ok",
+        )
+        return
+    cause = ""
+    for unit, factor in SPEED_UNITS.items():
+        if abs(ratio * factor - 1.0) < 0.1:
+            cause = f": it looks like {unit}"
+    yield Finding(
+        Code.DVL_UNIT,
+        f"its speed is {ratio:.4g} times that of the GNSS{cause or ': is it in m/s?'}",
+        dvl.label,
+        severity="error",
+    )
+
+
+def _in_radians(gnss: Gnss, gnss_speed: Array, dvl_speed: Array) -> bool:
+    """Whether fixes without velocities move as slowly as radians in columns of degrees do."""
+    if not np.isnan(gnss.velocity).all():
+        return False
+    small = np.nanmax(np.abs(gnss.geodetic[:, 0]), initial=0) < 90.0 * DEG**2
+    moving = (dvl_speed > MOVING_M_S) & (gnss_speed > 0.0)
+    ratio = dvl_speed[moving] / gnss_speed[moving] * DEG
+    return bool(small and moving.sum() > 3 and abs(np.median(ratio) - 1.0) < 0.2)
+
+
+def _steady_ratio(time: Array, dvl: Array, gnss: Array) -> float:
+    """Return the ratio of the speeds of velocities (M, 3) that are averaged over windows.
+
+    1 where the vessel does not get anywhere.
+    """
+    window = np.floor((time - time[0]) / WINDOW_S)
+    first = np.flatnonzero(np.diff(window, prepend=-1.0))
+    count = np.diff(np.append(first, time.size))[:, None]
+    mean_dvl, mean_gnss = (
+        np.linalg.norm(np.add.reduceat(v, first) / count, axis=1) for v in (dvl, gnss)
+    )
+    moving = mean_gnss > MOVING_M_S
+    return float(np.median(mean_dvl[moving] / mean_gnss[moving])) if moving.any() else 1.0
+
+
+def _sign_findings(
+    dvl: Dvl, body_axes: BodyAxes, velocity_d: Array, positive: str
+) -> Iterator[Finding]:
+    """Check that the vehicle moves ahead, where the mounting is known well enough."""
+    misalignment = next(p for p in dvl.parameters() if p.name == MISALIGNMENT)
+    if misalignment.sigma.max() > 30.0 * DEG:
+        return
+    dRb = exp_so3(misalignment.mean)
+    frd = velocity_d @ dRb @ frd_from_body(body_axes).T
+    horizontal = np.hypot(frd[:, 0], frd[:, 1])
+    moving = horizontal > MOVING_M_S
+    if moving.sum() < 3:
+        return
+    ahead = float(np.median(frd[moving, 0] / horizontal[moving]))
+    if ahead < -0.5:
+        yield Finding(
+            Code.DVL_SIGN,
+            "by its prior misalignment the vehicle moves astern most of the time: is the sign "
+            f"that of PD0? {positive}",
+            dvl.label,
+        )
+    elif ahead > 0.5:
+        yield Finding(
+            Code.DVL_SIGN,
+            "by its prior misalignment the vehicle moves ahead",
+            dvl.label,
+            severity="ok",
+        )

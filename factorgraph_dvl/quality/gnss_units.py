@@ -1,0 +1,106 @@
+"""Whether units, order and signs of GNSS agree with each other."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from scipy.integrate import cumulative_trapezoid
+
+from factorgraph_dvl.geometry.units import DEG
+from factorgraph_dvl.geometry.vectors import Array, interpolate
+from factorgraph_dvl.quality.records import WINDOW_S, velocity_between_fixes
+from factorgraph_dvl.quality.speed_units import MOVING_M_S, SPEED_UNITS
+from factorgraph_dvl.sensors.finding import Code, Finding
+from factorgraph_dvl.sensors.gnss import Gnss
+
+# What fixes in the wrong unit look like.
+RADIANS = "latitude and longitude look like radians, not deg"
+
+
+def gnss_findings(gnss: Gnss) -> Iterator[Finding]:
+    """Yield whether velocities of GNSS agree with its positions."""
+    geodetic = gnss.geodetic[~np.isnan(gnss.geodetic[:, 0])]
+    if geodetic.shape[0] and np.any(np.all(geodetic[:, :2] == 0.0, axis=1)):
+        text = "some fixes are at 0, 0: leave the cells of lost fixes empty"
+        yield Finding(Code.ZERO_FIXES, text, gnss.label, severity="error")
+    begin, end, between = velocity_between_fixes(gnss)
+    measured = ~np.isnan(gnss.velocity[:, 0])
+    if begin.size < 3 or measured.sum() < 3:
+        return
+    time, velocity = gnss.time[measured], gnss.velocity[measured]
+    mean = _interval_means(time, velocity, begin, end)
+    noise = np.sqrt(2.0) * float(np.median(gnss.position_std[:, :2])) / float(
+        np.median(end - begin)
+    ) + float(np.median(gnss.velocity_std[:, :2]))
+    yield from _compare_velocities(gnss, geodetic, between, mean, noise)
+
+
+def _interval_means(time: Array, values: Array, begin: Array, end: Array) -> Array:
+    """Return the means of values (N, 3) over intervals, (M, 3), by trapezoids."""
+    integral = cumulative_trapezoid(values, time, axis=0, initial=0)
+    duration = np.maximum(end - begin, 1e-9)[:, None]
+    return (interpolate(end, time, integral) - interpolate(begin, time, integral)) / duration
+
+
+def _compare_velocities(
+    gnss: Gnss, geodetic: Array, between: Array, mean: Array, noise: float
+) -> Iterator[Finding]:
+    """Compare velocities between fixes with measured ones, (M, 3) both."""
+    speed = rms(between[:, :2])
+    tolerance = 0.1 * speed + 3.0 * noise
+    misfit = rms(between[:, :2] - mean[:, :2])
+    if misfit <= tolerance:
+        if speed > MOVING_M_S:
+            yield Finding(
+                Code.GNSS_VELOCITY,
+                f"velocities agree with positions to {misfit:.2g} m/s rms",
+                gnss.label,
+                severity="ok",
+            )
+        yield from _compare_vertical(gnss, between, mean)
+        return
+    if np.abs(geodetic[:, 0]).max() < 90.0 * DEG**2 and rms(mean[:, :2] - between[:, :2] / DEG) < (
+        0.1 * rms(mean[:, :2]) + 3.0 * noise / DEG
+    ):
+        yield Finding(Code.RADIANS, RADIANS, gnss.label, severity="error")
+        return
+    explained = {
+        text: rms(between[:, :2] - mean[:, :2] @ np.array(matrix, dtype=float).T)
+        for text, matrix in _velocity_candidates()
+    }
+    best = min(explained, key=lambda text: explained[text])
+    cause = f": {best}" if explained[best] <= tolerance else ""
+    yield Finding(
+        Code.GNSS_VELOCITY,
+        f"velocities disagree with the differences of positions by {misfit:.3g} m/s rms{cause}",
+        gnss.label,
+        severity="error",
+    )
+
+
+def _velocity_candidates() -> Iterator[tuple[str, list[list[float]]]]:
+    """Return what may be wrong with a velocity, and the matrix that sets it right."""
+    yield (
+        "east and north look swapped (or latitude and longitude)",
+        [[0.0, 1.0], [1.0, 0.0]],
+    )
+    yield "the velocity has the opposite sign", [[-1.0, 0.0], [0.0, -1.0]]
+    yield "the east velocity has the opposite sign", [[-1.0, 0.0], [0.0, 1.0]]
+    yield "the north velocity has the opposite sign", [[1.0, 0.0], [0.0, -1.0]]
+    for unit, factor in SPEED_UNITS.items():
+        yield f"the velocity looks like {unit}", [[factor, 0.0], [0.0, factor]]
+
+
+def _compare_vertical(gnss: Gnss, between: Array, mean: Array) -> Iterator[Finding]:
+    noise = np.sqrt(2.0) * float(np.median(gnss.position_std[:, 2])) / WINDOW_S
+    up, measured = between[:, 2], mean[:, 2]
+    if rms(up) > 5.0 * noise + 0.05 and up @ measured < -0.5 * rms(up) * up.size * rms(measured):
+        text = "vel_u_m_s has the opposite sign of the change of height"
+        yield Finding(Code.GNSS_VELOCITY, text, gnss.label, severity="error")
+
+
+def rms(vectors: Array) -> float:
+    """Return the root mean square of vectors (M, c) or numbers (M,)."""
+    squares = vectors**2
+    return float(np.sqrt(np.mean(squares.sum(axis=-1) if vectors.ndim > 1 else squares)))

@@ -1,0 +1,138 @@
+"""Which axes or units of IMU and GNSS are wrong: what makes the two agree.
+
+Each candidate is one mistake. The IMU's record is set right as if it had been made, carried
+through windows anew and compared with GNSS, or with the DVL where there is none.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from factorgraph_dvl.geometry.units import DEG
+from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.initialization.carried_windows import CarriedWindows, carried_windows
+from factorgraph_dvl.initialization.clock_offsets import Comparison, least_misfit
+from factorgraph_dvl.quality.axis_permutations import in_words, mirrored, swapped
+from factorgraph_dvl.sensors.finding import Code
+from factorgraph_dvl.sensors.imu import Imu
+
+# The comparisons that there are, each with the offset of its clock around which to look.
+Compare = Callable[[CarriedWindows], Sequence[tuple[Comparison, float]]]
+
+# Windows in which candidates are compared. Chosen: six minutes tell them apart.
+_WINDOWS = 9
+# Share of the changes of velocity that may be left unexplained where all is right, and what a
+# candidate must leave of it at most, and gain in log-likelihood. Chosen: 10 % is the noise of a
+# good trial; a right cause explains nearly all.
+_EXPLAINED = 0.1
+_LEFT = 0.5
+_GAIN = 30.0
+# Turn rate beyond which a record is not one, rad/s. Chosen: what gyros measure at most.
+_FASTEST = 50.0
+# Clocks that are off at the same time, s, are allowed for.
+_REACH_S = 1.5
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """One mistake: what it is, and what sets gyro and accelerometer right, (3, 3) each."""
+
+    code: Code
+    text: str
+    gyro: Array
+    accel: Array
+
+    def corrected(self, imu: Imu) -> Imu:
+        """Return the record as it would be without the mistake."""
+        return replace(imu, gyro=imu.gyro @ self.gyro.T, accel=imu.accel @ self.accel.T)
+
+
+# A mirrored axis of the whole IMU: whichever axis it is, the fit is the same.
+HANDEDNESS = Candidate(Code.IMU_AXES, "", mirrored(1), mirrored(1))
+
+
+def candidates(imu: Imu) -> Iterator[Candidate]:
+    """Yield single mistakes that may have been made with the record of an IMU."""
+    eye = np.eye(3)
+    rate = 1.0 / float(np.median(np.diff(imu.time)))
+    yield HANDEDNESS
+    for unit, factor in (
+        ("deg/s; multiply by pi/180", DEG),
+        ("angle increments; divide by the sample interval", rate),
+    ):
+        if np.abs(imu.gyro).max() * factor > _FASTEST:
+            continue
+        text = f"the angular rate looks like {unit}"
+        yield Candidate(Code.GYRO_UNIT, text, factor * eye, eye)
+    for code, sensor, which in (
+        (Code.GYRO_AXES, "gyros", 0),
+        (Code.ACCEL_AXES, "accelerometers", 1),
+    ):
+        changes = [-eye]
+        changes += [mirrored(k) for k in range(3)]
+        changes += [swapped(k) for k in range(3)]
+        # Two mirrored axes of the gyros are, but for gravity, one of the accelerometers.
+        changes += [-mirrored(k) for k in range(3)] if which == 0 else []
+        for P in changes:
+            pair = (P, eye) if which == 0 else (eye, P)
+            yield Candidate(code, f"of the {sensor}, {in_words(P)}", *pair)
+
+
+@dataclass(frozen=True)
+class _Misfits:
+    """What the IMU leaves of the velocity changes that others see.
+
+    `share` of each comparison; `noise`, the share that stated noise makes; `total`, minus the
+    log-likelihood of all.
+    """
+
+    share: Array
+    noise: Array
+    total: float
+
+    @property
+    def excess(self) -> Array:
+        """Share beyond noise of each comparison."""
+        return np.maximum(self.share - 1.5 * self.noise, 0.0)
+
+
+def _misfits(compare: Compare, imu: Imu) -> _Misfits | None:
+    windows = carried_windows(imu, _WINDOWS)
+    compared = [] if windows is None else compare(windows)
+    if not compared:
+        return None
+    found = [least_misfit(c, around, _REACH_S) for c, around in compared]
+    noise = [
+        c.noise**2 * float(c.count.sum()) / max(float(c.signal.sum()), 1e-12) for c, _ in compared
+    ]
+    return _Misfits(
+        np.array([share for share, _ in found]), np.array(noise), sum(m for _, m in found)
+    )
+
+
+def diagnosis(compare: Compare, imu: Imu) -> list[Candidate]:
+    """Return the mistakes that explain a misfit best, none where there is none to explain.
+
+    Parameters
+    ----------
+    compare : callable
+        Makes the comparisons of GNSS and DVL with carried windows.
+    imu : Imu
+    """
+    nominal = _misfits(compare, imu)
+    if nominal is None or nominal.excess.max() < _EXPLAINED:
+        return []
+    worst = int(np.argmax(nominal.excess))
+    found = []
+    for candidate in candidates(imu):
+        misfits = _misfits(compare, candidate.corrected(imu))
+        if misfits is not None:
+            found.append((misfits.total, float(misfits.excess[worst]), candidate))
+    found.sort(key=lambda each: each[0])
+    least, left, _ = found[0]
+    if nominal.total - least < _GAIN or left > _LEFT * float(nominal.excess[worst]):
+        return []
+    return [candidate for total, _, candidate in found if total < least + _GAIN]

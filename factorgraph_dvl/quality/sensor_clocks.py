@@ -1,0 +1,113 @@
+"""What the clocks of GNSS and DVL are off from that of the IMU, as findings."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from factorgraph_dvl.initialization.clock_offsets import ClockOffset
+from factorgraph_dvl.sensors.dvl import Dvl
+from factorgraph_dvl.sensors.dvl_beams import DvlBeams
+from factorgraph_dvl.sensors.finding import Code, Finding
+from factorgraph_dvl.sensors.gnss import Gnss
+
+# Offsets below this, s, are left to the solver; times σ, and gain in log-likelihood, from which on
+# one is certain. Chosen: chance makes none in 10 000 trials.
+_LEAST_S = 0.05
+_SIGMAS = 6.0
+_LEAST_GAIN = 15.0
+# Prior standard deviations that an offset may be off, and s that a fixed one may. Chosen: beyond,
+# the result is not to be used.
+_COVERED = 3.0
+_HARMLESS_S = 0.1
+# GPS time less UTC, s, since 2017.
+LEAP_SECONDS = 18.0
+
+
+def clock_findings(
+    sensor: Gnss | Dvl | DvlBeams, clock: ClockOffset, span: float
+) -> Iterator[Finding]:
+    """Yield what is wrong with a clock.
+
+    Parameters
+    ----------
+    sensor : Gnss, Dvl or DvlBeams
+        Whose clock it is; its settings say what is known of it.
+    clock : ClockOffset
+        As found.
+    span : float
+        Length of its record, s.
+    """
+    mean = float(getattr(sensor.settings, "time_offset_s", 0.0))
+    std = float(getattr(sensor.settings, "time_offset_std_s", 0.0))
+    if clock.gain < _LEAST_GAIN:
+        return
+    change = clock.rate * span
+    if abs(change) > max(_LEAST_S, _SIGMAS * clock.rate_sigma * span):
+        rate_std = 1e-6 * float(getattr(sensor.settings, "clock_rate_std_ppm", 0.0))
+        covered = max(_COVERED * rate_std * span, _HARMLESS_S)
+        yield Finding(
+            Code.CLOCK_DRIFT,
+            f"its clock {'loses' if change < 0 else 'gains'} {abs(change):.2f} s in {span:.0f} s "
+            f"against the IMU's ({1e6 * clock.rate:.0f} ± {1e6 * clock.rate_sigma:.0f} ppm): "
+            "write time_s from true stamps, not from a rate that was assumed",
+            sensor.label,
+            severity="error" if abs(change) > covered else "warning",
+        )
+    if abs(clock.jump) > max(_LEAST_S, _SIGMAS * clock.jump_sigma):
+        yield Finding(
+            Code.CLOCK_STEP,
+            f"its clock jumps by {clock.jump:.2f} ± {clock.jump_sigma:.2f} s near "
+            f"{clock.jump_time:.0f} s against the IMU's",
+            sensor.label,
+            severity="error" if abs(clock.jump) > _HARMLESS_S else "warning",
+        )
+    off = clock.offset - mean
+    if abs(off) > max(_LEAST_S, _SIGMAS * clock.sigma):
+        known = "" if mean == 0.0 else f" instead of {mean:g} s"
+        yield Finding(
+            Code.CLOCK_OFFSET,
+            f"its stamps are {abs(clock.offset):.2f} ± {max(clock.sigma, 0.005):.2f} s "
+            f"{'late' if clock.offset > 0 else 'early'} against the IMU's{known}: "
+            f"state {sensor.section}: {{time_offset_s: {clock.offset:.2f}}}",
+            sensor.label,
+            severity="error" if abs(off) > max(_COVERED * std, _HARMLESS_S) else "warning",
+        )
+
+
+def far_clock_finding(sensor: Gnss | Dvl | DvlBeams, offset: float) -> Finding:
+    """Return what an offset of many seconds is, as an error."""
+    if abs(abs(offset) - LEAP_SECONDS) < 1.5:
+        return Finding(
+            Code.LEAP_SECONDS,
+            f"its stamps are {abs(offset):.0f} s {'late' if offset > 0 else 'early'}: the leap "
+            "seconds between GPS time and UTC",
+            sensor.label,
+            severity="error",
+        )
+    return Finding(
+        Code.CLOCK_OFFSET,
+        f"its stamps are {abs(offset):.1f} s {'late' if offset > 0 else 'early'} against the "
+        f"IMU's: correct them, or state {sensor.section}: {{time_offset_s: {offset:.1f}}}",
+        sensor.label,
+        severity="error",
+    )
+
+
+def whole_hours(first: tuple[float, float], second: tuple[float, float]) -> int:
+    """Return the hours by which a record must be moved to overlap another, 0 if none do.
+
+    Parameters
+    ----------
+    first, second : tuple of float
+        Begin and end of both, s.
+    """
+    if max(first[0], second[0]) <= min(first[1], second[1]):
+        return 0
+    hours = (np.mean(first) - np.mean(second)) / 3600.0
+    nearest = round(float(hours))
+    moved = (second[0] + 3600.0 * nearest, second[1] + 3600.0 * nearest)
+    inside = min(first[1], moved[1]) - max(first[0], moved[0])
+    shorter = min(first[1] - first[0], second[1] - second[0])
+    return nearest if abs(nearest) <= 14 and inside > 0.5 * shorter else 0

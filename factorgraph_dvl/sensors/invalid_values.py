@@ -1,0 +1,167 @@
+"""Values with which instruments mark what they have not measured, taken as missing."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.sensors.dvl import STD_COLUMNS, Dvl
+from factorgraph_dvl.sensors.dvl import VELOCITY_COLUMNS as DVL_COLUMNS
+from factorgraph_dvl.sensors.dvl_beams import DvlBeams
+from factorgraph_dvl.sensors.finding import Code, Finding
+from factorgraph_dvl.sensors.gnss import POSITION_COLUMNS, VELOCITY_COLUMNS, Gnss
+from factorgraph_dvl.sensors.imu import COLUMNS as IMU_COLUMNS
+from factorgraph_dvl.sensors.imu import Imu
+
+# No velocity, in m/s, and in mm/s that were not converted: TRDI, Rowe, and others.
+_SENTINELS = (-32.768, -32768.0, 88.888, 88888.0, 99.99, -99.99, 99.999, -99.999)
+_RELATIVE = 1e-5
+# Speed of the neighbours from which on a velocity of exactly zero is none, m/s, and rows of zeros
+# at an end of the record that are none. Chosen: far above what a vessel loses in a ping.
+_MOVING_M_S = 0.3
+_AT_AN_END = 3
+# Rows that repeat all their values, and the step at their end, in usual steps and in the unit of
+# the values, from which on they are frozen. Chosen: digits repeat by chance three times, not five.
+_REPEATED = 5
+_STEPS = 6.0
+_LEAST_STEP = {"m_s": 0.02, "deg": 3e-5}
+
+
+def without_invalid_values(
+    section: str, columns: Mapping[str, Array], source: str
+) -> tuple[dict[str, Array], list[Finding]]:
+    """Return the columns of a table with invalid values as nan, and what was found.
+
+    Rows of the IMU that are all zeros are left out: there a gap is a gap.
+
+    Parameters
+    ----------
+    section : str
+        Of trial.yaml.
+    columns : mapping of str to ndarray, shape (M,)
+        As read; left as they are.
+    source : str
+        Name of the file, for messages.
+    """
+    out = dict(columns)
+    findings: list[Finding] = []
+    if section == Dvl.section:
+        _blank(out, DVL_COLUMNS, "DVL", source, findings, beside=STD_COLUMNS)
+    elif section == DvlBeams.section:
+        beams = [name for name in out if name.startswith("beam")]
+        _blank(out, beams, "DVL beams", source, findings, single=True)
+    elif section == Gnss.section:
+        _blank(out, VELOCITY_COLUMNS, "GNSS", source, findings)
+        _blank_fixes(out, source, findings)
+    elif section == Imu.section:
+        zero = np.all(np.stack([out[name] for name in IMU_COLUMNS[1:]]) == 0.0, axis=0)
+        if 0 < zero.sum() < 0.5 * zero.size:
+            out = {name: values[~zero] for name, values in out.items()}
+            findings.append(_finding("IMU", source, [f"{zero.sum()} samples of zeros"]))
+    return out, findings
+
+
+def _blank(
+    columns: dict[str, Array],
+    names: Sequence[str],
+    label: str,
+    source: str,
+    findings: list[Finding],
+    *,
+    single: bool = False,
+    beside: Sequence[str] = (),
+) -> None:
+    """Blank velocities that are none; with `single`, each component by itself."""
+    if not set(names) <= set(columns):
+        return
+    values = np.stack([columns[name] for name in names], axis=1)
+    none = np.zeros(values.shape, dtype=bool)
+    words = []
+    for sentinel in _SENTINELS:
+        marked = np.abs(values - sentinel) < _RELATIVE * abs(sentinel)
+        if marked.any():
+            words.append(f"{int(marked.any(axis=1).sum())} of {sentinel:g}")
+        none |= marked
+    if not single:
+        none[none.any(axis=1)] = True
+    kept = np.where(none, np.nan, values)
+    zero = _zero_fills(kept)
+    if zero.any():
+        words.append(f"{int(zero.sum())} of zeros amid motion")
+        none[zero] = True
+    frozen = _frozen(np.where(none, np.nan, values), _LEAST_STEP["m_s"])
+    if frozen.any():
+        words.append(f"{int(frozen.sum())} that repeat the one before")
+        none[frozen] = True
+    if words:
+        kept = np.where(none, np.nan, values)
+        for i, name in enumerate(names):
+            columns[name] = kept[:, i]
+        for name in beside:
+            columns[name] = np.where(none.any(axis=1), np.nan, columns[name])
+        findings.append(_finding(label, source, words))
+
+
+def _blank_fixes(columns: dict[str, Array], source: str, findings: list[Finding]) -> None:
+    if not set(POSITION_COLUMNS) <= set(columns):
+        return
+    values = np.stack([columns[name] for name in POSITION_COLUMNS], axis=1)
+    zero = np.all(values[:, :2] == 0.0, axis=1)
+    elsewhere = np.abs(np.nanmedian(values[~zero, :2], axis=0)) if (~zero).any() else np.zeros(2)
+    zero &= bool(np.any(elsewhere > 1.0))
+    frozen = _frozen(np.where(zero[:, None], np.nan, values), _LEAST_STEP["deg"])
+    words = [f"{int(zero.sum())} fixes at 0, 0"] if zero.any() else []
+    words += [f"{int(frozen.sum())} fixes that repeat the one before"] if frozen.any() else []
+    if words:
+        kept = np.where((zero | frozen)[:, None], np.nan, values)
+        for i, name in enumerate(POSITION_COLUMNS):
+            columns[name] = kept[:, i]
+        findings.append(_finding("GNSS", source, words))
+
+
+def _zero_fills(values: Array) -> Array:
+    """Return which rows (M, n) are zeros while the rows around them move, (M,) bool."""
+    zero = np.all(values == 0.0, axis=1)
+    moving = np.flatnonzero(~zero & ~np.isnan(values).all(axis=1))
+    if not zero.any() or moving.size == 0:
+        return np.zeros(zero.size, dtype=bool)
+    speed = np.sqrt(np.nansum(values[moving] ** 2, axis=1))
+    rows = np.flatnonzero(zero)
+    after = np.searchsorted(moving, rows)
+    ends = np.concatenate([[np.inf], speed, [np.inf]])
+    slower = np.minimum(ends[after], ends[after + 1])
+    first, last = moving[0], moving[-1]
+    many = np.where(rows < first, first, np.where(rows > last, zero.size - 1 - last, _AT_AN_END))
+    out = np.zeros(zero.size, dtype=bool)
+    out[rows] = (slower > _MOVING_M_S) & (many >= _AT_AN_END)
+    return out
+
+
+def _frozen(values: Array, least: float) -> Array:
+    """Return which rows (M, n) repeat those before until the value jumps, (M,) bool."""
+    there = np.flatnonzero(~np.isnan(values).any(axis=1))
+    out = np.zeros(values.shape[0], dtype=bool)
+    if there.size < 2 * _REPEATED:
+        return out
+    steps = np.linalg.norm(np.diff(values[there], axis=0), axis=1)
+    usual = float(np.median(steps))
+    if usual == 0.0:
+        return out
+    same = np.concatenate([[False], steps == 0.0, [False]])
+    edges = np.flatnonzero(np.diff(same.astype(int)))
+    for begin, end in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
+        # Steps begin .. end - 1 are zero: rows begin + 1 .. end repeat row begin.
+        jumps = end < steps.size and steps[end] > max(_STEPS * usual, least)
+        if end - begin + 1 >= _REPEATED and jumps:
+            out[there[begin + 1 : end + 1]] = True
+    return out
+
+
+def _finding(label: str, source: str, words: Sequence[str]) -> Finding:
+    return Finding(
+        Code.INVALID_VALUES,
+        f"{', '.join(words)} in {source} were taken as missing",
+        label,
+    )
