@@ -47,6 +47,8 @@ _BETTER = 20.0
 _CHANGES = 3.2
 # Largest step of Gauss-Newton, s. Chosen: a minimum's width under sway.
 _LARGEST_STEP_S = 0.3
+# Times in two windows at which a jump is tried.
+_BREAKS = 15
 # Misfit below which nothing is gained, m/s. Chosen: finer than any receiver's or DVL's digits.
 _LEAST_MISFIT = 1e-3
 
@@ -144,18 +146,17 @@ def clock_offset(
     one = np.ones_like(time)
     constant = _refined(comparison, one[..., None], np.array([whole]))
     best, rate, jump, jump_time = constant, (0.0, 0.0), (0.0, 0.0), np.nan
-    slopes, at = _changes(comparison, constant)
     span = float(np.ptp(time[comparison.inside]))
-    if slopes or abs(last - first) > _STEP_S:
-        slope = 1.5 * (last - first) / span
+    if _changes(comparison, constant) or abs(last - first) > _STEP_S:
         design = np.stack([one, time - middle], axis=-1)
+        slope = 1.5 * (last - first) / span
         starts = [(constant.values[0], 0.0), (0.5 * (first + last), slope)]
         found = _first_of(comparison, design, starts)
         if found.better_than(best):
             best, rate = found, (float(found.values[1]), float(found.sigma[1]))
+        at, before, after = _break(comparison, _grid(around, reach, _STEP_S))
         design = np.stack([one, (time > at).astype(float)], axis=-1)
-        starts = [(constant.values[0], 0.0), (first, last - first)]
-        found = _first_of(comparison, design, starts)
+        found = _refined(comparison, design, np.array([before, after - before]))
         if found.better_than(best):
             best, rate = found, (0.0, 0.0)
             jump, jump_time = (float(found.values[1]), float(found.sigma[1])), at
@@ -222,13 +223,15 @@ def _lowest(grid: Array, misfit: Array) -> list[float]:
     return [float(x) for x in grid[minima[np.argsort(misfit[minima])[:_MINIMA]]]]
 
 
-def least_misfit(comparison: Comparison, around: float, reach: float) -> tuple[float, float]:
+def least_misfit(
+    comparison: Comparison, around: float, reach: float, step: float = _STEP_S
+) -> tuple[float, float]:
     """Return what is left of the changes of velocity at the best offset, and minus its likelihood.
 
     The first is the ratio of sums of squares, 1 where the IMU explains nothing.
     """
     some, _ = _telling(comparison)
-    grid = _grid(around, reach, _STEP_S)
+    grid = _grid(around, reach, step)
     misfits = _misfits_at(some, grid).sum(axis=1)
     best = int(np.argmin(misfits))
     residual = some.residual(float(grid[best]))
@@ -322,20 +325,36 @@ def _first_of(comparison: Comparison, design: Array, starts: Sequence[tuple[floa
     return max(fits, key=lambda fit: fit.likelihood)
 
 
-def _changes(comparison: Comparison, fit: _Fit) -> tuple[bool, float]:
-    """Return whether the offset seems to change, and when it changes most, by its scores."""
+def _changes(comparison: Comparison, fit: _Fit) -> bool:
+    """Whether the offset seems to change along the trial, by its scores."""
     order = np.argsort(comparison.time, axis=None)
-    score = fit.score.ravel()[order]
     share = np.cumsum(fit.information.ravel()[order])
     share /= max(share[-1], 1e-12)
-    process = np.cumsum(score)
+    process = np.cumsum(fit.score.ravel()[order])
     process -= share * process[-1]
     blocks = np.bincount(_blocks(comparison).ravel(), fit.score.ravel())
     scale = float(np.sqrt(np.sum(blocks**2)))
     inner = (share > 0.1) & (share < 0.9)
     height = np.abs(process) / np.sqrt(np.maximum(share * (1.0 - share), 0.01)) * inner
-    k = int(np.argmax(height))
-    return bool(height[k] > _CHANGES * max(scale, 1e-12)), float(comparison.time.ravel()[order][k])
+    return bool(height.max() > _CHANGES * max(scale, 1e-12))
+
+
+def _break(comparison: Comparison, grid: Array) -> tuple[float, float, float]:
+    """Return when an offset jumps, if it does, and its values on a grid before and after."""
+    misfits = _misfits_at(comparison, grid)
+    count = misfits.shape[1]
+    sums = np.concatenate([np.zeros((grid.size, 1)), np.cumsum(misfits, axis=1)], axis=1)
+    whole = sums[:, -1:] - sums
+    k = 1 + int(np.argmin((sums.min(axis=0) + whole.min(axis=0))[1:count])) if count > 1 else 0
+    before, after = float(grid[np.argmin(sums[:, k])]), float(grid[np.argmin(whole[:, k])])
+    time = comparison.time
+    first, last = time[max(k - 1, 0)].min(), time[min(k, count - 1)].max()
+    tried = np.linspace(first, last, _BREAKS)
+    likelihoods = [
+        _likelihood(comparison, comparison.residual(np.where(time > at, after, before)))
+        for at in tried
+    ]
+    return float(tried[np.argmax(likelihoods)]), before, after
 
 
 def _blocks(comparison: Comparison) -> np.ndarray:

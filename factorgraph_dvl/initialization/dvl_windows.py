@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 from factorgraph_dvl.geometry.rotations import exp_so3
 from factorgraph_dvl.geometry.vectors import Array, skew
 from factorgraph_dvl.initialization.carried_windows import CarriedWindows
-from factorgraph_dvl.initialization.gnss_windows import sorted_into
+from factorgraph_dvl.initialization.gnss_windows import sorted_into, steady
 from factorgraph_dvl.sensors.dvl import Dvl
 
 # Pings that a window takes at least. Chosen: twice the unknowns of its polynomial.
@@ -180,7 +180,8 @@ def dvl_windows(windows: CarriedWindows, dvl: Dvl, later: float = 0.0) -> DvlWin
     -------
     DvlWindows, None where no window has enough pings.
     """
-    locked = dvl.locked
+    locked = dvl.locked.copy()
+    locked[locked] = steady(dvl.velocity[locked])
     time = dvl.time[locked]
     rows, inside, window = sorted_into(windows, time - later, _LEAST)
     if window.size == 0:

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from scipy.ndimage import median_filter
 
 from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.units import STANDARD_GRAVITY
@@ -26,6 +27,10 @@ _BASELINE_S = 5.0
 _ARM_SIGMA_M = 5.0
 _ARM_STEPS = 2
 _TINY = 1e-12
+# Neighbours with whose median a velocity is compared, and what makes an outlier, in usual second
+# differences. Chosen: a false lock for a ping or two, and never sway.
+_NEIGHBOURS = 5
+_OUTLIER = 8.0
 _NUDGE = np.array([1e-4, 2e-4, 3e-4])
 # Measurements that a window takes at least. Chosen: twice its unknowns.
 _LEAST = 10
@@ -49,6 +54,12 @@ class LevelVelocities:
         """Middle of the spans, (N,), s."""
         return 0.5 * (self.begin + self.end)
 
+    def only(self, rows: np.ndarray) -> LevelVelocities:
+        """Return some of them."""
+        return LevelVelocities(
+            self.begin[rows], self.end[rows], self.velocity[rows], self.sigma[rows]
+        )
+
 
 def level_velocities(gnss: Gnss) -> LevelVelocities:
     """Return the velocities that a receiver measured, or else those between its fixes."""
@@ -56,7 +67,8 @@ def level_velocities(gnss: Gnss) -> LevelVelocities:
     if measured.any():
         time = gnss.time[measured]
         sigma = np.sqrt(np.mean(gnss.velocity_std[measured] ** 2, axis=1))
-        return LevelVelocities(time, time, gnss.velocity[measured], sigma)
+        found = LevelVelocities(time, time, gnss.velocity[measured], sigma)
+        return found.only(steady(found.velocity))
     has_fix = ~np.isnan(gnss.geodetic[:, 0])
     time, geodetic = gnss.time[has_fix], gnss.geodetic[has_fix]
     if time.size < 2:
@@ -69,12 +81,13 @@ def level_velocities(gnss: Gnss) -> LevelVelocities:
     first, last = first[near], last[near]
     span = (time[last] - time[first])[:, None]
     sigma = np.sqrt(np.mean(gnss.position_std[has_fix] ** 2, axis=1))
-    return LevelVelocities(
+    found = LevelVelocities(
         time[first],
         time[last],
         (place[last] - place[first]) / span,
         np.sqrt(2.0) * sigma[first] / span[:, 0],
     )
+    return found.only(steady(found.velocity))
 
 
 @dataclass(frozen=True)
@@ -278,6 +291,15 @@ def gnss_windows(windows: CarriedWindows, gnss: Gnss, later: float = 0.0) -> Gns
     if window.size == 0:
         return None
     return GnssWindows(windows, v, gnss.lever_arm(v.middle), rows, inside, window)
+
+
+def steady(velocity: Array) -> np.ndarray:
+    """Return which velocities (M, 3) are no outliers beside their neighbours, (M,) bool."""
+    if velocity.shape[0] < _NEIGHBOURS:
+        return np.ones(velocity.shape[0], dtype=bool)
+    away = np.abs(velocity - median_filter(velocity, size=(_NEIGHBOURS, 1), mode="nearest"))
+    usual = np.maximum(np.median(np.abs(np.diff(velocity, n=2, axis=0)), axis=0), _TINY)
+    return np.asarray(np.all(away <= _OUTLIER * usual, axis=1))
 
 
 def sorted_into(

@@ -62,6 +62,7 @@ _LEFT = 0.5
 # minute, after the leap seconds.
 _FAR_S = (LEAP_SECONDS, -LEAP_SECONDS, *(s * k for k in range(9, 60, 9) for s in (1.0, -1.0)))
 _REACH_S = 5.0
+_FAR_STEP_S = 0.25
 # What sets velocities right whose third component is positive down.
 _DOWN = np.diag([1.0, 1.0, -1.0])
 # Errors of single sensors that leave nothing to compare.
@@ -94,7 +95,7 @@ def consistency_findings(trial: Trial, errors: Sequence[Finding]) -> Iterator[Fi
     views = _views(windows, sensors)
     wrong: list[Candidate] = []
     if max((view.excess for view in views), default=0.0) > _CONTRADICTS:
-        wrong = diagnosis(compare, trial.imu)
+        wrong = diagnosis(compare, trial.imu, -frd_from_body(trial.body_axes)[2])
     if wrong:
         corrected = carried_windows(wrong[0].corrected(trial.imu))
         views = _views(corrected or windows, sensors)
@@ -231,7 +232,7 @@ def _far(view: _GnssView | _DvlView) -> _GnssView | _DvlView:
         moved = _compared(view.windows, view.sensor, around)
         if moved is None:
             continue
-        share, _ = least_misfit(moved, around, _REACH_S)
+        share, _ = least_misfit(moved, around, _REACH_S, _FAR_STEP_S)
         if share - 1.5 * noise_share(moved) < _LEFT * view.excess:
             return _view(view.windows, view.sensor, around) or view
     return view

@@ -6,7 +6,7 @@ through windows anew and compared with GNSS, or with the DVL where there is none
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -32,8 +32,12 @@ _LEFT = 0.5
 _GAIN = 30.0
 # Turn rate beyond which a record is not one, rad/s. Chosen: what gyros measure at most.
 _FASTEST = 50.0
-# Clocks that are off at the same time, s, are allowed for.
+# Clocks that are off at the same time, s, are allowed for; steps of their scan, for all candidates
+# and for the best of them. Chosen: turns last some seconds, sway half a second.
 _REACH_S = 1.5
+_COARSE_S = 0.5
+_FINE_S = 0.1
+_TRIED = 4
 
 
 @dataclass(frozen=True)
@@ -99,12 +103,12 @@ class _Misfits:
         return np.maximum(self.share - 1.5 * self.noise, 0.0)
 
 
-def _misfits(compare: Compare, imu: Imu) -> _Misfits | None:
+def _misfits(compare: Compare, imu: Imu, step: float) -> _Misfits | None:
     windows = carried_windows(imu, _WINDOWS)
     compared = [] if windows is None else compare(windows)
     if not compared:
         return None
-    found = [least_misfit(c, around, _REACH_S) for c, around in compared]
+    found = [least_misfit(c, around, _REACH_S, step) for c, around in compared]
     noise = [
         c.noise**2 * float(c.count.sum()) / max(float(c.signal.sum()), 1e-12) for c, _ in compared
     ]
@@ -113,7 +117,7 @@ def _misfits(compare: Compare, imu: Imu) -> _Misfits | None:
     )
 
 
-def diagnosis(compare: Compare, imu: Imu) -> list[Candidate]:
+def diagnosis(compare: Compare, imu: Imu, up_b: Array) -> list[Candidate]:
     """Return the mistakes that explain a misfit best, none where there is none to explain.
 
     Parameters
@@ -121,18 +125,32 @@ def diagnosis(compare: Compare, imu: Imu) -> list[Candidate]:
     compare : callable
         Makes the comparisons of GNSS and DVL with carried windows.
     imu : Imu
+    up_b : ndarray, shape (3,)
+        Up in body, by `body_axes`: gravity that is right already is not to be turned over.
     """
-    nominal = _misfits(compare, imu)
+    nominal = _misfits(compare, imu, _FINE_S)
     if nominal is None or nominal.excess.max() < _EXPLAINED:
         return []
     worst = int(np.argmax(nominal.excess))
-    found = []
-    for candidate in candidates(imu):
-        misfits = _misfits(compare, candidate.corrected(imu))
-        if misfits is not None:
-            found.append((misfits.total, float(misfits.excess[worst]), candidate))
-    found.sort(key=lambda each: each[0])
+    force = imu.accel.mean(axis=0)
+    upright = [c for c in candidates(imu) if up_b @ c.accel @ force >= min(up_b @ force, 0.0)]
+    found = _ranked(compare, imu, upright, worst, _COARSE_S)[:_TRIED]
+    found = _ranked(compare, imu, [candidate for *_, candidate in found], worst, _FINE_S)
+    if not found:
+        return []
     least, left, _ = found[0]
     if nominal.total - least < _GAIN or left > _LEFT * float(nominal.excess[worst]):
         return []
     return [candidate for total, _, candidate in found if total < least + _GAIN]
+
+
+def _ranked(
+    compare: Compare, imu: Imu, tried: Iterable[Candidate], worst: int, step: float
+) -> list[tuple[float, float, Candidate]]:
+    """Return misfit, and excess of the worst comparison, of candidates, the best first."""
+    found = []
+    for candidate in tried:
+        misfits = _misfits(compare, candidate.corrected(imu), step)
+        if misfits is not None and misfits.excess.size > worst:
+            found.append((misfits.total, float(misfits.excess[worst]), candidate))
+    return sorted(found, key=lambda each: each[0])

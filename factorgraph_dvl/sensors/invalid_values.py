@@ -27,6 +27,8 @@ _AT_AN_END = 3
 _REPEATED = 5
 _STEPS = 6.0
 _LEAST_STEP = {"m_s": 0.02, "deg": 3e-5}
+# Latitude, longitude and height on one scale, deg: a metre is 1e-5 deg.
+_FIX_DEG = np.array([1.0, 1.0, 1e-5])
 
 
 def without_invalid_values(
@@ -99,7 +101,7 @@ def _blank(
         kept = np.where(none, np.nan, values)
         for i, name in enumerate(names):
             columns[name] = kept[:, i]
-        for name in beside:
+        for name in set(beside) & set(columns):
             columns[name] = np.where(none.any(axis=1), np.nan, columns[name])
         findings.append(_finding(label, source, words))
 
@@ -111,7 +113,7 @@ def _blank_fixes(columns: dict[str, Array], source: str, findings: list[Finding]
     zero = np.all(values[:, :2] == 0.0, axis=1)
     elsewhere = np.abs(np.nanmedian(values[~zero, :2], axis=0)) if (~zero).any() else np.zeros(2)
     zero &= bool(np.any(elsewhere > 1.0))
-    frozen = _frozen(np.where(zero[:, None], np.nan, values), _LEAST_STEP["deg"])
+    frozen = _frozen(np.where(zero[:, None], np.nan, values * _FIX_DEG), _LEAST_STEP["deg"])
     words = [f"{int(zero.sum())} fixes at 0, 0"] if zero.any() else []
     words += [f"{int(frozen.sum())} fixes that repeat the one before"] if frozen.any() else []
     if words:

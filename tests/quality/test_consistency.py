@@ -1,0 +1,216 @@
+"""IMU, GNSS and DVL against each other: each mistake is named by its true cause."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import msgspec
+import numpy as np
+import pytest
+from truth import scenario
+
+from factorgraph_dvl.quality.survey import survey
+from factorgraph_dvl.sensors.finding import Code
+from factorgraph_dvl.simulation import faults, simulate
+from factorgraph_dvl.trial import Trial
+
+SWAP_XY = np.eye(3)[[1, 0, 2]]
+TURNED = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+
+
+def mirror(axis: int) -> np.ndarray:
+    return np.diag(np.where(np.arange(3) == axis, -1.0, 1.0))
+
+
+@pytest.fixture(scope="module")
+def trial() -> Trial:
+    """Three minutes of swell, turns and changes of speed; GNSS and DVL at 2 Hz, IMU at 50 Hz."""
+    legs = [
+        {"straight_s": 12},
+        {"turn_deg_s": -6, "duration_s": 20, "ramp_s": 4},
+        {"accelerate_m_s2": -0.2, "to_m_s": 2},
+        {"turn_deg_s": 8, "duration_s": 15, "ramp_s": 4},
+        {"accelerate_m_s2": 0.2, "to_m_s": 4},
+    ]
+    scene = scenario(
+        noise=True,
+        manoeuvres=[{"repeat": 3, "manoeuvres": legs}],
+        imu={"rate_hz": 50},
+        gnss={
+            "rate_hz": 2,
+            "position_std_m": [0.02, 0.02, 0.04],
+            "velocity_std_m_s": [0.03, 0.03, 0.03],
+        },
+        dvl={"rate_hz": 2},
+    )
+    return simulate(scene, 3)
+
+
+def found(trial: Trial, *changes: faults.Fault) -> dict[Code, str]:
+    problems = survey(faults.with_faults(trial, changes)).problems
+    return {finding.code: str(finding) for finding in problems}
+
+
+def test_a_right_trial_has_no_problems(trial: Trial) -> None:
+    assert found(trial) == {}
+
+
+@pytest.mark.parametrize("late", [0.3, -4.0])
+def test_late_stamps_are_found_with_their_offset(trial: Trial, late: float) -> None:
+    for section in ("gnss", "dvl"):
+        (text,) = found(trial, faults.late(section, late)).values()
+        assert ("late" if late > 0 else "early") in text
+        stated = float(text.rpartition(f"{section}: {{time_offset_s: ")[2].rstrip("}"))
+        assert stated == pytest.approx(late, abs=0.025)
+
+
+def test_an_offset_that_the_prior_covers_is_a_warning(trial: Trial) -> None:
+    def severity(stated: float) -> str:
+        late = faults.with_faults(trial, [faults.late("dvl", 0.2)])
+        assert late.dvl is not None
+        settings = msgspec.structs.replace(late.dvl.settings, time_offset_std_s=stated)
+        (finding,) = survey(replace(late, dvl=replace(late.dvl, settings=settings))).problems
+        assert finding.code == Code.CLOCK_OFFSET
+        return finding.severity
+
+    assert severity(0.0) == "error"
+    assert severity(0.5) == "warning"
+
+
+def test_leap_seconds_and_local_time_are_called_so(trial: Trial) -> None:
+    assert Code.LEAP_SECONDS in found(trial, faults.late("gnss", 18.0))
+    assert Code.LOCAL_TIME in found(trial, faults.late("gnss", 7200.0))
+
+
+def test_a_clock_that_runs_fast_is_not_one_that_is_off(trial: Trial) -> None:
+    text = found(trial, faults.clock_rate("dvl", 2500.0))
+    assert list(text) == [Code.CLOCK_DRIFT]
+    assert "25" in text[Code.CLOCK_DRIFT]
+
+
+def test_a_clock_that_jumps_is_named_with_its_time(trial: Trial) -> None:
+    assert trial.dvl is not None
+    time = trial.dvl.time
+    middle = float(time.mean())
+    jumped = replace(trial, dvl=replace(trial.dvl, time=time + 0.6 * (time > middle)))
+    (text,) = found(jumped).values()
+    assert "jumps by 0.6" in text or "jumps by 0.59" in text
+
+
+@pytest.mark.parametrize(
+    ("matrix", "words"),
+    [
+        (mirror(1), "axis y is mirrored"),
+        pytest.param(mirror(0), "axis x is mirrored", marks=pytest.mark.slow),
+        pytest.param(SWAP_XY, "axes x and y are swapped", marks=pytest.mark.slow),
+    ],
+)
+def test_a_mirrored_imu_is_named_with_its_axis(
+    trial: Trial, matrix: np.ndarray, words: str
+) -> None:
+    texts = found(trial, faults.axes_changed("imu", matrix.tolist()))
+    assert list(texts) == [Code.IMU_AXES]
+    assert f"of gyros and accelerometers, {words}" in texts[Code.IMU_AXES]
+
+
+@pytest.mark.parametrize(
+    ("matrix", "field", "code", "words"),
+    [
+        (mirror(2), "gyro", Code.GYRO_AXES, "of the gyros, axis z is mirrored"),
+        (mirror(1), "accel", Code.ACCEL_AXES, "of the accelerometers, axis y is mirrored"),
+        pytest.param(
+            *(SWAP_XY, "gyro", Code.GYRO_AXES, "of the gyros, axes x and y are swapped"),
+            marks=pytest.mark.slow,
+        ),
+        pytest.param(
+            *(-np.eye(3), "gyro", Code.GYRO_AXES, "of the gyros, all three axes"),
+            marks=pytest.mark.slow,
+        ),
+        pytest.param(
+            *(np.eye(3) * 180.0 / np.pi, "gyro", Code.GYRO_UNIT, "deg/s"), marks=pytest.mark.slow
+        ),
+    ],
+)
+def test_one_triad_of_other_axes_or_units_is_named(
+    trial: Trial, matrix: np.ndarray, field: str, code: Code, words: str
+) -> None:
+    texts = found(trial, faults.axes_changed("imu", matrix.tolist(), field))
+    assert code in texts
+    assert words in texts[code]
+
+
+def test_the_signs_of_pd0_are_mirrored_axes(trial: Trial) -> None:
+    texts = found(trial, faults.axes_changed("dvl", (-np.eye(3)).tolist()))
+    assert "all three axes have the opposite sign, as in PD0" in texts[Code.DVL_AXES]
+    assert "[2, 2, 30]" in texts[Code.DVL_AXES]
+
+
+def test_wrong_body_axes_are_seen_in_the_course(trial: Trial) -> None:
+    (text,) = found(replace(trial, body_axes="FLU")).values()
+    assert "the axes look like RFU" in text
+    (text,) = found(trial, faults.axes_changed("imu", TURNED.tolist())).values()
+    assert "mounted turned about the vertical" in text
+
+
+def test_another_antenna_is_found(trial: Trial) -> None:
+    (text,) = found(trial, faults.wrong_antenna((2.0, 0.0, 0.0))).values()
+    assert "not at the [2.0, 0.0, 0.0] m" in text
+
+
+def test_swapped_fixes_without_velocities_are_found(trial: Trial) -> None:
+    assert trial.gnss is not None
+    geodetic = trial.gnss.geodetic
+    change = (geodetic - geodetic[0])[:, [1, 0, 2]]
+    swapped = replace(
+        trial.gnss,
+        geodetic=np.array([0.6, 0.9, 0.0]) + change,
+        velocity=np.full_like(geodetic, np.nan),
+    )
+    texts = found(replace(trial, gnss=swapped))
+    assert "latitude and longitude" in texts[Code.GNSS_AXES]
+
+
+@pytest.mark.parametrize(
+    "fault",
+    [
+        faults.correlated_gnss((0.5, 0.5, 0.5), (0.05, 0.05, 0.05)),
+        faults.gnss_outliers(),
+        pytest.param(faults.dvl_outliers(), marks=pytest.mark.slow),
+        pytest.param(faults.dvl_false_lock(duration_s=20.0), marks=pytest.mark.slow),
+        pytest.param(faults.dvl_bias((0.01, 0.0, 0.0)), marks=pytest.mark.slow),
+        pytest.param(faults.jitter("dvl", 0.005), marks=pytest.mark.slow),
+    ],
+)
+def test_noise_and_outliers_are_no_mistakes_of_axes_or_clocks(
+    trial: Trial, fault: faults.Fault
+) -> None:
+    assert found(trial, fault) == {}
+
+
+def test_a_straight_run_says_nothing_of_axes() -> None:
+    scene = scenario(
+        noise=True,
+        sway={},
+        manoeuvres=[{"straight_s": 90}],
+        imu={"rate_hz": 50},
+        dvl={"rate_hz": 1},
+        gnss={"rate_hz": 1},
+    )
+    straight = simulate(scene, 1)
+    assert (
+        found(
+            straight, faults.axes_changed("dvl", (-np.eye(3)).tolist()), faults.late("gnss", 2.0)
+        )
+        == {}
+    )
+
+
+def test_a_dead_channel_of_the_imu_is_named(trial: Trial) -> None:
+    gyro = trial.imu.gyro.copy()
+    gyro[:, 1] = 0.0
+    texts = found(replace(trial, imu=replace(trial.imu, gyro=gyro)))
+    assert "gyro_y_rad_s is always 0" in texts[Code.IMU_CHANNEL]
+    frozen = trial.imu.accel.copy()
+    frozen[1000:1200] = frozen[1000]
+    texts = found(replace(trial, imu=replace(trial.imu, accel=frozen)))
+    assert "m_s2 repeats one value from 20.0 to 24" in texts[Code.FROZEN_VALUES]
