@@ -17,8 +17,11 @@ import numpy as np
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.initialization.carried_windows import MARGIN_S
 
-# Steps of the scan, s, halved near its middle. Chosen: the width of a minimum under sway at 2 Hz.
+# Steps of the scan, s, and of a finer one around its minimum, with its reach. Chosen: turns last
+# seconds; under sway at 2 Hz minima lie every 0.25 s, and are 0.05 s wide.
 _STEP_S = 0.1
+_FINE_STEP_S = 0.02
+_FINE_REACH_S = 0.3
 # Reach that is scanned first, s, and the misfit, in stated noise, from which on the rest is too.
 # Chosen: most clocks are that good, and a scan costs as much as all else.
 _NEAR_S = 1.0
@@ -29,10 +32,13 @@ _SCANNED = 3
 # Half of the difference in time by which residuals are differentiated, s.
 _DIFFERENCE_S = 0.02
 _ITERATIONS = 6
+# Minima of the finer scan that are refined. Chosen: aliases of a sway on both sides.
+_MINIMA = 5
+# Log-likelihood per degree of freedom by which minima differ at least, or the nearest is taken.
+# Chosen: sway repeats itself all but exactly.
+_ALIKE = 0.2
 # Halvings of a step that does not gain.
 _HALVINGS = 3
-# Minima of the scan that are refined. Chosen: under sway at 2 Hz they lie every 0.25 s.
-_MINIMA = 3
 # Blocks of measurements whose errors are independent, s. Chosen: several times the correlation
 # time of GNSS velocities.
 _BLOCK_S = 10.0
@@ -199,28 +205,30 @@ class _Fit:
 def _scan(comparison: Comparison, around: float, reach: float) -> tuple[float, float, float]:
     """Return the best offset of a scan, and those of the first and the last third."""
     some, parts = _telling(comparison)
-    grid = np.unique([*_grid(around, 0.5, 0.5 * _STEP_S), *_grid(around, _NEAR_S, _STEP_S)])
-    misfits = _misfits_at(some, grid)
-    minima = _lowest(grid, misfits.sum(axis=1))
-    best = _first_of(some, np.ones_like(some.time)[..., None], [(offset,) for offset in minima])
     freedom = max(float(some.count.sum()), 1.0)
-    fits = np.sum(best.residual**2) < freedom * (_FITS * some.noise) ** 2
-    inside = abs(best.values[0] - around) < _NEAR_S - _STEP_S
-    if reach > _NEAR_S and not (fits and inside):
-        grid = _grid(around, reach, _STEP_S)
+    for width in (min(_NEAR_S, reach), reach):
+        grid = _grid(around, width, _STEP_S)
         misfits = _misfits_at(some, grid)
-        starts = [(offset,) for offset in _lowest(grid, misfits.sum(axis=1))]
-        wide = _first_of(some, np.ones_like(some.time)[..., None], starts)
-        best = wide if wide.likelihood > best.likelihood else best
+        coarse = float(grid[np.argmin(misfits.sum(axis=1))])
+        fine = np.unique(
+            [_grid(middle, _FINE_REACH_S, _FINE_STEP_S) for middle in (coarse, around)]
+        )
+        starts = _lowest(fine, _misfits_at(some, fine).sum(axis=1), freedom)
+        found = _nearest_of(some, starts, around, freedom)
+        best = float(found.values[0])
+        fits = np.sum(found.residual**2) < freedom * (_FITS * some.noise) ** 2
+        if width == reach or (fits and abs(best - around) < width - _STEP_S):
+            break
     thirds = [float(grid[np.argmin(misfits[:, part].sum(axis=1))]) for part in parts]
-    return float(best.values[0]), thirds[0], thirds[-1]
+    return best, thirds[0], thirds[-1]
 
 
-def _lowest(grid: Array, misfit: Array) -> list[float]:
-    """Return the lowest minima of a misfit on a grid."""
+def _lowest(grid: Array, misfit: Array, freedom: float) -> list[float]:
+    """Return the lowest minima of a misfit on a grid, as far as they may be the lowest of all."""
     beyond = np.pad(misfit, 1, constant_values=np.inf)
-    minima = np.flatnonzero((misfit <= beyond[:-2]) & (misfit <= beyond[2:]))
-    return [float(x) for x in grid[minima[np.argsort(misfit[minima])[:_MINIMA]]]]
+    minimum = (misfit <= beyond[:-2]) & (misfit <= beyond[2:])
+    minima = np.flatnonzero(minimum & (misfit < misfit.min() + freedom))
+    return [float(at) for at in grid[minima[np.argsort(misfit[minima])[:_MINIMA]]]]
 
 
 def least_misfit(
@@ -323,6 +331,17 @@ def _first_of(comparison: Comparison, design: Array, starts: Sequence[tuple[floa
     """Return the best of the fits from several starts."""
     fits = [_refined(comparison, design, np.array(start)) for start in starts]
     return max(fits, key=lambda fit: fit.likelihood)
+
+
+def _nearest_of(
+    comparison: Comparison, starts: Sequence[float], around: float, freedom: float
+) -> _Fit:
+    """Return, of the fits that are nearly the best, the one nearest to what is stated."""
+    one = np.ones_like(comparison.time)[..., None]
+    fits = [_refined(comparison, one, np.array([start])) for start in starts]
+    most = max(fit.likelihood for fit in fits)
+    good = [fit for fit in fits if fit.likelihood >= most - _ALIKE * freedom]
+    return min(good, key=lambda fit: abs(float(fit.values[0]) - around))
 
 
 def _changes(comparison: Comparison, fit: _Fit) -> bool:

@@ -51,17 +51,12 @@ class DvlFit:
         Body to DVL; of determinant -1 where the axes are mirrored.
     scale_error : float
     lever_arm : ndarray, shape (3,), m
-    squares, squares_other : float, m²/s²
-        Sums of squares with these axes, and with the best ones of the other handedness (inf if
-        there is no minimum among them).
     """
 
     residual: Array
     dRb: Array
     scale_error: float
     lever_arm: Array
-    squares: float
-    squares_other: float
 
 
 @dataclass(frozen=True)
@@ -80,6 +75,8 @@ class DvlWindows:
         Which pings are in a window; the rest fills the table up.
     window : ndarray, shape (W,)
         Which window it is.
+    handedness : {0, 1, -1}
+        Of the DVL's axes: 1 right-handed, -1 mirrored, 0 whichever fits better.
     """
 
     windows: CarriedWindows
@@ -89,6 +86,7 @@ class DvlWindows:
     rows: np.ndarray
     inside: np.ndarray
     window: np.ndarray
+    handedness: int = 0
 
     @property
     def time(self) -> Array:
@@ -144,8 +142,10 @@ class DvlWindows:
         minima = _minima(form)
         cost = np.sum((minima @ form) * minima, axis=1)
         scale = minima @ linear[:, -1]
-        best = int(np.argmin(cost))
-        other = np.sign(scale) != np.sign(scale[best])
+        allowed = self.handedness * scale >= 0.0
+        # Without a minimum of that handedness, the one nearest to it.
+        nearest = int(np.argmax(self.handedness * scale))
+        best = int(np.argmin(np.where(allowed, cost, np.inf))) if allowed.any() else nearest
         x = np.concatenate([minima[best], minima[best] @ linear])
         c = x[-1] if abs(x[-1]) > 1e-9 else 1e-9
         return DvlFit(
@@ -153,8 +153,6 @@ class DvlWindows:
             dRb=np.sign(c) * minima[best].reshape(3, 3).T,
             scale_error=float(1.0 / abs(c) - 1.0),
             lever_arm=x[_AXES:-1] / c,
-            squares=float(cost[best]),
-            squares_other=float(cost[other].min(initial=np.inf)),
         )
 
     def _at(self, offset: float | Array) -> tuple[np.ndarray, Array]:

@@ -32,7 +32,7 @@ from factorgraph_dvl.quality.bow_and_course import (
     off_course,
     relabelling,
 )
-from factorgraph_dvl.quality.dvl_axes import handedness_findings
+from factorgraph_dvl.quality.dvl_axes import mirrored_finding
 from factorgraph_dvl.quality.imu_axes import HANDEDNESS, Candidate, diagnosis
 from factorgraph_dvl.quality.sensor_clocks import (
     LEAP_SECONDS,
@@ -63,6 +63,14 @@ _LEFT = 0.5
 _FAR_S = (LEAP_SECONDS, -LEAP_SECONDS, *(s * k for k in range(9, 60, 9) for s in (1.0, -1.0)))
 _REACH_S = 5.0
 _FAR_STEP_S = 0.25
+# Share of what is unexplained that such a clock may leave. Chosen: it explains all but outliers.
+_FAR_LEFT = 0.2
+# How many times less mirrored axes of a DVL leave than right-handed ones, and scale error they
+# may have. Chosen: sway repeats itself, so that a late clock mirrors some axes nearly.
+_MIRRORED = 4.0
+_LARGEST_SCALE_ERROR = 0.5
+# Offset below which a clock is none that sway repeats, s.
+_ALIASED_S = 0.05
 # What sets velocities right whose third component is positive down.
 _DOWN = np.diag([1.0, 1.0, -1.0])
 # Errors of single sensors that leave nothing to compare.
@@ -133,8 +141,19 @@ def _view(
         clock = None if gnss is None else clock_offset(gnss, around)
         return None if gnss is None else _GnssView(sensor, windows, gnss, clock, around)
     dvl = dvl_windows(windows, sensor, around)
-    clock = None if dvl is None else clock_offset(dvl, around)
-    return None if dvl is None else _DvlView(sensor, windows, dvl, clock, around)
+    if dvl is None:
+        return None
+    right = _dvl_view(windows, sensor, replace(dvl, handedness=1), around)
+    if right.excess < _CONTRADICTS and right.off < _ALIASED_S:
+        return right
+    mirrored = _dvl_view(windows, sensor, replace(dvl, handedness=-1), around)
+    return mirrored if mirrored.believed_beside(right) else right
+
+
+def _dvl_view(
+    windows: CarriedWindows, sensor: Dvl, compared: DvlWindows, around: float
+) -> _DvlView:
+    return _DvlView(sensor, windows, compared, clock_offset(compared, around), around)
 
 
 @dataclass(frozen=True)
@@ -202,10 +221,29 @@ class _DvlView:
         """Share of the changes of velocity that neither IMU nor noise explains."""
         return _excess(self.compared, self.clock)
 
+    @property
+    def off(self) -> float:
+        """How far the clock is from what is stated, s."""
+        return 0.0 if self.clock is None else abs(self.clock.offset - self.around)
+
+    def believed_beside(self, right: _DvlView) -> bool:
+        """Whether these axes, mirrored, are believed rather than right-handed ones.
+
+        Sway repeats itself: with a clock that is off by half a period the other axes fit nearly.
+        """
+        if self.clock is None or right.clock is None:
+            return False
+        scale_error = self.compared.fit(_late(self.compared, self.clock, self.around)).scale_error
+        ratio = self.clock.unexplained / max(right.clock.unexplained, 1e-12)
+        better = ratio < 1.0 / _MIRRORED and right.excess > _CONTRADICTS
+        aliased = ratio < 1.0 and self.off < _ALIASED_S
+        return abs(scale_error) < _LARGEST_SCALE_ERROR and (better or aliased)
+
     def findings(self) -> Iterator[Finding]:
         """Yield what is wrong with axes and clock."""
         late = _late(self.compared, self.clock, self.around)
-        yield from handedness_findings(self.sensor, self.compared.fit(late))
+        if self.compared.handedness < 0:
+            yield mirrored_finding(self.sensor, self.compared.fit(late))
         if self.clock is not None:
             yield from _clock(self.sensor, self.clock, self.around)
 
@@ -227,15 +265,17 @@ def _clock(sensor: Gnss | Dvl, clock: ClockOffset, around: float) -> Iterator[Fi
 
 def _far(view: _GnssView | _DvlView) -> _GnssView | _DvlView:
     """Return a view with a clock that is off by far, the same if no such clock explains more."""
+    shares = []
     for later in _FAR_S:
-        around = view.around + later
-        moved = _compared(view.windows, view.sensor, around)
-        if moved is None:
-            continue
-        share, _ = least_misfit(moved, around, _REACH_S, _FAR_STEP_S)
-        if share - 1.5 * noise_share(moved) < _LEFT * view.excess:
-            return _view(view.windows, view.sensor, around) or view
-    return view
+        moved = _compared(view.windows, view.sensor, view.around + later)
+        if moved is not None:
+            share, _ = least_misfit(moved, view.around + later, _REACH_S, _FAR_STEP_S)
+            shares.append((share, view.around + later))
+    if not shares:
+        return view
+    found = _view(view.windows, view.sensor, min(shares)[1])
+    enough = found is not None and found.excess < max(_FAR_LEFT * view.excess, _CONTRADICTS)
+    return found if found is not None and enough else view
 
 
 def _gnss_mistake(view: _GnssView) -> str:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 import numpy as np
 
 from factorgraph_dvl.geometry.rotations import exp_so3, log_so3
@@ -14,27 +12,19 @@ from factorgraph_dvl.quality.axis_permutations import in_words, mirrored, swappe
 from factorgraph_dvl.sensors.dvl import MISALIGNMENT, Dvl
 from factorgraph_dvl.sensors.finding import Code, Finding
 
-# Sum of squares of the best right-handed axes, relative to that of mirrored ones, and scale, from
-# which on the latter are believed. Chosen: factors that noise and poor motion do not make.
-_TIMES = 4.0
-_LARGEST_SCALE_ERROR = 0.5
 # Misalignments that differ by less, rad, are equally likely by their size. Chosen.
 _ALIKE = 20.0 * DEG
 
 
-def handedness_findings(dvl: Dvl, fit: DvlFit) -> Iterator[Finding]:
-    """Yield an error where the DVL's axes can only be mirrored ones.
+def mirrored_finding(dvl: Dvl, fit: DvlFit) -> Finding:
+    """Return the error that the DVL's axes can only be mirrored ones, and which.
 
     Parameters
     ----------
     dvl : Dvl
     fit : DvlFit
-        Of its pings to the carried IMU.
+        Of its pings to the carried IMU, with mirrored axes.
     """
-    mirror = np.linalg.det(fit.dRb) < 0.0
-    plausible = abs(fit.scale_error) < _LARGEST_SCALE_ERROR
-    if not mirror or not plausible or fit.squares_other < _TIMES * fit.squares:
-        return
     prior = next(p for p in dvl.parameters() if p.name == MISALIGNMENT)
     explained = []
     for P in (-np.eye(3), *(mirrored(k) for k in range(3)), *(swapped(k) for k in range(3))):
@@ -43,7 +33,7 @@ def handedness_findings(dvl: Dvl, fit: DvlFit) -> Iterator[Finding]:
         explained.append((away, P, log_so3(dRb) / DEG))
     least = min(away for away, _, _ in explained)
     likely = [each for each in explained if each[0] < least + _ALIKE]
-    yield Finding(
+    return Finding(
         Code.DVL_AXES,
         "turns and changes of speed show that its axes are mirrored, which no mounting does: "
         + ", or ".join(_cause(P, angles) for _, P, angles in likely),

@@ -18,10 +18,11 @@ from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.io.calibration_file import load_calibration
 from factorgraph_dvl.io.planar_folder import save_planar_trial
 from factorgraph_dvl.io.solution_folder import save_solution
+from factorgraph_dvl.io.trial_folder import load_trial
 from factorgraph_dvl.quality.refusal import explained
 from factorgraph_dvl.quality.survey import survey
 from factorgraph_dvl.replay import replay
-from factorgraph_dvl.sensors.finding import Finding
+from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.simulation import simulate
 
 
@@ -96,9 +97,7 @@ def errors_of(run, trial_path):
 
 
 @pytest.mark.parametrize("command", ["solve", "replay", "kalman"])
-@pytest.mark.parametrize(
-    "spoil", [late, in_a_gap, silent, radians, radians_without_velocity, zeros]
-)
+@pytest.mark.parametrize("spoil", [late, in_a_gap, silent, radians, radians_without_velocity])
 def test_records_that_cannot_be_used_are_refused(command, spoil, honest, tmp_path, run):
     spoilt = spoil(honest)
     trial = write_trial(tmp_path, spoilt)
@@ -265,3 +264,11 @@ def test_every_error_has_a_code(honest):
         errors = survey(spoil(honest)).errors
         assert errors
         assert all(isinstance(f, Finding) and f.code for f in errors)
+
+
+def test_fixes_at_zero_in_a_file_are_missing_and_counted(honest, tmp_path):
+    trial = load_trial(write_trial(tmp_path, zeros(honest)))
+    assert [str(note) for note in trial.notes if note.code == Code.INVALID_VALUES] == [
+        "GNSS: 1 fixes at 0, 0 in gnss.csv were taken as missing"
+    ]
+    assert not any(f.code == Code.ZERO_FIXES for f in survey(trial).findings)
