@@ -31,7 +31,7 @@ _FITS = 2.5
 _NOISE = 1.2
 _SHARE = 0.15
 # Windows that are scanned, of each third of the record. Chosen: those with the largest changes
-# of velocity tell nearly all.
+# of velocity show nearly all.
 _SCANNED = 2
 # Half of the difference in time by which residuals are differentiated, s.
 _DIFFERENCE_S = 0.02
@@ -208,7 +208,7 @@ class _Fit:
 
 def _scan(comparison: Comparison, around: float, reach: float) -> tuple[float, float, float]:
     """Return the best offset of a scan, and those of the first and the last third."""
-    some, parts = _telling(comparison)
+    some, parts = _strongest(comparison)
     freedom = max(float(some.count.sum()), 1.0)
     # A clock that is right needs no scan.
     near = _refined(some, np.ones_like(some.time)[..., None], np.array([around]))
@@ -248,7 +248,7 @@ def least_misfit(
 
     The first is the ratio of sums of squares, 1 where the IMU explains nothing.
     """
-    some, _ = _telling(comparison)
+    some, _ = _strongest(comparison)
     grid = _grid(around, reach, step)
     misfits = _misfits_at(some, grid).sum(axis=1)
     best = int(np.argmin(misfits))
@@ -270,8 +270,8 @@ def _grid(around: float, reach: float, step: float) -> Array:
     return np.asarray(around + step * np.arange(-steps, steps + 1), dtype=float)
 
 
-def _telling(comparison: Comparison) -> tuple[Comparison, list[slice]]:
-    """Return the windows that tell most, and which of them are in each third."""
+def _strongest(comparison: Comparison) -> tuple[Comparison, list[slice]]:
+    """Return the windows that show most, and which of them are in each third."""
     signal = comparison.signal
     thirds = [part for part in np.array_split(np.arange(signal.size), 3) if part.size]
     chosen = [np.sort(part[np.argsort(signal[part])[-_SCANNED:]]) for part in thirds]

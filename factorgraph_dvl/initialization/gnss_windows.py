@@ -1,7 +1,7 @@
 """GNSS velocities against the carried IMU, window by window.
 
 Within a window the velocity that the IMU carries, turned to level axes, is that of the antenna
-but for a polynomial, which takes the biases in. Gravity tells the tilt and the velocities the
+but for a polynomial, which takes the biases in. Gravity gives the tilt and the velocities the
 heading, so that attitude is known too where the vessel manoeuvres.
 """
 
@@ -297,9 +297,9 @@ def steady(velocity: Array) -> np.ndarray:
     """Return which velocities (M, 3) are no outliers beside their neighbours, (M,) bool."""
     if velocity.shape[0] < _NEIGHBOURS:
         return np.ones(velocity.shape[0], dtype=bool)
-    away = np.abs(velocity - median_filter(velocity, size=(_NEIGHBOURS, 1), mode="nearest"))
+    deviation = np.abs(velocity - median_filter(velocity, size=(_NEIGHBOURS, 1), mode="nearest"))
     usual = np.maximum(np.median(np.abs(np.diff(velocity, n=2, axis=0)), axis=0), _TINY)
-    return np.asarray(np.all(away <= _OUTLIER * usual, axis=1))
+    return np.asarray(np.all(deviation <= _OUTLIER * usual, axis=1))
 
 
 def sorted_into(

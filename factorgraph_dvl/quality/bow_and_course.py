@@ -40,7 +40,7 @@ class BodyDirections:
 def body_directions(
     compared: GnssWindows, offset: float | Array, fit: WindowFit
 ) -> BodyDirections:
-    """Return vertical and course in body axes, as GNSS and gravity tell them."""
+    """Return vertical and course in body axes, as GNSS and gravity show them."""
     nRb = compared.attitude(offset, fit.level_R)
     up = nRb[..., 2, :][compared.inside].mean(axis=0)
     velocity = compared.velocities.velocity[compared.rows]

@@ -339,7 +339,7 @@ def _imu_finding(
         cause = (
             in_words(found[0])
             if len(found) == 1
-            else "one axis is mirrored, or two are swapped (the course would tell which)"
+            else "one axis is mirrored, or two are swapped (the course would show which)"
         )
         text = f"{fits}, of gyros and accelerometers, {cause}"
     else:

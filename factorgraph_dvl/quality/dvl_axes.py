@@ -29,9 +29,9 @@ def mirrored_finding(dvl: Dvl, fit: DvlFit) -> Finding:
     explained = []
     for P in (-np.eye(3), *(mirrored(k) for k in range(3)), *(swapped(k) for k in range(3))):
         dRb = P @ fit.dRb
-        away = float(np.linalg.norm(log_so3(exp_so3(prior.mean).T @ dRb)))
-        explained.append((away, P, log_so3(dRb) / DEG))
-    least = min(away for away, _, _ in explained)
+        deviation = float(np.linalg.norm(log_so3(exp_so3(prior.mean).T @ dRb)))
+        explained.append((deviation, P, log_so3(dRb) / DEG))
+    least = min(deviation for deviation, _, _ in explained)
     likely = [each for each in explained if each[0] < least + _ALIKE]
     return Finding(
         Code.DVL_AXES,

@@ -34,8 +34,8 @@ def gnss_findings(gnss: Gnss) -> Iterator[Finding]:
         np.median(end - begin)
     ) + float(np.median(gnss.velocity_std[:, :2]))
     # Fixes that jump are no matter of units: they stand out from the usual deviation.
-    away = np.linalg.norm(between - mean, axis=1)
-    usual = away <= 5.0 * np.median(away)
+    deviation = np.linalg.norm(between - mean, axis=1)
+    usual = deviation <= 5.0 * np.median(deviation)
     yield from _compare_velocities(gnss, geodetic, between[usual], mean[usual], noise)
 
 

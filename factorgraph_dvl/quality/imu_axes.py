@@ -22,7 +22,7 @@ from factorgraph_dvl.sensors.imu import Imu
 # The comparisons that there are, each with the offset of its clock around which to look.
 Compare = Callable[[CarriedWindows], Sequence[tuple[Comparison, float]]]
 
-# Windows in which candidates are compared. Chosen: six minutes tell them apart.
+# Windows in which candidates are compared. Chosen: six minutes separate them.
 _WINDOWS = 9
 # Share of the changes of velocity that may be left unexplained where all is right, and what a
 # candidate must leave of it at most, and gain in log-likelihood. Chosen: 10 % is the noise of a

@@ -87,6 +87,6 @@ def _meets(aid: Aid, imu: Imu) -> bool:
     time = aid.time[np.logical_not(aid.missing)] - getattr(aid.settings, "time_offset_s", 0.0)
     after = np.searchsorted(imu.time, time)
     edges = np.concatenate([[-np.inf], imu.time, [np.inf]])
-    away = np.minimum(time - edges[after], edges[after + 1] - time)
+    deviation = np.minimum(time - edges[after], edges[after + 1] - time)
     interval = float(np.median(np.diff(imu.time))) if imu.time.size > 1 else 0.0
-    return bool(np.any(away <= interval))
+    return bool(np.any(deviation <= interval))
