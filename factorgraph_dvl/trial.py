@@ -212,6 +212,10 @@ class Trial:
         """The DVL, or what its beams amount to with their nominal directions."""
         return self.dvl if self.dvl is not None or self.beams is None else as_dvl(self.beams)
 
+    def on_one_clock(self) -> Trial:
+        """Return the trial with GNSS stamps from which the stated time offset is taken away."""
+        return self if self.gnss is None else replace(self, gnss=self.gnss.on_trial_clock())
+
     @property
     def aids(self) -> tuple[Aid, ...]:
         """The sensors other than the IMU."""

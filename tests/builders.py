@@ -59,7 +59,12 @@ def build_trial(*, seconds: float = 60.0, **changes: Any) -> Trial:
     velocity[5] = np.nan
     geodetic[7] = np.nan
     gnss = Gnss(
-        GnssSettings(position_std_m=(0.02, 0.02, 0.04), velocity_std_m_s=(0.02, 0.02, 0.02)),
+        GnssSettings(
+            position_std_m=(0.02, 0.02, 0.04),
+            velocity_std_m_s=(0.02, 0.02, 0.02),
+            lever_arm_std_m=(0.0, 0.0, 0.0),
+            time_offset_std_s=0.0,
+        ),
         fixes,
         geodetic + rng.normal(0.0, 1e-9, geodetic.shape),
         velocity,
@@ -71,7 +76,12 @@ def build_trial(*, seconds: float = 60.0, **changes: Any) -> Trial:
     velocity_d = np.tile([0.0, 2.0, 0.0], (pings.size, 1)) + rng.normal(0, 0.002, (pings.size, 3))
     velocity_d[3] = np.nan
     dvl = Dvl(
-        DvlSettings(misalignment_std_deg=(5.0, 5.0, 5.0), scale_error_std=(0.01, 0.02, 0.03)),
+        DvlSettings(
+            misalignment_std_deg=(5.0, 5.0, 5.0),
+            scale_error_std=(0.01, 0.02, 0.03),
+            bias_std_m_s=(0.0, 0.0, 0.0),
+            time_offset_std_s=0.0,
+        ),
         pings,
         velocity_d,
         np.where(np.isnan(velocity_d), np.nan, 0.002),

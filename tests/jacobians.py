@@ -9,10 +9,13 @@ import numpy as np
 
 from factorgraph_dvl.geometry.rotations import exp_so3
 from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.graph.clocks import linearized, parameters_of, true_time
 from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.sensors.protocol import Motion, Observation
 
 STEP = 1e-6
+# When the offsets of clocks hold, s; of any motion here.
+ZERO = 1.5
 
 
 def differentiate(function: Callable[[Array], Array], size: int, step: float = STEP) -> Array:
@@ -25,8 +28,8 @@ def differentiate(function: Callable[[Array], Array], size: int, step: float = S
     return np.stack(columns, axis=-1)
 
 
-def moved(motion: Motion, tau: float) -> Motion:
-    """Return a motion `tau` seconds later, to first order."""
+def moved(motion: Motion, tau: Array) -> Motion:
+    """Return a motion later by `tau` (M, 1), s, to first order."""
     return replace(
         motion,
         nRb=motion.nRb @ exp_so3(motion.omega_eb_b * tau),
@@ -56,7 +59,12 @@ def check_jacobians(
     parameters : those of the sensor; they tell rotations from vectors.
     tolerance : of the difference, relative to 1 or to the largest element.
     """
-    lin = observation.linearize(motion, values, observation.parameters)
+    names = parameters_of(observation)
+    by_name = {p.name: p for p in parameters}
+    # A clock is right unless the caller says otherwise.
+    clock = () if observation.clock is None else observation.clock.names
+    values = {name: np.zeros(1) for name in clock} | values
+    lin = linearized(observation, motion, values, names, ZERO)
     m, d = lin.residual.shape
     np.testing.assert_allclose(lin.residual, observation.residual(motion, values), atol=1e-14)
 
@@ -70,11 +78,10 @@ def check_jacobians(
         "omega": of_motion(lambda h: replace(motion, omega_eb_b=motion.omega_eb_b + h)),
     }
     stated = {"theta": lin.d_theta, "p": lin.d_p, "v": lin.d_v, "omega": lin.d_omega}
-    by_name = {p.name: p for p in parameters}
-    assert set(lin.d_parameters) == set(observation.parameters)
-    for name in observation.parameters:
+    assert set(lin.d_parameters) == set(names)
+    for name in names:
         stated[name] = lin.d_parameters[name]
-        found[name] = _of_parameter(observation, motion, values, by_name[name])
+        found[name] = _of_parameter(observation, motion, values, name, by_name.get(name))
     for name, numerical in found.items():
         analytic = stated[name]
         if analytic is None:
@@ -86,20 +93,20 @@ def check_jacobians(
 
 
 def _of_parameter(
-    observation: Observation, motion: Motion, values: dict[str, Array], parameter: Parameter
+    observation: Observation,
+    motion: Motion,
+    values: dict[str, Array],
+    name: str,
+    parameter: Parameter | None,
 ) -> Array:
-    name = parameter.name
-
     def at(h: Array) -> Array:
-        if parameter.rotation:
+        if parameter is not None and parameter.rotation:
             return observation.residual(motion, {**values, name: values[name] @ exp_so3(h)})
         changed = {**values, name: values[name] + h}
-        shift = observation.true_time(changed) - observation.true_time(values)
-        # All measurements of one record share the clock.
-        np.testing.assert_allclose(shift, shift[0], atol=1e-12)
-        return observation.residual(moved(motion, float(shift[0])), changed)
+        shift = true_time(observation, changed, ZERO) - true_time(observation, values, ZERO)
+        return observation.residual(moved(motion, shift[:, None]), changed)
 
-    return differentiate(at, parameter.mean.size)
+    return differentiate(at, values[name].shape[-1])
 
 
 def random_motion(m=5, seed=3):

@@ -38,7 +38,11 @@ def scenario_dict(**changes):
         "imu": {"rate_hz": 100},
         "gnss": {"rate_hz": 5, "position_std_m": [1, 1, 2], "velocity_std_m_s": [0.1, 0.1, 0.1]},
         "dvl": {"rate_hz": 5, "velocity_std_fraction": 0.002},
-        "trial": {"imu": {"gyro_bias_std_deg_h": 1, "accel_bias_std_ug": 100}},
+        "trial": {
+            "imu": {"gyro_bias_std_deg_h": 1, "accel_bias_std_ug": 100},
+            "gnss": {"lever_arm_std_m": [0, 0, 0], "time_offset_std_s": 0},
+            "dvl": {"bias_std_m_s": [0, 0, 0], "time_offset_std_s": 0},
+        },
     }
     for key, value in changes.items():
         if key in ("start", "imu", "gnss", "dvl", "trial") and value is not None:

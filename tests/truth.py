@@ -60,7 +60,9 @@ _BASE: dict[str, Any] = {
     },
     "trial": {
         "imu": {"gyro_bias_std_deg_h": 0.05, "accel_bias_std_ug": 100},
-        "dvl": {"velocity_std_m_s": 0.001},
+        # One clock, an antenna in its place, no bias, unless a test says otherwise.
+        "gnss": {"lever_arm_std_m": [0, 0, 0], "time_offset_std_s": 0},
+        "dvl": {"velocity_std_m_s": 0.001, "bias_std_m_s": [0, 0, 0], "time_offset_std_s": 0},
     },
 }
 

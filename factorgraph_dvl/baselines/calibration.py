@@ -126,7 +126,7 @@ def calibrate(
     if not (np.isfinite(rate_hz) and rate_hz > 0.0):
         raise ConfigError(f"rate_hz is {rate_hz}", expected="a number above 0")
     report = progress or (lambda stage, iteration, cost: None)
-    trial = without_strays(trial)
+    trial = without_strays(trial).on_one_clock()
     if method == "star" or method == "liu-2020":
         report("SINS/stars", 0, None)
         solution, outcome = calibrate_gyros(trial, rate_hz=rate_hz, printed=method == "liu-2020")

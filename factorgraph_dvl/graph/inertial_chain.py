@@ -68,6 +68,11 @@ class Chain:
     walking: bool
     graph: gtsam.NonlinearFactorGraph
 
+    @property
+    def middle(self) -> float:
+        """Middle of the record, s."""
+        return 0.5 * float(self.segments.node_time[0] + self.segments.node_time[-1])
+
     def bias_key(self, k: int) -> int:
         """Return the key of the bias at node k."""
         return keys.bias(k if self.walking else 0)

@@ -21,6 +21,7 @@ from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.rotations import exp_so3
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph import keys
+from factorgraph_dvl.graph.clocks import linearized, parameters_of, true_time
 from factorgraph_dvl.graph.inertial_chain import Chain
 from factorgraph_dvl.graph.priors import (
     ConstantsPrior,
@@ -42,14 +43,17 @@ from factorgraph_dvl.imu.propagation import (
     motion_at,
 )
 from factorgraph_dvl.sensors.parameters import Parameter
-from factorgraph_dvl.sensors.protocol import Aid, Linearization, Motion, Observation
+from factorgraph_dvl.sensors.protocol import (
+    Aid,
+    Linearization,
+    Motion,
+    Observation,
+    SensorClock,
+)
 
 # Stands for zero in a fixed direction, in standard deviations of the prior. Chosen: what data
 # that do not determine the direction cannot move.
 FIXED_DIRECTION_STD = 1e-4
-# Distance from the ends of the record, s, that measurements of unknown time must have. Chosen:
-# the start value of a time offset is better than this.
-_TIME_MARGIN = 0.05
 # How far, s, a motion is extrapolated before its measurements are bound anew. Measured: 2 Hz
 # sway of 4 deg then differs by 3e-6 rad/s from a straight line in the rate.
 _SAME_TIME = 2e-4
@@ -164,6 +168,8 @@ class Problem:
     constants_prior : ConstantsPrior, optional
         Joint prior of biases and parameters, in place of their own; the chain then has none of
         the biases.
+    clock_zero : float, optional
+        When the offsets of clocks hold, s; by default in the middle of the chain.
 
     Attributes
     ----------
@@ -181,8 +187,11 @@ class Problem:
         parameters: Sequence[Parameter],
         start: dict[str, Array] | None = None,
         constants_prior: ConstantsPrior | None = None,
+        clock_zero: float | None = None,
     ) -> None:
         self.chain = chain
+        # When the offsets of clocks hold, s.
+        self.clock_zero = chain.middle if clock_zero is None else clock_zero
         self.all_parameters = tuple(parameters)
         self.parameters = tuple(p for p in parameters if p.estimated)
         self._key = {
@@ -202,12 +211,11 @@ class Problem:
         self.robust_weights: Mapping[str, Array] = {}
         self._start = {**self.prior_values(), **(start or {})}
         self._bound: list[_Bound] = []
-        moved = self.moved(self._start, self._prior_sigma())
         for observation in observations:
-            self._bound.append(self._bind(observation, moved))
+            self._bound.append(self._bind(observation))
         blocks: dict[tuple[str, ...], _Block] = {}
         for bound in self._bound:
-            used = tuple(p for p in self.parameters if p.name in bound.observation.parameters)
+            used = tuple(p for p in self.parameters if p.name in parameters_of(bound.observation))
             names = tuple(p.name for p in used)
             blocks.setdefault(names, _Block([], used)).bound.append(bound)
         self._blocks = list(blocks.values())
@@ -307,15 +315,15 @@ class Problem:
         for p in self.parameters:
             parameters[p.name] = self._parameter(values, p)
         motions, residuals = [], []
-        computed: dict[tuple[int, float], Motion] = {}
+        computed: dict[tuple[int, SensorClock | None], Motion] = {}
         cost = self.graph.error(values)
         rate = self.chain.frame.earth_rate
         for bound in self._bound:
-            late = self._late(bound, parameters)
-            shared = (id(bound.attachment), late)
+            # Position and velocity of one receiver share attachment and clock.
+            shared = (id(bound.attachment), bound.observation.clock)
             if shared not in computed:
                 motion = motion_at(bound.attachment, states, self.chain.gravity_n, rate)
-                computed[shared] = motion if late == 0.0 else extrapolated(motion, late)
+                computed[shared] = extrapolated(motion, self._late(bound, parameters))
             motion = computed[shared]
             residual = bound.weight * bound.observation.residual(motion, parameters)
             motions.append(motion)
@@ -463,15 +471,9 @@ class Problem:
         bias = np.broadcast_to(bias, (n, _BIAS))
         return States(nRb, p_n, v_n, gyro_bias=bias[:, 3:], accel_bias=bias[:, :3])
 
-    def _bind(self, observation: Observation, moved: dict[str, Array]) -> _Bound:
-        time = observation.true_time(self._start)
-        later = observation.true_time(moved)
-        # A measurement whose time is yet to be found must not leave the record on the way.
-        margin = 0.0 if np.array_equal(time, later) else _TIME_MARGIN
-        locate = self.chain.segments.increments.locate
-        covered = locate(time)[2]
-        if margin > 0.0:
-            covered &= locate(time - margin)[2] & locate(time + margin)[2]
+    def _bind(self, observation: Observation) -> _Bound:
+        time = true_time(observation, self._start, self.clock_zero)
+        covered = self.chain.segments.increments.locate(time)[2]
         if not covered.all():
             self.uncovered[observation.label] = int((~covered).sum())
         weight = np.repeat(covered.astype(float)[:, None], len(observation.components), axis=1)
@@ -482,17 +484,13 @@ class Problem:
         # Times that are not covered weigh nothing; they only need a place on the chain.
         return _Bound(observation, at, time, covered, weight)
 
-    def _prior_sigma(self) -> Array:
-        """Return the standard deviations of the priors of all estimated parameters, (P,), SI."""
-        return np.concatenate([np.empty(0), *(p.sigma for p in self.parameters)])
-
     def needs_rebinding(self, parameters: dict[str, Array]) -> bool:
-        """Whether a time offset has moved measurements too far from where they were bound."""
-        return any(abs(self._late(b, parameters)) > _SAME_TIME for b in self._bound)
+        """Whether a clock has moved measurements too far from where they were bound."""
+        return any(np.abs(self._late(b, parameters)).max() > _SAME_TIME for b in self._bound)
 
-    def _late(self, bound: _Bound, parameters: dict[str, Array]) -> float:
-        """Return by how much a time offset has moved measurements since they were bound, s."""
-        return float((bound.observation.true_time(parameters) - bound.time)[0])
+    def _late(self, bound: _Bound, parameters: dict[str, Array]) -> Array:
+        """Return by how much clocks have moved measurements since they were bound, (M,), s."""
+        return true_time(bound.observation, parameters, self.clock_zero) - bound.time
 
     def _lay_out(self, block: _Block) -> None:
         """Make a block's factors for the nodes that its measurements hang on now."""
@@ -551,7 +549,13 @@ class Problem:
         """
         transition = transitions[id(evaluation.motions[self._bound.index(bound)])]
         wanted = [p.name for p in parameters]
-        lin = bound.observation.linearize(transition.motion, evaluation.parameters, wanted)
+        lin = linearized(
+            bound.observation,
+            transition.motion,
+            evaluation.parameters,
+            wanted,
+            self.clock_zero,
+        )
         columns = _STATE + _BIAS + sum(p.mean.size for p in parameters)
         full = np.empty((*lin.residual.shape, columns))
         full[:, :, : _STATE + _BIAS] = node_jacobian(lin, transition)

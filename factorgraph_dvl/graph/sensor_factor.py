@@ -14,6 +14,7 @@ import gtsam
 import numpy as np
 
 from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.graph.clocks import linearized, parameters_of, true_time
 from factorgraph_dvl.graph.problem import node_jacobian
 from factorgraph_dvl.imu.propagation import Attachment, States, Transition, extrapolated, motion_at
 from factorgraph_dvl.sensors.parameters import Parameter
@@ -60,6 +61,8 @@ class NodeMeasurements:
         `LocalFrame.gravity_without_rotation`, m/s².
     earth_rate_n : ndarray, shape (3,), rad/s
         Earth rate in n.
+    clock_zero : float, optional
+        When the offsets of clocks hold, s.
     """
 
     attachment: Attachment
@@ -68,6 +71,7 @@ class NodeMeasurements:
     fixed: Mapping[str, Array]
     gravity_n: Array
     earth_rate_n: Array
+    clock_zero: float = 0.0
 
     def attachment_of(self, rows: Rows) -> Attachment:
         """Return the attachment of measurements of one kind."""
@@ -80,8 +84,8 @@ class NodeMeasurements:
         out = []
         for r in self.rows:
             part = _part(motion, r.at) if len(self.rows) > 1 else motion
-            late = float((r.observation.true_time(values) - r.time)[0])
-            out.append(part if late == 0.0 else extrapolated(part, late))
+            late = true_time(r.observation, values, self.clock_zero) - r.time
+            out.append(extrapolated(part, late))
         return motion, out
 
     def linearize(
@@ -98,8 +102,9 @@ class NodeMeasurements:
         width = _STATE + _BIAS + sum(p.mean.size for p in self.parameters)
         residuals, jacobians = [], []
         for r, own in zip(self.rows, motions, strict=True):
-            wanted = [p.name for p in self.parameters if p.name in r.observation.parameters]
-            lin = r.observation.linearize(own, values, wanted)
+            used = parameters_of(r.observation)
+            wanted = [p.name for p in self.parameters if p.name in used]
+            lin = linearized(r.observation, own, values, wanted, self.clock_zero)
             m, d = lin.residual.shape
             matrix = np.zeros((m, d, width))
             matrix[:, :, : _STATE + _BIAS] = node_jacobian(

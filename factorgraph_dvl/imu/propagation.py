@@ -283,12 +283,15 @@ def motion_at(at: Attachment, states: States, gravity_n: Array, earth_rate_n: Ar
     )
 
 
-def extrapolated(motion: Motion, late: float) -> Motion:
-    """Return a motion `late` seconds later, to first order in all that changes.
+def extrapolated(motion: Motion, late: Array) -> Motion:
+    """Return a motion at times that are later by (M,) s, to first order in all that changes.
 
     Smooth in time where the increments are as rough as the noise of the samples: so a time
     offset has a minimum to converge to.
     """
+    if not late.any():
+        return motion
+    late = late[:, None]
     omega = motion.omega_eb_b + motion.alpha_b * late
     mean_rate = 0.5 * (motion.omega_eb_b + omega)
     return replace(

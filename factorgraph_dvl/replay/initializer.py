@@ -91,6 +91,7 @@ class Initializer:
         self._gap: Gap | None = None
         self._prior: ConstantsPrior | None = None
         self._usual_misfit = 1.0
+        self._clock_zero: float | None = None
         self._attempt = np.nan
         self._solved_at = np.nan
         self._solve_at = np.nan
@@ -257,7 +258,11 @@ class Initializer:
         except DataError:
             return "no position has been measured since" if self._gap else "no position yet"
         try:
-            return solve_start(trial, self._prior, self._interval, since, self._progress)
+            if self._clock_zero is None:
+                self._clock_zero = float(trial.imu.time[0])
+            return solve_start(
+                trial, self._prior, self._interval, since, self._progress, self._clock_zero
+            )
         except FactorgraphDvlError as error:
             return str(error)
 

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.graph.clocks import parameters_of, true_time
 from factorgraph_dvl.graph.sensor_factor import NodeMeasurements, Rows
 from factorgraph_dvl.imu.preintegration import Segments
 from factorgraph_dvl.imu.propagation import attach
@@ -46,7 +47,7 @@ def attached(
     times: list[Array] = []
     count = 0
     for o in observations:
-        time = o.true_time(values)
+        time = true_time(o, values, start.clock_zero)
         if rows and np.array_equal(time, rows[-1].time):
             # Of one sensor, such as position and velocity of GNSS.
             rows.append(Rows(o, rows[-1].at, time))
@@ -54,7 +55,7 @@ def attached(
         rows.append(Rows(o, slice(count, count + time.size), time))
         times.append(time)
         count += time.size
-    used = {name for o in observations for name in o.parameters}
+    used = {name for o in observations for name in parameters_of(o)}
     return NodeMeasurements(
         attachment=attach(seg, np.concatenate(times), start.frame.earth_rate),
         rows=tuple(rows),
@@ -62,6 +63,7 @@ def attached(
         fixed=start.fixed,
         gravity_n=gravity_n,
         earth_rate_n=start.frame.earth_rate,
+        clock_zero=start.clock_zero,
     )
 
 

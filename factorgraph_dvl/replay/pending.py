@@ -9,7 +9,7 @@ import numpy as np
 
 from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.vectors import Array
-from factorgraph_dvl.sensors.protocol import Aid, Observation
+from factorgraph_dvl.sensors.protocol import Aid, SensorClock
 from factorgraph_dvl.sensors.records import joined, rows_of
 
 # Times closer than this, s, are the same; chosen: the resolution of stamps in microseconds.
@@ -30,7 +30,7 @@ class PendingMeasurements:
 
     def __init__(self) -> None:
         self._records: dict[str, list[Aid]] = {}
-        self._example: dict[str, Observation] = {}
+        self._clocks: dict[str, SensorClock | None] = {}
         self.rejected: Counter[str] = Counter()
 
     @property
@@ -49,7 +49,12 @@ class PendingMeasurements:
         self._records.setdefault(record.section, []).append(record)
 
     def due(
-        self, section: str, end: float, frame: LocalFrame | None, values: Mapping[str, Array]
+        self,
+        section: str,
+        end: float,
+        frame: LocalFrame | None,
+        values: Mapping[str, Array],
+        clock_zero: float,
     ) -> tuple[Aid, Array] | None:
         """Remove what was true before a time, and return it with its true times.
 
@@ -63,6 +68,8 @@ class PendingMeasurements:
             Navigation frame of the measurements; None as long as there is none.
         values : mapping of str to ndarray
             Values of the parameters, SI.
+        clock_zero : float
+            When the offsets of clocks hold, s.
 
         Returns
         -------
@@ -70,7 +77,9 @@ class PendingMeasurements:
             Rows and their true times, s; None if nothing is due.
         """
         record = joined(self._records.pop(section))
-        true = record.time - (0.0 if frame is None else self._time_offset(record, frame, values))
+        clock = None if frame is None else self._clock(record, frame)
+        lag = 0.0 if clock is None else clock.lag(record.time, values, clock_zero)
+        true = record.time - lag
         due = true < end - SAME_TIME
         if not due.all():
             self._records[section] = [rows_of(record, ~due)]
@@ -81,13 +90,12 @@ class PendingMeasurements:
         later = [r.time[r.time > time] for r in self._records.get(section, [])]
         return min((float(t.min()) for t in later if t.size), default=np.inf)
 
-    def _time_offset(self, record: Aid, frame: LocalFrame, values: Mapping[str, Array]) -> float:
-        """Return by how much the clock of a sensor is ahead, s."""
+    def _clock(self, record: Aid, frame: LocalFrame) -> SensorClock | None:
+        """Return the clock of a sensor, None if it is that of the IMU or not known yet."""
         section = record.section
-        if section not in self._example:
+        if section not in self._clocks:
             observations = record.observations(frame)
             if not observations:
-                return 0.0
-            self._example[section] = observations[0]
-        o = self._example[section]
-        return float((o.time - o.true_time(values))[0])
+                return None
+            self._clocks[section] = observations[0].clock
+        return self._clocks[section]

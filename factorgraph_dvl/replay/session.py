@@ -343,11 +343,11 @@ class Replay:
     def _due(self, section: str, end: float) -> tuple[Aid, Array] | None:
         """Return what is pending of a sensor and was true before a time, and its true times."""
         nav = self._navigator
-        frame, values = None, {}
+        frame, values, clock_zero = None, {}, 0.0
         # Before its first measurement a sensor's clock offset is not known.
         if nav is not None and section in nav.start.sections:
-            frame, values = nav.start.frame, nav.values
-        found = self._pending.due(section, end, frame, values)
+            frame, values, clock_zero = nav.start.frame, nav.values, nav.start.clock_zero
+        found = self._pending.due(section, end, frame, values, clock_zero)
         if found is None or not self._measures(found[0]):
             return None
         if self._initializer.history is not None:

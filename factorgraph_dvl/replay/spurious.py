@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.graph.clocks import parameters_of
 from factorgraph_dvl.graph.priors import prior_root
 from factorgraph_dvl.graph.sensor_factor import NodeMeasurements
 from factorgraph_dvl.replay.start import ReplayStart
@@ -75,7 +76,7 @@ class SpuriousInformation:
         changed = False
         for r, motion, weight in zip(measured.rows, motions, weights, strict=True):
             o = r.observation
-            wanted = [p.name for p in measured.parameters if p.name in o.parameters]
+            wanted = [p.name for p in measured.parameters if p.name in parameters_of(o)]
             used = int(np.count_nonzero(weight.any(axis=1)))
             if not wanted or not used:
                 continue
@@ -91,6 +92,7 @@ class SpuriousInformation:
                 np.broadcast_to(P, (m, *P.shape)),
                 values,
                 wanted,
+                self._start.clock_zero,
             )
             root = self._root[self._start.columns(wanted)]
             share = self._used[o.label] / used

@@ -66,6 +66,8 @@ class ReplayStart:
         Spurious information on the parameters, in units of the priors' standard deviations.
     walking : bool
         Whether biases walk.
+    clock_zero : float
+        When the offsets of clocks hold, s.
     trajectory : Trajectory
         Motion after the time that `solve_start` was given.
     findings : tuple of Finding
@@ -88,6 +90,7 @@ class ReplayStart:
     windows: tuple[int, int]
     spurious: Array
     walking: bool
+    clock_zero: float
     trajectory: Trajectory
     findings: tuple[Finding, ...]
     misfit: float
@@ -104,7 +107,12 @@ class ReplayStart:
 
 
 def solve_start(
-    trial: Trial, known: ConstantsPrior | None, interval: float, since: float, progress: Progress
+    trial: Trial,
+    known: ConstantsPrior | None,
+    interval: float,
+    since: float,
+    progress: Progress,
+    clock_zero: float,
 ) -> ReplayStart | str:
     """Solve the records so far, and condense them to their last state.
 
@@ -120,6 +128,8 @@ def solve_start(
         Time after which the trajectory is wanted, s.
     progress : callable
         Called with stage, iteration and cost.
+    clock_zero : float
+        When the offsets of clocks hold, s.
 
     Returns
     -------
@@ -133,7 +143,11 @@ def solve_start(
     """
     # The smoother goes on with the noise that is stated.
     settled, start_positions = settled_minimum(
-        trial, progress=progress, constants_prior=known, estimate_noise=False
+        trial,
+        progress=progress,
+        constants_prior=known,
+        estimate_noise=False,
+        clock_zero=clock_zero,
     )
     problem, minimum = settled.problem, settled.minimum
     if len(start_positions.states) > 1:
@@ -177,6 +191,7 @@ def solve_start(
         windows=chain.segments.increments.chosen_windows,
         spurious=spurious,
         walking=chain.walking,
+        clock_zero=clock_zero,
         trajectory=_trajectory(
             problem, evaluation.states, covariances.nodes, trial.body_axes, since
         ),

@@ -15,6 +15,7 @@ from factorgraph_dvl.errors import DataError
 from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.units import GEODETIC_SI
 from factorgraph_dvl.geometry.vectors import Array, cross, rotate, skew
+from factorgraph_dvl.sensors.clock import Clock, ClockSection
 from factorgraph_dvl.sensors.parameters import SCALAR, Parameter, ParameterSpec
 from factorgraph_dvl.sensors.protocol import (
     Linearization,
@@ -33,6 +34,7 @@ NAME = "beacon"
 
 _SOUND_SPEED = ParameterSpec("sound_speed_error", labels=SCALAR)
 SOUND_SPEED_ERROR = _SOUND_SPEED.name
+_CLOCK = Clock.of("beacon", prefix="beacon_")
 
 # A measurement this many standard deviations off is no measurement but an echo.
 GATE = 3.5
@@ -66,7 +68,7 @@ class BeaconPosition(Section, frozen=True, kw_only=True):
         return np.array([self.lat_deg, self.lon_deg, self.height_m]) * GEODETIC_SI
 
 
-class BeaconSettings(SensorSection, frozen=True, kw_only=True):
+class BeaconSettings(ClockSection, frozen=True, kw_only=True):
     """Section `beacons` of trial.yaml."""
 
     file: str = "beacon.csv"
@@ -117,7 +119,10 @@ class Beacons:
     section_type: ClassVar[type[SensorSection]] = BeaconSettings
     required: ClassVar[tuple[str, ...]] = ("time_s", NAME)
     optional: ClassVar[tuple[tuple[str, ...], ...]] = ((RANGE,), (RANGE_RATE,))
-    specs: ClassVar[tuple[ParameterSpec, ...]] = (_SOUND_SPEED, _offset_spec(ANY_BEACON))
+    specs: ClassVar[tuple[ParameterSpec, ...]] = (
+        *(_SOUND_SPEED, _offset_spec(ANY_BEACON)),
+        *_CLOCK.specs,
+    )
 
     def __post_init__(self) -> None:
         check_times(self.time, self.source)
@@ -164,7 +169,7 @@ class Beacons:
         return np.asarray(np.isnan(self.range) & np.isnan(self.range_rate))
 
     def parameters(self) -> tuple[Parameter, ...]:
-        """Return the error of the sound speed, and how far each beacon is off its place."""
+        """Return the errors of sound speed, places and clock."""
         s = self.settings
         return (
             Parameter(_SOUND_SPEED, np.zeros(1), np.array([s.sound_speed_error_std])),
@@ -172,6 +177,7 @@ class Beacons:
                 Parameter(_offset_spec(name), np.zeros(3), np.full(3, position.std_m))
                 for name, position in s.positions.items()
             ),
+            *_CLOCK.parameters(s),
         )
 
     def observations(self, frame: LocalFrame) -> tuple[Observation, ...]:
@@ -196,6 +202,8 @@ class Beacons:
         if motion is None or motion.v_n.shape[0] < 2:
             return "there are hardly any ranges while the IMU runs"
         travelled = float(np.linalg.norm(np.ptp(motion.p_n[:, :2], axis=0)))
+        if parameter in _CLOCK.names:
+            return "a time offset shows only where the ranges change"
         if parameter == SOUND_SPEED_ERROR:
             return (
                 "an error of the sound speed shows only against a distance that something else "
@@ -262,9 +270,10 @@ class _ToBeacon:
         """Names of the calibration parameters that the measurement depends on."""
         return (SOUND_SPEED_ERROR, self.offset)
 
-    def true_time(self, values: Values) -> Array:
-        """Return the times of the measurements."""
-        return self.time
+    @property
+    def clock(self) -> Clock:
+        """Clock of the instrument."""
+        return _CLOCK
 
     def _geometry(self, motion: Motion, values: Values) -> tuple[Array, Array]:
         """Return distance (M,) and unit vector (M, 3) from the beacon to the transponder."""

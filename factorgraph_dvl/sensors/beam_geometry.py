@@ -119,6 +119,7 @@ def as_dvl(beams: DvlBeams, calibration: tuple[Array, Array, Array] | None = Non
     """
     s = beams.settings
     common = s.parametrisation == "common"
+    none = (0.0, 0.0, 0.0)
     std = s.misalignment_std_deg
     settings = DvlSettings(
         velocity_std_m_s=s.velocity_std_m_s,
@@ -129,20 +130,25 @@ def as_dvl(beams: DvlBeams, calibration: tuple[Array, Array, Array] | None = Non
         scale_error_std=s.scale_error_std,
         lever_arm_m=s.lever_arm_m,
         lever_arm_std_m=s.lever_arm_std_m,
+        bias_std_m_s=none,
+        time_offset_s=s.time_offset_s,
+        time_offset_std_s=s.time_offset_std_s,
+        clock_rate_std_ppm=s.clock_rate_std_ppm,
     )
     directions_d = s.nominal_d
     scale = np.zeros(1) if common else np.atleast_1d(np.array(s.scale_error, dtype=float))
     if calibration is not None:
         directions_b, scale, arm = calibration
         directions_d = directions_b @ exp_so3(np.array(s.misalignment_deg) * DEG).T
-        held = (0.0, 0.0, 0.0)
         settings = msgspec.structs.replace(
             settings,
-            misalignment_std_deg=held,
+            misalignment_std_deg=none,
             scale_error=0.0,
             scale_error_std=0.0,
             lever_arm_m=tuple(arm.tolist()),
-            lever_arm_std_m=held,
+            lever_arm_std_m=none,
+            time_offset_std_s=0.0,
+            clock_rate_std_ppm=0.0,
         )
     gain = (1.0 + np.broadcast_to(scale, len(directions_d)))[:, None] * directions_d
     velocity, std_d = velocities(gain, beams.velocity, beams.sigma())

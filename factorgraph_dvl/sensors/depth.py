@@ -10,6 +10,7 @@ import numpy as np
 
 from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.vectors import Array, skew
+from factorgraph_dvl.sensors.clock import Clock, ClockSection
 from factorgraph_dvl.sensors.parameters import SCALAR, Parameter, ParameterSpec
 from factorgraph_dvl.sensors.protocol import (
     Linearization,
@@ -23,9 +24,10 @@ from factorgraph_dvl.settings.sections import NonNegative, Positive, Vector3
 
 _SEA_SURFACE = ParameterSpec("sea_surface_height", "m", labels=SCALAR)
 SEA_SURFACE_HEIGHT = _SEA_SURFACE.name
+_CLOCK = Clock.of("depth", prefix="depth_")
 
 
-class DepthSettings(SensorSection, frozen=True, kw_only=True):
+class DepthSettings(ClockSection, frozen=True, kw_only=True):
     """Section `depth` of trial.yaml.
 
     The sea is not the ellipsoid: the geoid leaves it by -107 to 86 m, and tide comes on top.
@@ -64,7 +66,7 @@ class Depth:
     section_type: ClassVar[type[SensorSection]] = DepthSettings
     required: ClassVar[tuple[str, ...]] = ("time_s", "depth_m")
     optional: ClassVar[tuple[tuple[str, ...], ...]] = ()
-    specs: ClassVar[tuple[ParameterSpec, ...]] = (_SEA_SURFACE,)
+    specs: ClassVar[tuple[ParameterSpec, ...]] = (_SEA_SURFACE, *_CLOCK.specs)
 
     def __post_init__(self) -> None:
         check_times(self.time, self.source)
@@ -87,10 +89,11 @@ class Depth:
         return np.isnan(self.depth)
 
     def parameters(self) -> tuple[Parameter, ...]:
-        """Return the height of the sea surface above the ellipsoid."""
+        """Return the height of the sea surface above the ellipsoid, and the clock."""
         s = self.settings
         mean, sigma = s.sea_surface_height_m, s.sea_surface_height_std_m
-        return (Parameter(_SEA_SURFACE, np.array([mean]), np.array([sigma])),)
+        surface = Parameter(_SEA_SURFACE, np.array([mean]), np.array([sigma]))
+        return (surface, *_CLOCK.parameters(s))
 
     def observations(self, frame: LocalFrame) -> tuple[Observation, ...]:
         """Return the depths, where there are any."""
@@ -101,7 +104,9 @@ class Depth:
         return (DepthBelowSurface(self.time[m], self.depth[m], self.settings.std_m, arm, frame),)
 
     def explain(self, parameter: str, component: int, motion: Motion | None) -> str:
-        """Say why the height of the sea surface could not be observed."""
+        """Say why the height of the sea surface or the clock could not be observed."""
+        if parameter in _CLOCK.names:
+            return "a time offset shows only where the depth changes"
         return "nothing else in the trial measures height: it takes GNSS at the surface"
 
 
@@ -141,10 +146,7 @@ class DepthBelowSurface:
     noise_groups: tuple[tuple[int, ...], ...] = ((0,),)
     independent: bool = False
     parameters: tuple[str, ...] = (SEA_SURFACE_HEIGHT,)
-
-    def true_time(self, values: Values) -> Array:
-        """Return the times of the measurements."""
-        return self.time
+    clock: Clock = _CLOCK
 
     def sigma(self, motion: Motion, values: Values, factor: Array | float = 1.0) -> Array:
         """Return the standard deviation, (M, 1), m."""

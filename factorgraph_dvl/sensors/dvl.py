@@ -14,6 +14,7 @@ from factorgraph_dvl.errors import ConfigError
 from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array, cross, rotate, skew
+from factorgraph_dvl.sensors.clock import Clock, ClockSection
 from factorgraph_dvl.sensors.parameters import SCALAR, XYZ, JointPrior, Parameter, ParameterSpec
 from factorgraph_dvl.sensors.protocol import (
     Linearization,
@@ -42,14 +43,14 @@ SCALE_SPEC = ParameterSpec("scale_error", labels=SCALAR, place=3, limit=1e-3, ab
 SCALES_SPEC = replace(SCALE_SPEC, labels=XYZ, frame="d")
 LEVER_ARM_SPEC = ParameterSpec("lever_arm", "m", frame="b", place=4, limit=0.1)
 BIAS_SPEC = ParameterSpec("dvl_bias", "m_s", frame="d")
-TIME_OFFSET_SPEC = ParameterSpec("time_offset", "s", labels=SCALAR)
+CLOCK = Clock.of("dvl")
 CURRENT_SPEC = ParameterSpec("current", "m_s", labels=("e", "n"), frame="n")
 
 MISALIGNMENT = MISALIGNMENT_SPEC.name
 SCALE_ERROR = SCALE_SPEC.name
 LEVER_ARM = LEVER_ARM_SPEC.name
 BIAS = BIAS_SPEC.name
-TIME_OFFSET = TIME_OFFSET_SPEC.name
+TIME_OFFSET = CLOCK.offset.name
 CURRENT = CURRENT_SPEC.name
 
 # What a calibration says of the DVL, and not of the sea that day.
@@ -59,7 +60,7 @@ CALIBRATED = (MISALIGNMENT, SCALE_ERROR, LEVER_ARM, BIAS, TIME_OFFSET)
 _LEAST_SIGMA = 1e-4
 
 
-class DvlSettings(SensorSection, frozen=True, kw_only=True):
+class DvlSettings(ClockSection, frozen=True, kw_only=True):
     """Section `dvl` of trial.yaml."""
 
     file: str = "dvl.csv"
@@ -74,9 +75,8 @@ class DvlSettings(SensorSection, frozen=True, kw_only=True):
     scale_error_std: float | Sigma3 = 0.1
     lever_arm_m: Vector3 = (0.0, 0.0, 0.0)
     lever_arm_std_m: Sigma3 = (10.0, 10.0, 10.0)
-    bias_std_m_s: Sigma3 = (0.0, 0.0, 0.0)
-    time_offset_s: float = 0.0
-    time_offset_std_s: NonNegative = 0.0
+    bias_std_m_s: Sigma3 = (0.001, 0.001, 0.001)
+    time_offset_std_s: NonNegative = 0.5
     correlation_time_s: Positive | UnsetType = UNSET
     correlated_std_m_s: float | Sigma3 | UnsetType = UNSET
     scale_walk_std_sqrt_h: NonNegative = 0.0
@@ -126,7 +126,7 @@ class Dvl:
     optional: ClassVar[tuple[tuple[str, ...], ...]] = (STD_COLUMNS,)
     specs: ClassVar[tuple[ParameterSpec, ...]] = (
         *(MISALIGNMENT_SPEC, SCALE_SPEC, SCALES_SPEC, LEVER_ARM_SPEC),
-        *(BIAS_SPEC, TIME_OFFSET_SPEC, CURRENT_SPEC),
+        *(BIAS_SPEC, *CLOCK.specs, CURRENT_SPEC),
     )
 
     def __post_init__(self) -> None:
@@ -179,7 +179,7 @@ class Dvl:
         return np.maximum(np.where(np.isnan(self.std), model, self.std), _LEAST_SIGMA)
 
     def parameters(self) -> tuple[Parameter, ...]:
-        """Return misalignment, scale error, lever arm, bias, time offset and current.
+        """Return misalignment, scale error, lever arm, bias, clock and current.
 
         Raises
         ------
@@ -223,9 +223,7 @@ class Dvl:
             ),
             Parameter(LEVER_ARM_SPEC, np.array(s.lever_arm_m), np.array(s.lever_arm_std_m)),
             Parameter(BIAS_SPEC, np.zeros(3), np.array(s.bias_std_m_s)),
-            Parameter(
-                TIME_OFFSET_SPEC, np.array([s.time_offset_s]), np.array([s.time_offset_std_s])
-            ),
+            *CLOCK.parameters(s),
             Parameter(CURRENT_SPEC, np.zeros(2), current),
         )
 
@@ -269,7 +267,7 @@ class Dvl:
             )
         if parameter == BIAS:
             return "a bias separates from the scale only when speed or direction vary"
-        if parameter == TIME_OFFSET:
+        if parameter in CLOCK.names:
             return "a time offset shows only where velocity or attitude change"
         return "a current separates from the other errors only when the heading changes"
 
@@ -313,13 +311,9 @@ class DvlVelocity:
         SCALE_ERROR,
         LEVER_ARM,
         BIAS,
-        TIME_OFFSET,
         CURRENT,
     )
-
-    def true_time(self, values: Values) -> Array:
-        """Return the times of the pings on the trial's clock."""
-        return self.time - values[TIME_OFFSET][0]
+    clock: Clock = CLOCK
 
     def sigma(self, motion: Motion, values: Values, factor: Array | float = 1.0) -> Array:
         """Return the standard deviations, the gyro's share through the lever arm included.
@@ -352,21 +346,11 @@ class DvlVelocity:
         d_scale = unscaled_d[:, :, None] if n_scale == 1 else unscaled_d[:, :, None] * np.eye(3)
         d_v = dMb @ bRn
 
-        def by_offset() -> Array:
-            # d/dt of (bRn (v_n - c_n) + omega x l), against the direction of the offset.
-            rate_b = (
-                rotate(bRn, motion.a_n)
-                - cross(motion.omega_eb_b, imu_b)
-                + cross(motion.alpha_b, lever_arm)
-            )
-            return -(rate_b @ dMb.T)[:, :, None]
-
         derivatives: dict[str, Callable[[], Array]] = {
             MISALIGNMENT: lambda: -dMb @ skew(dvl_b),
             SCALE_ERROR: lambda: d_scale,
             LEVER_ARM: lambda: dMb @ skew(motion.omega_eb_b),
             BIAS: lambda: np.broadcast_to(np.eye(3), d_v.shape),
-            TIME_OFFSET: by_offset,
             CURRENT: lambda: -d_v[:, :, :2],
         }
         return Linearization(

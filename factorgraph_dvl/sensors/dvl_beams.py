@@ -15,7 +15,8 @@ from factorgraph_dvl.geometry.rotations import exp_so3
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array, cross, rotate, skew
 from factorgraph_dvl.sensors.beam_model import CommonGeometry, FreeGeometry, Geometry
-from factorgraph_dvl.sensors.dvl import LEVER_ARM_SPEC, MISALIGNMENT_SPEC, SCALE_SPEC
+from factorgraph_dvl.sensors.clock import Clock, ClockSection
+from factorgraph_dvl.sensors.dvl import CLOCK, LEVER_ARM_SPEC, MISALIGNMENT_SPEC, SCALE_SPEC
 from factorgraph_dvl.sensors.parameters import SCALAR, Parameter, ParameterSpec
 from factorgraph_dvl.sensors.protocol import (
     Linearization,
@@ -59,6 +60,7 @@ DIRECTION = direction_spec(1).name
 SCALE_ERROR = scale_spec(1).name
 # Of the parameters that a DVL beside the beams has under the same names.
 BEAM_PREFIX = "beam_"
+_OWN_CLOCK = Clock.of("beam", prefix=BEAM_PREFIX)
 
 Angle = Annotated[float, msgspec.Meta(ge=-360, le=360)]
 Acute = Annotated[float, msgspec.Meta(ge=0, le=90)]
@@ -72,7 +74,7 @@ _ROUNDING = 1e-12
 _OCTANTS = np.array([[1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0], [1.0, -1.0]])
 
 
-class DvlBeamsSettings(SensorSection, frozen=True, kw_only=True):
+class DvlBeamsSettings(ClockSection, frozen=True, kw_only=True):
     """Section `dvl_beams` of trial.yaml."""
 
     file: str = "dvl_beams.csv"
@@ -87,6 +89,7 @@ class DvlBeamsSettings(SensorSection, frozen=True, kw_only=True):
     scale_error_std: NonNegative = 0.02
     lever_arm_m: Vector3 = (0.0, 0.0, 0.0)
     lever_arm_std_m: Sigma3 = (3.0, 3.0, 3.0)
+    time_offset_std_s: NonNegative = 0.5
     velocity_std_m_s: NonNegative = 0.005
     velocity_std_fraction: NonNegative = 0.002
 
@@ -198,6 +201,7 @@ class DvlBeams:
     optional: ClassVar[tuple[tuple[str, ...], ...]] = ()
     specs: ClassVar[tuple[ParameterSpec, ...]] = (
         *(of_beams(spec, BEAM_PREFIX) for spec in (MISALIGNMENT_SPEC, SCALE_SPEC, LEVER_ARM_SPEC)),
+        *_OWN_CLOCK.specs,
         *(direction_spec(count) for count in range(3, MOST_BEAMS + 1)),
         *(scale_spec(count) for count in range(3, MOST_BEAMS + 1)),
     )
@@ -239,7 +243,7 @@ class DvlBeams:
         return np.maximum(model, _LEAST_SIGMA)
 
     def parameters(self) -> tuple[Parameter, ...]:
-        """Return directions and scale errors, or misalignment and scale error; lever arm."""
+        """Return directions or misalignment, scale errors, lever arm and clock."""
         s = self.settings
         lever_arm = Parameter(
             of_beams(LEVER_ARM_SPEC, self.prefix),
@@ -261,6 +265,7 @@ class DvlBeams:
                     np.array([s.scale_error_std]),
                 ),
                 lever_arm,
+                *self.clock.parameters(s),
             )
         n = len(self.nominal_b)
         scale = np.broadcast_to(np.array(s.scale_error, dtype=float), (n,))
@@ -273,14 +278,20 @@ class DvlBeams:
             ),
             Parameter(scale_spec(n), scale.copy(), np.full(n, s.scale_error_std)),
             lever_arm,
+            *self.clock.parameters(s),
         )
+
+    @property
+    def clock(self) -> Clock:
+        """Clock of the instrument, that of the DVL unless a `dvl` stands beside it."""
+        return _OWN_CLOCK if self.prefix else CLOCK
 
     def observations(self, frame: LocalFrame) -> tuple[Observation, ...]:
         """Return the pings at which at least one beam was not lost."""
         m = np.logical_not(self.missing)
         if not m.any():
             return ()
-        misalignment, scale, lever_arm = (p.name for p in self.parameters())
+        misalignment, scale, lever_arm, *_ = (p.name for p in self.parameters())
         geometry: Geometry = (
             CommonGeometry(self.settings.nominal_d, misalignment, scale)
             if self.settings.parametrisation == "common"
@@ -290,12 +301,16 @@ class DvlBeams:
         measured = np.where(lost, 0.0, self.velocity[m])
         s = self.settings
         noise = (s.velocity_std_m_s, s.velocity_std_fraction)
-        return (BeamVelocity(self.time[m], measured, lost, noise, geometry, lever_arm),)
+        return (
+            BeamVelocity(self.time[m], measured, lost, noise, geometry, lever_arm, self.clock),
+        )
 
     def explain(self, parameter: str, component: int, motion: Motion | None) -> str:
         """Say why a component could not be observed, given the motion of the trial."""
         if motion is None or motion.v_n.shape[0] < 2:
             return "the trial has no ping with a beam while the IMU runs, or only one"
+        if parameter in self.clock.names:
+            return "a time offset shows only where velocity or attitude change"
         received = np.flatnonzero(~np.isnan(self.velocity).all(axis=0)) + 1
         if parameter == of_beams(LEVER_ARM_SPEC, self.prefix).name:
             if received.size < 3:
@@ -344,6 +359,8 @@ class BeamVelocity:
         Directions and scales.
     lever_arm : str
         Name of the parameter.
+    clock : Clock
+        Of the instrument.
     """
 
     time: Array
@@ -352,6 +369,7 @@ class BeamVelocity:
     noise: tuple[float, float]
     geometry: Geometry
     lever_arm: str
+    clock: Clock = CLOCK
     label: str = "Beam velocity"
     unit: str = "m/s"
     gate: float | None = None
@@ -375,10 +393,6 @@ class BeamVelocity:
     def parameters(self) -> tuple[str, ...]:
         """Names of directions or misalignment, scale and lever arm."""
         return (*self.geometry.parameters, self.lever_arm)
-
-    def true_time(self, values: Values) -> Array:
-        """Return the times of the pings."""
-        return self.time
 
     def sigma(self, motion: Motion, values: Values, factor: Array | float = 1.0) -> Array:
         """Return the standard deviations, the gyro's share through the lever arm included.

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import ClassVar, Self
 
+import msgspec
 import numpy as np
 from msgspec import UNSET, UnsetType
 
 from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.units import DEG, GEODETIC_SI
 from factorgraph_dvl.geometry.vectors import Array, cross, rotate, skew
+from factorgraph_dvl.sensors.clock import Clock, ClockSection
 from factorgraph_dvl.sensors.parameters import Parameter, ParameterSpec
 from factorgraph_dvl.sensors.protocol import (
     Linearization,
@@ -30,7 +32,7 @@ from factorgraph_dvl.sensors.records import (
     stack,
 )
 from factorgraph_dvl.sensors.turntable_motion import TurntableMotion
-from factorgraph_dvl.settings.sections import Positive, Sigma3, Vector3
+from factorgraph_dvl.settings.sections import NonNegative, Positive, Sigma3, Vector3
 
 POSITION_COLUMNS = ("lat_deg", "lon_deg", "height_m")
 VELOCITY_COLUMNS = ("vel_e_m_s", "vel_n_m_s", "vel_u_m_s")
@@ -43,16 +45,19 @@ LEVER_ARM = "gnss_lever_arm_m"
 HORIZONTAL_AND_UP = ((0, 1), (2,))
 
 _LEVER_ARM = ParameterSpec("gnss_lever_arm", "m", frame="b")
+_CLOCK = Clock.of("gnss", prefix="gnss_")
+TIME_OFFSET = _CLOCK.offset.name
 
 
-class GnssSettings(SensorSection, frozen=True, kw_only=True):
+class GnssSettings(ClockSection, frozen=True, kw_only=True):
     """Section `gnss` of trial.yaml."""
 
     file: str = "gnss.csv"
     position_std_m: tuple[Positive, Positive, Positive] = (1.0, 1.0, 2.0)
     velocity_std_m_s: tuple[Positive, Positive, Positive] = (0.1, 0.1, 0.1)
     lever_arm_m: Vector3 = (0.0, 0.0, 0.0)
-    lever_arm_std_m: Sigma3 = (0.0, 0.0, 0.0)
+    lever_arm_std_m: Sigma3 = (0.02, 0.02, 0.02)
+    time_offset_std_s: NonNegative = 0.5
     correlation_time_s: Positive | UnsetType = UNSET
     correlated_std_m: Sigma3 | UnsetType = UNSET
     velocity_correlation_time_s: Positive | UnsetType = UNSET
@@ -100,7 +105,7 @@ class Gnss:
         POSITION_STD_COLUMNS,
         VELOCITY_STD_COLUMNS,
     )
-    specs: ClassVar[tuple[ParameterSpec, ...]] = (_LEVER_ARM,)
+    specs: ClassVar[tuple[ParameterSpec, ...]] = (_LEVER_ARM, *_CLOCK.specs)
 
     def __post_init__(self) -> None:
         check_times(self.time, self.source)
@@ -152,6 +157,14 @@ class Gnss:
         """Epochs with neither position nor velocity, (M,) bool."""
         return np.asarray(np.isnan(self.geodetic[:, 0]) & np.isnan(self.velocity[:, 0]))
 
+    def on_trial_clock(self) -> Self:
+        """Return this record with stamps from which the stated time offset is taken away."""
+        offset = self.settings.time_offset_s
+        if offset == 0.0:
+            return self
+        settings = msgspec.structs.replace(self.settings, time_offset_s=0.0)
+        return replace(self, settings=settings, time=self.time - offset)
+
     def carrier(self, time: Array) -> tuple[Array, Array]:
         """Return bRc (M, 3, 3), axes of what carries the antenna to body, and omega_cb_b (M, 3).
 
@@ -167,9 +180,10 @@ class Gnss:
         return bRc @ np.array(self.settings.lever_arm_m), omega_cb_b
 
     def parameters(self) -> tuple[Parameter, ...]:
-        """Return the antenna's lever arm."""
+        """Return the antenna's lever arm, and offset and rate of the receiver's clock."""
         s = self.settings
-        return (Parameter(_LEVER_ARM, np.array(s.lever_arm_m), np.array(s.lever_arm_std_m)),)
+        lever_arm = Parameter(_LEVER_ARM, np.array(s.lever_arm_m), np.array(s.lever_arm_std_m))
+        return (lever_arm, *_CLOCK.parameters(s))
 
     def observations(self, frame: LocalFrame) -> tuple[Observation, ...]:
         """Return position and velocity measurements, where there are any."""
@@ -203,7 +217,9 @@ class Gnss:
         return tuple(out)
 
     def explain(self, parameter: str, component: int, motion: Motion | None) -> str:
-        """Say why a component of the antenna's lever arm could not be observed."""
+        """Say why a component of the lever arm or the clock could not be observed."""
+        if parameter in _CLOCK.names:
+            return "a time offset shows only where velocity or attitude change"
         return (
             "the antenna's lever arm shows only where the vehicle turns, rolls or pitches "
             "about another axis than the lever arm's own"
@@ -240,10 +256,7 @@ class AntennaPosition:
     noise_groups: tuple[tuple[int, ...], ...] = HORIZONTAL_AND_UP
     independent: bool = False
     parameters: tuple[str, ...] = (LEVER_ARM,)
-
-    def true_time(self, values: Values) -> Array:
-        """Return the times of the measurements."""
-        return self.time
+    clock: Clock = _CLOCK
 
     def sigma(self, motion: Motion, values: Values, factor: Array | float = 1.0) -> Array:
         """Return the receiver's standard deviations, (M, 3), m."""
@@ -302,10 +315,7 @@ class AntennaVelocity:
     noise_groups: tuple[tuple[int, ...], ...] = HORIZONTAL_AND_UP
     independent: bool = False
     parameters: tuple[str, ...] = (LEVER_ARM,)
-
-    def true_time(self, values: Values) -> Array:
-        """Return the times of the measurements."""
-        return self.time
+    clock: Clock = _CLOCK
 
     def sigma(self, motion: Motion, values: Values, factor: Array | float = 1.0) -> Array:
         """Return the standard deviations, the gyro's share through the lever arm included."""

@@ -43,6 +43,7 @@ UNITS = {
     "m": Unit(1.0, "m"),
     "m_s": Unit(1.0, "m/s"),
     "s": Unit(1.0, "s"),
+    "ppm": Unit(1e-6, "ppm"),
 }
 
 

@@ -82,6 +82,17 @@ class Linearization:
     d_parameters: dict[str, Array] = field(default_factory=dict)
 
 
+class SensorClock(Protocol):
+    """What the stamps of a sensor depend on."""
+
+    @property
+    def names(self) -> tuple[str, str]:
+        """Names of the parameters offset and rate."""
+
+    def lag(self, time: Array, values: Values, zero: float) -> Array:
+        """Return stamps minus true times, (M,), s."""
+
+
 class Observation(Protocol):
     """M measurements of one kind, of d components each."""
 
@@ -103,7 +114,7 @@ class Observation(Protocol):
 
     @property
     def parameters(self) -> tuple[str, ...]:
-        """Names of the calibration parameters that the measurement depends on."""
+        """Names of the calibration parameters that it depends on, those of its clock aside."""
 
     @property
     def gate(self) -> float | None:
@@ -121,8 +132,9 @@ class Observation(Protocol):
     def independent(self) -> bool:
         """Whether components are measured apart, so that one may be an outlier alone."""
 
-    def true_time(self, values: Values) -> Array:
-        """Return the (M,) times at which the measurements were true, s."""
+    @property
+    def clock(self) -> SensorClock | None:
+        """Clock of the sensor; None = that of the IMU."""
 
     def sigma(self, motion: Motion, values: Values, factor: Array | float = 1.0) -> Array:
         """Return the (M, d) standard deviations of the residual.
@@ -135,7 +147,10 @@ class Observation(Protocol):
         """Return predicted - measured, (M, d)."""
 
     def linearize(self, motion: Motion, values: Values, wanted: Collection[str]) -> Linearization:
-        """Return the residual and its Jacobians, of the parameters `wanted` at least."""
+        """Return the residual and its Jacobians, of the parameters `wanted` at least.
+
+        Those of the clock follow from the motion, for every sensor alike.
+        """
 
 
 class SensorSection(Section, frozen=True, kw_only=True):

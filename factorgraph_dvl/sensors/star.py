@@ -420,10 +420,8 @@ class StarAttitude:
     label: str = "Star attitude"
     unit: str = "arcsec"
     parameters: tuple[str, ...] = (MOUNTING,)
-
-    def true_time(self, values: Values) -> Array:
-        """Return the times of the measurements."""
-        return self.time
+    # The sky turns with UTC: an attitude of another time is another measurement.
+    clock: None = None
 
     def sigma(self, motion: Motion, values: Values, factor: Array | float = 1.0) -> Array:
         """Return the standard deviations along the axes, (M, 3), arcsec."""

@@ -128,7 +128,10 @@ def simulate_gnss(
         position_std=unknown,
         velocity_std=unknown.copy(),
     )
-    return gnss, {"gnss_lever_arm_m": np.array(truth.lever_arm_m)}
+    return gnss, {
+        "gnss_lever_arm_m": np.array(truth.lever_arm_m),
+        "gnss_time_offset_s": np.zeros(1),
+    }
 
 
 def simulate_dvl(

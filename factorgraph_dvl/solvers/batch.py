@@ -130,6 +130,7 @@ def settled_minimum(
     progress: Progress | None = None,
     constants_prior: ConstantsPrior | None = None,
     estimate_noise: bool = True,
+    clock_zero: float | None = None,
 ) -> tuple[SettledMinimum, StartPositions]:
     """Return the minimum of a trial's cost, and all positions where it may have started.
 
@@ -147,6 +148,8 @@ def settled_minimum(
         Joint prior of biases and calibration, in place of the trial's priors.
     estimate_noise : bool, default True
         As of `settle`.
+    clock_zero : float, optional
+        When the offsets of clocks hold, s; by default in the middle of the trial.
     """
     report = progress or _silent
     _check_above_zero("state_interval_s", state_interval_s)
@@ -158,6 +161,7 @@ def settled_minimum(
         report,
         constants_prior=constants_prior,
         estimate_noise=estimate_noise,
+        clock_zero=clock_zero,
     )
     findings = (*prepared.findings, *settled.findings, *ambiguity(start.hypotheses))
     return replace(settled, findings=findings), start

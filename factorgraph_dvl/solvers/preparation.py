@@ -105,10 +105,11 @@ def prepare(trial: Trial, state_interval_s: float, report: Progress) -> Preparat
     inc, gaps = increments(trial.imu)
     seg = segments(inc, state_interval_s, dense_epochs(trial, frame, state_interval_s))
     report("alignment", 0, None)
-    start = initial_states(trial, frame, seg)
+    on_one_clock = trial.on_one_clock()
+    start = initial_states(on_one_clock, frame, seg)
     if trial.beacons is not None:
         report("ranges", 0, None)
-    start_positions = positions_from_ranges(trial, frame, seg, start.states)
+    start_positions = positions_from_ranges(on_one_clock, frame, seg, start.states)
     seen = [finding for each in attitudes(trial, frame) for finding in each.findings]
     by_aid = [(aid, *observed([aid], frame)) for aid in trial.aids]
     return Preparation(
@@ -132,12 +133,13 @@ def prepare(trial: Trial, state_interval_s: float, report: Progress) -> Preparat
 def mounted_start(
     prepared: Preparation, chain: Chain, states: States, report: Progress
 ) -> tuple[States, dict[str, Array], int]:
-    """Return states, values of the mountings that fit them, and the iterations it took.
+    """Return states, values of the parameters that fit them, and the iterations it took.
 
     GNSS and IMU alone smooth the motion first, unless the DVL is calibrated: such a one does
     no harm from the start.
     """
     iterations = 0
+    values = prepared.mountings
     aids = mounted_aids(prepared.trial, prepared.mountings)
     if aids is not None:
         problem = Problem(chain, *observed(aids, prepared.frame), start=prepared.mountings)
@@ -151,6 +153,7 @@ def mounted_start(
             proven=False,
         )
         states, iterations = coarse.evaluation.states, coarse.iterations
+        values = values | coarse.evaluation.parameters
     report("mounting", 0, None)
     (best, *_) = prepared.mountings_at(chain, states)
-    return states, prepared.mountings | best, iterations
+    return states, values | best, iterations

@@ -68,6 +68,7 @@ def settle(
     constants_prior: ConstantsPrior | None = None,
     values: dict[str, Array] | None = None,
     estimate_noise: bool = True,
+    clock_zero: float | None = None,
 ) -> SettledMinimum:
     """Return the minimum that some states lead to.
 
@@ -87,6 +88,8 @@ def settle(
     estimate_noise : bool, default True
         Whether to estimate the noise of sensors from their residuals, where the trial does not
         say that it is as stated.
+    clock_zero : float, optional
+        When the offsets of clocks hold, s; by default in the middle of the trial.
     """
     chain = prepared.chain(states, bias_prior=constants_prior is None)
     p_gravity = states.p_n
@@ -116,6 +119,7 @@ def settle(
                 prepared.parameters,
                 start=values,
                 constants_prior=constants_prior,
+                clock_zero=clock_zero,
             )
             problem.reject(rejected)
         problem.noise_factors = levels.factors[-1]

@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from factorgraph_dvl.geometry.vectors import Array, rotate, skew
+from factorgraph_dvl.graph.clocks import linearized, parameters_of
 from factorgraph_dvl.graph.problem import Evaluation, Problem
 from factorgraph_dvl.imu.propagation import Attachment
 from factorgraph_dvl.sensors.protocol import Motion, Observation, Values
@@ -123,10 +124,12 @@ def parameter_information(problem: Problem, evaluation: Evaluation) -> Array:
     for observation, motion, weight in zip(
         problem.observations, evaluation.motions, problem.weights, strict=True
     ):
-        wanted = [p.name for p in problem.parameters if p.name in observation.parameters]
+        wanted = [p.name for p in problem.parameters if p.name in parameters_of(observation)]
         if not wanted:
             continue
-        found = observation.linearize(motion, evaluation.parameters, wanted).d_parameters
+        found = linearized(
+            observation, motion, evaluation.parameters, wanted, problem.clock_zero
+        ).d_parameters
         J = np.concatenate([found[name] for name in wanted], axis=2) * weight[:, :, None]
         columns = np.concatenate([np.arange(len(root))[problem.columns[name]] for name in wanted])
         out[np.ix_(columns, columns)] += np.einsum("mdi,mdj->ij", J, J)
@@ -159,7 +162,7 @@ def spurious_information(problem: Problem, evaluation: Evaluation, nodes: Array)
         problem.weights,
         strict=True,
     ):
-        names = [p.name for p in problem.parameters if p.name in observation.parameters]
+        names = [p.name for p in problem.parameters if p.name in parameters_of(observation)]
         if names:
             part = spurious_by(
                 observation,
@@ -169,6 +172,7 @@ def spurious_information(problem: Problem, evaluation: Evaluation, nodes: Array)
                 nodes[attachment.node],
                 evaluation.parameters,
                 names,
+                problem.clock_zero,
             )
             places = [problem.columns[name] for name in names]
             columns = np.concatenate([np.arange(p.start, p.stop) for p in places])
@@ -237,6 +241,7 @@ def spurious_by(
     P: Array,
     values: Values,
     wanted: Sequence[str],
+    clock_zero: float,
 ) -> Array:
     """Return the spurious information by measurement, (M, p, p), SI.
 
@@ -254,10 +259,12 @@ def spurious_by(
         Of all parameters.
     wanted : sequence of str
         Names of the parameters, of p columns, whose information is asked for.
+    clock_zero : float
+        When the offsets of clocks hold, s.
     """
 
     def jacobian(at: Motion) -> Array:
-        found = observation.linearize(at, values, wanted).d_parameters
+        found = linearized(observation, at, values, wanted, clock_zero).d_parameters
         return np.concatenate([found[name] for name in wanted], axis=2)
 
     base = jacobian(motion)

@@ -13,6 +13,7 @@ from truth import exact_motion, scenario
 from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.rotations import exp_so3
 from factorgraph_dvl.geometry.units import DEG
+from factorgraph_dvl.graph.clocks import linearized, true_time
 from factorgraph_dvl.sensors.dvl import Dvl, DvlSettings, DvlVelocity
 from factorgraph_dvl.sensors.gnss import AntennaPosition, AntennaVelocity, Gnss, GnssSettings
 from factorgraph_dvl.sensors.protocol import Motion, lever_arm_sigma
@@ -28,7 +29,10 @@ def dvl_values(**changes):
         "lever_arm_m": np.array([1.0, -1.2, 1.4]),
         "dvl_bias_m_s": np.array([0.01, -0.02, 0.03]),
         "time_offset_s": np.array([0.08]),
+        "dvl_clock_rate_ppm": np.zeros(1),
         "current_m_s": np.zeros(2),
+        "gnss_time_offset_s": np.zeros(1),
+        "gnss_clock_rate_ppm": np.zeros(1),
     } | changes
 
 
@@ -79,7 +83,7 @@ def test_dvl_velocity_has_zero_error_at_the_truth(scale, reference, body_axes):
     values = dvl_values(scale_error=np.atleast_1d(scale))
     if reference == "water":
         values["current_m_s"] = np.array([0.3, -0.2])
-    motion = exact_motion(exact, frame, o.true_time(values))
+    motion = exact_motion(exact, frame, true_time(o, values, 0.0))
     # Through the water, the current keeps its east and north at the vehicle; the model
     # means those of the origin, 85 km away: 0.36 m/s times 0.0135 rad.
     limit = 1e-13 if reference == "bottom" else 5e-3
@@ -121,10 +125,11 @@ def test_time_offset_derivative_is_that_of_the_true_motion():
     exact, frame, observations = observed(scene())
     o = observations["DVL velocity"]
     values = dvl_values()
-    time = o.true_time(values)
+    time = true_time(o, values, 0.0)
     smooth = np.min(np.abs(time[:, None] - exact.kinks), axis=1) > 0.01
     o = replace(o, time=o.time[smooth], measured_d=o.measured_d[smooth], std=o.std[smooth])
-    lin = o.linearize(exact_motion(exact, frame, time[smooth]), values, ["time_offset_s"])
+    motion = exact_motion(exact, frame, time[smooth])
+    lin = linearized(o, motion, values, ["time_offset_s"], 0.0)
     h = 1e-4
     later, earlier = (
         o.residual(exact_motion(exact, frame, time[smooth] - s), values) for s in (h, -h)
@@ -189,7 +194,7 @@ def test_dvl_velocity_by_hand():
     o = DvlVelocity(np.array([7.0]), measured, np.full((1, 3), 0.01))
     np.testing.assert_allclose(o.residual(hand_motion(), values), [[-0.12, -0.2, 0.003]])
     # The file's time is 80 ms late.
-    np.testing.assert_allclose(o.true_time(values), [6.92])
+    np.testing.assert_allclose(true_time(o, values, 0.0), [6.92])
     # Per axis, the x scale acts on d's x: -2.1 · 1.1 = -2.31, -0.2 · 1 = -0.2, 0 · 0.9.
     values["scale_error"] = np.array([0.1, 0.0, -0.1])
     np.testing.assert_allclose(o.residual(hand_motion(), values), [[-0.309, -0.198, 0.003]])
@@ -245,7 +250,7 @@ def test_a_transposed_rotation_shows():
 
     for label in ("DVL velocity", "GNSS position", "GNSS velocity"):
         o = observations[label]
-        motion = exact_motion(exact, frame, o.true_time(values))
+        motion = exact_motion(exact, frame, true_time(o, values, 0.0))
         assert worst(o, motion) < 1e-5
         assert worst(o, replace(motion, nRb=motion.nRb.transpose(0, 2, 1))) > 0.5
         if label == "DVL velocity":

@@ -1,0 +1,80 @@
+"""The clock of a sensor: its offset and rate against the clock of the IMU."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.sensors.parameters import SCALAR, Parameter, ParameterSpec
+from factorgraph_dvl.sensors.protocol import SensorSection
+from factorgraph_dvl.settings.sections import NonNegative
+
+
+class ClockSection(SensorSection, frozen=True, kw_only=True):
+    """Section of trial.yaml of a sensor that has a clock of its own."""
+
+    time_offset_s: float = 0.0
+    time_offset_std_s: NonNegative = 0.0
+    clock_rate_std_ppm: NonNegative = 0.0
+
+
+@dataclass(frozen=True)
+class Clock:
+    """What the stamps of a sensor depend on: stamp = t + offset + rate (t - zero).
+
+    `zero` is the middle of the trial, so that offset and rate do not depend on each other.
+
+    Parameters
+    ----------
+    offset, rate : ParameterSpec
+        Offset, s, and rate, ppm, of the sensor's clock.
+    """
+
+    offset: ParameterSpec
+    rate: ParameterSpec
+
+    @classmethod
+    def of(cls, sensor: str, *, prefix: str = "") -> Clock:
+        """Return the clock of a sensor; `prefix` is that of the offset's name."""
+        offset = ParameterSpec(f"{prefix}time_offset", "s", labels=SCALAR)
+        return cls(offset, ParameterSpec(f"{sensor}_clock_rate", "ppm", labels=SCALAR))
+
+    @property
+    def names(self) -> tuple[str, str]:
+        """Names of offset and rate."""
+        return self.offset.name, self.rate.name
+
+    @property
+    def specs(self) -> tuple[ParameterSpec, ParameterSpec]:
+        """What offset and rate are."""
+        return self.offset, self.rate
+
+    def parameters(self, settings: ClockSection) -> tuple[Parameter, Parameter]:
+        """Return offset and rate with the priors of the settings."""
+        rate_sigma = settings.clock_rate_std_ppm * self.rate.si
+        return (
+            Parameter(
+                self.offset,
+                np.array([settings.time_offset_s]),
+                np.array([settings.time_offset_std_s]),
+            ),
+            Parameter(self.rate, np.zeros(1), np.array([rate_sigma])),
+        )
+
+    def lag(self, time: Array, values: Mapping[str, Array], zero: float) -> Array:
+        """Return stamps minus true times, (M,), s.
+
+        Parameters
+        ----------
+        time : ndarray, shape (M,), s
+            Stamps.
+        values : mapping of str to ndarray
+            Offset and rate by name, SI.
+        zero : float, s
+            When the offset holds.
+        """
+        offset, rate = (float(values[name][0]) for name in self.names)
+        return offset + rate * (time - zero)
