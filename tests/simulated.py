@@ -49,7 +49,11 @@ def scenario_dict(**changes):
             data[key] = data[key] | value
         else:
             data[key] = value
-    return copy.deepcopy({k: v for k, v in data.items() if v is not None})
+    out = copy.deepcopy({k: v for k, v in data.items() if v is not None})
+    for sensor in ("gnss", "dvl"):
+        if sensor not in out:
+            out.get("trial", {}).pop(sensor, None)
+    return out
 
 
 def run(seed=0, **changes):

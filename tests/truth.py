@@ -82,13 +82,21 @@ def merged(base: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
 
 def scenario(**changes: Any) -> Scenario:
     """Return a vessel that sways and turns for 70 s, noise-free, with changes."""
-    return parse_scenario(merged(_BASE, changes))
+    return _parsed(merged(_BASE, changes))
+
+
+def _parsed(data: dict[str, Any]) -> Scenario:
+    """Return a scenario without claims on sensors that a test has taken away."""
+    for sensor in ("gnss", "dvl"):
+        if sensor not in data:
+            data.get("trial", {}).pop(sensor, None)
+    return parse_scenario(data)
 
 
 def config(name: str, **changes: Any) -> Scenario:
     """Return a scenario of configs/, with changes."""
     data = yaml.safe_load((CONFIGS / f"{name}.yaml").read_text(encoding="utf-8"))
-    return parse_scenario(merged(data, changes))
+    return _parsed(merged(data, changes))
 
 
 def exact_motion(exact: ExactMotion, frame: LocalFrame, time: Array) -> Motion:

@@ -71,7 +71,9 @@ def calibrate_beams(trial: Trial, *, rate_hz: float, report: Progress) -> tuple[
     used = received & covered
     motion = motion_at(navigation, sensor.time[used])
     pings = BeamPings(motion, sensor.nominal_b, sensor.velocity[used], sensor.sigma()[used])
-    outcome = beam_filter(pings, sensor.parameters())
+    clock = sensor.clock.names
+    parameters = tuple(p for p in sensor.parameters() if p.name not in clock)
+    outcome = beam_filter(pings, parameters)
     report("summary", 0, None)
     outcome = replace(outcome, estimated=without_spurious_information(pings, outcome.estimated))
     residual, sigma = beam_residuals(pings, outcome.estimated)

@@ -354,7 +354,7 @@ def test_a_solution_keeps_its_directions_in_files(solved, tmp_path):
     np.testing.assert_allclose(np.linalg.norm(stated["value"], axis=1), 1.0, atol=1e-14)
     order = content["covariance"]["order"]
     assert order[:3] == ["beam_direction_1x_deg", "beam_direction_1y_deg", "beam_direction_2x_deg"]
-    assert len(order) == len(content["covariance"]["matrix"]) == 21
+    assert len(order) == len(content["covariance"]["matrix"]) == 22
     truth = turns_to(trial.beams.nominal_b, trial.calibration_truth["beam_direction_b"]) / DEG
     np.testing.assert_allclose(truth, ERRORS, atol=1e-12)
 
@@ -479,7 +479,9 @@ def test_each_beam_that_was_never_received_is_named(tmp_path):
 
 
 def test_a_single_ping_is_solved_and_written(tmp_path):
-    trial = simulate(noisy(turntable=None), 1)
+    # A ping that fits nothing: a clock to be found would have no best time for it.
+    one_clock = {"gnss": {"time_offset_std_s": 0}, "dvl_beams": {"time_offset_std_s": 0}}
+    trial = simulate(noisy(turntable=None, trial={"dvl": None} | one_clock), 1)
     sensor = replace(
         trial.beams, time=trial.beams.time[:1], velocity=4.0 * trial.beams.velocity[:1] + 1.0
     )
