@@ -32,6 +32,14 @@ ALL_FREE = {
     },
     "gnss": {"lever_arm_std_m": [0.1, 0.1, 0.1]},
 }
+# Errors of an IMU that grow with rate and force.
+IMU_ERRORS = {
+    "gyro_scale_std_ppm": 300,
+    "gyro_misalignment_std_deg": 0.02,
+    "gyro_g_sensitivity_std_deg_h_g": 10,
+    "accel_scale_std_ppm": 300,
+    "accel_misalignment_std_deg": 0.02,
+}
 
 
 def problem_of(scene, trial=None):
@@ -43,6 +51,7 @@ def problem_of(scene, trial=None):
     states = exact_states(scene, frame, seg.node_time)
     chain = inertial_chain(trial, frame, seg, states)
     observations, parameters = observed(trial.aids, frame)
+    parameters = (*parameters, *trial.imu.error_parameters())
     prior = Problem(chain, observations, parameters)
     rng = np.random.default_rng(0)
     n = seg.node_time.size

@@ -22,6 +22,7 @@ from factorgraph_dvl.geometry.rotations import exp_so3
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph import keys
 from factorgraph_dvl.graph.clocks import linearized, parameters_of, true_time
+from factorgraph_dvl.graph.imu_errors import ImuErrors, LinearImuFactors
 from factorgraph_dvl.graph.inertial_chain import Chain
 from factorgraph_dvl.graph.priors import (
     ConstantsPrior,
@@ -33,6 +34,7 @@ from factorgraph_dvl.graph.priors import (
     prior_root,
     value_at,
 )
+from factorgraph_dvl.graph.template import jacobian_template
 from factorgraph_dvl.imu.increments import IntArray
 from factorgraph_dvl.imu.propagation import (
     Attachment,
@@ -42,6 +44,7 @@ from factorgraph_dvl.imu.propagation import (
     extrapolated,
     motion_at,
 )
+from factorgraph_dvl.sensors.imu import ERRORS
 from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.sensors.protocol import (
     Aid,
@@ -109,6 +112,8 @@ class Evaluation:
         Per observation; residuals whitened, (M, d).
     cost : float
         Half the sum of all squared whitened residuals.
+    imu : LinearImuFactors, optional
+        Native factors, linear there, where errors of the IMU are estimated.
     """
 
     values: gtsam.Values
@@ -117,6 +122,7 @@ class Evaluation:
     motions: list[Motion]
     residuals: list[Array]
     cost: float
+    imu: LinearImuFactors | None = None
 
 
 @dataclass(frozen=True)
@@ -216,9 +222,15 @@ class Problem:
         self._bound: list[_Bound] = []
         for observation in observations:
             self._bound.append(self._bind(observation))
+        errors = [p for p in self.parameters if p.name in ERRORS]
+        self._imu_errors: ImuErrors | None = None
+        if errors:
+            error_keys = [self._key[p.name] for p in errors]
+            self._imu_errors = ImuErrors(chain, errors, error_keys, self.attachments)
         blocks: dict[tuple[str, ...], _Block] = {}
         for bound in self._bound:
-            used = tuple(p for p in self.parameters if p.name in parameters_of(bound.observation))
+            own = (*parameters_of(bound.observation), *ERRORS)
+            used = tuple(p for p in self.parameters if p.name in own)
             names = tuple(p.name for p in used)
             blocks.setdefault(names, _Block([], used)).bound.append(bound)
         self._blocks = list(blocks.values())
@@ -320,6 +332,11 @@ class Problem:
         motions, residuals = [], []
         computed: dict[tuple[int, SensorClock | None], Motion] = {}
         cost = self.graph.error(values)
+        imu = None
+        if self._imu_errors is not None:
+            errors = self._imu_errors.vector(parameters)
+            imu = self._imu_errors.linearized(self.graph.linearize(values), errors)
+            cost += imu.more_cost
         for bound in self._bound:
             # Position and velocity of one receiver share attachment and clock.
             shared = (id(bound.attachment), bound.observation.clock)
@@ -330,7 +347,7 @@ class Problem:
             motions.append(motion)
             residuals.append(residual)
             cost += 0.5 * float(np.vdot(residual, residual))
-        return Evaluation(values, states, parameters, motions, residuals, cost)
+        return Evaluation(values, states, parameters, motions, residuals, cost, imu)
 
     def reject(self, rejected: Mapping[str, Array]) -> None:
         """Use no measurements at the times (K,) that are given by label."""
@@ -419,7 +436,10 @@ class Problem:
 
         Its measurement factors are written in place at the next call.
         """
-        gaussian = self.graph.linearize(evaluation.values)
+        if self._imu_errors is None or evaluation.imu is None:
+            gaussian = self.graph.linearize(evaluation.values)
+        else:
+            gaussian = self._imu_errors.filled(evaluation.imu)
         transitions = self._transitions(evaluation)
         for block in self._blocks:
             matrix, vector = self._fill(block, transitions, evaluation)
@@ -502,7 +522,17 @@ class Problem:
         else:
             at, _ = attach_inside(self.chain.segments, bound.time + late, rate)
             rest = np.zeros_like(late)
+        at = self._corrected(bound, at, parameters)
         return extrapolated(motion_at(at, states, self.chain.gravity_n, rate), rest)
+
+    def _corrected(
+        self, bound: _Bound, at: Attachment, parameters: dict[str, Array]
+    ) -> Attachment:
+        """Return an attachment without the errors of the IMU."""
+        if self._imu_errors is None:
+            return at
+        errors = self._imu_errors.vector(parameters)
+        return self._imu_errors.corrected(at, bound.attachment, errors)
 
     def _late(self, bound: _Bound, parameters: dict[str, Array]) -> Array:
         """Return by how much clocks have moved measurements since they were bound, (M,), s."""
@@ -524,7 +554,7 @@ class Problem:
         block.matrices, block.vectors, block.factors = [], [], []
         for k, rows in zip(used.tolist(), counts.tolist(), strict=True):
             node_keys = [keys.node(k), self.chain.bias_key(k), *shared]
-            factor = _template(node_keys, sizes, rows)
+            factor = jacobian_template(node_keys, sizes, rows)
             block.factors.append(factor)
             block.matrices.append(factor.getA())
             block.vectors.append(factor.getb())
@@ -548,7 +578,12 @@ class Problem:
         """Return the transitions from the nodes to the times of each motion, by its identity."""
         rate = self.chain.frame.earth_rate
         return {
-            id(motion): Transition(b.attachment, evaluation.states, motion, rate)
+            id(motion): Transition(
+                self._corrected(b, b.attachment, evaluation.parameters),
+                evaluation.states,
+                motion,
+                rate,
+            )
             for b, motion in zip(self._bound, evaluation.motions, strict=True)
         }
 
@@ -576,8 +611,11 @@ class Problem:
         full = np.empty((*lin.residual.shape, columns))
         full[:, :, : _STATE + _BIAS] = node_jacobian(lin, transition)
         c = _STATE + _BIAS
+        found = dict(lin.d_parameters)
+        if self._imu_errors is not None:
+            found |= self._imu_errors.columns(lin, transition, bound.attachment)
         for p in parameters:
-            full[:, :, c : c + p.mean.size] = lin.d_parameters[p.name]
+            full[:, :, c : c + p.mean.size] = found[p.name]
             c += p.mean.size
         full *= bound.weight[:, :, None]
         return full, bound.weight * lin.residual
@@ -618,20 +656,3 @@ def node_jacobian(lin: Linearization, transition: Transition) -> Array:
         accel += lin.d_v @ transition.v_accel
         gyro += lin.d_v @ transition.v_gyro
     return out
-
-
-def _template(node_keys: list[int], sizes: list[int], rows: int) -> gtsam.JacobianFactor:
-    """Return an empty Jacobian factor; only a custom factor makes one of any number of keys."""
-
-    def nothing(
-        this: gtsam.CustomFactor, at: gtsam.Values, jacobians: list[Array] | None
-    ) -> Array:
-        if jacobians is not None:
-            for i, size in enumerate(sizes):
-                jacobians[i] = np.zeros((rows, size), order="F")
-        return np.zeros(rows)
-
-    noise = gtsam.noiseModel.Unit.Create(rows)
-    factor = gtsam.CustomFactor(noise, node_keys, nothing).linearize(gtsam.Values())
-    assert isinstance(factor, gtsam.JacobianFactor)
-    return factor

@@ -156,7 +156,8 @@ class Transition:
     earth_rate_n: Array
 
     @cached_property
-    def _turned(self) -> Array:
+    def turned(self) -> Array:
+        """Axes of the node before, carried with the Earth, to n, (M, 3, 3)."""
         return self.at.turn @ self.states.nRb[self.at.node]
 
     @cached_property
@@ -190,18 +191,18 @@ class Transition:
     @cached_property
     def p_theta(self) -> Array:
         """Position by attitude."""
-        return -self._turned @ skew(self._increments[2])
+        return -self.turned @ skew(self._increments[2])
 
     @cached_property
     def p_p(self) -> Array:
         """Position by position."""
         R = self.states.nRb[self.at.node]
-        return self._turned + self._tau * (self.at.turn @ (self._cross_rate @ R))
+        return self.turned + self._tau * (self.at.turn @ (self._cross_rate @ R))
 
     @cached_property
     def p_v(self) -> Array:
         """Position by velocity."""
-        return self._tau * self._turned
+        return self._tau * self.turned
 
     @cached_property
     def p_gyro(self) -> Array:
@@ -216,22 +217,22 @@ class Transition:
     @cached_property
     def v_theta(self) -> Array:
         """Velocity by attitude."""
-        return -self._turned @ skew(self._increments[1]) - self._cross_rate @ self.p_theta
+        return -self.turned @ skew(self._increments[1]) - self._cross_rate @ self.p_theta
 
     @cached_property
     def v_v(self) -> Array:
         """Velocity by velocity."""
-        return self._turned - self._cross_rate @ self.p_v
+        return self.turned - self._cross_rate @ self.p_v
 
     @cached_property
     def v_gyro(self) -> Array:
         """Velocity by gyro bias, for force and rate constant since the node."""
-        return self._turned @ (0.5 * skew(self.at.dV) @ self.at.dA)
+        return self.turned @ (0.5 * skew(self.at.dV) @ self.at.dA)
 
     @cached_property
     def v_accel(self) -> Array:
         """Velocity by accelerometer bias."""
-        return -self._turned @ self.at.dA
+        return -self.turned @ self.at.dA
 
 
 def motion_at(at: Attachment, states: States, gravity_n: Array, earth_rate_n: Array) -> Motion:

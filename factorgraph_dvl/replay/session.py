@@ -36,6 +36,12 @@ KINDS: tuple[Kind, ...] = ("fixed-lag", "isam2")
 # within 0.1 standard deviations of a batch solution.
 LAG = 30.0
 RATE = 5.0
+_IMU_ERRORS_LEFT_OUT = Finding(
+    Code.IMU_ERRORS_LEFT_OUT,
+    "a replay does not estimate scale, axes and g-sensitivity: standard deviations leave out what "
+    "they add; `solve` contains it",
+    sensor="IMU",
+)
 
 
 class Replay:
@@ -73,6 +79,10 @@ class Replay:
         for name, value in (("lag_s", lag_s), ("rate_hz", rate_hz)):
             if not (np.isfinite(value) and value > 0.0):
                 raise ConfigError(f"{name} is {value}", expected="a number above 0")
+        self._findings: list[Finding] = []
+        if any(p.estimated for p in settings.imu.error_parameters()):
+            settings = replace(settings, imu=settings.imu.without_errors())
+            self._findings.append(_IMU_ERRORS_LEFT_OUT)
         self._settings = settings
         self._kind = smoother
         self._lag = lag_s
@@ -87,7 +97,6 @@ class Replay:
         self._duplicates = Duplicates()
         self._clocks = Clocks()
         self._outages = Outages()
-        self._findings: list[Finding] = []
         self._smoothed_to = 0
         self._newest_state = -np.inf
         # End of the trajectory that updates have carried: a new batch solution corrects rounded

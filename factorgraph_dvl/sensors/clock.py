@@ -39,8 +39,9 @@ class Clock:
     @classmethod
     def of(cls, sensor: str, *, prefix: str = "") -> Clock:
         """Return the clock of a sensor; `prefix` is that of the offset's name."""
-        offset = ParameterSpec(f"{prefix}time_offset", "s", labels=SCALAR)
-        return cls(offset, ParameterSpec(f"{sensor}_clock_rate", "ppm", labels=SCALAR))
+        offset = ParameterSpec(f"{prefix}time_offset", "s", labels=SCALAR, nuisance=True)
+        rate = ParameterSpec(f"{sensor}_clock_rate", "ppm", labels=SCALAR, nuisance=True)
+        return cls(offset, rate)
 
     @property
     def names(self) -> tuple[str, str]:

@@ -537,6 +537,12 @@ class Code(StrEnum):
         "note",
     )
     # What a replay noticed.
+    IMU_ERRORS_LEFT_OUT = (
+        "imu_errors_left_out",
+        "The replay does not estimate scale, axes and g-sensitivity of the IMU.",
+        "Its standard deviations leave out what these errors add.",
+        "Solve the trial as a whole for standard deviations that contain them.",
+    )
     SILENT = (
         "silent",
         "A sensor has fallen silent.",

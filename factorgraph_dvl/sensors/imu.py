@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar, Literal, Self
 
 import msgspec
@@ -54,6 +55,54 @@ _NOT_STATED = math.nan
 
 _GYRO_BIAS = ParameterSpec("gyro_bias", "deg_h", frame="b", place=5)
 _ACCEL_BIAS = ParameterSpec("accel_bias", "ug", frame="b", place=6)
+
+
+@dataclass(frozen=True)
+class ImuError:
+    """One error of an IMU that grows with rate or force: an element of Mg, Gg or Ma.
+
+    Parameters
+    ----------
+    of, by : {'rate', 'force'}
+        What it changes, and what it grows with.
+    row, column : int
+        Axis that it changes, and axis that it grows with.
+    """
+
+    of: Literal["rate", "force"]
+    by: Literal["rate", "force"]
+    row: int
+    column: int
+
+
+_DIAGONAL = ((0, 0), (1, 1), (2, 2))
+_OFF_DIAGONAL = ((0, 1), (0, 2), (1, 0), (1, 2), (2, 0), (2, 1))
+_BELOW = ((1, 0), (2, 0), (2, 1))
+_FULL = tuple(itertools.product(range(3), range(3)))
+
+
+def _error_spec(
+    stem: str,
+    unit: str,
+    of: Literal["rate", "force"],
+    by: Literal["rate", "force"],
+    elements: tuple[tuple[int, int], ...],
+) -> tuple[ParameterSpec, tuple[ImuError, ...]]:
+    """Return what errors of one kind are, and the elements that they stand for."""
+    labels = tuple("xyz"[i] if elements is _DIAGONAL else "xyz"[i] + "xyz"[j] for i, j in elements)
+    spec = ParameterSpec(stem, unit, labels=labels, frame="b", nuisance=True)
+    return spec, tuple(ImuError(of, by, i, j) for i, j in elements)
+
+
+_ERRORS = (
+    _error_spec("gyro_scale", "ppm", "rate", "rate", _DIAGONAL),
+    _error_spec("gyro_misalignment", "deg", "rate", "rate", _OFF_DIAGONAL),
+    _error_spec("gyro_g_sensitivity", "deg_h_g", "rate", "force", _FULL),
+    _error_spec("accel_scale", "ppm", "force", "force", _DIAGONAL),
+    _error_spec("accel_misalignment", "deg", "force", "force", _BELOW),
+)
+# The elements that the components of each parameter stand for, by its name.
+ERRORS = {spec.name: elements for spec, elements in _ERRORS}
 
 
 @dataclass(frozen=True)
@@ -181,7 +230,10 @@ class Imu:
     section_type: ClassVar[type[SensorSection]] = ImuSettings
     required: ClassVar[tuple[str, ...]] = COLUMNS
     optional: ClassVar[tuple[tuple[str, ...], ...]] = ()
-    specs: ClassVar[tuple[ParameterSpec, ...]] = (_GYRO_BIAS, _ACCEL_BIAS)
+    specs: ClassVar[tuple[ParameterSpec, ...]] = (
+        *(_GYRO_BIAS, _ACCEL_BIAS),
+        *(spec for spec, _ in _ERRORS),
+    )
 
     def __post_init__(self) -> None:
         check_times(self.time, self.source)
@@ -207,6 +259,21 @@ class Imu:
     def error_std(self) -> ImuErrorStd:
         """Standard deviations of scale, axes and g-sensitivity, SI."""
         return self.settings.error_std
+
+    def without_errors(self) -> Self:
+        """Return the record with an IMU of exact scale and axes, and no g-sensitivity."""
+        keys = (f"{spec.stem}_std_{spec.unit}" for spec, _ in _ERRORS)
+        exact = msgspec.structs.replace(self.settings, **dict.fromkeys(keys, 0.0))
+        return replace(self, settings=exact)
+
+    def error_parameters(self) -> tuple[Parameter, ...]:
+        """Return scale, axes and g-sensitivity with their priors."""
+        return tuple(
+            Parameter(
+                spec, np.zeros(spec.size), np.full(spec.size, getattr(self.error_std, spec.stem))
+            )
+            for spec, _ in _ERRORS
+        )
 
     def parameters(self, duration: float) -> tuple[Parameter, Parameter]:
         """Return gyro and accelerometer bias; a walking one as its mean over `duration` s.

@@ -13,7 +13,7 @@ import numpy as np
 from factorgraph_dvl.errors import DataError
 from factorgraph_dvl.geometry.rotations import exp_so3
 from factorgraph_dvl.geometry.unit_vectors import turns_to
-from factorgraph_dvl.geometry.units import DEG, DEG_PER_HOUR, MICRO_G
+from factorgraph_dvl.geometry.units import DEG, DEG_PER_HOUR, MICRO_G, STANDARD_GRAVITY
 from factorgraph_dvl.geometry.vectors import Array
 
 # Rounding may leave a correlation matrix with an eigenvalue this far below zero.
@@ -39,6 +39,7 @@ UNITS = {
     "": Unit(1.0, ""),
     "deg": Unit(DEG, "deg"),
     "deg_h": Unit(DEG_PER_HOUR, "deg/h"),
+    "deg_h_g": Unit(DEG_PER_HOUR / STANDARD_GRAVITY, "deg/h/g"),
     "ug": Unit(MICRO_G, "µg"),
     "m": Unit(1.0, "m"),
     "m_s": Unit(1.0, "m/s"),
@@ -70,6 +71,9 @@ class ParameterSpec:
         Standard deviation that is good enough, unless a trial states another, in `unit`.
     above : float, optional
         Every component is above this, in `unit`.
+    nuisance : bool, default False
+        Whether it is estimated only for the sake of the others: nobody need be told that the data
+        do not determine it.
     """
 
     stem: str
@@ -80,6 +84,7 @@ class ParameterSpec:
     place: int | None = None
     limit: float | None = None
     above: float = -math.inf
+    nuisance: bool = False
 
     @cached_property
     def name(self) -> str:

@@ -88,6 +88,7 @@ def _at_truth(trial: Trial, true_states: TrueStates) -> tuple[Problem, Evaluatio
     states = true_states(frame, seg.node_time)
     chain = inertial_chain(trial, frame, seg, states)
     observations, parameters = observed(trial.aids, frame)
+    parameters = (*parameters, *trial.imu.error_parameters())
     truth: dict[str, Array] = {}
     for p in parameters:
         value = trial.calibration_truth.get(p.name)

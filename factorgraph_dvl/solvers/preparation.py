@@ -117,7 +117,10 @@ def prepare(trial: Trial, state_interval_s: float, report: Progress) -> Preparat
         frame=frame,
         segments=seg,
         observations=tuple(o for _, observations, _ in by_aid for o in observations),
-        parameters=tuple(p for _, _, parameters in by_aid for p in parameters),
+        parameters=(
+            *(p for _, _, parameters in by_aid for p in parameters),
+            *trial.imu.error_parameters(),
+        ),
         estimated_noise=frozenset(
             o.label
             for aid, observations, _ in by_aid

@@ -193,7 +193,8 @@ def _unobservable(
             "it takes longer, or turns and changes of speed"
         )
 
+    nuisances = {p.name for p in problem.parameters if p.spec.nuisance}
     for e in estimates:
-        if e.name not in calibrated:
+        if e.name not in calibrated and e.name not in nuisances:
             out += not_observable(e, partial(why, e.name))
     return out

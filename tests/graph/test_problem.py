@@ -5,13 +5,14 @@ from __future__ import annotations
 import gtsam
 import numpy as np
 import pytest
-from problems import ALL_FREE, SHORT, prior_cost, problem_of, walking
+from problems import ALL_FREE, IMU_ERRORS, SHORT, prior_cost, problem_of, walking
 from truth import scenario
 
 from factorgraph_dvl.geometry.rotations import exp_so3, rotation_from_rph
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.graph import keys
 from factorgraph_dvl.graph.clocks import parameters_of, true_time
+from factorgraph_dvl.sensors.imu import ERRORS
 from factorgraph_dvl.simulation import simulate
 
 
@@ -27,7 +28,8 @@ def rows_by_factor(problem):
     """
     groups = {}
     for i, (o, at) in enumerate(zip(problem.observations, problem.attachments, strict=True)):
-        names = tuple(p.name for p in problem.parameters if p.name in parameters_of(o))
+        own = (*parameters_of(o), *ERRORS)
+        names = tuple(p.name for p in problem.parameters if p.name in own)
         groups.setdefault(names, []).append((i, at.node))
     out = []
     for names, members in groups.items():
@@ -44,11 +46,12 @@ def keyed(problem, names, k):
     return [keys.node(k), problem.chain.bias_key(k), *(problem.key(n) for n in names)]
 
 
-@pytest.mark.parametrize("walks", [False, True])
-def test_blocks_equal_custom_factors_with_numerical_jacobians(walks):
-    scene = walking() if walks else scenario(manoeuvres=SHORT, trial=ALL_FREE)
+@pytest.mark.parametrize("kind", ["constant", "walking", "IMU errors"])
+def test_blocks_equal_custom_factors_with_numerical_jacobians(kind):
+    more = {"imu": IMU_ERRORS} if kind == "IMU errors" else {}
+    scene = walking() if kind == "walking" else scenario(manoeuvres=SHORT, trial=ALL_FREE | more)
     problem, values = problem_of(scene)
-    assert problem.chain.walking == walks
+    assert problem.chain.walking == (kind == "walking")
     problem.weigh(problem.evaluate(values))
     evaluation = problem.evaluate(values)
     factors = measurement_factors(problem, problem.linearize(evaluation))
@@ -92,6 +95,23 @@ def test_blocks_equal_custom_factors_with_numerical_jacobians(walks):
         assert (np.abs(factor.getA() - custom.getA()) / scale).max() < 2e-4
     assert checked == 4
     problem.evaluate(values)
+
+
+def test_the_linear_cost_with_imu_errors_is_that_of_the_evaluations():
+    problem, values = problem_of(scenario(manoeuvres=SHORT, trial=ALL_FREE | {"imu": IMU_ERRORS}))
+    problem.weigh(problem.evaluate(values))
+    evaluation = problem.evaluate(values)
+    gaussian = problem.linearize(evaluation)
+    rng = np.random.default_rng(1)
+    sigma = {problem.key(p.name): p.sigma for p in problem.parameters if p.name in ERRORS}
+    step = gtsam.VectorValues()
+    for key, size in values.dims().items():
+        step.insert(key, 1e-3 * rng.normal(0.0, sigma.get(key, np.full(size, 1e-6))))
+    zero = gtsam.VectorValues.Zero(step)
+    assert gaussian.error(zero) == pytest.approx(evaluation.cost, rel=1e-9)
+    change = problem.evaluate(values.retract(step)).cost - evaluation.cost
+    assert abs(change) > 1e-3
+    assert gaussian.error(step) - gaussian.error(zero) == pytest.approx(change, rel=0.02)
 
 
 def test_cost_is_the_sum_of_squares_by_hand():

@@ -1,0 +1,129 @@
+"""Errors of the IMU that grow with rate and force, as parameters of the graph.
+
+GTSAM's IMU factors have no variables for them. Their prediction of a state moves linearly
+with the errors, so the errors get columns of their own in the linear factors.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+
+from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.graph.inertial_chain import Chain
+from factorgraph_dvl.graph.template import jacobian_template
+from factorgraph_dvl.imu.propagation import Attachment, Transition
+from factorgraph_dvl.imu.sensitivity import Sensitivity, by_errors, corrected, sensitivities
+from factorgraph_dvl.sensors.imu import ERRORS
+from factorgraph_dvl.sensors.parameters import Parameter
+from factorgraph_dvl.sensors.protocol import Linearization
+
+_STATE = 9
+_BIAS = 6
+
+
+@dataclass(frozen=True)
+class LinearImuFactors:
+    """GTSAM's factors, linear at some values, with columns for the errors of the IMU.
+
+    Parameters
+    ----------
+    native : gtsam.GaussianFactorGraph
+        All native factors as GTSAM linearises them, the S IMU factors first.
+    jacobian : ndarray, shape (S, 9, 24 + n)
+        Of the IMU factors: states, bias, errors.
+    rhs : ndarray, shape (S, 9)
+        Right-hand side of the IMU factors.
+    more_cost : float
+        What the errors add to the cost of the native factors.
+    """
+
+    native: gtsam.GaussianFactorGraph
+    jacobian: Array
+    rhs: Array
+    more_cost: float
+
+
+class ImuErrors:
+    """Errors of the IMU in a graph.
+
+    Parameters
+    ----------
+    chain : Chain
+        Inertial part of the graph.
+    parameters : sequence of Parameter
+        Errors that are estimated.
+    keys : sequence of int
+        Their keys.
+    attachments : sequence of Attachment
+        Where measurements hang on the chain.
+    """
+
+    def __init__(
+        self,
+        chain: Chain,
+        parameters: Sequence[Parameter],
+        keys: Sequence[int],
+        attachments: Sequence[Attachment],
+    ) -> None:
+        self.names = tuple(p.name for p in parameters)
+        self._keys = list(keys)
+        self._sizes = [p.mean.size for p in parameters]
+        elements = [e for p in parameters for e in ERRORS[p.name]]
+        unique = {id(at): at for at in attachments}
+        ends, found = sensitivities(chain.segments, elements, list(unique.values()))
+        self._ends = ends
+        self._by: dict[int, Sensitivity] = dict(zip(unique, found, strict=True))
+        self._factors: list[gtsam.JacobianFactor] = []
+
+    def vector(self, parameters: Mapping[str, Array]) -> Array:
+        """Return the errors among parameters, (n,), SI."""
+        return np.concatenate([parameters[name] for name in self.names])
+
+    def corrected(self, at: Attachment, bound: Attachment, errors: Array) -> Attachment:
+        """Return an attachment without the errors, as sensitive to them as where it was bound."""
+        return corrected(at, self._by[id(bound)], errors)
+
+    def columns(
+        self, lin: Linearization, transition: Transition, bound: Attachment
+    ) -> dict[str, Array]:
+        """Return derivatives of measurements with respect to the errors, (M, d, n_i) by name."""
+        every = by_errors(lin, transition, self._by[id(bound)])
+        parts = np.split(every, np.cumsum(self._sizes)[:-1], axis=2)
+        return dict(zip(self.names, parts, strict=True))
+
+    def linearized(self, native: gtsam.GaussianFactorGraph, errors: Array) -> LinearImuFactors:
+        """Return native factors with what errors (n,) change in those of the IMU.
+
+        The predicted state at the end of a segment moves by D e, and with it the residual by
+        -A_j D e, where A_j is its Jacobian with respect to the state there.
+        """
+        count = self._ends.shape[0]
+        whole = np.array([native.at(k).augmentedJacobian() for k in range(count)])
+        columns = -whole[:, :, _STATE : 2 * _STATE] @ self._ends
+        change = columns @ errors
+        rhs = whole[:, :, -1]
+        more_cost = 0.5 * float(np.sum(change * (change - 2.0 * rhs)))
+        jacobian = np.concatenate([whole[:, :, :-1], columns], axis=2)
+        return LinearImuFactors(native, jacobian, rhs - change, more_cost)
+
+    def filled(self, linear: LinearImuFactors) -> gtsam.GaussianFactorGraph:
+        """Return the native part of the Gaussian graph; written in place at the next call."""
+        count = len(linear.jacobian)
+        if not self._factors:
+            sizes = [_STATE, _STATE, _BIAS, *self._sizes]
+            self._factors = [
+                jacobian_template([*linear.native.at(k).keys(), *self._keys], sizes, _STATE)
+                for k in range(count)
+            ]
+        out = gtsam.GaussianFactorGraph()
+        for k, factor in enumerate(self._factors):
+            factor.getA()[...] = linear.jacobian[k]
+            factor.getb()[...] = linear.rhs[k]
+            out.push_back(factor)
+        for k in range(count, linear.native.size()):
+            out.push_back(linear.native.at(k))
+        return out

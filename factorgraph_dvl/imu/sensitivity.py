@@ -1,0 +1,167 @@
+"""How errors of the IMU that grow with rate and force move what is integrated from it.
+
+With gyro = (I + Mg) omega + Gg f and accel = (I + Ma) f, an error e of unit size adds the
+columns E to the rate and A to the force. To first order, since the start of a segment,
+
+    Theta = ∫ dR E dt,    V = ∫ ([dR f]x Theta - dR A) dt,    P = ∫ V dt
+
+and increments that are free of errors e are Exp(-Theta e) dR, dV + V e, dP + P e.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from factorgraph_dvl.geometry.rotations import exp_so3
+from factorgraph_dvl.geometry.vectors import Array, rotate, skew
+from factorgraph_dvl.imu.increments import IntArray
+from factorgraph_dvl.imu.preintegration import Segments
+from factorgraph_dvl.imu.propagation import Attachment, Transition
+from factorgraph_dvl.sensors.imu import ImuError
+from factorgraph_dvl.sensors.protocol import Linearization
+
+
+@dataclass(frozen=True)
+class Sensitivity:
+    """Derivatives of what is integrated up to M times with respect to n errors.
+
+    Parameters
+    ----------
+    theta, v, p : ndarray, shape (M, 3, n)
+        Of rotation, velocity and position increments: -Theta, V, P, in the axes at the
+        segment's start.
+    rate, force : ndarray, shape (M, 3, n)
+        E and A at the times.
+    """
+
+    theta: Array
+    v: Array
+    p: Array
+    rate: Array
+    force: Array
+
+
+def unit_errors(rate: Array, force: Array, errors: Sequence[ImuError]) -> tuple[Array, Array]:
+    """Return what unit errors add to rates (M, 3) and forces (M, 3), (M, 3, n) each."""
+    added = {name: np.zeros((len(rate), 3, len(errors))) for name in ("rate", "force")}
+    by = {"rate": rate, "force": force}
+    for column, error in enumerate(errors):
+        added[error.of][:, error.row, column] = by[error.by][:, error.column]
+    return added["rate"], added["force"]
+
+
+def sensitivities(
+    seg: Segments, errors: Sequence[ImuError], attachments: Sequence[Attachment]
+) -> tuple[Array, list[Sensitivity]]:
+    """Return derivatives with respect to errors of the IMU, by sums over the samples.
+
+    Parameters
+    ----------
+    seg : Segments
+        Increments between the nodes.
+    errors : sequence of ImuError
+        The n errors.
+    attachments : sequence of Attachment
+        Where measurements hang on the chain.
+
+    Returns
+    -------
+    ends : ndarray, shape (S, 9, n)
+        Of the predicted states at the ends of the segments, in GTSAM's tangent space of
+        NavState: attitude, position, velocity.
+    attached : list of Sensitivity
+        Of the motion that is attached.
+    """
+    inc = seg.increments
+    count, n = seg.first.size, len(errors)
+    theta, v, p = (np.zeros((count, 3, n)) for _ in range(3))
+    places = [_place(seg, at) for at in attachments]
+    before = [tuple(np.zeros((at.tau.size, 3, n)) for _ in range(3)) for at in attachments]
+    for j in range(int((seg.last - seg.first).max())):
+        for (index, _), at, kept in zip(places, attachments, before, strict=True):
+            here = np.flatnonzero(index - seg.first[at.segment] == j)
+            for own, now in zip(kept, (theta, v, p), strict=True):
+                own[here] = now[at.segment[here]]
+        live = np.flatnonzero(seg.first + j < seg.last)
+        i = seg.first[live] + j
+        h = inc.dt[i]
+        rate, force = seg.phi[i] / h[:, None], seg.dv[i] / h[:, None]
+        step = _step(seg.dR[i], rate, force, h, errors, (theta[live], v[live], p[live]))
+        theta[live], v[live], p[live] = step
+    back = seg.totals()[0].transpose(0, 2, 1)
+    ends = np.concatenate([-(back @ theta), back @ p, back @ v], axis=1)
+    out = []
+    for (index, since), at, kept in zip(places, attachments, before, strict=True):
+        dR = seg.dR[index]
+        theta_at, v_at, p_at = _step(dR, at.gyro, at.force, since, errors, kept)
+        rate, force = unit_errors(at.gyro, at.force, errors)
+        out.append(Sensitivity(-theta_at, v_at, p_at, rate, force))
+    return ends, out
+
+
+def corrected(at: Attachment, by: Sensitivity, errors: Array) -> Attachment:
+    """Return an attachment without errors (n,) of the IMU."""
+    return replace(
+        at,
+        dR=exp_so3(by.theta @ errors) @ at.dR,
+        dV=at.dV + by.v @ errors,
+        dP=at.dP + by.p @ errors,
+        gyro=at.gyro - by.rate @ errors,
+        force=at.force - by.force @ errors,
+    )
+
+
+def by_errors(lin: Linearization, transition: Transition, by: Sensitivity) -> Array:
+    """Return the derivative of residuals with respect to errors of the IMU, (M, d, n).
+
+    Parameters
+    ----------
+    lin : Linearization
+        Derivatives with respect to the motion at the M times.
+    transition : Transition
+        From the nodes to these times.
+    by : Sensitivity
+        Of the motion.
+    """
+    out = np.zeros((*lin.residual.shape, by.theta.shape[2]))
+    d_theta = lin.d_theta
+    if lin.d_omega is not None:
+        out -= lin.d_omega @ by.rate
+        by_attitude = lin.d_omega @ transition.omega_theta
+        d_theta = by_attitude if d_theta is None else d_theta + by_attitude
+    if d_theta is not None:
+        out += d_theta @ (transition.at.dR.transpose(0, 2, 1) @ by.theta)
+    if lin.d_v is not None:
+        out += lin.d_v @ (transition.turned @ by.v)
+    if lin.d_p is not None:
+        out += lin.d_p @ (transition.turned @ by.p)
+    return out
+
+
+def _place(seg: Segments, at: Attachment) -> tuple[IntArray, Array]:
+    """Return the interval of attached times, and the time since its start."""
+    time = seg.node_time[at.node] + at.tau
+    index = np.clip(
+        seg.increments.locate(time)[0], seg.first[at.segment], seg.last[at.segment] - 1
+    )
+    return index, time - seg.increments.start[index]
+
+
+def _step(
+    dR: Array,
+    rate: Array,
+    force: Array,
+    h: Array,
+    errors: Sequence[ImuError],
+    before: tuple[Array, ...],
+) -> tuple[Array, Array, Array]:
+    """Return Theta, V and P after (M,) steps of rate and force (M, 3), s, from those before."""
+    theta, v, p = before
+    h = h[:, None, None]
+    by_rate, by_force = unit_errors(rate, force, errors)
+    turned = dR @ by_rate * h
+    pushed = (skew(rotate(dR, force)) @ (theta + 0.5 * turned) - dR @ by_force) * h
+    return theta + turned, v + pushed, p + v * h + 0.5 * pushed * h
