@@ -436,10 +436,7 @@ class Problem:
 
         Its measurement factors are written in place at the next call.
         """
-        if self._imu_errors is None or evaluation.imu is None:
-            gaussian = self.graph.linearize(evaluation.values)
-        else:
-            gaussian = self._imu_errors.filled(evaluation.imu)
+        gaussian = self.native(evaluation)
         transitions = self._transitions(evaluation)
         for block in self._blocks:
             matrix, vector = self._fill(block, transitions, evaluation)
@@ -464,6 +461,12 @@ class Problem:
                 every = [[keys.node(k), self.chain.bias_key(k), *shared] for k in nodes]
                 o = bound.observation
                 yield Rows(o.label, o.components, np.array(every), sizes, matrix, vector)
+
+    def native(self, evaluation: Evaluation) -> gtsam.GaussianFactorGraph:
+        """Return GTSAM's own factors, linear at an evaluation, with columns of IMU errors."""
+        if self._imu_errors is None or evaluation.imu is None:
+            return self.graph.linearize(evaluation.values)
+        return self._imu_errors.filled(evaluation.imu)
 
     def ordering(self, gaussian: gtsam.GaussianFactorGraph) -> gtsam.Ordering:
         """Return an elimination order in which biases and calibration come last."""

@@ -82,7 +82,7 @@ def _by_variable(rows: Rows, chunk: slice) -> Iterator[tuple[Array, Array]]:
 
 def _native_rows(problem: Problem, evaluation: Evaluation) -> Iterator[Rows]:
     """Yield the rows of the factors that GTSAM linearises itself, those of one source together."""
-    gaussian = problem.graph.linearize(evaluation.values)
+    gaussian = problem.native(evaluation)
     sizes = evaluation.values.dims()
     names = {problem.key(p.name): p.name for p in problem.parameters}
     found: dict[tuple[str, tuple[int, ...]], list[tuple[list[int], Array]]] = {}
@@ -108,13 +108,15 @@ def _native_rows(problem: Problem, evaluation: Evaluation) -> Iterator[Rows]:
 
 def _source(own: list[int], names: Mapping[int, str]) -> str:
     """Return the source of a factor's noise, from its variables."""
+    letters = "".join(map(keys.letter_of, own))
+    if letters.startswith("xxb"):
+        return IMU_NOISE
     calibration = [names[key] for key in own if key in names]
     if calibration:
         return PRIOR.format(", ".join(calibration))
     return {
-        "xxb": IMU_NOISE,
         "bb": WALK,
         "b": PRIOR,
         "x": FIRST_STATE,
         "xx": GAP,
-    }["".join(map(keys.letter_of, own))]
+    }[letters]
