@@ -1,0 +1,95 @@
+"""Clocks of the sensors: offsets and rates are found, and removed from the motion."""
+
+from dataclasses import replace
+
+import msgspec
+import numpy as np
+import pytest
+from truth import scenario
+
+from factorgraph_dvl import solve
+from factorgraph_dvl.graph.clocks import true_time
+from factorgraph_dvl.sensors.clock import Clock
+from factorgraph_dvl.sensors.dvl import DvlVelocity
+from factorgraph_dvl.simulation import simulate
+
+# A minute with turns; two free clocks, and GNSS that is good enough to show its own.
+FREE = {
+    "gnss": {"time_offset_std_s": 0.5, "clock_rate_std_ppm": 1000},
+    "dvl": {"time_offset_std_s": 0.5, "clock_rate_std_ppm": 1000},
+}
+GNSS = {"position_std_m": [0.02, 0.02, 0.04], "velocity_std_m_s": [0.02, 0.02, 0.02]}
+
+
+def stamped(record, offset, rate, middle):
+    """Return a record whose clock is late and fast."""
+    return replace(record, time=record.time + offset + rate * (record.time - middle))
+
+
+def test_a_lag_by_hand():
+    values = {"gnss_time_offset_s": np.array([0.5]), "gnss_clock_rate_ppm": np.array([2e-4])}
+    clock = Clock.of("gnss", prefix="gnss_")
+    # 0.5 s in the middle, at 100 s, and 200 ppm of 50 s more at the end.
+    np.testing.assert_allclose(clock.lag(np.array([100.0, 150.0]), values, 100.0), [0.5, 0.51])
+    o = DvlVelocity(np.array([150.0]), np.zeros((1, 3)), np.full((1, 3), 0.01))
+    dvl = {"time_offset_s": np.array([0.5]), "dvl_clock_rate_ppm": np.array([2e-4])}
+    np.testing.assert_allclose(true_time(o, dvl, 100.0), [149.49])
+
+
+def test_offsets_and_rates_of_two_clocks_are_found():
+    trial = simulate(scenario(noise=True, gnss=GNSS, trial=FREE), 3)
+    middle = 0.5 * (trial.imu.time[0] + trial.imu.time[-1])
+    late = replace(
+        trial,
+        gnss=stamped(trial.gnss, 0.08, 300e-6, middle),
+        dvl=stamped(trial.dvl, -0.04, -200e-6, middle),
+    )
+    solution = solve(late)
+    assert solution.converged
+    expected = {
+        "gnss_time_offset_s": 0.08,
+        "gnss_clock_rate_ppm": 300.0,
+        "time_offset_s": -0.04,
+        "dvl_clock_rate_ppm": -200.0,
+    }
+    for name, value in expected.items():
+        found = solution.estimate(name)
+        assert found.observable[0] or name == "gnss_clock_rate_ppm", name
+        assert abs(found.value[0] - value) < 4.0 * found.std[0], name
+    # As good as with right clocks.
+    for name in ("misalignment_deg", "scale_error", "lever_arm_m"):
+        error = solution.estimate(name).value - trial.calibration_truth[name]
+        assert np.all(np.abs(error) < 4.5 * solution.estimate(name).std), name
+
+
+def test_a_stated_offset_of_gnss_is_taken_away():
+    scene = scenario(gnss=GNSS, trial={"gnss": {"time_offset_std_s": 0}})
+    trial = simulate(scene)
+    settings = msgspec.structs.replace(trial.gnss.settings, time_offset_s=17.0)
+    shifted = replace(
+        trial, gnss=replace(trial.gnss, settings=settings, time=trial.gnss.time + 17.0)
+    )
+    a, b = solve(trial), solve(shifted)
+    np.testing.assert_allclose(
+        b.estimate("lever_arm_m").value, a.estimate("lever_arm_m").value, atol=1e-6
+    )
+    assert b.converged
+
+
+def test_a_free_clock_leaves_no_measurement_out():
+    fixed, free = (
+        solve(simulate(scenario(trial={"dvl": {"time_offset_std_s": s}}))) for s in (0.0, 0.5)
+    )
+    counts = [{r.label: r.time.size for r in solution.residuals} for solution in (fixed, free)]
+    assert counts[0] == counts[1]
+
+
+@pytest.mark.parametrize("offset", [0.3, -0.3])
+def test_a_late_gnss_is_found_from_far_away(offset):
+    trial = simulate(
+        scenario(noise=True, gnss=GNSS, trial={"gnss": {"time_offset_std_s": 0.5}}), 1
+    )
+    late = replace(trial, gnss=replace(trial.gnss, time=trial.gnss.time + offset))
+    found = solve(late).estimate("gnss_time_offset_s")
+    assert found.std[0] < 0.05
+    assert abs(found.value[0] - offset) < 4.0 * found.std[0]
