@@ -31,7 +31,7 @@ def true_time(observation: Observation, values: Mapping[str, Array], zero: float
     values : mapping of str to ndarray
         Values of the parameters, SI.
     zero : float, s
-        When the offsets of clocks hold.
+        Time at which the offsets of clocks hold.
     """
     clock = observation.clock
     if clock is None:
@@ -63,7 +63,7 @@ def linearized(
     wanted : collection of str
         Parameters whose Jacobians are needed.
     zero : float, s
-        t0, when the offsets of clocks hold.
+        Time t0 at which the offsets of clocks hold.
     """
     lin = observation.linearize(motion, values, wanted)
     if observation.clock is None:

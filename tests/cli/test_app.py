@@ -153,7 +153,7 @@ def test_an_output_that_exists_is_refused_before_the_work(
 BAD_INPUT = {
     "unknown key": ("trial.yaml", "misalignment_deg:", "misalinment_deg:", "misalinment_deg"),
     "out of range": ("trial.yaml", "velocity_std_m_s: 0.001", "velocity_std_m_s: -1", "line "),
-    "wrong type": ("trial.yaml", "time_offset_s: 0.0", "time_offset_s: []", "dvl.time_offset_s"),
+    "wrong type": ("trial.yaml", "time_offset_s: 0.0", "time_offset_s: []", "gnss.time_offset_s"),
     "syntax": ("trial.yaml", "body_axes: RFU", "body_axes: {", "line "),
     "no table": ("trial.yaml", "file: dvl.csv", "file: nowhere.csv", "nowhere.csv"),
     "a cell": ("dvl.csv", "0.75,", "x,", "line 2: time_s is 'x'"),

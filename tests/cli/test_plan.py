@@ -66,8 +66,11 @@ def test_wrong_plans(change, message, tmp_path: Path, capsys) -> None:
 @pytest.mark.parametrize("name", ["no gnss", "no dvl", "adrift", "two seconds"])
 def test_plans_that_tell_nothing(name, tmp_path: Path, capsys) -> None:
     changes = {
-        "no gnss": {"gnss": None, "trial": {"initial": {"position_std_m": [1, 1, 1]}}},
-        "no dvl": {"dvl": None, "required": None},
+        "no gnss": {
+            "gnss": None,
+            "trial": {"gnss": None, "initial": {"position_std_m": [1, 1, 1]}},
+        },
+        "no dvl": {"dvl": None, "required": None, "trial": {"dvl": None}},
         "adrift": {"manoeuvres": [{"straight_s": 20}], "required": None},
         "two seconds": {"manoeuvres": [{"straight_s": 2}], "required": None},
     }[name]

@@ -78,7 +78,7 @@ def test_times_off_the_chain_are_told_from_those_on_it():
 
 def test_a_motion_is_extrapolated_with_its_rates():
     seg = constant_segments(3.0, gyro=(0.0, 0.0, 0.2), accel=(0.0, 1.0, 9.8))
-    late = 0.05
+    late = np.array([0.05])
     time = seg.node_time[:1] + 0.4
     one, two = (motion(seg, states_of(seg), t) for t in (time, time + late))
     found = extrapolated(one, late)

@@ -145,7 +145,7 @@ BAD_SETTINGS = {
     "unknown key": ("misalignment_deg:", "misalinment_deg:", "dvl.misalinment_deg", "`misalignm"),
     "unknown section": ("gnss:\n", "gps:\n", "gps", "gnss"),
     "wrong type": ("time_offset_s: 0.0", "time_offset_s: abc", "time_offset_s is 'abc'", "a numb"),
-    "boolean": ("time_offset_s: 0.0", "time_offset_s: true", "dvl.time_offset_s", "a number"),
+    "boolean": ("time_offset_s: 0.0", "time_offset_s: true", "gnss.time_offset_s", "a number"),
     "negative": (
         "velocity_std_m_s: 0.001",
         "velocity_std_m_s: -1",

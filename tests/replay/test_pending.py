@@ -18,13 +18,13 @@ def test_measurements_are_due_once_in_the_order_of_time():
     pending.add(rows_of(dvl, slice(5, 10)))
     pending.add(rows_of(dvl, slice(0, 5)))
     assert pending.first_after("dvl", dvl.time[2]) == dvl.time[3]
-    found = pending.due("dvl", float(dvl.time[7]), None, {})
+    found = pending.due("dvl", float(dvl.time[7]), None, {}, 0.0)
     assert found is not None
     np.testing.assert_array_equal(found[0].time, dvl.time[:7])
     np.testing.assert_array_equal(found[1], dvl.time[:7])
-    assert pending.due("dvl", float(dvl.time[7]), None, {}) is None
+    assert pending.due("dvl", float(dvl.time[7]), None, {}, 0.0) is None
     assert pending.sections == ("dvl",)
-    assert pending.due("dvl", np.inf, None, {})[0].time.size == 3
+    assert pending.due("dvl", np.inf, None, {}, 0.0)[0].time.size == 3
     assert pending.sections == ()
 
 
@@ -36,7 +36,7 @@ def test_times_are_corrected_by_the_clock_offset():
     values = {p.name: p.mean for p in dvl.parameters()}
     offset = next(name for name in values if "offset" in name)
     values[offset] = np.array([0.05])
-    found = pending.due("dvl", np.inf, trial.frame(), values)
+    found = pending.due("dvl", np.inf, trial.frame(), values, 0.0)
     np.testing.assert_allclose(found[1], dvl.time - 0.05)
 
 
@@ -46,4 +46,4 @@ def test_what_is_far_ahead_of_the_imu_is_counted_and_discarded():
     pending = PendingMeasurements()
     pending.add(replace(dvl, time=time), newest=float(dvl.time[0]))
     assert pending.rejected == {dvl.label: 2}
-    assert pending.due("dvl", np.inf, None, {})[0].time.size == 8
+    assert pending.due("dvl", np.inf, None, {}, 0.0)[0].time.size == 8
