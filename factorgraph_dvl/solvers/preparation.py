@@ -156,7 +156,9 @@ def mounted_start(
             proven=False,
         )
         states, iterations = coarse.evaluation.states, coarse.iterations
-        values = values | coarse.evaluation.parameters
+        assert prepared.trial.gnss is not None
+        found = coarse.evaluation.parameters
+        values = values | {p.name: found[p.name] for p in prepared.trial.gnss.parameters()}
     report("mounting", 0, None)
     (best, *_) = prepared.mountings_at(chain, states)
     return states, values | best, iterations

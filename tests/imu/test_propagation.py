@@ -84,6 +84,6 @@ def test_a_motion_is_extrapolated_with_its_rates():
     found = extrapolated(one, late)
     np.testing.assert_allclose(found.nRb, two.nRb, atol=1e-9)
     # A turning thrust changes its direction within the time: second order.
-    np.testing.assert_allclose(found.v_n, two.v_n, atol=0.2 * late**2)
-    np.testing.assert_allclose(found.p_n, two.p_n, atol=0.2 * late**3)
+    np.testing.assert_allclose(found.v_n, two.v_n, atol=0.2 * late.item() ** 2)
+    np.testing.assert_allclose(found.p_n, two.p_n, atol=0.2 * late.item() ** 3)
     np.testing.assert_allclose(found.nRb @ exp_so3([0, 0, -0.09]), np.eye(3)[None], atol=1e-9)

@@ -479,11 +479,9 @@ def test_each_beam_that_was_never_received_is_named(tmp_path):
 
 
 def test_a_single_ping_is_solved_and_written(tmp_path):
-    # A ping that fits nothing: a clock to be found would have no best time for it.
-    one_clock = {"gnss": {"time_offset_std_s": 0}, "dvl_beams": {"time_offset_std_s": 0}}
-    trial = simulate(noisy(turntable=None, trial={"dvl": None} | one_clock), 1)
+    trial = simulate(noisy(turntable=None), 1)
     sensor = replace(
-        trial.beams, time=trial.beams.time[:1], velocity=4.0 * trial.beams.velocity[:1] + 1.0
+        trial.beams, time=trial.beams.time[:1], velocity=trial.beams.velocity[:1]
     )
     save_trial(replace(trial, others=(sensor,)), tmp_path / "trial")
     with pytest.raises(SystemExit) as done:
