@@ -92,11 +92,10 @@ class WheelSpeed:
     gate: float | None = None
     parameters: tuple[str, ...] = (SCALE.name,)
 
-    def true_time(self, values: Values) -> Array:
-        """Return the times of the measurements."""
-        return self.time
+    noise_groups: tuple[tuple[int, ...], ...] = ()
+    clock: None = None
 
-    def sigma(self, motion: Motion, values: Values) -> Array:
+    def sigma(self, motion: Motion, values: Values, factor: Array | float = 1.0) -> Array:
         """Return the standard deviations, (M, 1)."""
         return np.full((self.time.size, 1), self.std)
 
