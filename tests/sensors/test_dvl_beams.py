@@ -480,9 +480,7 @@ def test_each_beam_that_was_never_received_is_named(tmp_path):
 
 def test_a_single_ping_is_solved_and_written(tmp_path):
     trial = simulate(noisy(turntable=None), 1)
-    sensor = replace(
-        trial.beams, time=trial.beams.time[:1], velocity=trial.beams.velocity[:1]
-    )
+    sensor = replace(trial.beams, time=trial.beams.time[:1], velocity=trial.beams.velocity[:1])
     save_trial(replace(trial, others=(sensor,)), tmp_path / "trial")
     with pytest.raises(SystemExit) as done:
         main(["solve", str(tmp_path / "trial"), "--out", str(tmp_path / "out"), "--no-figures"])

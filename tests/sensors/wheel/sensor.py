@@ -93,6 +93,7 @@ class WheelSpeed:
     parameters: tuple[str, ...] = (SCALE.name,)
 
     noise_groups: tuple[tuple[int, ...], ...] = ()
+    independent: bool = False
     clock: None = None
 
     def sigma(self, motion: Motion, values: Values, factor: Array | float = 1.0) -> Array:
