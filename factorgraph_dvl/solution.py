@@ -44,7 +44,7 @@ OBSERVABLE = 0.5
 # few of them are so large by chance, of this probability.
 CONTRADICTS = 2.0
 _CHANCE = 1e-3
-# Share of outliers from which on they are a reason to doubt. Chosen: a good log has some.
+# Share of outliers from which on they are a contradiction. Chosen: a good log has some.
 _MANY_OUTLIERS = 0.02
 # Windows of outliers that a finding lists, and time between two of them, s. Chosen: a line's
 # length, and the time in which rejected measurements make a window.

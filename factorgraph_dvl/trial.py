@@ -213,7 +213,7 @@ class Trial:
         return self.dvl if self.dvl is not None or self.beams is None else as_dvl(self.beams)
 
     def on_one_clock(self) -> Trial:
-        """Return the trial with GNSS stamps from which the stated time offset is taken away."""
+        """Return the trial with stamps of GNSS less their stated time offset."""
         return self if self.gnss is None else replace(self, gnss=self.gnss.on_trial_clock())
 
     @property

@@ -41,7 +41,7 @@ class WhiteNoise(NamedTuple):
 
 
 def white_noise(imu: Imu) -> WhiteNoise | None:
-    """Return upper bounds of the white noise, None where the record does not tell.
+    """Return upper bounds of the white noise, None where the record does not show it.
 
     White noise is at all frequencies, so it is at most the lowest density of any band; motion
     and vibration are in some bands only. Density: median over spectra of stretches (Welch

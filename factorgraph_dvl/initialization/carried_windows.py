@@ -98,12 +98,14 @@ def carried_windows(imu: Imu, most: int = _MOST_WINDOWS) -> CarriedWindows | Non
     Parameters
     ----------
     imu : Imu
+        Record of the IMU.
     most : int
         Windows at most.
 
     Returns
     -------
-    CarriedWindows, None where the record is too short or too broken for a window.
+    CarriedWindows or None
+        The windows, None where the record is too short or too broken for one.
     """
     if imu.time.size < 3:
         return None

@@ -102,12 +102,13 @@ class ClockOffset:
     offset, sigma : float, s
         At `middle`; before the jump if there is one.
     rate, rate_sigma : float
-        s/s; 0 where a rate is not certain.
+        Rate and its standard deviation, s/s; 0 where a rate is not certain.
     jump, jump_sigma : float, s
         0 where a jump is not certain.
     jump_time : float, s
         When; nan if never.
     middle : float, s
+        Time at which the offset holds.
     gain : float
         Log-likelihood that it gains against an offset `around`, its noise correlated as it is.
     unexplained : float
@@ -139,6 +140,7 @@ def clock_offset(
     Parameters
     ----------
     comparison : Comparison
+        Of the sensor with the carried IMU.
     around : float
         Middle of the scan, s.
     reach : float
@@ -146,7 +148,8 @@ def clock_offset(
 
     Returns
     -------
-    ClockOffset, None where there are too few data.
+    ClockOffset or None
+        The clock, None where there are too few data.
     """
     if np.unique(_blocks(comparison)).size < _LEAST_BLOCKS:
         return None

@@ -50,7 +50,9 @@ class DvlFit:
     dRb : ndarray, shape (3, 3)
         Body to DVL; of determinant -1 where the axes are mirrored.
     scale_error : float
+        Scale error that fits.
     lever_arm : ndarray, shape (3,), m
+        Lever arm from the IMU that fits, in body.
     """
 
     residual: Array
@@ -66,7 +68,9 @@ class DvlWindows:
     Parameters
     ----------
     windows : CarriedWindows
+        The carried IMU.
     ping_time : ndarray, shape (M,), s
+        Stamps of the pings.
     velocity : ndarray, shape (M, 3), m/s
         In the axes of the DVL.
     sigma : ndarray, shape (M,), m/s
@@ -170,13 +174,16 @@ def dvl_windows(windows: CarriedWindows, dvl: Dvl, later: float = 0.0) -> DvlWin
     Parameters
     ----------
     windows : CarriedWindows
+        The carried IMU.
     dvl : Dvl
+        Record of the DVL.
     later : float
         Offset of its clock around which others are tried, s.
 
     Returns
     -------
-    DvlWindows, None where no window has enough pings.
+    DvlWindows or None
+        The comparison, None where no window has enough pings.
     """
     locked = dvl.locked.copy()
     locked[locked] = steady(dvl.velocity[locked])

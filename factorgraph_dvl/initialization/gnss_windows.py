@@ -122,7 +122,9 @@ class GnssWindows:
     Parameters
     ----------
     windows : CarriedWindows
+        The carried IMU.
     velocities : LevelVelocities
+        Velocities of the antenna.
     arms : pair of ndarray, shape (N, 3)
         Lever arm of the antenna in body, m, and the rate of the body relative to what carries
         the antenna, rad/s, at the velocities.
@@ -275,13 +277,16 @@ def gnss_windows(windows: CarriedWindows, gnss: Gnss, later: float = 0.0) -> Gns
     Parameters
     ----------
     windows : CarriedWindows
+        The carried IMU.
     gnss : Gnss
+        Record of the receiver.
     later : float
         Offset of its clock around which others are tried, s.
 
     Returns
     -------
-    GnssWindows, None where no window has enough of them.
+    GnssWindows or None
+        The comparison, None where no window has enough velocities.
     """
     v = level_velocities(gnss)
     if v.begin.size == 0:

@@ -85,6 +85,7 @@ def consistency_findings(trial: Trial, errors: Sequence[Finding]) -> Iterator[Fi
     Parameters
     ----------
     trial : Trial
+        Records to compare.
     errors : sequence of Finding
         What is wrong with single sensors; those are left out.
     """

@@ -22,6 +22,7 @@ def mirrored_finding(dvl: Dvl, fit: DvlFit) -> Finding:
     Parameters
     ----------
     dvl : Dvl
+        Record of the DVL.
     fit : DvlFit
         Of its pings to the carried IMU, with mirrored axes.
     """

@@ -125,6 +125,7 @@ def diagnosis(compare: Compare, imu: Imu, up_b: Array) -> list[Candidate]:
     compare : callable
         Makes the comparisons of GNSS and DVL with carried windows.
     imu : Imu
+        Record of the IMU.
     up_b : ndarray, shape (3,)
         Up in body, by `body_axes`: gravity that is right already is not to be turned over.
     """

@@ -158,7 +158,7 @@ class Gnss:
         return np.asarray(np.isnan(self.geodetic[:, 0]) & np.isnan(self.velocity[:, 0]))
 
     def on_trial_clock(self) -> Self:
-        """Return this record with stamps from which the stated time offset is taken away."""
+        """Return this record with stamps less the stated time offset."""
         offset = self.settings.time_offset_s
         if offset == 0.0:
             return self

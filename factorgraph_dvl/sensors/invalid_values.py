@@ -111,7 +111,8 @@ def _blank_fixes(columns: dict[str, Array], source: str, findings: list[Finding]
         return
     values = np.stack([columns[name] for name in POSITION_COLUMNS], axis=1)
     zero = np.all(values[:, :2] == 0.0, axis=1)
-    elsewhere = np.abs(np.nanmedian(values[~zero, :2], axis=0)) if (~zero).any() else np.zeros(2)
+    known = values[~zero & ~np.isnan(values[:, 0]), :2]
+    elsewhere = np.abs(np.median(known, axis=0)) if len(known) else np.zeros(2)
     zero &= bool(np.any(elsewhere > 1.0))
     frozen = _frozen(np.where(zero[:, None], np.nan, values * _FIX_DEG), _LEAST_STEP["deg"])
     words = [f"{int(zero.sum())} fixes at 0, 0"] if zero.any() else []

@@ -72,8 +72,8 @@ class ParameterSpec:
     above : float, optional
         Every component is above this, in `unit`.
     nuisance : bool, default False
-        Whether it is estimated only for the sake of the others: nobody need be told that the data
-        do not determine it.
+        Whether it is estimated only for the sake of the others: it makes no
+        warning where the data do not determine it.
     """
 
     stem: str

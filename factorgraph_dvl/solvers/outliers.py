@@ -14,7 +14,7 @@ from factorgraph_dvl.statistics.robust_weights import BoolArray, Truncation, win
 # Share of the measurements of a kind from which on it is the model that is wrong, and none is
 # rejected. Chosen: more than all gross errors of a bad trial together.
 _TOO_MANY = 0.4
-# Measurements from which on outliers are searched. Chosen: fewer do not tell their own scale.
+# Measurements from which on outliers are searched. Chosen: fewer do not show their own scale.
 _FEWEST = 20
 
 

@@ -59,6 +59,8 @@ COMMANDS = {
     "crosscheck": ("crosscheck", "RESULT", "RESULT", "--reference", "TRIAL", "--out", "OUT"),
     "plan": ("plan", CONFIGS / "plans" / "harbour.yaml", "--out", "OUT"),
     "simulate": ("simulate", CONFIGS / "seed-a-phase-0.yaml", "--out", "OUT"),
+    "reproduce": ("reproduce", "chen-2021", "--out", "OUT"),
+    "allan": ("allan", "IMU", "--out", "OUT"),
 }
 
 
@@ -86,7 +88,7 @@ def test_no_command_writes_over_a_trial(tmp_path, capsys, command, force):
     (tmp_path / "link").symlink_to(trial)
     before = files(tmp_path)
     for out in (trial, tmp_path / "link", trial / ".." / "trial"):
-        named = {"TRIAL": trial, "RESULT": result, "OUT": out}
+        named = {"TRIAL": trial, "RESULT": result, "OUT": out, "IMU": trial / "imu.csv"}
         code = run(*(named.get(word, word) for word in COMMANDS[command]), *force)
         assert code == 2
         assert "trial" in capsys.readouterr().err

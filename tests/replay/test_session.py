@@ -387,7 +387,7 @@ def test_lost_samples_and_an_end_that_is_not_reached_are_said(trial, tmp_path, c
     ):
         assert any(text in w for w in of_code(solution.findings, code)), text
         assert text in shown, text
-    assert "did not reach the end of the record" in shown
+    assert "the replay did not reach the end" in shown
 
 
 def test_what_matters_is_in_view_on_a_low_terminal(trial, run):
