@@ -130,8 +130,8 @@ class GnssWindows:
         the antenna, rad/s, at the velocities.
     rows : ndarray, shape (W, n)
         Which velocities are in a window.
-    inside : ndarray, shape (W, n)
-        Bool; the rest fills the table up.
+    inside : ndarray of bool, shape (W, n)
+        Which of them are meant; the rest fills the table up.
     window : ndarray, shape (W,)
         Which window it is.
     """
