@@ -154,7 +154,7 @@ def mission(calibrated: Trial, seed: int, lost: float) -> Trial:
             ],
         },
     ]
-    del data["gnss"]
+    del data["gnss"], data["trial"]["gnss"]
     data["trial"]["initial"] = {"position_std_m": [1, 1, 1], "attitude_std_deg": [0.1, 0.1, 0.1]}
     data["dvl_beams"] |= {
         "misalignment_deg": list(beams.settings.misalignment_deg),

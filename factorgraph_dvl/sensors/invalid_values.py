@@ -31,6 +31,8 @@ _LEAST_STEP = {"m_s": 0.02, "deg": 3e-5}
 _FIX_DEG = np.array([1.0, 1.0, 1e-5])
 
 
+# A damaged number may be too large for a product; ranges are checked later.
+@np.errstate(over="ignore", invalid="ignore")
 def without_invalid_values(
     section: str, columns: Mapping[str, Array], source: str
 ) -> tuple[dict[str, Array], list[Finding]]:

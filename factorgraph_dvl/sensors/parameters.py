@@ -147,7 +147,10 @@ class JointPrior:
         scale = np.where(std > 0.0, std, 1.0)
         correct = P.shape == (size, size) and bool(np.isfinite(P).all())
         if correct:
-            correlation = P / np.outer(scale, scale)
+            with np.errstate(over="ignore", under="ignore", divide="ignore", invalid="ignore"):
+                correlation = P / np.outer(scale, scale)
+            correct = bool(np.isfinite(correlation).all())
+        if correct:
             lowest = np.linalg.eigvalsh(0.5 * (correlation + correlation.T))[0] if size else 0.0
             symmetric = np.allclose(correlation, correlation.T, atol=1e-6)
             correct = symmetric and lowest > -_NEGATIVE and bool(np.all(np.diag(P) >= 0.0))

@@ -10,7 +10,7 @@ from factorgraph_dvl.io.calibration_file import encode_calibration, load_calibra
 from factorgraph_dvl.report.figures.error_budget import error_budget_figure
 from factorgraph_dvl.report.terminal.error_budget import error_budget_table
 from factorgraph_dvl.simulation import simulate
-from factorgraph_dvl.solvers.batch import solve, solved_problem
+from factorgraph_dvl.solvers.batch import solve, solved_problems
 from factorgraph_dvl.solvers.calibration import reported
 from factorgraph_dvl.solvers.levenberg_marquardt import eliminate
 from factorgraph_dvl.statistics.error_budget import error_budget
@@ -26,7 +26,7 @@ def solution():
 
 
 def test_sources_add_up_to_the_covariance():
-    found = solved_problem(simulate(SCENE, 0))
+    found = solved_problems(simulate(SCENE, 0))[0]
     problem, evaluation = found.problem, found.minimum.evaluation
     gaussian = problem.linearize(evaluation)
     tree = eliminate(gaussian, problem.ordering(gaussian))
