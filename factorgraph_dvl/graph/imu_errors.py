@@ -14,15 +14,13 @@ import numpy as np
 
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph.inertial_chain import Chain
+from factorgraph_dvl.graph.keys import BIAS_SIZE, STATE_SIZE
 from factorgraph_dvl.graph.template import jacobian_template
 from factorgraph_dvl.imu.propagation import Attachment, Transition
 from factorgraph_dvl.imu.sensitivity import Sensitivity, by_errors, corrected, sensitivities
 from factorgraph_dvl.sensors.imu import ERRORS
 from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.sensors.protocol import Linearization
-
-_STATE = 9
-_BIAS = 6
 
 
 @dataclass(frozen=True)
@@ -103,7 +101,7 @@ class ImuErrors:
         """
         count = self._ends.shape[0]
         whole = np.array([native.at(k).augmentedJacobian() for k in range(count)])
-        columns = -whole[:, :, _STATE : 2 * _STATE] @ self._ends
+        columns = -whole[:, :, STATE_SIZE : 2 * STATE_SIZE] @ self._ends
         change = columns @ errors
         rhs = whole[:, :, -1]
         more_cost = 0.5 * float(np.sum(change * (change - 2.0 * rhs)))
@@ -114,9 +112,9 @@ class ImuErrors:
         """Return the native part of the Gaussian graph; written in place at the next call."""
         count = len(linear.jacobian)
         if not self._factors:
-            sizes = [_STATE, _STATE, _BIAS, *self._sizes]
+            sizes = [STATE_SIZE, STATE_SIZE, BIAS_SIZE, *self._sizes]
             self._factors = [
-                jacobian_template([*linear.native.at(k).keys(), *self._keys], sizes, _STATE)
+                jacobian_template([*linear.native.at(k).keys(), *self._keys], sizes, STATE_SIZE)
                 for k in range(count)
             ]
         out = gtsam.GaussianFactorGraph()

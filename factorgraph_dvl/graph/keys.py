@@ -10,6 +10,11 @@ from gtsam.symbol_shorthand import B, X
 # Chosen: all letters but those of states and biases.
 _LETTERS = [c for c in string.ascii_letters + string.digits if c not in "bx"]
 
+# Dimensions of a state, attitude, position and velocity, and of the biases of accelerometers and
+# gyros: those of GTSAM's NavState and ConstantBias.
+STATE_SIZE = 9
+BIAS_SIZE = 6
+
 
 def node(k: int) -> int:
     """Return the key of the navigation state at node k."""

@@ -12,6 +12,7 @@ from scipy.linalg import block_diag
 from factorgraph_dvl.geometry.rotations import exp_so3, inverse_right_jacobian, right_jacobian
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph.inertial_chain import loose_diagonal, square_root
+from factorgraph_dvl.graph.keys import BIAS_SIZE
 from factorgraph_dvl.sensors.parameters import Parameter
 
 # Stands for a standard deviation of 0 in a parameter of which other components are estimated,
@@ -20,7 +21,6 @@ _FIXED_STD = 1e-7
 # Least eigenvalue of the correlations of a calibration. Chosen: it may know a combination of
 # parameters a million times better than each.
 _LEAST_EIGENVALUE = 1e-12
-_BIAS = 6
 
 
 @dataclass(frozen=True)
@@ -109,7 +109,7 @@ def joint_linear_prior(
     sigma = np.sqrt(np.diag(prior.covariance))
     correlation = prior.covariance / np.outer(sigma, sigma)
     gain = np.linalg.inv(np.linalg.cholesky(correlation)) / sigma
-    ends = np.cumsum([_BIAS, *(p.mean.size for p in parameters)])
+    ends = np.cumsum([BIAS_SIZE, *(p.mean.size for p in parameters)])
     columns = np.split(gain, ends[:-1], axis=1)
 
     def error(this: gtsam.CustomFactor, at: gtsam.Values, jacobians: list[Array] | None) -> Array:

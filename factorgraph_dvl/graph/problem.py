@@ -24,6 +24,7 @@ from factorgraph_dvl.graph import keys
 from factorgraph_dvl.graph.clocks import linearized, parameters_of, true_time
 from factorgraph_dvl.graph.imu_errors import ImuErrors, LinearImuFactors
 from factorgraph_dvl.graph.inertial_chain import Chain
+from factorgraph_dvl.graph.keys import BIAS_SIZE, STATE_SIZE
 from factorgraph_dvl.graph.priors import (
     ConstantsPrior,
     add_priors,
@@ -41,6 +42,7 @@ from factorgraph_dvl.imu.propagation import (
     States,
     Transition,
     attach_inside,
+    attitude_jacobian,
     extrapolated,
     motion_at,
 )
@@ -66,9 +68,6 @@ _EXTRAPOLATED = 1e-3
 # Relative change of a standard deviation from which on measurements are weighed anew. Chosen:
 # less hardly moves the minimum.
 _SAME_WEIGHT = 0.2
-
-_STATE = 9
-_BIAS = 6
 
 
 @dataclass(eq=False)
@@ -453,7 +452,7 @@ class Problem:
         """Yield the rows of each observation, unused ones included: these are zero."""
         transitions = self._transitions(evaluation)
         for block in self._blocks:
-            sizes = (_STATE, _BIAS, *(p.mean.size for p in block.parameters))
+            sizes = (STATE_SIZE, BIAS_SIZE, *(p.mean.size for p in block.parameters))
             shared = [self._key[p.name] for p in block.parameters]
             for bound in block.bound:
                 matrix, vector = self._jacobian(bound, block.parameters, transitions, evaluation)
@@ -492,7 +491,7 @@ class Problem:
             v_n[k] = state.velocity()
         m = n if self.chain.walking else 1
         bias = np.array([values.atConstantBias(keys.bias(k)).vector() for k in range(m)])
-        bias = np.broadcast_to(bias, (n, _BIAS))
+        bias = np.broadcast_to(bias, (n, BIAS_SIZE))
         return States(nRb, p_n, v_n, gyro_bias=bias[:, 3:], accel_bias=bias[:, :3])
 
     def _bind(self, observation: Observation) -> _Bound:
@@ -552,7 +551,7 @@ class Problem:
         used, counts = np.unique(row_node, return_counts=True)
         edges = np.concatenate([[0], np.cumsum(counts)])
         block.rows = [slice(a, b) for a, b in itertools.pairwise(edges)]
-        sizes = [_STATE, _BIAS] + [p.mean.size for p in block.parameters]
+        sizes = [STATE_SIZE, BIAS_SIZE] + [p.mean.size for p in block.parameters]
         shared = [self._key[p.name] for p in block.parameters]
         block.matrices, block.vectors, block.factors = [], [], []
         for k, rows in zip(used.tolist(), counts.tolist(), strict=True):
@@ -580,15 +579,12 @@ class Problem:
     def _transitions(self, evaluation: Evaluation) -> dict[int, Transition]:
         """Return the transitions from the nodes to the times of each motion, by its identity."""
         rate = self.chain.frame.earth_rate
-        return {
-            id(motion): Transition(
-                self._corrected(b, b.attachment, evaluation.parameters),
-                evaluation.states,
-                motion,
-                rate,
-            )
-            for b, motion in zip(self._bound, evaluation.motions, strict=True)
-        }
+        out: dict[int, Transition] = {}
+        for bound, motion in zip(self._bound, evaluation.motions, strict=True):
+            if id(motion) not in out:
+                at = self._corrected(bound, bound.attachment, evaluation.parameters)
+                out[id(motion)] = Transition(at, evaluation.states, motion, rate)
+        return out
 
     def _jacobian(
         self,
@@ -610,10 +606,10 @@ class Problem:
             wanted,
             self.clock_zero,
         )
-        columns = _STATE + _BIAS + sum(p.mean.size for p in parameters)
+        columns = STATE_SIZE + BIAS_SIZE + sum(p.mean.size for p in parameters)
         full = np.empty((*lin.residual.shape, columns))
-        full[:, :, : _STATE + _BIAS] = node_jacobian(lin, transition)
-        c = _STATE + _BIAS
+        full[:, :, : STATE_SIZE + BIAS_SIZE] = node_jacobian(lin, transition)
+        c = STATE_SIZE + BIAS_SIZE
         found = dict(lin.d_parameters)
         if self._imu_errors is not None:
             found |= self._imu_errors.columns(lin, transition, bound.attachment)
@@ -637,12 +633,10 @@ def node_jacobian(lin: Linearization, transition: Transition) -> Array:
     transition : Transition
         From the nodes to these times.
     """
-    out = np.zeros((*lin.residual.shape, _STATE + _BIAS))
+    out = np.zeros((*lin.residual.shape, STATE_SIZE + BIAS_SIZE))
     theta, p, v, accel, gyro = (out[:, :, i : i + 3] for i in range(0, 15, 3))
-    d_theta = lin.d_theta
+    d_theta = attitude_jacobian(lin, transition)
     if lin.d_omega is not None:
-        by_attitude = lin.d_omega @ transition.omega_theta
-        d_theta = by_attitude if d_theta is None else d_theta + by_attitude
         gyro -= lin.d_omega
     if d_theta is not None:
         theta += d_theta @ transition.theta_theta

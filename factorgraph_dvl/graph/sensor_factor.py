@@ -15,13 +15,11 @@ import numpy as np
 
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph.clocks import linearized, parameters_of, true_time
+from factorgraph_dvl.graph.keys import BIAS_SIZE, STATE_SIZE
 from factorgraph_dvl.graph.problem import node_jacobian
 from factorgraph_dvl.imu.propagation import Attachment, States, Transition, extrapolated, motion_at
 from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.sensors.protocol import Motion, Observation
-
-_STATE = 9
-_BIAS = 6
 
 
 @dataclass(frozen=True)
@@ -99,7 +97,7 @@ class NodeMeasurements:
         values = {**self.fixed, **values}
         motion, motions = self.motions(states, values)
         transition = Transition(self.attachment, states, motion, self.earth_rate_n)
-        width = _STATE + _BIAS + sum(p.mean.size for p in self.parameters)
+        width = STATE_SIZE + BIAS_SIZE + sum(p.mean.size for p in self.parameters)
         residuals, jacobians = [], []
         for r, own in zip(self.rows, motions, strict=True):
             used = parameters_of(r.observation)
@@ -107,10 +105,10 @@ class NodeMeasurements:
             lin = linearized(r.observation, own, values, wanted, self.clock_zero)
             m, d = lin.residual.shape
             matrix = np.zeros((m, d, width))
-            matrix[:, :, : _STATE + _BIAS] = node_jacobian(
+            matrix[:, :, : STATE_SIZE + BIAS_SIZE] = node_jacobian(
                 lin, cast(Transition, _Window(transition, r.at))
             )
-            column = _STATE + _BIAS
+            column = STATE_SIZE + BIAS_SIZE
             for p in self.parameters:
                 if p.name in wanted:
                     matrix[:, :, column : column + p.mean.size] = lin.d_parameters[p.name]
@@ -207,7 +205,7 @@ def measurement_factor(
     """
     kept = [first] if first is not None else []
     every = [node_key, bias_key, *parameter_keys]
-    sizes = [_STATE, _BIAS, *(p.mean.size for p in measured.parameters)]
+    sizes = [STATE_SIZE, BIAS_SIZE, *(p.mean.size for p in measured.parameters)]
     edges = np.cumsum([0, *sizes])
     rows = weight.size
     if len(every) != len(sizes):

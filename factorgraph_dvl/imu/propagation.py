@@ -12,7 +12,7 @@ from factorgraph_dvl.geometry.rotations import exp_so3
 from factorgraph_dvl.geometry.vectors import Array, cross, rotate, skew
 from factorgraph_dvl.imu.increments import IntArray
 from factorgraph_dvl.imu.preintegration import Segments
-from factorgraph_dvl.sensors.protocol import Motion
+from factorgraph_dvl.sensors.protocol import Linearization, Motion
 
 
 @dataclass(frozen=True)
@@ -233,6 +233,17 @@ class Transition:
     def v_accel(self) -> Array:
         """Velocity by accelerometer bias."""
         return -self.turned @ self.at.dA
+
+
+def attitude_jacobian(lin: Linearization, transition: Transition) -> Array | None:
+    """Return the derivative by the attitude at the times, that through the rate included.
+
+    None where it is zero; else (M, d, 3).
+    """
+    if lin.d_omega is None:
+        return lin.d_theta
+    by_rate = lin.d_omega @ transition.omega_theta
+    return by_rate if lin.d_theta is None else lin.d_theta + by_rate
 
 
 def motion_at(at: Attachment, states: States, gravity_n: Array, earth_rate_n: Array) -> Motion:

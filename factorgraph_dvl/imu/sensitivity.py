@@ -19,7 +19,7 @@ from factorgraph_dvl.geometry.rotations import exp_so3
 from factorgraph_dvl.geometry.vectors import Array, rotate, skew
 from factorgraph_dvl.imu.increments import IntArray
 from factorgraph_dvl.imu.preintegration import Segments
-from factorgraph_dvl.imu.propagation import Attachment, Transition
+from factorgraph_dvl.imu.propagation import Attachment, Transition, attitude_jacobian
 from factorgraph_dvl.sensors.imu import ImuError
 from factorgraph_dvl.sensors.protocol import Linearization
 
@@ -127,11 +127,9 @@ def by_errors(lin: Linearization, transition: Transition, by: Sensitivity) -> Ar
         Of the motion.
     """
     out = np.zeros((*lin.residual.shape, by.theta.shape[2]))
-    d_theta = lin.d_theta
+    d_theta = attitude_jacobian(lin, transition)
     if lin.d_omega is not None:
         out -= lin.d_omega @ by.rate
-        by_attitude = lin.d_omega @ transition.omega_theta
-        d_theta = by_attitude if d_theta is None else d_theta + by_attitude
     if d_theta is not None:
         out += d_theta @ (transition.at.dR.transpose(0, 2, 1) @ by.theta)
     if lin.d_v is not None:

@@ -118,7 +118,7 @@ def consistency_findings(trial: Trial, errors: Sequence[Finding]) -> Iterator[Fi
 
 
 def _stated(sensor: Gnss | Dvl) -> float:
-    return float(getattr(sensor.settings, "time_offset_s", 0.0))
+    return sensor.settings.time_offset_s
 
 
 def _compared(

@@ -8,6 +8,7 @@ import numpy as np
 
 from factorgraph_dvl.quality.records import GAP_INTERVALS, SensorSurvey
 from factorgraph_dvl.quality.sensor_clocks import whole_hours
+from factorgraph_dvl.sensors.clock import ClockSection
 from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.sensors.imu import Imu
 from factorgraph_dvl.sensors.protocol import Aid
@@ -84,7 +85,9 @@ def time_findings(trial: Trial, sensors: list[SensorSurvey]) -> Iterator[Finding
 
 def _meets(aid: Aid, imu: Imu) -> bool:
     """Whether the IMU runs at any measurement of a sensor."""
-    time = aid.time[np.logical_not(aid.missing)] - getattr(aid.settings, "time_offset_s", 0.0)
+    settings = aid.settings
+    offset = settings.time_offset_s if isinstance(settings, ClockSection) else 0.0
+    time = aid.time[np.logical_not(aid.missing)] - offset
     after = np.searchsorted(imu.time, time)
     edges = np.concatenate([[-np.inf], imu.time, [np.inf]])
     deviation = np.minimum(time - edges[after], edges[after + 1] - time)

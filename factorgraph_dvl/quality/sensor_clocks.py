@@ -39,13 +39,12 @@ def clock_findings(
     span : float
         Length of its record, s.
     """
-    mean = float(getattr(sensor.settings, "time_offset_s", 0.0))
-    std = float(getattr(sensor.settings, "time_offset_std_s", 0.0))
+    mean, std = sensor.settings.time_offset_s, sensor.settings.time_offset_std_s
     if clock.gain < _LEAST_GAIN:
         return
     change = clock.rate * span
     if abs(change) > max(_LEAST_S, _SIGMAS * clock.rate_sigma * span):
-        rate_std = 1e-6 * float(getattr(sensor.settings, "clock_rate_std_ppm", 0.0))
+        rate_std = 1e-6 * sensor.settings.clock_rate_std_ppm
         covered = max(_COVERED * rate_std * span, _HARMLESS_S)
         yield Finding(
             Code.CLOCK_DRIFT,

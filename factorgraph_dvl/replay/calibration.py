@@ -9,12 +9,11 @@ import numpy as np
 
 from factorgraph_dvl.geometry.rotations import exp_so3
 from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.graph.keys import BIAS_SIZE
 from factorgraph_dvl.graph.priors import local_coordinates, prior_mean, prior_root
 from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.solution import Estimate
 from factorgraph_dvl.solvers.reported import estimates_of, in_order, in_unit
-
-_BIAS = 6
 
 
 @dataclass(frozen=True)
@@ -75,7 +74,7 @@ def calibration_of(
         lambda r: r.parameter,
     )
     start = {accel.name: 0, gyro.name: 3}
-    at = _BIAS
+    at = BIAS_SIZE
     for p in free:
         start[p.name] = at
         at += p.mean.size
@@ -100,15 +99,15 @@ def _at_prior(
     """
     root = prior_root(free)
     A = np.zeros((fixed.shape[1], P.shape[0]))
-    A[:, _BIAS:] = fixed.T @ np.linalg.inv(root)
+    A[:, BIAS_SIZE:] = fixed.T @ np.linalg.inv(root)
     off = np.concatenate([local_coordinates(p, values[p.name], prior_mean(p)) for p in free])
     gain = np.linalg.solve(A @ P @ A.T, A @ P).T
-    step = -gain @ (A[:, _BIAS:] @ off)
+    step = -gain @ (A[:, BIAS_SIZE:] @ off)
     given = P - gain @ A @ P
-    given[_BIAS:, _BIAS:] += root @ fixed @ fixed.T @ root.T
-    given[:_BIAS, :_BIAS] = P[:_BIAS, :_BIAS]
+    given[BIAS_SIZE:, BIAS_SIZE:] += root @ fixed @ fixed.T @ root.T
+    given[:BIAS_SIZE, :BIAS_SIZE] = P[:BIAS_SIZE, :BIAS_SIZE]
     out = dict(values)
-    at = _BIAS
+    at = BIAS_SIZE
     for p in free:
         part = step[at : at + p.mean.size]
         at += p.mean.size

@@ -12,6 +12,7 @@ from factorgraph_dvl.geometry.rotations import BodyAxes, rph_from_rotation, rph_
 from factorgraph_dvl.geometry.vectors import Array, rotate
 from factorgraph_dvl.graph import keys
 from factorgraph_dvl.graph.inertial_chain import LEAST_WALK, loose_diagonal
+from factorgraph_dvl.graph.keys import BIAS_SIZE, STATE_SIZE
 from factorgraph_dvl.graph.priors import ConstantsPrior, local_coordinates, value_at
 from factorgraph_dvl.graph.sensor_factor import Linearized, measurement_factor, state_of
 from factorgraph_dvl.imu.preintegration import Segments, preintegrate
@@ -30,9 +31,6 @@ from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.sensors.protocol import Aid
 from factorgraph_dvl.solution import Trajectory
 from factorgraph_dvl.solvers.trajectory import TRAJECTORY_RATE, epochs_between, trajectory_between
-
-_STATE = 9
-_BIAS = 6
 
 
 @dataclass(frozen=True)
@@ -132,7 +130,7 @@ class Navigator:
 
     @property
     def _parameter_covariance(self) -> Array:
-        return self._P[_STATE + _BIAS :, _STATE + _BIAS :]
+        return self._P[STATE_SIZE + BIAS_SIZE :, STATE_SIZE + BIAS_SIZE :]
 
     def covariance_of(self, parameter: Parameter) -> Array:
         """Return the covariance of a parameter in its tangent space, SI."""
@@ -171,7 +169,7 @@ class Navigator:
             if not self.start.walking:
                 bias = self._linear.bias
             self._linear = _LinearizationPoint(predicted, bias, self._start_values)
-        self._P_before = self._P[:_STATE, :_STATE]
+        self._P_before = self._P[:STATE_SIZE, :STATE_SIZE]
         since = max(s.times[s.oldest], self.time - self._memory)
         while self._segments:
             old = next(iter(self._segments))
@@ -193,8 +191,8 @@ class Navigator:
 
     def known(self, later: float) -> ConstantsPrior:
         """Return what will be known of biases and parameters `later` seconds from now."""
-        P = self._P[_STATE:, _STATE:].copy()
-        P[:_BIAS, :_BIAS] += np.diag(self._walk_root_psd**2) * later
+        P = self._P[STATE_SIZE:, STATE_SIZE:].copy()
+        P[:BIAS_SIZE, :BIAS_SIZE] += np.diag(self._walk_root_psd**2) * later
         bias = self.smoother.bias(self.smoother.node).vector()
         return ConstantsPrior(bias, self.smoother.calibration(), P)
 
@@ -213,7 +211,7 @@ class Navigator:
             self.start.all_parameters,
             self.values,
             ((gyro, bias[3:]), (accel, bias[:3])),
-            self._P[_STATE:, _STATE:],
+            self._P[STATE_SIZE:, STATE_SIZE:],
             self.undetermined,
         )
 
@@ -256,7 +254,7 @@ class Navigator:
 
         The time is that of the state before it, but for what stamps have been corrected since.
         """
-        P = np.stack([self._P_before, self._P[:_STATE, :_STATE]])
+        P = np.stack([self._P_before, self._P[:STATE_SIZE, :STATE_SIZE]])
         return self._between(self.smoother.node - 1, P, body_axes, since)
 
     def _between(self, k: int, P: Array, body_axes: BodyAxes, since: float) -> Trajectory:
@@ -286,7 +284,7 @@ class Navigator:
         if measured is None:
             return None
         names = [p.name for p in measured.parameters]
-        own = np.r_[: _STATE + _BIAS, _STATE + _BIAS + self.start.columns(names)]
+        own = np.r_[: STATE_SIZE + BIAS_SIZE, STATE_SIZE + BIAS_SIZE + self.start.columns(names)]
         first = None
         if self._linear is not None and k == s.node:
             # Where GTSAM will linearise, so this is done once only.
@@ -304,7 +302,7 @@ class Navigator:
         )
         self.innovations += innovations
         self.findings += findings
-        state_P = self._P[:_STATE, :_STATE]
+        state_P = self._P[:STATE_SIZE, :STATE_SIZE]
         if self.spurious.add(measured, motions, weights, self.values, state_P, self.time):
             self.undetermined = self.spurious.undetermined(self._parameter_covariance)
         weight = np.concatenate([w.ravel() for w in weights])

@@ -36,8 +36,6 @@ _NEVER = 1e9
 _MOST = 0.4
 # Interval at which steps are checked, s; chosen.
 _CHECK = 1.0
-_STATE = 9
-_BIAS = 6
 
 
 class Smoother:

@@ -246,8 +246,6 @@ def _asymmetry(seeds: int) -> Result:
 
 
 _FILTER = "`kalman --method beams`"
-_CONFIG = "`configs/beams-turntable.yaml`"
-_GEOMETRY = "`sensors/beam_geometry`"
 BEAMS = Paper(
     "beams",
     "Cao Z., Sun D., Liu B., Zhang D., Liu X. (Harbin Engineering University): A method to "

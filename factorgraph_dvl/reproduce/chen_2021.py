@@ -434,14 +434,12 @@ def _model(seeds: int) -> Result:
     )
 
 
-_TWO = "`kalman --method 4sv-2ob`"
 _THREE = "`kalman --method 4sv-3ob`"
 _PAIR = "`baselines/mirror_pair`"
 CHEN_2021 = Paper(
     "chen-2021",
     "Chen X., Shang F., Lan Q. (2021): Model and algorithm improvement for UUV navigation based "
-    "on "
-    "single beacon",
+    "on single beacon",
     (
         Entry("figure 1", "geometry of range and range rate", "`sensors/beacon`", _geometry),
         Entry("figure 2", "two tracks fit the same ranges", "`ranging/hypotheses`", _mirror),

@@ -640,8 +640,7 @@ _SEGMENTS = "`analysis/information/segment_singular_values`"
 LUO_2024 = Paper(
     "luo-2024",
     "Luo H., Liu X., Liu J., Wu X., Cheng X. (2024): DVL calibration based on parameter "
-    "estimation "
-    "between two point sets",
+    "estimation between two point sets",
     (
         Entry("eq. 1", "(1 + δK)(I + [α×])(v_b + ω_ib × l)", "`baselines/luo_2024`", _equation_1),
         Entry("eq. 2", "to first order", "`baselines/luo_2024`", _equation_2),

@@ -22,6 +22,7 @@ from scipy.linalg.lapack import dgeqrf, dtrtri
 
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph import keys
+from factorgraph_dvl.graph.keys import BIAS_SIZE, STATE_SIZE
 from factorgraph_dvl.graph.problem import FIXED_DIRECTION_STD, Evaluation, Problem
 from factorgraph_dvl.quality.refusal import accepted_errors, explained
 from factorgraph_dvl.quality.survey import survey
@@ -39,9 +40,6 @@ from factorgraph_dvl.statistics.spurious_information import (
     undetermined_directions,
 )
 from factorgraph_dvl.trial import Trial
-
-_STATE = 9
-_BIAS = 6
 
 
 @dataclass(frozen=True)
@@ -250,7 +248,7 @@ def _layout(problem: Problem) -> tuple[_Layout, dict[int, tuple[int, int]]]:
     at = 0
     if not walking:
         constants[keys.bias(0)] = 0
-        at = _BIAS
+        at = BIAS_SIZE
     for p in problem.parameters:
         constants[problem.key(p.name)] = at
         at += p.mean.size
@@ -258,8 +256,8 @@ def _layout(problem: Problem) -> tuple[_Layout, dict[int, tuple[int, int]]]:
     for k in range(problem.chain.segments.node_time.size):
         node[keys.node(k)] = (k, 0)
         if walking:
-            node[keys.bias(k)] = (k, _STATE)
-    own = _STATE + _BIAS * walking
+            node[keys.bias(k)] = (k, STATE_SIZE)
+    own = STATE_SIZE + BIAS_SIZE * walking
     return _Layout(own, constants, 2 * own + at), node
 
 

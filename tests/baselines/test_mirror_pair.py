@@ -4,40 +4,25 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from planar import trial as planar_trial
 
 from factorgraph_dvl.baselines.mirror_pair import both_tracks, mirror_pair
 from factorgraph_dvl.errors import DataError
 from factorgraph_dvl.geometry.vectors import interpolate
-from factorgraph_dvl.simulation import parse_scenario, simulate_planar
 
 
 def trial(*, current=(0.0, 0.0, 0.0), noise=False):
-    return simulate_planar(
-        parse_scenario(
-            {
-                "name": "mirror",
-                "noise": noise,
-                "start": {
-                    "lat_deg": 25.0, "lon_deg": 135.004, "height_m": -40, "heading_deg": 20,
-                    "speed_m_s": 2,
-                },
-                "manoeuvres": [{"straight_s": 100}, {"turn_deg_s": -3, "duration_s": 30},
-                               {"straight_s": 100}],
-                "current_m_s": list(current),
-                "heading": {"rate_hz": 1, "std_deg": 0.5},
-                "log": {"rate_hz": 1, "speed_std_m_s": 0.05},
-                "depth": {"rate_hz": 1, "std_m": 0.1},
-                "beacons": {
-                    "rate_hz": 1,
-                    "positions": {"B1": {"lat_deg": 25.0, "lon_deg": 135.0, "height_m": -80}},
-                    "range_std_m": 1.0,
-                    "range_rate_std_m_s": 0.05,
-                },
-                "trial": {"log": {"current_std_m_s": [0.3, 0.3]}},
-            }
-        ),
-        0,
-    )  # fmt: skip
+    return planar_trial(
+        name="mirror",
+        noise=noise,
+        start={"lat_deg": 25.0, "lon_deg": 135.004},
+        manoeuvres=[
+            {"straight_s": 100},
+            {"turn_deg_s": -3, "duration_s": 30},
+            {"straight_s": 100},
+        ],
+        current_m_s=list(current),
+    )
 
 
 def truth(t, time):
