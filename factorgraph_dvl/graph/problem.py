@@ -18,7 +18,7 @@ import gtsam
 import numpy as np
 
 from factorgraph_dvl.geometry.earth import LocalFrame
-from factorgraph_dvl.geometry.rotations import exp_so3
+from factorgraph_dvl.geometry.rotations import BodyAxes, exp_so3
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph import keys
 from factorgraph_dvl.graph.clocks import linearized, parameters_of, true_time
@@ -153,10 +153,10 @@ class Rows:
 
 
 def observed(
-    aids: Sequence[Aid], frame: LocalFrame
+    aids: Sequence[Aid], frame: LocalFrame, body_axes: BodyAxes
 ) -> tuple[tuple[Observation, ...], tuple[Parameter, ...]]:
     """Return the measurements and the calibration parameters of aiding sensors."""
-    observations = tuple(o for aid in aids for o in aid.observations(frame))
+    observations = tuple(o for aid in aids for o in aid.observations(frame, body_axes))
     return observations, tuple(p for aid in aids for p in aid.parameters())
 
 

@@ -87,7 +87,9 @@ class RecordHistory:
         out._aids = {}
         for section, records in self._aids.items():
             record = joined(records)
-            kinds = {o.label for o in record.observations(frame)} & self._rejected.keys()
+            kinds = {
+                o.label for o in record.observations(frame, self._settings.body_axes)
+            } & self._rejected.keys()
             times = [time for kind in kinds for time in self._rejected[kind]]
             if times:
                 record = rows_of(record, ~np.isin(record.time, np.concatenate(times)))

@@ -40,7 +40,7 @@ def attached(
     values : mapping of str to ndarray
         Values of all parameters, SI.
     """
-    observations = [o for aid in aids for o in aid.observations(start.frame)]
+    observations = [o for aid in aids for o in aid.observations(start.frame, start.body_axes)]
     if not observations:
         return None
     rows: list[Rows] = []

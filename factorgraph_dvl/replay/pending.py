@@ -8,6 +8,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from factorgraph_dvl.geometry.earth import LocalFrame
+from factorgraph_dvl.geometry.rotations import BodyAxes
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.sensors.protocol import Aid, SensorClock
 from factorgraph_dvl.sensors.records import joined, rows_of
@@ -22,13 +23,19 @@ AHEAD = 60.0
 class PendingMeasurements:
     """Records by sensor, until the IMU reaches their time.
 
+    Parameters
+    ----------
+    body_axes : BodyAxes
+        Axes of the body.
+
     Attributes
     ----------
     rejected : Counter
         Number of measurements that were too far ahead, by label of the sensor.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, body_axes: BodyAxes) -> None:
+        self._body_axes = body_axes
         self._records: dict[str, list[Aid]] = {}
         self._clocks: dict[str, SensorClock | None] = {}
         self.rejected: Counter[str] = Counter()
@@ -94,7 +101,7 @@ class PendingMeasurements:
         """Return the clock of a sensor, None if it is that of the IMU or not known yet."""
         section = record.section
         if section not in self._clocks:
-            observations = record.observations(frame)
+            observations = record.observations(frame, self._body_axes)
             if not observations:
                 return None
             self._clocks[section] = observations[0].clock

@@ -93,7 +93,7 @@ class Replay:
         )
         self._navigator: Navigator | None = None
         self._gate = InnovationGate()
-        self._pending = PendingMeasurements()
+        self._pending = PendingMeasurements(settings.body_axes)
         self._duplicates = Duplicates()
         self._clocks = Clocks()
         self._outages = Outages()
@@ -345,7 +345,7 @@ class Replay:
             self._too_late[row.label] += 1
             return
         self._deferred[row.label] += 1
-        for o in row.observations(nav.start.frame):
+        for o in row.observations(nav.start.frame, nav.start.body_axes):
             if o.label in self._gate.excluded:
                 self._initializer.history.reject(o.label, o.time)
 
@@ -370,7 +370,9 @@ class Replay:
         be linearised at their priors.
         """
         anywhere = LocalFrame(0.0, 0.0, 0.0, self._settings.epoch)
-        return not record.missing.all() or bool(record.observations(anywhere))
+        return not record.missing.all() or bool(
+            record.observations(anywhere, self._settings.body_axes)
+        )
 
     def _update(
         self, nav: Navigator, began: float, trajectory: Trajectory, *, solved: bool, end: bool

@@ -42,6 +42,8 @@ class ReplayStart:
     ----------
     frame : LocalFrame
         Navigation frame of the states.
+    body_axes : BodyAxes
+        Axes of the body.
     node : int
         Index of the state.
     time : float
@@ -77,6 +79,7 @@ class ReplayStart:
     """
 
     frame: LocalFrame
+    body_axes: BodyAxes
     node: int
     time: float
     prior: gtsam.NonlinearFactorGraph
@@ -178,6 +181,7 @@ def solve_start(
     _, rest = gaussian.eliminatePartialMultifrontal(eliminated, gtsam.EliminateQR)
     return ReplayStart(
         frame=chain.frame,
+        body_axes=trial.body_axes,
         node=last,
         time=float(chain.segments.node_time[-1]),
         prior=gtsam.LinearContainerFactor.ConvertLinearGraph(rest, values),

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from factorgraph_dvl.errors import DataError
 from factorgraph_dvl.geometry.earth import LocalFrame
+from factorgraph_dvl.geometry.rotations import BodyAxes
 from factorgraph_dvl.geometry.units import GEODETIC_SI
 from factorgraph_dvl.geometry.vectors import Array, cross, rotate, skew
 from factorgraph_dvl.sensors.clock import Clock, ClockSection
@@ -180,7 +181,7 @@ class Beacons:
             *_CLOCK.parameters(s),
         )
 
-    def observations(self, frame: LocalFrame) -> tuple[Observation, ...]:
+    def observations(self, frame: LocalFrame, body_axes: BodyAxes) -> tuple[Observation, ...]:
         """Return ranges and range rates, beacon by beacon."""
         s = self.settings
         out: list[Observation] = []

@@ -9,6 +9,7 @@ from typing import ClassVar, Self
 import numpy as np
 
 from factorgraph_dvl.geometry.earth import LocalFrame
+from factorgraph_dvl.geometry.rotations import BodyAxes
 from factorgraph_dvl.geometry.vectors import Array, skew
 from factorgraph_dvl.sensors.clock import Clock, ClockSection
 from factorgraph_dvl.sensors.parameters import SCALAR, Parameter, ParameterSpec
@@ -95,7 +96,7 @@ class Depth:
         surface = Parameter(_SEA_SURFACE, np.array([mean]), np.array([sigma]))
         return (surface, *_CLOCK.parameters(s))
 
-    def observations(self, frame: LocalFrame) -> tuple[Observation, ...]:
+    def observations(self, frame: LocalFrame, body_axes: BodyAxes) -> tuple[Observation, ...]:
         """Return the depths, where there are any."""
         m = np.logical_not(self.missing)
         if not m.any():

@@ -12,6 +12,7 @@ from msgspec import UNSET, UnsetType
 
 from factorgraph_dvl.errors import ConfigError
 from factorgraph_dvl.geometry.earth import LocalFrame
+from factorgraph_dvl.geometry.rotations import BodyAxes
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array, cross, rotate, skew
 from factorgraph_dvl.sensors.clock import Clock, ClockSection
@@ -227,7 +228,7 @@ class Dvl:
             Parameter(CURRENT_SPEC, np.zeros(2), current),
         )
 
-    def observations(self, frame: LocalFrame) -> tuple[Observation, ...]:
+    def observations(self, frame: LocalFrame, body_axes: BodyAxes) -> tuple[Observation, ...]:
         """Return the pings that have a lock."""
         m = self.locked
         if not m.any():

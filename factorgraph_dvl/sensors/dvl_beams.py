@@ -11,7 +11,7 @@ import numpy as np
 from msgspec import UNSET, UnsetType
 
 from factorgraph_dvl.geometry.earth import LocalFrame
-from factorgraph_dvl.geometry.rotations import exp_so3
+from factorgraph_dvl.geometry.rotations import BodyAxes, exp_so3
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array, cross, rotate, skew
 from factorgraph_dvl.sensors.beam_model import CommonGeometry, FreeGeometry, Geometry
@@ -286,7 +286,7 @@ class DvlBeams:
         """Clock of the instrument, that of the DVL unless a `dvl` stands beside it."""
         return _OWN_CLOCK if self.prefix else CLOCK
 
-    def observations(self, frame: LocalFrame) -> tuple[Observation, ...]:
+    def observations(self, frame: LocalFrame, body_axes: BodyAxes) -> tuple[Observation, ...]:
         """Return the pings at which at least one beam was not lost."""
         m = np.logical_not(self.missing)
         if not m.any():

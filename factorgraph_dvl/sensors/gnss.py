@@ -11,6 +11,7 @@ import numpy as np
 from msgspec import UNSET, UnsetType
 
 from factorgraph_dvl.geometry.earth import LocalFrame
+from factorgraph_dvl.geometry.rotations import BodyAxes
 from factorgraph_dvl.geometry.units import DEG, GEODETIC_SI
 from factorgraph_dvl.geometry.vectors import Array, cross, rotate, skew
 from factorgraph_dvl.sensors.clock import Clock, ClockSection
@@ -185,7 +186,7 @@ class Gnss:
         lever_arm = Parameter(_LEVER_ARM, np.array(s.lever_arm_m), np.array(s.lever_arm_std_m))
         return (lever_arm, *_CLOCK.parameters(s))
 
-    def observations(self, frame: LocalFrame) -> tuple[Observation, ...]:
+    def observations(self, frame: LocalFrame, body_axes: BodyAxes) -> tuple[Observation, ...]:
         """Return position and velocity measurements, where there are any."""
         out: list[Observation] = []
         has_position = ~np.isnan(self.geodetic[:, 0])

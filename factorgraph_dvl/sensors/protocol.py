@@ -10,6 +10,7 @@ import numpy as np
 from msgspec import UNSET, UnsetType
 
 from factorgraph_dvl.geometry.earth import LocalFrame
+from factorgraph_dvl.geometry.rotations import BodyAxes
 from factorgraph_dvl.geometry.vectors import Array, cross_variance
 from factorgraph_dvl.sensors.finding import Finding
 from factorgraph_dvl.sensors.parameters import Parameter, ParameterSpec
@@ -213,8 +214,16 @@ class Aid(SensorRecord, Protocol):
     def parameters(self) -> tuple[Parameter, ...]:
         """Return the calibration parameters, fixed ones included."""
 
-    def observations(self, frame: LocalFrame) -> tuple[Observation, ...]:
-        """Return the measurements, with positions expressed in `frame`."""
+    def observations(self, frame: LocalFrame, body_axes: BodyAxes) -> tuple[Observation, ...]:
+        """Return the measurements.
+
+        Parameters
+        ----------
+        frame : LocalFrame
+            Tangent frame n, in which positions are expressed.
+        body_axes : {'RFU', 'FRD', 'FLU'}
+            Axes b of the body: a heading, roll or pitch refers to its bow.
+        """
 
     def explain(self, parameter: str, component: int, motion: Motion | None) -> str:
         """Say why a component could not be observed, given the motion of the trial."""

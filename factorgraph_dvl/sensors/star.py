@@ -19,7 +19,7 @@ from factorgraph_dvl.geometry.celestial import (
     spread,
 )
 from factorgraph_dvl.geometry.earth import LocalFrame, enu_from_ecef
-from factorgraph_dvl.geometry.rotations import inverse_right_jacobian, log_so3
+from factorgraph_dvl.geometry.rotations import BodyAxes, inverse_right_jacobian, log_so3
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array, rotate
 from factorgraph_dvl.sensors.finding import Code, Finding
@@ -327,7 +327,7 @@ class Star:
         apart = np.linalg.norm(iRs.apply(v.body) - v.inertial, axis=1)
         return apart / (float(np.max(self.settings.std_arcsec)) * ARCSEC)
 
-    def observations(self, frame: LocalFrame) -> tuple[Observation, ...]:
+    def observations(self, frame: LocalFrame, body_axes: BodyAxes) -> tuple[Observation, ...]:
         """Return the attitudes that were measured.
 
         Raises

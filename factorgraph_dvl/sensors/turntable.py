@@ -9,6 +9,7 @@ from typing import ClassVar, Self
 import numpy as np
 
 from factorgraph_dvl.geometry.earth import LocalFrame
+from factorgraph_dvl.geometry.rotations import BodyAxes
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.sensors.parameters import Parameter, ParameterSpec
@@ -82,7 +83,7 @@ class Turntable:
         """Return nothing: the angle is taken as exact."""
         return ()
 
-    def observations(self, frame: LocalFrame) -> tuple[Observation, ...]:
+    def observations(self, frame: LocalFrame, body_axes: BodyAxes) -> tuple[Observation, ...]:
         """Return nothing: the turn is a motion of the body, which the IMU sees."""
         return ()
 

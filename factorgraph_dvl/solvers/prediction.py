@@ -87,7 +87,7 @@ def _at_truth(trial: Trial, true_states: TrueStates) -> tuple[Problem, Evaluatio
     seg = segments(inc, STATE_INTERVAL, dense_epochs(trial, frame, STATE_INTERVAL))
     states = true_states(frame, seg.node_time)
     chain = inertial_chain(trial, frame, seg, states)
-    observations, parameters = observed(trial.aids, frame)
+    observations, parameters = observed(trial.aids, frame, trial.body_axes)
     parameters = (*parameters, *trial.imu.error_parameters())
     truth: dict[str, Array] = {}
     for p in parameters:

@@ -111,7 +111,7 @@ def prepare(trial: Trial, state_interval_s: float, report: Progress) -> Preparat
         report("ranges", 0, None)
     start_positions = positions_from_ranges(on_one_clock, frame, seg, start.states)
     seen = [finding for each in attitudes(trial, frame) for finding in each.findings]
-    by_aid = [(aid, *observed([aid], frame)) for aid in trial.aids]
+    by_aid = [(aid, *observed([aid], frame, trial.body_axes)) for aid in trial.aids]
     return Preparation(
         trial=trial,
         frame=frame,
@@ -145,7 +145,8 @@ def mounted_start(
     values = prepared.mountings
     aids = mounted_aids(prepared.trial, prepared.mountings)
     if aids is not None:
-        problem = Problem(chain, *observed(aids, prepared.frame), start=prepared.mountings)
+        found_by = observed(aids, prepared.frame, prepared.trial.body_axes)
+        problem = Problem(chain, *found_by, start=prepared.mountings)
         coarse = minimise(
             problem,
             problem.values(states, problem.prior_values() | prepared.mountings),

@@ -64,7 +64,7 @@ def node_measurements(time=20.0, **changes):
     for aid in trial.aids:
         start, end = seg.node_time
         inside = np.flatnonzero((aid.time >= start) & (aid.time < end - 1e-6))
-        for o in rows_of(aid, inside).observations(frame):
+        for o in rows_of(aid, inside).observations(frame, "RFU"):
             rows.append(Rows(o, slice(count, count + o.time.size), o.time))
             times.append(o.time)
             count += o.time.size
@@ -184,7 +184,7 @@ def test_a_stationary_vessel_reports_the_velocity_of_its_lever_arm():
     none = np.zeros(3)
     measured = NodeMeasurements(
         attachment=attach(seg, dvl.time, none),
-        rows=(Rows(dvl.observations(frame)[0], slice(0, 1), dvl.time),),
+        rows=(Rows(dvl.observations(frame, "RFU")[0], slice(0, 1), dvl.time),),
         parameters=tuple(p for p in dvl.parameters() if p.estimated),
         fixed={p.name: p.mean for p in dvl.parameters() if not p.estimated},
         gravity_n=np.array([[0.0, 0.0, -9.8]]),

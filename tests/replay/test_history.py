@@ -35,7 +35,7 @@ def test_rejected_rows_are_left_out_and_later_ones_removed():
     out = history(trial)
     out.add_aid(trial.dvl)
     assert out.without_rejected(trial.frame()) is None
-    label = trial.dvl.observations(trial.frame())[0].label
+    label = trial.dvl.observations(trial.frame(), "RFU")[0].label
     out.reject(label, trial.dvl.time[[3, 5]])
     fewer = out.without_rejected(trial.frame()).trial(np.inf).dvl.time
     np.testing.assert_array_equal(fewer, np.delete(trial.dvl.time, [3, 5]))

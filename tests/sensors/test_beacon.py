@@ -65,7 +65,7 @@ def test_zero_error_at_the_truth(body_axes):
     frame = LocalFrame(*exact.at(np.array([0.0])).geodetic[0])
     values = {name: value for name, value in trial.calibration_truth.items()}
     assert np.linalg.norm(values["beacon_B2_offset_m"]) > 0.1
-    observations = trial.beacons.observations(frame)
+    observations = trial.beacons.observations(frame, "RFU")
     assert len(observations) == 4
     for o in observations:
         smooth = np.min(np.abs(o.time[:, None] - exact.kinks), axis=1) > 0.01
@@ -80,7 +80,7 @@ def test_a_wrong_sign_of_rotation_or_rate_shows():
     scene = scenario(beacons=beacons())
     exact, trial = plan_motion(scene), simulate(scene)
     frame = LocalFrame(*exact.at(np.array([0.0])).geodetic[0])
-    for o in trial.beacons.observations(frame):
+    for o in trial.beacons.observations(frame, "RFU"):
         motion = exact_motion(exact, frame, o.time)
         turned = replace(motion, nRb=motion.nRb.transpose(0, 2, 1))
         assert np.abs(o.residual(turned, trial.calibration_truth)).max() > 0.1
@@ -98,7 +98,7 @@ def test_jacobians():
     )
     r = replace(r, settings=settings)
     frame = LocalFrame(np.radians(36.0), np.radians(121.0), 0.0)
-    for o in r.observations(frame):
+    for o in r.observations(frame, "RFU"):
         motion = random_motion(o.time.size)
         values = {
             "sound_speed_error": np.array([0.01]),
@@ -125,7 +125,7 @@ def test_by_hand():
         omega_eb_b=np.array([[0.0, 0.0, 0.5]]),
     )
     values = {"sound_speed_error": np.array([0.1]), offset_name("B1"): np.zeros(3)}
-    distance, rate = r.observations(frame)
+    distance, rate = r.observations(frame, "RFU")
     # The transponder is at (3, 4), 5 m away, and moves with (3, 0) + 0.5 · 2 to the north.
     np.testing.assert_allclose(distance.residual(motion, values), [[1.1 * 5.0]], atol=1e-8)
     np.testing.assert_allclose(rate.residual(motion, values), [[1.1 * (9.0 + 4.0) / 5.0]])
@@ -145,7 +145,7 @@ def test_a_two_way_range_is_that_of_its_middle():
         settings, one, np.array(["B1"]), 0.5 * sound * (out + back) * one, np.full(1, np.nan)
     )
     values = {"sound_speed_error": np.zeros(1), offset_name("B1"): np.zeros(3)}
-    (o, *_) = r.observations(frame)
+    (o, *_) = r.observations(frame, "RFU")
 
     def error(since):
         motion = replace(random_motion(1), nRb=np.eye(3)[None], p_n=(asked + v * since)[None])
@@ -250,7 +250,7 @@ def test_columns_of_either_measurement_may_be_absent(tmp_path):
         r.settings, {"time_s": r.time, "beacon": r.name, "range_m": r.range,
                      "range_rate_m_s": np.full(5, np.nan)}, "beacon.csv"
     )  # fmt: skip
-    assert [o.unit for o in none.observations(LocalFrame(0.6, 2.1, 0.0))] == ["m", "m"]
+    assert [o.unit for o in none.observations(LocalFrame(0.6, 2.1, 0.0), "RFU")] == ["m", "m"]
 
 
 def crowd(count):
@@ -288,7 +288,9 @@ def test_each_of_three_hundred_beacons_has_a_variable_of_its_own():
     states = States(np.broadcast_to(np.eye(3), (zero.shape[0], 3, 3)), zero, zero, zero, zero)
     beacon = trial.beacons
     problem = Problem(
-        inertial_chain(trial, frame, seg, states), beacon.observations(frame), beacon.parameters()
+        inertial_chain(trial, frame, seg, states),
+        beacon.observations(frame, "RFU"),
+        beacon.parameters(),
     )
     values = problem.values(states, problem.prior_values())
     assert values.size() == 300 + zero.shape[0] + 1

@@ -35,7 +35,7 @@ def observed(scn):
     fix = trial.gnss.geodetic[0]
     frame = LocalFrame(fix[0] - OFFSET_RAD, fix[1] + OFFSET_RAD, 0.0)
     (depth,) = trial.others
-    (o,) = depth.observations(frame)
+    (o,) = depth.observations(frame, "RFU")
     values = {"sea_surface_height_m": np.array([17.3])}
     return exact_motion(plan_motion(scn), frame, o.time), o, values, depth
 

@@ -86,7 +86,7 @@ def observation(m=5, *, values=None, lost=(), seed=0, **changes):
     for ping, beam in lost:
         velocity[ping, beam] = np.nan
     sensor = beams(velocity, **changes)
-    (found,) = sensor.observations(None)
+    (found,) = sensor.observations(None, "RFU")
     return found, sensor.parameters()
 
 
@@ -264,7 +264,7 @@ def test_zero_error_at_the_truth_on_a_turntable(slants, body_axes):
     scn = scene(slants, body_axes=body_axes)
     trial = simulate(scn)
     frame = trial.frame()
-    found = {o.label: o for aid in trial.aids for o in aid.observations(frame)}
+    found = {o.label: o for aid in trial.aids for o in aid.observations(frame, "RFU")}
     truth = trial.calibration_truth
     eta = turns_to(trial.beams.nominal_b, truth["beam_direction_b"]).ravel()
     values = {**truth, "beam_direction_b": eta}
@@ -283,7 +283,7 @@ def test_the_antenna_does_not_turn_with_the_body():
     scn = scene()
     trial = simulate(scn)
     frame = trial.frame()
-    fixed = replace(trial.gnss, turning=None).observations(frame)
+    fixed = replace(trial.gnss, turning=None).observations(frame, "RFU")
     motion = exact_motion(plan_motion(scn), frame, fixed[0].time)
     error = fixed[0].residual(motion, trial.calibration_truth)
     late = fixed[0].time > 36.0
@@ -300,7 +300,7 @@ def test_antenna_jacobians_on_a_turntable():
     names = ("time", "geodetic", "velocity", "position_std", "velocity_std")
     few = replace(trial.gnss, **{name: getattr(trial.gnss, name)[during] for name in names})
     assert np.abs(few.carrier(few.time)[1]).max() > 0.05
-    for o in few.observations(trial.frame()):
+    for o in few.observations(trial.frame(), "RFU"):
         motion = exact_motion(plan_motion(scn), trial.frame(), o.time)
         values = {"gnss_lever_arm_m": np.array([0.3, -1.5, 4.0])}
         check_jacobians(o, motion, values, few.parameters(), tolerance=1e-7)
@@ -674,7 +674,7 @@ def test_calibrated_beams_are_an_exact_dvl():
         "current_m_s": np.zeros(2),
     }
     assert not any(p.estimated for p in dvl.parameters())
-    (o,) = dvl.observations(trial.frame())
+    (o,) = dvl.observations(trial.frame(), "RFU")
     scn = scene(turntable=None, gnss=None, trial=SILENT)
     motion = exact_motion(plan_motion(scn), trial.frame(), o.time)
     assert np.abs(o.residual(motion, values)).max() < 1e-12

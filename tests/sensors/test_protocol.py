@@ -17,4 +17,4 @@ def test_rows_of_a_record_are_joined_in_the_order_of_time():
     out = joined(parts)
     np.testing.assert_array_equal(out.time, dvl.time[[0, 1, 2, 4]])
     np.testing.assert_array_equal(out.velocity, dvl.velocity[[0, 1, 2, 4]])
-    assert isinstance(out.observations(LocalFrame(0.0, 0.0, 0.0))[0], DvlVelocity)
+    assert isinstance(out.observations(LocalFrame(0.0, 0.0, 0.0), "RFU")[0], DvlVelocity)

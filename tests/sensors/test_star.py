@@ -196,7 +196,7 @@ def test_zero_error_at_the_truth(body_axes):
     trial = simulate(scene)
     fix = trial.gnss.geodetic[0]
     frame = LocalFrame(fix[0] - 0.01, fix[1] + 0.01, 0.0, scene.epoch)
-    (o,) = star_of(trial).observations(frame)
+    (o,) = star_of(trial).observations(frame, "RFU")
     motion = exact_motion(plan_motion(scene), frame, o.time)
     values = {"star_mounting_deg": exp_so3(np.array(MOUNTING_DEG) * DEG)}
     assert np.abs(o.residual(motion, values)).max() < 1e-5
@@ -244,7 +244,7 @@ def test_residual_by_hand():
 def test_whitened_residuals_hold_the_whole_covariance():
     trial = simulate(config("star", **SHORT, star={"stars": PRINTED.tolist()}), 0)
     star, frame = star_of(trial), trial.frame()
-    (o,) = star.observations(frame)
+    (o,) = star.observations(frame, "RFU")
     motion = replace(
         random_motion(star.time.size), nRb=random_rotations(star.time.size).as_matrix()
     )
@@ -257,7 +257,7 @@ def test_whitened_residuals_hold_the_whole_covariance():
 
 def test_sigma_may_differ_about_the_axes():
     star = star_by_hand(std_arcsec=(3.0, 4.0, 50.0))
-    (o,) = star.observations(LocalFrame(0.4, 2.3, 0.0, EPOCH))
+    (o,) = star.observations(LocalFrame(0.4, 2.3, 0.0, EPOCH), "RFU")
     np.testing.assert_allclose(o.std, [[3.0, 4.0, 50.0]] * 2)
 
 

@@ -66,7 +66,7 @@ def observed(scn):
     trial = simulate(scn)
     fix = trial.gnss.geodetic[0]
     frame = LocalFrame(fix[0] - OFFSET_RAD, fix[1] + OFFSET_RAD, 0.0)
-    out = {o.label: o for aid in trial.aids for o in aid.observations(frame)}
+    out = {o.label: o for aid in trial.aids for o in aid.observations(frame, "RFU")}
     return plan_motion(scn), frame, out
 
 
@@ -112,7 +112,7 @@ def test_dvl_velocity_jacobians(scale, misalignment):
     )
     time = np.arange(5.0)
     dvl = Dvl(settings, time, rng.normal(0.0, 3.0, (5, 3)), np.full((5, 3), 0.01))
-    (o,) = dvl.observations(LocalFrame(0.6, 2.1, 0.0))
+    (o,) = dvl.observations(LocalFrame(0.6, 2.1, 0.0), "RFU")
     values = dvl_values(
         scale_error=np.array(scale),
         misalignment_deg=exp_so3(np.array(misalignment) * DEG),
@@ -154,7 +154,7 @@ def test_antenna_jacobians():
     )
     motion = random_motion()
     values = {"gnss_lever_arm_m": np.array([0.3, -1.5, 4.0])}
-    for o in gnss.observations(LocalFrame(0.6, 2.1, 0.0)):
+    for o in gnss.observations(LocalFrame(0.6, 2.1, 0.0), "RFU"):
         # Positions of 3e5 m leave central differences of 1e-6 with 1e-4 of noise.
         shift = 0.0 if o.label == "GNSS velocity" else o.measured_n
         near = replace(motion, p_n=motion.p_n + shift)
@@ -277,7 +277,7 @@ def test_a_receiver_without_position_keeps_the_level_axes_of_its_last_fix():
         np.full((3, 3), nan),
         np.full((3, 3), nan),
     )
-    position, velocity = gnss.observations(frame)
+    position, velocity = gnss.observations(frame, "RFU")
     assert position.time.tolist() == [1.0]
     expected = frame.level_from_tangent(0.61, 2.12)
     np.testing.assert_allclose(velocity.lRn, np.tile(expected, (3, 1, 1)))

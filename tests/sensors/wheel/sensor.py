@@ -9,6 +9,7 @@ from typing import ClassVar, Self
 import numpy as np
 
 from factorgraph_dvl.geometry.earth import LocalFrame
+from factorgraph_dvl.geometry.rotations import BodyAxes
 from factorgraph_dvl.geometry.vectors import Array, rotate, skew
 from factorgraph_dvl.sensors.parameters import SCALAR, Parameter, ParameterSpec
 from factorgraph_dvl.sensors.protocol import (
@@ -68,7 +69,7 @@ class Wheel:
         """Return the scale error."""
         return (Parameter(SCALE, np.zeros(1), np.array([self.settings.scale_error_std])),)
 
-    def observations(self, frame: LocalFrame) -> tuple[Observation, ...]:
+    def observations(self, frame: LocalFrame, body_axes: BodyAxes) -> tuple[Observation, ...]:
         """Return the speeds."""
         s = self.settings
         return (WheelSpeed(self.time, self.speed, s.speed_std_m_s, np.array(s.ahead)),)
