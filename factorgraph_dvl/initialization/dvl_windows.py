@@ -12,7 +12,7 @@ mirrored axes, -C. That the noise is the DVL's and not the IMU's is why c stands
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -21,11 +21,13 @@ from scipy.spatial.transform import Rotation
 from factorgraph_dvl.geometry.rotations import exp_so3
 from factorgraph_dvl.geometry.vectors import Array, skew
 from factorgraph_dvl.initialization.carried_windows import CarriedWindows
-from factorgraph_dvl.initialization.gnss_windows import sorted_into, steady
+from factorgraph_dvl.initialization.velocity_windows import (
+    VelocityWindows,
+    sorted_into,
+    steady,
+)
 from factorgraph_dvl.sensors.dvl import Dvl
 
-# Pings that a window takes at least. Chosen: twice the unknowns of its polynomial.
-_LEAST = 10
 # Elements of C, and of what enters linearly: c l and c.
 _AXES = 9
 _REST = 4
@@ -62,68 +64,27 @@ class DvlFit:
 
 
 @dataclass(frozen=True)
-class DvlWindows:
-    """Pings, sorted into the windows of the carried IMU.
+class DvlWindows(VelocityWindows):
+    """Pings, sorted into the windows of the carried IMU; velocities in the axes of the DVL.
 
     Parameters
     ----------
-    windows : CarriedWindows
-        The carried IMU.
-    ping_time : ndarray, shape (M,), s
-        Stamps of the pings.
-    velocity : ndarray, shape (M, 3), m/s
-        In the axes of the DVL.
-    sigma : ndarray, shape (M,), m/s
-        Its stated standard deviation.
-    rows, inside : ndarray, shape (W, n)
-        Which pings are in a window; the rest fills the table up.
-    window : ndarray, shape (W,)
-        Which window it is.
     handedness : {0, 1, -1}
         Of the DVL's axes: 1 right-handed, -1 mirrored, 0 whichever fits better.
     """
 
-    windows: CarriedWindows
-    ping_time: Array
-    velocity: Array
-    sigma: Array
-    rows: np.ndarray
-    inside: np.ndarray
-    window: np.ndarray
     handedness: int = 0
-
-    @property
-    def time(self) -> Array:
-        """Times as in the record, (W, n), s."""
-        return self.ping_time[self.rows]
 
     @property
     def count(self) -> Array:
         """Degrees of freedom of each window, (W,)."""
-        return np.asarray(3.0 * self.inside.sum(axis=1) - 9.0)
-
-    @cached_property
-    def _basis(self) -> Array:
-        t = (self.time - self.time[:, :1]) / self.windows.length
-        columns = np.stack([np.ones_like(t), t, t**2], axis=2) * self.inside[..., None]
-        return np.linalg.qr(columns)[0]
+        return self.freedom(9)
 
     @cached_property
     def signal(self) -> Array:
         """Sum of squares of the velocity's changes in each window, (W,)."""
-        carried = self.windows.at(*self._at(0.0)).speed.reshape(*self.rows.shape, 3)
-        return np.asarray(np.sum(self._without_trend(carried) ** 2, axis=(1, 2)))
-
-    @property
-    def noise(self) -> float:
-        """Stated standard deviation of a component, m/s."""
-        return float(np.median(self.sigma[self.rows[self.inside]]))
-
-    def only(self, lines: np.ndarray) -> DvlWindows:
-        """Return some of the windows."""
-        return replace(
-            self, rows=self.rows[lines], inside=self.inside[lines], window=self.window[lines]
-        )
+        carried = self.carried(0.0).speed.reshape(*self.rows.shape, 3)
+        return np.asarray(np.sum(self.without_trend(carried) ** 2, axis=(1, 2)))
 
     def residual(self, offset: float | Array) -> Array:
         """Return what is left of the velocities if the DVL is late by an offset, (W, n, 3)."""
@@ -132,14 +93,14 @@ class DvlWindows:
     def fit(self, offset: float | Array) -> DvlFit:
         """Return how the DVL fits if it is late by an offset, s, constant or (W, n)."""
         shape = self.rows.shape
-        at = self.windows.at(*self._at(offset))
+        at = self.carried(offset)
         turn = at.turn.reshape(*shape, 3, 3)
         velocity = self.velocity[self.rows]
         axes = np.einsum("wnij,wnk->wnijk", turn, velocity).reshape(*shape, 3, 9)
         arm = -turn @ skew(at.rate).reshape(*shape, 3, 3)
         speed = at.speed.reshape(*shape, 3, 1)
         columns = np.concatenate([axes, arm, -speed], axis=3)
-        kept = self._without_trend(columns.reshape(*shape, -1)).reshape(columns.shape)
+        kept = self.without_trend(columns.reshape(*shape, -1)).reshape(columns.shape)
         flat = kept.reshape(-1, _AXES + _REST)
         gram = flat.T @ flat
         form, linear = _eliminated(gram)
@@ -158,14 +119,6 @@ class DvlWindows:
             scale_error=float(1.0 / abs(c) - 1.0),
             lever_arm=x[_AXES:-1] / c,
         )
-
-    def _at(self, offset: float | Array) -> tuple[np.ndarray, Array]:
-        window = np.broadcast_to(self.window[:, None], self.rows.shape)
-        return window.ravel(), (self.time - offset).ravel()
-
-    def _without_trend(self, values: Array) -> Array:
-        kept = values * self.inside[..., None]
-        return kept - self._basis @ (self._basis.transpose(0, 2, 1) @ kept)
 
 
 def dvl_windows(windows: CarriedWindows, dvl: Dvl, later: float = 0.0) -> DvlWindows | None:
@@ -188,11 +141,11 @@ def dvl_windows(windows: CarriedWindows, dvl: Dvl, later: float = 0.0) -> DvlWin
     locked = dvl.locked.copy()
     locked[locked] = steady(dvl.velocity[locked])
     time = dvl.time[locked]
-    rows, inside, window = sorted_into(windows, time - later, _LEAST)
-    if window.size == 0:
+    table = sorted_into(windows, time - later)
+    if table is None:
         return None
     sigma = np.sqrt(np.mean(dvl.sigma()[locked] ** 2, axis=1))
-    return DvlWindows(windows, time, dvl.velocity[locked], sigma, rows, inside, window)
+    return DvlWindows(windows, time, dvl.velocity[locked], sigma, *table)
 
 
 def _eliminated(gram: Array) -> tuple[Array, Array]:

@@ -7,16 +7,20 @@ heading, so that attitude is known too where the vessel manoeuvres.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy.ndimage import median_filter
 
 from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.units import STANDARD_GRAVITY
 from factorgraph_dvl.geometry.vectors import Array, rotate, skew
 from factorgraph_dvl.initialization.carried_windows import CarriedWindows
+from factorgraph_dvl.initialization.velocity_windows import (
+    VelocityWindows,
+    sorted_into,
+    steady,
+)
 from factorgraph_dvl.sensors.gnss import Gnss
 
 # Fixes this far apart, s, give a mean velocity where the receiver reports none. Chosen: a
@@ -27,13 +31,7 @@ _BASELINE_S = 5.0
 _ARM_SIGMA_M = 5.0
 _ARM_STEPS = 2
 _TINY = 1e-12
-# Neighbours with whose median a velocity is compared, and what makes an outlier, in usual second
-# differences. Chosen: a false lock for a ping or two, and never sway.
-_NEIGHBOURS = 5
-_OUTLIER = 8.0
 _NUDGE = np.array([1e-4, 2e-4, 3e-4])
-# Measurements that a window takes at least. Chosen: twice its unknowns.
-_LEAST = 10
 
 
 @dataclass(frozen=True)
@@ -116,74 +114,45 @@ class WindowFit:
 
 
 @dataclass(frozen=True)
-class GnssWindows:
-    """Velocities of GNSS, sorted into the windows of the carried IMU.
+class GnssWindows(VelocityWindows):
+    """Velocities of GNSS, east, north, up, sorted into the windows of the carried IMU.
 
     Parameters
     ----------
-    windows : CarriedWindows
-        The carried IMU.
-    velocities : LevelVelocities
-        Velocities of the antenna.
-    arms : pair of ndarray, shape (N, 3)
+    begin, end : ndarray, shape (N,), s
+        Spans whose mean the velocities are, stamped at their middle.
+    arm, omega_cb_b : ndarray, shape (N, 3)
         Lever arm of the antenna in body, m, and the rate of the body relative to what carries
         the antenna, rad/s, at the velocities.
-    rows : ndarray, shape (W, n)
-        Which velocities are in a window.
-    inside : ndarray of bool, shape (W, n)
-        Which of them are meant; the rest fills the table up.
-    window : ndarray, shape (W,)
-        Which window it is.
     """
 
-    windows: CarriedWindows
-    velocities: LevelVelocities
-    arms: tuple[Array, Array]
-    rows: np.ndarray
-    inside: np.ndarray
-    window: np.ndarray
-
-    @property
-    def time(self) -> Array:
-        """Times as in the record, (W, n), s."""
-        return self.velocities.middle[self.rows]
-
-    @cached_property
-    def measured(self) -> Array:
-        """Velocities, (W, n, 3), without their polynomial."""
-        return self.without_trend(self.velocities.velocity[self.rows])
-
-    @cached_property
-    def _basis(self) -> Array:
-        t = (self.time - self.time[:, :1]) / self.windows.length
-        columns = np.stack([np.ones_like(t), t, t**2], axis=2) * self.inside[..., None]
-        return np.linalg.qr(columns)[0]
-
-    def without_trend(self, values: Array) -> Array:
-        """Return values (W, n, c) without the parabola that fits them best in each window."""
-        kept = values * self.inside[..., None]
-        return kept - self._basis @ (self._basis.transpose(0, 2, 1) @ kept)
+    begin: Array
+    end: Array
+    arm: Array
+    omega_cb_b: Array
 
     @property
     def count(self) -> Array:
         """Degrees of freedom of each window, (W,)."""
-        return np.asarray(3.0 * self.inside.sum(axis=1) - 10.0)
+        return self.freedom(10)
 
-    def carried(self, offset: float | Array) -> Array:
+    @cached_property
+    def measured(self) -> Array:
+        """Velocities, (W, n, 3), without their polynomial."""
+        return self.without_trend(self.velocity[self.rows])
+
+    def antenna(self, offset: float | Array) -> Array:
         """Return the carried velocity if GNSS is late by an offset, (W, n, 3, 4).
 
         That of the antenna, and what each component of its lever arm adds to it.
         """
-        window = np.broadcast_to(self.window[:, None], self.rows.shape).ravel()
-        late = np.broadcast_to(offset, self.rows.shape).ravel()
-        begin, end = (x[self.rows].ravel() for x in (self.velocities.begin, self.velocities.end))
-        arm, omega_cb_b = (x[self.rows].reshape(-1, 3) for x in self.arms)
-        first = self.windows.at(window, begin - late)
-        if np.array_equal(begin, end):
+        arm, omega_cb_b = (x[self.rows].reshape(-1, 3) for x in (self.arm, self.omega_cb_b))
+        first = self.carried(offset, self.begin)
+        if np.array_equal(self.begin, self.end):
             speed, by_arm = first.speed, first.turn @ skew(first.rate - omega_cb_b)
         else:
-            last = self.windows.at(window, end - late)
-            span = np.maximum(end - begin, 1e-6)[:, None]
+            last = self.carried(offset, self.end)
+            span = np.maximum(self.end - self.begin, 1e-6)[self.rows].reshape(-1, 1)
             speed = (last.place - first.place) / span
             by_arm = (last.turn - first.turn) / span[..., None]
         speed = speed + rotate(by_arm, arm)
@@ -195,21 +164,9 @@ class GnssWindows:
         """Sum of squares of the velocity's changes in each window, (W,)."""
         return np.asarray(np.sum(self.measured**2, axis=(1, 2)))
 
-    @property
-    def noise(self) -> float:
-        """Stated standard deviation of a component, m/s."""
-        return float(np.median(self.velocities.sigma[self.rows[self.inside]]))
-
-    def only(self, lines: np.ndarray) -> GnssWindows:
-        """Return some of the windows."""
-        return replace(
-            self, rows=self.rows[lines], inside=self.inside[lines], window=self.window[lines]
-        )
-
     def attitude(self, offset: float | Array, level_R: Array) -> Array:
         """Return body to east, north, up at the velocities, (W, n, 3, 3), by a fit's level_R."""
-        window = np.broadcast_to(self.window[:, None], self.rows.shape).ravel()
-        turn = self.windows.at(window, (self.time - offset).ravel()).turn
+        turn = self.carried(offset).turn
         return level_R[:, None] @ turn.reshape(*self.rows.shape, 3, 3)
 
     def residual(self, offset: float | Array) -> Array:
@@ -218,7 +175,7 @@ class GnssWindows:
 
     def fit(self, offset: float | Array) -> WindowFit:
         """Return how GNSS fits if it is late by an offset, s, constant or (W, n)."""
-        carried = self.carried(offset)
+        carried = self.antenna(offset)
         level_R = self._tilt(carried[..., 0])
         kept = self.without_trend(carried.reshape(*self.rows.shape, 12))
         leveled = level_R[:, None] @ kept.reshape(carried.shape)
@@ -259,7 +216,7 @@ class GnssWindows:
     def _tilt(self, carried: Array) -> Array:
         """Return the rotations that level the carried force, by its mean, (W, 3, 3)."""
         up = np.array([0.0, 0.0, STANDARD_GRAVITY])
-        wanted = self._slope(self.velocities.velocity[self.rows]) + up
+        wanted = self._slope(self.velocity[self.rows]) + up
         return _shortest(self._slope(carried), wanted)
 
     def _slope(self, values: Array) -> Array:
@@ -291,40 +248,11 @@ def gnss_windows(windows: CarriedWindows, gnss: Gnss, later: float = 0.0) -> Gns
     v = level_velocities(gnss)
     if v.begin.size == 0:
         return None
-    middle = v.middle - later
-    rows, inside, window = sorted_into(windows, middle, _LEAST)
-    if window.size == 0:
+    table = sorted_into(windows, v.middle - later)
+    if table is None:
         return None
-    return GnssWindows(windows, v, gnss.lever_arm(v.middle), rows, inside, window)
-
-
-def steady(velocity: Array) -> np.ndarray:
-    """Return which velocities (M, 3) are no outliers beside their neighbours, (M,) bool."""
-    if velocity.shape[0] < _NEIGHBOURS:
-        return np.ones(velocity.shape[0], dtype=bool)
-    deviation = np.abs(velocity - median_filter(velocity, size=(_NEIGHBOURS, 1), mode="nearest"))
-    usual = np.maximum(np.median(np.abs(np.diff(velocity, n=2, axis=0)), axis=0), _TINY)
-    return np.asarray(np.all(deviation <= _OUTLIER * usual, axis=1))
-
-
-def sorted_into(
-    windows: CarriedWindows, time: Array, least: int
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return which of times (M,) are in which window, as a table that is filled up.
-
-    Rows (W, n), which of them are meant (W, n), and the window of each line (W,).
-    """
-    window = windows.window_of(time)
-    lines = [np.flatnonzero(window == w) for w in range(windows.start.size)]
-    used = np.array([w for w, line in enumerate(lines) if line.size >= least], dtype=int)
-    width = max((lines[w].size for w in used), default=0)
-    rows = np.zeros((used.size, width), dtype=int)
-    inside = np.zeros((used.size, width), dtype=bool)
-    for i, w in enumerate(used):
-        rows[i] = lines[w][-1]
-        rows[i, : lines[w].size] = lines[w]
-        inside[i, : lines[w].size] = True
-    return rows, inside, used
+    arms = gnss.lever_arm(v.middle)
+    return GnssWindows(windows, v.middle, v.velocity, v.sigma, *table, v.begin, v.end, *arms)
 
 
 def rotate_rows(rotations: Array, vectors: Array) -> Array:

@@ -43,7 +43,7 @@ def body_directions(
     """Return vertical and course in body axes, as GNSS and gravity show them."""
     nRb = compared.attitude(offset, fit.level_R)
     up = nRb[..., 2, :][compared.inside].mean(axis=0)
-    velocity = compared.velocities.velocity[compared.rows]
+    velocity = compared.velocity[compared.rows]
     speed = np.hypot(velocity[..., 0], velocity[..., 1])
     use = compared.inside & (speed > _LEAST_SPEED)
     use &= (fit.heading_sigma < _LARGEST_SIGMA)[:, None]

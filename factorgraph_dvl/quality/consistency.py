@@ -284,7 +284,6 @@ def _gnss_mistake(view: _GnssView) -> str:
 
     East and north swapped are, but for the unknown heading, one of them mirrored.
     """
-    velocities = view.compared.velocities
     for text, matrix in (
         (
             "latitude and longitude (east and north) look swapped, or one of the wrong sign",
@@ -292,8 +291,7 @@ def _gnss_mistake(view: _GnssView) -> str:
         ),
         ("up looks of the wrong sign: height_m and vel_u_m_s are positive up", _DOWN),
     ):
-        turned = replace(velocities, velocity=velocities.velocity @ matrix.T)
-        other = replace(view.compared, velocities=turned)
+        other = replace(view.compared, velocity=view.compared.velocity @ matrix.T)
         share, _ = least_misfit(other, view.around, _REACH_S)
         if share - 1.5 * noise_share(other) < _LEFT * view.excess:
             return text

@@ -1,0 +1,125 @@
+"""Velocities of a sensor, sorted into the windows of the carried IMU.
+
+Within a window a parabola takes gravity, start and biases out of all velocities that are compared.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Self
+
+import numpy as np
+from scipy.ndimage import median_filter
+
+from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.initialization.carried_windows import CarriedMotion, CarriedWindows
+
+# Measurements that a window takes at least. Chosen: twice the unknowns
+_LEAST = 10
+# Neighbours with whose median a velocity is compared, and what makes an outlier, in usual second
+# differences. Chosen: a false lock for a ping or two, and never sway.
+_NEIGHBOURS = 5
+_OUTLIER = 8.0
+# Keeps a division defined where nothing moves, in the unit of what it bounds.
+_TINY = 1e-12
+
+
+@dataclass(frozen=True)
+class VelocityWindows:
+    """Velocities at N times, sorted into W windows of at most n.
+
+    Parameters
+    ----------
+    windows : CarriedWindows
+        The carried IMU.
+    stamp : ndarray, shape (N,), s
+        Times of the velocities.
+    velocity : ndarray, shape (N, 3), m/s
+        The velocities, in the axes that their sensor reports.
+    sigma : ndarray, shape (N,), m/s
+        Their stated standard deviations.
+    rows : ndarray, shape (W, n)
+        Which velocities are in a window.
+    inside : ndarray of bool, shape (W, n)
+        Which of them are meant; the rest fills the table up.
+    window : ndarray, shape (W,)
+        Which window it is.
+    """
+
+    windows: CarriedWindows
+    stamp: Array
+    velocity: Array
+    sigma: Array
+    rows: np.ndarray
+    inside: np.ndarray
+    window: np.ndarray
+
+    @property
+    def time(self) -> Array:
+        """Times as in the record, (W, n), s."""
+        return self.stamp[self.rows]
+
+    @property
+    def noise(self) -> float:
+        """Stated standard deviation of a component, m/s."""
+        return float(np.median(self.sigma[self.rows[self.inside]]))
+
+    def only(self, lines: np.ndarray) -> Self:
+        """Return some of the windows."""
+        return replace(
+            self, rows=self.rows[lines], inside=self.inside[lines], window=self.window[lines]
+        )
+
+    def freedom(self, unknowns: int) -> Array:
+        """Return the degrees of freedom that so many unknowns leave in each window, (W,)."""
+        return np.asarray(3.0 * self.inside.sum(axis=1) - unknowns)
+
+    def carried(self, offset: float | Array, stamp: Array | None = None) -> CarriedMotion:
+        """Return the motion of the IMU at stamps (N,) that are late by an offset, W n times."""
+        time = self.time if stamp is None else stamp[self.rows]
+        window = np.broadcast_to(self.window[:, None], self.rows.shape)
+        return self.windows.at(window.ravel(), (time - offset).ravel())
+
+    def without_trend(self, values: Array) -> Array:
+        """Return values (W, n, c) without the parabola that fits them best in each window."""
+        kept = values * self.inside[..., None]
+        return kept - self._basis @ (self._basis.transpose(0, 2, 1) @ kept)
+
+    @cached_property
+    def _basis(self) -> Array:
+        t = (self.time - self.time[:, :1]) / self.windows.length
+        columns = np.stack([np.ones_like(t), t, t**2], axis=2) * self.inside[..., None]
+        return np.linalg.qr(columns)[0]
+
+
+def steady(velocity: Array) -> np.ndarray:
+    """Return which velocities (M, 3) are no outliers beside their neighbours, (M,) bool."""
+    if velocity.shape[0] < _NEIGHBOURS:
+        return np.ones(velocity.shape[0], dtype=bool)
+    deviation = np.abs(velocity - median_filter(velocity, size=(_NEIGHBOURS, 1), mode="nearest"))
+    usual = np.maximum(np.median(np.abs(np.diff(velocity, n=2, axis=0)), axis=0), _TINY)
+    return np.asarray(np.all(deviation <= _OUTLIER * usual, axis=1))
+
+
+def sorted_into(
+    windows: CarriedWindows, time: Array
+) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+    """Return which of times (M,) are in which window, as a table that is filled up.
+
+    Rows (W, n), which of them are meant (W, n), and the window of each line (W,); None where no
+    window has enough.
+    """
+    window = windows.window_of(time)
+    lines = [np.flatnonzero(window == w) for w in range(windows.start.size)]
+    used = np.array([w for w, line in enumerate(lines) if line.size >= _LEAST], dtype=int)
+    if used.size == 0:
+        return None
+    width = max(lines[w].size for w in used)
+    rows = np.zeros((used.size, width), dtype=int)
+    inside = np.zeros((used.size, width), dtype=bool)
+    for i, w in enumerate(used):
+        rows[i] = lines[w][-1]
+        rows[i, : lines[w].size] = lines[w]
+        inside[i, : lines[w].size] = True
+    return rows, inside, used

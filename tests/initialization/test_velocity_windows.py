@@ -1,0 +1,90 @@
+"""Velocities of a sensor in the windows of the carried IMU."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from factorgraph_dvl.initialization.carried_windows import CarriedWindows
+from factorgraph_dvl.initialization.velocity_windows import VelocityWindows, sorted_into, steady
+
+
+@pytest.fixture
+def windows() -> CarriedWindows:
+    """Two windows of 20 s with a gap between them, at rest in axes of the start."""
+    n = 50
+    zero = np.zeros((2, n, 3))
+    turn = np.tile(np.eye(3), (2, n, 1, 1))
+    start = np.array([5.0, 40.0])
+    return CarriedWindows(start, 20.0, start - 2.0, 0.5, turn, zero, zero, zero)
+
+
+def of(windows: CarriedWindows, time: np.ndarray, velocity: np.ndarray) -> VelocityWindows:
+    table = sorted_into(windows, time)
+    assert table is not None
+    return VelocityWindows(windows, time, velocity, np.full(time.size, 0.1), *table)
+
+
+def test_times_go_into_their_window(windows):
+    time = np.arange(0.0, 50.0)
+    rows, inside, window = sorted_into(windows, time)
+    assert window.tolist() == [0, 1]
+    assert time[rows[0][inside[0]]].tolist() == list(range(5, 25))
+    assert time[rows[1][inside[1]]].tolist() == list(range(40, 50))
+    # The shorter one is filled up with what is in it.
+    assert rows.shape == (2, 20)
+    assert set(rows[1]) == set(range(40, 50))
+
+
+def test_a_window_with_few_is_left_out(windows):
+    rows, inside, window = sorted_into(windows, np.arange(0.0, 49.0))
+    assert window.tolist() == [0]
+    assert inside.all()
+    assert rows.shape == (1, 20)
+    assert sorted_into(windows, np.arange(25.0, 40.0)) is None
+
+
+def test_a_parabola_is_taken_out_of_each_window_and_nothing_else(windows):
+    time = np.arange(0.0, 50.0)
+    t = time[:, None]
+    parabola = np.where(t < 30.0, 1.0 + 0.2 * t - 0.01 * t**2, -3.0 + 0.05 * t**2)
+    rng = np.random.default_rng(0)
+    noise = rng.normal(0.0, 1.0, (time.size, 3))
+    there = of(windows, time, noise)
+    left = there.without_trend(there.velocity[there.rows])
+    again = of(windows, time, parabola + noise)
+    kept = again.without_trend(again.velocity[again.rows])
+    np.testing.assert_allclose(kept, left, atol=1e-9)
+    assert not kept[~again.inside].any()
+    # Three unknowns for each component.
+    squares = np.sum(left**2) / there.freedom(9).sum()
+    assert 0.6 < squares < 1.5
+
+
+def test_some_of_the_windows(windows):
+    whole = of(windows, np.arange(0.0, 50.0), np.zeros((50, 3)))
+    part = whole.only(np.array([1]))
+    assert part.window.tolist() == [1]
+    np.testing.assert_array_equal(part.time, whole.time[1:])
+    np.testing.assert_array_equal(part.freedom(9), whole.freedom(9)[1:])
+    assert part.noise == whole.noise == 0.1
+
+
+def test_a_late_stamp_is_carried_to_its_true_time(windows):
+    moving = np.cumsum(np.ones((2, 50, 3)), axis=1) * 0.5
+    carried = CarriedWindows(
+        windows.start, 20.0, windows.begin, 0.5, windows.turn, moving, moving, 0.0 * moving
+    )
+    there = of(carried, np.arange(0.0, 50.0), np.zeros((50, 3)))
+    shift = there.carried(0.0).speed - there.carried(0.3).speed
+    np.testing.assert_allclose(shift, 0.3, atol=1e-12)
+
+
+def test_an_outlier_is_no_steady_velocity_and_sway_is():
+    time = np.arange(0.0, 20.0, 0.2)
+    velocity = np.stack([np.sin(time), np.cos(time), 0.1 * time], axis=1)
+    velocity += np.random.default_rng(0).normal(0.0, 0.01, velocity.shape)
+    assert steady(velocity).all()
+    velocity[40] += 3.0
+    assert np.flatnonzero(~steady(velocity)).tolist() == [40]
+    assert steady(velocity[:3]).all()
