@@ -1,10 +1,10 @@
-"""Solution folders, format 1: calibration.json, trajectory.csv, history.csv, latency.csv."""
+"""Solution folders, format 1: calibration, trajectory, residuals, and what solvers add."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import msgspec
 import numpy as np
@@ -23,14 +23,21 @@ from factorgraph_dvl.io.motion_table import (
     motion_columns,
     read_motion,
 )
+from factorgraph_dvl.io.residual_table import (
+    read_residuals,
+    rejected_columns,
+    residual_columns,
+)
 from factorgraph_dvl.io.tables import write_table
-from factorgraph_dvl.solution import Hypothesis, Residuals, Solution, Trajectory
+from factorgraph_dvl.solution import Hypothesis, Solution, Trajectory
 
 TRAJECTORY_FILE = "trajectory.csv"
 HISTORY_FILE = "history.csv"
 HYPOTHESES_FILE = "hypotheses.json"
 HYPOTHESES_FOLDER = "hypotheses"
 REJECTED_FILE = "rejected.csv"
+# Parquet: a third of the bytes of a CSV table, and read ten times as fast.
+RESIDUALS_FILE = "residuals.parquet"
 LATENCY_FILE = "latency.csv"
 CONVERGENCE_FILE = "convergence.csv"
 INSTRUMENT_FILE = "instrument.yaml"
@@ -41,7 +48,7 @@ FIGURES_FOLDER = "figures"
 # What is written with a solution; the first is in every one.
 OWNED = (
     *(CALIBRATION_FILE, TRAJECTORY_FILE, HISTORY_FILE, LATENCY_FILE, CONVERGENCE_FILE),
-    *(HYPOTHESES_FILE, f"{HYPOTHESES_FOLDER}/[0-9]*.csv", REJECTED_FILE),
+    *(HYPOTHESES_FILE, f"{HYPOTHESES_FOLDER}/[0-9]*.csv", REJECTED_FILE, RESIDUALS_FILE),
     *(INSTRUMENT_FILE, BEAMS_FILE, BEAM_ANGLES_FILE, HALVES_FILE),
     *(
         f"{FIGURES_FOLDER}/{name}.png"
@@ -102,7 +109,9 @@ def save_solution(
         if solution.hypotheses:
             _write_hypotheses(folder, solution.hypotheses)
         if solution.rejected:
-            write_table(folder / REJECTED_FILE, _rejected_columns(solution.rejected))
+            write_table(folder / REJECTED_FILE, rejected_columns(solution.rejected))
+        if solution.residuals:
+            write_table(folder / RESIDUALS_FILE, residual_columns(solution.residuals))
         if extra is not None:
             extra(folder)
         (folder / CALIBRATION_FILE).write_bytes(encode_calibration(solution))
@@ -119,28 +128,6 @@ def _write_hypotheses(folder: Path, hypotheses: Sequence[Hypothesis]) -> None:
         items.append(_Hypothesis(h.weight, h.born, h.died, name, time, weight))
     text = msgspec.json.format(msgspec.json.encode(_Hypotheses(1, items)), indent=2) + b"\n"
     (folder / HYPOTHESES_FILE).write_bytes(text)
-
-
-def _rejected_columns(rejected: Sequence[Residuals]) -> dict[str, Any]:
-    """Return the rejected measurements as a table, by time."""
-    parts = []
-    for r in rejected:
-        row, component = np.nonzero(np.isfinite(r.residual))
-        names = np.array(r.components)
-        parts.append(
-            {
-                "time_s": r.time[row],
-                "sensor": np.full(row.size, r.label),
-                "component": names[component],
-                "reason": np.full(row.size, r.reason),
-                "residual": r.residual[row, component],
-                "std": r.sigma[row, component],
-                "unit": np.full(row.size, r.unit),
-            }
-        )
-    columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-    order = np.argsort(columns["time_s"], kind="stable")
-    return {name: values[order] for name, values in columns.items()}
 
 
 def write_history(
@@ -193,8 +180,8 @@ def write_latency(folder: Path, time: Array, latency: Array, solved: np.ndarray)
 def load_solution(path: Path | str) -> Solution:
     """Read a solution folder.
 
-    The files hold the diagonals of the trajectory's covariances and no residuals: what
-    is loaded has zeros elsewhere, and none.
+    The files hold the diagonals of the trajectory's covariances: what is loaded has zeros
+    elsewhere. Residuals are those of `residuals.parquet` and `rejected.csv`, where they exist.
 
     Parameters
     ----------
@@ -211,7 +198,12 @@ def load_solution(path: Path | str) -> Solution:
     fields = {name: getattr(calibration, name) for name in calibration.__dataclass_fields__}
     file = folder / TRAJECTORY_FILE
     trajectory = as_trajectory(read_motion(file, str(file), STD_COLUMNS))
-    return Solution(**fields, trajectory=trajectory)
+    return Solution(
+        **fields,
+        trajectory=trajectory,
+        residuals=read_residuals(folder / RESIDUALS_FILE),
+        rejected=read_residuals(folder / REJECTED_FILE),
+    )
 
 
 def _trajectory_columns(trajectory: Trajectory) -> dict[str, Array]:

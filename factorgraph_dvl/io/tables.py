@@ -19,7 +19,7 @@ from factorgraph_dvl.geometry.vectors import Array
 _EMPTY = ("", "nan", "NaN", "NAN")
 _PARQUET = (".parquet", ".pq")
 # Columns that hold text, in whatever table.
-TEXT = ("beacon", "measurement", "unit")
+TEXT = ("beacon", "measurement", "unit", "sensor", "component", "reason")
 
 
 def read_table(
@@ -256,4 +256,6 @@ def _numbers(table: pa.Table, name: str) -> Array:
 
 def _text(table: pa.Table, name: str) -> NDArray[np.str_]:
     """Return a column of text, (N,); empty where it is null."""
-    return np.array([value or "" for value in table.column(name).cast(pa.string()).to_pylist()])
+    encoded = table.column(name).cast(pa.string()).fill_null("").combine_chunks()
+    encoded = encoded.dictionary_encode()
+    return np.array(encoded.dictionary.to_pylist(), dtype=str)[encoded.indices.to_numpy()]
