@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
+IntArray = np.ndarray
 
 
 def skew(v: ArrayLike) -> Array:

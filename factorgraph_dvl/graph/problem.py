@@ -19,7 +19,7 @@ import numpy as np
 
 from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.rotations import BodyAxes, exp_so3
-from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.geometry.vectors import Array, IntArray
 from factorgraph_dvl.graph import keys
 from factorgraph_dvl.graph.clocks import linearized, parameters_of, true_time
 from factorgraph_dvl.graph.imu_errors import ImuErrors, LinearImuFactors
@@ -36,7 +36,6 @@ from factorgraph_dvl.graph.priors import (
     value_at,
 )
 from factorgraph_dvl.graph.template import jacobian_template
-from factorgraph_dvl.imu.increments import IntArray
 from factorgraph_dvl.imu.propagation import (
     Attachment,
     States,

@@ -2,37 +2,26 @@
 
 Angular rate and specific force are rebuilt between the samples as polynomials through
 the neighbouring samples on both sides. That is better than the usual compensation by
-the sample before: all samples are there when a trial is processed. Where the rate steps,
-as at the start of an abrupt turn, a polynomial across the step would ring; there the
-neighbours are taken from the smoother side (the idea of essentially non-oscillatory
-schemes: Harten, Engquist, Osher, Chakravarthy, J. Comput. Phys. 71 (1987)).
+the sample before: all samples are there when a trial is processed.
 """
 
 from __future__ import annotations
 
 import itertools
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
-from math import comb
 
 import numpy as np
 
 from factorgraph_dvl.errors import DataError
-from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.geometry.vectors import Array, IntArray
+from factorgraph_dvl.imu.arc_polynomials import UNIFORM, ArcPolynomials, open_steps
 from factorgraph_dvl.imu.interpolation import Smoothed, smooth, unsmoothed
-from factorgraph_dvl.imu.polynomials import (
-    evaluate,
-    highest_difference,
-    integrate,
-    interpolation,
-    rate_and_slope,
-    regular_interpolation,
-)
+from factorgraph_dvl.imu.polynomials import evaluate, integrate, rate_and_slope
 from factorgraph_dvl.imu.timestamps import JUMP, fill_lost, unrounded
 from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.sensors.imu import Imu
-
-IntArray = np.ndarray
 
 # Lost samples up to this number are interpolated; a longer gap ends the arc.
 MAX_FILLED = 3
@@ -44,14 +33,10 @@ _SLOWEST = 0.5
 _ROUNDING = 1e-6
 # Relative spread of the intervals up to which the clock counts as regular.
 _REGULAR = 0.1
-_UNIFORM = 1e-3
+# Intervals whose polynomials are in memory at a time. Chosen: some MB.
 _CHUNK = 4000
-# Intervals up to which all polynomials are kept.
-_SHORT = 200
-# How much rougher than the noise of the gyro a motion must be to look for a step in it,
-# and how much smoother the stencil on one side.
-_ROUGH = 6.0
-_SMOOTHER = 0.3
+# Samples that an arc has at least: those of the widest stencil.
+_LEAST = 6
 # A difference is no sign of a step before it is so many of its standard deviations.
 _BEYOND_NOISE = 3.0
 
@@ -86,51 +71,23 @@ class Partial:
 
 
 @dataclass(frozen=True)
-class Increments:
+class Increments(ArcPolynomials):
     """Increments over N intervals, grouped into arcs without gaps.
 
     Parameters
     ----------
-    start, dt : ndarray, shape (N,), s
-        Start and length of the intervals.
-    arcs : ndarray of int, shape (A, 2)
-        First and last-plus-one interval of each arc.
-    samples : ndarray, shape (S, 6)
-        Rate and specific force that the polynomials pass through: the means over the intervals, or
-        the values at their ends.
-    first_sample : ndarray of int, shape (A,)
-        Index in `samples` of each arc's first.
-    averaged : bool
-        Whether `samples` are means over the intervals.
     open_sigma : ndarray, shape (N, 6)
         Standard deviation of the mean rate and force over an interval where the samples leave it
         open: lost ones, or a step between two of them; else 0.
-    gyro_sigma, accel_sigma : float
-        Standard deviation of one sample from its noise, SI.
+    accel_sigma : float
+        Standard deviation of one sample of the force from its noise, m/s².
     windows : tuple of (int, int), optional
         Samples over which rate and force are smoothed; None = chosen from the record.
     """
 
-    start: Array
-    dt: Array
-    arcs: IntArray
-    samples: Array
-    first_sample: IntArray
-    averaged: bool
     open_sigma: Array
-    gyro_sigma: float
     accel_sigma: float
     windows: tuple[int, int] | None = None
-
-    @cached_property
-    def arc_of(self) -> IntArray:
-        """Arc of each interval, (N,)."""
-        return np.repeat(np.arange(len(self.arcs)), self.arcs[:, 1] - self.arcs[:, 0])
-
-    @property
-    def end(self) -> Array:
-        """End of the intervals, (N,), s."""
-        return self.start + self.dt
 
     def ticks(self, rate_hz: float) -> Array:
         """Return the multiples of 1 / rate that the arcs cover, s; gaps cost nothing."""
@@ -157,13 +114,13 @@ class Increments:
         phi, dv = np.empty((index.size, 3)), np.empty((index.size, 3))
         for a in range(0, index.size, _CHUNK):
             part = index[a : a + _CHUNK]
-            c = self._polynomials(part)
+            c = self.coefficients(part)
             phi[a : a + _CHUNK], dv[a : a + _CHUNK] = integrate(c, self.dt[part], 1.0)
         return phi, dv
 
     def partial(self, index: IntArray, since: Array) -> Partial:
         """Return the motion over the first `since` seconds of intervals `index`, (M,)."""
-        c = self._polynomials(index)
+        c = self.coefficients(index)
         dt = self.dt[index]
         u = since / dt
         phi, dv = integrate(c, dt, u)
@@ -171,8 +128,8 @@ class Increments:
         force = evaluate(c, u)[:, 3:]
         # A step or a vibration leaves high differences, a smooth motion almost none; what
         # the gyro's noise accounts for is in its own standard deviation already.
-        rough = np.abs(self._differences[self._centred_sample(index)])
-        noise = _BEYOND_NOISE * self._difference_sigma
+        rough = np.abs(self.difference_at(index))
+        noise = _BEYOND_NOISE * self.difference_sigma
         unresolved = np.sqrt(np.maximum(rough**2 - noise**2, 0.0)) / 4.0
         omega_sigma, alpha_sigma, force_sigma = (np.empty(index.size) for _ in range(3))
         time = self.start[index] + since
@@ -213,7 +170,7 @@ class Increments:
             if not self.averaged:
                 time = np.append(self.start[a:b], self.end[b - 1])
             values = self.samples[base : base + time.size]
-            regular = np.abs(steps / dt - 1.0).max() < _UNIFORM
+            regular = np.abs(steps / dt - 1.0).max() < UNIFORM
             pair = []
             for i, (signal, sigma) in enumerate(
                 ((values[:, :3], self.gyro_sigma), (values[:, 3:], self.accel_sigma))
@@ -241,7 +198,7 @@ class Increments:
         gap = np.where(near < index, self.dt[near], -self.dt[index])
         gap = np.where(near == index, 0.0, gap)
         own, own_slope = rate_and_slope(c, since, self.dt[index])
-        other, other_slope = rate_and_slope(self._polynomials(near), since + gap, self.dt[near])
+        other, other_slope = rate_and_slope(self.coefficients(near), since + gap, self.dt[near])
         inward = np.where(u < 0.5, 1.0, -1.0)
         weight = np.clip(0.5 + np.where(u < 0.5, u, 1.0 - u), 0.0, 1.0)[:, None]
         moving = ((weight > 0.0) & (weight < 1.0)) * (inward / self.dt[index])[:, None]
@@ -249,98 +206,6 @@ class Increments:
             weight * own + (1.0 - weight) * other,
             weight * own_slope + (1.0 - weight) * other_slope + moving * (own - other),
         )
-
-    @property
-    def _width(self) -> int:
-        """Number of samples that a polynomial passes through."""
-        return 5 if self.averaged else 6
-
-    @cached_property
-    def _differences(self) -> Array:
-        """Highest difference of the rate over the stencil from each sample on, (S, 3)."""
-        out = np.full((self.samples.shape[0], 3), np.inf)
-        for (a, b), base in zip(self.arcs, self.first_sample, strict=True):
-            edges = np.append(self.start[a:b], self.end[b - 1])
-            count = b - a + (0 if self.averaged else 1)
-            highest = highest_difference(
-                self.samples[base : base + count, :3], edges, self._width, self.averaged
-            )
-            out[base : base + highest.shape[0]] = highest
-        return out
-
-    @cached_property
-    def _roughness(self) -> Array:
-        """Size of `_differences`, (S,), rad/s."""
-        return np.asarray(np.linalg.norm(self._differences, axis=1))
-
-    @property
-    def _difference_sigma(self) -> float:
-        """Standard deviation of `_differences` from the noise of the gyro, rad/s."""
-        return self.gyro_sigma * float(np.sqrt(comb(2 * self._width - 2, self._width - 1)))
-
-    def _centred_sample(self, index: IntArray) -> IntArray:
-        """Return the first sample of the centred stencil of intervals `index`."""
-        arc = self.arc_of[index]
-        first, last = self.arcs[arc, 0], self.arcs[arc, 1]
-        count = last - first + (0 if self.averaged else 1)
-        return self.first_sample[arc] + np.clip(index - first - 2, 0, count - self._width)
-
-    def _stencil(self, inside: IntArray, most: IntArray, base: IntArray) -> IntArray:
-        """Return the first sample, within the arc, of the stencils of intervals `inside` it.
-
-        Centred, unless the rate is rougher there than noise explains: then the smoothest
-        stencil that still holds the interval.
-        """
-        stencil = np.clip(inside - 2, 0, most)
-        roughness = self._roughness[base + stencil]
-        rough = np.flatnonzero(roughness > _ROUGH * self._difference_sigma)
-        if rough.size:
-            back = np.arange(self._width if self.averaged else self._width - 1)
-            options = np.clip(inside[rough, None] - back, 0, most[rough, None])
-            scores = self._roughness[base[rough, None] + options]
-            best = np.argmin(scores, axis=1)
-            smoother = scores.min(axis=1) < _SMOOTHER * roughness[rough]
-            chosen = np.take_along_axis(options, best[:, None], axis=1)[:, 0]
-            stencil[rough[smoother]] = chosen[smoother]
-        return stencil
-
-    def _polynomials(self, index: IntArray) -> Array:
-        """Return coefficients (M, K, 6) of rate and force in powers of (t - start) / dt."""
-        if self.dt.size <= _SHORT:
-            return np.asarray(self._all_polynomials[index])
-        return self._fit(index)
-
-    @cached_property
-    def _all_polynomials(self) -> Array:
-        """All of them, of a short record: asked for again and again."""
-        return self._fit(np.arange(self.dt.size))
-
-    def _fit(self, index: IntArray) -> Array:
-        arc = self.arc_of[index]
-        first, last = self.arcs[arc, 0], self.arcs[arc, 1]
-        width = self._width
-        count = last - first + (0 if self.averaged else 1)
-        stencil = self._stencil(index - first, count - width, self.first_sample[arc])
-        offset = index - first - stencil
-        rows = (self.first_sample[arc] + stencil)[:, None] + np.arange(width)
-        values = self.samples[rows]
-
-        # Edges of the stencil's intervals, relative to the interval and in its lengths.
-        intervals = (first + stencil)[:, None] + np.arange(width if self.averaged else width - 1)
-        lengths = self.dt[intervals] / self.dt[index][:, None]
-        uniform = np.all(np.abs(lengths - 1.0) < _UNIFORM, axis=1)
-        out = np.empty((index.size, width, 6))
-        for shift in np.unique(offset[uniform]):
-            pick = uniform & (offset == shift)
-            matrix = regular_interpolation(lengths.shape[1] + 1, int(shift), self.averaged)
-            out[pick] = np.matmul(matrix, values[pick])
-        rest = np.flatnonzero(~uniform)
-        if rest.size:
-            edges = np.zeros((rest.size, lengths.shape[1] + 1))
-            np.cumsum(lengths[rest], axis=1, out=edges[:, 1:])
-            edges -= np.take_along_axis(edges, offset[rest][:, None], axis=1)
-            out[rest] = np.matmul(interpolation(edges, self.averaged), values[rest])
-        return out
 
 
 def increments(
@@ -368,11 +233,49 @@ def increments(
         If no stretch of the record is long enough to integrate.
     """
     averaged = imu.settings.sampling == "mean"
-    time, samples = imu.time, np.hstack([imu.gyro, imu.accel])
-    least = 6
-    if time.size < least:
+    time, samples, filled_sigma, broken, lost = _bridged(imu)
+    bounds = np.concatenate([[0], np.flatnonzero(broken) + 1, [time.size]])
+    whole = [(a, b) for a, b in itertools.pairwise(bounds) if b - a >= _LEAST]
+    if not whole:
         raise DataError(
-            f"only {time.size} samples", where=imu.source, expected=f"at least {least}"
+            "no stretch without gaps is long enough",
+            where=imu.source,
+            expected=f"at least {_LEAST} samples in a row",
+        )
+    # Since the first sample: seconds of an epoch leave a double 1e-7 s only.
+    edges = [unrounded(time[a:b]) for a, b in whole]
+    if averaged:
+        edges = [np.concatenate([[e[0] - np.median(np.diff(e))], e]) for e in edges]
+    ends = np.cumsum([e.size - 1 for e in edges])
+    dt = float(np.median(np.diff(imu.time)))
+    out = Increments(
+        start=np.concatenate([time[a] + e[:-1] for (a, _), e in zip(whole, edges, strict=True)]),
+        dt=np.concatenate([np.diff(e) for e in edges]),
+        arcs=np.stack([np.concatenate([[0], ends[:-1]]), ends], axis=1),
+        samples=np.concatenate([samples[a:b] for a, b in whole]),
+        first_sample=np.cumsum([0, *(b - a for a, b in whole)])[:-1],
+        averaged=averaged,
+        open_sigma=np.concatenate([filled_sigma[a + (not averaged) : b] for a, b in whole]),
+        gyro_sigma=imu.settings.gyro_noise_root_psd / np.sqrt(dt),
+        accel_sigma=imu.settings.accel_noise_root_psd / np.sqrt(dt),
+        windows=windows,
+    )
+    if not averaged:
+        noise = np.repeat([out.gyro_sigma, out.accel_sigma], 3)
+        np.hypot(out.open_sigma, open_steps(out, noise), out=out.open_sigma)
+    alone = [(b - a, float(time[a])) for a, b in itertools.pairwise(bounds) if b - a < _LEAST]
+    return out, (*lost, *_unused(alone), *_gaps(out))
+
+
+def _bridged(imu: Imu) -> tuple[Array, Array, Array, np.ndarray, list[Finding]]:
+    """Return times and samples with few lost ones filled in, and where the record breaks.
+
+    The standard deviations of what was filled in stand third, the findings last.
+    """
+    time, samples = imu.time, np.hstack([imu.gyro, imu.accel])
+    if time.size < _LEAST:
+        raise DataError(
+            f"only {time.size} samples", where=imu.source, expected=f"at least {_LEAST}"
         )
     step = np.diff(time)
     dt = float(np.median(step))
@@ -383,109 +286,34 @@ def increments(
             expected=f"at least {1.0 / _SLOWEST:.0f} in a second",
             hint="Is time_s in seconds?",
         )
-    filled_sigma = np.zeros_like(samples)
-    findings: list[Finding] = []
-
     lost = np.zeros(step.size, dtype=int)
     if np.quantile(np.abs(step / dt - 1.0), 0.9) < _REGULAR:
         lost = np.where(step > _LOST * dt, np.rint(step / dt).astype(int) - 1, 0)
     bridged = (lost > 0) & (lost <= MAX_FILLED)
     broken = (lost > MAX_FILLED) | (step > (MAX_FILLED + _LOST) * dt)
-    if bridged.any():
-        time, samples, filled_sigma, broken = fill_lost(time, samples, lost, bridged, broken)
-        findings.append(
-            Finding(
-                Code.LOST_SAMPLES,
-                f"{int(lost[bridged].sum())} lost samples in {int(bridged.sum())} places were "
-                f"interpolated, the first after {imu.time[np.argmax(bridged)]:.3f} s",
-                sensor="IMU",
-            )
-        )
-
-    bounds = np.concatenate([[0], np.flatnonzero(broken) + 1, [time.size]])
-    starts, lengths, arcs, first_sample, kept, fill = [], [], [], [], [], []
-    n_intervals = n_samples = 0
-    for a, b in itertools.pairwise(bounds):
-        if b - a < least:
-            findings.append(
-                Finding(
-                    Code.UNUSED,
-                    f"{b - a} samples at {time[a]:.3f} s stand alone between gaps and were not "
-                    "used",
-                    sensor="IMU",
-                )
-            )
-            continue
-        # Since the first sample: seconds of an epoch leave a double 1e-7 s only.
-        edges = unrounded(time[a:b])
-        if averaged:
-            edges = np.concatenate([[edges[0] - np.median(np.diff(edges))], edges])
-        starts.append(time[a] + edges[:-1])
-        lengths.append(np.diff(edges))
-        arcs.append((n_intervals, n_intervals + edges.size - 1))
-        first_sample.append(n_samples)
-        kept.append(samples[a:b])
-        fill.append(filled_sigma[a:b] if averaged else filled_sigma[a + 1 : b])
-        n_intervals += edges.size - 1
-        n_samples += b - a
-    if not arcs:
-        raise DataError(
-            "no stretch without gaps is long enough",
-            where=imu.source,
-            expected=f"at least {least} samples in a row",
-        )
-    start, length = np.concatenate(starts), np.concatenate(lengths)
-    for (_, b), (c, _) in itertools.pairwise(arcs):
-        end = start[b - 1] + length[b - 1]
-        code, what = Code.IMU_GAP, f"gap of {start[c] - end:.3f} s at {end:.3f} s"
-        if start[c] - end > JUMP:
-            code = Code.CLOCK_JUMP
-            what = f"time_s jumps from {end:.3f} to {start[c]:.3f} s, as where a clock is set"
-        findings.append(Finding(code, f"{what}: the inertial chain breaks there", sensor="IMU"))
-    out = Increments(
-        start=start,
-        dt=length,
-        arcs=np.array(arcs),
-        samples=np.concatenate(kept),
-        first_sample=np.array(first_sample),
-        averaged=averaged,
-        open_sigma=np.concatenate(fill),
-        gyro_sigma=imu.settings.gyro_noise_root_psd / np.sqrt(dt),
-        accel_sigma=imu.settings.accel_noise_root_psd / np.sqrt(dt),
-        windows=windows,
+    if not bridged.any():
+        return time, samples, np.zeros_like(samples), broken, []
+    time, samples, filled_sigma, broken = fill_lost(time, samples, lost, bridged, broken)
+    text = (
+        f"{int(lost[bridged].sum())} lost samples in {int(bridged.sum())} places were "
+        f"interpolated, the first after {imu.time[np.argmax(bridged)]:.3f} s"
     )
-    if not averaged:
-        noise = np.repeat([out.gyro_sigma, out.accel_sigma], 3)
-        np.hypot(out.open_sigma, _steps(out, noise), out=out.open_sigma)
-    return out, tuple(findings)
+    return time, samples, filled_sigma, broken, [Finding(Code.LOST_SAMPLES, text, "IMU")]
 
 
-def _steps(inc: Increments, noise: Array) -> Array:
-    """Return the standard deviation of means, (N, 6), over intervals in which a signal steps.
+def _unused(alone: list[tuple[int, float]]) -> Iterator[Finding]:
+    """Yield the stretches that are too short, by their samples and start."""
+    for count, start in alone:
+        text = f"{count} samples at {start:.3f} s stand alone between gaps and were not used"
+        yield Finding(Code.UNUSED, text, "IMU")
 
-    Two instantaneous samples do not show when between them a signal stepped from the one
-    value to the other: the mean is uniform between the two. A step shows as an interval
-    that is rough in every stencil that holds it, while the stencils beside it are smooth.
 
-    Parameters
-    ----------
-    inc : Increments
-        Increments of instantaneous samples.
-    noise : ndarray, shape (6,)
-        Standard deviation of the samples.
-    """
-    width = 6
-    sigma = noise * np.sqrt(comb(2 * width - 2, width - 1))
-    out = np.zeros((inc.start.size, 6))
-    for (a, b), base in zip(inc.arcs, inc.first_sample, strict=True):
-        n = b - a
-        edges = np.append(inc.start[a:b], inc.end[b - 1])
-        rough = np.abs(highest_difference(inc.samples[base : base + n + 1], edges, width, False))
-        inside = np.arange(width - 1, n - width + 1)
-        if inside.size == 0:
-            continue
-        holding = np.min([rough[inside - k] for k in range(width - 1)], axis=0)
-        beside = np.maximum(rough[inside - width + 1], rough[inside + 1])
-        step = (holding > _ROUGH * sigma) & (_SMOOTHER * holding > beside)
-        out[a + inside] = np.where(step, holding / np.sqrt(12.0), 0.0)
-    return out
+def _gaps(inc: Increments) -> Iterator[Finding]:
+    """Yield the gaps between arcs."""
+    for (_, b), (c, _) in itertools.pairwise(inc.arcs):
+        end, start = inc.end[b - 1], inc.start[c]
+        code, what = Code.IMU_GAP, f"gap of {start - end:.3f} s at {end:.3f} s"
+        if start - end > JUMP:
+            code = Code.CLOCK_JUMP
+            what = f"time_s jumps from {end:.3f} to {start:.3f} s, as where a clock is set"
+        yield Finding(code, f"{what}: the inertial chain breaks there", "IMU")

@@ -8,8 +8,8 @@ import gtsam
 import numpy as np
 
 from factorgraph_dvl.geometry.rotations import exp_so3
-from factorgraph_dvl.geometry.vectors import Array, cross, rotate, skew
-from factorgraph_dvl.imu.increments import Increments, IntArray
+from factorgraph_dvl.geometry.vectors import Array, IntArray, cross, rotate, skew
+from factorgraph_dvl.imu.increments import Increments
 from factorgraph_dvl.sensors.imu import ImuSettings
 
 # Velocity noise that GTSAM adds to the position; only to keep its covariance regular.

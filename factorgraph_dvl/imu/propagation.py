@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factorgraph_dvl.geometry.rotations import exp_so3
-from factorgraph_dvl.geometry.vectors import Array, cross, rotate, skew
-from factorgraph_dvl.imu.increments import IntArray
+from factorgraph_dvl.geometry.vectors import Array, IntArray, cross, rotate, skew
 from factorgraph_dvl.imu.preintegration import Segments
 from factorgraph_dvl.sensors.protocol import Linearization, Motion
 

@@ -16,8 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from factorgraph_dvl.geometry.rotations import exp_so3
-from factorgraph_dvl.geometry.vectors import Array, rotate, skew
-from factorgraph_dvl.imu.increments import IntArray
+from factorgraph_dvl.geometry.vectors import Array, IntArray, rotate, skew
 from factorgraph_dvl.imu.preintegration import Segments
 from factorgraph_dvl.imu.propagation import Attachment, Transition, attitude_jacobian
 from factorgraph_dvl.sensors.imu import ImuError

@@ -8,8 +8,7 @@ import numpy as np
 
 from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.rotations import exp_so3
-from factorgraph_dvl.geometry.vectors import Array, rotate
-from factorgraph_dvl.imu.increments import IntArray
+from factorgraph_dvl.geometry.vectors import Array, IntArray, rotate
 from factorgraph_dvl.imu.preintegration import Segments
 from factorgraph_dvl.imu.propagation import Attachment, attach
 

@@ -1,0 +1,197 @@
+"""Polynomials through the samples of arcs: which neighbours each interval takes.
+
+Where the rate steps, as at the start of an abrupt turn, a polynomial across the step would ring;
+there the neighbours are taken from the smoother side (the idea of essentially non-oscillatory
+schemes: Harten, Engquist, Osher, Chakravarthy, J. Comput. Phys. 71 (1987)).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from math import comb
+
+import numpy as np
+
+from factorgraph_dvl.geometry.vectors import Array, IntArray
+from factorgraph_dvl.imu.polynomials import (
+    highest_difference,
+    interpolation,
+    regular_interpolation,
+)
+
+# Relative spread of intervals up to which a stencil counts as regular. Chosen: far below what
+# the interpolation sees.
+UNIFORM = 1e-3
+# Intervals up to which all polynomials are kept.
+_SHORT = 200
+# How much rougher than the noise of the gyro a motion must be to look for a step in it,
+# and how much smoother the stencil on one side.
+_ROUGH = 6.0
+_SMOOTHER = 0.3
+
+
+@dataclass(frozen=True)
+class ArcPolynomials:
+    """Rate and specific force over N intervals as polynomials through neighbouring samples.
+
+    Parameters
+    ----------
+    start, dt : ndarray, shape (N,), s
+        Start and length of the intervals.
+    arcs : ndarray of int, shape (A, 2)
+        First and last-plus-one interval of each arc.
+    samples : ndarray, shape (S, 6)
+        Rate and specific force: the means over the intervals, or the values at their ends.
+    first_sample : ndarray of int, shape (A,)
+        Index in `samples` of each arc's first.
+    averaged : bool
+        Whether `samples` are means over the intervals.
+    gyro_sigma : float
+        Standard deviation of one sample of the rate from its noise, rad/s.
+    """
+
+    start: Array
+    dt: Array
+    arcs: IntArray
+    samples: Array
+    first_sample: IntArray
+    averaged: bool
+    gyro_sigma: float
+
+    @property
+    def end(self) -> Array:
+        """End of the intervals, (N,), s."""
+        return self.start + self.dt
+
+    @cached_property
+    def arc_of(self) -> IntArray:
+        """Arc of each interval, (N,)."""
+        return np.repeat(np.arange(len(self.arcs)), self.arcs[:, 1] - self.arcs[:, 0])
+
+    def difference_at(self, index: IntArray) -> Array:
+        """Return the highest difference of the rate about intervals `index`, (M, 3), rad/s."""
+        return self.differences[self._centred_sample(index)]
+
+    @property
+    def width(self) -> int:
+        """Number of samples that a polynomial passes through."""
+        return 5 if self.averaged else 6
+
+    @cached_property
+    def differences(self) -> Array:
+        """Highest difference of the rate over the stencil from each sample on, (S, 3)."""
+        out = np.full((self.samples.shape[0], 3), np.inf)
+        for (a, b), base in zip(self.arcs, self.first_sample, strict=True):
+            edges = np.append(self.start[a:b], self.end[b - 1])
+            count = b - a + (0 if self.averaged else 1)
+            highest = highest_difference(
+                self.samples[base : base + count, :3], edges, self.width, self.averaged
+            )
+            out[base : base + highest.shape[0]] = highest
+        return out
+
+    @cached_property
+    def _roughness(self) -> Array:
+        """Size of `differences`, (S,), rad/s."""
+        return np.asarray(np.linalg.norm(self.differences, axis=1))
+
+    @property
+    def difference_sigma(self) -> float:
+        """Standard deviation of `differences` from the noise of the gyro, rad/s."""
+        return self.gyro_sigma * float(np.sqrt(comb(2 * self.width - 2, self.width - 1)))
+
+    def _centred_sample(self, index: IntArray) -> IntArray:
+        """Return the first sample of the centred stencil of intervals `index`."""
+        arc = self.arc_of[index]
+        first, last = self.arcs[arc, 0], self.arcs[arc, 1]
+        count = last - first + (0 if self.averaged else 1)
+        return self.first_sample[arc] + np.clip(index - first - 2, 0, count - self.width)
+
+    def _stencil(self, inside: IntArray, most: IntArray, base: IntArray) -> IntArray:
+        """Return the first sample, within the arc, of the stencils of intervals `inside` it.
+
+        Centred, unless the rate is rougher there than noise explains: then the smoothest
+        stencil that still holds the interval.
+        """
+        stencil = np.clip(inside - 2, 0, most)
+        roughness = self._roughness[base + stencil]
+        rough = np.flatnonzero(roughness > _ROUGH * self.difference_sigma)
+        if rough.size:
+            back = np.arange(self.width if self.averaged else self.width - 1)
+            options = np.clip(inside[rough, None] - back, 0, most[rough, None])
+            scores = self._roughness[base[rough, None] + options]
+            best = np.argmin(scores, axis=1)
+            smoother = scores.min(axis=1) < _SMOOTHER * roughness[rough]
+            chosen = np.take_along_axis(options, best[:, None], axis=1)[:, 0]
+            stencil[rough[smoother]] = chosen[smoother]
+        return stencil
+
+    def coefficients(self, index: IntArray) -> Array:
+        """Return coefficients (M, K, 6) of rate and force in powers of (t - start) / dt."""
+        if self.dt.size <= _SHORT:
+            return np.asarray(self._all[index])
+        return self._fit(index)
+
+    @cached_property
+    def _all(self) -> Array:
+        """All of them, of a short record: asked for again and again."""
+        return self._fit(np.arange(self.dt.size))
+
+    def _fit(self, index: IntArray) -> Array:
+        arc = self.arc_of[index]
+        first, last = self.arcs[arc, 0], self.arcs[arc, 1]
+        width = self.width
+        count = last - first + (0 if self.averaged else 1)
+        stencil = self._stencil(index - first, count - width, self.first_sample[arc])
+        offset = index - first - stencil
+        rows = (self.first_sample[arc] + stencil)[:, None] + np.arange(width)
+        values = self.samples[rows]
+
+        # Edges of the stencil's intervals, relative to the interval and in its lengths.
+        intervals = (first + stencil)[:, None] + np.arange(width if self.averaged else width - 1)
+        lengths = self.dt[intervals] / self.dt[index][:, None]
+        uniform = np.all(np.abs(lengths - 1.0) < UNIFORM, axis=1)
+        out = np.empty((index.size, width, 6))
+        for shift in np.unique(offset[uniform]):
+            pick = uniform & (offset == shift)
+            matrix = regular_interpolation(lengths.shape[1] + 1, int(shift), self.averaged)
+            out[pick] = np.matmul(matrix, values[pick])
+        rest = np.flatnonzero(~uniform)
+        if rest.size:
+            edges = np.zeros((rest.size, lengths.shape[1] + 1))
+            np.cumsum(lengths[rest], axis=1, out=edges[:, 1:])
+            edges -= np.take_along_axis(edges, offset[rest][:, None], axis=1)
+            out[rest] = np.matmul(interpolation(edges, self.averaged), values[rest])
+        return out
+
+
+def open_steps(arcs: ArcPolynomials, noise: Array) -> Array:
+    """Return the standard deviation of means, (N, 6), over intervals in which a signal steps.
+
+    Two instantaneous samples do not show when between them a signal stepped from the one
+    value to the other: the mean is uniform between the two. A step shows as an interval
+    that is rough in every stencil that holds it, while the stencils beside it are smooth.
+
+    Parameters
+    ----------
+    arcs : ArcPolynomials
+        Polynomials through instantaneous samples.
+    noise : ndarray, shape (6,)
+        Standard deviation of the samples.
+    """
+    width = 6
+    sigma = noise * np.sqrt(comb(2 * width - 2, width - 1))
+    out = np.zeros((arcs.start.size, 6))
+    for (a, b), base in zip(arcs.arcs, arcs.first_sample, strict=True):
+        n = b - a
+        edges = np.append(arcs.start[a:b], arcs.end[b - 1])
+        rough = np.abs(highest_difference(arcs.samples[base : base + n + 1], edges, width, False))
+        inside = np.arange(width - 1, n - width + 1)
+        if inside.size == 0:
+            continue
+        holding = np.min([rough[inside - k] for k in range(width - 1)], axis=0)
+        beside = np.maximum(rough[inside - width + 1], rough[inside + 1])
+        step = (holding > _ROUGH * sigma) & (_SMOOTHER * holding > beside)
+        out[a + inside] = np.where(step, holding / np.sqrt(12.0), 0.0)
+    return out
