@@ -10,10 +10,11 @@ from typing import ClassVar, TypeVar
 import numpy as np
 from msgspec import UnsetType
 
-from factorgraph_dvl.errors import DataError
+from factorgraph_dvl.errors import ConfigError, DataError
 from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.rotations import BodyAxes, frd_from_body
 from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.sensors.attitude import Attitude
 from factorgraph_dvl.sensors.beacon import Beacons
 from factorgraph_dvl.sensors.beam_geometry import as_dvl
 from factorgraph_dvl.sensors.depth import Depth
@@ -24,6 +25,7 @@ from factorgraph_dvl.sensors.fingerprint import fingerprints, shared
 from factorgraph_dvl.sensors.gnss import Gnss
 from factorgraph_dvl.sensors.grades import DEFAULT_LIMITS
 from factorgraph_dvl.sensors.imu import Imu
+from factorgraph_dvl.sensors.ins import Ins
 from factorgraph_dvl.sensors.protocol import Aid, NoiseModel, SensorRecord
 from factorgraph_dvl.sensors.speed_log import Heading, SpeedLog
 from factorgraph_dvl.sensors.turntable import Turntable
@@ -109,8 +111,8 @@ class Trial:
     ----------
     name : str
         Of the trial.
-    imu : Imu
-        The IMU; a trial without one cannot be smoothed.
+    imu : Imu or None
+        The IMU; None where an INS or another sensor of attitude takes its place.
     gnss, dvl : Gnss or Dvl
         The sensors that a calibration needs, None where the trial does not have them.
     others : tuple of Aid, optional
@@ -139,7 +141,7 @@ class Trial:
     """
 
     name: str
-    imu: Imu
+    imu: Imu | None
     gnss: Gnss | None = None
     dvl: Dvl | None = None
     others: tuple[Aid, ...] = ()
@@ -185,7 +187,7 @@ class Trial:
     @cached_property
     def _fingerprints(self) -> tuple[str, ...]:
         # A turntable's angle is that of its program, which two trials may share.
-        return fingerprints((self.imu, *(a for a in self.aids if not isinstance(a, Turntable))))
+        return fingerprints(a for a in self.records if not isinstance(a, Turntable))
 
     @property
     def inputs(self) -> tuple[str, ...]:
@@ -217,6 +219,30 @@ class Trial:
         return self if self.gnss is None else replace(self, gnss=self.gnss.on_trial_clock())
 
     @property
+    def inertial(self) -> Imu:
+        """The IMU.
+
+        Raises
+        ------
+        ConfigError
+            If the trial has none.
+        """
+        if self.imu is None:
+            raise ConfigError(
+                "the trial has no IMU, which this needs",
+                where="trial.yaml",
+                expected="an imu section",
+                hint="`inspect`, `solve`, `kalman` and `crosscheck` take trials with `ins` or "
+                "`attitude` in its place",
+            )
+        return self.imu
+
+    @property
+    def records(self) -> tuple[SensorRecord, ...]:
+        """The records of all sensors, that of the IMU first."""
+        return self.aids if self.imu is None else (self.imu, *self.aids)
+
+    @property
     def aids(self) -> tuple[Aid, ...]:
         """The sensors other than the IMU."""
         return tuple(aid for aid in (self.gnss, self.dvl, *self.others) if aid is not None)
@@ -225,6 +251,22 @@ class Trial:
     def beacons(self) -> Beacons | None:
         """The ranging to beacons, None where the trial does not have it."""
         return self.find(Beacons)
+
+    @property
+    def attitude(self) -> Attitude | Ins | None:
+        """The sensor of attitude, None where the trial does not have one."""
+        return self.find(Attitude) or self.find(Ins)
+
+    @property
+    def body_sensor(self) -> Imu | Attitude | Ins:
+        """The instrument whose body is that of the trial: the IMU, or what takes its place.
+
+        Raises
+        ------
+        ConfigError
+            If the trial has none.
+        """
+        return self.imu or self.attitude or self.inertial
 
     @property
     def depth(self) -> Depth | None:
@@ -244,6 +286,9 @@ class Trial:
             known = self.initial_position.geodetic[None]
         elif self.gnss is not None:
             known = self.gnss.geodetic[~np.isnan(self.gnss.geodetic[:, 0])]
+        ins = self.find(Ins)
+        if not known.size and ins is not None:
+            known = ins.geodetic[np.logical_not(ins.missing)]
         if not known.size and self.beacons is not None:
             known = self.beacons.places
         if known.size:
@@ -252,7 +297,7 @@ class Trial:
         raise DataError(
             "the trial has no position",
             where="trial.yaml",
-            expected="a gnss section with positions, initial.position, or beacons",
+            expected="a gnss or ins section with positions, initial.position, or beacons",
         )
 
 

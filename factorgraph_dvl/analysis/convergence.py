@@ -114,7 +114,8 @@ def check_limits(trial: Trial, limits: Iterable[str]) -> None:
     limits : iterable of str
         Reported names.
     """
-    sensors = (trial.imu.parameters(0.0), *(aid.parameters() for aid in trial.aids))
+    inertial = () if trial.imu is None else trial.imu.parameters(0.0)
+    sensors = (inertial, *(aid.parameters() for aid in trial.aids))
     known = [p.name for parameters in sensors for p in parameters if p.estimated]
     for name in limits:
         if name not in known:

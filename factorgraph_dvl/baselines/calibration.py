@@ -192,7 +192,7 @@ def _outage(trial: Trial) -> list[Finding]:
     """Say that GNSS is missing for too long, if it is."""
     assert trial.gnss is not None
     fixes = trial.gnss.time[~np.isnan(trial.gnss.geodetic[:, 0])]
-    time = trial.imu.time
+    time = trial.inertial.time
     jumps = np.flatnonzero(np.diff(time) > JUMP)
     edges = np.sort(np.concatenate([time[:1], fixes, time[jumps], time[jumps + 1], time[-1:]]))
     longest = float(np.diff(edges)[~np.isin(edges[:-1], time[jumps])].max())

@@ -59,7 +59,7 @@ def sins(
             hint="Take the attitude of a solution, or of the reference: --attitude",
         )
     last = fixes[-1] if align_s is None else fixes[0] + align_s
-    aided = _with_height_aiding(_rows(gnss, gnss.time <= last), trial.imu.time)
+    aided = _with_height_aiding(_rows(gnss, gnss.time <= last), trial.inertial.time)
     navigation = navigate(replace(trial, gnss=aided), np.zeros(0))
     bias = navigation.track.gyro_bias.mean(axis=0)
     return trajectory_of(trial, navigation, rate_hz), bias, navigation.findings

@@ -139,9 +139,9 @@ def navigate(trial: Trial, pings: Array, *, smoothed: bool = True) -> Navigation
             expected="a gnss section with positions",
             hint="`solve` does not need them",
         )
-    inc, gaps = increments(trial.imu)
+    inc, gaps = increments(trial.inertial)
     findings = [*trial.notes, *gaps]
-    samples = prepare(inc, trial.imu.settings)
+    samples = prepare(inc, trial.inertial.settings)
     if np.any(np.array(gnss.settings.lever_arm_std_m) > 0.0):
         findings.append(
             Finding(
@@ -286,7 +286,7 @@ def _navigate_arc(
     time = _events(span, np.concatenate([gnss.time, pings]))
     steps = compose(samples, time[:-1], time[1:])
     fixes = _fixes_at(gnss, samples, time)
-    s = trial.imu.settings
+    s = trial.inertial.settings
     walk = (s.gyro_bias_walk_root_psd**2, s.accel_bias_walk_root_psd**2)
     given = trial.initial_attitude if not earlier else None
     if given is not None and given.std.max() <= _WIDE:
@@ -401,7 +401,7 @@ def _start(
         v = trial.initial_velocity.velocity
         P[3:6, 3:6] = np.diag(trial.initial_velocity.std**2)
     P[6:9, 6:9] = attitude.covariance
-    s = trial.imu.settings
+    s = trial.inertial.settings
     bg, ba = np.zeros(3), np.zeros(3)
     if earlier:
         last = earlier[-1]

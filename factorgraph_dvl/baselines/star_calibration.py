@@ -102,10 +102,10 @@ def calibrate_gyros(
             hint="`solve` estimates the mounting",
         )
     frame = trial.frame()
-    inc, _ = increments(trial.imu)
-    samples = prepare(inc, trial.imu.settings)
+    inc, _ = increments(trial.inertial)
+    samples = prepare(inc, trial.inertial.settings)
     attitudes = star_attitudes(star, trial.epoch, frame.lat, frame.lon)
-    (gyro, _) = trial.imu.parameters(0.0)
+    (gyro, _) = trial.inertial.parameters(0.0)
     drift, P = np.zeros(3), np.diag(gyro.sigma**2)
     tracks: list[AttitudeTrack] = []
     history: list[tuple[float, Estimated]] = []
@@ -115,7 +115,7 @@ def calibrate_gyros(
             continue
         if tracks:
             gap = inside.time[0] - tracks[-1].time[-1]
-            P = P + trial.imu.settings.gyro_bias_walk_root_psd**2 * gap * np.eye(3)
+            P = P + trial.inertial.settings.gyro_bias_walk_root_psd**2 * gap * np.eye(3)
         if printed:
             filtered = run_printed(samples, inside, frame.lat, np.diag(gyro.sigma**2))
             tracks.append(filtered)
@@ -153,8 +153,8 @@ def _drift(trial: Trial, tracks: list[AttitudeTrack], drift: Array, P: Array) ->
     an upper bound.
     """
     begin, end = tracks[0].time[0], tracks[-1].time[-1]
-    parameter = trial.imu.parameters(float(end - begin))[0]
-    if trial.imu.settings.gyro_bias_walk_root_psd == 0.0:
+    parameter = trial.inertial.parameters(float(end - begin))[0]
+    if trial.inertial.settings.gyro_bias_walk_root_psd == 0.0:
         return Estimated((parameter,), (drift,), P)
     mean = np.concatenate([c.drift for c in tracks]).mean(axis=0)
     spread = np.concatenate([c.covariance[:, 3:, 3:] for c in tracks]).mean(axis=0)
@@ -174,9 +174,9 @@ def _by_mounting(trial: Trial, star: Star) -> Array:
     By delta the stars see the rate turned, which looks like a drift of omega x delta. What
     counts of a rate is its mean with the weights that fit a slope to white attitudes.
     """
-    time = trial.imu.time
+    time = trial.inertial.time
     weight = (time - time[0]) * (time[-1] - time)
-    W = skew(weight @ trial.imu.gyro / weight.sum())
+    W = skew(weight @ trial.inertial.gyro / weight.sum())
     return np.asarray(W @ _mounting_covariance(star) @ W.T)
 
 
@@ -205,7 +205,7 @@ def _summary(
         at = np.round(star.settings.mounting_deg, 6).tolist()
         text = f"star does not estimate star_mounting_deg: fixed at {at}"
         findings.append(Finding(Code.METHOD_LIMITS, text, parameter="star_mounting_deg"))
-    tilt = off_vertical(attitudes.time, attitudes.nRb, trial.imu.time, trial.imu.accel)
+    tilt = off_vertical(attitudes.time, attitudes.nRb, trial.inertial.time, trial.inertial.accel)
     if tilt > _OFF_VERTICAL:
         findings.append(
             Finding(

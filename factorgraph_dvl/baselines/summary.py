@@ -112,8 +112,8 @@ def _imu_biases(trial: Trial, navigation: Navigation) -> Estimated:
     an upper bound.
     """
     track = navigation.track
-    parameters = trial.imu.parameters(float(track.time[-1] - track.time[0]))
-    if not trial.imu.settings.bias_walks:
+    parameters = trial.inertial.parameters(float(track.time[-1] - track.time[0]))
+    if not trial.inertial.settings.bias_walks:
         values = (track.gyro_bias[-1], track.accel_bias[-1])
         return Estimated(parameters, values, track.covariance[-1, 9:, 9:])
     step = np.where(np.diff(navigation.arc) == 0, np.diff(track.time), 0.0)

@@ -156,14 +156,14 @@ def _attitude(
         from factorgraph_dvl.baselines import sins
 
         motion, bias, findings = sins(trial, align_s=align)
-        return AttitudeHistory(trial.imu, motion, trial.body_axes, bias), findings
+        return AttitudeHistory(trial.inertial, motion, trial.body_axes, bias), findings
     if source == "reference":
         if trial.reference is None:
             raise ConfigError(
                 "the trial has no reference", where="--attitude reference",
                 expected="sins, or a solution folder",
             )  # fmt: skip
-        return AttitudeHistory(trial.imu, trial.reference, trial.body_axes, np.zeros(3)), ()
+        return AttitudeHistory(trial.inertial, trial.reference, trial.body_axes, np.zeros(3)), ()
     from factorgraph_dvl.io.calibration_file import check_verdict
     from factorgraph_dvl.io.solution_folder import load_solution
 
@@ -181,7 +181,7 @@ def _attitude(
     bias = np.zeros(3)
     if "gyro_bias_deg_h" in names:
         bias = solution.estimate("gyro_bias_deg_h").value * DEG_PER_HOUR
-    return AttitudeHistory(trial.imu, solution.trajectory, solution.body_axes, bias), ()
+    return AttitudeHistory(trial.inertial, solution.trajectory, solution.body_axes, bias), ()
 
 
 def _draw(trial: Trial, result: BeforeAfter, folder: Path) -> None:

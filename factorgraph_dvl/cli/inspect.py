@@ -25,7 +25,7 @@ def inspect(trial_path: TrialPath) -> None:
     else:
         trial = load_trial(trial_path, anyway=True)
         result, notes = survey(trial), trial.notes
-        assumed = imu_lines(trial.imu.settings)
+        assumed = [] if trial.imu is None else imu_lines(trial.imu.settings)
     console = stdout()
     print_table(sensor_table(result))
     for line in (motion_line(result), *assumed):

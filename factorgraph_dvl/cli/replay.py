@@ -147,7 +147,7 @@ def _run(
     kind = next(k for k in KINDS if k == smoother)
     began = perf_counter()
     shown = began
-    first = float(trial.imu.time[0])
+    first = float(trial.inertial.time[0])
 
     def speed(update: Update) -> float:
         return (update.time - first) / max(perf_counter() - began, 1e-9)
@@ -267,7 +267,7 @@ def _print(trial: Trial, solution: Solution, record: ReplayRecord, found: Conver
     truth = trial.calibration_truth
     errors = calibration_errors(solution, truth) if truth else None
     print_table(calibration_table(solution, errors, width=console.width))
-    start = float(trial.imu.time[0])
+    start = float(trial.inertial.time[0])
     print_table(convergence_table(found, start))
     plain = 1e3 * record.latency[~record.solved]
     if plain.size:

@@ -84,14 +84,14 @@ def inertial_chain(
     """Return the inertial part of the graph, with gravity at the positions of `start`."""
     middle = 0.5 * (start.p_n[seg.origin] + start.p_n[seg.origin + 1])
     gravity_n = frame.gravity_without_rotation(middle)
-    settings = trial.imu.settings
+    settings = trial.inertial.settings
     graph = gtsam.NonlinearFactorGraph()
-    biases = trial.imu.parameters(float(seg.duration.sum()))
+    biases = trial.inertial.parameters(float(seg.duration.sum()))
     chain = Chain(frame, seg, gravity_n, biases, settings.bias_walks, graph)
     pims = preintegrate(seg, settings, gravity_n, frame.earth_rate)
     for k, pim in zip(seg.origin.tolist(), pims, strict=True):
         graph.add(gtsam.GalileanImuFactor2(keys.node(k), keys.node(k + 1), chain.bias_key(k), pim))
-    gyro, accel = trial.imu.parameters(0.0)
+    gyro, accel = trial.inertial.parameters(0.0)
     sigmas = np.concatenate([accel.sigma, gyro.sigma])
     if bias_prior:
         none = gtsam.imuBias.ConstantBias()

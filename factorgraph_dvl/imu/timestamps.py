@@ -21,7 +21,7 @@ def without_strays(trial: Trial) -> Trial:
     A logger that starts at 0 and takes GPS time later stamps its first samples by a clock of
     their own. Stretches before and after such a jump stay where other sensors measured.
     """
-    time = trial.imu.time
+    time = trial.inertial.time
     edges = np.concatenate([[0], np.flatnonzero(np.diff(time) > JUMP) + 1, [time.size]])
     if edges.size == 2:
         return trial
@@ -42,7 +42,7 @@ def without_strays(trial: Trial) -> Trial:
         for a, b, n in zip(first[~kept], last[~kept], np.diff(edges)[~kept], strict=True)
     )
     rows = np.repeat(kept, np.diff(edges))
-    return replace(trial, imu=rows_of(trial.imu, rows), notes=(*trial.notes, *notes))
+    return replace(trial, imu=rows_of(trial.inertial, rows), notes=(*trial.notes, *notes))
 
 
 def fill_lost(

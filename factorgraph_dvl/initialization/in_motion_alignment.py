@@ -118,7 +118,7 @@ def initial_states(trial: Trial, frame: LocalFrame, seg: Segments) -> AlignedSta
     if trial.initial_position is None and trial.beacons is None and not fixed.any():
         raise DataError(
             "no position while the IMU runs",
-            where=trial.imu.source,
+            where=trial.inertial.source,
             expected="GNSS between its first and last sample, initial.position, or beacons",
             hint="Check that all clocks start together",
         )
@@ -143,7 +143,7 @@ def initial_states(trial: Trial, frame: LocalFrame, seg: Segments) -> AlignedSta
         if pairs is None:
             raise DataError(
                 f"nothing to find the attitude with from {arc.start:z.1f} s on",
-                where=trial.imu.source,
+                where=trial.inertial.source,
                 expected="GNSS or DVL data there, or `initial` in trial.yaml",
             )
         before = nRb[arc.nodes[0] - 1] if a > 0 else None
@@ -256,7 +256,7 @@ def _align(
     Gyro biases turn the body axes of the start with time: so each window has its own
     rotation, and windows that do not show the heading take that of the nearest which does.
     """
-    bias = trial.imu.settings.gyro_bias_std_deg_h * DEG / 3600.0
+    bias = trial.inertial.settings.gyro_bias_std_deg_h * DEG / 3600.0
     length = float(np.clip(np.sqrt(12.0 * _WINDOW_ERROR / (9.8 * bias)), *_WINDOW_LIMITS))
     count = max(round(arc.since[-1] / length), 1)
     edges = arc.start + arc.since[-1] * np.arange(count + 1) / count

@@ -119,7 +119,7 @@ def load_trial(path: Path | str, *, anyway: bool = False) -> Trial:
     initial = settings.initial
     kinds = {aid.section: aid for aid in AIDS}
     notes: list[Finding] = []
-    imu = read_record(folder, Imu, settings.imu, notes)
+    imu = None if settings.imu is UNSET else read_record(folder, Imu, settings.imu, notes)
     aids = {
         name: read_record(folder, kinds[name], section, notes)
         for name, section in settings.aids.items()
@@ -200,7 +200,8 @@ def record_files(path: Path) -> list[Path]:
     """
     folder, file = locate(path)
     settings = parse_yaml(read_text(file), TrialSettings, source=file.name)
-    return [folder / section.file for section in (settings.imu, *settings.aids.values())]
+    sections = [] if settings.imu is UNSET else [settings.imu]
+    return [folder / section.file for section in (*sections, *settings.aids.values())]
 
 
 def save_trial(
@@ -236,7 +237,7 @@ def save_trial(
     suffix = ".parquet" if parquet else ".csv"
     check_saved(Path(path))
     with new_folder(Path(path), force=force, owned=OWNED) as folder:
-        for record in (trial.imu, *trial.aids):
+        for record in trial.records:
             write_table(folder / f"{record.section}{suffix}", record.columns())
         if trial.reference is not None:
             write_table(folder / f"reference{suffix}", motion_columns(trial.reference))
@@ -478,7 +479,7 @@ def _settings(trial: Trial, suffix: str) -> TrialSettings:
             record.section: msgspec.structs.replace(
                 record.settings, file=f"{record.section}{suffix}"
             )
-            for record in (trial.imu, *trial.aids)
+            for record in trial.records
         },
         limits=_limits(trial),
         initial=_initial(trial),

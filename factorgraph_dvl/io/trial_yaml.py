@@ -98,7 +98,7 @@ class _Settings(Section, frozen=True, kw_only=True):
     body_axes: BodyAxes = "RFU"
     epoch: str = ""
     noise: NoiseModel = "estimated"
-    imu: ImuSettings
+    imu: ImuSettings | UnsetType = UNSET
     limits: LimitSettings | UnsetType = UNSET
     initial: InitialSettings | UnsetType = UNSET
     reference: ReferenceSettings | UnsetType = UNSET
@@ -106,6 +106,10 @@ class _Settings(Section, frozen=True, kw_only=True):
     def __post_init__(self) -> None:
         super().__post_init__()
         check_epoch(self.epoch)
+        if self.imu is UNSET and not {"attitude", "ins"} & set(self.aids):
+            raise ValueError(
+                "missing key `imu`, or in its place `attitude` (AHRS, gyrocompass) or `ins`"
+            )
 
     @property
     def aids(self) -> dict[str, SensorSection]:

@@ -93,7 +93,7 @@ def consistency_findings(trial: Trial, errors: Sequence[Finding]) -> Iterator[Fi
         return
     left_out = {f.sensor for f in errors}
     sensors = [s for s in (trial.gnss, trial.log) if s is not None and s.label not in left_out]
-    windows = carried_windows(trial.imu)
+    windows = carried_windows(trial.inertial)
     if windows is None or not sensors:
         return
 
@@ -104,9 +104,9 @@ def consistency_findings(trial: Trial, errors: Sequence[Finding]) -> Iterator[Fi
     views = _views(windows, sensors)
     wrong: list[Candidate] = []
     if max((view.excess for view in views), default=0.0) > _CONTRADICTS:
-        wrong = diagnosis(compare, trial.imu, -frd_from_body(trial.body_axes)[2])
+        wrong = diagnosis(compare, trial.inertial, -frd_from_body(trial.body_axes)[2])
     if wrong:
-        corrected = carried_windows(wrong[0].corrected(trial.imu))
+        corrected = carried_windows(wrong[0].corrected(trial.inertial))
         views = _views(corrected or windows, sensors)
         directions = next((v.directions() for v in views if isinstance(v, _GnssView)), None)
         yield _imu_finding(wrong, directions, trial.body_axes)

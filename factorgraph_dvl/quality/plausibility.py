@@ -37,7 +37,9 @@ def findings(trial: Trial, sensors: list[SensorSurvey]) -> Iterator[Finding]:
         Its records, that of the IMU first.
     """
     alone = list(_of_single_sensors(trial, sensors))
-    together = list(consistency_findings(trial, [f for f in alone if f.severity == "error"]))
+    together = []
+    if trial.imu is not None:
+        together = list(consistency_findings(trial, [f for f in alone if f.severity == "error"]))
     known = {f.code for f in together}
     for finding in alone:
         if finding.code != Code.GYRO_UNIT or known.isdisjoint(_BETTER):
@@ -48,9 +50,10 @@ def findings(trial: Trial, sensors: list[SensorSurvey]) -> Iterator[Finding]:
 def _of_single_sensors(trial: Trial, sensors: list[SensorSurvey]) -> Iterator[Finding]:
     """Yield what is wrong with sensors alone, and with their speeds."""
     yield from time_findings(trial, sensors)
-    yield from force_findings(trial.imu, trial.body_axes)
-    yield from channel_findings(trial.imu)
-    yield from gyro_findings(trial.imu)
+    if trial.imu is not None:
+        yield from force_findings(trial.imu, trial.body_axes)
+        yield from channel_findings(trial.imu)
+        yield from gyro_findings(trial.imu)
     if trial.gnss is not None:
         yield from gnss_findings(trial.gnss)
     if trial.dvl is not None:
@@ -60,5 +63,5 @@ def _of_single_sensors(trial: Trial, sensors: list[SensorSurvey]) -> Iterator[Fi
         yield from dvl_findings(log, trial.gnss, trial.body_axes, BEAM_TERMS)
         yield from beam_findings(trial.beams)
     for aid in trial.others:
-        if isinstance(aid, Star):
+        if isinstance(aid, Star) and trial.imu is not None:
             yield from star_findings(aid, trial)

@@ -41,7 +41,7 @@ def star_findings(star: Star, trial: Trial) -> Iterator[Finding]:
             severity="error",
         )
     yield from star.findings()
-    convention = list(_convention(star, trial.imu))
+    convention = list(_convention(star, trial.inertial))
     yield from convention
     # What mixes up the quaternion turns the vertical too.
     if trial.epoch and not any(f.severity == "error" for f in convention):
@@ -54,7 +54,7 @@ def _vertical(star: Star, trial: Trial) -> Iterator[Finding]:
     if unknown or (trial.gnss is None and trial.initial_position is None):
         return
     seen = star.attitudes(trial.frame())
-    imu = trial.imu
+    imu = trial.inertial
     use = (seen.time >= imu.time[0]) & (seen.time <= imu.time[-1])
     if not use.any():
         return

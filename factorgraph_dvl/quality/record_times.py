@@ -8,18 +8,28 @@ import numpy as np
 
 from factorgraph_dvl.quality.records import GAP_INTERVALS, SensorSurvey
 from factorgraph_dvl.quality.sensor_clocks import whole_hours
+from factorgraph_dvl.sensors.attitude import Attitude
 from factorgraph_dvl.sensors.clock import ClockSection
 from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.sensors.imu import Imu
+from factorgraph_dvl.sensors.ins import Ins
 from factorgraph_dvl.sensors.protocol import Aid
 from factorgraph_dvl.trial import Trial
 
 
 def time_findings(trial: Trial, sensors: list[SensorSurvey]) -> Iterator[Finding]:
-    """Yield what is wrong with the times of the records, that of the IMU first."""
-    imu, *aids = sensors
+    """Yield what is wrong with the times of records against the IMU or what takes its place."""
+    body = trial.body_sensor
+    if isinstance(body, Imu):
+        name, (imu, *aids) = "the IMU", sensors
+    else:
+        aids = sensors
+        imu = next(s for s in sensors if s.label == body.label)
+        name = f"the {body.label}"
     interval = 1.0 / imu.rate
-    if interval >= 0.5:
+    if trial.imu is None:
+        pass
+    elif interval >= 0.5:
         unit = f", or milliseconds ({1000.0 / interval:.4g} Hz)" if interval >= 1.0 else ""
         yield Finding(
             Code.TIME_UNIT,
@@ -37,12 +47,12 @@ def time_findings(trial: Trial, sensors: list[SensorSurvey]) -> Iterator[Finding
             yield Finding(Code.NO_MEASUREMENT, text, aid.label, severity="error")
             continue
         inside = min(aid.end, imu.end) - max(aid.start, imu.start)
-        if not _meets(record, trial.imu):
+        if not _meets(record, body):
             hours = whole_hours((imu.start, imu.end), (aid.start, aid.end))
             if hours:
                 yield Finding(
                     Code.LOCAL_TIME,
-                    f"its times do not overlap those of the IMU, but would {abs(hours)} h "
+                    f"its times do not overlap those of {name}, but would {abs(hours)} h "
                     f"{'later' if hours > 0 else 'earlier'}: is one of them in local time?",
                     aid.label,
                     severity="error",
@@ -50,21 +60,23 @@ def time_findings(trial: Trial, sensors: list[SensorSurvey]) -> Iterator[Finding
                 continue
             yield Finding(
                 Code.NO_OVERLAP,
-                f"its times, {aid.start:.10g} to {aid.end:.10g} s, do not overlap those of the "
-                f"IMU, {imu.start:.10g} to {imu.end:.10g} s: are they of one clock, in seconds?",
+                f"its times, {aid.start:.10g} to {aid.end:.10g} s, do not overlap those of "
+                f"{name}, {imu.start:.10g} to {imu.end:.10g} s: "
+                "are they of one clock, in seconds?",
                 aid.label,
                 severity="error",
             )
         elif inside < 0.5 * (aid.end - aid.start):
             yield Finding(
                 Code.PARTIAL_OVERLAP,
-                "more than half of its record lies outside that of the IMU",
+                f"more than half of its record lies outside that of {name}",
                 aid.label,
             )
         elif inside < 0.5 * (imu.end - imu.start):
             yield Finding(
                 Code.PARTIAL_OVERLAP,
-                f"it covers {100.0 * inside / (imu.end - imu.start):.3g} % of the IMU's record",
+                f"it covers {100.0 * inside / (imu.end - imu.start):.3g} % of the record of "
+                f"{name}",
                 aid.label,
             )
     for sensor in sensors:
@@ -83,7 +95,7 @@ def time_findings(trial: Trial, sensors: list[SensorSurvey]) -> Iterator[Finding
             )
 
 
-def _meets(aid: Aid, imu: Imu) -> bool:
+def _meets(aid: Aid, imu: Imu | Attitude | Ins) -> bool:
     """Whether the IMU runs at any measurement of a sensor."""
     settings = aid.settings
     offset = settings.time_offset_s if isinstance(settings, ClockSection) else 0.0

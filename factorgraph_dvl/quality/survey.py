@@ -23,7 +23,7 @@ class Survey:
     sensors : tuple of SensorSurvey
         One entry for each.
     duration : float
-        Of the IMU's record, s.
+        Of the record of the IMU, or of what takes its place, s.
     distance : float
         Travelled, m; nan without GNSS and DVL.
     speed_min, speed_max : float
@@ -59,13 +59,16 @@ def survey(trial: Trial) -> Survey:
     trial : Trial
         As loaded.
     """
-    sensors = [record_of("IMU", trial.imu.time, np.zeros(trial.imu.time.size, dtype=bool))]
+    sensors = []
+    if trial.imu is not None:
+        sensors.append(record_of("IMU", trial.imu.time, np.zeros(trial.imu.time.size, dtype=bool)))
+    body = trial.body_sensor
     sensors += [record_of(aid.label, aid.time, aid.missing) for aid in trial.aids]
     distance, speed = travel(trial.gnss, trial.log)
     return Survey(
         trial=trial.name,
         sensors=tuple(sensors),
-        duration=float(trial.imu.time[-1] - trial.imu.time[0]),
+        duration=float(body.time[-1] - body.time[0]),
         distance=distance,
         speed_min=float(speed.min()) if speed.size else np.nan,
         speed_max=float(speed.max()) if speed.size else np.nan,

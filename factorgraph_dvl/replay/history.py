@@ -130,13 +130,13 @@ class RecordHistory:
                 aids[section] = record
         settings = self._settings
         imu = Imu(
-            settings.imu.settings,
+            settings.inertial.settings,
             samples[:, 0],
             samples[:, 1:4],
             samples[:, 4:7],
-            source=settings.imu.source,
+            source=settings.inertial.source,
         )
-        if settings.imu.time[0] < samples[0, 0] - 1.0:
+        if settings.inertial.time[0] < samples[0, 0] - 1.0:
             # What `initial` states is of a start that has been dropped.
             settings = replace(
                 settings, initial_attitude=None, initial_position=None, initial_velocity=None

@@ -259,7 +259,7 @@ class Initializer:
             return "no position has been measured since" if self._gap else "no position yet"
         try:
             if self._clock_zero is None:
-                self._clock_zero = float(trial.imu.time[0])
+                self._clock_zero = float(trial.inertial.time[0])
             return solve_start(
                 trial, self._prior, self._interval, since, self._progress, self._clock_zero
             )

@@ -97,7 +97,7 @@ def _played(
     trial.frame()
     run = Replay(trial, smoother=smoother, lag_s=lag_s, rate_hz=rate_hz, progress=progress)
     recorder = Recorder()
-    imu = trial.imu
+    imu = trial.inertial
     step = 1.0 / rate_hz
     # Gaps cost one step, whatever their length.
     steps = np.unique(np.floor((imu.time - imu.time[0]) / step))
@@ -160,7 +160,7 @@ def _solution(trial: Trial, run: Replay, recorder: Recorder, last: Update) -> So
                     aid.label,
                 )
             )
-    if trial.imu.settings.bias_walks:
+    if trial.inertial.settings.bias_walks:
         findings.append(
             Finding(
                 Code.MEAN_OR_LAST,

@@ -80,14 +80,14 @@ class Replay:
             if not (np.isfinite(value) and value > 0.0):
                 raise ConfigError(f"{name} is {value}", expected="a number above 0")
         self._findings: list[Finding] = []
-        if any(p.estimated for p in settings.imu.error_parameters()):
-            settings = replace(settings, imu=settings.imu.without_errors())
+        if any(p.estimated for p in settings.inertial.error_parameters()):
+            settings = replace(settings, imu=settings.inertial.without_errors())
             self._findings.append(_IMU_ERRORS_LEFT_OUT)
         self._settings = settings
         self._kind = smoother
         self._lag = lag_s
         self._interval = 1.0 / rate_hz
-        self._samples = SampleBuffer(settings.imu.settings)
+        self._samples = SampleBuffer(settings.inertial.settings)
         self._initializer = Initializer(
             settings, self._interval, progress or (lambda stage, iteration, cost: None)
         )
@@ -298,7 +298,7 @@ class Replay:
         self._deferred.clear()
         lag = self._lag if self._kind == "fixed-lag" else None
         self._navigator = Navigator(
-            start, self._settings.imu, self._gate, lag=lag, memory=self._lag
+            start, self._settings.inertial, self._gate, lag=lag, memory=self._lag
         )
         self._samples.windows = start.windows
         self._smoothed_to = start.node

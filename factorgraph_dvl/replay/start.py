@@ -230,7 +230,7 @@ def _own_states(trial: Trial, frame: LocalFrame, interval: float) -> tuple[str, 
     for aid in trial.aids:
         if isinstance(aid, AttitudeAid):
             seen = aid.attitudes(frame)
-            if seen.time.size and needs_states(seen, trial.imu.settings, interval):
+            if seen.time.size and needs_states(seen, trial.inertial.settings, interval):
                 out.append(aid.section)
     return tuple(out)
 

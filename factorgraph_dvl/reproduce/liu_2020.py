@@ -129,7 +129,7 @@ def _equation_1(seeds: int) -> Result:
     assert given.imu is not None
     still = msgspec.structs.replace(given.imu, gyro_bias_deg_h=(0.0, 0.0, 0.0))
     free = msgspec.structs.replace(given, imu=still)
-    with_drift, without = simulate(given, 0).imu.gyro, simulate(free, 0).imu.gyro
+    with_drift, without = simulate(given, 0).inertial.gyro, simulate(free, 0).inertial.gyro
     drift = (with_drift - without).mean(axis=0) / DEG_PER_HOUR
     return Result(
         f"simulated gyros less those without drift: {np.round(drift, 4).tolist()} °/h, constant "

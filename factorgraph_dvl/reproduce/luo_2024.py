@@ -552,7 +552,7 @@ def _sea() -> tuple[Array, BeforeAfter, float]:
     true = cruise.calibration_truth["lever_arm_m"]
     transit: Trial = simulate(scenario("transit"), 1)
     motion, bias, _ = sins(transit)
-    source = AttitudeHistory(transit.imu, motion, transit.body_axes, bias)
+    source = AttitudeHistory(transit.inertial, motion, transit.body_axes, bias)
     found = before_after(transit, {n: solution.estimate(n).value for n in _SEVEN}, source.at)
     return arm, found, float(np.max(np.abs(arm - true)))
 

@@ -5,19 +5,24 @@ from __future__ import annotations
 import re
 from dataclasses import replace
 
+from factorgraph_dvl.sensors.attitude import Attitude
 from factorgraph_dvl.sensors.beacon import ANY_BEACON, Beacons, offset_name
 from factorgraph_dvl.sensors.depth import Depth
 from factorgraph_dvl.sensors.dvl import Dvl
 from factorgraph_dvl.sensors.dvl_beams import DvlBeams
 from factorgraph_dvl.sensors.gnss import Gnss
 from factorgraph_dvl.sensors.imu import Imu
+from factorgraph_dvl.sensors.ins import Ins
 from factorgraph_dvl.sensors.parameters import ParameterSpec
 from factorgraph_dvl.sensors.protocol import Aid, SensorRecord
 from factorgraph_dvl.sensors.speed_log import Heading, SpeedLog
 from factorgraph_dvl.sensors.star import Star
 from factorgraph_dvl.sensors.turntable import Turntable
 
-AIDS: tuple[type[Aid], ...] = (Gnss, Dvl, Star, Depth, DvlBeams, Turntable, Beacons)
+AIDS: tuple[type[Aid], ...] = (
+    *(Gnss, Dvl, Ins, Attitude, Star, Depth),
+    *(DvlBeams, Turntable, Beacons),
+)
 
 
 # Records of a planar trial, which has no IMU.

@@ -75,7 +75,7 @@ def clock_rate(section: str, rate_ppm: float) -> Fault:
     """Let the clock of a sensor run fast by a rate, right at the middle of the trial."""
 
     def fault(trial: Trial, rng: np.random.Generator) -> Trial:
-        middle = 0.5 * (trial.imu.time[0] + trial.imu.time[-1])
+        middle = 0.5 * (trial.inertial.time[0] + trial.inertial.time[-1])
         return _stamped(
             trial, section, lambda t: t + 1e-6 * rate_ppm * (t - middle), rate_ppm=rate_ppm
         )
@@ -294,7 +294,7 @@ def imu_errors(
     """
 
     def fault(trial: Trial, rng: np.random.Generator) -> Trial:
-        imu, truth = trial.imu, trial.calibration_truth
+        imu, truth = trial.inertial, trial.calibration_truth
         added = imu.gyro @ np.transpose(gyro) + imu.accel @ np.transpose(g_sensitivity)
         out = _with(
             trial, "imu", gyro=imu.gyro + added, accel=imu.accel + imu.accel @ np.transpose(accel)
@@ -313,7 +313,7 @@ def saturated(gyro_rad_s: float = np.inf, accel_m_s2: float = np.inf) -> Fault:
     """Clip the samples of the IMU at the ends of its range."""
 
     def fault(trial: Trial, rng: np.random.Generator) -> Trial:
-        imu = trial.imu
+        imu = trial.inertial
         return _with(
             trial,
             "imu",
@@ -364,7 +364,7 @@ def _truth(trial: Trial, name: str, change: Array) -> Trial:
 
 
 def _record(trial: Trial, section: str) -> Any:
-    records = {"imu": trial.imu, **{aid.section: aid for aid in trial.aids}}
+    records = {"imu": trial.inertial, **{aid.section: aid for aid in trial.aids}}
     return records[section]
 
 

@@ -83,12 +83,12 @@ def continue_posterior(
 
 def _at_truth(trial: Trial, true_states: TrueStates) -> tuple[Problem, Evaluation]:
     frame = trial.frame()
-    inc, _ = increments(trial.imu)
+    inc, _ = increments(trial.inertial)
     seg = segments(inc, STATE_INTERVAL, dense_epochs(trial, frame, STATE_INTERVAL))
     states = true_states(frame, seg.node_time)
     chain = inertial_chain(trial, frame, seg, states)
     observations, parameters = observed(trial.aids, frame, trial.body_axes)
-    parameters = (*parameters, *trial.imu.error_parameters())
+    parameters = (*parameters, *trial.inertial.error_parameters())
     truth: dict[str, Array] = {}
     for p in parameters:
         value = trial.calibration_truth.get(p.name)

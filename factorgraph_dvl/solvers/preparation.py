@@ -97,12 +97,12 @@ def prepare(trial: Trial, state_interval_s: float, report: Progress) -> Preparat
     """
     trial = without_strays(trial)
     louder: tuple[Finding, ...] = ()
-    if trial.estimates_noise(trial.imu):
-        imu, louder = with_recorded_noise(trial.imu)
+    if trial.estimates_noise(trial.inertial):
+        imu, louder = with_recorded_noise(trial.inertial)
         trial = replace(trial, imu=imu)
     frame = trial.frame()
     report("increments", 0, None)
-    inc, gaps = increments(trial.imu)
+    inc, gaps = increments(trial.inertial)
     seg = segments(inc, state_interval_s, dense_epochs(trial, frame, state_interval_s))
     report("alignment", 0, None)
     on_one_clock = trial.on_one_clock()
@@ -119,7 +119,7 @@ def prepare(trial: Trial, state_interval_s: float, report: Progress) -> Preparat
         observations=tuple(o for _, observations, _ in by_aid for o in observations),
         parameters=(
             *(p for _, _, parameters in by_aid for p in parameters),
-            *trial.imu.error_parameters(),
+            *trial.inertial.error_parameters(),
         ),
         estimated_noise=frozenset(
             o.label

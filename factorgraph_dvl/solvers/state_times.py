@@ -28,7 +28,7 @@ def dense_epochs(trial: Trial, frame: LocalFrame, interval: float) -> Array | No
     The angle of the gyros walks by q t within t. Attitudes of variance sigma² each, n of
     them to a state, must not hang on that state if q interval is not far below sigma²/n.
     """
-    settings = trial.imu.settings
+    settings = trial.inertial.settings
     seen = [s for s in attitudes(trial, frame) if needs_states(s, settings, interval)]
     time = np.unique(np.concatenate([np.empty(0), *(s.time for s in seen)]))
     return _thinned(time) if time.size else None

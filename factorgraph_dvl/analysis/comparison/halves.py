@@ -109,11 +109,12 @@ def halves_of(trial: Trial) -> tuple[Trial, Trial]:
             where="--halves",
             expected="a trial with GNSS",
         )
-    middle = 0.5 * float(trial.imu.time[0] + trial.imu.time[-1])
+    record = trial.body_sensor.time
+    middle = 0.5 * float(record[0] + record[-1])
     first, second = (
         replace(
             trial,
-            imu=rows_of(trial.imu, (trial.imu.time >= middle) == later),
+            imu=trial.imu and rows_of(trial.imu, (trial.imu.time >= middle) == later),
             gnss=rows_of(trial.gnss, (trial.gnss.time >= middle) == later),
             dvl=trial.dvl and rows_of(trial.dvl, (trial.dvl.time >= middle) == later),
             others=tuple(rows_of(aid, (aid.time >= middle) == later) for aid in trial.others),

@@ -234,7 +234,7 @@ def _start(
         if inside.size:
             return float(known.time[inside[0]]), known.geodetic[inside[0]]
     if trial.initial_position is not None:
-        return float(trial.imu.time[0]), trial.initial_position.geodetic
+        return float(trial.body_sensor.time[0]), trial.initial_position.geodetic
     raise DataError(
         "no position to start from",
         where=trial.gnss.source if trial.gnss is not None else "trial.yaml",

@@ -252,7 +252,7 @@ def _rate_sigma(trial: Trial | None, trajectory: Trajectory, body_axes: BodyAxes
     """
     step = np.diff(trajectory.time)
     interval = float(np.median(step))
-    if trial is not None:
+    if trial is not None and trial.imu is not None:
         sigma = trial.imu.settings.gyro_noise_root_psd / np.sqrt(interval)
         return np.full(3, float(sigma))
     nRb = rotation_from_rph(trajectory.rph, body_axes)

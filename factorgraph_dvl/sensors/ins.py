@@ -1,0 +1,342 @@
+"""Inertial navigation systems: position, velocity and attitude that an instrument worked out."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+from typing import ClassVar, Self
+
+import numpy as np
+
+from factorgraph_dvl.geometry.earth import LocalFrame
+from factorgraph_dvl.geometry.rotations import BodyAxes
+from factorgraph_dvl.geometry.units import DEG, GEODETIC_SI
+from factorgraph_dvl.geometry.vectors import Array, rotate, skew
+from factorgraph_dvl.sensors.attitude import (
+    LEAST_STD,
+    AttitudeAngles,
+    AttitudeError,
+    Share,
+    check_angles,
+    spaced,
+)
+from factorgraph_dvl.sensors.clock import Clock, ClockSection
+from factorgraph_dvl.sensors.parameters import Parameter, ParameterSpec
+from factorgraph_dvl.sensors.protocol import (
+    Linearization,
+    Motion,
+    Observation,
+    SensorSection,
+    Values,
+)
+from factorgraph_dvl.sensors.records import (
+    check_all_or_none,
+    check_possible,
+    check_range,
+    check_times,
+    named_columns,
+    stack,
+)
+from factorgraph_dvl.settings.sections import NonNegative, Positive, Sigma3, Vector3
+
+POSITION_COLUMNS = ("lat_deg", "lon_deg", "height_m")
+VELOCITY_COLUMNS = ("vel_e_m_s", "vel_n_m_s", "vel_u_m_s")
+ATTITUDE_COLUMNS = ("roll_deg", "pitch_deg", "heading_deg")
+STD_COLUMNS = (
+    *("std_e_m", "std_n_m", "std_u_m"),
+    *("vel_std_e_m_s", "vel_std_n_m_s", "vel_std_u_m_s"),
+    *("roll_std_deg", "pitch_std_deg", "heading_std_deg"),
+)
+_CLOCK = Clock.of("ins", prefix="ins_")
+# Times the correlation time after which an error counts as another one beside an IMU.
+_APART = 2.0
+# Share of a total standard deviation that is new in each sample, whatever is stated. Chosen: it
+# keeps the weights of samples finite, and is lost beside the rest.
+_LEAST_SHARE = 0.02
+
+
+class InsSettings(ClockSection, frozen=True, kw_only=True):
+    """Section `ins` of trial.yaml.
+
+    Standard deviations are totals; `correlated_share` of their squares is a Gauss-Markov process.
+    """
+
+    file: str = "ins.csv"
+    position_std_m: Sigma3 = (1.0, 1.0, 2.0)
+    velocity_std_m_s: Sigma3 = (0.05, 0.05, 0.05)
+    attitude_std_deg: Sigma3 = (0.02, 0.02, 0.05)
+    correlation_time_s: Positive = 300.0
+    correlated_share: Share = 1.0
+    lever_arm_m: Vector3 = (0.0, 0.0, 0.0)
+    time_offset_std_s: NonNegative = 5.0
+
+
+@dataclass(frozen=True)
+class Ins:
+    """Settings and record of an inertial navigation system.
+
+    Parameters
+    ----------
+    settings : InsSettings
+        Section `ins` of trial.yaml.
+    time : ndarray, shape (M,), s
+        Strictly increasing.
+    geodetic : ndarray, shape (M, 3)
+        Latitude, longitude (rad), ellipsoidal height (m); nan where not known.
+    velocity : ndarray, shape (M, 3)
+        East, north, up, m/s; nan where not known.
+    rph : ndarray, shape (M, 3)
+        Roll, pitch, heading, rad; nan where not known.
+    std : ndarray, shape (M, 9)
+        Standard deviations of the three, m, m/s and rad; nan where the settings' hold.
+    source : str, optional
+        Name of the file, for messages.
+    """
+
+    settings: InsSettings
+    time: Array
+    geodetic: Array
+    velocity: Array
+    rph: Array
+    std: Array
+    source: str = "ins"
+    label: str = "INS"
+
+    section: ClassVar[str] = "ins"
+    section_type: ClassVar[type[SensorSection]] = InsSettings
+    required: ClassVar[tuple[str, ...]] = (
+        "time_s",
+        *POSITION_COLUMNS,
+        *VELOCITY_COLUMNS,
+        *ATTITUDE_COLUMNS,
+    )
+    optional: ClassVar[tuple[tuple[str, ...], ...]] = (STD_COLUMNS,)
+    specs: ClassVar[tuple[ParameterSpec, ...]] = _CLOCK.specs
+    clock: ClassVar[Clock] = _CLOCK
+
+    def __post_init__(self) -> None:
+        check_times(self.time, self.source)
+        position = named_columns(POSITION_COLUMNS, self.geodetic)
+        check_all_or_none(position, self.source)
+        degrees = {k: position[k] / DEG for k in POSITION_COLUMNS[:2]}
+        check_possible(degrees | {"height_m": position["height_m"]}, self.source)
+        velocity = named_columns(VELOCITY_COLUMNS, self.velocity)
+        check_all_or_none(velocity, self.source)
+        check_range(velocity, -200.0, 200.0, "m/s", self.source)
+        check_all_or_none(named_columns(ATTITUDE_COLUMNS, self.rph), self.source)
+        check_angles(self.rph, self.source)
+        check_range(named_columns(STD_COLUMNS, self.std), 1e-9, 1e6, "above 0", self.source)
+
+    @classmethod
+    def from_columns(
+        cls, settings: InsSettings, columns: Mapping[str, Array], source: str
+    ) -> Self:
+        """Return the record that a table holds."""
+        return cls(
+            settings,
+            columns["time_s"],
+            stack(columns, POSITION_COLUMNS) * GEODETIC_SI,
+            stack(columns, VELOCITY_COLUMNS),
+            stack(columns, ATTITUDE_COLUMNS) * DEG,
+            stack(columns, STD_COLUMNS) * np.repeat([1.0, 1.0, DEG], 3),
+            source,
+        )
+
+    def columns(self) -> dict[str, Array]:
+        """Return the record as a table."""
+        table = {
+            "time_s": self.time,
+            **named_columns(POSITION_COLUMNS, self.geodetic / GEODETIC_SI),
+            **named_columns(VELOCITY_COLUMNS, self.velocity),
+            **named_columns(ATTITUDE_COLUMNS, self.rph / DEG),
+        }
+        if not np.isnan(self.std).all():
+            table |= named_columns(STD_COLUMNS, self.std / np.repeat([1.0, 1.0, DEG], 3))
+        return table
+
+    @property
+    def missing(self) -> Array:
+        """Rows without a position, (M,) bool."""
+        return np.isnan(self.geodetic[:, 0])
+
+    @property
+    def total_std(self) -> Array:
+        """Total standard deviations of position, velocity, attitude, (M, 9), m, m/s, rad."""
+        s = self.settings
+        stated = np.array(
+            [*s.position_std_m, *s.velocity_std_m_s, *np.array(s.attitude_std_deg) * DEG]
+        )
+        return np.maximum(np.where(np.isnan(self.std), stated, self.std), LEAST_STD)
+
+    @property
+    def error(self) -> AttitudeError:
+        """What is stated of the errors of its attitude."""
+        sigma = np.median(self.total_std[:, 6:], axis=0)
+        s = self.settings
+        share = s.correlated_share
+        return AttitudeError(
+            np.sqrt(share) * sigma, s.correlation_time_s, np.sqrt(1 - share) * sigma
+        )
+
+    def parameters(self) -> tuple[Parameter, ...]:
+        """Return offset and rate of the clock."""
+        return _CLOCK.parameters(self.settings)
+
+    def observations(self, frame: LocalFrame, body_axes: BodyAxes) -> tuple[Observation, ...]:
+        """Return what is far enough apart to have errors of its own, with total deviations."""
+        apart = _APART * self.settings.correlation_time_s * (self.settings.correlated_share > 0.0)
+        rows = spaced(self.time, ~np.isnan(self.rph[:, 0]), apart)
+        kept = (
+            *self.motion_observations(frame, apart),
+            AttitudeAngles(
+                self.time[rows],
+                self.rph[rows],
+                self.total_std[rows, 6:],
+                frame,
+                body_axes,
+                _CLOCK,
+                label="INS attitude",
+                parameters=(),
+            ),
+        )
+        return tuple(o for o in kept if o.time.size)
+
+    def motion_observations(
+        self, frame: LocalFrame, apart: float = 0.0
+    ) -> tuple[InsPosition | InsVelocity, ...]:
+        """Return positions and velocities at least so many seconds apart.
+
+        All of them have the part of the standard deviation that is new in each; those that are
+        apart, the total.
+        """
+        share = 1.0 if apart > 0.0 else max(1.0 - self.settings.correlated_share, _LEAST_SHARE**2)
+        std = np.sqrt(share) * self.total_std
+        arm = np.array(self.settings.lever_arm_m)
+        at_position = spaced(self.time, ~np.isnan(self.geodetic[:, 0]), apart)
+        at_velocity = spaced(
+            self.time, ~np.isnan(self.velocity[:, 0]) & ~np.isnan(self.geodetic[:, 0]), apart
+        )
+        p, v = at_position, at_velocity
+        return (
+            InsPosition(
+                self.time[p],
+                frame.position(*self.geodetic[p].T),
+                frame.level_from_tangent(*self.geodetic[p, :2].T),
+                std[p, :3],
+                arm,
+            ),
+            InsVelocity(
+                self.time[v],
+                self.velocity[v],
+                frame.level_from_tangent(*self.geodetic[v, :2].T),
+                std[v, 3:6],
+                arm,
+            ),
+        )
+
+    def explain(self, parameter: str, component: int, motion: Motion | None) -> str:
+        """Say why the clock could not be observed."""
+        return "a time offset shows only where velocity or attitude change"
+
+
+@dataclass(frozen=True)
+class InsPosition:
+    """Position of the point that the INS reports; zero error where it is p_n + nRb l.
+
+    Parameters
+    ----------
+    time : ndarray, shape (M,), s
+        Of the samples.
+    measured_n : ndarray, shape (M, 3), m
+        Position in n.
+    lRn : ndarray, shape (M, 3, 3)
+        N to local-level axes.
+    std : ndarray, shape (M, 3), m
+        East, north, up.
+    lever_arm : ndarray, shape (3,), m
+        To the point, in body.
+    """
+
+    time: Array
+    measured_n: Array
+    lRn: Array
+    std: Array
+    lever_arm: Array
+    label: str = "INS position"
+    unit: str = "m"
+    components: tuple[str, ...] = ("east", "north", "up")
+    gate: float | None = None
+    noise_groups: tuple[tuple[int, ...], ...] = ()
+    independent: bool = False
+    parameters: tuple[str, ...] = ()
+    clock: Clock = _CLOCK
+
+    def sigma(self, motion: Motion, values: Values, factor: Array | float = 1.0) -> Array:
+        """Return the standard deviations, (M, 3), m."""
+        return self.std * factor
+
+    def residual(self, motion: Motion, values: Values) -> Array:
+        """Return predicted - measured in local-level east, north, up, (M, 3), m."""
+        point_n = motion.p_n + motion.nRb @ self.lever_arm
+        return rotate(self.lRn, point_n - self.measured_n)
+
+    def linearize(self, motion: Motion, values: Values, wanted: Collection[str]) -> Linearization:
+        """Return the residual and its Jacobians."""
+        return Linearization(
+            residual=self.residual(motion, values),
+            d_theta=-self.lRn @ motion.nRb @ skew(self.lever_arm),
+            d_p=self.lRn,
+        )
+
+
+@dataclass(frozen=True)
+class InsVelocity:
+    """Velocity of the point that the INS reports; zero error where it is v_n + nRb (w x l).
+
+    Parameters
+    ----------
+    time : ndarray, shape (M,), s
+        Of the samples.
+    measured_l : ndarray, shape (M, 3), m/s
+        East, north, up at the vehicle.
+    lRn : ndarray, shape (M, 3, 3)
+        N to local-level axes.
+    std : ndarray, shape (M, 3), m/s
+        East, north, up.
+    lever_arm : ndarray, shape (3,), m
+        To the point, in body.
+    """
+
+    time: Array
+    measured_l: Array
+    lRn: Array
+    std: Array
+    lever_arm: Array
+    label: str = "INS velocity"
+    unit: str = "m/s"
+    components: tuple[str, ...] = ("east", "north", "up")
+    gate: float | None = None
+    noise_groups: tuple[tuple[int, ...], ...] = ()
+    independent: bool = False
+    parameters: tuple[str, ...] = ()
+    clock: Clock = _CLOCK
+
+    def sigma(self, motion: Motion, values: Values, factor: Array | float = 1.0) -> Array:
+        """Return the standard deviations, (M, 3), m/s."""
+        return self.std * factor
+
+    def residual(self, motion: Motion, values: Values) -> Array:
+        """Return predicted - measured in local-level east, north, up, (M, 3), m/s."""
+        turning = skew(motion.omega_eb_b) @ self.lever_arm
+        return rotate(self.lRn, motion.v_n + rotate(motion.nRb, turning)) - self.measured_l
+
+    def linearize(self, motion: Motion, values: Values, wanted: Collection[str]) -> Linearization:
+        """Return the residual and its Jacobians."""
+        lRb = self.lRn @ motion.nRb
+        turning = skew(motion.omega_eb_b) @ self.lever_arm
+        return Linearization(
+            residual=self.residual(motion, values),
+            d_theta=-lRb @ skew(turning),
+            d_v=self.lRn,
+            d_omega=-lRb @ skew(self.lever_arm),
+        )
