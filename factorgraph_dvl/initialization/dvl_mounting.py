@@ -39,6 +39,13 @@ _VELOCITY_ERROR = 0.03
 # Least scale of a DVL, and steps of a descent. Chosen: far off what instruments do and need.
 _LEAST_SCALE = 0.2
 _STEPS = 30
+# A descent ends where a step gains less cost than this, or not even a step so damped gains any.
+# Chosen: the solver goes on from there.
+_GAIN = 1e-3
+_MOST_DAMPING = 1e6
+# Rotations to start from, and the derivatives of one.
+_CUBE = Rotation.create_group("O").as_matrix()
+_GENERATORS = skew(np.eye(3))
 # Rotation, rad, from which on two minima are two. Chosen: less than half of what divides starts.
 _APART = 20.0 * DEG
 # Pings that are summed up at most. Chosen: far more than the unknowns ask for.
@@ -64,11 +71,27 @@ class _Moments:
 
 
 @dataclass(frozen=True)
-class _Mounting:
+class _Mountings:
+    """S mountings: `dRb` (S, 3, 3), `scale` (S, n), `lever_arm` and `bias` (S, 3), m, m/s."""
+
     dRb: Array
     scale: Array
     lever_arm: Array
     bias: Array
+
+    def __getitem__(self, rows: np.ndarray) -> _Mountings:
+        """Return some of them."""
+        return _Mountings(self.dRb[rows], self.scale[rows], self.lever_arm[rows], self.bias[rows])
+
+    def moved(self, step: Array) -> _Mountings:
+        """Return them after steps (S, 9 + n)."""
+        n = self.scale.shape[1]
+        return _Mountings(
+            self.dRb @ exp_so3(step[:, :3]),
+            self.scale + step[:, 3 : 3 + n],
+            self.lever_arm + step[:, 3 + n : 6 + n],
+            self.bias + step[:, 6 + n :],
+        )
 
 
 MotionAt = Callable[[Array], tuple[Motion, NDArray[np.bool_]]]
@@ -119,16 +142,10 @@ def initial_mountings(dvl: Dvl, motion_at: MotionAt) -> list[dict[str, Array]]:
     found = moments(offset)
     if found.share == 0.0:
         return [values]
-    return [
-        values
-        | {
-            MISALIGNMENT: each.dRb,
-            SCALE_ERROR: each.scale - 1.0,
-            LEVER_ARM: each.lever_arm,
-            BIAS: each.bias,
-        }
-        for each in _minima(found, priors)
-    ]
+    minima = _minima(found, priors)
+    names = (MISALIGNMENT, SCALE_ERROR, LEVER_ARM, BIAS)
+    each = zip(minima.dRb, minima.scale - 1.0, minima.lever_arm, minima.bias, strict=True)
+    return [values | dict(zip(names, mounting, strict=True)) for mounting in each]
 
 
 def _linear_misfit(moments: _Moments) -> float:
@@ -148,133 +165,141 @@ def _least_squares(moments: _Moments) -> Array:
     return np.asarray(np.linalg.solve(moments.xx + ridge, moments.xy).T, dtype=float)
 
 
-def _minima(moments: _Moments, priors: dict[str, Parameter]) -> list[_Mounting]:
+def _minima(moments: _Moments, priors: dict[str, Parameter]) -> _Mountings:
     """Return the mountings that many starts lead to, the best first."""
-    prior = _Mounting(
-        exp_so3(priors[MISALIGNMENT].mean),
-        1.0 + priors[SCALE_ERROR].mean,
-        priors[LEVER_ARM].mean,
-        priors[BIAS].mean,
-    )
-    starts = [prior, *_closed_form(moments, prior)]
+    dRb = [exp_so3(priors[MISALIGNMENT].mean)]
+    scale, lever_arm = [1.0 + priors[SCALE_ERROR].mean], [priors[LEVER_ARM].mean]
+    closed = _closed_form(moments)
+    if closed is not None:
+        dRb.append(closed[0])
+        scale.append(np.full_like(scale[0], closed[1]))
+        lever_arm.append(closed[2])
     if priors[MISALIGNMENT].sigma.max() > 0.3:
-        starts += [
-            _Mounting(R, prior.scale, prior.lever_arm, prior.bias)
-            for R in Rotation.create_group("O").as_matrix()
-        ]
-    out: list[_Mounting] = []
-    for _, found in sorted((_descend(moments, s, priors) for s in starts), key=lambda r: r[0]):
-        if all(np.linalg.norm(log_so3(found.dRb.T @ o.dRb)) > _APART for o in out):
-            out.append(found)
-    return out
+        dRb.extend(_CUBE)
+        scale += [scale[0]] * len(_CUBE)
+        lever_arm += [lever_arm[0]] * len(_CUBE)
+    bias = [priors[BIAS].mean] * len(dRb)
+    starts = _Mountings(*map(np.array, (dRb, scale, lever_arm, bias)))
+    cost, found = _descend(moments, starts, priors)
+    distinct: list[int] = []
+    for i in np.argsort(cost, kind="stable").tolist():
+        turns = log_so3(found.dRb[i].T @ found.dRb[distinct])
+        if np.all(np.linalg.norm(turns, axis=1) > _APART):
+            distinct.append(i)
+    return found[np.array(distinct)]
 
 
-def _closed_form(moments: _Moments, prior: _Mounting) -> list[_Mounting]:
-    """Return the mounting from linear least squares of M and N, if M is a rotation's multiple.
+def _closed_form(moments: _Moments) -> tuple[Array, float, Array] | None:
+    """Return dRb, scale and lever arm by linear least squares of M and N.
 
-    Wahba's solution alone would take the lever arm's share for a misalignment.
+    None if M is no multiple of a rotation. Wahba's solution alone would take the lever arm's
+    share for a misalignment.
     """
     theta = _least_squares(moments)
     M, N = theta[:, :3], theta[:, 3:6]
     s = np.linalg.svd(M, compute_uv=False)
     if s[2] < _LEAST_SCALE or np.linalg.det(M) < 0:
-        return []
+        return None
     cross = -np.linalg.solve(M, N)
     lever_arm = 0.5 * np.array(
         [cross[2, 1] - cross[1, 2], cross[0, 2] - cross[2, 0], cross[1, 0] - cross[0, 1]]
     )
-    scale = np.full_like(prior.scale, s.mean())
-    return [_Mounting(best_rotation(M), scale, lever_arm, prior.bias)]
+    return best_rotation(M), float(s.mean()), lever_arm
 
 
 def _descend(
-    moments: _Moments, start: _Mounting, priors: dict[str, Parameter]
-) -> tuple[float, _Mounting]:
-    """Return cost and mounting after Gauss-Newton on the moments, with the priors."""
-    now, cost = start, _cost(moments, start, priors)
-    damping = 0.0
+    moments: _Moments, starts: _Mountings, priors: dict[str, Parameter]
+) -> tuple[Array, _Mountings]:
+    """Return costs and mountings after damped Gauss-Newton on the moments, with the priors."""
+    now, cost = starts, _cost(moments, starts, priors)
+    damping = np.zeros(cost.size)
+    active = np.arange(cost.size)
     for _ in range(_STEPS):
-        J = _derivative(now)
-        theta = _theta(now)
-        gradient = J.T @ (theta @ moments.xx - moments.xy.T).ravel()
-        H = np.einsum("aip,ij,ajq->pq", J.reshape(3, 7, -1), moments.xx, J.reshape(3, 7, -1))
-        prior_gradient, prior_information = _prior_terms(now, priors)
-        H = H + prior_information
-        H = H + damping * np.diag(np.diag(H))
-        step = -np.linalg.solve(H, gradient + prior_gradient)
-        n = now.scale.size
-        new = _Mounting(
-            now.dRb @ exp_so3(step[:3]),
-            now.scale + step[3 : 3 + n],
-            now.lever_arm + step[3 + n : 6 + n],
-            now.bias + step[6 + n :],
-        )
+        part = now[active]
+        step = _step(moments, part, priors, damping[active])
+        new = part.moved(step)
         new_cost = _cost(moments, new, priors)
-        if new.scale.min() > _LEAST_SCALE and new_cost <= cost:
-            done = cost - new_cost < 1e-3
-            now, cost = new, new_cost
-            damping = damping / 10.0 if damping > 1e-3 else 0.0
-            if done:
-                break
-        else:
-            damping = max(10.0 * damping, 1e-2)
-            if damping > 1e6:
-                break
+        better = (new.scale.min(axis=1) > _LEAST_SCALE) & (new_cost <= cost[active])
+        done = better & (cost[active] - new_cost < _GAIN)
+        k = active[better]
+        for whole, improved in (
+            (now.dRb, new.dRb),
+            (now.scale, new.scale),
+            (now.lever_arm, new.lever_arm),
+            (now.bias, new.bias),
+            (cost, new_cost),
+        ):
+            whole[k] = improved[better]
+        eased = np.where(damping > 1e-3, damping / 10.0, 0.0)
+        raised = np.maximum(10.0 * damping, 1e-2)
+        damping[active] = np.where(better, eased[active], raised[active])
+        active = active[~done & (damping[active] <= _MOST_DAMPING)]
+        if active.size == 0:
+            break
     return cost, now
 
 
-def _theta(m: _Mounting) -> Array:
-    """Return [M N beta], (3, 7)."""
-    M = m.scale[:, None] * m.dRb
-    return np.hstack([M, -M @ skew(m.lever_arm), m.bias[:, None]])
+def _step(moments: _Moments, m: _Mountings, priors: dict[str, Parameter], damping: Array) -> Array:
+    """Return Gauss-Newton steps (S, 9 + n), the diagonal of the normal equations damped."""
+    J = _derivative(m)
+    weighted = moments.xx @ J
+    count = J.shape[-1]
+    flat, weighted_flat = J.reshape(-1, 21, count), weighted.reshape(-1, 21, count)
+    misfit = (_theta(m) @ moments.xx - moments.xy.T).reshape(-1, 21, 1)
+    deviation, sigma = _deviations(m, priors)
+    gradient = (flat.transpose(0, 2, 1) @ misfit)[..., 0] + deviation / sigma**2
+    H = flat.transpose(0, 2, 1) @ weighted_flat + np.diag(1.0 / sigma**2)
+    H += damping[:, None, None] * (H * np.eye(count))
+    return np.asarray(-np.linalg.solve(H, gradient[..., None])[..., 0], dtype=float)
 
 
-def _derivative(m: _Mounting) -> Array:
-    """Return d vec(theta), (21, 9 + n), with respect to rotation, scale, lever arm, bias."""
-    columns = []
-    eye = np.eye(3)
-    scale = np.broadcast_to(m.scale, (3,))[:, None]
-    M = scale * m.dRb
-    cross = skew(m.lever_arm)
-    zero = np.zeros((3, 1))
-    for i in range(3):
-        turned = M @ skew(eye[i])
-        columns.append(np.hstack([turned, -turned @ cross, zero]))
-    for i in range(m.scale.size):
-        rows = np.ones((3, 1)) if m.scale.size == 1 else eye[:, i : i + 1]
-        grown = rows * m.dRb
-        columns.append(np.hstack([grown, -grown @ cross, zero]))
-    for i in range(3):
-        columns.append(np.hstack([0.0 * M, -M @ skew(eye[i]), zero]))
-    for i in range(3):
-        columns.append(np.hstack([0.0 * M, 0.0 * M, eye[:, i : i + 1]]))
-    return np.stack([c.ravel() for c in columns], axis=1)
+def _theta(m: _Mountings) -> Array:
+    """Return [M N beta], (S, 3, 7)."""
+    M = m.scale[:, :, None] * m.dRb
+    return np.concatenate([M, -M @ skew(m.lever_arm), m.bias[..., None]], axis=2)
 
 
-def _deviations(m: _Mounting, priors: dict[str, Parameter]) -> tuple[Array, Array]:
-    """Return deviation from the prior and its standard deviation, stacked as the steps are."""
+def _derivative(m: _Mountings) -> Array:
+    """Return d theta, (S, 3, 7, 9 + n), with respect to rotation, scale, lever arm, bias."""
+    S, n = m.scale.shape
+    M = m.scale[:, :, None] * m.dRb
+    turned = np.einsum("sij,kjl->skil", M, _GENERATORS)
+    rows = np.ones((1, 3, 1)) if n == 1 else np.eye(3)[:, :, None]
+    grown = rows * m.dRb[:, None]
+    cross = skew(m.lever_arm)[:, None]
+    J = np.zeros((S, 9 + n, 3, 7))
+    J[:, :3, :, :3], J[:, :3, :, 3:6] = turned, -turned @ cross
+    J[:, 3 : 3 + n, :, :3], J[:, 3 : 3 + n, :, 3:6] = grown, -grown @ cross
+    J[:, 3 + n : 6 + n, :, 3:6] = -turned
+    J[:, 6 + n :, :, 6] = np.eye(3)
+    return J.transpose(0, 2, 3, 1)
+
+
+def _deviations(m: _Mountings, priors: dict[str, Parameter]) -> tuple[Array, Array]:
+    """Return deviations from the prior, (S, 9 + n), and its standard deviation, (9 + n,).
+
+    Stacked as steps are, and to first order in the rotation.
+    """
     mean = priors[MISALIGNMENT].mean
+    turned = log_so3(exp_so3(mean).T @ m.dRb) @ inverse_right_jacobian(mean).T
     deviation = np.concatenate(
         [
-            inverse_right_jacobian(mean) @ log_so3(exp_so3(mean).T @ m.dRb),
+            turned,
             m.scale - 1.0 - priors[SCALE_ERROR].mean,
             m.lever_arm - priors[LEVER_ARM].mean,
             m.bias - priors[BIAS].mean,
-        ]
+        ],
+        axis=1,
     )
     names = (MISALIGNMENT, SCALE_ERROR, LEVER_ARM, BIAS)
     sigma = np.concatenate([priors[name].sigma for name in names])
     return deviation, np.maximum(sigma, 1e-6)
 
 
-def _cost(moments: _Moments, m: _Mounting, priors: dict[str, Parameter]) -> float:
+def _cost(moments: _Moments, m: _Mountings, priors: dict[str, Parameter]) -> Array:
+    """Return half the sum of squares of misfit and deviation from the prior, (S,)."""
     theta = _theta(m)
-    misfit = moments.yy - 2.0 * np.sum(theta.T * moments.xy) + np.sum((theta @ moments.xx) * theta)
+    products = (theta @ moments.xx) * theta - 2.0 * theta * moments.xy.T
+    misfit = moments.yy + np.sum(products, axis=(1, 2))
     deviation, sigma = _deviations(m, priors)
-    return float(0.5 * misfit + 0.5 * np.sum((deviation / sigma) ** 2))
-
-
-def _prior_terms(m: _Mounting, priors: dict[str, Parameter]) -> tuple[Array, Array]:
-    """Return gradient and information of the priors, to first order in the rotation."""
-    deviation, sigma = _deviations(m, priors)
-    return deviation / sigma**2, np.diag(1.0 / sigma**2)
+    return np.asarray(0.5 * misfit + 0.5 * np.sum((deviation / sigma) ** 2, axis=1))
