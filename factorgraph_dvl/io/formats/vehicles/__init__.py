@@ -1,0 +1,1 @@
+"""Logs of vehicles, and of one instrument, that libraries of their makers and users read."""

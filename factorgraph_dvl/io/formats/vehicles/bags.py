@@ -1,0 +1,332 @@
+"""ROS bags: ROS 1, ROS 2 (MCAP, SQLite, folders of either), through rosbags.
+
+Frames are those that ROS states: bodies forward, left, up and the world east, north, up (REP 103),
+navigation solutions in `nav_msgs/Odometry` with their velocity in the body (REP 105). Stamps are
+those of the messages, `received` the time of recording.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from factorgraph_dvl.errors import DataError
+from factorgraph_dvl.geometry.rotations import rph_from_rotation
+from factorgraph_dvl.geometry.vectors import Array, rotate
+from factorgraph_dvl.io.formats.format import Batch, Format, Kind, empty
+from factorgraph_dvl.io.formats.framing import Records
+from factorgraph_dvl.io.formats.vehicles.library import (
+    BLOCK,
+    describe,
+    given_up,
+    load,
+    quiet,
+    unreadable,
+)
+from factorgraph_dvl.io.formats.velocities import INSTRUMENT
+
+DVL_TYPE = "marine_acoustic_msgs/msg/Dvl"
+_ROS_1, _MCAP, _SQLITE = b"#ROSBAG V2.0\n", b"\x89MCAP0\r\n", b"SQLite format 3\0"
+_ENDINGS = {_ROS_1: ".bag", _MCAP: ".mcap", _SQLITE: ".db3"}
+# Stamps before 1973 count since some start, as in a simulation.
+_EARLIEST = 1e8
+# Names of topics and frames of velocities that a GNSS receiver measures.
+_GNSS_WORDS = ("gnss", "gps", "fix")
+_REP_103 = "{}: in axes forward, left, up, as REP 103 has it; the message does not say"
+# A message by its number in the file, and when it was recorded, s.
+Message = tuple[int, float, Any]
+
+
+def share(path: Path, sample: bytes) -> float:
+    """Return whether a path is a bag: by its first bytes, a folder by its metadata."""
+    if path.is_dir():
+        return float((path / "metadata.yaml").is_file())
+    is_table = sample.startswith(_SQLITE) and b"topics" in sample and b"messages" in sample
+    return float(sample.startswith((_ROS_1, _MCAP)) or is_table)
+
+
+def read(path: Path, mapping: Mapping[str, Any] | None = None) -> Iterator[Batch]:
+    """Read messages of the types in `CONVERTERS`; others are passed over.
+
+    Parameters
+    ----------
+    path : Path
+        File or folder.
+    mapping : mapping, optional
+        Not used.
+
+    Yields
+    ------
+    Batch
+
+    Raises
+    ------
+    ConfigError
+        If rosbags is not installed.
+    DataError
+        If the bag has no readable index, or nothing in it can be read.
+    """
+    rosbags = load("rosbags.highlevel", "bags")
+    _check_ending(path)
+    try:
+        reader = rosbags.AnyReader([path], default_typestore=typestore())
+        with quiet():
+            reader.open()
+    except Exception as error:  # Of any type: the library does not foresee all damage.
+        raise unreadable(
+            path,
+            error,
+            "a bag with its index",
+            "`rosbag reindex` (ROS 1), `ros2 bag reindex` and `mcap recover` mend cut files",
+        ) from None
+    try:
+        yield from _batches(path, reader)
+    finally:
+        reader.close()
+
+
+def typestore() -> Any:
+    """Return message definitions for bags without them: ROS 2's, and that of DVLs."""
+    typesys = load("rosbags.typesys", "bags")
+    store = typesys.get_typestore(typesys.Stores.ROS2_JAZZY)
+    package = resources.files("factorgraph_dvl.io.formats.vehicles")
+    text = (package / "marine_acoustic_msgs" / "Dvl.msg").read_text(encoding="utf-8")
+    store.register(typesys.get_types_from_msg(text, DVL_TYPE))
+    return store
+
+
+def _check_ending(path: Path) -> None:
+    """The library goes by the ending of the name; a wrong one leads it astray."""
+    if path.is_dir():
+        return
+    with path.open("rb") as file:
+        head = file.read(16)
+    for magic, ending in _ENDINGS.items():
+        if head.startswith(magic) and path.suffix != ending:
+            raise DataError(
+                "is a bag by its content and not by its name",
+                where=path.name,
+                expected=f"a name that ends in {ending}",
+            )
+
+
+def _batches(path: Path, reader: Any) -> Iterator[Batch]:
+    wanted = [c for c in reader.connections if c.msgtype in CONVERTERS]
+    gathered: dict[tuple[str, str], list[Message]] = {}
+    count, lost, note = 0, 0, ""
+    messages = iter(reader.messages(connections=wanted)) if wanted else iter(())
+    while True:
+        try:
+            connection, nanoseconds, data = next(messages)
+        except StopIteration:
+            break
+        except Exception as error:  # What was read until here is whole.
+            note = given_up(path, error, count)
+            break
+        count += 1
+        try:
+            message = reader.deserialize(data, connection.msgtype)
+        except Exception as error:
+            lost, note = lost + 1, f"{lost + 1} messages cannot be read ({describe(error)})"
+            continue
+        key = connection.topic, connection.msgtype
+        rows = gathered.setdefault(key, [])
+        rows.append((count, nanoseconds * 1e-9, message))
+        if len(rows) >= BLOCK:
+            yield from CONVERTERS[key[1]](key[0], gathered.pop(key))
+    if count == lost and note:
+        raise DataError(note, where=path.name, expected="messages that are whole")
+    for (topic, kind), rows in gathered.items():
+        yield from CONVERTERS[kind](topic, rows)
+    if note:
+        yield Batch("clock", empty("clock", 0), notes=(note,))
+
+
+def _stamped(kind: Kind, messages: list[Message]) -> Records:
+    out = empty(kind, len(messages))
+    out["at"] = [at for at, _, _ in messages]
+    out["received"] = [received for _, received, _ in messages]
+    stamps = [m.header.stamp for _, _, m in messages]
+    times = np.array([stamp.sec + stamp.nanosec * 1e-9 for stamp in stamps])
+    out["time"] = np.where(times >= _EARLIEST, times, out["received"])
+    return out
+
+
+def _about_stamps(topic: str, records: Records, messages: list[Message]) -> tuple[str, ...]:
+    if all(m.header.stamp.sec >= _EARLIEST for _, _, m in messages):
+        return ()
+    return (f"{topic}: stamps that are no UTC: times of recording were taken",)
+
+
+def _vectors(values: list[Any]) -> Array:
+    return np.array([(v.x, v.y, v.z) for v in values], float).reshape(-1, 3)
+
+
+def _deviations(covariances: list[Any]) -> Array:
+    """Return the standard deviations (N, 3) of 3 x 3 or 6 x 6 covariances, by rows; nan if unset."""
+    rows = np.array(covariances, float).reshape(len(covariances), -1)
+    side = 3 if rows.shape[1] == 9 else 6
+    variance = rows[:, [0, side + 1, 2 * side + 2]]
+    return np.sqrt(np.where(variance > 0.0, variance, np.nan))
+
+
+def _unset(covariances: list[Any]) -> NDArray[np.bool_]:
+    """Return where a covariance says that the value was not measured: by -1 in front."""
+    return np.array([row[0] == -1.0 for row in covariances], bool)
+
+
+def _orientations(quaternions: list[Any]) -> tuple[Array, Array]:
+    """Return nRb (N, 3, 3) and roll, pitch, heading (N, 3); nan where there is no quaternion."""
+    q = np.array([(q.x, q.y, q.z, q.w) for q in quaternions], float)
+    norm = np.linalg.norm(q, axis=1)
+    good = np.isfinite(norm) & (norm > 0.5)
+    nRb = np.full((len(q), 3, 3), np.nan)
+    nRb[good] = Rotation.from_quat(q[good]).as_matrix()
+    return nRb, rph_from_rotation(nRb, "FLU")
+
+
+def _imu(topic: str, messages: list[Message]) -> Iterator[Batch]:
+    """`sensor_msgs/Imu`: rates and specific force, and the orientation where it has one."""
+    bodies = [m for _, _, m in messages]
+    out = _stamped("imu", messages)
+    notes = (_REP_103.format(topic), *_about_stamps(topic, out, messages))
+    unset = _unset([m.angular_velocity_covariance for m in bodies])[:, None]
+    out["gyro"] = np.where(unset, np.nan, _vectors([m.angular_velocity for m in bodies]))
+    unset = _unset([m.linear_acceleration_covariance for m in bodies])[:, None]
+    out["accel"] = np.where(unset, np.nan, _vectors([m.linear_acceleration for m in bodies]))
+    if np.isfinite(out["gyro"]).any() or np.isfinite(out["accel"]).any():
+        yield Batch("imu", out, "utc", topic, "FLU", notes=notes)
+    attitude = _stamped("attitude", messages)
+    nRb, rph = _orientations([m.orientation for m in bodies])
+    rph[_unset([m.orientation_covariance for m in bodies])] = np.nan
+    # Drivers without an orientation leave the identity there.
+    if np.isfinite(rph).any() and not np.array_equal(nRb, np.broadcast_to(np.eye(3), nRb.shape)):
+        attitude["roll"], attitude["pitch"], attitude["heading"] = rph.T
+        attitude["std"] = _deviations([m.orientation_covariance for m in bodies])
+        yield Batch("attitude", attitude, "utc", topic, "FLU", notes=notes)
+
+
+def _fix(topic: str, messages: list[Message]) -> Iterator[Batch]:
+    """`sensor_msgs/NavSatFix`: heights are above the ellipsoid."""
+    bodies = [m for _, _, m in messages]
+    out = _stamped("fix", messages)
+    for name in ("latitude", "longitude"):
+        out[name[:3]] = np.radians([getattr(m, name) for m in bodies])
+    out["height"] = [m.altitude for m in bodies]
+    # Without, with, satellite-based and ground-based augmentation.
+    out["quality"] = [{-1: 0, 0: 1}.get(m.status.status, 2) for m in bodies]
+    known = np.array([m.position_covariance_type != 0 for m in bodies])[:, None]
+    out["std"] = np.where(known, _deviations([m.position_covariance for m in bodies]), np.nan)
+    yield Batch("fix", out, "utc", topic, notes=_about_stamps(topic, out, messages))
+
+
+def _odometry(topic: str, messages: list[Message]) -> Iterator[Batch]:
+    """`nav_msgs/Odometry`: attitude and velocity; positions are relative to an unknown origin."""
+    bodies = [m for _, _, m in messages]
+    out = _stamped("ins", messages)
+    nRb, rph = _orientations([m.pose.pose.orientation for m in bodies])
+    out["roll"], out["pitch"], out["heading"] = rph.T
+    out["velocity"] = rotate(nRb, _vectors([m.twist.twist.linear for m in bodies]))
+    # Rotations are the second half of the 6 x 6 covariance.
+    turned = np.array([m.pose.covariance for m in bodies], float).reshape(-1, 6, 6)[:, 3:, 3:]
+    out["attitude_std"] = _deviations(list(turned.reshape(-1, 9)))
+    yield Batch(
+        "ins",
+        out,
+        "utc",
+        topic,
+        "FLU",
+        notes=(
+            f"{topic}: positions are relative to an origin that the message does not state, "
+            "and were left out; its world is taken as east, north, up (REP 103)",
+            *_about_stamps(topic, out, messages),
+        ),
+    )
+
+
+def _twist(topic: str, messages: list[Message]) -> Iterator[Batch]:
+    """`geometry_msgs/TwistWithCovarianceStamped`: of a DVL, or of a GNSS receiver by its name."""
+    bodies = [m for _, _, m in messages]
+    velocity = _vectors([m.twist.twist.linear for m in bodies])
+    covariances = [m.twist.covariance for m in bodies]
+    velocity[_unset(covariances)] = np.nan
+    name = f"{topic} {bodies[0].header.frame_id}".lower()
+    if any(word in name for word in _GNSS_WORDS):
+        out = _stamped("fix", messages)
+        out["velocity"], out["velocity_std"] = velocity, _deviations(covariances)
+        note = f"{topic}: velocities of a GNSS receiver by its name, taken as east, north, up"
+        yield Batch("fix", out, "utc", topic, notes=(note,))
+        return
+    out = _stamped("dvl", messages)
+    out["axes"], out["velocity"], out["std"] = INSTRUMENT, velocity, _deviations(covariances)
+    notes = (_REP_103.format(topic), *_about_stamps(topic, out, messages))
+    yield Batch("dvl", out, "utc", topic, "FLU", notes=notes)
+
+
+def _dvl(topic: str, messages: list[Message]) -> Iterator[Batch]:
+    """`marine_acoustic_msgs/Dvl`: x forward, z where the instrument looks."""
+    modes = np.array([m.velocity_mode for _, _, m in messages])
+    kinds: tuple[tuple[Kind, NDArray[np.bool_]], ...] = (("dvl", modes != 2), ("water", modes == 2))
+    for kind, chosen in kinds:
+        part = [message for message, is_one in zip(messages, chosen, strict=True) if is_one]
+        if part:
+            yield _pings(kind, topic, part)
+
+
+def _pings(kind: Kind, topic: str, messages: list[Message]) -> Batch:
+    bodies = [m for _, _, m in messages]
+    out = _stamped(kind, messages)
+    velocity = _vectors([m.velocity for m in bodies])
+    lost = np.array([m.num_good_beams == 0 for m in bodies]) & ~velocity.any(axis=1)
+    velocity[lost] = np.nan
+    out["axes"], out["velocity"] = INSTRUMENT, velocity
+    out["std"] = _deviations([m.velocity_covar for m in bodies])
+    speeds = np.array([m.sound_speed for m in bodies], float)
+    out["sound_speed"] = np.where(speeds > 0.0, speeds, np.nan)
+    notes = [f"{topic}: axes forward, right, down, as the definition of its messages has them"]
+    notes.extend(_about_stamps(topic, out, messages))
+    beams = np.array([m.beam_velocity for m in bodies], float)
+    outward = np.array([_vectors(list(m.beam_unit_vec)) for m in bodies])
+    given = np.array([m.beam_velocities_valid for m in bodies], bool)[:, None]
+    beams = np.where(given, beams, np.nan)
+    along = np.einsum("nbi,ni->nb", outward, velocity)
+    agreement = np.nansum(beams * along)
+    if agreement < 0.0:
+        beams = -beams
+        notes.append(f"{topic}: velocities along beams were reversed: they oppose the velocity")
+    out["beams"] = beams
+    with np.errstate(invalid="ignore"):
+        angle = np.arccos(np.clip(outward[..., 2], -1.0, 1.0)).mean(axis=1)
+    out["beam_angle"] = np.where((angle > 0.0) & (angle < np.pi / 2.0), angle, np.nan)
+    ranges = np.array([m.range for m in bodies], float)
+    given = np.array([m.beam_ranges_valid for m in bodies], bool)[:, None]
+    out["range"] = np.where(given & (ranges > 0.0), ranges, np.nan)
+    return Batch(kind, out, "utc", topic, "FRD", notes=tuple(notes))
+
+
+CONVERTERS: dict[str, Callable[[str, list[Message]], Iterator[Batch]]] = {
+    "sensor_msgs/msg/Imu": _imu,
+    "sensor_msgs/msg/NavSatFix": _fix,
+    "nav_msgs/msg/Odometry": _odometry,
+    "geometry_msgs/msg/TwistWithCovarianceStamped": _twist,
+    DVL_TYPE: _dvl,
+}
+
+FORMAT = Format(
+    name="bag",
+    family="vehicle",
+    title="ROS 1 and ROS 2 bags, MCAP",
+    share=share,
+    read=read,
+    verified="MCAP of the library mcap with hand-packed messages; the values that rosbags wrote",
+    endings=(".bag", ".mcap", ".db3"),
+    module="rosbags",
+    extra="bags",
+    limit="rosbags keeps the index of a ROS 1 bag in memory",
+)

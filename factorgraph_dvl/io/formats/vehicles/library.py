@@ -1,0 +1,65 @@
+"""Third-party readers: loaded where they are used, silent, and their failures as errors of ours."""
+
+from __future__ import annotations
+
+import importlib
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
+from pathlib import Path
+from typing import Any
+
+from factorgraph_dvl.errors import ConfigError, DataError
+
+# Messages that become one batch.
+BLOCK = 10_000
+
+
+def load(module: str, extra: str) -> Any:
+    """Import a third-party module.
+
+    Parameters
+    ----------
+    module : str
+        Its name.
+    extra : str
+        The extra of this package that installs it.
+
+    Raises
+    ------
+    ConfigError
+        If it is not installed.
+    """
+    try:
+        return importlib.import_module(module)
+    except ImportError:
+        raise ConfigError(
+            f"{module.partition('.')[0]} is not installed",
+            expected=f"the extra `{extra}`",
+            hint=f"Install it by: pip install 'factorgraph-dvl[{extra}]'",
+        ) from None
+
+
+@contextmanager
+def quiet() -> Iterator[None]:
+    """Drop what a library prints; not around a `yield` that leaves this package."""
+    with open(os.devnull, "w") as nowhere, redirect_stdout(nowhere), redirect_stderr(nowhere):
+        yield
+
+
+def unreadable(path: Path, error: BaseException, expected: str, hint: str = "") -> DataError:
+    """Return the error for a file that a library gives up on before its first message."""
+    return DataError(
+        f"cannot be read ({describe(error)})", where=path.name, expected=expected, hint=hint
+    )
+
+
+def describe(error: BaseException) -> str:
+    """Return an exception of a library in one short line."""
+    text = " ".join(str(error).split())[:200]
+    return text.rstrip(".") or type(error).__name__
+
+
+def given_up(path: Path, error: BaseException, count: int) -> str:
+    """Return the note on a file that a library gives up on after `count` messages."""
+    return f"{path.name} is damaged: read up to message {count} ({describe(error)})"
