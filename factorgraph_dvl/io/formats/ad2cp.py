@@ -19,6 +19,8 @@ from factorgraph_dvl.io.formats.framing import Records, Source, number
 
 ENU, XYZ, BEAM = range(3)
 BOTTOM, BURST, AVERAGE, TEXT = 0x17, 0x15, 0x16, 0xA0
+# Nucleus frames its packets alike, with kinds of its own.
+NUCLEUS = 0x20
 _SEED = 0xB58C
 # The largest records, of raw echo sounder samples, have some 100 kB.
 _LARGEST = 1 << 24
@@ -107,7 +109,9 @@ def read_ad2cp(source: Source, block: int = BLOCK) -> Iterator[Ad2cp]:
     """
     pings: list[tuple[int, bytes]] = []
     text: list[str] = []
-    for kind, start, stop in _records(source):
+    for family, kind, start, stop in frames(source):
+        if family == NUCLEUS:
+            continue
         if kind == BOTTOM:
             pings.append((start, source[start:stop]))
         elif kind == TEXT:
@@ -131,8 +135,18 @@ def beam_matrix(text: str) -> np.ndarray[tuple[int, int], np.dtype[np.float64]] 
     return out if out.size and np.isfinite(out).all() else None
 
 
-def _records(source: Source) -> Iterator[tuple[int, int, int]]:
-    """Find records; yield kind, and start and stop of what stands behind the header."""
+def frames(source: Source) -> Iterator[tuple[int, int, int, int]]:
+    """Find records of Nortek's instruments whose checksums are right.
+
+    Parameters
+    ----------
+    source : Source
+        The file.
+
+    Yields
+    ------
+    Family, kind, and start and stop of what stands behind the header.
+    """
     at, size = 0, len(source)
     while (at := source.find(b"\xa5", at)) >= 0:
         header = source[at : at + 12]
@@ -141,7 +155,7 @@ def _records(source: Source) -> Iterator[tuple[int, int, int]]:
             at += 1
             continue
         layout = struct.Struct("<BBBBIHH" if long else "<BBBBHHH")
-        _, head, kind, _, length, data_sum, head_sum = layout.unpack_from(header)
+        _, head, kind, family, length, data_sum, head_sum = layout.unpack_from(header)
         start, stop = at + head, at + head + length
         if (
             checksum(header[: head - 2]) != head_sum
@@ -151,7 +165,7 @@ def _records(source: Source) -> Iterator[tuple[int, int, int]]:
         ):
             at += 1
             continue
-        yield kind, start, stop
+        yield family, kind, start, stop
         at = stop
 
 

@@ -169,7 +169,7 @@ def _vectors(values: list[Any]) -> Array:
 
 
 def _deviations(covariances: list[Any]) -> Array:
-    """Return the standard deviations (N, 3) of 3 x 3 or 6 x 6 covariances, by rows; nan if unset."""
+    """Return standard deviations (N, 3) of 3 x 3 or 6 x 6 covariances by rows; nan if unset."""
     rows = np.array(covariances, float).reshape(len(covariances), -1)
     side = 3 if rows.shape[1] == 9 else 6
     variance = rows[:, [0, side + 1, 2 * side + 2]]
@@ -272,7 +272,10 @@ def _twist(topic: str, messages: list[Message]) -> Iterator[Batch]:
 def _dvl(topic: str, messages: list[Message]) -> Iterator[Batch]:
     """`marine_acoustic_msgs/Dvl`: x forward, z where the instrument looks."""
     modes = np.array([m.velocity_mode for _, _, m in messages])
-    kinds: tuple[tuple[Kind, NDArray[np.bool_]], ...] = (("dvl", modes != 2), ("water", modes == 2))
+    kinds: tuple[tuple[Kind, NDArray[np.bool_]], ...] = (
+        ("dvl", modes != 2),
+        ("water", modes == 2),
+    )
     for kind, chosen in kinds:
         part = [message for message, is_one in zip(messages, chosen, strict=True) if is_one]
         if part:

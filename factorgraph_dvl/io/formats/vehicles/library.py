@@ -1,9 +1,9 @@
-"""Third-party readers: loaded where they are used, silent, and their failures as errors of ours."""
+"""Third-party readers: loaded where they are used, silent, their failures as errors of ours."""
 
 from __future__ import annotations
 
 import importlib
-import os
+import io
 from collections.abc import Iterator
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from pathlib import Path
@@ -40,10 +40,15 @@ def load(module: str, extra: str) -> Any:
         ) from None
 
 
+class _Nowhere(io.TextIOBase):
+    def write(self, text: str) -> int:
+        return len(text)
+
+
 @contextmanager
 def quiet() -> Iterator[None]:
     """Drop what a library prints; not around a `yield` that leaves this package."""
-    with open(os.devnull, "w") as nowhere, redirect_stdout(nowhere), redirect_stderr(nowhere):
+    with redirect_stdout(_Nowhere()), redirect_stderr(_Nowhere()):
         yield
 
 

@@ -1,0 +1,189 @@
+"""Nortek Nucleus: packets decoded by nucleus-driver, found by their checksums here.
+
+Units and axes are those that the names in the maker's driver state: m/s, rad/s, degrees; forward,
+right, down. They were not compared with an instrument.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from factorgraph_dvl.geometry.units import DEG
+from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.io.formats.ad2cp import NUCLEUS, frames
+from factorgraph_dvl.io.formats.format import Batch, Clock, Format, Kind, empty
+from factorgraph_dvl.io.formats.framing import Records, map_file
+from factorgraph_dvl.io.formats.vehicles.library import BLOCK, load, quiet
+from factorgraph_dvl.io.formats.velocities import INSTRUMENT
+
+IMU, AHRS, BOTTOM, WATER, INS = 0x82, 0xD2, 0xB4, 0xBE, 0xDC
+_HEADER = 10
+# Without an echo the driver passes on these.
+_NO_VELOCITY, _NO_MERIT = -32.0, 10.0
+_AXES = "axes of the Nucleus taken as forward, right, down: not verified"
+Packet = dict[str, Any]
+
+
+def share(path: Path, sample: bytes) -> float:
+    """Return the share of a sample that lies in packets of a Nucleus."""
+    if not sample:
+        return 0.0
+    found = [_HEADER + stop - start for kind, _, start, stop in frames(sample) if kind == NUCLEUS]
+    return sum(found) / len(sample)
+
+
+def read(path: Path, mapping: Mapping[str, Any] | None = None) -> Iterator[Batch]:
+    """Read IMU, AHRS, bottom track, water track and INS packets.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    mapping : mapping, optional
+        Not used.
+
+    Yields
+    ------
+    Batch
+
+    Raises
+    ------
+    ConfigError
+        If nucleus-driver is not installed.
+    DataError
+        If the file cannot be read.
+    """
+    library = load("nucleus_driver", "nucleus")
+    source = map_file(path)
+    with quiet():
+        parser = library.NucleusDriver().parser
+    gathered: dict[int, list[Packet]] = {kind: [] for kind in _CONVERTERS}
+    lost = 0
+    for family, kind, start, stop in frames(source):
+        if family != NUCLEUS or kind not in gathered:
+            continue
+        with quiet():
+            packet = _decoded(parser, bytearray(source[start - _HEADER : stop]))
+        if packet is None:
+            lost += 1
+            continue
+        packet["at"] = start - _HEADER
+        gathered[kind].append(packet)
+        if len(gathered[kind]) >= BLOCK:
+            yield from _CONVERTERS[kind](gathered[kind])
+            gathered[kind] = []
+    for kind, packets in gathered.items():
+        if packets:
+            yield from _CONVERTERS[kind](packets)
+    if lost:
+        note = f"{path.name}: {lost} packets are too short for what they state, and were left out"
+        yield Batch("clock", empty("clock", 0), notes=(note,))
+
+
+def _decoded(parser: Any, frame: bytearray) -> Packet | None:
+    try:
+        header, data, packet = parser.get_packet(frame)
+    except Exception:  # Of any type: the library does not foresee all damage.
+        return None
+    return packet if header and data and "flags.posixTime" in packet and len(packet) > 13 else None
+
+
+def _column(packets: list[Packet], name: str) -> Array:
+    return np.array([packet.get(name, np.nan) for packet in packets], float)
+
+
+def _columns(packets: list[Packet], *names: str) -> Array:
+    return np.stack([_column(packets, name) for name in names], axis=1)
+
+
+def _timed(kind: Kind, packets: list[Packet]) -> tuple[Records, Clock]:
+    out = empty(kind, len(packets))
+    out["at"] = [packet["at"] for packet in packets]
+    out["time"] = _column(packets, "timeStamp") + _column(packets, "microSeconds") * 1e-6
+    out["received"] = out["time"]
+    return out, "utc" if _column(packets, "flags.posixTime").all() else "own"
+
+
+def _imu(packets: list[Packet]) -> Iterator[Batch]:
+    out, clock = _timed("imu", packets)
+    out["gyro"] = _columns(packets, "gyro.x", "gyro.y", "gyro.z")
+    out["accel"] = _columns(packets, "accelerometer.x", "accelerometer.y", "accelerometer.z")
+    valid = _column(packets, "status.isValid") == 1.0
+    yield Batch("imu", out[valid], clock, "IMU", "FRD", notes=(_AXES,))
+
+
+def _attitude(packets: list[Packet]) -> Iterator[Batch]:
+    out, clock = _timed("attitude", packets)
+    for name in ("roll", "pitch", "heading"):
+        out[name] = _column(packets, f"ahrsData.{name}") * DEG
+    declination = _column(packets, "declination")
+    is_true = bool(np.all(np.isfinite(declination) & (declination != 0.0)))
+    note = "headings of the AHRS rest on its compass" + (
+        ", with a declination that was set" if is_true else "; no declination was set"
+    )
+    yield Batch(
+        "attitude", out, clock, "AHRS", "FRD", "true" if is_true else "magnetic", (_AXES, note)
+    )
+    depth, _ = _timed("depth", packets)
+    depth["depth"] = _column(packets, "depth")
+    yield Batch("depth", depth, clock, "AHRS")
+
+
+def _track(kind: Kind, stream: str) -> Callable[[list[Packet]], Iterator[Batch]]:
+    def convert(packets: list[Packet]) -> Iterator[Batch]:
+        out, clock = _timed(kind, packets)
+        velocity = _columns(packets, *(f"velocity{axis}" for axis in "XYZ"))
+        merit = _columns(packets, *(f"fom{axis}" for axis in "XYZ"))
+        valid = _columns(packets, *(f"status.{axis}VelocityValid" for axis in "xyz")) == 1.0
+        valid &= (velocity > _NO_VELOCITY) & (merit < _NO_MERIT)
+        out["axes"], out["velocity"] = INSTRUMENT, np.where(valid, velocity, np.nan)
+        out["std"] = np.where(valid & (merit > 0.0), merit, np.nan)
+        distance = _columns(packets, *(f"distanceBeam{i}" for i in (1, 2, 3)))
+        known = _columns(packets, *(f"status.beam{i}DistanceValid" for i in (1, 2, 3))) == 1.0
+        out["range"][:, :3] = np.where(known & (distance > 0.0), distance, np.nan)
+        out["sound_speed"] = _column(packets, "soundSpeed")
+        out["temperature"] = _column(packets, "temperature")
+        delay = _column(packets, "dtXYZ")
+        out["delay"] = np.where((delay > 0.0) & (delay < 1.0), delay, np.nan)
+        note = "velocities along beams were left out: directions and signs are not documented"
+        yield Batch(kind, out, clock, stream, "FRD", notes=(_AXES, note))
+
+    return convert
+
+
+def _ins(packets: list[Packet]) -> Iterator[Batch]:
+    out, clock = _timed("ins", packets)
+    for name in ("roll", "pitch", "heading"):
+        out[name] = _column(packets, f"ahrsData.{name}") * DEG
+    located = _column(packets, "statusIns.latLonIsValid") == 1.0
+    for name in ("latitude", "longitude"):
+        out[name[:3]] = np.where(located, _column(packets, name) * DEG, np.nan)
+    north, east, down = _columns(packets, *(f"velocityNed{axis}" for axis in "XYZ")).T
+    out["velocity"] = np.stack([east, north, -down], axis=1)
+    note = "the INS of the Nucleus uses its own DVL: its errors are not independent"
+    yield Batch("ins", out, clock, "INS", "FRD", notes=(_AXES, note))
+
+
+_CONVERTERS: dict[int, Callable[[list[Packet]], Iterator[Batch]]] = {
+    IMU: _imu,
+    AHRS: _attitude,
+    BOTTOM: _track("dvl", "bottom track"),
+    WATER: _track("water", "water track"),
+    INS: _ins,
+}
+
+FORMAT = Format(
+    name="nucleus",
+    family="dvl",
+    title="Nortek Nucleus",
+    share=share,
+    read=read,
+    verified="packets written after the fields of the maker's driver; axes not verified",
+    endings=(".nucleus",),
+    module="nucleus_driver",
+    extra="nucleus",
+)
