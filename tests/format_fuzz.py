@@ -1,23 +1,29 @@
 """Feed readers damaged input: `python tests/format_fuzz.py COUNT [SEED [READERS]]`.
 
-COUNT inputs of at most 64 kB for each reader, or for those named (with commas between).
+COUNT inputs of at most 64 kB for each reader of this package, or for those named (with commas
+between). Readers of third-party libraries are named: `bag`, `ardupilot`, `ulog`, `nucleus`; their
+process has limits of time and memory.
 """
 
 from __future__ import annotations
 
 import json
+import resource
+import sqlite3
 import sys
+import tempfile
 import time
 import tracemalloc
 import warnings
 from datetime import UTC, datetime
 from pathlib import Path
 
+import format_logs as logs
 import format_samples as samples
 import format_writers as writers
 import numpy as np
 
-from factorgraph_dvl.errors import FactorgraphDvlError
+from factorgraph_dvl.errors import DataError
 from factorgraph_dvl.io.formats import (
     ad2cp,
     dvl_sentences,
@@ -30,10 +36,15 @@ from factorgraph_dvl.io.formats import (
     sbet,
     water_linked,
 )
+from factorgraph_dvl.io.formats.vehicles import ardupilot, bags, nucleus, ulog
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 LIMIT = 1 << 16
 WHEN = datetime(2021, 3, 4, 5, 6, 7, 120000, UTC)
+# Of the process that runs a third-party library: address space, bytes, and processor time, s, for
+# each input besides that for starting.
+MOST_MEMORY = 4 << 30
+SLOWEST, STARTING = 2.0, 60.0
 
 
 def head(path, count=LIMIT):
@@ -145,6 +156,101 @@ def seeds():
     }
 
 
+def bag():
+    """Return a ROS 1 bag of the messages of a short trial, by rosbags' own writer."""
+    from rosbags.rosbag1 import Writer
+    from rosbags.typesys import Stores, get_typestore
+
+    # Headers of ROS 1 also have a number, which the conversion adds.
+    store, older = bags.typestore(), get_typestore(Stores.ROS1_NOETIC)
+    older.register({bags.DVL_TYPE: store.fielddefs[bags.DVL_TYPE]})
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "a.bag"
+        with Writer(path) as writer:
+            connections = {}
+            for topic, kind, seconds, data in logs.sea_trial():
+                name = kind.replace("/", "/msg/")
+                if topic not in connections:
+                    text, digest = older.generate_msgdef(name)
+                    connections[topic] = writer.add_connection(
+                        topic, name, msgdef=text, md5sum=digest
+                    )
+                raw = store.cdr_to_ros1(data, name)
+                writer.write(connections[topic], round(seconds * 1e9), raw)
+        return path.read_bytes()
+
+
+def database():
+    """Return a ROS 2 bag in SQLite, as recorders before definitions were stored wrote it."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "a.db3"
+        tables = sqlite3.connect(path)
+        tables.execute(
+            "CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT NOT NULL, type TEXT NOT NULL, "
+            "serialization_format TEXT NOT NULL, offered_qos_profiles TEXT NOT NULL)"
+        )
+        tables.execute(
+            "CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER NOT NULL, "
+            "timestamp INTEGER NOT NULL, data BLOB NOT NULL)"
+        )
+        topics = {}
+        for topic, kind, seconds, data in logs.sea_trial():
+            if topic not in topics:
+                topics[topic] = len(topics) + 1
+                row = (topics[topic], topic, kind.replace("/", "/msg/"), "cdr", "")
+                tables.execute("INSERT INTO topics VALUES (?, ?, ?, ?, ?)", row)
+            row = (topics[topic], round(seconds * 1e9), data)
+            tables.execute("INSERT INTO messages(topic_id, timestamp, data) VALUES (?, ?, ?)", row)
+        tables.commit()
+        tables.close()
+        return path.read_bytes()
+
+
+# Formats that libraries read, and what makes files of them, by the ending of their names.
+LIBRARIES = {
+    "bag": (
+        bags.FORMAT,
+        {".bag": bag, ".mcap": lambda: logs.mcap(logs.sea_trial(), 4000), ".db3": database},
+    ),
+    "ardupilot": (
+        ardupilot.FORMAT,
+        {".bin": lambda: logs.ardupilot_log(logs.ardupilot_trial())},
+    ),
+    "ulog": (ulog.FORMAT, {".ulg": lambda: logs.ulog(logs.ulog_trial())}),
+    "nucleus": (nucleus.FORMAT, {".nucleus": lambda: logs.nucleus_trial()}),
+}
+
+
+def limit(count):
+    """Limit this process, which reads `count` inputs, in time and memory."""
+    resource.setrlimit(resource.RLIMIT_AS, (MOST_MEMORY, MOST_MEMORY))
+    seconds = int(STARTING + SLOWEST * count)
+    resource.setrlimit(resource.RLIMIT_CPU, (seconds, seconds))
+
+
+def run_library(name, count, seed):
+    """Return the numbers refused and with records, and the slowest, s, of `count` inputs."""
+    form, makers = LIBRARIES[name]
+    bases = [(ending, make()) for ending, make in makers.items()]
+    rng = np.random.default_rng([seed, *name.encode()])
+    refused, useful, slowest = 0, 0, 0.0
+    with tempfile.TemporaryDirectory() as folder:
+        for index in range(count):
+            ending, base = bases[index % len(bases)]
+            path = Path(folder) / f"log{ending}"
+            data = damage(base, rng) if index >= len(bases) else base
+            path.write_bytes(data)
+            start = time.process_time()
+            try:
+                form.share(path, data)
+                useful += any([len(batch.records) > 0 for batch in form.read(path, None)])
+            except DataError:
+                refused += 1
+            slowest = max(slowest, time.process_time() - start)
+            assert index >= len(bases) or useful == index + 1, f"{path} as written is not read"
+    return refused, useful, slowest
+
+
 def damage(data, rng):
     data = bytearray(data)
     if rng.random() < 0.5 and len(data) > 2000:
@@ -204,7 +310,7 @@ def run(name, reader, bases, count, seed):
             tracemalloc.start()
         try:
             consume(reader, data)
-        except FactorgraphDvlError:
+        except DataError:
             refused += 1
         if is_measured:
             most = max(most, tracemalloc.get_traced_memory()[1])
@@ -219,6 +325,15 @@ def main():
     readers = seeds()
     warnings.simplefilter("error")
     for name in sys.argv[3].split(",") if len(sys.argv) > 3 else readers:
+        if name in LIBRARIES:
+            limit(count)
+            refused, useful, slowest = run_library(name, count, seed)
+            print(
+                f"{name:13} {count} inputs, {refused} refused, {useful} with records, "
+                f"slowest {slowest * 1e3:.0f} ms",
+                flush=True,
+            )
+            continue
         refused, slowest, most = run(name, *readers[name], count, seed)
         print(
             f"{name:13} {count} inputs, {refused} refused, slowest {slowest * 1e3:.0f} ms, "

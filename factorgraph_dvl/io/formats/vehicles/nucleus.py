@@ -17,7 +17,7 @@ from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.io.formats.ad2cp import NUCLEUS, frames
 from factorgraph_dvl.io.formats.format import Batch, Clock, Format, Kind, empty
 from factorgraph_dvl.io.formats.framing import Records, map_file
-from factorgraph_dvl.io.formats.vehicles.library import BLOCK, load, quiet
+from factorgraph_dvl.io.formats.vehicles.library import BLOCK, load
 from factorgraph_dvl.io.formats.velocities import INSTRUMENT
 
 IMU, AHRS, BOTTOM, WATER, INS = 0x82, 0xD2, 0xB4, 0xBE, 0xDC
@@ -26,6 +26,15 @@ _HEADER = 10
 _NO_VELOCITY, _NO_MERIT = -32.0, 10.0
 _AXES = "axes of the Nucleus taken as forward, right, down: not verified"
 Packet = dict[str, Any]
+
+
+class _Silent:
+    """Where the parser writes what it thinks of a packet."""
+
+    def write_warning(self, message: object) -> None:
+        """Drop a message."""
+
+    write_exception = write_message = write_warning
 
 
 def share(path: Path, sample: bytes) -> float:
@@ -57,17 +66,15 @@ def read(path: Path, mapping: Mapping[str, Any] | None = None) -> Iterator[Batch
     DataError
         If the file cannot be read.
     """
-    library = load("nucleus_driver", "nucleus")
+    # The parser alone: the driver around it opens sockets.
+    parser = load("nucleus_driver._parser", "nucleus").Parser(messages=_Silent())
     source = map_file(path)
-    with quiet():
-        parser = library.NucleusDriver().parser
     gathered: dict[int, list[Packet]] = {kind: [] for kind in _CONVERTERS}
     lost = 0
     for family, kind, start, stop in frames(source):
         if family != NUCLEUS or kind not in gathered:
             continue
-        with quiet():
-            packet = _decoded(parser, bytearray(source[start - _HEADER : stop]))
+        packet = _decoded(parser, bytearray(source[start - _HEADER : stop]))
         if packet is None:
             lost += 1
             continue

@@ -59,8 +59,8 @@ def read(path: Path, mapping: Mapping[str, Any] | None = None) -> Iterator[Batch
     """
     library = load("pyulog", "px4")
     try:
-        with quiet():
-            log = library.ULog(str(path), list(CONVERTERS), disable_str_exceptions=True)
+        with quiet(), path.open("rb") as file:
+            log = library.ULog(file, list(CONVERTERS), disable_str_exceptions=True)
     except Exception as error:  # Of any type: the library does not foresee all damage.
         raise unreadable(path, error, "a ULog file of PX4") from None
     found = [data for data in log.data_list if len(data.data.get("timestamp", ()))]
