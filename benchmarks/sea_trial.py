@@ -22,7 +22,7 @@ from factorgraph_dvl.baselines import sins
 from factorgraph_dvl.geometry.units import DEG_PER_HOUR
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.imu.attitude_history import AttitudeHistory
-from factorgraph_dvl.io.trial_folder import calibrated_by
+from factorgraph_dvl.io.earlier_calibration import calibrated_by
 from factorgraph_dvl.report.figures.dead_reckoning import errors_figure, lever_arm_figure
 from factorgraph_dvl.report.figures.drawing import save_figures
 from factorgraph_dvl.simulation import parse_scenario, simulate

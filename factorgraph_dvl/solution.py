@@ -343,6 +343,8 @@ class Solution(Judged):
         Of the measurements whose noise was estimated.
     error_budget : tuple of Cause, optional
         What makes up the standard deviations, the largest causes first.
+    epoch : str, optional
+        UTC of time zero, ISO 8601; empty if not given.
     """
 
     trial: str
@@ -362,6 +364,13 @@ class Solution(Judged):
     limits: Mapping[str, float] = field(default_factory=lambda: DEFAULT_LIMITS)
     noise: tuple[Noise, ...] = ()
     error_budget: tuple[Cause, ...] = ()
+    epoch: str = ""
+
+    @property
+    def span(self) -> tuple[float, float] | None:
+        """Times of the first and the last epoch, s."""
+        time = self.trajectory.time
+        return (float(time[0]), float(time[-1])) if time.size else None
 
     def with_findings(self, findings: Iterable[Finding]) -> Solution:
         """Return the solution with findings before its own, each once."""
@@ -398,6 +407,8 @@ class Calibration(Judged):
     limits: Mapping[str, float] = field(default_factory=lambda: DEFAULT_LIMITS)
     noise: tuple[Noise, ...] = ()
     error_budget: tuple[Cause, ...] = ()
+    epoch: str = ""
+    span: tuple[float, float] | None = None
 
     @property
     def values(self) -> dict[str, Array]:

@@ -26,6 +26,7 @@ from factorgraph_dvl.sensors.gnss import Gnss
 from factorgraph_dvl.sensors.grades import DEFAULT_LIMITS
 from factorgraph_dvl.sensors.imu import Imu
 from factorgraph_dvl.sensors.ins import Ins
+from factorgraph_dvl.sensors.parameters import JointPrior
 from factorgraph_dvl.sensors.protocol import Aid, NoiseModel, SensorRecord
 from factorgraph_dvl.sensors.speed_log import Heading, SpeedLog
 from factorgraph_dvl.sensors.turntable import Turntable
@@ -170,19 +171,23 @@ class Trial:
         self._check_prior()
 
     def _check_prior(self) -> None:
-        """Raise DataError if the prior of the DVL came from data of this trial."""
-        prior = None if self.dvl is None else self.dvl.prior
-        if prior is None or not prior.inputs:
-            return
-        section = shared(self._fingerprints, prior.inputs)
-        if section:
-            raise DataError(
-                f"the calibration came from the {section} data of this trial itself, which "
-                "would count twice and make every standard deviation too small",
-                where=f"dvl.calibration: {prior.source}",
-                expected="a calibration from other data",
-                hint="Leave the key out, or name the calibration of an earlier trial",
-            )
+        """Raise DataError if a prior of DVL or IMU came from data of this trial."""
+        for key, prior in self.priors.items():
+            section = shared(self._fingerprints, prior.inputs) if prior.inputs else ""
+            if section:
+                raise DataError(
+                    f"the calibration came from the {section} data of this trial itself, which "
+                    "would count twice and make every standard deviation too small",
+                    where=f"{key}.calibration: {prior.source}",
+                    expected="a calibration from other data",
+                    hint="Leave the key out, or name the calibration of an earlier trial",
+                )
+
+    @property
+    def priors(self) -> dict[str, JointPrior]:
+        """Earlier calibrations by section."""
+        records = (self.imu, self.dvl)
+        return {r.section: r.prior for r in records if r is not None and r.prior is not None}
 
     @cached_property
     def _fingerprints(self) -> tuple[str, ...]:
@@ -191,9 +196,9 @@ class Trial:
 
     @property
     def inputs(self) -> tuple[str, ...]:
-        """Fingerprints of all data behind a result: the records, and those of the prior."""
-        prior = None if self.dvl is None else self.dvl.prior
-        return (*self._fingerprints, *(() if prior is None else prior.inputs))
+        """Fingerprints of all data behind a result: the records, and those of the priors."""
+        earlier = (text for prior in self.priors.values() for text in prior.inputs)
+        return (*self._fingerprints, *dict.fromkeys(earlier))
 
     def estimates_noise(self, record: SensorRecord) -> bool:
         """Whether the stated noise of a sensor is a start value; if not, it is final."""

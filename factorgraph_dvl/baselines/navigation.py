@@ -31,7 +31,7 @@ from factorgraph_dvl.geometry.rotations import (
     rph_jacobian,
     wrapped,
 )
-from factorgraph_dvl.geometry.units import DEG, DEG_PER_HOUR, MICRO_G
+from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array, cross_variance, interpolate, rotate, skew
 from factorgraph_dvl.imu.increments import increments
 from factorgraph_dvl.sensors.finding import Code, Finding
@@ -401,14 +401,12 @@ def _start(
         v = trial.initial_velocity.velocity
         P[3:6, 3:6] = np.diag(trial.initial_velocity.std**2)
     P[6:9, 6:9] = attitude.covariance
-    s = trial.inertial.settings
-    bg, ba = np.zeros(3), np.zeros(3)
+    bg, ba = (p.mean for p in trial.inertial.parameters(0.0))
     if earlier:
         last = earlier[-1]
         gap = float(time[0] - last.time[-1])
         bg, ba = last.gyro_bias[-1], last.accel_bias[-1]
         P[9:, 9:] = last.covariance[-1, 9:, 9:] + np.diag(np.repeat(walk, 3)) * gap
     else:
-        P[9:12, 9:12] = (s.gyro_bias_std_deg_h * DEG_PER_HOUR) ** 2 * np.eye(3)
-        P[12:15, 12:15] = (s.accel_bias_std_ug * MICRO_G) ** 2 * np.eye(3)
+        P[9:, 9:] = trial.inertial.bias_covariance()
     return FilterState(place, v, attitude.nRb, bg, ba, P)

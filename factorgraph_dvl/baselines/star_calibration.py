@@ -106,7 +106,8 @@ def calibrate_gyros(
     samples = prepare(inc, trial.inertial.settings)
     attitudes = star_attitudes(star, trial.epoch, frame.lat, frame.lon)
     (gyro, _) = trial.inertial.parameters(0.0)
-    drift, P = np.zeros(3), np.diag(gyro.sigma**2)
+    drift, P = gyro.mean, np.diag(gyro.sigma**2)
+    (unknown, _) = trial.inertial.nominal().parameters(0.0)
     tracks: list[AttitudeTrack] = []
     history: list[tuple[float, Estimated]] = []
     for a, b in inc.arcs:
@@ -117,7 +118,8 @@ def calibrate_gyros(
             gap = inside.time[0] - tracks[-1].time[-1]
             P = P + trial.inertial.settings.gyro_bias_walk_root_psd**2 * gap * np.eye(3)
         if printed:
-            filtered = run_printed(samples, inside, frame.lat, np.diag(gyro.sigma**2))
+            # It starts from no drift, whatever an earlier calibration says.
+            filtered = run_printed(samples, inside, frame.lat, np.diag(unknown.sigma**2))
             tracks.append(filtered)
         else:
             forward = run_filter(samples, inside, frame.lat, drift, P)
@@ -225,6 +227,7 @@ def _summary(
         trial=trial.name,
         solver="kalman-star",
         body_axes=trial.body_axes,
+        epoch=trial.epoch,
         inputs=trial.inputs,
         converged=not contradicted,
         iterations=1,

@@ -92,6 +92,7 @@ def summarise(
         trial=trial.name,
         solver=solver,
         body_axes=trial.body_axes,
+        epoch=trial.epoch,
         inputs=trial.inputs,
         converged=outcome.converged and not contradicted,
         iterations=outcome.iterations,

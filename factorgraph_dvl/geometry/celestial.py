@@ -56,6 +56,12 @@ def earth_from_inertial(epoch: str, time: Array, ut1_utc: float = 0.0) -> Array:
     return np.asarray(erfa.c2tcio(erfa.c2ixys(x, y, s), angle, np.eye(3)))
 
 
+def seconds_between(earlier: str, later: str) -> float:
+    """Return the time from one epoch to another, s; leap seconds do not count."""
+    (day, fraction), (last_day, last_fraction) = _utc(earlier), _utc(later)
+    return (last_day - day + last_fraction - fraction) * _DAY
+
+
 def _utc(epoch: str) -> tuple[float, float]:
     """Return the Julian day at midnight, and the fraction of the day, of an epoch."""
     if not epoch:

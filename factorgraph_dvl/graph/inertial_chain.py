@@ -55,16 +55,19 @@ class Chain:
         `LocalFrame.gravity_without_rotation` along the segments, m/s².
     biases : tuple of (Parameter, Parameter)
         Gyro and accelerometer bias, as their mean over the trial is reported.
+    first_biases : tuple of (Parameter, Parameter)
+        The same at the first node.
     walking : bool
         Whether every node has a bias of its own.
     graph : gtsam.NonlinearFactorGraph
-        IMU factors, walks of the biases, priors of states and biases.
+        IMU factors, walks of the biases, priors of the states.
     """
 
     frame: LocalFrame
     segments: Segments
     gravity_n: Array
     biases: tuple[Parameter, Parameter]
+    first_biases: tuple[Parameter, Parameter]
     walking: bool
     graph: gtsam.NonlinearFactorGraph
 
@@ -78,24 +81,17 @@ class Chain:
         return keys.bias(k if self.walking else 0)
 
 
-def inertial_chain(
-    trial: Trial, frame: LocalFrame, seg: Segments, start: States, *, bias_prior: bool = True
-) -> Chain:
+def inertial_chain(trial: Trial, frame: LocalFrame, seg: Segments, start: States) -> Chain:
     """Return the inertial part of the graph, with gravity at the positions of `start`."""
     middle = 0.5 * (start.p_n[seg.origin] + start.p_n[seg.origin + 1])
     gravity_n = frame.gravity_without_rotation(middle)
     settings = trial.inertial.settings
     graph = gtsam.NonlinearFactorGraph()
-    biases = trial.inertial.parameters(float(seg.duration.sum()))
-    chain = Chain(frame, seg, gravity_n, biases, settings.bias_walks, graph)
+    first, mean = (trial.inertial.parameters(t) for t in (0.0, float(seg.duration.sum())))
+    chain = Chain(frame, seg, gravity_n, mean, first, settings.bias_walks, graph)
     pims = preintegrate(seg, settings, gravity_n, frame.earth_rate)
     for k, pim in zip(seg.origin.tolist(), pims, strict=True):
         graph.add(gtsam.GalileanImuFactor2(keys.node(k), keys.node(k + 1), chain.bias_key(k), pim))
-    gyro, accel = trial.inertial.parameters(0.0)
-    sigmas = np.concatenate([accel.sigma, gyro.sigma])
-    if bias_prior:
-        none = gtsam.imuBias.ConstantBias()
-        graph.addPriorConstantBias(keys.bias(0), none, loose_diagonal(sigmas))
     if chain.walking:
         root_psd = np.repeat(
             [settings.accel_bias_walk_root_psd, settings.gyro_bias_walk_root_psd], 3
@@ -111,11 +107,11 @@ def inertial_chain(
                     loose_diagonal(walk),
                 )
             )
-    for a, (first, _) in enumerate(seg.arc_nodes):
-        mean, root = _state_prior(trial, frame, seg, start, int(first), is_first=a == 0)
-        graph.add(gtsam.PriorFactorNavState(keys.node(int(first)), mean, square_root(root)))
-    for (_, last), (first, _) in pairwise(seg.arc_nodes):
-        graph.add(_gap_factor(int(last), int(first), seg.node_time))
+    for a, (begin, _) in enumerate(seg.arc_nodes):
+        state, root = _state_prior(trial, frame, seg, start, int(begin), is_first=a == 0)
+        graph.add(gtsam.PriorFactorNavState(keys.node(int(begin)), state, square_root(root)))
+    for (_, last), (begin, _) in pairwise(seg.arc_nodes):
+        graph.add(_gap_factor(int(last), int(begin), seg.node_time))
     return chain
 
 

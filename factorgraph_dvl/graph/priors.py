@@ -55,6 +55,26 @@ def add_priors(
             graph.add(linear_prior(group, key_of, gain, origin))
 
 
+def add_bias_prior(
+    graph: gtsam.NonlinearFactorGraph,
+    biases: tuple[Parameter, Parameter],
+    bias_key: int,
+    parameters: Sequence[Parameter],
+    key_of: Mapping[str, int],
+) -> None:
+    """Add the prior of gyro and accelerometer bias, with the parameters of their calibration."""
+    gyro, accel = biases
+    mean = np.concatenate([accel.mean, gyro.mean])
+    if gyro.joint is None:
+        at = gtsam.imuBias.ConstantBias(accel.mean, gyro.mean)
+        sigmas = np.concatenate([accel.sigma, gyro.sigma])
+        graph.addPriorConstantBias(bias_key, at, loose_diagonal(sigmas))
+        return
+    root = _root_of([accel, gyro, *parameters])
+    prior = ConstantsPrior(mean, {p.name: prior_mean(p) for p in parameters}, root @ root.T)
+    graph.add(joint_linear_prior(prior, bias_key, parameters, key_of))
+
+
 def prior_root(parameters: Sequence[Parameter]) -> Array:
     """Return a square root S of the prior covariance S Sᵀ of parameters, (P, P), SI.
 

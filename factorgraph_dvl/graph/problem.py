@@ -27,6 +27,7 @@ from factorgraph_dvl.graph.inertial_chain import Chain
 from factorgraph_dvl.graph.keys import BIAS_SIZE, STATE_SIZE
 from factorgraph_dvl.graph.priors import (
     ConstantsPrior,
+    add_bias_prior,
     add_priors,
     joint_linear_prior,
     linear_prior,
@@ -173,8 +174,7 @@ class Problem:
     start : dict of str to ndarray, optional
         Values of parameters near which the solution is expected; by default the prior means.
     constants_prior : ConstantsPrior, optional
-        Joint prior of biases and parameters, in place of their own; the chain then has none of
-        the biases.
+        Joint prior of biases and parameters, in place of their own.
     clock_zero : float, optional
         When the offsets of clocks hold, s; by default in the middle of the chain.
 
@@ -207,7 +207,13 @@ class Problem:
         self._fixed = {p.name: prior_mean(p) for p in parameters if not p.estimated}
         self.graph = gtsam.NonlinearFactorGraph(chain.graph)
         if constants_prior is None:
-            add_priors(self.graph, self.parameters, self._key)
+            joint = chain.biases[0].joint
+            with_biases = [p for p in self.parameters if p.joint and p.joint is joint]
+            others = [p for p in self.parameters if not p.joint or p.joint is not joint]
+            add_bias_prior(
+                self.graph, chain.first_biases, chain.bias_key(0), with_biases, self._key
+            )
+            add_priors(self.graph, others, self._key)
         else:
             self.graph.add(
                 joint_linear_prior(constants_prior, chain.bias_key(0), self.parameters, self._key)

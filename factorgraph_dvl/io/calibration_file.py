@@ -24,6 +24,7 @@ from factorgraph_dvl.sensors.fingerprint import PATTERN
 from factorgraph_dvl.sensors.grades import DEFAULT_LIMITS, Grade
 from factorgraph_dvl.settings.files import MEGABYTE, read_bytes
 from factorgraph_dvl.settings.ranges import out_of_range
+from factorgraph_dvl.settings.sections import check_epoch
 from factorgraph_dvl.solution import Calibration, Cause, Estimate, Noise, Solution
 
 CALIBRATION_FILE = "calibration.json"
@@ -102,6 +103,11 @@ class _File(msgspec.Struct):
     inputs: list[Annotated[str, msgspec.Meta(pattern=PATTERN)]] = []
     noise: dict[str, _Noise] = {}
     error_budget: list[_Cause] = []
+    epoch: str = ""
+    span_s: tuple[float, float] | None = None
+
+    def __post_init__(self) -> None:
+        check_epoch(self.epoch)
 
 
 def load_calibration(path: Path | str, *, body_axes: BodyAxes = "RFU") -> Calibration:
@@ -148,6 +154,8 @@ def load_calibration(path: Path | str, *, body_axes: BodyAxes = "RFU") -> Calibr
             Cause(printable(c.cause), printable(c.assumed), _adds(c, file.covariance.order, rows))
             for c in file.error_budget
         ),
+        epoch=file.epoch,
+        span=file.span_s,
     )
     return found if isinstance(file.verdict, UnsetType) else _with_verdict(found, file.verdict)
 
@@ -275,6 +283,8 @@ def encode_calibration(solution: Solution | Calibration) -> bytes:
             _Cause(c.cause, c.assumed, dict(zip(solution.order, c.adds.tolist(), strict=True)))
             for c in solution.error_budget
         ],
+        epoch=solution.epoch,
+        span_s=solution.span,
     )
     # msgspec writes nan and infinity as null, and every float with the digits it takes.
     return msgspec.json.format(msgspec.json.encode(calibration), indent=2) + b"\n"

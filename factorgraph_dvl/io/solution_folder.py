@@ -196,6 +196,8 @@ def load_solution(path: Path | str) -> Solution:
     folder = Path(path)
     calibration = load_calibration(folder / CALIBRATION_FILE)
     fields = {name: getattr(calibration, name) for name in calibration.__dataclass_fields__}
+    # A solution has that of its trajectory.
+    del fields["span"]
     file = folder / TRAJECTORY_FILE
     trajectory = as_trajectory(read_motion(file, str(file), STD_COLUMNS))
     return Solution(

@@ -10,18 +10,15 @@ from typing import Any, TypeVar, cast
 
 import msgspec
 import numpy as np
-from msgspec import UNSET, UnsetType
+from msgspec import UNSET
 
 from factorgraph_dvl.errors import ConfigError, DataError, printable
-from factorgraph_dvl.geometry.rotations import BodyAxes
 from factorgraph_dvl.geometry.units import DEG, GEODETIC_SI
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.io.calibration_file import (
-    check_usable,
     check_values,
-    encode_calibration,
-    load_calibration,
 )
+from factorgraph_dvl.io.earlier_calibration import save_prior, with_earlier_calibrations
 from factorgraph_dvl.io.folders import SETTINGS_FILE, new_folder
 from factorgraph_dvl.io.motion_table import motion_columns, read_reference
 from factorgraph_dvl.io.tables import read_table, write_table
@@ -36,20 +33,18 @@ from factorgraph_dvl.io.trial_yaml import (
     VelocitySettings,
     to_yaml,
 )
-from factorgraph_dvl.sensors.catalogue import AIDS, PLANAR, specs_of
-from factorgraph_dvl.sensors.dvl import CALIBRATED, Dvl
+from factorgraph_dvl.sensors.catalogue import AIDS, PLANAR
+from factorgraph_dvl.sensors.dvl import Dvl
 from factorgraph_dvl.sensors.dvl_beams import DvlBeams
 from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.sensors.gnss import Gnss
 from factorgraph_dvl.sensors.grades import DEFAULT_LIMITS
 from factorgraph_dvl.sensors.imu import Imu
 from factorgraph_dvl.sensors.invalid_values import without_invalid_values
-from factorgraph_dvl.sensors.parameters import JointPrior
 from factorgraph_dvl.sensors.protocol import Aid, SensorRecord, SensorSection
 from factorgraph_dvl.sensors.records import check_possible
 from factorgraph_dvl.settings.files import MEGABYTE, read_bytes
 from factorgraph_dvl.settings.yaml_file import parse_yaml, read_text
-from factorgraph_dvl.solution import Calibration, Estimate
 from factorgraph_dvl.trial import (
     InitialAttitude,
     InitialPosition,
@@ -59,13 +54,15 @@ from factorgraph_dvl.trial import (
 )
 
 TRUTH_FILE = "truth.json"
-# Where a trial that was loaded with a calibration of its DVL keeps it when it is saved.
+# Where a trial that was loaded with a calibration of its DVL or its IMU keeps it when it is saved.
 PRIOR_FILE = "dvl-calibration.json"
+BIAS_FILE = "imu-calibration.json"
 _TABLES = dict.fromkeys(("imu", *(kind.section for kind in (*AIDS, *PLANAR)), "reference"))
 OWNED = (
     SETTINGS_FILE,
     TRUTH_FILE,
     PRIOR_FILE,
+    BIAS_FILE,
     *(f"{table}{suffix}" for table in _TABLES for suffix in (".csv", ".parquet")),
 )
 
@@ -95,8 +92,8 @@ def load_trial(path: Path | str, *, anyway: bool = False) -> Trial:
     path : path-like
         Of the folder, or of the trial.yaml in it.
     anyway : bool, default False
-        Start from the calibration in `dvl.calibration` also if it is graded `do not use`; the
-        trial notes it.
+        Start from the calibrations in `dvl.calibration` and `imu.calibration` also if they are
+        graded `do not use`; the trial notes it.
 
     Raises
     ------
@@ -125,14 +122,10 @@ def load_trial(path: Path | str, *, anyway: bool = False) -> Trial:
         for name, section in settings.aids.items()
     }
     dvl = cast("Dvl | None", aids.pop(Dvl.section, None))
-    calibration = None if dvl is None else _calibration_for(dvl, folder, settings.body_axes)
-    if dvl is not None and calibration is not None:
-        source = str(dvl.settings.calibration)
-        dvl = calibrated_by(dvl, calibration, settings.body_axes, source, anyway=anyway)
-        verdict = calibration.verdict
-        if verdict.grade == "do not use":
-            text = f"{source} is graded `do not use`: {verdict.reasons[0]}"
-            notes.append(Finding(Code.UNUSABLE_PRIOR, text, sensor=dvl.label))
+    imu, dvl, found = with_earlier_calibrations(
+        *(imu, dvl, folder, settings.body_axes, settings.epoch), anyway=anyway
+    )
+    notes += found
     if dvl is not None and _share_pings(dvl, aids):
         notes.append(
             Finding(
@@ -243,11 +236,12 @@ def save_trial(
             write_table(folder / f"reference{suffix}", motion_columns(trial.reference))
         if trial.calibration_truth:
             (folder / TRUTH_FILE).write_bytes(truth_json(trial.calibration_truth))
+        if trial.imu is not None and trial.imu.prior is not None:
+            trial = replace(trial, imu=save_prior(folder, BIAS_FILE, trial.imu, trial))
         if trial.dvl is not None and trial.dvl.prior is not None:
-            calibration = _calibration_of(trial.dvl.prior, trial)
-            (folder / PRIOR_FILE).write_bytes(encode_calibration(calibration))
-            settings = msgspec.structs.replace(trial.dvl.settings, calibration=PRIOR_FILE)
-            trial = replace(trial, dvl=replace(trial.dvl, settings=settings))
+            both = trial.imu is not None and trial.dvl.prior is trial.imu.prior
+            file = BIAS_FILE if both else PRIOR_FILE
+            trial = replace(trial, dvl=save_prior(folder, file, trial.dvl, trial))
         write_settings(folder, _settings(trial, suffix), seed)
 
 
@@ -306,94 +300,6 @@ def _named(settings: Any) -> Iterator[str]:
                 yield value
             else:
                 yield from _named(value)
-
-
-def _calibration_for(dvl: Dvl, folder: Path, body_axes: BodyAxes) -> Calibration | None:
-    """Return the calibration that the settings of a DVL name, None if they name none."""
-    name = dvl.settings.calibration
-    if isinstance(name, UnsetType):
-        return None
-    path = folder / name
-    if not path.exists():
-        raise ConfigError(
-            f"dvl.calibration: the file {name} does not exist",
-            where=SETTINGS_FILE,
-            expected=f"a calibration.json at {path}",
-        )
-    return load_calibration(path, body_axes=body_axes)
-
-
-def calibrated_by(
-    dvl: Dvl, calibration: Calibration, body_axes: BodyAxes, source: str, *, anyway: bool = False
-) -> Dvl:
-    """Return a DVL whose prior is what a calibration says of it, correlations included.
-
-    What belongs to the day is left out: biases of the IMU, the current.
-
-    Parameters
-    ----------
-    dvl : Dvl
-        Without a calibration.
-    calibration : Calibration
-        Of the same DVL, mounted as it is now.
-    body_axes : BodyAxes
-        Of the trial.
-    source : str
-        Name of the calibration, for messages.
-    anyway : bool, default False
-        Take it also if it is graded `do not use`.
-
-    Raises
-    ------
-    DataError
-        If the calibration is not to be used, is in other axes, or says nothing of the DVL.
-    """
-    check_usable(calibration, body_axes, source, anyway=anyway)
-    values: dict[str, Array] = {}
-    rows: list[int] = []
-    at = 0
-    for e in calibration.estimates:
-        if e.name in CALIBRATED:
-            sizes = specs_of(e.name)
-            if e.value.size not in sizes:
-                raise DataError(
-                    f"{e.name} has {e.value.size} numbers",
-                    where=source,
-                    expected=" or ".join(map(str, sizes)),
-                )
-            values[e.name] = e.value
-            rows += range(at, at + e.value.size)
-        at += e.value.size
-    if not values:
-        raise DataError(
-            "the calibration says nothing of the DVL", where=source, expected=", ".join(CALIBRATED)
-        )
-    covariance = calibration.covariance[np.ix_(rows, rows)]
-    prior = JointPrior(source, values, covariance, calibration.inputs)
-    settings = msgspec.structs.replace(dvl.settings, calibration=source)
-    return replace(dvl, settings=settings, prior=prior)
-
-
-def _calibration_of(prior: JointPrior, trial: Trial) -> Calibration:
-    """Return a prior as the calibration that it came from."""
-    estimates = []
-    for name, value in prior.values.items():
-        std = prior.std(name)
-        names = specs_of(name)[value.size].component_names
-        known = np.ones(value.size, dtype=bool)
-        unknown = np.full(value.size, np.nan)
-        estimates.append(Estimate(name, names, value, std, unknown, unknown, known))
-    return Calibration(
-        trial=prior.source,
-        solver="prior",
-        body_axes=trial.body_axes,
-        converged=True,
-        iterations=0,
-        cost=np.nan,
-        estimates=tuple(estimates),
-        covariance=prior.covariance,
-        inputs=prior.inputs,
-    )
 
 
 class _Kind(msgspec.Struct):

@@ -10,6 +10,8 @@ from scipy.special import chdtrc
 
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.sensors.finding import Code, Finding
+from factorgraph_dvl.sensors.imu import BIASES
+from factorgraph_dvl.sensors.parameters import JointPrior
 from factorgraph_dvl.solution import Estimate
 from factorgraph_dvl.trial import Trial
 
@@ -92,20 +94,25 @@ def prior_against_data(
 def prior_findings(
     trial: Trial, estimates: Sequence[Estimate], covariance: Array
 ) -> Iterator[Finding]:
-    """Yield a finding if an earlier calibration contradicts the trial.
+    """Yield a finding for each earlier calibration that contradicts the trial.
 
     Parameters
     ----------
     trial : Trial
-        Its DVL may have an earlier calibration.
+        Its DVL and its IMU may have earlier calibrations.
     estimates : sequence of Estimate
         What the trial made of it, with other parameters.
     covariance : ndarray, shape (P, P)
         Joint covariance of `estimates`.
     """
-    prior = None if trial.dvl is None else trial.dvl.prior
-    if prior is None:
-        return
+    sensors = {id(prior): (section.upper(), prior) for section, prior in trial.priors.items()}
+    for sensor, prior in sensors.values():
+        yield from _contradiction(sensor, prior, estimates, covariance)
+
+
+def _contradiction(
+    sensor: str, prior: JointPrior, estimates: Sequence[Estimate], covariance: Array
+) -> Iterator[Finding]:
     ends = np.cumsum([e.value.size for e in estimates], dtype=int)
     own: list[int] = []
     before: list[int] = []
@@ -120,21 +127,31 @@ def prior_findings(
     mean = np.concatenate([np.ravel(v) for v in prior.values.values()])[before]
     value = np.concatenate([e.value for e in estimates])[own]
     P0 = prior.covariance[np.ix_(before, before)]
+    # Of a bias that walks the prior is that of its start, and the estimate its mean.
+    of_mean = np.concatenate([e.prior_std * (e.name in BIASES) for e in estimates])[own] ** 2
+    P0[np.diag_indices_from(P0)] = np.maximum(np.diag(P0), of_mean)
     P = covariance[np.ix_(own, own)]
     test = prior_against_data(mean, P0, value, P)
     p = test.probability
     if p >= DOUBTFUL_P:
         return
     std, after = np.sqrt(np.diag(P0)), np.sqrt(np.diag(P))
-    apart = np.abs(test.value - mean) / np.hypot(std, test.std)
-    i = int(np.nanargmax(apart))
+    # The same test of one component alone.
+    scale = np.maximum(std, np.finfo(float).tiny)
+    informed = 1.0 - (after / scale) ** 2
+    apart = np.where(informed > _LEAST_SHARE, np.abs(value - mean) / scale, 0.0)
+    i = int(np.argmax(apart / np.sqrt(np.maximum(informed, _LEAST_SHARE))))
+    alone = (
+        f"this trial alone says {test.value[i]:.2g} ± {test.std[i]:.1g}, and "
+        if np.isfinite(test.std[i])
+        else ""
+    )
     yield Finding(
         Code.PRIOR_CONTRADICTED,
         f"{prior.source} contradicts this trial (χ² {test.statistic:.0f} with {test.freedom} "
         f"degrees of freedom, by chance {p:.0e}): {names[i]} was {mean[i]:.2g} ± {std[i]:.1g}, "
-        f"this trial alone says {test.value[i]:.2g} ± {test.std[i]:.1g}, and the result, "
-        f"{value[i]:.2g} ± {after[i]:.1g}, is neither",
-        sensor="DVL",
+        f"{alone}the result, {value[i]:.2g} ± {after[i]:.1g}, fits neither",
+        sensor=sensor,
         parameter=next(e.name for e in estimates if names[i] in e.component_names),
         severity="error" if p < CONTRADICTED_P else "warning",
     )

@@ -180,6 +180,7 @@ def _solution(trial: Trial, run: Replay, recorder: Recorder, last: Update) -> So
         trial=trial.name,
         solver="replay",
         body_axes=trial.body_axes,
+        epoch=trial.epoch,
         inputs=trial.inputs,
         converged=run.unused < LEAST and not last.inconsistent,
         iterations=recorder.count,

@@ -385,7 +385,7 @@ class Code(StrEnum):
         "unusable_prior",
         "The calibration that the trial starts from is graded `do not use`.",
         "What was wrong there is carried into this trial.",
-        "Calibrate anew, and name that result in dvl.calibration.",
+        "Calibrate anew, and name that result in dvl.calibration or imu.calibration.",
     )
     HEADING_UNKNOWN = (
         "heading_unknown",
@@ -411,7 +411,8 @@ class Code(StrEnum):
         "prior_contradicted",
         "The calibration that the trial starts from contradicts its data.",
         "The result lies between the two, and fits neither.",
-        "Leave dvl.calibration out if the DVL was mounted anew; else look for what differs.",
+        "Leave dvl.calibration out if the DVL was mounted anew, imu.calibration if the IMU was "
+        "switched off; else look for what differs.",
     )
     HALVES_DIFFER = (
         "halves_differ",

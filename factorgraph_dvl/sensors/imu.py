@@ -12,6 +12,7 @@ import msgspec
 import numpy as np
 from msgspec import UNSET, UnsetType
 
+from factorgraph_dvl.errors import ConfigError
 from factorgraph_dvl.geometry.units import (
     DEG,
     DEG_PER_HOUR,
@@ -22,7 +23,7 @@ from factorgraph_dvl.geometry.units import (
 )
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.sensors.imu_grades import TYPICAL, ZERO_WITHOUT_GRADE, Grade
-from factorgraph_dvl.sensors.parameters import Parameter, ParameterSpec
+from factorgraph_dvl.sensors.parameters import JointPrior, Parameter, ParameterSpec
 from factorgraph_dvl.sensors.protocol import SensorSection
 from factorgraph_dvl.sensors.records import (
     check_finite,
@@ -101,6 +102,8 @@ _ERRORS = (
     _error_spec("accel_scale", "ppm", "force", "force", _DIAGONAL),
     _error_spec("accel_misalignment", "deg", "force", "force", _BELOW),
 )
+# Of what an earlier calibration says, what this IMU may start from.
+BIASES = (_GYRO_BIAS.name, _ACCEL_BIAS.name)
 # The elements that the components of each parameter stand for, by its name.
 ERRORS = {spec.name: elements for spec, elements in _ERRORS}
 
@@ -141,6 +144,7 @@ class ImuSettings(SensorSection, frozen=True, kw_only=True):
     file: str = "imu.csv"
     sampling: Literal["mean", "instantaneous"] = "mean"
     grade: Grade | UnsetType = UNSET
+    calibration: str | UnsetType = UNSET
     gyro_noise_deg_sqrt_h: NonNegative = _NOT_STATED
     gyro_bias_std_deg_h: Positive = _NOT_STATED
     gyro_bias_walk_deg_h_sqrt_h: NonNegative = _NOT_STATED
@@ -218,6 +222,9 @@ class Imu:
         Specific force in body.
     source : str, optional
         Name of the file, for messages.
+    prior : JointPrior, optional
+        What the calibration that `settings` name knows of the biases at the first sample; it takes
+        the place of their keys.
     """
 
     settings: ImuSettings
@@ -225,6 +232,7 @@ class Imu:
     gyro: Array
     accel: Array
     source: str = "imu"
+    prior: JointPrior | None = None
 
     section: ClassVar[str] = "imu"
     section_type: ClassVar[type[SensorSection]] = ImuSettings
@@ -260,6 +268,11 @@ class Imu:
         """Standard deviations of scale, axes and g-sensitivity, SI."""
         return self.settings.error_std
 
+    def nominal(self) -> Self:
+        """Return this IMU as trial.yaml describes it, without the calibration it names."""
+        settings = msgspec.structs.replace(self.settings, calibration=UNSET)
+        return replace(self, settings=settings, prior=None)
+
     def without_errors(self) -> Self:
         """Return the record with an IMU of exact scale and axes, and no g-sensitivity."""
         keys = (f"{spec.stem}_std_{spec.unit}" for spec, _ in _ERRORS)
@@ -280,18 +293,43 @@ class Imu:
 
         The mean of a random walk b(t) = b0 + w(t) over T has the variance
         var(b0) + q T / 3.
+
+        Raises
+        ------
+        ConfigError
+            If the calibration that trial.yaml names has not been read.
         """
         s = self.settings
-        gyro_sigma = np.hypot(
-            s.gyro_bias_std_deg_h * DEG_PER_HOUR,
-            s.gyro_bias_walk_root_psd * np.sqrt(duration / 3.0),
-        )
-        accel_sigma = np.hypot(
-            s.accel_bias_std_ug * MICRO_G,
-            s.accel_bias_walk_root_psd * np.sqrt(duration / 3.0),
-        )
-        zero = np.zeros(3)
+        if self.prior is None and s.calibration is not UNSET:
+            raise ConfigError(
+                f"the calibration {s.calibration} has not been read",
+                where="imu.calibration",
+                expected="a trial loaded from its folder",
+            )
         return (
-            Parameter(_GYRO_BIAS, zero, np.full(3, gyro_sigma)),
-            Parameter(_ACCEL_BIAS, zero, np.full(3, accel_sigma)),
+            self._bias(
+                _GYRO_BIAS, s.gyro_bias_std_deg_h, s.gyro_bias_walk_root_psd**2 * duration / 3.0
+            ),
+            self._bias(
+                _ACCEL_BIAS, s.accel_bias_std_ug, s.accel_bias_walk_root_psd**2 * duration / 3.0
+            ),
+        )
+
+    def bias_covariance(self) -> Array:
+        """Return the prior covariance of gyro and accelerometer bias at the start, (6, 6), SI."""
+        both = self.parameters(0.0)
+        if self.prior is None:
+            return np.diag(np.concatenate([p.sigma for p in both]) ** 2)
+        of_all = np.arange(len(self.prior.covariance))
+        rows = np.concatenate([of_all[self.prior.rows(p.name)] for p in both])
+        si = np.repeat([p.si for p in both], 3)
+        return np.asarray(self.prior.covariance[np.ix_(rows, rows)] * np.outer(si, si))
+
+    def _bias(self, spec: ParameterSpec, std: float, walked: float) -> Parameter:
+        """Return a bias with its prior, to whose variance `walked` is added, SI."""
+        mean, sigma = np.zeros(3), np.full(3, std)
+        if self.prior is not None:
+            mean, sigma = self.prior.values[spec.name], self.prior.std(spec.name)
+        return Parameter(
+            spec, mean * spec.si, np.sqrt((sigma * spec.si) ** 2 + walked), joint=self.prior
         )

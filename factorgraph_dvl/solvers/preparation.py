@@ -67,9 +67,9 @@ class Preparation:
     mountings: dict[str, Array]
     findings: tuple[Finding, ...]
 
-    def chain(self, states: States, *, bias_prior: bool = True) -> Chain:
+    def chain(self, states: States) -> Chain:
         """Return the inertial part of the graph, with gravity along the track of states."""
-        return inertial_chain(self.trial, self.frame, self.segments, states, bias_prior=bias_prior)
+        return inertial_chain(self.trial, self.frame, self.segments, states)
 
     def mountings_at(self, chain: Chain, states: States) -> list[dict[str, Array]]:
         """Return values of the mountings that fit the motion of states, the best first."""

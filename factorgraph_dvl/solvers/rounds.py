@@ -91,7 +91,7 @@ def settle(
     clock_zero : float, optional
         When the offsets of clocks hold, s; by default in the middle of the trial.
     """
-    chain = prepared.chain(states, bias_prior=constants_prior is None)
+    chain = prepared.chain(states)
     p_gravity = states.p_n
     if constants_prior is not None:
         values = constants_prior.parameters
@@ -131,7 +131,7 @@ def settle(
         changing = _changing(problem, minimum.evaluation)
         if np.sqrt(np.mean((states.p_n - p_gravity) ** 2)) > _SAME_GRAVITY:
             changing.insert(0, "gravity along the track")
-            chain = prepared.chain(states, bias_prior=constants_prior is None)
+            chain = prepared.chain(states)
             p_gravity = states.p_n
         if not cycle:
             if not (tried and _same(tried[-1], rejected)):

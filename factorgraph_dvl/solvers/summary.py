@@ -77,6 +77,7 @@ def summarise(trial: Trial, found: SolvedProblem, *, rate_hz: float) -> Solution
         trial=trial.name,
         solver="batch",
         body_axes=trial.body_axes,
+        epoch=trial.epoch,
         inputs=trial.inputs,
         converged=minimum.converged,
         iterations=minimum.iterations,

@@ -85,18 +85,19 @@ def _native_rows(problem: Problem, evaluation: Evaluation) -> Iterator[Rows]:
     gaussian = problem.native(evaluation)
     sizes = evaluation.values.dims()
     names = {problem.key(p.name): p.name for p in problem.parameters}
+    of_biases = ", ".join(p.name for p in problem.chain.biases)
     found: dict[tuple[str, tuple[int, ...]], list[tuple[list[int], Array]]] = {}
     for i in range(gaussian.size()):
         factor = gaussian.at(i)
         own = list(factor.keys())
-        kind = (_source(own, names), tuple(sizes[key] for key in own))
+        kind = (_source(own, names, of_biases), tuple(sizes[key] for key in own))
         found.setdefault(kind, []).append((own, np.array(factor.augmentedJacobian())))
     gyro, accel = (p.name for p in problem.chain.biases)
     for (source, shape), items in found.items():
         variables = np.array([own for own, _ in items])
         matrix = np.stack([augmented for _, augmented in items])
-        parts = {source: slice(None)}
-        if source in (PRIOR, WALK):
+        parts = {source.format(of_biases): slice(None)}
+        if source == WALK or (source == PRIOR and problem.chain.biases[0].joint is None):
             # GTSAM's order; the rows are independent of each other.
             parts = {source.format(accel): slice(0, 3), source.format(gyro): slice(3, 6)}
         for name, own_rows in parts.items():
@@ -106,12 +107,14 @@ def _native_rows(problem: Problem, evaluation: Evaluation) -> Iterator[Rows]:
             )
 
 
-def _source(own: list[int], names: Mapping[int, str]) -> str:
+def _source(own: list[int], names: Mapping[int, str], biases: str) -> str:
     """Return the source of a factor's noise, from its variables."""
     letters = "".join(map(keys.letter_of, own))
     if letters.startswith("xxb"):
         return IMU_NOISE
     calibration = [names[key] for key in own if key in names]
+    if calibration and "b" in letters:
+        calibration.insert(0, biases)
     if calibration:
         return PRIOR.format(", ".join(calibration))
     return {

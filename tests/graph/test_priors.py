@@ -21,7 +21,8 @@ from factorgraph_dvl.baselines import calibrate
 from factorgraph_dvl.errors import ConfigError, DataError
 from factorgraph_dvl.geometry.rotations import exp_so3
 from factorgraph_dvl.io.calibration_file import encode_calibration
-from factorgraph_dvl.io.trial_folder import calibrated_by, load_trial, save_trial
+from factorgraph_dvl.io.earlier_calibration import calibrated_by
+from factorgraph_dvl.io.trial_folder import load_trial, save_trial
 from factorgraph_dvl.sensors.finding import Code
 from factorgraph_dvl.sensors.parameters import JointPrior
 from factorgraph_dvl.simulation import simulate
