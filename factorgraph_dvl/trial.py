@@ -33,6 +33,15 @@ from factorgraph_dvl.sensors.turntable import Turntable
 
 _Sensor = TypeVar("_Sensor", bound=Aid)
 
+# What a trial may lack, in the words of import.log and of errors.
+NO_POSITION = (
+    "positions: no file has any; give a record of GNSS of the same time, such as NMEA or .pos"
+)
+NO_LOCK = (
+    "velocities: {count} pings, and none of them with bottom lock or a velocity through water"
+)
+NO_MOTION = "attitude: no file has an IMU, a navigation solution, or roll, pitch and heading"
+
 
 @dataclass(frozen=True)
 class InitialPosition:
@@ -300,7 +309,7 @@ class Trial:
             lat, lon, height = known[0]
             return LocalFrame(lat, lon, height, self.epoch)
         raise DataError(
-            "the trial has no position",
+            NO_POSITION,
             where="trial.yaml",
             expected="a gnss or ins section with positions, initial.position, or beacons",
         )

@@ -15,6 +15,7 @@ from factorgraph_dvl.cli.console import stderr, warn
 from factorgraph_dvl.cli.correct import correct
 from factorgraph_dvl.cli.crosscheck import crosscheck
 from factorgraph_dvl.cli.deadreckon import deadreckon
+from factorgraph_dvl.cli.import_files import import_
 from factorgraph_dvl.cli.inspect import inspect
 from factorgraph_dvl.cli.instrument import instrument
 from factorgraph_dvl.cli.memory import naming_memory
@@ -57,6 +58,8 @@ for _command in (
     reproduce,
 ):
     app.command()(naming_memory(_command))
+# A name that Python keeps for itself.
+app.command("import")(naming_memory(import_))
 
 
 def run(args: list[str]) -> NoReturn:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import pyarrow as pa
@@ -106,6 +106,40 @@ def write_table(path: Path, columns: Mapping[str, NDArray[Any]]) -> None:
     with path.open("wb") as file:
         file.write((",".join(columns) + "\n").encode())
         pyarrow.csv.write_csv(table, file, pyarrow.csv.WriteOptions(include_header=False))
+
+
+class TableWriter:
+    """A Parquet file of numbers that is written part by part.
+
+    Parameters
+    ----------
+    path : path-like
+        Of the file.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._writer: pyarrow.parquet.ParquetWriter | None = None
+        self.rows = 0
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *failure: object) -> None:
+        if self._writer is not None:
+            self._writer.close()
+
+    def write(self, columns: Mapping[str, Array]) -> None:
+        """Append columns (N,); nan is written as empty."""
+        table = pa.table(
+            {name: pa.array(x, pa.float64(), from_pandas=True) for name, x in columns.items()}
+        )
+        if self._writer is None:
+            self._writer = pyarrow.parquet.ParquetWriter(
+                self._path, table.schema, write_page_checksum=True
+            )
+        self._writer.write_table(table)
+        self.rows += table.num_rows
 
 
 def _choose(

@@ -167,7 +167,7 @@ def test_without_gnss_but_with_a_start():
 
 def test_without_any_position_there_is_no_frame():
     trial = simulate(scenario())
-    with pytest.raises(DataError, match="the trial has no position"):
+    with pytest.raises(DataError, match="positions: no file has any"):
         solve(replace(trial, gnss=None))
 
 

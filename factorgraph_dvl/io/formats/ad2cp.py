@@ -22,6 +22,8 @@ BOTTOM, BURST, AVERAGE, TEXT = 0x17, 0x15, 0x16, 0xA0
 # Nucleus frames its packets alike, with kinds of its own.
 NUCLEUS = 0x20
 _SEED = 0xB58C
+# Bytes of a header, 12 in its long form.
+_HEADER = 10
 # The largest records, of raw echo sounder samples, have some 100 kB.
 _LARGEST = 1 << 24
 BLOCK = 10_000
@@ -180,6 +182,12 @@ def checksum(data: bytes) -> int:
     even = len(data) & ~1
     total = _SEED + int(np.frombuffer(data[:even], "<u2").sum(dtype=np.int64))
     return (total + (data[-1] << 8 if len(data) & 1 else 0)) & 0xFFFF
+
+
+def covered(sample: bytes) -> int:
+    """Return the number of bytes of a sample that lie in records of AD2CP."""
+    found = frames(sample)
+    return sum(stop - start + _HEADER for family, _, start, stop in found if family != NUCLEUS)
 
 
 def _bottom_track(pings: list[tuple[int, bytes]]) -> Records:

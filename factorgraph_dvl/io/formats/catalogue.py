@@ -3,5 +3,23 @@
 from __future__ import annotations
 
 from factorgraph_dvl.io.formats.format import Format
+from factorgraph_dvl.io.formats.normalised import (
+    ad2cp,
+    nmea,
+    pd0,
+    trajectories,
+    velocity_logs,
+)
+from factorgraph_dvl.io.formats.vehicles import ardupilot, bags, nucleus, ulog
 
-FORMATS: tuple[Format, ...] = ()
+FORMATS: tuple[Format, ...] = (
+    *pd0.FORMATS,
+    *ad2cp.FORMATS,
+    *velocity_logs.FORMATS,
+    *trajectories.FORMATS,
+    *nmea.FORMATS,
+    nucleus.FORMAT,
+    bags.FORMAT,
+    ardupilot.FORMAT,
+    ulog.FORMAT,
+)

@@ -163,6 +163,8 @@ class Format:
         What the reader was compared with; `not verified` where nothing could be had.
     endings : tuple of str, optional
         Usual endings of names, lower case with dot; they decide between equal shares only.
+    in_text : bool, optional
+        Whether its records may stand in one text file with those of other such formats.
     module, extra : str, optional
         Third-party module that reading needs, and the extra that installs it.
     limit : str, optional
@@ -176,6 +178,7 @@ class Format:
     read: Reader
     verified: str
     endings: tuple[str, ...] = ()
+    in_text: bool = False
     module: str = ""
     extra: str = ""
     limit: str = ""

@@ -1,0 +1,1 @@
+"""Records of the readers in the common terms of `format`."""

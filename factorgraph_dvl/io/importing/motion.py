@@ -1,0 +1,91 @@
+"""The records of a trial that need no choice of axes: IMU, navigation solution, depth."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from factorgraph_dvl.geometry.units import DEG
+from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.io.importing.decisions import Decisions
+from factorgraph_dvl.io.importing.merging import Merged, merge
+from factorgraph_dvl.io.importing.positions import best_source
+from factorgraph_dvl.io.importing.time_base import Timed
+from factorgraph_dvl.io.motion_table import COLUMNS, STD_COLUMNS
+
+_SAMPLE = 20_000
+
+
+def choose(streams: Sequence[Timed], kind: str, decisions: Decisions) -> Merged | None:
+    """Return the records of a kind from its fullest source in all files, None without."""
+    return merge(best_source(streams, kind, _count, decisions), decisions)
+
+
+def _count(source: Sequence[Timed]) -> float:
+    return float(sum(np.isfinite(timed.time).sum() for timed in source))
+
+
+def imu_tables(imu: Merged, epoch: float) -> Iterator[dict[str, Array]]:
+    """Yield parts of the table `imu`."""
+    for time, part in imu.chunks():
+        good = np.isfinite(part["gyro"]).all(axis=1) & np.isfinite(part["accel"]).all(axis=1)
+        names = [f"gyro_{axis}_rad_s" for axis in "xyz"], [f"accel_{axis}_m_s2" for axis in "xyz"]
+        yield {
+            "time_s": (time - epoch)[good],
+            **{name: part["gyro"][good, i] for i, name in enumerate(names[0])},
+            **{name: part["accel"][good, i] for i, name in enumerate(names[1])},
+        }
+
+
+def depth_tables(depth: Merged, epoch: float) -> Iterator[dict[str, Array]]:
+    """Yield parts of the table `depth`."""
+    for time, part in depth.chunks():
+        yield {"time_s": time - epoch, "depth_m": part["depth"]}
+
+
+@dataclass(frozen=True)
+class Navigation:
+    """A navigation solution.
+
+    Parameters
+    ----------
+    ins : Merged
+        In order.
+    with_std : bool
+        Whether it has standard deviations.
+    """
+
+    ins: Merged
+    with_std: bool
+
+    @classmethod
+    def of(cls, ins: Merged) -> Navigation:
+        """Return the solution that records hold."""
+        _, part = ins.sample(_SAMPLE)
+        stds = [part[name] for name in ("std", "velocity_std", "attitude_std")]
+        return cls(ins, all(np.isfinite(std).any() for std in stds))
+
+    def tables(self, epoch: float) -> Iterator[dict[str, Array]]:
+        """Yield parts of the table `ins`."""
+        for time, part in self.ins.chunks():
+            values = np.column_stack(
+                [
+                    time - epoch,
+                    part["lat"] / DEG,
+                    (part["lon"] / DEG + 180.0) % 360.0 - 180.0,
+                    part["height"],
+                    part["velocity"],
+                    *(part[name] / DEG for name in ("roll", "pitch")),
+                    part["heading"] / DEG % 360.0,
+                ]
+            )
+            good = np.isfinite(values).all(axis=1)
+            table = dict(zip(COLUMNS, values[good].T, strict=True))
+            if self.with_std:
+                stds = np.column_stack(
+                    [part["std"], part["velocity_std"], part["attitude_std"] / DEG]
+                )
+                table |= dict(zip(STD_COLUMNS, stds[good].T, strict=True))
+            yield table
