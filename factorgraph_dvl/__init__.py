@@ -9,55 +9,159 @@ they are resolved in: `v_n`, `omega_eb_b`. Lever arms run from the IMU to the se
 b. Residual = predicted - measured. SI units and radians; other units stand in names.
 
 The DVL reports v_d = (1 + k) dRb (v_b + omega_eb_b x l) + beta, at its true time.
+
+Public names
+------------
+Trials: `Trial`, `trial_from_tables`, `load_trial`, `save_trial`, `simulate`, and the records
+`Imu`, `Gnss`, `Dvl` with their settings. `survey` says what a trial holds, and what is wrong.
+
+Estimates: `solve`, `Replay`, `kalman` (the usual filters, to compare). They return a `Solution`,
+with its `Trajectory`, each `Estimate` and a `Verdict`; `load_solution`, `save_solution`,
+`load_calibration`.
+
+Analyses: `crosscheck`, `observability`, `predict` (of a plan), `dead_reckon`.
+
+Parts for a GTSAM script of one's own: `preintegrate`, `measured_nodes`, `sensor_factor`,
+`solved_problems` (whose `Problem.nonlinear_graph` is the whole problem), `LocalFrame`.
+
+Errors: `ConfigError`, `DataError`, `SolveError` and `OutputError` are each a
+`FactorgraphDvlError`.
 """
 
 from __future__ import annotations
 
-from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from factorgraph_dvl.analysis.comparison.crosscheck import crosscheck
+    from factorgraph_dvl.analysis.dead_reckoning.integration import dead_reckon
+    from factorgraph_dvl.analysis.information.observability import observability
+    from factorgraph_dvl.baselines.calibration import kalman
+    from factorgraph_dvl.errors import (
+        ConfigError,
+        DataError,
+        FactorgraphDvlError,
+        OutputError,
+        SolveError,
+    )
+    from factorgraph_dvl.geometry.earth import LocalFrame
+    from factorgraph_dvl.graph.problem import Problem
+    from factorgraph_dvl.graph.sensor_factor import measured_nodes, sensor_factor
+    from factorgraph_dvl.imu.preintegration import preintegrate
+    from factorgraph_dvl.io.calibration_file import load_calibration
     from factorgraph_dvl.io.solution_folder import load_solution, save_solution
     from factorgraph_dvl.io.trial_folder import load_trial, save_trial
+    from factorgraph_dvl.io.trial_tables import trial_from_tables
+    from factorgraph_dvl.planning.prediction import predict
+    from factorgraph_dvl.quality.survey import survey
     from factorgraph_dvl.replay.session import Replay
+    from factorgraph_dvl.sensors.dvl import Dvl, DvlSettings
+    from factorgraph_dvl.sensors.finding import Verdict
+    from factorgraph_dvl.sensors.gnss import Gnss, GnssSettings
+    from factorgraph_dvl.sensors.imu import Imu, ImuSettings
     from factorgraph_dvl.simulation import simulate
-    from factorgraph_dvl.solution import Solution
-    from factorgraph_dvl.solvers.batch import solve
+    from factorgraph_dvl.solution import Calibration, Estimate, Solution, Trajectory
+    from factorgraph_dvl.solvers.batch import solve, solved_problems
     from factorgraph_dvl.trial import Trial
 
     __version__: str
 
+# Module of each public name.
 _PUBLIC = {
-    "Replay": "factorgraph_dvl.replay.session",
-    "Solution": "factorgraph_dvl.solution",
-    "Trial": "factorgraph_dvl.trial",
-    "load_solution": "factorgraph_dvl.io.solution_folder",
-    "load_trial": "factorgraph_dvl.io.trial_folder",
-    "save_solution": "factorgraph_dvl.io.solution_folder",
-    "save_trial": "factorgraph_dvl.io.trial_folder",
-    "simulate": "factorgraph_dvl.simulation",
-    "solve": "factorgraph_dvl.solvers.batch",
+    "Calibration": "solution",
+    "ConfigError": "errors",
+    "DataError": "errors",
+    "Dvl": "sensors.dvl",
+    "DvlSettings": "sensors.dvl",
+    "Estimate": "solution",
+    "FactorgraphDvlError": "errors",
+    "Gnss": "sensors.gnss",
+    "GnssSettings": "sensors.gnss",
+    "Imu": "sensors.imu",
+    "ImuSettings": "sensors.imu",
+    "LocalFrame": "geometry.earth",
+    "OutputError": "errors",
+    "Problem": "graph.problem",
+    "Replay": "replay.session",
+    "Solution": "solution",
+    "SolveError": "errors",
+    "Trajectory": "solution",
+    "Trial": "trial",
+    "Verdict": "sensors.finding",
+    "crosscheck": "analysis.comparison.crosscheck",
+    "dead_reckon": "analysis.dead_reckoning.integration",
+    "kalman": "baselines.calibration",
+    "load_calibration": "io.calibration_file",
+    "load_solution": "io.solution_folder",
+    "load_trial": "io.trial_folder",
+    "measured_nodes": "graph.sensor_factor",
+    "observability": "analysis.information.observability",
+    "predict": "planning.prediction",
+    "preintegrate": "imu.preintegration",
+    "save_solution": "io.solution_folder",
+    "save_trial": "io.trial_folder",
+    "sensor_factor": "graph.sensor_factor",
+    "simulate": "simulation",
+    "solve": "solvers.batch",
+    "solved_problems": "solvers.batch",
+    "survey": "quality.survey",
+    "trial_from_tables": "io.trial_tables",
 }
 
 __all__ = [
+    "Calibration",
+    "ConfigError",
+    "DataError",
+    "Dvl",
+    "DvlSettings",
+    "Estimate",
+    "FactorgraphDvlError",
+    "Gnss",
+    "GnssSettings",
+    "Imu",
+    "ImuSettings",
+    "LocalFrame",
+    "OutputError",
+    "Problem",
     "Replay",
     "Solution",
+    "SolveError",
+    "Trajectory",
     "Trial",
+    "Verdict",
+    "crosscheck",
+    "dead_reckon",
+    "kalman",
+    "load_calibration",
     "load_solution",
     "load_trial",
+    "measured_nodes",
+    "observability",
+    "predict",
+    "preintegrate",
     "save_solution",
     "save_trial",
+    "sensor_factor",
     "simulate",
     "solve",
+    "solved_problems",
+    "survey",
+    "trial_from_tables",
 ]
 
 
 def __getattr__(name: str) -> Any:
+    from importlib import import_module
+
     # GTSAM and SciPy take most of a second to load: only where they are used.
     if name == "__version__":
         from importlib.metadata import version
 
         return version("factorgraph-dvl")
     if name in _PUBLIC:
-        return getattr(import_module(_PUBLIC[name]), name)
+        return getattr(import_module(f"{__name__}.{_PUBLIC[name]}"), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return [*__all__, "__all__", "__doc__", "__file__", "__name__", "__path__", "__version__"]

@@ -108,6 +108,17 @@ class ImuErrors:
         jacobian = np.concatenate([whole[:, :, :-1], columns], axis=2)
         return LinearImuFactors(native, jacobian, rhs - change, more_cost)
 
+    def sensitivity(self, bound: Attachment) -> Sensitivity:
+        """Return how what is integrated up to measurements moves with the errors."""
+        return self._by[id(bound)]
+
+    def factors(self, graph: gtsam.NonlinearFactorGraph) -> list[gtsam.CustomFactor]:
+        """Return the IMU factors, which a graph begins with, as they depend on the errors."""
+        return [
+            _with_errors(graph.at(k), end, self._keys, self._sizes)
+            for k, end in enumerate(self._ends)
+        ]
+
     def filled(self, linear: LinearImuFactors) -> gtsam.GaussianFactorGraph:
         """Return the native part of the Gaussian graph; written in place at the next call."""
         count = len(linear.jacobian)
@@ -125,3 +136,26 @@ class ImuErrors:
         for k in range(count, linear.native.size()):
             out.push_back(linear.native.at(k))
         return out
+
+
+def _with_errors(
+    native: gtsam.NonlinearFactor, ends: Array, error_keys: Sequence[int], sizes: Sequence[int]
+) -> gtsam.CustomFactor:
+    """Return an IMU factor whose predicted state moves by `ends` (9, n) times the errors.
+
+    Zero error where the state at the end is the predicted one less that.
+    """
+    edges = np.cumsum([0, STATE_SIZE, STATE_SIZE, BIAS_SIZE, *sizes])
+
+    def error(this: gtsam.CustomFactor, at: gtsam.Values, jacobians: list[Array] | None) -> Array:
+        whole = native.linearize(at).augmentedJacobian()
+        columns = -whole[:, STATE_SIZE : 2 * STATE_SIZE] @ ends
+        errors = np.concatenate([at.atVector(key) for key in error_keys])
+        if jacobians is not None:
+            every = np.concatenate([whole[:, :-1], columns], axis=1)
+            for i in range(edges.size - 1):
+                jacobians[i] = np.asfortranarray(every[:, edges[i] : edges[i + 1]])
+        return np.asarray(columns @ errors - whole[:, -1])
+
+    unit = gtsam.noiseModel.Unit.Create(STATE_SIZE)
+    return gtsam.CustomFactor(unit, [*native.keys(), *error_keys], error)

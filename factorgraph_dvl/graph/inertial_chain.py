@@ -19,7 +19,7 @@ from factorgraph_dvl.geometry.rotations import (
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph import keys
-from factorgraph_dvl.imu.preintegration import Segments, preintegrate
+from factorgraph_dvl.imu.preintegration import Segments, gtsam_measurements
 from factorgraph_dvl.imu.propagation import States
 from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.trial import Trial
@@ -89,7 +89,7 @@ def inertial_chain(trial: Trial, frame: LocalFrame, seg: Segments, start: States
     graph = gtsam.NonlinearFactorGraph()
     first, mean = (trial.inertial.parameters(t) for t in (0.0, float(seg.duration.sum())))
     chain = Chain(frame, seg, gravity_n, mean, first, settings.bias_walks, graph)
-    pims = preintegrate(seg, settings, gravity_n, frame.earth_rate)
+    pims = gtsam_measurements(seg, settings, gravity_n, frame.earth_rate)
     for k, pim in zip(seg.origin.tolist(), pims, strict=True):
         graph.add(gtsam.GalileanImuFactor2(keys.node(k), keys.node(k + 1), chain.bias_key(k), pim))
     if chain.walking:

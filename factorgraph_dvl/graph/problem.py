@@ -218,6 +218,7 @@ class Problem:
             self.graph.add(
                 joint_linear_prior(constants_prior, chain.bias_key(0), self.parameters, self._key)
             )
+        self._weighed_at: gtsam.Values | None = None
         self.uncovered: dict[str, int] = {}
         self.rejected: Mapping[str, Array] = {}
         self.noise_factors: Mapping[str, Array] = {}
@@ -250,6 +251,11 @@ class Problem:
     def attachments(self) -> tuple[Attachment, ...]:
         """Where the observations hang on the chain."""
         return tuple(b.attachment for b in self._bound)
+
+    @property
+    def imu_errors(self) -> ImuErrors | None:
+        """Errors of the IMU that are estimated, None if there are none."""
+        return self._imu_errors
 
     @property
     def weights(self) -> tuple[Array, ...]:
@@ -383,6 +389,7 @@ class Problem:
 
     def weigh(self, evaluation: Evaluation) -> None:
         """Set the weights of all measurements from their standard deviations there."""
+        self._weighed_at = evaluation.values
         for bound, weight in zip(self._bound, self._weights(evaluation), strict=True):
             bound.weight = weight
 
@@ -465,6 +472,32 @@ class Problem:
                 every = [[keys.node(k), self.chain.bias_key(k), *shared] for k in nodes]
                 o = bound.observation
                 yield Rows(o.label, o.components, np.array(every), sizes, matrix, vector)
+
+    def nonlinear_graph(self) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
+        """Return the whole problem for GTSAM's own optimisers, and values to start from.
+
+        The graph has clocks, errors of the IMU, priors, gravity per segment, weights and outliers
+        as they are in the problem now; the values are those at which measurements were weighed
+        last. GTSAM copies all values at each measurement factor: use short trials, up to some
+        hundred states.
+
+        Returns
+        -------
+        graph : gtsam.NonlinearFactorGraph
+            Its minimum is that of the problem.
+        values : gtsam.Values
+            States `x`, biases `b`, and parameters, at `key`.
+
+        Raises
+        ------
+        ValueError
+            If measurements have not been weighed yet.
+        """
+        from factorgraph_dvl.graph.native_graph import native_graph
+
+        if self._weighed_at is None:
+            raise ValueError("the measurements have no weights yet: call `weigh` first")
+        return native_graph(self), gtsam.Values(self._weighed_at)
 
     def native(self, evaluation: Evaluation) -> gtsam.GaussianFactorGraph:
         """Return GTSAM's own factors, linear at an evaluation, with columns of IMU errors."""

@@ -6,9 +6,9 @@ one for a measurement.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
-from typing import cast
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Any, TypeVar, cast
 
 import gtsam
 import numpy as np
@@ -16,10 +16,121 @@ import numpy as np
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph.clocks import linearized, parameters_of, true_time
 from factorgraph_dvl.graph.keys import BIAS_SIZE, STATE_SIZE
+from factorgraph_dvl.graph.priors import prior_mean, value_at
 from factorgraph_dvl.graph.problem import node_jacobian
-from factorgraph_dvl.imu.propagation import Attachment, States, Transition, extrapolated, motion_at
+from factorgraph_dvl.imu.increments import IntArray
+from factorgraph_dvl.imu.preintegration import Preintegration
+from factorgraph_dvl.imu.propagation import (
+    Attachment,
+    States,
+    Transition,
+    attach_inside,
+    extrapolated,
+    motion_at,
+)
+from factorgraph_dvl.imu.sensitivity import Sensitivity, by_errors, corrected
+from factorgraph_dvl.sensors.imu import ERRORS
 from factorgraph_dvl.sensors.parameters import Parameter
-from factorgraph_dvl.sensors.protocol import Motion, Observation
+from factorgraph_dvl.sensors.protocol import Linearization, Motion, Observation, SensorClock
+
+_Arrays = TypeVar("_Arrays", Attachment, Motion, Sensitivity)
+
+
+@dataclass(frozen=True)
+class ObservationRows:
+    """Some measurements of an observation, as an observation.
+
+    Parameters
+    ----------
+    whole : Observation
+        M measurements.
+    index : ndarray of int, shape (K,)
+        Which of them.
+    """
+
+    whole: Observation
+    index: IntArray
+
+    @property
+    def label(self) -> str:
+        """Name of the measurement, for people."""
+        return self.whole.label
+
+    @property
+    def unit(self) -> str:
+        """Unit of the residual."""
+        return self.whole.unit
+
+    @property
+    def components(self) -> tuple[str, ...]:
+        """Names of the d components."""
+        return self.whole.components
+
+    @property
+    def time(self) -> Array:
+        """Times as in the record, (K,), s."""
+        return self.whole.time[self.index]
+
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        """Names of the calibration parameters that it depends on."""
+        return self.whole.parameters
+
+    @property
+    def gate(self) -> float | None:
+        """Standard deviations from which on a measurement is an echo."""
+        return self.whole.gate
+
+    @property
+    def noise_groups(self) -> tuple[tuple[int, ...], ...]:
+        """Components that share a factor on their stated standard deviation."""
+        return self.whole.noise_groups
+
+    @property
+    def independent(self) -> bool:
+        """Whether components are measured apart."""
+        return self.whole.independent
+
+    @property
+    def clock(self) -> SensorClock | None:
+        """Clock of the sensor."""
+        return self.whole.clock
+
+    def sigma(
+        self, motion: Motion, values: Mapping[str, Array], factor: Array | float = 1.0
+    ) -> Array:
+        """Return the standard deviations, (K, d)."""
+        whole = self.whole.sigma(self._embedded(motion), values, factor)
+        return np.asarray(whole[self.index])
+
+    def residual(self, motion: Motion, values: Mapping[str, Array]) -> Array:
+        """Return predicted - measured, (K, d)."""
+        return self.whole.residual(self._embedded(motion), values)[self.index]
+
+    def linearize(
+        self, motion: Motion, values: Mapping[str, Array], wanted: Collection[str]
+    ) -> Linearization:
+        """Return the residual and its Jacobians."""
+        whole = self.whole.linearize(self._embedded(motion), values, wanted)
+
+        def own(jacobian: Any) -> Any:
+            if jacobian is None:
+                return None
+            return np.broadcast_to(jacobian, (self.whole.time.size, *jacobian.shape[1:]))[
+                self.index
+            ]
+
+        by_motion = {
+            name: own(getattr(whole, name)) for name in ("d_theta", "d_p", "d_v", "d_omega")
+        }
+        by_parameters = {name: own(found) for name, found in whole.d_parameters.items()}
+        return Linearization(own(whole.residual), **by_motion, d_parameters=by_parameters)
+
+    def _embedded(self, motion: Motion) -> Motion:
+        """Return a motion at all M times: what the others see does not matter."""
+        source = np.zeros(self.whole.time.size, dtype=int)
+        source[self.index] = np.arange(self.index.size)
+        return sliced(motion, source)
 
 
 @dataclass(frozen=True)
@@ -61,6 +172,8 @@ class NodeMeasurements:
         Earth rate in n.
     clock_zero : float, optional
         When the offsets of clocks hold, s.
+    sensitivity : Sensitivity, optional
+        Of the attachment to the errors of the IMU among the parameters.
     """
 
     attachment: Attachment
@@ -70,18 +183,25 @@ class NodeMeasurements:
     gravity_n: Array
     earth_rate_n: Array
     clock_zero: float = 0.0
+    sensitivity: Sensitivity | None = None
+
+    def corrected(self, values: Mapping[str, Array]) -> Attachment:
+        """Return the attachment without the errors of the IMU."""
+        if self.sensitivity is None:
+            return self.attachment
+        errors = np.concatenate([values[p.name] for p in self.parameters if p.name in ERRORS])
+        return corrected(self.attachment, self.sensitivity, errors)
 
     def attachment_of(self, rows: Rows) -> Attachment:
         """Return the attachment of measurements of one kind."""
-        a = self.attachment
-        return Attachment(**{f.name: getattr(a, f.name)[rows.at] for f in fields(a)})
+        return sliced(self.attachment, rows.at)
 
     def motions(self, states: States, values: Mapping[str, Array]) -> tuple[Motion, list[Motion]]:
         """Return the motion at all times as attached, and at the true times of each kind."""
-        motion = motion_at(self.attachment, states, self.gravity_n, self.earth_rate_n)
+        motion = motion_at(self.corrected(values), states, self.gravity_n, self.earth_rate_n)
         out = []
         for r in self.rows:
-            part = _part(motion, r.at) if len(self.rows) > 1 else motion
+            part = sliced(motion, r.at) if len(self.rows) > 1 else motion
             late = true_time(r.observation, values, self.clock_zero) - r.time
             out.append(extrapolated(part, late))
         return motion, out
@@ -96,7 +216,7 @@ class NodeMeasurements:
         """
         values = {**self.fixed, **values}
         motion, motions = self.motions(states, values)
-        transition = Transition(self.attachment, states, motion, self.earth_rate_n)
+        transition = Transition(self.corrected(values), states, motion, self.earth_rate_n)
         width = STATE_SIZE + BIAS_SIZE + sum(p.mean.size for p in self.parameters)
         residuals, jacobians = [], []
         for r, own in zip(self.rows, motions, strict=True):
@@ -105,17 +225,28 @@ class NodeMeasurements:
             lin = linearized(r.observation, own, values, wanted, self.clock_zero)
             m, d = lin.residual.shape
             matrix = np.zeros((m, d, width))
-            matrix[:, :, : STATE_SIZE + BIAS_SIZE] = node_jacobian(
-                lin, cast(Transition, _Window(transition, r.at))
-            )
+            window = cast(Transition, _Window(transition, r.at))
+            matrix[:, :, : STATE_SIZE + BIAS_SIZE] = node_jacobian(lin, window)
+            found = {**lin.d_parameters, **self._by_errors(lin, window, r.at)}
             column = STATE_SIZE + BIAS_SIZE
             for p in self.parameters:
-                if p.name in wanted:
-                    matrix[:, :, column : column + p.mean.size] = lin.d_parameters[p.name]
+                if p.name in found:
+                    matrix[:, :, column : column + p.mean.size] = found[p.name]
                 column += p.mean.size
             residuals.append(lin.residual.ravel())
             jacobians.append(matrix.reshape(m * d, width))
         return np.concatenate(residuals), np.concatenate(jacobians), motions
+
+    def _by_errors(
+        self, lin: Linearization, transition: Transition, at: slice
+    ) -> dict[str, Array]:
+        """Return derivatives with respect to the errors of the IMU, (M, d, n_i) by name."""
+        if self.sensitivity is None:
+            return {}
+        errors = [p for p in self.parameters if p.name in ERRORS]
+        every = by_errors(lin, transition, sliced(self.sensitivity, at))
+        parts = np.split(every, np.cumsum([p.mean.size for p in errors])[:-1], axis=2)
+        return {p.name: part for p, part in zip(errors, parts, strict=True)}
 
     def residuals(self, states: States, values: Mapping[str, Array]) -> Array:
         """Return the residuals, (R,)."""
@@ -169,11 +300,12 @@ class Linearized:
 
 
 class _Window:
-    """A slice of a transition: what `node_jacobian` asks for, of some times only."""
+    """A slice of a transition: what Jacobians ask for, of some times only."""
 
     def __init__(self, transition: Transition, at: slice) -> None:
         self._transition = transition
         self._at = at
+        self.at = sliced(transition.at, at)
 
     def __getattr__(self, name: str) -> Array:
         return np.asarray(getattr(self._transition, name)[self._at])
@@ -246,5 +378,148 @@ def state_of(state: gtsam.NavState, bias: gtsam.imuBias.ConstantBias) -> States:
     )
 
 
-def _part(motion: Motion, at: slice) -> Motion:
-    return Motion(**{f.name: getattr(motion, f.name)[at] for f in fields(motion)})
+def sliced(rows: _Arrays, at: slice | IntArray) -> _Arrays:
+    """Return some rows of a data class whose every field is an array of them."""
+    return type(rows)(**{f.name: getattr(rows, f.name)[at] for f in fields(rows)})
+
+
+def concatenated(parts: Sequence[_Arrays]) -> _Arrays:
+    """Return the rows of several such data classes as one."""
+    first = parts[0]
+    return type(first)(
+        **{f.name: np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(first)}
+    )
+
+
+def sensor_factor(
+    observation: Observation,
+    parameters: Sequence[Parameter],
+    chain: Preintegration,
+    k: int,
+    keys: Mapping[str, int],
+    values: gtsam.Values,
+    *,
+    clock_zero: float = 0.0,
+) -> gtsam.CustomFactor:
+    """Return a factor of what a sensor measured between node k and the next.
+
+    Its variables are the `NavState` at node k, the `ConstantBias` of the IMU, and those
+    calibration parameters that have a key: a `Rot3` for a rotation, else a vector, SI. It works
+    in any graph, and GTSAM's own optimisers and `Marginals` take it. The other parameters are
+    fixed at their prior means.
+
+    Parameters
+    ----------
+    observation : Observation
+        Measurements of a sensor, as its `observations` returns them, at any times.
+    parameters : sequence of Parameter
+        Parameters of the sensor, as its `parameters` returns them.
+    chain : Preintegration
+        What the IMU saw between the nodes.
+    k : int
+        Node.
+    keys : mapping of str to int
+        Keys of the state, `state`, of the bias, `bias`, and of parameters by name.
+    values : gtsam.Values
+        Approximate values of these variables. Standard deviations are taken there.
+    clock_zero : float, optional
+        Time at which the offsets of clocks hold, s.
+
+    Raises
+    ------
+    ValueError
+        If nothing was measured there; see `measured_nodes`.
+    KeyError
+        If a parameter that has a key is none of the sensor's.
+
+    Examples
+    --------
+    A DVL 2 m ahead of an IMU that turns at 0.1 rad/s about the vertical, in axes right, forward,
+    up, moves at 0.2 m/s to the left:
+
+    >>> import gtsam, numpy as np
+    >>> import factorgraph_dvl as fd
+    >>> from gtsam.symbol_shorthand import B, L, X
+    >>> frame = fd.LocalFrame(np.radians(36.0), np.radians(121.0), 0.0)
+    >>> time = np.arange(1, 201) / 100.0
+    >>> gyro = np.tile([0.0, 0.0, 0.1], (200, 1))
+    >>> force = np.tile([0.0, 0.0, 9.8], (200, 1))
+    >>> imu = fd.Imu(fd.ImuSettings(grade="tactical"), time, gyro, force)
+    >>> chain = fd.preintegrate(imu, [0.0, 1.0, 2.0], frame)
+    >>> dvl = fd.Dvl(fd.DvlSettings(), np.array([0.0]), np.zeros((1, 3)), np.full((1, 3), 0.1))
+    >>> (velocity,) = dvl.observations(frame, "RFU")
+    >>> values = gtsam.Values()
+    >>> values.insert(X(0), gtsam.NavState())
+    >>> values.insert(B(0), gtsam.imuBias.ConstantBias())
+    >>> values.insert(L(0), np.array([0.0, 2.0, 0.0]))
+    >>> keys = {"state": X(0), "bias": B(0), "lever_arm_m": L(0)}
+    >>> factor = fd.sensor_factor(velocity, dvl.parameters(), chain, 0, keys, values)
+    >>> (0.1 * factor.unwhitenedError(values)).round(3)
+    array([-0.2,  0. ,  0. ])
+    """
+    unknown = set(keys) - {"state", "bias", *(p.name for p in parameters)}
+    if unknown:
+        raise KeyError(f"{', '.join(sorted(unknown))}: no parameter of the sensor")
+    fixed = {p.name: prior_mean(p) for p in parameters}
+    free = tuple(p for p in parameters if p.name in keys)
+    given = {**fixed, **{p.name: value_at(values, keys[p.name], p) for p in free}}
+    node, attachment = attached_rows(observation, chain, given, clock_zero)
+    (index,) = np.nonzero(node == k)
+    if not index.size:
+        raise ValueError(f"{observation.label} has no measurement between node {k} and the next")
+    own = ObservationRows(observation, index)
+    measured = NodeMeasurements(
+        attachment=at_first_node(sliced(attachment, index)),
+        rows=(Rows(own, slice(0, index.size), true_time(own, given, clock_zero)),),
+        parameters=free,
+        fixed=fixed,
+        gravity_n=chain.gravity_n[k : k + 1],
+        earth_rate_n=chain.frame.earth_rate,
+        clock_zero=clock_zero,
+    )
+    states = state_of(values.atNavState(keys["state"]), values.atConstantBias(keys["bias"]))
+    _, motions = measured.motions(states, given)
+    weight = 1.0 / measured.sigma(motions, given)
+    shared = [keys[p.name] for p in free]
+    return measurement_factor(measured, weight, keys["state"], keys["bias"], shared)
+
+
+def measured_nodes(
+    observation: Observation,
+    parameters: Sequence[Parameter],
+    chain: Preintegration,
+    *,
+    clock_zero: float = 0.0,
+) -> list[int]:
+    """Return the nodes after which a sensor measured something, for `sensor_factor`.
+
+    Parameters
+    ----------
+    observation : Observation
+        Measurements of a sensor.
+    parameters : sequence of Parameter
+        Its parameters.
+    chain : Preintegration
+        What the IMU saw between the nodes.
+    clock_zero : float, optional
+        Time at which the offsets of clocks hold, s.
+    """
+    fixed = {p.name: prior_mean(p) for p in parameters}
+    node, _ = attached_rows(observation, chain, fixed, clock_zero)
+    return [int(k) for k in np.unique(node) if k >= 0]
+
+
+def attached_rows(
+    observation: Observation, chain: Preintegration, values: Mapping[str, Array], clock_zero: float
+) -> tuple[IntArray, Attachment]:
+    """Return the nodes before measurements (M,), -1 outside the chain, and their attachment."""
+    time = true_time(observation, values, clock_zero)
+    attachment, _ = attach_inside(chain.segments, time, chain.frame.earth_rate)
+    inside = (time >= chain.time[0]) & (time <= chain.time[-1])
+    return np.where(inside, attachment.node, -1), attachment
+
+
+def at_first_node(attachment: Attachment) -> Attachment:
+    """Return the attachment of measurements after one node as if it were the first."""
+    first = np.zeros(attachment.node.size, dtype=int)
+    return replace(attachment, node=first, segment=first)

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import gtsam
 import numpy as np
+from numpy.typing import ArrayLike
 
+from factorgraph_dvl.errors import DataError
+from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.rotations import exp_so3
 from factorgraph_dvl.geometry.vectors import Array, IntArray, cross, rotate, skew
-from factorgraph_dvl.imu.increments import Increments
-from factorgraph_dvl.sensors.imu import ImuSettings
+from factorgraph_dvl.imu.increments import Increments, increments
+from factorgraph_dvl.sensors.imu import Imu, ImuSettings
 
 # Velocity noise that GTSAM adds to the position; only to keep its covariance regular.
 _INTEGRATION_ROOT_PSD = 1e-7
@@ -86,8 +90,7 @@ def segments(inc: Increments, interval: float, epochs: Array | None = None) -> S
         Times, s, of which each has a node at most a sample before it; the segments between them
         are no longer than `interval`. None: no such times.
     """
-    first, last, origin, arc_nodes, node_time = [], [], [], [], []
-    n_nodes = 0
+    cuts = []
     for a, b in inc.arcs:
         length = inc.start[b - 1] + inc.dt[b - 1] - inc.start[a]
         if epochs is None:
@@ -99,13 +102,21 @@ def segments(inc: Increments, interval: float, epochs: Array | None = None) -> S
             wanted = index[covered & (index >= a) & (index < b)]
             edges = np.append(inc.start[a:b], inc.end[b - 1])
             inner = a + _filled(np.unique(np.append(wanted - a, [0, b - a])), edges, interval)
-        cuts = np.unique(np.concatenate([[a], inner, [b]]))
-        first.append(cuts[:-1])
-        last.append(cuts[1:])
-        origin.append(n_nodes + np.arange(cuts.size - 1))
-        node_time.append(np.append(inc.start[cuts[:-1]], inc.start[b - 1] + inc.dt[b - 1]))
-        arc_nodes.append((n_nodes, n_nodes + cuts.size - 1))
-        n_nodes += cuts.size
+        cuts.append(np.unique(np.concatenate([[a], inner, [b]])))
+    return _integrated(inc, cuts)
+
+
+def _integrated(inc: Increments, cuts: Sequence[IntArray]) -> Segments:
+    """Return segments between cuts, which are indices of intervals, of each arc."""
+    first, last, origin, arc_nodes, node_time = [], [], [], [], []
+    n_nodes = 0
+    for inner in cuts:
+        first.append(inner[:-1])
+        last.append(inner[1:])
+        origin.append(n_nodes + np.arange(inner.size - 1))
+        node_time.append(np.append(inc.start[inner[:-1]], inc.end[inner[-1] - 1]))
+        arc_nodes.append((n_nodes, n_nodes + inner.size - 1))
+        n_nodes += inner.size
     i0, i1 = np.concatenate(first), np.concatenate(last)
     n = inc.start.size
     phi, dv = inc.over(np.arange(n))
@@ -139,6 +150,109 @@ def segments(inc: Increments, interval: float, epochs: Array | None = None) -> S
         dV=dV,
         dP=dP,
         dA=dA,
+    )
+
+
+@dataclass(frozen=True)
+class Preintegration:
+    """Samples of an IMU, integrated between nodes, for a graph of one's own.
+
+    Parameters
+    ----------
+    frame : LocalFrame
+        Tangent frame n of the states.
+    segments : Segments
+        Increments between the K nodes.
+    gravity_n : ndarray, shape (K - 1, 3)
+        `LocalFrame.gravity_without_rotation` along the segments, m/s².
+    measurements : list of gtsam.PreintegratedImuMeasurementsG
+        One for each segment, for a `gtsam.GalileanImuFactor2` between two `NavState` and a
+        `ConstantBias`.
+    """
+
+    frame: LocalFrame
+    segments: Segments
+    gravity_n: Array
+    measurements: list[gtsam.PreintegratedImuMeasurementsG]
+
+    @property
+    def time(self) -> Array:
+        """Times of the nodes, (K,), s."""
+        return self.segments.node_time
+
+
+def preintegrate(
+    imu: Imu, times: ArrayLike, frame: LocalFrame, p_n: ArrayLike | None = None
+) -> Preintegration:
+    """Integrate the samples of an IMU between nodes, free of coning, sculling and Earth rate.
+
+    Parameters
+    ----------
+    imu : Imu
+        Record and noise of the IMU.
+    times : array_like, shape (K,), s
+        Increasing times of the nodes. Each node lies on the nearest edge between two samples;
+        `Preintegration.time` has these edges.
+    frame : LocalFrame
+        Tangent frame n of the states.
+    p_n : array_like, shape (K, 3), optional
+        Positions of the nodes in n to some 10 m, m; by default all at the origin. Gravity turns
+        by 16 µg in 100 m.
+
+    Raises
+    ------
+    DataError
+        If the IMU does not cover the times, or has a gap between them.
+
+    Examples
+    --------
+    An IMU at rest for two seconds, level and in axes forward, right, down:
+
+    >>> import numpy as np
+    >>> from factorgraph_dvl import Imu, ImuSettings, LocalFrame, preintegrate
+    >>> frame = LocalFrame(np.radians(36.0), np.radians(121.0), 0.0)
+    >>> time = np.arange(1, 201) / 100.0
+    >>> force = np.tile([0.0, 0.0, -9.8], (200, 1))
+    >>> imu = Imu(ImuSettings(grade="tactical"), time, np.zeros((200, 3)), force)
+    >>> chain = preintegrate(imu, [0.0, 1.0, 2.0], frame)
+    >>> chain.time
+    array([0., 1., 2.])
+    >>> [round(pim.deltaTij(), 9) for pim in chain.measurements]
+    [1.0, 1.0]
+    """
+    inc, _ = increments(imu)
+    wanted = np.asarray(times, dtype=float)
+    edges = np.append(inc.start, inc.end[-1])
+    if wanted.ndim != 1 or wanted.size < 2 or not np.all(np.diff(wanted) > 0.0):
+        raise DataError(
+            "the times of the nodes do not increase", where="times", expected="two or more"
+        )
+    reach = float(np.median(inc.dt))
+    if wanted[0] < edges[0] - reach or wanted[-1] > edges[-1] + reach:
+        raise DataError(
+            f"nodes from {wanted[0]:g} to {wanted[-1]:g} s, the IMU from {edges[0]:g} to "
+            f"{edges[-1]:g} s",
+            where="times",
+            expected="times that the IMU covers",
+        )
+    cuts = np.unique(_nearest(edges, wanted))
+    if cuts.size != wanted.size:
+        raise DataError(
+            "two nodes lie between the same samples of the IMU",
+            where="times",
+            expected=f"nodes at least {reach:g} s apart",
+        )
+    if inc.arc_of[cuts[0]] != inc.arc_of[cuts[-1] - 1]:
+        raise DataError(
+            "the IMU has a gap between the first node and the last",
+            where="times",
+            expected="an IMU without gaps: preintegrate what is before and after it",
+        )
+    seg = _integrated(inc, [cuts])
+    places = np.zeros((cuts.size, 3)) if p_n is None else np.asarray(p_n, dtype=float)
+    gravity_n = frame.gravity_without_rotation(0.5 * (places[:-1] + places[1:]))
+    return Preintegration(
+        frame, seg, gravity_n, gtsam_measurements(seg, imu.settings, gravity_n, frame.earth_rate)
     )
 
 
@@ -195,7 +309,7 @@ def _nearest(grid: Array, targets: Array) -> IntArray:
     return np.where(targets - grid[right - 1] < grid[right] - targets, right - 1, right)
 
 
-def preintegrate(
+def gtsam_measurements(
     seg: Segments, settings: ImuSettings, gravity_n: Array, earth_rate_n: Array
 ) -> list[gtsam.PreintegratedImuMeasurementsG]:
     """Return GTSAM's preintegrated measurements of all segments.

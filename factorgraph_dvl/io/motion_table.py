@@ -42,8 +42,20 @@ def read_reference(path: Path, source: str = "") -> Reference:
     DataError
         If a column is missing, or a value is not a number or out of range.
     """
-    columns = read_motion(path, source)
-    check_finite(columns, source or path.name)
+    return reference_from(read_motion(path, source), source or path.name)
+
+
+def reference_from(columns: Mapping[str, Array], source: str) -> Reference:
+    """Return the reference that columns hold, in the units of files.
+
+    Raises
+    ------
+    DataError
+        If a value is not a number or out of range, or times do not increase.
+    """
+    check_times(columns["time_s"], source)
+    check_possible(columns, source)
+    check_finite(columns, source)
     return Reference(*_motion(columns))
 
 

@@ -18,6 +18,8 @@ from factorgraph_dvl.geometry.vectors import Array
 
 _EMPTY = ("", "nan", "NaN", "NAN")
 _PARQUET = (".parquet", ".pq")
+# Tables in memory, by section of trial.yaml: mappings of columns, or DataFrames.
+Tables = Mapping[str, Any]
 # Columns that hold text, in whatever table.
 TEXT = ("beacon", "measurement", "unit", "sensor", "component", "reason")
 
@@ -76,6 +78,47 @@ def read_table(
         raise DataError(f"cannot be read ({reason})", where=source, expected=expected) from None
     absent = np.full(table.num_rows, np.nan)
     return {name: columns.get(name, absent) for group in (required, *optional) for name in group}
+
+
+def columns_of(
+    table: Any, required: Sequence[str], optional: Sequence[Sequence[str]] = (), *, source: str
+) -> dict[str, Any]:
+    """Return columns of a table in memory, as `read_table` does those of a file.
+
+    Parameters
+    ----------
+    table : mapping of str to array_like, or DataFrame
+        Whatever has columns by name.
+    required, optional : sequence of str, sequence of sequence of str
+        As of `read_table`.
+    source : str
+        Name of the table in messages.
+
+    Raises
+    ------
+    DataError
+        If a column is missing, holds no numbers, or differs in length from the others.
+    """
+    header = [str(name) for name in table]
+    names = _choose(header, required, optional, source)
+    out: dict[str, Any] = {}
+    for name in names:
+        kind = str if name in TEXT else float
+        try:
+            out[name] = np.array(table[name], dtype=kind)
+        except (TypeError, ValueError):
+            raise DataError(
+                f"column {name} holds no numbers", where=source, expected="numbers, nan if missing"
+            ) from None
+        size = out[names[0]].shape
+        if out[name].ndim != 1 or out[name].shape != size:
+            raise DataError(
+                f"column {name} has the shape {out[name].shape}",
+                where=source,
+                expected=f"{size[0] if size else 'N'} numbers, one for each row",
+            )
+    absent = np.full(out[names[0]].size, np.nan)
+    return {name: out.get(name, absent) for group in (required, *optional) for name in group}
 
 
 def count_rows(path: Path) -> int:

@@ -20,8 +20,9 @@ from factorgraph_dvl.io.calibration_file import (
 )
 from factorgraph_dvl.io.earlier_calibration import save_prior, with_earlier_calibrations
 from factorgraph_dvl.io.folders import SETTINGS_FILE, new_folder
-from factorgraph_dvl.io.motion_table import motion_columns, read_reference
-from factorgraph_dvl.io.tables import read_table, write_table
+from factorgraph_dvl.io.motion_table import COLUMNS as MOTION_COLUMNS
+from factorgraph_dvl.io.motion_table import motion_columns, read_reference, reference_from
+from factorgraph_dvl.io.tables import Tables, columns_of, read_table, write_table
 from factorgraph_dvl.io.trial_yaml import (
     InitialSettings,
     LimitSettings,
@@ -113,12 +114,34 @@ def load_trial(path: Path | str, *, anyway: bool = False) -> Trial:
             hint="`inspect`, `solve` and `kalman` take planar trials",
         )
     settings = parse_yaml(text, TrialSettings, source=file.name)
+    trial = assembled(settings, folder, folder, anyway=anyway)
+    name = printable(settings.name or folder.resolve().name)
+    truth = read_truth(folder / TRUTH_FILE)
+    return replace(trial, name=name, calibration_truth=truth)
+
+
+def assembled(
+    settings: TrialSettings, tables: Path | Tables, folder: Path, *, anyway: bool = False
+) -> Trial:
+    """Return the trial that settings describe, without its truth.
+
+    Parameters
+    ----------
+    settings : TrialSettings
+        As in trial.yaml.
+    tables : Path or mapping of str to mapping
+        Folder with the tables of the sensors, or the tables by section.
+    folder : Path
+        Where `dvl.calibration` is looked for.
+    anyway : bool, default False
+        As of `load_trial`.
+    """
     initial = settings.initial
     kinds = {aid.section: aid for aid in AIDS}
     notes: list[Finding] = []
-    imu = None if settings.imu is UNSET else read_record(folder, Imu, settings.imu, notes)
+    imu = None if settings.imu is UNSET else read_record(tables, Imu, settings.imu, notes)
     aids = {
-        name: read_record(folder, kinds[name], section, notes)
+        name: read_record(tables, kinds[name], section, notes)
         for name, section in settings.aids.items()
     }
     dvl = cast("Dvl | None", aids.pop(Dvl.section, None))
@@ -135,7 +158,7 @@ def load_trial(path: Path | str, *, anyway: bool = False) -> Trial:
             )
         )
     return Trial(
-        name=printable(settings.name or folder.resolve().name),
+        name=printable(settings.name),
         imu=imu,
         gnss=cast("Gnss | None", aids.pop(Gnss.section, None)),
         dvl=dvl,
@@ -146,8 +169,7 @@ def load_trial(path: Path | str, *, anyway: bool = False) -> Trial:
         initial_attitude=None if initial is UNSET else _attitude(initial),
         initial_position=None if initial is UNSET else position_of(initial),
         initial_velocity=None if initial is UNSET else _velocity(initial),
-        reference=reference_of(folder, settings),
-        calibration_truth=read_truth(folder / TRUTH_FILE),
+        reference=reference_of(tables, settings),
         notes=tuple(notes),
         limits={**DEFAULT_LIMITS, **({} if settings.limits is UNSET else settings.limits.stated)},
     )
@@ -327,22 +349,34 @@ def locate(path: Path) -> tuple[Path, Path]:
     return file.parent, file
 
 
-def reference_of(folder: Path, settings: TrialSettings | PlanarSettings) -> Reference | None:
+def reference_of(
+    tables: Path | Tables, settings: TrialSettings | PlanarSettings
+) -> Reference | None:
     """Return the reference that the settings of a trial name, None if they name none."""
     if settings.reference is UNSET:
         return None
-    return read_reference(folder / settings.reference.file, settings.reference.file)
+    file = settings.reference.file
+    if isinstance(tables, Path):
+        return read_reference(tables / file, file)
+    return reference_from(columns_of(tables["reference"], MOTION_COLUMNS, source=file), file)
 
 
 def read_record(
-    folder: Path, kind: type[_Sensor], settings: SensorSection, notes: list[Finding] | None = None
+    tables: Path | Tables,
+    kind: type[_Sensor],
+    settings: SensorSection,
+    notes: list[Finding] | None = None,
 ) -> _Sensor:
-    """Return the record of a sensor, from the table that its settings name.
+    """Return the record of a sensor, from the table that its settings name in a folder.
 
     Invalid values are missing in it; `notes` takes in how many there were.
     """
     required = (*kind.required, *settings.more_columns)
-    table = read_table(folder / settings.file, required, kind.optional, source=settings.file)
+    if isinstance(tables, Path):
+        file = tables / settings.file
+        table = read_table(file, required, kind.optional, source=settings.file)
+    else:
+        table = columns_of(tables[kind.section], required, kind.optional, source=settings.file)
     columns, found = without_invalid_values(kind.section, table, settings.file)
     if notes is not None:
         notes += found

@@ -15,7 +15,7 @@ from factorgraph_dvl.graph.inertial_chain import LEAST_WALK, loose_diagonal
 from factorgraph_dvl.graph.keys import BIAS_SIZE, STATE_SIZE
 from factorgraph_dvl.graph.priors import ConstantsPrior, local_coordinates, value_at
 from factorgraph_dvl.graph.sensor_factor import Linearized, measurement_factor, state_of
-from factorgraph_dvl.imu.preintegration import Segments, preintegrate
+from factorgraph_dvl.imu.preintegration import Segments, gtsam_measurements
 from factorgraph_dvl.imu.propagation import States
 from factorgraph_dvl.replay.calibration import CalibrationEstimate, calibration_of
 from factorgraph_dvl.replay.gate import InnovationGate
@@ -147,7 +147,7 @@ class Navigator:
         gravity = self._gravity.at(states.p_n + 0.5 * duration * states.v_n)
 
         factors, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-        pim = preintegrate(seg, self._imu.settings, gravity, self.start.frame.earth_rate)[0]
+        pim = gtsam_measurements(seg, self._imu.settings, gravity, self.start.frame.earth_rate)[0]
         factors.add(gtsam.GalileanImuFactor2(keys.node(k), keys.node(k + 1), s.bias_key(k), pim))
         predicted = pim.predict(state, bias)
         values.insert(keys.node(k + 1), predicted)

@@ -17,7 +17,7 @@ from factorgraph_dvl.geometry.units import DEG, HOUR
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph.problem import node_jacobian
 from factorgraph_dvl.imu.increments import increments
-from factorgraph_dvl.imu.preintegration import Segments, preintegrate, segments
+from factorgraph_dvl.imu.preintegration import Segments, gtsam_measurements, segments
 from factorgraph_dvl.imu.propagation import States, Transition, attach, motion_at, segment_ends
 from factorgraph_dvl.sensors.protocol import Linearization
 from factorgraph_dvl.simulation import plan_motion, simulate
@@ -54,7 +54,7 @@ class Case:
 
     def pims(self):
         settings = self.trial.imu.settings
-        return preintegrate(self.seg, settings, self.gravity_n, self.rate)
+        return gtsam_measurements(self.seg, settings, self.gravity_n, self.rate)
 
 
 def build(**changes):
@@ -309,7 +309,7 @@ def test_samples_left_open_widen_the_covariance():
     imu = replace(imu, time=imu.time[keep], gyro=imu.gyro[keep], accel=imu.accel[keep])
     inc, _ = increments(imu)
     seg = segments(inc, 1.0)
-    wide = preintegrate(seg, imu.settings, case.gravity_n, case.rate)
+    wide = gtsam_measurements(seg, imu.settings, case.gravity_n, case.rate)
     narrow = case.pims()
     for k in range(len(narrow)):
         ratio = np.sqrt(np.diag(wide[k].preintMeasCov()) / np.diag(narrow[k].preintMeasCov()))
