@@ -13,12 +13,11 @@ from typing import Any, TypeVar, cast
 import gtsam
 import numpy as np
 
-from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.geometry.vectors import Array, IntArray
 from factorgraph_dvl.graph.clocks import linearized, parameters_of, true_time
 from factorgraph_dvl.graph.keys import BIAS_SIZE, STATE_SIZE
 from factorgraph_dvl.graph.priors import prior_mean, value_at
 from factorgraph_dvl.graph.problem import node_jacobian
-from factorgraph_dvl.imu.increments import IntArray
 from factorgraph_dvl.imu.preintegration import Preintegration
 from factorgraph_dvl.imu.propagation import (
     Attachment,
@@ -32,6 +31,9 @@ from factorgraph_dvl.imu.sensitivity import Sensitivity, by_errors, corrected
 from factorgraph_dvl.sensors.imu import ERRORS
 from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.sensors.protocol import Linearization, Motion, Observation, SensorClock
+
+# What rounding may take off a time, s.
+_ROUNDING = 1e-6
 
 _Arrays = TypeVar("_Arrays", Attachment, Motion, Sensitivity)
 
@@ -515,7 +517,7 @@ def attached_rows(
     """Return the nodes before measurements (M,), -1 outside the chain, and their attachment."""
     time = true_time(observation, values, clock_zero)
     attachment, _ = attach_inside(chain.segments, time, chain.frame.earth_rate)
-    inside = (time >= chain.time[0]) & (time <= chain.time[-1])
+    inside = (time > chain.time[0] - _ROUNDING) & (time < chain.time[-1] + _ROUNDING)
     return np.where(inside, attachment.node, -1), attachment
 
 

@@ -10,6 +10,7 @@ import pytest
 from jacobians import differentiate
 from truth import exact_states, scenario
 
+from factorgraph_dvl.errors import DataError
 from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.rotations import exp_so3
 from factorgraph_dvl.graph import keys
@@ -17,10 +18,12 @@ from factorgraph_dvl.graph.sensor_factor import (
     Linearized,
     NodeMeasurements,
     Rows,
+    measured_nodes,
     measurement_factor,
+    sensor_factor,
 )
 from factorgraph_dvl.imu.increments import increments
-from factorgraph_dvl.imu.preintegration import one_segment
+from factorgraph_dvl.imu.preintegration import one_segment, preintegrate
 from factorgraph_dvl.imu.propagation import States, attach
 from factorgraph_dvl.sensors.dvl import Dvl, DvlSettings
 from factorgraph_dvl.sensors.records import rows_of
@@ -200,3 +203,94 @@ def test_a_factor_with_the_wrong_number_of_keys_is_refused():
     measured, _, _ = node_measurements(trial=FREE)
     with pytest.raises(ValueError, match="keys"):
         measurement_factor(measured, np.ones(5), keys.node(0), keys.bias(0), [])
+
+
+def public_factor(**changes):
+    """`sensor_factor` of a DVL in a noiseless turn, its values at the truth, and its chain."""
+    scene = scenario(trial=FREE, **changes)
+    trial = simulate(scene)
+    frame = trial.frame()
+    times = np.arange(18.0, 24.0)
+    chain = preintegrate(trial.imu, times, frame, exact_states(scene, frame, times).p_n)
+    states = exact_states(scene, frame, chain.time)
+    values, named = gtsam.Values(), {"state": keys.node(2), "bias": keys.bias(0)}
+    nav = gtsam.NavState(gtsam.Rot3(states.nRb[2]), states.p_n[2], states.v_n[2])
+    values.insert(named["state"], nav)
+    values.insert(named["bias"], gtsam.imuBias.ConstantBias())
+    for i, p in enumerate(trial.dvl.parameters()):
+        if not p.estimated:
+            continue
+        true = np.zeros(p.mean.size) + trial.calibration_truth.get(p.name, 0.0) * p.si
+        named[p.name] = keys.calibration(i, p.mean.size)
+        values.insert(named[p.name], gtsam.Rot3(exp_so3(true)) if p.rotation else true)
+    (velocity,) = trial.dvl.observations(frame, trial.body_axes)
+    return velocity, trial.dvl.parameters(), chain, named, values
+
+
+def test_a_factor_of_an_own_graph_has_no_error_at_the_truth():
+    velocity, parameters, chain, named, values = public_factor()
+    assert measured_nodes(velocity, parameters, chain) == [0, 1, 2, 3, 4]
+    factor = sensor_factor(velocity, parameters, chain, 2, named, values)
+    assert factor.dim() == 5 * 3
+    # In standard deviations, of 8 mm/s at 4 m/s.
+    assert np.abs(factor.unwhitenedError(values)).max() < 0.01
+    state = values.atNavState(named["state"])
+    turned = gtsam.NavState(state.attitude().inverse(), state.position(), state.velocity())
+    wrong = gtsam.Values(values)
+    wrong.update(named["state"], turned)
+    assert np.abs(factor.unwhitenedError(wrong)).max() > 100.0
+
+
+def test_the_jacobians_of_a_factor_hold_in_any_graph():
+    velocity, parameters, chain, named, values = public_factor()
+    rng = np.random.default_rng(5)
+    delta = gtsam.VectorValues()
+    for key, size in values.dims().items():
+        delta.insert(key, rng.normal(0.0, 1e-5 if key == named["bias"] else 1e-3, size))
+    values = values.retract(delta)
+    graph = gtsam.NonlinearFactorGraph()
+    graph.add(sensor_factor(velocity, parameters, chain, 2, named, values))
+    ordering = gtsam.Ordering()
+    for key in named.values():
+        ordering.push_back(key)
+    A, b = graph.linearize(values).jacobian(ordering)
+    factor = graph.at(0)
+    np.testing.assert_allclose(b, -factor.unwhitenedError(values), atol=1e-12)
+    sizes = values.dims()
+    edges = np.cumsum([0, *(sizes[key] for key in named.values())])
+
+    def change(h):
+        step = gtsam.VectorValues()
+        for i, key in enumerate(named.values()):
+            step.insert(key, h[edges[i] : edges[i + 1]])
+        return factor.unwhitenedError(values.retract(step))
+
+    numerical = differentiate(change, A.shape[1], 1e-5)
+    scale = np.maximum(np.abs(numerical).max(axis=0), 1.0)
+    assert np.abs((A - numerical) / scale).max() < 2e-4
+
+
+def test_a_factor_without_measurements_and_an_unknown_parameter_are_refused():
+    velocity, parameters, chain, named, values = public_factor(dvl={"rate_hz": 0.5})
+    assert len(measured_nodes(velocity, parameters, chain)) == 3
+    missing = next(k for k in range(5) if k not in measured_nodes(velocity, parameters, chain))
+    with pytest.raises(ValueError, match="no measurement"):
+        sensor_factor(velocity, parameters, chain, missing, named, values)
+    with pytest.raises(KeyError, match="arm"):
+        sensor_factor(velocity, parameters, chain, 2, named | {"arm": 1}, values)
+
+
+def test_nodes_that_the_imu_does_not_cover_are_refused():
+    trial = simulate(scenario())
+    frame = trial.frame()
+    gap = (trial.imu.time < 10.0) | (trial.imu.time > 12.0)
+    imu = rows_of(trial.imu, gap)
+    for record, times, text in (
+        (trial.imu, [0.0, 1000.0], "covers"),
+        (trial.imu, [3.0, 2.0], "increase"),
+        (trial.imu, [3.0, 3.001], "apart"),
+        (imu, [5.0, 9.0, 14.0], "gap"),
+    ):
+        with pytest.raises(DataError, match=text):
+            preintegrate(record, times, frame)
+    np.testing.assert_allclose(preintegrate(imu, [13.0, 14.004], frame).time, [13.0, 14.0])
