@@ -100,7 +100,14 @@ UNOBSERVABLE = {
 }
 
 
-@pytest.mark.parametrize("name", UNOBSERVABLE)
+# Much like another one of them.
+VARIANTS = ("straight in a swell", "two seconds adrift", "three scales", "no current")
+
+
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(n, marks=pytest.mark.slow if n in VARIANTS else ()) for n in UNOBSERVABLE],
+)
 def test_nothing_unobservable_stops_it(name: str, tmp_path: Path, run: Run) -> None:
     trial = UNOBSERVABLE[name]()
     out = tmp_path / "out"

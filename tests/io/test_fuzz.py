@@ -193,7 +193,7 @@ def test_sound_files_are_read(cases: list[Case]) -> None:
 
 
 def test_damaged_files_raise_nothing_else(cases: list[Case]) -> None:
-    done, bad = fuzz(cases, 400, 25.0)
+    done, bad = fuzz(cases, 150, 25.0)
     assert done >= len(cases)
     assert not bad, "\n".join(bad)
 

@@ -15,6 +15,7 @@ from factorgraph_dvl.analysis.error_statistics import calibration_errors, motion
 from factorgraph_dvl.cli import main
 from factorgraph_dvl.errors import ConfigError, DataError, SolveError
 from factorgraph_dvl.io.tables import read_table
+from factorgraph_dvl.quality.survey import Survey
 from factorgraph_dvl.replay import Replay, replay
 from factorgraph_dvl.report.terminal.live import live_view
 from factorgraph_dvl.sensors.finding import Code
@@ -59,6 +60,13 @@ def within(solution, trial, limit=4.0):
     for v in (motion.position, motion.velocity, motion.attitude):
         assert np.sqrt(np.mean(v.normalised**2)) < 2.0
         assert np.abs(v.normalised).max() < 6.0
+
+
+@pytest.fixture
+def unsurveyed(monkeypatch):
+    """Replay without what a survey of the whole record would find of it, which takes longer."""
+    nothing = Survey("trial", (), 0.0, 0.0, 0.0, 0.0, ())
+    monkeypatch.setattr("factorgraph_dvl.replay.playback.survey", lambda trial: nothing)
 
 
 def feed(session, trial, start, end, *, sections=("gnss", "dvl")):
@@ -212,7 +220,7 @@ def test_a_gap_of_the_imu_is_survived_and_a_silent_sensor_after_it(trial):
     assert np.all(np.isfinite(record.std))
 
 
-def test_a_clock_that_jumps_is_not_believed(trial):
+def test_a_clock_that_jumps_is_not_believed(trial, unsurveyed):
     time = np.where(trial.dvl.time > 60.0, trial.dvl.time + 1.37, trial.dvl.time)
     solution, record = replay(replace(trial, dvl=replace(trial.dvl, time=time)), rate_hz=1.0)
     assert ("DVL velocity", Code.CONTRADICTS) in {(f.sensor, f.code) for f in solution.findings}
@@ -241,7 +249,7 @@ def test_a_clock_of_a_sensor_that_jumps_back_is_not_believed(trial):
             assert np.all(np.abs(e.value - truth[e.name]) < 4.0 * e.std)
 
 
-def test_a_clock_of_the_imu_that_jumps_ahead_is_no_gap(trial, run):
+def test_a_clock_of_the_imu_that_jumps_ahead_is_no_gap(trial, run, unsurveyed):
     time = np.where(trial.imu.time > 62.0, trial.imu.time + 1.37, trial.imu.time)
     solution, record = replay(replace(trial, imu=replace(trial.imu, time=time)), rate_hz=1.0)
     (text,) = of_code(solution.findings, Code.CLOCK_JUMP)

@@ -516,7 +516,8 @@ def test_the_common_mounting_is_found_from_anywhere():
     np.testing.assert_allclose(solution.estimate("misalignment_deg").value, mounting, atol=0.3)
 
 
-def test_a_common_mounting_that_is_far_off_does_not_mislead_poor_gyros():
+@pytest.mark.parametrize("seed", [4, pytest.param(2, marks=pytest.mark.slow)])
+def test_a_common_mounting_that_is_far_off_does_not_mislead_poor_gyros(seed):
     imu = {"gyro_noise_deg_sqrt_h": 0.15, "accel_noise_ug_sqrt_hz": 60}
     imu |= {"gyro_bias_deg_h": "draw", "accel_bias_ug": "draw"}
     bias = {"gyro_bias_std_deg_h": 20, "accel_bias_std_ug": 2000}
@@ -541,12 +542,11 @@ def test_a_common_mounting_that_is_far_off_does_not_mislead_poor_gyros():
         "turntable": None,
         "trial": claims,
     }
-    for seed in (2, 4):
-        trial = simulate(noisy(manoeuvres=parts, **changes), seed)
-        solution = solve(trial, rate_hz=1.0)
-        assert solution.converged
-        nees, dof = nees_of(solution, trial.calibration_truth)
-        assert nees < chi2.ppf(0.999, dof)
+    trial = simulate(noisy(manoeuvres=parts, **changes), seed)
+    solution = solve(trial, rate_hz=1.0)
+    assert solution.converged
+    nees, dof = nees_of(solution, trial.calibration_truth)
+    assert nees < chi2.ppf(0.999, dof)
 
 
 def test_beams_beside_a_dvl_have_names_of_their_own():
