@@ -9,6 +9,8 @@ from gtsam.symbol_shorthand import B, X
 
 # Chosen: all letters but those of states and biases.
 _LETTERS = [c for c in string.ascii_letters + string.digits if c not in "bx"]
+# Letters of correlated errors. Chosen: what no other variable has.
+_PROCESSES = string.punctuation
 
 # Dimensions of a state, attitude, position and velocity, and of the biases of accelerometers and
 # gyros: those of GTSAM's NavState and ConstantBias.
@@ -29,6 +31,16 @@ def bias(k: int) -> int:
 def calibration(i: int, size: int) -> int:
     """Return the key of calibration parameter i, which has `size` components."""
     return int(symbol(letter(size), i))
+
+
+def process(i: int, j: int) -> int:
+    """Return the key of node j of correlated error i."""
+    return int(symbol(_PROCESSES[i], j))
+
+
+def is_process(key: int) -> bool:
+    """Whether a key is that of a correlated error."""
+    return letter_of(key) in _PROCESSES
 
 
 def letter_of(key: int) -> str:

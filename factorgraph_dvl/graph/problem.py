@@ -36,6 +36,7 @@ from factorgraph_dvl.graph.priors import (
     prior_root,
     value_at,
 )
+from factorgraph_dvl.graph.processes import Process, in_time_order
 from factorgraph_dvl.graph.template import jacobian_template
 from factorgraph_dvl.imu.propagation import (
     Attachment,
@@ -72,24 +73,29 @@ _SAME_WEIGHT = 0.2
 
 @dataclass(eq=False)
 class _Bound:
-    """An observation tied to the chain; `usable` measurements (M,) are covered by the IMU."""
+    """An observation tied to the chain; `usable` measurements (M,) are covered by the IMU.
+
+    `correlated` is the place of its correlated error among those of the problem, if it has one.
+    """
 
     observation: Observation
     attachment: Attachment
     time: Array
     usable: Array
     weight: Array
+    correlated: int | None = None
 
 
 @dataclass
 class _Block:
-    """Observations with the same parameters: one factor per node for all of them.
+    """Observations with the same variables: one factor per set of nodes for all of them.
 
     `matrices` and `vectors` are views into `factors` and live no longer than they do.
     """
 
     bound: list[_Bound]
     parameters: tuple[Parameter, ...]
+    correlated: int | None = None
     order: IntArray | None = None
     rows: list[slice] = field(default_factory=list)
     factors: list[gtsam.JacobianFactor] = field(default_factory=list)
@@ -177,12 +183,18 @@ class Problem:
         Joint prior of biases and parameters, in place of their own.
     clock_zero : float, optional
         When the offsets of clocks hold, s; by default in the middle of the chain.
+    processes : sequence of Process, optional
+        Correlated errors of the observations, at most one each.
 
     Attributes
     ----------
+    processes : tuple of Process
+        They may be replaced by others at the same nodes.
     noise_factors : mapping of str to ndarray
         By label, factors (d,) on the standard deviations that sensors state for their own noise;
         1 where there are none. `weigh` applies them.
+    long_run : mapping of str to ndarray
+        By label, factors (d,) for noise that persists for some measurements; likewise.
     robust_weights : mapping of str to ndarray
         By label, weights from 0 to 1 on the squares of residuals, (M, d) or (M, 1); likewise.
     """
@@ -195,8 +207,10 @@ class Problem:
         start: dict[str, Array] | None = None,
         constants_prior: ConstantsPrior | None = None,
         clock_zero: float | None = None,
+        processes: Sequence[Process] = (),
     ) -> None:
         self.chain = chain
+        self.processes = tuple(processes)
         # When the offsets of clocks hold, s.
         self.clock_zero = chain.middle if clock_zero is None else clock_zero
         self.all_parameters = tuple(parameters)
@@ -222,6 +236,7 @@ class Problem:
         self.uncovered: dict[str, int] = {}
         self.rejected: Mapping[str, Array] = {}
         self.noise_factors: Mapping[str, Array] = {}
+        self.long_run: Mapping[str, Array] = {}
         self.robust_weights: Mapping[str, Array] = {}
         self._start = {**self.prior_values(), **(start or {})}
         self._bound: list[_Bound] = []
@@ -232,12 +247,12 @@ class Problem:
         if errors:
             error_keys = [self._key[p.name] for p in errors]
             self._imu_errors = ImuErrors(chain, errors, error_keys, self.attachments)
-        blocks: dict[tuple[str, ...], _Block] = {}
+        blocks: dict[tuple[tuple[str, ...], int | None], _Block] = {}
         for bound in self._bound:
             own = (*parameters_of(bound.observation), *ERRORS)
             used = tuple(p for p in self.parameters if p.name in own)
-            names = tuple(p.name for p in used)
-            blocks.setdefault(names, _Block([], used)).bound.append(bound)
+            kind = tuple(p.name for p in used), bound.correlated
+            blocks.setdefault(kind, _Block([], used, bound.correlated)).bound.append(bound)
         self._blocks = list(blocks.values())
         for block in self._blocks:
             self._lay_out(block)
@@ -280,6 +295,10 @@ class Problem:
                 keys.bias(k),
                 gtsam.imuBias.ConstantBias(states.accel_bias[k], states.gyro_bias[k]),
             )
+        for process in self.processes:
+            nodes = parameters.get(process.name, process.zero)
+            for j, node in enumerate(nodes):
+                out.insert(process.key(j), node)
         for p in self.parameters:
             value = parameters[p.name]
             out.insert(self._key[p.name], gtsam.Rot3(value) if p.rotation else value)
@@ -339,6 +358,9 @@ class Problem:
         parameters = {**self._fixed}
         for p in self.parameters:
             parameters[p.name] = self._parameter(values, p)
+        for process in self.processes:
+            nodes = [values.atVector(process.key(j)) for j in range(process.time.size)]
+            parameters[process.name] = np.array(nodes)
         motions, residuals = [], []
         computed: dict[tuple[int, SensorClock | None], Motion] = {}
         cost = self.graph.error(values)
@@ -347,17 +369,39 @@ class Problem:
             errors = self._imu_errors.vector(parameters)
             imu = self._imu_errors.linearized(self.graph.linearize(values), errors)
             cost += imu.more_cost
+        for process in self.processes:
+            cost += 0.5 * float(np.sum(process.prior_residuals(parameters[process.name]) ** 2))
         for bound in self._bound:
             # Position and velocity of one receiver share attachment and clock.
             shared = (id(bound.attachment), bound.observation.clock)
             if shared not in computed:
                 computed[shared] = self._motion(bound, states, parameters)
             motion = computed[shared]
-            residual = bound.weight * bound.observation.residual(motion, parameters)
+            residual = bound.weight * self.residual(bound.observation, motion, parameters)
             motions.append(motion)
             residuals.append(residual)
             cost += 0.5 * float(np.vdot(residual, residual))
         return Evaluation(values, states, parameters, motions, residuals, cost, imu)
+
+    def residual(
+        self, observation: Observation, motion: Motion, parameters: dict[str, Array]
+    ) -> Array:
+        """Return predicted - measured, (M, d), its correlated error included in what is predicted.
+
+        Parameters
+        ----------
+        observation : Observation
+            One of the problem's.
+        motion : Motion
+            At the true times.
+        parameters : dict of str to ndarray
+            Of an evaluation.
+        """
+        out = observation.residual(motion, parameters)
+        for process in self.processes:
+            if process.label == observation.label:
+                out = out + process.error(parameters[process.name], observation.time)
+        return out
 
     def reject(self, rejected: Mapping[str, Array]) -> None:
         """Use no measurements at the times (K,) that are given by label."""
@@ -380,7 +424,7 @@ class Problem:
             if o.gate is None:
                 continue
             before = np.isin(o.time, self.rejected.get(o.label, np.empty(0)))
-            miss = o.residual(motion, evaluation.parameters)
+            miss = self.residual(o, motion, evaluation.parameters)
             far = np.abs(miss) > o.gate * o.sigma(motion, evaluation.parameters)
             times = o.time[(before | (bound.weight > 0.0).any(axis=1)) & far.any(axis=1)]
             if times.size:
@@ -418,7 +462,10 @@ class Problem:
         factors = self.noise_factors if factors is None else factors
         return [
             b.observation.sigma(
-                motion, evaluation.parameters, factors.get(b.observation.label, 1.0)
+                motion,
+                evaluation.parameters,
+                factors.get(b.observation.label, 1.0)
+                * self.long_run.get(b.observation.label, 1.0),
             )
             for b, motion in zip(self._bound, evaluation.motions, strict=True)
         ]
@@ -464,13 +511,10 @@ class Problem:
         """Yield the rows of each observation, unused ones included: these are zero."""
         transitions = self._transitions(evaluation)
         for block in self._blocks:
-            sizes = (STATE_SIZE, BIAS_SIZE, *(p.mean.size for p in block.parameters))
-            shared = [self._key[p.name] for p in block.parameters]
             for bound in block.bound:
                 matrix, vector = self._jacobian(bound, block.parameters, transitions, evaluation)
-                nodes = bound.attachment.node.tolist()
-                every = [[keys.node(k), self.chain.bias_key(k), *shared] for k in nodes]
-                o = bound.observation
+                every = [self._keys_at(block, *n) for n in self._nodes_of(bound).tolist()]
+                o, sizes = bound.observation, tuple(self._sizes(block))
                 yield Rows(o.label, o.components, np.array(every), sizes, matrix, vector)
 
     def nonlinear_graph(self) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
@@ -500,16 +544,27 @@ class Problem:
         return native_graph(self), gtsam.Values(self._weighed_at)
 
     def native(self, evaluation: Evaluation) -> gtsam.GaussianFactorGraph:
-        """Return GTSAM's own factors, linear at an evaluation, with columns of IMU errors."""
+        """Return all factors but those of measurements, linear at an evaluation."""
         if self._imu_errors is None or evaluation.imu is None:
-            return self.graph.linearize(evaluation.values)
-        return self._imu_errors.filled(evaluation.imu)
+            out = self.graph.linearize(evaluation.values)
+        else:
+            out = self._imu_errors.filled(evaluation.imu)
+        for process in self.processes:
+            process.add_prior(out, evaluation.parameters[process.name])
+        return out
 
     def ordering(self, gaussian: gtsam.GaussianFactorGraph) -> gtsam.Ordering:
         """Return an elimination order in which biases and calibration come last."""
         last = [self._key[p.name] for p in self.parameters]
         if not self.chain.walking:
             last.insert(0, keys.bias(0))
+        if self.processes:
+            time = self.chain.segments.node_time
+            first = in_time_order(time, self.processes, walking=self.chain.walking)
+            out = gtsam.Ordering()
+            for key in (*first, *last):
+                out.push_back(key)
+            return out
         return gtsam.Ordering.ColamdConstrainedLastGaussianFactorGraph(gaussian, last)
 
     def key(self, name: str) -> int:
@@ -538,12 +593,14 @@ class Problem:
         if not covered.all():
             self.uncovered[observation.label] = int((~covered).sum())
         weight = np.repeat(covered.astype(float)[:, None], len(observation.components), axis=1)
+        labels = [process.label for process in self.processes]
+        own = labels.index(observation.label) if observation.label in labels else None
         for other in self._bound:
             if np.array_equal(other.time, time):
-                return _Bound(observation, other.attachment, time, covered, weight)
+                return _Bound(observation, other.attachment, time, covered, weight, own)
         at, _ = attach_inside(self.chain.segments, time, self.chain.frame.earth_rate)
         # Times that are not covered weigh nothing; they only need a place on the chain.
-        return _Bound(observation, at, time, covered, weight)
+        return _Bound(observation, at, time, covered, weight, own)
 
     def needs_rebinding(self, parameters: dict[str, Array]) -> bool:
         """Whether a clock has moved measurements too far from where they were bound."""
@@ -579,25 +636,45 @@ class Problem:
         return true_time(bound.observation, parameters, self.clock_zero) - bound.time
 
     def _lay_out(self, block: _Block) -> None:
-        """Make a block's factors for the nodes that its measurements hang on now."""
-        depth = [len(b.observation.components) for b in block.bound]
-        row_node = np.concatenate(
-            [np.repeat(b.attachment.node, d) for b, d in zip(block.bound, depth, strict=True)]
+        """Make a block's factors for the nodes that its measurements depend on."""
+        nodes = np.concatenate(
+            [self._nodes_of(b).repeat(len(b.observation.components), axis=0) for b in block.bound]
         )
-        in_order = bool(np.all(np.diff(row_node) >= 0))
-        block.order = None if in_order else np.argsort(row_node, kind="stable")
-        used, counts = np.unique(row_node, return_counts=True)
+        order = np.lexsort(nodes.T[::-1])
+        block.order = None if np.all(np.diff(order) == 1) else order
+        used, counts = np.unique(nodes[order], axis=0, return_counts=True)
         edges = np.concatenate([[0], np.cumsum(counts)])
         block.rows = [slice(a, b) for a, b in itertools.pairwise(edges)]
-        sizes = [STATE_SIZE, BIAS_SIZE] + [p.mean.size for p in block.parameters]
-        shared = [self._key[p.name] for p in block.parameters]
+        sizes = self._sizes(block)
         block.matrices, block.vectors, block.factors = [], [], []
-        for k, rows in zip(used.tolist(), counts.tolist(), strict=True):
-            node_keys = [keys.node(k), self.chain.bias_key(k), *shared]
-            factor = jacobian_template(node_keys, sizes, rows)
+        for at, rows in zip(used.tolist(), counts.tolist(), strict=True):
+            factor = jacobian_template(self._keys_at(block, *at), sizes, rows)
             block.factors.append(factor)
             block.matrices.append(factor.getA())
             block.vectors.append(factor.getb())
+
+    def _nodes_of(self, bound: _Bound) -> IntArray:
+        """Return the nodes of each measurement: of the chain, and of its correlated error."""
+        node = bound.attachment.node[:, None]
+        if bound.correlated is None:
+            return node
+        before, _ = self.processes[bound.correlated].place(bound.observation.time)
+        return np.column_stack([node, before])
+
+    def _keys_at(self, block: _Block, node: int, before: int = 0) -> list[int]:
+        """Return the variables of a block's measurements at some nodes."""
+        out = [keys.node(node), self.chain.bias_key(node)]
+        if block.correlated is not None:
+            process = self.processes[block.correlated]
+            out += [process.key(before), process.key(before + 1)]
+        return out + [self._key[p.name] for p in block.parameters]
+
+    def _sizes(self, block: _Block) -> list[int]:
+        """Return the dimensions of these variables."""
+        out = [STATE_SIZE, BIAS_SIZE]
+        if block.correlated is not None:
+            out += [self.processes[block.correlated].sigma.size] * 2
+        return out + [p.mean.size for p in block.parameters]
 
     def _fill(
         self, block: _Block, transitions: dict[int, Transition], evaluation: Evaluation
@@ -633,7 +710,7 @@ class Problem:
     ) -> tuple[Array, Array]:
         """Return the whitened Jacobian (M, d, n) and residual (M, d) of an observation.
 
-        Columns: state, bias, parameters.
+        Columns: state, bias, correlated error, parameters.
         """
         transition = transitions[id(evaluation.motions[self._bound.index(bound)])]
         wanted = [p.name for p in parameters]
@@ -644,18 +721,19 @@ class Problem:
             wanted,
             self.clock_zero,
         )
-        columns = STATE_SIZE + BIAS_SIZE + sum(p.mean.size for p in parameters)
-        full = np.empty((*lin.residual.shape, columns))
-        full[:, :, : STATE_SIZE + BIAS_SIZE] = node_jacobian(lin, transition)
-        c = STATE_SIZE + BIAS_SIZE
         found = dict(lin.d_parameters)
         if self._imu_errors is not None:
             found |= self._imu_errors.columns(lin, transition, bound.attachment)
-        for p in parameters:
-            full[:, :, c : c + p.mean.size] = found[p.name]
-            c += p.mean.size
+        parts = [node_jacobian(lin, transition)]
+        residual = lin.residual
+        if bound.correlated is not None:
+            process = self.processes[bound.correlated]
+            parts += process.jacobians(bound.observation.time)
+            nodes = evaluation.parameters[process.name]
+            residual = residual + process.error(nodes, bound.observation.time)
+        full = np.concatenate([*parts, *(found[p.name] for p in parameters)], axis=2)
         full *= bound.weight[:, :, None]
-        return full, bound.weight * lin.residual
+        return full, bound.weight * residual
 
 
 def node_jacobian(lin: Linearization, transition: Transition) -> Array:

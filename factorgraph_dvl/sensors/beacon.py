@@ -19,6 +19,7 @@ from factorgraph_dvl.geometry.vectors import Array, cross, rotate, skew
 from factorgraph_dvl.sensors.clock import Clock, ClockSection
 from factorgraph_dvl.sensors.parameters import SCALAR, Parameter, ParameterSpec
 from factorgraph_dvl.sensors.protocol import (
+    ExpectedCorrelation,
     Linearization,
     Motion,
     Observation,
@@ -255,6 +256,11 @@ class _ToBeacon:
     def noise_groups(self) -> tuple[tuple[int, ...], ...]:
         """None: the gate goes by the standard deviation that is stated."""
         return ()
+
+    @property
+    def correlated(self) -> ExpectedCorrelation | None:
+        """None: echoes come one by one."""
+        return None
 
     @property
     def independent(self) -> bool:

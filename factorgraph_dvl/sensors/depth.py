@@ -14,6 +14,7 @@ from factorgraph_dvl.geometry.vectors import Array, skew
 from factorgraph_dvl.sensors.clock import Clock, ClockSection
 from factorgraph_dvl.sensors.parameters import SCALAR, Parameter, ParameterSpec
 from factorgraph_dvl.sensors.protocol import (
+    ExpectedCorrelation,
     Linearization,
     Motion,
     Observation,
@@ -145,6 +146,7 @@ class DepthBelowSurface:
     components: tuple[str, ...] = ("down",)
     gate: float | None = None
     noise_groups: tuple[tuple[int, ...], ...] = ((0,),)
+    correlated: ExpectedCorrelation | None = None
     independent: bool = False
     parameters: tuple[str, ...] = (SEA_SURFACE_HEIGHT,)
     clock: Clock = _CLOCK

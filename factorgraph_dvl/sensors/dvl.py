@@ -18,11 +18,13 @@ from factorgraph_dvl.geometry.vectors import Array, cross, rotate, skew
 from factorgraph_dvl.sensors.clock import Clock, ClockSection
 from factorgraph_dvl.sensors.parameters import SCALAR, XYZ, JointPrior, Parameter, ParameterSpec
 from factorgraph_dvl.sensors.protocol import (
+    ExpectedCorrelation,
     Linearization,
     Motion,
     Observation,
     SensorSection,
     Values,
+    expected_correlation,
     lever_arm_sigma,
 )
 from factorgraph_dvl.sensors.records import (
@@ -235,7 +237,10 @@ class Dvl:
             return ()
         s = self.settings
         noise = (s.velocity_std_m_s, s.velocity_std_fraction)
-        return (DvlVelocity(self.time[m], self.velocity[m], self.std[m], noise),)
+        s = self.settings
+        correlated = expected_correlation(s.correlation_time_s, s.correlated_std_m_s, 3)
+        velocity = self.velocity[m]
+        return (DvlVelocity(self.time[m], velocity, self.std[m], noise, correlated=correlated),)
 
     def explain(self, parameter: str, component: int, motion: Motion | None) -> str:
         """Say why a component could not be observed, given the motion of the trial."""
@@ -306,6 +311,7 @@ class DvlVelocity:
     components: tuple[str, ...] = ("x", "y", "z")
     gate: float | None = None
     noise_groups: tuple[tuple[int, ...], ...] = ((0,), (1,), (2,))
+    correlated: ExpectedCorrelation | None = None
     independent: bool = False
     parameters: tuple[str, ...] = (
         MISALIGNMENT,

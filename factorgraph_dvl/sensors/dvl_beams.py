@@ -19,6 +19,7 @@ from factorgraph_dvl.sensors.clock import Clock, ClockSection
 from factorgraph_dvl.sensors.dvl import CLOCK, LEVER_ARM_SPEC, MISALIGNMENT_SPEC, SCALE_SPEC
 from factorgraph_dvl.sensors.parameters import SCALAR, Parameter, ParameterSpec
 from factorgraph_dvl.sensors.protocol import (
+    ExpectedCorrelation,
     Linearization,
     Motion,
     Observation,
@@ -373,6 +374,7 @@ class BeamVelocity:
     label: str = "Beam velocity"
     unit: str = "m/s"
     gate: float | None = None
+    correlated: ExpectedCorrelation | None = None
 
     @property
     def components(self) -> tuple[str, ...]:

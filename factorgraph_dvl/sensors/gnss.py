@@ -17,11 +17,14 @@ from factorgraph_dvl.geometry.vectors import Array, cross, rotate, skew
 from factorgraph_dvl.sensors.clock import Clock, ClockSection
 from factorgraph_dvl.sensors.parameters import Parameter, ParameterSpec
 from factorgraph_dvl.sensors.protocol import (
+    USUAL_CORRELATION_TIME,
+    ExpectedCorrelation,
     Linearization,
     Motion,
     Observation,
     SensorSection,
     Values,
+    expected_correlation,
     lever_arm_sigma,
 )
 from factorgraph_dvl.sensors.records import (
@@ -199,10 +202,22 @@ class Gnss:
         lat, lon = np.where(np.isnan(lat), frame.lat, lat), np.where(np.isnan(lon), frame.lon, lon)
         lRn = frame.level_from_tangent(lat, lon)
         bRc, omega_cb_b = self.carrier(self.time)
+        s = self.settings
         if has_position.any():
             m = has_position
             p_n = frame.position(*self.geodetic[m].T)
-            out.append(AntennaPosition(self.time[m], p_n, lRn[m], self.position_std[m], bRc[m]))
+            out.append(
+                AntennaPosition(
+                    self.time[m],
+                    p_n,
+                    lRn[m],
+                    self.position_std[m],
+                    bRc[m],
+                    correlated=expected_correlation(
+                        s.correlation_time_s, s.correlated_std_m, 3, USUAL_CORRELATION_TIME
+                    ),
+                )
+            )
         if has_velocity.any():
             m = has_velocity
             out.append(
@@ -213,6 +228,9 @@ class Gnss:
                     self.velocity_std[m],
                     bRc[m],
                     omega_cb_b[m],
+                    correlated=expected_correlation(
+                        s.velocity_correlation_time_s, s.correlated_velocity_std_m_s, 3
+                    ),
                 )
             )
         return tuple(out)
@@ -255,6 +273,7 @@ class AntennaPosition:
     components: tuple[str, ...] = ("east", "north", "up")
     gate: float | None = None
     noise_groups: tuple[tuple[int, ...], ...] = HORIZONTAL_AND_UP
+    correlated: ExpectedCorrelation | None = None
     independent: bool = False
     parameters: tuple[str, ...] = (LEVER_ARM,)
     clock: Clock = _CLOCK
@@ -314,6 +333,7 @@ class AntennaVelocity:
     components: tuple[str, ...] = ("east", "north", "up")
     gate: float | None = None
     noise_groups: tuple[tuple[int, ...], ...] = HORIZONTAL_AND_UP
+    correlated: ExpectedCorrelation | None = None
     independent: bool = False
     parameters: tuple[str, ...] = (LEVER_ARM,)
     clock: Clock = _CLOCK

@@ -24,6 +24,8 @@ NoiseModel = Literal["estimated", "stated"]
 # Residuals larger than stated by this factor make every standard deviation too small, and by
 # the second the model is another than the data's.
 TOO_LARGE = 1.3
+# Correlation time where none is stated, s. Chosen: that of multipath and atmosphere.
+USUAL_CORRELATION_TIME = 100.0
 DO_NOT_FIT = 10.0
 
 
@@ -94,6 +96,47 @@ class SensorClock(Protocol):
         """Return stamps minus true times, (M,), s."""
 
 
+@dataclass(frozen=True)
+class ExpectedCorrelation:
+    """What is known beforehand of noise that persists from one measurement to the next.
+
+    Parameters
+    ----------
+    time : float, s
+        Correlation time, within a factor of three.
+    sigma : ndarray, shape (d,), optional
+        Standard deviation of the part that persists, beside the white one; None where the
+        standard deviation of the measurement is that of both.
+    """
+
+    time: float
+    sigma: Array | None = None
+
+
+def expected_correlation(
+    time: float | UnsetType, sigma: object | UnsetType, size: int, usual: float | None = None
+) -> ExpectedCorrelation | None:
+    """Return what settings state of correlated noise; None if that is nothing.
+
+    Parameters
+    ----------
+    time : float or unset, s
+        Stated correlation time.
+    sigma : array_like or unset
+        Stated standard deviation, one for all components or one each.
+    size : int
+        Number of components.
+    usual : float, optional
+        Correlation time where none is stated, s.
+    """
+    std = None if isinstance(sigma, UnsetType) else np.broadcast_to(np.array(sigma, float), size)
+    if not isinstance(time, UnsetType):
+        return ExpectedCorrelation(time, std)
+    if usual is not None:
+        return ExpectedCorrelation(usual, std)
+    return None if std is None else ExpectedCorrelation(USUAL_CORRELATION_TIME, std)
+
+
 class Observation(Protocol):
     """M measurements of one kind, of d components each."""
 
@@ -128,6 +171,10 @@ class Observation(Protocol):
         The factors are estimated from the data. Components that are in no group have the
         standard deviation that is stated.
         """
+
+    @property
+    def correlated(self) -> ExpectedCorrelation | None:
+        """What is known beforehand of noise that persists; None = nothing."""
 
     @property
     def independent(self) -> bool:

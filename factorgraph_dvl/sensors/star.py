@@ -27,6 +27,7 @@ from factorgraph_dvl.sensors.parameters import Parameter, ParameterSpec
 from factorgraph_dvl.sensors.protocol import (
     TOO_LARGE,
     Attitudes,
+    ExpectedCorrelation,
     Linearization,
     Motion,
     Observation,
@@ -416,6 +417,7 @@ class StarAttitude:
     components: tuple[str, ...] = ("x", "y", "z")
     gate: float | None = None
     noise_groups: tuple[tuple[int, ...], ...] = ()
+    correlated: ExpectedCorrelation | None = None
     independent: bool = False
     label: str = "Star attitude"
     unit: str = "arcsec"

@@ -13,16 +13,15 @@ Sequential Estimation, 1977, ch. VI). At the end it is what the smoother has.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-import gtsam
 import numpy as np
 from scipy.linalg.lapack import dgeqrf, dtrtri
 
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph import keys
-from factorgraph_dvl.graph.keys import BIAS_SIZE, STATE_SIZE
+from factorgraph_dvl.graph.keys import BIAS_SIZE
 from factorgraph_dvl.graph.problem import FIXED_DIRECTION_STD, Evaluation, Problem
 from factorgraph_dvl.quality.refusal import accepted_errors, explained
 from factorgraph_dvl.quality.survey import survey
@@ -53,21 +52,6 @@ class Frontier:
     """
 
     root: Array
-
-
-@dataclass(frozen=True)
-class _Layout:
-    """Columns of two consecutive nodes and of the constants behind them."""
-
-    own: int
-    constants: dict[int, int]
-    width: int
-
-    def column(self, key: int, node: dict[int, tuple[int, int]], k: int) -> int:
-        if key in self.constants:
-            return 2 * self.own + self.constants[key]
-        index, offset = node[key]
-        return (index - k) * self.own + offset
 
 
 # Rate of the trajectory, Hz. Chosen: angular rates are taken from its attitudes, under sway of
@@ -145,36 +129,36 @@ def run_filter(
     frontier : Frontier
         Information at the last node.
     """
-    layout, node = _layout(problem)
-    nodes = problem.chain.segments.node_time.size
-    groups = _rows_by_node(problem, evaluation, layout, node, with_priors=start is None)
-    c = layout.width - 2 * layout.own
-    out = np.empty((nodes, c, c))
-    empty = np.zeros((0, layout.width))
-    if start is None:
-        root = _triangle(_of_one_node(groups.get(-1, empty), layout), layout.own + c)
-    else:
-        root = start.root
-    out[0] = _triangle(root[:, layout.own :], c)
-    for k in range(nodes):
-        new = groups.get(k, empty)
-        rows = np.zeros((root.shape[0] + new.shape[0], layout.width))
-        rows[: root.shape[0], : layout.own] = root[:, : layout.own]
-        rows[: root.shape[0], 2 * layout.own :] = root[:, layout.own :]
-        rows[root.shape[0] :] = new
-        if k == nodes - 1:
-            root = _triangle(_of_one_node(rows, layout), layout.own + c)
-            # Measurements at the very last node, if any, belong to its time.
-            out[k] = root[layout.own :, layout.own :]
-            break
-        root = _triangle(rows, layout.width)[layout.own :, layout.own :]
-        out[k + 1] = root[layout.own :, layout.own :]
-    return out, Frontier(root)
+    steps = _rows_by_step(problem, evaluation, with_priors=start is None)
+    sizes = evaluation.values.dims()
+    last = problem.chain.segments.node_time.size - 1
+    # A variable goes at the last step that depends on it, those of the last node never.
+    gone_after = {key: k for k, rows in sorted(steps.items()) for row in rows for key in row.keys}
+    gone_after |= dict.fromkeys(_own_keys(problem, last), last)
+    columns = _constants(problem)
+    c = sum(sizes[key] for key in columns)
+    out = np.empty((last + 1, c, c))
+    frontier = [] if start is None else _own_keys(problem, 0)
+    root = np.zeros((0, c)) if start is None else start.root
+    for k in range(-1 if start is None else 0, last + 1):
+        rows = steps.get(k, [])
+        present = dict.fromkeys((*frontier, *(key for row in rows for key in row.keys)))
+        inner = [key for key in present if key not in columns]
+        leaving = [key for key in inner if k < last and gone_after[key] <= k]
+        # The states come right before the constants, so that the frontier is the end of R.
+        staying = sorted(set(inner) - set(leaving), key=lambda key: not keys.is_process(key))
+        triangle = _triangle(*_stacked(root, frontier, rows, [*leaving, *staying], columns, sizes))
+        gone = sum(sizes[key] for key in leaving)
+        root, frontier = triangle[gone:, gone:], staying
+        # Measurements at the very last node, if any, belong to its time.
+        out[min(k + 1, last)] = triangle[len(triangle) - c :, len(triangle) - c :]
+    ending = c + sum(sizes[key] for key in _own_keys(problem, last))
+    return out, Frontier(root[len(root) - ending :, len(root) - ending :])
 
 
-def _of_one_node(rows: Array, layout: _Layout) -> Array:
-    """Return rows without the columns of the node after, which they do not touch."""
-    return np.delete(rows, np.s_[layout.own : 2 * layout.own], axis=1)
+def _own_keys(problem: Problem, k: int) -> list[int]:
+    """Return the variables of a node: its state, and its bias where biases walk."""
+    return [keys.node(k), keys.bias(k)] if problem.chain.walking else [keys.node(k)]
 
 
 def as_history(
@@ -197,17 +181,17 @@ def as_history(
     undetermined : mapping of int to ndarray
         Further directions that are at their prior, by entry.
     """
-    layout, _ = _layout(problem)
+    columns = _constants(problem)
     names: list[str] = []
     rows: list[Array] = []
     kept: list[dict[int, Array]] = []
     free: list[np.ndarray] = []
     for parameter, _, functional in reported(problem, evaluation):
-        if functional is None or not functional.keys() <= layout.constants.keys():
+        if functional is None or not functional.keys() <= columns.keys():
             continue
         for key, matrix in functional.items():
             wide = np.zeros((matrix.shape[0], triangles.shape[1]))
-            wide[:, layout.constants[key] : layout.constants[key] + matrix.shape[1]] = matrix
+            wide[:, columns[key] : columns[key] + matrix.shape[1]] = matrix
             rows.append(wide)
         kept.append(functional)
         names += parameter.component_names
@@ -215,7 +199,7 @@ def as_history(
     is_free = np.concatenate(free)
     transport = np.concatenate(rows)[is_free]
     whiten = np.linalg.inv(problem.prior_root)
-    columns = slice(triangles.shape[1] - len(whiten), None)
+    of_parameters = slice(triangles.shape[1] - len(whiten), None)
 
     def prior(directions: Array) -> Array:
         return prior_along(problem, directions, kept, {})[is_free]
@@ -227,7 +211,7 @@ def as_history(
         spread = at_prior
         if k in undetermined:
             rows_fixed = np.zeros((undetermined[k].shape[1], triangle.shape[0]))
-            rows_fixed[:, columns] = undetermined[k].T @ whiten / FIXED_DIRECTION_STD
+            rows_fixed[:, of_parameters] = undetermined[k].T @ whiten / FIXED_DIRECTION_STD
             triangle = _triangle(np.concatenate([triangle, rows_fixed]), triangle.shape[0])
             spread = np.hstack([at_prior, prior(undetermined[k])])
         inverse, info = dtrtri(triangle)
@@ -241,73 +225,87 @@ def as_history(
     )
 
 
-def _layout(problem: Problem) -> tuple[_Layout, dict[int, tuple[int, int]]]:
-    """Return the columns, and node and offset of every key that is not a constant."""
-    walking = problem.chain.walking
-    constants: dict[int, int] = {}
+def _constants(problem: Problem) -> dict[int, int]:
+    """Return the columns of the variables that do not belong to a time, parameters last."""
+    out: dict[int, int] = {}
     at = 0
-    if not walking:
-        constants[keys.bias(0)] = 0
+    if not problem.chain.walking:
+        out[keys.bias(0)] = 0
         at = BIAS_SIZE
     for p in problem.parameters:
-        constants[problem.key(p.name)] = at
+        out[problem.key(p.name)] = at
         at += p.mean.size
-    node: dict[int, tuple[int, int]] = {}
-    for k in range(problem.chain.segments.node_time.size):
-        node[keys.node(k)] = (k, 0)
-        if walking:
-            node[keys.bias(k)] = (k, STATE_SIZE)
-    own = STATE_SIZE + BIAS_SIZE * walking
-    return _Layout(own, constants, 2 * own + at), node
+    return out
 
 
-def _rows_by_node(
-    problem: Problem,
-    evaluation: Evaluation,
-    layout: _Layout,
-    node: dict[int, tuple[int, int]],
-    *,
-    with_priors: bool,
-) -> dict[int, Array]:
-    """Return the whitened rows of all factors by the first node of each.
+@dataclass(frozen=True)
+class _Factor:
+    """Whitened rows of a factor, with its variables."""
 
-    What involves nothing but constants and the first node's state without a measurement,
-    the priors, is under -1.
+    keys: list[int]
+    matrix: Array
+
+
+def _rows_by_step(
+    problem: Problem, evaluation: Evaluation, *, with_priors: bool
+) -> dict[int, list[_Factor]]:
+    """Return all factors by the first node of each.
+
+    What involves nothing but constants and the first node without a measurement, the priors, is
+    under -1; noise that is correlated belongs to the node before its own.
     """
     gaussian = problem.linearize(evaluation)
-    sizes = evaluation.values.dims()
+    time = problem.chain.segments.node_time
+    step = {keys.node(k): k for k in range(time.size)}
+    if problem.chain.walking:
+        step |= {keys.bias(k): k for k in range(time.size)}
+    for p in problem.processes:
+        before = np.searchsorted(time, p.time, side="right") - 1
+        step |= {p.key(j): int(k) for j, k in enumerate(np.clip(before, 0, time.size - 1))}
     priors = problem.graph.size()
-    found: dict[int, list[Array]] = {}
+    out: dict[int, list[_Factor]] = {}
     for i in range(gaussian.size()):
         factor = gaussian.at(i)
         involved = list(factor.keys())
-        nodes = {node[key][0] for key in involved if key in node}
-        first = min(nodes, default=0)
-        is_prior = i < priors and nodes <= {0}
+        states = {step[key] for key in involved if key in step and not keys.is_process(key)}
+        known = states or {step[key] for key in involved if key in step}
+        is_prior = i < priors and known <= {0}
         if is_prior and not with_priors:
             continue
-        found.setdefault(-1 if is_prior else first, []).append(
-            _wide(factor, involved, sizes, layout, node, first)
-        )
-    return {k: np.concatenate(parts) for k, parts in found.items()}
-
-
-def _wide(
-    factor: gtsam.GaussianFactor,
-    involved: list[int],
-    sizes: dict[int, int],
-    layout: _Layout,
-    node: dict[int, tuple[int, int]],
-    first: int,
-) -> Array:
-    A = factor.jacobian()[0]
-    out = np.zeros((A.shape[0], layout.width))
-    at = 0
-    for key in involved:
-        size, column = sizes[key], layout.column(key, node, first)
-        out[:, column : column + size] = A[:, at : at + size]
-        at += size
+        k = -1 if is_prior else min(known, default=0)
+        out.setdefault(k, []).append(_Factor(involved, factor.jacobian()[0]))
     return out
+
+
+def _stacked(
+    root: Array,
+    frontier: Sequence[int],
+    factors: Sequence[_Factor],
+    order: Sequence[int],
+    constants: Mapping[int, int],
+    sizes: Mapping[int, int],
+) -> tuple[Array, int]:
+    """Return rows over variables in an order, then constants, and their number of columns."""
+    column: dict[int, int] = {}
+    width = 0
+    for key in order:
+        column[key] = width
+        width += sizes[key]
+    column |= {key: width + at for key, at in constants.items()}
+    width += sum(sizes[key] for key in constants)
+    blocks = [_Factor([*frontier, *constants], root), *factors]
+    out = np.zeros((sum(len(f.matrix) for f in blocks), width))
+    row = 0
+    for f in blocks:
+        at = 0
+        for key in f.keys:
+            size = sizes[key]
+            out[row : row + len(f.matrix), column[key] : column[key] + size] = f.matrix[
+                :, at : at + size
+            ]
+            at += size
+        row += len(f.matrix)
+    return out, width
 
 
 def _triangle(rows: Array, size: int) -> Array:

@@ -93,7 +93,9 @@ def _normalised(
     sigma = problem.sigma(evaluation)
     out = {}
     for label, i in groups.items():
-        residual = problem.observations[i].residual(evaluation.motions[i], evaluation.parameters)
+        residual = problem.residual(
+            problem.observations[i], evaluation.motions[i], evaluation.parameters
+        )
         out[label] = np.where(used[label], residual / sigma[i], np.nan)
     return out
 

@@ -15,14 +15,16 @@ import numpy as np
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph.priors import ConstantsPrior
 from factorgraph_dvl.graph.problem import Evaluation, Problem
+from factorgraph_dvl.graph.processes import Process
 from factorgraph_dvl.imu.propagation import States
 from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.solution import Progress
+from factorgraph_dvl.solvers.correlated_noise import after_one_round, correlated_noise
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, minimise
 from factorgraph_dvl.solvers.outliers import robust_weights
 from factorgraph_dvl.solvers.preparation import Preparation, mounted_start
 from factorgraph_dvl.statistics.square_root_information import SquareRootInformation
-from factorgraph_dvl.statistics.variance_components import noise_factors
+from factorgraph_dvl.statistics.variance_components import variance_components
 
 # Root mean square change of the positions, m, from which on gravity is taken anew. Chosen: 1 m
 # turns it by 0.16 micro-g.
@@ -34,6 +36,10 @@ _NOISE_ROUNDS = 4
 # What of a problem changes without a new one.
 _NOISE = "the noise of the sensors"
 _OUTLIERS = "which measurements are outliers"
+_CORRELATED = "which noise is correlated"
+# Relative change of the innovations of correlated noise from which on it counts. Chosen: less
+# changes no σ that is shown.
+_SAME_INNOVATIONS = 0.05
 # Searches for outliers. Chosen: the second finds those that the first could not see.
 _SEARCHES = 2
 
@@ -109,6 +115,8 @@ def settle(
     }
     robust: dict[str, Array] = {}
     searches = 0
+    correlation_searched = False
+    long_run: Mapping[str, Array] = {}
     levels = _NoiseLevels((as_stated,), bool(as_stated))
     changing: list[str] = ["all"]
     for _ in range(_ROUNDS):
@@ -120,9 +128,12 @@ def settle(
                 start=values,
                 constants_prior=constants_prior,
                 clock_zero=clock_zero,
+                processes=levels.processes,
             )
             problem.reject(rejected)
+        problem.processes = levels.processes
         problem.noise_factors = levels.factors[-1]
+        problem.long_run = long_run
         problem.robust_weights = robust
         at = problem.values(states, problem.prior_values() | values)
         minimum = minimise(problem, at, stage="all sensors", progress=report)
@@ -149,9 +160,21 @@ def settle(
                 changing.append(_OUTLIERS)
                 robust, evaluation = outliers_found
                 states, values = evaluation.states, evaluation.parameters
+        if not changing and not correlation_searched and minimum.converged:
+            correlation_searched = True
+            found = correlated_noise(problem, minimum.evaluation, as_stated)
+            if found.processes or found.long_run:
+                changing.append(_CORRELATED)
+                long_run = found.long_run
+                white = levels.factors[-1] | found.factors
+                levels = replace(
+                    levels, factors=(*levels.factors, white), processes=found.processes
+                )
         if not changing and levels.estimated and minimum.converged:
+            before = levels
             levels = _next_noise(levels, problem, minimum)
-            if not _same(levels.factors[-1], levels.factors[-2]):
+            same = levels.processes == before.processes
+            if not (same and _same(levels.factors[-1], before.factors[-1])):
                 changing.append(_NOISE)
         if not changing:
             break
@@ -167,11 +190,16 @@ def settle(
 
 @dataclass(frozen=True)
 class _NoiseLevels:
-    """Factors on stated noise that were applied, and whether to estimate more of them."""
+    """Factors on stated noise that were applied, and whether to estimate more of them.
 
-    factors: tuple[Mapping[str, Array], ...]
+    `processes` is the correlated noise to assume next, `rounds` counts estimates.
+    """
+
+    factors: tuple[dict[str, Array], ...]
     estimated: bool
     findings: tuple[Finding, ...] = ()
+    processes: tuple[Process, ...] = ()
+    rounds: int = 0
 
 
 def _next_noise(levels: _NoiseLevels, problem: Problem, minimum: Minimum) -> _NoiseLevels:
@@ -183,11 +211,25 @@ def _next_noise(levels: _NoiseLevels, problem: Problem, minimum: Minimum) -> _No
     assert minimum.tree is not None
     evaluation = minimum.evaluation
     information = SquareRootInformation(minimum.tree, evaluation.values.dims())
-    found = noise_factors(problem, evaluation, information)
+    found = variance_components(problem, evaluation, information)
     last = levels.factors[-1]
-    latest = {label: f.after(last[label]) for label, f in found.items()}
-    if len(levels.factors) <= _NOISE_ROUNDS or _same(latest, last):
-        return replace(levels, factors=(*levels.factors, latest))
+    latest = last | {label: f.after(last[label]) for label, f in found.white.items()}
+    time = problem.chain.segments.node_time
+    duration = float(time[-1] - time[0])
+    processes = tuple(
+        after_one_round(p, found.correlated[p.label].factor, duration)
+        if p.label in found.correlated
+        and np.abs(found.correlated[p.label].factor - 1.0).max() > _SAME_INNOVATIONS
+        else p
+        for p in levels.processes
+    )
+    rounds = levels.rounds + 1
+    if rounds <= _NOISE_ROUNDS:
+        return replace(
+            levels, factors=(*levels.factors, latest), processes=processes, rounds=rounds
+        )
+    if _same(latest, last):
+        return replace(levels, rounds=rounds)
     unsettled = [name for name in latest if not np.array_equal(latest[name], last[name])]
     findings = tuple(
         Finding(
@@ -199,7 +241,7 @@ def _next_noise(levels: _NoiseLevels, problem: Problem, minimum: Minimum) -> _No
         for label in unsettled
     )
     first = {name: f for name, f in levels.factors[1].items() if name not in unsettled}
-    return _NoiseLevels((*levels.factors, first), False, findings)
+    return replace(levels, factors=(*levels.factors, first), estimated=False, findings=findings)
 
 
 def _changing(problem: Problem, evaluation: Evaluation) -> list[str]:

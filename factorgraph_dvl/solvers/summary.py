@@ -120,7 +120,7 @@ def _rejected(problem: Problem, minimum: Minimum) -> tuple[Residuals, ...]:
     for o, motion in zip(problem.observations, evaluation.motions, strict=True):
         own = np.isin(o.time, problem.rejected.get(o.label, np.empty(0)))
         if own.any():
-            residual = o.residual(motion, evaluation.parameters)[own]
+            residual = problem.residual(o, motion, evaluation.parameters)[own]
             sigma = o.sigma(motion, evaluation.parameters)[own]
             out.append(Residuals(o.label, o.unit, o.components, o.time[own], residual, sigma))
     return (*out, *_outliers(problem, evaluation))
@@ -133,7 +133,7 @@ def _outliers(problem: Problem, evaluation: Evaluation) -> Iterator[Residuals]:
     ):
         if o.label not in problem.robust_weights:
             continue
-        residual = o.residual(motion, evaluation.parameters)
+        residual = problem.residual(o, motion, evaluation.parameters)
         weights = np.broadcast_to(problem.robust_weights[o.label], residual.shape)
         measured = np.isfinite(sigma)
         left_out = np.asarray(measured & (weights == 0.0))

@@ -19,6 +19,7 @@ FIRST_STATE = "prior of the first state"
 GAP = "motion while the IMU is silent"
 PRIOR = "prior of {}"
 WALK = "random walk of {}"
+CORRELATED = "correlated noise of {}"
 
 # Items whose products are taken at once. Chosen: some ten megabytes.
 _CHUNK = 4096
@@ -86,6 +87,7 @@ def _native_rows(problem: Problem, evaluation: Evaluation) -> Iterator[Rows]:
     sizes = evaluation.values.dims()
     names = {problem.key(p.name): p.name for p in problem.parameters}
     of_biases = ", ".join(p.name for p in problem.chain.biases)
+    names |= {p.key(j): p.label for p in problem.processes for j in range(p.time.size)}
     found: dict[tuple[str, tuple[int, ...]], list[tuple[list[int], Array]]] = {}
     for i in range(gaussian.size()):
         factor = gaussian.at(i)
@@ -112,6 +114,8 @@ def _source(own: list[int], names: Mapping[int, str], biases: str) -> str:
     letters = "".join(map(keys.letter_of, own))
     if letters.startswith("xxb"):
         return IMU_NOISE
+    if keys.is_process(own[0]):
+        return CORRELATED.format(names[own[0]])
     calibration = [names[key] for key in own if key in names]
     if calibration and "b" in letters:
         calibration.insert(0, biases)

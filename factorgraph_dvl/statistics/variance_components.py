@@ -7,8 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from factorgraph_dvl.geometry.vectors import Array
-from factorgraph_dvl.graph.problem import Evaluation, Problem
+from factorgraph_dvl.graph.problem import Evaluation, Problem, Rows
 from factorgraph_dvl.statistics.leverage import leverage
+from factorgraph_dvl.statistics.rows import CORRELATED, rows_by_source
 from factorgraph_dvl.statistics.square_root_information import SquareRootInformation
 
 # Standard deviation of the logarithm of a factor before any data, as degrees of freedom at
@@ -17,7 +18,7 @@ _PRIOR_FREEDOM = 1.0 / (2.0 * np.log(3.0) ** 2)
 # Factor below which a stated standard deviation stays as it is. Chosen: residuals ten times
 # smaller are those of a record that was smoothed, or simulated without noise, and say nothing
 # of its error.
-_LEAST_FACTOR = 0.1
+LEAST_FACTOR = 0.1
 # Redundancy below which no factor is estimated. Chosen: it would be uncertain by over 20 %.
 _LEAST_REDUNDANCY = 10.0
 # Relative change of a factor from which on it counts, and in its own standard deviations.
@@ -48,12 +49,28 @@ class NoiseFactor:
         return np.where(change <= np.maximum(_SAME_FACTOR, chance), applied, self.factor)
 
 
-def noise_factors(
+@dataclass(frozen=True)
+class VarianceComponents:
+    """Noise against what was assumed of it.
+
+    Parameters
+    ----------
+    white : dict of str to NoiseFactor
+        By label, factors on the standard deviations that sensors state.
+    correlated : dict of str to NoiseFactor
+        By label, factors on the innovations of correlated noise, relative to those assumed.
+    """
+
+    white: dict[str, NoiseFactor]
+    correlated: dict[str, NoiseFactor]
+
+
+def variance_components(
     problem: Problem,
     evaluation: Evaluation,
     information: SquareRootInformation,
-) -> dict[str, NoiseFactor]:
-    """Return factors on stated standard deviations by restricted maximum likelihood.
+) -> VarianceComponents:
+    """Return factors on assumed standard deviations by restricted maximum likelihood.
 
     With residuals r whitened by the factor f that was applied, leverages h, and the share s of
     their variance that is the sensor's own,
@@ -72,37 +89,66 @@ def noise_factors(
         Its minimum.
     information : SquareRootInformation
         Information there.
-
-    Returns
-    -------
-    dict of str to NoiseFactor
-        By label.
     """
-    labels = [o.label for o in problem.observations]
+    processes = {CORRELATED.format(p.label): p for p in problem.processes}
+    wanted = {*problem.noise_factors, *processes}
+    source = (
+        rows_by_source(problem, evaluation) if processes else problem.observation_rows(evaluation)
+    )
+    rows = [r for r in source if r.source in wanted]
+    found = dict(zip(map(id, rows), leverage(rows, information), strict=True))
+    white = {
+        r.source: _white(problem, evaluation, r, found[id(r)])
+        for r in rows
+        if r.source not in processes
+    }
     groups = {o.label: o.noise_groups for o in problem.observations}
-    weights = dict(zip(labels, problem.weights, strict=True))
-    sigmas = dict(zip(labels, problem.sigma(evaluation), strict=True))
-    others = dict(zip(labels, problem.sigma(evaluation, dict.fromkeys(labels, 0.0)), strict=True))
-    rows = [r for r in problem.observation_rows(evaluation) if r.source in problem.noise_factors]
-    out = {}
-    for each, h in zip(rows, leverage(rows, information), strict=True):
-        label, size = each.source, len(each.components)
-        used = weights[label] > 0.0
-        ratio = np.divide(others[label], sigmas[label], out=np.ones(used.shape), where=used)
-        own = 1.0 - ratio**2
-        squares = np.sum(own * each.vector**2, axis=0)
-        freedom = np.sum(own * (used - h), axis=0)
-        before = problem.noise_factors[label]
-        factor, redundancy = np.ones(size), np.zeros(size)
-        for group in map(list, groups[label]):
-            left = max(float(freedom[group].sum()), 0.0)
-            redundancy[group] = left
-            total = float(squares[group] @ before[group] ** 2)
-            found = np.sqrt((total + _PRIOR_FREEDOM) / (left + _PRIOR_FREEDOM))
-            if left < _LEAST_REDUNDANCY or (found < _LEAST_FACTOR and before[group[0]] == 1.0):
-                factor[group] = before[group]
-            else:
-                # Not back to what is stated: that would come and go.
-                factor[group] = max(found, _LEAST_FACTOR)
-        out[label] = NoiseFactor(factor, redundancy)
-    return out
+    correlated = {
+        p.label: _innovations(
+            [(r, found[id(r)]) for r in rows if r.source == source_name], groups[p.label]
+        )
+        for source_name, p in processes.items()
+        if p.label in problem.noise_factors
+    }
+    return VarianceComponents(white, correlated)
+
+
+def _innovations(
+    rows: list[tuple[Rows, Array]], groups: tuple[tuple[int, ...], ...]
+) -> NoiseFactor:
+    """Return factors on the innovations of correlated noise."""
+    squares = np.sum([np.sum(r.vector**2, axis=0) for r, _ in rows], axis=0)
+    freedom = np.sum([np.sum(1.0 - h, axis=0) for _, h in rows], axis=0)
+    factor, redundancy = np.ones(squares.size), np.zeros(squares.size)
+    for group in map(list, groups):
+        left = max(float(freedom[group].sum()), 0.0)
+        redundancy[group] = left
+        total = float(squares[group].sum())
+        factor[group] = np.sqrt((total + _PRIOR_FREEDOM) / (left + _PRIOR_FREEDOM))
+    return NoiseFactor(factor, redundancy)
+
+
+def _white(problem: Problem, evaluation: Evaluation, each: Rows, h: Array) -> NoiseFactor:
+    """Return factors on the standard deviations that a sensor states, from its rows."""
+    label, size = each.source, len(each.components)
+    (i,) = (i for i, o in enumerate(problem.observations) if o.label == label)
+    sigma = problem.sigma(evaluation)[i]
+    others = problem.sigma(evaluation, {label: np.zeros(size)})[i]
+    used = problem.weights[i] > 0.0
+    own = 1.0 - np.divide(others, sigma, out=np.ones(used.shape), where=used) ** 2
+    long_run = problem.long_run.get(label, np.ones(size))
+    squares = np.sum(own * each.vector**2, axis=0) * long_run**2
+    freedom = np.sum(own * (used - h), axis=0)
+    before = problem.noise_factors[label]
+    factor, redundancy = np.ones(size), np.zeros(size)
+    for group in map(list, problem.observations[i].noise_groups):
+        left = max(float(freedom[group].sum()), 0.0)
+        redundancy[group] = left
+        total = float(squares[group] @ before[group] ** 2)
+        found = np.sqrt((total + _PRIOR_FREEDOM) / (left + _PRIOR_FREEDOM))
+        if left < _LEAST_REDUNDANCY or (found < LEAST_FACTOR and before[group[0]] == 1.0):
+            factor[group] = before[group]
+        else:
+            # Not back to what is stated: that would come and go.
+            factor[group] = max(found, LEAST_FACTOR)
+    return NoiseFactor(factor, redundancy)

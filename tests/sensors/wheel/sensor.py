@@ -13,6 +13,7 @@ from factorgraph_dvl.geometry.rotations import BodyAxes
 from factorgraph_dvl.geometry.vectors import Array, rotate, skew
 from factorgraph_dvl.sensors.parameters import SCALAR, Parameter, ParameterSpec
 from factorgraph_dvl.sensors.protocol import (
+    ExpectedCorrelation,
     Linearization,
     Motion,
     Observation,
@@ -94,6 +95,7 @@ class WheelSpeed:
     parameters: tuple[str, ...] = (SCALE.name,)
 
     noise_groups: tuple[tuple[int, ...], ...] = ()
+    correlated: ExpectedCorrelation | None = None
     independent: bool = False
     clock: None = None
 

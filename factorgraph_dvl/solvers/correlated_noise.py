@@ -1,0 +1,150 @@
+"""Correlated noise of the sensors: found in the residuals, or stated by the trial."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.graph.problem import Evaluation, Problem
+from factorgraph_dvl.graph.processes import Process, node_times
+from factorgraph_dvl.sensors.protocol import Observation
+from factorgraph_dvl.statistics.correlation import Correlation, fit_correlation
+from factorgraph_dvl.statistics.variance_components import LEAST_FACTOR
+
+# Correlation time, s, below which noise is no process: white noise of its long-run variance stands
+# for it. Chosen: nodes would come about as often as states.
+_SHORT = 4.0
+# Correlation times in a trial below which standard deviation and time cannot be told apart, but
+# only the density 2 σ² / τ. Measured: σ alone is then uncertain by a factor.
+_MANY = 20.0
+# Trial, s, below which correlation is not searched. Chosen: shorter ones have rival minima, whose
+# costs compare only under one model.
+_SHORTEST = 60.0
+
+
+@dataclass(frozen=True)
+class CorrelatedNoise:
+    """Correlated noise of a problem's observations.
+
+    Parameters
+    ----------
+    processes : tuple of Process
+        Errors that persist for longer than the interval of the states.
+    factors : mapping of str to ndarray
+        By label, factors (d,) on the standard deviations of the white noise that is left.
+    long_run : mapping of str to ndarray
+        By label, factors (d,) on standard deviations for noise that persists for seconds.
+    """
+
+    processes: tuple[Process, ...]
+    factors: Mapping[str, Array]
+    long_run: Mapping[str, Array]
+
+
+def correlated_noise(
+    problem: Problem, evaluation: Evaluation, estimated: Collection[str]
+) -> CorrelatedNoise:
+    """Return the correlated noise that a trial states, or that residuals show.
+
+    Parameters
+    ----------
+    problem : Problem
+        Its measurements count as if their noise were white.
+    evaluation : Evaluation
+        Its minimum.
+    estimated : collection of str
+        Labels of the observations whose noise may be estimated.
+    """
+    time = problem.chain.segments.node_time
+    span = float(time[0]), float(time[-1])
+    processes, factors, long_run = [], {}, {}
+    for i, o in enumerate(problem.observations):
+        weight = problem.weights[i]
+        used = weight > 0.0
+        if not o.noise_groups or used.any(axis=1).sum() < 2:
+            continue
+        sigma = _typical(weight)
+        interval = float(np.median(np.diff(o.time[used.any(axis=1)])))
+        stated = o.correlated
+        if stated is not None and stated.sigma is not None:
+            tau = np.full(sigma.size, stated.time)
+            nodes = node_times(span, stated.time, stated.sigma, sigma, interval)
+            processes.append(Process(o.label, len(processes), stated.sigma, tau, nodes))
+            continue
+        if o.label not in estimated or span[1] - span[0] < _SHORTEST:
+            continue
+        found = _fits(o, np.where(used, evaluation.residuals[i], np.nan))
+        if not found:
+            continue
+        process, white, inflation = _model(o, found, sigma, interval, span, len(processes))
+        factors[o.label] = white
+        if process is not None:
+            processes.append(process)
+        if (inflation != 1.0).any():
+            long_run[o.label] = inflation
+    return CorrelatedNoise(tuple(processes), factors, long_run)
+
+
+def _typical(weight: Array) -> Array:
+    """Return the median standard deviation of each component, 0 where none was used."""
+    return np.array([1.0 / np.median(w[w > 0.0]) if w.any() else 0.0 for w in weight.T])
+
+
+def _fits(o: Observation, residuals: Array) -> dict[tuple[int, ...], Correlation]:
+    """Return the correlation of each group of components that has any."""
+    expected = None if o.correlated is None else o.correlated.time
+    out = {}
+    for group in o.noise_groups:
+        fit = fit_correlation(o.time, residuals[:, list(group)], expected_time_s=expected)
+        if fit is not None and fit.white + fit.correlated > LEAST_FACTOR**2:
+            out[group] = fit
+    return out
+
+
+def _model(
+    o: Observation,
+    found: Mapping[tuple[int, ...], Correlation],
+    sigma: Array,
+    interval: float,
+    span: tuple[float, float],
+    index: int,
+) -> tuple[Process | None, Array, Array]:
+    """Return the process of an observation, and factors on its white noise and for seconds."""
+    size = sigma.size
+    white, inflation = np.ones(size), np.ones(size)
+    process_sigma, tau = np.zeros(size), np.ones(size)
+    for group, fit in found.items():
+        own = list(group)
+        white[own] = np.sqrt(fit.white)
+        if fit.time_s < _SHORT:
+            inflation[own] = np.sqrt(fit.long_run_factor(interval))
+            continue
+        process_sigma[own], tau[own] = sigma[own] * np.sqrt(fit.correlated), fit.time_s
+        if o.correlated is not None and span[1] - span[0] < _MANY * fit.time_s:
+            total = sigma[own] * max(1.0, np.sqrt(fit.white + fit.correlated))
+            tau[own] *= (total / process_sigma[own]) ** 2
+            process_sigma[own] = total
+    if not process_sigma.any():
+        return None, white, inflation
+    active = process_sigma > 0.0
+    tau[~active] = tau[active].max()
+    nodes = node_times(
+        span, float(tau[active].min()), process_sigma[active], (sigma * white)[active], interval
+    )
+    return Process(o.label, index, process_sigma, tau, nodes), white, inflation
+
+
+def after_one_round(process: Process, factor: Array, duration: float) -> Process:
+    """Return a process whose innovations are larger by a factor (d,) than assumed.
+
+    Where only the density 2 σ² / τ can be estimated, σ stays.
+    """
+    by_density = duration < _MANY * process.tau
+    return replace(
+        process,
+        sigma=np.where(by_density, process.sigma, process.sigma * factor),
+        tau=np.where(by_density, process.tau / factor**2, process.tau),
+    )
