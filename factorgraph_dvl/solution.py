@@ -185,11 +185,18 @@ class Noise:
     name : str
         As in calibration.json, e.g. `dvl_velocity`.
     factor : ndarray, shape (d,)
-        On the stated standard deviations, by component.
+        On the stated standard deviations, by component; of white and correlated noise together.
+    correlation_time : ndarray, shape (d,), s, optional
+        Correlation time of what persists from one measurement to the next; nan for a component
+        whose noise is white, None where all are.
+    correlated_std : ndarray, shape (d,), optional
+        Standard deviation of what persists, in the unit of the measurement.
     """
 
     name: str
     factor: Array
+    correlation_time: Array | None = None
+    correlated_std: Array | None = None
 
 
 @dataclass(frozen=True)

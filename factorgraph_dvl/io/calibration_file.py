@@ -76,8 +76,10 @@ class _Verdict(msgspec.Struct):
     reasons: list[_Reason] = []
 
 
-class _Noise(msgspec.Struct):
+class _Noise(msgspec.Struct, omit_defaults=True):
     factor: _Numbers
+    correlation_time_s: _Numbers | None = None
+    correlated_std: _Numbers | None = None
 
 
 class _Cause(msgspec.Struct):
@@ -147,7 +149,12 @@ def load_calibration(path: Path | str, *, body_axes: BodyAxes = "RFU") -> Calibr
         inputs=tuple(file.inputs),
         limits=_limits(file, str(path)),
         noise=tuple(
-            Noise(printable(name), np.array(n.factor, dtype=float))
+            Noise(
+                printable(name),
+                np.array(n.factor, dtype=float),
+                _optional(n.correlation_time_s),
+                _optional(n.correlated_std),
+            )
             for name, n in file.noise.items()
         ),
         error_budget=tuple(
@@ -158,6 +165,10 @@ def load_calibration(path: Path | str, *, body_axes: BodyAxes = "RFU") -> Calibr
         span=file.span_s,
     )
     return found if isinstance(file.verdict, UnsetType) else _with_verdict(found, file.verdict)
+
+
+def _optional(numbers: _Numbers | None) -> Array | None:
+    return None if numbers is None else np.array(numbers, dtype=float)
 
 
 def _adds(cause: _Cause, order: Sequence[str], rows: Sequence[int]) -> Array:
@@ -278,7 +289,14 @@ def encode_calibration(solution: Solution | Calibration) -> bytes:
             if f.severity != "ok"
         ],
         inputs=list(solution.inputs),
-        noise={n.name: _Noise(_numbers(n.factor)) for n in solution.noise},
+        noise={
+            n.name: _Noise(
+                _numbers(n.factor),
+                None if n.correlation_time is None else _numbers(n.correlation_time),
+                None if n.correlated_std is None else _numbers(n.correlated_std),
+            )
+            for n in solution.noise
+        },
         error_budget=[
             _Cause(c.cause, c.assumed, dict(zip(solution.order, c.adds.tolist(), strict=True)))
             for c in solution.error_budget

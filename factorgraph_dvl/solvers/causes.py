@@ -12,7 +12,7 @@ from factorgraph_dvl.solution import Cause
 from factorgraph_dvl.solvers.calibration import reported, spread_of_fixed
 from factorgraph_dvl.solvers.fixed_directions import SolvedProblem
 from factorgraph_dvl.statistics.error_budget import error_budget
-from factorgraph_dvl.statistics.rows import IMU_NOISE, PRIOR, WALK, rows_by_source
+from factorgraph_dvl.statistics.rows import CORRELATED, IMU_NOISE, PRIOR, WALK, rows_by_source
 
 
 def causes(found: SolvedProblem, imu: ImuSettings) -> tuple[Cause, ...]:
@@ -68,6 +68,11 @@ def _assumed(
         if (weight > 0.0).any():
             middle = [float(np.nanmedian(s)) for s in sigma.T if np.isfinite(s).any()]
             out[o.label] = _numbers(np.array(middle), o.unit)
+    for process in problem.processes:
+        (unit,) = (o.unit for o in problem.observations if o.label == process.label)
+        numbers = _numbers(process.sigma, unit)
+        over = _numbers(process.tau[process.sigma > 0.0], "s")
+        out[CORRELATED.format(process.label)] = f"{numbers} over {over}"
     priors = [*problem.chain.biases, *(p for p in parameters if p.name in problem.columns)]
     for p in priors:
         unit = UNITS[p.spec.unit].text

@@ -11,6 +11,7 @@ from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph.problem import Evaluation, Problem
 from factorgraph_dvl.graph.processes import Process, node_times
 from factorgraph_dvl.sensors.protocol import Observation
+from factorgraph_dvl.solution import Noise, noise_name
 from factorgraph_dvl.statistics.correlation import Correlation, fit_correlation
 from factorgraph_dvl.statistics.variance_components import LEAST_FACTOR
 
@@ -40,8 +41,8 @@ class CorrelatedNoise:
     """
 
     processes: tuple[Process, ...]
-    factors: Mapping[str, Array]
-    long_run: Mapping[str, Array]
+    factors: dict[str, Array]
+    long_run: dict[str, Array]
 
 
 def correlated_noise(
@@ -60,7 +61,9 @@ def correlated_noise(
     """
     time = problem.chain.segments.node_time
     span = float(time[0]), float(time[-1])
-    processes, factors, long_run = [], {}, {}
+    processes: list[Process] = []
+    factors: dict[str, Array] = {}
+    long_run: dict[str, Array] = {}
     for i, o in enumerate(problem.observations):
         weight = problem.weights[i]
         used = weight > 0.0
@@ -120,6 +123,7 @@ def _model(
         own = list(group)
         white[own] = np.sqrt(fit.white)
         if fit.time_s < _SHORT:
+            white[own] = np.sqrt(fit.white + fit.correlated)
             inflation[own] = np.sqrt(fit.long_run_factor(interval))
             continue
         process_sigma[own], tau[own] = sigma[own] * np.sqrt(fit.correlated), fit.time_s
@@ -148,3 +152,28 @@ def after_one_round(process: Process, factor: Array, duration: float) -> Process
         sigma=np.where(by_density, process.sigma, process.sigma * factor),
         tau=np.where(by_density, process.tau / factor**2, process.tau),
     )
+
+
+def noise_of(problem: Problem) -> tuple[Noise, ...]:
+    """Return the noise of each observation against what is stated of it."""
+    out = []
+    for o, weight in zip(problem.observations, problem.weights, strict=True):
+        if o.label not in problem.noise_factors:
+            continue
+        factor = problem.noise_factors[o.label]
+        time, std = None, None
+        for process in problem.processes:
+            if process.label == o.label:
+                applied = factor * problem.long_run.get(o.label, 1.0)
+                stated = _typical(weight) / applied
+                share = np.divide(
+                    process.sigma, stated, out=np.zeros(stated.size), where=stated > 0
+                )
+                duration = float(np.ptp(process.time))
+                # Where only the density is known, the stated deviation is that of the whole.
+                total = duration < _MANY * process.tau
+                factor = np.where(total, np.maximum(factor, share), np.hypot(factor, share))
+                time = np.where(process.sigma > 0.0, process.tau, np.nan)
+                std = process.sigma
+        out.append(Noise(noise_name(o.label), factor, time, std))
+    return tuple(out)

@@ -14,17 +14,16 @@ from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.sensors.protocol import Motion
 from factorgraph_dvl.solution import (
     Estimate,
-    Noise,
     Residuals,
     Solution,
     consistency_findings,
     mostly_rejected,
-    noise_name,
     not_observable,
     outlier_findings,
 )
 from factorgraph_dvl.solvers.calibration import calibration
 from factorgraph_dvl.solvers.causes import causes
+from factorgraph_dvl.solvers.correlated_noise import noise_of
 from factorgraph_dvl.solvers.fixed_directions import SolvedProblem
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum
 from factorgraph_dvl.solvers.trajectory import trajectory_between
@@ -67,7 +66,7 @@ def summarise(trial: Trial, found: SolvedProblem, *, rate_hz: float) -> Solution
     for label, count in problem.uncovered.items():
         text = f"{count} measurements at times without IMU data were not used"
         findings.append(Finding(Code.UNUSED, text, sensor=label))
-    noise = tuple(Noise(noise_name(n), f) for n, f in problem.noise_factors.items())
+    noise = noise_of(problem)
     findings += consistency_findings(estimates, residuals, noise)
     findings += prior_findings(trial, estimates, covariance)
     findings += mostly_rejected(residuals, [r for r in rejected if r.reason == "echo"])

@@ -47,13 +47,14 @@ class Correlation:
     gain: float
 
     def long_run_factor(self, interval_s: float) -> float:
-        """Return the ratio of the long-run variance to that of the white noise alone.
+        """Return the ratio of the long-run variance to that of a single measurement.
 
         Of a correlation time that is too short for nodes of its own: white noise of this variance
         leaves the same in a mean over a longer time.
         """
-        share = self.correlated / self.white
-        return 1.0 + share * 2.0 * max(self.time_s, 0.5 * interval_s) / interval_s
+        persists = 2.0 * max(self.time_s, 0.5 * interval_s) / interval_s
+        total = self.white + self.correlated
+        return (self.white + self.correlated * persists) / total
 
 
 def fit_correlation(
