@@ -19,6 +19,8 @@ from factorgraph_dvl.imu.increments import IntArray
 # Most of a correlation time between two nodes. Chosen: interpolation then leaves out 6 % of the
 # variance.
 _MOST_SPACING = 1.0 / 3.0
+# Correlation times without a measurement that need no nodes. Chosen: what persists is then gone.
+_GAP = 5.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,6 +41,8 @@ class Process:
         Correlation time of each component.
     time : ndarray, shape (J,), s
         Times of the nodes.
+    density_only : bool, default False
+        Whether only the density 2 sigma² / tau can be estimated, and sigma is as stated.
     """
 
     label: str
@@ -46,6 +50,7 @@ class Process:
     sigma: Array
     tau: Array
     time: Array
+    density_only: bool = False
 
     @property
     def name(self) -> str:
@@ -76,10 +81,15 @@ class Process:
         _, after = self.place(time)
         return [share[:, None, None] * np.diag(self.sigma) for share in (1.0 - after, after)]
 
+    @property
+    def _weight(self) -> Array:
+        """Inverse standard deviations of the innovations, (J - 1, n)."""
+        return 1.0 / np.sqrt(-np.expm1(-2.0 * np.diff(self.time)[:, None] / self.tau))
+
     def prior_residuals(self, nodes: Array) -> Array:
         """Return whitened residuals (J, n): the first node, then the transitions."""
         phi = np.exp(-np.diff(self.time)[:, None] / self.tau)
-        steps = (nodes[1:] - phi * nodes[:-1]) / np.sqrt(1.0 - phi**2)
+        steps = (nodes[1:] - phi * nodes[:-1]) * self._weight
         return np.concatenate([nodes[:1], steps])
 
     def add_prior(self, gaussian: gtsam.GaussianFactorGraph, nodes: Array) -> None:
@@ -89,7 +99,7 @@ class Process:
         unit = gtsam.noiseModel.Unit.Create(n)
         gaussian.add(self.key(0), np.eye(n), -residuals[0], unit)
         phi = np.exp(-np.diff(self.time)[:, None] / self.tau)
-        after = 1.0 / np.sqrt(1.0 - phi**2)
+        after = self._weight
         for j in range(len(phi)):
             gaussian.add(
                 self.key(j),
@@ -101,9 +111,7 @@ class Process:
             )
 
 
-def node_times(
-    span: tuple[float, float], tau: float, sigma: Array, white: Array, interval: float
-) -> Array:
+def node_times(time: Array, tau: float, sigma: Array, white: Array) -> Array:
     """Return times of nodes that are close enough for linear interpolation.
 
     Between two nodes dt apart the interpolation leaves out a variance of about q dt / 6, with
@@ -112,20 +120,27 @@ def node_times(
 
     Parameters
     ----------
-    span : tuple of (float, float)
-        First and last time, s.
+    time : ndarray, shape (M,), s
+        Times of the measurements. Nodes leave out what is without any for long.
     tau : float
         Correlation time, s.
     sigma, white : ndarray, shape (n,)
         Standard deviations of the process and of the white noise of each measurement.
-    interval : float
-        Time between measurements, s.
     """
+    step = np.diff(time)
+    interval = float(np.median(step))
     q = 2.0 * sigma**2 / tau
     balanced = np.sqrt(6.0 * white**2 * interval / np.maximum(q, 1e-300))
     spacing = max(min(_MOST_SPACING * tau, float(balanced.min())), interval)
-    count = max(int(np.ceil((span[1] - span[0]) / spacing)), 1)
-    return np.linspace(*span, count + 1)
+    ends = np.flatnonzero(step > max(_GAP * tau, 2.0 * spacing))
+    parts = np.split(time, ends + 1)
+    return np.concatenate(
+        [
+            np.linspace(p[0], p[-1], max(int(np.ceil(np.ptp(p) / spacing)), 1) + 1)
+            for p in parts
+            if np.ptp(p) > 0.0
+        ]
+    )
 
 
 def in_time_order(node_time: Array, processes: Sequence[Process], *, walking: bool) -> list[int]:

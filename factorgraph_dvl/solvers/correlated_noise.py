@@ -21,6 +21,8 @@ _SHORT = 4.0
 # Correlation times in a trial below which standard deviation and time cannot be told apart, but
 # only the density 2 σ² / τ. Measured: σ alone is then uncertain by a factor.
 _MANY = 20.0
+# Trials that a correlation time lasts, at most. Chosen: the process is then a constant.
+_CONSTANT = 100.0
 # Trial, s, below which correlation is not searched. Chosen: shorter ones have rival minima, whose
 # costs compare only under one model.
 _SHORTEST = 60.0
@@ -59,8 +61,6 @@ def correlated_noise(
     estimated : collection of str
         Labels of the observations whose noise may be estimated.
     """
-    time = problem.chain.segments.node_time
-    span = float(time[0]), float(time[-1])
     processes: list[Process] = []
     factors: dict[str, Array] = {}
     long_run: dict[str, Array] = {}
@@ -70,19 +70,21 @@ def correlated_noise(
         if not o.noise_groups or used.any(axis=1).sum() < 2:
             continue
         sigma = _typical(weight)
-        interval = float(np.median(np.diff(o.time[used.any(axis=1)])))
+        when = o.time[used.any(axis=1)]
         stated = o.correlated
         if stated is not None and stated.sigma is not None:
             tau = np.full(sigma.size, stated.time)
-            nodes = node_times(span, stated.time, stated.sigma, sigma, interval)
+            nodes = node_times(when, stated.time, stated.sigma, sigma)
             processes.append(Process(o.label, len(processes), stated.sigma, tau, nodes))
             continue
-        if o.label not in estimated or span[1] - span[0] < _SHORTEST:
+        if o.label not in estimated or np.ptp(when) < _SHORTEST:
             continue
-        found = _fits(o, np.where(used, evaluation.residuals[i], np.nan))
+        residuals = np.where(used, evaluation.residuals[i], np.nan)
+        found = _fits(o, residuals)
         if not found:
             continue
-        process, white, inflation = _model(o, found, sigma, interval, span, len(processes))
+        rms = np.sqrt(np.nanmean(residuals**2, axis=0))
+        process, white, inflation = _model(o, found, sigma, rms, when, len(processes))
         factors[o.label] = white
         if process is not None:
             processes.append(process)
@@ -111,24 +113,27 @@ def _model(
     o: Observation,
     found: Mapping[tuple[int, ...], Correlation],
     sigma: Array,
-    interval: float,
-    span: tuple[float, float],
+    rms: Array,
+    time: Array,
     index: int,
 ) -> tuple[Process | None, Array, Array]:
     """Return the process of an observation, and factors on its white noise and for seconds."""
     size = sigma.size
     white, inflation = np.ones(size), np.ones(size)
     process_sigma, tau = np.zeros(size), np.ones(size)
+    times = [fit.time_s for fit in found.values()]
+    longest = max(times) if o.correlated is None else max(*times, o.correlated.time)
+    density_only = o.correlated is not None and float(np.ptp(time)) < _MANY * longest
     for group, fit in found.items():
         own = list(group)
-        white[own] = np.sqrt(fit.white)
+        white[own] = max(np.sqrt(fit.white), LEAST_FACTOR)
         if fit.time_s < _SHORT:
             white[own] = np.sqrt(fit.white + fit.correlated)
-            inflation[own] = np.sqrt(fit.long_run_factor(interval))
+            inflation[own] = np.sqrt(fit.long_run_factor(float(np.median(np.diff(time)))))
             continue
         process_sigma[own], tau[own] = sigma[own] * np.sqrt(fit.correlated), fit.time_s
-        if o.correlated is not None and span[1] - span[0] < _MANY * fit.time_s:
-            total = sigma[own] * max(1.0, np.sqrt(fit.white + fit.correlated))
+        if density_only:
+            total = sigma[own] * max(1.0, float(rms[own].max()))
             tau[own] *= (total / process_sigma[own]) ** 2
             process_sigma[own] = total
     if not process_sigma.any():
@@ -136,22 +141,18 @@ def _model(
     active = process_sigma > 0.0
     tau[~active] = tau[active].max()
     nodes = node_times(
-        span, float(tau[active].min()), process_sigma[active], (sigma * white)[active], interval
+        time, float(tau[active].min()), process_sigma[active], (sigma * white)[active]
     )
-    return Process(o.label, index, process_sigma, tau, nodes), white, inflation
+    process = Process(o.label, index, process_sigma, tau, nodes, density_only)
+    return process, white, inflation
 
 
-def after_one_round(process: Process, factor: Array, duration: float) -> Process:
-    """Return a process whose innovations are larger by a factor (d,) than assumed.
-
-    Where only the density 2 σ² / τ can be estimated, σ stays.
-    """
-    by_density = duration < _MANY * process.tau
-    return replace(
-        process,
-        sigma=np.where(by_density, process.sigma, process.sigma * factor),
-        tau=np.where(by_density, process.tau / factor**2, process.tau),
-    )
+def with_innovations(process: Process, factor: Array) -> Process:
+    """Return a process whose innovations are larger by a factor (d,) than assumed."""
+    if process.density_only:
+        longest = _CONSTANT * float(np.ptp(process.time))
+        return replace(process, tau=np.clip(process.tau / factor**2, _SHORT, longest))
+    return replace(process, sigma=process.sigma * factor)
 
 
 def noise_of(problem: Problem) -> tuple[Noise, ...]:
@@ -166,13 +167,11 @@ def noise_of(problem: Problem) -> tuple[Noise, ...]:
             if process.label == o.label:
                 applied = factor * problem.long_run.get(o.label, 1.0)
                 stated = _typical(weight) / applied
-                share = np.divide(
-                    process.sigma, stated, out=np.zeros(stated.size), where=stated > 0
-                )
-                duration = float(np.ptp(process.time))
-                # Where only the density is known, the stated deviation is that of the whole.
-                total = duration < _MANY * process.tau
-                factor = np.where(total, np.maximum(factor, share), np.hypot(factor, share))
+                known = stated > 0.0
+                share = np.divide(process.sigma, stated, out=np.zeros(known.size), where=known)
+                # Where only the density is known, its deviation is that of the whole.
+                join = np.maximum if process.density_only else np.hypot
+                factor = join(factor, share)
                 time = np.where(process.sigma > 0.0, process.tau, np.nan)
                 std = process.sigma
         out.append(Noise(noise_name(o.label), factor, time, std))

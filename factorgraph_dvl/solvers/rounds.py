@@ -19,7 +19,7 @@ from factorgraph_dvl.graph.processes import Process
 from factorgraph_dvl.imu.propagation import States
 from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.solution import Progress
-from factorgraph_dvl.solvers.correlated_noise import after_one_round, correlated_noise
+from factorgraph_dvl.solvers.correlated_noise import correlated_noise, with_innovations
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, minimise
 from factorgraph_dvl.solvers.outliers import robust_weights
 from factorgraph_dvl.solvers.preparation import Preparation, mounted_start
@@ -174,7 +174,9 @@ def settle(
             before = levels
             levels = _next_noise(levels, problem, minimum)
             same = levels.processes == before.processes
-            if not (same and _same(levels.factors[-1], before.factors[-1])):
+            if len(levels.processes) != len(before.processes):
+                changing.append(_CORRELATED)
+            elif not (same and _same(levels.factors[-1], before.factors[-1])):
                 changing.append(_NOISE)
         if not changing:
             break
@@ -214,10 +216,8 @@ def _next_noise(levels: _NoiseLevels, problem: Problem, minimum: Minimum) -> _No
     found = variance_components(problem, evaluation, information)
     last = levels.factors[-1]
     latest = last | {label: f.after(last[label]) for label, f in found.white.items()}
-    time = problem.chain.segments.node_time
-    duration = float(time[-1] - time[0])
     processes = tuple(
-        after_one_round(p, found.correlated[p.label].factor, duration)
+        with_innovations(p, found.correlated[p.label].factor)
         if p.label in found.correlated
         and np.abs(found.correlated[p.label].factor - 1.0).max() > _SAME_INNOVATIONS
         else p
@@ -241,7 +241,13 @@ def _next_noise(levels: _NoiseLevels, problem: Problem, minimum: Minimum) -> _No
         for label in unsettled
     )
     first = {name: f for name, f in levels.factors[1].items() if name not in unsettled}
-    return replace(levels, factors=(*levels.factors, first), estimated=False, findings=findings)
+    return replace(
+        levels,
+        factors=(*levels.factors, first),
+        estimated=False,
+        findings=findings,
+        processes=tuple(p for p in levels.processes if p.label not in unsettled),
+    )
 
 
 def _changing(problem: Problem, evaluation: Evaluation) -> list[str]:

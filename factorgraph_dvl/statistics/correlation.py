@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.optimize import minimize
@@ -20,9 +20,14 @@ _STARTS = (1.0, 10.0)
 # Fall of -2 log likelihood from which on noise counts as correlated. Measured: below 10 on clean
 # data, above 1500 where half of the variance is correlated.
 _GAIN = 20.0
-# Share of the trial that a correlation time may have where none is expected. Measured: longer ones
-# are drift or bias, and made σ of a scale three times too large.
+# Share of the trial that a correlation time may have where none is expected, and gain from which
+# on it is that where a longer one fits best. Measured: less is drift or bias, and made σ of a
+# scale three times too large.
 _LONGEST = 0.2
+_CERTAIN = 200.0
+# Intervals that a gap counts at most. Chosen: longer ones, as of a clock that jumps, would fill
+# the record with zeros.
+_LONGEST_GAP = 1000
 # Residuals from which on a spectrum is worth a fit. Chosen: some tens of frequencies.
 _FEWEST = 100
 
@@ -111,13 +116,21 @@ def fit_correlation(
         float(tau),
         2.0 * (minus_log_likelihood(np.full((omega.size, 1), level)) - float(best.fun)),
     )
-    too_long = expected_time_s is None and tau > _LONGEST * (time[-1] - time[0])
-    return None if found.gain < _GAIN or too_long else found
+    longest = _LONGEST * float(time[-1] - time[0])
+    if found.gain < _GAIN:
+        return None
+    if expected_time_s is not None or found.time_s <= longest:
+        return found
+    if found.gain < _CERTAIN:
+        return None
+    # Of what is so slow only the rate of its random walk is seen, 2 c / tau.
+    return replace(found, time_s=longest, correlated=found.correlated * longest / found.time_s)
 
 
 def _periodogram(time: Array, residuals: Array, interval: float) -> tuple[Array, Array]:
     """Return power (F, d) of unit white noise 1, and angular frequencies (F,) per sample."""
-    place = np.round((time - time[0]) / interval).astype(int)
+    steps = np.minimum(np.round(np.diff(time) / interval), _LONGEST_GAP)
+    place = np.concatenate([[0], np.cumsum(steps)]).astype(int)
     grid = np.zeros((place[-1] + 1, residuals.shape[1]))
     grid[place] = residuals - residuals.mean(axis=0)
     power = np.abs(np.fft.rfft(grid, axis=0)) ** 2 / time.size

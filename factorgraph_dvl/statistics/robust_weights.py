@@ -86,8 +86,14 @@ class Truncation:
         return np.clip(between, 0.0, 1.0)
 
     def outliers(self, residuals: Array) -> BoolArray:
-        """Return what lies beyond the gate, (M, d) or (M, 1) bool."""
-        return np.asarray(self.squares(residuals) > self._gate)
+        """Return what lies beyond the gate, (M, d) or (M, 1) bool.
+
+        Where half of all residuals are larger than white noise makes them, the noise is
+        correlated, and the gate goes by all of it.
+        """
+        level = 1.4826 * np.nan_to_num(np.nanmedian(np.abs(residuals), axis=0))
+        relative = np.maximum(level / self._scale, 1.0)
+        return np.asarray(self.squares(residuals / relative) > self._gate)
 
 
 def rejection_cost(weights: Array, components: int) -> Array:

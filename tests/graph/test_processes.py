@@ -1,0 +1,124 @@
+"""Correlated errors as Gauss-Markov nodes: prior, interpolation, columns in the graph."""
+
+from __future__ import annotations
+
+import gtsam
+import numpy as np
+import pytest
+from problems import SHORT, problem_of
+from truth import scenario
+
+from factorgraph_dvl.graph import keys
+from factorgraph_dvl.graph.problem import Problem
+from factorgraph_dvl.graph.processes import Process, node_times
+from factorgraph_dvl.simulation import simulate
+
+TAU = np.array([4.0, 4.0, 20.0])
+SIGMA = np.array([0.5, 0.4, 1.0])
+
+
+def process(label="GNSS position", index=0, time=None, sigma=SIGMA):
+    time = np.array([0.0, 2.0, 5.0, 6.0]) if time is None else time
+    return Process(label, index, sigma, TAU, time)
+
+
+def test_the_prior_is_that_of_a_stationary_process():
+    p = process()
+    gaussian = gtsam.GaussianFactorGraph()
+    p.add_prior(gaussian, p.zero)
+    ordering = gtsam.Ordering()
+    for j in range(4):
+        ordering.push_back(p.key(j))
+    information = gaussian.hessian(ordering)[0]
+    covariance = np.linalg.inv(information).reshape(4, 3, 4, 3)
+    lag = np.abs(p.time[:, None] - p.time)
+    for i in range(3):
+        np.testing.assert_allclose(covariance[:, i, :, i], np.exp(-lag / TAU[i]), atol=1e-12)
+
+
+def test_residuals_by_hand():
+    p = process()
+    nodes = np.array([[1.0, 0.0, 0.0], [2.0, 0.0, 0.0], [0.0] * 3, [0.0] * 3])
+    phi = np.exp(-0.5)
+    expected = [1.0, (2.0 - phi) / np.sqrt(1.0 - phi**2)]
+    np.testing.assert_allclose(p.prior_residuals(nodes)[:2, 0], expected)
+    # Half-way between the first two nodes: 0.5 (1 + 2) / 2.
+    np.testing.assert_allclose(p.error(nodes, np.array([1.0]))[0], [0.75, 0.0, 0.0])
+
+
+def test_the_priors_factors_are_its_residuals():
+    p = process()
+    nodes = np.random.default_rng(0).normal(size=(4, 3))
+    gaussian = gtsam.GaussianFactorGraph()
+    p.add_prior(gaussian, nodes)
+    step = gtsam.VectorValues()
+    moved = nodes.copy()
+    for j in range(4):
+        h = np.random.default_rng(j).normal(size=3)
+        step.insert(p.key(j), h)
+        moved[j] += h
+    cost = 0.5 * np.sum(p.prior_residuals(moved) ** 2)
+    assert gaussian.error(step) == pytest.approx(cost, rel=1e-12)
+
+
+@pytest.mark.parametrize("labels", [["GNSS position"], ["GNSS position", "DVL velocity"]])
+def test_linear_and_evaluated_cost_agree(labels):
+    scene = scenario(manoeuvres=SHORT)
+    trial = simulate(scene, 1)
+    plain, _ = problem_of(scene, trial)
+    time = plain.chain.segments.node_time
+    nodes = np.linspace(time[0], time[-1], 4)
+    sigma = {"GNSS position": SIGMA, "DVL velocity": 0.01 * SIGMA}
+    processes = [process(o, i, nodes, sigma[o]) for i, o in enumerate(labels)]
+    problem = Problem(plain.chain, plain.observations, plain.all_parameters, processes=processes)
+    _, start = problem_of(scene, trial)
+    rng = np.random.default_rng(2)
+    for p in processes:
+        for j in range(4):
+            start.insert(p.key(j), rng.normal(size=3))
+    problem.weigh(problem.evaluate(start))
+    evaluation = problem.evaluate(start)
+    gaussian = problem.linearize(evaluation)
+    step, still = gtsam.VectorValues(), gtsam.VectorValues()
+    for key, size in start.dims().items():
+        still.insert(key, np.zeros(size))
+        small = 1e-7 if not keys.is_process(key) else 1.0
+        step.insert(key, small * rng.normal(size=size))
+    before = gaussian.error(still)
+    assert before == pytest.approx(evaluation.cost, rel=1e-9)
+    after = problem.evaluate(start.retract(step)).cost
+    assert gaussian.error(step) - before == pytest.approx(after - evaluation.cost, rel=1e-4)
+    # Each measurement depends on two nodes of its process, and the rows of the graph know it.
+    for rows in problem.observation_rows(evaluation):
+        own = [p for p in processes if p.label == rows.source]
+        assert sum(keys.is_process(int(key)) for key in rows.keys[0]) == 2 * len(own)
+
+
+def test_values_return_the_nodes():
+    scene = scenario(manoeuvres=SHORT)
+    plain, _ = problem_of(scene)
+    time = plain.chain.segments.node_time
+    p = process(time=np.linspace(time[0], time[-1], 4))
+    problem = Problem(plain.chain, plain.observations, plain.all_parameters, processes=[p])
+    nodes = np.random.default_rng(1).normal(size=(4, 3))
+    states = plain.evaluate(problem_of(scene)[1]).states
+    at = problem.values(states, problem.prior_values() | {p.name: nodes})
+    np.testing.assert_allclose(problem.evaluate(at).parameters[p.name], nodes)
+
+
+def test_nodes_are_close_where_the_process_is_fast():
+    sigma, white = np.full(3, 0.42), np.full(3, 0.27)
+    time = np.arange(2501) * 0.2
+    spacing = np.diff(node_times(time, 100.0, sigma, white))
+    # sqrt(6 · 0.27² · 0.2 / (2 · 0.42² / 100)) = 4.98 s, and no more than a third of tau.
+    assert spacing.max() == pytest.approx(4.98, abs=0.1)
+    slow = np.diff(node_times(time, 100.0, 0.01 * sigma, white))
+    assert slow.max() == pytest.approx(500.0 / 16.0)
+
+
+def test_nodes_leave_out_what_was_not_measured():
+    time = np.concatenate([np.arange(100.0), 1e9 + np.arange(100.0)])
+    nodes = node_times(time, 10.0, np.ones(1), np.ones(1))
+    assert nodes.size < 100
+    assert nodes[0] == 0.0
+    assert nodes[-1] == 1e9 + 99.0
