@@ -12,9 +12,8 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 
-from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.geometry.vectors import Array, IntArray
 from factorgraph_dvl.graph import keys
-from factorgraph_dvl.imu.increments import IntArray
 
 # Most of a correlation time between two nodes. Chosen: interpolation then leaves out 6 % of the
 # variance.

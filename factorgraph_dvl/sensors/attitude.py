@@ -22,6 +22,7 @@ from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.sensors.clock import Clock, ClockSection
 from factorgraph_dvl.sensors.parameters import SCALAR, Parameter, ParameterSpec
 from factorgraph_dvl.sensors.protocol import (
+    ExpectedCorrelation,
     Linearization,
     Motion,
     Observation,
@@ -301,6 +302,7 @@ class AttitudeAngles:
     components: tuple[str, ...] = ("roll", "pitch", "heading")
     gate: float | None = None
     noise_groups: tuple[tuple[int, ...], ...] = ()
+    correlated: ExpectedCorrelation | None = None
     independent: bool = False
     parameters: tuple[str, ...] = (HEADING_OFFSET, SCHULER, DEVIATION)
 

@@ -23,6 +23,7 @@ from factorgraph_dvl.sensors.attitude import (
 from factorgraph_dvl.sensors.clock import Clock, ClockSection
 from factorgraph_dvl.sensors.parameters import Parameter, ParameterSpec
 from factorgraph_dvl.sensors.protocol import (
+    ExpectedCorrelation,
     Linearization,
     Motion,
     Observation,
@@ -267,6 +268,7 @@ class InsPosition:
     components: tuple[str, ...] = ("east", "north", "up")
     gate: float | None = None
     noise_groups: tuple[tuple[int, ...], ...] = ()
+    correlated: ExpectedCorrelation | None = None
     independent: bool = False
     parameters: tuple[str, ...] = ()
     clock: Clock = _CLOCK
@@ -317,6 +319,7 @@ class InsVelocity:
     components: tuple[str, ...] = ("east", "north", "up")
     gate: float | None = None
     noise_groups: tuple[tuple[int, ...], ...] = ()
+    correlated: ExpectedCorrelation | None = None
     independent: bool = False
     parameters: tuple[str, ...] = ()
     clock: Clock = _CLOCK

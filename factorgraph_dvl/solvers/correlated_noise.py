@@ -18,8 +18,8 @@ from factorgraph_dvl.statistics.variance_components import LEAST_FACTOR
 # Correlation time, s, below which noise is no process: white noise of its long-run variance stands
 # for it. Chosen: nodes would come about as often as states.
 _SHORT = 4.0
-# Correlation times in a trial below which standard deviation and time cannot be told apart, but
-# only the density 2 σ² / τ. Measured: σ alone is then uncertain by a factor.
+# Correlation times in a trial below which only the density 2 σ² / τ can be
+# estimated. Measured: σ alone is then uncertain by a factor.
 _MANY = 20.0
 # Trials that a correlation time lasts, at most. Chosen: the process is then a constant.
 _CONSTANT = 100.0
