@@ -5,6 +5,7 @@ from __future__ import annotations
 import gtsam
 import numpy as np
 
+from factorgraph_dvl.errors import ConfigError
 from factorgraph_dvl.graph import keys
 from factorgraph_dvl.graph.clocks import parameters_of
 from factorgraph_dvl.graph.problem import Problem
@@ -28,7 +29,18 @@ def native_graph(problem: Problem) -> gtsam.NonlinearFactorGraph:
     IMU factors with gravity per segment, walks of the biases and all priors are the problem's
     own. What was measured between a node and the next is one custom factor, with the weights
     that measurements have now.
+
+    Raises
+    ------
+    ConfigError
+        If the problem has correlated errors, whose nodes such a factor does not know.
     """
+    if problem.processes:
+        names = ", ".join(p.label for p in problem.processes)
+        raise ConfigError(
+            f"the noise of {names} is correlated, which factors of GTSAM cannot express here",
+            hint="State white noise in the trial: `noise: stated` and no correlation times",
+        )
     imu_errors = problem.imu_errors
     graph = gtsam.NonlinearFactorGraph()
     replaced = [] if imu_errors is None else imu_errors.factors(problem.graph)

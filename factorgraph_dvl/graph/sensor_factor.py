@@ -30,7 +30,13 @@ from factorgraph_dvl.imu.propagation import (
 from factorgraph_dvl.imu.sensitivity import Sensitivity, by_errors, corrected
 from factorgraph_dvl.sensors.imu import ERRORS
 from factorgraph_dvl.sensors.parameters import Parameter
-from factorgraph_dvl.sensors.protocol import Linearization, Motion, Observation, SensorClock
+from factorgraph_dvl.sensors.protocol import (
+    ExpectedCorrelation,
+    Linearization,
+    Motion,
+    Observation,
+    SensorClock,
+)
 
 # What rounding may take off a time, s.
 _ROUNDING = 1e-6
@@ -87,6 +93,11 @@ class ObservationRows:
     def noise_groups(self) -> tuple[tuple[int, ...], ...]:
         """Components that share a factor on their stated standard deviation."""
         return self.whole.noise_groups
+
+    @property
+    def correlated(self) -> ExpectedCorrelation | None:
+        """What is known beforehand of noise that persists."""
+        return self.whole.correlated
 
     @property
     def independent(self) -> bool:
