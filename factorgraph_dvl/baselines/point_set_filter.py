@@ -51,8 +51,8 @@ def point_set(
     """Calibrate with the seven-state filter.
 
     From more than 90 degrees off the small-angle model ends in the mirror image, turned
-    by 180 degrees with a scale error near -2. The filter then starts once more, from the
-    best of the 24 rotations of a cube.
+    by 180 degrees with a scale error near -2, or where no rotation fits. The filter then starts
+    once more near the end that fits best of those that the 24 rotations of a cube lead to.
 
     Parameters
     ----------
@@ -72,7 +72,8 @@ def point_set(
         fits = [
             misfit(few, e, lever_arm.mean) if e.values[1][0] > _MIRRORED else np.inf for e in ends
         ]
-        sums, again = _filter(points, prior, ends[int(np.argmin(fits))].values[0])
+        near = _near(prior, ends[int(np.argmin(fits))].values[0])
+        sums, again = _filter(points, near, near.values[0])
         other, also = _settle(sums, prior, again[-1][1].values[0])
         if mirrored or misfit(points, other, lever_arm.mean) < misfit(
             points, best, lever_arm.mean
@@ -148,6 +149,16 @@ def _filter(
         square = estimated.values[2] ** 2 + np.maximum(estimated.covariance.diagonal()[4:], 0.0)
         history.append((float(points.time[row]), estimated))
     return sums, tuple(history)
+
+
+def _near(prior: Estimated, D: Array) -> Estimated:
+    """Return a prior whose misalignment is near a rotation.
+
+    The first pings, at rest, would lead the filter away from it.
+    """
+    covariance = prior.covariance.copy()
+    covariance[:3, :3] = _WIDE**2 * np.eye(3)
+    return Estimated(prior.parameters, (D, *prior.values[1:]), covariance)
 
 
 def _settle(sums: _Sums, prior: Estimated, at: Array) -> tuple[Estimated, bool]:
