@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.special import chdtrc
@@ -18,6 +19,13 @@ from factorgraph_dvl.sensors.finding import Code, Finding, Verdict, verdict_of
 from factorgraph_dvl.sensors.grades import DEFAULT_LIMITS, Grade, grades
 from factorgraph_dvl.sensors.parameters import SCALAR, Parameter, ParameterSpec
 from factorgraph_dvl.sensors.protocol import DO_NOT_FIT, TOO_LARGE
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+    from factorgraph_dvl.io.data_frames import FrameTable
+    from factorgraph_dvl.report.figures.drawing import Canvas
+    from factorgraph_dvl.trial import Trial
 
 # Called on the way to a solution: with the stage, what is counted in it, and the cost if any.
 Progress = Callable[[str, int, float | None], None]
@@ -81,6 +89,11 @@ class Trajectory:
     position_cov: Array
     velocity_cov: Array
     rph_cov: Array
+
+    def __repr__(self) -> str:
+        if not self.time.size:
+            return "<Trajectory without epochs>"
+        return f"<Trajectory of {self.time.size} epochs, {self.time[0]:g} to {self.time[-1]:g} s>"
 
     @property
     def position_std(self) -> Array:
@@ -257,11 +270,19 @@ def grades_of(estimate: Estimate, limits: Mapping[str, float]) -> tuple[Grade, .
 class Judged:
     """What a result's findings and standard deviations amount to."""
 
+    trial: str
+    solver: str
     converged: bool
     iterations: int
     estimates: tuple[Estimate, ...]
     findings: tuple[Finding, ...]
     limits: Mapping[str, float]
+
+    def __repr__(self) -> str:
+        return (
+            f"<{type(self).__name__} of {self.trial!r} by {self.solver}: {self.verdict.grade}, "
+            f"{len(self.estimates)} parameters>"
+        )
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -311,7 +332,7 @@ class Judged:
         return out
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Solution(Judged):
     """What a solver found.
 
@@ -379,6 +400,78 @@ class Solution(Judged):
         time = self.trajectory.time
         return (float(time[0]), float(time[-1])) if time.size else None
 
+    def _repr_html_(self) -> str:
+        from factorgraph_dvl.report.overview import html_overview
+
+        return html_overview(self)
+
+    def summary(self) -> str:
+        """Return verdict and calibration as text: value, standard deviation, unit and grade."""
+        from factorgraph_dvl.report.overview import overview
+
+        return overview(self)
+
+    def to_dataframe(self, table: FrameTable = "calibration") -> Any:
+        """Return a part of the solution as a pandas DataFrame, in the units of files.
+
+        Parameters
+        ----------
+        table : {'calibration', 'trajectory', 'residuals'}, optional
+            A row for each component, each epoch, or each component of each measurement.
+
+        Raises
+        ------
+        ConfigError
+            If there is no such table, or pandas is not installed (extra `notebook`).
+        """
+        from factorgraph_dvl.io.data_frames import to_dataframe
+
+        return to_dataframe(self, table)
+
+    def to_xarray(self) -> Any:
+        """Return calibration, joint covariance and trajectory as an xarray Dataset.
+
+        Dimensions are `component` (`other_component` for the columns of the covariance) and
+        `time_s`; units are those of files and stand in the names.
+
+        Raises
+        ------
+        ConfigError
+            If xarray is not installed (extra `notebook`).
+        """
+        from factorgraph_dvl.io.data_frames import to_xarray
+
+        return to_xarray(self)
+
+    def plot(
+        self, figure: str = "calibration", *, trial: Trial | None = None, axes: Axes | None = None
+    ) -> Canvas:
+        """Draw one of the figures that `solve` writes.
+
+        Parameters
+        ----------
+        figure : str, default 'calibration'
+            `track`, `motion`, `calibration`, `correlation`, `error_budget`, `beam_quality`, or the
+            residuals of a sensor, such as `dvl_residuals`.
+        trial : Trial, optional
+            For its GNSS fixes, reference and true calibration, which are drawn if it is given.
+        axes : matplotlib.axes.Axes, optional
+            Axes of your own figure: the panels take their place. By default a new figure.
+
+        Returns
+        -------
+        matplotlib.figure.Figure or matplotlib.figure.SubFigure
+            The new figure, or the part of yours.
+
+        Raises
+        ------
+        ConfigError
+            If there is no such figure, or nothing to draw in it.
+        """
+        from factorgraph_dvl.report.figures.solution import plot
+
+        return plot(self, figure, trial=trial, axes=axes)
+
     def with_findings(self, findings: Iterable[Finding]) -> Solution:
         """Return the solution with findings before its own, each once."""
         return replace(self, findings=tuple(dict.fromkeys((*findings, *self.findings))))
@@ -397,7 +490,7 @@ class Solution(Judged):
         raise KeyError(f"{name} was not estimated; there are {[e.name for e in self.estimates]}")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Calibration(Judged):
     """What a solver found of the sensors alone; the fields are those of `Solution`."""
 

@@ -166,6 +166,11 @@ class Trial:
     notes: tuple[Finding, ...] = ()
     limits: Mapping[str, float] = field(default_factory=lambda: DEFAULT_LIMITS)
 
+    def __repr__(self) -> str:
+        counts = [] if self.imu is None else [f"imu {self.imu.time.size}"]
+        counts += [f"{aid.section} {aid.time.size}" for aid in self.aids]
+        return f"<Trial {self.name!r}: {', '.join(counts)}>"
+
     def __post_init__(self) -> None:
         # What a sensor must know of another is set here, whoever made or changed the trial.
         prefix = BEAM_PREFIX if self.dvl is not None else ""

@@ -102,7 +102,7 @@ def save_solution(
         If the folder exists, is not empty, and `force` is not set; if it holds a trial.
     """
     with new_folder(Path(path), force=force, owned=OWNED) as folder:
-        columns = _trajectory_columns(solution.trajectory)
+        columns = trajectory_columns(solution.trajectory)
         if smoothed is not None:
             columns |= _smoothed_columns(solution.trajectory, smoothed)
         write_table(folder / TRAJECTORY_FILE, columns)
@@ -123,7 +123,7 @@ def _write_hypotheses(folder: Path, hypotheses: Sequence[Hypothesis]) -> None:
     items = []
     for i, h in enumerate(hypotheses, 1):
         name = f"{HYPOTHESES_FOLDER}/{i}.csv"
-        write_table(folder / name, _trajectory_columns(h.trajectory))
+        write_table(folder / name, trajectory_columns(h.trajectory))
         time, weight = h.history.T.tolist()
         items.append(_Hypothesis(h.weight, h.born, h.died, name, time, weight))
     text = msgspec.json.format(msgspec.json.encode(_Hypotheses(1, items)), indent=2) + b"\n"
@@ -208,7 +208,8 @@ def load_solution(path: Path | str) -> Solution:
     )
 
 
-def _trajectory_columns(trajectory: Trajectory) -> dict[str, Array]:
+def trajectory_columns(trajectory: Trajectory) -> dict[str, Array]:
+    """Return motion and standard deviations as the columns of trajectory.csv."""
     std = np.column_stack(
         [trajectory.position_std, trajectory.velocity_std, trajectory.rph_std / DEG]
     )
@@ -219,7 +220,7 @@ def _smoothed_columns(trajectory: Trajectory, smoothed: Trajectory) -> dict[str,
     """Return columns `smoothed_...` in the rows of the trajectory, nan where there is none."""
     row = np.searchsorted(trajectory.time, smoothed.time)
     out = {}
-    for name, values in _trajectory_columns(smoothed).items():
+    for name, values in trajectory_columns(smoothed).items():
         if name != "time_s":
             column = np.full(trajectory.time.size, np.nan)
             column[row] = values

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from matplotlib.figure import Figure
+from matplotlib.figure import SubFigure
 
 from factorgraph_dvl.analysis.beam_quality import BeamQuality
 from factorgraph_dvl.report.figures.drawing import (
@@ -13,9 +13,10 @@ from factorgraph_dvl.report.figures.drawing import (
     NORMAL,
     SMALL,
     TITLE,
+    Canvas,
+    canvas,
     clock,
     draw_band,
-    new_figure,
     new_grid,
     style,
 )
@@ -26,15 +27,17 @@ _DASHES = ("-", (0, (4, 4)), (0, (5, 2, 1, 2)), (0, (1, 3)))
 _MOST_POINTS = 4000
 
 
-def beam_quality_figure(quality: BeamQuality) -> Figure:
+def beam_quality_figure(quality: BeamQuality, *, into: SubFigure | None = None) -> Canvas:
     """Draw error velocity over time, and how far each group of three is from all beams.
 
     Parameters
     ----------
     quality : BeamQuality
         Of beams of which four or more were received together at least once.
+    into : SubFigure, optional
+        Where to draw; by default a new figure.
     """
-    figure = new_figure(11.0, 5.6)
+    figure = canvas(11.0, 5.6, into)
     grid = new_grid(figure, 4, 1, gap=(0.3, 0.0), right=0.9)
     axes = grid.subplots(squeeze=False, sharex=True)[:, 0]
     start, time_label = clock(quality.time)

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import LinearSegmentedColormap
-from matplotlib.figure import Figure
+from matplotlib.figure import SubFigure
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import ArrayLike, NDArray
 
@@ -21,9 +21,11 @@ from factorgraph_dvl.report.figures.drawing import (
     NORMAL,
     SMALL,
     TITLE,
-    new_figure,
+    Canvas,
+    canvas,
     new_grid,
     number,
+    size_of,
     style,
     typeset,
 )
@@ -33,10 +35,12 @@ from factorgraph_dvl.solution import Estimate, Solution
 _DIVERGING = LinearSegmentedColormap.from_list("correlation", ["#6b6b6b", "#ffffff", ACCENT])
 
 
-def calibration_figure(solution: Solution, truth: Mapping[str, ArrayLike]) -> Figure:
+def calibration_figure(
+    solution: Solution, truth: Mapping[str, ArrayLike], *, into: SubFigure | None = None
+) -> Canvas:
     """Draw every calibration component with its uncertainty, prior and truth."""
     rows = _calibration_rows(solution.estimates)
-    figure = new_figure(11.0, 0.75 + 1.12 * len(rows))
+    figure = canvas(11.0, 0.75 + 1.12 * len(rows), into)
     grid = new_grid(
         figure, len(rows), 3, left=0.15, right=0.15, bottom=0.3, top=0.85, gap=(0.52, 0.4)
     )
@@ -116,16 +120,18 @@ def _draw_component(ax: Axes, estimate: Estimate, c: int, truth: float | None) -
         )
 
 
-def correlation_figure(solution: Solution) -> Figure:
+def correlation_figure(solution: Solution, *, into: SubFigure | None = None) -> Canvas:
     """Draw the correlation matrix of the calibration components."""
     std = np.sqrt(np.maximum(np.diagonal(solution.covariance), 0.0))
     free = std > 0.0
     names = [name for name, shown in zip(solution.order, free, strict=True) if shown]
     correlation = solution.covariance[np.ix_(free, free)] / np.outer(std[free], std[free])
-    return heat_map(names, correlation)
+    return heat_map(names, correlation, into=into)
 
 
-def heat_map(components: Sequence[str], correlation: Array) -> Figure:
+def heat_map(
+    components: Sequence[str], correlation: Array, *, into: SubFigure | None = None
+) -> Canvas:
     """Draw a correlation matrix (n, n) of components, with its numbers."""
     names = [readable(name)[0] for name in components]
     n = len(names)
@@ -135,7 +141,10 @@ def heat_map(components: Sequence[str], correlation: Array) -> Figure:
     label_size = min(NORMAL, 40.0 * cell)
     margin = 0.2 + max(map(len, names), default=0) * 0.56 * label_size / 72.0
     width, height = margin + side + 1.0, margin + side + 0.4
-    figure = new_figure(width, height)
+    figure = canvas(width, height, into)
+    place = size_of(figure)
+    shrunk = min(1.0, place[0] / width, place[1] / height)
+    size, label_size = shrunk * size, shrunk * label_size
     ax = figure.add_axes((margin / width, margin / height, side / width, side / height))
     image = ax.imshow(correlation, cmap=_DIVERGING, vmin=-1.0, vmax=1.0)
     for i in range(n):

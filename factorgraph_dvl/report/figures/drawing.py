@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
+from matplotlib.figure import Figure, SubFigure
 from matplotlib.gridspec import GridSpec
 from numpy.typing import NDArray
 
@@ -16,6 +16,9 @@ from factorgraph_dvl.analysis.error_statistics import TrajectoryErrors, VectorEr
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.report.text import fixed
 from factorgraph_dvl.sensors.finding import Verdict
+
+# What panels stand in.
+Canvas = Figure | SubFigure
 
 ACCENT = "#0a6ebd"
 ACCENT_LIGHT = "#bcd9f0"
@@ -40,7 +43,7 @@ _MOST_CROSSINGS_OF_NOISE = 1600.0
 
 
 def save_figures(
-    figures: Mapping[str, Figure], folder: Path, verdict: Verdict | None = None
+    figures: Mapping[str, Canvas], folder: Path, verdict: Verdict | None = None
 ) -> list[Path]:
     """Write figures as PNG files under their names; return the paths.
 
@@ -48,6 +51,7 @@ def save_figures(
     """
     paths = []
     for name, figure in figures.items():
+        assert isinstance(figure, Figure)
         if verdict is not None:
             label = ": ".join([verdict.grade, *(r.code for r in verdict.reasons[:1])])
             colour = VERDICT_COLOURS[verdict.grade]
@@ -66,8 +70,19 @@ def new_figure(width: float, height: float) -> Figure:
     return Figure(figsize=(width, height), dpi=_DPI)
 
 
+def canvas(width: float, height: float, into: SubFigure | None) -> Canvas:
+    """Return an empty figure, inches; or what to draw into instead, whatever its size."""
+    return new_figure(width, height) if into is None else into
+
+
+def size_of(canvas: Canvas) -> tuple[float, float]:
+    """Return width and height, inches."""
+    box = canvas.bbox
+    return box.width / canvas.dpi, box.height / canvas.dpi
+
+
 def new_grid(
-    figure: Figure,
+    figure: Canvas,
     rows: int,
     columns: int,
     *,
@@ -83,7 +98,15 @@ def new_grid(
     Margins of fixed size, because a layout that measures every label is slow: nine panels take
     0.9 s to draw with Matplotlib's constrained layout, and 0.5 s without.
     """
-    width, height = figure.get_size_inches()
+    width, height = size_of(figure)
+    # In a small place of a larger figure, margins and gaps leave half of it to the panels.
+    small = min(
+        1.0,
+        0.5 * height / (bottom + top + (rows - 1) * gap[0]),
+        0.5 * width / (left + right + (columns - 1) * gap[1]),
+    )
+    left, right, bottom, top = (small * side for side in (left, right, bottom, top))
+    gap = (small * gap[0], small * gap[1])
     cell_height = (height - bottom - top - (rows - 1) * gap[0]) / rows
     cell_width = (width - left - right - (columns - 1) * gap[1]) / columns
     return figure.add_gridspec(

@@ -4,23 +4,31 @@ from __future__ import annotations
 
 import matplotlib
 import numpy as np
-from matplotlib.figure import Figure
+from matplotlib.figure import SubFigure
 
 from factorgraph_dvl.report.figures.calibration import readable
-from factorgraph_dvl.report.figures.drawing import LIGHT, SMALL, TITLE, new_figure, new_grid, style
+from factorgraph_dvl.report.figures.drawing import (
+    LIGHT,
+    SMALL,
+    TITLE,
+    Canvas,
+    canvas,
+    new_grid,
+    style,
+)
 from factorgraph_dvl.solution import Solution
 
 # Causes with a colour of their own; the others share one. Chosen: as many as the eye separates.
 _SHOWN = 9
 
 
-def error_budget_figure(solution: Solution) -> Figure:
+def error_budget_figure(solution: Solution, *, into: SubFigure | None = None) -> Canvas:
     """Draw what share of the variance of each component every cause has."""
     std = np.concatenate([e.std for e in solution.estimates])
     free = np.flatnonzero(std > 0.0)
     variance = np.stack([c.adds[free] ** 2 for c in solution.error_budget])
     share = 100.0 * variance / variance.sum(axis=0)
-    figure = new_figure(11.0, 1.4 + 0.24 * free.size)
+    figure = canvas(11.0, 1.4 + 0.24 * free.size, into)
     grid = new_grid(figure, 1, 1, left=1.5, right=3.4, bottom=0.5, top=0.35)
     ax = figure.add_subplot(grid[0, 0])
     y = np.arange(free.size)

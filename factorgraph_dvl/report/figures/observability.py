@@ -33,6 +33,7 @@ from factorgraph_dvl.report.figures.drawing import (
     NORMAL,
     SMALL,
     TITLE,
+    Canvas,
     clock,
     new_figure,
     new_grid,
@@ -77,7 +78,7 @@ def write_observability_figures(view: Observability, folder: Path) -> list[Path]
     folder : path-like
         Where the PNG files go.
     """
-    figures: dict[str, Figure] = {}
+    figures: dict[str, Canvas] = {}
     segments = [m.segment for m in view.segments]
     if view.point_set is not None:
         figures["singular_values"] = singular_value_figure(view.point_set)

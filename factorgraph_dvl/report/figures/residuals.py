@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
+from matplotlib.figure import SubFigure
 
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.report.figures.drawing import (
@@ -17,8 +17,9 @@ from factorgraph_dvl.report.figures.drawing import (
     LIGHT,
     SMALL,
     TITLE,
+    Canvas,
+    canvas,
     clock,
-    new_figure,
     new_grid,
     number,
     style,
@@ -30,7 +31,7 @@ _LARGEST_SCATTER = 20_000
 _PANEL = 6.0
 
 
-def residuals_figure(group: Sequence[Residuals]) -> Figure:
+def residuals_figure(group: Sequence[Residuals], *, into: SubFigure | None = None) -> Canvas:
     """Draw residual / σ over time, and its distribution.
 
     Each residual in units of its own σ: σ may change from one measurement to the next, and a
@@ -40,9 +41,11 @@ def residuals_figure(group: Sequence[Residuals]) -> Figure:
     ----------
     group : sequence of Residuals
         Of one sensor, a measurement each.
+    into : SubFigure, optional
+        Where to draw; by default a new figure.
     """
     rows = [(r, c) for r in group for c in range(len(r.components)) if _measured(r, c).any()]
-    figure = new_figure(11.0, 0.8 + 1.6 * len(rows))
+    figure = canvas(11.0, 0.8 + 1.6 * len(rows), into)
     gap = (0.16 if len(group) == 1 else 0.3, 0.2)
     grid = new_grid(figure, len(rows), 2, gap=gap, width_ratios=(3.4, 1.0))
     axes = grid.subplots(squeeze=False, sharex="col")

@@ -2,22 +2,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
+from typing import cast
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure, SubFigure
+from matplotlib.gridspec import GridSpec
 
 from factorgraph_dvl.analysis.beam_quality import beam_quality, calibrates, calibration_of
 from factorgraph_dvl.analysis.error_statistics import trajectory_errors
+from factorgraph_dvl.errors import ConfigError
 from factorgraph_dvl.report.figures.beams import beam_quality_figure
 from factorgraph_dvl.report.figures.calibration import calibration_figure, correlation_figure
-from factorgraph_dvl.report.figures.drawing import save_figures
+from factorgraph_dvl.report.figures.drawing import Canvas, save_figures
 from factorgraph_dvl.report.figures.error_budget import error_budget_figure
 from factorgraph_dvl.report.figures.residuals import residuals_figure
 from factorgraph_dvl.report.figures.trajectory import motion_figure, track_figure
 from factorgraph_dvl.solution import Residuals, Solution, Trajectory
 from factorgraph_dvl.trial import PlanarTrial, Trial
+
+# Draws into a part of a figure, or into a new one.
+Drawing = Callable[[SubFigure | None], Canvas]
 
 _LARGEST_TRAJECTORY = 20_000
 
@@ -45,30 +54,66 @@ def write_figures(trial: Trial | PlanarTrial, solution: Solution, folder: Path) 
         `error_budget.png`.
     """
     folder.mkdir(parents=True, exist_ok=True)
+    figures = {name: draw(None) for name, draw in drawings(solution, trial).items()}
+    return save_figures(figures, folder, solution.verdict)
+
+
+def plot(
+    solution: Solution,
+    figure: str = "calibration",
+    *,
+    trial: Trial | PlanarTrial | None = None,
+    axes: Axes | None = None,
+) -> Canvas:
+    """Draw one figure of a solution; see `Solution.plot`."""
+    known = drawings(solution, trial)
+    if figure not in known:
+        raise ConfigError(f"there is no figure {figure!r}", expected=f"one of {', '.join(known)}")
+    return known[figure](None if axes is None else _place_of(axes))
+
+
+def drawings(solution: Solution, trial: Trial | PlanarTrial | None) -> dict[str, Drawing]:
+    """Return by name what draws each figure of a solution for which there is something to draw."""
     thinned = replace(solution, trajectory=_thinned(solution.trajectory))
-    reference = trial.reference
+    reference = None if trial is None else trial.reference
     errors = trajectory_errors(thinned, reference) if reference is not None else None
     if errors is not None and errors.time.size == 0:
         errors = None
-
-    figures = {
-        "track": track_figure(trial, thinned.trajectory, errors, solution.hypotheses[1:]),
-        "motion": motion_figure(solution.trajectory, errors),
-    }
+    figures: dict[str, Drawing] = {}
+    if solution.trajectory.time.size:
+        others = solution.hypotheses[1:]
+        figures["track"] = lambda into: track_figure(
+            trial, thinned.trajectory, errors, others, into=into
+        )
+        figures["motion"] = lambda into: motion_figure(solution.trajectory, errors, into=into)
     for sensor, group in _by_sensor(solution.residuals).items():
-        figures[f"{sensor.lower()}_residuals"] = residuals_figure(group)
-    if trial.beams is not None and calibrates(solution, trial.beams):
+        figures[f"{sensor.lower()}_residuals"] = partial(_residuals, group)
+    if trial is not None and trial.beams is not None and calibrates(solution, trial.beams):
         quality = beam_quality(trial.beams, calibration_of(trial.beams, solution))
         if np.isfinite(quality.error_velocity).any():
-            figures["beam_quality"] = beam_quality_figure(quality)
+            figures["beam_quality"] = lambda into: beam_quality_figure(quality, into=into)
     if solution.estimates:
-        figures["calibration"] = calibration_figure(solution, trial.calibration_truth)
+        truth = {} if trial is None else trial.calibration_truth
+        figures["calibration"] = lambda into: calibration_figure(solution, truth, into=into)
     if np.count_nonzero(np.diagonal(solution.covariance) > 0.0) > 1:
-        figures["correlation"] = correlation_figure(solution)
+        figures["correlation"] = lambda into: correlation_figure(solution, into=into)
     if solution.error_budget:
-        figures["error_budget"] = error_budget_figure(solution)
+        figures["error_budget"] = lambda into: error_budget_figure(solution, into=into)
+    return figures
 
-    return save_figures(figures, folder, solution.verdict)
+
+def _residuals(group: Sequence[Residuals], into: SubFigure | None) -> Canvas:
+    return residuals_figure(group, into=into)
+
+
+def _place_of(axes: Axes) -> SubFigure:
+    """Return an empty part of a figure in the place of axes, which it takes out of the figure."""
+    figure, place = axes.figure, axes.get_position()
+    axes.remove()
+    part = figure.add_subfigure(GridSpec(1, 1, cast(Figure, figure))[0, 0])
+    # Matplotlib places a part by the ratios of its grid alone.
+    part.bbox_relative.p0, part.bbox_relative.p1 = place.p0, place.p1
+    return part
 
 
 def _thinned(trajectory: Trajectory) -> Trajectory:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
+from matplotlib.figure import SubFigure
 from matplotlib.gridspec import SubplotSpec
 
 from factorgraph_dvl.analysis.error_statistics import TrajectoryErrors
@@ -20,6 +20,8 @@ from factorgraph_dvl.report.figures.drawing import (
     MEDIUM,
     NORMAL,
     TITLE,
+    Canvas,
+    canvas,
     clock,
     draw_error,
     draw_line,
@@ -28,7 +30,6 @@ from factorgraph_dvl.report.figures.drawing import (
     envelope,
     error_title,
     is_dense,
-    new_figure,
     new_grid,
     style,
 )
@@ -43,20 +44,22 @@ _CLOSE_UP_INTERVALS = 20
 
 
 def track_figure(
-    trial: Trial | PlanarTrial,
+    trial: Trial | PlanarTrial | None,
     trajectory: Trajectory,
     errors: TrajectoryErrors | None,
     others: Sequence[Hypothesis] = (),
-) -> Figure:
+    *,
+    into: SubFigure | None = None,
+) -> Canvas:
     """Draw the track from above, and position errors (or standard deviations) over time."""
-    figure = new_figure(11.0, 5.6)
+    figure = canvas(11.0, 5.6, into)
     grid = new_grid(figure, 3, 2, width_ratios=(1.25, 1.0))
     ax = figure.add_subplot(grid[:, 0])
     frame = LocalFrame(*trajectory.geodetic[0])
     track = frame.position(*trajectory.geodetic.T)
     span = float(np.ptp(track[:, :2], axis=0).max())
     unit, scale = ("km", 1e-3) if span > 20e3 else ("m", 1.0)
-    if trial.gnss is not None:
+    if trial is not None and trial.gnss is not None:
         fixes = trial.gnss.geodetic[~np.isnan(trial.gnss.geodetic[:, 0])]
         if fixes.size:
             fixes_n = frame.position(*fixes[:: -(-len(fixes) // 2000)].T) * scale
@@ -74,11 +77,11 @@ def track_figure(
         other_n = frame.position(*other.trajectory.geodetic.T) * scale
         label = "other hypotheses" if i == 0 else None
         ax.plot(other_n[:, 0], other_n[:, 1], color=MEDIUM, lw=1.2, label=label)
-    if trial.beacons is not None:
+    if trial is not None and trial.beacons is not None:
         beacons_n = frame.position(*trial.beacons.places.T) * scale
         ax.plot(beacons_n[:, 0], beacons_n[:, 1], "^", color=DARK, markersize=8, label="beacon")
     ax.plot(track[:, 0] * scale, track[:, 1] * scale, color=ACCENT, lw=1.5, label="estimate")
-    if trial.reference is not None:
+    if trial is not None and trial.reference is not None:
         truth_n = _reference_track(trial.reference, trajectory, frame) * scale
         ax.plot(truth_n[:, 0], truth_n[:, 1], color=DARK, lw=0.9, dashes=(5, 4), label="reference")
     ax.plot(0.0, 0.0, "o", color=DARK, markerfacecolor="white", markersize=7, label="start")
@@ -101,7 +104,9 @@ def track_figure(
     return figure
 
 
-def motion_figure(trajectory: Trajectory, errors: TrajectoryErrors | None) -> Figure:
+def motion_figure(
+    trajectory: Trajectory, errors: TrajectoryErrors | None, *, into: SubFigure | None = None
+) -> Canvas:
     """Draw attitude and velocity, and their errors (or standard deviations), over time.
 
     If one of them swings too fast to be seen over the whole time, some seconds of all are
@@ -113,6 +118,8 @@ def motion_figure(trajectory: Trajectory, errors: TrajectoryErrors | None) -> Fi
         With all its epochs: of fewer, a swing may look like another.
     errors : TrajectoryErrors or None
         Of the same or of fewer epochs, if there is a reference.
+    into : SubFigure, optional
+        Where to draw; by default a new figure.
     """
     start, time_label = clock(trajectory.time)
     time = trajectory.time - start
@@ -129,7 +136,7 @@ def motion_figure(trajectory: Trajectory, errors: TrajectoryErrors | None) -> Fi
     # A planar trial measures neither roll nor pitch.
     shown = [i for i, row in enumerate(rows) if np.any(row[1]) or not np.isnan(row[2]).all()]
     close_up = _close_up(time) if any(is_dense(value) for _, value, _, _ in rows) else None
-    figure = new_figure(11.0 if close_up is None else 13.5, 1.5 * len(shown))
+    figure = canvas(11.0 if close_up is None else 13.5, 1.5 * len(shown), into)
     grid = new_grid(figure, len(shown), 2, width_ratios=(1.0 if close_up is None else 1.35, 1.0))
     columns: list[list[Axes]] = [[], [], []]
     for k, i in enumerate(shown):
@@ -172,7 +179,7 @@ def _close_up(time: Array) -> slice:
 
 
 def _panel(
-    figure: Figure,
+    figure: Canvas,
     cell: SubplotSpec,
     column: list[Axes],
     *,
