@@ -451,6 +451,13 @@ class Code(StrEnum):
         "Values and standard deviations come from the rest; smaller errors may have passed.",
         "Look at rejected.csv; check bottom lock and fixes at these times.",
     )
+    CHANGED_ALONG_TRIAL = (
+        "changed_along_trial",
+        "A parameter is not the same all along the trial.",
+        "A mount that slips, a false lock or a clock that steps make a mean that holds nowhere.",
+        "Check mount, lock and clock at that time; solve what came before and after apart.",
+        "error",
+    )
     NOISE_NOT_SETTLED = (
         "noise_not_settled",
         "The noise of a sensor comes out the larger the more of it is allowed for.",

@@ -23,6 +23,7 @@ from factorgraph_dvl.solution import (
 )
 from factorgraph_dvl.solvers.calibration import calibration
 from factorgraph_dvl.solvers.causes import causes
+from factorgraph_dvl.solvers.change_along_trial import change_findings
 from factorgraph_dvl.solvers.correlated_noise import noise_of
 from factorgraph_dvl.solvers.fixed_directions import SolvedProblem
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum
@@ -71,6 +72,7 @@ def summarise(trial: Trial, found: SolvedProblem, *, rate_hz: float) -> Solution
     findings += prior_findings(trial, estimates, covariance)
     findings += mostly_rejected(residuals, [r for r in rejected if r.reason == "echo"])
     findings += outlier_findings(residuals, [r for r in rejected if r.reason != "echo"])
+    findings += change_findings(found)
     findings += _unobservable(trial, problem, estimates, evaluation.motions)
     return Solution(
         trial=trial.name,

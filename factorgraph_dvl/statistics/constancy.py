@@ -1,0 +1,111 @@
+"""Score tests of a change along a trial: are parameters the same all the time."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.graph.problem import Rows
+from factorgraph_dvl.statistics.rows import product
+
+# Intervals in which a trial is divided. Chosen: a change is found to half a percent of the trial.
+INTERVALS = 200
+# Least share of a parameter's information that either side of a change must have. Chosen: with
+# less, a few measurements would decide.
+_LEAST_SHARE = 0.05
+# Share of the variance that must be left once all parameters follow what came before. Chosen: of
+# less, rounding is most.
+_LEAST_LEFT = 1e-6
+
+
+@dataclass(frozen=True)
+class Change:
+    """The most probable change of a component along a trial.
+
+    Parameters
+    ----------
+    chi2 : float
+        Twice the fall of the cost if the component changed then, one degree of freedom.
+    time : float, s
+        When.
+    size, std : float
+        By how much, after less before, in the unit of the component, and how well that is known.
+    """
+
+    chi2: float
+    time: float
+    size: float
+    std: float
+
+    @property
+    def significance(self) -> float:
+        """Size in standard deviations."""
+        return float(np.sqrt(self.chi2))
+
+
+def changes(
+    rows: Iterable[tuple[Rows, Array]],
+    with_components: Mapping[int, Array],
+    covariance: Array,
+    span: tuple[float, float],
+) -> list[Change]:
+    """Return the most probable change of each component of some parameters.
+
+    With the rows' residuals r, their Jacobian J̃ once all else follows the components, and the
+    covariance P of these, the score S and the information I of what was measured up to t make
+
+        S(t) = -sum J̃ᵀ r,    V(t) = I(t) - I(t) P I(t),    chi² = S_i² / V_ii
+
+    for a change of component i at t, all components being free: at the minimum the score of the
+    whole trial, priors included, is zero (Andrews, Tests for parameter instability and structural
+    change with unknown change point, Econometrica 61(4), 1993; Zeileis and Hornik, Generalized
+    M-fluctuation tests for parameter instability, 2007). The most probable time has the largest.
+
+    Parameters
+    ----------
+    rows : iterable of tuple of (Rows, ndarray)
+        Rows of the linearised graph, with the times (M,) of their items, s.
+    with_components : dict of int to ndarray
+        Covariance of every variable with the P components, (size, P) by key.
+    covariance : ndarray, shape (P, P)
+        Of the components.
+    span : tuple of (float, float)
+        First and last time, s.
+    """
+    edges = np.linspace(*span, INTERVALS + 1)[1:-1]
+    scale = np.sqrt(np.diag(covariance))
+    correlation = covariance / np.outer(scale, scale)
+    # Of steps in standard deviations, so that parameters of all sizes keep their digits.
+    whole = np.linalg.inv(correlation)
+    following = {key: (matrix / scale) @ whole for key, matrix in with_components.items()}
+    size = len(covariance)
+    score = np.zeros((INTERVALS, size))
+    information = np.zeros((INTERVALS, size, size))
+    for each, time in rows:
+        J = product(each, following)
+        of_interval = np.searchsorted(edges, time)
+        order = np.argsort(of_interval, kind="stable")
+        present, first = np.unique(of_interval[order], return_index=True)
+        parts = np.einsum("mdi,md->mi", J, each.vector)[order]
+        score[present] -= np.add.reduceat(parts, first, axis=0)
+        for k, at in zip(present, np.split(order, first[1:]), strict=True):
+            block = J[at].reshape(-1, size)
+            information[k] += block.T @ block
+    before = np.cumsum(score, axis=0)[:-1]
+    known = np.cumsum(information, axis=0)[:-1]
+    V = np.diagonal(known - known @ correlation @ known, axis1=1, axis2=2)
+    own, total = np.diagonal(known, axis1=1, axis2=2), np.diag(information.sum(axis=0))
+    share = own / np.maximum(total, np.finfo(float).tiny)
+    allowed = (share > _LEAST_SHARE) & (share < 1.0 - _LEAST_SHARE) & (_LEAST_LEFT * own < V)
+    chi2 = np.where(allowed, before**2 / np.where(allowed, V, 1.0), 0.0)
+    best = np.argmax(chi2, axis=0)
+    out = []
+    for i, k in enumerate(best):
+        std = scale[i] / np.sqrt(V[k, i]) if allowed[k, i] else np.inf
+        # The score of what came before asks for a value there; after it is the other way round.
+        size = -np.sign(before[k, i]) * np.sqrt(chi2[k, i]) * std if allowed[k, i] else 0.0
+        out.append(Change(float(chi2[k, i]), float(edges[k]), float(size), float(std)))
+    return out

@@ -1,0 +1,90 @@
+"""Changes along a trial: found where they are, with their size, and seldom by chance."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+import pytest
+from truth import merged, scenario
+
+from factorgraph_dvl.graph.problem import Rows
+from factorgraph_dvl.sensors.finding import Code
+from factorgraph_dvl.simulation import simulate
+from factorgraph_dvl.solvers.batch import solve
+from factorgraph_dvl.statistics.constancy import changes
+from factorgraph_dvl.statistics.square_root_information import SquareRootInformation
+
+TIME = np.arange(400.0)
+# A constant and a slope along something that has nothing to do with time.
+DESIGN = np.stack([np.ones(400), np.random.default_rng(5).normal(size=400)], axis=1)
+
+
+def fitted(data):
+    """Return the tests of a least-squares fit of DESIGN to data with unit noise."""
+    x = np.linalg.lstsq(DESIGN, data, rcond=None)[0]
+    graph = gtsam.GaussianFactorGraph()
+    graph.add(1, DESIGN, data - DESIGN @ x, gtsam.noiseModel.Unit.Create(400))
+    ordering = gtsam.Ordering()
+    ordering.push_back(1)
+    tree = graph.eliminateMultifrontal(ordering, gtsam.EliminateQR)
+    information = SquareRootInformation(tree, {1: 2})
+    keys = np.ones((400, 1), dtype=int)
+    rows = Rows("y", ("",), keys, (2,), DESIGN[:, None, :], (DESIGN @ x - data)[:, None])
+    functional = {1: np.eye(2)}
+    return changes(
+        [(rows, TIME)],
+        information.covariance_with(functional),
+        information.covariance_of([functional]),
+        (0.0, 399.0),
+    )
+
+
+def exact(data, i, time):
+    """Fall of the sum of squares, and the estimate, when component i changes after a time."""
+    more = np.column_stack([DESIGN, DESIGN[:, i] * (time < TIME)])
+    fits = [np.linalg.lstsq(A, data, rcond=None)[0] for A in (DESIGN, more)]
+    before, after = (
+        np.sum((data - A @ x) ** 2) for A, x in zip((DESIGN, more), fits, strict=True)
+    )
+    return before - after, fits[1][2]
+
+
+@pytest.mark.parametrize("component", [0, 1])
+def test_the_test_is_the_fall_of_the_cost(component):
+    data = np.random.default_rng(1).normal(size=400)
+    data += 1.5 * DESIGN[:, component] * (TIME > 250)
+    test = fitted(data)[component]
+    assert test.time == pytest.approx(250, abs=4.0)
+    fall, size = exact(data, component, test.time)
+    assert test.chi2 == pytest.approx(fall, rel=1e-9)
+    assert test.size == pytest.approx(size, rel=1e-9)
+    assert test.size / test.std == pytest.approx(test.significance)
+
+
+def test_chance_seldom_makes_a_change():
+    rng = np.random.default_rng(0)
+    largest = [max(t.significance for t in fitted(rng.normal(size=400))) for _ in range(150)]
+    assert max(largest) < 5.0
+    # Andrews: one test of a change within 5 to 95 % exceeds 3.6 in one of a hundred.
+    assert np.mean(np.array(largest) > 3.6) < 0.06
+
+
+SCENE = {
+    "noise": True,
+    "sway": merged({}, {"roll": [{"amplitude_deg": 4, "frequency_hz": 0.3}]}),
+    "imu": {"rate_hz": 50, "gyro_noise_deg_sqrt_h": 0.005},
+    "gnss": {"position_std_m": [0.02] * 3, "velocity_std_m_s": [0.02] * 3},
+}
+
+
+def test_a_scale_that_changes_is_found_and_makes_the_result_useless():
+    trial = simulate(scenario(**SCENE), 2)
+    assert not [f for f in solve(trial).findings if f.code == Code.CHANGED_ALONG_TRIAL]
+    velocity = trial.dvl.velocity * np.where(trial.dvl.time[:, None] > 30.0, 1.01, 1.0)
+    changed = solve(replace(trial, dvl=replace(trial.dvl, velocity=velocity)))
+    (finding,) = (f for f in changed.findings if f.code == Code.CHANGED_ALONG_TRIAL)
+    assert finding.parameter == "scale_error"
+    assert "scale_error changes by 0.01" in finding.text
+    assert changed.verdict.grade == "do not use"
