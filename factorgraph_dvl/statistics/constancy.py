@@ -104,8 +104,10 @@ def changes(
     best = np.argmax(chi2, axis=0)
     out = []
     for i, k in enumerate(best):
-        std = scale[i] / np.sqrt(V[k, i]) if allowed[k, i] else np.inf
-        # The score of what came before asks for a value there; after it is the other way round.
-        size = -np.sign(before[k, i]) * np.sqrt(chi2[k, i]) * std if allowed[k, i] else 0.0
-        out.append(Change(float(chi2[k, i]), float(edges[k]), float(size), float(std)))
+        std, change = np.inf, 0.0
+        if allowed[k, i]:
+            std = scale[i] / np.sqrt(V[k, i])
+            # What came before asks for a value by its score, what comes after for the opposite.
+            change = -np.sign(before[k, i]) * np.sqrt(chi2[k, i]) * std
+        out.append(Change(float(chi2[k, i]), float(edges[k]), float(change), float(std)))
     return out
