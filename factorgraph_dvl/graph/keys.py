@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import string
 
-from gtsam import symbol, symbolChr
+from gtsam import symbol, symbolChr, symbolIndex
 from gtsam.symbol_shorthand import B, X
 
 # Chosen: all letters but those of states and biases.
@@ -46,6 +46,11 @@ def is_process(key: int) -> bool:
 def letter_of(key: int) -> str:
     """Return the letter of a key: `x` of states, `b` of biases."""
     return chr(symbolChr(key))
+
+
+def index_of(key: int) -> int:
+    """Return the index of a key: of a node, or of a node of a correlated error."""
+    return int(symbolIndex(key))
 
 
 def letter(size: int) -> str:

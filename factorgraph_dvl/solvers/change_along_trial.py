@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-import gtsam
 import numpy as np
 
 from factorgraph_dvl.geometry.vectors import Array
@@ -87,13 +86,14 @@ def change_findings(found: SolvedProblem) -> Iterator[Finding]:
 def _with_times(problem: Problem, evaluation: Evaluation) -> Iterator[tuple[Rows, Array]]:
     """Yield the rows that belong to times, with these: all but priors."""
     when = {o.label: o.time for o in problem.observations}
-    processes = {p.key(0) >> 56: p.time for p in problem.processes}
+    processes = {keys.letter_of(p.key(0)): p.time for p in problem.processes}
     node_time = problem.chain.segments.node_time
     for rows in rows_by_source(problem, evaluation):
         if rows.source in when:
             yield rows, when[rows.source]
         elif rows.keys.shape[1] > 1:
             first = [int(key) for key in rows.keys[:, 0]]
-            table = processes.get(first[0] >> 56, node_time)
-            if keys.letter_of(first[0]) in "xb" or keys.is_process(first[0]):
-                yield rows, table[[gtsam.symbolIndex(key) for key in first]]
+            letter = keys.letter_of(first[0])
+            if letter in "xb" or letter in processes:
+                table = processes.get(letter, node_time)
+                yield rows, table[[keys.index_of(key) for key in first]]
