@@ -4,7 +4,11 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import time
 from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+
+from factorgraph_dvl.campaign.record import RunRecord
 
 
 def in_two_processes(one, jobs):
@@ -21,3 +25,11 @@ def in_two_processes(one, jobs):
             del os.environ["OMP_NUM_THREADS"]
         else:
             os.environ["OMP_NUM_THREADS"] = before
+
+
+def sleepy_run(label, counts):
+    """Return a record after half a second, and leave a file that it was begun."""
+    begun = Path(counts, f"{label}.{os.getpid()}.{time.monotonic_ns()}")
+    begun.touch()
+    time.sleep(0.5)
+    return RunRecord(name=label, fingerprint="", done=True)

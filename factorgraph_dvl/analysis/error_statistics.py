@@ -139,6 +139,23 @@ class CalibrationErrors:
         m = self.tested
         return float(_nees(self.error[None, m], self.covariance[np.ix_(m, m)][None])[0])
 
+    def without_pull(self, prior: Array, prior_std: Array) -> tuple[Array, Array]:
+        """Return the errors that noise makes (n,), and their covariance (n, n).
+
+        An estimate is drawn from the truth x towards its prior x0: the mean of its error is
+        -P L (x - x0) with the prior's information L, and P - P L P the covariance around it. A
+        truth that is not drawn from the prior shows that pull, seed after seed.
+
+        Parameters
+        ----------
+        prior, prior_std : ndarray, shape (n,)
+            Mean and standard deviations of the prior, in reported units.
+        """
+        information = np.zeros(prior_std.shape)
+        np.divide(1.0, prior_std**2, out=information, where=prior_std > 0.0)
+        gain = self.covariance * information
+        return self.error + gain @ (self.truth - prior), self.covariance - gain @ self.covariance
+
 
 def trajectory_errors(solution: Solution, reference: Reference) -> TrajectoryErrors:
     """Return the errors of a trajectory against a reference.

@@ -11,6 +11,7 @@ from rich.text import Text
 
 from factorgraph_dvl import __version__
 from factorgraph_dvl.cli.allan import allan
+from factorgraph_dvl.cli.campaign import campaign
 from factorgraph_dvl.cli.console import stderr, warn
 from factorgraph_dvl.cli.correct import correct
 from factorgraph_dvl.cli.crosscheck import crosscheck
@@ -56,6 +57,7 @@ for _command in (
     correct,
     allan,
     reproduce,
+    campaign,
 ):
     app.command()(naming_memory(_command))
 # A name that Python keeps for itself.

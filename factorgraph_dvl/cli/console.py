@@ -10,7 +10,15 @@ from time import perf_counter, time
 from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
-from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    SpinnerColumn,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
 from rich.text import Text
 
 from factorgraph_dvl.errors import printable
@@ -81,6 +89,43 @@ class ProgressLine:
         elif not self._quiet:
             elapsed = perf_counter() - self._start
             self._console.print(f"{elapsed:7.1f} s  {text}", markup=False, soft_wrap=True)
+
+
+class CountLine:
+    """A bar of runs that have ended, with the time left: live on a terminal, otherwise lines."""
+
+    def __init__(self, total: int, *, quiet: bool) -> None:
+        self._quiet, self._total, self._done = quiet, total, 0
+        self._start = perf_counter()
+        self._console = stderr()
+        self._live = Progress(
+            BarColumn(),
+            MofNCompleteColumn(),
+            TimeElapsedColumn(),
+            TimeRemainingColumn(),
+            TextColumn("{task.description}", markup=False),
+            console=self._console,
+            transient=True,
+            disable=quiet or not self._console.is_terminal,
+        )
+        self._task = self._live.add_task("", total=total)
+
+    def __enter__(self) -> CountLine:
+        self._live.start()
+        return self
+
+    def __exit__(self, *ended: object) -> None:
+        self._live.stop()
+
+    def __call__(self, text: str) -> None:
+        """Count one more, and say which."""
+        self._done += 1
+        if self._console.is_terminal:
+            self._live.update(self._task, advance=1, description=printable(text))
+        elif not self._quiet:
+            elapsed = perf_counter() - self._start
+            line = f"{elapsed:7.1f} s  {self._done} of {self._total}: {text}"
+            self._console.print(line, markup=False, soft_wrap=True)
 
 
 def print_written(out: Path) -> None:

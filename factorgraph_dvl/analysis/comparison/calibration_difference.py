@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,8 +17,9 @@ from factorgraph_dvl.geometry.rotations import exp_so3, log_so3
 from factorgraph_dvl.geometry.unit_vectors import turns_to
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array
-from factorgraph_dvl.solution import Estimate, Solution
+from factorgraph_dvl.solution import Calibration, Estimate, Solution
 
+_Result = TypeVar("_Result", Solution, Calibration)
 Side = Literal["A", "B"]
 Verdict = Literal["agree", "differ", "not comparable"]
 Kind = Literal["upper bound", "Hausman", "A alone", "B alone", "none"]
@@ -181,7 +182,7 @@ def joint_test(a: Solution, b: Solution, components: tuple[Component, ...]) -> J
     )
 
 
-def same_branch(solution: Solution, other: Solution) -> Solution:
+def same_branch(solution: _Result, other: Solution | Calibration) -> _Result:
     """Return a solution with its rotation vectors on the same branch as another's.
 
     Beam directions become turns of the other's nominal directions.
@@ -215,7 +216,7 @@ def same_branch(solution: Solution, other: Solution) -> Solution:
     return replace(solution, estimates=tuple(estimates), covariance=covariance)
 
 
-def _about_the_same(estimate: Estimate, other: Solution) -> Estimate:
+def _about_the_same(estimate: Estimate, other: Solution | Calibration) -> Estimate:
     """Return directions as turns of the other's nominal ones, to first order."""
     theirs = next((e for e in other.estimates if e.name == estimate.name), None)
     if theirs is None or theirs.nominal is None or theirs.value.size != estimate.value.size:

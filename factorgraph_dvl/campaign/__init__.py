@@ -1,0 +1,1 @@
+"""Many trials: each solved, one joint calibration of all, and what changed between them."""

@@ -1,0 +1,156 @@
+"""Joint calibration of many trials, with what varies, steps and drifts between them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import chdtrc, logsumexp
+
+from factorgraph_dvl.campaign.between_trials import fitted, probabilities
+from factorgraph_dvl.campaign.changes import FALSE_ALARM, Change, next_step, step_scores
+from factorgraph_dvl.campaign.covariates import Slope, slopes
+from factorgraph_dvl.campaign.drift import Drift, drift_of
+from factorgraph_dvl.campaign.information import Information
+from factorgraph_dvl.campaign.model import Effect, Fit, fit
+from factorgraph_dvl.geometry.vectors import Array
+
+
+@dataclass(frozen=True)
+class JointCalibration:
+    """The calibration that trials share, as it is in the last of them.
+
+    Parameters
+    ----------
+    information : Information
+        Of the N trials on n components, in order.
+    days : ndarray, shape (N,)
+        Times of the trials; their numbers where dates are not known.
+    fit : Fit
+        With variance between trials, changes, slopes and drifts.
+    variance_probability : ndarray, shape (n,)
+        Of each variance between trials, if there were none.
+    changes : tuple of Change
+        Steps between trials, in order.
+    slopes : tuple of Slope
+        Components that follow covariates.
+    drifts : tuple of Drift
+        Components that walk at random.
+    """
+
+    information: Information
+    days: Array
+    fit: Fit
+    variance_probability: Array
+    changes: tuple[Change, ...]
+    slopes: tuple[Slope, ...]
+    drifts: tuple[Drift, ...]
+
+    @property
+    def value(self) -> Array:
+        """Values in the last trial, with its covariates, (n,), in reported units."""
+        return self.fit.value_in(-1)[0]
+
+    @property
+    def covariance(self) -> Array:
+        """Covariance of `value`, (n, n)."""
+        return self.fit.value_in(-1)[1]
+
+    @property
+    def between_std(self) -> Array:
+        """Standard deviation between trials, (n,), in reported units."""
+        return np.asarray(np.sqrt(self.fit.variance) * self.fit.scale)
+
+    @property
+    def shared(self) -> Fit:
+        """The fit of nodes that all trials share, without variation between them."""
+        return fit(self.information, np.zeros(self.fit.size))
+
+    @property
+    def probability(self) -> float:
+        """Probability of trials as far from the fit by chance."""
+        freedom = self.fit.freedom
+        return float(chdtrc(freedom, self.fit.statistic)) if freedom > 0.0 else 1.0
+
+    def step(self, i: int) -> tuple[float, float]:
+        """Return size and standard deviation of a change, in reported units."""
+        return self.fit.effect(i)
+
+    def slope(self, i: int) -> tuple[float, float]:
+        """Return a slope and its standard deviation, by unit of the covariate."""
+        return self.fit.effect(len(self.changes) + i)
+
+
+def joint_calibration(
+    information: Information, days: Array, covariates: Mapping[str, Array] | None = None
+) -> JointCalibration:
+    """Return the joint calibration of trials, and what changed between them.
+
+    Slopes are found first, then steps, one after the other; a step on a component of which a
+    walk at random is more likely makes it a drift.
+
+    Parameters
+    ----------
+    information : Information
+        Of N trials, in order.
+    days : ndarray, shape (N,)
+        Times of the trials.
+    covariates : mapping of str to ndarray, shape (N,), optional
+        What components may follow.
+    """
+    follow = slopes(information, covariates or {})
+    fixed = [s.effect for s in follow]
+    found: list[Change] = []
+    drifts: list[Drift] = []
+    count = information.square.size
+
+    def effects() -> list[Effect]:
+        moved = [change.effect(count) for change in found]
+        return [*moved, *fixed, *(e for d in drifts for e in d.effects(days))]
+
+    while len(found) < count - 1:
+        change = next_step(information, effects(), [d.component for d in drifts])
+        if change is None:
+            break
+        drift = _more_likely_drift(information, effects(), change, days)
+        if drift is None:
+            found.append(change)
+        else:
+            found = [c for c in found if c.component != drift.component]
+            drifts.append(drift)
+    found.sort(key=lambda change: change.after)
+    best = fitted(information, effects())
+    p = probabilities(best)
+    for k in np.flatnonzero((best.variance > 0.0) & (p < FALSE_ALARM)):
+        candidate = drift_of(information, best, int(k), days)
+        if candidate is not None and candidate[0].probability < FALSE_ALARM / best.size:
+            drifts.append(candidate[0])
+    if drifts:
+        best = fitted(information, effects())
+        p = probabilities(best)
+    return JointCalibration(information, days, best, p, tuple(found), follow, tuple(drifts))
+
+
+def _more_likely_drift(
+    information: Information, effects: Sequence[Effect], change: Change, days: Array
+) -> Drift | None:
+    """Return the drift that is more likely than a step, None if it is the step.
+
+    Of either the variance is estimated; the step is as likely after each trial.
+    """
+    before = fitted(information, effects)
+    candidate = drift_of(information, before, change.component, days)
+    if candidate is None:
+        return None
+    step = change.effect(information.square.size)
+    with_step = fitted(information, [*effects, step])
+    alone = fit(information, with_step.variance, effects)
+    scores = step_scores(alone)
+    # Of a step of this variance, in units of the variance of each estimate of it.
+    ratio = with_step.effect(len(effects))[0] ** 2 / scores.std[change.component] ** 2
+    statistic = scores.statistic[change.component]
+    gains = 0.5 * (statistic**2 * ratio / (1.0 + ratio) - np.log1p(ratio))
+    gain = alone.likelihood - before.likelihood + float(logsumexp(gains)) - np.log(gains.size)
+    drift, gain_of_drift = candidate
+    return drift if gain_of_drift > gain else None

@@ -1,0 +1,174 @@
+"""Linear mixed model of many trials: a common value, effects, and variation between trials."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from factorgraph_dvl.campaign.information import Information
+from factorgraph_dvl.geometry.vectors import Array
+
+
+@dataclass(frozen=True)
+class Effect:
+    """What moves one component by a factor of its own in each trial.
+
+    Parameters
+    ----------
+    component : int
+        That it moves.
+    profile : ndarray, shape (N,)
+        By how many of its sizes, in each trial.
+    variance : float, optional
+        Of its size before the trials, in reported units; infinite by default.
+    """
+
+    component: int
+    profile: Array
+    variance: float = np.inf
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Common value and effects, given the variance between trials, in units of `scale`.
+
+    Trial i has the value μ + Σ effects + b_i with b_i ~ N(0, T). With its information Λ and
+    weighted value η the inverse covariance of its value is W = Λ (I + T Λ)⁻¹: without Λ⁻¹.
+
+    Parameters
+    ----------
+    information : Information
+        Of the trials.
+    effects : tuple of Effect
+        That are estimated.
+    scale : ndarray, shape (n,)
+        Of each component, in reported units.
+    variance : ndarray, shape (n,)
+        Between trials, T.
+    weight : ndarray, shape (N, n, n)
+        The inverse covariance of each trial, W.
+    design : ndarray, shape (N, n, n + p)
+        Derivative of the value of each trial by common value and effects.
+    covariance : ndarray, shape (n + p, n + p)
+        Of common value and effects.
+    estimate : ndarray, shape (n + p,)
+        Common value, relative to the origin, and sizes of the effects.
+    score : ndarray, shape (N, n)
+        Residual of each trial times W.
+    likelihood : float
+        Logarithm of the restricted likelihood, up to a constant.
+    statistic : float
+        Sum of squared normalised residuals of the trials.
+    freedom : float
+        Its degrees of freedom: what the trials inform on less what they determine.
+    """
+
+    information: Information
+    effects: tuple[Effect, ...]
+    scale: Array
+    variance: Array
+    weight: Array = field(repr=False)
+    design: Array = field(repr=False)
+    covariance: Array = field(repr=False)
+    estimate: Array = field(repr=False)
+    score: Array = field(repr=False)
+    likelihood: float
+    statistic: float
+    freedom: float
+
+    @property
+    def size(self) -> int:
+        """Number of components."""
+        return int(self.variance.size)
+
+    @property
+    def leverage(self) -> Array:
+        """Variance that the estimate takes from each score, W X A⁻¹ Xᵀ W, diagonal, (N, n)."""
+        spread = self.weight @ self.design
+        return np.asarray(np.einsum("ikp,pq,ikq->ik", spread, self.covariance, spread))
+
+    def value_in(self, trial: int) -> tuple[Array, Array]:
+        """Return the expected value of a trial (n,) and its covariance, in reported units."""
+        row = self.design[trial] * self.scale[:, None]
+        value = self.information.origin + row @ self.estimate
+        return value, row @ self.covariance @ row.T
+
+    def effect(self, i: int) -> tuple[float, float]:
+        """Return size and standard deviation of an effect, in reported units."""
+        k, at = self.effects[i].component, self.size + i
+        std = float(np.sqrt(self.covariance[at, at]))
+        return float(self.scale[k] * self.estimate[at]), float(self.scale[k] * std)
+
+
+def scale_of(information: Information) -> Array:
+    """Return a scale of each component (n,): the σ of all trials and the prior together."""
+    diagonal = np.einsum("ikk->k", information.matrix) + information.prior_std**-2
+    return np.asarray(diagonal**-0.5)
+
+
+def fit(information: Information, variance: Array, effects: Sequence[Effect] = ()) -> Fit:
+    """Estimate common value and effects by generalised least squares.
+
+    Parameters
+    ----------
+    information : Information
+        Of N trials on n components.
+    variance : ndarray, shape (n,)
+        Between trials, in units of `scale_of`.
+    effects : sequence of Effect, optional
+        To estimate with the common value.
+    """
+    scale = scale_of(information)
+    n, count = scale.size, information.square.size
+    Lambda = information.matrix * np.outer(scale, scale)
+    eta = information.weighted * scale
+    shrink = np.linalg.inv(np.eye(n) + Lambda * variance)
+    weight = shrink @ Lambda
+    weight = 0.5 * (weight + weight.transpose(0, 2, 1))
+    weighted = np.einsum("ikl,il->ik", shrink, eta)
+    p = len(effects)
+    design = np.zeros((count, n, n + p))
+    design[:, range(n), range(n)] = 1.0
+    prior = np.zeros(n + p)
+    prior[:n] = (scale / information.prior_std) ** 2
+    for j, e in enumerate(effects):
+        design[:, e.component, n + j] = e.profile
+        prior[n + j] = scale[e.component] ** 2 / e.variance
+    offset = np.zeros(n + p)
+    offset[:n] = (information.prior_mean - information.origin) / scale
+    spread = weight @ design
+    normal = np.einsum("ikp,ikq->pq", design, spread) + np.diag(prior)
+    right = np.einsum("ikp,ik->p", design, weighted) + prior * offset
+    # In units of its diagonal: effects of unlike sizes have unlike information.
+    unit = np.sqrt(np.diag(normal))
+    root = np.linalg.cholesky(normal / np.outer(unit, unit))
+    inverse = np.linalg.inv(root) / unit
+    covariance = inverse.T @ inverse
+    estimate = covariance @ right
+    score = weighted - np.einsum("ikp,p->ik", spread, estimate)
+    # x W x = x Λ x - ηᵀ (I + T Λ)⁻¹ T η
+    total = float(information.square.sum())
+    total -= float(np.einsum("ik,k,ikl,il->", eta, variance, shrink, eta))
+    total += float(prior @ offset**2)
+    whole = max(total - float(estimate @ right), 0.0)
+    off = estimate - offset
+    determinant = float(np.linalg.slogdet(np.eye(n) + Lambda * variance)[1].sum())
+    determinant += 2.0 * float(np.log(np.diag(root)).sum() + np.log(unit).sum())
+    finite = prior[n:] > 0.0
+    determinant -= float(np.log(prior[n:][finite]).sum())
+    return Fit(
+        information,
+        tuple(effects),
+        scale,
+        np.asarray(variance, dtype=float),
+        weight,
+        design,
+        covariance,
+        estimate,
+        score,
+        -0.5 * (determinant + whole),
+        max(whole - float(prior @ off**2), 0.0),
+        float(information.rank.sum()) - n - p + float(prior @ np.diag(covariance)),
+    )

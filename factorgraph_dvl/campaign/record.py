@@ -1,0 +1,111 @@
+"""Records of the runs of a campaign: what went in, how it ended, what it took."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import TypeVar
+
+import msgspec
+
+from factorgraph_dvl import __version__
+
+# Bytes that are read at once for a fingerprint.
+_BLOCK = 1 << 20
+
+
+class RunRecord(msgspec.Struct, kw_only=True):
+    """How a run ended.
+
+    Parameters
+    ----------
+    name : str
+        Of the trial, or the number of the seed.
+    fingerprint : str
+        Of all that the run depends on; see `fingerprint_of`.
+    done : bool
+        Whether it has a result.
+    error : str, optional
+        Why it has none.
+    epoch : str, optional
+        Of the trial, ISO 8601.
+    wall_s, cpu_s, peak_bytes : float or int, optional
+        What it took.
+    result : str, optional
+        SHA-256 of the file with its result, by which one that was changed is known.
+    prior_names : list of str, optional
+        Components that an earlier calibration was the prior of.
+    prior_covariance : list of list of float, optional
+        Of these, in reported units.
+    """
+
+    name: str
+    fingerprint: str
+    done: bool
+    error: str = ""
+    epoch: str = ""
+    wall_s: float = 0.0
+    cpu_s: float = 0.0
+    peak_bytes: int = 0
+    result: str = ""
+    prior_names: list[str] = msgspec.field(default_factory=list)
+    prior_covariance: list[list[float]] = msgspec.field(default_factory=list)
+
+
+_Record = TypeVar("_Record", bound=RunRecord)
+
+
+def write_record(record: RunRecord, path: Path) -> None:
+    """Write a record, complete or not at all."""
+    write_whole(path, msgspec.json.encode(record))
+
+
+def write_whole(path: Path, content: bytes) -> None:
+    """Write a file that appears complete or not at all, also if its folder is new."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        partial.write_bytes(content)
+        partial.replace(path)
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def read_record(path: Path, kind: type[_Record]) -> _Record | None:
+    """Return a record, None where there is none that can be read."""
+    try:
+        return msgspec.json.decode(path.read_bytes(), type=kind)
+    except (OSError, msgspec.MsgspecError):
+        return None
+
+
+def fingerprint_of(files: Iterable[Path], options: Mapping[str, str]) -> str:
+    """Return a hash of the content of files, of options, and of the version of the program.
+
+    Parameters
+    ----------
+    files : iterable of path-like
+        That a run reads; those that do not exist count as empty.
+    options : mapping of str to str
+        What else its result depends on.
+    """
+    total = hashlib.sha256(__version__.encode())
+    for name, value in sorted(options.items()):
+        total.update(f"\0{name}\0{value}".encode())
+    for file in files:
+        total.update(f"\0{file.name}\0{hash_of(file)}".encode())
+    return total.hexdigest()
+
+
+def hash_of(path: Path) -> str:
+    """Return the SHA-256 of a file; empty if it does not exist."""
+    total = hashlib.sha256()
+    try:
+        with path.open("rb") as file:
+            while block := file.read(_BLOCK):
+                total.update(block)
+    except OSError:
+        return ""
+    return total.hexdigest()

@@ -1,0 +1,198 @@
+"""The command `campaign`: many trials, or many seeds of a scenario."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from factorgraph_dvl.cli.console import CountLine, stderr, stdout, warn
+from factorgraph_dvl.cli.options import Anyway, Force, NoFigures, Quiet, claim_output
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from factorgraph_dvl.campaign.cluster import Run
+    from factorgraph_dvl.campaign.record import RunRecord
+    from factorgraph_dvl.campaign.trials import Campaign
+
+
+def campaign(
+    trials: Annotated[
+        list[Path],
+        typer.Argument(metavar="TRIAL...", help="Trial folders; or a scenario, with --seeds."),
+    ],
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder to write.")],
+    seeds: Annotated[
+        int | None, typer.Option(metavar="N", min=1, help="Simulate a scenario N times.")
+    ] = None,
+    workers: Annotated[
+        int | None,
+        typer.Option(metavar="N", min=1, help="Processes on this machine (one for each core)."),
+    ] = None,
+    scheduler: Annotated[
+        str | None, typer.Option(metavar="ADDRESS", help="A Dask scheduler that is running.")
+    ] = None,
+    covariates: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Table of what parameters may follow: temperature."),
+    ] = None,
+    force: Force = False,
+    no_figures: NoFigures = False,
+    anyway: Anyway = False,
+    quiet: Quiet = False,
+) -> None:
+    """Solve many trials, and calibrate all jointly; what is there is not solved again."""
+    from factorgraph_dvl.campaign.files import CAMPAIGN_FILE, OWNED
+    from factorgraph_dvl.campaign.trial_run import TRIALS_FOLDER
+    from factorgraph_dvl.errors import ConfigError
+
+    if workers is not None and scheduler is not None:
+        raise ConfigError("--workers and --scheduler exclude each other", expected="one of them")
+    if seeds is not None and (len(trials) != 1 or covariates is not None):
+        raise ConfigError(
+            "--seeds belongs to one scenario", expected="campaign SCENARIO --seeds N"
+        )
+    for path in trials:
+        if not path.exists():
+            kind = "a trial folder" if seeds is None else "a scenario, a YAML file"
+            raise ConfigError("does not exist", where=str(path), expected=kind)
+    # What an earlier run of this command left is its own, whether it ended or was killed.
+    resumed = any((out / name).exists() for name in (CAMPAIGN_FILE, TRIALS_FOLDER, "seeds"))
+    claim_output(out, force=force or resumed, owned=OWNED, inputs=trials)
+    found = workers, scheduler, quiet
+    if seeds is not None:
+        _run_seeds(trials[0].resolve(), seeds, out.resolve(), *found)
+    else:
+        options = [
+            *(["--no-figures"] if no_figures else []),
+            *(["--anyway"] if anyway else []),
+        ]
+        _run_trials(trials, out.resolve(), options, covariates, anyway, *found)
+
+
+def _run_trials(
+    paths: Sequence[Path],
+    out: Path,
+    options: Sequence[str],
+    covariates: Path | None,
+    anyway: bool,
+    workers: int | None,
+    scheduler: str | None,
+    quiet: bool,
+) -> None:
+    from factorgraph_dvl.campaign.files import write_campaign
+    from factorgraph_dvl.campaign.page import write_page
+    from factorgraph_dvl.campaign.trial_run import run_trial
+    from factorgraph_dvl.campaign.trials import assembled, labels_of, read_covariates
+
+    follow = None if covariates is None else read_covariates(covariates)
+    labels = labels_of(paths)
+    runs: list[Run] = [
+        (run_trial, (str(path.resolve()), label, str(out), tuple(options)))
+        for path, label in zip(paths, labels, strict=True)
+    ]
+    records = _run(runs, labels, out, workers, scheduler, quiet)
+    found = assembled(paths, labels, records, out, anyway=anyway, covariates=follow)
+    write_campaign(found, out)
+    write_page(found, out)
+    _print_campaign(found)
+    stdout().print(f"Wrote {out}", markup=False, soft_wrap=True)
+    _end(len(found.failed))
+
+
+def _run_seeds(
+    scenario: Path,
+    seeds: int,
+    out: Path,
+    workers: int | None,
+    scheduler: str | None,
+    quiet: bool,
+) -> None:
+    from factorgraph_dvl.campaign.files import write_seeds
+    from factorgraph_dvl.campaign.monte_carlo import monte_carlo
+    from factorgraph_dvl.campaign.page import write_seed_page
+    from factorgraph_dvl.campaign.seed_run import SeedRecord, run_seed
+    from factorgraph_dvl.errors import ConfigError
+    from factorgraph_dvl.simulation import load_scenario
+
+    if load_scenario(scenario).planar:
+        raise ConfigError(
+            "there is no imu", where=str(scenario), expected="a scenario with an imu"
+        )
+    labels = [str(seed) for seed in range(seeds)]
+    runs: list[Run] = [(run_seed, (str(scenario), seed, str(out))) for seed in range(seeds)]
+    given = _run(runs, labels, out, workers, scheduler, quiet)
+    records = [
+        r
+        if isinstance(r, SeedRecord)
+        else SeedRecord(name=r.name, fingerprint="", done=False, error=r.error)
+        for r in given
+    ]
+    found = monte_carlo(records)
+    write_seeds(found, records, scenario, out)
+    write_seed_page(found, scenario, seeds, out)
+    if found is not None:
+        for s in (found.nees, *found.ratio, *found.coverage):
+            band = f"{s.low:.4g} to {s.high:.4g}"
+            text = f"{s.name}: {s.value:.4g}, by chance {band}{'' if s.inside else ': OUTSIDE'}"
+            stdout().print(text, markup=False, soft_wrap=True)
+    stdout().print(f"Wrote {out}", markup=False, soft_wrap=True)
+    _end(sum(not r.done for r in records))
+
+
+def _run(
+    runs: Sequence[Run],
+    labels: Sequence[str],
+    out: Path,
+    workers: int | None,
+    scheduler: str | None,
+    quiet: bool,
+) -> list[RunRecord]:
+    """Return the records of runs, in their order, with progress."""
+    from factorgraph_dvl.campaign.cluster import connected, default_workers, records
+
+    found: dict[int, RunRecord] = {}
+    count = min(workers or default_workers(), len(runs))
+    with connected(count, scheduler) as client, CountLine(len(runs), quiet=quiet) as progress:
+        out.mkdir(parents=True, exist_ok=True)
+        if not quiet:
+            link = client.dashboard_link
+            stderr().print(f"Dashboard: {link}", markup=False, highlight=False, soft_wrap=True)
+        for i, record in records(client, runs, labels):
+            found[i] = record
+            progress(labels[i] if record.done else f"{labels[i]} FAILED: {record.error}")
+    return [found[i] for i in range(len(runs))]
+
+
+def _print_campaign(found: Campaign) -> None:
+    console = stdout()
+    unused = [t for t in found.trials if t.unused]
+    for t in unused:
+        warn(f"{t.name} is not used: {t.unused}")
+    joint = found.joint
+    if joint is None:
+        warn("no trial has a result that can be used: there is no joint calibration")
+        return
+    from factorgraph_dvl.report.text import with_std
+
+    std = [float(v) ** 0.5 for v in joint.covariance.diagonal()]
+    for k, name in enumerate(joint.information.names):
+        text = f"{name}: {with_std(float(joint.value[k]), std[k])}"
+        text += f", between trials {joint.between_std[k]:.2g}"
+        console.print(text, markup=False, soft_wrap=True)
+    for i, change in enumerate(joint.changes):
+        text = (
+            f"Change after {found.used[change.after].name}: "
+            f"{joint.information.names[change.component]} by {with_std(*joint.step(i))}, "
+            f"p = {change.probability:.1g}"
+        )
+        console.print(text, markup=False, soft_wrap=True)
+
+
+def _end(failed: int) -> None:
+    """End with exit code 1 if runs have no result."""
+    if failed:
+        stderr().print(f"error: {failed} of the runs have no result", markup=False, style="red")
+        raise typer.Exit(1)
