@@ -1,8 +1,9 @@
 """ROS bags: ROS 1, ROS 2 (MCAP, SQLite, folders of either), through rosbags.
 
-Frames are those that ROS states: bodies forward, left, up and the world east, north, up (REP 103),
-navigation solutions in `nav_msgs/Odometry` with their velocity in the body (REP 105). Stamps are
-those of the messages, `received` the time of recording.
+Frames are those that ROS states: the world is east, north, up, and a body forward, left, up
+(REP 103) unless the name of its frame ends in other axes, as `base_link_frd`; velocities in
+`nav_msgs/Odometry` are in the body (REP 105). Stamps are those of the messages, `received` the
+time of recording.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from factorgraph_dvl.errors import DataError
-from factorgraph_dvl.geometry.rotations import rph_from_rotation
+from factorgraph_dvl.geometry.rotations import BodyAxes, rph_from_rotation
 from factorgraph_dvl.geometry.vectors import Array, rotate
 from factorgraph_dvl.io.formats.format import Batch, Format, Kind, empty
 from factorgraph_dvl.io.formats.framing import Records
@@ -39,6 +40,10 @@ _EARLIEST = 1e8
 # Names of topics and frames of velocities that a GNSS receiver measures.
 _GNSS_WORDS = ("gnss", "gps", "fix")
 _REP_103 = "{}: in axes forward, left, up, as REP 103 has it; the message does not say"
+# A velocity belongs to the fix with the same stamp, s.
+_SAME = 1e-3
+TWIST = "geometry_msgs/msg/TwistWithCovarianceStamped"
+FIX = "sensor_msgs/msg/NavSatFix"
 # A message by its number in the file, and when it was recorded, s.
 Message = tuple[int, float, Any]
 
@@ -119,6 +124,7 @@ def _check_ending(path: Path) -> None:
 def _batches(path: Path, reader: Any) -> Iterator[Batch]:
     wanted = [c for c in reader.connections if c.msgtype in CONVERTERS]
     gathered: dict[tuple[str, str], list[Message]] = {}
+    velocities: list[Message] = []
     count, lost, note = 0, 0, ""
     messages = iter(reader.messages(connections=wanted)) if wanted else iter(())
     while True:
@@ -136,16 +142,60 @@ def _batches(path: Path, reader: Any) -> Iterator[Batch]:
             lost, note = lost + 1, f"{lost + 1} messages cannot be read ({describe(error)})"
             continue
         key = connection.topic, connection.msgtype
+        row = count, nanoseconds * 1e-9, message
+        if key[1] == TWIST and _is_gnss(key[0], message):
+            velocities.append(row)
+            continue
         rows = gathered.setdefault(key, [])
-        rows.append((count, nanoseconds * 1e-9, message))
+        rows.append(row)
         if len(rows) >= BLOCK:
-            yield from CONVERTERS[key[1]](key[0], gathered.pop(key))
+            yield from _converted(key, gathered.pop(key), velocities)
     if count == lost and note:
         raise DataError(note, where=path.name, expected="messages that are whole")
-    for (topic, kind), rows in gathered.items():
-        yield from CONVERTERS[kind](topic, rows)
-    if note:
-        yield Batch("clock", empty("clock", 0), notes=(note,))
+    for key, rows in gathered.items():
+        yield from _converted(key, rows, velocities)
+    notes = (note,) if note else ()
+    if velocities:
+        notes += (f"{len(velocities)} velocities of a GNSS receiver without fixes were left out",)
+    if notes:
+        yield Batch("clock", empty("clock", 0), notes=notes)
+
+
+def _converted(
+    key: tuple[str, str], rows: list[Message], velocities: list[Message]
+) -> Iterator[Batch]:
+    topic, kind = key
+    for batch in CONVERTERS[kind](topic, rows):
+        if kind == FIX and velocities:
+            _add_velocities(batch.records, velocities)
+            velocities.clear()
+        yield batch
+
+
+def _is_gnss(topic: str, message: Any) -> bool:
+    name = f"{topic} {message.header.frame_id}".lower()
+    return any(word in name for word in _GNSS_WORDS)
+
+
+def _add_velocities(fixes: Records, velocities: list[Message]) -> None:
+    """Give fixes the velocities, east, north, up, with the same stamps."""
+    bodies = [m for _, _, m in velocities]
+    stamps = _stamped("fix", velocities)["time"]
+    covariances = [m.twist.covariance for m in bodies]
+    order = np.argsort(stamps, kind="stable")
+    place = np.clip(np.searchsorted(stamps[order], fixes["time"] - _SAME), 0, len(order) - 1)
+    nearest = order[place]
+    same = (np.abs(stamps[nearest] - fixes["time"]) <= _SAME)[:, None]
+    velocity = _vectors([m.twist.twist.linear for m in bodies])
+    velocity[_unset(covariances)] = np.nan
+    fixes["velocity"] = np.where(same, velocity[nearest], np.nan)
+    fixes["velocity_std"] = np.where(same, _deviations(covariances)[nearest], np.nan)
+
+
+def _axes(message: Any, usual: BodyAxes) -> BodyAxes:
+    """Return the axes that the name of a frame ends in, or else the usual ones."""
+    ending = str(message.header.frame_id).rpartition("_")[2].upper()
+    return ending if ending in ("RFU", "FRD", "FLU") else usual  # type: ignore[return-value]
 
 
 def _stamped(kind: Kind, messages: list[Message]) -> Records:
@@ -158,7 +208,11 @@ def _stamped(kind: Kind, messages: list[Message]) -> Records:
     return out
 
 
-def _about_stamps(topic: str, records: Records, messages: list[Message]) -> tuple[str, ...]:
+def _about_axes(topic: str, axes: BodyAxes) -> tuple[str, ...]:
+    return (_REP_103.format(topic),) if axes == "FLU" else ()
+
+
+def _about_stamps(topic: str, messages: list[Message]) -> tuple[str, ...]:
     if all(m.header.stamp.sec >= _EARLIEST for _, _, m in messages):
         return ()
     return (f"{topic}: stamps that are no UTC: times of recording were taken",)
@@ -181,35 +235,36 @@ def _unset(covariances: list[Any]) -> NDArray[np.bool_]:
     return np.array([row[0] == -1.0 for row in covariances], bool)
 
 
-def _orientations(quaternions: list[Any]) -> tuple[Array, Array]:
+def _orientations(quaternions: list[Any], axes: BodyAxes) -> tuple[Array, Array]:
     """Return nRb (N, 3, 3) and roll, pitch, heading (N, 3); nan where there is no quaternion."""
     q = np.array([(q.x, q.y, q.z, q.w) for q in quaternions], float)
     norm = np.linalg.norm(q, axis=1)
     good = np.isfinite(norm) & (norm > 0.5)
     nRb = np.full((len(q), 3, 3), np.nan)
     nRb[good] = Rotation.from_quat(q[good]).as_matrix()
-    return nRb, rph_from_rotation(nRb, "FLU")
+    return nRb, rph_from_rotation(nRb, axes)
 
 
 def _imu(topic: str, messages: list[Message]) -> Iterator[Batch]:
     """`sensor_msgs/Imu`: rates and specific force, and the orientation where it has one."""
     bodies = [m for _, _, m in messages]
     out = _stamped("imu", messages)
-    notes = (_REP_103.format(topic), *_about_stamps(topic, out, messages))
+    axes = _axes(bodies[0], "FLU")
+    notes = (*_about_axes(topic, axes), *_about_stamps(topic, messages))
     unset = _unset([m.angular_velocity_covariance for m in bodies])[:, None]
     out["gyro"] = np.where(unset, np.nan, _vectors([m.angular_velocity for m in bodies]))
     unset = _unset([m.linear_acceleration_covariance for m in bodies])[:, None]
     out["accel"] = np.where(unset, np.nan, _vectors([m.linear_acceleration for m in bodies]))
     if np.isfinite(out["gyro"]).any() or np.isfinite(out["accel"]).any():
-        yield Batch("imu", out, "utc", topic, "FLU", notes=notes)
+        yield Batch("imu", out, "utc", topic, axes, notes=notes)
     attitude = _stamped("attitude", messages)
-    nRb, rph = _orientations([m.orientation for m in bodies])
+    nRb, rph = _orientations([m.orientation for m in bodies], axes)
     rph[_unset([m.orientation_covariance for m in bodies])] = np.nan
     # Drivers without an orientation leave the identity there.
     if np.isfinite(rph).any() and not np.array_equal(nRb, np.broadcast_to(np.eye(3), nRb.shape)):
         attitude["roll"], attitude["pitch"], attitude["heading"] = rph.T
         attitude["std"] = _deviations([m.orientation_covariance for m in bodies])
-        yield Batch("attitude", attitude, "utc", topic, "FLU", notes=notes)
+        yield Batch("attitude", attitude, "utc", topic, axes, notes=notes)
 
 
 def _fix(topic: str, messages: list[Message]) -> Iterator[Batch]:
@@ -223,14 +278,15 @@ def _fix(topic: str, messages: list[Message]) -> Iterator[Batch]:
     out["quality"] = [{-1: 0, 0: 1}.get(m.status.status, 2) for m in bodies]
     known = np.array([m.position_covariance_type != 0 for m in bodies])[:, None]
     out["std"] = np.where(known, _deviations([m.position_covariance for m in bodies]), np.nan)
-    yield Batch("fix", out, "utc", topic, notes=_about_stamps(topic, out, messages))
+    yield Batch("fix", out, "utc", topic, notes=_about_stamps(topic, messages))
 
 
 def _odometry(topic: str, messages: list[Message]) -> Iterator[Batch]:
     """`nav_msgs/Odometry`: attitude and velocity; positions are relative to an unknown origin."""
     bodies = [m for _, _, m in messages]
     out = _stamped("ins", messages)
-    nRb, rph = _orientations([m.pose.pose.orientation for m in bodies])
+    axes = _axes(bodies[0], "FLU")
+    nRb, rph = _orientations([m.pose.pose.orientation for m in bodies], axes)
     out["roll"], out["pitch"], out["heading"] = rph.T
     out["velocity"] = rotate(nRb, _vectors([m.twist.twist.linear for m in bodies]))
     # Rotations are the second half of the 6 x 6 covariance.
@@ -241,32 +297,26 @@ def _odometry(topic: str, messages: list[Message]) -> Iterator[Batch]:
         out,
         "utc",
         topic,
-        "FLU",
+        axes,
         notes=(
             f"{topic}: positions are relative to an origin that the message does not state, "
             "and were left out; its world is taken as east, north, up (REP 103)",
-            *_about_stamps(topic, out, messages),
+            *_about_stamps(topic, messages),
         ),
     )
 
 
 def _twist(topic: str, messages: list[Message]) -> Iterator[Batch]:
-    """`geometry_msgs/TwistWithCovarianceStamped`: of a DVL, or of a GNSS receiver by its name."""
+    """`geometry_msgs/TwistWithCovarianceStamped`: of a DVL, where no GNSS receiver is named."""
     bodies = [m for _, _, m in messages]
+    axes = _axes(bodies[0], "FLU")
     velocity = _vectors([m.twist.twist.linear for m in bodies])
     covariances = [m.twist.covariance for m in bodies]
     velocity[_unset(covariances)] = np.nan
-    name = f"{topic} {bodies[0].header.frame_id}".lower()
-    if any(word in name for word in _GNSS_WORDS):
-        out = _stamped("fix", messages)
-        out["velocity"], out["velocity_std"] = velocity, _deviations(covariances)
-        note = f"{topic}: velocities of a GNSS receiver by its name, taken as east, north, up"
-        yield Batch("fix", out, "utc", topic, notes=(note,))
-        return
     out = _stamped("dvl", messages)
     out["axes"], out["velocity"], out["std"] = INSTRUMENT, velocity, _deviations(covariances)
-    notes = (_REP_103.format(topic), *_about_stamps(topic, out, messages))
-    yield Batch("dvl", out, "utc", topic, "FLU", notes=notes)
+    notes = (*_about_axes(topic, axes), *_about_stamps(topic, messages))
+    yield Batch("dvl", out, "utc", topic, axes, notes=notes)
 
 
 def _dvl(topic: str, messages: list[Message]) -> Iterator[Batch]:
@@ -292,8 +342,11 @@ def _pings(kind: Kind, topic: str, messages: list[Message]) -> Batch:
     out["std"] = _deviations([m.velocity_covar for m in bodies])
     speeds = np.array([m.sound_speed for m in bodies], float)
     out["sound_speed"] = np.where(speeds > 0.0, speeds, np.nan)
-    notes = [f"{topic}: axes forward, right, down, as the definition of its messages has them"]
-    notes.extend(_about_stamps(topic, out, messages))
+    axes = _axes(bodies[0], "FRD")
+    notes = []
+    if axes == "FRD":
+        notes.append(f"{topic}: axes forward, right, down, as its messages' definition has them")
+    notes.extend(_about_stamps(topic, messages))
     beams = np.array([m.beam_velocity for m in bodies], float)
     outward = np.array([_vectors(list(m.beam_unit_vec)) for m in bodies])
     given = np.array([m.beam_velocities_valid for m in bodies], bool)[:, None]
@@ -310,14 +363,14 @@ def _pings(kind: Kind, topic: str, messages: list[Message]) -> Batch:
     ranges = np.array([m.range for m in bodies], float)
     given = np.array([m.beam_ranges_valid for m in bodies], bool)[:, None]
     out["range"] = np.where(given & (ranges > 0.0), ranges, np.nan)
-    return Batch(kind, out, "utc", topic, "FRD", notes=tuple(notes))
+    return Batch(kind, out, "utc", topic, axes, notes=tuple(notes))
 
 
 CONVERTERS: dict[str, Callable[[str, list[Message]], Iterator[Batch]]] = {
     "sensor_msgs/msg/Imu": _imu,
-    "sensor_msgs/msg/NavSatFix": _fix,
+    FIX: _fix,
     "nav_msgs/msg/Odometry": _odometry,
-    "geometry_msgs/msg/TwistWithCovarianceStamped": _twist,
+    TWIST: _twist,
     DVL_TYPE: _dvl,
 }
 
