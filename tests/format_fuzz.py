@@ -156,30 +156,6 @@ def seeds():
     }
 
 
-def bag():
-    """Return a ROS 1 bag of the messages of a short trial, by rosbags' own writer."""
-    from rosbags.rosbag1 import Writer
-    from rosbags.typesys import Stores, get_typestore
-
-    # Headers of ROS 1 also have a number, which the conversion adds.
-    store, older = bags.typestore(), get_typestore(Stores.ROS1_NOETIC)
-    older.register({bags.DVL_TYPE: store.fielddefs[bags.DVL_TYPE]})
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "a.bag"
-        with Writer(path) as writer:
-            connections = {}
-            for topic, kind, seconds, data in logs.sea_trial():
-                name = kind.replace("/", "/msg/")
-                if topic not in connections:
-                    text, digest = older.generate_msgdef(name)
-                    connections[topic] = writer.add_connection(
-                        topic, name, msgdef=text, md5sum=digest
-                    )
-                raw = store.cdr_to_ros1(data, name)
-                writer.write(connections[topic], round(seconds * 1e9), raw)
-        return path.read_bytes()
-
-
 def database():
     """Return a ROS 2 bag in SQLite, as recorders before definitions were stored wrote it."""
     with tempfile.TemporaryDirectory() as folder:
@@ -210,7 +186,11 @@ def database():
 LIBRARIES = {
     "bag": (
         bags.FORMAT,
-        {".bag": bag, ".mcap": lambda: logs.mcap(logs.sea_trial(), 4000), ".db3": database},
+        {
+            ".bag": lambda: logs.ros_1_bag(logs.sea_trial()),
+            ".mcap": lambda: logs.mcap(logs.sea_trial(), 4000),
+            ".db3": database,
+        },
     ),
     "ardupilot": (
         ardupilot.FORMAT,

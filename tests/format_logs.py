@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import io
 import struct
+import tempfile
+from pathlib import Path
 
 import format_writers as writers
 import numpy as np
@@ -138,6 +140,33 @@ def mcap(messages, chunk_size=1 << 20):
         writer.add_message(channels[topic], log_time=when, publish_time=when, data=data)
     writer.finish()
     return out.getvalue()
+
+
+def ros_1_bag(messages, chunk_size=4000):
+    """Return a ROS 1 bag of (topic, type, seconds, data), by rosbags' own writer."""
+    from rosbags.rosbag1 import Writer
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    # Headers of ROS 1 also have a number, which the conversion adds.
+    store, older = get_typestore(Stores.ROS2_JAZZY), get_typestore(Stores.ROS1_NOETIC)
+    kind = "marine_acoustic_msgs/msg/Dvl"
+    for one in (store, older):
+        one.register(get_types_from_msg(DEFINITIONS["marine_acoustic_msgs/Dvl"], kind))
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "a.bag"
+        with Writer(path) as writer:
+            writer.chunk_threshold = chunk_size
+            connections = {}
+            for topic, kind, seconds, data in messages:
+                name = kind.replace("/", "/msg/")
+                if topic not in connections:
+                    text, digest = older.generate_msgdef(name)
+                    connections[topic] = writer.add_connection(
+                        topic, name, msgdef=text, md5sum=digest
+                    )
+                raw = store.cdr_to_ros1(data, name)
+                writer.write(connections[topic], round(seconds * 1e9), raw)
+        return path.read_bytes()
 
 
 def sea_trial(count=40):

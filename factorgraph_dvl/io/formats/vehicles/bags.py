@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,20 +21,14 @@ from factorgraph_dvl.errors import DataError
 from factorgraph_dvl.geometry.rotations import BodyAxes, rph_from_rotation
 from factorgraph_dvl.geometry.vectors import Array, rotate
 from factorgraph_dvl.io.formats.format import Batch, Format, Kind, empty
-from factorgraph_dvl.io.formats.framing import Records
-from factorgraph_dvl.io.formats.vehicles.library import (
-    BLOCK,
-    describe,
-    given_up,
-    load,
-    quiet,
-    unreadable,
-)
+from factorgraph_dvl.io.formats.framing import Records, map_file
+from factorgraph_dvl.io.formats.vehicles.damaged_bags import MCAP, ROS_1, Channel, whole_messages
+from factorgraph_dvl.io.formats.vehicles.library import BLOCK, describe, load, quiet
 from factorgraph_dvl.io.formats.velocities import INSTRUMENT
 
 DVL_TYPE = "marine_acoustic_msgs/msg/Dvl"
-_ROS_1, _MCAP, _SQLITE = b"#ROSBAG V2.0\n", b"\x89MCAP0\r\n", b"SQLite format 3\0"
-_ENDINGS = {_ROS_1: ".bag", _MCAP: ".mcap", _SQLITE: ".db3"}
+_SQLITE = b"SQLite format 3\0"
+_ENDINGS = {ROS_1: ".bag", MCAP: ".mcap", _SQLITE: ".db3"}
 # Stamps before 1973 count since some start, as in a simulation.
 _EARLIEST = 1e8
 # Names of topics and frames of velocities that a GNSS receiver measures.
@@ -53,7 +47,7 @@ def share(path: Path, sample: bytes) -> float:
     if path.is_dir():
         return float((path / "metadata.yaml").is_file())
     is_table = sample.startswith(_SQLITE) and b"topics" in sample and b"messages" in sample
-    return float(sample.startswith((_ROS_1, _MCAP)) or is_table)
+    return float(sample.startswith((ROS_1, MCAP)) or is_table)
 
 
 def read(path: Path, mapping: Mapping[str, Any] | None = None) -> Iterator[Batch]:
@@ -75,25 +69,84 @@ def read(path: Path, mapping: Mapping[str, Any] | None = None) -> Iterator[Batch
     ConfigError
         If rosbags is not installed.
     DataError
-        If the bag has no readable index, or nothing in it can be read.
+        If nothing in the bag is whole.
     """
-    rosbags = load("rosbags.highlevel", "bags")
+    load("rosbags.highlevel", "bags")
     _check_ending(path)
+    notes: list[str] = []
+    yield from _batches(path, _messages(path, notes), notes)
+
+
+class Raw(NamedTuple):
+    """A message as it stands in the file.
+
+    Parameters
+    ----------
+    topic, kind : str
+        Name and type, `package/msg/Name`.
+    time : int
+        Of recording, ns since 1970.
+    data : bytes
+        Content.
+    decode : callable
+        Turns content and type into a message.
+    """
+
+    topic: str
+    kind: str
+    time: int
+    data: bytes
+    decode: Callable[[bytes, str], Any]
+
+
+def _messages(path: Path, notes: list[str]) -> Iterator[Raw]:
+    """Read messages by the index of the bag, and without it from where that fails."""
+    latest = -1
+    rosbags = load("rosbags.highlevel", "bags")
     try:
-        reader = rosbags.AnyReader([path], default_typestore=typestore())
         with quiet():
+            reader = rosbags.AnyReader([path], default_typestore=typestore())
             reader.open()
+        try:
+            wanted = [c for c in reader.connections if c.msgtype in CONVERTERS]
+            found = reader.messages(connections=wanted) if wanted else ()
+            for connection, time, data in found:
+                yield Raw(connection.topic, connection.msgtype, time, data, reader.deserialize)
+                latest = max(latest, time)
+        finally:
+            reader.close()
     except Exception as error:  # Of any type: the library does not foresee all damage.
-        raise unreadable(
-            path,
-            error,
-            "a bag with its index",
-            "`rosbag reindex` (ROS 1), `ros2 bag reindex` and `mcap recover` mend cut files",
-        ) from None
+        reason = describe(error)
+    else:
+        return
+    notes.append(f"{path.name} is damaged ({reason}): what is whole in it was read")
+    files = sorted(path.glob("*.mcap")) if path.is_dir() else [path]
+    decoders: dict[Channel, Callable[[bytes, str], Any] | None] = {}
+    for file in files:
+        for channel, time, data in whole_messages(map_file(file)):
+            if channel.kind not in CONVERTERS or time <= latest:
+                continue
+            if channel not in decoders:
+                decoders[channel] = _decoder(channel)
+            if (decode := decoders[channel]) is not None:
+                yield Raw(channel.topic, channel.kind, time, data, decode)
+
+
+def _decoder(channel: Channel) -> Callable[[bytes, str], Any] | None:
+    """Return what turns the messages of a channel into objects, None if its definition is none."""
+    typesys = load("rosbags.typesys", "bags")
+    store = typesys.get_typestore(typesys.Stores.EMPTY)
     try:
-        yield from _batches(path, reader)
-    finally:
-        reader.close()
+        if channel.encoding == "ros2idl":
+            store.register(typesys.get_types_from_idl(channel.definition))
+        else:
+            store.register(typesys.get_types_from_msg(channel.definition, channel.kind))
+    except Exception:  # Of any type: the library does not foresee all damage.
+        return None
+    is_first = channel.encoding == "ros1msg"
+    decode: Callable[[bytes, str], Any]
+    decode = store.deserialize_ros1 if is_first else store.deserialize_cdr
+    return decode
 
 
 def typestore() -> Any:
@@ -121,44 +174,40 @@ def _check_ending(path: Path) -> None:
             )
 
 
-def _batches(path: Path, reader: Any) -> Iterator[Batch]:
-    wanted = [c for c in reader.connections if c.msgtype in CONVERTERS]
+def _batches(path: Path, messages: Iterator[Raw], notes: list[str]) -> Iterator[Batch]:
     gathered: dict[tuple[str, str], list[Message]] = {}
     velocities: list[Message] = []
-    count, lost, note = 0, 0, ""
-    messages = iter(reader.messages(connections=wanted)) if wanted else iter(())
-    while True:
+    count = 0
+    unread: list[BaseException] = []
+    for count, raw in enumerate(messages, 1):
         try:
-            connection, nanoseconds, data = next(messages)
-        except StopIteration:
-            break
-        except Exception as error:  # What was read until here is whole.
-            note = given_up(path, error, count)
-            break
-        count += 1
-        try:
-            message = reader.deserialize(data, connection.msgtype)
-        except Exception as error:
-            lost, note = lost + 1, f"{lost + 1} messages cannot be read ({describe(error)})"
+            message = raw.decode(raw.data, raw.kind)
+        except Exception as error:  # Of any type, as above.
+            unread.append(error)
             continue
-        key = connection.topic, connection.msgtype
-        row = count, nanoseconds * 1e-9, message
-        if key[1] == TWIST and _is_gnss(key[0], message):
+        row = count, raw.time * 1e-9, message
+        if raw.kind == TWIST and _is_gnss(raw.topic, message):
             velocities.append(row)
             continue
+        key = raw.topic, raw.kind
         rows = gathered.setdefault(key, [])
         rows.append(row)
         if len(rows) >= BLOCK:
             yield from _converted(key, gathered.pop(key), velocities)
-    if count == lost and note:
-        raise DataError(note, where=path.name, expected="messages that are whole")
+    if unread:
+        notes.append(f"{path.name}: {len(unread)} messages are damaged ({describe(unread[0])})")
+    if count == len(unread) and notes:
+        raise DataError(
+            f"nothing whole was found in it: {notes[0]}",
+            where=path.name,
+            expected="a bag, cut at most: `ros2 bag reindex` mends those in SQLite",
+        )
     for key, rows in gathered.items():
         yield from _converted(key, rows, velocities)
-    notes = (note,) if note else ()
     if velocities:
-        notes += (f"{len(velocities)} velocities of a GNSS receiver without fixes were left out",)
+        notes.append(f"{len(velocities)} velocities of a GNSS receiver without fixes: left out")
     if notes:
-        yield Batch("clock", empty("clock", 0), notes=notes)
+        yield Batch("clock", empty("clock", 0), notes=tuple(notes))
 
 
 def _converted(
