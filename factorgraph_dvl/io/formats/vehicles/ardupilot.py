@@ -15,15 +15,17 @@ import numpy as np
 
 from factorgraph_dvl.errors import DataError
 from factorgraph_dvl.geometry.units import DEG
-from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.io.formats.clocks import gps_to_utc
 from factorgraph_dvl.io.formats.format import Batch, Format, empty
 from factorgraph_dvl.io.formats.framing import Records, Source, map_file
 from factorgraph_dvl.io.formats.vehicles.library import (
     BLOCK,
+    column,
+    columns,
     given_up,
     load,
     quiet,
+    silently,
     unreadable,
 )
 from factorgraph_dvl.io.formats.velocities import INSTRUMENT
@@ -119,8 +121,8 @@ def _whole(source: Source) -> list[tuple[int, int]]:
         is_whole = 0 < length <= size - at
         if is_whole and head[2] == _FMT:
             defined, length_of = _definition(source[at : at + _FMT_LENGTH])
-            is_whole = length_of > 0
-            lengths |= {defined: length_of} if is_whole else {}
+            # A second definition must be that of the first.
+            is_whole = length_of > 0 and lengths.setdefault(defined, length_of) == length_of
         if is_whole:
             at += length
             continue
@@ -171,7 +173,8 @@ def _batches(path: Path, log: Any, note: str) -> Iterator[Batch]:
             gathered.setdefault(f"{name}[{instance}]", []).append(row)
         for stream, part in gathered.items():
             if part:
-                yield _CONVERTERS[part[0]["mavpackettype"]](stream, part)
+                convert = _CONVERTERS[part[0]["mavpackettype"]]
+                yield from silently(map(convert, [stream], [part]))
                 gathered[stream] = []
         if len(rows) < BLOCK:
             break
@@ -186,30 +189,22 @@ def _next(log: Any) -> Row | None:
     return None if message is None else message.to_dict()
 
 
-def _column(rows: list[Row], name: str) -> Array:
-    return np.array([row.get(name, np.nan) for row in rows], float)
-
-
-def _columns(rows: list[Row], *names: str) -> Array:
-    return np.stack([_column(rows, name) for name in names], axis=1)
-
-
 def _started(out: Records, rows: list[Row]) -> Records:
-    out["at"] = _column(rows, "at")
-    out["received"] = out["time"] = _column(rows, "TimeUS") * _MICROSECOND
+    out["at"] = column(rows, "at")
+    out["received"] = out["time"] = column(rows, "TimeUS") * _MICROSECOND
     return out
 
 
 def _imu(stream: str, rows: list[Row]) -> Batch:
     out = _started(empty("imu", len(rows)), rows)
-    out["gyro"] = _columns(rows, "GyrX", "GyrY", "GyrZ")
-    out["accel"] = _columns(rows, "AccX", "AccY", "AccZ")
+    out["gyro"] = columns(rows, "GyrX", "GyrY", "GyrZ")
+    out["accel"] = columns(rows, "AccX", "AccY", "AccZ")
     return Batch("imu", out, "own", stream, "FRD")
 
 
 def _attitude(stream: str, rows: list[Row]) -> Batch:
     out = _started(empty("attitude", len(rows)), rows)
-    rph = _columns(rows, "Roll", "Pitch", "Yaw") * DEG
+    rph = columns(rows, "Roll", "Pitch", "Yaw") * DEG
     out["roll"], out["pitch"], out["heading"] = rph.T
     note = "ATT: the filter of the autopilot; whether its compass is true depends on its setup"
     return Batch("attitude", out, "own", stream, "FRD", notes=(note,))
@@ -217,22 +212,22 @@ def _attitude(stream: str, rows: list[Row]) -> Batch:
 
 def _fix(stream: str, rows: list[Row]) -> Batch:
     out = _started(empty("fix", len(rows)), rows)
-    week = _column(rows, "GWk")
-    utc = gps_to_utc(week, _column(rows, "GMS") * 1e-3)
+    week = column(rows, "GWk")
+    utc = gps_to_utc(week, column(rows, "GMS") * 1e-3)
     out["time"] = np.where(week >= _FIRST_WEEK, utc, np.nan)
-    lat, lon = _column(rows, "Lat") * DEG, _column(rows, "Lng") * DEG
-    out["lat"], out["lon"], out["altitude"] = lat, lon, _column(rows, "Alt")
+    lat, lon = column(rows, "Lat") * DEG, column(rows, "Lng") * DEG
+    out["lat"], out["lon"], out["altitude"] = lat, lon, column(rows, "Alt")
     accuracy = [row["accuracy"] for row in rows]
-    out["height"] = out["altitude"] + _column(accuracy, "Und")
-    status = _column(rows, "Status")
+    out["height"] = out["altitude"] + column(accuracy, "Und")
+    status = column(rows, "Status")
     known = np.isin(status, np.arange(len(_QUALITY)))
     out["quality"] = np.where(known, _QUALITY[np.where(known, status, 0).astype(int)], 0.0)
-    speed, course = _column(rows, "Spd"), _column(rows, "GCrs") * DEG
-    up = -_column(rows, "VZ")
+    speed, course = column(rows, "Spd"), column(rows, "GCrs") * DEG
+    up = -column(rows, "VZ")
     out["velocity"] = np.stack([speed * np.sin(course), speed * np.cos(course), up], axis=1)
-    stds = _columns(accuracy, "HAcc", "HAcc", "VAcc")
+    stds = columns(accuracy, "HAcc", "HAcc", "VAcc")
     out["std"] = np.where(stds > 0.0, stds, np.nan)
-    stds = _columns(accuracy, "SAcc", "SAcc", "SAcc")
+    stds = columns(accuracy, "SAcc", "SAcc", "SAcc")
     out["velocity_std"] = np.where(stds > 0.0, stds, np.nan)
     return Batch("fix", out, "utc", stream)
 
@@ -240,11 +235,11 @@ def _fix(stream: str, rows: list[Row]) -> Batch:
 def _odometry(stream: str, rows: list[Row]) -> Batch:
     """`VISO`, as which vehicles under water log their DVL: movements over intervals."""
     out = _started(empty("dvl", len(rows)), rows)
-    interval = _column(rows, "dt")
+    interval = column(rows, "dt")
     # ArduPilot takes seconds here and microseconds in the MAVLink message that it comes from.
     good = (interval > 0.0) & (interval < 100.0)
     interval = np.where(good, interval, np.nan)
-    out["velocity"] = _columns(rows, "PosDX", "PosDY", "PosDZ") / interval[:, None]
+    out["velocity"] = columns(rows, "PosDX", "PosDY", "PosDZ") / interval[:, None]
     out["axes"], out["delay"] = INSTRUMENT, -0.5 * interval
     note = "VISO: movements over intervals, taken as the mean velocity of a DVL in the body's axes"
     return Batch("dvl", out, "own", stream, "FRD", notes=(note,))

@@ -23,7 +23,13 @@ from factorgraph_dvl.geometry.vectors import Array, rotate
 from factorgraph_dvl.io.formats.format import Batch, Format, Kind, empty
 from factorgraph_dvl.io.formats.framing import Records, map_file
 from factorgraph_dvl.io.formats.vehicles.damaged_bags import MCAP, ROS_1, Channel, whole_messages
-from factorgraph_dvl.io.formats.vehicles.library import BLOCK, describe, load, quiet
+from factorgraph_dvl.io.formats.vehicles.library import (
+    BLOCK,
+    describe,
+    load,
+    quiet,
+    silently,
+)
 from factorgraph_dvl.io.formats.velocities import INSTRUMENT
 
 DVL_TYPE = "marine_acoustic_msgs/msg/Dvl"
@@ -193,7 +199,7 @@ def _batches(path: Path, messages: Iterator[Raw], notes: list[str]) -> Iterator[
         rows = gathered.setdefault(key, [])
         rows.append(row)
         if len(rows) >= BLOCK:
-            yield from _converted(key, gathered.pop(key), velocities)
+            yield from _converted(key, gathered.pop(key), velocities, notes)
     if unread:
         notes.append(f"{path.name}: {len(unread)} messages are damaged ({describe(unread[0])})")
     if count == len(unread) and notes:
@@ -203,7 +209,7 @@ def _batches(path: Path, messages: Iterator[Raw], notes: list[str]) -> Iterator[
             expected="a bag, cut at most: `ros2 bag reindex` mends those in SQLite",
         )
     for key, rows in gathered.items():
-        yield from _converted(key, rows, velocities)
+        yield from _converted(key, rows, velocities, notes)
     if velocities:
         notes.append(f"{len(velocities)} velocities of a GNSS receiver without fixes: left out")
     if notes:
@@ -211,12 +217,19 @@ def _batches(path: Path, messages: Iterator[Raw], notes: list[str]) -> Iterator[
 
 
 def _converted(
-    key: tuple[str, str], rows: list[Message], velocities: list[Message]
+    key: tuple[str, str], rows: list[Message], velocities: list[Message], notes: list[str]
 ) -> Iterator[Batch]:
     topic, kind = key
-    for batch in CONVERTERS[kind](topic, rows):
+    try:
+        batches = silently(CONVERTERS[kind](topic, rows))
+    except (AttributeError, TypeError, ValueError) as error:
+        # Bags bring definitions of their own, which damage can change.
+        notes.append(f"{topic}: its messages are no {kind} ({describe(error)}): left out")
+        return
+    for batch in batches:
         if kind == FIX and velocities:
-            _add_velocities(batch.records, velocities)
+            with np.errstate(all="ignore"):
+                _add_velocities(batch.records, velocities)
             velocities.clear()
         yield batch
 

@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import importlib
 import io
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from factorgraph_dvl.errors import ConfigError, DataError
+from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.io.formats.format import Batch
 
 # Messages that become one batch.
 BLOCK = 10_000
@@ -50,6 +54,23 @@ def quiet() -> Iterator[None]:
     """Drop what a library prints; not around a `yield` that leaves this package."""
     with redirect_stdout(_Nowhere()), redirect_stderr(_Nowhere()):
         yield
+
+
+def silently(batches: Iterator[Batch]) -> list[Batch]:
+    """Return all batches; damaged numbers overflow quietly, their ranges are checked later."""
+    with np.errstate(all="ignore"):
+        return list(batches)
+
+
+def column(rows: Sequence[Mapping[str, Any]], name: str) -> Array:
+    """Return the values of a column by its name, nan where it is missing or no number."""
+    values = (row.get(name) for row in rows)
+    return np.array([float(v) if isinstance(v, int | float) else np.nan for v in values])
+
+
+def columns(rows: Sequence[Mapping[str, Any]], *names: str) -> Array:
+    """Return several columns side by side, (N, M)."""
+    return np.stack([column(rows, name) for name in names], axis=1)
 
 
 def unreadable(path: Path, error: BaseException, expected: str, hint: str = "") -> DataError:

@@ -13,11 +13,10 @@ from typing import Any
 import numpy as np
 
 from factorgraph_dvl.geometry.units import DEG
-from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.io.formats.ad2cp import NUCLEUS, frames
 from factorgraph_dvl.io.formats.format import Batch, Clock, Format, Kind, empty
 from factorgraph_dvl.io.formats.framing import Records, map_file
-from factorgraph_dvl.io.formats.vehicles.library import BLOCK, load
+from factorgraph_dvl.io.formats.vehicles.library import BLOCK, column, columns, load, silently
 from factorgraph_dvl.io.formats.velocities import INSTRUMENT
 
 IMU, AHRS, BOTTOM, WATER, INS = 0x82, 0xD2, 0xB4, 0xBE, 0xDC
@@ -81,11 +80,11 @@ def read(path: Path, mapping: Mapping[str, Any] | None = None) -> Iterator[Batch
         packet["at"] = start - _HEADER
         gathered[kind].append(packet)
         if len(gathered[kind]) >= BLOCK:
-            yield from _CONVERTERS[kind](gathered[kind])
+            yield from silently(_CONVERTERS[kind](gathered[kind]))
             gathered[kind] = []
     for kind, packets in gathered.items():
         if packets:
-            yield from _CONVERTERS[kind](packets)
+            yield from silently(_CONVERTERS[kind](packets))
     if lost:
         note = f"{path.name}: {lost} packets are too short for what they state, and were left out"
         yield Batch("clock", empty("clock", 0), notes=(note,))
@@ -99,35 +98,27 @@ def _decoded(parser: Any, frame: bytearray) -> Packet | None:
     return packet if header and data and "flags.posixTime" in packet and len(packet) > 13 else None
 
 
-def _column(packets: list[Packet], name: str) -> Array:
-    return np.array([packet.get(name, np.nan) for packet in packets], float)
-
-
-def _columns(packets: list[Packet], *names: str) -> Array:
-    return np.stack([_column(packets, name) for name in names], axis=1)
-
-
 def _timed(kind: Kind, packets: list[Packet]) -> tuple[Records, Clock]:
     out = empty(kind, len(packets))
     out["at"] = [packet["at"] for packet in packets]
-    out["time"] = _column(packets, "timeStamp") + _column(packets, "microSeconds") * 1e-6
+    out["time"] = column(packets, "timeStamp") + column(packets, "microSeconds") * 1e-6
     out["received"] = out["time"]
-    return out, "utc" if _column(packets, "flags.posixTime").all() else "own"
+    return out, "utc" if column(packets, "flags.posixTime").all() else "own"
 
 
 def _imu(packets: list[Packet]) -> Iterator[Batch]:
     out, clock = _timed("imu", packets)
-    out["gyro"] = _columns(packets, "gyro.x", "gyro.y", "gyro.z")
-    out["accel"] = _columns(packets, "accelerometer.x", "accelerometer.y", "accelerometer.z")
-    valid = _column(packets, "status.isValid") == 1.0
+    out["gyro"] = columns(packets, "gyro.x", "gyro.y", "gyro.z")
+    out["accel"] = columns(packets, "accelerometer.x", "accelerometer.y", "accelerometer.z")
+    valid = column(packets, "status.isValid") == 1.0
     yield Batch("imu", out[valid], clock, "IMU", "FRD", notes=(_AXES,))
 
 
 def _attitude(packets: list[Packet]) -> Iterator[Batch]:
     out, clock = _timed("attitude", packets)
     for name in ("roll", "pitch", "heading"):
-        out[name] = _column(packets, f"ahrsData.{name}") * DEG
-    declination = _column(packets, "declination")
+        out[name] = column(packets, f"ahrsData.{name}") * DEG
+    declination = column(packets, "declination")
     is_true = bool(np.all(np.isfinite(declination) & (declination != 0.0)))
     note = "headings of the AHRS rest on its compass" + (
         ", with a declination that was set" if is_true else "; no declination was set"
@@ -136,25 +127,25 @@ def _attitude(packets: list[Packet]) -> Iterator[Batch]:
         "attitude", out, clock, "AHRS", "FRD", "true" if is_true else "magnetic", (_AXES, note)
     )
     depth, _ = _timed("depth", packets)
-    depth["depth"] = _column(packets, "depth")
+    depth["depth"] = column(packets, "depth")
     yield Batch("depth", depth, clock, "AHRS")
 
 
 def _track(kind: Kind, stream: str) -> Callable[[list[Packet]], Iterator[Batch]]:
     def convert(packets: list[Packet]) -> Iterator[Batch]:
         out, clock = _timed(kind, packets)
-        velocity = _columns(packets, *(f"velocity{axis}" for axis in "XYZ"))
-        merit = _columns(packets, *(f"fom{axis}" for axis in "XYZ"))
-        valid = _columns(packets, *(f"status.{axis}VelocityValid" for axis in "xyz")) == 1.0
+        velocity = columns(packets, *(f"velocity{axis}" for axis in "XYZ"))
+        merit = columns(packets, *(f"fom{axis}" for axis in "XYZ"))
+        valid = columns(packets, *(f"status.{axis}VelocityValid" for axis in "xyz")) == 1.0
         valid &= (velocity > _NO_VELOCITY) & (merit < _NO_MERIT)
         out["axes"], out["velocity"] = INSTRUMENT, np.where(valid, velocity, np.nan)
         out["std"] = np.where(valid & (merit > 0.0), merit, np.nan)
-        distance = _columns(packets, *(f"distanceBeam{i}" for i in (1, 2, 3)))
-        known = _columns(packets, *(f"status.beam{i}DistanceValid" for i in (1, 2, 3))) == 1.0
+        distance = columns(packets, *(f"distanceBeam{i}" for i in (1, 2, 3)))
+        known = columns(packets, *(f"status.beam{i}DistanceValid" for i in (1, 2, 3))) == 1.0
         out["range"][:, :3] = np.where(known & (distance > 0.0), distance, np.nan)
-        out["sound_speed"] = _column(packets, "soundSpeed")
-        out["temperature"] = _column(packets, "temperature")
-        delay = _column(packets, "dtXYZ")
+        out["sound_speed"] = column(packets, "soundSpeed")
+        out["temperature"] = column(packets, "temperature")
+        delay = column(packets, "dtXYZ")
         out["delay"] = np.where((delay > 0.0) & (delay < 1.0), delay, np.nan)
         note = "velocities along beams were left out: directions and signs are not documented"
         yield Batch(kind, out, clock, stream, "FRD", notes=(_AXES, note))
@@ -165,11 +156,11 @@ def _track(kind: Kind, stream: str) -> Callable[[list[Packet]], Iterator[Batch]]
 def _ins(packets: list[Packet]) -> Iterator[Batch]:
     out, clock = _timed("ins", packets)
     for name in ("roll", "pitch", "heading"):
-        out[name] = _column(packets, f"ahrsData.{name}") * DEG
-    located = _column(packets, "statusIns.latLonIsValid") == 1.0
+        out[name] = column(packets, f"ahrsData.{name}") * DEG
+    located = column(packets, "statusIns.latLonIsValid") == 1.0
     for name in ("latitude", "longitude"):
-        out[name[:3]] = np.where(located, _column(packets, name) * DEG, np.nan)
-    north, east, down = _columns(packets, *(f"velocityNed{axis}" for axis in "XYZ")).T
+        out[name[:3]] = np.where(located, column(packets, name) * DEG, np.nan)
+    north, east, down = columns(packets, *(f"velocityNed{axis}" for axis in "XYZ")).T
     out["velocity"] = np.stack([east, north, -down], axis=1)
     note = "the INS of the Nucleus uses its own DVL: its errors are not independent"
     yield Batch("ins", out, clock, "INS", "FRD", notes=(_AXES, note))

@@ -18,7 +18,7 @@ from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.io.formats.format import Batch, Format, empty
 from factorgraph_dvl.io.formats.framing import Records
-from factorgraph_dvl.io.formats.vehicles.library import load, quiet, unreadable
+from factorgraph_dvl.io.formats.vehicles.library import load, quiet, silently, unreadable
 from factorgraph_dvl.io.formats.velocities import INSTRUMENT
 
 _MAGIC = b"ULog\x01\x12\x35"
@@ -73,8 +73,9 @@ def read(path: Path, mapping: Mapping[str, Any] | None = None) -> Iterator[Batch
     # What the receivers sent stands in the log beside what was chosen of it.
     if any(data.name == "vehicle_gps_position" for data in found):
         found = [data for data in found if data.name != "sensor_gps"]
-    for data in found:
-        yield CONVERTERS[data.name](f"{data.name}[{data.multi_id}]", data.data)
+    yield from silently(
+        CONVERTERS[data.name](f"{data.name}[{data.multi_id}]", data.data) for data in found
+    )
     if log.file_corruption:
         note = f"{path.name} is damaged: pyulog left messages out"
         yield Batch("clock", empty("clock", 0), notes=(note,))
