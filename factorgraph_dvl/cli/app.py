@@ -24,6 +24,7 @@ from factorgraph_dvl.cli.observability import observability
 from factorgraph_dvl.cli.options import claims
 from factorgraph_dvl.cli.plan import plan
 from factorgraph_dvl.cli.replay import replay
+from factorgraph_dvl.cli.report import report
 from factorgraph_dvl.cli.reproduce import reproduce
 from factorgraph_dvl.cli.simulate import simulate
 from factorgraph_dvl.cli.solve import kalman, solve
@@ -53,6 +54,7 @@ for _command in (
     observability,
     plan,
     deadreckon,
+    report,
     instrument,
     correct,
     allan,

@@ -28,6 +28,7 @@ from factorgraph_dvl.cli.options import (
     TrialPath,
     claim_output,
 )
+from factorgraph_dvl.cli.report import write_report
 from factorgraph_dvl.cli.verdict import end_with, print_findings, print_verdict
 from factorgraph_dvl.errors import ConfigError
 
@@ -215,6 +216,7 @@ def _write(
     figures: bool,
 ) -> None:
     from factorgraph_dvl.cli.solve import write_beams, write_instrument
+    from factorgraph_dvl.io.run_file import run_of
     from factorgraph_dvl.io.solution_folder import (
         CONVERGENCE_FILE,
         FIGURES_FOLDER,
@@ -230,6 +232,8 @@ def _write(
         write_history(folder, record.time, record.names, record.values, record.std, record.latency)
         write_latency(folder, record.time, record.latency, record.solved)
         (folder / CONVERGENCE_FILE).write_text(to_csv(found), encoding="utf-8")
+        series = (record.time, tuple(record.names), record.std)
+        write_report(folder, str(out), solution, run_of(trial), series)
         if not figures:
             return
         from factorgraph_dvl.report.figures.convergence import write_convergence_figures

@@ -29,6 +29,7 @@ from factorgraph_dvl.cli.options import (
     claim_output,
 )
 from factorgraph_dvl.cli.plausibility import errors_in
+from factorgraph_dvl.cli.report import write_report
 from factorgraph_dvl.cli.verdict import end_with, print_findings, print_verdict
 
 if TYPE_CHECKING:
@@ -223,6 +224,7 @@ def _solve_into(
 ) -> None:
     """Load a trial, run a solver, write and show its solution."""
     from factorgraph_dvl.io.planar_folder import is_planar, load_planar_trial
+    from factorgraph_dvl.io.run_file import run_of
     from factorgraph_dvl.io.solution_folder import (
         FIGURES_FOLDER,
         HALVES_FILE,
@@ -252,6 +254,8 @@ def _solve_into(
             if found.halves is not None:
                 write_table(folder / HALVES_FILE, found.halves.columns())
             write_instrument(solution, folder)
+            series = None if history is None else (history.time, history.names, history.std)
+            write_report(folder, str(out), solution, run_of(trial), series)
             if not figures:
                 return
             from factorgraph_dvl.report.figures.solution import write_figures

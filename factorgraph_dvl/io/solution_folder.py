@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import msgspec
 import numpy as np
@@ -28,7 +28,8 @@ from factorgraph_dvl.io.residual_table import (
     rejected_columns,
     residual_columns,
 )
-from factorgraph_dvl.io.tables import write_table
+from factorgraph_dvl.io.run_file import RUN_FILE
+from factorgraph_dvl.io.tables import read_header, read_table, write_table
 from factorgraph_dvl.solution import Hypothesis, Solution, Trajectory
 
 TRAJECTORY_FILE = "trajectory.csv"
@@ -44,12 +45,14 @@ INSTRUMENT_FILE = "instrument.yaml"
 BEAMS_FILE = "beams.csv"
 BEAM_ANGLES_FILE = "beam_angles.csv"
 HALVES_FILE = "halves.csv"
+REPORT_FILE = "report.html"
 FIGURES_FOLDER = "figures"
 # What is written with a solution; the first is in every one.
 OWNED = (
     *(CALIBRATION_FILE, TRAJECTORY_FILE, HISTORY_FILE, LATENCY_FILE, CONVERGENCE_FILE),
     *(HYPOTHESES_FILE, f"{HYPOTHESES_FOLDER}/[0-9]*.csv", REJECTED_FILE, RESIDUALS_FILE),
     *(INSTRUMENT_FILE, BEAMS_FILE, BEAM_ANGLES_FILE, HALVES_FILE),
+    *(RUN_FILE, REPORT_FILE),
     *(
         f"{FIGURES_FOLDER}/{name}.png"
         for name in ("track", "motion", "calibration", "correlation", "error_budget")
@@ -206,6 +209,37 @@ def load_solution(path: Path | str) -> Solution:
         residuals=read_residuals(folder / RESIDUALS_FILE),
         rejected=read_residuals(folder / REJECTED_FILE),
     )
+
+
+def read_history(path: Path) -> tuple[Array, tuple[str, ...], Array] | None:
+    """Return times (H,), names, and standard deviations (H, n) of history.csv.
+
+    None where there is no such file.
+
+    Raises
+    ------
+    DataError
+        If it does not hold what it should.
+    """
+    file = path / HISTORY_FILE
+    if not file.exists():
+        return None
+    names = tuple(name.removesuffix("_std") for name in read_header(file) if name.endswith("_std"))
+    columns = read_table(file, ("time_s", *(f"{name}_std" for name in names)), source=str(file))
+    std = np.column_stack([columns[f"{name}_std"] for name in names] or [columns["time_s"]])
+    return columns["time_s"], names, std
+
+
+def read_halves(path: Path) -> dict[str, Any]:
+    """Return the columns of halves.csv; nothing where there is no such file.
+
+    Raises
+    ------
+    DataError
+        If it does not hold what it should.
+    """
+    file = path / HALVES_FILE
+    return read_table(file, read_header(file), source=str(file)) if file.exists() else {}
 
 
 def trajectory_columns(trajectory: Trajectory) -> dict[str, Array]:

@@ -121,6 +121,11 @@ def columns_of(
     return {name: out.get(name, absent) for group in (required, *optional) for name in group}
 
 
+def read_header(path: Path) -> list[str]:
+    """Return the names of the columns of a CSV file; raise DataError if it has none."""
+    return _csv_header(path, str(path))
+
+
 def count_rows(path: Path) -> int:
     """Return about how many rows a table has, without reading them."""
     if path.suffix.lower() in _PARQUET:

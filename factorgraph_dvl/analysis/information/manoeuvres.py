@@ -196,24 +196,19 @@ def _current(
 ) -> Array:
     """Return the current (2,), m/s, for which the speed in each wide turn is constant.
 
-    |v - c|² = s² of each turn is linear in c and |c|² - s²: |v|² = 2 v·c + d.
+    |v - c|² = s² of each turn is linear in c and |c|² - s²: |v|² = 2 v·c + d. The means over a
+    turn take d out.
     """
-    rows, right = [], []
-    wide = []
+    rows, right = [np.zeros((0, 2))], [np.zeros(0)]
     for start, end in turns:
-        inside = (time >= start) & (time <= end)
+        inside = slice(*np.searchsorted(time, [start, end + 1e-9]))
         if np.ptp(heading[inside]) >= _WIDE_TURN:
-            wide.append(inside)
-    if not wide:
-        return np.zeros(2)
-    for j, inside in enumerate(wide):
-        own = np.zeros((int(inside.sum()), 2 + len(wide)))
-        own[:, :2] = 2.0 * velocity[inside]
-        own[:, 2 + j] = 1.0
-        rows.append(own)
-        right.append(np.sum(velocity[inside] ** 2, axis=1))
+            v = velocity[inside]
+            squared = np.sum(v**2, axis=1)
+            rows.append(2.0 * (v - v.mean(axis=0)))
+            right.append(squared - squared.mean())
     found = np.linalg.lstsq(np.concatenate(rows), np.concatenate(right), rcond=None)[0]
-    return np.asarray(found[:2])
+    return np.asarray(found)
 
 
 def _separate(edges: Sequence[float]) -> list[float]:

@@ -1,0 +1,124 @@
+"""The command `report`: the page of a result, and of several side by side."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from factorgraph_dvl.cli.console import stdout, warn
+from factorgraph_dvl.cli.options import Force
+
+if TYPE_CHECKING:
+    from factorgraph_dvl.io.run_file import Run
+    from factorgraph_dvl.report.html.content import Result
+    from factorgraph_dvl.solution import Solution
+
+
+def report(
+    folders: Annotated[
+        list[Path], typer.Argument(metavar="DIR...", help="Solution folders.", show_default=False)
+    ],
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out", metavar="FILE", help="Page to write; by default report.html in the folder."
+        ),
+    ] = None,
+    force: Force = False,
+    redact: Annotated[
+        bool,
+        typer.Option("--redact", help="Leave out positions, names of trials and names of files."),
+    ] = False,
+) -> None:
+    """Write the page of a result, or a page that compares several results.
+
+    A page is one file that works offline. A cross-check in DIR/crosscheck and dead reckoning in
+    DIR/deadreckon are shown too.
+
+    Examples:
+      factorgraph-dvl report out
+
+      factorgraph-dvl report out-batch out-kalman --out comparison.html
+    """
+    from factorgraph_dvl.errors import ConfigError
+    from factorgraph_dvl.io.output_file import write_file
+    from factorgraph_dvl.io.solution_folder import REPORT_FILE
+    from factorgraph_dvl.report.html.page import comparison_page, report_page
+
+    if out is None and len(folders) > 1:
+        raise ConfigError(
+            "--out is missing", expected="the page to write, such as --out comparison.html"
+        )
+    results = [_load(folder) for folder in folders]
+    if len(results) == 1:
+        page = report_page(results[0], redacted=redact)
+    else:
+        page = comparison_page(results, redacted=redact)
+    file = out or folders[0] / REPORT_FILE
+    # The page in a solution folder is made to be made again.
+    write_file(file, lambda path: path.write_text(page, "utf-8"), force=force or out is None)
+    stdout().print(f"Wrote {file}", markup=False, soft_wrap=True)
+
+
+def _load(folder: Path) -> Result:
+    """Return what a solution folder holds."""
+    from factorgraph_dvl.io.run_file import read_run
+    from factorgraph_dvl.io.solution_folder import load_solution, read_halves, read_history
+    from factorgraph_dvl.report.html.content import Result
+
+    run = read_run(folder)
+    return Result(
+        name=str(folder),
+        solution=load_solution(folder),
+        run=_builtins(run) if run is not None else {},
+        history=read_history(folder),
+        crosscheck=_read_json(folder / "crosscheck" / "crosscheck.json"),
+        dead_reckoning=_read_json(folder / "deadreckon" / "deadreckon.json"),
+        halves=read_halves(folder),
+    )
+
+
+def _read_json(file: Path) -> dict[str, Any]:
+    """Return a JSON object; nothing where there is no such file."""
+    import msgspec
+
+    from factorgraph_dvl.errors import DataError
+    from factorgraph_dvl.settings.files import MEGABYTE, read_bytes
+
+    if not file.exists():
+        return {}
+    content = read_bytes(file, limit=16 * MEGABYTE, expected="a result in JSON")
+    try:
+        return msgspec.json.decode(content, type=dict[str, Any])
+    except (msgspec.MsgspecError, RecursionError) as error:
+        raise DataError(f"cannot be read ({error})", where=str(file)) from None
+
+
+def _builtins(run: Run) -> dict[str, Any]:
+    import msgspec
+
+    found: dict[str, Any] = msgspec.to_builtins(run)
+    return found
+
+
+def write_report(
+    folder: Path,
+    name: str,
+    solution: Solution,
+    run: Run,
+    history: tuple[Any, tuple[str, ...], Any] | None = None,
+) -> None:
+    """Write run.json, and report.html; a page that fails is a warning: results are worth more."""
+    from factorgraph_dvl.io.run_file import RUN_FILE, encode_run
+    from factorgraph_dvl.io.solution_folder import REPORT_FILE, read_halves
+    from factorgraph_dvl.report.html.content import Result
+    from factorgraph_dvl.report.html.page import report_page
+
+    (folder / RUN_FILE).write_bytes(encode_run(run))
+    try:
+        result = Result(name, solution, _builtins(run), history, halves=read_halves(folder))
+        (folder / REPORT_FILE).write_text(report_page(result), encoding="utf-8")
+    except Exception as error:
+        warn(f"{REPORT_FILE} could not be written: {type(error).__name__}: {error}")

@@ -1,0 +1,104 @@
+"""Run files, format 1: the settings, records and versions that a solution came from."""
+
+from __future__ import annotations
+
+import platform
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, Literal
+
+import msgspec
+import numpy as np
+
+from factorgraph_dvl.errors import DataError
+from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.settings.files import MEGABYTE, read_bytes
+from factorgraph_dvl.trial import PlanarTrial, Trial
+
+RUN_FILE = "run.json"
+# Settings of some dozen sensors, with the places of beacons.
+_MAX_BYTES = 16 * MEGABYTE
+# Packages that numbers depend on.
+_PACKAGES = ("factorgraph-dvl", "gtsam", "numpy", "scipy")
+
+
+class Inventory(msgspec.Struct):
+    """What the record of one sensor holds."""
+
+    sensor: str
+    rows: int
+    from_s: float
+    to_s: float
+    interval_s: float
+    longest_interval_s: float
+
+
+class Run(msgspec.Struct):
+    """What a solution came from; without times of the run, so that equal runs are equal."""
+
+    format: Literal[1]
+    versions: dict[str, str]
+    epoch: str
+    settings: dict[str, dict[str, Any]]
+    records: list[Inventory]
+    truth: dict[str, Any] = {}
+
+
+def run_of(trial: Trial | PlanarTrial) -> Run:
+    """Return what a solution of a trial comes from.
+
+    Parameters
+    ----------
+    trial : Trial or PlanarTrial
+        The trial, as loaded.
+    """
+    records: list[Any]
+    if isinstance(trial, PlanarTrial):
+        records, epoch = list(trial.records), ""
+    else:
+        own = () if trial.imu is None else (trial.imu,)
+        records, epoch = [*own, *trial.aids], trial.epoch
+    versions = {"python": platform.python_version()}
+    return Run(
+        format=1,
+        versions=versions | {name: version(name) for name in _PACKAGES},
+        epoch=epoch,
+        settings={r.section: msgspec.to_builtins(r.settings) for r in records},
+        records=[_inventory(r.section, r.time) for r in records],
+        truth={name: np.asarray(v).tolist() for name, v in trial.calibration_truth.items()},
+    )
+
+
+def _inventory(section: str, time: Array) -> Inventory:
+    intervals = np.diff(time) if time.size > 1 else np.zeros(1)
+    return Inventory(
+        sensor=section,
+        rows=int(time.size),
+        from_s=float(time[0]),
+        to_s=float(time[-1]),
+        interval_s=float(np.median(intervals)),
+        longest_interval_s=float(intervals.max()),
+    )
+
+
+def encode_run(run: Run) -> bytes:
+    """Return the content of run.json."""
+    return msgspec.json.format(msgspec.json.encode(run), indent=2) + b"\n"
+
+
+def read_run(folder: Path) -> Run | None:
+    """Read run.json of a solution folder; None where there is none, as in older folders.
+
+    Raises
+    ------
+    DataError
+        If it cannot be read.
+    """
+    file = folder / RUN_FILE
+    if not file.exists():
+        return None
+    try:
+        content = read_bytes(file, limit=_MAX_BYTES, expected="the settings of a solution")
+        return msgspec.json.decode(content, type=Run)
+    except (msgspec.MsgspecError, ValueError, RecursionError) as error:
+        raise DataError(f"cannot be read ({error})", where=str(file)) from None

@@ -1,0 +1,577 @@
+"""The sections of the page of one result."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from factorgraph_dvl.analysis.error_statistics import true_value_of
+from factorgraph_dvl.analysis.information.further_manoeuvres import further_manoeuvres
+from factorgraph_dvl.analysis.information.manoeuvres import Segment, find_segments
+from factorgraph_dvl.analysis.information.marginals import marginals
+from factorgraph_dvl.geometry.earth import LocalFrame
+from factorgraph_dvl.geometry.units import DEG
+from factorgraph_dvl.report.html.content import Result
+from factorgraph_dvl.report.html.markup import (
+    Cell,
+    Html,
+    Section,
+    both,
+    element,
+    folded,
+    items,
+    joined,
+    paragraph,
+    section,
+    table,
+)
+from factorgraph_dvl.report.html.plots import Plot
+from factorgraph_dvl.report.html.track import track_svg
+from factorgraph_dvl.report.html.words import component_names
+from factorgraph_dvl.report.text import at_precision, fixed, with_std
+from factorgraph_dvl.sensors.finding import Finding, Verdict
+from factorgraph_dvl.solution import Cause, Solution
+
+# Class of each verdict in the style sheet.
+_CLASSES = {"good": "good", "doubtful": "doubtful", "do not use": "unusable"}
+# Edge of the plots of residuals, and lines in them, in σ.
+_PANEL, _BAND = 6.0, 3.0
+# Causes with a colour of their own: Tol's muted scheme, which colour-blind readers tell apart.
+_SHADES = ("#332288", "#88ccee", "#117733", "#ddcc77", "#cc6677", "#aa4499", "#44aa99", "#999933")
+_REST = "#dddddd"
+# Causes in words beside each bar. Chosen: they make up nearly all of it.
+_NAMED = 2
+# Chosen: more manoeuvres than this fill a screen and more.
+_MOST_SEGMENTS = 200
+_MANOEUVRES = {
+    "straight": "straight ahead at constant speed",
+    "speed": "half speed, then full speed",
+    "turns": "turns to both sides at 3 deg/s",
+    "pitching": "pitching by 10 deg, up and down",
+}
+_ERRORS = (
+    ("end_point_error_m", "end point error, m"),
+    ("end_point_percent", "end point error, % of distance"),
+    ("global_error_m", "largest error, m"),
+    ("rms_error_m", "RMS error, m"),
+    ("distance_m", "distance, m"),
+)
+
+
+def verdict_section(result: Result) -> Section:
+    """Return what was found, how sure it is, what is wrong, and what to do."""
+    solution = result.solution
+    verdict = solution.verdict
+    cells: list[Cell] = [verdict_box(verdict)]
+    main = [e for e in solution.estimates if e.name in solution.limits]
+    if main:
+        rows = [
+            [component_cell(name), with_std(float(value), float(std)), component_names(name)[2],
+             grade_cell(grade)]
+            for e in main
+            for name, value, std, grade in zip(
+                e.component_names, e.value, e.std, solution.grades[e.name], strict=True
+            )
+        ]  # fmt: skip
+        cells.append(element("h3", both("What was found")))
+        header = [both(x) for x in ("parameter", "value ± σ", "unit", "grade")]
+        cells.append(table(header, rows, label="What was found", numeric=(1,)))
+    if verdict.reasons:
+        cells.append(element("h3", both("What is wrong, and what to do")))
+        cells += [_reason(f) for f in verdict.reasons]
+    notes = [f for f in solution.findings if f.severity == "note"]
+    if notes:
+        cells.append(folded("Notes", items([joined(str(f), _code(f)) for f in notes])))
+    return section("Verdict", *cells, key="verdict")
+
+
+def verdict_box(verdict: Verdict) -> Html:
+    """Return the grade of a verdict, with its first reason."""
+    if verdict.reasons:
+        first: Cell = str(verdict.reasons[0])
+    else:
+        first = both("Nothing was found that speaks against the result.")
+    return element(
+        "div",
+        element("strong", both(verdict.grade)),
+        paragraph(first),
+        class_=f"verdict {_CLASSES[verdict.grade]}",
+    )
+
+
+def _reason(finding: Finding) -> Html:
+    return element(
+        "div",
+        paragraph(element("b", str(finding)), Html(" "), _code(finding)),
+        paragraph(finding.code.why),
+        paragraph(element("b", both("What to do:")), " ", finding.code.action),
+        class_="reason",
+    )
+
+
+def _code(finding: Finding) -> Html:
+    return element("code", str(finding.code))
+
+
+def component_cell(component: str) -> Html:
+    """Return the name of a component without its unit."""
+    english, own, _ = component_names(component)
+    return both(english, own)
+
+
+def grade_cell(grade: str) -> Html:
+    """Return a grade with a sign of its own, so that colour is not needed."""
+    return element("span", both(grade), class_=f"grade grade-{grade}")
+
+
+def calibration_section(result: Result) -> Section:
+    """Return every component with its prior, its grade, and the truth where that is known."""
+    solution = result.solution
+    truth = result.run.get("truth", {})
+    known = {e.name: true_value_of(e, truth) for e in solution.estimates} if truth else {}
+    shown = any(v is not None for v in known.values())
+    rows: list[list[Cell]] = []
+    for e in solution.estimates:
+        limit = solution.limits.get(e.name)
+        true = known.get(e.name)
+        for i, name in enumerate(e.component_names):
+            value, std = float(e.value[i]), float(e.std[i])
+            prior = float(e.prior_std[i])
+            row: list[Cell] = [
+                component_cell(name),
+                with_std(value, std) if std > 0.0 else joined(f"{value:.6g} ", both("fixed")),
+                component_names(name)[2],
+                f"{float(e.prior_value[i]):.4g} ± {prior:.3g}" if np.isfinite(prior) else "–",
+                f"{limit:g}" if limit is not None else "",
+                grade_cell(solution.grades[e.name][i]),
+            ]
+            if shown and true is not None:
+                row.append(at_precision(float(true[i]), std))
+                row.append(fixed((value - float(true[i])) / std, 2) if std > 0.0 else "–")
+            elif shown:
+                row += ["", ""]
+            rows.append(row)
+    header = ["parameter", "value ± σ", "unit", "before the trial", "limit of σ", "grade"]
+    if shown:
+        header += ["truth", "error / σ"]
+    return section(
+        "Calibration",
+        paragraph(both(
+            "Grades: green, σ is within its limit; orange, up to twice the limit; red, above "
+            "that; grey, the data did not halve the σ known before the trial."
+        )),
+        table([both(h) for h in header], rows, label="Calibration", numeric=(1, 3, 4, 6, 7)),
+        *_noise(solution),
+        key="calibration",
+    )  # fmt: skip
+
+
+def _noise(solution: Solution) -> Iterator[Html]:
+    if solution.noise:
+        yield element("h3", both("Noise against what is stated"))
+        rows = [
+            [n.name.replace("_", " "), ", ".join(f"{f:.3g}" for f in np.atleast_1d(n.factor))]
+            for n in solution.noise
+        ]
+        header = [both("measurement"), both("factor")]
+        yield table(header, rows, label="Noise against what is stated", numeric=(1,))
+
+
+def track_section(result: Result) -> Section:
+    """Return the track on a plain grid."""
+    trajectory = result.solution.trajectory
+    cells: list[Cell] = [track_svg(trajectory)]
+    cells.append(paragraph(both("Circle: start. Square: end. Dots: time since the start.")))
+    if not result.redacted:
+        lat, lon, height = trajectory.geodetic[0]
+        cells.append(paragraph(
+            both("start of the track"),
+            f": {lat / DEG:.6f}°, {lon / DEG:.6f}°, {height:.2f} m",
+        ))  # fmt: skip
+    return section("Track", *cells, key="track")
+
+
+def motion_plots(result: Result, segments: Sequence[Segment]) -> list[Plot]:
+    """Return speed, heading, roll and pitch, and height over time."""
+    t = result.solution.trajectory
+    first = int(np.argmax(np.isfinite(t.geodetic).all(axis=1)))
+    up = LocalFrame(*t.geodetic[first]).position(*t.geodetic.T)[:, 2:]
+    speed = np.linalg.norm(t.velocity[:, :2], axis=1)[:, None]
+    heading = np.unwrap(np.nan_to_num(t.rph[:, 2]))[:, None] / DEG
+    plots = [
+        Plot("speed", "Speed over ground", "m/s", ["speed"], t.time, speed, segments),
+        Plot("heading", "Heading", "deg", ["heading"], t.time, heading, segments),
+    ]
+    if np.nanmax(np.abs(t.rph[:, :2]), initial=0.0) > 0.0:
+        rp = t.rph[:, :2] / DEG
+        plots.append(
+            Plot("attitude", "Roll and pitch", "deg", ["roll", "pitch"], t.time, rp, segments)
+        )
+    plots.append(Plot("height", "Height above the start", "m", ["height"], t.time, up, segments))
+    return plots
+
+
+def deviation_plots(result: Result, segments: Sequence[Segment]) -> list[Plot]:
+    """Return the standard deviations of the motion, and of the calibration as it converged."""
+    t = result.solution.trajectory
+    enu, rph = ["east", "north", "up"], ["roll", "pitch", "heading"]
+    plots = [
+        Plot("std-position", "σ of position", "m", enu, t.time, t.position_std, segments),
+        Plot("std-velocity", "σ of velocity", "m/s", enu, t.time, t.velocity_std, segments),
+        Plot("std-attitude", "σ of attitude", "deg", rph, t.time, t.rph_std / DEG, segments),
+    ]
+    plots = [p for p in plots if np.isfinite(p.values).any() and np.nanmax(p.values) > 0.0]
+    if result.history is not None:
+        time, names, std = result.history
+        for e in result.solution.estimates:
+            columns = [names.index(n) for n in e.component_names if n in names]
+            if columns and np.isfinite(std[:, columns]).any():
+                shown = [component_names(names[c])[0] for c in columns]
+                unit = component_names(names[columns[0]])[2]
+                plots.append(
+                    Plot(f"std-{e.name}", "σ along the trial", unit, shown, time,
+                         std[:, columns], segments, prefix=f"{e.spec.stem.replace('_', ' ')}: ")
+                )  # fmt: skip
+    return plots
+
+
+def budget_section(result: Result) -> Section | None:
+    """Return what each cause adds to the standard deviations, as bars and as numbers."""
+    solution = result.solution
+    causes = solution.error_budget
+    if not causes:
+        return None
+    std = np.concatenate([e.std for e in solution.estimates])
+    shown = causes[: len(_SHADES)]
+    legend = [
+        element("li", element("span", class_="swatch", style=f"background:{colour}"), _cause(c))
+        for c, colour in zip(shown, _SHADES, strict=False)
+    ]
+    if len(causes) > len(shown):
+        swatch = element("span", class_="swatch", style=f"background:{_REST}")
+        legend.append(element("li", swatch, both("all others")))
+    rows, numbers = [], []
+    for i, name in enumerate(solution.order):
+        if std[i] <= 0.0:
+            continue
+        total = sum(float(c.adds[i]) ** 2 for c in causes) or 1.0
+        shares = [float(c.adds[i]) ** 2 / total for c in causes]
+        largest = sorted(range(len(causes)), key=lambda k: -shares[k])[:_NAMED]
+        named = "; ".join(f"{causes[k].cause} {100.0 * shares[k]:.0f} %" for k in largest)
+        unit = component_names(name)[2]
+        rows.append([component_cell(name), f"{std[i]:.2g} {unit}", _bar(shares, named), named])
+        numbers.append([component_cell(name), unit, *(f"{float(c.adds[i]):.2g}" for c in causes)])
+    header = [both(x) for x in ("parameter", "σ now", "share of the variance", "largest causes")]
+    return section(
+        "Error budget",
+        paragraph(both("What each cause adds to σ. The squares add up to σ².")),
+        element("ul", *legend, class_="legend"),
+        table(header, rows, label="Error budget", numeric=(1,)),
+        folded(
+            "All numbers",
+            table(
+                [both("parameter"), both("unit"), *map(_cause, causes)],
+                numbers,
+                label="All numbers",
+                numeric=range(2, 2 + len(causes)),
+            ),
+        ),
+        key="budget",
+    )
+
+
+def _cause(cause: Cause) -> str:
+    return f"{cause.cause} ({cause.assumed})" if cause.assumed else cause.cause
+
+
+def _bar(shares: Sequence[float], text: str) -> Html:
+    parts = [
+        element("span", style=f"width:{100.0 * share:.2f}%;background:{colour}")
+        for share, colour in zip(shares, _SHADES, strict=False)
+    ]
+    parts.append(element("span", style=f"flex:1;background:{_REST}"))
+    return element("div", *parts, class_="share", role="img", aria_label=text)
+
+
+def observability_section(result: Result, segments: Sequence[Segment]) -> Section:
+    """Return posterior against prior, the weak directions, and manoeuvres that would help."""
+    solution = result.solution
+    cells: list[Cell] = []
+    view = marginals(solution.estimates, solution.covariance, solution.limits)
+    if view is not None:
+        rows = [
+            [component_cell(name), f"{prior:.3g}", f"{std:.3g}", f"{std / prior:.3f}",
+             grade_cell(grade)]
+            for name, prior, std, grade in zip(
+                view.names, view.prior_std, view.std, view.grade, strict=True
+            )
+        ]  # fmt: skip
+        header = ["parameter", "before the trial", "σ now", "σ / prior σ", "grade"]
+        numeric = (1, 2, 3)
+        cells.append(
+            table([both(h) for h in header], rows, label="Observability", numeric=numeric)
+        )
+        if view.sentences:
+            cells.append(element("h3", both("Directions that the data hardly determine")))
+            cells.append(items(list(view.sentences)))
+        else:
+            cells.append(paragraph(both("The data determine every component.")))
+    cells.append(element("h3", both("Which manoeuvre would help")))
+    cells += _further(solution)
+    if segments:
+        cells.append(
+            folded("Manoeuvres of this trial", _segment_table(solution, segments, result.start))
+        )
+    return section("Observability", *cells, key="observability")
+
+
+def _further(solution: Solution) -> list[Cell]:
+    short = [e for e in solution.estimates if np.any(e.std > solution.limits.get(e.name, np.inf))]
+    if not short:
+        return [paragraph(both("Every σ is within its limit: no further manoeuvre is needed."))]
+    found = further_manoeuvres(solution)
+    if not found:
+        text = "No manoeuvre of the list lowers what is above its limit: record longer."
+        return [paragraph(both(text))]
+    rows = [
+        [
+            both(_MANOEUVRES[m.name]) if i == 0 else "",
+            f"{m.duration:.0f}" if i == 0 else "",
+            component_cell(name),
+            f"{before:.2g} {component_names(name)[2]}",
+            f"{after:.2g}",
+        ]
+        for m in found
+        for i, (name, before, after) in enumerate(zip(m.names, m.before, m.after, strict=True))
+    ]
+    header = ["manoeuvre", "duration, s", "helps", "σ now", "σ at best"]
+    text = "At best; the motion is taken as known. The command plan predicts a whole trial."
+    label = "Which manoeuvre would help"
+    return [
+        table([both(h) for h in header], rows, label=label, numeric=(1, 3, 4)),
+        paragraph(both(text)),
+    ]
+
+
+def _segment_table(solution: Solution, segments: Sequence[Segment], start: float) -> Html:
+    t = solution.trajectory
+    speed = np.linalg.norm(t.velocity, axis=1)
+    heading = np.unwrap(np.nan_to_num(t.rph[:, 2])) / DEG
+    rows = []
+    for s in segments[:_MOST_SEGMENTS]:
+        inside = np.flatnonzero((t.time >= s.start) & (t.time <= s.end))
+        if inside.size:
+            rows.append([
+                both(s.label), f"{s.start - start:.0f}", f"{s.end - start:.0f}",
+                f"{speed[inside].mean():.2f}",
+                fixed(float(heading[inside[-1]] - heading[inside[0]]), 0),
+            ])  # fmt: skip
+    header = ["manoeuvre", "from, s", "to, s", "mean speed, m/s", "turn, deg"]
+    label = "Manoeuvres of this trial"
+    return table([both(h) for h in header], rows, label=label, numeric=(1, 2, 3, 4))
+
+
+def residual_plots(result: Result) -> list[Plot]:
+    """Return residual / σ over time of each component of each measurement."""
+    plots = []
+    for i, r in enumerate(result.solution.residuals):
+        order = np.argsort(r.time, kind="stable")
+        for c, name in enumerate(r.components):
+            known = order[np.isfinite(r.residual[order, c]) & (r.sigma[order, c] > 0.0)]
+            if known.size:
+                normalised = (r.residual[known, c] / r.sigma[known, c])[:, None]
+                key, prefix = f"residual-{i}-{c}", f"{r.label}: "
+                plots.append(
+                    Plot(key, "residual / σ", "", [name], r.time[known], normalised,
+                         limit=_PANEL, band=_BAND, prefix=prefix)
+                )  # fmt: skip
+    return plots
+
+
+def residual_tables(result: Result) -> list[Cell]:
+    """Return counts and sizes of residuals, and of what was rejected."""
+    solution = result.solution
+    rejected: dict[str, int] = {}
+    for r in solution.rejected:
+        rejected[r.label] = rejected.get(r.label, 0) + r.time.size
+    rows = []
+    for r in solution.residuals:
+        lost = rejected.get(r.label, 0)
+        share = 100.0 * lost / max(lost + r.time.size, 1)
+        for c, name in enumerate(r.components):
+            known = np.isfinite(r.residual[:, c]) & (r.sigma[:, c] > 0.0)
+            if not known.any():
+                continue
+            x = r.residual[known, c] / r.sigma[known, c]
+            rows.append([
+                r.label, both(name), f"{x.size}", f"{lost}", f"{share:.2g}",
+                fixed(float(x.mean()), 2), f"{float(np.sqrt(np.mean(x**2))):.2f}",
+                f"{float(np.abs(x).max()):.1f}",
+            ])  # fmt: skip
+    if not rows:
+        return [paragraph(both("No residuals were kept."))]
+    header = ["measurement", "component", "used", "rejected", "rejected, %", "mean / σ",
+              "RMS / σ", "largest / σ"]  # fmt: skip
+    cells: list[Cell] = [
+        table([both(h) for h in header], rows, label="Residuals", numeric=range(2, 8))
+    ]
+    if solution.rejected:
+        own = [
+            [r.label, both(r.reason), f"{r.time.size}", f"{r.time[0] - result.start:.1f}",
+             f"{r.time[-1] - result.start:.1f}"]
+            for r in solution.rejected if r.time.size
+        ]  # fmt: skip
+        header = ["measurement", "reason", "number", "from, s", "to, s"]
+        cells.append(element("h3", both("Rejected measurements")))
+        label = "Rejected measurements"
+        cells.append(table([both(h) for h in header], own, label=label, numeric=(2, 3, 4)))
+    return cells
+
+
+def clock_section(result: Result) -> Section:
+    """Return offsets and rates of the sensors' clocks."""
+    solution = result.solution
+    rows: list[list[Cell]] = []
+    for e in solution.estimates:
+        if e.spec.stem.endswith(("time_offset", "clock_rate")):
+            rows += [
+                [component_cell(name), with_std(float(value), float(std)),
+                 component_names(name)[2], f"{prior:.3g}"]
+                for name, value, std, prior in zip(
+                    e.component_names, e.value, e.std, e.prior_std, strict=True
+                )
+            ]  # fmt: skip
+    about = [
+        f
+        for f in solution.findings
+        if f.severity != "ok" and ("clock" in f.code or f.code in ("leap_seconds", "local_time"))
+    ]
+    cells: list[Cell] = []
+    if rows:
+        text = "Stamps of a sensor = time of the IMU + offset. A positive offset is a late stamp."
+        header = [both(x) for x in ("parameter", "value ± σ", "unit", "before the trial")]
+        cells = [paragraph(both(text)), table(header, rows, label="Clocks", numeric=(1, 3))]
+    else:
+        cells = [paragraph(both("No clock was estimated."))]
+    if about:
+        cells.append(items([joined(str(f), _code(f)) for f in about]))
+    return section("Clocks", *cells, key="clocks")
+
+
+def halves_section(result: Result) -> Section | None:
+    """Return the halves of the trial against each other, if they were solved."""
+    columns = result.halves
+    if not columns:
+        return None
+    names = list(columns)
+    rows = [[str(cell) for cell in row] for row in zip(*columns.values(), strict=True)]
+    shown = [[component_cell(row[0]), *row[1:]] for row in rows]
+    header = [name.replace("_", " ") for name in names]
+    numeric = range(1, len(names))
+    return section(
+        "Halves of the trial",
+        table(header, shown, label="Halves of the trial", numeric=numeric),
+        key="halves",
+    )
+
+
+def crosscheck_section(result: Result) -> Section | None:
+    """Return a cross-check with another result, if there is one."""
+    check = result.crosscheck
+    if not check:
+        return None
+    rows = [
+        [component_cell(c["name"]), _text(c["a"]), _text(c["b"]), _text(c["difference"]),
+         _text(c["in_sigmas"]), str(c["verdict"])]
+        for c in check.get("components", [])
+    ]  # fmt: skip
+    header: list[Cell] = [
+        both("parameter"), _side(check, "a"), _side(check, "b"),
+        both("difference"), both("difference / σ"), both("Verdict"),
+    ]  # fmt: skip
+    cells: list[Cell] = [table(header, rows, label="Cross-check", numeric=(1, 2, 3, 4))]
+    explanation = check.get("explanation")
+    if explanation:
+        lines = [explanation] if isinstance(explanation, str) else list(map(str, explanation))
+        cells.append(items(lines))
+    return section("Cross-check", *cells, key="crosscheck")
+
+
+def _side(check: Mapping[str, Any], side: str) -> str:
+    return f"{side.upper()}: {check.get(side, {}).get('solver', '')}"
+
+
+def dead_reckoning_section(result: Result) -> Section | None:
+    """Return errors of dead reckoning before and after calibration, if they were measured."""
+    found = result.dead_reckoning
+    if not found or "end_point_error_m" not in found:
+        return None
+    before = found.get("uncalibrated", {})
+    rows = [[both(name), _text(before.get(key)), _text(found.get(key))] for key, name in _ERRORS]
+    header = [Html(""), both("before calibration"), both("after calibration")]
+    return section(
+        "Dead reckoning",
+        table(header, rows, label="Dead reckoning", numeric=(1, 2)),
+        key="dead-reckoning",
+    )
+
+
+def _text(value: Any) -> str:
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return "–" if value is None else str(value)
+    return f"{value:.4g}"
+
+
+def settings_section(result: Result) -> Section:
+    """Return settings, records and versions that the result came from."""
+    run = result.run
+    if not run:
+        text = "The folder keeps no settings: it was made by an earlier version."
+        return section("Settings", paragraph(both(text)), key="settings")
+    start = result.start
+    records = [
+        [r["sensor"], f"{r['rows']}", f"{r['from_s'] - start:.1f}", f"{r['to_s'] - start:.1f}",
+         f"{r['interval_s']:.4g}", f"{r['longest_interval_s']:.4g}"]
+        for r in run["records"]
+    ]  # fmt: skip
+    header = ["sensor", "rows", "from, s", "to, s", "interval, s", "longest interval, s"]
+    settings = [[s, key, value] for s, key, value in flat_settings(run["settings"])]
+    versions = [[name, number] for name, number in run["versions"].items()]
+    return section(
+        "Settings",
+        element("h3", both("Data")),
+        table([both(h) for h in header], records, label="Data", numeric=range(1, 6)),
+        folded(
+            "Settings",
+            table([both("section"), both("key"), both("value")], settings, label="Settings"),
+        ),
+        element("h3", both("Versions")),
+        table([both("package"), both("version")], versions, label="Versions"),
+        key="settings",
+    )
+
+
+def flat_settings(settings: Mapping[str, Any]) -> Iterator[tuple[str, str, str]]:
+    """Yield section, key and value of every setting."""
+    for name, keys in settings.items():
+        for key, value in keys.items():
+            text = ", ".join(map(str, value)) if isinstance(value, list | tuple) else str(value)
+            yield name, key, text
+
+
+def segments_of(solution: Solution) -> tuple[Segment, ...]:
+    """Return the manoeuvres of a trial."""
+    if solution.trajectory.time.size < 2:
+        return ()
+    return find_segments(solution.trajectory)
+
+
+def titled(
+    plots: Sequence[Plot], start: float, title: str, key: str, *more: Cell
+) -> Section | None:
+    """Return a section of plots, or nothing where there are none."""
+    if not plots and not more:
+        return None
+    return section(title, *more, *(p.html(start) for p in plots), key=key)

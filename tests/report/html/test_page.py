@@ -1,0 +1,162 @@
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+from base64 import b64decode
+from dataclasses import replace
+from importlib.resources import files
+from typing import Any
+
+import numpy as np
+import pytest
+from reports import build_result
+
+from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.report.html.envelope import envelope
+from factorgraph_dvl.report.html.page import UPLOT, comparison_page, report_page
+from factorgraph_dvl.report.html.words import dictionary
+from factorgraph_dvl.sensors.finding import Code
+
+# Of the files in the package `uplot` 1.6.32 as npm serves it, whose shasum is
+# c800a63b432bad692d6d746f44f0882aa73a49ae.
+UPLOT_SHA256 = {
+    "uPlot.iife.min.js": "19c8d4c6ad88929a79f4ae49d6f7161566dfd0ba3d15cc495e974f787eb78f1f",
+    "uPlot.min.css": "df630c6a8d6f8eeaff264b50f73ce5b114f646ffd9a0bb74f049b0a00135fa04",
+    "LICENSE": "8f989229699b4fe2f1a0432d0e9edc338a8a911e250e2d1b01ecd770a5f5b1bd",
+}
+
+
+@pytest.fixture(scope="module")
+def page() -> str:
+    return report_page(build_result())
+
+
+def data_of(page: str) -> Any:
+    (found,) = re.findall(r'<script type="application/json" id="data">(.*?)</script>', page)
+    return json.loads(found.replace("<\\/", "</"))
+
+
+def test_uplot_is_that_of_the_registry() -> None:
+    folder = files("factorgraph_dvl.report") / UPLOT
+    found = {
+        name: hashlib.sha256((folder / name).read_bytes()).hexdigest() for name in UPLOT_SHA256
+    }
+    assert found == UPLOT_SHA256
+    assert {item.name for item in folder.iterdir()} == set(UPLOT_SHA256)
+
+
+def test_the_page_holds_all_it_needs(page: str) -> None:
+    assert "uPlot (v1.6.32) */" in page
+    assert "Permission is hereby granted, free of charge" in page
+    assert "default-src 'none'" in page
+    for tag in re.findall(r"<(?:script|link|img|iframe|a)\b[^>]*>", page):
+        assert "src=" not in tag
+        assert 'href="' not in tag or 'href="#' in tag
+
+
+def test_the_verdict_comes_first_with_what_to_do(page: str) -> None:
+    body = page[page.index("<main>") :]
+    first = body[: body.index("</section>")]
+    assert "doubtful" in first
+    assert "0.2 s late" in first
+    assert Code.CLOCK_OFFSET.why in first
+    assert Code.CLOCK_OFFSET.action in first
+
+
+def test_every_plot_has_a_description_and_a_table(page: str) -> None:
+    plots = data_of(page)["plots"]
+    assert len(plots) == 4 + 3 + 3
+    for plot in plots:
+        (canvas,) = re.findall(rf'<div [^>]*id="{plot["key"]}"[^>]*>', page)
+        assert 'role="img"' in canvas
+        assert re.search(r'aria-label="[^"]+"', canvas)
+        figure = page[page.index(canvas) : page.index("</figure>", page.index(canvas))]
+        assert figure.count("<tr>") == 1 + 11 + 2
+
+
+def test_residuals_beyond_the_panel_are_counted_and_marked(page: str) -> None:
+    (plot,) = (p for p in data_of(page)["plots"] if p["key"] == "residual-0-0")
+    assert plot["limit"] == 6.0
+    assert len(plot["series"][0]["outside"]) == 1
+    assert page.count(": 1 beyond the panel, up to 20") == 3
+
+
+def decode(series: dict[str, Any], key: str) -> Array:
+    steps = np.frombuffer(b64decode(series[key]), "<i2").astype(float)
+    steps[steps == -32768] = np.nan
+    return np.asarray(series["offset"] + series["step"] * steps)
+
+
+def test_envelopes_hold_every_value_to_a_65000th() -> None:
+    result = build_result(3000.0)
+    (plot,) = (p for p in data_of(report_page(result))["plots"] if p["key"] == "heading")
+    series = plot["series"][0]
+    heading = np.rad2deg(result.solution.trajectory.rph[:, 2])
+    step = np.ptp(heading) / 60000
+    assert np.nanmax(decode(series, "high")) == pytest.approx(heading.max(), abs=step)
+    assert np.nanmin(decode(series, "low")) == pytest.approx(heading.min(), abs=step)
+
+
+def test_a_gap_is_not_bridged() -> None:
+    time = np.concatenate([np.arange(0.0, 100.0, 0.01), np.arange(500.0, 600.0, 0.01)])
+    found = envelope(time, np.ones((time.size, 1)))
+    (blank,) = np.flatnonzero(np.isnan(found.low[:, 0]))
+    assert found.time[blank - 1] < 100.0 < found.time[blank + 1]
+    assert found.time.size < 1300
+
+
+@pytest.mark.parametrize("seconds", [4800.0, 14400.0])
+def test_pages_stay_small_at_any_length(seconds: float) -> None:
+    page = report_page(build_result(seconds))
+    assert len(page.encode()) < 1.5e6
+
+
+def test_a_redacted_page_has_no_places_and_no_names() -> None:
+    result = build_result()
+    full, redacted = report_page(result), report_page(result, redacted=True)
+    for private in ("by hand", "gnss.csv", "dvl.csv", "34.123456", "34.37", "108.86"):
+        assert private in full
+        assert private not in redacted
+    assert "0.2 s late" in redacted
+    assert "velocity_std_m_s" in redacted
+
+
+def test_text_of_files_is_escaped() -> None:
+    result = build_result()
+    solution = replace(result.solution, trial="<script>alert(1)</script>")
+    assert "<script>alert" not in report_page(replace(result, solution=solution))
+
+
+def test_every_phrase_is_there_in_chinese() -> None:
+    pages = report_page(build_result()) + comparison_page([build_result(), build_result(name="b")])
+    assert "标定报告" in pages
+    for spec in ("安装误差角", "刻度系数误差"):
+        assert spec in pages
+    # A heading in one language only would have no translation.
+    headings = re.findall(r"<h[23][^>]*>(.*?)</h[23]>", pages)
+    names = ("by hand", "out", "b")
+    assert all("zh-Hans" in h for h in headings if h not in names)
+    assert all(dictionary("phrases").values())
+
+
+def test_results_side_by_side() -> None:
+    a = build_result()
+    (first, scale) = a.solution.estimates
+    moved = replace(scale, value=scale.value + 3.0 * scale.std)
+    settings = {**a.run["settings"], "dvl": {"file": "dvl.csv", "velocity_std_m_s": 0.02}}
+    b = build_result(
+        name="kalman",
+        solution=replace(a.solution, estimates=(first, moved)),
+        run={**a.run, "settings": settings},
+    )
+    page = comparison_page([a, b])
+    values = page[page.index('id="values"') :]
+    row = values[values.index("scale error") :]
+    assert ">3.00<" in row[: row.index("</tr>")]
+    assert "dvl.velocity_std_m_s" in page
+    assert "beacons.positions" not in page
+
+
+def test_the_same_result_makes_the_same_bytes() -> None:
+    assert report_page(build_result()) == report_page(build_result())
