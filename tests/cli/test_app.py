@@ -78,7 +78,9 @@ def test_solve_options(tmp_path: Path, run: Run, stub: dict[str, Any]) -> None:
     assert result.code == 0
     assert stub["rate"] == 2.5
     assert "iteration" not in result.err
-    assert {p.name for p in out.iterdir()} == {"calibration.json", "trajectory.csv"}
+    assert {p.name for p in out.iterdir()} == {
+        *("calibration.json", "trajectory.csv", "report.html", "run.json")
+    }
     assert run("solve", trial, "--out", out).code == 2
     assert run("solve", trial, "--out", out, "--force").code == 0
 

@@ -23,7 +23,7 @@ class Result:
     Parameters
     ----------
     name : str
-        Name of the result, to tell it from others on the page.
+        Name of the result, distinct on its page.
     solution : Solution
         The result.
     run : mapping of str to object, optional

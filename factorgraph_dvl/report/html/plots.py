@@ -23,7 +23,7 @@ from factorgraph_dvl.report.html.markup import (
 )
 from factorgraph_dvl.report.html.words import chinese
 
-# Okabe and Ito's colours, which colour-blind readers tell apart; dashes for those who see none.
+# Okabe and Ito's colours, which colour-blind readers distinguish; dashes for those who see none.
 _COLOURS = ("#0072b2", "#b34700", "#00694b", "#8a2f6b", "#555555", "#7a5c00")
 _DASHES: tuple[list[int], ...] = ([], [8, 4], [2, 3], [10, 3, 2, 3], [4, 8], [1, 5])
 # Heights of plots, pixels. Chosen: residuals need less, and have a plot for each component.

@@ -38,7 +38,7 @@ from factorgraph_dvl.solution import Cause, Solution
 _CLASSES = {"good": "good", "doubtful": "doubtful", "do not use": "unusable"}
 # Edge of the plots of residuals, and lines in them, in σ.
 _PANEL, _BAND = 6.0, 3.0
-# Causes with a colour of their own: Tol's muted scheme, which colour-blind readers tell apart.
+# Causes with a colour of their own: Tol's muted scheme, which colour-blind readers distinguish.
 _SHADES = ("#332288", "#88ccee", "#117733", "#ddcc77", "#cc6677", "#aa4499", "#44aa99", "#999933")
 _REST = "#dddddd"
 # Causes in words beside each bar. Chosen: they make up nearly all of it.
