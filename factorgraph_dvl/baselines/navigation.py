@@ -42,6 +42,8 @@ from factorgraph_dvl.trial import Trial
 _LONGEST_STEP = 0.5
 # Chosen: times closer than this, s, are one.
 _SAME_TIME = 1e-6
+# Stands for an infinite standard deviation, m/s. Chosen: an update by it changes nothing.
+_UNMEASURED_STD = 1e4
 # Chosen: span, s, of the difference of fixes that stands for a velocity that is not reported.
 _BASELINE = 5.0
 # Chosen: change of the initial attitude from which on the filter runs again; linearisation errors
@@ -334,7 +336,8 @@ def _fixes_at(gnss: Gnss, samples: StrapdownSamples, time: Array) -> Fixes:
     gyro_noise = cross_variance(omega_sigma, lever_arm**2)
     turned = arm_std**2 * np.sum(signal.omega**2, axis=1)
     out["sp"][at] = gnss.position_std[inside] ** 2 + arm_std**2
-    out["sv"][at] = gnss.velocity_std[inside] ** 2 + (gyro_noise + turned)[at, None]
+    variance = np.minimum(gnss.velocity_std[inside], _UNMEASURED_STD) ** 2
+    out["sv"][at] = variance + (gyro_noise + turned)[at, None]
     turning = signal.omega - omega_cb_b
     return Fixes(out["p"], out["v"], out["sp"], out["sv"], turning, lever_arm)
 

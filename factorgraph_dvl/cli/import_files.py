@@ -15,19 +15,40 @@ def import_(
     files: Annotated[
         list[Path], typer.Argument(metavar="FILE...", help="Raw files of one trial.")
     ],
-    out: Annotated[Path, typer.Option("--out", metavar="TRIAL", help="Trial folder to write.")],
+    out: Annotated[
+        Path | None, typer.Option("--out", metavar="TRIAL", help="Trial folder to write.")
+    ] = None,
     form: Annotated[
         str, typer.Option("--format", metavar="NAME", help="Format of all files, not recognised.")
     ] = "",
+    mapping: Annotated[
+        Path | None,
+        typer.Option("--map", metavar="MAPPING.yaml", help="What the columns of tables are."),
+    ] = None,
+    guess: Annotated[
+        bool, typer.Option("--guess", help="Propose a mapping for tables, and write nothing.")
+    ] = False,
     force: Force = False,
     quiet: Quiet = False,
 ) -> None:
     """Import raw files of instruments: velocity logs, GNSS, attitude, IMU."""
+    from factorgraph_dvl.errors import ConfigError
+    from factorgraph_dvl.io.formats.mapping import MappingSettings
+    from factorgraph_dvl.io.importing.guess import guess_all
     from factorgraph_dvl.io.importing.raw_files import OWNED, import_files
+    from factorgraph_dvl.settings.yaml_file import read_yaml
 
-    claim_output(out, force=force, owned=OWNED, inputs=files)
+    if guess:
+        stdout().print(guess_all(files), markup=False, highlight=False, soft_wrap=True, end="")
+        return
+    if out is None:
+        raise ConfigError("is missing", where="--out", expected="the trial folder to write")
+    settings = None if mapping is None else read_yaml(mapping, MappingSettings)
+    claim_output(out, force=force, owned=OWNED, inputs=(*files, mapping))
     with ProgressLine(quiet=quiet) as progress:
-        decisions = import_files(files, out, form=form, force=force, progress=progress)
+        decisions = import_files(
+            files, out, form=form, mapping=settings, force=force, progress=progress
+        )
     for line in decisions.lines:
         stdout().print(line, markup=False, highlight=False, soft_wrap=True)
     for text in decisions.missing:

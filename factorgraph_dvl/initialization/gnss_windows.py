@@ -64,7 +64,7 @@ def level_velocities(gnss: Gnss) -> LevelVelocities:
     measured = ~np.isnan(gnss.velocity[:, 0])
     if measured.any():
         time = gnss.time[measured]
-        sigma = np.sqrt(np.mean(gnss.velocity_std[measured] ** 2, axis=1))
+        sigma = gnss.mean_velocity_std[measured]
         found = LevelVelocities(time, time, gnss.velocity[measured], sigma)
         return found.only(steady(found.velocity))
     has_fix = ~np.isnan(gnss.geodetic[:, 0])

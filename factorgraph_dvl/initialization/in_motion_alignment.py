@@ -190,7 +190,7 @@ def _from_velocity(gnss: Gnss, frame: LocalFrame, arc: DeadReckonedSpan) -> _Pai
         time,
         velocity + rotate(body_R, turning),
         space - arc.gravity_integrals(at)[0],
-        np.sqrt((gnss.velocity_std[use] ** 2).mean(axis=1)),
+        gnss.mean_velocity_std[use],
         v_n,
     )
 

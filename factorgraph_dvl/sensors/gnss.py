@@ -81,7 +81,8 @@ class Gnss:
     geodetic : ndarray, shape (M, 3)
         Latitude, longitude (rad), ellipsoidal height (m) of the antenna; nan where not measured.
     velocity : ndarray, shape (M, 3)
-        East, north, up, m/s; nan where not measured.
+        East, north, up, m/s; nan where not measured. Up alone may be nan, as where course and
+        speed over ground are known: it is then 0, with an infinite standard deviation.
     position_std, velocity_std : ndarray, shape (M, 3)
         Standard deviations, east, north, up; the settings' where the record has none (nan).
     source : str, optional
@@ -116,7 +117,10 @@ class Gnss:
         position = named_columns(POSITION_COLUMNS, self.geodetic)
         check_all_or_none(position, self.source)
         velocity = named_columns(VELOCITY_COLUMNS, self.velocity)
-        check_all_or_none(velocity, self.source)
+        check_all_or_none(dict(list(velocity.items())[:2]), self.source)
+        level = np.isfinite(self.velocity[:, 0])
+        no_up = level & (np.isnan(self.velocity[:, 2]) | np.isinf(self.velocity_std[:, 2]))
+        check_all_or_none(named_columns(VELOCITY_COLUMNS, self.velocity[~no_up]), self.source)
         degrees = {k: position[k] / DEG for k in POSITION_COLUMNS[:2]}
         check_possible(degrees | {"height_m": position["height_m"]}, self.source)
         check_range(velocity, -200.0, 200.0, "m/s", self.source)
@@ -124,7 +128,8 @@ class Gnss:
             (POSITION_STD_COLUMNS, self.position_std),
             (VELOCITY_STD_COLUMNS, self.velocity_std),
         ):
-            check_range(named_columns(names, std), 1e-6, 1e6, "above 0", self.source)
+            stated = np.where(np.isinf(std), np.nan, std)
+            check_range(named_columns(names, stated), 1e-6, 1e6, "above 0", self.source)
         for name, default in (
             ("position_std", self.settings.position_std_m),
             ("velocity_std", self.settings.velocity_std_m_s),
@@ -132,6 +137,11 @@ class Gnss:
             std = getattr(self, name)
             # A new array: the one that was given is the caller's.
             object.__setattr__(self, name, np.where(np.isnan(std), default, std))
+        if no_up.any():
+            up = np.array([False, False, True])
+            self.velocity_std[no_up, 2] = np.inf
+            measured = np.where(no_up[:, None] & up, 0.0, self.velocity)
+            object.__setattr__(self, "velocity", measured)
 
     @classmethod
     def from_columns(
@@ -152,14 +162,24 @@ class Gnss:
             **named_columns(POSITION_STD_COLUMNS, self.position_std),
         }
         if not np.isnan(self.velocity).all():
-            table |= named_columns(VELOCITY_COLUMNS, self.velocity)
-            table |= named_columns(VELOCITY_STD_COLUMNS, self.velocity_std)
+            known = np.isfinite(self.velocity_std)
+            table |= named_columns(VELOCITY_COLUMNS, np.where(known, self.velocity, np.nan))
+            table |= named_columns(
+                VELOCITY_STD_COLUMNS, np.where(known, self.velocity_std, np.nan)
+            )
         return table
 
     @property
     def missing(self) -> Array:
         """Epochs with neither position nor velocity, (M,) bool."""
         return np.asarray(np.isnan(self.geodetic[:, 0]) & np.isnan(self.velocity[:, 0]))
+
+    @property
+    def mean_velocity_std(self) -> Array:
+        """Root mean square of the standard deviations of measured components, (M,), m/s."""
+        known = np.isfinite(self.velocity_std)
+        total = np.sum(np.where(known, self.velocity_std, 0.0) ** 2, axis=1)
+        return np.asarray(np.sqrt(total / known.sum(axis=1)))
 
     def on_trial_clock(self) -> Self:
         """Return this record with stamps less the stated time offset."""
@@ -341,7 +361,9 @@ class AntennaVelocity:
     def sigma(self, motion: Motion, values: Values, factor: Array | float = 1.0) -> Array:
         """Return the standard deviations, the gyro's share through the lever arm included."""
         arm_b = self.bRc @ values[LEVER_ARM]
-        return np.hypot(self.std * factor, lever_arm_sigma(motion, arm_b)[:, None])
+        # A component that was never measured has no factor either.
+        scaled = self.std * np.where(np.isinf(self.std), 1.0, factor)
+        return np.hypot(scaled, lever_arm_sigma(motion, arm_b)[:, None])
 
     def residual(self, motion: Motion, values: Values) -> Array:
         """Return predicted - measured in local-level east, north, up, (M, 3), m/s."""

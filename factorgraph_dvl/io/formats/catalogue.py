@@ -10,6 +10,7 @@ from factorgraph_dvl.io.formats.normalised import (
     trajectories,
     velocity_logs,
 )
+from factorgraph_dvl.io.formats.table import FORMAT as TABLE
 from factorgraph_dvl.io.formats.vehicles import ardupilot, bags, nucleus, ulog
 
 FORMATS: tuple[Format, ...] = (
@@ -22,4 +23,5 @@ FORMATS: tuple[Format, ...] = (
     bags.FORMAT,
     ardupilot.FORMAT,
     ulog.FORMAT,
+    TABLE,
 )

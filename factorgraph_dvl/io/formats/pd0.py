@@ -293,6 +293,8 @@ def _water(pings: Records, types: _Types) -> Array:
     begin, end, present = types.first(0x0100, 2)
     cells = np.where(present, np.minimum(pings["cells"], (end - begin - 2) // 8), 0)
     most = int(cells.max())
+    if not most:
+        return np.empty((len(pings), 0, 4))
     layout = np.dtype([("velocity", "<i2", (most, 4))])
     values = gather(types.data, begin + 2, begin + 2 + cells * 8, layout)["velocity"]
     inside = np.arange(most) < cells[:, None]

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.io.formats.format import empty
 from factorgraph_dvl.io.importing import motion, orientation, positions, velocity
 from factorgraph_dvl.io.importing.decisions import Decisions
 from factorgraph_dvl.io.importing.merging import Merged
@@ -80,6 +81,8 @@ def assemble(streams: Sequence[Timed], name: str, decisions: Decisions) -> tuple
     imu = motion.choose(streams, "imu", decisions)
     ins = None if imu is not None else motion.choose(streams, "ins", decisions)
     gnss = positions.choose(streams, decisions)
+    if imu is not None and gnss is None:
+        gnss = positions.choose(fixes_of_navigation(streams, decisions), decisions)
     where = _place(gnss, streams)
     attitude = None
     if imu is None and ins is None:
@@ -113,6 +116,27 @@ def assemble(streams: Sequence[Timed], name: str, decisions: Decisions) -> tuple
     if imu is None and ins is None and attitude is None:
         decisions.lack(NO_MOTION)
     return out, epoch
+
+
+def fixes_of_navigation(streams: Sequence[Timed], decisions: Decisions) -> list[Timed]:
+    """Return the positions and velocities of navigation solutions as fixes, beside an IMU."""
+    out = []
+    for timed in streams:
+        if timed.stream.kind != "ins":
+            continue
+        records = empty("fix", len(timed.time))
+        for name in ("at", "time", "received", "lat", "lon", "height"):
+            records[name] = timed.stream.records[name]
+        for name in ("velocity", "std", "velocity_std"):
+            records[name] = timed.stream.records[name]
+        decisions.add(
+            timed.stream.label,
+            "beside the samples of an IMU, positions and velocities of a navigation solution are "
+            "taken as fixes; they must not come from the same IMU and DVL",
+            "gnss.file",
+        )
+        out.append(replace(timed, stream=replace(timed.stream, kind="fix", records=records)))
+    return out
 
 
 def _place(

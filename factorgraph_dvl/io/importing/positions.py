@@ -24,8 +24,8 @@ from factorgraph_dvl.sensors.gnss import (
 # differential, PPS, fixed and float ambiguities, SBAS), and the vertical one relative to it.
 _STD_BY_QUALITY = {1: 3.0, 2: 1.0, 3: 1.0, 4: 0.02, 5: 0.3, 9: 1.0}
 _UNKNOWN_STD, _VERTICAL = 3.0, 2.0
-# Chosen: heave of a vessel whose fixes have no height, m, and its vertical velocity, m/s.
-_HEAVE_STD, _HEAVE_RATE_STD = 2.0, 1.0
+# Chosen: heave of a vessel whose fixes have no height, m.
+_HEAVE_STD = 2.0
 # Below this speed a course is noise, m/s.
 _SLOWEST = 0.3
 # Chosen: of velocities by Doppler, m/s, and how long a receiver's filter correlates them, s.
@@ -69,10 +69,8 @@ class Positions:
                 same = np.abs(course_time[nearest] - time) <= _TOGETHER
                 use = (same & np.isnan(velocity).any(axis=1))[:, None]
                 velocity = np.where(use, course_velocity[nearest], velocity)
-                velocity_std = np.where(
-                    use, [VELOCITY_STD, VELOCITY_STD, _HEAVE_RATE_STD], velocity_std
-                )
-            unknown = np.isnan(velocity).any(axis=1)[:, None]
+                velocity_std = np.where(use, [VELOCITY_STD, VELOCITY_STD, np.nan], velocity_std)
+            unknown = np.isnan(velocity[:, :2]).any(axis=1)[:, None]
             velocity = np.where(unknown, np.nan, velocity)
             columns = (
                 ("time_s",),
@@ -106,8 +104,8 @@ class Positions:
         times, velocities = [], []
         for time, part in self.courses.chunks():
             speed, course = part["speed"], part["course"]
-            v = np.stack([speed * np.sin(course), speed * np.cos(course), 0.0 * speed], axis=1)
-            good = np.isfinite(v).all(axis=1) & (speed >= _SLOWEST)
+            v = np.stack([speed * np.sin(course), speed * np.cos(course), np.nan * speed], axis=1)
+            good = np.isfinite(v[:, :2]).all(axis=1) & (speed >= _SLOWEST)
             times.append(time[good])
             velocities.append(v[good])
         return np.concatenate(times), np.concatenate(velocities)

@@ -7,9 +7,13 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import msgspec
+
 from factorgraph_dvl.errors import DataError
 from factorgraph_dvl.io.folders import SETTINGS_FILE, claim, new_folder
 from factorgraph_dvl.io.formats.format import Format
+from factorgraph_dvl.io.formats.mapping import MappingSettings
+from factorgraph_dvl.io.formats.table import FORMAT as TABLE
 from factorgraph_dvl.io.importing.assembly import (
     SUFFIX,
     assemble,
@@ -36,7 +40,7 @@ def import_files(
     out: Path,
     *,
     form: str = "",
-    mapping: Mapping[str, Any] | None = None,
+    mapping: MappingSettings | None = None,
     force: bool = False,
     progress: Progress | None = None,
 ) -> Decisions:
@@ -50,8 +54,8 @@ def import_files(
         Trial folder to write.
     form : str, optional
         Name of the format of all files; by default each is recognised by its content.
-    mapping : dict, optional
-        Content of a mapping YAML, for tables and for topics of bags.
+    mapping : MappingSettings, optional
+        What the columns of tables are, and what else trial.yaml is to say.
     force : bool, default False
         Replace the tables of an earlier import; a trial.yaml that was edited stays, and what it
         would be is written beside it.
@@ -83,7 +87,7 @@ def import_files(
             say("assemble")
             name = Path(files[0]).stem
             assembly, epoch = assemble(streams, name, decisions)
-            _override(assembly.settings, mapping)
+            _override(assembly.settings, {} if mapping is None else mapping.trial)
             write_tables(assembly, epoch, folder)
             shutil.rmtree(spool_folder)
             text = yaml_text(assembly.settings, decisions.comments).encode()
@@ -108,8 +112,14 @@ def edited_settings(out: Path) -> bytes | None:
     return None if same else text
 
 
-def _formats_of(path: Path, form: str, mapping: Mapping[str, Any] | None) -> tuple[Format, ...]:
-    found = (by_name(form),) if form else recognise(path)
+def _formats_of(path: Path, form: str, mapping: MappingSettings | None) -> tuple[Format, ...]:
+    found: tuple[Format, ...]
+    if form:
+        found = (by_name(form),)
+    elif mapping is not None and mapping.of(path):
+        found = (TABLE,)
+    else:
+        found = recognise(path)
     for one in found:
         check_installed(one, path)
     return found
@@ -119,17 +129,18 @@ def _read(
     path: Path,
     formats: tuple[Format, ...],
     spool: Spool,
-    mapping: Mapping[str, Any] | None,
+    mapping: MappingSettings | None,
     decisions: Decisions,
     say: Progress,
 ) -> None:
     size = path.stat().st_size
     decisions.add(path.name, " and ".join(form.title for form in formats) + f", {size} bytes")
     count = 0
+    plain = None if mapping is None else msgspec.to_builtins(mapping)
     for form in formats:
         if form.limit:
             say(f"{path.name}: {form.limit}")
-        for batch in form.read(path, mapping):
+        for batch in form.read(path, plain):
             spool.append(path.name, form.name, batch)
             count += len(batch.records)
             if len(batch.records):
@@ -143,9 +154,8 @@ def _read(
         )
 
 
-def _override(settings: dict[str, Any], mapping: Mapping[str, Any] | None) -> None:
-    """Take over what the mapping states of trial.yaml."""
-    stated = (mapping or {}).get("trial", {})
+def _override(settings: dict[str, Any], stated: Mapping[str, Any]) -> None:
+    """Take over what a mapping states of trial.yaml."""
     for section, content in stated.items():
         if isinstance(content, Mapping) and isinstance(settings.get(section), dict):
             settings[section] |= content
