@@ -1,0 +1,133 @@
+"""Tests mirror modules: where each module of the package is tested."""
+
+from __future__ import annotations
+
+import ast
+from fnmatch import fnmatch
+from pathlib import Path
+
+import factorgraph_dvl
+
+PACKAGE = Path(factorgraph_dvl.__file__).parent
+TESTS = Path(__file__).parent
+# Modules without a test module that bears their name or imports them, and where what they do is
+# tested instead: they are parts of one thing, or stand behind a command or a catalogue.
+ELSEWHERE = {
+    "baselines/beam_calibration": "sensors/test_dvl_beams.py",
+    "baselines/spurious_information": "baselines/test_calibration.py",
+    "baselines/star_calibration": "sensors/test_star.py",
+    "campaign/*": "campaign",
+    "cli/allan": "analysis/test_static_noise.py",
+    "cli/correct": "sensors/test_dvl_beams.py",
+    "cli/deadreckon": "analysis/dead_reckoning/test_before_after.py",
+    "cli/import_files": "io/importing/test_real_files.py",
+    "cli/instrument": "analysis/test_instrument_terms.py",
+    "cli/replay": "replay/test_session.py",
+    "cli/report": "report",
+    "cli/*": "cli/test_app.py",
+    "graph/imu_errors": "graph/test_problem.py",
+    "imu/arc_polynomials": "imu/test_increments.py",
+    "imu/sensitivity": "graph/test_problem.py",
+    "io/corrected_record": "sensors/test_dvl_beams.py",
+    "io/data_frames": "io",
+    "io/formats/normalised/*": "io/importing",
+    "io/formats/vehicles/*": "io/formats/test_vehicles.py",
+    "io/formats/catalogue": "io/importing",
+    "io/formats/pd0_navigation": "io/formats/test_pd0.py",
+    "io/formats/sentences": "io/formats/test_nmea.py",
+    "io/importing/*": "io/importing",
+    "io/output_file": "io",
+    "io/run_file": "io",
+    "quality/plausibility*": "quality/test_survey.py",
+    "quality/*_units": "quality/test_survey.py",
+    "quality/imu_channels": "quality/test_survey.py",
+    "quality/record*": "quality/test_survey.py",
+    "quality/*": "quality/test_consistency.py",
+    "replay/initializer": "replay/test_session.py",
+    "replay/playback": "replay/test_session.py",
+    "report/figures/beams": "sensors/test_dvl_beams.py",
+    "report/figures/crosscheck": "cli/test_crosscheck.py",
+    "report/figures/dead_reckoning": "analysis/dead_reckoning/test_before_after.py",
+    "report/figures/static_noise": "analysis/test_static_noise.py",
+    "report/figures/*": "report/figures/test_solution.py",
+    "report/files/convergence": "replay/test_session.py",
+    "report/*crosscheck": "cli/test_crosscheck.py",
+    "report/files/dead_reckoning": "analysis/dead_reckoning/test_before_after.py",
+    "report/html/*": "report",
+    "report/overview": "report",
+    "report/terminal/observability": "cli/test_observability.py",
+    "reproduce/*": "cli/test_reproduce.py",
+    "sensors/attitude": "sensors",
+    "sensors/beam_model": "sensors/test_dvl_beams.py",
+    "sensors/ins": "sensors",
+    "sensors/turntable*": "sensors/test_dvl_beams.py",
+    "settings/sections": "settings/test_yaml_file.py",
+    "simulation/*": "simulation/test_measurements.py",
+    "solvers/change_along_trial": "solvers",
+    "solvers/prediction": "planning/test_prediction.py",
+}
+MODULES = sorted(
+    path.relative_to(PACKAGE).with_suffix("").as_posix()
+    for path in PACKAGE.rglob("*.py")
+    if not path.stem.startswith("__")
+)
+
+
+def imported_by_tests() -> set[str]:
+    """Return the modules that tests import, as paths without suffix."""
+    out = set()
+    for path in TESTS.rglob("test_*.py"):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.ImportFrom) and node.module:
+                names = [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
+                out |= {name.removeprefix("factorgraph_dvl.").replace(".", "/") for name in names}
+    return out
+
+
+def mirrored(module: str) -> bool:
+    """Whether a test module stands where the module stands."""
+    folder, _, name = module.rpartition("/")
+    return (TESTS / folder / f"test_{name}.py").exists()
+
+
+def test_every_module_is_tested_by_its_name_or_where_it_is_said():
+    imported = imported_by_tests()
+    homeless = [
+        module
+        for module in MODULES
+        if not mirrored(module)
+        and module not in imported
+        and not any(fnmatch(module, pattern) for pattern in ELSEWHERE)
+    ]
+    assert not homeless, "without a test module; give them one, or name it in ELSEWHERE"
+
+
+def test_what_is_named_is_there():
+    assert [where for where in ELSEWHERE.values() if not (TESTS / where).exists()] == []
+    unused = [p for p in ELSEWHERE if not any(fnmatch(module, p) for module in MODULES)]
+    assert unused == []
+
+
+def test_modules_of_the_core_have_their_own():
+    core = ("geometry", "graph", "imu", "initialization", "replay", "solvers", "statistics")
+    without = {m for m in MODULES if m.split("/")[0] in core and not mirrored(m)}
+    assert without <= {
+        # Constants, protocols and data without a function of their own.
+        "geometry/units",
+        "replay/update",
+        # By the tests of what uses them alone, named in ELSEWHERE or importing them.
+        "geometry/celestial",
+        "graph/clocks",
+        "graph/imu_errors",
+        "graph/processes",
+        "imu/arc_polynomials",
+        "imu/sensitivity",
+        "replay/initializer",
+        "replay/playback",
+        "solvers/change_along_trial",
+        "solvers/prediction",
+        "statistics/information_history",
+        "statistics/leverage",
+        "statistics/spurious_information",
+        "statistics/square_root_information",
+    }
