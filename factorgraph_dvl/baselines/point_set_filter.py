@@ -154,7 +154,7 @@ def _filter(
 def _near(prior: Estimated, D: Array) -> Estimated:
     """Return a prior whose misalignment is near a rotation.
 
-    The first pings, at rest, would lead the filter away from it.
+    The first pings, at rest, would move the filter off it.
     """
     covariance = prior.covariance.copy()
     covariance[:3, :3] = _WIDE**2 * np.eye(3)

@@ -12,6 +12,11 @@ from factorgraph_dvl.sensors.parameters import SCALAR, Parameter, ParameterSpec
 from factorgraph_dvl.sensors.protocol import SensorSection
 from factorgraph_dvl.settings.sections import NonNegative
 
+# Plausible offset, s, and rate, ppm, of a clock. Chosen: of loggers that were set by hand, and of
+# quartz that is broken.
+_OFFSET_S = 1.0
+_RATE_PPM = 1000.0
+
 
 class ClockSection(SensorSection, frozen=True, kw_only=True):
     """Section of trial.yaml of a sensor that has a clock of its own."""
@@ -39,8 +44,12 @@ class Clock:
     @classmethod
     def of(cls, sensor: str, *, prefix: str = "") -> Clock:
         """Return the clock of a sensor; `prefix` is that of the offset's name."""
-        offset = ParameterSpec(f"{prefix}time_offset", "s", labels=SCALAR, nuisance=True)
-        rate = ParameterSpec(f"{sensor}_clock_rate", "ppm", labels=SCALAR, nuisance=True)
+        offset = ParameterSpec(
+            f"{prefix}time_offset", "s", labels=SCALAR, nuisance=True, plausible=_OFFSET_S
+        )
+        rate = ParameterSpec(
+            f"{sensor}_clock_rate", "ppm", labels=SCALAR, nuisance=True, plausible=_RATE_PPM
+        )
         return cls(offset, rate)
 
     @property

@@ -45,7 +45,7 @@ MISALIGNMENT_SPEC = ParameterSpec(
 SCALE_SPEC = ParameterSpec("scale_error", labels=SCALAR, place=3, limit=1e-3, above=-1.0)
 SCALES_SPEC = replace(SCALE_SPEC, labels=XYZ, frame="d")
 LEVER_ARM_SPEC = ParameterSpec("lever_arm", "m", frame="b", place=4, limit=0.1)
-BIAS_SPEC = ParameterSpec("dvl_bias", "m_s", frame="d", nuisance=True)
+BIAS_SPEC = ParameterSpec("dvl_bias", "m_s", frame="d", nuisance=True, plausible=0.1)
 CLOCK = Clock.of("dvl")
 CURRENT_SPEC = ParameterSpec("current", "m_s", labels=("e", "n"), frame="n")
 

@@ -451,6 +451,19 @@ class Code(StrEnum):
         "Values and standard deviations come from the rest; smaller errors may have passed.",
         "Look at rejected.csv; check bottom lock and fixes at these times.",
     )
+    ESTIMATED_INSTEAD = (
+        "estimated_instead",
+        "The data contradict a parameter that was stated as known; it was estimated instead.",
+        "Taken as stated it would draw all values with it.",
+        "Check it, and state its standard deviation.",
+    )
+    UNEXPLAINED_MISFIT = (
+        "unexplained_misfit",
+        "Residuals do not fit, and a parameter that is taken as known would explain it.",
+        "Values are drawn by more than their standard deviations.",
+        "Check the parameter that is named, and give it a standard deviation.",
+        "error",
+    )
     CHANGED_ALONG_TRIAL = (
         "changed_along_trial",
         "A parameter is not the same all along the trial.",

@@ -88,19 +88,20 @@ def _error_spec(
     of: Literal["rate", "force"],
     by: Literal["rate", "force"],
     elements: tuple[tuple[int, int], ...],
+    plausible: float,
 ) -> tuple[ParameterSpec, tuple[ImuError, ...]]:
     """Return what errors of one kind are, and the elements that they stand for."""
     labels = tuple("xyz"[i] if elements is _DIAGONAL else "xyz"[i] + "xyz"[j] for i, j in elements)
-    spec = ParameterSpec(stem, unit, labels=labels, frame="b", nuisance=True)
+    spec = ParameterSpec(stem, unit, labels=labels, frame="b", nuisance=True, plausible=plausible)
     return spec, tuple(ImuError(of, by, i, j) for i, j in elements)
 
 
 _ERRORS = (
-    _error_spec("gyro_scale", "ppm", "rate", "rate", _DIAGONAL),
-    _error_spec("gyro_misalignment", "deg", "rate", "rate", _OFF_DIAGONAL),
-    _error_spec("gyro_g_sensitivity", "deg_h_g", "rate", "force", _FULL),
-    _error_spec("accel_scale", "ppm", "force", "force", _DIAGONAL),
-    _error_spec("accel_misalignment", "deg", "force", "force", _BELOW),
+    _error_spec("gyro_scale", "ppm", "rate", "rate", _DIAGONAL, 1e4),
+    _error_spec("gyro_misalignment", "deg", "rate", "rate", _OFF_DIAGONAL, 0.5),
+    _error_spec("gyro_g_sensitivity", "deg_h_g", "rate", "force", _FULL, 100.0),
+    _error_spec("accel_scale", "ppm", "force", "force", _DIAGONAL, 1e4),
+    _error_spec("accel_misalignment", "deg", "force", "force", _BELOW, 0.5),
 )
 # Of what an earlier calibration says, what this IMU may start from.
 BIASES = (_GYRO_BIAS.name, _ACCEL_BIAS.name)

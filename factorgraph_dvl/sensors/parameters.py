@@ -74,6 +74,9 @@ class ParameterSpec:
     nuisance : bool, default False
         Whether it is estimated only for the sake of the others: it makes no
         warning where the data do not determine it.
+    plausible : float, optional
+        Standard deviation of values that there can be, in `unit`. Where a trial states that the
+        parameter is known, tests ask whether another value would explain a misfit.
     """
 
     stem: str
@@ -85,6 +88,7 @@ class ParameterSpec:
     limit: float | None = None
     above: float = -math.inf
     nuisance: bool = False
+    plausible: float | None = None
 
     @cached_property
     def name(self) -> str:

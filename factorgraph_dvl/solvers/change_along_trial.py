@@ -7,15 +7,13 @@ from collections.abc import Iterator
 import numpy as np
 
 from factorgraph_dvl.geometry.vectors import Array
-from factorgraph_dvl.graph import keys
-from factorgraph_dvl.graph.problem import Evaluation, Problem, Rows
 from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.sensors.imu import ERRORS
 from factorgraph_dvl.sensors.parameters import UNITS
 from factorgraph_dvl.solvers.calibration import reported
 from factorgraph_dvl.solvers.fixed_directions import SolvedProblem
 from factorgraph_dvl.statistics.constancy import changes
-from factorgraph_dvl.statistics.rows import rows_by_source
+from factorgraph_dvl.statistics.rows import rows_with_times
 
 # Standard deviations from which on a change is one. Chosen: the probability by chance is below
 # 1e-4 although each of hundreds of times may be the one.
@@ -55,7 +53,7 @@ def change_findings(found: SolvedProblem) -> Iterator[Finding]:
     information = found.covariances.information
     time = problem.chain.segments.node_time
     tests = changes(
-        _with_times(problem, evaluation),
+        rows_with_times(problem, evaluation),
         information.covariance_with(joint),
         information.covariance_of(functionals),
         (float(time[0]), float(time[-1])),
@@ -81,19 +79,3 @@ def change_findings(found: SolvedProblem) -> Iterator[Finding]:
         "and after",
         parameter=p.name,
     )
-
-
-def _with_times(problem: Problem, evaluation: Evaluation) -> Iterator[tuple[Rows, Array]]:
-    """Yield the rows that belong to times, with these: all but priors."""
-    when = {o.label: o.time for o in problem.observations}
-    processes = {keys.letter_of(p.key(0)): p.time for p in problem.processes}
-    node_time = problem.chain.segments.node_time
-    for rows in rows_by_source(problem, evaluation):
-        if rows.source in when:
-            yield rows, when[rows.source]
-        elif rows.keys.shape[1] > 1:
-            first = [int(key) for key in rows.keys[:, 0]]
-            letter = keys.letter_of(first[0])
-            if letter in "xb" or letter in processes:
-                table = processes.get(letter, node_time)
-                yield rows, table[[keys.index_of(key) for key in first]]

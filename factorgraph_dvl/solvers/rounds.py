@@ -18,8 +18,15 @@ from factorgraph_dvl.graph.problem import Evaluation, Problem
 from factorgraph_dvl.graph.processes import Process
 from factorgraph_dvl.imu.propagation import States
 from factorgraph_dvl.sensors.finding import Code, Finding
+from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.solution import Progress
 from factorgraph_dvl.solvers.correlated_noise import correlated_noise, with_innovations
+from factorgraph_dvl.solvers.known_parameters import (
+    Explanation,
+    confirmed,
+    explanation,
+    explanation_findings,
+)
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, minimise
 from factorgraph_dvl.solvers.outliers import robust_weights
 from factorgraph_dvl.solvers.preparation import Preparation, mounted_start
@@ -37,6 +44,10 @@ _NOISE_ROUNDS = 4
 _NOISE = "the noise of the sensors"
 _OUTLIERS = "which measurements are outliers"
 _CORRELATED = "which noise is correlated"
+_KNOWN = "which parameters are known"
+# Parameters that are estimated although they were stated as known. Chosen: a third is a sign that
+# the model is wrong.
+_MOST_FREED = 2
 # Relative change of the innovations of correlated noise from which on it counts. Chosen: less
 # changes no σ that is shown.
 _SAME_INNOVATIONS = 0.05
@@ -116,15 +127,22 @@ def settle(
     robust: dict[str, Array] = {}
     searches = 0
     correlation_searched = False
+    freed: list[Explanation] = []
+    left: Explanation | None = None
+    parameters: tuple[Parameter, ...] = prepared.parameters
+    tested: tuple[Parameter, ...] | None = None
     long_run: Mapping[str, Array] = {}
-    levels = _NoiseLevels((as_stated,), bool(as_stated))
+    first_levels = _NoiseLevels((as_stated,), bool(as_stated))
+    levels = first_levels
     changing: list[str] = ["all"]
-    for _ in range(_ROUNDS):
+    count = 0
+    while count < _ROUNDS:
+        count += 1
         if changing not in ([_NOISE], [_OUTLIERS]):
             problem = Problem(
                 chain,
                 prepared.observations,
-                prepared.parameters,
+                parameters,
                 start=values,
                 constants_prior=constants_prior,
                 clock_zero=clock_zero,
@@ -170,6 +188,18 @@ def settle(
                 levels = replace(
                     levels, factors=(*levels.factors, white), processes=found.processes
                 )
+        if not changing and minimum.converged and parameters is not tested:
+            tested = parameters
+            left = explanation(problem, minimum.evaluation)
+            if left is not None and len(freed) < _MOST_FREED:
+                freed.append(left)
+                parameters = tuple(
+                    left.freed if p.name == left.parameter.name else p for p in parameters
+                )
+                # With another model, all that its misfit made is to be found anew.
+                changing.append(_KNOWN)
+                robust, long_run, levels = {}, {}, first_levels
+                searches, correlation_searched, count = 0, False, 0
         if not changing and levels.estimated and minimum.converged:
             before = levels
             levels = _next_noise(levels, problem, minimum)
@@ -181,7 +211,12 @@ def settle(
         if not changing:
             break
         rejected = outliers
-    findings = (*_at_the_gate(cycle), *levels.findings)
+    freed = [e for e in freed if not changing and confirmed(problem, minimum, e)]
+    findings = (
+        *_at_the_gate(cycle),
+        *levels.findings,
+        *explanation_findings(freed, left, minimum.evaluation),
+    )
     if changing:
         text = f"after {_ROUNDS} rounds {', '.join(changing)} still changed: do not use the result"
         findings += (Finding(Code.NOT_CONVERGED, text, severity="error"),)

@@ -81,19 +81,7 @@ def changes(
     # Of steps in standard deviations, so that parameters of all sizes keep their digits.
     whole = np.linalg.inv(correlation)
     following = {key: (matrix / scale) @ whole for key, matrix in with_components.items()}
-    size = len(covariance)
-    score = np.zeros((INTERVALS, size))
-    information = np.zeros((INTERVALS, size, size))
-    for each, time in rows:
-        J = product(each, following)
-        of_interval = np.searchsorted(edges, time)
-        order = np.argsort(of_interval, kind="stable")
-        present, first = np.unique(of_interval[order], return_index=True)
-        parts = np.einsum("mdi,md->mi", J, each.vector)[order]
-        score[present] -= np.add.reduceat(parts, first, axis=0)
-        for k, at in zip(present, np.split(order, first[1:]), strict=True):
-            block = J[at].reshape(-1, size)
-            information[k] += block.T @ block
+    score, information = by_interval(rows, following, edges)
     before = np.cumsum(score, axis=0)[:-1]
     known = np.cumsum(information, axis=0)[:-1]
     V = np.diagonal(known - known @ correlation @ known, axis1=1, axis2=2)
@@ -111,3 +99,33 @@ def changes(
             change = -np.sign(before[k, i]) * np.sqrt(chi2[k, i]) * std
         out.append(Change(float(chi2[k, i]), float(edges[k]), float(change), float(std)))
     return out
+
+
+def by_interval(
+    rows: Iterable[tuple[Rows, Array]], following: Mapping[int, Array], edges: Array
+) -> tuple[Array, Array]:
+    """Return scores (N, P) and information (N, P, P) of what was measured in each interval.
+
+    Parameters
+    ----------
+    rows : iterable of tuple of (Rows, ndarray)
+        Rows of the linearised graph, with the times (M,) of their items, s.
+    following : dict of int to ndarray
+        How every variable follows P components, (size, P) by key.
+    edges : ndarray, shape (N - 1,), s
+        Between the intervals.
+    """
+    size = next(iter(following.values())).shape[1]
+    score = np.zeros((edges.size + 1, size))
+    information = np.zeros((edges.size + 1, size, size))
+    for each, time in rows:
+        J = product(each, following)
+        of_interval = np.searchsorted(edges, time)
+        order = np.argsort(of_interval, kind="stable")
+        present, first = np.unique(of_interval[order], return_index=True)
+        parts = np.einsum("mdi,md->mi", J, each.vector)[order]
+        score[present] -= np.add.reduceat(parts, first, axis=0)
+        for k, at in zip(present, np.split(order, first[1:]), strict=True):
+            block = J[at].reshape(-1, size)
+            information[k] += block.T @ block
+    return score, information

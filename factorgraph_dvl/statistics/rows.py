@@ -34,6 +34,22 @@ def rows_by_source(problem: Problem, evaluation: Evaluation) -> Iterator[Rows]:
     yield from problem.observation_rows(evaluation)
 
 
+def rows_with_times(problem: Problem, evaluation: Evaluation) -> Iterator[tuple[Rows, Array]]:
+    """Yield the rows that belong to times, with these: all but priors."""
+    when = {o.label: o.time for o in problem.observations}
+    processes = {keys.letter_of(p.key(0)): p.time for p in problem.processes}
+    node_time = problem.chain.segments.node_time
+    for rows in rows_by_source(problem, evaluation):
+        if rows.source in when:
+            yield rows, when[rows.source]
+        elif rows.keys.shape[1] > 1:
+            first = [int(key) for key in rows.keys[:, 0]]
+            letter = keys.letter_of(first[0])
+            if letter in "xb" or letter in processes:
+                table = processes.get(letter, node_time)
+                yield rows, table[[keys.index_of(key) for key in first]]
+
+
 def product(rows: Rows, columns: Mapping[int, Array]) -> Array:
     """Return the Jacobian times columns (size, n) of its variables by key, (M, d, n)."""
     parts = []

@@ -38,6 +38,10 @@ class Score:
         """Logarithm of the probability of a larger chi2 by chance; -inf where it underflows."""
         return float(chi2.logsf(self.chi2, self.freedom) / np.log(10.0))
 
+    def divided(self, scatter: float) -> Score:
+        """Return the test where scores scatter more, in variance, than white noise makes them."""
+        return Score(self.chi2 / scatter, self.freedom, self.step, self.std * np.sqrt(scatter))
+
     def evidence(self, count: int) -> float:
         """Return what ranks causes: chi2, less what each component costs for a count of data.
 
@@ -59,16 +63,20 @@ class Scores:
         Downward gradient of the cost, 1/SI.
     information : ndarray, shape (C, C)
         Of the data, 1/SI².
+    wide : ndarray, shape (C,)
+        Standard deviations of the wide priors, SI: what the data do not inform on stays there.
     """
 
     places: Mapping[str, slice]
     score: Array
     information: Array
+    wide: Array
 
     def test(self, names: Sequence[str]) -> Score:
         """Return the test of some candidates together, all others being right."""
         rows = np.concatenate([np.arange(self.score.size)[self.places[name]] for name in names])
         own, score = self.information[np.ix_(rows, rows)], self.score[rows]
+        own = own + np.diag(self.wide[rows] ** -2)
         inverse = np.linalg.inv(own)
         step = inverse @ score
         return Score(float(score @ step), rows.size, step, np.sqrt(np.diag(inverse)))
@@ -113,4 +121,5 @@ def scores(
         {name: slice(a, b) for name, a, b in zip(candidates, edges, edges[1:], strict=False)},
         whole @ (step / sigma) / sigma,
         (whole - np.eye(sigma.size)) / np.outer(sigma, sigma),
+        sigma,
     )

@@ -1,0 +1,252 @@
+"""Parameters that are taken as known: would one of them explain what residuals do not fit."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.graph.clocks import parameters_of
+from factorgraph_dvl.graph.problem import Evaluation, Problem
+from factorgraph_dvl.sensors.finding import Code, Finding
+from factorgraph_dvl.sensors.imu import ERRORS
+from factorgraph_dvl.sensors.parameters import UNITS, Parameter
+from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, eliminate
+from factorgraph_dvl.statistics.constancy import by_interval
+from factorgraph_dvl.statistics.robust_weights import robust_scale
+from factorgraph_dvl.statistics.rows import rows_with_times
+from factorgraph_dvl.statistics.scores import Score, Scores, scores
+from factorgraph_dvl.statistics.square_root_information import SquareRootInformation
+
+# Logarithm of the probability, shared among all tests, below which a misfit is no chance.
+_LOG10_P = -6.0
+# Standard deviations of what is plausible that a parameter may be off. Chosen: beyond, it is not
+# the cause.
+_FAR = 4.0
+# Cost up to which a cause is as probable as the most probable one. Chosen: a likelihood of e^-4.
+_TIE = 4.0
+# Intervals whose scores show how much a misfit that a parameter does not explain scatters. Chosen:
+# longer than what persists in a trial of minutes.
+_INTERVALS = 20
+# Least scale of residuals against what is stated. Chosen: records without noise have none.
+_LEAST_SCALE = 0.5
+# Trial, s, from which on tests are made. Chosen: shorter ones have rival minima.
+_SHORTEST = 60.0
+
+
+@dataclass(frozen=True)
+class Explanation:
+    """A parameter that was taken as known, and that the data say has another value.
+
+    Parameters
+    ----------
+    parameter : Parameter
+        As it was taken.
+    score : Score
+        Its test.
+    others : tuple of str
+        Names of those that explain the misfit about as well.
+    """
+
+    parameter: Parameter
+    score: Score
+    others: tuple[str, ...]
+
+    @property
+    def freed(self) -> Parameter:
+        """The parameter, to be estimated."""
+        return _wide(self.parameter, self.parameter.mean)
+
+
+def explanation(problem: Problem, evaluation: Evaluation) -> Explanation | None:
+    """Return what would explain most of a misfit; None if chance may have made it.
+
+    Parameters
+    ----------
+    problem : Problem
+        What was minimised.
+    evaluation : Evaluation
+        Its minimum.
+    """
+    time = problem.chain.segments.node_time
+    used = {
+        name
+        for o, weight in zip(problem.observations, problem.weights, strict=True)
+        if weight.any()
+        for name in (*parameters_of(o), *ERRORS)
+    }
+    known = [
+        p
+        for p in problem.all_parameters
+        if not p.estimated and p.spec.plausible is not None and p.name in used
+    ]
+    if not known or time[-1] - time[0] < _SHORTEST:
+        return None
+    limit = _LOG10_P - np.log10(len(known))
+    test, at, columns = _freed(problem, evaluation, known)
+    gaussian = test.linearize(at)
+    tree = eliminate(gaussian, test.ordering(gaussian))
+    information = SquareRootInformation(tree, at.values.dims())
+    found = scores(tree, information, columns)
+    tests = {p.name: found.test([p.name]) for p in known}
+    if not any(t.log10_p < limit for t in tests.values()):
+        return None
+    scatter = _scatter(test, at, information, columns, found)
+    tests = {name: t.divided(scatter[name]) for name, t in tests.items()}
+    significant = [
+        p for p in known if tests[p.name].log10_p < limit and _is_plausible(p, tests[p.name])
+    ]
+    if not significant:
+        return None
+    count = sum(int(np.count_nonzero(w)) for w in problem.weights)
+    significant.sort(key=lambda p: -tests[p.name].evidence(count))
+    best = tests[significant[0].name].evidence(count)
+    others = tuple(
+        p.name for p in significant[1:] if best - tests[p.name].evidence(count) < 2.0 * _TIE
+    )
+    return Explanation(significant[0], tests[significant[0].name], others)
+
+
+def _is_plausible(p: Parameter, test: Score) -> bool:
+    """Whether a parameter can be as far from what it was taken to be."""
+    return bool(np.all(np.abs(test.step) < _FAR * _wide(p, p.mean).sigma))
+
+
+def confirmed(problem: Problem, minimum: Minimum, found: Explanation) -> bool:
+    """Whether a parameter is another than it was taken to be, now that it is estimated."""
+    assert minimum.tree is not None
+    evaluation = minimum.evaluation
+    information = SquareRootInformation(minimum.tree, evaluation.values.dims())
+    name = found.parameter.name
+    P = information.covariance_of([{problem.key(name): np.eye(found.parameter.mean.size)}])
+    moved = evaluation.parameters[name] - found.parameter.mean
+    again = Score(float(moved @ np.linalg.solve(P, moved)), moved.size, moved, np.sqrt(np.diag(P)))
+    return again.log10_p < _LOG10_P
+
+
+def explanation_findings(
+    freed: Sequence[Explanation], left: Explanation | None, evaluation: Evaluation
+) -> tuple[Finding, ...]:
+    """Return findings of parameters that were estimated instead, and of what is left."""
+    out = [
+        Finding(
+            Code.ESTIMATED_INSTEAD,
+            f"{e.parameter.name} was stated as {_numbers(e.parameter, e.parameter.mean)} without "
+            f"uncertainty; the data contradict that (χ² {e.score.chi2:.0f} with "
+            f"{e.score.freedom} degrees of freedom) and it was estimated instead: "
+            f"{_numbers(e.parameter, evaluation.parameters[e.parameter.name])}{_or(e)}",
+            parameter=e.parameter.name,
+        )
+        for e in freed
+    ]
+    if left is not None:
+        value = left.parameter.mean + left.score.step
+        out.append(
+            Finding(
+                Code.UNEXPLAINED_MISFIT,
+                f"{left.parameter.name} would have to be {_numbers(left.parameter, value)} "
+                f"instead of {_numbers(left.parameter, left.parameter.mean)} (χ² "
+                f"{left.score.chi2:.0f} with {left.score.freedom} degrees of freedom){_or(left)}",
+                parameter=left.parameter.name,
+            )
+        )
+    return tuple(out)
+
+
+def _or(found: Explanation) -> str:
+    return f"; {', '.join(found.others)} would explain it about as well" if found.others else ""
+
+
+def _numbers(p: Parameter, value: Array) -> str:
+    """Return a value in the unit of files."""
+    numbers = ", ".join(f"{v:.3g}" for v in value / p.si)
+    return f"{numbers} {UNITS[p.spec.unit].text}".rstrip()
+
+
+def _wide(p: Parameter, mean: Array) -> Parameter:
+    """Return a parameter that may be anything plausible around a mean."""
+    assert p.spec.plausible is not None
+    return replace(p, mean=mean, sigma=np.full(p.mean.size, p.spec.plausible * p.si))
+
+
+def _freed(
+    problem: Problem, evaluation: Evaluation, known: Sequence[Parameter]
+) -> tuple[Problem, Evaluation, dict[str, tuple[int, Array]]]:
+    """Return the problem with known parameters free, where it is, and their keys and priors."""
+    names = {p.name for p in known}
+    values = evaluation.parameters
+    free = [_wide(p, p.mean) if p.name in names else p for p in problem.all_parameters]
+    test = Problem(
+        problem.chain,
+        problem.observations,
+        free,
+        start=values,
+        clock_zero=problem.clock_zero,
+        processes=problem.processes,
+    )
+    test.reject(problem.rejected)
+    test.noise_factors = _as_scattered(problem, evaluation)
+    test.robust_weights = problem.robust_weights
+    test.long_run = problem.long_run
+    at = test.evaluate(test.values(evaluation.states, test.prior_values() | values))
+    test.weigh(at)
+    sigma = {p.name: p.sigma for p in free}
+    columns = {name: (test.key(name), sigma[name]) for name in sigma if name in names}
+    return test, test.evaluate(at.values), columns
+
+
+def _scatter(
+    test: Problem,
+    at: Evaluation,
+    information: SquareRootInformation,
+    columns: Mapping[str, tuple[int, Array]],
+    found: Scores,
+) -> dict[str, float]:
+    """Return how much more the scores of parts of the trial scatter than white noise makes them.
+
+    Once each parameter has explained what it can. Scores of a misfit that it does not explain, as
+    of correlated noise, go with each other for a while (White, Econometrica 48(4), 1980; Newey and
+    West, Econometrica 55(3), 1987).
+    """
+    size = sum(sigma.size for _, sigma in columns.values())
+    joint: dict[int, Array] = {}
+    column = 0
+    for key, sigma in columns.values():
+        joint[key] = np.zeros((size, sigma.size))
+        joint[key][column : column + sigma.size] = np.diag(1.0 / sigma)
+        column += sigma.size
+    # In units of the wide priors.
+    gain = np.linalg.inv(information.covariance_of([joint]))
+    following = {key: P @ gain for key, P in information.covariance_with(joint).items()}
+    time = test.chain.segments.node_time
+    edges = np.linspace(time[0], time[-1], _INTERVALS + 1)[1:-1]
+    score, known = by_interval(rows_with_times(test, at), following, edges)
+    out = {}
+    for name, place in found.places.items():
+        own = known[:, place, place]
+        total = own.sum(axis=0) + np.eye(own.shape[1])
+        step = np.linalg.solve(total, score[:, place].sum(axis=0))
+        left = score[:, place] - own @ step
+        more = left.T @ left * _INTERVALS / (_INTERVALS - 1)
+        out[name] = max(1.0, float(np.trace(np.linalg.solve(total, more))) / step.size)
+    return out
+
+
+def _as_scattered(problem: Problem, evaluation: Evaluation) -> dict[str, Array]:
+    """Return factors on stated noise by what residuals differ from one to the next.
+
+    That is noise alone, and no misfit; what is stated may be wrong by far.
+    """
+    out = {}
+    for o, weight, residual in zip(
+        problem.observations, problem.weights, evaluation.residuals, strict=True
+    ):
+        if o.label not in problem.noise_factors:
+            continue
+        scale = np.maximum(robust_scale(np.where(weight > 0.0, residual, np.nan)), _LEAST_SCALE)
+        for group in map(list, o.noise_groups):
+            scale[group] = np.max(scale[group])
+        out[o.label] = problem.noise_factors[o.label] * scale
+    return out

@@ -1,0 +1,95 @@
+"""What is stated as known and is not: named, estimated instead, and seldom by chance."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import msgspec
+import numpy as np
+import pytest
+from truth import merged, scenario
+
+from factorgraph_dvl.sensors.finding import Code
+from factorgraph_dvl.simulation import simulate
+from factorgraph_dvl.solvers.batch import solve
+
+SCENE = {
+    "noise": True,
+    "manoeuvres": [
+        {"straight_s": 10},
+        {"turn_deg_s": -6, "duration_s": 20, "ramp_s": 4},
+        {"accelerate_m_s2": -0.2, "to_m_s": 2},
+        {"turn_deg_s": 8, "duration_s": 20, "ramp_s": 4},
+        {"straight_s": 20},
+    ],
+    "imu": {"rate_hz": 50, "gyro_noise_deg_sqrt_h": 0.005},
+    "gnss": {"position_std_m": [0.1, 0.1, 0.2], "velocity_std_m_s": [0.03] * 3},
+    "dvl": {"velocity_std_fraction": 0.001},
+    "trial": {"dvl": {"velocity_std_fraction": 0.001}},
+}
+
+
+def known(trial):
+    """State that clocks, antenna and bias are known."""
+    gnss = msgspec.structs.replace(
+        trial.gnss.settings, lever_arm_std_m=(0.0,) * 3, time_offset_std_s=0.0
+    )
+    dvl = msgspec.structs.replace(
+        trial.dvl.settings, time_offset_std_s=0.0, bias_std_m_s=(0.0,) * 3
+    )
+    return replace(
+        trial,
+        gnss=replace(trial.gnss, settings=gnss),
+        dvl=replace(trial.dvl, settings=dvl),
+    )
+
+
+@pytest.fixture(scope="module")
+def trial():
+    return known(simulate(scenario(**merged({}, SCENE)), 4))
+
+
+def late(trial, sensor, seconds):
+    record = getattr(trial, sensor)
+    return replace(trial, **{sensor: replace(record, time=record.time + seconds)})
+
+
+def biased(trial, change):
+    return replace(trial, dvl=replace(trial.dvl, velocity=trial.dvl.velocity + change))
+
+
+def turned_too_far(trial, ppm):
+    gyro = trial.imu.gyro * np.array([1.0, 1.0, 1.0 + 1e-6 * ppm])
+    return replace(trial, imu=replace(trial.imu, gyro=gyro))
+
+
+FAULTS = {
+    "time_offset_s": (lambda t: late(t, "dvl", 0.02), 0.02),
+    "gnss_time_offset_s": (lambda t: late(t, "gnss", 0.08), 0.08),
+    "dvl_bias_m_s": (lambda t: biased(t, np.array([0.0, 0.03, 0.0])), 0.03),
+    "gyro_scale_ppm": (lambda t: turned_too_far(t, 5000.0), 5000.0),
+}
+
+
+@pytest.mark.parametrize("name", FAULTS)
+def test_the_cause_is_named_and_estimated(trial, name):
+    fault, size = FAULTS[name]
+    solution = solve(fault(trial), rate_hz=1.0)
+    (finding,) = (f for f in solution.findings if f.code == Code.ESTIMATED_INSTEAD)
+    assert finding.parameter == name
+    found = solution.estimate(name)
+    i = int(np.argmax(np.abs(found.value)))
+    assert abs(found.value[i] - size) < 4.0 * found.std[i]
+    assert solution.converged
+    assert solution.verdict.grade == "doubtful"
+    truth = trial.calibration_truth
+    for main in ("misalignment_deg", "scale_error", "lever_arm_m"):
+        e = solution.estimate(main)
+        assert np.all(np.abs(e.value - truth[main]) < 4.0 * e.std)
+
+
+def test_nothing_is_freed_without_a_misfit(trial):
+    solution = solve(trial, rate_hz=1.0)
+    codes = {f.code for f in solution.findings}
+    assert not codes & {Code.ESTIMATED_INSTEAD, Code.UNEXPLAINED_MISFIT}
+    assert {e.name for e in solution.estimates}.isdisjoint(FAULTS)
