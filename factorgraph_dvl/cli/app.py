@@ -16,6 +16,7 @@ from factorgraph_dvl.cli.console import stderr, warn
 from factorgraph_dvl.cli.correct import correct
 from factorgraph_dvl.cli.crosscheck import crosscheck
 from factorgraph_dvl.cli.deadreckon import deadreckon
+from factorgraph_dvl.cli.export import export
 from factorgraph_dvl.cli.import_files import import_
 from factorgraph_dvl.cli.inspect import inspect
 from factorgraph_dvl.cli.instrument import instrument
@@ -55,6 +56,7 @@ for _command in (
     plan,
     deadreckon,
     report,
+    export,
     instrument,
     correct,
     allan,

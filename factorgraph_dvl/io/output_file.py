@@ -33,7 +33,7 @@ def write_file(path: Path, write: Callable[[Path], object], *, force: bool = Fal
     path : path-like
         Of the file.
     write : callable of path-like, object
-        Writes the file to a path of the same suffix.
+        Writes the file to a path of the same name, and others beside it.
     force : bool, default False
         Replace the file that is there.
 
@@ -49,7 +49,12 @@ def write_file(path: Path, write: Callable[[Path], object], *, force: bool = Fal
         with TemporaryDirectory(prefix=".factorgraph-dvl-", dir=path.parent) as folder:
             partial = Path(folder) / path.name
             write(partial)
-            os.replace(partial, path)
+            # Files that belong to it lie beside it.
+            written = sorted(Path(folder).iterdir(), key=lambda file: file.name == path.name)
+            for file in written:
+                check_new_file(path.parent / file.name, force=force)
+            for file in written:
+                os.replace(file, path.parent / file.name)
     except OSError as error:
         raise OutputError(
             f"cannot be written: {error.strerror}; nothing was changed there", where=str(path)

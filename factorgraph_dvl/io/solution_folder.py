@@ -46,6 +46,8 @@ BEAMS_FILE = "beams.csv"
 BEAM_ANGLES_FILE = "beam_angles.csv"
 HALVES_FILE = "halves.csv"
 REPORT_FILE = "report.html"
+# Of trajectories that were exported, before the name of their format.
+EXPORT_STEM = "trajectory"
 FIGURES_FOLDER = "figures"
 # What is written with a solution; the first is in every one.
 OWNED = (
@@ -53,6 +55,12 @@ OWNED = (
     *(HYPOTHESES_FILE, f"{HYPOTHESES_FOLDER}/[0-9]*.csv", REJECTED_FILE, RESIDUALS_FILE),
     *(INSTRUMENT_FILE, BEAMS_FILE, BEAM_ANGLES_FILE, HALVES_FILE),
     *(RUN_FILE, REPORT_FILE),
+    *(
+        f"{EXPORT_STEM}.{name}"
+        for name in (
+            *("tum", "kml", "geojson", "netcdf", "parquet", "sbet", "smrmsg", "nmea", "matlab"),
+        )
+    ),
     *(
         f"{FIGURES_FOLDER}/{name}.png"
         for name in ("track", "motion", "calibration", "correlation", "error_budget")

@@ -104,3 +104,9 @@ def gps_to_utc(week: ArrayLike, second: ArrayLike) -> Array:
     gps = GPS_EPOCH + np.asarray(week, float) * 7.0 * DAY + np.asarray(second, float)
     leaps = np.searchsorted(_LEAPS + np.arange(1, len(_LEAPS) + 1), gps, "right")
     return np.asarray(gps - leaps)
+
+
+def utc_to_gps(utc: ArrayLike) -> Array:
+    """Return GPS time, counted like UTC from 1970, of UTC, seconds since 1970."""
+    utc = np.asarray(utc, float)
+    return np.asarray(utc + np.searchsorted(_LEAPS, utc, "right"))
