@@ -154,11 +154,7 @@ def _filter(
 def _near(prior: Estimated, D: Array) -> Estimated:
     """Return a prior whose misalignment is near a rotation.
 
-<<<<<<< HEAD
-    The first pings, at rest, would move the filter off it.
-=======
     The first pings, at rest, would mislead the filter.
->>>>>>> c5c60f9 (Use the field's word in a docstring)
     """
     covariance = prior.covariance.copy()
     covariance[:3, :3] = _WIDE**2 * np.eye(3)

@@ -21,7 +21,7 @@ from factorgraph_dvl.baselines.star_filter import (
 from factorgraph_dvl.baselines.strapdown import StrapdownSamples, prepare
 from factorgraph_dvl.baselines.summary import gnss_residuals
 from factorgraph_dvl.errors import ConfigError, DataError
-from factorgraph_dvl.geometry.celestial import ARCSEC, off_vertical
+from factorgraph_dvl.geometry.celestial import off_vertical
 from factorgraph_dvl.geometry.earth import enu_from_ecef
 from factorgraph_dvl.geometry.rotations import (
     inverse_right_jacobian,
@@ -29,7 +29,7 @@ from factorgraph_dvl.geometry.rotations import (
     rph_from_rotation,
     rph_jacobian,
 )
-from factorgraph_dvl.geometry.units import DEG
+from factorgraph_dvl.geometry.units import ARCSEC, DEG
 from factorgraph_dvl.geometry.vectors import Array, skew
 from factorgraph_dvl.imu.increments import increments
 from factorgraph_dvl.sensors.finding import Code, Finding

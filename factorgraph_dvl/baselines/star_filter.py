@@ -27,7 +27,7 @@ from factorgraph_dvl.baselines.kalman_filter import ForwardPass, smoothed_errors
 from factorgraph_dvl.baselines.strapdown import StrapdownSamples, compose
 from factorgraph_dvl.geometry.earth import RATE, enu_from_ecef
 from factorgraph_dvl.geometry.rotations import exp_so3
-from factorgraph_dvl.geometry.units import DEG
+from factorgraph_dvl.geometry.units import DAY, DEG
 from factorgraph_dvl.geometry.vectors import Array, rotate
 from factorgraph_dvl.sensors.star import Star
 
@@ -96,14 +96,14 @@ def star_attitudes(star: Star, epoch: str, lat: float, lon: float) -> StarAttitu
 def _earth_from_stars(epoch: str, time: Array, ut1_utc: float) -> Array:
     moment = datetime.fromisoformat(epoch)
     moment = moment.replace(tzinfo=UTC) if moment.tzinfo is None else moment.astimezone(UTC)
-    unix_day, second = divmod(moment.timestamp(), 86400.0)
-    day, fraction = 2440587.5 + unix_day, second / 86400.0
+    unix_day, second = divmod(moment.timestamp(), DAY)
+    day, fraction = 2440587.5 + unix_day, second / DAY
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", erfa.ErfaWarning)
         tai_day, tai_fraction = erfa.utctai(day, fraction)
-    tt_day, tt_fraction = erfa.taitt(tai_day, tai_fraction + time / 86400.0)
+    tt_day, tt_fraction = erfa.taitt(tai_day, tai_fraction + time / DAY)
     nutated = erfa.pnm06a(tt_day, tt_fraction)
-    sidereal = erfa.gst06(day, fraction + (time + ut1_utc) / 86400.0, tt_day, tt_fraction, nutated)
+    sidereal = erfa.gst06(day, fraction + (time + ut1_utc) / DAY, tt_day, tt_fraction, nutated)
     return np.asarray(erfa.c2teqx(nutated, sidereal, np.eye(3)))
 
 

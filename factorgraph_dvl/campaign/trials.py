@@ -16,11 +16,10 @@ from factorgraph_dvl.campaign.joint_calibration import JointCalibration, joint_c
 from factorgraph_dvl.campaign.record import RunRecord
 from factorgraph_dvl.campaign.trial_run import TRIALS_FOLDER
 from factorgraph_dvl.errors import ConfigError, DataError
+from factorgraph_dvl.geometry.units import DAY
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.io.calibration_file import load_calibration
 from factorgraph_dvl.solution import Calibration
-
-_SECONDS_PER_DAY = 86400.0
 
 
 @dataclass(frozen=True)
@@ -247,4 +246,4 @@ def _time_of(epoch: str) -> float:
     except ValueError:
         return np.nan
     when = when if when.tzinfo else when.replace(tzinfo=UTC)
-    return when.timestamp() / _SECONDS_PER_DAY
+    return when.timestamp() / DAY

@@ -10,11 +10,9 @@ import numpy as np
 
 from factorgraph_dvl.errors import ConfigError
 from factorgraph_dvl.geometry.rotations import best_rotation
-from factorgraph_dvl.geometry.units import DEG
+from factorgraph_dvl.geometry.units import DAY
 from factorgraph_dvl.geometry.vectors import Array, interpolate, rotate
 
-ARCSEC = DEG / 3600.0
-_DAY = 86400.0
 # Before that, UTC had no leap seconds.
 _FIRST_YEAR = 1972
 # The celestial pole is interpolated between epochs this far apart, s: nutation bends by less
@@ -50,16 +48,16 @@ def earth_from_inertial(epoch: str, time: Array, ut1_utc: float = 0.0) -> Array:
         tt = erfa.taitt(*erfa.utctai(day, fraction))
     steps = np.unique(np.floor(time / _POLE_STEP))
     grid = _POLE_STEP * np.union1d(steps, steps + 1.0)
-    pole = np.stack(erfa.xys06a(tt[0], np.asarray(tt[1]) + grid / _DAY), axis=1)
+    pole = np.stack(erfa.xys06a(tt[0], np.asarray(tt[1]) + grid / DAY), axis=1)
     x, y, s = interpolate(time, grid, pole).T
-    angle = erfa.era00(day, fraction + (time + ut1_utc) / _DAY)
+    angle = erfa.era00(day, fraction + (time + ut1_utc) / DAY)
     return np.asarray(erfa.c2tcio(erfa.c2ixys(x, y, s), angle, np.eye(3)))
 
 
 def seconds_between(earlier: str, later: str) -> float:
     """Return the time from one epoch to another, s; leap seconds do not count."""
     (day, fraction), (last_day, last_fraction) = _utc(earlier), _utc(later)
-    return (last_day - day + last_fraction - fraction) * _DAY
+    return (last_day - day + last_fraction - fraction) * DAY
 
 
 def _utc(epoch: str) -> tuple[float, float]:
@@ -80,7 +78,7 @@ def _utc(epoch: str) -> tuple[float, float]:
         )
     midnight = moment.replace(hour=0, minute=0, second=0, microsecond=0)
     day = erfa.cal2jd(moment.year, moment.month, moment.day)
-    return float(day[0] + day[1]), (moment - midnight).total_seconds() / _DAY
+    return float(day[0] + day[1]), (moment - midnight).total_seconds() / DAY
 
 
 def attitudes_from_vectors(

@@ -20,6 +20,7 @@ from factorgraph_dvl.sensors.imu import Imu
 from factorgraph_dvl.solution import Trajectory
 from factorgraph_dvl.trial import Reference
 
+# Time between the states that the gyros are integrated from, s. Chosen: that of the graph.
 _STEP = 1.0
 # Epochs further apart than this, s, leave the gyros alone for too long to be called known.
 _LONGEST = 60.0

@@ -41,6 +41,7 @@ from factorgraph_dvl.settings.yaml_file import parse_yaml, read_text
 from factorgraph_dvl.solution import Estimate, Solution, Trajectory
 from factorgraph_dvl.trial import Reference
 
+# How far the length of a direction may be off 1. Chosen: three digits.
 _UNIT = 1e-3
 _TABLES = (".csv", ".parquet", ".pq")
 _TEXTS = (".json", ".yaml", ".yml")

@@ -14,6 +14,7 @@ from factorgraph_dvl.quality.records import WINDOW_S
 from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.sensors.imu import Imu
 
+# Stretches over which the size of the force is compared, at most. Chosen: they show a drift.
 _WINDOWS = 20
 _AXIS_NAMES = ("+x", "+y", "+z", "-x", "-y", "-z")
 

@@ -11,7 +11,9 @@ from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.sensors.dvl import Dvl
 from factorgraph_dvl.sensors.gnss import Gnss
 
+# Usual intervals that make a gap. Chosen: two measurements in a row were lost.
 GAP_INTERVALS = 3.0
+# Time over which forces and speeds are averaged, s. Chosen: a few periods of a swell.
 WINDOW_S = 10.0
 
 

@@ -18,7 +18,7 @@ from factorgraph_dvl.geometry.rotations import (
     log_so3,
     rotation_from_rph,
 )
-from factorgraph_dvl.geometry.units import DEG, DEG_PER_HOUR
+from factorgraph_dvl.geometry.units import ARCSEC, DEG, DEG_PER_HOUR
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.report.figures.drawing import ACCENT, DARK, GREY, new_figure, new_grid, style
 from factorgraph_dvl.reproduce.entry import Entry, Paper, Result, judged, scenario, table
@@ -27,6 +27,7 @@ from factorgraph_dvl.simulation import simulate
 from factorgraph_dvl.solvers.batch import solve
 from factorgraph_dvl.trial import Trial
 
+# Drifts of the gyros, deg/h, noise and rate of the star tracker, heading: as printed.
 _DRIFTS = np.array([0.05, 0.1, 0.2])
 _SIGMA_ARCSEC, _RATE_HZ = 5.0, 2.0
 _HEADING_DEG = 40.0
@@ -40,7 +41,6 @@ _STARS = np.array(
 )
 # Chosen: what counts as zero, relative; numerical derivatives leave 1e-8.
 _ZERO = 1e-6
-_ARCSEC = DEG / 3600.0
 
 
 def _bound(duration: float) -> float:
@@ -167,7 +167,7 @@ def _equation_5(seeds: int) -> Result:
     unit = _STARS / length[:, None]
     body = unit @ iRb
     found = best_rotation(unit.T @ body)
-    difference = float(np.linalg.norm(log_so3(found.T @ iRb))) / _ARCSEC
+    difference = float(np.linalg.norm(log_so3(found.T @ iRb))) / ARCSEC
     drifts = _run("liu-2020-vectors", 0, "star")
     return Result(
         f"the printed vectors have norms {', '.join(f'{x:.3f}' for x in length)}, the first is "
@@ -192,7 +192,7 @@ def _equation_6(seeds: int) -> Result:
     same = np.abs(trial.reference.time[row] - found.time) < 1e-6
     truth = rotation_from_rph(trial.reference.rph[row[same]], trial.body_axes)
     difference = log_so3(truth.transpose(0, 2, 1) @ found.nRb[same])
-    worst = float(np.abs(difference).max()) / _ARCSEC
+    worst = float(np.abs(difference).max()) / ARCSEC
     # The noise-free tangent frame stands at the first fix, which has no error here.
     return Result(
         f"C_e^n C_i^e C_b^i against the true attitude: {worst:.1e}″", judged(worst < 0.1)
@@ -296,7 +296,7 @@ def _linear_filter(*, gain: bool, predicted: bool) -> tuple[float, float]:
     Without noise, 300 s at 2 Hz. `gain`: eq. 20 with the covariance of the innovation;
     `predicted`: eq. 21 from the predicted state.
     """
-    T, R = 1.0 / _RATE_HZ, (0.5 * _SIGMA_ARCSEC * _ARCSEC) ** 2
+    T, R = 1.0 / _RATE_HZ, (0.5 * _SIGMA_ARCSEC * ARCSEC) ** 2
     drift = 0.1 * DEG_PER_HOUR
     F, H = np.array([[1.0, 0.5 * T], [0.0, 1.0]]), np.array([[1.0, 0.0]])
     x, P = np.zeros(2), np.diag([R, (5.0 * DEG_PER_HOUR) ** 2])

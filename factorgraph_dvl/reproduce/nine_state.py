@@ -25,11 +25,13 @@ from factorgraph_dvl.reproduce.entry import Entry, Paper, Result, judged, table
 from factorgraph_dvl.sensors.dvl import BIAS_SPEC, MISALIGNMENT_SPEC, SCALE_SPEC
 from factorgraph_dvl.sensors.parameters import Parameter
 
+# True bias, m/s, scale error and misalignment of what is simulated. Chosen: of usual size.
 _BIAS = np.array([0.02, -0.03, 0.01])
 _SCALE = np.array([0.01, -0.02, 0.005])
 _SMALL = np.array([1.0, -1.0, 2.0]) * DEG
 # Noise of DVL and reference, m/s, where nothing else is said.
 _DVL_STD, _REFERENCE_STD = 0.005, 0.01
+# Pings. Chosen: two minutes at 5 Hz.
 _COUNT = 600
 _NO_ARM = np.zeros(3)
 

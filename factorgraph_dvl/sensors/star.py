@@ -13,14 +13,13 @@ from scipy.stats import chi2
 
 from factorgraph_dvl.errors import ConfigError, DataError
 from factorgraph_dvl.geometry.celestial import (
-    ARCSEC,
     attitudes_from_vectors,
     earth_from_inertial,
     spread,
 )
 from factorgraph_dvl.geometry.earth import LocalFrame, enu_from_ecef
 from factorgraph_dvl.geometry.rotations import BodyAxes, inverse_right_jacobian, log_so3
-from factorgraph_dvl.geometry.units import DEG
+from factorgraph_dvl.geometry.units import ARCSEC, DEG
 from factorgraph_dvl.geometry.vectors import Array, rotate
 from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.sensors.parameters import Parameter, ParameterSpec

@@ -16,6 +16,7 @@ from factorgraph_dvl.settings.files import MEGABYTE, read_bytes
 T = TypeVar("T")
 Key = str | int
 
+# Size and number of values of a file at most. Chosen: a hundred times what settings need.
 _MAX_BYTES = MEGABYTE
 _MAX_NODES = 100_000
 

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from factorgraph_dvl.errors import ConfigError
 from factorgraph_dvl.geometry.rotations import rotation_from_rph
-from factorgraph_dvl.geometry.units import DEG
+from factorgraph_dvl.geometry.units import ARCSEC, DAY, DEG
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.sensors.star import Star, StarSettings
 from factorgraph_dvl.simulation.instruments import StarTruth
@@ -21,8 +21,6 @@ from factorgraph_dvl.simulation.motion import TrueMotion, TrueState
 
 if TYPE_CHECKING:
     from factorgraph_dvl.simulation.scenario import Scenario
-
-_ARCSEC = DEG / 3600.0
 
 
 def simulate_star(
@@ -53,7 +51,7 @@ def simulate_star(
         * body
         * mounting.inv()
     )
-    sigma = np.broadcast_to(truth.std_arcsec, 3) * _ARCSEC * scenario.noise
+    sigma = np.broadcast_to(truth.std_arcsec, 3) * ARCSEC * scenario.noise
     settings = cast("StarSettings", scenario.settings("star"))
     if truth.stars:
         inertial = np.array(truth.stars)
@@ -94,9 +92,9 @@ def _inertial_from_earth(epoch: str, time: Array, ut1_utc: float) -> Rotation:
             begin.second + begin.microsecond * 1e-6,
         )
         tai_day, tai_fraction = erfa.utctai(*utc)
-        tt = erfa.taitt(tai_day, tai_fraction + time / 86400.0)
+        tt = erfa.taitt(tai_day, tai_fraction + time / DAY)
         ut1 = erfa.utcut1(*utc, ut1_utc)
-    matrix = erfa.c2t06a(*tt, ut1[0], ut1[1] + time / 86400.0, 0.0, 0.0)
+    matrix = erfa.c2t06a(*tt, ut1[0], ut1[1] + time / DAY, 0.0, 0.0)
     return Rotation.from_matrix(matrix).inv()
 
 

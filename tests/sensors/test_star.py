@@ -26,14 +26,13 @@ from factorgraph_dvl.baselines.strapdown import compose, prepare
 from factorgraph_dvl.cli import main
 from factorgraph_dvl.errors import ConfigError, DataError
 from factorgraph_dvl.geometry.celestial import (
-    ARCSEC,
     attitudes_from_vectors,
     earth_from_inertial,
     spread,
 )
 from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.rotations import exp_so3, log_so3
-from factorgraph_dvl.geometry.units import DEG
+from factorgraph_dvl.geometry.units import ARCSEC, DEG
 from factorgraph_dvl.imu.increments import increments
 from factorgraph_dvl.io.solution_folder import load_solution
 from factorgraph_dvl.io.tables import read_table

@@ -15,7 +15,7 @@ import numpy as np
 
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.io.formats.clocks import posix
-from factorgraph_dvl.io.formats.framing import Records, Source, number
+from factorgraph_dvl.io.formats.framing import BLOCK, Records, Source, number
 
 ENU, XYZ, BEAM = range(3)
 BOTTOM, BURST, AVERAGE, TEXT = 0x17, 0x15, 0x16, 0xA0
@@ -26,7 +26,6 @@ _SEED = 0xB58C
 _HEADER = 10
 # The largest records, of raw echo sounder samples, have some 100 kB.
 _LARGEST = 1 << 24
-BLOCK = 10_000
 _UNITS = {
     "sound_speed": 0.1,
     "temperature": 0.01,

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from factorgraph_dvl.geometry.units import DAY
 from factorgraph_dvl.geometry.vectors import Array
 
-DAY = 86400.0
 # Seconds from 1970 to the start of GPS time, and the days from which GPS time was ahead
 # of UTC by 1, 2, ... seconds (IERS Bulletin C; none since 2017).
 GPS_EPOCH = 315964800.0

@@ -15,12 +15,11 @@ import numpy as np
 
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.io.formats.clocks import posix
-from factorgraph_dvl.io.formats.framing import Records, Source, number
+from factorgraph_dvl.io.formats.framing import BLOCK, Records, Source, number
 from factorgraph_dvl.io.formats.nmea import second_of_day
 from factorgraph_dvl.io.formats.sentences import Sentence, sentences
 from factorgraph_dvl.io.formats.velocities import EARTH, INSTRUMENT, records, without
 
-BLOCK = 10_000
 Row = dict[str, object]
 
 

@@ -20,7 +20,11 @@ Index = NDArray[np.int64]
 # Structured arrays of named fields.
 Records = NDArray[Any]
 
+# Bytes that are searched at a time. Chosen: some ms, and some MB with what is made of them.
 WINDOW = 1 << 21
+# Records, and short ones, that are read at a time. Chosen: some MB.
+BLOCK = 10_000
+BLOCK_OF_LINES = 100_000
 # Text without a line end for longer than this is no text.
 LONGEST_LINE = 1 << 16
 

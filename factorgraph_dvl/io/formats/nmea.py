@@ -19,11 +19,10 @@ import numpy as np
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.io.formats.clocks import in_order, posix
-from factorgraph_dvl.io.formats.framing import Records, Source, number
+from factorgraph_dvl.io.formats.framing import BLOCK_OF_LINES, Records, Source, number
 from factorgraph_dvl.io.formats.sentences import Sentence, sentences
 
 KNOT = 1852.0 / 3600.0
-BLOCK = 100_000
 _HEAD = [("at", "i8"), ("received", "f8"), ("checked", "?"), ("talker", "S2")]
 Row = tuple[float, ...]
 
@@ -52,7 +51,7 @@ KINDS = {
 }
 
 
-def read_nmea(source: Source, block: int = BLOCK) -> Iterator[dict[str, Records]]:
+def read_nmea(source: Source, block: int = BLOCK_OF_LINES) -> Iterator[dict[str, Records]]:
     """Read sentences.
 
     Parameters

@@ -14,10 +14,9 @@ import numpy as np
 
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.io.formats.clocks import posix
-from factorgraph_dvl.io.formats.framing import Records, Source, lines, number
+from factorgraph_dvl.io.formats.framing import BLOCK, Records, Source, lines, number
 from factorgraph_dvl.io.formats.velocities import EARTH, INSTRUMENT, SHIP, VELOCITY, empty
 
-BLOCK = 10_000
 # In the order of preference: what is nearest to the instrument.
 _AXES = {b":BI": INSTRUMENT, b":BS": SHIP, b":BE": EARTH}
 _FIELDS = {b":SA": 3, b":TS": 5, b":RA": 5, b":BI": 5, b":BS": 4, b":BE": 4, b":BD": 5}

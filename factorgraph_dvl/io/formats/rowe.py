@@ -14,11 +14,12 @@ import numpy as np
 
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.io.formats.clocks import posix
-from factorgraph_dvl.io.formats.framing import Records, Source
+from factorgraph_dvl.io.formats.framing import BLOCK, Records, Source
 from factorgraph_dvl.io.formats.nmea import KINDS, read_nmea
 from factorgraph_dvl.io.formats.velocities import BEAM, INSTRUMENT, VELOCITY, empty, without
 
-BLOCK = 10_000
+# What an ensemble begins with, its largest size, bytes, and the value of a lost beam: by
+# the manual, the size chosen.
 _SYNC = b"\x80" * 16
 _LARGEST = 1 << 20
 _BAD = 88.888

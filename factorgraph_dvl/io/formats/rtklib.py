@@ -13,9 +13,8 @@ import numpy as np
 from factorgraph_dvl.errors import DataError
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.io.formats.clocks import GPS_EPOCH, gps_to_utc, posix
-from factorgraph_dvl.io.formats.framing import Records, Source, lines, number
+from factorgraph_dvl.io.formats.framing import BLOCK_OF_LINES, Records, Source, lines, number
 
-BLOCK = 100_000
 # Angles rad, heights above the ellipsoid unless `is_geodetic` says otherwise.
 SOLUTION = np.dtype(
     [("at", "i8"), ("time", "f8")]
@@ -49,7 +48,7 @@ _DATE = re.compile(rb"(\d{4})/(\d\d)/(\d\d)[ ,;\t]+(\d\d):(\d\d):(\d\d(?:\.\d+)?
 _WEEK = re.compile(rb"(\d{1,4})[ ,;\t]+(\d{1,6}(?:\.\d+)?)[ ,;\t]+(.*)")
 
 
-def read_rtklib(source: Source, block: int = BLOCK) -> Iterator[Records]:
+def read_rtklib(source: Source, block: int = BLOCK_OF_LINES) -> Iterator[Records]:
     """Read a solution in latitude, longitude and height.
 
     Parameters

@@ -16,10 +16,9 @@ from typing import Any
 import numpy as np
 
 from factorgraph_dvl.geometry.units import DEG
-from factorgraph_dvl.io.formats.framing import Records, Source, lines, number
+from factorgraph_dvl.io.formats.framing import BLOCK, Records, Source, lines, number
 from factorgraph_dvl.io.formats.velocities import INSTRUMENT, records
 
-BLOCK = 10_000
 POSITION = np.dtype(
     [("at", "i8"), *((name, "f8") for name in ("time", "x", "y", "z", "std"))]
     + [(name, "f8") for name in ("roll", "pitch", "yaw")]

@@ -8,8 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from factorgraph_dvl.errors import DataError
+from factorgraph_dvl.geometry.units import DAY
 from factorgraph_dvl.geometry.vectors import Array
-from factorgraph_dvl.io.formats.clocks import DAY, GPS_EPOCH, gps_to_utc, in_order, nearest_day
+from factorgraph_dvl.io.formats.clocks import GPS_EPOCH, gps_to_utc, in_order, nearest_day
 from factorgraph_dvl.io.importing.decisions import Decisions
 from factorgraph_dvl.io.importing.lag import lag_between
 from factorgraph_dvl.io.importing.speeds import ground_speed, log_speed

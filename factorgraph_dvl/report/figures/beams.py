@@ -21,10 +21,11 @@ from factorgraph_dvl.report.figures.drawing import (
     style,
 )
 
+# Groups of beams and points in a panel, at most. Chosen: what the eye keeps apart.
 _MOST_GROUPS = 10
+_MOST_POINTS = 4000
 _COLOURS = (ACCENT, DARK, "#d98c1f", "#3c8a4e", "#a0478f")
 _DASHES = ("-", (0, (4, 4)), (0, (5, 2, 1, 2)), (0, (1, 3)))
-_MOST_POINTS = 4000
 
 
 def beam_quality_figure(quality: BeamQuality, *, into: SubFigure | None = None) -> Canvas:

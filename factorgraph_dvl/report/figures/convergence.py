@@ -29,6 +29,7 @@ from factorgraph_dvl.report.text import split_unit
 from factorgraph_dvl.sensors.finding import Verdict
 from factorgraph_dvl.solution import Estimate
 
+# Points of a line. Chosen: more than a panel has pixels.
 _POINTS = 2000
 # The axes show what is left of the error from this share of the record on.
 _SHOWN_FROM = 0.15

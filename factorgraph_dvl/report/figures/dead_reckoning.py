@@ -28,6 +28,7 @@ from factorgraph_dvl.report.figures.drawing import (
 from factorgraph_dvl.trial import Reference, Trial
 
 _BEFORE = "#c2571a"
+# Points of a track. Chosen: more than a figure has pixels along it.
 _POINTS = 5000
 
 

@@ -28,11 +28,12 @@ MEDIUM = "#b5b5b5"
 LIGHT = "#e9e9e9"
 PALE = "#f5f5f5"
 VERDICT_COLOURS = {"good": "#2e7d32", "doubtful": "#b26a00", "do not use": "#c62828"}
+# Sizes of letters, pt, and dots per inch. Chosen: legible at the width of a page.
 SMALL = 7.5
 NORMAL = 8.5
 TITLE = 10.5
-
 _DPI = 120
+# Stretches whose extremes a line is drawn by. Chosen: more than a panel has pixels.
 _BUCKETS = 2_500
 # Filling a jagged area costs more than a line, and shows less.
 _WIDE_BUCKETS = 400

@@ -26,6 +26,7 @@ from factorgraph_dvl.report.figures.drawing import (
 )
 from factorgraph_dvl.solution import Residuals
 
+# Points of a panel. Chosen: more only take time, and hide each other.
 _LARGEST_SCATTER = 20_000
 # Panels end here, in σ; what lies beyond is a triangle at the edge, and is counted.
 _PANEL = 6.0

@@ -28,6 +28,7 @@ from factorgraph_dvl.trial import PlanarTrial, Trial
 # Draws into a part of a figure, or into a new one.
 Drawing = Callable[[SubFigure | None], Canvas]
 
+# Epochs that are drawn. Chosen: ten times the pixels of a figure.
 _LARGEST_TRAJECTORY = 20_000
 
 

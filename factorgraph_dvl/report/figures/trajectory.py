@@ -36,6 +36,7 @@ from factorgraph_dvl.report.figures.drawing import (
 from factorgraph_dvl.solution import Hypothesis, Trajectory
 from factorgraph_dvl.trial import PlanarTrial, Reference, Trial
 
+# Length of a close-up, s. Chosen: a period or two of a swell.
 _CLOSE_UP_S = 10.0
 # A line is about so thick beside its panel.
 _SEEN = 0.005

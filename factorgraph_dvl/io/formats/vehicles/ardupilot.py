@@ -17,9 +17,8 @@ from factorgraph_dvl.errors import DataError
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.io.formats.clocks import gps_to_utc
 from factorgraph_dvl.io.formats.format import Batch, Format, empty
-from factorgraph_dvl.io.formats.framing import Records, Source, map_file
+from factorgraph_dvl.io.formats.framing import BLOCK, Records, Source, map_file
 from factorgraph_dvl.io.formats.vehicles.library import (
-    BLOCK,
     column,
     columns,
     given_up,

@@ -21,10 +21,9 @@ from factorgraph_dvl.errors import DataError
 from factorgraph_dvl.geometry.rotations import BodyAxes, rph_from_rotation
 from factorgraph_dvl.geometry.vectors import Array, rotate
 from factorgraph_dvl.io.formats.format import Batch, Format, Kind, empty
-from factorgraph_dvl.io.formats.framing import Records, map_file
+from factorgraph_dvl.io.formats.framing import BLOCK, Records, map_file
 from factorgraph_dvl.io.formats.vehicles.damaged_bags import MCAP, ROS_1, Channel, whole_messages
 from factorgraph_dvl.io.formats.vehicles.library import (
-    BLOCK,
     describe,
     load,
     quiet,

@@ -16,7 +16,6 @@ from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.io.formats.format import Batch
 
 # Messages that become one batch.
-BLOCK = 10_000
 
 
 def load(module: str, extra: str) -> Any:

@@ -15,8 +15,8 @@ import numpy as np
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.io.formats.ad2cp import NUCLEUS, frames
 from factorgraph_dvl.io.formats.format import Batch, Clock, Format, Kind, empty
-from factorgraph_dvl.io.formats.framing import Records, map_file
-from factorgraph_dvl.io.formats.vehicles.library import BLOCK, column, columns, load, silently
+from factorgraph_dvl.io.formats.framing import BLOCK, Records, map_file
+from factorgraph_dvl.io.formats.vehicles.library import column, columns, load, silently
 from factorgraph_dvl.io.formats.velocities import INSTRUMENT
 
 IMU, AHRS, BOTTOM, WATER, INS = 0x82, 0xD2, 0xB4, 0xBE, 0xDC
