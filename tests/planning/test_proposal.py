@@ -46,6 +46,7 @@ def test_the_shortest_addition_is_proposed():
     assert planned.duration - prediction.duration == pytest.approx(found.added)
 
 
+@pytest.mark.slow
 def test_no_sequence_of_up_to_three_entries_is_shorter(monkeypatch):
     prediction = predict(scenario(manoeuvres=[{"straight_s": 30}], **CALM))
     items = (

@@ -434,6 +434,7 @@ def test_beams_lost_for_good_leave_the_others(lost):
     np.testing.assert_array_equal(np.isfinite(residual.sigma), np.isfinite(residual.residual))
 
 
+@pytest.mark.slow
 def test_noise_in_proportion_to_velocity_leaves_the_scales_alone():
     base = msgspec.to_builtins(noisy().dvl_beams) | {"velocity_std_fraction": 0.05}
     errors = []

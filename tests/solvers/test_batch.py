@@ -315,6 +315,7 @@ def test_a_heading_that_the_earth_tells_is_not_lost_to_the_mounting():
     assert np.abs(heading.normalised[:, 2]).max() < 3.0
 
 
+@pytest.mark.slow
 def test_noise_in_proportion_to_speed_leaves_the_scale_alone():
     errors = []
     for seed in range(8):

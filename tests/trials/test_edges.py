@@ -141,8 +141,18 @@ def undisturbed(noisy):
     return solve(noisy)
 
 
-@pytest.mark.parametrize("sections", [(), ("gnss", "dvl")])
-@pytest.mark.parametrize("method", ["solve", "kalman", "replay"])
+@pytest.mark.parametrize(
+    ("method", "sections"),
+    [
+        *(
+            (method, sections)
+            for method in ("solve", "kalman")
+            for sections in ((), ("gnss", "dvl"))
+        ),
+        ("replay", ("gnss", "dvl")),
+        pytest.param("replay", (), marks=pytest.mark.slow),
+    ],
+)
 def test_the_clock_of_a_logger_may_jump(noisy, undisturbed, sections, method):
     trial = with_jump(noisy, sections)
     run = {"solve": solve, "kalman": kalman, "replay": lambda t: replay(t)[0]}[method]
