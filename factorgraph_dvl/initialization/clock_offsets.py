@@ -46,7 +46,7 @@ _HALVINGS = 3
 # Blocks of measurements whose errors are independent, s. Chosen: several times the correlation
 # time of GNSS velocities.
 _BLOCK_S = 10.0
-# Fewer blocks say nothing of the scatter between them.
+# Fewer blocks say nothing of the scatter between them, as on either side of a jump.
 _LEAST_BLOCKS = 6
 # A rate or a jump is one where it is so many standard deviations, and better than none by this
 # much of the log-likelihood. Chosen: chance gives neither in 10 000 trials.
@@ -170,7 +170,8 @@ def clock_offset(
         at, before, after = _break(comparison, _grid(around, reach, _STEP_S))
         design = np.stack([one, (time > at).astype(float)], axis=-1)
         found = _refined(comparison, design, np.array([before, after - before]))
-        if found.better_than(best):
+        sides = [np.unique(_blocks(comparison)[side]).size for side in (time > at, time <= at)]
+        if found.better_than(best) and min(sides) >= _LEAST_BLOCKS:
             best, rate = found, (0.0, 0.0)
             jump, jump_time = (float(found.values[1]), float(found.sigma[1])), at
     zero = comparison.residual(around)
