@@ -10,9 +10,11 @@ import numpy as np
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph.clocks import parameters_of
 from factorgraph_dvl.graph.problem import Evaluation, Problem
+from factorgraph_dvl.quality.earlier_calibration import prior_against_data
 from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.sensors.imu import ERRORS
 from factorgraph_dvl.sensors.parameters import UNITS, Parameter
+from factorgraph_dvl.solvers.change_along_trial import CHANGED, component_changes
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, eliminate
 from factorgraph_dvl.statistics.constancy import by_interval
 from factorgraph_dvl.statistics.robust_weights import robust_scale
@@ -25,6 +27,9 @@ _LOG10_P = -6.0
 # Standard deviations of what is plausible that a parameter may be off. Chosen: beyond, it is not
 # the cause.
 _FAR = 4.0
+# Standard deviations of its prior that a parameter must be off to be estimated without. Chosen: by
+# chance it is seldom beyond three.
+_OUTSIDE = 5.0
 # Cost up to which a cause is as probable as the most probable one. Chosen: a likelihood of e^-4.
 _TIE = 4.0
 # Intervals whose scores show how much a misfit that a parameter does not explain scatters. Chosen:
@@ -60,17 +65,72 @@ class Explanation:
         return _wide(self.parameter, self.parameter.mean)
 
 
-def explanation(problem: Problem, evaluation: Evaluation) -> Explanation | None:
+def explanation(problem: Problem, minimum: Minimum) -> Explanation | None:
     """Return what would explain most of a misfit; None if chance may have made it.
+
+    None also where a change along the trial explains more.
 
     Parameters
     ----------
     problem : Problem
         What was minimised.
-    evaluation : Evaluation
-        Its minimum.
+    minimum : Minimum
+        Where it ended.
     """
     time = problem.chain.segments.node_time
+    if time[-1] - time[0] < _SHORTEST:
+        return None
+    assert minimum.tree is not None
+    evaluation = minimum.evaluation
+    information = SquareRootInformation(minimum.tree, evaluation.values.dims())
+    tests = {
+        **_tests_of_priors(problem, evaluation, information),
+        **_tests_of_known(problem, evaluation),
+    }
+    limit = _LOG10_P - np.log10(max(len(tests), 1))
+    significant = [
+        (p, test) for p, test in tests.values() if test.log10_p < limit and _is_plausible(p, test)
+    ]
+    if not significant:
+        return None
+    changes = component_changes(problem, evaluation, information)
+    most = max((each.change.chi2 for each in changes), default=0.0)
+    count = sum(int(np.count_nonzero(w)) for w in problem.weights)
+    significant.sort(key=lambda each: -each[1].evidence(count))
+    parameter, test = significant[0]
+    if most > max(test.chi2, CHANGED**2):
+        return None
+    others = tuple(
+        p.name for p, t in significant[1:] if test.evidence(count) - t.evidence(count) < 2.0 * _TIE
+    )
+    return Explanation(parameter, test, others)
+
+
+def _tests_of_priors(
+    problem: Problem, evaluation: Evaluation, information: SquareRootInformation
+) -> dict[str, tuple[Parameter, Score]]:
+    """Return tests of the priors of what is estimated for the sake of the others, by name.
+
+    Of those only that the data put far outside.
+    """
+    out = {}
+    for p in problem.parameters:
+        if p.spec.plausible is None or p.joint is not None or not np.all(p.sigma > 0.0):
+            continue
+        if np.all(p.sigma >= p.spec.plausible * p.si):
+            continue
+        P = information.covariance_of([{problem.key(p.name): np.eye(p.mean.size)}])
+        found = prior_against_data(p.mean, np.diag(p.sigma**2), evaluation.parameters[p.name], P)
+        step = np.where(np.isfinite(found.std), found.value - p.mean, 0.0)
+        if found.freedom and np.any(np.abs(step) > _OUTSIDE * p.sigma):
+            out[p.name] = p, Score(found.statistic, found.freedom, step, found.std)
+    return out
+
+
+def _tests_of_known(
+    problem: Problem, evaluation: Evaluation
+) -> dict[str, tuple[Parameter, Score]]:
+    """Return tests of what is taken as known, by name."""
     used = {
         name
         for o, weight in zip(problem.observations, problem.weights, strict=True)
@@ -82,31 +142,18 @@ def explanation(problem: Problem, evaluation: Evaluation) -> Explanation | None:
         for p in problem.all_parameters
         if not p.estimated and p.spec.plausible is not None and p.name in used
     ]
-    if not known or time[-1] - time[0] < _SHORTEST:
-        return None
-    limit = _LOG10_P - np.log10(len(known))
+    if not known:
+        return {}
     test, at, columns = _freed(problem, evaluation, known)
     gaussian = test.linearize(at)
     tree = eliminate(gaussian, test.ordering(gaussian))
     information = SquareRootInformation(tree, at.values.dims())
     found = scores(tree, information, columns)
     tests = {p.name: found.test([p.name]) for p in known}
-    if not any(t.log10_p < limit for t in tests.values()):
-        return None
-    scatter = _scatter(test, at, information, columns, found)
-    tests = {name: t.divided(scatter[name]) for name, t in tests.items()}
-    significant = [
-        p for p in known if tests[p.name].log10_p < limit and _is_plausible(p, tests[p.name])
-    ]
-    if not significant:
-        return None
-    count = sum(int(np.count_nonzero(w)) for w in problem.weights)
-    significant.sort(key=lambda p: -tests[p.name].evidence(count))
-    best = tests[significant[0].name].evidence(count)
-    others = tuple(
-        p.name for p in significant[1:] if best - tests[p.name].evidence(count) < 2.0 * _TIE
-    )
-    return Explanation(significant[0], tests[significant[0].name], others)
+    if any(t.log10_p < _LOG10_P for t in tests.values()):
+        scatter = _scatter(test, at, information, columns, found)
+        tests = {name: t.divided(scatter[name]) for name, t in tests.items()}
+    return {p.name: (p, tests[p.name]) for p in known}
 
 
 def _is_plausible(p: Parameter, test: Score) -> bool:
@@ -133,8 +180,8 @@ def explanation_findings(
     out = [
         Finding(
             Code.ESTIMATED_INSTEAD,
-            f"{e.parameter.name} was stated as {_numbers(e.parameter, e.parameter.mean)} without "
-            f"uncertainty; the data contradict that (χ² {e.score.chi2:.0f} with "
+            f"{e.parameter.name} was stated as {_numbers(e.parameter, e.parameter.mean)} "
+            f"{_uncertainty(e.parameter)}; the data contradict that (χ² {e.score.chi2:.0f} with "
             f"{e.score.freedom} degrees of freedom) and it was estimated instead: "
             f"{_numbers(e.parameter, evaluation.parameters[e.parameter.name])}{_or(e)}",
             parameter=e.parameter.name,
@@ -153,6 +200,10 @@ def explanation_findings(
             )
         )
     return tuple(out)
+
+
+def _uncertainty(p: Parameter) -> str:
+    return f"± {_numbers(p, p.sigma)}" if p.estimated else "without uncertainty"
 
 
 def _or(found: Explanation) -> str:

@@ -190,7 +190,7 @@ def settle(
                 )
         if not changing and minimum.converged and parameters is not tested:
             tested = parameters
-            left = explanation(problem, minimum.evaluation)
+            left = explanation(problem, minimum)
             if left is not None and len(freed) < _MOST_FREED:
                 freed.append(left)
                 parameters = tuple(

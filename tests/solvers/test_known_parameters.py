@@ -93,3 +93,15 @@ def test_nothing_is_freed_without_a_misfit(trial):
     codes = {f.code for f in solution.findings}
     assert not codes & {Code.ESTIMATED_INSTEAD, Code.UNEXPLAINED_MISFIT}
     assert {e.name for e in solution.estimates}.isdisjoint(FAULTS)
+
+
+def test_a_prior_that_the_data_put_far_outside_is_widened(trial):
+    settings = msgspec.structs.replace(trial.dvl.settings, bias_std_m_s=(0.001,) * 3)
+    stated = replace(trial, dvl=replace(trial.dvl, settings=settings))
+    solution = solve(biased(stated, np.array([0.0, 0.03, 0.0])), rate_hz=1.0)
+    (finding,) = (f for f in solution.findings if f.code == Code.ESTIMATED_INSTEAD)
+    assert "0, 0, 0 m/s ± 0.001, 0.001, 0.001 m/s" in finding.text
+    bias = solution.estimate("dvl_bias_m_s")
+    assert abs(bias.value[1] - 0.03) < 4.0 * bias.std[1]
+    scale = solution.estimate("scale_error")
+    assert abs(scale.value[0] - 0.005) < 4.0 * scale.std[0]
