@@ -46,7 +46,7 @@ from factorgraph_dvl.initialization.in_motion_alignment import initial_states
 from factorgraph_dvl.sensors.protocol import Aid
 from factorgraph_dvl.simulation import parse_scenario, plan_motion, simulate
 from factorgraph_dvl.solvers.batch import solve
-from factorgraph_dvl.solvers.information_history import solve_with_history
+from factorgraph_dvl.solvers.information_along_trial import solve_with_history
 from factorgraph_dvl.solvers.levenberg_marquardt import minimise, quick_step
 from factorgraph_dvl.solvers.state_times import STATE_INTERVAL
 from factorgraph_dvl.trial import Trial

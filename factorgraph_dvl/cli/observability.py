@@ -76,7 +76,7 @@ def _view(
         return solution, look(solution, given=given)
     trial = load_trial(source, anyway=anyway)
     # The solver is slow to import: do so after the checks of the input.
-    from factorgraph_dvl.solvers.information_history import solve_with_history
+    from factorgraph_dvl.solvers.information_along_trial import solve_with_history
 
     solution, history = solve_with_history(trial, anyway=anyway, progress=progress)
     return solution, look(solution, trial=trial, history=history, given=given)

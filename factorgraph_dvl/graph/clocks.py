@@ -1,4 +1,4 @@
-"""Clocks of the sensors: measurements of a late stamp saw the motion of before.
+"""Time offsets and rates of clocks, applied to measurements: a late stamp saw the motion before.
 
 A residual depends on time only through the motion, so the chain rule gives the derivative
 with respect to a clock for every sensor alike.

@@ -16,7 +16,7 @@ from factorgraph_dvl.simulation import plan_motion, simulate
 from factorgraph_dvl.simulation.motion import TrueMotion
 from factorgraph_dvl.simulation.scenario import AngularSway, Heave, Scenario, StartSettings
 from factorgraph_dvl.solution import Solution
-from factorgraph_dvl.solvers.information_history import Frontier
+from factorgraph_dvl.solvers.information_along_trial import Frontier
 from factorgraph_dvl.solvers.prediction import TrueStates, continue_posterior, predict_posterior
 from factorgraph_dvl.statistics.information_history import InformationHistory
 from factorgraph_dvl.trial import Trial

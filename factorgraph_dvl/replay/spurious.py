@@ -13,7 +13,8 @@ from factorgraph_dvl.graph.priors import prior_root
 from factorgraph_dvl.graph.sensor_factor import NodeMeasurements
 from factorgraph_dvl.replay.start import ReplayStart
 from factorgraph_dvl.sensors.protocol import Motion
-from factorgraph_dvl.statistics.spurious_information import spurious_by, undetermined_directions
+from factorgraph_dvl.statistics.spurious_information import spurious_by
+from factorgraph_dvl.statistics.undetermined_directions import undetermined_directions
 
 # Interval at which each kind of measurement is evaluated, s; chosen: the motion's covariance
 # changes little within, and evaluating every measurement would double the cost of an update.

@@ -13,7 +13,7 @@ from factorgraph_dvl.graph.problem import Problem
 from factorgraph_dvl.sensors.finding import Finding
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, eliminate
 from factorgraph_dvl.solvers.posterior import Posterior, changes_with, considered, posterior
-from factorgraph_dvl.statistics.spurious_information import (
+from factorgraph_dvl.statistics.undetermined_directions import (
     at_prior_along,
     data_information,
     parameter_information,

@@ -16,7 +16,12 @@ from factorgraph_dvl.imu.preintegration import segments
 from factorgraph_dvl.imu.propagation import States
 from factorgraph_dvl.solution import Solution
 from factorgraph_dvl.solvers.fixed_directions import with_covariances
-from factorgraph_dvl.solvers.information_history import RATE_HZ, Frontier, as_history, run_filter
+from factorgraph_dvl.solvers.information_along_trial import (
+    RATE_HZ,
+    Frontier,
+    as_history,
+    run_filter,
+)
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, eliminate
 from factorgraph_dvl.solvers.state_times import STATE_INTERVAL, dense_epochs
 from factorgraph_dvl.solvers.summary import summarise

@@ -55,7 +55,7 @@ from factorgraph_dvl.sensors.finding import Code
 from factorgraph_dvl.sensors.protocol import Motion
 from factorgraph_dvl.simulation import plan_motion, simulate
 from factorgraph_dvl.solvers.batch import solve
-from factorgraph_dvl.solvers.information_history import solve_with_history
+from factorgraph_dvl.solvers.information_along_trial import solve_with_history
 
 JANUS_X = ((30.0, 45.0), (30.0, 315.0), (30.0, 225.0), (30.0, 135.0))
 JANUS_PLUS = ((25.0, 0.0), (25.0, 90.0), (25.0, 180.0), (25.0, 270.0))

@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 
 from factorgraph_dvl.geometry.rotations import frd_from_body, rotation_from_rph
-from factorgraph_dvl.geometry.units import DEG
+from factorgraph_dvl.geometry.units import DAY, DEG
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.io.exporting.motion import ExportedMotion
-from factorgraph_dvl.io.formats.clocks import DAY, GPS_EPOCH, utc_to_gps
+from factorgraph_dvl.io.formats.clocks import GPS_EPOCH, utc_to_gps
 from factorgraph_dvl.io.formats.sbet import SBET, SMRMSG
 
 # A knot in m/s.

@@ -32,10 +32,10 @@ from factorgraph_dvl.solvers.fixed_directions import SolvedProblem
 from factorgraph_dvl.solvers.minima import evidence_against
 from factorgraph_dvl.solvers.summary import summarise
 from factorgraph_dvl.statistics.information_history import InformationHistory
-from factorgraph_dvl.statistics.spurious_information import (
+from factorgraph_dvl.statistics.spurious_information import spurious_information
+from factorgraph_dvl.statistics.undetermined_directions import (
     SPURIOUS,
     largest_spurious_share,
-    spurious_information,
     undetermined_directions,
 )
 from factorgraph_dvl.trial import Trial

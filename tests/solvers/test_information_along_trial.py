@@ -17,7 +17,7 @@ from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.graph import keys
 from factorgraph_dvl.simulation import simulate
 from factorgraph_dvl.solvers.batch import solved_problems
-from factorgraph_dvl.solvers.information_history import (
+from factorgraph_dvl.solvers.information_along_trial import (
     information_history,
     run_filter,
     solve_with_history,
