@@ -9,7 +9,11 @@ from problems import ALL_FREE, IMU_ERRORS, SHORT, problem_of, walking
 from truth import scenario
 
 from factorgraph_dvl.graph.problem import Problem
+from factorgraph_dvl.graph.processes import Process
 from factorgraph_dvl.solvers.levenberg_marquardt import minimise
+
+# Times of the nodes of correlated errors, s; a measurement lies between any two.
+NODES = np.array([0.0, 1.3, 2.9, 4.0, 6.5, 8.1])
 
 STRICT = gtsam.LevenbergMarquardtParams()
 STRICT.setRelativeErrorTol(1e-12)
@@ -23,11 +27,28 @@ def weighed(kind):
     more = {"imu": IMU_ERRORS} if kind == "IMU errors" else {}
     scene = walking() if kind == "walking" else scenario(manoeuvres=SHORT, trial=ALL_FREE | more)
     problem, values = problem_of(scene)
+    if kind == "correlated":
+        labels = ("GNSS position", "DVL velocity")
+        processes = [
+            Process(label, i, np.array([0.1, 0.2, 0.3]), np.array([3.0, 4.0, 5.0]), NODES)
+            for i, label in enumerate(labels)
+        ]
+        evaluation = problem.evaluate(values)
+        problem = Problem(
+            problem.chain,
+            problem.observations,
+            problem.all_parameters,
+            start=evaluation.parameters,
+            processes=processes,
+        )
+        rng = np.random.default_rng(2)
+        errors = {p.name: rng.normal(0.0, 1.0, p.zero.shape) for p in processes}
+        values = problem.values(evaluation.states, evaluation.parameters | errors)
     problem.weigh(problem.evaluate(values))
     return problem, values
 
 
-@pytest.mark.parametrize("kind", ["constant", "walking", "IMU errors"])
+@pytest.mark.parametrize("kind", ["constant", "walking", "IMU errors", "correlated"])
 def test_cost_and_jacobians_are_those_of_the_problem(kind):
     problem, values = weighed(kind)
     graph, start = problem.nonlinear_graph()
