@@ -17,6 +17,7 @@ from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.sensors.attitude import Attitude
 from factorgraph_dvl.sensors.beacon import Beacons
 from factorgraph_dvl.sensors.beam_geometry import as_dvl
+from factorgraph_dvl.sensors.catalogue import add_plug_in
 from factorgraph_dvl.sensors.depth import Depth
 from factorgraph_dvl.sensors.dvl import Dvl
 from factorgraph_dvl.sensors.dvl_beams import BEAM_PREFIX, DvlBeams
@@ -173,6 +174,8 @@ class Trial:
 
     def __post_init__(self) -> None:
         # What a sensor must know of another is set here, whoever made or changed the trial.
+        for aid in self.others:
+            add_plug_in(type(aid))
         prefix = BEAM_PREFIX if self.dvl is not None else ""
         for i, aid in enumerate(self.others):
             if isinstance(aid, DvlBeams) and aid.prefix != prefix:

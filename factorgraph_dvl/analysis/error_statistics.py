@@ -274,6 +274,8 @@ def true_value_of(estimate: Estimate, truth: Mapping[str, ArrayLike]) -> Array |
     value = np.broadcast_to(value, estimate.value.shape).copy()
     if estimate.spec.kind == "rotation":
         return nearest_rotation_vector(value, estimate.value)
+    if estimate.spec.kind == "angle":
+        return nearest_angle(value, estimate.value)
     return value
 
 
@@ -339,6 +341,12 @@ def _nees(error: Array, covariance: Array) -> Array:
     correlation = covariance / (std[:, :, None] * std[:, None, :])
     weighted = np.linalg.solve(correlation, z[:, :, None])[:, :, 0]
     return np.asarray(np.sum(z * weighted, axis=1))
+
+
+def nearest_angle(angle: Array, near: Array) -> Array:
+    """Return angles, deg, with whole turns added that bring them nearest to others; nan stays."""
+    turns = np.round((near - angle) / 360.0)
+    return angle + 360.0 * np.where(np.isfinite(turns), turns, 0.0)
 
 
 def nearest_rotation_vector(phi: Array, near: Array) -> Array:

@@ -32,9 +32,11 @@ from factorgraph_dvl.io.trial_yaml import (
     ReferenceSettings,
     TrialSettings,
     VelocitySettings,
+    parse_trial,
+    settings_type,
     to_yaml,
 )
-from factorgraph_dvl.sensors.catalogue import AIDS, PLANAR
+from factorgraph_dvl.sensors.catalogue import AIDS, PLANAR, aid_types
 from factorgraph_dvl.sensors.dvl import Dvl
 from factorgraph_dvl.sensors.dvl_beams import DvlBeams
 from factorgraph_dvl.sensors.finding import Code, Finding
@@ -113,7 +115,7 @@ def load_trial(path: Path | str, *, anyway: bool = False) -> Trial:
             expected="an imu section",
             hint="`inspect`, `solve` and `kalman` take planar trials",
         )
-    settings = parse_yaml(text, TrialSettings, source=file.name)
+    settings = parse_trial(text, file.name)
     trial = assembled(settings, folder, folder, anyway=anyway)
     name = printable(settings.name or folder.resolve().name)
     truth = read_truth(folder / TRUTH_FILE)
@@ -137,7 +139,7 @@ def assembled(
         As of `load_trial`.
     """
     initial = settings.initial
-    kinds = {aid.section: aid for aid in AIDS}
+    kinds = {aid.section: aid for aid in aid_types()}
     notes: list[Finding] = []
     imu = None if settings.imu is UNSET else read_record(tables, Imu, settings.imu, notes)
     aids = {
@@ -201,7 +203,7 @@ def load_reference(path: Path | str) -> tuple[Reference | None, dict[str, Array]
     if looks_planar(text, file.name):
         settings = parse_yaml(text, PlanarSettings, source=file.name)
     else:
-        settings = parse_yaml(text, TrialSettings, source=file.name)
+        settings = parse_trial(text, file.name)
     return reference_of(folder, settings), read_truth(folder / TRUTH_FILE)
 
 
@@ -214,7 +216,7 @@ def record_files(path: Path) -> list[Path]:
         As `load_trial`.
     """
     folder, file = locate(path)
-    settings = parse_yaml(read_text(file), TrialSettings, source=file.name)
+    settings = parse_trial(read_text(file), file.name)
     sections = [] if settings.imu is UNSET else [settings.imu]
     return [folder / section.file for section in (*sections, *settings.aids.values())]
 
@@ -251,7 +253,9 @@ def save_trial(
     """
     suffix = ".parquet" if parquet else ".csv"
     check_saved(Path(path))
-    with new_folder(Path(path), force=force, owned=OWNED) as folder:
+    tables = (f"{record.section}{suffix}" for record in trial.records)
+    owned = tuple(dict.fromkeys((*OWNED, *tables)))
+    with new_folder(Path(path), force=force, owned=owned) as folder:
         for record in trial.records:
             write_table(folder / f"{record.section}{suffix}", record.columns())
         if trial.reference is not None:
@@ -409,7 +413,7 @@ def position_of(initial: InitialSettings | PlanarInitialSettings) -> InitialPosi
 
 
 def _settings(trial: Trial, suffix: str) -> TrialSettings:
-    return TrialSettings(
+    return settings_type(record.section for record in trial.records)(
         format=1,
         name=trial.name,
         body_axes=trial.body_axes,

@@ -8,7 +8,7 @@ from typing import Any
 from factorgraph_dvl.errors import ConfigError
 from factorgraph_dvl.io.tables import Tables
 from factorgraph_dvl.io.trial_folder import assembled
-from factorgraph_dvl.io.trial_yaml import TrialSettings
+from factorgraph_dvl.io.trial_yaml import settings_type
 from factorgraph_dvl.settings.convert import convert
 from factorgraph_dvl.trial import Trial
 
@@ -61,7 +61,7 @@ def trial_from_tables(
                 f"section {name} has no table", where=_SOURCE, expected=f"a table {name}"
             )
     plain = _plain({"format": 1, **settings, **sections})
-    found = convert(plain, TrialSettings, "", _SOURCE)
+    found = convert(plain, settings_type(plain), "", _SOURCE)
     return assembled(found, tables, Path(folder), anyway=anyway)
 
 

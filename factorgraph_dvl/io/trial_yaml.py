@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
 
 import msgspec
 from msgspec import UNSET, Meta, UnsetType
 
 from factorgraph_dvl.geometry.rotations import BodyAxes
 from factorgraph_dvl.sensors.beacon import BeaconSettings
-from factorgraph_dvl.sensors.catalogue import AIDS
+from factorgraph_dvl.sensors.catalogue import AIDS, aid_types, load_plug_ins
 from factorgraph_dvl.sensors.depth import DepthSettings
 from factorgraph_dvl.sensors.imu import ImuSettings
-from factorgraph_dvl.sensors.protocol import NoiseModel, SensorSection
+from factorgraph_dvl.sensors.protocol import Aid, NoiseModel, SensorSection
 from factorgraph_dvl.sensors.speed_log import HeadingSettings, LogSettings
 from factorgraph_dvl.settings.sections import Positive, Section, Sigma3, check_epoch
+from factorgraph_dvl.settings.yaml_file import parse_yaml
 
 _Pitch = Annotated[float, Meta(ge=-90, le=90)]
 _Speed = Annotated[float, Meta(ge=-200, le=200)]
@@ -114,8 +116,22 @@ class _Settings(Section, frozen=True, kw_only=True):
     @property
     def aids(self) -> dict[str, SensorSection]:
         """Sections of the sensors other than the IMU, by name."""
-        given = {aid.section: getattr(self, aid.section) for aid in AIDS}
+        given = {aid.section: getattr(self, aid.section, UNSET) for aid in aid_types()}
         return {name: section for name, section in given.items() if section is not UNSET}
+
+
+def _with_sections(kinds: tuple[type[Aid], ...]) -> type[_Settings]:
+    """Return the settings of trials that may have these sensors."""
+    found = msgspec.defstruct(
+        "TrialSettings",
+        [(kind.section, kind.section_type | UnsetType, UNSET) for kind in kinds],
+        bases=(_Settings,),
+        frozen=True,
+        kw_only=True,
+        forbid_unknown_fields=True,
+        namespace={"__doc__": "The whole of trial.yaml; sections that are absent are unset."},
+    )
+    return cast(type[_Settings], found)
 
 
 if TYPE_CHECKING:
@@ -126,17 +142,31 @@ if TYPE_CHECKING:
         def __init__(self, **sections: Any) -> None: ...
 
 else:
-    TrialSettings = msgspec.defstruct(
-        "TrialSettings",
-        [
-            *((aid.section, aid.section_type | UnsetType, UNSET) for aid in AIDS),
-        ],
-        bases=(_Settings,),
-        frozen=True,
-        kw_only=True,
-        forbid_unknown_fields=True,
-        namespace={"__doc__": "The whole of trial.yaml; sections that are absent are unset."},
-    )
+    TrialSettings = _with_sections(AIDS)
+
+
+# Keys of trial.yaml that are no sections of sensors beside the IMU.
+_KEYS = set(_Settings.__struct_fields__)
+
+
+def settings_type(keys: Iterable[str]) -> type[TrialSettings]:
+    """Return the settings of trials with these keys: plug-ins are searched for unknown ones."""
+    load_plug_ins(set(keys) - _KEYS)
+    kinds = aid_types()
+    found = TrialSettings if kinds == AIDS else _with_sections(kinds)
+    return cast("type[TrialSettings]", found)
+
+
+def parse_trial(text: str, source: str) -> TrialSettings:
+    """Return the settings in the text of a trial.yaml.
+
+    Raises
+    ------
+    ConfigError
+        As of `parse_yaml`.
+    """
+    keys = parse_yaml(text, dict[str, Any], source=source)
+    return parse_yaml(text, settings_type(keys), source=source)
 
 
 def to_yaml(settings: TrialSettings | PlanarSettings) -> str:

@@ -46,7 +46,7 @@ SCHULER_PERIOD = 84.4 * 60.0
 # a Gauss-Markov process over a long time T has the variance 2 sigma² tau / T.
 _APART = 2.0
 
-HEADING_OFFSET_SPEC = ParameterSpec("heading_offset", "deg", labels=SCALAR)
+HEADING_OFFSET_SPEC = ParameterSpec("heading_offset", "deg", labels=SCALAR, kind="angle")
 SCHULER_SPEC = ParameterSpec("heading_schuler", "deg", labels=("cos", "sin"), nuisance=True)
 DEVIATION_SPEC = ParameterSpec(
     "compass_deviation", "deg", labels=("sin_1", "cos_1", "sin_2", "cos_2"), nuisance=True

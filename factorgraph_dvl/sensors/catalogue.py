@@ -1,10 +1,13 @@
-"""The sensors that aid the IMU: a new one is known once it stands here."""
+"""The sensors that aid the IMU: those of the package, and those of other packages."""
 
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable
 from dataclasses import replace
+from importlib.metadata import EntryPoint, entry_points
 
+from factorgraph_dvl.errors import ConfigError
 from factorgraph_dvl.sensors.attitude import Attitude
 from factorgraph_dvl.sensors.beacon import ANY_BEACON, Beacons, offset_name
 from factorgraph_dvl.sensors.depth import Depth
@@ -25,6 +28,63 @@ AIDS: tuple[type[Aid], ...] = (
 )
 
 
+# Group of entry points by which other packages offer sensors; each has the name of its section.
+GROUP = "factorgraph_dvl.sensors"
+# Attributes that a sensor must have before its section can be read; the protocol `Aid` has all.
+_DECLARED = ("section", "section_type", "required", "optional", "specs", "from_columns")
+
+# Sensors of other packages that a trial has named so far, by section.
+_PLUG_INS: dict[str, type[Aid]] = {}
+
+
+def aid_types() -> tuple[type[Aid], ...]:
+    """Return the sensors that are known: the package's own, and plug-ins that a trial named."""
+    return (*AIDS, *_PLUG_INS.values())
+
+
+def load_plug_ins(sections: Iterable[str]) -> None:
+    """Look for sensors of other packages that have these sections; ones without are left out.
+
+    Entry points are searched only if a section is not known yet.
+
+    Raises
+    ------
+    ConfigError
+        If a package that offers a section cannot be imported, or offers something else.
+    """
+    unknown = set(sections) - {kind.section for kind in aid_types()}
+    if not unknown:
+        return
+    for entry in entry_points(group=GROUP):
+        if entry.name in unknown:
+            add_plug_in(_loaded(entry))
+
+
+def add_plug_in(kind: type[Aid]) -> None:
+    """Make a sensor known to files, reports and comparisons; one of the package's is already."""
+    if kind not in AIDS:
+        _PLUG_INS[kind.section] = kind
+
+
+def _loaded(entry: EntryPoint) -> type[Aid]:
+    where = f"entry point {entry.name} = {entry.value}"
+    try:
+        kind = entry.load()
+    except (ImportError, AttributeError) as error:
+        raise ConfigError(
+            f"the sensor cannot be imported ({error})", where=where, expected="a class"
+        ) from error
+    missing = [name for name in _DECLARED if not hasattr(kind, name)]
+    if missing or kind.section != entry.name:
+        what = f"lacks {', '.join(missing)}" if missing else f"has section {kind.section!r}"
+        raise ConfigError(
+            f"the sensor {what}",
+            where=where,
+            expected=f"a class with section {entry.name!r} and the rest of `Aid`",
+        )
+    return kind
+
+
 # Records of a planar trial, which has no IMU.
 PLANAR: tuple[type[SensorRecord], ...] = (Heading, SpeedLog, Depth, Beacons)
 
@@ -35,7 +95,7 @@ BEACON_OFFSET = re.compile(offset_name(r"([^\s\"':,{}]+)") + r"\b")
 
 def every_spec() -> tuple[ParameterSpec, ...]:
     """Return the parameters of all sensors, with each number of components."""
-    kinds: tuple[type[SensorRecord], ...] = (Imu, *AIDS, *PLANAR)
+    kinds: tuple[type[SensorRecord], ...] = (Imu, *aid_types(), *PLANAR)
     return tuple(dict.fromkeys(spec for kind in kinds for spec in kind.specs))
 
 

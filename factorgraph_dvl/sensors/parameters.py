@@ -23,7 +23,7 @@ _NEGATIVE = 1e-6
 XYZ = ("x", "y", "z")
 SCALAR = ("",)
 
-Kind = Literal["vector", "rotation", "directions"]
+Kind = Literal["vector", "angle", "rotation", "directions"]
 Frame = Literal["b", "d", "n", ""]
 
 
@@ -61,8 +61,8 @@ class ParameterSpec:
     labels : tuple of str, optional
         Of the n components, `SCALAR` for a number.
     kind : Kind, optional
-        How the components are to be understood: as they are, as a rotation vector, or as turns
-        of unit vectors, two each.
+        How the components are to be understood: as they are, as angles, which are the same after
+        a full turn, as a rotation vector, or as turns of unit vectors, two each.
     frame : Frame, optional
         Axes of the components: body, DVL, or east, north, up; empty if there are none.
     place : int, optional

@@ -20,7 +20,7 @@ HEADING_BIAS = "heading_bias_deg"
 SCALE_ERROR = "log_scale_error"
 CURRENT = "current_m_s"
 
-HEADING_BIAS_SPEC = ParameterSpec("heading_bias", "deg", labels=SCALAR)
+HEADING_BIAS_SPEC = ParameterSpec("heading_bias", "deg", labels=SCALAR, kind="angle")
 LOG_SCALE_SPEC = ParameterSpec("log_scale_error", labels=SCALAR, above=-1.0)
 
 

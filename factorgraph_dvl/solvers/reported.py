@@ -8,7 +8,11 @@ from typing import TypeVar
 
 import numpy as np
 
-from factorgraph_dvl.geometry.rotations import inverse_right_jacobian, reported_rotation_vector
+from factorgraph_dvl.geometry.rotations import (
+    inverse_right_jacobian,
+    reported_rotation_vector,
+    wrapped,
+)
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.solution import Estimate, as_estimates
@@ -41,6 +45,8 @@ def in_unit(p: Parameter, value: Array) -> Reported:
     if p.rotation:
         value = reported_rotation_vector(value, p.mean)
         derivative = inverse_right_jacobian(value)
+    elif p.spec.kind == "angle":
+        value = wrapped(value)
     return Reported(p, value / p.si, derivative / p.si)
 
 

@@ -11,6 +11,7 @@ from scipy.special import chdtrc, chdtri
 
 from factorgraph_dvl.analysis.error_statistics import (
     VectorErrors,
+    nearest_angle,
     nearest_rotation_vector,
 )
 from factorgraph_dvl.geometry.rotations import exp_so3, log_so3
@@ -199,6 +200,9 @@ def same_branch(solution: _Result, other: Solution | Calibration) -> _Result:
         row = rows.stop
         if estimate.nominal is not None:
             estimates[i] = _about_the_same(estimate, other)
+        if estimate.spec.kind == "angle" and estimate.name in near:
+            value = nearest_angle(estimate.value, near[estimate.name])
+            estimates[i] = estimate = replace(estimate, value=value)
         if estimate.spec.kind != "rotation" or estimate.name not in near:
             continue
         phi = estimate.value
