@@ -10,6 +10,7 @@ import typer
 from rich.text import Text
 
 from factorgraph_dvl import __version__
+from factorgraph_dvl.cli import events
 from factorgraph_dvl.cli.allan import allan
 from factorgraph_dvl.cli.campaign import campaign
 from factorgraph_dvl.cli.console import stderr, warn
@@ -35,6 +36,8 @@ from factorgraph_dvl.errors import FactorgraphDvlError, printable
 _NAME = "factorgraph-dvl"
 # The exit code of an interrupt, as in Typer.
 _INTERRUPTED = 130
+# Options that stand anywhere on the line.
+_EVERYWHERE = ("--debug", "--json")
 
 # A command's module imports heavy packages (GTSAM, SciPy, Matplotlib, Arrow) only when it runs,
 # so that --help answers at once.
@@ -74,9 +77,23 @@ def run(args: list[str]) -> NoReturn:
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     guard_streams()
+    events.switch("--json" in args)
+    try:
+        _run(args)
+    except SystemExit as done:
+        if events.active():
+            events.emit(
+                events.End(done.code if isinstance(done.code, int) else int(bool(done.code)))
+            )
+        raise
+    finally:
+        events.switch(False)
+
+
+def _run(args: list[str]) -> NoReturn:
     try:
         with claims:
-            app(args=[arg for arg in args if arg != "--debug"], prog_name=_NAME)
+            app(args=[arg for arg in args if arg not in _EVERYWHERE], prog_name=_NAME)
     except FactorgraphDvlError as error:
         for note in getattr(error, "__notes__", ()):
             warn(note)
@@ -116,6 +133,9 @@ def _interrupted(error: BaseException | None) -> bool:
 def _fail(message: str, exit_code: int, args: list[str]) -> NoReturn:
     if "--debug" in args:
         stderr().print_exception()
+    if events.active():
+        events.emit(events.Failed(printable(message)))
+        sys.exit(exit_code)
     stderr().print(Text(f"error: {printable(message)}", "red"), soft_wrap=True)
     sys.exit(exit_code)
 
@@ -136,6 +156,13 @@ def _options(
     ] = False,
     debug: Annotated[
         bool, typer.Option("--debug", help="Show the traceback of an error.")
+    ] = False,
+    as_json: Annotated[
+        bool,
+        typer.Option(
+            "--json",
+            help="Print events and results of any command as JSON lines (docs/events.md).",
+        ),
     ] = False,
 ) -> None:
     pass

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from factorgraph_dvl.cli.console import CountLine, stderr, stdout, warn
+from factorgraph_dvl.cli.console import CountLine, print_folder, stderr, stdout, warn
 from factorgraph_dvl.cli.options import Anyway, Force, NoFigures, Quiet, claim_output
 
 if TYPE_CHECKING:
@@ -98,7 +98,7 @@ def _run_trials(
     write_campaign(found, out)
     write_page(found, out)
     _print_campaign(found)
-    stdout().print(f"Wrote {out}", markup=False, soft_wrap=True)
+    print_folder(out)
     _end(len(found.failed))
 
 
@@ -138,7 +138,7 @@ def _run_seeds(
             band = f"{s.low:.4g} to {s.high:.4g}"
             text = f"{s.name}: {s.value:.4g}, by chance {band}{'' if s.inside else ': OUTSIDE'}"
             stdout().print(text, markup=False, soft_wrap=True)
-    stdout().print(f"Wrote {out}", markup=False, soft_wrap=True)
+    print_folder(out)
     _end(sum(not r.done for r in records))
 
 

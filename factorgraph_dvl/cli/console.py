@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from time import perf_counter, time
 from typing import TYPE_CHECKING, Any
 
+import msgspec
 from rich.console import Console
 from rich.progress import (
     BarColumn,
@@ -21,6 +22,7 @@ from rich.progress import (
 )
 from rich.text import Text
 
+from factorgraph_dvl.cli import events
 from factorgraph_dvl.errors import printable
 
 if TYPE_CHECKING:
@@ -40,6 +42,10 @@ class _Console(Console):
     """A console that removes control characters, as from names of files."""
 
     def print(self, *objects: Any, **options: Any) -> None:
+        if events.active() and not self.stderr:
+            for x in objects:
+                events.emit(events.Text(_lines(str(x))))
+            return
         super().print(*(_lines(x) if isinstance(x, str) else x for x in objects), **options)
 
 
@@ -60,7 +66,7 @@ class ProgressLine:
             TimeElapsedColumn(),
             console=self._console,
             transient=True,
-            disable=quiet or not self._console.is_terminal,
+            disable=quiet or events.active() or not self._console.is_terminal,
         )
         self._task = self._live.add_task("load")
 
@@ -78,6 +84,11 @@ class ProgressLine:
 
     def __call__(self, stage: str, iteration: int = 0, cost: float | None = None) -> None:
         """Show the present stage."""
+        if events.active():
+            elapsed = perf_counter() - self._start
+            if not self._quiet:
+                events.emit(events.Progress(stage, round(elapsed, 3), iteration, cost))
+            return
         text = stage
         if iteration:
             text += f", iteration {iteration}"
@@ -106,7 +117,7 @@ class CountLine:
             TextColumn("{task.description}", markup=False),
             console=self._console,
             transient=True,
-            disable=quiet or not self._console.is_terminal,
+            disable=quiet or events.active() or not self._console.is_terminal,
         )
         self._task = self._live.add_task("", total=total)
 
@@ -120,6 +131,11 @@ class CountLine:
     def __call__(self, text: str) -> None:
         """Count one more, and say which."""
         self._done += 1
+        if events.active():
+            elapsed = perf_counter() - self._start
+            if not self._quiet:
+                events.emit(events.Progress(printable(text), round(elapsed, 3), self._done))
+            return
         if self._console.is_terminal:
             self._live.update(self._task, advance=1, description=printable(text))
         elif not self._quiet:
@@ -133,16 +149,53 @@ def print_written(out: Path) -> None:
     # A folder that --force replaced may contain other files.
     new = (p for p in out.rglob("*") if p.is_file() and p.stat().st_mtime >= _STARTED - 1.0)
     written = sorted(path.relative_to(out) for path in new)
+    if events.active():
+        events.emit(events.Written(str(out), list(map(str, written))))
+        _emit_results(out, written)
+        return
     stdout().print(f"Wrote {', '.join(map(str, written))} to {out}", markup=False, soft_wrap=True)
+
+
+def print_file(file: Path) -> None:
+    """Print which file this run wrote."""
+    if events.active():
+        events.emit(events.Written(str(file.parent), [file.name]))
+        return
+    stdout().print(f"Wrote {file}", markup=False, soft_wrap=True)
+
+
+def print_folder(out: Path) -> None:
+    """Print where this run wrote its results, where the files are too many to list."""
+    stdout().print(f"Wrote {out}", markup=False, soft_wrap=True)
+    if events.active():
+        _emit_results(out, sorted(path.relative_to(out) for path in out.glob("*.json")))
+
+
+def _emit_results(out: Path, written: Iterable[Path]) -> None:
+    """Emit the results that lie in a folder as JSON."""
+    for name in written:
+        if name.suffix == ".json" and name.parent == Path():
+            content = msgspec.json.decode((out / name).read_bytes())
+            events.emit(events.Result(str(name), content))
 
 
 def print_table(table: Table) -> None:
     """Print a table uncut; a terminal wraps one that is too wide."""
     from factorgraph_dvl.report.terminal.tables import width_of
 
+    if events.active():
+        cells = [[_plain(cell) for cell in column.cells] for column in table.columns]
+        rows = [list(row) for row in zip(*cells, strict=True)]
+        header = [_plain(column.header) for column in table.columns]
+        events.emit(events.Table(_plain(table.title or ""), header, rows))
+        return
     console = stdout()
     console.width = max(console.width, width_of(table))
     console.print(table)
+
+
+def _plain(cell: Any) -> str:
+    return _lines(cell.plain if isinstance(cell, Text) else str(cell))
 
 
 def print_error_budget(solution: Solution) -> None:
@@ -155,11 +208,24 @@ def print_error_budget(solution: Solution) -> None:
 
 def warn(message: str) -> None:
     """Print a warning."""
+    if events.active():
+        events.emit(events.Warned(printable(message)))
+        return
     stderr().print(Text(f"warning: {printable(message)}", "yellow"), soft_wrap=True)
+
+
+def found_event(finding: Finding) -> events.Found:
+    """Return a finding as an event."""
+    sensor, parameter, text = map(printable, (finding.sensor, finding.parameter, finding.text))
+    code = finding.code
+    return events.Found(str(code), finding.severity, sensor, parameter, text, code.action)
 
 
 def say(finding: Finding) -> None:
     """Print a finding, and what to do about it if there is something."""
+    if events.active():
+        events.emit(found_event(finding))
+        return
     from factorgraph_dvl.report.terminal.tables import STYLES
 
     line = printable(f"{finding.severity}: {finding}")

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from factorgraph_dvl.cli.console import stdout
+from factorgraph_dvl.cli.console import print_file
 from factorgraph_dvl.cli.options import Force
 
 if TYPE_CHECKING:
@@ -65,7 +65,7 @@ def export(
     motion = exported_motion(solution, run.epoch if run is not None else "")
     write = _writer(to)
     write_file(file, lambda path: write(motion, path), force=force)
-    stdout().print(f"Wrote {file}", markup=False, soft_wrap=True)
+    print_file(file)
 
 
 def _writer(to: ExportFormat) -> Callable[[ExportedMotion, Path], None]:

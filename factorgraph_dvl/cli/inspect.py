@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from factorgraph_dvl.cli import events
 from factorgraph_dvl.cli.console import print_table, say, stdout
 from factorgraph_dvl.cli.options import TrialPath
 
@@ -32,5 +33,9 @@ def inspect(trial_path: TrialPath) -> None:
         console.print(line, markup=False, soft_wrap=True)
     for note in notes:
         say(note)
+    if events.active():
+        for each in result.findings:
+            say(each)
+        return
     for finding in finding_lines(result):
         console.print(finding, soft_wrap=True)

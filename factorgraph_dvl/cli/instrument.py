@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from factorgraph_dvl.cli.console import stdout
 from factorgraph_dvl.cli.options import Anyway
 
 
@@ -23,4 +24,5 @@ def instrument(
 
     found = load_calibration(calibration)
     check_usable(found, found.body_axes, str(calibration), anyway=anyway)
-    typer.echo(instrument_text(instrument_of(found), found.trial), nl=False)
+    text = instrument_text(instrument_of(found), found.trial)
+    stdout().print(text, markup=False, highlight=False, soft_wrap=True, end="")

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.text import Text
 
+from factorgraph_dvl.cli import events
 from factorgraph_dvl.cli.console import (
     ProgressLine,
     drawing,
@@ -81,7 +82,7 @@ def replay(
     error_asked = _limits("--good-error", good_error)
     claim_output(out, force=force, owned=OWNED, inputs=inputs_of(trial_path))
     # Where nothing can be drawn over, lines of progress say as much.
-    live = live and stderr().is_terminal
+    live = live and stderr().is_terminal and not events.active()
     with ProgressLine(quiet=quiet or live) as progress:
         trial = load_trial(trial_path, anyway=anyway)
         check_limits(trial, (*std_asked, *error_asked))

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from factorgraph_dvl.cli.console import stdout, warn
+from factorgraph_dvl.cli.console import print_file, warn
 from factorgraph_dvl.cli.options import Force
 
 if TYPE_CHECKING:
@@ -59,7 +59,7 @@ def report(
     file = out or folders[0] / REPORT_FILE
     # The page in a solution folder is made to be made again.
     write_file(file, lambda path: path.write_text(page, "utf-8"), force=force or out is None)
-    stdout().print(f"Wrote {file}", markup=False, soft_wrap=True)
+    print_file(file)
 
 
 def _load(folder: Path) -> Result:

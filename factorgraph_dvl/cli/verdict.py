@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING
 import typer
 from rich.text import Text
 
-from factorgraph_dvl.cli.console import say, stderr, stdout
+from factorgraph_dvl.cli import events
+from factorgraph_dvl.cli.console import found_event, say, stderr, stdout
 from factorgraph_dvl.errors import printable
 
 if TYPE_CHECKING:
@@ -19,7 +20,12 @@ def print_verdict(solution: Solution) -> None:
     """Print the verdict on one line, with its first reason and what to do about it."""
     from factorgraph_dvl.report.terminal.tables import verdict_line
 
-    stdout().print(verdict_line(solution.verdict), soft_wrap=True)
+    verdict = solution.verdict
+    if events.active():
+        events.emit(events.Judged(verdict.grade, list(map(found_event, verdict.reasons))))
+        return
+
+    stdout().print(verdict_line(verdict), soft_wrap=True)
 
 
 def print_findings(solution: Solution) -> None:
@@ -39,5 +45,7 @@ def end_with(verdict: Verdict) -> None:
     """End the command with exit code 1 if a result is not to be used."""
     if verdict.grade == "do not use":
         text = printable(f"error: not to be used: {verdict.reasons[0]}")
+        if events.active():
+            raise typer.Exit(1)
         stderr().print(Text(text, "red"), soft_wrap=True)
         raise typer.Exit(1)
