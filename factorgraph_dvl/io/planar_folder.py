@@ -9,6 +9,7 @@ from msgspec import UNSET
 
 from factorgraph_dvl.errors import printable
 from factorgraph_dvl.io.folders import new_folder
+from factorgraph_dvl.io.initial_conditions import position_of, position_settings
 from factorgraph_dvl.io.motion_table import motion_columns
 from factorgraph_dvl.io.tables import write_table
 from factorgraph_dvl.io.trial_folder import (
@@ -17,15 +18,12 @@ from factorgraph_dvl.io.trial_folder import (
     check_saved,
     locate,
     looks_planar,
-    position_of,
-    position_settings,
     read_record,
-    read_truth,
     reference_of,
-    truth_json,
     write_settings,
 )
 from factorgraph_dvl.io.trial_yaml import PlanarInitialSettings, PlanarSettings, ReferenceSettings
+from factorgraph_dvl.io.truth_file import read_truth, truth_json
 from factorgraph_dvl.sensors.beacon import Beacons
 from factorgraph_dvl.sensors.depth import Depth
 from factorgraph_dvl.sensors.speed_log import Heading, SpeedLog

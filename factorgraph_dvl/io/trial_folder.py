@@ -13,29 +13,28 @@ import numpy as np
 from msgspec import UNSET
 
 from factorgraph_dvl.errors import ConfigError, DataError, printable
-from factorgraph_dvl.geometry.units import DEG, GEODETIC_SI
 from factorgraph_dvl.geometry.vectors import Array
-from factorgraph_dvl.io.calibration_file import (
-    check_values,
-)
 from factorgraph_dvl.io.earlier_calibration import save_prior, with_earlier_calibrations
 from factorgraph_dvl.io.folders import SETTINGS_FILE, new_folder
+from factorgraph_dvl.io.initial_conditions import (
+    attitude_of,
+    initial_settings,
+    position_of,
+    velocity_of,
+)
 from factorgraph_dvl.io.motion_table import COLUMNS as MOTION_COLUMNS
 from factorgraph_dvl.io.motion_table import motion_columns, read_reference, reference_from
 from factorgraph_dvl.io.tables import Tables, columns_of, read_table, write_table
 from factorgraph_dvl.io.trial_yaml import (
-    InitialSettings,
     LimitSettings,
-    PlanarInitialSettings,
     PlanarSettings,
-    PositionSettings,
     ReferenceSettings,
     TrialSettings,
-    VelocitySettings,
     parse_trial,
     settings_type,
     to_yaml,
 )
+from factorgraph_dvl.io.truth_file import read_truth, truth_json
 from factorgraph_dvl.sensors.catalogue import AIDS, PLANAR, aid_types
 from factorgraph_dvl.sensors.dvl import Dvl
 from factorgraph_dvl.sensors.dvl_beams import DvlBeams
@@ -46,12 +45,8 @@ from factorgraph_dvl.sensors.imu import Imu
 from factorgraph_dvl.sensors.invalid_values import without_invalid_values
 from factorgraph_dvl.sensors.protocol import Aid, SensorRecord, SensorSection
 from factorgraph_dvl.sensors.records import check_possible
-from factorgraph_dvl.settings.files import MEGABYTE, read_bytes
 from factorgraph_dvl.settings.yaml_file import parse_yaml, read_text
 from factorgraph_dvl.trial import (
-    InitialAttitude,
-    InitialPosition,
-    InitialVelocity,
     Reference,
     Trial,
 )
@@ -77,14 +72,6 @@ _SAVED = "# Saved by factorgraph_dvl"
 _NAMING = ("file", "calibration", "trajectory")
 
 _Sensor = TypeVar("_Sensor", bound=SensorRecord)
-
-
-class _TruthValue(msgspec.Struct):
-    value: list[float | list[float]]
-
-
-class _Truth(msgspec.Struct):
-    parameters: dict[str, _TruthValue]
 
 
 def load_trial(path: Path | str, *, anyway: bool = False) -> Trial:
@@ -168,9 +155,9 @@ def assembled(
         body_axes=settings.body_axes,
         epoch=settings.epoch,
         noise=settings.noise,
-        initial_attitude=None if initial is UNSET else _attitude(initial),
+        initial_attitude=None if initial is UNSET else attitude_of(initial),
         initial_position=None if initial is UNSET else position_of(initial),
-        initial_velocity=None if initial is UNSET else _velocity(initial),
+        initial_velocity=None if initial is UNSET else velocity_of(initial),
         reference=reference_of(tables, settings),
         notes=tuple(notes),
         limits={**DEFAULT_LIMITS, **({} if settings.limits is UNSET else settings.limits.stated)},
@@ -388,30 +375,6 @@ def read_record(
     return kind.from_columns(settings, columns, settings.file)
 
 
-def _attitude(initial: InitialSettings) -> InitialAttitude | None:
-    if initial.roll_pitch_heading_deg is UNSET or initial.std_deg is UNSET:
-        return None
-    return InitialAttitude(
-        np.array(initial.roll_pitch_heading_deg) * DEG, np.array(initial.std_deg) * DEG
-    )
-
-
-def _velocity(initial: InitialSettings) -> InitialVelocity | None:
-    velocity = initial.velocity
-    if velocity is UNSET:
-        return None
-    return InitialVelocity(np.array(velocity.east_north_up_m_s), np.array(velocity.std_m_s))
-
-
-def position_of(initial: InitialSettings | PlanarInitialSettings) -> InitialPosition | None:
-    """Return the prior of the position that `initial` states, None if there is none."""
-    position = initial.position
-    if position is UNSET:
-        return None
-    geodetic = np.array([position.lat_deg, position.lon_deg, position.height_m])
-    return InitialPosition(geodetic * GEODETIC_SI, np.array(position.std_m))
-
-
 def _settings(trial: Trial, suffix: str) -> TrialSettings:
     return settings_type(record.section for record in trial.records)(
         format=1,
@@ -426,7 +389,7 @@ def _settings(trial: Trial, suffix: str) -> TrialSettings:
             for record in trial.records
         },
         limits=_limits(trial),
-        initial=_initial(trial),
+        initial=initial_settings(trial),
         reference=(
             UNSET if trial.reference is None else ReferenceSettings(file=f"reference{suffix}")
         ),
@@ -436,61 +399,3 @@ def _settings(trial: Trial, suffix: str) -> TrialSettings:
 def _limits(trial: Trial) -> LimitSettings | msgspec.UnsetType:
     stated = {n: limit for n, limit in trial.limits.items() if limit != DEFAULT_LIMITS.get(n)}
     return LimitSettings(**stated) if stated else UNSET
-
-
-def _initial(trial: Trial) -> InitialSettings | msgspec.UnsetType:
-    attitude, position = trial.initial_attitude, trial.initial_position
-    velocity = trial.initial_velocity
-    if attitude is None and position is None and velocity is None:
-        return UNSET
-    fields: dict[str, object] = {}
-    if attitude is not None:
-        fields["roll_pitch_heading_deg"] = tuple((attitude.rph / DEG).tolist())
-        fields["std_deg"] = tuple((attitude.std / DEG).tolist())
-    if position is not None:
-        fields["position"] = position_settings(position)
-    if velocity is not None:
-        fields["velocity"] = VelocitySettings(
-            east_north_up_m_s=tuple(velocity.velocity.tolist()),
-            std_m_s=tuple(velocity.std.tolist()),
-        )
-    return InitialSettings(**fields)  # type: ignore[arg-type]
-
-
-def position_settings(position: InitialPosition) -> PositionSettings:
-    """Return the prior of the position as `initial` states it."""
-    lat, lon, height = (position.geodetic / GEODETIC_SI).tolist()
-    return PositionSettings(
-        lat_deg=lat, lon_deg=lon, height_m=height, std_m=tuple(position.std.tolist())
-    )
-
-
-def read_truth(path: Path) -> dict[str, Array]:
-    """Return the true calibration of a truth.json; empty if there is no such file."""
-    if not path.exists():
-        return {}
-    expected = '{"parameters": {name: {"value": [numbers]}}}'
-    content = read_bytes(path, limit=MEGABYTE, expected=expected)
-    try:
-        truth = msgspec.json.decode(content, type=_Truth)
-    except (msgspec.MsgspecError, ValueError, RecursionError) as error:
-        raise DataError(f"cannot be read ({error})", where=path.name, expected=expected) from None
-    out = {}
-    for name, item in truth.parameters.items():
-        try:
-            out[printable(name)] = np.array(item.value, dtype=float)
-        except ValueError:
-            raise DataError(
-                f"{name}: the vectors differ in size", where=path.name, expected=expected
-            ) from None
-        check_values(name, out[printable(name)], path.name)
-    return out
-
-
-def truth_json(truth: dict[str, Array]) -> bytes:
-    """Return the text of truth.json."""
-    values = {
-        name: _TruthValue(np.atleast_1d(np.asarray(value, dtype=float)).tolist())
-        for name, value in truth.items()
-    }
-    return msgspec.json.format(msgspec.json.encode(_Truth(values)), indent=2) + b"\n"
