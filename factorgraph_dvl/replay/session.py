@@ -83,6 +83,16 @@ class Replay:
         if any(p.estimated for p in settings.inertial.error_parameters()):
             settings = replace(settings, imu=settings.inertial.without_errors())
             self._findings.append(_IMU_ERRORS_LEFT_OUT)
+        self._findings += [
+            Finding(
+                Code.CORRELATION_LEFT_OUT,
+                "a replay takes all noise for white: standard deviations leave out what the "
+                "correlated part adds; `solve` contains it",
+                sensor=aid.label,
+            )
+            for aid in settings.aids
+            if aid.settings.states_correlation
+        ]
         self._settings = settings
         self._kind = smoother
         self._lag = lag_s

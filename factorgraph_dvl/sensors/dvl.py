@@ -86,6 +86,11 @@ class DvlSettings(ClockSection, frozen=True, kw_only=True):
     reference: Literal["bottom", "water"] = "bottom"
     current_std_m_s: tuple[NonNegative, NonNegative] = (0.5, 0.5)
 
+    @property
+    def states_correlation(self) -> bool:
+        """Whether velocities have a correlated part."""
+        return not isinstance(self.correlated_std_m_s, UnsetType)
+
     def __post_init__(self) -> None:
         super().__post_init__()
         scales = np.atleast_1d(self.scale_error)

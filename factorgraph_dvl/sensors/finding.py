@@ -558,6 +558,12 @@ class Code(StrEnum):
         "note",
     )
     # What a replay noticed.
+    CORRELATION_LEFT_OUT = (
+        "correlation_left_out",
+        "The replay takes noise that persists for white noise.",
+        "Its standard deviations are too small.",
+        "Solve the trial as a whole for standard deviations that contain it.",
+    )
     IMU_ERRORS_LEFT_OUT = (
         "imu_errors_left_out",
         "The replay does not estimate scale, axes and g-sensitivity of the IMU.",

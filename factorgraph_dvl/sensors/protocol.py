@@ -211,6 +211,11 @@ class SensorSection(Section, frozen=True, kw_only=True):
     noise: NoiseModel | UnsetType = UNSET
 
     @property
+    def states_correlation(self) -> bool:
+        """Whether a part of its noise persists, as the trial states it."""
+        return False
+
+    @property
     def more_columns(self) -> tuple[str, ...]:
         """Columns that the table must have because the settings say so."""
         return ()

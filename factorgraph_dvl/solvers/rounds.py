@@ -43,6 +43,7 @@ _NOISE_ROUNDS = 4
 # What of a problem changes without a new one.
 _NOISE = "the noise of the sensors"
 _OUTLIERS = "which measurements are outliers"
+_TIMES = "the times of measurements"
 _CORRELATED = "which noise is correlated"
 _KNOWN = "which parameters are known"
 # Parameters that are estimated although they were stated as known. Chosen: a third is a sign that
@@ -51,6 +52,9 @@ _MOST_FREED = 2
 # Relative change of the innovations of correlated noise from which on it counts. Chosen: less
 # changes no σ that is shown.
 _SAME_INNOVATIONS = 0.05
+# Bindings in a row from which on each is half-way between the last two. Chosen: most trials take
+# one.
+_IN_A_ROW = 2
 # Searches for outliers. Chosen: the second finds those that the first could not see.
 _SEARCHES = 2
 
@@ -135,15 +139,19 @@ def settle(
     first_levels = _NoiseLevels((as_stated,), bool(as_stated))
     levels = first_levels
     changing: list[str] = ["all"]
-    count = 0
+    count = in_a_row = 0
+    start = values
     while count < _ROUNDS:
         count += 1
         if changing not in ([_NOISE], [_OUTLIERS]):
+            in_a_row = in_a_row + 1 if changing == [_TIMES] else 0
+            # Where sway repeats itself, two bindings may lead to each other for ever.
+            start = values if in_a_row < _IN_A_ROW else values | _halfway(prepared, start, values)
             problem = Problem(
                 chain,
                 prepared.observations,
                 parameters,
-                start=values,
+                start=start,
                 constants_prior=constants_prior,
                 clock_zero=clock_zero,
                 processes=levels.processes,
@@ -288,10 +296,19 @@ def _next_noise(levels: _NoiseLevels, problem: Problem, minimum: Minimum) -> _No
 def _changing(problem: Problem, evaluation: Evaluation) -> list[str]:
     """Return what of the measurements would differ in a problem that starts here."""
     found = {
-        "the times of measurements": problem.needs_rebinding(evaluation.parameters),
+        _TIMES: problem.needs_rebinding(evaluation.parameters),
         "the weights of measurements": problem.needs_reweighting(evaluation),
     }
     return [name for name, changed in found.items() if changed]
+
+
+def _halfway(
+    prepared: Preparation, before: Mapping[str, Array], after: Mapping[str, Array]
+) -> dict[str, Array]:
+    """Return offsets and rates of clocks half-way between two sets of values."""
+    clocks = [o.clock for o in prepared.observations if o.clock is not None]
+    names = [n for clock in clocks for n in clock.names if n in before and n in after]
+    return {name: 0.5 * (before[name] + after[name]) for name in names}
 
 
 def _cycle(

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import msgspec
 import numpy as np
 import pytest
 from findings import of_code
 from scipy.spatial.transform import Rotation
-from truth import config
+from truth import config, scenario
 
 from factorgraph_dvl.analysis.error_statistics import motion_errors
 from factorgraph_dvl.replay import Replay, replay
@@ -202,3 +203,12 @@ def test_a_beacon_out_of_reach_is_no_hindrance():
     late = replace(trial.beacons, time=trial.beacons.time + 1e4)
     others = tuple(late if aid is trial.beacons else aid for aid in trial.others)
     assert solve(replace(trial, others=others), anyway=True).converged
+
+
+def test_stated_correlation_is_said_to_be_left_out():
+    trial = simulate(scenario(manoeuvres=[{"straight_s": 2}]), 0)
+    stated = msgspec.structs.replace(trial.gnss.settings, correlated_std_m=(1.0, 1.0, 2.0))
+    session = Replay(replace(trial, gnss=replace(trial.gnss, settings=stated)))
+    (finding,) = (f for f in session.findings if f.code == Code.CORRELATION_LEFT_OUT)
+    assert finding.sensor == "GNSS"
+    assert all(f.code != Code.CORRELATION_LEFT_OUT for f in Replay(trial).findings)
