@@ -185,7 +185,8 @@ def _add_prior(graph: gtsam.NonlinearFactorGraph, p: Parameter, key: int) -> Non
 
 def _root_of(group: Sequence[Parameter]) -> Array:
     """Return a square root of the prior covariance of parameters in their tangent space, SI."""
-    sigma = np.maximum(np.concatenate([p.sigma for p in group]), _FIXED_STD)
+    sigma = np.concatenate([p.sigma for p in group])
+    sigma = np.where(sigma > 0.0, sigma, _FIXED_STD)
     root = np.diag(sigma)
     joint = group[0].joint
     if joint is not None:
