@@ -87,6 +87,11 @@ class DvlSettings(ClockSection, frozen=True, kw_only=True):
     current_std_m_s: tuple[NonNegative, NonNegative] = (0.5, 0.5)
 
     @property
+    def left_out(self) -> tuple[str, ...]:
+        """The walk of the scale, where there is one."""
+        return ("scale_walk_std_sqrt_h",) if self.scale_walk_std_sqrt_h > 0.0 else ()
+
+    @property
     def states_correlation(self) -> bool:
         """Whether velocities have a correlated part."""
         return not isinstance(self.correlated_std_m_s, UnsetType)

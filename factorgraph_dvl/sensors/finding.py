@@ -558,6 +558,12 @@ class Code(StrEnum):
         "note",
     )
     # What a replay noticed.
+    ERROR_LEFT_OUT = (
+        "error_left_out",
+        "The trial states an error that no solver estimates.",
+        "Standard deviations leave out what this error adds.",
+        "Compare --halves; a change that is larger than chance is named.",
+    )
     CORRELATION_LEFT_OUT = (
         "correlation_left_out",
         "The replay takes noise that persists for white noise.",

@@ -211,6 +211,11 @@ class SensorSection(Section, frozen=True, kw_only=True):
     noise: NoiseModel | UnsetType = UNSET
 
     @property
+    def left_out(self) -> tuple[str, ...]:
+        """Keys that state an error which no solver estimates."""
+        return ()
+
+    @property
     def states_correlation(self) -> bool:
         """Whether a part of its noise persists, as the trial states it."""
         return False
