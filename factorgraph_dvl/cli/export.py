@@ -1,4 +1,4 @@
-"""The command `export`: results in the formats of other programs."""
+"""The command `export`: results and trials in the formats of other programs."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from factorgraph_dvl.cli.console import print_file
+from factorgraph_dvl.cli.console import print_file, warn
 from factorgraph_dvl.cli.options import Force
 
 if TYPE_CHECKING:
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 class ExportFormat(StrEnum):
-    """Formats of trajectories."""
+    """Formats of trajectories and of trials."""
 
     TUM = "tum"
     KML = "kml"
@@ -28,33 +28,69 @@ class ExportFormat(StrEnum):
     SBET = "sbet"
     NMEA = "nmea"
     MATLAB = "matlab"
+    CSV = "csv"
+    MCAP = "mcap"
+    PD0 = "pd0"
+
+
+_TRAJECTORIES = tuple(x for x in ExportFormat if x.value not in ("csv", "mcap", "pd0"))
 
 
 def export(
-    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Solution folder.")],
+    folder: Annotated[
+        Path, typer.Argument(metavar="DIR", help="Solution folder or trial folder.")
+    ],
     to: Annotated[
         ExportFormat, typer.Option("--to", metavar="FORMAT", help=", ".join(ExportFormat))
     ],
     out: Annotated[
         Path | None,
         typer.Option(
-            "--out", metavar="FILE", help="File to write; by default DIR/trajectory.FORMAT."
+            "--out",
+            metavar="FILE",
+            help="File to write; by default DIR/trajectory.FORMAT or DIR/trial.FORMAT.",
         ),
     ] = None,
     force: Force = False,
 ) -> None:
-    """Export the trajectory of a solution, with UTC and σ where the format has room for them.
+    """Export the trajectory of a solution, or the records of a trial.
+
+    Trajectories have UTC and σ where the format has room for them: tum, kml, geojson, netcdf,
+    parquet, sbet, nmea, matlab. Trials: csv and parquet (folders), netcdf, mcap, pd0.
 
     Examples:
       factorgraph-dvl export out --to tum
 
       factorgraph-dvl export out --to kml --out track.kml
+
+      factorgraph-dvl export trial --to pd0
     """
+    from factorgraph_dvl.io.exporting.trial import export_trial
+    from factorgraph_dvl.io.folders import SETTINGS_FILE
+
+    if folder.name == SETTINGS_FILE or (folder / SETTINGS_FILE).is_file():
+        written, notes = export_trial(folder, to.value, out, force=force)
+        for note in notes:
+            warn(note)
+        print_file(written)
+        return
+    _export_solution(folder, to, out, force=force)
+
+
+def _export_solution(folder: Path, to: ExportFormat, out: Path | None, *, force: bool) -> None:
+    from factorgraph_dvl.errors import ConfigError
     from factorgraph_dvl.io.exporting.motion import exported_motion
     from factorgraph_dvl.io.output_file import check_new_file, write_file
     from factorgraph_dvl.io.run_file import read_run
     from factorgraph_dvl.io.solution_folder import EXPORT_STEM, load_solution
 
+    if to not in _TRAJECTORIES:
+        raise ConfigError(
+            f"`{to}` is no format of trajectories",
+            where="--to",
+            expected=", ".join(_TRAJECTORIES),
+            hint=f"{folder} is no trial folder, of which there are csv, mcap and pd0 too",
+        )
     file = out or folder / f"{EXPORT_STEM}.{to.value}"
     # What lies in the folder under these names was exported before.
     force = force or out is None

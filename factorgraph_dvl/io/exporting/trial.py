@@ -30,9 +30,7 @@ _UNITS = (
     ("_m", "m"),
     ("_s", "s"),
 )
-# Formats of single files: the suffix of the name if none is given, and what writes them.
-_SUFFIX = {"netcdf": ".nc", "mcap": ".mcap", "pd0": ".pd0"}
-FORMATS = ("csv", "parquet", *_SUFFIX)
+FORMATS = ("csv", "parquet", "netcdf", "mcap", "pd0")
 
 
 def export_trial(
@@ -75,7 +73,7 @@ def export_trial(
         target = out or folder / f"trial-{to}"
         save_trial(trial, target, force=force, parquet=to == "parquet")
         return target, ()
-    target = out or folder / f"trial{_SUFFIX[to]}"
+    target = out or folder / f"trial.{to}"
     begin = datetime.fromisoformat(trial.epoch or _NO_EPOCH)
     begin = begin if begin.tzinfo is not None else begin.replace(tzinfo=UTC)
     notes: list[str] = []
