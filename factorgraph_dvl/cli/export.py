@@ -84,7 +84,7 @@ def _export_solution(folder: Path, to: ExportFormat, out: Path | None, *, force:
     from factorgraph_dvl.io.run_file import read_run
     from factorgraph_dvl.io.solution_folder import EXPORT_STEM, load_solution
 
-    if to not in _TRAJECTORIES:
+    if folder.exists() and to not in _TRAJECTORIES:
         raise ConfigError(
             f"`{to}` is no format of trajectories",
             where="--to",
