@@ -30,6 +30,8 @@ ELSEWHERE = {
     "imu/sensitivity": "graph/test_problem.py",
     "io/corrected_record": "sensors/test_dvl_beams.py",
     "io/data_frames": "io",
+    "io/exporting/bag": "io/exporting/test_trial.py",
+    "io/exporting/pd0": "io/exporting/test_trial.py",
     "io/formats/normalised/*": "io/importing",
     "io/formats/vehicles/*": "io/formats/test_vehicles.py",
     "io/formats/catalogue": "io/importing",
