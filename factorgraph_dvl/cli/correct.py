@@ -1,4 +1,4 @@
-"""The command `correct`: calibrated beams as an equivalent DVL."""
+"""The command `correct`: the record of a calibrated DVL, or of calibrated beams."""
 
 from __future__ import annotations
 
@@ -20,31 +20,52 @@ def correct(
     force: Force = False,
     anyway: Anyway = False,
 ) -> None:
-    """Convert the calibrated beams of a trial to a DVL record, and write the matrix for it."""
+    """Correct the record of a DVL, or of its beams, by a calibration; write the matrix for it.
+
+    Examples:
+      factorgraph-dvl correct TRIAL out/calibration.json --out corrected
+    """
     import numpy as np
 
     from factorgraph_dvl.analysis.beam_quality import calibration_of, check_same_instrument
     from factorgraph_dvl.errors import DataError
     from factorgraph_dvl.io.calibration_file import check_usable, load_calibration
-    from factorgraph_dvl.io.corrected_record import OWNED, save_corrected
+    from factorgraph_dvl.io.corrected_record import (
+        OWNED,
+        save_corrected,
+        save_corrected_dvl,
+    )
     from factorgraph_dvl.io.trial_folder import inputs_of, load_trial
+    from factorgraph_dvl.sensors.dvl import CALIBRATED, MISALIGNMENT
+    from factorgraph_dvl.sensors.dvl_beams import DvlBeams
 
     claim_output(out, force=force, owned=OWNED, inputs=(*inputs_of(trial_path), calibration))
     trial = load_trial(trial_path, anyway=anyway)
-    if trial.beams is None:
+    sensor = trial.beams or trial.dvl
+    if sensor is None:
         raise DataError(
-            "the trial has no beams", where=str(trial_path), expected="a dvl_beams section"
+            "the trial has no DVL", where=str(trial_path), expected="a dvl or dvl_beams section"
         )
     found = load_calibration(calibration, body_axes=trial.body_axes)
     check_usable(found, trial.body_axes, str(calibration), anyway=anyway)
-    beams = calibration_of(trial.beams, found)
-    check_same_instrument(trial.beams, beams, str(calibration))
-    record = save_corrected(
-        trial.beams, beams.directions_b, beams.scale_error, beams.lever_arm, out, force=force
-    )
+    if isinstance(sensor, DvlBeams):
+        beams = calibration_of(sensor, found)
+        check_same_instrument(sensor, beams, str(calibration))
+        record = save_corrected(
+            sensor, beams.directions_b, beams.scale_error, beams.lever_arm, out, force=force
+        )
+    else:
+        values = {name: v for name, v in found.values.items() if name in CALIBRATED}
+        if MISALIGNMENT not in values:
+            raise DataError(
+                f"the calibration has no {MISALIGNMENT}",
+                where=str(calibration),
+                expected="the calibration of a DVL",
+            )
+        record = save_corrected_dvl(sensor, values, out, force=force)
     for finding in trial.notes:
         say(finding)
-    own = {p.name for p in trial.beams.parameters()}
+    own = {p.name for p in sensor.parameters()}
     unknown = [
         name
         for e in found.estimates

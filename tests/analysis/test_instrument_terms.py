@@ -123,3 +123,44 @@ def test_half_a_turn_is_within_the_range_of_the_command():
 def test_a_calibration_without_a_dvl_is_refused():
     with pytest.raises(DataError, match="no lever_arm_m"):
         instrument_of(build_solution())
+
+
+@pytest.mark.parametrize("body_axes", ["RFU", "FRD", "FLU"])
+def test_each_maker_s_numbers_give_the_mounting_back_by_its_rule(body_axes):
+    """A velocity of the ship goes through the mounting, and comes back by the typed numbers."""
+    alpha = frd_from_body(body_axes).T @ np.array([1.2, -2.3, 31.0])
+    text = instrument_text(instrument_of(calibrated(alpha.tolist(), body_axes)), "cruise")
+    data = yaml.safe_load(text)
+    frd = frd_from_body(body_axes)
+    C_db = frd @ exp_so3(alpha * DEG).T @ frd.T  # d to b, forward, starboard, down
+
+    def rotation(axis: int, angle: float) -> np.ndarray:
+        return exp_so3(np.eye(3)[axis] * angle * DEG)
+
+    roll, pitch, yaw = data["nortek"]["roll_pitch_yaw_deg"]
+    found = rotation(2, yaw) @ rotation(1, pitch) @ rotation(0, roll)
+    np.testing.assert_allclose(found, C_db, atol=0.01 * DEG)
+
+    heading, pitch, roll = data["delph"]["heading_pitch_roll_deg"]
+    flu = np.diag([1.0, -1.0, -1.0])
+    # Clockwise from above is against the right hand about X3, which points up.
+    found = rotation(2, -heading) @ rotation(1, pitch) @ rotation(0, roll)
+    np.testing.assert_allclose(flu @ found @ flu, C_db, atol=1e-4 * DEG)
+
+    offset = data["water_linked"]["mounting_rotation_offset"]
+    forward = C_db[:, 0]
+    assert np.arctan2(forward[1], forward[0]) / DEG == pytest.approx(offset, abs=0.01)
+    assert f"tilt of {np.hypot(*data['nortek']['roll_pitch_yaw_deg'][:2]):.2f} deg" in text
+
+
+def test_trdi_s_commands_of_the_text_turn_a_ship_s_velocity_into_the_instrument_s():
+    alpha = np.array([1.2, -2.3, 31.0])
+    # The instrument's axes: X to starboard, Y (beam 3) ahead, Z up, as RFU.
+    text = instrument_text(instrument_of(calibrated(alpha.tolist(), "RFU")), "cruise")
+    EA, EI, EJ = (0.01 * yaml.safe_load(text)["trdi"][name] * DEG for name in ("EA", "EI", "EJ"))
+    ship = np.array([0.3, 2.0, 0.1])
+    # By the commands' rule, in forward, starboard, down.
+    matrix = exp_so3([0.0, 0.0, -EA]) @ exp_so3([0.0, EJ, 0.0]) @ exp_so3([EI, 0.0, 0.0])
+    rfu = frd_from_body("RFU")
+    measured = exp_so3(alpha * DEG) @ ship
+    np.testing.assert_allclose(rfu.T @ matrix @ rfu @ ship, measured, atol=2.0 * 0.01 * DEG)

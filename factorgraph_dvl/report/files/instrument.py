@@ -69,7 +69,40 @@ def instrument_text(instrument: InstrumentTerms, name: str) -> str:
             )
         ],
     ]
-    return "\n".join(lines) + "\n"
+    return "\n".join([*lines, *_makers(i)]) + "\n"
+
+
+def _makers(i: InstrumentTerms) -> list[str]:
+    """Return the calibration in the conventions of other makers, with their sign rules."""
+    roll, pitch, yaw = (float(x) for x in i.dvl_in_body["ZYX"].value)
+    mean = float(np.mean(i.scale_error))
+    forward, starboard, down = (float(x) for x in i.lever_arm)
+    upside_down = max(abs(roll), abs(pitch)) > _UPSIDE_DOWN_DEG
+    tilt = float(np.hypot(roll, pitch))
+    return [
+        "",
+        "# The sign rules below are those by which the numbers were computed. Before you type",
+        "# them in, check one of them against the manual of your firmware.",
+        "",
+        "# Nortek: attitude of the DVL in the vehicle, axes forward, starboard, down; yaw first,",
+        "# then pitch, then roll; each positive by the right hand about its axis.",
+        "nortek:",
+        f"  roll_pitch_yaw_deg: {_list([roll, pitch, yaw], 2)}",
+        "",
+        "# Water Linked: one angle, from the bow to the forward axis of the DVL, positive",
+        f"# clockwise from above. It leaves out the tilt of {fixed(tilt, 2)} deg.",
+        *(("# NOT TO BE TYPED IN: the DVL's axes look up.",) if upside_down else ()),
+        "water_linked:",
+        f"  mounting_rotation_offset: {fixed(yaw, 2)}",
+        "",
+        "# Delph-style: axes X1 forward, X2 to port, X3 up. Heading is positive clockwise from",
+        "# above, roll positive port side up, pitch positive bow down. The scale factor is what",
+        "# the DVL reads too much, in %; the lever arm runs from the IMU to the DVL.",
+        "delph:",
+        f"  heading_pitch_roll_deg: {_list([yaw, -pitch, roll], 4)}",
+        f"  scale_factor_percent: {fixed(100.0 * mean, 4)}",
+        f"  lever_arm_x1_x2_x3_m: {_list([forward, -starboard, -down], 4)}",
+    ]
 
 
 # Chosen: a DVL that looks down has a smaller roll and pitch.
