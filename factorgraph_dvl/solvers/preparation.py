@@ -38,7 +38,7 @@ class Preparation:
     Parameters
     ----------
     trial : Trial
-        The trial, without rows of impossible times.
+        The trial, without rows of impossible times, reference and truth.
     frame : LocalFrame
         Tangent frame n.
     segments : Segments
@@ -95,7 +95,8 @@ def prepare(trial: Trial, state_interval_s: float, report: Progress) -> Preparat
     DataError
         If the records do not determine where and how the trial starts.
     """
-    trial = without_strays(trial)
+    # What the result is compared with has no part in it.
+    trial = replace(without_strays(trial), reference=None, calibration_truth={})
     louder: tuple[Finding, ...] = ()
     if trial.estimates_noise(trial.inertial):
         imu, louder = with_recorded_noise(trial.inertial)

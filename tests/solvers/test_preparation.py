@@ -47,6 +47,14 @@ def test_states_are_a_second_apart_and_measurements_those_of_all_sensors(prepare
     assert {"misalignment_deg", "scale_error", "lever_arm_m"} <= set(names)
 
 
+def test_reference_and_truth_have_no_part_in_the_result(prepared):
+    trial, _ = solved.turning()
+    assert trial.reference is not None
+    assert trial.calibration_truth
+    assert prepared.trial.reference is None
+    assert not prepared.trial.calibration_truth
+
+
 def test_states_and_mounting_to_start_from_are_near_the_truth(prepared):
     trial, _ = solved.turning()
     (states,) = prepared.start_positions.states
