@@ -29,6 +29,7 @@ from factorgraph_dvl.sensors.protocol import (
     Linearization,
     Motion,
     Observation,
+    PlainObservation,
     SensorSection,
     Values,
 )
@@ -115,7 +116,7 @@ class Compass:
 
 
 @dataclass(frozen=True)
-class CompassHeading:
+class CompassHeading(PlainObservation):
     """Heading of a compass; zero error where measured = heading of nRb + bias.
 
     Parameters
@@ -141,11 +142,8 @@ class CompassHeading:
     unit: str = "deg"
     components: tuple[str, ...] = ("heading",)
     parameters: tuple[str, ...] = (BIAS.name,)
-    gate: float | None = None
     # Its noise is estimated from its residuals; it is white, on the clock of the IMU.
     noise_groups: tuple[tuple[int, ...], ...] = ((0,),)
-    correlated: None = None
-    independent: bool = False
     clock: None = None
 
     def sigma(self, motion: Motion, values: Values, factor: Array | float = 1.0) -> Array:

@@ -22,10 +22,10 @@ from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.sensors.clock import Clock, ClockSection
 from factorgraph_dvl.sensors.parameters import SCALAR, Parameter, ParameterSpec
 from factorgraph_dvl.sensors.protocol import (
-    ExpectedCorrelation,
     Linearization,
     Motion,
     Observation,
+    PlainObservation,
     SensorSection,
     Values,
 )
@@ -270,7 +270,7 @@ def heading_error(
 
 
 @dataclass(frozen=True)
-class AttitudeAngles:
+class AttitudeAngles(PlainObservation):
     """Roll, pitch and heading; zero error where measured = angles of nRb + heading error.
 
     Parameters
@@ -300,10 +300,6 @@ class AttitudeAngles:
     label: str = "Attitude"
     unit: str = "rad"
     components: tuple[str, ...] = ("roll", "pitch", "heading")
-    gate: float | None = None
-    noise_groups: tuple[tuple[int, ...], ...] = ()
-    correlated: ExpectedCorrelation | None = None
-    independent: bool = False
     parameters: tuple[str, ...] = (HEADING_OFFSET, SCHULER, DEVIATION)
 
     def sigma(self, motion: Motion, values: Values, factor: Array | float = 1.0) -> Array:

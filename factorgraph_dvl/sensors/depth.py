@@ -14,10 +14,10 @@ from factorgraph_dvl.geometry.vectors import Array, skew
 from factorgraph_dvl.sensors.clock import Clock, ClockSection
 from factorgraph_dvl.sensors.parameters import SCALAR, Parameter, ParameterSpec
 from factorgraph_dvl.sensors.protocol import (
-    ExpectedCorrelation,
     Linearization,
     Motion,
     Observation,
+    PlainObservation,
     SensorSection,
     Values,
 )
@@ -113,7 +113,7 @@ class Depth:
 
 
 @dataclass(frozen=True)
-class DepthBelowSurface:
+class DepthBelowSurface(PlainObservation):
     """Depth of a sensor.
 
     The error is zero where
@@ -144,10 +144,7 @@ class DepthBelowSurface:
     label: str = "Depth"
     unit: str = "m"
     components: tuple[str, ...] = ("down",)
-    gate: float | None = None
     noise_groups: tuple[tuple[int, ...], ...] = ((0,),)
-    correlated: ExpectedCorrelation | None = None
-    independent: bool = False
     parameters: tuple[str, ...] = (SEA_SURFACE_HEIGHT,)
     clock: Clock = _CLOCK
 

@@ -22,6 +22,7 @@ from factorgraph_dvl.sensors.protocol import (
     Linearization,
     Motion,
     Observation,
+    PlainObservation,
     SensorSection,
     Values,
     expected_correlation,
@@ -289,7 +290,7 @@ class Dvl:
 
 
 @dataclass(frozen=True)
-class DvlVelocity:
+class DvlVelocity(PlainObservation):
     """Velocity reported by a DVL.
 
     The error is zero where
@@ -319,10 +320,8 @@ class DvlVelocity:
     label: str = "DVL velocity"
     unit: str = "m/s"
     components: tuple[str, ...] = ("x", "y", "z")
-    gate: float | None = None
     noise_groups: tuple[tuple[int, ...], ...] = ((0,), (1,), (2,))
     correlated: ExpectedCorrelation | None = None
-    independent: bool = False
     parameters: tuple[str, ...] = (
         MISALIGNMENT,
         SCALE_ERROR,

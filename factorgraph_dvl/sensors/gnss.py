@@ -22,6 +22,7 @@ from factorgraph_dvl.sensors.protocol import (
     Linearization,
     Motion,
     Observation,
+    PlainObservation,
     SensorSection,
     Values,
     expected_correlation,
@@ -272,7 +273,7 @@ class Gnss:
 
 
 @dataclass(frozen=True)
-class AntennaPosition:
+class AntennaPosition(PlainObservation):
     """Position of the antenna; zero error where measured = p_n + nRb bRc l.
 
     Parameters
@@ -297,10 +298,8 @@ class AntennaPosition:
     label: str = "GNSS position"
     unit: str = "m"
     components: tuple[str, ...] = ("east", "north", "up")
-    gate: float | None = None
     noise_groups: tuple[tuple[int, ...], ...] = HORIZONTAL_AND_UP
     correlated: ExpectedCorrelation | None = None
-    independent: bool = False
     parameters: tuple[str, ...] = (LEVER_ARM,)
     clock: Clock = _CLOCK
 
@@ -325,7 +324,7 @@ class AntennaPosition:
 
 
 @dataclass(frozen=True)
-class AntennaVelocity:
+class AntennaVelocity(PlainObservation):
     """Velocity of the antenna.
 
     The error is zero where
@@ -357,10 +356,8 @@ class AntennaVelocity:
     label: str = "GNSS velocity"
     unit: str = "m/s"
     components: tuple[str, ...] = ("east", "north", "up")
-    gate: float | None = None
     noise_groups: tuple[tuple[int, ...], ...] = HORIZONTAL_AND_UP
     correlated: ExpectedCorrelation | None = None
-    independent: bool = False
     parameters: tuple[str, ...] = (LEVER_ARM,)
     clock: Clock = _CLOCK
 

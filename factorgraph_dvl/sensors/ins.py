@@ -23,10 +23,10 @@ from factorgraph_dvl.sensors.attitude import (
 from factorgraph_dvl.sensors.clock import Clock, ClockSection
 from factorgraph_dvl.sensors.parameters import Parameter, ParameterSpec
 from factorgraph_dvl.sensors.protocol import (
-    ExpectedCorrelation,
     Linearization,
     Motion,
     Observation,
+    PlainObservation,
     SensorSection,
     Values,
 )
@@ -241,7 +241,7 @@ class Ins:
 
 
 @dataclass(frozen=True)
-class InsPosition:
+class InsPosition(PlainObservation):
     """Position of the point that the INS reports; zero error where it is p_n + nRb l.
 
     Parameters
@@ -266,10 +266,6 @@ class InsPosition:
     label: str = "INS position"
     unit: str = "m"
     components: tuple[str, ...] = ("east", "north", "up")
-    gate: float | None = None
-    noise_groups: tuple[tuple[int, ...], ...] = ()
-    correlated: ExpectedCorrelation | None = None
-    independent: bool = False
     parameters: tuple[str, ...] = ()
     clock: Clock = _CLOCK
 
@@ -292,7 +288,7 @@ class InsPosition:
 
 
 @dataclass(frozen=True)
-class InsVelocity:
+class InsVelocity(PlainObservation):
     """Velocity of the point that the INS reports; zero error where it is v_n + nRb (w x l).
 
     Parameters
@@ -317,10 +313,6 @@ class InsVelocity:
     label: str = "INS velocity"
     unit: str = "m/s"
     components: tuple[str, ...] = ("east", "north", "up")
-    gate: float | None = None
-    noise_groups: tuple[tuple[int, ...], ...] = ()
-    correlated: ExpectedCorrelation | None = None
-    independent: bool = False
     parameters: tuple[str, ...] = ()
     clock: Clock = _CLOCK
 

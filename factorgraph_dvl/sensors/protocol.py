@@ -201,6 +201,15 @@ class Observation(Protocol):
         """
 
 
+class PlainObservation:
+    """What is the same for most observations; a class of its own states what differs."""
+
+    gate: float | None = None
+    noise_groups: tuple[tuple[int, ...], ...] = ()
+    correlated: ExpectedCorrelation | None = None
+    independent: bool = False
+
+
 class SensorSection(Section, frozen=True, kw_only=True):
     """A sensor's section of trial.yaml, with the table that holds its record.
 

@@ -26,10 +26,10 @@ from factorgraph_dvl.sensors.parameters import Parameter, ParameterSpec
 from factorgraph_dvl.sensors.protocol import (
     TOO_LARGE,
     Attitudes,
-    ExpectedCorrelation,
     Linearization,
     Motion,
     Observation,
+    PlainObservation,
     SensorSection,
     Values,
 )
@@ -383,7 +383,7 @@ def _check_vectors(time: Array, body: Array, inertial: Array, source: str) -> No
 
 
 @dataclass(frozen=True)
-class StarAttitude:
+class StarAttitude(PlainObservation):
     """Attitude from a star tracker.
 
     The error is zero where
@@ -414,10 +414,6 @@ class StarAttitude:
     axes: Array
     std: Array
     components: tuple[str, ...] = ("x", "y", "z")
-    gate: float | None = None
-    noise_groups: tuple[tuple[int, ...], ...] = ()
-    correlated: ExpectedCorrelation | None = None
-    independent: bool = False
     label: str = "Star attitude"
     unit: str = "arcsec"
     parameters: tuple[str, ...] = (MOUNTING,)

@@ -50,8 +50,8 @@ def with_wheel(tmp_path: Path) -> Path:
     for part, name in (("sensors", "sensor"), ("simulation", "model")):
         shutil.copy(WHEEL / f"{name}.py", package / part / "wheel.py")
     sensors, instruments = (package / part / "catalogue.py" for part in ("sensors", "simulation"))
-    add_line(sensors, "AIDS:", "from factorgraph_dvl.sensors.wheel import Wheel\n")
-    add_line(sensors, "Beacons),\n)\n\n\n# Records of a planar", "Wheel, ")
+    add_line(sensors, "AIDS: tuple", "from factorgraph_dvl.sensors.wheel import Wheel\n")
+    add_line(sensors, "Beacons),\n)\n\n\n", "Wheel, ")
     add_line(
         instruments,
         "\n\nclass Instrument",

@@ -13,10 +13,10 @@ from factorgraph_dvl.geometry.rotations import BodyAxes
 from factorgraph_dvl.geometry.vectors import Array, rotate, skew
 from factorgraph_dvl.sensors.parameters import SCALAR, Parameter, ParameterSpec
 from factorgraph_dvl.sensors.protocol import (
-    ExpectedCorrelation,
     Linearization,
     Motion,
     Observation,
+    PlainObservation,
     SensorSection,
     Values,
 )
@@ -81,7 +81,7 @@ class Wheel:
 
 
 @dataclass(frozen=True)
-class WheelSpeed:
+class WheelSpeed(PlainObservation):
     """Speed ahead: zero error where measured = (1 + k) aheadᵀ nRbᵀ v_n."""
 
     time: Array
@@ -91,12 +91,7 @@ class WheelSpeed:
     label: str = "Wheel speed"
     unit: str = "m/s"
     components: tuple[str, ...] = ("ahead",)
-    gate: float | None = None
     parameters: tuple[str, ...] = (SCALE.name,)
-
-    noise_groups: tuple[tuple[int, ...], ...] = ()
-    correlated: ExpectedCorrelation | None = None
-    independent: bool = False
     clock: None = None
 
     def sigma(self, motion: Motion, values: Values, factor: Array | float = 1.0) -> Array:
