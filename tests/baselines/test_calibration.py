@@ -144,6 +144,8 @@ def test_command_line(tmp_path, capsys):
         "trajectory.csv",
         "history.csv",
         "residuals.parquet",
+        "report.html",
+        "run.json",
     }
     solution = load_solution(out)
     assert solution.solver == "kalman-point-set"
