@@ -26,33 +26,36 @@ BEFORE = "daba728"
 CAPABILITIES = (
     (
         "units, rotations, Earth, settings, trial, solution",
-        "conventions celestial directions earth errors signals solution trial yaml_file __init__",
+        "conventions celestial directions earth errors solution trial yaml_file __init__",
         "geometry/* settings/* errors solution trial __init__",
         "settings/ranges settings/files",
     ),
     (
         "sensors: settings, records, residuals",
-        "sensors/* beam_geometry gains turning clock",
+        "sensors/* beam_geometry gains turning",
         "sensors/*",
-        "sensors/ins sensors/attitude sensors/finding sensors/invalid_values sensors/imu_grades",
+        "sensors/ins sensors/attitude sensors/finding sensors/invalid_values sensors/imu_grades "
+        "sensors/fingerprint sensors/grades sensors/clock",
     ),
     (
         "IMU: increments, preintegration, motion at any time",
-        "increments polynomials preintegration attitude",
+        "increments polynomials preintegration attitude clock signals",
         "imu/*",
-        "imu/noise imu/sensitivity imu/timestamps",
+        "imu/noise imu/sensitivity imu/attitude_record*",
     ),
     (
         "start values",
         "alignment arcs attitude_alignment mounting",
         "initialization/*",
-        "initialization/*_windows initialization/clock_offsets",
+        "initialization/*_windows initialization/clock_offsets initialization/track_*",
     ),
     (
         "factor graph, batch solver, covariance",
         "graph chain keys priors information solvers/*",
         "graph/* solvers/* statistics/*",
-        "graph/imu_errors graph/clocks graph/processes statistics/correlation "
+        "graph/imu_errors graph/clocks graph/processes graph/native_graph graph/motion_* "
+        "statistics/correlation statistics/constancy solvers/change_along_trial "
+        "solvers/correlated_noise solvers/known_parameters solvers/motion_* "
         "statistics/error_budget statistics/robust_weights statistics/rows statistics/scores "
         "statistics/variance_components solvers/causes solvers/minima solvers/outliers",
     ),
@@ -74,13 +77,14 @@ CAPABILITIES = (
         "simulation",
         "simulation/*",
         "simulation/*",
-        "simulation/faults simulation/stated_errors simulation/size",
+        "simulation/faults simulation/stated_errors simulation/size simulation/compass",
     ),
     (
         "trial and solution folders",
         "io/*",
         "io/*",
-        "io/formats/* io/importing/* io/campaign* io/combined*",
+        "io/formats/* io/importing/* io/exporting/* io/data_frames io/output_file io/run_file "
+        "io/residual_table io/earlier_calibration",
     ),
     (
         "plausibility of records",
@@ -89,15 +93,27 @@ CAPABILITIES = (
         "quality/consistency quality/bow_and_course quality/*_axes quality/axis_permutations "
         "quality/sensor_clocks quality/earlier_calibration quality/refusal",
     ),
-    ("analyses", "analysis/*", "analysis/*", "analysis/static_noise"),
+    (
+        "analyses",
+        "analysis/*",
+        "analysis/*",
+        "analysis/static_noise analysis/information/further_manoeuvres analysis/comparison/halves",
+    ),
     ("campaigns of trials", "", "campaign/*", "campaign/*"),
     (
         "figures, tables, result files",
         "report/*",
         "report/*",
-        "report/*static_noise report/*imu_noise report/*error_budget report/*campaign*",
+        "report/*static_noise report/*imu_noise report/*error_budget report/*campaign* "
+        "report/html/* report/overview",
     ),
-    ("command line", "cli/*", "cli/*", "cli/allan cli/import_files cli/reproduce cli/campaign*"),
+    (
+        "command line",
+        "cli/*",
+        "cli/*",
+        "cli/allan cli/import_files cli/reproduce cli/campaign* cli/events cli/export cli/report "
+        "cli/streams cli/memory cli/verdict",
+    ),
     ("publications, measured", "", "reproduce/*", "reproduce/*"),
 )
 
