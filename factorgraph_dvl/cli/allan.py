@@ -22,7 +22,11 @@ def allan(
     ] = None,
     force: Force = False,
 ) -> None:
-    """Find the noise of an IMU from a static record, by its Allan deviation."""
+    """Find the noise of an IMU from a static record, by its Allan deviation.
+
+    Examples:
+      factorgraph-dvl allan static.csv --out allan
+    """
     from factorgraph_dvl.analysis.static_noise import static_noise
     from factorgraph_dvl.io.folders import new_folder
     from factorgraph_dvl.io.tables import read_table

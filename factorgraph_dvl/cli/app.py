@@ -17,6 +17,7 @@ from factorgraph_dvl.cli.console import stderr, warn
 from factorgraph_dvl.cli.correct import correct
 from factorgraph_dvl.cli.crosscheck import crosscheck
 from factorgraph_dvl.cli.deadreckon import deadreckon
+from factorgraph_dvl.cli.demo import demo
 from factorgraph_dvl.cli.export import export
 from factorgraph_dvl.cli.import_files import import_
 from factorgraph_dvl.cli.inspect import inspect
@@ -45,10 +46,10 @@ app = typer.Typer(
     name=_NAME,
     help="Calibrate a Doppler velocity log, jointly with the trajectory of its vehicle.",
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
 )
 for _command in (
+    demo,
     simulate,
     solve,
     replay,

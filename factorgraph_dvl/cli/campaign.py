@@ -43,7 +43,11 @@ def campaign(
     anyway: Anyway = False,
     quiet: Quiet = False,
 ) -> None:
-    """Solve many trials, and calibrate all jointly; what is there is not solved again."""
+    """Solve many trials, and calibrate all jointly; what is there is not solved again.
+
+    Examples:
+      factorgraph-dvl campaign monday tuesday --out campaign
+    """
     from factorgraph_dvl.campaign.files import CAMPAIGN_FILE, OWNED
     from factorgraph_dvl.campaign.trial_run import TRIALS_FOLDER
     from factorgraph_dvl.errors import ConfigError

@@ -49,7 +49,11 @@ def crosscheck(
     anyway: Anyway = False,
     no_figures: NoFigures = False,
 ) -> None:
-    """Compare two results of one trial with each other and with the truth."""
+    """Compare two results of one trial with each other and with the truth.
+
+    Examples:
+      factorgraph-dvl crosscheck out out-kalman --out out/crosscheck
+    """
     from factorgraph_dvl.analysis.comparison.crosscheck import crosscheck as compare
     from factorgraph_dvl.io.calibration_file import check_verdict
     from factorgraph_dvl.io.external_results import load_results, load_truth

@@ -62,7 +62,11 @@ def deadreckon(
     anyway: Anyway = False,
     quiet: Quiet = False,
 ) -> None:
-    """Integrate the DVL's velocity, before and after calibration, and score the track."""
+    """Integrate the DVL's velocity, before and after calibration, and score the track.
+
+    Examples:
+      factorgraph-dvl deadreckon data/seed-a-phase-90 --calibration out --out out/deadreckon
+    """
     from factorgraph_dvl.analysis.dead_reckoning.before_after import before_after
     from factorgraph_dvl.io.external_results import read_calibration_values
     from factorgraph_dvl.io.folders import new_folder

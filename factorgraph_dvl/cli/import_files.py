@@ -31,7 +31,11 @@ def import_(
     force: Force = False,
     quiet: Quiet = False,
 ) -> None:
-    """Import raw files of instruments: velocity logs, GNSS, attitude, IMU."""
+    """Import raw files of instruments: velocity logs, GNSS, attitude, IMU.
+
+    Examples:
+      factorgraph-dvl import sensors.pd0 ship.nmea --out trial
+    """
     from factorgraph_dvl.errors import ConfigError
     from factorgraph_dvl.io.formats.mapping import MappingSettings
     from factorgraph_dvl.io.importing.guess import guess_all

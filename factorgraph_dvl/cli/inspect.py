@@ -8,7 +8,11 @@ from factorgraph_dvl.cli.options import TrialPath
 
 
 def inspect(trial_path: TrialPath) -> None:
-    """Show the records of a trial, and check their units and signs."""
+    """Show the records of a trial, and check their units and signs.
+
+    Examples:
+      factorgraph-dvl inspect data/seed-a-phase-90
+    """
     from factorgraph_dvl.io.planar_folder import is_planar, load_planar_trial
     from factorgraph_dvl.io.trial_folder import load_trial
     from factorgraph_dvl.quality.survey import survey

@@ -17,7 +17,11 @@ def instrument(
     ],
     anyway: Anyway = False,
 ) -> None:
-    """Print a calibration in the terms of instruments: angles, %, ppm, TRDI's EA and EI."""
+    """Print a calibration in the terms of instruments: angles, %, ppm, TRDI's EA and EI.
+
+    Examples:
+      factorgraph-dvl instrument out/calibration.json
+    """
     from factorgraph_dvl.analysis.instrument_terms import instrument_of
     from factorgraph_dvl.io.calibration_file import check_usable, load_calibration
     from factorgraph_dvl.report.files.instrument import instrument_text

@@ -40,7 +40,11 @@ def observability(
     anyway: Anyway = False,
     quiet: Quiet = False,
 ) -> None:
-    """Show which parameters the data determine, and which motion contributes to them."""
+    """Show which parameters the data determine, and which motion contributes to them.
+
+    Examples:
+      factorgraph-dvl observability data/seed-a-phase-90 --out observability
+    """
     from factorgraph_dvl.io.folders import new_folder
     from factorgraph_dvl.io.segments_file import read_segments
     from factorgraph_dvl.io.trial_folder import inputs_of

@@ -35,7 +35,11 @@ def plan(
     anyway: Anyway = False,
     quiet: Quiet = False,
 ) -> None:
-    """Predict the σ of a planned trial, and propose manoeuvres if requirements are missed."""
+    """Predict the σ of a planned trial, and propose manoeuvres if requirements are missed.
+
+    Examples:
+      factorgraph-dvl plan configs/plans/harbour.yaml --out plan
+    """
     from factorgraph_dvl.analysis.information.observability import observability as look
     from factorgraph_dvl.io.folders import new_folder
     from factorgraph_dvl.planning import predict, propose, requirements

@@ -73,7 +73,11 @@ def replay(
     anyway: Anyway = False,
     quiet: Quiet = False,
 ) -> None:
-    """Feed a trial in the order of time, and show what was known when."""
+    """Feed a trial in the order of time, and show what was known when.
+
+    Examples:
+      factorgraph-dvl replay data/seed-a-phase-90 --out out --live
+    """
     from factorgraph_dvl.analysis.convergence import check_limits, convergence
     from factorgraph_dvl.io.solution_folder import OWNED
     from factorgraph_dvl.io.trial_folder import inputs_of, load_trial

@@ -37,7 +37,11 @@ def reproduce(
     force: Force = False,
     quiet: Quiet = False,
 ) -> None:
-    """Measure what a publication states: each equation, table, figure and claim."""
+    """Measure what a publication states: each equation, table, figure and claim.
+
+    Examples:
+      factorgraph-dvl reproduce luo-2024 --out paper --table 3
+    """
     from factorgraph_dvl.errors import ConfigError
     from factorgraph_dvl.io.folders import new_folder
     from factorgraph_dvl.reproduce import PAPERS

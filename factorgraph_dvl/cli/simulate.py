@@ -21,7 +21,11 @@ def simulate(
         bool, typer.Option("--parquet", help="Write tables as Parquet instead of CSV.")
     ] = False,
 ) -> None:
-    """Simulate a trial with known truth."""
+    """Simulate a trial with known truth.
+
+    Examples:
+      factorgraph-dvl simulate configs/cruise.yaml --out trial --seed 1
+    """
     from factorgraph_dvl.io.planar_folder import save_planar_trial
     from factorgraph_dvl.io.trial_folder import OWNED, check_simulated, save_trial
     from factorgraph_dvl.simulation import load_scenario, simulate_planar

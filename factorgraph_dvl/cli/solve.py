@@ -85,7 +85,11 @@ def solve(
     anyway: Anyway = False,
     quiet: Quiet = False,
 ) -> None:
-    """Estimate calibration and trajectory from all data of a trial."""
+    """Estimate calibration and trajectory from all data of a trial.
+
+    Examples:
+      factorgraph-dvl solve data/seed-a-phase-90 --out out
+    """
 
     def run(trial: Trial, progress: ProgressLine) -> _Found:
         # The solver is slow to import: do so after the checks of the input.
@@ -141,7 +145,11 @@ def kalman(
     anyway: Anyway = False,
     quiet: Quiet = False,
 ) -> None:
-    """Calibrate or navigate with a Kalman filter, for comparison with `solve`."""
+    """Calibrate or navigate with a Kalman filter, for comparison with `solve`.
+
+    Examples:
+      factorgraph-dvl kalman data/seed-a-phase-90 --out out-kalman --method nine-state
+    """
     if linear and method is not KalmanMethod.NINE_STATE:
         from factorgraph_dvl.errors import ConfigError
 

@@ -1,0 +1,63 @@
+from __future__ import annotations
+
+import re
+import webbrowser
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from builders import build_solution, build_trial
+from running import Run
+
+from factorgraph_dvl.cli.app import app
+from factorgraph_dvl.io.trial_folder import save_trial
+
+ROOT = Path(__file__).parent.parent.parent
+COMMANDS = [command.name or command.callback.__name__ for command in app.registered_commands]
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_help_has_an_example(command: str, run: Run) -> None:
+    shown = run(command, "--help").out
+    assert f"factorgraph-dvl {command}" in shown.partition("Examples:")[2]
+
+
+def test_the_demo_is_the_shipped_trial_and_opens_its_page(
+    tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    opened: list[str] = []
+    solution = build_solution()
+
+    def solve(*_: Any, **__: Any) -> Any:
+        return solution
+
+    monkeypatch.setattr("factorgraph_dvl.solvers.batch.solve", solve)
+    monkeypatch.setattr(
+        "factorgraph_dvl.report.figures.solution.write_figures", lambda *_, **__: []
+    )
+    monkeypatch.setattr(webbrowser, "open", opened.append)
+    asked: list[Any] = []
+
+    def simulate(config: Path, trial: Path, **options: Any) -> None:
+        asked.append((config.name, config.read_text(), options["seed"]))
+        save_trial(build_trial(), trial)
+
+    monkeypatch.setattr("factorgraph_dvl.cli.demo.simulate", simulate)
+    result = run("demo", "--out", tmp_path / "demo")
+    assert result.code == 0, result.err
+    page = tmp_path / "demo" / "result" / "report.html"
+    assert opened == [page.resolve().as_uri()]
+    assert str(page.resolve()) in result.out
+    ((name, scenario, seed),) = asked
+    shipped = (ROOT / "data" / "README.md").read_text()
+    assert f"simulate configs/{name} --out data/seed-a-phase-90 --seed {seed} " in shipped
+    assert scenario == (ROOT / "configs" / name).read_text()
+
+
+def test_the_citation_names_the_version() -> None:
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
+    project = (ROOT / "pyproject.toml").read_text()
+    (version,) = re.findall(r'^version = "(.*)"', project, re.MULTILINE)
+    assert str(citation["version"]) == version
+    assert citation["license"] in project
