@@ -19,13 +19,13 @@ Estimates: `solve`, `Replay`, `kalman` (the usual filters, to compare). They ret
 with its `Trajectory`, each `Estimate` and a `Verdict`; `load_solution`, `save_solution`,
 `load_calibration`.
 
-Analyses: `crosscheck`, `observability`, `predict` (of a plan), `dead_reckon`.
+Analyses: `crosscheck`, `observability`, `predict` (of a scenario from `load_scenario`),
+`dead_reckon` (with `mounting_of` and an `AttitudeHistory`).
 
 Parts for a GTSAM script of one's own: `preintegrate`, `measured_nodes`, `sensor_factor`,
 `solved_problems` (whose `Problem.nonlinear_graph` is the whole problem), `LocalFrame`.
 
-Errors: `ConfigError`, `DataError`, `SolveError` and `OutputError` are each a
-`FactorgraphDvlError`.
+Errors: `ConfigError`, `DataError` and `SolveError` are each a `FactorgraphDvlError`.
 """
 
 from __future__ import annotations
@@ -34,19 +34,19 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from factorgraph_dvl.analysis.comparison.crosscheck import crosscheck
-    from factorgraph_dvl.analysis.dead_reckoning.integration import dead_reckon
+    from factorgraph_dvl.analysis.dead_reckoning.integration import dead_reckon, mounting_of
     from factorgraph_dvl.analysis.information.observability import observability
     from factorgraph_dvl.baselines.calibration import kalman
     from factorgraph_dvl.errors import (
         ConfigError,
         DataError,
         FactorgraphDvlError,
-        OutputError,
         SolveError,
     )
     from factorgraph_dvl.geometry.earth import LocalFrame
     from factorgraph_dvl.graph.problem import Problem
     from factorgraph_dvl.graph.sensor_factor import measured_nodes, sensor_factor
+    from factorgraph_dvl.imu.attitude_history import AttitudeHistory
     from factorgraph_dvl.imu.preintegration import preintegrate
     from factorgraph_dvl.io.calibration_file import load_calibration
     from factorgraph_dvl.io.solution_folder import load_solution, save_solution
@@ -60,6 +60,7 @@ if TYPE_CHECKING:
     from factorgraph_dvl.sensors.gnss import Gnss, GnssSettings
     from factorgraph_dvl.sensors.imu import Imu, ImuSettings
     from factorgraph_dvl.simulation import simulate
+    from factorgraph_dvl.simulation.scenario import load_scenario
     from factorgraph_dvl.solution import Calibration, Estimate, Solution, Trajectory
     from factorgraph_dvl.solvers.batch import solve, solved_problems
     from factorgraph_dvl.trial import Trial
@@ -68,6 +69,7 @@ if TYPE_CHECKING:
 
 # Module of each public name.
 _PUBLIC = {
+    "AttitudeHistory": "imu.attitude_history",
     "Calibration": "solution",
     "ConfigError": "errors",
     "DataError": "errors",
@@ -80,7 +82,6 @@ _PUBLIC = {
     "Imu": "sensors.imu",
     "ImuSettings": "sensors.imu",
     "LocalFrame": "geometry.earth",
-    "OutputError": "errors",
     "Problem": "graph.problem",
     "Replay": "replay.session",
     "Solution": "solution",
@@ -92,9 +93,11 @@ _PUBLIC = {
     "dead_reckon": "analysis.dead_reckoning.integration",
     "kalman": "baselines.calibration",
     "load_calibration": "io.calibration_file",
+    "load_scenario": "simulation.scenario",
     "load_solution": "io.solution_folder",
     "load_trial": "io.trial_folder",
     "measured_nodes": "graph.sensor_factor",
+    "mounting_of": "analysis.dead_reckoning.integration",
     "observability": "analysis.information.observability",
     "predict": "planning.prediction",
     "preintegrate": "imu.preintegration",
@@ -109,6 +112,7 @@ _PUBLIC = {
 }
 
 __all__ = [
+    "AttitudeHistory",
     "Calibration",
     "ConfigError",
     "DataError",
@@ -121,7 +125,6 @@ __all__ = [
     "Imu",
     "ImuSettings",
     "LocalFrame",
-    "OutputError",
     "Problem",
     "Replay",
     "Solution",
@@ -133,9 +136,11 @@ __all__ = [
     "dead_reckon",
     "kalman",
     "load_calibration",
+    "load_scenario",
     "load_solution",
     "load_trial",
     "measured_nodes",
+    "mounting_of",
     "observability",
     "predict",
     "preintegrate",

@@ -18,6 +18,15 @@ class FactorgraphDvlError(Exception):
         What would have been right.
     hint : str, optional
         What to try.
+
+    Examples
+    --------
+    >>> from factorgraph_dvl import FactorgraphDvlError, load_trial
+    >>> try:
+    ...     load_trial("no-such-trial")
+    ... except FactorgraphDvlError as error:
+    ...     print(error)
+    no-such-trial: the trial does not exist; expected a trial folder
     """
 
     exit_code = 1
@@ -35,19 +44,42 @@ class FactorgraphDvlError(Exception):
 
 
 class ConfigError(FactorgraphDvlError):
-    """A setting is missing, unknown or out of range."""
+    """A setting is missing, unknown or out of range.
+
+    Examples
+    --------
+    >>> import factorgraph_dvl as fd
+    >>> fd.solve(fd.simulate("examples/short.yaml", seed=1), rate_hz=-1.0)
+    Traceback (most recent call last):
+    factorgraph_dvl.errors.ConfigError: rate_hz is -1.0; expected a number above 0
+    """
 
     exit_code = 2
 
 
 class DataError(FactorgraphDvlError):
-    """A data file or record does not hold what it should."""
+    """A data file or record does not hold what it should.
+
+    Examples
+    --------
+    >>> import factorgraph_dvl as fd
+    >>> fd.load_solution("no-such-solution")
+    Traceback (most recent call last):
+    factorgraph_dvl.errors.DataError: ...
+    """
 
     exit_code = 2
 
 
 class SolveError(FactorgraphDvlError):
-    """The input was valid, but no trustworthy solution was found."""
+    """The input was valid, but no trustworthy solution was found.
+
+    Examples
+    --------
+    >>> from factorgraph_dvl import SolveError
+    >>> SolveError("the cost at the start is not finite").exit_code
+    1
+    """
 
     exit_code = 1
 

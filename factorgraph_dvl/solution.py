@@ -80,6 +80,13 @@ class Trajectory:
         Local-level east, north, up, m²/s².
     rph_cov : ndarray, shape (M, 3, 3)
         Roll, pitch, heading, rad².
+
+    Examples
+    --------
+    >>> import factorgraph_dvl as fd
+    >>> motion = fd.solve(fd.simulate("examples/short.yaml", seed=1)).trajectory
+    >>> motion.geodetic.shape == motion.position_std.shape == (motion.time.size, 3)
+    True
     """
 
     time: Array
@@ -134,6 +141,14 @@ class Estimate:
     nominal : ndarray, shape (N, 3), optional
         Unit vectors, if the parameter is N directions: the n = 2 N components turn them, in deg
         (`directions`). None for all other parameters.
+
+    Examples
+    --------
+    >>> import factorgraph_dvl as fd
+    >>> solution = fd.solve(fd.simulate("examples/short.yaml", seed=1))
+    >>> lever_arm = solution.estimate("lever_arm_m")
+    >>> lever_arm.value.round(1), lever_arm.observable
+    (array([ 0.8,  1.2, -1. ]), array([ True,  True,  True]))
     """
 
     name: str
@@ -373,6 +388,17 @@ class Solution(Judged):
         What makes up the standard deviations, the largest causes first.
     epoch : str, optional
         UTC of time zero, ISO 8601; empty if not given.
+
+    Examples
+    --------
+    >>> import factorgraph_dvl as fd
+    >>> solution = fd.solve(fd.simulate("examples/short.yaml", seed=1))
+    >>> solution
+    <Solution of 'short run' by batch: good, 9 parameters>
+    >>> print(solution.summary().splitlines()[5])
+    scale_error       0.00523 ± 0.00036          green
+    >>> solution.covariance.shape == 2 * (len(solution.order),)
+    True
     """
 
     trial: str
@@ -492,7 +518,19 @@ class Solution(Judged):
 
 @dataclass(frozen=True, repr=False)
 class Calibration(Judged):
-    """What a solver found of the sensors alone; the fields are those of `Solution`."""
+    """What a solver found of the sensors alone; the fields are those of `Solution`.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> import factorgraph_dvl as fd
+    >>> solution = fd.solve(fd.simulate("examples/short.yaml", seed=1))
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     fd.save_solution(solution, f"{folder}/out")
+    ...     calibration = fd.load_calibration(f"{folder}/out/calibration.json")
+    >>> calibration.order == solution.order
+    True
+    """
 
     trial: str
     solver: str

@@ -149,6 +149,15 @@ class Trial:
         What was noticed while loading, for the user.
     limits : mapping of str to float, optional
         Standard deviations that are good enough, by parameter, in reported units.
+
+    Examples
+    --------
+    >>> import factorgraph_dvl as fd
+    >>> trial = fd.simulate("examples/short.yaml", seed=1)
+    >>> trial
+    <Trial 'short run': imu 4300, gnss 172, dvl 172>
+    >>> trial.depth is None
+    True
     """
 
     name: str

@@ -75,7 +75,15 @@ def kalman(
     rate_hz: float = 10.0,
     progress: Progress | None = None,
 ) -> Solution:
-    """Return the solution of `calibrate` without the history."""
+    """Return the solution of `calibrate` without the history.
+
+    Examples
+    --------
+    >>> import factorgraph_dvl as fd
+    >>> found = fd.kalman(fd.simulate("examples/short.yaml", seed=1), "least-squares")
+    >>> found.solver
+    'kalman-least-squares'
+    """
     return calibrate(trial, method, rate_hz=rate_hz, progress=progress)[0]
 
 

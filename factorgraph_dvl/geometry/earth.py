@@ -79,6 +79,14 @@ class LocalFrame:
     epoch : str, optional
         UTC of the trial's time zero, ISO 8601, which fixes how the frame lies among the stars at
         any time; empty if not known.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from factorgraph_dvl import LocalFrame
+    >>> frame = LocalFrame(np.radians(36.0), np.radians(121.0), 0.0)
+    >>> frame.position(np.radians(36.0), np.radians(121.0), 5.0).round(6)
+    array([0., 0., 5.])
     """
 
     lat: float

@@ -197,6 +197,15 @@ class Problem:
         By label, factors (d,) for noise that persists for some measurements; likewise.
     robust_weights : mapping of str to ndarray
         By label, weights from 0 to 1 on the squares of residuals, (M, d) or (M, 1); likewise.
+
+    Examples
+    --------
+    `solved_problems` makes the problem of a trial:
+
+    >>> import factorgraph_dvl as fd
+    >>> solved, *_ = fd.solved_problems(fd.simulate("examples/short.yaml", seed=1))
+    >>> [p.name for p in solved.problem.parameters][:3]
+    ['gnss_lever_arm_m', 'gnss_time_offset_s', 'misalignment_deg']
     """
 
     def __init__(

@@ -58,6 +58,15 @@ class AttitudeHistory:
         Of the body.
     gyro_bias : ndarray, shape (3,), rad/s
         Zero if not known: through a lever arm of 1 m, 10 deg/h are 0.05 mm/s.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import factorgraph_dvl as fd
+    >>> trial = fd.simulate("examples/short.yaml", seed=1)
+    >>> history = fd.AttitudeHistory(trial.imu, trial.reference, trial.body_axes, np.zeros(3))
+    >>> history.at(np.array([10.0])).nRb.shape
+    (1, 3, 3)
     """
 
     def __init__(

@@ -215,7 +215,7 @@ def preintegrate(
     >>> force = np.tile([0.0, 0.0, -9.8], (200, 1))
     >>> imu = Imu(ImuSettings(grade="tactical"), time, np.zeros((200, 3)), force)
     >>> chain = preintegrate(imu, [0.0, 1.0, 2.0], frame)
-    >>> chain.time
+    >>> chain.time.round(6) + 0.0
     array([0., 1., 2.])
     >>> [round(pim.deltaTij(), 9) for pim in chain.measurements]
     [1.0, 1.0]

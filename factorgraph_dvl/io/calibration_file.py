@@ -126,6 +126,16 @@ def load_calibration(path: Path | str, *, body_axes: BodyAxes = "RFU") -> Calibr
     ------
     DataError
         If the file is missing or does not hold what it should.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> import factorgraph_dvl as fd
+    >>> solution = fd.solve(fd.simulate("examples/short.yaml", seed=1))
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     fd.save_solution(solution, f"{folder}/out")
+    ...     fd.load_calibration(f"{folder}/out/calibration.json").values["scale_error"].round(4)
+    array([0.0052])
     """
     path = Path(path)
     path = path / CALIBRATION_FILE if path.is_dir() else path

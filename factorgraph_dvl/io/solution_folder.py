@@ -111,6 +111,16 @@ def save_solution(
     ------
     DataError
         If the folder exists, is not empty, and `force` is not set; if it holds a trial.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> import factorgraph_dvl as fd
+    >>> solution = fd.solve(fd.simulate("examples/short.yaml", seed=1))
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     fd.save_solution(solution, f"{folder}/out")
+    ...     fd.load_solution(f"{folder}/out").verdict.grade
+    'good'
     """
     with new_folder(Path(path), force=force, owned=OWNED) as folder:
         columns = trajectory_columns(solution.trajectory)
@@ -203,6 +213,16 @@ def load_solution(path: Path | str) -> Solution:
     ------
     DataError
         If a file is missing or does not hold what it should.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> import factorgraph_dvl as fd
+    >>> solution = fd.solve(fd.simulate("examples/short.yaml", seed=1))
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     fd.save_solution(solution, f"{folder}/out")
+    ...     [r.label for r in fd.load_solution(f"{folder}/out").residuals]
+    ['GNSS position', 'GNSS velocity', 'DVL velocity']
     """
     folder = Path(path)
     calibration = load_calibration(folder / CALIBRATION_FILE)

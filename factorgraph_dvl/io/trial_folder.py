@@ -92,6 +92,12 @@ def load_trial(path: Path | str, *, anyway: bool = False) -> Trial:
         type or out of range.
     DataError
         If a table is missing or does not hold what it should.
+
+    Examples
+    --------
+    >>> import factorgraph_dvl as fd
+    >>> fd.load_trial("data/seed-a-phase-90").body_axes
+    'RFU'
     """
     folder, file = locate(Path(path))
     text = read_text(file)
@@ -237,6 +243,16 @@ def save_trial(
     DataError
         If the folder exists, is not empty, and `force` is not set, or holds a trial that was
         written otherwise.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> import factorgraph_dvl as fd
+    >>> trial = fd.simulate("examples/short.yaml", seed=1)
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     fd.save_trial(trial, f"{folder}/trial", parquet=True)
+    ...     fd.load_trial(f"{folder}/trial").dvl.time.size
+    172
     """
     suffix = ".parquet" if parquet else ".csv"
     check_saved(Path(path))

@@ -77,6 +77,13 @@ def predict(scenario: Scenario) -> Prediction:
     ------
     ConfigError
         If the manoeuvres cannot be carried out.
+
+    Examples
+    --------
+    >>> import factorgraph_dvl as fd
+    >>> prediction = fd.predict(fd.load_scenario("examples/short.yaml"))
+    >>> prediction.solution.estimate("misalignment_deg").std.round(2)
+    array([0.03, 0.06, 0.02])
     """
     scenario = msgspec.structs.replace(scenario, noise=False)
     motion = plan_motion(scenario)

@@ -58,6 +58,13 @@ def survey(trial: Trial) -> Survey:
     ----------
     trial : Trial
         As loaded.
+
+    Examples
+    --------
+    >>> import factorgraph_dvl as fd
+    >>> found = fd.survey(fd.simulate("examples/short.yaml", seed=1))
+    >>> found.duration, len(found.sensors)
+    (85.98, 3)
     """
     sensors = []
     if trial.imu is not None:

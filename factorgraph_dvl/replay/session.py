@@ -63,6 +63,18 @@ class Replay:
         States a second.
     progress : callable, optional
         Called with stage, iteration and cost while a batch solution runs.
+
+    Examples
+    --------
+    >>> import factorgraph_dvl as fd
+    >>> trial = fd.simulate("examples/short.yaml", seed=1)
+    >>> replay = fd.Replay(trial)
+    >>> replay.add(trial.gnss)
+    >>> replay.add(trial.dvl)
+    >>> imu = trial.imu
+    >>> updates = replay.add_imu(imu.time[:1000], imu.gyro[:1000], imu.accel[:1000])
+    >>> replay.started
+    False
     """
 
     def __init__(

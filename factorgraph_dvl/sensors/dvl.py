@@ -65,7 +65,14 @@ _LEAST_SIGMA = 1e-4
 
 
 class DvlSettings(ClockSection, frozen=True, kw_only=True):
-    """Section `dvl` of trial.yaml."""
+    """Section `dvl` of trial.yaml.
+
+    Examples
+    --------
+    >>> from factorgraph_dvl import DvlSettings
+    >>> DvlSettings(misalignment_deg=(0.0, 0.0, 45.0)).scale_error_std
+    0.1
+    """
 
     file: str = "dvl.csv"
     calibration: str | UnsetType = UNSET
@@ -124,6 +131,15 @@ class Dvl:
     prior : JointPrior, optional
         What the calibration that `settings` name knows; it takes the place of the keys for the
         parameters that it has.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from factorgraph_dvl import Dvl, DvlSettings
+    >>> velocity = np.array([[1.5, 0.0, 0.0], [np.nan, np.nan, np.nan]])
+    >>> dvl = Dvl(DvlSettings(), np.array([0.0, 0.5]), velocity, np.full((2, 3), np.nan))
+    >>> dvl.locked
+    array([ True, False])
     """
 
     settings: DvlSettings

@@ -671,6 +671,13 @@ class Verdict:
         `do not use`: the data contradict the model. `doubtful`: there is something to check.
     reasons : tuple of Finding
         The worst first, and of equal ones causes before symptoms. Empty if the grade is good.
+
+    Examples
+    --------
+    >>> import factorgraph_dvl as fd
+    >>> verdict = fd.solve(fd.simulate("examples/short.yaml", seed=1)).verdict
+    >>> verdict.grade, verdict.reasons
+    ('good', ())
     """
 
     grade: VerdictGrade

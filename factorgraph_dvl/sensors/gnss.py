@@ -55,7 +55,14 @@ TIME_OFFSET = _CLOCK.offset.name
 
 
 class GnssSettings(ClockSection, frozen=True, kw_only=True):
-    """Section `gnss` of trial.yaml."""
+    """Section `gnss` of trial.yaml.
+
+    Examples
+    --------
+    >>> from factorgraph_dvl import GnssSettings
+    >>> GnssSettings(lever_arm_m=(1.2, 0.0, -3.5)).lever_arm_std_m
+    (0.02, 0.02, 0.02)
+    """
 
     file: str = "gnss.csv"
     position_std_m: tuple[Positive, Positive, Positive] = (1.0, 1.0, 2.0)
@@ -97,6 +104,15 @@ class Gnss:
     turning : TurntableMotion, optional
         Of the body relative to the ship that carries the antenna; None = the antenna is fixed to
         the body.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from factorgraph_dvl import Gnss, GnssSettings
+    >>> geodetic = np.array([[np.radians(36.0), np.radians(121.0), 10.0]])
+    >>> absent = np.full((1, 3), np.nan)
+    >>> Gnss(GnssSettings(), np.zeros(1), geodetic, absent, absent, absent).missing
+    array([False])
     """
 
     settings: GnssSettings

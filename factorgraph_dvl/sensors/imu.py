@@ -140,7 +140,14 @@ class ImuErrorStd:
 
 
 class ImuSettings(SensorSection, frozen=True, kw_only=True):
-    """Section `imu` of trial.yaml; what it does not state has the value typical of the grade."""
+    """Section `imu` of trial.yaml; what it does not state has the value typical of the grade.
+
+    Examples
+    --------
+    >>> from factorgraph_dvl import ImuSettings
+    >>> ImuSettings(grade="tactical", gyro_noise_deg_sqrt_h=0.1).gyro_noise_deg_sqrt_h
+    0.1
+    """
 
     file: str = "imu.csv"
     sampling: Literal["mean", "instantaneous"] = "mean"
@@ -226,6 +233,15 @@ class Imu:
     prior : JointPrior, optional
         What the calibration that `settings` name knows of the biases at the first sample; it takes
         the place of their keys.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from factorgraph_dvl import Imu, ImuSettings
+    >>> time = np.arange(1, 101) / 100.0
+    >>> force = np.tile([0.0, 0.0, 9.8], (100, 1))
+    >>> Imu(ImuSettings(grade="mems"), time, np.zeros((100, 3)), force).time.size
+    100
     """
 
     settings: ImuSettings

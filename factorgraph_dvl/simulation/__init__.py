@@ -58,6 +58,13 @@ def simulate(scenario: Scenario | str | PathLike[str], seed: int = 0) -> Trial:
     ------
     ConfigError
         If the scenario cannot be read, is not valid, or has no IMU.
+
+    Examples
+    --------
+    >>> import factorgraph_dvl as fd
+    >>> trial = fd.simulate("examples/short.yaml", seed=1)
+    >>> trial.calibration_truth["lever_arm_m"]
+    array([ 0.8,  1.2, -1. ])
     """
     if not isinstance(scenario, Scenario):
         scenario = load_scenario(scenario)

@@ -241,6 +241,12 @@ def load_scenario(path: str | PathLike[str]) -> Scenario:
     ConfigError
         If the file is missing, is not YAML, or holds an unknown key, a wrong type or a
         value out of range; the message names file, line and key.
+
+    Examples
+    --------
+    >>> import factorgraph_dvl as fd
+    >>> fd.load_scenario("examples/short.yaml").name
+    'short run'
     """
     path = Path(path)
     scenario = read_yaml(path, Scenario, source=str(path))

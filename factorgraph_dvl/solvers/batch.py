@@ -73,6 +73,13 @@ def solve(
         If the trial cannot be solved as it is, or has records that cannot be used.
     SolveError
         If no minimum can be searched for at all.
+
+    Examples
+    --------
+    >>> import factorgraph_dvl as fd
+    >>> solution = fd.solve(fd.simulate("examples/short.yaml", seed=1))
+    >>> solution.estimate("misalignment_deg").value.round(1)
+    array([ 1. , -2.1, 20. ])
     """
     _check_above_zero("rate_hz", rate_hz)
     _check_above_zero("state_interval_s", state_interval_s)
@@ -106,6 +113,14 @@ def solved_problems(
     """Return the problem of a trial at all its minima, from the most probable position.
 
     The most probable one comes first; parameters and errors are those of `solve`.
+
+    Examples
+    --------
+    >>> import factorgraph_dvl as fd
+    >>> solved, *_ = fd.solved_problems(fd.simulate("examples/short.yaml", seed=1))
+    >>> graph, values = solved.problem.nonlinear_graph()
+    >>> graph.error(values) > graph.error(solved.minimum.evaluation.values)
+    True
     """
     report = progress or _silent
     _check_above_zero("state_interval_s", state_interval_s)

@@ -120,6 +120,14 @@ def crosscheck(
     ------
     DataError
         If the results have nothing in common and there is no truth for either.
+
+    Examples
+    --------
+    >>> import factorgraph_dvl as fd
+    >>> trial = fd.simulate("examples/short.yaml", seed=1)
+    >>> check = fd.crosscheck(fd.solve(trial), fd.kalman(trial, "least-squares"))
+    >>> {c.name: c.verdict for c in check.components}["lever_arm_x_m"]
+    'agree'
     """
     notes = [f"{side} did not converge" for side, s in (("A", a), ("B", b)) if not s.converged]
     if a.trial and b.trial and a.trial != b.trial:

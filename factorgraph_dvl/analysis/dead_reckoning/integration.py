@@ -92,6 +92,12 @@ def mounting_of(trial: Trial, values: Mapping[str, Array] | None = None) -> DvlM
         Trial with a DVL; its settings give the parameters that `values` omit.
     values : mapping of str to ndarray, shape (n,), optional
         Values by name as in calibration.json, in reported units.
+
+    Examples
+    --------
+    >>> import factorgraph_dvl as fd
+    >>> fd.mounting_of(fd.simulate("examples/short.yaml", seed=1)).lever_arm
+    array([0., 0., 0.])
     """
     given = values or {}
     si = {
@@ -138,6 +144,18 @@ def dead_reckon(
     ------
     DataError
         If there is no DVL, no lock while the attitude is known, or no position to start from.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import factorgraph_dvl as fd
+    >>> trial = fd.simulate("examples/short.yaml", seed=1)
+    >>> solution = fd.solve(trial)
+    >>> mounting = fd.mounting_of(trial, {e.name: e.value for e in solution.estimates})
+    >>> history = fd.AttitudeHistory(trial.imu, solution.trajectory, trial.body_axes, np.zeros(3))
+    >>> track = fd.dead_reckon(trial, mounting, history.at)
+    >>> track.geodetic.shape[1]
+    3
     """
     dvl = _log(trial)
     pings = dvl.time[dvl.locked] - mounting.time_offset

@@ -100,6 +100,14 @@ def observability(
         Segments: start and end, s, and label; by default they are found from the motion.
     kind : str, optional
         Source; by default `trial` or `solution`.
+
+    Examples
+    --------
+    >>> import factorgraph_dvl as fd
+    >>> solution = fd.solve(fd.simulate("examples/short.yaml", seed=1))
+    >>> view = fd.observability(solution)
+    >>> [m.segment.label for m in view.segments][:2]
+    ['steady', 'turning']
     """
     trajectory = solution.trajectory
     missing = []
