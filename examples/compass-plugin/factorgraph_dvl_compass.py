@@ -103,7 +103,7 @@ class Compass:
 
     def observations(self, frame: LocalFrame, body_axes: BodyAxes) -> tuple[Observation, ...]:
         """Return the headings, where there are any."""
-        known = ~self.missing
+        known = np.logical_not(self.missing)
         if not known.any():
             return ()
         s = self.settings
