@@ -16,6 +16,7 @@ import time
 import tracemalloc
 import warnings
 from datetime import UTC, datetime
+from functools import cache
 from pathlib import Path
 
 import format_logs as logs
@@ -24,19 +25,7 @@ import format_writers as writers
 import numpy as np
 
 from factorgraph_dvl.errors import DataError
-from factorgraph_dvl.io.formats import (
-    ad2cp,
-    dvl_sentences,
-    nmea,
-    pd0,
-    pd4,
-    pd6,
-    rowe,
-    rtklib,
-    sbet,
-    water_linked,
-)
-from factorgraph_dvl.io.formats.vehicles import ardupilot, bags, nucleus, ulog
+from factorgraph_dvl.io.formats.catalogue import FORMATS
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 LIMIT = 1 << 16
@@ -52,7 +41,7 @@ def head(path, count=LIMIT):
     return path.read_bytes()[:count] if path.exists() else b""
 
 
-def seeds():
+def own_files():
     more = [
         writers.winriver_gga(0.4, "120953.25", 44.9, -66.9, 2, 9.3, -28.1),
         writers.winriver_text(
@@ -129,30 +118,24 @@ def seeds():
             b"2019/06/08 08:04:%02d.500" % (i % 60) + samples.VALUES + b"\n" for i in range(100)
         )
     )
+    recordings = (
+        "nenana_river/nenana_2010-09-23.PD0",
+        "adcp_raw/vmdas01_wh.ENX",
+        "adcp_raw/winriver01.PD0",
+    )
+    rowe = (samples.rowe_ensemble(i, writers.nmea("GPHDT,85.5,T")) for i in range(30))
     return {
-        "nmea": (nmea.read_nmea, [text]),
-        "pd0": (
-            pd0.read_pd0,
-            [
-                made,
-                head("nenana_river/nenana_2010-09-23.PD0"),
-                head("adcp_raw/vmdas01_wh.ENX"),
-                head("adcp_raw/winriver01.PD0"),
-            ],
-        ),
-        "ad2cp": (ad2cp.read_ad2cp, [own, echo]),
-        "pd4": (pd4.read_pd4, [pd4s]),
-        "pd6": (pd6.read_pd6, [samples.PD13.encode() * 40]),
-        "nortek": (dvl_sentences.read_nortek, [nortek]),
-        "cerulean": (dvl_sentences.read_cerulean, [cerulean]),
-        "water_linked": (water_linked.read_water_linked, [samples.SERIAL * 20, json_lines]),
-        "rowe": (
-            rowe.read_rowe,
-            [b"".join(samples.rowe_ensemble(i, writers.nmea("GPHDT,85.5,T")) for i in range(30))],
-        ),
-        "sbet": (sbet.read_sbet, [smooth]),
-        "smrmsg": (sbet.read_smrmsg, [smooth]),
-        "rtklib": (rtklib.read_rtklib, [pos]),
+        "nmea": [text],
+        "pd0": [made, *map(head, recordings)],
+        "ad2cp": [own, echo],
+        "pd4": [pd4s],
+        "pd6": [samples.PD13.encode() * 40],
+        "nortek": [nortek],
+        "cerulean": [cerulean],
+        "water-linked": [samples.SERIAL * 20, json_lines],
+        "rowe": [b"".join(rowe)],
+        "sbet": [smooth],
+        "rtklib": [pos],
     }
 
 
@@ -182,23 +165,28 @@ def database():
         return path.read_bytes()
 
 
-# Formats that libraries read, and what makes files of them, by the ending of their names.
-LIBRARIES = {
-    "bag": (
-        bags.FORMAT,
-        {
-            ".bag": lambda: logs.ros_1_bag(logs.sea_trial()),
-            ".mcap": lambda: logs.mcap(logs.sea_trial(), 4000),
-            ".db3": database,
-        },
-    ),
-    "ardupilot": (
-        ardupilot.FORMAT,
-        {".bin": lambda: logs.ardupilot_log(logs.ardupilot_trial())},
-    ),
-    "ulog": (ulog.FORMAT, {".ulg": lambda: logs.ulog(logs.ulog_trial())}),
-    "nucleus": (nucleus.FORMAT, {".nucleus": lambda: logs.nucleus_trial()}),
-}
+def of_libraries():
+    """Return files of the formats that libraries read: ending, and what makes the bytes."""
+    return {
+        "bag": [
+            (".bag", lambda: logs.ros_1_bag(logs.sea_trial())),
+            (".mcap", lambda: logs.mcap(logs.sea_trial(), 4000)),
+            (".db3", database),
+        ],
+        "ardupilot": [(".bin", lambda: logs.ardupilot_log(logs.ardupilot_trial()))],
+        "ulog": [(".ulg", lambda: logs.ulog(logs.ulog_trial()))],
+        "nucleus": [(".nucleus", logs.nucleus_trial)],
+    }
+
+
+OWN = [form.name for form in FORMATS if not form.module and form.family != "table"]
+LIBRARIES = [form.name for form in FORMATS if form.module]
+
+
+@cache
+def files():
+    """Return whole files, as (ending, bytes), by the names of the formats here."""
+    return {name: [("", data) for data in all_ if data] for name, all_ in own_files().items()}
 
 
 def limit(count):
@@ -206,29 +194,6 @@ def limit(count):
     resource.setrlimit(resource.RLIMIT_AS, (MOST_MEMORY, MOST_MEMORY))
     seconds = int(STARTING + SLOWEST * count)
     resource.setrlimit(resource.RLIMIT_CPU, (seconds, seconds))
-
-
-def run_library(name, count, seed):
-    """Return the numbers refused and with records, and the slowest, s, of `count` inputs."""
-    form, makers = LIBRARIES[name]
-    bases = [(ending, make()) for ending, make in makers.items()]
-    rng = np.random.default_rng([seed, *name.encode()])
-    refused, useful, slowest = 0, 0, 0.0
-    with tempfile.TemporaryDirectory() as folder:
-        for index in range(count):
-            ending, base = bases[index % len(bases)]
-            path = Path(folder) / f"log{ending}"
-            data = damage(base, rng) if index >= len(bases) else base
-            path.write_bytes(data)
-            start = time.process_time()
-            try:
-                form.share(path, data)
-                useful += any([len(batch.records) > 0 for batch in form.read(path, None)])
-            except DataError:
-                refused += 1
-            slowest = max(slowest, time.process_time() - start)
-            assert index >= len(bases) or useful == index + 1, f"{path} as written is not read"
-    return refused, useful, slowest
 
 
 def damage(data, rng):
@@ -263,61 +228,56 @@ def damage(data, rng):
     return bytes(data[:LIMIT])
 
 
-def consume(reader, data):
-    total = 0
-    for block in reader(data):
-        parts = (
-            [block.pings, block.water, block.vmdas] if isinstance(block, pd0.Block) else [block]
-        )
-        if isinstance(block, dict):
-            parts = list(block.values())
-        if isinstance(block, ad2cp.Ad2cp):
-            parts = [block.bottom]
-        total += sum(getattr(p, "nbytes", 0) for p in parts)
-    return total
+def run(name, count, seed):
+    """Feed the reader of a format `count` inputs, the whole files first.
 
-
-def run(name, reader, bases, count, seed):
-    """Return the number refused, the slowest, s, and the most memory, bytes, of `count` inputs."""
+    Returns
+    -------
+    dict
+        The numbers `refused` and `useful`, with records; the `slowest`, s; and for readers of
+        this package the largest traced memory of every twentieth, `most`, bytes.
+    """
+    (form,) = (form for form in FORMATS if form.name == name)
+    if form.module:
+        bases = [(ending, make()) for ending, make in of_libraries()[name]]
+    else:
+        bases = files()[name]
     rng = np.random.default_rng([seed, *name.encode()])
-    bases = [base for base in bases if base]
-    slowest, most, refused = 0.0, 0, 0
-    for index in range(count):
-        data = damage(bases[index % len(bases)], rng)
-        start = time.process_time()
-        is_measured = index % 20 == 0
-        if is_measured:
-            tracemalloc.start()
-        try:
-            consume(reader, data)
-        except DataError:
-            refused += 1
-        if is_measured:
-            most = max(most, tracemalloc.get_traced_memory()[1])
-            tracemalloc.stop()
-        else:
-            slowest = max(slowest, time.process_time() - start)
-    return refused, slowest, most
+    out = {"refused": 0, "useful": 0, "slowest": 0.0, "most": 0}
+    with tempfile.TemporaryDirectory() as folder:
+        for index in range(count):
+            ending, base = bases[index % len(bases)]
+            data = damage(base, rng) if index >= len(bases) else base
+            path = Path(folder) / f"log{ending}"
+            path.write_bytes(data)
+            is_measured = not form.module and index % 20 == 0
+            start = time.process_time()
+            if is_measured:
+                tracemalloc.start()
+            try:
+                form.share(path, data)
+                out["useful"] += any([len(batch.records) > 0 for batch in form.read(path, None)])
+            except DataError:
+                out["refused"] += 1
+            if is_measured:
+                out["most"] = max(out["most"], tracemalloc.get_traced_memory()[1])
+                tracemalloc.stop()
+            else:
+                out["slowest"] = max(out["slowest"], time.process_time() - start)
+            assert index >= len(bases) or out["useful"] == index + 1, f"{name} {index} as written"
+    return out
 
 
 def main():
     count, seed = int(sys.argv[1]), int(sys.argv[2]) if len(sys.argv) > 2 else 0
-    readers = seeds()
     warnings.simplefilter("error")
-    for name in sys.argv[3].split(",") if len(sys.argv) > 3 else readers:
+    for name in sys.argv[3].split(",") if len(sys.argv) > 3 else OWN:
         if name in LIBRARIES:
             limit(count)
-            refused, useful, slowest = run_library(name, count, seed)
-            print(
-                f"{name:13} {count} inputs, {refused} refused, {useful} with records, "
-                f"slowest {slowest * 1e3:.0f} ms",
-                flush=True,
-            )
-            continue
-        refused, slowest, most = run(name, *readers[name], count, seed)
+        found = run(name, count, seed)
         print(
-            f"{name:13} {count} inputs, {refused} refused, slowest {slowest * 1e3:.0f} ms, "
-            f"at most {most >> 10} kB",
+            f"{name:13} {count} inputs, {found['refused']} refused, {found['useful']} with "
+            f"records, slowest {found['slowest'] * 1e3:.0f} ms, at most {found['most'] >> 10} kB",
             flush=True,
         )
 

@@ -1,9 +1,8 @@
 """ROS bags: ROS 1, ROS 2 (MCAP, SQLite, folders of either), through rosbags.
 
 Frames are those that ROS states: the world is east, north, up, and a body forward, left, up
-(REP 103) unless the name of its frame ends in other axes, as `base_link_frd`; velocities in
-`nav_msgs/Odometry` are in the body (REP 105). Stamps are those of the messages, `received` the
-time of recording.
+(REP 103) unless the name of its frame ends in other axes, as `base_link_frd`. Stamps are those of
+the messages, `received` the time of recording.
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from factorgraph_dvl.errors import DataError
 from factorgraph_dvl.geometry.rotations import BodyAxes, rph_from_rotation
-from factorgraph_dvl.geometry.vectors import Array, rotate
+from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.io.formats.format import Batch, Format, Kind, empty
 from factorgraph_dvl.io.formats.framing import BLOCK, Records, map_file
 from factorgraph_dvl.io.formats.vehicles.damaged_bags import MCAP, ROS_1, Channel, whole_messages
@@ -43,6 +42,7 @@ _REP_103 = "{}: in axes forward, left, up, as REP 103 has it; the message does n
 _SAME = 1e-3
 TWIST = "geometry_msgs/msg/TwistWithCovarianceStamped"
 FIX = "sensor_msgs/msg/NavSatFix"
+IMU, ODOMETRY = "sensor_msgs/msg/Imu", "nav_msgs/msg/Odometry"
 # A message by its number in the file, and when it was recorded, s.
 Message = tuple[int, float, Any]
 
@@ -343,28 +343,21 @@ def _fix(topic: str, messages: list[Message]) -> Iterator[Batch]:
 
 
 def _odometry(topic: str, messages: list[Message]) -> Iterator[Batch]:
-    """`nav_msgs/Odometry`: attitude and velocity; positions are relative to an unknown origin."""
+    """`nav_msgs/Odometry`: attitude; positions are relative to an origin that is not stated."""
     bodies = [m for _, _, m in messages]
-    out = _stamped("ins", messages)
+    out = _stamped("attitude", messages)
     axes = _axes(bodies[0], "FLU")
-    nRb, rph = _orientations([m.pose.pose.orientation for m in bodies], axes)
+    _, rph = _orientations([m.pose.pose.orientation for m in bodies], axes)
     out["roll"], out["pitch"], out["heading"] = rph.T
-    out["velocity"] = rotate(nRb, _vectors([m.twist.twist.linear for m in bodies]))
     # Rotations are the second half of the 6 x 6 covariance.
     turned = np.array([m.pose.covariance for m in bodies], float).reshape(-1, 6, 6)[:, 3:, 3:]
-    out["attitude_std"] = _deviations(list(turned.reshape(-1, 9)))
-    yield Batch(
-        "ins",
-        out,
-        "utc",
-        topic,
-        axes,
-        notes=(
-            f"{topic}: positions are relative to an origin that the message does not state, "
-            "and were left out; its world is taken as east, north, up (REP 103)",
-            *_about_stamps(topic, messages),
-        ),
+    out["std"] = _deviations(list(turned.reshape(-1, 9)))
+    note = (
+        f"{topic}: attitude in a world of east, north, up (REP 103); positions are relative to an "
+        "origin that the message does not state, and velocities those of a filter: left out"
     )
+    notes = (note, *_about_axes(topic, axes), *_about_stamps(topic, messages))
+    yield Batch("attitude", out, "utc", topic, axes, notes=notes)
 
 
 def _twist(topic: str, messages: list[Message]) -> Iterator[Batch]:
@@ -428,9 +421,9 @@ def _pings(kind: Kind, topic: str, messages: list[Message]) -> Batch:
 
 
 CONVERTERS: dict[str, Callable[[str, list[Message]], Iterator[Batch]]] = {
-    "sensor_msgs/msg/Imu": _imu,
+    IMU: _imu,
     FIX: _fix,
-    "nav_msgs/msg/Odometry": _odometry,
+    ODOMETRY: _odometry,
     TWIST: _twist,
     DVL_TYPE: _dvl,
 }

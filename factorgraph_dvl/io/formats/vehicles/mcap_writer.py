@@ -1,4 +1,4 @@
-"""Records as ROS 2 messages in an MCAP file, which the reader of bags reads back."""
+"""Records as ROS 2 messages in an MCAP file."""
 
 from __future__ import annotations
 
@@ -14,10 +14,9 @@ from scipy.spatial.transform import Rotation
 from factorgraph_dvl.geometry.rotations import BodyAxes, rotation_from_rph
 from factorgraph_dvl.geometry.vectors import Array, rotate
 from factorgraph_dvl.io.formats.format import Batch
-from factorgraph_dvl.io.formats.vehicles.bags import DVL_TYPE, FIX, TWIST, typestore
+from factorgraph_dvl.io.formats.vehicles.bags import DVL_TYPE, FIX, IMU, ODOMETRY, TWIST, typestore
 from factorgraph_dvl.io.formats.vehicles.library import load
 
-IMU, ODOMETRY = "sensor_msgs/msg/Imu", "nav_msgs/msg/Odometry"
 # Topic, type, and for each message its time, s, and what its type is made of.
 Messages = tuple[str, str, Iterator[tuple[float, Any]]]
 # What the definitions have for a value that is not known.
