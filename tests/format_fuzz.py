@@ -126,6 +126,7 @@ def own_files():
     rowe = (samples.rowe_ensemble(i, writers.nmea("GPHDT,85.5,T")) for i in range(30))
     return {
         "nmea": [text],
+        "pixse": [samples.PIXSE * 40],
         "pd0": [made, *map(head, recordings)],
         "ad2cp": [own, echo],
         "pd4": [pd4s],

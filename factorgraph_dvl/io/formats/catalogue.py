@@ -7,6 +7,7 @@ from factorgraph_dvl.io.formats.normalised import (
     ad2cp,
     nmea,
     pd0,
+    pixse,
     trajectories,
     velocity_logs,
 )
@@ -19,6 +20,7 @@ FORMATS: tuple[Format, ...] = (
     *velocity_logs.FORMATS,
     *trajectories.FORMATS,
     *nmea.FORMATS,
+    *pixse.FORMATS,
     nucleus.FORMAT,
     bags.FORMAT,
     ardupilot.FORMAT,

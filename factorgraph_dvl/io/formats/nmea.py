@@ -47,6 +47,9 @@ KINDS = {
     "POSITI": _kind("lat lon altitude"),
     "SPEED_": _kind("vel_e vel_n vel_u"),
     "STDHRP": _kind("std_heading std_roll std_pitch"),
+    "STDPOS": _kind("std_lat std_lon std_height"),
+    # Public readers disagree on which of the first two is north.
+    "STDSPD": _kind("std_1 std_2 std_up"),
     "TIME__": _kind("second"),
 }
 
@@ -225,6 +228,8 @@ _DECODERS: dict[str, tuple[int, Callable[[list[bytes]], Row]]] = {
     "POSITI": (3, lambda f: (_angle(f[0]), _angle(f[1]), number(f[2]))),
     "SPEED_": (3, lambda f: (number(f[0]), number(f[1]), number(f[2]))),
     "STDHRP": (3, lambda f: (_angle(f[0]), _angle(f[1]), _angle(f[2]))),
+    "STDPOS": (3, lambda f: (number(f[0]), number(f[1]), number(f[2]))),
+    "STDSPD": (3, lambda f: (number(f[0]), number(f[1]), number(f[2]))),
     "TIME__": (1, lambda f: (second_of_day(f[0]),)),
 }
 ADDRESSES = rb"[A-OQ-Z][A-Z0-9](?:GGA|RMC|VTG|ZDA|GST|HDT)|PASHR|PRDID|PADCP|PIXSE"
