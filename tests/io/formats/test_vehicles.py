@@ -10,10 +10,8 @@ import pytest
 
 from factorgraph_dvl.errors import ConfigError, DataError
 from factorgraph_dvl.geometry.rotations import rotation_from_rph
-from factorgraph_dvl.io.formats.format import Batch
 from factorgraph_dvl.io.formats.vehicles import ardupilot, bags, nucleus, ulog
 from factorgraph_dvl.io.formats.vehicles.library import load
-from factorgraph_dvl.io.formats.velocities import INSTRUMENT
 
 DEG = np.pi / 180.0
 MODULES = (bags, ardupilot, ulog, nucleus)
@@ -386,51 +384,3 @@ def test_what_cannot_be_read_is_named(tmp_path, module, name, data, capfd):
 
 def test_what_is_loaded_is_a_module():
     assert load("json.decoder", "none").JSONDecoder
-
-
-def filled(kind, count=30, **values):
-    out = bags.empty(kind, count)
-    out["time"] = out["received"] = logs.START + 0.5 * np.arange(count)
-    out["at"] = np.arange(count)
-    for name, value in values.items():
-        out[name] = value
-    return out
-
-
-def test_records_written_as_mcap_are_read_back(tmp_path):
-    needs(bags)
-    from factorgraph_dvl.io.formats.vehicles.mcap_writer import write_mcap
-
-    rng = np.random.default_rng(3)
-    angles = {"roll": 0.02, "pitch": -0.03, "heading": 4.5}
-    velocity = rng.normal(size=(30, 3))
-    lost = velocity.copy()
-    lost[4] = np.nan
-    place = {"lat": 0.9, "lon": -0.05, "height": 40.0}
-    batches = [
-        Batch("imu", filled("imu", gyro=velocity, accel=-velocity), axes="RFU"),
-        Batch("attitude", filled("attitude", **angles, std=(0.01, 0.02, 0.03)), axes="FRD"),
-        Batch(
-            "fix",
-            filled("fix", **place, std=2.0, quality=1.0, velocity=velocity, velocity_std=0.1),
-        ),
-        Batch(
-            "dvl", filled("dvl", axes=INSTRUMENT, velocity=lost, std=0.01, range=12.0), axes="RFU"
-        ),
-        Batch("ins", filled("ins", **place, **angles, velocity=velocity), axes="RFU"),
-        Batch("depth", filled("depth", depth=1.0)),
-    ]
-    path = tmp_path / "trial.mcap"
-    assert write_mcap(path, batches) == ("depth",)
-    assert [entry.name for entry in tmp_path.iterdir()] == ["trial.mcap"]
-    found, first, _ = read(bags, path)
-    names = {"imu": "/imu", "attitude": "/attitude", "fix": "/gnss/fix", "dvl": "/dvl"}
-    for batch in batches[:4]:
-        key = batch.kind, names[batch.kind]
-        assert first[key].axes == batch.axes
-        for name in set(batch.records.dtype.names) - {"at"}:
-            np.testing.assert_allclose(
-                found[key][name], batch.records[name], atol=1e-9, err_msg=f"{key} {name}"
-            )
-    np.testing.assert_allclose(found["attitude", "/ins"]["heading"], 4.5)
-    np.testing.assert_allclose(found["fix", "/ins/position"]["lat"], 0.9)
