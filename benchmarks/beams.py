@@ -177,6 +177,9 @@ def as_instrument(trial: Trial, scales: int) -> Trial:
         misalignment_std_deg=WIDE,
         scale_error_std=std,
         lever_arm_std_m=(3.0, 3.0, 3.0),
+        # As of the beams: one clock, and a velocity without bias where they have none.
+        time_offset_std_s=0.0,
+        bias_std_m_s=(0.0, 0.0, 0.0),
     )
     others = tuple(aid for aid in trial.others if aid is not beams)
     return replace(trial, dvl=replace(dvl, settings=settings), others=others)

@@ -11,6 +11,7 @@ from __future__ import annotations
 import common
 
 from factorgraph_dvl.reproduce import PAPERS
+from factorgraph_dvl.reproduce.entry import counted
 from factorgraph_dvl.reproduce.page import summary_lines
 
 PAGE = "papers.md"
@@ -20,7 +21,7 @@ INTRODUCTION = """\
 {origin}
 
 Each numbered equation, table, figure and claim, where it is in this package, what was measured
-over {seeds} seeds, and what becomes of it: *reproduced* as printed, *corrected* with the argument
+over {seeds}, and what becomes of it: *reproduced* as printed, *corrected* with the argument
 in the measurement, or *not reproducible* with the reason. One command makes a publication's items
 with their figures:
 
@@ -37,7 +38,7 @@ Continuous integration runs all of them with one seed.
 def main() -> None:
     """Run all publications and write the page."""
     args = common.parse(common.parser(__doc__, seeds=2))
-    lines = INTRODUCTION.format(origin=args.origin, seeds=args.seeds).splitlines()
+    lines = INTRODUCTION.format(origin=args.origin, seeds=counted(args.seeds)).splitlines()
     verdicts: dict[str, int] = {}
     for paper in PAPERS.values():
         results = []

@@ -18,7 +18,7 @@ from factorgraph_dvl.report.figures.drawing import (
     new_grid,
     style,
 )
-from factorgraph_dvl.reproduce.entry import Entry, Paper, Result, judged, table
+from factorgraph_dvl.reproduce.entry import Entry, Paper, Result, counted, judged, table
 from factorgraph_dvl.simulation import parse_scenario, simulate_planar
 from factorgraph_dvl.trial import PlanarTrial
 
@@ -197,7 +197,7 @@ def _headline(seeds: int) -> Result:
             "",
             f"Converged: the error stays below {_CONVERGED:g} m within {_UPDATES} updates; four "
             "geometries, "
-            f"{seeds} seeds each. Table 1 with the paper's own settings is lost in the copy.",
+            f"{counted(seeds)} each. Table 1 with the paper's own settings is lost in the copy.",
             "",
             "From a start that is 50 m off, median updates of 2OB and 3OB (a run that never "
             "converged counts as the whole run), and what 3OB saves:",
@@ -235,7 +235,7 @@ def _initialised(seeds: int) -> Result:
             *table(["geometry", "4SV-2OB", "4SV-3OB"], rows),
             "",
             f"Two filters from the mirror pair of the ranges at {_TIMES[0]:g}, {_TIMES[1]:g} and "
-            f"{_TIMES[2]:g} s, {seeds} seeds; the one with the smaller innovations is kept.",
+            f"{_TIMES[2]:g} s, {counted(seeds)}; the one with the smaller innovations is kept.",
         ),
     )
 

@@ -91,6 +91,11 @@ def judged(printed: bool, corrected: bool = False) -> Verdict:
     return "corrected" if corrected else "not reproducible"
 
 
+def counted(seeds: int) -> str:
+    """Return a number of seeds in words, such as `1 seed`."""
+    return f"{seeds} seed{'s' * (seeds != 1)}"
+
+
 def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> tuple[str, ...]:
     """Return a table in Markdown."""
     lines = [header, ["---"] * len(header), *rows]

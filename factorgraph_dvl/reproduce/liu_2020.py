@@ -21,7 +21,7 @@ from factorgraph_dvl.geometry.rotations import (
 from factorgraph_dvl.geometry.units import ARCSEC, DEG, DEG_PER_HOUR
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.report.figures.drawing import ACCENT, DARK, GREY, new_figure, new_grid, style
-from factorgraph_dvl.reproduce.entry import Entry, Paper, Result, judged, scenario, table
+from factorgraph_dvl.reproduce.entry import Entry, Paper, Result, counted, judged, scenario, table
 from factorgraph_dvl.sensors.star import Star
 from factorgraph_dvl.simulation import simulate
 from factorgraph_dvl.solvers.batch import solve
@@ -285,7 +285,7 @@ def _equation_16(seeds: int) -> Result:
         (
             *table(["drift, °/h, after 300 s", "x", "y", "z"], rows),
             "",
-            f"Mean of {seeds} seeds; σ of one is {std[0]:.4f} °/h. `kalman --method liu-2020` "
+            f"Mean of {counted(seeds)}; σ of one is {std[0]:.4f} °/h. `kalman --method liu-2020` "
             "is the printed "
             "filter, `--method star` the corrected one.",
         ),
@@ -390,7 +390,8 @@ def _stable(seeds: int) -> Result:
     return Result(
         f"the bound after 20 s is {bound:.3f} °/h, {bound / _DRIFTS[0]:.1f}, "
         f"{bound / _DRIFTS[1]:.1f} and "
-        f"{bound / _DRIFTS[2]:.1f} times the drifts; RMS error of {seeds} seeds {spread:.3f} °/h",
+        f"{bound / _DRIFTS[2]:.1f} times the drifts; RMS error of {counted(seeds)} "
+        f"{spread:.3f} °/h",
         judged(bound < 0.05 * _DRIFTS[2]),
     )
 
@@ -417,7 +418,7 @@ def _accurate(seeds: int) -> Result:
         "after 50 s "
         f"{bound:.4f} °/h; all three within 5 % by chance in {100 * np.prod(chance):.1g} % of "
         "runs; RMS "
-        f"error of {seeds} seeds {_scatter(seeds, 50.0):.3f} °/h",
+        f"error of {counted(seeds)} {_scatter(seeds, 50.0):.3f} °/h",
         judged(bound < 0.05 * _DRIFTS[0]),
         (
             "The bound is the variance of the slope of a line through attitudes with white "

@@ -24,7 +24,7 @@ from factorgraph_dvl.report.figures.drawing import (
     new_grid,
     style,
 )
-from factorgraph_dvl.reproduce.entry import Entry, Paper, Result, judged, scenario, table
+from factorgraph_dvl.reproduce.entry import Entry, Paper, Result, counted, judged, scenario, table
 from factorgraph_dvl.reproduce.luo_2024_equations import EQUATIONS, TRUE, ZERO, scene_of, stack_of
 from factorgraph_dvl.simulation import simulate
 from factorgraph_dvl.solution import Solution
@@ -157,9 +157,8 @@ def _table_4(seeds: int) -> Result:
         (
             *table(header, rows),
             "",
-            f"Values of seed 0 at sway phases 0° and 90°; accuracies over {seeds} seeds, of the "
-            "factor "
-            "graph over one.",
+            "Values of seed 0 at sway phases 0° and 90°; accuracies over "
+            f"{counted(seeds)}, of the factor graph over one.",
         ),
     )
 

@@ -21,7 +21,7 @@ from factorgraph_dvl.report.figures.drawing import (
     new_grid,
     style,
 )
-from factorgraph_dvl.reproduce.entry import Entry, Paper, Result, judged, table
+from factorgraph_dvl.reproduce.entry import Entry, Paper, Result, counted, judged, table
 from factorgraph_dvl.sensors.dvl import BIAS_SPEC, MISALIGNMENT_SPEC, SCALE_SPEC
 from factorgraph_dvl.sensors.parameters import Parameter
 
@@ -319,7 +319,7 @@ def _large_angles(seeds: int) -> Result:
         (
             *table(["misalignment, deg", *(f"{m}: error, deg" for m in methods)], rows),
             "",
-            f"RMS over {seeds} seeds of the angle between estimate and truth; prior 30° about "
+            f"RMS over {counted(seeds)} of the angle between estimate and truth; prior 30° about "
             "each axis.",
         ),
     )

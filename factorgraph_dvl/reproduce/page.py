@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from factorgraph_dvl.report.figures.drawing import save_figures
-from factorgraph_dvl.reproduce.entry import Entry, Paper, Result, table
+from factorgraph_dvl.reproduce.entry import Entry, Paper, Result, counted, table
 
 
 def selected(paper: Paper, *, figure: int | None, table: int | None) -> tuple[Entry, ...]:
@@ -44,7 +44,7 @@ def write_page(
     folder : path-like
         Where the files go.
     """
-    lines = [f"# {paper.reference}", "", f"Over {seeds} seed{'s' * (seeds != 1)}.", ""]
+    lines = [f"# {paper.reference}", "", f"Over {counted(seeds)}.", ""]
     lines += summary_lines(results)
     for entry, result in results:
         name = label_of(entry.label).replace(", ", "-").replace(" ", "-").replace(".", "")
