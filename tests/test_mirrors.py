@@ -35,7 +35,7 @@ ELSEWHERE = {
     "io/formats/normalised/*": "io/importing",
     "io/formats/vehicles/*": "io/formats/test_vehicles.py",
     "io/formats/catalogue": "io/importing",
-    "io/formats/table": "io/formats",
+    "io/formats/*": "io/formats",
     "io/formats/pd0_navigation": "io/formats/test_pd0.py",
     "io/formats/sentences": "io/formats/test_nmea.py",
     "io/importing/*": "io/importing",
