@@ -23,7 +23,8 @@ Analyses: `crosscheck`, `observability`, `predict` (of a scenario from `load_sce
 `dead_reckon` (with `mounting_of` and an `AttitudeHistory`).
 
 Parts for a GTSAM script of one's own: `preintegrate`, `measured_nodes`, `sensor_factor`,
-`solved_problems` (whose `Problem.nonlinear_graph` is the whole problem), `LocalFrame`.
+`solved_problems` (whose `Problem.nonlinear_graph` is the whole problem), `LocalFrame`. For a
+sensor of one's own: `check_sensor`.
 
 Errors: `ConfigError`, `DataError` and `SolveError` are each a `FactorgraphDvlError`.
 """
@@ -45,6 +46,7 @@ if TYPE_CHECKING:
     )
     from factorgraph_dvl.geometry.earth import LocalFrame
     from factorgraph_dvl.graph.problem import Problem
+    from factorgraph_dvl.graph.sensor_check import check_sensor
     from factorgraph_dvl.graph.sensor_factor import measured_nodes, sensor_factor
     from factorgraph_dvl.imu.attitude_history import AttitudeHistory
     from factorgraph_dvl.imu.preintegration import preintegrate
@@ -89,6 +91,7 @@ _PUBLIC = {
     "Trajectory": "solution",
     "Trial": "trial",
     "Verdict": "sensors.finding",
+    "check_sensor": "graph.sensor_check",
     "crosscheck": "analysis.comparison.crosscheck",
     "dead_reckon": "analysis.dead_reckoning.integration",
     "kalman": "baselines.calibration",
@@ -132,6 +135,7 @@ __all__ = [
     "Trajectory",
     "Trial",
     "Verdict",
+    "check_sensor",
     "crosscheck",
     "dead_reckon",
     "kalman",
