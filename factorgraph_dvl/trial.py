@@ -263,8 +263,8 @@ class Trial:
                 "the trial has no IMU, which this needs",
                 where="trial.yaml",
                 expected="an imu section",
-                hint="`inspect`, `solve`, `kalman` and `crosscheck` take trials with `ins` or "
-                "`attitude` in its place",
+                hint="`inspect`, `solve`, `observability`, `deadreckon`, `crosscheck` and some "
+                "methods of `kalman` take `ins` or `attitude` in its place",
             )
         return self.imu
 

@@ -29,7 +29,7 @@ from factorgraph_dvl.cli.verdict import end_with
 
 if TYPE_CHECKING:
     from factorgraph_dvl.analysis.dead_reckoning.before_after import BeforeAfter
-    from factorgraph_dvl.imu.attitude_history import AttitudeHistory
+    from factorgraph_dvl.analysis.dead_reckoning.integration import OrientationAt
     from factorgraph_dvl.sensors.finding import Finding
     from factorgraph_dvl.trial import Trial
 
@@ -49,8 +49,8 @@ def deadreckon(
         str | None,
         typer.Option(
             metavar="SOURCE",
-            help="Source of the attitude: sins (default), reference (default without GNSS), or a "
-            "solution folder.",
+            help="Source of the attitude: sins (default), reference (default without GNSS), record "
+            "(of `attitude` or `ins`, default without IMU), or a solution folder.",
         ),
     ] = None,
     align: Annotated[
@@ -95,7 +95,7 @@ def deadreckon(
             progress("attitude")
             source, findings = _attitude(trial, attitude, align, anyway=anyway)
             progress("dead reckoning")
-            result = before_after(trial, values, source.at)
+            result = before_after(trial, values, source)
         progress("write")
         with new_folder(out, force=force, owned=OWNED) as folder:
             for name, run in (
@@ -141,12 +141,14 @@ def deadreckon(
 
 
 def _default_attitude(trial: Trial) -> str:
+    if trial.imu is None:
+        return "record"
     return "reference" if trial.gnss is None and trial.reference is not None else "sins"
 
 
 def _attitude(
     trial: Trial, source: str, align: float | None, *, anyway: bool
-) -> tuple[AttitudeHistory, tuple[Finding, ...]]:
+) -> tuple[OrientationAt, tuple[Finding, ...]]:
     """Return the attitude for the track, and findings about it."""
     import numpy as np
 
@@ -154,20 +156,25 @@ def _attitude(
     from factorgraph_dvl.geometry.units import DEG_PER_HOUR
     from factorgraph_dvl.imu.attitude_history import AttitudeHistory
 
+    if source == "record" and trial.attitude is not None:
+        from factorgraph_dvl.imu.attitude_record import orientations
+
+        return orientations(trial.attitude, trial.body_axes), ()
     if align is not None and source != "sins":
         raise ConfigError("applies only to --attitude sins", where="--align")
     if source == "sins":
         from factorgraph_dvl.baselines import sins
 
         motion, bias, findings = sins(trial, align_s=align)
-        return AttitudeHistory(trial.inertial, motion, trial.body_axes, bias), findings
+        return AttitudeHistory(trial.inertial, motion, trial.body_axes, bias).at, findings
     if source == "reference":
         if trial.reference is None:
             raise ConfigError(
                 "the trial has no reference", where="--attitude reference",
                 expected="sins, or a solution folder",
             )  # fmt: skip
-        return AttitudeHistory(trial.inertial, trial.reference, trial.body_axes, np.zeros(3)), ()
+        history = AttitudeHistory(trial.inertial, trial.reference, trial.body_axes, np.zeros(3))
+        return history.at, ()
     from factorgraph_dvl.io.calibration_file import check_verdict
     from factorgraph_dvl.io.solution_folder import load_solution
 
@@ -175,7 +182,7 @@ def _attitude(
         raise ConfigError(
             f"there is no folder {source}",
             where="--attitude",
-            expected="sins, reference, or a solution folder",
+            expected="sins, reference, record, or a solution folder",
         )
     solution = load_solution(source)
     check_verdict(solution, source, anyway=anyway)
@@ -185,7 +192,8 @@ def _attitude(
     bias = np.zeros(3)
     if "gyro_bias_deg_h" in names:
         bias = solution.estimate("gyro_bias_deg_h").value * DEG_PER_HOUR
-    return AttitudeHistory(trial.inertial, solution.trajectory, solution.body_axes, bias), ()
+    history = AttitudeHistory(trial.inertial, solution.trajectory, solution.body_axes, bias)
+    return history.at, ()
 
 
 def _draw(trial: Trial, result: BeforeAfter, folder: Path) -> None:

@@ -82,6 +82,11 @@ def _view(
     # The solver is slow to import: do so after the checks of the input.
     from factorgraph_dvl.solvers.information_along_trial import solve_with_history
 
+    if trial.imu is None:
+        from factorgraph_dvl.solvers.batch import solve
+
+        solution = solve(trial, anyway=anyway, progress=progress)
+        return solution, look(solution, given=given)
     solution, history = solve_with_history(trial, anyway=anyway, progress=progress)
     return solution, look(solution, trial=trial, history=history, given=given)
 

@@ -93,6 +93,9 @@ class DvlSettings(ClockSection, frozen=True, kw_only=True):
     scale_walk_std_sqrt_h: NonNegative = 0.0
     reference: Literal["bottom", "water"] = "bottom"
     current_std_m_s: tuple[NonNegative, NonNegative] = (0.5, 0.5)
+    # Of the current as a process about its mean; estimated where they are not stated.
+    current_variation_std_m_s: NonNegative | UnsetType = UNSET
+    current_correlation_time_s: Positive | UnsetType = UNSET
 
     @property
     def left_out(self) -> tuple[str, ...]:

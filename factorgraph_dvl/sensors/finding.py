@@ -427,6 +427,13 @@ class Code(StrEnum):
         "Check lever arm, clock, units and axes; do not use the values.",
         "error",
     )
+    HEADING_ERROR = (
+        "heading_error",
+        "Without an IMU, misalignment and error of the heading show only together.",
+        "A DVL that is turned and a compass that is off make the same velocities.",
+        "Read the misalignment with the heading's own error, or relative to its mean.",
+        "note",
+    )
     FAR_FROM_PRIOR = (
         "far_from_prior",
         "A value is far outside its prior.",

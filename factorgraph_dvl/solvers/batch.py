@@ -29,6 +29,9 @@ from factorgraph_dvl.solvers.minima import (
     distinct,
     evidence_against,
 )
+from factorgraph_dvl.solvers.motion_preparation import prepare_motion
+from factorgraph_dvl.solvers.motion_smoother import smooth_motion
+from factorgraph_dvl.solvers.motion_summary import summarise_motion
 from factorgraph_dvl.solvers.preparation import Preparation, prepare
 from factorgraph_dvl.solvers.rounds import SettledMinimum, settle
 from factorgraph_dvl.solvers.state_times import STATE_INTERVAL
@@ -85,7 +88,13 @@ def solve(
     _check_above_zero("state_interval_s", state_interval_s)
     errors = accepted_errors(survey(trial), anyway=anyway)
     with explained(errors):
-        found = _most_probable(trial, rate_hz, state_interval_s, progress or _silent)
+        report = progress or _silent
+        if trial.imu is None:
+            found = summarise_motion(
+                trial, smooth_motion(prepare_motion(trial), report), rate_hz=rate_hz
+            )
+        else:
+            found = _most_probable(trial, rate_hz, state_interval_s, report)
     return found.with_findings(errors)
 
 

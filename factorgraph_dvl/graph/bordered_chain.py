@@ -1,0 +1,217 @@
+"""Normal equations of a chain: block-tridiagonal in its nodes, with constants as a border."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import cho_solve_banded, cholesky_banded
+
+from factorgraph_dvl.geometry.vectors import Array
+
+
+@dataclass(eq=False)
+class NormalEquations:
+    """Information on K nodes of n states and c constants, and a gradient.
+
+    Parameters
+    ----------
+    nodes : int
+        K.
+    size : int
+        n.
+    constants : int
+        c.
+
+    Attributes
+    ----------
+    diagonal, off : ndarray, shape (K, n, n) or (K - 1, n, n)
+        Information on each node, and between a node and the next.
+    border, corner : ndarray, shape (K, n, c) or (c, c)
+        Information between nodes and constants, and on the constants.
+    node_gradient, constant_gradient : ndarray, shape (K, n) or (c,)
+        Of the cost.
+    """
+
+    nodes: int
+    size: int
+    constants: int
+
+    def __post_init__(self) -> None:
+        k, n, c = self.nodes, self.size, self.constants
+        self.diagonal, self.off = np.zeros((k, n, n)), np.zeros((k - 1, n, n))
+        self.border, self.corner = np.zeros((k, n, c)), np.zeros((c, c))
+        self.node_gradient, self.constant_gradient = np.zeros((k, n)), np.zeros(c)
+
+    def add(
+        self, node: np.ndarray, before: Array, after: Array, constants: Array, residual: Array
+    ) -> None:
+        """Add rows of unit noise.
+
+        Parameters
+        ----------
+        node : ndarray of int, shape (M,)
+            Nodes before the rows, in increasing order.
+        before, after : ndarray, shape (M, d, n)
+            Derivatives with respect to that node and the next.
+        constants : ndarray, shape (M, d, c)
+            Derivatives with respect to the constants.
+        residual : ndarray, shape (M, d)
+            Residuals.
+        """
+        if not node.size:
+            return
+        used, starts = np.unique(node, return_index=True)
+
+        def by_node(items: Array) -> Array:
+            return np.asarray(np.add.reduceat(items, starts, axis=0))
+
+        before_t, after_t = before.transpose(0, 2, 1), after.transpose(0, 2, 1)
+        column = residual[:, :, None]
+        self.diagonal[used] += by_node(before_t @ before)
+        self.diagonal[used + 1] += by_node(after_t @ after)
+        self.off[used] += by_node(before_t @ after)
+        self.border[used] += by_node(before_t @ constants)
+        self.border[used + 1] += by_node(after_t @ constants)
+        self.node_gradient[used] += by_node(before_t @ column)[:, :, 0]
+        self.node_gradient[used + 1] += by_node(after_t @ column)[:, :, 0]
+        flat = constants.reshape(-1, self.constants)
+        self.corner += flat.T @ flat
+        self.constant_gradient += flat.T @ residual.ravel()
+
+    def factorise(self) -> Factorisation:
+        """Return the Cholesky factorisation.
+
+        Raises
+        ------
+        numpy.linalg.LinAlgError
+            If the information is not positive definite.
+        """
+        return Factorisation(self)
+
+
+class Factorisation:
+    """Cholesky factorisation of normal equations.
+
+    Parameters
+    ----------
+    equations : NormalEquations
+        What is factorised.
+
+    Attributes
+    ----------
+    influence : ndarray, shape (K, n, c)
+        A⁻¹ B, with A the information on the nodes and B the border.
+    constants : ndarray, shape (c, c)
+        Covariance of the constants.
+    """
+
+    def __init__(self, equations: NormalEquations) -> None:
+        k, n, c = equations.nodes, equations.size, equations.constants
+        self._equations = equations
+        self._factor = cholesky_banded(
+            _banded(equations.diagonal, equations.off), check_finite=False
+        )
+        border = equations.border.reshape(k * n, c)
+        self.influence = self.solve_nodes(equations.border)
+        schur = equations.corner - border.T @ self.influence.reshape(k * n, c)
+        self._root = np.linalg.cholesky(0.5 * (schur + schur.T))
+        inverse = np.linalg.inv(self._root)
+        self.constants = np.asarray(inverse.T @ inverse)
+
+    def solve_nodes(self, right: Array) -> Array:
+        """Return A⁻¹ times right-hand sides (K, n, m), the constants exact."""
+        k, n = right.shape[:2]
+        out = cho_solve_banded((self._factor, False), right.reshape(k * n, -1), check_finite=False)
+        return np.asarray(out.reshape(right.shape))
+
+    def step(self) -> tuple[Array, Array]:
+        """Return the Gauss-Newton step of nodes (K, n) and constants (c,)."""
+        e = self._equations
+        right = np.einsum("kic,ki->c", self.influence, e.node_gradient) - e.constant_gradient
+        constants = self.constants @ right
+        nodes = -self.solve_nodes(e.node_gradient[:, :, None])[:, :, 0]
+        return nodes - self.influence @ constants, constants
+
+    @property
+    def log_determinant(self) -> float:
+        """Logarithm of the determinant of the information."""
+        return 2.0 * float(np.sum(np.log(self._factor[-1])) + np.sum(np.log(np.diag(self._root))))
+
+    def covariances(self) -> Covariances:
+        """Return the covariances of neighbouring nodes and of the constants.
+
+        Of a block-tridiagonal A the blocks of the inverse follow from the ends: with the Schur
+        complements F from the front, P_KK = F_K⁻¹, and backwards with G = F_k⁻¹ A_k,k+1
+
+            P_k,k+1 = -G P_k+1,k+1,    P_kk = F_k⁻¹ + G P_k+1,k+1 Gᵀ.
+        """
+        e = self._equations
+        inverse = np.empty_like(e.diagonal)
+        inverse[0] = np.linalg.inv(e.diagonal[0])
+        for k in range(1, e.nodes):
+            before = e.off[k - 1]
+            inverse[k] = np.linalg.inv(e.diagonal[k] - before.T @ inverse[k - 1] @ before)
+        gain = inverse[:-1] @ e.off
+        own = inverse
+        for k in range(e.nodes - 2, -1, -1):
+            own[k] += gain[k] @ own[k + 1] @ gain[k].T
+        across = -gain @ own[1:]
+        shared = self.influence @ self.constants
+        return Covariances(
+            nodes=own + shared @ self.influence.transpose(0, 2, 1),
+            across=across + shared[:-1] @ self.influence[1:].transpose(0, 2, 1),
+            with_constants=-shared,
+            constants=self.constants,
+        )
+
+
+@dataclass(frozen=True)
+class Covariances:
+    """Covariances of a chain and its constants.
+
+    Parameters
+    ----------
+    nodes : ndarray, shape (K, n, n)
+        Of each node.
+    across : ndarray, shape (K - 1, n, n)
+        Of a node with the next.
+    with_constants : ndarray, shape (K, n, c)
+        Of each node with the constants.
+    constants : ndarray, shape (c, c)
+        Of the constants.
+    """
+
+    nodes: Array
+    across: Array
+    with_constants: Array
+    constants: Array
+
+    def around(self, node: np.ndarray) -> Array:
+        """Return the covariance of nodes (M,), the next ones and the constants, side by side."""
+        n, c = self.nodes.shape[1], self.constants.shape[0]
+        out = np.empty((node.size, 2 * n + c, 2 * n + c))
+        first, second, last = slice(0, n), slice(n, 2 * n), slice(2 * n, None)
+        across = self.across[node]
+        out[:, first, first], out[:, second, second] = self.nodes[node], self.nodes[node + 1]
+        out[:, first, second], out[:, second, first] = across, across.transpose(0, 2, 1)
+        for rows, shared in (
+            (first, self.with_constants[node]),
+            (second, self.with_constants[node + 1]),
+        ):
+            out[:, rows, last], out[:, last, rows] = shared, shared.transpose(0, 2, 1)
+        out[:, last, last] = self.constants
+        return out
+
+
+def _banded(diagonal: Array, off: Array) -> Array:
+    """Return a symmetric block-tridiagonal matrix in SciPy's upper banded form."""
+    n, size = diagonal.shape[:2]
+    above = 2 * size - 1
+    out = np.zeros((above + 1, n * size))
+    for i in range(size):
+        for j in range(size):
+            if j >= i:
+                out[above + i - j, j::size] = diagonal[:, i, j]
+            out[above - size + i - j, size + j :: size] = off[:, i, j]
+    return out

@@ -1,0 +1,229 @@
+"""Motion prior of a chain without IMU: white acceleration, and processes of errors beside it.
+
+Without an IMU nothing carries the motion from one state to the next but the inertia of the
+vessel: its acceleration is taken as white noise (Barfoot, Tong and Särkkä, Batch continuous-time
+trajectory estimation as exactly sparse Gaussian process regression, RSS 2014; Anderson and
+Barfoot, Full STEAM ahead, IROS 2015), and the motion between two states follows from both, with a
+variance.
+Errors that last, of attitudes, fixes and the current, are Gauss-Markov processes of unit variance.
+
+Attitude is no state. A gyrocompass or AHRS says how the body points to a fraction of a degree at
+once, and no prior of angular acceleration improves on that. What is not known is its error, which
+is slow: that is a process, or a constant with a prior, and turns the velocity that a DVL sees. So
+every equation is linear in the states, a ship needs no start values of attitude, and twelve hours
+take seconds; as a state, attitude would cost a Lie-group prior for the same result. Rates that
+turn lever arms come from the record of attitude, with a standard deviation.
+
+Accelerations of different spans, as of legs and turns, have densities of their own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from factorgraph_dvl.geometry.vectors import Array
+
+# Position and velocity.
+_MOTION = 6
+# Standard deviations of the first state, m and m/s. Chosen: they only keep the chain regular.
+_FREE = np.repeat([1e5, 1e2], 3)
+
+
+@dataclass(frozen=True)
+class Process:
+    """A first-order Gauss-Markov process; its states have unit variance.
+
+    Parameters
+    ----------
+    name : str
+        What it is an error of.
+    sigma : ndarray, shape (d,)
+        Standard deviations of the components, SI.
+    tau : float
+        Correlation time, s.
+    """
+
+    name: str
+    sigma: Array
+    tau: float
+
+
+@dataclass(frozen=True)
+class Interpolation:
+    """State at M times, x = L x_k + U x_k+1 + noise of variance V.
+
+    Parameters
+    ----------
+    node : ndarray of int, shape (M,)
+        K.
+    before, after : ndarray, shape (M, n, n)
+        L and U.
+    acceleration : ndarray, shape (M, 3, 12)
+        Derivative of the velocity in time by positions and velocities of both nodes.
+    variance : ndarray, shape (M, n, n)
+        V.
+    """
+
+    node: np.ndarray
+    before: Array
+    after: Array
+    acceleration: Array
+    variance: Array
+
+
+@dataclass(frozen=True)
+class MotionChain:
+    """States at K times: position, velocity, then the processes one after the other.
+
+    Parameters
+    ----------
+    time : ndarray, shape (K,), s
+        Of the nodes.
+    density : ndarray, shape (K - 1, 3)
+        Power spectral density of the acceleration east, north, up between the nodes, m²/s³.
+    processes : tuple of Process
+        Errors that last.
+    """
+
+    time: Array
+    density: Array
+    processes: tuple[Process, ...] = ()
+
+    @property
+    def size(self) -> int:
+        """Number of states of a node."""
+        return _MOTION + sum(p.sigma.size for p in self.processes)
+
+    def place(self, name: str) -> slice:
+        """Return the states of a process."""
+        at = _MOTION
+        for p in self.processes:
+            if p.name == name:
+                return slice(at, at + p.sigma.size)
+            at += p.sigma.size
+        raise KeyError(name)
+
+    def has(self, name: str) -> bool:
+        """Whether there is a process of that name."""
+        return any(p.name == name for p in self.processes)
+
+    def transitions(self) -> tuple[Array, Array]:
+        """Return rows of unit noise, W (x_k+1 - F x_k): W F with its sign, and W, (K - 1, n, n).
+
+        Of the acceleration: F = [1 dt; 0 1], Q = q [dt³/3 dt²/2; dt²/2 dt]; of a process:
+        F = exp(-dt / tau), Q = 1 - F².
+        """
+        dt = np.diff(self.time)
+        n = self.size
+        before, after = np.zeros((dt.size, n, n)), np.zeros((dt.size, n, n))
+        root = 1.0 / np.sqrt(self.density)
+        # Inverse of the Cholesky factor of Q / q.
+        t = dt[:, None]
+        w_pp, w_vp = np.sqrt(3.0 / t**3), -3.0 / np.sqrt(t**3)
+        w_vv = 2.0 / np.sqrt(t)
+        for i in range(3):
+            p, v = i, 3 + i
+            r = root[:, i]
+            after[:, p, p] = r * w_pp[:, 0]
+            after[:, v, p] = r * w_vp[:, 0]
+            after[:, v, v] = r * w_vv[:, 0]
+            before[:, p, p] = -after[:, p, p]
+            before[:, p, v] = -after[:, p, p] * dt
+            before[:, v, p] = -after[:, v, p]
+            before[:, v, v] = -after[:, v, p] * dt - after[:, v, v]
+        at = _MOTION
+        for process in self.processes:
+            phi = np.exp(-dt / process.tau)
+            weight = 1.0 / np.sqrt(-np.expm1(-2.0 * dt / process.tau))
+            for i in range(at, at + process.sigma.size):
+                after[:, i, i], before[:, i, i] = weight, -phi * weight
+            at += process.sigma.size
+        return before, after
+
+    def first(self) -> Array:
+        """Return the inverse standard deviations of the first node, (n,)."""
+        return np.concatenate([1.0 / _FREE, np.ones(self.size - _MOTION)])
+
+    def log_determinant(self) -> float:
+        """Return the logarithm of the determinant of the prior information."""
+        _, after = self.transitions()
+        diagonal = np.diagonal(after, axis1=1, axis2=2)
+        return 2.0 * float(np.sum(np.log(diagonal)) + np.sum(np.log(self.first())))
+
+    def covers(self, time: Array) -> np.ndarray:
+        """Whether times (M,) lie between the first node and the last."""
+        return np.asarray((time >= self.time[0]) & (time <= self.time[-1]))
+
+    def at(self, time: Array) -> Interpolation:
+        """Return the interpolation to times (M,), s.
+
+        Positions are cubic Hermite polynomials of the nodes, and velocities their derivatives:
+        the mean of a white-acceleration prior between two states.
+        """
+        k = np.clip(np.searchsorted(self.time, time, side="right") - 1, 0, self.time.size - 2)
+        span = self.time[k + 1] - self.time[k]
+        tau = np.clip(time - self.time[k], 0.0, span)
+        m, n = time.size, self.size
+        s = tau / span
+        before, after = np.zeros((m, n, n)), np.zeros((m, n, n))
+        variance = np.zeros((m, n, n))
+        acceleration = np.zeros((m, 3, 2 * _MOTION))
+        # Variance between known ends, over q.
+        rest = span - tau
+        v_pp = tau**3 * rest**3 / (3.0 * span**3)
+        v_pv = tau**2 * rest**2 * (rest - tau) / (2.0 * span**3)
+        v_vv = tau * rest * (span**2 - 3.0 * tau * rest) / span**3
+        for i in range(3):
+            p, v = i, 3 + i
+            before[:, p, p], before[:, p, v] = (
+                1.0 - 3.0 * s**2 + 2.0 * s**3,
+                span * s * (1 - s) ** 2,
+            )
+            after[:, p, p], after[:, p, v] = 3.0 * s**2 - 2.0 * s**3, -span * s**2 * (1.0 - s)
+            before[:, v, p], before[:, v, v] = 6.0 * (s**2 - s) / span, 3 * s**2 - 4 * s + 1.0
+            after[:, v, p], after[:, v, v] = 6.0 * (s - s**2) / span, 3.0 * s**2 - 2.0 * s
+            acceleration[:, i, p] = (12.0 * s - 6.0) / span**2
+            acceleration[:, i, v] = (6.0 * s - 4.0) / span
+            acceleration[:, i, _MOTION + p] = (6.0 - 12.0 * s) / span**2
+            acceleration[:, i, _MOTION + v] = (6.0 * s - 2.0) / span
+            q = self.density[k, i]
+            variance[:, p, p], variance[:, v, v] = q * v_pp, q * v_vv
+            variance[:, p, v] = variance[:, v, p] = q * v_pv
+        at = _MOTION
+        for process in self.processes:
+            whole = np.sinh(span / process.tau)
+            left = np.sinh(rest / process.tau) / whole
+            right = np.sinh(tau / process.tau) / whole
+            missing = (
+                np.expm1(-2.0 * tau / process.tau)
+                * np.expm1(-2.0 * rest / process.tau)
+                / -np.expm1(-2.0 * span / process.tau)
+            )
+            for i in range(at, at + process.sigma.size):
+                before[:, i, i], after[:, i, i], variance[:, i, i] = left, right, missing
+            at += process.sigma.size
+        return Interpolation(k, before, after, acceleration, variance)
+
+
+def node_times(time: Array, turning: Sequence[bool] | np.ndarray, interval: float) -> Array:
+    """Return times of nodes: some of given times (M,), all of them where the body turns.
+
+    Parameters
+    ----------
+    time : ndarray, shape (M,), s
+        Where nodes may be, in order.
+    turning : sequence of bool
+        Whether the body turns there.
+    interval : float
+        Least time between nodes where it does not, s.
+    """
+    kept = [0]
+    for i in range(1, time.size):
+        if turning[i] or time[i] - time[kept[-1]] >= interval:
+            kept.append(i)
+    if kept[-1] != time.size - 1:
+        kept.append(time.size - 1)
+    return np.asarray(time[kept])

@@ -1,0 +1,460 @@
+"""A trial without IMU as a least-squares problem: a motion prior, and sensors in bulk."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from factorgraph_dvl.geometry.earth import LocalFrame
+from factorgraph_dvl.geometry.rotations import exp_so3
+from factorgraph_dvl.geometry.vectors import Array, rotate
+from factorgraph_dvl.graph.bordered_chain import Covariances, NormalEquations
+from factorgraph_dvl.graph.clocks import linearized, true_time
+from factorgraph_dvl.graph.motion_chain import Interpolation, MotionChain
+from factorgraph_dvl.graph.priors import local_coordinates, prior_mean, prior_root
+from factorgraph_dvl.imu.attitude_record import AttitudeRecord, BodyAttitude, level_axes
+from factorgraph_dvl.sensors.attitude import heading_error
+from factorgraph_dvl.sensors.parameters import Parameter
+from factorgraph_dvl.sensors.protocol import Linearization, Motion, Observation
+
+# Names of the processes that are no error of a measurement.
+ATTITUDE = "attitude"
+CURRENT = "current"
+# Rows whose leverage is computed at once. Chosen: some 100 MB.
+_CHUNK = 4000
+
+
+@dataclass(frozen=True)
+class Seen:
+    """An observation at one set of states.
+
+    Parameters
+    ----------
+    motion : Motion
+        At the true times.
+    time : ndarray, shape (M,), s
+        True times.
+    interpolation : Interpolation
+        Of the states.
+    body : BodyAttitude
+        Attitude, as it was measured and without its errors.
+    residual : ndarray, shape (M, d)
+        Predicted minus measured.
+    by_state, by_parameters : ndarray, shape (M, d, n) or (M, d, c)
+        Derivatives.
+    by_rph : ndarray, shape (M, d, 3)
+        Derivatives by an error of roll, pitch, heading.
+    covered : ndarray of bool, shape (M,)
+        Whether motion and attitude are known.
+    """
+
+    motion: Motion
+    time: Array
+    interpolation: Interpolation
+    body: BodyAttitude
+    residual: Array
+    by_state: Array
+    by_parameters: Array
+    by_rph: Array
+    covered: np.ndarray
+
+
+@dataclass(frozen=True)
+class MotionEvaluation:
+    """States, parameters, and what is observed there.
+
+    Parameters
+    ----------
+    states : ndarray, shape (K, n)
+        Of the nodes.
+    parameters : dict of str to ndarray
+        Values by name, rotations as matrices.
+    seen : tuple of Seen
+        By observation.
+    """
+
+    states: Array
+    parameters: dict[str, Array]
+    seen: tuple[Seen, ...]
+
+
+@dataclass(frozen=True)
+class WhitenedRows:
+    """Rows of unit noise: of an observation, or of the prior of the motion.
+
+    Parameters
+    ----------
+    source : str
+        Where the noise comes from.
+    node : ndarray of int, shape (M,)
+        Node before.
+    before, after, constants : ndarray, shape (M, d, n) or (M, d, c)
+        Derivatives.
+    residual : ndarray, shape (M, d)
+        Residuals.
+    """
+
+    source: str
+    node: np.ndarray
+    before: Array
+    after: Array
+    constants: Array
+    residual: Array
+
+    def leverage(self, covariances: Covariances) -> Array:
+        """Return the variance of the rows' predictions, (M, d)."""
+        out = np.empty(self.residual.shape)
+        for a in range(0, self.node.size, _CHUNK):
+            rows = slice(a, a + _CHUNK)
+            J = np.concatenate([self.before[rows], self.after[rows], self.constants[rows]], axis=2)
+            out[rows] = np.sum((J @ covariances.around(self.node[rows])) * J, axis=2)
+        return out
+
+
+class MotionProblem:
+    """Motion prior, attitude record and measurements: what is minimised without an IMU.
+
+    Parameters
+    ----------
+    chain : MotionChain
+        Prior of the motion.
+    frame : LocalFrame
+        Tangent frame n.
+    attitude : AttitudeRecord
+        How the body points.
+    observations : sequence of Observation
+        Measurements.
+    parameters : sequence of Parameter
+        Calibration parameters, fixed ones included.
+    start : ndarray, shape (K, n)
+        States near which the solution is; the prior of the first is loose about it.
+
+    Attributes
+    ----------
+    noise_factors : mapping of str to ndarray
+        By label, factors (d,) on stated standard deviations.
+    rejected : mapping of str to ndarray
+        By label, whether measurements (M,) are left out.
+    total_sigma : list of ndarray
+        Standard deviations (M, d) of the residuals by observation, infinite where not used: noise
+        of the sensor and the attitude, and the motion between states.
+    """
+
+    def __init__(
+        self,
+        chain: MotionChain,
+        frame: LocalFrame,
+        attitude: AttitudeRecord,
+        observations: Sequence[Observation],
+        parameters: Sequence[Parameter],
+        start: Array,
+    ) -> None:
+        self.chain, self.frame, self.attitude = chain, frame, attitude
+        self.observations = tuple(observations)
+        self.all_parameters = tuple(parameters)
+        self.parameters = tuple(p for p in parameters if p.estimated)
+        self.zero = 0.5 * float(chain.time[0] + chain.time[-1])
+        self.noise_factors: Mapping[str, Array] = {}
+        self.rejected: Mapping[str, np.ndarray] = {}
+        self._start = start
+        self._nRl = level_axes(frame, start[:, :3])
+        self.total_sigma: list[Array] = []
+        self._whitening: list[Array] = []
+        self._log_weights = 0.0
+        # A parameter that no measurement names belongs to the attitude.
+        self._of_attitude = {p.name for p in attitude.sensor.parameters()}
+
+    @cached_property
+    def columns(self) -> dict[str, slice]:
+        """Place of every estimated parameter among all of them."""
+        ends = np.cumsum([p.mean.size for p in self.parameters])
+        return {
+            p.name: slice(int(end) - p.mean.size, int(end))
+            for p, end in zip(self.parameters, ends, strict=True)
+        }
+
+    @cached_property
+    def constants(self) -> int:
+        """Number of estimated components."""
+        return sum(p.mean.size for p in self.parameters)
+
+    @cached_property
+    def prior_root(self) -> Array:
+        """Square root S of the prior covariance S Sᵀ of the parameters, SI."""
+        return prior_root(self.parameters)
+
+    def prior_values(self) -> dict[str, Array]:
+        """Return the prior means of all parameters, rotations as matrices."""
+        return {p.name: prior_mean(p) for p in self.all_parameters}
+
+    def moved(self, parameters: Mapping[str, Array], step: Array) -> dict[str, Array]:
+        """Return parameters after a step (c,) in their tangent space."""
+        out = dict(parameters)
+        for p in self.parameters:
+            part, value = step[self.columns[p.name]], parameters[p.name]
+            out[p.name] = value @ exp_so3(part) if p.rotation else value + part
+        return out
+
+    def evaluate(self, states: Array, parameters: dict[str, Array]) -> MotionEvaluation:
+        """Evaluate motion, residuals and derivatives."""
+        seen = tuple(self._see(o, states, parameters) for o in self.observations)
+        return MotionEvaluation(states, parameters, seen)
+
+    def body_at(
+        self, time: Array, states: Array, parameters: Mapping[str, Array]
+    ) -> tuple[Interpolation, Array, BodyAttitude, dict[str, Array]]:
+        """Return states and attitude at times (M,), and the heading's error by its parameters."""
+        at = self.chain.at(time)
+        x = rotate(at.before, states[at.node]) + rotate(at.after, states[at.node + 1])
+        stamp = time + self._attitude_lag(time, parameters)
+        error = np.zeros((time.size, 3))
+        if self.chain.has(ATTITUDE):
+            place = self.chain.place(ATTITUDE)
+            error += x[:, place] * self._sigma(ATTITUDE)
+        near = np.clip(np.searchsorted(self.chain.time, time), 0, self.chain.time.size - 1)
+        nRl = self._nRl[near]
+        own = {n: v for n, v in parameters.items() if n in self._of_attitude}
+        heading = self.attitude.at(stamp, error, nRl).rph[:, 2] if own else np.zeros(time.size)
+        lasting, by = heading_error(time, heading, own, self.zero)
+        error[:, 2] += lasting
+        return at, x, self.attitude.at(stamp, error, nRl), by
+
+    def weigh(self, evaluation: MotionEvaluation) -> None:
+        """Set the weights of all measurements from their covariances there."""
+        self._whitening, self.total_sigma, self._log_weights = [], [], 0.0
+        for o, seen in zip(self.observations, evaluation.seen, strict=True):
+            sigma = self.sigma(o, seen, evaluation.parameters)
+            used = np.isfinite(sigma) & self.usable(o, seen)[:, None]
+            R = np.einsum("mi,ij->mij", np.where(used, sigma, 1.0) ** 2, np.eye(sigma.shape[1]))
+            spread = seen.by_rph * self.attitude.white
+            J = seen.by_state
+            more = spread @ spread.transpose(0, 2, 1)
+            more += J @ seen.interpolation.variance @ J.transpose(0, 2, 1)
+            R += more * used[:, :, None] * used[:, None, :]
+            variance = np.diagonal(R, axis1=1, axis2=2)
+            self.total_sigma.append(np.where(used, np.sqrt(variance), np.inf))
+            root = np.linalg.cholesky(R)
+            W = np.linalg.inv(root) * used[:, :, None] * used[:, None, :]
+            self._whitening.append(W)
+            diagonal = np.diagonal(root, axis1=1, axis2=2)
+            self._log_weights += 2.0 * float(np.sum(np.log(diagonal[used])))
+
+    def usable(self, observation: Observation, seen: Seen) -> np.ndarray:
+        """Whether measurements (M,) are covered and not rejected."""
+        left_out = self.rejected.get(observation.label)
+        return seen.covered if left_out is None else np.asarray(seen.covered & ~left_out)
+
+    def sigma(
+        self, observation: Observation, seen: Seen, parameters: Mapping[str, Array]
+    ) -> Array:
+        """Return the standard deviations (M, d) of the sensor itself, infinite if not measured."""
+        factor = self.noise_factors.get(observation.label, 1.0)
+        return observation.sigma(seen.motion, parameters, factor)
+
+    def rows(self, evaluation: MotionEvaluation) -> Iterator[WhitenedRows]:
+        """Yield the whitened rows of each observation, unused ones as zeros."""
+        for o, seen, W in zip(self.observations, evaluation.seen, self._whitening, strict=True):
+            J = W @ seen.by_state
+            yield WhitenedRows(
+                o.label,
+                seen.interpolation.node,
+                J @ seen.interpolation.before,
+                J @ seen.interpolation.after,
+                W @ seen.by_parameters,
+                rotate(W, seen.residual),
+            )
+
+    def residuals(self, evaluation: MotionEvaluation) -> Iterator[Array]:
+        """Yield residuals (M, d) in standard deviations, rejected ones too, nan if missing."""
+        for o, seen in zip(self.observations, evaluation.seen, strict=True):
+            sigma = self.sigma(o, seen, evaluation.parameters)
+            R = np.square(np.where(np.isfinite(sigma), sigma, np.nan))
+            spread = seen.by_rph * self.attitude.white
+            J = seen.by_state
+            R += np.sum(spread**2, axis=2)
+            R += np.sum((J @ seen.interpolation.variance) * J, axis=2)
+            yield np.where(seen.covered[:, None], seen.residual / np.sqrt(R), np.nan)
+
+    def motion_rows(self, states: Array) -> WhitenedRows:
+        """Return the whitened rows of the motion prior, a process of n rows for each step."""
+        before, after = self.chain.transitions()
+        residual = rotate(before, states[:-1]) + rotate(after, states[1:])
+        none = np.zeros((*residual.shape, self.constants))
+        return WhitenedRows("motion", np.arange(len(before)), before, after, none, residual)
+
+    def cost(self, evaluation: MotionEvaluation) -> float:
+        """Return half the sum of all squared whitened residuals."""
+        whitened = [
+            rotate(W, seen.residual)
+            for W, seen in zip(self._whitening, evaluation.seen, strict=True)
+        ]
+        whitened.append(self.motion_rows(evaluation.states).residual)
+        whitened.append(self.chain.first() * (evaluation.states[0] - self._first()))
+        whitened.append(self._prior_residual(evaluation.parameters))
+        return 0.5 * sum(float(np.vdot(r, r)) for r in whitened)
+
+    def equations(self, evaluation: MotionEvaluation) -> NormalEquations:
+        """Return the normal equations at an evaluation."""
+        out = NormalEquations(self.chain.time.size, self.chain.size, self.constants)
+        for rows in (self.motion_rows(evaluation.states), *self.rows(evaluation)):
+            order = np.argsort(rows.node, kind="stable")
+            out.add(
+                rows.node[order],
+                rows.before[order],
+                rows.after[order],
+                rows.constants[order],
+                rows.residual[order],
+            )
+        first = self.chain.first()
+        out.diagonal[0] += np.diag(first**2)
+        out.node_gradient[0] += first**2 * (evaluation.states[0] - self._first())
+        if self.parameters:
+            gain = np.linalg.inv(self.prior_root)
+            out.corner += gain.T @ gain
+            out.constant_gradient += gain.T @ self._prior_residual(evaluation.parameters)
+        return out
+
+    def deviance(self, evaluation: MotionEvaluation, chain: MotionChain) -> float:
+        """Return twice the negative logarithm of the restricted likelihood, but for a constant.
+
+        States and parameters are integrated out, linear at the evaluation, so that only what
+        they leave says how strong a prior is.
+
+        Parameters
+        ----------
+        evaluation : MotionEvaluation
+            Near the minimum.
+        chain : MotionChain
+            Another prior, with the same nodes and processes.
+        """
+        other = self.with_chain(chain)
+        states = evaluation.states.copy()
+        for p, q in zip(self.chain.processes, chain.processes, strict=True):
+            states[:, self.chain.place(p.name)] *= p.sigma / np.maximum(q.sigma, 1e-300)
+        moved = other.evaluate(states, evaluation.parameters)
+        other.weigh(moved)
+        equations = other.equations(moved)
+        factors = equations.factorise()
+        dx, dc = factors.step()
+        gain = np.vdot(dx, equations.node_gradient) + dc @ equations.constant_gradient
+        return (
+            2.0 * other.cost(moved)
+            + float(gain)
+            + other._log_weights
+            - chain.log_determinant()
+            + factors.log_determinant
+        )
+
+    def _first(self) -> Array:
+        first = self._start[0].copy()
+        first[6:] = 0.0
+        return first
+
+    def _prior_residual(self, parameters: Mapping[str, Array]) -> Array:
+        if not self.parameters:
+            return np.zeros(0)
+        off = [local_coordinates(p, parameters[p.name], prior_mean(p)) for p in self.parameters]
+        return np.asarray(np.linalg.solve(self.prior_root, np.concatenate(off)))
+
+    def _sigma(self, name: str) -> Array:
+        return next(p.sigma for p in self.chain.processes if p.name == name)
+
+    def _attitude_lag(self, time: Array, parameters: Mapping[str, Array]) -> Array:
+        """Return the stamps of the attitude less true times (M,), s."""
+        offset, rate = (parameters[name][0] for name in self.attitude.sensor.clock.names)
+        return np.asarray(offset + rate * (time - self.zero))
+
+    def _see(self, o: Observation, states: Array, parameters: dict[str, Array]) -> Seen:
+        """Return an observation with its derivatives."""
+        time = true_time(o, parameters, self.zero)
+        at, x, body, by_heading = self.body_at(time, states, parameters)
+        stamp = time + self._attitude_lag(time, parameters)
+        covered = self.chain.covers(time) & self.attitude.covers(stamp)
+        ends = np.concatenate([states[at.node, :6], states[at.node + 1, :6]], axis=1)
+        v_n = x[:, 3:6]
+        flows = self.chain.has(CURRENT) and any(n.startswith("current") for n in o.parameters)
+        if flows:
+            current = x[:, self.chain.place(CURRENT)] * self._sigma(CURRENT)
+            v_n = v_n - np.column_stack([current, np.zeros(time.size)])
+        motion = Motion(
+            nRb=body.nRb,
+            p_n=x[:, :3],
+            v_n=v_n,
+            omega_eb_b=body.omega_eb_b,
+            a_n=rotate(at.acceleration, ends),
+            alpha_b=body.alpha_b,
+            omega_sigma=body.omega_sigma,
+        )
+        wanted = [p.name for p in self.parameters]
+        lin = linearized(o, motion, parameters, wanted, self.zero)
+        m, d = lin.residual.shape
+        by_rph = np.zeros((m, d, 3))
+        if lin.d_theta is not None:
+            by_rph = -lin.d_theta @ body.theta_by_rph
+        by_state = np.zeros((m, d, self.chain.size))
+        if lin.d_p is not None:
+            by_state[:, :, :3] = lin.d_p
+        if lin.d_v is not None:
+            by_state[:, :, 3:6] = lin.d_v
+            if flows:
+                place = self.chain.place(CURRENT)
+                by_state[:, :, place] = -lin.d_v[:, :, :2] * self._sigma(CURRENT)
+        if self.chain.has(ATTITUDE):
+            by_state[:, :, self.chain.place(ATTITUDE)] = by_rph * self._sigma(ATTITUDE)
+        residual = lin.residual
+        if self.chain.has(o.label):
+            place = self.chain.place(o.label)
+            residual = residual + x[:, place] * self._sigma(o.label)
+            by_state[:, :, place] = np.diag(self._sigma(o.label))
+        by_parameters = np.zeros((m, d, self.constants))
+        found = self._by_attitude(lin, body, by_rph, by_heading, time)
+        for name, place in self.columns.items():
+            if name in lin.d_parameters:
+                by_parameters[:, :, place] += lin.d_parameters[name]
+            if name in found:
+                by_parameters[:, :, place] += found[name]
+        return Seen(motion, time, at, body, residual, by_state, by_parameters, by_rph, covered)
+
+    def _by_attitude(
+        self,
+        lin: Linearization,
+        body: BodyAttitude,
+        by_rph: Array,
+        by_heading: Mapping[str, Array],
+        time: Array,
+    ) -> dict[str, Array]:
+        """Return derivatives of a residual by errors of the heading and the attitude's clock."""
+        found = {name: by_rph[:, :, 2:] * by[:, None, :] for name, by in by_heading.items()}
+        late = np.zeros((*lin.residual.shape, 1))
+        if lin.d_theta is not None:
+            late += lin.d_theta @ body.omega_eb_b[:, :, None]
+        if lin.d_omega is not None:
+            late += lin.d_omega @ body.alpha_b[:, :, None]
+        offset, rate = self.attitude.sensor.clock.names
+        found[offset] = late
+        found[rate] = late * (time - self.zero)[:, None, None]
+        return found
+
+    def with_chain(self, chain: MotionChain) -> MotionProblem:
+        """Return the same problem with another strength of its prior."""
+        out = MotionProblem(
+            chain,
+            self.frame,
+            self.attitude,
+            self.observations,
+            self.all_parameters,
+            self._start,
+        )
+        out.noise_factors, out.rejected = self.noise_factors, self.rejected
+        return out
+
+
+def with_sigma(chain: MotionChain, name: str, sigma: Array, tau: float) -> MotionChain:
+    """Return a chain with another standard deviation and correlation time of a process."""
+    processes = [
+        replace(p, sigma=sigma, tau=tau) if p.name == name else p for p in chain.processes
+    ]
+    return replace(chain, processes=tuple(processes))

@@ -1,0 +1,66 @@
+"""Position and velocity at any time from GNSS or an INS alone, to start from without an IMU."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from factorgraph_dvl.errors import DataError
+from factorgraph_dvl.geometry.earth import LocalFrame
+from factorgraph_dvl.geometry.vectors import Array, interpolate
+from factorgraph_dvl.sensors.gnss import Gnss
+from factorgraph_dvl.sensors.ins import Ins
+
+# Span, s, over which positions make a velocity. Chosen: turns of a ship last longer.
+_SPAN = 5.0
+# Gap, s, beyond which nothing is known of the motion.
+_GAP = 15.0
+
+
+@dataclass(frozen=True)
+class Track:
+    """Positions (M, 3), m, and velocities (M, 3), m/s, in n at times (M,), s."""
+
+    time: Array
+    p_n: Array
+    v_n: Array
+
+    def at(self, time: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
+        """Return position and velocity at times (K,), and where they are known."""
+        after = np.clip(np.searchsorted(self.time, time), 1, self.time.size - 1)
+        known = self.time[after] - self.time[after - 1] < _GAP
+        known &= (time >= self.time[0]) & (time <= self.time[-1])
+        return (
+            interpolate(time, self.time, self.p_n),
+            interpolate(time, self.time, self.v_n),
+            np.asarray(known),
+        )
+
+
+def track_of(sensor: Gnss | Ins, frame: LocalFrame) -> Track:
+    """Return the track of an antenna or an INS: what it measured, smoothed over seconds.
+
+    Raises
+    ------
+    DataError
+        If there are fewer than three positions.
+    """
+    known = ~np.isnan(sensor.geodetic[:, 0])
+    if known.sum() < 3:
+        raise DataError(
+            f"{known.sum()} positions", where=sensor.source, expected="a track of three or more"
+        )
+    time, geodetic = sensor.time[known], sensor.geodetic[known]
+    p_n = frame.position(*geodetic.T)
+    velocity = sensor.velocity[known]
+    if np.mean(np.isnan(velocity[:, 0])) < 0.1:
+        level = frame.level_from_tangent(geodetic[:, 0], geodetic[:, 1])
+        measured = ~np.isnan(velocity[:, 0])
+        v_n = np.einsum("mji,mj->mi", level[measured], velocity[measured])
+        return Track(time, p_n, interpolate(time, time[measured], v_n))
+    half = max(1, round(0.5 * _SPAN / float(np.median(np.diff(time)))))
+    half = min(half, (time.size - 1) // 2)
+    v = (p_n[2 * half :] - p_n[: -2 * half]) / (time[2 * half :] - time[: -2 * half])[:, None]
+    return Track(time, p_n, interpolate(time, time[half:-half], v))

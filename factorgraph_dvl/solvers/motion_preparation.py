@@ -1,0 +1,307 @@
+"""From a trial without IMU to the problem that its smoothing starts from."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from factorgraph_dvl.errors import ConfigError, DataError
+from factorgraph_dvl.geometry.earth import LocalFrame
+from factorgraph_dvl.geometry.rotations import rotation_from_rph
+from factorgraph_dvl.geometry.units import DEG
+from factorgraph_dvl.geometry.vectors import Array, rotate
+from factorgraph_dvl.graph.motion_chain import MotionChain, Process, node_times
+from factorgraph_dvl.graph.motion_problem import ATTITUDE, CURRENT, MotionProblem
+from factorgraph_dvl.graph.priors import prior_mean
+from factorgraph_dvl.imu.attitude_record import AttitudeRecord, level_axes
+from factorgraph_dvl.initialization.dvl_mounting import initial_mountings
+from factorgraph_dvl.initialization.record_clocks import clock_lags
+from factorgraph_dvl.initialization.track_velocity import Track, track_of
+from factorgraph_dvl.sensors.attitude import Attitude
+from factorgraph_dvl.sensors.finding import Code, Finding
+from factorgraph_dvl.sensors.ins import Ins
+from factorgraph_dvl.sensors.parameters import Parameter
+from factorgraph_dvl.sensors.protocol import Motion, Observation
+from factorgraph_dvl.trial import Trial
+
+# Sensors that ask more of the motion than attitude records and a motion prior give.
+_NEED_IMU = frozenset({"star", "turntable", "beacons"})
+# Turn rate, averaged over seconds, from which on a vessel turns. Chosen: above yaw in a seaway.
+_TURNING = 0.4 * DEG
+_TURN_SPAN = 10.0
+# Nodes come at most so far apart, s, and so many.
+_LONGEST = 10.0
+_MOST_NODES = 60_000
+# Share of a ping's noise that the motion between two nodes may add. Chosen: 4 % of its variance,
+# as what neighbouring pings share of it counts as independent.
+_BETWEEN = 0.2
+# Density of acceleration, m²/s³: a start value where the log does not show one, and the least.
+_DENSITY = 1e-3
+_LEAST_DENSITY = 1e-9
+# Spans, s, over which changes of velocity show the density.
+_SHORT, _LONG = 2.0, 10.0
+# Start values of the current as a process: standard deviation, m/s, and correlation time, s.
+_CURRENT_STD, _CURRENT_TIME = 0.1, 3600.0
+
+
+@dataclass(frozen=True)
+class MotionPreparation:
+    """A problem, and where its minimisation starts.
+
+    Parameters
+    ----------
+    problem : MotionProblem
+        What to minimise.
+    states : ndarray, shape (K, n)
+        Of the nodes.
+    values : dict of str to ndarray
+        Of the parameters.
+    turning : ndarray of bool, shape (K - 1,)
+        Whether the vessel turns between nodes.
+    estimated_noise : frozenset of str
+        Labels of measurements whose stated noise is a start value.
+    current_is_free : bool
+        Whether the strength of the current is to be estimated.
+    findings : tuple of Finding
+        What the user must know.
+    """
+
+    problem: MotionProblem
+    states: Array
+    values: dict[str, Array]
+    turning: np.ndarray
+    estimated_noise: frozenset[str]
+    current_is_free: bool
+    findings: tuple[Finding, ...]
+
+
+def prepare_motion(trial: Trial) -> MotionPreparation:
+    """Return the problem of a trial without IMU.
+
+    Raises
+    ------
+    ConfigError
+        If sensors are missing, or ask for an IMU.
+    DataError
+        If records are too short.
+    """
+    sensor = trial.attitude
+    source = trial.gnss or trial.find(Ins)
+    if sensor is None or source is None:
+        raise ConfigError(
+            "nothing measures the position",
+            where="trial.yaml",
+            expected="with `attitude`, also `gnss` or `ins`",
+        )
+    for aid in trial.aids:
+        if aid.section in _NEED_IMU:
+            raise ConfigError(
+                f"`{aid.section}` needs an IMU",
+                where="trial.yaml",
+                expected="an imu section, or no such sensor",
+            )
+    frame = trial.frame()
+    record = AttitudeRecord(sensor, trial.body_axes, estimated=trial.estimates_noise(sensor))
+    track = track_of(source, frame)
+    observations, processes, estimated = _observed(trial, frame)
+    parameters = _parameters(trial)
+    values = {p.name: prior_mean(p) for p in parameters}
+    values |= _start_values(trial, record, track, frame, parameters)
+    times = _node_candidates(trial, record, track, values)
+    density, sigma = _densities(trial, record, track, values)
+    turning_at = _turns(record, times)
+    spacing = _BETWEEN**2 * 16.0 * sigma**2 / max(float(density[:2].max()), _LEAST_DENSITY)
+    spacing = max(spacing, (times[-1] - times[0]) / _MOST_NODES)
+    nodes = node_times(times, turning_at, min(spacing, _LONGEST))
+    turning = _turns(record, 0.5 * (nodes[1:] + nodes[:-1]))
+    chain = MotionChain(nodes, np.tile(density, (nodes.size - 1, 1)), processes)
+    p_n, v_n, _ = track.at(nodes)
+    states = np.hstack([p_n, v_n, np.zeros((nodes.size, chain.size - 6))])
+    problem = MotionProblem(chain, frame, record, observations, parameters, states)
+    return MotionPreparation(
+        problem=problem,
+        states=states,
+        values=values,
+        turning=turning,
+        estimated_noise=estimated,
+        current_is_free=chain.has(CURRENT) and _current(trial)[2],
+        findings=(*trial.notes, *_notes(trial)),
+    )
+
+
+def _observed(
+    trial: Trial, frame: LocalFrame
+) -> tuple[tuple[Observation, ...], tuple[Process, ...], frozenset[str]]:
+    """Return measurements, errors that last, and the labels whose noise may be estimated."""
+    assert trial.attitude is not None
+    observations: list[Observation] = []
+    processes: list[Process] = []
+    estimated: set[str] = set()
+    error = trial.attitude.error
+    if error.sigma.any():
+        processes.append(Process(ATTITUDE, error.sigma, error.tau))
+    if trial.dvl is not None and trial.dvl.settings.reference == "water":
+        sigma, tau, _ = _current(trial)
+        processes.append(Process(CURRENT, np.full(2, sigma), tau))
+    for aid in trial.aids:
+        if isinstance(aid, Attitude):
+            continue
+        if isinstance(aid, Ins):
+            share = np.sqrt(aid.settings.correlated_share)
+            total = np.median(aid.total_std, axis=0)
+            for o, std in zip(
+                aid.motion_observations(frame), (total[:3], total[3:6]), strict=True
+            ):
+                observations.append(o)
+                if share > 0.0:
+                    tau = aid.settings.correlation_time_s
+                    processes.append(Process(o.label, share * std, tau))
+            continue
+        for o in aid.observations(frame, trial.body_axes):
+            observations.append(o)
+            correlated = getattr(o, "correlated", None)
+            if correlated is not None and correlated.sigma is not None:
+                processes.append(Process(o.label, correlated.sigma, correlated.time))
+            if trial.estimates_noise(aid) and o.noise_groups:
+                estimated.add(o.label)
+    return tuple(observations), tuple(processes), frozenset(estimated)
+
+
+def _current(trial: Trial) -> tuple[float, float, bool]:
+    """Return standard deviation, correlation time, and whether they are to be estimated."""
+    assert trial.dvl is not None
+    s = trial.dvl.settings
+    sigma = s.current_variation_std_m_s
+    tau = s.current_correlation_time_s
+    known = isinstance(sigma, float) and isinstance(tau, float)
+    return (
+        sigma if isinstance(sigma, float) else _CURRENT_STD,
+        tau if isinstance(tau, float) else _CURRENT_TIME,
+        not known,
+    )
+
+
+def _parameters(trial: Trial) -> tuple[Parameter, ...]:
+    """Return the parameters of all sensors; without GNSS, the INS has the clock of the trial."""
+    out = []
+    for aid in trial.aids:
+        for p in aid.parameters():
+            reference = trial.gnss is None and isinstance(aid, Ins) and p.name in aid.clock.names
+            out.append(replace(p, sigma=np.zeros_like(p.sigma)) if reference else p)
+    return tuple(out)
+
+
+def _start_values(
+    trial: Trial,
+    record: AttitudeRecord,
+    track: Track,
+    frame: LocalFrame,
+    parameters: Sequence[Parameter],
+) -> dict[str, Array]:
+    """Return values of clocks and DVL that fit the track and the attitudes."""
+    dvl = trial.log
+    by_name = {p.name: p for p in parameters}
+    attitude_clock = by_name[record.sensor.clock.offset.name]
+    if dvl is None or not dvl.locked.any():
+        return {}
+    late = float(attitude_clock.mean[0])
+
+    def motion_at(time: Array, attitude_late: float) -> tuple[Motion, np.ndarray]:
+        p_n, v_n, known = track.at(time)
+        stamp = time + attitude_late
+        body = record.at(stamp, np.zeros((time.size, 3)), level_axes(frame, p_n))
+        none = np.zeros_like(p_n)
+        motion = Motion(body.nRb, p_n, v_n, body.omega_eb_b, none, body.alpha_b, body.omega_sigma)
+        return motion, np.asarray(known & record.covers(stamp))
+
+    pings = np.flatnonzero(dvl.locked)
+    pings = pings[:: max(pings.size // 3000, 1)]
+    through_water = dvl.settings.reference == "water"
+    clock = next(p for p in dvl.parameters() if p.name == "time_offset_s")
+    lag, late = clock_lags(
+        dvl.time[pings], dvl.velocity[pings], motion_at, clock, attitude_clock,
+        current=through_water,
+    )  # fmt: skip
+    found = {attitude_clock.name: np.array([late])}
+    if trial.dvl is None:
+        return found
+    shifted = replace(dvl, time=dvl.time - lag + float(clock.mean[0]))
+    best = initial_mountings(shifted, lambda time: motion_at(time, late))[0]
+    found |= {name: value for name, value in best.items() if name in by_name}
+    if clock.name in found:
+        found[clock.name] = found[clock.name] + lag - clock.mean
+    return found
+
+
+def _node_candidates(
+    trial: Trial, record: AttitudeRecord, track: Track, values: dict[str, Array]
+) -> Array:
+    """Return the times where nodes may be: between pings, and others in long gaps."""
+    late = float(values[record.sensor.clock.offset.name][0])
+    first = max(track.time[0], record.time[0] - late) - 1.0
+    last = min(track.time[-1], record.time[-1] - late) + 1.0
+    if last - first < 10.0:
+        raise DataError(
+            "positions and attitudes have less than 10 s in common",
+            where=record.sensor.source,
+            expected="records of the same time, by one clock",
+        )
+    log = trial.log
+    own = track.time
+    if log is not None and log.locked.sum() > 1:
+        own = log.time[log.locked] - float(values.get("time_offset_s", np.zeros(1))[0])
+    # Between pings: a clock moves them within an interval, where acceleration does not jump, and
+    # what the motion adds to a ping alone in its interval is independent of the others.
+    own = 0.5 * (own[1:] + own[:-1])
+    own = own[(own > first) & (own < last)]
+    edges = np.concatenate([[first], own, [last]])
+    wide = np.flatnonzero(np.diff(edges) > _LONGEST)
+    more = [np.linspace(edges[i], edges[i + 1],
+                        int(np.ceil((edges[i + 1] - edges[i]) / 5.0)) + 1)[1:-1]
+            for i in wide]  # fmt: skip
+    times = np.unique(np.concatenate([edges, *more]))
+    return np.asarray(times[np.concatenate([[True], np.diff(times) > 1e-3])])
+
+
+def _turns(record: AttitudeRecord, time: Array) -> np.ndarray:
+    """Whether the heading changes over seconds about times (M,)."""
+    ahead = record.rph_at(time + 0.5 * _TURN_SPAN)[:, 2]
+    behind = record.rph_at(time - 0.5 * _TURN_SPAN)[:, 2]
+    return np.abs(ahead - behind) / _TURN_SPAN > _TURNING
+
+
+def _densities(
+    trial: Trial, record: AttitudeRecord, track: Track, values: dict[str, Array]
+) -> tuple[Array, float]:
+    """Return the density of acceleration east, north, up, and the noise of a ping.
+
+    Velocities that are L apart differ by the density times L and by twice the noise: from two L
+    both follow.
+    """
+    log = trial.log
+    if log is None or log.locked.sum() < 50:
+        return np.full(3, _DENSITY), 0.1
+    rows = np.flatnonzero(log.locked)
+    time = log.time[rows] - float(values.get("time_offset_s", np.zeros(1))[0])
+    rph = record.rph_at(time)
+    bRd = values.get("misalignment_deg", np.eye(3)).T
+    v_n = rotate(rotation_from_rph(rph, record.body_axes), log.velocity[rows] @ bRd.T)
+    interval = float(np.median(np.diff(time)))
+    squares = []
+    for span in (_SHORT, _LONG):
+        step = max(1, round(span / interval))
+        step = min(step, time.size - 1)
+        squares.append(np.mean((v_n[step:] - v_n[:-step]) ** 2, axis=0))
+    density = np.maximum((squares[1] - squares[0]) / (_LONG - _SHORT), 0.0)
+    density[:2] = density[:2].mean()
+    return np.maximum(density, 1e-6), float(np.median(log.sigma()))
+
+
+def _notes(trial: Trial) -> tuple[Finding, ...]:
+    """Return what is left out, for the user."""
+    if trial.find(Ins) is None or trial.find(Attitude) is None:
+        return ()
+    text = "its attitude is not used: the section `attitude` says how the body points"
+    return (Finding(Code.UNUSED, text, sensor="INS"),)

@@ -1,0 +1,293 @@
+"""From the smoothed motion of a trial without IMU to a solution."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import partial
+
+import numpy as np
+
+from factorgraph_dvl.geometry.rotations import frd_from_body, rph_from_rotation
+from factorgraph_dvl.geometry.units import DEG
+from factorgraph_dvl.geometry.vectors import Array, rotate
+from factorgraph_dvl.graph.motion_problem import ATTITUDE, MotionProblem
+from factorgraph_dvl.sensors.attitude import HEADING_OFFSET, heading_error
+from factorgraph_dvl.sensors.finding import Code, Finding
+from factorgraph_dvl.sensors.parameters import UNITS, Parameter
+from factorgraph_dvl.sensors.protocol import Motion
+from factorgraph_dvl.solution import (
+    Cause,
+    Estimate,
+    Noise,
+    Residuals,
+    Solution,
+    Trajectory,
+    consistency_findings,
+    noise_name,
+    not_observable,
+    outlier_findings,
+)
+from factorgraph_dvl.solvers.motion_smoother import SmoothedMotion
+from factorgraph_dvl.solvers.reported import estimates_of, in_order, in_unit
+from factorgraph_dvl.statistics.rows import PRIOR
+from factorgraph_dvl.trial import Trial
+
+# Epochs whose covariances are computed at once.
+_CHUNK = 4000
+_MOTION_NOISE = "acceleration between states"
+
+
+def summarise_motion(trial: Trial, found: SmoothedMotion, *, rate_hz: float) -> Solution:
+    """Return the solution at a minimum without IMU.
+
+    Parameters
+    ----------
+    trial : Trial
+        What was solved.
+    found : SmoothedMotion
+        Its minimum.
+    rate_hz : float
+        Rate of the trajectory, Hz; at most that of the attitude record.
+    """
+    problem, evaluation = found.problem, found.evaluation
+    rows = in_order(
+        [(p, in_unit(p, evaluation.parameters[p.name])) for p in problem.all_parameters],
+        lambda r: r[0],
+    )
+    gain = _reported_gain(problem, [(p, r.derivative) for p, r in rows if p.estimated])
+    joint = gain @ found.covariances.constants @ gain.T
+    estimates, covariance = estimates_of([(p, r.value) for p, r in rows], joint)
+    residuals, rejected = _residuals(found)
+    noise = tuple(Noise(noise_name(n), f) for n, f in problem.noise_factors.items())
+    findings = [*found.findings]
+    for o, seen in zip(problem.observations, evaluation.seen, strict=True):
+        left_out = int((~seen.covered).sum())
+        if left_out:
+            text = f"{left_out} measurements at times without attitude or position were not used"
+            findings.append(Finding(Code.UNUSED, text, sensor=o.label))
+    findings += consistency_findings(estimates, residuals, noise)
+    findings += outlier_findings(residuals, rejected)
+    findings += _unobservable(trial, found, estimates)
+    findings += _heading_and_misalignment(trial, found)
+    return Solution(
+        trial=trial.name,
+        solver="batch",
+        body_axes=trial.body_axes,
+        inputs=trial.inputs,
+        converged=found.converged,
+        iterations=found.iterations,
+        cost=problem.cost(evaluation),
+        estimates=estimates,
+        covariance=covariance,
+        trajectory=_trajectory(found, rate_hz),
+        residuals=residuals,
+        findings=tuple(findings),
+        rejected=rejected,
+        limits=trial.limits,
+        noise=noise,
+        error_budget=_causes(found, [p for p, _ in rows], gain),
+    )
+
+
+def _reported_gain(problem: MotionProblem, free: Sequence[tuple[Parameter, Array]]) -> Array:
+    """Return the derivative of what is reported by the constants, (F, c)."""
+    size = sum(p.mean.size for p, _ in free)
+    out, at = np.zeros((size, problem.constants)), 0
+    for p, derivative in free:
+        out[at : at + p.mean.size, problem.columns[p.name]] = derivative
+        at += p.mean.size
+    return out
+
+
+def _residuals(found: SmoothedMotion) -> tuple[tuple[Residuals, ...], tuple[Residuals, ...]]:
+    """Return residuals that were used, and those that were rejected."""
+    problem, used, rejected = found.problem, [], []
+    for o, seen, total in zip(
+        problem.observations, found.evaluation.seen, problem.total_sigma, strict=True
+    ):
+        kept = np.isfinite(total).any(axis=1)
+        sigma = np.where(np.isfinite(total), total, np.nan)
+        residual = np.where(np.isfinite(total), seen.residual, np.nan)
+        used.append(
+            Residuals(o.label, o.unit, o.components, o.time[kept], residual[kept], sigma[kept])
+        )
+        out = problem.rejected.get(o.label)
+        if out is not None and out.any():
+            stated = problem.sigma(o, seen, found.evaluation.parameters)[out]
+            rejected.append(
+                Residuals(
+                    o.label,
+                    o.unit,
+                    o.components,
+                    o.time[out],
+                    seen.residual[out],
+                    stated,
+                    reason="outlier",
+                )
+            )
+    return tuple(used), tuple(rejected)
+
+
+def _trajectory(found: SmoothedMotion, rate_hz: float) -> Trajectory:
+    """Return the motion between the nodes at a rate, with its covariance."""
+    problem, evaluation = found.problem, found.evaluation
+    chain, frame = problem.chain, problem.frame
+    rate = min(rate_hz, 1.0 / problem.attitude.interval)
+    first, last = np.ceil(chain.time[0] * rate), np.floor(chain.time[-1] * rate)
+    time = np.arange(first, last + 1.0) / rate
+    offset = float(evaluation.parameters[problem.attitude.sensor.clock.offset.name][0])
+    time = time[problem.attitude.covers(time + offset)]
+    place = chain.place(ATTITUDE) if chain.has(ATTITUDE) else slice(0, 0)
+    sigma = next((p.sigma for p in chain.processes if p.name == ATTITUDE), np.zeros(3))
+    n, c = chain.size, problem.constants
+    parts = []
+    for a in range(0, time.size, _CHUNK):
+        at, x, body, by_heading = problem.body_at(
+            time[a : a + _CHUNK], evaluation.states, evaluation.parameters
+        )
+        P = found.covariances.around(at.node)
+        to_state = np.concatenate([at.before, at.after, np.zeros((at.node.size, n, c))], axis=2)
+        motion = to_state @ P @ to_state.transpose(0, 2, 1) + at.variance
+        # Errors of the attitude are those of the process and of the constants.
+        to_rph = np.zeros((at.node.size, 3, 2 * n + c))
+        if place.stop:
+            to_rph -= sigma[:, None] * to_state[:, place]
+        for name, by in by_heading.items():
+            if name in problem.columns:
+                own = problem.columns[name]
+                to_rph[:, 2, 2 * n + own.start : 2 * n + own.stop] -= by
+        rph_cov = to_rph @ P @ to_rph.transpose(0, 2, 1) + np.diag(problem.attitude.white**2)
+        if place.stop:
+            rph_cov += sigma[:, None] * at.variance[:, place, place] * sigma
+        lat, lon, height = frame.geodetic(x[:, :3])
+        level = frame.level_from_tangent(lat, lon)
+        level_t = level.transpose(0, 2, 1)
+        parts.append(
+            (
+                np.stack([lat, lon, height], axis=1),
+                rotate(level, x[:, 3:6]),
+                rph_from_rotation(level @ body.nRb, problem.attitude.body_axes),
+                level @ motion[:, :3, :3] @ level_t,
+                level @ motion[:, 3:6, 3:6] @ level_t,
+                rph_cov,
+            )
+        )
+    return Trajectory(time, *(np.concatenate(each) for each in zip(*parts, strict=True)))
+
+
+def _causes(
+    found: SmoothedMotion, reported: Sequence[Parameter], gain: Array
+) -> tuple[Cause, ...]:
+    """Return what each cause adds to the standard deviations: P = sum k kᵀ over rows of noise."""
+    problem, cov = found.problem, found.covariances
+    variances: dict[str, Array] = {}
+    chain = problem.chain
+    motion = problem.motion_rows(found.evaluation.states)
+    for rows in (motion, *problem.rows(found.evaluation)):
+        k = (
+            rows.before @ cov.with_constants[rows.node]
+            + rows.after @ cov.with_constants[rows.node + 1]
+            + rows.constants @ cov.constants
+        ) @ gain.T
+        squares = np.sum(k**2, axis=0)
+        if rows is motion:
+            first = (chain.first()[:, None] * cov.with_constants[0]) @ gain.T
+            squares[:] += first**2
+            variances[_MOTION_NOISE] = squares[:6].sum(axis=0)
+            for p in chain.processes:
+                name = p.name if p.name in (ATTITUDE, "current") else f"lasting errors of {p.name}"
+                name = "lasting errors of the attitude" if p.name == ATTITUDE else name
+                variances[name] = squares[chain.place(p.name)].sum(axis=0)
+        else:
+            variances[f"noise of {rows.source}"] = squares.sum(axis=0)
+    if problem.parameters:
+        whiten = np.linalg.inv(problem.prior_root)
+        for p in problem.parameters:
+            k = whiten[problem.columns[p.name]] @ cov.constants @ gain.T
+            variances[PRIOR.format(p.name)] = np.sum(k**2, axis=0)
+    assumed = {
+        PRIOR.format(p.name): f"{', '.join(f'{s:.2g}' for s in p.sigma / p.si)} "
+        f"{UNITS[p.spec.unit].text}".rstrip()
+        for p in problem.parameters
+    }
+    is_free = np.concatenate([np.full(p.mean.size, p.estimated) for p in reported])
+    exact = np.concatenate([p.sigma == 0.0 for p in reported])
+    out = []
+    for source, variance in variances.items():
+        adds = np.zeros(is_free.size)
+        adds[is_free] = np.sqrt(np.maximum(variance, 0.0))
+        adds[exact] = 0.0
+        out.append(Cause(source, assumed.get(source, ""), adds))
+    total = np.maximum(np.sum([c.adds**2 for c in out], axis=0), np.finfo(float).tiny)
+    return tuple(sorted(out, key=lambda c: -float(np.max(c.adds**2 / total))))
+
+
+def _unobservable(
+    trial: Trial, found: SmoothedMotion, estimates: Sequence[Estimate]
+) -> list[Finding]:
+    """Say which components the data did not determine, and why."""
+    by_name = {p.name: aid for aid in trial.aids for p in aid.parameters()}
+    seen: dict[str, Motion] = {}
+    for o, each in zip(found.problem.observations, found.evaluation.seen, strict=True):
+        for name in o.parameters:
+            seen[name] = each.motion
+    nuisances = {p.name for p in found.problem.parameters if p.spec.nuisance}
+    out: list[Finding] = []
+
+    def why(name: str, component: int) -> str:
+        return by_name[name].explain(name, component, seen.get(name))
+
+    for e in estimates:
+        if e.name not in nuisances:
+            out += not_observable(e, partial(why, e.name))
+    return out
+
+
+def _heading_and_misalignment(trial: Trial, found: SmoothedMotion) -> list[Finding]:
+    """Say how well the misalignment is known relative to the mean of the compass.
+
+    A heading that is too large by e looks like a misalignment by e about the vertical: data show
+    their sum, with the mean of e over the trial.
+    """
+    problem, x = found.problem, found.evaluation.states
+    chain, values = problem.chain, found.evaluation.parameters
+    name = "misalignment_deg"
+    if name not in problem.columns or not (
+        chain.has(ATTITUDE) or any(n in problem.columns for n in (HEADING_OFFSET,))
+    ):
+        return []
+    down = frd_from_body(trial.body_axes)[2]
+    by_constants = np.zeros(problem.constants)
+    by_constants[problem.columns[name]] = down
+    alone = float(np.sqrt(by_constants @ found.covariances.constants @ by_constants))
+    weight = np.gradient(chain.time) / (chain.time[-1] - chain.time[0])
+    weight /= weight.sum()
+    by_states = np.zeros_like(x)
+    mean = 0.0
+    if chain.has(ATTITUDE):
+        place = chain.place(ATTITUDE)
+        sigma = next(p.sigma for p in chain.processes if p.name == ATTITUDE)
+        by_states[:, place.start + 2] = weight * sigma[2]
+        mean += float(np.sum(by_states * x))
+    heading = problem.attitude.rph_at(chain.time)[:, 2]
+    lasting, by = heading_error(chain.time, heading, values, problem.zero)
+    mean += float(weight @ lasting)
+    for own, matrix in by.items():
+        if own in problem.columns:
+            by_constants[problem.columns[own]] = weight @ matrix
+    through = found.factors.solve_nodes(by_states[:, :, None])[:, :, 0]
+    rest = by_constants - np.einsum("kic,ki->c", found.factors.influence, by_states)
+    together = float(
+        np.sqrt(np.vdot(by_states, through) + rest @ found.covariances.constants @ rest)
+    )
+    angle = -float(down @ in_unit(_parameter(problem, name), values[name]).value)
+    text = (
+        f"about the vertical {angle:.3f} ± {alone / DEG:.2g} deg, which includes what is stated "
+        f"of the heading's error; relative to the mean heading of the compass "
+        f"{angle - mean / DEG:.3f} ± {together / DEG:.2g} deg, which the data alone determine"
+    )
+    return [Finding(Code.HEADING_ERROR, text, parameter=name)]
+
+
+def _parameter(problem: MotionProblem, name: str) -> Parameter:
+    return next(p for p in problem.parameters if p.name == name)
