@@ -49,8 +49,8 @@ def deadreckon(
         str | None,
         typer.Option(
             metavar="SOURCE",
-            help="Source of the attitude: sins (default), reference (default without GNSS), record "
-            "(of `attitude` or `ins`, default without IMU), or a solution folder.",
+            help="Source of the attitude: sins (default), reference (default without GNSS), "
+            "record (default without IMU), or a solution folder.",
         ),
     ] = None,
     align: Annotated[

@@ -157,11 +157,18 @@ class MotionChain:
         """Whether times (M,) lie between the first node and the last."""
         return np.asarray((time >= self.time[0]) & (time <= self.time[-1]))
 
-    def at(self, time: Array) -> Interpolation:
+    def at(self, time: Array, lasting: Array | None = None) -> Interpolation:
         """Return the interpolation to times (M,), s.
 
         Positions are cubic Hermite polynomials of the nodes, and velocities their derivatives:
         the mean of a white-acceleration prior between two states.
+
+        Parameters
+        ----------
+        time : ndarray, shape (M,), s
+            Of the motion.
+        lasting : ndarray, shape (M,), s, optional
+            Of the processes, between the same nodes; by default the same.
         """
         k = np.clip(np.searchsorted(self.time, time, side="right") - 1, 0, self.time.size - 2)
         span = self.time[k + 1] - self.time[k]
@@ -192,6 +199,9 @@ class MotionChain:
             q = self.density[k, i]
             variance[:, p, p], variance[:, v, v] = q * v_pp, q * v_vv
             variance[:, p, v] = variance[:, v, p] = q * v_pv
+        if lasting is not None:
+            tau = np.clip(lasting - self.time[k], 0.0, span)
+            rest = span - tau
         at = _MOTION
         for process in self.processes:
             whole = np.sinh(span / process.tau)

@@ -164,6 +164,7 @@ class MotionProblem:
         self.total_sigma: list[Array] = []
         self._whitening: list[Array] = []
         self._log_weights = 0.0
+        self._bound: dict[str, Array] = {}
         # A parameter that no measurement names belongs to the attitude.
         self._of_attitude = {p.name for p in attitude.sensor.parameters()}
 
@@ -204,10 +205,17 @@ class MotionProblem:
         return MotionEvaluation(states, parameters, seen)
 
     def body_at(
-        self, time: Array, states: Array, parameters: Mapping[str, Array]
+        self,
+        time: Array,
+        states: Array,
+        parameters: Mapping[str, Array],
+        bound: Array | None = None,
     ) -> tuple[Interpolation, Array, BodyAttitude, dict[str, Array]]:
-        """Return states and attitude at times (M,), and the heading's error by its parameters."""
-        at = self.chain.at(time)
+        """Return states and attitude at times (M,), and the heading's error by its parameters.
+
+        What lasts is that at `bound` (M,), where this lies between the same nodes.
+        """
+        at = self.chain.at(time, bound)
         x = rotate(at.before, states[at.node]) + rotate(at.after, states[at.node + 1])
         stamp = time + self._attitude_lag(time, parameters)
         error = np.zeros((time.size, 3))
@@ -225,6 +233,10 @@ class MotionProblem:
     def weigh(self, evaluation: MotionEvaluation) -> None:
         """Set the weights of all measurements from their covariances there."""
         self._whitening, self.total_sigma, self._log_weights = [], [], 0.0
+        # A clock that moves must not follow errors that are as rough as a random walk.
+        self._bound = {
+            o.label: seen.time for o, seen in zip(self.observations, evaluation.seen, strict=True)
+        }
         for o, seen in zip(self.observations, evaluation.seen, strict=True):
             sigma = self.sigma(o, seen, evaluation.parameters)
             used = np.isfinite(sigma) & self.usable(o, seen)[:, None]
@@ -370,7 +382,7 @@ class MotionProblem:
     def _see(self, o: Observation, states: Array, parameters: dict[str, Array]) -> Seen:
         """Return an observation with its derivatives."""
         time = true_time(o, parameters, self.zero)
-        at, x, body, by_heading = self.body_at(time, states, parameters)
+        at, x, body, by_heading = self.body_at(time, states, parameters, self._bound.get(o.label))
         stamp = time + self._attitude_lag(time, parameters)
         covered = self.chain.covers(time) & self.attitude.covers(stamp)
         ends = np.concatenate([states[at.node, :6], states[at.node + 1, :6]], axis=1)

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
 from factorgraph_dvl.errors import DataError
@@ -85,7 +86,7 @@ class AttitudeRecord:
             rph = rph * np.array([0.0, 0.0, 1.0])
             rph = np.where(np.isnan(sensor.rph[:, :2]).all(axis=1)[:, None], 0.0, rph)
             rph = np.column_stack([rph[:, :2], sensor.rph[:, 2]])
-        known = ~np.isnan(rph).any(axis=1)
+        known: NDArray[np.bool_] = np.asarray((~np.isnan(rph)).all(axis=1))
         if known.sum() < 5:
             raise DataError(
                 f"{known.sum()} attitudes", where=sensor.source, expected="five or more"
@@ -135,7 +136,9 @@ class AttitudeRecord:
         """
         rph = np.asarray(self._spline(time))
         true = rph - error
-        by_rph = np.linalg.inv(rph_jacobian(true, self.body_axes))
+        by_rph: Array = np.asarray(
+            np.linalg.inv(rph_jacobian(true, self.body_axes)), dtype=np.float64
+        )
         sigma = _SLOPE / self.interval * self.white
         return BodyAttitude(
             rph=rph,

@@ -60,7 +60,12 @@ def track_of(sensor: Gnss | Ins, frame: LocalFrame) -> Track:
         measured = ~np.isnan(velocity[:, 0])
         v_n = np.einsum("mji,mj->mi", level[measured], velocity[measured])
         return Track(time, p_n, interpolate(time, time[measured], v_n))
+    return Track(time, p_n, velocities(time, p_n))
+
+
+def velocities(time: Array, p_n: Array) -> Array:
+    """Return velocities (M, 3) from positions (M, 3) at times (M,), each over some seconds."""
     half = max(1, round(0.5 * _SPAN / float(np.median(np.diff(time)))))
     half = min(half, (time.size - 1) // 2)
     v = (p_n[2 * half :] - p_n[: -2 * half]) / (time[2 * half :] - time[: -2 * half])[:, None]
-    return Track(time, p_n, interpolate(time, time[half:-half], v))
+    return interpolate(time, time[half:-half], v)

@@ -57,7 +57,7 @@ def simulate(scenario: Scenario | str | PathLike[str], seed: int = 0) -> Trial:
     Raises
     ------
     ConfigError
-        If the scenario cannot be read, is not valid, or has no IMU.
+        If the scenario cannot be read, is not valid, or has neither IMU nor what takes its place.
 
     Examples
     --------
@@ -72,12 +72,13 @@ def simulate(scenario: Scenario | str | PathLike[str], seed: int = 0) -> Trial:
         raise ConfigError(
             "there is no imu",
             where=scenario.source,
-            expected="an imu, or `simulate_planar` for a planar scenario",
+            expected="imu, attitude or ins; or `simulate_planar` for a planar scenario",
         )
     motion = plan_motion(scenario)
     aids, truth = _records(INSTRUMENTS, scenario, motion, seed)
-    imu: Imu = aids.pop("imu")
-    attitude, position, velocity = _initial(scenario, motion, imu.time[:1])
+    imu = cast("Imu | None", aids.pop("imu", None))
+    start = np.zeros(1) if imu is None else imu.time[:1]
+    attitude, position, velocity = _initial(scenario, motion, start)
     trial = Trial(
         name=scenario.name,
         imu=imu,

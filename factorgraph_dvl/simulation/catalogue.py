@@ -6,6 +6,12 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 from factorgraph_dvl.simulation.beams import simulate_beams, simulate_turntable
+from factorgraph_dvl.simulation.compass import (
+    AttitudeTruth,
+    InsTruth,
+    simulate_attitude,
+    simulate_ins,
+)
 from factorgraph_dvl.simulation.depth import simulate_depth
 from factorgraph_dvl.simulation.instruments import (
     DepthTruth,
@@ -40,6 +46,8 @@ INSTRUMENTS = {
     "beacons": Instrument(BeaconTruth, simulate_beacons),
     "dvl_beams": Instrument(DvlBeamsTruth, simulate_beams),
     "turntable": Instrument(TurntableTruth, simulate_turntable),
+    "attitude": Instrument(AttitudeTruth, simulate_attitude),
+    "ins": Instrument(InsTruth, simulate_ins),
 }
 # Of a planar trial, which has no IMU.
 PLANAR_INSTRUMENTS = {

@@ -75,7 +75,8 @@ def clock_rate(section: str, rate_ppm: float) -> Fault:
     """Let the clock of a sensor run fast by a rate, right at the middle of the trial."""
 
     def fault(trial: Trial, rng: np.random.Generator) -> Trial:
-        middle = 0.5 * (trial.inertial.time[0] + trial.inertial.time[-1])
+        record = trial.body_sensor
+        middle = 0.5 * (record.time[0] + record.time[-1])
         return _stamped(
             trial, section, lambda t: t + 1e-6 * rate_ppm * (t - middle), rate_ppm=rate_ppm
         )
@@ -364,7 +365,7 @@ def _truth(trial: Trial, name: str, change: Array) -> Trial:
 
 
 def _record(trial: Trial, section: str) -> Any:
-    records = {"imu": trial.inertial, **{aid.section: aid for aid in trial.aids}}
+    records = {record.section: record for record in trial.records}
     return records[section]
 
 

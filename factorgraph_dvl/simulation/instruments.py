@@ -84,6 +84,14 @@ class Jumps(Section, frozen=True, kw_only=True):
     count: Annotated[int, msgspec.Meta(ge=1)] = 3
 
 
+class MovingWater(Section, frozen=True, kw_only=True):
+    """A current that changes with time and place about its mean."""
+
+    std_m_s: Positive
+    correlation_time_s: Positive = 3600.0
+    correlation_distance_m: Positive = 1e4
+
+
 class FalseLock(Section, frozen=True, kw_only=True):
     """A lock on something that moves, such as a layer of fish, for a while."""
 
@@ -217,6 +225,7 @@ class DvlTruth(ClockedInstrument, frozen=True, kw_only=True):
     outliers: Outliers | None = None
     false_lock: FalseLock | None = None
     reference: Literal["bottom", "water"] = "bottom"
+    moving_water: MovingWater | None = None
     no_lock_s: tuple[Interval, ...] = ()
 
     def __post_init__(self) -> None:

@@ -144,10 +144,10 @@ def simulate_dvl(
     at the true time of the ping. Through the water, v_b excludes the current.
     """
     truth: DvlTruth = scenario.dvl
-    jitter_rng, noise_rng = rng.spawn(2)
+    jitter_rng, noise_rng, water_rng = rng.spawn(3)
     time = sample_times(truth, motion.duration, jitter_rng)
     state = motion.at(time)
-    velocity = _dvl_velocity(scenario, state)
+    velocity = _dvl_velocity(scenario, state, _water(scenario, time, state, water_rng))
     if scenario.noise:
         speed = np.linalg.norm(velocity, axis=1, keepdims=True)
         sigma = np.hypot(truth.velocity_std_m_s, truth.velocity_std_fraction * speed)
@@ -172,9 +172,62 @@ def simulate_dvl(
     return dvl, calibration
 
 
-def _dvl_velocity(scenario: Scenario, state: TrueState) -> Array:
+def _water(scenario: Scenario, time: Array, state: TrueState, rng: np.random.Generator) -> Array:
+    """Return the velocity of what the DVL is locked on, (M, 3), m/s."""
     truth: DvlTruth = scenario.dvl
-    current = np.array(scenario.current_m_s) if truth.reference == "water" else np.zeros(3)
+    water = np.zeros((time.size, 3))
+    if truth.reference == "bottom":
+        return water
+    water += np.array(scenario.current_m_s)
+    moving = truth.moving_water
+    if moving is not None and scenario.noise:
+        east, north, _ = pymap3d.geodetic2enu(*state.geodetic.T, *state.geodetic[0], deg=False)
+        water[:, :2] += moving_water(
+            time,
+            np.stack([east, north], axis=1),
+            moving.std_m_s,
+            moving.correlation_time_s,
+            moving.correlation_distance_m,
+            rng,
+        )
+    return water
+
+
+def moving_water(
+    time: Array,
+    place: Array,
+    std_m_s: float,
+    tau_s: float,
+    distance_m: float,
+    rng: np.random.Generator,
+) -> Array:
+    """Return a current that changes with time and place, east and north, (M, 2), m/s.
+
+    Its covariance falls as exp(-|t| / tau - |x| / distance); it is drawn once a minute, and
+    linear in between.
+
+    Parameters
+    ----------
+    time : ndarray, shape (M,), s
+        In order.
+    place : ndarray, shape (M, 2), m
+        East and north.
+    std_m_s, tau_s, distance_m : float
+        Standard deviation, correlation time and distance.
+    rng : numpy.random.Generator
+        Source of the numbers.
+    """
+    knots = np.append(np.arange(time[0], time[-1], 60.0), time[-1])
+    at = np.stack([np.interp(knots, time, x) for x in place.T], axis=1)
+    apart = np.linalg.norm(at[:, None] - at[None], axis=2)
+    later = np.abs(knots[:, None] - knots[None])
+    covariance = np.exp(-later / tau_s - apart / distance_m) + 1e-9 * np.eye(knots.size)
+    draws = std_m_s * np.linalg.cholesky(covariance) @ rng.standard_normal((knots.size, 2))
+    return np.stack([np.interp(time, knots, x) for x in draws.T], axis=1)
+
+
+def _dvl_velocity(scenario: Scenario, state: TrueState, current: Array) -> Array:
+    truth: DvlTruth = scenario.dvl
     bRn = np.swapaxes(rotation_from_rph(state.rph, scenario.body_axes), 1, 2)
     at_imu = apply(bRn, state.v_n - current)
     at_dvl = at_imu + np.cross(state.omega_eb_b, truth.lever_arm_m)

@@ -28,6 +28,8 @@ depth: {...}                       # DepthTruth, optional
 star: {...}                        # StarTruth, optional
 beacons: {...}                     # BeaconTruth, optional
 dvl_beams: {...}                   # DvlBeamsTruth, optional
+attitude: {...}                    # AttitudeTruth, optional, beside or in place of imu
+ins: {...}                         # InsTruth, optional, likewise
 turntable: {...}                   # TurntableTruth, optional: turns IMU and DVL on the ship
 heading: {...}                     # without imu: HeadingTruth, LogTruth, DepthTruth, and
 log: {...}                         # beacons make a planar trial
@@ -184,8 +186,8 @@ class _Scenario(Section, frozen=True, kw_only=True):
 
     @property
     def planar(self) -> bool:
-        """Whether the trial is planar: without an IMU."""
-        return self.imu is None
+        """Whether the trial is planar: with heading and log, and without an IMU."""
+        return self.imu is None and not {"attitude", "ins"} & set(self.aids)
 
     @property
     def aids(self) -> dict[str, SimulatedInstrument]:
@@ -296,6 +298,8 @@ def _checked(scenario: Scenario) -> Scenario:
 def _check_sections(scenario: Scenario) -> None:
     """Raise ConfigError unless the sensors make a trial, with an IMU or planar."""
     given = {name for name in _INSTRUMENTS if getattr(scenario, name) is not None}
+    if not given & {"imu", "heading", "log"} and given & {"attitude", "ins"}:
+        return
     known = INSTRUMENTS.keys()
     wrong = sorted(given - known - {"imu"} if "imu" in given else given - set(PLANAR_INSTRUMENTS))
     missing = [] if "imu" in given else [name for name in PLANAR_INSTRUMENTS if name not in given]

@@ -60,7 +60,8 @@ def _stated(scenario: Scenario, seed: int) -> dict[str, Fault]:
             out |= _varying_dvl(scenario.dvl)
         if np.any(bias):
             out["dvl bias"] = faults.dvl_bias(bias.tolist())
-    out |= _imu_errors(scenario, seed)
+    if scenario.imu is not None:
+        out |= _imu_errors(scenario, seed)
     for section in ("gnss", "dvl", "dvl_beams", "imu"):
         truth = getattr(scenario, section)
         if truth is None:

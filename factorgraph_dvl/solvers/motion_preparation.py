@@ -18,9 +18,10 @@ from factorgraph_dvl.graph.priors import prior_mean
 from factorgraph_dvl.imu.attitude_record import AttitudeRecord, level_axes
 from factorgraph_dvl.initialization.dvl_mounting import initial_mountings
 from factorgraph_dvl.initialization.record_clocks import clock_lags
-from factorgraph_dvl.initialization.track_velocity import Track, track_of
+from factorgraph_dvl.initialization.track_velocity import Track, track_of, velocities
 from factorgraph_dvl.sensors.attitude import Attitude
 from factorgraph_dvl.sensors.finding import Code, Finding
+from factorgraph_dvl.sensors.gnss import Gnss
 from factorgraph_dvl.sensors.ins import Ins
 from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.sensors.protocol import Motion, Observation
@@ -104,7 +105,7 @@ def prepare_motion(trial: Trial) -> MotionPreparation:
             )
     frame = trial.frame()
     record = AttitudeRecord(sensor, trial.body_axes, estimated=trial.estimates_noise(sensor))
-    track = track_of(source, frame)
+    track = _of_body(track_of(source, frame), source, record)
     observations, processes, estimated = _observed(trial, frame)
     parameters = _parameters(trial)
     values = {p.name: prior_mean(p) for p in parameters}
@@ -131,6 +132,14 @@ def prepare_motion(trial: Trial) -> MotionPreparation:
     )
 
 
+def _of_body(track: Track, source: Gnss | Ins, record: AttitudeRecord) -> Track:
+    """Return the track of the body from that of an antenna, whose lever arm turns with it."""
+    nRb = rotation_from_rph(record.rph_at(track.time), record.body_axes)
+    arm = nRb @ np.array(source.settings.lever_arm_m)
+    p_n = track.p_n - arm
+    return Track(track.time, p_n, track.v_n - velocities(track.time, arm))
+
+
 def _observed(
     trial: Trial, frame: LocalFrame
 ) -> tuple[tuple[Observation, ...], tuple[Process, ...], frozenset[str]]:
@@ -151,13 +160,13 @@ def _observed(
         if isinstance(aid, Ins):
             share = np.sqrt(aid.settings.correlated_share)
             total = np.median(aid.total_std, axis=0)
-            for o, std in zip(
+            for seen, std in zip(
                 aid.motion_observations(frame), (total[:3], total[3:6]), strict=True
             ):
-                observations.append(o)
+                observations.append(seen)
                 if share > 0.0:
                     tau = aid.settings.correlation_time_s
-                    processes.append(Process(o.label, share * std, tau))
+                    processes.append(Process(seen.label, share * std, tau))
             continue
         for o in aid.observations(frame, trial.body_axes):
             observations.append(o)

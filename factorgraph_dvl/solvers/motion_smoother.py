@@ -46,6 +46,10 @@ _SEARCHES = 3
 # Limits of the strength of a current: m/s and s, by its logarithm.
 _CURRENT_STD = (np.log(0.005), np.log(2.0))
 _CURRENT_TIME = (np.log(60.0), np.log(2e5))
+# Density of acceleration, relative to that in turns, which changes nothing; and the largest step
+# of its logarithm.
+_NEGLIGIBLE = 1e-3
+_LARGEST_STEP = 3.0
 # Range of the density of acceleration, m²/s³. Chosen: regular, and beyond what vessels do.
 _DENSITY = (1e-10, 1e3)
 
@@ -81,6 +85,9 @@ class SmoothedMotion:
     findings: tuple[Finding, ...]
 
 
+DEBUG = False
+
+
 def smooth_motion(prepared: MotionPreparation, report: Progress) -> SmoothedMotion:
     """Return the minimum of a problem whose noise and prior have the strength that fits best.
 
@@ -96,6 +103,7 @@ def smooth_motion(prepared: MotionPreparation, report: Progress) -> SmoothedMoti
         if o.label in prepared.estimated_noise
     }
     iterations, free_current, changing = 0, prepared.current_is_free, ["all"]
+    last_moved = np.zeros_like(problem.chain.density)
     for round_ in range(_ROUNDS):
         evaluation, factors, steps, reached = _minimise(problem, states, values, report)
         iterations += steps
@@ -114,8 +122,12 @@ def smooth_motion(prepared: MotionPreparation, report: Progress) -> SmoothedMoti
         if _differ(noise, problem.noise_factors):
             changing.append("the noise of the sensors")
         chain = problem.chain
-        if np.max(np.abs(np.log(density / chain.density))) > 2.0 * _SAME:
+        moved = np.log(density / chain.density)
+        relevant = density > _NEGLIGIBLE * density.max(axis=0)
+        if np.max(np.abs(moved) * relevant) > 2.0 * _SAME:
             changing.append("the acceleration of the vessel")
+        density = chain.density * np.exp(_hastened(moved, last_moved))
+        last_moved = moved
         if free_current:
             report("current", round_, None)
             chain = _current(problem, evaluation, chain)
@@ -126,8 +138,17 @@ def smooth_motion(prepared: MotionPreparation, report: Progress) -> SmoothedMoti
             if abs(np.log(new.sigma[0] / old.sigma[0])) > 3.0 * _SAME:
                 changing.append("the current")
             free_current = len(changing) > 1 or "the current" in changing
-        if not changing:
+        if not changing or round_ == _ROUNDS - 1:
             break
+        if DEBUG:
+            print(
+                round_,
+                changing,
+                noise,
+                np.unique(density, axis=0).tolist(),
+                [p.sigma for p in chain.processes],
+                [p.tau for p in chain.processes],
+            )
         problem = problem.with_chain(replace(chain, density=density))
         problem.noise_factors = noise
     findings = prepared.findings
@@ -139,6 +160,13 @@ def smooth_motion(prepared: MotionPreparation, report: Progress) -> SmoothedMoti
     )
 
 
+def _hastened(moved: Array, before: Array) -> Array:
+    """Return steps of a fixed-point iteration that go where their ratio points (Aitken)."""
+    ratio = np.divide(moved, before, out=np.zeros_like(moved), where=np.abs(before) > 1e-6)
+    ratio = np.clip(ratio, 0.0, 0.8)
+    return np.clip(moved / (1.0 - ratio), -_LARGEST_STEP, _LARGEST_STEP)
+
+
 def _minimise(
     problem: MotionProblem, states: Array, values: dict[str, Array], report: Progress
 ) -> tuple[MotionEvaluation, Factorisation, int, bool]:
@@ -148,6 +176,7 @@ def _minimise(
     """
     evaluation = problem.evaluate(states, values)
     problem.weigh(evaluation)
+    evaluation = problem.evaluate(states, values)
     cost = problem.cost(evaluation)
     if not np.isfinite(cost):
         raise SolveError(
@@ -188,6 +217,7 @@ def _minimise(
         if share == 1.0 and steps < 3:
             # A DVL's noise follows from its speed, which a far start has wrong.
             problem.weigh(evaluation)
+            evaluation = problem.evaluate(evaluation.states, evaluation.parameters)
             cost = problem.cost(evaluation)
     return evaluation, factors, _STEPS, False
 
@@ -261,8 +291,8 @@ def _density(
     rows = problem.motion_rows(states)
     left = 1.0 - rows.leverage(covariances)
     density = problem.chain.density.copy()
-    for where in (turning, ~turning):
-        for axes in ((0, 1), (2,)):
+    for where in (turning, np.logical_not(turning)):
+        for axes in ([0, 1], [2]):
             own = [*axes, *(3 + i for i in axes)]
             freedom = float(left[where][:, own].sum())
             if freedom < _LEAST_REDUNDANCY:

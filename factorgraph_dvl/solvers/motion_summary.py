@@ -10,7 +10,7 @@ import numpy as np
 from factorgraph_dvl.geometry.rotations import frd_from_body, rph_from_rotation
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array, rotate
-from factorgraph_dvl.graph.motion_problem import ATTITUDE, MotionProblem
+from factorgraph_dvl.graph.motion_problem import ATTITUDE, CURRENT, MotionProblem
 from factorgraph_dvl.sensors.attitude import HEADING_OFFSET, heading_error
 from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.sensors.parameters import UNITS, Parameter
@@ -192,12 +192,13 @@ def _causes(
         squares = np.sum(k**2, axis=0)
         if rows is motion:
             first = (chain.first()[:, None] * cov.with_constants[0]) @ gain.T
-            squares[:] += first**2
+            squares += first**2
             variances[_MOTION_NOISE] = squares[:6].sum(axis=0)
-            for p in chain.processes:
-                name = p.name if p.name in (ATTITUDE, "current") else f"lasting errors of {p.name}"
-                name = "lasting errors of the attitude" if p.name == ATTITUDE else name
-                variances[name] = squares[chain.place(p.name)].sum(axis=0)
+            for process in chain.processes:
+                name = f"lasting errors of {process.name}"
+                if process.name == CURRENT:
+                    name = "changes of the current"
+                variances[name] = squares[chain.place(process.name)].sum(axis=0)
         else:
             variances[f"noise of {rows.source}"] = squares.sum(axis=0)
     if problem.parameters:
