@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
+from scipy.signal import savgol_coeffs, savgol_filter
 
 from factorgraph_dvl.errors import DataError
 from factorgraph_dvl.geometry.earth import LocalFrame
@@ -24,6 +26,9 @@ _NEIGHBOURS = np.array([-1.0, 4.0, 4.0, -1.0]) / 6.0
 _AMPLIFIED = np.sqrt(1.0 + _NEIGHBOURS @ _NEIGHBOURS)
 # Standard deviation of a spline's slope at its knots for white noise of 1 in knots 1 s apart.
 _SLOPE = 1.22
+# Span, s, of a local polynomial and its degree. Chosen: waves that move a ship are longer.
+_SMOOTHED = 1.5
+_DEGREE = 3
 # Sample intervals, and s, that make a gap, in which attitude is not known. Chosen: a cubic through
 # longer ones is a guess.
 _GAP_INTERVALS = 3.5
@@ -102,11 +107,24 @@ class AttitudeRecord:
                 where=at_row(sensor.source, np.flatnonzero(known)[steep[0]]),
                 expected="a vehicle that does not stand on end",
             )
+        interval = float(np.median(np.diff(self.time)))
+        noise = _white(rph)
+        width = _width(interval)
+        rph = _smoothed(self.time, rph, width, 1.5 * interval)
         self._spline = CubicSpline(self.time, rph)
         self._rate, self._change = self._spline.derivative(), self._spline.derivative(2)
         self.interval = float(np.median(np.diff(self.time)))
         stated = sensor.error.white
-        self.white = np.maximum(_white(rph), 0.0) if estimated else stated
+        self.white = noise if estimated else stated
+        # What the smoothing leaves of white noise, in angle and rate.
+        gain, slope = (
+            np.linalg.norm(savgol_coeffs(width, _DEGREE, deriv=d, delta=self.interval))
+            if width
+            else alone
+            for d, alone in ((0, 1.0), (1, _SLOPE / self.interval))
+        )
+        self._rate_sigma = float(slope) * self.white
+        self.white = float(gain) * self.white
         if isinstance(sensor, Attitude) and not sensor.measures_tilt:
             self.white = np.where([True, True, False], stated, self.white)
         self._gap = max(_GAP_INTERVALS * self.interval, _LEAST_GAP)
@@ -139,13 +157,12 @@ class AttitudeRecord:
         by_rph: Array = np.asarray(
             np.linalg.inv(rph_jacobian(true, self.body_axes)), dtype=np.float64
         )
-        sigma = _SLOPE / self.interval * self.white
         return BodyAttitude(
             rph=rph,
             nRb=nRl @ rotation_from_rph(true, self.body_axes),
             omega_eb_b=rotate(by_rph, np.asarray(self._rate(time))),
             alpha_b=rotate(by_rph, np.asarray(self._change(time))),
-            omega_sigma=np.sqrt(by_rph**2 @ sigma**2),
+            omega_sigma=np.sqrt(by_rph**2 @ self._rate_sigma**2),
             theta_by_rph=by_rph,
         )
 
@@ -171,6 +188,27 @@ def level_axes(frame: LocalFrame, p_n: Array) -> Array:
     """Return the rotations (M, 3, 3) of the local-level axes at positions (M, 3) to n."""
     lat, lon, _ = frame.geodetic(p_n)
     return frame.level_from_tangent(lat, lon).transpose(0, 2, 1)
+
+
+def _width(interval: float) -> int:
+    """Return the samples, an odd number, over which a record is smoothed; 0 = it is not."""
+    width = 2 * int(0.5 * _SMOOTHED / interval) + 1
+    return width if width > _DEGREE + 1 else 0
+
+
+def _smoothed(time: Array, rph: Array, width: int, gap: float) -> Array:
+    """Return angles (M, 3) with local cubics in place of samples, apart for each arc.
+
+    A spline through white noise has slopes that follow it: a clock that moves would climb them.
+    """
+    out = rph.copy()
+    if not width:
+        return out
+    edges = np.concatenate([[0], np.flatnonzero(np.diff(time) > gap) + 1, [time.size]])
+    for a, b in itertools.pairwise(edges.tolist()):
+        if b - a >= width:
+            out[a:b] = savgol_filter(rph[a:b], width, _DEGREE, axis=0)
+    return out
 
 
 def _white(rph: Array) -> Array:

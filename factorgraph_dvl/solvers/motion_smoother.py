@@ -85,9 +85,6 @@ class SmoothedMotion:
     findings: tuple[Finding, ...]
 
 
-DEBUG = False
-
-
 def smooth_motion(prepared: MotionPreparation, report: Progress) -> SmoothedMotion:
     """Return the minimum of a problem whose noise and prior have the strength that fits best.
 
@@ -140,15 +137,6 @@ def smooth_motion(prepared: MotionPreparation, report: Progress) -> SmoothedMoti
             free_current = len(changing) > 1 or "the current" in changing
         if not changing or round_ == _ROUNDS - 1:
             break
-        if DEBUG:
-            print(
-                round_,
-                changing,
-                noise,
-                np.unique(density, axis=0).tolist(),
-                [p.sigma for p in chain.processes],
-                [p.tau for p in chain.processes],
-            )
         problem = problem.with_chain(replace(chain, density=density))
         problem.noise_factors = noise
     findings = prepared.findings
