@@ -17,11 +17,11 @@ class NormalEquations:
     Parameters
     ----------
     nodes : int
-        K.
+        Number K of nodes.
     size : int
-        n.
+        Number n of states of a node.
     constants : int
-        c.
+        Number c of constants.
 
     Attributes
     ----------

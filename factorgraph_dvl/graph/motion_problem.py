@@ -450,15 +450,15 @@ class MotionProblem:
         found[rate] = late * (time - self.zero)[:, None, None]
         return found
 
-    def with_chain(self, chain: MotionChain) -> MotionProblem:
-        """Return the same problem with another strength of its prior."""
+    def with_chain(self, chain: MotionChain, start: Array | None = None) -> MotionProblem:
+        """Return the same problem with another prior, and states to start from if nodes moved."""
         out = MotionProblem(
             chain,
             self.frame,
             self.attitude,
             self.observations,
             self.all_parameters,
-            self._start,
+            self._start if start is None else start,
         )
         out.noise_factors, out.rejected = self.noise_factors, self.rejected
         return out

@@ -88,9 +88,8 @@ class AttitudeRecord:
     def __init__(self, sensor: Attitude | Ins, body_axes: BodyAxes, *, estimated: bool) -> None:
         rph = sensor.rph
         if isinstance(sensor, Attitude) and not sensor.measures_tilt:
-            rph = rph * np.array([0.0, 0.0, 1.0])
-            rph = np.where(np.isnan(sensor.rph[:, :2]).all(axis=1)[:, None], 0.0, rph)
-            rph = np.column_stack([rph[:, :2], sensor.rph[:, 2]])
+            # Tilt that no row has is zero.
+            rph = np.column_stack([np.zeros((sensor.time.size, 2)), rph[:, 2]])
         known: NDArray[np.bool_] = np.asarray((~np.isnan(rph)).all(axis=1))
         if known.sum() < 5:
             raise DataError(

@@ -9,7 +9,9 @@ from numpy.typing import NDArray
 
 from factorgraph_dvl.errors import DataError
 from factorgraph_dvl.geometry.earth import LocalFrame
+from factorgraph_dvl.geometry.rotations import rotation_from_rph
 from factorgraph_dvl.geometry.vectors import Array, interpolate
+from factorgraph_dvl.imu.attitude_record import AttitudeRecord
 from factorgraph_dvl.sensors.gnss import Gnss
 from factorgraph_dvl.sensors.ins import Ins
 
@@ -61,6 +63,14 @@ def track_of(sensor: Gnss | Ins, frame: LocalFrame) -> Track:
         v_n = np.einsum("mji,mj->mi", level[measured], velocity[measured])
         return Track(time, p_n, interpolate(time, time[measured], v_n))
     return Track(time, p_n, velocities(time, p_n))
+
+
+def body_track(sensor: Gnss | Ins, frame: LocalFrame, attitude: AttitudeRecord) -> Track:
+    """Return the track of the body: that of an antenna less its lever arm, which turns with it."""
+    track = track_of(sensor, frame)
+    nRb = rotation_from_rph(attitude.rph_at(track.time), attitude.body_axes)
+    arm_n = nRb @ np.array(sensor.settings.lever_arm_m)
+    return Track(track.time, track.p_n - arm_n, track.v_n - velocities(track.time, arm_n))
 
 
 def velocities(time: Array, p_n: Array) -> Array:

@@ -18,10 +18,9 @@ from factorgraph_dvl.graph.priors import prior_mean
 from factorgraph_dvl.imu.attitude_record import AttitudeRecord, level_axes
 from factorgraph_dvl.initialization.dvl_mounting import initial_mountings
 from factorgraph_dvl.initialization.record_clocks import clock_lags
-from factorgraph_dvl.initialization.track_velocity import Track, track_of, velocities
+from factorgraph_dvl.initialization.track_velocity import Track, body_track
 from factorgraph_dvl.sensors.attitude import Attitude
 from factorgraph_dvl.sensors.finding import Code, Finding
-from factorgraph_dvl.sensors.gnss import Gnss
 from factorgraph_dvl.sensors.ins import Ins
 from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.sensors.protocol import Motion, Observation
@@ -105,7 +104,7 @@ def prepare_motion(trial: Trial) -> MotionPreparation:
             )
     frame = trial.frame()
     record = AttitudeRecord(sensor, trial.body_axes, estimated=trial.estimates_noise(sensor))
-    track = _of_body(track_of(source, frame), source, record)
+    track = body_track(source, frame, record)
     observations, processes, estimated = _observed(trial, frame)
     parameters = _parameters(trial)
     values = {p.name: prior_mean(p) for p in parameters}
@@ -130,14 +129,6 @@ def prepare_motion(trial: Trial) -> MotionPreparation:
         current_is_free=chain.has(CURRENT) and _current(trial)[2],
         findings=(*trial.notes, *_notes(trial)),
     )
-
-
-def _of_body(track: Track, source: Gnss | Ins, record: AttitudeRecord) -> Track:
-    """Return the track of the body from that of an antenna, whose lever arm turns with it."""
-    nRb = rotation_from_rph(record.rph_at(track.time), record.body_axes)
-    arm = nRb @ np.array(source.settings.lever_arm_m)
-    p_n = track.p_n - arm
-    return Track(track.time, p_n, track.v_n - velocities(track.time, arm))
 
 
 def _observed(
@@ -193,11 +184,15 @@ def _current(trial: Trial) -> tuple[float, float, bool]:
 
 
 def _parameters(trial: Trial) -> tuple[Parameter, ...]:
-    """Return the parameters of all sensors; without GNSS, the INS has the clock of the trial."""
+    """Return the parameters of all sensors; the clock of the positions is that of the trial.
+
+    Without an IMU only differences of clocks show.
+    """
+    section = "ins" if trial.gnss is None else "gnss"
     out = []
     for aid in trial.aids:
         for p in aid.parameters():
-            reference = trial.gnss is None and isinstance(aid, Ins) and p.name in aid.clock.names
+            reference = aid.section == section and p.stem.endswith(("time_offset", "clock_rate"))
             out.append(replace(p, sigma=np.zeros_like(p.sigma)) if reference else p)
     return tuple(out)
 

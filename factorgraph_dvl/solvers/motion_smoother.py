@@ -10,7 +10,7 @@ from scipy.optimize import minimize
 from scipy.stats import chi2
 
 from factorgraph_dvl.errors import SolveError
-from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.geometry.vectors import Array, rotate
 from factorgraph_dvl.graph.bordered_chain import Covariances, Factorisation
 from factorgraph_dvl.graph.motion_chain import MotionChain
 from factorgraph_dvl.graph.motion_problem import (
@@ -24,18 +24,21 @@ from factorgraph_dvl.solution import Progress
 from factorgraph_dvl.solvers.motion_preparation import MotionPreparation
 from factorgraph_dvl.statistics.robust_weights import robust_scale
 
-# Decrease of the cost that the linear model still promises at a minimum, and steps to it.
-_CONVERGED = 1e-4
-_STEPS = 40
+# Decrease of the cost that the linear model still promises at a minimum, and steps of a round.
+_CONVERGED = 1e-3
+_STEPS = 6
 # Rounds of weights, noise and strength after which they count as not settled, and the relative
 # change of a standard deviation from which on there is another. Measured: most take four.
-_ROUNDS = 12
+_ROUNDS = 25
 _SAME = 0.03
 # Degrees of freedom of what is known of a standard deviation: as of the sensors with an IMU.
 _PRIOR_FREEDOM = 0.4
 _LEAST_REDUNDANCY = 10.0
 # Least factor on stated noise; residuals of less are those of a record that was smoothed.
 _LEAST_FACTOR = 0.1
+# Clock whose pings lie between nodes, and how far off the middle they may be, in intervals.
+_DVL_CLOCK = "time_offset_s"
+_OFF_CENTRE = 0.1
 # Probability with which a good measurement passes the gate, factor on the gate from which on it is
 # worth a search, and the share of outliers from which on it is the model that is wrong.
 _GATE = 0.999
@@ -101,6 +104,7 @@ def smooth_motion(prepared: MotionPreparation, report: Progress) -> SmoothedMoti
     }
     iterations, free_current, changing = 0, prepared.current_is_free, ["all"]
     last_moved = np.zeros_like(problem.chain.density)
+    at_clock = float(values[_DVL_CLOCK][0]) if _DVL_CLOCK in values else 0.0
     for round_ in range(_ROUNDS):
         evaluation, factors, steps, reached = _minimise(problem, states, values, report)
         iterations += steps
@@ -109,6 +113,15 @@ def smooth_motion(prepared: MotionPreparation, report: Progress) -> SmoothedMoti
         changing = []
         if not reached:
             changing.append("the minimum")
+        moved_clock = float(values[_DVL_CLOCK][0]) - at_clock if _DVL_CLOCK in values else 0.0
+        if abs(moved_clock) > _OFF_CENTRE * float(np.median(np.diff(problem.chain.time))):
+            # Pings stay between the nodes: one at a node has a state to itself, which fits it at
+            # any time, and would hold its clock there.
+            changing.append("the times of measurements")
+            problem, states = _shifted(problem, states, -moved_clock)
+            at_clock = float(values[_DVL_CLOCK][0])
+            if round_ < _ROUNDS - 1:
+                continue
         rejected = _rejected(problem, evaluation)
         if round_ < _SEARCHES and not _same_rows(rejected, problem.rejected):
             changing.append("which measurements are outliers")
@@ -146,6 +159,15 @@ def smooth_motion(prepared: MotionPreparation, report: Progress) -> SmoothedMoti
     return SmoothedMotion(
         problem, evaluation, factors, covariances, not changing, iterations, findings
     )
+
+
+def _shifted(problem: MotionProblem, states: Array, by: float) -> tuple[MotionProblem, Array]:
+    """Return a problem whose nodes are later by so many seconds, and their states."""
+    chain = problem.chain
+    time = chain.time + by
+    at = chain.at(np.clip(time, chain.time[0], chain.time[-1]))
+    x = rotate(at.before, states[at.node]) + rotate(at.after, states[at.node + 1])
+    return problem.with_chain(replace(chain, time=time), x), x
 
 
 def _hastened(moved: Array, before: Array) -> Array:
@@ -286,7 +308,8 @@ def _density(
             if freedom < _LEAST_REDUNDANCY:
                 continue
             squares = float(np.sum(rows.residual[where][:, own] ** 2))
-            density[np.ix_(where, axes)] *= (squares + _PRIOR_FREEDOM) / (freedom + _PRIOR_FREEDOM)
+            ratio = (squares + _PRIOR_FREEDOM) / (freedom + _PRIOR_FREEDOM)
+            density[np.ix_(np.flatnonzero(where), np.array(axes))] *= ratio
     return np.clip(density, *_DENSITY)
 
 
