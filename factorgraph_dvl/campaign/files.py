@@ -31,6 +31,20 @@ OWNED = (
 )
 
 
+def write_begun(out: Path) -> None:
+    """Write a campaign.json that says that a campaign has begun, unless there is one.
+
+    A run that is killed leaves at least it, by which the next knows that it goes on.
+
+    Parameters
+    ----------
+    out : path-like
+        Folder of the campaign.
+    """
+    if not (out / CAMPAIGN_FILE).exists():
+        write_whole(out / CAMPAIGN_FILE, _json({"format": 1, "ended": False}))
+
+
 def write_campaign(campaign: Campaign, out: Path) -> None:
     """Write the tables of a campaign, campaign.json last.
 
@@ -79,7 +93,8 @@ def write_seeds(
                 values[i] = r.deviation[k], np.sqrt(r.covariance[k][k])
         columns |= {f"{name}_error": values[:, 0], f"{name}_std": values[:, 1]}
     _write_table(out / SEEDS_FILE, columns)
-    content: dict[str, Any] = {"format": 1, "scenario": str(scenario), "seeds": len(records)}
+    content: dict[str, Any] = {"format": 1, "ended": True, "scenario": str(scenario)}
+    content["seeds"] = len(records)
     content["failed"] = [{"seed": int(r.name), "error": r.error} for r in records if not r.done]
     if found is not None:
         content |= {
@@ -102,6 +117,7 @@ def campaign_content(campaign: Campaign) -> dict[str, Any]:
     """
     content: dict[str, Any] = {
         "format": 1,
+        "ended": True,
         "trials": [
             {
                 "name": t.name,

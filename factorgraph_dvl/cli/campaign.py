@@ -48,8 +48,7 @@ def campaign(
     Examples:
       factorgraph-dvl campaign monday tuesday --out campaign
     """
-    from factorgraph_dvl.campaign.files import CAMPAIGN_FILE, OWNED
-    from factorgraph_dvl.campaign.trial_run import TRIALS_FOLDER
+    from factorgraph_dvl.campaign.files import CAMPAIGN_FILE, OWNED, write_begun
     from factorgraph_dvl.errors import ConfigError
 
     if workers is not None and scheduler is not None:
@@ -63,8 +62,9 @@ def campaign(
             kind = "a trial folder" if seeds is None else "a scenario, a YAML file"
             raise ConfigError("does not exist", where=str(path), expected=kind)
     # What an earlier run of this command left is its own, whether it ended or was killed.
-    resumed = any((out / name).exists() for name in (CAMPAIGN_FILE, TRIALS_FOLDER, "seeds"))
+    resumed = (out / CAMPAIGN_FILE).exists()
     claim_output(out, force=force or resumed, owned=OWNED, inputs=trials)
+    write_begun(out)
     found = workers, scheduler, quiet
     if seeds is not None:
         _run_seeds(trials[0].resolve(), seeds, out.resolve(), *found)
@@ -160,7 +160,6 @@ def _run(
     found: dict[int, RunRecord] = {}
     count = min(workers or default_workers(), len(runs))
     with connected(count, scheduler) as client, CountLine(len(runs), quiet=quiet) as progress:
-        out.mkdir(parents=True, exist_ok=True)
         if not quiet:
             link = client.dashboard_link
             stderr().print(f"Dashboard: {link}", markup=False, highlight=False, soft_wrap=True)

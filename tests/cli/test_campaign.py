@@ -120,6 +120,7 @@ def test_seeds_of_a_scenario_are_consistent(run, tmp_path):
     pytest.importorskip("distributed")
     config = tmp_path / "scenario.yaml"
     data = yaml.safe_load((CONFIGS / "seed-a-phase-90.yaml").read_text(encoding="utf-8"))
+    data["start"]["speed_m_s"] = 4.0
     config.write_text(yaml.safe_dump(data | {"manoeuvres": TURNING}))
     out = tmp_path / "out"
     result = run("campaign", config, "--seeds", 8, "--out", out, "--workers", 2)
