@@ -11,10 +11,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
+from math import factorial
 
 import numpy as np
+from numpy.polynomial.polynomial import polyder, polyval, polyvander
 from scipy.interpolate import BSpline, make_interp_spline
-from scipy.signal import savgol_coeffs, savgol_filter
+from scipy.ndimage import correlate1d
 
 from factorgraph_dvl.geometry.vectors import Array
 
@@ -79,9 +81,9 @@ def best_window(values: Array, dt: float, sigma: float) -> int:
         window = 2 * half + 1
         if half * dt > _LONGEST or window >= few.shape[0]:
             break
-        weights = savgol_coeffs(window, _ORDER)
+        weights = _polynomial(window)[0]
         kept = float(weights @ weights)
-        moved = np.mean((savgol_filter(few, window, _ORDER, axis=0) - few) ** 2)
+        moved = np.mean((_filtered(few, window) - few) ** 2)
         by_motion = max(float(moved) - sigma**2 * (1.0 - 2.0 * weights[half] + kept), 0.0)
         if by_motion + sigma**2 * kept < best:
             best, width = by_motion + sigma**2 * kept, window
@@ -137,7 +139,7 @@ def smooth(
 @lru_cache(maxsize=64)
 def _gain(width: int) -> float:
     """Return the standard deviation that a window leaves of unit noise."""
-    return float(np.linalg.norm(savgol_coeffs(width, _ORDER)))
+    return float(np.linalg.norm(_polynomial(width)[0]))
 
 
 @lru_cache(maxsize=64)
@@ -156,13 +158,40 @@ def _slope_gain(width: int) -> float:
 def _local_cubics(values: Array, width: int, deriv: int = 0) -> Array:
     """Return the values (N, 3), or a derivative at unit intervals, of local cubics."""
     if values.shape[0] > _SHORT:
-        return np.asarray(savgol_filter(values, width, _ORDER, deriv=deriv, axis=0))
+        return _filtered(values, width, deriv)
     return np.asarray(_filter_matrix(values.shape[0], width, deriv) @ values)
 
 
 @lru_cache(maxsize=64)
 def _filter_matrix(count: int, width: int, deriv: int) -> Array:
-    return np.asarray(savgol_filter(np.eye(count), width, _ORDER, deriv=deriv, axis=0))
+    return _filtered(np.eye(count), width, deriv)
+
+
+def _filtered(values: Array, width: int, deriv: int = 0) -> Array:
+    """Return the filter of Savitzky and Golay; the first and last window serve their ends.
+
+    As `scipy.signal` has it, which takes half as long to load as a short trial to solve.
+    """
+    half = width // 2
+    fit = _polynomial(width)
+    out = correlate1d(values, fit[deriv] * factorial(deriv), axis=0, mode="nearest")
+    place = np.arange(-half, 0.0)
+    for ends, at, rows in (
+        (values[:width], place, slice(half)),
+        (values[-width:], -place[::-1], slice(-half, None)),
+    ):
+        out[rows] = polyval(at, polyder(fit @ ends, deriv)).T
+    return np.asarray(out)
+
+
+@lru_cache(maxsize=64)
+def _polynomial(width: int) -> Array:
+    """Return what takes samples (width, ...) to coefficients of their polynomial, lowest first.
+
+    Places are counted from the middle.
+    """
+    half = width // 2
+    return np.asarray(np.linalg.pinv(polyvander(np.arange(-half, half + 1.0), _ORDER)))
 
 
 def _interpolant(time: Array, values: Array, degree: int) -> BSpline:

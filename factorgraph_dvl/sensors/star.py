@@ -9,7 +9,7 @@ from typing import Annotated, ClassVar, Self
 import msgspec
 import numpy as np
 from scipy.spatial.transform import Rotation
-from scipy.stats import chi2
+from scipy.special import chdtrc
 
 from factorgraph_dvl.errors import ConfigError, DataError
 from factorgraph_dvl.geometry.celestial import (
@@ -279,7 +279,7 @@ class Star:
             return ()
         square = self._star_misfits() ** 2
         freedom = 2 * v.time.size - 3 * self.time.size
-        if chi2.sf(square.sum(), freedom) > _BY_CHANCE:
+        if chdtrc(freedom, square.sum()) > _BY_CHANCE:
             return ()
         stars, row, which = np.unique(
             np.round(v.inertial, 4), axis=0, return_index=True, return_inverse=True

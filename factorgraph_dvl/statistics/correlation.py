@@ -17,6 +17,10 @@ _LOG_TIME = np.log(3.0)
 # Times, s, from which one that nothing is known of is searched. Chosen: of filters in receivers,
 # and of the sea.
 _STARTS = (1.0, 10.0)
+# Bounds of the search: logarithms of a variance over that of all, and of a time in s. Chosen: far
+# outside of what residuals show, and no power of either overflows.
+_VARIANCES = np.array([-30.0, 10.0])
+_TIMES = np.array([-10.0, 20.0])
 # Fall of -2 log likelihood from which on noise counts as correlated. Measured: below 10 on clean
 # data, above 1500 where half of the variance is correlated.
 _GAIN = 20.0
@@ -87,35 +91,36 @@ def fit_correlation(
         return None
     interval = float(np.median(np.diff(time)))
     power, omega = _periodogram(time, residuals, interval)
+    size, cosine = residuals.shape[1], np.cos(omega)
 
-    def minus_log_likelihood(spectrum: Array | float) -> float:
-        return float(np.sum(np.log(spectrum) + power / spectrum))
-
-    def cost(p: Array) -> float:
-        out = minus_log_likelihood(_spectrum(p, omega, interval)[:, None])
+    def cost(p: Array) -> tuple[float, Array]:
+        spectrum, by_p = _spectrum(p, cosine, interval)
+        out = float(size * np.log(spectrum).sum() + (power / spectrum).sum())
+        gradient = by_p @ ((size - power / spectrum) / spectrum)
         if expected_time_s is not None:
-            out += 0.5 * ((p[2] - np.log(expected_time_s)) / _LOG_TIME) ** 2
-        return out
+            off = (p[2] - np.log(expected_time_s)) / _LOG_TIME
+            out += 0.5 * off**2
+            gradient[2] += off / _LOG_TIME
+        return out, gradient
 
-    level = float(power.mean())
+    level = float(power.mean()) / size
     starts = _STARTS if expected_time_s is None else (expected_time_s,)
     fits = [
         minimize(
             cost,
             [np.log(0.6 * level), np.log(0.4 * level), np.log(start)],
-            method="Nelder-Mead",
-            options={"maxiter": 400},
+            jac=True,
+            method="L-BFGS-B",
+            bounds=[np.log(level) + _VARIANCES, np.log(level) + _VARIANCES, _TIMES],
+            options={"ftol": 1e-12},
         )
         for start in starts
     ]
     best = min(fits, key=lambda fit: fit.fun)
     white, correlated, tau = np.exp(best.x)
-    found = Correlation(
-        float(white),
-        float(correlated),
-        float(tau),
-        2.0 * (minus_log_likelihood(np.full((omega.size, 1), level)) - float(best.fun)),
-    )
+    alone = power.size * size * np.log(level) + float(power.sum()) / level
+    gain = 2.0 * (alone - float(best.fun))
+    found = Correlation(float(white), float(correlated), float(tau), gain)
     longest = _LONGEST * float(time[-1] - time[0])
     if found.gain < _GAIN:
         return None
@@ -128,18 +133,25 @@ def fit_correlation(
 
 
 def _periodogram(time: Array, residuals: Array, interval: float) -> tuple[Array, Array]:
-    """Return power (F, d) of unit white noise 1, and angular frequencies (F,) per sample."""
+    """Return power (F,) of unit white noise d, and angular frequencies (F,) per sample."""
     steps = np.minimum(np.round(np.diff(time) / interval), _LONGEST_GAP)
     place = np.concatenate([[0], np.cumsum(steps)]).astype(int)
     grid = np.zeros((place[-1] + 1, residuals.shape[1]))
     grid[place] = residuals - residuals.mean(axis=0)
-    power = np.abs(np.fft.rfft(grid, axis=0)) ** 2 / time.size
+    power = np.sum(np.abs(np.fft.rfft(grid, axis=0)) ** 2, axis=1) / time.size
     omega = np.asarray(2.0 * np.pi * np.fft.rfftfreq(grid.shape[0]), dtype=float)
     return power[_SKIPPED:], omega[_SKIPPED:]
 
 
-def _spectrum(p: Array, omega: Array, interval: float) -> Array:
-    """Return the spectral density, (F,), of logarithms of variances and correlation time."""
-    phi = np.exp(-interval / np.exp(p[2]))
-    process = (1.0 - phi**2) / (1.0 - 2.0 * phi * np.cos(omega) + phi**2)
-    return np.asarray(np.exp(p[0]) + np.exp(p[1]) * process)
+def _spectrum(p: Array, cosine: Array, interval: float) -> tuple[Array, Array]:
+    """Return the spectral density, (F,), of logarithms of variances and correlation time.
+
+    And its derivatives by them, (3, F); `cosine` is that of the angular frequency.
+    """
+    white, correlated, time = np.exp(p)
+    phi = np.exp(-interval / time)
+    denominator = 1.0 - 2.0 * phi * cosine + phi**2
+    process = correlated * (1.0 - phi**2) / denominator
+    by_phi = -2.0 * (phi * correlated + process * (phi - cosine)) / denominator
+    by_p = np.stack([np.full_like(process, white), process, by_phi * phi * interval / time])
+    return white + process, by_p

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from factorgraph_dvl.geometry.vectors import Array
 
@@ -63,7 +63,7 @@ class Truncation:
         self._apart = apart
         used = np.isfinite(residuals)
         freedom = np.ones(used.shape) if apart else used.sum(axis=1, keepdims=True)
-        self._gate = chi2.isf(1.0 - _GATE, np.maximum(freedom, 1))
+        self._gate = chdtri(np.maximum(freedom, 1), 1.0 - _GATE)
         largest = float(np.max(self.squares(residuals) / self._gate, initial=0.0))
         self.worth_it = largest > _WORTH
         self._mu = 1.0 / max(2.0 * largest - 1.0, 1e-9)
@@ -107,7 +107,7 @@ def rejection_cost(weights: Array, components: int) -> Array:
         Number d of components.
     """
     freedom = 1 if weights.shape[1] == components else components
-    return 0.5 * chi2.isf(1.0 - _GATE, freedom) * np.sum(1.0 - weights, axis=1)
+    return 0.5 * chdtri(freedom, 1.0 - _GATE) * np.sum(1.0 - weights, axis=1)
 
 
 def windows(time: Array, rejected: BoolArray, used: BoolArray) -> BoolArray:

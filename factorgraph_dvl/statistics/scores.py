@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import gtsam
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtrc
 
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.statistics.square_root_information import SquareRootInformation
@@ -36,7 +36,8 @@ class Score:
     @property
     def log10_p(self) -> float:
         """Logarithm of the probability of a larger chi2 by chance; -inf where it underflows."""
-        return float(chi2.logsf(self.chi2, self.freedom) / np.log(10.0))
+        with np.errstate(divide="ignore"):
+            return float(np.log10(chdtrc(self.freedom, self.chi2)))
 
     def divided(self, scatter: float) -> Score:
         """Return the test where scores scatter more, in variance, than white noise makes them."""
