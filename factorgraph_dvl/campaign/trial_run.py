@@ -9,6 +9,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from pathlib import Path
 from time import perf_counter
 
@@ -97,11 +98,23 @@ def run_trial(trial: str, label: str, out: str, options: Sequence[str]) -> RunRe
     return record
 
 
-def _describe(record: RunRecord, trial: Path) -> None:
-    """Take name, epoch and the joint prior of the DVL from the settings of a trial."""
+def name_of(trial: Path) -> str:
+    """Return the name of a trial; empty if its trial.yaml cannot be read."""
+    with suppress(FactorgraphDvlError, OSError):
+        return _settings_of(trial)[1]
+    return ""
+
+
+def _settings_of(trial: Path) -> tuple[TrialSettings, str, Path]:
+    """Return the settings of a trial, its name and folder."""
     folder, file = locate(trial)
     settings = parse_yaml(read_text(file), TrialSettings, source=file.name)
-    record.name = settings.name or folder.resolve().name
+    return settings, settings.name or folder.resolve().name, folder
+
+
+def _describe(record: RunRecord, trial: Path) -> None:
+    """Take name, epoch and the joint prior of the DVL from the settings of a trial."""
+    settings, record.name, folder = _settings_of(trial)
     record.epoch = settings.epoch
     dvl = settings.aids.get("dvl")
     if not isinstance(dvl, DvlSettings) or isinstance(dvl.calibration, UnsetType):

@@ -17,7 +17,6 @@ from factorgraph_dvl.campaign.record import RunRecord
 from factorgraph_dvl.campaign.trial_run import TRIALS_FOLDER
 from factorgraph_dvl.errors import ConfigError, DataError
 from factorgraph_dvl.geometry.units import DAY
-from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.io.calibration_file import load_calibration
 from factorgraph_dvl.solution import Calibration
 
@@ -144,7 +143,12 @@ def assembled(
     if not information.names:
         return Campaign(tuple(trials), dated, None)
     days = np.array([times[i] if dated else float(i) for i in used])
-    columns = _columns(covariates or {}, [trials[i] for i in used])
+    names = [trials[i].name for i in used]
+    check_covariates(covariates or {}, names)
+    columns = {
+        covariate: np.array([values[name] for name in names])
+        for covariate, values in (covariates or {}).items()
+    }
     return Campaign(tuple(trials), dated, joint_calibration(information, days, columns))
 
 
@@ -191,20 +195,24 @@ def _number(cell: str, name: str, where: str) -> float:
     return value
 
 
-def _columns(
-    covariates: Mapping[str, Mapping[str, float]], trials: Sequence[CampaignTrial]
-) -> dict[str, Array]:
-    for name, values in covariates.items():
-        for t in trials:
-            if t.name not in values:
+def check_covariates(covariates: Mapping[str, Mapping[str, float]], names: Sequence[str]) -> None:
+    """Raise ConfigError unless covariates have a value for each trial, by name.
+
+    Parameters
+    ----------
+    covariates : mapping of str to mapping of str to float
+        Value in each trial, by covariate and the trial's name.
+    names : sequence of str
+        Of the trials.
+    """
+    for covariate, values in covariates.items():
+        for name in names:
+            if name not in values:
                 raise ConfigError(
-                    f"{name} has no value for the trial {t.name}",
+                    f"{covariate} has no value for the trial {name}",
                     where="--covariates",
                     expected="one for each trial, by the `name` in its trial.yaml",
                 )
-    return {
-        name: np.array([values[t.name] for t in trials]) for name, values in covariates.items()
-    }
 
 
 def _reason_against(calibration: Calibration, anyway: bool) -> str:

@@ -48,7 +48,7 @@ def campaign(
     Examples:
       factorgraph-dvl campaign monday tuesday --out campaign
     """
-    from factorgraph_dvl.campaign.files import CAMPAIGN_FILE, OWNED, write_begun
+    from factorgraph_dvl.campaign.files import CAMPAIGN_FILE, OWNED
     from factorgraph_dvl.errors import ConfigError
 
     if workers is not None and scheduler is not None:
@@ -64,7 +64,6 @@ def campaign(
     # What an earlier run of this command left is its own, whether it ended or was killed.
     resumed = (out / CAMPAIGN_FILE).exists()
     claim_output(out, force=force or resumed, owned=OWNED, inputs=trials)
-    write_begun(out)
     found = workers, scheduler, quiet
     if seeds is not None:
         _run_seeds(trials[0].resolve(), seeds, out.resolve(), *found)
@@ -88,10 +87,17 @@ def _run_trials(
 ) -> None:
     from factorgraph_dvl.campaign.files import write_campaign
     from factorgraph_dvl.campaign.page import write_page
-    from factorgraph_dvl.campaign.trial_run import run_trial
-    from factorgraph_dvl.campaign.trials import assembled, labels_of, read_covariates
+    from factorgraph_dvl.campaign.trial_run import name_of, run_trial
+    from factorgraph_dvl.campaign.trials import (
+        assembled,
+        check_covariates,
+        labels_of,
+        read_covariates,
+    )
 
-    follow = None if covariates is None else read_covariates(covariates)
+    follow = {} if covariates is None else read_covariates(covariates)
+    # Before hours of solving, not after.
+    check_covariates(follow, [name for path in paths if (name := name_of(path))])
     labels = labels_of(paths)
     runs: list[Run] = [
         (run_trial, (str(path.resolve()), label, str(out), tuple(options)))
@@ -156,10 +162,12 @@ def _run(
 ) -> list[RunRecord]:
     """Return the records of runs, in their order, with progress."""
     from factorgraph_dvl.campaign.cluster import connected, default_workers, records
+    from factorgraph_dvl.campaign.files import write_begun
 
     found: dict[int, RunRecord] = {}
     count = min(workers or default_workers(), len(runs))
     with connected(count, scheduler) as client, CountLine(len(runs), quiet=quiet) as progress:
+        write_begun(out)
         if not quiet:
             link = client.dashboard_link
             stderr().print(f"Dashboard: {link}", markup=False, highlight=False, soft_wrap=True)

@@ -184,6 +184,20 @@ def test_covariates_name_file_and_line(tmp_path, campaign):
         assembled([out] * 2, "ba", records, out, covariates={"t": {"dive 2": 1.0}})
 
 
+def test_the_joint_calibration_of_one_trial_is_its_own(campaign):
+    found, out = campaign
+    (trial,) = [t for t in found.used if t.name == "dive 1"]
+    alone = assembled([out], [trial.label], [trial.record], out)
+    own = trial.calibration.estimates
+    values = {n: v for e in own for n, v in zip(e.component_names, e.value, strict=True)}
+    stds = {n: v for e in own for n, v in zip(e.component_names, e.std, strict=True)}
+    names = alone.joint.information.names
+    assert alone.joint.value == pytest.approx([values[n] for n in names], rel=1e-6)
+    std = np.sqrt(np.diag(alone.joint.covariance))
+    assert std == pytest.approx([stds[n] for n in names], rel=1e-4)
+    assert not alone.joint.between_std.any()
+
+
 def test_trials_without_a_result_leave_the_joint_calibration_to_others(tmp_path):
     failed = RunRecord(name="a", fingerprint="", done=False, error="no IMU")
     found = assembled([tmp_path], ["a"], [failed], tmp_path)
