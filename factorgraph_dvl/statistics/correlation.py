@@ -19,8 +19,8 @@ _LOG_TIME = np.log(3.0)
 _STARTS = (1.0, 10.0)
 # Bounds of the search: logarithms of a variance over that of all, and of a time in s. Chosen: far
 # outside of what residuals show, and no power of either overflows.
-_VARIANCES = np.array([-30.0, 10.0])
-_TIMES = np.array([-10.0, 20.0])
+_VARIANCES = (-30.0, 10.0)
+_TIMES = (-10.0, 20.0)
 # Fall of -2 log likelihood from which on noise counts as correlated. Measured: below 10 on clean
 # data, above 1500 where half of the variance is correlated.
 _GAIN = 20.0
@@ -104,6 +104,8 @@ def fit_correlation(
         return out, gradient
 
     level = float(power.mean()) / size
+    log_level = float(np.log(level))
+    within = (log_level + _VARIANCES[0], log_level + _VARIANCES[1])
     starts = _STARTS if expected_time_s is None else (expected_time_s,)
     fits = [
         minimize(
@@ -111,7 +113,7 @@ def fit_correlation(
             [np.log(0.6 * level), np.log(0.4 * level), np.log(start)],
             jac=True,
             method="L-BFGS-B",
-            bounds=[np.log(level) + _VARIANCES, np.log(level) + _VARIANCES, _TIMES],
+            bounds=[within, within, _TIMES],
             options={"ftol": 1e-12},
         )
         for start in starts
