@@ -20,9 +20,14 @@ from factorgraph_dvl.trial import NO_LOCK, NO_MOTION, NO_POSITION
 
 Tables = Callable[[float], Iterator[dict[str, Array]]]
 SUFFIX = ".parquet"
-# Chosen: priors of misalignment, deg, and of lever arms, m. Sensors inside a DVL are aligned with
-# its beams to a degree; their heading is that of the body by definition.
-_INSIDE, _UNKNOWN_ARM = [1.0, 1.0, 0.0], [10.0, 10.0, 10.0]
+# Chosen: priors of misalignment, deg, and of lever arms, m. Tilt sensors inside a DVL are aligned
+# with its beams to a degree; a compass there may be off by anything.
+_INSIDE, _UNKNOWN_ARM = [1.0, 1.0, 180.0], [10.0, 10.0, 10.0]
+# Chosen: biases of logs that come with no data sheet, m/s, on a bed that may move.
+_BIAS = [0.005, 0.005, 0.005]
+# Chosen: clocks that are related by when sentences arrived, without an IMU that would relate them
+# better, and the latency of instruments, s.
+_LATENCY = 2.0
 # Chosen: how long errors of attitude sensors and compasses stay alike, s.
 _ATTITUDE_CORRELATION = 300.0
 
@@ -170,6 +175,12 @@ def _add_gnss(out: Assembly, gnss: positions.Positions, has_body: bool) -> None:
             "no IMU → the antenna is the origin of the body, from which lever arms run",
             "gnss.lever_arm_std_m",
         )
+        keys["time_offset_std_s"] = 0.0
+        out.decisions.add(
+            "gnss.time_offset_std_s",
+            "no IMU → UTC of the fixes is the clock of the trial",
+            "gnss.time_offset_std_s",
+        )
     if gnss.courses is not None:
         keys["velocity_correlation_time_s"] = positions.VELOCITY_CORRELATION
         out.decisions.add(
@@ -247,17 +258,25 @@ def _add_log(
         keys["misalignment_std_deg"] = _INSIDE
         out.decisions.add(
             log.pings.label,
-            "attitude is that of sensors in the DVL itself → misalignment within a degree, and "
-            "none about the vertical, where it is the offset of the heading",
+            "attitude is that of sensors in the DVL itself → misalignment within a degree; about "
+            "the vertical any, as it has the error of the compass in it",
             f"{section}.misalignment_std_deg",
         )
     else:
         keys["misalignment_std_deg"] = [180.0, 180.0, 180.0]
     keys["lever_arm_std_m"] = _UNKNOWN_ARM
-    keys["time_offset_std_s"] = round(max(0.5, log.pings.offset_std), 3)
+    keys["bias_std_m_s"] = _BIAS
+    out.decisions.add(
+        log.pings.label, "no data sheet in the file → prior of a bias chosen", "dvl.bias_std_m_s"
+    )
+    least = 0.5 if attitude is None else _LATENCY
+    keys["time_offset_std_s"] = round(max(least, log.pings.offset_std), 3)
     if log.pings.rate_std:
         keys["clock_rate_std_ppm"] = round(log.pings.rate_std, 1)
-    if log.reference == "water" and log.directions is None:
+    if log.directions is not None:
+        # Beams have none.
+        del keys["bias_std_m_s"]
+    elif log.reference == "water":
         keys["reference"] = "water"
     out.add(section, log.tables, **keys)
 

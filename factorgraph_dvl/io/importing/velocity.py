@@ -148,7 +148,7 @@ def _velocities(pings: Merged, reference: str, locked: int, decisions: Decisions
             "dvl.reference",
         )
     describe_axes(pings, decisions)
-    directions = beam_geometry(pings) if locked else None
+    directions = beam_geometry(pings) if locked and reference == "bottom" else None
     _, sample = pings.sample(_SAMPLE)
     own_std = bool(np.isfinite(sample["std"]).any()) and directions is None
     return Velocities(
