@@ -37,7 +37,13 @@ DEFINITIONS = {
     + "float32[4] range_covar\nfloat32[4] beam_quality\nfloat32[4] beam_velocity\n"
     + "float32[4] beam_velocity_covar\n",
 }
+DEFINITIONS |= {
+    "dvl_msgs/DVLBeam": "int64 id\nfloat64 velocity\nfloat64 distance\nbool valid\n",
+    "dvl_msgs/DVL": HEADER
+    + "geometry_msgs/Vector3 velocity\nfloat64 fom\nDVLBeam[] beams\nbool velocity_valid\n",
+}
 NEEDS = {
+    "dvl_msgs/DVL": ("geometry_msgs/Vector3", "dvl_msgs/DVLBeam"),
     "sensor_msgs/Imu": ("geometry_msgs/Quaternion", "geometry_msgs/Vector3"),
     "sensor_msgs/NavSatFix": ("sensor_msgs/NavSatStatus",),
     "marine_acoustic_msgs/Dvl": ("geometry_msgs/Vector3",),
@@ -118,6 +124,19 @@ def dvl_message(seconds, velocity, mode=1, beams=4, sign=1.0):
         ("f", *[0.0] * 4),
         ("f", *along),
         ("f", *[-1.0] * 4),
+    )
+
+
+def foreign_dvl_message(seconds, velocity, valid=True):
+    beams = [(("q", i), ("d", 0.1 * i, 10.0 + i), ("?", True)) for i in range(4)]
+    return cdr(
+        *stamp(seconds),
+        ("s", "dvl"),
+        ("d", *velocity),
+        ("d", 0.02),
+        ("I", 4),
+        *(value for beam in beams for value in beam),
+        ("?", valid),
     )
 
 

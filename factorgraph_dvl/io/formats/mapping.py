@@ -137,15 +137,21 @@ class TimeColumn(Section, frozen=True, kw_only=True):
 
 
 class TableMapping(Section, frozen=True, kw_only=True):
-    """One kind of record in the tables whose names fit a pattern."""
+    """One kind of record in the tables whose names fit a pattern, or in a topic of bags.
+
+    In a topic columns are fields of its messages, such as `velocity.x`, `beams.0.distance` and
+    `header.stamp`. Where the column `valid` is 0 or false, nothing was measured.
+    """
 
     file: str = "*"
+    topic: str = ""
     kind: Literal["dvl", "water", "fix", "course", "attitude", "ins", "imu", "depth"]
     time: TimeColumn
     columns: dict[str, Column | str | int]
     separator: Literal[",", ";", "tab", "space"] | None = None
     header_lines: Annotated[int, msgspec.Meta(ge=0, le=1000)] = 1
     invalid: tuple[float, ...] = ()
+    valid: ColumnName | None = None
     axes: BodyAxes = "RFU"
     coordinates: Literal["beam", "instrument", "ship", "earth"] = "instrument"
     beam_angle_deg: Annotated[float, msgspec.Meta(ge=5, le=45)] | None = None
@@ -166,6 +172,8 @@ class TableMapping(Section, frozen=True, kw_only=True):
             raise ValueError(f"`columns` of {self.kind} needs {text}")
         if self.coordinates == "beam" and self.beam_angle_deg is None:
             raise ValueError("`coordinates: beam` needs `beam_angle_deg`")
+        if self.topic and (self.time.columns is not None or self.time.unit == "iso"):
+            raise ValueError("`time` of a `topic` needs one `column` of numbers")
 
     def column(self, field: str) -> Column:
         """Return the column of a field."""
@@ -184,6 +192,7 @@ class MappingSettings(Section, frozen=True, kw_only=True):
     tables: tuple[TableMapping, ...]
     trial: dict[str, Any] = msgspec.field(default_factory=dict)
 
-    def of(self, path: Path) -> tuple[TableMapping, ...]:
-        """Return the tables that a file holds."""
-        return tuple(table for table in self.tables if fnmatchcase(path.name, table.file))
+    def of(self, path: Path, *, topics: bool = False) -> tuple[TableMapping, ...]:
+        """Return the tables that a file holds, or the topics that a bag does."""
+        fits = (table for table in self.tables if fnmatchcase(path.name, table.file))
+        return tuple(table for table in fits if bool(table.topic) == topics)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,7 @@ from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.io.formats.clocks import gps_to_utc
 from factorgraph_dvl.io.formats.format import Batch, Format, Kind, empty
-from factorgraph_dvl.io.formats.framing import Source, map_file, number
+from factorgraph_dvl.io.formats.framing import Records, Source, map_file, number
 from factorgraph_dvl.io.formats.mapping import (
     COORDINATES,
     FIELDS,
@@ -75,9 +75,13 @@ def _batches(path: Path, table: TableMapping) -> Iterator[Batch]:
     names, start = header(source, separator, table.header_lines)
     place = {
         name: _index(name, names, path.name)
-        for name in (*(table.column(field).column for field in table.columns), *table.time.names)
+        for name in (
+            *(table.column(field).column for field in table.columns),
+            *table.time.names,
+            *(() if table.valid is None else (table.valid,)),
+        )
     }
-    notes = tuple(_notes(table))
+    notes = tuple(describe(table))
     for at, block in _blocks(source, start):
         rows, dropped = _parse(block, separator, len(names))
         if not rows.num_rows:
@@ -86,20 +90,11 @@ def _batches(path: Path, table: TableMapping) -> Iterator[Batch]:
         out["at"] = at
         out["time"] = _times(table, [rows.column(place[name]) for name in table.time.names])
         out["received"] = out["time"]
-        for field in table.columns:
-            values = _numbers(rows.column(place[table.column(field).column]))
-            values[np.isin(values, table.invalid)] = np.nan
-            name, index, _ = FIELDS[_kind(table)][field]
-            target = out[name] if index is None else out[name][:, index]
-            if target.dtype.kind == "i":
-                target[:] = np.nan_to_num(values, nan=-1.0)
-            else:
-                target[:] = values * table.factor(field)
-        if table.kind in ("dvl", "water"):
-            out["axes"], out["alignment"] = COORDINATES[table.coordinates], 0.0
-            out["tilts_used"] = True
-            if table.beam_angle_deg is not None:
-                out["beam_angle"] = table.beam_angle_deg * DEG
+
+        def column(name: ColumnName, rows: pa.Table = rows) -> Array:
+            return _numbers(rows.column(place[name]))
+
+        fill(out, table, column)
         lost = () if not dropped else ("rows with another number of cells were left out",)
         yield Batch(
             _kind(table),
@@ -112,11 +107,43 @@ def _batches(path: Path, table: TableMapping) -> Iterator[Batch]:
         )
 
 
+def fill(out: Records, table: TableMapping, column: Callable[[ColumnName], Array]) -> None:
+    """Fill records from the columns that a mapping names.
+
+    Parameters
+    ----------
+    out : Records
+        (N,) of the kind of the table, empty.
+    table : TableMapping
+        What its columns are.
+    column : callable
+        Returns the values of a column (N,), nan for what is no number.
+    """
+    for field in table.columns:
+        values = column(table.column(field).column)
+        lost = np.isin(values, table.invalid)
+        if table.valid is not None:
+            lost |= np.nan_to_num(column(table.valid)) == 0.0
+        values = np.where(lost, np.nan, values)
+        name, index, _ = FIELDS[_kind(table)][field]
+        target = out[name] if index is None else out[name][:, index]
+        if target.dtype.kind == "i":
+            target[:] = np.nan_to_num(values, nan=-1.0)
+        else:
+            target[:] = values * table.factor(field)
+    if table.kind in ("dvl", "water"):
+        out["axes"], out["alignment"] = COORDINATES[table.coordinates], 0.0
+        out["tilts_used"] = True
+        if table.beam_angle_deg is not None:
+            out["beam_angle"] = table.beam_angle_deg * DEG
+
+
 def _kind(table: TableMapping) -> Kind:
     return table.kind
 
 
-def _notes(table: TableMapping) -> Iterator[str]:
+def describe(table: TableMapping) -> Iterator[str]:
+    """Return what a mapping makes of the columns, a sentence each."""
     for field in table.columns:
         column = table.column(field)
         unit = column.unit or FIELDS[table.kind][field][2]
@@ -240,8 +267,13 @@ def _times(table: TableMapping, cells: list[pa.ChunkedArray]) -> Array:
     else:
         parts = [column.to_pylist() for column in cells]
         values = np.array([_iso(b"T".join(row)) for row in zip(*parts, strict=True)])
-    values = values + time.offset_s
-    return gps_to_utc(0.0, values) if time.clock == "gps" else values
+    return on_clock(table, values)
+
+
+def on_clock(table: TableMapping, seconds: Array) -> Array:
+    """Return times (N,), s, on the clock of the batch, of what a column of time has."""
+    seconds = seconds + table.time.offset_s
+    return gps_to_utc(0.0, seconds) if table.time.clock == "gps" else seconds
 
 
 def _iso(text: bytes) -> float:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import re
 import sys
 
 import format_logs as logs
 import numpy as np
 import pytest
+import yaml
 
 from factorgraph_dvl.errors import ConfigError, DataError
 from factorgraph_dvl.geometry.rotations import rotation_from_rph
@@ -132,6 +134,35 @@ def test_what_is_whole_in_a_damaged_bag_is_kept(tmp_path, make, damage):
     assert 15 <= len(found["imu", "/imu"]) <= 40
     assert len(np.unique(found["imu", "/imu"]["gyro"][:, 2])) == len(found["imu", "/imu"])
     assert any("damaged" in note for note in notes)
+
+
+def test_topics_by_the_mapping_of_the_page(tmp_path):
+    needs(bags)
+    pytest.importorskip("mcap")
+    page = (bags.Path(__file__).resolve().parents[3] / "docs" / "formats.md").read_text()
+    mapping = yaml.safe_load(re.search(r"```yaml\n(.*?)```", page, re.DOTALL)[1])
+    messages = [
+        (
+            "/dvl/data",
+            "dvl_msgs/DVL",
+            t,
+            logs.foreign_dvl_message(t - 0.1, (1.0, t % 7, 0.5), t % 2),
+        )
+        for t in range(logs.START, logs.START + 6)
+    ]
+    path = write(tmp_path / "log.mcap", logs.mcap(messages + logs.sea_trial(4)))
+    batches = list(bags.read(path, mapping))
+    (dvl,) = (batch for batch in batches if batch.stream == "/dvl/data")
+    assert (dvl.kind, dvl.axes, dvl.clock) == ("dvl", "FRD", "utc")
+    records = dvl.records
+    np.testing.assert_allclose(records["received"] - records["time"], 0.1, atol=1e-6)
+    valid = np.arange(logs.START, logs.START + 6) % 2 == 1
+    np.testing.assert_array_equal(np.isfinite(records["velocity"]).all(axis=1), valid)
+    np.testing.assert_allclose(records["range"][valid], [[10.0, 11.0, 12.0, 13.0]] * 3)
+    np.testing.assert_allclose(records["std"][valid, 0], 0.02)
+    assert any("vel_x is column velocity.x in m/s" in note for note in dvl.notes)
+    assert {batch.stream for batch in batches} >= {"/imu", "/dvl"}
+    assert not [batch for batch in bags.read(path) if batch.stream == "/dvl/data"]
 
 
 def test_a_bag_under_a_wrong_name(tmp_path):

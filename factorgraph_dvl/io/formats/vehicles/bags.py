@@ -7,11 +7,12 @@ the messages, `received` the time of recording.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Container, Iterator, Mapping
 from importlib import resources
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
@@ -21,6 +22,9 @@ from factorgraph_dvl.geometry.rotations import BodyAxes, rph_from_rotation
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.io.formats.format import Batch, Format, Kind, empty
 from factorgraph_dvl.io.formats.framing import BLOCK, Records, map_file
+from factorgraph_dvl.io.formats.mapping import UNITS, MappingSettings, TableMapping
+from factorgraph_dvl.io.formats.table import describe as describe_mapping
+from factorgraph_dvl.io.formats.table import fill, on_clock
 from factorgraph_dvl.io.formats.vehicles.damaged_bags import MCAP, ROS_1, Channel, whole_messages
 from factorgraph_dvl.io.formats.vehicles.library import (
     describe,
@@ -56,14 +60,14 @@ def share(path: Path, sample: bytes) -> float:
 
 
 def read(path: Path, mapping: Mapping[str, Any] | None = None) -> Iterator[Batch]:
-    """Read messages of the types in `CONVERTERS`; others are passed over.
+    """Read messages of the types in `CONVERTERS` and topics of a mapping; others are passed over.
 
     Parameters
     ----------
     path : Path
         File or folder.
     mapping : mapping, optional
-        Not used.
+        Content of a mapping YAML, of which tables with a `topic` count.
 
     Yields
     ------
@@ -78,8 +82,12 @@ def read(path: Path, mapping: Mapping[str, Any] | None = None) -> Iterator[Batch
     """
     load("rosbags.highlevel", "bags")
     _check_ending(path)
+    settings = None if mapping is None else msgspec.convert(mapping, MappingSettings)
+    topics: dict[str, list[TableMapping]] = {}
+    for table in () if settings is None else settings.of(path, topics=True):
+        topics.setdefault(table.topic, []).append(table)
     notes: list[str] = []
-    yield from _batches(path, _messages(path, notes), notes)
+    yield from _batches(path, _messages(path, notes, topics), notes, topics)
 
 
 class Raw(NamedTuple):
@@ -104,7 +112,7 @@ class Raw(NamedTuple):
     decode: Callable[[bytes, str], Any]
 
 
-def _messages(path: Path, notes: list[str]) -> Iterator[Raw]:
+def _messages(path: Path, notes: list[str], topics: Container[str]) -> Iterator[Raw]:
     """Read messages by the index of the bag, and without it from where that fails."""
     latest = -1
     rosbags = load("rosbags.highlevel", "bags")
@@ -113,7 +121,9 @@ def _messages(path: Path, notes: list[str]) -> Iterator[Raw]:
             reader = rosbags.AnyReader([path], default_typestore=typestore())
             reader.open()
         try:
-            wanted = [c for c in reader.connections if c.msgtype in CONVERTERS]
+            wanted = [
+                c for c in reader.connections if c.msgtype in CONVERTERS or c.topic in topics
+            ]
             found = reader.messages(connections=wanted) if wanted else ()
             for connection, time, data in found:
                 yield Raw(connection.topic, connection.msgtype, time, data, reader.deserialize)
@@ -129,7 +139,8 @@ def _messages(path: Path, notes: list[str]) -> Iterator[Raw]:
     decoders: dict[Channel, Callable[[bytes, str], Any] | None] = {}
     for file in files:
         for channel, time, data in whole_messages(map_file(file)):
-            if channel.kind not in CONVERTERS or time <= latest:
+            is_wanted = channel.kind in CONVERTERS or channel.topic in topics
+            if not is_wanted or time <= latest:
                 continue
             if channel not in decoders:
                 decoders[channel] = _decoder(channel)
@@ -179,7 +190,12 @@ def _check_ending(path: Path) -> None:
             )
 
 
-def _batches(path: Path, messages: Iterator[Raw], notes: list[str]) -> Iterator[Batch]:
+def _batches(
+    path: Path,
+    messages: Iterator[Raw],
+    notes: list[str],
+    topics: Mapping[str, list[TableMapping]],
+) -> Iterator[Batch]:
     gathered: dict[tuple[str, str], list[Message]] = {}
     velocities: list[Message] = []
     count = 0
@@ -191,14 +207,14 @@ def _batches(path: Path, messages: Iterator[Raw], notes: list[str]) -> Iterator[
             unread.append(error)
             continue
         row = count, raw.time * 1e-9, message
-        if raw.kind == TWIST and _is_gnss(raw.topic, message):
+        if raw.kind == TWIST and raw.topic not in topics and _is_gnss(raw.topic, message):
             velocities.append(row)
             continue
         key = raw.topic, raw.kind
         rows = gathered.setdefault(key, [])
         rows.append(row)
         if len(rows) >= BLOCK:
-            yield from _converted(key, gathered.pop(key), velocities, notes)
+            yield from _converted(key, gathered.pop(key), velocities, notes, topics)
     if unread:
         notes.append(f"{path.name}: {len(unread)} messages are damaged ({describe(unread[0])})")
     if count == len(unread) and notes:
@@ -208,7 +224,7 @@ def _batches(path: Path, messages: Iterator[Raw], notes: list[str]) -> Iterator[
             expected="a bag, cut at most: `ros2 bag reindex` mends those in SQLite",
         )
     for key, rows in gathered.items():
-        yield from _converted(key, rows, velocities, notes)
+        yield from _converted(key, rows, velocities, notes, topics)
     if velocities:
         notes.append(f"{len(velocities)} velocities of a GNSS receiver without fixes: left out")
     if notes:
@@ -216,9 +232,16 @@ def _batches(path: Path, messages: Iterator[Raw], notes: list[str]) -> Iterator[
 
 
 def _converted(
-    key: tuple[str, str], rows: list[Message], velocities: list[Message], notes: list[str]
+    key: tuple[str, str],
+    rows: list[Message],
+    velocities: list[Message],
+    notes: list[str],
+    topics: Mapping[str, list[TableMapping]],
 ) -> Iterator[Batch]:
     topic, kind = key
+    if topic in topics:
+        yield from silently(_mapped(table, rows) for table in topics[topic])
+        return
     try:
         batches = silently(CONVERTERS[kind](topic, rows))
     except (AttributeError, TypeError, ValueError) as error:
@@ -231,6 +254,40 @@ def _converted(
                 _add_velocities(batch.records, velocities)
             velocities.clear()
         yield batch
+
+
+def _mapped(table: TableMapping, messages: list[Message]) -> Batch:
+    """Return the records that a mapping makes of a topic."""
+    out = empty(table.kind, len(messages))
+    out["at"] = [at for at, _, _ in messages]
+    out["received"] = [received for _, received, _ in messages]
+
+    def column(name: str | int) -> Array:
+        return np.array([_field(message, str(name)) for _, _, message in messages])
+
+    (name,) = table.time.names
+    out["time"] = on_clock(table, column(name) * UNITS[table.time.unit])
+    fill(out, table, column)
+    clock, topic = table.time.batch_clock, table.topic
+    return Batch(
+        table.kind, out, clock, topic, table.axes, table.heading, tuple(describe_mapping(table))
+    )
+
+
+def _field(message: Any, name: str) -> float:
+    """Return a field of a message as a number: of others within it by `.`, of lists by number."""
+    value = message
+    for part in name.split("."):
+        try:
+            value = value[int(part)] if part.isdigit() else getattr(value, part)
+        except (AttributeError, IndexError, TypeError):
+            return float("nan")
+    if hasattr(value, "nanosec"):
+        return float(value.sec + value.nanosec * 1e-9)
+    try:
+        return float(value)
+    except (TypeError, ValueError):
+        return float("nan")
 
 
 def _is_gnss(topic: str, message: Any) -> bool:
