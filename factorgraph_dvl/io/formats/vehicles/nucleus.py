@@ -20,6 +20,8 @@ from factorgraph_dvl.io.formats.vehicles.library import column, columns, load, s
 from factorgraph_dvl.io.formats.velocities import INSTRUMENT
 
 IMU, AHRS, BOTTOM, WATER, INS = 0x82, 0xD2, 0xB4, 0xBE, 0xDC
+# A calibration must not be compared with what was made of the same data.
+_INS = "packets of the INS were left out: it navigates by the same IMU and DVL"
 _HEADER = 10
 # Without an echo the driver passes on these.
 _NO_VELOCITY, _NO_MERIT = -32.0, 10.0
@@ -45,7 +47,7 @@ def share(path: Path, sample: bytes) -> float:
 
 
 def read(path: Path, mapping: Mapping[str, Any] | None = None) -> Iterator[Batch]:
-    """Read IMU, AHRS, bottom track, water track and INS packets.
+    """Read IMU, AHRS, bottom track and water track packets.
 
     Parameters
     ----------
@@ -69,8 +71,10 @@ def read(path: Path, mapping: Mapping[str, Any] | None = None) -> Iterator[Batch
     parser = load("nucleus_driver._parser", "nucleus").Parser(messages=_Silent())
     source = map_file(path)
     gathered: dict[int, list[Packet]] = {kind: [] for kind in _CONVERTERS}
-    lost = 0
+    lost, notes = 0, []
     for family, kind, start, stop in frames(source):
+        if family == NUCLEUS and kind == INS and _INS not in notes:
+            notes.append(_INS)
         if family != NUCLEUS or kind not in gathered:
             continue
         packet = _decoded(parser, bytearray(source[start - _HEADER : stop]))
@@ -86,8 +90,9 @@ def read(path: Path, mapping: Mapping[str, Any] | None = None) -> Iterator[Batch
         if packets:
             yield from silently(_CONVERTERS[kind](packets))
     if lost:
-        note = f"{path.name}: {lost} packets are too short for what they state, and were left out"
-        yield Batch("clock", empty("clock", 0), notes=(note,))
+        notes.append(f"{lost} packets are too short for what they state, and were left out")
+    if notes:
+        yield Batch("clock", empty("clock", 0), notes=tuple(notes))
 
 
 def _decoded(parser: Any, frame: bytearray) -> Packet | None:
@@ -153,25 +158,11 @@ def _track(kind: Kind, stream: str) -> Callable[[list[Packet]], Iterator[Batch]]
     return convert
 
 
-def _ins(packets: list[Packet]) -> Iterator[Batch]:
-    out, clock = _timed("ins", packets)
-    for name in ("roll", "pitch", "heading"):
-        out[name] = column(packets, f"ahrsData.{name}") * DEG
-    located = column(packets, "statusIns.latLonIsValid") == 1.0
-    for name in ("latitude", "longitude"):
-        out[name[:3]] = np.where(located, column(packets, name) * DEG, np.nan)
-    north, east, down = columns(packets, *(f"velocityNed{axis}" for axis in "XYZ")).T
-    out["velocity"] = np.stack([east, north, -down], axis=1)
-    note = "the INS of the Nucleus uses its own DVL: its errors are not independent"
-    yield Batch("ins", out, clock, "INS", "FRD", notes=(_AXES, note))
-
-
 _CONVERTERS: dict[int, Callable[[list[Packet]], Iterator[Batch]]] = {
     IMU: _imu,
     AHRS: _attitude,
     BOTTOM: _track("dvl", "bottom track"),
     WATER: _track("water", "water track"),
-    INS: _ins,
 }
 
 FORMAT = Format(
