@@ -12,6 +12,7 @@ from factorgraph_dvl.cli.console import stdout
 from factorgraph_dvl.cli.options import Force, Quiet
 from factorgraph_dvl.cli.simulate import simulate
 from factorgraph_dvl.cli.solve import solve
+from factorgraph_dvl.errors import DataError
 
 _SCENARIO = "seed-a-phase-90.yaml"
 # The trial that ships in data/ was made with this seed.
@@ -37,6 +38,8 @@ def demo(
 
     from factorgraph_dvl.io.solution_folder import REPORT_FILE
 
+    if (out / "trial.yaml").exists():
+        raise DataError("holds a trial", where=str(out), expected="a new folder")
     trial, result = out / "trial", out / "result"
     with as_file(files("factorgraph_dvl.reproduce") / "configs" / _SCENARIO) as config:
         simulate(config, trial, seed=_SEED, force=force, parquet=True)

@@ -331,7 +331,7 @@ def test_what_never_starts_says_why():
     trial = simulate(scenario(noise=True, manoeuvres=[{"straight_s": 3}]), 0)
     with pytest.raises(SolveError, match="never sufficed"):
         replay(replace(trial, imu=rows_of(trial.imu, slice(0, 60))))
-    with pytest.raises(DataError, match="no position"):
+    with pytest.raises(DataError, match="positions: no file has any"):
         replay(replace(trial, gnss=None))
     with pytest.raises(ConfigError, match="lag_s"):
         Replay(trial, lag_s=0.0)

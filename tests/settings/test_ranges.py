@@ -17,8 +17,10 @@ from hypothesis import strategies as st
 
 from factorgraph_dvl.errors import ConfigError, DataError
 from factorgraph_dvl.io.trial_folder import load_trial
+from factorgraph_dvl.sensors.attitude import Attitude
 from factorgraph_dvl.sensors.catalogue import AIDS
 from factorgraph_dvl.sensors.imu import Imu
+from factorgraph_dvl.sensors.ins import Ins
 from factorgraph_dvl.sensors.records import arrays_of
 from factorgraph_dvl.sensors.speed_log import Heading, SpeedLog
 from factorgraph_dvl.settings.ranges import out_of_range, range_of
@@ -30,7 +32,16 @@ KINDS = (Imu, *AIDS, Heading, SpeedLog)
 def records() -> dict[type, Any]:
     trial = simulate(parse_scenario(EVERYTHING))
     planar = simulate_planar(parse_scenario(PLANAR))
-    return {type(r): r for r in (*planar.records, trial.imu, *trial.aids)}
+    some = np.linspace(0.1, 1.0, 5)
+    others = [
+        kind.from_columns(
+            kind.section_type(),
+            dict.fromkeys((*kind.required, *(n for group in kind.optional for n in group)), some),
+            kind.section,
+        )
+        for kind in (Attitude, Ins)
+    ]
+    return {type(r): r for r in (*planar.records, trial.imu, *trial.aids, *others)}
 
 
 @pytest.mark.parametrize("kind", KINDS)
