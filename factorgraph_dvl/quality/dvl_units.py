@@ -20,6 +20,10 @@ from factorgraph_dvl.sensors.gnss import Gnss
 DVL_TERMS = ("a lock", "Moving along +x must give a positive x")
 BEAM_TERMS = ("three beams", "Moving in the direction of a beam must give it a positive velocity")
 
+# Chosen: how far the ratio of speeds may be from 1 over the bottom; and the ratio that a current
+# makes of the speeds through water and over ground.
+_ALLOWED, _FASTEST_CURRENT = 0.25, 3.0
+
 
 def dvl_findings(
     dvl: Dvl, gnss: Gnss | None, body_axes: BodyAxes, terms: tuple[str, str]
@@ -63,10 +67,11 @@ def _speed_findings(dvl: Dvl, gnss: Gnss) -> Iterator[Finding]:
     if moving.sum() < 3:
         return
     ratio = float(np.median(dvl_speed[moving] / gnss_speed[moving]))
-    allowed = 0.5 if dvl.settings.reference == "water" else 0.25
     # Sway moves DVL and antenna by their lever arms, but not on the average.
     steady = _steady_ratio(pings[inside], dvl.velocity[dvl.locked][inside], at_ping)
-    if min(abs(ratio - 1.0), abs(steady - 1.0)) <= allowed:
+    in_water = dvl.settings.reference == "water"
+    in_current = in_water and 1.0 / _FASTEST_CURRENT < ratio < _FASTEST_CURRENT
+    if in_current or min(abs(ratio - 1.0), abs(steady - 1.0)) <= _ALLOWED:
         yield Finding(
             Code.DVL_UNIT,
             f"its unit is plausible: speed {ratio:.3g} times that of the GNSS, which is not its "

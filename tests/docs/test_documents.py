@@ -23,6 +23,7 @@ from running import Run, run  # noqa: F401
 from truth import merged, scenario
 
 from factorgraph_dvl.io.external_results import read_calibration_values
+from factorgraph_dvl.io.formats.mapping import MappingSettings
 from factorgraph_dvl.io.segments_file import read_segments
 from factorgraph_dvl.io.trial_folder import looks_planar, save_trial
 from factorgraph_dvl.io.trial_yaml import PlanarSettings, TrialSettings
@@ -105,6 +106,8 @@ def stock(tmp_path_factory) -> Path:
     )
     (folder / "segments.yaml").write_text("segments: [{start_s: 0, end_s: 30, label: first}]\n")
     easy_plan(folder / "PLAN.yaml")
+    fix = b"$GPGGA,092750.000,5321.6802,N,00630.3372,W,1,8,1.03,61.7,M,55.2,M,,*76\r\n"
+    (folder / "record.nmea").write_bytes(fix)
     for name in ("trial", "beams"):
         code = invoke("solve", folder / name, "--out", folder / f"{name}-solution", "--no-figures")
         assert code == 0, name
@@ -156,11 +159,12 @@ def arguments(command: str, line: str, stock: Path) -> list[str]:
         "A": stock / "trial-solution",
         "B": stock / "kalman-solution",
         "PLAN.yaml": stock / "PLAN.yaml",
+        "RECORD": stock / "record.nmea",
     }
     words = shlex.split(line, comments=True)[1:]
     count = len(list(Path().glob("dir-*")))
     names["DIR"] = Path(f"dir-{count}")
-    if "simulate" in words:
+    if "simulate" in words or "import" in words:
         names["TRIAL"] = Path(f"dir-{count}")
     # `--efficient A` is a choice.
     before = ["", *words]
@@ -206,6 +210,8 @@ def run_yaml(block: Block, folder: Path) -> None:
     file.write_text(block.text, encoding="utf-8")
     if "segments" in data:
         assert read_segments(file)
+    elif "tables" in data:
+        assert parse_yaml(block.text, MappingSettings, source="block").tables
     elif "manoeuvres" in data:
         parse_scenario(data)
     elif "required" in data:
