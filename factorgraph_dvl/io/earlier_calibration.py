@@ -185,21 +185,14 @@ def with_biases_of(
         raise DataError(
             "the calibration has no biases of an IMU", where=source, expected=" or ".join(BIASES)
         )
-    walked = _walked(imu, calibration, epoch, source)
-    values, P = dict(prior.values), prior.covariance.copy()
-    for parameter, root_psd in zip(
-        imu.nominal().parameters(0.0),
-        (imu.settings.gyro_bias_walk_root_psd, imu.settings.accel_bias_walk_root_psd),
-        strict=True,
-    ):
-        if parameter.name in values:
-            rows = np.arange(len(P))[prior.rows(parameter.name)]
-            P[rows, rows] += root_psd**2 * walked / parameter.si**2
-        else:
+    values, P = dict(prior.values), prior.covariance
+    for parameter in imu.nominal().parameters(0.0):
+        if parameter.name not in values:
             values[parameter.name] = parameter.mean / parameter.si
             P = block_diag(P, np.diag((parameter.sigma / parameter.si) ** 2))
     settings = msgspec.structs.replace(imu.settings, calibration=source)
-    return replace(imu, settings=settings, prior=JointPrior(source, values, P, prior.inputs))
+    then = replace(imu, settings=settings, prior=JointPrior(source, values, P, prior.inputs))
+    return replace(then, prior=then.prior_after(_walked(imu, calibration, epoch, source)))
 
 
 def _walked(imu: Imu, calibration: Calibration, epoch: str, source: str) -> float:

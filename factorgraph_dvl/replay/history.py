@@ -11,7 +11,6 @@ import numpy as np
 
 from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.vectors import Array
-from factorgraph_dvl.sensors.imu import Imu
 from factorgraph_dvl.sensors.protocol import Aid
 from factorgraph_dvl.sensors.records import joined, rows_of
 from factorgraph_dvl.trial import Trial
@@ -129,12 +128,12 @@ class RecordHistory:
                 self._aids[section] = [record]
                 aids[section] = record
         settings = self._settings
-        imu = Imu(
-            settings.inertial.settings,
-            samples[:, 0],
-            samples[:, 1:4],
-            samples[:, 4:7],
-            source=settings.inertial.source,
+        imu = replace(
+            settings.inertial,
+            time=samples[:, 0],
+            gyro=samples[:, 1:4],
+            accel=samples[:, 4:7],
+            prior=settings.inertial.prior_after(samples[0, 0] - settings.inertial.time[0]),
         )
         if settings.inertial.time[0] < samples[0, 0] - 1.0:
             # What `initial` states is of a start that has been dropped.

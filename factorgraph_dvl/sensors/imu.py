@@ -342,6 +342,20 @@ class Imu:
         si = np.repeat([p.si for p in both], 3)
         return np.asarray(self.prior.covariance[np.ix_(rows, rows)] * np.outer(si, si))
 
+    def prior_after(self, seconds: float) -> JointPrior | None:
+        """Return what is known of the biases some time after the start, None if as stated."""
+        s = self.settings
+        if self.prior is None or not s.bias_walks or seconds <= 0.0:
+            return self.prior
+        P = self.prior.covariance.copy()
+        for spec, root_psd in (
+            (_GYRO_BIAS, s.gyro_bias_walk_root_psd),
+            (_ACCEL_BIAS, s.accel_bias_walk_root_psd),
+        ):
+            rows = np.arange(len(P))[self.prior.rows(spec.name)]
+            P[rows, rows] += root_psd**2 * seconds / spec.si**2
+        return replace(self.prior, covariance=P)
+
     def _bias(self, spec: ParameterSpec, std: float, walked: float) -> Parameter:
         """Return a bias with its prior, to whose variance `walked` is added, SI."""
         mean, sigma = np.zeros(3), np.full(3, std)

@@ -21,6 +21,7 @@ from factorgraph_dvl.graph import keys
 from factorgraph_dvl.io.calibration_file import encode_calibration, load_calibration
 from factorgraph_dvl.io.earlier_calibration import calibrated_by, with_biases_of
 from factorgraph_dvl.io.trial_folder import load_trial, save_trial
+from factorgraph_dvl.replay import replay
 from factorgraph_dvl.sensors.finding import Code
 from factorgraph_dvl.sensors.imu import BIASES
 from factorgraph_dvl.simulation import simulate
@@ -71,7 +72,7 @@ def test_variances_grow_by_the_walk_over_the_time_between(epoch, hours):
     std = np.sqrt(1.0 + WALK_DEG_H_SQRT_H**2 * (apart + of_mean))
     np.testing.assert_allclose(gyro.mean, np.array([1.0, 2.0, 3.0]) * DEG_PER_HOUR)
     np.testing.assert_allclose(gyro.sigma, np.full(3, std) * DEG_PER_HOUR)
-    # The calibration has none of the accelerometers: theirs are as the settings say.
+    # The calibration has none of the accelerometers: theirs only walk if the settings say so.
     np.testing.assert_allclose(accel.sigma, imu.parameters(0.0)[1].sigma)
     np.testing.assert_allclose(found.covariance, earlier().covariance)
 
@@ -217,6 +218,16 @@ def test_files_there_and_back(tmp_path):
     for name in trial.imu.prior.values:
         np.testing.assert_allclose(copy.imu.prior.std(name), trial.imu.prior.std(name))
     np.testing.assert_allclose(copy.imu.bias_covariance(), trial.imu.bias_covariance())
+
+
+def test_a_replay_knows_of_biases_what_the_batch_does(two):
+    _, second, a = two
+    trial = both_from(second, as_calibration(a))
+    batch, replayed = solve(trial), replay(trial)[0]
+    for name in (*BIASES, *SEVEN):
+        one, other = batch.estimate(name), replayed.estimate(name)
+        np.testing.assert_allclose(other.std, one.std, rtol=0.02)
+        assert np.all(np.abs(other.value - one.value) < 0.2 * one.std), name
 
 
 def test_what_cannot_be_used_is_named(tmp_path, two):

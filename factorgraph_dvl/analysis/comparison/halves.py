@@ -121,7 +121,10 @@ def halves_of(trial: Trial) -> tuple[Trial, Trial]:
         )
         for later in (False, True)
     )
-    return first, replace(second, initial_attitude=None, initial_position=None)
+    imu = second.imu
+    if imu is not None:
+        imu = replace(imu, prior=imu.prior_after(middle - float(record[0])))
+    return first, replace(second, imu=imu, initial_attitude=None, initial_position=None)
 
 
 def compare_halves(trial: Trial, first: Solution, second: Solution) -> Halves:
