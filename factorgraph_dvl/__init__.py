@@ -20,7 +20,8 @@ with its `Trajectory`, each `Estimate` and a `Verdict`; `load_solution`, `save_s
 `load_calibration`.
 
 Analyses: `crosscheck`, `observability`, `predict` (of a scenario from `load_scenario`),
-`dead_reckon` (with `mounting_of` and an `AttitudeHistory`).
+`dead_reckon` (with `mounting_of` and an `AttitudeHistory`), and of many trials
+`joint_calibration` (with `information_of` each `TrialCalibration`).
 
 Parts for a GTSAM script of one's own: `preintegrate`, `measured_nodes`, `sensor_factor`,
 `solved_problems` (whose `Problem.nonlinear_graph` is the whole problem), `LocalFrame`. For a
@@ -38,6 +39,8 @@ if TYPE_CHECKING:
     from factorgraph_dvl.analysis.dead_reckoning.integration import dead_reckon, mounting_of
     from factorgraph_dvl.analysis.information.observability import observability
     from factorgraph_dvl.baselines.calibration import kalman
+    from factorgraph_dvl.campaign.information import TrialCalibration, information_of
+    from factorgraph_dvl.campaign.joint_calibration import joint_calibration
     from factorgraph_dvl.errors import (
         ConfigError,
         DataError,
@@ -90,10 +93,13 @@ _PUBLIC = {
     "SolveError": "errors",
     "Trajectory": "solution",
     "Trial": "trial",
+    "TrialCalibration": "campaign.information",
     "Verdict": "sensors.finding",
     "check_sensor": "graph.sensor_check",
     "crosscheck": "analysis.comparison.crosscheck",
     "dead_reckon": "analysis.dead_reckoning.integration",
+    "information_of": "campaign.information",
+    "joint_calibration": "campaign.joint_calibration",
     "kalman": "baselines.calibration",
     "load_calibration": "io.calibration_file",
     "load_scenario": "simulation.scenario",
@@ -134,10 +140,13 @@ __all__ = [
     "SolveError",
     "Trajectory",
     "Trial",
+    "TrialCalibration",
     "Verdict",
     "check_sensor",
     "crosscheck",
     "dead_reckon",
+    "information_of",
+    "joint_calibration",
     "kalman",
     "load_calibration",
     "load_scenario",

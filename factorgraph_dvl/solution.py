@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -425,6 +425,12 @@ class Solution(Judged):
         """Times of the first and the last epoch, s."""
         time = self.trajectory.time
         return (float(time[0]), float(time[-1])) if time.size else None
+
+    @property
+    def calibration(self) -> Calibration:
+        """The calibration alone, as `load_calibration` would read it."""
+        names = (f.name for f in fields(Calibration) if hasattr(self, f.name))
+        return Calibration(**{name: getattr(self, name) for name in names})
 
     def _repr_html_(self) -> str:
         from factorgraph_dvl.report.overview import html_overview

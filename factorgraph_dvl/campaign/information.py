@@ -89,6 +89,13 @@ class TrialCalibration:
         Components that an earlier calibration was the prior of.
     prior_covariance : ndarray, shape (m, m), optional
         Of these, in reported units.
+
+    Examples
+    --------
+    >>> import factorgraph_dvl as fd
+    >>> solution = fd.solve(fd.simulate("examples/short.yaml", seed=1))
+    >>> fd.TrialCalibration(solution.calibration).prior_names
+    ()
     """
 
     calibration: Calibration
@@ -103,6 +110,13 @@ def information_of(trials: Sequence[TrialCalibration]) -> Information:
     ----------
     trials : sequence of TrialCalibration
         With body axes and beams in common.
+
+    Examples
+    --------
+    >>> import factorgraph_dvl as fd
+    >>> solution = fd.solve(fd.simulate("examples/short.yaml", seed=1))
+    >>> fd.information_of([fd.TrialCalibration(solution.calibration)]).names[:2]
+    ('misalignment_x_deg', 'misalignment_y_deg')
     """
     first = trials[0].calibration
     calibrations = [same_branch(t.calibration, first) for t in trials]

@@ -98,6 +98,22 @@ def joint_calibration(
         Times of the trials.
     covariates : mapping of str to ndarray, shape (N,), optional
         What components may follow.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> import numpy as np
+    >>> import factorgraph_dvl as fd
+    >>> trials = []
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     for seed in (1, 2):
+    ...         solution = fd.solve(fd.simulate("examples/short.yaml", seed=seed))
+    ...         fd.save_solution(solution, f"{folder}/{seed}")
+    ...         trials.append(fd.TrialCalibration(fd.load_calibration(f"{folder}/{seed}")))
+    >>> information = fd.information_of(trials)
+    >>> joint = fd.joint_calibration(information, days=np.array([0.0, 1.0]))
+    >>> float(joint.value[information.names.index("lever_arm_y_m")].round(1)), joint.changes
+    (1.2, ())
     """
     follow = slopes(information, covariates or {})
     fixed = [s.effect for s in follow]
