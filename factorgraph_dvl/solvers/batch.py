@@ -86,6 +86,8 @@ def solve(
     """
     _check_above_zero("rate_hz", rate_hz)
     _check_above_zero("state_interval_s", state_interval_s)
+    # What a trial without positions lacks comes before what is odd in its records.
+    trial.frame()
     errors = accepted_errors(survey(trial), anyway=anyway)
     with explained(errors):
         report = progress or _silent

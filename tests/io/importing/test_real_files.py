@@ -1,10 +1,13 @@
 """Recordings of real instruments, from the raw file to a trial folder."""
 
+import re
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from factorgraph_dvl import solve
+from factorgraph_dvl.errors import DataError
 from factorgraph_dvl.io.importing.raw_files import import_files
 from factorgraph_dvl.io.tables import read_table
 from factorgraph_dvl.io.trial_folder import load_trial
@@ -96,6 +99,8 @@ def test_says_what_a_file_lacks(imported):
     assert decisions.missing[0].startswith("positions: no file has any")
     assert decisions.missing[1].startswith("velocities: 159 pings, and none of them")
     assert "missing: positions" in (out / "import.log").read_text()
+    with pytest.raises(DataError, match=re.escape(decisions.missing[0])):
+        solve(load_trial(out))
 
 
 def test_leaves_nothing_beside_the_input(imported):
@@ -104,3 +109,14 @@ def test_leaves_nothing_beside_the_input(imported):
     before = sorted(ECHO.parent.iterdir())
     imported(ECHO)
     assert sorted(ECHO.parent.iterdir()) == before
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("path", [NENANA, WINRIVER, VMDAS], ids=lambda path: path.stem)
+def test_from_raw_file_to_verdict(imported, path):
+    out, _ = imported(path)
+    solution = solve(load_trial(out), anyway=True)
+    assert solution.verdict.grade in ("good", "doubtful", "do not use")
+    scale = solution.estimate("scale_error")
+    # Independent fits give scales within 2 % of 1, and a few per cent through water.
+    assert abs(float(scale.value[0])) < 0.1 + 3.0 * float(scale.std[0])
