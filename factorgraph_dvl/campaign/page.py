@@ -51,7 +51,7 @@ def write_page(campaign: Campaign, out: Path) -> None:
         parts += ["<h2>History of each parameter</h2>"]
         parts += ["<p>Each point is a trial with its σ, and leads to its result.</p>"]
         for k, name in enumerate(joint.information.names):
-            parts += [f"<h3>{escape(name)}</h3>", _panel(campaign, joint, k)]
+            parts += [f"<h3>{escape(name)}</h3>", _panel(campaign, joint, k, out)]
     parts += ["<h2>Trials</h2>", _trial_table(campaign, out)]
     write_whole(out / REPORT_FILE, _page("Campaign", parts))
 
@@ -142,7 +142,7 @@ def _joint_parts(campaign: Campaign, joint: JointCalibration) -> list[str]:
     return parts
 
 
-def _panel(campaign: Campaign, joint: JointCalibration, k: int) -> str:
+def _panel(campaign: Campaign, joint: JointCalibration, k: int, out: Path) -> str:
     """Return the history of a component as SVG."""
     name, used = joint.information.names[k], campaign.used
     expected = [joint.fit.value_in(i) for i in range(len(used))]
@@ -185,7 +185,8 @@ def _panel(campaign: Campaign, joint: JointCalibration, k: int) -> str:
             ]
     for t, trial, (value, own) in zip(days, used, found, strict=True):
         if np.isfinite(value):
-            parts += [_point(trial, across(t), down(value), down(value + own), down(value - own))]
+            ends = down(value + own), down(value - own)
+            parts += [_point(trial, _link(trial, out), across(t), down(value), ends)]
     unit = split_unit(name)[1]
     axis = "days since the first trial" if campaign.dated else "trial"
     parts += [f'<text x="{_LEFT}" y="{_HEIGHT - 6}">{escape(unit)}</text>']
@@ -193,12 +194,12 @@ def _panel(campaign: Campaign, joint: JointCalibration, k: int) -> str:
     return "".join(parts)
 
 
-def _point(trial: CampaignTrial, x: float, y: float, top: float, bottom: float) -> str:
+def _point(trial: CampaignTrial, link: str, x: float, y: float, ends: tuple[float, float]) -> str:
     assert trial.calibration is not None
     colour = VERDICT_COLOURS[trial.calibration.verdict.grade]
     return (
-        f'<a href="{_link(trial)}"><title>{escape(trial.name)}</title>'
-        f'<line class="bar" x1="{x:.1f}" x2="{x:.1f}" y1="{top:.1f}" y2="{bottom:.1f}"/>'
+        f'<a href="{link}"><title>{escape(trial.name)}</title>'
+        f'<line class="bar" x1="{x:.1f}" x2="{x:.1f}" y1="{ends[0]:.1f}" y2="{ends[1]:.1f}"/>'
         f'<circle cx="{x:.1f}" cy="{y:.1f}" r="3.5" fill="{colour}"/></a>'
     )
 
@@ -207,14 +208,18 @@ def _trial_table(campaign: Campaign, out: Path) -> str:
     rows = []
     for t in campaign.trials:
         grade = t.calibration.verdict.grade if t.calibration else "not solved"
-        name = f'<a href="{_link(t)}">{_name(t)}</a>' if t.calibration else _name(t)
+        name = f'<a href="{_link(t, out)}">{_name(t)}</a>' if t.calibration else _name(t)
         took = f"{t.record.wall_s:.1f} s"
         rows.append([name, escape(t.record.epoch), grade, escape(t.unused), took])
     return _table(["trial", "date", "verdict", "why it is not used", "time"], rows)
 
 
-def _link(trial: CampaignTrial) -> str:
-    return escape(f"{TRIALS_FOLDER}/{trial.label}/{CALIBRATION_FILE}", quote=True)
+def _link(trial: CampaignTrial, out: Path) -> str:
+    """Return the address of a trial's own report, or of its calibration if it has none."""
+    folder = f"{TRIALS_FOLDER}/{trial.label}"
+    own = f"{folder}/{REPORT_FILE}"
+    found = own if (out / own).exists() else f"{folder}/{CALIBRATION_FILE}"
+    return escape(found, quote=True)
 
 
 def _name(trial: CampaignTrial) -> str:

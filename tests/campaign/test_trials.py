@@ -46,6 +46,7 @@ def campaign(solved, tmp_path_factory):
     trials, solutions = solved
     for label, solution in zip("ab", solutions, strict=True):
         save_solution(solution, out / "trials" / label)
+    (out / "trials" / "a" / "report.html").write_text("its own")
     failed = RunRecord(name="<b>", fingerprint="", done=False, error="a <table> is missing")
     records = [*map(record_of, trials), replace_epoch(failed, "2024-05-01")]
     found = assembled([out / "1", out / "2", out / "3"], "abc", records, out)
@@ -139,7 +140,7 @@ def test_the_page_is_whole_and_leads_to_the_results(campaign):
 
     Page().feed(re.sub(r"<(line|circle|polygon|polyline)([^>]*)/>", r"<\1\2>", text))
     assert not opened
-    assert {"trials/a/calibration.json", "trials/b/calibration.json"} == set(links)
+    assert {"trials/a/report.html", "trials/b/calibration.json"} == set(links)
     assert all((out / link).exists() for link in links)
     assert "a &lt;table&gt; is missing" in text
     assert "nan" not in text
