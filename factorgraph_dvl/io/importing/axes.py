@@ -14,11 +14,9 @@ from factorgraph_dvl.io.formats.janus import (
 )
 from factorgraph_dvl.io.formats.velocities import BEAM, EARTH, INSTRUMENT, SHIP
 from factorgraph_dvl.io.importing.decisions import Decisions
-from factorgraph_dvl.io.importing.merging import Merged
+from factorgraph_dvl.io.importing.merging import SAMPLE, Merged
 
 _NAMES = {BEAM: "beam", INSTRUMENT: "instrument", SHIP: "ship", EARTH: "Earth"}
-# Chosen: pings that are looked at to find out how a log was set up.
-_SAMPLE = 20_000
 
 
 def in_instrument_axes(pings: Records) -> Array:
@@ -56,7 +54,7 @@ def in_instrument_axes(pings: Records) -> Array:
 
 def beam_geometry(merged: Merged) -> Array | None:
     """Return outward directions (4, 3) if all pings with lock are along beams, else None."""
-    _, pings = merged.sample(_SAMPLE)
+    _, pings = merged.sample(SAMPLE)
     locked = pings[np.isfinite(pings["beams"]).any(axis=1) | np.isfinite(pings["velocity"]).any(1)]
     angle = np.unique(locked["beam_angle"])
     in_beams = len(locked) > 0 and bool((locked["axes"] == BEAM).all())
@@ -65,7 +63,7 @@ def beam_geometry(merged: Merged) -> Array | None:
 
 def describe_axes(merged: Merged, decisions: Decisions) -> None:
     """Note in which coordinates the pings are, and what turns them back."""
-    _, pings = merged.sample(_SAMPLE)
+    _, pings = merged.sample(SAMPLE)
     for axes in np.unique(pings["axes"]).tolist():
         part = pings[pings["axes"] == axes]
         decisions.add(merged.label, f"{_NAMES[axes]} coordinates → {_turned(part, axes)}")

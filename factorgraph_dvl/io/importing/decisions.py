@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 from factorgraph_dvl.errors import printable
@@ -52,10 +51,3 @@ def digest_in(log: str) -> str:
     """Return the digest of trial.yaml as the import wrote it, empty if the log has none."""
     last = log.rstrip("\n").rpartition("\n")[2]
     return last.removeprefix(_DIGEST) if last.startswith(_DIGEST) else ""
-
-
-def missing_in(log: str) -> Iterator[str]:
-    """Yield what a log says is missing."""
-    for line in log.splitlines():
-        if line.startswith(MISSING):
-            yield line.removeprefix(MISSING)

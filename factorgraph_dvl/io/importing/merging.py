@@ -13,6 +13,8 @@ from factorgraph_dvl.io.importing.decisions import Decisions
 from factorgraph_dvl.io.importing.time_base import Timed
 
 # Records at a time.
+# Records by which a stream is judged. Chosen: enough for shares of a percent.
+SAMPLE = 20_000
 CHUNK = 100_000
 # Stamps of one instant differ by the digits of their formats, s.
 _SAME = 1e-3

@@ -10,12 +10,10 @@ import numpy as np
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.io.importing.decisions import Decisions
-from factorgraph_dvl.io.importing.merging import Merged, merge
+from factorgraph_dvl.io.importing.merging import SAMPLE, Merged, merge
 from factorgraph_dvl.io.importing.positions import best_source
 from factorgraph_dvl.io.importing.time_base import Timed
 from factorgraph_dvl.io.motion_table import COLUMNS, STD_COLUMNS
-
-_SAMPLE = 20_000
 
 
 def choose(streams: Sequence[Timed], kind: str, decisions: Decisions) -> Merged | None:
@@ -63,7 +61,7 @@ class Navigation:
     @classmethod
     def of(cls, ins: Merged) -> Navigation:
         """Return the solution that records hold."""
-        _, part = ins.sample(_SAMPLE)
+        _, part = ins.sample(SAMPLE)
         stds = [part[name] for name in ("std", "velocity_std", "attitude_std")]
         return cls(ins, all(np.isfinite(std).any() for std in stds))
 

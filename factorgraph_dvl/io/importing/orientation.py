@@ -13,7 +13,7 @@ import numpy as np
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.io.importing.decisions import Decisions
-from factorgraph_dvl.io.importing.merging import Merged, merge
+from factorgraph_dvl.io.importing.merging import SAMPLE, Merged, merge
 from factorgraph_dvl.io.importing.positions import best_source
 from factorgraph_dvl.io.importing.time_base import FIRST_DATE, Timed
 
@@ -24,7 +24,6 @@ _TRUE = ((0.1, 0.1, 0.3), 0.0)
 _MAGNETIC_STD = (0.5, 0.5, 2.0)
 _CORRECTED_OFFSET, _MAGNETIC_OFFSET, _DEVIATION = 10.0, 40.0, 5.0
 _UNKNOWN = ((0.5, 0.5, 2.0), 45.0)
-_SAMPLE = 20_000
 _RANKS = {"true": 2, "unknown": 1, "magnetic": 0}
 # Stream of the sensors in a DVL itself.
 OWN = "leader"
@@ -94,7 +93,7 @@ def choose(
     if attitude is None:
         return None
     stream = attitude.streams[0].stream
-    _, part = attitude.sample(_SAMPLE)
+    _, part = attitude.sample(SAMPLE)
     tilt = bool(np.isfinite(part["roll"]).mean() > 0.5)
     declination = 0.0
     std, offset = _TRUE if stream.heading == "true" else _UNKNOWN
@@ -122,11 +121,11 @@ def choose(
 
 
 def _has_heading(timed: Timed) -> bool:
-    return bool(np.isfinite(timed.stream.records["heading"][:_SAMPLE]).any())
+    return bool(np.isfinite(timed.stream.records["heading"][:SAMPLE]).any())
 
 
 def _rank(source: Sequence[Timed]) -> tuple[float, ...]:
-    part = source[0].stream.records[:_SAMPLE]
+    part = source[0].stream.records[:SAMPLE]
     tilt = bool(np.isfinite(part["roll"]).any())
     count = sum(np.isfinite(timed.time).sum() for timed in source)
     return (_RANKS[source[0].stream.heading], float(tilt), float(count))

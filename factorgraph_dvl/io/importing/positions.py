@@ -11,7 +11,7 @@ from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.io.formats.framing import Records
 from factorgraph_dvl.io.importing.decisions import Decisions
-from factorgraph_dvl.io.importing.merging import Merged, merge
+from factorgraph_dvl.io.importing.merging import SAMPLE, Merged, merge
 from factorgraph_dvl.io.importing.time_base import Timed
 from factorgraph_dvl.sensors.gnss import (
     POSITION_COLUMNS,
@@ -32,7 +32,6 @@ _SLOWEST = 0.3
 VELOCITY_STD, VELOCITY_CORRELATION = 0.1, 2.0
 # A course belongs to the fix of the same instant, s.
 _TOGETHER = 0.05
-_SAMPLE = 20_000
 
 
 @dataclass(frozen=True)
@@ -154,14 +153,14 @@ def _count(source: Sequence[Timed]) -> tuple[float, ...]:
 
 
 def _rank_of_fixes(source: Sequence[Timed]) -> tuple[float, ...]:
-    parts = [timed.stream.records[:_SAMPLE] for timed in source]
+    parts = [timed.stream.records[:SAMPLE] for timed in source]
     has_std = any(np.isfinite(part["std"]).any() for part in parts)
     has_height = any(np.isfinite(part[n]).any() for part in parts for n in ("height", "altitude"))
     return (float(has_std), float(has_height), *_count(source))
 
 
 def _height(fixes: Merged, decisions: Decisions) -> str:
-    _, part = fixes.sample(_SAMPLE)
+    _, part = fixes.sample(SAMPLE)
     if np.isfinite(part["height"]).mean() > 0.5:
         if np.isfinite(part["altitude"]).any():
             separation = float(np.nanmedian(part["height"] - part["altitude"]))
@@ -187,7 +186,7 @@ def _height(fixes: Merged, decisions: Decisions) -> str:
 
 
 def _describe(fixes: Merged, courses: Merged | None, decisions: Decisions) -> None:
-    _, part = fixes.sample(_SAMPLE)
+    _, part = fixes.sample(SAMPLE)
     known = np.isfinite(part["std"]).all(axis=1)
     qualities = sorted({int(q) for q in part["quality"][np.isfinite(part["quality"])]})
     source = "stated in the file" if known.any() else "typical of the quality of the fix"

@@ -13,14 +13,13 @@ from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.io.formats.framing import Records
 from factorgraph_dvl.io.importing.axes import beam_geometry, describe_axes, in_instrument_axes
 from factorgraph_dvl.io.importing.decisions import Decisions
-from factorgraph_dvl.io.importing.merging import Merged, merge
+from factorgraph_dvl.io.importing.merging import SAMPLE, Merged, merge
 from factorgraph_dvl.io.importing.positions import best_source
 from factorgraph_dvl.io.importing.speeds import speed_of
 from factorgraph_dvl.io.importing.time_base import Timed
 from factorgraph_dvl.sensors.dvl import STD_COLUMNS, VELOCITY_COLUMNS
 from factorgraph_dvl.sensors.dvl_beams import beam_columns
 
-_SAMPLE = 20_000
 # Chosen: the least σ that a log is taken to have, and that of one that says nothing, m/s.
 _LEAST_STD, _USUAL_STD = 0.005, 0.02
 # The standard deviation of normal errors is this times their median magnitude.
@@ -111,7 +110,7 @@ def _usable(streams: Sequence[Timed]) -> list[Timed]:
 
 def _lock(source: Sequence[Timed]) -> float:
     return float(
-        sum(np.isfinite(speed_of(timed.stream.records[:_SAMPLE])).sum() for timed in source)
+        sum(np.isfinite(speed_of(timed.stream.records[:SAMPLE])).sum() for timed in source)
     )
 
 
@@ -120,7 +119,7 @@ def _check_one_instrument(streams: Sequence[Timed]) -> None:
     logs: dict[tuple[object, ...], str] = {}
     for timed in streams:
         if timed.stream.kind == "dvl":
-            angles = timed.stream.records["beam_angle"][:_SAMPLE]
+            angles = timed.stream.records["beam_angle"][:SAMPLE]
             angle = float(np.nanmedian(angles)) / DEG if np.isfinite(angles).any() else 0.0
             logs.setdefault((timed.stream.format, round(angle)), timed.stream.file)
     if len(set(logs.values())) > 1:
@@ -149,7 +148,7 @@ def _velocities(pings: Merged, reference: str, locked: int, decisions: Decisions
         )
     describe_axes(pings, decisions)
     directions = beam_geometry(pings) if locked and reference == "bottom" else None
-    _, sample = pings.sample(_SAMPLE)
+    _, sample = pings.sample(SAMPLE)
     own_std = bool(np.isfinite(sample["std"]).any()) and directions is None
     return Velocities(
         pings, reference, directions, _std(sample, label, decisions), own_std, locked, count
