@@ -50,3 +50,10 @@ def test_a_component_that_is_fixed_stays_exact():
     (estimate,), covariance = estimates_of([(partly, np.zeros(3))], np.ones((3, 3)))
     np.testing.assert_array_equal(covariance[1], 0.0)
     np.testing.assert_array_equal(estimate.std, [1.0, 0.0, 1.0])
+
+
+def test_an_angle_is_reported_within_half_a_turn():
+    bias = parameter("bias", [0.1], unit="deg", labels=SCALAR, kind="angle")
+    np.testing.assert_allclose(in_unit(bias, np.array([190.0 * DEG])).value, [-170.0])
+    plain = parameter("bias", [0.1], unit="deg", labels=SCALAR)
+    np.testing.assert_allclose(in_unit(plain, np.array([190.0 * DEG])).value, [190.0])

@@ -153,3 +153,12 @@ def test_angle_between_rotations() -> None:
     second = log_so3(turn @ exp_so3(first * DEG)) / DEG
     a, b = (result(estimate("misalignment_deg", v, [1.0] * 3)) for v in (first, second))
     assert crosscheck(a, b).angles["misalignment_deg"] == pytest.approx(3.0)
+
+
+def test_angles_on_both_sides_of_half_a_turn() -> None:
+    a = result(estimate("heading_bias_deg", 179.9, 0.1))
+    b = result(estimate("heading_bias_deg", -179.9, 0.1))
+    assert one(crosscheck(a, b)).difference == pytest.approx(-0.2)
+    assert crosscheck(a, b, truth={"heading_bias_deg": -180.0}).truth_a.calibration.error == (
+        pytest.approx([-0.1])
+    )
