@@ -283,6 +283,7 @@ def test_blocks_that_are_not_run_say_why():
         "docs/campaign.md": ["it"],
         "docs/events.md": ["needs", "needs"],
         "docs/formats.md": ["a"],
+        "docs/import.md": ["recordings", "needs"],
         "docs/verdict.md": ["part"],
         "examples/compass-plugin/README.md": ["installs"],
     }
