@@ -47,13 +47,15 @@ CAPABILITIES = (
         "start values",
         "alignment arcs attitude_alignment mounting",
         "initialization/*",
-        "initialization/*_windows initialization/clock_offsets initialization/track_*",
+        "initialization/*_windows initialization/clock_offsets initialization/track_* "
+        "initialization/record_clocks",
     ),
     (
         "factor graph, batch solver, covariance",
         "graph chain keys priors information solvers/*",
         "graph/* solvers/* statistics/*",
         "graph/imu_errors graph/clocks graph/processes graph/native_graph graph/motion_* "
+        "graph/bordered_chain "
         "statistics/correlation statistics/constancy solvers/change_along_trial "
         "solvers/correlated_noise solvers/known_parameters solvers/motion_* "
         "statistics/error_budget statistics/robust_weights statistics/rows statistics/scores "
