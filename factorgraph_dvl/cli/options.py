@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from contextlib import ExitStack
+from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
@@ -17,6 +18,19 @@ SolutionPath = Annotated[
 ]
 Force = Annotated[bool, typer.Option("--force", help="Replace existing results.")]
 NoFigures = Annotated[bool, typer.Option("--no-figures", help="Do not draw figures.")]
+
+
+class FigureKind(StrEnum):
+    """Formats of figures."""
+
+    PNG = "png"
+    SVG = "svg"
+    PDF = "pdf"
+
+
+Figures = Annotated[
+    FigureKind, typer.Option("--figures", help="Draw figures in this format too, beside PNG.")
+]
 Rate = Annotated[
     float, typer.Option(metavar="HZ", min=1e-3, max=1e4, help="Rate of the trajectory.")
 ]

@@ -22,6 +22,8 @@ from factorgraph_dvl.cli.console import (
 )
 from factorgraph_dvl.cli.options import (
     Anyway,
+    FigureKind,
+    Figures,
     Force,
     NoFigures,
     Quiet,
@@ -70,6 +72,7 @@ def replay(
     ] = None,
     force: Force = False,
     no_figures: NoFigures = False,
+    figures: Figures = FigureKind.PNG,
     anyway: Anyway = False,
     quiet: Quiet = False,
 ) -> None:
@@ -112,7 +115,7 @@ def replay(
             found,
             out,
             force=force,
-            figures=not no_figures,
+            figures=None if no_figures else figures,
         )
     _print(trial, solution, record, found)
     print_written(out)
@@ -218,7 +221,7 @@ def _write(
     out: Path,
     *,
     force: bool,
-    figures: bool,
+    figures: FigureKind | None,
 ) -> None:
     from factorgraph_dvl.cli.solve import write_beams, write_instrument
     from factorgraph_dvl.io.run_file import run_of
@@ -239,13 +242,13 @@ def _write(
         (folder / CONVERGENCE_FILE).write_text(to_csv(found), encoding="utf-8")
         series = (record.time, tuple(record.names), record.std)
         write_report(folder, str(out), solution, run_of(trial), series)
-        if not figures:
+        if figures is None:
             return
         from factorgraph_dvl.report.figures.convergence import write_convergence_figures
         from factorgraph_dvl.report.figures.solution import write_figures
 
         with drawing():
-            write_figures(trial, solution, folder / FIGURES_FOLDER)
+            write_figures(trial, solution, folder / FIGURES_FOLDER, kind=figures.value)
             write_convergence_figures(
                 record.time,
                 record.values,
@@ -256,6 +259,8 @@ def _write(
                 found,
                 folder / FIGURES_FOLDER,
                 solution.verdict,
+                name=solution.trial,
+                kind=figures.value,
             )
 
     save_solution(solution, out, force=force, extra=add, smoothed=record.smoothed)

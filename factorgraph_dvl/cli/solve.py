@@ -20,6 +20,8 @@ from factorgraph_dvl.cli.console import (
 )
 from factorgraph_dvl.cli.options import (
     Anyway,
+    FigureKind,
+    Figures,
     Force,
     NoFigures,
     Quiet,
@@ -78,6 +80,7 @@ def solve(
     out: SolutionPath,
     force: Force = False,
     no_figures: NoFigures = False,
+    figures: Figures = FigureKind.PNG,
     rate: Rate = 10.0,
     halves: Annotated[
         bool, typer.Option("--halves", help="Solve the trial's halves too, and compare them.")
@@ -120,7 +123,7 @@ def solve(
         run,
         run_planar,
         force=force,
-        figures=not no_figures,
+        figures=None if no_figures else figures,
         anyway=anyway,
         quiet=quiet,
     )
@@ -141,6 +144,7 @@ def kalman(
     ] = False,
     force: Force = False,
     no_figures: NoFigures = False,
+    figures: Figures = FigureKind.PNG,
     rate: Rate = 10.0,
     anyway: Anyway = False,
     quiet: Quiet = False,
@@ -188,7 +192,7 @@ def kalman(
         run,
         run_planar,
         force=force,
-        figures=not no_figures,
+        figures=None if no_figures else figures,
         anyway=anyway,
         quiet=quiet,
     )
@@ -226,7 +230,7 @@ def _solve_into(
     run_planar: Callable[[PlanarTrial, ProgressLine], _Found],
     *,
     force: bool,
-    figures: bool,
+    figures: FigureKind | None,
     anyway: bool,
     quiet: bool,
 ) -> None:
@@ -264,14 +268,14 @@ def _solve_into(
             write_instrument(solution, folder)
             series = None if history is None else (history.time, history.names, history.std)
             write_report(folder, str(out), solution, run_of(trial), series)
-            if not figures:
+            if figures is None:
                 return
             from factorgraph_dvl.report.figures.solution import write_figures
 
             with drawing():
-                write_figures(trial, solution, folder / FIGURES_FOLDER)
+                write_figures(trial, solution, folder / FIGURES_FOLDER, kind=figures.value)
                 if history is not None:
-                    draw_history(trial, solution, history, folder / FIGURES_FOLDER)
+                    draw_history(trial, solution, history, folder / FIGURES_FOLDER, figures.value)
 
         save_solution(solution, out, force=force, extra=add)
     _print_solution(trial, found)
@@ -280,7 +284,7 @@ def _solve_into(
 
 
 def draw_history(
-    trial: Trial | PlanarTrial, solution: Solution, history: History, folder: Path
+    trial: Trial | PlanarTrial, solution: Solution, history: History, folder: Path, kind: str
 ) -> None:
     """Draw how a recursive filter converged."""
     from factorgraph_dvl.report.figures.convergence import convergence_figure
@@ -290,7 +294,8 @@ def draw_history(
     figure = convergence_figure(
         history.time, history.values, history.std, estimates, trial.calibration_truth, float("nan")
     )
-    save_figures({"convergence": figure}, folder, solution.verdict)
+    drawn = {"convergence": figure}
+    save_figures(drawn, folder, solution.verdict, name=solution.trial, kind=kind)
 
 
 def write_beams(trial: Trial | PlanarTrial, solution: Solution, folder: Path) -> None:

@@ -62,11 +62,13 @@ OWNED = (
         )
     ),
     *(
-        f"{FIGURES_FOLDER}/{name}.png"
-        for name in ("track", "motion", "calibration", "correlation", "error_budget")
+        f"{FIGURES_FOLDER}/{name}.{kind}"
+        for kind in ("png", "svg", "pdf")
+        for name in (
+            *("track", "motion", "calibration", "correlation", "error_budget"),
+            *("*_residuals", "beam_quality", "convergence", "latency"),
+        )
     ),
-    *(f"{FIGURES_FOLDER}/{name}.png" for name in ("*_residuals", "beam_quality")),
-    *(f"{FIGURES_FOLDER}/{name}.png" for name in ("convergence", "latency")),
 )
 
 

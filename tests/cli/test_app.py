@@ -39,7 +39,7 @@ def stub(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
             raise state["raises"]
         return state["solution"]
 
-    def write_figures(trial: Trial, solution: Solution, folder: Path) -> None:
+    def write_figures(trial: Trial, solution: Solution, folder: Path, *, kind: str) -> None:
         folder.mkdir()
         (folder / "track.png").write_text("png")
 
@@ -129,7 +129,7 @@ def test_debug_shows_the_traceback(tmp_path: Path, run: Run, stub: dict[str, Any
 def test_figures_that_fail_do_not_cost_the_solution(
     tmp_path: Path, run: Run, stub: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def fail(*args: object) -> None:
+    def fail(*args: object, **options: object) -> None:
         raise ValueError("no axes")
 
     monkeypatch.setattr(factorgraph_dvl.report.figures.solution, "write_figures", fail)

@@ -32,7 +32,7 @@ from factorgraph_dvl.report.figures.drawing import (
 from factorgraph_dvl.report.text import split_unit, with_std
 from factorgraph_dvl.solution import Estimate, Solution
 
-_DIVERGING = LinearSegmentedColormap.from_list("correlation", ["#6b6b6b", "#ffffff", ACCENT])
+_DIVERGING = LinearSegmentedColormap.from_list("correlation", ["#b34700", "#ffffff", ACCENT])
 
 
 def calibration_figure(

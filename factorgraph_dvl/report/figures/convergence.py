@@ -45,6 +45,9 @@ def write_convergence_figures(
     found: Convergence,
     folder: Path,
     verdict: Verdict,
+    *,
+    name: str = "",
+    kind: str = "png",
 ) -> list[Path]:
     """Draw `convergence.png` and `latency.png`.
 
@@ -66,6 +69,10 @@ def write_convergence_figures(
         Where the files go.
     verdict : Verdict
         On the calibration.
+    name : str, optional
+        Name of the trial.
+    kind : {'png', 'svg', 'pdf'}, optional
+        Format of further files beside them.
     """
     pick = np.unique(np.linspace(0, time.size - 1, min(time.size, _POINTS)).astype(int))
     figures = {
@@ -74,7 +81,7 @@ def write_convergence_figures(
         ),
         "latency": latency_figure(time, latency),
     }
-    return save_figures(figures, folder, verdict)
+    return save_figures(figures, folder, verdict, name=name, kind=kind)
 
 
 def convergence_figure(

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
+from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure, SubFigure
@@ -33,6 +34,8 @@ SMALL = 7.5
 NORMAL = 8.5
 TITLE = 10.5
 _DPI = 120
+# Reasons that stand on a figure. Chosen: more would reach the titles.
+_MOST_CODES = 3
 # Stretches whose extremes a line is drawn by. Chosen: more than a panel has pixels.
 _BUCKETS = 2_500
 # Filling a jagged area costs more than a line, and shows less.
@@ -44,26 +47,62 @@ _MOST_CROSSINGS_OF_NOISE = 1600.0
 
 
 def save_figures(
-    figures: Mapping[str, Canvas], folder: Path, verdict: Verdict | None = None
+    figures: Mapping[str, Canvas],
+    folder: Path,
+    verdict: Verdict | None = None,
+    *,
+    name: str = "",
+    kind: str = "png",
 ) -> list[Path]:
     """Write figures as PNG files under their names; return the paths.
 
-    The verdict on what they show, if there is one, stands in the upper right corner.
+    Parameters
+    ----------
+    figures : mapping of str to Canvas
+        Figures by name.
+    folder : path-like
+        Where the files go.
+    verdict : Verdict, optional
+        What to write in the upper right corner: the grade, and the codes of its reasons.
+    name : str, optional
+        Name of the trial, for the lower left corner.
+    kind : {'png', 'svg', 'pdf'}, optional
+        Format of further files beside the PNG files; `png` adds none.
     """
     paths = []
-    for name, figure in figures.items():
+    for title, figure in figures.items():
         assert isinstance(figure, Figure)
         if verdict is not None:
-            label = ": ".join([verdict.grade, *(r.code for r in verdict.reasons[:1])])
             colour = VERDICT_COLOURS[verdict.grade]
+            label = _verdict_label(verdict)
             figure.text(0.997, 0.995, label, ha="right", va="top", fontsize=SMALL, color=colour)
-        path = folder / f"{name}.png"
+        if name:
+            figure.text(0.003, 0.005, name, ha="left", va="bottom", fontsize=SMALL, color=GREY)
+        path = folder / f"{title}.png"
         # Unlike `savefig` this draws only once. The fastest compression level is good
         # enough for line drawings.
         canvas = FigureCanvasAgg(figure)
         canvas.print_png(path, pil_kwargs={"compress_level": 1})  # type: ignore[no-untyped-call]
         paths.append(path)
+        if kind != "png":
+            paths.append(_save_vectors(figure, folder / f"{title}.{kind}"))
     return paths
+
+
+def _verdict_label(verdict: Verdict) -> str:
+    """Return the grade and the codes of the first reasons, with the number of others."""
+    codes = list(dict.fromkeys(str(reason.code) for reason in verdict.reasons))
+    others = f" and {len(codes) - _MOST_CODES} more" if len(codes) > _MOST_CODES else ""
+    shown = f"{', '.join(codes[:_MOST_CODES])}{others}"
+    return f"{verdict.grade}: {shown}" if shown else verdict.grade
+
+
+def _save_vectors(figure: Figure, path: Path) -> Path:
+    """Write a figure as SVG or PDF; the same figure gives the same bytes."""
+    date = {"svg": "Date", "pdf": "CreationDate"}[path.suffix[1:]]
+    with rc_context({"svg.hashsalt": "factorgraph-dvl"}):
+        figure.savefig(path, metadata={date: None})
+    return path
 
 
 def new_figure(width: float, height: float) -> Figure:

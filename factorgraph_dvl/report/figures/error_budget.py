@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import matplotlib
 import numpy as np
 from matplotlib.figure import SubFigure
 
@@ -20,6 +19,11 @@ from factorgraph_dvl.solution import Solution
 
 # Causes with a colour of their own; the others share one. Chosen: as many as the eye separates.
 _SHOWN = 9
+# Tol's muted scheme, which colour-blind readers distinguish.
+_COLOURS = (
+    *("#332288", "#88ccee", "#117733", "#ddcc77", "#cc6677", "#aa4499", "#44aa99", "#999933"),
+    "#882255",
+)
 
 
 def error_budget_figure(solution: Solution, *, into: SubFigure | None = None) -> Canvas:
@@ -33,10 +37,9 @@ def error_budget_figure(solution: Solution, *, into: SubFigure | None = None) ->
     ax = figure.add_subplot(grid[0, 0])
     y = np.arange(free.size)
     left = np.zeros(free.size)
-    colors = matplotlib.colormaps["tab10"]
     for i, cause in enumerate(solution.error_budget[:_SHOWN]):
         label = f"{cause.cause} ({cause.assumed})" if cause.assumed else cause.cause
-        ax.barh(y, share[i], left=left, color=colors(i), height=0.7, label=label)
+        ax.barh(y, share[i], left=left, color=_COLOURS[i], height=0.7, label=label)
         left += share[i]
     if len(share) > _SHOWN:
         ax.barh(y, 100.0 - left, left=left, color=LIGHT, height=0.7, label="all others")

@@ -32,7 +32,9 @@ Drawing = Callable[[SubFigure | None], Canvas]
 _LARGEST_TRAJECTORY = 20_000
 
 
-def write_figures(trial: Trial | PlanarTrial, solution: Solution, folder: Path) -> list[Path]:
+def write_figures(
+    trial: Trial | PlanarTrial, solution: Solution, folder: Path, *, kind: str = "png"
+) -> list[Path]:
     """Draw a solution: track, motion, residuals, calibration, correlation.
 
     Figures for which there is nothing to draw are left out. Long lines are drawn as
@@ -46,6 +48,8 @@ def write_figures(trial: Trial | PlanarTrial, solution: Solution, folder: Path) 
         What to draw.
     folder : path-like
         Where the PNG files go; created if needed.
+    kind : {'png', 'svg', 'pdf'}, optional
+        Format of further files beside them.
 
     Returns
     -------
@@ -56,7 +60,7 @@ def write_figures(trial: Trial | PlanarTrial, solution: Solution, folder: Path) 
     """
     folder.mkdir(parents=True, exist_ok=True)
     figures = {name: draw(None) for name, draw in drawings(solution, trial).items()}
-    return save_figures(figures, folder, solution.verdict)
+    return save_figures(figures, folder, solution.verdict, name=solution.trial, kind=kind)
 
 
 def plot(

@@ -8,6 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import SubFigure
 from matplotlib.gridspec import SubplotSpec
+from matplotlib.ticker import MaxNLocator
 
 from factorgraph_dvl.analysis.error_statistics import TrajectoryErrors
 from factorgraph_dvl.geometry.earth import LocalFrame
@@ -19,6 +20,7 @@ from factorgraph_dvl.report.figures.drawing import (
     LIGHT,
     MEDIUM,
     NORMAL,
+    SMALL,
     TITLE,
     Canvas,
     canvas,
@@ -37,6 +39,8 @@ from factorgraph_dvl.solution import Hypothesis, Trajectory
 from factorgraph_dvl.trial import PlanarTrial, Reference, Trial
 
 # Length of a close-up, s. Chosen: a period or two of a swell.
+# Times that are marked on a track, at most. Chosen: they stay apart.
+_TIME_MARKS = 6
 _CLOSE_UP_S = 10.0
 # A line is about so thick beside its panel.
 _SEEN = 0.005
@@ -86,10 +90,12 @@ def track_figure(
         truth_n = _reference_track(trial.reference, trajectory, frame) * scale
         ax.plot(truth_n[:, 0], truth_n[:, 1], color=DARK, lw=0.9, dashes=(5, 4), label="reference")
     ax.plot(0.0, 0.0, "o", color=DARK, markerfacecolor="white", markersize=7, label="start")
+    _mark_times(ax, trajectory.time, track * scale)
     ax.set_aspect("equal", adjustable="datalim")
     style(ax, f"east of start, {unit}", f"north of start, {unit}")
     ax.margins(0.06)
     ax.set_title("Track", fontsize=TITLE, loc="left")
+    ax.set_title("N ↑", fontsize=TITLE, loc="right")
     ax.legend(fontsize=NORMAL, frameon=True, framealpha=0.85, edgecolor="none", loc="best")
 
     start, time_label = clock(trajectory.time)
@@ -103,6 +109,23 @@ def track_figure(
         panel.tick_params(labelbottom=i == 2)
     error_title(panels[0], "Position error", "Position", errors)
     return figure
+
+
+def _mark_times(ax: Axes, time: Array, track: Array) -> None:
+    """Mark a few round times since the start on a track (M, 3)."""
+    duration = float(time[-1] - time[0])
+    for mark in MaxNLocator(nbins=_TIME_MARKS, steps=[1, 2, 5, 10]).tick_values(0.0, duration):
+        if 0.0 < mark < duration:
+            x, y = track[int(np.searchsorted(time, time[0] + mark)), :2].tolist()
+            ax.plot(x, y, "o", color=ACCENT, markerfacecolor="white", markersize=4)
+            ax.annotate(
+                f"{mark:g} s",
+                (x, y),
+                xytext=(5.0, 4.0),
+                textcoords="offset points",
+                fontsize=SMALL,
+                color=DARK,
+            )
 
 
 def motion_figure(

@@ -10,10 +10,11 @@ from matplotlib.figure import Figure
 
 from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.units import DEG
-from factorgraph_dvl.report.figures.drawing import draw_band
+from factorgraph_dvl.report.figures.drawing import draw_band, save_figures
 from factorgraph_dvl.report.figures.residuals import residuals_figure
 from factorgraph_dvl.report.figures.solution import write_figures
-from factorgraph_dvl.report.figures.trajectory import motion_figure
+from factorgraph_dvl.report.figures.trajectory import motion_figure, track_figure
+from factorgraph_dvl.sensors.finding import Code, Finding, verdict_of
 from factorgraph_dvl.sensors.gnss import Gnss, GnssSettings
 from factorgraph_dvl.sensors.imu import Imu, ImuSettings
 from factorgraph_dvl.solution import Estimate, Residuals, Solution, Trajectory
@@ -410,7 +411,7 @@ def test_lines_of_a_long_trial_are_drawn_with_few_points(
 ) -> None:
     drawn_points: list[int] = []
 
-    def keep(figures: dict[str, Figure], folder: Path, verdict: object) -> list[Path]:
+    def keep(figures: dict[str, Figure], folder: Path, *_: object, **__: object) -> list[Path]:
         for figure in figures.values():
             lines = [line for axes in figure.axes for line in axes.get_lines()]
             drawn_points.extend(np.size(line.get_xdata()) for line in lines)
@@ -421,3 +422,37 @@ def test_lines_of_a_long_trial_are_drawn_with_few_points(
     assert solution.trajectory.time.size > 100_000
     write_figures(trial, solution, tmp_path)
     assert 1000 < max(drawn_points) < 25_000
+
+
+@pytest.mark.parametrize(("kind", "start"), [("svg", b"<?xml"), ("pdf", b"%PDF-")])
+def test_vector_figures_lie_beside_and_are_the_same_again(
+    tmp_path: Path, kind: str, start: bytes
+) -> None:
+    written = []
+    for name in ("a", "b"):
+        figure = Figure()
+        figure.add_subplot().plot([0.0, 1.0], [0.0, 1.0])
+        paths = save_figures({name: figure}, tmp_path, kind=kind)
+        assert [path.name for path in paths] == [f"{name}.png", f"{name}.{kind}"]
+        written.append(paths[1].read_bytes())
+    assert written[0] == written[1]
+    assert written[0].startswith(start)
+
+
+def test_a_figure_bears_its_trial_its_verdict_and_the_reasons(tmp_path: Path) -> None:
+    codes = (Code.CLOCK_OFFSET, Code.CLOCK_JUMP, Code.IMU_NOISE, Code.CLOCK_STEP)
+    findings = tuple(Finding(code, "so it is", severity="warning") for code in codes)
+    verdict = verdict_of(findings)
+    figure = Figure()
+    save_figures({"empty": figure}, tmp_path, verdict, name="a trial")
+    texts = [text.get_text() for text in figure.texts]
+    first = ", ".join(reason.code for reason in verdict.reasons[:3])
+    assert texts == [f"doubtful: {first} and 1 more", "a trial"]
+
+
+def test_a_track_has_marks_of_time() -> None:
+    trial, solution = synthetic(60.0)
+    figure = track_figure(trial, solution.trajectory, None)
+    texts = {text.get_text() for text in figure.axes[0].texts}
+    assert {"10 s", "20 s", "50 s"} <= texts
+    assert figure.axes[0].get_title("right") == "N ↑"

@@ -11,8 +11,10 @@ from rich.table import Table
 
 from factorgraph_dvl.analysis.error_statistics import calibration_errors
 from factorgraph_dvl.quality.survey import survey
+from factorgraph_dvl.report.terminal.error_budget import error_budget_table
 from factorgraph_dvl.report.terminal.tables import calibration_table, sensor_table, width_of
 from factorgraph_dvl.report.text import at_precision, fixed, split_unit, with_std
+from factorgraph_dvl.solution import Cause
 
 TRUTH = {"misalignment_deg": [1.0, 2.0, 3.0], "scale_error": [0.005]}
 
@@ -78,3 +80,16 @@ def test_precision_and_units() -> None:
     assert at_precision(float("nan"), 1.0) == "nan"
     assert split_unit("gyro_bias_x_deg_h") == ("gyro_bias_x", "deg/h")
     assert split_unit("scale_error") == ("scale_error", "")
+
+
+def test_an_error_budget_fits_80_columns() -> None:
+    solution = build_solution()
+    adds = np.concatenate([e.std for e in solution.estimates])
+    causes = ("prior of beacon_sound_speed_error", "noise of DVL velocity", "IMU noise")
+    budget = tuple(Cause(name, "", adds / 2.0) for name in causes)
+    solution = replace(solution, error_budget=budget)
+    assert width_of(error_budget_table(solution)) > 80
+    brief = error_budget_table(solution, width=80)
+    assert width_of(brief) <= 80
+    shown = printed(brief, 80)
+    assert all(name in shown for name in causes)
