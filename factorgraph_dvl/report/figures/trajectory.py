@@ -41,6 +41,8 @@ from factorgraph_dvl.trial import PlanarTrial, Reference, Trial
 # Length of a close-up, s. Chosen: a period or two of a swell.
 # Times that are marked on a track, at most. Chosen: they stay apart.
 _TIME_MARKS = 6
+# Part of the duration in which the track is near a mark. Chosen: a tight circle takes longer.
+_BESIDE = 0.1
 _CLOSE_UP_S = 10.0
 # A line is about so thick beside its panel.
 _SEEN = 0.005
@@ -116,13 +118,18 @@ def _mark_times(ax: Axes, time: Array, track: Array) -> None:
     duration = float(time[-1] - time[0])
     for mark in MaxNLocator(nbins=_TIME_MARKS, steps=[1, 2, 5, 10]).tick_values(0.0, duration):
         if 0.0 < mark < duration:
-            x, y = track[int(np.searchsorted(time, time[0] + mark)), :2].tolist()
+            k = int(np.searchsorted(time, time[0] + mark))
+            near = np.abs(time - time[k]) < _BESIDE * duration
+            x, y = track[k, :2].tolist()
+            # On the side on which the track is not.
+            side = 1.0 if x >= track[near, 0].mean() else -1.0
             ax.plot(x, y, "o", color=ACCENT, markerfacecolor="white", markersize=4)
             ax.annotate(
                 f"{mark:g} s",
                 (x, y),
-                xytext=(5.0, 4.0),
+                xytext=(6.0 * side, 4.0),
                 textcoords="offset points",
+                ha="left" if side > 0.0 else "right",
                 fontsize=SMALL,
                 color=DARK,
             )
