@@ -1,0 +1,114 @@
+"""Recorded ships and vehicles without their IMU: an INS, or GNSS with a compass."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from factorgraph_dvl.geometry.units import DEG
+from factorgraph_dvl.sensors.attitude import Attitude, AttitudeSettings
+from factorgraph_dvl.sensors.dvl import Dvl, DvlSettings
+from factorgraph_dvl.sensors.gnss import Gnss, GnssSettings
+from factorgraph_dvl.sensors.ins import Ins, InsSettings
+from factorgraph_dvl.solvers.batch import solve
+from factorgraph_dvl.trial import Trial
+
+DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
+# Stamps were made by a linspace over one sample too few; samples come every second.
+STRETCHED = 1.0025
+
+
+def dive(number):
+    folder = DATA / "snapir_auv"
+    if not folder.is_dir():
+        pytest.skip(f"no recorded dives in {folder}")
+    pings = np.loadtxt(folder / f"DVL_trajectory{number}.csv", delimiter=",", skiprows=1)
+    motion = np.loadtxt(folder / f"GT_trajectory{number}.csv", delimiter=",", skiprows=1)
+    dvl = Dvl(
+        DvlSettings(time_offset_std_s=5.0, velocity_std_m_s=0.01),
+        pings[:, 0] / STRETCHED,
+        pings[:, 1:4],
+        np.full((len(pings), 3), np.nan),
+    )
+    ins = Ins(
+        InsSettings(position_std_m=(1.0, 1.0, 1.0), velocity_std_m_s=(0.02, 0.02, 0.02)),
+        motion[:, 0] / STRETCHED,
+        motion[:, [2, 1, 3]],
+        motion[:, [5, 4, 6]] * [1.0, 1.0, -1.0],
+        motion[:, 7:10],
+        np.full((len(motion), 9), np.nan),
+    )
+    return Trial(f"dive {number}", None, dvl=dvl, others=(ins,), body_axes="FRD")
+
+
+def found(number):
+    solution = solve(dive(number), rate_hz=1.0)
+    assert solution.converged
+    return solution
+
+
+def test_a_dive_without_its_imu_gives_lever_arm_and_clock():
+    solution = found(2)
+    assert solution.estimate("lever_arm_m").value[0] == pytest.approx(-1.84, abs=0.1)
+    # An independent fit: 1.41 to 1.51 s by dive.
+    assert -solution.estimate("time_offset_s").value[0] == pytest.approx(1.46, abs=0.1)
+    assert -solution.estimate("misalignment_deg").value[2] == pytest.approx(-0.2, abs=0.25)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [1, 3, 4, 8])
+def test_every_dive_agrees(number):
+    solution = found(number)
+    assert solution.estimate("lever_arm_m").value[0] == pytest.approx(-1.84, abs=0.1)
+    assert -solution.estimate("time_offset_s").value[0] == pytest.approx(1.46, abs=0.1)
+    assert -solution.estimate("misalignment_deg").value[2] == pytest.approx(-0.2, abs=0.25)
+
+
+def boat():
+    folder = DATA / "lake_boat"
+    if not folder.is_dir():
+        pytest.skip(f"no recorded boat in {folder}")
+
+    def table(name):
+        path = folder / f"lake_2019-11-01_{name}.csv"
+        return np.genfromtxt(path, delimiter=",", names=True)
+
+    adcp, fixes, compass = table("adcp"), table("gga"), table("hdt")
+    # Looking down, and bow where -Y is: right, forward, up.
+    velocity = np.stack([adcp["iv1"], -adcp["iv2"], -adcp["iv3"]], axis=1)
+    velocity[np.abs(velocity).max(axis=1) > 80.0] = np.nan
+    unknown = np.full(velocity.shape, np.nan)
+    dvl = Dvl(
+        DvlSettings(velocity_std_m_s=0.05, time_offset_std_s=5.0), adcp["t_s"], velocity, unknown
+    )
+    of_day = fixes["utc_s_of_day"]
+    time = of_day + np.median(fixes["ens_t_s"] - of_day)
+    degrees = np.stack([fixes["lat_deg"], fixes["lon_deg"], fixes["alt_msl_m"]], axis=1)
+    unknown = np.full(degrees.shape, np.nan)
+    gnss = Gnss(
+        GnssSettings(position_std_m=(0.5, 0.5, 1.0)),
+        time,
+        degrees * [DEG, DEG, 1.0],
+        unknown,
+        unknown.copy(),
+        unknown.copy(),
+    )
+    _, first = np.unique(compass["ens_t_s"], return_index=True)
+    rph = np.full((first.size, 3), np.nan)
+    rph[:, 2] = compass["heading_true_deg"][first] * DEG
+    settings = AttitudeSettings(std_deg=(2.0, 2.0, 0.3))
+    attitude = Attitude(settings, compass["ens_t_s"][first], rph)
+    return Trial("lake boat", None, gnss=gnss, dvl=dvl, others=(attitude,))
+
+
+@pytest.mark.slow
+def test_a_boat_with_a_gnss_compass_without_tilt():
+    solution = solve(boat(), rate_hz=1.0)
+    assert solution.converged
+    assert -solution.estimate("misalignment_deg").value[2] == pytest.approx(1.65, abs=1.0)
+    correction = 1.0 / (1.0 + solution.estimate("scale_error").value[0])
+    assert correction == pytest.approx(0.992, abs=0.006)
+    # A straight run shows no lever arm.
+    assert solution.estimate("lever_arm_m").std[1] > 1.0
