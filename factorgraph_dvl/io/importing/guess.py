@@ -46,10 +46,10 @@ _UNITS = (
     (r"deg(rees)?[ _/]*(per)?[ _/]*s(ec)?|dps", "deg/s"),
     (r"deg(rees)?[ _/]*(per)?[ _/]*h(our)?", "deg/h"),
     (r"rad(ians)?[ _/]*(per)?[ _/]*s(ec)?", "rad/s"),
-    (r"m[ _/]*s(\^|\*\*)?2|m[ _/]*s[ _/]*s|mps2", "m/s2"),
-    (r"mm[ _/]*s|mmps", "mm/s"),
-    (r"cm[ _/]*s|cmps", "cm/s"),
-    (r"m[ _/]*s|mps", "m/s"),
+    (r"m[ _/]+s(\^|\*\*)?2|m[ _/]+s[ _/]+s|mps2", "m/s2"),
+    (r"mm[ _/]+s|mmps", "mm/s"),
+    (r"cm[ _/]+s|cmps", "cm/s"),
+    (r"m[ _/]+s|mps", "m/s"),
     (r"km[ _/]*h|kph", "km/h"),
     (r"kn|knots?|kts?", "kn"),
     (r"deg(rees)?", "deg"),
@@ -208,6 +208,7 @@ def _time(names: Sequence[str], columns: Array, index: int, iso: bool) -> str:
     if "day" in _plain(names[index])[0]:
         return f"{{{column}, unit: s, clock: day}}"
     unit = next((u for p, u in _UNITS if re.fullmatch(p, _plain(names[index])[1])), "s")
+    unit = unit if unit in ("s", "ms", "us", "ns") else "s"
     return f"{{{column}, unit: {unit}, clock: trial}}  # one clock for all tables; else `own`"
 
 
