@@ -136,6 +136,7 @@ def own_files():
         "water-linked": [samples.SERIAL * 20, json_lines],
         "rowe": [b"".join(rowe)],
         "sbet": [smooth],
+        "smrmsg": [np.ascontiguousarray(samples.deviations(300)).tobytes()],
         "rtklib": [pos],
     }
 

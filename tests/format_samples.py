@@ -34,6 +34,13 @@ def rows(count, start=1000.0):
     return values
 
 
+def deviations(count, start=1000.0):
+    """Return rows (count, 10) of smrmsg: time, then north, east, down; arc minutes at the end."""
+    out = np.tile([0.0, 0.2, 0.1, 0.3, 0.02, 0.01, 0.03, 0.6, 1.2, 3.0], (count, 1))
+    out[:, 0] = start + np.arange(count)
+    return out
+
+
 HEADER = b"""% program   : RTKLIB ver.demo5 b31
 % obs start : 2019/06/08 08:03:55.5 GPST (week2056 547435.5s)
 %

@@ -32,7 +32,9 @@ from factorgraph_dvl.geometry.rotations import BodyAxes
 from factorgraph_dvl.io.formats.framing import Records
 
 Family = Literal["dvl", "ins", "gnss", "vehicle", "table"]
-Kind = Literal["dvl", "water", "fix", "course", "attitude", "ins", "imu", "depth", "clock"]
+Kind = Literal[
+    "dvl", "water", "fix", "course", "attitude", "ins", "ins_std", "imu", "depth", "clock"
+]
 # `utc`: seconds since 1970. `own`: the recording clock of the file, seconds since 1970 (perhaps of
 # local time) or since its start. `day`: seconds of the UTC day. `week`: of the GPS week.
 Clock = Literal["utc", "own", "day", "week"]
@@ -77,6 +79,7 @@ _PING = np.dtype(
 # course    `speed` m/s and `course` over ground.
 # attitude  roll, pitch, heading and their `std`; roll and pitch nan for a compass.
 # ins       a navigation solution; stds as in fix and attitude.
+# ins_std   standard deviations of a navigation solution that has a file of its own.
 # imu       `gyro` rad/s and `accel` m/s² (specific force), in `Batch.axes`.
 # depth     `depth` m below the surface.
 # clock     `time` is UTC at `received`; `number` of the ping that it belongs to, or -1.
@@ -100,6 +103,9 @@ KINDS: dict[Kind, np.dtype[Any]] = {
             *_RPH,
             *((name, "f8", (3,)) for name in ("std", "velocity_std", "attitude_std")),
         ]
+    ),
+    "ins_std": np.dtype(
+        [*_HEAD, *((name, "f8", (3,)) for name in ("std", "velocity_std", "attitude_std"))]
     ),
     "imu": np.dtype([*_HEAD, ("gyro", "f8", (3,)), ("accel", "f8", (3,))]),
     "depth": np.dtype([*_HEAD, ("depth", "f8")]),

@@ -105,7 +105,7 @@ def assemble(streams: Sequence[Timed], name: str, decisions: Decisions) -> tuple
     if gnss is not None:
         _add_gnss(out, gnss, imu is not None or ins is not None)
     if ins is not None:
-        _add_ins(out, ins)
+        _add_ins(out, ins, motion.choose(streams, "ins_std", decisions))
     if attitude is not None:
         _add_attitude(out, attitude)
     log = velocity.choose(streams, decisions)
@@ -191,8 +191,8 @@ def _add_gnss(out: Assembly, gnss: positions.Positions, has_body: bool) -> None:
     out.add("gnss", gnss.tables, **keys)
 
 
-def _add_ins(out: Assembly, ins: Merged) -> None:
-    navigation = motion.Navigation.of(ins)
+def _add_ins(out: Assembly, ins: Merged, deviations: Merged | None) -> None:
+    navigation = motion.Navigation.of(ins, deviations)
     keys: dict[str, Any] = {"correlated_share": 1.0}
     out.decisions.add(
         ins.label,

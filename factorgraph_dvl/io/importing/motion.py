@@ -15,6 +15,8 @@ from factorgraph_dvl.io.importing.positions import best_source
 from factorgraph_dvl.io.importing.time_base import Timed
 from factorgraph_dvl.io.motion_table import COLUMNS, STD_COLUMNS
 
+_STDS = ("std", "velocity_std", "attitude_std")
+
 
 def choose(streams: Sequence[Timed], kind: str, decisions: Decisions) -> Merged | None:
     """Return the records of a kind from its fullest source in all files, None without."""
@@ -51,19 +53,23 @@ class Navigation:
     ----------
     ins : Merged
         In order.
+    deviations : Merged or None
+        Its standard deviations, where these have a file of their own.
     with_std : bool
         Whether it has standard deviations.
     """
 
     ins: Merged
+    deviations: Merged | None
     with_std: bool
 
     @classmethod
-    def of(cls, ins: Merged) -> Navigation:
+    def of(cls, ins: Merged, deviations: Merged | None) -> Navigation:
         """Return the solution that records hold."""
         _, part = ins.sample(SAMPLE)
-        stds = [part[name] for name in ("std", "velocity_std", "attitude_std")]
-        return cls(ins, all(np.isfinite(std).any() for std in stds))
+        stds = [part[name] for name in _STDS]
+        has_own = all(np.isfinite(std).any() for std in stds)
+        return cls(ins, None if has_own else deviations, has_own or deviations is not None)
 
     def tables(self, epoch: float) -> Iterator[dict[str, Array]]:
         """Yield parts of the table `ins`."""
@@ -82,8 +88,16 @@ class Navigation:
             good = np.isfinite(values).all(axis=1)
             table = dict(zip(COLUMNS, values[good].T, strict=True))
             if self.with_std:
-                stds = np.column_stack(
-                    [part["std"], part["velocity_std"], part["attitude_std"] / DEG]
-                )
+                stds = np.column_stack([part[name] for name in _STDS])
+                if self.deviations is not None:
+                    stds = _at(self.deviations, time)
+                stds[:, 6:] /= DEG
                 table |= dict(zip(STD_COLUMNS, stds[good].T, strict=True))
             yield table
+
+
+def _at(deviations: Merged, time: Array) -> Array:
+    """Return the standard deviations (N, 9) at times (N,), linear between records."""
+    own, records = deviations.sample(len(deviations.time))
+    values = np.column_stack([records[name] for name in _STDS])
+    return np.column_stack([np.interp(time, own, column) for column in values.T])

@@ -10,11 +10,13 @@ import numpy as np
 
 from factorgraph_dvl.errors import DataError
 from factorgraph_dvl.io.formats.format import Batch, Format, empty
-from factorgraph_dvl.io.formats.framing import map_file
+from factorgraph_dvl.io.formats.framing import Records, map_file
 from factorgraph_dvl.io.formats.rtklib import is_geodetic, read_rtklib
-from factorgraph_dvl.io.formats.sbet import SBET, north_east, read_sbet, true_heading
+from factorgraph_dvl.io.formats.sbet import north_east, read_sbet, read_smrmsg, true_heading
 
 _LINE_BYTES = 130.0
+# Records of a trajectory are closer together than this, s.
+_LONGEST_STEP = 10.0
 
 
 def _share_rtklib(path: Path, sample: bytes) -> float:
@@ -38,9 +40,39 @@ def _read_rtklib(path: Path, mapping: Mapping[str, Any] | None = None) -> Iterat
         yield Batch("fix", out, "utc", "pos")
 
 
+def _share_of_steps(blocks: Iterator[Records], sample: bytes) -> float:
+    """Return the share of a sample in records whose times run forward.
+
+    Records without header or checksum are possible at other places too, of another length too; but
+    their times run forward in the right place alone.
+    """
+    size = 0
+    for block in blocks:
+        step = np.diff(block["second"])
+        size += int(np.sum((step > 0.0) & (step < _LONGEST_STEP))) * block.dtype.itemsize
+    return size / len(sample) if sample else 0.0
+
+
 def _share_sbet(path: Path, sample: bytes) -> float:
-    count = sum(len(block) for block in read_sbet(sample))
-    return count * SBET.itemsize / len(sample) if sample else 0.0
+    return _share_of_steps(read_sbet(sample), sample)
+
+
+def _share_smrmsg(path: Path, sample: bytes) -> float:
+    return _share_of_steps(read_smrmsg(sample), sample)
+
+
+def _read_smrmsg(path: Path, mapping: Mapping[str, Any] | None = None) -> Iterator[Batch]:
+    for block in read_smrmsg(map_file(path)):
+        out = empty("ins_std", len(block))
+        out["time"] = block["second"]
+        names = {
+            "std": ("std_e", "std_n", "std_d"),
+            "velocity_std": ("vel_std_e", "vel_std_n", "vel_std_d"),
+            "attitude_std": ("roll_std", "pitch_std", "heading_std"),
+        }
+        for name, columns in names.items():
+            out[name] = np.stack([block[column] for column in columns], axis=1)
+        yield Batch("ins_std", out, "week", "smrmsg")
 
 
 def _read_sbet(path: Path, mapping: Mapping[str, Any] | None = None) -> Iterator[Batch]:
@@ -72,5 +104,14 @@ FORMATS = (
         _read_sbet,
         "files written after public record tables; its wander angle is not verified",
         (".sbet", ".out"),
+    ),
+    Format(
+        "smrmsg",
+        "ins",
+        "smrmsg: standard deviations of an SBET file",
+        _share_smrmsg,
+        _read_smrmsg,
+        "files written after public record tables",
+        (".out", ".smrmsg"),
     ),
 )
