@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
 import msgspec
 from msgspec import UNSET, Meta, UnsetType
 
+from factorgraph_dvl.errors import ConfigError
 from factorgraph_dvl.geometry.rotations import BodyAxes
 from factorgraph_dvl.sensors.beacon import BeaconSettings
 from factorgraph_dvl.sensors.catalogue import AIDS, aid_types, load_plug_ins
@@ -166,7 +167,21 @@ def parse_trial(text: str, source: str) -> TrialSettings:
         As of `parse_yaml`.
     """
     keys = parse_yaml(text, dict[str, Any], source=source)
-    return parse_yaml(text, settings_type(keys), source=source)
+    kind = settings_type(keys)
+    try:
+        return parse_yaml(text, kind, source=source)
+    except ConfigError as error:
+        unknown = [
+            k for k in keys if k not in kind.__struct_fields__ and isinstance(keys[k], dict)
+        ]
+        if not unknown or error.hint:
+            raise
+        raise ConfigError(
+            error.what,
+            where=error.where,
+            expected=error.expected,
+            hint=f"If `{unknown[0]}` is a sensor of another package, install that package",
+        ) from None
 
 
 def to_yaml(settings: TrialSettings | PlanarSettings) -> str:
