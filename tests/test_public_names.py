@@ -37,7 +37,7 @@ def once():
     """Simulate and solve each trial of the examples once, in the root of the repository."""
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(ROOT)
-        for name in ("simulate", "solve", "kalman"):
+        for name in ("simulate", "solve", "solved_problems", "kalman"):
             patch.setattr(fd, name, remembered(getattr(fd, name)), raising=False)
         yield
 

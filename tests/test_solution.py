@@ -12,7 +12,7 @@ import factorgraph_dvl as fd
 from factorgraph_dvl.errors import ConfigError
 
 ROOT = Path(__file__).resolve().parents[1]
-FIGURES = ["track", "motion", "gnss_residuals", "dvl_residuals", "calibration", "correlation"]
+FIGURES = ["track", "motion", "dvl_residuals", "calibration", "correlation"]
 
 
 @pytest.fixture(scope="module")
