@@ -218,6 +218,32 @@ class TestMerging:
         assert 79 <= len(column(out, "gnss", "time_s")) < 100
 
 
+def test_damaged_files_end_in_a_trial_or_an_error(tmp_path):
+    whole = [pings(40), fixes(40), pings(40, frame=3), pings(40, frame=0), samples.SERIAL * 10]
+    whole.append(writers.sbet(samples.rows(60)))
+    rng = np.random.default_rng(11)
+    done, refused = 0, {}
+    for number in range(30):
+        files = []
+        for which in rng.integers(0, len(whole), rng.integers(1, 3)).tolist():
+            content = bytearray(whole[which])
+            for at in rng.integers(0, len(content), rng.integers(0, 40)).tolist():
+                content[at] ^= 1 << int(rng.integers(8))
+            files.append(tmp_path / f"{number}-{len(files)}")
+            cut = int(rng.integers(len(content))) if rng.random() < 0.3 else 0
+            files[-1].write_bytes(bytes(content[cut:]) + rng.bytes(int(rng.integers(300))))
+        try:
+            import_files(files, tmp_path / f"trial{number}")
+            done += 1
+        except DataError as error:
+            refused[number] = error.where
+    assert done > 10
+    for number, where in refused.items():
+        # Errors name the file, or are about several.
+        assert where.startswith((f"{number}-", "import"))
+        assert not (tmp_path / f"trial{number}").exists()
+
+
 class TestFolder:
     def test_an_edited_trial_is_never_overwritten(self, tmp_path):
         out, _ = imported(tmp_path, pings(), fixes())
