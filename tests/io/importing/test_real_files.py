@@ -112,11 +112,20 @@ def test_leaves_nothing_beside_the_input(imported):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("path", [NENANA, WINRIVER, VMDAS], ids=lambda path: path.stem)
+@pytest.mark.parametrize("path", [NENANA, WINRIVER], ids=lambda path: path.stem)
 def test_from_raw_file_to_verdict(imported, path):
     out, _ = imported(path)
-    solution = solve(load_trial(out), anyway=True)
-    assert solution.verdict.grade in ("good", "doubtful", "do not use")
+    solution = solve(load_trial(out))
+    assert solution.verdict.grade == "doubtful"
+    # Fits of velocities alone give scales within 2 % of 1.
     scale = solution.estimate("scale_error")
-    # Independent fits give scales within 2 % of 1, and a few per cent through water.
-    assert abs(float(scale.value[0])) < 0.1 + 3.0 * float(scale.std[0])
+    assert abs(float(scale.value[0])) < 0.02 + 3.0 * float(scale.std[0])
+
+
+@pytest.mark.slow
+def test_a_verdict_says_where_a_current_leaves_no_scale(imported):
+    # At 0.01 to 1.2 m/s over ground; the heading is off, which is seen all the same.
+    out, _ = imported(VMDAS)
+    solution = solve(load_trial(out))
+    assert solution.verdict.grade == "do not use"
+    assert any("scale_error" in str(reason) for reason in solution.verdict.reasons)
