@@ -46,6 +46,8 @@ _WORTH = 2.0
 _TOO_MANY = 0.4
 # Rounds in which outliers are searched. Chosen: the second finds those that the first hid.
 _SEARCHES = 3
+# Rounds from one search for the strength of the current to the next, while all else changes.
+_CURRENT_ROUNDS = 5
 # Limits of the strength of a current: m/s and s, by its logarithm.
 _CURRENT_STD = (np.log(0.005), np.log(2.0))
 _CURRENT_TIME = (np.log(60.0), np.log(2e5))
@@ -138,7 +140,8 @@ def smooth_motion(prepared: MotionPreparation, report: Progress) -> SmoothedMoti
             changing.append("the acceleration of the vessel")
         density = chain.density * np.exp(_hastened(moved, last_moved))
         last_moved = moved
-        if free_current:
+        # A search takes forty factorisations: not in every round.
+        if free_current and (not changing or round_ % _CURRENT_ROUNDS == 0):
             report("current", round_, None)
             chain = _current(problem, evaluation, chain)
             old, new = (next(p for p in c.processes if p.name == CURRENT)
