@@ -242,6 +242,8 @@ def _rejected(problem: MotionProblem, evaluation: MotionEvaluation) -> dict[str,
         known = np.isfinite(residuals).any(axis=1)
         if not o.noise_groups or known.sum() < 20:
             continue
+        # A component may never be measured, such as the vertical one of course and speed.
+        residuals = residuals[:, np.isfinite(residuals).any(axis=0)]
         # What is slow in residuals is no outlier, however small the noise beside it.
         middle = np.nanmedian(residuals, axis=0)
         spread = 1.4826 * np.nanmedian(np.abs(residuals - middle), axis=0)
