@@ -8,6 +8,7 @@ from dataclasses import replace
 import msgspec
 import numpy as np
 import pytest
+from monte_carlo import rms_band
 from truth import CONFIGS
 
 from factorgraph_dvl.analysis.error_statistics import calibration_errors
