@@ -10,7 +10,7 @@ import numpy as np
 
 from factorgraph_dvl.errors import DataError
 from factorgraph_dvl.geometry.earth import LocalFrame
-from factorgraph_dvl.geometry.rotations import BodyAxes, exp_so3
+from factorgraph_dvl.geometry.rotations import BodyAxes, exp_so3, wrapped
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph.priors import prior_mean
 from factorgraph_dvl.sensors.parameters import Parameter
@@ -112,11 +112,17 @@ def _quotients(
         "d_omega": lambda h: replace(motion, omega_eb_b=motion.omega_eb_b + h),
     }
     for name, move in moves.items():
-        yield name, _quotient(partial(_at_motion, o, values, move), 3, _STEPS[name])
+        yield (
+            name,
+            _quotient(
+                partial(_at_motion, o, values, move), 3, _STEPS[name], angles=o.unit == "rad"
+            ),
+        )
     for name in o.parameters:
         p = parameters[name]
         changed = partial(_at_value, o, motion, values, p)
-        yield f"d_parameters[{name!r}]", _quotient(changed, p.mean.size, _PARAMETER_STEP)
+        quotient = _quotient(changed, p.mean.size, _PARAMETER_STEP, angles=o.unit == "rad")
+        yield f"d_parameters[{name!r}]", quotient
 
 
 def _at_motion(
@@ -131,9 +137,13 @@ def _at_value(
     return o.residual(motion, {**values, p.name: _moved(p, values[p.name], h)})
 
 
-def _quotient(function: Callable[[Array], Array], size: int, step: float) -> Array:
-    steps = step * np.eye(size)
-    return np.stack([(function(h) - function(-h)) / (2.0 * step) for h in steps], axis=-1)
+def _quotient(
+    function: Callable[[Array], Array], size: int, step: float, *, angles: bool
+) -> Array:
+    change = [function(h) - function(-h) for h in step * np.eye(size)]
+    # Of angles one of the two may lie beyond half a turn.
+    change = [wrapped(c) for c in change] if angles else change
+    return np.stack([c / (2.0 * step) for c in change], axis=-1)
 
 
 def _moved(p: Parameter, value: Array, h: Array) -> Array:

@@ -11,6 +11,8 @@ from truth import scenario
 
 from factorgraph_dvl import LocalFrame, check_sensor, simulate
 from factorgraph_dvl.errors import DataError
+from factorgraph_dvl.geometry.rotations import wrapped
+from factorgraph_dvl.graph.sensor_check import _quotient
 
 FRAME = LocalFrame(0.6, 2.1, 0.0)
 TIME, HEADING = np.arange(4.0), np.radians([10.0, 100.0, 190.0, 359.0])
@@ -91,3 +93,10 @@ def test_what_a_sensor_lacks_is_named():
         check_sensor(object(), FRAME, "RFU")
     with pytest.raises(DataError, match="no measurement"):
         check_sensor(Compass(CompassSettings(), TIME, np.nan * HEADING), FRAME, "RFU")
+
+
+def test_differences_of_angles_do_not_jump_at_half_a_turn():
+    def angle(h):
+        return wrapped(np.array([[np.pi]]) + h)
+
+    np.testing.assert_allclose(_quotient(angle, 1, 1e-6, angles=True), 1.0, rtol=1e-6)
