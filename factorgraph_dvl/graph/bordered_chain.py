@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import cho_solve_banded, cholesky_banded
 
+from factorgraph_dvl.geometry.block_tridiagonal import banded, inverse_blocks
 from factorgraph_dvl.geometry.vectors import Array
 
 
@@ -110,7 +111,7 @@ class Factorisation:
         k, n, c = equations.nodes, equations.size, equations.constants
         self._equations = equations
         self._factor = cholesky_banded(
-            _banded(equations.diagonal, equations.off), check_finite=False
+            banded(equations.diagonal, equations.off), check_finite=False
         )
         border = equations.border.reshape(k * n, c)
         self.influence = self.solve_nodes(equations.border)
@@ -139,24 +140,8 @@ class Factorisation:
         return 2.0 * float(np.sum(np.log(self._factor[-1])) + np.sum(np.log(np.diag(self._root))))
 
     def covariances(self) -> Covariances:
-        """Return the covariances of neighbouring nodes and of the constants.
-
-        Of a block-tridiagonal A the blocks of the inverse follow from the ends: with the Schur
-        complements F from the front, P_KK = F_K⁻¹, and backwards with G = F_k⁻¹ A_k,k+1
-
-            P_k,k+1 = -G P_k+1,k+1,    P_kk = F_k⁻¹ + G P_k+1,k+1 Gᵀ.
-        """
-        e = self._equations
-        inverse = np.empty_like(e.diagonal)
-        inverse[0] = np.linalg.inv(e.diagonal[0])
-        for k in range(1, e.nodes):
-            before = e.off[k - 1]
-            inverse[k] = np.linalg.inv(e.diagonal[k] - before.T @ inverse[k - 1] @ before)
-        gain = inverse[:-1] @ e.off
-        own = inverse
-        for k in range(e.nodes - 2, -1, -1):
-            own[k] += gain[k] @ own[k + 1] @ gain[k].T
-        across = -gain @ own[1:]
+        """Return the covariances of neighbouring nodes and of the constants."""
+        own, across = inverse_blocks(self._equations.diagonal, self._equations.off)
         shared = self.influence @ self.constants
         return Covariances(
             nodes=own + shared @ self.influence.transpose(0, 2, 1),
@@ -202,16 +187,3 @@ class Covariances:
             out[:, rows, last], out[:, last, rows] = shared, shared.transpose(0, 2, 1)
         out[:, last, last] = self.constants
         return out
-
-
-def _banded(diagonal: Array, off: Array) -> Array:
-    """Return a symmetric block-tridiagonal matrix in SciPy's upper banded form."""
-    n, size = diagonal.shape[:2]
-    above = 2 * size - 1
-    out = np.zeros((above + 1, n * size))
-    for i in range(size):
-        for j in range(size):
-            if j >= i:
-                out[above + i - j, j::size] = diagonal[:, i, j]
-            out[above - size + i - j, size + j :: size] = off[:, i, j]
-    return out

@@ -9,12 +9,11 @@ from functools import cached_property
 import numpy as np
 
 from factorgraph_dvl.geometry.earth import LocalFrame
-from factorgraph_dvl.geometry.rotations import exp_so3
 from factorgraph_dvl.geometry.vectors import Array, rotate
 from factorgraph_dvl.graph.bordered_chain import Covariances, NormalEquations
 from factorgraph_dvl.graph.clocks import linearized, true_time
 from factorgraph_dvl.graph.motion_chain import Interpolation, MotionChain
-from factorgraph_dvl.graph.priors import local_coordinates, prior_mean, prior_root
+from factorgraph_dvl.graph.priors import local_coordinates, places, prior_mean, prior_root
 from factorgraph_dvl.imu.attitude_record import AttitudeRecord, BodyAttitude, level_axes
 from factorgraph_dvl.sensors.attitude import heading_error
 from factorgraph_dvl.sensors.parameters import Parameter
@@ -171,11 +170,7 @@ class MotionProblem:
     @cached_property
     def columns(self) -> dict[str, slice]:
         """Place of every estimated parameter among all of them."""
-        ends = np.cumsum([p.mean.size for p in self.parameters])
-        return {
-            p.name: slice(int(end) - p.mean.size, int(end))
-            for p, end in zip(self.parameters, ends, strict=True)
-        }
+        return places(self.parameters)
 
     @cached_property
     def constants(self) -> int:
@@ -190,14 +185,6 @@ class MotionProblem:
     def prior_values(self) -> dict[str, Array]:
         """Return the prior means of all parameters, rotations as matrices."""
         return {p.name: prior_mean(p) for p in self.all_parameters}
-
-    def moved(self, parameters: Mapping[str, Array], step: Array) -> dict[str, Array]:
-        """Return parameters after a step (c,) in their tangent space."""
-        out = dict(parameters)
-        for p in self.parameters:
-            part, value = step[self.columns[p.name]], parameters[p.name]
-            out[p.name] = value @ exp_so3(part) if p.rotation else value + part
-        return out
 
     def evaluate(self, states: Array, parameters: dict[str, Array]) -> MotionEvaluation:
         """Evaluate motion, residuals and derivatives."""

@@ -81,12 +81,11 @@ def prior_root(parameters: Sequence[Parameter]) -> Array:
     In the tangent space at the prior's mean. Priors are stated for the rotation vector:
     Exp(alpha + a) = Exp(alpha) Exp(Jr(alpha) a).
     """
-    ends = np.cumsum([p.mean.size for p in parameters], dtype=int)
-    rows = {p.name: np.arange(end - p.mean.size, end)
-            for p, end in zip(parameters, ends, strict=True)}  # fmt: skip
-    out = np.zeros((sum(p.mean.size for p in parameters),) * 2)
+    size = sum(p.mean.size for p in parameters)
+    place = places(parameters)
+    out = np.zeros((size, size))
     for group in _groups(parameters):
-        own = np.concatenate([rows[p.name] for p in group])
+        own = np.concatenate([np.arange(size)[place[p.name]] for p in group])
         out[np.ix_(own, own)] = _root_of(group)
     return out
 
@@ -102,8 +101,7 @@ def linear_prior(
     The callback must not know the problem: GTSAM would keep it, and it GTSAM's graph, and
     nothing would ever free the two.
     """
-    ends = np.cumsum([p.mean.size for p in parameters])
-    columns = [gain[:, end - p.mean.size : end] for p, end in zip(parameters, ends, strict=True)]
+    columns = [gain[:, place] for place in places(parameters).values()]
 
     def error(this: gtsam.CustomFactor, at: gtsam.Values, jacobians: list[Array] | None) -> Array:
         total = np.zeros(gain.shape[0])
@@ -158,6 +156,26 @@ def local_coordinates(p: Parameter, value: Array, origin: Array) -> Array:
     if p.rotation:
         return np.asarray(gtsam.Rot3.Logmap(gtsam.Rot3(origin.T @ value)))
     return value - origin
+
+
+def places(parameters: Sequence[Parameter]) -> dict[str, slice]:
+    """Return the place of each parameter among the components of all."""
+    ends = np.cumsum([p.mean.size for p in parameters])
+    return {
+        p.name: slice(int(end) - p.mean.size, int(end))
+        for p, end in zip(parameters, ends, strict=True)
+    }
+
+
+def after_step(
+    parameters: Sequence[Parameter], values: Mapping[str, Array], step: Array
+) -> dict[str, Array]:
+    """Return values after a step (P,) of some parameters in their tangent space, SI."""
+    out = dict(values)
+    for p, place in zip(parameters, places(parameters).values(), strict=True):
+        part, value = step[place], values[p.name]
+        out[p.name] = value @ exp_so3(part) if p.rotation else value + part
+    return out
 
 
 def prior_mean(p: Parameter) -> Array:

@@ -18,7 +18,7 @@ import gtsam
 import numpy as np
 
 from factorgraph_dvl.geometry.earth import LocalFrame
-from factorgraph_dvl.geometry.rotations import BodyAxes, exp_so3
+from factorgraph_dvl.geometry.rotations import BodyAxes
 from factorgraph_dvl.geometry.vectors import Array, IntArray
 from factorgraph_dvl.graph import keys
 from factorgraph_dvl.graph.clocks import linearized, parameters_of, true_time
@@ -32,6 +32,7 @@ from factorgraph_dvl.graph.priors import (
     joint_linear_prior,
     linear_prior,
     local_coordinates,
+    places,
     prior_mean,
     prior_root,
     value_at,
@@ -288,7 +289,7 @@ class Problem:
 
     def prior_values(self) -> dict[str, Array]:
         """Return the prior means of all parameters, rotations as matrices."""
-        return {**self._fixed, **{p.name: prior_mean(p) for p in self.parameters}}
+        return {p.name: prior_mean(p) for p in self.all_parameters}
 
     def values(self, states: States, parameters: dict[str, Array]) -> gtsam.Values:
         """Return GTSAM's values of states and parameters."""
@@ -316,11 +317,7 @@ class Problem:
     @cached_property
     def columns(self) -> dict[str, slice]:
         """Place of every estimated parameter among all of them."""
-        ends = np.cumsum([p.mean.size for p in self.parameters])
-        return {
-            p.name: slice(int(end) - p.mean.size, int(end))
-            for p, end in zip(self.parameters, ends, strict=True)
-        }
+        return places(self.parameters)
 
     @cached_property
     def prior_root(self) -> Array:
@@ -336,15 +333,6 @@ class Problem:
         return np.concatenate(
             [local_coordinates(p, parameters[p.name], origin[p.name]) for p in self.parameters]
         )
-
-    def moved(self, parameters: dict[str, Array], step: Array) -> dict[str, Array]:
-        """Return parameters after a step (P,) in their tangent space, SI."""
-        out = dict(parameters)
-        for p in self.parameters:
-            part = step[self.columns[p.name]]
-            value = parameters[p.name]
-            out[p.name] = value @ exp_so3(part) if p.rotation else value + part
-        return out
 
     def fix_directions(self, directions: Array, origin: dict[str, Array]) -> None:
         """Fix combinations of the parameters at an origin.

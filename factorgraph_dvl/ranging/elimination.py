@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.linalg import cho_solve_banded, cholesky_banded
 
+from factorgraph_dvl.geometry.block_tridiagonal import banded, inverse_blocks
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.ranging.model import (
     PlanarProblem,
@@ -91,7 +92,7 @@ class System:
         self._diagonal, self._off = diagonal, off
         self._border = border.reshape(4 * n, c)
         self._g, self._h = g.reshape(4 * n), h
-        self._factor = cholesky_banded(_banded(diagonal, off), check_finite=False)
+        self._factor = cholesky_banded(banded(diagonal, off), check_finite=False)
         self._influence = self._solve(self._border)
         self._schur = corner - self._border.T @ self._influence
 
@@ -118,34 +119,6 @@ class System:
             unit[-4:] = np.eye(4)
             own, influence = self._solve(unit)[-4:][None], influence[-1:]
         else:
-            own = _diagonal_of_inverse(self._diagonal, self._off)
+            own, _ = inverse_blocks(self._diagonal, self._off)
         states = own + influence @ constants @ influence.transpose(0, 2, 1)
         return states, -influence @ constants, constants
-
-
-def _banded(diagonal: Array, off: Array) -> Array:
-    """Return a symmetric block-tridiagonal matrix in SciPy's upper banded form."""
-    n, size = diagonal.shape[:2]
-    above = 2 * size - 1
-    out = np.zeros((above + 1, n * size))
-    for i in range(size):
-        for j in range(size):
-            if j >= i:
-                out[above + i - j, j::size] = diagonal[:, i, j]
-            out[above - size + i - j, size + j :: size] = off[:, i, j]
-    return out
-
-
-def _diagonal_of_inverse(diagonal: Array, off: Array) -> Array:
-    """Return the diagonal blocks of the inverse of a block-tridiagonal matrix."""
-    n = diagonal.shape[0]
-    inverse = np.empty_like(diagonal)
-    inverse[0] = np.linalg.inv(diagonal[0])
-    for k in range(1, n):
-        before = off[k - 1]
-        inverse[k] = np.linalg.inv(diagonal[k] - before.T @ inverse[k - 1] @ before)
-    out = inverse.copy()
-    for k in range(n - 2, -1, -1):
-        gain = inverse[k] @ off[k]
-        out[k] += gain @ out[k + 1] @ gain.T
-    return out

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph.problem import Evaluation, Problem
 from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.sensors.imu import ERRORS
@@ -67,17 +66,10 @@ def component_changes(
         return []
     functionals = [derivatives for _, derivatives in rows]
     of_component = [(name, p) for p, _ in rows for name in p.component_names]
-    joint: dict[int, Array] = {}
-    at = 0
-    for functional in functionals:
-        for key, matrix in functional.items():
-            whole = joint.setdefault(key, np.zeros((len(of_component), matrix.shape[1])))
-            whole[at : at + matrix.shape[0]] += matrix
-        at += next(iter(functional.values())).shape[0]
     time = problem.chain.segments.node_time
     tests = changes(
         rows_with_times(problem, evaluation),
-        information.covariance_with(joint),
+        information.covariance_with(functionals),
         information.covariance_of(functionals),
         (float(time[0]), float(time[-1])),
     )

@@ -80,9 +80,7 @@ def explanation(problem: Problem, minimum: Minimum) -> Explanation | None:
     time = problem.chain.segments.node_time
     if time[-1] - time[0] < _SHORTEST:
         return None
-    assert minimum.tree is not None
-    evaluation = minimum.evaluation
-    information = SquareRootInformation(minimum.tree, evaluation.values.dims())
+    evaluation, information = minimum.evaluation, minimum.information
     tests = {
         **_tests_of_priors(problem, evaluation, information),
         **_tests_of_known(problem, evaluation),
@@ -163,12 +161,9 @@ def _is_plausible(p: Parameter, test: Score) -> bool:
 
 def confirmed(problem: Problem, minimum: Minimum, found: Explanation) -> bool:
     """Whether a parameter is another than it was taken to be, now that it is estimated."""
-    assert minimum.tree is not None
-    evaluation = minimum.evaluation
-    information = SquareRootInformation(minimum.tree, evaluation.values.dims())
     name = found.parameter.name
-    P = information.covariance_of([{problem.key(name): np.eye(found.parameter.mean.size)}])
-    moved = evaluation.parameters[name] - found.parameter.mean
+    P = minimum.information.covariance_of([{problem.key(name): np.eye(found.parameter.mean.size)}])
+    moved = minimum.evaluation.parameters[name] - found.parameter.mean
     again = Score(float(moved @ np.linalg.solve(P, moved)), moved.size, moved, np.sqrt(np.diag(P)))
     return again.log10_p < _LOG10_P
 
@@ -261,16 +256,10 @@ def _scatter(
     of correlated noise, go with each other for a while (White, Econometrica 48(4), 1980; Newey and
     West, Econometrica 55(3), 1987).
     """
-    size = sum(sigma.size for _, sigma in columns.values())
-    joint: dict[int, Array] = {}
-    column = 0
-    for key, sigma in columns.values():
-        joint[key] = np.zeros((size, sigma.size))
-        joint[key][column : column + sigma.size] = np.diag(1.0 / sigma)
-        column += sigma.size
     # In units of the wide priors.
-    gain = np.linalg.inv(information.covariance_of([joint]))
-    following = {key: P @ gain for key, P in information.covariance_with(joint).items()}
+    scaled = [{key: np.diag(1.0 / sigma)} for key, sigma in columns.values()]
+    gain = np.linalg.inv(information.covariance_of(scaled))
+    following = {key: P @ gain for key, P in information.covariance_with(scaled).items()}
     time = test.chain.segments.node_time
     edges = np.linspace(time[0], time[-1], _INTERVALS + 1)[1:-1]
     score, known = by_interval(rows_with_times(test, at), following, edges)

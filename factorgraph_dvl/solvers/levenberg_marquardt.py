@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import gtsam
 import numpy as np
@@ -10,6 +11,7 @@ import numpy as np
 from factorgraph_dvl.errors import SolveError
 from factorgraph_dvl.graph.problem import Evaluation, Problem
 from factorgraph_dvl.solution import Progress
+from factorgraph_dvl.statistics.square_root_information import SquareRootInformation
 
 # A step is small when all of it together is this many standard deviations, squared and
 # halved: the decrease of the cost that the linear model still promises. Chosen: 0.004 σ.
@@ -51,6 +53,12 @@ class Minimum:
     tree: gtsam.GaussianBayesTree | None
     converged: bool
     iterations: int
+
+    @cached_property
+    def information(self) -> SquareRootInformation:
+        """Square-root information there, of a minimum that was proven."""
+        assert self.tree is not None
+        return SquareRootInformation(self.tree, self.evaluation.values.dims())
 
 
 def minimise(

@@ -19,6 +19,7 @@ from factorgraph_dvl.graph.motion_problem import (
     MotionProblem,
     with_sigma,
 )
+from factorgraph_dvl.graph.priors import after_step
 from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.solution import Progress
 from factorgraph_dvl.solvers.motion_preparation import MotionPreparation
@@ -217,7 +218,8 @@ def _minimise(
         share = 1.0
         while share > 1e-3:
             after = problem.evaluate(
-                evaluation.states + share * dx, problem.moved(evaluation.parameters, share * dc)
+                evaluation.states + share * dx,
+                after_step(problem.parameters, evaluation.parameters, share * dc),
             )
             after_cost = problem.cost(after)
             if after_cost < cost:

@@ -49,9 +49,7 @@ class Posterior:
 
 def posterior(problem: Problem, minimum: Minimum) -> Posterior:
     """Return the covariances at a minimum that was proven, fixed directions taken as exact."""
-    assert minimum.tree is not None
-    sizes = minimum.evaluation.values.dims()
-    information = SquareRootInformation(minimum.tree, sizes)
+    information = minimum.information
     wanted = [keys.node(k) for k in range(problem.chain.segments.node_time.size)]
     marginals = information.marginals(wanted)
     nodes = np.stack([marginals[key] for key in wanted])
@@ -59,7 +57,7 @@ def posterior(problem: Problem, minimum: Minimum) -> Posterior:
         return Posterior(information, nodes, nodes, np.zeros((0, 0)), {}, {})
     whiten = np.asarray(np.linalg.inv(problem.prior_root), float)
     every = {problem.key(name): whiten[:, place] for name, place in problem.columns.items()}
-    with_every = information.covariance_with(every)
+    with_every = information.covariance_with([every])
     cross = np.stack([with_every[key] for key in wanted])
     P = information.covariance_of([every])
     given = nodes - cross @ np.linalg.solve(P, cross.transpose(0, 2, 1))

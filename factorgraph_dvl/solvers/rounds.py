@@ -30,7 +30,6 @@ from factorgraph_dvl.solvers.known_parameters import (
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, minimise
 from factorgraph_dvl.solvers.outliers import robust_weights
 from factorgraph_dvl.solvers.preparation import Preparation, mounted_start
-from factorgraph_dvl.statistics.square_root_information import SquareRootInformation
 from factorgraph_dvl.statistics.variance_components import variance_components
 
 # Root mean square change of the positions, m, from which on gravity is taken anew. Chosen: 1 m
@@ -254,10 +253,7 @@ def _next_noise(levels: _NoiseLevels, problem: Problem, minimum: Minimum) -> _No
     It grows for ever where it takes the place of errors of the IMU: the less a sensor counts, the
     more the motion is the IMU's, and the larger are the residuals.
     """
-    assert minimum.tree is not None
-    evaluation = minimum.evaluation
-    information = SquareRootInformation(minimum.tree, evaluation.values.dims())
-    found = variance_components(problem, evaluation, information)
+    found = variance_components(problem, minimum.evaluation, minimum.information)
     last = levels.factors[-1]
     latest = last | {label: f.after(last[label]) for label, f in found.white.items()}
     processes = tuple(

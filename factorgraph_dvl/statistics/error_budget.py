@@ -39,22 +39,10 @@ def error_budget(
     dict of str to ndarray
         By source, (sum n, sum n); their sum is `information.covariance_of(functionals)`.
     """
-    with_functionals = information.covariance_with(_stacked(functionals))
+    with_functionals = information.covariance_with(functionals)
     out: dict[str, Array] = {}
     for each in rows:
         noise = product(each, with_functionals)
         part = np.einsum("mdi,mdj->ij", noise, noise, optimize=True)
         out[each.source] = out.get(each.source, 0.0) + part
-    return out
-
-
-def _stacked(functionals: Sequence[Mapping[int, Array]]) -> dict[int, Array]:
-    """Return functionals as one."""
-    heights = [next(iter(f.values())).shape[0] for f in functionals]
-    edges = np.cumsum([0, *heights])
-    out: dict[int, Array] = {}
-    for functional, first, last in zip(functionals, edges, edges[1:], strict=False):
-        for key, matrix in functional.items():
-            whole = out.setdefault(key, np.zeros((int(edges[-1]), matrix.shape[1])))
-            whole[first:last] += matrix
     return out

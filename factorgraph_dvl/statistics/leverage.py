@@ -50,7 +50,7 @@ def leverage(rows: Sequence[Rows], information: SquareRootInformation) -> list[A
         add_transposed_product(each, z, sums)
     if not sums:
         return []
-    with_probes = information.covariance_with(sums)
+    with_probes = information.covariance_with([sums])
     return [
         np.asarray(np.mean(z * product(each, with_probes), axis=2))
         for each, z in zip(rows, signs, strict=True)

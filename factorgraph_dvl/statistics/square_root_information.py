@@ -7,7 +7,7 @@ the digits that navigation-grade gyros need.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import gtsam
@@ -64,37 +64,23 @@ class SquareRootInformation:
             index = len(self._cliques) - 1
             stack += [(clique[i], index) for i in range(clique.nrChildren())]
 
-    def covariance_with(self, functional: Mapping[int, Array]) -> dict[int, Array]:
-        """Return the covariance of every variable with a linear functional.
+    def covariance_with(self, functionals: Sequence[Mapping[int, Array]]) -> dict[int, Array]:
+        """Return the covariance of every variable with linear functionals of all.
 
         P Wᵀ = R⁻¹ R⁻ᵀ Wᵀ: from the leaves to the root, and back.
 
         Parameters
         ----------
-        functional : mapping of int to ndarray
-            Keys to (n, size) matrices.
+        functionals : sequence of mapping of int to ndarray
+            Each maps keys to (n, size) matrices; values add up over keys.
 
         Returns
         -------
         dict of int to ndarray
-            Keys to (size, n) matrices.
+            Keys to (size, sum n) matrices.
         """
-        width = next(iter(functional.values())).shape[0]
-        pending = {key: matrix.T for key, matrix in functional.items()}
-        halfway: list[Array] = []
-        for clique in reversed(self._cliques):
-            w = np.concatenate(
-                [pending.pop(key, np.zeros((self._sizes[key], width))) for key in clique.frontals]
-            )
-            z = _solve(clique.R, w, transposed=True)
-            halfway.append(z)
-            passed = -clique.T.T @ z
-            row = 0
-            for key in clique.separators:
-                size = self._sizes[key]
-                pending[key] = pending.get(key, 0.0) + passed[row : row + size]
-                row += size
         out: dict[int, Array] = {}
+        halfway = list(self._halfway(functionals))
         for clique, z in zip(self._cliques, reversed(halfway), strict=True):
             if clique.separators:
                 z = z - clique.T @ np.concatenate([out[key] for key in clique.separators])
@@ -113,38 +99,41 @@ class SquareRootInformation:
         Parameters
         ----------
         functionals : sequence of mapping of int to ndarray
-            Each maps keys to (n, size) matrices; values add up over keys.
+            As in `covariance_with`.
 
         Returns
         -------
         ndarray, shape (sum n, sum n)
             Covariance.
         """
+        z = np.concatenate(list(self._halfway(functionals)))
+        return np.asarray(z.T @ z)
+
+    def _halfway(self, functionals: Sequence[Mapping[int, Array]]) -> Iterator[Array]:
+        """Yield the rows of z with Rᵀ z = Wᵀ, clique by clique from the leaves to the root."""
         widths = [next(iter(f.values())).shape[0] for f in functionals]
-        total = sum(widths)
+        edges = np.cumsum([0, *widths])
+        total = int(edges[-1])
         pending: dict[int, Array] = {}
-        column = 0
-        for functional, width in zip(functionals, widths, strict=True):
+        for functional, first, last in zip(functionals, edges, edges[1:], strict=False):
             for key, matrix in functional.items():
                 block = pending.setdefault(key, np.zeros((self._sizes[key], total)))
-                block[:, column : column + width] += matrix.T
-            column += width
-        out = np.zeros((total, total))
+                block[:, first:last] += matrix.T
         for clique in reversed(self._cliques):
             if not any(key in pending for key in clique.frontals):
+                yield np.zeros((clique.R.shape[0], total))
                 continue
             w = np.concatenate(
                 [pending.pop(key, np.zeros((self._sizes[key], total))) for key in clique.frontals]
             )
             z = _solve(clique.R, w, transposed=True)
-            out += z.T @ z
+            yield z
             passed = -clique.T.T @ z
             row = 0
             for key in clique.separators:
                 size = self._sizes[key]
                 pending[key] = pending.get(key, 0.0) + passed[row : row + size]
                 row += size
-        return 0.5 * (out + out.T)
 
     def marginals(self, wanted: Sequence[int]) -> dict[int, Array]:
         """Return the marginal covariances of variables by key.

@@ -11,6 +11,7 @@ import numpy as np
 
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph.clocks import linearized, parameters_of
+from factorgraph_dvl.graph.priors import after_step
 from factorgraph_dvl.graph.problem import Evaluation, Problem
 from factorgraph_dvl.statistics.spurious_information import spurious_information
 
@@ -178,5 +179,5 @@ def at_prior_along(
     for _ in range(10):
         offset = np.linalg.solve(root, problem.difference(parameters, prior))
         step = -directions @ (directions.T @ offset)
-        parameters = problem.moved(parameters, root @ step)
+        parameters = after_step(problem.parameters, parameters, root @ step)
     return parameters

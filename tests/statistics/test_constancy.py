@@ -36,7 +36,7 @@ def fitted(data):
     functional = {1: np.eye(2)}
     return changes(
         [(rows, TIME)],
-        information.covariance_with(functional),
+        information.covariance_with([functional]),
         information.covariance_of([functional]),
         (0.0, 399.0),
     )
