@@ -48,8 +48,10 @@ def inverse_blocks(diagonal: Array, off: Array) -> tuple[Array, Array]:
 
     Returns
     -------
-    own, across : ndarray, shape (K, n, n) or (K - 1, n, n)
-        P_kk and P_k,k+1.
+    own : ndarray, shape (K, n, n)
+        P_kk.
+    across : ndarray, shape (K - 1, n, n)
+        P_k,k+1.
     """
     own = np.empty_like(diagonal)
     own[0] = np.linalg.inv(diagonal[0])
