@@ -1,8 +1,11 @@
-"""Calibrate a DVL from Python, and use the numbers.
+"""Calibrate a DVL from Python
+==============================
+
+Solve a trial, print the calibration, and correct the velocities of the DVL with it::
 
     python examples/calibrate.py [TRIAL]
 
-Without an argument it takes the shipped trial.
+Without an argument the script takes the shipped trial.
 """
 
 from __future__ import annotations

@@ -1,6 +1,10 @@
-"""Calibrate a DVL with GTSAM's own Levenberg-Marquardt, and compare with `solve`.
+"""Calibrate with GTSAM's own optimiser
+=======================================
 
-python examples/gtsam_calibration.py
+Take the graph of a trial, minimise it with GTSAM's Levenberg-Marquardt, and compare with
+``solve``::
+
+    python examples/gtsam_calibration.py
 """
 
 import gtsam

@@ -1,9 +1,12 @@
-"""Calibrate while the sensors deliver: lines of text from a socket into `Replay`.
+"""Calibrate while the sensors deliver
+======================================
+
+Read lines of text from a socket into ``Replay``::
 
     python examples/live.py HOST PORT      # a server that sends the lines below
     python examples/live.py                # plays the short run to itself, over a link that breaks
 
-Lines, each with the time of its measurement:
+Lines, each with the time of its measurement::
 
     $GPGGA,hhmmss.ss,...*hh                                  GNSS, NMEA 0183
     wrz,vx,vy,vz,y,altitude,fom,covariance,time_us,...*hh    DVL, Water Linked's serial protocol

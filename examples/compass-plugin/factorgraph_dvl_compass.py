@@ -1,10 +1,12 @@
-"""A magnetic compass with a bias, as a sensor of factorgraph-dvl.
+"""A sensor of your own as a plug-in
+====================================
 
-Once this package is installed, a trial may have a section `compass`:
+A magnetic compass with a bias. Once this package is installed, a trial may have a section
+``compass``::
 
     compass: {file: compass.csv, std_deg: 1.0, declination_deg: -5.3, bias_std_deg: 10}
 
-and a table with the columns `time_s` and `heading_deg`, clockwise from magnetic north.
+and a table with the columns ``time_s`` and ``heading_deg``, clockwise from magnetic north.
 """
 
 from __future__ import annotations

@@ -204,7 +204,7 @@ class Dvl:
     def sigma(self) -> Array:
         """Return the standard deviations of the velocity components, (M, 3), m/s.
 
-        The record's own where it has them, else sqrt(floor² + (fraction |v|)²).
+        The record's own where it has them, else sqrt(floor² + (fraction · speed)²).
         """
         s = self.settings
         speed = np.linalg.norm(self.velocity, axis=1, keepdims=True)

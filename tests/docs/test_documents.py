@@ -61,9 +61,11 @@ def blocks_of(text: str) -> Iterator[Block]:
     while i < len(lines):
         before = lines[i - 1] if i else ""
         mark = before[4:-3].strip() if before.startswith("<!--") else ""
-        if fence := re.fullmatch(r"```(\w*)", lines[i]):
+        if fence := re.fullmatch(r"```(\w*|\{[\w-]+\})", lines[i]):
             end = lines.index("```", i + 1)
-            yield Block(fence[1], "\n".join(lines[i + 1 : end]) + "\n", mark, i + 1)
+            # Directives of the site are no code.
+            if not fence[1].startswith("{"):
+                yield Block(fence[1], "\n".join(lines[i + 1 : end]) + "\n", mark, i + 1)
             i = end
         elif re.match(r"    factorgraph-dvl ", lines[i]):
             yield Block("sh", lines[i].strip() + "\n", mark, i + 1)
