@@ -13,7 +13,7 @@ from factorgraph_dvl.baselines.beam_filter import (
     beam_residuals,
     without_spurious_information,
 )
-from factorgraph_dvl.baselines.navigation import motion_at, navigate
+from factorgraph_dvl.baselines.navigation import attitude_is_known, motion_at, navigate
 from factorgraph_dvl.baselines.outcome import Outcome
 from factorgraph_dvl.baselines.summary import (
     WHITE_NOISE,
@@ -67,8 +67,9 @@ def calibrate_beams(trial: Trial, *, rate_hz: float, report: Progress) -> tuple[
     received = np.logical_not(sensor.missing)
     navigation = navigate(trial, sensor.time[received])
     report("beams", 0, None)
-    covered = motion_at(navigation, sensor.time).covered
-    used = received & covered
+    everywhere = motion_at(navigation, sensor.time)
+    covered = received & everywhere.covered
+    used = received & attitude_is_known(everywhere)
     motion = motion_at(navigation, sensor.time[used])
     pings = BeamPings(motion, sensor.nominal_b, sensor.velocity[used], sensor.sigma()[used])
     clock = sensor.clock.names
@@ -79,9 +80,7 @@ def calibrate_beams(trial: Trial, *, rate_hz: float, report: Progress) -> tuple[
     residual, sigma = beam_residuals(pings, outcome.estimated)
     components = tuple(f"beam {i}" for i in range(1, residual.shape[1] + 1))
     findings = [*navigation.findings, WHITE_NOISE]
-    unused = int(np.sum(received & ~covered))
-    if unused:
-        findings.append(left_out(sensor, unused))
+    findings += left_out(sensor, int(np.sum(received & ~covered)), int(np.sum(covered & ~used)))
     solution = summarise(
         trial,
         navigation,

@@ -11,7 +11,7 @@ import numpy as np
 from factorgraph_dvl.baselines.beam_calibration import calibrate_beams
 from factorgraph_dvl.baselines.least_squares import least_squares
 from factorgraph_dvl.baselines.luo_2024 import as_printed
-from factorgraph_dvl.baselines.navigation import Navigation, motion_at, navigate
+from factorgraph_dvl.baselines.navigation import Navigation, attitude_is_known, motion_at, navigate
 from factorgraph_dvl.baselines.nine_state import nine_state, with_bias
 from factorgraph_dvl.baselines.nine_state_ukf import unscented
 from factorgraph_dvl.baselines.outcome import History, Outcome, history_of
@@ -163,7 +163,7 @@ def calibrate(
     pings = dvl.time[dvl.locked] - offset
     navigation = navigate(trial, pings, smoothed=method != "luo-2024")
     report(method, 0, None)
-    points_at, unused = _point_sets(navigation, dvl)
+    points_at, unused = _point_sets(navigation, dvl, as_printed=method == "luo-2024")
     outcome = _calibrate(method, points_at, dvl)
     report("summary", 0, None)
     points = points_at(offset)
@@ -179,9 +179,8 @@ def calibrate(
         *outcome.findings,
         WHITE_NOISE,
         *_neglects(method, dvl),
+        *left_out(dvl, *unused),
     ]
-    if unused:
-        findings.append(left_out(dvl, unused))
     solution = summarise(
         trial,
         navigation,
@@ -215,16 +214,24 @@ def _outage(trial: Trial) -> list[Finding]:
     ]
 
 
-def _point_sets(navigation: Navigation, dvl: Dvl) -> tuple[Callable[[float], Points], int]:
-    """Return the point sets as a function of the time offset, and how many pings fall out."""
+def _point_sets(
+    navigation: Navigation, dvl: Dvl, *, as_printed: bool
+) -> tuple[Callable[[float], Points], tuple[int, int]]:
+    """Return the point sets as a function of the time offset, and how many pings fall out.
+
+    Outside SINS/GNSS, and where it leaves the heading open; the printed filter takes the latter.
+    """
     prior = next(p for p in dvl.parameters() if p.stem == "time_offset")
     mean = float(prior.mean[0])
     reach = min(4.0 * float(prior.sigma[0]), _MARGIN)
     locked = np.flatnonzero(dvl.locked)
     covered = np.ones(locked.size, dtype=bool)
+    known = covered.copy()
     for offset in {mean - reach, mean, mean + reach}:
-        covered &= motion_at(navigation, dvl.time[locked] - offset).covered
-    used = locked[covered]
+        motion = motion_at(navigation, dvl.time[locked] - offset)
+        covered &= motion.covered
+        known &= motion.covered if as_printed else attitude_is_known(motion)
+    used = locked[known]
     sigma = dvl.sigma()[used]
 
     def points_at(offset: float) -> Points:
@@ -239,7 +246,7 @@ def _point_sets(navigation: Navigation, dvl: Dvl) -> tuple[Callable[[float], Poi
             sigma,
         )
 
-    return points_at, int(locked.size - used.size)
+    return points_at, (int(np.sum(~covered)), int(np.sum(covered & ~known)))
 
 
 def _calibrate(method: DvlMethod, points_at: Callable[[float], Points], dvl: Dvl) -> Outcome:

@@ -174,7 +174,10 @@ def _wahba(body: Array, space: Array, noise: float, system: float) -> tuple[Arra
     reduce it.
     """
     x, y = body - body.mean(axis=0), space - space.mean(axis=0)
-    moment = y.T @ y
+    R = best_rotation(y.T @ x)
+    # Of the velocity by specific force: the noise of that of GNSS would count as motion, and make
+    # the heading of a straight run look known to 1 / sqrt(2 M) rad.
+    moment = R @ (x.T @ x) @ R.T
     information = (np.trace(moment) * np.eye(3) - moment) / (noise**2 + len(x) * system**2)
     # A turn by a radian is as good as unknown.
-    return best_rotation(y.T @ x), np.linalg.inv(information + np.eye(3))
+    return R, np.linalg.inv(information + np.eye(3))

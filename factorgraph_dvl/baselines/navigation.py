@@ -53,7 +53,8 @@ _PASSES = 4
 # Chosen: standard deviations of the initial position, m, and velocity, m/s, beyond the fix's own.
 _POSITION_UNKNOWN = 10.0
 _VELOCITY_UNKNOWN = 3.0
-# Chosen: standard deviation of an attitude prior beyond which alignment is better.
+# Chosen: standard deviation of an attitude beyond which a filter that is linear in its error does
+# not describe it: of a prior, where alignment is better, and of what was found.
 _WIDE = 6.0 * DEG
 
 
@@ -236,6 +237,18 @@ def motion_at(navigation: Navigation, time: Array) -> NavigationMotion:
     )
 
 
+def attitude_is_known(motion: NavigationMotion) -> Array:
+    """Whether motion is covered, and its attitude known well enough to compare velocities, (M,).
+
+    On a short arc, as between two breaks of the IMU's clock, it may not be. What is wrong with its
+    heading then goes into the mounting, and no covariance that is linear describes it. Where no
+    arc is better, all are good enough: some of the parameters need no heading.
+    """
+    sigma = np.sqrt(np.diagonal(motion.covariance[:, 6:, 6:], axis1=1, axis2=2).max(axis=1))
+    known = motion.covered & (sigma <= _WIDE)
+    return known if known.any() else motion.covered
+
+
 def _carry(track: FilteredTrack, index: np.ndarray, step: Steps) -> tuple[Array, Array, Array]:
     """Return geodetic position, velocity and nRb, carried from events over steps."""
     C, v = track.nRb[index], track.velocity[index]
@@ -317,9 +330,10 @@ def _navigate_arc(
         forward = run_filter(time, steps, fixes, start, walk)
         track = smooth(forward)
         moved = np.linalg.norm(log_so3(track.nRb[0] @ start.nRb.T))
-        start = replace(start, nRb=track.nRb[0])
-        if moved < _CLOSE:
+        # A heading that moves by less than is known of it would only take its prior along.
+        if moved < max(_CLOSE, np.sqrt(track.covariance[0].diagonal()[6:9].max())):
             break
+        start = replace(start, nRb=track.nRb[0])
     return track if smoothed else forward.track, attitude.note
 
 

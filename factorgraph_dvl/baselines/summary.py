@@ -216,10 +216,17 @@ def gnss_residuals(trial: Trial, navigation: Navigation) -> tuple[Residuals, ...
     return tuple(out)
 
 
-def left_out(sensor: Aid, pings: int) -> Finding:
-    """Return that so many pings of a sensor were not used."""
-    text = f"{pings} pings at times without SINS/GNSS were not used"
-    return Finding(Code.UNUSED, text, sensor=sensor.label)
+def left_out(sensor: Aid, outside: int, vague: int) -> list[Finding]:
+    """Say how many pings of a sensor were not used, and why: outside SINS/GNSS, or vague there."""
+    reasons = {
+        "at times without SINS/GNSS": outside,
+        "on parts of the trial that leave the heading open": vague,
+    }
+    return [
+        Finding(Code.UNUSED, f"{pings} pings {reason} were not used", sensor=sensor.label)
+        for reason, pings in reasons.items()
+        if pings
+    ]
 
 
 def _unobservable(

@@ -6,7 +6,7 @@ import msgspec
 import numpy as np
 import pytest
 from kalman_trials import STILL, samples_of
-from truth import scenario
+from truth import SWELL, scenario
 
 from factorgraph_dvl.baselines.coarse_alignment import coarse_attitude
 from factorgraph_dvl.baselines.strapdown import compose
@@ -57,3 +57,12 @@ def test_at_rest_coarse_gyros_leave_no_heading():
     assert np.sqrt(found.covariance[2, 2]) == pytest.approx(60.0 * DEG)
     # Gravity levels all the same.
     assert np.linalg.norm(error[:2]) < 1.0 * DEG
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_noise_of_gnss_does_not_count_as_motion(seed):
+    """In ten seconds ahead in swell, velocities to 0.1 m/s leave the heading open."""
+    short = scenario(noise=True, sway=SWELL, manoeuvres=[{"straight_s": 10}])
+    found, error = aligned(simulate(short, seed))
+    assert "course over ground" in found.note
+    assert abs(error[2]) < 2.0 * np.sqrt(found.covariance[2, 2])
