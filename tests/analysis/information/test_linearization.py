@@ -64,14 +64,15 @@ def test_every_column_against_numerical_derivatives():
     np.testing.assert_allclose(found.values, expected, rtol=1e-4)
 
 
-@pytest.mark.xfail(
-    strict=True,
-    reason="without noise and adrift the solver ends at a scale error of -1, which also explains "
-    "a DVL that reads zero",
-)
 def test_at_rest_in_the_water_a_current_shows_no_mounting():
-    trial = straight(**WATER, current_m_s=[0.8, 0, 0], start={"speed_m_s": 0})
-    view = observability(solve(trial), trial=trial)
+    # A DVL has noise at rest too. Where it reads exactly zero, a scale error of -1 is more probable
+    # than noise far below what is stated.
+    noisy = {"dvl": {"reference": "water", "velocity_std_m_s": 0.001}}
+    trial = straight(**noisy, current_m_s=[0.8, 0, 0], start={"speed_m_s": 0})
+    solution = solve(trial)
+    assert abs(solution.estimate("scale_error").value[0]) < 0.01
+    assert not solution.estimate("scale_error").observable.any()
+    view = observability(solution, trial=trial)
     assert view.point_set is not None
     (stack,) = view.point_set.segments
     assert observed(stack) == {"current_e_m_s", "current_n_m_s"}
