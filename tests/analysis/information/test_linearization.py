@@ -65,7 +65,7 @@ def test_every_column_against_numerical_derivatives():
 
 
 def test_at_rest_in_the_water_a_current_shows_no_mounting():
-    # A DVL has noise at rest too. Where it reads exactly zero, a scale error of -1 is more probable
+    # A DVL has noise at rest too. If it reads exactly zero, a scale error of -1 is more probable
     # than noise far below what is stated.
     noisy = {"dvl": {"reference": "water", "velocity_std_m_s": 0.001}}
     trial = straight(**noisy, current_m_s=[0.8, 0, 0], start={"speed_m_s": 0})
