@@ -42,7 +42,6 @@ ELSEWHERE = {
     "statistics/spurious_information": "replay/test_session.py",
     "statistics/square_root_information": "solvers/test_posterior.py",
     "imu/arc_polynomials": "imu/test_increments.py",
-    "imu/sensitivity": "graph/test_problem.py",
     "io/corrected_record": "sensors/test_dvl_beams.py",
     "io/data_frames": "io",
     "io/exporting/bag": "io/exporting/test_trial.py",

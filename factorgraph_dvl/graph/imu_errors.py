@@ -17,7 +17,14 @@ from factorgraph_dvl.graph.inertial_chain import Chain
 from factorgraph_dvl.graph.keys import BIAS_SIZE, STATE_SIZE
 from factorgraph_dvl.graph.template import jacobian_template
 from factorgraph_dvl.imu.propagation import Attachment, Transition
-from factorgraph_dvl.imu.sensitivity import Sensitivity, by_errors, corrected, sensitivities
+from factorgraph_dvl.imu.sensitivity import (
+    Sensitivity,
+    by_errors,
+    corrected,
+    moved,
+    predicted,
+    sensitivities,
+)
 from factorgraph_dvl.sensors.imu import ERRORS
 from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.sensors.protocol import Linearization
@@ -70,10 +77,12 @@ class ImuErrors:
         self.names = tuple(p.name for p in parameters)
         self._keys = list(keys)
         self._sizes = [p.mean.size for p in parameters]
-        elements = [e for p in parameters for e in ERRORS[p.name]]
+        self._segments = chain.segments
+        self._elements = [e for p in parameters for e in ERRORS[p.name]]
         unique = {id(at): at for at in attachments}
-        ends, found = sensitivities(chain.segments, elements, list(unique.values()))
-        self._ends = ends
+        whole, found = sensitivities(chain.segments, self._elements, list(unique.values()))
+        self._whole = whole
+        self._ends = predicted(chain.segments, whole)
         self._by: dict[int, Sensitivity] = dict(zip(unique, found, strict=True))
         self._factors: list[gtsam.JacobianFactor] = []
 
@@ -82,8 +91,11 @@ class ImuErrors:
         return np.concatenate([parameters[name] for name in self.names])
 
     def corrected(self, at: Attachment, bound: Attachment, errors: Array) -> Attachment:
-        """Return an attachment without the errors, as sensitive to them as where it was bound."""
-        return corrected(at, self._by[id(bound)], errors)
+        """Return an attachment without the errors; `bound` is where it was bound."""
+        by = self._by[id(bound)]
+        if at is not bound:
+            by = moved(self._segments, at, bound, by, self._whole, self._elements)
+        return corrected(at, by, errors)
 
     def columns(
         self, lin: Linearization, transition: Transition, bound: Attachment

@@ -33,7 +33,7 @@ class Sensitivity:
         Of rotation, velocity and position increments: -Theta, V, P, in the axes at the
         segment's start.
     rate, force : ndarray, shape (M, 3, n)
-        E and A at the times.
+        E and A at the times; at the ends of segments zero.
     """
 
     theta: Array
@@ -54,7 +54,7 @@ def unit_errors(rate: Array, force: Array, errors: Sequence[ImuError]) -> tuple[
 
 def sensitivities(
     seg: Segments, errors: Sequence[ImuError], attachments: Sequence[Attachment]
-) -> tuple[Array, list[Sensitivity]]:
+) -> tuple[Sensitivity, list[Sensitivity]]:
     """Return derivatives with respect to errors of the IMU, by sums over the samples.
 
     Parameters
@@ -68,9 +68,8 @@ def sensitivities(
 
     Returns
     -------
-    ends : ndarray, shape (S, 9, n)
-        Of the predicted states at the ends of the segments, in GTSAM's tangent space of
-        NavState: attitude, position, velocity.
+    ends : Sensitivity
+        Of the increments over the S segments.
     attached : list of Sensitivity
         Of the motion that is attached.
     """
@@ -90,8 +89,7 @@ def sensitivities(
         rate, force = seg.phi[i] / h[:, None], seg.dv[i] / h[:, None]
         step = _step(seg.dR[i], rate, force, h, errors, (theta[live], v[live], p[live]))
         theta[live], v[live], p[live] = step
-    back = seg.totals()[0].transpose(0, 2, 1)
-    ends = np.concatenate([-(back @ theta), back @ p, back @ v], axis=1)
+    ends = Sensitivity(-theta, v, p, np.zeros_like(theta), np.zeros_like(theta))
     out = []
     for (index, since), at, kept in zip(places, attachments, before, strict=True):
         dR = seg.dR[index]
@@ -99,6 +97,61 @@ def sensitivities(
         rate, force = unit_errors(at.gyro, at.force, errors)
         out.append(Sensitivity(-theta_at, v_at, p_at, rate, force))
     return ends, out
+
+
+def predicted(seg: Segments, ends: Sensitivity) -> Array:
+    """Return derivatives of the predicted states at the ends of segments, (S, 9, n).
+
+    In GTSAM's tangent space of NavState: attitude, position, velocity.
+    """
+    back = seg.totals()[0].transpose(0, 2, 1)
+    return np.concatenate([back @ ends.theta, back @ ends.p, back @ ends.v], axis=1)
+
+
+def moved(
+    seg: Segments,
+    at: Attachment,
+    bound: Attachment,
+    by: Sensitivity,
+    ends: Sensitivity,
+    errors: Sequence[ImuError],
+) -> Sensitivity:
+    """Return the sensitivity at M times that a clock has moved.
+
+    What is integrated is interpolated between the start of the segment, the time where a
+    measurement was bound if that is in the same segment, and the end. So it does not jump where
+    a measurement moves into the segment before or after.
+
+    Parameters
+    ----------
+    seg : Segments
+        Increments between the nodes.
+    at, bound : Attachment
+        Where the measurements are, and where they were bound.
+    by : Sensitivity
+        Where they were bound.
+    ends : Sensitivity
+        Of the increments over whole segments.
+    errors : sequence of ImuError
+        The n errors.
+    """
+    length = seg.increments.end[seg.last - 1] - seg.node_time[seg.origin]
+    whole = length[at.segment]
+    same = at.segment == bound.segment
+    knot = np.where(same, bound.tau, 0.0)
+    last = _share(at.tau - knot, whole - knot)
+    own = np.where(at.tau < knot, _share(at.tau, knot), 1.0 - last) * same
+    theta, v, p = (
+        own[:, None, None] * here + last[:, None, None] * end[at.segment]
+        for here, end in ((by.theta, ends.theta), (by.v, ends.v), (by.p, ends.p))
+    )
+    return Sensitivity(theta, v, p, *unit_errors(at.gyro, at.force, errors))
+
+
+def _share(part: Array, whole: Array) -> Array:
+    """Return how much of a whole a part is, 0 to 1; 1 of nothing."""
+    share = np.divide(part, whole, out=np.ones_like(part), where=whole > 0.0)
+    return np.clip(share, 0.0, 1.0)
 
 
 def corrected(at: Attachment, by: Sensitivity, errors: Array) -> Attachment:

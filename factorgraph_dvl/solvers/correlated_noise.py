@@ -155,6 +155,16 @@ def with_innovations(process: Process, factor: Array) -> Process:
     return replace(process, sigma=process.sigma * factor)
 
 
+def long_run_share(problem: Problem, process: Process) -> Array:
+    """Return the share (d,) of a process in the variance of a sensor's mean over a long time."""
+    (i,) = (i for i, o in enumerate(problem.observations) if o.label == process.label)
+    interval = float(np.median(np.diff(problem.observations[i].time)))
+    correlated = 2.0 * process.sigma**2 * process.tau
+    white = _typical(problem.weights[i]) ** 2 * interval
+    total = correlated + white
+    return np.divide(correlated, total, out=np.zeros(total.size), where=total > 0.0)
+
+
 def noise_of(problem: Problem) -> tuple[Noise, ...]:
     """Return the noise of each observation against what is stated of it."""
     out = []

@@ -16,6 +16,9 @@ from factorgraph_dvl.statistics.square_root_information import SquareRootInforma
 # A step is small when all of it together is this many standard deviations, squared and
 # halved: the decrease of the cost that the linear model still promises. Chosen: 0.004 σ.
 CONVERGED = 1e-5
+# The same where the times of measurements are to be bound anew: another problem follows.
+# Chosen: 0.14 σ.
+_ANOTHER_FOLLOWS = 1e-2
 # Sizes of a step that the linear model is trusted for, once it has failed: NavState
 # (rad, m, m/s), and SI units in other variables. Chosen: where attitudes are nearly linear.
 _TRUSTED_STATE = np.repeat([0.05, 5.0, 0.5], 3)
@@ -42,9 +45,10 @@ class Minimum:
         At the last values.
     tree : gtsam.GaussianBayesTree or None
         Bayes tree from QR there, up to the last step, which was small if `converged`; None if no
-        proof was asked for.
+        proof was asked for, or another problem follows.
     converged : bool
-        Whether the linear model promises no more.
+        Whether the linear model promises no more; False where it stopped early because clocks
+        have moved measurements, so that another problem follows.
     iterations : int
         Accepted and refused steps.
     """
@@ -130,6 +134,8 @@ def minimise(
             delta = tree.optimize()
             promised = evaluation.cost - gaussian.error(delta)
         assert delta is not None
+        if promised < _ANOTHER_FOLLOWS and problem.needs_rebinding(evaluation.parameters):
+            return Minimum(evaluation, None, False, iteration)
         trial = problem.evaluate(evaluation.values.retract(delta))
         lower = trial.cost <= evaluation.cost * (1.0 + _ROUNDING)
         small = promised < tolerance

@@ -8,7 +8,7 @@ settled.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -20,7 +20,11 @@ from factorgraph_dvl.imu.propagation import States
 from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.solution import Progress
-from factorgraph_dvl.solvers.correlated_noise import correlated_noise, with_innovations
+from factorgraph_dvl.solvers.correlated_noise import (
+    correlated_noise,
+    long_run_share,
+    with_innovations,
+)
 from factorgraph_dvl.solvers.known_parameters import (
     Explanation,
     confirmed,
@@ -49,12 +53,15 @@ _KNOWN = "which parameters are known"
 # Parameters that are estimated although they were stated as known. Chosen: a third is a sign that
 # the model is wrong.
 _MOST_FREED = 2
-# Relative change of the innovations of correlated noise from which on it counts. Chosen: less
-# changes no σ that is shown.
+# Relative change of the noise over a long time, by that of innovations, from which on it counts.
+# Chosen: less changes no σ that is shown.
 _SAME_INNOVATIONS = 0.05
-# Bindings in a row from which on each is half-way between the last two. Chosen: most trials take
+# Ratio of two steps of the innovations up to which they are extrapolated. Chosen: five steps in
 # one.
-_IN_A_ROW = 2
+_MOST_RATIO = 0.8
+# Share of the last movement of the clocks from which on the next binding is half-way. Chosen:
+# where they settle, each movement is far smaller than the last.
+_NOT_SETTLING = 0.5
 # Searches for outliers. Chosen: the second finds those that the first could not see.
 _SEARCHES = 2
 
@@ -139,14 +146,18 @@ def settle(
     first_levels = _NoiseLevels((as_stated,), bool(as_stated))
     levels = first_levels
     changing: list[str] = ["all"]
-    count = in_a_row = 0
+    count = 0
+    movement = np.inf
     start = values
     while count < _ROUNDS:
         count += 1
         if changing not in ([_NOISE], [_OUTLIERS]):
-            in_a_row = in_a_row + 1 if changing == [_TIMES] else 0
+            only_times = changing == [_TIMES]
+            before = movement if only_times else np.inf
+            movement = _clock_movement(prepared, start, values) if only_times else np.inf
             # Where sway repeats itself, two bindings may lead to each other for ever.
-            start = values if in_a_row < _IN_A_ROW else values | _halfway(prepared, start, values)
+            settling = not only_times or movement < _NOT_SETTLING * before
+            start = values if settling else values | _halfway(prepared, start, values)
             problem = Problem(
                 chain,
                 prepared.observations,
@@ -209,12 +220,12 @@ def settle(
                 robust, long_run, levels = {}, {}, first_levels
                 searches, correlation_searched, count = 0, False, 0
         if not changing and levels.estimated and minimum.converged:
-            before = levels
+            last = levels
             levels = _next_noise(levels, problem, minimum)
-            same = levels.processes == before.processes
-            if len(levels.processes) != len(before.processes):
+            same = levels.processes == last.processes
+            if len(levels.processes) != len(last.processes):
                 changing.append(_CORRELATED)
-            elif not (same and _same(levels.factors[-1], before.factors[-1])):
+            elif not (same and _same(levels.factors[-1], last.factors[-1])):
                 changing.append(_NOISE)
         if not changing:
             break
@@ -237,13 +248,15 @@ def settle(
 class _NoiseLevels:
     """Factors on stated noise that were applied, and whether to estimate more of them.
 
-    `processes` is the correlated noise to assume next, `rounds` counts estimates.
+    `processes` is the correlated noise to assume next, `innovations` the logarithms of the factors
+    on its innovations that led there, by label, `rounds` counts estimates.
     """
 
     factors: tuple[dict[str, Array], ...]
     estimated: bool
     findings: tuple[Finding, ...] = ()
     processes: tuple[Process, ...] = ()
+    innovations: Mapping[str, Array] = field(default_factory=dict)
     rounds: int = 0
 
 
@@ -256,17 +269,22 @@ def _next_noise(levels: _NoiseLevels, problem: Problem, minimum: Minimum) -> _No
     found = variance_components(problem, minimum.evaluation, minimum.information)
     last = levels.factors[-1]
     latest = last | {label: f.after(last[label]) for label, f in found.white.items()}
+    logs = {label: np.log(f.factor) for label, f in found.correlated.items()}
     processes = tuple(
-        with_innovations(p, found.correlated[p.label].factor)
-        if p.label in found.correlated
-        and np.abs(found.correlated[p.label].factor - 1.0).max() > _SAME_INNOVATIONS
+        with_innovations(p, np.exp(_extrapolated(logs[p.label], levels.innovations.get(p.label))))
+        if p.label in logs
+        and np.abs(long_run_share(problem, p) * logs[p.label]).max() > _SAME_INNOVATIONS
         else p
         for p in levels.processes
     )
     rounds = levels.rounds + 1
     if rounds <= _NOISE_ROUNDS:
         return replace(
-            levels, factors=(*levels.factors, latest), processes=processes, rounds=rounds
+            levels,
+            factors=(*levels.factors, latest),
+            processes=processes,
+            innovations=logs,
+            rounds=rounds,
         )
     if _same(latest, last):
         return replace(levels, rounds=rounds)
@@ -290,6 +308,18 @@ def _next_noise(levels: _NoiseLevels, problem: Problem, minimum: Minimum) -> _No
     )
 
 
+def _extrapolated(step: Array, before: Array | None) -> Array:
+    """Return the step that a geometric series of steps comes to, after two of them (Aitken).
+
+    Where nodes are about as many as what determines them, each estimate of the innovations goes
+    only a part of the way.
+    """
+    if before is None:
+        return step
+    ratio = np.divide(step, before, out=np.zeros_like(step), where=before != 0.0)
+    return np.asarray(step / (1.0 - np.clip(ratio, 0.0, _MOST_RATIO)))
+
+
 def _changing(problem: Problem, evaluation: Evaluation) -> list[str]:
     """Return what of the measurements would differ in a problem that starts here."""
     found = {
@@ -303,9 +333,24 @@ def _halfway(
     prepared: Preparation, before: Mapping[str, Array], after: Mapping[str, Array]
 ) -> dict[str, Array]:
     """Return offsets and rates of clocks half-way between two sets of values."""
-    clocks = [o.clock for o in prepared.observations if o.clock is not None]
-    names = [n for clock in clocks for n in clock.names if n in before and n in after]
+    names = _clock_parameters(prepared, before, after)
     return {name: 0.5 * (before[name] + after[name]) for name in names}
+
+
+def _clock_movement(
+    prepared: Preparation, before: Mapping[str, Array], after: Mapping[str, Array]
+) -> float:
+    """Return the largest change of an offset, s, or of a rate between two sets of values."""
+    names = _clock_parameters(prepared, before, after)
+    return max((float(np.abs(after[n] - before[n]).max()) for n in names), default=0.0)
+
+
+def _clock_parameters(
+    prepared: Preparation, before: Mapping[str, Array], after: Mapping[str, Array]
+) -> list[str]:
+    """Return the names of offsets and rates of clocks that both sets of values have."""
+    clocks = [o.clock for o in prepared.observations if o.clock is not None]
+    return [n for clock in clocks for n in clock.names if n in before and n in after]
 
 
 def _cycle(

@@ -37,3 +37,15 @@ def test_a_cost_that_is_not_finite_is_refused():
     values.update(problem.key(name), np.full(problem.parameters[1].mean.size, np.nan))
     with pytest.raises(SolveError, match="not finite"):
         minimise(problem, values, stage="test")
+
+
+def test_it_stops_early_where_another_problem_follows(monkeypatch):
+    problem, values = problem_of(scenario(manoeuvres=SHORT))
+    whole = minimise(problem, values, stage="test")
+    monkeypatch.setattr(problem, "needs_rebinding", lambda _: True)
+    minimum = minimise(problem, values, stage="test")
+    assert not minimum.converged
+    assert minimum.tree is None
+    assert minimum.iterations < whole.iterations
+    # What is left is less than 0.14 sigma in all.
+    assert 0.0 <= minimum.evaluation.cost - whole.evaluation.cost < 1e-2
