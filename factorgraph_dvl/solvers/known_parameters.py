@@ -91,7 +91,10 @@ def explanation(problem: Problem, minimum: Minimum) -> Explanation | None:
     ]
     if not significant:
         return None
-    changes = component_changes(problem, evaluation, information)
+    same, at = _scattered(problem, evaluation, problem.all_parameters)
+    gaussian = same.linearize(at)
+    tree = eliminate(gaussian, same.ordering(gaussian))
+    changes = component_changes(same, at, SquareRootInformation(tree, at.values.dims()))
     most = max((each.change.chi2 for each in changes), default=0.0)
     count = sum(int(np.count_nonzero(w)) for w in problem.weights)
     significant.sort(key=lambda each: -each[1].evidence(count))
@@ -222,12 +225,20 @@ def _freed(
 ) -> tuple[Problem, Evaluation, dict[str, tuple[int, Array]]]:
     """Return the problem with known parameters free, where it is, and their keys and priors."""
     names = {p.name for p in known}
-    values = evaluation.parameters
     free = [_wide(p, p.mean) if p.name in names else p for p in problem.all_parameters]
+    test, at = _scattered(problem, evaluation, free)
+    return test, at, {p.name: (test.key(p.name), p.sigma) for p in free if p.name in names}
+
+
+def _scattered(
+    problem: Problem, evaluation: Evaluation, parameters: Sequence[Parameter]
+) -> tuple[Problem, Evaluation]:
+    """Return a problem with other parameters where it is, and noise as residuals scatter."""
+    values = evaluation.parameters
     test = Problem(
         problem.chain,
         problem.observations,
-        free,
+        parameters,
         start=values,
         clock_zero=problem.clock_zero,
         processes=problem.processes,
@@ -238,9 +249,7 @@ def _freed(
     test.long_run = problem.long_run
     at = test.evaluate(test.values(evaluation.states, test.prior_values() | values))
     test.weigh(at)
-    sigma = {p.name: p.sigma for p in free}
-    columns = {name: (test.key(name), sigma[name]) for name in sigma if name in names}
-    return test, test.evaluate(at.values), columns
+    return test, test.evaluate(at.values)
 
 
 def _scatter(
