@@ -125,8 +125,18 @@ def _compared(
     windows: CarriedWindows, sensor: Gnss | Dvl, around: float
 ) -> GnssWindows | DvlWindows | None:
     if isinstance(sensor, Gnss):
-        return gnss_windows(windows, sensor, around)
-    return dvl_windows(windows, sensor, around)
+        return _gnss_compared(windows, sensor, around)
+    return _dvl_compared(windows, sensor, around)
+
+
+def _gnss_compared(windows: CarriedWindows, sensor: Gnss, around: float) -> GnssWindows | None:
+    compared = gnss_windows(windows, sensor, around)
+    return None if compared is None else compared.without_outliers(around)
+
+
+def _dvl_compared(windows: CarriedWindows, sensor: Dvl, around: float) -> DvlWindows | None:
+    compared = dvl_windows(windows, sensor, around)
+    return None if compared is None else compared.without_outliers(around)
 
 
 def _views(windows: CarriedWindows, sensors: Sequence[Gnss | Dvl]) -> list[_GnssView | _DvlView]:
@@ -138,10 +148,10 @@ def _view(
     windows: CarriedWindows, sensor: Gnss | Dvl, around: float
 ) -> _GnssView | _DvlView | None:
     if isinstance(sensor, Gnss):
-        gnss = gnss_windows(windows, sensor, around)
+        gnss = _gnss_compared(windows, sensor, around)
         clock = None if gnss is None else clock_offset(gnss, around)
         return None if gnss is None else _GnssView(sensor, windows, gnss, clock, around)
-    dvl = dvl_windows(windows, sensor, around)
+    dvl = _dvl_compared(windows, sensor, around)
     if dvl is None:
         return None
     right = _dvl_view(windows, sensor, replace(dvl, handedness=1), around)

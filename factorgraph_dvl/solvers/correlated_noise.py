@@ -70,7 +70,9 @@ def correlated_noise(
         if not o.noise_groups or used.any(axis=1).sum() < 2:
             continue
         sigma = _typical(weight)
-        when = o.time[used.any(axis=1)]
+        # Nodes reach as far as the outliers too: those may be used later.
+        outlier = problem.robust_weights.get(o.label, np.ones(1)) == 0.0
+        when = o.time[(used | outlier).any(axis=1)]
         stated = o.correlated
         if stated is not None and stated.sigma is not None:
             tau = np.full(sigma.size, stated.time)

@@ -59,9 +59,9 @@ _SAME_INNOVATIONS = 0.05
 # Ratio of two steps of the innovations up to which they are extrapolated. Chosen: five steps in
 # one.
 _MOST_RATIO = 0.8
-# Share of the last movement of the clocks from which on the next binding is half-way. Chosen:
-# where they settle, each movement is far smaller than the last.
-_NOT_SETTLING = 0.5
+# Share of the last movement of the clocks from which on the next binding is half-way. Chosen: half
+# is what is left of a movement after one that went half the way.
+_NOT_SETTLING = 0.75
 # Searches for outliers. Chosen: the second finds those that the first could not see.
 _SEARCHES = 2
 
@@ -151,10 +151,10 @@ def settle(
     start = values
     while count < _ROUNDS:
         count += 1
+        only_times = changing == [_TIMES]
+        before = movement
+        movement = _clock_movement(prepared, start, values) if only_times else np.inf
         if changing not in ([_NOISE], [_OUTLIERS]):
-            only_times = changing == [_TIMES]
-            before = movement if only_times else np.inf
-            movement = _clock_movement(prepared, start, values) if only_times else np.inf
             # Where sway repeats itself, two bindings may lead to each other for ever.
             settling = not only_times or movement < _NOT_SETTLING * before
             start = values if settling else values | _halfway(prepared, start, values)
@@ -207,6 +207,9 @@ def settle(
                 levels = replace(
                     levels, factors=(*levels.factors, white), processes=found.processes
                 )
+                if any(process.label in robust for process in found.processes):
+                    # What wanders for long is no outlier.
+                    robust, searches = {}, 0
         if not changing and minimum.converged and parameters is not tested:
             tested = parameters
             left = explanation(problem, minimum)

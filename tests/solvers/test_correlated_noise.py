@@ -7,11 +7,13 @@ from dataclasses import replace
 import msgspec
 import numpy as np
 import pytest
+from problems import SHORT, problem_of
 from truth import scenario
 
 from factorgraph_dvl.simulation import simulate
 from factorgraph_dvl.simulation.faults import gauss_markov
 from factorgraph_dvl.solvers.batch import solve
+from factorgraph_dvl.solvers.correlated_noise import correlated_noise
 
 LONG = {
     "noise": True,
@@ -107,3 +109,17 @@ def test_a_wandering_receiver_keeps_the_stated_deviation(trial):
     np.testing.assert_allclose(position.correlated_std[:2], 2.0, rtol=0.3)
     sigma = np.sqrt(solution.trajectory.position_cov[:, 0, 0])
     assert np.all(sigma > 0.5)
+
+
+def test_nodes_reach_as_far_as_the_outliers():
+    stated = {"correlation_time_s": 10, "correlated_std_m": [0.5, 0.5, 0.5]}
+    problem, values = problem_of(scenario(manoeuvres=SHORT, trial={"gnss": stated}))
+    label, time = "GNSS position", problem.observations[0].time
+    assert problem.observations[0].label == label
+    weights = np.ones((time.size, 3))
+    weights[:10] = 0.0
+    problem.robust_weights = {label: weights}
+    problem.weigh(problem.evaluate(values))
+    assert not problem.weights[0][:10].any()
+    (process,) = correlated_noise(problem, problem.evaluate(values), ()).processes
+    assert process.time[[0, -1]] == pytest.approx(time[[0, -1]])
