@@ -27,6 +27,8 @@ _TINY = 1e-12
 # deviations where noise is white; with a wrong clock or wrong axes all that is left is large.
 _GROSS = 5.0
 _PASSES = 5
+# Least noise of a velocity, m/s. Chosen: digits of records.
+_FINEST = 1e-3
 
 
 @dataclass(frozen=True)
@@ -81,7 +83,7 @@ class VelocityWindows:
         kept = self
         for _ in range(_PASSES):
             left = np.linalg.norm(kept.residual(offset), axis=2)
-            fits = left <= _GROSS * np.median(left[kept.inside])
+            fits = left <= _GROSS * max(float(np.median(left[kept.inside])), kept.noise, _FINEST)
             if np.all(fits[kept.inside]):
                 break
             kept = replace(kept, inside=kept.inside & fits)
