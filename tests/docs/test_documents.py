@@ -174,6 +174,9 @@ def arguments(command: str, line: str, stock: Path) -> list[str]:
         word if previous == "--efficient" else str(names.get(word, word))
         for previous, word in zip(before, words, strict=False)
     ]
+    if command == "reproduce" and "--table" not in given:
+        # All of a publication takes a minute, and has a test of its own.
+        given += ["--table", "3"]
     # Drawing is tested elsewhere, and takes longer than all else on a trial of a minute.
     return [*given, "--no-figures"] if "--no-figures" in options(command) else given
 
