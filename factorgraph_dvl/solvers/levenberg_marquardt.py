@@ -120,6 +120,8 @@ def minimise(
     ordering = problem.ordering(gaussian)
     tree: gtsam.GaussianBayesTree | None = None
     damping = 0.0
+    # Greatest damping with which a step failed since the cost last fell.
+    failed = -1.0
     careful = False
     iteration = 0
     if progress:
@@ -141,6 +143,8 @@ def minimise(
         small = promised < tolerance
         if np.isfinite(trial.cost) and (lower or small):
             gain = (evaluation.cost - trial.cost) / promised if promised > 0.0 else 1.0
+            if trial.cost < evaluation.cost * (1.0 - _ROUNDING):
+                failed = -1.0
             if lower:
                 evaluation = trial
             if progress:
@@ -152,10 +156,14 @@ def minimise(
             elif gain < _POOR_GAIN:
                 damping *= 10.0
             gaussian = problem.linearize(evaluation)
+            if damping <= failed:
+                # Steps that small gain nothing, and larger ones fail: so it would go on.
+                break
         elif not careful and tree is None:
             # The step may have been bad for want of digits only.
             careful = True
         else:
+            failed = damping
             damping = max(damping * 10.0, _FIRST_DAMPING)
             if damping > _MAX_DAMPING:
                 break

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
+import gtsam
 import numpy as np
 import pytest
 from problems import SHORT, problem_of
@@ -49,3 +52,37 @@ def test_it_stops_early_where_another_problem_follows(monkeypatch):
     assert minimum.iterations < whole.iterations
     # What is left is less than 0.14 sigma in all.
     assert 0.0 <= minimum.evaluation.cost - whole.evaluation.cost < 1e-2
+
+
+class AtAKink:
+    """Lowest cost at 0, where a linear model promises to lower it further."""
+
+    def evaluate(self, values):
+        return SimpleNamespace(
+            values=values, parameters={}, cost=1.0 + float(np.abs(values.atVector(0)).sum())
+        )
+
+    def weigh(self, evaluation):
+        """Weights do not change."""
+
+    def needs_rebinding(self, parameters):
+        return False
+
+    def linearize(self, evaluation):
+        graph = gtsam.GaussianFactorGraph()
+        unit = gtsam.noiseModel.Unit.Create(1)
+        graph.add(0, np.eye(1), np.sqrt([2.0 * evaluation.cost]), unit)
+        return graph
+
+    def ordering(self, gaussian):
+        return gtsam.Ordering.ColamdGaussianFactorGraph(gaussian)
+
+
+def test_steps_that_gain_nothing_end_where_larger_ones_fail():
+    values = gtsam.Values()
+    values.insert(0, np.zeros(1))
+    minimum = minimise(AtAKink(), values, stage="test", max_iterations=1000)
+    assert not minimum.converged
+    assert minimum.evaluation.cost == 1.0
+    # One power of ten of damping each, up to steps that are small enough.
+    assert minimum.iterations < 20
