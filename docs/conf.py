@@ -40,8 +40,8 @@ myst_enable_extensions = ["dollarmath"]
 # Links to headings work down to this level.
 myst_heading_anchors = 4
 
-# Equations as SVG: the one file holds the glyphs, nothing is loaded beside it.
-mathjax_path = "vendor/mathjax-3.2.2/tex-svg.js"
+# Equations as SVG: the one file has all glyphs and extensions, nothing is loaded beside it.
+mathjax_path = "vendor/mathjax-3.2.2/tex-svg-full.js"
 mathjax3_config = {"options": {"enableMenu": False}}
 
 autodoc_typehints = "none"

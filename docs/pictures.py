@@ -50,18 +50,19 @@ def between(ax: Axes, start: Place, end: Place, colour: str, name: str) -> None:
     ax.text(*((a + b) / 2 + 0.28 * across), name, color=colour, ha="center", va="center")
 
 
-def panel(ax: Axes, title: str, half: float = 4.2) -> None:
+def panel(ax: Axes, title: str, width: float, low: float, high: float) -> None:
     """Make a panel without axes."""
-    ax.set(xlim=(-half, half), ylim=(-half, half), aspect="equal", title=title)
+    ax.set(xlim=(-width, width), ylim=(low, high), aspect="equal", title=title)
     ax.axis("off")
 
 
 def frames() -> Figure:
     """Draw body, DVL, antenna and navigation axes: from above, from starboard, from astern."""
-    figure = Figure(figsize=(11, 4.4), layout="constrained")
-    above, side, astern = figure.subplots(1, 3)
+    figure = Figure(figsize=(7.6, 5.6), layout="constrained")
+    panels = figure.subplot_mosaic([["above", "side"], ["above", "astern"]], height_ratios=[5, 3])
+    above, side, astern = panels["above"], panels["side"], panels["astern"]
 
-    panel(above, "from above")
+    panel(above, "from above", 4.2, -5, 4.6)
     heading = 25 * DEG
     # Columns: starboard and bow, in east and north.
     hull_axes = np.array([[np.cos(heading), np.sin(heading)], [-np.sin(heading), np.cos(heading)]])
@@ -87,7 +88,7 @@ def frames() -> Figure:
     above.add_patch(Arc(lever_arm, 2, 2, theta1=bow - 30, theta2=bow, color=DVL))
     above.annotate("$α_z$ > 0", (1.1, -2.0), color=DVL)
 
-    panel(side, "from starboard")
+    panel(side, "from starboard", 4.2, -3.8, 3.4)
     pitch = 8 * DEG
     turn = np.array([[np.cos(pitch), -np.sin(pitch)], [np.sin(pitch), np.cos(pitch)]])
     outline = np.array([[-3, -0.7], [2.3, -0.7], [3.3, 0.8], [-3, 0.8]])
@@ -114,7 +115,7 @@ def frames() -> Figure:
     side.annotate("antenna", mast + np.array([0.25, 0.2]), color=ANTENNA)
     side.text(1.9, -1.4, "pitch > 0: bow up", ha="center", color=PLAIN, fontsize=9)
 
-    panel(astern, "from astern")
+    panel(astern, "from astern", 4.2, -2.3, 2.6)
     roll = -10 * DEG
     turn = np.array([[np.cos(roll), -np.sin(roll)], [np.sin(roll), np.cos(roll)]])
     outline = np.array([[-1.7, 1], [-1.3, -0.5], [0, -1], [1.3, -0.5], [1.7, 1]])
