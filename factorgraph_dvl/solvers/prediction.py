@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 import gtsam
 import numpy as np
@@ -15,6 +15,7 @@ from factorgraph_dvl.imu.increments import increments
 from factorgraph_dvl.imu.preintegration import segments
 from factorgraph_dvl.imu.propagation import States
 from factorgraph_dvl.solution import Solution
+from factorgraph_dvl.solvers.correlated_noise import correlated_noise
 from factorgraph_dvl.solvers.fixed_directions import with_covariances
 from factorgraph_dvl.solvers.information_along_trial import (
     RATE_HZ,
@@ -102,7 +103,20 @@ def _at_truth(trial: Trial, true_states: TrueStates) -> tuple[Problem, Evaluatio
                 # One scale is estimated of an instrument that has three.
                 value = np.mean(value, keepdims=True)
             truth[p.name] = p.internal(value)
-    problem = Problem(chain, observations, parameters, start=truth)
+    problem, evaluation = _weighed(
+        Problem(chain, observations, parameters, start=truth), states, truth
+    )
+    stated = correlated_noise(problem, evaluation, ()).processes
+    if not stated:
+        return problem, evaluation
+    problem = Problem(chain, observations, parameters, start=truth, processes=stated)
+    return _weighed(problem, states, truth)
+
+
+def _weighed(
+    problem: Problem, states: States, truth: Mapping[str, Array]
+) -> tuple[Problem, Evaluation]:
+    """Return a problem with its weights at the truth, and its evaluation there."""
     values = problem.values(states, {**problem.prior_values(), **truth})
     problem.weigh(problem.evaluate(values))
     return problem, problem.evaluate(values)

@@ -14,7 +14,18 @@ from factorgraph_dvl.simulation import simulate
 from factorgraph_dvl.solvers.batch import solve
 
 
-@pytest.mark.parametrize("changes", [{}, WALKING], ids=["constant", "walking"])
+# Errors that persist, as the trial states them.
+CORRELATED = {
+    "trial": {
+        "gnss": {"correlated_std_m": [0.3] * 3, "correlation_time_s": 20, "noise": "stated"},
+        "dvl": {"correlated_std_m_s": 0.01, "correlation_time_s": 8, "noise": "stated"},
+    }
+}
+
+
+@pytest.mark.parametrize(
+    "changes", [{}, WALKING, CORRELATED], ids=["constant", "walking", "correlated"]
+)
 def test_a_prediction_is_what_the_solver_claims(changes):
     scene = scenario(**changes)
     predicted = predict(scene).solution
@@ -27,6 +38,11 @@ def test_a_prediction_is_what_the_solver_claims(changes):
     # Values are the truth: nothing is drawn.
     assert predicted.estimate("lever_arm_m").value == pytest.approx([1.0, 1.2, 1.4])
     assert predicted.estimate("misalignment_deg").value == pytest.approx([2.0, 2.0, 30.0])
+
+
+def test_correlated_noise_costs_what_it_costs_the_solver():
+    white, correlated = (std_of(predict(scenario(**c)).solution) for c in ({}, CORRELATED))
+    assert correlated["misalignment_z_deg"] > 1.5 * white["misalignment_z_deg"]
 
 
 def test_a_prediction_claims_nothing_that_noise_would_feign():
@@ -48,8 +64,10 @@ def test_one_scale_for_an_instrument_that_has_three():
     assert np.isfinite(history.std).all()
 
 
-def test_going_on_is_as_good_as_starting_again():
-    scene = scenario(current_m_s=[0.2, 0.1, 0])
+# What wanders over two parts of a plan wanders in each anew: 20 s of 120 s of it.
+@pytest.mark.parametrize(("changes", "equal"), [({}, 0.01), (CORRELATED, 0.1)])
+def test_going_on_is_as_good_as_starting_again(changes, equal):
+    scene = scenario(current_m_s=[0.2, 0.1, 0], **changes)
     more = [{"turn_deg_s": 3, "duration_s": 30}, {"straight_s": 20}]
     first = predict(scene)
     history, ending = extend(first.scenario, more, first.ending)
@@ -57,7 +75,7 @@ def test_going_on_is_as_good_as_starting_again():
     whole = predict(
         msgspec.structs.replace(scene, manoeuvres=[*scene.manoeuvres, *more, {"straight_s": 20}])
     )
-    np.testing.assert_allclose(second.std[-1], whole.history.std[-1], rtol=0.01)
+    np.testing.assert_allclose(second.std[-1], whole.history.std[-1], rtol=equal)
     assert np.all(second.std[-1] <= history.std[-1] * (1.0 + 1e-9))
     assert ending.time == pytest.approx(whole.duration)
     assert ending.start.heading_deg == pytest.approx(whole.ending.start.heading_deg)
