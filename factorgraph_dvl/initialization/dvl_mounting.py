@@ -50,6 +50,9 @@ _GENERATORS = skew(np.eye(3))
 _APART = 20.0 * DEG
 # Pings that are summed up at most. Chosen: far more than the unknowns ask for.
 _MAX_PINGS = 4000
+# The same in the first search for the time offset. Chosen: enough to see which of its steps is
+# the best.
+_MAX_SCANNED = 800
 # Steps of the search for the time offset, and its reach, s. Chosen: a fraction of the period of
 # a vessel's roll, then finer.
 _OFFSET_STEP = 0.04
@@ -115,13 +118,13 @@ def initial_mountings(dvl: Dvl, motion_at: MotionAt) -> list[dict[str, Array]]:
     if pings.size == 0:
         return [values]
     pings = pings[:: max(pings.size // _MAX_PINGS, 1)]
-    sigma = np.hypot(dvl.sigma()[pings], _VELOCITY_ERROR)
+    variance = dvl.sigma() ** 2 + _VELOCITY_ERROR**2
 
-    def moments(offset: float) -> _Moments:
+    def moments(offset: float, pings: NDArray[np.intp] = pings) -> _Moments:
         motion, covered = motion_at(dvl.time[pings] - offset)
         v_b = rotate(motion.nRb.transpose(0, 2, 1), motion.v_n)
         x = np.hstack([v_b, motion.omega_eb_b, np.ones((pings.size, 1))])
-        weight = covered / (sigma**2).mean(axis=1)
+        weight = covered / variance[pings].mean(axis=1)
         y = dvl.velocity[pings]
         xw = x * weight[:, None]
         share = float(np.mean(covered))
@@ -131,11 +134,12 @@ def initial_mountings(dvl: Dvl, motion_at: MotionAt) -> list[dict[str, Array]]:
     offset = float(offset_prior.mean[0])
     if offset_prior.estimated:
         reach = min(4.0 * float(offset_prior.sigma[0]), _OFFSET_REACH)
-        for step in (_OFFSET_STEP, _OFFSET_FINE):
+        few = pings[:: max(pings.size // _MAX_SCANNED, 1)]
+        for step, scanned in ((_OFFSET_STEP, few), (_OFFSET_FINE, pings)):
             count = int(np.ceil(reach / step))
             grid = offset + np.arange(-count, count + 1) * step
             prior_cost = 0.5 * ((grid - offset_prior.mean) / offset_prior.sigma) ** 2
-            misfit = [_linear_misfit(moments(t)) for t in grid]
+            misfit = [_linear_misfit(moments(t, scanned)) for t in grid]
             offset = float(grid[np.argmin(misfit + prior_cost)])
             reach = 2.0 * step
         values[TIME_OFFSET] = np.array([offset])
