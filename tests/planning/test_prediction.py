@@ -13,7 +13,6 @@ from factorgraph_dvl.planning.prediction import extend
 from factorgraph_dvl.simulation import simulate
 from factorgraph_dvl.solvers.batch import solve
 
-
 # Errors that persist, as the trial states them.
 CORRELATED = {
     "trial": {
