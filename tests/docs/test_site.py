@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 import factorgraph_dvl
+from factorgraph_dvl.sensors.finding import Code
 
 ROOT = Path(__file__).resolve().parents[2]
 DOCS = ROOT / "docs"
@@ -19,6 +20,9 @@ PAGES = sorted(
     path
     for folder in (".", "docs", "data", "benchmarks", "examples/compass-plugin")
     for path in (ROOT / folder).glob("*.md")
+)
+COMMANDS = sorted(
+    set(re.findall(r"(?:benchmarks|tests)/[\w/]+(?:\.\w+)?", (DOCS / "validation.md").read_text()))
 )
 # Of the files in the package `mathjax` 3.2.2 as npm serves it, whose shasum is
 # c754d7b46a679d7f3fa03543d6b8bf124ddf9f6b.
@@ -69,6 +73,17 @@ def test_the_reference_has_every_public_name():
     text = (DOCS / "api.md").read_text(encoding="utf-8")
     names = re.findall(r"^   (\w+)$", text, re.M)
     assert sorted(names) == sorted(factorgraph_dvl.__all__)
+
+
+def test_troubleshooting_has_every_code():
+    text = (DOCS / "troubleshooting.md").read_text(encoding="utf-8")
+    named = set(re.findall(r"`(\w+)`", text))
+    assert {code.value for code in Code} <= named
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_commands_of_the_validation_are_there(command):
+    assert (ROOT / command).exists()
 
 
 def test_mathjax_is_that_of_the_registry():
