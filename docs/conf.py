@@ -31,6 +31,12 @@ templates_path = ["_templates"]
 html_theme = "pydata_sphinx_theme"
 html_title = project
 html_static_path = ["_static"]
+html_css_files = ["site.css"]
+# Pages without pages below them need no list of these.
+html_sidebars = {
+    name: [] for name in ("getting-started", "getting-started.zh", "glossary", "comparison")
+}
+html_theme_options = {"show_toc_level": 2, "header_links_before_dropdown": 6}
 html_show_sourcelink = False
 html_copy_source = False
 # Code without a language, such as equations in plain text, is no Python.

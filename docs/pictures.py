@@ -177,10 +177,12 @@ def reports() -> None:
         config = ROOT / "configs" / "dvl-late.yaml"
         subprocess.run([*program, "simulate", config, "--out", late, "--seed", "1"], check=True)
         for trial, name in ((SHIPPED, "good"), (late, "late")):
-            options = ["--out", out, "--force", "--no-figures", "--quiet"]
+            options = ["--out", out, "--force", "--quiet"]
             subprocess.run([*program, "solve", trial, *options], check=True)
             screenshot(out / "report.html", f"report-{name}.png", "en")
             screenshot(out / "report.html", f"report-{name}.zh.png", "zh")
+            if trial == SHIPPED:
+                shutil.copy(out / "figures" / "calibration.png", IMAGES)
 
 
 def main() -> None:
