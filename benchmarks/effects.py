@@ -12,11 +12,12 @@ import json
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import as_completed
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import common
+import msgspec
 import numpy as np
 from common import config
 
@@ -30,6 +31,7 @@ from factorgraph_dvl.simulation.faults import (
     Fault,
     dvl_false_lock,
     dvl_outliers,
+    filled,
     gnss_jumps,
     gnss_outliers,
     with_faults,
@@ -68,6 +70,46 @@ def of(section: str, **keys: Any) -> Effect:
     return Effect(lambda scenario: scenario[section].update(keys))
 
 
+def rough_imu(factor: float) -> Fault:
+    """Return a fault that makes the noise of the IMU larger than stated by a factor."""
+
+    def fault(trial: Trial, rng: np.random.Generator) -> Trial:
+        imu = trial.inertial
+        more = np.sqrt((factor**2 - 1.0) / np.median(np.diff(imu.time)))
+        gyro, accel = (
+            x + more * root * rng.standard_normal(x.shape)
+            for x, root in (
+                (imu.gyro, imu.settings.gyro_noise_root_psd),
+                (imu.accel, imu.settings.accel_noise_root_psd),
+            )
+        )
+        return replace(trial, imu=replace(imu, gyro=gyro, accel=accel))
+
+    return fault
+
+
+def misstated(factor: float) -> Fault:
+    """Return a fault that states the noise of GNSS and DVL larger by a factor than it is."""
+
+    def fault(trial: Trial, rng: np.random.Generator) -> Trial:
+        gnss, dvl = trial.gnss, trial.dvl
+        assert gnss is not None
+        assert dvl is not None
+        stated = msgspec.structs.replace(
+            dvl.settings,
+            velocity_std_m_s=factor * dvl.settings.velocity_std_m_s,
+            velocity_std_fraction=factor * dvl.settings.velocity_std_fraction,
+        )
+        fixes = replace(
+            gnss,
+            position_std=factor * gnss.position_std,
+            velocity_std=factor * gnss.velocity_std,
+        )
+        return replace(trial, gnss=fixes, dvl=replace(dvl, settings=stated))
+
+    return fault
+
+
 EFFECTS: dict[str, Effect] = {
     "none": Effect(),
     "DVL bias 2 mm/s": of("dvl", bias_m_s=[0.002, 0, 0]),
@@ -91,6 +133,12 @@ EFFECTS: dict[str, Effect] = {
         accel_misalignment_deg="draw",
         accel_misalignment_std_deg=0.05,
     ),
+    "IMU scale 3000 ppm, stated 0": of("imu", gyro_scale_ppm=[3000, -3000, 3000]),
+    "IMU noise three times the stated": Effect(fault=rough_imu(3.0)),
+    "noise stated five times too large": Effect(fault=misstated(5.0)),
+    "noise stated five times too small": Effect(fault=misstated(0.2)),
+    "DVL outliers, 1 %": Effect(fault=dvl_outliers(0.01), bad="dvl"),
+    "DVL zero pings, 0.1 %": Effect(fault=filled("dvl", 0.001), bad="dvl"),
     "DVL outliers, 10 %": Effect(fault=dvl_outliers(), bad="dvl"),
     "GNSS outliers, 10 %": Effect(fault=gnss_outliers(), bad="gnss"),
     "DVL false lock, 60 s of 0.3 m/s": Effect(fault=dvl_false_lock(), bad="dvl"),
@@ -185,7 +233,7 @@ def outliers(
         record, before = getattr(trial, each), getattr(clean, each)
         # Heights are recomputed where nothing moves.
         change = (getattr(record, field) - getattr(before, field))[:, : 2 if each == "gnss" else 3]
-        bad = np.abs(change).max(axis=1) > MOVED
+        bad = np.abs(change).max(axis=1) > (MOVED if section else np.inf)
         out = np.isin(record.time, times_of(rejected, label))
         bad_count += int(bad.sum())
         found += int((bad & out).sum())

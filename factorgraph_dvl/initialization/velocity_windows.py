@@ -87,6 +87,10 @@ class VelocityWindows:
             if np.all(fits[kept.inside]):
                 break
             kept = replace(kept, inside=kept.inside & fits)
+            enough = kept.inside.sum(axis=1) >= _LEAST
+            if not enough.any():
+                return self
+            kept = kept.only(enough)
         return kept
 
     def only(self, lines: np.ndarray) -> Self:

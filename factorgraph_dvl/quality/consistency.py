@@ -294,6 +294,7 @@ def _gnss_mistake(view: _GnssView) -> str:
 
     East and north swapped are, but for the unknown heading, one of them mirrored.
     """
+    as_recorded, _ = least_misfit(view.compared, view.around, _REACH_S)
     for text, matrix in (
         (
             "latitude and longitude (east and north) look swapped, or one of the wrong sign",
@@ -303,7 +304,9 @@ def _gnss_mistake(view: _GnssView) -> str:
     ):
         other = replace(view.compared, velocity=view.compared.velocity @ matrix.T)
         share, _ = least_misfit(other, view.around, _REACH_S)
-        if share - 1.5 * noise_share(other) < _LEFT * view.excess:
+        noise = 1.5 * noise_share(other)
+        # In the same windows: those with the largest changes are explained better than the rest.
+        if share - noise < _LEFT * (as_recorded - noise):
             return text
     return ""
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 import msgspec
 import numpy as np
 import pytest
-from truth import scenario
+from truth import config, scenario
 
 from factorgraph_dvl.quality.survey import survey
 from factorgraph_dvl.sensors.finding import Code
@@ -214,3 +214,18 @@ def test_a_dead_channel_of_the_imu_is_named(trial: Trial) -> None:
     frozen[1000:1200] = frozen[1000]
     texts = found(replace(trial, imu=replace(trial.imu, accel=frozen)))
     assert "m_s2 repeats one value from 20.0 to 24" in texts[Code.FROZEN_VALUES]
+
+
+def test_noise_that_is_larger_than_stated_is_no_mistake_of_axes() -> None:
+    legs = [
+        {"accelerate_m_s2": 1, "to_m_s": 4},
+        {"straight_s": 150},
+        {"turn_deg_s": -2, "duration_s": 45},
+        {"straight_s": 150},
+        {"turn_deg_s": 9, "duration_s": 50},
+        {"straight_s": 100},
+    ]
+    sway = simulate(config("data-sheet-mix-navigation", manoeuvres=legs), 0)
+    assert sway.gnss is not None
+    stated = replace(sway.gnss, velocity_std=0.2 * sway.gnss.velocity_std)
+    assert Code.GNSS_AXES not in found(replace(sway, gnss=stated))
