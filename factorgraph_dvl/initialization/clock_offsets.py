@@ -167,7 +167,9 @@ def clock_offset(
         found = _first_of(comparison, design, starts)
         if found.better_than(best):
             best, rate = found, (float(found.values[1]), float(found.sigma[1]))
-        at, before, after = _break(comparison, _grid(around, reach, _STEP_S))
+        at, before, after = _break(
+            comparison, _grid(around, reach, _STEP_S), float(constant.values[0])
+        )
         design = np.stack([one, (time > at).astype(float)], axis=-1)
         found = _refined(comparison, design, np.array([before, after - before]))
         sides = [np.unique(_blocks(comparison)[side]).size for side in (time > at, time <= at)]
@@ -239,10 +241,21 @@ def _scan(comparison: Comparison, around: float, reach: float) -> tuple[float, f
 
 def _lowest(grid: Array, misfit: Array, freedom: float) -> list[float]:
     """Return the lowest minima of a misfit on a grid, as far as they may be the lowest of all."""
+    minima = _minima(misfit, freedom)
+    return [float(at) for at in grid[minima[np.argsort(misfit[minima])[:_MINIMA]]]]
+
+
+def _nearest_alike(grid: Array, misfit: Array, around: float, freedom: float) -> float:
+    """Return, of the minima that are nearly the lowest, the one nearest to an offset."""
+    minima = grid[_minima(misfit, _ALIKE * freedom)]
+    return float(minima[np.argmin(np.abs(minima - around))])
+
+
+def _minima(misfit: Array, margin: float) -> np.ndarray:
+    """Return which points of a grid are minima, up to a margin above the lowest."""
     beyond = np.pad(misfit, 1, constant_values=np.inf)
     minimum = (misfit <= beyond[:-2]) & (misfit <= beyond[2:])
-    minima = np.flatnonzero(minimum & (misfit < misfit.min() + freedom))
-    return [float(at) for at in grid[minima[np.argsort(misfit[minima])[:_MINIMA]]]]
+    return np.flatnonzero(minimum & (misfit <= misfit.min() + margin))
 
 
 def least_misfit(
@@ -372,14 +385,22 @@ def _changes(comparison: Comparison, fit: _Fit) -> bool:
     return bool(height.max() > _CHANGES * max(scale, 1e-12))
 
 
-def _break(comparison: Comparison, grid: Array) -> tuple[float, float, float]:
-    """Return when an offset jumps, if it does, and its values on a grid before and after."""
+def _break(comparison: Comparison, grid: Array, constant: float) -> tuple[float, float, float]:
+    """Return when an offset jumps, if it does, and its values before and after.
+
+    They are `constant`, the best offset without a jump, where another one is hardly better: by
+    a period of the sway, nearly the same motion is measured.
+    """
+    grid = np.unique([*grid, constant])
     misfits = _misfits_at(comparison, grid)
     count = misfits.shape[1]
     sums = np.concatenate([np.zeros((grid.size, 1)), np.cumsum(misfits, axis=1)], axis=1)
     whole = sums[:, -1:] - sums
     k = 1 + int(np.argmin((sums.min(axis=0) + whole.min(axis=0))[1:count])) if count > 1 else 0
-    before, after = float(grid[np.argmin(sums[:, k])]), float(grid[np.argmin(whole[:, k])])
+    before, after = (
+        _nearest_alike(grid, misfit[:, k], constant, float(comparison.count[part].sum()))
+        for misfit, part in ((sums, slice(k)), (whole, slice(k, None)))
+    )
     time = comparison.time
     first, last = time[max(k - 1, 0)].min(), time[min(k, count - 1)].max()
     tried = np.linspace(first, last, _BREAKS)

@@ -63,6 +63,41 @@ def test_a_jump_is_found_with_its_time(noisy):
     np.testing.assert_allclose(found.late(np.array([20.0, 200.0])), [0.0, 1.0], atol=0.05)
 
 
+class Sway:
+    """A vessel that sways at 2 Hz and speeds up early; its record is 0.1 s late throughout."""
+
+    noise = 0.005
+
+    def __init__(self, lines=slice(None)):
+        # A window is 12 s at 5 Hz.
+        self.lines = lines
+        self.time = (0.2 * np.arange(1200) + 0.05).reshape(20, 60)[lines]
+        self.inside = np.ones(self.time.shape, bool)
+        self.count = np.full(len(self.time), 180.0)
+        self.signal = np.sum((self.velocity(self.time) ** 2), axis=(1, 2))
+
+    def velocity(self, time):
+        sway = (1.0 + 0.01 * time) * np.sin(4.0 * np.pi * time)
+        speed = np.clip((time - 10.0) / 10.0, 0.0, 1.0)
+        return np.stack([sway, 0.5 * sway, speed], axis=-1)
+
+    def only(self, lines):
+        return Sway(lines)
+
+    def residual(self, offset):
+        late, sooner = self.velocity(self.time - 0.1), self.velocity(self.time + 0.4)
+        noise = np.random.default_rng(1).normal(0.0, 0.01, (20, 60, 3))[self.lines]
+        # The swell is not quite regular: in the second half it is more as half a second before.
+        measured = np.where((self.time > 120.0)[..., None], sooner, late) + noise
+        return self.velocity(self.time - np.asarray(offset)) - measured
+
+
+def test_a_period_of_the_sway_is_no_jump():
+    found = clock_offset(Sway())
+    assert found.offset == pytest.approx(0.1, abs=0.002)
+    assert found.jump == pytest.approx(0.0, abs=0.002)
+
+
 def test_a_record_of_seconds_says_nothing(noisy):
     trial, windows = noisy
     few = gnss_windows(windows, rows_of(trial.gnss, trial.gnss.time < 30.0))
