@@ -96,14 +96,27 @@ def errors_of(run, trial_path):
     return [line.removeprefix("error: ") for line in out.splitlines() if line.startswith("error")]
 
 
-@pytest.mark.parametrize("command", ["solve", "replay", "kalman"])
-@pytest.mark.parametrize("spoil", [late, in_a_gap, silent, radians, radians_without_velocity])
-def test_records_that_cannot_be_used_are_refused(command, spoil, honest, tmp_path, run):
-    spoilt = spoil(honest)
-    trial = write_trial(tmp_path, spoilt)
+@pytest.fixture(
+    scope="module",
+    params=[late, in_a_gap, silent, radians, radians_without_velocity],
+    ids=lambda spoil: spoil.__name__,
+)
+def unusable(request, honest, tmp_path_factory):
+    """A trial whose records cannot be used, and what is said of them."""
+    spoilt = request.param(honest)
     said = [str(f) for f in survey(spoilt).errors if f.unusable]
     assert said
+    return write_trial(tmp_path_factory.mktemp("unusable"), spoilt), said
+
+
+def test_records_that_cannot_be_used_are_errors_to_inspect(unusable, run):
+    trial, said = unusable
     assert set(said) <= set(errors_of(run, trial))
+
+
+@pytest.mark.parametrize("command", ["solve", "replay", "kalman"])
+def test_records_that_cannot_be_used_are_refused(command, unusable, tmp_path, run):
+    trial, said = unusable
     code, _, err = run(command, trial, "--out", tmp_path / "out", "--no-figures", "--quiet")
     assert code == 2
     assert all(text in err for text in said)
@@ -130,7 +143,8 @@ def test_what_contradicts_is_a_finding_of_the_result(command, spoil, honest, tmp
     trial = write_trial(tmp_path, spoil(honest))
     said = errors_of(run, trial)
     assert said
-    code, _, err = run(command, trial, "--out", tmp_path / "out", "--no-figures", "--quiet")
+    arguments = ("--out", tmp_path / "out", "--rate", "1", "--no-figures", "--quiet")
+    code, _, err = run(command, trial, *arguments)
     assert code == 1
     assert all(text in err for text in said)
     if (tmp_path / "out").exists():

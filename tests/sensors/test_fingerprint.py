@@ -127,7 +127,8 @@ def test_a_short_stretch_in_common_is_none_of_the_data(trial, other):
 
 
 def test_every_solver_writes_what_its_result_came_from(tmp_path, trial):
-    for solution in (solve(trial), calibrate(trial, "least-squares")[0], replay(trial)[0]):
+    replayed, _ = replay(trial, rate_hz=1.0)
+    for solution in (solve(trial), calibrate(trial, "least-squares")[0], replayed):
         assert solution.inputs == trial.inputs
         save_solution(solution, tmp_path / "out", force=True)
         assert load_solution(tmp_path / "out").inputs == trial.inputs

@@ -397,8 +397,14 @@ def test_a_walking_bias_is_followed():
         assert error @ np.linalg.solve(P, error) < 16.3
 
 
-@pytest.mark.parametrize("rate", [2, 3, 10])
-@pytest.mark.parametrize("noise", [0.001, 0.005, 0.05, 0.2])
+@pytest.mark.parametrize(
+    ("noise", "rate"),
+    [
+        pytest.param(noise, rate, marks=() if rate == fast else pytest.mark.slow)
+        for noise, fast in ((0.001, 3), (0.005, 10), (0.05, 2), (0.2, 3))
+        for rate in (2, 3, 10)
+    ],
+)
 def test_noise_of_the_gyros_between_states_counts(noise, rate):
     scene = config(
         "star", **SHORT, imu={"gyro_noise_deg_sqrt_h": noise}, star={"rate_hz": rate}

@@ -83,6 +83,7 @@ def test_what_the_stated_noise_does_not_explain_is_said(kitti):
     assert of_code(solution.findings, Code.UNUSED)
 
 
+@pytest.mark.slow
 def test_a_kalman_smoother_of_the_car_agrees(kitti):
     """The same data through equations that share nothing with the graph."""
     trial, _ = kitti

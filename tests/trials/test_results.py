@@ -15,10 +15,12 @@ SHARE = 1e-3
 EARTH = np.array([6.4e6, 6.4e6, 1.0])
 
 
-# That with poor gyros takes long, and is much like the other cruise.
+# They take long, and are much like the other cruise and the other dive.
+LONG = ("cruise-mems", "cruise-beams", "dive")
+
+
 @pytest.mark.parametrize(
-    "name",
-    [pytest.param(n, marks=pytest.mark.slow if n == "cruise-mems" else ()) for n in TRIALS],
+    "name", [pytest.param(n, marks=pytest.mark.slow if n in LONG else ()) for n in TRIALS]
 )
 def test_results_are_as_stored(name):
     before = json.loads(STORED.read_text(encoding="utf-8"))[name]

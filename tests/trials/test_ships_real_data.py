@@ -49,6 +49,7 @@ def found(number):
     return solution
 
 
+@pytest.mark.slow
 def test_a_dive_without_its_imu_gives_lever_arm_and_clock():
     solution = found(2)
     assert solution.estimate("lever_arm_m").value[0] == pytest.approx(-1.84, abs=0.1)
