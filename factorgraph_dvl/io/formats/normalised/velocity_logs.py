@@ -170,7 +170,7 @@ FORMATS = (
         "Rowe `.ens`",
         _share(_count(read_rowe), _ROWE_BYTES),
         _read_rowe,
-        "not verified: no document and no recording was within reach",
+        "not verified: no document and no recording was available",
         (".ens",),
     ),
 )
