@@ -80,7 +80,7 @@ INVERSIONS = {
         r"\b[^?]*$"
     ),
     "a preposition, and the verb without a comma": re.compile(
-        rf"{_CLAUSE}{_PREPOSITION} (?!which|that)(?:[^\s,;:]+ ){{1,7}}?{_VERB}\b"
+        rf"{_CLAUSE}{_PREPOSITION} (?:(?!which|that|who)[^\s,;:]+ ){{1,7}}?{_VERB}\b"
     ),
     "the verb before its subject": re.compile(
         rf"{_CLAUSE}(?:[Nn]or|[Nn]ot only|[Oo]nly then|[Hh]ere|[Tt]here|[Ss]o) "

@@ -1,6 +1,6 @@
 """Singular values by segment: table 3 of Luo et al. (2024) again, and rank and basis by hand.
 
-The derivations stand in docs/observability.md.
+The derivations are in docs/observability.md.
 """
 
 from __future__ import annotations

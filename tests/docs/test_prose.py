@@ -1,0 +1,163 @@
+"""What people read is plain: pages, help texts, findings and messages.
+
+The words and turns are listed in `tests/prose.py`. Tables are checked for words only, because
+their cells are no sentences.
+"""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+import click
+import pytest
+from prose import faults, sentences, split
+from typer.main import get_command
+
+from factorgraph_dvl.cli.app import app
+from factorgraph_dvl.sensors.finding import Code
+
+ROOT = Path(__file__).resolve().parents[2]
+PACKAGE = ROOT / "factorgraph_dvl"
+
+
+def is_measured(page: Path) -> bool:
+    """Whether a benchmark writes a page: its prose changes with its next run."""
+    return "do not edit" in page.read_text(encoding="utf-8")[:1000]
+
+
+def is_english(page: Path) -> bool:
+    return not page.stem.endswith(".zh")
+
+
+PAGES = [
+    page.relative_to(ROOT).as_posix()
+    for page in sorted([ROOT / "README.md", *ROOT.glob("docs/**/*.md")])
+    if is_english(page) and not is_measured(page)
+]
+
+
+def help_texts() -> Iterator[tuple[str, str]]:
+    """Yield the name and the text of every help of the command line."""
+    group = get_command(app)
+    assert isinstance(group, click.Group)
+    yield "factorgraph-dvl", group.help or ""
+    for name, command in sorted(group.commands.items()):
+        yield name, command.help or ""
+        for parameter in command.params:
+            yield f"{name} {parameter.name}", getattr(parameter, "help", None) or ""
+
+
+def messages() -> Iterator[tuple[str, str]]:
+    """Yield place and text of every message: what is raised, found or warned of."""
+    for path in sorted(PACKAGE.rglob("*.py")):
+        tree = ast.parse(path.read_text(encoding="utf-8"))
+        calls = [n for n in ast.walk(tree) if isinstance(n, ast.Call) and says(n)]
+        for call in calls:
+            texts = [*call.args, *(k.value for k in call.keywords)]
+            for text in map(text_of, texts):
+                if " " in text:
+                    yield f"{path.relative_to(ROOT)}:{call.lineno}", text
+
+
+def says(call: ast.Call) -> bool:
+    name = call.func.attr if isinstance(call.func, ast.Attribute) else ""
+    name = call.func.id if isinstance(call.func, ast.Name) else name
+    return name == "Finding" or name.endswith("Error") or name in {"warn", "warning", "note"}
+
+
+def text_of(node: ast.expr) -> str:
+    """Return a text, with a sign for each value in it; empty for anything else."""
+    if isinstance(node, ast.Constant) and isinstance(node.value, str):
+        return node.value
+    if isinstance(node, ast.JoinedStr):
+        parts = (v.value if isinstance(v, ast.Constant) else "`" for v in node.values)
+        return "".join(str(part) for part in parts)
+    return ""
+
+
+def found(texts: Iterator[tuple[str, str]]) -> list[str]:
+    return [
+        f"{where}: {fault}: {sentence}"
+        for where, text in texts
+        for sentence in split(" ".join(text.split()))
+        for fault in faults(sentence)
+    ]
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_pages_are_plain(page):
+    text = (ROOT / page).read_text(encoding="utf-8")
+    wrong = [
+        f"{page}:{line}: {fault}: {sentence}"
+        for line, sentence, running in sentences(text)
+        for fault in faults(sentence, running=running)
+    ]
+    assert not wrong, "\n".join(wrong)
+
+
+def test_help_texts_are_plain():
+    wrong = found(help_texts())
+    assert not wrong, "\n".join(wrong)
+
+
+def test_findings_are_plain():
+    wrong = found(
+        (f"{code}", text) for code in Code for text in (code.meaning, code.why, code.action)
+    )
+    assert not wrong, "\n".join(wrong)
+
+
+def test_messages_are_plain():
+    wrong = found(messages())
+    assert not wrong, "\n".join(wrong)
+
+
+def test_readme_is_short():
+    assert len((ROOT / "README.md").read_text(encoding="utf-8").splitlines()) <= 120
+
+
+@pytest.mark.parametrize(
+    ("sentence", "fault"),
+    [
+        ("Of all that is random.", "begins with 'of'"),
+        ("A height is nobody's knowledge beforehand.", "beforehand -> before the trial, in advance"),
+        ("Of a dive, one value is left.", "begins with 'of'"),
+        (
+            "453 s with these manoeuvres do not tell it better than the prior.",
+            "tell -> show, determine",
+        ),
+        ("What agrees might differ.", "begins with a clause of 'what', 'who' or 'that'"),
+        (
+            "In the case above 0.0002 deg/h are left.",
+            "a preposition, and the verb without a comma",
+        ),
+        ("Nor does it hold.", "the verb before its subject"),
+        ("word " * 31, "31 words"),
+    ],
+)
+def test_unclear_sentences_are_found(sentence, fault):
+    assert fault in faults(sentence)
+
+
+@pytest.mark.parametrize(
+    "sentence",
+    [
+        "Random seed.",
+        "The height of the sea surface is not known in advance.",
+        "Without noise, the result is exact.",
+        "The dead-reckoned track is compared with GNSS.",
+        "What does the verdict mean?",
+    ],
+)
+def test_plain_sentences_pass(sentence):
+    assert faults(sentence) == []
+
+
+def test_code_and_formulas_are_no_sentences():
+    page = "Text with `code of it`:\n\n    y = of x\n\n```sh\nof all that\n```\n\n| head |\n|---|\n| of x |\n"
+    assert [(s, running) for _, s, running in sentences(page)] == [
+        ("Text with `:", True),
+        ("of x", False),
+    ]
