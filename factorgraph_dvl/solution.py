@@ -652,7 +652,7 @@ def consistency_findings(
         elif rms > TOO_LARGE:
             effect = "are too small until you correct it"
             if factor is not None:
-                effect = "allow for that, as far as it is noise and no lasting error"
+                effect = "allow for noise of this size, but not for a lasting error"
             allowed = factor is not None and np.nanmax(factor) <= NOISE_FACTORS[1]
             out.append(
                 Finding(
@@ -691,14 +691,14 @@ def _far_from_prior(e: Estimate) -> list[Finding]:
     draws = moved[worst] * std / rest[worst]
     name = np.array(e.component_names)[informed][worst]
     effect = (
-        f"it draws the value by {draws:.2g} of its standard deviations, and others with it"
+        f"it moves the value by {draws:.2g} of its standard deviations, and biases others"
         if draws > _DRAWS
         else "the data outweigh it, but a unit, an axis or the model may be wrong"
     )
     return [
         Finding(
             Code.FAR_FROM_PRIOR,
-            f"the data say {name} {alone:.3g} ± {std * np.sqrt(gain):.1g}, {apart[worst]:.0f} "
+            f"the data show {name} {alone:.3g} ± {std * np.sqrt(gain):.1g}, {apart[worst]:.0f} "
             f"standard deviations from its prior, {mean:.3g} ± {prior_std:.2g}; {effect}",
             parameter=e.name,
             severity="error" if draws > _DRAWS else "warning",
@@ -919,7 +919,7 @@ def mostly_rejected(used: Sequence[Residuals], rejected: Sequence[Residuals]) ->
         Finding(
             Code.MANY_REJECTED,
             f"{r.time.size} of {r.time.size + kept.get(r.label, 0)} were rejected as echoes: a "
-            "place, a clock, a unit or a standard deviation may be wrong",
+            "position, a clock, a unit or a standard deviation may be wrong",
             sensor=r.label,
         )
         for r in rejected

@@ -260,11 +260,11 @@ class Trial:
         """
         if self.imu is None:
             raise ConfigError(
-                "the trial has no IMU, which this needs",
+                "the trial has no IMU, which this command needs",
                 where="trial.yaml",
                 expected="an imu section",
-                hint="`inspect`, `solve`, `observability`, `deadreckon`, `crosscheck` and some "
-                "methods of `kalman` take `ins` or `attitude` in its place",
+                hint="`inspect`, `solve`, `observability`, `deadreckon` and `crosscheck` accept "
+                "`ins` or `attitude` in its place. Some methods of `kalman` do as well",
             )
         return self.imu
 

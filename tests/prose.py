@@ -76,8 +76,7 @@ _PREPOSITION = (
 INVERSIONS = {
     "begins with 'of'": re.compile(rf"{_CLAUSE}[Oo]f\b"),
     "begins with a clause of 'what', 'who' or 'that'": re.compile(
-        rf"{_CLAUSE}(?:[Ww]hat|[Ww]ho|[Ww]hose|[Ww]hoever|[Tt]hat (?!is|was|are|were|makes|\w+s\b))"
-        r"\b[^?]*$"
+        rf"{_CLAUSE}(?:[Ww]hat|[Ww]ho|[Ww]hose|[Ww]hoever|[Tt]hat (?:an?|it|the|they|you))\b[^?]*$"
     ),
     "a preposition, and the verb without a comma": re.compile(
         rf"{_CLAUSE}{_PREPOSITION} (?:(?!which|that|who)[^\s,;:]+ ){{1,7}}?{_VERB}\b"
@@ -88,8 +87,10 @@ INVERSIONS = {
     ),
     "'of it' as an object": re.compile(r"\b(?:nobody's|no one's)\b"),
 }
-_END = re.compile(r"(?<=[.!?])(?<!\bal\.)(?<!\beq\.)(?<!\beqs\.)(?<!\bch\.)(?<!e\.g\.)(?<!i\.e\.)"
-                  r"(?<!\bNo\.)[)\"]?\s+(?=[A-Z(\"“0-9`]|$)")
+_END = re.compile(
+    r"(?<=[.!?])(?<!\bal\.)(?<!\beq\.)(?<!\beqs\.)(?<!\bch\.)(?<!e\.g\.)(?<!i\.e\.)"
+    r"(?<!\bNo\.)[)\"]?\s+(?=[A-Z(\"“0-9`]|$)"
+)
 _WORD = re.compile(r"[A-Za-z][A-Za-z’'-]+|`")
 
 

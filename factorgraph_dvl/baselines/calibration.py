@@ -50,8 +50,8 @@ METHODS: tuple[Method, ...] = (*DVL_METHODS, "star", "liu-2020", "beams")
 
 _UNCORRELATED = Finding(
     Code.METHOD_LIMITS,
-    "of the calibration in dvl.calibration values and standard deviations are the prior; these "
-    "methods take no correlations",
+    "the prior has the values and standard deviations of dvl.calibration; these methods "
+    "do not use its correlations",
 )
 _NEGLECTED: dict[DvlMethod, tuple[str, ...]] = {
     "point-set": ("dvl_bias", "time_offset"),
@@ -152,7 +152,8 @@ def calibrate(
         )
     if dvl.settings.reference == "water":
         raise ConfigError(
-            "the point-set methods know no current, and this DVL measures through the water",
+            "the point-set methods do not estimate a current, and this DVL measures through the "
+            "water",
             where="trial.yaml dvl.reference",
             expected="bottom",
             hint="`solve` estimates the current",
@@ -208,8 +209,8 @@ def _outage(trial: Trial) -> list[Finding]:
     return [
         Finding(
             Code.GNSS_OUTAGE,
-            f"GNSS is missing for {longest:.0f} s: the SINS/GNSS filter drifts there, so use "
-            "neither its motion nor the calibration; `solve` bridges it",
+            f"GNSS is missing for {longest:.0f} s: the SINS/GNSS filter drifts there, do not "
+            "use its motion or the calibration. `solve` bridges the outage",
         )
     ]
 

@@ -37,8 +37,8 @@ THRESHOLD = 1.0 * DEG
 _TUNING = Finding(
     Code.METHOD_LIMITS,
     f"luo-2024 multiplies the variance of the measurements by {NOISE_FACTOR:g} and rotates the "
-    f"data at {THRESHOLD / DEG:g} deg, as the paper states no tuning: its standard deviations are "
-    "no measure of its errors",
+    f"data at {THRESHOLD / DEG:g} deg, because the paper states no tuning. Its standard "
+    "deviations do not describe its errors",
 )
 
 

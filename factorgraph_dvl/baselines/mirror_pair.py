@@ -64,7 +64,7 @@ def mirror_pair(trial: PlanarTrial, times: tuple[float, float, float]) -> tuple[
     by_square, by_time, start = np.polyfit(t, square, 2)
     if by_square <= 0.0 or start <= 0.0:
         raise DataError(
-            "the three ranges belong to no straight run at constant speed",
+            "the three ranges do not fit a straight run at constant speed",
             where=beacons.source,
             expected="ranges whose square is a parabola in time, opening upwards",
         )

@@ -166,8 +166,8 @@ def navigate(trial: Trial, pings: Array, *, smoothed: bool = True) -> Navigation
             findings.append(
                 Finding(
                     Code.FILTER_RESTARTED,
-                    f"the SINS/GNSS filter starts again at {span[0]:.3f} s, after the gap: "
-                    "position, velocity and attitude anew, the biases from before",
+                    f"the SINS/GNSS filter starts again at {span[0]:.3f} s, after the gap. "
+                    "Position, velocity and attitude are new, and the biases continue",
                 )
             )
         track, note = _navigate_arc(trial, gnss, samples, span, pings, tracks, smoothed)

@@ -86,8 +86,8 @@ def nine_state(
         findings.append(
             Finding(
                 Code.NOT_OBSERVABLE,
-                f"{', '.join(mixed)} not observable: bias and scale separate only where the speed "
-                "along the axis varies, and here it does not vary enough",
+                f"{', '.join(mixed)} not observable: bias and scale separate only if the speed "
+                "along the axis varies, which is not the case here",
                 parameter=bias.name,
             )
         )
@@ -105,8 +105,8 @@ def with_bias(
         findings.append(
             Finding(
                 Code.METHOD_LIMITS,
-                f"the trial fixes the bias at zero, but the method estimates it: {_BIAS_SIGMA} "
-                "m/s taken for its prior standard deviation",
+                f"the trial fixes the bias at zero, but the method estimates it with a "
+                f"prior standard deviation of {_BIAS_SIGMA} m/s",
                 parameter=bias.name,
             )
         )

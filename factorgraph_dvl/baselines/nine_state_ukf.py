@@ -54,10 +54,10 @@ def unscented(
     """
     if parameters[0].sigma.max() > _WIDEST:
         raise ConfigError(
-            "the unscented filter needs to know the misalignment roughly",
+            "the unscented filter needs an approximate misalignment",
             where="trial.yaml dvl.misalignment_std_deg",
             expected=f"at most {_WIDEST / DEG:.0f}",
-            hint="nine-state finds misalignments of any size",
+            hint="Use --method nine-state, which finds misalignments of any size",
         )
     prior = prior_of(parameters)
     D, x, P = prior.values[0], np.concatenate(prior.values[1:]), prior.covariance.copy()

@@ -161,8 +161,8 @@ def filter_planar(
             *contradicted,
             Finding(
                 Code.METHOD_LIMITS,
-                f"{method} takes no range for an outlier, and sound speed, log, heading and "
-                "beacons for exact",
+                f"{method} uses all ranges, outliers included, and takes sound speed, log, "
+                "heading and beacons as exact",
             ),
         ),
     )
@@ -264,9 +264,9 @@ def _depends_on_start(
     return [
         Finding(
             Code.FILTER_CONTRADICTED,
-            f"from a start that is one standard deviation off the filter ends {apart:.3g} m, or "
-            f"{most:.3g} standard deviations, from where it did: it has not converged, and may "
-            "have gone to a mirror image; `solve` follows all of them",
+            "the filter has not converged: another start, one standard deviation off, ends "
+            f"{apart:.3g} m, or {most:.3g} standard deviations, from the result. It may have "
+            "found a mirror image; `solve` follows all of them",
         )
     ]
 

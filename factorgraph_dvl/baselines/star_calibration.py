@@ -55,8 +55,8 @@ _KNOWN_DEG = 5.0
 _OFF_VERTICAL = 2.0 * DEG
 _IN_N = Finding(
     Code.METHOD_LIMITS,
-    "liu-2020 takes the drift for constant in n, as printed: the drift of a vessel that heads "
-    "elsewhere than north is that of its gyros, rotated; the method `star` has it in body",
+    "liu-2020 takes the drift as constant in n, as printed. Unless the vessel heads north, this "
+    "is the rotated drift of the gyros. The method `star` estimates it in body",
 )
 
 
@@ -212,7 +212,7 @@ def _summary(
         findings.append(
             Finding(
                 Code.STAR_VERTICAL,
-                f"its attitudes put the vertical {np.degrees(tilt):.1f} deg from that of the "
+                f"the vertical of its attitudes is {np.degrees(tilt):.1f} deg off that of the "
                 "specific force: are `epoch` and `mounting_deg` right? Do not use the attitude "
                 "before they are corrected",
                 sensor=star.label,

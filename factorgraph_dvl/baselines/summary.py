@@ -31,7 +31,7 @@ from factorgraph_dvl.trial import Trial
 
 WHITE_NOISE = Finding(
     Code.METHOD_LIMITS,
-    "the error of the SINS/GNSS velocity is taken for white noise; it is correlated in time, so "
+    "the error of the SINS/GNSS velocity is treated as white noise; it is correlated in time, so "
     "the standard deviations of the DVL's parameters are too small",
 )
 

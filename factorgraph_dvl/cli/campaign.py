@@ -32,18 +32,18 @@ def campaign(
         typer.Option(metavar="N", min=1, help="Processes on this machine (one for each core)."),
     ] = None,
     scheduler: Annotated[
-        str | None, typer.Option(metavar="ADDRESS", help="A Dask scheduler that is running.")
+        str | None, typer.Option(metavar="ADDRESS", help="Address of a running Dask scheduler.")
     ] = None,
     covariates: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="Table of what parameters may follow: temperature."),
+        typer.Option(metavar="FILE", help="Table of covariates, such as temperature."),
     ] = None,
     force: Force = False,
     no_figures: NoFigures = False,
     anyway: Anyway = False,
     quiet: Quiet = False,
 ) -> None:
-    """Solve many trials, and calibrate all jointly; what is there is not solved again.
+    """Solve many trials, and calibrate all of them jointly. Existing results are kept.
 
     Examples:
       factorgraph-dvl campaign monday tuesday --out campaign

@@ -20,7 +20,7 @@ def correct(
     force: Force = False,
     anyway: Anyway = False,
 ) -> None:
-    """Correct the record of a DVL, or of its beams, by a calibration; write the matrix for it.
+    """Correct the record of a DVL or of its beams with a calibration, and write its matrix.
 
     Examples:
       factorgraph-dvl correct TRIAL out/calibration.json --out corrected

@@ -55,14 +55,14 @@ def deadreckon(
     ] = None,
     align: Annotated[
         float | None,
-        typer.Option(metavar="S", min=1.0, help="Time of GNSS that sins may use, s."),
+        typer.Option(metavar="S", min=1.0, help="Let sins use GNSS for the first S seconds only."),
     ] = None,
     force: Force = False,
     no_figures: NoFigures = False,
     anyway: Anyway = False,
     quiet: Quiet = False,
 ) -> None:
-    """Integrate the DVL's velocity, before and after calibration, and score the track.
+    """Integrate the DVL's velocity before and after calibration, and compare the tracks.
 
     Examples:
       factorgraph-dvl deadreckon data/seed-a-phase-90 --calibration out --out out/deadreckon
@@ -114,7 +114,7 @@ def deadreckon(
             }
             (folder / RESULT_FILE).write_bytes(to_json(result, about))
     if result.calibrated.score is None:
-        warn("neither a reference nor GNSS covers the track: its errors are unknown")
+        warn("neither a reference nor GNSS covers the track, so its errors are unknown")
     else:
         print_table(error_table(result))
         distance = result.calibrated.score.path.total
@@ -125,7 +125,7 @@ def deadreckon(
         if last - end > _UNSCORED_S:
             warn(
                 f"{result.scored_by} ends at {end:.1f} s, before the track ({last:.1f} s): "
-                f"distance and errors are those up to {end:.1f} s"
+                f"distance and errors are valid up to {end:.1f} s"
             )
     for finding in (*errors, *trial.notes, *findings):
         say(finding)

@@ -39,7 +39,7 @@ def demo(
     from factorgraph_dvl.io.solution_folder import REPORT_FILE
 
     if (out / "trial.yaml").exists():
-        raise DataError("holds a trial", where=str(out), expected="a new folder")
+        raise DataError("contains a trial", where=str(out), expected="a new folder")
     trial, result = out / "trial", out / "result"
     with as_file(files("factorgraph_dvl.reproduce") / "configs" / _SCENARIO) as config:
         simulate(config, trial, seed=_SEED, force=force, parquet=True)

@@ -86,10 +86,10 @@ def _export_solution(folder: Path, to: ExportFormat, out: Path | None, *, force:
 
     if folder.exists() and to not in _TRAJECTORIES:
         raise ConfigError(
-            f"`{to}` is no format of trajectories",
+            f"`{to}` is not a format of trajectories",
             where="--to",
             expected=", ".join(_TRAJECTORIES),
-            hint=f"{folder} is no trial folder, of which there are csv, mcap and pd0 too",
+            hint=f"{folder} is not a trial folder; only trials have csv, mcap and pd0",
         )
     file = out or folder / f"{EXPORT_STEM}.{to.value}"
     # What lies in the folder under these names was exported before.

@@ -19,11 +19,14 @@ def import_(
         Path | None, typer.Option("--out", metavar="TRIAL", help="Trial folder to write.")
     ] = None,
     form: Annotated[
-        str, typer.Option("--format", metavar="NAME", help="Format of all files, not recognised.")
+        str,
+        typer.Option(
+            "--format", metavar="NAME", help="Format of all files; by default recognised."
+        ),
     ] = "",
     mapping: Annotated[
         Path | None,
-        typer.Option("--map", metavar="MAPPING.yaml", help="What the columns of tables are."),
+        typer.Option("--map", metavar="MAPPING.yaml", help="Mapping of the columns of tables."),
     ] = None,
     guess: Annotated[
         bool, typer.Option("--guess", help="Propose a mapping for tables, and write nothing.")

@@ -35,7 +35,7 @@ Rate = Annotated[
     float, typer.Option(metavar="HZ", min=1e-3, max=1e4, help="Rate of the trajectory.")
 ]
 Anyway = Annotated[
-    bool, typer.Option("--anyway", help="Use records and calibrations that are refused.")
+    bool, typer.Option("--anyway", help="Use records and calibrations that would be refused.")
 ]
 Quiet = Annotated[bool, typer.Option("--quiet", help="Do not show progress.")]
 

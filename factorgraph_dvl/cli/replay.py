@@ -53,22 +53,27 @@ def replay(
     trial_path: TrialPath,
     out: SolutionPath,
     smoother: Annotated[
-        SmootherKind, typer.Option(help="Forget states after the lag, or never.")
+        SmootherKind,
+        typer.Option(help="fixed-lag marginalises states after the lag; isam2 keeps all."),
     ] = SmootherKind.FIXED_LAG,
     lag: Annotated[
         float, typer.Option(metavar="S", min=1.0, max=1e4, help="Lag of the smoother, s.")
     ] = 30.0,
     rate: Annotated[
-        float, typer.Option(metavar="HZ", min=0.1, max=50.0, help="States and updates a second.")
+        float, typer.Option(metavar="HZ", min=0.1, max=50.0, help="Rate of states and updates.")
     ] = 5.0,
-    live: Annotated[bool, typer.Option("--live", help="Show what is known as it runs.")] = False,
+    live: Annotated[
+        bool, typer.Option("--live", help="Show the current calibration while it runs.")
+    ] = False,
     good_std: Annotated[
         list[str] | None,
-        typer.Option(metavar="NAME=VALUE", help="σ of a parameter that is good enough."),
+        typer.Option(metavar="NAME=VALUE", help="Largest σ of a parameter that is good enough."),
     ] = None,
     good_error: Annotated[
         list[str] | None,
-        typer.Option(metavar="NAME=VALUE", help="Error of a parameter that is good enough."),
+        typer.Option(
+            metavar="NAME=VALUE", help="Largest error of a parameter that is good enough."
+        ),
     ] = None,
     force: Force = False,
     no_figures: NoFigures = False,

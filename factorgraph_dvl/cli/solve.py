@@ -83,7 +83,7 @@ def solve(
     figures: Figures = FigureKind.PNG,
     rate: Rate = 10.0,
     halves: Annotated[
-        bool, typer.Option("--halves", help="Solve the trial's halves too, and compare them.")
+        bool, typer.Option("--halves", help="Also solve each half of the trial, and compare them.")
     ] = False,
     anyway: Anyway = False,
     quiet: Quiet = False,

@@ -104,7 +104,7 @@ class AttitudeRecord:
             raise DataError(
                 "pitch is above 80 deg: heading and roll are not defined there",
                 where=at_row(sensor.source, np.flatnonzero(known)[steep[0]]),
-                expected="a vehicle that does not stand on end",
+                expected="pitch within 80 deg",
             )
         interval = float(np.median(np.diff(self.time)))
         noise = _white(rph)

@@ -109,9 +109,9 @@ def with_recorded_noise(imu: Imu) -> tuple[Imu, tuple[Finding, ...]]:
             findings.append(
                 Finding(
                     Code.IMU_NOISE,
-                    f"the noise of the {name} is {value / claimed:.2g} times the stated one by "
-                    f"the high frequencies of the record, and {value / si:.3g} {unit} was used; "
-                    f"state it as `{key}`, or `noise: stated` if the record only vibrates",
+                    f"the high frequencies of the record show {value / claimed:.2g} times the "
+                    f"stated noise of the {name}. {value / si:.3g} {unit} was used: state it as "
+                    f"`{key}`, or state `noise: stated` if the IMU only vibrates",
                     sensor="IMU",
                 )
             )

@@ -142,7 +142,7 @@ def initial_states(trial: Trial, frame: LocalFrame, seg: Segments) -> AlignedSta
             continue
         if pairs is None:
             raise DataError(
-                f"nothing to find the attitude with from {arc.start:z.1f} s on",
+                f"there are no data to find the attitude from {arc.start:z.1f} s on",
                 where=trial.inertial.source,
                 expected="GNSS or DVL data there, or `initial` in trial.yaml",
             )
@@ -153,7 +153,7 @@ def initial_states(trial: Trial, frame: LocalFrame, seg: Segments) -> AlignedSta
             findings.append(
                 Finding(
                     Code.HEADING_UNKNOWN,
-                    f"from {arc.start:z.0f} s on the velocity changes too little to find the "
+                    f"the velocity changes too little from {arc.start:z.0f} s on to find the "
                     "heading: the solver starts from the course over ground",
                 )
             )

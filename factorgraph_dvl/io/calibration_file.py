@@ -260,7 +260,7 @@ def check_verdict(result: Solution | Calibration, source: str, *, anyway: bool =
 def check_values(name: str, value: Array, source: str) -> None:
     """Raise DataError unless the values of a parameter are numbers that can be."""
     if not (value.size and np.isfinite(value).all()):
-        raise DataError(f"{name} holds no number", where=source, expected="finite values")
+        raise DataError(f"{name} is not a number", where=source, expected="finite values")
     if wrong := out_of_range(name, np.ravel(value).tolist()):
         raise DataError(wrong, where=source)
     above = max((spec.above for spec in specs_of(name).values()), default=-np.inf)

@@ -63,7 +63,7 @@ def save_corrected(
         raise DataError(
             "no ping has a velocity",
             where=beams.source,
-            expected="three beams, not in one plane, at one ping at least",
+            expected="at least one ping with three beams that are not in one plane",
         )
     dRb = exp_so3(np.array(beams.settings.misalignment_deg) * DEG)
     directions_d = directions_b @ dRb.T

@@ -132,7 +132,9 @@ def calibrated_by(
     prior = _prior_of(calibration, CALIBRATED, source)
     if not prior.values:
         raise DataError(
-            "the calibration says nothing of the DVL", where=source, expected=", ".join(CALIBRATED)
+            "the calibration has no parameter of the DVL",
+            where=source,
+            expected=", ".join(CALIBRATED),
         )
     settings = msgspec.structs.replace(dvl.settings, calibration=source)
     return replace(dvl, settings=settings, prior=prior)
@@ -202,7 +204,7 @@ def _walked(imu: Imu, calibration: Calibration, epoch: str, source: str) -> floa
     if not (calibration.epoch and calibration.span and epoch):
         where = "trial.yaml" if not epoch else source
         raise ConfigError(
-            "the biases of the IMU walk, and it is not known how long ago they were calibrated",
+            "the biases of the IMU walk, and the time since their calibration is not known",
             where=f"imu.calibration: {source}",
             expected=f"`epoch` in {where}",
             hint="State `epoch` in both trials, and solve the earlier one anew",

@@ -81,7 +81,7 @@ class _Directions(Section, frozen=True, kw_only=True):
         super().__post_init__()
         n = len(self.value)
         if n == 0 or np.any(np.abs(np.linalg.norm(self.value, axis=1) - 1.0) > _UNIT):
-            raise ValueError("`value` must hold unit vectors")
+            raise ValueError("`value` must contain unit vectors")
         if self.std is not UNSET and len(self.std) != n:
             raise ValueError(f"`std` must have a pair for each of the {n} vectors in `value`")
         if self.observable is not UNSET and len(self.observable) != n:

@@ -141,7 +141,7 @@ def _check_inputs(path: Path, target: Path, owned: Sequence[str], inputs: Iterab
         return
     if SETTINGS_FILE not in owned and (target / SETTINGS_FILE).exists():
         raise DataError(
-            f"holds {SETTINGS_FILE}: it is a trial, and no result may replace its files",
+            f"contains {SETTINGS_FILE}: results may not replace the files of a trial",
             where=str(path),
             expected="another folder for results",
         )
@@ -150,7 +150,7 @@ def _check_inputs(path: Path, target: Path, owned: Sequence[str], inputs: Iterab
         for item in (given, *beside):
             if _lies_in(item, target):
                 raise DataError(
-                    f"holds {item}, which this command reads: its results may not replace that",
+                    f"contains {item}, which this command reads: its results may not replace it",
                     where=str(path),
                     expected="another folder for results",
                 )
@@ -201,8 +201,8 @@ def _check_content(path: Path, target: Path, force: bool, owned: Sequence[str]) 
         for pattern in owned:
             for found in sorted(target.glob(pattern)):
                 raise DataError(
-                    f"holds {found.relative_to(target)} but no {owned[0]}: it is no earlier "
-                    "result of this command, and --force does not replace what others wrote",
+                    f"contains {found.relative_to(target)} but no {owned[0]}: it is not an "
+                    "earlier result of this command, and --force replaces only such results",
                     where=str(path),
                     expected="another folder",
                 )

@@ -108,7 +108,9 @@ def columns_of(
             out[name] = np.array(table[name], dtype=kind)
         except (TypeError, ValueError):
             raise DataError(
-                f"column {name} holds no numbers", where=source, expected="numbers, nan if missing"
+                f"column {name} contains no numbers",
+                where=source,
+                expected="numbers, nan if missing",
             ) from None
         size = out[names[0]].shape
         if out[name].ndim != 1 or out[name].shape != size:
@@ -325,7 +327,7 @@ def _read_parquet(path: Path, header: list[str], names: list[str], source: str) 
             continue
         if not (pa.types.is_floating(field.type) or pa.types.is_integer(field.type)):
             raise DataError(
-                f"column {field.name} holds {field.type}", where=source, expected="numbers"
+                f"column {field.name} contains {field.type}", where=source, expected="numbers"
             )
     return table
 

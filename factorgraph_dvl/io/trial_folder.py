@@ -148,8 +148,8 @@ def assembled(
         notes.append(
             Finding(
                 Code.COUNTED_TWICE,
-                "`dvl` and `dvl_beams` have pings at the same times: if both are records of one "
-                "instrument, its noise counts twice, and standard deviations come out too small",
+                "`dvl` and `dvl_beams` have pings at the same times. If both are records of one "
+                "instrument, its pings count twice, and standard deviations are too small",
             )
         )
     return Trial(
@@ -298,7 +298,7 @@ def _check_written(path: Path, by: str, heads: tuple[str, ...]) -> None:
     file = path / SETTINGS_FILE
     if file.exists() and not read_text(file).startswith(heads):
         raise DataError(
-            f"holds a {SETTINGS_FILE} that `{by}` did not write, and may not replace",
+            f"contains a {SETTINGS_FILE} that `{by}` did not write, and may not replace",
             where=str(path),
             expected=f"another folder, or one whose {SETTINGS_FILE} begins with `{heads[0]}`",
         )

@@ -327,7 +327,7 @@ def _course_findings(directions: BodyDirections, body_axes: BodyAxes) -> Iterato
     where = "astern" if abs(degrees) > 150.0 else f"{abs(degrees):.0f} deg to {side} of the bow"
     yield Finding(
         Code.COURSE,
-        f"by body_axes {body_axes} the vehicle goes {where} most of the time{cause}",
+        f"with body_axes {body_axes}, the vehicle moves {where} most of the time{cause}",
         "IMU",
         severity="error" if directions.turned > _TURNED else "warning",
     )

@@ -75,7 +75,7 @@ def _speed_findings(dvl: Dvl, gnss: Gnss) -> Iterator[Finding]:
         yield Finding(
             Code.DVL_UNIT,
             f"its unit is plausible: speed {ratio:.3g} times that of the GNSS, which is not its "
-            "scale error: the lever arm, in sway and turns, contributes",
+            "scale error: the lever arm contributes in sway and turns",
             dvl.label,
             severity="ok",
         )
@@ -134,14 +134,14 @@ def _sign_findings(
     if ahead < -0.5:
         yield Finding(
             Code.DVL_SIGN,
-            "by its prior misalignment the vehicle moves astern most of the time: is the sign "
+            "with its prior misalignment, the vehicle moves astern most of the time: is the sign "
             f"that of PD0? {positive}",
             dvl.label,
         )
     elif ahead > 0.5:
         yield Finding(
             Code.DVL_SIGN,
-            "by its prior misalignment the vehicle moves ahead",
+            "with its prior misalignment, the vehicle moves ahead",
             dvl.label,
             severity="ok",
         )

@@ -91,7 +91,7 @@ def gyro_findings(imu: Imu) -> Iterator[Finding]:
     if cause:
         yield Finding(
             Code.GYRO_UNIT,
-            f"the angular rate does not turn the specific force as it should: it looks {cause}",
+            f"the angular rate contradicts the rotation of the specific force: it looks {cause}",
             "IMU",
             severity="error",
         )

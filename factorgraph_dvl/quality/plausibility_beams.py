@@ -43,12 +43,12 @@ def _agreement(beams: DvlBeams) -> Iterator[Finding]:
     speed = float(np.sqrt(np.mean(np.sum(log.velocity[known] ** 2, axis=1))))
     noise = float(np.sqrt(np.nanmean(beams.sigma()[known] ** 2)))
     prior = speed * float(np.hypot(s.direction_std_deg * DEG, s.scale_error_std))
-    text = f"with nominal directions the beams contradict each other by {rms:.2g} m/s rms"
+    text = f"with nominal directions, the beams contradict each other by {rms:.2g} m/s rms"
     if rms > _TOO_LARGE * np.hypot(noise, prior):
         yield Finding(
             Code.BEAMS_DISAGREE,
-            f"{text}, at {speed:.2g} m/s more than noise and priors explain: is their order, "
-            "the sign of one, or a direction wrong?",
+            f"{text}, which is more than noise and priors explain at {speed:.2g} m/s: is their "
+            "order, the sign of one, or a direction wrong?",
             beams.label,
         )
     else:

@@ -38,8 +38,9 @@ def planar_findings(trial: PlanarTrial) -> Iterator[Finding]:
         if noise < _QUIET * heading.settings.std_deg:
             yield Finding(
                 Code.HEADING_UNIT,
-                f"all of it is within {np.abs(psi).max():.2g} deg of north, and steadier than its "
-                f"standard deviation of {heading.settings.std_deg:g} deg: is it in radians?",
+                f"all of it is within {np.abs(psi).max():.2g} deg of north, and varies less "
+                f"than its standard deviation of {heading.settings.std_deg:g} deg: is it in "
+                "radians?",
                 heading.label,
             )
     speed = float(np.nanmedian(log.speed)) if np.isfinite(log.speed).any() else 0.0
@@ -52,8 +53,8 @@ def planar_findings(trial: PlanarTrial) -> Iterator[Finding]:
     if abs(speed) <= _MOVING_M_S and len(trial.beacons.settings.positions) == 1:
         yield Finding(
             Code.AT_REST,
-            f"the speed is {abs(speed):.2g} m/s in the median: of a vehicle at rest one beacon "
-            "gives only a circle, and the hypotheses are examples of that",
+            f"the speed is {abs(speed):.2g} m/s in the median: one beacon gives only a circle for "
+            "a vehicle at rest, and the hypotheses are points on it",
             log.label,
         )
     below = float(np.nanmedian(depth.depth)) if np.isfinite(depth.depth).any() else 0.0
@@ -81,8 +82,8 @@ def _gaps(time: Array, label: str) -> Iterator[Finding]:
     for k in np.flatnonzero(steps > JUMP).tolist():
         yield Finding(
             Code.CLOCK_JUMP,
-            f"time_s jumps from {time[k]:.10g} to {time[k + 1]:.10g} s; only the part between "
-            "jumps with most ranges is used. Write all of time_s by one clock",
+            f"time_s jumps from {time[k]:.10g} to {time[k + 1]:.10g} s; only the part with the "
+            "most ranges is used. Write all of time_s by one clock",
             label,
             severity="warning",
         )
@@ -96,7 +97,7 @@ def _gaps(time: Array, label: str) -> Iterator[Finding]:
         yield Finding(
             Code.GAPS,
             f"{count} from {time[k]:.10g} to {time[k + 1]:.10g} s: it is interpolated, as if the "
-            "vehicle had not manoeuvred, and the standard deviations do not know better",
+            "vehicle had not manoeuvred. The standard deviations do not contain this error",
             label,
             severity="warning",
         )

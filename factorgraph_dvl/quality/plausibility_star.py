@@ -63,7 +63,7 @@ def _vertical(star: Star, trial: Trial) -> Iterator[Finding]:
     if tilt > _OFF_VERTICAL:
         yield Finding(
             Code.STAR_VERTICAL,
-            f"its attitudes put the vertical {np.degrees(tilt):.1f} deg from that of the "
+            f"the vertical of its attitudes is {np.degrees(tilt):.1f} deg off that of the "
             "specific force: are `epoch` (UTC of time_s = 0) and `mounting_deg` right?",
             star.label,
             severity="error",

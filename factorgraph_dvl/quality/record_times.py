@@ -43,7 +43,7 @@ def time_findings(trial: Trial, sensors: list[SensorSurvey]) -> Iterator[Finding
         yield Finding(Code.TIME_UNIT, text, "IMU", severity="error")
     for aid, record in zip(aids, trial.aids, strict=True):
         if aid.missing == 1.0:
-            text = "none of its rows holds a measurement"
+            text = "none of its rows contains a measurement"
             yield Finding(Code.NO_MEASUREMENT, text, aid.label, severity="error")
             continue
         inside = min(aid.end, imu.end) - max(aid.start, imu.start)
@@ -62,7 +62,7 @@ def time_findings(trial: Trial, sensors: list[SensorSurvey]) -> Iterator[Finding
                 Code.NO_OVERLAP,
                 f"its times, {aid.start:.10g} to {aid.end:.10g} s, do not overlap those of "
                 f"{name}, {imu.start:.10g} to {imu.end:.10g} s: "
-                "are they of one clock, in seconds?",
+                "are they from one clock, in seconds?",
                 aid.label,
                 severity="error",
             )
@@ -90,7 +90,7 @@ def time_findings(trial: Trial, sensors: list[SensorSurvey]) -> Iterator[Finding
         if 0.5 < sensor.missing < 1.0:
             yield Finding(
                 Code.MISSING,
-                f"{100.0 * sensor.missing:.3g} % of its rows hold no measurement",
+                f"{100.0 * sensor.missing:.3g} % of its rows contain no measurement",
                 sensor.label,
             )
 

@@ -50,7 +50,7 @@ def clock_findings(
             Code.CLOCK_DRIFT,
             f"its clock {'loses' if change < 0 else 'gains'} {abs(change):.2f} s in {span:.0f} s "
             f"against the IMU's ({1e6 * clock.rate:.0f} ± {1e6 * clock.rate_sigma:.0f} ppm): "
-            "write time_s from true stamps, not from a rate that was assumed",
+            "write time_s from true stamps, not from an assumed rate",
             sensor.label,
             severity="error" if abs(change) > covered else "warning",
         )

@@ -56,7 +56,7 @@ def _findings(trial: PlanarTrial, sensors: tuple[SensorSurvey, ...]) -> Iterator
         return
     inside = min(beacons.end, end) - max(beacons.start, start)
     if beacons.missing == 1.0:
-        text = "none of its rows holds a measurement"
+        text = "none of its rows contains a measurement"
         yield Finding(Code.NO_MEASUREMENT, text, beacons.label, severity="error")
     elif inside < 0.0:
         yield Finding(

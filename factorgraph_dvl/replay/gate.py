@@ -99,7 +99,7 @@ class InnovationGate:
                 self.inconsistent.discard(label)
                 self.excluded.discard(label)
                 return Finding(
-                    Code.HEARD_AGAIN, "consistent with the prediction again, and used", label
+                    Code.HEARD_AGAIN, "consistent with the prediction again, and used again", label
                 )
         elif full and rms > _INCONSISTENT_RMS:
             self.inconsistent.add(label)
@@ -124,8 +124,8 @@ class InnovationGate:
                 )
             return Finding(
                 Code.CONTRADICTS,
-                f"{what}; none are used until they are consistent again. A clock that has jumped "
-                "or a faulty sensor does this: check both",
+                f"{what}; none are used until they are consistent again. Possible causes are a "
+                "clock that has jumped and a faulty sensor: check both",
                 label,
             )
         return None

@@ -157,8 +157,8 @@ class Initializer:
             self.findings.append(
                 Finding(
                     Code.UNUSED,
-                    f"samples before {start:.3f} s are not used: before there was a start, the "
-                    f"clock jumped or nothing came for more than {_LONGEST:g} s",
+                    f"samples before {start:.3f} s are not used: before the start, the "
+                    f"clock jumped or no data came for more than {_LONGEST:g} s",
                     "IMU",
                 )
             )
@@ -301,8 +301,8 @@ class Initializer:
         self.findings.append(
             Finding(
                 Code.CLOCK_JUMP,
-                f"no gap at {gap.before:.2f} s, the clock jumped ahead by {jump.by:.2f} s: later "
-                "samples are shifted back by that. Check the clock of the logger",
+                f"there is no gap at {gap.before:.2f} s: the clock jumped ahead by {jump.by:.2f} "
+                "s. Later samples are shifted back by this. Check the clock of the logger",
                 "IMU",
             )
         )

@@ -50,8 +50,8 @@ class Outages:
                 out.append(
                     Finding(
                         Code.SILENT,
-                        f"no measurements since {newest:.1f} s; the estimate continues without, "
-                        "and its standard deviations grow",
+                        f"no measurements since {newest:.1f} s; the estimate continues without "
+                        "them, and its standard deviations grow",
                         label,
                     )
                 )

@@ -124,7 +124,7 @@ def _played(
     take(run.finish())
     if recorder.last is None:
         why = "; ".join(map(str, run.findings)) or "the record is too short"
-        raise SolveError(f"the data never sufficed to start: {why}", where=trial.name)
+        raise SolveError(f"the data were never sufficient to start: {why}", where=trial.name)
     return _solution(trial, run, recorder, recorder.last), recorder.record(run.delay)
 
 
@@ -138,15 +138,16 @@ def _solution(trial: Trial, run: Replay, recorder: Recorder, last: Update) -> So
         findings.append(
             Finding(
                 Code.UNUSED,
-                f"the replay ended at {last.time:.3f} s: {run.unused} samples follow, but too few "
-                "to start again after a gap; they and what was measured then were not used",
+                f"the replay ended at {last.time:.3f} s: {run.unused} samples follow, too few "
+                "to start again after a gap. They and the measurements at these times were not "
+                "used",
                 "IMU",
             )
         )
     findings += run.counts()
     findings += consistency_findings(calibration.estimates, residuals)
     findings += prior_findings(trial, calibration.estimates, calibration.covariance)
-    why = "the prior is reported; turns and changes of speed make more of it observable"
+    why = "the prior is reported; turns and changes of speed would help"
     for e in calibration.estimates:
         findings += not_observable(e, lambda _: why)
     known = {e.name for e in calibration.estimates}
@@ -155,7 +156,7 @@ def _solution(trial: Trial, run: Replay, recorder: Recorder, last: Update) -> So
             findings.append(
                 Finding(
                     Code.SILENT,
-                    "delivered nothing in time to be calibrated; check its record, or feed more "
+                    "no measurement came in time to calibrate it; check its record, or feed more "
                     "data",
                     aid.label,
                 )
@@ -164,7 +165,7 @@ def _solution(trial: Trial, run: Replay, recorder: Recorder, last: Update) -> So
         findings.append(
             Finding(
                 Code.MEAN_OR_LAST,
-                "a bias walks: reported is its value at the end, where `solve` reports the mean "
+                "a bias walks: the reported value is that of the end. `solve` reports the mean "
                 "over the trial",
                 "IMU",
             )

@@ -38,8 +38,8 @@ LAG = 30.0
 RATE = 5.0
 _IMU_ERRORS_LEFT_OUT = Finding(
     Code.IMU_ERRORS_LEFT_OUT,
-    "a replay does not estimate scale, axes and g-sensitivity: standard deviations leave out what "
-    "they add; `solve` contains it",
+    "a replay does not estimate scale, axes and g-sensitivity: standard deviations do not "
+    "contain their effect; those of `solve` do",
     sensor="IMU",
 )
 
@@ -98,8 +98,8 @@ class Replay:
         self._findings += [
             Finding(
                 Code.CORRELATION_LEFT_OUT,
-                "a replay takes all noise for white: standard deviations leave out what the "
-                "correlated part adds; `solve` contains it",
+                "a replay treats all noise as white: standard deviations do not contain the "
+                "correlated part; those of `solve` do",
                 sensor=aid.label,
             )
             for aid in settings.aids

@@ -206,13 +206,13 @@ class Attitude:
     def explain(self, parameter: str, component: int, motion: Motion | None) -> str:
         """Say why an error of the attitude or its clock could not be observed."""
         if parameter in _CLOCK.names:
-            return "a time offset shows only where the attitude changes"
+            return "a time offset is observable only where the attitude changes"
         if parameter == HEADING_OFFSET:
             return (
-                "without an IMU only the sum of heading offset and misalignment shows: state "
-                "`heading_offset_std_deg` as well as it is known"
+                "without an IMU, only the sum of heading offset and misalignment is observable: "
+                "state `heading_offset_std_deg`"
             )
-        return "it takes all headings, more than once"
+        return "the trial needs all headings, more than once"
 
 
 # Stands for a standard deviation of 0 of an angle, rad. Chosen: far below what is measured.

@@ -83,7 +83,7 @@ class BeaconSettings(ClockSection, frozen=True, kw_only=True):
     def __post_init__(self) -> None:
         super().__post_init__()
         if not self.positions:
-            raise ValueError("`positions` must hold at least one beacon")
+            raise ValueError("`positions` must contain at least one beacon")
         for name in self.positions:
             if not _NAMES.fullmatch(name):
                 raise ValueError(f"`positions`: a name has letters, digits, _ and -, not {name!r}")
@@ -205,16 +205,16 @@ class Beacons:
             return "there are hardly any ranges while the IMU runs"
         travelled = float(np.linalg.norm(np.ptp(motion.p_n[:, :2], axis=0)))
         if parameter in _CLOCK.names:
-            return "a time offset shows only where the ranges change"
+            return "a time offset is observable only where the ranges change"
         if parameter == SOUND_SPEED_ERROR:
             return (
-                "an error of the sound speed shows only against a distance that something else "
-                "measures: it takes GNSS, or a long way in several directions by a log without "
+                "an error of the sound speed is observable only if another sensor measures the "
+                "distance: add GNSS, or go a long way in several directions with a log without "
                 "scale error"
             )
         return (
-            f"the ranges were taken within {travelled:.3g} m: the place of a beacon shows only "
-            "from several sides, and from positions that something else knows"
+            f"the ranges were taken within {travelled:.3g} m: the position of a beacon is "
+            "observable only from several sides, and from known positions"
         )
 
 

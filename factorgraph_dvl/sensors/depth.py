@@ -108,8 +108,8 @@ class Depth:
     def explain(self, parameter: str, component: int, motion: Motion | None) -> str:
         """Say why the height of the sea surface or the clock could not be observed."""
         if parameter in _CLOCK.names:
-            return "a time offset shows only where the depth changes"
-        return "nothing else in the trial measures height: it takes GNSS at the surface"
+            return "a time offset is observable only where the depth changes"
+        return "nothing else in the trial measures height: add GNSS at the surface"
 
 
 @dataclass(frozen=True)

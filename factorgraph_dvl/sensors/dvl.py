@@ -287,25 +287,25 @@ class Dvl:
         if parameter == MISALIGNMENT:
             return (
                 f"the velocity keeps its direction in the body to {spread:.2g} deg, and a "
-                "rotation about the velocity changes nothing: it takes side slip, heave or a "
+                "rotation about the velocity changes nothing: add side slip, heave or a "
                 "current from changing sides"
             )
         if parameter == LEVER_ARM:
             x, y, z = rates
             return (
                 f"the body turns too little (rms rate {x:.2g}, {y:.2g}, {z:.2g} deg/s about "
-                "x, y, z): a lever arm shows only through rotation about another axis than its own"
+                "x, y, z): a lever arm is observable only through rotation about other axes"
             )
         if parameter == SCALE_ERROR:
             return (
                 f"nothing else in the trial measures speed well enough (it was {speed.min():.2g} "
-                f"to {speed.max():.2g} m/s): it takes GNSS and distance"
+                f"to {speed.max():.2g} m/s): add GNSS, and go farther"
             )
         if parameter == BIAS:
-            return "a bias separates from the scale only when speed or direction vary"
+            return "bias and scale are separable only if speed or direction vary"
         if parameter in CLOCK.names:
-            return "a time offset shows only where velocity or attitude change"
-        return "a current separates from the other errors only when the heading changes"
+            return "a time offset is observable only where velocity or attitude change"
+        return "current and other errors are separable only if the heading changes"
 
 
 @dataclass(frozen=True)

@@ -111,7 +111,9 @@ class DvlBeamsSettings(ClockSection, frozen=True, kw_only=True):
         beams = self.nominal_d
         name = given[0]
         if len(beams) < 3 or np.linalg.svd(beams, compute_uv=False)[2] < _LEAST_SPREAD:
-            raise ValueError(f"`{name}` must hold three or more beams that are not in one plane")
+            raise ValueError(
+                f"`{name}` must contain three or more beams that are not in one plane"
+            )
         scale = np.atleast_1d(self.scale_error)
         if scale.size not in (1, len(beams)):
             raise ValueError(f"`scale_error` must have one number, or {len(beams)}")
@@ -122,8 +124,8 @@ class DvlBeamsSettings(ClockSection, frozen=True, kw_only=True):
             raise ValueError("`scale_error` must be one number with `parametrisation: common`")
         if self.misalignment_std_deg is not UNSET and not common:
             raise ValueError(
-                "`misalignment_std_deg` has no place beside beams of which each has a direction "
-                "of its own; it belongs to `parametrisation: common`"
+                "`misalignment_std_deg` cannot be used if each beam has its own direction; it "
+                "belongs to `parametrisation: common`"
             )
 
     @property
@@ -135,7 +137,7 @@ class DvlBeamsSettings(ClockSection, frozen=True, kw_only=True):
             worst = int(np.argmax(np.abs(length - 1.0))) if length.size else 0
             if length.size and abs(length[worst] - 1.0) > _UNIT:
                 raise ValueError(
-                    "`directions` must hold unit vectors; that of "
+                    "`directions` must contain unit vectors; the vector of "
                     f"beam {worst + 1} has the length {length[worst]:.3g}"
                 )
             return np.asarray(vectors / length[:, None])
@@ -148,7 +150,7 @@ class DvlBeamsSettings(ClockSection, frozen=True, kw_only=True):
         assert not isinstance(self.alpha_theta_deg, UnsetType)
         alpha, theta = np.array(self.alpha_theta_deg).reshape(-1, 2).T * DEG
         if alpha.size != 4:
-            raise ValueError("`alpha_theta_deg` must hold four beams, in octants V to VIII")
+            raise ValueError("`alpha_theta_deg` must contain four beams, in octants V to VIII")
         # A beam in the xz plane may be beyond it by rounding.
         y2 = np.cos(alpha + theta) * np.cos(alpha - theta)
         if np.any(y2 < -_ROUNDING):
@@ -311,7 +313,7 @@ class DvlBeams:
         if motion is None or motion.v_n.shape[0] < 2:
             return "the trial has no ping with a beam while the IMU runs, or only one"
         if parameter in self.clock.names:
-            return "a time offset shows only where velocity or attitude change"
+            return "a time offset is observable only where velocity or attitude change"
         received = np.flatnonzero(~np.isnan(self.velocity).all(axis=0)) + 1
         if parameter == of_beams(LEVER_ARM_SPEC, self.prefix).name:
             if received.size < 3:
@@ -319,7 +321,7 @@ class DvlBeams:
             x, y, z = np.degrees(np.std(motion.omega_eb_b, axis=0))
             return (
                 f"the body turns too little (rms rate {x:.2g}, {y:.2g}, {z:.2g} deg/s about "
-                "x, y, z): a lever arm shows only through rotation about another axis than its own"
+                "x, y, z): a lever arm is observable only through rotation about other axes"
             )
         of_a_beam = {DIRECTION: component // 2, SCALE_ERROR: component}
         if self.settings.parametrisation == "beams":
@@ -329,9 +331,10 @@ class DvlBeams:
         v_b = rotate(motion.nRb.transpose(0, 2, 1), motion.v_n)
         x, y, z = np.sqrt(np.mean(v_b**2, axis=0))
         return (
-            "a beam shows its direction and its scale by velocities in three directions of the "
-            f"body, each against a better reference; here they were {x:.2g}, {y:.2g}, {z:.2g} m/s "
-            "rms along x, y, z: a turntable or sailing sideways adds the second, heave the third"
+            "direction and scale of a beam are observable only with velocities in three "
+            f"directions of the body and a better reference; here they were {x:.2g}, {y:.2g}, "
+            f"{z:.2g} m/s rms along x, y, z. A turntable or motion sideways adds the second, "
+            "heave the third"
         )
 
 

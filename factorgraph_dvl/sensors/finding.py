@@ -48,68 +48,71 @@ class Code(StrEnum):
     TIME_UNIT = (
         "time_unit",
         "The samples are too far apart, or too close together, for an IMU.",
-        "Every rate, noise density and lag in the trial is per second: nothing can be solved.",
+        "Rates, noise densities and time offsets are per second, so the trial cannot be solved.",
         "Write time_s in seconds.",
         "error",
     )
     NO_OVERLAP = (
         "no_overlap",
-        "A sensor measured nothing while the others did.",
-        "Nothing ties the sensor to the motion: it cannot be used.",
+        "The record of a sensor does not overlap the records of the others in time.",
+        "The sensor cannot be compared with the motion, so it cannot be used.",
         "Write all time_s by one clock, in seconds.",
         "error",
     )
     PARTIAL_OVERLAP = (
         "partial_overlap",
-        "Record and IMU cover each other only in part; the rest is not used.",
-        "The calibration rests on less data than the files hold.",
-        "Check the clocks, or record all sensors at once.",
+        "The records of a sensor and of the IMU overlap only in part. The rest is not used.",
+        "The calibration uses less data than the files contain.",
+        "Check the clocks, or record all sensors at the same time.",
         "note",
     )
     GAPS = (
         "gaps",
         "A record has gaps.",
-        "Nothing is measured there: standard deviations grow, and turns in a gap are lost.",
-        "Check the logger; of a planar trial keep straight on during a gap.",
+        "The motion in a gap is not measured: standard deviations grow, and turns may be missed.",
+        "Check the logger. In a planar trial, do not turn during a gap.",
         "note",
     )
     CLOCK_RESTARTED = (
         "clock_restarted",
-        "The IMU recorded a stretch by another clock than all other sensors; it is not used.",
-        "The true time of that stretch is unknown, and so is the motion in it.",
+        "The IMU used a different clock than all other sensors for a part of the trial. That "
+        "part is not used.",
+        "The true time of that part is unknown, and so is its motion.",
         "Write all of time_s by one clock.",
     )
     CLOCK_JUMP = (
         "clock_jump",
         "The clock of a record jumps.",
-        "The time that really passed is unknown: dead reckoning breaks there.",
+        "The time that passed is unknown, so dead reckoning breaks there.",
         "Write all of time_s by one clock.",
     )
     IMU_GAP = (
         "imu_gap",
-        "The IMU's record has a gap, which the inertial chain does not bridge.",
-        "Each part has biases in common but a motion of its own, known less well at its ends.",
-        "Nothing, if the rest is long enough; else record anew.",
+        "The record of the IMU has a gap that is too long to bridge.",
+        "The parts before and after it share the biases, but each is less accurate at its ends.",
+        "Nothing, if the rest is long enough. Otherwise, record the trial again.",
         "note",
     )
     LOST_SAMPLES = (
         "lost_samples",
-        "Few lost samples of the IMU were interpolated.",
-        "The motion in between is a guess, good while the gaps are few samples long.",
+        "A few lost samples of the IMU were interpolated.",
+        "The motion in between is approximate. This is harmless while the gaps are a few "
+        "samples long.",
         "Nothing, if they are few.",
         "note",
     )
     IMU_NOISE = (
         "imu_noise",
         "The record of the IMU is noisier at high frequencies than trial.yaml states.",
-        "The stated noise would make standard deviations too small; that of the record is used.",
-        "State the noise of a static record, or `noise: stated` where the IMU only vibrates.",
+        "The stated noise would make standard deviations too small, so the noise of the "
+        "record is used.",
+        "State the noise of a static record. If the IMU only vibrates, state `noise: stated`.",
     )
     CLOCK_OFFSET = (
         "clock_offset",
         "The clock of a sensor differs from that of the IMU.",
-        "In turns and sway it moves misalignment and lever arm by many standard deviations.",
-        "State it as time_offset_s of the sensor, or write all time_s by one clock.",
+        "In turns and sway, this changes misalignment and lever arm by many standard deviations.",
+        "State the offset as time_offset_s of the sensor, or write all time_s by one clock.",
     )
     CLOCK_DRIFT = (
         "clock_drift",
@@ -119,153 +122,153 @@ class Code(StrEnum):
     )
     CLOCK_STEP = (
         "clock_step",
-        "The clock of a sensor jumps against that of the IMU.",
+        "The clock of a sensor jumps relative to that of the IMU.",
         "No single time offset is right for the whole trial.",
-        "Write time_s by one clock, or solve the parts before and after the jump apart.",
+        "Write time_s by one clock, or solve the parts before and after the jump separately.",
     )
     LEAP_SECONDS = (
         "leap_seconds",
         "Stamps differ by the leap seconds between GPS time and UTC.",
-        "The sensor would be compared with motion of another time.",
+        "The sensor would be compared with the motion at another time.",
         "Write all time_s in UTC, or all in GPS time.",
         "error",
     )
     LOCAL_TIME = (
         "local_time",
         "Stamps differ by whole hours, as local time and UTC do.",
-        "Nothing ties the sensor to the motion: it cannot be used.",
+        "The sensor cannot be compared with the motion, so it cannot be used.",
         "Write all time_s in UTC.",
         "error",
     )
     UNUSED = (
         "unused",
-        "Measurements were not used.",
-        "The calibration rests on less data than the files hold.",
-        "Check the clocks; the text says how many there are, and why.",
+        "Some measurements were not used.",
+        "The calibration uses less data than the files contain.",
+        "Check the clocks. The text gives the number of measurements and the reason.",
         "note",
     )
     # What a record holds.
     INVALID_VALUES = (
         "invalid_values",
-        "Values with which an instrument marks what it has not measured were taken as missing.",
-        "As measurements they would be gross errors.",
-        "Nothing, if they are few; else leave such cells empty.",
+        'Some values are codes of the instrument for "not measured". They were taken as missing.',
+        "As measurements, they would be gross errors.",
+        "Nothing, if they are few. Otherwise, leave such cells empty.",
         "note",
     )
     FROZEN_VALUES = (
         "frozen_values",
         "A record repeats its values for a while.",
-        "What it repeats is not the motion of that time.",
+        "The repeated values do not show the motion at that time.",
         "Check the logger, and leave such rows out.",
         "error",
     )
     IMU_CHANNEL = (
         "imu_channel",
         "A channel of the IMU does not measure.",
-        "Without it there is no attitude, and nothing can be solved.",
-        "Check cable and conversion of the record.",
+        "The attitude cannot be computed without it, so the trial cannot be solved.",
+        "Check the cable and the conversion of the record.",
         "error",
     )
     NO_MEASUREMENT = (
         "no_measurement",
-        "A record holds no measurement.",
-        "A sensor that measured nothing adds nothing: most often a conversion failed.",
+        "A record contains no measurement.",
+        "The sensor adds no information. Usually, a conversion failed.",
         "Remove its section from trial.yaml, or correct the record.",
         "error",
     )
     MISSING = (
         "missing",
-        "More than half of the rows hold no measurement.",
-        "Parameters are known less well, and what is left may be the doubtful part.",
+        "More than half of the rows contain no measurement.",
+        "Parameters are less accurate, and the remaining measurements may be poor ones.",
         "Check bottom lock, fixes and the conversion of the record.",
         "note",
     )
     COUNTED_TWICE = (
         "counted_twice",
-        "dvl and dvl_beams seem to be records of one instrument, whose noise counts twice.",
-        "Standard deviations come out too small, by up to the square root of two.",
+        "dvl and dvl_beams seem to be records of the same instrument, so its pings count twice.",
+        "Standard deviations are too small, by up to the square root of two.",
         "Remove one of the two sections.",
     )
     # Units, signs and axes.
     FORCE_UNIT = (
         "force_unit",
         "The specific force is not about 9.8 m/s².",
-        "Velocity and attitude follow from the force: the solution would be wrong throughout.",
+        "Velocity and attitude depend on the force, so the whole solution would be wrong.",
         "Convert it to m/s², with gravity.",
         "error",
     )
     BODY_AXES = (
         "body_axes",
-        "Gravity does not point where body_axes says.",
-        "Roll, pitch and all lever arms would be those of other axes.",
+        "Gravity does not point in the direction that body_axes states.",
+        "Roll, pitch and all lever arms would be in wrong axes.",
         "Correct body_axes, or the sign of the force.",
         "error",
     )
     GYRO_UNIT = (
         "gyro_unit",
-        "The angular rate does not turn the specific force as it should.",
-        "Attitude follows from the rate: the solution would be wrong throughout.",
+        "The angular rate does not agree with the rotation of the specific force.",
+        "Attitude depends on the rate, so the whole solution would be wrong.",
         "Convert it to rad/s, in the axes of the force.",
         "error",
     )
     GYRO_FROZEN = (
         "gyro_frozen",
         "The angular rate is zero throughout.",
-        "Without rates there is neither attitude nor lever arm.",
+        "Attitude and lever arm cannot be computed without rates.",
         "Correct the record.",
         "error",
     )
     IMU_AXES = (
         "imu_axes",
         "Axes of the IMU are mirrored or swapped.",
-        "Turns are integrated to the wrong side: the solution would be wrong throughout.",
+        "Turns are integrated in the wrong direction, so the whole solution would be wrong.",
         "Invert or swap the columns of imu that the text names.",
         "error",
     )
     GYRO_AXES = (
         "gyro_axes",
-        "The gyros measure in other axes, or with another sign, than the accelerometers.",
-        "Attitude follows from the rate: the solution would be wrong throughout.",
+        "The gyros use other axes, or another sign, than the accelerometers.",
+        "Attitude depends on the rate, so the whole solution would be wrong.",
         "Invert or swap the columns of the gyros that the text names.",
         "error",
     )
     ACCEL_AXES = (
         "accel_axes",
-        "The accelerometers measure in other axes, or with another sign, than the gyros.",
-        "Velocity follows from the force: the solution would be wrong throughout.",
+        "The accelerometers use other axes, or another sign, than the gyros.",
+        "Velocity depends on the force, so the whole solution would be wrong.",
         "Invert or swap the columns of the accelerometers that the text names.",
         "error",
     )
     COURSE = (
         "course",
-        "The bow by body_axes does not point where the vehicle goes.",
-        "Roll, pitch, heading and the misalignment would be given in other axes than they seem.",
-        "Correct body_axes; if the vehicle did move like that, nothing.",
+        "The bow according to body_axes does not point in the direction of motion.",
+        "Roll, pitch, heading and the misalignment would be in other axes than stated.",
+        "Correct body_axes. If the vehicle did move like that, do nothing.",
     )
     ANTENNA = (
         "antenna",
-        "The antenna is elsewhere than gnss.lever_arm_m says.",
-        "In turns the error goes into the lever arm and the misalignment of the DVL.",
-        "Measure and correct gnss.lever_arm_m, or give lever_arm_std_m.",
+        "The antenna is not at the position that gnss.lever_arm_m states.",
+        "In turns, the error changes the lever arm and the misalignment of the DVL.",
+        "Measure and correct gnss.lever_arm_m, or state lever_arm_std_m.",
     )
     GNSS_AXES = (
         "gnss_axes",
-        "GNSS moves otherwise than the IMU.",
-        "Heading, and all that follows from it, would be wrong.",
-        "Correct order and sign of the columns of gnss that the text names.",
+        "The motion of GNSS does not agree with that of the IMU.",
+        "The heading would be wrong, and everything that depends on it.",
+        "Correct the order and sign of the columns of gnss that the text names.",
         "error",
     )
     DVL_AXES = (
         "dvl_axes",
-        "Axes of the DVL are mirrored, which no mounting does.",
-        "The misalignment would be a rotation that fits as badly as all others.",
-        "Invert the components that the text names; all three of a PD0 record.",
+        "Axes of the DVL are mirrored, which no mounting can do.",
+        "No rotation fits the data, so the misalignment would be meaningless.",
+        "Invert the components that the text names. A PD0 record needs all three inverted.",
         "error",
     )
     ZERO_FIXES = (
         "zero_fixes",
         "Some fixes are at latitude and longitude 0.",
-        "A fix that was lost would draw the track into the Gulf of Guinea.",
+        "Such a lost fix would pull the track into the Gulf of Guinea.",
         "Leave the cells of lost fixes empty.",
         "error",
     )
@@ -279,81 +282,82 @@ class Code(StrEnum):
     GNSS_VELOCITY = (
         "gnss_velocity",
         "GNSS velocities disagree with the differences of positions.",
-        "Heading, misalignment and scale error follow from this velocity.",
-        "Correct unit, order or sign of the velocity.",
+        "Heading, misalignment and scale error depend on this velocity.",
+        "Correct the unit, order or sign of the velocity.",
         "error",
     )
     DVL_UNIT = (
         "dvl_unit",
         "The DVL's speed is far from that of the GNSS.",
-        "The unit would be taken for a scale error.",
-        "Convert it to m/s.",
+        "The solver would mistake the unit for a scale error.",
+        "Convert the velocity to m/s.",
         "error",
     )
     DVL_FROZEN = (
         "dvl_frozen",
         "The DVL's velocity never changes.",
-        "A frozen value is taken for a measurement, and looks most precise.",
+        "The repeated value would count as a very precise measurement.",
         "Correct the record.",
         "error",
     )
     DVL_STD = (
         "dvl_std",
         "The DVL's standard deviation is large for its speed.",
-        "The DVL hardly counts: its parameters stay near their priors.",
+        "The DVL has little weight, so its parameters stay near their priors.",
         "Correct velocity_std_m_s, or the columns std.",
     )
     DVL_SIGN = (
         "dvl_sign",
-        "By its prior misalignment the vehicle moves astern.",
-        "The misalignment is searched for around the wrong direction.",
+        "With its prior misalignment, the DVL shows motion astern.",
+        "The solver searches for the misalignment around the wrong direction.",
         "Invert the velocity of a PD0 record, or correct misalignment_deg.",
     )
     BEAMS_LOST = (
         "beams_lost",
         "A beam is lost at most pings.",
-        "The direction and scale of that beam rest on few pings.",
-        "Check the transducer; its values are known less well.",
+        "Few pings determine the direction and scale of that beam.",
+        "Check the transducer. Its values are less accurate.",
         "note",
     )
     BEAMS_DISAGREE = (
         "beams_disagree",
         "Beams contradict each other by more than noise and priors explain.",
-        "A beam under another's number moves every parameter.",
-        "Check their order, signs and directions.",
+        "A beam with a wrong number changes every parameter.",
+        "Check the order, signs and directions of the beams.",
     )
     NO_EPOCH = (
         "no_epoch",
-        "Stars give the attitude only at a known time, and the trial has none.",
-        "The Earth turns by 15 degrees an hour under the stars.",
-        "Give epoch, the UTC of time_s = 0.",
+        "The trial has a star tracker, but no epoch.",
+        "Stars give the attitude only at a known time, because the Earth turns by 15 degrees "
+        "an hour.",
+        "State epoch, the UTC of time_s = 0.",
         "error",
     )
     STAR_CATALOGUE = (
         "star_catalogue",
         "The angles between stars differ from those of the catalogue.",
-        "A wrong star makes an attitude that looks as good as a right one.",
+        "A wrong star gives an attitude that looks as good as the right one.",
         "Check identification and columns, or raise std_arcsec.",
     )
     STAR_VERTICAL = (
         "star_vertical",
-        "The vertical by the stars is not that of the specific force.",
-        "A wrong time or mounting is taken for an attitude, and for gyro bias.",
+        "The vertical from the stars differs from that of the specific force.",
+        "A wrong time or mounting changes the attitude and the gyro bias.",
         "Check epoch and mounting_deg.",
         "error",
     )
     STAR_CONVENTION = (
         "star_convention",
-        "The star tracker turns otherwise than the gyros.",
+        "The attitude of the star tracker does not turn as the gyros do.",
         "An inverse or reordered quaternion contradicts the gyros at every turn.",
-        "Write C_b^i as a quaternion with the scalar first; check mounting_deg.",
+        "Write C_b^i as a quaternion with the scalar first. Check mounting_deg.",
         "error",
     )
     HEADING_UNIT = (
         "heading_unit",
-        "The heading stays close to north, steadier than it should.",
-        "The dead-reckoned track would run north whatever the vehicle did.",
-        "Convert it to degrees.",
+        "The heading stays close to north, and changes less than expected.",
+        "The dead-reckoned track would run north for any motion.",
+        "Convert the heading to degrees.",
     )
     LOG_SIGN = (
         "log_sign",
@@ -363,20 +367,20 @@ class Code(StrEnum):
     )
     DEPTH_SIGN = (
         "depth_sign",
-        "The depth is above the sea.",
-        "Heights, and with them slant ranges, would be mirrored at the surface.",
+        "The depth is above the sea surface.",
+        "Heights and slant ranges would be mirrored at the surface.",
         "Write depth_m positive down.",
     )
     BEACON_HEIGHT = (
         "beacon_height",
-        "A beacon is above the sea.",
-        "Horizontal distances follow from ranges and heights.",
-        "Write height_m positive up; check depth.sea_surface_height_m.",
+        "A beacon is above the sea surface.",
+        "Horizontal distances depend on ranges and heights.",
+        "Write height_m positive up. Check depth.sea_surface_height_m.",
     )
     AT_REST = (
         "at_rest",
-        "The vehicle rests, so that one beacon gives only a circle.",
-        "The trajectory is one of many that the ranges allow.",
+        "The vehicle is at rest, so one beacon gives only a circle.",
+        "The ranges allow many trajectories, and the result is one of them.",
         "Move, or add a beacon.",
         "note",
     )
@@ -384,182 +388,183 @@ class Code(StrEnum):
     UNUSABLE_PRIOR = (
         "unusable_prior",
         "The calibration that the trial starts from is graded `do not use`.",
-        "What was wrong there is carried into this trial.",
+        "Its errors enter this trial.",
         "Calibrate anew, and name that result in dvl.calibration or imu.calibration.",
     )
     HEADING_UNKNOWN = (
         "heading_unknown",
         "The velocity changes too little to find the heading before solving.",
-        "The solver starts from a heading that may be far off.",
-        "Change speed or course, or give `initial`.",
+        "The solver starts from a heading that may be wrong.",
+        "Change speed or course, or state `initial`.",
     )
     FEW_RANGES = (
         "few_ranges",
         "There are too few ranges to find a position from them.",
-        "The solver starts from a position that may be far off.",
-        "Give initial.position, or stay in reach of the beacons for longer.",
+        "The solver starts from a position that may be wrong.",
+        "State initial.position, or stay in reach of the beacons for longer.",
     )
     NOT_STARTED = (
         "not_started",
         "The replay cannot start yet.",
-        "There is no estimate yet; the records so far are kept.",
-        "Wait, manoeuvre, or give `initial`.",
+        "There is no estimate yet. The records so far are kept.",
+        "Wait, manoeuvre, or state `initial`.",
         "note",
     )
     # What a solver found.
     PRIOR_CONTRADICTED = (
         "prior_contradicted",
-        "The calibration that the trial starts from contradicts its data.",
-        "The result lies between the two, and fits neither.",
-        "Leave dvl.calibration out if the DVL was mounted anew, imu.calibration if the IMU was "
-        "switched off; else look for what differs.",
+        "The data contradict the calibration that the trial starts from.",
+        "The result is between the two, and fits neither.",
+        "Leave dvl.calibration out if the DVL was mounted anew, and imu.calibration if the "
+        "IMU was switched off. Otherwise, find out what differs.",
     )
     HALVES_DIFFER = (
         "halves_differ",
-        "The two halves of the trial, solved apart, differ by more than chance.",
-        "A mount or a scale that changes has no one value: the result is a mean.",
-        "Check the mount; calibrate again after it was fixed, or solve shorter trials.",
+        "The two halves of the trial, solved separately, differ by more than chance.",
+        "A mount or a scale that changes has no single value: the result is a mean.",
+        "Check the mount. Calibrate again after the repair, or solve shorter trials.",
     )
     DOES_NOT_FIT = (
         "does_not_fit",
-        "Residuals are so large that the model does not fit the data.",
-        "Values and standard deviations are those of a model that the data contradict.",
-        "Check lever arm, clock, units and axes; do not use the values.",
+        "The residuals are so large that the model does not fit the data.",
+        "Values and standard deviations are meaningless, because the data contradict the model.",
+        "Check lever arm, clock, units and axes. Do not use the values.",
         "error",
     )
     HEADING_ERROR = (
         "heading_error",
-        "Without an IMU, misalignment and error of the heading show only together.",
-        "A DVL that is turned and a compass that is off make the same velocities.",
-        "Read the misalignment with the heading's own error, or relative to its mean.",
+        "Without an IMU, the data determine only the sum of misalignment and heading error.",
+        "A rotated DVL and a compass with an offset give the same velocities.",
+        "Read the misalignment together with the heading error, or relative to the mean heading.",
         "note",
     )
     FAR_FROM_PRIOR = (
         "far_from_prior",
         "A value is far outside its prior.",
-        "Either the prior is wrong, which draws all values with it, or the data are.",
+        "Either the prior or the data are wrong. A wrong prior biases all values.",
         "Check clocks, units, axes and lever arms, and then the prior itself.",
     )
     LARGE_RESIDUALS = (
         "large_residuals",
-        "Residuals are larger than their standard deviation says.",
-        "Standard deviations allow for it where the noise was estimated; else they are too small.",
-        "Correct the standard deviation of the sensor; check clock and lever arm.",
+        "Residuals are larger than their standard deviation states.",
+        "If the noise is not estimated, standard deviations are too small.",
+        "Correct the standard deviation of the sensor. Check clock and lever arm.",
     )
     SMALL_RESIDUALS = (
         "small_residuals",
-        "The noise of a sensor is less than half of what is stated.",
-        "Errors that wander, as those of GNSS do, hide in the trajectory and leave little noise.",
-        "Correct the standard deviation of the sensor; state what wanders as correlated.",
+        "The noise of a sensor is less than half of the stated noise.",
+        "Slow errors, such as those of GNSS, move the trajectory instead of the residuals.",
+        "Correct the standard deviation of the sensor. State slow errors as correlated.",
     )
     OUTLIERS = (
         "outliers",
-        "Some measurements are far from what all others say, and are not used.",
-        "Values and standard deviations come from the rest; smaller errors may have passed.",
-        "Look at rejected.csv; check bottom lock and fixes at these times.",
+        "Some measurements are far from all others, and are not used.",
+        "Values and standard deviations come from the rest. Smaller errors may be among them.",
+        "Look at rejected.csv. Check bottom lock and fixes at these times.",
     )
     ESTIMATED_INSTEAD = (
         "estimated_instead",
-        "The data contradict a parameter that was stated as known; it was estimated instead.",
-        "Taken as stated it would draw all values with it.",
-        "Check it, and state its standard deviation.",
+        "The data contradict a parameter that was stated as known. It was estimated instead.",
+        "The stated value would bias all other values.",
+        "Check the parameter, and state its standard deviation.",
     )
     UNEXPLAINED_MISFIT = (
         "unexplained_misfit",
-        "Residuals do not fit, and a parameter that is taken as known would explain it.",
-        "Values are drawn by more than their standard deviations.",
-        "Check the parameter that is named, and give it a standard deviation.",
+        "The residuals do not fit. A wrong value of a parameter that is taken as known would "
+        "explain this.",
+        "The values have errors larger than their standard deviations.",
+        "Check the parameter that the text names, and state its standard deviation.",
         "error",
     )
     CHANGED_ALONG_TRIAL = (
         "changed_along_trial",
-        "A parameter is not the same all along the trial.",
-        "A mount that slips, a false lock or a clock that steps make a mean that holds nowhere.",
-        "Check mount, lock and clock at that time; solve what came before and after apart.",
+        "A parameter changes along the trial.",
+        "After a slipping mount, a false lock or a clock step, the mean is right at no time.",
+        "Check mount, lock and clock at that time. Solve the parts before and after separately.",
         "error",
     )
     NOISE_NOT_SETTLED = (
         "noise_not_settled",
-        "The noise of a sensor comes out the larger the more of it is allowed for.",
-        "What the IMU measured contradicts the sensor: errors of the IMU are larger than stated.",
-        "Raise the noise of the IMU, or give its grade; check clocks and lever arms.",
+        "The estimated noise of a sensor keeps growing.",
+        "The IMU contradicts the sensor, because errors of the IMU are larger than stated.",
+        "Raise the noise of the IMU, or state its grade. Check clocks and lever arms.",
     )
     MANY_REJECTED = (
         "many_rejected",
-        "Over a third of the measurements were rejected.",
-        "Single echoes are few: a cause common to all of them is more likely.",
-        "Check place, clock, unit and standard deviation.",
+        "More than a third of the measurements were rejected.",
+        "Echoes are rare, so a common cause is more likely.",
+        "Check position, clock, unit and standard deviation.",
     )
     AT_THE_GATE = (
         "at_the_gate",
-        "Some measurements are as likely echoes as not; they are used.",
-        "Results would change a little if they were left out.",
+        "Some measurements are as likely to be echoes as not. They are used.",
+        "The result would change a little without them.",
         "Nothing, if they are few.",
         "note",
     )
     AMBIGUOUS = (
         "ambiguous",
-        "More than one answer fits the data; the standard deviations contain all of them.",
-        "The value that is given may be that of the wrong answer.",
-        "Turn by 30 degrees or more, change speed, or give initial.position.",
+        "More than one answer fits the data. The standard deviations contain all of them.",
+        "The reported value may be that of the wrong answer.",
+        "Turn by 30 degrees or more, change speed, or state initial.position.",
     )
     NOT_CONVERGED = (
         "not_converged",
-        "The solver did not converge, so that its numbers are not to be used.",
-        "Values and standard deviations hold at a minimum of the cost only.",
-        "Look at the other findings, units and priors first.",
+        "The solver did not converge.",
+        "Values and standard deviations are valid only at a minimum of the cost.",
+        "Do not use the numbers. Check the other findings, units and priors first.",
         "error",
     )
     NOT_OBSERVABLE = (
         "not_observable",
         "The data do not determine a parameter better than its prior.",
-        "Its value is the prior's, not one that was measured.",
+        "Its value is that of the prior, and was not measured.",
         "Do the manoeuvres that the text names, or fix the parameter.",
         "note",
     )
     PRIOR_KEPT = (
         "prior_kept",
         "The trial adds little to the calibration that it starts from.",
-        "The values are those of the earlier calibration: this trial does not confirm them.",
+        "The values are those of the earlier calibration. This trial does not confirm them.",
         "Nothing.",
         "note",
     )
     UNCERTAIN = (
         "uncertain",
-        "A misalignment or scale error is known less well than the limits ask.",
+        "The standard deviation of a misalignment or scale error is above its limit.",
         "Dead reckoning with it drifts by more than the limits allow.",
         "Turn to both sides and change speed; `plan` proposes the manoeuvre that is missing.",
     )
     FILTER_CONTRADICTED = (
         "filter_contradicted",
-        "Residuals are larger than the filter's covariance allows: it has not converged.",
-        "Values and standard deviations of a filter that diverged mean nothing.",
+        "The filter has not converged: its residuals are larger than its covariance allows.",
+        "Values and standard deviations of a filter that diverged are meaningless.",
         "Use `solve`.",
         "error",
     )
     METHOD_LIMITS = (
         "method_limits",
-        "The method neglects, fixes or assumes something that `solve` does not.",
+        "The method neglects, fixes or assumes something that `solve` estimates.",
         "Values may be biased, and standard deviations too small.",
-        "Use `solve` if it matters.",
+        "Use `solve` if this matters.",
         "note",
     )
     GNSS_OUTAGE = (
         "gnss_outage",
         "GNSS is missing for so long that the filter drifts.",
-        "What the filter learns of the DVL in the outage is worth little.",
-        "Use `solve`, which bridges it.",
+        "The filter learns little about the DVL in the outage.",
+        "Use `solve`, which bridges the outage.",
     )
     FILTER_RESTARTED = (
         "filter_restarted",
         "The filter starts again after a gap.",
-        "Both sides of the gap are known less well than together.",
+        "The results before and after the gap are less accurate than a joint solution.",
         "Use `solve`, which joins the parts.",
         "note",
     )
     MEAN_OR_LAST = (
         "mean_or_last",
-        "A bias walks: a replay reports its last value, `solve` the mean.",
+        "A bias walks. A replay reports its last value, and `solve` its mean.",
         "The two values differ, and neither is wrong.",
         "Nothing.",
         "note",
@@ -568,46 +573,46 @@ class Code(StrEnum):
     ERROR_LEFT_OUT = (
         "error_left_out",
         "The trial states an error that no solver estimates.",
-        "Standard deviations leave out what this error adds.",
-        "Compare --halves; a change that is larger than chance is named.",
+        "Standard deviations do not contain the effect of this error.",
+        "Use --halves, which reports changes that are larger than chance.",
     )
     CORRELATION_LEFT_OUT = (
         "correlation_left_out",
-        "The replay takes noise that persists for white noise.",
+        "The replay treats correlated noise as white noise.",
         "Its standard deviations are too small.",
-        "Solve the trial as a whole for standard deviations that contain it.",
+        "Use `solve` for standard deviations that contain it.",
     )
     IMU_ERRORS_LEFT_OUT = (
         "imu_errors_left_out",
         "The replay does not estimate scale, axes and g-sensitivity of the IMU.",
-        "Its standard deviations leave out what these errors add.",
-        "Solve the trial as a whole for standard deviations that contain them.",
+        "Its standard deviations do not contain the effect of these errors.",
+        "Use `solve` for standard deviations that contain them.",
     )
     SILENT = (
         "silent",
-        "A sensor has fallen silent.",
-        "The estimate continues without it, and its standard deviations grow.",
+        "A sensor no longer sends measurements.",
+        "The estimate continues without it, and standard deviations grow.",
         "Check its cable, power and clock.",
         "note",
     )
     HEARD_AGAIN = (
         "heard_again",
-        "A sensor is back, or agrees again.",
-        "From here on its measurements are used again.",
+        "A sensor sends measurements again, or agrees again.",
+        "Its measurements are used again from this time on.",
         "Nothing.",
         "note",
     )
     CONTRADICTS = (
         "contradicts",
         "Measurements contradict the prediction.",
-        "Used, they would move the estimate by many standard deviations.",
+        "They would move the estimate by many standard deviations.",
         "Check clock, time offset and sensor.",
     )
     # Results from files.
     UNCLASSIFIED = (
         "unclassified",
-        "A warning in a file of another version, without a code that this one knows.",
-        "What it means for the result is known to the version that wrote it only.",
+        "A file of another version contains a warning that this version does not know.",
+        "Only the version that wrote it knows its effect on the result.",
         "Read its text.",
         "note",
     )

@@ -281,10 +281,10 @@ class Gnss:
     def explain(self, parameter: str, component: int, motion: Motion | None) -> str:
         """Say why a component of the lever arm or the clock could not be observed."""
         if parameter in _CLOCK.names:
-            return "a time offset shows only where velocity or attitude change"
+            return "a time offset is observable only where velocity or attitude change"
         return (
-            "the antenna's lever arm shows only where the vehicle turns, rolls or pitches "
-            "about another axis than the lever arm's own"
+            "the antenna's lever arm is observable only where the vehicle turns, rolls or "
+            "pitches about other axes than that of the lever arm"
         )
 
 

@@ -237,7 +237,7 @@ class Ins:
 
     def explain(self, parameter: str, component: int, motion: Motion | None) -> str:
         """Say why the clock could not be observed."""
-        return "a time offset shows only where velocity or attitude change"
+        return "a time offset is observable only where velocity or attitude change"
 
 
 @dataclass(frozen=True)

@@ -190,9 +190,9 @@ class Star:
         """
         if np.ndim(settings.std_arcsec) != 0:
             raise ConfigError(
-                "`std_arcsec` has three components, and a star's direction has no such axes",
+                "`std_arcsec` has three components, but star vectors need one number",
                 where="trial.yaml star.std_arcsec",
-                expected="one number where the record holds star vectors",
+                expected="one number",
             )
         _check_vectors(time, body, inertial, source)
         body = body / np.linalg.norm(body, axis=1, keepdims=True)
@@ -209,10 +209,10 @@ class Star:
                     else f"{source} lines {rows[0] + 2} to {rows[1] + 1}"
                 )
                 raise DataError(
-                    f"all {kind} vectors at {time[rows[0]]:.9g} s are parallel, which leaves the "
-                    "rotation about them open",
+                    f"all {kind} vectors at {time[rows[0]]:.9g} s are parallel, so the rotation "
+                    "about them is unknown",
                     where=lines,
-                    expected="two directions at least at every time",
+                    expected="at least two directions at every time",
                 )
         rotation, unit = attitudes_from_vectors(body, inertial, first)
         sigma = float(np.max(settings.std_arcsec)) * ARCSEC
@@ -353,7 +353,7 @@ class Star:
             return "the trial has no star attitude while the IMU runs, or only one"
         x, y, z = np.degrees(np.std(motion.omega_eb_b, axis=0))
         return (
-            "the mounting separates from the attitude only where the body turns about two axes, "
+            "mounting and attitude are separable only if the body turns about two axes, "
             f"and it hardly does (rms rate {x:.2g}, {y:.2g}, {z:.2g} deg/s about x, y, z), or "
             "where manoeuvres show the attitude without stars"
         )

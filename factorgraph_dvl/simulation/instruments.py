@@ -259,7 +259,7 @@ class StarTruth(SimulatedInstrument, frozen=True, kw_only=True):
         if self.stars and np.ndim(self.std_arcsec) != 0:
             raise ValueError("`std_arcsec` must be one number where there are `stars`")
         if any(not any(star) for star in self.stars):
-            raise ValueError("`stars` must hold directions, none of them zero")
+            raise ValueError("`stars` must contain directions, none of them zero")
 
     def claimed(self) -> dict[str, Any]:
         """Return noise, mounting and UT1 - UTC as simulated."""
@@ -384,4 +384,4 @@ def check_intervals(name: str, intervals: Sequence[Interval]) -> None:
     """Raise ValueError unless all intervals begin before they end."""
     for start, end in intervals:
         if not start <= end:
-            raise ValueError(f"`{name}` must hold pairs [start, end] with start <= end")
+            raise ValueError(f"`{name}` must contain pairs [start, end] with start <= end")

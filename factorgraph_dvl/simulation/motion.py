@@ -449,7 +449,7 @@ def _integrate_position(
         update = lat0 + begin[:, None] + coefficients @ integral_at.T
         if not np.all(np.abs(update) < _MAX_LATITUDE):
             raise ConfigError(
-                "the vehicle reaches a pole, where east and north end",
+                "the vehicle reaches a pole, where east and north are undefined",
                 where=f"{source} key start.lat_deg",
                 expected="a track between 89.5 degrees south and north",
             )

@@ -170,7 +170,7 @@ class _Scenario(Section, frozen=True, kw_only=True):
             numbers = given if isinstance(given, list) else [given]
             if not numbers or not all(_is_sigma(number) for number in numbers):
                 raise ValueError(
-                    f"`required` must hold a number above 0 for each name, or a list of them; "
+                    f"`required` must have a number above 0 for each name, or a list of them; "
                     f"{name} is {given}"
                 )
 

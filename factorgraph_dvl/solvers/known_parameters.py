@@ -179,8 +179,8 @@ def explanation_findings(
         Finding(
             Code.ESTIMATED_INSTEAD,
             f"{e.parameter.name} was stated as {_numbers(e.parameter, e.parameter.mean)} "
-            f"{_uncertainty(e.parameter)}; the data contradict that (χ² {e.score.chi2:.0f} with "
-            f"{e.score.freedom} degrees of freedom) and it was estimated instead: "
+            f"{_uncertainty(e.parameter)}; the data contradict this (χ² {e.score.chi2:.0f} with "
+            f"{e.score.freedom} degrees of freedom). It was estimated instead: "
             f"{_numbers(e.parameter, evaluation.parameters[e.parameter.name])}{_or(e)}",
             parameter=e.parameter.name,
         )

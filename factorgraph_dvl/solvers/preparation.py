@@ -148,7 +148,7 @@ def _left_out(trial: Trial) -> list[Finding]:
         Finding(
             Code.ERROR_LEFT_OUT,
             f"{aid.section}.{key} is not estimated: the value is a mean over the trial, and its "
-            "standard deviation leaves out how it changes",
+            "standard deviation does not contain the change",
             sensor=aid.label,
         )
         for aid in trial.aids

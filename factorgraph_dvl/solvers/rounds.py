@@ -295,8 +295,8 @@ def _next_noise(levels: _NoiseLevels, problem: Problem, minimum: Minimum) -> _No
     findings = tuple(
         Finding(
             Code.NOISE_NOT_SETTLED,
-            f"the noise comes out as {np.max(latest[label]):.2g} times the stated, and larger the "
-            "more of it is allowed for, so that it is no noise; it is taken as stated",
+            f"the estimated noise is {np.max(latest[label]):.2g} times the stated one, and keeps "
+            "growing, so it is not noise. The stated noise is used",
             sensor=label,
         )
         for label in unsettled
@@ -387,8 +387,7 @@ def _at_the_gate(cycle: Sequence[Mapping[str, Array]]) -> tuple[Finding, ...]:
             out.append(
                 Finding(
                     Code.AT_THE_GATE,
-                    f"{undecided} at the gate would be rejected if they were used, and used if "
-                    "they were rejected; they are used",
+                    f"{undecided} measurements at the gate could be echoes or not; they are used",
                     sensor=label,
                 )
             )

@@ -165,7 +165,7 @@ def test_command_line(tmp_path, capsys):
     assert run("kalman", trial, "--out", tmp_path / "x", "--method", "ukf") == 2
     (trial / "gnss.csv").write_text("time_s,lat_deg,lon_deg,height_m\n1,,,\n2,,,\n")
     assert run("kalman", trial, "--out", tmp_path / "y") == 2
-    assert "none of its rows holds a measurement" in " ".join(capsys.readouterr().err.split())
+    assert "none of its rows contains a measurement" in " ".join(capsys.readouterr().err.split())
     # Without its lever arm the motion contradicts the answer, which is written all the same.
     (tmp_path / "no-arm").mkdir()
     unknown = write_trial(tmp_path / "no-arm", simulate(scenario(noise=True), 0))

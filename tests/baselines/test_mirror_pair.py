@@ -51,5 +51,5 @@ def test_the_innovations_keep_the_right_one():
 def test_ranges_of_no_straight_run_are_refused():
     t = trial()
     t.beacons.range[:] = np.sqrt(3e5 - 5.0 * t.beacons.time**2)
-    with pytest.raises(DataError, match="no straight run"):
+    with pytest.raises(DataError, match="do not fit a straight run"):
         mirror_pair(t, (1.0, 40.0, 90.0))

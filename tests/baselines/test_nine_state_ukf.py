@@ -35,5 +35,5 @@ def test_it_finds_angles_that_a_linear_filter_does_not(turn):
 
 def test_a_misalignment_that_may_be_anything_is_refused():
     three, findings = with_bias(MISALIGNMENT, SCALE, BIAS)
-    with pytest.raises(ConfigError, match="misalignment roughly"):
+    with pytest.raises(ConfigError, match="approximate misalignment"):
         unscented(exact_points(), three, NO_ARM, findings)

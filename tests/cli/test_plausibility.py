@@ -193,7 +193,7 @@ def test_a_plan_is_checked_as_a_trial_is(tmp_path, run):
     arguments = ("plan", tmp_path / "plan.yaml", "--no-figures", "--quiet")
     code, _, err = run(*arguments, "--out", tmp_path / "out")
     assert code == 2
-    assert "DVL: none of its rows holds a measurement" in err
+    assert "DVL: none of its rows contains a measurement" in err
     assert not (tmp_path / "out").exists()
     code, _, err = run(*arguments, "--out", tmp_path / "out", "--anyway")
     assert code == 1

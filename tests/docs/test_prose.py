@@ -10,7 +10,6 @@ import ast
 from collections.abc import Iterator
 from pathlib import Path
 
-import click
 import pytest
 from prose import faults, sentences, split
 from typer.main import get_command
@@ -41,7 +40,6 @@ PAGES = [
 def help_texts() -> Iterator[tuple[str, str]]:
     """Yield the name and the text of every help of the command line."""
     group = get_command(app)
-    assert isinstance(group, click.Group)
     yield "factorgraph-dvl", group.help or ""
     for name, command in sorted(group.commands.items()):
         yield name, command.help or ""
@@ -122,7 +120,10 @@ def test_readme_is_short():
     ("sentence", "fault"),
     [
         ("Of all that is random.", "begins with 'of'"),
-        ("A height is nobody's knowledge beforehand.", "beforehand -> before the trial, in advance"),
+        (
+            "A height is nobody's knowledge beforehand.",
+            "beforehand -> before the trial, in advance",
+        ),
         ("Of a dive, one value is left.", "begins with 'of'"),
         (
             "453 s with these manoeuvres do not tell it better than the prior.",
@@ -156,7 +157,8 @@ def test_plain_sentences_pass(sentence):
 
 
 def test_code_and_formulas_are_no_sentences():
-    page = "Text with `code of it`:\n\n    y = of x\n\n```sh\nof all that\n```\n\n| head |\n|---|\n| of x |\n"
+    blocks = "    y = of x\n\n```sh\nof all that\n```\n\n| head |\n|---|\n| of x |\n"
+    page = f"Text with `code of it`:\n\n{blocks}"
     assert [(s, running) for _, s, running in sentences(page)] == [
         ("Text with `:", True),
         ("of x", False),

@@ -128,7 +128,8 @@ def test_kalman_takes_values_and_standard_deviations():
     estimate = solution.estimate("misalignment_deg")
     np.testing.assert_allclose(estimate.prior_std, [0.1, 0.2, 0.3])
     assert any(
-        "no correlations" in text for text in of_code(solution.findings, Code.METHOD_LIMITS)
+        "do not use its correlations" in text
+        for text in of_code(solution.findings, Code.METHOD_LIMITS)
     )
 
 
@@ -165,11 +166,11 @@ BAD = {
         lambda d: d.update(
             parameters={}, covariance={"order": [], "matrix": []},
         ),
-        "nothing of the DVL",
+        "no parameter of the DVL",
     ),
     "a number missing": (
         lambda d: d["parameters"]["lever_arm_m"]["value"].__setitem__(1, None),
-        "lever_arm_m holds no number",
+        "lever_arm_m is not a number",
     ),
     "negative variance": (
         lambda d: d["covariance"]["matrix"][0].__setitem__(0, -1.0),

@@ -67,7 +67,7 @@ def test_louder_noise_is_found_and_used() -> None:
         3.0 * imu.settings.gyro_noise_root_psd, rel=0.05
     )
     assert [finding.code for finding in findings] == [Code.IMU_NOISE] * 2
-    assert "times the stated one" in str(findings[0])
+    assert "times the stated noise of the" in str(findings[0])
 
 
 def test_quieter_noise_changes_nothing() -> None:

@@ -176,7 +176,7 @@ def test_gaps_of_gnss_are_bridged_by_the_dvl():
 
 def test_nothing_to_align_with():
     scene = scenario(trial={"initial": {"position_std_m": [1, 1, 1]}})
-    with pytest.raises(DataError, match=r"nothing to find the attitude with from 0\.0 s on"):
+    with pytest.raises(DataError, match=r"no data to find the attitude from 0\.0 s on"):
         start_of(scene, gnss=None, dvl=None)
     # With an initial attitude, the arc after a gap starts from the end of the one before.
     scene = scenario(imu={"gaps_s": [[30.0, 35.0]]}, trial=INITIAL)

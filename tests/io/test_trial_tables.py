@@ -52,7 +52,7 @@ def test_data_frames_are_tables():
     ("section", "column", "values", "text"),
     [
         ("imu", "time_s", None, "missing column time_s"),
-        ("dvl", "vel_x_m_s", ["a"] * 20, "holds no numbers"),
+        ("dvl", "vel_x_m_s", ["a"] * 20, "contains no numbers"),
         ("dvl", "vel_x_m_s", np.zeros(3), "shape"),
         ("gnss", "lat_deg", np.full(20, 900.0), "lat_deg"),
     ],

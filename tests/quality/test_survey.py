@@ -137,7 +137,7 @@ PROBLEMS: dict[str, tuple[Callable[[Trial], Trial], str, str]] = {
     "DVL sign": (lambda t: dvl_velocity(t, -1.0), "DVL", "PD0"),
     "DVL clock": (lambda t: late_dvl(t, 1e6), "DVL", "do not overlap"),
     "DVL late": (lambda t: late_dvl(t, 40.0), "DVL", "outside that of the IMU"),
-    "DVL lock": (lambda t: without_lock(t, 0.7), "DVL", "hold no measurement"),
+    "DVL lock": (lambda t: without_lock(t, 0.7), "DVL", "contain no measurement"),
     "no lock": (lambda t: without_lock(t, 2.0), "DVL", "no ping with a lock"),
     "noisy": (noisy, "DVL", "standard deviation"),
 }

@@ -20,7 +20,7 @@ def test_outages_is_that_of_arrivals():
     assert not [m for t in range(20) for m in outages.findings(t + 8.0, heard(float(t)))]
     assert [*map(str, outages.findings(34.0, []))] == [
         (
-            "GNSS: no measurements since 19.0 s; the estimate continues without, and its "
+            "GNSS: no measurements since 19.0 s; the estimate continues without them, and its "
             "standard deviations grow"
         )
     ]
@@ -40,7 +40,7 @@ def test_a_missed_ping_is_no_outages():
     assert [f.code for f in said] == [Code.SILENT]
     assert [*map(str, said)] == [
         (
-            "range: no measurements since 35.0 s; the estimate continues without, and its "
+            "range: no measurements since 35.0 s; the estimate continues without them, and its "
             "standard deviations grow"
         )
     ]

@@ -161,7 +161,7 @@ def test_without_gnss_but_with_a_start():
     solution = solve(straight)
     assert not solution.estimate("scale_error").observable.any()
     joined = " ".join(of_code(solution.findings, Code.NOT_OBSERVABLE))
-    assert "it takes GNSS and distance" in joined
+    assert "add GNSS, and go farther" in joined
     assert "without GNSS nothing separates the errors of the IMU from the motion" in joined
 
 

@@ -70,7 +70,7 @@ def write_mcap(trial: Trial, begin: float, path: Path) -> list[str]:
     written = [record for record in records if type(record) in sources]
     if not written:
         raise DataError(
-            "holds nothing that there is a message for",
+            "has no data that a message can contain",
             where=trial.name,
             expected="imu, attitude, gnss or dvl",
         )

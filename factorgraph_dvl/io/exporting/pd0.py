@@ -71,7 +71,7 @@ def write_pd0(trial: Trial, begin: float, path: Path) -> list[str]:
         raise DataError("has no velocity log", where=trial.name, expected="dvl or dvl_beams")
     if np.nanmax(np.abs(log.velocity), initial=0.0) > 32.767:
         raise DataError(
-            "holds velocities above 32.767 m/s", where=log.source, expected="what PD0 can store"
+            "has velocities above 32.767 m/s", where=log.source, expected="the range of PD0"
         )
     code = _angle_code(log) if isinstance(log, DvlBeams) else 2
     rph = _attitudes(trial, log)

@@ -65,7 +65,7 @@ def export_trial(
     """
     if to not in FORMATS:
         raise ConfigError(
-            f"`{to}` is no format of trials", where="--to", expected=", ".join(FORMATS)
+            f"`{to}` is not a format of trials", where="--to", expected=", ".join(FORMATS)
         )
     trial = load_trial(path, anyway=True)
     folder, settings = locate(path)

@@ -148,7 +148,7 @@ def _read(
                 say(f"read {path.name}, {100.0 * done:.0f} %")
     if not count:
         raise DataError(
-            "holds nothing that a trial can use",
+            "contains no data that a trial can use",
             where=path.name,
             expected="velocities, positions, attitude, depth, or the samples of an IMU",
         )

@@ -73,7 +73,7 @@ def check_installed(found: Format, path: Path) -> None:
     """Raise ConfigError if a format needs a module that is not installed."""
     if found.module and find_spec(found.module) is None:
         raise ConfigError(
-            f"to read {found.title} the Python package of `{found.module}` is needed",
+            f"{found.title} needs the Python package of `{found.module}`",
             where=path.name,
             hint=f"Install it: pip install 'factorgraph-dvl[{found.extra}]'",
         )

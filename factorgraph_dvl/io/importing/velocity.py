@@ -124,9 +124,9 @@ def _check_one_instrument(streams: Sequence[Timed]) -> None:
             logs.setdefault((timed.stream.format, round(angle)), timed.stream.file)
     if len(set(logs.values())) > 1:
         raise DataError(
-            f"the files are of {len(logs)} velocity logs ({', '.join(logs.values())})",
+            f"the files are from {len(logs)} velocity logs ({', '.join(logs.values())})",
             where="import",
-            expected="files of one; import the others to trials of their own",
+            expected="files of one log; import the others to separate trials",
         )
 
 

@@ -91,7 +91,7 @@ def test_mcap(folder, tmp_path):
 
 
 def test_refuses_what_it_cannot_write(folder, tmp_path):
-    with pytest.raises(ConfigError, match="is no format of trials; expected csv, parquet"):
+    with pytest.raises(ConfigError, match="is not a format of trials; expected csv, parquet"):
         export_trial(folder, "tum", tmp_path / "x")
     (tmp_path / "there.pd0").write_bytes(b"mine")
     with pytest.raises(DataError, match="the file exists"):

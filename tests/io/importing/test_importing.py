@@ -113,7 +113,7 @@ class TestRecognition:
             imported(tmp_path, pings(), form="pd99")
 
     def test_refuses_a_file_without_records(self, tmp_path):
-        with pytest.raises(DataError, match="holds nothing that a trial can use"):
+        with pytest.raises(DataError, match="contains no data that a trial can use"):
             imported(tmp_path, fixes(), form="pd0")
 
 
