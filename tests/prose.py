@@ -76,7 +76,7 @@ _PREPOSITION = (
 INVERSIONS = {
     "begins with 'of'": re.compile(rf"{_CLAUSE}[Oo]f\b"),
     "begins with a clause of 'what', 'who' or 'that'": re.compile(
-        rf"{_CLAUSE}(?:[Ww]hat|[Ww]ho|[Ww]hose|[Ww]hoever|[Tt]hat (?:an?|it|the|they|you))\b[^?]*$"
+        r"(?:^|; )(?:[Ww]hat|[Ww]ho|[Ww]hose|[Ww]hoever|[Tt]hat (?:an?|it|the|they|you))\b[^?]*$"
     ),
     "a preposition, and the verb without a comma": re.compile(
         rf"{_CLAUSE}{_PREPOSITION} (?:(?!which|that|who)[^\s,;:]+ ){{1,7}}?{_VERB}\b"
