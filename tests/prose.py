@@ -116,6 +116,11 @@ def sentences(text: str) -> Iterator[tuple[int, str, bool]]:
 
 
 def _plain(tokens: list[Token]) -> str:
+    tokens = [t for t in tokens if t.content or t.type != "text"]
+    if tokens and tokens[0].type == "strong_open":
+        end = next(i for i, t in enumerate(tokens) if t.type == "strong_close")
+        # A title in bold is no sentence.
+        tokens = tokens[end:] if tokens[end - 1].content.endswith(".") else tokens
     texts = {"softbreak": " ", "hardbreak": " ", "code_inline": "`", "html_inline": ""}
     return "".join(texts.get(t.type, t.content if t.type == "text" else "") for t in tokens)
 
