@@ -240,22 +240,22 @@ INTRODUCTION = """\
 {origin}
 
 Chen X., Shang F. and Lan Q., Journal of Unmanned Undersea Systems 29(4), 2021, add the range
-rate to slant range and depth: their extended Kalman filter 4SV-3OB converges after 150 updates
-instead of the 600 of 4SV-2OB, 75 % less. The table of their parameters is not in the text that
-we have, so these are scenarios of our own: 2 m/s through the water, a current of 0.25 m/s that
-no method knows (prior 0.3 m/s), updates at 1 Hz, ranges to 1 or 10 m, range rates to 0.05 m/s,
-heading to 0.5°, speed to 0.05 m/s, the beacon 40 m below the vehicle.
+rate to slant range and depth. Their extended Kalman filter 4SV-3OB converges after 150 updates
+instead of the 600 of 4SV-2OB, 75 % less. The available text lacks the table of their parameters,
+so this page uses other scenarios. The vehicle moves at 2 m/s through the water, and the beacon is
+40 m below it. No method knows the current of 0.25 m/s (prior 0.3 m/s). Updates come at 1 Hz, with
+ranges to 1 or 10 m, range rates to 0.05 m/s, heading to 0.5°, and speed to 0.05 m/s.
 
 ## Convergence
 
 Updates until the position error stays below {threshold:.0f} m, of {updates}: median (90 %
 quantile) over {seeds} seeds. All start from the same wrong position, drawn anew for each seed, and
-know the standard deviation of that error in east and in north. The *factor graph* is what `solve`
-makes of a planar trial, with the data so far; where several hypotheses are left, the heaviest
-counts. All are looked at after every fifth update.
+know the standard deviation of that error in east and in north. The *factor graph* is `solve` on a
+planar trial, with the data so far. If several hypotheses remain, the one with the largest weight
+counts. All are evaluated after every fifth update.
 
-Whether 75 % is gained depends on what a range is worth beside a range rate: the coarser the
-ranges, the more. A filter that starts far off may settle in the mirror image, with either set of
+The gain depends on the accuracy of the ranges relative to the range rates: coarser ranges give a
+larger gain. A filter that starts far off may settle in the mirror image, with either set of
 observations, and stay there.
 
 """

@@ -317,7 +317,7 @@ def main() -> None:
     times = dict(speed())
     lines = [
         "# Single beams: measured\n",
-        f"{args.origin} What it means is in [beams.md](beams.md).",
+        f"{args.origin} [Single beams](beams.md#measured) explains the results.",
         *calibration_section(runs),
         *reckoning_section(runs),
         *navigation_section(lost_runs, args.seeds),

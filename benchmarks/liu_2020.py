@@ -205,23 +205,23 @@ INTRODUCTION = """\
 {origin}
 
 A surfaced UUV floats and may not manoeuvre. The attitude of its SINS minus that of a star tracker
-tells the constant drift of the gyros. Scenario ([`configs/star.yaml`](../configs/star.yaml)):
+shows the constant drift of the gyros. Scenario ([`configs/star.yaml`](../configs/star.yaml)):
 135° E 25° N, 2018-12-01T05:30:00Z, position error 20 m, drifts 0.05, 0.1 and 0.2 °/h, star tracker
-5″ at 2 Hz, SINS at 50 Hz. The paper states neither noise of the gyros nor the sea: none, and a
-gentle one, are taken. *Factor graph* is `factorgraph-dvl solve`, *Kalman* is
+5″ at 2 Hz, SINS at 50 Hz. The paper states neither the noise of the gyros nor the sea. This study
+uses gyros without noise and a gentle sea. *Factor graph* is `factorgraph-dvl solve`. *Kalman* is
 `kalman --method star`, the paper's six-state filter ([`kalman.md`](kalman.md#star-six-states)).
 
 ## The bound
 
-Where the gyros have no noise, their sum follows the vessel exactly but for start and drift, so
-that SINS minus stars is a line, a + b t, about each axis. The least variance of its slope from N
-attitudes at equal intervals T/N, with white noise σ, is that of linear regression:
+If the gyros have no noise, their sum follows the vessel exactly except for start and drift. SINS
+minus stars is therefore a line, a + b t, about each axis. Linear regression gives the least
+variance of its slope from N attitudes at equal intervals T/N, with white noise σ:
 
     σ_b = σ √12 / (T √N) · 1 / √(1 − 1/N²)
 
 With 5″ at 2 Hz (1″/s = 1 °/h) that is {bounds}; the last factor is below
-1.0001. No unbiased estimator from the stars does better. What accelerometers and GNSS add is in
-the graph's σ below.
+1.0001. No unbiased estimator from the stars does better. The graph's σ below also contains the
+information of accelerometers and GNSS.
 """
 
 

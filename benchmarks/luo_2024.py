@@ -286,16 +286,17 @@ INTRODUCTION = """\
 {origin}
 
 The scenario is that of the paper's table 4 (`configs/seed-a-phase-0.yaml` and `-90.yaml`; the
-paper does not state the phase between roll and pitch). *Kalman point-set* is a filter of the
-paper's seven states over SINS/GNSS velocities that settles (`kalman`; the printed one is
-`kalman --method luo-2024`, [`kalman.md`](kalman.md)); *factor graph* is
-`factorgraph-dvl solve`; *least squares* fits the same point sets by Gauss-Newton. None of them
-is told the initial attitude. The *bound* is the covariance of the joint estimate at the
+paper does not state the phase between roll and pitch). *Kalman point-set* is `kalman`: a filter
+of the paper's seven states over SINS/GNSS velocities that settles. The printed filter is
+`kalman --method luo-2024` ([`kalman.md`](kalman.md)). *Factor graph* is
+`factorgraph-dvl solve`. *Least squares* fits the same point sets by Gauss-Newton. None of them
+knows the initial attitude. The *bound* is the covariance of the joint estimate at the
 noise-free solution: no unbiased estimator from all the data does better.
 
-RMS(error / σ) says whose σ is true: 1 is right, and {low:.2f} to {high:.2f} is chance with
-{seeds} seeds (99.7 %). The point-set methods take the error of the SINS/GNSS velocity for white
-noise. It is correlated over tens of seconds, so pings do not average it away as their σ supposes.
+RMS(error / σ) shows whose σ is right: the expected value is 1, and {low:.2f} to {high:.2f} is
+chance with {seeds} seeds (99.7 %). The point-set methods treat the error of the SINS/GNSS velocity
+as white noise. It is correlated over tens of seconds, so the mean of many pings has a larger error
+than their σ.
 """
 
 

@@ -20,10 +20,10 @@ INTRODUCTION = """\
 
 {origin}
 
-Each numbered equation, table, figure and claim, where it is in this package, what was measured
-over {seeds}, and what becomes of it: *reproduced* as printed, *corrected* with the argument
-in the measurement, or *not reproducible* with the reason. One command makes a publication's items
-with their figures:
+The tables list each numbered equation, table, figure and claim, its place in this package, and the
+measurement over {seeds}. The verdict is *reproduced* as printed, *corrected* with the argument in
+the measurement, or *not reproducible* with the reason. One command makes all items and figures of
+a publication:
 
 ```sh
 factorgraph-dvl reproduce luo-2024 --out DIR --table 3     # or --figure N, or neither for all
@@ -31,7 +31,7 @@ factorgraph-dvl reproduce luo-2024 --out DIR --table 3     # or --figure N, or n
 
 The others are `liu-2020`, `nine-state`, `beams` and `chen-2021`.
 
-Continuous integration runs all of them with one seed.
+Continuous integration runs all publications with one seed.
 """
 
 

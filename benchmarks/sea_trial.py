@@ -275,23 +275,24 @@ INTRODUCTION = """\
 
 {origin}
 
-Each seed calibrates a DVL on an 80-minute cruise (`configs/cruise.yaml`: α = [1.68 2.10 16.45]°,
-l = [−0.93 1.12 −0.34] m, δK = 0.0177, the values that Luo et al. (2024) found at sea), and then
-uses the calibration, with other noise. IMU of navigation grade, DVL noise 0.2 % of speed. All of
-it is simulated: what a model leaves out at sea, such as the speed of sound, is not in here.
+Each seed calibrates a DVL on an 80-minute cruise, and then uses the calibration with other noise.
+The scenario is `configs/cruise.yaml`: α = [1.68 2.10 16.45]°, l = [−0.93 1.12 −0.34] m and δK =
+0.0177, the values that Luo et al. (2024) found at sea. The IMU is of navigation grade, and the DVL
+noise is 0.2 % of speed. Everything is simulated, so effects that the model leaves out, such as the
+speed of sound, are not included.
 
 ## Dead reckoning: {minutes:.0f} s and {km:.1f} km
 
 `configs/transit.yaml`: legs of 10 and 5 km with a turn by 180° between, and two shorter ones.
 `factorgraph-dvl deadreckon` integrates the DVL's velocity. The start is fitted to the GNSS fixes
-of the first minute, so that the error of a single fix is not that of the DVL. Errors are
+of the first minute, which keeps the error of a single fix out of the comparison. Errors are
 horizontal, in % of the whole distance: at the end, and the largest on the way; medians over
 {seeds} seeds. *Before* is the mounting that trial.yaml states: aligned with the body, no scale
 error, no lever arm.
 
-The attitude decides as much as the calibration, so it is stated: of a SINS/GNSS filter and
-smoother that has GNSS all along; of the same with GNSS during the first {align:.0f} s only, which
-is all that a vessel has that is about to lose GNSS; and the true one.
+The attitude is as important as the calibration. The table has three sources: a SINS/GNSS filter
+and smoother with GNSS throughout, the same filter with GNSS during the first {align:.0f} s only
+(as before a dive), and the truth.
 """
 
 

@@ -258,7 +258,7 @@ def _table_5(seeds: int) -> Result:
         dvl.rate_hz == 5.0,
     )
     return Result(
-        f"{sum(stated)} of {len(stated)} figures of IMU and DVL stand in the configuration",
+        f"{sum(stated)} of {len(stated)} figures of IMU and DVL are in the configuration",
         judged(all(stated)),
     )
 
@@ -321,8 +321,8 @@ def _table_7(seeds: int) -> Result:
             "",
             "The record at sea is not published. Simulated, with its values, attitude by "
             "SINS/GNSS and "
-            "calibration by the printed filter, less is left than at sea: what the model leaves "
-            "out there, such as the speed of sound, is not in a simulation.",
+            "calibration by the printed filter, the errors are smaller than at sea. Effects that "
+            "the model leaves out, such as the speed of sound, are not in a simulation.",
         ),
         errors_figure(found.calibrated.score, found.uncalibrated.score),
     )

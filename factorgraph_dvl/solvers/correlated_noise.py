@@ -16,8 +16,8 @@ from factorgraph_dvl.statistics.correlation import Correlation, fit_correlation
 from factorgraph_dvl.statistics.variance_components import LEAST_FACTOR
 
 # Correlation time, s, below which noise is no process: white noise of its long-run variance takes
-# its place. Measured: with 4 s, and noise that is correlated over 5 s, σ was 2 to 5 times too large
-# under sway; nodes every 0.7 s cost a fifth more time.
+# its place. Measured: with 4 s, and noise that is correlated over 5 s, σ was 2 to 5 times too
+# large under sway; nodes every 0.7 s cost a fifth more time.
 _SHORT = 2.0
 # Correlation times in a trial below which only the density 2 σ² / τ can be
 # estimated. Measured: σ alone is then uncertain by a factor.

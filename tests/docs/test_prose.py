@@ -75,6 +75,14 @@ def text_of(node: ast.expr) -> str:
     return ""
 
 
+def introductions() -> Iterator[tuple[str, str]]:
+    """Yield the texts that benchmarks put on their pages."""
+    for path in sorted((ROOT / "benchmarks").glob("*.py")):
+        for node in ast.parse(path.read_text(encoding="utf-8")).body:
+            if isinstance(node, ast.Assign) and len(text := text_of(node.value)) > 200:
+                yield path.name, text
+
+
 def found(texts: Iterator[tuple[str, str]]) -> list[str]:
     return [
         f"{where}: {fault}: {sentence}"
@@ -90,6 +98,16 @@ def test_pages_are_plain(page):
     wrong = [
         f"{page}:{line}: {fault}: {sentence}"
         for line, sentence, running in sentences(text)
+        for fault in faults(sentence, running=running)
+    ]
+    assert not wrong, "\n".join(wrong)
+
+
+def test_introductions_of_measured_pages_are_plain():
+    wrong = [
+        f"{name}: {fault}: {sentence}"
+        for name, text in introductions()
+        for _, sentence, running in sentences(text)
         for fault in faults(sentence, running=running)
     ]
     assert not wrong, "\n".join(wrong)
