@@ -181,12 +181,12 @@ BELOW = """\
 ## Then a dive
 
 `configs/dive-stars.yaml`, cut to {minutes:.0f} minutes: {surface:.0f} s at the surface with turns,
-GNSS (0.5 m, 0.05 m/s) and stars, then 50 m below without either. The gyros have a drift
-with σ = 0.05 °/h and an angle random walk of 0.0005 °/√h. The DVL was calibrated before, with the
-errors of a calibration from an 80-minute cruise. Heading and position are those at the end of the
-dive, over {seeds} seeds; a mean NEES of {low:.1f} to {high:.1f} is chance (99.7 %). The third and the fourth row
-solve the dive as a trial of its own. It starts from position, velocity and attitude as the surface
-left them, with their standard deviations, and in the fourth row from its biases as well
+GNSS (0.5 m, 0.05 m/s) and stars, then 50 m below without either. The gyros have a drift with σ =
+0.05 °/h and an angle random walk of 0.0005 °/√h. The DVL was calibrated before, with the errors of
+a calibration from an 80-minute cruise. Heading and position are those at the end of the dive, over
+{seeds} seeds; a mean NEES of {low:.1f} to {high:.1f} is chance (99.7 %). The third and the fourth
+row solve the dive as a trial of its own. It starts from position, velocity and attitude as the
+surface left them, with their standard deviations, and in the fourth row from its biases as well
 ([`imu.calibration`](format.md#trialyaml)).
 
 """
