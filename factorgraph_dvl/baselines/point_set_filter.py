@@ -179,9 +179,8 @@ def _step(sums: _Sums, prior: Estimated, D: Array) -> tuple[Estimated, float]:
     """
     known = prior.covariance.diagonal() == 0.0
     free = ~known
-    left = log_so3(D.T @ prior.values[0])
-    if np.sqrt(prior.covariance.diagonal()[:3].max()) > _WIDE:
-        left = np.zeros(3)
+    is_wide = np.sqrt(prior.covariance.diagonal()[:3].max()) > _WIDE
+    left = np.zeros(3) if is_wide else log_so3(D.T @ prior.values[0])
     mean = np.concatenate([left, prior.values[1], prior.values[2]])
     of_prior = np.zeros((7, 7))
     of_prior[np.ix_(free, free)] = np.linalg.inv(prior.covariance[np.ix_(free, free)])
