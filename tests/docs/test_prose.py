@@ -7,6 +7,7 @@ their cells are no sentences.
 from __future__ import annotations
 
 import ast
+import json
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -122,6 +123,12 @@ def test_findings_are_plain():
     wrong = found(
         (f"{code}", text) for code in Code for text in (code.meaning, code.why, code.action)
     )
+    assert not wrong, "\n".join(wrong)
+
+
+def test_sentences_of_the_report_are_plain():
+    phrases = json.loads((PACKAGE / "report" / "html" / "chinese.json").read_text("utf-8"))
+    wrong = found((text, text) for text in phrases["phrases"] if text.endswith("."))
     assert not wrong, "\n".join(wrong)
 
 

@@ -169,7 +169,7 @@ def _values(results: Sequence[Result]) -> Section:
     header.append(both("Values, ±1σ (thick) and ±3σ (thin)"))
     text = (
         "Difference from the first result, over the larger σ of the two. Results of the same "
-        "data share errors: a difference above 1 deserves a look."
+        "data share errors, so check differences above 1."
     )
     return section(
         "Values against each other",
@@ -263,7 +263,7 @@ def _page(
         element(
             "noscript",
             paragraph(
-                both("Scripts are off: plots are not drawn. Their tables hold the numbers.")
+                both("Scripts are off, so there are no plots. Their tables contain the numbers.")
             ),
         ),
     )

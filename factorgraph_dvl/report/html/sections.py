@@ -92,7 +92,7 @@ def verdict_box(verdict: Verdict) -> Html:
     if verdict.reasons:
         first: Cell = str(verdict.reasons[0])
     else:
-        first = both("Nothing was found that speaks against the result.")
+        first = both("The checks found nothing wrong.")
     return element(
         "div",
         element("strong", both(verdict.grade)),
@@ -266,7 +266,7 @@ def budget_section(result: Result) -> Section | None:
     header = [both(x) for x in ("parameter", "σ now", "share of the variance", "largest causes")]
     return section(
         "Error budget",
-        paragraph(both("What each cause adds to σ. The squares add up to σ².")),
+        paragraph(both("Contribution of each cause to σ. The squares add up to σ².")),
         element("ul", *legend, class_="legend"),
         table(header, rows, label="Error budget", numeric=(1,)),
         folded(
@@ -333,7 +333,7 @@ def _further(solution: Solution) -> list[Cell]:
         return [paragraph(both("Every σ is within its limit: no further manoeuvre is needed."))]
     found = further_manoeuvres(solution)
     if not found:
-        text = "No manoeuvre of the list lowers what is above its limit: record longer."
+        text = "No manoeuvre of the list lowers a σ that is above its limit: record longer."
         return [paragraph(both(text))]
     rows = [
         [
@@ -347,7 +347,10 @@ def _further(solution: Solution) -> list[Cell]:
         for i, (name, before, after) in enumerate(zip(m.names, m.before, m.after, strict=True))
     ]
     header = ["manoeuvre", "duration, s", "helps", "σ now", "σ at best"]
-    text = "At best; the motion is taken as known. The command plan predicts a whole trial."
+    text = (
+        "These are lower limits, because the motion is taken as known. The command plan predicts "
+        "a whole trial."
+    )
     label = "Which manoeuvre would help"
     return [
         table([both(h) for h in header], rows, label=label, numeric=(1, 3, 4)),
@@ -528,7 +531,7 @@ def settings_section(result: Result) -> Section:
     """Return settings, records and versions that the result came from."""
     run = result.run
     if not run:
-        text = "The folder keeps no settings: it was made by an earlier version."
+        text = "The folder has no settings, because an earlier version wrote it."
         return section("Settings", paragraph(both(text)), key="settings")
     start = result.start
     records = [
