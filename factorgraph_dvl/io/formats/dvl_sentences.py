@@ -15,6 +15,7 @@ import numpy as np
 
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.io.formats.clocks import posix
+from factorgraph_dvl.io.formats.format import positive
 from factorgraph_dvl.io.formats.framing import BLOCK, Records, Source, number
 from factorgraph_dvl.io.formats.nmea import second_of_day
 from factorgraph_dvl.io.formats.sentences import Sentence, sentences
@@ -66,7 +67,7 @@ def _xyz(fields: list[bytes]) -> Row | None:
         "time": values[0],
         "velocity": without(values[3:6], -32.768),
         "merit": values[6] if values[6] < 10.0 else math.nan,
-        "range": np.where(values[7:11] > 0.0, values[7:11], np.nan),
+        "range": positive(values[7:11]),
     }
     if len(fields) >= 15:
         row |= {"sound_speed": number(fields[12]), "temperature": number(fields[14])}

@@ -29,6 +29,7 @@ from typing import Any, Literal
 import numpy as np
 
 from factorgraph_dvl.geometry.rotations import BodyAxes
+from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.io.formats.framing import Records
 
 Family = Literal["dvl", "ins", "gnss", "vehicle", "table"]
@@ -188,6 +189,11 @@ class Format:
     module: str = ""
     extra: str = ""
     limit: str = ""
+
+
+def positive(values: Array) -> Array:
+    """Return values above 0, and nan in place of others, which stand for what is not known."""
+    return np.where(values > 0.0, values, np.nan)
 
 
 def empty(kind: Kind, count: int) -> Records:

@@ -14,6 +14,7 @@ import numpy as np
 
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.io.formats.clocks import posix
+from factorgraph_dvl.io.formats.format import positive
 from factorgraph_dvl.io.formats.framing import BLOCK, Records, Source, lines, number
 from factorgraph_dvl.io.formats.velocities import EARTH, INSTRUMENT, SHIP, VELOCITY, empty
 
@@ -96,7 +97,7 @@ def _rest(ping: Records, name: bytes, fields: list[bytes]) -> None:
         ping["sound_speed"] = number(fields[4])
     elif name == b":RA":
         ranges = np.array([number(field) for field in fields[1:5]]) * 0.1
-        ping["range"] = np.where(ranges > 0.0, ranges, np.nan)
+        ping["range"] = positive(ranges)
     else:
         altitude = number(fields[3])
         ping["altitude"] = altitude if altitude > 0.0 else np.nan

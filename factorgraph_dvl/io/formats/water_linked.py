@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from factorgraph_dvl.geometry.units import DEG
+from factorgraph_dvl.io.formats.format import positive
 from factorgraph_dvl.io.formats.framing import BLOCK, Records, Source, lines, number
 from factorgraph_dvl.io.formats.velocities import INSTRUMENT, records
 
@@ -131,7 +132,7 @@ def _json_velocity(message: Row) -> Row:
         "step": _value(message, "time") * 1e-3,
         "velocity": velocity if good else np.full(3, np.nan),
         "beam_velocity": beams[0],
-        "range": np.where(beams[1] > 0.0, beams[1], np.nan),
+        "range": positive(beams[1]),
         "altitude": altitude if good and altitude > 0.0 else math.nan,
         "merit": _value(message, "fom"),
     }

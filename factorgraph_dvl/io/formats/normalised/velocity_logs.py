@@ -11,7 +11,7 @@ import numpy as np
 
 from factorgraph_dvl.geometry.rotations import BodyAxes
 from factorgraph_dvl.io.formats.dvl_sentences import read_cerulean, read_nortek
-from factorgraph_dvl.io.formats.format import Batch, Clock, Format, empty
+from factorgraph_dvl.io.formats.format import Batch, Clock, Format, empty, positive
 from factorgraph_dvl.io.formats.framing import Records, Source, map_file
 from factorgraph_dvl.io.formats.normalised.nmea import sentence_batches
 from factorgraph_dvl.io.formats.pd4 import read_pd4
@@ -45,7 +45,7 @@ def _pings(records: Records, clock: Clock, axes: _Axes, stream: str) -> Batch:
     out["time"] = records["time"] if has_time else records["second"]
     out["received"] = out["time"]
     out["alignment"], out["tilts_used"] = 0.0, True
-    out["std"] = np.where(records["merit"] > 0.0, records["merit"], np.nan)[:, None]
+    out["std"] = positive(records["merit"])[:, None]
     return Batch("dvl", out, clock, stream, axes)
 
 

@@ -16,11 +16,12 @@ import numpy as np
 from factorgraph_dvl.errors import DataError
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.io.formats.clocks import gps_to_utc
-from factorgraph_dvl.io.formats.format import Batch, Format, empty
+from factorgraph_dvl.io.formats.format import Batch, Format, empty, positive
 from factorgraph_dvl.io.formats.framing import BLOCK, Records, Source, map_file
 from factorgraph_dvl.io.formats.vehicles.library import (
     column,
     columns,
+    gga_quality,
     given_up,
     load,
     quiet,
@@ -47,8 +48,6 @@ _SIZES |= {
     "Q": 8,
 }
 _MICROSECOND = 1e-6
-# GPS status: none, no fix, 2D, 3D, differential, RTK float, RTK fixed; to GGA's numbers.
-_QUALITY = np.array([0.0, 0.0, 0.0, 1.0, 2.0, 5.0, 4.0])
 # Before the first of 2012 no ArduPilot log had weeks in its GPS messages.
 _FIRST_WEEK = 1669
 # Values of one message by the names of its columns.
@@ -218,16 +217,12 @@ def _fix(stream: str, rows: list[Row]) -> Batch:
     out["lat"], out["lon"], out["altitude"] = lat, lon, column(rows, "Alt")
     accuracy = [row["accuracy"] for row in rows]
     out["height"] = out["altitude"] + column(accuracy, "Und")
-    status = column(rows, "Status")
-    known = np.isin(status, np.arange(len(_QUALITY)))
-    out["quality"] = np.where(known, _QUALITY[np.where(known, status, 0).astype(int)], 0.0)
+    out["quality"] = gga_quality(column(rows, "Status"))
     speed, course = column(rows, "Spd"), column(rows, "GCrs") * DEG
     up = -column(rows, "VZ")
     out["velocity"] = np.stack([speed * np.sin(course), speed * np.cos(course), up], axis=1)
-    stds = columns(accuracy, "HAcc", "HAcc", "VAcc")
-    out["std"] = np.where(stds > 0.0, stds, np.nan)
-    stds = columns(accuracy, "SAcc", "SAcc", "SAcc")
-    out["velocity_std"] = np.where(stds > 0.0, stds, np.nan)
+    out["std"] = positive(columns(accuracy, "HAcc", "HAcc", "VAcc"))
+    out["velocity_std"] = positive(columns(accuracy, "SAcc", "SAcc", "SAcc"))
     return Batch("fix", out, "utc", stream)
 
 

@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 from factorgraph_dvl.errors import DataError
 from factorgraph_dvl.geometry.rotations import BodyAxes, rph_from_rotation
 from factorgraph_dvl.geometry.vectors import Array
-from factorgraph_dvl.io.formats.format import Batch, Format, Kind, empty
+from factorgraph_dvl.io.formats.format import Batch, Format, Kind, empty, positive
 from factorgraph_dvl.io.formats.framing import BLOCK, Records, map_file
 from factorgraph_dvl.io.formats.mapping import UNITS, MappingSettings, TableMapping
 from factorgraph_dvl.io.formats.table import describe as describe_mapping
@@ -345,7 +345,7 @@ def _deviations(covariances: list[Any]) -> Array:
     rows = np.array(covariances, float).reshape(len(covariances), -1)
     side = 3 if rows.shape[1] == 9 else 6
     variance = rows[:, [0, side + 1, 2 * side + 2]]
-    return np.sqrt(np.where(variance > 0.0, variance, np.nan))
+    return np.sqrt(positive(variance))
 
 
 def _unset(covariances: list[Any]) -> NDArray[np.bool_]:
@@ -452,7 +452,7 @@ def _pings(kind: Kind, topic: str, messages: list[Message]) -> Batch:
     out["axes"], out["velocity"] = INSTRUMENT, velocity
     out["std"] = _deviations([m.velocity_covar for m in bodies])
     speeds = np.array([m.sound_speed for m in bodies], float)
-    out["sound_speed"] = np.where(speeds > 0.0, speeds, np.nan)
+    out["sound_speed"] = positive(speeds)
     axes = _axes(bodies[0], "FRD")
     notes = []
     if axes == "FRD":

@@ -15,7 +15,9 @@ from factorgraph_dvl.errors import ConfigError, DataError
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.io.formats.format import Batch
 
-# Messages that become one batch.
+# Kinds of fixes in autopilots (none, no fix, 2D, 3D, differential, RTK float, RTK fixed) to GGA's
+# numbers.
+_QUALITY = np.array([0.0, 0.0, 0.0, 1.0, 2.0, 5.0, 4.0])
 
 
 def load(module: str, extra: str) -> Any:
@@ -70,6 +72,12 @@ def column(rows: Sequence[Mapping[str, Any]], name: str) -> Array:
 def columns(rows: Sequence[Mapping[str, Any]], *names: str) -> Array:
     """Return several columns side by side, (N, M)."""
     return np.stack([column(rows, name) for name in names], axis=1)
+
+
+def gga_quality(kind: Array) -> Array:
+    """Return the quality as in GGA of fixes by their kind in logs of autopilots, 0 if unknown."""
+    known = np.isin(kind, np.arange(len(_QUALITY)))
+    return np.where(known, _QUALITY[np.where(known, kind, 0).astype(int)], 0.0)
 
 
 def unreadable(path: Path, error: BaseException, expected: str, hint: str = "") -> DataError:

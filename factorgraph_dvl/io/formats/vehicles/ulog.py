@@ -16,15 +16,19 @@ from scipy.spatial.transform import Rotation
 from factorgraph_dvl.errors import DataError
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array
-from factorgraph_dvl.io.formats.format import Batch, Format, empty
+from factorgraph_dvl.io.formats.format import Batch, Format, empty, positive
 from factorgraph_dvl.io.formats.framing import Records
-from factorgraph_dvl.io.formats.vehicles.library import load, quiet, silently, unreadable
+from factorgraph_dvl.io.formats.vehicles.library import (
+    gga_quality,
+    load,
+    quiet,
+    silently,
+    unreadable,
+)
 from factorgraph_dvl.io.formats.velocities import INSTRUMENT
 
 _MAGIC = b"ULog\x01\x12\x35"
 _MICROSECOND = 1e-6
-# fix_type: none, none, 2D, 3D, code differential, RTK float, RTK fixed, -, extrapolated; as GGA.
-_QUALITY = np.array([0.0, 0.0, 0.0, 1.0, 2.0, 5.0, 4.0, 0.0, 6.0])
 # A receiver without time reports less.
 _EARLIEST = 1e8
 # Columns by name: of one message of the log.
@@ -136,16 +140,15 @@ def _fix(stream: str, columns: Columns) -> Batch:
     out["altitude"] = _column(columns, "altitude_msl_m", "alt") * units[1]
     out["height"] = _column(columns, "altitude_ellipsoid_m", "alt_ellipsoid") * units[1]
     kind = _column(columns, "fix_type")
-    known = np.isin(kind, np.arange(len(_QUALITY)))
-    out["quality"] = np.where(known, _QUALITY[np.where(known, kind, 0).astype(int)], 0.0)
+    # The last is extrapolated.
+    out["quality"] = np.where(kind == 8.0, 6.0, gga_quality(kind))
     north, east, down = (_column(columns, f"vel_{axis}_m_s") for axis in "ned")
     velocity = np.stack([east, north, -down], axis=1)
     valid = _column(columns, "vel_ned_valid") != 0.0
     out["velocity"] = np.where(valid[:, None], velocity, np.nan)
     stds = np.stack([_column(columns, name) for name in ("eph", "eph", "epv")], axis=1)
-    out["std"] = np.where(stds > 0.0, stds, np.nan)
-    speed = _column(columns, "s_variance_m_s")
-    out["velocity_std"] = np.where(speed > 0.0, speed, np.nan)[:, None]
+    out["std"] = positive(stds)
+    out["velocity_std"] = positive(_column(columns, "s_variance_m_s"))[:, None]
     return Batch("fix", out, "utc", stream)
 
 
@@ -155,7 +158,7 @@ def _odometry(stream: str, columns: Columns) -> Batch:
     in_body = _column(columns, "velocity_frame") == 3.0
     out["velocity"] = np.where(in_body[:, None], _vectors(columns, "velocity"), np.nan)
     variance = _vectors(columns, "velocity_variance")
-    out["std"] = np.sqrt(np.where(variance > 0.0, variance, np.nan))
+    out["std"] = np.sqrt(positive(variance))
     out["axes"] = INSTRUMENT
     note = f"{stream}: velocities in the body's axes, taken as those of a DVL; others left out"
     return Batch("dvl", out, "own", stream, "FRD", notes=(note,))
