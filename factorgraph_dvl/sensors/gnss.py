@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from typing import ClassVar, Self
 
 import msgspec
@@ -13,20 +13,16 @@ from msgspec import UNSET, UnsetType
 from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.rotations import BodyAxes
 from factorgraph_dvl.geometry.units import DEG, GEODETIC_SI
-from factorgraph_dvl.geometry.vectors import Array, cross, rotate, skew
+from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.sensors.carried_point import PointPosition, PointVelocity
 from factorgraph_dvl.sensors.clock import Clock, ClockSection
 from factorgraph_dvl.sensors.parameters import Parameter, ParameterSpec
 from factorgraph_dvl.sensors.protocol import (
     USUAL_CORRELATION_TIME,
-    ExpectedCorrelation,
-    Linearization,
     Motion,
     Observation,
-    PlainObservation,
     SensorSection,
-    Values,
     expected_correlation,
-    lever_arm_sigma,
 )
 from factorgraph_dvl.sensors.records import (
     check_all_or_none,
@@ -250,12 +246,16 @@ class Gnss:
             m = has_position
             p_n = frame.position(*self.geodetic[m].T)
             out.append(
-                AntennaPosition(
-                    self.time[m],
-                    p_n,
-                    lRn[m],
-                    self.position_std[m],
-                    bRc[m],
+                PointPosition(
+                    time=self.time[m],
+                    measured_n=p_n,
+                    lRn=lRn[m],
+                    std=self.position_std[m],
+                    label="GNSS position",
+                    clock=_CLOCK,
+                    lever_arm=LEVER_ARM,
+                    bRc=bRc[m],
+                    noise_groups=HORIZONTAL_AND_UP,
                     correlated=expected_correlation(
                         s.correlation_time_s, s.correlated_std_m, 3, USUAL_CORRELATION_TIME
                     ),
@@ -264,13 +264,17 @@ class Gnss:
         if has_velocity.any():
             m = has_velocity
             out.append(
-                AntennaVelocity(
-                    self.time[m],
-                    self.velocity[m],
-                    lRn[m],
-                    self.velocity_std[m],
-                    bRc[m],
-                    omega_cb_b[m],
+                PointVelocity(
+                    time=self.time[m],
+                    measured_l=self.velocity[m],
+                    lRn=lRn[m],
+                    std=self.velocity_std[m],
+                    label="GNSS velocity",
+                    clock=_CLOCK,
+                    lever_arm=LEVER_ARM,
+                    bRc=bRc[m],
+                    omega_cb_b=omega_cb_b[m],
+                    noise_groups=HORIZONTAL_AND_UP,
                     correlated=expected_correlation(
                         s.velocity_correlation_time_s, s.correlated_velocity_std_m_s, 3
                     ),
@@ -285,121 +289,4 @@ class Gnss:
         return (
             "the antenna's lever arm is observable only where the vehicle turns, rolls or "
             "pitches about other axes than that of the lever arm"
-        )
-
-
-@dataclass(frozen=True)
-class AntennaPosition(PlainObservation):
-    """Position of the antenna; zero error where measured = p_n + nRb bRc l.
-
-    Parameters
-    ----------
-    time : ndarray, shape (M,), s
-        Of the fixes.
-    measured_n : ndarray, shape (M, 3), m
-        Position in n.
-    lRn : ndarray, shape (M, 3, 3)
-        N to the local-level axes in which `std` holds.
-    std : ndarray, shape (M, 3)
-        East, north, up, m.
-    bRc : ndarray, shape (M, 3, 3) or (3, 3), optional
-        Axes of the antenna's carrier to body.
-    """
-
-    time: Array
-    measured_n: Array
-    lRn: Array
-    std: Array
-    bRc: Array = field(default_factory=lambda: np.eye(3))
-    label: str = "GNSS position"
-    unit: str = "m"
-    components: tuple[str, ...] = ("east", "north", "up")
-    noise_groups: tuple[tuple[int, ...], ...] = HORIZONTAL_AND_UP
-    correlated: ExpectedCorrelation | None = None
-    parameters: tuple[str, ...] = (LEVER_ARM,)
-    clock: Clock = _CLOCK
-
-    def sigma(self, motion: Motion, values: Values, factor: Array | float = 1.0) -> Array:
-        """Return the receiver's standard deviations, (M, 3), m."""
-        return self.std * factor
-
-    def residual(self, motion: Motion, values: Values) -> Array:
-        """Return predicted - measured in local-level east, north, up, (M, 3), m."""
-        antenna_n = motion.p_n + rotate(motion.nRb, self.bRc @ values[LEVER_ARM])
-        return rotate(self.lRn, antenna_n - self.measured_n)
-
-    def linearize(self, motion: Motion, values: Values, wanted: Collection[str]) -> Linearization:
-        """Return the residual and its Jacobians."""
-        lRb = self.lRn @ motion.nRb
-        return Linearization(
-            residual=self.residual(motion, values),
-            d_theta=-lRb @ skew(self.bRc @ values[LEVER_ARM]),
-            d_p=self.lRn,
-            d_parameters={LEVER_ARM: lRb @ self.bRc},
-        )
-
-
-@dataclass(frozen=True)
-class AntennaVelocity(PlainObservation):
-    """Velocity of the antenna.
-
-    The error is zero where
-
-        measured = v_n + nRb (omega_ec_b x bRc l),    omega_ec_b = omega_eb_b - omega_cb_b.
-
-    Parameters
-    ----------
-    time : ndarray, shape (M,), s
-        Of the fixes.
-    measured_l : ndarray, shape (M, 3)
-        East, north, up at the vehicle, m/s.
-    lRn : ndarray, shape (M, 3, 3)
-        N to local-level axes.
-    std : ndarray, shape (M, 3), m/s
-        East, north, up.
-    bRc : ndarray, shape (M, 3, 3) or (3, 3), optional
-        Axes of the antenna's carrier to body.
-    omega_cb_b : ndarray, shape (M, 3) or (3,), rad/s, optional
-        Rate of the body relative to that carrier.
-    """
-
-    time: Array
-    measured_l: Array
-    lRn: Array
-    std: Array
-    bRc: Array = field(default_factory=lambda: np.eye(3))
-    omega_cb_b: Array = field(default_factory=lambda: np.zeros(3))
-    label: str = "GNSS velocity"
-    unit: str = "m/s"
-    components: tuple[str, ...] = ("east", "north", "up")
-    noise_groups: tuple[tuple[int, ...], ...] = HORIZONTAL_AND_UP
-    correlated: ExpectedCorrelation | None = None
-    parameters: tuple[str, ...] = (LEVER_ARM,)
-    clock: Clock = _CLOCK
-
-    def sigma(self, motion: Motion, values: Values, factor: Array | float = 1.0) -> Array:
-        """Return the standard deviations, the gyro's share through the lever arm included."""
-        arm_b = self.bRc @ values[LEVER_ARM]
-        # A component that was never measured has no factor either.
-        scaled = self.std * np.where(np.isinf(self.std), 1.0, factor)
-        return np.hypot(scaled, lever_arm_sigma(motion, arm_b)[:, None])
-
-    def residual(self, motion: Motion, values: Values) -> Array:
-        """Return predicted - measured in local-level east, north, up, (M, 3), m/s."""
-        turning_b = cross(motion.omega_eb_b - self.omega_cb_b, self.bRc @ values[LEVER_ARM])
-        return rotate(self.lRn, motion.v_n + rotate(motion.nRb, turning_b)) - self.measured_l
-
-    def linearize(self, motion: Motion, values: Values, wanted: Collection[str]) -> Linearization:
-        """Return the residual and its Jacobians."""
-        lever_arm = self.bRc @ values[LEVER_ARM]
-        omega_ec_b = motion.omega_eb_b - self.omega_cb_b
-        lRb = self.lRn @ motion.nRb
-        return Linearization(
-            residual=self.residual(motion, values),
-            d_theta=-lRb @ skew(cross(omega_ec_b, lever_arm)),
-            d_v=self.lRn,
-            d_omega=-lRb @ skew(lever_arm),
-            d_parameters=(
-                {LEVER_ARM: lRb @ skew(omega_ec_b) @ self.bRc} if LEVER_ARM in wanted else {}
-            ),
         )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar, Self
 
@@ -11,7 +11,7 @@ import numpy as np
 from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.rotations import BodyAxes
 from factorgraph_dvl.geometry.units import DEG, GEODETIC_SI
-from factorgraph_dvl.geometry.vectors import Array, rotate, skew
+from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.sensors.attitude import (
     LEAST_STD,
     AttitudeAngles,
@@ -20,15 +20,13 @@ from factorgraph_dvl.sensors.attitude import (
     check_angles,
     spaced,
 )
+from factorgraph_dvl.sensors.carried_point import PointPosition, PointVelocity
 from factorgraph_dvl.sensors.clock import Clock, ClockSection
 from factorgraph_dvl.sensors.parameters import Parameter, ParameterSpec
 from factorgraph_dvl.sensors.protocol import (
-    Linearization,
     Motion,
     Observation,
-    PlainObservation,
     SensorSection,
-    Values,
 )
 from factorgraph_dvl.sensors.records import (
     check_all_or_none,
@@ -204,7 +202,7 @@ class Ins:
 
     def motion_observations(
         self, frame: LocalFrame, apart: float = 0.0
-    ) -> tuple[InsPosition | InsVelocity, ...]:
+    ) -> tuple[PointPosition | PointVelocity, ...]:
         """Return positions and velocities at least so many seconds apart.
 
         All of them have the part of the standard deviation that is new in each; those that are
@@ -219,119 +217,26 @@ class Ins:
         )
         p, v = at_position, at_velocity
         return (
-            InsPosition(
-                self.time[p],
-                frame.position(*self.geodetic[p].T),
-                frame.level_from_tangent(*self.geodetic[p, :2].T),
-                std[p, :3],
-                arm,
+            PointPosition(
+                time=self.time[p],
+                measured_n=frame.position(*self.geodetic[p].T),
+                lRn=frame.level_from_tangent(*self.geodetic[p, :2].T),
+                std=std[p, :3],
+                label="INS position",
+                clock=_CLOCK,
+                lever_arm=arm,
             ),
-            InsVelocity(
-                self.time[v],
-                self.velocity[v],
-                frame.level_from_tangent(*self.geodetic[v, :2].T),
-                std[v, 3:6],
-                arm,
+            PointVelocity(
+                time=self.time[v],
+                measured_l=self.velocity[v],
+                lRn=frame.level_from_tangent(*self.geodetic[v, :2].T),
+                std=std[v, 3:6],
+                label="INS velocity",
+                clock=_CLOCK,
+                lever_arm=arm,
             ),
         )
 
     def explain(self, parameter: str, component: int, motion: Motion | None) -> str:
         """Say why the clock could not be observed."""
         return "a time offset is observable only where velocity or attitude change"
-
-
-@dataclass(frozen=True)
-class InsPosition(PlainObservation):
-    """Position of the point that the INS reports; zero error where it is p_n + nRb l.
-
-    Parameters
-    ----------
-    time : ndarray, shape (M,), s
-        Of the samples.
-    measured_n : ndarray, shape (M, 3), m
-        Position in n.
-    lRn : ndarray, shape (M, 3, 3)
-        N to local-level axes.
-    std : ndarray, shape (M, 3), m
-        East, north, up.
-    lever_arm : ndarray, shape (3,), m
-        To the point, in body.
-    """
-
-    time: Array
-    measured_n: Array
-    lRn: Array
-    std: Array
-    lever_arm: Array
-    label: str = "INS position"
-    unit: str = "m"
-    components: tuple[str, ...] = ("east", "north", "up")
-    parameters: tuple[str, ...] = ()
-    clock: Clock = _CLOCK
-
-    def sigma(self, motion: Motion, values: Values, factor: Array | float = 1.0) -> Array:
-        """Return the standard deviations, (M, 3), m."""
-        return self.std * factor
-
-    def residual(self, motion: Motion, values: Values) -> Array:
-        """Return predicted - measured in local-level east, north, up, (M, 3), m."""
-        point_n = motion.p_n + motion.nRb @ self.lever_arm
-        return rotate(self.lRn, point_n - self.measured_n)
-
-    def linearize(self, motion: Motion, values: Values, wanted: Collection[str]) -> Linearization:
-        """Return the residual and its Jacobians."""
-        return Linearization(
-            residual=self.residual(motion, values),
-            d_theta=-self.lRn @ motion.nRb @ skew(self.lever_arm),
-            d_p=self.lRn,
-        )
-
-
-@dataclass(frozen=True)
-class InsVelocity(PlainObservation):
-    """Velocity of the point that the INS reports; zero error where it is v_n + nRb (w x l).
-
-    Parameters
-    ----------
-    time : ndarray, shape (M,), s
-        Of the samples.
-    measured_l : ndarray, shape (M, 3), m/s
-        East, north, up at the vehicle.
-    lRn : ndarray, shape (M, 3, 3)
-        N to local-level axes.
-    std : ndarray, shape (M, 3), m/s
-        East, north, up.
-    lever_arm : ndarray, shape (3,), m
-        To the point, in body.
-    """
-
-    time: Array
-    measured_l: Array
-    lRn: Array
-    std: Array
-    lever_arm: Array
-    label: str = "INS velocity"
-    unit: str = "m/s"
-    components: tuple[str, ...] = ("east", "north", "up")
-    parameters: tuple[str, ...] = ()
-    clock: Clock = _CLOCK
-
-    def sigma(self, motion: Motion, values: Values, factor: Array | float = 1.0) -> Array:
-        """Return the standard deviations, (M, 3), m/s."""
-        return self.std * factor
-
-    def residual(self, motion: Motion, values: Values) -> Array:
-        """Return predicted - measured in local-level east, north, up, (M, 3), m/s."""
-        turning = skew(motion.omega_eb_b) @ self.lever_arm
-        return rotate(self.lRn, motion.v_n + rotate(motion.nRb, turning)) - self.measured_l
-
-    def linearize(self, motion: Motion, values: Values, wanted: Collection[str]) -> Linearization:
-        """Return the residual and its Jacobians."""
-        lRb = self.lRn @ motion.nRb
-        turning = skew(motion.omega_eb_b) @ self.lever_arm
-        return Linearization(
-            residual=self.residual(motion, values),
-            d_theta=-lRb @ skew(turning),
-            d_v=self.lRn,
-            d_omega=-lRb @ skew(self.lever_arm),
-        )

@@ -14,8 +14,10 @@ from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.rotations import exp_so3
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.graph.clocks import linearized, true_time
+from factorgraph_dvl.sensors.carried_point import PointPosition, PointVelocity
+from factorgraph_dvl.sensors.clock import Clock
 from factorgraph_dvl.sensors.dvl import Dvl, DvlSettings, DvlVelocity
-from factorgraph_dvl.sensors.gnss import AntennaPosition, AntennaVelocity, Gnss, GnssSettings
+from factorgraph_dvl.sensors.gnss import LEVER_ARM, Gnss, GnssSettings
 from factorgraph_dvl.sensors.protocol import Motion, lever_arm_sigma
 from factorgraph_dvl.simulation import plan_motion, simulate
 
@@ -205,22 +207,34 @@ def test_dvl_velocity_by_hand():
     np.testing.assert_allclose(o.residual(hand_motion(), values), [[0.401, -0.198, 0.003]])
 
 
-def test_antenna_by_hand():
-    values = {"gnss_lever_arm_m": np.array([1.0, 2.0, 3.0])}
-    std = np.full((1, 3), 0.5)
+@pytest.mark.parametrize("lever_arm", [LEVER_ARM, np.array([1.0, 2.0, 3.0])], ids=type)
+def test_a_point_by_hand(lever_arm):
+    values = {LEVER_ARM: np.array([1.0, 2.0, 3.0])}
+    of_point = {
+        "time": np.zeros(1),
+        "lRn": QUARTER.T[None],
+        "std": np.full((1, 3), 0.5),
+        "label": "point",
+        "clock": Clock.of("gnss", prefix="gnss_"),
+        "lever_arm": lever_arm,
+    }
     # 1 m right is 1 m south, 2 m forward is 2 m east: the antenna is at (12, 19, 33).
     # Measured a metre further west; n's east is the level frame's -north.
-    level = QUARTER.T[None]
-    position = AntennaPosition(np.zeros(1), np.array([[11.0, 19.0, 33.0]]), level, std)
+    position = PointPosition(measured_n=np.array([[11.0, 19.0, 33.0]]), **of_point)
     np.testing.assert_allclose(
         position.residual(hand_motion(), values), [[0.0, -1.0, 0.0]], atol=1e-14
     )
     # w x l = (-0.2, 0.1, 0) in body: 0.2 m/s north and 0.1 m/s east. With 2 m/s east:
     # (2.1, 0.2, 0) in n, (0.2, -2.1, 0) in level axes.
-    velocity = AntennaVelocity(np.zeros(1), np.zeros((1, 3)), level, std)
+    velocity = PointVelocity(measured_l=np.zeros((1, 3)), **of_point)
     np.testing.assert_allclose(
         velocity.residual(hand_motion(), values), [[0.2, -2.1, 0.0]], atol=1e-14
     )
+    # Only what is estimated has derivatives; the noise of rates counts through any lever arm.
+    known = () if position.parameters == () else (LEVER_ARM,)
+    for o in (position, velocity):
+        assert tuple(o.linearize(hand_motion(), values, [LEVER_ARM]).d_parameters) == known
+    np.testing.assert_allclose(velocity.sigma(hand_motion(), values), np.sqrt(0.25 + 14e-6))
 
 
 def test_uncertain_rates_add_to_the_noise_through_the_lever_arm():
