@@ -68,11 +68,16 @@ sphinx_gallery_conf = {
 }
 
 
-def name_what_is_elsewhere(app: Sphinx, docname: str, content: list[str]) -> None:
-    """Replace links to folders and pages outside `docs` by their names: the site lacks them."""
+def follow_links_out_of_docs(app: Sphinx, docname: str, content: list[str]) -> None:
+    """Lead links to examples to the gallery; replace those to what the site lacks by names."""
 
     def named(link: re.Match[str]) -> str:
         text, path = link.groups()
+        folder = ROOT / path
+        if path.startswith("examples") and (path.endswith(".py") or any(folder.glob("GALLERY_*"))):
+            page = path.replace("examples", "/gallery", 1)
+            page = page.removesuffix(".py") if page.endswith(".py") else f"{page}/index"
+            return f"{{doc}}`{text.replace('`', '')} <{page}>`"
         if (ROOT / path).is_file() and not path.endswith(".md"):
             # Sphinx copies other files into the site.
             return link[0]
@@ -83,4 +88,4 @@ def name_what_is_elsewhere(app: Sphinx, docname: str, content: list[str]) -> Non
 
 def setup(app: Sphinx) -> None:
     """Connect the above."""
-    app.connect("source-read", name_what_is_elsewhere)
+    app.connect("source-read", follow_links_out_of_docs)
