@@ -43,6 +43,8 @@ html_copy_source = False
 highlight_language = "text"
 
 myst_enable_extensions = ["dollarmath"]
+# Equations as code hosts draw them too.
+myst_fence_as_directive = ["math"]
 # Links to headings work down to this level.
 myst_heading_anchors = 4
 

@@ -254,7 +254,7 @@ def run_blocks(name: str, stock: Path, folder: Path, run: Run, *, slow: bool) ->
             exec(compile(block.text, where, "exec"), namespace)
         elif block.language == "yaml":
             run_yaml(block, folder)
-        elif block.language == "text":
+        elif block.language in ("text", "math"):
             continue
         elif block.language == "json":
             json.loads(block.text)

@@ -111,11 +111,15 @@ def test_the_site_builds_without_warnings_and_loads_nothing_from_elsewhere(tmp_p
     browser = shutil.which("chromium")
     if browser is None:
         pytest.skip("chromium is not installed: equations are not looked at")
-    page = (tmp_path / "frames.html").as_uri()
     switches = ["--headless=new", "--no-sandbox", "--disable-gpu", "--enable-logging=stderr"]
-    shown = subprocess.run(
-        [browser, *switches, "--timeout=5000", "--dump-dom", page], capture_output=True, text=True
-    )
-    assert shown.stdout.count("<mjx-container") > 10
-    assert "Uncaught" not in shown.stderr
-    assert "ERR_" not in shown.stderr
+    for name in ("frames", "model", "kalman"):
+        page = (tmp_path / f"{name}.html").as_uri()
+        shown = subprocess.run(
+            [browser, *switches, "--timeout=5000", "--dump-dom", page],
+            capture_output=True,
+            text=True,
+        )
+        assert shown.stdout.count("<mjx-container") > 3
+        assert "mjx-merror" not in shown.stdout
+        assert "Uncaught" not in shown.stderr
+        assert "ERR_" not in shown.stderr
