@@ -52,6 +52,18 @@ def test_the_folder_is_made_and_by_default_no_page_is_replaced(benchmark, monkey
     assert "/out*/" in (ROOT / ".gitignore").read_text(encoding="utf-8").splitlines()
 
 
+def test_pages_of_the_documentation_name_the_commit_of_a_clean_tree():
+    pages = [p.read_text(encoding="utf-8") for p in sorted((ROOT / "docs").glob("*.md"))]
+    written = [
+        line for page in pages for line in page.splitlines() if "Written by `python" in line
+    ]
+    assert len(written) >= 6
+    validation = (ROOT / "docs" / "validation.md").read_text(encoding="utf-8")
+    for line in written:
+        assert line.split("`")[1] in validation
+        assert re.search(r" from commit [0-9a-f]{10} \(clean tree\); do not edit\.", line), line
+
+
 def test_a_changed_tree_is_named(benchmark, monkeypatch):
     common = benchmark("common")
 
@@ -73,8 +85,6 @@ def test_the_numbers_of_one_seed_are_those_of_the_page(name, benchmark):
     page = (ROOT / "docs" / module.PAGE).read_text(encoding="utf-8")
     if name == "beams":
         pytest.xfail("rows of seven and nine parameters are older than clocks by default")
-    if "from commit" not in page:
-        pytest.xfail(f"{module.PAGE} was made before pages named their commit: make it anew")
     printed = page.splitlines()
     missing = [line for line in module.sample() if not any(agree(line, p) for p in printed)]
     assert not missing, f"docs/{module.PAGE} is out of date; run benchmarks/{name}.py --out docs"
