@@ -23,6 +23,8 @@ SENSOR_DATA = (
 # GTSAM, SciPy and Matplotlib take most of a second to load: only what needs none of them may
 # be imported where the command line starts.
 LIGHT = ("errors", "settings", "cli")
+# Each takes half a second to load; `scipy.special` has distributions, `imu.interpolation` filters.
+SLOW_TO_LOAD = ("scipy.signal", "scipy.stats")
 MODULES = sorted(
     path.relative_to(PACKAGE).with_suffix("").parts
     for path in PACKAGE.rglob("*.py")
@@ -68,6 +70,19 @@ def test_the_map_of_the_package_is_that_of_the_tree():
 def test_the_top_holds_no_module_without_a_home():
     loose = {parts[0] for parts in MODULES if len(parts) == 1}
     assert loose == {"errors", "solution", "trial"}
+
+
+def test_no_solver_loads_what_takes_longer_than_a_short_trial():
+    for parts in MODULES:
+        if parts[0] != "reproduce":
+            text = PACKAGE.joinpath(*parts).with_suffix(".py").read_text(encoding="utf-8")
+            names = {
+                node.module if isinstance(node, ast.ImportFrom) else alias.name
+                for node in ast.walk(ast.parse(text))
+                if isinstance(node, ast.Import | ast.ImportFrom)
+                for alias in node.names
+            }
+            assert not names.intersection(SLOW_TO_LOAD), parts
 
 
 def test_no_package_hides_a_public_function():

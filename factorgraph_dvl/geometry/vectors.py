@@ -53,4 +53,5 @@ def cross_variance(omega_sigma: Array, squares: Array) -> Array:
 
 def rotate(matrices: Array, vectors: Array) -> Array:
     """Return the products of matrices (M, 3, 3) and vectors (M, 3) or (3,), as (M, 3)."""
-    return np.asarray(np.matmul(matrices, vectors[..., None])[..., 0])
+    # Half the time of a product with matrices of one column.
+    return np.asarray(np.einsum("...ij,...j->...i", matrices, vectors))

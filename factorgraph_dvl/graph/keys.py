@@ -7,6 +7,8 @@ import string
 from gtsam import symbol, symbolChr, symbolIndex
 from gtsam.symbol_shorthand import B, X
 
+from factorgraph_dvl.geometry.vectors import IntArray
+
 # Chosen: all letters but those of states and biases.
 _LETTERS = [c for c in string.ascii_letters + string.digits if c not in "bx"]
 # Letters of correlated errors. Chosen: what no other variable has.
@@ -21,6 +23,11 @@ BIAS_SIZE = 6
 def node(k: int) -> int:
     """Return the key of the navigation state at node k."""
     return int(X(k))
+
+
+def nodes(k: IntArray) -> IntArray:
+    """Return the keys of the navigation states at nodes (M,)."""
+    return node(0) + k
 
 
 def bias(k: int) -> int:
@@ -51,6 +58,12 @@ def letter_of(key: int) -> str:
 def index_of(key: int) -> int:
     """Return the index of a key: of a node, or of a node of a correlated error."""
     return int(symbolIndex(key))
+
+
+def indices_of(same: IntArray) -> IntArray:
+    """Return the indices of keys (M,) that have the same letter."""
+    first = int(same[0])
+    return same - first + index_of(first)
 
 
 def letter(size: int) -> str:

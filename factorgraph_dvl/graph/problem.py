@@ -510,9 +510,9 @@ class Problem:
         for block in self._blocks:
             for bound in block.bound:
                 matrix, vector = self._jacobian(bound, block.parameters, transitions, evaluation)
-                every = [self._keys_at(block, *n) for n in self._nodes_of(bound).tolist()]
                 o, sizes = bound.observation, tuple(self._sizes(block))
-                yield Rows(o.label, o.components, np.array(every), sizes, matrix, vector)
+                variables = self._keys_at(block, self._nodes_of(bound))
+                yield Rows(o.label, o.components, variables, sizes, matrix, vector)
 
     def nonlinear_graph(self) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
         """Return the whole problem for GTSAM's own optimisers, and values to start from.
@@ -644,8 +644,9 @@ class Problem:
         block.rows = [slice(a, b) for a, b in itertools.pairwise(edges)]
         sizes = self._sizes(block)
         block.matrices, block.vectors, block.factors = [], [], []
-        for at, rows in zip(used.tolist(), counts.tolist(), strict=True):
-            factor = jacobian_template(self._keys_at(block, *at), sizes, rows)
+        variables = self._keys_at(block, used).tolist()
+        for own, rows in zip(variables, counts.tolist(), strict=True):
+            factor = jacobian_template(own, sizes, rows)
             block.factors.append(factor)
             block.matrices.append(factor.getA())
             block.vectors.append(factor.getb())
@@ -658,13 +659,15 @@ class Problem:
         before, _ = self.processes[bound.correlated].place(bound.observation.time)
         return np.column_stack([node, before])
 
-    def _keys_at(self, block: _Block, node: int, before: int = 0) -> list[int]:
-        """Return the variables of a block's measurements at some nodes."""
-        out = [keys.node(node), self.chain.bias_key(node)]
+    def _keys_at(self, block: _Block, nodes: IntArray) -> IntArray:
+        """Return the variables of a block's measurements at nodes as `_nodes_of` has them."""
+        node = nodes[:, 0]
+        out = [keys.nodes(node), keys.bias(0) + self.chain.walking * node]
         if block.correlated is not None:
-            process = self.processes[block.correlated]
-            out += [process.key(before), process.key(before + 1)]
-        return out + [self._key[p.name] for p in block.parameters]
+            first = self.processes[block.correlated].key(0)
+            out += [first + nodes[:, 1], first + nodes[:, 1] + 1]
+        out += [np.full(node.size, self._key[p.name]) for p in block.parameters]
+        return np.column_stack(out)
 
     def _sizes(self, block: _Block) -> list[int]:
         """Return the dimensions of these variables."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import lru_cache
 
 import gtsam
 import numpy as np
@@ -22,16 +23,32 @@ def jacobian_template(keys: list[int], sizes: Sequence[int], rows: int) -> gtsam
     rows : int
         Number of rows.
     """
-
-    def nothing(
-        this: gtsam.CustomFactor, at: gtsam.Values, jacobians: list[Array] | None
-    ) -> Array:
-        if jacobians is not None:
-            for i, size in enumerate(sizes):
-                jacobians[i] = np.zeros((rows, size), order="F")
-        return np.zeros(rows)
-
     noise = gtsam.noiseModel.Unit.Create(rows)
-    factor = gtsam.CustomFactor(noise, keys, nothing).linearize(gtsam.Values())
+    zeros = _zeros(tuple(sizes), rows)
+    factor = gtsam.CustomFactor(noise, keys, zeros).linearize(_NO_VALUES)
     assert isinstance(factor, gtsam.JacobianFactor)
     return factor
+
+
+# What factors that are zero everywhere are evaluated at.
+_NO_VALUES = gtsam.Values()
+
+
+class _Zeros:
+    """Zero error with zero Jacobians; GTSAM copies them."""
+
+    def __init__(self, sizes: tuple[int, ...], rows: int) -> None:
+        self._error = np.zeros(rows)
+        zeros = [np.zeros((rows, size), order="F") for size in sizes]
+        self._jacobians = gtsam.gtsam.JacobianVector(zeros)
+
+    def __call__(
+        self, this: gtsam.CustomFactor, at: gtsam.Values, jacobians: list[Array] | None
+    ) -> Array:
+        if jacobians is not None:
+            jacobians[:] = self._jacobians
+        return self._error
+
+
+# Factors of a trial have the same few shapes over and over.
+_zeros = lru_cache(maxsize=64)(_Zeros)

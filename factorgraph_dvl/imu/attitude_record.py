@@ -9,13 +9,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
-from scipy.signal import savgol_coeffs, savgol_filter
 
 from factorgraph_dvl.errors import DataError
 from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.rotations import BodyAxes, rotation_from_rph, rph_jacobian
 from factorgraph_dvl.geometry.vectors import Array, rotate
 from factorgraph_dvl.imu.attitude_history import Orientation
+from factorgraph_dvl.imu.interpolation import ORDER, local_cubics, white_gain
 from factorgraph_dvl.sensors.attitude import Attitude
 from factorgraph_dvl.sensors.ins import Ins
 from factorgraph_dvl.sensors.records import at_row
@@ -26,9 +26,8 @@ _NEIGHBOURS = np.array([-1.0, 4.0, 4.0, -1.0]) / 6.0
 _AMPLIFIED = np.sqrt(1.0 + _NEIGHBOURS @ _NEIGHBOURS)
 # Standard deviation of a spline's slope at its knots for white noise of 1 in knots 1 s apart.
 _SLOPE = 1.22
-# Span, s, of a local polynomial and its degree. Chosen: waves that move a ship are longer.
+# Span, s, of a local cubic. Chosen: waves that move a ship are longer.
 _SMOOTHED = 1.5
-_DEGREE = 3
 # Sample intervals, and s, that make a gap, in which attitude is not known. Chosen: a cubic through
 # longer ones is a guess.
 _GAP_INTERVALS = 3.5
@@ -117,13 +116,11 @@ class AttitudeRecord:
         self.white = noise if estimated else stated
         # What the smoothing leaves of white noise, in angle and rate.
         gain, slope = (
-            np.linalg.norm(savgol_coeffs(width, _DEGREE, deriv=d, delta=self.interval))
-            if width
-            else alone
+            white_gain(width, deriv=d) / self.interval**d if width else alone
             for d, alone in ((0, 1.0), (1, _SLOPE / self.interval))
         )
-        self._rate_sigma = float(slope) * self.white
-        self.white = float(gain) * self.white
+        self._rate_sigma = slope * self.white
+        self.white = gain * self.white
         if isinstance(sensor, Attitude) and not sensor.measures_tilt:
             self.white = np.where([True, True, False], stated, self.white)
         self._gap = max(_GAP_INTERVALS * self.interval, _LEAST_GAP)
@@ -192,7 +189,7 @@ def level_axes(frame: LocalFrame, p_n: Array) -> Array:
 def _width(interval: float) -> int:
     """Return the samples, an odd number, over which a record is smoothed; 0 = it is not."""
     width = 2 * int(0.5 * _SMOOTHED / interval) + 1
-    return width if width > _DEGREE + 1 else 0
+    return width if width > ORDER + 1 else 0
 
 
 def _smoothed(time: Array, rph: Array, width: int, gap: float) -> Array:
@@ -206,7 +203,7 @@ def _smoothed(time: Array, rph: Array, width: int, gap: float) -> Array:
     edges = np.concatenate([[0], np.flatnonzero(np.diff(time) > gap) + 1, [time.size]])
     for a, b in itertools.pairwise(edges.tolist()):
         if b - a >= width:
-            out[a:b] = savgol_filter(rph[a:b], width, _DEGREE, axis=0)
+            out[a:b] = local_cubics(rph[a:b], width)
     return out
 
 

@@ -23,7 +23,8 @@ from factorgraph_dvl.geometry.vectors import Array
 # Half-widths that are tried, samples; none is longer than this many seconds.
 _HALF_WIDTHS = (2, 3, 5, 8, 12, 18, 25)
 _LONGEST = 0.25
-_ORDER = 3
+# Degree of the local polynomials. Chosen: follows a slope and its change.
+ORDER = 3
 # Samples that the window is chosen from. Chosen: minutes of motion, searched in milliseconds.
 _ENOUGH = 60_000
 # Noise of a derivative between single samples, in units of sample noise over interval.
@@ -119,27 +120,30 @@ def smooth(
     width = best_window(values, dt, sigma) if window is None else window
     if width == 0 or width > values.shape[0]:
         return unsmoothed(dt, sigma)
-    found = _local_cubics(values, width)
+    found = local_cubics(values, width)
     if averaged:
         # The mean over an interval exceeds the value at its middle by a'' dt² / 24.
-        found = found - _local_cubics(values, width, deriv=2) / 24.0
+        found = found - local_cubics(values, width, deriv=2) / 24.0
     narrow = 2 * _HALF_WIDTHS[0] + 1
-    noise = sigma * _gain(narrow)
-    apart = np.abs(_local_cubics(values, narrow) - found)
+    noise = sigma * white_gain(narrow)
+    apart = np.abs(local_cubics(values, narrow) - found)
     misfit = np.where(apart > _STEP * noise, apart, 0.0)
     return Smoothed(
         spline=_interpolant(time, found, 3),
         misfit=_interpolant(time, misfit, 1),
-        sigma=sigma * _gain(width),
+        sigma=sigma * white_gain(width),
         slope_sigma=sigma * _slope_gain(width) / dt,
         window=width,
     )
 
 
 @lru_cache(maxsize=64)
-def _gain(width: int) -> float:
-    """Return the standard deviation that a window leaves of unit noise."""
-    return float(np.linalg.norm(_polynomial(width)[0]))
+def white_gain(width: int, deriv: int = 0) -> float:
+    """Return the standard deviation that a window leaves of unit noise.
+
+    In its middle value, or in a derivative there, at unit intervals.
+    """
+    return float(np.linalg.norm(_polynomial(width)[deriv]) * factorial(deriv))
 
 
 @lru_cache(maxsize=64)
@@ -155,7 +159,7 @@ def _slope_gain(width: int) -> float:
     return float(np.linalg.norm(spline(width + 0.25, 1)))
 
 
-def _local_cubics(values: Array, width: int, deriv: int = 0) -> Array:
+def local_cubics(values: Array, width: int, deriv: int = 0) -> Array:
     """Return the values (N, 3), or a derivative at unit intervals, of local cubics."""
     if values.shape[0] > _SHORT:
         return _filtered(values, width, deriv)
@@ -191,7 +195,7 @@ def _polynomial(width: int) -> Array:
     Places are counted from the middle.
     """
     half = width // 2
-    return np.asarray(np.linalg.pinv(polyvander(np.arange(-half, half + 1.0), _ORDER)))
+    return np.asarray(np.linalg.pinv(polyvander(np.arange(-half, half + 1.0), ORDER)))
 
 
 def _interpolant(time: Array, values: Array, degree: int) -> BSpline:

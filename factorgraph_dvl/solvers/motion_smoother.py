@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.optimize import minimize
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from factorgraph_dvl.errors import SolveError
 from factorgraph_dvl.geometry.vectors import Array, rotate
@@ -251,7 +251,7 @@ def _rejected(problem: MotionProblem, evaluation: MotionEvaluation) -> dict[str,
         spread = 1.4826 * np.nanmedian(np.abs(residuals - middle), axis=0)
         scale = np.maximum(robust_scale(residuals), np.nan_to_num(spread))
         squares = np.nansum((residuals / scale) ** 2, axis=1)
-        gate = chi2.isf(1.0 - _GATE, residuals.shape[1])
+        gate = chdtri(residuals.shape[1], 1.0 - _GATE)
         out_ = known & (squares > gate)
         if squares[known].max() > _WORTH * gate and out_.sum() < _TOO_MANY * known.sum():
             out[o.label] = out_

@@ -10,7 +10,7 @@ from collections.abc import Iterator, Mapping
 
 import numpy as np
 
-from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.geometry.vectors import Array, IntArray
 from factorgraph_dvl.graph import keys
 from factorgraph_dvl.graph.problem import Evaluation, Problem, Rows
 
@@ -43,11 +43,10 @@ def rows_with_times(problem: Problem, evaluation: Evaluation) -> Iterator[tuple[
         if rows.source in when:
             yield rows, when[rows.source]
         elif rows.keys.shape[1] > 1:
-            first = [int(key) for key in rows.keys[:, 0]]
-            letter = keys.letter_of(first[0])
+            first = rows.keys[:, 0]
+            letter = keys.letter_of(int(first[0]))
             if letter in "xb" or letter in processes:
-                table = processes.get(letter, node_time)
-                yield rows, table[[keys.index_of(key) for key in first]]
+                yield rows, processes.get(letter, node_time)[keys.indices_of(first)]
 
 
 def product(rows: Rows, columns: Mapping[int, Array]) -> Array:
@@ -56,9 +55,10 @@ def product(rows: Rows, columns: Mapping[int, Array]) -> Array:
     for chunk in _chunks(rows):
         total: Array | float = 0.0
         for own, matrix in _by_variable(rows, chunk):
-            different, place = np.unique(own, return_inverse=True)
-            known = np.stack([columns[key] for key in different.tolist()])
-            total = total + matrix @ (known[0] if different.size == 1 else known[place])
+            first = _runs(own)
+            known = np.stack([columns[key] for key in own[first].tolist()])
+            lengths = np.diff(first, append=own.size)
+            total = total + matrix @ (known[0] if first.size == 1 else known.repeat(lengths, 0))
         parts.append(np.asarray(total))
     return np.concatenate(parts)
 
@@ -78,11 +78,15 @@ def add_transposed_product(rows: Rows, factors: Array, sums: dict[int, Array]) -
     for chunk in _chunks(rows):
         turned = factors[chunk].transpose(0, 2, 1)
         for own, matrix in _by_variable(rows, chunk):
-            order = np.argsort(own, kind="stable")
-            different, first = np.unique(own[order], return_index=True)
-            added = np.add.reduceat((turned @ matrix)[order], first, axis=0)
-            for key, part in zip(different.tolist(), added, strict=True):
+            first = _runs(own)
+            added = np.add.reduceat(turned @ matrix, first, axis=0)
+            for key, part in zip(own[first].tolist(), added, strict=True):
                 sums[key] = sums[key] + part if key in sums else part
+
+
+def _runs(keys_: IntArray) -> IntArray:
+    """Return where each run of equal keys begins: in the order of time few keys come again."""
+    return np.flatnonzero(np.diff(keys_, prepend=keys_[0] - 1))
 
 
 def _chunks(rows: Rows) -> Iterator[slice]:
@@ -90,7 +94,7 @@ def _chunks(rows: Rows) -> Iterator[slice]:
     return (slice(first, first + _CHUNK) for first in range(0, max(count, 1), _CHUNK))
 
 
-def _by_variable(rows: Rows, chunk: slice) -> Iterator[tuple[Array, Array]]:
+def _by_variable(rows: Rows, chunk: slice) -> Iterator[tuple[IntArray, Array]]:
     """Yield keys (M,) and Jacobian (M, d, size) of each variable of some items."""
     edges = np.cumsum([0, *rows.sizes])
     for i in range(len(rows.sizes)):

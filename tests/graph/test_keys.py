@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from factorgraph_dvl.graph import keys
 
 
@@ -18,3 +20,9 @@ def test_keys_know_what_they_are_of():
     assert keys.is_process(keys.process(1, 4))
     assert keys.index_of(keys.process(1, 4)) == 4
     assert not any(map(keys.is_process, (keys.node(0), keys.bias(0), keys.calibration(0, 3))))
+
+
+def test_keys_of_many_nodes_are_those_of_each():
+    k = np.array([0, 3, 4800])
+    assert keys.nodes(k).tolist() == [keys.node(i) for i in k]
+    assert keys.indices_of(keys.nodes(k)).tolist() == k.tolist()
