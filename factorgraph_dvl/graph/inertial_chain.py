@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import pairwise
 
 import gtsam
@@ -75,6 +76,29 @@ class Chain:
     def middle(self) -> float:
         """Middle of the record, s."""
         return 0.5 * float(self.segments.node_time[0] + self.segments.node_time[-1])
+
+    @cached_property
+    def zeros(self) -> gtsam.Values:
+        """States and biases of zero: they take GTSAM far longer to insert than to move."""
+        out = gtsam.Values()
+        state, bias = gtsam.NavState(), gtsam.imuBias.ConstantBias()
+        n = self.segments.node_time.size
+        for k in range(n):
+            out.insert(keys.node(k), state)
+        for k in range(n if self.walking else 1):
+            out.insert(keys.bias(k), bias)
+        return out
+
+    def values(self, states: States) -> gtsam.Values:
+        """Return GTSAM's values of states and biases."""
+        step = gtsam.VectorValues()
+        rows = np.hstack([log_so3(states.nRb), states.p_n, states.v_n])
+        for k, row in enumerate(rows):
+            step.insert(keys.node(k), row)
+        rows = np.hstack([states.accel_bias, states.gyro_bias])
+        for k, row in enumerate(rows if self.walking else rows[:1]):
+            step.insert(keys.bias(k), row)
+        return self.zeros.retract(step)
 
     def bias_key(self, k: int) -> int:
         """Return the key of the bias at node k."""

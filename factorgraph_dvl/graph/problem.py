@@ -293,18 +293,7 @@ class Problem:
 
     def values(self, states: States, parameters: dict[str, Array]) -> gtsam.Values:
         """Return GTSAM's values of states and parameters."""
-        out = gtsam.Values()
-        n = states.nRb.shape[0]
-        for k in range(n):
-            out.insert(
-                keys.node(k),
-                gtsam.NavState(gtsam.Rot3(states.nRb[k]), states.p_n[k], states.v_n[k]),
-            )
-        for k in range(n if self.chain.walking else 1):
-            out.insert(
-                keys.bias(k),
-                gtsam.imuBias.ConstantBias(states.accel_bias[k], states.gyro_bias[k]),
-            )
+        out = self.chain.values(states)
         for process in self.processes:
             nodes = parameters.get(process.name, process.zero)
             for j, node in enumerate(nodes):

@@ -15,12 +15,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from factorgraph_dvl.geometry.rotations import exp_so3
+from factorgraph_dvl.geometry.rotations import exp_so3, log_so3
 from factorgraph_dvl.geometry.vectors import Array, IntArray, rotate, skew
-from factorgraph_dvl.imu.preintegration import Segments
+from factorgraph_dvl.imu.preintegration import Segments, Strides
 from factorgraph_dvl.imu.propagation import Attachment, Transition, attitude_jacobian
 from factorgraph_dvl.sensors.imu import ImuError
 from factorgraph_dvl.sensors.protocol import Linearization
+
+# Shortest step, s, that has a mean rate. Chosen: far below the interval of any IMU.
+_LEAST_STEP = 1e-7
 
 
 @dataclass(frozen=True)
@@ -55,7 +58,7 @@ def unit_errors(rate: Array, force: Array, errors: Sequence[ImuError]) -> tuple[
 def sensitivities(
     seg: Segments, errors: Sequence[ImuError], attachments: Sequence[Attachment]
 ) -> tuple[Sensitivity, list[Sensitivity]]:
-    """Return derivatives with respect to errors of the IMU, by sums over the samples.
+    """Return derivatives with respect to errors of the IMU, by sums over strides.
 
     Parameters
     ----------
@@ -73,27 +76,29 @@ def sensitivities(
     attached : list of Sensitivity
         Of the motion that is attached.
     """
-    inc = seg.increments
-    count, n = seg.first.size, len(errors)
-    theta, v, p = (np.zeros((count, 3, n)) for _ in range(3))
-    places = [_place(seg, at) for at in attachments]
+    strides = seg.strides()
+    n, most = len(errors), int(strides.count.max())
+    theta, v, p = (np.zeros((seg.first.size, 3, n)) for _ in range(3))
     before = [tuple(np.zeros((at.tau.size, 3, n)) for _ in range(3)) for at in attachments]
-    for j in range(int((seg.last - seg.first).max())):
-        for (index, _), at, kept in zip(places, attachments, before, strict=True):
-            here = np.flatnonzero(index - seg.first[at.segment] == j)
+    places = [_stride_of(seg, strides, at) for at in attachments]
+    for j in range(most):
+        for place, at, kept in zip(places, attachments, before, strict=True):
+            here = np.flatnonzero(place - strides.begins[at.segment] == j)
             for own, now in zip(kept, (theta, v, p), strict=True):
                 own[here] = now[at.segment[here]]
-        live = np.flatnonzero(seg.first + j < seg.last)
-        i = seg.first[live] + j
-        h = inc.dt[i]
-        rate, force = seg.phi[i] / h[:, None], seg.dv[i] / h[:, None]
-        step = _step(seg.dR[i], rate, force, h, errors, (theta[live], v[live], p[live]))
+        live = np.flatnonzero(strides.count > j)
+        i = strides.begins[live] + j
+        means = _means(strides.phi[i], strides.dv[i], strides.duration[i])
+        step = _step(strides.dR[i], means, errors, (theta[live], v[live], p[live]))
         theta[live], v[live], p[live] = step
     ends = Sensitivity(-theta, v, p, np.zeros_like(theta), np.zeros_like(theta))
     out = []
-    for (index, since), at, kept in zip(places, attachments, before, strict=True):
-        dR = seg.dR[index]
-        theta_at, v_at, p_at = _step(dR, at.gyro, at.force, since, errors, kept)
+    for place, at, kept in zip(places, attachments, before, strict=True):
+        dR = strides.dR[place]
+        back = dR.transpose(0, 2, 1)
+        since = seg.node_time[at.node] + at.tau - strides.start[place]
+        means = _means(log_so3(back @ at.dR), rotate(back, at.dV - strides.dV[place]), since)
+        theta_at, v_at, p_at = _step(dR, means, errors, kept)
         rate, force = unit_errors(at.gyro, at.force, errors)
         out.append(Sensitivity(-theta_at, v_at, p_at, rate, force))
     return ends, out
@@ -191,27 +196,45 @@ def by_errors(lin: Linearization, transition: Transition, by: Sensitivity) -> Ar
     return out
 
 
-def _place(seg: Segments, at: Attachment) -> tuple[IntArray, Array]:
-    """Return the interval of attached times, and the time since its start."""
+def _stride_of(seg: Segments, strides: Strides, at: Attachment) -> IntArray:
+    """Return the stride of attached times."""
     time = seg.node_time[at.node] + at.tau
     index = np.clip(
         seg.increments.locate(time)[0], seg.first[at.segment], seg.last[at.segment] - 1
     )
-    return index, time - seg.increments.start[index]
+    return strides.begins[at.segment] + (index - seg.first[at.segment]) // seg.stride
+
+
+@dataclass(frozen=True)
+class _Means:
+    """Rate and force (M, 3) over steps of h s, (M,), in the axes in their middle.
+
+    `half` (M, 3, 3) turns the axes in the middle into those at the start.
+    """
+
+    rate: Array
+    force: Array
+    half: Array
+    h: Array
+
+
+def _means(phi: Array, dv: Array, h: Array) -> _Means:
+    """Return the means over steps with increments (M, 3), in the axes at their start."""
+    # A measurement may lie at the start of a step.
+    safe = np.where(np.abs(h) > _LEAST_STEP, h, 1.0)[:, None]
+    half = exp_so3(0.5 * phi)
+    return _Means(phi / safe, rotate(half.transpose(0, 2, 1), dv) / safe, half, h)
 
 
 def _step(
-    dR: Array,
-    rate: Array,
-    force: Array,
-    h: Array,
-    errors: Sequence[ImuError],
-    before: tuple[Array, ...],
+    dR: Array, means: _Means, errors: Sequence[ImuError], before: tuple[Array, ...]
 ) -> tuple[Array, Array, Array]:
-    """Return Theta, V and P after (M,) steps of rate and force (M, 3), s, from those before."""
+    """Return Theta, V and P after (M,) steps that start at rotations (M, 3, 3)."""
     theta, v, p = before
-    h = h[:, None, None]
-    by_rate, by_force = unit_errors(rate, force, errors)
-    turned = dR @ by_rate * h
-    pushed = (skew(rotate(dR, force)) @ (theta + 0.5 * turned) - dR @ by_force) * h
+    h = means.h[:, None, None]
+    by_rate, by_force = unit_errors(means.rate, means.force, errors)
+    middle = dR @ means.half
+    turned = middle @ by_rate * h
+    force = rotate(middle, means.force)
+    pushed = (skew(force) @ (theta + 0.5 * turned) - middle @ by_force) * h
     return theta + turned, v + pushed, p + v * h + 0.5 * pushed * h
