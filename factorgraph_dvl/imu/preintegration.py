@@ -123,6 +123,9 @@ class Segments:
         dA[ends] = self.dA[whole] + self.dR[whole] @ left * self.increments.dt[whole, None, None]
         start = self.increments.start
         duration = self.increments.end[b - 1] - start[a]
+        # A force that turns with the body within a sample, as GTSAM has it, leads less far.
+        less = rotate(self.dR, cross(self.phi, self.dv)) * (self.increments.dt[:, None] / 12.0)
+        dP = dP - np.add.reduceat(less, a)
         back = self.dR[a].transpose(0, 2, 1)
         swept = back @ (dA - self.dA[a])
         return Strides(
