@@ -198,6 +198,9 @@ class Problem:
         By label, factors (d,) for noise that persists for some measurements; likewise.
     robust_weights : mapping of str to ndarray
         By label, weights from 0 to 1 on the squares of residuals, (M, d) or (M, 1); likewise.
+    loosely_bound : bool
+        Whether clocks may move measurements as far as the motion is extrapolated before they are
+        to be bound anew: for those that sway moves to and fro.
 
     Examples
     --------
@@ -248,6 +251,7 @@ class Problem:
         self.noise_factors: Mapping[str, Array] = {}
         self.long_run: Mapping[str, Array] = {}
         self.robust_weights: Mapping[str, Array] = {}
+        self.loosely_bound = False
         self._start = {**self.prior_values(), **(start or {})}
         self._bound: list[_Bound] = []
         for observation in observations:
@@ -590,7 +594,8 @@ class Problem:
 
     def needs_rebinding(self, parameters: dict[str, Array]) -> bool:
         """Whether a clock has moved measurements too far from where they were bound."""
-        return any(np.abs(self._late(b, parameters)).max() > _SAME_TIME for b in self._bound)
+        most = _EXTRAPOLATED if self.loosely_bound else _SAME_TIME
+        return any(np.abs(self._late(b, parameters)).max() > most for b in self._bound)
 
     def _motion(self, bound: _Bound, states: States, parameters: dict[str, Array]) -> Motion:
         """Return the motion at the true times of measurements.

@@ -22,6 +22,8 @@ _SHORT = 2.0
 # Correlation times in a trial below which only the density 2 σ² / τ can be
 # estimated. Measured: σ alone is then uncertain by a factor.
 _MANY = 20.0
+# Correlation time, s, that the stated deviation has at least. Chosen: with less it is white.
+_LEAST_TIME = 4.0
 # Trials that a correlation time lasts, at most. Chosen: the process is then a constant.
 _CONSTANT = 100.0
 # Trial, s, below which correlation is not searched. Chosen: shorter ones have rival minima, whose
@@ -154,7 +156,7 @@ def with_innovations(process: Process, factor: Array) -> Process:
     """Return a process whose innovations are larger by a factor (d,) than assumed."""
     if process.density_only:
         longest = _CONSTANT * float(np.ptp(process.time))
-        return replace(process, tau=np.clip(process.tau / factor**2, _SHORT, longest))
+        return replace(process, tau=np.clip(process.tau / factor**2, _LEAST_TIME, longest))
     return replace(process, sigma=process.sigma * factor)
 
 

@@ -15,7 +15,7 @@ from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.sensors.imu import ERRORS
 from factorgraph_dvl.sensors.parameters import UNITS, Parameter
 from factorgraph_dvl.solvers.change_along_trial import CHANGED, component_changes
-from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, eliminate
+from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, tree_at
 from factorgraph_dvl.statistics.constancy import by_interval
 from factorgraph_dvl.statistics.robust_weights import robust_scale
 from factorgraph_dvl.statistics.rows import rows_with_times
@@ -92,9 +92,8 @@ def explanation(problem: Problem, minimum: Minimum) -> Explanation | None:
     if not significant:
         return None
     same, at = _scattered(problem, evaluation, problem.all_parameters)
-    gaussian = same.linearize(at)
-    tree = eliminate(gaussian, same.ordering(gaussian))
-    changes = component_changes(same, at, SquareRootInformation(tree, at.values.dims()))
+    there = SquareRootInformation(tree_at(same, at), at.values.dims())
+    changes = component_changes(same, at, there)
     most = max((each.change.chi2 for each in changes), default=0.0)
     count = sum(int(np.count_nonzero(w)) for w in problem.weights)
     significant.sort(key=lambda each: -each[1].evidence(count))
@@ -146,8 +145,7 @@ def _tests_of_known(
     if not known:
         return {}
     test, at, columns = _freed(problem, evaluation, known)
-    gaussian = test.linearize(at)
-    tree = eliminate(gaussian, test.ordering(gaussian))
+    tree = tree_at(test, at)
     information = SquareRootInformation(tree, at.values.dims())
     found = scores(tree, information, columns)
     tests = {p.name: found.test([p.name]) for p in known}

@@ -171,6 +171,12 @@ def minimise(
     return Minimum(evaluation, eliminate(gaussian, ordering), False, iteration)
 
 
+def tree_at(problem: Problem, evaluation: Evaluation) -> gtsam.GaussianBayesTree:
+    """Return the Bayes tree from QR of a problem that is linearised at some values."""
+    gaussian = problem.linearize(evaluation)
+    return eliminate(gaussian, problem.ordering(gaussian))
+
+
 def quick_step(
     gaussian: gtsam.GaussianFactorGraph, ordering: gtsam.Ordering
 ) -> gtsam.VectorValues | None:

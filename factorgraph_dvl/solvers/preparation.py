@@ -168,8 +168,10 @@ def mounted_start(
     values = prepared.mountings
     aids = mounted_aids(prepared.trial, prepared.mountings)
     if aids is not None:
-        found_by = observed(aids, prepared.frame, prepared.trial.body_axes)
-        problem = Problem(chain, *found_by, start=prepared.mountings)
+        observations, parameters = observed(aids, prepared.frame, prepared.trial.body_axes)
+        # In sway, errors of the IMU's axes look like a late clock.
+        parameters = (*parameters, *prepared.trial.inertial.error_parameters())
+        problem = Problem(chain, observations, parameters, start=prepared.mountings)
         coarse = minimise(
             problem,
             problem.values(states, problem.prior_values() | prepared.mountings),

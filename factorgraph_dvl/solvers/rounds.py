@@ -8,7 +8,7 @@ settled.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -31,10 +31,14 @@ from factorgraph_dvl.solvers.known_parameters import (
     explanation,
     explanation_findings,
 )
-from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, minimise
+from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, minimise, tree_at
 from factorgraph_dvl.solvers.outliers import robust_weights
 from factorgraph_dvl.solvers.preparation import Preparation, mounted_start
-from factorgraph_dvl.statistics.variance_components import variance_components
+from factorgraph_dvl.solvers.process_fit import refitted
+from factorgraph_dvl.statistics.variance_components import (
+    VarianceComponents,
+    variance_components,
+)
 
 # Root mean square change of the positions, m, from which on gravity is taken anew. Chosen: 1 m
 # turns it by 0.16 micro-g.
@@ -56,9 +60,9 @@ _MOST_FREED = 2
 # Relative change of the noise over a long time, by that of innovations, from which on it counts.
 # Chosen: less changes no σ that is shown.
 _SAME_INNOVATIONS = 0.05
-# Ratio of two steps of the innovations up to which they are extrapolated. Chosen: five steps in
-# one.
-_MOST_RATIO = 0.8
+# Bindings in a row after which clocks need not settle closer than the motion is extrapolated.
+# Chosen: most trials take one or two.
+_IN_A_ROW = 4
 # Share of the last movement of the clocks from which on the next binding is half-way. Chosen: half
 # is what is left of a movement after one that went half the way.
 _NOT_SETTLING = 0.75
@@ -146,7 +150,7 @@ def settle(
     first_levels = _NoiseLevels((as_stated,), bool(as_stated))
     levels = first_levels
     changing: list[str] = ["all"]
-    count = 0
+    count = in_a_row = 0
     movement = np.inf
     start = values
     while count < _ROUNDS:
@@ -172,6 +176,8 @@ def settle(
         problem.noise_factors = levels.factors[-1]
         problem.long_run = long_run
         problem.robust_weights = robust
+        in_a_row = in_a_row + 1 if only_times else 0
+        problem.loosely_bound = in_a_row > _IN_A_ROW
         at = problem.values(states, problem.prior_values() | values)
         minimum = minimise(problem, at, stage="all sensors", progress=report)
         iterations += minimum.iterations
@@ -242,6 +248,8 @@ def settle(
     if changing:
         text = f"after {_ROUNDS} rounds {', '.join(changing)} still changed: do not use the result"
         findings += (Finding(Code.NOT_CONVERGED, text, severity="error"),)
+    if minimum.tree is None:
+        minimum = replace(minimum, tree=tree_at(problem, minimum.evaluation))
     converged = minimum.converged and not changing
     minimum = replace(minimum, converged=converged, iterations=iterations)
     return SettledMinimum(problem, minimum, not changing, findings)
@@ -251,15 +259,13 @@ def settle(
 class _NoiseLevels:
     """Factors on stated noise that were applied, and whether to estimate more of them.
 
-    `processes` is the correlated noise to assume next, `innovations` the logarithms of the factors
-    on its innovations that led there, by label, `rounds` counts estimates.
+    `processes` is the correlated noise to assume next, `rounds` counts estimates.
     """
 
     factors: tuple[dict[str, Array], ...]
     estimated: bool
     findings: tuple[Finding, ...] = ()
     processes: tuple[Process, ...] = ()
-    innovations: Mapping[str, Array] = field(default_factory=dict)
     rounds: int = 0
 
 
@@ -272,13 +278,11 @@ def _next_noise(levels: _NoiseLevels, problem: Problem, minimum: Minimum) -> _No
     found = variance_components(problem, minimum.evaluation, minimum.information)
     last = levels.factors[-1]
     latest = last | {label: f.after(last[label]) for label, f in found.white.items()}
-    logs = {label: np.log(f.factor) for label, f in found.correlated.items()}
     processes = tuple(
-        with_innovations(p, np.exp(_extrapolated(logs[p.label], levels.innovations.get(p.label))))
-        if p.label in logs
-        and np.abs(long_run_share(problem, p) * logs[p.label]).max() > _SAME_INNOVATIONS
+        with_innovations(p, found.correlated[p.label].factor)
+        if p.density_only and p.label in found.correlated and _counts(problem, found, p)
         else p
-        for p in levels.processes
+        for p in refitted(problem, minimum.evaluation)
     )
     rounds = levels.rounds + 1
     if rounds <= _NOISE_ROUNDS:
@@ -286,7 +290,6 @@ def _next_noise(levels: _NoiseLevels, problem: Problem, minimum: Minimum) -> _No
             levels,
             factors=(*levels.factors, latest),
             processes=processes,
-            innovations=logs,
             rounds=rounds,
         )
     if _same(latest, last):
@@ -311,16 +314,10 @@ def _next_noise(levels: _NoiseLevels, problem: Problem, minimum: Minimum) -> _No
     )
 
 
-def _extrapolated(step: Array, before: Array | None) -> Array:
-    """Return the step that a geometric series of steps comes to, after two of them (Aitken).
-
-    Where nodes are about as many as what determines them, each estimate of the innovations goes
-    only a part of the way.
-    """
-    if before is None:
-        return step
-    ratio = np.divide(step, before, out=np.zeros_like(step), where=before != 0.0)
-    return np.asarray(step / (1.0 - np.clip(ratio, 0.0, _MOST_RATIO)))
+def _counts(problem: Problem, found: VarianceComponents, process: Process) -> bool:
+    """Whether other innovations change the noise over a long time."""
+    change = np.log(found.correlated[process.label].factor)
+    return bool(np.abs(long_run_share(problem, process) * change).max() > _SAME_INNOVATIONS)
 
 
 def _changing(problem: Problem, evaluation: Evaluation) -> list[str]:

@@ -143,6 +143,33 @@ class SquareRootInformation:
         """
         left = set(wanted)
         out: dict[int, Array] = {}
+        for clique, place, P in self._joint():
+            for key in clique.frontals:
+                if key in left:
+                    block = P[place[key], place[key]]
+                    out[key] = 0.5 * (block + block.T)
+        return out
+
+    def cross_covariances(self, pairs: Sequence[tuple[int, int]]) -> list[Array]:
+        """Return the covariances of pairs of variables that a factor ties together.
+
+        Such variables share a clique: that of the one that was eliminated first.
+        """
+        partners: dict[int, list[tuple[int, int]]] = {}
+        for i, (a, b) in enumerate(pairs):
+            partners.setdefault(a, []).append((i, b))
+            partners.setdefault(b, []).append((i, a))
+        out: list[Array] = [np.empty((0, 0))] * len(pairs)
+        for clique, place, P in self._joint():
+            for key in clique.frontals:
+                for i, other in partners.get(key, ()):
+                    if other in place:
+                        a, b = pairs[i]
+                        out[i] = P[place[a], place[b]]
+        return out
+
+    def _joint(self) -> Iterator[tuple[_Clique, dict[int, slice], Array]]:
+        """Yield each clique, the places of its variables and their joint covariance."""
         joint: list[tuple[dict[int, slice], Array]] = []
         for clique in self._cliques:
             f = clique.R.shape[0]
@@ -166,11 +193,7 @@ class SquareRootInformation:
                 place[key] = slice(row, row + self._sizes[key])
                 row += self._sizes[key]
             joint.append((place, P))
-            for key in clique.frontals:
-                if key in left:
-                    block = P[place[key], place[key]]
-                    out[key] = 0.5 * (block + block.T)
-        return out
+            yield clique, place, P
 
 
 def _range(s: slice) -> np.ndarray:

@@ -11,7 +11,6 @@ from factorgraph_dvl.graph.problem import Problem
 from factorgraph_dvl.sensors.finding import Code
 from factorgraph_dvl.simulation import simulate
 from factorgraph_dvl.solvers.batch import solve
-from factorgraph_dvl.solvers.rounds import _extrapolated
 
 
 def unsettled(monkeypatch, name, answer):
@@ -46,11 +45,3 @@ def test_outliers_that_never_repeat_do_not_settle(monkeypatch):
     assert not solution.converged
     text, *_ = of_code(solution.findings, Code.NOT_CONVERGED)
     assert "which measurements are echoes still changed" in text
-
-
-def test_steps_that_shrink_are_extrapolated_to_their_sum():
-    first = np.array([1.0, 0.0, 0.4])
-    # 1 + 1/2 + 1/4 + ...; nothing before; a step back.
-    second = np.array([0.5, 0.3, -0.2])
-    np.testing.assert_array_equal(_extrapolated(first, None), first)
-    np.testing.assert_allclose(_extrapolated(second, first), [1.0, 0.3, -0.2])

@@ -1,0 +1,127 @@
+"""Deviation and correlation time of correlated noise, from what the whole graph says of it.
+
+Residuals alone show too short a correlation time: the trajectory follows what is slow.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.graph.problem import Evaluation, Problem
+from factorgraph_dvl.graph.processes import Process
+from factorgraph_dvl.solvers.levenberg_marquardt import tree_at
+from factorgraph_dvl.statistics.square_root_information import SquareRootInformation
+
+# Steps at most, and the change of a logarithm from which on one counts. Chosen: a tenth of what
+# is usually uncertain.
+_STEPS = 12
+_SAME = 0.03
+# Ratio of two steps up to which they are extrapolated. Chosen: ten steps in one.
+_MOST_RATIO = 0.9
+# Largest logarithm of a step. Chosen: a factor of e.
+_LARGEST = 1.0
+# Spacings of nodes and trials between which a correlation time lies. Chosen: it is white, or a
+# constant, beyond.
+_SHORTEST = 1.0
+_LONGEST = 1.0
+# Least correlation of two nodes. Chosen: less has a time far below the spacing.
+_LEAST_CORRELATION = 1e-3
+
+
+def refitted(problem: Problem, evaluation: Evaluation) -> tuple[Process, ...]:
+    """Return the processes with the deviations and times of the restricted maximum likelihood.
+
+    By expectation and maximisation (Shumway and Stoffer, An approach to time series smoothing
+    and forecasting using the EM algorithm, Journal of Time Series Analysis 3(4), 1982) with
+    steps extrapolated; the motion is linearised where it is. Processes of which only the density
+    is known, and those that the trial states, stay as they are.
+
+    Parameters
+    ----------
+    problem : Problem
+        What was minimised.
+    evaluation : Evaluation
+        Its minimum.
+    """
+    before = problem.processes
+    free = [not p.density_only and p.label in problem.noise_factors for p in before]
+    if not any(free):
+        return before
+    parameters = dict(evaluation.parameters)
+    last: list[Array | None] = [None] * len(before)
+    for _ in range(_STEPS):
+        at = problem.evaluate(problem.values(evaluation.states, parameters))
+        tree = tree_at(problem, at)
+        information = SquareRootInformation(tree, at.values.dims())
+        delta = tree.optimize()
+        found = list(problem.processes)
+        moved = 0.0
+        for i, process in enumerate(problem.processes):
+            if not free[i]:
+                continue
+            nodes = at.parameters[process.name] + np.array(
+                [delta.at(process.key(j)) for j in range(process.time.size)]
+            )
+            step = _step(process, nodes, information)
+            moved = max(moved, float(np.abs(step).max()))
+            found[i] = _moved(process, _extrapolated(step, last[i]))
+            last[i] = step if last[i] is None else None
+            # The same error in another unit.
+            grown = np.divide(
+                process.sigma,
+                found[i].sigma,
+                out=np.ones_like(process.sigma),
+                where=found[i].sigma > 0.0,
+            )
+            parameters[process.name] = at.parameters[process.name] * grown
+        if moved < _SAME:
+            break
+        problem.processes = tuple(found)
+    after, problem.processes = problem.processes, before
+    return after
+
+
+def _step(process: Process, nodes: Array, information: SquareRootInformation) -> Array:
+    """Return the change of the logarithms of deviation and time, (2, n); 0 where there is none."""
+    second = information.marginals([process.key(j) for j in range(process.time.size)])
+    own = np.array([np.diag(second[process.key(j)]) for j in range(process.time.size)])
+    pairs = [(process.key(j), process.key(j + 1)) for j in range(process.time.size - 1)]
+    cross = np.array([np.diag(P) for P in information.cross_covariances(pairs)])
+    dt = np.diff(process.time)
+    spacing = float(np.median(dt))
+    regular = np.abs(dt / spacing - 1.0) < 0.5
+    square = nodes**2 + own
+    s00, s11 = square[:-1][regular].sum(axis=0), square[1:][regular].sum(axis=0)
+    s10 = (nodes[:-1] * nodes[1:] + cross)[regular].sum(axis=0)
+    count = int(regular.sum())
+    phi = np.clip(s10 / s00, _LEAST_CORRELATION, 1.0 - 1e-9)
+    span = float(np.ptp(process.time))
+    tau = np.clip(-spacing / np.log(phi), _SHORTEST * spacing, _LONGEST * span)
+    phi = np.exp(-spacing / tau)
+    innovation = (s11 - 2.0 * phi * s10 + phi**2 * s00) / count
+    sigma = process.sigma * np.sqrt(innovation / (1.0 - phi**2))
+    active = process.sigma > 0.0
+    ratio = np.where(active, sigma, 1.0) / np.where(active, process.sigma, 1.0)
+    return np.stack([np.log(ratio), np.where(active, np.log(tau / process.tau), 0.0)])
+
+
+def _extrapolated(step: Array, before: Array | None) -> Array:
+    """Return the sum of a geometric series of steps, after two of them (Aitken)."""
+    if before is None:
+        return step
+    ratio = np.divide(step, before, out=np.zeros_like(step), where=before != 0.0)
+    return np.asarray(step / (1.0 - np.clip(ratio, 0.0, _MOST_RATIO)))
+
+
+def _moved(process: Process, step: Array) -> Process:
+    """Return a process after a step of the logarithms."""
+    step = np.clip(step, -_LARGEST, _LARGEST)
+    span = float(np.ptp(process.time))
+    return replace(
+        process,
+        sigma=process.sigma * np.exp(step[0]),
+        tau=np.minimum(process.tau * np.exp(step[1]), _LONGEST * span),
+    )

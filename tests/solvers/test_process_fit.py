@@ -1,0 +1,93 @@
+"""Deviation and time of correlated noise: where the restricted likelihood is largest."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from truth import scenario
+
+from factorgraph_dvl.simulation import simulate
+from factorgraph_dvl.simulation.faults import gauss_markov
+from factorgraph_dvl.solvers.batch import solved_problems
+from factorgraph_dvl.solvers.levenberg_marquardt import eliminate
+from factorgraph_dvl.solvers.process_fit import refitted
+
+LEGS = [
+    {"straight_s": 30},
+    {"turn_deg_s": -6, "duration_s": 20, "ramp_s": 4},
+    {"accelerate_m_s2": -0.2, "to_m_s": 2},
+    {"straight_s": 30},
+]
+
+
+@pytest.fixture(scope="module")
+def solved():
+    """Return the problem of a trial with 0.03 m/s over 5 s in what the DVL measures."""
+    scene = scenario(
+        noise=True,
+        manoeuvres=LEGS,
+        imu={"rate_hz": 50},
+        dvl={"rate_hz": 2, "velocity_std_m_s": 0.01},
+        trial={"dvl": {"velocity_std_m_s": 0.01}},
+    )
+    trial = simulate(scene, 1)
+    error = 0.03 * gauss_markov(trial.dvl.time, 5.0, 3, np.random.default_rng(2))
+    dvl = replace(trial.dvl, velocity=trial.dvl.velocity + error)
+    (found,) = solved_problems(replace(trial, dvl=dvl))
+    assert len(found.problem.processes) == 1
+    return found.problem, found.minimum.evaluation
+
+
+def log_likelihood(problem, evaluation, process):
+    """Return the restricted log-likelihood, up to a constant, of the linearised problem."""
+    (before,) = problem.processes
+    problem.processes = (process,)
+    nodes = evaluation.parameters[process.name] * (before.sigma / process.sigma)
+    at = problem.evaluate(
+        problem.values(evaluation.states, evaluation.parameters | {process.name: nodes})
+    )
+    gaussian = problem.linearize(at)
+    tree = eliminate(gaussian, problem.ordering(gaussian))
+    problem.processes = (before,)
+    half_determinant, stack = 0.0, list(tree.roots())
+    while stack:
+        clique = stack.pop()
+        R = clique.conditional().R()
+        half_determinant += np.log(np.abs(np.diag(R[:, : R.shape[0]]))).sum()
+        stack += [clique[i] for i in range(clique.nrChildren())]
+    steps = np.diff(process.time)[:, None] / process.tau
+    of_prior = -0.5 * np.log(-np.expm1(-2.0 * steps)).sum()
+    return of_prior - half_determinant - gaussian.error(tree.optimize())
+
+
+def test_no_other_deviation_or_time_is_more_likely(solved):
+    problem, evaluation = solved
+    (process,) = problem.processes
+    # From far off, to the same place.
+    away = replace(process, sigma=process.sigma * 0.6, tau=process.tau * 2.0)
+    problem.processes = (away,)
+    moved = evaluation.parameters[process.name] / 0.6
+    (found,) = refitted(
+        problem, replace(evaluation, parameters=evaluation.parameters | {process.name: moved})
+    )
+    problem.processes = (process,)
+    best = log_likelihood(problem, evaluation, found)
+    assert best > log_likelihood(problem, evaluation, away) + 1.0
+    for name in ("sigma", "tau"):
+        for factor in (0.75, 1.33):
+            other = replace(found, **{name: getattr(found, name) * np.array([factor, 1.0, 1.0])})
+            assert log_likelihood(problem, evaluation, other) < best
+
+
+def test_what_is_stated_stays(solved):
+    problem, evaluation = solved
+    (process,) = problem.processes
+    problem.processes = (replace(process, density_only=True),)
+    assert refitted(problem, evaluation)[0] is problem.processes[0]
+    problem.processes = (process,)
+    factors = problem.noise_factors
+    problem.noise_factors = {}
+    assert refitted(problem, evaluation)[0] is process
+    problem.noise_factors = factors
