@@ -74,7 +74,7 @@ _PREPOSITION = (
 )
 # Turns that put the subject late, by what is wrong with them.
 INVERSIONS = {
-    "begins with 'of'": re.compile(rf"{_CLAUSE}[Oo]f\b"),
+    "begins with 'of'": re.compile(r"^Of\b|[;:–] of\b"),
     "begins with a clause of 'what', 'who' or 'that'": re.compile(
         r"(?:^|; )(?:[Ww]hat|[Ww]ho|[Ww]hose|[Ww]hoever|[Tt]hat (?:an?|it|the|they|you))\b[^?]*$"
     ),

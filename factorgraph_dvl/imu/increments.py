@@ -304,7 +304,7 @@ def _bridged(imu: Imu) -> tuple[Array, Array, Array, np.ndarray, list[Finding]]:
 def _unused(alone: list[tuple[int, float]]) -> Iterator[Finding]:
     """Yield the stretches that are too short, by their samples and start."""
     for count, start in alone:
-        text = f"{count} samples at {start:.3f} s stand alone between gaps and were not used"
+        text = f"{count} samples at {start:.3f} s are isolated between gaps and were not used"
         yield Finding(Code.UNUSED, text, "IMU")
 
 

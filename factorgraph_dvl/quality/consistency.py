@@ -353,7 +353,7 @@ def _imu_finding(
             if len(found) == 1
             else "one axis is mirrored, or two are swapped (the course would show which)"
         )
-        text = f"{fits}, of gyros and accelerometers, {cause}"
+        text = f"{fits}, for gyros and accelerometers, {cause}"
     else:
         causes = " or ".join(candidate.text for candidate in wrong if candidate is not HANDEDNESS)
         text = f"{fits} {causes}"

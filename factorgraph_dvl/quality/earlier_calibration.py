@@ -142,7 +142,7 @@ def _contradiction(
     apart = np.where(informed > _LEAST_SHARE, np.abs(value - mean) / scale, 0.0)
     i = int(np.argmax(apart / np.sqrt(np.maximum(informed, _LEAST_SHARE))))
     alone = (
-        f"this trial alone says {test.value[i]:.2g} ± {test.std[i]:.1g}, and "
+        f"this trial alone gives {test.value[i]:.2g} ± {test.std[i]:.1g}, and "
         if np.isfinite(test.std[i])
         else ""
     )

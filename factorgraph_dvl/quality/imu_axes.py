@@ -82,7 +82,7 @@ def candidates(imu: Imu) -> Iterator[Candidate]:
         changes += [-mirrored(k) for k in range(3)] if which == 0 else []
         for P in changes:
             pair = (P, eye) if which == 0 else (eye, P)
-            yield Candidate(code, f"of the {sensor}, {in_words(P)}", *pair)
+            yield Candidate(code, f"for the {sensor}, {in_words(P)}", *pair)
 
 
 @dataclass(frozen=True)

@@ -289,17 +289,18 @@ class Star:
         x, y, z = stars[worst]
         wrong = self.misfit > _WRONG_STARS
         consequence = (
-            "the stars are not those of the catalogue, and the attitudes are not to be used"
+            "The stars are not those of the catalogue, so do not use the attitudes"
             if wrong
-            else "the reported standard deviations are too small unless it is corrected"
+            else "The reported standard deviations are too small until this is corrected"
         )
         return (
             Finding(
                 Code.STAR_CATALOGUE,
-                f"the angles between stars differ from the catalogue's by {self.misfit:.3g} times "
-                "what `std_arcsec` lets expect, most at the star towards inertial "
-                f"({x:.4f}, {y:.4f}, {z:.4f}), first in {at_row(self.source, row[worst])}: is it "
-                "another one, are columns mixed up, or is aberration left in? " + consequence,
+                f"the angles between stars differ from the catalogue's {self.misfit:.3g} times as "
+                "much as `std_arcsec` allows. The star towards inertial "
+                f"({x:.4f}, {y:.4f}, {z:.4f}) differs most, first in "
+                f"{at_row(self.source, row[worst])}. Is it another star, are columns mixed up, or "
+                f"is aberration left in? {consequence}",
                 sensor=self.label,
                 severity="error" if wrong else "warning",
             ),
@@ -353,9 +354,9 @@ class Star:
             return "the trial has no star attitude while the IMU runs, or only one"
         x, y, z = np.degrees(np.std(motion.omega_eb_b, axis=0))
         return (
-            "mounting and attitude are separable only if the body turns about two axes, "
-            f"and it hardly does (rms rate {x:.2g}, {y:.2g}, {z:.2g} deg/s about x, y, z), or "
-            "where manoeuvres show the attitude without stars"
+            "mounting and attitude are separable only if the body turns about two axes, or if "
+            "manoeuvres show the attitude without stars; the rms rate is "
+            f"{x:.2g}, {y:.2g}, {z:.2g} deg/s about x, y, z"
         )
 
 

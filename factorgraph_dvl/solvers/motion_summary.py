@@ -283,9 +283,9 @@ def _heading_and_misalignment(trial: Trial, found: SmoothedMotion) -> list[Findi
     )
     angle = -float(down @ in_unit(_parameter(problem, name), values[name]).value)
     text = (
-        f"about the vertical {angle:.3f} ± {alone / DEG:.2g} deg, which includes what is stated "
-        f"of the heading's error; relative to the mean heading of the compass "
-        f"{angle - mean / DEG:.3f} ± {together / DEG:.2g} deg, which the data alone determine"
+        f"about the vertical {angle:.3f} ± {alone / DEG:.2g} deg, including the stated heading "
+        f"error. Relative to the mean heading of the compass, it is {angle - mean / DEG:.3f} ± "
+        f"{together / DEG:.2g} deg, which the data alone determine"
     )
     return [Finding(Code.HEADING_ERROR, text, parameter=name)]
 

@@ -112,7 +112,7 @@ def test_text_is_yaml_and_states_the_commands():
 def test_axes_that_cannot_be_trdi_s_are_named():
     for body_axes, said in (("RFU", False), ("FRD", True)):
         text = instrument_text(instrument_of(calibrated([0.0, 0.0, 45.0], body_axes)), "a trial")
-        assert ("NOT TO BE TYPED IN" in text) == said
+        assert ("DO NOT TYPE IN" in text) == said
 
 
 def test_half_a_turn_is_within_the_range_of_the_command():

@@ -49,24 +49,23 @@ def help_texts() -> Iterator[tuple[str, str]]:
 
 
 def messages() -> Iterator[tuple[str, str]]:
-    """Yield place and text of every message: what is raised, found or warned of."""
+    """Yield place and text of every message: the texts in the package of four words or more.
+
+    Docstrings and markup are none, nor are the rows of tables that `reproduce` prints.
+    """
     for path in sorted(PACKAGE.rglob("*.py")):
-        tree = ast.parse(path.read_text(encoding="utf-8"))
-        calls = [n for n in ast.walk(tree) if isinstance(n, ast.Call) and says(n)]
-        for call in calls:
-            texts = [*call.args, *(k.value for k in call.keywords)]
-            for text in map(text_of, texts):
-                if " " in text:
-                    yield f"{path.relative_to(ROOT)}:{call.lineno}", text
+        if path.parent.name == "reproduce":
+            continue
+        nodes = list(ast.walk(ast.parse(path.read_text(encoding="utf-8"))))
+        left_out = {id(n.value) for n in nodes if isinstance(n, ast.Expr)}
+        left_out |= {id(v) for n in nodes if isinstance(n, ast.JoinedStr) for v in n.values}
+        for node in nodes:
+            text = text_of(node)
+            if id(node) not in left_out and text.count(" ") >= 3 and not set("<{") & set(text):
+                yield f"{path.relative_to(ROOT)}:{node.lineno}", text.lstrip("# ")
 
 
-def says(call: ast.Call) -> bool:
-    name = call.func.attr if isinstance(call.func, ast.Attribute) else ""
-    name = call.func.id if isinstance(call.func, ast.Name) else name
-    return name == "Finding" or name.endswith("Error") or name in {"warn", "warning", "note"}
-
-
-def text_of(node: ast.expr) -> str:
+def text_of(node: ast.AST) -> str:
     """Return a text, with a sign for each value in it; empty for anything else."""
     if isinstance(node, ast.Constant) and isinstance(node.value, str):
         return node.value

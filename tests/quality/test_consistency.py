@@ -110,20 +110,20 @@ def test_a_mirrored_imu_is_named_with_its_axis(
 ) -> None:
     texts = found(trial, faults.axes_changed("imu", matrix.tolist()))
     assert list(texts) == [Code.IMU_AXES]
-    assert f"of gyros and accelerometers, {words}" in texts[Code.IMU_AXES]
+    assert f"for gyros and accelerometers, {words}" in texts[Code.IMU_AXES]
 
 
 @pytest.mark.parametrize(
     ("matrix", "field", "code", "words"),
     [
-        (mirror(2), "gyro", Code.GYRO_AXES, "of the gyros, axis z is mirrored"),
-        (mirror(1), "accel", Code.ACCEL_AXES, "of the accelerometers, axis y is mirrored"),
+        (mirror(2), "gyro", Code.GYRO_AXES, "for the gyros, axis z is mirrored"),
+        (mirror(1), "accel", Code.ACCEL_AXES, "for the accelerometers, axis y is mirrored"),
         pytest.param(
-            *(SWAP_XY, "gyro", Code.GYRO_AXES, "of the gyros, axes x and y are swapped"),
+            *(SWAP_XY, "gyro", Code.GYRO_AXES, "for the gyros, axes x and y are swapped"),
             marks=pytest.mark.slow,
         ),
         pytest.param(
-            *(-np.eye(3), "gyro", Code.GYRO_AXES, "of the gyros, all three axes"),
+            *(-np.eye(3), "gyro", Code.GYRO_AXES, "for the gyros, all three axes"),
             marks=pytest.mark.slow,
         ),
         pytest.param(

@@ -719,7 +719,7 @@ def test_a_star_that_does_not_fit_its_catalogue_is_named(off_arcsec, severity):
     moved[2::5] = Rotation.from_rotvec([0, off_arcsec * ARCSEC, 0]).apply(moved[2::5])
     wrong = Star.from_vectors(star.settings, v.time, v.body, moved, "star.csv")
     trial = replace(trial, others=(wrong,))
-    expected = "not to be used" if severity == "error" else "too small"
+    expected = "do not use the attitudes" if severity == "error" else "too small"
     for solution in (solve(trial), calibrate(trial, "star")[0]):
         (said,) = of_code(solution.findings, Code.STAR_CATALOGUE)
         assert "star.csv line 4" in said

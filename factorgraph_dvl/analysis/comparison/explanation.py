@@ -129,9 +129,9 @@ def _neglected_lever_arm(side: Side, own: Solution, other: Solution, found: Esti
         if neglected is not None:
             speed, share = neglected
             return text + (
-                f" At the angular rates of the trajectory this is a velocity error of {speed:.2g} "
-                f"m/s RMS, {100.0 * share:.2g} % of the speed: it biases misalignment and scale "
-                "where it repeats in turns, and adds noise elsewhere."
+                f" At the angular rates of the trajectory, this is a velocity error of "
+                f"{speed:.2g} m/s RMS, {100.0 * share:.2g} % of the speed. It biases misalignment "
+                "and scale where it repeats in turns, and adds noise elsewhere."
             )
     return text
 

@@ -83,8 +83,8 @@ class Halves:
         i = int(np.argmax(np.abs(self.difference) / np.where(self.std > 0.0, self.std, np.inf)))
         text = (
             f"the halves of the trial contradict each other (χ² {self.statistic:.0f} with "
-            f"{self.freedom} degrees of freedom, by chance {p:.0e}): most of all {self.names[i]}, "
-            f"which changes by {self.difference[i]:.2g} ± {self.std[i]:.1g}"
+            f"{self.freedom} degrees of freedom, by chance {p:.0e}). The largest change is "
+            f"{self.names[i]}, by {self.difference[i]:.2g} ± {self.std[i]:.1g}"
         )
         return (
             Finding(

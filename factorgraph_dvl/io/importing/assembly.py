@@ -100,7 +100,9 @@ def assemble(streams: Sequence[Timed], name: str, decisions: Decisions) -> tuple
     if imu is not None:
         out.add("imu", lambda zero: motion.imu_tables(imu, zero), grade="tactical")
         decisions.add(
-            imu.label, f"{len(imu.time)} samples → grade to be stated by you", "imu.grade"
+            imu.label,
+            f"{len(imu.time)} samples → grade chosen; state that of your IMU",
+            "imu.grade",
         )
     if gnss is not None:
         _add_gnss(out, gnss, imu is not None or ins is not None)
@@ -136,8 +138,8 @@ def fixes_of_navigation(streams: Sequence[Timed], decisions: Decisions) -> list[
             records[name] = timed.stream.records[name]
         decisions.add(
             timed.stream.label,
-            "beside the samples of an IMU, positions and velocities of a navigation solution are "
-            "taken as fixes; they must not come from the same IMU and DVL",
+            "positions and velocities of the navigation solution → fixes beside the IMU; they "
+            "must not come from the same IMU and DVL",
             "gnss.file",
         )
         out.append(replace(timed, stream=replace(timed.stream, kind="fix", records=records)))
@@ -164,8 +166,8 @@ def _add_gnss(out: Assembly, gnss: positions.Positions, has_body: bool) -> None:
         keys["lever_arm_std_m"] = _UNKNOWN_ARM
         out.decisions.add(
             "gnss.lever_arm_m",
-            "no file says where the antenna is → estimated; measure it, right, forward and up of "
-            "the IMU, and state it with its σ",
+            "no file states the antenna's position → estimated; measure it, right, forward and up "
+            "of the IMU, and state it with its σ",
             "gnss.lever_arm_std_m",
         )
     else:
@@ -233,7 +235,7 @@ def _add_attitude(out: Assembly, attitude: orientation.Orientation) -> None:
         keys["deviation_std_deg"] = attitude.deviation_std
         out.decisions.add(
             attitude.attitude.label,
-            "a magnetic compass deviates by what depends on the heading → estimated",
+            "the deviation of a magnetic compass depends on the heading → estimated",
             "attitude.deviation_std_deg",
         )
     out.add("attitude", attitude.tables, **keys)
@@ -248,8 +250,8 @@ def _add_log(
         keys["parametrisation"] = "common"
         out.decisions.add(
             log.pings.label,
-            "all pings are along beams → `dvl_beams`; where the instrument is not known to be "
-            "mounted as drawn, beams have one misalignment in common",
+            "all pings are along beams → `dvl_beams`; the mounting is not known, so all beams "
+            "have one common misalignment",
             "dvl_beams.parametrisation",
         )
     section = log.section
@@ -258,8 +260,8 @@ def _add_log(
         keys["misalignment_std_deg"] = _INSIDE
         out.decisions.add(
             log.pings.label,
-            "attitude is that of sensors in the DVL itself → misalignment within a degree; about "
-            "the vertical any, as it has the error of the compass in it",
+            "the attitude sensors are in the DVL → misalignment within a degree; any angle about "
+            "the vertical, because it contains the error of the compass",
             f"{section}.misalignment_std_deg",
         )
     else:

@@ -118,7 +118,7 @@ def guess(path: Path) -> str:
     invalid = [x for x in _INVALID if np.isclose(columns, x, atol=1e-6).any()]
     if invalid:
         shown = ", ".join(f"{x:g}" for x in invalid)
-        lines.append(f"    invalid: [{shown}]  # stand in the data")
+        lines.append(f"    invalid: [{shown}]  # found in the data")
     lines.append("    columns:")
     for field in FIELDS[kind]:
         if field in fields:

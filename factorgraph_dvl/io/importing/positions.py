@@ -143,7 +143,7 @@ def best_source(
     for other in ordered[1:]:
         decisions.add(
             ", ".join(dict.fromkeys(timed.stream.label for timed in other)),
-            f"{kind} not used: {ordered[0][0].stream.label} has more to say",
+            f"{kind} not used: {ordered[0][0].stream.label} is better",
         )
     return ordered[0]
 
@@ -173,8 +173,8 @@ def _height(fixes: Merged, decisions: Decisions) -> str:
     if np.isfinite(part["altitude"]).mean() > 0.5:
         decisions.add(
             fixes.label,
-            "altitudes above the geoid, whose separation is not given → taken as heights; that "
-            "shifts the track up or down as a whole, and no calibration feels it",
+            "altitudes above the geoid, whose separation is not given → taken as heights; this "
+            "shifts the whole track up or down, and does not change the calibration",
         )
         return "altitude"
     decisions.add(

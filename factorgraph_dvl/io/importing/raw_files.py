@@ -96,7 +96,7 @@ def import_files(
                 (folder / NEW_SETTINGS).write_bytes(text)
                 decisions.add(
                     SETTINGS_FILE,
-                    f"edited since the last import → kept; what it would be is in {NEW_SETTINGS}",
+                    f"edited since the last import → kept; the new one is in {NEW_SETTINGS}",
                 )
             (folder / LOG_FILE).write_text(decisions.text(digest(text)), encoding="utf-8")
     return decisions

@@ -246,7 +246,7 @@ def _from_content(
         + (
             peak
             if found is None
-            else f"speeds agree nowhere clearly ({peak}, next best {found.second:.2f})"
+            else f"no lag of the speeds is clear ({peak}, next best {found.second:.2f})"
         ),
         where=file,
         expected="files of the same time, or a file with both clocks",

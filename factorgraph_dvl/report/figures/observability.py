@@ -106,7 +106,7 @@ def singular_value_figure(point_set: PointSet) -> Figure:
     for i, (stacks, title) in enumerate(
         (
             (point_set.segments, "Singular values of each segment"),
-            (point_set.cumulative, "of all data up to the end of each segment"),
+            (point_set.cumulative, "Singular values of all data up to the end of each segment"),
         )
     ):
         ax = figure.add_subplot(grid[i, 0])

@@ -56,7 +56,7 @@ def instrument_text(instrument: InstrumentTerms, name: str) -> str:
         "# TRDI, 0.01 deg. EA is the direction of beam 3 seen from the ship's bow, positive",
         "# clockwise from above. EI and EJ are roll and pitch of the ship when the instrument is",
         "# level, positive port side up and bow up: Rz(-EA) Ry(EJ) Rx(EI) takes ship to",
-        "# instrument. They hold for a DVL that looks down, if the trial was recorded in",
+        "# instrument. They are valid for a DVL that looks down, if the trial was recorded in",
         "# instrument coordinates (aligned: X to starboard, Y, beam 3, ahead, Z up) with EA, EI",
         "# and EJ at 0, and if the body axes are parallel to those of the ship.",
         *(_NOT_TRDI if np.max(np.abs(i.alignment[1:])) > _UPSIDE_DOWN_DEG else ()),
@@ -91,7 +91,7 @@ def _makers(i: InstrumentTerms) -> list[str]:
         "",
         "# Water Linked: one angle, from the bow to the forward axis of the DVL, positive",
         f"# clockwise from above. It leaves out the tilt of {fixed(tilt, 2)} deg.",
-        *(("# NOT TO BE TYPED IN: the DVL's axes look up.",) if upside_down else ()),
+        *(("# DO NOT TYPE IN: the DVL's axes look up.",) if upside_down else ()),
         "water_linked:",
         f"  mounting_rotation_offset: {fixed(yaw, 2)}",
         "",
@@ -108,8 +108,8 @@ def _makers(i: InstrumentTerms) -> list[str]:
 # Chosen: a DVL that looks down has a smaller roll and pitch.
 _UPSIDE_DOWN_DEG = 90.0
 _NOT_TRDI = (
-    "# NOT TO BE TYPED IN: with these the instrument would look up. The DVL's data in this",
-    "# trial are in other axes than TRDI's; turn them into those, and calibrate again.",
+    "# DO NOT TYPE IN: with these values, the instrument would look up. The DVL's data in this",
+    "# trial are in other axes than TRDI's; convert them, and calibrate again.",
 )
 
 

@@ -79,7 +79,7 @@ def verdict_section(result: Result) -> Section:
         header = [both(x) for x in ("parameter", "value ± σ", "unit", "grade")]
         cells.append(table(header, rows, label="What was found", numeric=(1,)))
     if verdict.reasons:
-        cells.append(element("h3", both("What is wrong, and what to do")))
+        cells.append(element("h3", both("Problems, and what to do")))
         cells += [_reason(f) for f in verdict.reasons]
     notes = [f for f in solution.findings if f.severity == "note"]
     if notes:

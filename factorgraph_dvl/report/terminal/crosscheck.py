@@ -127,7 +127,7 @@ def paragraph(check: CrossCheck) -> str:
     text = (
         "Both results come from the same data, so their errors are correlated: var(A − B) = "
         "σ_A² + σ_B² − 2 cov, with an unknown covariance. It is not negative for two sound "
-        "estimates from the same data, so √(σ_A² + σ_B²) is an upper bound of the σ of A − B: a "
+        "estimates from the same data, so √(σ_A² + σ_B²) is an upper bound of the σ of A − B. A "
         "difference flagged here is significant; agreement may still fail a sharper test."
     )
     if check.efficient is None:

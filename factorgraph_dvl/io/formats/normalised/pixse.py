@@ -21,8 +21,8 @@ _PITCH = (
     "compare it with another pitch"
 )
 _HEIGHT = (
-    "$PIXSE,POSITI: its altitude was taken as height above the ellipsoid; if the system was set "
-    "to the geoid, it differs by the separation, which velocities and lever arm do not feel"
+    "$PIXSE,POSITI: its altitude was taken as height above the ellipsoid. If the system was set "
+    "to the geoid, all heights are off by the separation; the calibration does not change"
 )
 
 
