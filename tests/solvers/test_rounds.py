@@ -25,6 +25,14 @@ def test_what_never_settles_is_named(monkeypatch):
     assert "the weights of measurements still changed" in text
 
 
+def test_clocks_that_never_settle_leave_a_result_that_is_not_converged(monkeypatch):
+    solution = unsettled(monkeypatch, "needs_rebinding", lambda *_: True)
+    assert not solution.converged
+    assert np.isfinite(solution.covariance).all()
+    text, *_ = of_code(solution.findings, Code.NOT_CONVERGED)
+    assert "the times of measurements still changed" in text
+
+
 def test_a_measurement_at_its_gate_is_used_and_named(monkeypatch):
     def outliers(problem, _):
         return {} if problem.rejected else {"DVL velocity": np.array([1.0])}
