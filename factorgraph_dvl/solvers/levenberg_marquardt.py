@@ -74,6 +74,7 @@ def minimise(
     max_iterations: int = 50,
     tolerance: float = CONVERGED,
     proven: bool = True,
+    binding: bool = False,
 ) -> Minimum:
     """Minimise a problem's cost.
 
@@ -101,6 +102,8 @@ def minimise(
         Promised decrease of the cost below which the minimum is reached.
     proven : bool, default True
         Whether QR must confirm the minimum.
+    binding : bool, default False
+        Whether to stop near a minimum at which measurements are to be bound anew.
 
     Raises
     ------
@@ -136,7 +139,8 @@ def minimise(
             delta = tree.optimize()
             promised = evaluation.cost - gaussian.error(delta)
         assert delta is not None
-        if promised < _ANOTHER_FOLLOWS and problem.needs_rebinding(evaluation.parameters):
+        near = binding and promised < _ANOTHER_FOLLOWS
+        if near and problem.needs_rebinding(evaluation.parameters):
             return Minimum(evaluation, None, False, iteration)
         trial = problem.evaluate(evaluation.values.retract(delta))
         lower = trial.cost <= evaluation.cost * (1.0 + _ROUNDING)

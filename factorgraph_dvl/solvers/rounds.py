@@ -179,7 +179,7 @@ def settle(
         in_a_row = in_a_row + 1 if only_times else 0
         problem.loosely_bound = in_a_row > _IN_A_ROW
         at = problem.values(states, problem.prior_values() | values)
-        minimum = minimise(problem, at, stage="all sensors", progress=report)
+        minimum = minimise(problem, at, stage="all sensors", progress=report, binding=True)
         iterations += minimum.iterations
         states, values = minimum.evaluation.states, minimum.evaluation.parameters
         changing = _changing(problem, minimum.evaluation)

@@ -46,7 +46,8 @@ def test_it_stops_early_where_another_problem_follows(monkeypatch):
     problem, values = problem_of(scenario(manoeuvres=SHORT))
     whole = minimise(problem, values, stage="test")
     monkeypatch.setattr(problem, "needs_rebinding", lambda _: True)
-    minimum = minimise(problem, values, stage="test")
+    assert minimise(problem, values, stage="test").converged
+    minimum = minimise(problem, values, stage="test", binding=True)
     assert not minimum.converged
     assert minimum.tree is None
     assert minimum.iterations < whole.iterations
