@@ -33,7 +33,7 @@ Progress = Callable[[str, int, float | None], None]
 # Stems of the parameters that every dead-reckoned track depends on; of a lever arm it only
 # does in turns.
 DEAD_RECKONING = ("misalignment", "scale_error", "beam_direction", "beam_scale_error")
-# Standard deviations between prior and data that are no chance: it is 6e-7.
+# Standard deviations between prior and data that are no chance. Chosen: its probability is 6e-7.
 _FAR_FROM_PRIOR = 5.0
 # Standard deviations by which a wrong prior may draw a value. Chosen: one is within what is
 # claimed.
@@ -44,12 +44,13 @@ NOISE_FACTORS = (0.5, 2.0)
 # they are then at most three times less sharp than the prior; of less, errors of the model that
 # hardly matter make a contradiction.
 _INFORMED = 0.95
-# Evidence against a minimum with which it is not worth a word: its probability is e^-15.
+# Evidence against a minimum with which it is not worth a word. Chosen: a probability of e^-15.
 _IMPOSSIBLE = 15.0
 # The data observed a component if they at least halved what was unknown of it.
 OBSERVABLE = 0.5
 # Root mean square of normalised residuals from which on a filter has not converged, unless a
-# few of them are so large by chance, of this probability.
+# few of them are so large by chance, of this probability. Chosen: noise stated half as large as
+# it is.
 CONTRADICTS = 2.0
 _CHANCE = 1e-3
 # Share of outliers from which on they are a contradiction. Chosen: a good log has some.

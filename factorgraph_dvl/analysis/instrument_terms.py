@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from factorgraph_dvl.errors import DataError
-from factorgraph_dvl.geometry.rotations import BodyAxes, exp_so3, frd_from_body, wrapped
+from factorgraph_dvl.geometry.rotations import exp_so3, frd_from_body, wrapped
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.sensors.dvl import LEVER_ARM, MISALIGNMENT, SCALE_ERROR
@@ -136,11 +136,3 @@ def euler(matrix: Array, order: Order) -> Array:
     """
     found = Rotation.from_matrix(matrix).as_euler(order, degrees=True)
     return np.asarray(found[::-1] if order == "ZYX" else found)
-
-
-def rotation_of(angles: Array, order: Order, body_axes: BodyAxes) -> Array:
-    """Return the rotation (3, 3), in body axes, of roll, pitch and yaw (3,), deg."""
-    given = angles[::-1] if order == "ZYX" else angles
-    frd = frd_from_body(body_axes)
-    matrix = Rotation.from_euler(order, given, degrees=True).as_matrix()
-    return np.asarray(frd.T @ matrix @ frd)

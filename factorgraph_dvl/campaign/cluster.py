@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 # Workers that may die over a run before it is given up. Chosen: Dask counts a death against
 # what a worker had at hand, and its default of 3 ends good runs where workers are killed often.
 _ALLOWED_FAILURES = 30
-# Time for a scheduler to answer, s.
+# Time for a scheduler to answer, s. Chosen: a slow network.
 _TIMEOUT = 20
 
 Run = tuple[Callable[..., RunRecord], tuple[Any, ...]]

@@ -22,7 +22,8 @@ from factorgraph_dvl.trial import Reference
 
 # Time between the states that the gyros are integrated from, s. Chosen: that of the graph.
 _STEP = 1.0
-# Epochs further apart than this, s, leave the gyros alone for too long to be called known.
+# Time between epochs, s, beyond which the attitude is not known. Chosen: gyros alone would have
+# to bridge it.
 _LONGEST = 60.0
 
 

@@ -23,21 +23,24 @@ from factorgraph_dvl.imu.timestamps import JUMP, fill_lost, unrounded
 from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.sensors.imu import Imu
 
-# Lost samples up to this number are interpolated; a longer gap ends the arc.
+# Lost samples up to this number are interpolated; a longer gap ends the arc. Chosen: a polynomial
+# through six neighbours still follows the motion.
 MAX_FILLED = 3
-# Samples that are this much later than the median interval were preceded by lost ones.
+# Median intervals after which a sample was preceded by a lost one. Chosen: half-way between one
+# and two.
 _LOST = 1.5
-# Slower samples, s, do not follow any vessel; they are times in another unit.
+# Interval, s, from which on stamps are in another unit. Chosen: so slow no vessel is followed.
 _SLOWEST = 0.5
 # What rounding may take off a time, s.
 _ROUNDING = 1e-6
-# Relative spread of the intervals up to which the clock counts as regular.
+# Relative spread of the intervals up to which the clock counts as regular. Chosen: stamps in
+# milliseconds at 100 Hz.
 _REGULAR = 0.1
 # Intervals whose polynomials are in memory at a time. Chosen: some MB.
 _CHUNK = 4000
 # Samples that an arc has at least: those of the widest stencil.
 _LEAST = 6
-# A difference is no sign of a step before it is so many of its standard deviations.
+# Standard deviations from which on a difference may be a step. Chosen: seldom by chance.
 _BEYOND_NOISE = 3.0
 
 

@@ -20,7 +20,9 @@ from scipy.ndimage import correlate1d
 
 from factorgraph_dvl.geometry.vectors import Array
 
-# Half-widths that are tried, samples; none is longer than this many seconds.
+# Half-widths that are tried, samples, the longest of them, s, and the order of the polynomials in
+# them. Chosen: each is half as wide again as the one before; cubics follow a sway of 1 Hz for so
+# long.
 _HALF_WIDTHS = (2, 3, 5, 8, 12, 18, 25)
 _LONGEST = 0.25
 # Degree of the local polynomials. Chosen: follows a slope and its change.

@@ -11,7 +11,7 @@ from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.sensors.records import rows_of
 from factorgraph_dvl.trial import Trial
 
-# No IMU rests for so long within a trial, s: its clock was set.
+# Step of the time, s, from which on the clock was set. Chosen: no IMU rests for an hour.
 JUMP = 3600.0
 
 

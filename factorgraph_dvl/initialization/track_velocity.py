@@ -17,7 +17,7 @@ from factorgraph_dvl.sensors.ins import Ins
 
 # Span, s, over which positions make a velocity. Chosen: turns of a ship last longer.
 _SPAN = 5.0
-# Gap, s, beyond which nothing is known of the motion.
+# Gap, s, beyond which nothing is known of the motion. Chosen: a ship turns in it.
 _GAP = 15.0
 
 

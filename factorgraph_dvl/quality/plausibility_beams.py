@@ -11,7 +11,8 @@ from factorgraph_dvl.sensors.beam_geometry import as_dvl, error_velocity
 from factorgraph_dvl.sensors.dvl_beams import DvlBeams
 from factorgraph_dvl.sensors.finding import Code, Finding
 
-# Of what noise and priors make of the error velocity.
+# Times what noise and priors make of the error velocity from which on it is too large, and share
+# of lost pings that is worth a word. Chosen: no honest instrument comes near; half are left.
 _TOO_LARGE = 3.0
 _MOSTLY = 0.5
 

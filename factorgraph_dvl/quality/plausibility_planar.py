@@ -12,11 +12,14 @@ from factorgraph_dvl.imu.timestamps import JUMP
 from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.trial import PlanarTrial
 
-# Of so many intervals one is a gap, if it is also long enough for a vehicle to turn in.
+# Usual intervals, and seconds, that make a gap. Chosen: a lost sample is none, and in a gap a
+# vehicle has time to turn.
 _GAP_INTERVALS = 3.0
 _GAP_S = 5.0
-# Tide, and a beacon's float.
+# Height above the sea, m, from which on it is a mistake. Chosen: tide, and a beacon's float.
 _ABOVE_SEA_M = 10.0
+# Speed, m/s, up to which a vehicle is at rest, and share of the stated noise below which a record
+# has none. Chosen: what currents make; no data sheet is ten times too careful.
 _MOVING_M_S = 0.1
 _QUIET = 0.1
 

@@ -38,7 +38,7 @@ _SOUND_SPEED = ParameterSpec("sound_speed_error", labels=SCALAR)
 SOUND_SPEED_ERROR = _SOUND_SPEED.name
 _CLOCK = Clock.of("beacon", prefix="beacon_")
 
-# A measurement this many standard deviations off is no measurement but an echo.
+# Standard deviations from which on a measurement is an echo. Chosen: by chance one in 2000 is.
 GATE = 3.5
 
 _NAMES = re.compile(r"[A-Za-z0-9_-]+")

@@ -60,7 +60,8 @@ CURRENT = CURRENT_SPEC.name
 # What a calibration says of the DVL, and not of the sea that day.
 CALIBRATED = (MISALIGNMENT, SCALE_ERROR, LEVER_ARM, BIAS, TIME_OFFSET)
 
-# A DVL at rest reports a standard deviation of zero under a purely relative model.
+# Least standard deviation, m/s. Chosen: a tenth of the last digit of records; at rest a purely
+# relative model says zero.
 _LEAST_SIGMA = 1e-4
 
 

@@ -66,9 +66,12 @@ _OWN_CLOCK = Clock.of("beam", prefix=BEAM_PREFIX)
 Angle = Annotated[float, msgspec.Meta(ge=-360, le=360)]
 Acute = Annotated[float, msgspec.Meta(ge=0, le=90)]
 
-# Beams that lie in one plane, to this sine of an angle, do not determine a velocity.
+# Sine of the angle to one plane up to which beams do not determine a velocity, and what the norm
+# of a stated direction may differ from 1 by. Chosen: 3 degrees; two digits.
 _LEAST_SPREAD = 0.05
 _UNIT = 0.05
+# Least standard deviation, m/s, as of a DVL; what rounding leaves of a sine. Chosen: far below
+# what is measured.
 _LEAST_SIGMA = 1e-4
 _ROUNDING = 1e-12
 # Signs of x and y in the octants V to VIII, below the plane of x and y.

@@ -15,7 +15,8 @@ from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.sensors.protocol import SensorRecord
 
 PATTERN = r"^[a-z_]+:([0-9a-f]{16})+$"
-# Hashes that a fingerprint has at most, and the share of them that makes records the same.
+# Hashes that a fingerprint has at most, and the share of them that makes records the same. Chosen:
+# 2 kB of text; a part of a record still counts, and a short stretch in common does not.
 _SIZE = 128
 _SAME = 0.5
 # Chosen: of records with fewer measured columns, such as depth, rows are equal by chance, and so

@@ -21,12 +21,13 @@ Values = Mapping[str, Array]
 # Whether the noise of a sensor is estimated from its residuals, or final as it is stated.
 NoiseModel = Literal["estimated", "stated"]
 
-# Residuals larger than stated by this factor make every standard deviation too small, and by
-# the second the model is another than the data's.
+# Factors by which residuals are larger than stated from which on every standard deviation is too
+# small, and the model another than the data's. Chosen: sums of some hundred residuals stay below
+# the first by chance, and no data sheet is wrong by the second.
 TOO_LARGE = 1.3
+DO_NOT_FIT = 10.0
 # Correlation time where none is stated, s. Chosen: that of multipath and atmosphere.
 USUAL_CORRELATION_TIME = 100.0
-DO_NOT_FIT = 10.0
 
 
 @dataclass(frozen=True)

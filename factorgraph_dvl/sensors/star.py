@@ -49,12 +49,12 @@ VECTOR_COLUMNS = ("body_x", "body_y", "body_z", "inertial_x", "inertial_y", "ine
 _MOUNTING = ParameterSpec("star_mounting", "deg", kind="rotation", frame="b")
 MOUNTING = _MOUNTING.name
 
-# By how much the norm of a quaternion may differ from 1: what four decimals leave of it.
+# By how much the norm of a quaternion may differ from 1. Chosen: what four decimals leave of it.
 _NORM = 1e-3
-# Vectors closer to one line than this, rad, are parallel: they leave the rotation about
-# themselves open.
+# Vectors closer to one line than this, rad, are parallel. Chosen: they show the rotation about
+# themselves a thousand times less well than the other two.
 _PARALLEL = 1e-3
-# Probability of a misfit of stars below which it is no chance.
+# Probability of a misfit of stars below which it is no chance. Chosen: one trial in 10 000.
 _BY_CHANCE = 1e-4
 # Misfit of stars to their catalogue that no standard deviation stated too small explains: chosen.
 _WRONG_STARS = 3.0

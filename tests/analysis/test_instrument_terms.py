@@ -10,7 +10,7 @@ import yaml
 from builders import build_solution
 from scipy.spatial.transform import Rotation
 
-from factorgraph_dvl.analysis.instrument_terms import ORDERS, instrument_of, rotation_of
+from factorgraph_dvl.analysis.instrument_terms import ORDERS, instrument_of
 from factorgraph_dvl.errors import DataError
 from factorgraph_dvl.geometry.rotations import exp_so3, frd_from_body
 from factorgraph_dvl.geometry.units import DEG
@@ -18,6 +18,13 @@ from factorgraph_dvl.report.files.instrument import instrument_text
 from factorgraph_dvl.solution import Estimate
 
 STD = np.array([0.02, 0.03, 0.04])
+
+
+def rotation_of(angles, order, body_axes):
+    """Return the rotation, in body axes, of roll, pitch and yaw, deg."""
+    given = angles[::-1] if order == "ZYX" else angles
+    frd = frd_from_body(body_axes)
+    return frd.T @ Rotation.from_euler(order, given, degrees=True).as_matrix() @ frd
 
 
 def calibrated(alpha_deg, body_axes="RFU"):

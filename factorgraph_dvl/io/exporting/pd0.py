@@ -35,9 +35,10 @@ _BAD = -32768
 _INSTRUMENT, _BEAM = 1, 0
 # Nominal beam angles that the format has a code for, deg.
 _ANGLES = (15, 20, 30)
-# Beams may be off the nominal ones by this, deg.
+# What beams may be off the nominal ones by, deg. Chosen: ten times what calibrations find.
 _NEAR_BEAM = 0.5
-# Angles between samples of attitude further apart than this are not interpolated, s.
+# Time between samples of attitude, s, beyond which angles are not interpolated. Chosen: a vessel
+# turns meanwhile.
 _LONGEST_STEP = 5.0
 # Bits of EZ: pitch and roll are those of the instrument; a heading would be magnetic.
 _OWN_TILT = 0b01100

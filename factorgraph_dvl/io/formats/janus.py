@@ -57,23 +57,6 @@ def from_beams(beams: Array, beam_angle: ArrayLike, convex: ArrayLike = True) ->
     )
 
 
-def to_beams(velocity: Array, beam_angle: ArrayLike, convex: ArrayLike = True) -> Array:
-    """Return velocities along beams (N, 4) of `from_beams`' (N, 4)."""
-    angle = np.broadcast_to(np.asarray(beam_angle, float), len(velocity))
-    across = np.where(np.asarray(convex, bool), 1.0, -1.0) * np.sin(angle)
-    x, y, z, error = velocity.T
-    vertical, twist = z * np.cos(angle), error * np.sin(angle) / np.sqrt(2.0)
-    return np.stack(
-        [
-            vertical + across * x + twist,
-            vertical - across * x + twist,
-            vertical - across * y - twist,
-            vertical + across * y - twist,
-        ],
-        axis=1,
-    )
-
-
 def instrument_to_outer(
     coordinates: ArrayLike,
     roll: Array,

@@ -16,9 +16,11 @@ Series = tuple[Array, Array]
 # was set by hand is off, s.
 _WIDEST_ZONE, _HAND = 13 * 3600.0, 60.0
 _ZONE = 900.0
-# Least overlap of two records that are compared, s and as a share of the shorter one.
+# Least overlap of two records that are compared, s and as a share of the shorter one. Chosen: less
+# has no change of speed.
 _OVERLAP, _SHARE = 60.0, 0.5
-# A lag is clear if speeds at it correlate by this, and elsewhere by so much less.
+# A lag is clear if speeds at it correlate by this, and elsewhere by so much less. Chosen: by
+# chance neither comes about; and the step, s, of the finer search.
 _CLEAR, _MARGIN = 0.8, 0.1
 _FINE = 0.1
 # Records beyond this are thinned out: three days at 1 Hz.

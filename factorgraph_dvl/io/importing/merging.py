@@ -16,9 +16,9 @@ from factorgraph_dvl.io.importing.time_base import Timed
 # Records by which a stream is judged. Chosen: enough for shares of a percent.
 SAMPLE = 20_000
 CHUNK = 100_000
-# Stamps of one instant differ by the digits of their formats, s.
+# Difference of stamps, s, that is one instant. Chosen: the digits of formats.
 _SAME = 1e-3
-# A gap is longer than so many usual intervals.
+# Usual intervals that make a gap. Chosen: some lost samples are none.
 _GAP = 10.0
 
 

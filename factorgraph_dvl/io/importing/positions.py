@@ -26,11 +26,11 @@ _STD_BY_QUALITY = {1: 3.0, 2: 1.0, 3: 1.0, 4: 0.02, 5: 0.3, 9: 1.0}
 _UNKNOWN_STD, _VERTICAL = 3.0, 2.0
 # Chosen: heave of a vessel whose fixes have no height, m.
 _HEAVE_STD = 2.0
-# Below this speed a course is noise, m/s.
+# Speed, m/s, below which a course is noise. Chosen: three times that of a Doppler velocity.
 _SLOWEST = 0.3
 # Chosen: of velocities by Doppler, m/s, and how long a receiver's filter correlates them, s.
 VELOCITY_STD, VELOCITY_CORRELATION = 0.1, 2.0
-# A course belongs to the fix of the same instant, s.
+# Difference of stamps, s, up to which a course belongs to a fix. Chosen: half of it at 10 Hz.
 _TOGETHER = 0.05
 
 

@@ -10,9 +10,11 @@ from factorgraph_dvl.io.formats.catalogue import FORMATS
 from factorgraph_dvl.io.formats.format import Format
 from factorgraph_dvl.io.formats.framing import Source, map_file
 
-# Bytes from the start, and as many from the middle, in which formats are looked for.
+# Bytes from the start, and as many from the middle, in which formats are looked for. Chosen: some
+# minutes of a log, read in milliseconds.
 _SAMPLE = 1 << 20
-# A format that explains less than this share of the sample is there by chance.
+# Share of the sample below which a format is there by chance. Chosen: a checksum of two digits
+# fits one line in 256.
 _LEAST_SHARE = 0.01
 
 

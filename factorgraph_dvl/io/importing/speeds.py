@@ -14,7 +14,7 @@ from factorgraph_dvl.io.importing.spool import Stream
 
 # Mean radius of the Earth, m: near enough for the speed between two fixes.
 _EARTH = 6.371e6
-# Fixes further apart than this give no speed, s.
+# Time between fixes, s, beyond which they give no speed. Chosen: a vessel turns meanwhile.
 _LONGEST_STEP = 5.0
 
 

@@ -20,7 +20,7 @@ from factorgraph_dvl.io.importing.spool import Stream
 FIRST_DATE = 1e8
 # Receivers report a fix by this much late, s: what two clocks that are compared by it are off.
 _LATENCY = 0.5
-# Prior where stamps of two files were taken as they are, s.
+# Prior where stamps of two files were taken as they are, s. Chosen: computers set by hand.
 _UNCOMPARED = 5.0
 # Time zones are multiples of this, s.
 _ZONE = 900.0

@@ -31,7 +31,7 @@ from factorgraph_dvl.solution import Estimate
 
 # Points of a line. Chosen: more than a panel has pixels.
 _POINTS = 2000
-# The axes show what is left of the error from this share of the record on.
+# Share of the record from which on errors set the axes. Chosen: before it they are far larger.
 _SHOWN_FROM = 0.15
 
 
