@@ -8,7 +8,7 @@ from factorgraph_dvl.planning import requirements
 
 CALM = {"sway": {}, "current_m_s": [0.2, 0, 0]}
 
-STRAIGHT = {"manoeuvres": [{"straight_s": 60}], **CALM}
+STRAIGHT = {"manoeuvres": [{"straight_s": 60}], "imu": {"rate_hz": 50}, **CALM}
 
 WALKING = {"imu": {"gyro_noise_deg_sqrt_h": 0.1, "gyro_bias_walk_deg_h_sqrt_h": 1.0}}
 

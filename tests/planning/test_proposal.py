@@ -142,11 +142,12 @@ def test_a_search_that_ends_early_says_so(monkeypatch):
 
 
 def test_a_bias_that_walks_is_searched_for():
-    changes = {"imu": {"gyro_noise_deg_sqrt_h": 0.01, "gyro_bias_walk_deg_h_sqrt_h": 0.01}}
-    prediction = predict(scenario(**changes, **STRAIGHT))
+    walk = {"gyro_noise_deg_sqrt_h": 0.01, "gyro_bias_walk_deg_h_sqrt_h": 0.01}
+    plan = STRAIGHT | {"imu": STRAIGHT["imu"] | walk}
+    prediction = predict(scenario(**plan))
     assert "gyro_bias_x_deg_h" not in prediction.history.names
     before = std_of(prediction.solution)["gyro_bias_x_deg_h"]
-    more = predict(scenario(**changes, **{**STRAIGHT, "manoeuvres": [{"straight_s": 60}] * 2}))
+    more = predict(scenario(**plan | {"manoeuvres": [{"straight_s": 60}] * 2}))
     after = std_of(more.solution)["gyro_bias_x_deg_h"]
     required = required_of(prediction, gyro_bias_x_deg_h=after)
     found = propose(prediction, required)
