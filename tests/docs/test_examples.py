@@ -24,6 +24,11 @@ def test_example_calibrates_the_shipped_trial(monkeypatch, capsys):
     truth = load_trial(SHIPPED).calibration_truth
     assert float(printed["lever_arm_z_m"]) == pytest.approx(truth["lever_arm_m"][2], abs=0.003)
     assert float(printed["misalignment_z_deg"]) == pytest.approx(30.0, abs=0.05)
+    for page in ("getting-started.md", "getting-started.zh.md"):
+        text = (ROOT / "docs" / page).read_text(encoding="utf-8")
+        ((value, std),) = re.findall(r"`([\d.]+) ± ([\d.]+)` deg", text)
+        shown = float(printed["misalignment_z_deg"])
+        assert shown == pytest.approx(float(value), abs=0.1 * float(std))
 
 
 def test_python_of_the_readme(monkeypatch, tmp_path, capsys):
