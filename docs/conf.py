@@ -36,7 +36,7 @@ html_css_files = ["site.css"]
 html_sidebars = {
     name: [] for name in ("getting-started", "getting-started.zh", "glossary", "comparison")
 }
-html_theme_options = {"show_toc_level": 2, "header_links_before_dropdown": 6}
+html_theme_options = {"show_toc_level": 2}
 html_show_sourcelink = False
 html_copy_source = False
 # Code without a language, such as equations in plain text, is no Python.
