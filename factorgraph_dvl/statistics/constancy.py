@@ -13,6 +13,12 @@ from factorgraph_dvl.statistics.rows import product
 
 # Intervals in which a trial is divided. Chosen: a change is found to half a percent of the trial.
 INTERVALS = 200
+# Parts whose scores must agree but for white noise, and degrees of freedom that show it. Chosen:
+# parts last as long as noise is correlated, and a tenth of their number is chance.
+_PARTS = 20
+_LEAST_PARTS = 10
+# Fall of the cost below which a change is none anyway. Chosen: 4 standard deviations.
+_WORTH_IT = 16.0
 # Least share of a parameter's information that either side of a change must have. Chosen: with
 # less, a few measurements would decide.
 _LEAST_SHARE = 0.05
@@ -28,7 +34,8 @@ class Change:
     Parameters
     ----------
     chi2 : float
-        Twice the fall of the cost if the component changed then, one degree of freedom.
+        Twice the fall of the cost if the component changed then, one degree of freedom; less
+        where the scores of parts of the trial scatter more than white noise makes them.
     time : float, s
         When.
     size, std : float
@@ -42,7 +49,7 @@ class Change:
 
     @property
     def significance(self) -> float:
-        """Size in standard deviations."""
+        """Size in standard deviations, as many as the scatter of the scores allows."""
         return float(np.sqrt(self.chi2))
 
 
@@ -97,8 +104,30 @@ def changes(
             std = scale[i] / np.sqrt(V[k, i])
             # What came before asks for a value by its score, what comes after for the opposite.
             change = -np.sign(before[k, i]) * np.sqrt(chi2[k, i]) * std
-        out.append(Change(float(chi2[k, i]), float(edges[k]), float(change), float(std)))
+        most = float(chi2[k, i])
+        if most > _WORTH_IT:
+            most /= _scatter(score, information, int(k) + 1, i)
+        out.append(Change(most, float(edges[k]), float(change), float(std)))
     return out
+
+
+def _scatter(score: Array, information: Array, change: int, i: int) -> float:
+    """Return how much more scores of component i scatter than white noise makes them.
+
+    Once all components change before the interval `change`. Noise that is correlated in a way that
+    the model does not have makes the scores of parts of a trial scatter more.
+    """
+    edges = np.union1d(np.arange(0, INTERVALS, INTERVALS // _PARTS), [change]).astype(np.intp)
+    scores, known = np.add.reduceat(score, edges), np.add.reduceat(information, edges)
+    squares = freedom = 0.0
+    for side in (edges < change, edges >= change):
+        s, own = scores[side], known[side]
+        total = own.sum(axis=0)
+        step = np.linalg.lstsq(total, s.sum(axis=0), rcond=_LEAST_LEFT)[0]
+        left, used = (s - own @ step)[:, i], own[:, i, i] > 0.0
+        squares += float(np.sum(left[used] ** 2 / own[used, i, i]))
+        freedom += max(int(used.sum()) - 1, 0)
+    return max(1.0, squares / freedom) if freedom >= _LEAST_PARTS else 1.0
 
 
 def by_interval(
