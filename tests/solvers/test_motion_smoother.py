@@ -72,7 +72,7 @@ def test_causes_add_up_to_the_variances(solution):
 
 def test_the_phase_is_known_better_relative_to_the_compass(solution):
     (note,) = (f for f in solution.findings if f.code == Code.HEADING_ERROR)
-    alone, together = (float(part.split("±")[1].split()[0]) for part in str(note).split(";"))
+    alone, together = (float(part.split()[0]) for part in str(note).split("±")[1:])
     assert together < alone
     assert alone == pytest.approx(solution.estimate("misalignment_deg").std[2], rel=0.1)
 
