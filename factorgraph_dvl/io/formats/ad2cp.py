@@ -10,17 +10,20 @@ import re
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.io.formats.clocks import posix
 from factorgraph_dvl.io.formats.framing import BLOCK, Records, Source, number
+from factorgraph_dvl.io.formats.losses import Frame, Losses, count_stretch
 
 ENU, XYZ, BEAM = range(3)
 BOTTOM, BURST, AVERAGE, TEXT = 0x17, 0x15, 0x16, 0xA0
 # Nucleus frames its packets alike, with kinds of its own.
 NUCLEUS = 0x20
+_SYNC = b"\xa5"
 _SEED = 0xB58C
 # Bytes of a header, 12 in its long form.
 _HEADER = 10
@@ -94,7 +97,9 @@ class Ad2cp:
     text: tuple[str, ...]
 
 
-def read_ad2cp(source: Source, block: int = BLOCK) -> Iterator[Ad2cp]:
+def read_ad2cp(
+    source: Source, block: int = BLOCK, losses: Losses | None = None
+) -> Iterator[Ad2cp]:
     """Read records whose checksums are right.
 
     Parameters
@@ -103,14 +108,17 @@ def read_ad2cp(source: Source, block: int = BLOCK) -> Iterator[Ad2cp]:
         The file.
     block : int
         Number of records at a time.
+    losses : Losses, optional
+        Takes counts of what was left out.
 
     Yields
     ------
     Ad2cp
     """
+    losses = Losses() if losses is None else losses
     pings: list[tuple[int, bytes]] = []
     text: list[str] = []
-    for family, kind, start, stop in frames(source):
+    for family, kind, start, stop in frames(source, losses):
         if family == NUCLEUS:
             continue
         if kind == BOTTOM:
@@ -118,9 +126,9 @@ def read_ad2cp(source: Source, block: int = BLOCK) -> Iterator[Ad2cp]:
         elif kind == TEXT:
             text.append(source[start + 1 : stop].rstrip(b"\0").decode("latin-1"))
         if len(pings) + len(text) >= block:
-            yield Ad2cp(_bottom_track(pings), tuple(text))
+            yield Ad2cp(_bottom_track(pings, losses), tuple(text))
             pings, text = [], []
-    yield Ad2cp(_bottom_track(pings), tuple(text))
+    yield Ad2cp(_bottom_track(pings, losses), tuple(text))
 
 
 def beam_matrix(text: str) -> np.ndarray[tuple[int, int], np.dtype[np.float64]] | None:
@@ -136,38 +144,61 @@ def beam_matrix(text: str) -> np.ndarray[tuple[int, int], np.dtype[np.float64]] 
     return out if out.size and np.isfinite(out).all() else None
 
 
-def frames(source: Source) -> Iterator[tuple[int, int, int, int]]:
+def frames(source: Source, losses: Losses | None = None) -> Iterator[tuple[int, int, int, int]]:
     """Find records of Nortek's instruments whose checksums are right.
 
     Parameters
     ----------
     source : Source
         The file.
+    losses : Losses, optional
+        Takes counts of what was left out.
 
     Yields
     ------
     Family, kind, and start and stop of what stands behind the header.
     """
-    at, size = 0, len(source)
-    while (at := source.find(b"\xa5", at)) >= 0:
-        header = source[at : at + 12]
-        long = header[1:2] == b"\x0c"
-        if header[1:2] not in (b"\x0a", b"\x0c") or len(header) < header[1]:
-            at += 1
-            continue
-        layout = struct.Struct("<BBBBIHH" if long else "<BBBBHHH")
-        _, head, kind, family, length, data_sum, head_sum = layout.unpack_from(header)
-        start, stop = at + head, at + head + length
-        if (
-            checksum(header[: head - 2]) != head_sum
-            or length > _LARGEST
-            or stop > size
-            or checksum(source[start:stop]) != data_sum
-        ):
-            at += 1
-            continue
-        yield family, kind, start, stop
-        at = stop
+    losses = Losses() if losses is None else losses
+    at, free, size = 0, 0, len(source)
+    while (at := source.find(_SYNC, at)) >= 0:
+        header = _header(source, at)
+        if header is not None:
+            stop = at + header.size + header.length
+            if stop <= size and checksum(source[at + header.size : stop]) == header.data_sum:
+                count_stretch(source, free, at, losses, _FRAME)
+                yield header.family, header.kind, at + header.size, stop
+                at = free = stop
+                continue
+        at += 1
+    count_stretch(source, free, size, losses, _FRAME)
+
+
+class _Header(NamedTuple):
+    size: int
+    kind: int
+    family: int
+    length: int
+    data_sum: int
+
+
+def _header(source: Source, at: int) -> _Header | None:
+    """Return the header at a position, None if there is none whose own checksum is right."""
+    raw = source[at : at + 12]
+    if raw[1:2] not in (b"\x0a", b"\x0c") or len(raw) < raw[1]:
+        return None
+    layout = struct.Struct("<BBBBIHH" if raw[1] == 12 else "<BBBBHHH")
+    _, *fields, head_sum = layout.unpack_from(raw)
+    header = _Header(*fields)
+    is_right = checksum(raw[: header.size - 2]) == head_sum and header.length <= _LARGEST
+    return header if is_right else None
+
+
+def _size(source: Source, at: int) -> int:
+    header = _header(source, at)
+    return 0 if header is None else header.size + header.length
+
+
+_FRAME = Frame("record", _SYNC, _size)
 
 
 def checksum(data: bytes) -> int:
@@ -189,7 +220,7 @@ def covered(sample: bytes) -> int:
     return sum(stop - start + _HEADER for family, _, start, stop in found if family != NUCLEUS)
 
 
-def _bottom_track(pings: list[tuple[int, bytes]]) -> Records:
+def _bottom_track(pings: list[tuple[int, bytes]], losses: Losses) -> Records:
     """Return the pings of DF20 records, in the order of the file."""
     alike: dict[bytes, list[tuple[int, bytes]]] = {}
     for at, record in pings:
@@ -199,6 +230,9 @@ def _bottom_track(pings: list[tuple[int, bytes]]) -> Records:
             alike.setdefault(key, []).append((at, record))
     parts = [_alike(group) for group in alike.values()]
     out = np.concatenate(parts) if parts else np.empty(0, PING)
+    if pings:
+        impossible = len(pings) - len(out)
+        losses.add("record of bottom track with an impossible layout", pings[0][0], impossible)
     return out[np.argsort(out["at"], kind="stable")]
 
 

@@ -17,14 +17,19 @@ from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.io.formats.clocks import posix
 from factorgraph_dvl.io.formats.format import positive
 from factorgraph_dvl.io.formats.framing import BLOCK, Records, Source, number
+from factorgraph_dvl.io.formats.losses import Losses
 from factorgraph_dvl.io.formats.nmea import second_of_day
-from factorgraph_dvl.io.formats.sentences import Sentence, sentences
+from factorgraph_dvl.io.formats.sentences import NOT_USABLE, Sentence, sentences
 from factorgraph_dvl.io.formats.velocities import EARTH, INSTRUMENT, records, without
 
 Row = dict[str, object]
+# Fields of the two sentences of Cerulean.
+_INCREMENT, _EXTENDED = 9, 34
 
 
-def read_nortek(source: Source, block: int = BLOCK) -> Iterator[Records]:
+def read_nortek(
+    source: Source, block: int = BLOCK, losses: Losses | None = None
+) -> Iterator[Records]:
     """Read bottom track of Nortek DVLs: formats 300, 301, 350, 351 and 356 to 359.
 
     Parameters
@@ -33,6 +38,8 @@ def read_nortek(source: Source, block: int = BLOCK) -> Iterator[Records]:
         The file.
     block : int
         Number of pings at a time.
+    losses : Losses, optional
+        Takes counts of what was left out.
 
     Yields
     ------
@@ -40,6 +47,7 @@ def read_nortek(source: Source, block: int = BLOCK) -> Iterator[Records]:
         (N,) of `VELOCITY`; of formats that have a sentence for each beam, one record for
         the beams of one time.
     """
+    losses = Losses() if losses is None else losses
     rows: list[Row] = []
     for sentence in sentences(source, b"PNORBT[016789]?"):
         # With tags, in the same order: `NAME=value`.
@@ -49,6 +57,7 @@ def read_nortek(source: Source, block: int = BLOCK) -> Iterator[Records]:
         if row is None and name in (b"", b"0", b"1"):
             row = _beam(fields, rows[-1] if rows else {})
         if row is None:
+            losses.add(NOT_USABLE, sentence.at)
             continue
         if "at" not in row:
             row["at"] = sentence.at
@@ -95,7 +104,9 @@ def _beam(fields: list[bytes], last: Row) -> Row | None:
     return row
 
 
-def read_cerulean(source: Source, block: int = BLOCK) -> Iterator[tuple[Records, Records]]:
+def read_cerulean(
+    source: Source, block: int = BLOCK, losses: Losses | None = None
+) -> Iterator[tuple[Records, Records]]:
     """Read Cerulean's position increments and extended data.
 
     Parameters
@@ -104,6 +115,8 @@ def read_cerulean(source: Source, block: int = BLOCK) -> Iterator[tuple[Records,
         The file.
     block : int
         Number of pings at a time.
+    losses : Losses, optional
+        Takes counts of what was left out.
 
     Yields
     ------
@@ -111,24 +124,26 @@ def read_cerulean(source: Source, block: int = BLOCK) -> Iterator[tuple[Records,
     before, in vehicle axes, `second` since the instrument's start; of `$DVEXT`, in Earth
     axes, `second` the sum of its elapsed times.
     """
+    losses = Losses() if losses is None else losses
     increments: list[Row] = []
     extended: list[Row] = []
     elapsed = 0.0
     for sentence in sentences(source, b"DVPD[LX]|DVEXT"):
+        if len(sentence.fields) < (_EXTENDED if sentence.address == b"DVEXT" else _INCREMENT):
+            losses.add(NOT_USABLE, sentence.at)
+            continue
         if sentence.address == b"DVEXT":
             elapsed = _extended(sentence, extended, elapsed)
-        elif (row := _increment(sentence)) is not None:
-            increments.append(row)
+        else:
+            increments.append(_increment(sentence))
         if len(increments) + len(extended) >= block:
             yield records(increments, INSTRUMENT), records(extended, EARTH)
             increments, extended = [], []
     yield records(increments, INSTRUMENT), records(extended, EARTH)
 
 
-def _increment(sentence: Sentence) -> Row | None:
-    if len(sentence.fields) < 9:
-        return None
-    values = np.array([number(field) for field in sentence.fields[:9]])
+def _increment(sentence: Sentence) -> Row:
+    values = np.array([number(field) for field in sentence.fields[:_INCREMENT]])
     interval = values[1] * 1e-6
     # Without confidence the rest means nothing.
     good = values[8] > 0.0 and interval > 0.0
@@ -137,8 +152,6 @@ def _increment(sentence: Sentence) -> Row | None:
 
 
 def _extended(sentence: Sentence, rows: list[Row], elapsed: float) -> float:
-    if len(sentence.fields) < 34:
-        return elapsed
     fields = sentence.fields
     step = number(fields[13])
     elapsed += step if 0.0 <= step < 3600.0 else 0.0

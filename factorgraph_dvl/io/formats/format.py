@@ -11,6 +11,7 @@ To add a format, write a module in this package that has
 
 and put it into the table of `catalogue.py`. From there `import` knows it. What a reader decides
 (a sign, an axis, a unit) it says in `Batch.notes`, one sentence each: they go to `import.log`.
+What it leaves out because it is damaged it counts in `Losses`, which its last batch has.
 A third-party library is imported inside `read`, and named with its extra in `Format`.
 
 Records of all kinds have `at`, their position in the file; `time`, on the clock that the batch
@@ -31,6 +32,7 @@ import numpy as np
 from factorgraph_dvl.geometry.rotations import BodyAxes
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.io.formats.framing import Records
+from factorgraph_dvl.io.formats.losses import Losses
 
 Family = Literal["dvl", "ins", "gnss", "vehicle", "table"]
 Kind = Literal[
@@ -134,6 +136,8 @@ class Batch:
         What headings refer to.
     notes : tuple of str, optional
         What the reader decided, and why; the same sentence again is logged once.
+    losses : Losses, optional
+        What was left out of the file since the batch before that has some.
     """
 
     kind: Kind
@@ -143,6 +147,7 @@ class Batch:
     axes: BodyAxes | Literal[""] = ""
     heading: HeadingReference = "unknown"
     notes: tuple[str, ...] = ()
+    losses: Losses | None = None
 
 
 Reader = Callable[[Path, Mapping[str, Any] | None], Iterator[Batch]]
@@ -194,6 +199,11 @@ class Format:
 def positive(values: Array) -> Array:
     """Return values above 0, and nan in place of others, which stand for what is not known."""
     return np.where(values > 0.0, values, np.nan)
+
+
+def left_out(losses: Losses) -> Batch:
+    """Return a batch without records, for what was left out of a file."""
+    return Batch("clock", empty("clock", 0), losses=losses)
 
 
 def empty(kind: Kind, count: int) -> Records:

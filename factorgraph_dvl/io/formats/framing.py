@@ -87,7 +87,7 @@ def summed_frames(
     source : Source
         The stream.
     sync : bytes
-        Two bytes that every frame starts with.
+        Bytes that every frame starts with.
     length : callable
         Given a window and positions (N,) in it with `shortest` bytes behind each,
         returns the numbers (N,) of bytes from the sync to the checksum; 0 where no
@@ -106,7 +106,8 @@ def summed_frames(
         last = min(WINDOW, len(data) - shortest - 1)
         if last <= 0:
             continue
-        at = np.flatnonzero((data[:last] == sync[0]) & (data[1 : last + 1] == sync[1]))
+        begins = [data[i : last + i] == byte for i, byte in enumerate(sync)]
+        at = np.flatnonzero(np.logical_and.reduce(begins))
         if not len(at):
             continue
         stop = at + length(data, at)

@@ -20,7 +20,8 @@ from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.io.formats.clocks import in_order, posix
 from factorgraph_dvl.io.formats.framing import BLOCK_OF_LINES, Records, Source, number
-from factorgraph_dvl.io.formats.sentences import Sentence, sentences
+from factorgraph_dvl.io.formats.losses import Losses
+from factorgraph_dvl.io.formats.sentences import NOT_USABLE, Sentence, sentences
 
 KNOT = 1852.0 / 3600.0
 _HEAD = [("at", "i8"), ("received", "f8"), ("checked", "?"), ("talker", "S2")]
@@ -54,7 +55,9 @@ KINDS = {
 }
 
 
-def read_nmea(source: Source, block: int = BLOCK_OF_LINES) -> Iterator[dict[str, Records]]:
+def read_nmea(
+    source: Source, block: int = BLOCK_OF_LINES, losses: Losses | None = None
+) -> Iterator[dict[str, Records]]:
     """Read sentences.
 
     Parameters
@@ -63,6 +66,8 @@ def read_nmea(source: Source, block: int = BLOCK_OF_LINES) -> Iterator[dict[str,
         The stream.
     block : int
         Number of sentences at a time.
+    losses : Losses, optional
+        Takes counts of sentences with fewer fields than they should have.
 
     Yields
     ------
@@ -70,11 +75,15 @@ def read_nmea(source: Source, block: int = BLOCK_OF_LINES) -> Iterator[dict[str,
         Structured arrays by the names of `KINDS`, in the order of the stream; what was
         empty or unreadable in a sentence is nan.
     """
+    losses = Losses() if losses is None else losses
     rows: dict[str, list[tuple[object, ...]]] = {name: [] for name in KINDS}
     count = 0
     for sentence in sentences(source, ADDRESSES):
         kind, row = decode(sentence)
         if row is None:
+            # $PASHR has other forms, whose fields are others.
+            if kind in KINDS and kind != "PASHR":
+                losses.add(NOT_USABLE, sentence.at)
             continue
         head = (sentence.at, sentence.received, sentence.checked, sentence.address[:2])
         rows[kind].append((*head, *row))

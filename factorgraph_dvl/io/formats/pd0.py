@@ -28,9 +28,11 @@ from factorgraph_dvl.io.formats.framing import (
     summed_frames,
     u16,
 )
+from factorgraph_dvl.io.formats.losses import Losses, count_outside, summed
 from factorgraph_dvl.io.formats.pd0_navigation import VMDAS, embedded_sentences, vmdas_fixes
 
 BEAM, INSTRUMENT, SHIP, EARTH = range(4)
+_SYNC = b"\x7f\x7f"
 # At least a header with one data type, at most what 16 bits can count.
 _SHORTEST, _LONGEST = 8, 65535
 # Ensembles at a time: profiles of 255 cells then take 17 MB.
@@ -148,38 +150,48 @@ class Block:
     nmea: dict[str, Records]
 
 
-def read_pd0(source: Source) -> Iterator[Block]:
+def read_pd0(source: Source, losses: Losses | None = None) -> Iterator[Block]:
     """Read ensembles whose checksum is right and that have both leaders.
 
     Parameters
     ----------
     source : Source
         The file.
+    losses : Losses, optional
+        Takes counts of what was left out.
 
     Yields
     ------
     Block
     """
-    for frames in summed_frames(source, b"\x7f\x7f", _length, _SHORTEST, _LONGEST):
+    losses = Losses() if losses is None else losses
+    for frames in count_outside(source, _frames(source), losses, _FRAME, 2):
         for first in range(0, len(frames), _MOST):
             part = frames[first : first + _MOST]
             begin = int(part[0, 0])
             data = as_bytes(source, begin, int(part[-1, 1]))
             block = _block(data, part - begin, begin)
+            losses.add("ensemble without leaders", begin, len(part) - len(block.pings))
             if len(block.pings):
                 yield block
 
 
 def covered(sample: bytes) -> int:
     """Return the number of bytes of a sample that lie in ensembles whose checksum is right."""
-    found = summed_frames(sample, b"\x7f\x7f", _length, _SHORTEST, _LONGEST)
-    return sum(int(np.sum(frames[:, 1] - frames[:, 0] + 2)) for frames in found)
+    return sum(int(np.sum(frames[:, 1] - frames[:, 0] + 2)) for frames in _frames(sample))
+
+
+def _frames(source: Source) -> Iterator[Index]:
+    return summed_frames(source, _SYNC, _length, _SHORTEST, _LONGEST)
 
 
 def _length(data: Bytes, at: Index) -> Index:
     length = u16(data, at + 2)
     types = data[at + 5].astype(np.int64)
     return np.where((types > 0) & (length >= 6 + 2 * types), length, 0)
+
+
+_FRAME = summed("ensemble", _SYNC, _length, _SHORTEST)
 
 
 class _Types:

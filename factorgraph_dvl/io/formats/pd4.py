@@ -7,7 +7,7 @@ beam velocities in beam coordinates is not verified.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 
 import numpy as np
 
@@ -21,8 +21,11 @@ from factorgraph_dvl.io.formats.framing import (
     summed_frames,
     u16,
 )
+from factorgraph_dvl.io.formats.losses import Losses, count_outside, summed
 from factorgraph_dvl.io.formats.velocities import BEAM, empty
 
+_SYNC = b"\x7d"
+# Bytes of the two structures, which the second byte tells apart, without the checksum.
 _PD4, _PD5 = 45, 86
 _LAYOUT = np.dtype(
     {
@@ -39,13 +42,15 @@ _LAYOUT = np.dtype(
 )
 
 
-def read_pd4(source: Source) -> Iterator[Records]:
+def read_pd4(source: Source, losses: Losses | None = None) -> Iterator[Records]:
     """Read PD4 and PD5 ensembles whose checksum is right.
 
     Parameters
     ----------
     source : Source
         The file; other bytes, such as commands, may stand between ensembles.
+    losses : Losses, optional
+        Takes counts of what was left out.
 
     Yields
     ------
@@ -53,20 +58,23 @@ def read_pd4(source: Source) -> Iterator[Records]:
         (N,) of `VELOCITY`; `second` of the day by the DVL's clock, as there is no date.
         Roll, pitch, heading and depth are in PD5 only.
     """
-    for sync, length in ((b"\x7d\x00", _PD4), (b"\x7d\x01", _PD5)):
-        for frames in summed_frames(source, sync, _length(length), _PD4, _PD5):
-            begin = int(frames[0, 0])
-            data = as_bytes(source, begin, int(frames[-1, 1]))
-            at = (frames[:, 0] - begin)[:, None] + np.arange(_PD5)
-            raw = np.where(at < frames[:, 1:] - begin, data[np.minimum(at, len(data) - 1)], 0)
-            yield _records(np.ascontiguousarray(raw, np.uint8).view(_LAYOUT)[:, 0], frames[:, 0])
+    losses = Losses() if losses is None else losses
+    found = summed_frames(source, _SYNC, _length, _PD4, _PD5)
+    for frames in count_outside(source, found, losses, _FRAME, 2):
+        begin = int(frames[0, 0])
+        data = as_bytes(source, begin, int(frames[-1, 1]))
+        at = (frames[:, 0] - begin)[:, None] + np.arange(_PD5)
+        raw = np.where(at < frames[:, 1:] - begin, data[np.minimum(at, len(data) - 1)], 0)
+        yield _records(np.ascontiguousarray(raw, np.uint8).view(_LAYOUT)[:, 0], frames[:, 0])
 
 
-def _length(length: int) -> Callable[[Bytes, Index], Index]:
-    def stated(data: Bytes, at: Index) -> Index:
-        return np.where(u16(data, at + 2) == length, length, 0)
+def _length(data: Bytes, at: Index) -> Index:
+    structure = data[at + 1]
+    length = np.select([structure == 0, structure == 1], [_PD4, _PD5], 0)
+    return np.where(u16(data, at + 2) == length, length, 0)
 
-    return stated
+
+_FRAME = summed("ensemble", _SYNC, _length, _PD4)
 
 
 def _records(raw: Records, at: Index) -> Records:

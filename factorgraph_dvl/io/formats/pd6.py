@@ -16,6 +16,7 @@ from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.io.formats.clocks import posix
 from factorgraph_dvl.io.formats.format import positive
 from factorgraph_dvl.io.formats.framing import BLOCK, Records, Source, lines, number
+from factorgraph_dvl.io.formats.losses import Losses
 from factorgraph_dvl.io.formats.velocities import EARTH, INSTRUMENT, SHIP, VELOCITY, empty
 
 # In the order of preference: what is nearest to the instrument.
@@ -25,7 +26,9 @@ _LINE = re.compile(rb"(:SA|:TS|:RA|:BI|:BS|:BE|:BD),([^:]*)")
 _BAD = -32768.0
 
 
-def read_pd6(source: Source, block: int = BLOCK) -> Iterator[Records]:
+def read_pd6(
+    source: Source, block: int = BLOCK, losses: Losses | None = None
+) -> Iterator[Records]:
     """Read ensembles, each from its attitude line to the next.
 
     Parameters
@@ -34,6 +37,8 @@ def read_pd6(source: Source, block: int = BLOCK) -> Iterator[Records]:
         The file.
     block : int
         Number of ensembles at a time.
+    losses : Losses, optional
+        Takes counts of what was left out.
 
     Yields
     ------
@@ -41,6 +46,7 @@ def read_pd6(source: Source, block: int = BLOCK) -> Iterator[Records]:
         (N,) of `VELOCITY`, in instrument axes where the file has them, else ship or Earth
         axes. Ranges are in PD13 only, `altitude` in both.
     """
+    losses = Losses() if losses is None else losses
     out: list[Records] = []
     ping: Records | None = None
     best = EARTH
@@ -51,6 +57,7 @@ def read_pd6(source: Source, block: int = BLOCK) -> Iterator[Records]:
             continue
         start, name, fields = match.start(), match[1], match[2].strip().split(b",")
         if len(fields) < _FIELDS[name]:
+            losses.add("line with too few fields", at)
             continue
         if name == b":SA":
             if ping is not None:

@@ -15,6 +15,7 @@ import numpy as np
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.io.formats.clocks import posix
 from factorgraph_dvl.io.formats.framing import BLOCK, Records, Source
+from factorgraph_dvl.io.formats.losses import Frame, Losses, count_stretch
 from factorgraph_dvl.io.formats.nmea import KINDS, read_nmea
 from factorgraph_dvl.io.formats.velocities import BEAM, INSTRUMENT, VELOCITY, empty, without
 
@@ -22,13 +23,17 @@ from factorgraph_dvl.io.formats.velocities import BEAM, INSTRUMENT, VELOCITY, em
 # the manual, the size chosen.
 _SYNC = b"\x80" * 16
 _LARGEST = 1 << 20
+# Bytes before the data: sync, and number and length with their inverses.
+_HEADER = 32
 _BAD = 88.888
 # Floats before the first array of bottom track.
 _HEAD = 14
 _SIZES = {10: 4, 20: 4, 50: 1}
 
 
-def read_rowe(source: Source, block: int = BLOCK) -> Iterator[tuple[Records, dict[str, Records]]]:
+def read_rowe(
+    source: Source, block: int = BLOCK, losses: Losses | None = None
+) -> Iterator[tuple[Records, dict[str, Records]]]:
     """Read ensembles whose checksum is right.
 
     Parameters
@@ -37,6 +42,8 @@ def read_rowe(source: Source, block: int = BLOCK) -> Iterator[tuple[Records, dic
         The file.
     block : int
         Number of ensembles at a time.
+    losses : Losses, optional
+        Takes counts of what was left out.
 
     Yields
     ------
@@ -46,7 +53,7 @@ def read_rowe(source: Source, block: int = BLOCK) -> Iterator[tuple[Records, dic
     """
     pings: list[Records] = []
     nmea: dict[str, list[Records]] = {name: [] for name in KINDS}
-    for at, payload in _ensembles(source):
+    for at, payload in _ensembles(source, Losses() if losses is None else losses):
         sets = dict(_data_sets(payload))
         time = _time(sets.get("E000008", b""))
         ping = _bottom_track(sets.get("E000010", b""))
@@ -74,26 +81,33 @@ def _stack(
     return np.concatenate(pings) if pings else np.empty(0, VELOCITY), joined
 
 
-def _ensembles(source: Source) -> Iterator[tuple[int, bytes]]:
-    at, size = 0, len(source)
+def _ensembles(source: Source, losses: Losses) -> Iterator[tuple[int, bytes]]:
+    at, free, size = 0, 0, len(source)
     while (at := source.find(_SYNC, at)) >= 0:
-        header = source[at + 16 : at + 32]
-        if len(header) == 16:
-            number, inverse, length, inverse_length = struct.unpack("<4I", header)
-            stop = at + 32 + length
-            if (
-                number ^ inverse == 0xFFFFFFFF
-                and length ^ inverse_length == 0xFFFFFFFF
-                and length <= _LARGEST
-                and stop + 4 <= size
-            ):
-                payload = source[at + 32 : stop]
-                (stated,) = struct.unpack("<I", source[stop : stop + 4])
-                if binascii.crc_hqx(payload, 0) == stated:
-                    yield at, payload
-                    at = stop + 4
-                    continue
+        stop = at + _size(source, at)
+        if at < stop <= size:
+            payload = source[at + _HEADER : stop - 4]
+            (stated,) = struct.unpack("<I", source[stop - 4 : stop])
+            if binascii.crc_hqx(payload, 0) == stated:
+                count_stretch(source, free, at, losses, _FRAME)
+                yield at, payload
+                at = free = stop
+                continue
         at += 1
+    count_stretch(source, free, size, losses, _FRAME)
+
+
+def _size(source: Source, at: int) -> int:
+    """Return the number of bytes of an ensemble, 0 if there is no header at its position."""
+    header = source[at + len(_SYNC) : at + _HEADER]
+    if len(header) < _HEADER - len(_SYNC):
+        return 0
+    number, inverse, length, inverse_length = struct.unpack("<4I", header)
+    is_header = number ^ inverse == length ^ inverse_length == 0xFFFFFFFF
+    return _HEADER + length + 4 if is_header and length <= _LARGEST else 0
+
+
+_FRAME = Frame("ensemble", _SYNC, _size)
 
 
 def _data_sets(payload: bytes) -> Iterator[tuple[str, bytes]]:

@@ -14,6 +14,7 @@ from factorgraph_dvl.errors import DataError
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.io.formats.clocks import GPS_EPOCH, gps_to_utc, posix
 from factorgraph_dvl.io.formats.framing import BLOCK_OF_LINES, Records, Source, lines, number
+from factorgraph_dvl.io.formats.losses import Losses
 
 # Angles rad, heights above the ellipsoid unless `is_geodetic` says otherwise.
 SOLUTION = np.dtype(
@@ -42,13 +43,16 @@ _COLUMNS = {
     "sdvu": "vel_std_u",
 }
 _HEADER = re.compile(rb"^%\s*(GPST|UTC|JST)\s")
+_UNREADABLE = "line without time and position"
 # Japan's time is ahead of UTC by this.
 _JST = 9 * 3600.0
 _DATE = re.compile(rb"(\d{4})/(\d\d)/(\d\d)[ ,;\t]+(\d\d):(\d\d):(\d\d(?:\.\d+)?)[ ,;\t]+(.*)")
 _WEEK = re.compile(rb"(\d{1,4})[ ,;\t]+(\d{1,6}(?:\.\d+)?)[ ,;\t]+(.*)")
 
 
-def read_rtklib(source: Source, block: int = BLOCK_OF_LINES) -> Iterator[Records]:
+def read_rtklib(
+    source: Source, block: int = BLOCK_OF_LINES, losses: Losses | None = None
+) -> Iterator[Records]:
     """Read a solution in latitude, longitude and height.
 
     Parameters
@@ -57,6 +61,8 @@ def read_rtklib(source: Source, block: int = BLOCK_OF_LINES) -> Iterator[Records
         The file.
     block : int
         Number of solutions at a time.
+    losses : Losses, optional
+        Takes counts of what was left out.
 
     Yields
     ------
@@ -68,6 +74,7 @@ def read_rtklib(source: Source, block: int = BLOCK_OF_LINES) -> Iterator[Records
     DataError
         If solutions begin without a header, or it has other coordinates.
     """
+    losses = Losses() if losses is None else losses
     rows: list[tuple[float, ...]] = []
     system, names = b"", []
     for at, line in lines(source):
@@ -77,6 +84,8 @@ def read_rtklib(source: Source, block: int = BLOCK_OF_LINES) -> Iterator[Records
             continue
         match = _DATE.match(line) or _WEEK.match(line)
         if match is None:
+            if line.strip():
+                losses.add(_UNREADABLE, at)
             continue
         if not names:
             raise DataError(
@@ -89,6 +98,7 @@ def read_rtklib(source: Source, block: int = BLOCK_OF_LINES) -> Iterator[Records
         time = _time(match, system)
         lat, lon = row.get("lat", np.nan), row.get("lon", np.nan)
         if np.isnan(time) or not (abs(lat) <= 90.0 and abs(lon) <= 360.0):
+            losses.add(_UNREADABLE, at)
             continue
         row |= {"lat": lat * DEG, "lon": lon * DEG}
         rows.append((at, time, *(row.get(n, np.nan) for n in (SOLUTION.names or ())[2:])))

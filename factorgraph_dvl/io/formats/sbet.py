@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factorgraph_dvl.geometry.units import DEG
-from factorgraph_dvl.io.formats.framing import Bytes, Records, Source, as_bytes
+from factorgraph_dvl.io.formats.framing import Bytes, Index, Records, Source, as_bytes
+from factorgraph_dvl.io.formats.losses import Losses, count_outside
 
 # Time is GPS seconds of a week that the file does not name. Angles rad, heights above the
 # ellipsoid; velocities along the axes of the wander frame, the third down.
@@ -51,13 +52,15 @@ _TINY = 1e-30
 _STEP = 1 << 20
 
 
-def read_sbet(source: Source) -> Iterator[Records]:
+def read_sbet(source: Source, losses: Losses | None = None) -> Iterator[Records]:
     """Read a trajectory.
 
     Parameters
     ----------
     source : Source
         The file.
+    losses : Losses, optional
+        Takes counts of what was left out.
 
     Yields
     ------
@@ -65,12 +68,12 @@ def read_sbet(source: Source) -> Iterator[Records]:
         (N,) of `SBET`. There is no checksum: a record counts if all its values are possible and
         so are those of a record beside it.
     """
-    yield from _read(source, SBET, _SBET_LIMITS)
+    yield from _read(source, SBET, _SBET_LIMITS, losses)
 
 
-def read_smrmsg(source: Source) -> Iterator[Records]:
+def read_smrmsg(source: Source, losses: Losses | None = None) -> Iterator[Records]:
     """Read the standard deviations of a trajectory: (N,) of `SMRMSG`, as `read_sbet` does."""
-    for part in _read(source, SMRMSG, _SMRMSG_LIMITS):
+    for part in _read(source, SMRMSG, _SMRMSG_LIMITS, losses):
         out = part.copy()
         for name in ("roll_std", "pitch_std", "heading_std"):
             out[name] *= DEG / 60.0
@@ -90,9 +93,21 @@ def true_heading(records: Records) -> NDArray[np.float64]:
 
 
 def _read(
-    source: Source, layout: np.dtype[np.void], limits: NDArray[np.float64]
+    source: Source,
+    layout: np.dtype[np.void],
+    limits: NDArray[np.float64],
+    losses: Losses | None,
 ) -> Iterator[Records]:
-    size = layout.itemsize
+    found = _places(source, layout.itemsize, limits)
+    for places in count_outside(source, found, Losses() if losses is None else losses):
+        begin = int(places[0, 0])
+        data = as_bytes(source, begin, int(places[-1, 1]))
+        at = (places[:, :1] - begin) + np.arange(layout.itemsize)
+        yield np.ascontiguousarray(data[at]).view(layout)[:, 0]
+
+
+def _places(source: Source, size: int, limits: NDArray[np.float64]) -> Iterator[Index]:
+    """Yield where records start and stop (K, 2)."""
     free = 0
     for begin in range(0, len(source), _STEP):
         # With the record before, which may be all that vouches for the first.
@@ -107,11 +122,10 @@ def _read(
         found = []
         for start in (np.flatnonzero(chained[lead : lead + _STEP]) + lead).tolist():
             if begin - lead + start >= free:
-                found.append(start)
                 free = begin - lead + start + size
+                found.append((free - size, free))
         if found:
-            at = np.array(found)[:, None] + np.arange(size)
-            yield np.ascontiguousarray(data[at]).view(layout)[:, 0]
+            yield np.array(found, np.int64)
 
 
 def _possible(data: Bytes, size: int, limits: NDArray[np.float64]) -> NDArray[np.bool_]:

@@ -18,8 +18,9 @@ from factorgraph_dvl.errors import ConfigError, DataError
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.io.formats.clocks import gps_to_utc
-from factorgraph_dvl.io.formats.format import Batch, Format, Kind, empty
+from factorgraph_dvl.io.formats.format import Batch, Format, Kind, empty, left_out
 from factorgraph_dvl.io.formats.framing import Records, Source, map_file, number
+from factorgraph_dvl.io.formats.losses import Losses
 from factorgraph_dvl.io.formats.mapping import (
     COORDINATES,
     FIELDS,
@@ -33,6 +34,7 @@ from factorgraph_dvl.io.formats.mapping import (
 _BLOCK = 1 << 23
 # Line ends of text, of which a block ends with one; a longer line is no line of a table.
 _LONGEST_LINE = 1 << 20
+_OTHER_CELLS = "row with another number of cells"
 _SEPARATORS = {",": b",", ";": b";", "tab": b"\t", "space": b" "}
 
 
@@ -82,8 +84,11 @@ def _batches(path: Path, table: TableMapping) -> Iterator[Batch]:
         )
     }
     notes = tuple(describe(table))
+    losses = Losses()
     for at, block in _blocks(source, start):
         rows, dropped = _parse(block, separator, len(names))
+        if dropped:
+            losses.add(_OTHER_CELLS, at + _place(block, dropped[0]), len(dropped))
         if not rows.num_rows:
             continue
         out = empty(_kind(table), rows.num_rows)
@@ -95,7 +100,6 @@ def _batches(path: Path, table: TableMapping) -> Iterator[Batch]:
             return _numbers(rows.column(place[name]))
 
         fill(out, table, column)
-        lost = () if not dropped else ("rows with another number of cells were left out",)
         yield Batch(
             _kind(table),
             out,
@@ -103,8 +107,9 @@ def _batches(path: Path, table: TableMapping) -> Iterator[Batch]:
             table.kind,
             table.axes,
             table.heading,
-            (*notes, *lost),
+            notes,
         )
+    yield left_out(losses)
 
 
 def fill(out: Records, table: TableMapping, column: Callable[[ColumnName], Array]) -> None:
@@ -216,15 +221,21 @@ def _blocks(source: Source, start: int) -> Iterator[tuple[int, bytes]]:
         start = stop
 
 
-def _parse(block: bytes, separator: bytes, count: int) -> tuple[pa.Table, bool]:
-    """Return the rows of a block as text, and whether some had another number of cells."""
+def _place(block: bytes, row: bytes) -> int:
+    """Return where the line of a row starts, whose spaces may be fewer than in the block."""
+    cells = rb"[ \t]+".join(re.escape(cell) for cell in row.split())
+    found = re.search(rb"(?m)^[ \t]*" + cells + rb"[ \t]*\r?$", block)
+    return 0 if found is None else found.start()
+
+
+def _parse(block: bytes, separator: bytes, count: int) -> tuple[pa.Table, list[bytes]]:
+    """Return the rows of a block as text, and those that have another number of cells."""
     if separator == b" ":
         block = re.sub(rb"[ \t]+", b" ", re.sub(rb"(?m)^[ \t]+|[ \t]+(?=\r?$)", b"", block))
-    dropped = False
+    dropped: list[bytes] = []
 
-    def skip(_: Any) -> str:
-        nonlocal dropped
-        dropped = True
+    def skip(row: Any) -> str:
+        dropped.append(row.text.encode())
         return "skip"
 
     names = [str(i) for i in range(count)]
@@ -242,7 +253,7 @@ def _parse(block: bytes, separator: bytes, count: int) -> tuple[pa.Table, bool]:
             ),
         )
     except pa.ArrowInvalid:
-        return pa.table({name: pa.array([], pa.binary()) for name in names}), True
+        return pa.table({name: pa.array([], pa.binary()) for name in names}), block.splitlines()
     return table, dropped
 
 

@@ -18,6 +18,7 @@ import numpy as np
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.io.formats.format import positive
 from factorgraph_dvl.io.formats.framing import BLOCK, Records, Source, lines, number
+from factorgraph_dvl.io.formats.losses import Losses
 from factorgraph_dvl.io.formats.velocities import INSTRUMENT, records
 
 POSITION = np.dtype(
@@ -28,7 +29,9 @@ _SERIAL = re.compile(rb"w(r[zxup]),([ -)+-~]{1,400})\*([0-9a-f]{2})")
 Row = dict[str, Any]
 
 
-def read_water_linked(source: Source, block: int = BLOCK) -> Iterator[tuple[Records, Records]]:
+def read_water_linked(
+    source: Source, block: int = BLOCK, losses: Losses | None = None
+) -> Iterator[tuple[Records, Records]]:
     """Read velocity and position reports.
 
     Parameters
@@ -37,6 +40,8 @@ def read_water_linked(source: Source, block: int = BLOCK) -> Iterator[tuple[Reco
         The file, of either protocol.
     block : int
         Number of reports at a time.
+    losses : Losses, optional
+        Takes counts of what was left out.
 
     Yields
     ------
@@ -44,6 +49,7 @@ def read_water_linked(source: Source, block: int = BLOCK) -> Iterator[tuple[Reco
     `time`: of validity, nan in old versions, which have `second`, the sum of the times
     since the report before.
     """
+    losses = Losses() if losses is None else losses
     velocities: list[Row] = []
     positions: list[tuple[float, ...]] = []
     elapsed = 0.0
@@ -52,6 +58,8 @@ def read_water_linked(source: Source, block: int = BLOCK) -> Iterator[tuple[Reco
         start = line.find(b"{")
         if start >= 0:
             message = _object(line[start:])
+            if not message:
+                losses.add("line of damaged JSON", at + start)
             if message.get("type") == "position_local":
                 positions.append((at + start, *_json_position(message)))
             elif "vx" in message and "velocity_valid" in message:
@@ -59,6 +67,7 @@ def read_water_linked(source: Source, block: int = BLOCK) -> Iterator[tuple[Reco
         elif match := _SERIAL.search(line):
             start = match.start()
             if crc8(line[start : match.end() - 3]) != int(match[3], 16):
+                losses.add("report with a wrong checksum", at + start)
                 continue
             fields = match[2].split(b",")
             if match[1] == b"rp" and len(fields) >= 9:

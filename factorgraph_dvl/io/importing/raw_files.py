@@ -12,7 +12,10 @@ import msgspec
 from factorgraph_dvl.errors import DataError
 from factorgraph_dvl.io.folders import SETTINGS_FILE, claim, new_folder
 from factorgraph_dvl.io.formats.format import Format
+from factorgraph_dvl.io.formats.framing import map_file
+from factorgraph_dvl.io.formats.losses import Losses
 from factorgraph_dvl.io.formats.mapping import MappingSettings
+from factorgraph_dvl.io.formats.sentences import text_losses
 from factorgraph_dvl.io.formats.table import FORMAT as TABLE
 from factorgraph_dvl.io.importing.assembly import (
     SUFFIX,
@@ -136,16 +139,22 @@ def _read(
     size = path.stat().st_size
     decisions.add(path.name, " and ".join(form.title for form in formats) + f", {size} bytes")
     count = 0
+    # Text is looked through once, whatever formats stand in it.
+    losses = text_losses(map_file(path)) if formats[0].in_text else Losses()
     plain = None if mapping is None else msgspec.to_builtins(mapping)
     for form in formats:
         if form.limit:
             say(f"{path.name}: {form.limit}")
         for batch in form.read(path, plain):
             spool.append(path.name, form.name, batch)
+            if batch.losses is not None:
+                losses.include(batch.losses)
             count += len(batch.records)
             if len(batch.records):
                 done = min(int(batch.records["at"][-1]) / max(size, 1), 1.0)
                 say(f"read {path.name}, {100.0 * done:.0f} %")
+    if damage := str(losses):
+        decisions.add(path.name, f"{damage} → left out")
     if not count:
         raise DataError(
             "contains no data that a trial can use",

@@ -27,7 +27,8 @@ def test_pd4_and_pd5():
     data += writers.pd4(
         2, (1.0, 2.0, 3.0, 0.0), (1, 2, 3, 4), (1, 2, 3, 4), long=True, heading=350.5
     )
-    short, long = (part for part in read_pd4(data) if len(part))
+    (found,) = read_pd4(data)
+    short, long = found[:2], found[2:]
     np.testing.assert_allclose(short["velocity"][0], [0.123, -0.456, 1.0])
     np.testing.assert_array_equal(short["axes"], [INSTRUMENT, BEAM])
     np.testing.assert_allclose(short["range"][0], [10, 11, np.nan, 12.34])

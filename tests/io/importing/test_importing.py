@@ -63,6 +63,22 @@ def column(out, table, *names):
 VELOCITY = ("vel_x_m_s", "vel_y_m_s", "vel_z_m_s")
 
 
+def test_damage_is_a_line_for_each_file(tmp_path):
+    data, text = bytearray(pings()), fixes()
+    size = len(data) // 30
+    for i in (4, 9):
+        data[i * size + 80] ^= 1
+    out, decisions = imported(tmp_path, bytes(data), text[:500] + bytes(7) + text[507:])
+    first, second = (line for line in decisions.lines if line.endswith(" → left out"))
+    assert first == (
+        f"file0: 2 ensembles with a wrong checksum, the first at byte {4 * size:,} → left out"
+    )
+    assert second.startswith("file1: 7 bytes without text")
+    assert first in (out / "import.log").read_text()
+    _, decisions = imported(tmp_path, pings(), text, force=True)
+    assert not any(line.endswith(" → left out") for line in decisions.lines)
+
+
 class TestRecognition:
     @pytest.mark.parametrize(
         ("name", "content"),

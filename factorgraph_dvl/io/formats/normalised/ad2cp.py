@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 
 from factorgraph_dvl.io.formats import ad2cp
-from factorgraph_dvl.io.formats.format import Batch, Format, empty
+from factorgraph_dvl.io.formats.format import Batch, Format, empty, left_out
 from factorgraph_dvl.io.formats.framing import Records, map_file
+from factorgraph_dvl.io.formats.losses import Losses
 from factorgraph_dvl.io.formats.nmea import join, read_nmea
 from factorgraph_dvl.io.formats.normalised.nmea import sentence_batches
 from factorgraph_dvl.io.formats.velocities import EARTH, INSTRUMENT
@@ -28,7 +29,8 @@ def share(path: Path, sample: bytes) -> float:
 def read(path: Path, mapping: Mapping[str, Any] | None = None) -> Iterator[Batch]:
     """Read a file; the parameters and the result are those of `Format.read`."""
     matrix: np.ndarray[Any, np.dtype[np.float64]] | None = None
-    for block in ad2cp.read_ad2cp(map_file(path)):
+    losses = Losses()
+    for block in ad2cp.read_ad2cp(map_file(path), losses=losses):
         for text in block.text:
             found = ad2cp.beam_matrix(text)
             matrix = matrix if found is None else found
@@ -38,6 +40,7 @@ def read(path: Path, mapping: Mapping[str, Any] | None = None) -> Iterator[Batch
         nmea = join(read_nmea(sentences))
         near = float(np.nanmedian(block.bottom["time"])) if len(block.bottom) else None
         yield from sentence_batches(nmea, near)
+    yield left_out(losses)
 
 
 def _batches(

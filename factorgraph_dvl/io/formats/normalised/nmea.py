@@ -11,8 +11,16 @@ import numpy as np
 
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.io.formats.clocks import nearest_day
-from factorgraph_dvl.io.formats.format import Batch, Clock, Format, HeadingReference, empty
+from factorgraph_dvl.io.formats.format import (
+    Batch,
+    Clock,
+    Format,
+    HeadingReference,
+    empty,
+    left_out,
+)
 from factorgraph_dvl.io.formats.framing import Records, map_file
+from factorgraph_dvl.io.formats.losses import Losses
 from factorgraph_dvl.io.formats.nmea import ADDRESSES, read_nmea, utc
 from factorgraph_dvl.io.formats.sentences import sentences
 
@@ -21,7 +29,7 @@ Sentences = dict[str, Records]
 # GGA: 0 no fix, 6 dead reckoning, 7 typed in, 8 simulated.
 _MEASURED = (1, 2, 3, 4, 5, 9)
 _NO_FIX = "GGA of quality 0, 6, 7 or 8 is no measurement: left out"
-_UNCHECKED = "sentences without a checksum were left out, as others in the file have one"
+_UNCHECKED = "sentence without the checksum that others in the file have"
 _UNTIMED = "sentences without a time have that of the sentence with a time before them"
 # Chosen: sentences with a time that wait for others of their burst; more are left of lost ones.
 _WAITING = 2
@@ -41,20 +49,22 @@ def read(path: Path, mapping: Mapping[str, Any] | None = None) -> Iterator[Batch
     """Read a file; the parameters and the result are those of `Format.read`."""
     near: float | None = None
     checked = False
-    for block in read_nmea(map_file(path)):
+    losses = Losses()
+    for block in read_nmea(map_file(path), losses=losses):
         checked = checked or any(part["checked"].any() for part in block.values())
-        dropped = checked and any(not part["checked"].all() for part in block.values())
         if checked:
+            for part in block.values():
+                lost = part["at"][~part["checked"]]
+                losses.add(_UNCHECKED, int(lost[0]) if len(lost) else 0, len(lost))
             block = {kind: part[part["checked"]] for kind, part in block.items()}
-        for batch in sentence_batches(block, near, (_UNCHECKED,) if dropped else ()):
+        for batch in sentence_batches(block, near):
             if batch.clock == "utc" and len(batch.records):
                 near = float(batch.records["time"][-1])
             yield batch
+    yield left_out(losses)
 
 
-def sentence_batches(
-    block: Sentences, near: float | None, notes: tuple[str, ...] = ()
-) -> Iterator[Batch]:
+def sentence_batches(block: Sentences, near: float | None) -> Iterator[Batch]:
     """Convert sentences.
 
     Parameters
@@ -64,8 +74,6 @@ def sentence_batches(
     near : float or None, s
         Some time within half a day of sentences that have neither a date nor a time of
         reception; None if there is none.
-    notes : tuple of str, optional
-        For the batches.
 
     Yields
     ------
@@ -76,10 +84,10 @@ def sentence_batches(
     if not any(np.isfinite(time).any() for time in times.values()):
         clock = "day"
         times = {kind: np.array(block[kind]["second"]) for kind in times}
-    yield from _fixes(block, times, clock, notes)
-    yield from _courses(block, times, clock, notes)
-    yield from _attitudes(block, times, clock, notes)
-    yield from _clocks(block, times, clock, notes)
+    yield from _fixes(block, times, clock)
+    yield from _courses(block, times, clock)
+    yield from _attitudes(block, times, clock)
+    yield from _clocks(block, times, clock)
 
 
 def _times(block: Sentences, kind: str, near: float | None) -> Array:
@@ -132,9 +140,7 @@ def _in_turn(received: Array, time: Array, arrived: Array) -> Array:
     return out
 
 
-def _fixes(
-    block: Sentences, times: Mapping[str, Array], clock: Clock, notes: tuple[str, ...]
-) -> Iterator[Batch]:
+def _fixes(block: Sentences, times: Mapping[str, Array], clock: Clock) -> Iterator[Batch]:
     gga, rmc, gst = block["GGA"], block["RMC"], block["GST"]
     if len(gga):
         out = empty("fix", len(gga))
@@ -152,19 +158,17 @@ def _fixes(
             out["std"] = np.where(same[:, None], std, np.nan)
         measured = np.isin(out["quality"], _MEASURED) & np.isfinite(out["lat"])
         more = () if measured.all() else (_NO_FIX,)
-        yield Batch("fix", out[measured], clock, "GGA", notes=(*notes, *more))
+        yield Batch("fix", out[measured], clock, "GGA", notes=more)
     valid = (rmc["valid"] > 0.0) & np.isfinite(rmc["lat"])
     if valid.any():
         out = empty("fix", len(rmc))
         for name in ("at", "received", "lat", "lon"):
             out[name] = rmc[name]
         out["time"] = times["RMC"]
-        yield Batch("fix", out[valid], clock, "RMC", notes=notes)
+        yield Batch("fix", out[valid], clock, "RMC")
 
 
-def _courses(
-    block: Sentences, times: Mapping[str, Array], clock: Clock, notes: tuple[str, ...]
-) -> Iterator[Batch]:
+def _courses(block: Sentences, times: Mapping[str, Array], clock: Clock) -> Iterator[Batch]:
     for kind in ("RMC", "VTG"):
         part = block[kind]
         out = empty("course", len(part))
@@ -177,12 +181,10 @@ def _courses(
         more = () if kind == "RMC" else (_UNTIMED,)
         good = np.isfinite(out["speed"])
         if good.any():
-            yield Batch("course", out[good], clock, kind, notes=(*notes, *more))
+            yield Batch("course", out[good], clock, kind, notes=more)
 
 
-def _attitudes(
-    block: Sentences, times: Mapping[str, Array], clock: Clock, notes: tuple[str, ...]
-) -> Iterator[Batch]:
+def _attitudes(block: Sentences, times: Mapping[str, Array], clock: Clock) -> Iterator[Batch]:
     kinds: tuple[tuple[str, tuple[str, ...], HeadingReference], ...] = (
         ("PASHR", ("roll", "pitch", "heading"), "true"),
         ("PRDID", ("roll", "pitch", "heading"), "unknown"),
@@ -202,19 +204,17 @@ def _attitudes(
         else:
             out["time"] = _at_same_time(block, kind, times)
         more = () if kind == "PASHR" else (_UNTIMED,)
-        yield Batch("attitude", out, clock, kind, heading=reference, notes=(*notes, *more))
+        yield Batch("attitude", out, clock, kind, heading=reference, notes=more)
 
 
-def _clocks(
-    block: Sentences, times: Mapping[str, Array], clock: Clock, notes: tuple[str, ...]
-) -> Iterator[Batch]:
+def _clocks(block: Sentences, times: Mapping[str, Array], clock: Clock) -> Iterator[Batch]:
     padcp = block["PADCP"]
     if len(padcp):
         out = empty("clock", len(padcp))
         out["at"], out["received"] = padcp["at"], padcp["pc"]
         out["number"] = np.nan_to_num(padcp["ensemble"], nan=-1.0)
         out["time"] = padcp["pc"] - padcp["pc_minus_utc"]
-        yield Batch("clock", out, "utc", "PADCP", notes=notes)
+        yield Batch("clock", out, "utc", "PADCP")
 
 
 FORMATS = (

@@ -10,8 +10,9 @@ import numpy as np
 
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.io.formats import pd0
-from factorgraph_dvl.io.formats.format import Batch, Clock, Format, Kind, empty
+from factorgraph_dvl.io.formats.format import Batch, Clock, Format, Kind, empty, left_out
 from factorgraph_dvl.io.formats.framing import Records, map_file
+from factorgraph_dvl.io.formats.losses import Losses
 from factorgraph_dvl.io.formats.normalised.nmea import sentence_batches
 from factorgraph_dvl.io.formats.velocities import BEAM
 
@@ -36,10 +37,10 @@ def share(path: Path, sample: bytes) -> float:
 
 def read(path: Path, mapping: Mapping[str, Any] | None = None) -> Iterator[Batch]:
     """Read a file; the parameters and the result are those of `Format.read`."""
-    for block in pd0.read_pd0(map_file(path)):
-        if not len(block.pings):
-            continue
+    losses = Losses()
+    for block in pd0.read_pd0(map_file(path), losses):
         yield from _batches(block)
+    yield left_out(losses)
 
 
 def _batches(block: pd0.Block) -> Iterator[Batch]:

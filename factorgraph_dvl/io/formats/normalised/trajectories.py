@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 
 from factorgraph_dvl.errors import DataError
-from factorgraph_dvl.io.formats.format import Batch, Format, empty
+from factorgraph_dvl.io.formats.format import Batch, Format, empty, left_out
 from factorgraph_dvl.io.formats.framing import Records, map_file
+from factorgraph_dvl.io.formats.losses import Losses
 from factorgraph_dvl.io.formats.rtklib import is_geodetic, read_rtklib
 from factorgraph_dvl.io.formats.sbet import north_east, read_sbet, read_smrmsg, true_heading
 
@@ -30,7 +31,8 @@ def _share_rtklib(path: Path, sample: bytes) -> float:
 def _read_rtklib(path: Path, mapping: Mapping[str, Any] | None = None) -> Iterator[Batch]:
     source = map_file(path)
     vertical = "altitude" if is_geodetic(source) else "height"
-    for block in read_rtklib(source):
+    losses = Losses()
+    for block in read_rtklib(source, losses=losses):
         out = empty("fix", len(block))
         for name in ("at", "time", "lat", "lon"):
             out[name] = block[name]
@@ -38,6 +40,7 @@ def _read_rtklib(path: Path, mapping: Mapping[str, Any] | None = None) -> Iterat
         for name, prefix in (("std", "std_"), ("velocity", "vel_"), ("velocity_std", "vel_std_")):
             out[name] = np.stack([block[prefix + axis] for axis in "enu"], axis=1)
         yield Batch("fix", out, "utc", "pos")
+    yield left_out(losses)
 
 
 def _share_of_steps(blocks: Iterator[Records], sample: bytes) -> float:
@@ -62,7 +65,8 @@ def _share_smrmsg(path: Path, sample: bytes) -> float:
 
 
 def _read_smrmsg(path: Path, mapping: Mapping[str, Any] | None = None) -> Iterator[Batch]:
-    for block in read_smrmsg(map_file(path)):
+    losses = Losses()
+    for block in read_smrmsg(map_file(path), losses):
         out = empty("ins_std", len(block))
         out["time"] = block["second"]
         names = {
@@ -73,10 +77,12 @@ def _read_smrmsg(path: Path, mapping: Mapping[str, Any] | None = None) -> Iterat
         for name, columns in names.items():
             out[name] = np.stack([block[column] for column in columns], axis=1)
         yield Batch("ins_std", out, "week", "smrmsg")
+    yield left_out(losses)
 
 
 def _read_sbet(path: Path, mapping: Mapping[str, Any] | None = None) -> Iterator[Batch]:
-    for block in read_sbet(map_file(path)):
+    losses = Losses()
+    for block in read_sbet(map_file(path), losses):
         out = empty("ins", len(block))
         for name in ("lat", "lon", "height", "roll", "pitch"):
             out[name] = block[name]
@@ -84,6 +90,7 @@ def _read_sbet(path: Path, mapping: Mapping[str, Any] | None = None) -> Iterator
         north, east = north_east(block)
         out["velocity"] = np.stack([east, north, -block["vel_z"]], axis=1)
         yield Batch("ins", out, "week", "SBET", heading="true")
+    yield left_out(losses)
 
 
 FORMATS = (

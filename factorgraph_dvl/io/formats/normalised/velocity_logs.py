@@ -11,8 +11,9 @@ import numpy as np
 
 from factorgraph_dvl.geometry.rotations import BodyAxes
 from factorgraph_dvl.io.formats.dvl_sentences import read_cerulean, read_nortek
-from factorgraph_dvl.io.formats.format import Batch, Clock, Format, empty, positive
+from factorgraph_dvl.io.formats.format import Batch, Clock, Format, empty, left_out, positive
 from factorgraph_dvl.io.formats.framing import Records, Source, map_file
+from factorgraph_dvl.io.formats.losses import Losses
 from factorgraph_dvl.io.formats.normalised.nmea import sentence_batches
 from factorgraph_dvl.io.formats.pd4 import read_pd4
 from factorgraph_dvl.io.formats.pd6 import read_pd6
@@ -50,16 +51,18 @@ def _pings(records: Records, clock: Clock, axes: _Axes, stream: str) -> Batch:
 
 
 def _read(
-    reader: Callable[[Source], Iterator[Records]],
+    reader: Callable[..., Iterator[Records]],
     clock: Clock,
     axes: _Axes,
     path: Path,
     mapping: Mapping[str, Any] | None = None,
 ) -> Iterator[Batch]:
-    for records in reader(map_file(path)):
+    losses = Losses()
+    for records in reader(map_file(path), losses=losses):
         if len(records):
             yield _pings(records, clock, axes, "")
             yield from _attitude(records, clock)
+    yield left_out(losses)
 
 
 def _attitude(records: Records, clock: Clock) -> Iterator[Batch]:
@@ -74,14 +77,17 @@ def _attitude(records: Records, clock: Clock) -> Iterator[Batch]:
 
 
 def _read_water_linked(path: Path, mapping: Mapping[str, Any] | None = None) -> Iterator[Batch]:
-    for velocities, _ in read_water_linked(map_file(path)):
+    losses = Losses()
+    for velocities, _ in read_water_linked(map_file(path), losses=losses):
         if len(velocities):
             yield _pings(velocities, "own", "FRD", "")
+    yield left_out(losses)
 
 
 def _read_cerulean(path: Path, mapping: Mapping[str, Any] | None = None) -> Iterator[Batch]:
     last = np.nan
-    for increments, extended in read_cerulean(map_file(path)):
+    losses = Losses()
+    for increments, extended in read_cerulean(map_file(path), losses=losses):
         if len(increments):
             batch = _pings(increments, "own", "", "DVPDL")
             stamps = np.concatenate([[last], increments["second"]])
@@ -93,16 +99,19 @@ def _read_cerulean(path: Path, mapping: Mapping[str, Any] | None = None) -> Iter
         if len(extended):
             yield _pings(extended, "own", "", "DVEXT")
             yield from _attitude(extended, "own")
+    yield left_out(losses)
 
 
 def _read_rowe(path: Path, mapping: Mapping[str, Any] | None = None) -> Iterator[Batch]:
-    for velocities, nmea in read_rowe(map_file(path)):
+    losses = Losses()
+    for velocities, nmea in read_rowe(map_file(path), losses=losses):
         near = None
         if len(velocities):
             near = float(np.nanmedian(velocities["time"]))
             yield _pings(velocities, "own", "", "")
             yield from _attitude(velocities, "own")
         yield from sentence_batches(nmea, near)
+    yield left_out(losses)
 
 
 def _count(reader: Callable[[Source], Iterator[Any]]) -> Callable[[bytes], int]:

@@ -7,6 +7,7 @@ right, down. They were not compared with an instrument.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +15,9 @@ import numpy as np
 
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.io.formats.ad2cp import NUCLEUS, frames
-from factorgraph_dvl.io.formats.format import Batch, Clock, Format, Kind, empty
+from factorgraph_dvl.io.formats.format import Batch, Clock, Format, Kind, empty, left_out
 from factorgraph_dvl.io.formats.framing import BLOCK, Records, map_file
+from factorgraph_dvl.io.formats.losses import Losses
 from factorgraph_dvl.io.formats.vehicles.library import column, columns, load, silently
 from factorgraph_dvl.io.formats.velocities import INSTRUMENT
 
@@ -71,15 +73,15 @@ def read(path: Path, mapping: Mapping[str, Any] | None = None) -> Iterator[Batch
     parser = load("nucleus_driver._parser", "nucleus").Parser(messages=_Silent())
     source = map_file(path)
     gathered: dict[int, list[Packet]] = {kind: [] for kind in _CONVERTERS}
-    lost, notes = 0, []
-    for family, kind, start, stop in frames(source):
+    losses, notes = Losses(), []
+    for family, kind, start, stop in frames(source, losses):
         if family == NUCLEUS and kind == INS and _INS not in notes:
             notes.append(_INS)
         if family != NUCLEUS or kind not in gathered:
             continue
         packet = _decoded(parser, bytearray(source[start - _HEADER : stop]))
         if packet is None:
-            lost += 1
+            losses.add("packet too short for what it states", start - _HEADER)
             continue
         packet["at"] = start - _HEADER
         gathered[kind].append(packet)
@@ -89,10 +91,7 @@ def read(path: Path, mapping: Mapping[str, Any] | None = None) -> Iterator[Batch
     for kind, packets in gathered.items():
         if packets:
             yield from silently(_CONVERTERS[kind](packets))
-    if lost:
-        notes.append(f"{lost} packets are too short for what they state, and were left out")
-    if notes:
-        yield Batch("clock", empty("clock", 0), notes=tuple(notes))
+    yield replace(left_out(losses), notes=tuple(notes))
 
 
 def _decoded(parser: Any, frame: bytearray) -> Packet | None:
