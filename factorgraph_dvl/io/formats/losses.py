@@ -56,7 +56,7 @@ def _counted(what: str, count: int) -> str:
 
 @dataclass(frozen=True)
 class Frame:
-    """How records of a binary format can be told where their checksum is wrong.
+    """How records of a binary format are recognised where their checksum is wrong.
 
     Parameters
     ----------
@@ -77,7 +77,7 @@ class Frame:
 def summed(
     noun: str, sync: bytes, length: Callable[[Bytes, Index], Index], shortest: int
 ) -> Frame:
-    """Return how to tell the records that `summed_frames` finds, by its parameters."""
+    """Return how to recognise the records that `summed_frames` finds, by its parameters."""
 
     def size(source: Source, at: int) -> int:
         head = as_bytes(source, at, at + shortest)
@@ -105,7 +105,7 @@ def count_outside(
     losses : Losses
         Takes the counts.
     frame : Frame, optional
-        How to tell records with a wrong checksum; without, all that is outside counts as bytes.
+        How to recognise records with a wrong checksum; without, all that is outside counts as bytes.
     tail : int, default 0
         Bytes of a record behind where it stops.
 

@@ -25,7 +25,7 @@ from factorgraph_dvl.io.formats.losses import Losses, count_outside, summed
 from factorgraph_dvl.io.formats.velocities import BEAM, empty
 
 _SYNC = b"\x7d"
-# Bytes of the two structures, which the second byte tells apart, without the checksum.
+# Bytes of the structures 0 and 1, the second byte of an ensemble, without the checksum.
 _PD4, _PD5 = 45, 86
 _LAYOUT = np.dtype(
     {

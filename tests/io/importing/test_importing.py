@@ -285,7 +285,7 @@ class TestFolder:
     def test_a_trial_of_others_is_left_alone(self, tmp_path):
         (tmp_path / "trial").mkdir()
         (tmp_path / "trial" / "trial.yaml").write_text("format: 1\n")
-        with pytest.raises(DataError, match=r"holds trial.yaml but no import.log"):
+        with pytest.raises(DataError, match=r"contains trial.yaml but no import.log"):
             imported(tmp_path, pings(), fixes(), force=True)
 
     def test_every_key_has_its_reason(self, tmp_path):
