@@ -61,9 +61,9 @@ if TYPE_CHECKING:
     from factorgraph_dvl.quality.survey import survey
     from factorgraph_dvl.replay.session import Replay
     from factorgraph_dvl.sensors.dvl import Dvl, DvlSettings
-    from factorgraph_dvl.sensors.finding import Verdict
     from factorgraph_dvl.sensors.gnss import Gnss, GnssSettings
     from factorgraph_dvl.sensors.imu import Imu, ImuSettings
+    from factorgraph_dvl.sensors.verdict import Verdict
     from factorgraph_dvl.simulation import simulate
     from factorgraph_dvl.simulation.scenario import load_scenario
     from factorgraph_dvl.solution import Calibration, Estimate, Solution, Trajectory
@@ -94,7 +94,7 @@ _PUBLIC = {
     "Trajectory": "solution",
     "Trial": "trial",
     "TrialCalibration": "campaign.information",
-    "Verdict": "sensors.finding",
+    "Verdict": "sensors.verdict",
     "check_sensor": "graph.sensor_check",
     "crosscheck": "analysis.comparison.crosscheck",
     "dead_reckon": "analysis.dead_reckoning.integration",

@@ -15,10 +15,11 @@ from factorgraph_dvl.geometry.unit_vectors import turned
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.sensors.catalogue import specs_of
-from factorgraph_dvl.sensors.finding import Code, Finding, Verdict, verdict_of
+from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.sensors.grades import DEFAULT_LIMITS, Grade, grades
 from factorgraph_dvl.sensors.parameters import SCALAR, Parameter, ParameterSpec
 from factorgraph_dvl.sensors.protocol import DO_NOT_FIT, TOO_LARGE
+from factorgraph_dvl.sensors.verdict import Verdict, verdict_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

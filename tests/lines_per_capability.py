@@ -34,8 +34,8 @@ CAPABILITIES = (
         "sensors: settings, records, residuals",
         "sensors/* beam_geometry gains turning",
         "sensors/*",
-        "sensors/ins sensors/attitude sensors/finding sensors/invalid_values sensors/imu_grades "
-        "sensors/fingerprint sensors/grades sensors/clock",
+        "sensors/ins sensors/attitude sensors/finding sensors/verdict sensors/invalid_values "
+        "sensors/imu_grades sensors/fingerprint sensors/grades sensors/clock",
     ),
     (
         "IMU: increments, preintegration, motion at any time",

@@ -82,7 +82,7 @@ def deadreckon(
         error_table,
         to_json,
     )
-    from factorgraph_dvl.sensors.finding import verdict_of
+    from factorgraph_dvl.sensors.verdict import verdict_of
 
     read = (*inputs_of(trial_path), calibration, None if attitude is None else Path(attitude))
     claim_output(out, force=force, owned=OWNED, inputs=read)

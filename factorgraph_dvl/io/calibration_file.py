@@ -19,9 +19,10 @@ from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.sensors.catalogue import specs_of
 from factorgraph_dvl.sensors.dvl import CALIBRATED
-from factorgraph_dvl.sensors.finding import Code, Finding, Severity, VerdictGrade
+from factorgraph_dvl.sensors.finding import Code, Finding, Severity
 from factorgraph_dvl.sensors.fingerprint import PATTERN
 from factorgraph_dvl.sensors.grades import DEFAULT_LIMITS, Grade
+from factorgraph_dvl.sensors.verdict import VerdictGrade
 from factorgraph_dvl.settings.files import MEGABYTE, read_bytes
 from factorgraph_dvl.settings.ranges import out_of_range
 from factorgraph_dvl.settings.sections import check_epoch

@@ -9,7 +9,6 @@ from typing import Literal, Self, cast
 
 # A check that was passed; something to know; a reason for caution; one not to use it.
 Severity = Literal["ok", "note", "warning", "error"]
-VerdictGrade = Literal["good", "doubtful", "do not use"]
 
 
 class Code(StrEnum):
@@ -671,41 +670,6 @@ class Finding:
 
     def __str__(self) -> str:
         return f"{self.sensor}: {self.text}" if self.sensor else self.text
-
-
-@dataclass(frozen=True)
-class Verdict:
-    """Whether a result can be used, and why not.
-
-    Parameters
-    ----------
-    grade : VerdictGrade
-        `do not use`: the data contradict the model. `doubtful`: there is something to check.
-    reasons : tuple of Finding
-        The worst first, and of equal ones causes before symptoms. Empty if the grade is good.
-
-    Examples
-    --------
-    >>> import factorgraph_dvl as fd
-    >>> verdict = fd.solve(fd.simulate("examples/short.yaml", seed=1)).verdict
-    >>> verdict.grade, verdict.reasons
-    ('good', ())
-    """
-
-    grade: VerdictGrade
-    reasons: tuple[Finding, ...]
-
-    def __str__(self) -> str:
-        return f"{self.grade}: {self.reasons[0]}" if self.reasons else self.grade
-
-
-def verdict_of(findings: Iterable[Finding]) -> Verdict:
-    """Return the verdict on a result with these findings."""
-    found = dict.fromkeys(findings)
-    errors = [f for f in found if f.severity == "error"]
-    warnings = [f for f in found if f.severity == "warning"]
-    reasons = [f for group in (errors, warnings) for f in sorted(group, key=lambda f: f.code.rank)]
-    return Verdict("do not use" if errors else "doubtful" if warnings else "good", tuple(reasons))
 
 
 def errors_of(findings: Iterable[Finding]) -> tuple[Finding, ...]:

@@ -10,8 +10,9 @@ import pytest
 from builders import build_solution
 
 from factorgraph_dvl.io.trial_yaml import LimitSettings
-from factorgraph_dvl.sensors.finding import Code, Finding, verdict_of
+from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.sensors.grades import DEFAULT_LIMITS, grades
+from factorgraph_dvl.sensors.verdict import verdict_of
 from factorgraph_dvl.solution import Noise, Residuals, consistency_findings
 
 

@@ -26,7 +26,7 @@ from factorgraph_dvl.report.figures.drawing import (
     style,
 )
 from factorgraph_dvl.report.text import split_unit
-from factorgraph_dvl.sensors.finding import Verdict
+from factorgraph_dvl.sensors.verdict import Verdict
 from factorgraph_dvl.solution import Estimate
 
 # Points of a line. Chosen: more than a panel has pixels.

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from factorgraph_dvl.analysis.error_statistics import TrajectoryErrors, VectorErrors
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.report.text import fixed
-from factorgraph_dvl.sensors.finding import Verdict
+from factorgraph_dvl.sensors.verdict import Verdict
 
 # What panels stand in.
 Canvas = Figure | SubFigure

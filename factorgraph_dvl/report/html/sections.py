@@ -31,7 +31,8 @@ from factorgraph_dvl.report.html.plots import Plot
 from factorgraph_dvl.report.html.track import track_svg
 from factorgraph_dvl.report.html.words import component_names
 from factorgraph_dvl.report.text import at_precision, fixed, with_std
-from factorgraph_dvl.sensors.finding import Finding, Verdict
+from factorgraph_dvl.sensors.finding import Finding
+from factorgraph_dvl.sensors.verdict import Verdict
 from factorgraph_dvl.solution import Cause, Solution
 
 # Class of each verdict in the style sheet.

@@ -17,8 +17,8 @@ from factorgraph_dvl.errors import printable
 from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.quality.survey import Survey
 from factorgraph_dvl.report.text import at_precision, fixed, split_unit, with_std
-from factorgraph_dvl.sensors.finding import Verdict
 from factorgraph_dvl.sensors.imu import ImuSettings
+from factorgraph_dvl.sensors.verdict import Verdict
 from factorgraph_dvl.solution import Solution
 
 # Of findings, by severity.

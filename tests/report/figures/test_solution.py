@@ -14,9 +14,10 @@ from factorgraph_dvl.report.figures.drawing import draw_band, save_figures
 from factorgraph_dvl.report.figures.residuals import residuals_figure
 from factorgraph_dvl.report.figures.solution import write_figures
 from factorgraph_dvl.report.figures.trajectory import motion_figure, track_figure
-from factorgraph_dvl.sensors.finding import Code, Finding, verdict_of
+from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.sensors.gnss import Gnss, GnssSettings
 from factorgraph_dvl.sensors.imu import Imu, ImuSettings
+from factorgraph_dvl.sensors.verdict import verdict_of
 from factorgraph_dvl.solution import Estimate, Residuals, Solution, Trajectory
 from factorgraph_dvl.trial import Reference, Trial
 
