@@ -105,7 +105,7 @@ def count_outside(
     losses : Losses
         Takes the counts.
     frame : Frame, optional
-        How to recognise records with a wrong checksum; without, all that is outside counts as bytes.
+        How to recognise records with a wrong checksum; without, all outside counts as bytes.
     tail : int, default 0
         Bytes of a record behind where it stops.
 
