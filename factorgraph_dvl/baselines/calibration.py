@@ -11,12 +11,17 @@ import numpy as np
 from factorgraph_dvl.baselines.beam_calibration import calibrate_beams
 from factorgraph_dvl.baselines.least_squares import least_squares
 from factorgraph_dvl.baselines.luo_2024 import as_printed
-from factorgraph_dvl.baselines.navigation import Navigation, attitude_is_known, motion_at, navigate
+from factorgraph_dvl.baselines.navigation import Navigation, attitude_is_known, navigate
 from factorgraph_dvl.baselines.nine_state import nine_state, with_bias
 from factorgraph_dvl.baselines.nine_state_ukf import unscented
 from factorgraph_dvl.baselines.outcome import History, Outcome, history_of
 from factorgraph_dvl.baselines.point_set_filter import point_set
 from factorgraph_dvl.baselines.point_sets import Points
+from factorgraph_dvl.baselines.recorded_navigation import (
+    RecordedNavigation,
+    recorded_navigation,
+)
+from factorgraph_dvl.baselines.ship_adcp import horizontal, joyce, outcome_of, pollard_read
 from factorgraph_dvl.baselines.spurious_information import without_spurious_information
 from factorgraph_dvl.baselines.star_calibration import calibrate_gyros
 from factorgraph_dvl.baselines.summary import (
@@ -28,6 +33,7 @@ from factorgraph_dvl.baselines.summary import (
 )
 from factorgraph_dvl.baselines.wahba import wahba
 from factorgraph_dvl.errors import ConfigError, DataError
+from factorgraph_dvl.geometry.rotations import BodyAxes, rph_from_rotation
 from factorgraph_dvl.imu.timestamps import JUMP, without_strays
 from factorgraph_dvl.sensors.dvl import SCALE_SPEC, Dvl
 from factorgraph_dvl.sensors.finding import Code, Finding
@@ -43,6 +49,8 @@ DvlMethod = Literal[
     "nine-state-ukf",
     "wahba",
     "least-squares",
+    "joyce",
+    "pollard-read",
 ]
 DVL_METHODS: tuple[DvlMethod, ...] = get_args(DvlMethod)
 Method = DvlMethod | Literal["star", "liu-2020", "beams"]
@@ -61,7 +69,11 @@ _NEGLECTED: dict[DvlMethod, tuple[str, ...]] = {
     "nine-state-ukf": ("lever_arm", "time_offset"),
     "wahba": ("lever_arm", "dvl_bias", "time_offset"),
     "least-squares": (),
+    "joyce": ("lever_arm", "dvl_bias", "time_offset"),
+    "pollard-read": ("lever_arm", "dvl_bias", "time_offset"),
 }
+# Methods that a current does not mislead.
+_THROUGH_WATER = ("joyce", "pollard-read")
 # Chosen: longest gap of GNSS, s. Over a longer one the INS drifts beyond the linear error model.
 _LONGEST_GAP = 300.0
 # Chosen: time offsets that a search may try, s; pings nearer to the ends are not used.
@@ -106,12 +118,14 @@ def calibrate(
     Parameters
     ----------
     trial : Trial
-        With IMU, GNSS and DVL, or its beams, or star tracker.
+        With IMU, GNSS and DVL, or its beams, or star tracker. Without IMU, an INS, or GNSS with a
+        compass, is what the DVL is compared with.
     method : Method, default 'point-set'
         `point-set` (seven states), `luo-2024` (the same as printed), `nine-state`,
-        `nine-state-linear` (as printed), `nine-state-ukf`, `wahba` or `least-squares`, which take
-        beams without a DVL beside them for the velocity that they amount to; `star`, or
-        `liu-2020` as printed; or `beams`, an extended Kalman filter of single beams.
+        `nine-state-linear` (as printed), `nine-state-ukf`, `wahba`, `least-squares`, or the fits
+        `joyce` and `pollard-read` for ships. These take beams without a DVL beside them for the
+        velocity that they amount to. `star`, or `liu-2020` as printed; or `beams`, an extended
+        Kalman filter of single beams.
     rate_hz : float, default 10.0
         Rate of the trajectory in the solution.
     progress : callable, optional
@@ -134,7 +148,7 @@ def calibrate(
     if not (np.isfinite(rate_hz) and rate_hz > 0.0):
         raise ConfigError(f"rate_hz is {rate_hz}", expected="a number above 0")
     report = progress or (lambda stage, iteration, cost: None)
-    trial = without_strays(trial).on_one_clock()
+    trial = (trial if trial.imu is None else without_strays(trial)).on_one_clock()
     if method == "star" or method == "liu-2020":
         report("SINS/stars", 0, None)
         solution, outcome = calibrate_gyros(trial, rate_hz=rate_hz, printed=method == "liu-2020")
@@ -150,24 +164,31 @@ def calibrate(
             expected="a dvl section",
             hint="The method `star` needs none",
         )
-    if dvl.settings.reference == "water":
+    if dvl.settings.reference == "water" and method not in _THROUGH_WATER:
         raise ConfigError(
             "the point-set methods do not estimate a current, and this DVL measures through the "
             "water",
             where="trial.yaml dvl.reference",
             expected="bottom",
-            hint="`solve` estimates the current",
+            hint="`solve` estimates the current; methods joyce and pollard-read allow for it",
         )
-    report("SINS/GNSS", 0, None)
     prior = {p.stem: p for p in dvl.parameters()}
     offset = float(prior["time_offset"].mean[0])
     pings = dvl.time[dvl.locked] - offset
-    navigation = navigate(trial, pings, smoothed=method != "luo-2024")
+    report("motion", 0, None)
+    navigation: Navigation | RecordedNavigation
+    if trial.imu is None:
+        navigation = recorded_navigation(trial)
+    else:
+        navigation = navigate(trial, pings, smoothed=method != "luo-2024")
     report(method, 0, None)
     points_at, unused = _point_sets(navigation, dvl, as_printed=method == "luo-2024")
-    outcome = _calibrate(method, points_at, dvl)
-    report("summary", 0, None)
     points = points_at(offset)
+    if method == "joyce" or method == "pollard-read":
+        outcome = _by_ship(method, navigation, points, dvl, trial.body_axes)
+    else:
+        outcome = _calibrate(method, points_at, dvl)
+    report("summary", 0, None)
     arm = prior["lever_arm"].mean
     outcome = replace(
         outcome, estimated=without_spurious_information(points, outcome.estimated, arm)
@@ -198,7 +219,8 @@ def calibrate(
 
 def _outage(trial: Trial) -> list[Finding]:
     """Say that GNSS is missing for too long, if it is."""
-    assert trial.gnss is not None
+    if trial.imu is None or trial.gnss is None:
+        return []
     fixes = trial.gnss.time[~np.isnan(trial.gnss.geodetic[:, 0])]
     time = trial.inertial.time
     jumps = np.flatnonzero(np.diff(time) > JUMP)
@@ -215,12 +237,34 @@ def _outage(trial: Trial) -> list[Finding]:
     ]
 
 
+def _by_ship(
+    method: DvlMethod,
+    navigation: Navigation | RecordedNavigation,
+    points: Points,
+    dvl: Dvl,
+    body_axes: BodyAxes,
+) -> Outcome:
+    """Return angle and scale as fits of a ship's horizontal velocities show them."""
+    parameters = {p.stem: p for p in dvl.parameters()}
+    misalignment, arm = parameters["misalignment"], parameters["lever_arm"]
+    motion = navigation.at(points.time)
+    ship, adcp = horizontal(motion, points.v_d, misalignment, arm.mean)
+    water = dvl.settings.reference == "water"
+    if method == "joyce":
+        c, sigma = joyce(points.time, ship, adcp, water=water)
+    else:
+        heading = rph_from_rotation(motion.nRb, body_axes)[:, 2]
+        c, sigma = pollard_read(points.time, heading, ship, adcp, water=water)
+    return outcome_of(c, sigma, misalignment, _single(parameters["scale_error"]), body_axes)
+
+
 def _point_sets(
-    navigation: Navigation, dvl: Dvl, *, as_printed: bool
+    navigation: Navigation | RecordedNavigation, dvl: Dvl, *, as_printed: bool
 ) -> tuple[Callable[[float], Points], tuple[int, int]]:
     """Return the point sets as a function of the time offset, and how many pings fall out.
 
-    Outside SINS/GNSS, and where it leaves the heading open; the printed filter takes the latter.
+    Outside the motion to compare with, and where it leaves the heading open; the printed filter
+    takes the latter.
     """
     prior = next(p for p in dvl.parameters() if p.stem == "time_offset")
     mean = float(prior.mean[0])
@@ -229,14 +273,14 @@ def _point_sets(
     covered = np.ones(locked.size, dtype=bool)
     known = covered.copy()
     for offset in {mean - reach, mean, mean + reach}:
-        motion = motion_at(navigation, dvl.time[locked] - offset)
+        motion = navigation.at(dvl.time[locked] - offset)
         covered &= motion.covered
         known &= motion.covered if as_printed else attitude_is_known(motion)
     used = locked[known]
     sigma = dvl.sigma()[used]
 
     def points_at(offset: float) -> Points:
-        motion = motion_at(navigation, dvl.time[used] - offset)
+        motion = navigation.at(dvl.time[used] - offset)
         return Points(
             motion.time,
             motion.v_b,
@@ -288,7 +332,8 @@ def _neglects(method: DvlMethod, dvl: Dvl) -> list[Finding]:
         for p in (parameters[stem] for stem in _NEGLECTED[method])
         if p.estimated
     ]
-    if method in ("point-set", "luo-2024", "wahba") and parameters["scale_error"].mean.size == 3:
+    single = ("point-set", "luo-2024", "wahba", "joyce", "pollard-read")
+    if method in single and parameters["scale_error"].mean.size == 3:
         text = f"{method} estimates one scale error for the three axes"
         out.append(Finding(Code.METHOD_LIMITS, text, parameter=parameters["scale_error"].name))
     return out

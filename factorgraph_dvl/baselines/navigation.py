@@ -79,6 +79,14 @@ class Navigation:
     arc: np.ndarray
     findings: tuple[Finding, ...]
 
+    def at(self, time: Array) -> NavigationMotion:
+        """Return the motion at times (M,), as `motion_at`."""
+        return motion_at(self, time)
+
+    def ticks(self, rate_hz: float) -> Array:
+        """Return the multiples of 1 / rate that the samples cover."""
+        return self.samples.increments.ticks(rate_hz)
+
 
 @dataclass(frozen=True)
 class NavigationMotion:

@@ -6,10 +6,12 @@ from collections.abc import Sequence
 from functools import partial
 
 import numpy as np
+from scipy.linalg import block_diag
 
-from factorgraph_dvl.baselines.navigation import Navigation, NavigationMotion, motion_at
+from factorgraph_dvl.baselines.navigation import Navigation, NavigationMotion
 from factorgraph_dvl.baselines.outcome import Estimated, Outcome
 from factorgraph_dvl.baselines.point_sets import Points, residuals
+from factorgraph_dvl.baselines.recorded_navigation import RecordedNavigation
 from factorgraph_dvl.geometry.earth import radii
 from factorgraph_dvl.geometry.rotations import rph_from_rotation, rph_jacobian, wrapped
 from factorgraph_dvl.geometry.vectors import Array, rotate
@@ -31,14 +33,14 @@ from factorgraph_dvl.trial import Trial
 
 WHITE_NOISE = Finding(
     Code.METHOD_LIMITS,
-    "the error of the SINS/GNSS velocity is treated as white noise; it is correlated in time, so "
+    "the error of the velocity to compare with is treated as white noise; it is correlated, so "
     "the standard deviations of the DVL's parameters are too small",
 )
 
 
 def summarise(
     trial: Trial,
-    navigation: Navigation,
+    navigation: Navigation | RecordedNavigation,
     outcome: Outcome,
     *,
     aid: Aid,
@@ -54,8 +56,8 @@ def summarise(
     ----------
     trial : Trial
         That was solved.
-    navigation : Navigation
-        Of SINS/GNSS.
+    navigation : Navigation or RecordedNavigation
+        Of SINS/GNSS, or what instruments report.
     outcome : Outcome
         Of the calibrator.
     aid : Aid
@@ -72,15 +74,16 @@ def summarise(
         What is already known.
     """
     dvl_values, dvl_covariance = outcome.estimated.reported()
-    imu = _imu_biases(trial, navigation)
-    imu_values, imu_covariance = imu.reported()
-    n = dvl_values.size
-    covariance = np.zeros((n + imu_values.size, n + imu_values.size))
-    covariance[:n, :n], covariance[n:, n:] = dvl_covariance, imu_covariance
-    parameters = [*outcome.estimated.parameters, *imu.parameters]
-    values = np.concatenate([dvl_values, imu_values])
+    parameters, values, covariance = list(outcome.estimated.parameters), dvl_values, dvl_covariance
+    all_residuals: tuple[Residuals, ...] = (measured,)
+    if isinstance(navigation, Navigation):
+        imu = _imu_biases(trial, navigation)
+        imu_values, imu_covariance = imu.reported()
+        covariance = block_diag(dvl_covariance, imu_covariance)
+        parameters += imu.parameters
+        values = np.concatenate([dvl_values, imu_values])
+        all_residuals = (measured, *gnss_residuals(trial, navigation))
     estimates = as_estimates(parameters, values, covariance, outcome.unseparated)
-    all_residuals = (measured, *gnss_residuals(trial, navigation))
     contradicted = contradictions(all_residuals)
     found = (
         *findings,
@@ -125,9 +128,11 @@ def _imu_biases(trial: Trial, navigation: Navigation) -> Estimated:
     return Estimated(parameters, values, P)
 
 
-def trajectory_of(trial: Trial, navigation: Navigation, rate_hz: float) -> Trajectory:
-    """Return the smoothed motion at the multiples of 1 / rate that it covers."""
-    motion = motion_at(navigation, navigation.samples.increments.ticks(rate_hz))
+def trajectory_of(
+    trial: Trial, navigation: Navigation | RecordedNavigation, rate_hz: float
+) -> Trajectory:
+    """Return the motion at the multiples of 1 / rate that it covers."""
+    motion = navigation.at(navigation.ticks(rate_hz))
     at = motion.covered
     P = motion.covariance[at]
     rph = rph_from_rotation(motion.nRb[at], trial.body_axes)
@@ -143,15 +148,17 @@ def trajectory_of(trial: Trial, navigation: Navigation, rate_hz: float) -> Traje
     )
 
 
-def dvl_residuals(dvl: Dvl, navigation: Navigation, outcome: Outcome, points: Points) -> Residuals:
+def dvl_residuals(
+    dvl: Dvl, navigation: Navigation | RecordedNavigation, outcome: Outcome, points: Points
+) -> Residuals:
     """Return the residuals of a DVL's velocity.
 
     Parameters
     ----------
     dvl : Dvl
         That was calibrated.
-    navigation : Navigation
-        Of SINS/GNSS.
+    navigation : Navigation or RecordedNavigation
+        Of SINS/GNSS, or what instruments report.
     outcome : Outcome
         Of the calibrator.
     points : Points
@@ -161,7 +168,7 @@ def dvl_residuals(dvl: Dvl, navigation: Navigation, outcome: Outcome, points: Po
     before = float(prior["time_offset"][0])
     offset = float(outcome.estimated.value("time_offset", prior["time_offset"])[0])
     if offset != before:
-        motion = motion_at(navigation, points.time + before - offset)
+        motion = navigation.at(points.time + before - offset)
         points = Points(
             motion.time,
             motion.v_b,
@@ -179,7 +186,7 @@ def gnss_residuals(trial: Trial, navigation: Navigation) -> tuple[Residuals, ...
     """Return predicted - measured position and velocity of the antenna."""
     gnss = trial.gnss
     assert gnss is not None
-    motion: NavigationMotion = motion_at(navigation, gnss.time)
+    motion = navigation.at(gnss.time)
     arm, omega_cb_b = gnss.lever_arm(gnss.time)
     meridian, east = radii(motion.geodetic[:, 0])
     height = motion.geodetic[:, 2]
@@ -217,9 +224,9 @@ def gnss_residuals(trial: Trial, navigation: Navigation) -> tuple[Residuals, ...
 
 
 def left_out(sensor: Aid, outside: int, vague: int) -> list[Finding]:
-    """Say how many pings of a sensor were not used, and why: outside SINS/GNSS, or vague there."""
+    """Say how many pings of a sensor were not used, and why: outside the motion, or vague."""
     reasons = {
-        "at times without SINS/GNSS": outside,
+        "at times without motion to compare with": outside,
         "on parts of the trial that leave the heading open": vague,
     }
     return [

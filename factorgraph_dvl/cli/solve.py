@@ -63,6 +63,8 @@ class KalmanMethod(StrEnum):
     NINE_STATE_UKF = "nine-state-ukf"
     WAHBA = "wahba"
     LEAST_SQUARES = "least-squares"
+    JOYCE = "joyce"
+    POLLARD_READ = "pollard-read"
     STAR = "star"
     LIU_2020 = "liu-2020"
     BEAMS = "beams"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.linalg import cholesky_banded
 
 from factorgraph_dvl.geometry.vectors import Array
 
@@ -36,10 +37,9 @@ def banded(diagonal: Array, off: Array) -> Array:
 def inverse_blocks(diagonal: Array, off: Array) -> tuple[Array, Array]:
     """Return the blocks of the inverse P of a symmetric block-tridiagonal matrix A.
 
-    They follow from the ends: with the Schur complements F from the front, P_KK = F_K⁻¹, and
-    backwards with G = F_k⁻¹ A_k,k+1
+    They follow from the end: with A = Uᵀ U and G = U_kk⁻¹ U_k,k+1
 
-        P_k,k+1 = -G P_k+1,k+1,    P_kk = F_k⁻¹ + G P_k+1,k+1 Gᵀ.
+        P_k,k+1 = -G P_k+1,k+1,    P_kk = U_kk⁻¹ U_kk⁻ᵀ + G P_k+1,k+1 Gᵀ.
 
     Parameters
     ----------
@@ -52,12 +52,24 @@ def inverse_blocks(diagonal: Array, off: Array) -> tuple[Array, Array]:
         P_kk.
     across : ndarray, shape (K - 1, n, n)
         P_k,k+1.
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        If the matrix is not positive definite.
     """
-    own = np.empty_like(diagonal)
-    own[0] = np.linalg.inv(diagonal[0])
-    for k, before in enumerate(off):
-        own[k + 1] = np.linalg.inv(diagonal[k + 1] - before.T @ own[k] @ before)
-    gain = own[:-1] @ off
+    factor = cholesky_banded(banded(diagonal, off), check_finite=False)
+    size = diagonal.shape[1]
+    above = 2 * size - 1
+    root, beside = np.zeros_like(diagonal), np.empty_like(off)
+    for i in range(size):
+        for j in range(size):
+            if j >= i:
+                root[:, i, j] = factor[above + i - j, j::size]
+            beside[:, i, j] = factor[above - size + i - j, size + j :: size]
+    root = np.linalg.inv(root)
+    gain = root[:-1] @ beside
+    own = root @ root.transpose(0, 2, 1)
     for k in range(len(off) - 1, -1, -1):
         own[k] += gain[k] @ own[k + 1] @ gain[k].T
     return own, -gain @ own[1:]

@@ -139,9 +139,18 @@ def rotation_from_rph(rph: ArrayLike, body_axes: BodyAxes) -> Array:
         Rotation matrices.
     """
     rph = np.asarray(rph, dtype=float)
-    flat = Rotation.from_euler("ZYX", rph.reshape(-1, 3)[:, ::-1]).as_matrix()
-    nRb = _ENU_FROM_NED @ flat @ _FRD_FROM_BODY[body_axes]
-    return nRb.reshape(*rph.shape, 3)
+    (sr, sp, sh), (cr, cp, ch) = (np.moveaxis(f(rph), -1, 0) for f in (np.sin, np.cos))
+    out = np.empty((*rph.shape, 3))
+    out[..., 0, 0] = cp * sh
+    out[..., 0, 1] = sr * sp * sh + cr * ch
+    out[..., 0, 2] = cr * sp * sh - sr * ch
+    out[..., 1, 0] = cp * ch
+    out[..., 1, 1] = sr * sp * ch - cr * sh
+    out[..., 1, 2] = cr * sp * ch + sr * sh
+    out[..., 2, 0] = sp
+    out[..., 2, 1] = -sr * cp
+    out[..., 2, 2] = -cr * cp
+    return out @ _FRD_FROM_BODY[body_axes]
 
 
 def rph_from_rotation(nRb: ArrayLike, body_axes: BodyAxes) -> Array:
@@ -171,3 +180,21 @@ def rph_jacobian(rph: ArrayLike, body_axes: BodyAxes) -> Array:
     out[..., 2, 1] = sr / cp
     out[..., 2, 2] = cr / cp
     return out @ _FRD_FROM_BODY[body_axes]
+
+
+def theta_by_rph(rph: ArrayLike, body_axes: BodyAxes) -> Array:
+    """Return d(theta) / d(roll, pitch, heading), (..., 3, 3), for nRb Exp(theta).
+
+    The inverse of `rph_jacobian`, regular at every pitch.
+    """
+    rph = np.asarray(rph, dtype=float)
+    sr, cr = np.sin(rph[..., 0]), np.cos(rph[..., 0])
+    sp, cp = np.sin(rph[..., 1]), np.cos(rph[..., 1])
+    out = np.zeros((*rph.shape, 3))
+    out[..., 0, 0] = 1.0
+    out[..., 0, 2] = -sp
+    out[..., 1, 1] = cr
+    out[..., 1, 2] = sr * cp
+    out[..., 2, 1] = -sr
+    out[..., 2, 2] = cr * cp
+    return np.asarray(_FRD_FROM_BODY[body_axes].T @ out)

@@ -55,23 +55,56 @@ class Process:
 class Interpolation:
     """State at M times, x = L x_k + U x_k+1 + noise of variance V.
 
+    Of position and velocity L and U are the same along each axis; of processes they are diagonal.
+
     Parameters
     ----------
     node : ndarray of int, shape (M,)
         K.
-    before, after : ndarray, shape (M, n, n)
-        L and U.
-    acceleration : ndarray, shape (M, 3, 12)
-        Derivative of the velocity in time by positions and velocities of both nodes.
-    variance : ndarray, shape (M, n, n)
-        V.
+    motion_before, motion_after : ndarray, shape (M, 2, 2)
+        L and U of position and velocity along an axis.
+    motion_variance : ndarray, shape (M, 2, 2, 3)
+        V of position and velocity, by axis.
+    acceleration : ndarray, shape (M, 4)
+        Derivative of the velocity in time by position and velocity of both nodes.
+    process_before, process_after, process_variance : ndarray, shape (M, n - 6)
+        Diagonals of L, U and V.
     """
 
     node: np.ndarray
-    before: Array
-    after: Array
+    motion_before: Array
+    motion_after: Array
+    motion_variance: Array
     acceleration: Array
-    variance: Array
+    process_before: Array
+    process_after: Array
+    process_variance: Array
+
+    def states(self, nodes: Array) -> Array:
+        """Return the states (M, n) between those of the nodes, (K, n)."""
+        before, after = nodes[self.node], nodes[self.node + 1]
+        motion = self.motion_before @ before[:, :_MOTION].reshape(-1, 2, 3)
+        motion += self.motion_after @ after[:, :_MOTION].reshape(-1, 2, 3)
+        lasting = self.process_before * before[:, _MOTION:]
+        lasting += self.process_after * after[:, _MOTION:]
+        return np.concatenate([motion.reshape(-1, _MOTION), lasting], axis=1)
+
+    def accelerations(self, nodes: Array) -> Array:
+        """Return the accelerations (M, 3) between the states of the nodes, (K, n)."""
+        ends = np.concatenate([nodes[self.node, :_MOTION], nodes[self.node + 1, :_MOTION]], axis=1)
+        return np.asarray((self.acceleration[:, None, :] @ ends.reshape(-1, 4, 3))[:, 0])
+
+    def by_nodes(self, by_state: Array) -> tuple[Array, Array]:
+        """Return J L and J U, (M, d, n), from derivatives J by the states between."""
+        return (
+            _times(by_state, self.motion_before, self.process_before),
+            _times(by_state, self.motion_after, self.process_after),
+        )
+
+    def variance(self, by_state: Array) -> Array:
+        """Return J V Jᵀ, (M, d, d), from derivatives J (M, d, n) by the states between."""
+        by_noise = _times(by_state, self.motion_variance, self.process_variance)
+        return np.asarray(by_noise @ by_state.transpose(0, 2, 1))
 
 
 @dataclass(frozen=True)
@@ -173,49 +206,58 @@ class MotionChain:
         k = np.clip(np.searchsorted(self.time, time, side="right") - 1, 0, self.time.size - 2)
         span = self.time[k + 1] - self.time[k]
         tau = np.clip(time - self.time[k], 0.0, span)
-        m, n = time.size, self.size
-        s = tau / span
-        before, after = np.zeros((m, n, n)), np.zeros((m, n, n))
-        variance = np.zeros((m, n, n))
-        acceleration = np.zeros((m, 3, 2 * _MOTION))
+        s, rest = tau / span, span - tau
         # Variance between known ends, over q.
-        rest = span - tau
         v_pp = tau**3 * rest**3 / (3.0 * span**3)
         v_pv = tau**2 * rest**2 * (rest - tau) / (2.0 * span**3)
         v_vv = tau * rest * (span**2 - 3.0 * tau * rest) / span**3
-        for i in range(3):
-            p, v = i, 3 + i
-            before[:, p, p], before[:, p, v] = (
-                1.0 - 3.0 * s**2 + 2.0 * s**3,
-                span * s * (1 - s) ** 2,
-            )
-            after[:, p, p], after[:, p, v] = 3.0 * s**2 - 2.0 * s**3, -span * s**2 * (1.0 - s)
-            before[:, v, p], before[:, v, v] = 6.0 * (s**2 - s) / span, 3 * s**2 - 4 * s + 1.0
-            after[:, v, p], after[:, v, v] = 6.0 * (s - s**2) / span, 3.0 * s**2 - 2.0 * s
-            acceleration[:, i, p] = (12.0 * s - 6.0) / span**2
-            acceleration[:, i, v] = (6.0 * s - 4.0) / span
-            acceleration[:, i, _MOTION + p] = (6.0 - 12.0 * s) / span**2
-            acceleration[:, i, _MOTION + v] = (6.0 * s - 2.0) / span
-            q = self.density[k, i]
-            variance[:, p, p], variance[:, v, v] = q * v_pp, q * v_vv
-            variance[:, p, v] = variance[:, v, p] = q * v_pv
+        p_after, v_after = 3.0 * s**2 - 2.0 * s**3, 6.0 * (s - s**2) / span
+        before = _blocks(1.0 - p_after, span * s * (1 - s) ** 2, -v_after, 3 * s**2 - 4 * s + 1.0)
+        after = _blocks(p_after, -span * s**2 * (1.0 - s), v_after, 3.0 * s**2 - 2.0 * s)
+        acceleration = np.stack(
+            [
+                (12.0 * s - 6.0) / span**2,
+                (6.0 * s - 4.0) / span,
+                (6.0 - 12.0 * s) / span**2,
+                (6.0 * s - 2.0) / span,
+            ],
+            axis=1,
+        )
         if lasting is not None:
             tau = np.clip(lasting - self.time[k], 0.0, span)
             rest = span - tau
-        at = _MOTION
-        for process in self.processes:
-            whole = np.sinh(span / process.tau)
-            left = np.sinh(rest / process.tau) / whole
-            right = np.sinh(tau / process.tau) / whole
-            missing = (
-                np.expm1(-2.0 * tau / process.tau)
-                * np.expm1(-2.0 * rest / process.tau)
-                / -np.expm1(-2.0 * span / process.tau)
-            )
-            for i in range(at, at + process.sigma.size):
-                before[:, i, i], after[:, i, i], variance[:, i, i] = left, right, missing
-            at += process.sigma.size
-        return Interpolation(k, before, after, acceleration, variance)
+        own = np.array([p.tau for p in self.processes for _ in range(p.sigma.size)])
+        scaled = [t[:, None] / own for t in (span, tau, rest)]
+        whole, left, right = (np.sinh(t) for t in scaled)
+        missing = np.expm1(-2.0 * scaled[1]) * np.expm1(-2.0 * scaled[2])
+        return Interpolation(
+            node=k,
+            motion_before=before,
+            motion_after=after,
+            motion_variance=_blocks(v_pp, v_pv, v_pv, v_vv)[..., None]
+            * self.density[k][:, None, None, :],
+            acceleration=acceleration,
+            process_before=right / whole,
+            process_after=left / whole,
+            process_variance=missing / -np.expm1(-2.0 * scaled[0]),
+        )
+
+
+def _blocks(pp: Array, pv: Array, vp: Array, vv: Array) -> Array:
+    """Return matrices (M, 2, 2) from their elements (M,)."""
+    return np.stack([np.stack([pp, pv], axis=1), np.stack([vp, vv], axis=1)], axis=1)
+
+
+def _times(J: Array, motion: Array, process: Array) -> Array:
+    """Return J (M, d, n) times matrices by axis, (M, 2, 2) or (M, 2, 2, 3), and a diagonal."""
+    if motion.ndim == 3:
+        motion = motion[..., None]
+    p, v = J[:, :, :3], J[:, :, 3:_MOTION]
+    out = np.empty(J.shape)
+    out[:, :, :3] = p * motion[:, None, 0, 0] + v * motion[:, None, 1, 0]
+    out[:, :, 3:_MOTION] = p * motion[:, None, 0, 1] + v * motion[:, None, 1, 1]
+    out[:, :, _MOTION:] = J[:, :, _MOTION:] * process[:, None]
+    return out
 
 
 def node_times(time: Array, turning: Sequence[bool] | np.ndarray, interval: float) -> Array:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -10,7 +11,7 @@ import numpy as np
 
 from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.vectors import Array, rotate
-from factorgraph_dvl.graph.bordered_chain import Covariances, NormalEquations
+from factorgraph_dvl.graph.bordered_chain import Covariances, NormalEquations, rows_by_node
 from factorgraph_dvl.graph.clocks import linearized, true_time
 from factorgraph_dvl.graph.motion_chain import Interpolation, MotionChain
 from factorgraph_dvl.graph.priors import local_coordinates, places, prior_mean, prior_root
@@ -22,8 +23,8 @@ from factorgraph_dvl.sensors.protocol import Linearization, Motion, Observation
 # Names of the processes that are no error of a measurement.
 ATTITUDE = "attitude"
 CURRENT = "current"
-# Rows whose leverage is computed at once. Chosen: some 100 MB.
-_CHUNK = 4000
+# Least share of a residual's variance that its fit leaves. Chosen: below it rounding decides.
+_LEAST_LEFT = 0.02
 
 
 @dataclass(frozen=True)
@@ -106,10 +107,11 @@ class WhitenedRows:
     def leverage(self, covariances: Covariances) -> Array:
         """Return the variance of the rows' predictions, (M, d)."""
         out = np.empty(self.residual.shape)
-        for a in range(0, self.node.size, _CHUNK):
-            rows = slice(a, a + _CHUNK)
-            J = np.concatenate([self.before[rows], self.after[rows], self.constants[rows]], axis=2)
-            out[rows] = np.sum((J @ covariances.around(self.node[rows])) * J, axis=2)
+        J = np.concatenate([self.before, self.after, self.constants], axis=2)
+        for at, rows in rows_by_node(self.node):
+            stacked = J[rows].reshape(at.size, -1, J.shape[2])
+            variance = np.sum((stacked @ covariances.around(at)) * stacked, axis=2)
+            out[rows] = variance.reshape(*rows.shape, -1)
         return out
 
 
@@ -162,7 +164,6 @@ class MotionProblem:
         self._nRl = level_axes(frame, start[:, :3])
         self.total_sigma: list[Array] = []
         self._whitening: list[Array] = []
-        self._log_weights = 0.0
         self._bound: dict[str, Array] = {}
         # A parameter that no measurement names belongs to the attitude.
         self._of_attitude = {p.name for p in attitude.sensor.parameters()}
@@ -203,7 +204,7 @@ class MotionProblem:
         What lasts is that at `bound` (M,), where this lies between the same nodes.
         """
         at = self.chain.at(time, bound)
-        x = rotate(at.before, states[at.node]) + rotate(at.after, states[at.node + 1])
+        x = at.states(states)
         stamp = time + self._attitude_lag(time, parameters)
         error = np.zeros((time.size, 3))
         if self.chain.has(ATTITUDE):
@@ -212,14 +213,14 @@ class MotionProblem:
         near = np.clip(np.searchsorted(self.chain.time, time), 0, self.chain.time.size - 1)
         nRl = self._nRl[near]
         own = {n: v for n, v in parameters.items() if n in self._of_attitude}
-        heading = self.attitude.at(stamp, error, nRl).rph[:, 2] if own else np.zeros(time.size)
+        heading = self.attitude.rph_at(stamp)[:, 2]
         lasting, by = heading_error(time, heading, own, self.zero)
         error[:, 2] += lasting
         return at, x, self.attitude.at(stamp, error, nRl), by
 
     def weigh(self, evaluation: MotionEvaluation) -> None:
         """Set the weights of all measurements from their covariances there."""
-        self._whitening, self.total_sigma, self._log_weights = [], [], 0.0
+        self._whitening, self.total_sigma = [], []
         # A clock that moves must not follow errors that are as rough as a random walk.
         self._bound = {
             o.label: seen.time for o, seen in zip(self.observations, evaluation.seen, strict=True)
@@ -229,17 +230,13 @@ class MotionProblem:
             used = np.isfinite(sigma) & self.usable(o, seen)[:, None]
             R = np.einsum("mi,ij->mij", np.where(used, sigma, 1.0) ** 2, np.eye(sigma.shape[1]))
             spread = seen.by_rph * self.attitude.white
-            J = seen.by_state
             more = spread @ spread.transpose(0, 2, 1)
-            more += J @ seen.interpolation.variance @ J.transpose(0, 2, 1)
+            more += seen.interpolation.variance(seen.by_state)
             R += more * used[:, :, None] * used[:, None, :]
             variance = np.diagonal(R, axis1=1, axis2=2)
             self.total_sigma.append(np.where(used, np.sqrt(variance), np.inf))
-            root = np.linalg.cholesky(R)
-            W = np.linalg.inv(root) * used[:, :, None] * used[:, None, :]
+            W = np.linalg.inv(np.linalg.cholesky(R)) * used[:, :, None] * used[:, None, :]
             self._whitening.append(W)
-            diagonal = np.diagonal(root, axis1=1, axis2=2)
-            self._log_weights += 2.0 * float(np.sum(np.log(diagonal[used])))
 
     def usable(self, observation: Observation, seen: Seen) -> np.ndarray:
         """Whether measurements (M,) are covered and not rejected."""
@@ -256,26 +253,31 @@ class MotionProblem:
     def rows(self, evaluation: MotionEvaluation) -> Iterator[WhitenedRows]:
         """Yield the whitened rows of each observation, unused ones as zeros."""
         for o, seen, W in zip(self.observations, evaluation.seen, self._whitening, strict=True):
-            J = W @ seen.by_state
-            yield WhitenedRows(
-                o.label,
-                seen.interpolation.node,
-                J @ seen.interpolation.before,
-                J @ seen.interpolation.after,
-                W @ seen.by_parameters,
-                rotate(W, seen.residual),
+            yield _rows(
+                o, seen, W @ seen.by_state, W @ seen.by_parameters, rotate(W, seen.residual)
             )
 
-    def residuals(self, evaluation: MotionEvaluation) -> Iterator[Array]:
-        """Yield residuals (M, d) in standard deviations, rejected ones too, nan if missing."""
+    def residuals(self, evaluation: MotionEvaluation, covariances: Covariances) -> Iterator[Array]:
+        """Yield residuals (M, d) in their standard deviations, rejected ones too, nan if missing.
+
+        The variance of a residual is that of the measurement less that of its prediction; of one
+        that was left out, their sum.
+        """
         for o, seen in zip(self.observations, evaluation.seen, strict=True):
             sigma = self.sigma(o, seen, evaluation.parameters)
-            R = np.square(np.where(np.isfinite(sigma), sigma, np.nan))
+            known = np.isfinite(sigma) & seen.covered[:, None]
+            R = np.square(np.where(known, sigma, 1.0))
             spread = seen.by_rph * self.attitude.white
             J = seen.by_state
             R += np.sum(spread**2, axis=2)
-            R += np.sum((J @ seen.interpolation.variance) * J, axis=2)
-            yield np.where(seen.covered[:, None], seen.residual / np.sqrt(R), np.nan)
+            R += np.diagonal(seen.interpolation.variance(J), axis1=1, axis2=2)
+            W = (known / np.sqrt(R))[:, :, None]
+            leverage = _rows(o, seen, W * J, W * seen.by_parameters, seen.residual).leverage(
+                covariances
+            )
+            used = self.usable(o, seen)[:, None]
+            left = np.where(used, np.maximum(1.0 - leverage, _LEAST_LEFT), 1.0 + leverage)
+            yield np.where(known, seen.residual / np.sqrt(R * left), np.nan)
 
     def motion_rows(self, states: Array) -> WhitenedRows:
         """Return the whitened rows of the motion prior, a process of n rows for each step."""
@@ -297,55 +299,58 @@ class MotionProblem:
 
     def equations(self, evaluation: MotionEvaluation) -> NormalEquations:
         """Return the normal equations at an evaluation."""
+        out = self._without_motion(evaluation)
+        self._add_motion(out, evaluation.states)
+        return out
+
+    def deviance(self, evaluation: MotionEvaluation) -> Callable[[MotionChain], float]:
+        """Return twice the negative logarithm of the restricted likelihood, but for a constant.
+
+        It is a function of other priors with the same nodes and processes. States and parameters
+        are integrated out, linear at the evaluation, so that only what they leave says how strong
+        a prior is. Weights of measurements and interpolation are those of this prior.
+
+        Parameters
+        ----------
+        evaluation : MotionEvaluation
+            Near the minimum.
+        """
+        data = self._without_motion(evaluation)
+
+        def of(chain: MotionChain) -> float:
+            other = self.with_chain(chain)
+            scale = np.ones(chain.size)
+            for p, q in zip(self.chain.processes, chain.processes, strict=True):
+                scale[chain.place(p.name)] = np.maximum(q.sigma, 1e-300) / p.sigma
+            states = evaluation.states / scale
+            equations = data.scaled(scale)
+            prior = other._add_motion(equations, states)
+            factors = equations.factorise()
+            dx, dc = factors.step()
+            gain = np.vdot(dx, equations.node_gradient) + dc @ equations.constant_gradient
+            return prior + float(gain) - chain.log_determinant() + factors.log_determinant
+
+        return of
+
+    def _without_motion(self, evaluation: MotionEvaluation) -> NormalEquations:
+        """Return the normal equations of measurements and parameters alone."""
         out = NormalEquations(self.chain.time.size, self.chain.size, self.constants)
-        for rows in (self.motion_rows(evaluation.states), *self.rows(evaluation)):
-            order = np.argsort(rows.node, kind="stable")
-            out.add(
-                rows.node[order],
-                rows.before[order],
-                rows.after[order],
-                rows.constants[order],
-                rows.residual[order],
-            )
-        first = self.chain.first()
-        out.diagonal[0] += np.diag(first**2)
-        out.node_gradient[0] += first**2 * (evaluation.states[0] - self._first())
+        for rows in self.rows(evaluation):
+            out.add(rows.node, rows.before, rows.after, rows.constants, rows.residual)
         if self.parameters:
             gain = np.linalg.inv(self.prior_root)
             out.corner += gain.T @ gain
             out.constant_gradient += gain.T @ self._prior_residual(evaluation.parameters)
         return out
 
-    def deviance(self, evaluation: MotionEvaluation, chain: MotionChain) -> float:
-        """Return twice the negative logarithm of the restricted likelihood, but for a constant.
-
-        States and parameters are integrated out, linear at the evaluation, so that only what
-        they leave says how strong a prior is.
-
-        Parameters
-        ----------
-        evaluation : MotionEvaluation
-            Near the minimum.
-        chain : MotionChain
-            Another prior, with the same nodes and processes.
-        """
-        other = self.with_chain(chain)
-        states = evaluation.states.copy()
-        for p, q in zip(self.chain.processes, chain.processes, strict=True):
-            states[:, self.chain.place(p.name)] *= p.sigma / np.maximum(q.sigma, 1e-300)
-        moved = other.evaluate(states, evaluation.parameters)
-        other.weigh(moved)
-        equations = other.equations(moved)
-        factors = equations.factorise()
-        dx, dc = factors.step()
-        gain = np.vdot(dx, equations.node_gradient) + dc @ equations.constant_gradient
-        return (
-            2.0 * other.cost(moved)
-            + float(gain)
-            + other._log_weights
-            - chain.log_determinant()
-            + factors.log_determinant
-        )
+    def _add_motion(self, equations: NormalEquations, states: Array) -> float:
+        """Add the prior of the motion, and return its sum of squares."""
+        rows, first = self.motion_rows(states), self.chain.first()
+        equations.add_steps(rows.before, rows.after, rows.residual)
+        beyond = first * (states[0] - self._first())
+        equations.diagonal[0] += np.diag(first**2)
+        equations.node_gradient[0] += first * beyond
+        return float(np.vdot(rows.residual, rows.residual) + beyond @ beyond)
 
     def _first(self) -> Array:
         first = self._start[0].copy()
@@ -372,7 +377,6 @@ class MotionProblem:
         at, x, body, by_heading = self.body_at(time, states, parameters, self._bound.get(o.label))
         stamp = time + self._attitude_lag(time, parameters)
         covered = self.chain.covers(time) & self.attitude.covers(stamp)
-        ends = np.concatenate([states[at.node, :6], states[at.node + 1, :6]], axis=1)
         v_n = x[:, 3:6]
         flows = self.chain.has(CURRENT) and any(n.startswith("current") for n in o.parameters)
         if flows:
@@ -383,7 +387,7 @@ class MotionProblem:
             p_n=x[:, :3],
             v_n=v_n,
             omega_eb_b=body.omega_eb_b,
-            a_n=rotate(at.acceleration, ends),
+            a_n=at.accelerations(states),
             alpha_b=body.alpha_b,
             omega_sigma=body.omega_sigma,
         )
@@ -439,16 +443,22 @@ class MotionProblem:
 
     def with_chain(self, chain: MotionChain, start: Array | None = None) -> MotionProblem:
         """Return the same problem with another prior, and states to start from if nodes moved."""
-        out = MotionProblem(
-            chain,
-            self.frame,
-            self.attitude,
-            self.observations,
-            self.all_parameters,
-            self._start if start is None else start,
-        )
-        out.noise_factors, out.rejected = self.noise_factors, self.rejected
+        out = copy(self)
+        out.chain = chain
+        out._bound = {}
+        if start is not None:
+            out._start, out._nRl = start, level_axes(self.frame, start[:, :3])
         return out
+
+
+def _rows(
+    observation: Observation, seen: Seen, by_state: Array, by_parameters: Array, residual: Array
+) -> WhitenedRows:
+    """Return rows by the nodes before and after from rows by the state between them."""
+    at = seen.interpolation
+    return WhitenedRows(
+        observation.label, at.node, *at.by_nodes(by_state), by_parameters, residual
+    )
 
 
 def with_sigma(chain: MotionChain, name: str, sigma: Array, tau: float) -> MotionChain:

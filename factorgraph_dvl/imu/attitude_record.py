@@ -12,7 +12,7 @@ from scipy.interpolate import CubicSpline
 
 from factorgraph_dvl.errors import DataError
 from factorgraph_dvl.geometry.earth import LocalFrame
-from factorgraph_dvl.geometry.rotations import BodyAxes, rotation_from_rph, rph_jacobian
+from factorgraph_dvl.geometry.rotations import BodyAxes, rotation_from_rph, theta_by_rph
 from factorgraph_dvl.geometry.vectors import Array, rotate
 from factorgraph_dvl.imu.attitude_history import Orientation
 from factorgraph_dvl.imu.interpolation import ORDER, local_cubics, white_gain
@@ -150,9 +150,7 @@ class AttitudeRecord:
         """
         rph = np.asarray(self._spline(time))
         true = rph - error
-        by_rph: Array = np.asarray(
-            np.linalg.inv(rph_jacobian(true, self.body_axes)), dtype=np.float64
-        )
+        by_rph = theta_by_rph(true, self.body_axes)
         return BodyAttitude(
             rph=rph,
             nRb=nRl @ rotation_from_rph(true, self.body_axes),

@@ -203,8 +203,8 @@ def moving_water(
 ) -> Array:
     """Return a current that changes with time and place, east and north, (M, 2), m/s.
 
-    Its covariance falls as exp(-|t| / tau - |x| / distance); it is drawn once a minute, and
-    linear in between.
+    Its covariance falls as exp(-|t| / tau - |x| / distance). It is drawn once a minute, and
+    between these knots as a random walk that meets both: over so short a time it is one.
 
     Parameters
     ----------
@@ -217,13 +217,21 @@ def moving_water(
     rng : numpy.random.Generator
         Source of the numbers.
     """
-    knots = np.append(np.arange(time[0], time[-1], 60.0), time[-1])
-    at = np.stack([np.interp(knots, time, x) for x in place.T], axis=1)
-    apart = np.linalg.norm(at[:, None] - at[None], axis=2)
-    later = np.abs(knots[:, None] - knots[None])
+    knots = np.unique(np.append(np.searchsorted(time, np.arange(time[0], time[-1], 60.0)),
+                                time.size - 1))  # fmt: skip
+    apart = np.linalg.norm(place[knots, None] - place[knots], axis=2)
+    later = np.abs(time[knots, None] - time[knots])
     covariance = np.exp(-later / tau_s - apart / distance_m) + 1e-9 * np.eye(knots.size)
     draws = std_m_s * np.linalg.cholesky(covariance) @ rng.standard_normal((knots.size, 2))
-    return np.stack([np.interp(time, knots, x) for x in draws.T], axis=1)
+    way = np.linalg.norm(np.diff(place, axis=0), axis=1)
+    steps = np.diff(time) / tau_s + way / distance_m
+    passed = np.append(0.0, np.cumsum(steps))
+    walk = np.zeros((time.size, 2))
+    walk[1:] = np.cumsum(
+        std_m_s * np.sqrt(2.0 * steps)[:, None] * rng.standard_normal((steps.size, 2)), axis=0
+    )
+    beyond = draws - walk[knots]
+    return walk + np.stack([np.interp(passed, passed[knots], x) for x in beyond.T], axis=1)
 
 
 def _dvl_velocity(scenario: Scenario, state: TrueState, current: Array) -> Array:

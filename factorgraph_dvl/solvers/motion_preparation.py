@@ -40,8 +40,9 @@ _BETWEEN = 0.2
 # Density of acceleration, m²/s³: a start value where the log does not show one, and the least.
 _DENSITY = 1e-3
 _LEAST_DENSITY = 1e-9
-# Spans, s, over which changes of velocity show the density.
-_SHORT, _LONG = 2.0, 10.0
+# Spans, s, over which changes of velocity on legs show the density; in turns, in which velocity
+# changes steadily, they are the intervals of the pings.
+_LEG_SPANS = (2.0, 10.0)
 # Start values of the current as a process: standard deviation, m/s, and correlation time, s.
 _CURRENT_STD, _CURRENT_TIME = 0.1, 3600.0
 
@@ -110,13 +111,14 @@ def prepare_motion(trial: Trial) -> MotionPreparation:
     values = {p.name: prior_mean(p) for p in parameters}
     values |= _start_values(trial, record, track, frame, parameters)
     times = _node_candidates(trial, record, track, values)
-    density, sigma = _densities(trial, record, track, values)
+    on_legs, in_turns, sigma = _densities(trial, record, values)
     turning_at = _turns(record, times)
-    spacing = _BETWEEN**2 * 16.0 * sigma**2 / max(float(density[:2].max()), _LEAST_DENSITY)
+    spacing = _BETWEEN**2 * 16.0 * sigma**2 / max(float(on_legs[:2].max()), _LEAST_DENSITY)
     spacing = max(spacing, (times[-1] - times[0]) / _MOST_NODES)
     nodes = node_times(times, turning_at, min(spacing, _LONGEST))
     turning = _turns(record, 0.5 * (nodes[1:] + nodes[:-1]))
-    chain = MotionChain(nodes, np.tile(density, (nodes.size - 1, 1)), processes)
+    density = np.where(turning[:, None], in_turns, on_legs)
+    chain = MotionChain(nodes, density, processes)
     p_n, v_n, _ = track.at(nodes)
     states = np.hstack([p_n, v_n, np.zeros((nodes.size, chain.size - 6))])
     problem = MotionProblem(chain, frame, record, observations, parameters, states)
@@ -277,30 +279,39 @@ def _turns(record: AttitudeRecord, time: Array) -> np.ndarray:
 
 
 def _densities(
-    trial: Trial, record: AttitudeRecord, track: Track, values: dict[str, Array]
-) -> tuple[Array, float]:
-    """Return the density of acceleration east, north, up, and the noise of a ping.
+    trial: Trial, record: AttitudeRecord, values: dict[str, Array]
+) -> tuple[Array, Array, float]:
+    """Return the density of acceleration east, north, up on legs and in turns, and a ping's noise.
 
     Velocities that are L apart differ by the density times L and by twice the noise: from two L
     both follow.
     """
     log = trial.log
     if log is None or log.locked.sum() < 50:
-        return np.full(3, _DENSITY), 0.1
+        return np.full(3, _DENSITY), np.full(3, _DENSITY), 0.1
     rows = np.flatnonzero(log.locked)
     time = log.time[rows] - float(values.get("time_offset_s", np.zeros(1))[0])
     rph = record.rph_at(time)
     bRd = values.get("misalignment_deg", np.eye(3)).T
     v_n = rotate(rotation_from_rph(rph, record.body_axes), log.velocity[rows] @ bRd.T)
     interval = float(np.median(np.diff(time)))
-    squares = []
-    for span in (_SHORT, _LONG):
-        step = max(1, round(span / interval))
-        step = min(step, time.size - 1)
-        squares.append(np.mean((v_n[step:] - v_n[:-step]) ** 2, axis=0))
-    density = np.maximum((squares[1] - squares[0]) / (_LONG - _SHORT), 0.0)
-    density[:2] = density[:2].mean()
-    return np.maximum(density, 1e-6), float(np.median(log.sigma()))
+    turning = _turns(record, time)
+
+    def density(wanted: np.ndarray, spans: tuple[float, float]) -> Array:
+        squares = []
+        for span in spans:
+            step = min(max(1, round(span / interval)), time.size - 1)
+            alike = wanted[step:] & wanted[:-step]
+            if step < round(span / interval) or alike.sum() < 20:
+                return np.full(3, _DENSITY)
+            squares.append(np.mean((v_n[step:] - v_n[:-step])[alike] ** 2, axis=0))
+        found = np.maximum((squares[1] - squares[0]) / (spans[1] - spans[0]), 0.0)
+        found[:2] = found[:2].mean()
+        return np.maximum(found, 1e-6)
+
+    on_legs = density(np.logical_not(turning), _LEG_SPANS)
+    in_turns = density(turning, (interval, 2.0 * interval))
+    return on_legs, in_turns, float(np.median(log.sigma()))
 
 
 def _notes(trial: Trial) -> tuple[Finding, ...]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
@@ -10,7 +11,7 @@ from scipy.optimize import minimize
 from scipy.special import chdtri
 
 from factorgraph_dvl.errors import SolveError
-from factorgraph_dvl.geometry.vectors import Array, rotate
+from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph.bordered_chain import Covariances, Factorisation
 from factorgraph_dvl.graph.motion_chain import MotionChain
 from factorgraph_dvl.graph.motion_problem import (
@@ -25,9 +26,15 @@ from factorgraph_dvl.solution import Progress
 from factorgraph_dvl.solvers.motion_preparation import MotionPreparation
 from factorgraph_dvl.statistics.robust_weights import robust_scale
 
-# Decrease of the cost that the linear model still promises at a minimum, and steps of a round.
+# Decrease of the cost that the linear model still promises at a minimum, and steps of the first
+# round, which starts far off, and of others, in which noise and strengths move the minimum.
 _CONVERGED = 1e-3
-_STEPS = 6
+_FAR_STEPS = 6
+_STEPS = 3
+# Share by which a cost may miss what the linear model promised before another length of the step
+# is tried, and the longest of these. Chosen: well above rounding, and what clocks need.
+_POOR = 0.3
+_LONGEST_STEP = 4.0
 # Rounds of weights, noise and strength after which they count as not settled, and the relative
 # change of a standard deviation from which on there is another. Measured: most take four.
 _ROUNDS = 25
@@ -37,21 +44,26 @@ _PRIOR_FREEDOM = 0.4
 _LEAST_REDUNDANCY = 10.0
 # Least factor on stated noise; residuals of less are those of a record that was smoothed.
 _LEAST_FACTOR = 0.1
-# Clock whose pings lie between nodes, and how far off the middle they may be, in intervals.
+# Clock whose pings lie between nodes, and how far off the middle they may be, in its standard
+# deviations.
 _DVL_CLOCK = "time_offset_s"
-_OFF_CENTRE = 0.1
+_OFF_CENTRE = 0.2
 # Probability with which a good measurement passes the gate, factor on the gate from which on it is
 # worth a search, and the share of outliers from which on it is the model that is wrong.
 _GATE = 0.999
 _WORTH = 2.0
 _TOO_MANY = 0.4
-# Rounds in which outliers are searched. Chosen: the second finds those that the first hid.
-_SEARCHES = 3
+# How often outliers are searched before anything else, and in all. Chosen: the second search finds
+# those that the first hid, and the last ones judge them by the noise that was found.
+_FIRST_SEARCHES = 2
+_SEARCHES = 5
 # Rounds from one search for the strength of the current to the next, while all else changes.
 _CURRENT_ROUNDS = 5
+# Reach of the first and the later searches by the logarithm of the strength, and their precision.
+_FAR, _NEAR, _FINEST = 0.7, 0.2, 0.03
 # Limits of the strength of a current: m/s and s, by its logarithm.
-_CURRENT_STD = (np.log(0.005), np.log(2.0))
-_CURRENT_TIME = (np.log(60.0), np.log(2e5))
+_CURRENT_STD = (math.log(0.005), math.log(2.0))
+_CURRENT_TIME = (math.log(60.0), math.log(2e5))
 # Density of acceleration, relative to that in turns, which changes nothing; and the largest step
 # of its logarithm.
 _NEGLIGIBLE = 1e-3
@@ -105,11 +117,13 @@ def smooth_motion(prepared: MotionPreparation, report: Progress) -> SmoothedMoti
         for o in problem.observations
         if o.label in prepared.estimated_noise
     }
-    iterations, free_current, changing = 0, prepared.current_is_free, ["all"]
-    last_moved = np.zeros_like(problem.chain.density)
+    iterations, searches, free_current, changing = 0, 0, prepared.current_is_free, ["all"]
+    last_moved, reach = np.zeros_like(problem.chain.density), _FAR
     at_clock = float(values[_DVL_CLOCK][0]) if _DVL_CLOCK in values else 0.0
     for round_ in range(_ROUNDS):
-        evaluation, factors, steps, reached = _minimise(problem, states, values, report)
+        evaluation, factors, steps, reached = _minimise(
+            problem, states, values, report, far=round_ == 0
+        )
         iterations += steps
         states, values = evaluation.states, evaluation.parameters
         covariances = factors.covariances()
@@ -117,18 +131,16 @@ def smooth_motion(prepared: MotionPreparation, report: Progress) -> SmoothedMoti
         if not reached:
             changing.append("the minimum")
         moved_clock = float(values[_DVL_CLOCK][0]) - at_clock if _DVL_CLOCK in values else 0.0
-        if abs(moved_clock) > _OFF_CENTRE * float(np.median(np.diff(problem.chain.time))):
-            # Pings stay between the nodes: one at a node has a state to itself, which fits it at
-            # any time, and would hold its clock there.
+        off_centre = abs(moved_clock) > _OFF_CENTRE * _clock_sigma(problem, factors)
+        if off_centre:
             changing.append("the times of measurements")
-            problem, states = _shifted(problem, states, -moved_clock)
-            at_clock = float(values[_DVL_CLOCK][0])
-            if round_ < _ROUNDS - 1:
-                continue
-        rejected = _rejected(problem, evaluation)
-        if round_ < _SEARCHES and not _same_rows(rejected, problem.rejected):
+        if (
+            searches < _FIRST_SEARCHES
+            and not off_centre
+            and _rejects_others(problem, evaluation, covariances)
+        ):
+            searches += 1
             changing.append("which measurements are outliers")
-            problem.rejected = rejected
             continue
         noise = _noise(problem, evaluation, covariances)
         density = _density(problem, prepared.turning, states, covariances)
@@ -141,10 +153,11 @@ def smooth_motion(prepared: MotionPreparation, report: Progress) -> SmoothedMoti
             changing.append("the acceleration of the vessel")
         density = chain.density * np.exp(_hastened(moved, last_moved))
         last_moved = moved
-        # A search takes forty factorisations: not in every round.
+        # A search takes twenty factorisations: not in every round.
         if free_current and (not changing or round_ % _CURRENT_ROUNDS == 0):
             report("current", round_, None)
-            chain = _current(problem, evaluation, chain)
+            chain = _current(problem, evaluation, chain, reach)
+            reach = _NEAR
             old, new = (next(p for p in c.processes if p.name == CURRENT)
                         for c in (problem.chain, chain))  # fmt: skip
             states = states.copy()
@@ -152,10 +165,25 @@ def smooth_motion(prepared: MotionPreparation, report: Progress) -> SmoothedMoti
             if abs(np.log(new.sigma[0] / old.sigma[0])) > 3.0 * _SAME:
                 changing.append("the current")
             free_current = len(changing) > 1 or "the current" in changing
+        if (
+            not changing
+            and searches < _SEARCHES
+            and _rejects_others(problem, evaluation, covariances)
+        ):
+            # What seemed far off while noise and strengths were not known may be none.
+            searches += 1
+            changing.append("which measurements are outliers")
+            if round_ < _ROUNDS - 1:
+                continue
         if not changing or round_ == _ROUNDS - 1:
             break
         problem = problem.with_chain(replace(chain, density=density))
         problem.noise_factors = noise
+        if off_centre:
+            # Pings stay in the middle between nodes: elsewhere the variance of the motion between
+            # nodes changes with the clock, and pulls it.
+            problem, states = _shifted(problem, states, -moved_clock)
+            at_clock += moved_clock
     findings = prepared.findings
     if changing:
         text = f"after {_ROUNDS} rounds {', '.join(changing)} still changed: do not use the result"
@@ -165,12 +193,20 @@ def smooth_motion(prepared: MotionPreparation, report: Progress) -> SmoothedMoti
     )
 
 
+def _clock_sigma(problem: MotionProblem, factors: Factorisation) -> float:
+    """Return the standard deviation of the clock of the pings, s; infinite where it is known."""
+    if _DVL_CLOCK not in problem.columns:
+        return np.inf
+    at = problem.columns[_DVL_CLOCK].start
+    return float(np.sqrt(factors.constants[at, at]))
+
+
 def _shifted(problem: MotionProblem, states: Array, by: float) -> tuple[MotionProblem, Array]:
     """Return a problem whose nodes are later by so many seconds, and their states."""
     chain = problem.chain
     time = chain.time + by
     at = chain.at(np.clip(time, chain.time[0], chain.time[-1]))
-    x = rotate(at.before, states[at.node]) + rotate(at.after, states[at.node + 1])
+    x = at.states(states)
     return problem.with_chain(replace(chain, time=time), x), x
 
 
@@ -182,23 +218,26 @@ def _hastened(moved: Array, before: Array) -> Array:
 
 
 def _minimise(
-    problem: MotionProblem, states: Array, values: dict[str, Array], report: Progress
+    problem: MotionProblem,
+    states: Array,
+    values: dict[str, Array],
+    report: Progress,
+    *,
+    far: bool,
 ) -> tuple[MotionEvaluation, Factorisation, int, bool]:
     """Return the minimum near states and values, its factorisation, steps, and if it was reached.
 
-    Gauss-Newton; a step that does not lower the cost is halved.
+    From a far start weights follow the first steps: a DVL's noise is that of its speed.
     """
-    evaluation = problem.evaluate(states, values)
-    problem.weigh(evaluation)
-    evaluation = problem.evaluate(states, values)
-    cost = problem.cost(evaluation)
+    most = _FAR_STEPS if far else _STEPS
+    evaluation, cost = _weighted(problem, states, values)
     if not np.isfinite(cost):
         raise SolveError(
             "the cost at the start is not finite",
             where="all sensors",
             hint="Inspect the trial: a unit or a column may be wrong",
         )
-    for steps in range(_STEPS):
+    for steps in range(most):
         report("all sensors", steps, cost)
         equations = problem.equations(evaluation)
         try:
@@ -215,32 +254,83 @@ def _minimise(
         )
         if promised < _CONVERGED:
             return evaluation, factors, steps, True
-        share = 1.0
-        while share > 1e-3:
-            after = problem.evaluate(
-                evaluation.states + share * dx,
-                after_step(problem.parameters, evaluation.parameters, share * dc),
-            )
-            after_cost = problem.cost(after)
-            if after_cost < cost:
-                break
-            share *= 0.5
-        else:
+        after = _lower(problem, evaluation, cost, factors, dx, dc, promised)
+        if after is None:
             # No digits are left, or the weights hold the step back.
             return evaluation, factors, steps, promised < 1e-2
-        evaluation, cost = after, after_cost
-        if share == 1.0 and steps < 3:
-            # A DVL's noise follows from its speed, which a far start has wrong.
-            problem.weigh(evaluation)
-            evaluation = problem.evaluate(evaluation.states, evaluation.parameters)
-            cost = problem.cost(evaluation)
-    return evaluation, factors, _STEPS, False
+        evaluation, cost = after
+        if far and steps < 3:
+            evaluation, cost = _weighted(problem, evaluation.states, evaluation.parameters)
+    return evaluation, factors, most, False
 
 
-def _rejected(problem: MotionProblem, evaluation: MotionEvaluation) -> dict[str, np.ndarray]:
+def _weighted(
+    problem: MotionProblem, states: Array, values: dict[str, Array]
+) -> tuple[MotionEvaluation, float]:
+    """Weigh a problem anew, and return its evaluation and cost."""
+    problem.weigh(problem.evaluate(states, values))
+    evaluation = problem.evaluate(states, values)
+    return evaluation, problem.cost(evaluation)
+
+
+def _lower(
+    problem: MotionProblem,
+    evaluation: MotionEvaluation,
+    cost: float,
+    factors: Factorisation,
+    dx: Array,
+    dc: Array,
+    promised: float,
+) -> tuple[MotionEvaluation, float] | None:
+    """Return an evaluation of lower cost along a Gauss-Newton step; None if there is none.
+
+    States are linear, clocks are not: where turns are noisy the step of a clock is up to twice
+    too long, or much too short. The cost at a second length shows how long it should be, while
+    the states follow the constants.
+    """
+
+    def along(share: float) -> tuple[MotionEvaluation, float]:
+        there = problem.evaluate(
+            evaluation.states + dx + factors.influence @ ((1.0 - share) * dc),
+            after_step(problem.parameters, evaluation.parameters, share * dc),
+        )
+        return there, problem.cost(there)
+
+    found = along(1.0)
+    by_constants = 0.5 * float(dc @ np.linalg.solve(factors.constants, dc))
+    if abs(cost - found[1] - promised) > _POOR * promised and by_constants > _CONVERGED:
+        curvature = found[1] - (cost - promised + by_constants) + 2.0 * by_constants
+        share = by_constants / max(curvature, by_constants / _LONGEST_STEP)
+        other = along(max(share, 1.0 / _LONGEST_STEP))
+        found = min(found, other, key=lambda each: each[1])
+    share = 0.5
+    while not found[1] < cost:
+        if share < 1e-3:
+            return None
+        there = problem.evaluate(
+            evaluation.states + share * dx,
+            after_step(problem.parameters, evaluation.parameters, share * dc),
+        )
+        found = there, problem.cost(there)
+        share *= 0.5
+    return found
+
+
+def _rejects_others(
+    problem: MotionProblem, evaluation: MotionEvaluation, covariances: Covariances
+) -> bool:
+    """Reject measurements beyond the gate; return whether they are others than before."""
+    before, problem.rejected = problem.rejected, _rejected(problem, evaluation, covariances)
+    return not _same_rows(problem.rejected, before)
+
+
+def _rejected(
+    problem: MotionProblem, evaluation: MotionEvaluation, covariances: Covariances
+) -> dict[str, np.ndarray]:
     """Return measurements beyond the gate, by label: their scale is that of the others."""
     out = {}
-    for o, residuals in zip(problem.observations, problem.residuals(evaluation), strict=True):
+    all_residuals = problem.residuals(evaluation, covariances)
+    for o, residuals in zip(problem.observations, all_residuals, strict=True):
         known = np.isfinite(residuals).any(axis=1)
         if not o.noise_groups or known.sum() < 20:
             continue
@@ -259,7 +349,8 @@ def _rejected(problem: MotionProblem, evaluation: MotionEvaluation) -> dict[str,
 
 
 def _same_rows(a: Mapping[str, np.ndarray], b: Mapping[str, np.ndarray]) -> bool:
-    return a.keys() == b.keys() and all(np.mean(a[k] != b[k]) < 1e-3 for k in a)
+    rows = ((a.get(k, False), b.get(k, False)) for k in a.keys() | b.keys())
+    return all(np.mean(one != other) < 1e-3 for one, other in rows)
 
 
 def _differ(a: Mapping[str, Array], b: Mapping[str, Array]) -> bool:
@@ -321,30 +412,28 @@ def _density(
 
 
 def _current(
-    problem: MotionProblem, evaluation: MotionEvaluation, chain: MotionChain
+    problem: MotionProblem, evaluation: MotionEvaluation, chain: MotionChain, reach: float
 ) -> MotionChain:
-    """Return a chain whose current has the strength of the greatest restricted likelihood."""
+    """Return a chain whose current has the strength of the greatest restricted likelihood.
+
+    It is searched within a reach of its logarithm first.
+    """
     now = next(p for p in chain.processes if p.name == CURRENT)
+    deviance_of = problem.deviance(evaluation)
 
     def chain_of(x: Array) -> MotionChain:
         return with_sigma(chain, CURRENT, np.full(2, np.exp(x[0])), float(np.exp(x[1])))
 
     def deviance(x: Array) -> float:
-        penalty = sum(
-            max(low - v, v - high, 0.0) ** 2
-            for v, (low, high) in zip(x, (_CURRENT_STD, _CURRENT_TIME), strict=True)
-        )
-        inside = np.array([np.clip(x[0], *_CURRENT_STD), np.clip(x[1], *_CURRENT_TIME)])
-        return problem.deviance(evaluation, chain_of(inside)) + 100.0 * penalty
+        return deviance_of(chain_of(x))
 
-    start = np.array([np.log(now.sigma[0]), np.log(now.tau)])
-    # By diffusion and standard deviation, along which the likelihood is round.
-    simplex = start + np.array([[0.0, 0.0], [0.5, 0.0], [0.0, 0.7]])
+    limits = [_CURRENT_STD, _CURRENT_TIME]
+    start = np.clip([np.log(now.sigma[0]), np.log(now.tau)], *np.transpose(limits))
     found = minimize(
         deviance,
         start,
-        method="Nelder-Mead",
-        options={"initial_simplex": simplex, "xatol": 0.05, "fatol": 0.1, "maxfev": 40},
+        method="COBYQA",
+        bounds=limits,
+        options={"initial_tr_radius": reach, "final_tr_radius": _FINEST, "maxfev": 40},
     )
-    x = np.array([np.clip(found.x[0], *_CURRENT_STD), np.clip(found.x[1], *_CURRENT_TIME)])
-    return chain_of(x)
+    return chain_of(found.x)

@@ -146,8 +146,10 @@ def _trajectory(found: SmoothedMotion, rate_hz: float) -> Trajectory:
             time[a : a + _CHUNK], evaluation.states, evaluation.parameters
         )
         P = found.covariances.around(at.node)
-        to_state = np.concatenate([at.before, at.after, np.zeros((at.node.size, n, c))], axis=2)
-        motion = to_state @ P @ to_state.transpose(0, 2, 1) + at.variance
+        every = np.broadcast_to(np.eye(n), (at.node.size, n, n))
+        missing = at.variance(every)
+        to_state = np.concatenate([*at.by_nodes(every), np.zeros((at.node.size, n, c))], axis=2)
+        motion = to_state @ P @ to_state.transpose(0, 2, 1) + missing
         # Errors of the attitude are those of the process and of the constants.
         to_rph = np.zeros((at.node.size, 3, 2 * n + c))
         if place.stop:
@@ -158,7 +160,7 @@ def _trajectory(found: SmoothedMotion, rate_hz: float) -> Trajectory:
                 to_rph[:, 2, 2 * n + own.start : 2 * n + own.stop] -= by
         rph_cov = to_rph @ P @ to_rph.transpose(0, 2, 1) + np.diag(problem.attitude.white**2)
         if place.stop:
-            rph_cov += sigma[:, None] * at.variance[:, place, place] * sigma
+            rph_cov += sigma[:, None] * missing[:, place, place] * sigma
         lat, lon, height = frame.geodetic(x[:, :3])
         level = frame.level_from_tangent(lat, lon)
         level_t = level.transpose(0, 2, 1)

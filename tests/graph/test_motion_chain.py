@@ -29,26 +29,28 @@ def test_the_state_between_nodes_is_the_mean_of_the_process(chain):
     before = np.array([[1.0, t], [0.0, 1.0]]) - after @ np.array([[1.0, span], [0.0, 1.0]])
     rows = np.ix_([0, 3], [0, 3])
     assert at.node == [1]
-    np.testing.assert_allclose(at.before[0][rows], before, atol=1e-12)
-    np.testing.assert_allclose(at.after[0][rows], after, atol=1e-12)
-    np.testing.assert_allclose(at.variance[0][rows], own - after @ forward @ own, atol=1e-12)
-    known = at.before[0, 6, 6] * np.exp(-t / 50.0) + at.after[0, 6, 6] * np.exp(-(span - t) / 50.0)
-    assert at.variance[0, 6, 6] == pytest.approx(1.0 - known)
+    every = np.eye(8)[None]
+    (by_before,), (by_after,) = at.by_nodes(every)
+    (variance,) = at.variance(every)
+    np.testing.assert_allclose(by_before[rows], before, atol=1e-12)
+    np.testing.assert_allclose(by_after[rows], after, atol=1e-12)
+    np.testing.assert_allclose(variance[rows], own - after @ forward @ own, atol=1e-12)
+    known = by_before[6, 6] * np.exp(-t / 50.0) + by_after[6, 6] * np.exp(-(span - t) / 50.0)
+    assert variance[6, 6] == pytest.approx(1.0 - known)
+    states = np.random.default_rng(1).standard_normal((4, 8))
+    expected = by_before @ states[1] + by_after @ states[2]
+    np.testing.assert_allclose(at.states(states)[0], expected, atol=1e-12)
 
 
 def test_acceleration_is_the_slope_of_the_velocity(chain):
     states = np.random.default_rng(1).standard_normal((4, 8))
 
     def velocity(t):
-        at = chain.at(np.array([t]))
-        return (at.before @ states[at.node, :, None] + at.after @ states[at.node + 1, :, None])[
-            0, 3:6, 0
-        ]
+        return chain.at(np.array([t])).states(states)[0, 3:6]
 
     at = chain.at(np.array([2.2]))
-    ends = np.concatenate([states[1, :6], states[2, :6]])
     slope = (velocity(2.2 + 1e-5) - velocity(2.2 - 1e-5)) / 2e-5
-    np.testing.assert_allclose(at.acceleration[0] @ ends, slope, atol=1e-6)
+    np.testing.assert_allclose(at.accelerations(states)[0], slope, atol=1e-6)
 
 
 def test_transitions_whiten_the_noise_of_a_step(chain):
