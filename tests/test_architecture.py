@@ -17,7 +17,7 @@ PACKAGE = Path(factorgraph_dvl.__file__).parent
 ROOT = PACKAGE.parent
 # Data classes of the sensors: no measurement equation is among them.
 SENSOR_DATA = (
-    *("Imu", "ImuSettings", "Gnss", "Dvl", "Star", "Aid", "Motion"),
+    *("Imu", "ImuSettings", "Gnss", "Ins", "Dvl", "Star", "Aid", "Motion"),
     *("Parameter", "SPEC", "Code", "Finding"),
 )
 # GTSAM, SciPy and Matplotlib take most of a second to load: only what needs none of them may

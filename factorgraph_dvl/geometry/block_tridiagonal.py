@@ -67,7 +67,7 @@ def inverse_blocks(diagonal: Array, off: Array) -> tuple[Array, Array]:
             if j >= i:
                 root[:, i, j] = factor[above + i - j, j::size]
             beside[:, i, j] = factor[above - size + i - j, size + j :: size]
-    root = np.linalg.inv(root)
+    root = np.asarray(np.linalg.inv(root), dtype=np.float64)
     gain = root[:-1] @ beside
     own = root @ root.transpose(0, 2, 1)
     for k in range(len(off) - 1, -1, -1):

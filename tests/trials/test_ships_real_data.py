@@ -59,7 +59,7 @@ def test_a_dive_without_its_imu_gives_lever_arm_and_clock():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("number", [1, 3, 4, 8])
+@pytest.mark.parametrize("number", [1, 3, 4, 8, 10])
 def test_every_dive_agrees(number):
     solution = found(number)
     assert solution.estimate("lever_arm_m").value[0] == pytest.approx(-1.84, abs=0.1)
