@@ -30,9 +30,7 @@ def circle(time):
 
 
 def geodetic(metres):
-    return np.stack(
-        [45.0 * DEG + metres[:, 1] / NORTH, metres[:, 0] / EAST, metres[:, 2]], axis=1
-    )
+    return np.stack([45.0 * DEG + metres[:, 1] / NORTH, metres[:, 0] / EAST, metres[:, 2]], axis=1)
 
 
 def reported(arm):
