@@ -12,7 +12,7 @@ from factorgraph_dvl.cli.console import found_event, say, stderr, stdout
 from factorgraph_dvl.errors import printable
 
 if TYPE_CHECKING:
-    from factorgraph_dvl.sensors.finding import Verdict
+    from factorgraph_dvl.sensors.verdict import Verdict
     from factorgraph_dvl.solution import Solution
 
 
