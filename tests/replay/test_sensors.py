@@ -65,7 +65,13 @@ def as_the_batch(trial, rate=1.0):
     return solution
 
 
-@pytest.mark.parametrize("changes", [MOUNTED, NOISY], ids=["mounting", "noisy gyros"])
+@pytest.mark.parametrize(
+    "changes",
+    [
+        pytest.param(MOUNTED, id="mounting"),
+        pytest.param(NOISY, id="noisy gyros", marks=pytest.mark.slow),
+    ],
+)
 def test_a_star_tracker(changes):
     trial = simulate(config("seed-a-star", manoeuvres=TURNS, reference_rate_hz=100, **changes), 1)
     solution = as_the_batch(trial)
@@ -159,7 +165,7 @@ def test_a_beacon_bounds_a_dive_and_its_echoes_are_left_out():
     assert np.abs(apart / end.position_std).max() < 0.5
 
 
-@pytest.mark.parametrize("rows", ["none", "empty"])
+@pytest.mark.parametrize("rows", ["none", pytest.param("empty", marks=pytest.mark.slow)])
 def test_a_sensor_that_is_first_heard_after_the_start(rows):
     scene = config("seed-a-phase-90", manoeuvres=[*TURNS, *TURNS[1:]], reference_rate_hz=50)
     trial = simulate(scene, 5)
