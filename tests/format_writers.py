@@ -24,14 +24,17 @@ def pd0(parts):
     return body + struct.pack("<H", sum(body) % 65536)
 
 
-def fixed_leader(*, frame=0, cells=2, up=False, convex=True, angle=1, alignment=0, tilts=True):
-    """Return Table 33: configuration, cells, EX, EA; 59 bytes."""
+def fixed_leader(
+    *, frame=0, cells=2, up=False, convex=True, angle=1, alignment=0, tilts=True, pings=(1, 0.0)
+):
+    """Return Table 33: configuration, cells, pings and their interval in s, EX, EA; 59 bytes."""
     out = bytearray(59)
     out[0:2] = b"\x00\x00"
     out[4] = 0b0100_0011 | (0x80 if up else 0) | (0x08 if convex else 0)
     out[5] = 0x40 | angle
     out[8], out[9] = 4, cells
-    out[10:12] = struct.pack("<H", 1)
+    out[10:12] = struct.pack("<H", pings[0])
+    out[22:25] = int(pings[1]) // 60, int(pings[1]) % 60, round(pings[1] % 1.0 * 100.0)
     out[12:14] = struct.pack("<H", 50)
     out[25] = frame << 3 | (0b100 if tilts else 0) | 0b10
     out[26:28] = struct.pack("<h", alignment)

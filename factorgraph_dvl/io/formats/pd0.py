@@ -53,6 +53,7 @@ PING = np.dtype(
         ("heading_bias", "f8"),
         ("sensor_source", "u1"),
         ("pings", "i8"),
+        ("ping_interval", "f8"),
         ("cells", "i8"),
         ("cell_size", "f8"),
         ("first_cell", "f8"),
@@ -89,6 +90,7 @@ _FIXED = _layout(
     cells=(9, "u1"),
     pings=(10, "<u2"),
     cell_size=(12, "<u2"),
+    interval=(22, "3u1"),
     transform=(25, "u1"),
     alignment=(26, "<i2"),
     bias=(28, "<i2"),
@@ -130,9 +132,11 @@ class Block:
     Parameters
     ----------
     pings : Records
-        (N,) of `PING`: `at`, position in the file; `time`, of the instrument, seconds since
-        1970; angles in rad, roll positive starboard down, pitch positive bow up, if beam 3 is
-        forward; `heading_alignment` and `heading_bias`, EA and EB; `up`, looking up;
+        (N,) of `PING`: `at`, position in the file; `time` at which the ensemble began, by the
+        instrument, seconds since 1970; `pings`, how many are averaged in it, and
+        `ping_interval`, s from one to the next, 0 for as fast as possible; angles in rad, roll
+        positive starboard down, pitch positive bow up, if beam 3 is forward;
+        `heading_alignment` and `heading_bias`, EA and EB; `up`, looking up;
         `bottom_...` by beam (or axis, for velocities in other than beam coordinates), ranges
         vertical, m; nan where not measured.
     water : Array
@@ -273,6 +277,7 @@ def _leaders(pings: Records, types: _Types) -> None:
     pings["heading_bias"] = fixed["bias"] * 0.01 * DEG
     pings["sensor_source"] = fixed["source"]
     pings["pings"], pings["cells"] = fixed["pings"], fixed["cells"]
+    pings["ping_interval"] = fixed["interval"] @ np.array([60.0, 1.0, 0.01])
     pings["cell_size"], pings["first_cell"] = fixed["cell_size"] * 0.01, fixed["first_cell"] * 0.01
 
     variable, _ = types.decode(0x0080, 28, _VARIABLE)

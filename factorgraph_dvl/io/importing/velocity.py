@@ -92,8 +92,9 @@ def choose(streams: Sequence[Timed], decisions: Decisions) -> Velocities | None:
         If the files are of several instruments.
     """
     _check_one_instrument(streams)
+    usable = _usable(streams, decisions)
     for kind, reference in (("dvl", "bottom"), ("water", "water")):
-        pings = merge(best_source(_usable(streams), kind, _lock, decisions), decisions)
+        pings = merge(best_source(usable, kind, _lock, decisions), decisions)
         if pings is None:
             continue
         locked = sum(int(np.isfinite(speed_of(part)).sum()) for _, part in pings.chunks())
@@ -104,8 +105,16 @@ def choose(streams: Sequence[Timed], decisions: Decisions) -> Velocities | None:
     return None
 
 
-def _usable(streams: Sequence[Timed]) -> list[Timed]:
-    return [timed for timed in streams if np.isfinite(timed.time).any()]
+def _usable(streams: Sequence[Timed], decisions: Decisions) -> list[Timed]:
+    out = []
+    for timed in streams:
+        if np.isfinite(timed.time).any():
+            out.append(timed)
+        elif timed.stream.kind in ("dvl", "water"):
+            decisions.add(
+                timed.stream.label, f"{len(timed.time)} pings, none with a time → left out"
+            )
+    return out
 
 
 def _lock(source: Sequence[Timed]) -> float:

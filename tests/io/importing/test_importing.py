@@ -63,6 +63,22 @@ def column(out, table, *names):
 VELOCITY = ("vel_x_m_s", "vel_y_m_s", "vel_z_m_s")
 
 
+def test_stamps_move_from_the_start_of_an_average_to_its_middle(tmp_path):
+    usual, _ = imported(tmp_path, pings(velocity=(0.1, -1.5, 0.0, 0.01)), fixes())
+    first = column(usual, "dvl", "time_s")[:, 0]
+    out, decisions = imported(tmp_path, pings(pings=(4, 0.2)), fixes(), force=True)
+    # Seconds since 1970 are exact to 2.4e-7 s.
+    np.testing.assert_allclose(column(out, "dvl", "time_s")[:, 0] - first, 0.3, atol=1e-6)
+    assert any("0.2 s apart" in line and "by 0.3 s" in line for line in decisions.lines)
+
+
+def test_says_that_pings_have_no_time(tmp_path):
+    start = WHEN.replace(year=1970)
+    unset = b"".join(ping(i, (0.1, -1.5, 0.0, 0.01), start) for i in range(30))
+    _, decisions = imported(tmp_path, unset)
+    assert "file0 bottom: 30 pings, none with a time → left out" in decisions.lines
+
+
 def test_damage_is_a_line_for_each_file(tmp_path):
     data, text = bytearray(pings()), fixes()
     size = len(data) // 30

@@ -25,6 +25,10 @@ _SIGN = (
     "were reversed; velocities along beams are those of the transducers already"
 )
 _CLOCK = "pings of VmDas: UTC is the clock of the PC minus its stored difference from UTC"
+_SHIFT = (
+    "PD0 stamps an ensemble when it begins, and its pings are {interval:g} s apart: stamps of "
+    "velocities were shifted by {delay:g} s, to the middle of the pings"
+)
 _HEIGHT = "VmDas stores fixes without heights"
 # Bit of EZ, the sources of sensors: heading by the compass in the instrument.
 _OWN_HEADING = 1 << 4
@@ -53,6 +57,9 @@ def _batches(block: pd0.Block) -> Iterator[Batch]:
     received = pings["time"]
     common = _common(pings, times)
     common["received"] = received
+    if clock == "own":
+        # Which of its ensembles' times VmDas stores is not documented.
+        notes = _shift(common, pings)
     bottom = pings["bottom_velocity"]
     if np.isfinite(bottom).any():
         yield _pings("dvl", common, bottom, clock, notes)
@@ -94,6 +101,18 @@ def _common(pings: Records, times: Array) -> Records:
     out["time"], out["axes"] = times, pings["coordinates"]
     out["alignment"] = pings["heading_alignment"]
     return out
+
+
+def _shift(common: Records, pings: Records) -> tuple[str, ...]:
+    """Set the delays from stamps to the middle of averages; return what is said about them."""
+    delay = 0.5 * (pings["pings"] - 1) * pings["ping_interval"]
+    common["delay"] = np.where(delay > 0.0, delay, np.nan)
+    stated, first = np.unique(delay, return_index=True)
+    return tuple(
+        _SHIFT.format(interval=pings["ping_interval"][place], delay=value)
+        for value, place in zip(stated, first, strict=True)
+        if value > 0.0
+    )
 
 
 def _pings(

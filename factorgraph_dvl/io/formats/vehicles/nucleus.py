@@ -28,6 +28,7 @@ _HEADER = 10
 # Without an echo the driver passes on these.
 _NO_VELOCITY, _NO_MERIT = -32.0, 10.0
 _AXES = "axes of the Nucleus taken as forward, right, down: not verified"
+_SHIFT = "stamps of velocities were shifted by dtXYZ, from the stamp to their measurement"
 Packet = dict[str, Any]
 
 
@@ -152,7 +153,8 @@ def _track(kind: Kind, stream: str) -> Callable[[list[Packet]], Iterator[Batch]]
         delay = column(packets, "dtXYZ")
         out["delay"] = np.where((delay > 0.0) & (delay < 1.0), delay, np.nan)
         note = "velocities along beams were left out: directions and signs are not documented"
-        yield Batch(kind, out, clock, stream, "FRD", notes=(_AXES, note))
+        shifted = (_SHIFT,) if np.isfinite(out["delay"]).any() else ()
+        yield Batch(kind, out, clock, stream, "FRD", notes=(_AXES, note, *shifted))
 
     return convert
 
