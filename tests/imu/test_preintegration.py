@@ -245,6 +245,24 @@ def test_imu_factors_have_zero_error_at_the_truth(cases, name):
     assert micro_g < 0.02
 
 
+@pytest.mark.parametrize("name", ["coning", "south"])
+def test_strides_lead_where_samples_do(cases, name, monkeypatch):
+    case = cases[name]
+    strides = case.pims()
+    monkeypatch.setattr("factorgraph_dvl.imu.preintegration._FEW", case.seg.phi.shape[0] + 1)
+    samples = case.pims()
+    # Far more than is left of a bias: what it does is compared, too.
+    bias = gtsam.imuBias.ConstantBias(np.full(3, 1e-2), np.full(3, 1e-5))
+    at = gtsam.NavState()
+    for one, other in zip(strides, samples, strict=True):
+        apart = one.predict(at, bias).localCoordinates(other.predict(at, bias))
+        assert np.abs(apart[:3]).max() < 1e-9
+        assert np.abs(apart[3:6]).max() < 1e-6
+        assert np.abs(apart[6:]).max() < 2e-7
+        P, Q = one.preintMeasCov(), other.preintMeasCov()
+        np.testing.assert_allclose(np.linalg.solve(Q, P), np.eye(9), atol=1e-3)
+
+
 def test_imu_factor_residual_is_predicted_minus_state(cases):
     case = cases["swell"]
     k = 30
