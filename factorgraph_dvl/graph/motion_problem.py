@@ -23,6 +23,7 @@ from factorgraph_dvl.sensors.protocol import Linearization, Motion, Observation
 # Names of the processes that are no error of a measurement.
 ATTITUDE = "attitude"
 CURRENT = "current"
+_SCALE = "scale_error"
 # Least share of a residual's variance that its fit leaves. Chosen: below it rounding decides.
 _LEAST_LEFT = 0.02
 
@@ -379,9 +380,13 @@ class MotionProblem:
         covered = self.chain.covers(time) & self.attitude.covers(stamp)
         v_n = x[:, 3:6]
         flows = self.chain.has(CURRENT) and any(n.startswith("current") for n in o.parameters)
+        # The process is the current as a DVL with a scale error of k sees it, (1 + k) times the
+        # true one: a prior of the true one would pull k up, with which it grows smaller.
+        scale = 1.0 + float(np.mean(parameters.get(_SCALE, 0.0)))
+        flow = np.zeros_like(v_n)
         if flows:
-            current = x[:, self.chain.place(CURRENT)] * self._sigma(CURRENT)
-            v_n = v_n - np.column_stack([current, np.zeros(time.size)])
+            flow[:, :2] = x[:, self.chain.place(CURRENT)] * self._sigma(CURRENT) / scale
+            v_n = v_n - flow
         motion = Motion(
             nRb=body.nRb,
             p_n=x[:, :3],
@@ -404,7 +409,7 @@ class MotionProblem:
             by_state[:, :, 3:6] = lin.d_v
             if flows:
                 place = self.chain.place(CURRENT)
-                by_state[:, :, place] = -lin.d_v[:, :, :2] * self._sigma(CURRENT)
+                by_state[:, :, place] = -lin.d_v[:, :, :2] * self._sigma(CURRENT) / scale
         if self.chain.has(ATTITUDE):
             by_state[:, :, self.chain.place(ATTITUDE)] = by_rph * self._sigma(ATTITUDE)
         residual = lin.residual
@@ -419,6 +424,9 @@ class MotionProblem:
                 by_parameters[:, :, place] += lin.d_parameters[name]
             if name in found:
                 by_parameters[:, :, place] += found[name]
+            if name == _SCALE and lin.d_v is not None and name in lin.d_parameters:
+                share = (lin.d_v @ flow[:, :, None]) / scale
+                by_parameters[:, :, place] += share / (place.stop - place.start)
         return Seen(motion, time, at, body, residual, by_state, by_parameters, by_rph, covered)
 
     def _by_attitude(

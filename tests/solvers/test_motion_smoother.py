@@ -13,11 +13,13 @@ from truth import CONFIGS
 
 from factorgraph_dvl.analysis.error_statistics import calibration_errors
 from factorgraph_dvl.errors import ConfigError, FactorgraphDvlError
+from factorgraph_dvl.graph.motion_problem import CURRENT
 from factorgraph_dvl.io.trial_folder import load_trial, save_trial
 from factorgraph_dvl.sensors.finding import Code
 from factorgraph_dvl.simulation import load_scenario, simulate
 from factorgraph_dvl.simulation.compass import InsTruth
 from factorgraph_dvl.solvers.batch import solve
+from factorgraph_dvl.solvers.motion_preparation import prepare_motion
 
 RUNS = int(os.environ.get("FACTORGRAPH_DVL_SEEDS", "20"))
 MOUNTING = ("misalignment_deg", "scale_error", "lever_arm_m")
@@ -132,3 +134,24 @@ def ratio(scenario, runs):
 def test_standard_deviations_hold(make):
     low, high = rms_band(7 * RUNS)
     assert low < ratio(make(), RUNS) < high
+
+
+def test_the_current_as_a_dvl_sees_it_does_not_pull_the_scale_error():
+    problem = (prepared := prepare_motion(simulate(shortened("ship-water"), 1))).problem
+    place = problem.chain.place(CURRENT)
+    flowing = prepared.states.copy()
+    flowing[:, place] = 2.0
+
+    def residual(states, scale):
+        values = problem.prior_values() | prepared.values | {"scale_error": np.array([scale])}
+        return problem.evaluate(states, values).seen[1]
+
+    changes = [
+        residual(flowing, k).residual - residual(prepared.states, k).residual for k in (0.0, 0.2)
+    ]
+    assert np.abs(changes[0]).max() > 0.1
+    np.testing.assert_allclose(changes[0], changes[1], atol=1e-12)
+    step = 1e-5
+    slope = residual(flowing, step).residual - residual(flowing, -step).residual
+    by_scale = residual(flowing, 0.0).by_parameters[:, :, problem.columns["scale_error"]]
+    np.testing.assert_allclose(by_scale[:, :, 0], slope / (2.0 * step), atol=1e-6)
