@@ -25,8 +25,26 @@ WINDOW = 1 << 21
 # Records, and short ones, that are read at a time. Chosen: some MB.
 BLOCK = 10_000
 BLOCK_OF_LINES = 100_000
+# Bytes behind which pages of a file are dropped. Chosen: some windows.
+_KEPT = 1 << 24
 # Text without a line end for longer than this is no text.
 LONGEST_LINE = 1 << 16
+
+
+class _Map(mmap.mmap):
+    """A memory map whose pages do not stay in memory once they were read.
+
+    The system counts them as memory of the process until then: as much as the file.
+    """
+
+    _near = 0
+
+    def __getitem__(self, key: Any) -> Any:
+        start = (key.start or 0) if isinstance(key, slice) else key
+        if abs(start - self._near) > _KEPT:
+            self._near = start
+            self.madvise(mmap.MADV_DONTNEED)
+        return super().__getitem__(key)
 
 
 def map_file(path: Path) -> Source:
@@ -54,7 +72,9 @@ def map_file(path: Path) -> Source:
         with path.open("rb") as file:
             if path.stat().st_size == 0:
                 return b""
-            return mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+            # Only some systems can be asked to drop pages.
+            kind = _Map if hasattr(mmap, "MADV_DONTNEED") else mmap.mmap
+            return kind(file.fileno(), 0, access=mmap.ACCESS_READ)
     except OSError as error:
         reason = error.strerror or str(error)
         raise DataError(f"cannot be read ({reason})", where=path.name) from error

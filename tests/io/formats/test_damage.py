@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tracemalloc
 from datetime import UTC, datetime, timedelta
+from pathlib import Path
 
 import format_writers as writers
 import numpy as np
@@ -122,6 +123,28 @@ def test_text_without_ends_is_no_text():
 def test_a_trajectory_is_found_behind_other_bytes():
     found = np.concatenate(list(read_sbet(b"header" + writers.sbet(rows(50)))))
     assert len(found) == 50
+
+
+@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="needs Linux")
+def test_pages_of_a_file_do_not_stay_in_memory(tmp_path):
+    def mapped():
+        status = Path("/proc/self/status").read_text()
+        return int(status.split("RssFile:")[1].split()[0]) * 1024
+
+    size = 160 << 20
+    path = tmp_path / "sparse"
+    with path.open("wb") as file:
+        file.truncate(size)
+        file.seek(size // 2)
+        file.write(b"middle")
+    source, before, most = map_file(path), mapped(), 0
+    for at in range(0, size, WINDOW):
+        part = source[at : at + WINDOW]
+        assert part[:6] == (b"middle" if at == size // 2 else bytes(6))
+        most = max(most, mapped() - before)
+    assert most < size / 4
+    assert source[size // 2] == b"m"[0]
+    assert source.find(b"middle") == size // 2
 
 
 @pytest.mark.parametrize("reader", [read_pd0, read_pd4, read_ad2cp])
