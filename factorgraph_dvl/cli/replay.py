@@ -157,11 +157,13 @@ def _run(
     """Run the replay; if live, show what is known and whether it is good enough as it goes."""
     from factorgraph_dvl.replay import KINDS, Update
     from factorgraph_dvl.replay import replay as run
+    from factorgraph_dvl.replay.verdict_as_it_goes import VerdictAsItGoes
 
     kind = next(k for k in KINDS if k == smoother)
     began = perf_counter()
     shown = began
     first = float(trial.inertial.time[0])
+    verdict = VerdictAsItGoes(trial)
 
     def speed(update: Update) -> float:
         return (update.time - first) / max(perf_counter() - began, 1e-9)
@@ -180,6 +182,7 @@ def _run(
 
             def show(update: Update) -> None:
                 nonlocal shown, since
+                verdict.take(update)
                 bad = short_of_limits(update.calibration.estimates, trial.limits)
                 if bad or update.inconsistent:
                     since = None
@@ -199,6 +202,7 @@ def _run(
                             inconsistent=update.inconsistent,
                             short_of_limits=bad,
                             good_since=since,
+                            verdict=verdict.at(update),
                         )
                     )
                 for finding in update.findings:
@@ -210,10 +214,13 @@ def _run(
 
     def print_update(update: Update) -> None:
         nonlocal shown
+        verdict.take(update)
         now = perf_counter()
         if now - shown > 2.0:
             shown = now
-            progress(f"at {update.time - first:.0f} s, {speed(update):.0f} times real time")
+            grade = verdict.at(update).grade
+            at = f"{update.time - first:.0f} s"
+            progress(f"at {at}, {speed(update):.0f} times real time, {grade}")
 
     return run(trial, smoother=kind, lag_s=lag, rate_hz=rate, anyway=anyway, watch=print_update)
 

@@ -55,8 +55,17 @@ _BETTER = 20.0
 # Height of the score process, in standard deviations, from which on a rate or a jump is tried.
 # Chosen: without a change it stays below 3.2 in 99 % (Andrews 1993).
 _CHANGES = 3.2
+# Variance that a window may have beside the usual one for a rate or a jump to be believed. Chosen:
+# turns leave ten times more than straight courses where a lever arm is not quite right.
+_ALIKE_WINDOWS = 30.0
+# Share of the squares that one that explains a misfit leaves at most.
+_MOST = 0.25
 # Largest step of Gauss-Newton, s. Chosen: a minimum's width under sway.
 _LARGEST_STEP_S = 0.3
+# Drifts over the trial that are tried, and their step, s. Chosen: what stamps at an assumed rate
+# make; under sway at 2 Hz thirds of a trial find aliases, and minima are 0.05 s wide.
+_DRIFT_S = 1.2
+_DRIFT_STEP_S = 0.06
 # Times in two windows at which a jump is tried.
 _BREAKS = 15
 # Misfit below which nothing is gained, m/s. Chosen: finer than any receiver's or DVL's digits.
@@ -164,8 +173,9 @@ def clock_offset(
         design = np.stack([one, time - middle], axis=-1)
         slope = 1.5 * (last - first) / span
         starts = [(constant.values[0], 0.0), (0.5 * (first + last), slope)]
+        starts += [_drift(comparison, middle, (around, constant.values[0]))]
         found = _first_of(comparison, design, starts)
-        if found.better_than(best):
+        if found.better_than(best) and _explains(comparison, found, constant):
             best, rate = found, (float(found.values[1]), float(found.sigma[1]))
         at, before, after = _break(
             comparison, _grid(around, reach, _STEP_S), float(constant.values[0])
@@ -173,7 +183,8 @@ def clock_offset(
         design = np.stack([one, (time > at).astype(float)], axis=-1)
         found = _refined(comparison, design, np.array([before, after - before]))
         sides = [np.unique(_blocks(comparison)[side]).size for side in (time > at, time <= at)]
-        if found.better_than(best) and min(sides) >= _LEAST_BLOCKS:
+        enough = min(sides) >= _LEAST_BLOCKS and _explains(comparison, found, constant, at)
+        if enough and found.better_than(best):
             best, rate = found, (0.0, 0.0)
             jump, jump_time = (float(found.values[1]), float(found.sigma[1])), at
     zero = comparison.residual(around)
@@ -383,6 +394,37 @@ def _changes(comparison: Comparison, fit: _Fit) -> bool:
     inner = (share > 0.1) & (share < 0.9)
     height = np.abs(process) / np.sqrt(np.maximum(share * (1.0 - share), 0.01)) * inner
     return bool(height.max() > _CHANGES * max(scale, 1e-12))
+
+
+def _drift(comparison: Comparison, middle: float, offsets: Sequence[float]) -> tuple[float, float]:
+    """Return offset and rate that fit best, of some offsets in the middle and drifts on a grid."""
+    some, _ = _strongest(comparison)
+    span = float(np.ptp(comparison.time[comparison.inside]))
+    tried = [
+        (float(offset), drift / span)
+        for offset in offsets
+        for drift in _grid(0.0, _DRIFT_S, _DRIFT_STEP_S)
+    ]
+    likelihoods = [
+        _likelihood(some, some.residual(offset + rate * (some.time - middle)))
+        for offset, rate in tried
+    ]
+    return tried[int(np.argmax(likelihoods))]
+
+
+def _explains(comparison: Comparison, fit: _Fit, without: _Fit, at: float = np.nan) -> bool:
+    """Whether a fit explains most of a misfit, or leaves about as much in each window.
+
+    If not, something else is wrong there. The time of a jump, `at`, is not known well enough for
+    the window that it is in.
+    """
+    if np.sum(fit.residual**2) < _MOST * np.sum(without.residual**2):
+        return True
+    variance = np.sum(fit.residual**2, axis=(1, 2)) / np.maximum(comparison.count, 1.0)
+    usual = max(float(np.median(variance)), comparison.noise**2)
+    time = np.where(comparison.inside, comparison.time, np.nan)
+    around = (np.nanmin(time, axis=1) <= at) & (at <= np.nanmax(time, axis=1))
+    return bool(np.all(variance[~around] < _ALIKE_WINDOWS * usual))
 
 
 def _break(comparison: Comparison, grid: Array, constant: float) -> tuple[float, float, float]:

@@ -71,9 +71,12 @@ class DvlWindows(VelocityWindows):
     ----------
     handedness : {0, 1, -1}
         Of the DVL's axes: 1 right-handed, -1 mirrored, 0 whichever fits better.
+    later : float, s
+        Offset of its clock around which others are tried.
     """
 
     handedness: int = 0
+    later: float = 0.0
 
     @property
     def count(self) -> Array:
@@ -83,7 +86,7 @@ class DvlWindows(VelocityWindows):
     @cached_property
     def signal(self) -> Array:
         """Sum of squares of the velocity's changes in each window, (W,)."""
-        carried = self.carried(0.0).speed.reshape(*self.rows.shape, 3)
+        carried = self.carried(self.later).speed.reshape(*self.rows.shape, 3)
         return np.asarray(np.sum(self.without_trend(carried) ** 2, axis=(1, 2)))
 
     def residual(self, offset: float | Array) -> Array:
@@ -145,7 +148,7 @@ def dvl_windows(windows: CarriedWindows, dvl: Dvl, later: float = 0.0) -> DvlWin
     if table is None:
         return None
     sigma = np.sqrt(np.mean(dvl.sigma()[locked] ** 2, axis=1))
-    return DvlWindows(windows, time, dvl.velocity[locked], sigma, *table)
+    return DvlWindows(windows, time, dvl.velocity[locked], sigma, *table, later=later)
 
 
 def _eliminated(gram: Array) -> tuple[Array, Array]:

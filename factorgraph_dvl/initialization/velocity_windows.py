@@ -21,6 +21,9 @@ _LEAST = 10
 # differences. Chosen: a false lock for a ping or two, and never sway.
 _NEIGHBOURS = 5
 _OUTLIER = 8.0
+# What makes a residual stand out, in lower quartiles of second differences. Chosen: 13 standard
+# deviations of white noise.
+_ISOLATED = 17.0
 # Keeps a division defined where nothing moves, in the unit of what it bounds.
 _TINY = 1e-12
 # The same against the IMU: times the median of what is left, and passes. Chosen: 7.7 standard
@@ -128,6 +131,25 @@ def steady(velocity: Array) -> np.ndarray:
     deviation = np.abs(velocity - median_filter(velocity, size=(_NEIGHBOURS, 1), mode="nearest"))
     usual = np.maximum(np.median(np.abs(np.diff(velocity, n=2, axis=0)), axis=0), _TINY)
     return np.asarray(np.all(deviation <= _OUTLIER * usual, axis=1))
+
+
+def isolated(residual: Array, inside: np.ndarray) -> np.ndarray:
+    """Return which residuals (W, n, 3) stand out beside those just before and after, (W, n) bool.
+
+    What axes and clocks make lasts as long as a turn, or repeats itself with the sway; a gross
+    error does neither. The lower quartile of second differences knows noise where a third of the
+    measurements are wrong.
+    """
+    out = np.zeros(inside.shape, dtype=bool)
+    for line, use in enumerate(inside):
+        rows = np.flatnonzero(use)
+        if rows.size < _LEAST:
+            continue
+        r = residual[line, rows]
+        deviation = np.abs(r - median_filter(r, size=(_NEIGHBOURS, 1), mode="nearest"))
+        usual = np.quantile(np.abs(np.diff(r, n=2, axis=0)), 0.25, axis=0)
+        out[line, rows] = np.any(deviation > _ISOLATED * np.maximum(usual, _TINY), axis=1)
+    return out
 
 
 def sorted_into(

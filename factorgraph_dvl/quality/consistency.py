@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -24,6 +25,7 @@ from factorgraph_dvl.initialization.clock_offsets import (
 )
 from factorgraph_dvl.initialization.dvl_windows import DvlWindows, dvl_windows
 from factorgraph_dvl.initialization.gnss_windows import GnssWindows, WindowFit, gnss_windows
+from factorgraph_dvl.initialization.velocity_windows import isolated
 from factorgraph_dvl.quality.axis_permutations import in_words
 from factorgraph_dvl.quality.bow_and_course import (
     BodyDirections,
@@ -42,6 +44,7 @@ from factorgraph_dvl.quality.sensor_clocks import (
 from factorgraph_dvl.sensors.dvl import Dvl
 from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.sensors.gnss import Gnss
+from factorgraph_dvl.sensors.records import rows_of
 from factorgraph_dvl.trial import Trial
 
 # Angle between bow and course from which on axes are wrong, and course change from which on it is
@@ -56,6 +59,11 @@ _ARM_SIGMAS = 12.0
 # clocks that are off by far. Chosen: what good trials leave, and what wrong ones do.
 _CONTRADICTS = 0.1
 _UNEXPLAINED = 0.3
+# Share of the changes of velocity that must be elsewhere to tell what is wrong throughout.
+_ENOUGH = 0.5
+# Searches for gross errors, each with what those before left out. Chosen: the first sees the
+# largest only.
+_SEARCHES = 4
 # Share of it that a cause may leave.
 _LEFT = 0.5
 # Offsets around which clocks that are off by far are looked for, and the reach, s. Chosen: a
@@ -63,6 +71,8 @@ _LEFT = 0.5
 _FAR_S = (LEAP_SECONDS, -LEAP_SECONDS, *(s * k for k in range(9, 60, 9) for s in (1.0, -1.0)))
 _REACH_S = 5.0
 _FAR_STEP_S = 0.25
+# Offset from which on a minimum may be the edge of a scan, s.
+_AT_EDGE_S = 4.5
 # Share of what is unexplained that such a clock may leave. Chosen: it explains all but outliers.
 _FAR_LEFT = 0.2
 # How many times less mirrored axes of a DVL leave than right-handed ones, and scale error they
@@ -75,7 +85,15 @@ _ALIASED_S = 0.05
 _DOWN = np.diag([1.0, 1.0, -1.0])
 # Errors of single sensors that leave nothing to compare.
 _NO_IMU = frozenset(
-    {Code.TIME_UNIT, Code.FORCE_UNIT, Code.GYRO_FROZEN, Code.IMU_CHANNEL, Code.FROZEN_VALUES}
+    {
+        Code.TIME_UNIT,
+        Code.FORCE_UNIT,
+        Code.GYRO_FROZEN,
+        Code.IMU_CHANNEL,
+        Code.FROZEN_VALUES,
+        Code.SATURATED,
+        Code.IMU_SPIKES,
+    }
 )
 
 
@@ -102,6 +120,10 @@ def consistency_findings(trial: Trial, errors: Sequence[Finding]) -> Iterator[Fi
         return [(comparison, around) for comparison, around in made if comparison is not None]
 
     views = _views(windows, sensors)
+    if max((view.excess for view in views), default=0.0) > _CONTRADICTS:
+        # What is grossly wrong for an instant says nothing of axes and clocks.
+        sensors = [_without_gross_errors(s, views) for s in sensors]
+        views = _views(windows, sensors)
     wrong: list[Candidate] = []
     if max((view.excess for view in views), default=0.0) > _CONTRADICTS:
         wrong = diagnosis(compare, trial.inertial, -frd_from_body(trial.body_axes)[2])
@@ -111,7 +133,7 @@ def consistency_findings(trial: Trial, errors: Sequence[Finding]) -> Iterator[Fi
         directions = next((v.directions() for v in views if isinstance(v, _GnssView)), None)
         yield _imu_finding(wrong, directions, trial.body_axes)
     for view in views:
-        found = _far(view) if view.excess > _UNEXPLAINED else view
+        found = _far(view) if view.excess > _UNEXPLAINED or view.off > _AT_EDGE_S else view
         yield from found.findings()
         if isinstance(found, _GnssView) and not wrong:
             yield from _course_findings(found.directions(), trial.body_axes)
@@ -177,10 +199,15 @@ class _GnssView:
     clock: ClockOffset | None
     around: float
 
-    @property
+    @cached_property
     def excess(self) -> float:
         """Share of the changes of velocity that neither IMU nor noise explains."""
-        return _excess(self.compared, self.clock)
+        return _excess(self.compared, self.clock, self.around)
+
+    @property
+    def off(self) -> float:
+        """How far the clock is from what is stated, s."""
+        return _off(self.clock, self.around)
 
     def fit(self) -> WindowFit:
         """Return the fit with the clock set right."""
@@ -227,15 +254,15 @@ class _DvlView:
     clock: ClockOffset | None
     around: float
 
-    @property
+    @cached_property
     def excess(self) -> float:
         """Share of the changes of velocity that neither IMU nor noise explains."""
-        return _excess(self.compared, self.clock)
+        return _excess(self.compared, self.clock, self.around)
 
     @property
     def off(self) -> float:
         """How far the clock is from what is stated, s."""
-        return 0.0 if self.clock is None else abs(self.clock.offset - self.around)
+        return _off(self.clock, self.around)
 
     def believed_beside(self, right: _DvlView) -> bool:
         """Whether these axes, mirrored, are believed rather than right-handed ones.
@@ -248,7 +275,8 @@ class _DvlView:
         ratio = self.clock.unexplained / max(right.clock.unexplained, 1e-12)
         better = ratio < 1.0 / _MIRRORED and right.excess > _CONTRADICTS
         aliased = ratio < 1.0 and self.off < _ALIASED_S
-        return abs(scale_error) < _LARGEST_SCALE_ERROR and (better or aliased)
+        possible = abs(scale_error) < _LARGEST_SCALE_ERROR and self.excess < _UNEXPLAINED
+        return possible and (better or aliased)
 
     def findings(self) -> Iterator[Finding]:
         """Yield what is wrong with axes and clock."""
@@ -259,8 +287,43 @@ class _DvlView:
             yield from _clock(self.sensor, self.clock, self.around)
 
 
-def _excess(comparison: Comparison, clock: ClockOffset | None) -> float:
-    return 0.0 if clock is None else clock.unexplained - 1.5 * noise_share(comparison)
+def _without_gross_errors(sensor: Gnss | Dvl, views: Sequence[_GnssView | _DvlView]) -> Gnss | Dvl:
+    """Return a record without what stands out beside the carried IMU."""
+    view = next((v for v in views if v.sensor is sensor), None)
+    if view is None or view.excess < _CONTRADICTS:
+        return sensor
+    compared: GnssWindows | DvlWindows = view.compared
+    gross = np.zeros(compared.inside.shape, dtype=bool)
+    for _ in range(_SEARCHES):
+        found = isolated(
+            compared.residual(_late(compared, view.clock, view.around)), compared.inside
+        )
+        if not found.any():
+            break
+        gross |= found
+        compared = replace(compared, inside=compared.inside & ~found)
+    return rows_of(sensor, ~np.isin(sensor.time, compared.time[gross])) if gross.any() else sensor
+
+
+def _excess(comparison: Comparison, clock: ClockOffset | None, around: float) -> float:
+    """Return the share of the changes of velocity that neither IMU nor noise explains.
+
+    What is wrong with axes shows wherever the velocity changes; a share that only one window
+    leaves, or two beside each other, is something else.
+    """
+    if clock is None:
+        return 0.0
+    squares = np.sum(comparison.residual(_late(comparison, clock, around)) ** 2, axis=(1, 2))
+    signal = comparison.signal
+    elsewhere = np.abs(np.arange(signal.size) - int(np.argmax(squares))) > 1
+    share = float(squares.sum() / max(signal.sum(), 1e-12))
+    if signal[elsewhere].sum() > _ENOUGH * signal.sum():
+        share = min(share, float(squares[elsewhere].sum() / signal[elsewhere].sum()))
+    return share - 1.5 * noise_share(comparison)
+
+
+def _off(clock: ClockOffset | None, around: float) -> float:
+    return 0.0 if clock is None else abs(clock.offset - around)
 
 
 def _late(comparison: Comparison, clock: ClockOffset | None, around: float) -> float | Array:

@@ -12,7 +12,7 @@ from factorgraph_dvl.geometry.vectors import Array, interpolate
 from factorgraph_dvl.quality.gnss_units import RADIANS
 from factorgraph_dvl.quality.records import WINDOW_S, gnss_velocity
 from factorgraph_dvl.quality.speed_units import MOVING_M_S, SPEED_UNITS
-from factorgraph_dvl.sensors.dvl import MISALIGNMENT, Dvl
+from factorgraph_dvl.sensors.dvl import MISALIGNMENT, VELOCITY_COLUMNS, Dvl
 from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.sensors.gnss import Gnss
 
@@ -20,6 +20,8 @@ from factorgraph_dvl.sensors.gnss import Gnss
 DVL_TERMS = ("a lock", "Moving along +x must give a positive x")
 BEAM_TERMS = ("three beams", "Moving in the direction of a beam must give it a positive velocity")
 
+# Pings that do not agree in any component by chance.
+_FEW = 10
 # Chosen: how far the ratio of speeds may be from 1 over the bottom; and the ratio that a current
 # makes of the speeds through water and over ground.
 _ALLOWED, _FASTEST_CURRENT = 0.25, 3.0
@@ -46,6 +48,11 @@ def dvl_findings(
         )
     if np.all(velocity == velocity[0]) and velocity.shape[0] > 2:
         yield Finding(Code.DVL_FROZEN, "the velocity never changes", dvl.label, severity="error")
+    elif velocity.shape[0] > _FEW:
+        stuck = [k for k in range(3) if np.ptp(velocity[:, k]) == 0.0]
+        if stuck:
+            names = ", ".join(f"{VELOCITY_COLUMNS[k]} is always {velocity[0, k]:g}" for k in stuck)
+            yield Finding(Code.DVL_FROZEN, names, dvl.label, severity="error")
     if gnss is not None:
         yield from _speed_findings(dvl, gnss)
     yield from _sign_findings(dvl, body_axes, velocity, positive)

@@ -1,4 +1,4 @@
-"""Whether each channel of an IMU measures: frozen and constant ones."""
+"""Whether each channel of an IMU measures: constant, frozen, saturated, with spikes."""
 
 from __future__ import annotations
 
@@ -15,6 +15,19 @@ from factorgraph_dvl.sensors.imu import COLUMNS, Imu
 _ALL = 20
 _SINGLE = 100
 _LEAST_S = 0.5
+# Samples that three gyros, or accelerometers, repeat together, and runs of them at most. Chosen:
+# three channels with digits of their own never do.
+_TRIAD = 5
+_RUNS = 3
+# Samples at the very end of a channel's range, in all, in one run, and against those at the next
+# value, from which on it is saturated. Chosen: the largest of many digits is met once or twice.
+_AT_THE_END = 20
+_RUN = 3
+_PILED = 5.0
+# Deviation from the mean of both neighbours, in the usual one, that makes a spike, and spikes that
+# are no chance. Chosen: white noise reaches 7 in an hour at 100 Hz; blows last several samples.
+_SPIKE = 30.0
+_SPIKES = 3
 
 
 def channel_findings(imu: Imu) -> Iterator[Finding]:
@@ -30,16 +43,69 @@ def channel_findings(imu: Imu) -> Iterator[Finding]:
     if constant:
         names = ", ".join(f"{COLUMNS[k + 1]} is always {values[0, k]:g}" for k in constant)
         yield Finding(Code.IMU_CHANNEL, names, "IMU", severity="error")
+    ends = [e for k in np.flatnonzero(moves).tolist() for e in _ends(COLUMNS[k + 1], values[:, k])]
+    if ends:
+        text = f"{', '.join(ends)}: its range ends there"
+        yield Finding(Code.SATURATED, text, "IMU", severity="error")
+    yield from _spikes(values, moves)
     same = np.diff(values[:, moves], axis=0) == 0.0
     interval = float(np.median(np.diff(imu.time)))
     begin, length = _longest(same.all(axis=1))
     if length >= max(_ALL, _LEAST_S / interval):
         yield _frozen("all its channels repeat", imu, begin, length)
         return
+    for names, some in (("gyros", slice(0, 3)), ("accelerometers", slice(3, 6))):
+        if not moves[some].all():
+            continue
+        repeats = np.all(np.diff(values[:, some], axis=0) == 0.0, axis=1)
+        begin, length = _longest(repeats)
+        # Coarse digits, and samples that are written twice, repeat in many short runs.
+        runs = np.count_nonzero(np.diff(repeats.astype(int)) > 0)
+        if length >= _TRIAD and runs <= _RUNS:
+            yield _frozen(f"all {names} repeat", imu, begin, length)
+            return
     for column, k in enumerate(np.flatnonzero(moves).tolist()):
         begin, length = _longest(same[:, column])
         if length >= max(_SINGLE, 2.0 * _LEAST_S / interval):
             yield _frozen(f"{COLUMNS[k + 1]} repeats", imu, begin, length)
+
+
+def _spikes(values: Array, moves: np.ndarray) -> Iterator[Finding]:
+    """Yield that single samples stand out from those before and after."""
+    if values.shape[0] < 2 * _ALL:
+        return
+    signed = values[1:-1, moves] - 0.5 * (values[2:, moves] + values[:-2, moves])
+    deviation = np.abs(signed)
+    usual = np.maximum(np.median(deviation, axis=0), np.finfo(float).tiny)
+    # A spike makes both its neighbours deviate half as much to the other side; a corner does not.
+    alone = [
+        np.abs(beside + 0.5 * signed[1:-1]) < 0.2 * deviation[1:-1]
+        for beside in (signed[:-2], signed[2:])
+    ]
+    hit = np.any((deviation[1:-1] > _SPIKE * usual) & alone[0] & alone[1], axis=1)
+    count = int(hit.sum())
+    if count >= _SPIKES:
+        size = np.max(deviation / usual, axis=0).max()
+        yield Finding(
+            Code.IMU_SPIKES,
+            f"{count} single samples stand out from those before and after, by up to {size:.0f} "
+            "times what is usual",
+            "IMU",
+            severity="error",
+        )
+
+
+def _ends(name: str, values: Array) -> Iterator[str]:
+    """Yield the ends of a channel's range at which samples pile up."""
+    for end, words in ((values.max(), "above"), (values.min(), "below")):
+        at_end = values == end
+        count = int(at_end.sum())
+        if count < _AT_THE_END or _longest(at_end)[1] < _RUN:
+            continue
+        others = values[~at_end]
+        following = others.max() if words == "above" else others.min()
+        if count > _PILED * np.count_nonzero(others == following):
+            yield f"{name} is never {words} {end:.4g}, and is that {count} times"
 
 
 def _frozen(what: str, imu: Imu, begin: int, length: int) -> Finding:

@@ -9,7 +9,7 @@ import numpy as np
 from factorgraph_dvl.geometry.rotations import BodyAxes, exp_so3, frd_from_body
 from factorgraph_dvl.geometry.units import DEG, STANDARD_GRAVITY
 from factorgraph_dvl.geometry.vectors import Array
-from factorgraph_dvl.quality.axis_permutations import in_words, mirrored, swapped
+from factorgraph_dvl.quality.axis_permutations import NAMES, in_words, mirrored, swapped
 from factorgraph_dvl.quality.records import WINDOW_S
 from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.sensors.imu import Imu
@@ -118,6 +118,13 @@ def _steadier(imu: Imu, enough: float) -> str:
     }
     for P in (*(mirrored(k) for k in range(3)), *(swapped(k) for k in range(3))):
         candidates[f"as if {in_words(P)}"] = P
+    # Turned about a horizontal axis, a mirrored force looks the same.
+    up = int(np.argmax(np.abs(imu.accel.mean(axis=0))))
+    for k in {0, 1, 2} - {up}:
+        (other,) = {0, 1, 2} - {up, k}
+        del candidates[f"as if {in_words(mirrored(k))}"]
+        text = f"as if axis {NAMES[k]} is mirrored, or axis {NAMES[other]} of the accelerometers"
+        candidates[text] = mirrored(k)
     losses = {text: 1.0 - _force_steadiness(imu, matrix) for text, matrix in candidates.items()}
     best = min(losses, key=lambda text: losses[text])
     return best if losses[best] < enough else ""

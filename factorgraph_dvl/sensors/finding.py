@@ -168,6 +168,20 @@ class Code(StrEnum):
         "Check the cable and the conversion of the record.",
         "error",
     )
+    IMU_SPIKES = (
+        "imu_spikes",
+        "Single samples of the IMU stand out from those before and after.",
+        "Each turns or pushes the vehicle for good, as far as the solver knows.",
+        "Leave such samples out: few that are missing are interpolated.",
+        "error",
+    )
+    SATURATED = (
+        "saturated",
+        "A channel of the IMU reaches the end of its range.",
+        "The motion beyond is lost, and goes into attitude, velocity and biases.",
+        "Set a larger range, or leave out the time of such motion.",
+        "error",
+    )
     NO_MEASUREMENT = (
         "no_measurement",
         "A record contains no measurement.",
@@ -294,7 +308,7 @@ class Code(StrEnum):
     )
     DVL_FROZEN = (
         "dvl_frozen",
-        "The DVL's velocity never changes.",
+        "The DVL's velocity, or a component, never changes.",
         "The repeated value would count as a very precise measurement.",
         "Correct the record.",
         "error",

@@ -24,6 +24,8 @@ _MOVING_M_S = 0.3
 _AT_AN_END = 3
 # Rows that repeat all their values, and the step at their end, in usual steps and in the unit of
 # the values, from which on they are frozen. Chosen: digits repeat by chance three times, not five.
+# Of a vessel that moves they are so without a step where no row repeats the one before for less
+# long: coarse digits do both.
 _REPEATED = 5
 _STEPS = 6.0
 _LEAST_STEP = {"m_s": 0.02, "deg": 3e-5}
@@ -95,7 +97,9 @@ def _blank(
     if zero.any():
         words.append(f"{int(zero.sum())} of zeros amid motion")
         none[zero] = True
-    frozen = _frozen(np.where(none, np.nan, values), _LEAST_STEP["m_s"])
+    kept = np.where(none, np.nan, values)
+    moving = np.sqrt(np.nansum(kept**2, axis=1)) > _MOVING_M_S
+    frozen = _frozen(kept, _LEAST_STEP["m_s"], moving)
     if frozen.any():
         words.append(f"{int(frozen.sum())} that repeat the one before")
         none[frozen] = True
@@ -116,7 +120,9 @@ def _blank_fixes(columns: dict[str, Array], source: str, findings: list[Finding]
     known = values[~zero & ~np.isnan(values[:, 0]), :2]
     elsewhere = np.abs(np.median(known, axis=0)) if len(known) else np.zeros(2)
     zero &= bool(np.any(elsewhere > 1.0))
-    frozen = _frozen(np.where(zero[:, None], np.nan, values * _FIX_DEG), _LEAST_STEP["deg"])
+    fixes = np.where(zero[:, None], np.nan, values * _FIX_DEG)
+    # Receivers at rest hold their fix.
+    frozen = _frozen(fixes, _LEAST_STEP["deg"], np.zeros(zero.size, dtype=bool))
     words = [f"{int(zero.sum())} fixes at 0, 0"] if zero.any() else []
     words += [f"{int(frozen.sum())} fixes that repeat the one before"] if frozen.any() else []
     if words:
@@ -144,8 +150,11 @@ def _zero_fills(values: Array) -> Array:
     return out
 
 
-def _frozen(values: Array, least: float) -> Array:
-    """Return which rows (M, n) repeat those before until the value jumps, (M,) bool."""
+def _frozen(values: Array, least: float, moving: np.ndarray) -> Array:
+    """Return which rows (M, n) repeat those before until the value jumps, (M,) bool.
+
+    Where `moving` (M,), without a jump too, if nothing repeats by chance.
+    """
     there = np.flatnonzero(~np.isnan(values).any(axis=1))
     out = np.zeros(values.shape[0], dtype=bool)
     if there.size < 2 * _REPEATED:
@@ -156,10 +165,13 @@ def _frozen(values: Array, least: float) -> Array:
         return out
     same = np.concatenate([[False], steps == 0.0, [False]])
     edges = np.flatnonzero(np.diff(same.astype(int)))
+    long = edges[1::2] - edges[::2] >= _REPEATED - 1
+    by_chance = np.count_nonzero(~long) > np.count_nonzero(long)
     for begin, end in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
         # Steps begin .. end - 1 are zero: rows begin + 1 .. end repeat row begin.
         jumps = end < steps.size and steps[end] > max(_STEPS * usual, least)
-        if end - begin + 1 >= _REPEATED and jumps:
+        surely = jumps or (moving[there[begin]] and not by_chance)
+        if end - begin + 1 >= _REPEATED and surely:
             out[there[begin + 1 : end + 1]] = True
     return out
 

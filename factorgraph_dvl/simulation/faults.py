@@ -13,7 +13,9 @@ from typing import Any
 
 import msgspec
 import numpy as np
+from scipy.spatial.transform import Rotation
 
+from factorgraph_dvl.geometry.rotations import BodyAxes, frd_from_body
 from factorgraph_dvl.geometry.units import DEG_PER_HOUR, HOUR, MICRO_G
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.simulation.measurements import displaced
@@ -84,6 +86,17 @@ def clock_rate(section: str, rate_ppm: float) -> Fault:
     return fault
 
 
+def clock_step(section: str, step_s: float, share: float = 0.5) -> Fault:
+    """Let the clock of a sensor jump after a share of the trial, of half its size to each side."""
+
+    def fault(trial: Trial, rng: np.random.Generator) -> Trial:
+        time = trial.body_sensor.time
+        at = time[0] + share * (time[-1] - time[0])
+        return _stamped(trial, section, lambda t: t + step_s * (t > at) - 0.5 * step_s)
+
+    return fault
+
+
 def jitter(section: str, std_s: float) -> Fault:
     """Scatter the stamps of a sensor; they stay in order."""
 
@@ -137,6 +150,27 @@ def gnss_outliers(share: float = 0.1, sigmas: tuple[float, float] = (10.0, 100.0
         gnss = _record(trial, "gnss")
         step = _gross(gnss.time.size, share, sigmas, rng) * gnss.settings.position_std_m
         return _with(trial, "gnss", geodetic=displaced(gnss.geodetic, step))
+
+    return fault
+
+
+def datum(shift_m: Sequence[float]) -> Fault:
+    """Give the fixes in another datum: shifted east, north and up, all by the same vector."""
+
+    def fault(trial: Trial, rng: np.random.Generator) -> Trial:
+        gnss = _record(trial, "gnss")
+        shift = np.tile(np.asarray(shift_m, float), (gnss.time.size, 1))
+        return _with(trial, "gnss", geodetic=displaced(gnss.geodetic, shift))
+
+    return fault
+
+
+def fixes_swapped() -> Fault:
+    """Write latitude and longitude into each other's column."""
+
+    def fault(trial: Trial, rng: np.random.Generator) -> Trial:
+        gnss = _record(trial, "gnss")
+        return _with(trial, "gnss", geodetic=gnss.geodetic[:, [1, 0, 2]])
 
     return fault
 
@@ -230,6 +264,40 @@ def dvl_false_lock(speed_m_s: float = 0.3, duration_s: float = 60.0) -> Fault:
     return fault
 
 
+def dvl_slipped(turn_deg: Sequence[float], share: float = 0.5) -> Fault:
+    """Turn the DVL in its mount after a share of the record, by a rotation vector in its axes."""
+
+    def fault(trial: Trial, rng: np.random.Generator) -> Trial:
+        dvl = _record(trial, "dvl")
+        after = dvl.time > dvl.time[0] + share * np.ptp(dvl.time)
+        turn = Rotation.from_rotvec(turn_deg, degrees=True).as_matrix()
+        velocity = np.where(after[:, None], dvl.velocity @ turn.T, dvl.velocity)
+        return _with(trial, "dvl", velocity=velocity)
+
+    return fault
+
+
+def dvl_water_track(current_m_s: Sequence[float], duration_s: float = 60.0) -> Fault:
+    """Measure against a layer of water for a while, which a current, east, north, up, moves."""
+
+    def fault(trial: Trial, rng: np.random.Generator) -> Trial:
+        dvl, reference = _record(trial, "dvl"), trial.reference
+        assert reference is not None
+        (inside,) = _spans(dvl.time, duration_s, 1, rng)
+        rph = [np.interp(dvl.time, reference.time, angle) for angle in np.unwrap(reference.rph.T)]
+        roll, pitch, heading = rph
+        # Axes forward, starboard and down to north, east and down.
+        level = Rotation.from_euler("ZYX", np.stack([heading, pitch, roll], axis=1))
+        east, north, up = current_m_s
+        in_frd = level.inv().apply([north, east, -up])
+        in_body = in_frd @ frd_from_body(trial.body_axes)
+        mounted = Rotation.from_rotvec(trial.calibration_truth["misalignment_deg"], degrees=True)
+        moved = dvl.velocity - mounted.apply(in_body) * inside[:, None]
+        return _with(trial, "dvl", velocity=moved)
+
+    return fault
+
+
 def frozen(section: str, duration_s: float = 30.0, field: str = "velocity") -> Fault:
     """Repeat the value that a sensor had at the start of a random span."""
 
@@ -250,6 +318,17 @@ def filled(section: str, share: float, value: float = 0.0, field: str = "velocit
         record = _record(trial, section)
         values = getattr(record, field).copy()
         values[rng.uniform(size=record.time.size) < share] = value
+        return _with(trial, section, **{field: values})
+
+    return fault
+
+
+def stuck(section: str, axis: int, field: str = "velocity") -> Fault:
+    """Let one axis of a sensor repeat its first value throughout."""
+
+    def fault(trial: Trial, rng: np.random.Generator) -> Trial:
+        values = getattr(_record(trial, section), field).copy()
+        values[:, axis] = values[0, axis]
         return _with(trial, section, **{field: values})
 
     return fault
@@ -306,6 +385,57 @@ def imu_errors(
         leaked = np.asarray(g_sensitivity) @ accel_bias * (MICRO_G / DEG_PER_HOUR)
         out = _truth(out, "gyro_bias_deg_h", np.asarray(gyro) @ gyro_bias + leaked)
         return _truth(out, "accel_bias_ug", np.asarray(accel) @ accel_bias)
+
+    return fault
+
+
+def imu_bias_walk(gyro_deg_h_sqrt_h: float, accel_ug_sqrt_h: float = 0.0) -> Fault:
+    """Let the biases of the IMU walk at random from zero, by standard deviations per √h."""
+
+    def fault(trial: Trial, rng: np.random.Generator) -> Trial:
+        imu = trial.inertial
+        root = np.sqrt(np.diff(imu.time, prepend=imu.time[0]) / HOUR)[:, None]
+        walk = np.cumsum(root * rng.standard_normal((imu.time.size, 6)), axis=0)
+        return _with(
+            trial,
+            "imu",
+            gyro=imu.gyro + gyro_deg_h_sqrt_h * DEG_PER_HOUR * walk[:, :3],
+            accel=imu.accel + accel_ug_sqrt_h * MICRO_G * walk[:, 3:],
+        )
+
+    return fault
+
+
+def imu_spikes(share: float, gyro_rad_s: float = 1.0, accel_m_s2: float = 10.0) -> Fault:
+    """Add spikes of a size, in random directions, to a share of the samples of the IMU."""
+
+    def fault(trial: Trial, rng: np.random.Generator) -> Trial:
+        imu = trial.inertial
+        hit = (rng.uniform(size=imu.time.size) < share)[:, None]
+        gyro, accel = (hit * _directions(imu.time.size, rng) for _ in range(2))
+        return _with(
+            trial, "imu", gyro=imu.gyro + gyro_rad_s * gyro, accel=imu.accel + accel_m_s2 * accel
+        )
+
+    return fault
+
+
+def sampling_misstated() -> Fault:
+    """State that the IMU samples the other way: means for instants, or instants for means."""
+
+    def fault(trial: Trial, rng: np.random.Generator) -> Trial:
+        stated = trial.inertial.settings
+        other = "mean" if stated.sampling == "instantaneous" else "instantaneous"
+        return _with(trial, "imu", settings=msgspec.structs.replace(stated, sampling=other))
+
+    return fault
+
+
+def body_axes_misstated(body_axes: BodyAxes) -> Fault:
+    """State other axes of the body than those of the records."""
+
+    def fault(trial: Trial, rng: np.random.Generator) -> Trial:
+        return replace(trial, body_axes=body_axes)
 
     return fault
 

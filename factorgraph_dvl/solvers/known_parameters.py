@@ -98,7 +98,8 @@ def explanation(problem: Problem, minimum: Minimum) -> Explanation | None:
     count = sum(int(np.count_nonzero(w)) for w in problem.weights)
     significant.sort(key=lambda each: -each[1].evidence(count))
     parameter, test = significant[0]
-    if most > max(test.chi2, CHANGED**2):
+    # Tests of changes take noise for white.
+    if most > max(test.chi2 * test.scatter, CHANGED**2):
         return None
     others = tuple(
         p.name for p, t in significant[1:] if test.evidence(count) - t.evidence(count) < 2.0 * _TIE

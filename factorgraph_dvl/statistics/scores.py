@@ -26,12 +26,15 @@ class Score:
     step, std : ndarray, shape (freedom,), SI
         Where they would go in their tangent space, and how well that would be known, all other
         candidates being right.
+    scatter : float
+        Variance of the scores over that of white noise, by which chi2 was divided.
     """
 
     chi2: float
     freedom: int
     step: Array
     std: Array
+    scatter: float = 1.0
 
     @property
     def log10_p(self) -> float:
@@ -41,7 +44,8 @@ class Score:
 
     def divided(self, scatter: float) -> Score:
         """Return the test where scores scatter more, in variance, than white noise makes them."""
-        return Score(self.chi2 / scatter, self.freedom, self.step, self.std * np.sqrt(scatter))
+        std = self.std * np.sqrt(scatter)
+        return Score(self.chi2 / scatter, self.freedom, self.step, std, self.scatter * scatter)
 
     def evidence(self, count: int) -> float:
         """Return what ranks causes: chi2, less what each component costs for a count of data.

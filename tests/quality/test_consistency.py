@@ -175,7 +175,8 @@ def test_swapped_fixes_without_velocities_are_found(trial: Trial) -> None:
     [
         faults.correlated_gnss((0.5, 0.5, 0.5), (0.05, 0.05, 0.05)),
         faults.gnss_outliers(),
-        pytest.param(faults.dvl_outliers(), marks=pytest.mark.slow),
+        faults.dvl_outliers(),
+        pytest.param(faults.dvl_outliers(0.3), marks=pytest.mark.slow),
         pytest.param(faults.dvl_false_lock(duration_s=20.0), marks=pytest.mark.slow),
         pytest.param(faults.dvl_bias((0.01, 0.0, 0.0)), marks=pytest.mark.slow),
         pytest.param(faults.jitter("dvl", 0.005), marks=pytest.mark.slow),
@@ -210,10 +211,14 @@ def test_a_dead_channel_of_the_imu_is_named(trial: Trial) -> None:
     gyro[:, 1] = 0.0
     texts = found(replace(trial, imu=replace(trial.imu, gyro=gyro)))
     assert "gyro_y_rad_s is always 0" in texts[Code.IMU_CHANNEL]
+    gyro = trial.imu.gyro.copy()
+    gyro[1000:1025] = gyro[1000]
+    texts = found(replace(trial, imu=replace(trial.imu, gyro=gyro)))
+    assert "all gyros repeat one value from 20.0 to 20.5 s" in texts[Code.FROZEN_VALUES]
     frozen = trial.imu.accel.copy()
     frozen[1000:1200] = frozen[1000]
     texts = found(replace(trial, imu=replace(trial.imu, accel=frozen)))
-    assert "m_s2 repeats one value from 20.0 to 24" in texts[Code.FROZEN_VALUES]
+    assert "all accelerometers repeat one value from 20.0 to 24" in texts[Code.FROZEN_VALUES]
 
 
 def test_noise_that_is_larger_than_stated_is_no_mistake_of_axes() -> None:
@@ -229,3 +234,44 @@ def test_noise_that_is_larger_than_stated_is_no_mistake_of_axes() -> None:
     assert sway.gnss is not None
     stated = replace(sway.gnss, velocity_std=0.2 * sway.gnss.velocity_std)
     assert Code.GNSS_AXES not in found(replace(sway, gnss=stated))
+
+
+def test_a_saturated_channel_is_named_and_a_coarse_one_is_not(trial: Trial) -> None:
+    limit = 0.95 * float(np.abs(trial.inertial.gyro[:, 1]).max())
+    text = found(trial, faults.saturated(gyro_rad_s=limit))[Code.SATURATED]
+    assert "gyro_y_rad_s is never" in text
+    assert f"{limit:.4g}, and is that" in text
+    coarse = replace(trial.inertial, gyro=np.round(trial.inertial.gyro, 3))
+    assert Code.SATURATED not in found(replace(trial, imu=coarse))
+
+
+def test_a_stuck_axis_of_the_dvl_is_named(trial: Trial) -> None:
+    (text,) = found(trial, faults.stuck("dvl", 2)).values()
+    assert "vel_z_m_s is always" in text
+
+
+def test_what_is_wrong_for_a_while_is_no_clock_that_jumps(trial: Trial) -> None:
+    assert Code.CLOCK_STEP not in found(trial, faults.dvl_false_lock(1.0, 40.0))
+
+
+def test_stamps_that_scatter_mirror_no_axes_and_move_no_clock(trial: Trial) -> None:
+    """Nothing that is wrong throughout explains them."""
+    texts = found(trial, faults.jitter("dvl", 0.5))
+    assert not {Code.DVL_AXES, Code.CLOCK_OFFSET, Code.LEAP_SECONDS} & set(texts)
+
+
+def test_a_clock_that_drifts_by_a_period_of_the_sway_mirrors_no_axes() -> None:
+    """Sway at 2 Hz, and 0.45 s over the trial."""
+    sway = {
+        "roll": [{"amplitude_deg": 4, "frequency_hz": 2}],
+        "pitch": [{"amplitude_deg": 4, "frequency_hz": 2, "phase_deg": 90}],
+    }
+    legs = [{"straight_s": 30}, {"turn_deg_s": 6, "duration_s": 30, "ramp_s": 4}]
+    scene = scenario(noise=True, sway=sway, manoeuvres=[{"repeat": 3, "manoeuvres": legs}])
+    text = found(simulate(scene, 2), faults.clock_rate("dvl", 2500.0))
+    assert list(text) == [Code.CLOCK_DRIFT]
+
+
+def test_spikes_of_the_imu_are_named(trial: Trial) -> None:
+    (text,) = found(trial, faults.imu_spikes(0.001)).values()
+    assert "single samples stand out" in text

@@ -410,9 +410,11 @@ def test_what_matters_is_in_view_on_a_low_terminal(trial, run):
         speed=20.0,
         inconsistent=("GNSS position",),
         short_of_limits=("misalignment_y_deg",),
+        verdict=solution.verdict,
     )
     lines = [s for line in console.render_lines(view) if (s := "".join(x.text for x in line))]
     text = "\n".join(lines[: console.height - 1])
+    assert str(solution.verdict)[:40] in text
     for expected in ("not good enough yet: misalignment_y", "contradictory: GNSS position"):
         assert expected in text
     for expected in ("position", "latency 4.0 ms, 20.0 times", "lever_arm_z"):

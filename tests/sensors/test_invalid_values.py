@@ -61,6 +61,23 @@ def test_frozen_velocities_are_missing():
     assert "69 that repeat" in finding.text
 
 
+def test_frozen_velocities_need_no_step_where_no_row_repeats_another_by_chance():
+    table = dvl_table()
+    for name in VELOCITY_COLUMNS:
+        table[name][50:60] = table[name][50]
+    out, (finding,) = without_invalid_values("dvl", table, "dvl.csv")
+    assert missing(out) == list(range(51, 60))
+    assert "9 that repeat" in finding.text
+
+
+def test_coarse_velocities_that_repeat_by_chance_stay():
+    table = dvl_table()
+    for name in VELOCITY_COLUMNS:
+        table[name] = np.round(table[name], 1)
+    table["vel_z_m_s"] *= 0.0
+    assert without_invalid_values("dvl", table, "dvl.csv")[1] == []
+
+
 def test_a_lost_beam_does_not_take_the_others_along():
     time = np.arange(50) * 1.0
     rng = np.random.default_rng(0)

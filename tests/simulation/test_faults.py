@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from truth import scenario
 
+from factorgraph_dvl.geometry.units import DEG_PER_HOUR
 from factorgraph_dvl.simulation import faults, simulate
 
 QUIET = {"noise": False, "manoeuvres": [{"straight_s": 300}]}
@@ -161,3 +162,69 @@ def test_gnss_wanders_by_the_stated_amounts():
     change = out.gnss.velocity - trial.gnss.velocity
     assert np.all(change[:, [0, 2]] == 0.0)
     assert np.std(change[:, 1]) == pytest.approx(0.3, rel=0.2)
+
+
+def test_a_clock_that_jumps_moves_both_halves(trial):
+    out = one(trial, faults.clock_step("dvl", 0.4))
+    late = out.dvl.time - trial.dvl.time
+    assert sorted(set(np.round(late, 9))) == [-0.2, 0.2]
+    assert out.calibration_truth["time_offset_s"] == pytest.approx(
+        trial.calibration_truth["time_offset_s"]
+    )
+
+
+def test_another_datum_moves_all_fixes_alike(trial):
+    out = one(trial, faults.datum((30.0, 40.0, 5.0)))
+    assert moved_m(out.gnss.geodetic, trial.gnss.geodetic) == pytest.approx(50.2, abs=0.3)
+
+
+def test_swapped_fixes_are_each_others():
+    trial = simulate(scenario(noise=False, start={"lon_deg": 21.0}))
+    out = one(trial, faults.fixes_swapped())
+    np.testing.assert_array_equal(out.gnss.geodetic[:, 0], trial.gnss.geodetic[:, 1])
+
+
+def test_a_slipped_dvl_turns_from_a_time_on(trial):
+    out = one(trial, faults.dvl_slipped((0.0, 0.0, 90.0)))
+    np.testing.assert_array_equal(out.dvl.velocity[0], trial.dvl.velocity[0])
+    x, y, _ = trial.dvl.velocity[-1]
+    assert out.dvl.velocity[-1, :2] == pytest.approx([-y, x])
+
+
+def test_a_water_track_lacks_the_current(trial):
+    """Along the course the current takes all of the speed away."""
+    still = simulate(scenario(**QUIET, sway={}, current_m_s=[0, 0, 0]))
+    velocity = still.reference.velocity[100]
+    out = one(still, faults.dvl_water_track(velocity, 30.0))
+    inside = np.any(out.dvl.velocity != still.dvl.velocity, axis=1)
+    assert inside.sum() == pytest.approx(
+        30.0 * still.dvl.time.size / np.ptp(still.dvl.time), abs=2
+    )
+    speed = np.linalg.norm(out.dvl.velocity[inside], axis=1)
+    assert np.all(speed < 0.02 * np.linalg.norm(velocity))
+
+
+def test_a_stuck_axis_leaves_the_others(trial):
+    out = one(trial, faults.stuck("dvl", 1))
+    assert np.ptp(out.dvl.velocity[:, 1]) == 0.0
+    np.testing.assert_array_equal(out.dvl.velocity[:, 0], trial.dvl.velocity[:, 0])
+
+
+def test_biases_walk_as_stated(trial):
+    out = one(trial, faults.imu_bias_walk(1.0, 100.0))
+    walked = (out.imu.gyro - trial.imu.gyro) / DEG_PER_HOUR
+    steps = np.diff(walked, axis=0) / np.sqrt(np.diff(out.imu.time)[:, None] / 3600.0)
+    assert walked[0] == pytest.approx(0.0, abs=1e-9)
+    assert steps.std() == pytest.approx(1.0, abs=0.02)
+
+
+def test_spikes_hit_a_share_of_the_samples(trial):
+    out = one(trial, faults.imu_spikes(0.01, gyro_rad_s=2.0))
+    size = np.linalg.norm(out.imu.gyro - trial.imu.gyro, axis=1)
+    assert np.mean(size > 0) == pytest.approx(0.01, abs=0.003)
+    assert size.max() == pytest.approx(2.0)
+
+
+def test_settings_are_misstated(trial):
+    assert one(trial, faults.sampling_misstated()).imu.settings.sampling == "instantaneous"
+    assert one(trial, faults.body_axes_misstated("FLU")).body_axes == "FLU"

@@ -10,7 +10,10 @@ from rich.table import Table
 from rich.text import Text
 
 from factorgraph_dvl.report.text import at_precision, split_unit
+from factorgraph_dvl.sensors.finding import Verdict
 from factorgraph_dvl.solution import Estimate, Trajectory
+
+_COLOURS = {"good": "green", "doubtful": "yellow", "do not use": "red"}
 
 
 def live_view(
@@ -24,6 +27,7 @@ def live_view(
     inconsistent: Sequence[str],
     short_of_limits: Sequence[str] = (),
     good_since: float | None = None,
+    verdict: Verdict | None = None,
 ) -> Group:
     """Return verdict, position, latency, speed and calibration.
 
@@ -49,6 +53,8 @@ def live_view(
         Components whose standard deviations exceed their limits.
     good_since : float, optional
         Time from which no standard deviation exceeds its limit, s; None = some do.
+    verdict : Verdict, optional
+        On what is known now.
     """
     table = Table()
     table.add_column("parameter")
@@ -69,11 +75,11 @@ def live_view(
     lat, lon, height = state.geodetic[0]
     rph = np.degrees(state.rph[0])
     if good_since is not None:
-        verdict = Text(f"{trial}: {time:.1f} s, good enough since {good_since:.0f} s", "green")
+        first = Text(f"{trial}: {time:.1f} s, good enough since {good_since:.0f} s", "green")
     else:
         why = ", ".join(split_unit(component)[0] for component in short_of_limits)
         why = why or "measurements contradict the estimate"
-        verdict = Text(f"{trial}: {time:.1f} s, not good enough yet: {why}")
+        first = Text(f"{trial}: {time:.1f} s, not good enough yet: {why}")
     lines = [
         f"position {np.degrees(lat):.7f} {np.degrees(lon):.7f} deg, {height:.2f} m "
         f"(σ {_three(state.position_std[0])} m)",
@@ -81,7 +87,9 @@ def live_view(
         f"roll, pitch, heading {_three(rph)} deg (σ {_three(np.degrees(state.rph_std[0]))})",
         f"latency {1e3 * latency:.1f} ms, {speed:.1f} times real time",
     ]
-    parts: list[Table | Text] = [verdict]
+    parts: list[Table | Text] = [first]
+    if verdict is not None:
+        parts.append(Text(str(verdict), _COLOURS[verdict.grade]))
     if inconsistent:
         parts.append(Text(f"contradictory: {', '.join(inconsistent)}", "red"))
     parts += [Text(line) for line in lines]
