@@ -59,7 +59,7 @@ _ARM_SIGMAS = 12.0
 # clocks that are off by far. Chosen: what good trials leave, and what wrong ones do.
 _CONTRADICTS = 0.1
 _UNEXPLAINED = 0.3
-# Share of the changes of velocity that must be elsewhere to tell what is wrong throughout.
+# Share of the changes of velocity that must be elsewhere to show what is wrong throughout.
 _ENOUGH = 0.5
 # Searches for gross errors, each with what those before left out. Chosen: the first sees the
 # largest only.

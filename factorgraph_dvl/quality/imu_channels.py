@@ -88,7 +88,7 @@ def _spikes(values: Array, moves: np.ndarray) -> Iterator[Finding]:
         size = np.max(deviation / usual, axis=0).max()
         yield Finding(
             Code.IMU_SPIKES,
-            f"{count} single samples stand out from those before and after, by up to {size:.0f} "
+            f"{count} single samples differ from those before and after, by up to {size:.0f} "
             "times what is usual",
             "IMU",
             severity="error",

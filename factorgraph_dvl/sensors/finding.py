@@ -170,15 +170,15 @@ class Code(StrEnum):
     )
     IMU_SPIKES = (
         "imu_spikes",
-        "Single samples of the IMU stand out from those before and after.",
-        "Each turns or pushes the vehicle for good, as far as the solver knows.",
-        "Leave such samples out: few that are missing are interpolated.",
+        "Single samples of the IMU differ by far from those before and after.",
+        "The solver takes each for a real turn or push of the vehicle.",
+        "Leave such samples out. A few missing samples are interpolated.",
         "error",
     )
     SATURATED = (
         "saturated",
         "A channel of the IMU reaches the end of its range.",
-        "The motion beyond is lost, and goes into attitude, velocity and biases.",
+        "The motion beyond it is lost, which changes attitude, velocity and biases.",
         "Set a larger range, or leave out the time of such motion.",
         "error",
     )

@@ -274,4 +274,4 @@ def test_a_clock_that_drifts_by_a_period_of_the_sway_mirrors_no_axes() -> None:
 
 def test_spikes_of_the_imu_are_named(trial: Trial) -> None:
     (text,) = found(trial, faults.imu_spikes(0.001)).values()
-    assert "single samples stand out" in text
+    assert "single samples differ" in text

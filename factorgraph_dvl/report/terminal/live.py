@@ -13,6 +13,7 @@ from factorgraph_dvl.report.text import at_precision, split_unit
 from factorgraph_dvl.sensors.finding import Verdict
 from factorgraph_dvl.solution import Estimate, Trajectory
 
+# Of the line with the verdict; chosen: those of its figures.
 _COLOURS = {"good": "green", "doubtful": "yellow", "do not use": "red"}
 
 

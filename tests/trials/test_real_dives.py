@@ -1,0 +1,99 @@
+"""Recorded dives with a raw IMU: mistakes are named one after the other, and dives agree."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from factorgraph_dvl.io.trial_folder import load_trial
+from factorgraph_dvl.quality.survey import survey
+from factorgraph_dvl.sensors.finding import Code
+from factorgraph_dvl.sensors.imu import COLUMNS
+from factorgraph_dvl.solvers.batch import solve
+
+DIVES = Path(__file__).resolve().parents[3] / "shared" / "data" / "snapir_auv"
+ALL = (1, 2, 3, 4, 8, 10)
+GNSS = "time_s,lat_deg,lon_deg,height_m,vel_e_m_s,vel_n_m_s,vel_u_m_s"
+DVL = "time_s,vel_x_m_s,vel_y_m_s,vel_z_m_s"
+
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(not DIVES.is_dir(), reason=f"no recorded dives in {DIVES.name}"),
+]
+
+
+def written(folder, number, *, corrected, gnss="", dvl=""):
+    """Write a dive as a trial: as recorded, or with axis and stamps corrected."""
+    folder.mkdir(exist_ok=True)
+    imu, motion, pings = (
+        np.loadtxt(DIVES / f"{name}_trajectory{number}.csv{end}", delimiter=",", skiprows=1)
+        for name, end in (("IMU", ".gz"), ("GT", ""), ("DVL", ""))
+    )
+    if corrected:
+        imu[:, [2, 5]] *= -1.0
+        for table, step in ((imu, 0.01), (motion, 1.0), (pings, 1.0)):
+            table[:, 0] = step * np.arange(len(table))
+    fixes = np.c_[motion[:, 0], np.degrees(motion[:, [2, 1]]), motion[:, [3, 5, 4]], -motion[:, 6]]
+    for name, header, values in (
+        ("imu", ",".join(COLUMNS), imu[:, [0, 4, 5, 6, 1, 2, 3]]),
+        ("gnss", GNSS, fixes),
+        ("dvl", DVL, pings),
+    ):
+        np.savetxt(
+            folder / f"{name}.csv", values, delimiter=",", header=header, comments="", fmt="%.12g"
+        )
+    (folder / "trial.yaml").write_text(
+        f"format: 1\nname: dive {number}\nbody_axes: FRD\nimu: {{grade: tactical}}\n"
+        f"gnss: {{position_std_m: [0.5, 0.5, 0.5], velocity_std_m_s: [0.02, 0.02, 0.02]{gnss}}}\n"
+        f"dvl: {{velocity_std_m_s: 0.01, velocity_std_fraction: 0.002{dvl}}}\n",
+        encoding="utf-8",
+    )
+    return load_trial(folder)
+
+
+def proposed(trial):
+    """Return what the checks propose: both clocks and the antenna, as YAML."""
+    texts = [str(f) for f in survey(trial).problems]
+    (gnss, dvl) = (
+        next(m[1] for t in texts if (m := re.search(rf"{s}: {{(time_offset_s: [-.\d]+)}}", t)))
+        for s in ("gnss", "dvl")
+    )
+    (arm,) = (m[1] for t in texts if (m := re.search(r"antenna at (\[.*?\]) m", t)))
+    offset = "time_offset_std_s: 0.05"
+    antenna = f"lever_arm_m: {arm}, lever_arm_std_m: [0.1, 0.1, 0.1]"
+    return {"gnss": f", {gnss}, {offset}, {antenna}", "dvl": f", {dvl}, {offset}"}
+
+
+def test_mistakes_are_named_one_after_the_other(tmp_path):
+    first = survey(written(tmp_path / "as it is", 2, corrected=False)).errors
+    assert first[0].code == Code.IMU_AXES
+    assert "axis y is mirrored" in first[0].text
+    assert [(f.code, f.sensor) for f in first[1:]] == [
+        (Code.CLOCK_DRIFT, "GNSS"),
+        (Code.CLOCK_DRIFT, "DVL"),
+    ]
+    then = survey(written(tmp_path / "corrected", 2, corrected=True)).problems
+    assert {f.code for f in then} == {Code.CLOCK_OFFSET, Code.ANTENNA}
+
+
+def test_lever_arms_and_clocks_of_all_dives_agree(tmp_path):
+    arms, P, clocks = [], [], []
+    for number in ALL:
+        found = proposed(written(tmp_path / f"{number}", number, corrected=True))
+        solution = solve(written(tmp_path / f"{number}", number, corrected=True, **found))
+        rows = [solution.order.index(f"lever_arm_{k}_m") for k in "xyz"]
+        arms.append(solution.estimate("lever_arm_m").value)
+        P.append(solution.covariance[np.ix_(rows, rows)])
+        clocks.append(
+            [solution.estimate(name).value[0] for name in ("time_offset_s", "gnss_time_offset_s")]
+        )
+    weights = np.linalg.inv(P)
+    mean = np.linalg.solve(weights.sum(axis=0), np.einsum("dij,dj->i", weights, arms))
+    left = np.array(arms) - mean
+    statistic = float(np.einsum("di,dij,dj->", left, weights, left))
+    assert statistic < chi2.ppf(0.99, 3 * (len(ALL) - 1))
+    assert np.ptp(clocks, axis=0).max() < 0.05
