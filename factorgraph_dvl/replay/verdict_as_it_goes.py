@@ -6,8 +6,9 @@ from dataclasses import replace
 
 from factorgraph_dvl.quality.survey import survey
 from factorgraph_dvl.replay.update import Update
-from factorgraph_dvl.sensors.finding import Code, Finding, Verdict
+from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.sensors.records import rows_of
+from factorgraph_dvl.sensors.verdict import Verdict
 from factorgraph_dvl.solution import Calibration, consistency_findings
 from factorgraph_dvl.trial import Trial
 

@@ -10,7 +10,7 @@ from rich.table import Table
 from rich.text import Text
 
 from factorgraph_dvl.report.text import at_precision, split_unit
-from factorgraph_dvl.sensors.finding import Verdict
+from factorgraph_dvl.sensors.verdict import Verdict
 from factorgraph_dvl.solution import Estimate, Trajectory
 
 # Of the line with the verdict; chosen: those of its figures.
