@@ -73,6 +73,8 @@ def _given(options: dict[str, Any]) -> Iterable[str]:
         flag = "--" + name.replace("_", "-")
         if value is True:
             yield flag
+        elif isinstance(value, list):
+            yield from (f"{flag} {each}" for each in value)
         elif value not in (None, False):
             yield f"{flag} {value}"
 

@@ -291,6 +291,7 @@ def test_blocks_that_are_not_run_say_why():
         "docs/campaign.md": ["it"],
         "docs/events.md": ["needs", "needs"],
         "docs/formats.md": ["a"],
+        "docs/before-solving.md": ["recordings", "recordings"],
         "docs/getting-started.md": ["recordings"],
         "docs/getting-started.zh.md": ["recordings"],
         "docs/import.md": ["recordings", "needs"],
