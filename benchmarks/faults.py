@@ -594,10 +594,10 @@ INTRODUCTION = """\
 
 Each row is a fault that a simulated trial has on top of its honest errors, solved from its files
 as its user would. Where no key says otherwise, clocks, antenna and DVL bias are estimated.
-*Error* is the largest one over calibration, position and attitude, in standard deviations. Position
-and attitude count every second, so 4 is chance. λ is the noncentrality of the fault: twice the cost
-that it adds at the minimum with noise as stated. *Named* says whether the first reason is the
-true cause. λ is worked out for results that are graded good.
+*Error* is the largest one over calibration, position and attitude, in standard deviations.
+Position and attitude count every second, so 4 is chance. λ is the noncentrality of the fault:
+twice the cost that it adds at the minimum with noise as stated. *Named* says whether the first
+reason is the true cause. λ is worked out for results that are graded good.
 
 Scenarios: seed A (`configs/seed-a-phase-90.yaml`, 450 s), the first quarter of an hour of
 `configs/cruise.yaml`, and `configs/dive.yaml` with ten minutes below.
