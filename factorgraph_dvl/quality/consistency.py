@@ -311,7 +311,8 @@ def _excess(comparison: Comparison, clock: ClockOffset | None, around: float) ->
     What is wrong with axes shows wherever the velocity changes; a share that only one window
     leaves, or two beside each other, is something else.
     """
-    if clock is None:
+    # Where noise is more than all changes of velocity, the IMU shows nothing to compare.
+    if clock is None or noise_share(comparison) > 1.0:
         return 0.0
     squares = np.sum(comparison.residual(_late(comparison, clock, around)) ** 2, axis=(1, 2))
     signal = comparison.signal

@@ -156,7 +156,7 @@ def test_simulate_replaces_only_what_it_wrote(tmp_path, capsys):
     raw.mkdir()
     (raw / "imu.csv").write_text("mine")
     assert run("simulate", config, "--out", raw, "--force") == 2
-    assert "holds imu.csv but no trial.yaml" in capsys.readouterr().err
+    assert "contains imu.csv but no trial.yaml" in capsys.readouterr().err
     assert files(raw) == {"imu.csv": b"mine"}
 
 
@@ -207,7 +207,7 @@ def test_force_replaces_no_file_of_a_name_it_did_not_write(tmp_path):
     out = tmp_path / "out"
     out.mkdir()
     (out / "table.csv").write_text("mine")
-    with pytest.raises(DataError, match=r"holds table\.csv but no result\.json"):
+    with pytest.raises(DataError, match=r"contains table\.csv but no result\.json"):
         write(out, "new", force=True)
     assert files(tmp_path) == {"out": None, "out/table.csv": b"mine"}
 

@@ -109,7 +109,7 @@ def test_parquet_may_hold_integers_and_nulls(tmp_path: Path) -> None:
 
     pa.parquet.write_table(pa.table({"a": [1, 2, None], "b": ["x", "y", "z"]}), tmp_path / "t.pq")
     np.testing.assert_array_equal(read_table(tmp_path / "t.pq", ("a",))["a"], [1.0, 2.0, np.nan])
-    with pytest.raises(DataError, match="column b holds string; expected numbers"):
+    with pytest.raises(DataError, match="column b contains string; expected numbers"):
         read_table(tmp_path / "t.pq", ("b",))
     (tmp_path / "bad.parquet").write_text("a,b\n1,2\n")
     with pytest.raises(DataError, match=r"bad\.parquet: is not a Parquet file"):
