@@ -138,28 +138,8 @@ def rms(values: Any) -> float:
 
 
 def until(trial: Trial, end: float) -> Trial:
-    """Return a trial's records up to a time."""
-
-    def cut(record: Any) -> Any:
-        keep = record.time <= end + 1e-6
-        arrays = {
-            name: value[keep]
-            for name, value in vars(record).items()
-            if isinstance(value, np.ndarray) and value.shape[:1] == keep.shape
-        }
-        return replace(record, **arrays)
-
-    def cut_if_there(record: Any) -> Any:
-        return None if record is None else cut(record)
-
-    return replace(
-        trial,
-        imu=cut(trial.imu),
-        gnss=cut_if_there(trial.gnss),
-        dvl=cut_if_there(trial.dvl),
-        others=tuple(cut(aid) for aid in trial.others),
-        reference=None,
-    )
+    """Return a trial's records up to a time, without what the result is compared with."""
+    return replace(trial.until(end + 1e-6), reference=None)
 
 
 def cpu_name() -> str:

@@ -41,8 +41,11 @@ from factorgraph_dvl.trial import Trial
 
 PAGE = "effects.md"
 GRADES = ("navigation", "tactical", "mems")
-SEVEN = ("misalignment_x_deg", "misalignment_y_deg", "misalignment_z_deg", "scale_error")
-ARM = ("lever_arm_x_m", "lever_arm_y_m", "lever_arm_z_m")
+SEVEN = (
+    *(f"misalignment_{axis}_deg" for axis in "xyz"),
+    "scale_error",
+    *(f"lever_arm_{axis}_m" for axis in "xyz"),
+)
 # Straight legs, s: the trial then lasts ten minutes.
 STRAIGHT_S = 150.0
 # Change of a measurement, m/s or rad, from which on it is bad: less are its last digits.
@@ -202,7 +205,7 @@ def one(name: str, grade: str, seed: int) -> Run:
     solution = solve(trial)
     cpu = time.process_time() - start
     found = calibration_errors(solution, trial.calibration_truth)
-    own = [found.names.index(n) for n in (*SEVEN, *ARM)]
+    own = [found.names.index(n) for n in SEVEN]
     error, P = found.error[own], found.covariance[np.ix_(own, own)]
     assert trial.reference is not None
     position = trajectory_errors(solution, trial.reference).position.normalised

@@ -29,10 +29,12 @@ from factorgraph_dvl.sensors.imu import Imu
 from factorgraph_dvl.sensors.ins import Ins
 from factorgraph_dvl.sensors.parameters import JointPrior
 from factorgraph_dvl.sensors.protocol import Aid, NoiseModel, SensorRecord
+from factorgraph_dvl.sensors.records import rows_of
 from factorgraph_dvl.sensors.speed_log import Heading, SpeedLog
 from factorgraph_dvl.sensors.turntable import Turntable
 
 _Sensor = TypeVar("_Sensor", bound=Aid)
+_Record = TypeVar("_Record", bound=Aid | Imu)
 
 # What a trial may lack, in the words of import.log and of errors.
 NO_POSITION = (
@@ -248,6 +250,23 @@ class Trial:
     def on_one_clock(self) -> Trial:
         """Return the trial with stamps of GNSS less their stated time offset."""
         return self if self.gnss is None else replace(self, gnss=self.gnss.on_trial_clock())
+
+    def until(self, end: float) -> Trial:
+        """Return the records up to a time, s; a sensor that has none yet is left out."""
+
+        def cut(record: _Record | None) -> _Record | None:
+            if record is None or record.time[0] > end:
+                return None
+            return rows_of(record, record.time <= end)
+
+        others = (cut(aid) for aid in self.others)
+        return replace(
+            self,
+            imu=cut(self.imu),
+            gnss=cut(self.gnss),
+            dvl=cut(self.dvl),
+            others=tuple(aid for aid in others if aid is not None),
+        )
 
     @property
     def inertial(self) -> Imu:

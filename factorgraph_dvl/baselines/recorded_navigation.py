@@ -12,7 +12,7 @@ from factorgraph_dvl.errors import ConfigError, DataError
 from factorgraph_dvl.geometry.earth import radii
 from factorgraph_dvl.geometry.rotations import rotation_from_rph
 from factorgraph_dvl.geometry.vectors import Array, rotate, skew
-from factorgraph_dvl.imu.attitude_record import AttitudeRecord
+from factorgraph_dvl.imu.attitude_record import AttitudeRecord, longest_gap
 from factorgraph_dvl.sensors.finding import Finding
 from factorgraph_dvl.sensors.gnss import Gnss
 from factorgraph_dvl.sensors.ins import Ins
@@ -21,10 +21,6 @@ from factorgraph_dvl.trial import Trial
 # Span, s, of the difference of positions that stands for a velocity that is not reported. Chosen:
 # that of the SINS/GNSS filter.
 _BASELINE = 5.0
-# Gap, s and in sample intervals, in which the motion is not known. Chosen: a cubic through longer
-# ones is a guess.
-_LEAST_GAP = 2.5
-_GAP_INTERVALS = 3.5
 
 
 @dataclass(frozen=True)
@@ -65,8 +61,8 @@ class RecordedNavigation:
         both = CubicSpline(self.time, np.hstack([self.geodetic, self.velocity]))(within)
         geodetic, velocity = both[:, :3], both[:, 3:]
         after = np.clip(np.searchsorted(self.time, within), 1, self.time.size - 1)
-        gap = max(_LEAST_GAP, _GAP_INTERVALS * float(np.median(np.diff(self.time))))
-        covered = (time == within) & (self.time[after] - self.time[after - 1] <= gap)
+        near = self.time[after] - self.time[after - 1] <= longest_gap(self.time)
+        covered = (time == within) & near
         P = np.square(self.std[after])[:, :, None] * np.eye(9)
         bRn = body.nRb.transpose(0, 2, 1)
         J = np.concatenate([bRn, bRn @ skew(velocity)], axis=2)

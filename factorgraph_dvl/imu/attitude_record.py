@@ -123,7 +123,7 @@ class AttitudeRecord:
         self.white = gain * self.white
         if isinstance(sensor, Attitude) and not sensor.measures_tilt:
             self.white = np.where([True, True, False], stated, self.white)
-        self._gap = max(_GAP_INTERVALS * self.interval, _LEAST_GAP)
+        self._gap = longest_gap(self.time)
 
     def covers(self, time: Array) -> np.ndarray:
         """Whether attitude is known at stamps (M,) of the sensor."""
@@ -182,6 +182,11 @@ def level_axes(frame: LocalFrame, p_n: Array) -> Array:
     """Return the rotations (M, 3, 3) of the local-level axes at positions (M, 3) to n."""
     lat, lon, _ = frame.geodetic(p_n)
     return frame.level_from_tangent(lat, lon).transpose(0, 2, 1)
+
+
+def longest_gap(time: Array) -> float:
+    """Return the gap, s, between records at (M,) beyond which nothing is known between them."""
+    return max(_GAP_INTERVALS * float(np.median(np.diff(time))), _LEAST_GAP)
 
 
 def _width(interval: float) -> int:

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 from factorgraph_dvl.quality.survey import survey
 from factorgraph_dvl.replay.update import Update
 from factorgraph_dvl.sensors.finding import Code, Finding
-from factorgraph_dvl.sensors.records import rows_of
 from factorgraph_dvl.sensors.verdict import Verdict
 from factorgraph_dvl.solution import Calibration, consistency_findings
 from factorgraph_dvl.trial import Trial
@@ -47,7 +44,7 @@ class VerdictAsItGoes:
         if update.time >= self._due:
             start = float(self._trial.inertial.time[0])
             self._due = start + _GROWTH * (update.time - start)
-            self._compared = survey(_until(self._trial, update.time)).errors
+            self._compared = survey(self._trial.until(update.time)).errors
         now = [
             Finding(Code.CONTRADICTS, "disagrees with the prediction", kind)
             for kind in update.inconsistent
@@ -66,16 +63,3 @@ class VerdictAsItGoes:
             findings=(*self._compared, *self._said, *now, *known),
             limits=self._trial.limits,
         ).verdict
-
-
-def _until(trial: Trial, end: float) -> Trial:
-    """Return the records of a trial up to a time; a sensor that has none yet is left out."""
-    imu = trial.inertial
-    gnss, dvl = trial.gnss, trial.dvl
-    return replace(
-        trial,
-        imu=rows_of(imu, imu.time <= end),
-        gnss=rows_of(gnss, gnss.time <= end) if gnss and gnss.time[0] <= end else None,
-        dvl=rows_of(dvl, dvl.time <= end) if dvl and dvl.time[0] <= end else None,
-        others=tuple(rows_of(aid, aid.time <= end) for aid in trial.others if aid.time[0] <= end),
-    )

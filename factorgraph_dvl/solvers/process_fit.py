@@ -23,10 +23,6 @@ _SAME = 0.03
 _MOST_RATIO = 0.9
 # Largest logarithm of a step. Chosen: a factor of e.
 _LARGEST = 1.0
-# Spacings of nodes and trials between which a correlation time lies. Chosen: it is white, or a
-# constant, beyond.
-_SHORTEST = 1.0
-_LONGEST = 1.0
 # Least correlation of two nodes. Chosen: less has a time far below the spacing.
 _LEAST_CORRELATION = 1e-3
 
@@ -86,10 +82,12 @@ def refitted(problem: Problem, evaluation: Evaluation) -> tuple[Process, ...]:
 
 def _step(process: Process, nodes: Array, information: SquareRootInformation) -> Array:
     """Return the change of the logarithms of deviation and time, (2, n); 0 where there is none."""
-    second = information.marginals([process.key(j) for j in range(process.time.size)])
-    own = np.array([np.diag(second[process.key(j)]) for j in range(process.time.size)])
     pairs = [(process.key(j), process.key(j + 1)) for j in range(process.time.size - 1)]
-    cross = np.array([np.diag(P) for P in information.cross_covariances(pairs)])
+    joint = np.array(information.joint_covariances(pairs))
+    n = process.sigma.size
+    variance = np.diagonal(joint, axis1=1, axis2=2)
+    own = np.concatenate([variance[:1, :n], variance[:, n:]])
+    cross = np.diagonal(joint[:, :n, n:], axis1=1, axis2=2)
     dt = np.diff(process.time)
     spacing = float(np.median(dt))
     regular = np.abs(dt / spacing - 1.0) < 0.5
@@ -99,7 +97,8 @@ def _step(process: Process, nodes: Array, information: SquareRootInformation) ->
     count = int(regular.sum())
     phi = np.clip(s10 / s00, _LEAST_CORRELATION, 1.0 - 1e-9)
     span = float(np.ptp(process.time))
-    tau = np.clip(-spacing / np.log(phi), _SHORTEST * spacing, _LONGEST * span)
+    # What is shorter than the spacing is white; what is longer than the trial is a constant.
+    tau = np.clip(-spacing / np.log(phi), spacing, span)
     phi = np.exp(-spacing / tau)
     innovation = (s11 - 2.0 * phi * s10 + phi**2 * s00) / count
     sigma = process.sigma * np.sqrt(innovation / (1.0 - phi**2))
@@ -123,5 +122,5 @@ def _moved(process: Process, step: Array) -> Process:
     return replace(
         process,
         sigma=process.sigma * np.exp(step[0]),
-        tau=np.minimum(process.tau * np.exp(step[1]), _LONGEST * span),
+        tau=np.minimum(process.tau * np.exp(step[1]), span),
     )

@@ -150,8 +150,8 @@ class SquareRootInformation:
                     out[key] = 0.5 * (block + block.T)
         return out
 
-    def cross_covariances(self, pairs: Sequence[tuple[int, int]]) -> list[Array]:
-        """Return the covariances of pairs of variables that a factor ties together.
+    def joint_covariances(self, pairs: Sequence[tuple[int, int]]) -> list[Array]:
+        """Return the joint covariances of pairs of variables that a factor ties together.
 
         Such variables share a clique: that of the one that was eliminated first.
         """
@@ -164,8 +164,8 @@ class SquareRootInformation:
             for key in clique.frontals:
                 for i, other in partners.get(key, ()):
                     if other in place:
-                        a, b = pairs[i]
-                        out[i] = P[place[a], place[b]]
+                        rows = np.concatenate([_range(place[each]) for each in pairs[i]])
+                        out[i] = P[np.ix_(rows, rows)]
         return out
 
     def _joint(self) -> Iterator[tuple[_Clique, dict[int, slice], Array]]:

@@ -9,12 +9,10 @@ from rich.console import Group
 from rich.table import Table
 from rich.text import Text
 
+from factorgraph_dvl.report.terminal.tables import VERDICT_COLOURS
 from factorgraph_dvl.report.text import at_precision, split_unit
 from factorgraph_dvl.sensors.verdict import Verdict
 from factorgraph_dvl.solution import Estimate, Trajectory
-
-# Of the line with the verdict; chosen: those of its figures.
-_COLOURS = {"good": "green", "doubtful": "yellow", "do not use": "red"}
 
 
 def live_view(
@@ -90,7 +88,7 @@ def live_view(
     ]
     parts: list[Table | Text] = [first]
     if verdict is not None:
-        parts.append(Text(str(verdict), _COLOURS[verdict.grade]))
+        parts.append(Text(str(verdict), VERDICT_COLOURS[verdict.grade]))
     if inconsistent:
         parts.append(Text(f"contradictory: {', '.join(inconsistent)}", "red"))
     parts += [Text(line) for line in lines]

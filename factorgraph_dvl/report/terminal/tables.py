@@ -24,7 +24,7 @@ from factorgraph_dvl.solution import Solution
 # Of findings, by severity.
 STYLES = {"error": "red", "warning": "yellow", "note": "", "ok": "green"}
 # Of verdicts and grades.
-_VERDICTS = {"good": "green", "doubtful": "yellow", "do not use": "red"}
+VERDICT_COLOURS = {"good": "green", "doubtful": "yellow", "do not use": "red"}
 GRADES = {"green": "green", "orange": "yellow", "red": "red", "grey": "dim"}
 # Chosen: wider than any table, in columns.
 _UNLIMITED = 10_000
@@ -93,7 +93,7 @@ def _calibration_table(
 
 def verdict_line(verdict: Verdict) -> Text:
     """Return the verdict on a result, its first reason, and what to do about it."""
-    line = Text.assemble("Verdict: ", (verdict.grade, _VERDICTS[verdict.grade]))
+    line = Text.assemble("Verdict: ", (verdict.grade, VERDICT_COLOURS[verdict.grade]))
     if verdict.reasons:
         first, *others = verdict.reasons
         line.append(f": {printable(str(first))}. {first.code.action}")
