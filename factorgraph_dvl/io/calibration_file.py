@@ -425,10 +425,11 @@ def _check_std(calibration: _File, covariance: Array, source: str) -> None:
     std = np.concatenate(
         [np.empty(0), *(_array(p.std).ravel() for p in calibration.parameters.values())]
     )
-    diagonal = np.diag(covariance)
-    known = np.isfinite(std) & np.isfinite(diagonal)
-    if std.size != diagonal.size or np.any(
-        np.abs(std[known] ** 2 - diagonal[known]) > _ROUNDING * np.maximum(diagonal[known], 1e-30)
+    # Roots, as the square of a damaged number overflows.
+    root = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    known = np.isfinite(std) & np.isfinite(root)
+    if std.size != root.size or np.any(
+        np.abs(std[known] - root[known]) > 0.5 * _ROUNDING * np.maximum(root[known], 1e-15)
     ):
         raise DataError(
             "`std` and the diagonal of the covariance do not agree",

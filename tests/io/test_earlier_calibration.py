@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 
 import gtsam
@@ -244,3 +245,15 @@ def test_what_cannot_be_used_is_named(tmp_path, two):
     unread = msgspec.structs.replace(first.imu.settings, calibration="x.json")
     with pytest.raises(ConfigError, match="has not been read"):
         replace(first.imu, settings=unread).parameters(0.0)
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("std", [0.5, 1e300])
+def test_deviations_that_contradict_the_covariance_are_named(tmp_path, std):
+    """The square of the second overflows."""
+    content = json.loads(encode_calibration(earlier()))
+    content["parameters"]["scale_error"]["std"] = [std]
+    file = tmp_path / "calibration.json"
+    file.write_text(json.dumps(content))
+    with pytest.raises(DataError, match=r"diagonal.*do not agree"):
+        load_calibration(file)

@@ -275,3 +275,16 @@ def test_a_clock_that_drifts_by_a_period_of_the_sway_mirrors_no_axes() -> None:
 def test_spikes_of_the_imu_are_named(trial: Trial) -> None:
     (text,) = found(trial, faults.imu_spikes(0.001)).values()
     assert "single samples differ" in text
+
+
+def test_spikes_below_the_integrated_noise_hide_no_other_error(trial: Trial) -> None:
+    """Three steps of 35 deviations among 11,250 samples add less than the noise does."""
+
+    def few(trial: Trial, rng: np.random.Generator) -> Trial:
+        accel = trial.inertial.accel.copy()
+        second = np.diff(accel[:, 2], 2)
+        accel[[2000, 4000, 6000], 2] += 35.0 * 0.5 * np.median(np.abs(second))
+        return replace(trial, imu=replace(trial.inertial, accel=accel))
+
+    assert list(found(trial, few)) == []
+    assert list(found(trial, few, faults.late("dvl", 0.3))) == [Code.CLOCK_OFFSET]
