@@ -31,7 +31,7 @@ _SPIKES = 3
 # Share of the variance of the integrated noise that spikes must add. Chosen: below it they change
 # neither attitude nor velocity by a σ. A blow on a hull added 0.09 to six minutes.
 _ADDED = 0.25
-# Square of the median deviation from the mean of both neighbours, over the variance of white noise.
+# Square of the median deviation from the mean of both neighbours, over the variance of noise.
 _MEDIAN_SQUARED = 1.5 * 0.6745**2
 
 
