@@ -55,16 +55,6 @@ def test_the_page_of_all_publications_has_every_item(name):
         assert found[0].rpartition(" | ")[2].strip(" |") in VERDICTS
 
 
-@pytest.mark.slow
-def test_a_whole_publication(run, tmp_path):  # noqa: F811
-    out = tmp_path / "out"
-    result = run("reproduce", "luo-2024", "--seeds", "1", "--out", out, "--quiet")
-    assert result.code == 0, result.err
-    page = (out / "luo-2024.md").read_text(encoding="utf-8")
-    assert all(f"| {e.label} | {e.says} | " in page for e in PAPERS["luo-2024"].entries)
-    assert faults(page) == []
-
-
 def test_one_table(run, tmp_path):  # noqa: F811
     result = run("reproduce", "luo-2024", "--table", "3", "--out", tmp_path / "out", "--quiet")
     assert result.code == 0, result.err
