@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from factorgraph_dvl.cli.console import drawing, print_table, print_written, stdout
-from factorgraph_dvl.cli.options import Force, claim_output
+from factorgraph_dvl.cli.options import FigureKind, Figures, Force, claim_output
 
 _FIGURE, _KEYS = "allan", "imu.yaml"
 
@@ -20,6 +20,7 @@ def allan(
     out: Annotated[
         Path | None, typer.Option("--out", metavar="DIR", help="Folder for plot and keys.")
     ] = None,
+    figures: Figures = FigureKind.PNG,
     force: Force = False,
 ) -> None:
     """Find the noise of an IMU from a static record, by its Allan deviation.
@@ -31,9 +32,10 @@ def allan(
     from factorgraph_dvl.io.folders import new_folder
     from factorgraph_dvl.io.tables import read_table
     from factorgraph_dvl.report.files.imu_noise import imu_yaml, noise_table
+    from factorgraph_dvl.report.text import figure_files
     from factorgraph_dvl.sensors.imu import COLUMNS, Imu, ImuSettings
 
-    owned = (f"{_FIGURE}.png", _KEYS)
+    owned = (*figure_files(_FIGURE), _KEYS)
     if out is not None:
         claim_output(out, force=force, owned=owned, inputs=(file,))
     # The noise is what is asked for: that of the settings is not used.
@@ -52,5 +54,6 @@ def allan(
             from factorgraph_dvl.report.figures.drawing import save_figures
             from factorgraph_dvl.report.figures.static_noise import allan_figure
 
-            save_figures({_FIGURE: allan_figure(noise)}, folder)
+            drawn = {_FIGURE: allan_figure(noise)}
+            save_figures(drawn, folder, name=file.name, kind=figures.value)
     print_written(out)

@@ -8,7 +8,15 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from factorgraph_dvl.cli.console import CountLine, print_folder, stderr, stdout, warn
-from factorgraph_dvl.cli.options import Anyway, Force, NoFigures, Quiet, claim_output
+from factorgraph_dvl.cli.options import (
+    Anyway,
+    FigureKind,
+    Figures,
+    Force,
+    NoFigures,
+    Quiet,
+    claim_output,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -40,6 +48,7 @@ def campaign(
     ] = None,
     force: Force = False,
     no_figures: NoFigures = False,
+    figures: Figures = FigureKind.PNG,
     anyway: Anyway = False,
     quiet: Quiet = False,
 ) -> None:
@@ -70,6 +79,7 @@ def campaign(
     else:
         options = [
             *(["--no-figures"] if no_figures else []),
+            *([f"--figures={figures.value}"] if figures != FigureKind.PNG else []),
             *(["--anyway"] if anyway else []),
         ]
         _run_trials(trials, out.resolve(), options, covariates, anyway, *found)

@@ -9,7 +9,14 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from factorgraph_dvl.cli.console import drawing, print_table, print_written, stdout, warn
-from factorgraph_dvl.cli.options import Anyway, Force, NoFigures, claim_output
+from factorgraph_dvl.cli.options import (
+    Anyway,
+    FigureKind,
+    Figures,
+    Force,
+    NoFigures,
+    claim_output,
+)
 
 if TYPE_CHECKING:
     from factorgraph_dvl.analysis.comparison.crosscheck import CrossCheck
@@ -48,6 +55,7 @@ def crosscheck(
     force: Force = False,
     anyway: Anyway = False,
     no_figures: NoFigures = False,
+    figures: Figures = FigureKind.PNG,
 ) -> None:
     """Compare two results of one trial with each other and with the truth.
 
@@ -81,17 +89,17 @@ def crosscheck(
         if check.motion is not None:
             write_table(folder / "differences.csv", difference_columns(check.motion))
         if not no_figures:
-            _draw_crosscheck(check, folder)
+            _draw_crosscheck(check, folder, figures.value)
         (folder / "crosscheck.json").write_bytes(to_json(check, {"A": str(a), "B": str(b)}))
     _print_crosscheck(check, a, b)
     print_written(out)
 
 
-def _draw_crosscheck(check: CrossCheck, folder: Path) -> None:
+def _draw_crosscheck(check: CrossCheck, folder: Path, kind: str) -> None:
     from factorgraph_dvl.report.figures.crosscheck import write_crosscheck_figures
 
     with drawing():
-        write_crosscheck_figures(check, folder)
+        write_crosscheck_figures(check, folder, kind=kind)
 
 
 def _print_crosscheck(check: CrossCheck, a: Path, b: Path) -> None:

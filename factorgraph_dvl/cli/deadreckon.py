@@ -18,6 +18,8 @@ from factorgraph_dvl.cli.console import (
 )
 from factorgraph_dvl.cli.options import (
     Anyway,
+    FigureKind,
+    Figures,
     Force,
     NoFigures,
     Quiet,
@@ -31,6 +33,7 @@ if TYPE_CHECKING:
     from factorgraph_dvl.analysis.dead_reckoning.before_after import BeforeAfter
     from factorgraph_dvl.analysis.dead_reckoning.integration import OrientationAt
     from factorgraph_dvl.sensors.finding import Finding
+    from factorgraph_dvl.sensors.verdict import Verdict
     from factorgraph_dvl.trial import Trial
 
 
@@ -59,6 +62,7 @@ def deadreckon(
     ] = None,
     force: Force = False,
     no_figures: NoFigures = False,
+    figures: Figures = FigureKind.PNG,
     anyway: Anyway = False,
     quiet: Quiet = False,
 ) -> None:
@@ -104,7 +108,8 @@ def deadreckon(
             ):
                 write_table(folder / name, motion_columns(run.track.motion))
             if not no_figures:
-                _draw(trial, result, folder)
+                verdict = verdict_of(errors) if errors else None
+                _draw(trial, result, folder, verdict, figures.value)
             about = {
                 "trial": trial.name,
                 "calibration": str(calibration),
@@ -196,8 +201,10 @@ def _attitude(
     return history.at, ()
 
 
-def _draw(trial: Trial, result: BeforeAfter, folder: Path) -> None:
+def _draw(
+    trial: Trial, result: BeforeAfter, folder: Path, verdict: Verdict | None, kind: str
+) -> None:
     from factorgraph_dvl.report.figures.dead_reckoning import write_dead_reckoning_figures
 
     with drawing():
-        write_dead_reckoning_figures(trial, result, folder)
+        write_dead_reckoning_figures(trial, result, folder, verdict, kind=kind)

@@ -10,12 +10,16 @@ import msgspec
 
 
 class Progress(msgspec.Struct, tag="progress", tag_field="event"):
-    """A stage began, or an iteration of it; `elapsed_s` counts from the start of the command."""
+    """A stage began, or an iteration of it; `elapsed_s` counts from the start of the command.
+
+    `left_s` is a guess at the time that is left.
+    """
 
     stage: str
     elapsed_s: float
     iteration: int = 0
     cost: float | None = None
+    left_s: float | None = None
 
 
 class Warned(msgspec.Struct, tag="warning", tag_field="event"):

@@ -15,11 +15,20 @@ from factorgraph_dvl.cli.console import (
     stdout,
     warn,
 )
-from factorgraph_dvl.cli.options import Anyway, Force, NoFigures, Quiet, claim_output
+from factorgraph_dvl.cli.options import (
+    Anyway,
+    FigureKind,
+    Figures,
+    Force,
+    NoFigures,
+    Quiet,
+    claim_output,
+)
 from factorgraph_dvl.cli.verdict import end_with
 
 if TYPE_CHECKING:
     from factorgraph_dvl.analysis.information.observability import Observability
+    from factorgraph_dvl.sensors.verdict import Verdict
     from factorgraph_dvl.solution import Solution
 
 
@@ -37,6 +46,7 @@ def observability(
     ] = None,
     force: Force = False,
     no_figures: NoFigures = False,
+    figures: Figures = FigureKind.PNG,
     anyway: Anyway = False,
     quiet: Quiet = False,
 ) -> None:
@@ -56,7 +66,8 @@ def observability(
         solution, view = _view(source, given, anyway, progress)
         progress("write", 0, None)
         with new_folder(out, force=force, owned=OWNED) as folder:
-            write_observability(view, folder, str(source), figures=not no_figures)
+            kind = None if no_figures else figures.value
+            write_observability(view, folder, str(source), solution.verdict, figures=kind)
     print_observability(view)
     print_written(out)
     end_with(solution.verdict)
@@ -82,33 +93,32 @@ def _view(
     # The solver is slow to import: do so after the checks of the input.
     from factorgraph_dvl.solvers.information_along_trial import solve_with_history
 
-    if trial.imu is None:
-        from factorgraph_dvl.solvers.batch import solve
-
-        solution = solve(trial, anyway=anyway, progress=progress)
-        return solution, look(solution, given=given)
     solution, history = solve_with_history(trial, anyway=anyway, progress=progress)
+    if history is None:
+        return solution, look(solution, given=given)
     return solution, look(solution, trial=trial, history=history, given=given)
 
 
-def write_observability(view: Observability, folder: Path, source: str, *, figures: bool) -> None:
-    """Write JSON, tables and figures to a folder."""
+def write_observability(
+    view: Observability, folder: Path, source: str, verdict: Verdict, *, figures: str | None
+) -> None:
+    """Write JSON, tables and, in a format, figures to a folder."""
     from factorgraph_dvl.io.tables import write_table
     from factorgraph_dvl.report.files.observability import history_columns, to_csv, to_json
 
     (folder / "observability.csv").write_text(to_csv(view), encoding="utf-8")
     if view.history is not None:
         write_table(folder / "history.csv", history_columns(view.history))
-    if figures:
-        _draw(view, folder)
+    if figures is not None:
+        _draw(view, folder, verdict, figures)
     (folder / "observability.json").write_bytes(to_json(view, source))
 
 
-def _draw(view: Observability, folder: Path) -> None:
+def _draw(view: Observability, folder: Path, verdict: Verdict, kind: str) -> None:
     from factorgraph_dvl.report.figures.observability import write_observability_figures
 
     with drawing():
-        write_observability_figures(view, folder)
+        write_observability_figures(view, folder, verdict, kind=kind)
 
 
 def print_observability(view: Observability) -> None:

@@ -15,7 +15,15 @@ from factorgraph_dvl.cli.console import (
     stdout,
 )
 from factorgraph_dvl.cli.observability import print_observability, write_observability
-from factorgraph_dvl.cli.options import Anyway, Force, NoFigures, Quiet, claim_output
+from factorgraph_dvl.cli.options import (
+    Anyway,
+    FigureKind,
+    Figures,
+    Force,
+    NoFigures,
+    Quiet,
+    claim_output,
+)
 from factorgraph_dvl.cli.plausibility import errors_in
 from factorgraph_dvl.cli.verdict import end_with
 
@@ -32,6 +40,7 @@ def plan(
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder to write.")],
     force: Force = False,
     no_figures: NoFigures = False,
+    figures: Figures = FigureKind.PNG,
     anyway: Anyway = False,
     quiet: Quiet = False,
 ) -> None:
@@ -59,7 +68,8 @@ def plan(
         proposal = propose(prediction, required, progress=progress)
         progress("write", 0, None)
         with new_folder(out, force=force, owned=OWNED) as folder:
-            write_observability(view, folder, str(source), figures=not no_figures)
+            kind = None if no_figures else figures.value
+            write_observability(view, folder, str(source), solution.verdict, figures=kind)
             (folder / "plan.json").write_bytes(
                 to_json(solution, prediction.duration, required, proposal, str(source))
             )

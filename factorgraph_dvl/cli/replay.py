@@ -93,7 +93,6 @@ def replay(
     std_asked = _limits("--good-std", good_std)
     error_asked = _limits("--good-error", good_error)
     claim_output(out, force=force, owned=OWNED, inputs=inputs_of(trial_path))
-    # Where nothing can be drawn over, lines of progress say as much.
     live = live and stderr().is_terminal and not events.active()
     with ProgressLine(quiet=quiet or live) as progress:
         trial = load_trial(trial_path, anyway=anyway)
@@ -162,7 +161,7 @@ def _run(
     kind = next(k for k in KINDS if k == smoother)
     began = perf_counter()
     shown = began
-    first = float(trial.inertial.time[0])
+    first, last = (float(t) for t in trial.inertial.time[[0, -1]])
     verdict = VerdictAsItGoes(trial)
 
     def speed(update: Update) -> float:
@@ -220,7 +219,8 @@ def _run(
             shown = now
             grade = verdict.at(update).grade
             at = f"{update.time - first:.0f} s"
-            progress(f"at {at}, {speed(update):.0f} times real time, {grade}")
+            done = (update.time - first) / max(last - first, 1e-9)
+            progress(f"at {at}, {speed(update):.0f} times real time, {grade}", done=done)
 
     return run(trial, smoother=kind, lag_s=lag, rate_hz=rate, anyway=anyway, watch=print_update)
 
@@ -249,7 +249,7 @@ def _write(
     def add(folder: Path) -> None:
         write_beams(trial, solution, folder)
         write_instrument(solution, folder)
-        write_history(folder, record.time, record.names, record.values, record.std, record.latency)
+        write_history(folder, record.time, record.names, record.std, record.values, record.latency)
         write_latency(folder, record.time, record.latency, record.solved)
         (folder / CONVERGENCE_FILE).write_text(to_csv(found), encoding="utf-8")
         series = (record.time, tuple(record.names), record.std)

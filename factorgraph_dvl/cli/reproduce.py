@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from factorgraph_dvl.cli.console import ProgressLine, print_written, stdout
-from factorgraph_dvl.cli.options import Force, Quiet, claim_output
+from factorgraph_dvl.cli.options import FigureKind, Figures, Force, Quiet, claim_output
 
 
 class PaperName(StrEnum):
@@ -34,6 +34,7 @@ def reproduce(
     seeds: Annotated[
         int, typer.Option(metavar="N", min=1, max=1000, help="Number of simulated trials.")
     ] = 5,
+    figures: Figures = FigureKind.PNG,
     force: Force = False,
     quiet: Quiet = False,
 ) -> None:
@@ -44,6 +45,7 @@ def reproduce(
     """
     from factorgraph_dvl.errors import ConfigError
     from factorgraph_dvl.io.folders import new_folder
+    from factorgraph_dvl.report.text import figure_files
     from factorgraph_dvl.reproduce import PAPERS
     from factorgraph_dvl.reproduce.page import selected, write_page
 
@@ -54,15 +56,15 @@ def reproduce(
         raise ConfigError(
             f"{paper.value} has no such figure or table", expected=", ".join(labels) or "neither"
         )
-    owned = (f"{paper.value}.md", "figure-*.png", "table-*.png", "claim-*.png")
+    owned = (f"{paper.value}.md", *figure_files("figure-*", "table-*", "claim-*"))
     claim_output(out, force=force, owned=owned, inputs=())
     results = []
     with ProgressLine(quiet=quiet) as progress:
-        for entry in entries:
-            progress(entry.label, 0, None)
+        for i, entry in enumerate(entries):
+            progress(entry.label, done=i / len(entries))
             results.append((entry, entry.check(seeds)))
     with new_folder(out, force=force, owned=owned) as folder:
-        write_page(found, results, seeds, folder)
+        write_page(found, results, seeds, folder, kind=figures.value)
     for entry, result in results:
         text = f"{entry.label}: {result.measured}: {result.verdict}"
         stdout().print(text, markup=False, soft_wrap=True)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from math import isfinite
 from pathlib import Path
@@ -42,15 +42,24 @@ if TYPE_CHECKING:
     from factorgraph_dvl.baselines.calibration import Method
     from factorgraph_dvl.errors import ConfigError
     from factorgraph_dvl.solution import Solution
+    from factorgraph_dvl.statistics.information_history import InformationHistory
     from factorgraph_dvl.trial import PlanarTrial, Trial
+
+# Entries of σ along the trial. Chosen: a plot has no more pixels, and each costs as much as a
+# step of the filter behind it.
+_ENTRIES = 500
 
 
 @dataclass(frozen=True)
 class _Found:
-    """What a run found: the solution, how a filter converged, and the trial's halves."""
+    """What a run found.
+
+    The solution, how a filter converged or the information grew along the trial, and its halves.
+    """
 
     solution: Solution
     history: History | None = None
+    along: InformationHistory | None = None
     halves: Halves | None = None
 
 
@@ -99,13 +108,14 @@ def solve(
     def run(trial: Trial, progress: ProgressLine) -> _Found:
         # The solver is slow to import: do so after the checks of the input.
         from factorgraph_dvl.analysis.comparison.halves import halves_of
-        from factorgraph_dvl.solvers.batch import solve as run_batch
+        from factorgraph_dvl.solvers.information_along_trial import solve_with_history
 
         parts = halves_of(trial) if halves else None
-        solution = run_batch(trial, rate_hz=rate, anyway=anyway, progress=progress)
-        if parts is None:
-            return _Found(solution)
-        return _with_halves(trial, solution, parts, progress)
+        solution, along = solve_with_history(
+            trial, rate_hz=rate, entries=_ENTRIES, anyway=anyway, progress=progress
+        )
+        found = _Found(solution, along=along)
+        return found if parts is None else _with_halves(trial, found, parts, progress)
 
     def run_planar(trial: PlanarTrial, progress: ProgressLine) -> _Found:
         from factorgraph_dvl.quality.plausibility_planar import planar_findings
@@ -201,7 +211,7 @@ def kalman(
 
 
 def _with_halves(
-    trial: Trial, solution: Solution, parts: tuple[Trial, Trial], progress: ProgressLine
+    trial: Trial, found: _Found, parts: tuple[Trial, Trial], progress: ProgressLine
 ) -> _Found:
     """Return a solution with the difference of the trial's halves, if they can be solved."""
     from factorgraph_dvl.analysis.comparison.halves import compare_halves
@@ -214,9 +224,10 @@ def _with_halves(
     except FactorgraphDvlError as error:
         text = f"a half of the trial cannot be solved: {error}"
         note = Finding(Code.HALVES_DIFFER, text, severity="note")
-        return _Found(solution.with_findings((note,)))
+        return replace(found, solution=found.solution.with_findings((note,)))
     halves = compare_halves(trial, first, second)
-    return _Found(solution.with_findings(halves.findings()), halves=halves)
+    solution = found.solution.with_findings(halves.findings())
+    return replace(found, solution=solution, halves=halves)
 
 
 def _misplaced(what: str, expected: str) -> ConfigError:
@@ -264,11 +275,14 @@ def _solve_into(
         def add(folder: Path) -> None:
             write_beams(trial, solution, folder)
             if history is not None:
-                write_history(folder, history.time, history.names, history.values, history.std)
+                write_history(folder, history.time, history.names, history.std, history.values)
+            if found.along is not None:
+                write_history(folder, found.along.time, found.along.names, found.along.std)
             if found.halves is not None:
                 write_table(folder / HALVES_FILE, found.halves.columns())
             write_instrument(solution, folder)
-            series = None if history is None else (history.time, history.names, history.std)
+            shown = history or found.along
+            series = None if shown is None else (shown.time, shown.names, shown.std)
             write_report(folder, str(out), solution, run_of(trial), series)
             if figures is None:
                 return

@@ -157,11 +157,11 @@ def write_history(
     folder: Path,
     time: Array,
     names: Sequence[str],
-    values: Array,
     std: Array,
+    values: Array | None = None,
     latency: Array | None = None,
 ) -> None:
-    """Write how a recursive solver converged, as history.csv.
+    """Write how the calibration became known along the trial, as history.csv.
 
     Parameters
     ----------
@@ -171,8 +171,10 @@ def write_history(
         Of the updates.
     names : sequence of str
         Of the n components, as in `covariance.order`.
-    values, std : ndarray, shape (H, n)
-        In reported units.
+    std : ndarray, shape (H, n)
+        Standard deviations, in reported units.
+    values : ndarray, shape (H, n), optional
+        What a recursive solver knew then, in reported units.
     latency : ndarray, shape (H,), optional
         Time that each update took, s, if it was measured.
     """
@@ -180,7 +182,9 @@ def write_history(
     if latency is not None:
         columns["latency_ms"] = 1e3 * latency
     for i, name in enumerate(names):
-        columns |= {name: values[:, i], f"{name}_std": std[:, i]}
+        if values is not None:
+            columns[name] = values[:, i]
+        columns[f"{name}_std"] = std[:, i]
     write_table(folder / HISTORY_FILE, columns)
 
 

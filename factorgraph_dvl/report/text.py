@@ -8,6 +8,13 @@ from factorgraph_dvl.sensors.parameters import UNITS
 
 # Chosen: fewer than the digits of a double.
 _MAX_DECIMALS = 12
+# Formats of figures.
+_FIGURE_KINDS = ("png", "svg", "pdf")
+
+
+def figure_files(*names: str) -> tuple[str, ...]:
+    """Return the files that figures may have, in all their formats."""
+    return tuple(f"{name}.{kind}" for name in names for kind in _FIGURE_KINDS)
 
 
 def split_unit(component: str) -> tuple[str, str]:

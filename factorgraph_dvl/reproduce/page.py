@@ -29,7 +29,12 @@ def summary_lines(results: Sequence[tuple[Entry, Result]]) -> tuple[str, ...]:
 
 
 def write_page(
-    paper: Paper, results: Sequence[tuple[Entry, Result]], seeds: int, folder: Path
+    paper: Paper,
+    results: Sequence[tuple[Entry, Result]],
+    seeds: int,
+    folder: Path,
+    *,
+    kind: str = "png",
 ) -> None:
     """Write `PAPER.md`, and a PNG file for each figure.
 
@@ -43,6 +48,8 @@ def write_page(
         Number of seeds.
     folder : path-like
         Where the files go.
+    kind : {'png', 'svg', 'pdf'}, optional
+        Format of further files beside the PNG files.
     """
     lines = [f"# {paper.reference}", "", f"Over {counted(seeds)}.", ""]
     lines += summary_lines(results)
@@ -51,6 +58,6 @@ def write_page(
         if result.details or result.figure is not None:
             lines += ["", f"## {entry.label[0].upper()}{entry.label[1:]}", "", *result.details]
         if result.figure is not None:
-            save_figures({name: result.figure}, folder)
+            save_figures({name: result.figure}, folder, name=paper.name, kind=kind)
             lines += ["", f"![{entry.says}]({name}.png)"]
     (folder / f"{paper.name}.md").write_text("\n".join(lines) + "\n", encoding="utf-8")

@@ -84,11 +84,34 @@ def solve(
     >>> solution.estimate("misalignment_deg").value.round(1)
     array([ 1. , -2.1, 20. ])
     """
+    solution, _ = solve_with_problem(
+        trial,
+        rate_hz=rate_hz,
+        state_interval_s=state_interval_s,
+        anyway=anyway,
+        progress=progress,
+    )
+    return solution
+
+
+def solve_with_problem(
+    trial: Trial,
+    *,
+    rate_hz: float,
+    state_interval_s: float = STATE_INTERVAL,
+    anyway: bool = False,
+    progress: Progress | None = None,
+) -> tuple[Solution, SolvedProblem | None]:
+    """Return the solution of a trial, and its problem at the most probable minimum.
+
+    There is none for a trial without IMU. Parameters and errors are those of `solve`.
+    """
     _check_above_zero("rate_hz", rate_hz)
     _check_above_zero("state_interval_s", state_interval_s)
     # What a trial without positions lacks comes before what is odd in its records.
     trial.frame()
     errors = accepted_errors(survey(trial), anyway=anyway)
+    solved: SolvedProblem | None = None
     with explained(errors):
         report = progress or _silent
         if trial.imu is None:
@@ -96,23 +119,25 @@ def solve(
                 trial, smooth_motion(prepare_motion(trial), report), rate_hz=rate_hz
             )
         else:
-            found = _most_probable(trial, rate_hz, state_interval_s, report)
-    return found.with_findings(errors)
+            found, solved = _most_probable(trial, rate_hz, state_interval_s, report)
+    return found.with_findings(errors), solved
 
 
 def _most_probable(
     trial: Trial, rate_hz: float, state_interval_s: float, report: Progress
-) -> Solution:
+) -> tuple[Solution, SolvedProblem]:
     """Return the most probable of all minima from all positions, with the spread of the others."""
     prepared = prepare(trial, state_interval_s, report)
-    solutions, terms = [], []
+    solutions, best = [], []
     for states in prepared.start_positions.states:
         minima = _minima(prepared, states, prepared.findings, report)
         against = np.array([evidence_against(each) for each in minima])
         summaries = [summarise(trial, each, rate_hz=rate_hz) for each in minima]
         solutions.append(most_probable_minimum(summaries, against))
-        terms.append(cost_terms(minima[0]))
-    return joined(solutions, significant_costs(terms), prepared.start_positions.hypotheses)
+        best.append(minima[0])
+    costs = significant_costs([cost_terms(each) for each in best])
+    likeliest = int(np.argmin(costs))
+    return joined(solutions, costs, prepared.start_positions.hypotheses), best[likeliest]
 
 
 def solved_problems(

@@ -23,14 +23,10 @@ from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph import keys
 from factorgraph_dvl.graph.keys import BIAS_SIZE
 from factorgraph_dvl.graph.problem import FIXED_DIRECTION_STD, Evaluation, Problem
-from factorgraph_dvl.quality.refusal import accepted_errors, explained
-from factorgraph_dvl.quality.survey import survey
-from factorgraph_dvl.solution import Progress, Solution, most_probable_minimum
-from factorgraph_dvl.solvers.batch import solved_problems
+from factorgraph_dvl.solution import Progress, Solution
+from factorgraph_dvl.solvers.batch import solve_with_problem
 from factorgraph_dvl.solvers.calibration import prior_along, reported
 from factorgraph_dvl.solvers.fixed_directions import SolvedProblem
-from factorgraph_dvl.solvers.minima import evidence_against
-from factorgraph_dvl.solvers.summary import summarise
 from factorgraph_dvl.statistics.information_history import InformationHistory
 from factorgraph_dvl.statistics.spurious_information import spurious_information
 from factorgraph_dvl.statistics.undetermined_directions import (
@@ -60,39 +56,53 @@ RATE_HZ = 20.0
 
 
 def solve_with_history(
-    trial: Trial, *, anyway: bool = False, progress: Progress | None = None
-) -> tuple[Solution, InformationHistory]:
+    trial: Trial,
+    *,
+    rate_hz: float = RATE_HZ,
+    entries: int | None = None,
+    anyway: bool = False,
+    progress: Progress | None = None,
+) -> tuple[Solution, InformationHistory | None]:
     """Solve a trial, and follow the information on its constants along it.
 
-    Parameters and errors as of `solvers.batch.solve`.
+    There is no history of a trial without IMU. Parameters and errors as of `solvers.batch.solve`;
+    `entries` as of `information_history`.
     """
-    errors = accepted_errors(survey(trial), anyway=anyway)
-    with explained(errors):
-        minima = solved_problems(trial, progress=progress)
+    solution, solved = solve_with_problem(trial, rate_hz=rate_hz, anyway=anyway, progress=progress)
+    if solved is None:
+        return solution, None
     if progress:
         progress("information along the trial", 0, None)
-    solution = most_probable_minimum(
-        [summarise(trial, each, rate_hz=RATE_HZ) for each in minima],
-        np.array([evidence_against(each) for each in minima]),
-    )
-    return solution.with_findings(errors), information_history(minima[0])
+    return solution, information_history(solved, entries=entries)
 
 
-def information_history(found: SolvedProblem) -> InformationHistory:
-    """Return the covariance of all constants given the data up to each node.
+def information_history(found: SolvedProblem, *, entries: int | None = None) -> InformationHistory:
+    """Return the covariance of all constants given the data up to nodes along the trial.
 
-    Information that only the noise of the motion makes is no more believed half-way than it
+    Information that only the noise of the motion makes is no more accepted half-way than it
     is at the end: where it prevails, a direction stays at its prior. Directions that are
     fixed in the problem stay there all the time.
+
+    Parameters
+    ----------
+    found : SolvedProblem
+        Of the trial.
+    entries : int, optional
+        Most entries of the history; where there are more nodes, evenly among them, with the
+        first and the last. By default every node has one.
     """
     problem, evaluation = found.problem, found.minimum.evaluation
     triangles, _ = run_filter(problem, evaluation)
-    undetermined = _undetermined(problem, evaluation, found.covariances.given, triangles)
-    return as_history(problem, evaluation, found.fixed, triangles, undetermined)
+    count = len(triangles)
+    shown = np.unique(np.linspace(0, count - 1, min(entries or count, count)).astype(int))
+    undetermined = _undetermined(problem, evaluation, found.covariances.given, triangles, shown)
+    return as_history(
+        problem, evaluation, found.fixed, triangles[shown], undetermined, nodes=shown
+    )
 
 
 def _undetermined(
-    problem: Problem, evaluation: Evaluation, nodes: Array, triangles: Array
+    problem: Problem, evaluation: Evaluation, nodes: Array, triangles: Array, shown: Array
 ) -> dict[int, Array]:
     """Return the directions that the data do not determine yet, by entry of the history."""
     size = len(problem.prior_root)
@@ -100,8 +110,9 @@ def _undetermined(
         return {}
     spurious = np.zeros((nodes.shape[0], size, size))
     np.cumsum(spurious_information(problem, evaluation, nodes)[:-1], axis=0, out=spurious[1:])
+    spurious = spurious[shown]
     # The last columns are those of the parameters: their triangle has all else eliminated.
-    root = triangles[:, -size:, -size:] @ problem.prior_root
+    root = triangles[shown, -size:, -size:] @ problem.prior_root
     data = np.swapaxes(root, 1, 2) @ root - np.eye(size)
     # The last entry was judged by the solver.
     doubtful = np.flatnonzero(largest_spurious_share(data, spurious)[:-1] >= SPURIOUS)
@@ -167,6 +178,8 @@ def as_history(
     fixed: Array,
     triangles: Array,
     undetermined: Mapping[int, Array],
+    *,
+    nodes: Array | None = None,
 ) -> InformationHistory:
     """Return triangles over the constants in reported parametrisation and units.
 
@@ -180,6 +193,8 @@ def as_history(
         Of `run_filter`.
     undetermined : mapping of int to ndarray
         Further directions that are at their prior, by entry.
+    nodes : ndarray of int, optional
+        Of the triangles; by default every node.
     """
     columns = _constants(problem)
     names: list[str] = []
@@ -218,8 +233,9 @@ def as_history(
         if info != 0:
             raise np.linalg.LinAlgError("a constant without a prior")
         root[k] = _triangle(np.hstack([transport @ inverse, spread]).T, size).T
+    time = problem.chain.segments.node_time
     return InformationHistory(
-        time=problem.chain.segments.node_time,
+        time=time if nodes is None else time[nodes],
         names=tuple(name for name, is_kept in zip(names, is_free, strict=True) if is_kept),
         root=root,
     )

@@ -7,19 +7,21 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from builders import build_solution, build_trial, edit, write_trial
 from running import Run
 from truth import CONFIGS
 
 import factorgraph_dvl.report.figures.solution
-import factorgraph_dvl.solvers.batch
+import factorgraph_dvl.solvers.information_along_trial
 from factorgraph_dvl.errors import SolveError
 from factorgraph_dvl.io.solution_folder import load_solution
 from factorgraph_dvl.io.trial_folder import load_trial
 from factorgraph_dvl.sensors.finding import Code
 from factorgraph_dvl.simulation import Scenario, load_scenario
 from factorgraph_dvl.solution import Solution
+from factorgraph_dvl.statistics.information_history import InformationHistory
 from factorgraph_dvl.trial import Trial
 
 
@@ -29,21 +31,22 @@ def stub(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
     state: dict[str, Any] = {"solution": build_solution(), "raises": None}
 
     def solve(
-        trial: Trial, *, rate_hz: float, anyway: bool, progress: Callable[..., None]
-    ) -> Solution:
+        trial: Trial, *, rate_hz: float, entries: int, anyway: bool, progress: Callable[..., None]
+    ) -> tuple[Solution, InformationHistory | None]:
         state["trial"], state["rate"] = trial, rate_hz
         progress("alignment", 0, None)
         progress("batch", 0, 9.87e12)
         progress("batch", 1, 12.51234)
         if state["raises"] is not None:
             raise state["raises"]
-        return state["solution"]
+        return state["solution"], state.get("along")
 
     def write_figures(trial: Trial, solution: Solution, folder: Path, *, kind: str) -> None:
         folder.mkdir()
         (folder / "track.png").write_text("png")
 
-    monkeypatch.setattr(factorgraph_dvl.solvers.batch, "solve", solve)
+    module = factorgraph_dvl.solvers.information_along_trial
+    monkeypatch.setattr(module, "solve_with_history", solve)
     monkeypatch.setattr(factorgraph_dvl.report.figures.solution, "write_figures", write_figures)
     return state
 
@@ -68,8 +71,24 @@ def test_solve_writes_a_solution_and_shows_it(
     assert result.out.startswith(f"Verdict: doubtful: {reason}. {Code.UNCERTAIN.action}")
     assert f"warning: {reason}" in result.err
     assert "note: misalignment_z_deg was not observable" in result.err
-    steps = [line.partition(" s  ")[2] for line in result.err.splitlines() if " s  " in line]
-    assert steps == ["alignment", "batch", "batch, iteration 1, cost 12.51", "write"]
+    # Nothing is drawn over in a pipe.
+    assert "iteration" not in result.err
+    assert " s  " not in result.err
+
+
+def test_solve_shows_sigma_along_the_trial(tmp_path: Path, run: Run, stub: dict[str, Any]) -> None:
+    names = stub["solution"].order[:3]
+    roots = np.array([180.0, 3.0, 0.05])[:, None, None] * np.eye(3)
+    stub["along"] = InformationHistory(np.array([0.0, 5.0, 10.0]), tuple(names), roots)
+    out = tmp_path / "out"
+    assert run("solve", write_trial(tmp_path), "--out", out, "--no-figures").code == 0
+    header, *rows = (out / "history.csv").read_text().splitlines()
+    assert header.split(",") == ["time_s", *(f"{name}_std" for name in names)]
+    assert [float(row.split(",")[1]) for row in rows] == [180.0, 3.0, 0.05]
+    page = (out / "report.html").read_text(encoding="utf-8")
+    assert "misalignment: σ along the trial, deg" in page
+    assert run("report", out).code == 0
+    assert (out / "report.html").read_text(encoding="utf-8") == page
 
 
 def test_solve_options(tmp_path: Path, run: Run, stub: dict[str, Any]) -> None:

@@ -48,7 +48,10 @@ def test_a_result_comes_with_its_verdict_and_its_files(
     tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     solution = build_solution()
-    monkeypatch.setattr("factorgraph_dvl.solvers.batch.solve", lambda *_, **__: solution)
+    monkeypatch.setattr(
+        "factorgraph_dvl.solvers.information_along_trial.solve_with_history",
+        lambda *_, **__: (solution, None),
+    )
     out = tmp_path / "out"
     result = run("--json", "solve", write_trial(tmp_path), "--out", out, "--no-figures")
     events = lines(result.out)

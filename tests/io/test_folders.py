@@ -16,7 +16,7 @@ import pytest
 from builders import build_solution, edit, write_trial
 from truth import CONFIGS
 
-import factorgraph_dvl.solvers.batch
+import factorgraph_dvl.solvers.information_along_trial
 from factorgraph_dvl.cli import main
 from factorgraph_dvl.errors import DataError
 from factorgraph_dvl.io import folders
@@ -337,9 +337,10 @@ def test_a_second_run_into_one_output_fails_at_once(tmp_path, capsys, monkeypatc
                 check=False,
             )
         )
-        return build_solution()
+        return build_solution(), None
 
-    monkeypatch.setattr(factorgraph_dvl.solvers.batch, "solve", solve)
+    module = factorgraph_dvl.solvers.information_along_trial
+    monkeypatch.setattr(module, "solve_with_history", solve)
     assert run("solve", trial, "--out", out, "--no-figures") == 0
     (second,) = codes
     assert second.returncode == 2

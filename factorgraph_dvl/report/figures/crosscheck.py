@@ -32,8 +32,10 @@ from factorgraph_dvl.report.figures.drawing import (
     save_figures,
     style,
     typeset,
+    verdict_label,
 )
 from factorgraph_dvl.report.text import split_unit, with_std
+from factorgraph_dvl.solution import Solution
 
 _RED = "#c0392b"
 _COLORS = {"agree": ACCENT, "differ": _RED, "not comparable": GREY}
@@ -42,7 +44,7 @@ _EDGE = 8.0
 _GROUPS = ("Position", "Velocity", "Attitude")
 
 
-def write_crosscheck_figures(check: CrossCheck, folder: Path) -> list[Path]:
+def write_crosscheck_figures(check: CrossCheck, folder: Path, *, kind: str = "png") -> list[Path]:
     """Draw a cross-check; figures for which there is nothing to draw are left out.
 
     Parameters
@@ -51,6 +53,8 @@ def write_crosscheck_figures(check: CrossCheck, folder: Path) -> list[Path]:
         What to draw.
     folder : path-like
         Where the PNG files go; created if needed.
+    kind : {'png', 'svg', 'pdf'}, optional
+        Format of further files beside them.
 
     Returns
     -------
@@ -65,7 +69,14 @@ def write_crosscheck_figures(check: CrossCheck, folder: Path) -> list[Path]:
         figures["differences"] = _differences(check.motion)
     if check.truth_a.trajectory is not None or check.truth_b.trajectory is not None:
         figures["errors"] = _errors(check)
-    return save_figures(figures, folder)
+    sides = [_side(name, side) for name, side in (("A", check.a), ("B", check.b))]
+    return save_figures(figures, folder, name="; ".join(sides), kind=kind)
+
+
+def _side(name: str, solution: Solution) -> str:
+    """Return what a figure says of a result: its trial, its solver, its grade and the reasons."""
+    what = " ".join(part for part in (solution.trial, solution.solver) if part)
+    return f"{name}: {what or 'external'}, {verdict_label(solution.verdict)}"
 
 
 def _parameters(check: CrossCheck) -> Figure:

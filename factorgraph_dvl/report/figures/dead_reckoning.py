@@ -25,6 +25,7 @@ from factorgraph_dvl.report.figures.drawing import (
     save_figures,
     style,
 )
+from factorgraph_dvl.sensors.verdict import Verdict
 from factorgraph_dvl.trial import Reference, Trial
 
 _BEFORE = "#c2571a"
@@ -32,12 +33,33 @@ _BEFORE = "#c2571a"
 _POINTS = 5000
 
 
-def write_dead_reckoning_figures(trial: Trial, result: BeforeAfter, folder: Path) -> list[Path]:
-    """Draw `tracks.png`, `lever_arm.png` and, if the errors are known, `errors.png`."""
+def write_dead_reckoning_figures(
+    trial: Trial,
+    result: BeforeAfter,
+    folder: Path,
+    verdict: Verdict | None = None,
+    *,
+    kind: str = "png",
+) -> list[Path]:
+    """Draw `tracks.png`, `lever_arm.png` and, if the errors are known, `errors.png`.
+
+    Parameters
+    ----------
+    trial : Trial
+        With its reference, if it has one.
+    result : BeforeAfter
+        What to draw.
+    folder : path-like
+        Where the files go.
+    verdict : Verdict, optional
+        On the records.
+    kind : {'png', 'svg', 'pdf'}, optional
+        Format of further files beside the PNG files.
+    """
     figures = {"tracks": tracks_figure(trial, result), "lever_arm": lever_arm_figure(result)}
     if result.calibrated.score is not None and result.uncalibrated.score is not None:
         figures["errors"] = errors_figure(result.calibrated.score, result.uncalibrated.score)
-    return save_figures(figures, folder)
+    return save_figures(figures, folder, verdict, name=trial.name, kind=kind)
 
 
 def tracks_figure(trial: Trial, result: BeforeAfter) -> Figure:

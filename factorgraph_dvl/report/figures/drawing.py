@@ -74,7 +74,7 @@ def save_figures(
         assert isinstance(figure, Figure)
         if verdict is not None:
             colour = VERDICT_COLOURS[verdict.grade]
-            label = _verdict_label(verdict)
+            label = verdict_label(verdict)
             figure.text(0.997, 0.995, label, ha="right", va="top", fontsize=SMALL, color=colour)
         if name:
             figure.text(0.003, 0.005, name, ha="left", va="bottom", fontsize=SMALL, color=GREY)
@@ -89,7 +89,7 @@ def save_figures(
     return paths
 
 
-def _verdict_label(verdict: Verdict) -> str:
+def verdict_label(verdict: Verdict) -> str:
     """Return the grade and the codes of the first reasons, with the number of others."""
     codes = list(dict.fromkeys(str(reason.code) for reason in verdict.reasons))
     others = f" and {len(codes) - _MOST_CODES} more" if len(codes) > _MOST_CODES else ""

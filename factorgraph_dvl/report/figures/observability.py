@@ -40,6 +40,7 @@ from factorgraph_dvl.report.figures.drawing import (
     save_figures,
     style,
 )
+from factorgraph_dvl.sensors.verdict import Verdict
 from factorgraph_dvl.statistics.information_history import InformationHistory
 
 # Of what is drawn for each kind of motion; mixtures take that of their last kind.
@@ -65,7 +66,9 @@ _MOST_TICKS = 24
 _FLOOR = 1e-2
 
 
-def write_observability_figures(view: Observability, folder: Path) -> list[Path]:
+def write_observability_figures(
+    view: Observability, folder: Path, verdict: Verdict | None = None, *, kind: str = "png"
+) -> list[Path]:
     """Draw what there is; return the paths of the files.
 
     `singular_values.png`, `std_along_trial.png`, `correlation.png`, `directions.png`,
@@ -77,6 +80,10 @@ def write_observability_figures(view: Observability, folder: Path) -> list[Path]
         What to draw.
     folder : path-like
         Where the PNG files go.
+    verdict : Verdict, optional
+        On the result.
+    kind : {'png', 'svg', 'pdf'}, optional
+        Format of further files beside them.
     """
     figures: dict[str, Canvas] = {}
     segments = [m.segment for m in view.segments]
@@ -90,7 +97,7 @@ def write_observability_figures(view: Observability, folder: Path) -> list[Path]
         figures["directions"] = direction_figure(view.marginals)
     if view.shares is not None:
         figures["shares"] = share_figure(view.shares, segments)
-    return save_figures(figures, folder)
+    return save_figures(figures, folder, verdict, name=view.name, kind=kind)
 
 
 def singular_value_figure(point_set: PointSet) -> Figure:

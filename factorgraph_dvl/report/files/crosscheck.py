@@ -25,12 +25,13 @@ from factorgraph_dvl.analysis.error_statistics import (
     nees_band,
 )
 from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.report.text import figure_files
 from factorgraph_dvl.solution import Solution
 
 # Files of a cross-check; the first makes the folder valid.
 OWNED = (
     *("crosscheck.json", "crosscheck.csv", "differences.csv"),
-    *("parameters.png", "differences.png", "errors.png"),
+    *figure_files("parameters", "differences", "errors"),
 )
 _COLUMNS = (
     *("parameter", "name", "a", "b", "difference", "std_a", "std_b"),

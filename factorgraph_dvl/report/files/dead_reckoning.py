@@ -12,13 +12,16 @@ from rich.table import Table
 
 from factorgraph_dvl.analysis.dead_reckoning.before_after import BeforeAfter, Run
 from factorgraph_dvl.analysis.dead_reckoning.track_error import Score, Stretches
-from factorgraph_dvl.report.text import fixed
+from factorgraph_dvl.report.text import figure_files, fixed
 
 RESULT_FILE = "deadreckon.json"
 TRACK_FILE = "track.csv"
 UNCALIBRATED_FILE = "track-uncalibrated.csv"
 # Files of `deadreckon`; the first makes the folder valid.
-OWNED = (RESULT_FILE, TRACK_FILE, UNCALIBRATED_FILE, "tracks.png", "errors.png", "lever_arm.png")
+OWNED = (
+    *(RESULT_FILE, TRACK_FILE, UNCALIBRATED_FILE),
+    *figure_files("tracks", "errors", "lever_arm"),
+)
 
 
 def to_json(result: BeforeAfter, about: Mapping[str, Any]) -> bytes:

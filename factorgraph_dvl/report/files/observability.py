@@ -15,13 +15,10 @@ from factorgraph_dvl.analysis.information.observability import Observability, Se
 from factorgraph_dvl.analysis.information.segment_singular_values import OBSERVABLE, SingularValues
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array
-from factorgraph_dvl.report.text import split_unit
+from factorgraph_dvl.report.text import figure_files, split_unit
 from factorgraph_dvl.statistics.information_history import InformationHistory
 
-FIGURES = tuple(
-    f"{name}.png"
-    for name in ("singular_values", "std_along_trial", "correlation", "directions", "shares")
-)
+FIGURES = figure_files("singular_values", "std_along_trial", "correlation", "directions", "shares")
 # Files of the command; the first makes the folder valid.
 OWNED = ("observability.json", "observability.csv", "history.csv", *FIGURES)
 

@@ -56,8 +56,10 @@ class Plot:
         Values beyond ± this are arrows at the edge, with their number; nan = none.
     band : float, optional
         Draw lines at ± this; nan = none.
-    prefix : str, optional
-        Text before the title that is not translated.
+    about : str, optional
+        What it is about, before the title: a measurement or a parameter.
+    log : bool, default False
+        Draw on a logarithmic axis; values that are not above 0 are left out.
     """
 
     key: str
@@ -69,11 +71,12 @@ class Plot:
     segments: Sequence[Segment] = field(default_factory=tuple)
     limit: float = np.nan
     band: float = np.nan
-    prefix: str = ""
+    about: str = ""
+    log: bool = False
 
     def data(self, start: float) -> dict[str, Any]:
         """Return what the script draws, with times from `start`, s."""
-        found = envelope(self.time - start, self.values)
+        found = envelope(self.time - start, self._drawn())
         limited = np.isfinite(self.limit)
         clip = self.limit if limited else np.inf
         series = []
@@ -95,6 +98,7 @@ class Plot:
             "key": self.key,
             "height": _LOW if limited else _HIGH,
             "unit": self.unit,
+            "log": self.log,
             "time": packed_times(found.time),
             "series": series,
             "limit": float(self.limit) if limited else None,
@@ -106,12 +110,19 @@ class Plot:
             ],
         }
 
+    def _drawn(self) -> Array:
+        """Return what is drawn; the logarithms of base 10 on a logarithmic axis."""
+        if not self.log:
+            return self.values
+        return np.log10(np.where(self.values > 0.0, self.values, np.nan))
+
     def html(self, start: float) -> Html:
         """Return the place of the plot in the page, its legend, and a table of its values."""
         unit = f", {self.unit}" if self.unit else ""
-        own = chinese(self.title)
-        english = f"{self.prefix}{self.title}{unit}"
-        title = both(english, f"{self.prefix}{own}{unit}")
+        english, own = f"{self.title}{unit}", f"{chinese(self.title)}{unit}"
+        if self.about:
+            english, own = f"{self.about}: {english}", f"{chinese(self.about)}：{own}"
+        title = both(english, own)
         legend = [
             element(
                 "li",
@@ -127,7 +138,7 @@ class Plot:
             id_=self.key,
             role="img",
             tabindex="0",
-            **labels_of(english, f"{self.prefix}{own}{unit}"),
+            **labels_of(english, own),
         )
         return element(
             "figure",

@@ -9,7 +9,11 @@
 
   const bytes = (text) => Uint8Array.from(atob(text), (c) => c.charCodeAt(0)).buffer;
   const times = (t) => Array.from(new Int32Array(bytes(t.data)), (k) => t.start + t.step * k);
-  const values = (s, key) => Array.from(new Int16Array(bytes(s[key])), (k) => k === -32768 ? null : s.offset + s.step * k);
+  const values = (s, key, log) => Array.from(new Int16Array(bytes(s[key])), (k) => {
+    if (k === -32768) return null;
+    const v = s.offset + s.step * k;
+    return log ? 10 ** v : v;
+  });
   const short = (v) => v === null || v === undefined ? "–" : Number(v.toPrecision(4)).toString().replace("-", "−");
 
   let language = "en";
@@ -31,8 +35,8 @@
     const series = [{}];
     const bands = [];
     for (const s of plot.series) {
-      const low = s.lows = values(s, "low");
-      if (s.high !== undefined) s.highs = values(s, "high");
+      const low = s.lows = values(s, "low", plot.log);
+      if (s.high !== undefined) s.highs = values(s, "high", plot.log);
       const style = { stroke: s.colour, width: 1.3, dash: s.dash, points: { show: false }, spanGaps: false };
       if (s.high === undefined) {
         columns.push(low);
@@ -48,8 +52,8 @@
     const u = new uPlot({
       width: width(), height: plot.height, legend: { show: false }, bands, series,
       cursor: { sync: { key: "time", scales: ["x", null] }, drag: { x: true, y: false } },
-      scales: { x: { time: false }, y: plot.limit === null ? {} : { range: [-plot.limit * 1.08, plot.limit * 1.08] } },
-      axes: [{ size: 34, space: 60 }, { size: 72, values: (_, ticks) => ticks.map(short) }],
+      scales: { x: { time: false }, y: plot.log ? { distr: 3 } : plot.limit === null ? {} : { range: [-plot.limit * 1.08, plot.limit * 1.08] } },
+      axes: [{ size: 34, space: 60 }, { size: 72, values: (_, ticks) => ticks.map((v) => v === null ? "" : short(v)) }],
       hooks: {
         drawClear: [(u) => {
           for (const [from, to, label] of plot.shade) {

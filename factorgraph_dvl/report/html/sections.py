@@ -233,7 +233,8 @@ def deviation_plots(result: Result, segments: Sequence[Segment]) -> list[Plot]:
                 unit = component_names(names[columns[0]])[2]
                 plots.append(
                     Plot(f"std-{e.name}", "σ along the trial", unit, shown, time,
-                         std[:, columns], segments, prefix=f"{e.spec.stem.replace('_', ' ')}: ")
+                         std[:, columns], segments, about=e.spec.stem.replace("_", " "),
+                         log=True)
                 )  # fmt: skip
     return plots
 
@@ -386,10 +387,10 @@ def residual_plots(result: Result) -> list[Plot]:
             known = order[np.isfinite(r.residual[order, c]) & (r.sigma[order, c] > 0.0)]
             if known.size:
                 normalised = (r.residual[known, c] / r.sigma[known, c])[:, None]
-                key, prefix = f"residual-{i}-{c}", f"{r.label}: "
+                key = f"residual-{i}-{c}"
                 plots.append(
                     Plot(key, "residual / σ", "", [name], r.time[known], normalised,
-                         limit=_PANEL, band=_BAND, prefix=prefix)
+                         limit=_PANEL, band=_BAND, about=r.label)
                 )  # fmt: skip
     return plots
 

@@ -24,8 +24,9 @@ def dictionary(kind: str) -> dict[str, str]:
 
 
 def chinese(english: str) -> str:
-    """Return a phrase in Chinese; where there is none, as it is."""
-    return dictionary("phrases").get(english, english)
+    """Return a phrase, or the name of a parameter, in Chinese; where there is none, as it is."""
+    name = dictionary("parameters").get(english.replace(" ", "_"), english)
+    return dictionary("phrases").get(english, name)
 
 
 def component_names(component: str) -> tuple[str, str, str]:

@@ -1,0 +1,81 @@
+from __future__ import annotations
+
+import io
+from typing import Any
+
+import pytest
+from rich.console import Console
+
+import factorgraph_dvl.cli.console as console
+from factorgraph_dvl.cli.console import CountLine, ProgressLine, share_done
+
+
+@pytest.fixture
+def terminal(monkeypatch: pytest.MonkeyPatch) -> tuple[io.StringIO, dict[str, float]]:
+    """What a terminal shows, and a clock that is set by hand."""
+    text, clock = io.StringIO(), {"now": 0.0}
+    monkeypatch.setattr(
+        console, "stderr", lambda: Console(file=text, force_terminal=True, width=100)
+    )
+    monkeypatch.setattr(console, "perf_counter", lambda: clock["now"])
+    return text, clock
+
+
+def shown(progress: Any, text: io.StringIO) -> str:
+    progress._live.refresh()
+    return text.getvalue()
+
+
+def test_a_terminal_shows_stage_cost_and_time_left(
+    terminal: tuple[io.StringIO, dict[str, float]],
+) -> None:
+    text, clock = terminal
+    with ProgressLine(quiet=False) as progress:
+        progress("load")
+        assert "left" not in shown(progress, text)
+        clock["now"] = 9.0
+        progress("all sensors", 0, 9.87e12)
+        # 45 % are done after 9 s.
+        assert "about 11 s left" in shown(progress, text)
+        clock["now"] = 18.0
+        progress("write", 1, 12.51234)
+        assert "write, iteration 1, cost 12.51" in shown(progress, text)
+        assert "about 1 s left" in shown(progress, text)
+        # A stage of another solver, or an earlier one, does not turn the time back.
+        progress("other mountings")
+        assert "other mountings" in shown(progress, text)
+        progress("half", done=0.5)
+        assert "about 1 s left" in shown(progress, text)
+
+
+def test_a_campaign_shows_what_has_ended_and_the_time_left(
+    terminal: tuple[io.StringIO, dict[str, float]],
+) -> None:
+    text, _ = terminal
+    with CountLine(2, quiet=False) as progress:
+        progress("monday")
+        assert "1/2" in shown(progress, text)
+        assert "monday" in shown(progress, text)
+
+
+@pytest.mark.parametrize("kind", ["pipe", "quiet"])
+def test_nothing_is_shown_elsewhere(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    text = io.StringIO()
+    monkeypatch.setattr(
+        console, "stderr", lambda: Console(file=text, force_terminal=kind == "quiet")
+    )
+    with ProgressLine(quiet=kind == "quiet") as progress:
+        progress("load")
+        progress("write", done=0.5)
+    with CountLine(2, quiet=kind == "quiet") as count:
+        count("monday")
+    assert text.getvalue() == ""
+
+
+def test_the_share_that_is_done_only_grows() -> None:
+    stages = ["load", "increments", "alignment", "inertial and GNSS", "mounting", "all sensors"]
+    stages += ["covariance", "information along the trial", "write"]
+    found = [share_done(stage, iteration) for stage in stages for iteration in (0, 1, 5, 50)]
+    assert all(share is not None and 0.0 <= share < 1.0 for share in found)
+    assert found == sorted(found, key=lambda share: share or 0.0)
+    assert share_done("ranges", 0) is None
