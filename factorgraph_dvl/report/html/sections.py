@@ -29,7 +29,7 @@ from factorgraph_dvl.report.html.markup import (
 )
 from factorgraph_dvl.report.html.plots import Plot
 from factorgraph_dvl.report.html.track import track_svg
-from factorgraph_dvl.report.html.words import component_names
+from factorgraph_dvl.report.html.words import chinese_cause, component_names, dictionary
 from factorgraph_dvl.report.text import at_precision, fixed, with_std
 from factorgraph_dvl.sensors.finding import Finding
 from factorgraph_dvl.sensors.verdict import Verdict
@@ -84,14 +84,14 @@ def verdict_section(result: Result) -> Section:
         cells += [_reason(f) for f in verdict.reasons]
     notes = [f for f in solution.findings if f.severity == "note"]
     if notes:
-        cells.append(folded("Notes", items([joined(str(f), _code(f)) for f in notes])))
+        cells.append(folded("Notes", items([joined(_what(f), _code(f)) for f in notes])))
     return section("Verdict", *cells, key="verdict")
 
 
 def verdict_box(verdict: Verdict) -> Html:
     """Return the grade of a verdict, with its first reason."""
     if verdict.reasons:
-        first: Cell = str(verdict.reasons[0])
+        first = _what(verdict.reasons[0])
     else:
         first = both("The checks found nothing wrong.")
     return element(
@@ -102,12 +102,19 @@ def verdict_box(verdict: Verdict) -> Html:
     )
 
 
+def _what(finding: Finding) -> Html:
+    """Return what was found; in Chinese what its code means, with the text in brackets."""
+    meaning, _, _ = dictionary("findings")[finding.code]
+    return both(str(finding), f"{meaning}（{finding}）")
+
+
 def _reason(finding: Finding) -> Html:
+    _, why, action = dictionary("findings")[finding.code]
     return element(
         "div",
-        paragraph(element("b", str(finding)), Html(" "), _code(finding)),
-        paragraph(finding.code.why),
-        paragraph(element("b", both("What to do:")), " ", finding.code.action),
+        paragraph(element("b", _what(finding)), Html(" "), _code(finding)),
+        paragraph(both(finding.code.why, why)),
+        paragraph(element("b", both("What to do:")), " ", both(finding.code.action, action)),
         class_="reason",
     )
 
@@ -261,9 +268,18 @@ def budget_section(result: Result) -> Section | None:
         total = sum(float(c.adds[i]) ** 2 for c in causes) or 1.0
         shares = [float(c.adds[i]) ** 2 / total for c in causes]
         largest = sorted(range(len(causes)), key=lambda k: -shares[k])[:_NAMED]
-        named = "; ".join(f"{causes[k].cause} {100.0 * shares[k]:.0f} %" for k in largest)
+        parts = [(causes[k].cause, f"{100.0 * shares[k]:.0f} %") for k in largest]
+        named = "; ".join(f"{cause} {share}" for cause, share in parts)
+        own = "；".join(f"{chinese_cause(cause)} {share}" for cause, share in parts)
         unit = component_names(name)[2]
-        rows.append([component_cell(name), f"{std[i]:.2g} {unit}", _bar(shares, named), named])
+        rows.append(
+            [
+                component_cell(name),
+                f"{std[i]:.2g} {unit}",
+                _bar(shares, named, own),
+                both(named, own),
+            ]
+        )
         numbers.append([component_cell(name), unit, *(f"{float(c.adds[i]):.2g}" for c in causes)])
     header = [both(x) for x in ("parameter", "σ now", "share of the variance", "largest causes")]
     return section(
@@ -284,17 +300,22 @@ def budget_section(result: Result) -> Section | None:
     )
 
 
-def _cause(cause: Cause) -> str:
-    return f"{cause.cause} ({cause.assumed})" if cause.assumed else cause.cause
+def _cause(cause: Cause) -> Html:
+    own = chinese_cause(cause.cause)
+    if not cause.assumed:
+        return both(cause.cause, own)
+    return both(f"{cause.cause} ({cause.assumed})", f"{own}（{cause.assumed}）")
 
 
-def _bar(shares: Sequence[float], text: str) -> Html:
+def _bar(shares: Sequence[float], text: str, own: str) -> Html:
     parts = [
         element("span", style=f"width:{100.0 * share:.2f}%;background:{colour}")
         for share, colour in zip(shares, _SHADES, strict=False)
     ]
     parts.append(element("span", style=f"flex:1;background:{_REST}"))
-    return element("div", *parts, class_="share", role="img", aria_label=text)
+    return element(
+        "div", *parts, class_="share", role="img", aria_label=text, data_en=text, data_zh=own
+    )
 
 
 def observability_section(result: Result, segments: Sequence[Segment]) -> Section:
@@ -411,7 +432,7 @@ def residual_tables(result: Result) -> list[Cell]:
                 continue
             x = r.residual[known, c] / r.sigma[known, c]
             rows.append([
-                r.label, both(name), f"{x.size}", f"{lost}", f"{share:.2g}",
+                both(r.label), both(name), f"{x.size}", f"{lost}", f"{share:.2g}",
                 fixed(float(x.mean()), 2), f"{float(np.sqrt(np.mean(x**2))):.2f}",
                 f"{float(np.abs(x).max()):.1f}",
             ])  # fmt: skip
@@ -424,7 +445,7 @@ def residual_tables(result: Result) -> list[Cell]:
     ]
     if solution.rejected:
         own = [
-            [r.label, both(r.reason), f"{r.time.size}", f"{r.time[0] - result.start:.1f}",
+            [both(r.label), both(r.reason), f"{r.time.size}", f"{r.time[0] - result.start:.1f}",
              f"{r.time[-1] - result.start:.1f}"]
             for r in solution.rejected if r.time.size
         ]  # fmt: skip
@@ -461,7 +482,7 @@ def clock_section(result: Result) -> Section:
     else:
         cells = [paragraph(both("No clock was estimated."))]
     if about:
-        cells.append(items([joined(str(f), _code(f)) for f in about]))
+        cells.append(items([joined(_what(f), _code(f)) for f in about]))
     return section("Clocks", *cells, key="clocks")
 
 

@@ -1,32 +1,50 @@
-"""Phrases and names of parameters in Chinese, from `chinese.json`."""
+"""Phrases, names of parameters and findings in Chinese, from `chinese.json`."""
 
 from __future__ import annotations
 
 import json
 from functools import cache
 from importlib.resources import files
+from typing import Any
 
 from factorgraph_dvl.report.text import split_unit
 
+# Beginnings of causes that name a measurement or a parameter, and what follows it in Chinese.
+_CAUSES = {
+    "noise of ": "噪声",
+    "correlated noise of ": "相关噪声",
+    "prior of ": "的先验",
+    "random walk of ": "的随机游走",
+}
+
 
 @cache
-def dictionary(kind: str) -> dict[str, str]:
-    """Return the Chinese of every English phrase, or of every stem of a parameter.
+def dictionary(kind: str) -> dict[str, Any]:
+    """Return the Chinese of every English phrase, stem of a parameter, or code of a finding.
 
     Parameters
     ----------
-    kind : {'phrases', 'parameters'}
-        Which of them.
+    kind : {'phrases', 'parameters', 'findings'}
+        Which of them. A finding has three texts: its meaning, why it matters, and the action.
     """
     file = files("factorgraph_dvl.report") / "html" / "chinese.json"
-    found: dict[str, str] = json.loads(file.read_text(encoding="utf-8"))[kind]
+    found: dict[str, Any] = json.loads(file.read_text(encoding="utf-8"))[kind]
     return found
 
 
 def chinese(english: str) -> str:
     """Return a phrase, or the name of a parameter, in Chinese; where there is none, as it is."""
     name = dictionary("parameters").get(english.replace(" ", "_"), english)
-    return dictionary("phrases").get(english, name)
+    return str(dictionary("phrases").get(english, name))
+
+
+def chinese_cause(cause: str) -> str:
+    """Return a cause of the error budget in Chinese; what is not known stays as it is."""
+    for start, own in _CAUSES.items():
+        if cause.startswith(start):
+            name = split_unit(cause.removeprefix(start))[0].replace("_", " ")
+            return f"{chinese(name)}{own}"
+    return chinese(cause)
 
 
 def component_names(component: str) -> tuple[str, str, str]:

@@ -9,6 +9,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from reports import build_result
 
@@ -19,7 +20,7 @@ CHROMIUM, DRIVER = shutil.which("chromium"), shutil.which("chromedriver")
 pytestmark = pytest.mark.skipif(
     CHROMIUM is None or DRIVER is None, reason="chromium and chromedriver are not installed"
 )
-PLOTS = 10
+PLOTS = 11
 
 
 @pytest.fixture(scope="module")
@@ -38,7 +39,9 @@ def driver() -> Iterator[Any]:
 def page(driver: Any, tmp_path_factory: pytest.TempPathFactory) -> Any:
     """The page of a result, opened from its file."""
     file = tmp_path_factory.mktemp("page") / "report.html"
-    file.write_text(report_page(build_result()), encoding="utf-8")
+    # The plot of σ along the trial has a logarithmic axis.
+    along = np.array([0.0, 300.0, 600.0]), ("misalignment_x_deg",), np.array([[9.0], [1], [0.1]])
+    file.write_text(report_page(build_result(history=along)), encoding="utf-8")
     driver.get(file.as_uri())
     return driver
 

@@ -5,18 +5,22 @@ import json
 import re
 from base64 import b64decode
 from dataclasses import replace
+from importlib import import_module
 from importlib.resources import files
+from pkgutil import iter_modules
 from typing import Any
 
 import numpy as np
 import pytest
 from reports import build_result
 
+from factorgraph_dvl import sensors
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.report.html.envelope import envelope
 from factorgraph_dvl.report.html.page import UPLOT, comparison_page, report_page
-from factorgraph_dvl.report.html.words import dictionary
+from factorgraph_dvl.report.html.words import chinese_cause, dictionary
 from factorgraph_dvl.sensors.finding import Code
+from factorgraph_dvl.sensors.parameters import ParameterSpec
 
 # Of the files in the package `uplot` 1.6.32 as npm serves it, whose shasum is
 # c800a63b432bad692d6d746f44f0882aa73a49ae.
@@ -138,6 +142,46 @@ def test_every_phrase_is_there_in_chinese() -> None:
     names = ("by hand", "out", "b")
     assert all("zh-Hans" in h for h in headings if h not in names)
     assert all(dictionary("phrases").values())
+
+
+def test_findings_and_causes_are_there_in_chinese() -> None:
+    own = dictionary("findings")
+    assert own.keys() == {str(code) for code in Code}
+    assert all(len(texts) == 3 and all(texts) for texts in own.values())
+    page = report_page(build_result())
+    code = Code.CLOCK_OFFSET
+    for english, chinese in zip((code.why, code.action), own[code][1:], strict=True):
+        assert f'<span lang="en">{english}</span>' in page
+        assert f'<span lang="zh-Hans">{chinese}</span>' in page
+    assert f"{own[code][0]}（GNSS: gnss.csv of by hand is 0.2 s late）" in page
+    assert "IMU 噪声（0.1 deg/√h）" in page
+    assert chinese_cause("noise of DVL velocity") == "DVL 速度噪声"
+    assert chinese_cause("prior of lever_arm_m") == "杆臂的先验"
+    assert chinese_cause("DVL noise") == "DVL noise"
+
+
+def test_parameters_are_there_in_chinese() -> None:
+    known = dictionary("parameters")
+    specs = {
+        spec.stem
+        for module in iter_modules(sensors.__path__)
+        for spec in vars(import_module(f"{sensors.__name__}.{module.name}")).values()
+        if isinstance(spec, ParameterSpec)
+    }
+    assert len(specs) > 10
+    assert specs <= known.keys()
+
+
+def test_sigma_along_the_trial_is_drawn_on_a_logarithmic_axis() -> None:
+    time = np.array([0.0, 300.0, 600.0])
+    std = np.array([[180.0], [3.0], [0.05]])
+    page = report_page(build_result(history=(time, ("misalignment_x_deg",), std)))
+    (plot,) = (p for p in data_of(page)["plots"] if p["key"] == "std-misalignment_deg")
+    assert plot["log"]
+    assert plot["shade"]
+    np.testing.assert_allclose(10.0 ** decode(plot["series"][0], "low"), std[:, 0], rtol=1e-3)
+    assert "misalignment: σ along the trial, deg" in page
+    assert "安装误差角：试验过程中的 σ, deg" in page
 
 
 def test_results_side_by_side() -> None:
