@@ -35,8 +35,8 @@ if TYPE_CHECKING:
     from factorgraph_dvl.solution import Solution
 
 _STARTED = time()
-# Chosen: width of tables in a file or a pipe, columns; wide enough for every table.
-_PIPE_WIDTH = 180
+# Chosen: width of tables in a file or a pipe, columns; that of a page or a mail.
+_PIPE_WIDTH = 80
 # Share of a run that is done when each stage of the batch solver begins. Measured on the shipped
 # trial and on an hour's cruise; where the data contradict the model, more rounds come.
 _STAGES = {
@@ -234,9 +234,17 @@ def _emit_results(out: Path, written: Iterable[Path]) -> None:
             events.emit(events.Result(str(name), content))
 
 
-def print_table(table: Table) -> None:
-    """Print a table uncut; a terminal wraps one that is too wide."""
-    from factorgraph_dvl.report.terminal.tables import width_of
+def print_table(table: Table, *leave_out: str) -> None:
+    """Print a table uncut, and without some columns if there is no room for them.
+
+    Parameters
+    ----------
+    table : Table
+        What to print; if it is still too wide, a terminal wraps it.
+    *leave_out : str
+        Headers of columns that may be left out, the least important first.
+    """
+    from factorgraph_dvl.report.terminal.tables import fitted, width_of
 
     if events.active():
         cells = [[_plain(cell) for cell in column.cells] for column in table.columns]
@@ -245,6 +253,7 @@ def print_table(table: Table) -> None:
         events.emit(events.Table(_plain(table.title or ""), header, rows))
         return
     console = stdout()
+    table = fitted(table, console.width, leave_out)
     console.width = max(console.width, width_of(table))
     console.print(table)
 

@@ -114,9 +114,9 @@ def _print_crosscheck(check: CrossCheck, a: Path, b: Path) -> None:
     if check.components:
         print_table(tables.component_table(check, width=console.width))
     if check.motion is not None:
-        print_table(tables.motion_table(check.motion))
+        print_table(tables.motion_table(check.motion), "at s", "largest in σ", "which σ")
     for table in tables.truth_tables(check):
-        print_table(table)
+        print_table(table, "unit", "truth", "largest of A", "largest of B")
     for note in check.notes:
         warn(note)
     console.print(tables.paragraph(check), markup=False, highlight=False)

@@ -131,11 +131,11 @@ def print_observability(view: Observability) -> None:
 
     console = stdout()
     if view.segments:
-        print_table(segment_table(view))
+        print_table(segment_table(view), "strongest", "weakest", "rms rate deg/s", "up to its end")
     if view.point_set is not None:
         console.print(f"Singular values: {view.point_set.scaling}.", markup=False, soft_wrap=True)
     if view.marginals is not None:
-        print_table(marginal_table(view))
+        print_table(marginal_table(view), "information from", "observable", "prior std")
         for line in direction_lines(view.marginals):
             console.print(line, markup=False, highlight=False, soft_wrap=True)
     for warning in view.warnings:

@@ -85,7 +85,7 @@ def _print_requirements(required: Sequence[Requirement], proposal: Proposal | No
 
     console = stdout()
     if required:
-        print_table(requirement_table(required, proposal))
+        print_table(requirement_table(required, proposal), "unit")
     if proposal is not None:
         for line in proposal_lines(proposal):
             console.print(line, markup=False, highlight=False, soft_wrap=True)

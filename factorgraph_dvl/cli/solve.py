@@ -361,7 +361,7 @@ def _print_solution(trial: Trial | PlanarTrial, found: _Found) -> None:
             text = "Accuracy, mean of 1 − |error / truth| of misalignment, scale and lever arm: "
             stdout().print(f"{text}{accuracy:.2f} %", markup=False, soft_wrap=True)
     if found.halves is not None:
-        print_table(halves_table(found.halves))
+        print_table(halves_table(found.halves), "unit", "second")
     if solution.hypotheses:
         print_table(hypothesis_table(solution))
     if solution.rejected:

@@ -8,6 +8,8 @@ from factorgraph_dvl.sensors.parameters import UNITS
 
 # Chosen: fewer than the digits of a double.
 _MAX_DECIMALS = 12
+# Words of names that are written in capitals.
+_ACRONYMS = {"gnss": "GNSS", "dvl": "DVL", "ins": "INS"}
 # Formats of figures.
 _FIGURE_KINDS = ("png", "svg", "pdf")
 
@@ -25,6 +27,11 @@ def split_unit(component: str) -> tuple[str, str]:
         if unit is not None:
             return "_".join(parts[:i]), unit.text
     return component, ""
+
+
+def in_words(name: str) -> str:
+    """Return a name of the files as words: `gnss_lever_arm_x` is `GNSS lever arm x`."""
+    return " ".join(_ACRONYMS.get(word, word) for word in name.split("_"))
 
 
 def fixed(value: float, decimals: int, *, signed: bool = False) -> str:

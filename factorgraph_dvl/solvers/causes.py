@@ -85,6 +85,11 @@ def _assumed(
 
 def _numbers(values: Array, unit: str) -> str:
     """Return numbers with their unit, once if they are all the same."""
-    texts = list(dict.fromkeys(f"{value:.2g}" for value in values))
-    numbers = texts[0] if len(texts) == 1 else ", ".join(f"{value:.2g}" for value in values)
+    texts = list(dict.fromkeys(_brief(value) for value in values))
+    numbers = texts[0] if len(texts) == 1 else ", ".join(map(_brief, values))
     return f"{numbers} {unit}".rstrip()
+
+
+def _brief(value: float) -> str:
+    """Write a number with two digits that count, and without an exponent up to a million."""
+    return f"{float(f'{value:.2g}'):g}"

@@ -65,7 +65,9 @@ def summarise(trial: Trial, found: SolvedProblem, *, rate_hz: float) -> Solution
             Finding(Code.NOT_CONVERGED, f"{text}: do not use the result", severity="error")
         )
     for label, count in problem.uncovered.items():
-        text = f"{count} measurements at times without IMU data were not used"
+        measurements = "1 measurement" if count == 1 else f"{count} measurements"
+        were = "was" if count == 1 else "were"
+        text = f"{measurements} at times without IMU data {were} not used"
         findings.append(Finding(Code.UNUSED, text, sensor=label))
     noise = noise_of(problem)
     findings += consistency_findings(estimates, residuals, noise)
@@ -191,8 +193,8 @@ def _unobservable(
         if trial.gnss is None:
             return "without GNSS nothing separates the errors of the IMU from the motion"
         return (
-            f"{duration:.0f} s with these manoeuvres add little to the prior; "
-            "it takes longer, or turns and changes of speed"
+            f"it could not be determined from this {duration:.0f} s run: record longer, or add "
+            "turns and speed changes"
         )
 
     nuisances = {p.name for p in problem.parameters if p.spec.nuisance}

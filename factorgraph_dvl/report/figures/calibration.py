@@ -29,7 +29,7 @@ from factorgraph_dvl.report.figures.drawing import (
     style,
     typeset,
 )
-from factorgraph_dvl.report.text import split_unit, with_std
+from factorgraph_dvl.report.text import in_words, split_unit, with_std
 from factorgraph_dvl.solution import Estimate, Solution
 
 _DIVERGING = LinearSegmentedColormap.from_list("correlation", ["#b34700", "#ffffff", ACCENT])
@@ -40,9 +40,9 @@ def calibration_figure(
 ) -> Canvas:
     """Draw every calibration component with its uncertainty, prior and truth."""
     rows = _calibration_rows(solution.estimates)
-    figure = canvas(11.0, 0.75 + 1.12 * len(rows), into)
+    figure = canvas(11.0, 0.87 + 1.12 * len(rows), into)
     grid = new_grid(
-        figure, len(rows), 3, left=0.15, right=0.15, bottom=0.3, top=0.85, gap=(0.52, 0.4)
+        figure, len(rows), 3, left=0.15, right=0.15, bottom=0.42, top=0.85, gap=(0.52, 0.4)
     )
     known = False
     for i, row in enumerate(rows):
@@ -198,7 +198,7 @@ def _chunks(components: list[tuple[Estimate, int]]) -> Iterator[list[tuple[Estim
 def readable(component: str) -> tuple[str, str]:
     """Split the name of a component into words and unit: `lever_arm_x_m`, `lever arm x`, `m`."""
     name, unit = split_unit(component)
-    return name.replace("_", " "), unit
+    return in_words(name), unit
 
 
 def _ticks(low: float, high: float) -> tuple[NDArray[np.float64], list[str]]:

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 from factorgraph_dvl.analysis.convergence import Convergence
 from factorgraph_dvl.analysis.error_statistics import true_value_of
 from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.report.figures.calibration import readable
 from factorgraph_dvl.report.figures.drawing import (
     ACCENT,
     ACCENT_LIGHT,
@@ -25,7 +26,6 @@ from factorgraph_dvl.report.figures.drawing import (
     save_figures,
     style,
 )
-from factorgraph_dvl.report.text import split_unit
 from factorgraph_dvl.sensors.verdict import Verdict
 from factorgraph_dvl.solution import Estimate
 
@@ -145,7 +145,7 @@ def convergence_figure(
                 low, high = min(low, float(true_value[n])), max(high, float(true_value[n]))
             margin = 0.05 * (high - low) or 1.0
             ax.set_ylim(low - margin, high + margin)
-            name, unit = split_unit(e.component_names[n])
+            name, unit = readable(e.component_names[n])
             style(ax, label if i == len(rows) - 1 else "", "")
             ax.set_title(f"{name}, {unit}" if unit else name, fontsize=NORMAL, loc="left")
     handles = figure.axes[0]

@@ -15,6 +15,7 @@ from factorgraph_dvl.analysis.comparison.motion_difference import (
     MotionDifference,
     joined_errors,
 )
+from factorgraph_dvl.report.figures.calibration import readable
 from factorgraph_dvl.report.figures.drawing import (
     ACCENT,
     DARK,
@@ -41,6 +42,9 @@ _RED = "#c0392b"
 _COLORS = {"agree": ACCENT, "differ": _RED, "not comparable": GREY}
 # Further out, how far is only a number.
 _EDGE = 8.0
+# Margin for the names of components, and from the panel to the verdicts, inches. Chosen: the
+# longest names and differences fit.
+_LEFT, _TO_VERDICT = 1.6, 2.0
 _GROUPS = ("Position", "Velocity", "Attitude")
 
 
@@ -70,21 +74,22 @@ def write_crosscheck_figures(check: CrossCheck, folder: Path, *, kind: str = "pn
     if check.truth_a.trajectory is not None or check.truth_b.trajectory is not None:
         figures["errors"] = _errors(check)
     sides = [_side(name, side) for name, side in (("A", check.a), ("B", check.b))]
-    return save_figures(figures, folder, name="; ".join(sides), kind=kind)
+    trial = check.a.trial or check.b.trial
+    return save_figures(figures, folder, name=trial, note="   ".join(sides), kind=kind)
 
 
 def _side(name: str, solution: Solution) -> str:
-    """Return what a figure says of a result: its trial, its solver, its grade and the reasons."""
-    what = " ".join(part for part in (solution.trial, solution.solver) if part)
-    return f"{name}: {what or 'external'}, {verdict_label(solution.verdict)}"
+    """Return what a figure says of a result: its solver, its grade and the reasons."""
+    return f"{name}: {solution.solver or 'external'}, {verdict_label(solution.verdict)}"
 
 
 def _parameters(check: CrossCheck) -> Figure:
     """Draw A − B of every component that both have, over its standard deviation."""
     rows = [c for c in check.components if np.isfinite(c.difference)]
-    right = 2.2 + 0.062 * max(len(_verdict(c)) for c in rows)
-    figure = new_figure(6.2 + right, 1.2 + 0.3 * len(rows))
-    grid = new_grid(figure, 1, 1, left=1.6, right=right, top=0.65)
+    right = _TO_VERDICT + 0.3 + 0.062 * max(len(_verdict(c)) for c in rows)
+    # The margins take at most half of a figure.
+    figure = new_figure(max(6.2 + right, 2.0 * (_LEFT + right)), 1.2 + 0.3 * len(rows))
+    grid = new_grid(figure, 1, 1, left=_LEFT, right=right, top=0.65)
     ax = figure.add_subplot(grid[0, 0])
     ax.axvspan(-AGREE_SIGMAS, AGREE_SIGMAS, color=LIGHT, lw=0, zorder=0)
     ax.axvline(0.0, color=GREY, lw=0.8, zorder=1)
@@ -95,9 +100,7 @@ def _parameters(check: CrossCheck) -> Figure:
     style(ax, "(A − B) / σ of A − B", "")
     ax.grid(visible=False, axis="y")
     ax.set_xticks([-6, -3, 0, 3, 6], ["−6", "−3", "0", "3", "6"])
-    ax.set_yticks(
-        range(len(rows)), [split_unit(c.name)[0].replace("_", " ") for c in rows], fontsize=NORMAL
-    )
+    ax.set_yticks(range(len(rows)), [readable(c.name)[0] for c in rows], fontsize=NORMAL)
     ax.tick_params(axis="y", length=0)
     ax.spines["left"].set_visible(False)
     shown = dict.fromkeys(c.kind for c in rows)
@@ -139,12 +142,16 @@ def _draw_component(ax: Axes, y: int, c: Component) -> None:
     difference = with_std(c.difference, c.std) if known else f"{c.difference:.4g}"
     kind = "" if c.kind in ("none", "upper bound") else f"({c.kind})"
     difference = typeset(" ".join(part for part in (difference, unit, kind) if part))
-    for x, text, text_color in ((1.02, difference, DARK), (1.48, _verdict(c), color)):
-        ax.text(
-            x,
-            y,
+    for inches, text, text_color in (
+        (0.1, difference, DARK),
+        (_TO_VERDICT, _verdict(c), color),
+    ):
+        ax.annotate(
             text,
-            transform=ax.get_yaxis_transform(),
+            (1.0, y),
+            xycoords=ax.get_yaxis_transform(),
+            xytext=(72.0 * inches, 0.0),
+            textcoords="offset points",
             va="center",
             fontsize=SMALL,
             color=text_color,
@@ -206,7 +213,7 @@ def _errors(check: CrossCheck) -> Figure:
     handles += axes[0, 0].plot([], [], color=GREY, lw=0.8, dashes=(4, 3), label="±3σ of each")
     figure.legend(
         handles=handles,
-        loc="upper right",
+        loc="upper left",
         ncols=3,
         fontsize=NORMAL,
         frameon=False,

@@ -122,7 +122,7 @@ def errors_figure(calibrated: Score, uncalibrated: Score) -> Figure:
 def lever_arm_figure(result: BeforeAfter) -> Figure:
     """Draw what a neglected lever arm does to the position when the vessel turns."""
     figure = new_figure(11.0, 7.2)
-    grid = new_grid(figure, 3, 1)
+    grid = new_grid(figure, 3, 1, gap=(0.4, 0.85))
     effect, track = result.lever_arm, result.calibrated.track
     start, time_label = clock(effect.time)
     time = effect.time - start
@@ -137,7 +137,15 @@ def lever_arm_figure(result: BeforeAfter) -> Figure:
         middle.plot(time, effect.closed_form[:, i], color=color, lw=0.8, dashes=(4, 3),
                     label=f"{name}: (C(t) − C(0)) l")  # fmt: skip
     style(middle, "", "difference, m")
-    middle.legend(loc="center left", fontsize=NORMAL, framealpha=0.85, edgecolor="none")
+    # Above the panel: the curves of turns go everywhere.
+    middle.legend(
+        loc="lower left",
+        bbox_to_anchor=(0.0, 1.0),
+        ncols=4,
+        borderaxespad=0.1,
+        fontsize=NORMAL,
+        frameon=False,
+    )
     bare, full = result.without_lever_arm.score, result.calibrated.score
     if bare is None or full is None:
         bottom.plot(time, np.hypot(effect.measured[:, 0], effect.measured[:, 1]), color=DARK)

@@ -52,6 +52,7 @@ def save_figures(
     verdict: Verdict | None = None,
     *,
     name: str = "",
+    note: str = "",
     kind: str = "png",
 ) -> list[Path]:
     """Write figures as PNG files under their names; return the paths.
@@ -66,15 +67,18 @@ def save_figures(
         What to write in the upper right corner: the grade, and the codes of its reasons.
     name : str, optional
         Name of the trial, for the lower left corner.
+    note : str, optional
+        What to write in the upper right corner in place of a verdict.
     kind : {'png', 'svg', 'pdf'}, optional
         Format of further files beside the PNG files; `png` adds none.
     """
     paths = []
     for title, figure in figures.items():
         assert isinstance(figure, Figure)
+        label, colour = note, GREY
         if verdict is not None:
-            colour = VERDICT_COLOURS[verdict.grade]
-            label = verdict_label(verdict)
+            label, colour = verdict_label(verdict), VERDICT_COLOURS[verdict.grade]
+        if label:
             figure.text(0.997, 0.995, label, ha="right", va="top", fontsize=SMALL, color=colour)
         if name:
             figure.text(0.003, 0.005, name, ha="left", va="bottom", fontsize=SMALL, color=GREY)

@@ -141,7 +141,7 @@ def singular_value_figure(point_set: PointSet) -> Figure:
     figure.legend(
         handles=handles, loc="upper left", ncols=len(handles), fontsize=NORMAL, frameon=False
     )
-    figure.text(0.008, 0.012, _wrapped(point_set.scaling), fontsize=SMALL, color=GREY)
+    figure.text(0.992, 0.012, _wrapped(point_set.scaling), ha="right", fontsize=SMALL, color=GREY)
     return figure
 
 
@@ -173,6 +173,7 @@ def _draw_stack(
                 va="center",
                 fontsize=6.5,
                 color=DARK,
+                bbox={"facecolor": "white", "alpha": 0.85, "edgecolor": "none", "pad": 0.5},
             )
             placed = shown
 

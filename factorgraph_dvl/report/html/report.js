@@ -16,6 +16,19 @@
   });
   const short = (v) => v === null || v === undefined ? "–" : Number(v.toPrecision(4)).toString().replace("-", "−");
 
+  // Powers of ten; where they are few, also two and five times them.
+  const decades = (u, axis, min, max) => {
+    const steps = Math.log10(max / min) < 2.5 ? [1, 2, 5] : [1];
+    const found = [];
+    for (let k = Math.floor(Math.log10(min)); k <= Math.ceil(Math.log10(max)); k++) {
+      for (const step of steps) {
+        const v = Number(`${step}e${k}`);
+        if (v >= min * 0.999 && v <= max * 1.001) found.push(v);
+      }
+    }
+    return found;
+  };
+
   let language = "en";
   const plots = [];
   const setLanguage = (to) => {
@@ -52,8 +65,8 @@
     const u = new uPlot({
       width: width(), height: plot.height, legend: { show: false }, bands, series,
       cursor: { sync: { key: "time", scales: ["x", null] }, drag: { x: true, y: false } },
-      scales: { x: { time: false }, y: plot.log ? { distr: 3 } : plot.limit === null ? {} : { range: [-plot.limit * 1.08, plot.limit * 1.08] } },
-      axes: [{ size: 34, space: 60 }, { size: 72, values: (_, ticks) => ticks.map((v) => v === null ? "" : short(v)) }],
+      scales: { x: { time: false }, y: plot.log ? { distr: 3, range: (u, min, max) => [min / 1.3, max * 1.3] } : plot.limit === null ? {} : { range: [-plot.limit * 1.08, plot.limit * 1.08] } },
+      axes: [{ size: 34, space: 60 }, { size: 72, values: (_, ticks) => ticks.map(short), ...(plot.log ? { splits: decades, filter: (_, ticks) => ticks } : {}) }],
       hooks: {
         drawClear: [(u) => {
           for (const [from, to, label] of plot.shade) {

@@ -30,7 +30,7 @@ from factorgraph_dvl.report.html.markup import (
 from factorgraph_dvl.report.html.plots import Plot
 from factorgraph_dvl.report.html.track import track_svg
 from factorgraph_dvl.report.html.words import chinese_cause, component_names, dictionary
-from factorgraph_dvl.report.text import at_precision, fixed, with_std
+from factorgraph_dvl.report.text import at_precision, fixed, in_words, with_std
 from factorgraph_dvl.sensors.finding import Finding
 from factorgraph_dvl.sensors.verdict import Verdict
 from factorgraph_dvl.solution import Cause, Solution
@@ -180,7 +180,7 @@ def _noise(solution: Solution) -> Iterator[Html]:
     if solution.noise:
         yield element("h3", both("Noise against what is stated"))
         rows = [
-            [n.name.replace("_", " "), ", ".join(f"{f:.3g}" for f in np.atleast_1d(n.factor))]
+            [both(in_words(n.name)), ", ".join(f"{f:.3g}" for f in np.atleast_1d(n.factor))]
             for n in solution.noise
         ]
         header = [both("measurement"), both("factor")]
@@ -240,7 +240,7 @@ def deviation_plots(result: Result, segments: Sequence[Segment]) -> list[Plot]:
                 unit = component_names(names[columns[0]])[2]
                 plots.append(
                     Plot(f"std-{e.name}", "σ along the trial", unit, shown, time,
-                         std[:, columns], segments, about=e.spec.stem.replace("_", " "),
+                         std[:, columns], segments, about=in_words(e.spec.stem),
                          log=True)
                 )  # fmt: skip
     return plots

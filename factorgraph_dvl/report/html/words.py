@@ -7,7 +7,7 @@ from functools import cache
 from importlib.resources import files
 from typing import Any
 
-from factorgraph_dvl.report.text import split_unit
+from factorgraph_dvl.report.text import in_words, split_unit
 
 # Beginnings of causes that name a measurement or a parameter, and what follows it in Chinese.
 _CAUSES = {
@@ -34,7 +34,7 @@ def dictionary(kind: str) -> dict[str, Any]:
 
 def chinese(english: str) -> str:
     """Return a phrase, or the name of a parameter, in Chinese; where there is none, as it is."""
-    name = dictionary("parameters").get(english.replace(" ", "_"), english)
+    name = dictionary("parameters").get(english.lower().replace(" ", "_"), english)
     return str(dictionary("phrases").get(english, name))
 
 
@@ -42,8 +42,8 @@ def chinese_cause(cause: str) -> str:
     """Return a cause of the error budget in Chinese; what is not known stays as it is."""
     for start, own in _CAUSES.items():
         if cause.startswith(start):
-            name = split_unit(cause.removeprefix(start))[0].replace("_", " ")
-            return f"{chinese(name)}{own}"
+            name = split_unit(cause.removeprefix(start))[0]
+            return f"{dictionary('parameters').get(name, chinese(name))}{own}"
     return chinese(cause)
 
 
@@ -60,5 +60,5 @@ def component_names(component: str) -> tuple[str, str, str]:
     for stem in sorted(stems, key=len, reverse=True):
         if name == stem or name.startswith(f"{stem}_"):
             own = f"{stems[stem]}{name[len(stem) :].replace('_', ' ')}"
-            return name.replace("_", " "), own, unit
-    return name.replace("_", " "), name.replace("_", " "), unit
+            return in_words(name), own, unit
+    return in_words(name), in_words(name), unit

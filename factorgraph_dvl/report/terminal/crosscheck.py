@@ -205,7 +205,7 @@ def _trajectory_truth(sides: Sequence[tuple[str, AgainstTruth]]) -> Table:
     table.add_column("component", no_wrap=True)
     table.add_column("unit", no_wrap=True)
     for side, _ in sides:
-        for header in (f"RMS of {side}", f"largest of {side}", f"within 2σ of {side} %"):
+        for header in (f"RMS of {side}", f"largest of {side}", f"{side} in 2σ, %"):
             table.add_column(header, justify="right", no_wrap=True)
     found = [
         None if against.trajectory is None else error_spreads(against.trajectory)
@@ -229,13 +229,17 @@ def _trajectory_truth(sides: Sequence[tuple[str, AgainstTruth]]) -> Table:
             errors = against.trajectory
             nees = "–" if errors is None else _or_dash(float(mean_nees(errors)[k]), ".2f")
             cells += [nees, "", ""]
-        table.add_row(f"{group}: mean NEES (3 expected)", "", *cells)
+        table.add_row(f"{group}: NEES (expected 3)", "", *cells)
     table.caption = f"Expected within 2σ: {100.0 * TWO_SIGMA_SHARE:.1f} %, over many trials"
     return table
 
 
 def _or_dash(value: float, spec: str) -> str:
-    return format(value + 0.0, spec) if np.isfinite(value) else "–"
+    if not np.isfinite(value):
+        return "–"
+    text = format(value, spec)
+    # Never a negative zero.
+    return text if float(text) != 0.0 else format(0.0, spec)
 
 
 def _resolution(c: Component) -> float:

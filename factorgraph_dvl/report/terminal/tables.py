@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 from msgspec import UnsetType
@@ -109,7 +110,7 @@ def halves_table(halves: Halves) -> Table:
     for header in ("first", "second", "difference"):
         add_column(table, header, numeric=True)
     add_column(table, "unit")
-    add_column(table, "difference/σ", numeric=True)
+    add_column(table, "in σ", numeric=True)
     rows = zip(
         halves.names,
         halves.first,
@@ -240,6 +241,33 @@ def sensor_table(survey: Survey) -> Table:
 def width_of(table: Table) -> int:
     """Return the width of an uncut table, columns."""
     return Console(width=_UNLIMITED).measure(table).maximum
+
+
+def fitted(table: Table, width: int, leave_out: Sequence[str]) -> Table:
+    """Return a table that fits a width, without the first of some columns that are in the way.
+
+    Parameters
+    ----------
+    table : Table
+        Of which all columns are numbers or names.
+    width : int
+        Columns of the terminal.
+    leave_out : sequence of str
+        Headers of columns, the least important first. Without all of them the table may still be
+        wider.
+    """
+    for header in leave_out:
+        if width_of(table) <= width:
+            break
+        kept = [column for column in table.columns if column.header != header]
+        narrower = Table(title=table.title, caption=table.caption)
+        for column in kept:
+            narrower.add_column(column.header, justify=column.justify, no_wrap=True)
+        cells = zip(*(column.cells for column in kept), strict=True)
+        for row, texts in zip(table.rows, cells, strict=True):
+            narrower.add_row(*texts, end_section=row.end_section)
+        table = narrower
+    return table
 
 
 def motion_line(survey: Survey) -> str:
