@@ -11,9 +11,9 @@ which takes some minutes and about a gigabyte of disk.
 
 from __future__ import annotations
 
+import json
 import os
 import platform
-import re
 import subprocess
 import sys
 import tempfile
@@ -351,10 +351,10 @@ def cruise_duration() -> float:
 
 def run_cli(*args: object) -> Run:
     """Run the command line in a process of its own."""
-    command = [sys.executable, "-m", "factorgraph_dvl.cli", *map(str, args)]
+    command = [sys.executable, "-m", "factorgraph_dvl.cli", "--json", *map(str, args)]
     with tempfile.TemporaryFile("w+") as log:
         start = perf_counter()
-        process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=log)
+        process = subprocess.Popen(command, stdout=log, stderr=log)
         # Of this child alone: getrusage knows only the largest of all children.
         _, status, usage = os.wait4(process.pid, 0)
         wall = perf_counter() - start
@@ -369,12 +369,12 @@ def run_cli(*args: object) -> Run:
 
 
 def stages_of(log: str, wall: float) -> dict[str, float]:
-    """Return how long each stage took, from the progress that `solve` reports."""
+    """Return how long each stage took, from the events of progress that `solve` prints."""
     began: list[tuple[str, float]] = []
     for line in log.splitlines():
-        match = re.match(r"\s*([0-9.]+) s  ([^,]+)", line)
-        if match and (not began or began[-1][0] != match[2]):
-            began.append((match[2], float(match[1])))
+        event = json.loads(line) if line.startswith('{"event":"progress"') else None
+        if event and (not began or began[-1][0] != event["stage"]):
+            began.append((event["stage"], event["elapsed_s"]))
     out: dict[str, float] = {}
     for (stage, at), (_, until) in pairwise([*began, ("", wall)]):
         name = stage if until != wall else f"{stage}, figures, start and end of the process"

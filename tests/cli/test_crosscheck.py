@@ -138,3 +138,16 @@ def test_saved_solutions_agree_with_themselves(folders: tuple[Path, Path]) -> No
     assert check.explanation == ()
     assert check.joint is not None
     assert check.joint.statistic == 0.0
+
+
+def test_figures_come_in_other_formats_and_an_earlier_one_is_replaced(
+    tmp_path: Path, run: Run, folders: tuple[Path, Path]
+) -> None:
+    out = tmp_path / "out"
+    code, _, err = run(*folders, "--figures", "svg", "--out", out)
+    assert code == 0, err
+    text = (out / "parameters.svg").read_text(encoding="utf-8")
+    assert text.startswith("<?xml")
+    assert (out / "parameters.png").exists()
+    assert run(*folders, "--no-figures", "--out", out, "--force")[0] == 0
+    assert {p.suffix for p in out.iterdir()} == {".json", ".csv"}

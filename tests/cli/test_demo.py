@@ -9,6 +9,7 @@ import pytest
 import yaml
 from builders import build_solution, build_trial
 from running import Run
+from typer.main import get_command
 
 from factorgraph_dvl.cli.app import app
 from factorgraph_dvl.io.trial_folder import save_trial
@@ -21,6 +22,18 @@ COMMANDS = [command.name or command.callback.__name__ for command in app.registe
 def test_every_help_has_an_example(command: str, run: Run) -> None:
     shown = run(command, "--help").out
     assert f"factorgraph-dvl {command}" in shown.partition("Examples:")[2]
+
+
+def test_every_command_that_draws_offers_other_formats() -> None:
+    commands = get_command(app).commands  # type: ignore[attr-defined]
+    options = {
+        name: {option for parameter in command.params for option in parameter.opts}
+        for name, command in commands.items()
+    }
+    drawing = {name for name, own in options.items() if "--no-figures" in own}
+    assert drawing >= {"solve", "kalman", "replay", "observability", "plan", "crosscheck"}
+    for name in (*drawing, "allan", "reproduce"):
+        assert "--figures" in options[name], name
 
 
 def test_the_demo_is_the_shipped_trial_and_opens_its_page(

@@ -165,7 +165,7 @@ def _verdict(c: Component) -> str:
 def _differences(motion: MotionDifference) -> Figure:
     """Draw A − B over time within ±3σ of what is shown."""
     figure = new_figure(12.0, 6.2)
-    axes = new_grid(figure, 3, 3, top=0.4).subplots(sharex=True, squeeze=False)
+    axes = new_grid(figure, 3, 3, top=0.5).subplots(sharex=True, squeeze=False)
     start, time_label = clock(motion.time)
     time = motion.time - start
     for i, name in enumerate(COMPONENTS):

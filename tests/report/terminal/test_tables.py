@@ -12,7 +12,12 @@ from rich.table import Table
 from factorgraph_dvl.analysis.error_statistics import calibration_errors
 from factorgraph_dvl.quality.survey import survey
 from factorgraph_dvl.report.terminal.error_budget import error_budget_table
-from factorgraph_dvl.report.terminal.tables import calibration_table, sensor_table, width_of
+from factorgraph_dvl.report.terminal.tables import (
+    calibration_table,
+    fitted,
+    sensor_table,
+    width_of,
+)
 from factorgraph_dvl.report.text import at_precision, fixed, split_unit, with_std
 from factorgraph_dvl.solution import Cause
 
@@ -48,6 +53,22 @@ def test_what_a_narrow_terminal_leaves_out() -> None:
     assert width_of(calibration_table(solution, width=60)) <= 60
     assert "prior std" in printed(calibration_table(solution, errors), 160)
     assert "prior std" not in printed(calibration_table(solution, errors, width=80), 80)
+
+
+def test_columns_are_left_out_until_a_table_fits() -> None:
+    table = Table(title="Title", caption="caption")
+    for header in ("name", "first", "second"):
+        table.add_column(header, no_wrap=True)
+    table.add_row("a", "1" * 20, "2" * 20, end_section=True)
+    table.add_row("b", "3", "4")
+    assert fitted(table, 80, ("first", "second")) is table
+    narrow = fitted(table, 40, ("second", "first"))
+    assert [column.header for column in narrow.columns] == ["name", "first"]
+    assert [list(column.cells) for column in narrow.columns] == [["a", "b"], ["1" * 20, "3"]]
+    assert [row.end_section for row in narrow.rows] == [True, False]
+    assert (narrow.title, narrow.caption) == ("Title", "caption")
+    # What is left may be too wide.
+    assert width_of(fitted(table, 5, ("second",))) > 5
 
 
 def test_records_with_large_clock_readings_are_not_cut() -> None:
