@@ -7,30 +7,9 @@ import sys
 from typing import Annotated, NoReturn
 
 import typer
-from rich.text import Text
 
-from factorgraph_dvl import __version__
-from factorgraph_dvl.cli import events
-from factorgraph_dvl.cli.allan import allan
-from factorgraph_dvl.cli.campaign import campaign
-from factorgraph_dvl.cli.console import stderr, warn
-from factorgraph_dvl.cli.correct import correct
-from factorgraph_dvl.cli.crosscheck import crosscheck
-from factorgraph_dvl.cli.deadreckon import deadreckon
-from factorgraph_dvl.cli.demo import demo
-from factorgraph_dvl.cli.export import export
-from factorgraph_dvl.cli.import_files import import_
-from factorgraph_dvl.cli.inspect import inspect
-from factorgraph_dvl.cli.instrument import instrument
-from factorgraph_dvl.cli.memory import naming_memory
-from factorgraph_dvl.cli.observability import observability
+from factorgraph_dvl.cli.commands import Commands
 from factorgraph_dvl.cli.options import claims
-from factorgraph_dvl.cli.plan import plan
-from factorgraph_dvl.cli.replay import replay
-from factorgraph_dvl.cli.report import report
-from factorgraph_dvl.cli.reproduce import reproduce
-from factorgraph_dvl.cli.simulate import simulate
-from factorgraph_dvl.cli.solve import kalman, solve
 from factorgraph_dvl.cli.streams import guard_streams, output_failure
 from factorgraph_dvl.errors import FactorgraphDvlError, printable
 
@@ -40,36 +19,13 @@ _INTERRUPTED = 130
 # Options that stand anywhere on the line.
 _EVERYWHERE = ("--debug", "--json")
 
-# A command's module imports heavy packages (GTSAM, SciPy, Matplotlib, Arrow) only when it runs,
-# so that --help answers at once.
 app = typer.Typer(
     name=_NAME,
+    cls=Commands,
     help="Calibrate a Doppler velocity log, jointly with the trajectory of its vehicle.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
 )
-for _command in (
-    demo,
-    simulate,
-    solve,
-    replay,
-    kalman,
-    inspect,
-    crosscheck,
-    observability,
-    plan,
-    deadreckon,
-    report,
-    export,
-    instrument,
-    correct,
-    allan,
-    reproduce,
-    campaign,
-):
-    app.command()(naming_memory(_command))
-# A name that Python keeps for itself.
-app.command("import")(naming_memory(import_))
 
 
 def run(args: list[str]) -> NoReturn:
@@ -78,14 +34,20 @@ def run(args: list[str]) -> NoReturn:
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     guard_streams()
-    events.switch("--json" in args)
+    if "--json" in args:
+        _run_with_events(args)
+    _run(args)
+
+
+def _run_with_events(args: list[str]) -> NoReturn:
+    from factorgraph_dvl.cli import events
+
+    events.switch(True)
     try:
         _run(args)
     except SystemExit as done:
-        if events.active():
-            events.emit(
-                events.End(done.code if isinstance(done.code, int) else int(bool(done.code)))
-            )
+        code = done.code if isinstance(done.code, int) else int(bool(done.code))
+        events.emit(events.End(code))
         raise
     finally:
         events.switch(False)
@@ -96,6 +58,8 @@ def _run(args: list[str]) -> NoReturn:
         with claims:
             app(args=[arg for arg in args if arg not in _EVERYWHERE], prog_name=_NAME)
     except FactorgraphDvlError as error:
+        from factorgraph_dvl.cli.console import warn
+
         for note in getattr(error, "__notes__", ()):
             warn(note)
         _fail(str(error), error.exit_code, args)
@@ -132,6 +96,11 @@ def _interrupted(error: BaseException | None) -> bool:
 
 
 def _fail(message: str, exit_code: int, args: list[str]) -> NoReturn:
+    from rich.text import Text
+
+    from factorgraph_dvl.cli import events
+    from factorgraph_dvl.cli.console import stderr
+
     if "--debug" in args:
         stderr().print_exception()
     if events.active():
@@ -143,6 +112,8 @@ def _fail(message: str, exit_code: int, args: list[str]) -> NoReturn:
 
 def _show_version(value: bool) -> None:
     if value:
+        from factorgraph_dvl import __version__
+
         typer.echo(f"{_NAME} {__version__}")
         raise typer.Exit
 

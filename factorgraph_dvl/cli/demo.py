@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import webbrowser
 from pathlib import Path
 from typing import Annotated
 
@@ -34,6 +33,7 @@ def demo(
     Examples:
       factorgraph-dvl demo
     """
+    import webbrowser
     from importlib.resources import as_file, files
 
     from factorgraph_dvl.io.solution_folder import REPORT_FILE

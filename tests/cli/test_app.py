@@ -15,6 +15,7 @@ from truth import CONFIGS
 
 import factorgraph_dvl.report.figures.solution
 import factorgraph_dvl.solvers.information_along_trial
+from factorgraph_dvl.cli.commands import COMMANDS, command
 from factorgraph_dvl.errors import SolveError
 from factorgraph_dvl.io.solution_folder import load_solution
 from factorgraph_dvl.io.trial_folder import load_trial
@@ -332,8 +333,14 @@ def test_version_and_help(run: Run) -> None:
     assert result.out.startswith("factorgraph-dvl 0")
     result = run("--help")
     assert result.code == 0
-    for command in ("simulate", "solve", "inspect"):
-        assert command in result.out
+    for name in ("simulate", "solve", "inspect"):
+        assert name in result.out
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_the_list_of_commands_has_their_first_lines(name: str) -> None:
+    listed = COMMANDS[name][1]
+    assert (command(name).help or "").splitlines()[0] == listed
 
 
 def test_help_loads_nothing_heavy() -> None:
@@ -342,7 +349,8 @@ def test_help_loads_nothing_heavy() -> None:
         "from factorgraph_dvl.cli import main\n"
         "try:\n    main(['--help'])\n"
         "except SystemExit:\n    pass\n"
-        "print([m for m in ('gtsam', 'scipy', 'numpy', 'matplotlib', 'pyarrow') "
+        "print([m for m in ('gtsam', 'scipy', 'numpy', 'matplotlib', 'pyarrow', 'msgspec', "
+        "'rich.progress', 'factorgraph_dvl.cli.solve') "
         "if m in sys.modules], file=sys.stderr)\n"
     )
     done = subprocess.run(

@@ -9,27 +9,21 @@ import pytest
 import yaml
 from builders import build_solution, build_trial
 from running import Run
-from typer.main import get_command
 
-from factorgraph_dvl.cli.app import app
+from factorgraph_dvl.cli.commands import COMMANDS, command
 from factorgraph_dvl.io.trial_folder import save_trial
 
 ROOT = Path(__file__).parent.parent.parent
-COMMANDS = [command.name or command.callback.__name__ for command in app.registered_commands]
 
 
-@pytest.mark.parametrize("command", COMMANDS)
-def test_every_help_has_an_example(command: str, run: Run) -> None:
-    shown = run(command, "--help").out
-    assert f"factorgraph-dvl {command}" in shown.partition("Examples:")[2]
+@pytest.mark.parametrize("name", COMMANDS)
+def test_every_help_has_an_example(name: str, run: Run) -> None:
+    shown = run(name, "--help").out
+    assert f"factorgraph-dvl {name}" in shown.partition("Examples:")[2]
 
 
 def test_every_command_that_draws_offers_other_formats() -> None:
-    commands = get_command(app).commands  # type: ignore[attr-defined]
-    options = {
-        name: {option for parameter in command.params for option in parameter.opts}
-        for name, command in commands.items()
-    }
+    options = {name: {option for p in command(name).params for option in p.opts} for name in COMMANDS}
     drawing = {name for name, own in options.items() if "--no-figures" in own}
     assert drawing >= {"solve", "kalman", "replay", "observability", "plan", "crosscheck"}
     for name in (*drawing, "allan", "reproduce"):

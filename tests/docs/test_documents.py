@@ -185,12 +185,9 @@ def arguments(command: str, line: str, stock: Path) -> list[str]:
 
 def options(command: str) -> set[str]:
     """Return the options that a command has."""
-    from typer.main import get_command
+    from factorgraph_dvl.cli.commands import command as command_named
 
-    from factorgraph_dvl.cli.app import app
-
-    found = get_command(app).commands[command]
-    return {option for parameter in found.params for option in parameter.opts}
+    return {option for p in command_named(command).params for option in p.opts}
 
 
 def run_shell(block: Block, stock: Path, run: Run) -> None:  # noqa: F811

@@ -16,6 +16,8 @@ from prose import faults, sentences, split
 from typer.main import get_command
 
 from factorgraph_dvl.cli.app import app
+from factorgraph_dvl.cli.commands import COMMANDS
+from factorgraph_dvl.cli.commands import command as command_named
 from factorgraph_dvl.sensors.finding import Code
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -42,7 +44,8 @@ def help_texts() -> Iterator[tuple[str, str]]:
     """Yield the name and the text of every help of the command line."""
     group = get_command(app)
     yield "factorgraph-dvl", group.help or ""
-    for name, command in sorted(group.commands.items()):
+    for name in sorted(COMMANDS):
+        command = command_named(name)
         yield name, command.help or ""
         for parameter in command.params:
             yield f"{name} {parameter.name}", getattr(parameter, "help", None) or ""

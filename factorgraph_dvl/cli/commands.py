@@ -1,0 +1,119 @@
+"""The commands by name: the module of each is imported where the command is used."""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import Any
+
+import typer
+from typer.core import TyperCommand, TyperGroup
+
+from factorgraph_dvl.cli.memory import naming_memory
+
+# Function of each command within this subpackage, and what a list of commands says of it.
+COMMANDS = {
+    "demo": (
+        "demo.demo",
+        "Simulate a trial, calibrate its DVL, and open the page of the result.",
+    ),
+    "simulate": ("simulate.simulate", "Simulate a trial with known truth."),
+    "solve": (
+        "solve.solve",
+        "Estimate calibration and trajectory from all data of a trial.",
+    ),
+    "replay": (
+        "replay.replay",
+        "Feed a trial in the order of time, and show what was known when.",
+    ),
+    "kalman": (
+        "solve.kalman",
+        "Calibrate or navigate with a Kalman filter, for comparison with `solve`.",
+    ),
+    "inspect": (
+        "inspect.inspect",
+        "Show the records of a trial, and check their units and signs.",
+    ),
+    "crosscheck": (
+        "crosscheck.crosscheck",
+        "Compare two results of one trial with each other and with the truth.",
+    ),
+    "observability": (
+        "observability.observability",
+        "Show which parameters the data determine, and which motion contributes to them.",
+    ),
+    "plan": (
+        "plan.plan",
+        "Predict the σ of a planned trial, and propose manoeuvres if requirements are missed.",
+    ),
+    "deadreckon": (
+        "deadreckon.deadreckon",
+        "Integrate the DVL's velocity before and after calibration, and compare the tracks.",
+    ),
+    "report": (
+        "report.report",
+        "Write the page of a result, or a page that compares several results.",
+    ),
+    "export": (
+        "export.export",
+        "Export the trajectory of a solution, or the records of a trial.",
+    ),
+    "instrument": (
+        "instrument.instrument",
+        "Print a calibration in the terms of instruments: angles, %, ppm, TRDI's EA and EI.",
+    ),
+    "correct": (
+        "correct.correct",
+        "Correct the record of a DVL or of its beams with a calibration, and write its matrix.",
+    ),
+    "allan": (
+        "allan.allan",
+        "Find the noise of an IMU from a static record, by its Allan deviation.",
+    ),
+    "reproduce": (
+        "reproduce.reproduce",
+        "Measure what a publication states: each equation, table, figure and claim.",
+    ),
+    "campaign": (
+        "campaign.campaign",
+        "Solve many trials, and calibrate all of them jointly. Existing results are kept.",
+    ),
+    "import": (
+        "import_files.import_",
+        "Import raw files of instruments: velocity logs, GNSS, attitude, IMU.",
+    ),
+}
+
+
+def command(name: str) -> TyperCommand:
+    """Return a command with its arguments and options.
+
+    Parameters
+    ----------
+    name : str
+        As on the command line.
+    """
+    module, function = COMMANDS[name][0].split(".")
+    alone = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
+    found = getattr(import_module(f"{__package__}.{module}"), function)
+    alone.command(name)(naming_memory(found))
+    out = typer.main.get_command(alone)
+    assert isinstance(out, TyperCommand)
+    return out
+
+
+class _Listed(TyperCommand):
+    """A command of which only name and summary are known until it is used."""
+
+    def make_context(self, *args: Any, **options: Any) -> Any:
+        """Return the context of the command itself."""
+        assert self.name is not None
+        return command(self.name).make_context(*args, **options)
+
+
+class Commands(TyperGroup):
+    """All commands: their list imports none of their modules."""
+
+    def __init__(self, **attributes: Any) -> None:
+        super().__init__(**attributes)
+        for name, (_, summary) in COMMANDS.items():
+            self.add_command(_Listed(name, help=summary))
