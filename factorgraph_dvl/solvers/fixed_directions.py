@@ -11,7 +11,7 @@ import numpy as np
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph.problem import Problem
 from factorgraph_dvl.sensors.finding import Finding
-from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, tree_at
+from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, factorized
 from factorgraph_dvl.solvers.posterior import Posterior, changes_with, considered, posterior
 from factorgraph_dvl.statistics.undetermined_directions import (
     at_prior_along,
@@ -105,7 +105,8 @@ def undetermined_there(solved: SolvedProblem, free: Problem) -> bool:
         The same problem without.
     """
     evaluation = solved.minimum.evaluation
-    covariances = posterior(free, replace(solved.minimum, tree=tree_at(free, evaluation)))
+    square_root, _ = factorized(free, evaluation)
+    covariances = posterior(free, replace(solved.minimum, square_root=square_root))
     information = data_information(free, evaluation, covariances.parameters, covariances.given)
     directions = information.undetermined_directions()
     if directions.shape != solved.fixed.shape:

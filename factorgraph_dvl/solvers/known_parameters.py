@@ -15,7 +15,7 @@ from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.sensors.imu import ERRORS
 from factorgraph_dvl.sensors.parameters import UNITS, Parameter
 from factorgraph_dvl.solvers.change_along_trial import CHANGED, component_changes
-from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, tree_at
+from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, factorized
 from factorgraph_dvl.statistics.constancy import by_interval
 from factorgraph_dvl.statistics.robust_weights import robust_scale
 from factorgraph_dvl.statistics.rows import rows_with_times
@@ -92,8 +92,7 @@ def explanation(problem: Problem, minimum: Minimum) -> Explanation | None:
     if not significant:
         return None
     same, at = _scattered(problem, evaluation, problem.all_parameters)
-    there = SquareRootInformation(tree_at(same, at), at.values.dims())
-    changes = component_changes(same, at, there)
+    changes = component_changes(same, at, factorized(same, at)[0])
     most = max((each.change.chi2 for each in changes), default=0.0)
     count = sum(int(np.count_nonzero(w)) for w in problem.weights)
     significant.sort(key=lambda each: -each[1].evidence(count))
@@ -146,9 +145,8 @@ def _tests_of_known(
     if not known:
         return {}
     test, at, columns = _freed(problem, evaluation, known)
-    tree = tree_at(test, at)
-    information = SquareRootInformation(tree, at.values.dims())
-    found = scores(tree, information, columns)
+    information, delta = factorized(test, at)
+    found = scores(delta, information, columns)
     tests = {p.name: found.test([p.name]) for p in known}
     if any(t.log10_p < _LOG10_P for t in tests.values()):
         scatter = _scatter(test, at, information, columns, found)

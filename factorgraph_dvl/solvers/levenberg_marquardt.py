@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 
 import gtsam
 import numpy as np
@@ -43,9 +42,9 @@ class Minimum:
     ----------
     evaluation : Evaluation
         At the last values.
-    tree : gtsam.GaussianBayesTree or None
-        Bayes tree from QR there, up to the last step, which was small if `converged`; None if no
-        proof was asked for, or another problem follows.
+    square_root : SquareRootInformation or None
+        From QR there, up to the last step, which was small if `converged`; None if no proof was
+        asked for, or another problem follows.
     converged : bool
         Whether the linear model promises no more; False where it stopped early because clocks
         have moved measurements, so that another problem follows.
@@ -54,15 +53,15 @@ class Minimum:
     """
 
     evaluation: Evaluation
-    tree: gtsam.GaussianBayesTree | None
+    square_root: SquareRootInformation | None
     converged: bool
     iterations: int
 
-    @cached_property
+    @property
     def information(self) -> SquareRootInformation:
         """Square-root information there, of a minimum that was proven."""
-        assert self.tree is not None
-        return SquareRootInformation(self.tree, self.evaluation.values.dims())
+        assert self.square_root is not None
+        return self.square_root
 
 
 def minimise(
@@ -154,7 +153,7 @@ def minimise(
             if progress:
                 progress(stage, iteration, evaluation.cost)
             if small and damping == 0.0 and (tree is not None or not proven):
-                return Minimum(evaluation, tree, True, iteration)
+                return Minimum(evaluation, _square_root(evaluation, tree), True, iteration)
             if small or gain > _GOOD_GAIN:
                 damping = damping / 10.0 if damping > _FIRST_DAMPING else 0.0
             elif gain < _POOR_GAIN:
@@ -172,13 +171,24 @@ def minimise(
             if damping > _MAX_DAMPING:
                 break
         tree = None
-    return Minimum(evaluation, eliminate(gaussian, ordering), False, iteration)
+    tree = eliminate(gaussian, ordering)
+    return Minimum(evaluation, _square_root(evaluation, tree), False, iteration)
 
 
-def tree_at(problem: Problem, evaluation: Evaluation) -> gtsam.GaussianBayesTree:
-    """Return the Bayes tree from QR of a problem that is linearised at some values."""
+def factorized(
+    problem: Problem, evaluation: Evaluation
+) -> tuple[SquareRootInformation, gtsam.VectorValues]:
+    """Return the square-root information from QR at some values, and the step to the minimum."""
     gaussian = problem.linearize(evaluation)
-    return eliminate(gaussian, problem.ordering(gaussian))
+    tree = eliminate(gaussian, problem.ordering(gaussian))
+    return SquareRootInformation(tree, evaluation.values.dims()), tree.optimize()
+
+
+def _square_root(
+    evaluation: Evaluation, tree: gtsam.GaussianBayesTree | None
+) -> SquareRootInformation | None:
+    """Return the square-root information of a tree: GTSAM's keeps all rows that went in."""
+    return None if tree is None else SquareRootInformation(tree, evaluation.values.dims())
 
 
 def quick_step(

@@ -23,7 +23,7 @@ from factorgraph_dvl.solvers.information_along_trial import (
     as_history,
     run_filter,
 )
-from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, tree_at
+from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, factorized
 from factorgraph_dvl.solvers.state_times import STATE_INTERVAL, dense_epochs
 from factorgraph_dvl.solvers.summary import summarise
 from factorgraph_dvl.statistics.information_history import InformationHistory
@@ -123,4 +123,4 @@ def _weighed(
 
 
 def _minimum(problem: Problem, evaluation: Evaluation) -> Minimum:
-    return Minimum(evaluation, tree_at(problem, evaluation), converged=True, iterations=0)
+    return Minimum(evaluation, factorized(problem, evaluation)[0], True, 0)

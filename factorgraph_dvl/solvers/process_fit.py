@@ -12,7 +12,7 @@ import numpy as np
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph.problem import Evaluation, Problem
 from factorgraph_dvl.graph.processes import Process
-from factorgraph_dvl.solvers.levenberg_marquardt import tree_at
+from factorgraph_dvl.solvers.levenberg_marquardt import factorized
 from factorgraph_dvl.statistics.square_root_information import SquareRootInformation
 
 # Steps at most, and the change of a logarithm from which on one counts. Chosen: a tenth of what
@@ -50,9 +50,7 @@ def refitted(problem: Problem, evaluation: Evaluation) -> tuple[Process, ...]:
     last: list[Array | None] = [None] * len(before)
     for _ in range(_STEPS):
         at = problem.evaluate(problem.values(evaluation.states, parameters))
-        tree = tree_at(problem, at)
-        information = SquareRootInformation(tree, at.values.dims())
-        delta = tree.optimize()
+        information, delta = factorized(problem, at)
         found = list(problem.processes)
         moved = 0.0
         for i, process in enumerate(problem.processes):

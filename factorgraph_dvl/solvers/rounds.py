@@ -31,7 +31,7 @@ from factorgraph_dvl.solvers.known_parameters import (
     explanation,
     explanation_findings,
 )
-from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, minimise, tree_at
+from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, factorized, minimise
 from factorgraph_dvl.solvers.outliers import robust_weights
 from factorgraph_dvl.solvers.preparation import Preparation, mounted_start
 from factorgraph_dvl.solvers.process_fit import refitted
@@ -248,8 +248,8 @@ def settle(
     if changing:
         text = f"after {_ROUNDS} rounds {', '.join(changing)} still changed: do not use the result"
         findings += (Finding(Code.NOT_CONVERGED, text, severity="error"),)
-    if minimum.tree is None:
-        minimum = replace(minimum, tree=tree_at(problem, minimum.evaluation))
+    if minimum.square_root is None:
+        minimum = replace(minimum, square_root=factorized(problem, minimum.evaluation)[0])
     converged = minimum.converged and not changing
     minimum = replace(minimum, converged=converged, iterations=iterations)
     return SettledMinimum(problem, minimum, not changing, findings)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import fields, replace
+
 import numpy as np
 
 from factorgraph_dvl.geometry.earth import LocalFrame
@@ -22,6 +24,8 @@ from factorgraph_dvl.solution import Trajectory
 TRAJECTORY_RATE = 10.0
 # What rounding may add to a time, in periods of that rate. Chosen: far above double precision.
 EPOCH_ROUNDING = 1e-6
+# Times whose motion is found at once. Chosen: some ten megabytes.
+_CHUNK = 8192
 
 
 def trajectory_between(
@@ -50,31 +54,38 @@ def trajectory_between(
     time : ndarray, shape (M,), s
         When the motion is wanted.
     """
-    motion, fraction, node = _smoothed(seg, states, gravity_n, frame.earth_rate, time)
-    lat, lon, height = frame.geodetic(motion.p_n)
-    lRn = frame.level_from_tangent(lat, lon)
-    nRb = lRn @ motion.nRb
-    rph = rph_from_rotation(nRb, body_axes)
-
-    n = seg.node_time.size
+    closing = _closing(seg, states, gravity_n, frame.earth_rate)
     # GTSAM's tangent space is in body axes, which differ from node to node; n does not.
-    P_n = P.reshape(n, 3, 3, 3, 3)
-    P_n = np.einsum("kia,kxayb,kjb->kxiyj", states.nRb, P_n, states.nRb)
-    at = P_n[node] + fraction[:, None, None, None, None] * (P_n[node + 1] - P_n[node])
+    blocks = np.stack([P[:, i : i + 3, i : i + 3] for i in (0, 3, 6)], axis=1)
+    R = states.nRb[:, None]
+    P_n = R @ blocks @ R.transpose(0, 1, 3, 2)
 
-    def level(i: int) -> Array:
-        return lRn @ at[:, i, :, i, :] @ lRn.transpose(0, 2, 1)
+    def part(time: Array) -> Trajectory:
+        motion, fraction, node = _smoothed(seg, states, closing, gravity_n, frame.earth_rate, time)
+        lat, lon, height = frame.geodetic(motion.p_n)
+        lRn = frame.level_from_tangent(lat, lon)
+        nRb = lRn @ motion.nRb
+        rph = rph_from_rotation(nRb, body_axes)
+        at = P_n[node] + fraction[:, None, None, None] * (P_n[node + 1] - P_n[node])
+        of_attitude, of_position, of_velocity = (
+            lRn @ at[:, i] @ lRn.transpose(0, 2, 1) for i in range(3)
+        )
+        to_rph = rph_jacobian(rph, body_axes) @ nRb.transpose(0, 2, 1)
+        return Trajectory(
+            time=time,
+            geodetic=np.stack([lat, lon, height], axis=1),
+            velocity=rotate(lRn, motion.v_n),
+            rph=rph,
+            position_cov=of_position,
+            velocity_cov=of_velocity,
+            rph_cov=to_rph @ of_attitude @ to_rph.transpose(0, 2, 1),
+        )
 
-    to_rph = rph_jacobian(rph, body_axes) @ nRb.transpose(0, 2, 1)
-    return Trajectory(
-        time=time,
-        geodetic=np.stack([lat, lon, height], axis=1),
-        velocity=rotate(lRn, motion.v_n),
-        rph=rph,
-        position_cov=level(1),
-        velocity_cov=level(2),
-        rph_cov=to_rph @ level(0) @ to_rph.transpose(0, 2, 1),
-    )
+    parts = [part(time[i : i + _CHUNK]) for i in range(0, max(time.size, 1), _CHUNK)]
+    if len(parts) == 1:
+        return parts[0]
+    columns = {f.name: [getattr(each, f.name) for each in parts] for f in fields(Trajectory)}
+    return Trajectory(**{name: np.concatenate(each) for name, each in columns.items()})
 
 
 def epochs_between(start: float, end: float, rate_hz: float) -> Array:
@@ -83,28 +94,42 @@ def epochs_between(start: float, end: float, rate_hz: float) -> Array:
     return np.asarray(np.arange(first + 1.0, last + 1.0) / rate_hz + 0.0)
 
 
+def _closing(
+    seg: Segments, states: States, gravity_n: Array, earth_rate_n: Array
+) -> tuple[Array, Array, Array]:
+    """Return what the motion is off at the ends of segments: rotation vector, position, velocity.
+
+    It is the noise of the IMU over the segment.
+    """
+    ends = motion_at(segment_ends(seg, earth_rate_n), states, gravity_n, earth_rate_n)
+    after = seg.origin + 1
+    return (
+        log_so3(states.nRb[after] @ ends.nRb.transpose(0, 2, 1)),
+        states.p_n[after] - ends.p_n,
+        states.v_n[after] - ends.v_n,
+    )
+
+
 def _smoothed(
-    seg: Segments, states: States, gravity_n: Array, earth_rate_n: Array, time: Array
+    seg: Segments,
+    states: States,
+    closing: tuple[Array, Array, Array],
+    gravity_n: Array,
+    earth_rate_n: Array,
+    time: Array,
 ) -> tuple[Motion, Array, np.ndarray]:
     """Return the motion between the nodes, carried forward and closed onto the node after.
 
-    What the IMU is off at the next node is its noise over the segment; it is spread in
-    proportion to time.
+    What it is off there is spread in proportion to time.
     """
     at = attach(seg, time, earth_rate_n)
     motion = motion_at(at, states, gravity_n, earth_rate_n)
-    ends = motion_at(segment_ends(seg, earth_rate_n), states, gravity_n, earth_rate_n)
-    after = seg.origin + 1
     fraction = np.clip(at.tau / seg.duration[at.segment], 0.0, 1.0)
-    part = fraction[:, None]
-    closing = log_so3(states.nRb[after] @ ends.nRb.transpose(0, 2, 1))
-    closed = Motion(
-        nRb=exp_so3(part * closing[at.segment]) @ motion.nRb,
-        p_n=motion.p_n + part * (states.p_n[after] - ends.p_n)[at.segment],
-        v_n=motion.v_n + part * (states.v_n[after] - ends.v_n)[at.segment],
-        omega_eb_b=motion.omega_eb_b,
-        a_n=motion.a_n,
-        alpha_b=motion.alpha_b,
-        omega_sigma=motion.omega_sigma,
+    turn, shift, change = (fraction[:, None] * each[at.segment] for each in closing)
+    closed = replace(
+        motion,
+        nRb=exp_so3(turn) @ motion.nRb,
+        p_n=motion.p_n + shift,
+        v_n=motion.v_n + change,
     )
     return closed, fraction, at.node

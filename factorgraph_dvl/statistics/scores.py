@@ -88,7 +88,7 @@ class Scores:
 
 
 def scores(
-    tree: gtsam.GaussianBayesTree,
+    delta: gtsam.VectorValues,
     information: SquareRootInformation,
     candidates: Mapping[str, tuple[int, Array]],
 ) -> Scores:
@@ -96,7 +96,7 @@ def scores(
 
     The graph holds them as variables with a wide prior, linearised where the fit without them
     ended, their priors' means being the values there. With P their covariance, the step delta
-    that the tree promises, and Lambda the information of the priors,
+    to the minimum, and Lambda the information of the priors,
 
         I = P⁻¹ - Lambda,    S = P⁻¹ delta,    chi² = Sᵀ I⁻¹ S
 
@@ -105,14 +105,13 @@ def scores(
 
     Parameters
     ----------
-    tree : gtsam.GaussianBayesTree
-        From QR.
+    delta : gtsam.VectorValues
+        Step to the minimum of the graph.
     information : SquareRootInformation
-        Of that tree.
+        Of the graph.
     candidates : mapping of str to tuple of (int, ndarray)
         By name, key and standard deviations (n,) of the wide prior.
     """
-    delta = tree.optimize()
     sizes = [sigma.size for _, sigma in candidates.values()]
     edges = np.cumsum([0, *sizes])
     P = information.covariance_of(

@@ -170,8 +170,13 @@ class SquareRootInformation:
 
     def _joint(self) -> Iterator[tuple[_Clique, dict[int, slice], Array]]:
         """Yield each clique, the places of its variables and their joint covariance."""
-        joint: list[tuple[dict[int, slice], Array]] = []
+        # Of cliques whose children are still to come.
+        joint: dict[int, tuple[dict[int, slice], Array]] = {}
+        children = [0] * len(self._cliques)
         for clique in self._cliques:
+            if clique.parent >= 0:
+                children[clique.parent] += 1
+        for index, clique in enumerate(self._cliques):
             f = clique.R.shape[0]
             identity = np.eye(f)
             solved = _solve(clique.R, np.hstack([identity, clique.T]), transposed=False)
@@ -192,7 +197,12 @@ class SquareRootInformation:
             for key in (*clique.frontals, *clique.separators):
                 place[key] = slice(row, row + self._sizes[key])
                 row += self._sizes[key]
-            joint.append((place, P))
+            if children[index]:
+                joint[index] = place, P
+            if clique.parent >= 0:
+                children[clique.parent] -= 1
+                if not children[clique.parent]:
+                    del joint[clique.parent]
             yield clique, place, P
 
 

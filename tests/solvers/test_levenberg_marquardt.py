@@ -49,7 +49,7 @@ def test_it_stops_early_where_another_problem_follows(monkeypatch):
     assert minimise(problem, values, stage="test").converged
     minimum = minimise(problem, values, stage="test", binding=True)
     assert not minimum.converged
-    assert minimum.tree is None
+    assert minimum.square_root is None
     assert minimum.iterations < whole.iterations
     # What is left is less than 0.14 sigma in all.
     assert 0.0 <= minimum.evaluation.cost - whole.evaluation.cost < 1e-2

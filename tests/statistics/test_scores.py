@@ -39,7 +39,7 @@ def line():
         ordering.push_back(key)
     tree = graph.eliminateMultifrontal(ordering, gtsam.EliminateQR)
     information = SquareRootInformation(tree, {1: 1, 2: 1, 3: 1, 4: 2})
-    return columns, data, scores(tree, information, WIDE)
+    return columns, data, scores(tree.optimize(), information, WIDE)
 
 
 def filled(jacobians, root):
