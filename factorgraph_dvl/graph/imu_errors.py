@@ -21,11 +21,11 @@ from factorgraph_dvl.imu.sensitivity import (
     Sensitivity,
     by_errors,
     corrected,
+    elements,
     moved,
     predicted,
     sensitivities,
 )
-from factorgraph_dvl.sensors.imu import ERRORS
 from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.sensors.protocol import Linearization
 
@@ -78,7 +78,7 @@ class ImuErrors:
         self._keys = list(keys)
         self._sizes = [p.mean.size for p in parameters]
         self._segments = chain.segments
-        self._elements = [e for p in parameters for e in ERRORS[p.name]]
+        self._elements = elements(parameters)
         unique = {id(at): at for at in attachments}
         whole, found = sensitivities(chain.segments, self._elements, list(unique.values()))
         self._whole = whole
@@ -94,14 +94,14 @@ class ImuErrors:
         """Return an attachment without the errors; `bound` is where it was bound."""
         by = self._by[id(bound)]
         if at is not bound:
-            by = moved(self._segments, at, bound, by, self._whole, self._elements)
-        return corrected(at, by, errors)
+            by = moved(self._segments, at, bound, by, self._whole)
+        return corrected(at, by, self._elements, errors)
 
     def columns(
         self, lin: Linearization, transition: Transition, bound: Attachment
     ) -> dict[str, Array]:
         """Return derivatives of measurements with respect to the errors, (M, d, n_i) by name."""
-        every = by_errors(lin, transition, self._by[id(bound)])
+        every = by_errors(lin, transition, self._by[id(bound)], self._elements)
         parts = np.split(every, np.cumsum(self._sizes)[:-1], axis=2)
         return dict(zip(self.names, parts, strict=True))
 

@@ -9,7 +9,6 @@ slow and makes GTSAM's optimisers copy all values.
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -87,18 +86,29 @@ class _Bound:
     correlated: int | None = None
 
 
+@dataclass(frozen=True)
+class _RowsByFactor:
+    """Rows of an observation, sorted by `order` if they are not, and their places in factors.
+
+    Each place is the index of a factor, rows there, and rows of the observation.
+    """
+
+    order: IntArray | None
+    places: list[tuple[int, slice, slice]]
+
+
 @dataclass
 class _Block:
     """Observations with the same variables: one factor per set of nodes for all of them.
 
+    `rows` has, by observation, which of its rows go to which of the factors, and where.
     `matrices` and `vectors` are views into `factors` and live no longer than they do.
     """
 
     bound: list[_Bound]
     parameters: tuple[Parameter, ...]
     correlated: int | None = None
-    order: IntArray | None = None
-    rows: list[slice] = field(default_factory=list)
+    rows: list[_RowsByFactor] = field(default_factory=list)
     factors: list[gtsam.JacobianFactor] = field(default_factory=list)
     matrices: list[Array] = field(default_factory=list)
     vectors: list[Array] = field(default_factory=list)
@@ -487,12 +497,14 @@ class Problem:
         gaussian = self.native(evaluation)
         transitions = self._transitions(evaluation)
         for block in self._blocks:
-            matrix, vector = self._fill(block, transitions, evaluation)
-            for target, source, rows in zip(
-                block.matrices, block.vectors, block.rows, strict=True
-            ):
-                target[...] = matrix[rows]
-                source[...] = vector[rows]
+            for bound, rows in zip(block.bound, block.rows, strict=True):
+                matrix, vector = self._jacobian(bound, block.parameters, transitions, evaluation)
+                matrix, vector = matrix.reshape(-1, matrix.shape[2]), -vector.ravel()
+                if rows.order is not None:
+                    matrix, vector = matrix[rows.order], vector[rows.order]
+                for factor_index, there, here in rows.places:
+                    block.matrices[factor_index][there] = matrix[here]
+                    block.vectors[factor_index][there] = vector[here]
             for factor in block.factors:
                 gaussian.push_back(factor)
         return gaussian
@@ -628,14 +640,26 @@ class Problem:
 
     def _lay_out(self, block: _Block) -> None:
         """Make a block's factors for the nodes that its measurements depend on."""
-        nodes = np.concatenate(
-            [self._nodes_of(b).repeat(len(b.observation.components), axis=0) for b in block.bound]
-        )
-        order = np.lexsort(nodes.T[::-1])
-        block.order = None if np.all(np.diff(order) == 1) else order
-        used, counts = np.unique(nodes[order], axis=0, return_counts=True)
-        edges = np.concatenate([[0], np.cumsum(counts)])
-        block.rows = [slice(a, b) for a, b in itertools.pairwise(edges)]
+        nodes = [
+            self._nodes_of(b).repeat(len(b.observation.components), axis=0) for b in block.bound
+        ]
+        used, place = np.unique(np.concatenate(nodes), axis=0, return_inverse=True)
+        counts = np.zeros(len(used), dtype=int)
+        edges = np.cumsum([len(each) for each in nodes])[:-1]
+        block.rows = []
+        for own in np.split(place.ravel(), edges):
+            order = np.argsort(own, kind="stable")
+            present, first, count = np.unique(own[order], return_index=True, return_counts=True)
+            there = counts[present]
+            places = zip(
+                present.tolist(),
+                map(slice, there.tolist(), (there + count).tolist()),
+                map(slice, first.tolist(), (first + count).tolist()),
+                strict=True,
+            )
+            in_order = np.all(np.diff(order) == 1)
+            block.rows.append(_RowsByFactor(None if in_order else order, list(places)))
+            counts[present] += count
         sizes = self._sizes(block)
         block.matrices, block.vectors, block.factors = [], [], []
         variables = self._keys_at(block, used).tolist()
@@ -669,21 +693,6 @@ class Problem:
         if block.correlated is not None:
             out += [self.processes[block.correlated].sigma.size] * 2
         return out + [p.mean.size for p in block.parameters]
-
-    def _fill(
-        self, block: _Block, transitions: dict[int, Transition], evaluation: Evaluation
-    ) -> tuple[Array, Array]:
-        """Return the whitened Jacobian and right-hand side of a block, rows by node."""
-        parts, rhs = [], []
-        for bound in block.bound:
-            full, residual = self._jacobian(bound, block.parameters, transitions, evaluation)
-            parts.append(full.reshape(-1, full.shape[2]))
-            rhs.append(-residual.ravel())
-        matrix = np.concatenate(parts) if len(parts) > 1 else parts[0]
-        vector = np.concatenate(rhs)
-        if block.order is None:
-            return matrix, vector
-        return matrix[block.order], vector[block.order]
 
     def _transitions(self, evaluation: Evaluation) -> dict[int, Transition]:
         """Return the transitions from the nodes to the times of each motion, by its identity."""

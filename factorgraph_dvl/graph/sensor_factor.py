@@ -27,7 +27,7 @@ from factorgraph_dvl.imu.propagation import (
     extrapolated,
     motion_at,
 )
-from factorgraph_dvl.imu.sensitivity import Sensitivity, by_errors, corrected
+from factorgraph_dvl.imu.sensitivity import Sensitivity, by_errors, corrected, elements
 from factorgraph_dvl.sensors.imu import ERRORS
 from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.sensors.protocol import (
@@ -202,8 +202,9 @@ class NodeMeasurements:
         """Return the attachment without the errors of the IMU."""
         if self.sensitivity is None:
             return self.attachment
-        errors = np.concatenate([values[p.name] for p in self.parameters if p.name in ERRORS])
-        return corrected(self.attachment, self.sensitivity, errors)
+        errors = [p for p in self.parameters if p.name in ERRORS]
+        sizes = np.concatenate([values[p.name] for p in errors])
+        return corrected(self.attachment, self.sensitivity, elements(errors), sizes)
 
     def attachment_of(self, rows: Rows) -> Attachment:
         """Return the attachment of measurements of one kind."""
@@ -257,7 +258,7 @@ class NodeMeasurements:
         if self.sensitivity is None:
             return {}
         errors = [p for p in self.parameters if p.name in ERRORS]
-        every = by_errors(lin, transition, sliced(self.sensitivity, at))
+        every = by_errors(lin, transition, sliced(self.sensitivity, at), elements(errors))
         parts = np.split(every, np.cumsum([p.mean.size for p in errors])[:-1], axis=2)
         return {p.name: part for p, part in zip(errors, parts, strict=True)}
 

@@ -19,7 +19,8 @@ from factorgraph_dvl.geometry.rotations import exp_so3, log_so3
 from factorgraph_dvl.geometry.vectors import Array, IntArray, rotate, skew
 from factorgraph_dvl.imu.preintegration import Segments, Strides
 from factorgraph_dvl.imu.propagation import Attachment, Transition, attitude_jacobian
-from factorgraph_dvl.sensors.imu import ImuError
+from factorgraph_dvl.sensors.imu import ERRORS, ImuError
+from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.sensors.protocol import Linearization
 
 # Shortest step, s, that has a mean rate. Chosen: far below the interval of any IMU.
@@ -35,15 +36,20 @@ class Sensitivity:
     theta, v, p : ndarray, shape (M, 3, n)
         Of rotation, velocity and position increments: -Theta, V, P, in the axes at the
         segment's start.
-    rate, force : ndarray, shape (M, 3, n)
-        E and A at the times; at the ends of segments zero.
+    gyro, force : ndarray, shape (M, 3)
+        Rate and force at the times, of which E and A consist; at the ends of segments zero.
     """
 
     theta: Array
     v: Array
     p: Array
-    rate: Array
+    gyro: Array
     force: Array
+
+
+def elements(parameters: Sequence[Parameter]) -> list[ImuError]:
+    """Return the errors that parameters of an IMU have as components, in their order."""
+    return [error for p in parameters for error in ERRORS[p.name]]
 
 
 def unit_errors(rate: Array, force: Array, errors: Sequence[ImuError]) -> tuple[Array, Array]:
@@ -52,6 +58,17 @@ def unit_errors(rate: Array, force: Array, errors: Sequence[ImuError]) -> tuple[
     by = {"rate": rate, "force": force}
     for column, error in enumerate(errors):
         added[error.of][:, error.row, column] = by[error.by][:, error.column]
+    return added["rate"], added["force"]
+
+
+def added_by(
+    rate: Array, force: Array, errors: Sequence[ImuError], sizes: Array
+) -> tuple[Array, Array]:
+    """Return what errors of given sizes (n,) add to rates (M, 3) and forces (M, 3)."""
+    added = {"rate": np.zeros_like(rate), "force": np.zeros_like(force)}
+    by = {"rate": rate, "force": force}
+    for error, size in zip(errors, sizes.tolist(), strict=True):
+        added[error.of][:, error.row] += size * by[error.by][:, error.column]
     return added["rate"], added["force"]
 
 
@@ -91,7 +108,8 @@ def sensitivities(
         means = _means(strides.phi[i], strides.dv[i], strides.duration[i])
         step = _step(strides.dR[i], means, errors, (theta[live], v[live], p[live]))
         theta[live], v[live], p[live] = step
-    ends = Sensitivity(-theta, v, p, np.zeros_like(theta), np.zeros_like(theta))
+    nothing = np.zeros((seg.first.size, 3))
+    ends = Sensitivity(-theta, v, p, nothing, nothing)
     out = []
     for place, at, kept in zip(places, attachments, before, strict=True):
         dR = strides.dR[place]
@@ -99,8 +117,7 @@ def sensitivities(
         since = seg.node_time[at.node] + at.tau - strides.start[place]
         means = _means(log_so3(back @ at.dR), rotate(back, at.dV - strides.dV[place]), since)
         theta_at, v_at, p_at = _step(dR, means, errors, kept)
-        rate, force = unit_errors(at.gyro, at.force, errors)
-        out.append(Sensitivity(-theta_at, v_at, p_at, rate, force))
+        out.append(Sensitivity(-theta_at, v_at, p_at, at.gyro, at.force))
     return ends, out
 
 
@@ -119,7 +136,6 @@ def moved(
     bound: Attachment,
     by: Sensitivity,
     ends: Sensitivity,
-    errors: Sequence[ImuError],
 ) -> Sensitivity:
     """Return the sensitivity at M times that a clock has moved.
 
@@ -137,8 +153,6 @@ def moved(
         Where they were bound.
     ends : Sensitivity
         Of the increments over whole segments.
-    errors : sequence of ImuError
-        The n errors.
     """
     length = seg.increments.end[seg.last - 1] - seg.node_time[seg.origin]
     whole = length[at.segment]
@@ -150,7 +164,7 @@ def moved(
         own[:, None, None] * here + last[:, None, None] * end[at.segment]
         for here, end in ((by.theta, ends.theta), (by.v, ends.v), (by.p, ends.p))
     )
-    return Sensitivity(theta, v, p, *unit_errors(at.gyro, at.force, errors))
+    return Sensitivity(theta, v, p, at.gyro, at.force)
 
 
 def _share(part: Array, whole: Array) -> Array:
@@ -159,19 +173,24 @@ def _share(part: Array, whole: Array) -> Array:
     return np.clip(share, 0.0, 1.0)
 
 
-def corrected(at: Attachment, by: Sensitivity, errors: Array) -> Attachment:
-    """Return an attachment without errors (n,) of the IMU."""
+def corrected(
+    at: Attachment, by: Sensitivity, errors: Sequence[ImuError], sizes: Array
+) -> Attachment:
+    """Return an attachment without errors of the IMU of given sizes (n,)."""
+    rate, force = added_by(by.gyro, by.force, errors, sizes)
     return replace(
         at,
-        dR=exp_so3(by.theta @ errors) @ at.dR,
-        dV=at.dV + by.v @ errors,
-        dP=at.dP + by.p @ errors,
-        gyro=at.gyro - by.rate @ errors,
-        force=at.force - by.force @ errors,
+        dR=exp_so3(by.theta @ sizes) @ at.dR,
+        dV=at.dV + by.v @ sizes,
+        dP=at.dP + by.p @ sizes,
+        gyro=at.gyro - rate,
+        force=at.force - force,
     )
 
 
-def by_errors(lin: Linearization, transition: Transition, by: Sensitivity) -> Array:
+def by_errors(
+    lin: Linearization, transition: Transition, by: Sensitivity, errors: Sequence[ImuError]
+) -> Array:
     """Return the derivative of residuals with respect to errors of the IMU, (M, d, n).
 
     Parameters
@@ -182,11 +201,17 @@ def by_errors(lin: Linearization, transition: Transition, by: Sensitivity) -> Ar
         From the nodes to these times.
     by : Sensitivity
         Of the motion.
+    errors : sequence of ImuError
+        The n errors.
     """
     out = np.zeros((*lin.residual.shape, by.theta.shape[2]))
     d_theta = attitude_jacobian(lin, transition)
     if lin.d_omega is not None:
-        out -= lin.d_omega @ by.rate
+        signals = {"rate": by.gyro, "force": by.force}
+        for column, error in enumerate(errors):
+            if error.of == "rate":
+                signal = signals[error.by][:, None, error.column]
+                out[:, :, column] -= lin.d_omega[:, :, error.row] * signal
     if d_theta is not None:
         out += d_theta @ (transition.at.dR.transpose(0, 2, 1) @ by.theta)
     if lin.d_v is not None:

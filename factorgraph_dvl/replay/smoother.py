@@ -17,8 +17,7 @@ import numpy as np
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph import keys
 from factorgraph_dvl.sensors.parameters import Parameter
-from factorgraph_dvl.solvers.levenberg_marquardt import eliminate
-from factorgraph_dvl.statistics.square_root_information import SquareRootInformation
+from factorgraph_dvl.statistics.square_root_information import eliminated
 
 # Steps after which a state is linearised anew: rad, m, m/s; chosen. Positions enter linearly, but
 # for ranges: at 10 m from a beacon the last step changes one by 0.2 m more than it should.
@@ -170,7 +169,7 @@ class Smoother:
         ordering = gtsam.Ordering()
         for key in order:
             ordering.push_back(key)
-        information = SquareRootInformation(eliminate(graph, ordering), self._sizes)
+        information = eliminated(graph, ordering, self._sizes)
         marginals = information.marginals([keys.node(k) for k in wanted])
         return {k: marginals[keys.node(k)] for k in wanted}
 

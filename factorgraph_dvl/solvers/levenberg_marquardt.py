@@ -10,7 +10,7 @@ import numpy as np
 from factorgraph_dvl.errors import SolveError
 from factorgraph_dvl.graph.problem import Evaluation, Problem
 from factorgraph_dvl.solution import Progress
-from factorgraph_dvl.statistics.square_root_information import SquareRootInformation
+from factorgraph_dvl.statistics.square_root_information import SquareRootInformation, eliminated
 
 # A step is small when all of it together is this many standard deviations, squared and
 # halved: the decrease of the cost that the linear model still promises. Chosen: 0.004 σ.
@@ -119,8 +119,8 @@ def minimise(
             hint="Inspect the trial: a unit or a column may be wrong",
         )
     gaussian = problem.linearize(evaluation)
-    ordering = problem.ordering(gaussian)
-    tree: gtsam.GaussianBayesTree | None = None
+    ordering, sizes = problem.ordering(gaussian), values.dims()
+    root: SquareRootInformation | None = None
     damping = 0.0
     # Greatest damping with which a step failed since the cost last fell.
     failed = -1.0
@@ -134,8 +134,8 @@ def minimise(
         delta = None if careful else quick_step(damped, ordering)
         promised = evaluation.cost - gaussian.error(delta) if delta is not None else -np.inf
         if delta is None or (proven and not promised > tolerance):
-            tree = eliminate(damped, ordering)
-            delta = tree.optimize()
+            root = eliminated(damped, ordering, sizes)
+            delta = root.solution()
             promised = evaluation.cost - gaussian.error(delta)
         assert delta is not None
         near = binding and promised < _ANOTHER_FOLLOWS
@@ -152,8 +152,8 @@ def minimise(
                 evaluation = trial
             if progress:
                 progress(stage, iteration, evaluation.cost)
-            if small and damping == 0.0 and (tree is not None or not proven):
-                return Minimum(evaluation, _square_root(evaluation, tree), True, iteration)
+            if small and damping == 0.0 and (root is not None or not proven):
+                return Minimum(evaluation, root, True, iteration)
             if small or gain > _GOOD_GAIN:
                 damping = damping / 10.0 if damping > _FIRST_DAMPING else 0.0
             elif gain < _POOR_GAIN:
@@ -162,7 +162,7 @@ def minimise(
             if damping <= failed:
                 # Steps that small gain nothing, and larger ones fail: so it would go on.
                 break
-        elif not careful and tree is None:
+        elif not careful and root is None:
             # The step may have been bad for want of digits only.
             careful = True
         else:
@@ -170,9 +170,8 @@ def minimise(
             damping = max(damping * 10.0, _FIRST_DAMPING)
             if damping > _MAX_DAMPING:
                 break
-        tree = None
-    tree = eliminate(gaussian, ordering)
-    return Minimum(evaluation, _square_root(evaluation, tree), False, iteration)
+        root = None
+    return Minimum(evaluation, eliminated(gaussian, ordering, sizes), False, iteration)
 
 
 def factorized(
@@ -180,15 +179,8 @@ def factorized(
 ) -> tuple[SquareRootInformation, gtsam.VectorValues]:
     """Return the square-root information from QR at some values, and the step to the minimum."""
     gaussian = problem.linearize(evaluation)
-    tree = eliminate(gaussian, problem.ordering(gaussian))
-    return SquareRootInformation(tree, evaluation.values.dims()), tree.optimize()
-
-
-def _square_root(
-    evaluation: Evaluation, tree: gtsam.GaussianBayesTree | None
-) -> SquareRootInformation | None:
-    """Return the square-root information of a tree: GTSAM's keeps all rows that went in."""
-    return None if tree is None else SquareRootInformation(tree, evaluation.values.dims())
+    out = eliminated(gaussian, problem.ordering(gaussian), evaluation.values.dims())
+    return out, out.solution()
 
 
 def quick_step(
@@ -199,13 +191,6 @@ def quick_step(
         return gaussian.optimize(ordering)
     except RuntimeError:
         return None
-
-
-def eliminate(
-    gaussian: gtsam.GaussianFactorGraph, ordering: gtsam.Ordering
-) -> gtsam.GaussianBayesTree:
-    """Return the Bayes tree from QR, which does not square the condition of the problem."""
-    return gaussian.eliminateMultifrontal(ordering, gtsam.EliminateQR)
 
 
 def _damped(

@@ -8,8 +8,9 @@ import numpy as np
 
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph.problem import Evaluation, Problem
-from factorgraph_dvl.solvers.levenberg_marquardt import eliminate, quick_step
+from factorgraph_dvl.solvers.levenberg_marquardt import quick_step
 from factorgraph_dvl.statistics.robust_weights import BoolArray, Truncation, windows
+from factorgraph_dvl.statistics.square_root_information import eliminated
 
 # Share of the measurements of a kind from which on it is the model that is wrong, and none is
 # rejected. Chosen: more than all gross errors of a bad trial together.
@@ -50,7 +51,7 @@ def robust_weights(
         ordering = problem.ordering(gaussian)
         step = quick_step(gaussian, ordering)
         if step is None:
-            step = eliminate(gaussian, ordering).optimize()
+            step = eliminated(gaussian, ordering, evaluation.values.dims()).solution()
         after = problem.evaluate(evaluation.values.retract(step))
         if not np.isfinite(after.cost):
             break

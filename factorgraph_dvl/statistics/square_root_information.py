@@ -7,7 +7,7 @@ the digits that navigation-grade gyros need.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import gtsam
@@ -16,16 +16,23 @@ from scipy.linalg.lapack import dtrtrs
 
 from factorgraph_dvl.geometry.vectors import Array
 
+# Parts in which variables are eliminated. Chosen: GTSAM keeps all rows that went into a
+# conditional, up to 60 kB for each state, of which a tenth is needed; each part looks through all
+# factors that are left.
+_PARTS = 16
+# Variables from which on there are parts. Chosen: fewer need little memory.
+_MANY = 500
+
 
 @dataclass(frozen=True)
 class _Clique:
-    """Frontal variables F given separators S: R x_F + T x_S = noise of unit variance."""
+    """Frontal variables F given separators S: R x_F + T x_S = d + noise of unit variance."""
 
-    parent: int
     frontals: tuple[int, ...]
     separators: tuple[int, ...]
     R: Array
     T: Array
+    d: Array
 
 
 class SquareRootInformation:
@@ -33,36 +40,40 @@ class SquareRootInformation:
 
     Parameters
     ----------
-    tree : gtsam.GaussianBayesTree
-        Bayes tree from QR elimination.
+    trees : iterable of gtsam.GaussianBayesTree
+        Bayes trees from QR elimination of all variables, or of one part after another.
     sizes : mapping of int to int
         Dimension of every variable by key.
     """
 
-    def __init__(self, tree: gtsam.GaussianBayesTree, sizes: Mapping[int, int]) -> None:
+    def __init__(self, trees: Iterable[gtsam.GaussianBayesTree], sizes: Mapping[int, int]) -> None:
         self._sizes = sizes
+        # From the leaves to the root; then the other way round.
         self._cliques: list[_Clique] = []
-        stack = [(root, -1) for root in tree.roots()]
-        while stack:
-            clique, parent = stack.pop()
-            conditional = clique.conditional()
-            keys = conditional.keys()
-            R = np.array(conditional.R())
-            n = count = 0
-            while n < R.shape[0]:
-                n += sizes[keys[count]]
-                count += 1
-            self._cliques.append(
-                _Clique(
-                    parent,
-                    tuple(keys[:count]),
-                    tuple(keys[count:]),
-                    R,
-                    np.array(conditional.S()),
-                )
-            )
-            index = len(self._cliques) - 1
-            stack += [(clique[i], index) for i in range(clique.nrChildren())]
+        for tree in trees:
+            self._cliques += reversed(_cliques_of(tree, sizes))
+        self._cliques.reverse()
+        place = {key: i for i, c in enumerate(self._cliques) for key in c.frontals}
+        # That of the separator that was eliminated first: it has all the others.
+        self._parents = [
+            max((place[key] for key in c.separators), default=-1) for c in self._cliques
+        ]
+
+    def solution(self) -> gtsam.VectorValues:
+        """Return the minimum of the graph."""
+        found: dict[int, Array] = {}
+        out = gtsam.VectorValues()
+        for clique in self._cliques:
+            d = clique.d
+            if clique.separators:
+                d = d - clique.T @ np.concatenate([found[key] for key in clique.separators])
+            x = _solve(clique.R, d, transposed=False)
+            row = 0
+            for key in clique.frontals:
+                found[key] = x[row : row + self._sizes[key]]
+                out.insert(key, found[key])
+                row += self._sizes[key]
+        return out
 
     def covariance_with(self, functionals: Sequence[Mapping[int, Array]]) -> dict[int, Array]:
         """Return the covariance of every variable with linear functionals of all.
@@ -173,10 +184,10 @@ class SquareRootInformation:
         # Of cliques whose children are still to come.
         joint: dict[int, tuple[dict[int, slice], Array]] = {}
         children = [0] * len(self._cliques)
-        for clique in self._cliques:
-            if clique.parent >= 0:
-                children[clique.parent] += 1
-        for index, clique in enumerate(self._cliques):
+        for parent in self._parents:
+            if parent >= 0:
+                children[parent] += 1
+        for index, (clique, parent) in enumerate(zip(self._cliques, self._parents, strict=True)):
             f = clique.R.shape[0]
             identity = np.eye(f)
             solved = _solve(clique.R, np.hstack([identity, clique.T]), transposed=False)
@@ -184,9 +195,9 @@ class SquareRootInformation:
             s = clique.T.shape[1]
             P = np.empty((f + s, f + s))
             if s:
-                where, parent = joint[clique.parent]
+                where, above = joint[parent]
                 rows = np.concatenate([_range(where[key]) for key in clique.separators])
-                P_SS = parent[np.ix_(rows, rows)]
+                P_SS = above[np.ix_(rows, rows)]
                 P_FS = -gain @ P_SS
                 P[:f, :f] = inverse @ inverse.T - P_FS @ gain.T
                 P[:f, f:], P[f:, :f], P[f:, f:] = P_FS, P_FS.T, P_SS
@@ -199,11 +210,68 @@ class SquareRootInformation:
                 row += self._sizes[key]
             if children[index]:
                 joint[index] = place, P
-            if clique.parent >= 0:
-                children[clique.parent] -= 1
-                if not children[clique.parent]:
-                    del joint[clique.parent]
+            if parent >= 0:
+                children[parent] -= 1
+                if not children[parent]:
+                    del joint[parent]
             yield clique, place, P
+
+
+def eliminated(
+    gaussian: gtsam.GaussianFactorGraph, ordering: gtsam.Ordering, sizes: Mapping[int, int]
+) -> SquareRootInformation:
+    """Return the square-root information of a graph from QR.
+
+    QR does not square the condition of the problem.
+
+    Parameters
+    ----------
+    gaussian : gtsam.GaussianFactorGraph
+        All factors.
+    ordering : gtsam.Ordering
+        All variables in the order of elimination.
+    sizes : mapping of int to int
+        Dimension of every variable by key.
+    """
+    return SquareRootInformation(_trees(gaussian, ordering), sizes)
+
+
+def _trees(
+    gaussian: gtsam.GaussianFactorGraph, ordering: gtsam.Ordering
+) -> Iterator[gtsam.GaussianBayesTree]:
+    """Yield the Bayes trees of one part of the variables after another."""
+    count = ordering.size()
+    size = -(-count // _PARTS) if count > _MANY else count
+    for first in range(0, count - size, size):
+        part = gtsam.Ordering()
+        for i in range(first, first + size):
+            part.push_back(ordering.at(i))
+        tree, gaussian = gaussian.eliminatePartialMultifrontal(part, gtsam.EliminateQR)
+        yield tree
+    last = gtsam.Ordering()
+    for i in range(size * ((count - 1) // size), count):
+        last.push_back(ordering.at(i))
+    yield gaussian.eliminateMultifrontal(last, gtsam.EliminateQR)
+
+
+def _cliques_of(tree: gtsam.GaussianBayesTree, sizes: Mapping[int, int]) -> list[_Clique]:
+    """Return the cliques of a tree, each after its parent."""
+    out = []
+    stack = list(tree.roots())
+    while stack:
+        clique = stack.pop()
+        conditional = clique.conditional()
+        keys = conditional.keys()
+        R = np.array(conditional.R())
+        n = count = 0
+        while n < R.shape[0]:
+            n += sizes[keys[count]]
+            count += 1
+        frontals, separators = tuple(keys[:count]), tuple(keys[count:])
+        T, d = np.array(conditional.S()), np.array(conditional.d())
+        out.append(_Clique(frontals, separators, R, T, d))
+        stack += [clique[i] for i in range(clique.nrChildren())]
+    return out
 
 
 def _range(s: slice) -> np.ndarray:

@@ -10,8 +10,8 @@ from problems import SHORT, dense_covariance, problem_of, walking
 from truth import scenario
 
 from factorgraph_dvl.graph import keys
-from factorgraph_dvl.solvers.levenberg_marquardt import eliminate
-from factorgraph_dvl.statistics.square_root_information import SquareRootInformation
+from factorgraph_dvl.statistics import square_root_information
+from factorgraph_dvl.statistics.square_root_information import eliminated
 
 
 @pytest.fixture(scope="module", params=["constant", "walking"])
@@ -23,7 +23,7 @@ def system(request):
     gaussian = problem.linearize(problem.evaluate(values))
     ordering = problem.ordering(gaussian)
     sizes = values.dims()
-    information = SquareRootInformation(eliminate(gaussian, ordering), sizes)
+    information = eliminated(gaussian, ordering, sizes)
     order = sorted(sizes)
     place, at = {}, 0
     for key in order:
@@ -38,11 +38,37 @@ def system(request):
             wide[:, place[key]] = A[:, column : column + sizes[key]]
             column += sizes[key]
         rows.append(wide)
-    return problem, information, place, np.concatenate(rows)
+    return problem, information, place, np.concatenate(rows), gaussian, sizes
+
+
+def test_elimination_in_parts_gives_the_same(system, monkeypatch):
+    problem, whole, _, _, gaussian, sizes = system
+    monkeypatch.setattr(square_root_information, "_MANY", 0)
+    in_parts = eliminated(gaussian, problem.ordering(gaussian), sizes)
+    every = [{problem.key(p.name): np.eye(p.mean.size)} for p in problem.parameters]
+    np.testing.assert_allclose(
+        in_parts.covariance_of(every), whole.covariance_of(every), rtol=1e-6
+    )
+    wanted = list(sizes)
+    found, expected = in_parts.marginals(wanted), whole.marginals(wanted)
+    step, exact = in_parts.solution(), whole.solution()
+    for key in wanted:
+        assert worst_relative(found[key], expected[key]) < 1e-6
+        sigma = np.sqrt(np.diag(expected[key]))
+        np.testing.assert_allclose(step.at(key) / sigma, exact.at(key) / sigma, atol=1e-6)
+
+
+def test_the_solution_is_that_of_gtsam(system):
+    problem, whole, _, _, gaussian, sizes = system
+    tree = gaussian.eliminateMultifrontal(problem.ordering(gaussian), gtsam.EliminateQR)
+    exact, step = tree.optimize(), whole.solution()
+    sigma = {key: np.sqrt(np.diag(P)) for key, P in whole.marginals(list(sizes)).items()}
+    for key, each in sigma.items():
+        np.testing.assert_allclose(step.at(key) / each, exact.at(key) / each, atol=1e-6)
 
 
 def test_marginals_equal_the_dense_inverse(system):
-    _, information, place, A = system
+    _, information, place, A, *_ = system
     P = dense_covariance(A)
     found = information.marginals(list(place))
     assert set(found) == set(place)
@@ -51,7 +77,7 @@ def test_marginals_equal_the_dense_inverse(system):
 
 
 def test_joint_covariance_of_functionals_equals_the_dense_inverse(system):
-    problem, information, place, A = system
+    problem, information, place, A, *_ = system
     P = dense_covariance(A)
     rng = np.random.default_rng(0)
     n = problem.chain.segments.node_time.size
@@ -69,7 +95,7 @@ def test_joint_covariance_of_functionals_equals_the_dense_inverse(system):
 
 
 def test_the_normal_equations_would_have_few_digits_left(system):
-    _, _, _, A = system
+    _, _, _, A, *_ = system
     information = A.T @ A
     # Why everything stays with the square root: 1 / epsilon is 4.5e15, and this is a trial
     # of eight seconds.
@@ -87,7 +113,7 @@ def test_a_conflicting_pair_of_measurements_by_hand():
     ordering = gtsam.Ordering()
     ordering.push_back(1)
     ordering.push_back(2)
-    information = SquareRootInformation(eliminate(graph, ordering), {1: 1, 2: 1})
+    information = eliminated(graph, ordering, {1: 1, 2: 1})
     joint = information.covariance_of([{1: one}, {2: one}])
     np.testing.assert_allclose(joint, [[5 / 6, 2 / 3], [2 / 3, 4 / 3]])
     np.testing.assert_allclose(information.marginals([1])[1], [[5 / 6]])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import gtsam
 import numpy as np
 import pytest
 from truth import scenario
@@ -11,7 +12,6 @@ from truth import scenario
 from factorgraph_dvl.simulation import simulate
 from factorgraph_dvl.simulation.faults import gauss_markov
 from factorgraph_dvl.solvers.batch import solved_problems
-from factorgraph_dvl.solvers.levenberg_marquardt import eliminate
 from factorgraph_dvl.solvers.process_fit import refitted
 
 LEGS = [
@@ -49,7 +49,7 @@ def log_likelihood(problem, evaluation, process):
         problem.values(evaluation.states, evaluation.parameters | {process.name: nodes})
     )
     gaussian = problem.linearize(at)
-    tree = eliminate(gaussian, problem.ordering(gaussian))
+    tree = gaussian.eliminateMultifrontal(problem.ordering(gaussian), gtsam.EliminateQR)
     problem.processes = (before,)
     half_determinant, stack = 0.0, list(tree.roots())
     while stack:

@@ -30,7 +30,7 @@ def fitted(data):
     ordering = gtsam.Ordering()
     ordering.push_back(1)
     tree = graph.eliminateMultifrontal(ordering, gtsam.EliminateQR)
-    information = SquareRootInformation(tree, {1: 2})
+    information = SquareRootInformation([tree], {1: 2})
     keys = np.ones((400, 1), dtype=int)
     rows = Rows("y", ("",), keys, (2,), DESIGN[:, None, :], (DESIGN @ x - data)[:, None])
     functional = {1: np.eye(2)}

@@ -12,10 +12,9 @@ from factorgraph_dvl.report.terminal.error_budget import error_budget_table
 from factorgraph_dvl.simulation import simulate
 from factorgraph_dvl.solvers.batch import solve, solved_problems
 from factorgraph_dvl.solvers.calibration import reported
-from factorgraph_dvl.solvers.levenberg_marquardt import eliminate
 from factorgraph_dvl.statistics.error_budget import error_budget
 from factorgraph_dvl.statistics.rows import rows_by_source
-from factorgraph_dvl.statistics.square_root_information import SquareRootInformation
+from factorgraph_dvl.statistics.square_root_information import eliminated
 
 SCENE = scenario(noise=True, manoeuvres=TURNING[:3], imu={"rate_hz": 50})
 
@@ -29,8 +28,8 @@ def test_sources_add_up_to_the_covariance():
     found = solved_problems(simulate(SCENE, 0))[0]
     problem, evaluation = found.problem, found.minimum.evaluation
     gaussian = problem.linearize(evaluation)
-    tree = eliminate(gaussian, problem.ordering(gaussian))
-    information = SquareRootInformation(tree, evaluation.values.dims())
+    sizes = evaluation.values.dims()
+    information = eliminated(gaussian, problem.ordering(gaussian), sizes)
     functionals = [f for _, _, f in reported(problem, evaluation) if f is not None]
     parts = error_budget(rows_by_source(problem, evaluation), information, functionals)
     P = information.covariance_of(functionals)

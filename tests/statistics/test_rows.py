@@ -8,10 +8,9 @@ from exactness import worst_relative
 from problems import SHORT, dense_covariance, problem_of, walking
 from truth import scenario
 
-from factorgraph_dvl.solvers.levenberg_marquardt import eliminate
 from factorgraph_dvl.statistics.leverage import leverage
 from factorgraph_dvl.statistics.rows import add_transposed_product, product, rows_by_source
-from factorgraph_dvl.statistics.square_root_information import SquareRootInformation
+from factorgraph_dvl.statistics.square_root_information import eliminated
 
 
 @pytest.fixture(scope="module", params=["constant", "walking"])
@@ -87,8 +86,8 @@ def test_products_are_those_of_dense_matrices(system):
 def test_sums_of_leverages_are_those_of_the_dense_hat_matrix(system):
     problem, evaluation, rows = system
     gaussian = problem.linearize(evaluation)
-    tree = eliminate(gaussian, problem.ordering(gaussian))
-    information = SquareRootInformation(tree, evaluation.values.dims())
+    sizes = evaluation.values.dims()
+    information = eliminated(gaussian, problem.ordering(gaussian), sizes)
     place = place_of(evaluation)
     matrices = [dense(r, place) for r in rows]
     P = dense_covariance(np.concatenate([J.reshape(-1, width_of(place)) for J in matrices]))

@@ -38,7 +38,7 @@ def line():
     for key in (1, 2, 3, 4):
         ordering.push_back(key)
     tree = graph.eliminateMultifrontal(ordering, gtsam.EliminateQR)
-    information = SquareRootInformation(tree, {1: 1, 2: 1, 3: 1, 4: 2})
+    information = SquareRootInformation([tree], {1: 1, 2: 1, 3: 1, 4: 2})
     return columns, data, scores(tree.optimize(), information, WIDE)
 
 
