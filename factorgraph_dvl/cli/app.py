@@ -73,7 +73,10 @@ def _run(args: list[str]) -> NoReturn:
         _fail(f"internal error: {type(error).__name__}: {error}{hint}", 1, args)
     except SystemExit as done:
         if done.code == _INTERRUPTED:
-            _fail("interrupted", _INTERRUPTED, args)
+            if "--json" in args:
+                _fail("interrupted", _INTERRUPTED, args)
+            # Said without rich, which may be what was being loaded.
+            raise KeyboardInterrupt from done
         failure = output_failure()
         if failure is None or done.code:
             raise
