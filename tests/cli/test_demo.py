@@ -23,7 +23,9 @@ def test_every_help_has_an_example(name: str, run: Run) -> None:
 
 
 def test_every_command_that_draws_offers_other_formats() -> None:
-    options = {name: {option for p in command(name).params for option in p.opts} for name in COMMANDS}
+    options = {
+        name: {option for p in command(name).params for option in p.opts} for name in COMMANDS
+    }
     drawing = {name for name, own in options.items() if "--no-figures" in own}
     assert drawing >= {"solve", "kalman", "replay", "observability", "plan", "crosscheck"}
     for name in (*drawing, "allan", "reproduce"):
