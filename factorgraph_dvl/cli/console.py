@@ -267,7 +267,7 @@ def print_error_budget(solution: Solution) -> None:
     from factorgraph_dvl.report.terminal.error_budget import error_budget_table
 
     if solution.error_budget:
-        print_table(error_budget_table(solution, width=stdout().width))
+        print_table(error_budget_table(solution, width=stdout().width), "std")
 
 
 def warn(message: str) -> None:

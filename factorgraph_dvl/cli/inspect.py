@@ -32,7 +32,7 @@ def inspect(trial_path: TrialPath) -> None:
         result, notes = survey(trial), trial.notes
         assumed = [] if trial.imu is None else imu_lines(trial.imu.settings)
     console = stdout()
-    print_table(sensor_table(result))
+    print_table(sensor_table(result), "longest s", "from s")
     for line in (motion_line(result), *assumed):
         console.print(line, markup=False, soft_wrap=True)
     for note in notes:

@@ -67,23 +67,23 @@ def _assumed(
         sigma = 1.0 / np.where(weight > 0.0, weight, np.nan)
         if (weight > 0.0).any():
             middle = [float(np.nanmedian(s)) for s in sigma.T if np.isfinite(s).any()]
-            out[o.label] = _numbers(np.array(middle), o.unit)
+            out[o.label] = numbers_with_unit(np.array(middle), o.unit)
     for process in problem.processes:
         (unit,) = (o.unit for o in problem.observations if o.label == process.label)
-        numbers = _numbers(process.sigma, unit)
-        over = _numbers(process.tau[process.sigma > 0.0], "s")
+        numbers = numbers_with_unit(process.sigma, unit)
+        over = numbers_with_unit(process.tau[process.sigma > 0.0], "s")
         out[CORRELATED.format(process.label)] = f"{numbers} over {over}"
     priors = [*problem.chain.biases, *(p for p in parameters if p.name in problem.columns)]
     for p in priors:
         unit = UNITS[p.spec.unit].text
-        out[PRIOR.format(p.name)] = _numbers(p.sigma / p.si, unit)
+        out[PRIOR.format(p.name)] = numbers_with_unit(p.sigma / p.si, unit)
     gyro, accel = problem.chain.biases
     out[WALK.format(gyro.name)] = f"{imu.gyro_bias_walk_deg_h_sqrt_h:.3g} deg/h/√h"
     out[WALK.format(accel.name)] = f"{imu.accel_bias_walk_ug_sqrt_h:.3g} µg/√h"
     return out
 
 
-def _numbers(values: Array, unit: str) -> str:
+def numbers_with_unit(values: Array, unit: str) -> str:
     """Return numbers with their unit, once if they are all the same."""
     texts = list(dict.fromkeys(_brief(value) for value in values))
     numbers = texts[0] if len(texts) == 1 else ", ".join(map(_brief, values))

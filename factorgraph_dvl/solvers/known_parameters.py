@@ -168,6 +168,13 @@ def confirmed(problem: Problem, minimum: Minimum, found: Explanation) -> bool:
     return again.log10_p < _LOG10_P
 
 
+def _chi_square(explanation: Explanation) -> str:
+    """Return how strong the evidence is, in brackets."""
+    score = explanation.score
+    degrees = "1 degree" if score.freedom == 1 else f"{score.freedom} degrees"
+    return f"(χ² {score.chi2:.0f} with {degrees} of freedom)"
+
+
 def explanation_findings(
     freed: Sequence[Explanation], left: Explanation | None, evaluation: Evaluation
 ) -> tuple[Finding, ...]:
@@ -176,8 +183,8 @@ def explanation_findings(
         Finding(
             Code.ESTIMATED_INSTEAD,
             f"{e.parameter.name} was stated as {_numbers(e.parameter, e.parameter.mean)} "
-            f"{_uncertainty(e.parameter)}; the data contradict this (χ² {e.score.chi2:.0f} with "
-            f"{e.score.freedom} degrees of freedom). It was estimated instead: "
+            f"{_uncertainty(e.parameter)}; the data contradict this {_chi_square(e)}. It was "
+            "estimated instead: "
             f"{_numbers(e.parameter, evaluation.parameters[e.parameter.name])}{_or(e)}",
             parameter=e.parameter.name,
         )
@@ -189,8 +196,8 @@ def explanation_findings(
             Finding(
                 Code.UNEXPLAINED_MISFIT,
                 f"{left.parameter.name} would have to be {_numbers(left.parameter, value)} "
-                f"instead of {_numbers(left.parameter, left.parameter.mean)} (χ² "
-                f"{left.score.chi2:.0f} with {left.score.freedom} degrees of freedom){_or(left)}",
+                f"instead of {_numbers(left.parameter, left.parameter.mean)} "
+                f"{_chi_square(left)}{_or(left)}",
                 parameter=left.parameter.name,
             )
         )

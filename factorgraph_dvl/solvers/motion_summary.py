@@ -27,6 +27,7 @@ from factorgraph_dvl.solution import (
     not_observable,
     outlier_findings,
 )
+from factorgraph_dvl.solvers.causes import numbers_with_unit
 from factorgraph_dvl.solvers.motion_smoother import SmoothedMotion
 from factorgraph_dvl.solvers.reported import estimates_of, in_order, in_unit
 from factorgraph_dvl.statistics.rows import PRIOR
@@ -209,8 +210,7 @@ def _causes(
             k = whiten[problem.columns[p.name]] @ cov.constants @ gain.T
             variances[PRIOR.format(p.name)] = np.sum(k**2, axis=0)
     assumed = {
-        PRIOR.format(p.name): f"{', '.join(f'{s:.2g}' for s in p.sigma / p.si)} "
-        f"{UNITS[p.spec.unit].text}".rstrip()
+        PRIOR.format(p.name): numbers_with_unit(p.sigma / p.si, UNITS[p.spec.unit].text)
         for p in problem.parameters
     }
     is_free = np.concatenate([np.full(p.mean.size, p.estimated) for p in reported])

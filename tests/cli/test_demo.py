@@ -1,6 +1,9 @@
 from __future__ import annotations
 
+import os
 import re
+import subprocess
+import sys
 import webbrowser
 from pathlib import Path
 from typing import Any
@@ -64,6 +67,18 @@ def test_the_demo_is_the_shipped_trial_and_opens_its_page(
     shipped = (ROOT / "data" / "README.md").read_text()
     assert f"simulate configs/{name} --out data/seed-a-phase-90 --seed {seed} " in shipped
     assert scenario == (ROOT / "configs" / name).read_text()
+
+
+def test_the_shell_completes_commands() -> None:
+    words = {"_FACTORGRAPH_DVL_COMPLETE": "complete_bash", "COMP_CWORD": "1"}
+    done = subprocess.run(
+        [sys.executable, "-m", "factorgraph_dvl.cli"],
+        env=os.environ | words | {"COMP_WORDS": "factorgraph-dvl cros"},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert done.stdout.split() == ["crosscheck"]
 
 
 def test_the_citation_names_the_version() -> None:

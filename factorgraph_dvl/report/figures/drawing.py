@@ -133,7 +133,7 @@ def new_grid(
     left: float = 0.75,
     right: float = 0.12,
     bottom: float = 0.48,
-    top: float = 0.32,
+    top: float = 0.45,
     gap: tuple[float, float] = (0.16, 0.85),
     width_ratios: Sequence[float] | None = None,
 ) -> GridSpec:

@@ -32,18 +32,19 @@ def error_budget_figure(solution: Solution, *, into: SubFigure | None = None) ->
     free = np.flatnonzero(std > 0.0)
     variance = np.stack([c.adds[free] ** 2 for c in solution.error_budget])
     share = 100.0 * variance / variance.sum(axis=0)
-    figure = canvas(11.0, 1.4 + 0.24 * free.size, into)
-    grid = new_grid(figure, 1, 1, left=1.5, right=3.4, bottom=0.5, top=0.35)
+    names = [f"{readable(solution.order[i])[0]}  {std[i]:.2g}" for i in free]
+    left = max(1.5, 0.25 + 0.068 * max(map(len, names)))
+    figure = canvas(9.5 + left, 1.5 + 0.24 * free.size, into)
+    grid = new_grid(figure, 1, 1, left=left, right=3.4, bottom=0.5, top=0.45)
     ax = figure.add_subplot(grid[0, 0])
     y = np.arange(free.size)
-    left = np.zeros(free.size)
+    reached = np.zeros(free.size)
     for i, cause in enumerate(solution.error_budget[:_SHOWN]):
         label = f"{cause.cause} ({cause.assumed})" if cause.assumed else cause.cause
-        ax.barh(y, share[i], left=left, color=_COLOURS[i], height=0.7, label=label)
-        left += share[i]
+        ax.barh(y, share[i], left=reached, color=_COLOURS[i], height=0.7, label=label)
+        reached += share[i]
     if len(share) > _SHOWN:
-        ax.barh(y, 100.0 - left, left=left, color=LIGHT, height=0.7, label="all others")
-    names = [f"{readable(solution.order[i])[0]}  {std[i]:.2g}" for i in free]
+        ax.barh(y, 100.0 - reached, left=reached, color=LIGHT, height=0.7, label="all others")
     ax.set_yticks(y, names, fontsize=SMALL)
     ax.invert_yaxis()
     ax.set_xlim(0.0, 100.0)

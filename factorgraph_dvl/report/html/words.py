@@ -13,6 +13,7 @@ from factorgraph_dvl.report.text import in_words, split_unit
 _CAUSES = {
     "noise of ": "噪声",
     "correlated noise of ": "相关噪声",
+    "lasting errors of ": "的持续误差",
     "prior of ": "的先验",
     "random walk of ": "的随机游走",
 }
