@@ -131,6 +131,10 @@ class ImuErrors:
             for k, end in enumerate(self._ends)
         ]
 
+    def release(self) -> None:
+        """Free the factors that `filled` writes; its next call makes others."""
+        self._factors = []
+
     def filled(self, linear: LinearImuFactors) -> gtsam.GaussianFactorGraph:
         """Return the native part of the Gaussian graph; written in place at the next call."""
         count = len(linear.jacobian)

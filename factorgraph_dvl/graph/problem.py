@@ -278,8 +278,6 @@ class Problem:
             kind = tuple(p.name for p in used), bound.correlated
             blocks.setdefault(kind, _Block([], used, bound.correlated)).bound.append(bound)
         self._blocks = list(blocks.values())
-        for block in self._blocks:
-            self._lay_out(block)
 
     @property
     def observations(self) -> tuple[Observation, ...]:
@@ -497,6 +495,8 @@ class Problem:
         gaussian = self.native(evaluation)
         transitions = self._transitions(evaluation)
         for block in self._blocks:
+            if not block.factors:
+                self._lay_out(block)
             for bound, rows in zip(block.bound, block.rows, strict=True):
                 matrix, vector = self._jacobian(bound, block.parameters, transitions, evaluation)
                 matrix, vector = matrix.reshape(-1, matrix.shape[2]), -vector.ravel()
@@ -508,6 +508,13 @@ class Problem:
             for factor in block.factors:
                 gaussian.push_back(factor)
         return gaussian
+
+    def release(self) -> None:
+        """Free the factors of measurements; the next linearisation makes others."""
+        for block in self._blocks:
+            block.rows, block.matrices, block.vectors, block.factors = [], [], [], []
+        if self._imu_errors is not None:
+            self._imu_errors.release()
 
     def observation_rows(self, evaluation: Evaluation) -> Iterator[Rows]:
         """Yield the rows of each observation, unused ones included: these are zero."""

@@ -69,6 +69,10 @@ def read_table(
         columns = {
             name: _text(table, name) if name in TEXT else _numbers(table, name) for name in names
         }
+        rows = table.num_rows
+        del table
+        # Arrow keeps what it read with otherwise, about as much as the columns take.
+        pa.default_memory_pool().release_unused()
     except MemoryError:
         raise
     except (OSError, pa.ArrowException, UnicodeDecodeError) as error:
@@ -76,7 +80,7 @@ def read_table(
         reason = getattr(error, "strerror", None) or str(error).partition("\n")[0]
         expected = "a Parquet file that is whole" if is_parquet else ""
         raise DataError(f"cannot be read ({reason})", where=source, expected=expected) from None
-    absent = np.full(table.num_rows, np.nan)
+    absent = np.full(rows, np.nan)
     return {name: columns.get(name, absent) for group in (required, *optional) for name in group}
 
 

@@ -218,6 +218,8 @@ def settle(
                     robust, searches = {}, 0
         if not changing and minimum.converged and parameters is not tested:
             tested = parameters
+            # The test has a problem of its own, and more columns.
+            problem.release()
             left = explanation(problem, minimum)
             if left is not None and len(freed) < _MOST_FREED:
                 freed.append(left)
@@ -250,6 +252,7 @@ def settle(
         findings += (Finding(Code.NOT_CONVERGED, text, severity="error"),)
     if minimum.square_root is None:
         minimum = replace(minimum, square_root=factorized(problem, minimum.evaluation)[0])
+    problem.release()
     converged = minimum.converged and not changing
     minimum = replace(minimum, converged=converged, iterations=iterations)
     return SettledMinimum(problem, minimum, not changing, findings)

@@ -46,6 +46,22 @@ def keyed(problem, names, k):
     return [keys.node(k), problem.chain.bias_key(k), *(problem.key(n) for n in names)]
 
 
+def jacobians(problem, evaluation):
+    factors = measurement_factors(problem, problem.linearize(evaluation))
+    return [factor.augmentedJacobian() for factor in factors]
+
+
+def test_released_factors_come_back_the_same():
+    problem, values = problem_of(scenario(manoeuvres=SHORT, trial={"imu": IMU_ERRORS}))
+    problem.weigh(problem.evaluate(values))
+    evaluation = problem.evaluate(values)
+    before = jacobians(problem, evaluation)
+    problem.release()
+    after = jacobians(problem, evaluation)
+    for a, b in zip(before, after, strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
 @pytest.mark.parametrize("kind", ["constant", "walking", "IMU errors"])
 def test_blocks_equal_custom_factors_with_numerical_jacobians(kind):
     more = {"imu": IMU_ERRORS} if kind == "IMU errors" else {}
