@@ -25,6 +25,7 @@ from factorgraph_dvl.report.figures.drawing import (
     save_figures,
     style,
 )
+from factorgraph_dvl.report.figures.trajectory import mark_times
 from factorgraph_dvl.sensors.verdict import Verdict
 from factorgraph_dvl.trial import Reference, Trial
 
@@ -82,7 +83,10 @@ def tracks_figure(trial: Trial, result: BeforeAfter) -> Figure:
     ax.set_aspect("equal", adjustable="datalim")
     style(ax, f"east of start, {unit}", f"north of start, {unit}")
     ax.margins(0.06)
+    marked = frame.position(*calibrated.geodetic.T) * scale
+    mark_times(ax, calibrated.time, marked)
     ax.set_title("Dead reckoning", fontsize=TITLE, loc="left")
+    ax.set_title("N ↑", fontsize=TITLE, loc="right")
     ax.legend(fontsize=NORMAL, frameon=True, framealpha=0.85, edgecolor="none", loc="best")
     return figure
 

@@ -92,7 +92,7 @@ def track_figure(
         truth_n = _reference_track(trial.reference, trajectory, frame) * scale
         ax.plot(truth_n[:, 0], truth_n[:, 1], color=DARK, lw=0.9, dashes=(5, 4), label="reference")
     ax.plot(0.0, 0.0, "o", color=DARK, markerfacecolor="white", markersize=7, label="start")
-    _mark_times(ax, trajectory.time, track * scale)
+    mark_times(ax, trajectory.time, track * scale)
     ax.set_aspect("equal", adjustable="datalim")
     style(ax, f"east of start, {unit}", f"north of start, {unit}")
     ax.margins(0.06)
@@ -113,8 +113,18 @@ def track_figure(
     return figure
 
 
-def _mark_times(ax: Axes, time: Array, track: Array) -> None:
-    """Mark a few round times since the start on a track (M, 3)."""
+def mark_times(ax: Axes, time: Array, track: Array) -> None:
+    """Mark a few round times since the start on a track.
+
+    Parameters
+    ----------
+    ax : Axes
+        Where the track is drawn.
+    time : ndarray, shape (M,), s
+        Of its points.
+    track : ndarray, shape (M, 2) or (M, 3)
+        In the units of the axes; east and north first.
+    """
     duration = float(time[-1] - time[0])
     for mark in MaxNLocator(nbins=_TIME_MARKS, steps=[1, 2, 5, 10]).tick_values(0.0, duration):
         if 0.0 < mark < duration:

@@ -277,6 +277,18 @@ def test_command_writes_its_folder(run, folder):  # noqa: F811
     assert header.startswith("time_s,lat_deg,lon_deg,height_m,vel_e_m_s")
 
 
+def test_the_tracks_have_a_compass_and_marks_of_time(folder):
+    from factorgraph_dvl.io.trial_folder import load_trial
+    from factorgraph_dvl.report.figures.dead_reckoning import tracks_figure
+
+    trial = load_trial(folder / "trial")
+    attitude = attitude_of(trial)
+    found = before_after(trial, trial.calibration_truth, attitude.at)
+    (ax,) = tracks_figure(trial, found).axes
+    assert ax.get_title("right") == "N ↑"
+    assert {"20 s", "40 s"} <= {text.get_text() for text in ax.texts}
+
+
 def test_command_takes_the_attitude_of_a_solution_or_the_reference(run, folder, tmp_path):  # noqa: F811
     from builders import build_solution
 

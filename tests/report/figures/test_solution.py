@@ -3,16 +3,19 @@ from __future__ import annotations
 import struct
 from dataclasses import replace
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.text import Text
 
 from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.report.figures.drawing import draw_band, save_figures
 from factorgraph_dvl.report.figures.residuals import residuals_figure
-from factorgraph_dvl.report.figures.solution import write_figures
+from factorgraph_dvl.report.figures.solution import drawings, write_figures
 from factorgraph_dvl.report.figures.trajectory import motion_figure, track_figure
 from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.sensors.gnss import Gnss, GnssSettings
@@ -457,3 +460,23 @@ def test_a_track_has_marks_of_time() -> None:
     texts = {text.get_text() for text in figure.axes[0].texts}
     assert {"10 s", "20 s", "50 s"} <= texts
     assert figure.axes[0].get_title("right") == "N ↑"
+
+
+@pytest.mark.parametrize("name", ["track", "motion", "dvl_residuals", "calibration"])
+def test_verdict_and_name_keep_clear_of_all_other_text(name: str, tmp_path: Path) -> None:
+    trial, solution = synthetic(60.0)
+    figure = drawings(solution, trial)[name](None)
+    codes = (Code.SMALL_RESIDUALS, Code.OUTLIERS, Code.UNCERTAIN)
+    verdict = verdict_of([Finding(code, "so it is", severity="warning") for code in codes])
+    save_figures({name: figure}, tmp_path, verdict, name="a trial")
+    renderer = FigureCanvasAgg(cast(Figure, figure)).get_renderer()
+    own = figure.texts[-2:]
+    others = [
+        text
+        for text in figure.findobj(Text)
+        if isinstance(text, Text) and text not in own and text.get_visible() and text.get_text()
+    ]
+    assert len(others) > 5
+    for label in own:
+        place = label.get_window_extent(renderer)
+        assert not [t.get_text() for t in others if place.overlaps(t.get_window_extent(renderer))]
