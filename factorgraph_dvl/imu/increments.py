@@ -8,7 +8,7 @@ the sample before: all samples are there when a trial is processed.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -255,10 +255,10 @@ def increments(
         start=np.concatenate([time[a] + e[:-1] for (a, _), e in zip(whole, edges, strict=True)]),
         dt=np.concatenate([np.diff(e) for e in edges]),
         arcs=np.stack([np.concatenate([[0], ends[:-1]]), ends], axis=1),
-        samples=np.concatenate([samples[a:b] for a, b in whole]),
+        samples=_in_a_row([samples[a:b] for a, b in whole]),
         first_sample=np.cumsum([0, *(b - a for a, b in whole)])[:-1],
         averaged=averaged,
-        open_sigma=np.concatenate([filled_sigma[a + (not averaged) : b] for a, b in whole]),
+        open_sigma=_in_a_row([filled_sigma[a + (not averaged) : b] for a, b in whole]),
         gyro_sigma=imu.settings.gyro_noise_root_psd / np.sqrt(dt),
         accel_sigma=imu.settings.accel_noise_root_psd / np.sqrt(dt),
         windows=windows,
@@ -268,6 +268,11 @@ def increments(
         np.hypot(out.open_sigma, open_steps(out, noise), out=out.open_sigma)
     alone = [(b - a, float(time[a])) for a, b in itertools.pairwise(bounds) if b - a < _LEAST]
     return out, (*lost, *_unused(alone), *_gaps(out))
+
+
+def _in_a_row(parts: Sequence[Array]) -> Array:
+    """Return arrays one after another; a single one is not copied."""
+    return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
 
 def _bridged(imu: Imu) -> tuple[Array, Array, Array, np.ndarray, list[Finding]]:
@@ -295,7 +300,8 @@ def _bridged(imu: Imu) -> tuple[Array, Array, Array, np.ndarray, list[Finding]]:
     bridged = (lost > 0) & (lost <= MAX_FILLED)
     broken = (lost > MAX_FILLED) | (step > (MAX_FILLED + _LOST) * dt)
     if not bridged.any():
-        return time, samples, np.zeros_like(samples), broken, []
+        # Unlike those of `zeros_like`, these zeros take no memory until one is written.
+        return time, samples, np.zeros(samples.shape), broken, []
     time, samples, filled_sigma, broken = fill_lost(time, samples, lost, bridged, broken)
     text = (
         f"{int(lost[bridged].sum())} lost samples in {int(bridged.sum())} places were "
