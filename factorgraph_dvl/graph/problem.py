@@ -647,26 +647,29 @@ class Problem:
 
     def _lay_out(self, block: _Block) -> None:
         """Make a block's factors for the nodes that its measurements depend on."""
-        nodes = [
-            self._nodes_of(b).repeat(len(b.observation.components), axis=0) for b in block.bound
-        ]
-        used, place = np.unique(np.concatenate(nodes), axis=0, return_inverse=True)
+        nodes = np.concatenate([self._nodes_of(b) for b in block.bound])
+        # One number for each pair of nodes, which sorts as the pair does.
+        pair = np.ravel_multi_index(tuple(nodes.T), tuple(nodes.max(axis=0, initial=0) + 1))
+        _, index, place = np.unique(pair, return_index=True, return_inverse=True)
+        used = nodes[index]
         counts = np.zeros(len(used), dtype=int)
-        edges = np.cumsum([len(each) for each in nodes])[:-1]
+        edges = np.cumsum([b.observation.time.size for b in block.bound])[:-1]
         block.rows = []
-        for own in np.split(place.ravel(), edges):
+        for bound, own in zip(block.bound, np.split(place, edges), strict=True):
+            d = len(bound.observation.components)
             order = np.argsort(own, kind="stable")
             present, first, count = np.unique(own[order], return_index=True, return_counts=True)
             there = counts[present]
             places = zip(
                 present.tolist(),
-                map(slice, there.tolist(), (there + count).tolist()),
-                map(slice, first.tolist(), (first + count).tolist()),
+                map(slice, there.tolist(), (there + d * count).tolist()),
+                map(slice, (d * first).tolist(), (d * (first + count)).tolist()),
                 strict=True,
             )
             in_order = np.all(np.diff(order) == 1)
-            block.rows.append(_RowsByFactor(None if in_order else order, list(places)))
-            counts[present] += count
+            rows = None if in_order else (d * order[:, None] + np.arange(d)).ravel()
+            block.rows.append(_RowsByFactor(rows, list(places)))
+            counts[present] += d * count
         sizes = self._sizes(block)
         block.matrices, block.vectors, block.factors = [], [], []
         variables = self._keys_at(block, used).tolist()
