@@ -65,6 +65,7 @@ def connected(workers: int, scheduler: str | None) -> Iterator[Client]:
                 expected="the address of a Dask scheduler that is running, as tcp://host:8786",
             ) from None
         with client:
+            _allow_failures(client)
             yield client
         return
     with (
@@ -81,6 +82,16 @@ def connected(workers: int, scheduler: str | None) -> Iterator[Client]:
         Client(cluster) as client,
     ):
         yield client
+
+
+def _allow_failures(client: Client) -> None:
+    """Have a scheduler that is running bear with the deaths of workers."""
+
+    # Nested, as the scheduler may not have this package.
+    def allow(count: int, dask_scheduler: Any) -> None:
+        dask_scheduler.allowed_failures = max(dask_scheduler.allowed_failures, count)
+
+    client.run_on_scheduler(allow, _ALLOWED_FAILURES)
 
 
 def records(

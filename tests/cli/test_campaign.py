@@ -116,6 +116,26 @@ def test_a_worker_that_is_killed_costs_what_it_was_running(tmp_path):
 
 
 @pytest.mark.slow
+def test_a_scheduler_that_is_running_survives_more_deaths_than_it_would(tmp_path):
+    distributed = pytest.importorskip("distributed")
+
+    from factorgraph_dvl.campaign.cluster import connected, records
+
+    labels = [f"run-{i}" for i in range(6)]
+    runs = [(sleepy_run, (label, str(tmp_path))) for label in labels]
+    with (
+        distributed.LocalCluster(
+            n_workers=1, threads_per_worker=1, host="127.0.0.1", dashboard_address="127.0.0.1:0"
+        ) as cluster,
+        connected(1, cluster.scheduler_address) as client,
+    ):
+        allowed = client.run_on_scheduler(lambda dask_scheduler: dask_scheduler.allowed_failures)
+        assert allowed >= 30
+        found = dict(records(client, runs, labels))
+    assert all(found[i].done for i in range(6))
+
+
+@pytest.mark.slow
 def test_seeds_of_a_scenario_are_consistent(run, tmp_path):
     pytest.importorskip("distributed")
     config = tmp_path / "scenario.yaml"
