@@ -164,7 +164,9 @@ def _values(results: Sequence[Result]) -> Section:
         row.append(_intervals([v.get(name) for v in own]))
         rows.append(row)
     header: list[Cell] = [both("parameter"), both("unit")]
+    numeric: list[int] = []
     for k, r in enumerate(results):
+        numeric += [len(header)] + ([len(header) + 2] if k else [])
         header += [r.name, both("grade")] + ([both("difference / σ")] if k else [])
     header.append(both("Values, ±1σ (thick) and ±3σ (thin)"))
     text = (
@@ -174,7 +176,7 @@ def _values(results: Sequence[Result]) -> Section:
     return section(
         "Values against each other",
         paragraph(both(text)),
-        table(header, rows, label="Values against each other"),
+        table(header, rows, label="Values against each other", numeric=numeric),
         key="values",
     )
 

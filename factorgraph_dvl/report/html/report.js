@@ -16,9 +16,10 @@
   });
   const short = (v) => v === null || v === undefined ? "–" : Number(v.toPrecision(4)).toString().replace("-", "−");
 
-  // Powers of ten; where they are few, also two and five times them.
+  // Powers of ten; where they are few, also numbers between them.
   const decades = (u, axis, min, max) => {
-    const steps = Math.log10(max / min) < 2.5 ? [1, 2, 5] : [1];
+    const span = Math.log10(max / min);
+    const steps = span > 2.5 ? [1] : span > 1 ? [1, 2, 5] : [1, 1.2, 1.5, 2, 2.5, 3, 4, 5, 6, 7, 8, 9];
     const found = [];
     for (let k = Math.floor(Math.log10(min)); k <= Math.ceil(Math.log10(max)); k++) {
       for (const step of steps) {

@@ -197,7 +197,10 @@ def test_results_side_by_side() -> None:
     page = comparison_page([a, b])
     values = page[page.index('id="values"') :]
     row = values[values.index("scale error") :]
-    assert ">3.00<" in row[: row.index("</tr>")]
+    row = row[: row.index("</tr>")]
+    assert ">3.00<" in row
+    # Values are not broken over lines: two, and the difference.
+    assert row.count('<td class="number">') == 3
     assert "dvl.velocity_std_m_s" in page
     assert "beacons.positions" not in page
 
