@@ -533,7 +533,8 @@ def _cost(trial: Trial) -> float:
     prepared = prepare(trial, STATE_INTERVAL, _silent)
     states = prepared.start_positions.states[0]
     chain = prepared.chain(states)
-    states, values, _ = mounted_start(prepared, chain, states, _silent)
+    at_start = mounted_start(prepared, chain, states, _silent)
+    states, values = at_start.states, at_start.values
     cost = np.nan
     for _ in range(BINDINGS):
         problem = Problem(chain, prepared.observations, prepared.parameters, start=values)

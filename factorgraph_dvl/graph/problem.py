@@ -18,7 +18,7 @@ import numpy as np
 
 from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.rotations import BodyAxes
-from factorgraph_dvl.geometry.vectors import Array, IntArray
+from factorgraph_dvl.geometry.vectors import Array, BoolArray, IntArray
 from factorgraph_dvl.graph import keys
 from factorgraph_dvl.graph.clocks import linearized, parameters_of, true_time
 from factorgraph_dvl.graph.imu_errors import ImuErrors, LinearImuFactors
@@ -81,7 +81,7 @@ class _Bound:
     observation: Observation
     attachment: Attachment
     time: Array
-    usable: Array
+    usable: BoolArray
     weight: Array
     correlated: int | None = None
 
@@ -196,6 +196,8 @@ class Problem:
         When the offsets of clocks hold, s; by default in the middle of the chain.
     processes : sequence of Process, optional
         Correlated errors of the observations, at most one each.
+    usable : mapping of str to ndarray of bool, optional
+        By label, measurements (M,) that may be used where the IMU covers them; by default all.
 
     Attributes
     ----------
@@ -231,6 +233,7 @@ class Problem:
         constants_prior: ConstantsPrior | None = None,
         clock_zero: float | None = None,
         processes: Sequence[Process] = (),
+        usable: Mapping[str, BoolArray] | None = None,
     ) -> None:
         self.chain = chain
         self.processes = tuple(processes)
@@ -265,7 +268,7 @@ class Problem:
         self._start = {**self.prior_values(), **(start or {})}
         self._bound: list[_Bound] = []
         for observation in observations:
-            self._bound.append(self._bind(observation))
+            self._bound.append(self._bind(observation, (usable or {}).get(observation.label)))
         errors = [p for p in self.parameters if p.name in ERRORS]
         self._imu_errors: ImuErrors | None = None
         if errors:
@@ -293,6 +296,11 @@ class Problem:
     def imu_errors(self) -> ImuErrors | None:
         """Errors of the IMU that are estimated, None if there are none."""
         return self._imu_errors
+
+    @property
+    def usable(self) -> dict[str, BoolArray]:
+        """Measurements (M,) that the IMU covers, by label."""
+        return {b.observation.label: b.usable for b in self._bound}
 
     @property
     def weights(self) -> tuple[Array, ...]:
@@ -596,9 +604,11 @@ class Problem:
         bias = np.broadcast_to(bias, (n, BIAS_SIZE))
         return States(nRb, p_n, v_n, gyro_bias=bias[:, 3:], accel_bias=bias[:, :3])
 
-    def _bind(self, observation: Observation) -> _Bound:
+    def _bind(self, observation: Observation, usable: BoolArray | None) -> _Bound:
         time = true_time(observation, self._start, self.clock_zero)
         covered = self.chain.segments.increments.locate(time)[2]
+        if usable is not None:
+            covered = covered & usable
         if not covered.all():
             self.uncovered[observation.label] = int((~covered).sum())
         weight = np.repeat(covered.astype(float)[:, None], len(observation.components), axis=1)

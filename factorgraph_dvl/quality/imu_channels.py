@@ -9,16 +9,13 @@ import numpy as np
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.sensors.imu import COLUMNS, Imu
+from factorgraph_dvl.sensors.invalid_values import frozen_samples
 
 # Samples that repeat, of all channels and of a single one, from which on they are frozen, and for
 # how long at least, s. Chosen: digits of a quiet gyro repeat for a while.
 _ALL = 20
 _SINGLE = 100
 _LEAST_S = 0.5
-# Samples that three gyros, or accelerometers, repeat together, and runs of them at most. Chosen:
-# three channels with digits of their own never do.
-_TRIAD = 5
-_RUNS = 3
 # Samples at the very end of a channel's range, in all, in one run, and against those at the next
 # value, from which on it is saturated. Chosen: the largest of many digits is met once or twice.
 _AT_THE_END = 20
@@ -60,13 +57,9 @@ def channel_findings(imu: Imu) -> Iterator[Finding]:
         yield _frozen("all its channels repeat", imu, begin, length)
         return
     for names, some in (("gyros", slice(0, 3)), ("accelerometers", slice(3, 6))):
-        if not moves[some].all():
-            continue
-        repeats = np.all(np.diff(values[:, some], axis=0) == 0.0, axis=1)
-        begin, length = _longest(repeats)
-        # Coarse digits, and samples that are written twice, repeat in many short runs.
-        runs = np.count_nonzero(np.diff(repeats.astype(int)) > 0)
-        if length >= _TRIAD and runs <= _RUNS:
+        frozen = frozen_samples(values[:, some]) & moves[some].all()
+        begin, length = _longest(frozen[1:])
+        if length:
             yield _frozen(f"all {names} repeat", imu, begin, length)
             return
     for column, k in enumerate(np.flatnonzero(moves).tolist()):
@@ -81,7 +74,8 @@ def _spikes(values: Array, moves: np.ndarray) -> Iterator[Finding]:
         return
     signed = values[1:-1, moves] - 0.5 * (values[2:, moves] + values[:-2, moves])
     deviation = np.abs(signed)
-    usual = np.maximum(np.median(deviation, axis=0), np.finfo(float).tiny)
+    rounding = np.finfo(float).eps * np.abs(values[:, moves]).max(axis=0)
+    usual = np.maximum(np.median(deviation, axis=0), rounding)
     # A spike makes both its neighbours deviate half as much to the other side; a corner does not.
     alone = [
         np.abs(beside + 0.5 * signed[1:-1]) < 0.2 * deviation[1:-1]

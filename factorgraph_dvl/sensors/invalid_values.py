@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.geometry.vectors import Array, BoolArray, IntArray
 from factorgraph_dvl.sensors.dvl import STD_COLUMNS, Dvl
 from factorgraph_dvl.sensors.dvl import VELOCITY_COLUMNS as DVL_COLUMNS
 from factorgraph_dvl.sensors.dvl_beams import DvlBeams
@@ -29,6 +29,8 @@ _AT_AN_END = 3
 _REPEATED = 5
 _STEPS = 6.0
 _LEAST_STEP = {"m_s": 0.02, "deg": 3e-5}
+# Share of the samples of the IMU that may be frozen. Chosen: more are written several times each.
+_MOST_FROZEN = 0.3
 # Latitude, longitude and height on one scale, deg: a metre is 1e-5 deg.
 _FIX_DEG = np.array([1.0, 1.0, 1e-5])
 
@@ -40,7 +42,7 @@ def without_invalid_values(
 ) -> tuple[dict[str, Array], list[Finding]]:
     """Return the columns of a table with invalid values as nan, and what was found.
 
-    Rows of the IMU that are all zeros are left out: there a gap is a gap.
+    Rows of the IMU that are all zeros or frozen are left out: there a gap is a gap.
 
     Parameters
     ----------
@@ -66,7 +68,36 @@ def without_invalid_values(
         if 0 < zero.sum() < 0.5 * zero.size:
             out = {name: values[~zero] for name, values in out.items()}
             findings.append(_finding("IMU", source, [f"{zero.sum()} samples of zeros"]))
+        channels = np.stack([out[name] for name in IMU_COLUMNS[1:]], axis=1)
+        frozen = frozen_samples(channels[:, :3]) | frozen_samples(channels[:, 3:])
+        if frozen.any():
+            out = {name: values[~frozen] for name, values in out.items()}
+            text = f"{frozen.sum()} samples that repeat the one before"
+            findings.append(_finding("IMU", source, [text]))
     return out, findings
+
+
+def frozen_samples(values: Array) -> BoolArray:
+    """Return which samples of a triad (M, 3) repeat those before for long, (M,) bool.
+
+    Three channels with digits of their own never do by chance. Coarse digits, and samples that are
+    written several times, repeat in many runs.
+    """
+    same = np.all(np.diff(values, axis=0) == 0.0, axis=1)
+    begin, end = _runs(same)
+    long = end - begin >= _REPEATED
+    out = np.zeros(values.shape[0], dtype=bool)
+    if np.count_nonzero(~long) > np.count_nonzero(long):
+        return out
+    for a, b in zip(begin[long].tolist(), end[long].tolist(), strict=True):
+        out[a + 1 : b + 1] = True
+    return out & (np.count_nonzero(out) < _MOST_FROZEN * out.size)
+
+
+def _runs(true: BoolArray) -> tuple[IntArray, IntArray]:
+    """Return where runs of true begin, and where they end."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], true.astype(int), [0]])))
+    return edges[::2], edges[1::2]
 
 
 def _blank(
@@ -163,11 +194,10 @@ def _frozen(values: Array, least: float, moving: np.ndarray) -> Array:
     usual = float(np.median(steps))
     if usual == 0.0:
         return out
-    same = np.concatenate([[False], steps == 0.0, [False]])
-    edges = np.flatnonzero(np.diff(same.astype(int)))
-    long = edges[1::2] - edges[::2] >= _REPEATED - 1
+    starts, ends = _runs(steps == 0.0)
+    long = ends - starts >= _REPEATED - 1
     by_chance = np.count_nonzero(~long) > np.count_nonzero(long)
-    for begin, end in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
+    for begin, end in zip(starts.tolist(), ends.tolist(), strict=True):
         # Steps begin .. end - 1 are zero: rows begin + 1 .. end repeat row begin.
         jumps = end < steps.size and steps[end] > max(_STEPS * usual, least)
         surely = jumps or (moving[there[begin]] and not by_chance)

@@ -6,10 +6,10 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.geometry.vectors import Array, BoolArray
 from factorgraph_dvl.graph.problem import Evaluation, Problem
 from factorgraph_dvl.solvers.levenberg_marquardt import quick_step
-from factorgraph_dvl.statistics.robust_weights import BoolArray, Truncation, windows
+from factorgraph_dvl.statistics.robust_weights import Truncation, windows
 from factorgraph_dvl.statistics.square_root_information import eliminated
 
 # Share of the measurements of a kind from which on it is the model that is wrong, and none is

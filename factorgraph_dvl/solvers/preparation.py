@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph.inertial_chain import Chain, inertial_chain
@@ -22,6 +24,7 @@ from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.sensors.protocol import Observation
 from factorgraph_dvl.solution import Progress
 from factorgraph_dvl.solvers.levenberg_marquardt import minimise
+from factorgraph_dvl.solvers.outliers import robust_weights
 from factorgraph_dvl.solvers.state_times import dense_epochs
 from factorgraph_dvl.trial import Trial
 
@@ -29,6 +32,9 @@ from factorgraph_dvl.trial import Trial
 # this, or after so many steps. Chosen: the next stage goes on from there.
 ROUGH_TOLERANCE = 1.0
 _ROUGH_ITERATIONS = 10
+# Square of a residual, in the mean and in variances, above which gross errors are searched before
+# the mounting is. Chosen: jumps of 10 m do no harm there, those of 50 m do.
+_GROSS = 10.0
 
 
 @dataclass(frozen=True)
@@ -156,16 +162,39 @@ def _left_out(trial: Trial) -> list[Finding]:
     ]
 
 
+@dataclass(frozen=True)
+class MountedStart:
+    """Where the minimisation with all sensors starts.
+
+    Parameters
+    ----------
+    states : States
+        Motion.
+    values : dict of str to ndarray
+        Parameters that fit it.
+    robust_weights : dict of str to ndarray
+        Weights of measurements that are gross errors there, 0 or 1, by label.
+    iterations : int
+        That it took.
+    """
+
+    states: States
+    values: dict[str, Array]
+    robust_weights: dict[str, Array]
+    iterations: int
+
+
 def mounted_start(
     prepared: Preparation, chain: Chain, states: States, report: Progress
-) -> tuple[States, dict[str, Array], int]:
-    """Return states, values of the parameters that fit them, and the iterations it took.
+) -> MountedStart:
+    """Return states, and values of the parameters that fit them.
 
     GNSS and IMU alone smooth the motion first, unless the DVL is calibrated: such a one does
     no harm from the start.
     """
     iterations = 0
     values = prepared.mountings
+    gross: dict[str, Array] = {}
     aids = mounted_aids(prepared.trial, prepared.mountings)
     if aids is not None:
         observations, parameters = observed(aids, prepared.frame, prepared.trial.body_axes)
@@ -181,10 +210,14 @@ def mounted_start(
             tolerance=ROUGH_TOLERANCE,
             proven=False,
         )
-        states, iterations = coarse.evaluation.states, coarse.iterations
+        evaluation, iterations = coarse.evaluation, coarse.iterations
+        count = sum(np.count_nonzero(weights) for weights in problem.weights)
+        if 2.0 * evaluation.cost > _GROSS * count:
+            gross, evaluation = robust_weights(problem, evaluation) or (gross, evaluation)
+        states = evaluation.states
         assert prepared.trial.gnss is not None
-        found = coarse.evaluation.parameters
+        found = evaluation.parameters
         values = values | {p.name: found[p.name] for p in prepared.trial.gnss.parameters()}
     report("mounting", 0, None)
     (best, *_) = prepared.mountings_at(chain, states)
-    return states, values | best, iterations
+    return MountedStart(states, values | best, gross, iterations)

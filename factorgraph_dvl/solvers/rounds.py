@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.geometry.vectors import Array, BoolArray
 from factorgraph_dvl.graph.priors import ConstantsPrior
 from factorgraph_dvl.graph.problem import Evaluation, Problem
 from factorgraph_dvl.graph.processes import Process
@@ -128,8 +128,12 @@ def settle(
     if constants_prior is not None:
         values = constants_prior.parameters
     iterations = 0
+    robust: dict[str, Array] = {}
+    usable: Mapping[str, BoolArray] | None = None
     if values is None:
-        states, values, iterations = mounted_start(prepared, chain, states, report)
+        start = mounted_start(prepared, chain, states, report)
+        states, values, iterations = start.states, start.values, start.iterations
+        robust = start.robust_weights
     rejected = prepared.start_positions.rejected
     tried: list[Mapping[str, Array]] = []
     cycle: list[Mapping[str, Array]] = []
@@ -139,7 +143,6 @@ def settle(
         for o in prepared.observations
         if o.label in estimated and o.noise_groups
     }
-    robust: dict[str, Array] = {}
     searches = 0
     correlation_searched = False
     freed: list[Explanation] = []
@@ -152,24 +155,25 @@ def settle(
     changing: list[str] = ["all"]
     count = in_a_row = 0
     movement = np.inf
-    start = values
+    bound = values
     while count < _ROUNDS:
         count += 1
         only_times = changing == [_TIMES]
         before = movement
-        movement = _clock_movement(prepared, start, values) if only_times else np.inf
+        movement = _clock_movement(prepared, bound, values) if only_times else np.inf
         if changing not in ([_NOISE], [_OUTLIERS]):
             # Where sway repeats itself, two bindings may lead to each other for ever.
             settling = not only_times or movement < _NOT_SETTLING * before
-            start = values if settling else values | _halfway(prepared, start, values)
+            bound = values if settling else values | _halfway(prepared, bound, values)
             problem = Problem(
                 chain,
                 prepared.observations,
                 parameters,
-                start=start,
+                start=bound,
                 constants_prior=constants_prior,
                 clock_zero=clock_zero,
                 processes=levels.processes,
+                usable=usable,
             )
             problem.reject(rejected)
         problem.processes = levels.processes
@@ -178,6 +182,8 @@ def settle(
         problem.robust_weights = robust
         in_a_row = in_a_row + 1 if only_times else 0
         problem.loosely_bound = in_a_row > _IN_A_ROW
+        # At the ends of the record two bindings may use one measurement in turn.
+        usable = problem.usable if problem.loosely_bound else None
         at = problem.values(states, problem.prior_values() | values)
         minimum = minimise(problem, at, stage="all sensors", progress=report, binding=True)
         iterations += minimum.iterations
@@ -197,6 +203,10 @@ def settle(
         if not _same(outliers, rejected):
             changing.append("which measurements are echoes")
         if not changing and searches < _SEARCHES:
+            if searches == 0:
+                # Gross errors of the start are searched anew, among all.
+                problem.robust_weights = robust = {}
+                problem.weigh(minimum.evaluation)
             searches += 1
             outliers_found = robust_weights(problem, minimum.evaluation)
             if outliers_found is not None:

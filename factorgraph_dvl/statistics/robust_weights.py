@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import chdtri
 
-from factorgraph_dvl.geometry.vectors import Array
-
-BoolArray = NDArray[np.bool_]
+from factorgraph_dvl.geometry.vectors import Array, BoolArray
 
 # Probability with which a good measurement passes the gate. Chosen: one in a thousand is lost.
 _GATE = 0.999

@@ -112,3 +112,30 @@ def test_zero_rows_of_the_imu_are_left_out():
     out, (finding,) = without_invalid_values("imu", table, "imu.csv")
     assert out["time_s"].size == 97
     assert "3 samples of zeros" in finding.text
+
+
+def imu_table(rows=400, seed=0):
+    rng = np.random.default_rng(seed)
+    names = COLUMNS[1:]
+    return {"time_s": 0.01 * np.arange(rows), **{n: rng.standard_normal(rows) for n in names}}
+
+
+@pytest.mark.parametrize("triad", [COLUMNS[1:4], COLUMNS[4:]])
+def test_frozen_samples_of_a_triad_are_left_out(triad):
+    table = imu_table()
+    for name in triad:
+        table[name][50:60] = table[name][50]
+    out, (finding,) = without_invalid_values("imu", table, "imu.csv")
+    np.testing.assert_array_equal(np.delete(table["time_s"], np.arange(51, 60)), out["time_s"])
+    assert "9 samples that repeat the one before in imu.csv" in finding.text
+
+
+def test_coarse_digits_and_samples_written_twice_are_not_frozen():
+    coarse = imu_table()
+    coarse |= {name: np.round(5.0 + coarse[name] / 3.0) for name in COLUMNS[1:]}
+    assert without_invalid_values("imu", coarse, "imu.csv")[1] == []
+    for times in (2, 8):
+        table = imu_table(400 // times)
+        written = {n: np.repeat(v, times) for n, v in table.items()}
+        written["time_s"] = 0.01 * np.arange(written["time_s"].size)
+        assert without_invalid_values("imu", written, "imu.csv")[1] == []

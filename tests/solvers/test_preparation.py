@@ -59,8 +59,10 @@ def test_states_and_mounting_to_start_from_are_near_the_truth(prepared):
     trial, _ = solved.turning()
     (states,) = prepared.start_positions.states
     chain = prepared.chain(states)
-    states, values, iterations = mounted_start(prepared, chain, states, lambda *_: None)
-    assert iterations > 0
+    start = mounted_start(prepared, chain, states, lambda *_: None)
+    states, values = start.states, start.values
+    assert start.iterations > 0
+    assert not start.robust_weights
     truth = exp_so3(trial.calibration_truth["misalignment_deg"] * DEG)
     off = np.linalg.norm(log_so3(truth.T @ values["misalignment_deg"])) / DEG
     assert off < 2.0
@@ -96,3 +98,22 @@ def test_an_error_that_is_stated_and_not_estimated_is_named():
     for each, count in ((trial, 0), (walking, 1)):
         found = prepare(each, 1.0, lambda stage, iteration, cost: None).findings
         assert sum(f.code == Code.ERROR_LEFT_OUT for f in found) == count
+
+
+def test_large_jumps_of_gnss_turn_no_mounting_that_is_started_from(prepared):
+    """Fixes 50 m off for a tenth of the trial."""
+    trial, _ = solved.turning()
+    fixes = trial.gnss.geodetic.copy()
+    jump = slice(len(fixes) // 2, len(fixes) // 2 + len(fixes) // 10)
+    fixes[jump, 2] += 5.0
+    fixes[jump, :2] += 50.0 / 6.4e6
+    jumping = replace(trial, gnss=replace(trial.gnss, geodetic=fixes))
+    other = prepare(jumping, 1.0, lambda *_: None)
+    (states,) = other.start_positions.states
+    start = mounted_start(other, other.chain(states), states, lambda *_: None)
+    (weights,) = start.robust_weights.values()
+    out = np.flatnonzero(weights[:, 0] == 0.0)
+    np.testing.assert_array_equal(out, np.arange(jump.start, jump.stop))
+    truth = exp_so3(trial.calibration_truth["misalignment_deg"] * DEG)
+    off = np.linalg.norm(log_so3(truth.T @ start.values["misalignment_deg"])) / DEG
+    assert off < 2.0
