@@ -298,7 +298,7 @@ def _as_scattered(problem: Problem, evaluation: Evaluation) -> dict[str, Array]:
     ):
         if o.label not in problem.noise_factors:
             continue
-        scale = np.maximum(robust_scale(np.where(weight > 0.0, residual, np.nan)), _LEAST_SCALE)
+        scale = robust_scale(np.where(weight > 0.0, residual, np.nan), _LEAST_SCALE)
         for group in map(list, o.noise_groups):
             scale[group] = np.max(scale[group])
         out[o.label] = problem.noise_factors[o.label] * scale

@@ -74,7 +74,11 @@ def _searches(
     used = _used(problem, groups)
     residuals = _normalised(problem, evaluation, used, groups)
     return {
-        label: Truncation(residuals[label], apart=problem.observations[i].independent)
+        label: Truncation(
+            residuals[label],
+            apart=problem.observations[i].independent,
+            unit=1.0 / problem.noise_factors.get(label, np.ones(1)),
+        )
         for label, i in groups.items()
         if np.count_nonzero(used[label].any(axis=1)) >= _FEWEST
     }

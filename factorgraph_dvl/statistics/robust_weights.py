@@ -25,11 +25,11 @@ _RUN_TIME = 10.0
 _RUN_SHARE = 0.75
 
 
-def robust_scale(residuals: Array) -> Array:
+def robust_scale(residuals: Array, least: Array | float = _LEAST_SCALE) -> Array:
     """Return the standard deviation (d,) of white noise in residuals (M, d), nan where unused.
 
     From the median absolute deviation of first differences over sqrt(2): neither outliers nor
-    what is slow, as errors of the model or correlated noise, count.
+    what is slow, as errors of the model or correlated noise, count. It is `least` at least.
     """
     step = np.diff(residuals, axis=0) / np.sqrt(2.0)
     out = np.ones(residuals.shape[1])
@@ -37,7 +37,7 @@ def robust_scale(residuals: Array) -> Array:
         known = column[np.isfinite(column)]
         if known.size:
             out[i] = 1.4826 * np.median(np.abs(known - np.median(known)))
-    return np.maximum(out, _LEAST_SCALE)
+    return np.maximum(out, least)
 
 
 class Truncation:
@@ -49,14 +49,17 @@ class Truncation:
     Parameters
     ----------
     residuals : ndarray, shape (M, d)
-        At the start, in stated standard deviations; nan where a component is not used. Their
-        scale is frozen there.
+        At the start, in standard deviations; nan where a component is not used. Their scale is
+        frozen there.
     apart : bool
         Whether components are outliers each for itself.
+    unit : ndarray, shape (d,), or float, default 1
+        Stated standard deviations in those of `residuals`. An error of less than about one is
+        none that is gross, however little the rest scatters.
     """
 
-    def __init__(self, residuals: Array, *, apart: bool) -> None:
-        self._scale = robust_scale(residuals)
+    def __init__(self, residuals: Array, *, apart: bool, unit: Array | float = 1.0) -> None:
+        self._scale = robust_scale(residuals, _LEAST_SCALE * unit)
         self._apart = apart
         used = np.isfinite(residuals)
         freedom = np.ones(used.shape) if apart else used.sum(axis=1, keepdims=True)

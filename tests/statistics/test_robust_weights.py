@@ -56,6 +56,14 @@ def test_a_mean_is_found_among_outliers(apart):
     assert np.all(np.abs(mean) < 0.2)
 
 
+def test_errors_of_less_than_a_stated_deviation_are_not_gross():
+    """The noise turned out to be a 25th of what was stated."""
+    data = noise()
+    data[::10] += 4.0
+    assert Truncation(data, apart=False).worth_it
+    assert not Truncation(data, apart=False, unit=25.0).worth_it
+
+
 def test_unused_components_count_nothing():
     data = noise()
     data[5] = np.nan
