@@ -484,7 +484,11 @@ class Run:
 
 def outcome(run: Run) -> dict[str, Any]:
     """Solve a trial as its user would, from files."""
-    made = run.trial()
+    try:
+        made = run.trial()
+    except FactorgraphDvlError as error:
+        # No record may hold such values.
+        return {"grade": "refused", "exit": error.exit_code, "reason": str(error)}
     with tempfile.TemporaryDirectory() as folder:
         save_trial(made, Path(folder) / "trial", parquet=True)
         start = time.process_time()

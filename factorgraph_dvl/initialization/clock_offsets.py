@@ -41,6 +41,14 @@ _MINIMA = 5
 # Log-likelihood per degree of freedom by which minima differ at least, or the nearest is taken.
 # Chosen: sway repeats itself all but exactly.
 _ALIKE = 0.2
+# Variance of a window beside the usual one from which on it stands out, that another offset may
+# have beside this one in any window, and must have in such a one at most; gain of its
+# log-likelihood. Chosen: with a period of sway too many, motion differs where a turn begins or
+# ends only.
+_STANDS_OUT = 1.4
+_NO_WORSE = 1.15
+_BETTER_THERE = 0.8
+_DOMINATES = 50.0
 # Halvings of a step that does not gain.
 _HALVINGS = 3
 # Blocks of measurements whose errors are independent, s. Chosen: several times the correlation
@@ -165,6 +173,7 @@ def clock_offset(
     time = comparison.time
     middle = float(np.mean(time[comparison.inside]))
     whole, first, last = _scan(comparison, around, reach)
+    whole = _dominating(comparison, whole, around, reach)
     one = np.ones_like(time)
     constant = _refined(comparison, one[..., None], np.array([whole]))
     best, rate, jump, jump_time = constant, (0.0, 0.0), (0.0, 0.0), np.nan
@@ -177,9 +186,7 @@ def clock_offset(
         found = _first_of(comparison, design, starts)
         if found.better_than(best) and _explains(comparison, found, constant):
             best, rate = found, (float(found.values[1]), float(found.sigma[1]))
-        at, before, after = _break(
-            comparison, _grid(around, reach, _STEP_S), float(constant.values[0])
-        )
+        at, before, after = _break(comparison, float(constant.values[0]), around, reach)
         design = np.stack([one, (time > at).astype(float)], axis=-1)
         found = _refined(comparison, design, np.array([before, after - before]))
         sides = [np.unique(_blocks(comparison)[side]).size for side in (time > at, time <= at)]
@@ -248,6 +255,42 @@ def _scan(comparison: Comparison, around: float, reach: float) -> tuple[float, f
             break
     thirds = [float(grid[np.argmin(misfits[:, part].sum(axis=1))]) for part in parts]
     return best, thirds[0], thirds[-1]
+
+
+def stands_out(comparison: Comparison, offset: float | Array) -> float:
+    """Return the variance of the window that fits worst, beside that of the usual window."""
+    variance = _variances(comparison, offset)
+    return float(variance.max() / max(float(np.median(variance)), 1e-12))
+
+
+def _variances(comparison: Comparison, offset: float | Array) -> Array:
+    """Return the mean square of each window, (W,), and of digits."""
+    squares = np.sum(comparison.residual(offset) ** 2, axis=(1, 2))
+    return np.asarray(squares / np.maximum(comparison.count, 1.0) + _LEAST_MISFIT**2)
+
+
+def _dominating(comparison: Comparison, offset: float, around: float, reach: float) -> float:
+    """Return the offset that fits each window as well as another, and one of them much better.
+
+    Sway repeats itself, and steady turns as well. Where the motion changes, the difference shows.
+    """
+    at = _variances(comparison, offset)
+    worst = int(np.argmax(at))
+    if at[worst] < _STANDS_OUT * np.median(at):
+        return offset
+    there = comparison.only(np.array([worst]))
+    grid = _grid(around, reach, _FINE_STEP_S)
+    minima = grid[_minima(_misfits_at(there, grid).sum(axis=1), np.inf)]
+    likely = np.argsort(_misfits_at(comparison, minima).sum(axis=1))
+    starts = minima[likely[:_MINIMA]]
+    best, most = offset, _DOMINATES
+    for start in starts:
+        fit = _refined(comparison, np.ones_like(comparison.time)[..., None], np.array([start]))
+        ratio = _variances(comparison, float(fit.values[0])) / at
+        gain = -0.5 * float(np.sum(comparison.count * np.log(ratio)))
+        if gain > most and ratio.max() < _NO_WORSE and ratio[worst] < _BETTER_THERE:
+            best, most = float(fit.values[0]), gain
+    return best
 
 
 def _lowest(grid: Array, misfit: Array, freedom: float) -> list[float]:
@@ -427,13 +470,15 @@ def _explains(comparison: Comparison, fit: _Fit, without: _Fit, at: float = np.n
     return bool(np.all(variance[~around] < _ALIKE_WINDOWS * usual))
 
 
-def _break(comparison: Comparison, grid: Array, constant: float) -> tuple[float, float, float]:
+def _break(
+    comparison: Comparison, constant: float, around: float, reach: float
+) -> tuple[float, float, float]:
     """Return when an offset jumps, if it does, and its values before and after.
 
     They are `constant`, the best offset without a jump, where another one is hardly better: by
     a period of the sway, nearly the same motion is measured.
     """
-    grid = np.unique([*grid, constant])
+    grid = np.unique([*_grid(around, reach, _STEP_S), constant])
     misfits = _misfits_at(comparison, grid)
     count = misfits.shape[1]
     sums = np.concatenate([np.zeros((grid.size, 1)), np.cumsum(misfits, axis=1)], axis=1)
@@ -442,6 +487,11 @@ def _break(comparison: Comparison, grid: Array, constant: float) -> tuple[float,
     before, after = (
         _nearest_alike(grid, misfit[:, k], constant, float(comparison.count[part].sum()))
         for misfit, part in ((sums, slice(k)), (whole, slice(k, None)))
+    )
+    sides = np.arange(count) < k, np.arange(count) > k
+    before, after = (
+        _dominating(comparison.only(side), offset, around, reach) if side.any() else offset
+        for side, offset in zip(sides, (before, after), strict=True)
     )
     time = comparison.time
     first, last = time[max(k - 1, 0)].min(), time[min(k, count - 1)].max()

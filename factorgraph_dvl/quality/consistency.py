@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import TypeVar
 
 import numpy as np
 
@@ -22,6 +23,7 @@ from factorgraph_dvl.initialization.clock_offsets import (
     clock_offset,
     least_misfit,
     noise_share,
+    stands_out,
 )
 from factorgraph_dvl.initialization.dvl_windows import DvlWindows, dvl_windows
 from factorgraph_dvl.initialization.gnss_windows import GnssWindows, WindowFit, gnss_windows
@@ -66,6 +68,10 @@ _ENOUGH = 0.5
 _SEARCHES = 4
 # Share of it that a cause may leave.
 _LEFT = 0.5
+# Residual, in medians, from which on it counts no more, and share of squares that another clock
+# may leave to be believed. Chosen: outliers count alike by any clock.
+_TRUNCATED = 5.0
+_LEFT_BY_CLOCK = 0.9
 # Offsets around which clocks that are off by far are looked for, and the reach, s. Chosen: a
 # minute, after the leap seconds.
 _FAR_S = (LEAP_SECONDS, -LEAP_SECONDS, *(s * k for k in range(9, 60, 9) for s in (1.0, -1.0)))
@@ -73,8 +79,13 @@ _REACH_S = 5.0
 _FAR_STEP_S = 0.25
 # Offset from which on a minimum may be the edge of a scan, s.
 _AT_EDGE_S = 4.5
-# Share of what is unexplained that such a clock may leave. Chosen: it explains all but outliers.
+# Share of what is unexplained that such a clock may leave, and of all that the IMU leaves. Chosen:
+# it explains all but outliers and noise.
 _FAR_LEFT = 0.2
+_FAR_LEFT_OF_ALL = 0.5
+# Variance of a window beside the usual one from which on such a clock is looked for. Chosen:
+# correlated noise leaves less.
+_STANDS_OUT = 4.0
 # How many times less mirrored axes of a DVL leave than right-handed ones, and scale error they
 # may have. Chosen: sway repeats itself, so that a late clock mirrors some axes nearly.
 _MIRRORED = 4.0
@@ -133,10 +144,20 @@ def consistency_findings(trial: Trial, errors: Sequence[Finding]) -> Iterator[Fi
         directions = next((v.directions() for v in views if isinstance(v, _GnssView)), None)
         yield _imu_finding(wrong, directions, trial.body_axes)
     for view in views:
-        found = _far(view) if view.excess > _UNEXPLAINED or view.off > _AT_EDGE_S else view
+        far = view.excess > _UNEXPLAINED or view.off > _AT_EDGE_S or _stands_out(view)
+        found = _far(view) if far else view
         yield from found.findings()
         if isinstance(found, _GnssView) and not wrong:
             yield from _course_findings(found.directions(), trial.body_axes)
+
+
+_Windows = TypeVar("_Windows", GnssWindows, DvlWindows)
+
+
+def _stands_out(view: _GnssView | _DvlView) -> bool:
+    if view.clock is None:
+        return False
+    return stands_out(view.compared, view.clock.late(view.compared.time)) > _STANDS_OUT
 
 
 def _stated(sensor: Gnss | Dvl) -> float:
@@ -146,19 +167,34 @@ def _stated(sensor: Gnss | Dvl) -> float:
 def _compared(
     windows: CarriedWindows, sensor: Gnss | Dvl, around: float
 ) -> GnssWindows | DvlWindows | None:
+    compared: GnssWindows | DvlWindows | None
     if isinstance(sensor, Gnss):
-        return _gnss_compared(windows, sensor, around)
-    return _dvl_compared(windows, sensor, around)
-
-
-def _gnss_compared(windows: CarriedWindows, sensor: Gnss, around: float) -> GnssWindows | None:
-    compared = gnss_windows(windows, sensor, around)
+        compared = gnss_windows(windows, sensor, around)
+    else:
+        compared = dvl_windows(windows, sensor, around)
     return None if compared is None else compared.without_outliers(around)
 
 
-def _dvl_compared(windows: CarriedWindows, sensor: Dvl, around: float) -> DvlWindows | None:
-    compared = dvl_windows(windows, sensor, around)
-    return None if compared is None else compared.without_outliers(around)
+def _without_outliers(compared: _Windows, around: float) -> _Windows:
+    """Return a comparison without outliers: beside the clock as it is stated, or as it looks.
+
+    With a wrong clock, what changes the motion stands out.
+    """
+    kept = compared.without_outliers(around)
+    if kept.inside.sum() == compared.inside.sum():
+        return kept
+    clock = clock_offset(compared, around)
+    if clock is None:
+        return kept
+    lefts = [
+        np.linalg.norm(compared.residual(late), axis=2)[compared.inside]
+        for late in (around, clock.late(compared.time))
+    ]
+    most = _TRUNCATED * max(min(float(np.median(left)) for left in lefts), compared.noise)
+    stated, found = (float(np.sum(np.minimum(left, most) ** 2)) for left in lefts)
+    if found < _LEFT_BY_CLOCK * stated:
+        return compared.without_outliers(clock.late(compared.time))
+    return kept
 
 
 def _views(windows: CarriedWindows, sensors: Sequence[Gnss | Dvl]) -> list[_GnssView | _DvlView]:
@@ -170,12 +206,15 @@ def _view(
     windows: CarriedWindows, sensor: Gnss | Dvl, around: float
 ) -> _GnssView | _DvlView | None:
     if isinstance(sensor, Gnss):
-        gnss = _gnss_compared(windows, sensor, around)
-        clock = None if gnss is None else clock_offset(gnss, around)
-        return None if gnss is None else _GnssView(sensor, windows, gnss, clock, around)
-    dvl = _dvl_compared(windows, sensor, around)
+        gnss = gnss_windows(windows, sensor, around)
+        if gnss is None:
+            return None
+        gnss = _without_outliers(gnss, around)
+        return _GnssView(sensor, windows, gnss, clock_offset(gnss, around), around)
+    dvl = dvl_windows(windows, sensor, around)
     if dvl is None:
         return None
+    dvl = _without_outliers(dvl, around)
     right = _dvl_view(windows, sensor, replace(dvl, handedness=1), around)
     if right.excess < _CONTRADICTS and right.off < _ALIASED_S:
         return right
@@ -349,8 +388,11 @@ def _far(view: _GnssView | _DvlView) -> _GnssView | _DvlView:
     if not shares:
         return view
     found = _view(view.windows, view.sensor, min(shares)[1])
-    enough = found is not None and found.excess < max(_FAR_LEFT * view.excess, _CONTRADICTS)
-    return found if found is not None and enough else view
+    if found is None or found.clock is None or view.clock is None:
+        return view
+    enough = found.excess < max(_FAR_LEFT * view.excess, _CONTRADICTS)
+    better = found.clock.unexplained < _FAR_LEFT_OF_ALL * view.clock.unexplained
+    return found if enough and better else view
 
 
 def _gnss_mistake(view: _GnssView) -> str:

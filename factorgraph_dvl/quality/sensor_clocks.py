@@ -17,6 +17,8 @@ from factorgraph_dvl.sensors.gnss import Gnss
 _LEAST_S = 0.05
 _SIGMAS = 6.0
 _LEAST_GAIN = 15.0
+# A jump below this, s, is none. Chosen: no parameter takes up the smallest that is certain.
+_LEAST_JUMP_S = 0.01
 # Prior standard deviations that an offset may be off, and s that a fixed one may. Chosen: beyond,
 # the result is not to be used.
 _COVERED = 3.0
@@ -54,13 +56,13 @@ def clock_findings(
             sensor.label,
             severity="error" if abs(change) > covered else "warning",
         )
-    if abs(clock.jump) > max(_LEAST_S, _SIGMAS * clock.jump_sigma):
+    if abs(clock.jump) > max(_LEAST_JUMP_S, _SIGMAS * clock.jump_sigma):
         yield Finding(
             Code.CLOCK_STEP,
-            f"its clock jumps by {clock.jump:.2f} ± {clock.jump_sigma:.2f} s near "
+            f"its clock jumps by {clock.jump:.2g} ± {clock.jump_sigma:.1g} s near "
             f"{clock.jump_time:.0f} s against the IMU's",
             sensor.label,
-            severity="error" if abs(clock.jump) > _HARMLESS_S else "warning",
+            severity="error",
         )
     off = clock.offset - mean
     if abs(off) > max(_LEAST_S, _SIGMAS * clock.sigma):

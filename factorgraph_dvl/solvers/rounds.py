@@ -203,7 +203,7 @@ def settle(
         if not _same(outliers, rejected):
             changing.append("which measurements are echoes")
         if not changing and searches < _SEARCHES:
-            if searches == 0:
+            if robust and searches == 0:
                 # Gross errors of the start are searched anew, among all.
                 problem.robust_weights = robust = {}
                 problem.weigh(minimum.evaluation)

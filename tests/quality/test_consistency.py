@@ -288,3 +288,28 @@ def test_spikes_below_the_integrated_noise_hide_no_other_error(trial: Trial) -> 
 
     assert list(found(trial, few)) == []
     assert list(found(trial, few, faults.late("dvl", 0.3))) == [Code.CLOCK_OFFSET]
+
+
+def swaying_turns() -> Trial:
+    """Steady turns under sway at 2 Hz: by a period, nearly the same motion is measured."""
+    legs = [{"straight_s": 40}, {"turn_deg_s": 9, "duration_s": 40}]
+    sway = {
+        "roll": [{"amplitude_deg": 4, "frequency_hz": 2}],
+        "pitch": [{"amplitude_deg": 4, "frequency_hz": 2, "phase_deg": 90}],
+    }
+    moving = {"repeat": 2, "manoeuvres": legs}
+    return simulate(scenario(noise=True, sway=sway, manoeuvres=[moving]), 2)
+
+
+def test_clocks_that_are_off_by_periods_of_the_sway_are_found() -> None:
+    trial = swaying_turns()
+    assert found(trial) == {}
+    text = found(trial, faults.late("dvl", 3.0))[Code.CLOCK_OFFSET]
+    assert "time_offset_s: 3.00" in text
+    assert Code.LEAP_SECONDS in found(trial, faults.late("gnss", 18.0))
+
+
+def test_small_steps_of_a_clock_are_errors(trial: Trial) -> None:
+    """Nothing that is estimated takes them up."""
+    problems = survey(faults.with_faults(trial, [faults.clock_step("dvl", 0.1)])).problems
+    assert [(p.code, p.severity) for p in problems] == [(Code.CLOCK_STEP, "error")]
