@@ -65,6 +65,8 @@ class Interpolation:
         L and U of position and velocity along an axis.
     motion_variance : ndarray, shape (M, 2, 2, 3)
         V of position and velocity, by axis.
+    motion_variance_rate : ndarray, shape (M, 2, 2, 3)
+        Its derivative in time.
     acceleration : ndarray, shape (M, 4)
         Derivative of the velocity in time by position and velocity of both nodes.
     process_before, process_after, process_variance : ndarray, shape (M, n - 6)
@@ -75,6 +77,7 @@ class Interpolation:
     motion_before: Array
     motion_after: Array
     motion_variance: Array
+    motion_variance_rate: Array
     acceleration: Array
     process_before: Array
     process_after: Array
@@ -104,6 +107,12 @@ class Interpolation:
     def variance(self, by_state: Array) -> Array:
         """Return J V Jᵀ, (M, d, d), from derivatives J (M, d, n) by the states between."""
         by_noise = _times(by_state, self.motion_variance, self.process_variance)
+        return np.asarray(by_noise @ by_state.transpose(0, 2, 1))
+
+    def variance_rate(self, by_state: Array) -> Array:
+        """Return the derivative of J V Jᵀ in time, that of processes apart."""
+        none = np.zeros_like(self.process_variance)
+        by_noise = _times(by_state, self.motion_variance_rate, none)
         return np.asarray(by_noise @ by_state.transpose(0, 2, 1))
 
 
@@ -211,6 +220,10 @@ class MotionChain:
         v_pp = tau**3 * rest**3 / (3.0 * span**3)
         v_pv = tau**2 * rest**2 * (rest - tau) / (2.0 * span**3)
         v_vv = tau * rest * (span**2 - 3.0 * tau * rest) / span**3
+        left = rest - tau
+        r_pp = tau**2 * rest**2 * left / span**3
+        r_pv = tau * rest * (left**2 - tau * rest) / span**3
+        r_vv = left * (span**2 - 6.0 * tau * rest) / span**3
         p_after, v_after = 3.0 * s**2 - 2.0 * s**3, 6.0 * (s - s**2) / span
         before = _blocks(1.0 - p_after, span * s * (1 - s) ** 2, -v_after, 3 * s**2 - 4 * s + 1.0)
         after = _blocks(p_after, -span * s**2 * (1.0 - s), v_after, 3.0 * s**2 - 2.0 * s)
@@ -226,19 +239,20 @@ class MotionChain:
         if lasting is not None:
             tau = np.clip(lasting - self.time[k], 0.0, span)
             rest = span - tau
+        density = self.density[k][:, None, None, :]
         own = np.array([p.tau for p in self.processes for _ in range(p.sigma.size)])
         scaled = [t[:, None] / own for t in (span, tau, rest)]
-        whole, left, right = (np.sinh(t) for t in scaled)
+        whole, since, until = (np.sinh(t) for t in scaled)
         missing = np.expm1(-2.0 * scaled[1]) * np.expm1(-2.0 * scaled[2])
         return Interpolation(
             node=k,
             motion_before=before,
             motion_after=after,
-            motion_variance=_blocks(v_pp, v_pv, v_pv, v_vv)[..., None]
-            * self.density[k][:, None, None, :],
+            motion_variance=_blocks(v_pp, v_pv, v_pv, v_vv)[..., None] * density,
+            motion_variance_rate=_blocks(r_pp, r_pv, r_pv, r_vv)[..., None] * density,
             acceleration=acceleration,
-            process_before=right / whole,
-            process_after=left / whole,
+            process_before=until / whole,
+            process_after=since / whole,
             process_variance=missing / -np.expm1(-2.0 * scaled[0]),
         )
 

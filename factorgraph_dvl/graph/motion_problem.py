@@ -37,7 +37,7 @@ class Seen:
     motion : Motion
         At the true times.
     time : ndarray, shape (M,), s
-        True times.
+        By the clock of the nodes.
     interpolation : Interpolation
         Of the states.
     body : BodyAttitude
@@ -75,11 +75,14 @@ class MotionEvaluation:
         Values by name, rotations as matrices.
     seen : tuple of Seen
         By observation.
+    whitening : tuple of ndarray
+        By observation, inverse square roots (M, d, d) of covariances, 0 where not used.
     """
 
     states: Array
     parameters: dict[str, Array]
     seen: tuple[Seen, ...]
+    whitening: tuple[Array, ...]
 
 
 @dataclass(frozen=True)
@@ -119,10 +122,17 @@ class WhitenedRows:
 class MotionProblem:
     """Motion prior, attitude record and measurements: what is minimised without an IMU.
 
+    The nodes have their times by the clock of one sensor, and move with it, so that its
+    measurements stay where they are between nodes. Those of others move, and with them the
+    variance V of the motion between nodes: it is part of the covariance R of a residual r, and
+    the derivative -½ rᵀ R⁻¹ (dR/dt) R⁻¹ r of the cost goes with it. With weights of the clock
+    before, a clock was held back 13 times as strongly as the data pulled it (a river boat with
+    pings every 1.3 s).
+
     Parameters
     ----------
     chain : MotionChain
-        Prior of the motion.
+        Prior of the motion, by the clock of the nodes.
     frame : LocalFrame
         Tangent frame n.
     attitude : AttitudeRecord
@@ -133,6 +143,8 @@ class MotionProblem:
         Calibration parameters, fixed ones included.
     start : ndarray, shape (K, n)
         States near which the solution is; the prior of the first is loose about it.
+    clock : str
+        Name of the time offset of the nodes' clock.
 
     Attributes
     ----------
@@ -153,18 +165,21 @@ class MotionProblem:
         observations: Sequence[Observation],
         parameters: Sequence[Parameter],
         start: Array,
+        clock: str,
     ) -> None:
         self.chain, self.frame, self.attitude = chain, frame, attitude
         self.observations = tuple(observations)
         self.all_parameters = tuple(parameters)
         self.parameters = tuple(p for p in parameters if p.estimated)
+        self.clock = clock
         self.zero = 0.5 * float(chain.time[0] + chain.time[-1])
         self.noise_factors: Mapping[str, Array] = {}
         self.rejected: Mapping[str, np.ndarray] = {}
         self._start = start
         self._nRl = level_axes(frame, start[:, :3])
         self.total_sigma: list[Array] = []
-        self._whitening: list[Array] = []
+        # By observation: noise but for the motion (M, d, d), derivatives by states, what is used.
+        self._weights: list[tuple[Array, Array, Array]] = []
         self._bound: dict[str, Array] = {}
         # A parameter that no measurement names belongs to the attitude.
         self._of_attitude = {p.name for p in attitude.sensor.parameters()}
@@ -191,7 +206,11 @@ class MotionProblem:
     def evaluate(self, states: Array, parameters: dict[str, Array]) -> MotionEvaluation:
         """Evaluate motion, residuals and derivatives."""
         seen = tuple(self._see(o, states, parameters) for o in self.observations)
-        return MotionEvaluation(states, parameters, seen)
+        whitening = tuple(
+            np.linalg.inv(np.linalg.cholesky(own + s.interpolation.variance(J) * used)) * used
+            for s, (own, J, used) in zip(seen, self._weights, strict=False)
+        )
+        return MotionEvaluation(states, parameters, seen, whitening)
 
     def body_at(
         self,
@@ -200,18 +219,20 @@ class MotionProblem:
         parameters: Mapping[str, Array],
         bound: Array | None = None,
     ) -> tuple[Interpolation, Array, BodyAttitude, dict[str, Array]]:
-        """Return states and attitude at times (M,), and the heading's error by its parameters.
+        """Return states and attitude at true times (M,), and the heading's error by parameters.
 
-        What lasts is that at `bound` (M,), where this lies between the same nodes.
+        What lasts is that at `bound` (M,), by the clock of the nodes, where this lies between the
+        same nodes.
         """
-        at = self.chain.at(time, bound)
+        by_nodes = time + self.offset(parameters)
+        at = self.chain.at(by_nodes, bound)
         x = at.states(states)
         stamp = time + self._attitude_lag(time, parameters)
         error = np.zeros((time.size, 3))
         if self.chain.has(ATTITUDE):
             place = self.chain.place(ATTITUDE)
             error += x[:, place] * self._sigma(ATTITUDE)
-        near = np.clip(np.searchsorted(self.chain.time, time), 0, self.chain.time.size - 1)
+        near = np.clip(np.searchsorted(self.chain.time, by_nodes), 0, self.chain.time.size - 1)
         nRl = self._nRl[near]
         own = {n: v for n, v in parameters.items() if n in self._of_attitude}
         heading = self.attitude.rph_at(stamp)[:, 2]
@@ -219,9 +240,13 @@ class MotionProblem:
         error[:, 2] += lasting
         return at, x, self.attitude.at(stamp, error, nRl), by
 
+    def offset(self, parameters: Mapping[str, Array]) -> float:
+        """Return the times of the nodes less true times, s."""
+        return float(parameters[self.clock][0])
+
     def weigh(self, evaluation: MotionEvaluation) -> None:
         """Set the weights of all measurements from their covariances there."""
-        self._whitening, self.total_sigma = [], []
+        self._weights, self.total_sigma = [], []
         # A clock that moves must not follow errors that are as rough as a random walk.
         self._bound = {
             o.label: seen.time for o, seen in zip(self.observations, evaluation.seen, strict=True)
@@ -231,13 +256,13 @@ class MotionProblem:
             used = np.isfinite(sigma) & self.usable(o, seen)[:, None]
             R = np.einsum("mi,ij->mij", np.where(used, sigma, 1.0) ** 2, np.eye(sigma.shape[1]))
             spread = seen.by_rph * self.attitude.white
-            more = spread @ spread.transpose(0, 2, 1)
-            more += seen.interpolation.variance(seen.by_state)
-            R += more * used[:, :, None] * used[:, None, :]
-            variance = np.diagonal(R, axis1=1, axis2=2)
+            pairs = used[:, :, None] * used[:, None, :]
+            R += spread @ spread.transpose(0, 2, 1) * pairs
+            variance = np.diagonal(
+                R + seen.interpolation.variance(seen.by_state), axis1=1, axis2=2
+            )
             self.total_sigma.append(np.where(used, np.sqrt(variance), np.inf))
-            W = np.linalg.inv(np.linalg.cholesky(R)) * used[:, :, None] * used[:, None, :]
-            self._whitening.append(W)
+            self._weights.append((R, seen.by_state, pairs))
 
     def usable(self, observation: Observation, seen: Seen) -> np.ndarray:
         """Whether measurements (M,) are covered and not rejected."""
@@ -253,7 +278,9 @@ class MotionProblem:
 
     def rows(self, evaluation: MotionEvaluation) -> Iterator[WhitenedRows]:
         """Yield the whitened rows of each observation, unused ones as zeros."""
-        for o, seen, W in zip(self.observations, evaluation.seen, self._whitening, strict=True):
+        for o, seen, W in zip(
+            self.observations, evaluation.seen, evaluation.whitening, strict=True
+        ):
             yield _rows(
                 o, seen, W @ seen.by_state, W @ seen.by_parameters, rotate(W, seen.residual)
             )
@@ -291,7 +318,7 @@ class MotionProblem:
         """Return half the sum of all squared whitened residuals."""
         whitened = [
             rotate(W, seen.residual)
-            for W, seen in zip(self._whitening, evaluation.seen, strict=True)
+            for W, seen in zip(evaluation.whitening, evaluation.seen, strict=True)
         ]
         whitened.append(self.motion_rows(evaluation.states).residual)
         whitened.append(self.chain.first() * (evaluation.states[0] - self._first()))
@@ -338,11 +365,28 @@ class MotionProblem:
         out = NormalEquations(self.chain.time.size, self.chain.size, self.constants)
         for rows in self.rows(evaluation):
             out.add(rows.node, rows.before, rows.after, rows.constants, rows.residual)
+        self._add_variances(out, evaluation)
         if self.parameters:
             gain = np.linalg.inv(self.prior_root)
             out.corner += gain.T @ gain
             out.constant_gradient += gain.T @ self._prior_residual(evaluation.parameters)
         return out
+
+    def _add_variances(self, equations: NormalEquations, evaluation: MotionEvaluation) -> None:
+        """Add the gradient of the cost by clocks through the variance of the motion."""
+        for o, seen, W, (_, J, _) in zip(
+            self.observations, evaluation.seen, evaluation.whitening, self._weights, strict=True
+        ):
+            u = rotate(W.transpose(0, 2, 1), rotate(W, seen.residual))
+            by_time = -0.5 * np.sum(u * rotate(seen.interpolation.variance_rate(J), u), axis=1)
+            later = {self.clock: np.ones(by_time.size)}
+            if o.clock is not None:
+                offset, rate = o.clock.names
+                later[offset] = later.get(offset, np.zeros(by_time.size)) - 1.0
+                later[rate] = self.zero - o.time
+            for name, change in later.items():
+                if name in self.columns:
+                    equations.constant_gradient[self.columns[name]] += by_time @ change
 
     def _add_motion(self, equations: NormalEquations, states: Array) -> float:
         """Add the prior of the motion, and return its sum of squares."""
@@ -377,7 +421,8 @@ class MotionProblem:
         time = true_time(o, parameters, self.zero)
         at, x, body, by_heading = self.body_at(time, states, parameters, self._bound.get(o.label))
         stamp = time + self._attitude_lag(time, parameters)
-        covered = self.chain.covers(time) & self.attitude.covers(stamp)
+        by_nodes = time + self.offset(parameters)
+        covered = self.chain.covers(by_nodes) & self.attitude.covers(stamp)
         v_n = x[:, 3:6]
         flows = self.chain.has(CURRENT) and any(n.startswith("current") for n in o.parameters)
         # The process is the current as a DVL with a scale error of k sees it, (1 + k) times the
@@ -419,6 +464,13 @@ class MotionProblem:
             by_state[:, :, place] = np.diag(self._sigma(o.label))
         by_parameters = np.zeros((m, d, self.constants))
         found = self._by_attitude(lin, body, by_rph, by_heading, time)
+        if self.clock in self.columns:
+            # The nodes move with this clock, and their motion with them.
+            by_time = np.zeros((m, d, 1))
+            for by, change in ((lin.d_p, motion.v_n), (lin.d_v, motion.a_n)):
+                if by is not None:
+                    by_time += by @ change[:, :, None]
+            found[self.clock] = by_time
         for name, place in self.columns.items():
             if name in lin.d_parameters:
                 by_parameters[:, :, place] += lin.d_parameters[name]
@@ -427,7 +479,7 @@ class MotionProblem:
             if name == _SCALE and lin.d_v is not None and name in lin.d_parameters:
                 share = (lin.d_v @ flow[:, :, None]) / scale
                 by_parameters[:, :, place] += share / (place.stop - place.start)
-        return Seen(motion, time, at, body, residual, by_state, by_parameters, by_rph, covered)
+        return Seen(motion, by_nodes, at, body, residual, by_state, by_parameters, by_rph, covered)
 
     def _by_attitude(
         self,
@@ -449,13 +501,11 @@ class MotionProblem:
         found[rate] = late * (time - self.zero)[:, None, None]
         return found
 
-    def with_chain(self, chain: MotionChain, start: Array | None = None) -> MotionProblem:
-        """Return the same problem with another prior, and states to start from if nodes moved."""
+    def with_chain(self, chain: MotionChain) -> MotionProblem:
+        """Return the same problem with another prior."""
         out = copy(self)
         out.chain = chain
         out._bound = {}
-        if start is not None:
-            out._start, out._nRl = start, level_axes(self.frame, start[:, :3])
         return out
 
 

@@ -110,18 +110,21 @@ def prepare_motion(trial: Trial) -> MotionPreparation:
     parameters = _parameters(trial)
     values = {p.name: prior_mean(p) for p in parameters}
     values |= _start_values(trial, record, track, frame, parameters)
-    times = _node_candidates(trial, record, track, values)
-    on_legs, in_turns, sigma = _densities(trial, record, values)
-    turning_at = _turns(record, times)
+    clock = _clock(trial, frame)
+    late = float(values[record.sensor.clock.offset.name][0])
+    lag = float(values[clock][0])
+    times = _node_candidates(trial, record, track, late=late, lag=lag)
+    on_legs, in_turns, sigma = _densities(trial, record, values, late)
+    turning_at = _turns(record, times + late - lag)
     spacing = _BETWEEN**2 * 16.0 * sigma**2 / max(float(on_legs[:2].max()), _LEAST_DENSITY)
     spacing = max(spacing, (times[-1] - times[0]) / _MOST_NODES)
     nodes = node_times(times, turning_at, min(spacing, _LONGEST))
-    turning = _turns(record, 0.5 * (nodes[1:] + nodes[:-1]))
+    turning = _turns(record, 0.5 * (nodes[1:] + nodes[:-1]) + late - lag)
     density = np.where(turning[:, None], in_turns, on_legs)
     chain = MotionChain(nodes, density, processes)
-    p_n, v_n, _ = track.at(nodes)
+    p_n, v_n, _ = track.at(nodes - lag)
     states = np.hstack([p_n, v_n, np.zeros((nodes.size, chain.size - 6))])
-    problem = MotionProblem(chain, frame, record, observations, parameters, states)
+    problem = MotionProblem(chain, frame, record, observations, parameters, states, clock)
     return MotionPreparation(
         problem=problem,
         states=states,
@@ -241,26 +244,48 @@ def _start_values(
     return found
 
 
+def _clock(trial: Trial, frame: LocalFrame) -> str:
+    """Return the time offset of the clock of the nodes: that of the sensor they are tied to."""
+    sensor = trial.find(Ins) or trial.dvl or trial.beams or trial.gnss
+    assert sensor is not None
+    clock = sensor.observations(frame, trial.body_axes)[0].clock
+    assert clock is not None
+    return clock.names[0]
+
+
 def _node_candidates(
-    trial: Trial, record: AttitudeRecord, track: Track, values: dict[str, Array]
+    trial: Trial, record: AttitudeRecord, track: Track, *, late: float, lag: float
 ) -> Array:
-    """Return the times where nodes may be: between pings, and others in long gaps."""
-    late = float(values[record.sensor.clock.offset.name][0])
-    first = max(track.time[0], record.time[0] - late) - 1.0
-    last = min(track.time[-1], record.time[-1] - late) + 1.0
+    """Return the times where nodes may be, and others in long gaps.
+
+    An INS knows the motion at its samples: they are there. Fixes do not: they are between pings,
+    as what the motion adds to a ping alone in its interval is independent of the others.
+
+    Parameters
+    ----------
+    trial : Trial
+        Without IMU.
+    record : AttitudeRecord
+        How the body points.
+    track : Track
+        Of the body.
+    late, lag : float, s
+        Time offsets of the attitude and of the nodes.
+    """
+    first = lag + max(track.time[0], record.time[0] - late) - 1.0
+    last = lag + min(track.time[-1], record.time[-1] - late) + 1.0
     if last - first < 10.0:
         raise DataError(
             "positions and attitudes have less than 10 s in common",
             where=record.sensor.source,
             expected="records of the same time, by one clock",
         )
-    log = trial.log
-    own = track.time
-    if log is not None and log.locked.sum() > 1:
-        own = log.time[log.locked] - float(values.get("time_offset_s", np.zeros(1))[0])
-    # Between pings: a clock moves them within an interval, where acceleration does not jump, and
-    # what the motion adds to a ping alone in its interval is independent of the others.
-    own = 0.5 * (own[1:] + own[:-1])
+    log, ins = trial.log, trial.find(Ins)
+    if ins is not None:
+        own = ins.time[~np.isnan(ins.geodetic[:, 0])]
+    else:
+        own = track.time if log is None or log.locked.sum() < 2 else log.time[log.locked]
+        own = 0.5 * (own[1:] + own[:-1])
     own = own[(own > first) & (own < last)]
     edges = np.concatenate([[first], own, [last]])
     wide = np.flatnonzero(np.diff(edges) > _LONGEST)
@@ -272,17 +297,18 @@ def _node_candidates(
 
 
 def _turns(record: AttitudeRecord, time: Array) -> np.ndarray:
-    """Whether the heading changes over seconds about times (M,)."""
+    """Whether the heading changes over seconds about stamps (M,) of the attitude."""
     ahead = record.rph_at(time + 0.5 * _TURN_SPAN)[:, 2]
     behind = record.rph_at(time - 0.5 * _TURN_SPAN)[:, 2]
     return np.abs(ahead - behind) / _TURN_SPAN > _TURNING
 
 
 def _densities(
-    trial: Trial, record: AttitudeRecord, values: dict[str, Array]
+    trial: Trial, record: AttitudeRecord, values: dict[str, Array], late: float
 ) -> tuple[Array, Array, float]:
     """Return the density of acceleration east, north, up on legs and in turns, and a ping's noise.
 
+    Stamps of the attitude are late by so many seconds.
     Velocities that are L apart differ by the density times L and by twice the noise: from two L
     both follow.
     """
@@ -290,12 +316,12 @@ def _densities(
     if log is None or log.locked.sum() < 50:
         return np.full(3, _DENSITY), np.full(3, _DENSITY), 0.1
     rows = np.flatnonzero(log.locked)
-    time = log.time[rows] - float(values.get("time_offset_s", np.zeros(1))[0])
-    rph = record.rph_at(time)
+    time = log.time[rows] - float(values["time_offset_s"][0])
+    rph = record.rph_at(time + late)
     bRd = values.get("misalignment_deg", np.eye(3)).T
     v_n = rotate(rotation_from_rph(rph, record.body_axes), log.velocity[rows] @ bRd.T)
     interval = float(np.median(np.diff(time)))
-    turning = _turns(record, time)
+    turning = _turns(record, time + late)
 
     def density(wanted: np.ndarray, spans: tuple[float, float]) -> Array:
         squares = []

@@ -132,9 +132,10 @@ def _residuals(found: SmoothedMotion) -> tuple[tuple[Residuals, ...], tuple[Resi
 def _trajectory(found: SmoothedMotion, rate_hz: float) -> Trajectory:
     """Return the motion between the nodes at a rate, with its covariance."""
     problem, evaluation = found.problem, found.evaluation
-    chain, frame = problem.chain, problem.frame
+    chain, frame, states = problem.chain, problem.frame, evaluation.states
     rate = min(rate_hz, 1.0 / problem.attitude.interval)
-    first, last = np.ceil(chain.time[0] * rate), np.floor(chain.time[-1] * rate)
+    begin, end = chain.time[[0, -1]] - problem.offset(evaluation.parameters)
+    first, last = np.ceil(begin * rate), np.floor(end * rate)
     time = np.arange(first, last + 1.0) / rate
     offset = float(evaluation.parameters[problem.attitude.sensor.clock.offset.name][0])
     time = time[problem.attitude.covers(time + offset)]
@@ -144,12 +145,17 @@ def _trajectory(found: SmoothedMotion, rate_hz: float) -> Trajectory:
     parts = []
     for a in range(0, time.size, _CHUNK):
         at, x, body, by_heading = problem.body_at(
-            time[a : a + _CHUNK], evaluation.states, evaluation.parameters
+            time[a : a + _CHUNK], states, evaluation.parameters
         )
         P = found.covariances.around(at.node)
         every = np.broadcast_to(np.eye(n), (at.node.size, n, n))
         missing = at.variance(every)
-        to_state = np.concatenate([*at.by_nodes(every), np.zeros((at.node.size, n, c))], axis=2)
+        by_constants = np.zeros((at.node.size, n, c))
+        if problem.clock in problem.columns:
+            own = problem.columns[problem.clock]
+            by_constants[:, :3, own] = x[:, 3:6, None]
+            by_constants[:, 3:6, own] = at.accelerations(states)[:, :, None]
+        to_state = np.concatenate([*at.by_nodes(every), by_constants], axis=2)
         motion = to_state @ P @ to_state.transpose(0, 2, 1) + missing
         # Errors of the attitude are those of the process and of the constants.
         to_rph = np.zeros((at.node.size, 3, 2 * n + c))
@@ -272,8 +278,9 @@ def _heading_and_misalignment(trial: Trial, found: SmoothedMotion) -> list[Findi
         sigma = next(p.sigma for p in chain.processes if p.name == ATTITUDE)
         by_states[:, place.start + 2] = weight * sigma[2]
         mean += float(np.sum(by_states * x))
-    heading = problem.attitude.rph_at(chain.time)[:, 2]
-    lasting, by = heading_error(chain.time, heading, values, problem.zero)
+    time = chain.time - problem.offset(values)
+    heading = problem.attitude.rph_at(time)[:, 2]
+    lasting, by = heading_error(time, heading, values, problem.zero)
     mean += float(weight @ lasting)
     for own, matrix in by.items():
         if own in problem.columns:

@@ -136,6 +136,56 @@ def test_standard_deviations_hold(make):
     assert low < ratio(make(), RUNS) < high
 
 
+def variances_of_motion(prepared, label, late):
+    problem = prepared.problem
+    values = problem.prior_values() | prepared.values | {"time_offset_s": np.array([late])}
+    (at,) = (i for i, o in enumerate(problem.observations) if o.label == label)
+    return problem.evaluate(prepared.states, values).seen[at].interpolation.motion_variance
+
+
+def test_pings_stay_between_nodes_wherever_their_clock_moves(ship):
+    prepared = prepare_motion(ship)
+    first, later = (variances_of_motion(prepared, "DVL velocity", late) for late in (0.0, 0.3))
+    np.testing.assert_allclose(first, later, rtol=1e-6)
+
+
+def test_an_ins_is_at_nodes_in_turns():
+    prepared = prepare_motion(simulate(ins_scenario(), 3))
+    variances = variances_of_motion(prepared, "INS velocity", 0.3)[:, 1, 1, 0]
+    assert np.sum(variances < 1e-9) > prepared.turning.sum() > 100
+
+
+def test_the_variance_of_the_motion_has_its_derivative(ship):
+    chain = prepare_motion(ship).problem.chain
+    span = np.diff(chain.time)
+    time = chain.time[:-1] + np.linspace(0.05, 0.95, span.size) * span
+    step = 1e-4 * span
+    every = np.broadcast_to(np.eye(chain.size), (time.size, chain.size, chain.size))
+    low, high = (chain.at(time + change).variance(every) for change in (-step, step))
+    slope = ((high - low) / (2.0 * step[:, None, None]))[:, :6, :6]
+    rate = chain.at(time).variance_rate(every)[:, :6, :6]
+    np.testing.assert_allclose(rate, slope, atol=1e-6 * np.abs(slope).max())
+
+
+def test_derivatives_by_clocks_are_those_of_residuals(ship):
+    problem = (prepared := prepare_motion(ship)).problem
+    values = problem.prior_values() | prepared.values
+    step = 1e-4
+    for name in ("time_offset_s", "attitude_time_offset_s"):
+        low, high = (
+            problem.evaluate(prepared.states, values | {name: values[name] + change}).seen
+            for change in (-step, step)
+        )
+        now = problem.evaluate(prepared.states, values).seen
+        for a, seen, b in zip(low, now, high, strict=True):
+            inside = a.covered & seen.covered & b.covered
+            inside &= a.interpolation.node == b.interpolation.node
+            slope = (b.residual - a.residual)[inside] / (2.0 * step)
+            found = seen.by_parameters[inside][:, :, problem.columns[name].start]
+            # The squares of rates in waves are left out.
+            np.testing.assert_allclose(found, slope, atol=0.01)
+
+
 def test_the_current_as_a_dvl_sees_it_does_not_pull_the_scale_error():
     problem = (prepared := prepare_motion(simulate(shortened("ship-water"), 1))).problem
     place = problem.chain.place(CURRENT)

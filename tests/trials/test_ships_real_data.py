@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.special import chdtri
 
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.sensors.attitude import Attitude, AttitudeSettings
@@ -49,12 +50,18 @@ def found(number):
     return solution
 
 
+def check_clock(solution):
+    # An independent fit: 1.41 to 1.51 s by dive.
+    clock = solution.estimate("time_offset_s")
+    assert clock.std[0] < 0.025
+    assert 1.41 - 4.0 * clock.std[0] < -clock.value[0] < 1.51 + 4.0 * clock.std[0]
+
+
 @pytest.mark.slow
 def test_a_dive_without_its_imu_gives_lever_arm_and_clock():
     solution = found(2)
     assert solution.estimate("lever_arm_m").value[0] == pytest.approx(-1.84, abs=0.1)
-    # An independent fit: 1.41 to 1.51 s by dive.
-    assert -solution.estimate("time_offset_s").value[0] == pytest.approx(1.46, abs=0.1)
+    check_clock(solution)
     assert -solution.estimate("misalignment_deg").value[2] == pytest.approx(-0.2, abs=0.25)
 
 
@@ -63,8 +70,21 @@ def test_a_dive_without_its_imu_gives_lever_arm_and_clock():
 def test_every_dive_agrees(number):
     solution = found(number)
     assert solution.estimate("lever_arm_m").value[0] == pytest.approx(-1.84, abs=0.1)
-    assert -solution.estimate("time_offset_s").value[0] == pytest.approx(1.46, abs=0.1)
+    check_clock(solution)
     assert -solution.estimate("misalignment_deg").value[2] == pytest.approx(-0.2, abs=0.25)
+
+
+@pytest.mark.slow
+def test_six_dives_scatter_as_their_standard_deviations_say():
+    solutions = [found(number) for number in (1, 2, 3, 4, 8, 10)]
+    for name, component in (("misalignment_deg", 2), ("scale_error", 0), ("lever_arm_m", 0)):
+        estimates = [solution.estimate(name) for solution in solutions]
+        values = np.array([e.value[component] for e in estimates])
+        weights = np.array([e.std[component] ** -2.0 for e in estimates])
+        squares = float(weights @ (values - np.average(values, weights=weights)) ** 2)
+        # 0.999 of what five degrees of freedom give; all dives share the errors of one INS, which
+        # each standard deviation contains, so that less is no sign of an error.
+        assert squares < chdtri(5.0, 0.001), name
 
 
 def boat():
@@ -111,5 +131,9 @@ def test_a_boat_with_a_gnss_compass_without_tilt():
     assert -solution.estimate("misalignment_deg").value[2] == pytest.approx(1.65, abs=1.0)
     correction = 1.0 / (1.0 + solution.estimate("scale_error").value[0])
     assert correction == pytest.approx(0.992, abs=0.006)
-    # A straight run shows no lever arm.
-    assert solution.estimate("lever_arm_m").std[1] > 1.0
+    # A straight run shows no lever arm that is good enough, and none along the vertical.
+    grades = solution.estimate("lever_arm_m").std / 0.1
+    assert np.all(grades > [2.0, 2.0, 90.0])
+    # An independent fit: 1.6 s.
+    clock = solution.estimate("time_offset_s")
+    assert abs(clock.value[0] + 1.6) < 2.0 * clock.std[0]

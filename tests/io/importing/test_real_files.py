@@ -112,17 +112,7 @@ def test_leaves_nothing_beside_the_input(imported):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "path",
-    [
-        NENANA,
-        pytest.param(
-            WINRIVER,
-            marks=pytest.mark.xfail(reason="rounds end before its clocks settle, and say so"),
-        ),
-    ],
-    ids=lambda path: path.stem,
-)
+@pytest.mark.parametrize("path", [NENANA, WINRIVER], ids=lambda path: path.stem)
 def test_from_raw_file_to_verdict(imported, path):
     out, _ = imported(path)
     solution = solve(load_trial(out))
