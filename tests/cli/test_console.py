@@ -33,19 +33,21 @@ def test_a_terminal_shows_stage_cost_and_time_left(
     with ProgressLine(quiet=False) as progress:
         progress("load")
         assert "left" not in shown(progress, text)
-        clock["now"] = 9.0
+        clock["now"] = 8.0
         progress("all sensors", 0, 9.87e12)
-        # 45 % are done after 9 s.
-        assert "about 11 s left" in shown(progress, text)
-        clock["now"] = 18.0
+        # 40 % are done after 8 s.
+        assert "about 12 s left" in shown(progress, text)
+        clock["now"] = 16.0
+        progress("write", 0, 12.51234)
         progress("write", 1, 12.51234)
         assert "write, iteration 1, cost 12.51" in shown(progress, text)
-        assert "about 1 s left" in shown(progress, text)
+        # The rest of the last stage, but for 30 % of it.
+        assert "about 7 s left" in shown(progress, text)
         # A stage of another solver, or an earlier one, does not turn the time back.
         progress("other mountings")
         assert "other mountings" in shown(progress, text)
         progress("half", done=0.5)
-        assert "about 1 s left" in shown(progress, text)
+        assert "about 7 s left" in shown(progress, text)
 
 
 def test_a_campaign_shows_what_has_ended_and_the_time_left(
