@@ -136,8 +136,10 @@ def consistency_findings(trial: Trial, errors: Sequence[Finding]) -> Iterator[Fi
         sensors = [_without_gross_errors(s, views) for s in sensors]
         views = _views(windows, sensors)
     wrong: list[Candidate] = []
-    if max((view.excess for view in views), default=0.0) > _CONTRADICTS:
-        wrong = diagnosis(compare, trial.inertial, -frd_from_body(trial.body_axes)[2])
+    suspected = any(f.code == Code.GYRO_UNIT for f in errors)
+    if suspected or max((view.excess for view in views), default=0.0) > _CONTRADICTS:
+        down_b = frd_from_body(trial.body_axes)[2]
+        wrong = diagnosis(compare, trial.inertial, -down_b, suspected=suspected)
     if wrong:
         corrected = carried_windows(wrong[0].corrected(trial.inertial))
         views = _views(corrected or windows, sensors)

@@ -117,7 +117,9 @@ def _misfits(compare: Compare, imu: Imu, step: float) -> _Misfits | None:
     )
 
 
-def diagnosis(compare: Compare, imu: Imu, up_b: Array) -> list[Candidate]:
+def diagnosis(
+    compare: Compare, imu: Imu, up_b: Array, *, suspected: bool = False
+) -> list[Candidate]:
     """Return the mistakes that explain a misfit best, none where there is none to explain.
 
     Parameters
@@ -128,9 +130,12 @@ def diagnosis(compare: Compare, imu: Imu, up_b: Array) -> list[Candidate]:
         Record of the IMU.
     up_b : ndarray, shape (3,)
         Up in body, by `body_axes`: gravity that is right already is not to be turned over.
+    suspected : bool, default False
+        Whether gyros and accelerometers contradict each other without another sensor.
     """
     nominal = _misfits(compare, imu, _FINE_S)
-    if nominal is None or nominal.excess.max() < _EXPLAINED:
+    least_excess = 0.0 if suspected else _EXPLAINED
+    if nominal is None or nominal.excess.max() < least_excess:
         return []
     worst = int(np.argmax(nominal.excess))
     force = imu.accel.mean(axis=0)

@@ -313,3 +313,11 @@ def test_small_steps_of_a_clock_are_errors(trial: Trial) -> None:
     """Nothing that is estimated takes them up."""
     problems = survey(faults.with_faults(trial, [faults.clock_step("dvl", 0.1)])).problems
     assert [(p.code, p.severity) for p in problems] == [(Code.CLOCK_STEP, "error")]
+
+
+def test_a_mirrored_axis_is_named_where_sway_hides_the_clock() -> None:
+    """Gyros and accelerometers contradict each other; a clock all but fits GNSS and DVL."""
+    for axis in (0, 1):
+        texts = found(swaying_turns(), faults.axes_changed("imu", mirror(axis).tolist()))
+        assert Code.IMU_AXES in texts
+        assert f"axis {'xyz'[axis]} is mirrored" in texts[Code.IMU_AXES]
