@@ -94,6 +94,7 @@ class VelocityWindows:
             if not enough.any():
                 return self
             kept = kept.only(enough)
+            offset = offset[enough] if isinstance(offset, np.ndarray) else offset
         return kept
 
     def only(self, lines: np.ndarray) -> Self:

@@ -88,3 +88,25 @@ def test_an_outlier_is_no_steady_velocity_and_sway_is():
     velocity[40] += 3.0
     assert np.flatnonzero(~steady(velocity)).tolist() == [40]
     assert steady(velocity[:3]).all()
+
+
+def test_outliers_are_left_out_by_a_clock_that_changes(windows):
+    """A window that has too few left goes, and with it its offsets."""
+
+    class Still(VelocityWindows):
+        def residual(self, offset):
+            assert np.shape(offset) in ((), self.rows.shape)
+            return self.velocity[self.rows]
+
+    time = np.arange(0.0, 60.0)
+    velocity = np.random.default_rng(0).normal(0.0, 0.01, (time.size, 3))
+    velocity[52:60] = 9.0
+    velocity[10] = 9.0
+    there = Still(windows, time, velocity, np.full(time.size, 0.01), *sorted_into(windows, time))
+    for offset in (0.0, np.zeros(there.rows.shape)):
+        kept = there.without_outliers(offset)
+        assert kept.window.tolist() == [0, 1]
+        assert 10 not in time[kept.rows[kept.inside]]
+    velocity[48:60] = 9.0
+    there = Still(windows, time, velocity, np.full(time.size, 0.01), *sorted_into(windows, time))
+    assert there.without_outliers(np.zeros(there.rows.shape)).window.tolist() == [0]
