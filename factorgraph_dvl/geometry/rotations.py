@@ -14,6 +14,7 @@ from factorgraph_dvl.geometry.vectors import Array, skew
 BodyAxes = Literal["RFU", "FRD", "FLU"]
 _Angle = TypeVar("_Angle", float, Array)
 
+# By definition: components forward, right, down of body axes, and ENU of NED.
 _FRD_FROM_BODY: dict[str, Array] = {
     "FRD": np.eye(3),
     "RFU": np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]]),

@@ -33,7 +33,7 @@ _FREE = np.repeat([1e5, 1e2], 3)
 
 
 @dataclass(frozen=True)
-class Process:
+class ChainProcess:
     """A first-order Gauss-Markov process; its states have unit variance.
 
     Parameters
@@ -126,13 +126,13 @@ class MotionChain:
         Of the nodes.
     density : ndarray, shape (K - 1, 3)
         Power spectral density of the acceleration east, north, up between the nodes, m²/s³.
-    processes : tuple of Process
+    processes : tuple of ChainProcess
         Errors that last.
     """
 
     time: Array
     density: Array
-    processes: tuple[Process, ...] = ()
+    processes: tuple[ChainProcess, ...] = ()
 
     @property
     def size(self) -> int:
@@ -274,7 +274,7 @@ def _times(J: Array, motion: Array, process: Array) -> Array:
     return out
 
 
-def node_times(time: Array, turning: Sequence[bool] | np.ndarray, interval: float) -> Array:
+def chain_nodes(time: Array, turning: Sequence[bool] | np.ndarray, interval: float) -> Array:
     """Return times of nodes: some of given times (M,), all of them where the body turns.
 
     Parameters

@@ -14,9 +14,9 @@ from factorgraph_dvl.graph.clocks import parameters_of
 from factorgraph_dvl.graph.problem import Problem
 from factorgraph_dvl.graph.processes import Process
 from factorgraph_dvl.graph.sensor_factor import (
+    AttachedMeasurements,
     NodeMeasurements,
     ObservationRows,
-    Rows,
     at_first_node,
     concatenated,
     measurement_factor,
@@ -55,7 +55,7 @@ def native_graph(problem: Problem) -> gtsam.NonlinearFactorGraph:
 def _measurement_factor(problem: Problem, k: int) -> gtsam.CustomFactor | None:
     """Return the factor of what was measured after node k, None if nothing was."""
     chain, imu_errors = problem.chain, problem.imu_errors
-    rows: list[Rows] = []
+    rows: list[AttachedMeasurements] = []
     attachments: list[Attachment] = []
     sensitivities: list[Sensitivity] = []
     nodes: dict[str, int] = {}
@@ -75,7 +75,7 @@ def _measurement_factor(problem: Problem, k: int) -> gtsam.CustomFactor | None:
             if process.label == o.label:
                 own = CorrelatedRows(o, index, process)
                 nodes.update(own.nodes)
-        rows.append(Rows(own, place, time))
+        rows.append(AttachedMeasurements(own, place, time))
         attachments.append(sliced(at, index))
         weights.append(weight[index].ravel())
         if imu_errors is not None:
@@ -162,7 +162,7 @@ def _node_name(process: Process, j: int) -> str:
     return f"{process.name} {j}"
 
 
-def _as_parameters(rows: Sequence[Rows]) -> Iterator[Parameter]:
+def _as_parameters(rows: Sequence[AttachedMeasurements]) -> Iterator[Parameter]:
     """Yield the nodes of correlated errors as parameters of a factor."""
     seen = set()
     for r in rows:

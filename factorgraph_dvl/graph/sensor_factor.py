@@ -147,7 +147,7 @@ class ObservationRows:
 
 
 @dataclass(frozen=True)
-class Rows:
+class AttachedMeasurements:
     """Measurements of one kind, tied to a node.
 
     Parameters
@@ -173,7 +173,7 @@ class NodeMeasurements:
     ----------
     attachment : Attachment
         Of all measurement times, to a node that counts as the first.
-    rows : tuple of Rows
+    rows : tuple of AttachedMeasurements
         The measurements.
     parameters : tuple of Parameter
         Those that are estimated and that the measurements depend on.
@@ -190,7 +190,7 @@ class NodeMeasurements:
     """
 
     attachment: Attachment
-    rows: tuple[Rows, ...]
+    rows: tuple[AttachedMeasurements, ...]
     parameters: tuple[Parameter, ...]
     fixed: Mapping[str, Array]
     gravity_n: Array
@@ -206,7 +206,7 @@ class NodeMeasurements:
         sizes = np.concatenate([values[p.name] for p in errors])
         return corrected(self.attachment, self.sensitivity, elements(errors), sizes)
 
-    def attachment_of(self, rows: Rows) -> Attachment:
+    def attachment_of(self, rows: AttachedMeasurements) -> Attachment:
         """Return the attachment of measurements of one kind."""
         return sliced(self.attachment, rows.at)
 
@@ -484,7 +484,7 @@ def sensor_factor(
     own = ObservationRows(observation, index)
     measured = NodeMeasurements(
         attachment=at_first_node(sliced(attachment, index)),
-        rows=(Rows(own, slice(0, index.size), true_time(own, given, clock_zero)),),
+        rows=(AttachedMeasurements(own, slice(0, index.size), true_time(own, given, clock_zero)),),
         parameters=free,
         fixed=fixed,
         gravity_n=chain.gravity_n[k : k + 1],

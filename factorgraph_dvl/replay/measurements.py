@@ -8,7 +8,7 @@ import numpy as np
 
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph.clocks import parameters_of, true_time
-from factorgraph_dvl.graph.sensor_factor import NodeMeasurements, Rows
+from factorgraph_dvl.graph.sensor_factor import AttachedMeasurements, NodeMeasurements
 from factorgraph_dvl.imu.preintegration import Segments
 from factorgraph_dvl.imu.propagation import attach
 from factorgraph_dvl.replay.gate import InnovationGate
@@ -43,16 +43,16 @@ def attached(
     observations = [o for aid in aids for o in aid.observations(start.frame, start.body_axes)]
     if not observations:
         return None
-    rows: list[Rows] = []
+    rows: list[AttachedMeasurements] = []
     times: list[Array] = []
     count = 0
     for o in observations:
         time = true_time(o, values, start.clock_zero)
         if rows and np.array_equal(time, rows[-1].time):
             # Of one sensor, such as position and velocity of GNSS.
-            rows.append(Rows(o, rows[-1].at, time))
+            rows.append(AttachedMeasurements(o, rows[-1].at, time))
             continue
-        rows.append(Rows(o, slice(count, count + time.size), time))
+        rows.append(AttachedMeasurements(o, slice(count, count + time.size), time))
         times.append(time)
         count += time.size
     used = {name for o in observations for name in parameters_of(o)}

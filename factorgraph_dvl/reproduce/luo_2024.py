@@ -31,6 +31,7 @@ from factorgraph_dvl.solution import Solution
 from factorgraph_dvl.solvers.batch import solve
 from factorgraph_dvl.trial import Trial
 
+# As printed: phases of the sway, deg; table 4, and the digits that it has.
 _PHASES = (0, 90)
 _LABELS = ("α_x, deg", "α_y, deg", "α_z, deg", "δK", "l_x, m", "l_y, m", "l_z, m")
 _DIGITS = (3, 3, 3, 6, 3, 3, 3)

@@ -40,12 +40,14 @@ from factorgraph_dvl.settings.sections import NonNegative, Positive, Sigma3, Vec
 VELOCITY_COLUMNS = ("vel_x_m_s", "vel_y_m_s", "vel_z_m_s")
 STD_COLUMNS = ("std_x_m_s", "std_y_m_s", "std_z_m_s")
 
+# Limits of what is good enough. Chosen: dead reckoning then drifts by 0.2 % of the distance.
 MISALIGNMENT_SPEC = ParameterSpec(
     "misalignment", "deg", kind="rotation", frame="b", place=2, limit=0.1
 )
 SCALE_SPEC = ParameterSpec("scale_error", labels=SCALAR, place=3, limit=1e-3, above=-1.0)
 SCALES_SPEC = replace(SCALE_SPEC, labels=XYZ, frame="d")
 LEVER_ARM_SPEC = ParameterSpec("lever_arm", "m", frame="b", place=4, limit=0.1)
+# Plausible size, m/s. Chosen: ten times the bias of a DVL that is in order.
 BIAS_SPEC = ParameterSpec("dvl_bias", "m_s", frame="d", nuisance=True, plausible=0.1)
 CLOCK = Clock.of("dvl")
 CURRENT_SPEC = ParameterSpec("current", "m_s", labels=("e", "n"), frame="n")

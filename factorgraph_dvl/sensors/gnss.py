@@ -45,6 +45,7 @@ LEVER_ARM = "gnss_lever_arm_m"
 # Components whose noise is alike: a fix is as good to the east as to the north, on the whole.
 HORIZONTAL_AND_UP = ((0, 1), (2,))
 
+# Plausible size, m. Chosen: a vessel's length, for an antenna that was not measured.
 _LEVER_ARM = ParameterSpec("gnss_lever_arm", "m", frame="b", nuisance=True, plausible=5.0)
 _CLOCK = Clock.of("gnss", prefix="gnss_")
 TIME_OFFSET = _CLOCK.offset.name

@@ -19,6 +19,7 @@ from factorgraph_dvl.geometry.units import (
     DEG_PER_SQRT_HOUR,
     HOUR,
     MICRO_G,
+    PPM,
     STANDARD_GRAVITY,
 )
 from factorgraph_dvl.geometry.vectors import Array
@@ -49,7 +50,6 @@ _LEAST_GYRO_NOISE = 1e-6 * DEG_PER_SQRT_HOUR
 _LEAST_ACCEL_NOISE = 0.01 * MICRO_G
 _MAX_RATE_RAD_S = 100.0
 _MAX_FORCE_M_S2 = 1000.0
-_PPM = 1e-6
 # Stands for a key that is not stated, until the grade or zero takes its place; as a value in a
 # file it is refused.
 _NOT_STATED = math.nan
@@ -76,6 +76,7 @@ class ImuError:
     column: int
 
 
+# By definition: elements (row, column) of a matrix of errors.
 _DIAGONAL = ((0, 0), (1, 1), (2, 2))
 _OFF_DIAGONAL = ((0, 1), (0, 2), (1, 0), (1, 2), (2, 0), (2, 1))
 _BELOW = ((1, 0), (2, 0), (2, 1))
@@ -96,6 +97,7 @@ def _error_spec(
     return spec, tuple(ImuError(of, by, i, j) for i, j in elements)
 
 
+# Plausible sizes. Chosen: the worst of data sheets of MEMS.
 _ERRORS = (
     _error_spec("gyro_scale", "ppm", "rate", "rate", _DIAGONAL, 1e4),
     _error_spec("gyro_misalignment", "deg", "rate", "rate", _OFF_DIAGONAL, 0.5),
@@ -179,12 +181,12 @@ class ImuSettings(SensorSection, frozen=True, kw_only=True):
     def error_std(self) -> ImuErrorStd:
         """Standard deviations of scale, axes and g-sensitivity, SI."""
         return ImuErrorStd(
-            gyro_scale=self.gyro_scale_std_ppm * _PPM,
+            gyro_scale=self.gyro_scale_std_ppm * PPM,
             gyro_misalignment=self.gyro_misalignment_std_deg * DEG,
             gyro_g_sensitivity=(
                 self.gyro_g_sensitivity_std_deg_h_g * DEG_PER_HOUR / STANDARD_GRAVITY
             ),
-            accel_scale=self.accel_scale_std_ppm * _PPM,
+            accel_scale=self.accel_scale_std_ppm * PPM,
             accel_misalignment=self.accel_misalignment_std_deg * DEG,
         )
 

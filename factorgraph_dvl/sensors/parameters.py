@@ -13,7 +13,7 @@ import numpy as np
 from factorgraph_dvl.errors import DataError
 from factorgraph_dvl.geometry.rotations import exp_so3
 from factorgraph_dvl.geometry.unit_vectors import turns_to
-from factorgraph_dvl.geometry.units import DEG, DEG_PER_HOUR, MICRO_G, STANDARD_GRAVITY
+from factorgraph_dvl.geometry.units import DEG, DEG_PER_HOUR, MICRO_G, PPM, STANDARD_GRAVITY
 from factorgraph_dvl.geometry.vectors import Array
 
 # Rounding may leave a correlation matrix with an eigenvalue this far below zero.
@@ -44,7 +44,7 @@ UNITS = {
     "m": Unit(1.0, "m"),
     "m_s": Unit(1.0, "m/s"),
     "s": Unit(1.0, "s"),
-    "ppm": Unit(1e-6, "ppm"),
+    "ppm": Unit(PPM, "ppm"),
 }
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from factorgraph_dvl.errors import ConfigError, DataError
 
+# By definition, bytes.
 MEGABYTE = 1_000_000
 
 

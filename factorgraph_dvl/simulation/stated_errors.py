@@ -8,7 +8,7 @@ from zlib import crc32
 
 import numpy as np
 
-from factorgraph_dvl.geometry.units import DEG, DEG_PER_HOUR, STANDARD_GRAVITY
+from factorgraph_dvl.geometry.units import DEG, DEG_PER_HOUR, PPM, STANDARD_GRAVITY
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.simulation import faults
 from factorgraph_dvl.simulation.faults import Fault
@@ -18,7 +18,6 @@ from factorgraph_dvl.trial import Trial
 if TYPE_CHECKING:
     from factorgraph_dvl.simulation.scenario import Scenario
 
-_PPM = 1e-6
 _PER_G = DEG_PER_HOUR / STANDARD_GRAVITY
 _OFF_DIAGONAL = ~np.eye(3, dtype=bool)
 _BELOW_DIAGONAL = np.tri(3, k=-1, dtype=bool)
@@ -119,9 +118,9 @@ def _imu_errors(scenario: Scenario, seed: int) -> dict[str, Fault]:
     elements = {name: _value(scenario, "imu", name, seed) for name in ImuTruth.matrices}
     if not any(value.any() for value in elements.values()):
         return {}
-    gyro = np.diag(elements["gyro_scale_ppm"] * _PPM)
+    gyro = np.diag(elements["gyro_scale_ppm"] * PPM)
     gyro[_OFF_DIAGONAL] = elements["gyro_misalignment_deg"] * DEG
-    accel = np.diag(elements["accel_scale_ppm"] * _PPM)
+    accel = np.diag(elements["accel_scale_ppm"] * PPM)
     accel[_BELOW_DIAGONAL] = elements["accel_misalignment_deg"] * DEG
     sensitivity = elements["gyro_g_sensitivity_deg_h_g"] * _PER_G
     return {"imu": faults.imu_errors(gyro.tolist(), sensitivity.tolist(), accel.tolist())}

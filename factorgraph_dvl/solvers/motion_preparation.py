@@ -12,7 +12,7 @@ from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.rotations import rotation_from_rph
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array, rotate
-from factorgraph_dvl.graph.motion_chain import MotionChain, Process, node_times
+from factorgraph_dvl.graph.motion_chain import ChainProcess, MotionChain, chain_nodes
 from factorgraph_dvl.graph.motion_problem import ATTITUDE, CURRENT, MotionProblem
 from factorgraph_dvl.graph.priors import prior_mean
 from factorgraph_dvl.imu.attitude_record import AttitudeRecord, level_axes
@@ -118,7 +118,7 @@ def prepare_motion(trial: Trial) -> MotionPreparation:
     turning_at = _turns(record, times + late - lag)
     spacing = _BETWEEN**2 * 16.0 * sigma**2 / max(float(on_legs[:2].max()), _LEAST_DENSITY)
     spacing = max(spacing, (times[-1] - times[0]) / _MOST_NODES)
-    nodes = node_times(times, turning_at, min(spacing, _LONGEST))
+    nodes = chain_nodes(times, turning_at, min(spacing, _LONGEST))
     turning = _turns(record, 0.5 * (nodes[1:] + nodes[:-1]) + late - lag)
     density = np.where(turning[:, None], in_turns, on_legs)
     chain = MotionChain(nodes, density, processes)
@@ -138,18 +138,18 @@ def prepare_motion(trial: Trial) -> MotionPreparation:
 
 def _observed(
     trial: Trial, frame: LocalFrame
-) -> tuple[tuple[Observation, ...], tuple[Process, ...], frozenset[str]]:
+) -> tuple[tuple[Observation, ...], tuple[ChainProcess, ...], frozenset[str]]:
     """Return measurements, errors that last, and the labels whose noise may be estimated."""
     assert trial.attitude is not None
     observations: list[Observation] = []
-    processes: list[Process] = []
+    processes: list[ChainProcess] = []
     estimated: set[str] = set()
     error = trial.attitude.error
     if error.sigma.any():
-        processes.append(Process(ATTITUDE, error.sigma, error.tau))
+        processes.append(ChainProcess(ATTITUDE, error.sigma, error.tau))
     if trial.dvl is not None and trial.dvl.settings.reference == "water":
         sigma, tau, _ = _current(trial)
-        processes.append(Process(CURRENT, np.full(2, sigma), tau))
+        processes.append(ChainProcess(CURRENT, np.full(2, sigma), tau))
     for aid in trial.aids:
         if isinstance(aid, Attitude):
             continue
@@ -162,13 +162,13 @@ def _observed(
                 observations.append(seen)
                 if share > 0.0:
                     tau = aid.settings.correlation_time_s
-                    processes.append(Process(seen.label, share * std, tau))
+                    processes.append(ChainProcess(seen.label, share * std, tau))
             continue
         for o in aid.observations(frame, trial.body_axes):
             observations.append(o)
             correlated = getattr(o, "correlated", None)
             if correlated is not None and correlated.sigma is not None:
-                processes.append(Process(o.label, correlated.sigma, correlated.time))
+                processes.append(ChainProcess(o.label, correlated.sigma, correlated.time))
             if trial.estimates_noise(aid) and o.noise_groups:
                 estimated.add(o.label)
     return tuple(observations), tuple(processes), frozenset(estimated)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from factorgraph_dvl.graph.bordered_chain import NormalEquations
-from factorgraph_dvl.graph.motion_chain import MotionChain, Process, node_times
+from factorgraph_dvl.graph.motion_chain import ChainProcess, MotionChain, chain_nodes
 
 TIME = np.array([0.0, 1.7, 3.0, 8.0])
 
@@ -12,7 +12,7 @@ TIME = np.array([0.0, 1.7, 3.0, 8.0])
 @pytest.fixture
 def chain():
     density = np.array([[0.3, 0.3, 0.1], [0.2, 0.2, 0.1], [0.3, 0.3, 0.2]])
-    return MotionChain(TIME, density, (Process("current", np.array([0.2, 0.2]), 50.0),))
+    return MotionChain(TIME, density, (ChainProcess("current", np.array([0.2, 0.2]), 50.0),))
 
 
 def covariance_between(t, q):
@@ -65,7 +65,7 @@ def test_transitions_whiten_the_noise_of_a_step(chain):
 def test_nodes_are_sparse_on_legs_and_dense_in_turns():
     time = np.arange(30.0)
     turning = (time > 9.0) & (time < 15.0)
-    nodes = node_times(time, turning, 5.0)
+    nodes = chain_nodes(time, turning, 5.0)
     np.testing.assert_array_equal(nodes, [0, 5, 10, 11, 12, 13, 14, 19, 24, 29])
 
 

@@ -15,9 +15,9 @@ from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.rotations import exp_so3
 from factorgraph_dvl.graph import keys
 from factorgraph_dvl.graph.sensor_factor import (
+    AttachedMeasurements,
     Linearized,
     NodeMeasurements,
-    Rows,
     measured_nodes,
     measurement_factor,
     sensor_factor,
@@ -68,7 +68,7 @@ def node_measurements(time=20.0, **changes):
         start, end = seg.node_time
         inside = np.flatnonzero((aid.time >= start) & (aid.time < end - 1e-6))
         for o in rows_of(aid, inside).observations(frame, "RFU"):
-            rows.append(Rows(o, slice(count, count + o.time.size), o.time))
+            rows.append(AttachedMeasurements(o, slice(count, count + o.time.size), o.time))
             times.append(o.time)
             count += o.time.size
     middle = states.p_n + 0.5 * states.v_n
@@ -187,7 +187,7 @@ def test_a_stationary_vessel_reports_the_velocity_of_its_lever_arm():
     none = np.zeros(3)
     measured = NodeMeasurements(
         attachment=attach(seg, dvl.time, none),
-        rows=(Rows(dvl.observations(frame, "RFU")[0], slice(0, 1), dvl.time),),
+        rows=(AttachedMeasurements(dvl.observations(frame, "RFU")[0], slice(0, 1), dvl.time),),
         parameters=tuple(p for p in dvl.parameters() if p.estimated),
         fixed={p.name: p.mean for p in dvl.parameters() if not p.estimated},
         gravity_n=np.array([[0.0, 0.0, -9.8]]),

@@ -7,14 +7,12 @@ from pathlib import Path
 import numpy as np
 
 from factorgraph_dvl.geometry.rotations import frd_from_body, rotation_from_rph
-from factorgraph_dvl.geometry.units import DAY, DEG
+from factorgraph_dvl.geometry.units import DAY, DEG, KNOT
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.io.exporting.motion import ExportedMotion
 from factorgraph_dvl.io.formats.clocks import GPS_EPOCH, utc_to_gps
 from factorgraph_dvl.io.formats.sbet import SBET, SMRMSG
 
-# A knot in m/s.
-_KNOT = 1852.0 / 3600.0
 # Of a position that is estimated and not measured, in GGA.
 _ESTIMATED = 6
 
@@ -99,7 +97,7 @@ def write_nmea(motion: ExportedMotion, path: Path) -> None:
             f"INGGA,{at},{_angle(t.geodetic[k, 0], 2, 'NS')},{_angle(t.geodetic[k, 1], 3, 'EW')},"
             f"{_ESTIMATED},00,,{t.geodetic[k, 2]:.3f},M,0.000,M,,",
             f"INGST,{at},,{major:.3f},{minor:.3f},{bearing:.1f},{north:.3f},{east:.3f},{up:.3f}",
-            f"INVTG,{course[k]:.2f},T,,M,{speed[k] / _KNOT:.3f},N,{speed[k] * 3.6:.3f},K,D",
+            f"INVTG,{course[k]:.2f},T,,M,{speed[k] / KNOT:.3f},N,{speed[k] * 3.6:.3f},K,D",
             f"INHDT,{heading[k]:.3f},T",
         ]
     path.write_text("".join(map(_sentence, lines)), encoding="ascii", newline="")

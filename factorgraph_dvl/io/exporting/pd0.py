@@ -21,7 +21,7 @@ from factorgraph_dvl.geometry.rotations import (
     rotation_from_rph,
     rph_from_rotation,
 )
-from factorgraph_dvl.geometry.units import DEG
+from factorgraph_dvl.geometry.units import DEG, KNOT
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.io.formats.janus import beam_directions
 from factorgraph_dvl.sensors.attitude import Attitude
@@ -31,6 +31,7 @@ from factorgraph_dvl.sensors.gnss import Gnss
 from factorgraph_dvl.sensors.ins import Ins
 from factorgraph_dvl.trial import Trial
 
+# A velocity that is missing, as TRDI defines it, and the coordinates of a ping.
 _BAD = -32768
 _INSTRUMENT, _BEAM = 1, 0
 # Nominal beam angles that the format has a code for, deg.
@@ -157,7 +158,7 @@ def _fix(gnss: Gnss, row: int, begin: float) -> Iterator[bytes]:
     east, north = gnss.velocity[row, :2].tolist()
     motion = ","
     if np.isfinite(east):
-        knots = np.hypot(east, north) * 3600.0 / 1852.0
+        knots = np.hypot(east, north) / KNOT
         motion = f"{knots:.4f},{np.arctan2(east, north) / DEG % 360.0:.4f}"
     yield _checked(f"GPRMC,{clock},A,{place},{motion},{date},,,A")
     # Height above the ellipsoid, with a geoid that coincides.

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 import msgspec
 
 from factorgraph_dvl.geometry.rotations import BodyAxes
-from factorgraph_dvl.geometry.units import DEG, DEG_PER_HOUR, STANDARD_GRAVITY
+from factorgraph_dvl.geometry.units import DEG, DEG_PER_HOUR, KNOT, STANDARD_GRAVITY
 from factorgraph_dvl.io.formats.format import Clock, HeadingReference, Kind
 from factorgraph_dvl.io.formats.velocities import BEAM, EARTH, INSTRUMENT, SHIP
 from factorgraph_dvl.settings.sections import Section
@@ -18,7 +18,7 @@ from factorgraph_dvl.settings.sections import Section
 UNITS = {
     **{"rad": 1.0, "deg": DEG, "arcmin": DEG / 60.0},
     **{"m": 1.0, "mm": 1e-3, "cm": 1e-2, "km": 1e3, "ft": 0.3048},
-    **{"m/s": 1.0, "mm/s": 1e-3, "cm/s": 1e-2, "km/h": 1.0 / 3.6, "kn": 1852.0 / 3600.0},
+    **{"m/s": 1.0, "mm/s": 1e-3, "cm/s": 1e-2, "km/h": 1.0 / 3.6, "kn": KNOT},
     **{"rad/s": 1.0, "deg/s": DEG, "deg/h": DEG_PER_HOUR},
     **{"m/s2": 1.0, "g": STANDARD_GRAVITY, "mg": 1e-3 * STANDARD_GRAVITY},
     **{"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0, "day": 86400.0},

@@ -16,14 +16,13 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
-from factorgraph_dvl.geometry.units import DEG
+from factorgraph_dvl.geometry.units import DEG, KNOT
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.io.formats.clocks import in_order, posix
 from factorgraph_dvl.io.formats.framing import BLOCK_OF_LINES, Records, Source, number
 from factorgraph_dvl.io.formats.losses import Losses
 from factorgraph_dvl.io.formats.sentences import NOT_USABLE, Sentence, sentences
 
-KNOT = 1852.0 / 3600.0
 _HEAD = [("at", "i8"), ("received", "f8"), ("checked", "?"), ("talker", "S2")]
 Row = tuple[float, ...]
 

@@ -122,6 +122,7 @@ _BOTTOM = _layout(
     good=(40, "4u1"),
     range_high=(77, "4u1"),
 )
+# A velocity that is missing, as TRDI defines it.
 _BAD = -32768
 
 

@@ -13,10 +13,10 @@ import struct
 import numpy as np
 from numpy.typing import NDArray
 
-from factorgraph_dvl.geometry.units import DEG
+from factorgraph_dvl.geometry.units import DEG, KNOT
 from factorgraph_dvl.io.formats.clocks import nearest_day, posix
 from factorgraph_dvl.io.formats.framing import Bytes, Index, Records
-from factorgraph_dvl.io.formats.nmea import ADDRESSES, KINDS, KNOT, Row, decode, second_of_day
+from factorgraph_dvl.io.formats.nmea import ADDRESSES, KINDS, Row, decode, second_of_day
 from factorgraph_dvl.io.formats.sentences import sentences
 
 __all__ = ["VMDAS", "embedded_sentences", "vmdas_fixes"]

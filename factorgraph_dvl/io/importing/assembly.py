@@ -219,7 +219,7 @@ def _add_ins(out: Assembly, ins: Merged, deviations: Merged | None) -> None:
     out.add("ins", navigation.tables, **keys)
 
 
-def _add_attitude(out: Assembly, attitude: orientation.Orientation) -> None:
+def _add_attitude(out: Assembly, attitude: orientation.ImportedAttitude) -> None:
     keys: dict[str, Any] = {
         "std_deg": [float(value) for value in attitude.std],
         "correlation_time_s": _ATTITUDE_CORRELATION,
@@ -242,7 +242,7 @@ def _add_attitude(out: Assembly, attitude: orientation.Orientation) -> None:
 
 
 def _add_log(
-    out: Assembly, log: velocity.Velocities, attitude: orientation.Orientation | None
+    out: Assembly, log: velocity.Velocities, attitude: orientation.ImportedAttitude | None
 ) -> None:
     keys: dict[str, Any] = {}
     if log.directions is not None:

@@ -15,13 +15,15 @@ Series = tuple[Array, Array]
 # Chosen: the widest difference of local time from UTC, one hour aside, and how far a clock that
 # was set by hand is off, s.
 _WIDEST_ZONE, _HAND = 13 * 3600.0, 60.0
+# By law: zones are off by quarters of an hour, s.
 _ZONE = 900.0
 # Least overlap of two records that are compared, s and as a share of the shorter one. Chosen: less
 # has no change of speed.
 _OVERLAP, _SHARE = 60.0, 0.5
 # A lag is clear if speeds at it correlate by this, and elsewhere by so much less. Chosen: by
-# chance neither comes about; and the step, s, of the finer search.
+# chance neither comes about.
 _CLEAR, _MARGIN = 0.8, 0.1
+# Step of the finer search, s. Chosen: finer than the interval of most receivers.
 _FINE = 0.1
 # Records beyond this are thinned out: three days at 1 Hz.
 _LONGEST = 1 << 18

@@ -23,14 +23,16 @@ from factorgraph_dvl.io.importing.time_base import FIRST_DATE, Timed
 _TRUE = ((0.1, 0.1, 0.3), 0.0)
 _MAGNETIC_STD = (0.5, 0.5, 2.0)
 _CORRECTED_OFFSET, _MAGNETIC_OFFSET, _DEVIATION = 10.0, 40.0, 5.0
+# Where nothing says which north a heading counts from. Chosen: as a magnetic one.
 _UNKNOWN = ((0.5, 0.5, 2.0), 45.0)
+# Chosen: the greater the better.
 _RANKS = {"true": 2, "unknown": 1, "magnetic": 0}
 # Stream of the sensors in a DVL itself.
 OWN = "leader"
 
 
 @dataclass(frozen=True)
-class Orientation:
+class ImportedAttitude:
     """Roll, pitch and heading, and what is known of their errors.
 
     Parameters
@@ -76,7 +78,7 @@ class Orientation:
 
 def choose(
     streams: Sequence[Timed], where: tuple[float, float] | None, decisions: Decisions
-) -> Orientation | None:
+) -> ImportedAttitude | None:
     """Return the best attitude of all files, None if there is none.
 
     Parameters
@@ -117,7 +119,7 @@ def choose(
     decisions.add(attitude.label, f"{len(attitude.time)} records of {what}", "attitude.file")
     deviation = _DEVIATION if stream.heading == "magnetic" else 0.0
     own = stream.stream == OWN
-    return Orientation(attitude, tilt, declination, std, offset, deviation, own)
+    return ImportedAttitude(attitude, tilt, declination, std, offset, deviation, own)
 
 
 def _has_heading(timed: Timed) -> bool:

@@ -15,6 +15,7 @@ from factorgraph_dvl.io.formats.losses import Losses
 from factorgraph_dvl.io.formats.rtklib import is_geodetic, read_rtklib
 from factorgraph_dvl.io.formats.sbet import north_east, read_sbet, read_smrmsg, true_heading
 
+# Bytes of a record of RTKLIB. Chosen: about those of a line; they only share a file out.
 _LINE_BYTES = 130.0
 # Records of a trajectory are closer together than this, s.
 _LONGEST_STEP = 10.0

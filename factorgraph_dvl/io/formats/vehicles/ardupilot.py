@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from factorgraph_dvl.errors import DataError
-from factorgraph_dvl.geometry.units import DEG
+from factorgraph_dvl.geometry.units import DEG, MICROSECOND
 from factorgraph_dvl.io.formats.clocks import gps_to_utc
 from factorgraph_dvl.io.formats.format import Batch, Format, empty, positive
 from factorgraph_dvl.io.formats.framing import BLOCK, Records, Source, map_file
@@ -47,7 +47,6 @@ _SIZES |= {
     "q": 8,
     "Q": 8,
 }
-_MICROSECOND = 1e-6
 # Before the first of 2012 no ArduPilot log had weeks in its GPS messages.
 _FIRST_WEEK = 1669
 # Values of one message by the names of its columns.
@@ -189,7 +188,7 @@ def _next(log: Any) -> Row | None:
 
 def _started(out: Records, rows: list[Row]) -> Records:
     out["at"] = column(rows, "at")
-    out["received"] = out["time"] = column(rows, "TimeUS") * _MICROSECOND
+    out["received"] = out["time"] = column(rows, "TimeUS") * MICROSECOND
     return out
 
 

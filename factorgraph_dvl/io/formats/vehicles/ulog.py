@@ -14,7 +14,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from factorgraph_dvl.errors import DataError
-from factorgraph_dvl.geometry.units import DEG
+from factorgraph_dvl.geometry.units import DEG, MICROSECOND
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.io.formats.format import Batch, Format, empty, positive
 from factorgraph_dvl.io.formats.framing import Records
@@ -28,7 +28,6 @@ from factorgraph_dvl.io.formats.vehicles.library import (
 from factorgraph_dvl.io.formats.velocities import INSTRUMENT
 
 _MAGIC = b"ULog\x01\x12\x35"
-_MICROSECOND = 1e-6
 # A receiver without time reports less.
 _EARLIEST = 1e8
 # Columns by name: of one message of the log.
@@ -99,8 +98,8 @@ def _vectors(columns: Columns, name: str, count: int = 3) -> Array:
 
 def _started(out: Records, columns: Columns) -> Records:
     out["at"] = np.arange(len(out))
-    out["received"] = _column(columns, "timestamp") * _MICROSECOND
-    stamps = _column(columns, "timestamp_sample") * _MICROSECOND
+    out["received"] = _column(columns, "timestamp") * MICROSECOND
+    stamps = _column(columns, "timestamp_sample") * MICROSECOND
     out["time"] = np.where(stamps > 0.0, stamps, out["received"])
     return out
 
@@ -131,7 +130,7 @@ def _attitude(stream: str, columns: Columns) -> Batch:
 
 def _fix(stream: str, columns: Columns) -> Batch:
     out = _started(empty("fix", _count(columns)), columns)
-    utc = _column(columns, "time_utc_usec") * _MICROSECOND
+    utc = _column(columns, "time_utc_usec") * MICROSECOND
     out["time"] = np.where(utc > _EARLIEST, utc, np.nan)
     # Before version 1.14 positions were integers of 1e-7 degrees and of millimetres.
     units = (1e-7, 1e-3) if "lat" in columns else (1.0, 1.0)
