@@ -115,7 +115,8 @@ def stock(tmp_path_factory) -> Path:
     for name in ("trial", "beams"):
         code = invoke("solve", folder / name, "--out", folder / f"{name}-solution", "--no-figures")
         assert code == 0, name
-    assert invoke("kalman", folder / "trial", "--out", folder / "kalman-solution") == 0
+    kalman = ("kalman", folder / "trial", "--out", folder / "kalman-solution", "--no-figures")
+    assert invoke(*kalman) == 0
     return folder
 
 
@@ -261,7 +262,17 @@ def run_blocks(name: str, stock: Path, folder: Path, run: Run, *, slow: bool) ->
             pytest.fail(f"{where}: no language, so nothing says how to run it")
 
 
-@pytest.mark.parametrize("name", run_documents(slow=False))
+# Their commands are run by the blocks of other pages too, and take long.
+LONG = ("docs/crosscheck.md", "docs/getting-started.md", "docs/kalman.md", "docs/replay.md")
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=pytest.mark.slow if name in LONG else ())
+        for name in run_documents(slow=False)
+    ],
+)
 def test_blocks_run(name, stock, bench, run):  # noqa: F811
     run_blocks(name, stock, bench, run, slow=False)
 
