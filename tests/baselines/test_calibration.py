@@ -46,7 +46,14 @@ SMALL_ANGLES = ("luo-2024", "nine-state-linear", "nine-state-ukf")
 OF_SHORT_TRIALS = [m for m in DVL_METHODS if m not in ("joyce", "pollard-read")]
 
 
-@pytest.fixture(scope="module", params=[[0, 0, 180], [0, 180, 0], [100, -80, 60]], ids=str)
+HALF_TURNS = ([0, 0, 180], [0, 180, 0])
+
+
+@pytest.fixture(
+    scope="module",
+    params=[*(pytest.param(t, marks=pytest.mark.slow) for t in HALF_TURNS), [100, -80, 60]],
+    ids=str,
+)
 def turned(request):
     """A trial without noise, and its large misalignment."""
     dvl = {"misalignment_deg": request.param}

@@ -106,7 +106,10 @@ UNOBSERVABLE = {
 
 
 # Much like another one of them.
-VARIANTS = ("straight in a swell", "two seconds adrift", "three scales", "no current")
+VARIANTS = (
+    *("straight in a swell", "two seconds adrift", "three scales", "no current"),
+    *("one ping", "walking biases", "gap"),
+)
 
 
 @pytest.mark.parametrize(

@@ -64,7 +64,10 @@ def test_one_scale_for_an_instrument_that_has_three():
 
 
 # What wanders over two parts of a plan wanders in each anew: 20 s of 120 s of it.
-@pytest.mark.parametrize(("changes", "equal"), [({}, 0.01), (CORRELATED, 0.1)])
+@pytest.mark.parametrize(
+    ("changes", "equal"),
+    [({}, 0.01), pytest.param(CORRELATED, 0.1, marks=pytest.mark.slow)],
+)
 def test_going_on_is_as_good_as_starting_again(changes, equal):
     scene = scenario(current_m_s=[0.2, 0.1, 0], **changes)
     more = [{"turn_deg_s": 3, "duration_s": 30}, {"straight_s": 20}]

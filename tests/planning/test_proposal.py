@@ -141,6 +141,7 @@ def test_a_search_that_ends_early_says_so(monkeypatch):
     assert f"including all of up to {found.limit:.0f} s" in line
 
 
+@pytest.mark.slow
 def test_a_bias_that_walks_is_searched_for():
     walk = {"gyro_noise_deg_sqrt_h": 0.01, "gyro_bias_walk_deg_h_sqrt_h": 0.01}
     plan = STRAIGHT | {"imu": STRAIGHT["imu"] | walk}

@@ -117,7 +117,10 @@ def test_a_mirrored_imu_is_named_with_its_axis(
     ("matrix", "field", "code", "words"),
     [
         (mirror(2), "gyro", Code.GYRO_AXES, "for the gyros, axis z is mirrored"),
-        (mirror(1), "accel", Code.ACCEL_AXES, "for the accelerometers, axis y is mirrored"),
+        pytest.param(
+            *(mirror(1), "accel", Code.ACCEL_AXES, "for the accelerometers, axis y is mirrored"),
+            marks=pytest.mark.slow,
+        ),
         pytest.param(
             *(SWAP_XY, "gyro", Code.GYRO_AXES, "for the gyros, axes x and y are swapped"),
             marks=pytest.mark.slow,
@@ -221,6 +224,7 @@ def test_a_dead_channel_of_the_imu_is_named(trial: Trial) -> None:
     assert "all accelerometers repeat one value from 20.0 to 24" in texts[Code.FROZEN_VALUES]
 
 
+@pytest.mark.slow
 def test_noise_that_is_larger_than_stated_is_no_mistake_of_axes() -> None:
     legs = [
         {"accelerate_m_s2": 1, "to_m_s": 4},

@@ -83,6 +83,7 @@ def test_a_vessel_that_floats_under_the_stars():
     as_the_batch(simulate(scene, 1))
 
 
+@pytest.mark.slow
 def test_a_depth_sensor_beyond_gnss():
     changes = {"outages_s": [[45, 400]]}
     trial = simulate(config("dive", manoeuvres=SINKS, reference_rate_hz=100, gnss=changes), 1)
@@ -113,6 +114,7 @@ def test_star_vectors_one_epoch_at_a_time():
     assert {"Star attitude"} <= {r.label for r in solution.residuals}
 
 
+@pytest.mark.slow
 def test_a_bias_that_walks_is_reported_as_it_is_at_the_end():
     walk = {"gyro_bias_walk_deg_h_sqrt_h": 20.0}
     scene = config(

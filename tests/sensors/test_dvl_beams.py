@@ -517,7 +517,8 @@ def test_the_common_mounting_is_found_from_anywhere():
     np.testing.assert_allclose(solution.estimate("misalignment_deg").value, mounting, atol=0.3)
 
 
-@pytest.mark.parametrize("seed", [4, pytest.param(2, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [2, 4])
 def test_a_common_mounting_that_is_far_off_does_not_mislead_poor_gyros(seed):
     imu = {"gyro_noise_deg_sqrt_h": 0.15, "accel_noise_ug_sqrt_hz": 60}
     imu |= {"gyro_bias_deg_h": "draw", "accel_bias_ug": "draw"}

@@ -38,10 +38,16 @@ def test_without_noise_the_trial_of_the_paper_is_exact():
 @pytest.mark.parametrize(
     "changes",
     [
-        {"start": {"heading_deg": 137}, "body_axes": "FRD"},
+        pytest.param({"start": {"heading_deg": 137}, "body_axes": "FRD"}, marks=pytest.mark.slow),
         {"start": {"lat_deg": -45, "lon_deg": 179.999, "heading_deg": 90}, "body_axes": "FLU"},
-        {"gnss": {"lever_arm_m": [0.5, -3, 4]}, "start": {"heading_deg": 250}},
-        {"dvl": {"rate_hz": 7, "phase_s": 0.031, "misalignment_deg": [20, -100, 140]}},
+        pytest.param(
+            {"gnss": {"lever_arm_m": [0.5, -3, 4]}, "start": {"heading_deg": 250}},
+            marks=pytest.mark.slow,
+        ),
+        pytest.param(
+            {"dvl": {"rate_hz": 7, "phase_s": 0.031, "misalignment_deg": [20, -100, 140]}},
+            marks=pytest.mark.slow,
+        ),
         {
             "dvl": {"scale_error": [0.01, -0.02, 0.03]},
             "trial": {"dvl": {"scale_error_std": [0.1] * 3}},
@@ -49,10 +55,10 @@ def test_without_noise_the_trial_of_the_paper_is_exact():
         {"dvl": {"time_offset_s": 0.08}, "trial": {"dvl": {"time_offset_std_s": 0.1}}},
         {"dvl": {"bias_m_s": [0.01, -0.02, 0.01]}, "trial": {"dvl": {"bias_std_m_s": [0.05] * 3}}},
         {"imu": {"sampling": "instantaneous"}},
-        {"gnss": {"velocity_std_m_s": None}},
+        pytest.param({"gnss": {"velocity_std_m_s": None}}, marks=pytest.mark.slow),
         {"trial": {"gnss": {"lever_arm_std_m": [1, 1, 1]}}},
         {"imu": {"gaps_s": [[20.0, 23.0]]}},
-        {"imu": {"gaps_s": [[20.0, 50.0]]}},
+        pytest.param({"imu": {"gaps_s": [[20.0, 50.0]]}}, marks=pytest.mark.slow),
         {"gnss": {"outages_s": [[15.0, 55.0]]}},
         {"dvl": {"no_lock_s": [[15.0, 55.0]]}},
         {"dvl": {"reference": "water"}, "current_m_s": [0.3, -0.2, 0.0]},
@@ -103,7 +109,7 @@ def test_the_trajectory_comes_at_the_rate_asked_for(rate):
     np.testing.assert_allclose(np.diff(time), 1.0 / rate)
 
 
-@pytest.mark.parametrize("interval", [0.2, 2.0])
+@pytest.mark.parametrize("interval", [pytest.param(0.2, marks=pytest.mark.slow), 2.0])
 def test_the_states_may_be_denser_or_sparser(interval):
     trial = simulate(scenario(sway=CONING))
     assert_exact(trial, solve(trial, state_interval_s=interval))
@@ -287,7 +293,7 @@ MEMS = {
     ("mounting_std", "walk"),
     [
         (1.0, 5),
-        (20.0, 0),
+        pytest.param(20.0, 0, marks=pytest.mark.slow),
         pytest.param(1.0, 0, marks=pytest.mark.slow),
         pytest.param(20.0, 5, marks=pytest.mark.slow),
     ],

@@ -149,8 +149,10 @@ def undisturbed(noisy):
             for method in ("solve", "kalman")
             for sections in ((), ("gnss", "dvl"))
         ),
-        ("replay", ("gnss", "dvl")),
-        pytest.param("replay", (), marks=pytest.mark.slow),
+        *(
+            pytest.param("replay", sections, marks=pytest.mark.slow)
+            for sections in ((), ("gnss", "dvl"))
+        ),
     ],
 )
 def test_the_clock_of_a_logger_may_jump(noisy, undisturbed, sections, method):

@@ -15,8 +15,8 @@ SHARE = 1e-3
 EARTH = np.array([6.4e6, 6.4e6, 1.0])
 
 
-# They take long, and are much like the other cruise and the other dive.
-LONG = ("cruise-mems", "cruise-beams", "dive")
+# They take long: what is left has GNSS, a DVL and a star tracker in one minute.
+LONG = ("cruise", "cruise-mems", "cruise-beams", "dive", "dive-one-beacon")
 
 
 @pytest.mark.parametrize(

@@ -21,9 +21,10 @@ TESTS = Path(__file__).resolve().parents[2]
 
 
 @pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("count", [40, pytest.param(200, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", OWN)
-def test_damaged_input(name):
-    found = run(name, 77, 11)
+def test_damaged_input(name, count):
+    found = run(name, count, 11)
     # 64 kB take milliseconds on an idle machine; a hang takes longer than this on any.
     assert found["slowest"] < 5.0
     assert found["most"] < 20e6
