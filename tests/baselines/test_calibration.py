@@ -82,8 +82,8 @@ def test_without_noise_large_misalignments_are_exact(method, turned):
     scope="module",
     params=[
         STILL,
-        {**STILL, "start": {"speed_m_s": 0}},
-        {"dvl": {"no_lock_s": [[0.0, 100.0]]}},
+        pytest.param({**STILL, "start": {"speed_m_s": 0}}, marks=pytest.mark.slow),
+        pytest.param({"dvl": {"no_lock_s": [[0.0, 100.0]]}}, marks=pytest.mark.slow),
         {"trial": {"dvl": {"misalignment_std_deg": [0, 0, 0], "scale_error_std": 0}}},
     ],
     ids=["straight", "at rest", "no lock", "fixed"],

@@ -137,7 +137,11 @@ def test_a_refusal_is_overridden(honest, tmp_path, run):
 
 @pytest.mark.parametrize(
     ("command", "spoil"),
-    [("solve", east_mirrored), ("replay", upside_down), ("kalman", east_mirrored)],
+    [
+        ("solve", east_mirrored),
+        pytest.param("replay", upside_down, marks=pytest.mark.slow),
+        pytest.param("kalman", east_mirrored, marks=pytest.mark.slow),
+    ],
 )
 def test_what_contradicts_is_a_finding_of_the_result(command, spoil, honest, tmp_path, run):
     trial = write_trial(tmp_path, spoil(honest))

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 from builders import build_trial, edit, write_trial
+from running import Run
 from truth import scenario
 
 from factorgraph_dvl.cli.memory import naming_memory
@@ -96,15 +97,15 @@ def test_too_little_memory_says_what_the_trial_takes(tmp_path: Path) -> None:
     assert caught.value.exit_code == 1
 
 
-def test_names_give_a_terminal_no_orders(tmp_path: Path) -> None:
+def test_names_give_a_terminal_no_orders(tmp_path: Path, run: Run) -> None:
     trial = write_trial(tmp_path)
     edit(trial / "trial.yaml", "name: by hand", 'name: "a\\e[31m\\x9b2J\u202eb"')
-    done = inspect(trial, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
-    assert r"a\x1b[31m\x9b2J\u202eb" in done.stdout
+    shown = run("inspect", trial)
+    assert r"a\x1b[31m\x9b2J\u202eb" in shown.out
     edit(trial / "trial.yaml", "body_axes:", '"k\\e[2J": 1\nbody_axes:')
-    done = inspect(trial, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
-    assert r"unknown key `k\x1b[2J`" in done.stderr
-    assert not set("\x1b\x9b\u202e") & set(done.stdout + done.stderr)
+    refused = run("inspect", trial)
+    assert r"unknown key `k\x1b[2J`" in refused.err
+    assert not set("\x1b\x9b\u202e") & set(shown.out + shown.err + refused.out + refused.err)
 
 
 def test_a_full_disk_is_named_with_the_output_and_leaves_nothing(tmp_path: Path) -> None:
@@ -112,7 +113,7 @@ def test_a_full_disk_is_named_with_the_output_and_leaves_nothing(tmp_path: Path)
         # A file may grow to 4 kB only, as on a disk that is nearly full.
         resource.setrlimit(resource.RLIMIT_FSIZE, (4096, 4096))
 
-    config = Path(__file__).resolve().parents[2] / "configs" / "seed-a-phase-0.yaml"
+    config = Path(__file__).resolve().parents[2] / "examples" / "short.yaml"
     done = subprocess.run(
         [*CLI, "simulate", str(config), "--out", str(tmp_path / "out")],
         preexec_fn=little_room,

@@ -249,6 +249,7 @@ def test_a_clock_of_a_sensor_that_jumps_back_is_not_believed(trial):
             assert np.all(np.abs(e.value - truth[e.name]) < 4.0 * e.std)
 
 
+@pytest.mark.slow
 def test_a_clock_of_the_imu_that_jumps_ahead_is_no_gap(trial, run, unsurveyed):
     time = np.where(trial.imu.time > 62.0, trial.imu.time + 1.37, trial.imu.time)
     solution, record = replay(replace(trial, imu=replace(trial.imu, time=time)), rate_hz=1.0)
@@ -281,6 +282,7 @@ def test_a_clock_of_the_imu_alone_that_jumps_back_is_set_right(trial):
     assert not updates[-1].inconsistent
 
 
+@pytest.mark.slow
 def test_a_clock_that_jumps_back_is_set_right(trial):
     session = Replay(trial, rate_hz=1.0)
     feed(session, trial, 0.0, 60.0)

@@ -464,6 +464,7 @@ def test_a_beam_that_was_never_received_is_named():
         assert any(text.startswith(said) for text in unseen(solve(trial)))
 
 
+@pytest.mark.slow
 def test_each_beam_that_was_never_received_is_named(tmp_path):
     trial = simulate(noisy(turntable=None), 1)
     trial.beams.velocity[:, 1:] = np.nan

@@ -618,11 +618,13 @@ def test_mixed_up_quaternions_are_noticed(floating, quaternion, cause):
     ("name", "changes"),
     [
         ("star", {}),
-        ("star", {"star": {"rate_hz": 10, "std_arcsec": 60}}),
+        pytest.param(
+            *("star", {"star": {"rate_hz": 10, "std_arcsec": 60}}), marks=pytest.mark.slow
+        ),
         ("star", {"star": {"rate_hz": 10, "std_arcsec": 60, "mounting_deg": MOUNTING_DEG}}),
         # Attitudes between the samples of the gyros.
         ("star", {"imu": {"rate_hz": 53}, "star": {"rate_hz": 3}}),
-        ("seed-a-star", {}),
+        pytest.param("seed-a-star", {}, marks=pytest.mark.slow),
         ("seed-a-star", {"star": {"rate_hz": 10, "std_arcsec": 60}}),
         ("seed-a-star", {"imu": {"sampling": "instantaneous"}, "star": {"rate_hz": 1}}),
         ("seed-a-star", {"imu": {"gyro_noise_deg_sqrt_h": 0.2}}),
