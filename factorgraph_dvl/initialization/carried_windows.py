@@ -65,20 +65,22 @@ class CarriedWindows:
 
     def at(self, window: np.ndarray, time: Array) -> CarriedMotion:
         """Return the motion at times (M,) in windows (M,), margins included."""
-        last = self.turn.shape[1] - 1
+        samples = self.turn.shape[1]
         exact = (time - self.begin[window]) / self.step
-        k = np.clip(exact.astype(int), 0, last - 1)
+        k = np.clip(exact.astype(int), 0, samples - 2)
         part = np.clip(exact - k, 0.0, 1.0)[:, None]
-        rate = self.rate[window, k + 1]
-        turn = self.turn[window, k] @ exp_so3(rate * (part * self.step))
         # A rate is the mean over the step before it: that of a time lies between two means.
-        j = np.clip((exact + 0.5).astype(int), 0, last - 1)
+        j = np.clip((exact + 0.5).astype(int), 0, samples - 2)
         near = np.clip(exact + 0.5 - j, 0.0, 1.0)[:, None]
+        # One index for window and sample: NumPy takes rows by two in twice the time.
+        k, j = window * samples + k, window * samples + j
+        turn = self.turn.reshape(-1, 3, 3).take(k, axis=0)
+        speed, place, rate = (x.reshape(-1, 3) for x in (self.speed, self.place, self.rate))
         return CarriedMotion(
-            turn,
-            (1.0 - part) * self.speed[window, k] + part * self.speed[window, k + 1],
-            (1.0 - part) * self.place[window, k] + part * self.place[window, k + 1],
-            (1.0 - near) * self.rate[window, j] + near * self.rate[window, j + 1],
+            turn @ exp_so3(rate.take(k + 1, axis=0) * (part * self.step)),
+            _between(speed, k, part),
+            _between(place, k, part),
+            _between(rate, j, near),
         )
 
 
@@ -140,6 +142,11 @@ def carried_windows(imu: Imu, most: int = _MOST_WINDOWS) -> CarriedWindows | Non
     turn, speed, place = _integrals(gyro, force, step)
     rate = np.concatenate([gyro[:, :1], gyro], axis=1)
     return CarriedWindows(start, length, begin, step, turn, speed, place, rate)
+
+
+def _between(values: Array, row: np.ndarray, part: Array) -> Array:
+    """Return what lies between rows (M,) of values and the next."""
+    return (1.0 - part) * values.take(row, axis=0) + part * values.take(row + 1, axis=0)
 
 
 def _integrals(gyro: Array, force: Array, step: float) -> tuple[Array, Array, Array]:
