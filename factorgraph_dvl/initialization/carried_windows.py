@@ -86,7 +86,7 @@ class CarriedWindows:
 
 @dataclass(frozen=True)
 class CarriedMotion:
-    """Motion at M times: `turn` (M, 3, 3), `speed`, `place`, `rate` (M, 3), as in the windows."""
+    """Motion at times (...): `turn` (..., 3, 3), `speed`, `place`, `rate` (..., 3)."""
 
     turn: Array
     speed: Array

@@ -49,6 +49,9 @@ _STANDS_OUT = 1.4
 _NO_WORSE = 1.15
 _BETTER_THERE = 0.8
 _DOMINATES = 50.0
+# Share of the changes of velocity that an offset by periods of the sway leaves in the usual window
+# at most. Chosen: sway repeats itself nearly; where no offset fits, another is no better.
+_REPEATED = 0.5
 # Halvings of a step that does not gain.
 _HALVINGS = 3
 # Blocks of measurements whose errors are independent, s. Chosen: several times the correlation
@@ -76,6 +79,8 @@ _DRIFT_S = 1.2
 _DRIFT_STEP_S = 0.06
 # Times in two windows at which a jump is tried.
 _BREAKS = 15
+# Measurements that are compared at a time. Chosen: their columns stay in the cache.
+_TOGETHER = 5000
 # Misfit below which nothing is gained, m/s. Chosen: finer than any receiver's or DVL's digits.
 _LEAST_MISFIT = 1e-3
 
@@ -107,7 +112,7 @@ class Comparison(Protocol):
         """Return some of the windows."""
 
     def residual(self, offset: float | Array) -> Array:
-        """Return what is left if the sensor is late by an offset, (W, n, 3)."""
+        """Return what is left if the sensor is late by offsets (..., W, n), (..., W, n, 3)."""
 
 
 @dataclass(frozen=True)
@@ -276,7 +281,8 @@ def _dominating(comparison: Comparison, offset: float, around: float, reach: flo
     """
     at = _variances(comparison, offset)
     worst = int(np.argmax(at))
-    if at[worst] < _STANDS_OUT * np.median(at):
+    share = at * comparison.count / np.maximum(comparison.signal, 1e-12)
+    if at[worst] < _STANDS_OUT * np.median(at) or np.median(share) > _REPEATED:
         return offset
     there = comparison.only(np.array([worst]))
     grid = _grid(around, reach, _FINE_STEP_S)
@@ -350,10 +356,17 @@ def _strongest(comparison: Comparison) -> tuple[Comparison, list[slice]]:
     return comparison.only(np.concatenate(chosen)), list(map(slice, edges[:-1], edges[1:]))
 
 
-def _misfits_at(comparison: Comparison, grid: Array) -> Array:
-    return np.array(
-        [_misfits(comparison, comparison.residual(float(o))) for o in grid], dtype=float
+def _misfits_at(comparison: Comparison, offsets: Array) -> Array:
+    """Return minus the log-likelihood of each window (L, W) at offsets (L,) or (L, W, n)."""
+    late = offsets.reshape(-1, 1, 1) if offsets.ndim == 1 else offsets
+    shape = comparison.time.shape
+    together = max(int(_TOGETHER / comparison.time.size), 1)
+    parts = (late[k : k + together] for k in range(0, len(late), together))
+    misfits = (
+        _misfits(comparison, comparison.residual(np.broadcast_to(part, (len(part), *shape))))
+        for part in parts
     )
+    return np.concatenate(list(misfits))
 
 
 def _refined(comparison: Comparison, design: Array, start: Array) -> _Fit:
@@ -448,11 +461,8 @@ def _drift(comparison: Comparison, middle: float, offsets: Sequence[float]) -> t
         for offset in offsets
         for drift in _grid(0.0, _DRIFT_S, _DRIFT_STEP_S)
     ]
-    likelihoods = [
-        _likelihood(some, some.residual(offset + rate * (some.time - middle)))
-        for offset, rate in tried
-    ]
-    return tried[int(np.argmax(likelihoods))]
+    late = np.array([offset + rate * (some.time - middle) for offset, rate in tried])
+    return tried[int(np.argmin(_misfits_at(some, late).sum(axis=1)))]
 
 
 def _explains(comparison: Comparison, fit: _Fit, without: _Fit, at: float = np.nan) -> bool:
@@ -496,11 +506,9 @@ def _break(
     time = comparison.time
     first, last = time[max(k - 1, 0)].min(), time[min(k, count - 1)].max()
     tried = np.linspace(first, last, _BREAKS)
-    likelihoods = [
-        _likelihood(comparison, comparison.residual(np.where(time > at, after, before)))
-        for at in tried
-    ]
-    return float(tried[np.argmax(likelihoods)]), before, after
+    late = np.where(time > tried[:, None, None], after, before)
+    at = tried[np.argmin(_misfits_at(comparison, late).sum(axis=1))]
+    return float(at), before, after
 
 
 def _blocks(comparison: Comparison) -> np.ndarray:
@@ -510,8 +518,8 @@ def _blocks(comparison: Comparison) -> np.ndarray:
 
 
 def _misfits(comparison: Comparison, residual: Array) -> Array:
-    """Return minus the log-likelihood of each window, (W,), its noise unknown."""
-    squares = np.sum(residual**2, axis=(1, 2))
+    """Return minus the log-likelihood of each window, (..., W), its noise unknown."""
+    squares = np.sum(residual**2, axis=(-2, -1))
     freedom = np.maximum(comparison.count, 1.0)
     return np.asarray(0.5 * freedom * np.log(squares / freedom + _LEAST_MISFIT**2))
 

@@ -86,42 +86,45 @@ class DvlWindows(VelocityWindows):
     @cached_property
     def signal(self) -> Array:
         """Sum of squares of the velocity's changes in each window, (W,)."""
-        carried = self.carried(self.later).speed.reshape(*self.rows.shape, 3)
+        carried = self.carried(self.later).speed
         return np.asarray(np.sum(self.without_trend(carried) ** 2, axis=(1, 2)))
 
     def residual(self, offset: float | Array) -> Array:
-        """Return what is left of the velocities if the DVL is late by an offset, (W, n, 3)."""
-        return self.fit(offset).residual
+        """Return what is left of the velocities if the DVL is late by offsets, (..., W, n, 3)."""
+        kept, x = self._best(offset)
+        return np.asarray((kept @ x[..., None, None, :, None])[..., 0])
 
     def fit(self, offset: float | Array) -> DvlFit:
         """Return how the DVL fits if it is late by an offset, s, constant or (W, n)."""
-        shape = self.rows.shape
-        at = self.carried(offset)
-        turn = at.turn.reshape(*shape, 3, 3)
-        velocity = self.velocity[self.rows]
-        axes = np.einsum("wnij,wnk->wnijk", turn, velocity).reshape(*shape, 3, 9)
-        arm = -turn @ skew(at.rate).reshape(*shape, 3, 3)
-        speed = at.speed.reshape(*shape, 3, 1)
-        columns = np.concatenate([axes, arm, -speed], axis=3)
-        kept = self.without_trend(columns.reshape(*shape, -1)).reshape(columns.shape)
-        flat = kept.reshape(-1, _AXES + _REST)
-        gram = flat.T @ flat
-        form, linear = _eliminated(gram)
-        minima = _minima(form)
-        cost = np.sum((minima @ form) * minima, axis=1)
-        scale = minima @ linear[:, -1]
-        allowed = self.handedness * scale >= 0.0
-        # Without a minimum of that handedness, the one nearest to it.
-        nearest = int(np.argmax(self.handedness * scale))
-        best = int(np.argmin(np.where(allowed, cost, np.inf))) if allowed.any() else nearest
-        x = np.concatenate([minima[best], minima[best] @ linear])
+        kept, x = self._best(offset)
         c = x[-1] if abs(x[-1]) > 1e-9 else 1e-9
         return DvlFit(
             residual=kept @ x,
-            dRb=np.sign(c) * minima[best].reshape(3, 3).T,
+            dRb=np.sign(c) * x[:_AXES].reshape(3, 3).T,
             scale_error=float(1.0 / abs(c) - 1.0),
             lever_arm=x[_AXES:-1] / c,
         )
+
+    def _best(self, offset: float | Array) -> tuple[Array, Array]:
+        """Return the columns of the model (..., W, n, 3, 13), and what fits best (..., 13)."""
+        at = self.carried(offset)
+        shape = at.speed.shape
+        axes = at.turn[..., None] * self.velocity[self.rows][..., None, None, :]
+        arm = -at.turn @ skew(at.rate)
+        columns = np.concatenate([axes.reshape(*shape, _AXES), arm, -at.speed[..., None]], axis=-1)
+        kept = self.without_trend(columns.reshape(*shape[:-1], -1)).reshape(columns.shape)
+        flat = kept.reshape(*shape[:-3], -1, _AXES + _REST)
+        form, linear = _eliminated(flat.swapaxes(-1, -2) @ flat)
+        minima = _minima(form)
+        cost = np.sum((minima @ form) * minima, axis=-1)
+        scale = (minima @ linear)[..., -1]
+        allowed = self.handedness * scale >= 0.0
+        # Without a minimum of that handedness, the one nearest to it.
+        nearest = np.argmax(self.handedness * scale, axis=-1)
+        best = np.argmin(np.where(allowed, cost, np.inf), axis=-1)
+        best = np.where(allowed.any(axis=-1), best, nearest)
+        C = np.take_along_axis(minima, best[..., None, None], axis=-2)
+        return kept, np.concatenate([C, C @ linear], axis=-1)[..., 0, :]
 
 
 def dvl_windows(windows: CarriedWindows, dvl: Dvl, later: float = 0.0) -> DvlWindows | None:
@@ -152,25 +155,30 @@ def dvl_windows(windows: CarriedWindows, dvl: Dvl, later: float = 0.0) -> DvlWin
 
 
 def _eliminated(gram: Array) -> tuple[Array, Array]:
-    """Return the quadratic form of the axes (9, 9), and what takes them to the rest, (9, 4)."""
-    rest = gram[_AXES:, _AXES:]
-    rest = rest + 1e-9 * np.diag(np.maximum(np.diag(rest), 1e-9))
-    linear = -np.linalg.solve(rest, gram[_AXES:, :_AXES]).T
-    form = gram[:_AXES, :_AXES] + gram[:_AXES, _AXES:] @ linear.T
-    return np.asarray(0.5 * (form + form.T)), np.asarray(linear, dtype=float)
+    """Return the quadratic form of the axes (..., 9, 9), and what takes them to the rest.
+
+    From sums of products (..., 13, 13); the latter is (..., 9, 4).
+    """
+    rest = gram[..., _AXES:, _AXES:]
+    diagonal = np.maximum(np.diagonal(rest, axis1=-2, axis2=-1), 1e-9)
+    rest = rest + 1e-9 * diagonal[..., None] * np.eye(_REST)
+    back = np.asarray(-np.linalg.solve(rest, gram[..., _AXES:, :_AXES]), dtype=float)
+    form = gram[..., :_AXES, :_AXES] + gram[..., :_AXES, _AXES:] @ back
+    return 0.5 * (form + form.swapaxes(-1, -2)), back.swapaxes(-1, -2)
 
 
 def _minima(form: Array) -> Array:
-    """Return rotations, (24, 9), where Gauss-Newton steps on a form end from 24 starts."""
-    C = _STARTS
+    """Return rotations, (..., 24, 9), where Gauss-Newton steps on a form end from 24 starts."""
+    count = len(_STARTS)
+    C = np.broadcast_to(_STARTS, (*form.shape[:-2], count, 3, 3))
     for _ in range(_STEPS):
-        change = (C[:, None] @ _TURNS).reshape(-1, 3, _AXES)
-        weighed = change @ form
-        gradient = weighed @ C.reshape(-1, _AXES, 1)
-        curvature = weighed @ change.transpose(0, 2, 1)
-        trace = np.trace(curvature, axis1=1, axis2=2)[:, None, None]
+        change = (C[..., None, :, :] @ _TURNS).reshape(*C.shape[:-2], 3, _AXES)
+        weighed = (change.reshape(*form.shape[:-2], -1, _AXES) @ form).reshape(change.shape)
+        gradient = weighed @ C.reshape(*C.shape[:-2], _AXES, 1)
+        curvature = weighed @ change.swapaxes(-1, -2)
+        trace = np.trace(curvature, axis1=-2, axis2=-1)[..., None, None]
         step = -np.linalg.solve(curvature + 1e-6 * trace * np.eye(3), gradient)[..., 0]
-        size = np.sqrt(np.sum(step**2, axis=1, keepdims=True))
+        size = np.sqrt(np.sum(step**2, axis=-1, keepdims=True))
         step *= np.minimum(1.0, _LARGEST_STEP / np.maximum(size, 1e-12))
         C = C @ exp_so3(step)
-    return C.reshape(-1, _AXES)
+    return C.reshape(*form.shape[:-2], count, _AXES)

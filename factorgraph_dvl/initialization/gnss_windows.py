@@ -142,22 +142,21 @@ class GnssWindows(VelocityWindows):
         return self.without_trend(self.velocity[self.rows])
 
     def antenna(self, offset: float | Array) -> Array:
-        """Return the carried velocity if GNSS is late by an offset, (W, n, 3, 4).
+        """Return the carried velocity if GNSS is late by an offset, (..., W, n, 3, 4).
 
         That of the antenna, and what each component of its lever arm adds to it.
         """
-        arm, omega_cb_b = (x[self.rows].reshape(-1, 3) for x in (self.arm, self.omega_cb_b))
+        arm, omega_cb_b = self.arm[self.rows], self.omega_cb_b[self.rows]
         first = self.carried(offset, self.begin)
         if np.array_equal(self.begin, self.end):
             speed, by_arm = first.speed, first.turn @ skew(first.rate - omega_cb_b)
         else:
             last = self.carried(offset, self.end)
-            span = np.maximum(self.end - self.begin, 1e-6)[self.rows].reshape(-1, 1)
+            span = np.maximum(self.end - self.begin, 1e-6)[self.rows][..., None]
             speed = (last.place - first.place) / span
             by_arm = (last.turn - first.turn) / span[..., None]
         speed = speed + rotate(by_arm, arm)
-        out = np.concatenate([speed[..., None], by_arm], axis=2)
-        return out.reshape(*self.rows.shape, 3, 4)
+        return np.concatenate([speed[..., None], by_arm], axis=-1)
 
     @cached_property
     def signal(self) -> Array:
@@ -166,44 +165,43 @@ class GnssWindows(VelocityWindows):
 
     def attitude(self, offset: float | Array, level_R: Array) -> Array:
         """Return body to east, north, up at the velocities, (W, n, 3, 3), by a fit's level_R."""
-        turn = self.carried(offset).turn
-        return level_R[:, None] @ turn.reshape(*self.rows.shape, 3, 3)
+        return level_R[:, None] @ self.carried(offset).turn
 
     def residual(self, offset: float | Array) -> Array:
-        """Return what is left of the velocities if GNSS is late by an offset, (W, n, 3)."""
+        """Return what is left of the velocities if GNSS is late by offsets, (..., W, n, 3)."""
         return self.fit(offset).residual
 
     def fit(self, offset: float | Array) -> WindowFit:
-        """Return how GNSS fits if it is late by an offset, s, constant or (W, n)."""
+        """Return how GNSS fits if it is late by an offset, s, constant or (..., W, n)."""
         carried = self.antenna(offset)
         level_R = self._tilt(carried[..., 0])
-        kept = self.without_trend(carried.reshape(*self.rows.shape, 12))
-        leveled = level_R[:, None] @ kept.reshape(carried.shape)
-        arm = np.zeros(3)
-        covariance = np.eye(3)
+        kept = self.without_trend(carried.reshape(*carried.shape[:-2], 12))
+        leveled = level_R[..., None, :, :] @ kept.reshape(carried.shape)
+        arm = np.zeros((*carried.shape[:-4], 3))
         for _ in range(_ARM_STEPS):
-            antenna = leveled @ np.append(1.0, arm)
+            antenna = leveled[..., 0] + _by_arm(leveled[..., 1:], arm)
             turn = _about_up(_heading(antenna, self.measured))
-            level_R, leveled = turn @ level_R, turn[:, None] @ leveled
+            level_R, leveled = turn @ level_R, turn[..., None, :, :] @ leveled
             antenna = rotate_rows(turn, antenna)
             across = np.stack(
-                [-antenna[..., 1], antenna[..., 0], np.zeros_like(antenna[..., 0])], axis=2
+                [-antenna[..., 1], antenna[..., 0], np.zeros_like(antenna[..., 0])], axis=-1
             )
-            power = np.sum(across**2, axis=(1, 2))
+            power = np.sum(across**2, axis=(-2, -1))
             columns = np.concatenate(
-                [(self.measured - leveled[..., 0])[..., None], leveled[..., 1:]], axis=3
+                [(self.measured - leveled[..., 0])[..., None], leveled[..., 1:]], axis=-1
             )
-            share = np.einsum("wni,wnij->wj", across, columns) / np.maximum(power, _TINY)[:, None]
-            columns = columns - across[..., None] * share[:, None, None, :]
+            share = np.einsum("...ni,...nij->...j", across, columns)
+            share /= np.maximum(power, _TINY)[..., None]
+            columns = columns - across[..., None] * share[..., None, None, :]
             y, A = columns[..., 0], columns[..., 1:]
-            squares = np.sum((y - A @ arm) ** 2, axis=(1, 2))
+            squares = np.sum((y - _by_arm(A, arm)) ** 2, axis=(-2, -1))
             weight = np.maximum(self.count, 1.0) / np.maximum(squares, _TINY)
-            weighted = (A * weight[:, None, None, None]).reshape(-1, 3)
-            information = weighted.T @ A.reshape(-1, 3) + np.eye(3) / _ARM_SIGMA_M**2
-            covariance = np.linalg.inv(information)
-            arm = covariance @ (weighted.T @ y.ravel())
-        residual = y - A @ arm
-        variance = np.sum(residual**2, axis=(1, 2)) / np.maximum(self.count, 1.0)
+            flat = A.reshape(*arm.shape[:-1], -1, 3)
+            weighted = (A * weight[..., None, None, None]).reshape(flat.shape).swapaxes(-1, -2)
+            covariance = np.linalg.inv(weighted @ flat + np.eye(3) / _ARM_SIGMA_M**2)
+            arm = rotate(covariance, (weighted @ y.reshape(*flat.shape[:-1], 1))[..., 0])
+        residual = y - _by_arm(A, arm)
+        variance = np.sum(residual**2, axis=(-2, -1)) / np.maximum(self.count, 1.0)
         variance = np.maximum(variance, self.noise**2)
         return WindowFit(
             residual,
@@ -214,18 +212,18 @@ class GnssWindows(VelocityWindows):
         )
 
     def _tilt(self, carried: Array) -> Array:
-        """Return the rotations that level the carried force, by its mean, (W, 3, 3)."""
+        """Return the rotations that level the carried force, by its mean, (..., W, 3, 3)."""
         up = np.array([0.0, 0.0, STANDARD_GRAVITY])
         wanted = self._slope(self.velocity[self.rows]) + up
         return _shortest(self._slope(carried), wanted)
 
     def _slope(self, values: Array) -> Array:
-        """Return the mean rate of change of values (W, n, 3), (W, 3)."""
+        """Return the mean rate of change of values (..., W, n, 3), (..., W, 3)."""
         weight = self.inside.astype(float)
         n = weight.sum(axis=1, keepdims=True)
         t = self.time - (weight * self.time).sum(axis=1, keepdims=True) / n
         t = t * weight
-        return np.einsum("wn,wnc->wc", t, values) / np.sum(t**2, axis=1)[:, None]
+        return np.einsum("wn,...wnc->...wc", t, values) / np.sum(t**2, axis=1)[:, None]
 
 
 def gnss_windows(windows: CarriedWindows, gnss: Gnss, later: float = 0.0) -> GnssWindows | None:
@@ -256,34 +254,39 @@ def gnss_windows(windows: CarriedWindows, gnss: Gnss, later: float = 0.0) -> Gns
 
 
 def rotate_rows(rotations: Array, vectors: Array) -> Array:
-    """Turn vectors (W, n, 3) by one rotation for each line, (W, 3, 3)."""
-    return vectors @ rotations.transpose(0, 2, 1)
+    """Turn vectors (..., W, n, 3) by one rotation for each line, (..., W, 3, 3)."""
+    return vectors @ rotations.swapaxes(-1, -2)
+
+
+def _by_arm(columns: Array, arm: Array) -> Array:
+    """Return products of columns (..., W, n, 3, 3) and a lever arm (..., 3)."""
+    return np.asarray((columns @ arm[..., None, None, :, None])[..., 0])
 
 
 def _heading(carried: Array, measured: Array) -> Array:
-    """Return the angles about the vertical that turn (W, n, 3) best to others, (W,)."""
+    """Return the angles about the vertical that turn (..., W, n, 3) best to others, (..., W)."""
     x, y = carried, measured
-    along = np.sum(x[..., :2] * y[..., :2], axis=(1, 2))
-    across = np.sum(x[..., 0] * y[..., 1] - x[..., 1] * y[..., 0], axis=1)
+    along = np.sum(x[..., :2] * y[..., :2], axis=(-2, -1))
+    across = np.sum(x[..., 0] * y[..., 1] - x[..., 1] * y[..., 0], axis=-1)
     return np.arctan2(across, along)
 
 
 def _about_up(angle: Array) -> Array:
-    out = np.zeros((angle.size, 3, 3))
-    out[:, 0, 0] = out[:, 1, 1] = np.cos(angle)
-    out[:, 1, 0] = np.sin(angle)
-    out[:, 0, 1] = -out[:, 1, 0]
-    out[:, 2, 2] = 1.0
+    out = np.zeros((*angle.shape, 3, 3))
+    out[..., 0, 0] = out[..., 1, 1] = np.cos(angle)
+    out[..., 1, 0] = np.sin(angle)
+    out[..., 0, 1] = -out[..., 1, 0]
+    out[..., 2, 2] = 1.0
     return out
 
 
 def _shortest(a: Array, b: Array) -> Array:
-    """Return the shortest rotations that take directions a to b, (W, 3) both."""
-    a = a / np.maximum(np.linalg.norm(a, axis=1, keepdims=True), 1e-12)
-    b = b / np.maximum(np.linalg.norm(b, axis=1, keepdims=True), 1e-12)
+    """Return the shortest rotations that take directions a to b, (..., 3) both."""
+    a = a / np.maximum(np.linalg.norm(a, axis=-1, keepdims=True), 1e-12)
+    b = b / np.maximum(np.linalg.norm(b, axis=-1, keepdims=True), 1e-12)
     # Opposite directions have no shortest rotation: a little off, any will do.
-    a = np.where(np.sum((a + b) ** 2, axis=1, keepdims=True) < 1e-12, a + _NUDGE, a)
+    a = np.where(np.sum((a + b) ** 2, axis=-1, keepdims=True) < 1e-12, a + _NUDGE, a)
     axis = np.cross(a, b)
     c = skew(axis)
-    cosine = np.sum(a * b, axis=1)[:, None, None]
+    cosine = np.sum(a * b, axis=-1)[..., None, None]
     return np.eye(3) + c + c @ c / np.maximum(1.0 + cosine, 1e-9)

@@ -75,7 +75,10 @@ class VelocityWindows:
         return float(np.median(self.sigma[self.rows[self.inside]]))
 
     def residual(self, offset: float | Array) -> Array:
-        """Return what is left of the velocities if the sensor is late by an offset, (W, n, 3)."""
+        """Return what is left of the velocities if the sensor is late by an offset.
+
+        A constant or (..., W, n), s; returns (..., W, n, 3). Each comparison is by itself.
+        """
         raise NotImplementedError
 
     def without_outliers(self, offset: float | Array) -> Self:
@@ -108,13 +111,17 @@ class VelocityWindows:
         return np.asarray(3.0 * self.inside.sum(axis=1) - unknowns)
 
     def carried(self, offset: float | Array, stamp: Array | None = None) -> CarriedMotion:
-        """Return the motion of the IMU at stamps (N,) that are late by an offset, W n times."""
-        time = self.time if stamp is None else stamp[self.rows]
-        window = np.broadcast_to(self.window[:, None], self.rows.shape)
-        return self.windows.at(window.ravel(), (time - offset).ravel())
+        """Return the motion of the IMU at stamps (N,) that are late by an offset (..., W, n)."""
+        time = (self.time if stamp is None else stamp[self.rows]) - offset
+        window = np.broadcast_to(self.window[:, None], time.shape)
+        at = self.windows.at(window.ravel(), time.ravel())
+        return CarriedMotion(
+            at.turn.reshape(*time.shape, 3, 3),
+            *(x.reshape(*time.shape, 3) for x in (at.speed, at.place, at.rate)),
+        )
 
     def without_trend(self, values: Array) -> Array:
-        """Return values (W, n, c) without the parabola that fits them best in each window."""
+        """Return values (..., W, n, c) without the parabola that fits them best in each window."""
         kept = values * self.inside[..., None]
         return kept - self._basis @ (self._basis.transpose(0, 2, 1) @ kept)
 

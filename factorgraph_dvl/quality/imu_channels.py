@@ -1,4 +1,4 @@
-"""Whether each channel of an IMU measures: constant, frozen, saturated, with spikes."""
+"""Whether each channel of an IMU measures: constant, frozen, saturated, spikes, jitter."""
 
 from __future__ import annotations
 
@@ -28,6 +28,8 @@ _SPIKES = 3
 # Share of the variance of the integrated noise that spikes must add. Chosen: below it they change
 # neither attitude nor velocity by a σ. A blow on a hull added 0.09 to six minutes.
 _ADDED = 0.25
+# Interval from which on it is a gap, in usual ones.
+_GAP = 1.5
 # Square of the median deviation from the mean of both neighbours, over the variance of noise.
 _MEDIAN_SQUARED = 1.5 * 0.6745**2
 
@@ -50,6 +52,7 @@ def channel_findings(imu: Imu) -> Iterator[Finding]:
         text = f"{', '.join(ends)}: its range ends there"
         yield Finding(Code.SATURATED, text, "IMU", severity="error")
     yield from _spikes(values, moves)
+    yield from _jitter(imu)
     same = np.diff(values[:, moves], axis=0) == 0.0
     interval = float(np.median(np.diff(imu.time)))
     begin, length = _longest(same.all(axis=1))
@@ -91,6 +94,37 @@ def _spikes(values: Array, moves: np.ndarray) -> Iterator[Finding]:
             Code.IMU_SPIKES,
             f"{count} single samples differ from those before and after, by up to {size:.0f} "
             "times what is usual",
+            "IMU",
+            severity="error",
+        )
+
+
+def _jitter(imu: Imu) -> Iterator[Finding]:
+    """Yield that stamps scatter about an even grid, and move the motion between them.
+
+    A stamp that is late by d gives d of the change of the rate to the wrong sample, which adds to
+    the noise that an attitude integrates.
+    """
+    interval = np.diff(imu.time)
+    usual = float(np.median(interval))
+    whole = (interval[1:] < _GAP * usual) & (interval[:-1] < _GAP * usual)
+    if np.count_nonzero(whole) < _SINGLE:
+        return
+    squared = float(np.median(np.diff(interval)[whole] ** 2)) / (4.0 * _MEDIAN_SQUARED)
+    settings = imu.settings
+    added = max(
+        squared * float(np.mean(np.diff(values, axis=0) ** 2, axis=0).max()) / (psd**2 * usual)
+        for values, psd in (
+            (imu.gyro, settings.gyro_noise_root_psd),
+            (imu.accel, settings.accel_noise_root_psd),
+        )
+    )
+    if added > _ADDED:
+        std_ms = 1e3 * np.sqrt(squared)
+        yield Finding(
+            Code.CLOCK_JITTER,
+            f"its stamps scatter by {std_ms:.2g} ms about even intervals of {1e3 * usual:.3g} ms. "
+            f"This adds {added:.2g} times the variance of its noise: write even stamps",
             "IMU",
             severity="error",
         )

@@ -100,6 +100,14 @@ class Code(StrEnum):
         "Nothing, if they are few.",
         "note",
     )
+    CLOCK_JITTER = (
+        "clock_jitter",
+        "The stamps of the IMU scatter about even intervals.",
+        "The motion between two samples is given to the wrong time, which adds an error to "
+        "attitude and velocity at each sample.",
+        "Write the stamps of the instrument, or even ones, in place of those of the computer.",
+        "error",
+    )
     IMU_NOISE = (
         "imu_noise",
         "The record of the IMU is noisier at high frequencies than trial.yaml states.",

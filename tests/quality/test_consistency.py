@@ -281,6 +281,12 @@ def test_spikes_of_the_imu_are_named(trial: Trial) -> None:
     assert "single samples differ" in text
 
 
+def test_jitter_of_stamps_is_named_where_it_adds_to_the_noise(trial: Trial) -> None:
+    (text,) = found(trial, faults.jitter("imu", 0.002)).values()
+    assert "scatter by 2 ms about even intervals of 20 ms" in text
+    assert found(trial, faults.jitter("imu", 1e-6)) == {}
+
+
 def test_spikes_below_the_integrated_noise_hide_no_other_error(trial: Trial) -> None:
     """Three steps of 35 deviations among 11,250 samples add less than the noise does."""
 
