@@ -139,7 +139,7 @@ def consistency_findings(trial: Trial, errors: Sequence[Finding]) -> Iterator[Fi
     suspected = any(f.code == Code.GYRO_UNIT for f in errors)
     if suspected or max((view.excess for view in views), default=0.0) > _CONTRADICTS:
         down_b = frd_from_body(trial.body_axes)[2]
-        wrong = diagnosis(compare, trial.inertial, -down_b, suspected=suspected)
+        wrong = diagnosis(compare, trial.inertial, -down_b)
     if wrong:
         corrected = carried_windows(wrong[0].corrected(trial.inertial))
         views = _views(corrected or windows, sensors)

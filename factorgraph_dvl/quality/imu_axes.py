@@ -24,10 +24,8 @@ Compare = Callable[[CarriedWindows], Sequence[tuple[Comparison, float]]]
 
 # Windows in which candidates are compared. Chosen: six minutes separate them.
 _WINDOWS = 9
-# Share of the changes of velocity that may be left unexplained where all is right, and what a
-# candidate must leave of it at most, and gain in log-likelihood. Chosen: 10 % is the noise of a
-# good trial; a right cause explains nearly all.
-_EXPLAINED = 0.1
+# Share of what is unexplained that a candidate must leave at most, and its gain in log-likelihood.
+# Chosen: a right cause explains nearly all.
 _LEFT = 0.5
 _GAIN = 30.0
 # Turn rate beyond which a record is not one, rad/s. Chosen: what gyros measure at most.
@@ -117,9 +115,7 @@ def _misfits(compare: Compare, imu: Imu, step: float) -> _Misfits | None:
     )
 
 
-def diagnosis(
-    compare: Compare, imu: Imu, up_b: Array, *, suspected: bool = False
-) -> list[Candidate]:
+def diagnosis(compare: Compare, imu: Imu, up_b: Array) -> list[Candidate]:
     """Return the mistakes that explain a misfit best, none where there is none to explain.
 
     Parameters
@@ -130,12 +126,9 @@ def diagnosis(
         Record of the IMU.
     up_b : ndarray, shape (3,)
         Up in body, by `body_axes`: gravity that is right already is not to be turned over.
-    suspected : bool, default False
-        Whether gyros and accelerometers contradict each other without another sensor.
     """
     nominal = _misfits(compare, imu, _FINE_S)
-    least_excess = 0.0 if suspected else _EXPLAINED
-    if nominal is None or nominal.excess.max() < least_excess:
+    if nominal is None or nominal.excess.max() == 0.0:
         return []
     worst = int(np.argmax(nominal.excess))
     force = imu.accel.mean(axis=0)
