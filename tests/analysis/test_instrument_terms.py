@@ -87,6 +87,7 @@ def test_signs_by_hand():
     np.testing.assert_allclose(found.lever_arm, [1.12, -0.93, 0.34])
 
 
+@pytest.mark.slow
 def test_standard_deviations_are_those_of_the_angles():
     alpha = np.array([10.0, -25.0, 60.0])
     found = instrument_of(calibrated(alpha))

@@ -325,6 +325,7 @@ def test_small_steps_of_a_clock_are_errors(trial: Trial) -> None:
     assert [(p.code, p.severity) for p in problems] == [(Code.CLOCK_STEP, "error")]
 
 
+@pytest.mark.slow
 def test_a_mirrored_axis_is_named_where_sway_hides_the_clock() -> None:
     """Gyros and accelerometers contradict each other; a clock all but fits GNSS and DVL."""
     for axis in (0, 1):

@@ -179,6 +179,7 @@ def test_a_sensor_that_is_first_heard_after_the_start(rows):
     as_the_batch(replace(trial, dvl=dvl))
 
 
+@pytest.mark.slow
 def test_no_start_while_a_mirror_image_fits_the_ranges():
     scene = config(
         "dive-one-beacon",

@@ -266,6 +266,7 @@ def crowd(count):
     )
 
 
+@pytest.mark.slow
 def test_thirty_uncertain_beacons_are_estimated():
     trial = crowd(30)
     solution = solve(trial, rate_hz=1.0)

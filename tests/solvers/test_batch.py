@@ -22,6 +22,7 @@ from factorgraph_dvl.solvers.batch import solve
 STRAIGHT = {"manoeuvres": [{"straight_s": 60}], "sway": {}}
 
 
+@pytest.mark.slow
 def test_without_noise_the_trial_of_the_paper_is_exact():
     trial = simulate(config("seed-a-phase-90", noise=False), 0)
     solution = solve(trial)
