@@ -85,6 +85,8 @@ def own_files():
         )
         for _ in range(50)
     )
+    track = writers.df21(WHEN, (1.5, 2, 3, 4), (1, 2, 3, 4), (10, 11, 12, 13))
+    own += b"".join(writers.ad2cp(kind, track) for kind in (0x1B, 0x1D)) * 30
     nortek = b"".join(
         writers.nmea(f"PNORBT7,145224491{i % 10}.75,1,2,0.1,0.2,0.3,0.01,1,2,3,4")
         + writers.nmea(

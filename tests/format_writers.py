@@ -152,6 +152,19 @@ def df20(when, velocity, distance, merit, *, heading=0.0, scale=-5, frame=2, ahr
     return bytes(out) + body
 
 
+def df21(when, velocity, beams, ranges, *, merit=0.01, delay=0.02, status=0xFFFFF):
+    """Return a track of a DVL: X, Y, Z1, Z2 and four beams, m/s, ranges in m; 212 bytes."""
+    out = struct.pack("<BBI", 1, 36, 4711)
+    clock = (when.year - 1900, when.month - 1, when.day, when.hour, when.minute, when.second)
+    out += struct.pack("<6BHHII", *clock, when.microsecond // 100, 4, 0, status)
+    out += struct.pack("<3f", 1490.0, 11.5, 2.25)
+    for values in (beams, ranges, [merit] * 4, [delay] * 4, [-0.1] * 4, [0.005] * 4):
+        out += struct.pack("<4f", *values)
+    for values in (velocity, [merit] * 4, [delay] * 4, [-0.1] * 4, [0.005] * 4):
+        out += struct.pack("<4f", *values)
+    return out
+
+
 def pd4(frame, velocity, ranges, clock, *, long=False, heading=0.0):
     """Return PD4, or PD5 if long (Tables 48 and 49); velocities m/s, None: bad."""
     v = [-32768 if x is None else round(x * 1000) for x in velocity]

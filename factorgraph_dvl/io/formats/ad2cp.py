@@ -1,7 +1,8 @@
 """Nortek AD2CP files: bottom track, orientation and the configuration they begin with.
 
 Source: Nortek, Signature Integrator's Guide (2017), 6.1 (header, DF20 bottom track, DF3
-records); AHRS fields as in the DF3 table. Records of other kinds are passed over, whole.
+records); AHRS fields as in the DF3 table. `ad2cp_tracks` has the records of DVLs. Records of other
+kinds are passed over, whole.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from factorgraph_dvl.geometry.units import DEG
+from factorgraph_dvl.io.formats import ad2cp_tracks
 from factorgraph_dvl.io.formats.clocks import posix
 from factorgraph_dvl.io.formats.framing import BLOCK, Records, Source, number
 from factorgraph_dvl.io.formats.losses import Frame, Losses, count_stretch
@@ -39,6 +41,7 @@ _UNITS = {
     "acceleration": 9.81 / 16384.0,
 }
 _FIELDS = ((1 << 5, "velocity", "<i4"), (1 << 8, "distance", "<i4"), (1 << 9, "merit", "<u2"))
+_IMPOSSIBLE = "record of bottom track with an impossible layout"
 # Above this a velocity is one of nothing: the widest velocity range is 30 m/s.
 _FASTEST = 50.0
 
@@ -89,11 +92,14 @@ class Ad2cp:
         (N,) of `PING`, bottom track: `time`, seconds since 1970; angles in rad as sent;
         `velocity` m/s by beam or axis, `distance` m, `merit` (figure of merit), nan where
         not measured; `rotation`, `quaternion` and `rate` (rad/s) of the AHRS, nan without.
+    tracks : Records
+        (M,) of `ad2cp_tracks.TRACK`, bottom and water track of DVLs.
     text : tuple of str
         String records, in order: configuration, and sentences that were sent to it.
     """
 
     bottom: Records
+    tracks: Records
     text: tuple[str, ...]
 
 
@@ -117,18 +123,25 @@ def read_ad2cp(
     """
     losses = Losses() if losses is None else losses
     pings: list[tuple[int, bytes]] = []
+    dvl: list[tuple[int, int, bytes]] = []
     text: list[str] = []
     for family, kind, start, stop in frames(source, losses):
         if family == NUCLEUS:
             continue
         if kind == BOTTOM:
             pings.append((start, source[start:stop]))
+        elif kind in (ad2cp_tracks.BOTTOM, ad2cp_tracks.WATER):
+            record = source[start:stop]
+            if ad2cp_tracks.is_whole(record):
+                dvl.append((start, kind, record))
+            else:
+                losses.add(_IMPOSSIBLE, start)
         elif kind == TEXT:
             text.append(source[start + 1 : stop].rstrip(b"\0").decode("latin-1"))
-        if len(pings) + len(text) >= block:
-            yield Ad2cp(_bottom_track(pings, losses), tuple(text))
-            pings, text = [], []
-    yield Ad2cp(_bottom_track(pings, losses), tuple(text))
+        if len(pings) + len(dvl) + len(text) >= block:
+            yield Ad2cp(_bottom_track(pings, losses), ad2cp_tracks.tracks(dvl), tuple(text))
+            pings, dvl, text = [], [], []
+    yield Ad2cp(_bottom_track(pings, losses), ad2cp_tracks.tracks(dvl), tuple(text))
 
 
 def beam_matrix(text: str) -> np.ndarray[tuple[int, int], np.dtype[np.float64]] | None:
@@ -232,7 +245,7 @@ def _bottom_track(pings: list[tuple[int, bytes]], losses: Losses) -> Records:
     out = np.concatenate(parts) if parts else np.empty(0, PING)
     if pings:
         impossible = len(pings) - len(out)
-        losses.add("record of bottom track with an impossible layout", pings[0][0], impossible)
+        losses.add(_IMPOSSIBLE, pings[0][0], impossible)
     return out[np.argsort(out["at"], kind="stable")]
 
 

@@ -138,6 +138,9 @@ class Batch:
         What the reader decided, and why; the same sentence again is logged once.
     losses : Losses, optional
         What was left out of the file since the batch before that has some.
+    directions : tuple of tuple of float, optional
+        Outward directions of the beams (4, 3) in instrument axes, where the file has them and
+        `beam_angle` does not say them.
     """
 
     kind: Kind
@@ -148,6 +151,7 @@ class Batch:
     heading: HeadingReference = "unknown"
     notes: tuple[str, ...] = ()
     losses: Losses | None = None
+    directions: tuple[tuple[float, ...], ...] = ()
 
 
 Reader = Callable[[Path, Mapping[str, Any] | None], Iterator[Batch]]

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
+from functools import lru_cache
 
 import numpy as np
 
@@ -178,6 +179,7 @@ def _angle(text: bytes) -> float:
     return number(text) * DEG
 
 
+@lru_cache(maxsize=256)
 def _calendar(day: bytes, month: bytes, year: bytes) -> float:
     if not (day.isdigit() and month.isdigit() and year.isdigit() and len(year) in (2, 4)):
         return math.nan

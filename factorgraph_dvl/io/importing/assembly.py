@@ -12,6 +12,7 @@ import numpy as np
 
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.io.formats.format import empty
+from factorgraph_dvl.io.formats.framing import Records
 from factorgraph_dvl.io.importing import motion, orientation, positions, velocity
 from factorgraph_dvl.io.importing.decisions import Decisions
 from factorgraph_dvl.io.importing.merging import Merged
@@ -76,9 +77,7 @@ def assemble(streams: Sequence[Timed], name: str, decisions: Decisions) -> tuple
         UTC of time zero, a whole second, s since 1970.
     """
     out = Assembly(decisions)
-    first = min(
-        (float(np.nanmin(t.time)) for t in streams if np.isfinite(t.time).any()), default=0.0
-    )
+    first = min((first for t in streams for first, _ in t.blocks), default=0.0)
     epoch = float(np.floor(first))
     out.settings |= {"format": 1, "name": name}
     if epoch >= FIRST_DATE:
@@ -101,7 +100,7 @@ def assemble(streams: Sequence[Timed], name: str, decisions: Decisions) -> tuple
         out.add("imu", lambda zero: motion.imu_tables(imu, zero), grade="tactical")
         decisions.add(
             imu.label,
-            f"{len(imu.time)} samples → grade chosen; state that of your IMU",
+            f"{imu.count} samples → grade chosen; state that of your IMU",
             "imu.grade",
         )
     if gnss is not None:
@@ -131,11 +130,7 @@ def fixes_of_navigation(streams: Sequence[Timed], decisions: Decisions) -> list[
     for timed in streams:
         if timed.stream.kind != "ins":
             continue
-        records = empty("fix", len(timed.time))
-        for name in ("at", "time", "received", "lat", "lon", "height"):
-            records[name] = timed.stream.records[name]
-        for name in ("velocity", "std", "velocity_std"):
-            records[name] = timed.stream.records[name]
+        records = timed.stream.records.converted(_as_fixes)
         decisions.add(
             timed.stream.label,
             "positions and velocities of the navigation solution → fixes beside the IMU; they "
@@ -146,12 +141,21 @@ def fixes_of_navigation(streams: Sequence[Timed], decisions: Decisions) -> list[
     return out
 
 
+def _as_fixes(navigation: Records) -> Records:
+    out = empty("fix", len(navigation))
+    for name in ("at", "time", "received", "lat", "lon", "height"):
+        out[name] = navigation[name]
+    for name in ("velocity", "std", "velocity_std"):
+        out[name] = navigation[name]
+    return out
+
+
 def _place(
     gnss: positions.Positions | None, streams: Sequence[Timed]
 ) -> tuple[float, float] | None:
     """Return a latitude and longitude of the trial, rad."""
     if gnss is not None:
-        _, part = gnss.fixes.sample(1000)
+        part = gnss.fixes.sample
         return float(np.nanmedian(part["lat"])), float(np.nanmedian(part["lon"]))
     for timed in streams:
         if timed.stream.kind == "ins":
@@ -198,7 +202,7 @@ def _add_ins(out: Assembly, ins: Merged, deviations: Merged | None) -> None:
     keys: dict[str, Any] = {"correlated_share": 1.0}
     out.decisions.add(
         ins.label,
-        f"{len(ins.time)} records of a navigation solution, in place of an IMU",
+        f"{ins.count} records of a navigation solution, in place of an IMU",
         "ins.file",
     )
     out.decisions.add(

@@ -14,7 +14,7 @@ from factorgraph_dvl.io.formats.janus import (
 )
 from factorgraph_dvl.io.formats.velocities import BEAM, EARTH, INSTRUMENT, SHIP
 from factorgraph_dvl.io.importing.decisions import Decisions
-from factorgraph_dvl.io.importing.merging import SAMPLE, Merged
+from factorgraph_dvl.io.importing.merging import Merged
 
 _NAMES = {BEAM: "beam", INSTRUMENT: "instrument", SHIP: "ship", EARTH: "Earth"}
 
@@ -54,16 +54,19 @@ def in_instrument_axes(pings: Records) -> Array:
 
 def beam_geometry(merged: Merged) -> Array | None:
     """Return outward directions (4, 3) if all pings with lock are along beams, else None."""
-    _, pings = merged.sample(SAMPLE)
+    pings = merged.sample
     locked = pings[np.isfinite(pings["beams"]).any(axis=1) | np.isfinite(pings["velocity"]).any(1)]
     angle = np.unique(locked["beam_angle"])
     in_beams = len(locked) > 0 and bool((locked["axes"] == BEAM).all())
+    stated = {timed.stream.directions for timed in merged.streams}
+    if in_beams and len(stated) == 1 and (directions := stated.pop()):
+        return np.array(directions)
     return beam_directions(float(angle[0])) if in_beams and np.isfinite(angle).all() else None
 
 
 def describe_axes(merged: Merged, decisions: Decisions) -> None:
     """Note in which coordinates the pings are, and what turns them back."""
-    _, pings = merged.sample(SAMPLE)
+    pings = merged.sample
     for axes in np.unique(pings["axes"]).tolist():
         part = pings[pings["axes"] == axes]
         decisions.add(merged.label, f"{_NAMES[axes]} coordinates → {_turned(part, axes)}")

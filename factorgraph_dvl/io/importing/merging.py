@@ -8,18 +8,19 @@ from dataclasses import dataclass
 import numpy as np
 
 from factorgraph_dvl.geometry.vectors import Array
-from factorgraph_dvl.io.formats.framing import Index, Records
+from factorgraph_dvl.io.formats.framing import Records
 from factorgraph_dvl.io.importing.decisions import Decisions
+from factorgraph_dvl.io.importing.spool import CHUNK
 from factorgraph_dvl.io.importing.time_base import Timed
 
-# Records at a time.
 # Records by which a stream is judged. Chosen: enough for shares of a percent.
 SAMPLE = 20_000
-CHUNK = 100_000
 # Difference of stamps, s, that is one instant. Chosen: the digits of formats.
 _SAME = 1e-3
 # Usual intervals that make a gap. Chosen: some lost samples are none.
 _GAP = 10.0
+# Intervals that say what is usual. Chosen: some MB.
+_USUAL = 1 << 20
 
 
 @dataclass(frozen=True)
@@ -30,35 +31,22 @@ class Merged:
     ----------
     streams : tuple of Timed
         Where they are.
-    time : ndarray, shape (N,), s
-        UTC.
-    order : ndarray of int, shape (N,)
-        Their places in all streams, one after the other.
+    count : int
+        Their number N.
+    sample_time : ndarray, shape (M,), s
+        UTC of records, evenly thinned out to about `SAMPLE`.
+    sample : Records
+        (M,) these records.
     """
 
     streams: tuple[Timed, ...]
-    time: Array
-    order: Index
+    count: int
+    sample_time: Array
+    sample: Records
 
-    def chunks(self, size: int = CHUNK) -> Iterator[tuple[Array, Records]]:
-        """Yield times (M,) and records (M,), M at most `size`."""
-        for begin in range(0, len(self.order), size):
-            part = self.order[begin : begin + size]
-            yield self.time[begin : begin + size], self._take(part)
-
-    def sample(self, most: int) -> tuple[Array, Records]:
-        """Return times and records, evenly thinned out to about `most`."""
-        step = max(len(self.order) // most, 1)
-        return self.time[::step], self._take(self.order[::step])
-
-    def _take(self, places: Index) -> Records:
-        out = np.empty(len(places), self.streams[0].stream.records.dtype)
-        start = 0
-        for timed in self.streams:
-            here = (places >= start) & (places < start + len(timed.time))
-            out[here] = timed.stream.records[places[here] - start]
-            start += len(timed.time)
-        return out
+    def chunks(self) -> Iterator[tuple[Array, Records]]:
+        """Yield times (M,) and records (M,), some `CHUNK`s at a time."""
+        return _without_repeats(self.streams)
 
     @property
     def offset_std(self) -> float:
@@ -74,6 +62,41 @@ class Merged:
     def label(self) -> str:
         """Names of the sources, for people."""
         return ", ".join(dict.fromkeys(timed.stream.label for timed in self.streams))
+
+
+class Beside:
+    """Records of one source at the times of another, as both are read in order.
+
+    Parameters
+    ----------
+    merged : Merged
+        The source.
+    margin : float, s
+        What is wanted before and behind these times.
+    """
+
+    def __init__(self, merged: Merged, margin: float = 0.0) -> None:
+        self._chunks, self._margin = merged.chunks(), margin
+        self._time, self._records = merged.sample_time[:0], merged.sample[:0]
+
+    def around(self, time: Array) -> tuple[Array, Records]:
+        """Return times and records around times (N,), with one more on each side.
+
+        Parameters
+        ----------
+        time : ndarray, shape (N,), s
+            In order, and behind those of the call before.
+        """
+        begin, end = time[0] - self._margin, time[-1] + self._margin
+        while not len(self._time) or self._time[-1] <= end:
+            more = next(self._chunks, None)
+            if more is None:
+                break
+            self._time = np.concatenate([self._time, more[0]])
+            self._records = np.concatenate([self._records, more[1]])
+        first = max(int(np.searchsorted(self._time, begin)) - 1, 0)
+        self._time, self._records = self._time[first:], self._records[first:]
+        return self._time, self._records
 
 
 def merge(streams: Sequence[Timed], decisions: Decisions) -> Merged | None:
@@ -96,35 +119,100 @@ def merge(streams: Sequence[Timed], decisions: Decisions) -> Merged | None:
     """
     if not streams:
         return None
-    time = np.concatenate([timed.time for timed in streams])
-    # Where two have one time, the one that says when it was received comes first.
-    unstamped = np.concatenate([np.isnan(timed.stream.records["received"]) for timed in streams])
-    order = np.lexsort((unstamped, np.round(time / _SAME)))
-    order = order[np.isfinite(time[order])]
+    total, known = (sum(n) for n in zip(*((len(t.time), t.known) for t in streams), strict=True))
     label = ", ".join(dict.fromkeys(timed.stream.label for timed in streams))
-    if len(order) < len(time):
-        decisions.add(label, f"{len(time) - len(order)} records without a time were left out")
-    if not len(order):
+    if known < total:
+        decisions.add(label, f"{total - known} records without a time were left out")
+    if not known:
         return None
-    ordered = time[order]
-    keep = np.diff(ordered, prepend=-np.inf) > _SAME
-    if not keep.all():
-        decisions.add(
-            label, f"{int((~keep).sum())} records repeat the time of another one: left out"
-        )
-    merged = Merged(tuple(streams), ordered[keep], order[keep])
-    _say_gaps(merged, label, decisions)
-    return merged
+    thin = max(known // SAMPLE, 1)
+    count, times, parts, intervals = 0, [], [], _Intervals()
+    for time, records in _without_repeats(streams):
+        begin = -count % thin
+        times.append(time[begin::thin])
+        parts.append(records[begin::thin])
+        intervals.add(time)
+        count += len(time)
+    if count < known:
+        decisions.add(label, f"{known - count} records repeat the time of another one: left out")
+    if text := str(intervals):
+        decisions.add(label, text)
+    return Merged(tuple(streams), count, np.concatenate(times), np.concatenate(parts))
 
 
-def _say_gaps(merged: Merged, label: str, decisions: Decisions) -> None:
-    steps = np.diff(merged.time)
-    if not len(steps):
-        return
-    gaps = steps[steps > _GAP * np.median(steps)]
-    if len(gaps):
-        decisions.add(
-            label,
-            f"{len(gaps)} gaps longer than {_GAP * np.median(steps):.3g} s, {gaps.sum():.0f} s in "
-            f"all, the longest {gaps.max():.0f} s",
+def _without_repeats(streams: Sequence[Timed]) -> Iterator[tuple[Array, Records]]:
+    last = -np.inf
+    for time, records in _in_order(streams):
+        if len(time):
+            keep = np.diff(time, prepend=last) > _SAME
+            last = time[-1]
+            if keep.any():
+                yield time[keep], records[keep]
+
+
+def _in_order(streams: Sequence[Timed]) -> Iterator[tuple[Array, Records]]:
+    """Yield the records that have a time in its order, from as few chunks as are out of order."""
+    blocks = sorted(
+        (first, which, start)
+        for which, timed in enumerate(streams)
+        for first, start in timed.blocks
+    )
+    # Columns: time, whether it lacks when it was received, stream, place, record.
+    waiting = [np.empty(0), np.empty(0, bool), np.empty(0, int), np.empty(0, int)]
+    records = streams[0].stream.records[:0]
+    following = [first for first, _, _ in blocks[1:]] + [np.inf]
+    for (_, which, start), limit in zip(blocks, following, strict=True):
+        chunk = slice(start, start + CHUNK)
+        time, part = streams[which].time[chunk], streams[which].stream.records[chunk]
+        place = np.flatnonzero(np.isfinite(time))
+        part = part[place]
+        new = (time[place], np.isnan(part["received"]), np.full(len(place), which), start + place)
+        waiting = [np.concatenate(pair) for pair in zip(waiting, new, strict=True)]
+        records = np.concatenate([records, part])
+        # Where two have one time, the one that says when it was received comes first.
+        instant = np.round(waiting[0] / _SAME)
+        order = np.lexsort((*reversed(waiting[1:]), instant))
+        is_final = (instant < np.round(limit / _SAME))[order]
+        yield waiting[0][order[is_final]], records[order[is_final]]
+        rest = order[~is_final]
+        waiting, records = [column[rest] for column in waiting], records[rest]
+
+
+class _Intervals:
+    """Intervals between times, as these come: which are gaps."""
+
+    def __init__(self) -> None:
+        self._last, self._first = np.nan, [np.empty(0)]
+        self._limit = np.nan
+        self._gaps = [np.empty(0)]
+
+    def add(self, time: Array) -> None:
+        """Add times in order."""
+        steps = np.diff(time, prepend=self._last)
+        self._last = time[-1]
+        steps = steps[np.isfinite(steps)]
+        if np.isnan(self._limit):
+            self._first.append(steps)
+            if sum(map(len, self._first)) >= _USUAL:
+                self._close()
+        else:
+            self._gaps.append(steps[steps > self._limit])
+
+    def _close(self) -> None:
+        first = np.concatenate(self._first)
+        if len(first):
+            self._limit = _GAP * float(np.median(first))
+            self._gaps = [first[first > self._limit]]
+        self._first = []
+
+    def __str__(self) -> str:
+        """Return a sentence about gaps, empty if there are none."""
+        if self._first:
+            self._close()
+        gaps = np.concatenate(self._gaps)
+        if not len(gaps):
+            return ""
+        return (
+            f"{len(gaps)} gaps longer than {self._limit:.3g} s, {gaps.sum():.0f} s in all, the "
+            f"longest {gaps.max():.0f} s"
         )

@@ -9,8 +9,9 @@ import numpy as np
 
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.io.formats.framing import Records
 from factorgraph_dvl.io.importing.decisions import Decisions
-from factorgraph_dvl.io.importing.merging import SAMPLE, Merged, merge
+from factorgraph_dvl.io.importing.merging import Beside, Merged, merge
 from factorgraph_dvl.io.importing.positions import best_source
 from factorgraph_dvl.io.importing.time_base import Timed
 from factorgraph_dvl.io.motion_table import COLUMNS, STD_COLUMNS
@@ -24,7 +25,7 @@ def choose(streams: Sequence[Timed], kind: str, decisions: Decisions) -> Merged 
 
 
 def _count(source: Sequence[Timed]) -> float:
-    return float(sum(np.isfinite(timed.time).sum() for timed in source))
+    return float(sum(timed.known for timed in source))
 
 
 def imu_tables(imu: Merged, epoch: float) -> Iterator[dict[str, Array]]:
@@ -66,13 +67,13 @@ class Navigation:
     @classmethod
     def of(cls, ins: Merged, deviations: Merged | None) -> Navigation:
         """Return the solution that records hold."""
-        _, part = ins.sample(SAMPLE)
-        stds = [part[name] for name in _STDS]
+        stds = [ins.sample[name] for name in _STDS]
         has_own = all(np.isfinite(std).any() for std in stds)
         return cls(ins, None if has_own else deviations, has_own or deviations is not None)
 
     def tables(self, epoch: float) -> Iterator[dict[str, Array]]:
         """Yield parts of the table `ins`."""
+        beside = None if self.deviations is None else Beside(self.deviations)
         for time, part in self.ins.chunks():
             values = np.column_stack(
                 [
@@ -89,15 +90,14 @@ class Navigation:
             table = dict(zip(COLUMNS, values[good].T, strict=True))
             if self.with_std:
                 stds = np.column_stack([part[name] for name in _STDS])
-                if self.deviations is not None:
-                    stds = _at(self.deviations, time)
+                if beside is not None:
+                    stds = _at(time, *beside.around(time))
                 stds[:, 6:] /= DEG
                 table |= dict(zip(STD_COLUMNS, stds[good].T, strict=True))
             yield table
 
 
-def _at(deviations: Merged, time: Array) -> Array:
+def _at(time: Array, own: Array, records: Records) -> Array:
     """Return the standard deviations (N, 9) at times (N,), linear between records."""
-    own, records = deviations.sample(len(deviations.time))
     values = np.column_stack([records[name] for name in _STDS])
     return np.column_stack([np.interp(time, own, column) for column in values.T])

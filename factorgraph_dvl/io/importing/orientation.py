@@ -95,13 +95,15 @@ def choose(
     if attitude is None:
         return None
     stream = attitude.streams[0].stream
-    _, part = attitude.sample(SAMPLE)
+    part = attitude.sample
     tilt = bool(np.isfinite(part["roll"]).mean() > 0.5)
     declination = 0.0
     std, offset = _TRUE if stream.heading == "true" else _UNKNOWN
     if stream.heading == "magnetic":
         std, offset = _MAGNETIC_STD, _MAGNETIC_OFFSET
-        found = _declination(where, float(np.median(attitude.time)), attitude.label, decisions)
+        found = _declination(
+            where, float(np.median(attitude.sample_time)), attitude.label, decisions
+        )
         if found is not None:
             declination, offset = found, _CORRECTED_OFFSET
     elif stream.heading == "unknown":
@@ -116,20 +118,20 @@ def choose(
         roll, pitch, heading = np.median(stated, axis=0).tolist()
         std = (roll, pitch, heading)
     what = "roll, pitch and heading" if tilt else "heading alone"
-    decisions.add(attitude.label, f"{len(attitude.time)} records of {what}", "attitude.file")
+    decisions.add(attitude.label, f"{attitude.count} records of {what}", "attitude.file")
     deviation = _DEVIATION if stream.heading == "magnetic" else 0.0
     own = stream.stream == OWN
     return ImportedAttitude(attitude, tilt, declination, std, offset, deviation, own)
 
 
 def _has_heading(timed: Timed) -> bool:
-    return bool(np.isfinite(timed.stream.records["heading"][:SAMPLE]).any())
+    return bool(np.isfinite(timed.stream.records[:SAMPLE]["heading"]).any())
 
 
 def _rank(source: Sequence[Timed]) -> tuple[float, ...]:
     part = source[0].stream.records[:SAMPLE]
     tilt = bool(np.isfinite(part["roll"]).any())
-    count = sum(np.isfinite(timed.time).sum() for timed in source)
+    count = sum(timed.known for timed in source)
     return (_RANKS[source[0].stream.heading], float(tilt), float(count))
 
 

@@ -11,7 +11,7 @@ from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.io.formats.framing import Records
 from factorgraph_dvl.io.importing.decisions import Decisions
-from factorgraph_dvl.io.importing.merging import SAMPLE, Merged, merge
+from factorgraph_dvl.io.importing.merging import SAMPLE, Beside, Merged, merge
 from factorgraph_dvl.io.importing.time_base import Timed
 from factorgraph_dvl.sensors.gnss import (
     POSITION_COLUMNS,
@@ -54,9 +54,12 @@ class Positions:
 
     def tables(self, epoch: float) -> Iterator[dict[str, Array]]:
         """Yield parts of the table `gnss`."""
-        course_time, course_velocity = self._course_velocities()
+        beside = None if self.courses is None else Beside(self.courses, _TOGETHER)
         for time, fixes in self.fixes.chunks():
             velocity, velocity_std = np.array(fixes["velocity"]), np.array(fixes["velocity_std"])
+            course_time, course_velocity = np.empty(0), np.empty((0, 3))
+            if beside is not None:
+                course_time, course_velocity = _velocities(*beside.around(time))
             if len(course_time):
                 place = np.clip(
                     np.searchsorted(course_time, time), 1, max(len(course_time) - 1, 1)
@@ -97,17 +100,13 @@ class Positions:
         stated = np.array(fixes["std"])
         return np.where(np.isfinite(stated) & (stated > 0.0), stated, typical)
 
-    def _course_velocities(self) -> tuple[Array, Array]:
-        if self.courses is None:
-            return np.empty(0), np.empty((0, 3))
-        times, velocities = [], []
-        for time, part in self.courses.chunks():
-            speed, course = part["speed"], part["course"]
-            v = np.stack([speed * np.sin(course), speed * np.cos(course), np.nan * speed], axis=1)
-            good = np.isfinite(v[:, :2]).all(axis=1) & (speed >= _SLOWEST)
-            times.append(time[good])
-            velocities.append(v[good])
-        return np.concatenate(times), np.concatenate(velocities)
+
+def _velocities(time: Array, courses: Records) -> tuple[Array, Array]:
+    """Return times and velocities (N, 3) of courses and speeds that are no noise."""
+    speed, course = courses["speed"], courses["course"]
+    v = np.stack([speed * np.sin(course), speed * np.cos(course), np.nan * speed], axis=1)
+    good = np.isfinite(v[:, :2]).all(axis=1) & (speed >= _SLOWEST)
+    return time[good], v[good]
 
 
 def choose(streams: Sequence[Timed], decisions: Decisions) -> Positions | None:
@@ -149,7 +148,7 @@ def best_source(
 
 
 def _count(source: Sequence[Timed]) -> tuple[float, ...]:
-    return (float(sum(np.isfinite(timed.time).sum() for timed in source)),)
+    return (float(sum(timed.known for timed in source)),)
 
 
 def _rank_of_fixes(source: Sequence[Timed]) -> tuple[float, ...]:
@@ -160,7 +159,7 @@ def _rank_of_fixes(source: Sequence[Timed]) -> tuple[float, ...]:
 
 
 def _height(fixes: Merged, decisions: Decisions) -> str:
-    _, part = fixes.sample(SAMPLE)
+    part = fixes.sample
     if np.isfinite(part["height"]).mean() > 0.5:
         if np.isfinite(part["altitude"]).any():
             separation = float(np.nanmedian(part["height"] - part["altitude"]))
@@ -186,11 +185,11 @@ def _height(fixes: Merged, decisions: Decisions) -> str:
 
 
 def _describe(fixes: Merged, courses: Merged | None, decisions: Decisions) -> None:
-    _, part = fixes.sample(SAMPLE)
+    part = fixes.sample
     known = np.isfinite(part["std"]).all(axis=1)
     qualities = sorted({int(q) for q in part["quality"][np.isfinite(part["quality"])]})
     source = "stated in the file" if known.any() else "typical of the quality of the fix"
-    text = f"{len(fixes.time)} fixes; standard deviations {source}"
+    text = f"{fixes.count} fixes; standard deviations {source}"
     if qualities:
         text += f" (quality {', '.join(map(str, qualities))})"
     decisions.add(fixes.label, text, "gnss.file")

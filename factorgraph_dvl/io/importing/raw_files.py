@@ -86,7 +86,7 @@ def import_files(
             spool = Spool(spool_folder, decisions.add)
             for path, found in zip(files, formats, strict=True):
                 _read(Path(path), found, spool, mapping, decisions, say)
-            streams = on_utc(spool.streams(), decisions)
+            streams = on_utc(spool.streams(), spool, decisions)
             say("assemble")
             name = Path(files[0]).stem
             assembly, epoch = assemble(streams, name, decisions)

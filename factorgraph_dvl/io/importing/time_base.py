@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,7 +14,7 @@ from factorgraph_dvl.io.formats.clocks import GPS_EPOCH, gps_to_utc, in_order, n
 from factorgraph_dvl.io.importing.decisions import Decisions
 from factorgraph_dvl.io.importing.lag import lag_between
 from factorgraph_dvl.io.importing.speeds import ground_speed, log_speed
-from factorgraph_dvl.io.importing.spool import Stream
+from factorgraph_dvl.io.importing.spool import CHUNK, Spool, Stored, Stream
 
 # Stamps from here on are dates; before, they count from the start of an instrument.
 FIRST_DATE = 1e8
@@ -37,9 +37,13 @@ class Timed:
     ----------
     stream : Stream
         The records.
-    time : ndarray, shape (N,), s
-        UTC since 1970, nan where the record has no time; since an arbitrary zero if no file
-        has a date.
+    time : Stored
+        (N,) UTC since 1970, s, nan where the record has no time; since an arbitrary zero if no
+        file has a date.
+    blocks : tuple of (float, int)
+        Earliest time and first record of each `CHUNK` of records in which one has a time.
+    known : int
+        Number of records with a time.
     offset_std : float, s
         Of what may be left of an offset.
     rate_std : float, ppm
@@ -47,9 +51,23 @@ class Timed:
     """
 
     stream: Stream
-    time: Array
+    time: Stored
+    blocks: tuple[tuple[float, int], ...]
+    known: int
     offset_std: float = 0.0
     rate_std: float = 0.0
+
+    @classmethod
+    def of(cls, stream: Stream, times: Iterable[Array], spool: Spool, *stds: float) -> Timed:
+        """Return a stream with its times, which are written to the spool."""
+        time = spool.store(times)
+        blocks, known = [], 0
+        for number, part in enumerate(time.chunks()):
+            part = part[np.isfinite(part)]
+            if len(part):
+                blocks.append((float(part.min()), number * CHUNK))
+                known += len(part)
+        return cls(stream, time, tuple(blocks), known, *stds)
 
 
 @dataclass(frozen=True)
@@ -61,13 +79,15 @@ class _Offset:
     rate_std: float = 0.0
 
 
-def on_utc(streams: Sequence[Stream], decisions: Decisions) -> list[Timed]:
+def on_utc(streams: Sequence[Stream], spool: Spool, decisions: Decisions) -> list[Timed]:
     """Relate the clocks of all files to UTC.
 
     Parameters
     ----------
     streams : sequence of Stream
         Of all files.
+    spool : Spool
+        Takes the times.
     decisions : Decisions
         Takes what was found and done.
 
@@ -82,18 +102,20 @@ def on_utc(streams: Sequence[Stream], decisions: Decisions) -> list[Timed]:
         If the clock of a file cannot be related to that of the positions.
     """
     near = _some_date(streams)
-    dated = {id(s): _dated(s, near, decisions) for s in streams if s.clock != "own"}
+    dated = {
+        id(s): Timed.of(s, _dated(s, near, decisions), spool) for s in streams if s.clock != "own"
+    }
     out = []
     offsets: dict[str, _Offset] = {}
     for stream in streams:
         if stream.clock != "own":
-            out.append(Timed(stream, dated[id(stream)]))
+            out.append(dated[id(stream)])
             continue
         if stream.file not in offsets:
             offsets[stream.file] = _offset(stream.file, streams, dated, decisions)
         offset = offsets[stream.file]
-        time = stream.records["time"] - offset.value
-        out.append(Timed(stream, time, offset.std, offset.rate_std))
+        times = (part["time"] - offset.value for part in stream.records.chunks())
+        out.append(Timed.of(stream, times, spool, offset.std, offset.rate_std))
     return out
 
 
@@ -102,40 +124,51 @@ def _some_date(streams: Sequence[Stream]) -> float | None:
     for clock in ("utc", "own"):
         for stream in streams:
             if stream.clock == clock:
-                times = stream.records["time"][:_MOST_PAIRS]
+                times = stream.records[:_MOST_PAIRS]["time"]
                 times = times[times >= FIRST_DATE]
                 if len(times):
                     return float(np.median(times))
     return None
 
 
-def _dated(stream: Stream, near: float | None, decisions: Decisions) -> Array:
-    time = np.array(stream.records["time"], float)
+def _dated(stream: Stream, near: float | None, decisions: Decisions) -> Iterator[Array]:
+    """Yield the times of a stream, part by part."""
+    times = (part["time"] for part in stream.records.chunks())
     if stream.clock == "utc" or near is None:
         if stream.clock != "utc":
             decisions.add(
                 stream.label, "no file has a date: times count from midnight or the week"
             )
-        return time
-    if stream.clock == "day":
+        yield from times
+    elif stream.clock == "day":
         decisions.add(stream.label, "times of day without a date: dated by the other files")
-        # A file may run past midnight, more than once: its first record is what is dated.
+        yield from _days(times, near)
+    else:
+        decisions.add(
+            stream.label,
+            "GPS seconds of a week that the file does not name: dated by the other files",
+        )
+        for time in times:
+            yield gps_to_utc(np.round((near - GPS_EPOCH - time) / _WEEK), time)
+
+
+def _days(times: Iterable[Array], near: float) -> Iterator[Array]:
+    """Date times of day: a file may run past midnight, more than once."""
+    for time in times:
         date = np.full(len(time), np.nan)
         known = np.flatnonzero(np.isfinite(time))
         if len(known):
             date[known[0]] = nearest_day(time[known[:1]], near)[0] - time[known[0]]
-        return in_order(time, date)
-    decisions.add(
-        stream.label, "GPS seconds of a week that the file does not name: dated by the other files"
-    )
-    weeks = np.round((near - GPS_EPOCH - time) / _WEEK)
-    return gps_to_utc(weeks, time)
+        out = in_order(time, date)
+        if len(known):
+            near = float(out[known[-1]])
+        yield out
 
 
 def _offset(
     file: str,
     streams: Sequence[Stream],
-    dated: dict[int, Array],
+    dated: Mapping[int, Timed],
     decisions: Decisions,
 ) -> _Offset:
     own = [s for s in streams if s.file == file and s.clock == "own"]
@@ -148,30 +181,29 @@ def _offset(
 
 def _interval(own: Sequence[Stream]) -> float:
     pings = next((s for s in own if s.kind in ("dvl", "water")), own[0])
-    steps = np.diff(pings.records["time"][:_MOST_PAIRS])
+    steps = np.diff(pings.records[:_MOST_PAIRS]["time"])
     steps = steps[steps > 0.0]
     return float(np.median(steps)) if len(steps) else 0.0
 
 
 def _pairs(
-    file: str, own: Sequence[Stream], streams: Sequence[Stream], dated: dict[int, Array]
+    file: str, own: Sequence[Stream], streams: Sequence[Stream], dated: Mapping[int, Timed]
 ) -> tuple[Array, Array]:
     """Return recording clock and UTC of the same instants."""
     received, utc = [np.empty(0)], [np.empty(0)]
     for stream in streams:
         if stream.clock != "utc" or stream.kind not in ("fix", "clock"):
             continue
+        part, times = (x.thinned(_MOST_PAIRS) for x in (stream.records, dated[id(stream)].time))
         if stream.file == file:
-            received.append(np.array(stream.records["received"]))
-            utc.append(dated[id(stream)])
+            received.append(part["received"])
+            utc.append(times)
         elif stream.kind == "clock":
             pings = next((s for s in own if s.kind in ("dvl", "water")), None)
-            if pings is not None:
-                _, a, b = np.intersect1d(
-                    pings.records["number"], stream.records["number"], return_indices=True
-                )
-                received.append(np.array(pings.records["time"])[a])
-                utc.append(dated[id(stream)][b])
+            for some in () if pings is None else pings.records.chunks():
+                _, a, b = np.intersect1d(some["number"], part["number"], return_indices=True)
+                received.append(some["time"][a])
+                utc.append(times[b])
     clock, time = np.concatenate(received), np.concatenate(utc)
     both = np.flatnonzero(np.isfinite(clock) & np.isfinite(time))
     both = both[:: max(len(both) // _MOST_PAIRS, 1)]
@@ -210,15 +242,15 @@ def _from_content(
     file: str,
     own: Sequence[Stream],
     streams: Sequence[Stream],
-    dated: dict[int, Array],
+    dated: Mapping[int, Timed],
     interval: float,
     decisions: Decisions,
 ) -> _Offset:
     """Return the offset at which speeds agree, or zero where stamps can be taken as they are."""
-    stamps = np.concatenate([s.records["time"] for s in own])
+    stamps = np.concatenate([s.records.thinned(_MOST_PAIRS)["time"] for s in own])
     stamps = stamps[np.isfinite(stamps)]
     has_dates = len(stamps) > 0 and bool(np.median(stamps) >= FIRST_DATE)
-    ground = ground_speed([(s, dated[id(s)]) for s in streams if id(s) in dated])
+    ground = ground_speed([(s, dated[id(s)].time) for s in streams if id(s) in dated])
     through = log_speed(own)
     if ground is None:
         decisions.add(file, "no file has UTC to compare its clock with → taken as UTC")

@@ -108,7 +108,7 @@ def choose(streams: Sequence[Timed], decisions: Decisions) -> Velocities | None:
 def _usable(streams: Sequence[Timed], decisions: Decisions) -> list[Timed]:
     out = []
     for timed in streams:
-        if np.isfinite(timed.time).any():
+        if timed.known:
             out.append(timed)
         elif timed.stream.kind in ("dvl", "water"):
             decisions.add(
@@ -128,7 +128,7 @@ def _check_one_instrument(streams: Sequence[Timed]) -> None:
     logs: dict[tuple[object, ...], str] = {}
     for timed in streams:
         if timed.stream.kind == "dvl":
-            angles = timed.stream.records["beam_angle"][:SAMPLE]
+            angles = timed.stream.records[:SAMPLE]["beam_angle"]
             angle = float(np.nanmedian(angles)) / DEG if np.isfinite(angles).any() else 0.0
             logs.setdefault((timed.stream.format, round(angle)), timed.stream.file)
     if len(set(logs.values())) > 1:
@@ -140,7 +140,7 @@ def _check_one_instrument(streams: Sequence[Timed]) -> None:
 
 
 def _velocities(pings: Merged, reference: str, locked: int, decisions: Decisions) -> Velocities:
-    count = len(pings.time)
+    count = pings.count
     label = pings.label
     what = (
         "pings with bottom lock"
@@ -157,7 +157,7 @@ def _velocities(pings: Merged, reference: str, locked: int, decisions: Decisions
         )
     describe_axes(pings, decisions)
     directions = beam_geometry(pings) if locked and reference == "bottom" else None
-    _, sample = pings.sample(SAMPLE)
+    sample = pings.sample
     own_std = bool(np.isfinite(sample["std"]).any()) and directions is None
     return Velocities(
         pings, reference, directions, _std(sample, label, decisions), own_std, locked, count

@@ -9,6 +9,7 @@ import pytest
 
 from factorgraph_dvl.errors import ConfigError, DataError
 from factorgraph_dvl.io.formats.mapping import MappingSettings
+from factorgraph_dvl.io.importing import merging, spool, time_base
 from factorgraph_dvl.io.importing.guess import guess_all
 from factorgraph_dvl.io.importing.lag import lag_between
 from factorgraph_dvl.io.importing.raw_files import import_files
@@ -61,6 +62,7 @@ def column(out, table, *names):
 
 
 VELOCITY = ("vel_x_m_s", "vel_y_m_s", "vel_z_m_s")
+FIX = ("lat_deg", "lon_deg", "height_m", "vel_e_m_s", "vel_n_m_s")
 
 
 def test_stamps_move_from_the_start_of_an_average_to_its_middle(tmp_path):
@@ -234,6 +236,34 @@ class TestMerging:
         np.testing.assert_allclose(np.diff(time), 1.0)
         assert len(time) == 40
         assert any("20 records repeat the time of another one" in x for x in decisions.lines)
+
+    def test_parts_of_files_do_not_matter(self, tmp_path, monkeypatch):
+        late = fixes(30, WHEN + timedelta(seconds=25))
+        first, second = pings(20), pings(30, WHEN + timedelta(seconds=15))
+        # One file runs backwards, as parts that were joined in the wrong order.
+        size = len(second) // 30
+        mixed = second[20 * size :] + second[: 20 * size]
+        whole, decisions = imported(tmp_path, mixed, fixes(), first, late)
+        names = {"dvl": VELOCITY, "gnss": FIX, "attitude": ("heading_deg",)}
+        kept = {table: column(whole, table, "time_s", *of) for table, of in names.items()}
+        for module in (spool, merging, time_base):
+            monkeypatch.setattr(module, "CHUNK", 7)
+        again, others = imported(tmp_path, mixed, fixes(), first, late, force=True)
+        assert others.lines == decisions.lines
+        for table, values in kept.items():
+            found = column(again, table, "time_s", *names[table])
+            np.testing.assert_array_equal(found, values)
+
+    def test_gaps_are_counted_where_intervals_are_many(self, monkeypatch):
+        monkeypatch.setattr(merging, "_USUAL", 50)
+        time = np.arange(400.0)
+        time[30:] += 20.0
+        time[300:] += 40.0
+        intervals = merging._Intervals()
+        for part in np.split(time, [10, 11, 200]):
+            intervals.add(part)
+        text = "2 gaps longer than 10 s, 62 s in all, the longest 41 s"
+        assert str(intervals) == text
 
     def test_two_instruments_are_no_trial(self, tmp_path):
         with pytest.raises(DataError, match="2 velocity logs"):
