@@ -17,6 +17,7 @@ from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.sensors.catalogue import specs_of
 from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.sensors.grades import DEFAULT_LIMITS, Grade, grades
+from factorgraph_dvl.sensors.message import Message, message
 from factorgraph_dvl.sensors.parameters import SCALAR, Parameter, ParameterSpec
 from factorgraph_dvl.sensors.protocol import DO_NOT_FIT, TOO_LARGE
 from factorgraph_dvl.sensors.verdict import Verdict, verdict_of
@@ -321,7 +322,7 @@ class Judged:
         """Whether the result can be used, from its findings and grades."""
         found = [*self.findings, *self._uncertain()]
         if not self.converged and not any(f.severity == "error" for f in found):
-            text = f"the solver did not converge in {self.iterations} iterations"
+            text = message("not_converged.iterations", iterations=self.iterations)
             found.append(Finding(Code.NOT_CONVERGED, text))
         return verdict_of(found)
 
@@ -339,12 +340,13 @@ class Judged:
             if limit is None or e.name in said or e.spec.stem not in DEAD_RECKONING:
                 continue
             poor = [
-                f"{name} (±{std:.2g})"
+                message("uncertain.component", name=name, std=std)
                 for name, std, grade in zip(e.component_names, e.std, own[e.name], strict=True)
                 if grade in ("red", "grey") and std > limit
             ]
             if poor:
-                text = f"{', '.join(poor)} above the limit of {limit:g} {e.spec.unit}".rstrip()
+                unit = f" {e.spec.unit}" if e.spec.unit else ""
+                text = message("uncertain.above", components=poor, limit=limit, unit=unit)
                 out.append(Finding(Code.UNCERTAIN, text, parameter=e.name))
         return out
 
@@ -567,23 +569,23 @@ def values_of(estimates: Sequence[Estimate]) -> dict[str, Array]:
     return {e.name: e.value if e.nominal is None else e.directions for e in estimates}
 
 
-def not_observable(estimate: Estimate, why: Callable[[int], str]) -> list[Finding]:
+def not_observable(estimate: Estimate, why: Callable[[int], Message | str]) -> list[Finding]:
     """Return a finding for each reason why components of an estimate are not observable.
 
     Parameters
     ----------
     estimate : Estimate
         Components that are fixed are left out.
-    why : callable of int, str
+    why : callable of int, Message
         The reason of a component, by its index.
     """
-    reasons: dict[str, list[str]] = {}
+    reasons: dict[Message | str, list[str]] = {}
     for i in np.flatnonzero(~estimate.observable & (estimate.prior_std > 0.0)):
         reasons.setdefault(why(int(i)), []).append(estimate.component_names[i])
     return [
         Finding(
             Code.NOT_OBSERVABLE,
-            f"{', '.join(names)} not observable: {reason}",
+            message("not_observable.because", names=names, reason=reason),
             parameter=estimate.name,
         )
         for reason, names in reasons.items()
@@ -645,28 +647,23 @@ def consistency_findings(
             out.append(
                 Finding(
                     Code.DOES_NOT_FIT,
-                    f"residuals are {rms:.0f} times as large as their stated standard deviation: "
-                    "the model does not fit the data, so do not use the values. A lever arm, a "
-                    "clock offset, a unit or an axis may be missing or wrong",
+                    message("does_not_fit.residuals", ratio=rms),
                     sensor=r.label,
                 )
             )
         elif rms > TOO_LARGE:
-            effect = "are too small until you correct it"
-            if factor is not None:
-                effect = "allow for noise of this size, but not for a lasting error"
+            key = "large_residuals.stated" if factor is None else "large_residuals.estimated"
             allowed = factor is not None and np.nanmax(factor) <= NOISE_FACTORS[1]
             out.append(
                 Finding(
                     Code.LARGE_RESIDUALS,
-                    f"residuals are {rms:.1f} times as large as their stated standard deviation; "
-                    f"the reported standard deviations {effect}",
+                    message(key, ratio=rms),
                     sensor=r.label,
                     severity="note" if allowed else "warning",
                 )
             )
         if factor is not None and np.nanmin(factor) < NOISE_FACTORS[0]:
-            text = f"the noise is {np.nanmin(factor):.2g} times its stated standard deviation"
+            text = message("small_residuals.noise", ratio=np.nanmin(factor))
             out.append(Finding(Code.SMALL_RESIDUALS, text, sensor=r.label))
     return out
 
@@ -692,16 +689,22 @@ def _far_from_prior(e: Estimate) -> list[Finding]:
     alone = mean + gain * (e.value[informed][worst] - mean)
     draws = moved[worst] * std / rest[worst]
     name = np.array(e.component_names)[informed][worst]
-    effect = (
-        f"it moves the value by {draws:.2g} of its standard deviations, and biases others"
-        if draws > _DRAWS
-        else "the data outweigh it, but a unit, an axis or the model may be wrong"
-    )
+    effect = message("far_from_prior.outweighed")
+    if draws > _DRAWS:
+        effect = message("far_from_prior.moves", draws=draws)
     return [
         Finding(
             Code.FAR_FROM_PRIOR,
-            f"the data show {name} {alone:.3g} ± {std * np.sqrt(gain):.1g}, {apart[worst]:.0f} "
-            f"standard deviations from its prior, {mean:.3g} ± {prior_std:.2g}; {effect}",
+            message(
+                "far_from_prior.data",
+                name=name,
+                value=alone,
+                std=std * np.sqrt(gain),
+                apart=apart[worst],
+                prior=mean,
+                prior_std=prior_std,
+                effect=effect,
+            ),
             parameter=e.name,
             severity="error" if draws > _DRAWS else "warning",
         )
@@ -729,9 +732,7 @@ def contradictions(residuals: Sequence[Residuals]) -> list[Finding]:
             out.append(
                 Finding(
                     Code.FILTER_CONTRADICTED,
-                    f"over the last half, residuals are {np.sqrt(square / z.size):.3g} times as "
-                    "large as the filter's covariance allows: it has not converged, so do not use "
-                    "its values and standard deviations",
+                    message("filter_contradicted.residuals", ratio=np.sqrt(square / z.size)),
                     sensor=r.label,
                 )
             )
@@ -781,16 +782,18 @@ def ambiguity(hypotheses: Sequence[Hypothesis]) -> list[Finding]:
     living = [h for h in hypotheses if h.died is None]
     if len(living) < 2:
         return []
-    weights = ", ".join(f"{h.weight:.2g}" for h in living)
     first, second = living[:2]
     frame = LocalFrame(*first.trajectory.geodetic[-1])
     apart = float(np.linalg.norm(frame.position(*second.trajectory.geodetic[-1])))
     return [
         Finding(
             Code.AMBIGUOUS,
-            f"{len(living)} trajectories fit the data (weights {weights}), {apart:.3g} m apart at "
-            "the end: the answer is ambiguous. The standard deviations contain all of them; a "
-            "turn of 30 degrees or more, or `initial.position`, would show which is right",
+            message(
+                "ambiguous.trajectories",
+                count=len(living),
+                weights=[h.weight for h in living],
+                apart=apart,
+            ),
         )
     ]
 
@@ -858,13 +861,12 @@ def most_probable_minimum(solutions: Sequence[Solution], against: Array) -> Solu
         seen = np.all([solutions[i].estimates[k].observable for i in order], axis=0)
         seen &= own <= OBSERVABLE * e.prior_std
         estimates.append(replace(e, std=own, observable=seen))
-    shares = ", ".join(f"{w:.2g}" for w in weights)
-    turned = "; ".join(
-        f"{e.name} {np.round(e.value, 1).tolist()}"
+    turned = [
+        message("words.at", name=e.name, value=str(np.round(e.value, 1).tolist()))
         for i in order[1:]
         for e in solutions[i].estimates
         if e.spec.kind == "rotation"
-    )
+    ]
     return replace(
         best,
         converged=all(solutions[i].converged for i in order),
@@ -877,9 +879,9 @@ def most_probable_minimum(solutions: Sequence[Solution], against: Array) -> Solu
             *best.findings,
             Finding(
                 Code.AMBIGUOUS,
-                f"{len(order)} minima fit the data (weights {shares}), the others at {turned}: "
-                "the answer is ambiguous. The standard deviations contain all of them; a longer "
-                "trial with turns and changes of speed would show which is right",
+                message(
+                    "ambiguous.minima", count=len(order), weights=weights, others=tuple(turned)
+                ),
             ),
         ),
     )
@@ -893,12 +895,14 @@ def outlier_findings(used: Sequence[Residuals], rejected: Sequence[Residuals]) -
         own = [r for r in rejected if r.label == label]
         count = sum(r.time.size for r in own)
         total = count + kept.get(label, 0)
-        text = f"{count} of {total} are outliers and were not used; rejected.csv lists them"
+        text = message("outliers.some", count=count, total=total)
         spans = [span for r in own if r.reason == "window" for span in _spans(r.time)]
         if spans:
-            listed = ", ".join(f"{a:.1f} to {b:.1f} s" for a, b in spans[:_LISTED])
-            more = f" and {len(spans) - _LISTED} more" if len(spans) > _LISTED else ""
-            text += f". They are wrong together from {listed}{more}"
+            listed = [message("words.span", start=a, end=b) for a, b in spans[:_LISTED]]
+            more: Message | str = ""
+            if len(spans) > _LISTED:
+                more = message("words.and_more", count=len(spans) - _LISTED)
+            text = message("outliers.windows", count=count, total=total, windows=listed, more=more)
         severe = count > _MANY_OUTLIERS * total or bool(spans)
         out.append(
             Finding(Code.OUTLIERS, text, sensor=label, severity="warning" if severe else "note")
@@ -920,8 +924,11 @@ def mostly_rejected(used: Sequence[Residuals], rejected: Sequence[Residuals]) ->
     return [
         Finding(
             Code.MANY_REJECTED,
-            f"{r.time.size} of {r.time.size + kept.get(r.label, 0)} were rejected as echoes: a "
-            "position, a clock, a unit or a standard deviation may be wrong",
+            message(
+                "many_rejected.echoes",
+                count=r.time.size,
+                total=r.time.size + kept.get(r.label, 0),
+            ),
             sensor=r.label,
         )
         for r in rejected

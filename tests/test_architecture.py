@@ -18,7 +18,7 @@ ROOT = PACKAGE.parent
 # Data classes of the sensors: no measurement equation is among them.
 SENSOR_DATA = (
     *("Imu", "ImuSettings", "Gnss", "Ins", "Dvl", "Star", "Aid", "Motion"),
-    *("Parameter", "SPEC", "Code", "Finding"),
+    *("Parameter", "SPEC", "Code", "Finding", "message", "Message"),
 )
 # GTSAM, SciPy and Matplotlib take most of a second to load: only what needs none of them may
 # be imported where the command line starts.

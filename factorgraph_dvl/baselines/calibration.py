@@ -37,6 +37,7 @@ from factorgraph_dvl.geometry.rotations import BodyAxes, rph_from_rotation
 from factorgraph_dvl.imu.timestamps import JUMP, without_strays
 from factorgraph_dvl.sensors.dvl import SCALE_SPEC, Dvl
 from factorgraph_dvl.sensors.finding import Code, Finding
+from factorgraph_dvl.sensors.message import message
 from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.solution import Progress, Solution
 from factorgraph_dvl.trial import Trial
@@ -56,11 +57,7 @@ DVL_METHODS: tuple[DvlMethod, ...] = get_args(DvlMethod)
 Method = DvlMethod | Literal["star", "liu-2020", "beams"]
 METHODS: tuple[Method, ...] = (*DVL_METHODS, "star", "liu-2020", "beams")
 
-_UNCORRELATED = Finding(
-    Code.METHOD_LIMITS,
-    "the prior has the values and standard deviations of dvl.calibration; these methods "
-    "do not use its correlations",
-)
+_UNCORRELATED = Finding(Code.METHOD_LIMITS, message("method_limits.uncorrelated_prior"))
 _NEGLECTED: dict[DvlMethod, tuple[str, ...]] = {
     "point-set": ("dvl_bias", "time_offset"),
     "luo-2024": ("dvl_bias", "time_offset"),
@@ -228,13 +225,7 @@ def _outage(trial: Trial) -> list[Finding]:
     longest = float(np.diff(edges)[~np.isin(edges[:-1], time[jumps])].max())
     if longest <= _LONGEST_GAP:
         return []
-    return [
-        Finding(
-            Code.GNSS_OUTAGE,
-            f"GNSS is missing for {longest:.0f} s: the SINS/GNSS filter drifts there, do not "
-            "use its motion or the calibration. `solve` bridges the outage",
-        )
-    ]
+    return [Finding(Code.GNSS_OUTAGE, message("gnss_outage.long", duration=longest))]
 
 
 def _by_ship(
@@ -326,7 +317,12 @@ def _neglects(method: DvlMethod, dvl: Dvl) -> list[Finding]:
     out = [
         Finding(
             Code.METHOD_LIMITS,
-            f"{method} does not estimate {p.name}: fixed at {np.round(p.mean / p.si, 6).tolist()}",
+            message(
+                "method_limits.fixed",
+                method=method,
+                name=p.name,
+                value=str(np.round(p.mean / p.si, 6).tolist()),
+            ),
             parameter=p.name,
         )
         for p in (parameters[stem] for stem in _NEGLECTED[method])
@@ -334,6 +330,6 @@ def _neglects(method: DvlMethod, dvl: Dvl) -> list[Finding]:
     ]
     single = ("point-set", "luo-2024", "wahba", "joyce", "pollard-read")
     if method in single and parameters["scale_error"].mean.size == 3:
-        text = f"{method} estimates one scale error for the three axes"
+        text = message("method_limits.one_scale", method=method)
         out.append(Finding(Code.METHOD_LIMITS, text, parameter=parameters["scale_error"].name))
     return out

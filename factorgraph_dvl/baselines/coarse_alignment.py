@@ -18,6 +18,7 @@ from factorgraph_dvl.geometry.rotations import BodyAxes, best_rotation, exp_so3,
 from factorgraph_dvl.geometry.units import DEG, DEG_PER_HOUR, MICRO_G, STANDARD_GRAVITY
 from factorgraph_dvl.geometry.vectors import Array, rotate
 from factorgraph_dvl.sensors.imu import ImuSettings
+from factorgraph_dvl.sensors.message import Message, message
 
 # Chosen: error of the integrated velocity, m/s, that the gyro bias may cause within a window.
 _WINDOW_ERROR = 0.2
@@ -43,13 +44,13 @@ class CoarseAttitude:
         Local-level.
     covariance : ndarray, shape (3, 3), rad²
         Of phi in Exp(phi) nRb.
-    note : str, optional
-        For the user; may be empty.
+    note : Message, optional
+        For the user.
     """
 
     nRb: Array
     covariance: Array
-    note: str = ""
+    note: Message | None = None
 
 
 def coarse_attitude(
@@ -141,8 +142,7 @@ def _by_course(
         return CoarseAttitude(
             nRb,
             np.diag(spread**2),
-            "the data do not determine the heading: the vehicle is at rest, and its gyros are "
-            "too coarse for gyrocompassing",
+            message("heading_unknown.at_rest"),
         )
     k = moving[0]
     forward = nRb @ turn[k] @ frd_from_body(body_axes)[0]
@@ -152,7 +152,7 @@ def _by_course(
     return CoarseAttitude(
         exp_so3([0.0, 0.0, angle]) @ nRb,
         np.diag(spread**2),
-        "the initial heading is the course over ground: the motion does not determine it better",
+        message("heading_unknown.course"),
     )
 
 

@@ -25,6 +25,7 @@ from factorgraph_dvl.geometry.rotations import exp_so3, log_so3
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.sensors.finding import Code, Finding
+from factorgraph_dvl.sensors.message import message
 from factorgraph_dvl.sensors.parameters import Parameter
 
 # The tuning, which the paper leaves open ("set by the noise of the DVL and the accuracy of
@@ -36,9 +37,7 @@ THRESHOLD = 1.0 * DEG
 
 _TUNING = Finding(
     Code.METHOD_LIMITS,
-    f"luo-2024 multiplies the variance of the measurements by {NOISE_FACTOR:g} and rotates the "
-    f"data at {THRESHOLD / DEG:g} deg, because the paper states no tuning. Its standard "
-    "deviations do not describe its errors",
+    message("method_limits.luo_tuning", factor=NOISE_FACTOR, threshold=THRESHOLD / DEG),
 )
 
 
@@ -72,7 +71,7 @@ def as_printed(
         if k in keep:
             history.append((float(points.time[k]), _estimated(parameters, D, x, P)))
     rotated = Finding(
-        Code.METHOD_LIMITS, f"luo-2024 rotated the data of the DVL {rotations} times"
+        Code.METHOD_LIMITS, message("method_limits.luo_rotated", rotations=rotations)
     )
     return Outcome(_estimated(parameters, D, x, P), 1, tuple(history), findings=(_TUNING, rotated))
 

@@ -36,6 +36,7 @@ from factorgraph_dvl.geometry.vectors import Array, cross_variance, interpolate,
 from factorgraph_dvl.imu.increments import increments
 from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.sensors.gnss import Gnss
+from factorgraph_dvl.sensors.message import Message, message
 from factorgraph_dvl.trial import Trial
 
 # Chosen: longest step, s, over which gravity and Coriolis terms count as constant.
@@ -157,8 +158,7 @@ def navigate(trial: Trial, pings: Array, *, smoothed: bool = True) -> Navigation
         findings.append(
             Finding(
                 Code.METHOD_LIMITS,
-                "the filter does not estimate the antenna's lever arm: its uncertainty is added "
-                "to the noise of the fixes",
+                message("method_limits.antenna"),
                 sensor=gnss.label,
             )
         )
@@ -167,20 +167,15 @@ def navigate(trial: Trial, pings: Array, *, smoothed: bool = True) -> Navigation
         span = (float(inc.start[a]), float(inc.end[b - 1]))
         inside = (gnss.time >= span[0]) & (gnss.time <= span[1])
         if not np.any(inside & ~np.isnan(gnss.geodetic[:, 0])):
-            text = f"no position from {span[0]:.3f} to {span[1]:.3f} s, which is not used"
+            text = message("unused.no_position", start=span[0], end=span[1])
             findings.append(Finding(Code.UNUSED, text, sensor=gnss.label))
             continue
         if tracks:
-            findings.append(
-                Finding(
-                    Code.FILTER_RESTARTED,
-                    f"the SINS/GNSS filter starts again at {span[0]:.3f} s, after the gap. "
-                    "Position, velocity and attitude are new, and the biases continue",
-                )
-            )
+            text = message("filter_restarted.after_gap", time=span[0])
+            findings.append(Finding(Code.FILTER_RESTARTED, text))
         track, note = _navigate_arc(trial, gnss, samples, span, pings, tracks, smoothed)
         tracks.append(track)
-        findings += [Finding(Code.HEADING_UNKNOWN, note)] if note else []
+        findings += [Finding(Code.HEADING_UNKNOWN, note)] if note is not None else []
     if not tracks:
         raise DataError(
             "no GNSS position while the IMU runs",
@@ -305,7 +300,7 @@ def _navigate_arc(
     pings: Array,
     earlier: list[FilteredTrack],
     smoothed: bool,
-) -> tuple[FilteredTrack, str]:
+) -> tuple[FilteredTrack, Message | None]:
     time = _events(span, np.concatenate([gnss.time, pings]))
     steps = compose(samples, time[:-1], time[1:])
     fixes = _fixes_at(gnss, samples, time)

@@ -23,6 +23,7 @@ from factorgraph_dvl.geometry.rotations import exp_so3, log_so3
 from factorgraph_dvl.geometry.vectors import Array, rotate, skew
 from factorgraph_dvl.sensors.dvl import SCALES_SPEC
 from factorgraph_dvl.sensors.finding import Code, Finding
+from factorgraph_dvl.sensors.message import message
 from factorgraph_dvl.sensors.parameters import Parameter
 
 # Chosen: prior standard deviation of the bias, m/s, where the trial fixes it: the method
@@ -86,8 +87,11 @@ def nine_state(
         findings.append(
             Finding(
                 Code.NOT_OBSERVABLE,
-                f"{', '.join(mixed)} not observable: bias and scale separate only if the speed "
-                "along the axis varies, which is not the case here",
+                message(
+                    "not_observable.because",
+                    names=mixed,
+                    reason=message("not_observable.bias_and_scale"),
+                ),
                 parameter=bias.name,
             )
         )
@@ -105,8 +109,7 @@ def with_bias(
         findings.append(
             Finding(
                 Code.METHOD_LIMITS,
-                f"the trial fixes the bias at zero, but the method estimates it with a "
-                f"prior standard deviation of {_BIAS_SIGMA} m/s",
+                message("method_limits.bias", std=_BIAS_SIGMA),
                 parameter=bias.name,
             )
         )

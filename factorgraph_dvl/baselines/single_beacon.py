@@ -20,6 +20,7 @@ from factorgraph_dvl.baselines.outcome import History
 from factorgraph_dvl.errors import ConfigError, DataError
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.sensors.finding import Code, Finding
+from factorgraph_dvl.sensors.message import message
 from factorgraph_dvl.solution import (
     Estimate,
     Progress,
@@ -161,8 +162,7 @@ def filter_planar(
             *contradicted,
             Finding(
                 Code.METHOD_LIMITS,
-                f"{method} uses all ranges, outliers included, and takes sound speed, log, "
-                "heading and beacons as exact",
+                message("method_limits.all_ranges", method=str(method)),
             ),
         ),
     )
@@ -251,8 +251,7 @@ def _depends_on_start(
     """
     P = found.covariance[-1]
     if not (np.isfinite(P).all() and np.linalg.eigvalsh(P)[0] > 0.0):
-        text = "the filter has diverged: its covariance is not positive definite"
-        return [Finding(Code.FILTER_CONTRADICTED, text)]
+        return [Finding(Code.FILTER_CONTRADICTED, message("filter_contradicted.diverged"))]
     apart, most = 0.0, 0.0
     for move in (*np.diag(std), *-np.diag(std)):
         moved = run_filter(trial, method, mean + move, std).state[-1] - found.state[-1]
@@ -264,9 +263,7 @@ def _depends_on_start(
     return [
         Finding(
             Code.FILTER_CONTRADICTED,
-            "the filter has not converged: another start, one standard deviation off, ends "
-            f"{apart:.3g} m, or {most:.3g} standard deviations, from the result. It may have "
-            "found a mirror image; `solve` follows all of them",
+            message("filter_contradicted.start", apart=apart, sigmas=most),
         )
     ]
 

@@ -33,6 +33,7 @@ from factorgraph_dvl.geometry.units import ARCSEC, DEG
 from factorgraph_dvl.geometry.vectors import Array, skew
 from factorgraph_dvl.imu.increments import increments
 from factorgraph_dvl.sensors.finding import Code, Finding
+from factorgraph_dvl.sensors.message import message
 from factorgraph_dvl.sensors.star import Star
 from factorgraph_dvl.solution import (
     Residuals,
@@ -55,8 +56,7 @@ _KNOWN_DEG = 5.0
 _OFF_VERTICAL = 2.0 * DEG
 _IN_N = Finding(
     Code.METHOD_LIMITS,
-    "liu-2020 takes the drift as constant in n, as printed. Unless the vessel heads north, this "
-    "is the rotated drift of the gyros. The method `star` estimates it in body",
+    message("method_limits.liu_in_n"),
 )
 
 
@@ -204,22 +204,24 @@ def _summary(
     residuals = (_star_residuals(tracks, attitudes), *gnss_residuals(trial, navigation))
     findings = [*navigation.findings, *star.findings()]
     if np.any(np.array(star.settings.mounting_std_deg) > 0.0):
-        at = np.round(star.settings.mounting_deg, 6).tolist()
-        text = f"star does not estimate star_mounting_deg: fixed at {at}"
+        text = message(
+            "method_limits.fixed",
+            method="star",
+            name="star_mounting_deg",
+            value=str(np.round(star.settings.mounting_deg, 6).tolist()),
+        )
         findings.append(Finding(Code.METHOD_LIMITS, text, parameter="star_mounting_deg"))
     tilt = off_vertical(attitudes.time, attitudes.nRb, trial.inertial.time, trial.inertial.accel)
     if tilt > _OFF_VERTICAL:
         findings.append(
             Finding(
                 Code.STAR_VERTICAL,
-                f"the vertical of its attitudes is {np.degrees(tilt):.1f} deg off that of the "
-                "specific force: are `epoch` and `mounting_deg` right? Do not use the attitude "
-                "before they are corrected",
+                message("star_vertical.do_not_use", tilt=np.degrees(tilt)),
                 sensor=star.label,
             )
         )
     for e in estimates:
-        findings += not_observable(e, lambda _: "the arc is too short for these stars")
+        findings += not_observable(e, lambda _: message("not_observable.short_arc"))
     contradicted = contradictions(residuals)
     first = residuals[0]
     motion = motion_at(navigation, samples.increments.ticks(rate_hz))

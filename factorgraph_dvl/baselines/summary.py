@@ -17,6 +17,7 @@ from factorgraph_dvl.geometry.rotations import rph_from_rotation, rph_jacobian, 
 from factorgraph_dvl.geometry.vectors import Array, rotate
 from factorgraph_dvl.sensors.dvl import Dvl
 from factorgraph_dvl.sensors.finding import Code, Finding
+from factorgraph_dvl.sensors.message import Message, message
 from factorgraph_dvl.sensors.protocol import Aid
 from factorgraph_dvl.sensors.protocol import Motion as SensorMotion
 from factorgraph_dvl.solution import (
@@ -33,8 +34,7 @@ from factorgraph_dvl.trial import Trial
 
 WHITE_NOISE = Finding(
     Code.METHOD_LIMITS,
-    "the error of the velocity to compare with is treated as white noise; it is correlated, so "
-    "the standard deviations of the DVL's parameters are too small",
+    message("method_limits.white_noise"),
 )
 
 
@@ -226,12 +226,12 @@ def gnss_residuals(trial: Trial, navigation: Navigation) -> tuple[Residuals, ...
 def left_out(sensor: Aid, outside: int, vague: int) -> list[Finding]:
     """Say how many pings of a sensor were not used, and why: outside the motion, or vague."""
     reasons = {
-        "at times without motion to compare with": outside,
-        "on parts of the trial that leave the heading open": vague,
+        "unused.pings_outside": outside,
+        "unused.pings_vague": vague,
     }
     return [
-        Finding(Code.UNUSED, f"{pings} pings {reason} were not used", sensor=sensor.label)
-        for reason, pings in reasons.items()
+        Finding(Code.UNUSED, message(key, count=pings), sensor=sensor.label)
+        for key, pings in reasons.items()
         if pings
     ]
 
@@ -243,13 +243,10 @@ def _unobservable(
     own = {p.name for p in aid.parameters()}
     out: list[Finding] = []
 
-    def why(name: str, component: int) -> str:
+    def why(name: str, component: int) -> Message | str:
         if name in own:
             return aid.explain(name, component, motion)
-        return (
-            "the data determine it no better than the prior; make the trial longer, or add "
-            "turns and changes of speed"
-        )
+        return message("not_observable.no_better")
 
     for e in estimates:
         out += not_observable(e, partial(why, e.name))

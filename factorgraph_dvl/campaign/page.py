@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from html import escape
 from pathlib import Path
 
@@ -17,18 +17,26 @@ from factorgraph_dvl.campaign.trials import Campaign, CampaignTrial
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.io.calibration_file import CALIBRATION_FILE
 from factorgraph_dvl.report.figures.drawing import VERDICT_COLOURS
+from factorgraph_dvl.report.html.markup import (
+    Cell,
+    Html,
+    Section,
+    both,
+    element,
+    paragraph,
+    said,
+    section,
+    table,
+)
+from factorgraph_dvl.report.html.page import whole_page
+from factorgraph_dvl.report.html.sections import component_cell
+from factorgraph_dvl.report.html.words import chinese, component_names
 from factorgraph_dvl.report.text import at_precision, split_unit, with_std
+from factorgraph_dvl.sensors.message import message
 
 # Of a panel, in pixels.
 _WIDTH, _HEIGHT, _LEFT, _RIGHT, _TOP, _BOTTOM = 900, 190, 90, 20, 12, 24
-_STYLE = """
-body { font: 15px/1.45 system-ui, sans-serif; max-width: 960px; margin: 2em auto; color: #222; }
-table { border-collapse: collapse; margin: 1em 0; }
-td, th { padding: .2em .8em .2em 0; text-align: left; border-bottom: 1px solid #ddd; }
-svg { width: 100%; height: auto; } svg text { font: 11px system-ui, sans-serif; fill: #222; }
-.band { fill: #bcd9f0; } .joint { stroke: #0a6ebd; fill: none; } .bar { stroke: #8a8a8a; }
-.change { stroke: #c62828; stroke-dasharray: 4 3; } .grid { stroke: #e9e9e9; }
-"""
+_KIND = "Campaign report"
 
 
 def write_page(campaign: Campaign, out: Path) -> None:
@@ -41,19 +49,22 @@ def write_page(campaign: Campaign, out: Path) -> None:
     out : path-like
         Folder of the campaign.
     """
-    parts = [f"<h1>Campaign of {len(campaign.trials)} trials</h1>"]
+    sections: list[Section] = []
     if campaign.failed:
-        rows = [[_name(t), escape(t.record.error)] for t in campaign.failed]
-        parts += ["<h2>Not solved</h2>", _table(["trial", "reason"], rows)]
+        rows = [[t.name, t.record.error] for t in campaign.failed]
+        own = _table(["trial", "reason"], rows, "Not solved")
+        sections.append(section("Not solved", own, key="failed"))
     joint = campaign.joint
     if joint is not None:
-        parts += _joint_parts(campaign, joint)
-        parts += ["<h2>History of each parameter</h2>"]
-        parts += ["<p>Each point is a trial with its σ, and leads to its result.</p>"]
+        sections += _joint_sections(campaign, joint)
+        text = "Each point is a trial with its σ, and leads to its result."
+        panels: list[Cell] = [paragraph(both(text))]
         for k, name in enumerate(joint.information.names):
-            parts += [f"<h3>{escape(name)}</h3>", _panel(campaign, joint, k, out)]
-    parts += ["<h2>Trials</h2>", _trial_table(campaign, out)]
-    write_whole(out / REPORT_FILE, _page("Campaign", parts))
+            panels += [element("h3", component_cell(name)), _panel(campaign, joint, k, out)]
+        sections.append(section("History of each parameter", *panels, key="history"))
+    sections.append(section("Trials", _trial_table(campaign, out), key="trials"))
+    heading = message("campaign.title", count=len(campaign.trials))
+    write_whole(out / REPORT_FILE, _page(said(heading), str(heading), sections))
 
 
 def write_seed_page(found: MonteCarlo | None, scenario: Path, runs: int, out: Path) -> None:
@@ -70,79 +81,109 @@ def write_seed_page(found: MonteCarlo | None, scenario: Path, runs: int, out: Pa
     out : path-like
         Folder of the campaign.
     """
-    parts = [f"<h1>{escape(scenario.name)}, {runs} seeds</h1>"]
-    if found is None:
-        parts += ["<p>No seed was solved.</p>"]
-    else:
-        parts += [f"<p>{found.runs} of {runs} seeds were solved.</p>"]
-        parts += _statistic_table([found.nees, *found.coverage], "statistic")
-        parts += ["<h2>Root mean square of error over σ</h2>"]
-        parts += _statistic_table(found.ratio, "component")
-    write_whole(out / REPORT_FILE, _page(scenario.name, parts))
+    heading = message("campaign.seeds_title", scenario=scenario.name, count=runs)
+    solved = message("campaign.solved", solved=0 if found is None else found.runs, count=runs)
+    cells: list[Cell] = [paragraph(said(solved))]
+    sections: list[Section] = []
+    if found is not None:
+        title = "Root mean square of error over σ"
+        cells.append(_statistic_table([found.nees, *found.coverage], "statistic", "Seeds"))
+        ratios = _statistic_table(found.ratio, "component", title)
+        sections.append(section(title, ratios, key="ratio"))
+    sections.insert(0, section("Seeds", *cells, key="seeds"))
+    write_whole(out / REPORT_FILE, _page(said(heading), str(heading), sections))
 
 
-def _statistic_table(statistics: Sequence[Statistic], of: str) -> list[str]:
+def _page(heading: Html, title: str, sections: Sequence[Section]) -> bytes:
+    return whole_page(_KIND, heading, sections, title=title).encode()
+
+
+def _table(header: Sequence[str], rows: Sequence[Sequence[Cell]], label: str) -> Html:
+    return table([both(h) for h in header], rows, label=label)
+
+
+def _statistic_table(statistics: Sequence[Statistic], of: str, label: str) -> Html:
     rows = [
         [
-            escape(s.name),
+            s.name,
             f"{s.value:.4g}",
             f"{s.expected:.4g}",
-            f"{s.low:.4g} to {s.high:.4g}",
-            "yes" if s.inside else "<b>no</b>",
+            f"{s.low:.4g} – {s.high:.4g}",
+            both("yes") if s.inside else element("b", both("no")),
         ]
         for s in statistics
     ]
-    return [_table([of, "measured", "expected", "by chance (99 %)", "inside"], rows)]
+    return _table([of, "measured", "expected", "by chance (99 %)", "inside"], rows, label)
 
 
-def _joint_parts(campaign: Campaign, joint: JointCalibration) -> list[str]:
+def _joint_sections(campaign: Campaign, joint: JointCalibration) -> Iterator[Section]:
     names, used = joint.information.names, campaign.used
     std = np.sqrt(np.diag(joint.covariance))
     rows = [
         [
-            escape(name),
-            escape(with_std(float(joint.value[k]), float(std[k]))),
+            component_cell(name),
+            component_names(name)[2],
+            with_std(float(joint.value[k]), float(std[k])),
             at_precision(float(joint.between_std[k]), float(joint.between_std[k])),
             f"{joint.variance_probability[k]:.2g}",
         ]
         for k, name in enumerate(names)
     ]
-    parts = [
-        f"<h2>Joint calibration of {len(used)} trials</h2>",
-        _table(["component", "in the last trial", "σ between trials", "p of none"], rows),
-        f"<p>χ² {joint.fit.statistic:.0f} with {joint.fit.freedom:.0f} degrees of freedom, "
-        f"p = {joint.probability:.2g}.</p>",
-    ]
+    header = ["component", "unit", "in the last trial", "σ between trials", "p of none"]
+    fit = message(
+        "campaign.fit",
+        statistic=joint.fit.statistic,
+        freedom=joint.fit.freedom,
+        probability=joint.probability,
+    )
+    yield section(
+        "Joint calibration",
+        paragraph(said(message("campaign.joint", count=len(used)))),
+        _table(header, rows, "Joint calibration"),
+        paragraph(said(fit)),
+        key="joint",
+    )
+    yield section("Changes", *_changes(campaign, joint), key="changes")
+
+
+def _changes(campaign: Campaign, joint: JointCalibration) -> Iterator[Html]:
+    names, used = joint.information.names, campaign.used
     changes = [
         [
-            _name(used[c.after]),
-            escape(used[c.after + 1].record.epoch),
-            escape(names[c.component]),
-            escape(with_std(*joint.step(i))),
+            used[c.after].name,
+            used[c.after + 1].record.epoch,
+            component_cell(names[c.component]),
+            with_std(*joint.step(i)),
             f"{c.probability:.1g}",
         ]
         for i, c in enumerate(joint.changes)
     ]
-    parts += ["<h2>Changes</h2>"]
     if changes:
-        parts += [_table(["after", "seen on", "component", "step", "p"], changes)]
+        yield _table(["after", "seen on", "component", "step", "p"], changes, "Changes")
     else:
-        parts += ["<p>No step between trials is clearer than chance.</p>"]
+        yield paragraph(both("No step between trials is clearer than chance."))
     unit = "√day" if campaign.dated else "√trial"
-    parts += [
-        f"<p>{escape(names[d.component])} drifts by {np.sqrt(d.variance):.2g} per {unit} "
-        f"(p = {d.probability:.1g}).</p>"
-        for d in joint.drifts
-    ]
-    parts += [
-        f"<p>{escape(names[s.component])} follows {escape(s.covariate)}: "
-        f"{escape(with_std(*joint.slope(i)))} per unit (p = {s.probability:.1g}).</p>"
-        for i, s in enumerate(joint.slopes)
-    ]
-    return parts
+    for d in joint.drifts:
+        drift = message(
+            "campaign.drift",
+            name=names[d.component],
+            size=np.sqrt(d.variance),
+            unit=unit,
+            probability=d.probability,
+        )
+        yield paragraph(said(drift))
+    for i, s in enumerate(joint.slopes):
+        slope = message(
+            "campaign.slope",
+            name=names[s.component],
+            covariate=s.covariate,
+            slope=with_std(*joint.slope(i)),
+            probability=s.probability,
+        )
+        yield paragraph(said(slope))
 
 
-def _panel(campaign: Campaign, joint: JointCalibration, k: int, out: Path) -> str:
+def _panel(campaign: Campaign, joint: JointCalibration, k: int, out: Path) -> Html:
     """Return the history of a component as SVG."""
     name, used = joint.information.names[k], campaign.used
     expected = [joint.fit.value_in(i) for i in range(len(used))]
@@ -168,7 +209,12 @@ def _panel(campaign: Campaign, joint: JointCalibration, k: int, out: Path) -> st
         return (f"{across(t):.1f},{down(v):.1f}" for t, v in zip(days, values, strict=True))
 
     outline = " ".join([*line(centre + std), *reversed(list(line(centre - std)))])
-    parts = [f'<svg viewBox="0 0 {_WIDTH} {_HEIGHT}">']
+    heading = message("campaign.history", name=name)
+    label, own = escape(heading.text()), escape(heading.text("zh"))
+    parts = [
+        f'<svg class="history" viewBox="0 0 {_WIDTH} {_HEIGHT}" role="group" '
+        f'aria-label="{label}" data-en="{label}" data-zh="{own}">'
+    ]
     for value in np.linspace(low + room, high - room, 4):
         y = down(float(value))
         parts += [f'<line class="grid" x1="{_LEFT}" x2="{_WIDTH}" y1="{y:.1f}" y2="{y:.1f}"/>']
@@ -186,12 +232,16 @@ def _panel(campaign: Campaign, joint: JointCalibration, k: int, out: Path) -> st
     for t, trial, (value, own) in zip(days, used, found, strict=True):
         if np.isfinite(value):
             ends = down(value + own), down(value - own)
-            parts += [_point(trial, _link(trial, out), across(t), down(value), ends)]
+            parts += [_point(trial, escape(_link(trial, out)), across(t), down(value), ends)]
     unit = split_unit(name)[1]
     axis = "days since the first trial" if campaign.dated else "trial"
     parts += [f'<text x="{_LEFT}" y="{_HEIGHT - 6}">{escape(unit)}</text>']
-    parts += [f'<text x="{_WIDTH - 4}" y="{_HEIGHT - 6}" text-anchor="end">{axis}</text></svg>']
-    return "".join(parts)
+    words = "".join(
+        f'<tspan lang="{language}">{text}</tspan>'
+        for language, text in (("en", axis), ("zh-Hans", chinese(axis)))
+    )
+    parts += [f'<text x="{_WIDTH - 4}" y="{_HEIGHT - 6}" text-anchor="end">{words}</text></svg>']
+    return Html("".join(parts))
 
 
 def _point(trial: CampaignTrial, link: str, x: float, y: float, ends: tuple[float, float]) -> str:
@@ -204,14 +254,14 @@ def _point(trial: CampaignTrial, link: str, x: float, y: float, ends: tuple[floa
     )
 
 
-def _trial_table(campaign: Campaign, out: Path) -> str:
-    rows = []
+def _trial_table(campaign: Campaign, out: Path) -> Html:
+    rows: list[list[Cell]] = []
     for t in campaign.trials:
         grade = t.calibration.verdict.grade if t.calibration else "not solved"
-        name = f'<a href="{_link(t, out)}">{_name(t)}</a>' if t.calibration else _name(t)
+        name = element("a", t.name, href=_link(t, out)) if t.calibration else t.name
         took = f"{t.record.wall_s:.1f} s"
-        rows.append([name, escape(t.record.epoch), grade, escape(t.unused), took])
-    return _table(["trial", "date", "verdict", "why it is not used", "time"], rows)
+        rows.append([name, t.record.epoch, both(grade), said(t.unused), took])
+    return _table(["trial", "date", "verdict", "why it is not used", "time"], rows, "Trials")
 
 
 def _link(trial: CampaignTrial, out: Path) -> str:
@@ -219,11 +269,7 @@ def _link(trial: CampaignTrial, out: Path) -> str:
     folder = f"{TRIALS_FOLDER}/{trial.label}"
     own = f"{folder}/{REPORT_FILE}"
     found = own if (out / own).exists() else f"{folder}/{CALIBRATION_FILE}"
-    return escape(found, quote=True)
-
-
-def _name(trial: CampaignTrial) -> str:
-    return escape(trial.name)
+    return found
 
 
 def _estimate(trial: CampaignTrial, component: str) -> tuple[float, float]:
@@ -232,19 +278,3 @@ def _estimate(trial: CampaignTrial, component: str) -> tuple[float, float]:
             if name == component:
                 return float(value), float(std)
     return np.nan, np.nan
-
-
-def _table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """Return a table of HTML; cells are HTML already."""
-    head = "".join(f"<th>{escape(h)}</th>" for h in heads)
-    body = "".join("<tr>" + "".join(f"<td>{c}</td>" for c in row) + "</tr>" for row in rows)
-    return f"<table><tr>{head}</tr>{body}</table>"
-
-
-def _page(title: str, parts: Iterable[str]) -> bytes:
-    text = "\n".join(parts)
-    return (
-        '<!doctype html><html lang="en"><head><meta charset="utf-8">'
-        f"<title>{escape(title)}</title>"
-        f"<style>{_STYLE}</style></head><body>{text}</body></html>\n"
-    ).encode()

@@ -18,6 +18,7 @@ from factorgraph_dvl.campaign.trial_run import TRIALS_FOLDER
 from factorgraph_dvl.errors import ConfigError, DataError
 from factorgraph_dvl.geometry.units import DAY
 from factorgraph_dvl.io.calibration_file import load_calibration
+from factorgraph_dvl.sensors.message import Message, message
 from factorgraph_dvl.solution import Calibration
 
 
@@ -37,7 +38,7 @@ class CampaignTrial:
         How its run ended.
     calibration : Calibration or None
         Its result.
-    unused : str
+    unused : Message or str
         Why the joint calibration does not use it; empty if it does.
     """
 
@@ -46,7 +47,7 @@ class CampaignTrial:
     path: str
     record: RunRecord
     calibration: Calibration | None
-    unused: str = ""
+    unused: Message | str = ""
 
 
 @dataclass(frozen=True)
@@ -125,7 +126,8 @@ def assembled(
     """
     trials = []
     for path, label, record in zip(paths, labels, records, strict=True):
-        calibration, unused = None, record.error or "it was not solved"
+        calibration = None
+        unused: Message | str = record.error or message("campaign.not_solved")
         if record.done:
             calibration = load_calibration(out / TRIALS_FOLDER / label)
             unused = _reason_against(calibration, anyway)
@@ -215,11 +217,14 @@ def check_covariates(covariates: Mapping[str, Mapping[str, float]], names: Seque
                 )
 
 
-def _reason_against(calibration: Calibration, anyway: bool) -> str:
+def _reason_against(calibration: Calibration, anyway: bool) -> Message | str:
     verdict = calibration.verdict
     if verdict.grade == "do not use" and not anyway:
-        return f"graded `do not use`: {verdict.reasons[0]}"
-    return "" if np.isfinite(calibration.covariance).all() else "its covariance is not finite"
+        reason = verdict.reasons[0]
+        if reason.sensor:
+            return message("campaign.graded_sensor", sensor=reason.sensor, reason=reason.message)
+        return message("campaign.graded", reason=reason.message)
+    return "" if np.isfinite(calibration.covariance).all() else message("campaign.not_finite")
 
 
 def _in_common_axes(trials: Sequence[CampaignTrial]) -> list[CampaignTrial]:
@@ -231,7 +236,8 @@ def _in_common_axes(trials: Sequence[CampaignTrial]) -> list[CampaignTrial]:
     out = []
     for t in trials:
         if t.calibration is not None and not t.unused and t.calibration.body_axes != common:
-            t = replace(t, unused=f"in {t.calibration.body_axes} axes, most trials in {common}")
+            own = t.calibration.body_axes
+            t = replace(t, unused=message("campaign.other_axes", axes=own, common=common))
         out.append(t)
     return out
 

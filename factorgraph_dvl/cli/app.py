@@ -4,20 +4,27 @@ from __future__ import annotations
 
 import os
 import sys
-from typing import Annotated, NoReturn
+from collections.abc import Mapping
+from contextlib import redirect_stdout, suppress
+from io import StringIO
+from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
 
 from factorgraph_dvl.cli.commands import Commands
 from factorgraph_dvl.cli.options import claims
 from factorgraph_dvl.cli.streams import guard_streams, output_failure
-from factorgraph_dvl.errors import FactorgraphDvlError, printable
+from factorgraph_dvl.errors import FactorgraphDvlError, OutputError, printable
+
+if TYPE_CHECKING:
+    from factorgraph_dvl.cli.events import FailureKind
 
 _NAME = "factorgraph-dvl"
 # The exit code of an interrupt, as in Typer.
 _INTERRUPTED = 130
 # Options that stand anywhere on the line.
 _EVERYWHERE = ("--debug", "--json")
+_NO_PARTS: Mapping[str, str] = {}
 
 app = typer.Typer(
     name=_NAME,
@@ -44,6 +51,11 @@ def _run_with_events(args: list[str]) -> NoReturn:
 
     events.switch(True)
     try:
+        if "--help" in args:
+            _emit_help(args)
+        # Typer would print its help.
+        if not set(args) - set(_EVERYWHERE):
+            _fail("the command is missing", 2, args, "usage")
         _run(args)
     except SystemExit as done:
         code = done.code if isinstance(done.code, int) else int(bool(done.code))
@@ -53,28 +65,51 @@ def _run_with_events(args: list[str]) -> NoReturn:
         events.switch(False)
 
 
+def _emit_help(args: list[str]) -> NoReturn:
+    """Print help as an event."""
+    from factorgraph_dvl.cli import events
+
+    with redirect_stdout(StringIO()) as shown, suppress(SystemExit):
+        _call(args)
+    events.emit(events.Text(shown.getvalue()))
+    sys.exit(0)
+
+
+def _call(args: list[str]) -> None:
+    """Call the command; with events, wrong usage is an exception for `_run`."""
+    as_json = "--json" in args
+    given = [arg for arg in args if arg not in _EVERYWHERE]
+    code = app(args=given, prog_name=_NAME, standalone_mode=not as_json)
+    if isinstance(code, int):
+        sys.exit(code)
+
+
 def _run(args: list[str]) -> NoReturn:
     try:
         with claims:
-            app(args=[arg for arg in args if arg not in _EVERYWHERE], prog_name=_NAME)
+            _call(args)
     except FactorgraphDvlError as error:
         from factorgraph_dvl.cli.console import warn
 
         for note in getattr(error, "__notes__", ()):
             warn(note)
-        _fail(str(error), error.exit_code, args)
+        parts = {name: getattr(error, name) for name in ("what", "where", "expected", "hint")}
+        _fail(str(error), error.exit_code, args, _kind_of(error), parts)
     except OSError as error:
         name = error.filename if error.filename is not None else "a file"
-        _fail(f"{name}: {error.strerror or error}", 2, args)
+        _fail(f"{name}: {error.strerror or error}", 2, args, "system")
     except Exception as error:
         if _interrupted(error):
             raise KeyboardInterrupt from error
+        # Typer's errors of usage have no public base class.
+        if hasattr(error, "format_message"):
+            _fail(error.format_message(), 2, args, "usage")
         hint = "" if "--debug" in args else ". Run with --debug to see where"
-        _fail(f"internal error: {type(error).__name__}: {error}{hint}", 1, args)
+        _fail(f"internal error: {type(error).__name__}: {error}{hint}", 1, args, "internal")
     except SystemExit as done:
         if done.code == _INTERRUPTED:
             if "--json" in args:
-                _fail("interrupted", _INTERRUPTED, args)
+                _fail("interrupted", _INTERRUPTED, args, "interrupted")
             # Said without rich, which may be what was being loaded.
             raise KeyboardInterrupt from done
         failure = output_failure()
@@ -85,6 +120,7 @@ def _run(args: list[str]) -> NoReturn:
             "are complete",
             1,
             args,
+            "output",
         )
     sys.exit(0)
 
@@ -98,7 +134,19 @@ def _interrupted(error: BaseException | None) -> bool:
     return False
 
 
-def _fail(message: str, exit_code: int, args: list[str]) -> NoReturn:
+def _kind_of(error: FactorgraphDvlError) -> FailureKind:
+    if isinstance(error, OutputError):
+        return "output"
+    return "input" if error.exit_code == 2 else "result"
+
+
+def _fail(
+    message: str,
+    exit_code: int,
+    args: list[str],
+    kind: FailureKind,
+    parts: Mapping[str, str] = _NO_PARTS,
+) -> NoReturn:
     from rich.text import Text
 
     from factorgraph_dvl.cli import events
@@ -107,7 +155,7 @@ def _fail(message: str, exit_code: int, args: list[str]) -> NoReturn:
     if "--debug" in args:
         stderr().print_exception()
     if events.active():
-        events.emit(events.Failed(printable(message)))
+        events.emit(events.Failed(printable(message), kind, **parts))
         sys.exit(exit_code)
     stderr().print(Text(f"error: {printable(message)}", "red"), soft_wrap=True)
     sys.exit(exit_code)
@@ -116,8 +164,9 @@ def _fail(message: str, exit_code: int, args: list[str]) -> NoReturn:
 def _show_version(value: bool) -> None:
     if value:
         from factorgraph_dvl import __version__
+        from factorgraph_dvl.cli.console import stdout
 
-        typer.echo(f"{_NAME} {__version__}")
+        stdout().print(f"{_NAME} {__version__}", markup=False, highlight=False)
         raise typer.Exit
 
 

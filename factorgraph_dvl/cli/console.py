@@ -221,9 +221,12 @@ def print_file(file: Path) -> None:
 
 def print_folder(out: Path) -> None:
     """Print where this run wrote its results, where the files are too many to list."""
-    stdout().print(f"Wrote {out}", markup=False, soft_wrap=True)
     if events.active():
-        _emit_results(out, sorted(path.relative_to(out) for path in out.glob("*.json")))
+        results = sorted(path.relative_to(out) for path in out.glob("*.json"))
+        events.emit(events.Written(str(out), list(map(str, results))))
+        _emit_results(out, results)
+        return
+    stdout().print(f"Wrote {out}", markup=False, soft_wrap=True)
 
 
 def _emit_results(out: Path, written: Iterable[Path]) -> None:
@@ -280,9 +283,15 @@ def warn(message: str) -> None:
 
 def found_event(finding: Finding) -> events.Found:
     """Return a finding as an event."""
+    from factorgraph_dvl.sensors.message import encoded
+
     sensor, parameter, text = map(printable, (finding.sensor, finding.parameter, finding.text))
-    code = finding.code
-    return events.Found(str(code), finding.severity, sensor, parameter, text, code.action)
+    code, own = finding.code, finding.message
+    said = None
+    if not isinstance(own, str):
+        values = encoded(own.with_words(printable))["values"]
+        said = events.Said(own.key, values)
+    return events.Found(str(code), finding.severity, sensor, parameter, text, code.action, said)
 
 
 def say(finding: Finding) -> None:

@@ -72,7 +72,7 @@ def deadreckon(
       factorgraph-dvl deadreckon data/seed-a-phase-90 --calibration out --out out/deadreckon
     """
     from factorgraph_dvl.analysis.dead_reckoning.before_after import before_after
-    from factorgraph_dvl.io.external_results import read_calibration_values
+    from factorgraph_dvl.io.external_results import own_calibration, read_calibration_values
     from factorgraph_dvl.io.folders import new_folder
     from factorgraph_dvl.io.motion_table import motion_columns
     from factorgraph_dvl.io.tables import write_table
@@ -93,6 +93,7 @@ def deadreckon(
     with ProgressLine(quiet=quiet) as progress:
         trial = load_trial(trial_path, anyway=anyway)
         values = read_calibration_values(calibration, trial.body_axes, anyway=anyway)
+        own = own_calibration(calibration, trial.body_axes)
         errors = errors_in(trial, anyway=anyway)
         attitude = attitude or _default_attitude(trial)
         with explained(errors):
@@ -108,7 +109,8 @@ def deadreckon(
             ):
                 write_table(folder / name, motion_columns(run.track.motion))
             if not no_figures:
-                verdict = verdict_of(errors) if errors else None
+                reasons = () if own is None else own.verdict.reasons
+                verdict = verdict_of((*errors, *trial.notes, *findings, *reasons))
                 _draw(trial, result, folder, verdict, figures.value)
             about = {
                 "trial": trial.name,
@@ -201,9 +203,7 @@ def _attitude(
     return history.at, ()
 
 
-def _draw(
-    trial: Trial, result: BeforeAfter, folder: Path, verdict: Verdict | None, kind: str
-) -> None:
+def _draw(trial: Trial, result: BeforeAfter, folder: Path, verdict: Verdict, kind: str) -> None:
     from factorgraph_dvl.report.figures.dead_reckoning import write_dead_reckoning_figures
 
     with drawing():

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import sys
-from typing import Any
+from typing import Any, Literal
 
 import msgspec
 
@@ -28,8 +28,18 @@ class Warned(msgspec.Struct, tag="warning", tag_field="event"):
     text: str
 
 
+class Said(msgspec.Struct):
+    """A message: its key, and its values by name; a value may be a list, or a message itself."""
+
+    key: str
+    values: dict[str, Any]
+
+
 class Found(msgspec.Struct, tag="finding", tag_field="event"):
-    """A finding about records or a result; docs/findings.md lists the codes."""
+    """A finding about records or a result; docs/findings.md lists the codes.
+
+    `message` has the numbers and names of the text; it is null where another version wrote it.
+    """
 
     code: str
     severity: str
@@ -37,6 +47,7 @@ class Found(msgspec.Struct, tag="finding", tag_field="event"):
     parameter: str
     text: str
     action: str
+    message: Said | None
 
 
 class Judged(msgspec.Struct, tag="verdict", tag_field="event"):
@@ -74,10 +85,19 @@ class Result(msgspec.Struct, tag="result", tag_field="event"):
     content: Any
 
 
+# What kind of error ended a command; `usage` is a wrong command line.
+FailureKind = Literal["usage", "input", "result", "output", "system", "internal", "interrupted"]
+
+
 class Failed(msgspec.Struct, tag="error", tag_field="event"):
-    """An error that ends the command."""
+    """An error that ends the command; the parts of its text are empty where it has none."""
 
     text: str
+    kind: FailureKind
+    what: str = ""
+    where: str = ""
+    expected: str = ""
+    hint: str = ""
 
 
 class End(msgspec.Struct, tag="end", tag_field="event"):

@@ -217,12 +217,13 @@ def _with_halves(
     from factorgraph_dvl.analysis.comparison.halves import compare_halves
     from factorgraph_dvl.errors import FactorgraphDvlError
     from factorgraph_dvl.sensors.finding import Code, Finding
+    from factorgraph_dvl.sensors.message import message
     from factorgraph_dvl.solvers.batch import solve as run_batch
 
     try:
         first, second = (run_batch(part, anyway=True, progress=progress) for part in parts)
     except FactorgraphDvlError as error:
-        text = f"a half of the trial cannot be solved: {error}"
+        text = message("halves_differ.unsolved", error=str(error))
         note = Finding(Code.HALVES_DIFFER, text, severity="note")
         return replace(found, solution=found.solution.with_findings((note,)))
     halves = compare_halves(trial, first, second)

@@ -22,6 +22,7 @@ from factorgraph_dvl.imu.polynomials import evaluate, integrate, rate_and_slope
 from factorgraph_dvl.imu.timestamps import JUMP, fill_lost, unrounded
 from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.sensors.imu import Imu
+from factorgraph_dvl.sensors.message import message
 
 # Lost samples up to this number are interpolated; a longer gap ends the arc. Chosen: a polynomial
 # through six neighbours still follows the motion.
@@ -303,9 +304,11 @@ def _bridged(imu: Imu) -> tuple[Array, Array, Array, np.ndarray, list[Finding]]:
         # Unlike those of `zeros_like`, these zeros take no memory until one is written.
         return time, samples, np.zeros(samples.shape), broken, []
     time, samples, filled_sigma, broken = fill_lost(time, samples, lost, bridged, broken)
-    text = (
-        f"{int(lost[bridged].sum())} lost samples in {int(bridged.sum())} places were "
-        f"interpolated, the first after {imu.time[np.argmax(bridged)]:.3f} s"
+    text = message(
+        "lost_samples.interpolated",
+        samples=int(lost[bridged].sum()),
+        places=int(bridged.sum()),
+        time=imu.time[np.argmax(bridged)],
     )
     return time, samples, filled_sigma, broken, [Finding(Code.LOST_SAMPLES, text, "IMU")]
 
@@ -313,7 +316,7 @@ def _bridged(imu: Imu) -> tuple[Array, Array, Array, np.ndarray, list[Finding]]:
 def _unused(alone: list[tuple[int, float]]) -> Iterator[Finding]:
     """Yield the stretches that are too short, by their samples and start."""
     for count, start in alone:
-        text = f"{count} samples at {start:.3f} s are isolated between gaps and were not used"
+        text = message("unused.isolated", count=count, start=start)
         yield Finding(Code.UNUSED, text, "IMU")
 
 
@@ -321,8 +324,9 @@ def _gaps(inc: Increments) -> Iterator[Finding]:
     """Yield the gaps between arcs."""
     for (_, b), (c, _) in itertools.pairwise(inc.arcs):
         end, start = inc.end[b - 1], inc.start[c]
-        code, what = Code.IMU_GAP, f"gap of {start - end:.3f} s at {end:.3f} s"
         if start - end > JUMP:
-            code = Code.CLOCK_JUMP
-            what = f"time_s jumps from {end:.3f} to {start:.3f} s, as where a clock is set"
-        yield Finding(code, f"{what}: the inertial chain breaks there", "IMU")
+            text = message("clock_jump.imu", start=end, end=start)
+            yield Finding(Code.CLOCK_JUMP, text, "IMU")
+        else:
+            text = message("imu_gap.long", length=start - end, time=end)
+            yield Finding(Code.IMU_GAP, text, "IMU")

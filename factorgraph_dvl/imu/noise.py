@@ -13,6 +13,7 @@ from factorgraph_dvl.geometry.units import DEG_PER_SQRT_HOUR, MICRO_G
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.sensors.imu import Imu
+from factorgraph_dvl.sensors.message import message
 
 # Chosen: samples to a spectrum, and the window, whose side lobes are 180 dB down: sway of
 # 1 rad/s leaks less than the quietest gyro's noise into the bands.
@@ -92,15 +93,15 @@ def with_recorded_noise(imu: Imu) -> tuple[Imu, tuple[Finding, ...]]:
     assert found is not None
     changes: dict[str, float] = {}
     findings: list[Finding] = []
-    for name, value, claimed, (si, unit, key) in (
+    for text, value, claimed, (si, unit, key) in (
         (
-            "gyros",
+            "imu_noise.gyros",
             found.gyro,
             stated[0],
             (DEG_PER_SQRT_HOUR, "deg/√h", "gyro_noise_deg_sqrt_h"),
         ),
         (
-            "accelerometers",
+            "imu_noise.accelerometers",
             found.accel,
             stated[1],
             (MICRO_G, "µg/√Hz", "accel_noise_ug_sqrt_hz"),
@@ -111,9 +112,7 @@ def with_recorded_noise(imu: Imu) -> tuple[Imu, tuple[Finding, ...]]:
             findings.append(
                 Finding(
                     Code.IMU_NOISE,
-                    f"the high frequencies of the record show {value / claimed:.2g} times the "
-                    f"stated noise of the {name}. {value / si:.3g} {unit} was used: state it as "
-                    f"`{key}`, or state `noise: stated` if the IMU only vibrates",
+                    message(text, ratio=value / claimed, value=value / si, unit=unit, name=key),
                     sensor="IMU",
                 )
             )

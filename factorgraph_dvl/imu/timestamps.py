@@ -8,6 +8,7 @@ import numpy as np
 
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.sensors.finding import Code, Finding
+from factorgraph_dvl.sensors.message import message
 from factorgraph_dvl.sensors.records import rows_of
 from factorgraph_dvl.trial import Trial
 
@@ -34,9 +35,7 @@ def without_strays(trial: Trial) -> Trial:
     notes = tuple(
         Finding(
             Code.CLOCK_RESTARTED,
-            f"time_s jumps there; no other sensor measured from {a:.3f} to {b:.3f} s, and the {n} "
-            "samples of the IMU are not used. If its clock was set while it ran, write all of "
-            "time_s by one clock",
+            message("clock_restarted.alone", start=a, end=b, samples=n),
             sensor="IMU",
         )
         for a, b, n in zip(first[~kept], last[~kept], np.diff(edges)[~kept], strict=True)

@@ -42,6 +42,7 @@ from factorgraph_dvl.sensors.dvl import (
 )
 from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.sensors.gnss import Gnss
+from factorgraph_dvl.sensors.message import message
 from factorgraph_dvl.trial import Trial
 
 # Velocity error, m/s, that a gyro bias may cause over a window through tilted gravity, and
@@ -151,11 +152,7 @@ def initial_states(trial: Trial, frame: LocalFrame, seg: Segments) -> AlignedSta
         nRb[arc.nodes] = spin @ aligned @ arc.turn
         if not found and before is None:
             findings.append(
-                Finding(
-                    Code.HEADING_UNKNOWN,
-                    f"the velocity changes too little from {arc.start:z.0f} s on to find the "
-                    "heading: the solver starts from the course over ground",
-                )
+                Finding(Code.HEADING_UNKNOWN, message("heading_unknown.from", time=arc.start))
             )
     p_n, v_n = _kinematics(trial, frame, seg, nRb)
     zero = np.zeros((n, 3))

@@ -22,6 +22,7 @@ from factorgraph_dvl.sensors.dvl import CALIBRATED
 from factorgraph_dvl.sensors.finding import Code, Finding, Severity
 from factorgraph_dvl.sensors.fingerprint import PATTERN
 from factorgraph_dvl.sensors.grades import DEFAULT_LIMITS, Grade
+from factorgraph_dvl.sensors.message import decoded, encoded, message
 from factorgraph_dvl.sensors.verdict import VerdictGrade
 from factorgraph_dvl.settings.files import MEGABYTE, read_bytes
 from factorgraph_dvl.settings.ranges import out_of_range
@@ -62,6 +63,7 @@ class _Finding(msgspec.Struct):
     sensor: str
     parameter: str
     text: str
+    message: Any = UNSET
 
 
 class _Reason(msgspec.Struct):
@@ -70,6 +72,7 @@ class _Reason(msgspec.Struct):
     sensor: str = ""
     parameter: str = ""
     action: str = ""
+    message: Any = UNSET
 
 
 class _Verdict(msgspec.Struct):
@@ -216,14 +219,20 @@ def _with_verdict(calibration: Calibration, stated: _Verdict) -> Calibration:
     found = [_finding(reason, severity) for reason in stated.reasons]
     more = [f for f in found if (f.code, f.text) not in said]
     if severity == "error" and own.grade != stated.grade and not more:
-        more = [Finding(Code.UNCLASSIFIED, "no reason is given", severity="error")]
+        more = [Finding(Code.UNCLASSIFIED, message("unclassified.none"), severity="error")]
     return replace(calibration, findings=(*calibration.findings, *more))
 
 
 def _finding(stored: _Finding | _Reason, severity: Severity | None) -> Finding:
     code = _CODES.get(stored.code, Code.UNCLASSIFIED)
     text, sensor, parameter = map(printable, (stored.text, stored.sensor, stored.parameter))
-    return Finding(code, text, sensor, parameter, severity or code.severity)
+    said = decoded(stored.message, text)
+    return Finding(code, said, sensor, parameter, severity or code.severity)
+
+
+def _message(finding: Finding) -> Any:
+    said = finding.message
+    return UNSET if isinstance(said, str) else encoded(said)
 
 
 def check_usable(
@@ -288,14 +297,14 @@ def encode_calibration(solution: Solution | Calibration) -> bytes:
         verdict=_Verdict(
             solution.verdict.grade,
             [
-                _Reason(f.code, f.text, f.sensor, f.parameter, f.code.action)
+                _Reason(f.code, f.text, f.sensor, f.parameter, f.code.action, _message(f))
                 for f in solution.verdict.reasons
             ],
         ),
         limits=dict(solution.limits),
         warnings=list(solution.warnings),
         findings=[
-            _Finding(f.code, f.severity, f.sensor, f.parameter, f.text)
+            _Finding(f.code, f.severity, f.sensor, f.parameter, f.text, _message(f))
             for f in solution.findings
             if f.severity != "ok"
         ],

@@ -26,6 +26,7 @@ from factorgraph_dvl.sensors.catalogue import specs_of
 from factorgraph_dvl.sensors.dvl import CALIBRATED, Dvl
 from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.sensors.imu import BIASES, Imu
+from factorgraph_dvl.sensors.message import message
 from factorgraph_dvl.sensors.parameters import JointPrior
 from factorgraph_dvl.solution import Calibration, Estimate
 from factorgraph_dvl.trial import Trial
@@ -69,7 +70,7 @@ def with_earlier_calibrations(
     for section, (source, calibration) in earlier.items():
         verdict = calibration.verdict
         if verdict.grade == "do not use" and anyway:
-            text = f"{source} is graded `do not use`: {verdict.reasons[0]}"
+            text = message("unusable_prior.graded", source=source, reason=str(verdict.reasons[0]))
             notes.append(Finding(Code.UNUSABLE_PRIOR, text, sensor=section.upper()))
     if dvl is not None and Dvl.section in earlier:
         source, calibration = earlier[Dvl.section]

@@ -38,7 +38,7 @@ from factorgraph_dvl.sensors.records import check_finite, check_range
 from factorgraph_dvl.settings.ranges import out_of_range
 from factorgraph_dvl.settings.sections import Section
 from factorgraph_dvl.settings.yaml_file import parse_yaml, read_text
-from factorgraph_dvl.solution import Estimate, Solution, Trajectory
+from factorgraph_dvl.solution import Calibration, Estimate, Solution, Trajectory
 from factorgraph_dvl.trial import Reference
 
 # How far the length of a direction may be off 1. Chosen: three digits.
@@ -295,11 +295,8 @@ def read_calibration_values(
         If there are no such values, they are in other axes, or not to be used.
     """
     path = Path(path)
-    whole = path.is_dir() or (
-        path.suffix.lower() == ".json" and b'"covariance"' in read_calibration_bytes(path)
-    )
-    if whole:
-        calibration = load_calibration(path, body_axes=body_axes)
+    calibration = own_calibration(path, body_axes)
+    if calibration is not None:
         check_usable(calibration, body_axes, str(path), anyway=anyway)
         values = calibration.values
     else:
@@ -310,6 +307,22 @@ def read_calibration_values(
     for name, value in values.items():
         check_values(name, value, str(path))
     return values
+
+
+def own_calibration(path: Path, body_axes: BodyAxes) -> Calibration | None:
+    """Read a calibration of this program; None if a file holds values typed in by hand.
+
+    Parameters
+    ----------
+    path : path-like
+        As for `read_calibration_values`.
+    body_axes : BodyAxes
+        Of a file that does not state them.
+    """
+    whole = path.is_dir() or (
+        path.suffix.lower() == ".json" and b'"covariance"' in read_calibration_bytes(path)
+    )
+    return load_calibration(path, body_axes=body_axes) if whole else None
 
 
 def _read_calibration(path: Path) -> _File:

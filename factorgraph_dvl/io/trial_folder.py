@@ -43,6 +43,7 @@ from factorgraph_dvl.sensors.gnss import Gnss
 from factorgraph_dvl.sensors.grades import DEFAULT_LIMITS
 from factorgraph_dvl.sensors.imu import Imu
 from factorgraph_dvl.sensors.invalid_values import without_invalid_values
+from factorgraph_dvl.sensors.message import message
 from factorgraph_dvl.sensors.protocol import Aid, SensorRecord, SensorSection
 from factorgraph_dvl.sensors.records import check_possible
 from factorgraph_dvl.settings.yaml_file import parse_yaml, read_text
@@ -148,8 +149,7 @@ def assembled(
         notes.append(
             Finding(
                 Code.COUNTED_TWICE,
-                "`dvl` and `dvl_beams` have pings at the same times. If both are records of one "
-                "instrument, its pings count twice, and standard deviations are too small",
+                message("counted_twice.dvl"),
             )
         )
     return Trial(

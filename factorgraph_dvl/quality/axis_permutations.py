@@ -7,6 +7,7 @@ import itertools
 import numpy as np
 
 from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.sensors.message import Message, message
 
 NAMES = ("x", "y", "z")
 
@@ -34,19 +35,19 @@ def swapped(left_out: int) -> Array:
     return np.eye(3)[order]
 
 
-def in_words(P: Array) -> str:
+def in_words(P: Array) -> Message:
     """Say what a signed permutation, which sets recorded axes right, finds wrong with them."""
     order = np.argmax(np.abs(P), axis=1)
     signs = P[np.arange(3), order]
     inverted = [NAMES[k] for k in range(3) if signs[k] < 0.0]
     if np.array_equal(order, np.arange(3)):
         if len(inverted) == 1:
-            return f"axis {inverted[0]} is mirrored"
+            return message("axes.mirrored", axis=inverted[0])
         if len(inverted) == 3:
-            return "all three axes have the opposite sign"
-        return f"axes {' and '.join(inverted)} have the opposite sign"
+            return message("axes.all_opposite")
+        return message("axes.opposite", first=inverted[0], second=inverted[1])
     moved = [NAMES[k] for k in range(3) if order[k] != k]
     if len(moved) == 2 and not inverted:
-        return f"axes {' and '.join(moved)} are swapped"
+        return message("axes.swapped", first=moved[0], second=moved[1])
     right = ", ".join(f"{'-' if signs[k] < 0.0 else ''}{NAMES[order[k]]}" for k in range(3))
-    return f"its x, y, z are those that it calls {right}"
+    return message("axes.renamed", right=right)

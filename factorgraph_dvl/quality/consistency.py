@@ -46,6 +46,7 @@ from factorgraph_dvl.quality.sensor_clocks import (
 from factorgraph_dvl.sensors.dvl import Dvl
 from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.sensors.gnss import Gnss
+from factorgraph_dvl.sensors.message import Message, either, message
 from factorgraph_dvl.sensors.records import rows_of
 from factorgraph_dvl.trial import Trial
 
@@ -261,8 +262,8 @@ class _GnssView:
 
     def findings(self) -> Iterator[Finding]:
         """Yield what is wrong with axes, clock and antenna."""
-        mistake = _gnss_mistake(self) if self.excess > _CONTRADICTS else ""
-        if mistake:
+        mistake = _gnss_mistake(self) if self.excess > _CONTRADICTS else None
+        if mistake is not None:
             yield Finding(Code.GNSS_AXES, mistake, self.sensor.label, severity="error")
         elif self.clock is not None:
             yield from _clock(self.sensor, self.clock, self.around)
@@ -274,15 +275,10 @@ class _GnssView:
         stated = np.array(self.sensor.settings.lever_arm_m)
         free = 3.0 * np.array(self.sensor.settings.lever_arm_std_m)
         if np.any(np.abs(fit.arm_error) > np.maximum(_ARM_SIGMAS * sigma, _ARM_M) + free):
-            said, found = (
-                ", ".join(f"{x:z.1f}" for x in each) for each in (stated, stated + fit.arm_error)
+            text = message(
+                "antenna.elsewhere", found=stated + fit.arm_error, std=sigma.max(), stated=stated
             )
-            yield Finding(
-                Code.ANTENNA,
-                f"turns show its antenna at [{found}] m from the IMU (± {sigma.max():.2g} m), not "
-                f"at the [{said}] m of gnss.lever_arm_m",
-                self.sensor.label,
-            )
+            yield Finding(Code.ANTENNA, text, self.sensor.label)
 
 
 @dataclass(frozen=True)
@@ -397,18 +393,15 @@ def _far(view: _GnssView | _DvlView) -> _GnssView | _DvlView:
     return found if enough and better else view
 
 
-def _gnss_mistake(view: _GnssView) -> str:
-    """Return what is wrong with order or sign of the axes of GNSS, empty if that explains nothing.
+def _gnss_mistake(view: _GnssView) -> Message | None:
+    """Return what is wrong with order or sign of the axes of GNSS, None if that explains nothing.
 
     East and north swapped are, but for the unknown heading, one of them mirrored.
     """
     as_recorded, _ = least_misfit(view.compared, view.around, _REACH_S)
     for text, matrix in (
-        (
-            "latitude and longitude (east and north) look swapped, or one of the wrong sign",
-            np.eye(3)[[1, 0, 2]],
-        ),
-        ("up looks of the wrong sign: height_m and vel_u_m_s are positive up", _DOWN),
+        (message("gnss_axes.swapped"), np.eye(3)[[1, 0, 2]]),
+        (message("gnss_axes.up"), _DOWN),
     ):
         other = replace(view.compared, velocity=view.compared.velocity @ matrix.T)
         share, _ = least_misfit(other, view.around, _REACH_S)
@@ -416,7 +409,7 @@ def _gnss_mistake(view: _GnssView) -> str:
         # In the same windows: those with the largest changes are explained better than the rest.
         if share - noise < _LEFT * (as_recorded - noise):
             return text
-    return ""
+    return None
 
 
 def _course_findings(directions: BodyDirections, body_axes: BodyAxes) -> Iterator[Finding]:
@@ -426,16 +419,17 @@ def _course_findings(directions: BodyDirections, body_axes: BodyAxes) -> Iterato
         return
     degrees = angle / DEG
     fit = [axes for axes in axes_that_fit(directions) if axes != body_axes]
-    cause = (
-        f": the axes look like {' or '.join(fit)}"
-        if fit
-        else ": is the IMU mounted turned about the vertical?"
-    )
-    side = "starboard" if degrees > 0 else "port"
-    where = "astern" if abs(degrees) > 150.0 else f"{abs(degrees):.0f} deg to {side} of the bow"
+    cause = message("course.turned_imu")
+    if fit:
+        cause = message("course.other_axes", axes=either(fit))
+    if abs(degrees) > 150.0:
+        where = message("course.astern")
+    else:
+        side = "course.starboard" if degrees > 0 else "course.port"
+        where = message(side, angle=abs(degrees))
     yield Finding(
         Code.COURSE,
-        f"with body_axes {body_axes}, the vehicle moves {where} most of the time{cause}",
+        message("course.moves", axes=body_axes, where=where, cause=cause),
         "IMU",
         severity="error" if directions.turned > _TURNED else "warning",
     )
@@ -446,9 +440,8 @@ def _imu_finding(
 ) -> Finding:
     """Return which axes or units of the IMU are wrong."""
     first = wrong[0]
-    fits = "turns and changes of velocity fit only if"
     if first.code == Code.GYRO_UNIT:
-        text = first.text
+        text = first.message
     elif first is HANDEDNESS:
         found: list[Array] = []
         if directions is not None:
@@ -456,13 +449,9 @@ def _imu_finding(
             course = None if directions.course is None else back @ directions.course
             recorded = replace(directions, up=back @ directions.up, course=course)
             found = relabelling(recorded, body_axes, -1)
-        cause = (
-            in_words(found[0])
-            if len(found) == 1
-            else "one axis is mirrored, or two are swapped (the course would show which)"
-        )
-        text = f"{fits}, for gyros and accelerometers, {cause}"
+        cause = in_words(found[0]) if len(found) == 1 else message("imu_axes.one_of_them")
+        text = message("imu_axes.fit_only_if", cause=cause)
     else:
-        causes = " or ".join(candidate.text for candidate in wrong if candidate is not HANDEDNESS)
-        text = f"{fits} {causes}"
+        causes = either([c.message for c in wrong if c is not HANDEDNESS])
+        text = message("axes.fit_only_if", causes=causes)
     return Finding(first.code, text, "IMU", severity="error")

@@ -11,6 +11,7 @@ from factorgraph_dvl.initialization.dvl_windows import DvlFit
 from factorgraph_dvl.quality.axis_permutations import in_words, mirrored, swapped
 from factorgraph_dvl.sensors.dvl import MISALIGNMENT, Dvl
 from factorgraph_dvl.sensors.finding import Code, Finding
+from factorgraph_dvl.sensors.message import Message, either, message
 
 # Misalignments that differ by less, rad, are equally likely by their size. Chosen.
 _ALIKE = 20.0 * DEG
@@ -36,14 +37,13 @@ def mirrored_finding(dvl: Dvl, fit: DvlFit) -> Finding:
     likely = [each for each in explained if each[0] < least + _ALIKE]
     return Finding(
         Code.DVL_AXES,
-        "turns and changes of speed show that its axes are mirrored, which no mounting does: "
-        + ", or ".join(_cause(P, angles) for _, P, angles in likely),
+        message("dvl_axes.mirrored", causes=either([_cause(P, a) for _, P, a in likely])),
         dvl.label,
         severity="error",
     )
 
 
-def _cause(P: Array, angles: Array) -> str:
-    degrees = ", ".join(f"{angle:z.0f}" for angle in angles)
-    sign = ", as in PD0" if np.array_equal(P, -np.eye(3)) else ""
-    return f"{in_words(P)}{sign} (misalignment_deg is then [{degrees}])"
+def _cause(P: Array, angles: Array) -> Message:
+    if np.array_equal(P, -np.eye(3)):
+        return message("dvl_axes.as_pd0", angles=angles)
+    return message("dvl_axes.cause", axes=in_words(P), angles=angles)

@@ -15,10 +15,11 @@ from factorgraph_dvl.quality.speed_units import MOVING_M_S, SPEED_UNITS
 from factorgraph_dvl.sensors.dvl import MISALIGNMENT, VELOCITY_COLUMNS, Dvl
 from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.sensors.gnss import Gnss
+from factorgraph_dvl.sensors.message import Message, message
 
 # What a ping takes, and which sign it has.
-DVL_TERMS = ("a lock", "Moving along +x must give a positive x")
-BEAM_TERMS = ("three beams", "Moving in the direction of a beam must give it a positive velocity")
+DVL_TERMS = (message("no_measurement.lock"), message("dvl_sign.along_x"))
+BEAM_TERMS = (message("no_measurement.beams"), message("dvl_sign.along_beam"))
 
 # Pings that do not agree in any component by chance.
 _FEW = 10
@@ -28,31 +29,31 @@ _ALLOWED, _FASTEST_CURRENT = 0.25, 3.0
 
 
 def dvl_findings(
-    dvl: Dvl, gnss: Gnss | None, body_axes: BodyAxes, terms: tuple[str, str]
+    dvl: Dvl, gnss: Gnss | None, body_axes: BodyAxes, terms: tuple[Message, Message]
 ) -> Iterator[Finding]:
     """Yield whether unit and sign of a DVL are plausible; `terms` as DVL_TERMS."""
     locked = dvl.locked
     lock, positive = terms
     if not locked.any():
-        text = f"there is no ping with {lock}"
-        yield Finding(Code.NO_MEASUREMENT, text, dvl.label, severity="warning")
+        yield Finding(Code.NO_MEASUREMENT, lock, dvl.label, severity="warning")
         return
     velocity = dvl.velocity[locked]
     std = float(np.median(dvl.sigma()[locked]))
     speed = float(np.median(np.linalg.norm(velocity, axis=1)))
     if std > max(0.3 * speed, 0.1):
-        yield Finding(
-            Code.DVL_STD,
-            f"its standard deviation, {std:.2g} m/s, is large for a speed of {speed:.2g} m/s",
-            dvl.label,
-        )
+        text = message("dvl_std.large", std=std, speed=speed)
+        yield Finding(Code.DVL_STD, text, dvl.label)
     if np.all(velocity == velocity[0]) and velocity.shape[0] > 2:
-        yield Finding(Code.DVL_FROZEN, "the velocity never changes", dvl.label, severity="error")
+        yield Finding(Code.DVL_FROZEN, message("dvl_frozen.all"), dvl.label, severity="error")
     elif velocity.shape[0] > _FEW:
         stuck = [k for k in range(3) if np.ptp(velocity[:, k]) == 0.0]
         if stuck:
-            names = ", ".join(f"{VELOCITY_COLUMNS[k]} is always {velocity[0, k]:g}" for k in stuck)
-            yield Finding(Code.DVL_FROZEN, names, dvl.label, severity="error")
+            constant = [
+                message("words.is_always", name=VELOCITY_COLUMNS[k], value=velocity[0, k])
+                for k in stuck
+            ]
+            text = message("dvl_frozen.some", constant=constant)
+            yield Finding(Code.DVL_FROZEN, text, dvl.label, severity="error")
     if gnss is not None:
         yield from _speed_findings(dvl, gnss)
     yield from _sign_findings(dvl, body_axes, velocity, positive)
@@ -81,22 +82,16 @@ def _speed_findings(dvl: Dvl, gnss: Gnss) -> Iterator[Finding]:
     if in_current or min(abs(ratio - 1.0), abs(steady - 1.0)) <= _ALLOWED:
         yield Finding(
             Code.DVL_UNIT,
-            f"its unit is plausible: speed {ratio:.3g} times that of the GNSS, which is not its "
-            "scale error: the lever arm contributes in sway and turns",
+            message("dvl_unit.plausible", ratio=ratio),
             dvl.label,
             severity="ok",
         )
         return
-    cause = ""
+    text = message("dvl_unit.unknown", ratio=ratio)
     for unit, factor in SPEED_UNITS.items():
         if abs(ratio * factor - 1.0) < 0.1:
-            cause = f": it looks like {unit}"
-    yield Finding(
-        Code.DVL_UNIT,
-        f"its speed is {ratio:.4g} times that of the GNSS{cause or ': is it in m/s?'}",
-        dvl.label,
-        severity="error",
-    )
+            text = message("dvl_unit.looks_like", ratio=ratio, unit=unit)
+    yield Finding(Code.DVL_UNIT, text, dvl.label, severity="error")
 
 
 def _in_radians(gnss: Gnss, gnss_speed: Array, dvl_speed: Array) -> bool:
@@ -125,7 +120,7 @@ def _steady_ratio(time: Array, dvl: Array, gnss: Array) -> float:
 
 
 def _sign_findings(
-    dvl: Dvl, body_axes: BodyAxes, velocity_d: Array, positive: str
+    dvl: Dvl, body_axes: BodyAxes, velocity_d: Array, positive: Message
 ) -> Iterator[Finding]:
     """Check that the vehicle moves ahead, where the mounting is known well enough."""
     misalignment = next(p for p in dvl.parameters() if p.name == MISALIGNMENT)
@@ -141,14 +136,13 @@ def _sign_findings(
     if ahead < -0.5:
         yield Finding(
             Code.DVL_SIGN,
-            "with its prior misalignment, the vehicle moves astern most of the time: is the sign "
-            f"that of PD0? {positive}",
+            message("dvl_sign.astern", positive=positive),
             dvl.label,
         )
     elif ahead > 0.5:
         yield Finding(
             Code.DVL_SIGN,
-            "with its prior misalignment, the vehicle moves ahead",
+            message("dvl_sign.ahead"),
             dvl.label,
             severity="ok",
         )

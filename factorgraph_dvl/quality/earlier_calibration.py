@@ -11,6 +11,7 @@ from scipy.special import chdtrc
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.sensors.imu import BIASES
+from factorgraph_dvl.sensors.message import Message, message
 from factorgraph_dvl.sensors.parameters import JointPrior
 from factorgraph_dvl.solution import Estimate
 from factorgraph_dvl.trial import Trial
@@ -141,16 +142,24 @@ def _contradiction(
     informed = 1.0 - (after / scale) ** 2
     apart = np.where(informed > _LEAST_SHARE, np.abs(value - mean) / scale, 0.0)
     i = int(np.argmax(apart / np.sqrt(np.maximum(informed, _LEAST_SHARE))))
-    alone = (
-        f"this trial alone gives {test.value[i]:.2g} ± {test.std[i]:.1g}, and "
-        if np.isfinite(test.std[i])
-        else ""
-    )
+    alone: Message | str = ""
+    if np.isfinite(test.std[i]):
+        alone = message("prior_contradicted.alone", value=test.value[i], std=test.std[i])
     yield Finding(
         Code.PRIOR_CONTRADICTED,
-        f"{prior.source} contradicts this trial (χ² {test.statistic:.0f} with {test.freedom} "
-        f"degrees of freedom, by chance {p:.0e}): {names[i]} was {mean[i]:.2g} ± {std[i]:.1g}, "
-        f"{alone}the result, {value[i]:.2g} ± {after[i]:.1g}, fits neither",
+        message(
+            "prior_contradicted.by_trial",
+            source=prior.source,
+            statistic=test.statistic,
+            freedom=test.freedom,
+            probability=p,
+            name=names[i],
+            before=mean[i],
+            before_std=std[i],
+            alone=alone,
+            value=value[i],
+            std=after[i],
+        ),
         sensor=sensor,
         parameter=next(e.name for e in estimates if names[i] in e.component_names),
         severity="error" if p < CONTRADICTED_P else "warning",

@@ -13,17 +13,17 @@ from factorgraph_dvl.quality.records import WINDOW_S, velocity_between_fixes
 from factorgraph_dvl.quality.speed_units import MOVING_M_S, SPEED_UNITS
 from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.sensors.gnss import Gnss
+from factorgraph_dvl.sensors.message import Message, message
 
 # What fixes in the wrong unit look like.
-RADIANS = "latitude and longitude look like radians, not deg"
+RADIANS = message("radians.fixes")
 
 
 def gnss_findings(gnss: Gnss) -> Iterator[Finding]:
     """Yield whether velocities of GNSS agree with its positions."""
     geodetic = gnss.geodetic[~np.isnan(gnss.geodetic[:, 0])]
     if geodetic.shape[0] and np.any(np.all(geodetic[:, :2] == 0.0, axis=1)):
-        text = "some fixes are at 0, 0: leave the cells of lost fixes empty"
-        yield Finding(Code.ZERO_FIXES, text, gnss.label, severity="error")
+        yield Finding(Code.ZERO_FIXES, message("zero_fixes.some"), gnss.label, severity="error")
     begin, end, between = velocity_between_fixes(gnss)
     measured = ~np.isnan(gnss.velocity[:, 0])
     if begin.size < 3 or measured.sum() < 3:
@@ -57,7 +57,7 @@ def _compare_velocities(
         if speed > MOVING_M_S:
             yield Finding(
                 Code.GNSS_VELOCITY,
-                f"velocities agree with positions to {misfit:.2g} m/s rms",
+                message("gnss_velocity.agree", misfit=misfit),
                 gnss.label,
                 severity="ok",
             )
@@ -69,37 +69,31 @@ def _compare_velocities(
         yield Finding(Code.RADIANS, RADIANS, gnss.label, severity="error")
         return
     explained = {
-        text: rms(between[:, :2] - mean[:, :2] @ np.array(matrix, dtype=float).T)
-        for text, matrix in _velocity_candidates()
+        mistake: rms(between[:, :2] - mean[:, :2] @ np.array(matrix, dtype=float).T)
+        for mistake, matrix in _velocity_candidates()
     }
-    best = min(explained, key=lambda text: explained[text])
-    cause = f": {best}" if explained[best] <= tolerance else ""
-    yield Finding(
-        Code.GNSS_VELOCITY,
-        f"velocities disagree with the differences of positions by {misfit:.3g} m/s rms{cause}",
-        gnss.label,
-        severity="error",
-    )
+    best = min(explained, key=lambda mistake: explained[mistake])
+    text = message("gnss_velocity.disagree", misfit=misfit)
+    if explained[best] <= tolerance:
+        text = message("gnss_velocity.disagree_because", misfit=misfit, cause=best)
+    yield Finding(Code.GNSS_VELOCITY, text, gnss.label, severity="error")
 
 
-def _velocity_candidates() -> Iterator[tuple[str, list[list[float]]]]:
+def _velocity_candidates() -> Iterator[tuple[Message, list[list[float]]]]:
     """Return what may be wrong with a velocity, and the matrix that sets it right."""
-    yield (
-        "east and north look swapped (or latitude and longitude)",
-        [[0.0, 1.0], [1.0, 0.0]],
-    )
-    yield "the velocity has the opposite sign", [[-1.0, 0.0], [0.0, -1.0]]
-    yield "the east velocity has the opposite sign", [[-1.0, 0.0], [0.0, 1.0]]
-    yield "the north velocity has the opposite sign", [[1.0, 0.0], [0.0, -1.0]]
+    yield message("gnss_velocity.swapped"), [[0.0, 1.0], [1.0, 0.0]]
+    yield message("gnss_velocity.opposite"), [[-1.0, 0.0], [0.0, -1.0]]
+    yield message("gnss_velocity.east_opposite"), [[-1.0, 0.0], [0.0, 1.0]]
+    yield message("gnss_velocity.north_opposite"), [[1.0, 0.0], [0.0, -1.0]]
     for unit, factor in SPEED_UNITS.items():
-        yield f"the velocity looks like {unit}", [[factor, 0.0], [0.0, factor]]
+        yield message("gnss_velocity.unit", unit=unit), [[factor, 0.0], [0.0, factor]]
 
 
 def _compare_vertical(gnss: Gnss, between: Array, mean: Array) -> Iterator[Finding]:
     noise = np.sqrt(2.0) * float(np.median(gnss.position_std[:, 2])) / WINDOW_S
     up, measured = between[:, 2], mean[:, 2]
     if rms(up) > 5.0 * noise + 0.05 and up @ measured < -0.5 * rms(up) * up.size * rms(measured):
-        text = "vel_u_m_s has the opposite sign of the change of height"
+        text = message("gnss_velocity.up_opposite")
         yield Finding(Code.GNSS_VELOCITY, text, gnss.label, severity="error")
 
 

@@ -18,6 +18,7 @@ from factorgraph_dvl.initialization.clock_offsets import Comparison, least_misfi
 from factorgraph_dvl.quality.axis_permutations import in_words, mirrored, swapped
 from factorgraph_dvl.sensors.finding import Code
 from factorgraph_dvl.sensors.imu import Imu
+from factorgraph_dvl.sensors.message import Message, message
 
 # The comparisons that there are, each with the offset of its clock around which to look.
 Compare = Callable[[CarriedWindows], Sequence[tuple[Comparison, float]]]
@@ -43,7 +44,7 @@ class Candidate:
     """One mistake: what it is, and what sets gyro and accelerometer right, (3, 3) each."""
 
     code: Code
-    text: str
+    message: Message
     gyro: Array
     accel: Array
 
@@ -53,7 +54,7 @@ class Candidate:
 
 
 # A mirrored axis of the whole IMU: whichever axis it is, the fit is the same.
-HANDEDNESS = Candidate(Code.IMU_AXES, "", mirrored(1), mirrored(1))
+HANDEDNESS = Candidate(Code.IMU_AXES, in_words(mirrored(1)), mirrored(1), mirrored(1))
 
 
 def candidates(imu: Imu) -> Iterator[Candidate]:
@@ -61,17 +62,16 @@ def candidates(imu: Imu) -> Iterator[Candidate]:
     eye = np.eye(3)
     rate = 1.0 / float(np.median(np.diff(imu.time)))
     yield HANDEDNESS
-    for unit, factor in (
-        ("deg/s; multiply by pi/180", DEG),
-        ("angle increments; divide by the sample interval", rate),
+    for text, factor in (
+        (message("gyro_unit.looks_like_degrees"), DEG),
+        (message("gyro_unit.looks_like_increments"), rate),
     ):
         if np.abs(imu.gyro).max() * factor > _FASTEST:
             continue
-        text = f"the angular rate looks like {unit}"
         yield Candidate(Code.GYRO_UNIT, text, factor * eye, eye)
-    for code, sensor, which in (
-        (Code.GYRO_AXES, "gyros", 0),
-        (Code.ACCEL_AXES, "accelerometers", 1),
+    for code, key, which in (
+        (Code.GYRO_AXES, "axes.of_gyros", 0),
+        (Code.ACCEL_AXES, "axes.of_accelerometers", 1),
     ):
         changes = [-eye]
         changes += [mirrored(k) for k in range(3)]
@@ -80,7 +80,7 @@ def candidates(imu: Imu) -> Iterator[Candidate]:
         changes += [-mirrored(k) for k in range(3)] if which == 0 else []
         for P in changes:
             pair = (P, eye) if which == 0 else (eye, P)
-            yield Candidate(code, f"for the {sensor}, {in_words(P)}", *pair)
+            yield Candidate(code, message(key, axes=in_words(P)), *pair)
 
 
 @dataclass(frozen=True)

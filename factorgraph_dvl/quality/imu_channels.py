@@ -10,6 +10,7 @@ from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.sensors.imu import COLUMNS, Imu
 from factorgraph_dvl.sensors.invalid_values import frozen_samples
+from factorgraph_dvl.sensors.message import Message, message
 
 # Samples that repeat, of all channels and of a single one, from which on they are frozen, and for
 # how long at least, s. Chosen: digits of a quiet gyro repeat for a while.
@@ -45,11 +46,14 @@ def channel_findings(imu: Imu) -> Iterator[Finding]:
         # That all three gyros rest is a finding of its own.
         constant = [k for k in constant if k >= 3]
     if constant:
-        names = ", ".join(f"{COLUMNS[k + 1]} is always {values[0, k]:g}" for k in constant)
-        yield Finding(Code.IMU_CHANNEL, names, "IMU", severity="error")
+        found = [
+            message("words.is_always", name=COLUMNS[k + 1], value=values[0, k]) for k in constant
+        ]
+        text = message("imu_channel.constant", channels=found)
+        yield Finding(Code.IMU_CHANNEL, text, "IMU", severity="error")
     ends = [e for k in np.flatnonzero(moves).tolist() for e in _ends(COLUMNS[k + 1], values[:, k])]
     if ends:
-        text = f"{', '.join(ends)}: its range ends there"
+        text = message("saturated.ends", ends=ends)
         yield Finding(Code.SATURATED, text, "IMU", severity="error")
     yield from _spikes(values, moves)
     yield from _jitter(imu)
@@ -57,18 +61,22 @@ def channel_findings(imu: Imu) -> Iterator[Finding]:
     interval = float(np.median(np.diff(imu.time)))
     begin, length = _longest(same.all(axis=1))
     if length >= max(_ALL, _LEAST_S / interval):
-        yield _frozen("all its channels repeat", imu, begin, length)
+        yield _frozen(message("frozen_values.all"), imu, begin, length)
         return
-    for names, some in (("gyros", slice(0, 3)), ("accelerometers", slice(3, 6))):
+    for what, some in (
+        (message("frozen_values.gyros"), slice(0, 3)),
+        (message("frozen_values.accelerometers"), slice(3, 6)),
+    ):
         frozen = frozen_samples(values[:, some]) & moves[some].all()
         begin, length = _longest(frozen[1:])
         if length:
-            yield _frozen(f"all {names} repeat", imu, begin, length)
+            yield _frozen(what, imu, begin, length)
             return
     for column, k in enumerate(np.flatnonzero(moves).tolist()):
         begin, length = _longest(same[:, column])
         if length >= max(_SINGLE, 2.0 * _LEAST_S / interval):
-            yield _frozen(f"{COLUMNS[k + 1]} repeats", imu, begin, length)
+            what = message("frozen_values.one", name=COLUMNS[k + 1])
+            yield _frozen(what, imu, begin, length)
 
 
 def _spikes(values: Array, moves: np.ndarray) -> Iterator[Finding]:
@@ -92,8 +100,7 @@ def _spikes(values: Array, moves: np.ndarray) -> Iterator[Finding]:
         size = np.max(ratio, where=hit, initial=0.0)
         yield Finding(
             Code.IMU_SPIKES,
-            f"{count} single samples differ from those before and after, by up to {size:.0f} "
-            "times what is usual",
+            message("imu_spikes.single", count=count, size=size),
             "IMU",
             severity="error",
         )
@@ -120,34 +127,33 @@ def _jitter(imu: Imu) -> Iterator[Finding]:
         )
     )
     if added > _ADDED:
-        std_ms = 1e3 * np.sqrt(squared)
-        yield Finding(
-            Code.CLOCK_JITTER,
-            f"its stamps scatter by {std_ms:.2g} ms about even intervals of {1e3 * usual:.3g} ms. "
-            f"This adds {added:.2g} times the variance of its noise: write even stamps",
-            "IMU",
-            severity="error",
+        text = message(
+            "clock_jitter.scatter",
+            scatter_ms=1e3 * np.sqrt(squared),
+            interval_ms=1e3 * usual,
+            added=added,
         )
+        yield Finding(Code.CLOCK_JITTER, text, "IMU", severity="error")
 
 
-def _ends(name: str, values: Array) -> Iterator[str]:
+def _ends(name: str, values: Array) -> Iterator[Message]:
     """Yield the ends of a channel's range at which samples pile up."""
-    for end, words in ((values.max(), "above"), (values.min(), "below")):
+    for end, key in ((values.max(), "saturated.above"), (values.min(), "saturated.below")):
         at_end = values == end
         count = int(at_end.sum())
         if count < _AT_THE_END or _longest(at_end)[1] < _RUN:
             continue
         others = values[~at_end]
-        following = others.max() if words == "above" else others.min()
+        following = others.max() if end == values.max() else others.min()
         if count > _PILED * np.count_nonzero(others == following):
-            yield f"{name} is never {words} {end:.4g}, and is that {count} times"
+            yield message(key, name=name, end=end, count=count)
 
 
-def _frozen(what: str, imu: Imu, begin: int, length: int) -> Finding:
+def _frozen(what: Message, imu: Imu, begin: int, length: int) -> Finding:
     start, end = imu.time[begin], imu.time[begin + length]
     return Finding(
         Code.FROZEN_VALUES,
-        f"{what} one value from {start:.1f} to {end:.1f} s: leave such rows out",
+        message("frozen_values.repeat", what=what, start=start, end=end),
         "IMU",
         severity="error",
     )

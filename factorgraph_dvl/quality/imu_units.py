@@ -13,6 +13,7 @@ from factorgraph_dvl.quality.axis_permutations import NAMES, in_words, mirrored,
 from factorgraph_dvl.quality.records import WINDOW_S
 from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.sensors.imu import Imu
+from factorgraph_dvl.sensors.message import Message, either, message
 
 # Stretches over which the size of the force is compared, at most. Chosen: they show a drift.
 _WINDOWS = 20
@@ -23,25 +24,24 @@ def force_findings(imu: Imu, body_axes: BodyAxes) -> Iterator[Finding]:
     """Yield whether the specific force has the size and direction of gravity."""
     size = float(np.median(np.linalg.norm(imu.accel, axis=1)))
     interval = float(np.median(np.diff(imu.time))) if imu.time.size > 1 else np.nan
-    looks = f"the specific force is {size:.4g} in the median, not about 9.8 m/s²"
     for unit, gravity in (
-        ("g; multiply by 9.80665", 1.0),
-        ("mg; multiply by 0.00980665", 1000.0),
-        ("ft/s²; multiply by 0.3048", STANDARD_GRAVITY / 0.3048),
-        ("velocity increments; divide by the sample interval", STANDARD_GRAVITY * interval),
+        (message("force_unit.multiply", unit="g", factor="9.80665"), 1.0),
+        (message("force_unit.multiply", unit="mg", factor="0.00980665"), 1000.0),
+        (
+            message("force_unit.multiply", unit="ft/s²", factor="0.3048"),
+            STANDARD_GRAVITY / 0.3048,
+        ),
+        (message("force_unit.increments"), STANDARD_GRAVITY * interval),
     ):
         if abs(size / gravity - 1.0) < 0.05:
-            yield Finding(
-                Code.FORCE_UNIT, f"{looks}: it looks like {unit}", "IMU", severity="error"
-            )
+            text = message("force_unit.looks_like", size=size, unit=unit)
+            yield Finding(Code.FORCE_UNIT, text, "IMU", severity="error")
             return
     if abs(size / STANDARD_GRAVITY - 1.0) > 0.05:
-        removed = ": was gravity removed? Specific force includes it" if size < 3.0 else ""
-        yield Finding(Code.FORCE_UNIT, looks + removed, "IMU", severity="error")
+        text = message("force_unit.removed" if size < 3.0 else "force_unit.wrong", size=size)
+        yield Finding(Code.FORCE_UNIT, text, "IMU", severity="error")
         return
-    yield Finding(
-        Code.FORCE_UNIT, f"specific force {size:.4g} m/s² in the median", "IMU", severity="ok"
-    )
+    yield Finding(Code.FORCE_UNIT, message("force_unit.right", size=size), "IMU", severity="ok")
     yield from _axes_findings(imu, body_axes)
 
 
@@ -53,81 +53,70 @@ def _axes_findings(imu: Imu, body_axes: BodyAxes) -> Iterator[Finding]:
     if tilt < 30.0:
         yield Finding(
             Code.BODY_AXES,
-            f"gravity fits body_axes {body_axes} to {tilt:.2g} deg",
+            message("body_axes.fit", axes=body_axes, tilt=tilt),
             "IMU",
             severity="ok",
         )
         return
     k = int(np.argmax(np.concatenate([mean, -mean])))
     expected = _AXIS_NAMES[int(np.argmax(np.concatenate([up_b, -up_b])))]
-    text = (
-        f"the mean specific force points along {_AXIS_NAMES[k]} of the IMU; at rest it points "
-        f"up, which body_axes {body_axes} says is {expected}"
-    )
-    if tilt > 150.0:
-        other = "RFU or FLU" if body_axes == "FRD" else "FRD"
-        question = f"are the axes {other}, or is the force that of gravity?"
-        yield Finding(Code.BODY_AXES, f"{text}: {question}", "IMU", severity="error")
+    upside_down = tilt > 150.0
+    if upside_down:
+        other = either(["RFU", "FLU"] if body_axes == "FRD" else ["FRD"])
+        question = message("body_axes.other", axes=other)
     else:
-        yield Finding(
-            Code.BODY_AXES,
-            f"{text}: is the IMU mounted {tilt:.0f} deg off level?",
-            "IMU",
-            severity="warning",
-        )
+        question = message("body_axes.off_level", tilt=tilt)
+    text = message(
+        "body_axes.points_along",
+        along=_AXIS_NAMES[k],
+        axes=body_axes,
+        expected=expected,
+        question=question,
+    )
+    yield Finding(Code.BODY_AXES, text, "IMU", severity="error" if upside_down else "warning")
 
 
 def gyro_findings(imu: Imu) -> Iterator[Finding]:
     """Yield whether the angular rate turns the specific force as it should."""
     rms = float(np.sqrt(np.mean(np.sum(imu.gyro**2, axis=1))))
     if rms == 0.0:
-        yield Finding(
-            Code.GYRO_FROZEN, "the angular rate is zero throughout", "IMU", severity="error"
-        )
+        yield Finding(Code.GYRO_FROZEN, message("gyro_frozen.zero"), "IMU", severity="error")
         return
     loss = 1.0 - _force_steadiness(imu, np.eye(3))
     # Turned by a right gyro, the force keeps the direction of gravity.
-    cause = _steadier(imu, 0.25 * loss) if loss > 0.001 else ""
-    if cause:
-        yield Finding(
-            Code.GYRO_UNIT,
-            f"the angular rate contradicts the rotation of the specific force: it looks {cause}",
-            "IMU",
-            severity="error",
-        )
+    cause = _steadier(imu, 0.25 * loss) if loss > 0.001 else None
+    if cause is not None:
+        text = message("gyro_unit.contradicts", cause=cause)
+        yield Finding(Code.GYRO_UNIT, text, "IMU", severity="error")
     elif rms > 3.0:
-        text = f"the angular rate is {rms:.3g} rad/s rms: is it in deg/s?"
+        text = message("gyro_unit.fast", rate=rms)
         yield Finding(Code.GYRO_UNIT, text, "IMU", severity="error")
     else:
-        yield Finding(
-            Code.GYRO_UNIT,
-            f"angular rate {rms / DEG:.3g} deg/s rms, fits gravity",
-            "IMU",
-            severity="ok",
-        )
+        text = message("gyro_unit.right", rate=rms / DEG)
+        yield Finding(Code.GYRO_UNIT, text, "IMU", severity="ok")
 
 
-def _steadier(imu: Imu, enough: float) -> str:
-    """Return what the angular rate looks like if that turns the force better, else nothing."""
+def _steadier(imu: Imu, enough: float) -> Message | None:
+    """Return what the angular rate looks like if that turns the force better, else None."""
     eye = np.eye(3)
     rate = 1.0 / float(np.median(np.diff(imu.time))) if imu.time.size > 1 else 1.0
     candidates = {
-        "in deg/s; multiply by pi/180": DEG * eye,
-        "in angle increments; divide by the sample interval": rate * eye,
-        "of the opposite sign, or in other axes than the specific force": -eye,
+        message("gyro_unit.in_degrees"): DEG * eye,
+        message("gyro_unit.in_increments"): rate * eye,
+        message("gyro_unit.opposite"): -eye,
     }
-    for P in (*(mirrored(k) for k in range(3)), *(swapped(k) for k in range(3))):
-        candidates[f"as if {in_words(P)}"] = P
     # Turned about a horizontal axis, a mirrored force looks the same.
     up = int(np.argmax(np.abs(imu.accel.mean(axis=0))))
-    for k in {0, 1, 2} - {up}:
-        (other,) = {0, 1, 2} - {up, k}
-        del candidates[f"as if {in_words(mirrored(k))}"]
-        text = f"as if axis {NAMES[k]} is mirrored, or axis {NAMES[other]} of the accelerometers"
+    for k in range(3):
+        text = message("gyro_unit.as_if", axes=in_words(mirrored(k)))
+        if k != up:
+            (other,) = {0, 1, 2} - {up, k}
+            text = message("gyro_unit.as_if_or", axis=NAMES[k], other=NAMES[other])
         candidates[text] = mirrored(k)
+        candidates[message("gyro_unit.as_if", axes=in_words(swapped(k)))] = swapped(k)
     losses = {text: 1.0 - _force_steadiness(imu, matrix) for text, matrix in candidates.items()}
     best = min(losses, key=lambda text: losses[text])
-    return best if losses[best] < enough else ""
+    return best if losses[best] < enough else None
 
 
 def _force_steadiness(imu: Imu, matrix: Array) -> float:

@@ -10,6 +10,7 @@ from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.sensors.beam_geometry import as_dvl, error_velocity
 from factorgraph_dvl.sensors.dvl_beams import DvlBeams
 from factorgraph_dvl.sensors.finding import Code, Finding
+from factorgraph_dvl.sensors.message import message
 
 # Times what noise and priors make of the error velocity from which on it is too large, and share
 # of lost pings that is worth a word. Chosen: no honest instrument comes near; half are left.
@@ -21,10 +22,9 @@ def beam_findings(beams: DvlBeams) -> Iterator[Finding]:
     """Check how often each beam is lost, and how well nominal beams agree."""
     lost = np.isnan(beams.velocity).mean(axis=0)
     if lost.any():
-        shares = ", ".join(f"{100.0 * share:.3g}" for share in lost)
         yield Finding(
             Code.BEAMS_LOST,
-            f"lost at {shares} % of the pings, beam by beam",
+            message("beams_lost.shares", shares=100.0 * lost),
             beams.label,
             severity="note" if lost.max() > _MOSTLY else "ok",
         )
@@ -44,18 +44,9 @@ def _agreement(beams: DvlBeams) -> Iterator[Finding]:
     speed = float(np.sqrt(np.mean(np.sum(log.velocity[known] ** 2, axis=1))))
     noise = float(np.sqrt(np.nanmean(beams.sigma()[known] ** 2)))
     prior = speed * float(np.hypot(s.direction_std_deg * DEG, s.scale_error_std))
-    text = f"with nominal directions, the beams contradict each other by {rms:.2g} m/s rms"
     if rms > _TOO_LARGE * np.hypot(noise, prior):
-        yield Finding(
-            Code.BEAMS_DISAGREE,
-            f"{text}, which is more than noise and priors explain at {speed:.2g} m/s: is their "
-            "order, the sign of one, or a direction wrong?",
-            beams.label,
-        )
+        text = message("beams_disagree.more", rms=rms, speed=speed)
+        yield Finding(Code.BEAMS_DISAGREE, text, beams.label)
     else:
-        yield Finding(
-            Code.BEAMS_DISAGREE,
-            f"{text}, no more than noise and priors explain",
-            beams.label,
-            severity="ok",
-        )
+        text = message("beams_disagree.explained", rms=rms)
+        yield Finding(Code.BEAMS_DISAGREE, text, beams.label, severity="ok")

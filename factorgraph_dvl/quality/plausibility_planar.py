@@ -10,6 +10,7 @@ from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.imu.timestamps import JUMP
 from factorgraph_dvl.sensors.finding import Code, Finding
+from factorgraph_dvl.sensors.message import message
 from factorgraph_dvl.trial import PlanarTrial
 
 # Usual intervals, and seconds, that make a gap. Chosen: a lost sample is none, and in a gap a
@@ -39,42 +40,25 @@ def planar_findings(trial: PlanarTrial) -> Iterator[Finding]:
     if psi.size > 2 and np.abs(psi).max() <= 2.0 * np.pi:
         noise = float(np.median(np.abs(np.diff(psi))))
         if noise < _QUIET * heading.settings.std_deg:
-            yield Finding(
-                Code.HEADING_UNIT,
-                f"all of it is within {np.abs(psi).max():.2g} deg of north, and varies less "
-                f"than its standard deviation of {heading.settings.std_deg:g} deg: is it in "
-                "radians?",
-                heading.label,
+            text = message(
+                "heading_unit.near_north", most=np.abs(psi).max(), std=heading.settings.std_deg
             )
+            yield Finding(Code.HEADING_UNIT, text, heading.label)
     speed = float(np.nanmedian(log.speed)) if np.isfinite(log.speed).any() else 0.0
     if speed < -_MOVING_M_S:
-        yield Finding(
-            Code.LOG_SIGN,
-            f"the speed is {speed:.3g} m/s in the median, astern: speed_m_s is positive ahead",
-            log.label,
-        )
+        yield Finding(Code.LOG_SIGN, message("log_sign.astern", speed=speed), log.label)
     if abs(speed) <= _MOVING_M_S and len(trial.beacons.settings.positions) == 1:
-        yield Finding(
-            Code.AT_REST,
-            f"the speed is {abs(speed):.2g} m/s in the median: one beacon gives only a circle for "
-            "a vehicle at rest, and the hypotheses are points on it",
-            log.label,
-        )
+        yield Finding(Code.AT_REST, message("at_rest.circle", speed=abs(speed)), log.label)
     below = float(np.nanmedian(depth.depth)) if np.isfinite(depth.depth).any() else 0.0
     if below < -_ABOVE_SEA_M:
-        yield Finding(
-            Code.DEPTH_SIGN,
-            f"the depth is {below:.4g} m in the median, above the sea: depth_m is positive down",
-            depth.label,
-        )
+        yield Finding(Code.DEPTH_SIGN, message("depth_sign.above", depth=below), depth.label)
     sea = depth.settings.sea_surface_height_m
     for name, place in trial.beacons.settings.positions.items():
         above = place.height_m - sea
         if above > _ABOVE_SEA_M + 3.0 * place.std_m:
             yield Finding(
                 Code.BEACON_HEIGHT,
-                f"{name} is {above:.4g} m above the sea surface: height_m is positive up, and "
-                "`depth.sea_surface_height_m` the height of the sea above the ellipsoid",
+                message("beacon_height.above", name=name, above=above),
                 trial.beacons.label,
             )
 
@@ -85,8 +69,7 @@ def _gaps(time: Array, label: str) -> Iterator[Finding]:
     for k in np.flatnonzero(steps > JUMP).tolist():
         yield Finding(
             Code.CLOCK_JUMP,
-            f"time_s jumps from {time[k]:.10g} to {time[k + 1]:.10g} s; only the part with the "
-            "most ranges is used. Write all of time_s by one clock",
+            message("clock_jump.ranges", start=time[k], end=time[k + 1]),
             label,
             severity="warning",
         )
@@ -96,11 +79,14 @@ def _gaps(time: Array, label: str) -> Iterator[Finding]:
     gaps = steps[steps > max(_GAP_S, _GAP_INTERVALS * float(np.median(steps)))]
     if gaps.size:
         k = int(np.argmax(steps))
-        count = "1 gap" if gaps.size == 1 else f"{gaps.size} gaps, the longest"
         yield Finding(
             Code.GAPS,
-            f"{count} from {time[k]:.10g} to {time[k + 1]:.10g} s: it is interpolated, as if the "
-            "vehicle had not manoeuvred. The standard deviations do not contain this error",
+            message(
+                "gaps.one_interpolated" if gaps.size == 1 else "gaps.interpolated",
+                count=gaps.size,
+                start=time[k],
+                end=time[k + 1],
+            ),
             label,
             severity="warning",
         )

@@ -13,6 +13,7 @@ from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.quality.records import GAP_INTERVALS
 from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.sensors.imu import Imu
+from factorgraph_dvl.sensors.message import message
 from factorgraph_dvl.sensors.star import Star
 from factorgraph_dvl.trial import Trial
 
@@ -33,13 +34,7 @@ _KNOWN_MOUNTING_DEG = 0.5
 def star_findings(star: Star, trial: Trial) -> Iterator[Finding]:
     """Check epoch, stars and convention of a star tracker."""
     if not trial.epoch:
-        yield Finding(
-            Code.NO_EPOCH,
-            "trial.yaml has no `epoch` (UTC of time_s = 0), and stars give the attitude only at a "
-            "known time",
-            star.label,
-            severity="error",
-        )
+        yield Finding(Code.NO_EPOCH, message("no_epoch.missing"), star.label, severity="error")
     yield from star.findings()
     convention = list(_convention(star, trial.inertial))
     yield from convention
@@ -63,8 +58,7 @@ def _vertical(star: Star, trial: Trial) -> Iterator[Finding]:
     if tilt > _OFF_VERTICAL:
         yield Finding(
             Code.STAR_VERTICAL,
-            f"the vertical of its attitudes is {np.degrees(tilt):.1f} deg off that of the "
-            "specific force: are `epoch` (UTC of time_s = 0) and `mounting_deg` right?",
+            message("star_vertical.off", tilt=np.degrees(tilt)),
             star.label,
             severity="error",
         )
@@ -104,22 +98,18 @@ def _convention(star: Star, imu: Imu) -> Iterator[Finding]:
     right = quaternion[:, [1, 2, 3, 0]]
     stated = misfit(right, False)
     if stated < limit:
-        text = f"its turns agree with those of the gyros to {100.0 * stated:.2g} %"
+        text = message("star_convention.agree", percent=100.0 * stated)
         yield Finding(Code.STAR_CONVENTION, text, star.label, severity="ok")
         return
     candidates = {
-        "is it that of inertial to body, the inverse?": misfit(right, True),
-        "is the scalar last?": misfit(quaternion, False),
-        "is the scalar last, and is it that of inertial to body?": misfit(quaternion, True),
+        message("star_convention.inverse"): misfit(right, True),
+        message("star_convention.scalar_last"): misfit(quaternion, False),
+        message("star_convention.both"): misfit(quaternion, True),
     }
     best = min(candidates, key=lambda text: candidates[text])
-    cause = best if candidates[best] < limit else "is `mounting_deg` right?"
-    yield Finding(
-        Code.STAR_CONVENTION,
-        f"its turns differ from those of the gyros by {100.0 * stated:.3g} %: {cause}",
-        star.label,
-        severity="error",
-    )
+    cause = best if candidates[best] < limit else message("star_convention.mounting")
+    text = message("star_convention.differ", percent=100.0 * stated, cause=cause)
+    yield Finding(Code.STAR_CONVENTION, text, star.label, severity="error")
 
 
 def _pairs(time: Array, imu_time: Array, span: float) -> tuple[np.ndarray, np.ndarray]:

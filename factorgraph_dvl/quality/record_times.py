@@ -13,6 +13,7 @@ from factorgraph_dvl.sensors.clock import ClockSection
 from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.sensors.imu import Imu
 from factorgraph_dvl.sensors.ins import Ins
+from factorgraph_dvl.sensors.message import Message, message
 from factorgraph_dvl.sensors.protocol import Aid
 from factorgraph_dvl.trial import Trial
 
@@ -21,29 +22,26 @@ def time_findings(trial: Trial, sensors: list[SensorSurvey]) -> Iterator[Finding
     """Yield what is wrong with the times of records against the IMU or what takes its place."""
     body = trial.body_sensor
     if isinstance(body, Imu):
-        name, (imu, *aids) = "the IMU", sensors
+        name, (imu, *aids) = message("words.the_imu"), sensors
     else:
         aids = sensors
         imu = next(s for s in sensors if s.label == body.label)
-        name = f"the {body.label}"
+        name = message("words.the_sensor", sensor=body.label)
     interval = 1.0 / imu.rate
     if trial.imu is None:
         pass
     elif interval >= 0.5:
-        unit = f", or milliseconds ({1000.0 / interval:.4g} Hz)" if interval >= 1.0 else ""
-        yield Finding(
-            Code.TIME_UNIT,
-            f"one sample every {interval:.4g} s: time_s must be in seconds{unit}; "
-            "an IMU this slow does not resolve the motion",
-            "IMU",
-            severity="error",
-        )
+        unit: Message | str = ""
+        if interval >= 1.0:
+            unit = message("time_unit.milliseconds", rate=1000.0 / interval)
+        text = message("time_unit.slow", interval=interval, unit=unit)
+        yield Finding(Code.TIME_UNIT, text, "IMU", severity="error")
     elif imu.rate > 2e4:
-        text = f"{imu.rate:.4g} samples per second: is time_s in seconds?"
+        text = message("time_unit.fast", rate=imu.rate)
         yield Finding(Code.TIME_UNIT, text, "IMU", severity="error")
     for aid, record in zip(aids, trial.aids, strict=True):
         if aid.missing == 1.0:
-            text = "none of its rows contains a measurement"
+            text = message("no_measurement.rows")
             yield Finding(Code.NO_MEASUREMENT, text, aid.label, severity="error")
             continue
         inside = min(aid.end, imu.end) - max(aid.start, imu.start)
@@ -52,45 +50,51 @@ def time_findings(trial: Trial, sensors: list[SensorSurvey]) -> Iterator[Finding
             if hours:
                 yield Finding(
                     Code.LOCAL_TIME,
-                    f"its times do not overlap those of {name}, but would {abs(hours)} h "
-                    f"{'later' if hours > 0 else 'earlier'}: is one of them in local time?",
+                    message(
+                        "local_time.later" if hours > 0 else "local_time.earlier",
+                        name=name,
+                        hours=abs(hours),
+                    ),
                     aid.label,
                     severity="error",
                 )
                 continue
             yield Finding(
                 Code.NO_OVERLAP,
-                f"its times, {aid.start:.10g} to {aid.end:.10g} s, do not overlap those of "
-                f"{name}, {imu.start:.10g} to {imu.end:.10g} s: "
-                "are they from one clock, in seconds?",
+                message(
+                    "no_overlap.times",
+                    start=aid.start,
+                    end=aid.end,
+                    names=name,
+                    other_start=imu.start,
+                    other_end=imu.end,
+                ),
                 aid.label,
                 severity="error",
             )
         elif inside < 0.5 * (aid.end - aid.start):
-            yield Finding(
-                Code.PARTIAL_OVERLAP,
-                f"more than half of its record lies outside that of {name}",
-                aid.label,
-            )
+            text = message("partial_overlap.outside", names=name)
+            yield Finding(Code.PARTIAL_OVERLAP, text, aid.label)
         elif inside < 0.5 * (imu.end - imu.start):
-            yield Finding(
-                Code.PARTIAL_OVERLAP,
-                f"it covers {100.0 * inside / (imu.end - imu.start):.3g} % of the record of "
-                f"{name}",
-                aid.label,
-            )
+            percent = 100.0 * inside / (imu.end - imu.start)
+            text = message("partial_overlap.covers", percent=percent, name=name)
+            yield Finding(Code.PARTIAL_OVERLAP, text, aid.label)
     for sensor in sensors:
         if sensor.gaps:
             yield Finding(
                 Code.GAPS,
-                f"{sensor.gaps} gaps longer than {GAP_INTERVALS:g} sample intervals, the longest "
-                f"{sensor.longest_gap:.4g} s",
+                message(
+                    "gaps.longer",
+                    count=sensor.gaps,
+                    intervals=GAP_INTERVALS,
+                    longest=sensor.longest_gap,
+                ),
                 sensor.label,
             )
         if 0.5 < sensor.missing < 1.0:
             yield Finding(
                 Code.MISSING,
-                f"{100.0 * sensor.missing:.3g} % of its rows contain no measurement",
+                message("missing.rows", percent=100.0 * sensor.missing),
                 sensor.label,
             )
 

@@ -11,6 +11,7 @@ from factorgraph_dvl.sensors.dvl import Dvl
 from factorgraph_dvl.sensors.dvl_beams import DvlBeams
 from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.sensors.gnss import Gnss
+from factorgraph_dvl.sensors.message import message
 
 # Offsets below this, s, are left to the solver; times σ, and gain in log-likelihood, from which on
 # one is certain. Chosen: chance makes none in 10 000 trials.
@@ -50,28 +51,37 @@ def clock_findings(
         covered = max(_COVERED * rate_std * span, _HARMLESS_S)
         yield Finding(
             Code.CLOCK_DRIFT,
-            f"its clock {'loses' if change < 0 else 'gains'} {abs(change):.2f} s in {span:.0f} s "
-            f"against the IMU's ({1e6 * clock.rate:.0f} ± {1e6 * clock.rate_sigma:.0f} ppm): "
-            "write time_s from true stamps, not from an assumed rate",
+            message(
+                "clock_drift.loses" if change < 0 else "clock_drift.gains",
+                change=abs(change),
+                span=span,
+                rate=1e6 * clock.rate,
+                std=1e6 * clock.rate_sigma,
+            ),
             sensor.label,
             severity="error" if abs(change) > covered else "warning",
         )
     if abs(clock.jump) > max(_LEAST_JUMP_S, _SIGMAS * clock.jump_sigma):
         yield Finding(
             Code.CLOCK_STEP,
-            f"its clock jumps by {clock.jump:.2g} ± {clock.jump_sigma:.1g} s near "
-            f"{clock.jump_time:.0f} s against the IMU's",
+            message(
+                "clock_step.jumps", jump=clock.jump, std=clock.jump_sigma, time=clock.jump_time
+            ),
             sensor.label,
             severity="error",
         )
     off = clock.offset - mean
     if abs(off) > max(_LEAST_S, _SIGMAS * clock.sigma):
-        known = "" if mean == 0.0 else f" instead of {mean:g} s"
         yield Finding(
             Code.CLOCK_OFFSET,
-            f"its stamps are {abs(clock.offset):.2f} ± {max(clock.sigma, 0.005):.2f} s "
-            f"{'late' if clock.offset > 0 else 'early'} against the IMU's{known}: "
-            f"state {sensor.section}: {{time_offset_s: {clock.offset:.2f}}}",
+            message(
+                "clock_offset.late" if clock.offset > 0 else "clock_offset.early",
+                size=abs(clock.offset),
+                std=max(clock.sigma, 0.005),
+                instead="" if mean == 0.0 else message("clock_offset.instead", stated=mean),
+                section=sensor.section,
+                offset=clock.offset,
+            ),
             sensor.label,
             severity="error" if abs(off) > max(_COVERED * std, _HARMLESS_S) else "warning",
         )
@@ -82,15 +92,18 @@ def far_clock_finding(sensor: Gnss | Dvl | DvlBeams, offset: float) -> Finding:
     if abs(abs(offset) - LEAP_SECONDS) < 1.5:
         return Finding(
             Code.LEAP_SECONDS,
-            f"its stamps are {abs(offset):.0f} s {'late' if offset > 0 else 'early'}: the leap "
-            "seconds between GPS time and UTC",
+            message("leap_seconds.late" if offset > 0 else "leap_seconds.early", size=abs(offset)),
             sensor.label,
             severity="error",
         )
     return Finding(
         Code.CLOCK_OFFSET,
-        f"its stamps are {abs(offset):.1f} s {'late' if offset > 0 else 'early'} against the "
-        f"IMU's: correct them, or state {sensor.section}: {{time_offset_s: {offset:.1f}}}",
+        message(
+            "clock_offset.far_late" if offset > 0 else "clock_offset.far_early",
+            size=abs(offset),
+            section=sensor.section,
+            offset=offset,
+        ),
         sensor.label,
         severity="error",
     )

@@ -10,6 +10,7 @@ from factorgraph_dvl.quality.plausibility_planar import planar_findings
 from factorgraph_dvl.quality.records import SensorSurvey, record_of
 from factorgraph_dvl.quality.survey import Survey
 from factorgraph_dvl.sensors.finding import Code, Finding
+from factorgraph_dvl.sensors.message import message
 from factorgraph_dvl.trial import PlanarTrial
 
 
@@ -45,31 +46,26 @@ def survey_planar(trial: PlanarTrial) -> Survey:
 def _findings(trial: PlanarTrial, sensors: tuple[SensorSurvey, ...]) -> Iterator[Finding]:
     *carried, beacons = sensors
     start, end = max(s.start for s in carried), min(s.end for s in carried)
-    names = "heading, log and depth"
+    names = message("words.heading_log_and_depth")
     if not start < end:
-        yield Finding(
-            Code.NO_OVERLAP,
-            f"{names} have no time in common: are they of one clock?",
-            "Heading",
-            severity="error",
-        )
+        text = message("no_overlap.none_in_common", names=names)
+        yield Finding(Code.NO_OVERLAP, text, "Heading", severity="error")
         return
     inside = min(beacons.end, end) - max(beacons.start, start)
     if beacons.missing == 1.0:
-        text = "none of its rows contains a measurement"
+        text = message("no_measurement.rows")
         yield Finding(Code.NO_MEASUREMENT, text, beacons.label, severity="error")
     elif inside < 0.0:
-        yield Finding(
-            Code.NO_OVERLAP,
-            f"its times, {beacons.start:.10g} to {beacons.end:.10g} s, do not overlap those of "
-            f"{names}, {start:.10g} to {end:.10g} s: are they of one clock, in seconds?",
-            beacons.label,
-            severity="error",
+        text = message(
+            "no_overlap.times",
+            start=beacons.start,
+            end=beacons.end,
+            names=names,
+            other_start=start,
+            other_end=end,
         )
+        yield Finding(Code.NO_OVERLAP, text, beacons.label, severity="error")
     elif inside < 0.5 * (beacons.end - beacons.start):
-        yield Finding(
-            Code.PARTIAL_OVERLAP,
-            f"more than half of its record lies outside that of {names}",
-            beacons.label,
-        )
+        text = message("partial_overlap.outside", names=names)
+        yield Finding(Code.PARTIAL_OVERLAP, text, beacons.label)
     yield from planar_findings(trial)

@@ -17,6 +17,7 @@ from factorgraph_dvl.ranging.problem import RangingSetup, planar_setup
 from factorgraph_dvl.ranging.smoother import Fit, covariance, residuals
 from factorgraph_dvl.sensors.beacon import Beacons
 from factorgraph_dvl.sensors.finding import Code, Finding
+from factorgraph_dvl.sensors.message import Message, message
 from factorgraph_dvl.solution import (
     Estimate,
     Hypothesis,
@@ -43,12 +44,12 @@ _FIRST_ROWS = 8
 
 # Why the data do not determine a constant, by its reported name; else it is the place of a beacon.
 _NOT_OBSERVABLE = {
-    "heading_bias_deg": "a rotation of the track about the only beacon changes no range",
-    "current_m_s": "on a straight run the mirror image fits another current; add a turn",
-    "log_scale_error": "a scale error separates from the current only over several headings",
-    "sound_speed_error": "it needs a longer distance by log and heading to compare with",
+    "heading_bias_deg": message("not_observable.heading_by_one_beacon"),
+    "current_m_s": message("not_observable.current_by_ranges"),
+    "log_scale_error": message("not_observable.log_scale"),
+    "sound_speed_error": message("not_observable.sound_speed_by_log"),
 }
-_PLACE_NOT_OBSERVABLE = "it needs ranges from several sides, and a second beacon"
+_PLACE_NOT_OBSERVABLE = message("not_observable.place")
 
 
 def solve_planar(
@@ -148,11 +149,11 @@ def _summary(
     used, rejected = measurements(trial.beacons, setup, best)
     findings = [*trial.notes]
     if not best.converged:
-        text = "the smoother did not converge: do not use this result"
+        text = message("not_converged.smoother")
         findings.append(Finding(Code.NOT_CONVERGED, text, severity="error"))
     if setup.uncovered:
-        text = f"{setup.uncovered} measurements at times without heading, speed or depth"
-        findings.append(Finding(Code.UNUSED, f"{text} were not used", sensor="Beacon"))
+        text = message("unused.without_heading", count=setup.uncovered)
+        findings.append(Finding(Code.UNUSED, text, sensor="Beacon"))
     findings += ambiguity(reported)
     findings += consistency_findings(estimates, used)
     findings += mostly_rejected(used, rejected)
@@ -285,7 +286,7 @@ def measurements(
 
 
 def _unobservable(estimates: Sequence[Estimate]) -> list[Finding]:
-    def why(name: str, _: int) -> str:
+    def why(name: str, _: int) -> Message:
         return _NOT_OBSERVABLE.get(name, _PLACE_NOT_OBSERVABLE)
 
     return [f for e in estimates for f in not_observable(e, partial(why, e.name))]

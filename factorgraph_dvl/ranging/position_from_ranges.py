@@ -26,6 +26,7 @@ from factorgraph_dvl.ranging.problem import RangingSetup, ranging_setup
 from factorgraph_dvl.sensors.beacon import Beacons
 from factorgraph_dvl.sensors.dvl import CURRENT_SPEC
 from factorgraph_dvl.sensors.finding import Code, Finding
+from factorgraph_dvl.sensors.message import message
 from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.sensors.speed_log import HEADING_BIAS_SPEC, LOG_SCALE_SPEC
 from factorgraph_dvl.solution import Hypothesis, mostly_rejected
@@ -105,7 +106,7 @@ def positions_from_ranges(
     found = follow(setup.problem, updates, searches)
     living = [c for c in found if c.died is None]
     if not living:
-        few = Finding(Code.FEW_RANGES, "too few ranges to find a position from them")
+        few = Finding(Code.FEW_RANGES, message("few_ranges.too_few"))
         return StartPositions((states,), findings=(few,))
     rejected = {r.label: r.time for r in measurements(beacons, setup, living[0].fit)[1]}
     return StartPositions(

@@ -8,6 +8,7 @@ import numpy as np
 
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.sensors.finding import Code, Finding
+from factorgraph_dvl.sensors.message import message
 
 # Standard deviations beyond which a measurement is rejected; chosen: 2e-9 of Gaussian errors.
 _LIMIT = 6.0
@@ -98,17 +99,13 @@ class InnovationGate:
             if full and share <= readmit and rms < _CONSISTENT_RMS:
                 self.inconsistent.discard(label)
                 self.excluded.discard(label)
-                return Finding(
-                    Code.HEARD_AGAIN, "consistent with the prediction again, and used again", label
-                )
+                return Finding(Code.HEARD_AGAIN, message("heard_again.consistent"), label)
         elif full and rms > _INCONSISTENT_RMS:
             self.inconsistent.add(label)
             if rms <= _EXCLUDE_RMS and share <= exclude:
                 return Finding(
                     Code.CONTRADICTS,
-                    f"the last {_WINDOW} innovations are {rms:.1f} times as large as predicted, "
-                    "so the standard deviations are too small. Check the stated noise, the clock "
-                    "and the mounting of this sensor",
+                    message("contradicts.larger", count=_WINDOW, ratio=rms),
                     label,
                 )
         if label not in self.excluded and (
@@ -116,16 +113,10 @@ class InnovationGate:
         ):
             self.inconsistent.add(label)
             self.excluded.add(label)
-            what = f"the last {_WINDOW} innovations are {rms:.1f} times as large as predicted"
+            text = message("contradicts.excluded", count=_WINDOW, ratio=rms)
             if share > exclude:
-                what = (
-                    f"{count} of the last {len(window)} measurements are more than {limit:g} "
-                    "standard deviations from the prediction"
+                text = message(
+                    "contradicts.excluded_beyond", count=count, total=len(window), limit=limit
                 )
-            return Finding(
-                Code.CONTRADICTS,
-                f"{what}; none are used until they are consistent again. Possible causes are a "
-                "clock that has jumped and a faulty sensor: check both",
-                label,
-            )
+            return Finding(Code.CONTRADICTS, text, label)
         return None

@@ -14,6 +14,7 @@ from factorgraph_dvl.replay.navigator import Navigator
 from factorgraph_dvl.replay.samples import Gap
 from factorgraph_dvl.replay.start import ReplayStart, solve_start
 from factorgraph_dvl.sensors.finding import Code, Finding
+from factorgraph_dvl.sensors.message import Message, message
 from factorgraph_dvl.solution import Progress
 from factorgraph_dvl.trial import InitialPosition, Trial
 
@@ -95,7 +96,7 @@ class Initializer:
         self._attempt = np.nan
         self._solved_at = np.nan
         self._solve_at = np.nan
-        self._reason = ""
+        self._reason: Message | None = None
         self._noted = set(settings.notes)
 
     def restart(self, gap: Gap, navigator: Navigator, samples: Array) -> None:
@@ -114,8 +115,7 @@ class Initializer:
         self.findings.append(
             Finding(
                 Code.IMU_GAP,
-                f"gap of {length:.2f} s at {gap.before:.2f} s: the attitude is aligned again, "
-                f"from the {_AFTER_GAP:g} s after it",
+                message("imu_gap.aligned", length=length, time=gap.before, after=_AFTER_GAP),
                 "IMU",
             )
         )
@@ -157,8 +157,7 @@ class Initializer:
             self.findings.append(
                 Finding(
                     Code.UNUSED,
-                    f"samples before {start:.3f} s are not used: before the start, the "
-                    f"clock jumped or no data came for more than {_LONGEST:g} s",
+                    message("unused.before_start", start=start, longest=_LONGEST),
                     "IMU",
                 )
             )
@@ -216,14 +215,14 @@ class Initializer:
             until -= jump.by if jump else 0.0
         self._solved_at = until
         self._solve_at = self.history.start + _GROWTH * (until - self.history.start)
-        if isinstance(start, str):
+        if isinstance(start, Message):
             if navigator is None:
                 if start != self._reason:
-                    text = f"no start yet at {until:.1f} s: {start}"
+                    text = message("not_started.yet", time=until, reason=start)
                     self.findings.append(Finding(Code.NOT_STARTED, text))
                 self._reason = start
             return None, jump
-        self._reason = ""
+        self._reason = None
         self._gap = None
         self._usual_misfit = max(1.0, start.misfit)
         self.findings += [f for f in start.findings if f not in self._noted]
@@ -250,13 +249,13 @@ class Initializer:
         if agrees and known and not after.undetermined.size:
             self.history = None
 
-    def _begin(self, until: float, since: float) -> ReplayStart | str:
+    def _begin(self, until: float, since: float) -> ReplayStart | Message:
         assert self.history is not None
         trial = self.history.trial(until)
         try:
             trial.frame()
         except DataError:
-            return "no position has been measured since" if self._gap else "no position yet"
+            return message("not_started.since_gap" if self._gap else "not_started.no_position")
         try:
             if self._clock_zero is None:
                 self._clock_zero = float(trial.inertial.time[0])
@@ -264,15 +263,15 @@ class Initializer:
                 trial, self._prior, self._interval, since, self._progress, self._clock_zero
             )
         except FactorgraphDvlError as error:
-            return str(error)
+            return message("not_started.error", error=str(error))
 
-    def _contradicts(self, start: ReplayStart | str) -> bool:
+    def _contradicts(self, start: ReplayStart | Message) -> bool:
         """Whether there is no start, or one whose residuals are larger than they were."""
-        return isinstance(start, str) or start.misfit > _MISFIT * self._usual_misfit
+        return isinstance(start, Message) or start.misfit > _MISFIT * self._usual_misfit
 
     def _without_rejected(
-        self, until: float, since: float, start: ReplayStart | str, navigator: Navigator
-    ) -> ReplayStart | str:
+        self, until: float, since: float, start: ReplayStart | Message, navigator: Navigator
+    ) -> ReplayStart | Message:
         """Return a better start without what the innovation gate rejected, if there is one."""
         whole = self.history
         assert whole is not None
@@ -281,14 +280,16 @@ class Initializer:
             return start
         self.history = fewer
         other = self._begin(until, since)
-        if isinstance(other, str) or (not isinstance(start, str) and other.misfit >= start.misfit):
+        if isinstance(other, Message) or (
+            not isinstance(start, Message) and other.misfit >= start.misfit
+        ):
             self.history = whole
             return start
         return other
 
     def _with_clock_jump(
-        self, until: float, since: float, start: ReplayStart | str, gap: Gap, dt: float
-    ) -> tuple[ReplayStart | str, ClockJump | None]:
+        self, until: float, since: float, start: ReplayStart | Message, gap: Gap, dt: float
+    ) -> tuple[ReplayStart | Message, ClockJump | None]:
         """Solve as if the IMU went on through a gap, and its clock jumped."""
         assert self.history is not None
         jump = ClockJump(gap.after, gap.after - gap.before - dt)
@@ -296,13 +297,14 @@ class Initializer:
         other = self._begin(until - jump.by, since)
         if self._contradicts(other):
             self.history.shift_samples(gap.before + 0.5 * dt, jump.by)
-            why = start if isinstance(start, str) else f"misfit of {start.misfit:.1f}"
-            return f"after the gap the IMU contradicts the other sensors ({why})", None
+            why = start
+            if not isinstance(why, Message):
+                why = message("not_started.misfit", misfit=why.misfit)
+            return message("not_started.contradicts", reason=why), None
         self.findings.append(
             Finding(
                 Code.CLOCK_JUMP,
-                f"there is no gap at {gap.before:.2f} s: the clock jumped ahead by {jump.by:.2f} "
-                "s. Later samples are shifted back by this. Check the clock of the logger",
+                message("clock_jump.ahead", time=gap.before, jump=jump.by),
                 "IMU",
             )
         )

@@ -8,6 +8,7 @@ import numpy as np
 
 from factorgraph_dvl.replay.update import Innovations
 from factorgraph_dvl.sensors.finding import Code, Finding
+from factorgraph_dvl.sensors.message import message
 
 # Silence, s, that counts as an outage; chosen: several pings, and short against the time over
 # which an INS drifts.
@@ -41,7 +42,7 @@ class Outages:
                 self._interval[i.label] = min(now - before, self._interval.get(i.label, np.inf))
             if i.label in self._out:
                 self._out.discard(i.label)
-                text = f"back after {now - before:.1f} s"
+                text = message("heard_again.back", duration=now - before)
                 out.append(Finding(Code.HEARD_AGAIN, text, i.label))
         for label, (before, newest) in self._last.items():
             longest = max(_OUTAGE, _INTERVALS * self._interval.get(label, 0.0))
@@ -50,8 +51,7 @@ class Outages:
                 out.append(
                     Finding(
                         Code.SILENT,
-                        f"no measurements since {newest:.1f} s; the estimate continues without "
-                        "them, and its standard deviations grow",
+                        message("silent.since", time=newest),
                         label,
                     )
                 )

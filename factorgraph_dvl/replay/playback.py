@@ -18,6 +18,7 @@ from factorgraph_dvl.replay.samples import LEAST
 from factorgraph_dvl.replay.session import LAG, RATE, Kind, Replay
 from factorgraph_dvl.replay.update import Update
 from factorgraph_dvl.sensors.finding import Code, Finding
+from factorgraph_dvl.sensors.message import message
 from factorgraph_dvl.sensors.records import rows_of
 from factorgraph_dvl.solution import Progress, Solution, consistency_findings, not_observable
 from factorgraph_dvl.trial import Trial
@@ -132,22 +133,25 @@ def _solution(trial: Trial, run: Replay, recorder: Recorder, last: Update) -> So
     calibration = last.calibration
     residuals = recorder.residuals()
     findings = [*trial.notes]
-    findings += [replace(f, text=f"at {time:.1f} s: {f.text}") for time, f in recorder.findings]
-    findings += [replace(f, text=f"at the end: {f.text}") for f in run.findings]
+    findings += [
+        replace(f, message=message("words.at_time", time=time, what=f.message))
+        for time, f in recorder.findings
+    ]
+    findings += [
+        replace(f, message=message("words.at_the_end", what=f.message)) for f in run.findings
+    ]
     if run.unused:
         findings.append(
             Finding(
                 Code.UNUSED,
-                f"the replay ended at {last.time:.3f} s: {run.unused} samples follow, too few "
-                "to start again after a gap. They and the measurements at these times were not "
-                "used",
+                message("unused.replay_ended", time=last.time, count=run.unused),
                 "IMU",
             )
         )
     findings += run.counts()
     findings += consistency_findings(calibration.estimates, residuals)
     findings += prior_findings(trial, calibration.estimates, calibration.covariance)
-    why = "the prior is reported; turns and changes of speed would help"
+    why = message("not_observable.prior_reported")
     for e in calibration.estimates:
         findings += not_observable(e, lambda _: why)
     known = {e.name for e in calibration.estimates}
@@ -156,8 +160,7 @@ def _solution(trial: Trial, run: Replay, recorder: Recorder, last: Update) -> So
             findings.append(
                 Finding(
                     Code.SILENT,
-                    "no measurement came in time to calibrate it; check its record, or feed more "
-                    "data",
+                    message("silent.never"),
                     aid.label,
                 )
             )
@@ -165,16 +168,14 @@ def _solution(trial: Trial, run: Replay, recorder: Recorder, last: Update) -> So
         findings.append(
             Finding(
                 Code.MEAN_OR_LAST,
-                "a bias walks: the reported value is that of the end. `solve` reports the mean "
-                "over the trial",
+                message("mean_or_last.walks"),
                 "IMU",
             )
         )
     if run.unused >= LEAST:
-        findings.append(Finding(Code.NOT_CONVERGED, "the replay did not reach the end"))
+        findings.append(Finding(Code.NOT_CONVERGED, message("not_converged.replay")))
     elif last.inconsistent:
-        kinds = ", ".join(sorted(last.inconsistent))
-        text = f"at the end the prediction still disagrees with {kinds}"
+        text = message("not_converged.disagrees", sensors=sorted(last.inconsistent))
         findings.append(Finding(Code.NOT_CONVERGED, text))
     cost = 0.5 * sum(float(np.nansum((r.residual / r.sigma) ** 2)) for r in residuals)
     return Solution(

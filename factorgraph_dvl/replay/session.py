@@ -24,6 +24,7 @@ from factorgraph_dvl.replay.pending import AHEAD, SAME_TIME, PendingMeasurements
 from factorgraph_dvl.replay.samples import Gap, SampleBuffer
 from factorgraph_dvl.replay.update import Update
 from factorgraph_dvl.sensors.finding import Code, Finding
+from factorgraph_dvl.sensors.message import message
 from factorgraph_dvl.sensors.protocol import Aid
 from factorgraph_dvl.sensors.records import rows_of
 from factorgraph_dvl.solution import Progress, Trajectory
@@ -38,8 +39,7 @@ LAG = 30.0
 RATE = 5.0
 _IMU_ERRORS_LEFT_OUT = Finding(
     Code.IMU_ERRORS_LEFT_OUT,
-    "a replay does not estimate scale, axes and g-sensitivity: standard deviations do not "
-    "contain their effect; those of `solve` do",
+    message("imu_errors_left_out.replay"),
     sensor="IMU",
 )
 
@@ -98,8 +98,7 @@ class Replay:
         self._findings += [
             Finding(
                 Code.CORRELATION_LEFT_OUT,
-                "a replay treats all noise as white: standard deviations do not contain the "
-                "correlated part; those of `solve` do",
+                message("correlation_left_out.replay"),
                 sensor=aid.label,
             )
             for aid in settings.aids
@@ -155,34 +154,24 @@ class Replay:
     def counts(self) -> list[Finding]:
         """Return how many measurements were not used, and why."""
         reasons = (
-            (
-                self._too_late,
-                f"came too late and were not used: they were older than the lag of {self._lag:g} "
-                "s, or than the last batch solution; a longer lag would keep them",
-            ),
-            (self._deferred, "came late and were left for the next batch solution"),
-            (self._duplicates.rejected, "came twice and were used once"),
-            (
-                self._pending.rejected,
-                f"were more than {AHEAD:g} s ahead of the IMU and not used; check the clocks",
-            ),
-            (self._gate.rejected, "contradicted the prediction and were not used"),
+            (self._too_late, message("unused.too_late", lag=self._lag)),
+            (self._deferred, message("unused.deferred")),
+            (self._duplicates.rejected, message("unused.twice")),
+            (self._pending.rejected, message("unused.ahead", ahead=AHEAD)),
+            (self._gate.rejected, message("unused.contradicted")),
         )
         out = [
-            Finding(Code.UNUSED, f"{n} measurements {why}", label)
+            Finding(Code.UNUSED, message("unused.measurements", count=n, why=why), label)
             for counts, why in reasons
             for label, n in counts.items()
             if n
         ]
         if self._samples.rejected:
-            text = (
-                f"{self._samples.rejected} samples were out of order or not numbers, and not "
-                "used; check the logger"
-            )
+            text = message("unused.out_of_order", count=self._samples.rejected)
             out.append(Finding(Code.UNUSED, text, "IMU"))
         if self._samples.interpolated:
             n = self._samples.interpolated
-            text = f"{n} samples that were lost after the start were interpolated"
+            text = message("lost_samples.after_start", count=n)
             out.append(Finding(Code.LOST_SAMPLES, text, "IMU"))
         return out
 
@@ -206,8 +195,7 @@ class Replay:
             self._findings.append(
                 Finding(
                     Code.CLOCK_JUMP,
-                    f"the clock jumped back by {jump:.3f} s at {self._samples.newest:.3f} s: "
-                    "later samples are shifted by that. Check the clock of the logger",
+                    message("clock_jump.back", jump=jump, time=self._samples.newest),
                     "IMU",
                 )
             )

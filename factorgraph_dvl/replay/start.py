@@ -17,6 +17,7 @@ from factorgraph_dvl.graph.priors import ConstantsPrior, prior_mean
 from factorgraph_dvl.graph.problem import Evaluation, Problem
 from factorgraph_dvl.imu.propagation import States
 from factorgraph_dvl.sensors.finding import Finding
+from factorgraph_dvl.sensors.message import Message, message
 from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.sensors.protocol import AttitudeAid
 from factorgraph_dvl.solution import Progress, Trajectory
@@ -116,7 +117,7 @@ def solve_start(
     since: float,
     progress: Progress,
     clock_zero: float,
-) -> ReplayStart | str:
+) -> ReplayStart | Message:
     """Solve the records so far, and condense them to their last state.
 
     Parameters
@@ -136,7 +137,7 @@ def solve_start(
 
     Returns
     -------
-    ReplayStart or str
+    ReplayStart or Message
         Start, or why there is none yet.
 
     Raises
@@ -154,22 +155,20 @@ def solve_start(
     )
     problem, minimum = settled.problem, settled.minimum
     if len(start_positions.states) > 1:
-        return (
-            f"{len(start_positions.states)} trajectories fit the ranges; turn by 30 degrees or "
-            "more, or give `initial.position`"
-        )
+        return message("not_started.ambiguous", count=len(start_positions.states))
     if start_positions.findings:
-        return start_positions.findings[0].text
+        first = start_positions.findings[0].message
+        return message("not_started.error", error=first)
     if not minimum.converged:
-        return "the batch solution did not converge"
+        return message("not_started.not_converged")
     covariances = posterior(problem, minimum)
     attitude = float(np.sqrt(np.linalg.eigvalsh(covariances.nodes[-1][:3, :3])[-1]))
     if not attitude < _ATTITUDE:
-        return f"the attitude is known to {np.degrees(attitude):.2g} deg only"
+        return message("not_started.attitude", std=np.degrees(attitude))
     if trial.beacons is not None:
         position = float(np.sqrt(np.linalg.eigvalsh(covariances.nodes[-1][3:6, 3:6])[-1]))
         if not position < _linear_std(trial.beacons.range, trial.beacons.settings.range_std_m):
-            return f"the position is known to {position:.2g} m only"
+            return message("not_started.position", std=position)
     evaluation = minimum.evaluation
     # The whole error, also what all states share: the smoother linearises later states without it.
     spurious = spurious_information(problem, evaluation, covariances.nodes).sum(axis=0)

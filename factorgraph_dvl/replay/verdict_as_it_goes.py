@@ -5,6 +5,7 @@ from __future__ import annotations
 from factorgraph_dvl.quality.survey import survey
 from factorgraph_dvl.replay.update import Update
 from factorgraph_dvl.sensors.finding import Code, Finding
+from factorgraph_dvl.sensors.message import message
 from factorgraph_dvl.sensors.verdict import Verdict
 from factorgraph_dvl.solution import Calibration, consistency_findings
 from factorgraph_dvl.trial import Trial
@@ -46,7 +47,7 @@ class VerdictAsItGoes:
             self._due = start + _GROWTH * (update.time - start)
             self._compared = survey(self._trial.until(update.time)).errors
         now = [
-            Finding(Code.CONTRADICTS, "disagrees with the prediction", kind)
+            Finding(Code.CONTRADICTS, message("contradicts.prediction"), kind)
             for kind in update.inconsistent
         ]
         calibration = update.calibration

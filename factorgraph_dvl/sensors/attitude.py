@@ -20,6 +20,7 @@ from factorgraph_dvl.geometry.rotations import (
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.sensors.clock import Clock, ClockSection
+from factorgraph_dvl.sensors.message import Message, message
 from factorgraph_dvl.sensors.parameters import SCALAR, Parameter, ParameterSpec
 from factorgraph_dvl.sensors.protocol import (
     Linearization,
@@ -203,16 +204,13 @@ class Attitude:
         angles = AttitudeAngles(self.time[rows], np.nan_to_num(rph), std, frame, body_axes, _CLOCK)
         return (angles,)
 
-    def explain(self, parameter: str, component: int, motion: Motion | None) -> str:
+    def explain(self, parameter: str, component: int, motion: Motion | None) -> Message:
         """Say why an error of the attitude or its clock could not be observed."""
         if parameter in _CLOCK.names:
-            return "a time offset is observable only where the attitude changes"
+            return message("not_observable.clock_by_attitude")
         if parameter == HEADING_OFFSET:
-            return (
-                "without an IMU, only the sum of heading offset and misalignment is observable: "
-                "state `heading_offset_std_deg`"
-            )
-        return "the trial needs all headings, more than once"
+            return message("not_observable.heading_offset")
+        return message("not_observable.all_headings")
 
 
 # Stands for a standard deviation of 0 of an angle, rad. Chosen: far below what is measured.

@@ -17,6 +17,7 @@ from factorgraph_dvl.geometry.rotations import BodyAxes
 from factorgraph_dvl.geometry.units import GEODETIC_SI
 from factorgraph_dvl.geometry.vectors import Array, cross, rotate, skew
 from factorgraph_dvl.sensors.clock import Clock, ClockSection
+from factorgraph_dvl.sensors.message import Message, message
 from factorgraph_dvl.sensors.parameters import SCALAR, Parameter, ParameterSpec
 from factorgraph_dvl.sensors.protocol import (
     ExpectedCorrelation,
@@ -199,23 +200,16 @@ class Beacons:
                     out.append(kind(self.time[m], values[m], std, place_n, nRl, arm, name))
         return tuple(out)
 
-    def explain(self, parameter: str, component: int, motion: Motion | None) -> str:
+    def explain(self, parameter: str, component: int, motion: Motion | None) -> Message:
         """Say why a component could not be observed, given the motion of the trial."""
         if motion is None or motion.v_n.shape[0] < 2:
-            return "there are hardly any ranges while the IMU runs"
+            return message("not_observable.no_ranges")
         travelled = float(np.linalg.norm(np.ptp(motion.p_n[:, :2], axis=0)))
         if parameter in _CLOCK.names:
-            return "a time offset is observable only where the ranges change"
+            return message("not_observable.clock_by_ranges")
         if parameter == SOUND_SPEED_ERROR:
-            return (
-                "an error of the sound speed is observable only if another sensor measures the "
-                "distance: add GNSS, or go a long way in several directions with a log without "
-                "scale error"
-            )
-        return (
-            f"the ranges were taken within {travelled:.3g} m: the position of a beacon is "
-            "observable only from several sides, and from known positions"
-        )
+            return message("not_observable.sound_speed")
+        return message("not_observable.beacon_position", travelled=travelled)
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.rotations import BodyAxes
 from factorgraph_dvl.geometry.vectors import Array, skew
 from factorgraph_dvl.sensors.clock import Clock, ClockSection
+from factorgraph_dvl.sensors.message import Message, message
 from factorgraph_dvl.sensors.parameters import SCALAR, Parameter, ParameterSpec
 from factorgraph_dvl.sensors.protocol import (
     Linearization,
@@ -105,11 +106,11 @@ class Depth:
         arm = np.array(self.settings.lever_arm_m)
         return (DepthBelowSurface(self.time[m], self.depth[m], self.settings.std_m, arm, frame),)
 
-    def explain(self, parameter: str, component: int, motion: Motion | None) -> str:
+    def explain(self, parameter: str, component: int, motion: Motion | None) -> Message:
         """Say why the height of the sea surface or the clock could not be observed."""
         if parameter in _CLOCK.names:
-            return "a time offset is observable only where the depth changes"
-        return "nothing else in the trial measures height: add GNSS at the surface"
+            return message("not_observable.clock_by_depth")
+        return message("not_observable.sea_surface")
 
 
 @dataclass(frozen=True)

@@ -16,6 +16,7 @@ from factorgraph_dvl.geometry.rotations import BodyAxes
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array, cross, rotate, skew
 from factorgraph_dvl.sensors.clock import Clock, ClockSection
+from factorgraph_dvl.sensors.message import Message, message
 from factorgraph_dvl.sensors.parameters import SCALAR, XYZ, JointPrior, Parameter, ParameterSpec
 from factorgraph_dvl.sensors.protocol import (
     ExpectedCorrelation,
@@ -275,10 +276,10 @@ class Dvl:
         velocity = self.velocity[m]
         return (DvlVelocity(self.time[m], velocity, self.std[m], noise, correlated=correlated),)
 
-    def explain(self, parameter: str, component: int, motion: Motion | None) -> str:
+    def explain(self, parameter: str, component: int, motion: Motion | None) -> Message:
         """Say why a component could not be observed, given the motion of the trial."""
         if motion is None or motion.v_n.shape[0] < 2:
-            return "the trial has no ping with a lock while the IMU runs, or only one"
+            return message("not_observable.no_ping")
         v_b = rotate(motion.nRb.transpose(0, 2, 1), motion.v_n)
         speed = np.linalg.norm(v_b, axis=1)
         moving = speed > 0.3 * max(speed.max(), 1e-9)
@@ -288,27 +289,16 @@ class Dvl:
         )
         rates = np.degrees(np.std(motion.omega_eb_b, axis=0))
         if parameter == MISALIGNMENT:
-            return (
-                f"the velocity keeps its direction in the body to {spread:.2g} deg, and a "
-                "rotation about the velocity changes nothing: add side slip, heave or a "
-                "current from changing sides"
-            )
+            return message("not_observable.misalignment", spread=spread)
         if parameter == LEVER_ARM:
-            x, y, z = rates
-            return (
-                f"the body turns too little (rms rate {x:.2g}, {y:.2g}, {z:.2g} deg/s about "
-                "x, y, z): a lever arm is observable only through rotation about other axes"
-            )
+            return message("not_observable.lever_arm", rates=rates)
         if parameter == SCALE_ERROR:
-            return (
-                f"nothing else in the trial measures speed well enough (it was {speed.min():.2g} "
-                f"to {speed.max():.2g} m/s): add GNSS, and go farther"
-            )
+            return message("not_observable.scale", least=speed.min(), largest=speed.max())
         if parameter == BIAS:
-            return "bias and scale are separable only if speed or direction vary"
+            return message("not_observable.bias")
         if parameter in CLOCK.names:
-            return "a time offset is observable only where velocity or attitude change"
-        return "current and other errors are separable only if the heading changes"
+            return message("not_observable.clock")
+        return message("not_observable.current")
 
 
 @dataclass(frozen=True)

@@ -17,6 +17,7 @@ from factorgraph_dvl.geometry.vectors import Array, cross, rotate, skew
 from factorgraph_dvl.sensors.beam_model import CommonGeometry, FreeGeometry, Geometry
 from factorgraph_dvl.sensors.clock import Clock, ClockSection
 from factorgraph_dvl.sensors.dvl import CLOCK, LEVER_ARM_SPEC, MISALIGNMENT_SPEC, SCALE_SPEC
+from factorgraph_dvl.sensors.message import Message, message
 from factorgraph_dvl.sensors.parameters import SCALAR, Parameter, ParameterSpec
 from factorgraph_dvl.sensors.protocol import (
     ExpectedCorrelation,
@@ -311,34 +312,25 @@ class DvlBeams:
             BeamVelocity(self.time[m], measured, lost, noise, geometry, lever_arm, self.clock),
         )
 
-    def explain(self, parameter: str, component: int, motion: Motion | None) -> str:
+    def explain(self, parameter: str, component: int, motion: Motion | None) -> Message:
         """Say why a component could not be observed, given the motion of the trial."""
         if motion is None or motion.v_n.shape[0] < 2:
-            return "the trial has no ping with a beam while the IMU runs, or only one"
+            return message("not_observable.no_beam")
         if parameter in self.clock.names:
-            return "a time offset is observable only where velocity or attitude change"
+            return message("not_observable.clock")
         received = np.flatnonzero(~np.isnan(self.velocity).all(axis=0)) + 1
         if parameter == of_beams(LEVER_ARM_SPEC, self.prefix).name:
             if received.size < 3:
-                return f"too few beams were ever received: {' and '.join(map(str, received))}"
-            x, y, z = np.degrees(np.std(motion.omega_eb_b, axis=0))
-            return (
-                f"the body turns too little (rms rate {x:.2g}, {y:.2g}, {z:.2g} deg/s about "
-                "x, y, z): a lever arm is observable only through rotation about other axes"
-            )
+                return message("not_observable.few_beams", beams=received)
+            rates = np.degrees(np.std(motion.omega_eb_b, axis=0))
+            return message("not_observable.lever_arm", rates=rates)
         of_a_beam = {DIRECTION: component // 2, SCALE_ERROR: component}
         if self.settings.parametrisation == "beams":
             beam = of_a_beam[parameter]
             if beam + 1 not in received:
-                return f"beam {beam + 1} was never received"
+                return message("not_observable.beam_lost", beam=beam + 1)
         v_b = rotate(motion.nRb.transpose(0, 2, 1), motion.v_n)
-        x, y, z = np.sqrt(np.mean(v_b**2, axis=0))
-        return (
-            "direction and scale of a beam are observable only with velocities in three "
-            f"directions of the body and a better reference; here they were {x:.2g}, {y:.2g}, "
-            f"{z:.2g} m/s rms along x, y, z. A turntable or motion sideways adds the second, "
-            "heave the third"
-        )
+        return message("not_observable.beam", speeds=np.sqrt(np.mean(v_b**2, axis=0)))
 
 
 @dataclass(frozen=True)

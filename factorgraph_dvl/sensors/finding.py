@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Literal, Self, cast
 
+from factorgraph_dvl.sensors.message import Message, in_language
+
 # A check that was passed; something to know; a reason for caution; one not to use it.
 Severity = Literal["ok", "note", "warning", "error"]
 
@@ -665,8 +667,8 @@ class Finding:
     ----------
     code : Code
         What it is.
-    text : str
-        What happened, in this case.
+    message : Message or str
+        What happened, in this case; a plain text is one from a file of another version.
     sensor : str, optional
         Label of the sensor, or of the kind of its measurements; empty if it is about none.
     parameter : str, optional
@@ -677,13 +679,18 @@ class Finding:
     """
 
     code: Code
-    text: str
+    message: Message | str
     sensor: str = ""
     parameter: str = ""
     severity: Severity = _OF_THE_CODE
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "severity", self.severity or self.code.severity)
+
+    @property
+    def text(self) -> str:
+        """What happened, in English."""
+        return in_language(self.message, "en")
 
     @property
     def unusable(self) -> bool:

@@ -16,6 +16,7 @@ from factorgraph_dvl.geometry.units import DEG, GEODETIC_SI
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.sensors.carried_point import PointPosition, PointVelocity
 from factorgraph_dvl.sensors.clock import Clock, ClockSection
+from factorgraph_dvl.sensors.message import Message, message
 from factorgraph_dvl.sensors.parameters import Parameter, ParameterSpec
 from factorgraph_dvl.sensors.protocol import (
     USUAL_CORRELATION_TIME,
@@ -283,11 +284,8 @@ class Gnss:
             )
         return tuple(out)
 
-    def explain(self, parameter: str, component: int, motion: Motion | None) -> str:
+    def explain(self, parameter: str, component: int, motion: Motion | None) -> Message:
         """Say why a component of the lever arm or the clock could not be observed."""
         if parameter in _CLOCK.names:
-            return "a time offset is observable only where velocity or attitude change"
-        return (
-            "the antenna's lever arm is observable only where the vehicle turns, rolls or "
-            "pitches about other axes than that of the lever arm"
-        )
+            return message("not_observable.clock")
+        return message("not_observable.antenna")

@@ -22,6 +22,7 @@ from factorgraph_dvl.sensors.attitude import (
 )
 from factorgraph_dvl.sensors.carried_point import PointPosition, PointVelocity
 from factorgraph_dvl.sensors.clock import Clock, ClockSection
+from factorgraph_dvl.sensors.message import Message, message
 from factorgraph_dvl.sensors.parameters import Parameter, ParameterSpec
 from factorgraph_dvl.sensors.protocol import (
     Motion,
@@ -237,6 +238,6 @@ class Ins:
             ),
         )
 
-    def explain(self, parameter: str, component: int, motion: Motion | None) -> str:
+    def explain(self, parameter: str, component: int, motion: Motion | None) -> Message:
         """Say why the clock could not be observed."""
-        return "a time offset is observable only where velocity or attitude change"
+        return message("not_observable.clock")

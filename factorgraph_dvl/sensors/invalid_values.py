@@ -14,6 +14,7 @@ from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.sensors.gnss import POSITION_COLUMNS, VELOCITY_COLUMNS, Gnss
 from factorgraph_dvl.sensors.imu import COLUMNS as IMU_COLUMNS
 from factorgraph_dvl.sensors.imu import Imu
+from factorgraph_dvl.sensors.message import Message, message
 
 # No velocity, in m/s, and in mm/s that were not converted: TRDI, Rowe, and others.
 _SENTINELS = (-32.768, -32768.0, 88.888, 88888.0, 99.99, -99.99, 99.999, -99.999)
@@ -67,12 +68,13 @@ def without_invalid_values(
         zero = np.all(np.stack([out[name] for name in IMU_COLUMNS[1:]]) == 0.0, axis=0)
         if 0 < zero.sum() < 0.5 * zero.size:
             out = {name: values[~zero] for name, values in out.items()}
-            findings.append(_finding("IMU", source, [f"{zero.sum()} samples of zeros"]))
+            text = message("invalid_values.zero_samples", count=zero.sum())
+            findings.append(_finding("IMU", source, [text]))
         channels = np.stack([out[name] for name in IMU_COLUMNS[1:]], axis=1)
         frozen = frozen_samples(channels[:, :3]) | frozen_samples(channels[:, 3:])
         if frozen.any():
             out = {name: values[~frozen] for name, values in out.items()}
-            text = f"{frozen.sum()} samples that repeat the one before"
+            text = message("invalid_values.repeated_samples", count=frozen.sum())
             findings.append(_finding("IMU", source, [text]))
     return out, findings
 
@@ -119,20 +121,21 @@ def _blank(
     for sentinel in _SENTINELS:
         marked = np.abs(values - sentinel) < _RELATIVE * abs(sentinel)
         if marked.any():
-            words.append(f"{int(marked.any(axis=1).sum())} of {sentinel:g}")
+            count = int(marked.any(axis=1).sum())
+            words.append(message("invalid_values.sentinel", count=count, sentinel=sentinel))
         none |= marked
     if not single:
         none[none.any(axis=1)] = True
     kept = np.where(none, np.nan, values)
     zero = _zero_fills(kept)
     if zero.any():
-        words.append(f"{int(zero.sum())} of zeros amid motion")
+        words.append(message("invalid_values.zeros", count=int(zero.sum())))
         none[zero] = True
     kept = np.where(none, np.nan, values)
     moving = np.sqrt(np.nansum(kept**2, axis=1)) > _MOVING_M_S
     frozen = _frozen(kept, _LEAST_STEP["m_s"], moving)
     if frozen.any():
-        words.append(f"{int(frozen.sum())} that repeat the one before")
+        words.append(message("invalid_values.repeated", count=int(frozen.sum())))
         none[frozen] = True
     if words:
         kept = np.where(none, np.nan, values)
@@ -154,8 +157,11 @@ def _blank_fixes(columns: dict[str, Array], source: str, findings: list[Finding]
     fixes = np.where(zero[:, None], np.nan, values * _FIX_DEG)
     # Receivers at rest hold their fix.
     frozen = _frozen(fixes, _LEAST_STEP["deg"], np.zeros(zero.size, dtype=bool))
-    words = [f"{int(zero.sum())} fixes at 0, 0"] if zero.any() else []
-    words += [f"{int(frozen.sum())} fixes that repeat the one before"] if frozen.any() else []
+    words = []
+    if zero.any():
+        words.append(message("invalid_values.zero_fixes", count=int(zero.sum())))
+    if frozen.any():
+        words.append(message("invalid_values.repeated_fixes", count=int(frozen.sum())))
     if words:
         kept = np.where((zero | frozen)[:, None], np.nan, values)
         for i, name in enumerate(POSITION_COLUMNS):
@@ -206,9 +212,9 @@ def _frozen(values: Array, least: float, moving: np.ndarray) -> Array:
     return out
 
 
-def _finding(label: str, source: str, words: Sequence[str]) -> Finding:
+def _finding(label: str, source: str, words: Sequence[Message]) -> Finding:
     return Finding(
         Code.INVALID_VALUES,
-        f"{', '.join(words)} in {source} were taken as missing",
+        message("invalid_values.missing", values=words, source=source),
         label,
     )

@@ -13,6 +13,7 @@ from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.rotations import BodyAxes
 from factorgraph_dvl.geometry.vectors import Array, cross_variance
 from factorgraph_dvl.sensors.finding import Finding
+from factorgraph_dvl.sensors.message import Message
 from factorgraph_dvl.sensors.parameters import Parameter, ParameterSpec
 from factorgraph_dvl.settings.sections import Section
 
@@ -292,7 +293,7 @@ class Aid(SensorRecord, Protocol):
             Axes b of the body: a heading, roll or pitch refers to its bow.
         """
 
-    def explain(self, parameter: str, component: int, motion: Motion | None) -> str:
+    def explain(self, parameter: str, component: int, motion: Motion | None) -> Message | str:
         """Say why a component could not be observed, given the motion of the trial."""
 
 

@@ -22,6 +22,7 @@ from factorgraph_dvl.geometry.rotations import BodyAxes, inverse_right_jacobian,
 from factorgraph_dvl.geometry.units import ARCSEC, DEG
 from factorgraph_dvl.geometry.vectors import Array, rotate
 from factorgraph_dvl.sensors.finding import Code, Finding
+from factorgraph_dvl.sensors.message import Message, message
 from factorgraph_dvl.sensors.parameters import Parameter, ParameterSpec
 from factorgraph_dvl.sensors.protocol import (
     TOO_LARGE,
@@ -286,21 +287,16 @@ class Star:
         )
         each = np.bincount(which.ravel(), square) / np.bincount(which.ravel())
         worst = int(np.argmax(each))
-        x, y, z = stars[worst]
         wrong = self.misfit > _WRONG_STARS
-        consequence = (
-            "The stars are not those of the catalogue, so do not use the attitudes"
-            if wrong
-            else "The reported standard deviations are too small until this is corrected"
-        )
         return (
             Finding(
                 Code.STAR_CATALOGUE,
-                f"the angles between stars differ from the catalogue's {self.misfit:.3g} times as "
-                "much as `std_arcsec` allows. The star towards inertial "
-                f"({x:.4f}, {y:.4f}, {z:.4f}) differs most, first in "
-                f"{at_row(self.source, row[worst])}. Is it another star, are columns mixed up, or "
-                f"is aberration left in? {consequence}",
+                message(
+                    "star_catalogue.wrong" if wrong else "star_catalogue.differs",
+                    misfit=self.misfit,
+                    star=stars[worst],
+                    row=at_row(self.source, row[worst]),
+                ),
                 sensor=self.label,
                 severity="error" if wrong else "warning",
             ),
@@ -348,16 +344,12 @@ class Star:
         std = np.sqrt(variance) / ARCSEC
         return (StarAttitude(found.time, found.nRs, axes, std, components),)
 
-    def explain(self, parameter: str, component: int, motion: Motion | None) -> str:
+    def explain(self, parameter: str, component: int, motion: Motion | None) -> Message:
         """Say why a component of the mounting could not be observed."""
         if motion is None or motion.nRb.shape[0] < 2:
-            return "the trial has no star attitude while the IMU runs, or only one"
-        x, y, z = np.degrees(np.std(motion.omega_eb_b, axis=0))
-        return (
-            "mounting and attitude are separable only if the body turns about two axes, or if "
-            "manoeuvres show the attitude without stars; the rms rate is "
-            f"{x:.2g}, {y:.2g}, {z:.2g} deg/s about x, y, z"
-        )
+            return message("not_observable.no_star")
+        rates = np.degrees(np.std(motion.omega_eb_b, axis=0))
+        return message("not_observable.star_mounting", rates=rates)
 
 
 def _check_vectors(time: Array, body: Array, inertial: Array, source: str) -> None:

@@ -10,6 +10,7 @@ import numpy as np
 from factorgraph_dvl.graph.problem import Evaluation, Problem
 from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.sensors.imu import ERRORS
+from factorgraph_dvl.sensors.message import Message, message
 from factorgraph_dvl.sensors.parameters import UNITS, Parameter
 from factorgraph_dvl.solvers.calibration import reported
 from factorgraph_dvl.solvers.fixed_directions import SolvedProblem
@@ -102,11 +103,20 @@ def change_findings(found: SolvedProblem) -> Iterator[Finding]:
     ties.remove(best)
     change = best.change
     unit = UNITS[best.parameter.spec.unit].text
-    others = f", or {', '.join(t.name for t in ties)} does" if ties else ""
-    size = f"{change.size:.2g} ± {change.std:.1g} {unit}".rstrip()
+    others: Message | str = ""
+    if ties:
+        others = message("changed_along_trial.others", names=[t.name for t in ties])
     yield Finding(
         Code.CHANGED_ALONG_TRIAL,
-        f"{best.name} changes by {size} at {change.time:.0f} s{others}: "
-        f"{change.significance:.0f} standard deviations; the result is a mean of before and after",
+        message(
+            "changed_along_trial.changes",
+            name=best.name,
+            size=change.size,
+            std=change.std,
+            unit=f" {unit}" if unit else "",
+            time=change.time,
+            others=others,
+            significance=change.significance,
+        ),
         parameter=best.parameter.name,
     )

@@ -13,6 +13,7 @@ from factorgraph_dvl.graph.problem import Evaluation, Problem
 from factorgraph_dvl.quality.earlier_calibration import prior_against_data
 from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.sensors.imu import ERRORS
+from factorgraph_dvl.sensors.message import Message, message
 from factorgraph_dvl.sensors.parameters import UNITS, Parameter
 from factorgraph_dvl.solvers.change_along_trial import CHANGED, component_changes
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, factorized
@@ -168,11 +169,12 @@ def confirmed(problem: Problem, minimum: Minimum, found: Explanation) -> bool:
     return again.log10_p < _LOG10_P
 
 
-def _chi_square(explanation: Explanation) -> str:
+def _chi_square(explanation: Explanation) -> Message:
     """Return how strong the evidence is, in brackets."""
     score = explanation.score
-    degrees = "1 degree" if score.freedom == 1 else f"{score.freedom} degrees"
-    return f"(χ² {score.chi2:.0f} with {degrees} of freedom)"
+    if score.freedom == 1:
+        return message("words.chi2_of_one", chi2=score.chi2)
+    return message("words.chi2", chi2=score.chi2, freedom=score.freedom)
 
 
 def explanation_findings(
@@ -182,10 +184,15 @@ def explanation_findings(
     out = [
         Finding(
             Code.ESTIMATED_INSTEAD,
-            f"{e.parameter.name} was stated as {_numbers(e.parameter, e.parameter.mean)} "
-            f"{_uncertainty(e.parameter)}; the data contradict this {_chi_square(e)}. It was "
-            "estimated instead: "
-            f"{_numbers(e.parameter, evaluation.parameters[e.parameter.name])}{_or(e)}",
+            message(
+                "estimated_instead.stated",
+                name=e.parameter.name,
+                stated=_numbers(e.parameter, e.parameter.mean),
+                std=_uncertainty(e.parameter),
+                chi2=_chi_square(e),
+                value=_numbers(e.parameter, evaluation.parameters[e.parameter.name]),
+                others=_or(e),
+            ),
             parameter=e.parameter.name,
         )
         for e in freed
@@ -195,27 +202,38 @@ def explanation_findings(
         out.append(
             Finding(
                 Code.UNEXPLAINED_MISFIT,
-                f"{left.parameter.name} would have to be {_numbers(left.parameter, value)} "
-                f"instead of {_numbers(left.parameter, left.parameter.mean)} "
-                f"{_chi_square(left)}{_or(left)}",
+                message(
+                    "unexplained_misfit.would_have_to_be",
+                    name=left.parameter.name,
+                    value=_numbers(left.parameter, value),
+                    stated=_numbers(left.parameter, left.parameter.mean),
+                    chi2=_chi_square(left),
+                    others=_or(left),
+                ),
                 parameter=left.parameter.name,
             )
         )
     return tuple(out)
 
 
-def _uncertainty(p: Parameter) -> str:
-    return f"± {_numbers(p, p.sigma)}" if p.estimated else "without uncertainty"
+def _uncertainty(p: Parameter) -> Message:
+    if not p.estimated:
+        return message("estimated_instead.certain")
+    return message("words.plus_minus", value=_numbers(p, p.sigma))
 
 
-def _or(found: Explanation) -> str:
-    return f"; {', '.join(found.others)} would explain it about as well" if found.others else ""
+def _or(found: Explanation) -> Message | str:
+    if not found.others:
+        return ""
+    return message("unexplained_misfit.others", names=found.others)
 
 
-def _numbers(p: Parameter, value: Array) -> str:
+def _numbers(p: Parameter, value: Array) -> Message:
     """Return a value in the unit of files."""
-    numbers = ", ".join(f"{v:.3g}" for v in value / p.si)
-    return f"{numbers} {UNITS[p.spec.unit].text}".rstrip()
+    unit = UNITS[p.spec.unit].text
+    if not unit:
+        return message("words.numbers", values=value / p.si)
+    return message("words.numbers_with_unit", values=value / p.si, unit=unit)
 
 
 def _wide(p: Parameter, mean: Array) -> Parameter:

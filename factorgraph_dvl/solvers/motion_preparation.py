@@ -22,6 +22,7 @@ from factorgraph_dvl.initialization.track_velocity import Track, body_track
 from factorgraph_dvl.sensors.attitude import Attitude
 from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.sensors.ins import Ins
+from factorgraph_dvl.sensors.message import message
 from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.sensors.protocol import Motion, Observation
 from factorgraph_dvl.trial import Trial
@@ -344,5 +345,5 @@ def _notes(trial: Trial) -> tuple[Finding, ...]:
     """Return what is left out, for the user."""
     if trial.find(Ins) is None or trial.find(Attitude) is None:
         return ()
-    text = "its attitude is not used: the section `attitude` says how the body points"
+    text = message("unused.ins_attitude")
     return (Finding(Code.UNUSED, text, sensor="INS"),)

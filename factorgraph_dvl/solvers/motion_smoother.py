@@ -22,6 +22,7 @@ from factorgraph_dvl.graph.motion_problem import (
 )
 from factorgraph_dvl.graph.priors import after_step, local_coordinates
 from factorgraph_dvl.sensors.finding import Code, Finding
+from factorgraph_dvl.sensors.message import message
 from factorgraph_dvl.solution import Progress
 from factorgraph_dvl.solvers.motion_preparation import MotionPreparation
 from factorgraph_dvl.statistics.robust_weights import robust_scale
@@ -60,6 +61,7 @@ _TOO_MANY = 0.4
 # those that the first hid, and the last ones judge them by the noise that was found.
 _FIRST_SEARCHES = 2
 _SEARCHES = 5
+_CURRENT = message("not_converged.current")
 # Rounds from one search for the strength of the current to the next, while all else changes.
 _CURRENT_ROUNDS = 5
 # Reach of the first and the later searches by the logarithm of the strength, and their precision.
@@ -120,7 +122,8 @@ def smooth_motion(prepared: MotionPreparation, report: Progress) -> SmoothedMoti
         for o in problem.observations
         if o.label in prepared.estimated_noise
     }
-    iterations, searches, free_current, changing = 0, 0, prepared.current_is_free, ["all"]
+    iterations, searches, free_current = 0, 0, prepared.current_is_free
+    changing = [message("not_converged.all")]
     last_moved, reach = np.zeros_like(problem.chain.density), _FAR
     earlier = [values]
     last_noise = {label: np.zeros_like(f) for label, f in problem.noise_factors.items()}
@@ -133,11 +136,11 @@ def smooth_motion(prepared: MotionPreparation, report: Progress) -> SmoothedMoti
         covariances = factors.covariances()
         changing = []
         if not reached and _moved(problem, factors, values, earlier[-2:][0]) > _STILL:
-            changing.append("the minimum")
+            changing.append(message("not_converged.minimum"))
         earlier.append(values)
         if searches < _FIRST_SEARCHES and _rejects_others(problem, evaluation, covariances):
             searches += 1
-            changing.append("which measurements are outliers")
+            changing.append(message("not_converged.outliers"))
             continue
         noise_moved = {
             label: np.log(found / problem.noise_factors[label])
@@ -151,12 +154,12 @@ def smooth_motion(prepared: MotionPreparation, report: Progress) -> SmoothedMoti
         last_noise = noise_moved
         density = _density(problem, prepared.turning, states, covariances)
         if _differ(noise, problem.noise_factors):
-            changing.append("the noise of the sensors")
+            changing.append(message("not_converged.noise"))
         chain = problem.chain
         moved = np.log(density / chain.density)
         relevant = density > _NEGLIGIBLE * density.max(axis=0)
         if np.max(np.abs(moved) * relevant) > 2.0 * _SAME:
-            changing.append("the acceleration of the vessel")
+            changing.append(message("not_converged.acceleration"))
         density = chain.density * np.exp(_hastened(moved, last_moved))
         last_moved = moved
         # A search takes twenty factorisations: not in every round.
@@ -169,8 +172,8 @@ def smooth_motion(prepared: MotionPreparation, report: Progress) -> SmoothedMoti
             states = states.copy()
             states[:, chain.place(CURRENT)] *= old.sigma / new.sigma
             if abs(np.log(new.sigma[0] / old.sigma[0])) > 3.0 * _SAME:
-                changing.append("the current")
-            free_current = len(changing) > 1 or "the current" in changing
+                changing.append(_CURRENT)
+            free_current = len(changing) > 1 or _CURRENT in changing
         if (
             not changing
             and searches < _SEARCHES
@@ -178,7 +181,7 @@ def smooth_motion(prepared: MotionPreparation, report: Progress) -> SmoothedMoti
         ):
             # What seemed far off while noise and strengths were not known may be none.
             searches += 1
-            changing.append("which measurements are outliers")
+            changing.append(message("not_converged.outliers"))
             if round_ < _ROUNDS - 1:
                 continue
         if not changing or round_ == _ROUNDS - 1:
@@ -187,7 +190,7 @@ def smooth_motion(prepared: MotionPreparation, report: Progress) -> SmoothedMoti
         problem.noise_factors = noise
     findings = prepared.findings
     if changing:
-        text = f"after {_ROUNDS} rounds {', '.join(changing)} still changed: do not use the result"
+        text = message("not_converged.rounds", rounds=_ROUNDS, changing=changing)
         findings += (Finding(Code.NOT_CONVERGED, text, severity="error"),)
     return SmoothedMotion(
         problem, evaluation, factors, covariances, not changing, iterations, findings

@@ -13,6 +13,7 @@ from factorgraph_dvl.geometry.vectors import Array, rotate
 from factorgraph_dvl.graph.motion_problem import ATTITUDE, CURRENT, MotionProblem
 from factorgraph_dvl.sensors.attitude import HEADING_OFFSET, heading_error
 from factorgraph_dvl.sensors.finding import Code, Finding
+from factorgraph_dvl.sensors.message import Message, message
 from factorgraph_dvl.sensors.parameters import UNITS, Parameter
 from factorgraph_dvl.sensors.protocol import Motion
 from factorgraph_dvl.solution import (
@@ -64,7 +65,7 @@ def summarise_motion(trial: Trial, found: SmoothedMotion, *, rate_hz: float) -> 
     for o, seen in zip(problem.observations, evaluation.seen, strict=True):
         left_out = int((~seen.covered).sum())
         if left_out:
-            text = f"{left_out} measurements at times without attitude or position were not used"
+            text = message("unused.without_motion", count=left_out)
             findings.append(Finding(Code.UNUSED, text, sensor=o.label))
     findings += consistency_findings(estimates, residuals, noise)
     findings += outlier_findings(residuals, rejected)
@@ -243,7 +244,7 @@ def _unobservable(
     nuisances = {p.name for p in found.problem.parameters if p.spec.nuisance}
     out: list[Finding] = []
 
-    def why(name: str, component: int) -> str:
+    def why(name: str, component: int) -> Message | str:
         return by_name[name].explain(name, component, seen.get(name))
 
     for e in estimates:
@@ -291,10 +292,12 @@ def _heading_and_misalignment(trial: Trial, found: SmoothedMotion) -> list[Findi
         np.sqrt(np.vdot(by_states, through) + rest @ found.covariances.constants @ rest)
     )
     angle = -float(down @ in_unit(_parameter(problem, name), values[name]).value)
-    text = (
-        f"about the vertical {angle:.3f} ± {alone / DEG:.2g} deg, including the stated heading "
-        f"error. Relative to the mean heading of the compass, it is {angle - mean / DEG:.3f} ± "
-        f"{together / DEG:.2g} deg, which the data alone determine"
+    text = message(
+        "heading_error.about_the_vertical",
+        angle=angle,
+        std=alone / DEG,
+        relative=angle - mean / DEG,
+        relative_std=together / DEG,
     )
     return [Finding(Code.HEADING_ERROR, text, parameter=name)]
 

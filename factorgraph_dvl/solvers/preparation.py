@@ -20,6 +20,7 @@ from factorgraph_dvl.initialization.in_motion_alignment import initial_states
 from factorgraph_dvl.initialization.mountings import mounted_aids, mountings_from_motion
 from factorgraph_dvl.ranging.position_from_ranges import StartPositions, positions_from_ranges
 from factorgraph_dvl.sensors.finding import Code, Finding
+from factorgraph_dvl.sensors.message import message
 from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.sensors.protocol import Observation
 from factorgraph_dvl.solution import Progress
@@ -153,8 +154,7 @@ def _left_out(trial: Trial) -> list[Finding]:
     return [
         Finding(
             Code.ERROR_LEFT_OUT,
-            f"{aid.section}.{key} is not estimated: the value is a mean over the trial, and its "
-            "standard deviation does not contain the change",
+            message("error_left_out.change", section=aid.section, name=key),
             sensor=aid.label,
         )
         for aid in trial.aids

@@ -18,6 +18,7 @@ from factorgraph_dvl.graph.problem import Evaluation, Problem
 from factorgraph_dvl.graph.processes import Process
 from factorgraph_dvl.imu.propagation import States
 from factorgraph_dvl.sensors.finding import Code, Finding
+from factorgraph_dvl.sensors.message import Message, message
 from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.solution import Progress
 from factorgraph_dvl.solvers.correlated_noise import (
@@ -52,11 +53,11 @@ _FRUITLESS = 300
 # Rounds after which noise counts as not settled. Measured: a factor of five takes two.
 _NOISE_ROUNDS = 4
 # What of a problem changes without a new one.
-_NOISE = "the noise of the sensors"
-_OUTLIERS = "which measurements are outliers"
-_TIMES = "the times of measurements"
-_CORRELATED = "which noise is correlated"
-_KNOWN = "which parameters are known"
+_NOISE = message("not_converged.noise")
+_OUTLIERS = message("not_converged.outliers")
+_TIMES = message("not_converged.times")
+_CORRELATED = message("not_converged.correlated")
+_KNOWN = message("not_converged.known")
 # Parameters that are estimated although they were stated as known. Chosen: a third is a sign that
 # the model is wrong.
 _MOST_FREED = 2
@@ -155,7 +156,7 @@ def settle(
     long_run: Mapping[str, Array] = {}
     first_levels = _NoiseLevels((as_stated,), bool(as_stated))
     levels = first_levels
-    changing: list[str] = ["all"]
+    changing = [message("not_converged.all")]
     count = in_a_row = fruitless = 0
     movement = np.inf
     bound = values
@@ -194,7 +195,7 @@ def settle(
         states, values = minimum.evaluation.states, minimum.evaluation.parameters
         changing = _changing(problem, minimum.evaluation)
         if np.sqrt(np.mean((states.p_n - p_gravity) ** 2)) > _SAME_GRAVITY:
-            changing.insert(0, "gravity along the track")
+            changing.insert(0, message("not_converged.gravity"))
             chain = prepared.chain(states)
             p_gravity = states.p_n
         if not cycle:
@@ -205,7 +206,7 @@ def settle(
         if cycle:
             outliers = min(cycle, key=_count)
         if not _same(outliers, rejected):
-            changing.append("which measurements are echoes")
+            changing.append(message("not_converged.echoes"))
         if not changing and searches < _SEARCHES:
             if robust and searches == 0:
                 # Gross errors of the start are searched anew, among all.
@@ -262,7 +263,7 @@ def settle(
         *explanation_findings(freed, left, minimum.evaluation),
     )
     if changing:
-        text = f"after {count} rounds {', '.join(changing)} still changed: do not use the result"
+        text = message("not_converged.rounds", rounds=count, changing=changing)
         findings += (Finding(Code.NOT_CONVERGED, text, severity="error"),)
     if minimum.square_root is None:
         minimum = replace(minimum, square_root=factorized(problem, minimum.evaluation)[0])
@@ -315,8 +316,7 @@ def _next_noise(levels: _NoiseLevels, problem: Problem, minimum: Minimum) -> _No
     findings = tuple(
         Finding(
             Code.NOISE_NOT_SETTLED,
-            f"the estimated noise is {np.max(latest[label]):.2g} times the stated one, and keeps "
-            "growing, so it is not noise. The stated noise is used",
+            message("noise_not_settled.growing", ratio=np.max(latest[label])),
             sensor=label,
         )
         for label in unsettled
@@ -337,11 +337,11 @@ def _counts(problem: Problem, found: VarianceComponents, process: Process) -> bo
     return bool(np.abs(long_run_share(problem, process) * change).max() > _SAME_INNOVATIONS)
 
 
-def _changing(problem: Problem, evaluation: Evaluation) -> list[str]:
+def _changing(problem: Problem, evaluation: Evaluation) -> list[Message]:
     """Return what of the measurements would differ in a problem that starts here."""
     found = {
         _TIMES: problem.needs_rebinding(evaluation.parameters),
-        "the weights of measurements": problem.needs_reweighting(evaluation),
+        message("not_converged.weights"): problem.needs_reweighting(evaluation),
     }
     return [name for name, changed in found.items() if changed]
 
@@ -401,7 +401,7 @@ def _at_the_gate(cycle: Sequence[Mapping[str, Array]]) -> tuple[Finding, ...]:
             out.append(
                 Finding(
                     Code.AT_THE_GATE,
-                    f"{undecided} measurements at the gate could be echoes or not; they are used",
+                    message("at_the_gate.undecided", count=undecided),
                     sensor=label,
                 )
             )

@@ -11,6 +11,7 @@ import numpy as np
 from factorgraph_dvl.graph.problem import Evaluation, Problem
 from factorgraph_dvl.quality.earlier_calibration import prior_findings
 from factorgraph_dvl.sensors.finding import Code, Finding
+from factorgraph_dvl.sensors.message import Message, message
 from factorgraph_dvl.sensors.protocol import Motion
 from factorgraph_dvl.solution import (
     Estimate,
@@ -60,14 +61,11 @@ def summarise(trial: Trial, found: SolvedProblem, *, rate_hz: float) -> Solution
     rejected = _rejected(problem, minimum)
     findings = [*found.findings]
     if not minimum.converged:
-        text = f"the solver did not converge in {minimum.iterations} iterations"
-        findings.append(
-            Finding(Code.NOT_CONVERGED, f"{text}: do not use the result", severity="error")
-        )
+        text = message("not_converged.do_not_use", iterations=minimum.iterations)
+        findings.append(Finding(Code.NOT_CONVERGED, text, severity="error"))
     for label, count in problem.uncovered.items():
-        measurements = "1 measurement" if count == 1 else f"{count} measurements"
-        were = "was" if count == 1 else "were"
-        text = f"{measurements} at times without IMU data {were} not used"
+        text = message("unused.one_without_imu" if count == 1 else "unused.without_imu",
+                       count=count)  # fmt: skip
         findings.append(Finding(Code.UNUSED, text, sensor=label))
     noise = noise_of(problem)
     findings += consistency_findings(estimates, residuals, noise)
@@ -183,19 +181,18 @@ def _unobservable(
             for n in np.array(e.component_names)[~e.observable]]  # fmt: skip
     if kept:
         source = next(iter(calibrated.values())).source
-        text = f"{', '.join(kept)}: as in {source}; this trial adds little or nothing to that"
+        text = message("prior_kept.little", names=kept, source=source)
         out.append(Finding(Code.PRIOR_KEPT, text, sensor="DVL"))
 
-    def why(name: str, component: int) -> str:
+    def why(name: str, component: int) -> Message | str:
         if name in by_name:
-            missing = "; the trial has no GNSS" if trial.gnss is None else ""
-            return by_name[name].explain(name, component, seen.get(name)) + missing
+            reason = by_name[name].explain(name, component, seen.get(name))
+            if trial.gnss is None:
+                return message("not_observable.and_no_gnss", reason=reason)
+            return reason
         if trial.gnss is None:
-            return "without GNSS nothing separates the errors of the IMU from the motion"
-        return (
-            f"it could not be determined from this {duration:.0f} s run: record longer, or add "
-            "turns and speed changes"
-        )
+            return message("not_observable.imu_without_gnss")
+        return message("not_observable.short_run", duration=duration)
 
     nuisances = {p.name for p in problem.parameters if p.spec.nuisance}
     for e in estimates:

@@ -12,6 +12,7 @@ import pytest
 from builders import build_solution, write_trial
 from running import Run
 
+from factorgraph_dvl.cli.commands import COMMANDS
 from factorgraph_dvl.cli.events import Event
 from factorgraph_dvl.io.solution_folder import save_solution
 
@@ -72,12 +73,45 @@ def test_an_error_is_an_event_and_keeps_its_exit_code(tmp_path: Path, run: Run) 
     assert result.code == 2
     assert failed["event"] == "error"
     assert "none" in failed["text"]
+    assert (failed["kind"], failed["expected"]) == ("input", "a trial folder")
     assert end == {"event": "end", "exit_code": 2}
 
 
-def test_wrong_usage_ends_with_its_exit_code(run: Run) -> None:
-    result = run("solve", "--json", "--no-such-option")
-    assert lines(result.out) == [{"event": "end", "exit_code": 2}]
+@pytest.mark.parametrize("name", COMMANDS)
+def test_wrong_usage_is_an_error_of_its_kind(run: Run, name: str) -> None:
+    result = run(name, "--json", "--no-such-option")
+    failed, end = lines(result.out)
+    assert failed["event"] == "error"
+    assert failed["kind"] == "usage"
+    assert "--no-such-option" in failed["text"]
+    assert end == {"event": "end", "exit_code": 2}
+    assert result.code == 2
+    assert result.err == ""
+
+
+@pytest.mark.parametrize("args", [(), ("no-such-command",), ("solve",)])
+def test_a_command_line_that_lacks_something_is_wrong_usage(
+    run: Run, args: tuple[str, ...]
+) -> None:
+    failed, end = lines(run(*args, "--json").out)
+    assert (failed["kind"], end["exit_code"]) == ("usage", 2)
+    assert failed["text"]
+
+
+def test_help_and_version_are_texts(run: Run) -> None:
+    for args in (("--version",), ("solve", "--help")):
+        text, end = lines(run(*args, "--json").out)
+        assert text["event"] == "text"
+        assert text["text"]
+        assert end["exit_code"] == 0
+
+
+def test_the_terms_of_instruments_are_a_result(tmp_path: Path, run: Run) -> None:
+    save_solution(build_solution(), tmp_path / "s")
+    found, end = lines(run("instrument", tmp_path / "s", "--json").out)
+    assert found["event"] == "result"
+    assert set(found["content"]["trdi"]) == {"EA", "EI", "EJ"}
+    assert end["exit_code"] == 0
 
 
 def test_the_next_command_prints_text_again(tmp_path: Path, run: Run) -> None:

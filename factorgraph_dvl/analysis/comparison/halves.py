@@ -14,6 +14,7 @@ from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.quality.earlier_calibration import CONTRADICTED_P, DOUBTFUL_P
 from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.sensors.imu import Imu
+from factorgraph_dvl.sensors.message import message
 from factorgraph_dvl.sensors.parameters import JointPrior
 from factorgraph_dvl.sensors.records import rows_of
 from factorgraph_dvl.solution import Solution
@@ -81,10 +82,14 @@ class Halves:
         if p >= DOUBTFUL_P:
             return ()
         i = int(np.argmax(np.abs(self.difference) / np.where(self.std > 0.0, self.std, np.inf)))
-        text = (
-            f"the halves of the trial contradict each other (χ² {self.statistic:.0f} with "
-            f"{self.freedom} degrees of freedom, by chance {p:.0e}). The largest change is "
-            f"{self.names[i]}, by {self.difference[i]:.2g} ± {self.std[i]:.1g}"
+        text = message(
+            "halves_differ.contradict",
+            statistic=self.statistic,
+            freedom=self.freedom,
+            probability=p,
+            name=self.names[i],
+            change=self.difference[i],
+            std=self.std[i],
         )
         return (
             Finding(

@@ -11,6 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure, SubFigure
 from matplotlib.gridspec import GridSpec
+from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 from numpy.typing import NDArray
 
 from factorgraph_dvl.analysis.error_statistics import TrajectoryErrors, VectorErrors
@@ -34,6 +35,10 @@ SMALL = 7.5
 NORMAL = 8.5
 TITLE = 10.5
 _DPI = 120
+# From an axis to its label, inches: numbers such as −0.00025 fit between them.
+_LABEL_AT = 0.66
+# Chosen: an axis of fewer decades has ticks at 2 and 5 too.
+_FEW_DECADES = 1.9
 # Reasons that stand on a figure. Chosen: more would reach the titles.
 _MOST_CODES = 3
 # Stretches whose extremes a line is drawn by. Chosen: more than a panel has pixels.
@@ -130,11 +135,11 @@ def new_grid(
     rows: int,
     columns: int,
     *,
-    left: float = 0.75,
+    left: float = 0.82,
     right: float = 0.12,
     bottom: float = 0.48,
     top: float = 0.45,
-    gap: tuple[float, float] = (0.16, 0.85),
+    gap: tuple[float, float] = (0.16, 0.92),
     width_ratios: Sequence[float] | None = None,
 ) -> GridSpec:
     """Return a grid with margins and gaps (vertical, horizontal) in inches.
@@ -179,7 +184,29 @@ def style(ax: Axes, xlabel: str, ylabel: str) -> None:
     if ylabel:
         ax.set_ylabel(ylabel, fontsize=NORMAL)
         width = ax.get_position().width * ax.figure.get_figure(root=True).get_size_inches()[0]
-        ax.yaxis.set_label_coords(-0.58 / width, 0.5)
+        ax.yaxis.set_label_coords(-_LABEL_AT / width, 0.5)
+
+
+def log_axis(ax: Axes, which: str, low: float, high: float) -> None:
+    """Make an axis logarithmic, with few ticks: those of every decade take long to lay out.
+
+    Parameters
+    ----------
+    ax : Axes
+        Axes.
+    which : {'x', 'y'}
+        Axis.
+    low, high : float
+        Least and largest value to show.
+    """
+    ax.set(**{f"{which}scale": "log"})
+    axis = ax.yaxis if which == "y" else ax.xaxis
+    few = np.log10(high / low) < _FEW_DECADES
+    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if few else (1.0,), numticks=8))
+    if few:
+        axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:.6g}"))
+    axis.set_minor_locator(NullLocator())
+    ax.set(**{f"{which}lim": (0.6 * low, 2.2 * high)})
 
 
 def error_title(

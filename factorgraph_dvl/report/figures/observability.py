@@ -11,7 +11,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
-from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
 from factorgraph_dvl.analysis.information.linearization import PointSet
 from factorgraph_dvl.analysis.information.manoeuvres import Segment
@@ -35,6 +34,7 @@ from factorgraph_dvl.report.figures.drawing import (
     TITLE,
     Canvas,
     clock,
+    log_axis,
     new_figure,
     new_grid,
     save_figures,
@@ -119,7 +119,7 @@ def singular_value_figure(point_set: PointSet) -> Figure:
         ax = figure.add_subplot(grid[i, 0])
         for x, stack in enumerate(stacks):
             _draw_stack(ax, x, stack, colours, named=count <= _MOST_NAMED)
-        _log_axis(ax, "y", max(_FLOOR, min(lowest, 1.0)), 2.5 * max(highest, 10.0))
+        log_axis(ax, "y", max(_FLOOR, min(lowest, 1.0)), 2.5 * max(highest, 10.0))
         ax.axhline(OBSERVABLE, color=GREY, lw=0.9)
         ax.set_xlim(-0.4, count - 0.25 if count <= _MOST_NAMED else count - 0.6)
         style(ax, "", "singular value")
@@ -196,7 +196,7 @@ def history_figure(history: InformationHistory, segments: Sequence[Segment]) -> 
             own = readable(history.names[i])[0].removeprefix(stem).strip() or "σ"
             colour, dashes = _line(own, at)
             ax.plot(history.time - start, std[:, i], color=colour, ls=dashes, lw=1.3, label=own)
-        _log_axis(ax, "y", float(std[:, members].min()), float(std[:, members].max()))
+        log_axis(ax, "y", float(std[:, members].min()), float(std[:, members].max()))
         _, unit = readable(history.names[members[0]])
         last_row = k // columns == rows - 1 or k + columns >= len(groups)
         style(ax, label if last_row else "", "")
@@ -216,18 +216,6 @@ def _line(component: str, place: int) -> tuple[str, str]:
         return _LINES[place % len(_LINES)]
     beam = int(component.rstrip("xy")) - 1
     return _BEAM_COLOURS[beam % len(_BEAM_COLOURS)], "--" if component.endswith("y") else "-"
-
-
-def _log_axis(ax: Axes, which: str, low: float, high: float) -> None:
-    """Make an axis logarithmic, with few ticks: those of every decade take long to lay out."""
-    ax.set(**{f"{which}scale": "log"})
-    axis = ax.yaxis if which == "y" else ax.xaxis
-    few = np.log10(high / low) < 1.5
-    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if few else (1.0,), numticks=8))
-    if few:
-        axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:.6g}"))
-    axis.set_minor_locator(NullLocator())
-    ax.set(**{f"{which}lim": (0.6 * low, 2.2 * high)})
 
 
 def _shade(ax: Axes, segments: Sequence[Segment], start: float) -> None:
@@ -261,8 +249,17 @@ def direction_figure(marginals: Marginals) -> Figure:
     colour = [GREY if r >= OPEN else ACCENT for r in ratio]
     ax.barh(y, ratio - floor, left=floor, color=colour, height=0.62)
     for k, r in enumerate(ratio):
-        ax.text(r * 1.12, k, f"{min(r, 1.0):.2g}", va="center", fontsize=SMALL, color=DARK)
-    _log_axis(ax, "x", floor, 1.3)
+        ax.text(
+            r * 1.12,
+            k,
+            f"{min(r, 1.0):.2g}",
+            va="center",
+            fontsize=SMALL,
+            color=DARK,
+            # Above the line of a halved σ.
+            bbox={"facecolor": "white", "edgecolor": "none", "pad": 0.8},
+        )
+    log_axis(ax, "x", floor, 1.3)
     ax.set_xlim(left=floor)
     ax.axvline(OPEN, color=GREY, lw=0.9)
     labels = [_combination(d.names, d.vector, marginals.names) for d in directions]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 from matplotlib.figure import Figure
-from matplotlib.ticker import LogFormatter
 
 from factorgraph_dvl.analysis.static_noise import StaticNoise
 from factorgraph_dvl.geometry.units import DEG_PER_HOUR, MICRO_G
@@ -13,8 +12,8 @@ from factorgraph_dvl.report.figures.drawing import (
     DARK,
     GREY,
     NORMAL,
-    SMALL,
     TITLE,
+    log_axis,
     new_figure,
     new_grid,
     style,
@@ -41,11 +40,8 @@ def allan_figure(noise: StaticNoise) -> Figure:
             fine = np.geomspace(axis.tau[0], axis.tau[-1], 200)
             ax.plot(fine, axis.model(fine) / si, color=colour, lw=1.0, label=label)
         ax.set_xscale("log")
-        ax.set_yscale("log")
-        # A span of less than two decades has labels between the powers of ten.
-        for axis_format in (ax.yaxis.set_major_formatter, ax.yaxis.set_minor_formatter):
-            axis_format(LogFormatter(labelOnlyBase=False, minor_thresholds=(2.0, 0.5)))
-        ax.tick_params(which="minor", labelsize=SMALL)
+        shown = np.concatenate([[*(a.deviation - a.std), *(a.deviation + a.std)] for a in axes])
+        log_axis(ax, "y", float(shown[shown > 0.0].min()) / si, float(shown.max()) / si)
         style(ax, "averaging time, s", f"Allan deviation, {unit}")
         ax.set_title(title, fontsize=TITLE, loc="left")
         ax.legend(fontsize=NORMAL, frameon=False)

@@ -8,6 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import SubFigure
 from matplotlib.gridspec import SubplotSpec
+from matplotlib.patheffects import withStroke
 from matplotlib.ticker import MaxNLocator
 
 from factorgraph_dvl.analysis.error_statistics import TrajectoryErrors
@@ -43,6 +44,10 @@ from factorgraph_dvl.trial import PlanarTrial, Reference, Trial
 _TIME_MARKS = 6
 # Part of the duration in which the track is near a mark. Chosen: a tight circle takes longer.
 _BESIDE = 0.1
+# Chosen: share of a track's size that a label of such a mark takes, and how far, as a sine, its
+# side may be off an axis for the label to be centred.
+_MARKS_APART = 0.06
+_STEEP = 0.4
 _CLOSE_UP_S = 10.0
 # A line is about so thick beside its panel.
 _SEEN = 0.005
@@ -126,23 +131,43 @@ def mark_times(ax: Axes, time: Array, track: Array) -> None:
         In the units of the axes; east and north first.
     """
     duration = float(time[-1] - time[0])
+    box = ax.dataLim
+    size = max(box.width, box.height, float(np.ptp(track[:, :2], axis=0).max()))
+    shown = [track[0, :2]]
     for mark in MaxNLocator(nbins=_TIME_MARKS, steps=[1, 2, 5, 10]).tick_values(0.0, duration):
-        if 0.0 < mark < duration:
-            k = int(np.searchsorted(time, time[0] + mark))
-            near = np.abs(time - time[k]) < _BESIDE * duration
-            x, y = track[k, :2].tolist()
-            # On the side on which the track is not.
-            side = 1.0 if x >= track[near, 0].mean() else -1.0
-            ax.plot(x, y, "o", color=ACCENT, markerfacecolor="white", markersize=4)
-            ax.annotate(
-                f"{mark:g} s",
-                (x, y),
-                xytext=(6.0 * side, 4.0),
-                textcoords="offset points",
-                ha="left" if side > 0.0 else "right",
-                fontsize=SMALL,
-                color=DARK,
-            )
+        if not 0.0 < mark < duration:
+            continue
+        k = int(np.searchsorted(time, time[0] + mark))
+        place = track[k, :2]
+        # Labels of marks that are closer would cover each other.
+        if min(float(np.linalg.norm(place - other)) for other in shown) < _MARKS_APART * size:
+            continue
+        shown.append(place)
+        near = np.abs(time - time[k]) < _BESIDE * duration
+        dx, dy = _beside(place, track[near, :2])
+        if place[0] + 2.0 * _MARKS_APART * size > box.x1 and dx > 0.0:
+            dx, dy = -dx, -dy
+        ax.plot(*place, "o", color=ACCENT, markerfacecolor="white", markersize=4)
+        ax.annotate(
+            f"{mark:g} s",
+            place.tolist(),
+            xytext=(7.0 * dx, 7.0 * dy),
+            textcoords="offset points",
+            ha="center" if abs(dx) < _STEEP else "left" if dx > 0.0 else "right",
+            va="center" if abs(dy) < _STEEP else "bottom" if dy > 0.0 else "top",
+            fontsize=SMALL,
+            color=DARK,
+            path_effects=[withStroke(linewidth=2.5, foreground="white")],
+        )
+
+
+def _beside(place: Array, near: Array) -> tuple[float, float]:
+    """Return the direction (2,) across a track, to the side on which the track is not."""
+    along = near[-1] - near[0]
+    across = np.array([-along[1], along[0]]) / max(float(np.linalg.norm(along)), 1e-12)
+    if across @ (place - near.mean(axis=0)) < 0.0:
+        across = -across
+    return float(across[0]), float(across[1])
 
 
 def motion_figure(

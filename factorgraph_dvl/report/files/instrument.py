@@ -58,7 +58,8 @@ def instrument_text(instrument: InstrumentTerms, name: str) -> str:
         "# level, positive port side up and bow up: Rz(-EA) Ry(EJ) Rx(EI) takes ship to",
         "# instrument. They are valid for a DVL that looks down, if the trial was recorded in",
         "# instrument coordinates (aligned: X to starboard, Y, beam 3, ahead, Z up) with EA, EI",
-        "# and EJ at 0, and if the body axes are parallel to those of the ship.",
+        "# and EJ at 0, and if the body axes are parallel to those of the ship. EI and EJ are as",
+        "# in the Pathfinder DVL Guide (2018). The sign of EA is NOT VERIFIED against a manual.",
         *(_NOT_TRDI if np.max(np.abs(i.alignment[1:])) > _UPSIDE_DOWN_DEG else ()),
         "trdi:",
         *[
@@ -81,23 +82,24 @@ def _makers(i: InstrumentTerms) -> list[str]:
     tilt = float(np.hypot(roll, pitch))
     return [
         "",
-        "# The sign rules below are those by which the numbers were computed. Before you type",
-        "# them in, check one of them against the manual of your firmware.",
-        "",
         "# Nortek: attitude of the DVL in the vehicle, axes forward, starboard, down; yaw first,",
         "# then pitch, then roll; each positive by the right hand about its axis.",
+        f"# {_NOT_VERIFIED}",
         "nortek:",
         f"  roll_pitch_yaw_deg: {_list([roll, pitch, yaw], 2)}",
         "",
-        "# Water Linked: one angle, from the bow to the forward axis of the DVL, positive",
-        f"# clockwise from above. It leaves out the tilt of {fixed(tilt, 2)} deg.",
+        "# Water Linked: one angle, from the vehicle's forward axis to that of the DVL, positive",
+        "# clockwise from above, in whole degrees from 0 to 359. Sign rule: DVL documentation,",
+        f"# page Axes. The angle is {fixed(yaw, 2)} deg; the rest and the tilt of "
+        f"{fixed(tilt, 2)} deg are left out.",
         *(("# DO NOT TYPE IN: the DVL's axes look up.",) if upside_down else ()),
         "water_linked:",
-        f"  mounting_rotation_offset: {fixed(yaw, 2)}",
+        f"  mounting_rotation_offset: {round(yaw) % 360}",
         "",
         "# Delph-style: axes X1 forward, X2 to port, X3 up. Heading is positive clockwise from",
         "# above, roll positive port side up, pitch positive bow down. The scale factor is what",
         "# the DVL reads too much, in %; the lever arm runs from the IMU to the DVL.",
+        f"# {_NOT_VERIFIED}",
         "delph:",
         f"  heading_pitch_roll_deg: {_list([yaw, -pitch, roll], 4)}",
         f"  scale_factor_percent: {fixed(100.0 * mean, 4)}",
@@ -105,6 +107,9 @@ def _makers(i: InstrumentTerms) -> list[str]:
     ]
 
 
+_NOT_VERIFIED = (
+    "The signs are NOT VERIFIED against the maker's manual: check one of them before use."
+)
 # Chosen: a DVL that looks down has a smaller roll and pitch.
 _UPSIDE_DOWN_DEG = 90.0
 _NOT_TRDI = (

@@ -62,11 +62,15 @@ def redact(result: Result) -> Result:
     """Return a result without absolute positions, names of trials, and names of files."""
     own = result.solution
 
+    def without_names(text: str) -> str:
+        text = _FILES.sub("[file]", text)
+        return text.replace(own.trial, "[trial]") if own.trial else text
+
     def hidden(finding: Finding) -> Finding:
-        text = _FILES.sub("[file]", finding.text)
-        if own.trial:
-            text = text.replace(own.trial, "[trial]")
-        return replace(finding, text=text)
+        said = finding.message
+        if isinstance(said, str):
+            return replace(finding, message=without_names(said))
+        return replace(finding, message=said.with_words(without_names))
 
     run = dict(result.run)
     if run:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from html import escape
 
 from factorgraph_dvl.report.html.words import chinese
+from factorgraph_dvl.sensors.message import Message, in_language
 
 
 @dataclass(frozen=True)
@@ -41,6 +42,11 @@ def both(english: str, own: str = "") -> Html:
     return Html(
         f'<span lang="en">{escape(english)}</span><span lang="zh-Hans">{escape(other)}</span>'
     )
+
+
+def said(message: Message | str) -> Html:
+    """Return a message in English and Chinese; a text from a file as it is."""
+    return both(in_language(message, "en"), in_language(message, "zh"))
 
 
 def joined(*cells: Cell, by: str = " ") -> Html:

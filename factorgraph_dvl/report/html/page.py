@@ -107,7 +107,7 @@ def report_page(result: Result, *, redacted: bool = False) -> str:
     plots = [*motion, *deviations, *residuals]
     data = [p.data(result.start) for p in plots]
     shown = [s for s in sections if s is not None]
-    return _page("Calibration report", result.trial, shown, data, redacted=redacted)
+    return whole_page("Calibration report", result.trial, shown, data, redacted=redacted)
 
 
 def comparison_page(results: Sequence[Result], *, redacted: bool = False) -> str:
@@ -125,7 +125,7 @@ def comparison_page(results: Sequence[Result], *, redacted: bool = False) -> str
         results = [_renamed(redact(r), next(letters)) for r in results]
     sections = [_overview(results), _values(results), _different_settings(results)]
     title = " · ".join(r.name for r in results)
-    return _page("Comparison of results", title, sections, [], redacted=redacted)
+    return whole_page("Comparison of results", title, sections, [], redacted=redacted)
 
 
 def _renamed(result: Result, name: str) -> Result:
@@ -236,10 +236,32 @@ def _different_settings(results: Sequence[Result]) -> Section:
     return section(title, table(header, rows, label=title), key="settings")
 
 
-def _page(
-    kind: str, name: str, sections: Sequence[Section], plots: Sequence[Any], *, redacted: bool
+def whole_page(
+    kind: str,
+    name: Cell,
+    sections: Sequence[Section],
+    plots: Sequence[Any] = (),
+    *,
+    redacted: bool = False,
+    title: str = "",
 ) -> str:
-    """Return a whole page, with style, script and data inside."""
+    """Return a whole page, with style, script and data inside.
+
+    Parameters
+    ----------
+    kind : str
+        What it is, as `words` lists it.
+    name : Cell
+        Heading.
+    sections : sequence of Section
+        What it contains.
+    plots : sequence, optional
+        Data of the plots in the sections.
+    redacted : bool, default False
+        Say that positions and names are left out.
+    title : str, optional
+        Title of the window; the heading if not given.
+    """
     own = files("factorgraph_dvl.report")
     style = (own / UPLOT / "uPlot.min.css").read_text(encoding="utf-8")
     style += (own / "html" / "report.css").read_text(encoding="utf-8")
@@ -278,7 +300,8 @@ def _page(
         '<!DOCTYPE html>\n<html lang="en" data-lang="en">\n<head>\n<meta charset="utf-8">\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
         f'<meta http-equiv="Content-Security-Policy" content="{_POLICY}">\n'
-        f"{html(element('title', f'{kind}: {name}'))}\n<style>\n{style}</style>\n</head>\n"
+        f"{html(element('title', title or f'{kind}: {name}'))}\n<style>\n{style}</style>\n"
+        "</head>\n"
         f"<body>\n{''.join(map(html, body))}\n"
         f'<script type="application/json" id="data">{data}</script>\n'
         f"<!--\nuPlot\n{licence}-->\n"

@@ -29,7 +29,12 @@ from factorgraph_dvl.report.html.markup import (
 )
 from factorgraph_dvl.report.html.plots import Plot
 from factorgraph_dvl.report.html.track import track_svg
-from factorgraph_dvl.report.html.words import chinese_cause, component_names, dictionary
+from factorgraph_dvl.report.html.words import (
+    chinese_cause,
+    chinese_finding,
+    component_names,
+    dictionary,
+)
 from factorgraph_dvl.report.text import at_precision, fixed, in_words, with_std
 from factorgraph_dvl.sensors.finding import Finding
 from factorgraph_dvl.sensors.verdict import Verdict
@@ -103,9 +108,8 @@ def verdict_box(verdict: Verdict) -> Html:
 
 
 def _what(finding: Finding) -> Html:
-    """Return what was found; in Chinese what its code means, with the text in brackets."""
-    meaning, _, _ = dictionary("findings")[finding.code]
-    return both(str(finding), f"{meaning}（{finding}）")
+    """Return what was found."""
+    return both(str(finding), chinese_finding(finding))
 
 
 def _reason(finding: Finding) -> Html:

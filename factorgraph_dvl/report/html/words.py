@@ -8,6 +8,7 @@ from importlib.resources import files
 from typing import Any
 
 from factorgraph_dvl.report.text import in_words, split_unit
+from factorgraph_dvl.sensors.finding import Finding
 
 # Beginnings of causes that name a measurement or a parameter, and what follows it in Chinese.
 _CAUSES = {
@@ -46,6 +47,15 @@ def chinese_cause(cause: str) -> str:
             name = split_unit(cause.removeprefix(start))[0]
             return f"{dictionary('parameters').get(name, chinese(name))}{own}"
     return chinese(cause)
+
+
+def chinese_finding(finding: Finding) -> str:
+    """Return a finding in Chinese; a text of another version behind what its code means."""
+    if isinstance(finding.message, str):
+        meaning, _, _ = dictionary("findings")[finding.code]
+        return f"{meaning}（{finding}）"
+    text = finding.message.text("zh")
+    return f"{chinese(finding.sensor)}：{text}" if finding.sensor else text
 
 
 def component_names(component: str) -> tuple[str, str, str]:
