@@ -243,11 +243,11 @@ def print_table(table: Table, *leave_out: str) -> None:
     Parameters
     ----------
     table : Table
-        What to print; if it is still too wide, a terminal wraps it.
+        What to print. Names that are too long continue on the next line.
     *leave_out : str
         Headers of columns that may be left out, the least important first.
     """
-    from factorgraph_dvl.report.terminal.tables import fitted, width_of
+    from factorgraph_dvl.report.terminal.tables import fitted, least_width_of
 
     if events.active():
         cells = [[_plain(cell) for cell in column.cells] for column in table.columns]
@@ -257,7 +257,7 @@ def print_table(table: Table, *leave_out: str) -> None:
         return
     console = stdout()
     table = fitted(table, console.width, leave_out)
-    console.width = max(console.width, width_of(table))
+    console.width = max(console.width, least_width_of(table))
     console.print(table)
 
 

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from msgspec import UnsetType
+from rich.cells import cell_len
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
@@ -29,6 +30,8 @@ VERDICT_COLOURS = {"good": "green", "doubtful": "yellow", "do not use": "red"}
 GRADES = {"green": "green", "orange": "yellow", "red": "red", "grey": "dim"}
 # Chosen: wider than any table, in columns.
 _UNLIMITED = 10_000
+# Chosen: a column of names is at least so wide, in columns.
+_LEAST_NAME = 12
 
 
 def calibration_table(
@@ -243,8 +246,10 @@ def width_of(table: Table) -> int:
     return Console(width=_UNLIMITED).measure(table).maximum
 
 
-def fitted(table: Table, width: int, leave_out: Sequence[str]) -> Table:
+def fitted(table: Table, width: int, leave_out: Sequence[str] = ()) -> Table:
     """Return a table that fits a width, without the first of some columns that are in the way.
+
+    Names that are still too long continue on the next line; numbers are never cut.
 
     Parameters
     ----------
@@ -253,21 +258,42 @@ def fitted(table: Table, width: int, leave_out: Sequence[str]) -> Table:
     width : int
         Columns of the terminal.
     leave_out : sequence of str
-        Headers of columns, the least important first. Without all of them the table may still be
-        wider.
+        Headers of columns, the least important first.
     """
     for header in leave_out:
         if width_of(table) <= width:
             break
-        kept = [column for column in table.columns if column.header != header]
-        narrower = Table(title=table.title, caption=table.caption)
-        for column in kept:
-            narrower.add_column(column.header, justify=column.justify, no_wrap=True)
-        cells = zip(*(column.cells for column in kept), strict=True)
-        for row, texts in zip(table.rows, cells, strict=True):
-            narrower.add_row(*texts, end_section=row.end_section)
-        table = narrower
-    return table
+        table = _copied(table, without=header)
+    return table if width_of(table) <= width else _copied(table, fold=True)
+
+
+def least_width_of(table: Table) -> int:
+    """Return the width, columns, below which numbers would be cut, or names hard to read."""
+    widths = [
+        max(map(_width, (column.header, *column.cells)))
+        if column.no_wrap
+        else max(_width(column.header), _LEAST_NAME)
+        for column in table.columns
+    ]
+    return sum(widths) + 3 * len(widths) + 1
+
+
+def _width(cell: object) -> int:
+    text = cell.plain if isinstance(cell, Text) else str(cell)
+    return max(map(cell_len, text.split("\n")))
+
+
+def _copied(table: Table, *, without: str = "", fold: bool = False) -> Table:
+    """Return a table without a column; with `fold`, long names continue on the next line."""
+    kept = [column for column in table.columns if column.header != without]
+    copy = Table(title=table.title, caption=table.caption)
+    for column in kept:
+        wraps = fold and column.justify == "left"
+        copy.add_column(column.header, justify=column.justify, no_wrap=not wraps, overflow="fold")
+    cells = zip(*(column.cells for column in kept), strict=True)
+    for row, texts in zip(table.rows, cells, strict=True):
+        copy.add_row(*texts, end_section=row.end_section)
+    return copy
 
 
 def motion_line(survey: Survey) -> str:

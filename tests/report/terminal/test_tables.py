@@ -13,8 +13,10 @@ from factorgraph_dvl.analysis.error_statistics import calibration_errors
 from factorgraph_dvl.quality.survey import survey
 from factorgraph_dvl.report.terminal.error_budget import error_budget_table
 from factorgraph_dvl.report.terminal.tables import (
+    add_column,
     calibration_table,
     fitted,
+    least_width_of,
     sensor_table,
     width_of,
 )
@@ -69,6 +71,25 @@ def test_columns_are_left_out_until_a_table_fits() -> None:
     assert (narrow.title, narrow.caption) == ("Title", "caption")
     # What is left may be too wide.
     assert width_of(fitted(table, 5, ("second",))) > 5
+
+
+def test_long_names_continue_on_the_next_line() -> None:
+    table = Table()
+    name = "position of the beacon that the harbour master calls the second from the east"
+    add_column(table, "parameter")
+    for header in ("value", "std", "truth"):
+        add_column(table, header, numeric=True)
+    table.add_row(name, "123456.789 ± 0.012", "0.012", "123456.791")
+    narrow = fitted(table, 80)
+    assert least_width_of(narrow) <= 80
+    file = StringIO()
+    Console(file=file, width=80).print(narrow)
+    lines = file.getvalue().splitlines()
+    assert max(map(len, lines)) <= 80
+    assert "123456.789 ± 0.012" in file.getvalue()
+    cells = [line.split("│")[1].strip() for line in lines if line.startswith("│")]
+    assert " ".join(cells).split() == name.split()
+    assert least_width_of(table) > 80
 
 
 def test_records_with_large_clock_readings_are_not_cut() -> None:
