@@ -164,6 +164,12 @@ def decoded(data: Any, text: str) -> Message | str:
     return text
 
 
+def together(parts: Sequence[Message | str]) -> Message | str:
+    """Return parts, joined by "and"."""
+    first, *rest = parts
+    return message("words.and", first=first, rest=together(rest)) if rest else first
+
+
 def either(parts: Sequence[Message | str]) -> Message | str:
     """Return alternatives, joined by "or"."""
     first, *rest = parts

@@ -26,7 +26,7 @@ PACKAGE = Path(factorgraph_dvl.__file__).parent
 KEYS = {f"{group}.{name}" for group, own in catalogue().items() for name in own}
 SOURCES = {path: ast.parse(path.read_text(encoding="utf-8")) for path in PACKAGE.rglob("*.py")}
 # Messages inside of others, and those of pages.
-PARTS = {"words", "axes", "campaign"}
+PARTS = {"words", "axes", "campaign", "directions"}
 
 
 def fields(template: str) -> set[str]:

@@ -10,6 +10,7 @@ import numpy as np
 from factorgraph_dvl.analysis.information.segment_singular_values import dominant, readable_basis
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.sensors.grades import DEFAULT_LIMITS, Grade
+from factorgraph_dvl.sensors.message import Message, message, together
 from factorgraph_dvl.solution import Estimate, grades_of
 
 # Chosen: a direction is undetermined if at least half of the prior's σ remains; above the second
@@ -62,7 +63,7 @@ class Marginals:
         Correlation of the posterior.
     directions : tuple of Direction
         P directions, the weakest first.
-    sentences : tuple of str
+    sentences : tuple of Message
         A sentence for each weak direction.
     """
 
@@ -74,7 +75,7 @@ class Marginals:
     grade: tuple[Grade, ...]
     correlation: Array
     directions: tuple[Direction, ...]
-    sentences: tuple[str, ...]
+    sentences: tuple[Message, ...]
 
     @property
     def ratio(self) -> Array:
@@ -151,7 +152,7 @@ def _direction(row: Array, scaled: Array, names: tuple[str, ...]) -> Direction:
 
 def _undetermined_sentences(
     directions: Sequence[Direction], names: tuple[str, ...], prior: Array, P: Array
-) -> list[str]:
+) -> list[Message]:
     """Return a sentence for each direction that the data do not determine.
 
     These directions span a subspace: two undetermined combinations of two components leave
@@ -164,43 +165,55 @@ def _undetermined_sentences(
     basis = readable_basis(np.linalg.qr(np.array(vectors).T)[0].T)
     for row in basis:
         d = _direction(row, P / np.outer(prior, prior), names)
-        left = f"{100.0 * min(d.ratio, 1.0):.0f} % of the prior's σ remains"
+        left = 100.0 * min(d.ratio, 1.0)
         index = [names.index(name) for name in d.names]
         if len(index) == 1:
-            verdict = "is not" if d.ratio > _NOTHING else "is hardly"
-            out.append(f"{d.names[0]} {verdict} determined by the data: {left}")
+            key = "directions.open" if d.ratio > _NOTHING else "directions.hardly"
+            out.append(message(key, name=d.names[0], left=left))
         elif len(index) > _MOST_NAMED:
-            out.append(f"{_listed(d.names)} cannot be separated: {left} in a combination")
+            out.append(message("directions.many", names=_listed(d.names), left=left))
         else:
             step = d.vector[index] * prior[index]
-            moves = " and ".join(
-                f"{name} by {s / step[0]:.3g}" for name, s in zip(d.names, step, strict=True)
-            )
-            text = f"{_listed(d.names)} cannot be separated: {left} if {moves} change together"
+            moves = [
+                message("directions.by", name=name, size=s / step[0])
+                for name, s in zip(d.names, step, strict=True)
+            ]
+            known: Message | str = ""
             if len(index) == 2:
-                text += _known_combination(index[0], index[1], step, names, prior, P)
-            out.append(text)
+                known = _known_combination(index[0], index[1], step, names, prior, P)
+            out.append(
+                message(
+                    "directions.together",
+                    names=_listed(d.names),
+                    left=left,
+                    moves=together(moves),
+                    known=known,
+                )
+            )
     return out
 
 
 def _known_combination(
     i: int, j: int, step: Array, names: Sequence[str], prior: Array, P: Array
-) -> str:
+) -> Message | str:
     """Return the combination of two components that the data determine, if there is one."""
     slope = float(step[0] / step[1])
     variance = float(P[i, i] - 2.0 * slope * P[i, j] + slope**2 * P[j, j])
     before = float(prior[i] ** 2 + (slope * prior[j]) ** 2)
     if variance > OPEN**2 * before:
         return ""
-    return (
-        f"; only {names[i]} {_signed(-slope)} · {names[j]} is known, to "
-        f"{np.sqrt(max(variance, 0.0)):.2g}"
+    return message(
+        "directions.known",
+        first=names[i],
+        factor=_signed(-slope),
+        second=names[j],
+        std=np.sqrt(max(variance, 0.0)),
     )
 
 
 def _correlated_sentences(
     names: Sequence[str], P: Array, correlation: Array, std: Array, prior: Array
-) -> list[str]:
+) -> list[Message]:
     """Return a sentence for each pair of known but strongly correlated components."""
     out = []
     known = std < OPEN * prior
@@ -212,15 +225,23 @@ def _correlated_sentences(
             slope = float(P[i, j] / P[j, j])
             rest = float(std[i]) * np.sqrt(max(1.0 - rho**2, 0.0))
             out.append(
-                f"{names[i]} and {names[j]} are hard to separate (correlation {rho:.3f}): "
-                f"{names[i]} {_signed(-slope)} · {names[j]} is known to {rest:.2g}, "
-                f"{names[i]} alone to {std[i]:.2g}"
+                message(
+                    "directions.correlated",
+                    first=names[i],
+                    second=names[j],
+                    correlation=rho,
+                    factor=_signed(-slope),
+                    rest=rest,
+                    alone=std[i],
+                )
             )
     return out
 
 
-def _listed(names: Sequence[str]) -> str:
-    return f"{', '.join(names[:-1])} and {names[-1]}" if len(names) > 1 else names[0]
+def _listed(names: Sequence[str]) -> Message | str:
+    if len(names) == 1:
+        return names[0]
+    return message("words.listed", names=names[:-1], last=names[-1])
 
 
 def _signed(value: float) -> str:

@@ -32,7 +32,10 @@ def error_budget_figure(solution: Solution, *, into: SubFigure | None = None) ->
     free = np.flatnonzero(std > 0.0)
     variance = np.stack([c.adds[free] ** 2 for c in solution.error_budget])
     share = 100.0 * variance / variance.sum(axis=0)
-    names = [f"{readable(solution.order[i])[0]}  {std[i]:.2g}" for i in free]
+    read = [readable(solution.order[i]) for i in free]
+    names = [
+        f"{name}  {std[i]:.2g} {unit}".rstrip() for i, (name, unit) in zip(free, read, strict=True)
+    ]
     left = max(1.5, 0.25 + 0.068 * max(map(len, names)))
     figure = canvas(9.5 + left, 1.5 + 0.24 * free.size, into)
     grid = new_grid(figure, 1, 1, left=left, right=3.4, bottom=0.5, top=0.45)

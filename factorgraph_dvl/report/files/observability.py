@@ -164,7 +164,7 @@ def _marginals(m: Marginals) -> dict[str, Any]:
         },
         "correlation": {"order": m.names, "matrix": m.correlation.tolist()},
         "directions": [_direction(d) for d in m.directions],
-        "sentences": m.sentences,
+        "sentences": list(map(str, m.sentences)),
     }
 
 

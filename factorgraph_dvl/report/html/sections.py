@@ -24,6 +24,7 @@ from factorgraph_dvl.report.html.markup import (
     items,
     joined,
     paragraph,
+    said,
     section,
     table,
 )
@@ -342,7 +343,7 @@ def observability_section(result: Result, segments: Sequence[Segment]) -> Sectio
         )
         if view.sentences:
             cells.append(element("h3", both("Directions that the data hardly determine")))
-            cells.append(items(list(view.sentences)))
+            cells.append(items(list(map(said, view.sentences))))
         else:
             cells.append(paragraph(both("The data determine every component.")))
     cells.append(element("h3", both("Which manoeuvre would help")))
