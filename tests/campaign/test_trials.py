@@ -140,10 +140,16 @@ def test_the_page_is_whole_and_leads_to_the_results(campaign):
 
     Page().feed(re.sub(r"<(line|circle|polygon|polyline)([^>]*)/>", r"<\1\2>", text))
     assert not opened
-    assert {"trials/a/report.html", "trials/b/calibration.json"} == set(links)
+    links = {link for link in links if not link.startswith("#")}
+    assert {"trials/a/report.html", "trials/b/calibration.json"} == links
     assert all((out / link).exists() for link in links)
     assert "a &lt;table&gt; is missing" in text
-    assert "nan" not in text
+    shown = text[text.index("<main") : text.index("</main>")]
+    assert "nan" not in shown
+    headings = re.findall(r"<h[123][^>]*>(.*?)</h[123]>", shown)
+    assert headings
+    assert all("zh-Hans" in heading for heading in headings)
+    assert "次试验的联合标定" in text
 
 
 def test_labels_are_folders_of_their_own(tmp_path):

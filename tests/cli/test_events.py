@@ -10,10 +10,12 @@ import events_schema
 import msgspec
 import pytest
 from builders import build_solution, write_trial
+from calibrations import calibration
 from running import Run
 
 from factorgraph_dvl.cli.commands import COMMANDS
 from factorgraph_dvl.cli.events import Event
+from factorgraph_dvl.io.calibration_file import encode_calibration
 from factorgraph_dvl.io.solution_folder import save_solution
 
 
@@ -107,8 +109,9 @@ def test_help_and_version_are_texts(run: Run) -> None:
 
 
 def test_the_terms_of_instruments_are_a_result(tmp_path: Path, run: Run) -> None:
-    save_solution(build_solution(), tmp_path / "s")
-    found, end = lines(run("instrument", tmp_path / "s", "--json").out)
+    file = tmp_path / "calibration.json"
+    file.write_bytes(encode_calibration(calibration()))
+    found, end = lines(run("instrument", file, "--json").out)
     assert found["event"] == "result"
     assert set(found["content"]["trdi"]) == {"EA", "EI", "EJ"}
     assert end["exit_code"] == 0
