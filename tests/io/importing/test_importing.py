@@ -1,5 +1,7 @@
 """What an import decides: formats, clocks, order, axes, and what it leaves alone."""
 
+import re
+from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 
 import format_samples as samples
@@ -9,7 +11,7 @@ import pytest
 
 from factorgraph_dvl.errors import ConfigError, DataError
 from factorgraph_dvl.io.formats.mapping import MappingSettings
-from factorgraph_dvl.io.importing import merging, spool, time_base
+from factorgraph_dvl.io.importing import merging, raw_files, spool, time_base
 from factorgraph_dvl.io.importing.guess import guess_all
 from factorgraph_dvl.io.importing.lag import lag_between
 from factorgraph_dvl.io.importing.raw_files import import_files
@@ -79,6 +81,20 @@ def test_says_that_pings_have_no_time(tmp_path):
     unset = b"".join(ping(i, (0.1, -1.5, 0.0, 0.01), start) for i in range(30))
     _, decisions = imported(tmp_path, unset)
     assert "file0 bottom: 30 pings, none with a time → left out" in decisions.lines
+
+
+def test_limits_are_said_before_reading_and_progress_while(tmp_path, monkeypatch):
+    said = []
+
+    def limited(path):
+        return tuple(replace(form, limit="keeps all in memory") for form in recognise(path))
+
+    monkeypatch.setattr(raw_files, "recognise", limited)
+    imported(tmp_path, pings(), fixes(), progress=said.append)
+    assert said[0] == "file0: keeps all in memory"
+    assert all(re.fullmatch(r"read file0, \d+ %", line) for line in said[1:3])
+    assert said.index("file1: keeps all in memory") > said.index(said[2])
+    assert said[-1] == "assemble"
 
 
 def test_damage_is_a_line_for_each_file(tmp_path):
