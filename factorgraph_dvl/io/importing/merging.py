@@ -129,8 +129,9 @@ def merge(streams: Sequence[Timed], decisions: Decisions) -> Merged | None:
     count, times, parts, intervals = 0, [], [], _Intervals()
     for time, records in _without_repeats(streams):
         begin = -count % thin
-        times.append(time[begin::thin])
-        parts.append(records[begin::thin])
+        # Views would keep all records.
+        times.append(time[begin::thin].copy())
+        parts.append(records[begin::thin].copy())
         intervals.add(time)
         count += len(time)
     if count < known:

@@ -63,7 +63,8 @@ def _over_ground(stream: Stream, times: Stored) -> Iterator[Series]:
 
 def _joined(parts: Iterator[Series], stream: Stream) -> Series:
     step = max(len(stream.records) // _MOST, 1)
-    thin = [(time[::step], speed[::step]) for time, speed in parts]
+    # Views would keep all records.
+    thin = [(time[::step].copy(), speed[::step].copy()) for time, speed in parts]
     if not thin:
         return np.empty(0), np.empty(0)
     return _series(*(np.concatenate(column) for column in zip(*thin, strict=True)))

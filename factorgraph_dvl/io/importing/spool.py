@@ -46,7 +46,9 @@ class Stored:
     def __getitem__(self, part: slice) -> Records:
         start, stop, step = part.indices(self._count)
         count, offset = max(stop - start, 0), start * self._dtype.itemsize
-        out = np.fromfile(self._path, self._dtype, count, offset=offset)[::step]
+        out = np.fromfile(self._path, self._dtype, count, offset=offset)
+        # A view would keep all of what was read.
+        out = out if step == 1 else out[::step].copy()
         return out if self._convert is None else self._convert(out)
 
     def chunks(self) -> Iterator[Records]:

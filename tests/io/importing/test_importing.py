@@ -1,6 +1,7 @@
 """What an import decides: formats, clocks, order, axes, and what it leaves alone."""
 
 import re
+import tracemalloc
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 
@@ -10,8 +11,10 @@ import numpy as np
 import pytest
 
 from factorgraph_dvl.errors import ConfigError, DataError
+from factorgraph_dvl.io.formats.format import Batch, empty
 from factorgraph_dvl.io.formats.mapping import MappingSettings
 from factorgraph_dvl.io.importing import merging, raw_files, spool, time_base
+from factorgraph_dvl.io.importing.decisions import Decisions
 from factorgraph_dvl.io.importing.guess import guess_all
 from factorgraph_dvl.io.importing.lag import lag_between
 from factorgraph_dvl.io.importing.raw_files import import_files
@@ -269,6 +272,26 @@ class TestMerging:
         for table, values in kept.items():
             found = column(again, table, "time_s", *names[table])
             np.testing.assert_array_equal(found, values)
+
+    def test_memory_does_not_grow_with_files(self, tmp_path, monkeypatch):
+        for module in (spool, merging, time_base):
+            monkeypatch.setattr(module, "CHUNK", 2_000)
+        monkeypatch.setattr(merging, "SAMPLE", 100)
+        monkeypatch.setattr(merging, "_USUAL", 1_000)
+        store = spool.Spool(tmp_path, lambda *_: None)
+        for begin in range(0, 100_000, 2_000):
+            batch = Batch("course", empty("course", 2_000))
+            batch.records["time"] = 1e9 + begin + np.arange(2_000)
+            store.append("file", "nmea", batch)
+        tracemalloc.start()
+        (timed,) = time_base.on_utc(store.streams(), store, Decisions())
+        found = merging.merge([timed], Decisions())
+        timed.stream.records.thinned(100)
+        most = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        assert (found.count, len(found.sample)) == (100_000, 100)
+        # All records take 4 MB.
+        assert most < 1e6
 
     def test_gaps_are_counted_where_intervals_are_many(self, monkeypatch):
         monkeypatch.setattr(merging, "_USUAL", 50)
