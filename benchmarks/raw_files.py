@@ -27,8 +27,8 @@ import format_writers as writers
 
 PAGE = "raw_files.md"
 GB = 10**9
-# In GB, each four times the one before: what each reader takes a minute or two for.
-SIZES = {"pd0": (0.25, 1.0, 4.0), "ad2cp": (0.05, 0.2), "nmea": (0.05, 0.2), "csv": (0.25, 1.0, 4.0)}
+# In GB, each four times the one before: what takes each reader a minute at most.
+SIZES = {"pd0": (0.25, 1.0), "ad2cp": (0.02, 0.08), "nmea": (0.02, 0.08), "csv": (0.25, 1.0)}
 START = datetime(2021, 3, 4, 5, 6, 7, tzinfo=UTC)
 # Records that are made at a time.
 PART = 20_000
