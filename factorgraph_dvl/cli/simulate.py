@@ -8,7 +8,8 @@ from typing import Annotated
 
 import typer
 
-from factorgraph_dvl.cli.console import stdout
+from factorgraph_dvl.cli import events
+from factorgraph_dvl.cli.console import print_written, stdout
 from factorgraph_dvl.cli.options import Force, claim_output
 
 
@@ -41,6 +42,9 @@ def simulate(
         )
     else:
         save_trial(run(scenario, seed), out, force=force, parquet=parquet, seed=seed)
+    if events.active():
+        print_written(out)
+        return
     stdout().print(
         f"Wrote trial {scenario.name} to {out} in {perf_counter() - start:.1f} s",
         markup=False,

@@ -100,6 +100,15 @@ def test_a_command_line_that_lacks_something_is_wrong_usage(
     assert failed["text"]
 
 
+def test_a_simulated_trial_is_written(tmp_path: Path, run: Run) -> None:
+    config = Path(__file__).parents[2] / "examples" / "short.yaml"
+    out = tmp_path / "trial"
+    written, *_, end = lines(run("simulate", config, "--out", out, "--json").out)
+    assert written["event"] == "written"
+    assert "trial.yaml" in written["files"]
+    assert end["exit_code"] == 0
+
+
 def test_help_and_version_are_texts(run: Run) -> None:
     for args in (("--version",), ("solve", "--help")):
         text, end = lines(run(*args, "--json").out)
