@@ -132,26 +132,40 @@ class CorrelatedRows(ObservationRows):
     def residual(self, motion: Motion, values: Mapping[str, Array]) -> Array:
         """Return predicted - measured, (K, d), the error included in what is predicted."""
         residual = super().residual(motion, values)
-        for name, jacobian in self._by_nodes().items():
-            residual = residual + jacobian @ values[name]
-        return residual
+        return self.process.with_error(residual, self._at_nodes(values), self.time)
 
     def linearize(
         self, motion: Motion, values: Mapping[str, Array], wanted: Collection[str]
     ) -> Linearization:
         """Return the residual and its Jacobians."""
         lin = super().linearize(motion, values, wanted)
-        by_nodes = self._by_nodes()
-        residual = lin.residual
-        for name, jacobian in by_nodes.items():
-            residual = residual + jacobian @ values[name]
-        return replace(lin, residual=residual, d_parameters={**lin.d_parameters, **by_nodes})
+        nodes = self._at_nodes(values)
+        gain = self.process.gain(nodes, self.time)[..., None]
+        of_motion = {
+            name: gain * each
+            for name in ("d_theta", "d_p", "d_v", "d_omega")
+            if (each := getattr(lin, name)) is not None
+        }
+        by_parameters = {name: gain * each for name, each in lin.d_parameters.items()}
+        return replace(
+            lin,
+            **of_motion,
+            residual=self.process.with_error(lin.residual, nodes, self.time),
+            d_parameters=by_parameters | self._by_nodes(lin.residual),
+        )
 
-    def _by_nodes(self) -> dict[str, Array]:
-        """Return the derivatives of the error with respect to each node, (K, d, d)."""
+    def _at_nodes(self, values: Mapping[str, Array]) -> Array:
+        """Return the nodes of the error, (J, size); zero where none is among the values."""
+        out = self.process.zero
+        for j in range(len(out)):
+            out[j] = values.get(_node_name(self.process, j), out[j])
+        return out
+
+    def _by_nodes(self, residual: Array) -> dict[str, Array]:
+        """Return the derivatives of the error with respect to each node, (K, d, size)."""
         before, _ = self.process.place(self.time)
         found = dict.fromkeys(self.nodes, np.zeros(()))
-        for part, jacobian in enumerate(self.process.jacobians(self.time)):
+        for part, jacobian in enumerate(self.process.jacobians(residual, self.time)):
             for name in found:
                 here = [_node_name(self.process, int(j) + part) == name for j in before]
                 found[name] = found[name] + np.where(np.array(here)[:, None, None], jacobian, 0.0)
@@ -167,7 +181,7 @@ def _as_parameters(rows: Sequence[AttachedMeasurements]) -> Iterator[Parameter]:
     seen = set()
     for r in rows:
         if isinstance(r.observation, CorrelatedRows):
-            sigma = np.ones(r.observation.process.sigma.size)
+            sigma = np.ones(r.observation.process.size)
             for name in r.observation.nodes:
                 if name not in seen:
                     seen.add(name)

@@ -406,7 +406,7 @@ class Problem:
         out = observation.residual(motion, parameters)
         for process in self.processes:
             if process.label == observation.label:
-                out = out + process.error(parameters[process.name], observation.time)
+                out = process.with_error(out, parameters[process.name], observation.time)
         return out
 
     def reject(self, rejected: Mapping[str, Array]) -> None:
@@ -711,7 +711,7 @@ class Problem:
         """Return the dimensions of these variables."""
         out = [STATE_SIZE, BIAS_SIZE]
         if block.correlated is not None:
-            out += [self.processes[block.correlated].sigma.size] * 2
+            out += [self.processes[block.correlated].size] * 2
         return out + [p.mean.size for p in block.parameters]
 
     def _transitions(self, evaluation: Evaluation) -> dict[int, Transition]:
@@ -747,14 +747,17 @@ class Problem:
         found = dict(lin.d_parameters)
         if self._imu_errors is not None:
             found |= self._imu_errors.columns(lin, transition, bound.attachment)
-        parts = [node_jacobian(lin, transition)]
+        state, others = node_jacobian(lin, transition), [found[p.name] for p in parameters]
+        by_nodes: list[Array] = []
         residual = lin.residual
         if bound.correlated is not None:
-            process = self.processes[bound.correlated]
-            parts += process.jacobians(bound.observation.time)
+            process, time = self.processes[bound.correlated], bound.observation.time
             nodes = evaluation.parameters[process.name]
-            residual = residual + process.error(nodes, bound.observation.time)
-        full = np.concatenate([*parts, *(found[p.name] for p in parameters)], axis=2)
+            gain = process.gain(nodes, time)[..., None]
+            by_nodes = process.jacobians(residual, time)
+            state, others = gain * state, [gain * each for each in others]
+            residual = process.with_error(residual, nodes, time)
+        full = np.concatenate([state, *by_nodes, *others], axis=2)
         full *= bound.weight[:, :, None]
         return full, bound.weight * residual
 

@@ -1,25 +1,31 @@
 """First-order Gauss-Markov processes: errors of a sensor that persist from one measurement on.
 
 The deviation of a measurement is sigma times the linear interpolation of two nodes c of unit
-variance, so that another sigma or correlation time changes factors and never their layout.
+variance, so that another sigma or correlation time changes factors and never their layout. A scale
+that walks is one more component of the nodes, with a correlation time of several trials.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import gtsam
 import numpy as np
 
 from factorgraph_dvl.geometry.vectors import Array, IntArray
 from factorgraph_dvl.graph import keys
+from factorgraph_dvl.sensors.protocol import ScaleWalk
 
 # Most of a correlation time between two nodes. Chosen: interpolation then leaves out 6 % of the
 # variance.
 _MOST_SPACING = 1.0 / 3.0
 # Correlation times without a measurement that need no nodes. Chosen: what persists is then gone.
 _GAP = 5.0
+# Correlation time of a scale that walks, in lengths of the record. Chosen: over one length its
+# changes then have 85 % of the variance of a walk.
+_LENGTHS = 3.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,6 +48,8 @@ class Process:
         Times of the nodes.
     density_only : bool, default False
         Whether only the density 2 sigma² / tau can be estimated, and sigma is as stated.
+    walk : ScaleWalk, optional
+        Of the scale, which is the last component of the nodes.
     """
 
     label: str
@@ -50,6 +58,21 @@ class Process:
     tau: Array
     time: Array
     density_only: bool = False
+    walk: ScaleWalk | None = None
+
+    @cached_property
+    def _of_nodes(self) -> tuple[Array, Array]:
+        """Standard deviations and correlation times of the components of a node, (size,)."""
+        if self.walk is None:
+            return self.sigma, self.tau
+        tau = walk_time(self.time)
+        sigma = walk_sigma(self.walk, tau)
+        return np.append(self.sigma, sigma), np.append(self.tau, tau)
+
+    @property
+    def size(self) -> int:
+        """Components of a node."""
+        return self._of_nodes[0].size
 
     @property
     def name(self) -> str:
@@ -62,42 +85,78 @@ class Process:
 
     @property
     def zero(self) -> Array:
-        """Nodes without an error, (J, n)."""
-        return np.zeros((self.time.size, self.sigma.size))
+        """Nodes without an error, (J, size)."""
+        return np.zeros((self.time.size, self.size))
 
     def place(self, time: Array) -> tuple[IntArray, Array]:
         """Return the nodes before times (M,), and the weights of the nodes after them."""
         j = np.clip(np.searchsorted(self.time, time, side="right") - 1, 0, self.time.size - 2)
         return j, np.clip((time - self.time[j]) / (self.time[j + 1] - self.time[j]), 0.0, 1.0)
 
-    def error(self, nodes: Array, time: Array) -> Array:
-        """Return the error (M, n) at times (M,), from the nodes (J, n)."""
+    def _error(self, nodes: Array, time: Array) -> Array:
+        """Return the error of each component of a node at times (M,), (M, size)."""
         j, after = self.place(time)
-        return self.sigma * ((1.0 - after)[:, None] * nodes[j] + after[:, None] * nodes[j + 1])
+        between = (1.0 - after)[:, None] * nodes[j] + after[:, None] * nodes[j + 1]
+        return np.asarray(self._of_nodes[0] * between)
 
-    def jacobians(self, time: Array) -> list[Array]:
-        """Return the derivatives of the error with respect to the nodes before and after."""
+    def with_error(self, residual: Array, nodes: Array, time: Array) -> Array:
+        """Return residuals (M, n) at times (M,) with the error by the nodes (J, size) added."""
+        error = self._error(nodes, time)
+        n = self.sigma.size
+        out = residual + error[:, :n]
+        if self.walk is not None:
+            out = out + error[:, n:] * self._predicted(residual, time)
+        return out
+
+    def gain(self, nodes: Array, time: Array) -> Array:
+        """Return the derivatives of `with_error` with respect to residuals, (M, 1)."""
+        if self.walk is None:
+            return np.ones((time.size, 1))
+        return 1.0 + self._error(nodes, time)[:, self.sigma.size :]
+
+    def jacobians(self, residual: Array, time: Array) -> list[Array]:
+        """Return the derivatives of `with_error` with respect to nodes before and after."""
         _, after = self.place(time)
-        return [share[:, None, None] * np.diag(self.sigma) for share in (1.0 - after, after)]
+        sigma, n = self._of_nodes[0], self.sigma.size
+        columns = np.zeros((time.size, n, sigma.size))
+        columns[:, :, :n] = np.diag(self.sigma)
+        if self.walk is not None:
+            columns[:, :, n] = sigma[n] * self._predicted(residual, time)
+        return [share[:, None, None] * columns for share in (1.0 - after, after)]
+
+    def _predicted(self, residual: Array, time: Array) -> Array:
+        # What was measured has noise, which a scale of its own would make smaller.
+        assert self.walk is not None
+        return residual + self.walk.measured[np.searchsorted(self.walk.time, time)]
+
+    def mean_walk(self, nodes: Array) -> tuple[float, dict[int, Array]]:
+        """Return the mean of a scale that walks, and its derivatives by the key of each node."""
+        weight = np.zeros(self.time.size)
+        step = np.diff(self.time)
+        weight[:-1] += step
+        weight[1:] += step
+        weight *= self._of_nodes[0][-1] / weight.sum()
+        last = np.eye(1, self.size, self.size - 1)
+        return float(weight @ nodes[:, -1]), {self.key(j): w * last for j, w in enumerate(weight)}
 
     @property
     def _weight(self) -> Array:
-        """Inverse standard deviations of the innovations, (J - 1, n)."""
-        return 1.0 / np.sqrt(-np.expm1(-2.0 * np.diff(self.time)[:, None] / self.tau))
+        """Inverse standard deviations of the innovations, (J - 1, size)."""
+        return 1.0 / np.sqrt(-np.expm1(-2.0 * np.diff(self.time)[:, None] / self._of_nodes[1]))
 
     def prior_residuals(self, nodes: Array) -> Array:
-        """Return whitened residuals (J, n): the first node, then the transitions."""
-        phi = np.exp(-np.diff(self.time)[:, None] / self.tau)
+        """Return whitened residuals (J, size): the first node, then the transitions."""
+        phi = np.exp(-np.diff(self.time)[:, None] / self._of_nodes[1])
         steps = (nodes[1:] - phi * nodes[:-1]) * self._weight
         return np.concatenate([nodes[:1], steps])
 
     def add_prior(self, gaussian: gtsam.GaussianFactorGraph, nodes: Array) -> None:
         """Add the factors of `prior_residuals`, which are linear."""
-        n = self.sigma.size
+        n = self.size
         residuals = self.prior_residuals(nodes)
         unit = gtsam.noiseModel.Unit.Create(n)
         gaussian.add(self.key(0), np.eye(n), -residuals[0], unit)
-        phi = np.exp(-np.diff(self.time)[:, None] / self.tau)
+        phi = np.exp(-np.diff(self.time)[:, None] / self._of_nodes[1])
         after = self._weight
         for j in range(len(phi)):
             gaussian.add(
@@ -108,6 +167,16 @@ class Process:
                 -residuals[j + 1],
                 unit,
             )
+
+
+def walk_time(time: Array) -> float:
+    """Return the correlation time with which a scale walks over a record at times (M,), s."""
+    return _LENGTHS * float(np.ptp(time))
+
+
+def walk_sigma(walk: ScaleWalk, tau: float) -> float:
+    """Return the standard deviation that a scale then has, so that its changes are a walk's."""
+    return walk.rate * float(np.sqrt(0.5 * tau))
 
 
 def node_times(time: Array, tau: float, sigma: Array, white: Array) -> Array:

@@ -35,6 +35,7 @@ from factorgraph_dvl.sensors.protocol import (
     Linearization,
     Motion,
     Observation,
+    ScaleWalk,
     SensorClock,
 )
 
@@ -98,6 +99,11 @@ class ObservationRows:
     def correlated(self) -> ExpectedCorrelation | None:
         """What is known beforehand of noise that persists."""
         return self.whole.correlated
+
+    @property
+    def scale_walk(self) -> ScaleWalk | None:
+        """How its scale walks."""
+        return self.whole.scale_walk
 
     @property
     def independent(self) -> bool:

@@ -20,10 +20,10 @@ from factorgraph_dvl.sensors.clock import Clock, ClockSection
 from factorgraph_dvl.sensors.message import Message, message
 from factorgraph_dvl.sensors.parameters import SCALAR, Parameter, ParameterSpec
 from factorgraph_dvl.sensors.protocol import (
-    ExpectedCorrelation,
     Linearization,
     Motion,
     Observation,
+    PlainObservation,
     SensorSection,
     Values,
     lever_arm_sigma,
@@ -213,7 +213,7 @@ class Beacons:
 
 
 @dataclass(frozen=True)
-class _ToBeacon:
+class _ToBeacon(PlainObservation):
     """What range and range rate to one beacon share.
 
     Parameters
@@ -241,25 +241,8 @@ class _ToBeacon:
     arm_b: Array
     beacon: str
 
-    @property
-    def gate(self) -> float | None:
-        """Standard deviations from which on a range is that of an echo."""
-        return GATE
-
-    @property
-    def noise_groups(self) -> tuple[tuple[int, ...], ...]:
-        """None: the gate goes by the standard deviation that is stated."""
-        return ()
-
-    @property
-    def correlated(self) -> ExpectedCorrelation | None:
-        """None: echoes come one by one."""
-        return None
-
-    @property
-    def independent(self) -> bool:
-        """Whether components are measured apart; there is one."""
-        return False
+    # Echoes come one by one, and the gate goes by the standard deviation that is stated.
+    gate = GATE
 
     @property
     def offset(self) -> str:

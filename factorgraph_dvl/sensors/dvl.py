@@ -13,7 +13,7 @@ from msgspec import UNSET, UnsetType
 from factorgraph_dvl.errors import ConfigError
 from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.rotations import BodyAxes
-from factorgraph_dvl.geometry.units import DEG
+from factorgraph_dvl.geometry.units import DEG, HOUR
 from factorgraph_dvl.geometry.vectors import Array, cross, rotate, skew
 from factorgraph_dvl.sensors.clock import Clock, ClockSection
 from factorgraph_dvl.sensors.message import Message, message
@@ -24,6 +24,7 @@ from factorgraph_dvl.sensors.protocol import (
     Motion,
     Observation,
     PlainObservation,
+    ScaleWalk,
     SensorSection,
     Values,
     expected_correlation,
@@ -108,8 +109,8 @@ class DvlSettings(ClockSection, frozen=True, kw_only=True):
 
     @property
     def states_correlation(self) -> bool:
-        """Whether velocities have a correlated part."""
-        return not isinstance(self.correlated_std_m_s, UnsetType)
+        """Whether velocities have a part that is correlated, or whose scale walks."""
+        return not isinstance(self.correlated_std_m_s, UnsetType) or bool(self.left_out)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -273,8 +274,14 @@ class Dvl:
         noise = (s.velocity_std_m_s, s.velocity_std_fraction)
         s = self.settings
         correlated = expected_correlation(s.correlation_time_s, s.correlated_std_m_s, 3)
-        velocity = self.velocity[m]
-        return (DvlVelocity(self.time[m], velocity, self.std[m], noise, correlated=correlated),)
+        time, velocity = self.time[m], self.velocity[m]
+        rate = s.scale_walk_std_sqrt_h / np.sqrt(HOUR)
+        walk = ScaleWalk(SCALE_ERROR, rate, time, velocity) if rate > 0.0 else None
+        return (
+            DvlVelocity(
+                time, velocity, self.std[m], noise, correlated=correlated, scale_walk=walk
+            ),
+        )
 
     def explain(self, parameter: str, component: int, motion: Motion | None) -> Message:
         """Say why a component could not be observed, given the motion of the trial."""
@@ -334,6 +341,7 @@ class DvlVelocity(PlainObservation):
     components: tuple[str, ...] = ("x", "y", "z")
     noise_groups: tuple[tuple[int, ...], ...] = ((0,), (1,), (2,))
     correlated: ExpectedCorrelation | None = None
+    scale_walk: ScaleWalk | None = None
     parameters: tuple[str, ...] = (
         MISALIGNMENT,
         SCALE_ERROR,

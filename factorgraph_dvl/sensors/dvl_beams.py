@@ -24,6 +24,7 @@ from factorgraph_dvl.sensors.protocol import (
     Linearization,
     Motion,
     Observation,
+    ScaleWalk,
     SensorSection,
     Values,
     lever_arm_sigma,
@@ -373,6 +374,7 @@ class BeamVelocity:
     unit: str = "m/s"
     gate: float | None = None
     correlated: ExpectedCorrelation | None = None
+    scale_walk: ScaleWalk | None = None
 
     @property
     def components(self) -> tuple[str, ...]:

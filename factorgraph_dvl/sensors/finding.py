@@ -595,7 +595,7 @@ class Code(StrEnum):
     # What a replay noticed.
     ERROR_LEFT_OUT = (
         "error_left_out",
-        "The trial states an error that no solver estimates.",
+        "The trial states an error that is estimated only with an IMU.",
         "Standard deviations do not contain the effect of this error.",
         "Use --halves, which reports changes that are larger than chance.",
     )

@@ -139,6 +139,28 @@ def expected_correlation(
     return None if std is None else ExpectedCorrelation(USUAL_CORRELATION_TIME, std)
 
 
+@dataclass(frozen=True, eq=False)
+class ScaleWalk:
+    """A scale that walks at random from one measurement to the next.
+
+    Parameters
+    ----------
+    parameter : str
+        Name of the scale error, which is the mean over the trial.
+    rate : float, 1/√s
+        Standard deviation of its change.
+    time : ndarray, shape (M,), s
+        Of the measurements, in order.
+    measured : ndarray, shape (M, d)
+        What was measured; a unit of scale adds what is predicted of it.
+    """
+
+    parameter: str
+    rate: float
+    time: Array
+    measured: Array
+
+
 class Observation(Protocol):
     """M measurements of one kind, of d components each."""
 
@@ -179,6 +201,10 @@ class Observation(Protocol):
         """What is known beforehand of noise that persists; None = nothing."""
 
     @property
+    def scale_walk(self) -> ScaleWalk | None:
+        """How its scale walks; None = not at all."""
+
+    @property
     def independent(self) -> bool:
         """Whether components are measured apart, so that one may be an outlier alone."""
 
@@ -209,6 +235,7 @@ class PlainObservation:
     gate: float | None = None
     noise_groups: tuple[tuple[int, ...], ...] = ()
     correlated: ExpectedCorrelation | None = None
+    scale_walk: ScaleWalk | None = None
     independent: bool = False
 
 
@@ -223,7 +250,7 @@ class SensorSection(Section, frozen=True, kw_only=True):
 
     @property
     def left_out(self) -> tuple[str, ...]:
-        """Keys that state an error which no solver estimates."""
+        """Keys that state an error which is estimated only with an IMU."""
         return ()
 
     @property

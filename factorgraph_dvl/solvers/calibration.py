@@ -22,7 +22,8 @@ def reported(
     """Return all calibration parameters in the order in which they are reported.
 
     Each with its value in reported units and the derivatives of that with respect to the
-    variables of the graph, by key; None for one that is fixed.
+    variables of the graph, by key; None for one that is fixed. What walks is reported as its mean
+    over the trial.
     """
     chain = problem.chain
     weight = _mean_weights(chain.segments)
@@ -40,7 +41,13 @@ def reported(
     for p in problem.all_parameters:
         row = in_unit(p, evaluation.parameters[p.name])
         own = {problem.key(p.name): row.derivative} if p.estimated else None
-        rows.append((p, row.value, own))
+        value = row.value
+        for process in problem.processes:
+            if own is not None and process.walk is not None and process.walk.parameter == p.name:
+                mean, by_node = process.mean_walk(evaluation.parameters[process.name])
+                value = value + mean
+                own |= {key: np.repeat(d, p.mean.size, axis=0) for key, d in by_node.items()}
+        rows.append((p, value, own))
     return in_order(rows, lambda r: r[0])
 
 

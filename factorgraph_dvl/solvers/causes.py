@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from factorgraph_dvl.geometry.units import HOUR
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph.problem import Problem
 from factorgraph_dvl.sensors.imu import ImuSettings
@@ -70,9 +71,13 @@ def _assumed(
             out[o.label] = numbers_with_unit(np.array(middle), o.unit)
     for process in problem.processes:
         (unit,) = (o.unit for o in problem.observations if o.label == process.label)
-        numbers = numbers_with_unit(process.sigma, unit)
-        over = numbers_with_unit(process.tau[process.sigma > 0.0], "s")
-        out[CORRELATED.format(process.label)] = f"{numbers} over {over}"
+        assumed = []
+        if process.sigma.any():
+            over = numbers_with_unit(process.tau[process.sigma > 0.0], "s")
+            assumed.append(f"{numbers_with_unit(process.sigma, unit)} over {over}")
+        if process.walk is not None:
+            assumed.append(f"scale {process.walk.rate * np.sqrt(HOUR):.2g} /√h")
+        out[CORRELATED.format(process.label)] = ", ".join(assumed)
     priors = [*problem.chain.biases, *(p for p in parameters if p.name in problem.columns)]
     for p in priors:
         unit = UNITS[p.spec.unit].text

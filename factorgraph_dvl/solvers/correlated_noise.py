@@ -9,8 +9,8 @@ import numpy as np
 
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph.problem import Evaluation, Problem
-from factorgraph_dvl.graph.processes import Process, node_times
-from factorgraph_dvl.sensors.protocol import Observation
+from factorgraph_dvl.graph.processes import Process, node_times, walk_sigma, walk_time
+from factorgraph_dvl.sensors.protocol import Observation, ScaleWalk
 from factorgraph_dvl.solution import Noise, noise_name
 from factorgraph_dvl.statistics.correlation import Correlation, fit_correlation
 from factorgraph_dvl.statistics.variance_components import LEAST_FACTOR
@@ -77,25 +77,37 @@ def correlated_noise(
         outlier = problem.robust_weights.get(o.label, np.ones(1)) == 0.0
         when = o.time[(used | outlier).any(axis=1)]
         stated = o.correlated
+        process = None
         if stated is not None and stated.sigma is not None:
             tau = np.full(sigma.size, stated.time)
             nodes = node_times(when, stated.time, stated.sigma, sigma)
-            processes.append(Process(o.label, len(processes), stated.sigma, tau, nodes))
-            continue
-        if o.label not in estimated or np.ptp(when) < _SHORTEST:
-            continue
-        residuals = np.where(used, evaluation.residuals[i], np.nan)
-        found = _fits(o, residuals)
-        if not found:
-            continue
-        rms = np.sqrt(np.nanmean(residuals**2, axis=0))
-        process, white, inflation = _model(o, found, sigma, rms, when, len(processes))
-        factors[o.label] = white
+            process = Process(o.label, len(processes), stated.sigma, tau, nodes)
+        elif o.label in estimated and np.ptp(when) >= _SHORTEST:
+            residuals = np.where(used, evaluation.residuals[i], np.nan)
+            found = _fits(o, residuals)
+            if found:
+                rms = np.sqrt(np.nanmean(residuals**2, axis=0))
+                process, white, inflation = _model(o, found, sigma, rms, when, len(processes))
+                factors[o.label] = white
+                if (inflation != 1.0).any():
+                    long_run[o.label] = inflation
+        if o.scale_walk is not None and np.ptp(when) > 0.0:
+            process = _walking(process, o.label, len(processes), o.scale_walk, sigma, when)
         if process is not None:
             processes.append(process)
-        if (inflation != 1.0).any():
-            long_run[o.label] = inflation
     return CorrelatedNoise(tuple(processes), factors, long_run)
+
+
+def _walking(
+    process: Process | None, label: str, index: int, walk: ScaleWalk, sigma: Array, time: Array
+) -> Process:
+    """Return a process with a scale that walks: the one there is, or one of the scale alone."""
+    if process is None:
+        tau = walk_time(time)
+        most = np.max(np.abs(walk.measured), axis=0) * walk_sigma(walk, tau)
+        nodes = node_times(time, tau, most, sigma)
+        process = Process(label, index, np.zeros(sigma.size), np.ones(sigma.size), nodes)
+    return replace(process, walk=walk)
 
 
 def _typical(weight: Array) -> Array:
@@ -179,7 +191,7 @@ def noise_of(problem: Problem) -> tuple[Noise, ...]:
         factor = problem.noise_factors[o.label]
         time, std = None, None
         for process in problem.processes:
-            if process.label == o.label:
+            if process.label == o.label and process.sigma.any():
                 applied = factor * problem.long_run.get(o.label, 1.0)
                 stated = _typical(weight) / applied
                 known = stated > 0.0

@@ -133,7 +133,7 @@ def prepare_motion(trial: Trial) -> MotionPreparation:
         turning=turning,
         estimated_noise=estimated,
         current_is_free=chain.has(CURRENT) and _current(trial)[2],
-        findings=(*trial.notes, *_notes(trial)),
+        findings=(*trial.notes, *_notes(trial), *_left_out(trial)),
     )
 
 
@@ -339,6 +339,19 @@ def _densities(
     on_legs = density(np.logical_not(turning), _LEG_SPANS)
     in_turns = density(turning, (interval, 2.0 * interval))
     return on_legs, in_turns, float(np.median(log.sigma()))
+
+
+def _left_out(trial: Trial) -> list[Finding]:
+    """Name errors that the trial states and that are not estimated without an IMU."""
+    return [
+        Finding(
+            Code.ERROR_LEFT_OUT,
+            message("error_left_out.change", section=aid.section, name=key),
+            sensor=aid.label,
+        )
+        for aid in trial.aids
+        for key in aid.settings.left_out
+    ]
 
 
 def _notes(trial: Trial) -> tuple[Finding, ...]:

@@ -19,8 +19,7 @@ from factorgraph_dvl.initialization.attitude_sensors import attitudes
 from factorgraph_dvl.initialization.in_motion_alignment import initial_states
 from factorgraph_dvl.initialization.mountings import mounted_aids, mountings_from_motion
 from factorgraph_dvl.ranging.position_from_ranges import StartPositions, positions_from_ranges
-from factorgraph_dvl.sensors.finding import Code, Finding
-from factorgraph_dvl.sensors.message import message
+from factorgraph_dvl.sensors.finding import Finding
 from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.sensors.protocol import Observation
 from factorgraph_dvl.solution import Progress
@@ -139,7 +138,6 @@ def prepare(trial: Trial, state_interval_s: float, report: Progress) -> Preparat
         mountings=start.mountings,
         findings=(
             *trial.notes,
-            *_left_out(trial),
             *louder,
             *gaps,
             *start.findings,
@@ -147,19 +145,6 @@ def prepare(trial: Trial, state_interval_s: float, report: Progress) -> Preparat
             *start_positions.findings,
         ),
     )
-
-
-def _left_out(trial: Trial) -> list[Finding]:
-    """Name errors that the trial states and that are not estimated."""
-    return [
-        Finding(
-            Code.ERROR_LEFT_OUT,
-            message("error_left_out.change", section=aid.section, name=key),
-            sensor=aid.label,
-        )
-        for aid in trial.aids
-        for key in aid.settings.left_out
-    ]
 
 
 @dataclass(frozen=True)

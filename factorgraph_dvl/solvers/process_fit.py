@@ -43,7 +43,10 @@ def refitted(problem: Problem, evaluation: Evaluation) -> tuple[Process, ...]:
         Its minimum.
     """
     before = problem.processes
-    free = [not p.density_only and p.label in problem.noise_factors for p in before]
+    free = [
+        not p.density_only and p.label in problem.noise_factors and bool(p.sigma.any())
+        for p in before
+    ]
     if not any(free):
         return before
     parameters = dict(evaluation.parameters)
@@ -64,12 +67,9 @@ def refitted(problem: Problem, evaluation: Evaluation) -> tuple[Process, ...]:
             found[i] = _moved(process, _extrapolated(step, last[i]))
             last[i] = step if last[i] is None else None
             # The same error in another unit.
-            grown = np.divide(
-                process.sigma,
-                found[i].sigma,
-                out=np.ones_like(process.sigma),
-                where=found[i].sigma > 0.0,
-            )
+            grown = np.ones(process.size)
+            later = found[i].sigma
+            np.divide(process.sigma, later, out=grown[: later.size], where=later > 0.0)
             parameters[process.name] = at.parameters[process.name] * grown
         if moved < _SAME:
             break
@@ -82,10 +82,11 @@ def _step(process: Process, nodes: Array, information: SquareRootInformation) ->
     """Return the change of the logarithms of deviation and time, (2, n); 0 where there is none."""
     pairs = [(process.key(j), process.key(j + 1)) for j in range(process.time.size - 1)]
     joint = np.array(information.joint_covariances(pairs))
-    n = process.sigma.size
+    n, size = process.sigma.size, process.size
     variance = np.diagonal(joint, axis1=1, axis2=2)
-    own = np.concatenate([variance[:1, :n], variance[:, n:]])
-    cross = np.diagonal(joint[:, :n, n:], axis1=1, axis2=2)
+    own = np.concatenate([variance[:1, :n], variance[:, size : size + n]])
+    cross = np.diagonal(joint[:, :n, size : size + n], axis1=1, axis2=2)
+    nodes = nodes[:, :n]
     dt = np.diff(process.time)
     spacing = float(np.median(dt))
     regular = np.abs(dt / spacing - 1.0) < 0.5

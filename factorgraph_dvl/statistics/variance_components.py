@@ -117,9 +117,11 @@ def _innovations(
     rows: list[tuple[Rows, Array]], groups: tuple[tuple[int, ...], ...]
 ) -> NoiseFactor:
     """Return factors on the innovations of correlated noise."""
-    squares = np.sum([np.sum(r.vector**2, axis=0) for r, _ in rows], axis=0)
-    freedom = np.sum([np.sum(1.0 - h, axis=0) for _, h in rows], axis=0)
-    factor, redundancy = np.ones(squares.size), np.zeros(squares.size)
+    # A scale that walks is the last component, and in no group.
+    size = 1 + max(map(max, groups))
+    squares = np.sum([np.sum(r.vector[:, :size] ** 2, axis=0) for r, _ in rows], axis=0)
+    freedom = np.sum([np.sum(1.0 - h[:, :size], axis=0) for _, h in rows], axis=0)
+    factor, redundancy = np.ones(size), np.zeros(size)
     for group in map(list, groups):
         left = max(float(freedom[group].sum()), 0.0)
         redundancy[group] = left

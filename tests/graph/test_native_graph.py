@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import gtsam
 import numpy as np
 import pytest
@@ -10,6 +12,7 @@ from truth import scenario
 
 from factorgraph_dvl.graph.problem import Problem
 from factorgraph_dvl.graph.processes import Process
+from factorgraph_dvl.sensors.protocol import ScaleWalk
 from factorgraph_dvl.solvers.levenberg_marquardt import minimise
 
 # Times of the nodes of correlated errors, s; a measurement lies between any two.
@@ -33,6 +36,9 @@ def weighed(kind):
             Process(label, i, np.array([0.1, 0.2, 0.3]), np.array([3.0, 4.0, 5.0]), NODES)
             for i, label in enumerate(labels)
         ]
+        (dvl,) = (o for o in problem.observations if o.label == "DVL velocity")
+        walk = ScaleWalk("scale_error", 0.01, dvl.time, dvl.measured_d)
+        processes[1] = replace(processes[1], walk=walk)
         evaluation = problem.evaluate(values)
         problem = Problem(
             problem.chain,

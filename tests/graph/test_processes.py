@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import gtsam
 import numpy as np
 import pytest
@@ -11,6 +13,7 @@ from truth import scenario
 from factorgraph_dvl.graph import keys
 from factorgraph_dvl.graph.problem import Problem
 from factorgraph_dvl.graph.processes import Process, node_times
+from factorgraph_dvl.sensors.protocol import ScaleWalk
 from factorgraph_dvl.simulation import simulate
 
 TAU = np.array([4.0, 4.0, 20.0])
@@ -43,7 +46,63 @@ def test_residuals_by_hand():
     expected = [1.0, (2.0 - phi) / np.sqrt(1.0 - phi**2)]
     np.testing.assert_allclose(p.prior_residuals(nodes)[:2, 0], expected)
     # Half-way between the first two nodes: 0.5 (1 + 2) / 2.
-    np.testing.assert_allclose(p.error(nodes, np.array([1.0]))[0], [0.75, 0.0, 0.0])
+    one = np.array([1.0])
+    np.testing.assert_allclose(p.with_error(np.zeros((1, 3)), nodes, one)[0], [0.75, 0.0, 0.0])
+
+
+def walking(time=None):
+    """A process, and a scale that walks by 0.01 in the square root of a second."""
+    seen = np.array([[2.0, 0.0, -1.0], [1.0, 3.0, 0.5], [0.0, 1.0, 2.0]])
+    walk = ScaleWalk("scale_error", 0.01, np.array([0.5, 1.0, 4.0]), seen)
+    return replace(process(time=time), walk=walk)
+
+
+def test_a_scale_that_walks_adds_a_share_of_what_is_predicted_by_hand():
+    """Over six seconds tau is 18 s, and sigma 0.01 √9 = 0.03."""
+    p = walking()
+    nodes = p.zero
+    assert nodes.shape == (4, 4)
+    nodes[:2, 3] = 1.0, 3.0
+    residual = np.array([[0.1, 0.2, 0.3]])
+    # Half-way, at 1 s: 2 sigma = 0.06, of the 1.1, 3.2 and 0.8 that are predicted.
+    out = p.with_error(residual, nodes, np.array([1.0]))
+    np.testing.assert_allclose(out, residual + 0.06 * np.array([[1.1, 3.2, 0.8]]), rtol=1e-12)
+    np.testing.assert_allclose(p.gain(nodes, np.array([1.0])), [[1.06]])
+    # Its mean: 1 and 3 over two seconds, 3 to 0 over three.
+    mean, by_key = p.mean_walk(nodes)
+    assert mean == pytest.approx(0.03 * (2.0 * 2.0 + 3.0 * 1.5) / 6.0)
+    np.testing.assert_allclose(by_key[p.key(1)], [[0.0, 0.0, 0.0, 0.03 * 2.5 / 6.0]])
+
+
+def test_changes_of_a_scale_are_those_of_a_walk():
+    p = walking(np.linspace(0.0, 100.0, 101))
+    gaussian = gtsam.GaussianFactorGraph()
+    p.add_prior(gaussian, p.zero)
+    ordering = gtsam.Ordering()
+    for j in range(101):
+        ordering.push_back(p.key(j))
+    covariance = np.linalg.inv(gaussian.hessian(ordering)[0])[3::4, 3::4]
+    sigma = 0.01 * np.sqrt(150.0)
+    for lag, most in ((1, 0.01), (10, 0.02), (100, 0.16)):
+        change = sigma**2 * 2.0 * (covariance[0, 0] - covariance[0, lag])
+        assert change == pytest.approx(0.01**2 * lag, rel=most)
+
+
+def test_columns_of_an_error_are_its_derivatives():
+    p = walking()
+    rng = np.random.default_rng(3)
+    time, residual, nodes = p.walk.time, rng.normal(size=(3, 3)), rng.normal(size=(4, 4))
+    before, _ = p.place(time)
+    h = 1e-6
+    for part, jacobian in enumerate(p.jacobians(residual, time)):
+        for m in range(3):
+            for i in range(4):
+                moved = nodes.copy()
+                moved[before[m] + part, i] += h
+                change = p.with_error(residual, moved, time) - p.with_error(residual, nodes, time)
+                np.testing.assert_allclose(jacobian[m, :, i], change[m] / h, atol=1e-8)
+    change = p.with_error(residual + h, nodes, time) - p.with_error(residual, nodes, time)
+    np.testing.assert_allclose(np.broadcast_to(p.gain(nodes, time), (3, 3)), change / h, rtol=1e-8)
 
 
 def test_the_priors_factors_are_its_residuals():

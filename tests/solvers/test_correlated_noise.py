@@ -7,11 +7,12 @@ from dataclasses import replace
 import msgspec
 import numpy as np
 import pytest
+from monte_carlo import RUNS, rms_band
 from problems import SHORT, problem_of
 from truth import scenario
 
 from factorgraph_dvl.simulation import simulate
-from factorgraph_dvl.simulation.faults import gauss_markov
+from factorgraph_dvl.simulation.faults import dvl_scale_walk, gauss_markov, with_faults
 from factorgraph_dvl.solvers.batch import solve
 from factorgraph_dvl.solvers.correlated_noise import correlated_noise
 
@@ -33,6 +34,13 @@ LONG = {
 @pytest.fixture(scope="module")
 def trial():
     return simulate(scenario(**LONG), 3)
+
+
+def walking(trial, rate, seed):
+    """Return a trial whose scale walks by a rate per √h, and which states it."""
+    out = with_faults(trial, [dvl_scale_walk(rate)], seed)
+    settings = msgspec.structs.replace(out.dvl.settings, scale_walk_std_sqrt_h=rate)
+    return replace(out, dvl=replace(out.dvl, settings=settings))
 
 
 @pytest.fixture(scope="module")
@@ -110,6 +118,31 @@ def test_a_wandering_receiver_keeps_the_stated_deviation(trial):
     np.testing.assert_allclose(position.correlated_std[:2], 2.0, rtol=0.3)
     sigma = np.sqrt(solution.trajectory.position_cov[:, 0, 0])
     assert np.all(sigma > 0.5)
+
+
+def test_a_scale_that_walks_is_reported_as_its_mean(trial):
+    """Walks of 2 % in three minutes, where a constant scale contradicts the noise."""
+    solution = solve(walking(trial, 0.1, 1), rate_hz=1.0)
+    assert solution.converged
+    assert solution.verdict.grade != "do not use"
+    scale = solution.estimate("scale_error")
+    assert np.abs(scale.value - trial.calibration_truth["scale_error"]) < 3.0 * scale.std
+    assert scale.std < 0.002
+    causes = {c.cause: c.assumed for c in solution.error_budget}
+    assert causes["correlated noise of DVL velocity"] == "scale 0.1 /√h"
+    # White noise is none of the scale.
+    assert noise(solution)["dvl_velocity"].correlation_time is None
+
+
+@pytest.mark.slow
+def test_the_deviation_of_a_scale_that_walks_is_that_of_its_errors(trial):
+    z = []
+    for seed in range(RUNS):
+        walked = walking(simulate(scenario(**LONG), 100 + seed), 0.03, seed)
+        scale = solve(walked, rate_hz=1.0).estimate("scale_error")
+        z.append((scale.value - walked.calibration_truth["scale_error"]) / scale.std)
+    low, high = rms_band(RUNS)
+    assert low < np.sqrt(np.mean(np.square(z))) < high
 
 
 def test_nodes_reach_as_far_as_the_outliers():

@@ -42,6 +42,14 @@ def solution(ship):
     return solve(ship, rate_hz=1.0)
 
 
+def test_a_scale_that_walks_is_named_as_left_out(ship):
+    settings = msgspec.structs.replace(ship.dvl.settings, scale_walk_std_sqrt_h=0.001)
+    walking = replace(ship, dvl=replace(ship.dvl, settings=settings))
+    for each, count in ((ship, 0), (walking, 1)):
+        found = prepare_motion(each).findings
+        assert sum(f.code == Code.ERROR_LEFT_OUT for f in found) == count
+
+
 def deviations(solution, truth):
     return {
         name: (solution.estimate(name).value - truth[name]) / solution.estimate(name).std

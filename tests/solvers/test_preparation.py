@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import msgspec
 import numpy as np
 import pytest
 import solved
@@ -89,15 +88,6 @@ def test_a_trial_without_a_position_is_refused():
     trial, _ = solved.turning()
     with pytest.raises(DataError, match="position"):
         prepare(replace(trial, gnss=None), 1.0, lambda *_: None)
-
-
-def test_an_error_that_is_stated_and_not_estimated_is_named():
-    trial, _ = solved.turning()
-    settings = msgspec.structs.replace(trial.dvl.settings, scale_walk_std_sqrt_h=0.001)
-    walking = replace(trial, dvl=replace(trial.dvl, settings=settings))
-    for each, count in ((trial, 0), (walking, 1)):
-        found = prepare(each, 1.0, lambda stage, iteration, cost: None).findings
-        assert sum(f.code == Code.ERROR_LEFT_OUT for f in found) == count
 
 
 def test_large_jumps_of_gnss_turn_no_mounting_that_is_started_from(prepared):
