@@ -49,9 +49,9 @@ _STANDS_OUT = 1.4
 _NO_WORSE = 1.15
 _BETTER_THERE = 0.8
 _DOMINATES = 50.0
-# Share of the changes of velocity that an offset by periods of the sway leaves in the usual window
-# at most. Chosen: sway repeats itself nearly; where no offset fits, another is no better.
-_REPEATED = 0.5
+# Windows beside it in which other offsets are refined. Chosen: those with the largest changes of
+# velocity show nearly all.
+_BESIDE = 4
 # Halvings of a step that does not gain.
 _HALVINGS = 3
 # Blocks of measurements whose errors are independent, s. Chosen: several times the correlation
@@ -281,17 +281,16 @@ def _dominating(comparison: Comparison, offset: float, around: float, reach: flo
     """
     at = _variances(comparison, offset)
     worst = int(np.argmax(at))
-    share = at * comparison.count / np.maximum(comparison.signal, 1e-12)
-    if at[worst] < _STANDS_OUT * np.median(at) or np.median(share) > _REPEATED:
+    if at[worst] < _STANDS_OUT * np.median(at):
         return offset
     there = comparison.only(np.array([worst]))
     grid = _grid(around, reach, _FINE_STEP_S)
     minima = grid[_minima(_misfits_at(there, grid).sum(axis=1), np.inf)]
-    likely = np.argsort(_misfits_at(comparison, minima).sum(axis=1))
-    starts = minima[likely[:_MINIMA]]
+    some = comparison.only(np.union1d(np.argsort(comparison.signal)[-_BESIDE:], [worst]))
+    likely = np.argsort(_misfits_at(some, minima).sum(axis=1))
     best, most = offset, _DOMINATES
-    for start in starts:
-        fit = _refined(comparison, np.ones_like(comparison.time)[..., None], np.array([start]))
+    for start in minima[likely[:_MINIMA]]:
+        fit = _refined(some, np.ones_like(some.time)[..., None], np.array([start]))
         ratio = _variances(comparison, float(fit.values[0])) / at
         gain = -0.5 * float(np.sum(comparison.count * np.log(ratio)))
         if gain > most and ratio.max() < _NO_WORSE and ratio[worst] < _BETTER_THERE:
