@@ -35,6 +35,11 @@ Progress = Callable[[str, int, float | None], None]
 # Stems of the parameters that every dead-reckoned track depends on; of a lever arm it only
 # does in turns.
 DEAD_RECKONING = ("misalignment", "scale_error", "beam_direction", "beam_scale_error")
+# Scale errors of velocity logs, the largest that one has, and the standard deviations beyond it
+# that are no chance. Chosen: a sound speed of 1500 m/s in fresh water of 5 °C makes 5 %.
+_SCALES = ("scale_error", "beam_scale_error")
+_LARGEST_SCALE = 0.05
+_CERTAIN = 3.0
 # Standard deviations between prior and data that are no chance. Chosen: its probability is 6e-7.
 _FAR_FROM_PRIOR = 5.0
 # Standard deviations by which a wrong prior may draw a value. Chosen: one is within what is
@@ -638,7 +643,7 @@ def consistency_findings(
     factors = {n.name: n.factor for n in noise}
     out = []
     for e in estimates:
-        out += _far_from_prior(e)
+        out += _far_from_prior(e) + _impossible_scale(e)
     for r in residuals:
         factor = factors.get(noise_name(r.label))
         stated = r.sigma if factor is None else r.sigma / factor
@@ -666,6 +671,22 @@ def consistency_findings(
             text = message("small_residuals.noise", ratio=np.nanmin(factor))
             out.append(Finding(Code.SMALL_RESIDUALS, text, sensor=r.label))
     return out
+
+
+def _impossible_scale(e: Estimate) -> list[Finding]:
+    """Return a finding if a scale error is larger than a velocity log has, unless stated so."""
+    if e.spec.stem not in _SCALES:
+        return []
+    off = np.minimum(np.abs(e.value), np.abs(e.value - e.prior_value))
+    if not (off - _CERTAIN * e.std > _LARGEST_SCALE).any():
+        return []
+    worst = int(np.argmax(off - _CERTAIN * e.std))
+    value, std, name = e.value[worst], e.std[worst], e.component_names[worst]
+    text = (
+        f"{name} is {value:.2g} ± {std:.1g}, and a velocity log that works is within "
+        f"{100.0 * _LARGEST_SCALE:.0f} %: a current, a unit or another error is taken for it"
+    )
+    return [Finding(Code.IMPOSSIBLE_SCALE, text, parameter=e.name)]
 
 
 def _far_from_prior(e: Estimate) -> list[Finding]:

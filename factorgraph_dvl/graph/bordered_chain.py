@@ -152,8 +152,11 @@ class Factorisation:
         e = self._equations
         right = np.einsum("kic,ki->c", self.influence, e.node_gradient) - e.constant_gradient
         constants = self.constants @ right
-        nodes = -self.solve_nodes(e.node_gradient[:, :, None])[:, :, 0]
-        return nodes - self.influence @ constants, constants
+        return self.node_step() - self.influence @ constants, constants
+
+    def node_step(self) -> Array:
+        """Return the Gauss-Newton step of the nodes (K, n), the constants exact."""
+        return -self.solve_nodes(self._equations.node_gradient[:, :, None])[:, :, 0]
 
     @property
     def log_determinant(self) -> float:
@@ -192,6 +195,26 @@ class Covariances:
     across: Array
     with_constants: Array
     constants: Array
+
+    def given_constants(self) -> Covariances:
+        """Return those of the nodes where the constants are exact."""
+        k, n, _ = self.with_constants.shape
+        gain = self.with_constants @ np.linalg.inv(self.constants)
+        by_constants = self.with_constants.transpose(0, 2, 1)
+        return Covariances(
+            nodes=self.nodes - gain @ by_constants,
+            across=self.across - gain[:-1] @ by_constants[1:],
+            with_constants=np.zeros((k, n, 0)),
+            constants=np.zeros((0, 0)),
+        )
+
+    def products(self, node: np.ndarray, rows: Array) -> Array:
+        """Return rows (M, d, 2 n + c) times the covariance of nodes (M,), the next, constants."""
+        out = np.empty_like(rows)
+        for a in range(0, node.size, _CHUNK):
+            part = slice(a, a + _CHUNK)
+            out[part] = rows[part] @ self.around(node[part])
+        return out
 
     def around(self, node: np.ndarray) -> Array:
         """Return the covariance of nodes (M,), the next ones and the constants, side by side."""

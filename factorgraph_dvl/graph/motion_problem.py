@@ -11,7 +11,12 @@ import numpy as np
 
 from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.vectors import Array, rotate
-from factorgraph_dvl.graph.bordered_chain import Covariances, NormalEquations, rows_by_node
+from factorgraph_dvl.graph.bordered_chain import (
+    Covariances,
+    Factorisation,
+    NormalEquations,
+    rows_by_node,
+)
 from factorgraph_dvl.graph.clocks import linearized, true_time
 from factorgraph_dvl.graph.motion_chain import Interpolation, MotionChain
 from factorgraph_dvl.graph.priors import local_coordinates, places, prior_mean, prior_root
@@ -24,6 +29,12 @@ from factorgraph_dvl.sensors.protocol import Linearization, Motion, Observation
 ATTITUDE = "attitude"
 CURRENT = "current"
 _SCALE = "scale_error"
+# Factor on the density of acceleration that makes a prior weak. Chosen: of its effect on constants
+# a tenth of a percent is left, and the states stay determined in gaps.
+_WEAKER = 1000.0
+# Share of the current on which the motion over ground does not depend, and its standard deviation.
+# Chosen: all of it if a vessel keeps its track, none if it drifts, any in between as likely.
+_TRACK, TRACK_STD = 0.5, 12.0**-0.5
 # Least share of a residual's variance that its fit leaves. Chosen: below it rounding decides.
 _LEAST_LEFT = 0.02
 
@@ -152,6 +163,9 @@ class MotionProblem:
         By label, factors (d,) on stated standard deviations.
     rejected : mapping of str to ndarray
         By label, whether measurements (M,) are left out.
+    slope : ndarray, shape (c,)
+        Derivatives by the constants that are added to those of the cost, as `follow_motion` found
+        them.
     total_sigma : list of ndarray
         Standard deviations (M, d) of the residuals by observation, infinite where not used: noise
         of the sensor and the attitude, and the motion between states.
@@ -175,6 +189,8 @@ class MotionProblem:
         self.zero = 0.5 * float(chain.time[0] + chain.time[-1])
         self.noise_factors: Mapping[str, Array] = {}
         self.rejected: Mapping[str, np.ndarray] = {}
+        self.slope = np.zeros(self.constants)
+        self._slope_at = self.prior_values()
         self._start = start
         self._nRl = level_axes(frame, start[:, :3])
         self.total_sigma: list[Array] = []
@@ -323,7 +339,56 @@ class MotionProblem:
         whitened.append(self.motion_rows(evaluation.states).residual)
         whitened.append(self.chain.first() * (evaluation.states[0] - self._first()))
         whitened.append(self._prior_residual(evaluation.parameters))
-        return 0.5 * sum(float(np.vdot(r, r)) for r in whitened)
+        linear = self.slope @ self._from(self._slope_at, evaluation.parameters)
+        return 0.5 * sum(float(np.vdot(r, r)) for r in whitened) + float(linear)
+
+    def follow_motion(
+        self, evaluation: MotionEvaluation, factors: Factorisation, covariances: Covariances
+    ) -> Array:
+        """Set the slope by which the constants do not depend on how smooth the prior is.
+
+        At the least cost the prior holds the states back, and a scale error, or a clock, makes up
+        for it: in a tidal race a scale error of 0.29 came from it. Their gradient is therefore
+        that of residuals about the states that a much weaker prior allows, with the derivatives
+        at these states: the residuals then contain noise alone, whatever the motion is like. Of a
+        single velocity that GNSS and log measure this is the least-squares fit of one to the
+        other, with the smoothed velocity as the instrument.
+
+        A vessel that keeps its track moves independently of the current, one that drifts moves
+        with it. In between, a share of the current's information on the scale error counts.
+
+        Returns
+        -------
+        ndarray, shape (c,)
+            Change of the slope from a vessel that drifts to one that keeps its track.
+        """
+        weak = self.with_chain(replace(self.chain, density=_WEAKER * self.chain.density))
+        data = weak._without_motion(evaluation)
+        weak._add_motion(data, evaluation.states)
+        freed = data.factorise().node_step() - factors.node_step()
+        slope = np.einsum("kic,ki->c", data.border, freed)
+        given = covariances.given_constants()
+        by_track = np.zeros(self.constants)
+        for o, seen, W in zip(
+            self.observations, evaluation.seen, evaluation.whitening, strict=True
+        ):
+            at, J = seen.interpolation, W @ seen.by_state
+            by_nodes = np.concatenate(at.by_nodes(J), axis=2)
+            through = given.products(at.node, by_nodes)
+            left = np.eye(J.shape[1]) - through @ by_nodes.transpose(0, 2, 1)
+            by_time = 0.5 * np.sum(at.variance_rate(J) * left, axis=(1, 2))
+            self._add_by_clocks(slope, o, by_time)
+            if not (self.chain.has(CURRENT) and _SCALE in o.parameters and _SCALE in self.columns):
+                continue
+            flow = np.zeros_like(J)
+            place = self.chain.place(CURRENT)
+            flow[:, :, place] = J[:, :, place]
+            by_row = np.sum(np.concatenate(at.by_nodes(flow), axis=2) * through, axis=(0, 2))
+            gain = 1.0 + evaluation.parameters[_SCALE]
+            by_track[self.columns[_SCALE]] += (by_row.sum() if gain.size == 1 else by_row) / gain
+        self.slope = slope + _TRACK * by_track
+        self._slope_at = dict(evaluation.parameters)
+        return by_track
 
     def equations(self, evaluation: MotionEvaluation) -> NormalEquations:
         """Return the normal equations at an evaluation."""
@@ -370,6 +435,7 @@ class MotionProblem:
             gain = np.linalg.inv(self.prior_root)
             out.corner += gain.T @ gain
             out.constant_gradient += gain.T @ self._prior_residual(evaluation.parameters)
+            out.constant_gradient += self.slope
         return out
 
     def _add_variances(self, equations: NormalEquations, evaluation: MotionEvaluation) -> None:
@@ -379,14 +445,18 @@ class MotionProblem:
         ):
             u = rotate(W.transpose(0, 2, 1), rotate(W, seen.residual))
             by_time = -0.5 * np.sum(u * rotate(seen.interpolation.variance_rate(J), u), axis=1)
-            later = {self.clock: np.ones(by_time.size)}
-            if o.clock is not None:
-                offset, rate = o.clock.names
-                later[offset] = later.get(offset, np.zeros(by_time.size)) - 1.0
-                later[rate] = self.zero - o.time
-            for name, change in later.items():
-                if name in self.columns:
-                    equations.constant_gradient[self.columns[name]] += by_time @ change
+            self._add_by_clocks(equations.constant_gradient, o, by_time)
+
+    def _add_by_clocks(self, gradient: Array, o: Observation, by_time: Array) -> None:
+        """Add derivatives (M,) by times of measurements among the nodes to those by clocks."""
+        later = {self.clock: np.ones(by_time.size)}
+        if o.clock is not None:
+            offset, rate = o.clock.names
+            later[offset] = later.get(offset, np.zeros(by_time.size)) - 1.0
+            later[rate] = self.zero - o.time
+        for name, change in later.items():
+            if name in self.columns:
+                gradient[self.columns[name]] += by_time @ change
 
     def _add_motion(self, equations: NormalEquations, states: Array) -> float:
         """Add the prior of the motion, and return its sum of squares."""
@@ -405,8 +475,13 @@ class MotionProblem:
     def _prior_residual(self, parameters: Mapping[str, Array]) -> Array:
         if not self.parameters:
             return np.zeros(0)
-        off = [local_coordinates(p, parameters[p.name], prior_mean(p)) for p in self.parameters]
-        return np.asarray(np.linalg.solve(self.prior_root, np.concatenate(off)))
+        off = self._from({p.name: prior_mean(p) for p in self.parameters}, parameters)
+        return np.asarray(np.linalg.solve(self.prior_root, off))
+
+    def _from(self, origin: Mapping[str, Array], parameters: Mapping[str, Array]) -> Array:
+        """Return the estimated parameters in coordinates (c,) about others."""
+        off = [local_coordinates(p, parameters[p.name], origin[p.name]) for p in self.parameters]
+        return np.concatenate([np.zeros(0), *off])
 
     def _sigma(self, name: str) -> Array:
         return next(p.sigma for p in self.chain.processes if p.name == name)
@@ -425,13 +500,9 @@ class MotionProblem:
         covered = self.chain.covers(by_nodes) & self.attitude.covers(stamp)
         v_n = x[:, 3:6]
         flows = self.chain.has(CURRENT) and any(n.startswith("current") for n in o.parameters)
-        # The process is the current as a DVL with a scale error of k sees it, (1 + k) times the
-        # true one: a prior of the true one would pull k up, with which it grows smaller.
-        scale = 1.0 + float(np.mean(parameters.get(_SCALE, 0.0)))
-        flow = np.zeros_like(v_n)
         if flows:
-            flow[:, :2] = x[:, self.chain.place(CURRENT)] * self._sigma(CURRENT) / scale
-            v_n = v_n - flow
+            v_n = v_n.copy()
+            v_n[:, :2] -= x[:, self.chain.place(CURRENT)] * self._sigma(CURRENT)
         motion = Motion(
             nRb=body.nRb,
             p_n=x[:, :3],
@@ -454,7 +525,7 @@ class MotionProblem:
             by_state[:, :, 3:6] = lin.d_v
             if flows:
                 place = self.chain.place(CURRENT)
-                by_state[:, :, place] = -lin.d_v[:, :, :2] * self._sigma(CURRENT) / scale
+                by_state[:, :, place] = -lin.d_v[:, :, :2] * self._sigma(CURRENT)
         if self.chain.has(ATTITUDE):
             by_state[:, :, self.chain.place(ATTITUDE)] = by_rph * self._sigma(ATTITUDE)
         residual = lin.residual
@@ -476,9 +547,6 @@ class MotionProblem:
                 by_parameters[:, :, place] += lin.d_parameters[name]
             if name in found:
                 by_parameters[:, :, place] += found[name]
-            if name == _SCALE and lin.d_v is not None and name in lin.d_parameters:
-                share = (lin.d_v @ flow[:, :, None]) / scale
-                by_parameters[:, :, place] += share / (place.stop - place.start)
         return Seen(motion, by_nodes, at, body, residual, by_state, by_parameters, by_rph, covered)
 
     def _by_attitude(

@@ -461,6 +461,13 @@ class Code(StrEnum):
         "Read the misalignment together with the heading error, or relative to the mean heading.",
         "note",
     )
+    IMPOSSIBLE_SCALE = (
+        "impossible_scale",
+        "A scale error is larger than a velocity log that works can have.",
+        "Something else, such as a current, is taken for it, and biases the other values.",
+        "Check units and sound speed. Through water, sail faster, on both sides of each course.",
+        "error",
+    )
     FAR_FROM_PRIOR = (
         "far_from_prior",
         "A value is far outside its prior.",

@@ -16,6 +16,7 @@ from factorgraph_dvl.graph.bordered_chain import Covariances, Factorisation
 from factorgraph_dvl.graph.motion_chain import MotionChain
 from factorgraph_dvl.graph.motion_problem import (
     CURRENT,
+    TRACK_STD,
     MotionEvaluation,
     MotionProblem,
     with_sigma,
@@ -35,14 +36,17 @@ _FAR_STEPS = 6
 # at a minimum with a kink: the acceleration jumps at a node, where a clock may move a measurement.
 _STILL = 0.05
 _STEPS = 3
+# Standard deviations by which a new slope of the cost may move the minimum at the end.
+# Chosen: it follows noise and strengths, which are known no better.
+_PULLED = 0.1
 # Share by which a cost may miss what the linear model promised before another length of the step
 # is tried, and the longest of these. Chosen: well above rounding, and what clocks need.
 _POOR = 0.3
 _LONGEST_STEP = 4.0
 # Rounds of weights, noise and strength after which they count as not settled, and the relative
 # change of a standard deviation from which on there is another. Measured: most take four to ten, a
-# river boat with five searches for outliers 36.
-_ROUNDS = 40
+# river boat with five searches for outliers 45.
+_ROUNDS = 60
 _SAME = 0.03
 # Change of the logarithm of a noise factor below which it is extrapolated. Chosen: larger ones are
 # those of the first rounds, in which outliers and clocks move them.
@@ -66,9 +70,11 @@ _CURRENT = message("not_converged.current")
 _CURRENT_ROUNDS = 5
 # Reach of the first and the later searches by the logarithm of the strength, and their precision.
 _FAR, _NEAR, _FINEST = 0.7, 0.2, 0.03
-# Limits of the strength of a current: m/s and s, by its logarithm.
+# Limits of the strength of a current: m/s and s, by its logarithm. Chosen: a current that changes
+# faster is noise of pings. A limit of 60 s, in a tidal race of 20 to 30 s, took slow changes for
+# more uncertain, and fast ones for less, than they were.
 _CURRENT_STD = (math.log(0.005), math.log(2.0))
-_CURRENT_TIME = (math.log(60.0), math.log(2e5))
+_CURRENT_TIME = (math.log(3.0), math.log(2e5))
 # Density of acceleration, relative to that in turns, which changes nothing; and the largest step
 # of its logarithm.
 _NEGLIGIBLE = 1e-3
@@ -97,6 +103,9 @@ class SmoothedMotion:
         Steps of all rounds.
     findings : tuple of Finding
         What the user must know.
+    by_track : ndarray, shape (c,)
+        Standard deviations of the constants, with signs, that come from not knowing how much the
+        current carries the vessel.
     """
 
     problem: MotionProblem
@@ -106,6 +115,12 @@ class SmoothedMotion:
     converged: bool
     iterations: int
     findings: tuple[Finding, ...]
+    by_track: Array
+
+    @property
+    def constants(self) -> Array:
+        """Covariance of the constants, (c, c), that of the share of the current included."""
+        return self.covariances.constants + np.outer(self.by_track, self.by_track)
 
 
 def smooth_motion(prepared: MotionPreparation, report: Progress) -> SmoothedMotion:
@@ -138,6 +153,11 @@ def smooth_motion(prepared: MotionPreparation, report: Progress) -> SmoothedMoti
         if not reached and _moved(problem, factors, values, earlier[-2:][0]) > _STILL:
             changing.append(message("not_converged.minimum"))
         earlier.append(values)
+        slope = problem.slope
+        by_track = problem.follow_motion(evaluation, factors, covariances)
+        pulled = factors.constants @ (problem.slope - slope)
+        if np.any(np.abs(pulled) > _PULLED * np.sqrt(np.diag(factors.constants))):
+            changing.append("the minimum")
         if searches < _FIRST_SEARCHES and _rejects_others(problem, evaluation, covariances):
             searches += 1
             changing.append(message("not_converged.outliers"))
@@ -193,7 +213,14 @@ def smooth_motion(prepared: MotionPreparation, report: Progress) -> SmoothedMoti
         text = message("not_converged.rounds", rounds=_ROUNDS, changing=changing)
         findings += (Finding(Code.NOT_CONVERGED, text, severity="error"),)
     return SmoothedMotion(
-        problem, evaluation, factors, covariances, not changing, iterations, findings
+        problem,
+        evaluation,
+        factors,
+        covariances,
+        not changing,
+        iterations,
+        findings,
+        TRACK_STD * factors.constants @ by_track,
     )
 
 

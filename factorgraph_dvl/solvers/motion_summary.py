@@ -37,6 +37,7 @@ from factorgraph_dvl.trial import Trial
 # Epochs whose covariances are computed at once.
 _CHUNK = 4000
 _MOTION_NOISE = "acceleration between states"
+_TRACK = "how much the current carries the vessel"
 
 
 def summarise_motion(trial: Trial, found: SmoothedMotion, *, rate_hz: float) -> Solution:
@@ -57,7 +58,7 @@ def summarise_motion(trial: Trial, found: SmoothedMotion, *, rate_hz: float) -> 
         lambda r: r[0],
     )
     gain = _reported_gain(problem, [(p, r.derivative) for p, r in rows if p.estimated])
-    joint = gain @ found.covariances.constants @ gain.T
+    joint = gain @ found.constants @ gain.T
     estimates, covariance = estimates_of([(p, r.value) for p, r in rows], joint)
     residuals, rejected = _residuals(found)
     noise = tuple(Noise(noise_name(n), f) for n, f in problem.noise_factors.items())
@@ -216,10 +217,13 @@ def _causes(
         for p in problem.parameters:
             k = whiten[problem.columns[p.name]] @ cov.constants @ gain.T
             variances[PRIOR.format(p.name)] = np.sum(k**2, axis=0)
+    if chain.has(CURRENT):
+        variances[_TRACK] = (gain @ found.by_track) ** 2
     assumed = {
         PRIOR.format(p.name): numbers_with_unit(p.sigma / p.si, UNITS[p.spec.unit].text)
         for p in problem.parameters
     }
+    assumed[_TRACK] = "any share"
     is_free = np.concatenate([np.full(p.mean.size, p.estimated) for p in reported])
     exact = np.concatenate([p.sigma == 0.0 for p in reported])
     out = []
@@ -269,7 +273,8 @@ def _heading_and_misalignment(trial: Trial, found: SmoothedMotion) -> list[Findi
     down = frd_from_body(trial.body_axes)[2]
     by_constants = np.zeros(problem.constants)
     by_constants[problem.columns[name]] = down
-    alone = float(np.sqrt(by_constants @ found.covariances.constants @ by_constants))
+    constants = found.constants
+    alone = float(np.sqrt(by_constants @ constants @ by_constants))
     weight = np.gradient(chain.time) / (chain.time[-1] - chain.time[0])
     weight /= weight.sum()
     by_states = np.zeros_like(x)
@@ -288,9 +293,7 @@ def _heading_and_misalignment(trial: Trial, found: SmoothedMotion) -> list[Findi
             by_constants[problem.columns[own]] = weight @ matrix
     through = found.factors.solve_nodes(by_states[:, :, None])[:, :, 0]
     rest = by_constants - np.einsum("kic,ki->c", found.factors.influence, by_states)
-    together = float(
-        np.sqrt(np.vdot(by_states, through) + rest @ found.covariances.constants @ rest)
-    )
+    together = float(np.sqrt(np.vdot(by_states, through) + rest @ constants @ rest))
     angle = -float(down @ in_unit(_parameter(problem, name), values[name]).value)
     text = message(
         "heading_error.about_the_vertical",

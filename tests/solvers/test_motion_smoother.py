@@ -13,7 +13,7 @@ from truth import CONFIGS
 
 from factorgraph_dvl.analysis.error_statistics import calibration_errors
 from factorgraph_dvl.errors import ConfigError, FactorgraphDvlError
-from factorgraph_dvl.graph.motion_problem import CURRENT
+from factorgraph_dvl.graph.priors import after_step
 from factorgraph_dvl.io.trial_folder import load_trial, save_trial
 from factorgraph_dvl.sensors.finding import Code
 from factorgraph_dvl.simulation import load_scenario, simulate
@@ -194,22 +194,42 @@ def test_derivatives_by_clocks_are_those_of_residuals(ship):
             np.testing.assert_allclose(found, slope, atol=0.01)
 
 
-def test_the_current_as_a_dvl_sees_it_does_not_pull_the_scale_error():
-    problem = (prepared := prepare_motion(simulate(shortened("ship-water"), 1))).problem
-    place = problem.chain.place(CURRENT)
-    flowing = prepared.states.copy()
-    flowing[:, place] = 2.0
+def scale_error_with(prepared, strength, *, follows):
+    """Return the scale error, and its standard deviation, of another density of acceleration."""
+    problem = prepared.problem
+    chain = replace(problem.chain, density=strength * problem.chain.density)
+    problem = problem.with_chain(chain)
+    states, values = prepared.states, problem.prior_values() | prepared.values
+    problem.weigh(problem.evaluate(states, values))
+    for _ in range(6):
+        evaluation = problem.evaluate(states, values)
+        factors = problem.equations(evaluation).factorise()
+        if follows:
+            problem.follow_motion(evaluation, factors, factors.covariances())
+        nodes, constants = problem.equations(evaluation).factorise().step()
+        states = states + nodes
+        values = after_step(problem.parameters, values, constants)
+    column = problem.columns["scale_error"]
+    return values["scale_error"][0], np.sqrt(factors.constants[column, column][0, 0])
 
-    def residual(states, scale):
-        values = problem.prior_values() | prepared.values | {"scale_error": np.array([scale])}
-        return problem.evaluate(states, values).seen[1]
 
-    changes = [
-        residual(flowing, k).residual - residual(prepared.states, k).residual for k in (0.0, 0.2)
-    ]
-    assert np.abs(changes[0]).max() > 0.1
-    np.testing.assert_allclose(changes[0], changes[1], atol=1e-12)
-    step = 1e-5
-    slope = residual(flowing, step).residual - residual(flowing, -step).residual
-    by_scale = residual(flowing, 0.0).by_parameters[:, :, problem.columns["scale_error"]]
-    np.testing.assert_allclose(by_scale[:, :, 0], slope / (2.0 * step), atol=1e-6)
+def test_a_scale_error_does_not_make_up_for_a_prior_that_is_too_smooth():
+    prepared = prepare_motion(simulate(shortened(), 1))
+    (smooth, std), (rough, _) = (
+        scale_error_with(prepared, strength, follows=True) for strength in (0.03, 10.0)
+    )
+    assert abs(smooth - rough) < 0.5 * std
+    (smooth, _), (rough, _) = (
+        scale_error_with(prepared, strength, follows=False) for strength in (0.03, 10.0)
+    )
+    assert smooth - rough > 1.5 * std
+
+
+def test_a_current_adds_what_is_unknown_of_its_share_in_the_motion():
+    solution = solve(simulate(shortened("ship-water"), 1), rate_hz=0.1)
+    (cause,) = (c for c in solution.error_budget if "carries the vessel" in c.cause)
+    at = solution.order.index("scale_error")
+    # A fast ship owes little to it.
+    assert 0.0 < cause.adds[at] < 0.5 * np.sqrt(solution.covariance[at, at])
+    total = np.sum([c.adds**2 for c in solution.error_budget], axis=0)
+    np.testing.assert_allclose(total, np.diag(solution.covariance), rtol=1e-6)
