@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,8 @@ from matplotlib.figure import Figure
 
 import factorgraph_dvl as fd
 from factorgraph_dvl.errors import ConfigError
+from factorgraph_dvl.sensors.finding import Code
+from factorgraph_dvl.solution import consistency_findings
 
 ROOT = Path(__file__).resolve().parents[1]
 FIGURES = ["track", "motion", "dvl_residuals", "calibration", "correlation"]
@@ -122,3 +125,21 @@ def test_axes_without_a_grid_have_a_place(loaded):
 def test_an_unknown_figure_is_refused(solution):
     with pytest.raises(ConfigError, match=r"no figure 'poses'.*one of track, motion"):
         solution.plot("poses")
+
+
+@pytest.mark.parametrize(("value", "std", "stated", "refused"), [
+    (0.29, 0.02, 0.0, True),
+    (-0.20, 0.02, 0.0, True),
+    (0.29, 0.10, 0.0, False),
+    (0.06, 0.01, 0.0, False),
+    (0.29, 0.02, 0.3, False),
+])  # fmt: skip
+def test_a_scale_error_that_no_log_has_is_not_to_be_used(solution, value, std, stated, refused):
+    scale = replace(
+        solution.estimate("scale_error"),
+        value=np.array([value]),
+        std=np.array([std]),
+        prior_value=np.array([stated]),
+    )
+    found = consistency_findings([scale], [])
+    assert [f.severity for f in found if f.code == Code.IMPOSSIBLE_SCALE] == ["error"] * refused

@@ -30,8 +30,8 @@ ATTITUDE = "attitude"
 CURRENT = "current"
 _SCALE = "scale_error"
 # Factor on the density of acceleration that makes a prior weak. Chosen: of its effect on constants
-# a tenth of a percent is left, and the states stay determined in gaps.
-_WEAKER = 1000.0
+# a percent is left, and the states stay determined in gaps.
+_WEAKER = 100.0
 # Share of the current on which the motion over ground does not depend, and its standard deviation.
 # Chosen: all of it if a vessel keeps its track, none if it drifts, any in between as likely.
 _TRACK, TRACK_STD = 0.5, 12.0**-0.5
@@ -345,14 +345,17 @@ class MotionProblem:
     def follow_motion(
         self, evaluation: MotionEvaluation, factors: Factorisation, covariances: Covariances
     ) -> Array:
-        """Set the slope by which the constants do not depend on how smooth the prior is.
+        """Set the slope by which scale errors and clocks do not depend on the prior of the motion.
 
-        At the least cost the prior holds the states back, and a scale error, or a clock, makes up
-        for it: in a tidal race a scale error of 0.29 came from it. Their gradient is therefore
-        that of residuals about the states that a much weaker prior allows, with the derivatives
-        at these states: the residuals then contain noise alone, whatever the motion is like. Of a
-        single velocity that GNSS and log measure this is the least-squares fit of one to the
-        other, with the smoothed velocity as the instrument.
+        At the least cost the prior holds the velocity back, and a scale error makes up for it: in
+        a tidal race one of 0.29 came from it. Its gradient is therefore that of residuals about
+        the states that a much weaker prior allows, with the derivatives at these states: the
+        residuals then contain noise alone, whatever the motion is like. Of a single velocity that
+        GNSS and log measure this is the least-squares fit of one to the other, with the smoothed
+        velocity as the instrument. Lever arms and mountings gain nothing from it but noise.
+
+        Clocks change the variance R of the motion between nodes: half the logarithm of det R goes
+        with what the cost gains where R is large.
 
         A vessel that keeps its track moves independently of the current, one that drifts moves
         with it. In between, a share of the current's information on the scale error counts.
@@ -366,7 +369,10 @@ class MotionProblem:
         data = weak._without_motion(evaluation)
         weak._add_motion(data, evaluation.states)
         freed = data.factorise().node_step() - factors.node_step()
-        slope = np.einsum("kic,ki->c", data.border, freed)
+        slope = np.zeros(self.constants)
+        for name, column in self.columns.items():
+            if name.endswith(_SCALE):
+                slope[column] = np.einsum("kic,ki->c", data.border[:, :, column], freed)
         given = covariances.given_constants()
         by_track = np.zeros(self.constants)
         for o, seen, W in zip(

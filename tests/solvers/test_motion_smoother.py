@@ -13,8 +13,10 @@ from truth import CONFIGS
 
 from factorgraph_dvl.analysis.error_statistics import calibration_errors
 from factorgraph_dvl.errors import ConfigError, FactorgraphDvlError
+from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.graph.priors import after_step
 from factorgraph_dvl.io.trial_folder import load_trial, save_trial
+from factorgraph_dvl.sensors.attitude import SCHULER_PERIOD
 from factorgraph_dvl.sensors.finding import Code
 from factorgraph_dvl.simulation import load_scenario, simulate
 from factorgraph_dvl.simulation.compass import InsTruth
@@ -233,3 +235,49 @@ def test_a_current_adds_what_is_unknown_of_its_share_in_the_motion():
     assert 0.0 < cause.adds[at] < 0.5 * np.sqrt(solution.covariance[at, at])
     total = np.sum([c.adds**2 for c in solution.error_budget], axis=0)
     np.testing.assert_allclose(total, np.diag(solution.covariance), rtol=1e-6)
+
+
+def dense_standard_deviations(trial, scenario, span):
+    """Return those of phase, rad, and scale by generalised least squares of means over a span, s.
+
+    z_s = (1 - k) exp(-i (alpha + e)) z_d + w: e the oscillation of the heading, w the current and
+    the noise of differences of fixes, whose covariances are those that the scenario draws from.
+    """
+    moving, gnss = scenario.dvl.moving_water, trial.gnss.settings
+    time = trial.reference.time
+    east, north, _ = trial.frame().position(*trial.reference.geodetic.T).T
+    edges = np.flatnonzero(np.isin(time, np.arange(time[0], time[-1], span)))
+    at, ends, place = time[edges], np.diff(time[edges]), (east + 1j * north)[edges]
+    z = np.diff(place) / ends
+    middle, there = 0.5 * (at[1:] + at[:-1]), 0.5 * (place[1:] + place[:-1])
+    later = np.abs(middle[:, None] - middle) / moving.correlation_time_s
+    apart = np.abs(there[:, None] - there) / moving.correlation_distance_m
+    covariance = moving.std_m_s**2 * np.exp(-later - apart)
+    covariance += trial.dvl.settings.current_std_m_s[0] ** 2
+    fixes = gnss.correlated_std_m[0] ** 2 * np.exp(
+        -np.abs(at[:, None] - at) / gnss.correlation_time_s
+    )
+    fixes += gnss.position_std_m[0] ** 2 * np.eye(at.size)
+    covariance += np.diff(np.diff(fixes, axis=0), axis=1) / np.outer(ends, ends)
+    covariance += trial.dvl.settings.velocity_std_m_s**2 / span * np.eye(z.size)
+    swing = 2.0 * np.pi / SCHULER_PERIOD * middle
+    columns = np.stack([1j * z, z, 1j * z * np.cos(swing), 1j * z * np.sin(swing)], axis=1)
+    weights = np.linalg.inv(covariance)
+    information = np.real(columns.conj().T @ weights @ columns)
+    stated = trial.attitude.settings.schuler_std_deg * DEG
+    information[[2, 3], [2, 3]] += stated**-2.0
+    return np.sqrt(np.diag(np.linalg.inv(information))[:2])
+
+
+@pytest.mark.slow
+def test_through_water_standard_deviations_are_those_of_least_squares():
+    scenario = shortened("ship-water", repeat=5)
+    trial = simulate(scenario, 1)
+    solution = solve(trial, rate_hz=0.1)
+    phase = solution.estimate("misalignment_deg").std[2] * DEG
+    scale = solution.estimate("scale_error").std[0]
+    found = np.array([phase, scale])
+    assert np.all(found < 1.3 * dense_standard_deviations(trial, scenario, 60.0))
+    # Means of a minute lose what turns show: of 10 s, they are 0.8 times as uncertain. The current
+    # of one hour may also vary less than that of many, from which the reference takes it.
+    assert np.all(found > 0.75 * dense_standard_deviations(trial, scenario, 10.0))

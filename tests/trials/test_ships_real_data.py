@@ -54,7 +54,7 @@ def check_clock(solution):
     # An independent fit: 1.41 to 1.51 s by dive.
     clock = solution.estimate("time_offset_s")
     assert clock.std[0] < 0.025
-    assert 1.41 - 4.0 * clock.std[0] < -clock.value[0] < 1.51 + 4.0 * clock.std[0]
+    assert 1.41 - 2.0 * clock.std[0] < -clock.value[0] < 1.51 + 2.0 * clock.std[0]
 
 
 @pytest.mark.slow
@@ -131,9 +131,12 @@ def test_a_boat_with_a_gnss_compass_without_tilt():
     assert -solution.estimate("misalignment_deg").value[2] == pytest.approx(1.65, abs=1.0)
     correction = 1.0 / (1.0 + solution.estimate("scale_error").value[0])
     assert correction == pytest.approx(0.992, abs=0.006)
-    # A straight run shows no lever arm that is good enough, and none along the vertical.
-    grades = solution.estimate("lever_arm_m").std / 0.1
-    assert np.all(grades > [2.0, 2.0, 90.0])
+    # A straight run shows no lever arm that is good enough, and none along the vertical. To
+    # starboard, 233 pings of 0.04 m/s at a yaw rate of 0.23 deg/s rms make 0.64 m.
+    std = solution.estimate("lever_arm_m").std
+    assert std[0] > 0.2
+    assert std[1] == pytest.approx(0.04 / (0.23 * DEG * np.sqrt(233.0)), rel=0.2)
+    assert std[2] > 9.0
     # An independent fit: 1.6 s.
     clock = solution.estimate("time_offset_s")
     assert abs(clock.value[0] + 1.6) < 2.0 * clock.std[0]
