@@ -345,7 +345,7 @@ class MotionProblem:
     def follow_motion(
         self, evaluation: MotionEvaluation, factors: Factorisation, covariances: Covariances
     ) -> Array:
-        """Set the slope by which scale errors and clocks do not depend on the prior of the motion.
+        """Set the slope by which scale errors do not depend on the prior of the motion.
 
         At the least cost the prior holds the velocity back, and a scale error makes up for it: in
         a tidal race one of 0.29 came from it. Its gradient is therefore that of residuals about
@@ -353,9 +353,6 @@ class MotionProblem:
         residuals then contain noise alone, whatever the motion is like. Of a single velocity that
         GNSS and log measure this is the least-squares fit of one to the other, with the smoothed
         velocity as the instrument. Lever arms and mountings gain nothing from it but noise.
-
-        Clocks change the variance R of the motion between nodes: half the logarithm of det R goes
-        with what the cost gains where R is large.
 
         A vessel that keeps its track moves independently of the current, one that drifts moves
         with it. In between, a share of the current's information on the scale error counts.
@@ -368,30 +365,31 @@ class MotionProblem:
         weak = self.with_chain(replace(self.chain, density=_WEAKER * self.chain.density))
         data = weak._without_motion(evaluation)
         weak._add_motion(data, evaluation.states)
-        freed = data.factorise().node_step() - factors.node_step()
+        try:
+            freed = data.factorise().node_step() - factors.node_step()
+        except np.linalg.LinAlgError:
+            # No digits are left for a weaker prior, because it alone determines some states.
+            freed = np.zeros_like(evaluation.states)
         slope = np.zeros(self.constants)
         for name, column in self.columns.items():
             if name.endswith(_SCALE):
                 slope[column] = np.einsum("kic,ki->c", data.border[:, :, column], freed)
-        given = covariances.given_constants()
         by_track = np.zeros(self.constants)
-        for o, seen, W in zip(
-            self.observations, evaluation.seen, evaluation.whitening, strict=True
-        ):
-            at, J = seen.interpolation, W @ seen.by_state
-            by_nodes = np.concatenate(at.by_nodes(J), axis=2)
-            through = given.products(at.node, by_nodes)
-            left = np.eye(J.shape[1]) - through @ by_nodes.transpose(0, 2, 1)
-            by_time = 0.5 * np.sum(at.variance_rate(J) * left, axis=(1, 2))
-            self._add_by_clocks(slope, o, by_time)
-            if not (self.chain.has(CURRENT) and _SCALE in o.parameters and _SCALE in self.columns):
-                continue
-            flow = np.zeros_like(J)
-            place = self.chain.place(CURRENT)
-            flow[:, :, place] = J[:, :, place]
-            by_row = np.sum(np.concatenate(at.by_nodes(flow), axis=2) * through, axis=(0, 2))
+        if self.chain.has(CURRENT) and _SCALE in self.columns:
+            given, place = covariances.given_constants(), self.chain.place(CURRENT)
             gain = 1.0 + evaluation.parameters[_SCALE]
-            by_track[self.columns[_SCALE]] += (by_row.sum() if gain.size == 1 else by_row) / gain
+            for o, seen, W in zip(
+                self.observations, evaluation.seen, evaluation.whitening, strict=True
+            ):
+                if _SCALE not in o.parameters:
+                    continue
+                at, J = seen.interpolation, W @ seen.by_state
+                through = given.products(at.node, np.concatenate(at.by_nodes(J), axis=2))
+                flow = np.zeros_like(J)
+                flow[:, :, place] = J[:, :, place]
+                by_row = np.sum(np.concatenate(at.by_nodes(flow), axis=2) * through, axis=(0, 2))
+                rows = by_row.sum() if gain.size == 1 else by_row
+                by_track[self.columns[_SCALE]] += rows / gain
         self.slope = slope + _TRACK * by_track
         self._slope_at = dict(evaluation.parameters)
         return by_track
@@ -451,18 +449,14 @@ class MotionProblem:
         ):
             u = rotate(W.transpose(0, 2, 1), rotate(W, seen.residual))
             by_time = -0.5 * np.sum(u * rotate(seen.interpolation.variance_rate(J), u), axis=1)
-            self._add_by_clocks(equations.constant_gradient, o, by_time)
-
-    def _add_by_clocks(self, gradient: Array, o: Observation, by_time: Array) -> None:
-        """Add derivatives (M,) by times of measurements among the nodes to those by clocks."""
-        later = {self.clock: np.ones(by_time.size)}
-        if o.clock is not None:
-            offset, rate = o.clock.names
-            later[offset] = later.get(offset, np.zeros(by_time.size)) - 1.0
-            later[rate] = self.zero - o.time
-        for name, change in later.items():
-            if name in self.columns:
-                gradient[self.columns[name]] += by_time @ change
+            later = {self.clock: np.ones(by_time.size)}
+            if o.clock is not None:
+                offset, rate = o.clock.names
+                later[offset] = later.get(offset, np.zeros(by_time.size)) - 1.0
+                later[rate] = self.zero - o.time
+            for name, change in later.items():
+                if name in self.columns:
+                    equations.constant_gradient[self.columns[name]] += by_time @ change
 
     def _add_motion(self, equations: NormalEquations, states: Array) -> float:
         """Add the prior of the motion, and return its sum of squares."""
