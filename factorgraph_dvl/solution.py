@@ -682,9 +682,8 @@ def _impossible_scale(e: Estimate) -> list[Finding]:
         return []
     worst = int(np.argmax(off - _CERTAIN * e.std))
     value, std, name = e.value[worst], e.std[worst], e.component_names[worst]
-    text = (
-        f"{name} is {value:.2g} ± {std:.1g}, and a velocity log that works is within "
-        f"{100.0 * _LARGEST_SCALE:.0f} %: a current, a unit or another error is taken for it"
+    text = message(
+        "impossible_scale.larger", name=name, value=value, std=std, limit=100.0 * _LARGEST_SCALE
     )
     return [Finding(Code.IMPOSSIBLE_SCALE, text, parameter=e.name)]
 

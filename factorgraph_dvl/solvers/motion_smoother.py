@@ -157,7 +157,7 @@ def smooth_motion(prepared: MotionPreparation, report: Progress) -> SmoothedMoti
         by_track = problem.follow_motion(evaluation, factors, covariances)
         pulled = factors.constants @ (problem.slope - slope)
         if np.any(np.abs(pulled) > _PULLED * np.sqrt(np.diag(factors.constants))):
-            changing.append("the minimum")
+            changing.append(message("not_converged.minimum"))
         if searches < _FIRST_SEARCHES and _rejects_others(problem, evaluation, covariances):
             searches += 1
             changing.append(message("not_converged.outliers"))
