@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.optimize import minimize
 
 from factorgraph_dvl.simulation.faults import gauss_markov
+from factorgraph_dvl.statistics import correlation
 from factorgraph_dvl.statistics.correlation import Correlation, fit_correlation
 
 
@@ -44,6 +46,25 @@ def test_white_noise_is_white(seed):
     assert (
         fit_correlation(time, residuals(time, 1.0, 0.0, 1.0, seed), expected_time_s=100.0) is None
     )
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_noise_that_persists_for_less_than_an_interval_takes_no_long_search(monkeypatch, seed):
+    taken = []
+
+    def counted(*args, **kwargs):
+        fit = minimize(*args, **kwargs)
+        taken.append(fit.nfev)
+        return fit
+
+    monkeypatch.setattr(correlation, "minimize", counted)
+    noise = np.random.default_rng(seed).standard_normal((5001, 2))
+    time = np.arange(5000) * 0.2
+    # White noise and such a process have the same spectrum: only one of them is searched.
+    found = fit_correlation(time, noise[1:] + 0.08 * noise[:-1])
+    assert found is not None
+    assert found.long_run_factor(0.2) == pytest.approx(1.0, abs=1e-3)
+    assert sum(taken) < 200
 
 
 def test_drift_is_no_correlation():
