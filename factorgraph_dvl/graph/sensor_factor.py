@@ -42,7 +42,7 @@ from factorgraph_dvl.sensors.protocol import (
 # What rounding may take off a time, s.
 _ROUNDING = 1e-6
 
-_Arrays = TypeVar("_Arrays", Attachment, Motion, Sensitivity)
+_Arrays = TypeVar("_Arrays", Attachment, Motion, Sensitivity, States)
 
 
 @dataclass(frozen=True)

@@ -79,11 +79,25 @@ class Attachment:
 
 def attach(seg: Segments, time: Array, earth_rate_n: Array) -> Attachment:
     """Attach times (M,), all covered by arcs, to the chain."""
+    return _attach(seg, *_inside(seg, time), earth_rate_n)
+
+
+def attach_with_ends(seg: Segments, time: Array, earth_rate_n: Array) -> Attachment:
+    """Attach times (M,), and after them the ends of all segments to the nodes at their starts."""
+    index, since = _inside(seg, time)
+    last = seg.last - 1
+    since = np.concatenate([since, seg.increments.dt[last]])
+    return _attach(seg, np.concatenate([index, last]), since, earth_rate_n)
+
+
+def _inside(seg: Segments, time: Array) -> tuple[IntArray, Array]:
+    """Return the intervals of the chain that times (M,) are in, and the times since their start.
+
+    A time on the edge of the chain may be off it by rounding.
+    """
     index, since, _ = seg.increments.locate(time)
-    # A time on the edge of the chain may be off it by rounding.
     inside = np.clip(index, seg.first[0], seg.last[-1] - 1)
-    since = np.where(inside == index, since, time - seg.increments.start[inside])
-    return _attach(seg, inside, since, earth_rate_n)
+    return inside, np.where(inside == index, since, time - seg.increments.start[inside])
 
 
 def attach_inside(

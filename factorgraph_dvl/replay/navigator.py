@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
@@ -14,9 +14,13 @@ from factorgraph_dvl.graph import keys
 from factorgraph_dvl.graph.inertial_chain import LEAST_WALK, loose_diagonal
 from factorgraph_dvl.graph.keys import BIAS_SIZE, STATE_SIZE
 from factorgraph_dvl.graph.priors import ConstantsPrior, local_coordinates, value_at
-from factorgraph_dvl.graph.sensor_factor import Linearized, measurement_factor, state_of
+from factorgraph_dvl.graph.sensor_factor import (
+    Linearized,
+    concatenated,
+    measurement_factor,
+    state_of,
+)
 from factorgraph_dvl.imu.preintegration import Segments, gtsam_measurements
-from factorgraph_dvl.imu.propagation import States
 from factorgraph_dvl.replay.calibration import CalibrationEstimate, calibration_of
 from factorgraph_dvl.replay.gate import InnovationGate
 from factorgraph_dvl.replay.gravity import LocalGravity
@@ -30,7 +34,14 @@ from factorgraph_dvl.sensors.imu import Imu
 from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.sensors.protocol import Aid
 from factorgraph_dvl.solution import Trajectory
-from factorgraph_dvl.solvers.trajectory import TRAJECTORY_RATE, epochs_between, trajectory_between
+from factorgraph_dvl.solvers.trajectory import (
+    TRAJECTORY_RATE,
+    Epochs,
+    attached_epochs,
+    epochs_between,
+    successive,
+    trajectory_at,
+)
 
 
 @dataclass(frozen=True)
@@ -40,6 +51,15 @@ class _LinearizationPoint:
     state: gtsam.NavState
     bias: gtsam.imuBias.ConstantBias
     parameters: Mapping[str, Array]
+
+
+@dataclass(frozen=True)
+class _Segment:
+    """A segment, gravity (1, 3) along it, and the epochs in it."""
+
+    segment: Segments
+    gravity_n: Array
+    epochs: Epochs
 
 
 class Navigator:
@@ -96,7 +116,7 @@ class Navigator:
             ranges=start.ranges,
         )
         self._gravity = LocalGravity(start.frame)
-        self._segments: dict[int, tuple[Segments, Array]] = {}
+        self._segments: dict[int, _Segment] = {}
         self.innovations: list[Innovations] = []
         self.findings: list[Finding] = []
         self._refresh()
@@ -160,11 +180,14 @@ class Navigator:
                 )
             )
             values.insert(keys.bias(k + 1), bias)
-        self._segments[k] = (seg, gravity)
+        end = float(seg.node_time[1])
+        time = epochs_between(self.time, end, TRAJECTORY_RATE)
+        epochs = attached_epochs(seg, time, self.start.frame.earth_rate)
+        self._segments[k] = _Segment(seg, gravity, epochs)
         measured = self._measurement_factor(k, aids)
         if measured is not None:
             factors.add(measured)
-        s.extend(float(seg.node_time[1]), factors, values)
+        s.extend(end, factors, values)
         if self._linear is not None:
             if not self.start.walking:
                 bias = self._linear.bias
@@ -243,10 +266,9 @@ class Navigator:
         """Return the motion from state `first` to state `last`, smoothed with later data."""
         wanted = [k for k in self._segments if first <= k < last]
         P = self.smoother.state_covariances([*wanted, last])
-        times = self.smoother.times
-        parts = [self._between(k, np.stack([P[k], P[k + 1]]), body_axes, times[k]) for k in wanted]
-        return Trajectory(
-            *(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Trajectory))
+        parts = [self._segments[k] for k in wanted]
+        return self._between(
+            wanted[0], parts, np.stack([P[k] for k in (*wanted, last)]), body_axes
         )
 
     def last_segment(self, body_axes: BodyAxes, since: float) -> Trajectory:
@@ -255,18 +277,23 @@ class Navigator:
         The time is that of the state before it, but for what stamps have been corrected since.
         """
         P = np.stack([self._P_before, self._P[:STATE_SIZE, :STATE_SIZE]])
-        return self._between(self.smoother.node - 1, P, body_axes, since)
+        k = self.smoother.node - 1
+        part = self._segments[k]
+        time = epochs_between(since, self.time, TRAJECTORY_RATE)
+        if not np.array_equal(time, part.epochs.time):
+            epochs = attached_epochs(part.segment, time, self.start.frame.earth_rate)
+            part = replace(part, epochs=epochs)
+        return self._between(k, [part], P, body_axes)
 
-    def _between(self, k: int, P: Array, body_axes: BodyAxes, since: float) -> Trajectory:
-        """Return the motion from state k to the next at the epochs of a batch solution."""
+    def _between(
+        self, first: int, parts: Sequence[_Segment], P: Array, body_axes: BodyAxes
+    ) -> Trajectory:
+        """Return the motion in segments that follow each other from a state on."""
         s = self.smoother
-        seg, gravity = self._segments[k]
-        time = epochs_between(since, s.times[k + 1], TRAJECTORY_RATE)
-        pair = [state_of(s.state(i), s.bias(i)) for i in (k, k + 1)]
-        states = States(
-            *(np.concatenate([getattr(x, f.name) for x in pair]) for f in fields(States))
-        )
-        return trajectory_between(seg, states, P, gravity, self.start.frame, body_axes, time)
+        each = [state_of(s.state(k), s.bias(k)) for k in range(first, first + len(parts) + 1)]
+        gravity = np.concatenate([part.gravity_n for part in parts])
+        epochs = successive([part.epochs for part in parts])
+        return trajectory_at(epochs, concatenated(each), P, gravity, self.start.frame, body_axes)
 
     @property
     def _walk_root_psd(self) -> Array:
@@ -280,7 +307,8 @@ class Navigator:
     def _measurement_factor(self, k: int, aids: Sequence[Aid]) -> gtsam.CustomFactor | None:
         """Return the factor of measurements after state k that the gate accepts."""
         s = self.smoother
-        measured = attached(aids, *self._segments[k], self.start, self.values)
+        part = self._segments[k]
+        measured = attached(aids, part.segment, part.gravity_n, self.start, self.values)
         if measured is None:
             return None
         names = [p.name for p in measured.parameters]

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import fields, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
@@ -14,9 +15,17 @@ from factorgraph_dvl.geometry.rotations import (
     rph_from_rotation,
     rph_jacobian,
 )
-from factorgraph_dvl.geometry.vectors import Array, rotate
+from factorgraph_dvl.geometry.vectors import Array, IntArray, rotate
+from factorgraph_dvl.graph.sensor_factor import concatenated, sliced
 from factorgraph_dvl.imu.preintegration import Segments
-from factorgraph_dvl.imu.propagation import States, attach, motion_at, segment_ends
+from factorgraph_dvl.imu.propagation import (
+    Attachment,
+    States,
+    attach,
+    attach_with_ends,
+    motion_at,
+    segment_ends,
+)
 from factorgraph_dvl.sensors.protocol import Motion
 from factorgraph_dvl.solution import Trajectory
 
@@ -54,32 +63,16 @@ def trajectory_between(
     time : ndarray, shape (M,), s
         When the motion is wanted.
     """
-    closing = _closing(seg, states, gravity_n, frame.earth_rate)
-    # GTSAM's tangent space is in body axes, which differ from node to node; n does not.
-    blocks = np.stack([P[:, i : i + 3, i : i + 3] for i in (0, 3, 6)], axis=1)
-    R = states.nRb[:, None]
-    P_n = R @ blocks @ R.transpose(0, 1, 3, 2)
+    ends = motion_at(segment_ends(seg, frame.earth_rate), states, gravity_n, frame.earth_rate)
+    closing = _closing(ends, states, seg.origin + 1)
+    P_n = _in_n(P, states)
 
     def part(time: Array) -> Trajectory:
-        motion, fraction, node = _smoothed(seg, states, closing, gravity_n, frame.earth_rate, time)
-        lat, lon, height = frame.geodetic(motion.p_n)
-        lRn = frame.level_from_tangent(lat, lon)
-        nRb = lRn @ motion.nRb
-        rph = rph_from_rotation(nRb, body_axes)
-        at = P_n[node] + fraction[:, None, None, None] * (P_n[node + 1] - P_n[node])
-        of_attitude, of_position, of_velocity = (
-            lRn @ at[:, i] @ lRn.transpose(0, 2, 1) for i in range(3)
-        )
-        to_rph = rph_jacobian(rph, body_axes) @ nRb.transpose(0, 2, 1)
-        return Trajectory(
-            time=time,
-            geodetic=np.stack([lat, lon, height], axis=1),
-            velocity=rotate(lRn, motion.v_n),
-            rph=rph,
-            position_cov=of_position,
-            velocity_cov=of_velocity,
-            rph_cov=to_rph @ of_attitude @ to_rph.transpose(0, 2, 1),
-        )
+        at = attach(seg, time, frame.earth_rate)
+        motion = motion_at(at, states, gravity_n, frame.earth_rate)
+        fraction = np.clip(at.tau / seg.duration[at.segment], 0.0, 1.0)
+        motion = _closed(motion, fraction, at.segment, closing)
+        return _reported(time, motion, _between(P_n, at.node, fraction), frame, body_axes)
 
     parts = [part(time[i : i + _CHUNK]) for i in range(0, max(time.size, 1), _CHUNK)]
     if len(parts) == 1:
@@ -94,15 +87,76 @@ def epochs_between(start: float, end: float, rate_hz: float) -> Array:
     return np.asarray(np.arange(first + 1.0, last + 1.0) / rate_hz + 0.0)
 
 
-def _closing(
-    seg: Segments, states: States, gravity_n: Array, earth_rate_n: Array
-) -> tuple[Array, Array, Array]:
+@dataclass(frozen=True)
+class Epochs:
+    """Times in successive segments of a chain, and their ends, attached to the nodes before.
+
+    Parameters
+    ----------
+    time : ndarray, shape (M,), s
+        The times.
+    at : Attachment
+        Of the M times and the ends of the S segments; node i is the one before segment i.
+    duration : ndarray, shape (S,), s
+        Of the segments.
+    """
+
+    time: Array
+    at: Attachment
+    duration: Array
+
+
+def attached_epochs(seg: Segments, time: Array, earth_rate_n: Array) -> Epochs:
+    """Attach times (M,) in a single segment: once, however often the states change."""
+    return Epochs(time, attach_with_ends(seg, time, earth_rate_n), seg.duration)
+
+
+def successive(parts: Sequence[Epochs]) -> Epochs:
+    """Return times in single segments that follow each other as those of one chain."""
+    times, ends = [], []
+    for i, part in enumerate(parts):
+        at = replace(part.at, segment=part.at.segment + i, node=part.at.node + i)
+        times.append(sliced(at, slice(part.time.size)))
+        ends.append(sliced(at, slice(part.time.size, None)))
+    return Epochs(
+        np.concatenate([part.time for part in parts]),
+        concatenated([*times, *ends]),
+        np.concatenate([part.duration for part in parts]),
+    )
+
+
+def trajectory_at(
+    epochs: Epochs,
+    states: States,
+    P: Array,
+    gravity_n: Array,
+    frame: LocalFrame,
+    body_axes: BodyAxes,
+) -> Trajectory:
+    """Return the motion at epochs in S segments between S + 1 nodes.
+
+    Parameters
+    ----------
+    epochs : Epochs
+        When the motion is wanted.
+    states, P, gravity_n, frame, body_axes : optional
+        As of `trajectory_between`.
+    """
+    motion = motion_at(epochs.at, states, gravity_n, frame.earth_rate)
+    count, size = epochs.time.size, epochs.duration.size
+    closing = _closing(sliced(motion, slice(count, None)), states, np.arange(size) + 1)
+    segment = epochs.at.segment[:count]
+    fraction = np.clip(epochs.at.tau[:count] / epochs.duration[segment], 0.0, 1.0)
+    motion = _closed(sliced(motion, slice(count)), fraction, segment, closing)
+    covariance = _between(_in_n(P, states), segment, fraction)
+    return _reported(epochs.time, motion, covariance, frame, body_axes)
+
+
+def _closing(ends: Motion, states: States, after: IntArray) -> tuple[Array, Array, Array]:
     """Return what the motion is off at the ends of segments: rotation vector, position, velocity.
 
     It is the noise of the IMU over the segment.
     """
-    ends = motion_at(segment_ends(seg, earth_rate_n), states, gravity_n, earth_rate_n)
-    after = seg.origin + 1
     return (
         log_so3(states.nRb[after] @ ends.nRb.transpose(0, 2, 1)),
         states.p_n[after] - ends.p_n,
@@ -110,26 +164,51 @@ def _closing(
     )
 
 
-def _smoothed(
-    seg: Segments,
-    states: States,
-    closing: tuple[Array, Array, Array],
-    gravity_n: Array,
-    earth_rate_n: Array,
-    time: Array,
-) -> tuple[Motion, Array, np.ndarray]:
-    """Return the motion between the nodes, carried forward and closed onto the node after.
-
-    What it is off there is spread in proportion to time.
-    """
-    at = attach(seg, time, earth_rate_n)
-    motion = motion_at(at, states, gravity_n, earth_rate_n)
-    fraction = np.clip(at.tau / seg.duration[at.segment], 0.0, 1.0)
-    turn, shift, change = (fraction[:, None] * each[at.segment] for each in closing)
-    closed = replace(
+def _closed(
+    motion: Motion, fraction: Array, segment: IntArray, closing: tuple[Array, Array, Array]
+) -> Motion:
+    """Return a motion carried forward, closed onto the nodes after in proportion to time."""
+    turn, shift, change = (fraction[:, None] * each[segment] for each in closing)
+    return replace(
         motion,
         nRb=exp_so3(turn) @ motion.nRb,
         p_n=motion.p_n + shift,
         v_n=motion.v_n + change,
     )
-    return closed, fraction, at.node
+
+
+def _in_n(P: Array, states: States) -> Array:
+    """Return the covariances of attitude, position and velocity in n, (K, 3, 3, 3)."""
+    # GTSAM's tangent space is in body axes, which differ from node to node; n does not.
+    blocks = np.stack([P[:, i : i + 3, i : i + 3] for i in (0, 3, 6)], axis=1)
+    R = states.nRb[:, None]
+    return np.asarray(R @ blocks @ R.transpose(0, 1, 3, 2))
+
+
+def _between(P_n: Array, node: IntArray, fraction: Array) -> Array:
+    """Return covariances between those of nodes and of the next, (M, 3, 3, 3)."""
+    before = P_n[node]
+    return np.asarray(before + fraction[:, None, None, None] * (P_n[node + 1] - before))
+
+
+def _reported(
+    time: Array, motion: Motion, P_n: Array, frame: LocalFrame, body_axes: BodyAxes
+) -> Trajectory:
+    """Return a motion with its covariances in the frames of a trajectory."""
+    lat, lon, height = frame.geodetic(motion.p_n)
+    lRn = frame.level_from_tangent(lat, lon)
+    nRb = lRn @ motion.nRb
+    rph = rph_from_rotation(nRb, body_axes)
+    of_attitude, of_position, of_velocity = (
+        lRn @ P_n[:, i] @ lRn.transpose(0, 2, 1) for i in range(3)
+    )
+    to_rph = rph_jacobian(rph, body_axes) @ nRb.transpose(0, 2, 1)
+    return Trajectory(
+        time=time,
+        geodetic=np.stack([lat, lon, height], axis=1),
+        velocity=rotate(lRn, motion.v_n),
+        rph=rph,
+        position_cov=of_position,
+        velocity_cov=of_velocity,
+        rph_cov=to_rph @ of_attitude @ to_rph.transpose(0, 2, 1),
+    )
