@@ -81,9 +81,9 @@ def sections(folder: Path, args: Any) -> Iterator[tuple[str, list[Row]]]:
         yield "Recorded trials", joint(folder / "recorded", trials, args.workers)
 
 
-def scenario(seconds: float, turned_deg: Sequence[float] = (0.0, 0.0, 0.0)) -> Scenario:
+def scenario(name: str, seconds: float, turned_deg: Sequence[float] = (0.0, 0.0, 0.0)) -> Scenario:
     """Return the scenario with straight legs so long that it takes some seconds."""
-    data = common.config("seed-a-phase-90")
+    data = common.config("seed-a-phase-90", name=name)
     for each in data["manoeuvres"]:
         if "straight_s" in each:
             each["straight_s"] = (seconds - MANOEUVRES) / LEGS
@@ -96,7 +96,9 @@ def killed(folder: Path, args: Any) -> list[Row]:
     """Measure a campaign of which workers are killed against trials one after the other."""
     trials = [folder / "trials" / f"{seed:04d}" for seed in range(args.trials)]
     for seed, path in enumerate(trials):
-        save_trial(simulate(scenario(args.seconds), seed), path, parquet=True, seed=seed)
+        save_trial(
+            simulate(scenario(path.name, args.seconds), seed), path, parquet=True, seed=seed
+        )
     single = []
     for path in trials[:SINGLE]:
         start = perf_counter()
@@ -135,7 +137,12 @@ def remount(folder: Path, args: Any) -> list[Row]:
     for seed, path in enumerate(trials):
         turned = BETWEEN_TRIALS * rng.standard_normal(3)
         turned[2] += STEP * (seed > last)
-        save_trial(simulate(scenario(args.seconds, turned), seed), path, parquet=True, seed=seed)
+        save_trial(
+            simulate(scenario(path.name, args.seconds, turned), seed),
+            path,
+            parquet=True,
+            seed=seed,
+        )
     content, _, _ = campaign(folder, trials, args.workers, np.inf)
     rows = [
         ("trials", f"{args.remount}"),
@@ -145,10 +152,9 @@ def remount(folder: Path, args: Any) -> list[Row]:
         (
             "found",
             f"{c['parameter']} by {c['step']:.3f} ± {c['std']:.3f} deg after the trial "
-            f"{Path(content['trials'][k]['folder']).name}, p = {c['p']:.1g}",
+            f"{c['after']}, p = {c['p']:.1g}",
         )
         for c in content["changes"]
-        for k in [[t["name"] for t in content["trials"]].index(c["after"])]
     ]
     return [*rows, *spread(content)]
 
@@ -173,7 +179,7 @@ def spread(content: dict[str, Any]) -> list[Row]:
         for name, std in content["between_trials_std"].items()
         if std > 0.0
     ]
-    text = f"{chi['statistic']:.1f} of {chi['freedom']}, p = {chi['p']:.2g}"
+    text = f"{chi['statistic']:.1f}, {chi['freedom']:.1f} expected, p = {chi['p']:.3g}"
     return [*rows, ("**χ² of all trials with this variation**", text)]
 
 

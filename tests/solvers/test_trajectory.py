@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, replace
+from itertools import pairwise
 
 import numpy as np
 from inertial import constant_segments
@@ -10,8 +11,15 @@ from inertial import constant_segments
 from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.rotations import exp_so3, rotation_from_rph
 from factorgraph_dvl.geometry.units import DEG
+from factorgraph_dvl.imu.preintegration import one_segment
 from factorgraph_dvl.imu.propagation import States
-from factorgraph_dvl.solvers.trajectory import epochs_between, trajectory_between
+from factorgraph_dvl.solvers.trajectory import (
+    attached_epochs,
+    epochs_between,
+    successive,
+    trajectory_at,
+    trajectory_between,
+)
 
 FRAME = LocalFrame(0.6, 2.0, 0.0)
 
@@ -64,6 +72,28 @@ def test_what_the_imu_is_off_at_the_next_node_is_spread_over_the_segment():
     np.testing.assert_allclose(after.rph[:, 2] - before.rph[:, 2], [0.5 * DEG, DEG], atol=1e-6)
     apart = FRAME.position(*after.geodetic.T) - FRAME.position(*before.geodetic.T)
     np.testing.assert_allclose(apart, [[0.1, 0.0, 0.0], [0.2, 0.0, 0.0]], atol=1e-6)
+
+
+def test_segments_one_by_one_give_the_motion_of_the_chain():
+    seg, states = chain(heading=0.3)
+    rng = np.random.default_rng(0)
+    k = seg.node_time.size
+    states = replace(states, p_n=rng.standard_normal((k, 3)), v_n=rng.standard_normal((k, 3)))
+    root = 0.01 * rng.standard_normal((k, 9, 9))
+    P = root @ root.transpose(0, 2, 1)
+    edges = seg.node_time
+    times = [epochs_between(a, b, 10.0) for a, b in pairwise(edges)]
+    parts = [
+        attached_epochs(one_segment(seg.increments, int(a), int(b)), time, FRAME.earth_rate)
+        for a, b, time in zip(seg.first, seg.last, times, strict=True)
+    ]
+    gravity = np.tile(FRAME.gravity_without_rotation(np.zeros((1, 3))), (k - 1, 1))
+    found = trajectory_at(successive(parts), states, P, gravity, FRAME, "RFU")
+    whole = between(seg, states, P, np.concatenate(times))
+    for field in fields(whole):
+        np.testing.assert_allclose(
+            getattr(found, field.name), getattr(whole, field.name), rtol=1e-9, atol=1e-12
+        )
 
 
 def test_epochs_are_the_multiples_after_a_time_and_up_to_another():
