@@ -25,7 +25,7 @@ from factorgraph_dvl.campaign.record import (
 )
 from factorgraph_dvl.errors import FactorgraphDvlError
 from factorgraph_dvl.io.calibration_file import CALIBRATION_FILE, load_calibration
-from factorgraph_dvl.io.trial_folder import inputs_of, locate
+from factorgraph_dvl.io.trial_folder import files_of, locate
 from factorgraph_dvl.io.trial_yaml import TrialSettings
 from factorgraph_dvl.sensors.dvl import CALIBRATED, DvlSettings
 from factorgraph_dvl.settings.yaml_file import parse_yaml, read_text
@@ -54,8 +54,7 @@ def run_trial(trial: str, label: str, out: str, options: Sequence[str]) -> RunRe
     """
     folder = Path(out) / TRIALS_FOLDER / label
     file = folder.with_name(f"{label}.json")
-    files = sorted({f for f in inputs_of(Path(trial)) if f.is_file()} | {locate(Path(trial))[1]})
-    fingerprint = fingerprint_of(files, {"options": " ".join(options)})
+    fingerprint = fingerprint_of(files_of(Path(trial)), {"options": " ".join(options)})
     earlier = read_record(file, RunRecord)
     same = earlier is not None and earlier.done and earlier.fingerprint == fingerprint
     if earlier is not None and same and earlier.result == hash_of(folder / CALIBRATION_FILE):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from math import isfinite
@@ -17,6 +18,7 @@ from factorgraph_dvl.cli.console import (
     print_table,
     print_written,
     stdout,
+    warn,
 )
 from factorgraph_dvl.cli.options import (
     Anyway,
@@ -29,18 +31,20 @@ from factorgraph_dvl.cli.options import (
     SolutionPath,
     TrialPath,
     claim_output,
+    claims,
 )
 from factorgraph_dvl.cli.plausibility import errors_in
 from factorgraph_dvl.cli.report import write_report
 from factorgraph_dvl.cli.verdict import end_with, print_findings, print_verdict
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterator, Mapping
 
     from factorgraph_dvl.analysis.comparison.halves import Halves
     from factorgraph_dvl.baselines import History
     from factorgraph_dvl.baselines.calibration import Method
     from factorgraph_dvl.errors import ConfigError
+    from factorgraph_dvl.io.finished_stages import FinishedStages
     from factorgraph_dvl.solution import Solution
     from factorgraph_dvl.statistics.information_history import InformationHistory
     from factorgraph_dvl.trial import PlanarTrial, Trial
@@ -97,6 +101,9 @@ def solve(
         bool, typer.Option("--halves", help="Also solve each half of the trial, and compare them.")
     ] = False,
     anyway: Anyway = False,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Continue a run that was interrupted.")
+    ] = False,
     quiet: Quiet = False,
 ) -> None:
     """Estimate calibration and trajectory from all data of a trial.
@@ -105,14 +112,20 @@ def solve(
       factorgraph-dvl solve data/seed-a-phase-90 --out out
     """
 
-    def run(trial: Trial, progress: ProgressLine) -> _Found:
+    def run(trial: Trial, progress: ProgressLine, stages: FinishedStages | None) -> _Found:
         # The solver is slow to import: do so after the checks of the input.
         from factorgraph_dvl.analysis.comparison.halves import halves_of
         from factorgraph_dvl.solvers.information_along_trial import solve_with_history
 
         parts = halves_of(trial) if halves else None
+
         solution, along = solve_with_history(
-            trial, rate_hz=rate, entries=_ENTRIES, anyway=anyway, progress=progress
+            trial,
+            rate_hz=rate,
+            entries=_ENTRIES,
+            anyway=anyway,
+            progress=progress,
+            stages=stages,
         )
         found = _Found(solution, along=along)
         return found if parts is None else _with_halves(trial, found, parts, progress)
@@ -138,6 +151,8 @@ def solve(
         figures=None if no_figures else figures,
         anyway=anyway,
         quiet=quiet,
+        resume=resume,
+        options={"anyway": f"{anyway}", "rate": f"{rate}"},
     )
 
 
@@ -171,7 +186,7 @@ def kalman(
 
         raise ConfigError("--linear belongs to one method", expected="--method nine-state")
 
-    def run(trial: Trial, progress: ProgressLine) -> _Found:
+    def run(trial: Trial, progress: ProgressLine, _: FinishedStages | None) -> _Found:
         from factorgraph_dvl.baselines import calibrate
         from factorgraph_dvl.quality.refusal import explained
 
@@ -240,15 +255,20 @@ def _misplaced(what: str, expected: str) -> ConfigError:
 def _solve_into(
     out: Path,
     trial_path: Path,
-    run: Callable[[Trial, ProgressLine], _Found],
+    run: Callable[[Trial, ProgressLine, FinishedStages | None], _Found],
     run_planar: Callable[[PlanarTrial, ProgressLine], _Found],
     *,
     force: bool,
     figures: FigureKind | None,
     anyway: bool,
     quiet: bool,
+    resume: bool = False,
+    options: Mapping[str, str] | None = None,
 ) -> None:
-    """Load a trial, run a solver, write and show its solution."""
+    """Load a trial, run a solver, write and show its solution.
+
+    Stages of runs with `options`, which they depend on, are kept until the run ends.
+    """
     from factorgraph_dvl.io.planar_folder import is_planar, load_planar_trial
     from factorgraph_dvl.io.run_file import run_of
     from factorgraph_dvl.io.solution_folder import (
@@ -261,7 +281,7 @@ def _solve_into(
     from factorgraph_dvl.io.tables import write_table
     from factorgraph_dvl.io.trial_folder import inputs_of, load_trial
 
-    claim_output(out, force=force, owned=OWNED, inputs=inputs_of(trial_path))
+    work = claim_output(out, force=force, owned=OWNED, inputs=inputs_of(trial_path))
     with ProgressLine(quiet=quiet) as progress:
         trial: Trial | PlanarTrial
         if is_planar(trial_path):
@@ -269,7 +289,8 @@ def _solve_into(
             found = run_planar(trial, progress)
         else:
             trial = load_trial(trial_path, anyway=anyway)
-            found = run(trial, progress)
+            stages = None if options is None else _stages(work, trial_path, options, resume)
+            found = run(trial, progress, stages)
         solution, history = found.solution, found.history
         progress("write", 0, None)
 
@@ -298,6 +319,38 @@ def _solve_into(
     _print_solution(trial, found)
     print_written(out)
     end_with(solution.verdict)
+
+
+def _stages(
+    work: Path, trial_path: Path, options: Mapping[str, str], resume: bool
+) -> FinishedStages:
+    """Return the finished stages of a run; they are removed unless it is interrupted or killed."""
+    from factorgraph_dvl.campaign.record import fingerprint_of
+    from factorgraph_dvl.io.finished_stages import FinishedStages
+    from factorgraph_dvl.io.trial_folder import files_of
+
+    fingerprint = fingerprint_of(files_of(trial_path), options)
+    stages = FinishedStages(work / "stages", fingerprint, resume=resume)
+    if resume and not stages.found:
+        warn(
+            "--resume: there is no interrupted run of this trial with these options and this "
+            "version of the program, so all stages run anew"
+        )
+
+    @contextmanager
+    def removed() -> Iterator[None]:
+        try:
+            yield
+        except Exception:
+            stages.remove()
+            raise
+        except BaseException:
+            warn("interrupted; --resume continues after the stages that had ended")
+            raise
+        stages.remove()
+
+    claims.enter_context(removed())
+    return stages
 
 
 def draw_history(

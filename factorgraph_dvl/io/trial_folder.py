@@ -12,7 +12,7 @@ import msgspec
 import numpy as np
 from msgspec import UNSET
 
-from factorgraph_dvl.errors import ConfigError, DataError, printable
+from factorgraph_dvl.errors import ConfigError, DataError, FactorgraphDvlError, printable
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.io.earlier_calibration import save_prior, with_earlier_calibrations
 from factorgraph_dvl.io.folders import SETTINGS_FILE, new_folder
@@ -319,6 +319,15 @@ def inputs_of(path: Path) -> list[Path]:
         named = parse_yaml(read_text(file), dict[str, Any], source=file.name)
         found += [file.parent / name for name in _named(named)]
     return found
+
+
+def files_of(path: Path) -> list[Path]:
+    """Return the files that a trial is read from, in a fixed order: settings, records, others."""
+    found = {file for file in inputs_of(path) if file.is_file()}
+    with suppress(FactorgraphDvlError):
+        # Records that the settings do not name have names by default.
+        found |= set(record_files(path))
+    return [locate(path)[1], *sorted(found - {locate(path)[1]})]
 
 
 def _named(settings: Any) -> Iterator[str]:

@@ -11,6 +11,7 @@ import numpy as np
 from factorgraph_dvl.errors import ConfigError
 from factorgraph_dvl.graph.priors import ConstantsPrior
 from factorgraph_dvl.imu.propagation import States
+from factorgraph_dvl.io.finished_stages import FinishedStages
 from factorgraph_dvl.quality.refusal import accepted_errors, explained
 from factorgraph_dvl.quality.survey import survey
 from factorgraph_dvl.ranging.hypothesis_weights import significant_costs
@@ -101,10 +102,12 @@ def solve_with_problem(
     state_interval_s: float = STATE_INTERVAL,
     anyway: bool = False,
     progress: Progress | None = None,
+    stages: FinishedStages | None = None,
 ) -> tuple[Solution, SolvedProblem | None]:
     """Return the solution of a trial, and its problem at the most probable minimum.
 
-    There is none for a trial without IMU. Parameters and errors are those of `solve`.
+    There is none for a trial without IMU. Parameters and errors are those of `solve`; in `stages`
+    results of alignment and mounting are kept, and taken from.
     """
     _check_above_zero("rate_hz", rate_hz)
     _check_above_zero("state_interval_s", state_interval_s)
@@ -119,18 +122,25 @@ def solve_with_problem(
                 trial, smooth_motion(prepare_motion(trial), report), rate_hz=rate_hz
             )
         else:
-            found, solved = _most_probable(trial, rate_hz, state_interval_s, report)
+            found, solved = _most_probable(trial, rate_hz, state_interval_s, report, stages)
     return found.with_findings(errors), solved
 
 
 def _most_probable(
-    trial: Trial, rate_hz: float, state_interval_s: float, report: Progress
+    trial: Trial,
+    rate_hz: float,
+    state_interval_s: float,
+    report: Progress,
+    stages: FinishedStages | None,
 ) -> tuple[Solution, SolvedProblem]:
     """Return the most probable of all minima from all positions, with the spread of the others."""
-    prepared = prepare(trial, state_interval_s, report)
+    prepared = prepare(trial, state_interval_s, report, stages)
+    starts = prepared.start_positions.states
+    # Of several starts each has a mounting of its own.
+    mounting = stages if len(starts) == 1 else None
     solutions, best = [], []
-    for states in prepared.start_positions.states:
-        minima = _minima(prepared, states, prepared.findings, report)
+    for states in starts:
+        minima = _minima(prepared, states, prepared.findings, report, mounting)
         against = np.array([evidence_against(each) for each in minima])
         summaries = [summarise(trial, each, rate_hz=rate_hz) for each in minima]
         solutions.append(most_probable_minimum(summaries, against))
@@ -167,10 +177,14 @@ def solved_problems(
 
 
 def _minima(
-    prepared: Preparation, states: States, findings: tuple[Finding, ...], report: Progress
+    prepared: Preparation,
+    states: States,
+    findings: tuple[Finding, ...],
+    report: Progress,
+    stages: FinishedStages | None = None,
 ) -> list[SolvedProblem]:
     """Return the minima near some states and their rivals, the most probable first."""
-    found = competing_minima(prepared, states, report)
+    found = competing_minima(prepared, states, report, stages)
     return distinct(prepared, [_with_covariances(each, findings, report) for each in found])
 
 

@@ -23,6 +23,7 @@ from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph import keys
 from factorgraph_dvl.graph.keys import BIAS_SIZE
 from factorgraph_dvl.graph.problem import FIXED_DIRECTION_STD, Evaluation, Problem
+from factorgraph_dvl.io.finished_stages import FinishedStages, finished
 from factorgraph_dvl.solution import Progress, Solution
 from factorgraph_dvl.solvers.batch import solve_with_problem
 from factorgraph_dvl.solvers.calibration import prior_along, reported
@@ -55,6 +56,14 @@ class Frontier:
 RATE_HZ = 20.0
 
 
+@dataclass(frozen=True)
+class _Solved:
+    """The solution of a trial, and how the information grew along it."""
+
+    solution: Solution
+    along: InformationHistory | None
+
+
 def solve_with_history(
     trial: Trial,
     *,
@@ -62,18 +71,26 @@ def solve_with_history(
     entries: int | None = None,
     anyway: bool = False,
     progress: Progress | None = None,
+    stages: FinishedStages | None = None,
 ) -> tuple[Solution, InformationHistory | None]:
     """Solve a trial, and follow the information on its constants along it.
 
-    There is no history of a trial without IMU. Parameters and errors as of `solvers.batch.solve`;
-    `entries` as of `information_history`.
+    There is no history of a trial without IMU. Parameters and errors as of `solvers.batch.solve`,
+    and `stages` as of `solve_with_problem`; `entries` as of `information_history`.
     """
-    solution, solved = solve_with_problem(trial, rate_hz=rate_hz, anyway=anyway, progress=progress)
-    if solved is None:
-        return solution, None
-    if progress:
-        progress("information along the trial", 0, None)
-    return solution, information_history(solved, entries=entries)
+
+    def found() -> _Solved:
+        solution, solved = solve_with_problem(
+            trial, rate_hz=rate_hz, anyway=anyway, progress=progress, stages=stages
+        )
+        if solved is None:
+            return _Solved(solution, None)
+        if progress:
+            progress("information along the trial", 0, None)
+        return _Solved(solution, information_history(solved, entries=entries))
+
+    out = finished(stages, "solution", _Solved, found)
+    return out.solution, out.along
 
 
 def information_history(found: SolvedProblem, *, entries: int | None = None) -> InformationHistory:

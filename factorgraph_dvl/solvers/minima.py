@@ -12,6 +12,7 @@ from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph.problem import Evaluation, Problem
 from factorgraph_dvl.imu.propagation import States
+from factorgraph_dvl.io.finished_stages import FinishedStages
 from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.solution import Progress
 from factorgraph_dvl.solvers.fixed_directions import SolvedProblem
@@ -39,7 +40,10 @@ _SAME_ANGLE = 15.0 * DEG
 
 
 def competing_minima(
-    prepared: Preparation, states: States, report: Progress
+    prepared: Preparation,
+    states: States,
+    report: Progress,
+    stages: FinishedStages | None = None,
 ) -> list[SettledMinimum]:
     """Return the minimum that some states lead to, then others that are about as probable.
 
@@ -54,8 +58,10 @@ def competing_minima(
         Where to start.
     report : callable
         Called with stage, iteration and cost.
+    stages : FinishedStages, optional
+        Where what the first starts from is kept, and taken from.
     """
-    first = settle(prepared, states, report)
+    first = settle(prepared, states, report, stages=stages)
     rotations = [p for p in prepared.parameters if p.rotation and p.estimated]
     time = prepared.segments.node_time
     is_free = any(p.sigma.max() > _ANY_ANGLE for p in rotations)

@@ -16,8 +16,9 @@ from factorgraph_dvl.imu.preintegration import Segments, segments
 from factorgraph_dvl.imu.propagation import States
 from factorgraph_dvl.imu.timestamps import without_strays
 from factorgraph_dvl.initialization.attitude_sensors import attitudes
-from factorgraph_dvl.initialization.in_motion_alignment import initial_states
+from factorgraph_dvl.initialization.in_motion_alignment import AlignedStates, initial_states
 from factorgraph_dvl.initialization.mountings import mounted_aids, mountings_from_motion
+from factorgraph_dvl.io.finished_stages import FinishedStages, finished
 from factorgraph_dvl.ranging.position_from_ranges import StartPositions, positions_from_ranges
 from factorgraph_dvl.sensors.finding import Finding
 from factorgraph_dvl.sensors.parameters import Parameter
@@ -84,7 +85,12 @@ class Preparation:
         )
 
 
-def prepare(trial: Trial, state_interval_s: float, report: Progress) -> Preparation:
+def prepare(
+    trial: Trial,
+    state_interval_s: float,
+    report: Progress,
+    stages: FinishedStages | None = None,
+) -> Preparation:
     """Return segments, start states and measurements of a trial.
 
     Parameters
@@ -95,6 +101,8 @@ def prepare(trial: Trial, state_interval_s: float, report: Progress) -> Preparat
         Time between the states of the graph, s.
     report : callable
         Called with stage, iteration and cost.
+    stages : FinishedStages, optional
+        Where the start states are kept, and taken from.
 
     Raises
     ------
@@ -113,7 +121,9 @@ def prepare(trial: Trial, state_interval_s: float, report: Progress) -> Preparat
     seg = segments(inc, state_interval_s, dense_epochs(trial, frame, state_interval_s))
     report("alignment", 0, None)
     on_one_clock = trial.on_one_clock()
-    start = initial_states(on_one_clock, frame, seg)
+    start = finished(
+        stages, "alignment", AlignedStates, lambda: initial_states(on_one_clock, frame, seg)
+    )
     if trial.beacons is not None:
         report("ranges", 0, None)
     start_positions = positions_from_ranges(on_one_clock, frame, seg, start.states)

@@ -17,6 +17,7 @@ from factorgraph_dvl.graph.priors import ConstantsPrior
 from factorgraph_dvl.graph.problem import Evaluation, Problem
 from factorgraph_dvl.graph.processes import Process
 from factorgraph_dvl.imu.propagation import States
+from factorgraph_dvl.io.finished_stages import FinishedStages, finished
 from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.sensors.message import Message, message
 from factorgraph_dvl.sensors.parameters import Parameter
@@ -34,7 +35,7 @@ from factorgraph_dvl.solvers.known_parameters import (
 )
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, factorized, minimise
 from factorgraph_dvl.solvers.outliers import robust_weights
-from factorgraph_dvl.solvers.preparation import Preparation, mounted_start
+from factorgraph_dvl.solvers.preparation import MountedStart, Preparation, mounted_start
 from factorgraph_dvl.solvers.process_fit import refitted
 from factorgraph_dvl.statistics.variance_components import (
     VarianceComponents,
@@ -105,6 +106,7 @@ def settle(
     values: dict[str, Array] | None = None,
     estimate_noise: bool = True,
     clock_zero: float | None = None,
+    stages: FinishedStages | None = None,
 ) -> SettledMinimum:
     """Return the minimum that some states lead to.
 
@@ -126,6 +128,8 @@ def settle(
         say that it is as stated.
     clock_zero : float, optional
         When the offsets of clocks hold, s; by default in the middle of the trial.
+    stages : FinishedStages, optional
+        Where the mountings are kept, and taken from.
     """
     chain = prepared.chain(states)
     p_gravity = states.p_n
@@ -135,7 +139,10 @@ def settle(
     robust: dict[str, Array] = {}
     usable: Mapping[str, BoolArray] | None = None
     if values is None:
-        start = mounted_start(prepared, chain, states, report)
+        first = states
+        start = finished(
+            stages, "mounting", MountedStart, lambda: mounted_start(prepared, chain, first, report)
+        )
         states, values, iterations = start.states, start.values, start.iterations
         robust = start.robust_weights
     rejected = prepared.start_positions.rejected
