@@ -13,7 +13,7 @@ from factorgraph_dvl.errors import ConfigError, DataError, FactorgraphDvlError
 from factorgraph_dvl.io.folders import new_folder
 from factorgraph_dvl.io.planar_folder import save_planar_trial
 from factorgraph_dvl.io.tables import read_table, write_table
-from factorgraph_dvl.io.trial_folder import load_trial, save_trial
+from factorgraph_dvl.io.trial_folder import files_of, load_trial, save_trial
 from factorgraph_dvl.trial import Trial
 
 
@@ -250,6 +250,18 @@ def test_an_explosion_of_aliases_is_an_error(tmp_path: Path) -> None:
     (tmp_path / "trial.yaml").write_text("\n".join(lines))
     with pytest.raises(ConfigError, match="too large"):
         load_trial(tmp_path)
+
+
+def test_files_of_a_trial_are_all_that_it_is_read_from(tmp_path: Path) -> None:
+    (tmp_path / "trial.yaml").write_text(
+        "format: 1\nbody_axes: FRD\nimu: {grade: tactical}\nreference: {file: truth.csv}\n"
+        "gnss: {file: fixes.csv, position_std_m: [1, 1, 1]}\ndvl: {velocity_std_m_s: 0.01}\n"
+    )
+    (tmp_path / "truth.csv").touch()
+    # Records that the settings do not name are imu.csv and dvl.csv.
+    names = [path.name for path in files_of(tmp_path)]
+    assert names == ["trial.yaml", "dvl.csv", "fixes.csv", "imu.csv", "truth.csv"]
+    assert files_of(tmp_path / "trial.yaml") == files_of(tmp_path)
 
 
 def test_missing_trials_are_named(tmp_path: Path) -> None:
