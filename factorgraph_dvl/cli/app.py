@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, NoReturn
 import typer
 
 from factorgraph_dvl.cli.commands import Commands
-from factorgraph_dvl.cli.options import claims
+from factorgraph_dvl.cli.options import INTERRUPTED, claims
 from factorgraph_dvl.cli.streams import guard_streams, output_failure
 from factorgraph_dvl.errors import FactorgraphDvlError, OutputError, printable
 
@@ -20,8 +20,6 @@ if TYPE_CHECKING:
     from factorgraph_dvl.cli.events import FailureKind
 
 _NAME = "factorgraph-dvl"
-# The exit code of an interrupt, as in Typer.
-_INTERRUPTED = 130
 # Options that stand anywhere on the line.
 _EVERYWHERE = ("--debug", "--json")
 _NO_PARTS: Mapping[str, str] = {}
@@ -107,9 +105,9 @@ def _run(args: list[str]) -> NoReturn:
         hint = "" if "--debug" in args else ". Run with --debug to see where"
         _fail(f"internal error: {type(error).__name__}: {error}{hint}", 1, args, "internal")
     except SystemExit as done:
-        if done.code == _INTERRUPTED:
+        if done.code == INTERRUPTED:
             if "--json" in args:
-                _fail("interrupted", _INTERRUPTED, args, "interrupted")
+                _fail("interrupted", INTERRUPTED, args, "interrupted")
             # Said without rich, which may be what was being loaded.
             raise KeyboardInterrupt from done
         failure = output_failure()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from math import isfinite
@@ -21,6 +20,7 @@ from factorgraph_dvl.cli.console import (
     warn,
 )
 from factorgraph_dvl.cli.options import (
+    INTERRUPTED,
     Anyway,
     FigureKind,
     Figures,
@@ -38,7 +38,7 @@ from factorgraph_dvl.cli.report import write_report
 from factorgraph_dvl.cli.verdict import end_with, print_findings, print_verdict
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping
+    from collections.abc import Callable, Mapping
 
     from factorgraph_dvl.analysis.comparison.halves import Halves
     from factorgraph_dvl.baselines import History
@@ -118,7 +118,6 @@ def solve(
         from factorgraph_dvl.solvers.information_along_trial import solve_with_history
 
         parts = halves_of(trial) if halves else None
-
         solution, along = solve_with_history(
             trial,
             rate_hz=rate,
@@ -337,19 +336,13 @@ def _stages(
             "version of the program, so all stages run anew"
         )
 
-    @contextmanager
-    def removed() -> Iterator[None]:
-        try:
-            yield
-        except Exception:
-            stages.remove()
-            raise
-        except BaseException:
+    def ended(_: object, error: BaseException | None, __: object) -> None:
+        if isinstance(error, KeyboardInterrupt) or getattr(error, "code", 0) == INTERRUPTED:
             warn("interrupted; --resume continues after the stages that had ended")
-            raise
-        stages.remove()
+        else:
+            stages.remove()
 
-    claims.enter_context(removed())
+    claims.push(ended)
     return stages
 
 

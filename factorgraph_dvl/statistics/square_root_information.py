@@ -7,6 +7,7 @@ the digits that navigation-grade gyros need.
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -234,6 +235,19 @@ def eliminated(
         Dimension of every variable by key.
     """
     return SquareRootInformation(_trees(gaussian, ordering), sizes)
+
+
+def last_eliminated(
+    gaussian: gtsam.GaussianFactorGraph, ordering: gtsam.Ordering, sizes: Mapping[int, int]
+) -> SquareRootInformation:
+    """Return the square-root information of what is eliminated last alone.
+
+    As `eliminated`, of which it keeps a part; the solution and covariances of these variables are
+    the same.
+    """
+    # Those before the last are not needed once they are eliminated.
+    last = deque(_trees(gaussian, ordering), maxlen=1)
+    return SquareRootInformation(last, sizes)
 
 
 def _trees(

@@ -6,12 +6,12 @@ import os
 import signal
 
 import pytest
-from simulated import scenario_dict
+from truth import scenario
 
 from factorgraph_dvl.cli import main
 from factorgraph_dvl.cli.console import ProgressLine
 from factorgraph_dvl.io.trial_folder import save_trial
-from factorgraph_dvl.simulation import parse_scenario, simulate
+from factorgraph_dvl.simulation import simulate
 from factorgraph_dvl.solvers import information_along_trial, preparation, rounds
 
 RESULTS = ("calibration.json", "trajectory.csv", "residuals.parquet", "history.csv")
@@ -20,7 +20,7 @@ RESULTS = ("calibration.json", "trajectory.csv", "residuals.parquet", "history.c
 @pytest.fixture(scope="module")
 def trial(tmp_path_factory):
     path = tmp_path_factory.mktemp("resume") / "trial"
-    save_trial(simulate(parse_scenario(scenario_dict(noise=True)), 1), path, parquet=True)
+    save_trial(simulate(scenario(noise=True), 1), path, parquet=True)
     return path
 
 
