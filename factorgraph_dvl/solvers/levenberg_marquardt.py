@@ -192,7 +192,12 @@ def factorized_last(
 ) -> tuple[SquareRootInformation, gtsam.VectorValues]:
     """Return what `factorized` does of the parameters alone, with less memory."""
     gaussian = problem.linearize(evaluation)
-    out = last_eliminated(gaussian, problem.ordering(gaussian), evaluation.values.dims())
+    out = last_eliminated(
+        gaussian,
+        problem.ordering(gaussian),
+        evaluation.values.dims(),
+        len(problem.parameters),
+    )
     return out, out.solution()
 
 

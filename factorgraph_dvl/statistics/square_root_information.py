@@ -238,16 +238,24 @@ def eliminated(
 
 
 def last_eliminated(
-    gaussian: gtsam.GaussianFactorGraph, ordering: gtsam.Ordering, sizes: Mapping[int, int]
+    gaussian: gtsam.GaussianFactorGraph,
+    ordering: gtsam.Ordering,
+    sizes: Mapping[int, int],
+    count: int,
 ) -> SquareRootInformation:
-    """Return the square-root information of what is eliminated last alone.
+    """Return the square-root information of the `count` variables that are eliminated last.
 
     As `eliminated`, of which it keeps a part; the solution and covariances of these variables are
     the same.
     """
-    # Those before the last are not needed once they are eliminated.
-    last = deque(_trees(gaussian, ordering), maxlen=1)
-    return SquareRootInformation(last, sizes)
+    # Parts before these are not needed once they are eliminated.
+    kept = 1 + -(-count // _part(ordering.size()))
+    return SquareRootInformation(deque(_trees(gaussian, ordering), maxlen=kept), sizes)
+
+
+def _part(count: int) -> int:
+    """Return how many of so many variables are eliminated at once."""
+    return -(-count // _PARTS) if count > _MANY else count
 
 
 def _trees(
@@ -255,7 +263,7 @@ def _trees(
 ) -> Iterator[gtsam.GaussianBayesTree]:
     """Yield the Bayes trees of one part of the variables after another."""
     count = ordering.size()
-    size = -(-count // _PARTS) if count > _MANY else count
+    size = _part(count)
     for first in range(0, count - size, size):
         part = gtsam.Ordering()
         for i in range(first, first + size):

@@ -56,7 +56,8 @@ def test_elimination_in_parts_gives_the_same(system, monkeypatch):
         assert worst_relative(found[key], expected[key]) < 1e-6
         sigma = np.sqrt(np.diag(expected[key]))
         np.testing.assert_allclose(step.at(key) / sigma, exact.at(key) / sigma, atol=1e-6)
-    last = last_eliminated(gaussian, problem.ordering(gaussian), sizes)
+    count = len(problem.parameters)
+    last = last_eliminated(gaussian, problem.ordering(gaussian), sizes, count)
     np.testing.assert_allclose(
         last.covariance_of(every), in_parts.covariance_of(every), rtol=1e-12
     )
