@@ -73,13 +73,6 @@ class FinishedStages:
         shutil.rmtree(self._folder, ignore_errors=True)
 
 
-def finished(
-    stages: FinishedStages | None, stage: str, kind: type[_Result], compute: Callable[[], _Result]
-) -> _Result:
-    """Return the result of a stage, as `FinishedStages.result`; without stages, a new one."""
-    return compute() if stages is None else stages.result(stage, kind, compute)
-
-
 def _write(file: Path, content: bytes) -> None:
     """Write a file, complete or not at all; without room for it the run goes on."""
     partial = file.with_suffix(".partial")

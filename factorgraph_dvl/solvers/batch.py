@@ -11,7 +11,6 @@ import numpy as np
 from factorgraph_dvl.errors import ConfigError
 from factorgraph_dvl.graph.priors import ConstantsPrior
 from factorgraph_dvl.imu.propagation import States
-from factorgraph_dvl.io.finished_stages import FinishedStages
 from factorgraph_dvl.quality.refusal import accepted_errors, explained
 from factorgraph_dvl.quality.survey import survey
 from factorgraph_dvl.ranging.hypothesis_weights import significant_costs
@@ -35,6 +34,7 @@ from factorgraph_dvl.solvers.motion_smoother import smooth_motion
 from factorgraph_dvl.solvers.motion_summary import summarise_motion
 from factorgraph_dvl.solvers.preparation import Preparation, prepare
 from factorgraph_dvl.solvers.rounds import SettledMinimum, settle
+from factorgraph_dvl.solvers.stages import Stages
 from factorgraph_dvl.solvers.state_times import STATE_INTERVAL
 from factorgraph_dvl.solvers.summary import summarise
 from factorgraph_dvl.solvers.trajectory import TRAJECTORY_RATE
@@ -102,7 +102,7 @@ def solve_with_problem(
     state_interval_s: float = STATE_INTERVAL,
     anyway: bool = False,
     progress: Progress | None = None,
-    stages: FinishedStages | None = None,
+    stages: Stages | None = None,
 ) -> tuple[Solution, SolvedProblem | None]:
     """Return the solution of a trial, and its problem at the most probable minimum.
 
@@ -131,7 +131,7 @@ def _most_probable(
     rate_hz: float,
     state_interval_s: float,
     report: Progress,
-    stages: FinishedStages | None,
+    stages: Stages | None,
 ) -> tuple[Solution, SolvedProblem]:
     """Return the most probable of all minima from all positions, with the spread of the others."""
     prepared = prepare(trial, state_interval_s, report, stages)
@@ -181,7 +181,7 @@ def _minima(
     states: States,
     findings: tuple[Finding, ...],
     report: Progress,
-    stages: FinishedStages | None = None,
+    stages: Stages | None = None,
 ) -> list[SolvedProblem]:
     """Return the minima near some states and their rivals, the most probable first."""
     found = competing_minima(prepared, states, report, stages)

@@ -23,11 +23,11 @@ from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph import keys
 from factorgraph_dvl.graph.keys import BIAS_SIZE
 from factorgraph_dvl.graph.problem import FIXED_DIRECTION_STD, Evaluation, Problem
-from factorgraph_dvl.io.finished_stages import FinishedStages, finished
 from factorgraph_dvl.solution import Progress, Solution
 from factorgraph_dvl.solvers.batch import solve_with_problem
 from factorgraph_dvl.solvers.calibration import prior_along, reported
 from factorgraph_dvl.solvers.fixed_directions import SolvedProblem
+from factorgraph_dvl.solvers.stages import Stages, finished
 from factorgraph_dvl.statistics.information_history import InformationHistory
 from factorgraph_dvl.statistics.spurious_information import spurious_information
 from factorgraph_dvl.statistics.undetermined_directions import (
@@ -71,7 +71,7 @@ def solve_with_history(
     entries: int | None = None,
     anyway: bool = False,
     progress: Progress | None = None,
-    stages: FinishedStages | None = None,
+    stages: Stages | None = None,
 ) -> tuple[Solution, InformationHistory | None]:
     """Solve a trial, and follow the information on its constants along it.
 

@@ -12,13 +12,13 @@ from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph.problem import Evaluation, Problem
 from factorgraph_dvl.imu.propagation import States
-from factorgraph_dvl.io.finished_stages import FinishedStages
 from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.solution import Progress
 from factorgraph_dvl.solvers.fixed_directions import SolvedProblem
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, minimise
 from factorgraph_dvl.solvers.preparation import ROUGH_TOLERANCE, Preparation
 from factorgraph_dvl.solvers.rounds import SettledMinimum, settle
+from factorgraph_dvl.solvers.stages import Stages
 from factorgraph_dvl.statistics.robust_weights import rejection_cost
 
 # Length, s, up to which start values may lead to a wrong minimum, and standard deviation, rad,
@@ -43,7 +43,7 @@ def competing_minima(
     prepared: Preparation,
     states: States,
     report: Progress,
-    stages: FinishedStages | None = None,
+    stages: Stages | None = None,
 ) -> list[SettledMinimum]:
     """Return the minimum that some states lead to, then others that are about as probable.
 
@@ -58,7 +58,7 @@ def competing_minima(
         Where to start.
     report : callable
         Called with stage, iteration and cost.
-    stages : FinishedStages, optional
+    stages : Stages, optional
         Where what the first starts from is kept, and taken from.
     """
     first = settle(prepared, states, report, stages=stages)

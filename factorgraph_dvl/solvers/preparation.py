@@ -18,7 +18,6 @@ from factorgraph_dvl.imu.timestamps import without_strays
 from factorgraph_dvl.initialization.attitude_sensors import attitudes
 from factorgraph_dvl.initialization.in_motion_alignment import AlignedStates, initial_states
 from factorgraph_dvl.initialization.mountings import mounted_aids, mountings_from_motion
-from factorgraph_dvl.io.finished_stages import FinishedStages, finished
 from factorgraph_dvl.ranging.position_from_ranges import StartPositions, positions_from_ranges
 from factorgraph_dvl.sensors.finding import Finding
 from factorgraph_dvl.sensors.parameters import Parameter
@@ -26,6 +25,7 @@ from factorgraph_dvl.sensors.protocol import Observation
 from factorgraph_dvl.solution import Progress
 from factorgraph_dvl.solvers.levenberg_marquardt import minimise
 from factorgraph_dvl.solvers.outliers import robust_weights
+from factorgraph_dvl.solvers.stages import Stages, finished
 from factorgraph_dvl.solvers.state_times import dense_epochs
 from factorgraph_dvl.trial import Trial
 
@@ -89,7 +89,7 @@ def prepare(
     trial: Trial,
     state_interval_s: float,
     report: Progress,
-    stages: FinishedStages | None = None,
+    stages: Stages | None = None,
 ) -> Preparation:
     """Return segments, start states and measurements of a trial.
 
@@ -101,7 +101,7 @@ def prepare(
         Time between the states of the graph, s.
     report : callable
         Called with stage, iteration and cost.
-    stages : FinishedStages, optional
+    stages : Stages, optional
         Where the start states are kept, and taken from.
 
     Raises

@@ -17,7 +17,6 @@ from factorgraph_dvl.graph.priors import ConstantsPrior
 from factorgraph_dvl.graph.problem import Evaluation, Problem
 from factorgraph_dvl.graph.processes import Process
 from factorgraph_dvl.imu.propagation import States
-from factorgraph_dvl.io.finished_stages import FinishedStages, finished
 from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.sensors.message import Message, message
 from factorgraph_dvl.sensors.parameters import Parameter
@@ -37,6 +36,7 @@ from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, factorized, min
 from factorgraph_dvl.solvers.outliers import robust_weights
 from factorgraph_dvl.solvers.preparation import MountedStart, Preparation, mounted_start
 from factorgraph_dvl.solvers.process_fit import refitted
+from factorgraph_dvl.solvers.stages import Stages, finished
 from factorgraph_dvl.statistics.variance_components import (
     VarianceComponents,
     variance_components,
@@ -106,7 +106,7 @@ def settle(
     values: dict[str, Array] | None = None,
     estimate_noise: bool = True,
     clock_zero: float | None = None,
-    stages: FinishedStages | None = None,
+    stages: Stages | None = None,
 ) -> SettledMinimum:
     """Return the minimum that some states lead to.
 
@@ -128,7 +128,7 @@ def settle(
         say that it is as stated.
     clock_zero : float, optional
         When the offsets of clocks hold, s; by default in the middle of the trial.
-    stages : FinishedStages, optional
+    stages : Stages, optional
         Where the mountings are kept, and taken from.
     """
     chain = prepared.chain(states)

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from factorgraph_dvl.geometry.vectors import Array
-from factorgraph_dvl.io.finished_stages import FinishedStages, finished
+from factorgraph_dvl.io.finished_stages import FinishedStages
+from factorgraph_dvl.solvers.stages import finished
 
 
 @dataclass(frozen=True)
