@@ -1,7 +1,7 @@
 """Measure campaigns: workers that are killed, a mount that moved, recorded trials.
 
-    python benchmarks/campaign.py [--trials N] [--seconds S] [--between S] [--workers N]
-                                  [--remount N] [--recorded FOLDER] [--out DIR]
+    python benchmarks/campaign.py [--trials N] [--seconds S] [--between S] [--single N]
+                                  [--workers N] [--remount N] [--recorded FOLDER] [--out DIR]
 
 writes `campaign-results.md` into out/benchmarks, or with `--out docs` that of the documentation.
 Trials are simulated, some of them solved one after the other, and all of them by a campaign of
@@ -34,8 +34,6 @@ from factorgraph_dvl.simulation import parse_scenario, simulate
 from factorgraph_dvl.simulation.scenario import Scenario
 
 PAGE = "campaign-results.md"
-# Trials that are solved one after the other.
-SINGLE = 20
 # Step of the mount, and standard deviation of each angle between trials, deg; and the share of
 # the trials before the step.
 STEP = 0.1
@@ -55,6 +53,7 @@ def main() -> None:
     parser.add_argument("--trials", type=int, default=200, help="trials with kills (200)")
     parser.add_argument("--seconds", type=float, default=453.0, help="length of each (453)")
     parser.add_argument("--between", type=float, default=60.0, help="time between kills, s (60)")
+    parser.add_argument("--single", type=int, default=20, help="trials solved alone (20)")
     parser.add_argument("--workers", type=int, default=2, help="number of workers (2)")
     parser.add_argument("--remount", type=int, default=40, help="trials with a remount (40)")
     parser.add_argument("--recorded", type=Path, help="folder of trials, such as recorded dives")
@@ -100,7 +99,7 @@ def killed(folder: Path, args: Any) -> list[Row]:
             simulate(scenario(path.name, args.seconds), seed), path, parquet=True, seed=seed
         )
     single = []
-    for path in trials[:SINGLE]:
+    for path in trials[: args.single]:
         start = perf_counter()
         solve = ["solve", str(path), "--out", str(folder / "single" / path.name), "--quiet"]
         subprocess.run(command(*solve), check=True, stdout=subprocess.DEVNULL)
