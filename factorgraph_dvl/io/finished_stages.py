@@ -39,10 +39,10 @@ class FinishedStages:
     def __init__(self, folder: Path, fingerprint: str, *, resume: bool) -> None:
         self._folder = folder
         file = folder / _FINGERPRINT
-        self.found = resume and file.exists() and file.read_text(encoding="utf-8") == fingerprint
+        self.found = resume and file.is_file() and file.read_bytes() == fingerprint.encode()
         if not self.found:
             self.remove()
-            folder.mkdir(parents=True)
+            folder.mkdir(parents=True, exist_ok=True)
             _write(file, fingerprint.encode())
 
     def result(self, stage: str, kind: type[_Result], compute: Callable[[], _Result]) -> _Result:
