@@ -65,7 +65,9 @@ class FinishedStages:
                 # What cannot be read is computed anew.
                 pass
         out = compute()
-        _write(file, msgspec.msgpack.encode(out, enc_hook=_encoded))
+        # Sensors of other packages may have results of other kinds, which are computed anew.
+        with suppress(TypeError, OverflowError):
+            _write(file, msgspec.msgpack.encode(out, enc_hook=_encoded))
         return out
 
     def remove(self) -> None:

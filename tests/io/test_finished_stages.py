@@ -80,4 +80,6 @@ def test_without_room_a_run_goes_on(tmp_path):
     # Under this name nothing can be written.
     (tmp_path / "stages" / "alignment.partial").mkdir()
     assert stages.result("alignment", Result, lambda: RESULT) is RESULT
+    other = Result(RESULT.values, RESULT.used, (object(),))
+    assert stages.result("mounting", Result, lambda: other) is other
     assert finished(None, "alignment", Result, lambda: RESULT) is RESULT
