@@ -32,7 +32,13 @@ def stub(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
     state: dict[str, Any] = {"solution": build_solution(), "raises": None}
 
     def solve(
-        trial: Trial, *, rate_hz: float, entries: int, anyway: bool, progress: Callable[..., None]
+        trial: Trial,
+        *,
+        rate_hz: float,
+        entries: int,
+        anyway: bool,
+        progress: Callable[..., None],
+        stages: object,
     ) -> tuple[Solution, InformationHistory | None]:
         state["trial"], state["rate"] = trial, rate_hz
         progress("alignment", 0, None)
