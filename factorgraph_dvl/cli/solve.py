@@ -337,7 +337,8 @@ def _stages(
         )
 
     def ended(_: object, error: BaseException | None, __: object) -> None:
-        if isinstance(error, KeyboardInterrupt) or getattr(error, "code", 0) == INTERRUPTED:
+        code = getattr(error, "code", 0)
+        if stages.any and (isinstance(error, KeyboardInterrupt) or code == INTERRUPTED):
             warn("interrupted; --resume continues after the stages that had ended")
         else:
             stages.remove()

@@ -12,6 +12,7 @@ import msgspec
 import numpy as np
 
 _FINGERPRINT = "fingerprint"
+_SUFFIX = ".msgpack"
 # Kinds of numbers that results consist of: truth values, integers, floats.
 _KINDS = "biuf"
 
@@ -45,6 +46,11 @@ class FinishedStages:
             folder.mkdir(parents=True, exist_ok=True)
             _write(file, fingerprint.encode())
 
+    @property
+    def any(self) -> bool:
+        """Whether there is the result of a stage."""
+        return any(self._folder.glob(f"*{_SUFFIX}"))
+
     def result(self, stage: str, kind: type[_Result], compute: Callable[[], _Result]) -> _Result:
         """Return the result of a stage: the one that was kept, else a new one, which is kept.
 
@@ -57,7 +63,7 @@ class FinishedStages:
         compute : callable
             Returns the result.
         """
-        file = self._folder / f"{stage}.msgpack"
+        file = self._folder / f"{stage}{_SUFFIX}"
         if file.exists():
             try:
                 return msgspec.msgpack.decode(file.read_bytes(), type=kind, dec_hook=_decoded)
