@@ -151,7 +151,7 @@ def solve(
         anyway=anyway,
         quiet=quiet,
         resume=resume,
-        options={"anyway": f"{anyway}", "rate": f"{rate}"},
+        options={"anyway": f"{anyway}"},
     )
 
 

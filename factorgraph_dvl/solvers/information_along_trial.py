@@ -27,7 +27,7 @@ from factorgraph_dvl.solution import Progress, Solution
 from factorgraph_dvl.solvers.batch import solve_with_problem
 from factorgraph_dvl.solvers.calibration import prior_along, reported
 from factorgraph_dvl.solvers.fixed_directions import SolvedProblem
-from factorgraph_dvl.solvers.stages import Stages, finished
+from factorgraph_dvl.solvers.stages import Stages
 from factorgraph_dvl.statistics.information_history import InformationHistory
 from factorgraph_dvl.statistics.spurious_information import spurious_information
 from factorgraph_dvl.statistics.undetermined_directions import (
@@ -56,14 +56,6 @@ class Frontier:
 RATE_HZ = 20.0
 
 
-@dataclass(frozen=True)
-class _Solved:
-    """The solution of a trial, and how the information grew along it."""
-
-    solution: Solution
-    along: InformationHistory | None
-
-
 def solve_with_history(
     trial: Trial,
     *,
@@ -78,19 +70,14 @@ def solve_with_history(
     There is no history of a trial without IMU. Parameters and errors as of `solvers.batch.solve`,
     and `stages` as of `solve_with_problem`; `entries` as of `information_history`.
     """
-
-    def found() -> _Solved:
-        solution, solved = solve_with_problem(
-            trial, rate_hz=rate_hz, anyway=anyway, progress=progress, stages=stages
-        )
-        if solved is None:
-            return _Solved(solution, None)
-        if progress:
-            progress("information along the trial", 0, None)
-        return _Solved(solution, information_history(solved, entries=entries))
-
-    out = finished(stages, "solution", _Solved, found)
-    return out.solution, out.along
+    solution, solved = solve_with_problem(
+        trial, rate_hz=rate_hz, anyway=anyway, progress=progress, stages=stages
+    )
+    if solved is None:
+        return solution, None
+    if progress:
+        progress("information along the trial", 0, None)
+    return solution, information_history(solved, entries=entries)
 
 
 def information_history(found: SolvedProblem, *, entries: int | None = None) -> InformationHistory:

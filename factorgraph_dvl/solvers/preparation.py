@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -19,7 +20,8 @@ from factorgraph_dvl.initialization.attitude_sensors import attitudes
 from factorgraph_dvl.initialization.in_motion_alignment import AlignedStates, initial_states
 from factorgraph_dvl.initialization.mountings import mounted_aids, mountings_from_motion
 from factorgraph_dvl.ranging.position_from_ranges import StartPositions, positions_from_ranges
-from factorgraph_dvl.sensors.finding import Finding
+from factorgraph_dvl.sensors.finding import Code, Finding, Severity
+from factorgraph_dvl.sensors.message import decoded, encoded
 from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.sensors.protocol import Observation
 from factorgraph_dvl.solution import Progress
@@ -85,6 +87,43 @@ class Preparation:
         )
 
 
+@dataclass(frozen=True)
+class _Said:
+    """A finding as plain data."""
+
+    code: Code
+    message: Any
+    text: str
+    sensor: str
+    parameter: str
+    severity: Severity
+
+
+@dataclass(frozen=True)
+class _Aligned:
+    """Aligned states with findings as plain data, as stages keep them."""
+
+    states: States
+    mountings: dict[str, Array]
+    findings: tuple[_Said, ...]
+
+    def again(self) -> AlignedStates:
+        """Return the aligned states."""
+        findings = tuple(
+            Finding(f.code, decoded(f.message, f.text), f.sensor, f.parameter, f.severity)
+            for f in self.findings
+        )
+        return AlignedStates(self.states, self.mountings, findings)
+
+
+def _kept(found: AlignedStates) -> _Aligned:
+    said = []
+    for f in found.findings:
+        plain = None if isinstance(f.message, str) else encoded(f.message)
+        said.append(_Said(f.code, plain, f.text, f.sensor, f.parameter, f.severity))
+    return _Aligned(found.states, found.mountings, tuple(said))
+
+
 def prepare(
     trial: Trial,
     state_interval_s: float,
@@ -121,9 +160,10 @@ def prepare(
     seg = segments(inc, state_interval_s, dense_epochs(trial, frame, state_interval_s))
     report("alignment", 0, None)
     on_one_clock = trial.on_one_clock()
-    start = finished(
-        stages, "alignment", AlignedStates, lambda: initial_states(on_one_clock, frame, seg)
+    aligned = finished(
+        stages, "alignment", _Aligned, lambda: _kept(initial_states(on_one_clock, frame, seg))
     )
+    start = aligned.again()
     if trial.beacons is not None:
         report("ranges", 0, None)
     start_positions = positions_from_ranges(on_one_clock, frame, seg, start.states)

@@ -12,7 +12,7 @@ from factorgraph_dvl.cli import main
 from factorgraph_dvl.cli.console import ProgressLine
 from factorgraph_dvl.io.trial_folder import save_trial
 from factorgraph_dvl.simulation import simulate
-from factorgraph_dvl.solvers import information_along_trial, preparation, rounds
+from factorgraph_dvl.solvers import preparation, rounds
 
 RESULTS = ("calibration.json", "trajectory.csv", "residuals.parquet", "history.csv")
 
@@ -60,17 +60,6 @@ def test_a_run_continues_after_the_stages_that_had_ended(run, monkeypatch, trial
     killed(trial, tmp_path / "out", "covariance")
     monkeypatch.setattr(preparation, "initial_states", forbidden)
     monkeypatch.setattr(rounds, "mounted_start", forbidden)
-    result = run(*options(trial, tmp_path / "out", "--resume"))
-    assert result.code == 0, result.err
-    assert {name: (tmp_path / "out" / name).read_bytes() for name in RESULTS} == whole
-    assert [p.name for p in tmp_path.iterdir()] == ["out"]
-
-
-def test_a_solution_that_was_not_yet_written_is_not_solved_again(
-    run, monkeypatch, trial, whole, tmp_path
-):
-    killed(trial, tmp_path / "out", "write")
-    monkeypatch.setattr(information_along_trial, "solve_with_problem", forbidden)
     result = run(*options(trial, tmp_path / "out", "--resume"))
     assert result.code == 0, result.err
     assert {name: (tmp_path / "out" / name).read_bytes() for name in RESULTS} == whole
