@@ -190,7 +190,7 @@ def factorized(
 def factorized_last(
     problem: Problem, evaluation: Evaluation
 ) -> tuple[SquareRootInformation, gtsam.VectorValues]:
-    """Return what `factorized` does of the parameters alone, with less memory."""
+    """Return what `factorized` does of the parameters alone: states need not be kept."""
     gaussian = problem.linearize(evaluation)
     out = last_eliminated(
         gaussian,
