@@ -82,7 +82,7 @@ def _gaps(time: Array, label: str) -> Iterator[Finding]:
         yield Finding(
             Code.GAPS,
             message(
-                "gaps.one_interpolated" if gaps.size == 1 else "gaps.interpolated",
+                "gaps.interpolated",
                 count=gaps.size,
                 start=time[k],
                 end=time[k + 1],

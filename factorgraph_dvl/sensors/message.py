@@ -60,7 +60,14 @@ class _InLanguage(Formatter):
         self._separator = separator
 
     def format_field(self, value: Any, format_spec: str) -> str:
-        """Return a value as text; each of several by the same format."""
+        """Return a value as text; each of several by the same format.
+
+        `|ping|pings` writes a number with its word, `~is|are` the word alone.
+        """
+        if format_spec[:1] in ("|", "~"):
+            one, many = format_spec[1:].split("|")
+            word = one if value == 1 else many
+            return f"{value} {word}" if format_spec[0] == "|" else word
         if isinstance(value, Message):
             return value.text(self._language)
         if isinstance(value, tuple):

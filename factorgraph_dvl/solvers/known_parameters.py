@@ -172,8 +172,6 @@ def confirmed(problem: Problem, minimum: Minimum, found: Explanation) -> bool:
 def _chi_square(explanation: Explanation) -> Message:
     """Return how strong the evidence is, in brackets."""
     score = explanation.score
-    if score.freedom == 1:
-        return message("words.chi2_of_one", chi2=score.chi2)
     return message("words.chi2", chi2=score.chi2, freedom=score.freedom)
 
 

@@ -64,8 +64,7 @@ def summarise(trial: Trial, found: SolvedProblem, *, rate_hz: float) -> Solution
         text = message("not_converged.do_not_use", iterations=minimum.iterations)
         findings.append(Finding(Code.NOT_CONVERGED, text, severity="error"))
     for label, count in problem.uncovered.items():
-        text = message("unused.one_without_imu" if count == 1 else "unused.without_imu",
-                       count=count)  # fmt: skip
+        text = message("unused.without_imu", count=count)
         findings.append(Finding(Code.UNUSED, text, sensor=label))
     noise = noise_of(problem)
     findings += consistency_findings(estimates, residuals, noise)

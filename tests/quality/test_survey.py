@@ -118,7 +118,7 @@ PROBLEMS: dict[str, tuple[Callable[[Trial], Trial], str, str]] = {
     "opposite rate": (lambda t: scaled_imu(t, gyro=-1.0), "IMU", "opposite sign"),
     "no rate": (lambda t: scaled_imu(t, gyro=0.0), "IMU", "zero throughout"),
     "axes": (lambda t: replace(t, body_axes="FRD"), "IMU", "points along +z"),
-    "gap": (lambda t: cut(t, 20.0, 25.0), "IMU", "1 gaps"),
+    "gap": (lambda t: cut(t, 20.0, 25.0), "IMU", "1 gap"),
     "milliseconds": (slow_clock, "IMU", "milliseconds (50 Hz)"),
     "swapped": (
         lambda t: gnss_velocity(t, lambda v: v[:, [1, 0, 2]] * [1.0, 1.0, 1.0]),

@@ -391,8 +391,8 @@ def test_lost_samples_and_an_end_that_is_not_reached_are_said(trial, tmp_path, c
     assert solution.trajectory.time[-1] == pytest.approx(75.0, abs=0.11)
     shown = " ".join(capsys.readouterr().err.split())
     for code, text in (
-        (Code.LOST_SAMPLES, "3 lost samples in 1 places were interpolated"),
-        (Code.LOST_SAMPLES, "1 samples that were lost after the start were interpolated"),
+        (Code.LOST_SAMPLES, "3 lost samples in 1 place were interpolated"),
+        (Code.LOST_SAMPLES, "1 sample that was lost after the start was interpolated"),
         (Code.UNUSED, "the replay ended at 75.0"),
     ):
         assert any(text in w for w in of_code(solution.findings, code)), text

@@ -115,6 +115,12 @@ def test_numbers_and_words_are_written_in_either_language():
     assert "[1.0, 0.0, 2.0] m" in arm.text("zh")
 
 
+def test_words_follow_their_number():
+    one, many = (str(message("unused.without_imu", count=n)) for n in (1, 2))
+    assert one == "1 measurement at times without IMU data was not used"
+    assert many == "2 measurements at times without IMU data were not used"
+
+
 def test_alternatives_are_joined():
     assert str(either(["RFU", "FLU", "FRD"])) == "RFU or FLU or FRD"
     assert either(["FRD"]) == "FRD"
