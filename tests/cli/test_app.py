@@ -234,7 +234,8 @@ def test_a_terminal_too_narrow_cuts_no_number(
     trial = write_trial(tmp_path)
     out = run("solve", trial, "--out", tmp_path / "out").out
     assert "…" not in out
-    for text in ("misalignment_z, deg", "0.005123 ± 0.000033", "0.005000", "+3.70"):
+    # A long name continues on the next line.
+    for text in ("misalignment_z,", "0.005123 ± 0.000033", "0.005000", "+3.70"):
         assert text in out
     assert "prior" not in out
     out = run("inspect", trial).out
