@@ -82,16 +82,18 @@ def test_an_earlier_calibration_is_contradicted(apart, severity):
     ("value", "std", "severity"),
     [
         # The data outweigh a prior that is six standard deviations off, or are drawn by it.
-        (0.6, 0.001, "warning"),
-        (0.45, 0.05, "error"),
-        (0.4, 0.001, None),
+        (0.006, 1e-5, "warning"),
+        (0.0045, 5e-4, "error"),
+        (0.004, 1e-5, None),
         # Half of what the prior knew, and half of the way: seven standard deviations apart.
-        (0.495, 0.0707, "error"),
+        (0.00495, 7.07e-4, "error"),
     ],
 )
 def test_a_value_far_from_its_stated_prior_is_a_reason(value, std, severity):
     scale = build_solution().estimates[1]
-    scale = replace(scale, value=np.array([value]), std=np.array([std]), prior_std=np.array([0.1]))
+    scale = replace(
+        scale, value=np.array([value]), std=np.array([std]), prior_std=np.array([1e-3])
+    )
     found = consistency_findings([scale], [])
     assert [(f.code, f.severity) for f in found] == (
         [(Code.FAR_FROM_PRIOR, severity)] if severity else []

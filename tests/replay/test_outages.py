@@ -9,6 +9,7 @@ import numpy as np
 from factorgraph_dvl.replay.outages import Outages
 from factorgraph_dvl.replay.update import Innovations
 from factorgraph_dvl.sensors.finding import Code, Finding
+from factorgraph_dvl.sensors.message import message
 
 
 def test_outages_is_that_of_arrivals():
@@ -25,7 +26,7 @@ def test_outages_is_that_of_arrivals():
         )
     ]
     assert outages.findings(35.0, heard(20.0)) == [
-        Finding(Code.HEARD_AGAIN, "back after 8.0 s", "GNSS")
+        Finding(Code.HEARD_AGAIN, message("heard_again.back", duration=8.0), "GNSS")
     ]
 
 

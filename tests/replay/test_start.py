@@ -7,6 +7,7 @@ from exactness import worst_relative
 
 from factorgraph_dvl.replay.smoother import Smoother
 from factorgraph_dvl.replay.start import solve_start
+from factorgraph_dvl.sensors.message import Message
 from factorgraph_dvl.solvers.batch import settled_minimum
 from factorgraph_dvl.solvers.posterior import posterior
 
@@ -56,5 +57,5 @@ def test_measurements_as_stated_fit(started):
 def test_a_start_is_refused_with_its_reason(started, monkeypatch):
     monkeypatch.setattr("factorgraph_dvl.replay.start._ATTITUDE", 1e-9)
     said = solve_start(started.early, None, 1.0, 0.0, silent, 0.0)
-    assert isinstance(said, str)
-    assert "attitude is known to" in said
+    assert isinstance(said, Message)
+    assert "attitude is known to" in str(said)
