@@ -19,6 +19,7 @@ def trial(tmp_path_factory):
     return folder
 
 
+@pytest.mark.slow
 def test_the_linear_filter_draws_how_it_converged_and_says_its_accuracy(trial, run, tmp_path):  # noqa: F811
     out = tmp_path / "out"
     result = run("kalman", trial, "--method", "nine-state", "--linear", "--out", out, "--quiet")

@@ -263,7 +263,13 @@ def run_blocks(name: str, stock: Path, folder: Path, run: Run, *, slow: bool) ->
 
 
 # Their commands are run by the blocks of other pages too, and take long.
-LONG = ("docs/crosscheck.md", "docs/getting-started.md", "docs/kalman.md", "docs/replay.md")
+LONG = (
+    "README.md",
+    "docs/crosscheck.md",
+    "docs/getting-started.md",
+    "docs/kalman.md",
+    "docs/replay.md",
+)
 
 
 @pytest.mark.parametrize(

@@ -160,6 +160,7 @@ def test_another_antenna_is_found(trial: Trial) -> None:
     assert "not at the [2.0, 0.0, 0.0] m" in text
 
 
+@pytest.mark.slow
 def test_swapped_fixes_without_velocities_are_found(trial: Trial) -> None:
     assert trial.gnss is not None
     geodetic = trial.gnss.geodetic
@@ -311,6 +312,7 @@ def swaying_turns() -> Trial:
     return simulate(scenario(noise=True, sway=sway, manoeuvres=[moving]), 2)
 
 
+@pytest.mark.slow
 def test_clocks_that_are_off_by_periods_of_the_sway_are_found() -> None:
     trial = swaying_turns()
     assert found(trial) == {}

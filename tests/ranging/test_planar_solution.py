@@ -29,6 +29,7 @@ def test_ranges_without_rates_are_enough():
     assert np.hypot(*error_of(t, solution).T).max() < 40.0
 
 
+@pytest.mark.slow
 def test_echoes_are_named_and_lost_ranges_do_no_harm():
     clean, echoes = trial(4), trial(4, beacons={"multipath": 0.2, "missed": 0.1})
     solution = solve_planar(echoes, rate_hz=1.0)
@@ -103,6 +104,7 @@ def test_more_than_a_third_of_echoes_is_doubtful():
     assert "40 of 100 were rejected" in mostly_rejected(some(60), some(40))[0].text
 
 
+@pytest.mark.slow
 def test_hypotheses_are_written(tmp_path, capsys):
     save_planar_trial(trial(7, **STRAIGHT), tmp_path / "t")
     with pytest.raises(SystemExit) as exit_info:

@@ -141,6 +141,7 @@ def test_sensors_that_were_never_announced_are_refused_by_name():
         session.add(rows_of(trial.others[0], [0]))
 
 
+@pytest.mark.slow
 def test_a_beacon_bounds_a_dive_and_its_echoes_are_left_out():
     scene = config(
         "dive-one-beacon",

@@ -434,6 +434,7 @@ def test_quiet_gyros_need_no_more_states(floating):
     assert np.diff(dense_epochs(replace(noisy, others=(fast,)), frame, 1.0)).min() > 0.049
 
 
+@pytest.mark.slow
 def test_stars_tell_more_of_the_misalignment():
     trial = simulate(config("seed-a-star", imu={"rate_hz": 50}), 0)
     without = solve(replace(trial, others=()))

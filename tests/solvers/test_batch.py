@@ -92,6 +92,7 @@ def test_without_noise_every_variant_is_exact(changes):
     assert_exact(trial, solution, **limits)
 
 
+@pytest.mark.slow
 def test_the_same_trial_gives_the_same_numbers():
     trial = simulate(scenario(noise=True), 5)
     one, two = solve(trial), solve(trial)

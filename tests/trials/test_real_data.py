@@ -66,6 +66,7 @@ def kitti():
     return trial, solve(trial)
 
 
+@pytest.mark.slow
 def test_a_car_is_smoothed_from_positions_alone(kitti):
     _, solution = kitti
     assert solution.converged
@@ -73,6 +74,7 @@ def test_a_car_is_smoothed_from_positions_alone(kitti):
     assert np.all(np.sqrt(np.mean(position.residual**2, axis=0)) < 0.25)
 
 
+@pytest.mark.slow
 def test_what_the_stated_noise_does_not_explain_is_said(kitti):
     """The noise is that of GTSAM's own example; it is larger, and it persists for seconds."""
     _, solution = kitti
@@ -100,6 +102,7 @@ def test_a_kalman_smoother_of_the_car_agrees(kitti):
     assert np.sqrt(np.mean(speed_apart**2)) < 1.0
 
 
+@pytest.mark.slow
 def test_the_car_does_not_slide_sideways(kitti):
     """Nothing tells the solver that wheels roll forward: heading and biases must show it."""
     trial, solution = kitti
