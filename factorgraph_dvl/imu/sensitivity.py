@@ -25,8 +25,6 @@ from factorgraph_dvl.sensors.protocol import Linearization
 
 # Shortest step, s, that has a mean rate. Chosen: far below the interval of any IMU.
 _LEAST_STEP = 1e-7
-# Measurements whose derivatives are found at once. Chosen: some megabytes.
-_CHUNK = 4000
 
 
 @dataclass(frozen=True)
@@ -114,18 +112,12 @@ def sensitivities(
     ends = Sensitivity(-theta, v, p, nothing, nothing)
     out = []
     for place, at, kept in zip(places, attachments, before, strict=True):
-        for first in range(0, at.tau.size, _CHUNK):
-            rows = slice(first, first + _CHUNK)
-            dR, dV = strides.dR[place[rows]], strides.dV[place[rows]]
-            back = dR.transpose(0, 2, 1)
-            since = seg.node_time[at.node[rows]] + at.tau[rows] - strides.start[place[rows]]
-            means = _means(log_so3(back @ at.dR[rows]), rotate(back, at.dV[rows] - dV), since)
-            after = _step(dR, means, errors, tuple(own[rows] for own in kept))
-            for own, now in zip(kept, after, strict=True):
-                own[rows] = now
-        theta_at, v_at, p_at = kept
-        np.negative(theta_at, out=theta_at)
-        out.append(Sensitivity(theta_at, v_at, p_at, at.gyro, at.force))
+        dR = strides.dR[place]
+        back = dR.transpose(0, 2, 1)
+        since = seg.node_time[at.node] + at.tau - strides.start[place]
+        means = _means(log_so3(back @ at.dR), rotate(back, at.dV - strides.dV[place]), since)
+        theta_at, v_at, p_at = _step(dR, means, errors, kept)
+        out.append(Sensitivity(-theta_at, v_at, p_at, at.gyro, at.force))
     return ends, out
 
 

@@ -16,7 +16,7 @@ from factorgraph_dvl.sensors.imu import ERRORS
 from factorgraph_dvl.sensors.message import Message, message
 from factorgraph_dvl.sensors.parameters import UNITS, Parameter
 from factorgraph_dvl.solvers.change_along_trial import CHANGED, component_changes
-from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, factorized, factorized_last
+from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, factorized
 from factorgraph_dvl.statistics.constancy import by_interval
 from factorgraph_dvl.statistics.robust_weights import robust_scale
 from factorgraph_dvl.statistics.rows import rows_with_times
@@ -146,11 +146,11 @@ def _tests_of_known(
     if not known:
         return {}
     test, at, columns = _freed(problem, evaluation, known)
-    information, delta = factorized_last(test, at)
+    information, delta = factorized(test, at)
     found = scores(delta, information, columns)
     tests = {p.name: found.test([p.name]) for p in known}
     if any(t.log10_p < _LOG10_P for t in tests.values()):
-        scatter = _scatter(test, at, factorized(test, at)[0], columns, found)
+        scatter = _scatter(test, at, information, columns, found)
         tests = {name: t.divided(scatter[name]) for name, t in tests.items()}
     return {p.name: (p, tests[p.name]) for p in known}
 

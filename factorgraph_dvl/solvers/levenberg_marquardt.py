@@ -10,11 +10,7 @@ import numpy as np
 from factorgraph_dvl.errors import SolveError
 from factorgraph_dvl.graph.problem import Evaluation, Problem
 from factorgraph_dvl.solution import Progress
-from factorgraph_dvl.statistics.square_root_information import (
-    SquareRootInformation,
-    eliminated,
-    last_eliminated,
-)
+from factorgraph_dvl.statistics.square_root_information import SquareRootInformation, eliminated
 
 # A step is small when all of it together is this many standard deviations, squared and
 # halved: the decrease of the cost that the linear model still promises. Chosen: 0.004 σ.
@@ -184,20 +180,6 @@ def factorized(
     """Return the square-root information from QR at some values, and the step to the minimum."""
     gaussian = problem.linearize(evaluation)
     out = eliminated(gaussian, problem.ordering(gaussian), evaluation.values.dims())
-    return out, out.solution()
-
-
-def factorized_last(
-    problem: Problem, evaluation: Evaluation
-) -> tuple[SquareRootInformation, gtsam.VectorValues]:
-    """Return what `factorized` does of the parameters alone: states need not be kept."""
-    gaussian = problem.linearize(evaluation)
-    out = last_eliminated(
-        gaussian,
-        problem.ordering(gaussian),
-        evaluation.values.dims(),
-        len(problem.parameters),
-    )
     return out, out.solution()
 
 

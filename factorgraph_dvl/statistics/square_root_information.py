@@ -7,7 +7,6 @@ the digits that navigation-grade gyros need.
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -237,33 +236,12 @@ def eliminated(
     return SquareRootInformation(_trees(gaussian, ordering), sizes)
 
 
-def last_eliminated(
-    gaussian: gtsam.GaussianFactorGraph,
-    ordering: gtsam.Ordering,
-    sizes: Mapping[int, int],
-    count: int,
-) -> SquareRootInformation:
-    """Return the square-root information of the `count` variables that are eliminated last.
-
-    As `eliminated`, of which it keeps a part; the solution and covariances of these variables are
-    the same.
-    """
-    # Parts before these are not needed once they are eliminated.
-    kept = 1 + -(-count // _part(ordering.size()))
-    return SquareRootInformation(deque(_trees(gaussian, ordering), maxlen=kept), sizes)
-
-
-def _part(count: int) -> int:
-    """Return how many of so many variables are eliminated at once."""
-    return -(-count // _PARTS) if count > _MANY else count
-
-
 def _trees(
     gaussian: gtsam.GaussianFactorGraph, ordering: gtsam.Ordering
 ) -> Iterator[gtsam.GaussianBayesTree]:
     """Yield the Bayes trees of one part of the variables after another."""
     count = ordering.size()
-    size = _part(count)
+    size = -(-count // _PARTS) if count > _MANY else count
     for first in range(0, count - size, size):
         part = gtsam.Ordering()
         for i in range(first, first + size):
