@@ -6,10 +6,10 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.geometry.vectors import Array, BoolArray
 from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.sensors.imu import COLUMNS, Imu
-from factorgraph_dvl.sensors.invalid_values import frozen_samples
+from factorgraph_dvl.sensors.invalid_values import frozen_samples, runs
 from factorgraph_dvl.sensors.message import Message, message
 
 # Samples that repeat, of all channels and of a single one, from which on they are frozen, and for
@@ -159,11 +159,10 @@ def _frozen(what: Message, imu: Imu, begin: int, length: int) -> Finding:
     )
 
 
-def _longest(true: Array) -> tuple[int, int]:
+def _longest(true: BoolArray) -> tuple[int, int]:
     """Return where the longest run of true begins, and its length."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], true.astype(int), [0]])))
-    if edges.size == 0:
+    begin, end = runs(true)
+    if begin.size == 0:
         return 0, 0
-    lengths = edges[1::2] - edges[::2]
-    k = int(np.argmax(lengths))
-    return int(edges[2 * k]), int(lengths[k])
+    k = int(np.argmax(end - begin))
+    return int(begin[k]), int(end[k] - begin[k])

@@ -86,7 +86,7 @@ def frozen_samples(values: Array) -> BoolArray:
     written several times, repeat in many runs.
     """
     same = np.all(np.diff(values, axis=0) == 0.0, axis=1)
-    begin, end = _runs(same)
+    begin, end = runs(same)
     long = end - begin >= _REPEATED
     out = np.zeros(values.shape[0], dtype=bool)
     if np.count_nonzero(~long) > np.count_nonzero(long):
@@ -96,8 +96,8 @@ def frozen_samples(values: Array) -> BoolArray:
     return out & (np.count_nonzero(out) < _MOST_FROZEN * out.size)
 
 
-def _runs(true: BoolArray) -> tuple[IntArray, IntArray]:
-    """Return where runs of true begin, and where they end."""
+def runs(true: BoolArray) -> tuple[IntArray, IntArray]:
+    """Return where runs of true (M,) begin, and where they end."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], true.astype(int), [0]])))
     return edges[::2], edges[1::2]
 
@@ -200,7 +200,7 @@ def _frozen(values: Array, least: float, moving: np.ndarray) -> Array:
     usual = float(np.median(steps))
     if usual == 0.0:
         return out
-    starts, ends = _runs(steps == 0.0)
+    starts, ends = runs(steps == 0.0)
     long = ends - starts >= _REPEATED - 1
     by_chance = np.count_nonzero(~long) > np.count_nonzero(long)
     for begin, end in zip(starts.tolist(), ends.tolist(), strict=True):
