@@ -227,7 +227,13 @@ ROWS = (
     Row("DVL: jitter", "s", (0.01, 0.1), lambda x: [f.jitter("dvl", x)], (gross("DVL"),)),
     Row("GNSS: jitter", "s", (0.05, 0.2), lambda x: [f.jitter("gnss", x)], (gross("GNSS"),)),
     Row("IMU: jitter", "s", (0.001, 0.005), lambda x: [f.jitter("imu", x)], (r"IMU",)),
-    Row("DVL: unit", "m/s", (0.01, KNOTS), lambda x: turned("dvl", I3 / x), (r"^dvl_unit DVL",)),
+    Row(
+        "DVL: unit",
+        "m/s",
+        (0.01, KNOTS),
+        lambda x: turned("dvl", I3 / x),
+        (r"^dvl_unit DVL", r"in cm/s"),
+    ),
     Row(
         "IMU: gyros in deg/s",
         "",

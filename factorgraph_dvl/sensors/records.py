@@ -15,6 +15,18 @@ from factorgraph_dvl.settings.ranges import range_of
 
 _AnyRecord = TypeVar("_AnyRecord")
 
+# Share of a column outside its range from which on it is no glitch. Chosen: sensors lose fewer.
+_SYSTEMATIC = 0.1
+# Share of a column that lies in range in its true unit. Chosen: glitches are fewer than the rest.
+_USUAL = 0.9
+# Units that instruments write in place of a column's own, with the number of them in one of it.
+_OTHER_UNITS = {
+    "m/s": {"cm/s": 100.0, "mm/s": 1000.0},
+    "rad/s": {"deg/s": np.degrees(1.0), "mdeg/s": 1e3 * np.degrees(1.0)},
+    "m/s²": {"mg": 1e3 / 9.80665, "µm/s²": 1e6},
+    "m": {"cm": 100.0, "mm": 1000.0},
+}
+
 
 def rows_of(record: _AnyRecord, rows: slice | NDArray[Any] | list[int]) -> _AnyRecord:
     """Return some rows of a sensor's record, in the order of time: of every array in it."""
@@ -80,15 +92,36 @@ def check_finite(columns: Mapping[str, Array], source: str) -> None:
 def check_range(
     columns: Mapping[str, Array], low: float, high: float, unit: str, source: str
 ) -> None:
-    """Raise DataError where a value that is present lies outside [low, high]."""
+    """Raise DataError where a value that is present lies outside [low, high].
+
+    Where many do, the error says which other unit they may have.
+    """
     for name, values in columns.items():
         bad = np.flatnonzero((values < low) | (values > high))
         if bad.size:
             raise DataError(
                 f"{name} = {values[bad[0]]:.6g} is out of range",
                 where=at_row(source, bad[0]),
-                expected=f"{low:g} to {high:g} {unit}",
+                expected=f"{low:g} to {high:g} {unit}{_other_unit(values, bad.size, high, unit)}",
             )
+
+
+def _other_unit(values: Array, outside: int, high: float, unit: str) -> str:
+    """Return the units that would bring most values of a column into range, as words."""
+    present = int(np.count_nonzero(np.isfinite(values)))
+    if outside < _SYSTEMATIC * present:
+        return ""
+    usual = float(np.nanquantile(np.abs(values), _USUAL))
+    fitting = [
+        f"{name} (divide it by {factor:.6g})"
+        for name, factor in _OTHER_UNITS.get(unit, {}).items()
+        if usual <= factor * high
+    ]
+    if not fitting:
+        return ""
+    return (
+        f"; {outside} of {present} values are outside: the column may be in {' or '.join(fitting)}"
+    )
 
 
 def check_possible(columns: Mapping[str, Array], source: str) -> None:
