@@ -146,7 +146,8 @@ def _state_prior(
     nRb, p_n = start.nRb[k], start.p_n[k]
     root = np.diag(1.0 / np.repeat([_FREE_ATTITUDE, _FREE_POSITION, _FREE_VELOCITY], 3))
     # The first mean sample ends where `initial` holds; the first node is where it begins.
-    back = exp_so3(-seg.phi[0]) if seg.increments.averaged else np.eye(3)
+    phi, dv = (each[0] for each in seg.increments.over(np.zeros(1, dtype=int)))
+    back = exp_so3(-phi) if seg.increments.averaged else np.eye(3)
     if is_first and trial.initial_attitude is not None:
         rph = trial.initial_attitude.rph
         nRb = rotation_from_rph(rph, trial.body_axes) @ back
@@ -162,7 +163,7 @@ def _state_prior(
     if is_first and trial.initial_velocity is not None:
         v_n = trial.initial_velocity.velocity
         if seg.increments.averaged:
-            v_n = v_n - nRb @ seg.dv[0] - frame.gravity(p_n) * seg.increments.dt[0]
+            v_n = v_n - nRb @ dv - frame.gravity(p_n) * seg.increments.dt[0]
         std = np.maximum(trial.initial_velocity.std, _LEAST_STD)
         root[6:9, 6:9] = nRb / std[:, None]
     return gtsam.NavState(gtsam.Rot3(nRb), p_n, v_n), root

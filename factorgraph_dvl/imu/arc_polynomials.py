@@ -41,12 +41,13 @@ class ArcPolynomials:
         Start and length of the intervals.
     arcs : ndarray of int, shape (A, 2)
         First and last-plus-one interval of each arc.
-    samples : ndarray, shape (S, 6)
-        Rate and specific force: the means over the intervals, or the values at their ends.
+    rate, force : ndarray, shape (S, 3)
+        Samples of rate and specific force: the means over the intervals, or the values at their
+        ends.
     first_sample : ndarray of int, shape (A,)
-        Index in `samples` of each arc's first.
+        Index of each arc's first sample.
     averaged : bool
-        Whether `samples` are means over the intervals.
+        Whether samples are means over the intervals.
     gyro_sigma : float
         Standard deviation of one sample of the rate from its noise, rad/s.
     """
@@ -54,7 +55,8 @@ class ArcPolynomials:
     start: Array
     dt: Array
     arcs: IntArray
-    samples: Array
+    rate: Array
+    force: Array
     first_sample: IntArray
     averaged: bool
     gyro_sigma: float
@@ -67,7 +69,9 @@ class ArcPolynomials:
     @cached_property
     def arc_of(self) -> IntArray:
         """Arc of each interval, (N,)."""
-        return np.repeat(np.arange(len(self.arcs)), self.arcs[:, 1] - self.arcs[:, 0])
+        # One byte each, where there are not many.
+        arc = np.arange(len(self.arcs), dtype=np.min_scalar_type(len(self.arcs)))
+        return np.repeat(arc, self.arcs[:, 1] - self.arcs[:, 0])
 
     def difference_at(self, index: IntArray) -> Array:
         """Return the highest difference of the rate about intervals `index`, (M, 3), rad/s."""
@@ -81,12 +85,12 @@ class ArcPolynomials:
     @cached_property
     def differences(self) -> Array:
         """Highest difference of the rate over the stencil from each sample on, (S, 3)."""
-        out = np.full((self.samples.shape[0], 3), np.inf)
+        out = np.full(self.rate.shape, np.inf)
         for (a, b), base in zip(self.arcs, self.first_sample, strict=True):
             edges = np.append(self.start[a:b], self.end[b - 1])
             count = b - a + (0 if self.averaged else 1)
             highest = highest_difference(
-                self.samples[base : base + count, :3], edges, self.width, self.averaged
+                self.rate[base : base + count], edges, self.width, self.averaged
             )
             out[base : base + highest.shape[0]] = highest
         return out
@@ -146,7 +150,7 @@ class ArcPolynomials:
         stencil = self._stencil(index - first, count - width, self.first_sample[arc])
         offset = index - first - stencil
         rows = (self.first_sample[arc] + stencil)[:, None] + np.arange(width)
-        values = self.samples[rows]
+        values = np.concatenate([self.rate[rows], self.force[rows]], axis=2)
 
         # Edges of the stencil's intervals, relative to the interval and in its lengths.
         intervals = (first + stencil)[:, None] + np.arange(width if self.averaged else width - 1)
@@ -186,7 +190,9 @@ def open_steps(arcs: ArcPolynomials, noise: Array) -> Array:
     for (a, b), base in zip(arcs.arcs, arcs.first_sample, strict=True):
         n = b - a
         edges = np.append(arcs.start[a:b], arcs.end[b - 1])
-        rough = np.abs(highest_difference(arcs.samples[base : base + n + 1], edges, width, False))
+        own = slice(base, base + n + 1)
+        values = np.hstack([arcs.rate[own], arcs.force[own]])
+        rough = np.abs(highest_difference(values, edges, width, False))
         inside = np.arange(width - 1, n - width + 1)
         if inside.size == 0:
             continue

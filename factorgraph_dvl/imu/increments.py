@@ -39,6 +39,8 @@ _ROUNDING = 1e-6
 _REGULAR = 0.1
 # Intervals whose polynomials are in memory at a time. Chosen: some MB.
 _CHUNK = 4000
+# Intervals up to which all increments are kept. Chosen: a replay asks twice for those of a second.
+_FEW = 1000
 # Samples that an arc has at least: those of the widest stencil.
 _LEAST = 6
 # Standard deviations from which on a difference may be a step. Chosen: seldom by chance.
@@ -115,6 +117,16 @@ class Increments(ArcPolynomials):
 
     def over(self, index: IntArray) -> tuple[Array, Array]:
         """Return phi and dv over whole intervals `index`, (M, 3) each."""
+        if self.dt.size <= _FEW:
+            return self._every[0][index], self._every[1][index]
+        return self._over(index)
+
+    @cached_property
+    def _every(self) -> tuple[Array, Array]:
+        """Increments over all intervals of a short record: asked for again and again."""
+        return self._over(np.arange(self.dt.size))
+
+    def _over(self, index: IntArray) -> tuple[Array, Array]:
         phi, dv = np.empty((index.size, 3)), np.empty((index.size, 3))
         for a in range(0, index.size, _CHUNK):
             part = index[a : a + _CHUNK]
@@ -173,11 +185,11 @@ class Increments(ArcPolynomials):
             time = self.start[a:b] + 0.5 * steps
             if not self.averaged:
                 time = np.append(self.start[a:b], self.end[b - 1])
-            values = self.samples[base : base + time.size]
+            own = slice(base, base + time.size)
             regular = np.abs(steps / dt - 1.0).max() < UNIFORM
             pair = []
             for i, (signal, sigma) in enumerate(
-                ((values[:, :3], self.gyro_sigma), (values[:, 3:], self.accel_sigma))
+                ((self.rate[own], self.gyro_sigma), (self.force[own], self.accel_sigma))
             ):
                 window = None if self.windows is None else self.windows[i]
                 pair.append(
@@ -237,7 +249,7 @@ def increments(
         If no stretch of the record is long enough to integrate.
     """
     averaged = imu.settings.sampling == "mean"
-    time, samples, filled_sigma, broken, lost = _bridged(imu)
+    time, rate, force, filled_sigma, broken, lost = _bridged(imu)
     bounds = np.concatenate([[0], np.flatnonzero(broken) + 1, [time.size]])
     whole = [(a, b) for a, b in itertools.pairwise(bounds) if b - a >= _LEAST]
     if not whole:
@@ -256,7 +268,8 @@ def increments(
         start=np.concatenate([time[a] + e[:-1] for (a, _), e in zip(whole, edges, strict=True)]),
         dt=np.concatenate([np.diff(e) for e in edges]),
         arcs=np.stack([np.concatenate([[0], ends[:-1]]), ends], axis=1),
-        samples=_in_a_row([samples[a:b] for a, b in whole]),
+        rate=_in_a_row([rate[a:b] for a, b in whole]),
+        force=_in_a_row([force[a:b] for a, b in whole]),
         first_sample=np.cumsum([0, *(b - a for a, b in whole)])[:-1],
         averaged=averaged,
         open_sigma=_in_a_row([filled_sigma[a + (not averaged) : b] for a, b in whole]),
@@ -276,12 +289,12 @@ def _in_a_row(parts: Sequence[Array]) -> Array:
     return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
 
-def _bridged(imu: Imu) -> tuple[Array, Array, Array, np.ndarray, list[Finding]]:
-    """Return times and samples with few lost ones filled in, and where the record breaks.
+def _bridged(imu: Imu) -> tuple[Array, Array, Array, Array, np.ndarray, list[Finding]]:
+    """Return times, rates and forces with few lost ones filled in, and where the record breaks.
 
-    The standard deviations of what was filled in stand third, the findings last.
+    The standard deviations of what was filled in stand fourth, the findings last.
     """
-    time, samples = imu.time, np.hstack([imu.gyro, imu.accel])
+    time = imu.time
     if time.size < _LEAST:
         raise DataError(
             f"only {time.size} samples", where=imu.source, expected=f"at least {_LEAST}"
@@ -302,7 +315,8 @@ def _bridged(imu: Imu) -> tuple[Array, Array, Array, np.ndarray, list[Finding]]:
     broken = (lost > MAX_FILLED) | (step > (MAX_FILLED + _LOST) * dt)
     if not bridged.any():
         # Unlike those of `zeros_like`, these zeros take no memory until one is written.
-        return time, samples, np.zeros(samples.shape), broken, []
+        return time, imu.gyro, imu.accel, np.zeros((time.size, 6)), broken, []
+    samples = np.hstack([imu.gyro, imu.accel])
     time, samples, filled_sigma, broken = fill_lost(time, samples, lost, bridged, broken)
     text = message(
         "lost_samples.interpolated",
@@ -310,7 +324,8 @@ def _bridged(imu: Imu) -> tuple[Array, Array, Array, np.ndarray, list[Finding]]:
         places=int(bridged.sum()),
         time=imu.time[np.argmax(bridged)],
     )
-    return time, samples, filled_sigma, broken, [Finding(Code.LOST_SAMPLES, text, "IMU")]
+    rate, force = samples[:, :3], samples[:, 3:]
+    return time, rate, force, filled_sigma, broken, [Finding(Code.LOST_SAMPLES, text, "IMU")]
 
 
 def _unused(alone: list[tuple[int, float]]) -> Iterator[Finding]:

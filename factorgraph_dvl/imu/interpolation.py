@@ -127,12 +127,13 @@ def smooth(
         # The mean over an interval exceeds the value at its middle by a'' dt² / 24.
         found = found - local_cubics(values, width, deriv=2) / 24.0
     narrow = 2 * _HALF_WIDTHS[0] + 1
-    noise = sigma * white_gain(narrow)
-    apart = np.abs(local_cubics(values, narrow) - found)
-    misfit = np.where(apart > _STEP * noise, apart, 0.0)
+    misfit = local_cubics(values, narrow)
+    misfit -= found
+    np.abs(misfit, out=misfit)
+    misfit[misfit <= _STEP * sigma * white_gain(narrow)] = 0.0
     return Smoothed(
         spline=_interpolant(time, found, 3),
-        misfit=_interpolant(time, misfit, 1),
+        misfit=_broken_line(time, misfit),
         sigma=sigma * white_gain(width),
         slope_sigma=sigma * _slope_gain(width) / dt,
         window=width,
@@ -198,6 +199,17 @@ def _polynomial(width: int) -> Array:
     """
     half = width // 2
     return np.asarray(np.linalg.pinv(polyvander(np.arange(-half, half + 1.0), ORDER)))
+
+
+def _broken_line(time: Array, values: Array) -> BSpline:
+    """Return lines between values (N, 3) at regular times, most of which are zero."""
+    if time.size <= _SHORT:
+        return _interpolant(time, values, 1)
+    # Lines that start and end at zero need no knots in between.
+    beside = np.pad(values.any(axis=1), 1)
+    kept = beside[:-2] | beside[1:-1] | beside[2:]
+    kept[[0, -1]] = True
+    return make_interp_spline(time[kept], values[kept], k=1)
 
 
 def _interpolant(time: Array, values: Array, degree: int) -> BSpline:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
+from itertools import pairwise
 
 import gtsam
 import numpy as np
@@ -22,6 +24,63 @@ _INTEGRATION_ROOT_PSD = 1e-7
 _STRIDE = 0.04
 # Samples from which on strides take less time than samples one by one.
 _FEW = 1000
+# Samples that are integrated at once. Chosen: some ten megabytes.
+_CHUNK = 100_000
+
+
+@dataclass(frozen=True)
+class Integrals:
+    """What the samples add up to since the starts of segments, at M times.
+
+    Parameters
+    ----------
+    dR : ndarray, shape (M, 3, 3)
+        Rotation.
+    dV, dP : ndarray, shape (M, 3)
+        Velocity and position increment, in the axes at the segment's start.
+    dA : ndarray, shape (M, 3, 3), s
+        Integral of dR.
+    """
+
+    dR: Array
+    dV: Array
+    dP: Array
+    dA: Array
+
+    @classmethod
+    def zero(cls, count: int) -> Integrals:
+        """Return those at the starts of segments."""
+        turn, shift = np.tile(np.eye(3), (count, 1, 1)), np.zeros((2, count, 3))
+        return cls(turn, shift[0], shift[1], np.zeros((count, 3, 3)))
+
+    def at(self, index: IntArray | slice) -> Integrals:
+        """Return some of them."""
+        return Integrals(self.dR[index], self.dV[index], self.dP[index], self.dA[index])
+
+    def put(self, index: IntArray, others: Integrals) -> None:
+        """Write others in the place of some of them."""
+        self.dR[index], self.dV[index] = others.dR, others.dV
+        self.dP[index], self.dA[index] = others.dP, others.dA
+
+    def after(self, turn: Array, left: Array, dv: Array, dt: Array) -> Integrals:
+        """Return those after one more interval each.
+
+        Parameters
+        ----------
+        turn, left : ndarray, shape (M, 3, 3)
+            `_turns` of the rotation vectors over the intervals.
+        dv : ndarray, shape (M, 3)
+            Velocity increments over them.
+        dt : ndarray, shape (M,), s
+            Their lengths.
+        """
+        turned, h = rotate(self.dR, dv), dt[:, None]
+        return Integrals(
+            dR=self.dR @ turn,
+            dV=self.dV + turned,
+            dP=self.dP + (self.dV * h + 0.5 * turned * h),
+            dA=self.dA + self.dR @ left * h[:, :, None],
+        )
 
 
 @dataclass(frozen=True)
@@ -73,15 +132,15 @@ class Segments:
         Node at the start of each segment; the node at its end is the next one.
     arc_nodes : ndarray of int, shape (A, 2)
         First and last node of each arc.
-    phi, dv : ndarray, shape (N, 3)
-        Increments over the intervals.
-    dR : ndarray, shape (N, 3, 3)
-        Rotation since the segment's start, at the start of each interval.
-    dV, dP : ndarray, shape (N, 3)
-        Since the segment's start, at the start of each interval, in the axes at the segment's
-        start.
-    dA : ndarray, shape (N, 3, 3), s
-        Integral of dR.
+    spacing : int
+        Intervals from one knot to the next.
+    knots : Integrals
+        T of them: at the start of each segment, and of every `spacing`-th interval from there on.
+    less : ndarray, shape (T, 3), m
+        By how much less far each knot would lead to the next with a force that turns with the body
+        within a sample, as GTSAM has it.
+    ends : Integrals
+        At the ends of the S segments.
     """
 
     increments: Increments
@@ -90,12 +149,10 @@ class Segments:
     last: IntArray
     origin: IntArray
     arc_nodes: IntArray
-    phi: Array
-    dv: Array
-    dR: Array
-    dV: Array
-    dP: Array
-    dA: Array
+    spacing: int
+    knots: Integrals
+    less: Array
+    ends: Integrals
 
     @property
     def duration(self) -> Array:
@@ -105,52 +162,66 @@ class Segments:
     @property
     def stride(self) -> int:
         """Samples in a stride."""
-        return max(int(_STRIDE / float(np.mean(self.increments.dt)) + 1e-3), 1)
+        return _stride(self.increments)
 
-    def strides(self) -> Strides:
-        """Return the segments in steps of several samples each."""
-        count = -(-(self.last - self.first) // self.stride)
+    @cached_property
+    def first_knot(self) -> IntArray:
+        """First knot of each segment, (S,)."""
+        return _begins(_parts(self.first, self.last, self.spacing))
+
+    def since_start(self, index: IntArray) -> Integrals:
+        """Return what adds up from the starts of segments to those of intervals (M,)."""
+        segment = np.searchsorted(self.first, index, side="right") - 1
+        inside = index - self.first[segment]
+        found = self.knots.at(self.first_knot[segment] + inside // self.spacing)
+        left = inside % self.spacing
+        for j in range(int(left.max(initial=0))):
+            live = np.flatnonzero(left > j)
+            i = index[live] - left[live] + j
+            phi, dv = self.increments.over(i)
+            after = found.at(live).after(*_turns(phi), dv, self.increments.dt[i])
+            found.put(live, after)
+        return found
+
+    def blocks(self) -> Iterator[slice]:
+        """Yield the segments in blocks of not too many samples."""
+        return _blocks(self.first, self.last)
+
+    def strides(self, block: slice) -> Strides:
+        """Return a block of segments in steps of several samples each; both count within it."""
+        first, last = self.first[block], self.last[block]
+        count = _parts(first, last, self.stride)
+        begins = _begins(count)
         segment = np.repeat(np.arange(count.size), count)
-        begins = np.cumsum(count) - count
-        a = self.first[segment] + self.stride * (np.arange(segment.size) - begins[segment])
-        b = np.minimum(a + self.stride, self.last[segment])
-        # The start of an interval is the end of the one before, but for the last of a segment.
-        inside = np.where(b < self.last[segment], b, 0)
-        dR, dV, dP, dA = self.dR[inside], self.dV[inside], self.dP[inside], self.dA[inside]
-        ends, whole = begins + count - 1, self.last - 1
-        dR[ends], dV[ends], dP[ends] = self.totals()
-        left = np.eye(3) + 0.5 * skew(self.phi[whole])
-        dA[ends] = self.dA[whole] + self.dR[whole] @ left * self.increments.dt[whole, None, None]
-        start = self.increments.start
-        duration = self.increments.end[b - 1] - start[a]
-        # A force that turns with the body within a sample, as GTSAM has it, leads less far.
-        less = rotate(self.dR, cross(self.phi, self.dv)) * (self.increments.dt[:, None] / 12.0)
-        dP = dP - np.add.reduceat(less, a)
-        back = self.dR[a].transpose(0, 2, 1)
-        swept = back @ (dA - self.dA[a])
+        number = np.arange(segment.size) - begins[segment]
+        a = first[segment] + self.stride * number
+        b = np.minimum(a + self.stride, last[segment])
+        knot = self.first_knot[block][segment] + self.stride // self.spacing * number
+        start, end = self.knots.at(knot), self.knots.at(np.append(knot[1:], knot[-1]))
+        end.put(begins + count - 1, self.ends.at(block))
+        of_last = _parts(first[-1:], last[-1:], self.spacing)
+        less = self.less[knot[0] : self.first_knot[block][-1] + int(of_last[0])]
+        dP = end.dP - np.add.reduceat(less, knot - knot[0])
+        duration = self.increments.start[b - 1] + self.increments.dt[b - 1]
+        duration -= self.increments.start[a]
+        back = start.dR.transpose(0, 2, 1)
+        swept = back @ (end.dA - start.dA)
         return Strides(
             begins=begins,
             count=count,
-            start=start[a],
+            start=self.increments.start[a],
             duration=duration,
-            dR=self.dR[a],
-            dV=self.dV[a],
-            phi=log_so3(back @ dR),
-            dv=rotate(back, dV - self.dV[a]),
-            dp=rotate(back, dP - self.dP[a] - self.dV[a] * duration[:, None]),
+            dR=start.dR,
+            dV=start.dV,
+            phi=log_so3(back @ end.dR),
+            dv=rotate(back, end.dV - start.dV),
+            dp=rotate(back, dP - start.dP - start.dV * duration[:, None]),
             swept=0.5 * (swept[:, [2, 0, 1], [1, 2, 0]] - swept[:, [1, 2, 0], [2, 0, 1]]),
         )
 
     def totals(self) -> tuple[Array, Array, Array]:
         """Return dR (S, 3, 3), dV, dP (S, 3) over whole segments."""
-        i = self.last - 1
-        dt = self.increments.dt[i][:, None]
-        turned = rotate(self.dR[i], self.dv[i])
-        return (
-            self.dR[i] @ exp_so3(self.phi[i]),
-            self.dV[i] + turned,
-            self.dP[i] + self.dV[i] * dt + 0.5 * turned * dt,
-        )
+        return self.ends.dR, self.ends.dV, self.ends.dP
 
 
 def segments(inc: Increments, interval: float, epochs: Array | None = None) -> Segments:
@@ -194,25 +265,8 @@ def _integrated(inc: Increments, cuts: Sequence[IntArray]) -> Segments:
         arc_nodes.append((n_nodes, n_nodes + inner.size - 1))
         n_nodes += inner.size
     i0, i1 = np.concatenate(first), np.concatenate(last)
-    n = inc.start.size
-    phi, dv = inc.over(np.arange(n))
-    turn = exp_so3(phi)
-    left = np.eye(3) + 0.5 * skew(phi)
-    dR, dA = np.empty((n, 3, 3)), np.empty((n, 3, 3))
-    dV, dP = np.empty((n, 3)), np.empty((n, 3))
-    R, A = np.tile(np.eye(3), (i0.size, 1, 1)), np.zeros((i0.size, 3, 3))
-    V, P = np.zeros((i0.size, 3)), np.zeros((i0.size, 3))
-    for j in range(int((i1 - i0).max())):
-        live = i0 + j < i1
-        i = i0[live] + j
-        dt = inc.dt[i][:, None]
-        r = R[live]
-        dR[i], dV[i], dP[i], dA[i] = r, V[live], P[live], A[live]
-        turned = rotate(r, dv[i])
-        P[live] += V[live] * dt + 0.5 * turned * dt
-        V[live] += turned
-        A[live] += np.matmul(r, left[i]) * dt[:, :, None]
-        R[live] = np.matmul(r, turn[i])
+    spacing = _stride(inc)
+    knots, less, ends = _knots(inc, i0, i1, spacing)
     return Segments(
         increments=inc,
         node_time=np.concatenate(node_time),
@@ -220,13 +274,67 @@ def _integrated(inc: Increments, cuts: Sequence[IntArray]) -> Segments:
         last=i1,
         origin=np.concatenate(origin),
         arc_nodes=np.array(arc_nodes),
-        phi=phi,
-        dv=dv,
-        dR=dR,
-        dV=dV,
-        dP=dP,
-        dA=dA,
+        spacing=spacing,
+        knots=knots,
+        less=less,
+        ends=ends,
     )
+
+
+def _knots(
+    inc: Increments, first: IntArray, last: IntArray, spacing: int
+) -> tuple[Integrals, Array, Integrals]:
+    """Return knots, by how much less far they lead, and the ends of segments of intervals."""
+    count = _parts(first, last, spacing)
+    begins, total = _begins(count), int(count.sum())
+    knots, less, ends = Integrals.zero(total), np.zeros((total, 3)), Integrals.zero(first.size)
+    for block in _blocks(first, last):
+        begin, end, knot = first[block], last[block], begins[block]
+        phi, dv = inc.over(np.arange(begin[0], end[-1]))
+        turn, left = _turns(phi)
+        behind = cross(phi, dv)
+        now = Integrals.zero(begin.size)
+        for j in range(int((end - begin).max())):
+            live = np.flatnonzero(begin + j < end)
+            i = begin[live] + j
+            at, here, dt = knot[live] + j // spacing, now.at(live), inc.dt[i]
+            if j % spacing == 0:
+                knots.put(at, here)
+            i -= begin[0]
+            less[at] += rotate(here.dR, behind[i]) * (dt[:, None] / 12.0)
+            now.put(live, here.after(turn[i], left[i], dv[i], dt))
+        ends.put(np.arange(first.size)[block], now)
+    return knots, less, ends
+
+
+def _turns(phi: Array) -> tuple[Array, Array]:
+    """Return Exp(phi), and its mean over the way to it, of rotation vectors (M, 3)."""
+    return exp_so3(phi), np.eye(3) + 0.5 * skew(phi)
+
+
+def _stride(inc: Increments) -> int:
+    """Return the samples in a stride."""
+    return max(int(_STRIDE / float(np.mean(inc.dt)) + 1e-3), 1)
+
+
+def _parts(first: IntArray, last: IntArray, size: int) -> IntArray:
+    """Return how many parts of so many intervals, the last one shorter, each segment has."""
+    return np.asarray(-(-(last - first) // size))
+
+
+def _begins(count: IntArray) -> IntArray:
+    """Return the number of the first part of each segment."""
+    return np.asarray(np.cumsum(count) - count)
+
+
+def _blocks(first: IntArray, last: IntArray) -> Iterator[slice]:
+    """Yield segments in blocks of not too many samples."""
+    begin = 0
+    while begin < first.size:
+        end = int(np.searchsorted(last, first[begin] + _CHUNK, side="right"))
+        end = max(end, begin + 1)
+        yield slice(begin, end)
+        begin = end
 
 
 @dataclass(frozen=True)
@@ -333,26 +441,23 @@ def preintegrate(
 
 
 def one_segment(inc: Increments, first: int, last: int) -> Segments:
-    """Return intervals [first, last) of a single arc as a chain of two nodes.
-
-    Increments outside them stay zero.
-    """
-    n, inside = inc.start.size, np.arange(first, last)
-    phi, dv = np.zeros((n, 3)), np.zeros((n, 3))
-    phi[inside], dv[inside] = inc.over(inside)
-    turn = exp_so3(phi[inside])
-    dR = np.zeros((n, 3, 3))
+    """Return intervals [first, last) of a single arc as a chain of two nodes."""
+    inside = np.arange(first, last)
+    phi, dv = inc.over(inside)
+    turn, left = _turns(phi)
+    dR = np.empty((inside.size, 3, 3))
     R = np.eye(3)
-    for i, step in zip(inside.tolist(), turn, strict=True):
+    for i, step in enumerate(turn):
         dR[i] = R
         R = R @ step
     dt = inc.dt[inside, None]
-    turned = rotate(dR[inside], dv[inside])
-    swept = dR[inside] @ (np.eye(3) + 0.5 * skew(phi[inside])) * dt[:, :, None]
-    dV, dP, dA = np.zeros((n, 3)), np.zeros((n, 3)), np.zeros((n, 3, 3))
-    dV[first + 1 : last] = np.cumsum(turned[:-1], axis=0)
-    dA[first + 1 : last] = np.cumsum(swept[:-1], axis=0)
-    dP[first + 1 : last] = np.cumsum((dV[inside] * dt + 0.5 * turned * dt)[:-1], axis=0)
+    turned = rotate(dR, dv)
+    dV, dP = np.zeros((2, inside.size, 3))
+    dA = np.zeros((inside.size, 3, 3))
+    np.cumsum(turned[:-1], axis=0, out=dV[1:])
+    np.cumsum((dR @ left * dt[:, :, None])[:-1], axis=0, out=dA[1:])
+    np.cumsum((dV * dt + 0.5 * turned * dt)[:-1], axis=0, out=dP[1:])
+    knots, whole = Integrals(dR, dV, dP, dA), slice(-1, None)
     return Segments(
         increments=inc,
         node_time=np.array([inc.start[first], inc.start[last - 1] + inc.dt[last - 1]]),
@@ -360,12 +465,10 @@ def one_segment(inc: Increments, first: int, last: int) -> Segments:
         last=np.array([last]),
         origin=np.array([0]),
         arc_nodes=np.array([[0, 1]]),
-        phi=phi,
-        dv=dv,
-        dR=dR,
-        dV=dV,
-        dP=dP,
-        dA=dA,
+        spacing=1,
+        knots=knots,
+        less=rotate(dR, cross(phi, dv)) * (dt / 12.0),
+        ends=knots.at(whole).after(turn[whole], left[whole], dv[whole], dt[whole, 0]),
     )
 
 
@@ -407,42 +510,47 @@ def gtsam_measurements(
         Earth rate in n.
     """
     inc = seg.increments
-    first, rate, force, step = (_by_sample if seg.phi.shape[0] < _FEW else _by_stride)(seg)
-    steps = step.tolist()
     gyro_psd = settings.gyro_noise_root_psd**2 * np.eye(3)
     accel_psd = settings.accel_noise_root_psd**2 * np.eye(3)
     integration_psd = _INTEGRATION_ROOT_PSD**2 * np.eye(3)
     is_open = np.any(inc.open_sigma > 0.0, axis=1)
+    by_steps = _by_sample if inc.dt.size < _FEW else _by_stride
     out = []
-    for s in range(seg.first.size):
-        a, b = int(seg.first[s]), int(seg.last[s])
-        params = gtsam.PreintegrationParams(gravity_n[s])
-        params.setOmegaCoriolis(earth_rate_n)
-        params.setIntegrationCovariance(integration_psd)
-        extra_gyro, extra_accel = 0.0, 0.0
-        if np.any(is_open[a:b]):
-            extra = (inc.open_sigma[a:b] * inc.dt[a:b, None]) ** 2
-            extra_gyro = extra[:, :3].sum() / seg.duration[s]
-            extra_accel = extra[:, 3:].sum() / seg.duration[s]
-        params.setGyroscopeCovariance(gyro_psd + extra_gyro * np.eye(3))
-        params.setAccelerometerCovariance(accel_psd + extra_accel * np.eye(3))
-        pim = gtsam.PreintegratedImuMeasurementsG(params)
-        add = pim.integrateMeasurement
-        for i in range(int(first[s]), int(first[s + 1])):
-            add(force[i], rate[i], steps[i])
-        out.append(pim)
+    for block in seg.blocks():
+        first, rate, force, step = by_steps(seg, block)
+        steps = step.tolist()
+        for s, (begin, end) in enumerate(pairwise(first.tolist()), block.start):
+            params = gtsam.PreintegrationParams(gravity_n[s])
+            params.setOmegaCoriolis(earth_rate_n)
+            params.setIntegrationCovariance(integration_psd)
+            extra_gyro, extra_accel = 0.0, 0.0
+            a, b = int(seg.first[s]), int(seg.last[s])
+            if np.any(is_open[a:b]):
+                extra = (inc.open_sigma[a:b] * inc.dt[a:b, None]) ** 2
+                extra_gyro = extra[:, :3].sum() / seg.duration[s]
+                extra_accel = extra[:, 3:].sum() / seg.duration[s]
+            params.setGyroscopeCovariance(gyro_psd + extra_gyro * np.eye(3))
+            params.setAccelerometerCovariance(accel_psd + extra_accel * np.eye(3))
+            pim = gtsam.PreintegratedImuMeasurementsG(params)
+            add = pim.integrateMeasurement
+            for i in range(begin, end):
+                add(force[i], rate[i], steps[i])
+            out.append(pim)
     return out
 
 
-def _by_sample(seg: Segments) -> tuple[IntArray, Array, Array, Array]:
+def _by_sample(seg: Segments, block: slice) -> tuple[IntArray, Array, Array, Array]:
     """Return steps of one sample each; see `_by_stride`."""
-    dt = seg.increments.dt[:, None]
-    first = np.append(seg.first, seg.last[-1])
-    return first, seg.phi / dt, _force(seg.phi, seg.dv, dt), seg.increments.dt
+    first = np.append(seg.first[block], seg.last[block][-1])
+    inside = np.arange(first[0], first[-1])
+    phi, dv = seg.increments.over(inside)
+    step = seg.increments.dt[inside]
+    dt = step[:, None]
+    return first - first[0], phi / dt, _force(phi, dv, dt), step
 
 
-def _by_stride(seg: Segments) -> tuple[IntArray, Array, Array, Array]:
-    """Return steps of half a stride each, which give the increments of the strides.
+def _by_stride(seg: Segments, block: slice) -> tuple[IntArray, Array, Array, Array]:
+    """Return steps of half a stride each, which give the increments of the strides of a block.
 
     Over a half of h seconds that turns by psi, a constant force f gives the velocity A f and the
     position B f, with B A⁻¹ = h (I / 2 - [psi x] / 12) and no term of second order in psi, so that
@@ -461,7 +569,7 @@ def _by_stride(seg: Segments) -> tuple[IntArray, Array, Array, Array]:
     duration : ndarray, shape (T,), s
         Of each step.
     """
-    strides = seg.strides()
+    strides = seg.strides(block)
     h = 0.5 * strides.duration[:, None]
     before = strides.swept / h - 0.5 * strides.phi
     turn = exp_so3(before)

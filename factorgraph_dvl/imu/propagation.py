@@ -121,7 +121,8 @@ def _attach(seg: Segments, index: IntArray, since: Array, earth_rate_n: Array) -
     part = inc.partial(index, since)
     segment = np.searchsorted(seg.first, index, side="right") - 1
     node = seg.origin[segment]
-    dR = seg.dR[index]
+    before = seg.since_start(index)
+    dR = before.dR
     turned = rotate(dR, part.dv)
     h = since[:, None]
     tau = inc.start[index] + since - seg.node_time[node]
@@ -130,9 +131,9 @@ def _attach(seg: Segments, index: IntArray, since: Array, earth_rate_n: Array) -
         node=node,
         tau=tau,
         dR=dR @ exp_so3(part.phi),
-        dA=seg.dA[index] + dR @ (np.eye(3) + 0.5 * skew(part.phi)) * h[:, :, None],
-        dV=seg.dV[index] + turned,
-        dP=seg.dP[index] + seg.dV[index] * h + 0.5 * turned * h,
+        dA=before.dA + dR @ (np.eye(3) + 0.5 * skew(part.phi)) * h[:, :, None],
+        dV=before.dV + turned,
+        dP=before.dP + before.dV * h + 0.5 * turned * h,
         gyro=part.omega,
         alpha=part.alpha,
         force=part.force,

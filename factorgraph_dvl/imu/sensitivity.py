@@ -16,8 +16,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from factorgraph_dvl.geometry.rotations import exp_so3, log_so3
-from factorgraph_dvl.geometry.vectors import Array, IntArray, rotate, skew
-from factorgraph_dvl.imu.preintegration import Segments, Strides
+from factorgraph_dvl.geometry.vectors import Array, BoolArray, IntArray, rotate, skew
+from factorgraph_dvl.imu.preintegration import Segments
 from factorgraph_dvl.imu.propagation import Attachment, Transition, attitude_jacobian
 from factorgraph_dvl.sensors.imu import ERRORS, ImuError
 from factorgraph_dvl.sensors.parameters import Parameter
@@ -93,32 +93,46 @@ def sensitivities(
     attached : list of Sensitivity
         Of the motion that is attached.
     """
-    strides = seg.strides()
-    n, most = len(errors), int(strides.count.max())
-    theta, v, p = (np.zeros((seg.first.size, 3, n)) for _ in range(3))
-    before = [tuple(np.zeros((at.tau.size, 3, n)) for _ in range(3)) for at in attachments]
-    places = [_stride_of(seg, strides, at) for at in attachments]
-    for j in range(most):
-        for place, at, kept in zip(places, attachments, before, strict=True):
-            here = np.flatnonzero(place - strides.begins[at.segment] == j)
-            for own, now in zip(kept, (theta, v, p), strict=True):
-                own[here] = now[at.segment[here]]
-        live = np.flatnonzero(strides.count > j)
-        i = strides.begins[live] + j
-        means = _means(strides.phi[i], strides.dv[i], strides.duration[i])
-        step = _step(strides.dR[i], means, errors, (theta[live], v[live], p[live]))
-        theta[live], v[live], p[live] = step
+    n = len(errors)
+    whole = _zeros(seg.first.size, n)
+    attached = [_zeros(at.tau.size, n) for at in attachments]
+    for block in seg.blocks():
+        strides, count = seg.strides(block), block.stop - block.start
+        theta, v, p = _zeros(count, n)
+        rows = [np.flatnonzero(_is_within(at.segment, block)) for at in attachments]
+        segment = [
+            at.segment[own] - block.start for at, own in zip(attachments, rows, strict=True)
+        ]
+        places = [
+            strides.begins[inside] + _stride_of(seg, at, own)
+            for at, own, inside in zip(attachments, rows, segment, strict=True)
+        ]
+        for j in range(int(strides.count.max())):
+            for place, inside, own, outs in zip(places, segment, rows, attached, strict=True):
+                here = np.flatnonzero(place - strides.begins[inside] == j)
+                for out, now in zip(outs, (theta, v, p), strict=True):
+                    out[own[here]] = now[inside[here]]
+            live = np.flatnonzero(strides.count > j)
+            i = strides.begins[live] + j
+            means = _means(strides.phi[i], strides.dv[i], strides.duration[i])
+            step = _step(strides.dR[i], means, errors, (theta[live], v[live], p[live]))
+            theta[live], v[live], p[live] = step
+        for out, each in zip(whole, (-theta, v, p), strict=True):
+            out[block] = each
+        for place, at, own, outs in zip(places, attachments, rows, attached, strict=True):
+            dR = strides.dR[place]
+            back = dR.transpose(0, 2, 1)
+            since = seg.node_time[at.node[own]] + at.tau[own] - strides.start[place]
+            dV = at.dV[own] - strides.dV[place]
+            means = _means(log_so3(back @ at.dR[own]), rotate(back, dV), since)
+            theta, v, p = _step(dR, means, errors, tuple(out[own] for out in outs))
+            for out, each in zip(outs, (-theta, v, p), strict=True):
+                out[own] = each
     nothing = np.zeros((seg.first.size, 3))
-    ends = Sensitivity(-theta, v, p, nothing, nothing)
-    out = []
-    for place, at, kept in zip(places, attachments, before, strict=True):
-        dR = strides.dR[place]
-        back = dR.transpose(0, 2, 1)
-        since = seg.node_time[at.node] + at.tau - strides.start[place]
-        means = _means(log_so3(back @ at.dR), rotate(back, at.dV - strides.dV[place]), since)
-        theta_at, v_at, p_at = _step(dR, means, errors, kept)
-        out.append(Sensitivity(-theta_at, v_at, p_at, at.gyro, at.force))
-    return ends, out
+    return Sensitivity(*whole, nothing, nothing), [
+        Sensitivity(*outs, at.gyro, at.force)
+        for outs, at in zip(attached, attachments, strict=True)
+    ]
 
 
 def predicted(seg: Segments, ends: Sensitivity) -> Array:
@@ -221,13 +235,20 @@ def by_errors(
     return out
 
 
-def _stride_of(seg: Segments, strides: Strides, at: Attachment) -> IntArray:
-    """Return the stride of attached times."""
-    time = seg.node_time[at.node] + at.tau
-    index = np.clip(
-        seg.increments.locate(time)[0], seg.first[at.segment], seg.last[at.segment] - 1
-    )
-    return strides.begins[at.segment] + (index - seg.first[at.segment]) // seg.stride
+def _zeros(count: int, n: int) -> tuple[Array, Array, Array]:
+    return np.zeros((count, 3, n)), np.zeros((count, 3, n)), np.zeros((count, 3, n))
+
+
+def _is_within(segment: IntArray, block: slice) -> BoolArray:
+    return np.asarray((segment >= block.start) & (segment < block.stop))
+
+
+def _stride_of(seg: Segments, at: Attachment, rows: IntArray) -> IntArray:
+    """Return the stride of some attached times, counted from the start of their segments."""
+    segment = at.segment[rows]
+    time = seg.node_time[at.node[rows]] + at.tau[rows]
+    index = np.clip(seg.increments.locate(time)[0], seg.first[segment], seg.last[segment] - 1)
+    return np.asarray((index - seg.first[segment]) // seg.stride)
 
 
 @dataclass(frozen=True)

@@ -130,7 +130,8 @@ def initial_states(trial: Trial, frame: LocalFrame, seg: Segments) -> AlignedSta
         if a == 0 and trial.initial_attitude is not None:
             at_start = rotation_from_rph(trial.initial_attitude.rph, trial.body_axes)
             if seg.increments.averaged:
-                at_start = at_start @ exp_so3(-seg.phi[0])
+                phi, _ = seg.increments.over(np.zeros(1, dtype=int))
+                at_start = at_start @ exp_so3(-phi[0])
             nRb[arc.nodes] = spin @ at_start @ arc.turn
             continue
         seen = attitude_at_start(trial, frame, arc, mountings)

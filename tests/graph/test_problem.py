@@ -288,7 +288,8 @@ def test_initial_priors_are_east_north_up_and_roll_pitch_heading():
     np.testing.assert_allclose(prior.prior().velocity(), known, atol=0.01)
     rph = trial.initial_attitude.rph
     # The prior holds at the end of the first sample, the node is at its start.
-    back = exp_so3(-problem.chain.segments.phi[0])
+    phi, _ = problem.chain.segments.increments.over(np.zeros(1, dtype=int))
+    back = exp_so3(-phi[0])
     for axis, sigma in enumerate([0.5, 1.0, 5.0]):
         step = np.zeros(3)
         step[axis] = 1e-3 * sigma

@@ -55,8 +55,12 @@ def test_the_noise_that_is_left_is_as_stated():
 def test_a_step_is_named_as_not_resolved():
     values = np.where(TIME < 5.0, 0.0, 1.0)[:, None] * np.ones(3)
     found = smooth(TIME, values, DT, 1e-3, averaged=False, window=25)
-    assert found.at(np.array([5.0]))[2].min() > 0.1
-    assert found.at(np.array([2.0]))[2].max() == 0.0
+    misfit = found.at(np.array([2.0, 4.9, 4.995, 5.0, 5.1, 8.0]))[2]
+    assert misfit[3].min() > 0.1
+    np.testing.assert_allclose(misfit[2], found.at(np.array([4.99, 5.0]))[2].mean(axis=0))
+    assert misfit[[0, -1]].max() == 0.0
+    # Nothing is kept where there is nothing.
+    assert found.misfit.c.shape[0] < 50
 
 
 def test_samples_that_are_left_alone_have_their_own_noise():

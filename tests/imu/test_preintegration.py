@@ -249,7 +249,7 @@ def test_imu_factors_have_zero_error_at_the_truth(cases, name):
 def test_strides_lead_where_samples_do(cases, name, monkeypatch):
     case = cases[name]
     strides = case.pims()
-    monkeypatch.setattr("factorgraph_dvl.imu.preintegration._FEW", case.seg.phi.shape[0] + 1)
+    monkeypatch.setattr("factorgraph_dvl.imu.preintegration._FEW", case.seg.increments.dt.size + 1)
     samples = case.pims()
     # Far more than is left of a bias: what it does is compared, too.
     bias = gtsam.imuBias.ConstantBias(np.full(3, 1e-2), np.full(3, 1e-5))
@@ -319,6 +319,32 @@ def test_preintegrated_covariance_is_that_of_noisy_samples():
     assert np.all((ratio > 0.85) & (ratio < 1.15))
 
 
+def test_few_numbers_are_kept_for_each_sample(cases):
+    seg = cases["swell"].seg
+    imu, inc = cases["swell"].trial.imu, seg.increments
+    assert np.shares_memory(inc.rate, imu.gyro)
+    assert np.shares_memory(inc.force, imu.accel)
+    kept = [*vars(seg.knots).values(), *vars(seg.ends).values(), seg.less]
+    # A double for each of 27 numbers at every fourth sample, and of 24 at every hundredth.
+    assert sum(each.nbytes for each in kept) < 60 * imu.time.size
+
+
+@pytest.mark.parametrize("name", ["coning", "instantaneous"])
+def test_what_adds_up_to_any_sample_is_what_samples_one_by_one_add_up_to(cases, name, monkeypatch):
+    seg = cases[name].seg
+    monkeypatch.setattr("factorgraph_dvl.imu.preintegration._STRIDE", 0.01)
+    # Blocks of some segments each.
+    monkeypatch.setattr("factorgraph_dvl.imu.preintegration._CHUNK", 450)
+    each = segments(seg.increments, 1.0)
+    assert (seg.spacing, each.spacing) == (4, 1)
+    index = np.arange(seg.first[0], seg.last[-1])
+    some, every = seg.since_start(index), each.since_start(index)
+    for name_, values in vars(some).items():
+        np.testing.assert_allclose(values, getattr(every, name_), atol=1e-14, err_msg=name_)
+    np.testing.assert_allclose(seg.ends.dP, each.ends.dP, atol=1e-14)
+    np.testing.assert_allclose(seg.less.sum(axis=0), each.less.sum(axis=0), rtol=1e-12)
+
+
 def test_samples_left_open_widen_the_covariance():
     case = build(sway=CONING)
     imu = case.trial.imu
@@ -346,13 +372,13 @@ def test_gtsams_default_preintegration_would_not_do(cases):
     case = cases["coning"]
     drift = []
     for k in range(40, 60):
-        part = slice(case.seg.first[k], case.seg.last[k])
-        dt = case.seg.increments.dt[part]
+        part = np.arange(case.seg.first[k], case.seg.last[k])
+        dt, increments_over = case.seg.increments.dt[part], case.seg.increments.over(part)
         params = gtsam.PreintegrationParams(case.gravity_n[k])
         turned = {}
         for kind in (gtsam.PreintegratedImuMeasurements, gtsam.PreintegratedImuMeasurementsG):
             pim = kind(params)
-            for phi, dv, h in zip(case.seg.phi[part], case.seg.dv[part], dt, strict=True):
+            for phi, dv, h in zip(*increments_over, dt, strict=True):
                 pim.integrateMeasurement(dv / h, phi / h, h)
             turned[kind] = pim.deltaRij().matrix()
         default, galilean = turned.values()
