@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.linalg import cholesky_banded
 
 from factorgraph_dvl.geometry.vectors import Array
 
@@ -34,7 +33,7 @@ def banded(diagonal: Array, off: Array) -> Array:
     return out
 
 
-def inverse_blocks(diagonal: Array, off: Array) -> tuple[Array, Array]:
+def inverse_blocks(factor: Array, size: int) -> tuple[Array, Array]:
     """Return the blocks of the inverse P of a symmetric block-tridiagonal matrix A.
 
     They follow from the end: with A = Uᵀ U and G = U_kk⁻¹ U_k,k+1
@@ -43,8 +42,10 @@ def inverse_blocks(diagonal: Array, off: Array) -> tuple[Array, Array]:
 
     Parameters
     ----------
-    diagonal, off : ndarray, shape (K, n, n) or (K - 1, n, n)
-        As in `banded`.
+    factor : ndarray, shape (2 n, K n)
+        U in banded form, as `scipy.linalg.cholesky_banded` returns it.
+    size : int
+        Size n of a block.
 
     Returns
     -------
@@ -52,16 +53,10 @@ def inverse_blocks(diagonal: Array, off: Array) -> tuple[Array, Array]:
         P_kk.
     across : ndarray, shape (K - 1, n, n)
         P_k,k+1.
-
-    Raises
-    ------
-    numpy.linalg.LinAlgError
-        If the matrix is not positive definite.
     """
-    factor = cholesky_banded(banded(diagonal, off), check_finite=False)
-    size = diagonal.shape[1]
+    count = factor.shape[1] // size
     above = 2 * size - 1
-    root, beside = np.zeros_like(diagonal), np.empty_like(off)
+    root, beside = np.zeros((count, size, size)), np.empty((count - 1, size, size))
     for i in range(size):
         for j in range(size):
             if j >= i:
@@ -70,6 +65,8 @@ def inverse_blocks(diagonal: Array, off: Array) -> tuple[Array, Array]:
     root = np.asarray(np.linalg.inv(root), dtype=np.float64)
     gain = root[:-1] @ beside
     own = root @ root.transpose(0, 2, 1)
-    for k in range(len(off) - 1, -1, -1):
-        own[k] += gain[k] @ own[k + 1] @ gain[k].T
+    after = own[-1]
+    for each, through in zip(own[-2::-1], gain[::-1], strict=True):
+        each += through.dot(after).dot(through.T)
+        after = each
     return own, -gain @ own[1:]

@@ -86,8 +86,8 @@ class Interpolation:
     def states(self, nodes: Array) -> Array:
         """Return the states (M, n) between those of the nodes, (K, n)."""
         before, after = nodes[self.node], nodes[self.node + 1]
-        motion = self.motion_before @ before[:, :_MOTION].reshape(-1, 2, 3)
-        motion += self.motion_after @ after[:, :_MOTION].reshape(-1, 2, 3)
+        motion = np.einsum("mij,mjk->mik", self.motion_before, _by_axis(before))
+        motion += np.einsum("mij,mjk->mik", self.motion_after, _by_axis(after))
         lasting = self.process_before * before[:, _MOTION:]
         lasting += self.process_after * after[:, _MOTION:]
         return np.concatenate([motion.reshape(-1, _MOTION), lasting], axis=1)
@@ -240,7 +240,8 @@ class MotionChain:
             tau = np.clip(lasting - self.time[k], 0.0, span)
             rest = span - tau
         density = self.density[k][:, None, None, :]
-        own = np.array([p.tau for p in self.processes for _ in range(p.sigma.size)])
+        own = np.array([p.tau for p in self.processes])
+        size = [p.sigma.size for p in self.processes]
         scaled = [t[:, None] / own for t in (span, tau, rest)]
         whole, since, until = (np.sinh(t) for t in scaled)
         missing = np.expm1(-2.0 * scaled[1]) * np.expm1(-2.0 * scaled[2])
@@ -251,10 +252,15 @@ class MotionChain:
             motion_variance=_blocks(v_pp, v_pv, v_pv, v_vv)[..., None] * density,
             motion_variance_rate=_blocks(r_pp, r_pv, r_pv, r_vv)[..., None] * density,
             acceleration=acceleration,
-            process_before=until / whole,
-            process_after=since / whole,
-            process_variance=missing / -np.expm1(-2.0 * scaled[0]),
+            process_before=np.repeat(until / whole, size, axis=1),
+            process_after=np.repeat(since / whole, size, axis=1),
+            process_variance=np.repeat(missing / -np.expm1(-2.0 * scaled[0]), size, axis=1),
         )
+
+
+def _by_axis(states: Array) -> Array:
+    """Return position and velocity (M, 2, 3) of states (M, n)."""
+    return states[:, :_MOTION].reshape(-1, 2, 3)
 
 
 def _blocks(pp: Array, pv: Array, vp: Array, vv: Array) -> Array:
@@ -266,12 +272,12 @@ def _times(J: Array, motion: Array, process: Array) -> Array:
     """Return J (M, d, n) times matrices by axis, (M, 2, 2) or (M, 2, 2, 3), and a diagonal."""
     if motion.ndim == 3:
         motion = motion[..., None]
-    p, v = J[:, :, :3], J[:, :, 3:_MOTION]
-    out = np.empty(J.shape)
-    out[:, :, :3] = p * motion[:, None, 0, 0] + v * motion[:, None, 1, 0]
-    out[:, :, 3:_MOTION] = p * motion[:, None, 0, 1] + v * motion[:, None, 1, 1]
-    out[:, :, _MOTION:] = J[:, :, _MOTION:] * process[:, None]
-    return out
+    motion = np.broadcast_to(motion, (*motion.shape[:3], 3))
+    # One product of whole rows: those of three elements take longer.
+    out = J * np.concatenate([motion[:, 0, 0], motion[:, 1, 1], process], axis=1)[:, None]
+    out[:, :, :3] += J[:, :, 3:_MOTION] * motion[:, None, 1, 0]
+    out[:, :, 3:_MOTION] += J[:, :, :3] * motion[:, None, 0, 1]
+    return np.asarray(out)
 
 
 def chain_nodes(time: Array, turning: Sequence[bool] | np.ndarray, interval: float) -> Array:

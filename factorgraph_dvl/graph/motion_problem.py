@@ -15,7 +15,6 @@ from factorgraph_dvl.graph.bordered_chain import (
     Covariances,
     Factorisation,
     NormalEquations,
-    rows_by_node,
 )
 from factorgraph_dvl.graph.clocks import linearized, true_time
 from factorgraph_dvl.graph.motion_chain import Interpolation, MotionChain
@@ -121,13 +120,7 @@ class WhitenedRows:
 
     def leverage(self, covariances: Covariances) -> Array:
         """Return the variance of the rows' predictions, (M, d)."""
-        out = np.empty(self.residual.shape)
-        J = np.concatenate([self.before, self.after, self.constants], axis=2)
-        for at, rows in rows_by_node(self.node):
-            stacked = J[rows].reshape(at.size, -1, J.shape[2])
-            variance = np.sum((stacked @ covariances.around(at)) * stacked, axis=2)
-            out[rows] = variance.reshape(*rows.shape, -1)
-        return out
+        return covariances.variance(self.node, self.before, self.after, self.constants)
 
 
 class MotionProblem:
@@ -197,6 +190,7 @@ class MotionProblem:
         # By observation: noise but for the motion (M, d, d), derivatives by states, what is used.
         self._weights: list[tuple[Array, Array, Array]] = []
         self._bound: dict[str, Array] = {}
+        self._last: tuple[MotionEvaluation, NormalEquations] | None = None
         # A parameter that no measurement names belongs to the attitude.
         self._of_attitude = {p.name for p in attitude.sensor.parameters()}
 
@@ -222,11 +216,20 @@ class MotionProblem:
     def evaluate(self, states: Array, parameters: dict[str, Array]) -> MotionEvaluation:
         """Evaluate motion, residuals and derivatives."""
         seen = tuple(self._see(o, states, parameters) for o in self.observations)
-        whitening = tuple(
+        return MotionEvaluation(states, parameters, seen, self._whitening(seen))
+
+    def weighed(self, states: Array, parameters: dict[str, Array]) -> MotionEvaluation:
+        """Set the weights of all measurements from their covariances there, and evaluate."""
+        self._bound = {}
+        seen = tuple(self._see(o, states, parameters) for o in self.observations)
+        self._weigh(seen, parameters)
+        return MotionEvaluation(states, parameters, seen, self._whitening(seen))
+
+    def _whitening(self, seen: Sequence[Seen]) -> tuple[Array, ...]:
+        return tuple(
             np.linalg.inv(np.linalg.cholesky(own + s.interpolation.variance(J) * used)) * used
             for s, (own, J, used) in zip(seen, self._weights, strict=False)
         )
-        return MotionEvaluation(states, parameters, seen, whitening)
 
     def body_at(
         self,
@@ -260,15 +263,13 @@ class MotionProblem:
         """Return the times of the nodes less true times, s."""
         return float(parameters[self.clock][0])
 
-    def weigh(self, evaluation: MotionEvaluation) -> None:
-        """Set the weights of all measurements from their covariances there."""
+    def _weigh(self, all_seen: Sequence[Seen], parameters: Mapping[str, Array]) -> None:
+        """Set the weights of all measurements from their covariances."""
         self._weights, self.total_sigma = [], []
-        # A clock that moves must not follow errors that are as rough as a random walk.
-        self._bound = {
-            o.label: seen.time for o, seen in zip(self.observations, evaluation.seen, strict=True)
-        }
-        for o, seen in zip(self.observations, evaluation.seen, strict=True):
-            sigma = self.sigma(o, seen, evaluation.parameters)
+        for o, seen in zip(self.observations, all_seen, strict=True):
+            # A clock that moves must not follow errors that are as rough as a random walk.
+            self._bound[o.label] = seen.time
+            sigma = self.sigma(o, seen, parameters)
             used = np.isfinite(sigma) & self.usable(o, seen)[:, None]
             R = np.einsum("mi,ij->mij", np.where(used, sigma, 1.0) ** 2, np.eye(sigma.shape[1]))
             spread = seen.by_rph * self.attitude.white
@@ -363,10 +364,11 @@ class MotionProblem:
             Change of the slope from a vessel that drifts to one that keeps its track.
         """
         weak = self.with_chain(replace(self.chain, density=_WEAKER * self.chain.density))
-        data = weak._without_motion(evaluation)
-        weak._add_motion(data, evaluation.states)
+        data = self._without_motion(evaluation)
+        equations = data.copy()
+        weak._add_motion(equations, evaluation.states)
         try:
-            freed = data.factorise().node_step() - factors.node_step()
+            freed = equations.factorise().node_step() - factors.node_step()
         except np.linalg.LinAlgError:
             # No digits are left for a weaker prior, because it alone determines some states.
             freed = np.zeros_like(evaluation.states)
@@ -383,11 +385,12 @@ class MotionProblem:
             ):
                 if _SCALE not in o.parameters:
                     continue
-                at, J = seen.interpolation, W @ seen.by_state
-                through = given.products(at.node, np.concatenate(at.by_nodes(J), axis=2))
-                flow = np.zeros_like(J)
-                flow[:, :, place] = J[:, :, place]
-                by_row = np.sum(np.concatenate(at.by_nodes(flow), axis=2) * through, axis=(0, 2))
+                at = seen.interpolation
+                before, after = at.by_nodes(W @ seen.by_state)
+                through = given.with_states(at.node, before, after, place)
+                by_row = np.zeros(W.shape[1])
+                for J, each in zip((before, after), through, strict=True):
+                    by_row += np.sum(J[:, :, place] * each, axis=(0, 2))
                 rows = by_row.sum() if gain.size == 1 else by_row
                 by_track[self.columns[_SCALE]] += rows / gain
         self.slope = slope + _TRACK * by_track
@@ -396,7 +399,8 @@ class MotionProblem:
 
     def equations(self, evaluation: MotionEvaluation) -> NormalEquations:
         """Return the normal equations at an evaluation."""
-        out = self._without_motion(evaluation)
+        out = self._without_motion(evaluation).copy()
+        out.constant_gradient += self.slope
         self._add_motion(out, evaluation.states)
         return out
 
@@ -412,7 +416,7 @@ class MotionProblem:
         evaluation : MotionEvaluation
             Near the minimum.
         """
-        data = self._without_motion(evaluation)
+        data, slope = self._without_motion(evaluation), self.slope
 
         def of(chain: MotionChain) -> float:
             other = self.with_chain(chain)
@@ -421,6 +425,7 @@ class MotionProblem:
                 scale[chain.place(p.name)] = np.maximum(q.sigma, 1e-300) / p.sigma
             states = evaluation.states / scale
             equations = data.scaled(scale)
+            equations.constant_gradient += slope
             prior = other._add_motion(equations, states)
             factors = equations.factorise()
             dx, dc = factors.step()
@@ -430,7 +435,13 @@ class MotionProblem:
         return of
 
     def _without_motion(self, evaluation: MotionEvaluation) -> NormalEquations:
-        """Return the normal equations of measurements and parameters alone."""
+        """Return the normal equations of measurements and parameters alone, not to be changed.
+
+        Those of the last evaluation are kept: the step, the slope and the strength of the current
+        take them.
+        """
+        if self._last is not None and self._last[0] is evaluation:
+            return self._last[1]
         out = NormalEquations(self.chain.time.size, self.chain.size, self.constants)
         for rows in self.rows(evaluation):
             out.add(rows.node, rows.before, rows.after, rows.constants, rows.residual)
@@ -439,7 +450,7 @@ class MotionProblem:
             gain = np.linalg.inv(self.prior_root)
             out.corner += gain.T @ gain
             out.constant_gradient += gain.T @ self._prior_residual(evaluation.parameters)
-            out.constant_gradient += self.slope
+        self._last = (evaluation, out)
         return out
 
     def _add_variances(self, equations: NormalEquations, evaluation: MotionEvaluation) -> None:
@@ -537,11 +548,11 @@ class MotionProblem:
         found = self._by_attitude(lin, body, by_rph, by_heading, time)
         if self.clock in self.columns:
             # The nodes move with this clock, and their motion with them.
-            by_time = np.zeros((m, d, 1))
+            by_time = np.zeros((m, d))
             for by, change in ((lin.d_p, motion.v_n), (lin.d_v, motion.a_n)):
                 if by is not None:
-                    by_time += by @ change[:, :, None]
-            found[self.clock] = by_time
+                    by_time += rotate(by, change)
+            found[self.clock] = by_time[:, :, None]
         for name, place in self.columns.items():
             if name in lin.d_parameters:
                 by_parameters[:, :, place] += lin.d_parameters[name]
@@ -559,14 +570,14 @@ class MotionProblem:
     ) -> dict[str, Array]:
         """Return derivatives of a residual by errors of the heading and the attitude's clock."""
         found = {name: by_rph[:, :, 2:] * by[:, None, :] for name, by in by_heading.items()}
-        late = np.zeros((*lin.residual.shape, 1))
+        late = np.zeros(lin.residual.shape)
         if lin.d_theta is not None:
-            late += lin.d_theta @ body.omega_eb_b[:, :, None]
+            late += rotate(lin.d_theta, body.omega_eb_b)
         if lin.d_omega is not None:
-            late += lin.d_omega @ body.alpha_b[:, :, None]
+            late += rotate(lin.d_omega, body.alpha_b)
         offset, rate = self.attitude.sensor.clock.names
-        found[offset] = late
-        found[rate] = late * (time - self.zero)[:, None, None]
+        found[offset] = late[:, :, None]
+        found[rate] = found[offset] * (time - self.zero)[:, None, None]
         return found
 
     def with_chain(self, chain: MotionChain) -> MotionProblem:

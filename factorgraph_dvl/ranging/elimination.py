@@ -119,6 +119,6 @@ class System:
             unit[-4:] = np.eye(4)
             own, influence = self._solve(unit)[-4:][None], influence[-1:]
         else:
-            own, _ = inverse_blocks(self._diagonal, self._off)
+            own, _ = inverse_blocks(self._factor, 4)
         states = own + influence @ constants @ influence.transpose(0, 2, 1)
         return states, -influence @ constants, constants

@@ -298,8 +298,7 @@ def _weighted(
     problem: MotionProblem, states: Array, values: dict[str, Array]
 ) -> tuple[MotionEvaluation, float]:
     """Weigh a problem anew, and return its evaluation and cost."""
-    problem.weigh(problem.evaluate(states, values))
-    evaluation = problem.evaluate(states, values)
+    evaluation = problem.weighed(states, values)
     return evaluation, problem.cost(evaluation)
 
 

@@ -23,7 +23,7 @@ def test_solution_and_blocks_of_the_inverse_are_those_of_the_dense_matrix(count)
     solution = cho_solve_banded((factor, False), right)
     np.testing.assert_allclose(solution, np.linalg.solve(dense, right), atol=1e-12)
     inverse = np.linalg.inv(dense).reshape(count, size, count, size)
-    own, across = inverse_blocks(diagonal, off)
+    own, across = inverse_blocks(factor, size)
     for k in range(count):
         np.testing.assert_allclose(own[k], inverse[k, :, k], atol=1e-12)
     for k in range(count - 1):

@@ -202,7 +202,7 @@ def scale_error_with(prepared, strength, *, follows):
     chain = replace(problem.chain, density=strength * problem.chain.density)
     problem = problem.with_chain(chain)
     states, values = prepared.states, problem.prior_values() | prepared.values
-    problem.weigh(problem.evaluate(states, values))
+    problem.weighed(states, values)
     for _ in range(6):
         evaluation = problem.evaluate(states, values)
         factors = problem.equations(evaluation).factorise()
