@@ -29,6 +29,8 @@ _SPIKES = 3
 # Share of the variance of the integrated noise that spikes must add. Chosen: below it they change
 # neither attitude nor velocity by a σ. A blow on a hull added 0.09 to six minutes.
 _ADDED = 0.25
+# The same of fewer spikes than that. Chosen: ten blows such as that one, in one sample.
+_ADDED_BY_FEW = 9.0
 # Interval from which on it is a gap, in usual ones.
 _GAP = 1.5
 # Square of the median deviation from the mean of both neighbours, over the variance of noise.
@@ -96,7 +98,7 @@ def _spikes(values: Array, moves: np.ndarray) -> Iterator[Finding]:
     hit = (ratio > _SPIKE) & alone[0] & alone[1]
     count = int(np.any(hit, axis=1).sum())
     added = _MEDIAN_SQUARED * np.sum(np.square(ratio), axis=0, where=hit) / ratio.shape[0]
-    if count >= _SPIKES and added.max() > _ADDED:
+    if added.max() > (_ADDED if count >= _SPIKES else _ADDED_BY_FEW):
         size = np.max(ratio, where=hit, initial=0.0)
         yield Finding(
             Code.IMU_SPIKES,

@@ -109,6 +109,7 @@ _ERRORS = (
 BIASES = (_GYRO_BIAS.name, _ACCEL_BIAS.name)
 # The elements that the components of each parameter stand for, by its name.
 ERRORS = {spec.name: elements for spec, elements in _ERRORS}
+GYRO_SCALE = _ERRORS[0][0].name
 
 
 @dataclass(frozen=True)

@@ -10,9 +10,10 @@ import numpy as np
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph.clocks import parameters_of
 from factorgraph_dvl.graph.problem import Evaluation, Problem
+from factorgraph_dvl.imu.sampling import apparent_gyro_scale
 from factorgraph_dvl.quality.earlier_calibration import prior_against_data
 from factorgraph_dvl.sensors.finding import Code, Finding
-from factorgraph_dvl.sensors.imu import ERRORS
+from factorgraph_dvl.sensors.imu import ERRORS, GYRO_SCALE, Imu
 from factorgraph_dvl.sensors.message import Message, message
 from factorgraph_dvl.sensors.parameters import UNITS, Parameter
 from factorgraph_dvl.solvers.change_along_trial import CHANGED, component_changes
@@ -38,6 +39,9 @@ _TIE = 4.0
 _INTERVALS = 20
 # Least scale of residuals against what is stated. Chosen: records without noise have none.
 _LEAST_SCALE = 0.5
+# Share of χ² that may be left where the wrong `sampling` explains a scale of the gyros. Chosen:
+# the motion between samples is known to some per cent.
+_LEFT = 0.2
 # Trial, s, from which on tests are made. Chosen: shorter ones have rival minima.
 _SHORTEST = 60.0
 
@@ -53,7 +57,7 @@ class Explanation:
     score : Score
         Its test.
     others : tuple of str
-        Names of those that explain the misfit about as well.
+        Names of those that explain the misfit about as well, and `imu.sampling` where that does.
     """
 
     parameter: Parameter
@@ -66,7 +70,7 @@ class Explanation:
         return _wide(self.parameter, self.parameter.mean)
 
 
-def explanation(problem: Problem, minimum: Minimum) -> Explanation | None:
+def explanation(problem: Problem, minimum: Minimum, imu: Imu) -> Explanation | None:
     """Return what would explain most of a misfit; None if chance may have made it.
 
     None also where a change along the trial explains more.
@@ -77,6 +81,8 @@ def explanation(problem: Problem, minimum: Minimum) -> Explanation | None:
         What was minimised.
     minimum : Minimum
         Where it ended.
+    imu : Imu
+        The samples, as they are stated to be taken.
     """
     time = problem.chain.segments.node_time
     if time[-1] - time[0] < _SHORTEST:
@@ -104,7 +110,15 @@ def explanation(problem: Problem, minimum: Minimum) -> Explanation | None:
     others = tuple(
         p.name for p, t in significant[1:] if test.evidence(count) - t.evidence(count) < 2.0 * _TIE
     )
+    if parameter.name == GYRO_SCALE and _is_sampling(test, imu):
+        others = (*others, "imu.sampling")
     return Explanation(parameter, test, others)
+
+
+def _is_sampling(scale: Score, imu: Imu) -> bool:
+    """Whether a scale of the gyros is what the wrong sampling looks like."""
+    left = (scale.step - apparent_gyro_scale(imu)) / scale.std
+    return bool(left @ left < _LEFT * np.sum((scale.step / scale.std) ** 2))
 
 
 def _tests_of_priors(

@@ -242,7 +242,7 @@ def settle(
             tested = parameters
             # The test has a problem of its own, and more columns.
             problem.release()
-            left = explanation(problem, minimum)
+            left = explanation(problem, minimum, prepared.trial.inertial)
             if left is not None and len(freed) < _MOST_FREED:
                 freed.append(left)
                 parameters = tuple(

@@ -282,6 +282,16 @@ def test_spikes_of_the_imu_are_named(trial: Trial) -> None:
     assert "single samples differ" in text
 
 
+def test_a_single_spike_of_the_imu_is_named(trial: Trial) -> None:
+    def spike(trial: Trial, rng: np.random.Generator) -> Trial:
+        accel = trial.inertial.accel.copy()
+        accel[2000, 0] += 10.0
+        return replace(trial, imu=replace(trial.inertial, accel=accel))
+
+    (text,) = found(trial, spike).values()
+    assert "1 single sample differs" in text
+
+
 def test_jitter_of_stamps_is_named_where_it_adds_to_the_noise(trial: Trial) -> None:
     (text,) = found(trial, faults.jitter("imu", 0.002)).values()
     assert "scatter by 2 ms about even intervals of 20 ms" in text

@@ -10,7 +10,7 @@ import pytest
 from truth import merged, scenario
 
 from factorgraph_dvl.sensors.finding import Code
-from factorgraph_dvl.simulation import simulate
+from factorgraph_dvl.simulation import faults, simulate
 from factorgraph_dvl.solvers.batch import solve
 
 SCENE = {
@@ -63,6 +63,18 @@ def turned_too_far(trial, ppm):
     return replace(trial, imu=replace(trial.imu, gyro=gyro))
 
 
+def test_the_wrong_sampling_is_named_beside_the_scale_that_it_looks_like():
+    sway = {
+        "roll": [{"amplitude_deg": 4, "frequency_hz": 2}],
+        "pitch": [{"amplitude_deg": 4, "frequency_hz": 2, "phase_deg": 90}],
+    }
+    swaying = known(simulate(scenario(**merged({"sway": sway}, SCENE)), 4))
+    solution = solve(faults.with_faults(swaying, [faults.sampling_misstated()]), rate_hz=1.0)
+    (finding,) = (f for f in solution.findings if f.parameter == "gyro_scale_ppm")
+    assert finding.code == Code.ESTIMATED_INSTEAD
+    assert "imu.sampling would explain it about as well" in finding.text
+
+
 FAULTS = {
     "time_offset_s": (lambda t: late(t, "dvl", 0.02), 0.02),
     "gnss_time_offset_s": (lambda t: late(t, "gnss", 0.08), 0.08),
@@ -77,6 +89,7 @@ def test_the_cause_is_named_and_estimated(trial, name):
     solution = solve(fault(trial), rate_hz=1.0)
     (finding,) = (f for f in solution.findings if f.code == Code.ESTIMATED_INSTEAD)
     assert finding.parameter == name
+    assert "sampling" not in finding.text
     found = solution.estimate(name)
     i = int(np.argmax(np.abs(found.value)))
     assert abs(found.value[i] - size) < 4.0 * found.std[i]
