@@ -161,7 +161,7 @@ def _run(
     kind = next(k for k in KINDS if k == smoother)
     began = perf_counter()
     shown = began
-    first, last = (float(t) for t in trial.inertial.time[[0, -1]])
+    first, last = (float(t) for t in trial.body_sensor.time[[0, -1]])
     verdict = VerdictAsItGoes(trial)
 
     def speed(update: Update) -> float:
@@ -293,7 +293,7 @@ def _print(trial: Trial, solution: Solution, record: ReplayRecord, found: Conver
     truth = trial.calibration_truth
     errors = calibration_errors(solution, truth) if truth else None
     print_table(calibration_table(solution, errors, width=console.width))
-    start = float(trial.inertial.time[0])
+    start = float(trial.body_sensor.time[0])
     print_table(convergence_table(found, start))
     plain = 1e3 * record.latency[~record.solved]
     if plain.size:
@@ -301,7 +301,7 @@ def _print(trial: Trial, solution: Solution, record: ReplayRecord, found: Conver
         console.print(
             f"{plain.size} updates: latency {median:.1f} ms (median), {tail:.1f} ms (99 %); "
             f"{int(record.solved.sum())} with a solution of all collected data, the longest "
-            f"{record.latency.max():.1f} s; estimates are {record.delay:.2f} s behind the IMU",
+            f"{record.latency.max():.1f} s; estimates are {record.delay:.2f} s behind the records",
             markup=False,
             highlight=False,
             soft_wrap=True,

@@ -106,6 +106,52 @@ class NormalEquations:
         out.constant_gradient = self.constant_gradient.copy()
         return out
 
+    def without_first(self, count: int) -> NormalEquations:
+        """Return the equations of the other nodes and the constants, the first nodes eliminated.
+
+        Parameters
+        ----------
+        count : int
+            Number of nodes to eliminate, less than all.
+
+        Raises
+        ------
+        numpy.linalg.LinAlgError
+            If the information on these nodes is not positive definite.
+        """
+        if not count:
+            return self
+        n = self.size
+        following = np.zeros((count, n, n))
+        following[-1] = self.off[count - 1]
+        right = np.concatenate(
+            [following, self.border[:count], self.node_gradient[:count, :, None]], axis=2
+        )
+        width = right.shape[2]
+        factor = cholesky_banded(
+            banded(self.diagonal[:count], self.off[: count - 1]), check_finite=False
+        )
+        right = right.reshape(count * n, width)
+        solved = cho_solve_banded((factor, False), right, check_finite=False)
+        lost = right[:, :-1].T @ solved
+        out = NormalEquations(self.nodes - count, n, self.constants)
+        for name in ("diagonal", "off", "border", "node_gradient"):
+            setattr(out, name, getattr(self, name)[count:].copy())
+        out.diagonal[0] -= lost[:n, :n]
+        out.border[0] -= lost[:n, n:-1]
+        out.node_gradient[0] -= lost[:n, -1]
+        out.corner = self.corner - lost[n:, n:-1]
+        out.constant_gradient = self.constant_gradient - lost[n:, -1]
+        return out
+
+    def first_alone(self) -> NormalEquations:
+        """Return the equations of the first node and the constants, those of others dropped."""
+        out = NormalEquations(1, self.size, self.constants)
+        for name in ("diagonal", "border", "node_gradient"):
+            setattr(out, name, getattr(self, name)[:1].copy())
+        out.corner, out.constant_gradient = self.corner.copy(), self.constant_gradient.copy()
+        return out
+
     def factorise(self) -> Factorisation:
         """Return the Cholesky factorisation.
 

@@ -340,7 +340,7 @@ class MotionProblem:
         whitened.append(self.motion_rows(evaluation.states).residual)
         whitened.append(self.chain.first() * (evaluation.states[0] - self._first()))
         whitened.append(self._prior_residual(evaluation.parameters))
-        linear = self.slope @ self._from(self._slope_at, evaluation.parameters)
+        linear = self.slope @ self.coordinates(self._slope_at, evaluation.parameters)
         return 0.5 * sum(float(np.vdot(r, r)) for r in whitened) + float(linear)
 
     def follow_motion(
@@ -404,6 +404,20 @@ class MotionProblem:
         self._add_motion(out, evaluation.states)
         return out
 
+    def known_before(self, evaluation: MotionEvaluation, node: int) -> NormalEquations:
+        """Return the equations of one node and the constants by all that came before the node."""
+        early = tuple(
+            W * (seen.interpolation.node < node)[:, None, None]
+            for W, seen in zip(evaluation.whitening, evaluation.seen, strict=True)
+        )
+        out = self._without_motion(replace(evaluation, whitening=early)).copy()
+        out.constant_gradient += self.slope
+        rows = self.motion_rows(evaluation.states)
+        rows.before[node:], rows.after[node:], rows.residual[node:] = 0.0, 0.0, 0.0
+        out.add_steps(rows.before, rows.after, rows.residual)
+        self._add_first(out, evaluation.states)
+        return out.without_first(node).first_alone()
+
     def deviance(self, evaluation: MotionEvaluation) -> Callable[[MotionChain], float]:
         """Return twice the negative logarithm of the restricted likelihood, but for a constant.
 
@@ -434,6 +448,14 @@ class MotionProblem:
 
         return of
 
+    def measured(self, evaluation: MotionEvaluation) -> NormalEquations:
+        """Return the normal equations of measurements alone."""
+        out = NormalEquations(self.chain.time.size, self.chain.size, self.constants)
+        for rows in self.rows(evaluation):
+            out.add(rows.node, rows.before, rows.after, rows.constants, rows.residual)
+        self._add_variances(out, evaluation)
+        return out
+
     def _without_motion(self, evaluation: MotionEvaluation) -> NormalEquations:
         """Return the normal equations of measurements and parameters alone, not to be changed.
 
@@ -442,10 +464,7 @@ class MotionProblem:
         """
         if self._last is not None and self._last[0] is evaluation:
             return self._last[1]
-        out = NormalEquations(self.chain.time.size, self.chain.size, self.constants)
-        for rows in self.rows(evaluation):
-            out.add(rows.node, rows.before, rows.after, rows.constants, rows.residual)
-        self._add_variances(out, evaluation)
+        out = self.measured(evaluation)
         if self.parameters:
             gain = np.linalg.inv(self.prior_root)
             out.corner += gain.T @ gain
@@ -471,12 +490,17 @@ class MotionProblem:
 
     def _add_motion(self, equations: NormalEquations, states: Array) -> float:
         """Add the prior of the motion, and return its sum of squares."""
-        rows, first = self.motion_rows(states), self.chain.first()
+        rows = self.motion_rows(states)
         equations.add_steps(rows.before, rows.after, rows.residual)
+        return float(np.vdot(rows.residual, rows.residual)) + self._add_first(equations, states)
+
+    def _add_first(self, equations: NormalEquations, states: Array) -> float:
+        """Add the prior of the first node, and return its sum of squares."""
+        first = self.chain.first()
         beyond = first * (states[0] - self._first())
         equations.diagonal[0] += np.diag(first**2)
         equations.node_gradient[0] += first * beyond
-        return float(np.vdot(rows.residual, rows.residual) + beyond @ beyond)
+        return float(beyond @ beyond)
 
     def _first(self) -> Array:
         first = self._start[0].copy()
@@ -486,10 +510,10 @@ class MotionProblem:
     def _prior_residual(self, parameters: Mapping[str, Array]) -> Array:
         if not self.parameters:
             return np.zeros(0)
-        off = self._from({p.name: prior_mean(p) for p in self.parameters}, parameters)
+        off = self.coordinates({p.name: prior_mean(p) for p in self.parameters}, parameters)
         return np.asarray(np.linalg.solve(self.prior_root, off))
 
-    def _from(self, origin: Mapping[str, Array], parameters: Mapping[str, Array]) -> Array:
+    def coordinates(self, origin: Mapping[str, Array], parameters: Mapping[str, Array]) -> Array:
         """Return the estimated parameters in coordinates (c,) about others."""
         off = [local_coordinates(p, parameters[p.name], origin[p.name]) for p in self.parameters]
         return np.concatenate([np.zeros(0), *off])

@@ -125,6 +125,12 @@ class AttitudeRecord:
             self.white = np.where([True, True, False], stated, self.white)
         self._gap = longest_gap(self.time)
 
+    def of_rows(self, sensor: Attitude | Ins) -> AttitudeRecord:
+        """Return the record of other rows of the sensor, with the same white noise."""
+        out = AttitudeRecord(sensor, self.body_axes, estimated=False)
+        out.white, out._rate_sigma = self.white, self._rate_sigma
+        return out
+
     def covers(self, time: Array) -> np.ndarray:
         """Whether attitude is known at stamps (M,) of the sensor."""
         after = np.clip(np.searchsorted(self.time, time), 1, self.time.size - 1)

@@ -8,11 +8,12 @@ from itertools import pairwise
 
 import numpy as np
 
-from factorgraph_dvl.errors import SolveError
+from factorgraph_dvl.errors import ConfigError, SolveError
 from factorgraph_dvl.imu.timestamps import without_strays
 from factorgraph_dvl.quality.earlier_calibration import prior_findings
 from factorgraph_dvl.quality.refusal import accepted_errors, explained
 from factorgraph_dvl.quality.survey import survey
+from factorgraph_dvl.replay.motion_session import MOST_UPDATES_HZ, MotionReplay
 from factorgraph_dvl.replay.record import Recorder, ReplayRecord
 from factorgraph_dvl.replay.samples import LEAST
 from factorgraph_dvl.replay.session import LAG, RATE, Kind, Replay
@@ -74,7 +75,7 @@ def replay(
     errors = accepted_errors(survey(trial), anyway=anyway)
     with explained(errors):
         solution, record = _played(
-            without_strays(trial),
+            trial if trial.imu is None else without_strays(trial),
             smoother=smoother,
             lag_s=lag_s,
             rate_hz=rate_hz,
@@ -96,6 +97,8 @@ def _played(
     """Feed a trial without impossible times; the parameters are those of `replay`."""
     # Fails early if the trial has no position.
     trial.frame()
+    if trial.imu is None:
+        return _played_without_imu(trial, smoother, lag_s, rate_hz, progress, watch)
     run = Replay(trial, smoother=smoother, lag_s=lag_s, rate_hz=rate_hz, progress=progress)
     recorder = Recorder()
     imu = trial.inertial
@@ -129,7 +132,38 @@ def _played(
     return _solution(trial, run, recorder, recorder.last), recorder.record(run.delay)
 
 
-def _solution(trial: Trial, run: Replay, recorder: Recorder, last: Update) -> Solution:
+def _played_without_imu(
+    trial: Trial,
+    smoother: Kind,
+    lag_s: float,
+    rate_hz: float,
+    progress: Progress | None,
+    watch: Watch | None,
+) -> tuple[Solution, ReplayRecord]:
+    """Read a trial without IMU step by step; the parameters are those of `replay`."""
+    if smoother != "fixed-lag":
+        raise ConfigError(
+            f"smoother is {smoother!r}, which needs an IMU", expected="fixed-lag, without an IMU"
+        )
+    run = MotionReplay(trial, lag_s, progress or (lambda stage, iteration, cost: None))
+    recorder = Recorder()
+    time = trial.body_sensor.time
+    last = float(max(aid.time[-1] for aid in trial.aids))
+    steps = np.arange(time[0], last, 1.0 / min(rate_hz, MOST_UPDATES_HZ))
+    for until in (*steps.tolist(), last):
+        for update in run.advance(until, end=until == last):
+            recorder.add(update)
+            if watch is not None:
+                watch(update)
+    if recorder.last is None:
+        why = "; ".join(map(str, run.findings)) or "the record is too short"
+        raise SolveError(f"the data were never sufficient to start: {why}", where=trial.name)
+    return _solution(trial, run, recorder, recorder.last), recorder.record(run.delay)
+
+
+def _solution(
+    trial: Trial, run: Replay | MotionReplay, recorder: Recorder, last: Update
+) -> Solution:
     calibration = last.calibration
     residuals = recorder.residuals()
     findings = [*trial.notes]
@@ -155,7 +189,7 @@ def _solution(trial: Trial, run: Replay, recorder: Recorder, last: Update) -> So
     for e in calibration.estimates:
         findings += not_observable(e, lambda _: why)
     known = {e.name for e in calibration.estimates}
-    for aid in trial.aids:
+    for aid in () if trial.imu is None else trial.aids:
         if any(p.estimated and p.name not in known for p in aid.parameters()):
             findings.append(
                 Finding(
@@ -164,7 +198,7 @@ def _solution(trial: Trial, run: Replay, recorder: Recorder, last: Update) -> So
                     aid.label,
                 )
             )
-    if trial.inertial.settings.bias_walks:
+    if trial.imu is not None and trial.imu.settings.bias_walks:
         findings.append(
             Finding(
                 Code.MEAN_OR_LAST,

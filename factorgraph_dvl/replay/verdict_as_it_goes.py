@@ -34,7 +34,7 @@ class VerdictAsItGoes:
         self._trial = trial
         self._said: list[Finding] = []
         self._compared: tuple[Finding, ...] = ()
-        self._due = float(trial.inertial.time[0]) + _FIRST_S
+        self._due = float(trial.body_sensor.time[0]) + _FIRST_S
 
     def take(self, update: Update) -> None:
         """Take notice of what an update says."""
@@ -43,7 +43,7 @@ class VerdictAsItGoes:
     def at(self, update: Update) -> Verdict:
         """Return the verdict on what is known at an update that was taken."""
         if update.time >= self._due:
-            start = float(self._trial.inertial.time[0])
+            start = float(self._trial.body_sensor.time[0])
             self._due = start + _GROWTH * (update.time - start)
             self._compared = survey(self._trial.until(update.time)).errors
         now = [

@@ -9,7 +9,7 @@ import numpy as np
 
 from factorgraph_dvl.errors import ConfigError, DataError
 from factorgraph_dvl.geometry.earth import LocalFrame
-from factorgraph_dvl.geometry.rotations import rotation_from_rph
+from factorgraph_dvl.geometry.rotations import BodyAxes, rotation_from_rph
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array, rotate
 from factorgraph_dvl.graph.motion_chain import ChainProcess, MotionChain, chain_nodes
@@ -24,14 +24,14 @@ from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.sensors.ins import Ins
 from factorgraph_dvl.sensors.message import message
 from factorgraph_dvl.sensors.parameters import Parameter
-from factorgraph_dvl.sensors.protocol import Motion, Observation
+from factorgraph_dvl.sensors.protocol import Aid, Motion, Observation
 from factorgraph_dvl.trial import Trial
 
 # Sensors that ask more of the motion than attitude records and a motion prior give.
 _NEED_IMU = frozenset({"star", "turntable", "beacons"})
 # Turn rate, averaged over seconds, from which on a vessel turns. Chosen: above yaw in a seaway.
 _TURNING = 0.4 * DEG
-_TURN_SPAN = 10.0
+TURN_SPAN = 10.0
 # Nodes come at most so far apart, s, and so many.
 _LONGEST = 10.0
 _MOST_NODES = 60_000
@@ -62,6 +62,8 @@ class MotionPreparation:
         Of the parameters.
     turning : ndarray of bool, shape (K - 1,)
         Whether the vessel turns between nodes.
+    interval : float, s
+        Least time between nodes where it does not.
     estimated_noise : frozenset of str
         Labels of measurements whose stated noise is a start value.
     current_is_free : bool
@@ -74,6 +76,7 @@ class MotionPreparation:
     states: Array
     values: dict[str, Array]
     turning: np.ndarray
+    interval: float
     estimated_noise: frozenset[str]
     current_is_free: bool
     findings: tuple[Finding, ...]
@@ -116,11 +119,12 @@ def prepare_motion(trial: Trial) -> MotionPreparation:
     lag = float(values[clock][0])
     times = _node_candidates(trial, record, track, late=late, lag=lag)
     on_legs, in_turns, sigma = _densities(trial, record, values, late)
-    turning_at = _turns(record, times + late - lag)
+    turning_at = turns(record, times + late - lag)
     spacing = _BETWEEN**2 * 16.0 * sigma**2 / max(float(on_legs[:2].max()), _LEAST_DENSITY)
     spacing = max(spacing, (times[-1] - times[0]) / _MOST_NODES)
-    nodes = chain_nodes(times, turning_at, min(spacing, _LONGEST))
-    turning = _turns(record, 0.5 * (nodes[1:] + nodes[:-1]) + late - lag)
+    spacing = min(spacing, _LONGEST)
+    nodes = chain_nodes(times, turning_at, spacing)
+    turning = turns(record, 0.5 * (nodes[1:] + nodes[:-1]) + late - lag)
     density = np.where(turning[:, None], in_turns, on_legs)
     chain = MotionChain(nodes, density, processes)
     p_n, v_n, _ = track.at(nodes - lag)
@@ -131,10 +135,22 @@ def prepare_motion(trial: Trial) -> MotionPreparation:
         states=states,
         values=values,
         turning=turning,
+        interval=spacing,
         estimated_noise=estimated,
         current_is_free=chain.has(CURRENT) and _current(trial)[2],
         findings=(*trial.notes, *_notes(trial), *_left_out(trial)),
     )
+
+
+def motion_observations(
+    aid: Aid, frame: LocalFrame, body_axes: BodyAxes
+) -> tuple[Observation, ...]:
+    """Return what a sensor measures of the motion; an attitude is known, and not measured."""
+    if isinstance(aid, Attitude):
+        return ()
+    if isinstance(aid, Ins):
+        return aid.motion_observations(frame)
+    return aid.observations(frame, body_axes)
 
 
 def _observed(
@@ -152,21 +168,17 @@ def _observed(
         sigma, tau, _ = _current(trial)
         processes.append(ChainProcess(CURRENT, np.full(2, sigma), tau))
     for aid in trial.aids:
-        if isinstance(aid, Attitude):
-            continue
+        own = motion_observations(aid, frame, trial.body_axes)
+        observations += own
         if isinstance(aid, Ins):
             share = np.sqrt(aid.settings.correlated_share)
             total = np.median(aid.total_std, axis=0)
-            for seen, std in zip(
-                aid.motion_observations(frame), (total[:3], total[3:6]), strict=True
-            ):
-                observations.append(seen)
+            for seen, std in zip(own, (total[:3], total[3:6]), strict=True):
                 if share > 0.0:
                     tau = aid.settings.correlation_time_s
                     processes.append(ChainProcess(seen.label, share * std, tau))
             continue
-        for o in aid.observations(frame, trial.body_axes):
-            observations.append(o)
+        for o in own:
             correlated = getattr(o, "correlated", None)
             if correlated is not None and correlated.sigma is not None:
                 processes.append(ChainProcess(o.label, correlated.sigma, correlated.time))
@@ -281,27 +293,43 @@ def _node_candidates(
             where=record.sensor.source,
             expected="records of the same time, by one clock",
         )
+    own = own_times(trial, track.time)
+    own = own[(own > first) & (own < last)]
+    times = without_long_gaps(np.concatenate([[first], own, [last]]))
+    return np.asarray(times[np.concatenate([[True], np.diff(times) > 1e-3])])
+
+
+def own_times(trial: Trial, track_time: Array) -> Array:
+    """Return the times at samples of an INS, between pings, or else between positions, s.
+
+    Parameters
+    ----------
+    trial : Trial
+        Without IMU.
+    track_time : ndarray, shape (M,), s
+        When positions were measured.
+    """
     log, ins = trial.log, trial.find(Ins)
     if ins is not None:
-        own = ins.time[~np.isnan(ins.geodetic[:, 0])]
-    else:
-        own = track.time if log is None or log.locked.sum() < 2 else log.time[log.locked]
-        own = 0.5 * (own[1:] + own[:-1])
-    own = own[(own > first) & (own < last)]
-    edges = np.concatenate([[first], own, [last]])
+        return np.asarray(ins.time[~np.isnan(ins.geodetic[:, 0])])
+    own = track_time if log is None or log.locked.sum() < 2 else log.time[log.locked]
+    return np.asarray(0.5 * (own[1:] + own[:-1]))
+
+
+def without_long_gaps(edges: Array) -> Array:
+    """Return times, s, with others in between where they are far apart."""
     wide = np.flatnonzero(np.diff(edges) > _LONGEST)
     more = [np.linspace(edges[i], edges[i + 1],
                         int(np.ceil((edges[i + 1] - edges[i]) / 5.0)) + 1)[1:-1]
             for i in wide]  # fmt: skip
-    times = np.unique(np.concatenate([edges, *more]))
-    return np.asarray(times[np.concatenate([[True], np.diff(times) > 1e-3])])
+    return np.unique(np.concatenate([edges, *more]))
 
 
-def _turns(record: AttitudeRecord, time: Array) -> np.ndarray:
+def turns(record: AttitudeRecord, time: Array) -> np.ndarray:
     """Whether the heading changes over seconds about stamps (M,) of the attitude."""
-    ahead = record.rph_at(time + 0.5 * _TURN_SPAN)[:, 2]
-    behind = record.rph_at(time - 0.5 * _TURN_SPAN)[:, 2]
-    return np.abs(ahead - behind) / _TURN_SPAN > _TURNING
+    ahead = record.rph_at(time + 0.5 * TURN_SPAN)[:, 2]
+    behind = record.rph_at(time - 0.5 * TURN_SPAN)[:, 2]
+    return np.abs(ahead - behind) / TURN_SPAN > _TURNING
 
 
 def _densities(
@@ -322,7 +350,7 @@ def _densities(
     bRd = values.get("misalignment_deg", np.eye(3)).T
     v_n = rotate(rotation_from_rph(rph, record.body_axes), log.velocity[rows] @ bRd.T)
     interval = float(np.median(np.diff(time)))
-    turning = _turns(record, time + late)
+    turning = turns(record, time + late)
 
     def density(wanted: np.ndarray, spans: tuple[float, float]) -> Array:
         squares = []

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 
 import numpy as np
@@ -10,7 +10,8 @@ import numpy as np
 from factorgraph_dvl.geometry.rotations import frd_from_body, rph_from_rotation
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array, rotate
-from factorgraph_dvl.graph.motion_problem import ATTITUDE, CURRENT, MotionProblem
+from factorgraph_dvl.graph.bordered_chain import Covariances
+from factorgraph_dvl.graph.motion_problem import ATTITUDE, CURRENT, MotionEvaluation, MotionProblem
 from factorgraph_dvl.sensors.attitude import HEADING_OFFSET, heading_error
 from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.sensors.message import Message, message
@@ -53,13 +54,9 @@ def summarise_motion(trial: Trial, found: SmoothedMotion, *, rate_hz: float) -> 
         Rate of the trajectory, Hz; at most that of the attitude record.
     """
     problem, evaluation = found.problem, found.evaluation
-    rows = in_order(
-        [(p, in_unit(p, evaluation.parameters[p.name])) for p in problem.all_parameters],
-        lambda r: r[0],
+    estimates, covariance, gain = reported_calibration(
+        problem, evaluation.parameters, found.constants
     )
-    gain = _reported_gain(problem, [(p, r.derivative) for p, r in rows if p.estimated])
-    joint = gain @ found.constants @ gain.T
-    estimates, covariance = estimates_of([(p, r.value) for p, r in rows], joint)
     residuals, rejected = _residuals(found)
     noise = tuple(Noise(noise_name(n), f) for n, f in problem.noise_factors.items())
     findings = [*found.findings]
@@ -88,8 +85,30 @@ def summarise_motion(trial: Trial, found: SmoothedMotion, *, rate_hz: float) -> 
         rejected=rejected,
         limits=trial.limits,
         noise=noise,
-        error_budget=_causes(found, [p for p, _ in rows], gain),
+        error_budget=_causes(found, in_order(problem.all_parameters, lambda p: p), gain),
     )
+
+
+def reported_calibration(
+    problem: MotionProblem, values: Mapping[str, Array], constants: Array
+) -> tuple[tuple[Estimate, ...], Array, Array]:
+    """Return estimates, their covariance, and the derivative of what is free by the constants.
+
+    Parameters
+    ----------
+    problem : MotionProblem
+        Whose parameters are reported.
+    values : mapping of str to ndarray
+        Their values, SI; rotations as matrices.
+    constants : ndarray, shape (c, c)
+        Covariance of the estimated ones, SI.
+    """
+    reported = (in_unit(p, values[p.name]) for p in problem.all_parameters)
+    rows = in_order(reported, lambda r: r.parameter)
+    free = [(r.parameter, r.derivative) for r in rows if r.parameter.estimated]
+    gain = _reported_gain(problem, free)
+    joint = gain @ constants @ gain.T
+    return (*estimates_of([(r.parameter, r.value) for r in rows], joint), gain)
 
 
 def _reported_gain(problem: MotionProblem, free: Sequence[tuple[Parameter, Array]]) -> Array:
@@ -134,22 +153,50 @@ def _residuals(found: SmoothedMotion) -> tuple[tuple[Residuals, ...], tuple[Resi
 def _trajectory(found: SmoothedMotion, rate_hz: float) -> Trajectory:
     """Return the motion between the nodes at a rate, with its covariance."""
     problem, evaluation = found.problem, found.evaluation
-    chain, frame, states = problem.chain, problem.frame, evaluation.states
+    begin, end = problem.chain.time[[0, -1]] - problem.offset(evaluation.parameters)
+    time = trajectory_epochs(problem, evaluation.parameters, begin, end, rate_hz)
+    return trajectory_of(problem, evaluation, found.covariances, time)
+
+
+def trajectory_epochs(
+    problem: MotionProblem, values: Mapping[str, Array], begin: float, end: float, rate_hz: float
+) -> Array:
+    """Return the epochs of a trajectory from one true time to another, s, its ends included.
+
+    They come at a rate, Hz, at most that of the attitudes, and where these are known.
+    """
     rate = min(rate_hz, 1.0 / problem.attitude.interval)
-    begin, end = chain.time[[0, -1]] - problem.offset(evaluation.parameters)
-    first, last = np.ceil(begin * rate), np.floor(end * rate)
-    time = np.arange(first, last + 1.0) / rate
-    offset = float(evaluation.parameters[problem.attitude.sensor.clock.offset.name][0])
-    time = time[problem.attitude.covers(time + offset)]
+    time = np.arange(np.ceil(begin * rate), np.floor(end * rate) + 1.0) / rate
+    offset = float(values[problem.attitude.sensor.clock.offset.name][0])
+    return np.asarray(time[problem.attitude.covers(time + offset)])
+
+
+def trajectory_of(
+    problem: MotionProblem, evaluation: MotionEvaluation, covariances: Covariances, time: Array
+) -> Trajectory:
+    """Return the motion at true times (M,), s, between the nodes, with its covariance.
+
+    Parameters
+    ----------
+    problem : MotionProblem
+        Of the nodes.
+    evaluation : MotionEvaluation
+        States and parameters.
+    covariances : Covariances
+        Theirs.
+    time : ndarray, shape (M,), s
+        Epochs.
+    """
+    chain, frame, states = problem.chain, problem.frame, evaluation.states
     place = chain.place(ATTITUDE) if chain.has(ATTITUDE) else slice(0, 0)
     sigma = next((p.sigma for p in chain.processes if p.name == ATTITUDE), np.zeros(3))
     n, c = chain.size, problem.constants
     parts = []
-    for a in range(0, time.size, _CHUNK):
+    for a in range(0, max(time.size, 1), _CHUNK):
         at, x, body, by_heading = problem.body_at(
             time[a : a + _CHUNK], states, evaluation.parameters
         )
-        P = found.covariances.around(at.node)
+        P = covariances.around(at.node)
         every = np.broadcast_to(np.eye(n), (at.node.size, n, n))
         missing = at.variance(every)
         by_constants = np.zeros((at.node.size, n, c))
