@@ -282,8 +282,8 @@ class Trial:
                 "the trial has no IMU, which this command needs",
                 where="trial.yaml",
                 expected="an imu section",
-                hint="`inspect`, `solve`, `observability`, `deadreckon` and `crosscheck` accept "
-                "`ins` or `attitude` in its place. Some methods of `kalman` do as well",
+                hint="`inspect`, `solve`, `replay`, `observability`, `deadreckon` and "
+                "`crosscheck` accept `ins` or `attitude` in its place. Some methods of `kalman` do as well",
             )
         return self.imu
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from time import perf_counter
 
 import numpy as np
@@ -13,7 +13,6 @@ from factorgraph_dvl.errors import ConfigError, FactorgraphDvlError
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph.motion_chain import MotionChain, chain_nodes
 from factorgraph_dvl.graph.motion_problem import TRACK_STD
-from factorgraph_dvl.graph.sensor_factor import concatenated
 from factorgraph_dvl.imu.attitude_record import AttitudeRecord
 from factorgraph_dvl.replay.calibration import CalibrationEstimate
 from factorgraph_dvl.replay.motion_window import (
@@ -48,8 +47,8 @@ from factorgraph_dvl.trial import Trial
 # Time, s, by which states are behind the records: whether the vessel turns shows in the seconds
 # after.
 DELAY = 0.5 * TURN_SPAN
-# Most updates a second; chosen: pings of ships come once a second.
-MOST_UPDATES_HZ = 1.0
+# Most updates a second; chosen: states come with pings, and are behind them by seconds anyway.
+MOST_UPDATES_HZ = 0.5
 # Data before the first batch solution, s; chosen: some legs show the noise of fixes and pings.
 _FIRST = 60.0
 # Growth of the record from one batch solution to the next, and to the next attempt where one
@@ -157,7 +156,7 @@ class MotionReplay:
         """Read the records up to a time, s, and yield the updates that they make possible."""
         began = perf_counter()
         if until >= self._solve_at or (end and self._current is None):
-            update = self._solve(until, began)
+            update = self._solve(until, began, end=end)
             if update is not None:
                 yield update
                 began = perf_counter()
@@ -165,10 +164,23 @@ class MotionReplay:
             return
         nodes = self._next_nodes(*self._current, until)
         if nodes.size:
-            yield self._extend(*self._current, nodes, until, began, end=end)
+            yield self._extend(*self._current, nodes, until, began)
 
-    def _solve(self, until: float, began: float) -> Update | None:
+    def finished(self, last: Update) -> Update:
+        """Return the last update with what stays in the window when no more records come."""
+        assert self._current is not None
+        _, window = self._current
+        smoothed, innovations = self._leave(window, window.problem.chain.time.size)
+        if last.smoothed is not None:
+            both = last.smoothed, smoothed
+            smoothed = Trajectory(
+                *(np.concatenate([getattr(t, f.name) for t in both]) for f in fields(Trajectory))
+            )
+        return replace(last, smoothed=smoothed, innovations=(*last.innovations, *innovations))
+
+    def _solve(self, until: float, began: float, *, end: bool) -> Update | None:
         """Solve the records up to a time as a batch, and start a window at its end."""
+        self._solve_at = self._start + _GROWTH * (until - self._start)
         try:
             prepared = prepare_motion(self._trial.until(until))
             found = smooth_motion(prepared, self._progress)
@@ -179,7 +191,8 @@ class MotionReplay:
                 text = message("not_started.yet", time=until, reason=why)
                 self.findings.append(Finding(Code.NOT_STARTED, text))
             return None
-        self._solve_at = self._start + _GROWTH * (until - self._start)
+        if not (found.converged or end):
+            return None
         whole = SmoothedWindow(found.problem, found.evaluation, found.covariances)
         chain, at = found.problem.chain, found.evaluation
         count = int(np.searchsorted(chain.time, _latest(whole, until)))
@@ -216,8 +229,6 @@ class MotionReplay:
         nodes: Array,
         until: float,
         began: float,
-        *,
-        end: bool,
     ) -> Update:
         """Add nodes to the window, and let the oldest leave it."""
         chain, at = window.problem.chain, window.evaluation
@@ -238,9 +249,6 @@ class MotionReplay:
         )
         self._current = batch, window
         trajectory = self._trajectory(window, time.size - 1)
-        if end:
-            more, further = self._leave(window, time.size)
-            smoothed, innovations = concatenated([smoothed, more]), innovations + further
         return self._update(began, trajectory, smoothed, innovations, solved=False)
 
     def _smooth(
@@ -308,7 +316,7 @@ class MotionReplay:
         for o, seen, total in zip(
             problem.observations, window.evaluation.seen, problem.total_sigma, strict=True
         ):
-            past = seen.interpolation.node < node
+            past = np.asarray(seen.interpolation.node < node)
             new = past & seen.covered & (o.time > self._residuals_to.get(o.label, -np.inf))
             used = np.isfinite(total)
             every = Innovations(
@@ -318,12 +326,12 @@ class MotionReplay:
                 o.time[new],
                 np.where(used, seen.residual, np.nan)[new],
                 np.where(used, total, np.nan)[new],
-                used.any(axis=1)[new],
+                np.asarray(used.any(axis=1))[new],
             )
             innovations.append(every)
             rejected = problem.rejected.get(o.label)
             if rejected is not None:
-                self._rejected[o.label] += int((rejected & new).sum())
+                self._rejected[o.label] += int(np.sum(rejected & new))
             if past.any():
                 last = float(o.time[past][-1])
                 self._residuals_to[o.label] = max(last, self._residuals_to.get(o.label, last))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 
@@ -21,6 +21,9 @@ from factorgraph_dvl.sensors.protocol import Observation
 # Probability with which a good measurement passes the gate; chosen: 6 standard deviations of one
 # component, as of a replay with an IMU.
 _PASSES = 2e-9
+# Searches for measurements beyond the gate, and least share of the largest square among those that
+# one rejects; chosen: errors of one kind that differ by less are alike.
+_SEARCHES, _WORST = 4, 0.25
 # Share of a kind's measurements beyond the gate from which on it contradicts the prediction;
 # chosen, as of a replay with an IMU.
 _CONTRADICTS = 0.3
@@ -141,15 +144,16 @@ def smooth_window(
     SolveError
         If no step is possible.
     """
-    problem.weigh(problem.evaluate(states, values))
-    found = _step(problem, states, values)
-    rejected, inconsistent = _rejected(problem, found)
-    if any(each.any() for each in rejected.values()):
-        problem = copy(problem)
-        problem.rejected = rejected
+    for _ in range(_SEARCHES):
         problem.weigh(problem.evaluate(states, values))
         found = _step(problem, states, values)
-    return replace(found, inconsistent=inconsistent)
+        further = _worst(problem, found)
+        if not further:
+            break
+        problem = copy(problem)
+        before = problem.rejected
+        problem.rejected = {**before, **{k: v | before.get(k, False) for k, v in further.items()}}
+    return replace(found, inconsistent=_inconsistent(problem))
 
 
 def _step(problem: WindowProblem, states: Array, values: dict[str, Array]) -> SmoothedWindow:
@@ -167,19 +171,21 @@ def _step(problem: WindowProblem, states: Array, values: dict[str, Array]) -> Sm
     return SmoothedWindow(problem, after, factors.covariances())
 
 
-def _rejected(
-    problem: WindowProblem, found: SmoothedWindow
-) -> tuple[Mapping[str, BoolArray], tuple[str, ...]]:
-    """Return measurements beyond the gate, by label, and the kinds of which they are too many."""
-    out, inconsistent = {}, []
+def _worst(problem: WindowProblem, found: SmoothedWindow) -> dict[str, BoolArray]:
+    """Return the worst measurements beyond the gate, by label: they make others seem so."""
+    out = {}
     each = problem.residuals(found.evaluation, found.covariances)
     for o, residuals in zip(problem.observations, each, strict=True):
         known = np.isfinite(residuals)
-        freedom = np.maximum(known.sum(axis=1), 1)
-        beyond = np.nansum(residuals**2, axis=1) > chdtri(freedom, _PASSES)
-        if not o.noise_groups or not beyond.any():
-            continue
-        if beyond.sum() > max(_CONTRADICTS * known.any(axis=1).sum(), 1):
-            inconsistent.append(o.label)
-        out[o.label] = beyond
-    return out, tuple(inconsistent)
+        known[problem.rejected.get(o.label, np.zeros(len(known), dtype=bool))] = False
+        squares = np.sum(np.where(known, residuals, 0.0) ** 2, axis=1)
+        beyond = squares > chdtri(np.maximum(known.sum(axis=1), 1), _PASSES)
+        if o.noise_groups and beyond.any():
+            out[o.label] = beyond & (squares >= _WORST * squares.max())
+    return out
+
+
+def _inconsistent(problem: WindowProblem) -> tuple[str, ...]:
+    """Return the kinds of measurements of which too many were rejected."""
+    shares = {label: float(np.mean(rows)) for label, rows in problem.rejected.items()}
+    return tuple(label for label, share in shares.items() if share > _CONTRADICTS)

@@ -127,8 +127,7 @@ def _played(
             take(run.add_imu(imu.time[a:b], imu.gyro[a:b], imu.accel[a:b]))
     take(run.finish())
     if recorder.last is None:
-        why = "; ".join(map(str, run.findings)) or "the record is too short"
-        raise SolveError(f"the data were never sufficient to start: {why}", where=trial.name)
+        raise _never_started(trial, run)
     return _solution(trial, run, recorder, recorder.last), recorder.record(run.delay)
 
 
@@ -148,17 +147,30 @@ def _played_without_imu(
     run = MotionReplay(trial, lag_s, progress or (lambda stage, iteration, cost: None))
     recorder = Recorder()
     time = trial.body_sensor.time
-    last = float(max(aid.time[-1] for aid in trial.aids))
-    steps = np.arange(time[0], last, 1.0 / min(rate_hz, MOST_UPDATES_HZ))
-    for until in (*steps.tolist(), last):
-        for update in run.advance(until, end=until == last):
-            recorder.add(update)
-            if watch is not None:
-                watch(update)
-    if recorder.last is None:
-        why = "; ".join(map(str, run.findings)) or "the record is too short"
-        raise SolveError(f"the data were never sufficient to start: {why}", where=trial.name)
-    return _solution(trial, run, recorder, recorder.last), recorder.record(run.delay)
+    end = float(max(aid.time[-1] for aid in trial.aids))
+    steps = np.arange(time[0], end, 1.0 / min(rate_hz, MOST_UPDATES_HZ))
+    update: Update | None = None
+
+    def take(update: Update) -> None:
+        recorder.add(update)
+        if watch is not None:
+            watch(update)
+
+    for until in (*steps.tolist(), end):
+        for following in run.advance(until, end=until == end):
+            if update is not None:
+                take(update)
+            update = following
+    if update is None:
+        raise _never_started(trial, run)
+    last = run.finished(update)
+    take(last)
+    return _solution(trial, run, recorder, last), recorder.record(run.delay)
+
+
+def _never_started(trial: Trial, run: Replay | MotionReplay) -> SolveError:
+    why = "; ".join(map(str, run.findings)) or "the record is too short"
+    return SolveError(f"the data were never sufficient to start: {why}", where=trial.name)
 
 
 def _solution(
