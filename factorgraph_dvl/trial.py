@@ -283,7 +283,8 @@ class Trial:
                 where="trial.yaml",
                 expected="an imu section",
                 hint="`inspect`, `solve`, `replay`, `observability`, `deadreckon` and "
-                "`crosscheck` accept `ins` or `attitude` in its place. Some methods of `kalman` do as well",
+                "`crosscheck` accept `ins` or `attitude` in its place. Some methods of "
+                "`kalman` do as well",
             )
         return self.imu
 
