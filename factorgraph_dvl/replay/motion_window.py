@@ -96,7 +96,7 @@ class WindowProblem(MotionProblem):
         out.corner += known.corner
         out.node_gradient[0] += known.node_gradient[0]
         out.node_gradient[0] += known.diagonal[0] @ by_state + known.border[0] @ by_constants
-        out.constant_gradient += known.constant_gradient + self.slope
+        out.constant_gradient += known.constant_gradient
         out.constant_gradient += known.corner @ by_constants + by_state @ known.border[0]
         return out
 
@@ -145,7 +145,6 @@ def smooth_window(
         If no step is possible.
     """
     for _ in range(_SEARCHES):
-        problem.weigh(problem.evaluate(states, values))
         found = _step(problem, states, values)
         further = _worst(problem, found)
         if not further:
@@ -157,7 +156,7 @@ def smooth_window(
 
 
 def _step(problem: WindowProblem, states: Array, values: dict[str, Array]) -> SmoothedWindow:
-    equations = problem.equations(problem.evaluate(states, values))
+    equations = problem.equations(problem.weighed(states, values))
     try:
         factors: Factorisation = equations.factorise()
     except np.linalg.LinAlgError:

@@ -28,8 +28,7 @@ def found(ship):
     """The batch solution, with the weights at its minimum."""
     smoothed = smooth_motion(prepare_motion(ship), lambda stage, iteration, cost: None)
     problem, at = smoothed.problem, smoothed.evaluation
-    problem.weigh(at)
-    at = problem.evaluate(at.states, at.parameters)
+    at = problem.weighed(at.states, at.parameters)
     covariances = problem.equations(at).factorise().covariances()
     return SmoothedWindow(problem, at, covariances)
 
