@@ -7,7 +7,8 @@ one for a measurement.
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, TypeVar, cast
 
 import gtsam
@@ -16,7 +17,7 @@ import numpy as np
 from factorgraph_dvl.geometry.vectors import Array, IntArray
 from factorgraph_dvl.graph.clocks import linearized, parameters_of, true_time
 from factorgraph_dvl.graph.keys import BIAS_SIZE, STATE_SIZE
-from factorgraph_dvl.graph.priors import prior_mean, value_at
+from factorgraph_dvl.graph.priors import places, prior_mean, value_at
 from factorgraph_dvl.graph.problem import node_jacobian
 from factorgraph_dvl.imu.preintegration import Preintegration
 from factorgraph_dvl.imu.propagation import (
@@ -41,6 +42,8 @@ from factorgraph_dvl.sensors.protocol import (
 
 # What rounding may take off a time, s.
 _ROUNDING = 1e-6
+# Derivatives by the motion, as `Linearization` names them.
+_BY_MOTION = ("d_theta", "d_p", "d_v", "d_omega")
 
 _Arrays = TypeVar("_Arrays", Attachment, Motion, Sensitivity, States)
 
@@ -139,9 +142,7 @@ class ObservationRows:
                 self.index
             ]
 
-        by_motion = {
-            name: own(getattr(whole, name)) for name in ("d_theta", "d_p", "d_v", "d_omega")
-        }
+        by_motion = {name: own(getattr(whole, name)) for name in _BY_MOTION}
         by_parameters = {name: own(found) for name, found in whole.d_parameters.items()}
         return Linearization(own(whole.residual), **by_motion, d_parameters=by_parameters)
 
@@ -216,12 +217,34 @@ class NodeMeasurements:
         """Return the attachment of measurements of one kind."""
         return sliced(self.attachment, rows.at)
 
+    @cached_property
+    def _place(self) -> dict[str, slice]:
+        """Place of each parameter among the components of all."""
+        return places(self.parameters)
+
+    @cached_property
+    def _wanted(self) -> list[list[str]]:
+        """Names of the parameters that each kind depends on."""
+        used = [parameters_of(r.observation) for r in self.rows]
+        return [[name for name in self._place if name in each] for each in used]
+
+    @cached_property
+    def _components(self) -> tuple[list[slice], IntArray]:
+        """Slices of the kinds among all R components, and the time of each component."""
+        count = np.arange(self.attachment.tau.size)
+        index = [count[r.at].repeat(len(r.observation.components)) for r in self.rows]
+        ends = np.cumsum([each.size for each in index]).tolist()
+        parts = [slice(end - each.size, end) for each, end in zip(index, ends, strict=True)]
+        return parts, np.concatenate(index)
+
     def motions(self, states: States, values: Mapping[str, Array]) -> tuple[Motion, list[Motion]]:
         """Return the motion at all times as attached, and at the true times of each kind."""
         motion = motion_at(self.corrected(values), states, self.gravity_n, self.earth_rate_n)
-        out = []
+        out: list[Motion] = []
+        part, at = motion, slice(0, self.attachment.tau.size)
         for r in self.rows:
-            part = sliced(motion, r.at) if len(self.rows) > 1 else motion
+            if r.at != at:
+                part, at = sliced(motion, r.at), r.at
             late = true_time(r.observation, values, self.clock_zero) - r.time
             out.append(extrapolated(part, late))
         return motion, out
@@ -237,36 +260,31 @@ class NodeMeasurements:
         values = {**self.fixed, **values}
         motion, motions = self.motions(states, values)
         transition = Transition(self.corrected(values), states, motion, self.earth_rate_n)
-        width = STATE_SIZE + BIAS_SIZE + sum(p.mean.size for p in self.parameters)
-        residuals, jacobians = [], []
-        for r, own in zip(self.rows, motions, strict=True):
-            used = parameters_of(r.observation)
-            wanted = [p.name for p in self.parameters if p.name in used]
-            lin = linearized(r.observation, own, values, wanted, self.clock_zero)
-            m, d = lin.residual.shape
-            matrix = np.zeros((m, d, width))
-            window = cast(Transition, _Window(transition, r.at))
-            matrix[:, :, : STATE_SIZE + BIAS_SIZE] = node_jacobian(lin, window)
-            found = {**lin.d_parameters, **self._by_errors(lin, window, r.at)}
-            column = STATE_SIZE + BIAS_SIZE
-            for p in self.parameters:
-                if p.name in found:
-                    matrix[:, :, column : column + p.mean.size] = found[p.name]
-                column += p.mean.size
-            residuals.append(lin.residual.ravel())
-            jacobians.append(matrix.reshape(m * d, width))
-        return np.concatenate(residuals), np.concatenate(jacobians), motions
-
-    def _by_errors(
-        self, lin: Linearization, transition: Transition, at: slice
-    ) -> dict[str, Array]:
-        """Return derivatives with respect to the errors of the IMU, (M, d, n_i) by name."""
-        if self.sensitivity is None:
-            return {}
-        errors = [p for p in self.parameters if p.name in ERRORS]
-        every = by_errors(lin, transition, sliced(self.sensitivity, at), elements(errors))
-        parts = np.split(every, np.cumsum([p.mean.size for p in errors])[:-1], axis=2)
-        return {p.name: part for p, part in zip(errors, parts, strict=True)}
+        parts, index = self._components
+        found = [
+            linearized(r.observation, own, values, wanted, self.clock_zero)
+            for r, own, wanted in zip(self.rows, motions, self._wanted, strict=True)
+        ]
+        # All components at once, each as a measurement of its own.
+        whole = Linearization(
+            np.concatenate([lin.residual.ravel() for lin in found])[:, None],
+            **{name: _stacked(found, name, parts) for name in _BY_MOTION},
+        )
+        window = cast(Transition, _Window(transition, index))
+        first = STATE_SIZE + BIAS_SIZE
+        matrix = np.zeros((index.size, first + sum(p.mean.size for p in self.parameters)))
+        matrix[:, :first] = node_jacobian(whole, window)[:, 0]
+        for part, lin in zip(parts, found, strict=True):
+            by_parameters = matrix[part].reshape(*lin.residual.shape, -1)[:, :, first:]
+            for name, jacobian in lin.d_parameters.items():
+                if name in self._place:
+                    by_parameters[:, :, self._place[name]] = jacobian
+        if self.sensitivity is not None:
+            errors = [p for p in self.parameters if p.name in ERRORS]
+            own = by_errors(whole, window, sliced(self.sensitivity, index), elements(errors))
+            columns = [np.r_[self._place[p.name]] for p in errors]
+            matrix[:, first + np.concatenate(columns)] = own[:, 0]
+        return whole.residual[:, 0], matrix, motions
 
     def residuals(self, states: States, values: Mapping[str, Array]) -> Array:
         """Return the residuals, (R,)."""
@@ -312,23 +330,38 @@ class Linearized:
 
     def is_at(self, states: States, values: Mapping[str, Array]) -> bool:
         """Whether it was computed at these very states and values."""
-        same = all(
-            np.array_equal(getattr(self.states, f.name), getattr(states, f.name))
-            for f in fields(States)
-        )
-        return same and all(np.array_equal(self.values[name], v) for name, v in values.items())
+        pairs = [*zip(vars(self.states).values(), vars(states).values(), strict=True)]
+        pairs += [(self.values[name], value) for name, value in values.items()]
+        return all((ours == theirs).all() for ours, theirs in pairs)
 
 
 class _Window:
-    """A slice of a transition: what Jacobians ask for, of some times only."""
+    """A transition at some of its times, of which one may come several times."""
 
-    def __init__(self, transition: Transition, at: slice) -> None:
+    def __init__(self, transition: Transition, index: IntArray) -> None:
         self._transition = transition
-        self._at = at
-        self.at = sliced(transition.at, at)
+        self._index = index
+
+    @cached_property
+    def at(self) -> Attachment:
+        """Attachment of these times."""
+        return sliced(self._transition.at, self._index)
 
     def __getattr__(self, name: str) -> Array:
-        return np.asarray(getattr(self._transition, name)[self._at])
+        found: Array = getattr(self._transition, name)[self._index]
+        return found
+
+
+def _stacked(found: Sequence[Linearization], name: str, parts: Sequence[slice]) -> Array | None:
+    """Return derivatives by one of the motion's variables, (R, 1, 3); None if all are zero."""
+    given = [getattr(lin, name) for lin in found]
+    if all(jacobian is None for jacobian in given):
+        return None
+    out = np.zeros((parts[-1].stop, 1, 3))
+    for part, jacobian, lin in zip(parts, given, found, strict=True):
+        if jacobian is not None:
+            out[part].reshape(*lin.residual.shape, 3)[:] = jacobian
+    return out
 
 
 def measurement_factor(
@@ -400,14 +433,14 @@ def state_of(state: gtsam.NavState, bias: gtsam.imuBias.ConstantBias) -> States:
 
 def sliced(rows: _Arrays, at: slice | IntArray) -> _Arrays:
     """Return some rows of a data class whose every field is an array of them."""
-    return type(rows)(**{f.name: getattr(rows, f.name)[at] for f in fields(rows)})
+    return type(rows)(*[values[at] for values in vars(rows).values()])
 
 
 def concatenated(parts: Sequence[_Arrays]) -> _Arrays:
     """Return the rows of several such data classes as one."""
     first = parts[0]
     return type(first)(
-        **{f.name: np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(first)}
+        **{name: np.concatenate([vars(p)[name] for p in parts]) for name in vars(first)}
     )
 
 

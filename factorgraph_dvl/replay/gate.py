@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter, deque
 
 import numpy as np
@@ -73,8 +74,10 @@ class InnovationGate:
         """
         window = self._windows.setdefault(label, deque(maxlen=_WINDOW))
         limit = _LIMIT if echo_limit is None else echo_limit
-        beyond = np.any(np.abs(normalised) >= limit, axis=1)
-        squares = np.nanmean(normalised**2, axis=1)
+        beyond = (np.abs(normalised) >= limit).any(axis=1)
+        there = np.isfinite(normalised)
+        squares = np.where(there, normalised, 0.0) ** 2
+        squares = squares.sum(axis=1) / there.sum(axis=1)
         window.extend(zip(beyond.tolist(), squares.tolist(), strict=True))
         finding = self._judge(label, window, limit, echo_limit is not None)
         used = np.zeros_like(beyond) if label in self.excluded else ~beyond
@@ -89,11 +92,11 @@ class InnovationGate:
             if echoes
             else (_READMIT_SHARE, _EXCLUDE_SHARE)
         )
-        count = sum(beyond for beyond, _ in window)
-        share = count / len(window)
         # Outliers are rejected one by one and say nothing of the others.
         within = [square for beyond, square in window if not beyond]
-        rms = float(np.sqrt(np.mean(within))) if within else np.inf
+        count = len(window) - len(within)
+        share = count / len(window)
+        rms = math.sqrt(math.fsum(within) / len(within)) if within else math.inf
         full = len(window) == _WINDOW
         if label in self.inconsistent:
             if full and share <= readmit and rms < _CONSISTENT_RMS:

@@ -16,8 +16,10 @@ from factorgraph_dvl.graph.keys import BIAS_SIZE, STATE_SIZE
 from factorgraph_dvl.graph.priors import ConstantsPrior, local_coordinates, value_at
 from factorgraph_dvl.graph.sensor_factor import (
     Linearized,
+    NodeMeasurements,
     concatenated,
     measurement_factor,
+    sliced,
     state_of,
 )
 from factorgraph_dvl.imu.preintegration import Segments, gtsam_measurements
@@ -41,6 +43,7 @@ from factorgraph_dvl.solvers.trajectory import (
     epochs_between,
     successive,
     trajectory_at,
+    with_end,
 )
 
 
@@ -121,8 +124,8 @@ class Navigator:
         self.findings: list[Finding] = []
         self._refresh()
         self._start_values = {
-            p.name: value_at(start.values, key, p)
-            for p, key in zip(start.parameters, self.smoother.calibration_keys, strict=True)
+            p.name: value_at(start.values, self.smoother.calibration_keys[p.name], p)
+            for p in start.parameters
         }
         self.spurious = SpuriousInformation(start)
         self.undetermined = self.spurious.undetermined(self._parameter_covariance)
@@ -182,11 +185,10 @@ class Navigator:
             values.insert(keys.bias(k + 1), bias)
         end = float(seg.node_time[1])
         time = epochs_between(self.time, end, TRAJECTORY_RATE)
-        epochs = attached_epochs(seg, time, self.start.frame.earth_rate)
+        measured, epochs = attached(aids, seg, gravity, self.start, self.values, time)
         self._segments[k] = _Segment(seg, gravity, epochs)
-        measured = self._measurement_factor(k, aids)
         if measured is not None:
-            factors.add(measured)
+            self._add_factor(factors, k, measured)
         s.extend(end, factors, values)
         if self._linear is not None:
             if not self.start.walking:
@@ -205,9 +207,12 @@ class Navigator:
         """Add measurements that arrived late, by the index of the state before them."""
         factors = gtsam.NonlinearFactorGraph()
         for k, records in aids.items():
-            measured = self._measurement_factor(k, records)
+            part, none = self._segments[k], np.empty(0)
+            measured, _ = attached(
+                records, part.segment, part.gravity_n, self.start, self.values, none
+            )
             if measured is not None:
-                factors.add(measured)
+                self._add_factor(factors, k, measured)
         if factors.size():
             self.smoother.correct(factors, min(aids))
             self._refresh()
@@ -271,8 +276,8 @@ class Navigator:
             wanted[0], parts, np.stack([P[k] for k in (*wanted, last)]), body_axes
         )
 
-    def last_segment(self, body_axes: BodyAxes, since: float) -> Trajectory:
-        """Return the motion up to the newest state, at the epochs after a time, s.
+    def last_segment(self, body_axes: BodyAxes, since: float) -> tuple[Trajectory, Trajectory]:
+        """Return the motion at the epochs after a time, s, and the newest state, which follows.
 
         The time is that of the state before it, but for what stamps have been corrected since.
         """
@@ -280,10 +285,13 @@ class Navigator:
         k = self.smoother.node - 1
         part = self._segments[k]
         time = epochs_between(since, self.time, TRAJECTORY_RATE)
-        if not np.array_equal(time, part.epochs.time):
-            epochs = attached_epochs(part.segment, time, self.start.frame.earth_rate)
-            part = replace(part, epochs=epochs)
-        return self._between(k, [part], P, body_axes)
+        epochs = part.epochs
+        if not np.array_equal(time, epochs.time):
+            none = np.empty(0)
+            epochs, _ = attached_epochs(part.segment, time, self.start.frame.earth_rate, none)
+        part = replace(part, epochs=with_end(epochs, self.time))
+        motion = self._between(k, [part], P, body_axes)
+        return sliced(motion, slice(-1)), sliced(motion, slice(-1, None))
 
     def _between(
         self, first: int, parts: Sequence[_Segment], P: Array, body_axes: BodyAxes
@@ -304,15 +312,16 @@ class Navigator:
         self._P = self.smoother.joint_covariance()
         self.values = {**self.start.fixed, **self.smoother.calibration()}
 
-    def _measurement_factor(self, k: int, aids: Sequence[Aid]) -> gtsam.CustomFactor | None:
-        """Return the factor of measurements after state k that the gate accepts."""
+    def _add_factor(
+        self, factors: gtsam.NonlinearFactorGraph, k: int, measured: NodeMeasurements
+    ) -> None:
+        """Add the factor of measurements after state k that the gate accepts."""
         s = self.smoother
-        part = self._segments[k]
-        measured = attached(aids, part.segment, part.gravity_n, self.start, self.values)
-        if measured is None:
-            return None
         names = [p.name for p in measured.parameters]
-        own = np.r_[: STATE_SIZE + BIAS_SIZE, STATE_SIZE + BIAS_SIZE + self.start.columns(names)]
+        first_parameter = STATE_SIZE + BIAS_SIZE
+        own = np.concatenate(
+            [np.arange(first_parameter), first_parameter + self.start.columns(names)]
+        )
         first = None
         if self._linear is not None and k == s.node:
             # Where GTSAM will linearise, so this is done once only.
@@ -334,11 +343,11 @@ class Navigator:
         if self.spurious.add(measured, motions, weights, self.values, state_P, self.time):
             self.undetermined = self.spurious.undetermined(self._parameter_covariance)
         weight = np.concatenate([w.ravel() for w in weights])
-        if not weight.any():
-            return None
-        every = dict(zip((p.name for p in self.start.parameters), s.calibration_keys, strict=True))
-        shared = [every[name] for name in names]
-        return measurement_factor(measured, weight, keys.node(k), s.bias_key(k), shared, first)
+        if weight.any():
+            shared = [s.calibration_keys[name] for name in names]
+            factors.add(
+                measurement_factor(measured, weight, keys.node(k), s.bias_key(k), shared, first)
+            )
 
     def _local_coordinates(self, origin: _LinearizationPoint) -> Array:
         """Return newest state, bias and parameters in the tangent space at a point."""

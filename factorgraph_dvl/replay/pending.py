@@ -88,8 +88,9 @@ class PendingMeasurements:
         lag = 0.0 if clock is None else clock.lag(record.time, values, clock_zero)
         true = record.time - lag
         due = true < end - SAME_TIME
-        if not due.all():
-            self._records[section] = [rows_of(record, ~due)]
+        if due.all():
+            return record, true
+        self._records[section] = [rows_of(record, ~due)]
         return (rows_of(record, due), true[due]) if due.any() else None
 
     def first_after(self, section: str, time: float) -> float:

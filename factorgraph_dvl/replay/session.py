@@ -243,7 +243,8 @@ class Replay:
                 nav = self._start(until)
                 if nav is not None:
                     self._trajectory_to = nav.time
-                    yield self._update(nav, began, nav.start.trajectory, solved=True, end=end)
+                    motion, state = nav.start.trajectory, nav.filtered(self._settings.body_axes)
+                    yield self._update(nav, began, motion, state, solved=True, end=end)
                 elif end and until >= self._samples.newest - self._samples.delay:
                     return
                 continue
@@ -263,10 +264,15 @@ class Replay:
                 for i in nav.innovations:
                     self._initializer.history.reject(i.label, i.time[~i.used])
             self._samples.forget(nav.time)
-            trajectory = nav.last_segment(self._settings.body_axes, self._trajectory_to)
+            axes = self._settings.body_axes
+            trajectory, state = nav.last_segment(axes, self._trajectory_to)
             self._trajectory_to = nav.time
             again = self._solve_again(nav) if self._initializer.solve_due(nav) else None
-            yield self._update(again or nav, began, trajectory, solved=again is not None, end=end)
+            if again is None:
+                yield self._update(nav, began, trajectory, state, solved=False, end=end)
+            else:
+                state = again.filtered(axes)
+                yield self._update(again, began, trajectory, state, solved=True, end=end)
 
     def _next_own_state(self, nav: Navigator) -> float:
         """Return the time of the next attitude that needs a state of its own, s."""
@@ -336,6 +342,9 @@ class Replay:
                 self._initializer.solve_by(end)
                 continue
             now = true >= nav.time - SAME_TIME
+            if now.all():
+                out.append(record)
+                continue
             if now.any():
                 out.append(rows_of(record, now))
             for i in np.flatnonzero(~now).tolist():
@@ -385,10 +394,16 @@ class Replay:
         )
 
     def _update(
-        self, nav: Navigator, began: float, trajectory: Trajectory, *, solved: bool, end: bool
+        self,
+        nav: Navigator,
+        began: float,
+        trajectory: Trajectory,
+        state: Trajectory,
+        *,
+        solved: bool,
+        end: bool,
     ) -> Update:
-        """Return what is known now; `trajectory` since the update before."""
-        axes = self._settings.body_axes
+        """Return what is known now; `trajectory` since the update before, `state` the newest."""
         self._newest_state = nav.time
         smoothed = None
         oldest = nav.smoother.times.get(self._smoothed_to, np.inf)
@@ -402,7 +417,7 @@ class Replay:
         innovations = tuple(nav.innovations)
         for taken in (self._findings, self._initializer.findings, nav.findings, nav.innovations):
             taken.clear()
-        state, calibration = nav.filtered(axes), nav.calibration()
+        calibration = nav.calibration()
         return Update(
             time=nav.time,
             latency=perf_counter() - began,

@@ -73,9 +73,9 @@ class Smoother:
         ranges: bool = False,
     ) -> None:
         self.parameters = tuple(parameters)
-        self.calibration_keys = [
-            keys.calibration(i, p.mean.size) for i, p in enumerate(self.parameters)
-        ]
+        self.calibration_keys = {
+            p.name: keys.calibration(i, p.mean.size) for i, p in enumerate(self.parameters)
+        }
         self.node = node
         self.times = {node: time}
         self._walking = walking
@@ -139,7 +139,7 @@ class Smoother:
             p.name: self._isam.calculateEstimateRot3(key).matrix()
             if p.rotation
             else self._isam.calculateEstimateVector(key)
-            for p, key in zip(self.parameters, self.calibration_keys, strict=True)
+            for p, key in zip(self.parameters, self.calibration_keys.values(), strict=True)
         }
 
     def joint_covariance(self) -> Array:
@@ -174,7 +174,7 @@ class Smoother:
         return {k: marginals[keys.node(k)] for k in wanted}
 
     def _top(self) -> list[int]:
-        return [keys.node(self.node), self.bias_key(self.node), *self.calibration_keys]
+        return [keys.node(self.node), self.bias_key(self.node), *self.calibration_keys.values()]
 
     def _in_time(self) -> list[int]:
         """Return all keys in the order of elimination."""
@@ -183,7 +183,7 @@ class Smoother:
             out.append(keys.node(k))
             if self._walking:
                 out.append(keys.bias(k))
-        return [*out, *([] if self._walking else [keys.bias(0)]), *self.calibration_keys]
+        return [*out, *([] if self._walking else [keys.bias(0)]), *self.calibration_keys.values()]
 
     def _update(
         self, factors: gtsam.NonlinearFactorGraph, values: gtsam.Values, first: int

@@ -106,13 +106,44 @@ class Epochs:
     duration: Array
 
 
-def attached_epochs(seg: Segments, time: Array, earth_rate_n: Array) -> Epochs:
-    """Attach times (M,) in a single segment: once, however often the states change."""
-    return Epochs(time, attach_with_ends(seg, time, earth_rate_n), seg.duration)
+def attached_epochs(
+    seg: Segments, time: Array, earth_rate_n: Array, others: Array
+) -> tuple[Epochs, Attachment]:
+    """Attach times (M,) in a single segment: once, however often the states change.
+
+    Parameters
+    ----------
+    seg : Segments
+        The segment.
+    time : ndarray, shape (M,), s
+        The times.
+    earth_rate_n : ndarray, shape (3,), rad/s
+        Earth rate in n.
+    others : ndarray, shape (N,), s
+        Other times to attach with them.
+
+    Returns
+    -------
+    epochs : Epochs
+        The times, attached.
+    at : Attachment
+        Of the others.
+    """
+    at = attach_with_ends(seg, np.concatenate([others, time]), earth_rate_n)
+    epochs = Epochs(time, sliced(at, slice(others.size, None)), seg.duration)
+    return epochs, sliced(at, slice(others.size))
+
+
+def with_end(epochs: Epochs, end: float) -> Epochs:
+    """Return epochs of a single segment, and its end, s, as one more."""
+    index = np.append(np.arange(epochs.time.size + 1), epochs.time.size)
+    return replace(epochs, time=np.append(epochs.time, end), at=sliced(epochs.at, index))
 
 
 def successive(parts: Sequence[Epochs]) -> Epochs:
     """Return times in single segments that follow each other as those of one chain."""
+    if len(parts) == 1:
+        return parts[0]
     times, ends = [], []
     for i, part in enumerate(parts):
         at = replace(part.at, segment=part.at.segment + i, node=part.at.node + i)

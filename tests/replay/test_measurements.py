@@ -17,7 +17,7 @@ def attached_to(started, aids, seg):
     p_n = start.values.atNavState(keys.node(start.node)).position()
     values = {p.name: np.eye(3) if p.rotation else p.mean for p in start.all_parameters}
     gravity = start.frame.gravity_without_rotation(p_n[None])
-    return attached(aids, seg, gravity, start, values)
+    return attached(aids, seg, gravity, start, values, np.empty(0))[0]
 
 
 def test_measurements_of_one_time_share_the_motion_there(started):

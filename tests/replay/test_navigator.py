@@ -24,7 +24,7 @@ def test_a_segment_takes_the_motion_on_by_its_length(navigator, started):
         seg = started.segment(i)
         navigator.extend(seg, started.aids(seg))
         assert navigator.time == pytest.approx(seg.node_time[1])
-    last = navigator.last_segment(started.trial.body_axes, navigator.time - 1.0)
+    last, _ = navigator.last_segment(started.trial.body_axes, navigator.time - 1.0)
     assert last.time.size == 10
     found = motion_errors(last, started.trial.reference)
     for v in (found.position, found.velocity, found.attitude):

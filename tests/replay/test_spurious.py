@@ -25,7 +25,7 @@ def second(started):
     seg = started.segment(0)
     states = state_of(smoother.state(start.node), smoother.bias(start.node))
     gravity = LocalGravity(start.frame).at(states.p_n)
-    measured = attached(started.aids(seg), seg, gravity, start, values)
+    measured, _ = attached(started.aids(seg), seg, gravity, start, values, np.empty(0))
     _, _, motions = measured.linearize(states, values)
     P = smoother.joint_covariance()[:9, :9]
     weights = [np.ones((r.time.size, len(r.observation.components))) for r in measured.rows]

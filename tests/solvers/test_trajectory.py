@@ -84,7 +84,9 @@ def test_segments_one_by_one_give_the_motion_of_the_chain():
     edges = seg.node_time
     times = [epochs_between(a, b, 10.0) for a, b in pairwise(edges)]
     parts = [
-        attached_epochs(one_segment(seg.increments, int(a), int(b)), time, FRAME.earth_rate)
+        attached_epochs(
+            one_segment(seg.increments, int(a), int(b)), time, FRAME.earth_rate, np.empty(0)
+        )[0]
         for a, b, time in zip(seg.first, seg.last, times, strict=True)
     ]
     gravity = np.tile(FRAME.gravity_without_rotation(np.zeros((1, 3))), (k - 1, 1))
