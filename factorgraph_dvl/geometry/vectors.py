@@ -14,6 +14,12 @@ IntArray = np.ndarray
 _FEW = 100
 
 
+def median(values: Array) -> float:
+    """Return the median of numbers (N,); of few, in a tenth of the time of NumPy's."""
+    places = (values.size - 1) // 2, values.size // 2
+    return 0.5 * float(np.partition(values, places)[list(places)].sum())
+
+
 def skew(v: ArrayLike) -> Array:
     """Return the cross-product matrices [v x] of vectors (..., 3), as (..., 3, 3)."""
     v = np.asarray(v, dtype=float)

@@ -15,7 +15,7 @@ from functools import cached_property
 import numpy as np
 
 from factorgraph_dvl.errors import DataError
-from factorgraph_dvl.geometry.vectors import Array, IntArray
+from factorgraph_dvl.geometry.vectors import Array, IntArray, median
 from factorgraph_dvl.imu.arc_polynomials import UNIFORM, ArcPolynomials, open_steps
 from factorgraph_dvl.imu.interpolation import Smoothed, smooth, unsmoothed
 from factorgraph_dvl.imu.polynomials import evaluate, integrate, rate_and_slope
@@ -157,7 +157,7 @@ class Increments(ArcPolynomials):
                 omega[mine], alpha[mine], misfit = rates.at(time[mine])
                 unresolved[mine] = np.hypot(unresolved[mine], misfit)
             if forces.spline is not None:
-                force[mine] = forces.at(time[mine])[0]
+                force[mine] = forces.spline(time[mine])
         return Partial(
             phi=phi,
             dv=dv,
@@ -181,7 +181,7 @@ class Increments(ArcPolynomials):
         out = []
         for (a, b), base in zip(self.arcs, self.first_sample, strict=True):
             steps = self.dt[a:b]
-            dt = float(np.median(steps))
+            dt = median(steps)
             time = self.start[a:b] + 0.5 * steps
             if not self.averaged:
                 time = np.append(self.start[a:b], self.end[b - 1])
@@ -261,9 +261,9 @@ def increments(
     # Since the first sample: seconds of an epoch leave a double 1e-7 s only.
     edges = [unrounded(time[a:b]) for a, b in whole]
     if averaged:
-        edges = [np.concatenate([[e[0] - np.median(np.diff(e))], e]) for e in edges]
+        edges = [np.concatenate([[e[0] - median(np.diff(e))], e]) for e in edges]
     ends = np.cumsum([e.size - 1 for e in edges])
-    dt = float(np.median(np.diff(imu.time)))
+    dt = median(np.diff(imu.time))
     out = Increments(
         start=np.concatenate([time[a] + e[:-1] for (a, _), e in zip(whole, edges, strict=True)]),
         dt=np.concatenate([np.diff(e) for e in edges]),
@@ -300,7 +300,7 @@ def _bridged(imu: Imu) -> tuple[Array, Array, Array, Array, np.ndarray, list[Fin
             f"only {time.size} samples", where=imu.source, expected=f"at least {_LEAST}"
         )
     step = np.diff(time)
-    dt = float(np.median(step))
+    dt = median(step)
     if dt > _SLOWEST:
         raise DataError(
             f"one sample in {dt:.3g} s",
@@ -308,6 +308,8 @@ def _bridged(imu: Imu) -> tuple[Array, Array, Array, Array, np.ndarray, list[Fin
             expected=f"at least {1.0 / _SLOWEST:.0f} in a second",
             hint="Is time_s in seconds?",
         )
+    if not (step > _LOST * dt).any():
+        return time, samples, np.zeros(samples.shape), np.zeros(step.size, dtype=bool), []
     lost = np.zeros(step.size, dtype=int)
     if np.quantile(np.abs(step / dt - 1.0), 0.9) < _REGULAR:
         lost = np.where(step > _LOST * dt, np.rint(step / dt).astype(int) - 1, 0)

@@ -7,7 +7,7 @@ from math import factorial
 
 import numpy as np
 
-from factorgraph_dvl.geometry.vectors import Array, cross
+from factorgraph_dvl.geometry.vectors import Array, cross, median
 
 # Gauss-Legendre quadrature with three nodes on [0, 1]: exact up to degree five.
 _GAUSS_NODES = np.array([0.5 - np.sqrt(15.0) / 10.0, 0.5, 0.5 + np.sqrt(15.0) / 10.0])
@@ -26,7 +26,7 @@ def highest_difference(values: Array, edges: Array, width: int, averaged: bool) 
         span = edges[order + reach :] - edges[: -order - reach]
         out = np.diff(out, axis=0) / span[:, None]
     factor = factorial(width) if averaged else factorial(width - 1)
-    return np.asarray(out * factor * float(np.median(np.diff(edges))) ** (width - 1))
+    return np.asarray(out * factor * median(np.diff(edges)) ** (width - 1))
 
 
 def interpolation(edges: Array, averaged: bool) -> Array:

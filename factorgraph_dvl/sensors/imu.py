@@ -265,6 +265,10 @@ class Imu:
 
     def __post_init__(self) -> None:
         check_times(self.time, self.source)
+        rate, force = (np.abs(signal).max(initial=0.0) for signal in (self.gyro, self.accel))
+        # Not a number is not below a limit either.
+        if rate <= _MAX_RATE_RAD_S and force <= _MAX_FORCE_M_S2:
+            return
         gyro = named_columns(COLUMNS[1:4], self.gyro)
         accel = named_columns(COLUMNS[4:7], self.accel)
         check_finite({**gyro, **accel}, self.source)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from copy import copy
 from typing import Any, TypeVar
 
 import numpy as np
@@ -30,7 +29,7 @@ _OTHER_UNITS = {
 
 def rows_of(record: _AnyRecord, rows: slice | NDArray[Any] | list[int]) -> _AnyRecord:
     """Return some rows of a sensor's record, in the order of time: of every array in it."""
-    return _with(record, {name: values[rows] for name, values in arrays_of(record).items()})
+    return with_arrays(record, {name: values[rows] for name, values in arrays_of(record).items()})
 
 
 def joined(records: Sequence[_AnyRecord]) -> _AnyRecord:
@@ -43,14 +42,13 @@ def joined(records: Sequence[_AnyRecord]) -> _AnyRecord:
     columns = [arrays_of(record) for record in records]
     whole = {name: np.concatenate([c[name] for c in columns]) for name in columns[0]}
     _, rows = np.unique(whole["time"], return_index=True)
-    return _with(records[0], {name: values[rows] for name, values in whole.items()})
+    return with_arrays(records[0], {name: values[rows] for name, values in whole.items()})
 
 
-def _with(record: _AnyRecord, arrays: Mapping[str, Array]) -> _AnyRecord:
-    # Rows of a record that was checked need no check, which would take most of the time.
-    out = copy(record)
-    for name, values in arrays.items():
-        object.__setattr__(out, name, values)
+def with_arrays(record: _AnyRecord, arrays: Mapping[str, Array]) -> _AnyRecord:
+    """Return a record with other arrays, by name, which must have been checked."""
+    out = object.__new__(type(record))
+    vars(out).update(vars(record), **arrays)
     return out
 
 
