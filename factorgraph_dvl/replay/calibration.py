@@ -10,7 +10,7 @@ import numpy as np
 from factorgraph_dvl.geometry.rotations import exp_so3
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph.keys import BIAS_SIZE
-from factorgraph_dvl.graph.priors import local_coordinates, prior_mean, prior_root
+from factorgraph_dvl.graph.priors import local_coordinates, places, prior_mean, prior_root
 from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.solution import Estimate
 from factorgraph_dvl.solvers.reported import estimates_of, in_order, in_unit
@@ -32,61 +32,63 @@ class CalibrationEstimate:
     covariance: Array
 
 
-def calibration_of(
-    parameters: Sequence[Parameter],
-    values: Mapping[str, Array],
-    biases: tuple[tuple[Parameter, Array], tuple[Parameter, Array]],
-    P: Array,
-    undetermined: Array,
-) -> CalibrationEstimate:
-    """Return the calibration as reported.
+class CalibrationReport:
+    """Reports calibrations: the order, and what is not estimated, never change.
 
     Parameters
     ----------
     parameters : sequence of Parameter
         All parameters, those that are not estimated included.
-    values : mapping of str to ndarray
-        Their values, SI; rotations as matrices.
-    biases : tuple of (tuple of (Parameter, ndarray), tuple of (Parameter, ndarray))
-        Parameter and value of the gyro bias, and of the accelerometer bias.
-    P : ndarray, shape (6 + n, 6 + n)
-        Joint covariance of accelerometer bias, gyro bias and the estimated parameters, in GTSAM's
-        tangent space, SI.
-    undetermined : ndarray, shape (n, h)
-        Directions that are not observable, as `undetermined_directions` returns them: the prior is
-        reported there.
-
-    Returns
-    -------
-    CalibrationEstimate
-        Estimates and joint covariance in reported units.
+    gyro, accel : Parameter
+        Gyro bias and accelerometer bias.
     """
-    free = [p for p in parameters if p.estimated]
-    (gyro, gyro_bias), (accel, accel_bias) = biases
-    if undetermined.size:
-        values, P = _at_prior(free, values, P, undetermined)
-    rows = in_order(
-        [
-            in_unit(gyro, gyro_bias),
-            in_unit(accel, accel_bias),
-            *(in_unit(p, values[p.name]) for p in parameters),
-        ],
-        lambda r: r.parameter,
-    )
-    start = {accel.name: 0, gyro.name: 3}
-    at = BIAS_SIZE
-    for p in free:
-        start[p.name] = at
-        at += p.mean.size
-    estimated = [r for r in rows if r.parameter.estimated]
-    total = sum(r.value.size for r in estimated)
-    T = np.zeros((total, P.shape[0]))
-    at = 0
-    for r in estimated:
-        n, column = r.value.size, start[r.parameter.name]
-        T[at : at + n, column : column + n] = r.derivative
-        at += n
-    return CalibrationEstimate(*estimates_of([(r.parameter, r.value) for r in rows], T @ P @ T.T))
+
+    def __init__(self, parameters: Sequence[Parameter], gyro: Parameter, accel: Parameter) -> None:
+        self._free = [p for p in parameters if p.estimated]
+        self._rows = in_order([gyro, accel, *parameters], lambda p: p)
+        self._exact = {p.name: in_unit(p, prior_mean(p)) for p in self._rows if not p.estimated}
+        self._column = places([accel, gyro, *self._free])
+
+    def at(
+        self, values: Mapping[str, Array], bias: Array, P: Array, undetermined: Array
+    ) -> CalibrationEstimate:
+        """Return a calibration as reported.
+
+        Parameters
+        ----------
+        values : mapping of str to ndarray
+            Values of the parameters, SI; rotations as matrices.
+        bias : ndarray, shape (6,)
+            Accelerometer bias and gyro bias, SI.
+        P : ndarray, shape (6 + n, 6 + n)
+            Joint covariance of accelerometer bias, gyro bias and the estimated parameters, in
+            GTSAM's tangent space, SI.
+        undetermined : ndarray, shape (n, h)
+            Directions that are not observable, as `undetermined_directions` returns them: the
+            prior is reported there.
+
+        Returns
+        -------
+        CalibrationEstimate
+            Estimates and joint covariance in reported units.
+        """
+        if undetermined.size:
+            values, P = _at_prior(self._free, values, P, undetermined)
+        accel, gyro = list(self._column)[:2]
+        values = {**values, accel: bias[:3], gyro: bias[3:]}
+        rows = [
+            self._exact[p.name] if p.name in self._exact else in_unit(p, values[p.name])
+            for p in self._rows
+        ]
+        T = np.zeros((P.shape[0], P.shape[0]))
+        at = 0
+        for r in rows:
+            name, n = r.parameter.name, r.value.size
+            if name not in self._exact:
+                T[at : at + n, self._column[name]] = r.derivative
+                at += n
+        joint = T @ P @ T.T
+        return CalibrationEstimate(*estimates_of([(r.parameter, r.value) for r in rows], joint))
 
 
 def _at_prior(

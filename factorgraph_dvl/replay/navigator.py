@@ -23,7 +23,7 @@ from factorgraph_dvl.graph.sensor_factor import (
     state_of,
 )
 from factorgraph_dvl.imu.preintegration import Segments, gtsam_measurements
-from factorgraph_dvl.replay.calibration import CalibrationEstimate, calibration_of
+from factorgraph_dvl.replay.calibration import CalibrationEstimate, CalibrationReport
 from factorgraph_dvl.replay.gate import InnovationGate
 from factorgraph_dvl.replay.gravity import LocalGravity
 from factorgraph_dvl.replay.measurements import attached, gated
@@ -118,6 +118,7 @@ class Navigator:
             lag=lag,
             ranges=start.ranges,
         )
+        self._report = CalibrationReport(start.all_parameters, *imu.parameters(0.0))
         self._gravity = LocalGravity(start.frame)
         self._segments: dict[int, _Segment] = {}
         self.innovations: list[Innovations] = []
@@ -234,14 +235,8 @@ class Navigator:
     def calibration(self) -> CalibrationEstimate:
         """Return the calibration as it is reported."""
         bias = self.smoother.bias(self.smoother.node).vector()
-        gyro, accel = self._imu.parameters(0.0)
-        return calibration_of(
-            self.start.all_parameters,
-            self.values,
-            ((gyro, bias[3:]), (accel, bias[:3])),
-            self._P[STATE_SIZE:, STATE_SIZE:],
-            self.undetermined,
-        )
+        P = self._P[STATE_SIZE:, STATE_SIZE:]
+        return self._report.at(self.values, bias, P, self.undetermined)
 
     def filtered(self, body_axes: BodyAxes) -> Trajectory:
         """Return the newest state, as a trajectory of one epoch."""

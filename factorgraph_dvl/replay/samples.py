@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.geometry.vectors import Array, IntArray
 from factorgraph_dvl.imu.increments import MAX_FILLED, increments
 from factorgraph_dvl.imu.preintegration import Segments, one_segment
 from factorgraph_dvl.imu.timestamps import unrounded
@@ -140,13 +140,19 @@ class SampleBuffer:
 
     def gap_after(self, time: float) -> Gap | None:
         """Return the first gap after a time, None if there is none."""
+        return self._first_gap(self._after_gaps(), time)
+
+    def _after_gaps(self) -> IntArray:
+        """Return the samples that follow a gap; none until the interval is known."""
         if self.dt == 0.0:
-            return None
+            return np.empty(0, dtype=int)
+        steps = np.diff(self._table[:, 0])
+        return np.flatnonzero(steps > (MAX_FILLED + 1.5) * self.dt) + 1
+
+    def _first_gap(self, after_gaps: IntArray, time: float) -> Gap | None:
         t = self._table[:, 0]
-        wide = np.flatnonzero(self._wide(t) & (t > time))
-        if wide.size == 0:
-            return None
-        return Gap(float(t[wide[0] - 1]), float(t[wide[0]]))
+        later = after_gaps[t[after_gaps] > time]
+        return Gap(float(t[later[0] - 1]), float(t[later[0]])) if later.size else None
 
     def segment_after(
         self, start: float, interval: float, wanted: float, *, end: bool
@@ -175,7 +181,8 @@ class SampleBuffer:
             come so far.
         """
         t = self._table[:, 0]
-        gap = self.gap_after(start)
+        wide = self._after_gaps()
+        gap = self._first_gap(wide, start)
         count = t.size if gap is None else int(np.searchsorted(t, gap.before, side="right"))
         complete = end or gap is not None
         a = int(np.argmin(np.abs(t[:count] - start)))
@@ -191,7 +198,7 @@ class SampleBuffer:
             b = before
         if not complete and b + self.side >= count:
             return None
-        begin = int(np.max(np.flatnonzero(self._wide(t[: a + 1])), initial=0))
+        begin = int(wide[wide <= a].max(initial=0))
         low, high = max(a - self.side, begin), min(b + self.side + 1, count)
         if high - low < LEAST:
             return gap
@@ -203,10 +210,6 @@ class SampleBuffer:
         last = int(np.argmin(np.abs(inc.end - time[b - low]))) + 1
         self.interpolated += last - first - (b - a)
         return one_segment(inc, first, last)
-
-    def _wide(self, time: Array) -> np.ndarray:
-        """Return whether there is a gap before each of some samples."""
-        return np.diff(time, prepend=time[:1]) > (MAX_FILLED + 1.5) * self.dt
 
     def _regular(self, time: Array) -> Array:
         """Return stamps without gaps as `increments` takes those of a whole record."""

@@ -10,12 +10,15 @@ is a leaf that can be marginalised as it is. The estimates are the same.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import accumulate
 
 import gtsam
 import numpy as np
+from scipy.linalg.lapack import dtrtri
 
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph import keys
+from factorgraph_dvl.graph.keys import STATE_SIZE
 from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.statistics.square_root_information import eliminated
 
@@ -153,11 +156,11 @@ class Smoother:
         sizes = {key: self._sizes[key] for key in wanted}
         order = [net.at(i).firstFrontalKey() for i in range(net.size())]
         R, _ = net.matrix()
-        inverse = np.linalg.solve(R, np.eye(R.shape[0]))
-        P = inverse @ inverse.T
-        starts = dict(zip(order, np.cumsum([0, *(sizes[key] for key in order)]), strict=False))
-        index = np.concatenate([starts[key] + np.arange(sizes[key]) for key in wanted])
-        return np.asarray(P[np.ix_(index, index)])
+        starts = dict(zip(order, accumulate(sizes[key] for key in order), strict=True))
+        index = [i for key in wanted for i in range(starts[key] - sizes[key], starts[key])]
+        inverse, _ = dtrtri(R)
+        own = inverse[index]
+        return np.asarray(own @ own.T)
 
     def state_covariances(self, wanted: Sequence[int]) -> dict[int, Array]:
         """Return covariances (9, 9) of states by index, given all that came since."""
@@ -226,15 +229,13 @@ class Smoother:
             return None
         self._checked = now
         delta = self._isam.getDelta()
+        # The newest state may be yet to come.
+        nodes = [k for k in self.times if k < self.node or delta.exists(keys.node(k))]
+        steps = delta.vector([keys.node(k) for k in nodes]).reshape(-1, STATE_SIZE)
         fixed = self._isam.getFixedVariables()
-        for k in self.times:
-            key = keys.node(k)
-            if (
-                delta.exists(key)
-                and np.any(np.abs(delta.at(key)) > self._state_step)
-                and not fixed.count(key)
-            ):
-                return k
+        for i in np.flatnonzero((np.abs(steps) > self._state_step).any(axis=1)).tolist():
+            if not fixed.count(keys.node(nodes[i])):
+                return nodes[i]
         return None
 
     def _marginalise(self, k: int) -> None:

@@ -144,14 +144,15 @@ def successive(parts: Sequence[Epochs]) -> Epochs:
     """Return times in single segments that follow each other as those of one chain."""
     if len(parts) == 1:
         return parts[0]
-    times, ends = [], []
-    for i, part in enumerate(parts):
-        at = replace(part.at, segment=part.at.segment + i, node=part.at.node + i)
-        times.append(sliced(at, slice(part.time.size)))
-        ends.append(sliced(at, slice(part.time.size, None)))
+    at = concatenated([part.at for part in parts])
+    size = [part.at.tau.size for part in parts]
+    number = np.arange(len(parts)).repeat(size)
+    at = replace(at, segment=at.segment + number, node=at.node + number)
+    ends = np.cumsum(size) - 1
+    times = np.delete(np.arange(number.size), ends)
     return Epochs(
         np.concatenate([part.time for part in parts]),
-        concatenated([*times, *ends]),
+        sliced(at, np.concatenate([times, ends])),
         np.concatenate([part.duration for part in parts]),
     )
 

@@ -9,7 +9,7 @@ import pytest
 
 from factorgraph_dvl.geometry.rotations import exp_so3
 from factorgraph_dvl.geometry.units import DEG, DEG_PER_HOUR, MICRO_G
-from factorgraph_dvl.replay.calibration import calibration_of
+from factorgraph_dvl.replay.calibration import CalibrationReport
 from factorgraph_dvl.sensors.dvl import LEVER_ARM_SPEC, MISALIGNMENT_SPEC, SCALE_SPEC
 from factorgraph_dvl.sensors.imu import Imu, ImuSettings
 from factorgraph_dvl.sensors.parameters import Parameter
@@ -42,9 +42,15 @@ def biases():
     return (gyro, np.full(3, 0.2 * DEG_PER_HOUR)), (accel, np.full(3, 30.0 * MICRO_G))
 
 
+def reported(parameters, values, biases, P, undetermined):
+    (gyro, gyro_bias), (accel, accel_bias) = biases
+    bias = np.concatenate([accel_bias, gyro_bias])
+    return CalibrationReport(parameters, gyro, accel).at(values, bias, P, undetermined)
+
+
 def test_values_and_deviations_are_in_the_units_and_the_order_of_reports(biases):
     none = np.zeros((7, 0))
-    found = calibration_of(PARAMETERS, VALUES, biases, np.diag(SIGMA**2), none)
+    found = reported(PARAMETERS, VALUES, biases, np.diag(SIGMA**2), none)
     names = [e.name for e in found.estimates]
     assert names[:3] == ["misalignment_deg", "scale_error", "lever_arm_m"]
     by_name = {e.name: e for e in found.estimates}
@@ -63,7 +69,7 @@ def test_along_an_undetermined_direction_the_prior_is_reported(biases):
     fixed[5] = 1.0
     P = np.diag(SIGMA**2)
     P[0, 11] = P[11, 0] = 0.5 * SIGMA[0] * SIGMA[11]
-    found = calibration_of(PARAMETERS, VALUES, biases, P, fixed)
+    found = reported(PARAMETERS, VALUES, biases, P, fixed)
     by_name = {e.name: e for e in found.estimates}
     arm = by_name["lever_arm_m"]
     np.testing.assert_allclose(arm.value, [1.1, 2.0, 3.2], atol=1e-12)
@@ -78,6 +84,6 @@ def test_a_parameter_that_is_not_estimated_is_exact(biases):
     known = (replace(PARAMETERS[0], sigma=np.zeros(1)), *PARAMETERS[1:])
     values = VALUES | {"scale_error": known[0].mean}
     P = np.diag(np.delete(SIGMA, 6) ** 2)
-    found = calibration_of(known, values, biases, P, np.zeros((6, 0)))
+    found = reported(known, values, biases, P, np.zeros((6, 0)))
     (scale,) = [e for e in found.estimates if e.name == "scale_error"]
     assert (scale.value[0], scale.std[0]) == (0.01, 0.0)
