@@ -14,6 +14,9 @@ _LETTERS = [c for c in string.ascii_letters + string.digits if c not in "bx"]
 # Letters of correlated errors. Chosen: what no other variable has.
 _PROCESSES = string.punctuation
 
+# Keys with the index 0; the others follow. By GTSAM's definition.
+_FIRST_NODE = int(X(0))
+_FIRST_BIAS = int(B(0))
 # Dimensions of a state, attitude, position and velocity, and of the biases of accelerometers and
 # gyros: those of GTSAM's NavState and ConstantBias.
 STATE_SIZE = 9
@@ -22,7 +25,7 @@ BIAS_SIZE = 6
 
 def node(k: int) -> int:
     """Return the key of the navigation state at node k."""
-    return int(X(k))
+    return _FIRST_NODE + k
 
 
 def nodes(k: IntArray) -> IntArray:
@@ -32,7 +35,7 @@ def nodes(k: IntArray) -> IntArray:
 
 def bias(k: int) -> int:
     """Return the key of IMU bias k."""
-    return int(B(k))
+    return _FIRST_BIAS + k
 
 
 def calibration(i: int, size: int) -> int:

@@ -289,20 +289,23 @@ def motion_at(at: Attachment, states: States, gravity_n: Array, earth_rate_n: Ar
     w = earth_rate_n
     tau = at.tau[:, None]
     dR, dV, dP = _with_bias(at, bg, ba)
-    v_J = v + cross(w, p)
-    wg = cross(w, g)
+    # Vectors times this are their products with w.
+    by_w = skew(w).T
+    v_J = v + p @ by_w
+    wg = g @ by_w
     p_end = rotate(
         at.turn, p + v_J * tau + rotate(R, dP) + g * (tau**2 / 2.0) + wg * (tau**3 / 6.0)
     )
     v_end = rotate(at.turn, v_J + rotate(R, dV) + g * tau + wg * (tau**2 / 2.0))
-    v_end = v_end - cross(w, p_end)
+    carried = p_end @ by_w
+    v_end = v_end - carried
     nRb = at.turn @ R @ dR
-    a_n = rotate(nRb, at.force - ba) + g - 2.0 * cross(w, v_end) - cross(w, cross(w, p_end))
+    a_n = rotate(nRb, at.force - ba) + g - (2.0 * v_end + carried) @ by_w
     return Motion(
         nRb=nRb,
         p_n=p_end,
         v_n=v_end,
-        omega_eb_b=at.gyro - bg - rotate(nRb.transpose(0, 2, 1), np.broadcast_to(w, v.shape)),
+        omega_eb_b=at.gyro - bg - w @ nRb,
         a_n=a_n,
         alpha_b=at.alpha,
         omega_sigma=at.omega_sigma,

@@ -97,5 +97,6 @@ def unrounded(time: Array, number: Array | None = None) -> Array:
         unit = 10.0**-decimals
         if unit < 0.5 * slope and np.all(np.abs(since / unit - np.rint(since / unit)) < 1e-3):
             quantum = max(quantum, unit)
+            break
     # A fitted line may be off by as much as the rounding itself.
     return line if np.abs(since - line).max() <= quantum else since

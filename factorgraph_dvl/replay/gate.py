@@ -74,7 +74,7 @@ class InnovationGate:
         """
         window = self._windows.setdefault(label, deque(maxlen=_WINDOW))
         limit = _LIMIT if echo_limit is None else echo_limit
-        beyond = (np.abs(normalised) >= limit).any(axis=1)
+        beyond = np.any(np.abs(normalised) >= limit, axis=1)
         there = np.isfinite(normalised)
         squares = np.where(there, normalised, 0.0) ** 2
         squares = squares.sum(axis=1) / there.sum(axis=1)

@@ -140,19 +140,16 @@ class SampleBuffer:
 
     def gap_after(self, time: float) -> Gap | None:
         """Return the first gap after a time, None if there is none."""
-        return self._first_gap(self._after_gaps(), time)
+        t = self._table[:, 0]
+        t = t[max(int(np.searchsorted(t, time, side="right")) - 1, 0) :]
+        after = self._after_gaps(t)
+        return Gap(float(t[after[0] - 1]), float(t[after[0]])) if after.size else None
 
-    def _after_gaps(self) -> IntArray:
-        """Return the samples that follow a gap; none until the interval is known."""
+    def _after_gaps(self, time: Array) -> IntArray:
+        """Return which of some samples follow a gap; none until the interval is known."""
         if self.dt == 0.0:
             return np.empty(0, dtype=int)
-        steps = np.diff(self._table[:, 0])
-        return np.flatnonzero(steps > (MAX_FILLED + 1.5) * self.dt) + 1
-
-    def _first_gap(self, after_gaps: IntArray, time: float) -> Gap | None:
-        t = self._table[:, 0]
-        later = after_gaps[t[after_gaps] > time]
-        return Gap(float(t[later[0] - 1]), float(t[later[0]])) if later.size else None
+        return np.flatnonzero(np.diff(time) > (MAX_FILLED + 1.5) * self.dt) + 1
 
     def segment_after(
         self, start: float, interval: float, wanted: float, *, end: bool
@@ -181,8 +178,7 @@ class SampleBuffer:
             come so far.
         """
         t = self._table[:, 0]
-        wide = self._after_gaps()
-        gap = self._first_gap(wide, start)
+        gap = self.gap_after(start)
         count = t.size if gap is None else int(np.searchsorted(t, gap.before, side="right"))
         complete = end or gap is not None
         a = int(np.argmin(np.abs(t[:count] - start)))
@@ -198,7 +194,7 @@ class SampleBuffer:
             b = before
         if not complete and b + self.side >= count:
             return None
-        begin = int(wide[wide <= a].max(initial=0))
+        begin = int(self._after_gaps(t[: a + 1]).max(initial=0))
         low, high = max(a - self.side, begin), min(b + self.side + 1, count)
         if high - low < LEAST:
             return gap

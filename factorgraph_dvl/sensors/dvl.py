@@ -376,7 +376,7 @@ class DvlVelocity(PlainObservation):
         bRn = motion.nRb.transpose(0, 2, 1)
         scale = 1.0 + values[SCALE_ERROR]
         unscaled_d = dvl_b @ values[MISALIGNMENT].T
-        dMb = np.broadcast_to(scale, (3,))[:, None] * values[MISALIGNMENT]
+        dMb = scale[:, None] * values[MISALIGNMENT]
         lever_arm = values[LEVER_ARM]
         n_scale = values[SCALE_ERROR].size
         d_scale = unscaled_d[:, :, None] if n_scale == 1 else unscaled_d[:, :, None] * np.eye(3)
