@@ -266,10 +266,9 @@ class NodeMeasurements:
             for r, own, wanted in zip(self.rows, motions, self._wanted, strict=True)
         ]
         # All components at once, each as a measurement of its own.
-        whole = Linearization(
-            np.concatenate([lin.residual.ravel() for lin in found])[:, None],
-            **{name: _stacked(found, name, parts) for name in _BY_MOTION},
-        )
+        by_motion: dict[str, Any] = {name: _stacked(found, name, parts) for name in _BY_MOTION}
+        residual = np.concatenate([lin.residual.ravel() for lin in found])
+        whole = Linearization(residual[:, None], **by_motion)
         window = cast(Transition, _Window(transition, index))
         first = STATE_SIZE + BIAS_SIZE
         matrix = np.zeros((index.size, first + sum(p.mean.size for p in self.parameters)))
@@ -284,7 +283,7 @@ class NodeMeasurements:
             own = by_errors(whole, window, sliced(self.sensitivity, index), elements(errors))
             columns = [np.r_[self._place[p.name]] for p in errors]
             matrix[:, first + np.concatenate(columns)] = own[:, 0]
-        return whole.residual[:, 0], matrix, motions
+        return residual, matrix, motions
 
     def residuals(self, states: States, values: Mapping[str, Array]) -> Array:
         """Return the residuals, (R,)."""

@@ -19,7 +19,6 @@ from factorgraph_dvl.graph.sensor_factor import (
     NodeMeasurements,
     concatenated,
     measurement_factor,
-    sliced,
     state_of,
 )
 from factorgraph_dvl.imu.preintegration import Segments, gtsam_measurements
@@ -35,6 +34,7 @@ from factorgraph_dvl.sensors.finding import Finding
 from factorgraph_dvl.sensors.imu import Imu
 from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.sensors.protocol import Aid
+from factorgraph_dvl.sensors.records import rows_of
 from factorgraph_dvl.solution import Trajectory
 from factorgraph_dvl.solvers.trajectory import (
     TRAJECTORY_RATE,
@@ -286,7 +286,7 @@ class Navigator:
             epochs, _ = attached_epochs(part.segment, time, self.start.frame.earth_rate, none)
         part = replace(part, epochs=with_end(epochs, self.time))
         motion = self._between(k, [part], P, body_axes)
-        return sliced(motion, slice(-1)), sliced(motion, slice(-1, None))
+        return rows_of(motion, slice(-1)), rows_of(motion, slice(-1, None))
 
     def _between(
         self, first: int, parts: Sequence[_Segment], P: Array, body_axes: BodyAxes

@@ -18,9 +18,8 @@ from scipy.linalg.lapack import dtrtri
 
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph import keys
-from factorgraph_dvl.graph.keys import STATE_SIZE
+from factorgraph_dvl.graph.keys import BIAS_SIZE, STATE_SIZE
 from factorgraph_dvl.sensors.parameters import Parameter
-from factorgraph_dvl.statistics.square_root_information import eliminated
 
 # Steps after which a state is linearised anew: rad, m, m/s; chosen. Positions enter linearly, but
 # for ranges: at 10 m from a beacon the last step changes one by 0.2 m more than it should.
@@ -163,18 +162,50 @@ class Smoother:
         return np.asarray(own @ own.T)
 
     def state_covariances(self, wanted: Sequence[int]) -> dict[int, Array]:
-        """Return covariances (9, 9) of states by index, given all that came since."""
-        order = self._in_time()
-        net = self._isam.jointBayesNet(order, gtsam.EliminateQR)
-        graph = gtsam.GaussianFactorGraph()
-        for i in range(net.size()):
-            graph.push_back(net.at(i))
-        ordering = gtsam.Ordering()
-        for key in order:
-            ordering.push_back(key)
-        information = eliminated(graph, ordering, self._sizes)
-        marginals = information.marginals([keys.node(k) for k in wanted])
-        return {k: marginals[keys.node(k)] for k in wanted}
+        """Return covariances (9, 9) of states by index, given all that came since.
+
+        From the newest state back: given the next one and what all states share, each is
+
+            x = G (next, shared) + noise,    G = -R⁻¹ T,    with covariance R⁻¹ R⁻ᵀ,
+
+        for the rows [R T] of the square root of the information.
+        """
+        net = self._isam.jointBayesNet(self._in_time(), gtsam.EliminateQR)
+        nodes = list(self.times)
+        own = STATE_SIZE + (BIAS_SIZE if self._walking else 0)
+        P = self.joint_covariance()
+        rows = np.zeros((len(nodes) - 1, own, own + len(P)))
+        # Column of each variable in its own rows; that of the next state is by `own` further.
+        column, at = {}, own
+        for key in self._top():
+            column[key] = at
+            at += self._sizes[key]
+        number = {}
+        for j, k in enumerate(nodes):
+            for offset, key in ((0, keys.node(k)), (STATE_SIZE, self.bias_key(k))):
+                if offset < own:
+                    number[key], column[key] = j, offset
+        for i in range(len(rows) * (2 if self._walking else 1)):
+            conditional = net.at(i)
+            first, *others = conditional.keys()
+            j, row = number[first], slice(column[first], column[first] + self._sizes[first])
+            rows[j, row, row] = conditional.R()
+            right, T = 0, conditional.S()
+            for key in others:
+                left, right = right, right + self._sizes[key]
+                start = column[key] + own * (number.get(key, j) - j)
+                rows[j, row, start : start + right - left] = T[:, left:right]
+        inverse = np.linalg.inv(rows[:, :, :own])
+        gain = -inverse @ rows[:, :, own:]
+        noise = inverse @ inverse.transpose(0, 2, 1)
+        out = {nodes[-1]: P[:STATE_SIZE, :STATE_SIZE]}
+        for j in range(len(rows) - 1, nodes.index(min(wanted)) - 1, -1):
+            joint = gain[j] @ P
+            P = P.copy()
+            P[:own, :own] = joint @ gain[j].T + noise[j]
+            P[:own, own:], P[own:, :own] = joint[:, own:], joint[:, own:].T
+            out[nodes[j]] = P[:STATE_SIZE, :STATE_SIZE]
+        return {k: 0.5 * (out[k] + out[k].T) for k in wanted}
 
     def _top(self) -> list[int]:
         return [keys.node(self.node), self.bias_key(self.node), *self.calibration_keys.values()]
