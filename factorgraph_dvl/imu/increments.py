@@ -308,11 +308,9 @@ def _bridged(imu: Imu) -> tuple[Array, Array, Array, Array, np.ndarray, list[Fin
             expected=f"at least {1.0 / _SLOWEST:.0f} in a second",
             hint="Is time_s in seconds?",
         )
-    if not (step > _LOST * dt).any():
-        return time, samples, np.zeros(samples.shape), np.zeros(step.size, dtype=bool), []
-    lost = np.zeros(step.size, dtype=int)
-    if np.quantile(np.abs(step / dt - 1.0), 0.9) < _REGULAR:
-        lost = np.where(step > _LOST * dt, np.rint(step / dt).astype(int) - 1, 0)
+    lost, late = np.zeros(step.size, dtype=int), step > _LOST * dt
+    if late.any() and np.quantile(np.abs(step / dt - 1.0), 0.9) < _REGULAR:
+        lost = np.where(late, np.rint(step / dt).astype(int) - 1, 0)
     bridged = (lost > 0) & (lost <= MAX_FILLED)
     broken = (lost > MAX_FILLED) | (step > (MAX_FILLED + _LOST) * dt)
     if not bridged.any():
