@@ -99,7 +99,6 @@ def integrate(c: Array, dt: Array, u: Array | float) -> tuple[Array, Array]:
     force = at[:, :, 3:]
     once = cross(turned, force)
     twice = cross(turned, once)
-    mean = np.tensordot(
-        _GAUSS_WEIGHTS, force + once + twice / 2.0 + cross(turned, twice) / 6.0, axes=1
-    )
+    rotated = force + once + twice / 2.0 + cross(turned, twice) / 6.0
+    mean = rotated.transpose(1, 2, 0) @ _GAUSS_WEIGHTS
     return phi, h * mean

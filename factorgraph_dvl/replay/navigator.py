@@ -9,7 +9,7 @@ import gtsam
 import numpy as np
 
 from factorgraph_dvl.geometry.rotations import BodyAxes, rph_from_rotation, rph_jacobian
-from factorgraph_dvl.geometry.vectors import Array, rotate
+from factorgraph_dvl.geometry.vectors import Array, IntArray, rotate
 from factorgraph_dvl.graph import keys
 from factorgraph_dvl.graph.inertial_chain import LEAST_WALK, loose_diagonal
 from factorgraph_dvl.graph.keys import BIAS_SIZE, STATE_SIZE
@@ -121,6 +121,8 @@ class Navigator:
         self._report = CalibrationReport(start.all_parameters, *imu.parameters(0.0))
         self._gravity = LocalGravity(start.frame)
         self._segments: dict[int, _Segment] = {}
+        # By the names of parameters: their columns, and those of state and bias before them.
+        self._own: dict[tuple[str, ...], IntArray] = {}
         self.innovations: list[Innovations] = []
         self.findings: list[Finding] = []
         self._refresh()
@@ -312,11 +314,11 @@ class Navigator:
     ) -> None:
         """Add the factor of measurements after state k that the gate accepts."""
         s = self.smoother
-        names = [p.name for p in measured.parameters]
-        first_parameter = STATE_SIZE + BIAS_SIZE
-        own = np.concatenate(
-            [np.arange(first_parameter), first_parameter + self.start.columns(names)]
-        )
+        names = tuple(p.name for p in measured.parameters)
+        if names not in self._own:
+            own = np.arange(STATE_SIZE + BIAS_SIZE)
+            self._own[names] = np.append(own, own.size + self.start.columns(names))
+        own = self._own[names]
         first = None
         if self._linear is not None and k == s.node:
             # Where GTSAM will linearise, so this is done once only.
@@ -330,7 +332,7 @@ class Navigator:
             residual, matrix, motions = measured.linearize(states, self.values)
         sigma = measured.sigma(motions, self.values)
         weights, innovations, findings = gated(
-            measured, residual, matrix, sigma, self._P[np.ix_(own, own)], self._gate
+            measured, residual, matrix, sigma, self._P[own[:, None], own], self._gate
         )
         self.innovations += innovations
         self.findings += findings

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from factorgraph_dvl.geometry.vectors import cross, interpolate, rotate, skew
+from factorgraph_dvl.geometry.vectors import cross, interpolate, median, rotate, skew
 
 RNG = np.random.default_rng(3)
 
@@ -26,3 +26,21 @@ def test_interpolation_is_linear_between_knots_and_constant_beyond(shape):
     values = np.multiply.outer(knots, slope)
     found = interpolate(np.array([-1.0, 0.5, 2.0, 4.0]), knots, values)
     assert found == pytest.approx(np.multiply.outer([0.0, 0.5, 2.0, 3.0], slope))
+
+
+@pytest.mark.parametrize("size", [1, 2, 7, 8])
+def test_the_median_is_numpys(size):
+    values = np.random.default_rng(size).standard_normal(size)
+    assert median(values) == np.median(values)
+
+
+def test_products_with_few_vectors_are_those_with_many():
+    rng = np.random.default_rng(3)
+    matrices, vectors = rng.standard_normal((300, 3, 3)), rng.standard_normal((300, 3))
+    few = [
+        rotate(m, v) for m, v in zip(np.split(matrices, 60), np.split(vectors, 60), strict=True)
+    ]
+    np.testing.assert_allclose(np.concatenate(few), rotate(matrices, vectors), atol=1e-14)
+    np.testing.assert_allclose(
+        rotate(matrices[:5], vectors[0]), matrices[:5] @ vectors[0], atol=1e-14
+    )

@@ -68,6 +68,29 @@ def test_the_lag_is_that_of_the_incremental_fixed_lag_smoother():
     )
 
 
+def test_covariances_of_all_states_are_their_marginals_where_biases_walk():
+    prior, values, steps = chain_of_states(12)
+    walk = gtsam.noiseModel.Isotropic.Sigma(6, 1e-3)
+    none = gtsam.imuBias.ConstantBias()
+    ours = Smoother(prior, values, node=0, time=0.0, parameters=(), walking=True, lag=100.0)
+    whole = gtsam.NonlinearFactorGraph(prior)
+    for k, (time, graph, new) in enumerate(steps):
+        imu, measured = graph.at(0), graph.at(1)
+        own = gtsam.NonlinearFactorGraph()
+        x, y, b = keys.node(k), keys.node(k + 1), keys.bias(k)
+        own.add(gtsam.GalileanImuFactor2(x, y, b, imu.preintegratedMeasurements()))
+        own.add(gtsam.BetweenFactorConstantBias(b, keys.bias(k + 1), none, walk))
+        own.add(measured)
+        new.insert(keys.bias(k + 1), none)
+        ours.extend(time, own, new)
+        whole.push_back(own)
+    marginals = gtsam.Marginals(whole, ours._isam.getLinearizationPoint())
+    found = ours.state_covariances(list(ours.times))
+    assert len(found) == 12
+    for k, P in found.items():
+        np.testing.assert_allclose(P, marginals.marginalCovariance(keys.node(k)), atol=1e-9)
+
+
 def test_a_range_is_linearised_where_the_position_is_found_to_be():
     """A vehicle 30 m off its reckoned place hears two beacons after a long outages."""
     sigma = 0.5
