@@ -16,7 +16,7 @@ import gtsam
 import numpy as np
 from scipy.linalg.lapack import dtrtri
 
-from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.geometry.vectors import Array, IntArray
 from factorgraph_dvl.graph import keys
 from factorgraph_dvl.graph.keys import BIAS_SIZE, STATE_SIZE
 from factorgraph_dvl.sensors.parameters import Parameter
@@ -185,26 +185,32 @@ class Smoother:
             for offset, key in ((0, keys.node(k)), (STATE_SIZE, self.bias_key(k))):
                 if offset < own:
                     number[key], column[key] = j, offset
+        # Conditionals that depend on the same variables, relative to their own, come in runs.
+        columns: dict[tuple[int, ...], IntArray] = {}
         for i in range(len(rows) * (2 if self._walking else 1)):
             conditional = net.at(i)
             first, *others = conditional.keys()
-            j, row = number[first], slice(column[first], column[first] + self._sizes[first])
-            rows[j, row, row] = conditional.R()
-            right, T = 0, conditional.S()
-            for key in others:
-                left, right = right, right + self._sizes[key]
-                start = column[key] + own * (number.get(key, j) - j)
-                rows[j, row, start : start + right - left] = T[:, left:right]
+            j, start = number[first], column[first]
+            pattern = (start, *[key - first if key in number else key for key in others])
+            if pattern not in columns:
+                columns[pattern] = np.concatenate(
+                    [
+                        column[key] + own * (number.get(key, j) - j) + np.arange(self._sizes[key])
+                        for key in others
+                    ]
+                )
+            own_rows = rows[j, start : start + self._sizes[first]]
+            own_rows[:, start : start + self._sizes[first]] = conditional.R()
+            own_rows[:, columns[pattern]] = conditional.S()
         inverse = np.linalg.inv(rows[:, :, :own])
         gain = -inverse @ rows[:, :, own:]
         noise = inverse @ inverse.transpose(0, 2, 1)
-        out = {nodes[-1]: P[:STATE_SIZE, :STATE_SIZE]}
+        out = {nodes[-1]: P[:STATE_SIZE, :STATE_SIZE].copy()}
         for j in range(len(rows) - 1, nodes.index(min(wanted)) - 1, -1):
             joint = gain[j] @ P
-            P = P.copy()
             P[:own, :own] = joint @ gain[j].T + noise[j]
             P[:own, own:], P[own:, :own] = joint[:, own:], joint[:, own:].T
-            out[nodes[j]] = P[:STATE_SIZE, :STATE_SIZE]
+            out[nodes[j]] = P[:STATE_SIZE, :STATE_SIZE].copy()
         return {k: 0.5 * (out[k] + out[k].T) for k in wanted}
 
     def _top(self) -> list[int]:

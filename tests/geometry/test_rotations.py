@@ -121,10 +121,8 @@ def test_covariance_of_the_rotation_vector_by_monte_carlo(axis, angle):
 
 
 @pytest.mark.parametrize("angle", [0.0, 1e-160, 1e-9, 1e-3, 1.0, 2.0, 3.1])
-def test_logarithms_of_few_rotations_are_those_of_many(angle):
-    axes = np.random.default_rng(2).standard_normal((200, 3))
+def test_the_logarithm_is_exact_at_every_angle(angle):
+    axes = np.random.default_rng(2).standard_normal((20, 3))
     phi = angle * axes / np.linalg.norm(axes, axis=1, keepdims=True)
-    many = exp_so3(phi)
-    few = [log_so3(matrices) for matrices in np.split(many, 40)]
-    np.testing.assert_allclose(np.concatenate(few), log_so3(many), atol=1e-15, rtol=1e-14)
-    np.testing.assert_allclose(log_so3(many[0]), phi[0], atol=1e-15, rtol=1e-14)
+    np.testing.assert_allclose(log_so3(exp_so3(phi)), phi, atol=1e-15, rtol=1e-13)
+    np.testing.assert_allclose(log_so3(exp_so3(phi[0])), phi[0], atol=1e-15, rtol=1e-13)
