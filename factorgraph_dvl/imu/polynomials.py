@@ -55,22 +55,27 @@ def regular_interpolation(count: int, shift: int, averaged: bool) -> Array:
     return interpolation(edges[None], averaged)[0]
 
 
-def evaluate(c: Array, u: Array | float) -> Array:
-    """Return polynomials c (M, K, n) at u (M,) or scalar, (M, n), or at u (G, M), (G, M, n)."""
-    u = np.asarray(u)[..., None]
-    out = np.repeat(c[None, :, -1], u.shape[0], axis=0) if u.ndim > 2 else c[:, -1].copy()
-    for k in range(c.shape[1] - 2, -1, -1):
-        out *= u
-        out += c[:, k]
-    return out
+def powers(u: Array, count: int) -> Array:
+    """Return the powers 0 to count - 1 of numbers (...), as (..., count)."""
+    out = np.empty((*u.shape, count))
+    out[..., 0] = 1.0
+    out[..., 1:] = u[..., None]
+    return np.asarray(np.multiply.accumulate(out, axis=-1))
+
+
+def evaluate(c: Array, u: Array) -> Array:
+    """Return polynomials c (M, K, n) at u (M,), as (M, n)."""
+    return np.asarray((powers(u, c.shape[1])[:, None] @ c)[:, 0])
 
 
 def rate_and_slope(c: Array, since: Array, dt: Array) -> tuple[Array, Array]:
     """Return the rate and its derivative, (M, 3), `since` seconds into intervals."""
-    u = since / dt
-    rate = c[:, :, :3]
-    order = np.arange(1, c.shape[1])
-    return evaluate(rate, u), evaluate(rate[:, 1:] * order[:, None], u) / dt[:, None]
+    order = np.arange(c.shape[1])
+    rows = np.zeros((dt.size, 2, order.size))
+    rows[:, 0] = powers(since / dt, order.size)
+    rows[:, 1, 1:] = rows[:, 0, :-1] * order[1:]
+    at = rows @ c[:, :, :3]
+    return at[:, 0], at[:, 1] / dt[:, None]
 
 
 def integrate(c: Array, dt: Array, u: Array | float) -> tuple[Array, Array]:
@@ -80,11 +85,11 @@ def integrate(c: Array, dt: Array, u: Array | float) -> tuple[Array, Array]:
     Oteo, Ros, Phys. Rep. 470 (2009), eq. 253), the velocity by Gauss quadrature of the
     force rotated to the start.
     """
-    u = np.broadcast_to(np.asarray(u, dtype=float), dt.shape)
-    h = (dt * u)[:, None]
-    nodes = _GAUSS_NODES[:, None] * u
-    at = evaluate(c, nodes)
+    nodes = np.multiply.outer(u, _GAUSS_NODES)
+    rows = powers(nodes, c.shape[1])
+    at = _at_nodes(rows, c)
     w1, w2, w3 = at[:, :, :3]
+    h = (dt * u)[:, None]
     a1 = h * w2
     a2 = (np.sqrt(15.0) / 3.0) * h * (w3 - w1)
     a3 = (10.0 / 3.0) * h * (w3 - 2.0 * w2 + w1)
@@ -93,12 +98,20 @@ def integrate(c: Array, dt: Array, u: Array | float) -> tuple[Array, Array]:
     c2 = cross(a1, 2.0 * a3 + c1) / 60.0
     phi = a1 + a3 / 12.0 - cross(-20.0 * a1 - a3 + c1, a2 + c2) / 240.0
 
-    power = np.arange(1, c.shape[1] + 1)
-    integral = np.concatenate([np.zeros_like(c[:, :1, :3]), c[:, :, :3] / power[:, None]], axis=1)
-    turned = dt[:, None] * evaluate(integral, nodes)
+    integral = rows * nodes[..., None] / np.arange(1, c.shape[1] + 1)
+    turned = dt[:, None] * _at_nodes(integral, c[:, :, :3])
     force = at[:, :, 3:]
     once = cross(turned, force)
     twice = cross(turned, once)
     rotated = force + once + twice / 2.0 + cross(turned, twice) / 6.0
     mean = rotated.transpose(1, 2, 0) @ _GAUSS_WEIGHTS
     return phi, h * mean
+
+
+def _at_nodes(rows: Array, c: Array) -> Array:
+    """Return combinations (3, M, n) of coefficients (M, K, n), by rows (3, K) or (M, 3, K)."""
+    if rows.ndim == 3:
+        return np.asarray((rows @ c).transpose(1, 0, 2))
+    # One product of two large matrices instead of many small ones.
+    together = rows @ c.transpose(1, 0, 2).reshape(c.shape[1], -1)
+    return np.asarray(together.reshape(rows.shape[0], c.shape[0], -1))

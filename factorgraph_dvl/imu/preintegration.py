@@ -445,11 +445,12 @@ def one_segment(inc: Increments, first: int, last: int) -> Segments:
     inside = np.arange(first, last)
     phi, dv = inc.over(inside)
     turn, left = _turns(phi)
-    dR = np.empty((inside.size, 3, 3))
-    R = np.eye(3)
-    for i, step in enumerate(turn):
-        dR[i] = R
-        R = R @ step
+    dR = np.concatenate([np.eye(3)[None], turn[:-1]])
+    # Products of all up to each: of runs that become twice as long.
+    run = 1
+    while run < inside.size:
+        dR[run:] = dR[:-run] @ dR[run:]
+        run *= 2
     dt = inc.dt[inside, None]
     turned = rotate(dR, dv)
     dV, dP = np.zeros((2, inside.size, 3))
