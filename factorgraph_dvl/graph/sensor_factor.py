@@ -27,6 +27,7 @@ from factorgraph_dvl.imu.propagation import (
     attach_inside,
     extrapolated,
     motion_at,
+    with_bias,
 )
 from factorgraph_dvl.imu.sensitivity import Sensitivity, by_errors, corrected, elements
 from factorgraph_dvl.sensors.imu import ERRORS
@@ -240,6 +241,9 @@ class NodeMeasurements:
     def motions(self, states: States, values: Mapping[str, Array]) -> tuple[Motion, list[Motion]]:
         """Return the motion at all times as attached, and at the true times of each kind."""
         motion = motion_at(self.corrected(values), states, self.gravity_n, self.earth_rate_n)
+        return motion, self._at_true_times(motion, values)
+
+    def _at_true_times(self, motion: Motion, values: Mapping[str, Array]) -> list[Motion]:
         out: list[Motion] = []
         part, at = motion, slice(0, self.attachment.tau.size)
         for r in self.rows:
@@ -247,7 +251,7 @@ class NodeMeasurements:
                 part, at = sliced(motion, r.at), r.at
             late = true_time(r.observation, values, self.clock_zero) - r.time
             out.append(extrapolated(part, late))
-        return motion, out
+        return out
 
     def linearize(
         self, states: States, values: Mapping[str, Array]
@@ -258,8 +262,11 @@ class NodeMeasurements:
         accelerometer and gyro bias, then the parameters.
         """
         values = {**self.fixed, **values}
-        motion, motions = self.motions(states, values)
-        transition = Transition(self.corrected(values), states, motion, self.earth_rate_n)
+        at, rate = self.corrected(values), self.earth_rate_n
+        increments = with_bias(at, states)
+        motion = motion_at(at, states, self.gravity_n, rate, increments)
+        motions = self._at_true_times(motion, values)
+        transition = Transition(at, states, motion, rate, increments)
         parts, index = self._components
         found = [
             linearized(r.observation, own, values, wanted, self.clock_zero)

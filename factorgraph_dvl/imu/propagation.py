@@ -162,12 +162,15 @@ class Transition:
         At the times.
     earth_rate_n : ndarray, shape (3,), rad/s
         Earth rate in n.
+    increments : tuple of ndarray, optional
+        What `with_bias` returned, if it was asked before.
     """
 
     at: Attachment
     states: States
     motion: Motion
     earth_rate_n: Array
+    increments: tuple[Array, Array, Array] | None = None
 
     @cached_property
     def turned(self) -> Array:
@@ -176,8 +179,7 @@ class Transition:
 
     @cached_property
     def _increments(self) -> tuple[Array, Array, Array]:
-        k = self.at.node
-        return _with_bias(self.at, self.states.gyro_bias[k], self.states.accel_bias[k])
+        return self.increments or with_bias(self.at, self.states)
 
     @cached_property
     def _cross_rate(self) -> Array:
@@ -260,7 +262,13 @@ def attitude_jacobian(lin: Linearization, transition: Transition) -> Array | Non
     return by_rate if lin.d_theta is None else lin.d_theta + by_rate
 
 
-def motion_at(at: Attachment, states: States, gravity_n: Array, earth_rate_n: Array) -> Motion:
+def motion_at(
+    at: Attachment,
+    states: States,
+    gravity_n: Array,
+    earth_rate_n: Array,
+    increments: tuple[Array, Array, Array] | None = None,
+) -> Motion:
     """Return the motion at attached times, carried forward from the nodes before.
 
     Motion over a rotating Earth in closed form: in axes that keep their direction in
@@ -281,14 +289,16 @@ def motion_at(at: Attachment, states: States, gravity_n: Array, earth_rate_n: Ar
         `LocalFrame.gravity_without_rotation` along the segments, m/s².
     earth_rate_n : ndarray, shape (3,), rad/s
         W.
+    increments : tuple of ndarray, optional
+        What `with_bias` returned, if it was asked before.
     """
     k = at.node
     R, p, v = states.nRb[k], states.p_n[k], states.v_n[k]
     bg, ba = states.gyro_bias[k], states.accel_bias[k]
+    dR, dV, dP = increments or with_bias(at, states)
     g = gravity_n[at.segment]
     w = earth_rate_n
     tau = at.tau[:, None]
-    dR, dV, dP = _with_bias(at, bg, ba)
     # Vectors times this are their products with w.
     by_w = skew(w).T
     v_J = v + p @ by_w
@@ -332,8 +342,9 @@ def extrapolated(motion: Motion, late: Array) -> Motion:
     )
 
 
-def _with_bias(at: Attachment, bg: Array, ba: Array) -> tuple[Array, Array, Array]:
-    """Return dR, dV, dP corrected to first order for the biases."""
+def with_bias(at: Attachment, states: States) -> tuple[Array, Array, Array]:
+    """Return dR (M, 3, 3), dV, dP (M, 3), corrected to first order for the biases."""
+    bg, ba = states.gyro_bias[at.node], states.accel_bias[at.node]
     turned = rotate(at.dA, bg)
     v_gyro = 0.5 * cross(at.dV, turned)
     v_accel = rotate(at.dA, ba)

@@ -237,10 +237,13 @@ class Gnss:
         has_velocity = ~np.isnan(self.velocity[:, 0])
         # A receiver that loses its position keeps the axes of the last one: the
         # vertical turns by a degree in 111 km.
-        known = np.maximum.accumulate(np.where(has_position, np.arange(self.time.size), -1))
-        known = np.where(known < 0, np.argmax(has_position), known)
-        lat, lon = self.geodetic[known, 0], self.geodetic[known, 1]
-        lat, lon = np.where(np.isnan(lat), frame.lat, lat), np.where(np.isnan(lon), frame.lon, lon)
+        lat, lon = self.geodetic[:, 0], self.geodetic[:, 1]
+        if not has_position.any():
+            lat, lon = np.full_like(lat, frame.lat), np.full_like(lon, frame.lon)
+        elif not has_position.all():
+            known = np.maximum.accumulate(np.where(has_position, np.arange(self.time.size), -1))
+            known = np.where(known < 0, np.argmax(has_position), known)
+            lat, lon = lat[known], lon[known]
         lRn = frame.level_from_tangent(lat, lon)
         bRc, omega_cb_b = self.carrier(self.time)
         s = self.settings
