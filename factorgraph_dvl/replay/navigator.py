@@ -17,7 +17,6 @@ from factorgraph_dvl.graph.priors import ConstantsPrior, local_coordinates, valu
 from factorgraph_dvl.graph.sensor_factor import (
     Linearized,
     NodeMeasurements,
-    concatenated,
     measurement_factor,
     state_of,
 )
@@ -268,10 +267,7 @@ class Navigator:
         """Return the motion from state `first` to state `last`, smoothed with later data."""
         wanted = [k for k in self._segments if first <= k < last]
         P = self.smoother.state_covariances([*wanted, last])
-        parts = [self._segments[k] for k in wanted]
-        return self._between(
-            wanted[0], parts, np.stack([P[k] for k in (*wanted, last)]), body_axes
-        )
+        return self._between(wanted[0], [self._segments[k] for k in wanted], P, body_axes)
 
     def last_segment(self, body_axes: BodyAxes, since: float) -> tuple[Trajectory, Trajectory]:
         """Return the motion at the epochs after a time, s, and the newest state, which follows.
@@ -294,11 +290,10 @@ class Navigator:
         self, first: int, parts: Sequence[_Segment], P: Array, body_axes: BodyAxes
     ) -> Trajectory:
         """Return the motion in segments that follow each other from a state on."""
-        s = self.smoother
-        each = [state_of(s.state(k), s.bias(k)) for k in range(first, first + len(parts) + 1)]
+        states = self.smoother.states(range(first, first + len(parts) + 1))
         gravity = np.concatenate([part.gravity_n for part in parts])
         epochs = successive([part.epochs for part in parts])
-        return trajectory_at(epochs, concatenated(each), P, gravity, self.start.frame, body_axes)
+        return trajectory_at(epochs, states, P, gravity, self.start.frame, body_axes)
 
     @property
     def _walk_root_psd(self) -> Array:

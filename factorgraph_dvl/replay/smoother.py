@@ -19,6 +19,7 @@ from scipy.linalg.lapack import dtrtri
 from factorgraph_dvl.geometry.vectors import Array, IntArray
 from factorgraph_dvl.graph import keys
 from factorgraph_dvl.graph.keys import BIAS_SIZE, STATE_SIZE
+from factorgraph_dvl.imu.propagation import States
 from factorgraph_dvl.sensors.parameters import Parameter
 
 # Steps after which a state is linearised anew: rad, m, m/s; chosen. Positions enter linearly, but
@@ -161,8 +162,22 @@ class Smoother:
         own = inverse[index]
         return np.asarray(own @ own.T)
 
-    def state_covariances(self, wanted: Sequence[int]) -> dict[int, Array]:
-        """Return covariances (9, 9) of states by index, given all that came since.
+    def states(self, wanted: Sequence[int]) -> States:
+        """Return the estimates of states, by their indices, with the biases there."""
+        each = [self.state(k) for k in wanted]
+        own = [self.bias_key(k) for k in wanted]
+        found = {key: self._isam.calculateEstimateConstantBias(key).vector() for key in set(own)}
+        bias = np.array([found[key] for key in own])
+        return States(
+            np.array([state.attitude().matrix() for state in each]),
+            np.array([state.position() for state in each]),
+            np.array([state.velocity() for state in each]),
+            gyro_bias=bias[:, 3:],
+            accel_bias=bias[:, :3],
+        )
+
+    def state_covariances(self, wanted: Sequence[int]) -> Array:
+        """Return covariances (K, 9, 9) of states, by their indices, given all that came since.
 
         From the newest state back: given the next one and what all states share, each is
 
@@ -205,13 +220,15 @@ class Smoother:
         inverse = np.linalg.inv(rows[:, :, :own])
         gain = -inverse @ rows[:, :, own:]
         noise = inverse @ inverse.transpose(0, 2, 1)
-        out = {nodes[-1]: P[:STATE_SIZE, :STATE_SIZE].copy()}
+        out = np.empty((len(nodes), STATE_SIZE, STATE_SIZE))
+        out[-1] = P[:STATE_SIZE, :STATE_SIZE]
         for j in range(len(rows) - 1, nodes.index(min(wanted)) - 1, -1):
             joint = gain[j] @ P
             P[:own, :own] = joint @ gain[j].T + noise[j]
             P[:own, own:], P[own:, :own] = joint[:, own:], joint[:, own:].T
-            out[nodes[j]] = P[:STATE_SIZE, :STATE_SIZE].copy()
-        return {k: 0.5 * (out[k] + out[k].T) for k in wanted}
+            out[j] = P[:STATE_SIZE, :STATE_SIZE]
+        found = out[[number[keys.node(k)] for k in wanted]]
+        return np.asarray(0.5 * (found + found.transpose(0, 2, 1)))
 
     def _top(self) -> list[int]:
         return [keys.node(self.node), self.bias_key(self.node), *self.calibration_keys.values()]
