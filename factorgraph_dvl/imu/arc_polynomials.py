@@ -17,7 +17,7 @@ from factorgraph_dvl.geometry.vectors import Array, IntArray
 from factorgraph_dvl.imu.polynomials import (
     highest_difference,
     interpolation,
-    regular_interpolation,
+    regular_interpolations,
 )
 
 # Relative spread of intervals up to which a stencil counts as regular. Chosen: far below what
@@ -156,11 +156,8 @@ class ArcPolynomials:
         intervals = (first + stencil)[:, None] + np.arange(width if self.averaged else width - 1)
         lengths = self.dt[intervals] / self.dt[index][:, None]
         uniform = np.all(np.abs(lengths - 1.0) < UNIFORM, axis=1)
-        out = np.empty((index.size, width, 6))
-        for shift in np.unique(offset[uniform]):
-            pick = uniform & (offset == shift)
-            matrix = regular_interpolation(lengths.shape[1] + 1, int(shift), self.averaged)
-            out[pick] = np.matmul(matrix, values[pick])
+        regular = regular_interpolations(lengths.shape[1] + 1, self.averaged)
+        out = np.matmul(regular[offset], values)
         rest = np.flatnonzero(~uniform)
         if rest.size:
             edges = np.zeros((rest.size, lengths.shape[1] + 1))

@@ -49,10 +49,10 @@ def interpolation(edges: Array, averaged: bool) -> Array:
 
 
 @lru_cache(maxsize=64)
-def regular_interpolation(count: int, shift: int, averaged: bool) -> Array:
-    """Return `interpolation` (K, K) at `count` edges one apart, from -shift on."""
-    edges = np.arange(count, dtype=float) - shift
-    return interpolation(edges[None], averaged)[0]
+def regular_interpolations(count: int, averaged: bool) -> Array:
+    """Return `interpolation` (S, K, K) at `count` edges one apart, from -s on for each s."""
+    edges = np.arange(count, dtype=float)
+    return interpolation(edges - edges[:-1, None], averaged)
 
 
 def powers(u: Array, count: int) -> Array:

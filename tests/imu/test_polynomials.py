@@ -11,7 +11,7 @@ from factorgraph_dvl.imu.polynomials import (
     integrate,
     interpolation,
     rate_and_slope,
-    regular_interpolation,
+    regular_interpolations,
 )
 
 
@@ -32,7 +32,7 @@ def test_samples_of_a_polynomial_give_its_coefficients(averaged):
 
 def test_regular_samples_have_one_matrix():
     expected = interpolation(np.array([[-1.0, 0.0, 1.0, 2.0]]), True)[0]
-    np.testing.assert_array_equal(regular_interpolation(4, 1, True), expected)
+    np.testing.assert_array_equal(regular_interpolations(4, True)[1], expected)
 
 
 def test_the_highest_difference_of_a_power_is_its_factorial():
