@@ -95,13 +95,17 @@ class ImuErrors:
         by = self._by[id(bound)]
         if at is not bound:
             by = moved(self._segments, at, bound, by, self._whole)
+        return self.without(at, by, errors)
+
+    def without(self, at: Attachment, by: Sensitivity, errors: Array) -> Attachment:
+        """Return an attachment without the errors (n,), which move it by its sensitivity."""
         return corrected(at, by, self._elements, errors)
 
     def columns(
-        self, lin: Linearization, transition: Transition, bound: Attachment
+        self, lin: Linearization, transition: Transition, by: Sensitivity
     ) -> dict[str, Array]:
         """Return derivatives of measurements with respect to the errors, (M, d, n_i) by name."""
-        every = by_errors(lin, transition, self._by[id(bound)], self._elements)
+        every = by_errors(lin, transition, by, self._elements)
         parts = np.split(every, np.cumsum(self._sizes)[:-1], axis=2)
         return dict(zip(self.names, parts, strict=True))
 

@@ -12,11 +12,13 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from itertools import pairwise, zip_longest
 
 import gtsam
 import numpy as np
 
 from factorgraph_dvl.geometry.earth import LocalFrame
+from factorgraph_dvl.geometry.records import rows_of
 from factorgraph_dvl.geometry.rotations import BodyAxes
 from factorgraph_dvl.geometry.vectors import Array, BoolArray, IntArray
 from factorgraph_dvl.graph import keys
@@ -71,6 +73,10 @@ _EXTRAPOLATED = 1e-3
 _SAME_WEIGHT = 0.2
 
 
+# Measurements whose rows are found at once. Chosen: some ten megabytes.
+_CHUNK = 4000
+
+
 @dataclass(eq=False)
 class _Bound:
     """An observation tied to the chain; `usable` measurements (M,) are covered by the IMU.
@@ -87,13 +93,13 @@ class _Bound:
 
 
 @dataclass(frozen=True)
-class _RowsByFactor:
-    """Rows of an observation, sorted by `order` if they are not, and their places in factors.
+class _Part:
+    """Some measurements of an observation, and the places of their rows in factors.
 
-    Each place is the index of a factor, rows there, and rows of the observation.
+    Each place is the index of a factor, rows there, and rows of these measurements.
     """
 
-    order: IntArray | None
+    measurements: slice | IntArray
     places: list[tuple[int, slice, slice]]
 
 
@@ -101,14 +107,14 @@ class _RowsByFactor:
 class _Block:
     """Observations with the same variables: one factor per set of nodes for all of them.
 
-    `rows` has, by observation, which of its rows go to which of the factors, and where.
+    `parts` has, by observation, which of its rows go to which of the factors, and where.
     `matrices` and `vectors` are views into `factors` and live no longer than they do.
     """
 
     bound: list[_Bound]
     parameters: tuple[Parameter, ...]
     correlated: int | None = None
-    rows: list[_RowsByFactor] = field(default_factory=list)
+    parts: list[list[_Part]] = field(default_factory=list)
     factors: list[gtsam.JacobianFactor] = field(default_factory=list)
     matrices: list[Array] = field(default_factory=list)
     vectors: list[Array] = field(default_factory=list)
@@ -501,35 +507,47 @@ class Problem:
         Its measurement factors are written in place at the next call.
         """
         gaussian = self.native(evaluation)
-        transitions = self._transitions(evaluation)
         for block in self._blocks:
             if not block.factors:
                 self._lay_out(block)
-            for bound, rows in zip(block.bound, block.rows, strict=True):
-                matrix, vector = self._jacobian(bound, block.parameters, transitions, evaluation)
-                matrix, vector = matrix.reshape(-1, matrix.shape[2]), -vector.ravel()
-                if rows.order is not None:
-                    matrix, vector = matrix[rows.order], vector[rows.order]
-                for factor_index, there, here in rows.places:
-                    block.matrices[factor_index][there] = matrix[here]
-                    block.vectors[factor_index][there] = vector[here]
+            self._fill(block, evaluation)
             for factor in block.factors:
                 gaussian.push_back(factor)
         return gaussian
 
+    def _fill(self, block: _Block, evaluation: Evaluation) -> None:
+        """Write the rows of a block into its factors, some measurements at a time."""
+        linear = [self._linearized(bound, block.parameters, evaluation) for bound in block.bound]
+        for parts in zip_longest(*block.parts):
+            transitions: dict[int, Transition] = {}
+            for bound, lin, part in zip(block.bound, linear, parts, strict=True):
+                if part is None:
+                    continue
+                some = part.measurements
+                matrix, vector = self._jacobian(
+                    bound, block.parameters, lin, some, evaluation, transitions
+                )
+                matrix, vector = matrix.reshape(-1, matrix.shape[2]), -vector.ravel()
+                for factor_index, there, here in part.places:
+                    block.matrices[factor_index][there] = matrix[here]
+                    block.vectors[factor_index][there] = vector[here]
+
     def release(self) -> None:
         """Free the factors of measurements; the next linearisation makes others."""
         for block in self._blocks:
-            block.rows, block.matrices, block.vectors, block.factors = [], [], [], []
+            block.parts, block.matrices, block.vectors, block.factors = [], [], [], []
         if self._imu_errors is not None:
             self._imu_errors.release()
 
     def observation_rows(self, evaluation: Evaluation) -> Iterator[Rows]:
         """Yield the rows of each observation, unused ones included: these are zero."""
-        transitions = self._transitions(evaluation)
+        transitions: dict[int, Transition] = {}
         for block in self._blocks:
             for bound in block.bound:
-                matrix, vector = self._jacobian(bound, block.parameters, transitions, evaluation)
+                lin = self._linearized(bound, block.parameters, evaluation)
+                matrix, vector = self._jacobian(
+                    bound, block.parameters, lin, slice(None), evaluation, transitions
+                )
                 o, sizes = bound.observation, tuple(self._sizes(block))
                 variables = self._keys_at(block, self._nodes_of(bound))
                 yield Rows(o.label, o.components, variables, sizes, matrix, vector)
@@ -664,21 +682,25 @@ class Problem:
         used = nodes[index]
         counts = np.zeros(len(used), dtype=int)
         edges = np.cumsum([b.observation.time.size for b in block.bound])[:-1]
-        block.rows = []
+        block.parts = []
         for bound, own in zip(block.bound, np.split(place, edges), strict=True):
             d = len(bound.observation.components)
             order = np.argsort(own, kind="stable")
             present, first, count = np.unique(own[order], return_index=True, return_counts=True)
-            there = counts[present]
-            places = zip(
-                present.tolist(),
-                map(slice, there.tolist(), (there + d * count).tolist()),
-                map(slice, (d * first).tolist(), (d * (first + count)).tolist()),
-                strict=True,
-            )
-            in_order = np.all(np.diff(order) == 1)
-            rows = None if in_order else (d * order[:, None] + np.arange(d)).ravel()
-            block.rows.append(_RowsByFactor(rows, list(places)))
+            in_order = bool(np.all(np.diff(order) == 1))
+            parts = []
+            for a, b in pairwise(_part_edges(first, own.size)):
+                whole = slice(int(first[a]), int(first[b - 1] + count[b - 1]))
+                begin, there = d * (first[a:b] - first[a]), counts[present[a:b]]
+                rows = d * count[a:b]
+                places = zip(
+                    present[a:b].tolist(),
+                    map(slice, there.tolist(), (there + rows).tolist()),
+                    map(slice, begin.tolist(), (begin + rows).tolist()),
+                    strict=True,
+                )
+                parts.append(_Part(whole if in_order else order[whole], list(places)))
+            block.parts.append(parts)
             counts[present] += d * count
         sizes = self._sizes(block)
         block.matrices, block.vectors, block.factors = [], [], []
@@ -714,52 +736,83 @@ class Problem:
             out += [self.processes[block.correlated].size] * 2
         return out + [p.mean.size for p in block.parameters]
 
-    def _transitions(self, evaluation: Evaluation) -> dict[int, Transition]:
-        """Return the transitions from the nodes to the times of each motion, by its identity."""
-        rate = self.chain.frame.earth_rate
-        out: dict[int, Transition] = {}
-        for bound, motion in zip(self._bound, evaluation.motions, strict=True):
-            if id(motion) not in out:
-                at = self._corrected(bound, bound.attachment, evaluation.parameters)
-                out[id(motion)] = Transition(at, evaluation.states, motion, rate)
-        return out
+    def _linearized(
+        self, bound: _Bound, parameters: Sequence[Parameter], evaluation: Evaluation
+    ) -> Linearization:
+        """Return an observation linearised at an evaluation."""
+        motion = evaluation.motions[self._bound.index(bound)]
+        wanted = [p.name for p in parameters]
+        return linearized(
+            bound.observation, motion, evaluation.parameters, wanted, self.clock_zero
+        )
 
     def _jacobian(
         self,
         bound: _Bound,
         parameters: Sequence[Parameter],
-        transitions: dict[int, Transition],
+        lin: Linearization,
+        some: slice | IntArray,
         evaluation: Evaluation,
+        transitions: dict[int, Transition],
     ) -> tuple[Array, Array]:
-        """Return the whitened Jacobian (M, d, n) and residual (M, d) of an observation.
+        """Return the whitened Jacobian (M, d, n) and residual (M, d) of some measurements.
 
-        Columns: state, bias, correlated error, parameters.
+        Columns: state, bias, correlated error, parameters. `transitions` to the times of each
+        motion, by its identity, are kept for other observations there.
         """
-        transition = transitions[id(evaluation.motions[self._bound.index(bound)])]
-        wanted = [p.name for p in parameters]
-        lin = linearized(
-            bound.observation,
-            transition.motion,
-            evaluation.parameters,
-            wanted,
-            self.clock_zero,
-        )
+        lin = _of_some(lin, some)
+        motion = evaluation.motions[self._bound.index(bound)]
+        attachment = rows_of(bound.attachment, some)
+        errors = self._imu_errors
+        by = None if errors is None else rows_of(errors.sensitivity(bound.attachment), some)
+        if id(motion) not in transitions:
+            at = attachment
+            if errors is not None and by is not None:
+                at = errors.without(at, by, errors.vector(evaluation.parameters))
+            transitions[id(motion)] = Transition(
+                at, evaluation.states, rows_of(motion, some), self.chain.frame.earth_rate
+            )
+        transition = transitions[id(motion)]
         found = dict(lin.d_parameters)
-        if self._imu_errors is not None:
-            found |= self._imu_errors.columns(lin, transition, bound.attachment)
+        if errors is not None and by is not None:
+            found |= errors.columns(lin, transition, by)
         state, others = node_jacobian(lin, transition), [found[p.name] for p in parameters]
         by_nodes: list[Array] = []
         residual = lin.residual
         if bound.correlated is not None:
-            process, time = self.processes[bound.correlated], bound.observation.time
+            process, time = self.processes[bound.correlated], bound.observation.time[some]
             nodes = evaluation.parameters[process.name]
             gain = process.gain(nodes, time)[..., None]
             by_nodes = process.jacobians(residual, time)
             state, others = gain * state, [gain * each for each in others]
             residual = process.with_error(residual, nodes, time)
         full = np.concatenate([state, *by_nodes, *others], axis=2)
-        full *= bound.weight[:, :, None]
-        return full, bound.weight * residual
+        weight = bound.weight[some]
+        full *= weight[:, :, None]
+        return full, weight * residual
+
+
+def _part_edges(first: IntArray, count: int) -> list[int]:
+    """Return where parts of some measurements begin and end, by the first ones of factors."""
+    begins = np.searchsorted(first, np.arange(0, count, _CHUNK))
+    return np.unique(np.append(begins, first.size)).tolist()
+
+
+def _of_some(lin: Linearization, some: slice | IntArray) -> Linearization:
+    """Return the derivatives of some of M measurements."""
+    count = len(lin.residual)
+
+    def own(each: Array) -> Array:
+        # What is the same for all stands there once.
+        return np.asarray(np.broadcast_to(each, (count, *each.shape[1:]))[some])
+
+    by_motion = {
+        name: own(each)
+        for name in ("d_theta", "d_p", "d_v", "d_omega")
+        if (each := getattr(lin, name)) is not None
+    }
+    by_parameters = {name: own(each) for name, each in lin.d_parameters.items()}
+    return Linearization(lin.residual[some], **by_motion, d_parameters=by_parameters)
 
 
 def node_jacobian(lin: Linearization, transition: Transition) -> Array:

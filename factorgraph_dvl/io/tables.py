@@ -148,7 +148,7 @@ def write_table(path: Path, columns: Mapping[str, NDArray[Any]]) -> None:
     """
     table = pa.table(
         {
-            name: pa.array(values.tolist(), pa.string())
+            name: pa.array(values, pa.string())
             if values.dtype.kind == "U"
             else pa.array(values, pa.float64(), from_pandas=True)
             for name, values in columns.items()

@@ -178,8 +178,11 @@ def factorized(
     problem: Problem, evaluation: Evaluation
 ) -> tuple[SquareRootInformation, gtsam.VectorValues]:
     """Return the square-root information from QR at some values, and the step to the minimum."""
-    gaussian = problem.linearize(evaluation)
-    out = eliminated(gaussian, problem.ordering(gaussian), evaluation.values.dims())
+    gaussian = [problem.linearize(evaluation)]
+    ordering = problem.ordering(gaussian[0])
+    # Nothing else holds the factors then, so that each goes once it is eliminated.
+    problem.release()
+    out = eliminated(gaussian.pop(), ordering, evaluation.values.dims())
     return out, out.solution()
 
 

@@ -233,7 +233,10 @@ def eliminated(
     sizes : mapping of int to int
         Dimension of every variable by key.
     """
-    return SquareRootInformation(_trees(gaussian, ordering), sizes)
+    trees = _trees(gaussian, ordering)
+    # Factors that nobody else holds go once they are eliminated.
+    del gaussian
+    return SquareRootInformation(trees, sizes)
 
 
 def _trees(

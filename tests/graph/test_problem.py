@@ -14,6 +14,7 @@ from factorgraph_dvl.graph import keys
 from factorgraph_dvl.graph.clocks import parameters_of, true_time
 from factorgraph_dvl.sensors.imu import ERRORS
 from factorgraph_dvl.simulation import simulate
+from factorgraph_dvl.solvers.levenberg_marquardt import factorized
 
 
 def measurement_factors(problem, gaussian):
@@ -60,6 +61,28 @@ def test_released_factors_come_back_the_same():
     after = jacobians(problem, evaluation)
     for a, b in zip(before, after, strict=True):
         np.testing.assert_array_equal(a, b)
+
+
+def test_rows_of_some_measurements_at_a_time_are_those_of_all(monkeypatch):
+    problem, values = problem_of(scenario(manoeuvres=SHORT, trial=ALL_FREE | {"imu": IMU_ERRORS}))
+    problem.weigh(problem.evaluate(values))
+    evaluation = problem.evaluate(values)
+    at_once = jacobians(problem, evaluation)
+    problem.release()
+    monkeypatch.setattr("factorgraph_dvl.graph.problem._CHUNK", 7)
+    in_parts = jacobians(problem, evaluation)
+    for a, b in zip(at_once, in_parts, strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_nothing_holds_factors_that_are_eliminated():
+    problem, values = problem_of(scenario(manoeuvres=SHORT))
+    problem.weigh(problem.evaluate(values))
+    evaluation = problem.evaluate(values)
+    before = factorized(problem, evaluation)[1]
+    assert not any(block.factors for block in problem._blocks)
+    after = factorized(problem, evaluation)[1]
+    assert after.equals(before, 0.0)
 
 
 @pytest.mark.parametrize("kind", ["constant", "walking", "IMU errors"])
