@@ -282,9 +282,8 @@ class Trial:
                 "the trial has no IMU, which this command needs",
                 where="trial.yaml",
                 expected="an imu section",
-                hint="`inspect`, `solve`, `replay`, `observability`, `deadreckon` and "
-                "`crosscheck` accept `ins` or `attitude` in its place. Some methods of "
-                "`kalman` do as well",
+                hint="Other commands and some methods of `kalman` accept `ins` or `attitude` "
+                "in its place",
             )
         return self.imu
 

@@ -94,8 +94,6 @@ def _view(
     from factorgraph_dvl.solvers.information_along_trial import solve_with_history
 
     solution, history = solve_with_history(trial, anyway=anyway, progress=progress)
-    if history is None:
-        return solution, look(solution, given=given)
     return solution, look(solution, trial=trial, history=history, given=given)
 
 

@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 
@@ -34,6 +35,9 @@ _WEAKER = 100.0
 # Share of the current on which the motion over ground does not depend, and its standard deviation.
 # Chosen: all of it if a vessel keeps its track, none if it drifts, any in between as likely.
 _TRACK, TRACK_STD = 0.5, 12.0**-0.5
+# Least inverse standard deviation of the states of the first node, 1/m and s/m, where early nodes
+# are eliminated before a position is known. Chosen: digits stay, and fixes of 10 m lose 1 %.
+_FIRST_NODE = 1e-2
 # Least share of a residual's variance that its fit leaves. Chosen: below it rounding decides.
 _LEAST_LEFT = 0.02
 
@@ -417,6 +421,37 @@ class MotionProblem:
         out.add_steps(rows.before, rows.after, rows.residual)
         self._add_first(out, evaluation.states)
         return out.without_first(node).first_alone()
+
+    def constants_along(
+        self, evaluation: MotionEvaluation, nodes: Sequence[int]
+    ) -> Iterator[Array]:
+        """Yield covariances (c, c) of the constants by all that came before each of some nodes.
+
+        Parameters
+        ----------
+        evaluation : MotionEvaluation
+            Linearised there.
+        nodes : sequence of int
+            Increasing, from 1 on.
+        """
+        measured, motion = list(self.rows(evaluation)), self.motion_rows(evaluation.states)
+        known = NormalEquations(1, self.chain.size, self.constants)
+        known.diagonal[0] = np.diag(np.maximum(self.chain.first(), _FIRST_NODE) ** 2)
+        if self.parameters:
+            gain = np.linalg.inv(self.prior_root)
+            known.corner = gain.T @ gain
+        for a, b in pairwise((0, *nodes)):
+            part = NormalEquations(b - a + 1, self.chain.size, self.constants)
+            part.diagonal[0], part.border[0] = known.diagonal[0], known.border[0]
+            part.corner[:] = known.corner
+            for rows in measured:
+                own = (rows.node >= a) & (rows.node < b)
+                each = (rows.before, rows.after, rows.constants, rows.residual)
+                part.add(rows.node[own] - a, *(values[own] for values in each))
+            steps = slice(a, b)
+            part.add_steps(motion.before[steps], motion.after[steps], motion.residual[steps])
+            known = part.without_first(b - a)
+            yield known.factorise().constants
 
     def deviance(self, evaluation: MotionEvaluation) -> Callable[[MotionChain], float]:
         """Return twice the negative logarithm of the restricted likelihood, but for a constant.

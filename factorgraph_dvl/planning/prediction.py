@@ -16,7 +16,9 @@ from factorgraph_dvl.simulation import plan_motion, simulate
 from factorgraph_dvl.simulation.motion import TrueMotion
 from factorgraph_dvl.simulation.scenario import AngularSway, Heave, Scenario, StartSettings
 from factorgraph_dvl.solution import Solution
-from factorgraph_dvl.solvers.information_along_trial import Frontier
+from factorgraph_dvl.solvers.information_along_trial import RATE_HZ, Frontier
+from factorgraph_dvl.solvers.motion_information import motion_history, predict_motion
+from factorgraph_dvl.solvers.motion_summary import summarise_motion
 from factorgraph_dvl.solvers.prediction import TrueStates, continue_posterior, predict_posterior
 from factorgraph_dvl.statistics.information_history import InformationHistory
 from factorgraph_dvl.trial import Trial
@@ -35,13 +37,13 @@ class Ending:
         Position, heading and speed at the end.
     time : float
         Time since the start of the plan, s, for the phase of the sway.
-    frontier : Frontier
-        Posterior at the end.
+    frontier : Frontier or None
+        Posterior at the end; None without IMU, where the whole plan is predicted anew.
     """
 
     start: StartSettings
     time: float
-    frontier: Frontier
+    frontier: Frontier | None
 
 
 @dataclass(frozen=True)
@@ -85,10 +87,17 @@ def predict(scenario: Scenario) -> Prediction:
     >>> prediction.solution.estimate("misalignment_deg").std.round(2)
     array([0.03, 0.06, 0.02])
     """
-    scenario = msgspec.structs.replace(scenario, noise=False)
+    recorded, scenario = scenario, msgspec.structs.replace(scenario, noise=False)
     motion = plan_motion(scenario)
     trial = simulate(scenario)
-    solution, history, frontier = predict_posterior(trial, _true_states(motion, trial))
+    true_states = _true_states(motion, trial)
+    frontier: Frontier | None = None
+    if trial.imu is None:
+        found = predict_motion(trial, simulate(recorded), true_states)
+        solution = summarise_motion(trial, found, rate_hz=RATE_HZ)
+        history = motion_history(found)
+    else:
+        solution, history, frontier = predict_posterior(trial, true_states)
     return Prediction(
         scenario=scenario,
         trial=trial,
@@ -107,7 +116,7 @@ def extend(
     Parameters
     ----------
     scenario : Scenario
-        Scenario of the plan, with its sway and sensors.
+        Scenario of the plan, with its sway and sensors, an IMU among them.
     manoeuvres : list of dict of str to object
         Manoeuvres to add, as in a scenario.
     ending : Ending
@@ -145,7 +154,9 @@ def extend(
     )
     motion = plan_motion(further)
     trial = simulate(further)
-    history, frontier = continue_posterior(trial, _true_states(motion, trial), ending.frontier)
+    start = ending.frontier
+    assert start is not None
+    history, frontier = continue_posterior(trial, _true_states(motion, trial), start)
     return history, _ending(motion, frontier, ending.time)
 
 
@@ -154,7 +165,7 @@ def _later(part: AngularSway | Heave, time: float) -> AngularSway | Heave:
     return msgspec.structs.replace(part, phase_deg=phase % 360.0)
 
 
-def _ending(motion: TrueMotion, frontier: Frontier, before: float) -> Ending:
+def _ending(motion: TrueMotion, frontier: Frontier | None, before: float) -> Ending:
     end = np.array([motion.duration])
     state = motion.at(end)
     # The mean motion, to which sway is added again.
@@ -169,8 +180,9 @@ def _ending(motion: TrueMotion, frontier: Frontier, before: float) -> Ending:
 
 
 def _true_states(motion: TrueMotion, trial: Trial) -> TrueStates:
-    gyro = trial.calibration_truth["gyro_bias_deg_h"] * DEG_PER_HOUR
-    accel = trial.calibration_truth["accel_bias_ug"] * MICRO_G
+    none = np.zeros(3)
+    gyro = trial.calibration_truth.get("gyro_bias_deg_h", none) * DEG_PER_HOUR
+    accel = trial.calibration_truth.get("accel_bias_ug", none) * MICRO_G
 
     def states(frame: LocalFrame, time: Array) -> States:
         state = motion.at(np.clip(time, 0.0, motion.duration))

@@ -109,14 +109,16 @@ class _Search:
     tried: dict[tuple[int, ...], _Tried | None] = field(default_factory=dict)
 
     @property
-    def walking(self) -> bool:
-        """Whether a requirement is on a random walk, which only a whole prediction contains."""
-        return not {r.component for r in self.required} <= set(self.prediction.history.names)
+    def from_start(self) -> bool:
+        """Whether only a prediction from the start has it all: without IMU, or of random walks."""
+        known = set(self.prediction.history.names)
+        no_imu = self.prediction.ending.frontier is None
+        return no_imu or not {r.component for r in self.required} <= known
 
     @property
     def left(self) -> int:
         """Number of sequences that may still be tried."""
-        return (_MAX_PREDICTED if self.walking else _MAX_TRIED) - len(self.tried)
+        return (_MAX_PREDICTED if self.from_start else _MAX_TRIED) - len(self.tried)
 
     def chosen(self, items: tuple[int, ...]) -> list[Item]:
         """Return the entries of a sequence, with the one to get under way."""
@@ -131,7 +133,7 @@ class _Search:
         """Try a sequence whose beginning was tried; None if it cannot be carried out."""
         if items not in self.tried:
             try:
-                self.tried[items] = self._whole(items) if self.walking else self._last(items)
+                self.tried[items] = self._whole(items) if self.from_start else self._last(items)
             except ConfigError:
                 self.tried[items] = None
             if self.progress:

@@ -30,7 +30,7 @@ from factorgraph_dvl.solvers.minima import (
     evidence_against,
 )
 from factorgraph_dvl.solvers.motion_preparation import prepare_motion
-from factorgraph_dvl.solvers.motion_smoother import smooth_motion
+from factorgraph_dvl.solvers.motion_smoother import SmoothedMotion, smooth_motion
 from factorgraph_dvl.solvers.motion_summary import summarise_motion
 from factorgraph_dvl.solvers.preparation import Preparation, prepare
 from factorgraph_dvl.solvers.rounds import SettledMinimum, settle
@@ -103,24 +103,23 @@ def solve_with_problem(
     anyway: bool = False,
     progress: Progress | None = None,
     stages: Stages | None = None,
-) -> tuple[Solution, SolvedProblem | None]:
+) -> tuple[Solution, SolvedProblem | SmoothedMotion]:
     """Return the solution of a trial, and its problem at the most probable minimum.
 
-    There is none for a trial without IMU. Parameters and errors are those of `solve`; in `stages`
-    results of alignment and mounting are kept, and taken from.
+    Parameters and errors are those of `solve`; in `stages` results of alignment and mounting are
+    kept, and taken from.
     """
     _check_above_zero("rate_hz", rate_hz)
     _check_above_zero("state_interval_s", state_interval_s)
     # What a trial without positions lacks comes before what is odd in its records.
     trial.frame()
     errors = accepted_errors(survey(trial), anyway=anyway)
-    solved: SolvedProblem | None = None
+    solved: SolvedProblem | SmoothedMotion
     with explained(errors):
         report = progress or _silent
         if trial.imu is None:
-            found = summarise_motion(
-                trial, smooth_motion(prepare_motion(trial), report), rate_hz=rate_hz
-            )
+            solved = smooth_motion(prepare_motion(trial), report)
+            found = summarise_motion(trial, solved, rate_hz=rate_hz)
         else:
             found, solved = _most_probable(trial, rate_hz, state_interval_s, report, stages)
     return found.with_findings(errors), solved

@@ -27,6 +27,8 @@ from factorgraph_dvl.solution import Progress, Solution
 from factorgraph_dvl.solvers.batch import solve_with_problem
 from factorgraph_dvl.solvers.calibration import prior_along, reported
 from factorgraph_dvl.solvers.fixed_directions import SolvedProblem
+from factorgraph_dvl.solvers.motion_information import motion_history
+from factorgraph_dvl.solvers.motion_smoother import SmoothedMotion
 from factorgraph_dvl.solvers.stages import Stages
 from factorgraph_dvl.statistics.information_history import InformationHistory
 from factorgraph_dvl.statistics.spurious_information import spurious_information
@@ -64,19 +66,19 @@ def solve_with_history(
     anyway: bool = False,
     progress: Progress | None = None,
     stages: Stages | None = None,
-) -> tuple[Solution, InformationHistory | None]:
+) -> tuple[Solution, InformationHistory]:
     """Solve a trial, and follow the information on its constants along it.
 
-    There is no history of a trial without IMU. Parameters and errors as of `solvers.batch.solve`,
-    and `stages` as of `solve_with_problem`; `entries` as of `information_history`.
+    Parameters and errors as of `solvers.batch.solve`, and `stages` as of `solve_with_problem`;
+    `entries` as of `information_history`.
     """
     solution, solved = solve_with_problem(
         trial, rate_hz=rate_hz, anyway=anyway, progress=progress, stages=stages
     )
-    if solved is None:
-        return solution, None
     if progress:
         progress("information along the trial", 0, None)
+    if isinstance(solved, SmoothedMotion):
+        return solution, motion_history(solved, entries=entries)
     return solution, information_history(solved, entries=entries)
 
 

@@ -102,7 +102,7 @@ def test_outliers_are_left_out(ship, played):
     velocity = ship.dvl.velocity.copy()
     # After the last batch solution.
     velocity[150] += 3.0
-    solution, _ = replay(replace(ship, dvl=replace(ship.dvl, velocity=velocity)), rate_hz=0.2)
+    solution, _ = replay(replace(ship, dvl=replace(ship.dvl, velocity=velocity)), rate_hz=0.1)
     moved, _ = far_apart(solution, played[0])
     assert moved < 0.3
     (found,) = (f for f in solution.findings if f.code == Code.UNUSED)
@@ -116,7 +116,7 @@ def test_a_lag_is_all_that_there_is(ship):
 
 def test_gaps_of_pings_are_bridged(ship):
     kept = (ship.dvl.time < 90.0) | (ship.dvl.time > 120.0)
-    solution, record = replay(replace(ship, dvl=rows_of(ship.dvl, kept)), rate_hz=0.2)
+    solution, record = replay(replace(ship, dvl=rows_of(ship.dvl, kept)), rate_hz=0.1)
     assert solution.converged
     assert np.diff(record.time).max() < 45.0
 
