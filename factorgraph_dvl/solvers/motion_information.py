@@ -66,7 +66,7 @@ def predict_motion(
     trial : Trial
         Its records without noise, its true calibration, and the noise that it claims.
     recorded : Trial
-        The same with noise, which tells the white noise of the attitude, as no trial claims it.
+        The same with noise, from which the white noise of the attitude comes: no trial claims it.
     true_states : callable
         Returns the states at (K,) times in a frame.
     """
