@@ -43,11 +43,14 @@ class CorrelatedNoise:
         By label, factors (d,) on the standard deviations of the white noise that is left.
     long_run : mapping of str to ndarray
         By label, factors (d,) on standard deviations for noise that persists for seconds.
+    gain : float
+        Fall of -2 log likelihood by what is not stated, against white noise alone.
     """
 
     processes: tuple[Process, ...]
     factors: dict[str, Array]
     long_run: dict[str, Array]
+    gain: float
 
 
 def correlated_noise(
@@ -67,6 +70,7 @@ def correlated_noise(
     processes: list[Process] = []
     factors: dict[str, Array] = {}
     long_run: dict[str, Array] = {}
+    gain = 0.0
     for i, o in enumerate(problem.observations):
         weight = problem.weights[i]
         used = weight > 0.0
@@ -89,13 +93,14 @@ def correlated_noise(
                 rms = np.sqrt(np.nanmean(residuals**2, axis=0))
                 process, white, inflation = _model(o, found, sigma, rms, when, len(processes))
                 factors[o.label] = white
+                gain += sum(fit.gain for fit in found.values())
                 if (inflation != 1.0).any():
                     long_run[o.label] = inflation
         if o.scale_walk is not None and np.ptp(when) > 0.0:
             process = _walking(process, o.label, len(processes), o.scale_walk, sigma, when)
         if process is not None:
             processes.append(process)
-    return CorrelatedNoise(tuple(processes), factors, long_run)
+    return CorrelatedNoise(tuple(processes), factors, long_run, gain)
 
 
 def _walking(

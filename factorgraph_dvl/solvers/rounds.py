@@ -21,6 +21,7 @@ from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.sensors.message import Message, message
 from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.solution import Progress
+from factorgraph_dvl.solvers.change_along_trial import CHANGED, component_changes
 from factorgraph_dvl.solvers.correlated_noise import (
     correlated_noise,
     long_run_share,
@@ -228,6 +229,9 @@ def settle(
         if not changing and not correlation_searched and minimum.converged:
             correlation_searched = True
             found = correlated_noise(problem, minimum.evaluation, as_stated)
+            if found.gain > 0.0 and _changes_explain_more(problem, minimum, found.gain):
+                # Noise that persists would take the place of what changed.
+                found = correlated_noise(problem, minimum.evaluation, ())
             if found.processes or found.long_run:
                 changing.append(_CORRELATED)
                 long_run = found.long_run
@@ -278,6 +282,13 @@ def settle(
     converged = minimum.converged and not changing
     minimum = replace(minimum, converged=converged, iterations=iterations)
     return SettledMinimum(problem, minimum, not changing, findings)
+
+
+def _changes_explain_more(problem: Problem, minimum: Minimum, gain: float) -> bool:
+    """Whether a parameter that changed along the trial explains more than correlated noise."""
+    information = minimum.square_root or factorized(problem, minimum.evaluation)[0]
+    tests = component_changes(problem, minimum.evaluation, information)
+    return max((t.change.chi2 for t in tests), default=0.0) > max(gain, CHANGED**2)
 
 
 @dataclass(frozen=True)

@@ -7,12 +7,18 @@ from dataclasses import replace
 import msgspec
 import numpy as np
 import pytest
+import yaml
 from monte_carlo import RUNS, rms_band
 from problems import SHORT, problem_of
-from truth import scenario
+from truth import CONFIGS, scenario
 
-from factorgraph_dvl.simulation import simulate
-from factorgraph_dvl.simulation.faults import dvl_scale_walk, gauss_markov, with_faults
+from factorgraph_dvl.simulation import parse_scenario, simulate
+from factorgraph_dvl.simulation.faults import (
+    clock_step,
+    dvl_scale_walk,
+    gauss_markov,
+    with_faults,
+)
 from factorgraph_dvl.solvers.batch import solve
 from factorgraph_dvl.solvers.correlated_noise import correlated_noise
 
@@ -157,3 +163,16 @@ def test_nodes_reach_as_far_as_the_outliers():
     assert not problem.weights[0][:10].any()
     (process,) = correlated_noise(problem, problem.evaluate(values), ()).processes
     assert process.time[[0, -1]] == pytest.approx(time[[0, -1]])
+
+
+@pytest.mark.slow
+def test_a_clock_that_jumps_under_water_is_no_correlated_noise():
+    """All fixes after a dive are 1 s late: noise that persists would explain it too."""
+    dive = yaml.safe_load((CONFIGS / "dive.yaml").read_text(encoding="utf-8"))
+    next(m for m in dive["manoeuvres"] if "repeat" in m)["repeat"] = 1
+    dive["gnss"]["outages_s"] = [[305, 1080]]
+    dive |= {"trial": {}, "dvl": dive["dvl"] | {"no_lock_s": []}}
+    trial = with_faults(simulate(parse_scenario(dive), 0), [clock_step("gnss", 1.0)])
+    solution = solve(trial, rate_hz=1.0)
+    assert solution.verdict.grade == "do not use"
+    assert (solution.verdict.reasons[0].parameter or "").startswith("gnss_")
