@@ -177,7 +177,7 @@ class SampleBuffer:
             The segment; the gap that follows the start at once; None if the samples have not
             come so far.
         """
-        t = self._table[:, 0]
+        t = np.ascontiguousarray(self._table[:, 0])
         gap = self.gap_after(start)
         count = t.size if gap is None else int(np.searchsorted(t, gap.before, side="right"))
         complete = end or gap is not None

@@ -265,9 +265,9 @@ class Imu:
 
     def __post_init__(self) -> None:
         check_times(self.time, self.source)
-        rate, force = (np.abs(signal).max(initial=0.0) for signal in (self.gyro, self.accel))
-        # Not a number is not below a limit either.
-        if rate <= _MAX_RATE_RAD_S and force <= _MAX_FORCE_M_S2:
+        # Not a number is within no limits either.
+        limits = (self.gyro, _MAX_RATE_RAD_S), (self.accel, _MAX_FORCE_M_S2)
+        if all(-limit <= signal.min() and signal.max() <= limit for signal, limit in limits):
             return
         gyro = named_columns(COLUMNS[1:4], self.gyro)
         accel = named_columns(COLUMNS[4:7], self.accel)

@@ -104,7 +104,7 @@ class ParameterSpec:
             for label in self.labels
         )
 
-    @property
+    @cached_property
     def si(self) -> float:
         """SI value of one reported unit."""
         return UNITS[self.unit].si

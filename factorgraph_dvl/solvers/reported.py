@@ -41,13 +41,13 @@ class Reported:
 
 def in_unit(p: Parameter, value: Array) -> Reported:
     """Return a parameter as it is reported, from its value in SI or its rotation matrix."""
-    derivative = np.eye(p.mean.size)
+    si, derivative = p.si, np.eye(p.mean.size)
     if p.rotation:
         value = reported_rotation_vector(value, p.mean)
         derivative = inverse_right_jacobian(value)
     elif p.spec.kind == "angle":
         value = wrapped(value)
-    return Reported(p, value / p.si, derivative / p.si)
+    return Reported(p, value / si, derivative / si)
 
 
 def in_order(rows: Iterable[_Row], parameter: Callable[[_Row], Parameter]) -> list[_Row]:
