@@ -26,6 +26,7 @@ ELSEWHERE = {
     "cli/report": "report",
     "cli/*": "cli/test_app.py",
     "geometry/celestial": "sensors/test_star.py",
+    "geometry/records": "graph/test_problem.py",
     "geometry/units": "settings/test_ranges.py",
     "graph/bordered_chain": "graph/test_motion_chain.py",
     "graph/clocks": "solvers/test_clocks.py",
