@@ -140,8 +140,7 @@ class Increments(ArcPolynomials):
         dt = self.dt[index]
         u = since / dt
         phi, dv = integrate(c, dt, u)
-        omega, alpha = self._blended_rate(index, since, c)
-        force = evaluate(c, u)[:, 3:]
+        omega, alpha, force = (np.empty((index.size, 3)) for _ in range(3))
         # A step or a vibration leaves high differences, a smooth motion almost none; what
         # the gyro's noise accounts for is in its own standard deviation already.
         rough = np.abs(self.difference_at(index))
@@ -153,10 +152,14 @@ class Increments(ArcPolynomials):
             mine = np.flatnonzero(self.arc_of[index] == arc)
             omega_sigma[mine], alpha_sigma[mine] = rates.sigma, rates.slope_sigma
             force_sigma[mine] = forces.sigma
-            if rates.spline is not None:
+            if rates.spline is None:
+                omega[mine], alpha[mine] = self._blended_rate(index[mine], since[mine], c[mine])
+            else:
                 omega[mine], alpha[mine], misfit = rates.at(time[mine])
                 unresolved[mine] = np.hypot(unresolved[mine], misfit)
-            if forces.spline is not None:
+            if forces.spline is None:
+                force[mine] = evaluate(c[mine, :, 3:], u[mine])
+            else:
                 force[mine] = forces.spline(time[mine])
         return Partial(
             phi=phi,
