@@ -308,6 +308,11 @@ class Trial:
         return self.find(Attitude) or self.find(Ins)
 
     @property
+    def position_sensor(self) -> Gnss | Ins | None:
+        """GNSS, or else the INS; None where the trial has neither."""
+        return self.gnss or self.find(Ins)
+
+    @property
     def body_sensor(self) -> Imu | Attitude | Ins:
         """The instrument whose body is that of the trial: the IMU, or what takes its place.
 

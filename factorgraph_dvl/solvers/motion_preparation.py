@@ -93,7 +93,7 @@ def prepare_motion(trial: Trial) -> MotionPreparation:
         If records are too short.
     """
     sensor = trial.attitude
-    source = trial.gnss or trial.find(Ins)
+    source = trial.position_sensor
     if sensor is None or source is None:
         raise ConfigError(
             "nothing measures the position",

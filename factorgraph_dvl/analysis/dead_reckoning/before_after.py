@@ -13,7 +13,7 @@ from factorgraph_dvl.analysis.dead_reckoning.integration import (
     DeadReckonedTrack,
     DvlMounting,
     OrientationAt,
-    antenna_removed,
+    body_positions,
     dead_reckon,
     displaced,
     lever_arm_error,
@@ -23,6 +23,7 @@ from factorgraph_dvl.analysis.dead_reckoning.track_error import Score, differenc
 from factorgraph_dvl.geometry.rotations import rotation_from_rph
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.sensors.beam_geometry import as_dvl
+from factorgraph_dvl.sensors.ins import Ins
 from factorgraph_dvl.trial import Reference, Trial
 
 # Chosen: the fixes of this time give the start of a track; their noise averages out, and a
@@ -78,7 +79,7 @@ class BeforeAfter:
         The three runs.
     lever_arm : LeverArmEffect
         Difference of the first and the last.
-    scored_by : {reference, GNSS, nothing}
+    scored_by : {reference, GNSS, INS, nothing}
         Source of the positions that the tracks are compared with.
     """
 
@@ -86,7 +87,7 @@ class BeforeAfter:
     uncalibrated: Run
     without_lever_arm: Run
     lever_arm: LeverArmEffect
-    scored_by: Literal["reference", "GNSS", "nothing"]
+    scored_by: Literal["reference", "GNSS", "INS", "nothing"]
 
 
 def before_after(
@@ -152,9 +153,9 @@ def _start(
     The median by axis is used because a fix may be an outlier.
     """
     first, position = float(track.time[0]), track.geodetic[0]
-    if trial.gnss is None:
+    if trial.position_sensor is None:
         return first, position
-    fixes = antenna_removed(trial.gnss, orientation_at)
+    fixes = body_positions(trial.position_sensor, orientation_at)
     last = min(first + _START_S, float(track.time[-1]))
     early = (fixes.time >= first) & (fixes.time <= last)
     if not early.any():
@@ -175,9 +176,10 @@ def _calibrated(trial: Trial, values: Mapping[str, Array]) -> tuple[Trial, DvlMo
 
 def _truth(
     trial: Trial, orientation_at: OrientationAt
-) -> tuple[Reference | None, Literal["reference", "GNSS", "nothing"]]:
+) -> tuple[Reference | None, Literal["reference", "GNSS", "INS", "nothing"]]:
     if trial.reference is not None:
         return trial.reference, "reference"
-    if trial.gnss is not None:
-        return antenna_removed(trial.gnss, orientation_at), "GNSS"
+    sensor = trial.position_sensor
+    if sensor is not None:
+        return body_positions(sensor, orientation_at), "INS" if isinstance(sensor, Ins) else "GNSS"
     return None, "nothing"

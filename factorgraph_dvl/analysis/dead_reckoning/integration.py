@@ -17,6 +17,7 @@ from factorgraph_dvl.imu.timestamps import JUMP
 from factorgraph_dvl.sensors import dvl as dvl_names
 from factorgraph_dvl.sensors.dvl import Dvl
 from factorgraph_dvl.sensors.gnss import Gnss
+from factorgraph_dvl.sensors.ins import Ins
 from factorgraph_dvl.trial import Reference, Trial
 
 OrientationAt = Callable[[Array], Orientation]
@@ -217,12 +218,15 @@ def lever_arm_error(nRb: Array, lever_arm: Array) -> Array:
     return np.asarray((nRb - nRb[0]) @ lever_arm)
 
 
-def antenna_removed(gnss: Gnss, orientation_at: OrientationAt) -> Reference:
-    """Return the positions of the IMU at the fixes; attitude and velocity are zero."""
-    has_fix = ~np.isnan(gnss.geodetic[:, 0])
-    time, geodetic = gnss.time[has_fix], gnss.geodetic[has_fix]
+def body_positions(sensor: Gnss | Ins, orientation_at: OrientationAt) -> Reference:
+    """Return the positions of the body by GNSS or an INS; attitude and velocity are zero."""
+    has_fix = ~np.isnan(sensor.geodetic[:, 0])
+    time, geodetic = sensor.time[has_fix], sensor.geodetic[has_fix]
     there = orientation_at(time)
-    arm_n = rotate(there.nRb[there.covered], gnss.lever_arm(time[there.covered])[0])
+    arm = np.array(sensor.settings.lever_arm_m)
+    if isinstance(sensor, Gnss):
+        arm = sensor.lever_arm(time[there.covered])[0]
+    arm_n = rotate(there.nRb[there.covered], arm)
     moved = displaced(geodetic[there.covered], -arm_n)
     zero = np.zeros_like(moved)
     return Reference(time[there.covered], moved, zero, zero)
@@ -246,8 +250,8 @@ def _start(
     trial: Trial, first: float, last: float, orientation_at: OrientationAt
 ) -> tuple[float, Array]:
     """Return time and position of the IMU at the first fix between the first and last ping."""
-    if trial.gnss is not None:
-        known = antenna_removed(trial.gnss, orientation_at)
+    if trial.position_sensor is not None:
+        known = body_positions(trial.position_sensor, orientation_at)
         inside = np.flatnonzero((known.time >= first) & (known.time < last))
         if inside.size:
             return float(known.time[inside[0]]), known.geodetic[inside[0]]
@@ -256,7 +260,7 @@ def _start(
     raise DataError(
         "no position to start from",
         where=trial.gnss.source if trial.gnss is not None else "trial.yaml",
-        expected="a GNSS position while the DVL has a lock, or initial.position",
+        expected="a position by GNSS or an INS while the DVL has a lock, or initial.position",
     )
 
 

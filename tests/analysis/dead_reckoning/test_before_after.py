@@ -5,11 +5,12 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 
+import msgspec
 import numpy as np
 import pytest
 from running import run  # noqa: F401
 from scipy.integrate import quad
-from truth import CONING, config, scenario
+from truth import CONFIGS, CONING, config, scenario
 
 from factorgraph_dvl.analysis.dead_reckoning.before_after import before_after
 from factorgraph_dvl.analysis.dead_reckoning.integration import (
@@ -27,9 +28,11 @@ from factorgraph_dvl.geometry.earth import ECCENTRICITY_SQUARED, RATE, SEMI_MAJO
 from factorgraph_dvl.geometry.rotations import log_so3, rotation_from_rph
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.imu.attitude_history import AttitudeHistory
+from factorgraph_dvl.imu.attitude_record import orientations
 from factorgraph_dvl.io.solution_folder import save_solution
 from factorgraph_dvl.io.trial_folder import save_trial
-from factorgraph_dvl.simulation import plan_motion, simulate
+from factorgraph_dvl.simulation import load_scenario, plan_motion, simulate
+from factorgraph_dvl.simulation.compass import InsTruth
 from factorgraph_dvl.solution import Trajectory
 from factorgraph_dvl.trial import Reference
 
@@ -371,3 +374,17 @@ def test_without_gnss_the_reference_gives_the_attitude_and_initial_the_start(run
     data = json.loads((tmp_path / "out" / "deadreckon.json").read_text())
     assert data["attitude"] == "reference"
     assert data["global_error_m"] < 0.05
+
+
+def test_an_ins_gives_start_and_score():
+    ins = InsTruth(rate_hz=1)
+    made = msgspec.structs.replace(
+        load_scenario(CONFIGS / "ship.yaml"), manoeuvres=[{"straight_s": 60}], noise=False
+    )
+    claims = msgspec.structs.replace(made.trial, gnss={}, attitude={})
+    made = msgspec.structs.replace(made, gnss=None, attitude=None, ins=ins, trial=claims)
+    trial = replace(simulate(made), reference=None)
+    truth = trial.calibration_truth
+    result = before_after(trial, truth, orientations(trial.attitude, trial.body_axes))
+    assert result.scored_by == "INS"
+    assert np.abs(result.calibrated.score.error).max() < 0.1
