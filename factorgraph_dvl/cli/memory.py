@@ -12,12 +12,12 @@ from factorgraph_dvl.errors import SolveError
 _P = ParamSpec("_P")
 _R = TypeVar("_R")
 
-# Measured with `solve`: 0.33 GB for 45 300 IMU samples with 4530 rows of other sensors, which
-# each make a state; 0.96 GB for 480 000 with 48 000, 0.79 GB for half of these samples.
+# Measured with `solve` at a state a second: 0.40 GB for 120 000 IMU samples with 12 000 rows of
+# other sensors; 0.74 GB for 480 000 with 48 000, 0.69 GB for half of these samples.
 _LIBRARIES_GB = 1.5
-_BASE_GB = 0.26
-_GB_PER_SAMPLE = 0.68e-6
-_GB_PER_ROW = 7.7e-6
+_BASE_GB = 0.29
+_GB_PER_SAMPLE = 0.22e-6
+_GB_PER_ROW = 7.1e-6
 
 
 def naming_memory(command: Callable[_P, _R]) -> Callable[_P, _R]:

@@ -29,7 +29,7 @@ from factorgraph_dvl.io.residual_table import (
     residual_columns,
 )
 from factorgraph_dvl.io.run_file import RUN_FILE
-from factorgraph_dvl.io.tables import read_header, read_table, write_table
+from factorgraph_dvl.io.tables import read_header, read_table, release_memory, write_table
 from factorgraph_dvl.solution import Hypothesis, Solution, Trajectory
 
 TRAJECTORY_FILE = "trajectory.csv"
@@ -136,6 +136,8 @@ def save_solution(
         if solution.residuals:
             write_table(folder / RESIDUALS_FILE, residual_columns(solution.residuals))
         if extra is not None:
+            # What the solver has freed is not needed while figures are drawn.
+            release_memory()
             extra(folder)
         (folder / CALIBRATION_FILE).write_bytes(encode_calibration(solution))
 

@@ -72,7 +72,7 @@ def read_table(
         rows = table.num_rows
         del table
         # Arrow keeps what it read with otherwise, about as much as the columns take.
-        pa.default_memory_pool().release_unused()
+        release_memory()
     except MemoryError:
         raise
     except (OSError, pa.ArrowException, UnicodeDecodeError) as error:
@@ -139,6 +139,11 @@ def count_rows(path: Path) -> int:
     with path.open("rb") as file:
         lines = sum(block.count(b"\n") for block in iter(lambda: file.read(1 << 20), b""))
     return lines - 1
+
+
+def release_memory() -> None:
+    """Give memory that is free back to the system, as far as Arrow's allocator can."""
+    pa.default_memory_pool().release_unused()
 
 
 def write_table(path: Path, columns: Mapping[str, NDArray[Any]]) -> None:
