@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from dives import dive
 from scipy.stats import chi2
 
 from factorgraph_dvl.io.trial_folder import load_trial
@@ -97,3 +98,35 @@ def test_lever_arms_and_clocks_of_all_dives_agree(tmp_path):
     statistic = float(np.einsum("di,dij,dj->", left, weights, left))
     assert statistic < chi2.ppf(0.99, 3 * (len(ALL) - 1))
     assert np.ptp(clocks, axis=0).max() < 0.05
+
+
+def relative(solution, signs):
+    """Return a sum of parameters with signs, and its variances."""
+    names = [f"{name}{part}" for name in signs for part in signs[name][1]]
+    rows = np.array([solution.order.index(name) for name in names]).reshape(len(signs), -1)
+    values = np.concatenate([e.value for e in solution.estimates])[rows]
+    weights = np.array([signs[name][0] for name in signs])
+    blocks = solution.covariance[rows[:, None, :], rows[None, :, :]]
+    return weights @ values, np.einsum("i,ijk,j->k", weights, blocks, weights)
+
+
+def test_a_dive_with_its_imu_and_without_gives_the_same(tmp_path):
+    found = proposed(written(tmp_path / "dive", 2, corrected=True))
+    with_imu = solve(written(tmp_path / "dive", 2, corrected=True, **found), rate_hz=1.0)
+    without = solve(dive(2), rate_hz=1.0)
+    assert with_imu.converged
+    assert without.converged
+    axes, one = ("_x_m", "_y_m", "_z_m"), ("",)
+    # The reference point of the dive is the antenna of the one, and the body of the other.
+    for there, here in (
+        ({"lever_arm": (1.0, axes), "gnss_lever_arm": (-1.0, axes)}, {"lever_arm": (1.0, axes)}),
+        (
+            {"time_offset_s": (1.0, one), "gnss_time_offset_s": (-1.0, one)},
+            {"time_offset_s": (1.0, one)},
+        ),
+        ({"misalignment_z_deg": (1.0, one)}, {"misalignment_z_deg": (1.0, one)}),
+        ({"scale_error": (1.0, one)}, {"scale_error": (1.0, one)}),
+    ):
+        a, b = relative(with_imu, there), relative(without, here)
+        # Both have the same pings, so that the sum of the variances is the most that may differ.
+        assert np.all(np.abs(a[0] - b[0]) < 3.0 * np.sqrt(a[1] + b[1])), there
