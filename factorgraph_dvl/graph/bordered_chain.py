@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy.linalg import cho_solve_banded, cholesky_banded
+from scipy.linalg.lapack import dtbtrs
 
 from factorgraph_dvl.geometry.block_tridiagonal import banded, inverse_blocks
 from factorgraph_dvl.geometry.vectors import Array
@@ -173,10 +175,10 @@ class Factorisation:
 
     Attributes
     ----------
-    influence : ndarray, shape (K, n, c)
-        A⁻¹ B, with A the information on the nodes and B the border.
     constants : ndarray, shape (c, c)
         Covariance of the constants.
+    decrease : float
+        Of the cost by the Gauss-Newton step, if residuals are linear.
     """
 
     def __init__(self, equations: NormalEquations) -> None:
@@ -185,12 +187,31 @@ class Factorisation:
         self._factor = cholesky_banded(
             banded(equations.diagonal, equations.off), check_finite=False
         )
-        border = equations.border.reshape(k * n, c)
-        self.influence = self.solve_nodes(equations.border)
-        schur = equations.corner - border.T @ self.influence.reshape(k * n, c)
-        self._root = np.linalg.cholesky(0.5 * (schur + schur.T))
+        right = np.concatenate([equations.border, equations.node_gradient[:, :, None]], axis=2)
+        # With A = Uᵀ U: U⁻ᵀ times the border and the gradient, (K n, c + 1).
+        self._forward = self._substituted(right.reshape(k * n, c + 1), "T")
+        square = self._forward.T @ self._forward
+        self._root = np.linalg.cholesky(equations.corner - square[:c, :c])
         inverse = np.linalg.inv(self._root)
         self.constants = np.asarray(inverse.T @ inverse)
+        # Gradient by the constants where the nodes follow them.
+        self._constant_gradient = equations.constant_gradient - square[:c, c]
+        whitened = inverse @ self._constant_gradient
+        self.decrease = 0.5 * float(square[c, c] + whitened @ whitened)
+
+    def _substituted(self, right: Array, transposed: str) -> Array:
+        """Return U⁻¹ or, by "T", U⁻ᵀ times right-hand sides (K n, m)."""
+        out, info = dtbtrs(self._factor, right, trans=transposed)
+        if info:
+            raise np.linalg.LinAlgError(f"element {info} of the diagonal is zero")
+        return np.asarray(out)
+
+    @cached_property
+    def influence(self) -> Array:
+        """A⁻¹ B, (K, n, c), with A the information on the nodes and B the border."""
+        border = self._equations.border
+        c = border.shape[2]
+        return self._substituted(self._forward[:, :c], "N").reshape(border.shape)
 
     def solve_nodes(self, right: Array) -> Array:
         """Return A⁻¹ times right-hand sides (K, n, m), the constants exact."""
@@ -200,14 +221,13 @@ class Factorisation:
 
     def step(self) -> tuple[Array, Array]:
         """Return the Gauss-Newton step of nodes (K, n) and constants (c,)."""
-        e = self._equations
-        right = np.einsum("kic,ki->c", self.influence, e.node_gradient) - e.constant_gradient
-        constants = self.constants @ right
+        constants = -self.constants @ self._constant_gradient
         return self.node_step() - self.influence @ constants, constants
 
     def node_step(self) -> Array:
         """Return the Gauss-Newton step of the nodes (K, n), the constants exact."""
-        return -self.solve_nodes(self._equations.node_gradient[:, :, None])[:, :, 0]
+        shape = self._equations.node_gradient.shape
+        return -self._substituted(self._forward[:, -1:], "N").reshape(shape)
 
     @property
     def log_determinant(self) -> float:

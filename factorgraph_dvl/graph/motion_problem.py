@@ -477,9 +477,8 @@ class MotionProblem:
             equations.constant_gradient += slope
             prior = other._add_motion(equations, states)
             factors = equations.factorise()
-            dx, dc = factors.step()
-            gain = np.vdot(dx, equations.node_gradient) + dc @ equations.constant_gradient
-            return prior + float(gain) - chain.log_determinant() + factors.log_determinant
+            cost = prior - 2.0 * factors.decrease
+            return cost - chain.log_determinant() + factors.log_determinant
 
         return of
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+import msgspec
 import numpy as np
 
 from factorgraph_dvl.errors import ConfigError, DataError
@@ -249,12 +250,12 @@ def _start_values(
     found = {attitude_clock.name: np.array([late])}
     if trial.dvl is None:
         return found
-    shifted = replace(dvl, time=dvl.time - lag + float(clock.mean[0]))
+    # Its clock is found: a mounting that fits better with another makes up for noise or a current.
+    known_clock = msgspec.structs.replace(dvl.settings, time_offset_std_s=0.0)
+    shifted = replace(dvl, settings=known_clock, time=dvl.time - lag + float(clock.mean[0]))
     best = initial_mountings(shifted, lambda time: motion_at(time, late))[0]
     found |= {name: value for name, value in best.items() if name in by_name}
-    if clock.name in found:
-        found[clock.name] = found[clock.name] + lag - clock.mean
-    return found
+    return found | {clock.name: np.array([lag])}
 
 
 def _clock(trial: Trial, frame: LocalFrame) -> str:

@@ -278,16 +278,12 @@ def _minimise(
                 where="all sensors",
                 hint="Inspect the trial: standard deviations may differ by too many digits",
             ) from None
-        dx, dc = factors.step()
-        promised = -0.5 * float(
-            np.vdot(dx, equations.node_gradient) + dc @ equations.constant_gradient
-        )
-        if promised < _CONVERGED:
+        if factors.decrease < _CONVERGED:
             return evaluation, factors, steps, True
-        after = _lower(problem, evaluation, cost, factors, dx, dc, promised)
+        after = _lower(problem, evaluation, cost, factors)
         if after is None:
             # No digits are left, or the weights hold the step back.
-            return evaluation, factors, steps, promised < 1e-2
+            return evaluation, factors, steps, factors.decrease < 1e-2
         evaluation, cost = after
         if far and steps < 3:
             evaluation, cost = _weighted(problem, evaluation.states, evaluation.parameters)
@@ -307,9 +303,6 @@ def _lower(
     evaluation: MotionEvaluation,
     cost: float,
     factors: Factorisation,
-    dx: Array,
-    dc: Array,
-    promised: float,
 ) -> tuple[MotionEvaluation, float] | None:
     """Return an evaluation of lower cost along a Gauss-Newton step; None if there is none.
 
@@ -317,6 +310,8 @@ def _lower(
     too long, or much too short. The cost at a second length shows how long it should be, while
     the states follow the constants.
     """
+
+    (dx, dc), promised = factors.step(), factors.decrease
 
     def along(share: float) -> tuple[MotionEvaluation, float]:
         there = problem.evaluate(

@@ -13,6 +13,7 @@ from truth import CONFIGS
 
 from factorgraph_dvl.analysis.error_statistics import calibration_errors
 from factorgraph_dvl.errors import ConfigError, FactorgraphDvlError
+from factorgraph_dvl.geometry.rotations import exp_so3, log_so3
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.graph.priors import after_step
 from factorgraph_dvl.io.trial_folder import load_trial, save_trial
@@ -236,6 +237,15 @@ def test_a_current_adds_what_is_unknown_of_its_share_in_the_motion():
     assert 0.0 < cause.adds[at] < 0.5 * np.sqrt(solution.covariance[at, at])
     total = np.sum([c.adds**2 for c in solution.error_budget], axis=0)
     np.testing.assert_allclose(total, np.diag(solution.covariance), rtol=1e-6)
+
+
+def test_a_current_that_changes_for_hours_moves_no_clock_of_the_start():
+    trial = simulate(load_scenario(CONFIGS / "ship-water.yaml"), 1)
+    start = prepare_motion(trial).values
+    for name in ("time_offset_s", "attitude_time_offset_s"):
+        assert abs(start[name][0]) < 0.5, name
+    truth = exp_so3(trial.calibration_truth["misalignment_deg"] * DEG)
+    assert np.linalg.norm(log_so3(start["misalignment_deg"] @ truth.T)) < 5.0 * DEG
 
 
 def dense_standard_deviations(trial, scenario, span):
