@@ -96,9 +96,10 @@ def _misfit_through_water(
 ) -> float:
     """Return the negative log-likelihood of velocities over ground with the best A, l and c.
 
-    v_n = nRb (A v_d - omega x l) + c. The current c is constant for some minutes only: one current for twelve hours left residuals of
-    0.3 m/s, and clocks 1.8 s off made up for them. Velocities over ground are noisier than those
-    of a DVL: on the other side of the equation, their noise would make A too small.
+    v_n = nRb (A v_d - omega x l) + c. The current c is constant for some minutes only: with one
+    current for twelve hours, clocks 1.8 s off made up for residuals of 0.3 m/s. Velocities over
+    ground are noisier than those of a DVL: on the other side of the equation, their noise would
+    make A too small.
     """
     nRb = motion.nRb[known]
     through_water = nRb[:, :, :, None] * velocity[known][:, None, None, :]

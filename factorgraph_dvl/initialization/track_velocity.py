@@ -16,10 +16,10 @@ from factorgraph_dvl.imu.attitude_record import AttitudeRecord
 from factorgraph_dvl.sensors.gnss import Gnss
 from factorgraph_dvl.sensors.ins import Ins
 
-# Spans, s, over which positions make a velocity, and its standard deviation, m/s, for which the span
-# is as long as it must be. Chosen: the least averages waves, turns of a ship last longer than the
-# longest, and the noise is that of a ping. Velocities of 0.25 m/s, from positions of 1 m over 5 s,
-# made clocks 1 s off fit better than the right ones.
+# Spans, s, over which positions make a velocity, and the standard deviation, m/s, that it should
+# have. Chosen: the least averages waves, turns of a ship last longer than the longest, and a ping
+# has such noise. With noise of 0.25 m/s, from positions of 1 m over 5 s, clocks 1 s off fitted
+# better than the right ones.
 _SPANS = (5.0, 15.0)
 _VELOCITY_STD = 0.05
 # Gap, s, beyond which nothing is known of the motion. Chosen: a ship turns in it.
@@ -80,7 +80,7 @@ def body_track(sensor: Gnss | Ins, frame: LocalFrame, attitude: AttitudeRecord) 
 
 
 def velocities(time: Array, p_n: Array, span: float) -> Array:
-    """Return velocities (M, 3) from positions (M, 3) at times (M,): slopes of lines over a span."""
+    """Return velocities (M, 3) at times (M,): slopes of positions (M, 3) over a span, s."""
     half = max(1, round(0.5 * span / float(np.median(np.diff(time)))))
     half = min(half, (time.size - 1) // 2)
     t, p = (sliding_window_view(x, 2 * half + 1, axis=0) for x in (time, p_n))

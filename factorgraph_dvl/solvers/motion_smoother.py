@@ -310,7 +310,6 @@ def _lower(
     too long, or much too short. The cost at a second length shows how long it should be, while
     the states follow the constants.
     """
-
     (dx, dc), promised = factors.step(), factors.decrease
 
     def along(share: float) -> tuple[MotionEvaluation, float]:
