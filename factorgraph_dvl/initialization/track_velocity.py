@@ -16,11 +16,10 @@ from factorgraph_dvl.imu.attitude_record import AttitudeRecord
 from factorgraph_dvl.sensors.gnss import Gnss
 from factorgraph_dvl.sensors.ins import Ins
 
-# Spans, s, over which positions make a velocity, and the standard deviation, m/s, that it should
-# have. Chosen: the least averages waves, turns of a ship last longer than the longest, and a ping
-# has such noise. With noise of 0.25 m/s, from positions of 1 m over 5 s, clocks 1 s off fitted
-# better than the right ones.
-_SPANS = (5.0, 15.0)
+# Least span, s, over which positions make a velocity, and the standard deviation, m/s, that it should
+# have. Chosen: the span averages waves, and a ping has such noise. With noise of 0.25 m/s, from
+# positions of 1 m over 5 s, clocks 1 s off fitted pings through water better than the right ones.
+_SPAN = 5.0
 _VELOCITY_STD = 0.05
 # Gap, s, beyond which nothing is known of the motion. Chosen: a ship turns in it.
 _GAP = 15.0
@@ -46,7 +45,7 @@ class Track:
         )
 
 
-def track_of(sensor: Gnss | Ins, frame: LocalFrame) -> Track:
+def track_of(sensor: Gnss | Ins, frame: LocalFrame, longest: float) -> Track:
     """Return the track of an antenna or an INS: what it measured, smoothed over seconds.
 
     Raises
@@ -67,15 +66,17 @@ def track_of(sensor: Gnss | Ins, frame: LocalFrame) -> Track:
         measured = ~np.isnan(velocity[:, 0])
         v_n = np.einsum("mji,mj->mi", level[measured], velocity[measured])
         return Track(time, p_n, interpolate(time, time[measured], v_n))
-    return Track(time, p_n, velocities(time, p_n, _span(sensor, time)))
+    return Track(time, p_n, velocities(time, p_n, _span(sensor, time, longest)))
 
 
-def body_track(sensor: Gnss | Ins, frame: LocalFrame, attitude: AttitudeRecord) -> Track:
+def body_track(
+    sensor: Gnss | Ins, frame: LocalFrame, attitude: AttitudeRecord, *, longest: float
+) -> Track:
     """Return the track of the body: that of an antenna less its lever arm, which turns with it."""
-    track = track_of(sensor, frame)
+    track = track_of(sensor, frame, longest)
     nRb = rotation_from_rph(attitude.rph_at(track.time), attitude.body_axes)
     arm_n = nRb @ np.array(sensor.settings.lever_arm_m)
-    v_n = track.v_n - velocities(track.time, arm_n, _span(sensor, track.time))
+    v_n = track.v_n - velocities(track.time, arm_n, _span(sensor, track.time, longest))
     return Track(track.time, track.p_n - arm_n, v_n)
 
 
@@ -89,11 +90,11 @@ def velocities(time: Array, p_n: Array, span: float) -> Array:
     return interpolate(time, time[half:-half], v)
 
 
-def _span(sensor: Gnss | Ins, time: Array) -> float:
+def _span(sensor: Gnss | Ins, time: Array, longest: float) -> float:
     """Return the span, s, whose line has a slope of the wanted standard deviation."""
     if isinstance(sensor, Ins):
         # Its errors change slowly.
-        return _SPANS[0]
+        return _SPAN
     variance = float(np.median(sensor.position_std[:, :2])) ** 2
     interval = float(np.median(np.diff(time)))
-    return float(np.clip(np.cbrt(12.0 * variance * interval / _VELOCITY_STD**2), *_SPANS))
+    return float(np.clip(np.cbrt(12.0 * variance * interval / _VELOCITY_STD**2), _SPAN, longest))

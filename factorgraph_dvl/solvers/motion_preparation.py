@@ -39,6 +39,9 @@ _MOST_NODES = 60_000
 # Share of a ping's noise that the motion between two nodes may add. Chosen: 4 % of its variance,
 # as what neighbouring pings share of it counts as independent.
 _BETWEEN = 0.2
+# Longest spans, s, over which positions make a velocity, over ground and through water. Chosen:
+# below the time in which a ship turns; through water noise makes wrong clocks more likely.
+_GROUND_SPAN, _WATER_SPAN = 5.0, 15.0
 # Density of acceleration, m²/s³: a start value where the log does not show one, and the least.
 _DENSITY = 1e-3
 _LEAST_DENSITY = 1e-9
@@ -110,7 +113,9 @@ def prepare_motion(trial: Trial) -> MotionPreparation:
             )
     frame = trial.frame()
     record = AttitudeRecord(sensor, trial.body_axes, estimated=trial.estimates_noise(sensor))
-    track = body_track(source, frame, record)
+    water = trial.dvl is not None and trial.dvl.settings.reference == "water"
+    longest = _WATER_SPAN if water else _GROUND_SPAN
+    track = body_track(source, frame, record, longest=longest)
     observations, processes, estimated = _observed(trial, frame)
     parameters = _parameters(trial)
     values = {p.name: prior_mean(p) for p in parameters}
@@ -250,12 +255,16 @@ def _start_values(
     found = {attitude_clock.name: np.array([late])}
     if trial.dvl is None:
         return found
-    # Its clock is found: a mounting that fits better with another makes up for noise or a current.
-    known_clock = msgspec.structs.replace(dvl.settings, time_offset_std_s=0.0)
-    shifted = replace(dvl, settings=known_clock, time=dvl.time - lag + float(clock.mean[0]))
+    settings = dvl.settings
+    if through_water:
+        # A mounting that fits better with another clock makes up for the current.
+        settings = msgspec.structs.replace(settings, time_offset_std_s=0.0)
+    shifted = replace(dvl, settings=settings, time=dvl.time - lag + float(clock.mean[0]))
     best = initial_mountings(shifted, lambda time: motion_at(time, late))[0]
     found |= {name: value for name, value in best.items() if name in by_name}
-    return found | {clock.name: np.array([lag])}
+    if clock.name in found:
+        found[clock.name] = found[clock.name] + lag - clock.mean
+    return found
 
 
 def _clock(trial: Trial, frame: LocalFrame) -> str:
