@@ -16,9 +16,9 @@ from factorgraph_dvl.imu.attitude_record import AttitudeRecord
 from factorgraph_dvl.sensors.gnss import Gnss
 from factorgraph_dvl.sensors.ins import Ins
 
-# Least span, s, over which positions make a velocity, and the standard deviation, m/s, that it should
-# have. Chosen: the span averages waves, and a ping has such noise. With noise of 0.25 m/s, from
-# positions of 1 m over 5 s, clocks 1 s off fitted pings through water better than the right ones.
+# Least span, s, over which positions make a velocity, and the standard deviation, m/s, that it
+# should have. Chosen: the span averages waves, and a ping has such noise. With noise of 0.25 m/s,
+# from positions of 1 m over 5 s, clocks 1 s off fitted pings through water better than right ones.
 _SPAN = 5.0
 _VELOCITY_STD = 0.05
 # Gap, s, beyond which nothing is known of the motion. Chosen: a ship turns in it.
