@@ -21,11 +21,13 @@ from factorgraph_dvl.initialization.dvl_mounting import initial_mountings
 from factorgraph_dvl.initialization.record_clocks import clock_lags
 from factorgraph_dvl.initialization.track_velocity import Track, body_track
 from factorgraph_dvl.sensors.attitude import Attitude
+from factorgraph_dvl.sensors.dvl import Dvl
 from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.sensors.ins import Ins
 from factorgraph_dvl.sensors.message import message
 from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.sensors.protocol import Aid, Motion, Observation
+from factorgraph_dvl.sensors.records import rows_of
 from factorgraph_dvl.trial import Trial
 
 # Sensors that ask more of the motion than attitude records and a motion prior give.
@@ -48,6 +50,9 @@ _LEAST_DENSITY = 1e-9
 # Spans, s, over which changes of velocity on legs show the density; in turns, in which velocity
 # changes steadily, they are the intervals of the pings.
 _LEG_SPANS = (2.0, 10.0)
+# Fewest pings that show which speeds are far off, and by how much: in standard deviations of all,
+# and at least, m/s. Chosen: lever arms, currents and clocks that are off by seconds make less.
+_FEWEST, _FAR_OFF, _FAR_OFF_M_S = 20, 8.0, 2.0
 # Start values of the current as a process: standard deviation, m/s, and correlation time, s.
 _CURRENT_STD, _CURRENT_TIME = 0.1, 3600.0
 
@@ -244,6 +249,7 @@ def _start_values(
         motion = Motion(body.nRb, p_n, v_n, body.omega_eb_b, none, body.alpha_b, body.omega_sigma)
         return motion, np.asarray(known & record.covers(stamp))
 
+    dvl = _without_gross_errors(dvl, track)
     pings = np.flatnonzero(dvl.locked)
     pings = pings[:: max(pings.size // 3000, 1)]
     through_water = dvl.settings.reference == "water"
@@ -265,6 +271,21 @@ def _start_values(
     if clock.name in found:
         found[clock.name] = found[clock.name] + lag - clock.mean
     return found
+
+
+def _without_gross_errors(dvl: Dvl, track: Track) -> Dvl:
+    """Return the pings whose speed is about that of the track: one that is far off turns a fit.
+
+    No mounting changes a speed.
+    """
+    _, v_n, known = track.at(dvl.time)
+    known = np.asarray(known & (dvl.locked > 0), dtype=bool)
+    if known.sum() < _FEWEST:
+        return dvl
+    off = np.linalg.norm(dvl.velocity, axis=1) - np.linalg.norm(v_n, axis=1)
+    off -= np.median(off[known])
+    gate = max(_FAR_OFF * 1.4826 * float(np.median(np.abs(off[known]))), _FAR_OFF_M_S)
+    return rows_of(dvl, np.flatnonzero(known & (np.abs(off) < gate)))
 
 
 def _clock(trial: Trial, frame: LocalFrame) -> str:

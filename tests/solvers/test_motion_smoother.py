@@ -68,6 +68,22 @@ def test_a_ship_with_compass_gnss_and_adcp_is_calibrated(ship, solution):
     assert solution.estimate("scale_error").std[0] < 0.002
 
 
+def test_a_gross_error_turns_no_mounting(ship):
+    short = ship.until(ship.dvl.time[160])
+    fixes, velocity = short.gnss.geodetic.copy(), short.dvl.velocity.copy()
+    fixes[120, 2] += 300.0
+    velocity[150] += 3.0
+    wrong = replace(
+        short,
+        gnss=replace(short.gnss, geodetic=fixes),
+        dvl=replace(short.dvl, velocity=velocity),
+    )
+    a, b = (prepare_motion(each).values for each in (short, wrong))
+    turned = a["misalignment_deg"] @ b["misalignment_deg"].T
+    assert np.trace(turned) > 1.0 + 2.0 * np.cos(10.0 * DEG)
+    assert abs(a["time_offset_s"][0] - b["time_offset_s"][0]) < 0.5
+
+
 def test_clocks_agree_with_each_other(ship, solution):
     assert "gnss_time_offset_s" not in solution.order
     dvl, attitude = (solution.estimate(n) for n in ("time_offset_s", "attitude_time_offset_s"))
