@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import msgspec
 import numpy as np
+from numpy.typing import NDArray
 
 from factorgraph_dvl.errors import ConfigError, DataError
 from factorgraph_dvl.geometry.earth import LocalFrame
@@ -21,7 +22,6 @@ from factorgraph_dvl.initialization.dvl_mounting import initial_mountings
 from factorgraph_dvl.initialization.record_clocks import clock_lags
 from factorgraph_dvl.initialization.track_velocity import Track, body_track
 from factorgraph_dvl.sensors.attitude import Attitude
-from factorgraph_dvl.sensors.dvl import Dvl
 from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.sensors.ins import Ins
 from factorgraph_dvl.sensors.message import message
@@ -249,7 +249,7 @@ def _start_values(
         motion = Motion(body.nRb, p_n, v_n, body.omega_eb_b, none, body.alpha_b, body.omega_sigma)
         return motion, np.asarray(known & record.covers(stamp))
 
-    dvl = _without_gross_errors(dvl, track)
+    dvl = rows_of(dvl, _without_gross_errors(dvl.time, dvl.velocity, dvl.locked, track))
     pings = np.flatnonzero(dvl.locked)
     pings = pings[:: max(pings.size // 3000, 1)]
     through_water = dvl.settings.reference == "water"
@@ -273,19 +273,32 @@ def _start_values(
     return found
 
 
-def _without_gross_errors(dvl: Dvl, track: Track) -> Dvl:
+def _without_gross_errors(
+    time: Array, velocity: Array, locked: Array, track: Track
+) -> NDArray[np.intp]:
     """Return the pings whose speed is about that of the track: one that is far off turns a fit.
 
     No mounting changes a speed.
+
+    Parameters
+    ----------
+    time : ndarray, shape (M,), s
+        Of the pings.
+    velocity : ndarray, shape (M, 3), m/s
+        By the DVL.
+    locked : ndarray of bool, shape (M,)
+        Whether there is a velocity.
+    track : Track
+        Of the body.
     """
-    _, v_n, known = track.at(dvl.time)
-    known = np.asarray(known & (dvl.locked > 0), dtype=bool)
-    if known.sum() < _FEWEST:
-        return dvl
-    off = np.linalg.norm(dvl.velocity, axis=1) - np.linalg.norm(v_n, axis=1)
-    off -= np.median(off[known])
-    gate = max(_FAR_OFF * 1.4826 * float(np.median(np.abs(off[known]))), _FAR_OFF_M_S)
-    return rows_of(dvl, np.flatnonzero(known & (np.abs(off) < gate)))
+    _, v_n, covered = track.at(time)
+    known = np.flatnonzero(covered & (locked > 0))
+    if known.size < _FEWEST:
+        return np.asarray(np.flatnonzero(locked))
+    off = np.linalg.norm(velocity[known], axis=1) - np.linalg.norm(v_n[known], axis=1)
+    off = np.abs(off - np.median(off))
+    gate = max(_FAR_OFF * 1.4826 * float(np.median(off)), _FAR_OFF_M_S)
+    return np.asarray(known[off < gate])
 
 
 def _clock(trial: Trial, frame: LocalFrame) -> str:
