@@ -51,7 +51,7 @@ _SAME_GRAVITY = 2.0
 _ROUNDS = 24
 # Iterations in a row without a minimum, after which there is none. Measured: with gross errors 60,
 # and the next converges.
-_FRUITLESS = 300
+_FRUITLESS = 150
 # Rounds after which noise counts as not settled. Measured: a factor of five takes two.
 _NOISE_ROUNDS = 4
 # What of a problem changes without a new one.
