@@ -465,6 +465,12 @@ def dive() -> dict[str, Any]:
 
 
 SCENARIOS = {"seed A": seed_a, "cruise": cruise, "dive": dive}
+# What they are, on the page.
+MOTIONS = {
+    "seed A": "`configs/seed-a-phase-90.yaml`, 450 s",
+    "cruise": "the first quarter of an hour of `configs/cruise.yaml`",
+    "dive": "`configs/dive.yaml` with ten minutes below",
+}
 
 
 @dataclass(frozen=True)
@@ -608,10 +614,7 @@ as its user would. Where no key says otherwise, clocks, antenna and DVL bias are
 *Error* is the largest one over calibration, position and attitude, in standard deviations.
 Position and attitude count every second, so 4 is chance. λ is the noncentrality of the fault:
 twice the cost that it adds at the minimum with noise as stated. *Named* says whether the first
-reason is the true cause. λ is worked out for results that are graded good.
-
-Scenarios: seed A (`configs/seed-a-phase-90.yaml`, 450 s), the first quarter of an hour of
-`configs/cruise.yaml`, and `configs/dive.yaml` with ten minutes below.
+reason is the true cause. λ is worked out for results that are graded good. Scenarios:
 
 """
 
@@ -622,6 +625,8 @@ def page(origin: str, runs: Sequence[tuple[Run, dict[str, Any]]]) -> list[str]:
     faulty = [(r, found, _added(r, found, honest)) for r, found in runs if r.row is not None]
     return [
         *INTRODUCTION.format(origin=origin).splitlines(),
+        *(f"- {name}: {MOTIONS[name]}" for name in dict.fromkeys(r.scenario for r, _ in runs)),
+        "",
         *summary(faulty),
         "",
         *table(faulty),

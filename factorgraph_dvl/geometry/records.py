@@ -1,9 +1,11 @@
-"""Some rows of data classes whose every field is an array of them."""
+"""Rows of data classes whose every field is an array of them: chosen, and joined."""
 
 from __future__ import annotations
 
-from dataclasses import fields
+from collections.abc import Sequence
 from typing import Any, TypeVar
+
+import numpy as np
 
 from factorgraph_dvl.geometry.vectors import IntArray
 
@@ -12,4 +14,12 @@ _Arrays = TypeVar("_Arrays", bound=Any)
 
 def rows_of(arrays: _Arrays, rows: slice | IntArray) -> _Arrays:
     """Return some rows of such a data class."""
-    return type(arrays)(**{f.name: getattr(arrays, f.name)[rows] for f in fields(arrays)})
+    return type(arrays)(*[values[rows] for values in vars(arrays).values()])
+
+
+def concatenated(parts: Sequence[_Arrays]) -> _Arrays:
+    """Return the rows of several such data classes as one."""
+    first = parts[0]
+    return type(first)(
+        **{name: np.concatenate([vars(p)[name] for p in parts]) for name in vars(first)}
+    )

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import gtsam
 import numpy as np
 
+from factorgraph_dvl.geometry.records import concatenated, rows_of
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph import keys
 from factorgraph_dvl.graph.clocks import parameters_of
@@ -18,9 +19,7 @@ from factorgraph_dvl.graph.sensor_factor import (
     NodeMeasurements,
     ObservationRows,
     at_first_node,
-    concatenated,
     measurement_factor,
-    sliced,
 )
 from factorgraph_dvl.imu.propagation import Attachment
 from factorgraph_dvl.imu.sensitivity import Sensitivity
@@ -76,10 +75,10 @@ def _measurement_factor(problem: Problem, k: int) -> gtsam.CustomFactor | None:
                 own = CorrelatedRows(o, index, process)
                 nodes.update(own.nodes)
         rows.append(AttachedMeasurements(own, place, time))
-        attachments.append(sliced(at, index))
+        attachments.append(rows_of(at, index))
         weights.append(weight[index].ravel())
         if imu_errors is not None:
-            sensitivities.append(sliced(imu_errors.sensitivity(at), index))
+            sensitivities.append(rows_of(imu_errors.sensitivity(at), index))
         count += index.size
     if not rows:
         return None

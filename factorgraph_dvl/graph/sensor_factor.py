@@ -9,11 +9,12 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, TypeVar, cast
+from typing import Any, cast
 
 import gtsam
 import numpy as np
 
+from factorgraph_dvl.geometry.records import rows_of
 from factorgraph_dvl.geometry.vectors import Array, IntArray
 from factorgraph_dvl.graph.clocks import linearized, parameters_of, true_time
 from factorgraph_dvl.graph.keys import BIAS_SIZE, STATE_SIZE
@@ -45,8 +46,6 @@ from factorgraph_dvl.sensors.protocol import (
 _ROUNDING = 1e-6
 # Derivatives by the motion, as `Linearization` names them.
 _BY_MOTION = ("d_theta", "d_p", "d_v", "d_omega")
-
-_Arrays = TypeVar("_Arrays", Attachment, Motion, Sensitivity, States)
 
 
 @dataclass(frozen=True)
@@ -151,7 +150,7 @@ class ObservationRows:
         """Return a motion at all M times: what the others see does not matter."""
         source = np.zeros(self.whole.time.size, dtype=int)
         source[self.index] = np.arange(self.index.size)
-        return sliced(motion, source)
+        return rows_of(motion, source)
 
 
 @dataclass(frozen=True)
@@ -216,7 +215,7 @@ class NodeMeasurements:
 
     def attachment_of(self, rows: AttachedMeasurements) -> Attachment:
         """Return the attachment of measurements of one kind."""
-        return sliced(self.attachment, rows.at)
+        return rows_of(self.attachment, rows.at)
 
     @cached_property
     def _place(self) -> dict[str, slice]:
@@ -248,7 +247,7 @@ class NodeMeasurements:
         part, at = motion, slice(0, self.attachment.tau.size)
         for r in self.rows:
             if r.at != at:
-                part, at = sliced(motion, r.at), r.at
+                part, at = rows_of(motion, r.at), r.at
             late = true_time(r.observation, values, self.clock_zero) - r.time
             out.append(extrapolated(part, late))
         return out
@@ -287,7 +286,7 @@ class NodeMeasurements:
                     by_parameters[:, :, self._place[name]] = jacobian
         if self.sensitivity is not None:
             errors = [p for p in self.parameters if p.name in ERRORS]
-            own = by_errors(whole, window, sliced(self.sensitivity, index), elements(errors))
+            own = by_errors(whole, window, rows_of(self.sensitivity, index), elements(errors))
             columns = [np.r_[self._place[p.name]] for p in errors]
             matrix[:, first + np.concatenate(columns)] = own[:, 0]
         return residual, matrix, motions
@@ -351,7 +350,7 @@ class _Window:
     @cached_property
     def at(self) -> Attachment:
         """Attachment of these times."""
-        return sliced(self._transition.at, self._index)
+        return rows_of(self._transition.at, self._index)
 
     def __getattr__(self, name: str) -> Array:
         found: Array = getattr(self._transition, name)[self._index]
@@ -437,19 +436,6 @@ def state_of(state: gtsam.NavState, bias: gtsam.imuBias.ConstantBias) -> States:
     )
 
 
-def sliced(rows: _Arrays, at: slice | IntArray) -> _Arrays:
-    """Return some rows of a data class whose every field is an array of them."""
-    return type(rows)(*[values[at] for values in vars(rows).values()])
-
-
-def concatenated(parts: Sequence[_Arrays]) -> _Arrays:
-    """Return the rows of several such data classes as one."""
-    first = parts[0]
-    return type(first)(
-        **{name: np.concatenate([vars(p)[name] for p in parts]) for name in vars(first)}
-    )
-
-
 def sensor_factor(
     observation: Observation,
     parameters: Sequence[Parameter],
@@ -528,7 +514,7 @@ def sensor_factor(
         raise ValueError(f"{observation.label} has no measurement between node {k} and the next")
     own = ObservationRows(observation, index)
     measured = NodeMeasurements(
-        attachment=at_first_node(sliced(attachment, index)),
+        attachment=at_first_node(rows_of(attachment, index)),
         rows=(AttachedMeasurements(own, slice(0, index.size), true_time(own, given, clock_zero)),),
         parameters=free,
         fixed=fixed,

@@ -100,16 +100,17 @@ def check_range(
             raise DataError(
                 f"{name} = {values[bad[0]]:.6g} is out of range",
                 where=at_row(source, bad[0]),
-                expected=f"{low:g} to {high:g} {unit}{_other_unit(values, bad.size, high, unit)}",
+                expected=f"{low:g} to {high:g} {unit}{_other_unit(values, high, unit)}",
             )
 
 
-def _other_unit(values: Array, outside: int, high: float, unit: str) -> str:
+def _other_unit(values: Array, high: float, unit: str) -> str:
     """Return the units that would bring most values of a column into range, as words."""
-    present = int(np.count_nonzero(np.isfinite(values)))
-    if outside < _SYSTEMATIC * present:
+    size = np.abs(values[np.isfinite(values)])
+    outside = int(np.count_nonzero(size > high))
+    if outside == 0 or outside < _SYSTEMATIC * size.size:
         return ""
-    usual = float(np.nanquantile(np.abs(values), _USUAL))
+    usual = float(np.quantile(size, _USUAL))
     fitting = [
         f"{name} (divide it by {factor:.6g})"
         for name, factor in _OTHER_UNITS.get(unit, {}).items()
@@ -118,7 +119,8 @@ def _other_unit(values: Array, outside: int, high: float, unit: str) -> str:
     if not fitting:
         return ""
     return (
-        f"; {outside} of {present} values are outside: the column may be in {' or '.join(fitting)}"
+        f"; {outside} of {size.size} values are outside: "
+        f"the column may be in {' or '.join(fitting)}"
     )
 
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 
 from factorgraph_dvl.geometry.earth import LocalFrame
+from factorgraph_dvl.geometry.records import concatenated, rows_of
 from factorgraph_dvl.geometry.rotations import (
     BodyAxes,
     exp_so3,
@@ -16,7 +17,6 @@ from factorgraph_dvl.geometry.rotations import (
     rph_jacobian,
 )
 from factorgraph_dvl.geometry.vectors import Array, IntArray, rotate
-from factorgraph_dvl.graph.sensor_factor import concatenated, sliced
 from factorgraph_dvl.imu.preintegration import Segments
 from factorgraph_dvl.imu.propagation import (
     Attachment,
@@ -130,14 +130,14 @@ def attached_epochs(
         Of the others.
     """
     at = attach_with_ends(seg, np.concatenate([others, time]), earth_rate_n)
-    epochs = Epochs(time, sliced(at, slice(others.size, None)), seg.duration)
-    return epochs, sliced(at, slice(others.size))
+    epochs = Epochs(time, rows_of(at, slice(others.size, None)), seg.duration)
+    return epochs, rows_of(at, slice(others.size))
 
 
 def with_end(epochs: Epochs, end: float) -> Epochs:
     """Return epochs of a single segment, and its end, s, as one more."""
     index = np.append(np.arange(epochs.time.size + 1), epochs.time.size)
-    return replace(epochs, time=np.append(epochs.time, end), at=sliced(epochs.at, index))
+    return replace(epochs, time=np.append(epochs.time, end), at=rows_of(epochs.at, index))
 
 
 def successive(parts: Sequence[Epochs]) -> Epochs:
@@ -152,7 +152,7 @@ def successive(parts: Sequence[Epochs]) -> Epochs:
     times = np.delete(np.arange(number.size), ends)
     return Epochs(
         np.concatenate([part.time for part in parts]),
-        sliced(at, np.concatenate([times, ends])),
+        rows_of(at, np.concatenate([times, ends])),
         np.concatenate([part.duration for part in parts]),
     )
 
@@ -176,10 +176,10 @@ def trajectory_at(
     """
     motion = motion_at(epochs.at, states, gravity_n, frame.earth_rate)
     count, size = epochs.time.size, epochs.duration.size
-    closing = _closing(sliced(motion, slice(count, None)), states, np.arange(size) + 1)
+    closing = _closing(rows_of(motion, slice(count, None)), states, np.arange(size) + 1)
     segment = epochs.at.segment[:count]
     fraction = np.clip(epochs.at.tau[:count] / epochs.duration[segment], 0.0, 1.0)
-    motion = _closed(sliced(motion, slice(count)), fraction, segment, closing)
+    motion = _closed(rows_of(motion, slice(count)), fraction, segment, closing)
     covariance = _between(_in_n(P, states), segment, fraction)
     return _reported(epochs.time, motion, covariance, frame, body_axes)
 

@@ -27,3 +27,8 @@ def test_single_values_out_of_range_say_nothing_of_the_unit() -> None:
     speed[[3, 50]] = 400.0
     with pytest.raises(DataError, match=r"dvl line 5: .*expected -50 to 50 m/s$"):
         check_range({"vel_x_m_s": speed}, -50.0, 50.0, "m/s", "dvl")
+
+
+def test_infinite_values_are_out_of_range_and_in_no_unit() -> None:
+    with pytest.raises(DataError, match=r"expected -50 to 50 m/s$"):
+        check_range({"vel_x_m_s": np.array([0.0, np.inf])}, -50.0, 50.0, "m/s", "dvl")
