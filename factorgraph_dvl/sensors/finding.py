@@ -468,6 +468,13 @@ class Code(StrEnum):
         "Check units and sound speed. Through water, sail faster, on both sides of each course.",
         "error",
     )
+    CHANGED_ALONG_TRIAL = (
+        "changed_along_trial",
+        "A parameter changes along the trial.",
+        "After a slipping mount, a false lock or a clock step, the mean is right at no time.",
+        "Check mount, lock and clock at that time. Solve the parts before and after separately.",
+        "error",
+    )
     FAR_FROM_PRIOR = (
         "far_from_prior",
         "A value is far outside its prior.",
@@ -504,13 +511,6 @@ class Code(StrEnum):
         "explain this.",
         "The values have errors larger than their standard deviations.",
         "Check the parameter that the text names, and state its standard deviation.",
-        "error",
-    )
-    CHANGED_ALONG_TRIAL = (
-        "changed_along_trial",
-        "A parameter changes along the trial.",
-        "After a slipping mount, a false lock or a clock step, the mean is right at no time.",
-        "Check mount, lock and clock at that time. Solve the parts before and after separately.",
         "error",
     )
     NOISE_NOT_SETTLED = (

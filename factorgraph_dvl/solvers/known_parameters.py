@@ -18,7 +18,7 @@ from factorgraph_dvl.sensors.message import Message, message
 from factorgraph_dvl.sensors.parameters import UNITS, Parameter
 from factorgraph_dvl.solvers.change_along_trial import CHANGED, component_changes
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, factorized
-from factorgraph_dvl.statistics.constancy import by_interval
+from factorgraph_dvl.statistics.constancy import Change, by_interval
 from factorgraph_dvl.statistics.robust_weights import robust_scale
 from factorgraph_dvl.statistics.rows import rows_with_times
 from factorgraph_dvl.statistics.scores import Score, Scores, scores
@@ -100,12 +100,11 @@ def explanation(problem: Problem, minimum: Minimum, imu: Imu) -> Explanation | N
         return None
     same, at = _scattered(problem, evaluation, problem.all_parameters)
     changes = component_changes(same, at, factorized(same, at)[0])
-    most = max((each.change.chi2 for each in changes), default=0.0)
+    certain = [e.change for e in changes if e.change.chi2 > CHANGED**2]
     count = sum(int(np.count_nonzero(w)) for w in problem.weights)
     significant.sort(key=lambda each: -each[1].evidence(count))
     parameter, test = significant[0]
-    # Tests of changes take noise for white.
-    if most > max(test.chi2 * test.scatter, CHANGED**2):
+    if any(c.chi2 > test.chi2 or _fall(c) > test.chi2 * test.scatter for c in certain):
         return None
     others = tuple(
         p.name for p, t in significant[1:] if test.evidence(count) - t.evidence(count) < 2.0 * _TIE
@@ -113,6 +112,11 @@ def explanation(problem: Problem, minimum: Minimum, imu: Imu) -> Explanation | N
     if parameter.name == GYRO_SCALE and _is_sampling(test, imu):
         others = (*others, "imu.sampling")
     return Explanation(parameter, test, others)
+
+
+def _fall(change: Change) -> float:
+    """Return twice the fall of the cost by a change, of noise that is white."""
+    return (change.size / change.std) ** 2
 
 
 def _is_sampling(scale: Score, imu: Imu) -> bool:
