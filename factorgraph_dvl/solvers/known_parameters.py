@@ -39,8 +39,8 @@ _TIE = 4.0
 _INTERVALS = 20
 # Least scale of residuals against what is stated. Chosen: records without noise have none.
 _LEAST_SCALE = 0.5
-# Share of χ² that may be left where the wrong `sampling` explains a scale of the gyros. Chosen:
-# the motion between samples is known to some per cent.
+# Share of the squares of a scale of the gyros that the wrong `sampling` may leave. Chosen: the
+# motion between samples is known to some per cent, and the scale to ten.
 _LEFT = 0.2
 # Trial, s, from which on tests are made. Chosen: shorter ones have rival minima.
 _SHORTEST = 60.0
@@ -121,8 +121,8 @@ def _fall(change: Change) -> float:
 
 def _is_sampling(scale: Score, imu: Imu) -> bool:
     """Whether a scale of the gyros is what the wrong sampling looks like."""
-    left = (scale.step - apparent_gyro_scale(imu)) / scale.std
-    return bool(left @ left < _LEFT * np.sum((scale.step / scale.std) ** 2))
+    left = scale.step - apparent_gyro_scale(imu)
+    return bool(left @ left < _LEFT * scale.step @ scale.step)
 
 
 def _tests_of_priors(
