@@ -62,7 +62,7 @@ def parse(parser: argparse.ArgumentParser, argv: Sequence[str] | None = None) ->
             pass
     except OSError as error:
         parser.error(f"--out: {args.out} cannot be written: {error.strerror}")
-    options = {name: v for name, v in vars(args).items() if name not in ("out", "jobs")}
+    options = {name: v for name, v in vars(args).items() if name not in ("out", "jobs", "cache")}
     command = " ".join(["python", f"benchmarks/{Path(sys.argv[0]).name}", *_given(options)])
     args.origin = f"Written by `{command}` from {commit()}; do not edit."
     return args

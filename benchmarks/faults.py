@@ -665,8 +665,9 @@ def table(faulty: Iterable[tuple[Run, dict[str, Any], float]]) -> list[str]:
         named = "" if found["grade"] == "good" else ("yes" if is_named(run, found) else "no")
         level = ", ".join(f"{x:.3g}" if isinstance(x, float) else str(x) for x in _levels(run))
         lam = "–" if np.isnan(added) else f"{added:.0f}"
+        size = "–" if np.isnan(worst(found)) else f"{worst(found):.2g}"
         out.append(
-            f"| {run.scenario} | {run.row.name} | {level} {run.row.unit} | {worst(found):.2g} "
+            f"| {run.scenario} | {run.row.name} | {level} {run.row.unit} | {size} "
             f"| {lam} | {found['grade']} | {reason} | {named} |"
         )
     return out
