@@ -614,7 +614,8 @@ as its user would. Where no key says otherwise, clocks, antenna and DVL bias are
 *Error* is the largest one over calibration, position and attitude, in standard deviations.
 Position and attitude count every second, so 4 is chance. λ is the noncentrality of the fault:
 twice the cost that it adds at the minimum with noise as stated. *Named* says whether the first
-reason is the true cause. λ is worked out for results that are graded good. Scenarios:
+reason is the true cause. λ is worked out for results that are graded good, and is negative where
+measurements are missing. Scenarios:
 
 """
 
@@ -664,7 +665,7 @@ def table(faulty: Iterable[tuple[Run, dict[str, Any], float]]) -> list[str]:
         reason = found["reason"].split(":")[0].strip() if found["grade"] != "refused" else "–"
         named = "" if found["grade"] == "good" else ("yes" if is_named(run, found) else "no")
         level = ", ".join(f"{x:.3g}" if isinstance(x, float) else str(x) for x in _levels(run))
-        lam = "–" if np.isnan(added) else f"{added:.0f}"
+        lam = "–" if np.isnan(added) else f"{round(added)}"
         size = "–" if np.isnan(worst(found)) else f"{worst(found):.2g}"
         out.append(
             f"| {run.scenario} | {run.row.name} | {level} {run.row.unit} | {size} "
