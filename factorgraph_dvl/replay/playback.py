@@ -114,9 +114,7 @@ def _played(
 
     def take(updates: list[Update]) -> None:
         for update in updates:
-            recorder.add(update)
-            if watch is not None:
-                watch(update)
+            _take(recorder, update, watch)
 
     for j, (a, b) in enumerate(pairwise(samples.tolist())):
         for aid, each in zip(trial.aids, rows, strict=True):
@@ -150,22 +148,23 @@ def _played_without_imu(
     end = float(max(aid.time[-1] for aid in trial.aids))
     steps = np.arange(time[0], end, 1.0 / min(rate_hz, MOST_UPDATES_HZ))
     update: Update | None = None
-
-    def take(update: Update) -> None:
-        recorder.add(update)
-        if watch is not None:
-            watch(update)
-
     for until in (*steps.tolist(), end):
         for following in run.advance(until, end=until == end):
             if update is not None:
-                take(update)
+                _take(recorder, update, watch)
             update = following
     if update is None:
         raise _never_started(trial, run)
     last = run.finished(update)
-    take(last)
+    _take(recorder, last, watch)
     return _solution(trial, run, recorder, last), recorder.record(run.delay)
+
+
+def _take(recorder: Recorder, update: Update, watch: Watch | None) -> None:
+    """Record an update, and show it."""
+    recorder.add(update)
+    if watch is not None:
+        watch(update)
 
 
 def _never_started(trial: Trial, run: Replay | MotionReplay) -> SolveError:
