@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -24,6 +24,7 @@ from factorgraph_dvl.baselines.strapdown import (
 )
 from factorgraph_dvl.errors import DataError
 from factorgraph_dvl.geometry.earth import RATE, radii
+from factorgraph_dvl.geometry.records import concatenated
 from factorgraph_dvl.geometry.rotations import (
     exp_so3,
     log_so3,
@@ -182,9 +183,7 @@ def navigate(trial: Trial, pings: Array, *, smoothed: bool = True) -> Navigation
             where=gnss.source,
             expected="times on the clock of the IMU",
         )
-    joined = FilteredTrack(
-        *(np.concatenate([getattr(t, f.name) for t in tracks]) for f in fields(FilteredTrack))
-    )
+    joined = concatenated(tracks)
     arc = np.repeat(np.arange(len(tracks)), [t.time.size for t in tracks])
     return Navigation(samples, joined, arc, tuple(findings))
 

@@ -9,6 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from factorgraph_dvl.baselines.outcome import Estimated
+from factorgraph_dvl.geometry.records import rows_of
 from factorgraph_dvl.geometry.rotations import (
     exp_so3,
 )
@@ -57,7 +58,7 @@ class Points:
 
     def take(self, which: np.ndarray | slice) -> Points:
         """Return some of the pings."""
-        return Points(*(getattr(self, name)[which] for name in self.__dataclass_fields__))
+        return rows_of(self, which)
 
     def thinned(self) -> Points:
         """Return as many pings as it takes to compare starts."""

@@ -7,12 +7,12 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from factorgraph_dvl.geometry.vectors import IntArray
+from factorgraph_dvl.geometry.vectors import BoolArray, IntArray
 
 _Arrays = TypeVar("_Arrays", bound=Any)
 
 
-def rows_of(arrays: _Arrays, rows: slice | IntArray) -> _Arrays:
+def rows_of(arrays: _Arrays, rows: slice | IntArray | BoolArray) -> _Arrays:
     """Return some rows of such a data class."""
     return type(arrays)(*[values[rows] for values in vars(arrays).values()])
 

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 
 from factorgraph_dvl.errors import DataError
 from factorgraph_dvl.geometry.earth import LocalFrame
+from factorgraph_dvl.geometry.records import rows_of
 from factorgraph_dvl.geometry.rotations import exp_so3, log_so3
 from factorgraph_dvl.geometry.vectors import Array, IntArray, cross, rotate, skew
 from factorgraph_dvl.imu.increments import Increments, increments
@@ -52,10 +53,6 @@ class Integrals:
         """Return those at the starts of segments."""
         turn, shift = np.tile(np.eye(3), (count, 1, 1)), np.zeros((2, count, 3))
         return cls(turn, shift[0], shift[1], np.zeros((count, 3, 3)))
-
-    def at(self, index: IntArray | slice) -> Integrals:
-        """Return some of them."""
-        return Integrals(self.dR[index], self.dV[index], self.dP[index], self.dA[index])
 
     def put(self, index: IntArray, others: Integrals) -> None:
         """Write others in the place of some of them."""
@@ -173,13 +170,13 @@ class Segments:
         """Return what adds up from the starts of segments to those of intervals (M,)."""
         segment = np.searchsorted(self.first, index, side="right") - 1
         inside = index - self.first[segment]
-        found = self.knots.at(self.first_knot[segment] + inside // self.spacing)
+        found = rows_of(self.knots, self.first_knot[segment] + inside // self.spacing)
         left = inside % self.spacing
         for j in range(int(left.max(initial=0))):
             live = np.flatnonzero(left > j)
             i = index[live] - left[live] + j
             phi, dv = self.increments.over(i)
-            after = found.at(live).after(*_turns(phi), dv, self.increments.dt[i])
+            after = rows_of(found, live).after(*_turns(phi), dv, self.increments.dt[i])
             found.put(live, after)
         return found
 
@@ -197,8 +194,8 @@ class Segments:
         a = first[segment] + self.stride * number
         b = np.minimum(a + self.stride, last[segment])
         knot = self.first_knot[block][segment] + self.stride // self.spacing * number
-        start, end = self.knots.at(knot), self.knots.at(np.append(knot[1:], knot[-1]))
-        end.put(begins + count - 1, self.ends.at(block))
+        start, end = rows_of(self.knots, knot), rows_of(self.knots, np.append(knot[1:], knot[-1]))
+        end.put(begins + count - 1, rows_of(self.ends, block))
         of_last = _parts(first[-1:], last[-1:], self.spacing)
         less = self.less[knot[0] : self.first_knot[block][-1] + int(of_last[0])]
         dP = end.dP - np.add.reduceat(less, knot - knot[0])
@@ -297,7 +294,7 @@ def _knots(
         for j in range(int((end - begin).max())):
             live = np.flatnonzero(begin + j < end)
             i = begin[live] + j
-            at, here, dt = knot[live] + j // spacing, now.at(live), inc.dt[i]
+            at, here, dt = knot[live] + j // spacing, rows_of(now, live), inc.dt[i]
             if j % spacing == 0:
                 knots.put(at, here)
             i -= begin[0]
@@ -469,7 +466,7 @@ def one_segment(inc: Increments, first: int, last: int) -> Segments:
         spacing=1,
         knots=knots,
         less=rotate(dR, cross(phi, dv)) * (dt / 12.0),
-        ends=knots.at(whole).after(turn[whole], left[whole], dv[whole], dt[whole, 0]),
+        ends=rows_of(knots, whole).after(turn[whole], left[whole], dv[whole], dt[whole, 0]),
     )
 
 

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from time import perf_counter
 
 import numpy as np
 
 from factorgraph_dvl.errors import ConfigError, FactorgraphDvlError
+from factorgraph_dvl.geometry.records import concatenated
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph.motion_chain import MotionChain, chain_nodes
 from factorgraph_dvl.graph.motion_problem import TRACK_STD
@@ -116,7 +117,7 @@ class MotionReplay:
     unused = 0
 
     def __init__(self, trial: Trial, lag_s: float, progress: Progress) -> None:
-        source = trial.gnss or trial.attitude
+        source = trial.position_sensor
         if trial.attitude is None or source is None:
             raise ConfigError(
                 "nothing measures the attitude",
@@ -172,10 +173,7 @@ class MotionReplay:
         _, window = self._current
         smoothed, innovations = self._leave(window, window.problem.chain.time.size)
         if last.smoothed is not None:
-            both = last.smoothed, smoothed
-            smoothed = Trajectory(
-                *(np.concatenate([getattr(t, f.name) for t in both]) for f in fields(Trajectory))
-            )
+            smoothed = concatenated([last.smoothed, smoothed])
         return replace(last, smoothed=smoothed, innovations=(*last.innovations, *innovations))
 
     def _solve(self, until: float, began: float, *, end: bool) -> Update | None:

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import fields
 from functools import partial
 
 import numpy as np
 
+from factorgraph_dvl.geometry.records import rows_of
 from factorgraph_dvl.graph.problem import Evaluation, Problem
 from factorgraph_dvl.quality.earlier_calibration import prior_findings
 from factorgraph_dvl.sensors.finding import Code, Finding
@@ -157,17 +157,13 @@ def _outliers(problem: Problem, evaluation: Evaluation) -> Iterator[Residuals]:
                 )
 
 
-def _subset(motion: Motion, used: np.ndarray) -> Motion:
-    return Motion(**{f.name: getattr(motion, f.name)[used] for f in fields(motion)})
-
-
 def _unobservable(
     trial: Trial, problem: Problem, estimates: Sequence[Estimate], motions: Sequence[Motion]
 ) -> list[Finding]:
     """Say which components the data did not determine, and why."""
     by_name = {p.name: aid for aid in trial.aids for p in aid.parameters()}
     seen = {
-        name: _subset(motion, np.any(weight > 0.0, axis=1))
+        name: rows_of(motion, np.any(weight > 0.0, axis=1))
         for observation, motion, weight in zip(
             problem.observations, motions, problem.weights, strict=True
         )

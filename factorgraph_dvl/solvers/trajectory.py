@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -75,10 +75,7 @@ def trajectory_between(
         return _reported(time, motion, _between(P_n, at.node, fraction), frame, body_axes)
 
     parts = [part(time[i : i + _CHUNK]) for i in range(0, max(time.size, 1), _CHUNK)]
-    if len(parts) == 1:
-        return parts[0]
-    columns = {f.name: [getattr(each, f.name) for each in parts] for f in fields(Trajectory)}
-    return Trajectory(**{name: np.concatenate(each) for name, each in columns.items()})
+    return parts[0] if len(parts) == 1 else concatenated(parts)
 
 
 def epochs_between(start: float, end: float, rate_hz: float) -> Array:

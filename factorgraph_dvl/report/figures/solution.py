@@ -16,6 +16,7 @@ from matplotlib.gridspec import GridSpec
 from factorgraph_dvl.analysis.beam_quality import beam_quality, calibrates, calibration_of
 from factorgraph_dvl.analysis.error_statistics import trajectory_errors
 from factorgraph_dvl.errors import ConfigError
+from factorgraph_dvl.geometry.records import rows_of
 from factorgraph_dvl.report.figures.beams import beam_quality_figure
 from factorgraph_dvl.report.figures.calibration import calibration_figure, correlation_figure
 from factorgraph_dvl.report.figures.drawing import Canvas, save_figures
@@ -126,7 +127,7 @@ def _thinned(trajectory: Trajectory) -> Trajectory:
     k = -(-trajectory.time.size // _LARGEST_TRAJECTORY)
     if k == 1:
         return trajectory
-    return Trajectory(*(getattr(trajectory, name)[::k] for name in trajectory.__annotations__))
+    return rows_of(trajectory, slice(None, None, k))
 
 
 def _by_sensor(residuals: Sequence[Residuals]) -> dict[str, list[Residuals]]:
