@@ -6,6 +6,7 @@ import copy
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 import yaml
 
@@ -16,6 +17,7 @@ from factorgraph_dvl.geometry.vectors import Array, rotate
 from factorgraph_dvl.imu.propagation import States
 from factorgraph_dvl.sensors.protocol import Motion
 from factorgraph_dvl.simulation import parse_scenario, plan_motion
+from factorgraph_dvl.simulation.compass import InsTruth
 from factorgraph_dvl.simulation.motion import TrueMotion as ExactMotion
 from factorgraph_dvl.simulation.scenario import Scenario
 
@@ -67,6 +69,16 @@ _BASE: dict[str, Any] = {
 }
 
 
+# Of a ship: the velocity errs with the period of Schuler, the rest is small.
+SCHULER = InsTruth(
+    rate_hz=1,
+    schuler_velocity_rms_m_s=0.05,
+    attitude_std_deg=(0.02, 0.02, 0.05),
+    white_velocity_std_m_s=0.005,
+    white_position_std_m=0.02,
+)
+
+
 def merged(base: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
     """Return nested `base` with `changes`; a value of None removes a key."""
     out = copy.deepcopy(base)
@@ -97,6 +109,12 @@ def config(name: str, **changes: Any) -> Scenario:
     """Return a scenario of configs/, with changes."""
     data = yaml.safe_load((CONFIGS / f"{name}.yaml").read_text(encoding="utf-8"))
     return _parsed(merged(data, changes))
+
+
+def with_ins(made: Scenario, ins: InsTruth) -> Scenario:
+    """Return a scenario with an INS in place of compass and GNSS."""
+    claims = msgspec.structs.replace(made.trial, gnss={}, attitude={})
+    return msgspec.structs.replace(made, gnss=None, attitude=None, ins=ins, trial=claims)
 
 
 def exact_motion(exact: ExactMotion, frame: LocalFrame, time: Array) -> Motion:

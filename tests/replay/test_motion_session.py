@@ -9,7 +9,7 @@ import msgspec
 import numpy as np
 import pytest
 from monte_carlo import rms_band
-from truth import CONFIGS
+from truth import CONFIGS, SCHULER, with_ins
 
 from factorgraph_dvl.analysis.error_statistics import calibration_errors
 from factorgraph_dvl.errors import ConfigError
@@ -17,7 +17,6 @@ from factorgraph_dvl.replay import replay
 from factorgraph_dvl.sensors.finding import Code
 from factorgraph_dvl.sensors.records import rows_of
 from factorgraph_dvl.simulation import load_scenario, simulate
-from factorgraph_dvl.simulation.compass import InsTruth
 from factorgraph_dvl.solvers.batch import solve
 
 RUNS = int(os.environ.get("FACTORGRAPH_DVL_SEEDS", "8"))
@@ -32,19 +31,6 @@ TURNS = [
 
 def scenario(manoeuvres, name="ship"):
     return msgspec.structs.replace(load_scenario(CONFIGS / f"{name}.yaml"), manoeuvres=manoeuvres)
-
-
-def with_ins(made):
-    """Return a scenario with an INS in place of compass and GNSS."""
-    ins = InsTruth(
-        rate_hz=1,
-        schuler_velocity_rms_m_s=0.05,
-        attitude_std_deg=(0.02, 0.02, 0.05),
-        white_velocity_std_m_s=0.005,
-        white_position_std_m=0.02,
-    )
-    claims = msgspec.structs.replace(made.trial, gnss={}, attitude={})
-    return msgspec.structs.replace(made, gnss=None, attitude=None, ins=ins, trial=claims)
 
 
 def far_apart(found, batch, names=MOUNTING):
@@ -150,7 +136,7 @@ def test_errors_with_an_ins_are_no_larger_than_their_standard_deviations():
     Standard deviations are then on the safe side, those of a batch solution too: 0.67 over eight
     seeds.
     """
-    nees = nees_of_seven(with_ins(scenario(2 * TURNS + [{"straight_s": 60}])))
+    nees = nees_of_seven(with_ins(scenario(2 * TURNS + [{"straight_s": 60}]), SCHULER))
     assert np.sqrt(np.mean(nees) / 7) < rms_band(7 * RUNS)[1]
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import msgspec
 import numpy as np
 import pytest
-from truth import CONFIGS
+from truth import CONFIGS, with_ins
 
 from factorgraph_dvl.analysis.information.observability import observability
 from factorgraph_dvl.planning import predict, propose
@@ -20,12 +20,6 @@ def scenario(repeat=1, manoeuvres=None):
     made = load_scenario(CONFIGS / "ship.yaml")
     legs = made.manoeuvres[0]["manoeuvres"] if manoeuvres is None else manoeuvres
     return msgspec.structs.replace(made, manoeuvres=[{"repeat": repeat, "manoeuvres": legs}])
-
-
-def with_ins(made):
-    ins = InsTruth(rate_hz=1, attitude_std_deg=(0.02, 0.02, 0.05), white_velocity_std_m_s=0.005)
-    claims = msgspec.structs.replace(made.trial, gnss={}, attitude={})
-    return msgspec.structs.replace(made, gnss=None, attitude=None, ins=ins, trial=claims)
 
 
 def std_of(solution):
@@ -95,7 +89,8 @@ def test_a_plan_is_what_the_solver_claims(solved):
 
 @pytest.mark.slow
 def test_a_plan_with_an_ins_is_what_the_solver_claims():
-    made = with_ins(scenario())
+    ins = InsTruth(rate_hz=1, attitude_std_deg=(0.02, 0.02, 0.05), white_velocity_std_m_s=0.005)
+    made = with_ins(scenario(), ins)
     check_plan(made, solve_with_history(simulate(made, 1), rate_hz=1.0)[0])
 
 

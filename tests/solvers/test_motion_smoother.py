@@ -9,7 +9,7 @@ import msgspec
 import numpy as np
 import pytest
 from monte_carlo import rms_band
-from truth import CONFIGS
+from truth import CONFIGS, SCHULER, with_ins
 
 from factorgraph_dvl.analysis.error_statistics import calibration_errors
 from factorgraph_dvl.errors import ConfigError, FactorgraphDvlError
@@ -20,7 +20,6 @@ from factorgraph_dvl.io.trial_folder import load_trial, save_trial
 from factorgraph_dvl.sensors.attitude import SCHULER_PERIOD
 from factorgraph_dvl.sensors.finding import Code
 from factorgraph_dvl.simulation import load_scenario, simulate
-from factorgraph_dvl.simulation.compass import InsTruth
 from factorgraph_dvl.solvers.batch import solve
 from factorgraph_dvl.solvers.motion_preparation import prepare_motion
 
@@ -122,16 +121,7 @@ def test_positions_are_needed_and_an_imu_is_asked_for(ship):
 
 
 def ins_scenario(repeat=1):
-    ins = InsTruth(
-        rate_hz=1,
-        schuler_velocity_rms_m_s=0.05,
-        attitude_std_deg=(0.02, 0.02, 0.05),
-        white_velocity_std_m_s=0.005,
-        white_position_std_m=0.02,
-    )
-    scenario = shortened(repeat=repeat)
-    claims = msgspec.structs.replace(scenario.trial, gnss={}, attitude={})
-    return msgspec.structs.replace(scenario, gnss=None, attitude=None, ins=ins, trial=claims)
+    return with_ins(shortened(repeat=repeat), SCHULER)
 
 
 def test_an_ins_alone_is_enough():

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from running import run  # noqa: F401
 from scipy.integrate import quad
-from truth import CONFIGS, CONING, config, scenario
+from truth import CONFIGS, CONING, config, scenario, with_ins
 
 from factorgraph_dvl.analysis.dead_reckoning.before_after import before_after
 from factorgraph_dvl.analysis.dead_reckoning.integration import (
@@ -377,13 +377,10 @@ def test_without_gnss_the_reference_gives_the_attitude_and_initial_the_start(run
 
 
 def test_an_ins_gives_start_and_score():
-    ins = InsTruth(rate_hz=1)
     made = msgspec.structs.replace(
         load_scenario(CONFIGS / "ship.yaml"), manoeuvres=[{"straight_s": 60}], noise=False
     )
-    claims = msgspec.structs.replace(made.trial, gnss={}, attitude={})
-    made = msgspec.structs.replace(made, gnss=None, attitude=None, ins=ins, trial=claims)
-    trial = replace(simulate(made), reference=None)
+    trial = replace(simulate(with_ins(made, InsTruth(rate_hz=1))), reference=None)
     truth = trial.calibration_truth
     result = before_after(trial, truth, orientations(trial.attitude, trial.body_axes))
     assert result.scored_by == "INS"
