@@ -19,8 +19,8 @@ from factorgraph_dvl.geometry.vectors import interpolate
 from factorgraph_dvl.ranging.hypotheses import follow
 from factorgraph_dvl.ranging.planar_solution import solve_planar
 from factorgraph_dvl.ranging.problem import planar_setup
-from factorgraph_dvl.simulation import parse_scenario, simulate_planar
-from factorgraph_dvl.trial import PlanarTrial
+from factorgraph_dvl.simulation import parse_scenario, simulate
+from factorgraph_dvl.trial import Trial
 
 PAGE = "chen-2021.md"
 UPDATES = 600
@@ -102,7 +102,7 @@ def scenario(
     )
 
 
-def truth(trial: PlanarTrial, time: np.ndarray) -> np.ndarray:
+def truth(trial: Trial, time: np.ndarray) -> np.ndarray:
     """Return the true positions in the trial's frame, (M, 2), m."""
     r = trial.reference
     return trial.frame().position(*interpolate(time, r.time, r.geodetic).T)[:, :2]
@@ -116,7 +116,7 @@ def settled(error: np.ndarray, threshold: float = THRESHOLD) -> float:
     return float(above[-1] + 2) if above[-1] + 1 < error.size else np.inf
 
 
-def replay(trial: PlanarTrial) -> tuple[np.ndarray, np.ndarray]:
+def replay(trial: Trial) -> tuple[np.ndarray, np.ndarray]:
     """Return times and positions of the heaviest hypothesis, with the data so far."""
     problem = planar_setup(trial).problem
     nodes = list(range(EVERY + 1, problem.time.size + 1, EVERY))
@@ -135,7 +135,7 @@ def convergence(task: tuple[str, float, float, int]) -> dict[str, float]:
     """Return the updates that each method takes on one seed, from the same wrong start."""
     name, std, range_std, seed = task
     geometry = GEOMETRIES[name]
-    trial = simulate_planar(scenario(geometry, prior=std, range_std_m=range_std), seed)
+    trial = simulate(scenario(geometry, prior=std, range_std_m=range_std), seed)
     off = np.random.default_rng([seed, 9]).normal(0.0, std, 2)
     start = trial.initial_position.geodetic
     moved = trial.frame().position(*start) + np.array([*off, 0.0])
@@ -171,8 +171,8 @@ def solved(task: tuple[str, int]) -> Solved:
     changes: dict = {"multipath": 0.2} if kind == "multipath" else {}
     geometry = STRAIGHT if kind == "straight" else ONE_TURN
     current = np.random.default_rng([seed, 10]).normal(0.0, CURRENT_STD, 2)
-    trial = simulate_planar(scenario(geometry, current=current, **changes), seed)
-    clean = simulate_planar(scenario(geometry, current=current), seed)
+    trial = simulate(scenario(geometry, current=current, **changes), seed)
+    clean = simulate(scenario(geometry, current=current), seed)
     solution = solve_planar(trial, rate_hz=1.0)
     t = solution.trajectory
     error = trial.frame().position(*t.geodetic.T)[:, :2] - truth(trial, t.time)

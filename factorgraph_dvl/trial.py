@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import ClassVar, TypeVar
+from typing import TypeVar
 
 import numpy as np
 from msgspec import UnsetType
@@ -17,7 +17,7 @@ from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.sensors.attitude import Attitude
 from factorgraph_dvl.sensors.beacon import Beacons
 from factorgraph_dvl.sensors.beam_geometry import as_dvl
-from factorgraph_dvl.sensors.catalogue import add_plug_in
+from factorgraph_dvl.sensors.catalogue import PLANAR, add_plug_in
 from factorgraph_dvl.sensors.depth import Depth
 from factorgraph_dvl.sensors.dvl import Dvl
 from factorgraph_dvl.sensors.dvl_beams import BEAM_PREFIX, DvlBeams
@@ -125,7 +125,8 @@ class Trial:
     name : str
         Of the trial.
     imu : Imu or None
-        The IMU; None where an INS or another sensor of attitude takes its place.
+        The IMU; None where an INS, another sensor of attitude, or a compass with a speed log
+        takes its place.
     gnss, dvl : Gnss or Dvl
         The sensors that a calibration needs, None where the trial does not have them.
     others : tuple of Aid, optional
@@ -196,7 +197,24 @@ class Trial:
             if isinstance(aid, Turntable) and self.gnss is not None:
                 up = -frd_from_body(self.body_axes)[2]
                 object.__setattr__(self, "gnss", replace(self.gnss, turning=aid.turning(up)))
+        self._check_planar()
         self._check_prior()
+
+    def _check_planar(self) -> None:
+        """Raise ConfigError for what a track in the plane would leave out."""
+        if self.find(Heading) is None and self.find(SpeedLog) is None:
+            return
+        unused = [r.section for r in self.records if type(r) not in PLANAR]
+        unused += ["initial.roll_pitch_heading_deg"] if self.initial_attitude else []
+        unused += ["initial.velocity"] if self.initial_velocity else []
+        if unused:
+            raise ConfigError(
+                "heading and log make a planar trial, which does not use this key",
+                where=f"trial.yaml key {unused[0]}",
+                expected=", ".join(kind.section for kind in PLANAR),
+                hint="State a compass beside other sensors as `attitude`, and a log as `dvl` with "
+                "`reference: water`",
+            )
 
     def _check_prior(self) -> None:
         """Raise DataError if a prior of DVL or IMU came from data of this trial."""
@@ -236,6 +254,28 @@ class Trial:
     def find(self, kind: type[_Sensor]) -> _Sensor | None:
         """Return the sensor of a type, None where the trial does not have it."""
         return next((aid for aid in self.aids if isinstance(aid, kind)), None)
+
+    def required(self, kind: type[_Sensor]) -> _Sensor:
+        """Return the sensor of a type.
+
+        Raises
+        ------
+        ConfigError
+            If the trial does not have it.
+        """
+        found = self.find(kind)
+        if found is None:
+            raise ConfigError(
+                f"the trial has no `{kind.section}`, which is needed here",
+                where="trial.yaml",
+                expected=f"a section {kind.section}",
+            )
+        return found
+
+    @property
+    def planar(self) -> bool:
+        """Whether compass and log stand for the IMU: the track is found in the plane."""
+        return self.find(Heading) is not None
 
     @property
     def beams(self) -> DvlBeams | None:
@@ -313,7 +353,7 @@ class Trial:
         return self.gnss or self.find(Ins)
 
     @property
-    def body_sensor(self) -> Imu | Attitude | Ins:
+    def body_sensor(self) -> Imu | Attitude | Ins | Heading:
         """The instrument whose body is that of the trial: the IMU, or what takes its place.
 
         Raises
@@ -321,7 +361,7 @@ class Trial:
         ConfigError
             If the trial has none.
         """
-        return self.imu or self.attitude or self.inertial
+        return self.imu or self.attitude or self.find(Heading) or self.inertial
 
     @property
     def depth(self) -> Depth | None:
@@ -329,7 +369,7 @@ class Trial:
         return self.find(Depth)
 
     def frame(self) -> LocalFrame:
-        """Return the tangent frame at the first known position, at worst a beacon's.
+        """Return the tangent frame at the first known position; of a planar trial, at a beacon.
 
         Raises
         ------
@@ -337,7 +377,10 @@ class Trial:
             If neither GNSS nor `initial.position` nor a beacon gives a position.
         """
         known = np.empty((0, 3))
-        if self.initial_position is not None:
+        if self.planar and self.beacons is not None:
+            # Ranges fit a plane best where it touches the Earth near the beacons.
+            known = self.beacons.places
+        elif self.initial_position is not None:
             known = self.initial_position.geodetic[None]
         elif self.gnss is not None:
             known = self.gnss.geodetic[~np.isnan(self.gnss.geodetic[:, 0])]
@@ -354,61 +397,3 @@ class Trial:
             where="trial.yaml",
             expected="a gnss or ins section with positions, initial.position, or beacons",
         )
-
-
-@dataclass(frozen=True)
-class PlanarTrial:
-    """A trial of a vehicle without a usable IMU: heading, speed, depth, and beacons.
-
-    Parameters
-    ----------
-    name : str
-        Of the trial.
-    heading : Heading
-        Record of the compass.
-    log : SpeedLog
-        Record of the log.
-    depth : Depth
-        Record of the depth sensor.
-    beacons : Beacons
-        Record of the ranges.
-    body_axes : BodyAxes, optional
-        Axes in which lever arms are given.
-    initial_position : InitialPosition, optional
-        Prior; None = found from the ranges.
-    reference : Reference, optional
-        Truth or a trusted solution, None if there is none.
-    calibration_truth : dict of str to ndarray, optional
-        True values of what is estimated, by reported name, in reported units; empty outside
-        simulations.
-    notes : tuple of Finding, optional
-        What was noticed while loading, for the user.
-    """
-
-    name: str
-    heading: Heading
-    log: SpeedLog
-    depth: Depth
-    beacons: Beacons
-    body_axes: BodyAxes = "RFU"
-    initial_position: InitialPosition | None = None
-    reference: Reference | None = None
-    calibration_truth: dict[str, Array] = field(default_factory=dict)
-    notes: tuple[Finding, ...] = ()
-
-    gnss: ClassVar[None] = None
-    beams: ClassVar[None] = None
-
-    @property
-    def records(self) -> tuple[Heading, SpeedLog, Depth, Beacons]:
-        """All records."""
-        return self.heading, self.log, self.depth, self.beacons
-
-    @property
-    def inputs(self) -> tuple[str, ...]:
-        """Fingerprints of all data behind a result."""
-        return fingerprints(self.records)
-
-    def frame(self) -> LocalFrame:
-        """Return the tangent frame at the first beacon."""
-        return LocalFrame(*self.beacons.places[0])

@@ -8,7 +8,7 @@ import numpy as np
 from truth import merged
 
 from factorgraph_dvl.geometry.vectors import interpolate
-from factorgraph_dvl.simulation import parse_scenario, simulate_planar
+from factorgraph_dvl.simulation import parse_scenario, simulate
 
 BASE = {
     "name": "test",
@@ -39,7 +39,7 @@ BASE = {
 
 
 def trial(seed=0, **changes):
-    return simulate_planar(parse_scenario(merged(BASE, changes)), seed)
+    return simulate(parse_scenario(merged(BASE, changes)), seed)
 
 
 ALL_CONSTANTS = {
@@ -74,6 +74,12 @@ def true_state(t, problem):
 def error_of(t, solution):
     track = solution.trajectory
     return t.frame().position(*track.geodetic.T)[:, :2] - truth(t, track.time)
+
+
+def changed(t, *records):
+    """Return a trial with records in place of those of the same sensors."""
+    new = {type(record): record for record in records}
+    return replace(t, others=tuple(new.get(type(aid), aid) for aid in t.others))
 
 
 def without(record, first, last):

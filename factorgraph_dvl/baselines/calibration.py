@@ -22,6 +22,9 @@ from factorgraph_dvl.baselines.recorded_navigation import (
     recorded_navigation,
 )
 from factorgraph_dvl.baselines.ship_adcp import horizontal, joyce, outcome_of, pollard_read
+from factorgraph_dvl.baselines.single_beacon import METHODS as BEACON_METHODS
+from factorgraph_dvl.baselines.single_beacon import Method as BeaconMethod
+from factorgraph_dvl.baselines.single_beacon import filter_planar
 from factorgraph_dvl.baselines.spurious_information import without_spurious_information
 from factorgraph_dvl.baselines.star_calibration import calibrate_gyros
 from factorgraph_dvl.baselines.summary import (
@@ -54,8 +57,8 @@ DvlMethod = Literal[
     "pollard-read",
 ]
 DVL_METHODS: tuple[DvlMethod, ...] = get_args(DvlMethod)
-Method = DvlMethod | Literal["star", "liu-2020", "beams"]
-METHODS: tuple[Method, ...] = (*DVL_METHODS, "star", "liu-2020", "beams")
+Method = DvlMethod | BeaconMethod | Literal["star", "liu-2020", "beams"]
+METHODS: tuple[Method, ...] = (*DVL_METHODS, "star", "liu-2020", "beams", *BEACON_METHODS)
 
 _UNCORRELATED = Finding(Code.METHOD_LIMITS, message("method_limits.uncorrelated_prior"))
 _NEGLECTED: dict[DvlMethod, tuple[str, ...]] = {
@@ -79,7 +82,7 @@ _MARGIN = 1.0
 
 def kalman(
     trial: Trial,
-    method: Method = "point-set",
+    method: Method | None = None,
     *,
     rate_hz: float = 10.0,
     progress: Progress | None = None,
@@ -98,7 +101,7 @@ def kalman(
 
 def calibrate(
     trial: Trial,
-    method: Method = "point-set",
+    method: Method | None = None,
     *,
     rate_hz: float = 10.0,
     progress: Progress | None = None,
@@ -110,19 +113,20 @@ def calibrate(
     neglects the correlations between them.
 
     The methods `star` and `liu-2020` estimate the drift of the gyros against a star tracker
-    instead.
+    instead, and `4sv-2ob` and `4sv-3ob` the track of a planar trial and the current.
 
     Parameters
     ----------
     trial : Trial
         With IMU, GNSS and DVL, or its beams, or star tracker. Without IMU, an INS, or GNSS with a
-        compass, is what the DVL is compared with.
-    method : Method, default 'point-set'
+        compass, is what the DVL is compared with. Or a planar trial, with its first position.
+    method : Method, optional
+        By default `point-set`, and `4sv-3ob` for a planar trial.
         `point-set` (seven states), `luo-2024` (the same as printed), `nine-state`,
         `nine-state-linear` (as printed), `nine-state-ukf`, `wahba`, `least-squares`, or the fits
         `joyce` and `pollard-read` for ships. These take beams without a DVL beside them for the
-        velocity that they amount to. `star`, or `liu-2020` as printed; or `beams`, an extended
-        Kalman filter of single beams.
+        velocity that they amount to. `star`, or `liu-2020` as printed; `beams`, an extended
+        Kalman filter of single beams; or, for planar trials, `4sv-2ob` or `4sv-3ob`.
     rate_hz : float, default 10.0
         Rate of the trajectory in the solution.
     progress : callable, optional
@@ -140,11 +144,15 @@ def calibrate(
     ConfigError, DataError
         If the trial cannot be calibrated this way.
     """
+    if method is None:
+        method = "4sv-3ob" if trial.planar else "point-set"
     if method not in METHODS:
         raise ConfigError(f"method is {method!r}", expected=f"one of {', '.join(METHODS)}")
     if not (np.isfinite(rate_hz) and rate_hz > 0.0):
         raise ConfigError(f"rate_hz is {rate_hz}", expected="a number above 0")
     report = progress or (lambda stage, iteration, cost: None)
+    if method == "4sv-2ob" or method == "4sv-3ob":
+        return filter_planar(trial, method, progress=report)
     trial = (trial if trial.imu is None else without_strays(trial)).on_one_clock()
     if method == "star" or method == "liu-2020":
         report("SINS/stars", 0, None)

@@ -15,7 +15,10 @@ import numpy as np
 from factorgraph_dvl.baselines.single_beacon import Filtered, Method, run_filter
 from factorgraph_dvl.errors import DataError
 from factorgraph_dvl.geometry.vectors import Array
-from factorgraph_dvl.trial import PlanarTrial
+from factorgraph_dvl.sensors.beacon import Beacons
+from factorgraph_dvl.sensors.depth import Depth
+from factorgraph_dvl.sensors.speed_log import Heading
+from factorgraph_dvl.trial import Trial
 
 # Chosen: standard deviation of a start, relative to its distance: the course over ground is not
 # known better than the heading, and a current of 0.3 m/s turns that of 2 m/s by 0.15 rad.
@@ -38,12 +41,12 @@ class Tracks:
     misfit: Array
 
 
-def mirror_pair(trial: PlanarTrial, times: tuple[float, float, float]) -> tuple[Array, Array]:
+def mirror_pair(trial: Trial, times: tuple[float, float, float]) -> tuple[Array, Array]:
     """Return both positions at the first time, (2, 2), m, in the trial's frame, and the deviation.
 
     Parameters
     ----------
-    trial : PlanarTrial
+    trial : Trial
         With one beacon, on a straight run over the times.
     times : tuple of (float, float, float)
         When the ranges are taken, s.
@@ -53,12 +56,13 @@ def mirror_pair(trial: PlanarTrial, times: tuple[float, float, float]) -> tuple[
     DataError
         If the three ranges belong to no straight run.
     """
-    beacons, frame = trial.beacons, trial.frame()
+    beacons, depth = trial.required(Beacons), trial.required(Depth)
+    compass, frame = trial.required(Heading), trial.frame()
     known = np.flatnonzero(~np.isnan(beacons.range))
     rows = known[np.searchsorted(beacons.time[known], np.array(times) - 1e-6)]
     place = frame.position(*next(iter(beacons.settings.positions.values())).geodetic)
-    depth = np.interp(beacons.time[rows], trial.depth.time, trial.depth.depth)
-    above = trial.depth.settings.sea_surface_height_m - depth - frame.height - place[2]
+    below = np.interp(beacons.time[rows], depth.time, depth.depth)
+    above = depth.settings.sea_surface_height_m - below - frame.height - place[2]
     square = beacons.range[rows] ** 2 - above**2
     t = beacons.time[rows] - beacons.time[rows[0]]
     by_square, by_time, start = np.polyfit(t, square, 2)
@@ -70,14 +74,14 @@ def mirror_pair(trial: PlanarTrial, times: tuple[float, float, float]) -> tuple[
         )
     along = by_time / (2.0 * np.sqrt(by_square))
     across = np.sqrt(max(start - along**2, 0.0))
-    heading = float(np.interp(beacons.time[rows[0]], trial.heading.time, trial.heading.heading))
+    heading = float(np.interp(beacons.time[rows[0]], compass.time, compass.heading))
     ahead = np.array([np.sin(heading), np.cos(heading)])
     starboard = np.array([ahead[1], -ahead[0]])
     pair = place[:2] + along * ahead + np.outer([1.0, -1.0], across * starboard)
     return pair, np.full(2, _RELATIVE_STD * np.sqrt(start))
 
 
-def both_tracks(trial: PlanarTrial, method: Method, times: tuple[float, float, float]) -> Tracks:
+def both_tracks(trial: Trial, method: Method, times: tuple[float, float, float]) -> Tracks:
     """Follow both mirror images, and say which the data prefer.
 
     The paper drops the track whose covariance grows. That of an extended Kalman filter does not

@@ -17,10 +17,13 @@ from typing import Literal, get_args
 import numpy as np
 
 from factorgraph_dvl.baselines.outcome import History
-from factorgraph_dvl.errors import ConfigError, DataError
+from factorgraph_dvl.errors import DataError
 from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.sensors.beacon import Beacons
+from factorgraph_dvl.sensors.depth import Depth
 from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.sensors.message import message
+from factorgraph_dvl.sensors.speed_log import Heading, SpeedLog
 from factorgraph_dvl.solution import (
     Estimate,
     Progress,
@@ -29,7 +32,7 @@ from factorgraph_dvl.solution import (
     Trajectory,
     contradictions,
 )
-from factorgraph_dvl.trial import PlanarTrial
+from factorgraph_dvl.trial import Trial
 
 Method = Literal["4sv-2ob", "4sv-3ob"]
 METHODS: tuple[Method, ...] = get_args(Method)
@@ -72,8 +75,8 @@ class Filtered:
 
 
 def filter_planar(
-    trial: PlanarTrial,
-    method: Method | str,
+    trial: Trial,
+    method: Method,
     *,
     progress: Progress | None = None,
 ) -> tuple[Solution, History]:
@@ -81,9 +84,9 @@ def filter_planar(
 
     Parameters
     ----------
-    trial : PlanarTrial
+    trial : Trial
         With `initial.position`: the filters cannot find it.
-    method : Method or str
+    method : Method
         `4sv-2ob` or `4sv-3ob`.
     progress : callable, optional
         Called with stage, iteration and cost.
@@ -98,10 +101,9 @@ def filter_planar(
     Raises
     ------
     ConfigError, DataError
-        If the method is unknown, or the trial has no position to start from.
+        If the trial has no compass, log, depth sensor or beacons, or no position to start from.
     """
-    if method not in METHODS:
-        raise ConfigError(f"method is {method!r}", expected=f"one of {', '.join(METHODS)}")
+    heading, depth = trial.required(Heading).settings, trial.required(Depth).settings
     if trial.initial_position is None:
         raise DataError(
             "the trial has no position to start from",
@@ -120,18 +122,17 @@ def filter_planar(
         *_depends_on_start(trial, method, mean, start_std, filtered),
     ]
     m = filtered.time.size
-    surface = trial.depth.settings.sea_surface_height_m
-    height = surface - _depth_at(trial, filtered.time)
+    height = depth.sea_surface_height_m - _depth_at(trial, filtered.time)
     p = np.column_stack([filtered.state[:, :2], height - frame.height])
     lat, lon, _ = frame.geodetic(p)
     position_cov, velocity_cov = np.zeros((m, 3, 3)), np.zeros((m, 3, 3))
     position_cov[:, :2, :2] = filtered.covariance[:, :2, :2]
     velocity_cov[:, :2, :2] = filtered.covariance[:, 2:, 2:]
-    position_cov[:, 2, 2] = velocity_cov[:, 2, 2] = trial.depth.settings.std_m**2
+    position_cov[:, 2, 2] = velocity_cov[:, 2, 2] = depth.std_m**2
     rph, rph_cov = np.zeros((m, 3)), np.full((m, 3, 3), np.nan)
     rph[:, 2] = np.interp(filtered.time, *_heading(trial))
     rph[:, 2] %= 2.0 * np.pi
-    rph_cov[:, 2, 2] = trial.heading.settings.std_rad**2
+    rph_cov[:, 2, 2] = heading.std_rad**2
     value, P = filtered.state[-1, 2:], filtered.covariance[-1, 2:, 2:]
     prior = _current_std(trial)
     std = np.sqrt(np.diag(P))
@@ -170,12 +171,12 @@ def filter_planar(
     return solution, History(filtered.time, _NAMES, filtered.state[:, 2:], stds[:, 2:])
 
 
-def run_filter(trial: PlanarTrial, method: Method | str, mean: Array, std: Array) -> Filtered:
+def run_filter(trial: Trial, method: Method | str, mean: Array, std: Array) -> Filtered:
     """Run a filter from a position.
 
     Parameters
     ----------
-    trial : PlanarTrial
+    trial : Trial
         With heading, log, depth and beacons.
     method : Method or str
         `4sv-2ob` or `4sv-3ob`.
@@ -187,13 +188,14 @@ def run_filter(trial: PlanarTrial, method: Method | str, mean: Array, std: Array
     Filtered
         At the times of the beacons' record that heading and log cover.
     """
-    beacons, frame = trial.beacons, trial.frame()
+    beacons, frame = trial.required(Beacons), trial.frame()
     settings = beacons.settings
     dead_reckoning = _DeadReckoning(trial)
     x = np.array([*mean, 0.0, 0.0])
     P = np.diag([*std, *np.maximum(_current_std(trial), _LEAST_CURRENT)]) ** 2
     places = {n: frame.position(*place.geodetic) for n, place in settings.positions.items()}
-    height = trial.depth.settings.sea_surface_height_m - _depth_at(trial, beacons.time)
+    surface = trial.required(Depth).settings.sea_surface_height_m
+    height = surface - _depth_at(trial, beacons.time)
     now = dead_reckoning.start
     times, states, covariances, velocities = [], [], [], []
     innovations_of: dict[str, list[tuple[float, float, float]]] = {"range": [], "range rate": []}
@@ -242,7 +244,7 @@ def run_filter(trial: PlanarTrial, method: Method | str, mean: Array, std: Array
 
 
 def _depends_on_start(
-    trial: PlanarTrial, method: Method | str, mean: Array, std: Array, found: Filtered
+    trial: Trial, method: Method | str, mean: Array, std: Array, found: Filtered
 ) -> list[Finding]:
     """Return a finding if the end depends more on the start than its covariance allows.
 
@@ -268,34 +270,35 @@ def _depends_on_start(
     ]
 
 
-def _current_std(trial: PlanarTrial) -> Array:
-    if trial.log.settings.reference == "bottom":
-        return np.zeros(2)
-    return np.array(trial.log.settings.current_std_m_s)
+def _current_std(trial: Trial) -> Array:
+    settings = trial.required(SpeedLog).settings
+    return np.array(settings.current_std_m_s) * (settings.reference == "water")
 
 
-def _heading(trial: PlanarTrial) -> tuple[Array, Array]:
+def _heading(trial: Trial) -> tuple[Array, Array]:
     """Return times and measured headings, unwrapped."""
-    known = ~np.isnan(trial.heading.heading)
-    return trial.heading.time[known], np.unwrap(trial.heading.heading[known])
+    heading = trial.required(Heading)
+    known = ~np.isnan(heading.heading)
+    return heading.time[known], np.unwrap(heading.heading[known])
 
 
-def _depth_at(trial: PlanarTrial, time: Array) -> Array:
-    known = ~np.isnan(trial.depth.depth)
-    return np.interp(time, trial.depth.time[known], trial.depth.depth[known])
+def _depth_at(trial: Trial, time: Array) -> Array:
+    depth = trial.required(Depth)
+    known = ~np.isnan(depth.depth)
+    return np.interp(time, depth.time[known], depth.depth[known])
 
 
 class _DeadReckoning:
     """Heading and speed: displacement and velocity, each with its noise."""
 
-    def __init__(self, trial: PlanarTrial) -> None:
-        heading, log = trial.heading, trial.log
+    def __init__(self, trial: Trial) -> None:
+        heading, log = trial.required(Heading), trial.required(SpeedLog)
         measured = ~np.isnan(log.speed)
         self._heading = _heading(trial)
         starboard = np.nan_to_num(log.starboard[measured])
         self._speed = log.time[measured], log.speed[measured], starboard
         self._std = log.settings.speed_std_m_s, heading.settings.std_rad
-        depth = trial.depth.time
+        depth = trial.required(Depth).time
         self.start = max(self._heading[0][0], self._speed[0][0], depth[0])
         self.end = min(self._heading[0][-1], self._speed[0][-1], depth[-1])
         self._steps = tuple(

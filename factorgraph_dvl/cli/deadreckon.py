@@ -163,9 +163,14 @@ def _attitude(
     from factorgraph_dvl.geometry.units import DEG_PER_HOUR
     from factorgraph_dvl.imu.attitude_history import AttitudeHistory
 
-    if source == "record" and trial.attitude is not None:
+    if source == "record":
         from factorgraph_dvl.imu.attitude_record import orientations
 
+        if trial.attitude is None:
+            raise ConfigError(
+                "the trial has no record of roll, pitch and heading", where="--attitude record",
+                expected="a trial with ins or attitude",
+            )  # fmt: skip
         return orientations(trial.attitude, trial.body_axes), ()
     if align is not None and source != "sins":
         raise ConfigError("applies only to --attitude sins", where="--align")

@@ -6,15 +6,15 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from factorgraph_dvl.sensors.finding import Finding
-    from factorgraph_dvl.trial import PlanarTrial, Trial
+    from factorgraph_dvl.trial import Trial
 
 
-def errors_in(trial: Trial | PlanarTrial, *, anyway: bool) -> tuple[Finding, ...]:
+def errors_in(trial: Trial, *, anyway: bool) -> tuple[Finding, ...]:
     """Return the errors in the records of a trial.
 
     Parameters
     ----------
-    trial : Trial or PlanarTrial
+    trial : Trial
         As loaded.
     anyway : bool
         Go on where records cannot be used.
@@ -26,8 +26,5 @@ def errors_in(trial: Trial | PlanarTrial, *, anyway: bool) -> tuple[Finding, ...
     """
     from factorgraph_dvl.quality.refusal import accepted_errors
     from factorgraph_dvl.quality.survey import survey
-    from factorgraph_dvl.quality.survey_planar import survey_planar
-    from factorgraph_dvl.trial import PlanarTrial
 
-    found = survey_planar(trial) if isinstance(trial, PlanarTrial) else survey(trial)
-    return accepted_errors(found, anyway=anyway)
+    return accepted_errors(survey(trial), anyway=anyway)

@@ -27,21 +27,15 @@ def simulate(
     Examples:
       factorgraph-dvl simulate configs/cruise.yaml --out trial --seed 1
     """
-    from factorgraph_dvl.io.planar_folder import save_planar_trial
     from factorgraph_dvl.io.trial_folder import OWNED, check_simulated, save_trial
-    from factorgraph_dvl.simulation import load_scenario, simulate_planar
+    from factorgraph_dvl.simulation import load_scenario
     from factorgraph_dvl.simulation import simulate as run
 
     check_simulated(out)
     claim_output(out, force=force, owned=OWNED, inputs=(config,))
     start = perf_counter()
     scenario = load_scenario(config)
-    if scenario.planar:
-        save_planar_trial(
-            simulate_planar(scenario, seed), out, force=force, parquet=parquet, seed=seed
-        )
-    else:
-        save_trial(run(scenario, seed), out, force=force, parquet=parquet, seed=seed)
+    save_trial(run(scenario, seed), out, force=force, parquet=parquet, seed=seed)
     if events.active():
         print_written(out)
         return

@@ -43,11 +43,10 @@ if TYPE_CHECKING:
     from factorgraph_dvl.analysis.comparison.halves import Halves
     from factorgraph_dvl.baselines import History
     from factorgraph_dvl.baselines.calibration import Method
-    from factorgraph_dvl.errors import ConfigError
     from factorgraph_dvl.io.finished_stages import FinishedStages
     from factorgraph_dvl.solution import Solution
     from factorgraph_dvl.statistics.information_history import InformationHistory
-    from factorgraph_dvl.trial import PlanarTrial, Trial
+    from factorgraph_dvl.trial import Trial
 
 # Entries of σ along the trial. Chosen: a plot has no more pixels, and each costs as much as a
 # step of the filter behind it.
@@ -83,11 +82,6 @@ class KalmanMethod(StrEnum):
     BEAMS = "beams"
     TWO_OBSERVATIONS = "4sv-2ob"
     THREE_OBSERVATIONS = "4sv-3ob"
-
-    @property
-    def planar(self) -> bool:
-        """Whether the method filters planar trials."""
-        return self in (KalmanMethod.TWO_OBSERVATIONS, KalmanMethod.THREE_OBSERVATIONS)
 
 
 def solve(
@@ -129,23 +123,10 @@ def solve(
         found = _Found(solution, along=along)
         return found if parts is None else _with_halves(trial, found, parts, progress)
 
-    def run_planar(trial: PlanarTrial, progress: ProgressLine) -> _Found:
-        from factorgraph_dvl.quality.plausibility_planar import planar_findings
-        from factorgraph_dvl.quality.refusal import explained
-        from factorgraph_dvl.ranging.planar_solution import solve_planar
-
-        if halves:
-            raise _misplaced("--halves", "a trial with an imu")
-        errors = errors_in(trial, anyway=anyway)
-        with explained(errors):
-            solution = solve_planar(trial, rate_hz=rate, progress=progress)
-        return _Found(solution.with_findings((*errors, *planar_findings(trial))))
-
     _solve_into(
         out,
         trial_path,
         run,
-        run_planar,
         force=force,
         figures=None if no_figures else figures,
         anyway=anyway,
@@ -189,34 +170,18 @@ def kalman(
         from factorgraph_dvl.baselines import calibrate
         from factorgraph_dvl.quality.refusal import explained
 
-        chosen = method or KalmanMethod.POINT_SET
-        if chosen.planar:
-            raise _misplaced(f"method {chosen.value}", "a planar trial, without an imu")
-        name = f"{chosen.value}-linear" if linear else chosen.value
+        name = "nine-state-linear" if linear else method and method.value
         errors = errors_in(trial, anyway=anyway)
         with explained(errors):
             solution, history = calibrate(
-                trial, cast("Method", name), rate_hz=rate, progress=progress
+                trial, cast("Method | None", name), rate_hz=rate, progress=progress
             )
-        return _Found(solution.with_findings(errors), history)
-
-    def run_planar(trial: PlanarTrial, progress: ProgressLine) -> _Found:
-        from factorgraph_dvl.baselines.single_beacon import filter_planar
-        from factorgraph_dvl.quality.refusal import explained
-
-        chosen = method or KalmanMethod.THREE_OBSERVATIONS
-        if not chosen.planar:
-            raise _misplaced(f"method {chosen.value}", "a trial with imu, gnss and dvl")
-        errors = errors_in(trial, anyway=anyway)
-        with explained(errors):
-            solution, history = filter_planar(trial, chosen.value, progress=progress)
         return _Found(solution.with_findings(errors), history)
 
     _solve_into(
         out,
         trial_path,
         run,
-        run_planar,
         force=force,
         figures=None if no_figures else figures,
         anyway=anyway,
@@ -245,17 +210,10 @@ def _with_halves(
     return replace(found, solution=solution, halves=halves)
 
 
-def _misplaced(what: str, expected: str) -> ConfigError:
-    from factorgraph_dvl.errors import ConfigError
-
-    return ConfigError(f"{what} does not fit this trial", expected=expected)
-
-
 def _solve_into(
     out: Path,
     trial_path: Path,
     run: Callable[[Trial, ProgressLine, FinishedStages | None], _Found],
-    run_planar: Callable[[PlanarTrial, ProgressLine], _Found],
     *,
     force: bool,
     figures: FigureKind | None,
@@ -268,7 +226,6 @@ def _solve_into(
 
     Stages of runs with `options`, which they depend on, are kept until the run ends.
     """
-    from factorgraph_dvl.io.planar_folder import is_planar, load_planar_trial
     from factorgraph_dvl.io.run_file import run_of
     from factorgraph_dvl.io.solution_folder import (
         FIGURES_FOLDER,
@@ -282,14 +239,9 @@ def _solve_into(
 
     work = claim_output(out, force=force, owned=OWNED, inputs=inputs_of(trial_path))
     with ProgressLine(quiet=quiet) as progress:
-        trial: Trial | PlanarTrial
-        if is_planar(trial_path):
-            trial = load_planar_trial(trial_path)
-            found = run_planar(trial, progress)
-        else:
-            trial = load_trial(trial_path, anyway=anyway)
-            stages = None if options is None else _stages(work, trial_path, options, resume)
-            found = run(trial, progress, stages)
+        trial = load_trial(trial_path, anyway=anyway)
+        stages = None if options is None else _stages(work, trial_path, options, resume)
+        found = run(trial, progress, stages)
         solution, history = found.solution, found.history
         progress("write", 0, None)
 
@@ -348,7 +300,7 @@ def _stages(
 
 
 def draw_history(
-    trial: Trial | PlanarTrial, solution: Solution, history: History, folder: Path, kind: str
+    trial: Trial, solution: Solution, history: History, folder: Path, kind: str
 ) -> None:
     """Draw how a recursive filter converged."""
     from factorgraph_dvl.report.figures.convergence import convergence_figure
@@ -362,7 +314,7 @@ def draw_history(
     save_figures(drawn, folder, solution.verdict, name=solution.trial, kind=kind)
 
 
-def write_beams(trial: Trial | PlanarTrial, solution: Solution, folder: Path) -> None:
+def write_beams(trial: Trial, solution: Solution, folder: Path) -> None:
     """Write consistency and angles of the beams, if the solution calibrates beams."""
     from factorgraph_dvl.analysis.beam_angles import beam_angles
     from factorgraph_dvl.analysis.beam_quality import beam_quality, calibrates, calibration_of
@@ -388,7 +340,7 @@ def write_instrument(solution: Solution, folder: Path) -> None:
         (folder / INSTRUMENT_FILE).write_text(text, encoding="utf-8")
 
 
-def _print_solution(trial: Trial | PlanarTrial, found: _Found) -> None:
+def _print_solution(trial: Trial, found: _Found) -> None:
     from factorgraph_dvl.analysis.error_statistics import calibration_errors, paper_accuracy
     from factorgraph_dvl.report.terminal.tables import (
         calibration_table,

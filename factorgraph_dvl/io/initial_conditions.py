@@ -7,12 +7,7 @@ import numpy as np
 from msgspec import UNSET
 
 from factorgraph_dvl.geometry.units import DEG, GEODETIC_SI
-from factorgraph_dvl.io.trial_yaml import (
-    InitialSettings,
-    PlanarInitialSettings,
-    PositionSettings,
-    VelocitySettings,
-)
+from factorgraph_dvl.io.trial_yaml import InitialSettings, PositionSettings, VelocitySettings
 from factorgraph_dvl.trial import InitialAttitude, InitialPosition, InitialVelocity, Trial
 
 
@@ -33,7 +28,7 @@ def velocity_of(initial: InitialSettings) -> InitialVelocity | None:
     return InitialVelocity(np.array(velocity.east_north_up_m_s), np.array(velocity.std_m_s))
 
 
-def position_of(initial: InitialSettings | PlanarInitialSettings) -> InitialPosition | None:
+def position_of(initial: InitialSettings) -> InitialPosition | None:
     """Return the prior of the position that `initial` states, None if there is none."""
     position = initial.position
     if position is UNSET:
@@ -53,18 +48,13 @@ def initial_settings(trial: Trial) -> InitialSettings | msgspec.UnsetType:
         fields["roll_pitch_heading_deg"] = tuple((attitude.rph / DEG).tolist())
         fields["std_deg"] = tuple((attitude.std / DEG).tolist())
     if position is not None:
-        fields["position"] = position_settings(position)
+        lat, lon, height = (position.geodetic / GEODETIC_SI).tolist()
+        fields["position"] = PositionSettings(
+            lat_deg=lat, lon_deg=lon, height_m=height, std_m=tuple(position.std.tolist())
+        )
     if velocity is not None:
         fields["velocity"] = VelocitySettings(
             east_north_up_m_s=tuple(velocity.velocity.tolist()),
             std_m_s=tuple(velocity.std.tolist()),
         )
     return InitialSettings(**fields)  # type: ignore[arg-type]
-
-
-def position_settings(position: InitialPosition) -> PositionSettings:
-    """Return the prior of the position as `initial` states it."""
-    lat, lon, height = (position.geodetic / GEODETIC_SI).tolist()
-    return PositionSettings(
-        lat_deg=lat, lon_deg=lon, height_m=height, std_m=tuple(position.std.tolist())
-    )

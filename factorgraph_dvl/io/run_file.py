@@ -13,7 +13,7 @@ import numpy as np
 from factorgraph_dvl.errors import DataError
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.settings.files import MEGABYTE, read_bytes
-from factorgraph_dvl.trial import PlanarTrial, Trial
+from factorgraph_dvl.trial import Trial
 
 RUN_FILE = "run.json"
 # Settings of some dozen sensors, with the places of beacons.
@@ -44,25 +44,20 @@ class Run(msgspec.Struct):
     truth: dict[str, Any] = {}
 
 
-def run_of(trial: Trial | PlanarTrial) -> Run:
+def run_of(trial: Trial) -> Run:
     """Return what a solution of a trial comes from.
 
     Parameters
     ----------
-    trial : Trial or PlanarTrial
+    trial : Trial
         The trial, as loaded.
     """
-    records: list[Any]
-    if isinstance(trial, PlanarTrial):
-        records, epoch = list(trial.records), ""
-    else:
-        own = () if trial.imu is None else (trial.imu,)
-        records, epoch = [*own, *trial.aids], trial.epoch
+    records: list[Any] = list(trial.records)
     versions = {"python": platform.python_version()}
     return Run(
         format=1,
         versions=versions | {name: version(name) for name in _PACKAGES},
-        epoch=epoch,
+        epoch=trial.epoch,
         settings={r.section: msgspec.to_builtins(r.settings) for r in records},
         records=[_inventory(r.section, r.time) for r in records],
         truth={name: np.asarray(v).tolist() for name, v in trial.calibration_truth.items()},

@@ -27,7 +27,6 @@ from factorgraph_dvl.io.motion_table import motion_columns, read_reference, refe
 from factorgraph_dvl.io.tables import Tables, columns_of, read_table, write_table
 from factorgraph_dvl.io.trial_yaml import (
     LimitSettings,
-    PlanarSettings,
     ReferenceSettings,
     TrialSettings,
     parse_trial,
@@ -35,7 +34,7 @@ from factorgraph_dvl.io.trial_yaml import (
     to_yaml,
 )
 from factorgraph_dvl.io.truth_file import read_truth, truth_json
-from factorgraph_dvl.sensors.catalogue import AIDS, PLANAR, aid_types
+from factorgraph_dvl.sensors.catalogue import AIDS, aid_types
 from factorgraph_dvl.sensors.dvl import Dvl
 from factorgraph_dvl.sensors.dvl_beams import DvlBeams
 from factorgraph_dvl.sensors.finding import Code, Finding
@@ -56,7 +55,7 @@ TRUTH_FILE = "truth.json"
 # Where a trial that was loaded with a calibration of its DVL or its IMU keeps it when it is saved.
 PRIOR_FILE = "dvl-calibration.json"
 BIAS_FILE = "imu-calibration.json"
-_TABLES = dict.fromkeys(("imu", *(kind.section for kind in (*AIDS, *PLANAR)), "reference"))
+_TABLES = dict.fromkeys(("imu", *(kind.section for kind in AIDS), "reference"))
 OWNED = (
     SETTINGS_FILE,
     TRUTH_FILE,
@@ -101,15 +100,7 @@ def load_trial(path: Path | str, *, anyway: bool = False) -> Trial:
     'RFU'
     """
     folder, file = locate(Path(path))
-    text = read_text(file)
-    if looks_planar(text, file.name):
-        raise ConfigError(
-            "is a planar trial, without an imu",
-            where=file.name,
-            expected="an imu section",
-            hint="`inspect`, `solve` and `kalman` take planar trials",
-        )
-    settings = parse_trial(text, file.name)
+    settings = parse_trial(read_text(file), file.name)
     trial = assembled(settings, folder, folder, anyway=anyway)
     name = printable(settings.name or folder.resolve().name)
     truth = read_truth(folder / TRUTH_FILE)
@@ -160,11 +151,11 @@ def assembled(
         others=tuple(aids.values()),
         body_axes=settings.body_axes,
         epoch=settings.epoch,
-        noise=settings.noise,
+        noise="estimated" if settings.noise is UNSET else settings.noise,
         initial_attitude=None if initial is UNSET else attitude_of(initial),
         initial_position=None if initial is UNSET else position_of(initial),
         initial_velocity=None if initial is UNSET else velocity_of(initial),
-        reference=reference_of(tables, settings),
+        reference=_reference_of(tables, settings),
         notes=tuple(notes),
         limits={**DEFAULT_LIMITS, **({} if settings.limits is UNSET else settings.limits.stated)},
     )
@@ -191,13 +182,8 @@ def load_reference(path: Path | str) -> tuple[Reference | None, dict[str, Array]
         As `load_trial`.
     """
     folder, file = locate(Path(path))
-    text = read_text(file)
-    settings: TrialSettings | PlanarSettings
-    if looks_planar(text, file.name):
-        settings = parse_yaml(text, PlanarSettings, source=file.name)
-    else:
-        settings = parse_trial(text, file.name)
-    return reference_of(folder, settings), read_truth(folder / TRUTH_FILE)
+    settings = parse_trial(read_text(file), file.name)
+    return _reference_of(folder, settings), read_truth(folder / TRUTH_FILE)
 
 
 def record_files(path: Path) -> list[Path]:
@@ -255,7 +241,7 @@ def save_trial(
     172
     """
     suffix = ".parquet" if parquet else ".csv"
-    check_saved(Path(path))
+    _check_written(Path(path), "save_trial", (_SAVED, _SIMULATED))
     tables = (f"{record.section}{suffix}" for record in trial.records)
     owned = tuple(dict.fromkeys((*OWNED, *tables)))
     with new_folder(Path(path), force=force, owned=owned) as folder:
@@ -271,12 +257,10 @@ def save_trial(
             both = trial.imu is not None and trial.dvl.prior is trial.imu.prior
             file = BIAS_FILE if both else PRIOR_FILE
             trial = replace(trial, dvl=save_prior(folder, file, trial.dvl, trial))
-        write_settings(folder, _settings(trial, suffix), seed)
+        _write_settings(folder, _settings(trial, suffix), seed)
 
 
-def write_settings(
-    folder: Path, settings: TrialSettings | PlanarSettings, seed: int | None
-) -> None:
+def _write_settings(folder: Path, settings: TrialSettings, seed: int | None) -> None:
     """Write trial.yaml, which says what wrote it, and the seed of a simulated trial."""
     head = f"{_SAVED}; it may replace this folder\n"
     if seed is not None:
@@ -287,11 +271,6 @@ def write_settings(
 def check_simulated(path: Path) -> None:
     """Raise DataError if a folder holds a trial that was not written by `simulate`."""
     _check_written(path, "simulate", (_SIMULATED,))
-
-
-def check_saved(path: Path) -> None:
-    """Raise DataError if a folder holds a trial whose tables may be the user's only ones."""
-    _check_written(path, "save_trial", (_SAVED, _SIMULATED))
 
 
 def _check_written(path: Path, by: str, heads: tuple[str, ...]) -> None:
@@ -340,18 +319,6 @@ def _named(settings: Any) -> Iterator[str]:
                 yield from _named(value)
 
 
-class _Kind(msgspec.Struct):
-    imu: Any = None
-    heading: Any = None
-    log: Any = None
-
-
-def looks_planar(text: str, source: str) -> bool:
-    """Whether the text of a trial.yaml has heading or log, and no imu."""
-    kind = parse_yaml(text, _Kind, source=source)
-    return kind.imu is None and (kind.heading is not None or kind.log is not None)
-
-
 def _share_pings(dvl: Dvl, others: dict[str, Aid]) -> bool:
     beams = others.get(DvlBeams.section)
     return beams is not None and bool(np.mean(np.isin(beams.time, dvl.time)) > 0.5)
@@ -365,9 +332,7 @@ def locate(path: Path) -> tuple[Path, Path]:
     return file.parent, file
 
 
-def reference_of(
-    tables: Path | Tables, settings: TrialSettings | PlanarSettings
-) -> Reference | None:
+def _reference_of(tables: Path | Tables, settings: TrialSettings) -> Reference | None:
     """Return the reference that the settings of a trial name, None if they name none."""
     if settings.reference is UNSET:
         return None
@@ -378,10 +343,7 @@ def reference_of(
 
 
 def read_record(
-    tables: Path | Tables,
-    kind: type[_Sensor],
-    settings: SensorSection,
-    notes: list[Finding] | None = None,
+    tables: Path | Tables, kind: type[_Sensor], settings: SensorSection, notes: list[Finding]
 ) -> _Sensor:
     """Return the record of a sensor, from the table that its settings name in a folder.
 
@@ -394,8 +356,7 @@ def read_record(
     else:
         table = columns_of(tables[kind.section], required, kind.optional, source=settings.file)
     columns, found = without_invalid_values(kind.section, table, settings.file)
-    if notes is not None:
-        notes += found
+    notes += found
     check_possible(columns, settings.file)
     return kind.from_columns(settings, columns, settings.file)
 
@@ -406,7 +367,7 @@ def _settings(trial: Trial, suffix: str) -> TrialSettings:
         name=trial.name,
         body_axes=trial.body_axes,
         epoch=trial.epoch,
-        noise=trial.noise,
+        noise=UNSET if trial.planar else trial.noise,
         **{
             record.section: msgspec.structs.replace(
                 record.settings, file=f"{record.section}{suffix}"

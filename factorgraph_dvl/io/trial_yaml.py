@@ -10,12 +10,9 @@ from msgspec import UNSET, Meta, UnsetType
 
 from factorgraph_dvl.errors import ConfigError
 from factorgraph_dvl.geometry.rotations import BodyAxes
-from factorgraph_dvl.sensors.beacon import BeaconSettings
-from factorgraph_dvl.sensors.catalogue import AIDS, aid_types, load_plug_ins
-from factorgraph_dvl.sensors.depth import DepthSettings
+from factorgraph_dvl.sensors.catalogue import AIDS, PLANAR, aid_types, load_plug_ins
 from factorgraph_dvl.sensors.imu import ImuSettings
 from factorgraph_dvl.sensors.protocol import Aid, NoiseModel, SensorSection
-from factorgraph_dvl.sensors.speed_log import HeadingSettings, LogSettings
 from factorgraph_dvl.settings.sections import Positive, Section, Sigma3, check_epoch
 from factorgraph_dvl.settings.yaml_file import parse_yaml
 
@@ -75,32 +72,12 @@ class LimitSettings(Section, frozen=True, kw_only=True):
         return {name: limit for name, limit in found.items() if limit is not UNSET}
 
 
-class PlanarInitialSettings(Section, frozen=True, kw_only=True):
-    """Section `initial` of a planar trial.yaml."""
-
-    position: PositionSettings
-
-
-class PlanarSettings(Section, frozen=True, kw_only=True):
-    """The whole of a planar trial.yaml."""
-
-    format: Literal[1]
-    name: str = ""
-    body_axes: BodyAxes = "RFU"
-    heading: HeadingSettings
-    log: LogSettings
-    depth: DepthSettings
-    beacons: BeaconSettings
-    initial: PlanarInitialSettings | UnsetType = UNSET
-    reference: ReferenceSettings | UnsetType = UNSET
-
-
 class _Settings(Section, frozen=True, kw_only=True):
     format: Literal[1]
     name: str = ""
     body_axes: BodyAxes = "RFU"
     epoch: str = ""
-    noise: NoiseModel = "estimated"
+    noise: NoiseModel | UnsetType = UNSET
     imu: ImuSettings | UnsetType = UNSET
     limits: LimitSettings | UnsetType = UNSET
     initial: InitialSettings | UnsetType = UNSET
@@ -109,7 +86,11 @@ class _Settings(Section, frozen=True, kw_only=True):
     def __post_init__(self) -> None:
         super().__post_init__()
         check_epoch(self.epoch)
-        if self.imu is UNSET and not {"attitude", "ins"} & set(self.aids):
+        given = set(self.aids)
+        missing = [kind.section for kind in PLANAR if kind.section not in given]
+        if given & {"heading", "log"} and missing:
+            raise ValueError(f"missing key `{missing[0]}`")
+        if self.imu is UNSET and not {"attitude", "ins", "heading"} & given:
             raise ValueError(
                 "missing key `imu`, or in its place `attitude` (AHRS, gyrocompass) or `ins`"
             )
@@ -184,7 +165,7 @@ def parse_trial(text: str, source: str) -> TrialSettings:
         ) from None
 
 
-def to_yaml(settings: TrialSettings | PlanarSettings) -> str:
+def to_yaml(settings: TrialSettings) -> str:
     """Return the text of trial.yaml."""
     import yaml
 

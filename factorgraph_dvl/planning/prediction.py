@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import msgspec
 import numpy as np
 
+from factorgraph_dvl.errors import ConfigError
 from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.rotations import rotation_from_rph
 from factorgraph_dvl.geometry.units import DEG, DEG_PER_HOUR, MICRO_G
@@ -78,7 +79,7 @@ def predict(scenario: Scenario) -> Prediction:
     Raises
     ------
     ConfigError
-        If the manoeuvres cannot be carried out.
+        If the manoeuvres cannot be carried out, or the scenario is planar.
 
     Examples
     --------
@@ -87,6 +88,12 @@ def predict(scenario: Scenario) -> Prediction:
     >>> prediction.solution.estimate("misalignment_deg").std.round(2)
     array([0.03, 0.06, 0.02])
     """
+    if scenario.planar:
+        raise ConfigError(
+            "no prediction is made of a planar trial",
+            where=scenario.source,
+            expected="imu, attitude or ins in place of heading and log",
+        )
     recorded, scenario = scenario, msgspec.structs.replace(scenario, noise=False)
     motion = plan_motion(scenario)
     trial = simulate(scenario)

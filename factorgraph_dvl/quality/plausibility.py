@@ -14,6 +14,7 @@ from factorgraph_dvl.quality.gnss_units import gnss_findings
 from factorgraph_dvl.quality.imu_channels import channel_findings
 from factorgraph_dvl.quality.imu_units import force_findings, gyro_findings
 from factorgraph_dvl.quality.plausibility_beams import beam_findings
+from factorgraph_dvl.quality.plausibility_planar import planar_findings
 from factorgraph_dvl.quality.plausibility_star import star_findings
 from factorgraph_dvl.quality.record_times import time_findings
 from factorgraph_dvl.quality.records import SensorSurvey
@@ -36,6 +37,9 @@ def findings(trial: Trial, sensors: list[SensorSurvey]) -> Iterator[Finding]:
     sensors : list of SensorSurvey
         Its records, that of the IMU first.
     """
+    if trial.planar:
+        yield from planar_findings(trial, sensors)
+        return
     alone = list(_of_single_sensors(trial, sensors))
     together = []
     if trial.imu is not None:

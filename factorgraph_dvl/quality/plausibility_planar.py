@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.imu.timestamps import JUMP
+from factorgraph_dvl.quality.records import SensorSurvey
+from factorgraph_dvl.sensors.beacon import Beacons
+from factorgraph_dvl.sensors.depth import Depth
 from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.sensors.message import message
-from factorgraph_dvl.trial import PlanarTrial
+from factorgraph_dvl.sensors.speed_log import Heading, SpeedLog
+from factorgraph_dvl.trial import Trial
 
 # Usual intervals, and seconds, that make a gap. Chosen: a lost sample is none, and in a gap a
 # vehicle has time to turn.
@@ -25,15 +29,22 @@ _MOVING_M_S = 0.1
 _QUIET = 0.1
 
 
-def planar_findings(trial: PlanarTrial) -> Iterator[Finding]:
-    """Check gaps, units and signs of the records of a trial.
+def planar_findings(trial: Trial, sensors: Sequence[SensorSurvey]) -> Iterator[Finding]:
+    """Check overlap, gaps, units and signs of the records of a trial.
 
     Parameters
     ----------
-    trial : PlanarTrial
-        As loaded.
+    trial : Trial
+        With compass, log, depth and beacons.
+    sensors : sequence of SensorSurvey
+        Its records.
     """
-    heading, log, depth = trial.heading, trial.log, trial.depth
+    together = list(_overlap(sensors))
+    yield from together
+    if together and together[0].sensor == "Heading":
+        return
+    heading, log = trial.required(Heading), trial.required(SpeedLog)
+    depth, beacons = trial.required(Depth), trial.required(Beacons)
     for record, values in ((heading, heading.heading), (log, log.speed), (depth, depth.depth)):
         yield from _gaps(record.time[~np.isnan(values)], record.label)
     psi = heading.heading[~np.isnan(heading.heading)] / DEG
@@ -47,20 +58,48 @@ def planar_findings(trial: PlanarTrial) -> Iterator[Finding]:
     speed = float(np.nanmedian(log.speed)) if np.isfinite(log.speed).any() else 0.0
     if speed < -_MOVING_M_S:
         yield Finding(Code.LOG_SIGN, message("log_sign.astern", speed=speed), log.label)
-    if abs(speed) <= _MOVING_M_S and len(trial.beacons.settings.positions) == 1:
+    if abs(speed) <= _MOVING_M_S and len(beacons.settings.positions) == 1:
         yield Finding(Code.AT_REST, message("at_rest.circle", speed=abs(speed)), log.label)
     below = float(np.nanmedian(depth.depth)) if np.isfinite(depth.depth).any() else 0.0
     if below < -_ABOVE_SEA_M:
         yield Finding(Code.DEPTH_SIGN, message("depth_sign.above", depth=below), depth.label)
     sea = depth.settings.sea_surface_height_m
-    for name, place in trial.beacons.settings.positions.items():
+    for name, place in beacons.settings.positions.items():
         above = place.height_m - sea
         if above > _ABOVE_SEA_M + 3.0 * place.std_m:
             yield Finding(
                 Code.BEACON_HEIGHT,
                 message("beacon_height.above", name=name, above=above),
-                trial.beacons.label,
+                beacons.label,
             )
+
+
+def _overlap(sensors: Sequence[SensorSurvey]) -> Iterator[Finding]:
+    """Yield what the records have no time in common with."""
+    *carried, beacons = sensors
+    start, end = max(s.start for s in carried), min(s.end for s in carried)
+    names = message("words.heading_log_and_depth")
+    if not start < end:
+        text = message("no_overlap.none_in_common", names=names)
+        yield Finding(Code.NO_OVERLAP, text, "Heading", severity="error")
+        return
+    inside = min(beacons.end, end) - max(beacons.start, start)
+    if beacons.missing == 1.0:
+        text = message("no_measurement.rows")
+        yield Finding(Code.NO_MEASUREMENT, text, beacons.label, severity="error")
+    elif inside < 0.0:
+        text = message(
+            "no_overlap.times",
+            start=beacons.start,
+            end=beacons.end,
+            names=names,
+            other_start=start,
+            other_end=end,
+        )
+        yield Finding(Code.NO_OVERLAP, text, beacons.label, severity="error")
+    elif inside < 0.5 * (beacons.end - beacons.start):
+        text = message("partial_overlap.outside", names=names)
+        yield Finding(Code.PARTIAL_OVERLAP, text, beacons.label)
 
 
 def _gaps(time: Array, label: str) -> Iterator[Finding]:

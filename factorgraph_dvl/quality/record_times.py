@@ -6,13 +6,12 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.quality.records import GAP_INTERVALS, SensorSurvey
 from factorgraph_dvl.quality.sensor_clocks import whole_hours
-from factorgraph_dvl.sensors.attitude import Attitude
 from factorgraph_dvl.sensors.clock import ClockSection
 from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.sensors.imu import Imu
-from factorgraph_dvl.sensors.ins import Ins
 from factorgraph_dvl.sensors.message import Message, message
 from factorgraph_dvl.sensors.protocol import Aid
 from factorgraph_dvl.trial import Trial
@@ -45,7 +44,7 @@ def time_findings(trial: Trial, sensors: list[SensorSurvey]) -> Iterator[Finding
             yield Finding(Code.NO_MEASUREMENT, text, aid.label, severity="error")
             continue
         inside = min(aid.end, imu.end) - max(aid.start, imu.start)
-        if not _meets(record, body):
+        if not _meets(record, body.time):
             hours = whole_hours((imu.start, imu.end), (aid.start, aid.end))
             if hours:
                 yield Finding(
@@ -99,13 +98,13 @@ def time_findings(trial: Trial, sensors: list[SensorSurvey]) -> Iterator[Finding
             )
 
 
-def _meets(aid: Aid, imu: Imu | Attitude | Ins) -> bool:
-    """Whether the IMU runs at any measurement of a sensor."""
+def _meets(aid: Aid, body: Array) -> bool:
+    """Whether the body's record, (M,) times, has a sample at any measurement of a sensor."""
     settings = aid.settings
     offset = settings.time_offset_s if isinstance(settings, ClockSection) else 0.0
     time = aid.time[np.logical_not(aid.missing)] - offset
-    after = np.searchsorted(imu.time, time)
-    edges = np.concatenate([[-np.inf], imu.time, [np.inf]])
+    after = np.searchsorted(body, time)
+    edges = np.concatenate([[-np.inf], body, [np.inf]])
     deviation = np.minimum(time - edges[after], edges[after + 1] - time)
-    interval = float(np.median(np.diff(imu.time))) if imu.time.size > 1 else 0.0
+    interval = float(np.median(np.diff(body))) if body.size > 1 else 0.0
     return bool(np.any(deviation <= interval))

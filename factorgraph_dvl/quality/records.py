@@ -10,6 +10,7 @@ from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.sensors.dvl import Dvl
 from factorgraph_dvl.sensors.gnss import Gnss
+from factorgraph_dvl.sensors.speed_log import SpeedLog
 
 # Usual intervals that make a gap. Chosen: two measurements in a row were lost.
 GAP_INTERVALS = 3.0
@@ -76,7 +77,7 @@ def record_of(label: str, time: Array, missing: Array) -> SensorSurvey:
     )
 
 
-def travel(gnss: Gnss | None, dvl: Dvl | None) -> tuple[float, Array]:
+def travel(gnss: Gnss | None, dvl: Dvl | None, log: SpeedLog | None = None) -> tuple[float, Array]:
     """Return the distance, m, and the speeds, (M,), m/s, by the best sensor there is."""
     if gnss is not None:
         time, velocity = gnss_velocity(gnss)
@@ -90,6 +91,10 @@ def travel(gnss: Gnss | None, dvl: Dvl | None) -> tuple[float, Array]:
     if dvl is not None and dvl.locked.sum() > 1:
         speed = np.linalg.norm(dvl.velocity[dvl.locked], axis=1)
         return float(np.trapezoid(speed, dvl.time[dvl.locked])), speed
+    if log is not None:
+        known = ~np.isnan(log.speed)
+        speed = np.hypot(log.speed[known], np.nan_to_num(log.starboard[known]))
+        return float(np.trapezoid(speed, log.time[known])) if speed.size > 1 else np.nan, speed
     return np.nan, np.zeros(0)
 
 

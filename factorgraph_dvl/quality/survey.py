@@ -9,6 +9,7 @@ import numpy as np
 from factorgraph_dvl.quality.plausibility import findings
 from factorgraph_dvl.quality.records import SensorSurvey, record_of, travel
 from factorgraph_dvl.sensors.finding import Finding, errors_of
+from factorgraph_dvl.sensors.speed_log import SpeedLog
 from factorgraph_dvl.trial import Trial
 
 
@@ -25,7 +26,7 @@ class Survey:
     duration : float
         Of the record of the IMU, or of what takes its place, s.
     distance : float
-        Travelled, m; nan without GNSS and DVL.
+        Travelled, m; nan without GNSS, DVL and log.
     speed_min, speed_max : float
         Slowest and fastest, m/s; nan likewise.
     findings : tuple of Finding
@@ -71,7 +72,7 @@ def survey(trial: Trial) -> Survey:
         sensors.append(record_of("IMU", trial.imu.time, np.zeros(trial.imu.time.size, dtype=bool)))
     body = trial.body_sensor
     sensors += [record_of(aid.label, aid.time, aid.missing) for aid in trial.aids]
-    distance, speed = travel(trial.gnss, trial.log)
+    distance, speed = travel(trial.gnss, trial.log, trial.find(SpeedLog))
     return Survey(
         trial=trial.name,
         sensors=tuple(sensors),

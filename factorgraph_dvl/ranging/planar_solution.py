@@ -15,9 +15,12 @@ from factorgraph_dvl.ranging.model import EARTH_RADIUS, PlanarProblem
 from factorgraph_dvl.ranging.planar_track import SLOPE_OVER
 from factorgraph_dvl.ranging.problem import RangingSetup, planar_setup
 from factorgraph_dvl.ranging.smoother import Fit, covariance, residuals
-from factorgraph_dvl.sensors.beacon import Beacons
+from factorgraph_dvl.sensors.beacon import SOUND_SPEED_ERROR, Beacons
+from factorgraph_dvl.sensors.depth import Depth
 from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.sensors.message import Message, message
+from factorgraph_dvl.sensors.protocol import Aid
+from factorgraph_dvl.sensors.speed_log import Heading, SpeedLog
 from factorgraph_dvl.solution import (
     Estimate,
     Hypothesis,
@@ -32,7 +35,7 @@ from factorgraph_dvl.solution import (
     mostly_rejected,
     not_observable,
 )
-from factorgraph_dvl.trial import PlanarTrial
+from factorgraph_dvl.trial import Trial
 
 # Chosen: number of times at which hypotheses are fitted and weighed.
 _UPDATES = 40
@@ -42,25 +45,16 @@ _SEARCHES = (0, 1, 2, 4, 8, 16, 28)
 # Chosen: rows before the first of them; a start and a current have four unknowns.
 _FIRST_ROWS = 8
 
-# Why the data do not determine a constant, by its reported name; else it is the place of a beacon.
-_NOT_OBSERVABLE = {
-    "heading_bias_deg": message("not_observable.heading_by_one_beacon"),
-    "current_m_s": message("not_observable.current_by_ranges"),
-    "log_scale_error": message("not_observable.log_scale"),
-    "sound_speed_error": message("not_observable.sound_speed_by_log"),
-}
-_PLACE_NOT_OBSERVABLE = message("not_observable.place")
-
 
 def solve_planar(
-    trial: PlanarTrial, *, rate_hz: float = 10.0, progress: Progress | None = None
+    trial: Trial, *, rate_hz: float = 10.0, progress: Progress | None = None
 ) -> Solution:
     """Estimate the track of a planar trial, with current and sound speed.
 
     Parameters
     ----------
-    trial : PlanarTrial
-        Records of heading, log, depth and beacons, with their priors.
+    trial : Trial
+        With compass, log, depth and beacons.
     rate_hz : float, default 10.0
         Rate of the trajectory in the solution.
     progress : callable, optional
@@ -99,7 +93,7 @@ def solve_planar(
         count = int(np.isfinite(problem.ranging.range).sum())
         raise SolveError(
             f"{count} {'range is' if count == 1 else 'ranges are'} too few to find a position",
-            where=trial.beacons.source,
+            where=trial.required(Beacons).source,
             hint="Give `initial.position` in trial.yaml, or a longer record",
         )
     report("covariance", 0, None)
@@ -116,13 +110,13 @@ def schedule(problem: PlanarProblem) -> tuple[list[int], list[int]]:
 
 
 def _summary(
-    trial: PlanarTrial,
+    trial: Trial,
     setup: RangingSetup,
     hypotheses: Sequence[TrackedHypothesis],
     rate_hz: float,
 ) -> Solution:
     problem = setup.problem
-    depth_std = trial.depth.settings.std_m
+    depth_std = trial.required(Depth).settings.std_m
     living = [c for c in hypotheses if c.died is None]
     grids = [grid_points(problem, c.fit) for c in living]
     best = grids[0][0].fit
@@ -146,7 +140,7 @@ def _summary(
     covs = [s.parts[2] / np.outer(problem.si, problem.si) for s in every]
     joint = _mixture(values, covs, weights)
     estimates = as_estimates(problem.constants, values[0], joint)
-    used, rejected = measurements(trial.beacons, setup, best)
+    used, rejected = measurements(trial.required(Beacons), setup, best)
     findings = [*trial.notes]
     if not best.converged:
         text = message("not_converged.smoother")
@@ -157,7 +151,7 @@ def _summary(
     findings += ambiguity(reported)
     findings += consistency_findings(estimates, used)
     findings += mostly_rejected(used, rejected)
-    findings += _unobservable(estimates)
+    findings += _unobservable(estimates, (trial.required(Heading), trial.required(SpeedLog)))
     return Solution(
         trial=trial.name,
         solver="planar",
@@ -285,8 +279,13 @@ def measurements(
     return tuple(used), tuple(rejected)
 
 
-def _unobservable(estimates: Sequence[Estimate]) -> list[Finding]:
-    def why(name: str, _: int) -> Message:
-        return _NOT_OBSERVABLE.get(name, _PLACE_NOT_OBSERVABLE)
+def _unobservable(estimates: Sequence[Estimate], carried: Sequence[Aid]) -> list[Finding]:
+    def why(name: str, component: int) -> Message | str:
+        for aid in carried:
+            if name in {p.name for p in aid.parameters()}:
+                return aid.explain(name, component, None)
+        if name == SOUND_SPEED_ERROR:
+            return message("not_observable.sound_speed_by_log")
+        return message("not_observable.place")
 
     return [f for e in estimates for f in not_observable(e, partial(why, e.name))]

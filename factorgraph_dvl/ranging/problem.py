@@ -23,8 +23,10 @@ from factorgraph_dvl.ranging.planar_track import (
     velocity_change_psd,
 )
 from factorgraph_dvl.sensors.beacon import Beacons
+from factorgraph_dvl.sensors.depth import Depth
 from factorgraph_dvl.sensors.parameters import Parameter
-from factorgraph_dvl.trial import InitialPosition, PlanarTrial
+from factorgraph_dvl.sensors.speed_log import Heading, SpeedLog
+from factorgraph_dvl.trial import InitialPosition, Trial
 
 # Chosen: times closer than this, s, are one node. The information of a shorter step leaves no
 # digits for that of the ranges.
@@ -58,22 +60,25 @@ class RangingSetup:
     uncovered: int
 
 
-def dead_reckoned(trial: PlanarTrial) -> PlanarTrack:
+def dead_reckoned(trial: Trial) -> PlanarTrack:
     """Return the track of a trial by heading, speed and depth.
 
     Raises
     ------
+    ConfigError
+        If the trial has no compass, log, depth sensor or beacons.
     DataError
         If one of them has no values or too few, or they have no time in common.
     """
-    heading, log, depth = trial.heading, trial.log, trial.depth
+    heading, log = trial.required(Heading), trial.required(SpeedLog)
+    depth, beacons = trial.required(Depth), trial.required(Beacons)
     parts = []
     for record, values in ((heading, heading.heading), (log, log.speed), (depth, depth.depth)):
         known = ~np.isnan(values)
         if not known.any():
             raise DataError("no values", where=record.source, expected="at least one")
         parts.append((record.time[known], values[known]))
-    first, last = _between_jumps([time for time, _ in parts], trial.beacons.time)
+    first, last = _between_jumps([time for time, _ in parts], beacons.time)
     start = max(first, *(time[0] for time, _ in parts))
     end = min(last, *(time[-1] for time, _ in parts))
     if not start < end:
@@ -97,12 +102,11 @@ def dead_reckoned(trial: PlanarTrial) -> PlanarTrack:
         (time[own], values[own]) for (time, values), own in zip(parts, inside, strict=True)
     )
     starboard = np.nan_to_num(log.starboard[~np.isnan(log.speed)])[inside[1]]
-    extra = trial.beacons.time
     return track_from_records(
         (heading_time, psi, heading.settings.std_rad),
         (log_time, speed, starboard, log.settings.speed_std_m_s),
         (depth_time, depth.settings.sea_surface_height_m - below),
-        extra[(extra >= start) & (extra <= end)],
+        beacons.time[(beacons.time >= start) & (beacons.time <= end)],
     )
 
 
@@ -122,33 +126,35 @@ def _between_jumps(records: Sequence[Array], beacons: Array) -> tuple[float, flo
     return float(first[k]), float(last[k])
 
 
-def planar_setup(trial: PlanarTrial) -> RangingSetup:
+def planar_setup(trial: Trial) -> RangingSetup:
     """Return the problem of a planar trial.
 
     Raises
     ------
-    DataError
-        If there are no ranges at times when heading, speed and depth are known.
+    ConfigError, DataError
+        As of `dead_reckoned`, or if there are no ranges at times when heading, speed and depth
+        are known.
     """
     track = dead_reckoned(trial)
+    log, beacons = trial.required(SpeedLog), trial.required(Beacons)
     parameters = (
-        *(p for p in trial.log.parameters() if p.stem == "current"),
-        *trial.beacons.parameters(),
-        *(p for p in trial.log.parameters() if p.stem != "current"),
-        *trial.heading.parameters(),
+        *(p for p in log.parameters() if p.stem == "current"),
+        *beacons.parameters(),
+        *(p for p in log.parameters() if p.stem != "current"),
+        *trial.required(Heading).parameters(),
     )
-    arm = np.array(trial.beacons.settings.lever_arm_m)
+    arm = np.array(beacons.settings.lever_arm_m)
     level = np.zeros((track.time.size, 3))
     level[:, 2] = track.heading
     arm_n = rotation_from_rph(level, trial.body_axes) @ arm
     return ranging_setup(
         track,
         arm_n,
-        trial.beacons,
+        beacons,
         parameters,
         trial.frame(),
         trial.initial_position,
-        trial.depth.settings.std_m,
+        trial.required(Depth).settings.std_m,
     )
 
 

@@ -19,8 +19,9 @@ from factorgraph_dvl.report.figures.drawing import (
     style,
 )
 from factorgraph_dvl.reproduce.entry import Entry, Paper, Result, counted, judged, table
-from factorgraph_dvl.simulation import parse_scenario, simulate_planar
-from factorgraph_dvl.trial import PlanarTrial
+from factorgraph_dvl.sensors.beacon import Beacons
+from factorgraph_dvl.simulation import parse_scenario, simulate
+from factorgraph_dvl.trial import Trial
 
 _METHODS: tuple[Method, Method] = ("4sv-2ob", "4sv-3ob")
 # Updates of a run, as the paper's figure 5 has them, and when a track has converged, m (chosen).
@@ -61,7 +62,7 @@ _NEAR_STD, _NEAR_RANGE_STD = 50.0, (1.0, 10.0, 30.0)
 
 
 @cache
-def _trial(name: str, seed: int, range_std: float = 1.0, current: bool = True) -> PlanarTrial:
+def _trial(name: str, seed: int, range_std: float = 1.0, current: bool = True) -> Trial:
     (east, north, heading), manoeuvres = _GEOMETRIES[name]
     data: dict[str, Any] = {
         "name": "chen-2021",
@@ -85,21 +86,21 @@ def _trial(name: str, seed: int, range_std: float = 1.0, current: bool = True) -
         },
         "trial": {"log": {"current_std_m_s": [0.3, 0.3]}},
     }
-    return simulate_planar(parse_scenario(data), seed)
+    return simulate(parse_scenario(data), seed)
 
 
-def _beacon(trial: PlanarTrial) -> Array:
-    place = next(iter(trial.beacons.settings.positions.values()))
+def _beacon(trial: Trial) -> Array:
+    place = next(iter(trial.required(Beacons).settings.positions.values()))
     return np.asarray(trial.frame().position(*place.geodetic)[:2])
 
 
-def _truth(trial: PlanarTrial, time: Array) -> Array:
+def _truth(trial: Trial, time: Array) -> Array:
     r = trial.reference
     assert r is not None
     return trial.frame().position(*interpolate(time, r.time, r.geodetic).T)[:, :2]
 
 
-def _error(trial: PlanarTrial, found: Filtered) -> Array:
+def _error(trial: Trial, found: Filtered) -> Array:
     difference = found.state[:, :2] - _truth(trial, found.time)
     return np.nan_to_num(np.hypot(*difference.T), nan=np.inf)[:_UPDATES]
 

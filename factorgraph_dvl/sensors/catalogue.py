@@ -23,7 +23,7 @@ from factorgraph_dvl.sensors.star import Star
 from factorgraph_dvl.sensors.turntable import Turntable
 
 AIDS: tuple[type[Aid], ...] = (
-    *(Gnss, Dvl, Ins, Attitude, Star, Depth),
+    *(Gnss, Dvl, Ins, Attitude, Heading, SpeedLog, Star, Depth),
     *(DvlBeams, Turntable, Beacons),
 )
 
@@ -85,8 +85,8 @@ def _loaded(entry: EntryPoint) -> type[Aid]:
     return kind
 
 
-# Records of a planar trial, which has no IMU.
-PLANAR: tuple[type[SensorRecord], ...] = (Heading, SpeedLog, Depth, Beacons)
+# The sensors of a planar trial, which has no IMU.
+PLANAR: tuple[type[Aid], ...] = (Heading, SpeedLog, Depth, Beacons)
 
 
 # Offsets of beacons, whose names are the user's, from any text around them.
@@ -95,7 +95,7 @@ BEACON_OFFSET = re.compile(offset_name(r"([^\s\"':,{}]+)") + r"\b")
 
 def every_spec() -> tuple[ParameterSpec, ...]:
     """Return the parameters of all sensors, with each number of components."""
-    kinds: tuple[type[SensorRecord], ...] = (Imu, *aid_types(), *PLANAR)
+    kinds: tuple[type[SensorRecord], ...] = (Imu, *aid_types())
     return tuple(dict.fromkeys(spec for kind in kinds for spec in kind.specs))
 
 

@@ -8,11 +8,14 @@ from typing import ClassVar, Literal, Self
 
 import numpy as np
 
+from factorgraph_dvl.geometry.earth import LocalFrame
+from factorgraph_dvl.geometry.rotations import BodyAxes
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.sensors.dvl import CURRENT_SPEC
+from factorgraph_dvl.sensors.message import Message, message
 from factorgraph_dvl.sensors.parameters import SCALAR, Parameter, ParameterSpec
-from factorgraph_dvl.sensors.protocol import SensorSection
+from factorgraph_dvl.sensors.protocol import Motion, Observation, SensorSection
 from factorgraph_dvl.sensors.records import check_range, check_times
 from factorgraph_dvl.settings.sections import NonNegative, Positive
 
@@ -25,7 +28,7 @@ LOG_SCALE_SPEC = ParameterSpec("log_scale_error", labels=SCALAR, above=-1.0)
 
 
 class HeadingSettings(SensorSection, frozen=True, kw_only=True):
-    """Section `heading` of a planar trial.yaml."""
+    """Section `heading` of trial.yaml."""
 
     file: str = "heading.csv"
     std_deg: Positive = 0.5
@@ -38,7 +41,7 @@ class HeadingSettings(SensorSection, frozen=True, kw_only=True):
 
 
 class LogSettings(SensorSection, frozen=True, kw_only=True):
-    """Section `log` of a planar trial.yaml."""
+    """Section `log` of trial.yaml."""
 
     file: str = "log.csv"
     speed_std_m_s: Positive = 0.05
@@ -90,10 +93,23 @@ class Heading:
         """Return the record as a table."""
         return {"time_s": self.time, "heading_deg": self.heading / DEG}
 
+    @property
+    def missing(self) -> Array:
+        """Rows without a heading, (M,) bool."""
+        return np.isnan(self.heading)
+
     def parameters(self) -> tuple[Parameter, ...]:
         """Return the constant error of the heading."""
         sigma = np.array([self.settings.bias_std_deg]) * DEG
         return (Parameter(HEADING_BIAS_SPEC, np.zeros(1), sigma),)
+
+    def observations(self, frame: LocalFrame, body_axes: BodyAxes) -> tuple[Observation, ...]:
+        """Return nothing: the record is integrated, as that of an IMU is."""
+        return ()
+
+    def explain(self, parameter: str, component: int, motion: Motion | None) -> Message:
+        """Say why the error of the heading could not be observed."""
+        return message("not_observable.heading_by_one_beacon")
 
 
 @dataclass(frozen=True)
@@ -148,6 +164,11 @@ class SpeedLog:
             table["starboard_m_s"] = self.starboard
         return table
 
+    @property
+    def missing(self) -> Array:
+        """Rows without a speed, (M,) bool."""
+        return np.isnan(self.speed)
+
     def parameters(self) -> tuple[Parameter, ...]:
         """Return scale error and, through the water, the current."""
         s = self.settings
@@ -158,3 +179,13 @@ class SpeedLog:
             Parameter(LOG_SCALE_SPEC, np.zeros(1), scale),
             Parameter(CURRENT_SPEC, np.zeros(2), current),
         )
+
+    def observations(self, frame: LocalFrame, body_axes: BodyAxes) -> tuple[Observation, ...]:
+        """Return nothing: the record is integrated, as that of an IMU is."""
+        return ()
+
+    def explain(self, parameter: str, component: int, motion: Motion | None) -> Message:
+        """Say why current or scale error could not be observed."""
+        if parameter == CURRENT:
+            return message("not_observable.current_by_ranges")
+        return message("not_observable.log_scale")

@@ -13,7 +13,6 @@ from typing import Any, cast
 
 import numpy as np
 
-from factorgraph_dvl.errors import ConfigError
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.sensors.dvl import Dvl
@@ -28,7 +27,6 @@ from factorgraph_dvl.trial import (
     InitialAttitude,
     InitialPosition,
     InitialVelocity,
-    PlanarTrial,
     Reference,
     Trial,
 )
@@ -39,7 +37,6 @@ __all__ = [
     "parse_scenario",
     "plan_motion",
     "simulate",
-    "simulate_planar",
 ]
 
 
@@ -57,7 +54,7 @@ def simulate(scenario: Scenario | str | PathLike[str], seed: int = 0) -> Trial:
     Raises
     ------
     ConfigError
-        If the scenario cannot be read, is not valid, or has neither IMU nor what takes its place.
+        If the scenario cannot be read, or is not valid.
 
     Examples
     --------
@@ -68,16 +65,15 @@ def simulate(scenario: Scenario | str | PathLike[str], seed: int = 0) -> Trial:
     """
     if not isinstance(scenario, Scenario):
         scenario = load_scenario(scenario)
-    if scenario.planar:
-        raise ConfigError(
-            "there is no imu",
-            where=scenario.source,
-            expected="imu, attitude or ins; or `simulate_planar` for a planar scenario",
-        )
     motion = plan_motion(scenario)
-    aids, truth = _records(INSTRUMENTS, scenario, motion, seed)
+    instruments = PLANAR_INSTRUMENTS if scenario.planar else INSTRUMENTS
+    aids, truth = _records(instruments, scenario, motion, seed)
     imu = cast("Imu | None", aids.pop("imu", None))
     start = np.zeros(1) if imu is None else imu.time[:1]
+    if scenario.planar:
+        start = np.array([max(aids[name].time[0] for name in ("heading", "log", "depth"))])
+        # In the plane the height of the sea surface is as stated.
+        truth.pop("sea_surface_height_m")
     attitude, position, velocity = _initial(scenario, motion, start)
     trial = Trial(
         name=scenario.name,
@@ -95,40 +91,6 @@ def simulate(scenario: Scenario | str | PathLike[str], seed: int = 0) -> Trial:
         calibration_truth=truth,
     )
     return with_stated_errors(trial, scenario, seed)
-
-
-def simulate_planar(scenario: Scenario | str | PathLike[str], seed: int = 0) -> PlanarTrial:
-    """Simulate a planar trial: heading, log, depth and beacons.
-
-    Parameters
-    ----------
-    scenario : Scenario or path-like of str
-        A scenario without an IMU, or the path of its YAML file.
-    seed : int, default 0
-        Random seed. Each sensor has a random stream of its own.
-
-    Raises
-    ------
-    ConfigError
-        If the scenario cannot be read, is not valid, or has an IMU.
-    """
-    if not isinstance(scenario, Scenario):
-        scenario = load_scenario(scenario)
-    if not scenario.planar:
-        raise ConfigError("there is an imu", where=scenario.source, expected="a planar scenario")
-    motion = plan_motion(scenario)
-    records, truth = _records(PLANAR_INSTRUMENTS, scenario, motion, seed)
-    # In the plane the height of the sea surface is as stated.
-    truth.pop("sea_surface_height_m")
-    start = np.array([max(records[name].time[0] for name in ("heading", "log", "depth"))])
-    return PlanarTrial(
-        name=scenario.name,
-        **records,
-        body_axes=scenario.body_axes,
-        initial_position=_initial(scenario, motion, start)[1],
-        reference=_reference(motion, scenario.reference_rate_hz),
-        calibration_truth=truth,
-    )
 
 
 def _records(

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+from factorgraph_dvl.sensors.catalogue import PLANAR
 from factorgraph_dvl.simulation.beams import simulate_beams, simulate_turntable
 from factorgraph_dvl.simulation.compass import (
     AttitudeTruth,
@@ -48,11 +49,8 @@ INSTRUMENTS = {
     "turntable": Instrument(TurntableTruth, simulate_turntable),
     "attitude": Instrument(AttitudeTruth, simulate_attitude),
     "ins": Instrument(InsTruth, simulate_ins),
-}
-# Of a planar trial, which has no IMU.
-PLANAR_INSTRUMENTS = {
     "heading": Instrument(HeadingTruth, simulate_heading),
     "log": Instrument(LogTruth, simulate_log),
-    "depth": INSTRUMENTS["depth"],
-    "beacons": INSTRUMENTS["beacons"],
 }
+# Of a planar trial, likewise in the order of its streams.
+PLANAR_INSTRUMENTS = {kind.section: INSTRUMENTS[kind.section] for kind in PLANAR}

@@ -67,9 +67,6 @@ from factorgraph_dvl.simulation.catalogue import INSTRUMENTS, PLANAR_INSTRUMENTS
 from factorgraph_dvl.simulation.instruments import ImuTruth, SimulatedInstrument
 from factorgraph_dvl.simulation.manoeuvres import Manoeuvre, flatten
 
-# Every simulated sensor, by section.
-_INSTRUMENTS = {**INSTRUMENTS, **PLANAR_INSTRUMENTS}
-
 Latitude = Annotated[float, msgspec.Meta(ge=-89, le=89)]
 Longitude = Annotated[float, msgspec.Meta(ge=-360, le=360)]
 
@@ -135,7 +132,7 @@ if TYPE_CHECKING:
 else:
     Claims = msgspec.defstruct(
         "Claims",
-        [(name, dict[str, Any], msgspec.field(default_factory=dict)) for name in _INSTRUMENTS],
+        [(name, dict[str, Any], msgspec.field(default_factory=dict)) for name in INSTRUMENTS],
         bases=(_Claims,),
         frozen=True,
         kw_only=True,
@@ -187,12 +184,12 @@ class _Scenario(Section, frozen=True, kw_only=True):
     @property
     def planar(self) -> bool:
         """Whether the trial is planar: with heading and log, and without an IMU."""
-        return self.imu is None and not {"attitude", "ins"} & set(self.aids)
+        return "heading" in self.aids
 
     @property
     def aids(self) -> dict[str, SimulatedInstrument]:
         """The simulated sensors other than the IMU, by section."""
-        given = {name: getattr(self, name) for name in _INSTRUMENTS if name != "imu"}
+        given = {name: getattr(self, name) for name in INSTRUMENTS if name != "imu"}
         return {name: truth for name, truth in given.items() if truth is not None}
 
     def settings(self, section: str) -> SensorSection:
@@ -220,7 +217,7 @@ if TYPE_CHECKING:
 else:
     Scenario = msgspec.defstruct(
         "Scenario",
-        [(name, each.truth | None, None) for name, each in _INSTRUMENTS.items() if name != "imu"],
+        [(name, each.truth | None, None) for name, each in INSTRUMENTS.items() if name != "imu"],
         bases=(_Scenario,),
         frozen=True,
         kw_only=True,
@@ -283,7 +280,7 @@ def _checked(scenario: Scenario) -> Scenario:
     source = scenario.source
     scenario.plan()
     _check_sections(scenario)
-    for name in _INSTRUMENTS:
+    for name in INSTRUMENTS:
         if getattr(scenario, name) is not None:
             scenario.settings(name)
         elif getattr(scenario.trial, name):
@@ -297,24 +294,24 @@ def _checked(scenario: Scenario) -> Scenario:
 
 def _check_sections(scenario: Scenario) -> None:
     """Raise ConfigError unless the sensors make a trial, with an IMU or planar."""
-    given = {name for name in _INSTRUMENTS if getattr(scenario, name) is not None}
-    if not given & {"imu", "heading", "log"} and given & {"attitude", "ins"}:
-        return
-    known = INSTRUMENTS.keys()
-    wrong = sorted(given - known - {"imu"} if "imu" in given else given - set(PLANAR_INSTRUMENTS))
-    missing = [] if "imu" in given else [name for name in PLANAR_INSTRUMENTS if name not in given]
-    if wrong and "imu" in given:
-        raise ConfigError(
-            f"`{wrong[0]}` belongs to a planar trial, which has no imu",
-            where=f"{scenario.source} key {wrong[0]}",
-            expected="`imu`, or heading and log",
-        )
-    if missing and not given & {"heading", "log"}:
+    given = {name for name in INSTRUMENTS if getattr(scenario, name) is not None}
+    reckoned = sorted(given & {"heading", "log"})
+    if not reckoned:
+        if given & {"imu", "attitude", "ins"}:
+            return
         raise ConfigError(
             "missing key `imu`",
             where=scenario.source,
             expected="this key; or, for a planar trial, heading, log, depth and beacons",
         )
+    if "imu" in given:
+        raise ConfigError(
+            f"`{reckoned[0]}` belongs to a planar trial, which has no imu",
+            where=f"{scenario.source} key {reckoned[0]}",
+            expected="`imu`, or heading and log",
+        )
+    missing = [name for name in PLANAR_INSTRUMENTS if name not in given]
+    wrong = sorted(given - PLANAR_INSTRUMENTS.keys())
     if missing or wrong:
         raise ConfigError(
             f"missing key `{missing[0]}`" if missing else f"`{wrong[0]}` needs an imu",

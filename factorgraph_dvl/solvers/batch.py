@@ -14,6 +14,7 @@ from factorgraph_dvl.imu.propagation import States
 from factorgraph_dvl.quality.refusal import accepted_errors, explained
 from factorgraph_dvl.quality.survey import survey
 from factorgraph_dvl.ranging.hypothesis_weights import significant_costs
+from factorgraph_dvl.ranging.planar_solution import solve_planar
 from factorgraph_dvl.ranging.position_from_ranges import StartPositions
 from factorgraph_dvl.sensors.finding import Finding
 from factorgraph_dvl.solution import Progress, Solution, ambiguity, joined, most_probable_minimum
@@ -103,20 +104,24 @@ def solve_with_problem(
     anyway: bool = False,
     progress: Progress | None = None,
     stages: Stages | None = None,
-) -> tuple[Solution, SolvedProblem | SmoothedMotion]:
+) -> tuple[Solution, SolvedProblem | SmoothedMotion | None]:
     """Return the solution of a trial, and its problem at the most probable minimum.
 
-    Parameters and errors are those of `solve`; in `stages` results of alignment and mounting are
-    kept, and taken from.
+    That of a planar trial is of another kind, and None here. Parameters and errors are those of
+    `solve`; in `stages` results of alignment and mounting are kept, and taken from.
     """
     _check_above_zero("rate_hz", rate_hz)
     _check_above_zero("state_interval_s", state_interval_s)
     # What a trial without positions lacks comes before what is odd in its records.
     trial.frame()
-    errors = accepted_errors(survey(trial), anyway=anyway)
+    records = survey(trial)
+    errors = accepted_errors(records, anyway=anyway)
     solved: SolvedProblem | SmoothedMotion
     with explained(errors):
         report = progress or _silent
+        if trial.planar:
+            found = solve_planar(trial, rate_hz=rate_hz, progress=report)
+            return found.with_findings(records.problems), None
         if trial.imu is None:
             solved = smooth_motion(prepare_motion(trial), report)
             found = summarise_motion(trial, solved, rate_hz=rate_hz)

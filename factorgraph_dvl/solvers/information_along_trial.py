@@ -66,8 +66,10 @@ def solve_with_history(
     anyway: bool = False,
     progress: Progress | None = None,
     stages: Stages | None = None,
-) -> tuple[Solution, InformationHistory]:
+) -> tuple[Solution, InformationHistory | None]:
     """Solve a trial, and follow the information on its constants along it.
+
+    A planar trial has no such history.
 
     Parameters and errors as of `solvers.batch.solve`, and `stages` as of `solve_with_problem`;
     `entries` as of `information_history`.
@@ -75,6 +77,8 @@ def solve_with_history(
     solution, solved = solve_with_problem(
         trial, rate_hz=rate_hz, anyway=anyway, progress=progress, stages=stages
     )
+    if solved is None:
+        return solution, None
     if progress:
         progress("information along the trial", 0, None)
     if isinstance(solved, SmoothedMotion):

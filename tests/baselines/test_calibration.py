@@ -148,7 +148,7 @@ def test_command_line(tmp_path, capsys):
     claims = {"dvl": {"lever_arm_m": [1, 1.2, 1.4]}}
     trial = write_trial(tmp_path, simulate(scenario(noise=True, trial=claims), 0))
     out = tmp_path / "out"
-    named = [m.value for m in KalmanMethod if not m.planar]
+    named = [m.value for m in KalmanMethod]
     # The linear filter is an option of the iterated one.
     assert named == [m for m in METHODS if m != "nine-state-linear"]
     assert run("kalman", trial, "--out", out, "--quiet", "--no-figures", "--rate", "5") == 0

@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from findings import of_code
-from planar import STRAIGHT, error_of, trial
+from planar import STRAIGHT, changed, error_of, trial
 
 from factorgraph_dvl.baselines.single_beacon import filter_planar
 from factorgraph_dvl.cli import main
 from factorgraph_dvl.errors import DataError
-from factorgraph_dvl.io.planar_folder import save_planar_trial
+from factorgraph_dvl.io.trial_folder import save_trial
 from factorgraph_dvl.sensors.finding import Code
 from factorgraph_dvl.solution import Residuals, contradictions
 from factorgraph_dvl.trial import InitialPosition
@@ -33,11 +33,10 @@ def test_the_filters_start_from_a_position_only():
 
 def test_the_filters_pass_over_missing_headings_and_depths():
     t = trial(5, trial={"initial": {"position_std_m": [5, 5, 1]}})
-    heading, depth = t.heading.heading.copy(), t.depth.depth.copy()
+    compass = t.records[0]
+    heading, depth = compass.heading.copy(), t.depth.depth.copy()
     heading[5:8] = depth[5:8] = np.nan
-    lost = replace(
-        t, heading=replace(t.heading, heading=heading), depth=replace(t.depth, depth=depth)
-    )
+    lost = changed(t, replace(compass, heading=heading), replace(t.depth, depth=depth))
     motions = [filter_planar(x, "4sv-3ob")[0].trajectory for x in (t, lost)]
     for name in ("rph", "geodetic", "velocity"):
         np.testing.assert_allclose(*(getattr(m, name) for m in motions), atol=0.5)
@@ -58,7 +57,7 @@ def test_a_filter_that_went_to_a_mirror_image_has_not_converged(tmp_path, capsys
         solution, _ = filter_planar(t, method)
         assert not solution.converged
         assert of_code(solution.findings, Code.FILTER_CONTRADICTED)
-    save_planar_trial(t, tmp_path / "t")
+    save_trial(t, tmp_path / "t")
     with pytest.raises(SystemExit) as exit_info:
         main(["kalman", str(tmp_path / "t"), "--out", str(tmp_path / "k"), "--no-figures"])
     assert exit_info.value.code == 1

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import yaml
 from builders import build_solution, write_trial
+from planar import changed
 from planar import trial as planar_trial
 from truth import CONFIGS, scenario
 
@@ -16,9 +17,8 @@ from factorgraph_dvl.cli import main
 from factorgraph_dvl.errors import DataError, SolveError
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.io.calibration_file import load_calibration
-from factorgraph_dvl.io.planar_folder import save_planar_trial
 from factorgraph_dvl.io.solution_folder import save_solution
-from factorgraph_dvl.io.trial_folder import load_trial
+from factorgraph_dvl.io.trial_folder import load_trial, save_trial
 from factorgraph_dvl.quality.refusal import explained
 from factorgraph_dvl.quality.survey import survey
 from factorgraph_dvl.replay import replay
@@ -249,8 +249,8 @@ def test_an_honest_trial_is_neither(honest, tmp_path, run):
 
 def test_beacons_of_another_time_are_refused_in_the_plane(tmp_path, run):
     t = planar_trial(6)
-    moved = replace(t, beacons=replace(t.beacons, time=t.beacons.time + 1e5))
-    save_planar_trial(moved, tmp_path / "t")
+    moved = changed(t, replace(t.beacons, time=t.beacons.time + 1e5))
+    save_trial(moved, tmp_path / "t")
     (said,) = errors_of(run, tmp_path / "t")
     code, _, err = run("solve", tmp_path / "t", "--out", tmp_path / "out", "--quiet")
     assert code == 2

@@ -25,8 +25,8 @@ from truth import merged, scenario
 from factorgraph_dvl.io.external_results import read_calibration_values
 from factorgraph_dvl.io.formats.mapping import MappingSettings
 from factorgraph_dvl.io.segments_file import read_segments
-from factorgraph_dvl.io.trial_folder import looks_planar, save_trial
-from factorgraph_dvl.io.trial_yaml import PlanarSettings, TrialSettings
+from factorgraph_dvl.io.trial_folder import save_trial
+from factorgraph_dvl.io.trial_yaml import TrialSettings
 from factorgraph_dvl.settings.yaml_file import parse_yaml
 from factorgraph_dvl.simulation import parse_scenario, simulate
 
@@ -236,8 +236,7 @@ def run_yaml(block: Block, folder: Path) -> None:
             },
         }
         whole = block.text if "format" in data else yaml.safe_dump(merged(base, data))
-        kind = PlanarSettings if looks_planar(whole, "block") else TrialSettings
-        parse_yaml(whole, kind, source="block")
+        parse_yaml(whole, TrialSettings, source="block")
 
 
 def run_blocks(name: str, stock: Path, folder: Path, run: Run, *, slow: bool) -> None:  # noqa: F811

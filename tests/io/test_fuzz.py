@@ -22,16 +22,14 @@ from truth import CONFIGS
 
 from factorgraph_dvl.errors import FactorgraphDvlError
 from factorgraph_dvl.io.external_results import load_results, load_truth, read_calibration_values
-from factorgraph_dvl.io.planar_folder import is_planar, load_planar_trial, save_planar_trial
 from factorgraph_dvl.io.segments_file import read_segments
 from factorgraph_dvl.io.solution_folder import load_solution, save_solution
 from factorgraph_dvl.io.trial_folder import load_trial, read_record, save_trial
 from factorgraph_dvl.io.trial_yaml import TrialSettings
 from factorgraph_dvl.quality.survey import survey
-from factorgraph_dvl.quality.survey_planar import survey_planar
 from factorgraph_dvl.sensors.depth import Depth, DepthSettings
 from factorgraph_dvl.settings.yaml_file import parse_yaml
-from factorgraph_dvl.simulation import load_scenario, parse_scenario, simulate, simulate_planar
+from factorgraph_dvl.simulation import load_scenario, parse_scenario, simulate
 
 SEED = 20240131
 # No file here takes longer than this to be refused; a hang takes for ever.
@@ -57,11 +55,8 @@ TYPED_IN = (
 
 
 def look(path: Path) -> None:
-    """Load a trial of either kind, and survey it."""
-    if is_planar(path):
-        survey_planar(load_planar_trial(path))
-    else:
-        survey(load_trial(path))
+    """Load a trial, and survey it."""
+    survey(load_trial(path))
 
 
 def look_with_calibration(path: Path) -> None:
@@ -80,7 +75,7 @@ def cases(tmp_path_factory: pytest.TempPathFactory) -> list[Case]:
     every = simulate(parse_scenario(EVERYTHING))
     save_trial(every, home / "csv")
     save_trial(every, home / "parquet", parquet=True)
-    save_planar_trial(simulate_planar(parse_scenario(PLANAR)), home / "planar")
+    save_trial(simulate(parse_scenario(PLANAR)), home / "planar")
     save_solution(replace(build_solution(), body_axes="RFU"), home / "solution")
     save_trial(build_trial(seconds=10.0), home / "dive")
     shutil.copy(home / "solution" / "calibration.json", home / "dive")
@@ -253,6 +248,6 @@ def test_any_numbers_in_a_table_are_read_or_refused(
     rows = "".join(f"{time!r},{depth!r}\n" for time, depth in cells)
     (path / "depth.csv").write_text("time_s,depth_m\n" + rows)
     with suppress(FactorgraphDvlError):
-        record = read_record(path, Depth, DepthSettings())
+        record = read_record(path, Depth, DepthSettings(), [])
         assert np.all(np.diff(record.time) > 0.0)
         assert np.all(np.isnan(record.depth) | (np.abs(record.depth) <= 12e3))

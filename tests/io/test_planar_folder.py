@@ -7,13 +7,16 @@ from builders import edit
 from planar import trial
 
 from factorgraph_dvl.errors import FactorgraphDvlError
-from factorgraph_dvl.io.planar_folder import load_planar_trial, save_planar_trial
+from factorgraph_dvl.io.trial_folder import load_trial, save_trial
 
 
 @pytest.mark.parametrize(
     ("file", "old", "new", "says"),
     [
         ("trial.yaml", "heading: {", "headings: {", "unknown key `headings`"),
+        ("trial.yaml", "log:", "dvl:", "unknown key `dvl.speed_std_m_s`"),
+        ("trial.yaml", "format: 1", "format: 1\ngnss: {}", "gnss.csv"),
+        ("trial.yaml", "format: 1", "format: 1\nimu: {grade: mems}", "imu.csv"),
         ("trial.yaml", "reference: water", "reference: air", "expected water or bottom"),
         (
             "trial.yaml",
@@ -26,8 +29,8 @@ from factorgraph_dvl.io.planar_folder import load_planar_trial, save_planar_tria
     ],
 )
 def test_bad_input_is_named(tmp_path, file, old, new, says):
-    save_planar_trial(trial(), tmp_path / "t")
+    save_trial(trial(), tmp_path / "t")
     edit(tmp_path / "t" / file, old, new)
     with pytest.raises(FactorgraphDvlError) as error:
-        load_planar_trial(tmp_path / "t")
+        load_trial(tmp_path / "t")
     assert says in str(error.value)

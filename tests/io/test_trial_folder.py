@@ -7,11 +7,9 @@ import msgspec
 import numpy as np
 import pytest
 from builders import build_trial, edit, write_trial
-from planar import trial as planar_trial
 
 from factorgraph_dvl.errors import ConfigError, DataError, FactorgraphDvlError
 from factorgraph_dvl.io.folders import new_folder
-from factorgraph_dvl.io.planar_folder import save_planar_trial
 from factorgraph_dvl.io.tables import read_table, write_table
 from factorgraph_dvl.io.trial_folder import files_of, load_trial, save_trial
 from factorgraph_dvl.trial import Trial
@@ -377,8 +375,6 @@ def test_force_replaces_no_trial_that_someone_else_wrote(tmp_path: Path) -> None
     before = {p.name: p.read_bytes() for p in path.iterdir()}
     with pytest.raises(DataError, match="`save_trial` did not write"):
         save_trial(build_trial(), path, force=True)
-    with pytest.raises(DataError, match="`save_trial` did not write"):
-        save_planar_trial(planar_trial(), path, force=True)
     assert {p.name: p.read_bytes() for p in path.iterdir()} == before
 
 

@@ -8,14 +8,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from planar import STRAIGHT, error_of, trial
+from planar import BASE, STRAIGHT, changed, error_of, trial
 
+from factorgraph_dvl import kalman, predict, solve
 from factorgraph_dvl.cli import main
-from factorgraph_dvl.errors import ConfigError, SolveError
-from factorgraph_dvl.io.planar_folder import is_planar, load_planar_trial, save_planar_trial
+from factorgraph_dvl.errors import ConfigError, DataError, SolveError
 from factorgraph_dvl.io.solution_folder import load_solution
-from factorgraph_dvl.io.trial_folder import load_trial
+from factorgraph_dvl.io.trial_folder import load_trial, save_trial
 from factorgraph_dvl.ranging.planar_solution import solve_planar
+from factorgraph_dvl.simulation import parse_scenario
 from factorgraph_dvl.solution import Residuals, mostly_rejected
 
 SEEDS = int(os.environ.get("FACTORGRAPH_DVL_SEEDS", "20"))
@@ -63,19 +64,18 @@ def test_too_few_ranges_are_no_position():
         range_rate=t.beacons.range_rate[few],
     )
     with pytest.raises(SolveError, match="4 ranges are too few"):
-        solve_planar(replace(t, beacons=cut))
+        solve_planar(changed(t, cut))
 
 
 def test_files_and_commands(tmp_path, capsys):
     t = trial(6, beacons={"missed": 0.1}, trial={"initial": {"position_std_m": [5, 5, 1]}})
-    save_planar_trial(t, tmp_path / "t")
-    assert is_planar(tmp_path / "t")
-    loaded = load_planar_trial(tmp_path / "t")
-    np.testing.assert_array_equal(loaded.log.speed, t.log.speed)
+    save_trial(t, tmp_path / "t")
+    loaded = load_trial(tmp_path / "t")
+    assert loaded.planar
+    (heading, log, *_), (as_loaded, as_logged, *_) = t.records, loaded.records
+    np.testing.assert_array_equal(as_logged.speed, log.speed)
     np.testing.assert_array_equal(loaded.beacons.range, t.beacons.range)
-    np.testing.assert_allclose(loaded.heading.heading, t.heading.heading, rtol=1e-15)
-    with pytest.raises(ConfigError, match="planar trial"):
-        load_trial(tmp_path / "t")
+    np.testing.assert_allclose(as_loaded.heading, heading.heading, rtol=1e-15)
 
     def run(*args):
         with pytest.raises(SystemExit) as exit_info:
@@ -94,6 +94,17 @@ def test_files_and_commands(tmp_path, capsys):
     assert run(*wrong) == 2
 
 
+def test_one_call_solves_any_trial():
+    t = trial(2, trial={"initial": {"position_std_m": [5, 5, 1]}})
+    solution = solve(t, rate_hz=1.0)
+    np.testing.assert_array_equal(solution.covariance, solve_planar(t, rate_hz=1.0).covariance)
+    assert kalman(t).solver == "kalman-4sv-3ob"
+    with pytest.raises(DataError, match="no DVL"):
+        kalman(t, "wahba")
+    with pytest.raises(ConfigError, match="planar"):
+        predict(parse_scenario(BASE))
+
+
 def test_more_than_a_third_of_echoes_is_doubtful():
     def some(n):
         return (
@@ -106,7 +117,7 @@ def test_more_than_a_third_of_echoes_is_doubtful():
 
 @pytest.mark.slow
 def test_hypotheses_are_written(tmp_path, capsys):
-    save_planar_trial(trial(7, **STRAIGHT), tmp_path / "t")
+    save_trial(trial(7, **STRAIGHT), tmp_path / "t")
     with pytest.raises(SystemExit) as exit_info:
         main(["solve", str(tmp_path / "t"), "--out", str(tmp_path / "s")])
     assert exit_info.value.code == 0

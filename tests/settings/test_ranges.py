@@ -22,16 +22,15 @@ from factorgraph_dvl.sensors.catalogue import AIDS
 from factorgraph_dvl.sensors.imu import Imu
 from factorgraph_dvl.sensors.ins import Ins
 from factorgraph_dvl.sensors.records import arrays_of
-from factorgraph_dvl.sensors.speed_log import Heading, SpeedLog
 from factorgraph_dvl.settings.ranges import out_of_range, range_of
-from factorgraph_dvl.simulation import parse_scenario, simulate, simulate_planar
+from factorgraph_dvl.simulation import parse_scenario, simulate
 
-KINDS = (Imu, *AIDS, Heading, SpeedLog)
+KINDS = (Imu, *AIDS)
 
 
 def records() -> dict[type, Any]:
     trial = simulate(parse_scenario(EVERYTHING))
-    planar = simulate_planar(parse_scenario(PLANAR))
+    planar = simulate(parse_scenario(PLANAR))
     some = np.linspace(0.1, 1.0, 5)
     others = [
         kind.from_columns(

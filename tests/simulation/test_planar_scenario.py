@@ -8,7 +8,7 @@ from truth import CONFIGS, merged
 
 from factorgraph_dvl.cli import main
 from factorgraph_dvl.errors import ConfigError
-from factorgraph_dvl.io.planar_folder import load_planar_trial
+from factorgraph_dvl.io.trial_folder import load_trial
 from factorgraph_dvl.simulation import parse_scenario, simulate
 
 
@@ -26,11 +26,10 @@ def test_a_scenario_is_planar_or_has_an_imu(changes, says):
         parse_scenario(merged(BASE, changes))
 
 
-def test_a_planar_scenario_is_no_other(tmp_path, capsys):
-    with pytest.raises(ConfigError, match="there is no imu"):
-        simulate(parse_scenario(BASE))
+def test_a_planar_scenario_makes_a_trial_as_any_other(tmp_path, capsys):
+    assert simulate(parse_scenario(BASE)).planar
     with pytest.raises(SystemExit) as exit_info:
         main(["simulate", str(CONFIGS / "one-beacon.yaml"), "--out", str(tmp_path / "t")])
     capsys.readouterr()
     assert exit_info.value.code == 0
-    assert load_planar_trial(tmp_path / "t").name == "one-beacon"
+    assert load_trial(tmp_path / "t").name == "one-beacon"

@@ -131,7 +131,8 @@ def observability(
         missing.append("posterior against prior: nothing was estimated from a known prior")
     shares = None
     if history is None:
-        missing.append("σ along the trial and shares of the segments: they need the trial itself")
+        lacks = "they need the trial itself" if trial is None else "a planar trial has none"
+        missing.append(f"σ along the trial and shares of the segments: {lacks}")
     elif segments and history.names:
         shares = information_shares(history, segments)
         varying = set(view.names if view is not None else ()) - set(history.names)

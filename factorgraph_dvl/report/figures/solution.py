@@ -24,7 +24,7 @@ from factorgraph_dvl.report.figures.error_budget import error_budget_figure
 from factorgraph_dvl.report.figures.residuals import residuals_figure
 from factorgraph_dvl.report.figures.trajectory import motion_figure, track_figure
 from factorgraph_dvl.solution import Residuals, Solution, Trajectory
-from factorgraph_dvl.trial import PlanarTrial, Trial
+from factorgraph_dvl.trial import Trial
 
 # Draws into a part of a figure, or into a new one.
 Drawing = Callable[[SubFigure | None], Canvas]
@@ -34,7 +34,7 @@ _LARGEST_TRAJECTORY = 20_000
 
 
 def write_figures(
-    trial: Trial | PlanarTrial, solution: Solution, folder: Path, *, kind: str = "png"
+    trial: Trial, solution: Solution, folder: Path, *, kind: str = "png"
 ) -> list[Path]:
     """Draw a solution: track, motion, residuals, calibration, correlation.
 
@@ -43,7 +43,7 @@ def write_figures(
 
     Parameters
     ----------
-    trial : Trial or PlanarTrial
+    trial : Trial
         For its GNSS fixes, reference and true calibration.
     solution : Solution
         What to draw.
@@ -68,7 +68,7 @@ def plot(
     solution: Solution,
     figure: str = "calibration",
     *,
-    trial: Trial | PlanarTrial | None = None,
+    trial: Trial | None = None,
     axes: Axes | None = None,
 ) -> Canvas:
     """Draw one figure of a solution; see `Solution.plot`."""
@@ -78,7 +78,7 @@ def plot(
     return known[figure](None if axes is None else _place_of(axes))
 
 
-def drawings(solution: Solution, trial: Trial | PlanarTrial | None) -> dict[str, Drawing]:
+def drawings(solution: Solution, trial: Trial | None) -> dict[str, Drawing]:
     """Return by name what draws each figure of a solution for which there is something to draw."""
     thinned = replace(solution, trajectory=_thinned(solution.trajectory))
     reference = None if trial is None else trial.reference

@@ -37,7 +37,7 @@ from factorgraph_dvl.report.figures.drawing import (
     style,
 )
 from factorgraph_dvl.solution import Hypothesis, Trajectory
-from factorgraph_dvl.trial import PlanarTrial, Reference, Trial
+from factorgraph_dvl.trial import Reference, Trial
 
 # Length of a close-up, s. Chosen: a period or two of a swell.
 # Times that are marked on a track, at most. Chosen: they stay apart.
@@ -56,7 +56,7 @@ _CLOSE_UP_INTERVALS = 20
 
 
 def track_figure(
-    trial: Trial | PlanarTrial | None,
+    trial: Trial | None,
     trajectory: Trajectory,
     errors: TrajectoryErrors | None,
     others: Sequence[Hypothesis] = (),
