@@ -54,7 +54,7 @@ class Replay:
     Parameters
     ----------
     settings : Trial
-        Trial of which everything but the records counts: sensor settings, axes, priors.
+        With an IMU. Everything but its records counts: sensor settings, axes, priors.
     smoother : Kind, default 'fixed-lag'
         Smoother: `fixed-lag` or `isam2`.
     lag_s : float, optional
@@ -63,6 +63,11 @@ class Replay:
         States a second.
     progress : callable, optional
         Called with stage, iteration and cost while a batch solution runs.
+
+    Raises
+    ------
+    ConfigError
+        If an option is out of range, or the trial has no IMU.
 
     Examples
     --------
@@ -91,6 +96,13 @@ class Replay:
         for name, value in (("lag_s", lag_s), ("rate_hz", rate_hz)):
             if not (np.isfinite(value) and value > 0.0):
                 raise ConfigError(f"{name} is {value}", expected="a number above 0")
+        if settings.imu is None:
+            raise ConfigError(
+                "a live feed needs an IMU",
+                where="trial.yaml",
+                expected="an imu section",
+                hint="`factorgraph_dvl.replay.replay` takes a recorded trial without one",
+            )
         self._findings: list[Finding] = []
         if any(p.estimated for p in settings.inertial.error_parameters()):
             settings = replace(settings, imu=settings.inertial.without_errors())

@@ -339,6 +339,8 @@ def test_what_never_starts_says_why():
         Replay(trial, lag_s=0.0)
     with pytest.raises(ConfigError, match="smoother"):
         Replay(trial, smoother="kalman")
+    with pytest.raises(ConfigError, match=r"needs an IMU.*replay\.replay"):
+        Replay(replace(trial, imu=None))
 
 
 def test_the_command_writes_what_was_known_when(trial, tmp_path, capsys):
