@@ -39,12 +39,17 @@ def planar_findings(trial: Trial, sensors: Sequence[SensorSurvey]) -> Iterator[F
     sensors : sequence of SensorSurvey
         Its records.
     """
-    together = list(_overlap(sensors))
-    yield from together
-    if together and together[0].sensor == "Heading":
-        return
     heading, log = trial.required(Heading), trial.required(SpeedLog)
     depth, beacons = trial.required(Depth), trial.required(Beacons)
+    surveys = {s.label: s for s in sensors}
+    carried = [surveys[record.label] for record in (heading, log, depth)]
+    start, end = max(s.start for s in carried), min(s.end for s in carried)
+    if not start < end:
+        names = message("words.heading_log_and_depth")
+        text = message("no_overlap.none_in_common", names=names)
+        yield Finding(Code.NO_OVERLAP, text, heading.label, severity="error")
+        return
+    yield from _overlap(surveys[beacons.label], start, end)
     for record, values in ((heading, heading.heading), (log, log.speed), (depth, depth.depth)):
         yield from _gaps(record.time[~np.isnan(values)], record.label)
     psi = heading.heading[~np.isnan(heading.heading)] / DEG
@@ -74,15 +79,9 @@ def planar_findings(trial: Trial, sensors: Sequence[SensorSurvey]) -> Iterator[F
             )
 
 
-def _overlap(sensors: Sequence[SensorSurvey]) -> Iterator[Finding]:
-    """Yield what the records have no time in common with."""
-    *carried, beacons = sensors
-    start, end = max(s.start for s in carried), min(s.end for s in carried)
+def _overlap(beacons: SensorSurvey, start: float, end: float) -> Iterator[Finding]:
+    """Yield what to say of beacons that are heard outside the time of the other records, s."""
     names = message("words.heading_log_and_depth")
-    if not start < end:
-        text = message("no_overlap.none_in_common", names=names)
-        yield Finding(Code.NO_OVERLAP, text, "Heading", severity="error")
-        return
     inside = min(beacons.end, end) - max(beacons.start, start)
     if beacons.missing == 1.0:
         text = message("no_measurement.rows")

@@ -57,5 +57,10 @@ def test_inspect_knows_planar_trials(tmp_path, capsys):
     for text in ("Heading", "Log", "Depth", "Beacon", "speed 1.", "warning: Heading: 1 gap"):
         assert text in out
     late = changed(t, replace(t.beacons, time=t.beacons.time + 1e5))
-    (finding,) = survey(late).problems
-    assert (finding.severity, finding.code) == ("error", Code.NO_OVERLAP)
+    for in_order in (late, replace(late, others=late.others[::-1])):
+        (finding,) = survey(in_order).problems
+        assert (finding.severity, finding.code) == ("error", Code.NO_OVERLAP)
+    heading = t.records[0]
+    apart = changed(t, replace(heading, time=heading.time + 1e5))
+    (finding,) = survey(apart).problems
+    assert (finding.sensor, finding.code) == ("Heading", Code.NO_OVERLAP)
