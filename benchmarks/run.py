@@ -234,10 +234,7 @@ def iteration_times(trial: Trial) -> Iterator[tuple[str, str, str]]:
     problems = {"without": without, "with": both}
     for name, problem in problems.items():
         problem.weigh(problem.evaluate(values[name]))
-    orderings = {
-        name: problem.ordering(problem.linearize(problem.evaluate(values[name])))
-        for name, problem in problems.items()
-    }
+    orderings = {name: problem.ordering() for name, problem in problems.items()}
     taken: dict[str, list[dict[str, float]]] = {"without": [], "with": []}
     for _ in range(ITERATIONS + 1):
         for name, problem in problems.items():

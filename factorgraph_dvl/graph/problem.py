@@ -23,6 +23,7 @@ from factorgraph_dvl.geometry.rotations import BodyAxes
 from factorgraph_dvl.geometry.vectors import Array, BoolArray, IntArray
 from factorgraph_dvl.graph import keys
 from factorgraph_dvl.graph.clocks import linearized, parameters_of, true_time
+from factorgraph_dvl.graph.freed_memory import return_freed
 from factorgraph_dvl.graph.imu_errors import ImuErrors, LinearImuFactors
 from factorgraph_dvl.graph.inertial_chain import Chain
 from factorgraph_dvl.graph.keys import BIAS_SIZE, STATE_SIZE
@@ -538,6 +539,7 @@ class Problem:
             block.parts, block.matrices, block.vectors, block.factors = [], [], [], []
         if self._imu_errors is not None:
             self._imu_errors.release()
+        return_freed()
 
     def observation_rows(self, evaluation: Evaluation) -> Iterator[Rows]:
         """Yield the rows of each observation, unused ones included: these are zero."""
@@ -588,19 +590,24 @@ class Problem:
             process.add_prior(out, evaluation.parameters[process.name])
         return out
 
-    def ordering(self, gaussian: gtsam.GaussianFactorGraph) -> gtsam.Ordering:
-        """Return an elimination order in which biases and calibration come last."""
+    def ordering(self, *, branches: bool = True) -> gtsam.Ordering:
+        """Return an elimination order in which biases and calibration come last.
+
+        In branches for a step by Cholesky's factorisation of the whole; else in time, for QR part
+        by part, which then leaves less to keep.
+        """
         last = [self._key[p.name] for p in self.parameters]
         if not self.chain.walking:
             last.insert(0, keys.bias(0))
-        if self.processes:
+        if branches and not self.processes:
+            first = self.chain.in_branches()
+        else:
             time = self.chain.segments.node_time
             first = in_time_order(time, self.processes, walking=self.chain.walking)
-            out = gtsam.Ordering()
-            for key in (*first, *last):
-                out.push_back(key)
-            return out
-        return gtsam.Ordering.ColamdConstrainedLastGaussianFactorGraph(gaussian, last)
+        out = gtsam.Ordering()
+        for key in (*first, *last):
+            out.push_back(key)
+        return out
 
     def key(self, name: str) -> int:
         """Return the key of an estimated parameter."""

@@ -214,8 +214,8 @@ def node_times(time: Array, tau: float, sigma: Array, white: Array) -> Array:
 def in_time_order(node_time: Array, processes: Sequence[Process], *, walking: bool) -> list[int]:
     """Return the keys of states, biases and processes in the order of elimination.
 
-    In time: a node of a process goes when the last state that depends on it has gone. COLAMD takes
-    four times as long once there are processes.
+    In time: a node of a process goes when the last state that depends on it has gone. COLAMD's
+    order takes four times as long once there are processes.
     """
     items: list[tuple[float, int, int]] = []
     for k, t in enumerate(node_time.tolist()):

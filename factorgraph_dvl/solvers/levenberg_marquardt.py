@@ -119,7 +119,7 @@ def minimise(
             hint="Inspect the trial: a unit or a column may be wrong",
         )
     gaussian = problem.linearize(evaluation)
-    ordering, sizes = problem.ordering(gaussian), values.dims()
+    ordering, sizes = problem.ordering(), values.dims()
     root: SquareRootInformation | None = None
     damping = 0.0
     # Greatest damping with which a step failed since the cost last fell.
@@ -134,7 +134,7 @@ def minimise(
         delta = None if careful else quick_step(damped, ordering)
         promised = evaluation.cost - gaussian.error(delta) if delta is not None else -np.inf
         if delta is None or (proven and not promised > tolerance):
-            root = eliminated(damped, ordering, sizes)
+            root = eliminated(damped, problem.ordering(branches=False), sizes)
             delta = root.solution()
             promised = evaluation.cost - gaussian.error(delta)
         assert delta is not None
@@ -171,7 +171,9 @@ def minimise(
             if damping > _MAX_DAMPING:
                 break
         root = None
-    return Minimum(evaluation, eliminated(gaussian, ordering, sizes), False, iteration)
+    return Minimum(
+        evaluation, eliminated(gaussian, problem.ordering(branches=False), sizes), False, iteration
+    )
 
 
 def factorized(
@@ -179,7 +181,7 @@ def factorized(
 ) -> tuple[SquareRootInformation, gtsam.VectorValues]:
     """Return the square-root information from QR at some values, and the step to the minimum."""
     gaussian = [problem.linearize(evaluation)]
-    ordering = problem.ordering(gaussian[0])
+    ordering = problem.ordering(branches=False)
     # Nothing else holds the factors then, so that each goes once it is eliminated.
     problem.release()
     out = eliminated(gaussian.pop(), ordering, evaluation.values.dims())

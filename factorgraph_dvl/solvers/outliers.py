@@ -48,7 +48,7 @@ def robust_weights(
         problem.robust_weights = weights
         problem.weigh(evaluation)
         gaussian = problem.linearize(evaluation)
-        ordering = problem.ordering(gaussian)
+        ordering = problem.ordering()
         step = quick_step(gaussian, ordering)
         if step is None:
             step = eliminated(gaussian, ordering, evaluation.values.dims()).solution()

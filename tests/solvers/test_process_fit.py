@@ -49,7 +49,7 @@ def log_likelihood(problem, evaluation, process):
         problem.values(evaluation.states, evaluation.parameters | {process.name: nodes})
     )
     gaussian = problem.linearize(at)
-    tree = gaussian.eliminateMultifrontal(problem.ordering(gaussian), gtsam.EliminateQR)
+    tree = gaussian.eliminateMultifrontal(problem.ordering(), gtsam.EliminateQR)
     problem.processes = (before,)
     half_determinant, stack = 0.0, list(tree.roots())
     while stack:

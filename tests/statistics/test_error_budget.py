@@ -29,7 +29,7 @@ def test_sources_add_up_to_the_covariance():
     problem, evaluation = found.problem, found.minimum.evaluation
     gaussian = problem.linearize(evaluation)
     sizes = evaluation.values.dims()
-    information = eliminated(gaussian, problem.ordering(gaussian), sizes)
+    information = eliminated(gaussian, problem.ordering(), sizes)
     functionals = [f for _, _, f in reported(problem, evaluation) if f is not None]
     parts = error_budget(rows_by_source(problem, evaluation), information, functionals)
     P = information.covariance_of(functionals)

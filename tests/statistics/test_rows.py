@@ -87,7 +87,7 @@ def test_sums_of_leverages_are_those_of_the_dense_hat_matrix(system):
     problem, evaluation, rows = system
     gaussian = problem.linearize(evaluation)
     sizes = evaluation.values.dims()
-    information = eliminated(gaussian, problem.ordering(gaussian), sizes)
+    information = eliminated(gaussian, problem.ordering(), sizes)
     place = place_of(evaluation)
     matrices = [dense(r, place) for r in rows]
     P = dense_covariance(np.concatenate([J.reshape(-1, width_of(place)) for J in matrices]))
