@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-import pymap3d
 from numpy.typing import ArrayLike
 
 from factorgraph_dvl.geometry.vectors import Array, skew
@@ -16,6 +15,9 @@ RATE = 7.292115e-5
 SEMI_MAJOR = 6378137.0
 FLATTENING = 1.0 / 298.257223563
 ECCENTRICITY_SQUARED = FLATTENING * (2.0 - FLATTENING)
+_SEMI_MINOR = SEMI_MAJOR * (1.0 - FLATTENING)
+# Steps of the latitude. Measured: the third leaves rounding up to 10,000 km above the ellipsoid.
+_LATITUDE_STEPS = 3
 _GRAVITY_EQUATOR = 9.7803253359
 _GRAVITY_POLE = 9.8321849379
 _CENTRIFUGAL_RATIO = 0.00344978650684
@@ -66,6 +68,16 @@ def enu_from_ecef(lat: ArrayLike, lon: ArrayLike) -> Array:
     return out
 
 
+def _ecef(lat: ArrayLike, lon: ArrayLike, height: ArrayLike) -> Array:
+    """Return positions in ECEF, (..., 3), m, of geodetic coordinates (rad, rad, m)."""
+    height = np.asarray(height, dtype=float)
+    s, c = np.sin(lat), np.cos(lat)
+    east = SEMI_MAJOR / np.sqrt(1.0 - ECCENTRICITY_SQUARED * s**2)
+    out = (east + height) * c
+    up = ((1.0 - ECCENTRICITY_SQUARED) * east + height) * s
+    return np.stack([out * np.cos(lon), out * np.sin(lon), up], axis=-1)
+
+
 @dataclass(frozen=True)
 class LocalFrame:
     """Tangent east-north-up frame, fixed to the Earth at an origin: the `n` of the graph.
@@ -99,24 +111,37 @@ class LocalFrame:
         return enu_from_ecef(self.lat, self.lon)
 
     @cached_property
+    def _origin(self) -> Array:
+        """Origin in ECEF, (3,), m."""
+        return _ecef(self.lat, self.lon, self.height)
+
+    @cached_property
     def earth_rate(self) -> Array:
         """Earth rotation resolved in n, (3,), rad/s."""
         return RATE * np.array([0.0, np.cos(self.lat), np.sin(self.lat)])
 
     def position(self, lat: ArrayLike, lon: ArrayLike, height: ArrayLike) -> Array:
         """Return positions in n, (..., 3), m, of geodetic coordinates (rad, rad, m)."""
-        enu = pymap3d.geodetic2enu(lat, lon, height, self.lat, self.lon, self.height, deg=False)
-        return np.stack([np.asarray(x, dtype=float) for x in enu], axis=-1)
+        return (_ecef(lat, lon, height) - self._origin) @ self._enu_from_ecef.T
 
     def geodetic(self, p_n: ArrayLike) -> tuple[Array, Array, Array]:
-        """Return latitude, longitude (rad) and height (m) of positions (..., 3) in n."""
-        p_n = np.asarray(p_n, dtype=float)
-        lat, lon, height = pymap3d.enu2geodetic(
-            p_n[..., 0], p_n[..., 1], p_n[..., 2], self.lat, self.lon, self.height, deg=False
-        )
-        # A single position comes back with mixed shapes.
-        shape = p_n.shape[:-1]
-        return tuple(np.reshape(x, shape) for x in (lat, lon, height))  # type: ignore[return-value]
+        """Return latitude, longitude (rad) and height (m) of positions (..., 3) in n.
+
+        By the reduced latitude, step by step: Bowring, Survey Review 23(181), 1976.
+        """
+        ecef = np.asarray(p_n, dtype=float) @ self._enu_from_ecef + self._origin
+        z, out = ecef[..., 2], np.hypot(ecef[..., 0], ecef[..., 1])
+        # Sine and cosine of a latitude, but for a factor that they share.
+        up, along = SEMI_MAJOR * z, _SEMI_MINOR * out
+        for _ in range(_LATITUDE_STEPS):
+            size = np.hypot(up, along)
+            sine = z + ECCENTRICITY_SQUARED * SEMI_MAJOR**2 / _SEMI_MINOR * (up / size) ** 3
+            cosine = out - ECCENTRICITY_SQUARED * SEMI_MAJOR * (along / size) ** 3
+            up, along = _SEMI_MINOR * sine, SEMI_MAJOR * cosine
+        size = np.hypot(sine, cosine)
+        s, c = sine / size, cosine / size
+        height = out * c + z * s - SEMI_MAJOR * np.sqrt(1.0 - ECCENTRICITY_SQUARED * s**2)
+        return np.arctan2(s, c), np.arctan2(ecef[..., 1], ecef[..., 0]), height
 
     def level_from_tangent(self, lat: ArrayLike, lon: ArrayLike) -> Array:
         """Return the (..., 3, 3) rotation from n to the local-level ENU at lat, lon (rad)."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pymap3d
 import pytest
 
 from factorgraph_dvl.geometry.earth import LocalFrame, enu_from_ecef, normal_gravity, radii
@@ -38,6 +39,18 @@ def test_positions_and_back():
     np.testing.assert_allclose(FRAME.position(lat, lon, height), p_n, atol=1e-6)
     one = FRAME.geodetic(p_n[0])
     assert all(np.shape(x) == () for x in one)
+
+
+@pytest.mark.parametrize("size_m", [10.0, 1e4, 1e6, 8e6])
+@pytest.mark.parametrize("lat_deg", [36.0, -90.0, 0.0])
+def test_positions_are_those_of_pymap3d_however_far(lat_deg, size_m):
+    frame = LocalFrame(lat_deg * DEG, 121.0 * DEG, 10.0)
+    p_n = np.random.default_rng(0).normal(0.0, size_m, (20, 3))
+    geodetic = frame.geodetic(p_n)
+    np.testing.assert_allclose(frame.position(*geodetic), p_n, atol=3e-8)
+    # Its way back is off by metres there.
+    enu = pymap3d.geodetic2enu(*geodetic, frame.lat, frame.lon, frame.height, deg=False)
+    np.testing.assert_allclose(np.stack(enu, axis=1), p_n, atol=3e-8)
 
 
 def test_axes_of_the_tangent_frame_are_level_at_its_origin():
