@@ -11,7 +11,7 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.geometry.vectors import Array, BoolArray
 from factorgraph_dvl.sensors.protocol import SensorRecord
 
 PATTERN = r"^[a-z_]+:([0-9a-f]{16})+$"
@@ -23,6 +23,8 @@ _SAME = 0.5
 # many of them count as one, unless they hold the same values.
 _FEWEST_COLUMNS = 3
 _TOGETHER = 16
+# Rows that are hashed at once. Chosen: they stay in the cache.
+_CHUNK = 16384
 _MIXERS = (np.uint64(0x9E3779B97F4A7C15), np.uint64(0xBF58476D1CE4E5B9))
 
 
@@ -49,7 +51,23 @@ def _fingerprint(record: SensorRecord) -> str:
     if len(rows) == 1:
         # Of beacons either measurement may be absent.
         rows = [column for column in columns.values() if column.dtype.kind == "f"]
-    known = ~np.all(np.isnan(rows[1:]), axis=0)
+    parts = [slice(a, a + _CHUNK) for a in range(0, max(rows[0].size, 1), _CHUNK)]
+    hashes = np.concatenate([_hashes([column[part] for column in rows]) for part in parts])
+    if len(rows) <= _FEWEST_COLUMNS:
+        known = _known(rows)
+        hashes = _joined(hashes, [column[known] for column in rows[1:]])
+    smallest = np.unique(hashes)[:_SIZE].astype("<u8")
+    return f"{record.section}:{smallest.tobytes().hex()}" if smallest.size else ""
+
+
+def _known(rows: Sequence[Array]) -> BoolArray:
+    """Whether any column but the first, the time, has a value."""
+    return np.asarray(~np.all(np.isnan(rows[1:]), axis=0))
+
+
+def _hashes(rows: Sequence[Array]) -> NDArray[np.uint64]:
+    """Return one hash for every row that is known, by all its columns."""
+    known = _known(rows)
     hashes = np.zeros(int(known.sum()), dtype=np.uint64)
     for column in rows:
         # One pattern of bits for each number: -0 is 0, and there is one nan.
@@ -58,10 +76,7 @@ def _fingerprint(record: SensorRecord) -> str:
         for mixer in _MIXERS:
             hashes *= mixer
             hashes ^= hashes >> np.uint64(31)
-    if len(rows) <= _FEWEST_COLUMNS:
-        hashes = _joined(hashes, [column[known] for column in rows[1:]])
-    smallest = np.unique(hashes)[:_SIZE].astype("<u8")
-    return f"{record.section}:{smallest.tobytes().hex()}" if smallest.size else ""
+    return hashes
 
 
 def _joined(hashes: NDArray[np.uint64], columns: list[Array]) -> NDArray[np.uint64]:
