@@ -220,14 +220,19 @@ class Smoother:
         inverse = np.linalg.inv(rows[:, :, :own])
         gain = -inverse @ rows[:, :, own:]
         noise = inverse @ inverse.transpose(0, 2, 1)
-        out = np.empty((len(nodes), STATE_SIZE, STATE_SIZE))
-        out[-1] = P[:STATE_SIZE, :STATE_SIZE]
+        # Given what all share, the newest state is `shared` times that, with covariance `alone`.
+        shared = np.empty((len(nodes), own, len(P) - own))
+        alone = np.empty((len(nodes), own, own))
+        shared[-1] = np.linalg.solve(P[own:, own:], P[own:, :own]).T
+        alone[-1] = P[:own, :own] - shared[-1] @ P[own:, :own]
         for j in range(len(rows) - 1, nodes.index(min(wanted)) - 1, -1):
-            joint = gain[j] @ P
-            P[:own, :own] = joint @ gain[j].T + noise[j]
-            P[:own, own:], P[own:, :own] = joint[:, own:], joint[:, own:].T
-            out[j] = P[:STATE_SIZE, :STATE_SIZE]
-        found = out[[number[keys.node(k)] for k in wanted]]
+            by_next = gain[j, :, :own]
+            shared[j] = by_next @ shared[j + 1] + gain[j, :, own:]
+            alone[j] = by_next @ alone[j + 1] @ by_next.T + noise[j]
+        index = [number[keys.node(k)] for k in wanted]
+        across = shared[index, :STATE_SIZE]
+        found = alone[index, :STATE_SIZE, :STATE_SIZE]
+        found = found + across @ P[own:, own:] @ across.transpose(0, 2, 1)
         return np.asarray(0.5 * (found + found.transpose(0, 2, 1)))
 
     def _top(self) -> list[int]:
