@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
 
@@ -106,6 +106,30 @@ class Chain:
     def bias_key(self, k: int) -> int:
         """Return the key of the bias at node k."""
         return keys.bias(k if self.walking else 0)
+
+    def part(self, block: slice) -> Chain:
+        """Return the part of some segments in a row; states keep their keys.
+
+        Its factors are those of these segments, and others whose first state is in `nodes_of` it.
+        """
+        count, nodes = self.segments.first.size, self.nodes_of(block)
+        graph = gtsam.NonlinearFactorGraph()
+        for i in range(block.start, block.stop):
+            graph.add(self.graph.at(i))
+        for i in range(count, self.graph.size()):
+            if gtsam.symbolIndex(self.graph.at(i).keys()[0]) in nodes:
+                graph.add(self.graph.at(i))
+        return replace(
+            self,
+            segments=self.segments.part(block),
+            gravity_n=self.gravity_n[block],
+            graph=graph,
+        )
+
+    def nodes_of(self, block: slice) -> range:
+        """Return the nodes from the first of some segments to that of the segments after them."""
+        origin, count = self.segments.origin, self.segments.node_time.size
+        return range(int(origin[block.start]), int(np.append(origin, count)[block.stop]))
 
     def in_branches(self) -> list[int]:
         """Return the keys of states and walking biases in an order of elimination.

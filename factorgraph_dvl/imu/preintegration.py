@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
 
@@ -179,6 +179,20 @@ class Segments:
             after = rows_of(found, live).after(*_turns(phi), dv, self.increments.dt[i])
             found.put(live, after)
         return found
+
+    def part(self, block: slice) -> Segments:
+        """Return some segments in a row, from a start to a stop; nodes keep their numbers."""
+        edges = np.append(self.first_knot, self.less.shape[0])
+        knots = slice(int(edges[block.start]), int(edges[block.stop]))
+        return replace(
+            self,
+            first=self.first[block],
+            last=self.last[block],
+            origin=self.origin[block],
+            knots=rows_of(self.knots, knots),
+            less=self.less[knots],
+            ends=rows_of(self.ends, block),
+        )
 
     def blocks(self) -> Iterator[slice]:
         """Yield the segments in blocks of not too many samples."""

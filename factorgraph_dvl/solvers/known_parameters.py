@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
+import gtsam
 import numpy as np
 
 from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.graph import keys
 from factorgraph_dvl.graph.clocks import parameters_of
 from factorgraph_dvl.graph.freed_memory import return_freed
 from factorgraph_dvl.graph.problem import Evaluation, Problem
+from factorgraph_dvl.graph.sensor_factor import ObservationRows
 from factorgraph_dvl.imu.sampling import apparent_gyro_scale
 from factorgraph_dvl.quality.earlier_calibration import prior_against_data
 from factorgraph_dvl.sensors.finding import Code, Finding
@@ -23,7 +27,10 @@ from factorgraph_dvl.statistics.constancy import Change, by_interval
 from factorgraph_dvl.statistics.robust_weights import robust_scale
 from factorgraph_dvl.statistics.rows import rows_with_times
 from factorgraph_dvl.statistics.scores import Score, Scores, scores
-from factorgraph_dvl.statistics.square_root_information import SquareRootInformation
+from factorgraph_dvl.statistics.square_root_information import (
+    SquareRootInformation,
+    eliminated,
+)
 
 # Logarithm of the probability, shared among all tests, below which a misfit is no chance.
 _LOG10_P = -6.0
@@ -43,6 +50,10 @@ _LEAST_SCALE = 0.5
 # Share of the squares of a scale of the gyros that the wrong `sampling` may leave. Chosen: the
 # motion between samples is known to some per cent, and the scale to ten.
 _LEFT = 0.2
+# Segments from which on states are eliminated in ranges, and how many of these. Chosen: those of a
+# trial of hours, whose columns for all candidates take as much memory as all else.
+_MANY = 10_000
+_RANGES = 6
 # Trial, s, from which on tests are made. Chosen: shorter ones have rival minima.
 _SHORTEST = 60.0
 
@@ -165,14 +176,70 @@ def _tests_of_known(
     ]
     if not known:
         return {}
-    test, at, columns = _freed(problem, evaluation, known)
-    information, delta = factorized(test, at)
-    found = scores(delta, information, columns)
+    by_ranges = problem.chain.segments.first.size > _MANY and not problem.processes
+    if by_ranges:
+        found = _scores_by_ranges(problem, evaluation, known)
+    else:
+        test, at, columns = _freed(problem, evaluation, known)
+        information, delta = factorized(test, at)
+        found = scores(delta, information, columns)
     tests = {p.name: found.test([p.name]) for p in known}
     if any(t.log10_p < _LOG10_P for t in tests.values()):
+        if by_ranges:
+            test, at, columns = _freed(problem, evaluation, known)
+            information, _ = factorized(test, at)
         scatter = _scatter(test, at, information, columns, found)
         tests = {name: t.divided(scatter[name]) for name, t in tests.items()}
     return {p.name: (p, tests[p.name]) for p in known}
+
+
+def _scores_by_ranges(
+    problem: Problem, evaluation: Evaluation, known: Sequence[Parameter]
+) -> Scores:
+    """Return the scores of known parameters; states are eliminated range by range.
+
+    So the columns of all candidates are there for the states of one range only.
+    """
+    count = problem.chain.segments.first.size
+    edges = np.linspace(0, count, _RANGES + 1).astype(int).tolist()
+    graph = gtsam.GaussianFactorGraph()
+    for a, b in itertools.pairwise(edges):
+        graph, sizes, columns = _after_range(problem, evaluation, known, slice(a, b), graph)
+    order = gtsam.Ordering()
+    for key in sizes:
+        order.push_back(key)
+    information = eliminated(graph, order, sizes)
+    return scores(information.solution(), information, columns)
+
+
+def _after_range(
+    problem: Problem,
+    evaluation: Evaluation,
+    known: Sequence[Parameter],
+    block: slice,
+    graph: gtsam.GaussianFactorGraph,
+) -> tuple[gtsam.GaussianFactorGraph, dict[int, int], dict[str, tuple[int, Array]]]:
+    """Return a graph with the factors of some segments, without the states before their end.
+
+    And the sizes of all variables that all states share, and columns as `_freed` returns them.
+    """
+    test, at, columns = _freed(problem, evaluation, known, block)
+    gaussian = test.linearize(at)
+    # Priors of what all states share count once.
+    again = range(test.chain.graph.size(), test.graph.size()) if block.start else range(0)
+    for i in range(gaussian.size()):
+        if i not in again:
+            graph.push_back(gaussian.at(i))
+    order = gtsam.Ordering()
+    for k in problem.chain.nodes_of(block):
+        order.push_back(keys.node(k))
+        if problem.chain.walking:
+            order.push_back(keys.bias(k))
+    _, left = graph.eliminatePartialMultifrontal(order, gtsam.EliminateQR)
+    shared = [] if problem.chain.walking else [keys.bias(0)]
+    shared += [test.key(p.name) for p in test.parameters]
+    dims = at.values.dims()
+    return left, {key: int(dims[key]) for key in shared}, columns
 
 
 def _is_plausible(p: Parameter, test: Score) -> bool:
@@ -261,23 +328,46 @@ def _wide(p: Parameter, mean: Array) -> Parameter:
 
 
 def _freed(
-    problem: Problem, evaluation: Evaluation, known: Sequence[Parameter]
+    problem: Problem,
+    evaluation: Evaluation,
+    known: Sequence[Parameter],
+    block: slice | None = None,
 ) -> tuple[Problem, Evaluation, dict[str, tuple[int, Array]]]:
     """Return the problem with known parameters free, where it is, and their keys and priors."""
     names = {p.name for p in known}
     free = [_wide(p, p.mean) if p.name in names else p for p in problem.all_parameters]
-    test, at = _scattered(problem, evaluation, free)
+    test, at = _scattered(problem, evaluation, free, block)
     return test, at, {p.name: (test.key(p.name), p.sigma) for p in free if p.name in names}
 
 
 def _scattered(
-    problem: Problem, evaluation: Evaluation, parameters: Sequence[Parameter]
+    problem: Problem,
+    evaluation: Evaluation,
+    parameters: Sequence[Parameter],
+    block: slice | None = None,
 ) -> tuple[Problem, Evaluation]:
-    """Return a problem with other parameters where it is, and noise as residuals scatter."""
+    """Return a problem with other parameters where it is, and noise as residuals scatter.
+
+    Of some segments only where a block of them is given.
+    """
     values = evaluation.parameters
+    chain, observations, robust = problem.chain, problem.observations, problem.robust_weights
+    if block is not None:
+        own = [
+            np.flatnonzero((at.segment >= block.start) & (at.segment < block.stop))
+            for at in problem.attachments
+        ]
+        rows = {o.label: index for o, index in zip(observations, own, strict=True)}
+        chain = chain.part(block)
+        observations = tuple(
+            ObservationRows(o, index)
+            for o, index in zip(observations, own, strict=True)
+            if index.size
+        )
+        robust = {label: weight[rows[label]] for label, weight in robust.items()}
     test = Problem(
-        problem.chain,
-        problem.observations,
+        chain,
+        observations,
         parameters,
         start=values,
         clock_zero=problem.clock_zero,
@@ -285,7 +375,7 @@ def _scattered(
     )
     test.reject(problem.rejected)
     test.noise_factors = _as_scattered(problem, evaluation)
-    test.robust_weights = problem.robust_weights
+    test.robust_weights = robust
     test.long_run = problem.long_run
     at = test.evaluate(test.values(evaluation.states, test.prior_values() | values))
     test.weigh(at)
