@@ -68,7 +68,7 @@ FIXED_DIRECTION_STD = 1e-4
 _SAME_TIME = 2e-4
 # The same, s, before the motion is integrated anew on the way to a minimum. Measured: at most
 # 7e-5 rad/s in the same sway.
-_EXTRAPOLATED = 1e-3
+EXTRAPOLATED = 1e-3
 # Relative change of a standard deviation from which on measurements are weighed anew. Chosen:
 # less hardly moves the minimum.
 _SAME_WEIGHT = 0.2
@@ -217,9 +217,9 @@ class Problem:
         By label, factors (d,) for noise that persists for some measurements; likewise.
     robust_weights : mapping of str to ndarray
         By label, weights from 0 to 1 on the squares of residuals, (M, d) or (M, 1); likewise.
-    loosely_bound : bool
-        Whether clocks may move measurements as far as the motion is extrapolated before they are
-        to be bound anew: for those that sway moves to and fro.
+    clock_tolerance : mapping of str to float
+        By name of a clock's offset, how far, s, it may move measurements before they are to be
+        bound anew: for clocks that sway, or noise of the IMU's samples, moves to and fro.
 
     Examples
     --------
@@ -271,7 +271,7 @@ class Problem:
         self.noise_factors: Mapping[str, Array] = {}
         self.long_run: Mapping[str, Array] = {}
         self.robust_weights: Mapping[str, Array] = {}
-        self.loosely_bound = False
+        self.clock_tolerance: Mapping[str, float] = {}
         self._start = {**self.prior_values(), **(start or {})}
         self._bound: list[_Bound] = []
         for observation in observations:
@@ -648,8 +648,14 @@ class Problem:
 
     def needs_rebinding(self, parameters: dict[str, Array]) -> bool:
         """Whether a clock has moved measurements too far from where they were bound."""
-        most = _EXTRAPOLATED if self.loosely_bound else _SAME_TIME
-        return any(np.abs(self._late(b, parameters)).max() > most for b in self._bound)
+        return any(
+            np.abs(self._late(b, parameters)).max() > self._tolerance(b, _SAME_TIME)
+            for b in self._bound
+        )
+
+    def _tolerance(self, bound: _Bound, least: float) -> float:
+        clock = bound.observation.clock
+        return least if clock is None else max(self.clock_tolerance.get(clock.names[0], 0.0), least)
 
     def _motion(self, bound: _Bound, states: States, parameters: dict[str, Array]) -> Motion:
         """Return the motion at the true times of measurements.
@@ -659,7 +665,7 @@ class Problem:
         """
         rate = self.chain.frame.earth_rate
         late = self._late(bound, parameters)
-        if np.abs(late).max() <= _EXTRAPOLATED:
+        if np.abs(late).max() <= self._tolerance(bound, EXTRAPOLATED):
             at, rest = bound.attachment, late
         else:
             at, _ = attach_inside(self.chain.segments, bound.time + late, rate)

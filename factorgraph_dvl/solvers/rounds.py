@@ -14,7 +14,7 @@ import numpy as np
 
 from factorgraph_dvl.geometry.vectors import Array, BoolArray
 from factorgraph_dvl.graph.priors import ConstantsPrior
-from factorgraph_dvl.graph.problem import Evaluation, Problem
+from factorgraph_dvl.graph.problem import EXTRAPOLATED, Evaluation, Problem
 from factorgraph_dvl.graph.processes import Process
 from factorgraph_dvl.imu.propagation import States
 from factorgraph_dvl.sensors.finding import Code, Finding
@@ -66,9 +66,12 @@ _MOST_FREED = 2
 # Relative change of the noise over a long time, by that of innovations, from which on it counts.
 # Chosen: less changes no σ that is shown.
 _SAME_INNOVATIONS = 0.05
-# Bindings in a row after which clocks need not settle closer than the motion is extrapolated.
-# Chosen: most trials take one or two.
+# Bindings in a row after which clocks need not settle closer than the motion is extrapolated, or
+# than a share of their standard deviation. Chosen: most trials take one or two.
 _IN_A_ROW = 4
+# That share. Chosen: a tenth of the variance. Noise of the IMU's samples may give the cost a bend
+# within it, from where two bindings lead to each other.
+_SETTLED_SHARE = 0.3
 # Share of the last movement of the clocks from which on the next binding is half-way. Chosen: half
 # is what is left of a movement after one that went half the way.
 _NOT_SETTLING = 0.75
@@ -165,6 +168,7 @@ def settle(
     first_levels = _NoiseLevels((as_stated,), bool(as_stated))
     levels = first_levels
     changing = [message("not_converged.all")]
+    tolerance: Mapping[str, float] = {}
     count = in_a_row = fruitless = 0
     movement = np.inf
     bound = values
@@ -193,9 +197,11 @@ def settle(
         problem.long_run = long_run
         problem.robust_weights = robust
         in_a_row = in_a_row + 1 if only_times else 0
-        problem.loosely_bound = in_a_row > _IN_A_ROW
+        if in_a_row > _IN_A_ROW and not tolerance:
+            tolerance = _clock_tolerance(prepared, problem, minimum.evaluation)
+        problem.clock_tolerance = tolerance
         # At the ends of the record two bindings may use one measurement in turn.
-        usable = problem.usable if problem.loosely_bound else None
+        usable = problem.usable if tolerance else None
         at = problem.values(states, problem.prior_values() | values)
         minimum = minimise(problem, at, stage="all sensors", progress=report, binding=True)
         iterations += minimum.iterations
@@ -234,6 +240,7 @@ def settle(
                 found = correlated_noise(problem, minimum.evaluation, ())
             if found.processes or found.long_run:
                 changing.append(_CORRELATED)
+                tolerance = {}
                 long_run = found.long_run
                 white = levels.factors[-1] | found.factors
                 levels = replace(
@@ -254,7 +261,7 @@ def settle(
                 )
                 # With another model, all that its misfit made is to be found anew.
                 changing.append(_KNOWN)
-                robust, long_run, levels = {}, {}, first_levels
+                robust, long_run, levels, tolerance = {}, {}, first_levels, {}
                 searches, correlation_searched, count = 0, False, 0
         if not changing and levels.estimated and minimum.converged:
             last = levels
@@ -362,6 +369,19 @@ def _changing(problem: Problem, evaluation: Evaluation) -> list[Message]:
         message("not_converged.weights"): problem.needs_reweighting(evaluation),
     }
     return [name for name, changed in found.items() if changed]
+
+
+def _clock_tolerance(
+    prepared: Preparation, problem: Problem, evaluation: Evaluation
+) -> dict[str, float]:
+    """Return how closely clocks are to settle, s, by the names of their offsets."""
+    names = {o.clock.names[0] for o in prepared.observations if o.clock is not None}
+    keys = {p.name: problem.key(p.name) for p in problem.parameters if p.name in names}
+    marginals = factorized(problem, evaluation)[0].marginals(list(keys.values()))
+    return {
+        name: max(EXTRAPOLATED, _SETTLED_SHARE * float(np.sqrt(marginals[key][0, 0])))
+        for name, key in keys.items()
+    }
 
 
 def _halfway(
