@@ -94,12 +94,13 @@ def change_findings(found: SolvedProblem) -> Iterator[Finding]:
     tests = component_changes(
         found.problem, found.minimum.evaluation, found.covariances.information
     )
-    largest = max((t.change.chi2 for t in tests), default=0.0)
-    if largest < CHANGED**2:
+    significant = [t for t in tests if t.change.chi2 >= CHANGED**2]
+    if not significant:
         return
-    ties = [t for t in tests if largest - t.change.chi2 < 2.0 * _TIE]
+    largest = max(t.change.fall for t in significant)
+    ties = [t for t in significant if largest - t.change.fall < 2.0 * _TIE]
     # Of what is about as probable, what the trial is for.
-    best = min(ties, key=lambda t: (t.parameter.spec.nuisance, -t.change.chi2))
+    best = min(ties, key=lambda t: (t.parameter.spec.nuisance, -t.change.fall))
     ties.remove(best)
     change = best.change
     unit = UNITS[best.parameter.spec.unit].text

@@ -36,6 +36,8 @@ class Change:
     chi2 : float
         Twice the fall of the cost if the component changed then, one degree of freedom; less
         where the scores of parts of the trial scatter more than white noise makes them.
+    fall : float
+        The same, whatever the scatter: that of a drift is the drift's own.
     time : float, s
         When.
     size, std : float
@@ -43,6 +45,7 @@ class Change:
     """
 
     chi2: float
+    fall: float
     time: float
     size: float
     std: float
@@ -104,10 +107,9 @@ def changes(
             std = scale[i] / np.sqrt(V[k, i])
             # What came before asks for a value by its score, what comes after for the opposite.
             change = -np.sign(before[k, i]) * np.sqrt(chi2[k, i]) * std
-        most = float(chi2[k, i])
-        if most > _WORTH_IT:
-            most /= _scatter(score, information, int(k) + 1, i)
-        out.append(Change(most, float(edges[k]), float(change), float(std)))
+        fall = float(chi2[k, i])
+        scatter = _scatter(score, information, int(k) + 1, i) if fall > _WORTH_IT else 1.0
+        out.append(Change(fall / scatter, fall, float(edges[k]), float(change), float(std)))
     return out
 
 
