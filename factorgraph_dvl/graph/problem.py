@@ -655,7 +655,9 @@ class Problem:
 
     def _tolerance(self, bound: _Bound, least: float) -> float:
         clock = bound.observation.clock
-        return least if clock is None else max(self.clock_tolerance.get(clock.names[0], 0.0), least)
+        return (
+            least if clock is None else max(self.clock_tolerance.get(clock.names[0], 0.0), least)
+        )
 
     def _motion(self, bound: _Bound, states: States, parameters: dict[str, Array]) -> Motion:
         """Return the motion at the true times of measurements.

@@ -57,6 +57,12 @@ class CarriedWindows:
     place: Array
     rate: Array
 
+    @property
+    def mean_force(self) -> Array:
+        """Mean specific force of each window in the axes at its start, (W, 3), m/s²."""
+        duration = self.step * (self.speed.shape[1] - 1)
+        return np.asarray((self.speed[:, -1] - self.speed[:, 0]) / duration)
+
     def window_of(self, time: Array) -> np.ndarray:
         """Return the window of each time (M,), -1 where there is none."""
         k = np.searchsorted(self.start, time, side="right") - 1

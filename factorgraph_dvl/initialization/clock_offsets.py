@@ -188,17 +188,23 @@ def clock_offset(
         slope = 1.5 * (last - first) / span
         starts = [(constant.values[0], 0.0), (0.5 * (first + last), slope)]
         starts += [_drift(comparison, middle, (around, constant.values[0]))]
-        found = _first_of(comparison, design, starts)
-        if found.better_than(best) and _explains(comparison, found, constant):
-            best, rate = found, (float(found.values[1]), float(found.sigma[1]))
-        at, before, after = _break(comparison, float(constant.values[0]), around, reach)
-        design = np.stack([one, (time > at).astype(float)], axis=-1)
-        found = _refined(comparison, design, np.array([before, after - before]))
-        sides = [np.unique(_blocks(comparison)[side]).size for side in (time > at, time <= at)]
-        enough = min(sides) >= _LEAST_BLOCKS and _explains(comparison, found, constant, at)
-        if enough and found.better_than(best):
-            best, rate = found, (0.0, 0.0)
-            jump, jump_time = (float(found.values[1]), float(found.sigma[1])), at
+        drift = _first_of(comparison, design, starts)
+        if drift.better_than(best) and _explains(comparison, drift, constant):
+            best, rate = drift, (float(drift.values[1]), float(drift.sigma[1]))
+        breaks = [
+            _break(comparison, float(constant.values[0]), around, reach),
+            _break_like(comparison, drift.values, middle),
+        ]
+        for at, before, after in breaks:
+            design = np.stack([one, (time > at).astype(float)], axis=-1)
+            found = _refined(comparison, design, np.array([before, after - before]))
+            sides = [np.unique(_blocks(comparison)[side]).size for side in (time > at, time <= at)]
+            enough = min(sides) >= _LEAST_BLOCKS and _explains(comparison, found, constant, at)
+            # A jump has as many parameters as a rate.
+            better = found.better_than(constant) and found.likelihood > best.likelihood
+            if enough and better:
+                best, rate = found, (0.0, 0.0)
+                jump, jump_time = (float(found.values[1]), float(found.sigma[1])), at
     zero = comparison.residual(around)
     return ClockOffset(
         offset=float(best.values[0]),
@@ -502,12 +508,36 @@ def _break(
         _dominating(comparison.only(side), offset, around, reach) if side.any() else offset
         for side, offset in zip(sides, (before, after), strict=True)
     )
+    return _break_near(comparison, k, before, after), before, after
+
+
+def _break_like(comparison: Comparison, drift: Array, middle: float) -> tuple[float, float, float]:
+    """Return when an offset jumps, and its values before and after, as like a drift as possible.
+
+    A jump J after a share p of the time has the mean offset and, by least squares, the rate
+
+        before + (1 - p) J,    6 p (1 - p) J / span.
+    """
+    inside = comparison.time[comparison.inside]
+    begin, span = float(inside.min()), float(np.ptp(inside))
+    edges = comparison.time[1:, 0]
+    share = (edges - begin) / span
+    jump = drift[1] * span / (6.0 * share * (1.0 - share))
+    before = drift[0] + drift[1] * (begin + 0.5 * span - middle) - (1.0 - share) * jump
+    after = np.asarray(comparison.time > edges[:, None, None], dtype=float)
+    late = before[:, None, None] + after * jump[:, None, None]
+    k = int(np.argmin(_misfits_at(comparison, late).sum(axis=1)))
+    sides = float(before[k]), float(before[k] + jump[k])
+    return _break_near(comparison, k + 1, *sides), *sides
+
+
+def _break_near(comparison: Comparison, k: int, before: float, after: float) -> float:
+    """Return when an offset jumps, within the last window before and the first after, `k`."""
     time = comparison.time
-    first, last = time[max(k - 1, 0)].min(), time[min(k, count - 1)].max()
+    first, last = time[max(k - 1, 0)].min(), time[min(k, time.shape[0] - 1)].max()
     tried = np.linspace(first, last, _BREAKS)
     late = np.where(time > tried[:, None, None], after, before)
-    at = tried[np.argmin(_misfits_at(comparison, late).sum(axis=1))]
-    return float(at), before, after
+    return float(tried[np.argmin(_misfits_at(comparison, late).sum(axis=1))])
 
 
 def _blocks(comparison: Comparison) -> np.ndarray:

@@ -111,14 +111,20 @@ class VelocityWindows:
         return np.asarray(3.0 * self.inside.sum(axis=1) - unknowns)
 
     def carried(self, offset: float | Array, stamp: Array | None = None) -> CarriedMotion:
-        """Return the motion of the IMU at stamps (N,) that are late by an offset (..., W, n)."""
-        time = (self.time if stamp is None else stamp[self.rows]) - offset
+        """Return the motion of the IMU at stamps (N,) that are late by an offset (..., W, n).
+
+        Integrals of the mean force are those up to the stamps. Where an offset jumps, they do not,
+        so that a trend along the stamps takes gravity out.
+        """
+        stamps = self.time if stamp is None else stamp[self.rows]
+        time = stamps - offset
         window = np.broadcast_to(self.window[:, None], time.shape)
         at = self.windows.at(window.ravel(), time.ravel())
-        return CarriedMotion(
-            at.turn.reshape(*time.shape, 3, 3),
-            *(x.reshape(*time.shape, 3) for x in (at.speed, at.place, at.rate)),
-        )
+        turn = at.turn.reshape(*time.shape, 3, 3)
+        speed, place, rate = (x.reshape(*time.shape, 3) for x in (at.speed, at.place, at.rate))
+        missing = self.windows.mean_force[self.window][:, None] * (stamps - time)[..., None]
+        since = (stamps - self.windows.begin[self.window][:, None])[..., None]
+        return CarriedMotion(turn, speed + missing, place + missing * since, rate)
 
     def without_trend(self, values: Array) -> Array:
         """Return values (..., W, n, c) without the parabola that fits them best in each window."""

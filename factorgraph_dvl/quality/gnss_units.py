@@ -15,6 +15,9 @@ from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.sensors.gnss import Gnss
 from factorgraph_dvl.sensors.message import Message, message
 
+# Share of the intervals in which velocities agree, from which on fixes jump, and no unit is wrong.
+# Chosen: of 30 % outliers half of the intervals have none at either end.
+_JUMPS = 0.3
 # What fixes in the wrong unit look like.
 RADIANS = message("radians.fixes")
 
@@ -76,7 +79,19 @@ def _compare_velocities(
     text = message("gnss_velocity.disagree", misfit=misfit)
     if explained[best] <= tolerance:
         text = message("gnss_velocity.disagree_because", misfit=misfit, cause=best)
+    elif _agreeing_share(between[:, :2], mean[:, :2], noise) > _JUMPS:
+        return
     yield Finding(Code.GNSS_VELOCITY, text, gnss.label, severity="error")
+
+
+def _agreeing_share(between: Array, mean: Array, noise: float) -> float:
+    """Return the share of intervals in motion in which velocities agree with positions."""
+    speed = np.linalg.norm(mean, axis=1)
+    moving = speed > MOVING_M_S
+    if not moving.any():
+        return 0.0
+    agree = np.linalg.norm(between - mean, axis=1) <= 0.1 * speed + 3.0 * noise
+    return float(np.mean(agree[moving]))
 
 
 def _velocity_candidates() -> Iterator[tuple[Message, list[list[float]]]]:

@@ -23,7 +23,7 @@ from factorgraph_dvl.sensors.message import Message, message
 from factorgraph_dvl.sensors.parameters import UNITS, Parameter
 from factorgraph_dvl.solvers.change_along_trial import CHANGED, component_changes
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, factorized
-from factorgraph_dvl.statistics.constancy import Change, by_interval
+from factorgraph_dvl.statistics.constancy import by_interval
 from factorgraph_dvl.statistics.robust_weights import robust_scale
 from factorgraph_dvl.statistics.rows import rows_with_times
 from factorgraph_dvl.statistics.scores import Score, Scores, scores
@@ -68,13 +68,14 @@ class Explanation:
         As it was taken.
     score : Score
         Its test.
-    others : tuple of str
-        Names of those that explain the misfit about as well, and `imu.sampling` where that does.
+    others : tuple of str or Message
+        Names of those that explain the misfit about as well, `imu.sampling` where that does, and
+        changes along the trial that do.
     """
 
     parameter: Parameter
     score: Score
-    others: tuple[str, ...]
+    others: tuple[str | Message, ...]
 
     @property
     def freed(self) -> Parameter:
@@ -113,23 +114,24 @@ def explanation(problem: Problem, minimum: Minimum, imu: Imu) -> Explanation | N
         return None
     same, at = _scattered(problem, evaluation, problem.all_parameters)
     changes = component_changes(same, at, factorized(same, at)[0])
-    certain = [e.change for e in changes if e.change.chi2 > CHANGED**2]
+    certain = [e for e in changes if e.change.chi2 > CHANGED**2]
     count = sum(int(np.count_nonzero(w)) for w in problem.weights)
     significant.sort(key=lambda each: -each[1].evidence(count))
     parameter, test = significant[0]
-    if any(c.chi2 > test.chi2 or _fall(c) > test.chi2 * test.scatter for c in certain):
+    fall = test.chi2 * test.scatter
+    if any(e.change.chi2 > test.chi2 or e.change.fall > fall for e in certain):
         return None
-    others = tuple(
+    others: tuple[str | Message, ...] = tuple(
         p.name for p, t in significant[1:] if test.evidence(count) - t.evidence(count) < 2.0 * _TIE
+    )
+    others += tuple(
+        message("unexplained_misfit.change", name=e.name, time=e.change.time)
+        for e in certain
+        if fall - e.change.fall < 2.0 * _TIE
     )
     if parameter.name == GYRO_SCALE and _is_sampling(test, imu):
         others = (*others, "imu.sampling")
     return Explanation(parameter, test, others)
-
-
-def _fall(change: Change) -> float:
-    """Return twice the fall of the cost by a change, of noise that is white."""
-    return (change.size / change.std) ** 2
 
 
 def _is_sampling(scale: Score, imu: Imu) -> bool:

@@ -197,8 +197,6 @@ def settle(
         problem.long_run = long_run
         problem.robust_weights = robust
         in_a_row = in_a_row + 1 if only_times else 0
-        if in_a_row > _IN_A_ROW and not tolerance:
-            tolerance = _clock_tolerance(prepared, problem, minimum.evaluation)
         problem.clock_tolerance = tolerance
         # At the ends of the record two bindings may use one measurement in turn.
         usable = problem.usable if tolerance else None
@@ -208,6 +206,8 @@ def settle(
         fruitless = 0 if minimum.converged else fruitless + minimum.iterations
         states, values = minimum.evaluation.states, minimum.evaluation.parameters
         changing = _changing(problem, minimum.evaluation)
+        if changing == [_TIMES] and in_a_row >= _IN_A_ROW and not tolerance:
+            tolerance = _clock_tolerance(prepared, problem, minimum.evaluation)
         if np.sqrt(np.mean((states.p_n - p_gravity) ** 2)) > _SAME_GRAVITY:
             changing.insert(0, message("not_converged.gravity"))
             chain = prepared.chain(states)

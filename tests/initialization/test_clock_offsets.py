@@ -63,6 +63,14 @@ def test_a_jump_is_found_with_its_time(noisy):
     np.testing.assert_allclose(found.late(np.array([20.0, 200.0])), [0.0, 1.0], atol=0.05)
 
 
+def test_a_small_jump_is_no_rate(noisy):
+    """A rate would explain three quarters of it."""
+    found = clock_offset(compared(noisy, "dvl", lambda time: np.where(time > 120.0, 0.3, 0.0)))
+    assert found.jump == pytest.approx(0.3, abs=0.03)
+    assert found.rate == 0.0
+    assert 110.0 < found.jump_time < 150.0
+
+
 class Sway:
     """A vessel that sways at 2 Hz and speeds up early; its record is 0.1 s late throughout."""
 

@@ -71,13 +71,38 @@ def test_some_of_the_windows(windows):
 
 
 def test_a_late_stamp_is_carried_to_its_true_time(windows):
-    moving = np.cumsum(np.ones((2, 50, 3)), axis=1) * 0.5
+    """A surge, on top of the mean force of gravity."""
+    time = 0.5 * np.arange(50.0)
+    surge = 3.0 * np.sin(2.0 * np.pi * time / 24.5)
+    speed = np.tile((9.8 * time + surge)[:, None], (2, 1, 3))
+    zero = np.zeros_like(speed)
     carried = CarriedWindows(
-        windows.start, 20.0, windows.begin, 0.5, windows.turn, moving, moving, 0.0 * moving
+        windows.start, 20.0, windows.begin, 0.5, windows.turn, speed, zero, zero
     )
     there = of(carried, np.arange(0.0, 50.0), np.zeros((50, 3)))
-    shift = there.carried(0.0).speed - there.carried(0.3).speed
-    np.testing.assert_allclose(shift, 0.3, atol=1e-12)
+    shift = there.carried(0.0).speed - there.carried(0.5).speed
+    since = there.time - there.windows.begin[there.window][:, None]
+    expected = np.interp(since, time, surge) - np.interp(since - 0.5, time, surge)
+    np.testing.assert_allclose(shift, np.repeat(expected[..., None], 3, axis=2), atol=1e-9)
+
+
+def test_gravity_makes_no_step_where_a_clock_jumps(windows):
+    """Neither in the velocity, nor in its mean between two stamps."""
+    time = 0.5 * np.arange(50.0)
+    fallen = np.tile((9.8 * time)[:, None], (2, 1, 3))
+    place = np.tile((4.9 * time**2)[:, None], (2, 1, 3))
+    carried = CarriedWindows(
+        windows.start, 20.0, windows.begin, 0.5, windows.turn, fallen, place, 0.0 * fallen
+    )
+    stamp = np.arange(0.0, 50.0)
+    there = of(carried, stamp, np.zeros((50, 3)))
+    jump = np.where(there.time > 12.0, 1.0, 0.0)
+    np.testing.assert_allclose(there.carried(jump).speed, there.carried(0.0).speed, atol=1e-9)
+    means = [
+        there.carried(late, stamp + 0.5).place - there.carried(late, stamp).place
+        for late in (0.0, jump)
+    ]
+    np.testing.assert_allclose(means[0], means[1], atol=1e-9)
 
 
 def test_an_outlier_is_no_steady_velocity_and_sway_is():

@@ -150,6 +150,20 @@ def test_a_mistake_is_found_and_explained(case: str) -> None:
     assert any(text in f.text for f in result.problems if f.sensor == sensor), result.problems
 
 
+def test_fixes_that_jump_are_no_unit_of_the_velocity() -> None:
+    """Half of the intervals between fixes have one that jumps at either end."""
+    trial = build_trial()
+    gnss = trial.gnss
+    assert gnss is not None
+    rng = np.random.default_rng(3)
+    jumps = 1e-5 * rng.uniform(1.0, 5.0, gnss.time.size) * (rng.uniform(size=gnss.time.size) < 0.3)
+    spoilt = replace(gnss, geodetic=gnss.geodetic + np.outer(jumps, [1.0, -1.0, 0.0]))
+    found = survey(replace(trial, gnss=spoilt)).findings
+    assert not [f for f in found if f.code == Code.GNSS_VELOCITY and f.severity == "error"]
+    knots = gnss_velocity(replace(trial, gnss=spoilt), lambda v: v / 0.5144)
+    assert [f.code for f in survey(knots).problems if f.sensor == "GNSS"] == [Code.GNSS_VELOCITY]
+
+
 def test_a_down_velocity_is_found() -> None:
     trial = build_trial()
     gnss = trial.gnss

@@ -65,6 +65,15 @@ def test_the_test_is_the_fall_of_the_cost(component):
     assert (test.size / test.std) ** 2 == pytest.approx(fall, rel=1e-9)
 
 
+def test_a_drift_is_the_largest_fall_although_it_scatters_most():
+    """The scores of a drift scatter as it goes on; those of what follows it scatter less."""
+    data = np.random.default_rng(2).normal(size=400) + 0.03 * TIME
+    drift, other = fitted(data)
+    assert drift.fall == pytest.approx((drift.size / drift.std) ** 2, rel=1e-9)
+    assert drift.chi2 < 0.2 * drift.fall
+    assert drift.fall > 20.0 * other.fall
+
+
 def test_chance_seldom_makes_a_change():
     rng = np.random.default_rng(0)
     largest = [max(t.significance for t in fitted(rng.normal(size=400))) for _ in range(150)]
