@@ -16,8 +16,8 @@ from factorgraph_dvl.sensors.gnss import Gnss
 from factorgraph_dvl.sensors.message import Message, message
 
 # Share of the intervals in which velocities agree, from which on fixes jump, and no unit is wrong.
-# Chosen: of 30 % outliers half of the intervals have none at either end.
-_JUMPS = 0.3
+# Chosen: of 30 % outliers half of the intervals have one at an end.
+_JUMPS = 0.25
 # What fixes in the wrong unit look like.
 RADIANS = message("radians.fixes")
 
