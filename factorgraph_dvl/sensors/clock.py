@@ -12,9 +12,9 @@ from factorgraph_dvl.sensors.parameters import SCALAR, Parameter, ParameterSpec
 from factorgraph_dvl.sensors.protocol import SensorSection
 from factorgraph_dvl.settings.sections import NonNegative
 
-# Plausible offset, s, and rate, ppm, of a clock. Chosen: of loggers that were set by hand, and of
-# quartz that is broken.
-_OFFSET_S = 1.0
+# Plausible offset, s, and rate, ppm, of a clock. Chosen: four times the first are the leap seconds
+# of GPS time, and the second is quartz that is broken.
+_OFFSET_S = 5.0
 _RATE_PPM = 1000.0
 
 

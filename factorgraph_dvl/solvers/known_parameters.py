@@ -17,6 +17,7 @@ from factorgraph_dvl.graph.problem import Evaluation, Problem
 from factorgraph_dvl.graph.sensor_factor import ObservationRows
 from factorgraph_dvl.imu.sampling import apparent_gyro_scale
 from factorgraph_dvl.quality.earlier_calibration import prior_against_data
+from factorgraph_dvl.quality.sensor_clocks import LEAP_SECONDS
 from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.sensors.imu import ERRORS, GYRO_SCALE, Imu
 from factorgraph_dvl.sensors.message import Message, message
@@ -278,7 +279,7 @@ def explanation_findings(
                 std=_uncertainty(e.parameter),
                 chi2=_chi_square(e),
                 value=_numbers(e.parameter, evaluation.parameters[e.parameter.name]),
-                others=_or(e),
+                others=_leap_seconds(e.parameter, evaluation) or _or(e),
             ),
             parameter=e.parameter.name,
         )
@@ -301,6 +302,14 @@ def explanation_findings(
             )
         )
     return tuple(out)
+
+
+def _leap_seconds(p: Parameter, evaluation: Evaluation) -> Message | None:
+    """Return that a clock is off by the leap seconds, None if it is not."""
+    if not p.spec.stem.endswith("time_offset"):
+        return None
+    off = abs(float(evaluation.parameters[p.name][0]))
+    return message("leap_seconds.estimated") if abs(off - LEAP_SECONDS) < 1.0 else None
 
 
 def _uncertainty(p: Parameter) -> Message:

@@ -15,6 +15,8 @@ from truth import CONFIGS, scenario
 from factorgraph_dvl.simulation import parse_scenario, simulate
 from factorgraph_dvl.simulation.faults import (
     clock_step,
+    correlated_dvl,
+    correlated_gnss,
     dvl_scale_walk,
     gauss_markov,
     with_faults,
@@ -176,3 +178,22 @@ def test_a_clock_that_jumps_under_water_is_no_correlated_noise():
     solution = solve(trial, rate_hz=1.0)
     assert solution.verdict.grade == "do not use"
     assert (solution.verdict.reasons[0].parameter or "").startswith("gnss_")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("fault", "label"),
+    [
+        (correlated_dvl(0.05), "DVL velocity"),
+        (correlated_gnss(velocity_std_m_s=(0.5, 0.5, 0.5)), "GNSS velocity"),
+    ],
+    ids=["DVL", "GNSS"],
+)
+def test_noise_that_persists_at_ten_times_what_is_stated_leaves_a_minimum(fault, label):
+    """The clock of GNSS is known to 10 ms then, and its cost is as rough as the IMU's samples."""
+    data = yaml.safe_load((CONFIGS / "seed-a-phase-90.yaml").read_text(encoding="utf-8"))
+    data["trial"] = {"imu": data["trial"]["imu"], "dvl": {"velocity_std_m_s": 0.001}}
+    solution = solve(with_faults(simulate(parse_scenario(data), 0), [fault]), rate_hz=1.0)
+    assert solution.converged
+    assert solution.verdict.grade == "doubtful"
+    assert solution.verdict.reasons[0].sensor == label
