@@ -58,16 +58,19 @@ def component_changes(
     information : SquareRootInformation
         Information there.
     """
+    chain = problem.chain
+    # Biases that walk change anyway.
+    constant = {*problem.columns, *(() if chain.walking else (p.name for p in chain.biases))}
     rows = [
         (p, derivatives)
         for p, _, derivatives in reported(problem, evaluation)
-        if derivatives is not None and p.name in problem.columns and np.all(p.sigma > 0.0)
+        if derivatives is not None and p.name in constant and np.all(p.sigma > 0.0)
     ]
     if not rows:
         return []
     functionals = [derivatives for _, derivatives in rows]
     of_component = [(name, p) for p, _ in rows for name in p.component_names]
-    time = problem.chain.segments.node_time
+    time = chain.segments.node_time
     tests = changes(
         rows_with_times(problem, evaluation),
         information.covariance_with(functionals),
