@@ -97,7 +97,7 @@ class LocalFrame:
     >>> import numpy as np
     >>> from factorgraph_dvl import LocalFrame
     >>> frame = LocalFrame(np.radians(36.0), np.radians(121.0), 0.0)
-    >>> frame.position(np.radians(36.0), np.radians(121.0), 5.0).round(6)
+    >>> frame.position(np.radians(36.0), np.radians(121.0), 5.0).round(6) + 0.0
     array([0., 0., 5.])
     """
 

@@ -117,7 +117,7 @@ class Chain:
         for i in range(block.start, block.stop):
             graph.add(self.graph.at(i))
         for i in range(count, self.graph.size()):
-            if gtsam.symbolIndex(self.graph.at(i).keys()[0]) in nodes:
+            if keys.index_of(self.graph.at(i).keys()[0]) in nodes:
                 graph.add(self.graph.at(i))
         return replace(
             self,

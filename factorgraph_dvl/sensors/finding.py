@@ -472,8 +472,8 @@ class Code(StrEnum):
         "changed_along_trial",
         "A parameter changes along the trial.",
         "After a slipping mount, a false lock or a clock step, the mean is right at no time.",
-        "Check mount, lock and clock at that time, and solve the parts before and after separately. "
-        "For a bias of the IMU state imu: {gyro_bias_walk_deg_h_sqrt_h, accel_bias_walk_ug_sqrt_h}.",
+        "Check mount, lock and clock at that time. Solve the parts before and after separately. "
+        "For a bias of the IMU state its walk, such as imu: gyro_bias_walk_deg_h_sqrt_h.",
         "error",
     )
     FAR_FROM_PRIOR = (
