@@ -400,10 +400,10 @@ class Replay:
         A sensor that only says that it cannot measure has not reported: its parameters must not
         be linearised at their priors.
         """
+        if not record.missing.all():
+            return True
         anywhere = LocalFrame(0.0, 0.0, 0.0, self._settings.epoch)
-        return not record.missing.all() or bool(
-            record.observations(anywhere, self._settings.body_axes)
-        )
+        return bool(record.observations(anywhere, self._settings.body_axes))
 
     def _update(
         self,

@@ -84,13 +84,12 @@ class SpuriousInformation:
             self._used[o.label] += used
             if time - self._evaluated.get(o.label, self._start.time) < _EVERY:
                 continue
-            m = r.time.size
             part = spurious_by(
                 o,
                 measured.attachment_of(r),
                 motion,
                 weight,
-                np.broadcast_to(P, (m, *P.shape)),
+                P[None],
                 values,
                 wanted,
                 self._start.clock_zero,

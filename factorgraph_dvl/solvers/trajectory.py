@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -80,8 +81,8 @@ def trajectory_between(
 
 def epochs_between(start: float, end: float, rate_hz: float) -> Array:
     """Return the multiples of 1 / rate after a time and up to another, s."""
-    first, last = np.floor(np.array([start, end]) * rate_hz + EPOCH_ROUNDING)
-    return np.asarray(np.arange(first + 1.0, last + 1.0) / rate_hz + 0.0)
+    first, last = (math.floor(time * rate_hz + EPOCH_ROUNDING) for time in (start, end))
+    return np.asarray(np.arange(first + 1, last + 1) / rate_hz)
 
 
 @dataclass(frozen=True)

@@ -14,11 +14,15 @@ from dataclasses import replace
 
 import numpy as np
 
+from factorgraph_dvl.geometry.records import rows_of
 from factorgraph_dvl.geometry.vectors import Array, rotate, skew
 from factorgraph_dvl.graph.clocks import linearized, parameters_of
 from factorgraph_dvl.graph.problem import Evaluation, Problem
 from factorgraph_dvl.imu.propagation import Attachment
 from factorgraph_dvl.sensors.protocol import Motion, Observation, Values
+
+# Measurements whose covariances are found at once. Chosen: some megabytes.
+_CHUNK = 4096
 
 
 def spurious_information(problem: Problem, evaluation: Evaluation, nodes: Array) -> Array:
@@ -54,7 +58,7 @@ def spurious_information(problem: Problem, evaluation: Evaluation, nodes: Array)
                 attachment,
                 motion,
                 weight,
-                nodes[attachment.node],
+                nodes,
                 evaluation.parameters,
                 names,
                 problem.clock_zero,
@@ -85,8 +89,8 @@ def spurious_by(
         Of them.
     weight : ndarray, shape (M, d)
         Inverse standard deviations.
-    P : ndarray, shape (M, 9, 9)
-        Covariances of the nodes before them, in GTSAM's tangent space.
+    P : ndarray, shape (K, 9, 9)
+        Covariances of the nodes to which they are attached, in GTSAM's tangent space.
     values : Values
         Of all parameters.
     wanted : sequence of str
@@ -99,26 +103,42 @@ def spurious_by(
         found = linearized(observation, at, values, wanted, clock_zero).d_parameters
         return np.concatenate([found[name] for name in wanted], axis=2)
 
+    # No residual has derivatives by accelerations: they only move what a clock is late for.
+    clock = observation.clock
+    by_clock = clock is not None and any(name in wanted for name in clock.names)
     base = jacobian(motion)
     size = base.shape[2]
+    parts = [slice(a, a + _CHUNK) for a in range(0, max(attachment.node.size, 1), _CHUNK)]
+    root = np.concatenate(
+        [_velocity_root(rows_of(motion, part), P[attachment.node[part]]) for part in parts]
+    )
+    out = np.zeros((attachment.node.size, size, size))
+    for k in range(3):
+        axis = np.eye(3)[k]
+        velocity_error = rotate(motion.nRb, root[:, :, k])
+        errors = [
+            replace(motion, v_n=motion.v_n + velocity_error),
+            replace(motion, omega_eb_b=motion.omega_eb_b + motion.omega_sigma * axis),
+        ]
+        if by_clock:
+            acceleration_error = rotate(motion.nRb, attachment.force_sigma[:, None] * axis)
+            alpha_error = attachment.alpha_sigma[:, None] * axis
+            errors += [
+                replace(motion, a_n=motion.a_n + acceleration_error),
+                replace(motion, alpha_b=motion.alpha_b + alpha_error),
+            ]
+        for changed in errors:
+            change = (jacobian(changed) - base) * weight[:, :, None]
+            out += change.transpose(0, 2, 1) @ change
+    return out
+
+
+def _velocity_root(motion: Motion, P: Array) -> Array:
+    """Return roots (M, 3, 3) of the covariance of the velocity in body axes."""
     v_b = rotate(motion.nRb.transpose(0, 2, 1), motion.v_n)
     by_state = np.concatenate(
         [skew(v_b), np.zeros_like(motion.nRb), np.broadcast_to(np.eye(3), motion.nRb.shape)],
         axis=2,
     )
     covariance = by_state @ P @ by_state.transpose(0, 2, 1)
-    root = np.linalg.cholesky(covariance + 1e-16 * np.eye(3))
-    out = np.zeros((attachment.node.size, size, size))
-    for k in range(3):
-        axis = np.eye(3)[k]
-        velocity_error = rotate(motion.nRb, root[:, :, k])
-        acceleration_error = rotate(motion.nRb, attachment.force_sigma[:, None] * axis)
-        for changed in (
-            replace(motion, v_n=motion.v_n + velocity_error),
-            replace(motion, omega_eb_b=motion.omega_eb_b + motion.omega_sigma * axis),
-            replace(motion, a_n=motion.a_n + acceleration_error),
-            replace(motion, alpha_b=motion.alpha_b + attachment.alpha_sigma[:, None] * axis),
-        ):
-            change = (jacobian(changed) - base) * weight[:, :, None]
-            out += change.transpose(0, 2, 1) @ change
-    return out
+    return np.linalg.cholesky(covariance + 1e-16 * np.eye(3))
