@@ -543,13 +543,14 @@ class Problem:
 
     def observation_rows(self, evaluation: Evaluation) -> Iterator[Rows]:
         """Yield the rows of each observation, unused ones included: these are zero."""
-        transitions: dict[int, Transition] = {}
         for block in self._blocks:
             for bound in block.bound:
                 lin = self._linearized(bound, block.parameters, evaluation)
-                matrix, vector = self._jacobian(
-                    bound, block.parameters, lin, slice(None), evaluation, transitions
-                )
+                found = [
+                    self._jacobian(bound, block.parameters, lin, slice(a, b), evaluation, {})
+                    for a, b in pairwise([*range(0, max(len(lin.residual), 1), _CHUNK), None])
+                ]
+                matrix, vector = (np.concatenate(each) for each in zip(*found, strict=True))
                 o, sizes = bound.observation, tuple(self._sizes(block))
                 variables = self._keys_at(block, self._nodes_of(bound))
                 yield Rows(o.label, o.components, variables, sizes, matrix, vector)
