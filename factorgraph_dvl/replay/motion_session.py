@@ -406,5 +406,8 @@ def _motion(window: SmoothedWindow, since: float, node: int) -> Trajectory:
     """Return the motion after a true time, s, up to a node."""
     problem, at = window.problem, window.evaluation
     begin, end = problem.chain.time[[0, node]] - problem.offset(at.parameters)
-    time = trajectory_epochs(problem, at.parameters, max(begin, since), end, TRAJECTORY_RATE)
+    if begin < since + 2.0 * max(1.0 / TRAJECTORY_RATE, problem.attitude.interval):
+        # The clock may have moved since the window before ended there: no epoch lies in between.
+        begin = since
+    time = trajectory_epochs(problem, at.parameters, begin, end, TRAJECTORY_RATE)
     return trajectory_of(problem, at, window.covariances, time[time > since + _APART])

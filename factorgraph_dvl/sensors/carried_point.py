@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -33,11 +33,26 @@ class _OfPoint(PlainObservation):
     components: tuple[str, ...] = ("east", "north", "up")
     noise_groups: tuple[tuple[int, ...], ...] = ()
     correlated: ExpectedCorrelation | None = None
+    # Parameters with their derivatives (M, 3, n), where the measurement errs by their sum.
+    errors: Mapping[str, Array] = field(default_factory=dict)
 
     @property
     def parameters(self) -> tuple[str, ...]:
-        """The lever arm, where it is a parameter."""
-        return (self.lever_arm,) if isinstance(self.lever_arm, str) else ()
+        """The lever arm, where it is a parameter, and the errors."""
+        return ((self.lever_arm,) if isinstance(self.lever_arm, str) else ()) + tuple(self.errors)
+
+    def error(self, values: Values) -> Array:
+        """Return measured minus true by the parameters, (M, 3)."""
+        out = np.zeros((self.time.size, 3))
+        for name, by in self.errors.items():
+            if name in values:
+                out += by @ values[name]
+        return out
+
+    def _derivatives(self, by_lever_arm: Array, wanted: Collection[str]) -> dict[str, Array]:
+        """Return those by the parameters, of which that by a lever arm is given."""
+        own = {n: self.errors.get(n, by_lever_arm) for n in self.parameters}
+        return {name: by for name, by in own.items() if name in wanted}
 
     def lever_arm_b(self, values: Values) -> Array:
         """Return the lever arm in body, (3,) or (M, 3), m."""
@@ -69,6 +84,8 @@ class PointPosition(_OfPoint):
         Axes of that carrier to body.
     components, noise_groups, correlated : optional
         As in `Observation`.
+    errors : mapping of str to ndarray, optional
+        Parameters whose sum, by these derivatives (M, 3, n), is what is measured too much.
     """
 
     measured_n: Array
@@ -81,7 +98,7 @@ class PointPosition(_OfPoint):
     def residual(self, motion: Motion, values: Values) -> Array:
         """Return predicted - measured in local-level east, north, up, (M, 3), m."""
         point_n = motion.p_n + rotate(motion.nRb, self.lever_arm_b(values))
-        return rotate(self.lRn, point_n - self.measured_n)
+        return rotate(self.lRn, point_n - self.measured_n) + self.error(values)
 
     def linearize(self, motion: Motion, values: Values, wanted: Collection[str]) -> Linearization:
         """Return the residual and its Jacobians."""
@@ -90,7 +107,7 @@ class PointPosition(_OfPoint):
             residual=self.residual(motion, values),
             d_theta=-lRb @ skew(self.lever_arm_b(values)),
             d_p=self.lRn,
-            d_parameters={name: lRb @ self.bRc for name in self.parameters},
+            d_parameters=self._derivatives(lRb @ self.bRc, wanted),
         )
 
 
@@ -124,6 +141,8 @@ class PointVelocity(_OfPoint):
         Rate of the body relative to that carrier.
     components, noise_groups, correlated : optional
         As in `Observation`.
+    errors : mapping of str to ndarray, optional
+        Parameters whose sum, by these derivatives (M, 3, n), is what is measured too much.
     """
 
     measured_l: Array
@@ -139,7 +158,8 @@ class PointVelocity(_OfPoint):
     def residual(self, motion: Motion, values: Values) -> Array:
         """Return predicted - measured in local-level east, north, up, (M, 3), m/s."""
         turning_b = cross(motion.omega_eb_b - self.omega_cb_b, self.lever_arm_b(values))
-        return rotate(self.lRn, motion.v_n + rotate(motion.nRb, turning_b)) - self.measured_l
+        predicted = rotate(self.lRn, motion.v_n + rotate(motion.nRb, turning_b))
+        return predicted - self.measured_l + self.error(values)
 
     def linearize(self, motion: Motion, values: Values, wanted: Collection[str]) -> Linearization:
         """Return the residual and its Jacobians."""
@@ -151,9 +171,5 @@ class PointVelocity(_OfPoint):
             d_theta=-lRb @ skew(cross(omega_ec_b, lever_arm)),
             d_v=self.lRn,
             d_omega=-lRb @ skew(lever_arm),
-            d_parameters={
-                name: lRb @ skew(omega_ec_b) @ self.bRc
-                for name in self.parameters
-                if name in wanted
-            },
+            d_parameters=self._derivatives(lRb @ skew(omega_ec_b) @ self.bRc, wanted),
         )

@@ -14,6 +14,7 @@ from factorgraph_dvl.geometry.units import DEG, GEODETIC_SI
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.sensors.attitude import (
     LEAST_STD,
+    SCHULER_PERIOD,
     AttitudeAngles,
     AttitudeError,
     Share,
@@ -36,6 +37,7 @@ from factorgraph_dvl.sensors.records import (
     check_times,
     named_columns,
     stack,
+    white_noise,
 )
 from factorgraph_dvl.settings.sections import NonNegative, Positive, Sigma3, Vector3
 
@@ -48,17 +50,27 @@ STD_COLUMNS = (
     *("roll_std_deg", "pitch_std_deg", "heading_std_deg"),
 )
 _CLOCK = Clock.of("ins", prefix="ins_")
+SCHULER_SPEC = ParameterSpec(
+    "ins_schuler",
+    "m_s",
+    labels=("cos_east", "cos_north", "sin_east", "sin_north"),
+    nuisance=True,
+)
 # Times the correlation time after which an error counts as another one beside an IMU.
 _APART = 2.0
 # Share of a total standard deviation that is new in each sample, whatever is stated. Chosen: it
 # keeps the weights of samples finite, and is lost beside the rest.
 _LEAST_SHARE = 0.02
+# Fewest samples whose white noise is measured. Chosen: it is then known to a third.
+_FEWEST = 12
 
 
 class InsSettings(ClockSection, frozen=True, kw_only=True):
     """Section `ins` of trial.yaml.
 
     Standard deviations are totals; `correlated_share` of their squares is a Gauss-Markov process.
+    An oscillation of 84.4 minutes comes on top, with a root mean square of the velocity east and
+    north.
     """
 
     file: str = "ins.csv"
@@ -67,6 +79,7 @@ class InsSettings(ClockSection, frozen=True, kw_only=True):
     attitude_std_deg: Sigma3 = (0.02, 0.02, 0.05)
     correlation_time_s: Positive = 300.0
     correlated_share: Share = 1.0
+    schuler_std_m_s: NonNegative = 0.0
     lever_arm_m: Vector3 = (0.0, 0.0, 0.0)
     time_offset_std_s: NonNegative = 5.0
 
@@ -111,7 +124,7 @@ class Ins:
         *ATTITUDE_COLUMNS,
     )
     optional: ClassVar[tuple[tuple[str, ...], ...]] = (STD_COLUMNS,)
-    specs: ClassVar[tuple[ParameterSpec, ...]] = _CLOCK.specs
+    specs: ClassVar[tuple[ParameterSpec, ...]] = (SCHULER_SPEC, *_CLOCK.specs)
     clock: ClassVar[Clock] = _CLOCK
 
     def __post_init__(self) -> None:
@@ -179,8 +192,10 @@ class Ins:
         )
 
     def parameters(self) -> tuple[Parameter, ...]:
-        """Return offset and rate of the clock."""
-        return _CLOCK.parameters(self.settings)
+        """Return Schuler oscillation, offset and rate of the clock."""
+        std = np.full(SCHULER_SPEC.size, self.settings.schuler_std_m_s)
+        schuler = Parameter(SCHULER_SPEC, np.zeros(SCHULER_SPEC.size), std)
+        return (schuler, *_CLOCK.parameters(self.settings))
 
     def observations(self, frame: LocalFrame, body_axes: BodyAxes) -> tuple[Observation, ...]:
         """Return what is far enough apart to have errors of its own, with total deviations."""
@@ -206,26 +221,36 @@ class Ins:
     ) -> tuple[PointPosition | PointVelocity, ...]:
         """Return positions and velocities at least so many seconds apart.
 
-        All of them have the part of the standard deviation that is new in each; those that are
-        apart, the total.
+        All of them have the part of the standard deviation that is new in each, at least the white
+        noise of the record; those that are apart, the total. Without that noise the motion would
+        follow it, and a clock would move to where the interpolation has less of it: by 0.2 s, with
+        0.02 m in positions once a second.
         """
         share = 1.0 if apart > 0.0 else max(1.0 - self.settings.correlated_share, _LEAST_SHARE**2)
         std = np.sqrt(share) * self.total_std
+        place_n = frame.position(*self.geodetic.T)
+        if not apart:
+            for i, measured in ((0, place_n), (3, self.velocity)):
+                known = measured[~np.isnan(measured[:, 0])]
+                if len(known) >= _FEWEST:
+                    std[:, i : i + 3] = np.maximum(std[:, i : i + 3], white_noise(known))
         arm = np.array(self.settings.lever_arm_m)
         at_position = spaced(self.time, ~np.isnan(self.geodetic[:, 0]), apart)
         at_velocity = spaced(
             self.time, ~np.isnan(self.velocity[:, 0]) & ~np.isnan(self.geodetic[:, 0]), apart
         )
         p, v = at_position, at_velocity
+        by_position, by_velocity = self._by_schuler()
         return (
             PointPosition(
                 time=self.time[p],
-                measured_n=frame.position(*self.geodetic[p].T),
+                measured_n=place_n[p],
                 lRn=frame.level_from_tangent(*self.geodetic[p, :2].T),
                 std=std[p, :3],
                 label="INS position",
                 clock=_CLOCK,
                 lever_arm=arm,
+                errors={SCHULER_SPEC.name: by_position[p]},
             ),
             PointVelocity(
                 time=self.time[v],
@@ -235,7 +260,23 @@ class Ins:
                 label="INS velocity",
                 clock=_CLOCK,
                 lever_arm=arm,
+                errors={SCHULER_SPEC.name: by_velocity[v]},
             ),
+        )
+
+    def _by_schuler(self) -> tuple[Array, Array]:
+        """Return the derivatives of errors of position and velocity by the oscillation, (M, 3, 4).
+
+        The velocity errs by c cos w (t - t0) + s sin w (t - t0) east and north, t0 the middle of
+        the record, and the position by its integral about a mean of zero.
+        """
+        rate = 2.0 * np.pi / SCHULER_PERIOD
+        phase = rate * (self.time - 0.5 * (self.time[0] + self.time[-1]))
+        level = np.eye(3)[:, :2]
+        cos, sin = (f(phase)[:, None, None] * level for f in (np.cos, np.sin))
+        return (
+            np.concatenate([sin, -cos], axis=2) / rate,
+            np.concatenate([cos, sin], axis=2),
         )
 
     def explain(self, parameter: str, component: int, motion: Motion | None) -> Message:

@@ -12,6 +12,11 @@ from factorgraph_dvl.errors import DataError
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.settings.ranges import range_of
 
+# Weights of the samples two before, one before, one after and two after, through which a cubic
+# passes; and the factor by which a sample less these amplifies white noise.
+_NEIGHBOURS = np.array([-1.0, 4.0, 4.0, -1.0]) / 6.0
+_AMPLIFIED = np.sqrt(1.0 + _NEIGHBOURS @ _NEIGHBOURS)
+
 _AnyRecord = TypeVar("_AnyRecord")
 
 # Share of a column outside its range from which on it is no glitch. Chosen: sensors lose fewer.
@@ -156,3 +161,14 @@ def stack(columns: Mapping[str, Array], names: Sequence[str]) -> Array:
 def named_columns(names: Iterable[str], values: Array) -> dict[str, Array]:
     """Pair names with the columns of an (M, n) array."""
     return {name: values[:, i] for i, name in enumerate(names)}
+
+
+def white_noise(values: Array) -> Array:
+    """Return the white noise of samples (M, n) in order, M of five or more, (n,).
+
+    It is what a cubic through the neighbours misses, by the median absolute deviation.
+    """
+    before = _NEIGHBOURS[0] * values[:-4] + _NEIGHBOURS[1] * values[1:-3]
+    after = _NEIGHBOURS[2] * values[3:-1] + _NEIGHBOURS[3] * values[4:]
+    missed = values[2:-2] - before - after
+    return np.asarray(1.4826 * np.median(np.abs(missed), axis=0) / _AMPLIFIED)

@@ -69,11 +69,11 @@ class InsTruth(SimulatedInstrument, frozen=True, kw_only=True):
     time_offset_s: float = 0.0
 
     def claimed(self) -> dict[str, Any]:
-        """Return standard deviations as simulated."""
-        v, amplitude = self.schuler_velocity_rms_m_s, _SCHULER_S / (2.0 * np.pi)
+        """Return standard deviations and times as simulated."""
         return {
-            "velocity_std_m_s": (v, v, max(0.1 * v, 1e-3)),
-            "position_std_m": (v * amplitude, v * amplitude, max(0.1 * v * amplitude, 0.1)),
+            "velocity_std_m_s": (self.white_velocity_std_m_s,) * 3,
+            "position_std_m": (self.white_position_std_m,) * 3,
+            "schuler_std_m_s": self.schuler_velocity_rms_m_s,
             "attitude_std_deg": self.attitude_std_deg,
             "correlation_time_s": self.correlation_time_s,
         }

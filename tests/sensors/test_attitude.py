@@ -80,11 +80,27 @@ def test_samples_with_one_error_count_once_beside_an_imu():
 
 def test_position_and_velocity_of_an_ins(motion):
     geodetic = np.stack(FRAME.geodetic(motion.p_n), axis=1)
-    settings = InsSettings(lever_arm_m=(1.0, -2.0, 0.5))
+    settings = InsSettings(lever_arm_m=(1.0, -2.0, 0.5), schuler_std_m_s=0.1)
+    values = {"ins_schuler_m_s": np.array([0.05, -0.1, 0.02, 0.08])}
     ins = Ins(settings, TIME, geodetic, motion.v_n, RPH, np.full((3, 9), np.nan))
     for observation in ins.motion_observations(FRAME):
         # Differences over 1e-6 of positions of 9 km are rounded to 1e-6.
-        check_jacobians(observation, motion, {}, (), tolerance=2e-6)
+        check_jacobians(observation, motion, values, ins.parameters()[:1], tolerance=2e-6)
+
+
+def test_the_position_of_an_ins_errs_by_the_integral_of_its_velocity():
+    time = np.arange(0.0, 6000.0, 1.0)
+    settings = InsSettings(schuler_std_m_s=0.1)
+    place = np.broadcast_to([0.7, 0.1, 0.0], (time.size, 3))
+    still = np.zeros((time.size, 3))
+    ins = Ins(settings, time, place, still, still, np.full((time.size, 9), np.nan))
+    values = {"ins_schuler_m_s": np.array([0.05, -0.1, 0.02, 0.08])}
+    position, velocity = (o.error(values) for o in ins.motion_observations(FRAME))
+    np.testing.assert_allclose(
+        np.gradient(position, time, axis=0)[1:-1], velocity[1:-1], atol=1e-6
+    )
+    whole = np.sqrt(np.mean(velocity[:5064] ** 2, axis=0))
+    np.testing.assert_allclose(whole[0], np.hypot(0.05, 0.02) / np.sqrt(2.0), rtol=1e-3)
 
 
 def test_values_that_cannot_be_are_refused():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import os
 from dataclasses import replace
 
@@ -17,7 +18,6 @@ from factorgraph_dvl.geometry.rotations import exp_so3, log_so3
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.graph.priors import after_step
 from factorgraph_dvl.io.trial_folder import load_trial, save_trial
-from factorgraph_dvl.sensors.attitude import SCHULER_PERIOD
 from factorgraph_dvl.sensors.finding import Code
 from factorgraph_dvl.simulation import load_scenario, simulate
 from factorgraph_dvl.solvers.batch import solve
@@ -147,10 +147,36 @@ def ratio(scenario, runs):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("make", [lambda: shortened(repeat=2), lambda: ins_scenario(repeat=2)])
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: shortened(repeat=2),
+        lambda: ins_scenario(repeat=2),
+        lambda: shortened("ship-water", repeat=5),
+    ],
+)
 def test_standard_deviations_hold(make):
     low, high = rms_band(7 * RUNS)
     assert low < ratio(make(), RUNS) < high
+
+
+@pytest.mark.slow
+def test_noise_of_a_compass_makes_no_lever_arm_shorter():
+    """A lever arm times noisy rates would explain some of their noise."""
+    made = shortened(repeat=2)
+    noisy = msgspec.structs.replace(made.attitude, white_std_deg=(0.05, 0.05, 0.1))
+    made = msgspec.structs.replace(made, attitude=noisy)
+    off = []
+    for seed in range(RUNS):
+        trial = simulate(made, seed)
+        off.append(deviations(solve(trial, rate_hz=0.1), trial.calibration_truth)["lever_arm_m"])
+    assert np.all(np.abs(np.mean(off, axis=0)) < 4.0 / np.sqrt(RUNS))
+
+
+def test_white_noise_of_an_ins_moves_no_clock():
+    trial = simulate(ins_scenario(repeat=2), 0)
+    offset = solve(trial, rate_hz=0.1).estimate("time_offset_s")
+    assert abs(offset.value[0]) < 4.0 * offset.std[0]
 
 
 def variances_of_motion(prepared, label, late):
@@ -254,40 +280,10 @@ def test_a_current_that_changes_for_hours_moves_no_clock_of_the_start():
     assert np.linalg.norm(log_so3(start["misalignment_deg"] @ truth.T)) < 5.0 * DEG
 
 
-def dense_standard_deviations(trial, scenario, span):
-    """Return those of phase, rad, and scale by generalised least squares of means over a span, s.
-
-    z_s = (1 - k) exp(-i (alpha + e)) z_d + w: e the oscillation of the heading, w the current and
-    the noise of differences of fixes, whose covariances are those that the scenario draws from.
-    """
-    moving, gnss = scenario.dvl.moving_water, trial.gnss.settings
-    time = trial.reference.time
-    east, north, _ = trial.frame().position(*trial.reference.geodetic.T).T
-    edges = np.flatnonzero(np.isin(time, np.arange(time[0], time[-1], span)))
-    at, ends, place = time[edges], np.diff(time[edges]), (east + 1j * north)[edges]
-    z = np.diff(place) / ends
-    middle, there = 0.5 * (at[1:] + at[:-1]), 0.5 * (place[1:] + place[:-1])
-    later = np.abs(middle[:, None] - middle) / moving.correlation_time_s
-    apart = np.abs(there[:, None] - there) / moving.correlation_distance_m
-    covariance = moving.std_m_s**2 * np.exp(-later - apart)
-    covariance += trial.dvl.settings.current_std_m_s[0] ** 2
-    fixes = gnss.correlated_std_m[0] ** 2 * np.exp(
-        -np.abs(at[:, None] - at) / gnss.correlation_time_s
-    )
-    fixes += gnss.position_std_m[0] ** 2 * np.eye(at.size)
-    covariance += np.diff(np.diff(fixes, axis=0), axis=1) / np.outer(ends, ends)
-    covariance += trial.dvl.settings.velocity_std_m_s**2 / span * np.eye(z.size)
-    swing = 2.0 * np.pi / SCHULER_PERIOD * middle
-    columns = np.stack([1j * z, z, 1j * z * np.cos(swing), 1j * z * np.sin(swing)], axis=1)
-    weights = np.linalg.inv(covariance)
-    information = np.real(columns.conj().T @ weights @ columns)
-    stated = trial.attitude.settings.schuler_std_deg * DEG
-    information[[2, 3], [2, 3]] += stated**-2.0
-    return np.sqrt(np.diag(np.linalg.inv(information))[:2])
-
-
 @pytest.mark.slow
-def test_through_water_standard_deviations_are_those_of_least_squares():
+def test_through_water_standard_deviations_are_those_of_least_squares(monkeypatch):
+    monkeypatch.syspath_prepend(CONFIGS.parent / "benchmarks")
+    dense_standard_deviations = importlib.import_module("ships").dense_standard_deviations
     scenario = shortened("ship-water", repeat=5)
     trial = simulate(scenario, 1)
     solution = solve(trial, rate_hz=0.1)
