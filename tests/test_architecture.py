@@ -23,7 +23,7 @@ SENSOR_DATA = (
 )
 # GTSAM, SciPy and Matplotlib take most of a second to load: only what needs none of them may
 # be imported where the command line starts.
-LIGHT = ("errors", "settings", "cli")
+LIGHT = ("background", "errors", "settings", "cli")
 # Each takes half a second to load; `scipy.special` has distributions, `imu.interpolation` filters.
 SLOW_TO_LOAD = ("scipy.signal", "scipy.stats")
 MODULES = sorted(
@@ -70,7 +70,7 @@ def test_the_map_of_the_package_is_that_of_the_tree():
 
 def test_the_top_holds_no_module_without_a_home():
     loose = {parts[0] for parts in MODULES if len(parts) == 1}
-    assert loose == {"errors", "solution", "trial"}
+    assert loose == {"background", "errors", "solution", "trial"}
 
 
 def test_no_solver_loads_what_takes_longer_than_a_short_trial():

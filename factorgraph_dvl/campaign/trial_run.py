@@ -16,6 +16,7 @@ from time import perf_counter
 import numpy as np
 from msgspec import UnsetType
 
+from factorgraph_dvl.background import PROCESSES
 from factorgraph_dvl.campaign.record import (
     RunRecord,
     fingerprint_of,
@@ -78,6 +79,8 @@ def run_trial(trial: str, label: str, out: str, options: Sequence[str]) -> RunRe
             stdout=subprocess.DEVNULL,
             stderr=log,
             preexec_fn=_die_with(os.getpid()),
+            # Every core has a trial of its own.
+            env=os.environ | {PROCESSES: "1"},
         )
         # Of this process alone: getrusage knows only the largest of all.
         _, status, usage = os.wait4(process.pid, 0)

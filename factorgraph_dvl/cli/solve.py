@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from enum import StrEnum
+from functools import partial
 from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, cast
 
 import typer
 
+from factorgraph_dvl.background import on_standby
 from factorgraph_dvl.cli.console import (
     ProgressLine,
     drawing,
@@ -38,7 +41,7 @@ from factorgraph_dvl.cli.report import write_report
 from factorgraph_dvl.cli.verdict import end_with, print_findings, print_verdict
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable, Iterator, Mapping
 
     from factorgraph_dvl.analysis.comparison.halves import Halves
     from factorgraph_dvl.baselines import History
@@ -53,17 +56,31 @@ if TYPE_CHECKING:
 _ENTRIES = 500
 
 
+def _unknown() -> None:
+    """Return the information along the trial of a method that does not follow it."""
+
+
 @dataclass(frozen=True)
 class _Found:
     """What a run found.
 
-    The solution, how a filter converged or the information grew along the trial, and its halves.
+    The solution, how a filter converged, what follows the information along the trial, and its
+    halves.
     """
 
     solution: Solution
     history: History | None = None
-    along: InformationHistory | None = None
+    along: Callable[[], InformationHistory | None] = _unknown
     halves: Halves | None = None
+
+
+@dataclass(frozen=True)
+class _Drawn:
+    """What figures show, and where they go."""
+
+    solution: Solution
+    history: History | None
+    folder: Path
 
 
 class KalmanMethod(StrEnum):
@@ -109,10 +126,10 @@ def solve(
     def run(trial: Trial, progress: ProgressLine, stages: FinishedStages | None) -> _Found:
         # The solver is slow to import: do so after the checks of the input.
         from factorgraph_dvl.analysis.comparison.halves import halves_of
-        from factorgraph_dvl.solvers.information_along_trial import solve_with_history
+        from factorgraph_dvl.solvers.information_along_trial import solve_then_history
 
         parts = halves_of(trial) if halves else None
-        solution, along = solve_with_history(
+        solution, along = solve_then_history(
             trial,
             rate_hz=rate,
             entries=_ENTRIES,
@@ -120,8 +137,12 @@ def solve(
             progress=progress,
             stages=stages,
         )
-        found = _Found(solution, along=along)
-        return found if parts is None else _with_halves(trial, found, parts, progress)
+        if parts is None:
+            return _Found(solution, along=along)
+        # The problem of the whole trial goes before those of the halves come.
+        history = along()
+        del along
+        return _with_halves(trial, _Found(solution, along=lambda: history), parts, progress)
 
     _solve_into(
         out,
@@ -238,33 +259,39 @@ def _solve_into(
     from factorgraph_dvl.io.trial_folder import inputs_of, load_trial
 
     work = claim_output(out, force=force, owned=OWNED, inputs=inputs_of(trial_path))
-    with ProgressLine(quiet=quiet) as progress:
+    with ProgressLine(quiet=quiet) as progress, ExitStack() as second:
         trial = load_trial(trial_path, anyway=anyway)
+        draw: Callable[[_Drawn], Callable[[], None]] | None = None
+        if figures is not None:
+            # Matplotlib takes as long to load as the figures do to draw.
+            draw = second.enter_context(
+                on_standby(partial(_draw, trial, figures.value), _load_figures)
+            )
         stages = None if options is None else _stages(work, trial_path, options, resume)
         found = run(trial, progress, stages)
         solution, history = found.solution, found.history
-        progress("write", 0, None)
 
-        def add(folder: Path) -> None:
+        @contextmanager
+        def add(folder: Path) -> Iterator[None]:
+            if draw is not None:
+                drawn = draw(_Drawn(solution, history, folder / FIGURES_FOLDER))
+            along = found.along()
+            progress("write", 0, None)
+            yield
             write_beams(trial, solution, folder)
             if history is not None:
                 write_history(folder, history.time, history.names, history.std, history.values)
-            if found.along is not None:
-                write_history(folder, found.along.time, found.along.names, found.along.std)
+            if along is not None:
+                write_history(folder, along.time, along.names, along.std)
             if found.halves is not None:
                 write_table(folder / HALVES_FILE, found.halves.columns())
             write_instrument(solution, folder)
-            shown = history or found.along
+            shown = history or along
             series = None if shown is None else (shown.time, shown.names, shown.std)
             write_report(folder, str(out), solution, run_of(trial), series)
-            if figures is None:
-                return
-            from factorgraph_dvl.report.figures.solution import write_figures
-
-            with drawing():
-                write_figures(trial, solution, folder / FIGURES_FOLDER, kind=figures.value)
-                if history is not None:
-                    draw_history(trial, solution, history, folder / FIGURES_FOLDER, figures.value)
+            if draw is not None:
+                with drawing():
+                    drawn()
 
         save_solution(solution, out, force=force, extra=add)
     _print_solution(trial, found)
@@ -297,6 +324,20 @@ def _stages(
 
     claims.push(ended)
     return stages
+
+
+def _load_figures() -> None:
+    """Load what draws figures."""
+    import factorgraph_dvl.report.figures.solution  # noqa: F401
+
+
+def _draw(trial: Trial, kind: str, given: _Drawn) -> None:
+    """Draw the figures of a solution."""
+    from factorgraph_dvl.report.figures.solution import write_figures
+
+    write_figures(trial, given.solution, given.folder, kind=kind)
+    if given.history is not None:
+        draw_history(trial, given.solution, given.history, given.folder, kind)
 
 
 def draw_history(

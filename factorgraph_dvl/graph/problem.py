@@ -10,7 +10,7 @@ slow and makes GTSAM's optimisers copy all values.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise, zip_longest
 
@@ -135,6 +135,8 @@ class Evaluation:
         Per observation; residuals whitened, (M, d).
     cost : float
         Half the sum of all squared whitened residuals.
+    own_cost : float
+        The part of it that is not of measurements.
     imu : LinearImuFactors, optional
         Native factors, linear there, where errors of the IMU are estimated.
     """
@@ -145,6 +147,7 @@ class Evaluation:
     motions: list[Motion]
     residuals: list[Array]
     cost: float
+    own_cost: float
     imu: LinearImuFactors | None = None
 
 
@@ -374,27 +377,36 @@ class Problem:
         for process in self.processes:
             nodes = [values.atVector(process.key(j)) for j in range(process.time.size)]
             parameters[process.name] = np.array(nodes)
-        motions, residuals = [], []
-        computed: dict[tuple[int, SensorClock | None], Motion] = {}
-        cost = self.graph.error(values)
+        own_cost = self.graph.error(values)
         imu = None
         if self._imu_errors is not None:
             errors = self._imu_errors.vector(parameters)
             imu = self._imu_errors.linearized(self.graph.linearize(values), errors)
-            cost += imu.more_cost
+            own_cost += imu.more_cost
         for process in self.processes:
-            cost += 0.5 * float(np.sum(process.prior_residuals(parameters[process.name]) ** 2))
+            own_cost += 0.5 * float(np.sum(process.prior_residuals(parameters[process.name]) ** 2))
+        motions = []
+        computed: dict[tuple[int, SensorClock | None], Motion] = {}
         for bound in self._bound:
             # Position and velocity of one receiver share attachment and clock.
             shared = (id(bound.attachment), bound.observation.clock)
             if shared not in computed:
                 computed[shared] = self._motion(bound, states, parameters)
-            motion = computed[shared]
-            residual = bound.weight * self.residual(bound.observation, motion, parameters)
-            motions.append(motion)
-            residuals.append(residual)
-            cost += 0.5 * float(np.vdot(residual, residual))
-        return Evaluation(values, states, parameters, motions, residuals, cost, imu)
+            motions.append(computed[shared])
+        residuals, cost = self._whitened(motions, parameters)
+        return Evaluation(
+            values, states, parameters, motions, residuals, own_cost + cost, own_cost, imu
+        )
+
+    def _whitened(
+        self, motions: Sequence[Motion], parameters: dict[str, Array]
+    ) -> tuple[list[Array], float]:
+        """Return the whitened residuals of all observations, and their cost."""
+        residuals = [
+            bound.weight * self.residual(bound.observation, motion, parameters)
+            for bound, motion in zip(self._bound, motions, strict=True)
+        ]
+        return residuals, sum(0.5 * float(np.vdot(each, each)) for each in residuals)
 
     def residual(
         self, observation: Observation, motion: Motion, parameters: dict[str, Array]
@@ -449,6 +461,12 @@ class Problem:
         self._weighed_at = evaluation.values
         for bound, weight in zip(self._bound, self._weights(evaluation), strict=True):
             bound.weight = weight
+
+    def weighed(self, evaluation: Evaluation) -> Evaluation:
+        """Weigh the measurements as `weigh` does; return what the evaluation then is."""
+        self.weigh(evaluation)
+        residuals, cost = self._whitened(evaluation.motions, evaluation.parameters)
+        return replace(evaluation, residuals=residuals, cost=evaluation.own_cost + cost)
 
     def needs_reweighting(self, evaluation: Evaluation) -> bool:
         """Whether standard deviations there are other than those that measurements count by."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any, Literal
 
@@ -91,7 +92,7 @@ def save_solution(
     path: Path | str,
     *,
     force: bool = False,
-    extra: Callable[[Path], object] | None = None,
+    extra: Callable[[Path], AbstractContextManager[object]] | None = None,
     smoothed: Trajectory | None = None,
 ) -> None:
     """Write a solution folder, complete or not at all.
@@ -104,8 +105,9 @@ def save_solution(
         Of the folder.
     force : bool, default False
         Replace the solution that is there.
-    extra : callable of path-like, object, optional
-        Called with the folder before it appears under `path`, to add files.
+    extra : callable, optional
+        Called with the folder before it appears under `path`; returns a context manager that adds
+        files. The solution is written within.
     smoothed : Trajectory, optional
         What later data made of states of the trajectory; more columns of it.
 
@@ -125,20 +127,19 @@ def save_solution(
     'good'
     """
     with new_folder(Path(path), force=force, owned=OWNED) as folder:
-        columns = trajectory_columns(solution.trajectory)
-        if smoothed is not None:
-            columns |= _smoothed_columns(solution.trajectory, smoothed)
-        write_table(folder / TRAJECTORY_FILE, columns)
-        if solution.hypotheses:
-            _write_hypotheses(folder, solution.hypotheses)
-        if solution.rejected:
-            write_table(folder / REJECTED_FILE, rejected_columns(solution.rejected))
-        if solution.residuals:
-            write_table(folder / RESIDUALS_FILE, residual_columns(solution.residuals))
-        if extra is not None:
-            # What the solver has freed is not needed while figures are drawn.
-            release_memory()
-            extra(folder)
+        # What the solver has freed is not needed while figures are drawn.
+        release_memory()
+        with nullcontext() if extra is None else extra(folder):
+            columns = trajectory_columns(solution.trajectory)
+            if smoothed is not None:
+                columns |= _smoothed_columns(solution.trajectory, smoothed)
+            write_table(folder / TRAJECTORY_FILE, columns)
+            if solution.hypotheses:
+                _write_hypotheses(folder, solution.hypotheses)
+            if solution.rejected:
+                write_table(folder / REJECTED_FILE, rejected_columns(solution.rejected))
+            if solution.residuals:
+                write_table(folder / RESIDUALS_FILE, residual_columns(solution.residuals))
         (folder / CALIBRATION_FILE).write_bytes(encode_calibration(solution))
 
 

@@ -153,9 +153,7 @@ def write_table(path: Path, columns: Mapping[str, NDArray[Any]]) -> None:
     """
     table = pa.table(
         {
-            name: pa.array(values, pa.string())
-            if values.dtype.kind == "U"
-            else pa.array(values, pa.float64(), from_pandas=True)
+            name: pa.array(values, pa.string()) if values.dtype.kind == "U" else _floats(values)
             for name, values in columns.items()
         }
     )
@@ -165,6 +163,14 @@ def write_table(path: Path, columns: Mapping[str, NDArray[Any]]) -> None:
     with path.open("wb") as file:
         file.write((",".join(columns) + "\n").encode())
         pyarrow.csv.write_csv(table, file, pyarrow.csv.WriteOptions(include_header=False))
+
+
+def _floats(values: NDArray[Any]) -> pa.Array:
+    """Return numbers (N,) as Arrow's, nan as null: `pyarrow.array` would load Pandas for that."""
+    values = np.ascontiguousarray(values, dtype=float)
+    known = ~np.isnan(values)
+    mask = None if known.all() else pa.py_buffer(np.packbits(known, bitorder="little"))
+    return pa.Array.from_buffers(pa.float64(), values.size, [mask, pa.py_buffer(values)])
 
 
 class TableWriter:
@@ -190,9 +196,7 @@ class TableWriter:
 
     def write(self, columns: Mapping[str, Array]) -> None:
         """Append columns (N,); nan is written as empty."""
-        table = pa.table(
-            {name: pa.array(x, pa.float64(), from_pandas=True) for name, x in columns.items()}
-        )
+        table = pa.table({name: _floats(x) for name, x in columns.items()})
         if self._writer is None:
             self._writer = pyarrow.parquet.ParquetWriter(
                 self._path, table.schema, write_page_checksum=True

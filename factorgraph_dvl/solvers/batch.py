@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from copy import copy
 from dataclasses import replace
+from typing import TypeVar
 
 import gtsam
 import numpy as np
 
+from factorgraph_dvl.background import in_background
 from factorgraph_dvl.errors import ConfigError
 from factorgraph_dvl.graph.priors import ConstantsPrior
 from factorgraph_dvl.imu.propagation import States
@@ -23,6 +26,7 @@ from factorgraph_dvl.solvers.fixed_directions import (
     undetermined_there,
     with_covariances,
 )
+from factorgraph_dvl.solvers.known_parameters import explanation
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, minimise
 from factorgraph_dvl.solvers.minima import (
     competing_minima,
@@ -35,11 +39,14 @@ from factorgraph_dvl.solvers.motion_smoother import SmoothedMotion, smooth_motio
 from factorgraph_dvl.solvers.motion_summary import summarise_motion
 from factorgraph_dvl.solvers.preparation import Preparation, prepare
 from factorgraph_dvl.solvers.rounds import SettledMinimum, settle
+from factorgraph_dvl.solvers.speculation import Explain, speculated
 from factorgraph_dvl.solvers.stages import Stages
 from factorgraph_dvl.solvers.state_times import STATE_INTERVAL
 from factorgraph_dvl.solvers.summary import summarise
 from factorgraph_dvl.solvers.trajectory import TRAJECTORY_RATE
 from factorgraph_dvl.trial import Trial
+
+_Prepared = TypeVar("_Prepared")
 
 
 def solve(
@@ -114,41 +121,72 @@ def solve_with_problem(
     _check_above_zero("state_interval_s", state_interval_s)
     # What a trial without positions lacks comes before what is odd in its records.
     trial.frame()
-    records = survey(trial)
-    errors = accepted_errors(records, anyway=anyway)
+    report = progress or _silent
     solved: SolvedProblem | SmoothedMotion
-    with explained(errors):
-        report = progress or _silent
-        if trial.planar:
+    if trial.planar:
+        records = survey(trial)
+        with explained(accepted_errors(records, anyway=anyway)):
             found = solve_planar(trial, rate_hz=rate_hz, progress=report)
-            return found.with_findings(records.problems), None
-        if trial.imu is None:
-            solved = smooth_motion(prepare_motion(trial), report)
+        return found.with_findings(records.problems), None
+    if trial.imu is None:
+        motion, errors = _prepared(trial, lambda: prepare_motion(trial), anyway=anyway)
+        with explained(errors):
+            solved = smooth_motion(motion, report)
             found = summarise_motion(trial, solved, rate_hz=rate_hz)
-        else:
-            found, solved = _most_probable(trial, rate_hz, state_interval_s, report, stages)
+    else:
+        prepared, errors = _prepared(
+            trial, lambda: prepare(trial, state_interval_s, report, stages), anyway=anyway
+        )
+        with explained(errors):
+            found, solved = _most_probable(trial, prepared, rate_hz, report, stages)
     return found.with_findings(errors), solved
+
+
+def _prepared(
+    trial: Trial, prepare: Callable[[], _Prepared], *, anyway: bool
+) -> tuple[_Prepared, tuple[Finding, ...]]:
+    """Return a prepared trial, and the errors in its records with which it can be solved."""
+    prepared: _Prepared | None = None
+    failure: Exception | None = None
+    with in_background(lambda: survey(trial)) as surveyed:
+        try:
+            prepared = prepare()
+        except Exception as error:
+            # Where records cannot be used, that is what the user must know.
+            failure = error
+        errors = accepted_errors(surveyed(), anyway=anyway)
+    with explained(errors):
+        if failure is not None:
+            raise failure
+    assert prepared is not None
+    return prepared, errors
 
 
 def _most_probable(
     trial: Trial,
+    prepared: Preparation,
     rate_hz: float,
-    state_interval_s: float,
     report: Progress,
     stages: Stages | None,
 ) -> tuple[Solution, SolvedProblem]:
     """Return the most probable of all minima from all positions, with the spread of the others."""
-    prepared = prepare(trial, state_interval_s, report, stages)
     starts = prepared.start_positions.states
     # Of several starts each has a mounting of its own.
     mounting = stages if len(starts) == 1 else None
     solutions, best = [], []
     for states in starts:
-        minima = _minima(prepared, states, prepared.findings, report, mounting)
-        against = np.array([evidence_against(each) for each in minima])
-        summaries = [summarise(trial, each, rate_hz=rate_hz) for each in minima]
-        solutions.append(most_probable_minimum(summaries, against))
-        best.append(minima[0])
+
+        def summarised(
+            explain: Explain, states: States = states
+        ) -> tuple[Solution, SolvedProblem]:
+            minima = _minima(prepared, states, prepared.findings, report, mounting, explain)
+            against = np.array([evidence_against(each) for each in minima])
+            summaries = [summarise(trial, each, rate_hz=rate_hz) for each in minima]
+            return most_probable_minimum(summaries, against), minima[0]
+
+        solution, minimum = speculated(summarised)
+        solutions.append(solution)
+        best.append(minimum)
     costs = significant_costs([cost_terms(each) for each in best])
     likeliest = int(np.argmin(costs))
     return joined(solutions, costs, prepared.start_positions.hypotheses), best[likeliest]
@@ -186,9 +224,10 @@ def _minima(
     findings: tuple[Finding, ...],
     report: Progress,
     stages: Stages | None = None,
+    explain: Explain = explanation,
 ) -> list[SolvedProblem]:
     """Return the minima near some states and their rivals, the most probable first."""
-    found = competing_minima(prepared, states, report, stages)
+    found = competing_minima(prepared, states, report, stages, explain)
     return distinct(prepared, [_with_covariances(each, findings, report) for each in found])
 
 

@@ -13,7 +13,7 @@ Sequential Estimation, 1977, ch. VI). At the end it is what the smoother has.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -65,9 +65,27 @@ def solve_with_history(
     entries: int | None = None,
     anyway: bool = False,
     progress: Progress | None = None,
-    stages: Stages | None = None,
 ) -> tuple[Solution, InformationHistory | None]:
     """Solve a trial, and follow the information on its constants along it.
+
+    Parameters and errors as of `solve_then_history`.
+    """
+    solution, history = solve_then_history(
+        trial, rate_hz=rate_hz, entries=entries, anyway=anyway, progress=progress
+    )
+    return solution, history()
+
+
+def solve_then_history(
+    trial: Trial,
+    *,
+    rate_hz: float,
+    entries: int | None = None,
+    anyway: bool = False,
+    progress: Progress | None = None,
+    stages: Stages | None = None,
+) -> tuple[Solution, Callable[[], InformationHistory | None]]:
+    """Solve a trial; return what follows the information on its constants along it, too.
 
     A planar trial has no such history.
 
@@ -77,13 +95,17 @@ def solve_with_history(
     solution, solved = solve_with_problem(
         trial, rate_hz=rate_hz, anyway=anyway, progress=progress, stages=stages
     )
-    if solved is None:
-        return solution, None
-    if progress:
-        progress("information along the trial", 0, None)
-    if isinstance(solved, SmoothedMotion):
-        return solution, motion_history(solved, entries=entries)
-    return solution, information_history(solved, entries=entries)
+
+    def history() -> InformationHistory | None:
+        if solved is None:
+            return None
+        if progress:
+            progress("information along the trial", 0, None)
+        if isinstance(solved, SmoothedMotion):
+            return motion_history(solved, entries=entries)
+        return information_history(solved, entries=entries)
+
+    return solution, history
 
 
 def information_history(found: SolvedProblem, *, entries: int | None = None) -> InformationHistory:

@@ -389,8 +389,7 @@ def _scattered(
     test.robust_weights = robust
     test.long_run = problem.long_run
     at = test.evaluate(test.values(evaluation.states, test.prior_values() | values))
-    test.weigh(at)
-    return test, test.evaluate(at.values)
+    return test, test.weighed(at)
 
 
 def _scatter(

@@ -73,6 +73,7 @@ def minimise(
     max_iterations: int = 50,
     tolerance: float = CONVERGED,
     proven: bool = True,
+    enough: float = 0.0,
     binding: bool = False,
 ) -> Minimum:
     """Minimise a problem's cost.
@@ -101,6 +102,8 @@ def minimise(
         Promised decrease of the cost below which the minimum is reached.
     proven : bool, default True
         Whether QR must confirm the minimum.
+    enough : float, default 0
+        Mean square of a whitened residual below which no minimum is needed.
     binding : bool, default False
         Whether to stop near a minimum at which measurements are to be bound anew.
 
@@ -109,9 +112,7 @@ def minimise(
     SolveError
         If the cost at the start is not finite.
     """
-    evaluation = problem.evaluate(values)
-    problem.weigh(evaluation)
-    evaluation = problem.evaluate(values)
+    evaluation = problem.weighed(problem.evaluate(values))
     if not np.isfinite(evaluation.cost):
         raise SolveError(
             "the cost at the start is not finite",
@@ -120,18 +121,23 @@ def minimise(
         )
     gaussian = problem.linearize(evaluation)
     ordering, sizes = problem.ordering(), values.dims()
+    if enough:
+        enough *= 0.5 * sum(np.count_nonzero(weights) for weights in problem.weights)
     root: SquareRootInformation | None = None
     damping = 0.0
     # Greatest damping with which a step failed since the cost last fell.
     failed = -1.0
     careful = False
+    promised = np.inf
     iteration = 0
     if progress:
         progress(stage, 0, evaluation.cost)
     while iteration < max_iterations:
         iteration += 1
         damped = _damped(gaussian, evaluation.values, damping) if damping > 0.0 else gaussian
-        delta = None if careful else quick_step(damped, ordering)
+        # After so small a step the next one is for QR to prove.
+        last = proven and damping == 0.0 and promised < _ANOTHER_FOLLOWS
+        delta = None if careful or last else quick_step(damped, ordering)
         promised = evaluation.cost - gaussian.error(delta) if delta is not None else -np.inf
         if delta is None or (proven and not promised > tolerance):
             root = eliminated(damped, problem.ordering(branches=False), sizes)
@@ -145,15 +151,20 @@ def minimise(
         lower = trial.cost <= evaluation.cost * (1.0 + _ROUNDING)
         small = promised < tolerance
         if np.isfinite(trial.cost) and (lower or small):
-            gain = (evaluation.cost - trial.cost) / promised if promised > 0.0 else 1.0
+            decrease = evaluation.cost - trial.cost
+            gain = decrease / promised if promised > 0.0 else 1.0
+            # A model that was right about this step promises no more after it.
+            ended = small or (not proven and abs(promised - decrease) < tolerance)
             if trial.cost < evaluation.cost * (1.0 - _ROUNDING):
                 failed = -1.0
             if lower:
                 evaluation = trial
             if progress:
                 progress(stage, iteration, evaluation.cost)
-            if small and damping == 0.0 and (root is not None or not proven):
+            if ended and damping == 0.0 and (root is not None or not proven):
                 return Minimum(evaluation, root, True, iteration)
+            if evaluation.cost < enough:
+                return Minimum(evaluation, None, False, iteration)
             if small or gain > _GOOD_GAIN:
                 damping = damping / 10.0 if damping > _FIRST_DAMPING else 0.0
             elif gain < _POOR_GAIN:

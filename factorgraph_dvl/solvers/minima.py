@@ -15,9 +15,11 @@ from factorgraph_dvl.imu.propagation import States
 from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.solution import Progress
 from factorgraph_dvl.solvers.fixed_directions import SolvedProblem
+from factorgraph_dvl.solvers.known_parameters import explanation
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, minimise
 from factorgraph_dvl.solvers.preparation import ROUGH_TOLERANCE, Preparation
 from factorgraph_dvl.solvers.rounds import SettledMinimum, settle
+from factorgraph_dvl.solvers.speculation import Explain
 from factorgraph_dvl.solvers.stages import Stages
 from factorgraph_dvl.statistics.robust_weights import rejection_cost
 
@@ -44,6 +46,7 @@ def competing_minima(
     states: States,
     report: Progress,
     stages: Stages | None = None,
+    explain: Explain = explanation,
 ) -> list[SettledMinimum]:
     """Return the minimum that some states lead to, then others that are about as probable.
 
@@ -60,8 +63,10 @@ def competing_minima(
         Called with stage, iteration and cost.
     stages : Stages, optional
         Where what the first starts from is kept, and taken from.
+    explain : callable, optional
+        As of `settle`, for the first.
     """
-    first = settle(prepared, states, report, stages=stages)
+    first = settle(prepared, states, report, stages=stages, explain=explain)
     rotations = [p for p in prepared.parameters if p.rotation and p.estimated]
     time = prepared.segments.node_time
     is_free = any(p.sigma.max() > _ANY_ANGLE for p in rotations)

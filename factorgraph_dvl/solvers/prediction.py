@@ -118,8 +118,7 @@ def _weighed(
 ) -> tuple[Problem, Evaluation]:
     """Return a problem with its weights at the truth, and its evaluation there."""
     values = problem.values(states, {**problem.prior_values(), **truth})
-    problem.weigh(problem.evaluate(values))
-    return problem, problem.evaluate(values)
+    return problem, problem.weighed(problem.evaluate(values))
 
 
 def _minimum(problem: Problem, evaluation: Evaluation) -> Minimum:

@@ -35,6 +35,9 @@ from factorgraph_dvl.trial import Trial
 # this, or after so many steps. Chosen: the next stage goes on from there.
 ROUGH_TOLERANCE = 1.0
 _ROUGH_ITERATIONS = 10
+# Square of a residual, in the mean and in variances, at which it ends too. Chosen: what is left is
+# less than the noise.
+_ROUGHLY_NOISE = 1.5
 # Square of a residual, in the mean and in variances, above which gross errors are searched before
 # the mounting is. Chosen: jumps of 10 m do no harm there, those of 50 m do.
 _GROSS = 10.0
@@ -244,6 +247,7 @@ def mounted_start(
             max_iterations=_ROUGH_ITERATIONS,
             tolerance=ROUGH_TOLERANCE,
             proven=False,
+            enough=_ROUGHLY_NOISE,
         )
         evaluation, iterations = coarse.evaluation, coarse.iterations
         count = sum(np.count_nonzero(weights) for weights in problem.weights)

@@ -37,6 +37,7 @@ from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, factorized, min
 from factorgraph_dvl.solvers.outliers import robust_weights
 from factorgraph_dvl.solvers.preparation import MountedStart, Preparation, mounted_start
 from factorgraph_dvl.solvers.process_fit import refitted
+from factorgraph_dvl.solvers.speculation import Explain
 from factorgraph_dvl.solvers.stages import Stages, finished
 from factorgraph_dvl.statistics.variance_components import (
     VarianceComponents,
@@ -111,6 +112,7 @@ def settle(
     estimate_noise: bool = True,
     clock_zero: float | None = None,
     stages: Stages | None = None,
+    explain: Explain = explanation,
 ) -> SettledMinimum:
     """Return the minimum that some states lead to.
 
@@ -134,6 +136,8 @@ def settle(
         When the offsets of clocks hold, s; by default in the middle of the trial.
     stages : Stages, optional
         Where the mountings are kept, and taken from.
+    explain : callable, optional
+        Test of parameters that are taken as known.
     """
     chain = prepared.chain(states)
     p_gravity = states.p_n
@@ -253,7 +257,7 @@ def settle(
             tested = parameters
             # The test has a problem of its own, and more columns.
             problem.release()
-            left = explanation(problem, minimum, prepared.trial.inertial)
+            left = explain(problem, minimum, prepared.trial.inertial)
             if left is not None and len(freed) < _MOST_FREED:
                 freed.append(left)
                 parameters = tuple(

@@ -63,8 +63,8 @@ class AtAKink:
             values=values, parameters={}, cost=1.0 + float(np.abs(values.atVector(0)).sum())
         )
 
-    def weigh(self, evaluation):
-        """Weights do not change."""
+    def weighed(self, evaluation):
+        return evaluation
 
     def needs_rebinding(self, parameters):
         return False

@@ -1,0 +1,183 @@
+"""Work in a second process, which goes on beside the first one."""
+
+from __future__ import annotations
+
+import copyreg
+import gc
+import os
+import pickle
+import signal
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from types import MappingProxyType
+from typing import Any, BinaryIO, NoReturn, TypeVar
+
+# Number of processes that a run may have. The command line sets it unless the user did. Without
+# it there is one: a program with threads of its own cannot fork safely.
+PROCESSES = "FACTORGRAPH_DVL_PROCESSES"
+_PR_SET_PDEATHSIG = 1
+
+
+_Input = TypeVar("_Input")
+_Result = TypeVar("_Result")
+
+
+def _unchanging(values: dict[Any, Any]) -> MappingProxyType[Any, Any]:
+    """Return a mapping that cannot be changed; Python does not pickle such by itself."""
+    return MappingProxyType(values)
+
+
+copyreg.pickle(MappingProxyType, lambda mapping: (_unchanging, (dict(mapping),)))
+
+
+@contextmanager
+def in_background(work: Callable[[], _Result]) -> Iterator[Callable[[], _Result]]:
+    """Start work in a second process, and yield what waits for its result.
+
+    The second process begins as a copy of this one: it has all data, and only its result is sent
+    back. It ends with the block, whether its result was asked for or not. Where there may be one
+    process only, the work is done when its result is asked for.
+
+    Parameters
+    ----------
+    work : callable
+        Returns a result that can be pickled. It prints nothing.
+
+    Raises
+    ------
+    Exception
+        What the work raises, from the callable that is yielded.
+    MemoryError
+        From that callable, if the system killed the second process.
+
+    Examples
+    --------
+    >>> with in_background(lambda: sum(range(5))) as total:
+    ...     total()
+    10
+    """
+    with on_standby(lambda _: work()) as start:
+        yield start(None)
+
+
+@contextmanager
+def on_standby(
+    work: Callable[[_Input], _Result], prepare: Callable[[], object] = bool
+) -> Iterator[Callable[[_Input], Callable[[], _Result]]]:
+    """Start a second process that waits for input, and yield what starts its work.
+
+    That returns what waits for the result; all else is as of `in_background`.
+
+    Parameters
+    ----------
+    work : callable
+        Takes an input that can be pickled, and returns a result that can be.
+    prepare : callable, optional
+        What the second process does first, such as loading modules.
+
+    Examples
+    --------
+    >>> with on_standby(sum) as start:
+    ...     total = start([1, 2])
+    ...     total()
+    3
+    """
+    second = _fork(work, prepare) if available() else None
+    if second is None:
+        yield lambda given: lambda: work(given)
+        return
+    process, order, reply = second
+
+    def start(given: _Input) -> Callable[[], _Result]:
+        # Of a process that was killed the reply ends early.
+        with suppress(BrokenPipeError), order:
+            pickle.dump(given, order, protocol=pickle.HIGHEST_PROTOCOL)
+        return lambda: _received(reply)
+
+    try:
+        with reply:
+            yield start
+    finally:
+        with suppress(BrokenPipeError):
+            order.close()
+        with suppress(ProcessLookupError):
+            os.kill(process, signal.SIGKILL)
+        os.waitpid(process, 0)
+
+
+def available() -> bool:
+    """Whether a run may have a second process, and a core for it."""
+    # Elsewhere libraries of the system do not bear to be copied.
+    if sys.platform != "linux" or len(os.sched_getaffinity(0)) < 2:
+        return False
+    return os.environ.get(PROCESSES, "1") != "1"
+
+
+def _fork(
+    work: Callable[[Any], Any], prepare: Callable[[], object]
+) -> tuple[int, BinaryIO, BinaryIO] | None:
+    """Return the second process, where its input goes to and where its reply comes from.
+
+    None without means for it.
+    """
+    parent = os.getpid()
+    pipes = (*os.pipe(), *os.pipe())
+    order, given, reply, result = pipes
+    try:
+        process = os.fork()
+    except OSError:
+        for end in pipes:
+            os.close(end)
+        return None
+    if process == 0:
+        os.close(given)
+        _work(work, prepare, order, result, parent)
+    os.close(order)
+    os.close(result)
+    return process, os.fdopen(given, "wb"), os.fdopen(reply, "rb")
+
+
+def _work(
+    work: Callable[[Any], Any],
+    prepare: Callable[[], object],
+    order: int,
+    result: int,
+    parent: int,
+) -> NoReturn:
+    """Do the work of the second process, send its result or error, and end."""
+    import ctypes
+
+    try:
+        # The first process ends it. It must not outlive that, whose output folder it keeps locked.
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+        if os.getppid() == parent:
+            # Collecting what the first process made would copy it.
+            gc.freeze()
+            with os.fdopen(order, "rb") as given, os.fdopen(result, "wb") as reply:
+                reply.write(_reply(work, prepare, given))
+    finally:
+        # Nothing of what the first process has to clean up is cleaned up here.
+        os._exit(0)
+
+
+def _reply(work: Callable[[Any], Any], prepare: Callable[[], object], given: BinaryIO) -> bytes:
+    """Return whether the work was done, and its result or error, as bytes."""
+    try:
+        prepare()
+        done = work(pickle.load(given))
+        return pickle.dumps((True, done), protocol=pickle.HIGHEST_PROTOCOL)
+    except Exception as error:
+        return pickle.dumps((False, error), protocol=pickle.HIGHEST_PROTOCOL)
+
+
+def _received(reply: BinaryIO) -> Any:
+    """Return the result that the second process sends, or raise its error."""
+    try:
+        done, result = pickle.load(reply)
+    except EOFError:
+        raise MemoryError("a second process was killed") from None
+    if done:
+        return result
+    raise result

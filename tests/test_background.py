@@ -1,0 +1,141 @@
+from __future__ import annotations
+
+import os
+import signal
+import time
+from pathlib import Path
+from types import MappingProxyType
+
+import pytest
+
+from factorgraph_dvl.background import PROCESSES, available, in_background, on_standby
+from factorgraph_dvl.errors import DataError
+
+
+@pytest.fixture
+def two(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(PROCESSES, "2")
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0, 1})
+
+
+def refuse() -> None:
+    error = DataError("is empty", where="dvl.csv", hint="Look at it")
+    error.add_note("note")
+    raise error
+
+
+@pytest.mark.usefixtures("two")
+def test_a_second_process_sends_its_result() -> None:
+    with in_background(os.getpid) as found:
+        second = found()
+    assert second != os.getpid()
+
+
+@pytest.mark.usefixtures("two")
+def test_results_larger_than_a_pipe_arrive() -> None:
+    with in_background(lambda: bytes(1_000_000)) as found:
+        assert len(found()) == 1_000_000
+
+
+@pytest.mark.usefixtures("two")
+def test_an_error_of_the_second_process_is_one_of_the_first() -> None:
+    with in_background(refuse) as found, pytest.raises(DataError, match="is empty") as caught:
+        found()
+    assert caught.value.where == "dvl.csv"
+    assert caught.value.hint == "Look at it"
+    assert caught.value.__notes__ == ["note"]
+
+
+@pytest.mark.usefixtures("two")
+def test_a_result_that_cannot_be_sent_is_an_error() -> None:
+    with (
+        in_background(lambda: lambda: None) as found,
+        pytest.raises(AttributeError, match="pickle"),
+    ):
+        found()
+
+
+@pytest.mark.usefixtures("two")
+def test_a_second_process_that_is_killed_is_an_error() -> None:
+    def end() -> None:
+        os.kill(os.getpid(), signal.SIGKILL)
+
+    with in_background(end) as found, pytest.raises(MemoryError, match="killed"):
+        found()
+
+
+@pytest.mark.usefixtures("two")
+def test_it_ends_with_the_block_and_cleans_up_nothing_of_the_first(tmp_path: Path) -> None:
+    marker, started = tmp_path / "marker", tmp_path / "started"
+
+    def work() -> None:
+        started.write_text(str(os.getpid()))
+        time.sleep(60.0)
+
+    def interrupted() -> None:
+        try:
+            with in_background(work):
+                while not started.exists() or not started.read_text():
+                    time.sleep(0.01)
+                raise KeyboardInterrupt
+        finally:
+            marker.write_text(marker.read_text() + "." if marker.exists() else ".")
+
+    with pytest.raises(KeyboardInterrupt):
+        interrupted()
+    with pytest.raises(ProcessLookupError):
+        os.kill(int(started.read_text()), 0)
+    assert marker.read_text() == "."
+
+
+@pytest.mark.parametrize("why", ["one process", "one core", "no fork", "another system"])
+@pytest.mark.usefixtures("two")
+def test_otherwise_the_work_is_done_in_line(why: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert available()
+    if why == "one process":
+        monkeypatch.delenv(PROCESSES)
+    elif why == "one core":
+        monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0})
+    elif why == "another system":
+        monkeypatch.setattr("sys.platform", "darwin")
+    else:
+
+        def fail() -> int:
+            raise OSError("no more processes")
+
+        monkeypatch.setattr(os, "fork", fail)
+    with in_background(os.getpid) as found:
+        assert found() == os.getpid()
+    with in_background(refuse) as found, pytest.raises(DataError, match="is empty"):
+        found()
+
+
+@pytest.mark.usefixtures("two")
+def test_a_process_on_standby_takes_what_was_made_after_it_began() -> None:
+    made: list[int] = []
+    with on_standby(lambda given: (made, given), lambda: made.append(1)) as start:
+        made.append(2)
+        wait = start(MappingProxyType({"a": 3}))
+        assert wait() == ([1], {"a": 3})
+
+
+@pytest.mark.usefixtures("two")
+def test_an_error_before_the_work_is_one_of_the_first_too() -> None:
+    with on_standby(lambda given: given, refuse) as start, pytest.raises(DataError, match="empty"):
+        start(1)()
+
+
+@pytest.mark.usefixtures("two")
+def test_a_process_that_died_on_standby_is_an_error() -> None:
+    def end() -> None:
+        os.kill(os.getpid(), signal.SIGKILL)
+
+    with on_standby(lambda given: given, end) as start:
+        time.sleep(0.1)
+        with pytest.raises(MemoryError, match="killed"):
+            start(bytes(1_000_000))()
+
+
+def test_without_a_second_process_nothing_is_prepared() -> None:
+    with on_standby(lambda given: given + 1, refuse) as start:
+        assert start(1)() == 2
