@@ -54,7 +54,7 @@ class Integrals:
         turn, shift = np.tile(np.eye(3), (count, 1, 1)), np.zeros((2, count, 3))
         return cls(turn, shift[0], shift[1], np.zeros((count, 3, 3)))
 
-    def put(self, index: IntArray, others: Integrals) -> None:
+    def put(self, index: IntArray | slice, others: Integrals) -> None:
         """Write others in the place of some of them."""
         self.dR[index], self.dV[index] = others.dR, others.dV
         self.dP[index], self.dA[index] = others.dP, others.dA
@@ -306,7 +306,9 @@ def _knots(
         behind = cross(phi, dv)
         now = Integrals.zero(begin.size)
         for j in range(int((end - begin).max())):
-            live = np.flatnonzero(begin + j < end)
+            is_live = begin + j < end
+            # Views of all are no copies.
+            live = slice(None) if is_live.all() else np.flatnonzero(is_live)
             i = begin[live] + j
             at, here, dt = knot[live] + j // spacing, rows_of(now, live), inc.dt[i]
             if j % spacing == 0:
@@ -525,7 +527,9 @@ def gtsam_measurements(
     gyro_psd = settings.gyro_noise_root_psd**2 * np.eye(3)
     accel_psd = settings.accel_noise_root_psd**2 * np.eye(3)
     integration_psd = _INTEGRATION_ROOT_PSD**2 * np.eye(3)
-    is_open = np.any(inc.open_sigma > 0.0, axis=1)
+    is_open = np.flatnonzero(np.any(inc.open_sigma > 0.0, axis=1))
+    some_open = np.searchsorted(is_open, seg.first) < np.searchsorted(is_open, seg.last)
+    no_extra = np.zeros((3, 3))
     by_steps = _by_sample if inc.dt.size < _FEW else _by_stride
     out = []
     for block in seg.blocks():
@@ -535,14 +539,13 @@ def gtsam_measurements(
             params = gtsam.PreintegrationParams(gravity_n[s])
             params.setOmegaCoriolis(earth_rate_n)
             params.setIntegrationCovariance(integration_psd)
-            extra_gyro, extra_accel = 0.0, 0.0
-            a, b = int(seg.first[s]), int(seg.last[s])
-            if np.any(is_open[a:b]):
-                extra = (inc.open_sigma[a:b] * inc.dt[a:b, None]) ** 2
-                extra_gyro = extra[:, :3].sum() / seg.duration[s]
-                extra_accel = extra[:, 3:].sum() / seg.duration[s]
-            params.setGyroscopeCovariance(gyro_psd + extra_gyro * np.eye(3))
-            params.setAccelerometerCovariance(accel_psd + extra_accel * np.eye(3))
+            extra_gyro, extra_accel = no_extra, no_extra
+            if some_open[s]:
+                own = slice(seg.first[s], seg.last[s])
+                extra = (inc.open_sigma[own] * inc.dt[own, None]) ** 2 / seg.duration[s]
+                extra_gyro, extra_accel = (e.sum() * np.eye(3) for e in np.hsplit(extra, 2))
+            params.setGyroscopeCovariance(gyro_psd + extra_gyro)
+            params.setAccelerometerCovariance(accel_psd + extra_accel)
             pim = gtsam.PreintegratedImuMeasurementsG(params)
             add = pim.integrateMeasurement
             for i in range(begin, end):

@@ -15,6 +15,9 @@ from factorgraph_dvl.statistics.square_root_information import SquareRootInforma
 # A step is small when all of it together is this many standard deviations, squared and
 # halved: the decrease of the cost that the linear model still promises. Chosen: 0.004 σ.
 CONVERGED = 1e-5
+# The same below which the next step is for QR to prove, and small if the cost falls as promised.
+# Chosen: 0.014 σ.
+_NEARLY = 1e-4
 # The same where the times of measurements are to be bound anew: another problem follows.
 # Chosen: 0.14 σ.
 _ANOTHER_FOLLOWS = 1e-2
@@ -135,11 +138,10 @@ def minimise(
     while iteration < max_iterations:
         iteration += 1
         damped = _damped(gaussian, evaluation.values, damping) if damping > 0.0 else gaussian
-        # After so small a step the next one is for QR to prove.
         last = proven and damping == 0.0 and promised < _ANOTHER_FOLLOWS
         delta = None if careful or last else quick_step(damped, ordering)
         promised = evaluation.cost - gaussian.error(delta) if delta is not None else -np.inf
-        if delta is None or (proven and not promised > tolerance):
+        if delta is None or (proven and not promised > max(tolerance, _NEARLY)):
             root = eliminated(damped, problem.ordering(branches=False), sizes)
             delta = root.solution()
             promised = evaluation.cost - gaussian.error(delta)
@@ -154,7 +156,8 @@ def minimise(
             decrease = evaluation.cost - trial.cost
             gain = decrease / promised if promised > 0.0 else 1.0
             # A model that was right about this step promises no more after it.
-            ended = small or (not proven and abs(promised - decrease) < tolerance)
+            right = abs(promised - decrease) < tolerance
+            ended = small or (right and (promised < _NEARLY or not proven))
             if trial.cost < evaluation.cost * (1.0 - _ROUNDING):
                 failed = -1.0
             if lower:
