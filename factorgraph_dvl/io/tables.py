@@ -153,7 +153,7 @@ def write_table(path: Path, columns: Mapping[str, NDArray[Any]]) -> None:
     """
     table = pa.table(
         {
-            name: pa.array(values, pa.string()) if values.dtype.kind == "U" else _floats(values)
+            name: _texts(values) if values.dtype.kind == "U" else _floats(values)
             for name, values in columns.items()
         }
     )
@@ -166,11 +166,19 @@ def write_table(path: Path, columns: Mapping[str, NDArray[Any]]) -> None:
 
 
 def _floats(values: NDArray[Any]) -> pa.Array:
-    """Return numbers (N,) as Arrow's, nan as null: `pyarrow.array` would load Pandas for that."""
+    """Return numbers (N,) as Arrow's, nan as null. `pyarrow.array` would load Pandas."""
     values = np.ascontiguousarray(values, dtype=float)
     known = ~np.isnan(values)
     mask = None if known.all() else pa.py_buffer(np.packbits(known, bitorder="little"))
     return pa.Array.from_buffers(pa.float64(), values.size, [mask, pa.py_buffer(values)])
+
+
+def _texts(values: NDArray[np.str_]) -> pa.Array:
+    """Return texts (N,) as Arrow's."""
+    encoded = [text.encode() for text in values.tolist()]
+    ends = np.cumsum([0, *map(len, encoded)], dtype=np.int32)
+    buffers = [None, pa.py_buffer(ends), pa.py_buffer(b"".join(encoded))]
+    return pa.Array.from_buffers(pa.string(), values.size, buffers)
 
 
 class TableWriter:
@@ -346,9 +354,28 @@ def _read_parquet(path: Path, header: list[str], names: list[str], source: str) 
 
 
 def _numbers(table: pa.Table, name: str) -> Array:
-    """Return a column, (N,), writable, with nan where it is null."""
-    column = table.column(name).cast(pa.float64(), safe=False)
-    return np.array(column.to_numpy(zero_copy_only=False), dtype=float)
+    """Return a column, (N,), writable, with nan where it is null.
+
+    Arrow's own conversion would load Pandas.
+    """
+    column = table.column(name)
+    if column.type != pa.float64():
+        column = column.cast(pa.float64(), safe=False)
+    return np.concatenate([np.empty(0), *map(_chunk, column.chunks)])
+
+
+def _chunk(chunk: pa.Array) -> Array:
+    """Return the numbers of an array of Arrow's, (N,), with nan where it is null."""
+    known, data = chunk.buffers()
+    if not len(chunk):
+        return np.empty(0)
+    end = chunk.offset + len(chunk)
+    values = np.frombuffer(data, dtype=float, count=end)[chunk.offset :]
+    if not chunk.null_count:
+        return values
+    bits = np.frombuffer(known, dtype=np.uint8)
+    is_known = np.unpackbits(bits, count=end, bitorder="little")[chunk.offset :]
+    return np.where(is_known, values, np.nan)
 
 
 def _text(table: pa.Table, name: str) -> NDArray[np.str_]:
