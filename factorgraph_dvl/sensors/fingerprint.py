@@ -19,6 +19,8 @@ PATTERN = r"^[a-z_]+:([0-9a-f]{16})+$"
 # 2 kB of text; a part of a record still counts, and a short stretch in common does not.
 _SIZE = 128
 _SAME = 0.5
+# Hashes that are sorted, of longer records. Chosen: enough where most rows come thrice.
+_MANY = 4 * _SIZE
 # Chosen: of records with fewer measured columns, such as depth, rows are equal by chance, and so
 # many of them count as one, unless they hold the same values.
 _FEWEST_COLUMNS = 3
@@ -56,7 +58,7 @@ def _fingerprint(record: SensorRecord) -> str:
     if len(rows) <= _FEWEST_COLUMNS:
         known = _known(rows)
         hashes = _joined(hashes, [column[known] for column in rows[1:]])
-    smallest = np.unique(hashes)[:_SIZE].astype("<u8")
+    smallest = _smallest(hashes).astype("<u8")
     return f"{record.section}:{smallest.tobytes().hex()}" if smallest.size else ""
 
 
@@ -77,6 +79,16 @@ def _hashes(rows: Sequence[Array]) -> NDArray[np.uint64]:
             hashes *= mixer
             hashes ^= hashes >> np.uint64(31)
     return hashes
+
+
+def _smallest(hashes: NDArray[np.uint64]) -> NDArray[np.uint64]:
+    """Return the smallest hashes in order, each once."""
+    # Few rows are equal: among so many hashes there are enough different ones, with few to sort.
+    if hashes.size > _MANY:
+        few = np.unique(np.partition(hashes, _MANY)[:_MANY])
+        if few.size >= _SIZE:
+            return few[:_SIZE]
+    return np.unique(hashes)[:_SIZE]
 
 
 def _joined(hashes: NDArray[np.uint64], columns: list[Array]) -> NDArray[np.uint64]:
