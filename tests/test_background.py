@@ -136,6 +136,7 @@ def test_a_process_that_died_on_standby_is_an_error() -> None:
             start(bytes(1_000_000))()
 
 
-def test_without_a_second_process_nothing_is_prepared() -> None:
+def test_without_a_second_process_nothing_is_prepared(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv(PROCESSES, raising=False)
     with on_standby(lambda given: given + 1, refuse) as start:
         assert start(1)() == 2
