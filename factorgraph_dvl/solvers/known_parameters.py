@@ -119,8 +119,10 @@ def explanation(problem: Problem, minimum: Minimum, imu: Imu) -> Explanation | N
     count = sum(int(np.count_nonzero(w)) for w in problem.weights)
     significant.sort(key=lambda each: -each[1].evidence(count))
     parameter, test = significant[0]
-    fall = test.chi2 * test.scatter
-    if any(e.change.chi2 > test.chi2 or e.change.fall > fall for e in certain):
+    # A change is one component.
+    more = (test.freedom - 1) * float(np.log(count))
+    fall = test.chi2 * test.scatter - more
+    if any(e.change.chi2 > test.chi2 - more or e.change.fall > fall for e in certain):
         return None
     others: tuple[str | Message, ...] = tuple(
         p.name for p, t in significant[1:] if test.evidence(count) - t.evidence(count) < 2.0 * _TIE
