@@ -149,9 +149,13 @@ def _work(
     import ctypes
 
     try:
-        # The first process ends it. It must not outlive that, whose output folder it keeps locked.
+        # The first process ends it, also where that is killed, and alone keeps its files locked.
         signal.signal(signal.SIGINT, signal.SIG_IGN)
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+        first, last = sorted((order, result))
+        os.closerange(3, first)
+        os.closerange(first + 1, last)
+        os.closerange(last + 1, os.sysconf("SC_OPEN_MAX"))
         if os.getppid() == parent:
             # Collecting what the first process made would copy it.
             gc.freeze()
