@@ -119,12 +119,15 @@ class Chain:
         for i in range(count, self.graph.size()):
             if keys.index_of(self.graph.at(i).keys()[0]) in nodes:
                 graph.add(self.graph.at(i))
-        return replace(
+        out = replace(
             self,
             segments=self.segments.part(block),
             gravity_n=self.gravity_n[block],
             graph=graph,
         )
+        # Of all states, which take long to insert.
+        vars(out)["zeros"] = self.zeros
+        return out
 
     def nodes_of(self, block: slice) -> range:
         """Return the nodes from the first of some segments to that of the segments after them."""
