@@ -79,8 +79,9 @@ _CURRENT_TIME = (math.log(3.0), math.log(2e5))
 # of its logarithm.
 _NEGLIGIBLE = 1e-3
 _LARGEST_STEP = 3.0
-# Range of the density of acceleration, m²/s³. Chosen: regular, and beyond what vessels do.
-_DENSITY = (1e-10, 1e3)
+# Range of the density of acceleration, m²/s³. Chosen: a velocity that wanders by 1 mm/s in 100 s,
+# and beyond what vessels do.
+_DENSITY = (1e-8, 1e3)
 
 
 @dataclass(frozen=True)
@@ -180,7 +181,7 @@ def smooth_motion(prepared: MotionPreparation, report: Progress) -> SmoothedMoti
         relevant = density > _NEGLIGIBLE * density.max(axis=0)
         if np.max(np.abs(moved) * relevant) > 2.0 * _SAME:
             changing.append(message("not_converged.acceleration"))
-        density = chain.density * np.exp(_hastened(moved, last_moved))
+        density = np.clip(chain.density * np.exp(_hastened(moved, last_moved)), *_DENSITY)
         last_moved = moved
         # A search takes twenty factorisations: not in every round.
         if free_current and (not changing or round_ % _CURRENT_ROUNDS == 0):
