@@ -267,11 +267,11 @@ class Ins:
     def _by_schuler(self) -> tuple[Array, Array]:
         """Return the derivatives of errors of position and velocity by the oscillation, (M, 3, 4).
 
-        The velocity errs by c cos w (t - t0) + s sin w (t - t0) east and north, t0 the middle of
-        the record, and the position by its integral about a mean of zero.
+        The velocity errs by c cos w t + s sin w t east and north, and the position by its integral
+        about a mean of zero. Time is that of the trial: a part of the record has the same c and s.
         """
         rate = 2.0 * np.pi / SCHULER_PERIOD
-        phase = rate * (self.time - 0.5 * (self.time[0] + self.time[-1]))
+        phase = rate * self.time
         level = np.eye(3)[:, :2]
         cos, sin = (f(phase)[:, None, None] * level for f in (np.cos, np.sin))
         return (
