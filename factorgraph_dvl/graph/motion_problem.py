@@ -29,9 +29,6 @@ from factorgraph_dvl.sensors.protocol import Linearization, Motion, Observation
 ATTITUDE = "attitude"
 CURRENT = "current"
 _SCALE = "scale_error"
-_LEVER_ARM = "lever_arm_m"
-# Products e_i × with the unit vectors, (3, 3, 3).
-_CROSS = np.cross(np.eye(3)[:, None], np.eye(3)[None]).transpose(0, 2, 1)
 # Factor on the density of acceleration that makes a prior weak. Chosen: of its effect on constants
 # a percent is left, and the states stay determined in gaps.
 _WEAKER = 100.0
@@ -353,7 +350,7 @@ class MotionProblem:
     def follow_motion(
         self, evaluation: MotionEvaluation, factors: Factorisation, covariances: Covariances
     ) -> Array:
-        """Set the slope that takes the prior of the motion and noise of rates out of constants.
+        """Set the slope by which scale errors do not depend on the prior of the motion.
 
         At the least cost the prior holds the velocity back, and a scale error makes up for it: in
         a tidal race one of 0.29 came from it. Its gradient is therefore that of residuals about
@@ -361,10 +358,6 @@ class MotionProblem:
         residuals then contain noise alone, whatever the motion is like. Of a single velocity that
         GNSS and log measure this is the least-squares fit of one to the other, with the smoothed
         velocity as the instrument. Lever arms and mountings gain nothing from it but noise.
-
-        Rates of a record have noise n, and a lever arm l that is too short makes less of n × l.
-        The gradient by l has the expectation of this, and the slope is its opposite (corrected
-        score: Nakamura, Biometrika 77 (1990)). It takes out what a smoothed record still has.
 
         A vessel that keeps its track moves independently of the current, one that drifts moves
         with it. In between, a share of the current's information on the scale error counts.
@@ -404,31 +397,9 @@ class MotionProblem:
                     by_row += np.sum(J[:, :, place] * each, axis=(0, 2))
                 rows = by_row.sum() if gain.size == 1 else by_row
                 by_track[self.columns[_SCALE]] += rows / gain
-        for name, column in self.columns.items():
-            if name.endswith(_LEVER_ARM):
-                slope[column] -= self._by_noise_of_rates(name, evaluation)
         self.slope = slope + _TRACK * by_track
         self._slope_at = dict(evaluation.parameters)
         return by_track
-
-    def _by_noise_of_rates(self, name: str, evaluation: MotionEvaluation) -> Array:
-        """Return what noise of the rates adds to the gradient by a lever arm, (3,)."""
-        out = np.zeros(3)
-        for o, seen, W in zip(
-            self.observations, evaluation.seen, evaluation.whitening, strict=True
-        ):
-            if name not in o.parameters:
-                continue
-            # Derivatives by the velocity in the body, as those by the velocity in n.
-            J = W @ seen.by_state[:, :, 3:6] @ seen.motion.nRb
-            weight = J.transpose(0, 2, 1) @ J
-            variance = seen.motion.omega_sigma**2
-            # By noise along each axis, whose product with the lever arm is e_i × l.
-            products = np.einsum(
-                "mi,mjk,ijp,ikq->pq", variance, weight, _CROSS, _CROSS, optimize=True
-            )
-            out += products @ evaluation.parameters[name]
-        return out
 
     def equations(self, evaluation: MotionEvaluation) -> NormalEquations:
         """Return the normal equations at an evaluation."""

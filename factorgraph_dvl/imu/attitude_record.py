@@ -9,27 +9,21 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
-from scipy.linalg import solveh_banded
 
 from factorgraph_dvl.errors import DataError
 from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.rotations import BodyAxes, rotation_from_rph, theta_by_rph
 from factorgraph_dvl.geometry.vectors import Array, rotate
 from factorgraph_dvl.imu.attitude_history import Orientation
-from factorgraph_dvl.sensors.attitude import LEAST_STD, Attitude
+from factorgraph_dvl.imu.interpolation import ORDER, local_cubics, white_gain
+from factorgraph_dvl.sensors.attitude import Attitude
 from factorgraph_dvl.sensors.ins import Ins
 from factorgraph_dvl.sensors.records import at_row, white_noise
 
-# Cutoffs, Hz, that are tried, and the largest by a sampling rate. Chosen: waves that move a ship
-# are longer than two seconds, and beyond the last a spline's noise depends on the place.
-_CUTOFFS = (0.25, 0.35, 0.5, 0.7, 1.0, 1.4)
-_LARGEST_CUTOFF = 0.2
-# Factor on the cutoff at which noise and motion that is lost are least together. Chosen: the loss
-# of motion, which makes lever arms too long, is then 64 times less.
-_SAFE = 2.0
-# Samples from which the cutoff is chosen, and the least of an arc that is smoothed. Chosen:
-# seconds of motion at 5 Hz, searched in milliseconds.
-_ENOUGH, _SHORTEST = 60_000, 20
+# Standard deviation of a spline's slope at its knots for white noise of 1 in knots 1 s apart.
+_SLOPE = 1.22
+# Span, s, of a local cubic. Chosen: waves that move a ship are longer.
+_SMOOTHED = 1.5
 # Sample intervals, and s, that make a gap, in which attitude is not known. Chosen: a cubic through
 # longer ones is a guess.
 _GAP_INTERVALS = 3.5
@@ -109,15 +103,19 @@ class AttitudeRecord:
             )
         interval = float(np.median(np.diff(self.time)))
         noise = white_noise(rph)
-        cutoff = _cutoff(rph, noise, interval)
-        rph = _smoothed(self.time, rph, cutoff, 1.5 * interval)
+        width = _width(interval)
+        rph = _smoothed(self.time, rph, width, 1.5 * interval)
         self._spline = CubicSpline(self.time, rph)
         self._rate, self._change = self._spline.derivative(), self._spline.derivative(2)
         self.interval = float(np.median(np.diff(self.time)))
         stated = sensor.error.white
         self.white = noise if estimated else stated
-        gain, slope = _white_gains(cutoff)
-        self._rate_sigma = slope / self.interval * self.white
+        # What the smoothing leaves of white noise, in angle and rate.
+        gain, slope = (
+            white_gain(width, deriv=d) / self.interval**d if width else alone
+            for d, alone in ((0, 1.0), (1, _SLOPE / self.interval))
+        )
+        self._rate_sigma = slope * self.white
         self.white = gain * self.white
         if isinstance(sensor, Attitude) and not sensor.measures_tilt:
             self.white = np.where([True, True, False], stated, self.white)
@@ -193,83 +191,22 @@ def longest_gap(time: Array) -> float:
     return max(_GAP_INTERVALS * float(np.median(np.diff(time))), _LEAST_GAP)
 
 
-def _cutoff(rph: Array, noise: Array, interval: float) -> float:
-    """Return the cutoff of the low-pass filter of a record, in cycles a sample; 0 = none.
-
-    Parameters
-    ----------
-    rph : ndarray, shape (M, 3), rad
-        Angles.
-    noise : ndarray, shape (3,), rad
-        Their white noise.
-    interval : float, s
-        Of the samples.
-    """
-    scaled = rph[:_ENOUGH] / np.maximum(noise, LEAST_STD)
-    tried = [f * interval for f in _CUTOFFS if _SAFE * f * interval <= _LARGEST_CUTOFF]
-    if not tried or len(scaled) < _SHORTEST:
-        return 0.0
-    errors = []
-    for cutoff in tried:
-        weights = _response(cutoff)
-        kept = float(weights @ weights)
-        moved = np.mean((_low_pass(scaled, cutoff) - scaled) ** 2, axis=0)
-        by_motion = np.maximum(moved - (1.0 - 2.0 * weights.max() + kept), 0.0)
-        errors.append(float(np.mean(by_motion)) + kept)
-    if min(errors) > 1.0:
-        return 0.0
-    return _SAFE * tried[int(np.argmin(errors))]
+def _width(interval: float) -> int:
+    """Return the samples, an odd number, over which a record is smoothed; 0 = it is not."""
+    width = 2 * int(0.5 * _SMOOTHED / interval) + 1
+    return width if width > ORDER + 1 else 0
 
 
-def _smoothed(time: Array, rph: Array, cutoff: float, gap: float) -> Array:
-    """Return angles (M, 3) that have passed the filter, apart for each arc.
+def _smoothed(time: Array, rph: Array, width: int, gap: float) -> Array:
+    """Return angles (M, 3) with local cubics in place of samples, apart for each arc.
 
-    A spline through white noise has slopes that follow it: a clock that moves would climb them,
-    and a lever arm times these rates would explain noise, so that it came out too short.
+    A spline through white noise has slopes that follow it: a clock that moves would climb them.
     """
     out = rph.copy()
-    if not cutoff:
+    if not width:
         return out
     edges = np.concatenate([[0], np.flatnonzero(np.diff(time) > gap) + 1, [time.size]])
     for a, b in itertools.pairwise(edges.tolist()):
-        if b - a >= _SHORTEST:
-            out[a:b] = _low_pass(rph[a:b], cutoff)
+        if b - a >= width:
+            out[a:b] = local_cubics(rph[a:b], width)
     return out
-
-
-def _low_pass(values: Array, cutoff: float) -> Array:
-    """Return values (M, ...) filtered without delay: half the amplitude is left at the cutoff.
-
-    The filter minimises the squares of the changes plus those of third differences times a
-    weight, and leaves 1 / (1 + (f / cutoff)⁶) of an oscillation that is slow for the samples
-    (Eilers, Anal. Chem. 75 (2003)).
-    """
-    weight = (2.0 * np.sin(np.pi * cutoff)) ** -6.0
-    differences = np.array([-1.0, 3.0, -3.0, 1.0])
-    count = len(values)
-    matrix = np.zeros((4, count))
-    matrix[3] = 1.0
-    for i in range(4):
-        for j in range(i, 4):
-            matrix[3 - (j - i), j : count - 3 + j] += weight * differences[i] * differences[j]
-    return np.asarray(solveh_banded(matrix, values, check_finite=False))
-
-
-def _response(cutoff: float) -> Array:
-    """Return the response of the filter to one sample of 1 among zeros."""
-    half = int(np.ceil(5.0 / cutoff))
-    impulse = np.zeros(2 * half + 1)
-    impulse[half] = 1.0
-    return _low_pass(impulse, cutoff)
-
-
-def _white_gains(cutoff: float) -> tuple[float, float]:
-    """Return what is left of white noise of 1 in samples 1 s apart: in angle, and in rate.
-
-    Of the spline through what the filter leaves, a quarter of an interval after a sample.
-    """
-    response = _response(cutoff) if cutoff else np.eye(1, 81, 40)[0]
-    spline = CubicSpline(np.arange(float(response.size)), response)
-    between = np.arange(response.size - 1) + 0.25
-    angle = response if cutoff else 1.0
-    return float(np.linalg.norm(angle)), float(np.linalg.norm(spline(between, 1)))
