@@ -223,10 +223,10 @@ def iteration_times(trial: Trial) -> Iterator[tuple[str, str, str]]:
     chain = inertial_chain(trial, frame, seg, start)
     assert trial.gnss is not None
     assert trial.dvl is not None
-    without = problem_of(chain, (trial.gnss,))
+    without = problem_of(trial, chain, (trial.gnss,))
     minimum = minimise(without, values_of(without, start, {}), stage="GNSS")
     states = minimum.evaluation.states
-    both = problem_of(chain, (trial.gnss, trial.dvl))
+    both = problem_of(trial, chain, (trial.gnss, trial.dvl))
     values = {
         "without": values_of(without, states, {}),
         "with": values_of(both, states, true_parameters(both, trial)),
@@ -284,8 +284,8 @@ def history_times(trial: Trial) -> Iterator[tuple[str, str, str]]:
     yield "**ratio of these two**", f"{best['with'] / best['without']:.2f}", "2"
 
 
-def problem_of(chain: Chain, aids: tuple[Aid, ...]) -> Problem:
-    observations = [o for aid in aids for o in aid.observations(chain.frame)]
+def problem_of(trial: Trial, chain: Chain, aids: tuple[Aid, ...]) -> Problem:
+    observations = [o for aid in aids for o in aid.observations(chain.frame, trial.body_axes)]
     parameters = [p for aid in aids for p in aid.parameters()]
     return Problem(chain, observations, parameters)
 
