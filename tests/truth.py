@@ -79,6 +79,16 @@ SCHULER = InsTruth(
 )
 
 
+# Manoeuvres that determine a calibration within a minute and a half.
+TURNS_AND_BRAKING = [
+    {"straight_s": 10},
+    {"turn_deg_s": -6, "duration_s": 20, "ramp_s": 4},
+    {"accelerate_m_s2": -0.2, "to_m_s": 2},
+    {"turn_deg_s": 8, "duration_s": 20, "ramp_s": 4},
+    {"straight_s": 20},
+]
+
+
 def merged(base: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
     """Return nested `base` with `changes`; a value of None removes a key."""
     out = copy.deepcopy(base)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
@@ -142,9 +143,13 @@ class Chain:
         """
         nodes = range(self.segments.node_time.size)
         order = [k for k in nodes if k % _BRANCH] + [*nodes[::_BRANCH]]
+        return self.keys_of(order)
+
+    def keys_of(self, nodes: Iterable[int]) -> list[int]:
+        """Return the keys of the states at nodes, each with that of its bias where biases walk."""
         if not self.walking:
-            return [keys.node(k) for k in order]
-        return [key for k in order for key in (keys.node(k), keys.bias(k))]
+            return [keys.node(k) for k in nodes]
+        return [key for k in nodes for key in (keys.node(k), keys.bias(k))]
 
 
 def inertial_chain(trial: Trial, frame: LocalFrame, seg: Segments, start: States) -> Chain:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import string
+from collections.abc import Iterable
 
-from gtsam import symbol, symbolChr, symbolIndex
+from gtsam import Ordering, symbol, symbolChr, symbolIndex
 from gtsam.symbol_shorthand import B, X
 
 from factorgraph_dvl.geometry.vectors import IntArray
@@ -75,3 +76,11 @@ def letter(size: int) -> str:
     iSAM2's thresholds go by letters, and must have the dimension of the variable.
     """
     return _LETTERS[size - 1]
+
+
+def ordering(of: Iterable[int]) -> Ordering:
+    """Return an order of elimination of keys."""
+    out = Ordering()
+    for key in of:
+        out.push_back(key)
+    return out

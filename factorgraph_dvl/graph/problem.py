@@ -623,10 +623,7 @@ class Problem:
         else:
             time = self.chain.segments.node_time
             first = in_time_order(time, self.processes, walking=self.chain.walking)
-        out = gtsam.Ordering()
-        for key in (*first, *last):
-            out.push_back(key)
-        return out
+        return keys.ordering([*first, *last])
 
     def key(self, name: str) -> int:
         """Return the key of an estimated parameter."""

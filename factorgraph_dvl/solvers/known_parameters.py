@@ -210,10 +210,7 @@ def _scores_by_ranges(
     graph = gtsam.GaussianFactorGraph()
     for a, b in itertools.pairwise(edges):
         graph, sizes, columns = _after_range(problem, evaluation, known, slice(a, b), graph)
-    order = gtsam.Ordering()
-    for key in sizes:
-        order.push_back(key)
-    information = eliminated(graph, order, sizes)
+    information = eliminated(graph, keys.ordering(sizes), sizes)
     return scores(information.solution(), information, columns)
 
 
@@ -235,11 +232,7 @@ def _after_range(
     for i in range(gaussian.size()):
         if i not in again:
             graph.push_back(gaussian.at(i))
-    order = gtsam.Ordering()
-    for k in problem.chain.nodes_of(block):
-        order.push_back(keys.node(k))
-        if problem.chain.walking:
-            order.push_back(keys.bias(k))
+    order = keys.ordering(problem.chain.keys_of(problem.chain.nodes_of(block)))
     _, left = graph.eliminatePartialMultifrontal(order, gtsam.EliminateQR)
     shared = [] if problem.chain.walking else [keys.bias(0)]
     shared += [test.key(p.name) for p in test.parameters]

@@ -15,6 +15,7 @@ import numpy as np
 from scipy.linalg.lapack import dtrtrs
 
 from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.graph import keys
 
 # Parts in which variables are eliminated. Chosen: GTSAM keeps all rows that went into a
 # conditional, up to 60 kB for each state, of which a tenth is needed; each part looks through all
@@ -246,14 +247,10 @@ def _trees(
     count = ordering.size()
     size = -(-count // _PARTS) if count > _MANY else count
     for first in range(0, count - size, size):
-        part = gtsam.Ordering()
-        for i in range(first, first + size):
-            part.push_back(ordering.at(i))
+        part = keys.ordering(ordering.at(i) for i in range(first, first + size))
         tree, gaussian = gaussian.eliminatePartialMultifrontal(part, gtsam.EliminateQR)
         yield tree
-    last = gtsam.Ordering()
-    for i in range(size * ((count - 1) // size), count):
-        last.push_back(ordering.at(i))
+    last = keys.ordering(ordering.at(i) for i in range(size * ((count - 1) // size), count))
     yield gaussian.eliminateMultifrontal(last, gtsam.EliminateQR)
 
 
@@ -264,13 +261,13 @@ def _cliques_of(tree: gtsam.GaussianBayesTree, sizes: Mapping[int, int]) -> list
     while stack:
         clique = stack.pop()
         conditional = clique.conditional()
-        keys = conditional.keys()
+        own = conditional.keys()
         R = np.array(conditional.R())
         n = count = 0
         while n < R.shape[0]:
-            n += sizes[keys[count]]
+            n += sizes[own[count]]
             count += 1
-        frontals, separators = tuple(keys[:count]), tuple(keys[count:])
+        frontals, separators = tuple(own[:count]), tuple(own[count:])
         T, d = np.array(conditional.S()), np.array(conditional.d())
         out.append(_Clique(frontals, separators, R, T, d))
         stack += [clique[i] for i in range(clique.nrChildren())]

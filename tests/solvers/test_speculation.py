@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from truth import merged, scenario
+from truth import TURNS_AND_BRAKING, merged, scenario
 
 from factorgraph_dvl.background import PROCESSES
 from factorgraph_dvl.errors import DataError
@@ -18,13 +18,7 @@ from factorgraph_dvl.solvers.speculation import speculated
 
 SCENE = {
     "noise": True,
-    "manoeuvres": [
-        {"straight_s": 10},
-        {"turn_deg_s": -6, "duration_s": 20, "ramp_s": 4},
-        {"accelerate_m_s2": -0.2, "to_m_s": 2},
-        {"turn_deg_s": 8, "duration_s": 20, "ramp_s": 4},
-        {"straight_s": 20},
-    ],
+    "manoeuvres": TURNS_AND_BRAKING,
     "gnss": {"position_std_m": [0.1, 0.1, 0.2], "velocity_std_m_s": [0.03] * 3},
     "dvl": {"velocity_std_fraction": 0.001},
     "trial": {"dvl": {"velocity_std_fraction": 0.001, "time_offset_std_s": 0.0}},
