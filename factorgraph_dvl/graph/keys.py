@@ -49,6 +49,11 @@ def process(i: int, j: int) -> int:
     return int(symbol(_PROCESSES[i], j))
 
 
+def correlated(k: int) -> int:
+    """Return the key of all correlated errors at state k, where each state has its own."""
+    return process(-1, k)
+
+
 def is_process(key: int) -> bool:
     """Whether a key is that of a correlated error."""
     return letter_of(key) in _PROCESSES

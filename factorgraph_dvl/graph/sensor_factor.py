@@ -376,6 +376,7 @@ def measurement_factor(
     bias_key: int,
     parameter_keys: Sequence[int],
     first: Linearized | None = None,
+    errors: Mapping[int, Array] | None = None,
 ) -> gtsam.CustomFactor:
     """Return the factor of what was measured after a node; zero error where it is predicted.
 
@@ -392,9 +393,12 @@ def measurement_factor(
         Of the variables, parameters as in `measured`.
     first : Linearized, optional
         Where GTSAM will linearise first.
+    errors : mapping of int to ndarray, optional
+        Derivatives (R, n) of the residuals by vectors that add to them, by their keys.
     """
     kept = [first] if first is not None else []
     every = [node_key, bias_key, *parameter_keys]
+    added = [] if errors is None else [*errors.items()]
     sizes = [STATE_SIZE, BIAS_SIZE, *(p.mean.size for p in measured.parameters)]
     edges = np.cumsum([0, *sizes])
     rows = weight.size
@@ -407,20 +411,24 @@ def measurement_factor(
             p.name: at.atRot3(key).matrix() if p.rotation else at.atVector(key)
             for p, key in zip(measured.parameters, parameter_keys, strict=True)
         }
+        error = sum((gain @ at.atVector(key) for key, gain in added), start=np.zeros(rows))
         if jacobians is None:
-            return weight * measured.residuals(states, values)
+            return weight * (measured.residuals(states, values) + error)
         once = kept.pop() if kept else None
         if once is not None and once.is_at(states, values):
             residual, matrix = once.residual, once.jacobian
         else:
             residual, matrix, _ = measured.linearize(states, values)
-        if matrix.shape != (rows, edges[-1]) or len(jacobians) != len(sizes):
+        if matrix.shape != (rows, edges[-1]) or len(jacobians) != len(sizes) + len(added):
             raise ValueError(f"Jacobian of shape {matrix.shape}, expected {(rows, edges[-1])}")
         matrix = matrix * weight[:, None]
         for i in range(len(sizes)):
             jacobians[i] = np.asfortranarray(matrix[:, edges[i] : edges[i + 1]])
-        return weight * residual
+        for i, (_, gain) in enumerate(added, start=len(sizes)):
+            jacobians[i] = np.asfortranarray(weight[:, None] * gain)
+        return weight * (residual + error)
 
+    every += [key for key, _ in added]
     return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(rows), every, error)
 
 

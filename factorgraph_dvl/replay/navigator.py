@@ -116,6 +116,7 @@ class Navigator:
             walking=start.walking,
             lag=lag,
             ranges=start.ranges,
+            errors=start.errors.size,
         )
         self._report = CalibrationReport(start.all_parameters, *imu.parameters(0.0))
         self._gravity = LocalGravity(start.frame)
@@ -185,6 +186,10 @@ class Navigator:
                 )
             )
             values.insert(keys.bias(k + 1), bias)
+        errors = self.start.errors
+        if errors.size:
+            factors.add(errors.transition(k, duration))
+            values.insert(keys.correlated(k + 1), errors.after(duration) * s.errors(k))
         end = float(seg.node_time[1])
         time = epochs_between(self.time, end, TRAJECTORY_RATE)
         measured, epochs = attached(aids, seg, gravity, self.start, self.values, time)
@@ -301,7 +306,9 @@ class Navigator:
         return np.repeat([s.accel_bias_walk_root_psd, s.gyro_bias_walk_root_psd], 3)
 
     def _refresh(self) -> None:
-        self._P = self.smoother.joint_covariance()
+        self._P_with_errors = self.smoother.joint_covariance()
+        size = len(self._P_with_errors) - self.start.errors.size
+        self._P = self._P_with_errors[:size, :size]
         self.values = {**self.start.fixed, **self.smoother.calibration()}
 
     def _add_factor(
@@ -326,9 +333,14 @@ class Navigator:
             states = state_of(s.state(k), s.bias(k))
             residual, matrix, motions = measured.linearize(states, self.values)
         sigma = measured.sigma(motions, self.values)
-        weights, innovations, findings = gated(
-            measured, residual, matrix, sigma, self._P[own[:, None], own], self._gate
-        )
+        errors = None
+        if self.start.errors.size:
+            errors, error = self._correlated_errors(k, measured)
+            residual = residual + error
+            matrix = np.hstack([matrix, sum(errors.values())])
+            own = np.append(own, np.arange(len(self._P), len(self._P_with_errors)))
+        P = self._P_with_errors[own[:, None], own]
+        weights, innovations, findings = gated(measured, residual, matrix, sigma, P, self._gate)
         self.innovations += innovations
         self.findings += findings
         state_P = self._P[:STATE_SIZE, :STATE_SIZE]
@@ -337,9 +349,20 @@ class Navigator:
         weight = np.concatenate([w.ravel() for w in weights])
         if weight.any():
             shared = [s.calibration_keys[name] for name in names]
-            factors.add(
-                measurement_factor(measured, weight, keys.node(k), s.bias_key(k), shared, first)
-            )
+            node, bias = keys.node(k), s.bias_key(k)
+            factors.add(measurement_factor(measured, weight, node, bias, shared, first, errors))
+
+    def _correlated_errors(
+        self, k: int, measured: NodeMeasurements
+    ) -> tuple[dict[int, Array], Array]:
+        """Return the derivatives of residuals after state k by its errors, and their estimate."""
+        s, errors = self.smoother, self.start.errors
+        duration = float(self._segments[k].segment.duration[0])
+        by_before, by_after = errors.gains(measured, duration)
+        before = s.errors(k)
+        after = errors.after(duration) * before if k == s.node else s.errors(k + 1)
+        gains = {keys.correlated(k): by_before, keys.correlated(k + 1): by_after}
+        return gains, by_before @ before + by_after @ after
 
     def _local_coordinates(self, origin: _LinearizationPoint) -> Array:
         """Return newest state, bias and parameters in the tangent space at a point."""

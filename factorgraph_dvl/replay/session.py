@@ -114,7 +114,7 @@ class Replay:
                 sensor=aid.label,
             )
             for aid in settings.aids
-            if aid.settings.states_correlation
+            if aid.settings.left_out
         ]
         self._settings = settings
         self._kind = smoother

@@ -61,6 +61,8 @@ class Smoother:
         Age at which states are marginalised, s; None = never.
     ranges : bool, default False
         Whether there are ranges, which are not linear in the position.
+    errors : int, default 0
+        Size of the vector of correlated errors that every state has, `keys.correlated`.
     """
 
     def __init__(
@@ -74,6 +76,7 @@ class Smoother:
         walking: bool,
         lag: float | None,
         ranges: bool = False,
+        errors: int = 0,
     ) -> None:
         self.parameters = tuple(parameters)
         self.calibration_keys = {
@@ -82,12 +85,13 @@ class Smoother:
         self.node = node
         self.times = {node: time}
         self._walking = walking
+        self._errors = errors
         self._lag = lag
         self._checked = time
         self._state_step = _STATE_STEP.copy()
         if ranges:
             self._state_step[3:6] = _POSITION_STEP_BY_RANGES
-        settings = _settings(self.parameters, self._state_step, fixed=lag is not None)
+        settings = _settings(self.parameters, self._state_step, errors, fixed=lag is not None)
         self._isam = gtsam.ISAM2(settings)
         self._sizes = {key: int(size) for key, size in values.dims().items()}
         self._update(prior, values, node)
@@ -113,7 +117,7 @@ class Smoother:
         factors : gtsam.NonlinearFactorGraph
             Factors that tie it to the one before, and measurements after that one.
         values : gtsam.Values
-            Start values of the new state, and of its bias if that walks.
+            Start values of the new state, of its bias if that walks, and of its errors.
         """
         if self._lag is not None:
             gone = [k for k, t in self.times.items() if t < time - self._lag and k < self.node]
@@ -136,6 +140,10 @@ class Smoother:
         """Return the estimate of the bias at state k."""
         return self._isam.calculateEstimateConstantBias(self.bias_key(k))
 
+    def errors(self, k: int) -> Array:
+        """Return the estimate of the correlated errors at state k, (n,), of unit variance."""
+        return self._isam.calculateEstimateVector(keys.correlated(k))
+
     def calibration(self) -> dict[str, Array]:
         """Return the estimates of the parameters, SI; rotations as matrices."""
         return {
@@ -146,12 +154,15 @@ class Smoother:
         }
 
     def joint_covariance(self) -> Array:
-        """Return the joint covariance of newest state, its bias and the parameters.
+        """Return the joint covariance of newest state, its bias, the parameters and its errors.
 
         In that order, in GTSAM's tangent space, SI: attitude, position, velocity, bias of
-        accelerometer and gyro, parameters.
+        accelerometer and gyro, parameters, correlated errors.
         """
-        wanted = self._top()
+        return self._covariance_of(self._top())
+
+    def _covariance_of(self, wanted: Sequence[int]) -> Array:
+        """Return the joint covariance of variables at the root of the tree, in their order."""
         net = self._isam.jointBayesNet(wanted, gtsam.EliminateQR)
         sizes = {key: self._sizes[key] for key in wanted}
         order = [net.at(i).firstFrontalKey() for i in range(net.size())]
@@ -187,22 +198,24 @@ class Smoother:
         """
         net = self._isam.jointBayesNet(self._in_time(), gtsam.EliminateQR)
         nodes = list(self.times)
-        own = STATE_SIZE + (BIAS_SIZE if self._walking else 0)
-        P = self.joint_covariance()
+        top = [*self._of_state(self.node), *self._shared()]
+        own = sum(self._sizes[key] for key in self._of_state(self.node))
+        P = self._covariance_of(top)
         rows = np.zeros((len(nodes) - 1, own, own + len(P)))
         # Column of each variable in its own rows; that of the next state is by `own` further.
         column, at = {}, own
-        for key in self._top():
+        for key in top:
             column[key] = at
             at += self._sizes[key]
         number = {}
         for j, k in enumerate(nodes):
-            for offset, key in ((0, keys.node(k)), (STATE_SIZE, self.bias_key(k))):
-                if offset < own:
-                    number[key], column[key] = j, offset
+            offset = 0
+            for key in self._of_state(k):
+                number[key], column[key] = j, offset
+                offset += self._sizes[key]
         # Conditionals that depend on the same variables, relative to their own, come in runs.
         columns: dict[tuple[int, ...], IntArray] = {}
-        for i in range(len(rows) * (2 if self._walking else 1)):
+        for i in range(len(rows) * len(self._of_state(self.node))):
             conditional = net.at(i)
             first, *others = conditional.keys()
             j, start = number[first], column[first]
@@ -236,16 +249,26 @@ class Smoother:
         return np.asarray(0.5 * (found + found.transpose(0, 2, 1)))
 
     def _top(self) -> list[int]:
-        return [keys.node(self.node), self.bias_key(self.node), *self.calibration_keys.values()]
+        errors = [keys.correlated(self.node)] if self._errors else []
+        calibration = self.calibration_keys.values()
+        return [keys.node(self.node), self.bias_key(self.node), *calibration, *errors]
+
+    def _of_state(self, k: int) -> list[int]:
+        """Return the keys of state k, of its bias if that walks, and of its errors."""
+        out = [keys.node(k)]
+        if self._walking:
+            out.append(keys.bias(k))
+        if self._errors:
+            out.append(keys.correlated(k))
+        return out
+
+    def _shared(self) -> list[int]:
+        """Return the keys of what all states share."""
+        return [*([] if self._walking else [keys.bias(0)]), *self.calibration_keys.values()]
 
     def _in_time(self) -> list[int]:
         """Return all keys in the order of elimination."""
-        out = []
-        for k in self.times:
-            out.append(keys.node(k))
-            if self._walking:
-                out.append(keys.bias(k))
-        return [*out, *([] if self._walking else [keys.bias(0)]), *self.calibration_keys.values()]
+        return [*(key for k in self.times for key in self._of_state(k)), *self._shared()]
 
     def _update(
         self, factors: gtsam.NonlinearFactorGraph, values: gtsam.Values, first: int
@@ -272,11 +295,7 @@ class Smoother:
                 if self._isam.valueExists(key):
                     again.push_back(key)
             settings.extraReelimKeys = again
-        pairs = []
-        for i, k in enumerate(nodes):
-            pairs.append((keys.node(k), i))
-            if self._walking:
-                pairs.append((keys.bias(k), i))
+        pairs = [(key, i) for i, k in enumerate(nodes) for key in self._of_state(k)]
         pairs += [(key, len(nodes)) for key in self._top()]
         settings.constrainedKeys = _groups(pairs)
         self._isam.update(factors, values, settings)
@@ -299,18 +318,15 @@ class Smoother:
 
     def _marginalise(self, k: int) -> None:
         leaves = gtsam.KeyList()
-        leaves.push_back(keys.node(k))
-        if self._walking:
-            leaves.push_back(keys.bias(k))
+        for key in self._of_state(k):
+            leaves.push_back(key)
+            del self._sizes[key]
         self._isam.marginalizeLeaves(leaves)
         del self.times[k]
-        del self._sizes[keys.node(k)]
-        if self._walking:
-            del self._sizes[keys.bias(k)]
 
 
 def _settings(
-    parameters: Sequence[Parameter], state_step: Array, *, fixed: bool
+    parameters: Sequence[Parameter], state_step: Array, errors: int, *, fixed: bool
 ) -> gtsam.ISAM2Params:
     settings = gtsam.ISAM2Params()
     # Cholesky has no digits left at navigation grade.
@@ -325,6 +341,10 @@ def _settings(
     step = _NEVER if fixed else _CALIBRATION_STEP
     for size in {p.mean.size for p in parameters}:
         thresholds.insert((keys.letter(size), np.full(size, step)))
+    if errors:
+        # Measurements are linear in them.
+        letter = keys.letter_of(keys.correlated(0))
+        thresholds.insert((letter, np.full(errors, _NEVER)))
     settings.setRelinearizeThreshold(thresholds)
     return settings
 

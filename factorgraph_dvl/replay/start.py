@@ -16,6 +16,7 @@ from factorgraph_dvl.graph import keys
 from factorgraph_dvl.graph.priors import ConstantsPrior, prior_mean
 from factorgraph_dvl.graph.problem import Evaluation, Problem
 from factorgraph_dvl.imu.propagation import States
+from factorgraph_dvl.replay.correlated_errors import CorrelatedErrors
 from factorgraph_dvl.sensors.finding import Finding
 from factorgraph_dvl.sensors.message import Message, message
 from factorgraph_dvl.sensors.parameters import Parameter
@@ -69,6 +70,8 @@ class ReplayStart:
         Spurious information on the parameters, in units of the priors' standard deviations.
     walking : bool
         Whether biases walk.
+    errors : CorrelatedErrors
+        Correlated errors of the sensors.
     clock_zero : float
         When the offsets of clocks hold, s.
     trajectory : Trajectory
@@ -94,6 +97,7 @@ class ReplayStart:
     windows: tuple[int, int]
     spurious: Array
     walking: bool
+    errors: CorrelatedErrors
     clock_zero: float
     trajectory: Trajectory
     findings: tuple[Finding, ...]
@@ -176,13 +180,20 @@ def solve_start(
     last = chain.segments.node_time.size - 1
     values = _last_values(problem, evaluation.values, last)
     gaussian = problem.linearize(evaluation)
+    time = float(chain.segments.node_time[-1])
+    errors = CorrelatedErrors.of(problem.processes)
+    if errors.size:
+        found = errors.add_start(
+            gaussian, problem.processes, evaluation.parameters, last, time
+        )
+        values.insert(keys.correlated(last), found)
     eliminated = [key for key in evaluation.values.dims() if not values.exists(key)]
     _, rest = gaussian.eliminatePartialMultifrontal(eliminated, gtsam.EliminateQR)
     return ReplayStart(
         frame=chain.frame,
         body_axes=trial.body_axes,
         node=last,
-        time=float(chain.segments.node_time[-1]),
+        time=time,
         prior=gtsam.LinearContainerFactor.ConvertLinearGraph(rest, values),
         values=values,
         parameters=problem.parameters,
@@ -194,6 +205,7 @@ def solve_start(
         windows=chain.segments.increments.chosen_windows,
         spurious=spurious,
         walking=chain.walking,
+        errors=errors,
         clock_zero=clock_zero,
         trajectory=_trajectory(
             problem, evaluation.states, covariances.nodes, trial.body_axes, since
