@@ -41,6 +41,26 @@ TURNING = [
     {"turn_deg_s": 8, "duration_s": 20, "ramp_s": 4},
     {"straight_s": 10},
 ]
+# Half the variance of GNSS and DVL persists, and the trial states both halves.
+CORRELATED: dict[str, Any] = {
+    "gnss": {"correlated_share": 0.5, "velocity_correlated_share": 0.5},
+    "dvl": {"correlated_share": 0.5, "correlation_time_s": 5},
+    "trial": {
+        "gnss": {
+            "position_std_m": [0.354, 0.354, 0.707],
+            "correlated_std_m": [0.354, 0.354, 0.707],
+            "correlation_time_s": 100,
+            "velocity_std_m_s": [0.0707, 0.0707, 0.0707],
+            "correlated_velocity_std_m_s": [0.0707, 0.0707, 0.0707],
+            "velocity_correlation_time_s": 2,
+        },
+        "dvl": {
+            "velocity_std_fraction": 0.00141,
+            "correlated_std_m_s": 0.00566,
+            "correlation_time_s": 5,
+        },
+    },
+}
 _BASE: dict[str, Any] = {
     "name": "test",
     "noise": False,

@@ -109,12 +109,12 @@ class Replay:
             self._findings.append(_IMU_ERRORS_LEFT_OUT)
         self._findings += [
             Finding(
-                Code.CORRELATION_LEFT_OUT,
-                message("correlation_left_out.replay"),
+                Code.SCALE_WALK_LEFT_OUT,
+                message("scale_walk_left_out.replay", section=aid.section, name=key),
                 sensor=aid.label,
             )
             for aid in settings.aids
-            if aid.settings.left_out
+            for key in aid.settings.left_out
         ]
         self._settings = settings
         self._kind = smoother

@@ -183,9 +183,7 @@ def solve_start(
     time = float(chain.segments.node_time[-1])
     errors = CorrelatedErrors.of(problem.processes)
     if errors.size:
-        found = errors.add_start(
-            gaussian, problem.processes, evaluation.parameters, last, time
-        )
+        found = errors.add_start(gaussian, problem.processes, evaluation.parameters, last, time)
         values.insert(keys.correlated(last), found)
     eliminated = [key for key in evaluation.values.dims() if not values.exists(key)]
     _, rest = gaussian.eliminatePartialMultifrontal(eliminated, gtsam.EliminateQR)

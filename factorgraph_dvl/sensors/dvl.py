@@ -107,11 +107,6 @@ class DvlSettings(ClockSection, frozen=True, kw_only=True):
         """The walk of the scale, where there is one."""
         return ("scale_walk_std_sqrt_h",) if self.scale_walk_std_sqrt_h > 0.0 else ()
 
-    @property
-    def states_correlation(self) -> bool:
-        """Whether velocities have a part that is correlated, or whose scale walks."""
-        return not isinstance(self.correlated_std_m_s, UnsetType) or bool(self.left_out)
-
     def __post_init__(self) -> None:
         super().__post_init__()
         scales = np.atleast_1d(self.scale_error)

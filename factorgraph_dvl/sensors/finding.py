@@ -607,11 +607,11 @@ class Code(StrEnum):
         "Standard deviations do not contain the effect of this error.",
         "Use --halves, which reports changes that are larger than chance.",
     )
-    CORRELATION_LEFT_OUT = (
-        "correlation_left_out",
-        "The replay treats correlated noise as white noise.",
+    SCALE_WALK_LEFT_OUT = (
+        "scale_walk_left_out",
+        "The replay takes a scale that walks as constant.",
         "Its standard deviations are too small.",
-        "Use `solve` for standard deviations that contain it.",
+        "Use `solve` for standard deviations that contain the walk.",
     )
     IMU_ERRORS_LEFT_OUT = (
         "imu_errors_left_out",

@@ -73,12 +73,6 @@ class GnssSettings(ClockSection, frozen=True, kw_only=True):
     velocity_correlation_time_s: Positive | UnsetType = UNSET
     correlated_velocity_std_m_s: Sigma3 | UnsetType = UNSET
 
-    @property
-    def states_correlation(self) -> bool:
-        """Whether position or velocity have a correlated part."""
-        stated = (self.correlated_std_m, self.correlated_velocity_std_m_s)
-        return not all(isinstance(std, UnsetType) for std in stated)
-
 
 @dataclass(frozen=True)
 class Gnss:

@@ -254,11 +254,6 @@ class SensorSection(Section, frozen=True, kw_only=True):
         return ()
 
     @property
-    def states_correlation(self) -> bool:
-        """Whether a part of its noise persists, as the trial states it."""
-        return False
-
-    @property
     def more_columns(self) -> tuple[str, ...]:
         """Columns that the table must have because the settings say so."""
         return ()

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from findings import of_code
 from scipy.spatial.transform import Rotation
-from truth import config, scenario
+from truth import CORRELATED, config, scenario
 
 from factorgraph_dvl.analysis.error_statistics import motion_errors
 from factorgraph_dvl.replay import Replay, replay
@@ -215,10 +215,16 @@ def test_a_beacon_out_of_reach_is_no_hindrance():
     assert solve(replace(trial, others=others), anyway=True).converged
 
 
-def test_stated_correlation_is_said_to_be_left_out():
+def test_a_scale_that_walks_is_said_to_be_left_out():
     trial = simulate(scenario(manoeuvres=[{"straight_s": 2}]), 0)
-    stated = msgspec.structs.replace(trial.gnss.settings, correlated_std_m=(1.0, 1.0, 2.0))
-    session = Replay(replace(trial, gnss=replace(trial.gnss, settings=stated)))
-    (finding,) = (f for f in session.findings if f.code == Code.CORRELATION_LEFT_OUT)
-    assert finding.sensor == "GNSS"
-    assert all(f.code != Code.CORRELATION_LEFT_OUT for f in Replay(trial).findings)
+    stated = msgspec.structs.replace(trial.dvl.settings, scale_walk_std_sqrt_h=1e-3)
+    session = Replay(replace(trial, dvl=replace(trial.dvl, settings=stated)))
+    (finding,) = (f for f in session.findings if f.code == Code.SCALE_WALK_LEFT_OUT)
+    assert finding.sensor == "DVL"
+    assert all(f.code != Code.SCALE_WALK_LEFT_OUT for f in Replay(trial).findings)
+
+
+def test_correlated_noise_as_the_trial_states_it():
+    """Position and velocity of GNSS, and velocity of the DVL, each with a process of its own."""
+    scene = config("seed-a-phase-90", manoeuvres=TURNS, reference_rate_hz=100, **CORRELATED)
+    as_the_batch(simulate(scene, 1), rate=2.0)

@@ -13,7 +13,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from truth import config
+from truth import CORRELATED, config
 from workers import in_two_processes
 
 from factorgraph_dvl.analysis.error_statistics import motion_errors, nees_band, true_value_of
@@ -30,6 +30,7 @@ _RARE = 0.003
 TIMES = {
     "seed-a-phase-0": (40.0, 60.0, 90.0, 130.0, 180.0, 250.0, 350.0, 453.0),
     "seed-a-phase-90": (40.0, 60.0, 90.0, 130.0, 180.0, 250.0, 350.0, 453.0),
+    "correlated noise": (40.0, 60.0, 90.0, 130.0, 180.0, 250.0, 350.0, 453.0),
     "cruise": (60.0, 100.0, 200.0, 300.0, 450.0, 600.0, 900.0, 1200.0),
 }
 # Of 4800 s.
@@ -44,6 +45,7 @@ class Run:
     nees: np.ndarray
     motion: np.ndarray
     apart: np.ndarray
+    ratio: np.ndarray
     started: float
 
 
@@ -52,9 +54,15 @@ def up_to(trial, end):
     return replace(trial, imu=rows_of(trial.imu, trial.imu.time < end), gnss=gnss, dvl=dvl)
 
 
+def scene_of(name):
+    if name == "correlated noise":
+        return config("seed-a-phase-90", reference_rate_hz=100, **CORRELATED)
+    return config(name, reference_rate_hz=100)
+
+
 def one(job):
     name, seed = job
-    trial = up_to(simulate(config(name, reference_rate_hz=100), seed), END)
+    trial = up_to(simulate(scene_of(name), seed), END)
     session, updates = Replay(trial, rate_hz=1.0), []
     imu = trial.imu
     edges = np.arange(0.0, imu.time[-1] + 1.0, 1.0)
@@ -78,11 +86,13 @@ def one(job):
         nees.append(error @ np.linalg.solve(P, error))
         errors = motion_errors(u.state, trial.reference)
         motion.append([v.nees[0] for v in (errors.position, errors.velocity, errors.attitude)])
-    batch = solve(trial)
+    # A replay takes the noise as it is stated.
+    batch = solve(replace(trial, noise="stated"))
     value = np.concatenate([e.value for e in batch.estimates])
     last = np.concatenate([e.value for e in updates[-1].calibration.estimates])
-    apart = (last - value) / np.sqrt(np.diag(batch.covariance))
-    return Run(np.array(nees), np.array(motion), apart, time[0])
+    std = np.sqrt(np.diag(batch.covariance))
+    ratio = np.sqrt(np.diag(updates[-1].calibration.covariance)) / std
+    return Run(np.array(nees), np.array(motion), (last - value) / std, ratio, time[0])
 
 
 @pytest.fixture(scope="module", params=TIMES)
@@ -94,6 +104,8 @@ def test_every_run_starts_soon_and_ends_where_the_batch_solver_does(runs):
     assert max(r.started for r in runs) < 40.0
     worst = np.max(np.abs([r.apart for r in runs]), axis=0)
     assert np.all(worst < 0.3), worst
+    ratio = np.array([r.ratio for r in runs])
+    assert np.all((ratio > 0.9) & (ratio < 1.1)), ratio
 
 
 def test_the_calibration_is_as_good_as_stated_all_along(runs):
