@@ -24,7 +24,7 @@ def highest_difference(values: Array, edges: Array, width: int, averaged: bool) 
     out = values
     for order in range(1, width):
         span = edges[order + reach :] - edges[: -order - reach]
-        out = np.diff(out, axis=0) / span[:, None]
+        out = (out[1:] - out[:-1]) / span[:, None]
     factor = factorial(width) if averaged else factorial(width - 1)
     return np.asarray(out * factor * median(np.diff(edges)) ** (width - 1))
 

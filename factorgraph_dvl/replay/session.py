@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import replace
@@ -330,6 +331,9 @@ class Replay:
         )
         self._samples.windows = start.windows
         self._smoothed_to = start.node
+        # What is there now stays: to look for cycles in it again takes 5 ms of some updates.
+        gc.collect()
+        gc.freeze()
         return self._navigator
 
     def _solve_again(self, before: Navigator) -> Navigator | None:

@@ -93,6 +93,8 @@ class Smoother:
             self._state_step[3:6] = _POSITION_STEP_BY_RANGES
         settings = _settings(self.parameters, self._state_step, errors, fixed=lag is not None)
         self._isam = gtsam.ISAM2(settings)
+        # By state, what `_all_rows` has; it lasts until an old state is touched.
+        self._rows: dict[int, Array] = {}
         self._sizes = {key: int(size) for key, size in values.dims().items()}
         self._update(prior, values, node)
 
@@ -130,28 +132,44 @@ class Smoother:
 
     def correct(self, factors: gtsam.NonlinearFactorGraph, first: int) -> None:
         """Add measurements of states that are there, the oldest of index `first`."""
+        self._rows.clear()
         self._update(factors, gtsam.Values(), first)
 
     def state(self, k: int) -> gtsam.NavState:
         """Return the estimate of state k."""
-        return self._isam.calculateEstimateNavState(keys.node(k))
+        key = keys.node(k)
+        if key in self._place:
+            at = self._isam.getLinearizationPoint().atNavState(key)
+            return at.retract(self._step[self._place[key]])
+        return self._isam.calculateEstimateNavState(key)
 
     def bias(self, k: int) -> gtsam.imuBias.ConstantBias:
         """Return the estimate of the bias at state k."""
-        return self._isam.calculateEstimateConstantBias(self.bias_key(k))
+        key = self.bias_key(k)
+        if key in self._place:
+            at = self._isam.getLinearizationPoint().atConstantBias(key)
+            return at.retract(self._step[self._place[key]])
+        return self._isam.calculateEstimateConstantBias(key)
 
     def errors(self, k: int) -> Array:
         """Return the estimate of the correlated errors at state k, (n,), of unit variance."""
-        return self._isam.calculateEstimateVector(keys.correlated(k))
+        key = keys.correlated(k)
+        if key in self._place:
+            at = self._isam.getLinearizationPoint().atVector(key)
+            return np.asarray(at + self._step[self._place[key]])
+        return self._isam.calculateEstimateVector(key)
 
     def calibration(self) -> dict[str, Array]:
         """Return the estimates of the parameters, SI; rotations as matrices."""
-        return {
-            p.name: self._isam.calculateEstimateRot3(key).matrix()
-            if p.rotation
-            else self._isam.calculateEstimateVector(key)
-            for p, key in zip(self.parameters, self.calibration_keys.values(), strict=True)
-        }
+        at, out = self._isam.getLinearizationPoint(), {}
+        for p in self.parameters:
+            key = self.calibration_keys[p.name]
+            step = self._step[self._place[key]]
+            value = (
+                at.atRot3(key).retract(step).matrix() if p.rotation else at.atVector(key) + step
+            )
+            out[p.name] = np.asarray(value)
+        return out
 
     def joint_covariance(self) -> Array:
         """Return the joint covariance of newest state, its bias, the parameters and its errors.
@@ -162,23 +180,38 @@ class Smoother:
         return self._covariance_of(self._top())
 
     def _covariance_of(self, wanted: Sequence[int]) -> Array:
-        """Return the joint covariance of variables at the root of the tree, in their order."""
-        net = self._isam.jointBayesNet(wanted, gtsam.EliminateQR)
-        sizes = {key: self._sizes[key] for key in wanted}
-        order = [net.at(i).firstFrontalKey() for i in range(net.size())]
-        R, _ = net.matrix()
-        starts = dict(zip(order, accumulate(sizes[key] for key in order), strict=True))
-        index = [i for key in wanted for i in range(starts[key] - sizes[key], starts[key])]
-        inverse, _ = dtrtri(R)
-        own = inverse[index]
+        """Return the joint covariance of variables of `_solve_newest`, in their order."""
+        own = np.concatenate([self._inverse[self._place[key]] for key in wanted])
         return np.asarray(own @ own.T)
+
+    def _solve_newest(self) -> None:
+        """Solve for the newest two states and what all share.
+
+        iSAM2's own estimates are of all states, and take longer than this.
+        """
+        before = self._of_state(self.node - 1) if self.node - 1 in self.times else []
+        net = self._isam.jointBayesNet([*before, *self._top()], gtsam.EliminateQR)
+        order = [net.at(i).firstFrontalKey() for i in range(net.size())]
+        ends = accumulate(self._sizes[key] for key in order)
+        self._place = {
+            key: slice(end - self._sizes[key], end) for key, end in zip(order, ends, strict=True)
+        }
+        R, d = net.matrix()
+        self._inverse, _ = dtrtri(R)
+        self._step = self._inverse @ d
+        if before and order[: len(before)] == before:
+            later = [*self._of_state(self.node), *self._shared()]
+            own = self._place[before[-1]].stop
+            parts = [R[:own, self._place[key]] for key in later]
+            self._rows[self.node - 1] = np.concatenate([R[:own, :own], *parts], axis=1)
 
     def states(self, wanted: Sequence[int]) -> States:
         """Return the estimates of states, by their indices, with the biases there."""
         each = [self.state(k) for k in wanted]
-        own = [self.bias_key(k) for k in wanted]
-        found = {key: self._isam.calculateEstimateConstantBias(key).vector() for key in set(own)}
-        bias = np.array([found[key] for key in own])
+        if self._walking:
+            bias = np.array([self.bias(k).vector() for k in wanted])
+        else:
+            bias = np.tile(self.bias(self.node).vector(), (len(each), 1))
         return States(
             np.array([state.attitude().matrix() for state in each]),
             np.array([state.position() for state in each]),
@@ -196,40 +229,12 @@ class Smoother:
 
         for the rows [R T] of the square root of the information.
         """
-        net = self._isam.jointBayesNet(self._in_time(), gtsam.EliminateQR)
-        nodes = list(self.times)
+        if len(self._rows) < len(self.times) - 1:
+            self._rows = dict(zip(self.times, self._all_rows(), strict=False))
+        nodes, rows = list(self.times), np.array(list(self._rows.values()))
         top = [*self._of_state(self.node), *self._shared()]
-        own = sum(self._sizes[key] for key in self._of_state(self.node))
+        own = rows.shape[1]
         P = self._covariance_of(top)
-        rows = np.zeros((len(nodes) - 1, own, own + len(P)))
-        # Column of each variable in its own rows; that of the next state is by `own` further.
-        column, at = {}, own
-        for key in top:
-            column[key] = at
-            at += self._sizes[key]
-        number = {}
-        for j, k in enumerate(nodes):
-            offset = 0
-            for key in self._of_state(k):
-                number[key], column[key] = j, offset
-                offset += self._sizes[key]
-        # Conditionals that depend on the same variables, relative to their own, come in runs.
-        columns: dict[tuple[int, ...], IntArray] = {}
-        for i in range(len(rows) * len(self._of_state(self.node))):
-            conditional = net.at(i)
-            first, *others = conditional.keys()
-            j, start = number[first], column[first]
-            pattern = (start, *[key - first if key in number else key for key in others])
-            if pattern not in columns:
-                columns[pattern] = np.concatenate(
-                    [
-                        column[key] + own * (number.get(key, j) - j) + np.arange(self._sizes[key])
-                        for key in others
-                    ]
-                )
-            own_rows = rows[j, start : start + self._sizes[first]]
-            own_rows[:, start : start + self._sizes[first]] = conditional.R()
-            own_rows[:, columns[pattern]] = conditional.S()
         inverse = np.linalg.inv(rows[:, :, :own])
         gain = -inverse @ rows[:, :, own:]
         noise = inverse @ inverse.transpose(0, 2, 1)
@@ -242,11 +247,48 @@ class Smoother:
             by_next = gain[j, :, :own]
             shared[j] = by_next @ shared[j + 1] + gain[j, :, own:]
             alone[j] = by_next @ alone[j + 1] @ by_next.T + noise[j]
-        index = [number[keys.node(k)] for k in wanted]
+        index = [nodes.index(k) for k in wanted]
         across = shared[index, :STATE_SIZE]
         found = alone[index, :STATE_SIZE, :STATE_SIZE]
         found = found + across @ P[own:, own:] @ across.transpose(0, 2, 1)
         return np.asarray(0.5 * (found + found.transpose(0, 2, 1)))
+
+    def _all_rows(self) -> Array:
+        """Return rows [R T] (K - 1, own, 2 own + shared) of all states but the newest."""
+        net = self._isam.jointBayesNet(self._in_time(), gtsam.EliminateQR)
+        nodes = list(self.times)
+        size, shared = self._sizes, self._shared()
+        own = sum(size[key] for key in self._of_state(self.node))
+        rows = np.zeros((len(nodes) - 1, own, 2 * own + sum(size[key] for key in shared)))
+        # Column of each variable in its own rows; that of the next state is by `own` further.
+        column, at = {}, own
+        for key in [*self._of_state(self.node), *shared]:
+            column[key] = at
+            at += size[key]
+        number = {}
+        for j, k in enumerate(nodes):
+            offset = 0
+            for key in self._of_state(k):
+                number[key], column[key] = j, offset
+                offset += size[key]
+        # Conditionals that depend on the same variables, relative to their own, come in runs.
+        columns: dict[tuple[int, ...], IntArray] = {}
+        for i in range(len(rows) * len(self._of_state(self.node))):
+            conditional = net.at(i)
+            first, *others = conditional.keys()
+            j, start = number[first], column[first]
+            pattern = (start, *[key - first if key in number else key for key in others])
+            if pattern not in columns:
+                columns[pattern] = np.concatenate(
+                    [
+                        column[key] + own * (number.get(key, j) - j) + np.arange(size[key])
+                        for key in others
+                    ]
+                )
+            own_rows = rows[j, start : start + size[first]]
+            own_rows[:, start : start + size[first]] = conditional.R()
+            own_rows[:, columns[pattern]] = conditional.S()
+        return rows
 
     def _top(self) -> list[int]:
         errors = [keys.correlated(self.node)] if self._errors else []
@@ -276,12 +318,15 @@ class Smoother:
         settings = gtsam.ISAM2UpdateParams()
         if self._lag is None:
             settings.constrainedKeys = _groups([(key, 1) for key in self._top()])
+            self._rows.clear()
             self._isam.update(factors, values, settings)
+            self._solve_newest()
             return
         moved = self._moved()
         if moved is not None:
             first = min(first, moved)
             settings.force_relinearize = True
+            self._rows.clear()
         # What is touched, and all above it in the tree, is eliminated anew: in the order of
         # time, so that the oldest state stays a leaf. Groups beyond the number of variables
         # are not allowed; calibration and bias are in one.
@@ -299,6 +344,7 @@ class Smoother:
         pairs += [(key, len(nodes)) for key in self._top()]
         settings.constrainedKeys = _groups(pairs)
         self._isam.update(factors, values, settings)
+        self._solve_newest()
 
     def _moved(self) -> int | None:
         """Return the oldest state that has moved too far from where it was linearised."""
@@ -323,6 +369,7 @@ class Smoother:
             del self._sizes[key]
         self._isam.marginalizeLeaves(leaves)
         del self.times[k]
+        self._rows.pop(k, None)
 
 
 def _settings(
