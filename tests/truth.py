@@ -44,7 +44,12 @@ TURNING = [
 # Half the variance of GNSS and DVL persists, and the trial states both halves.
 CORRELATED: dict[str, Any] = {
     "gnss": {"correlated_share": 0.5, "velocity_correlated_share": 0.5},
-    "dvl": {"correlated_share": 0.5, "correlation_time_s": 5},
+    "dvl": {
+        "velocity_std_m_s": 0.008,
+        "velocity_std_fraction": 0,
+        "correlated_share": 0.5,
+        "correlation_time_s": 5,
+    },
     "trial": {
         "gnss": {
             "position_std_m": [0.354, 0.354, 0.707],
@@ -55,7 +60,8 @@ CORRELATED: dict[str, Any] = {
             "velocity_correlation_time_s": 2,
         },
         "dvl": {
-            "velocity_std_fraction": 0.00141,
+            "velocity_std_m_s": 0.00566,
+            "velocity_std_fraction": 0,
             "correlated_std_m_s": 0.00566,
             "correlation_time_s": 5,
         },

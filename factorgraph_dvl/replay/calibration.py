@@ -12,8 +12,8 @@ from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph.keys import BIAS_SIZE
 from factorgraph_dvl.graph.priors import local_coordinates, places, prior_mean, prior_root
 from factorgraph_dvl.sensors.parameters import Parameter
-from factorgraph_dvl.solution import Estimate
-from factorgraph_dvl.solvers.reported import estimates_of, in_order, in_unit
+from factorgraph_dvl.solution import Estimate, as_estimates
+from factorgraph_dvl.solvers.reported import in_order, in_unit
 
 
 @dataclass(frozen=True)
@@ -45,9 +45,23 @@ class CalibrationReport:
 
     def __init__(self, parameters: Sequence[Parameter], gyro: Parameter, accel: Parameter) -> None:
         self._free = [p for p in parameters if p.estimated]
-        self._rows = in_order([gyro, accel, *parameters], lambda p: p)
-        self._exact = {p.name: in_unit(p, prior_mean(p)) for p in self._rows if not p.estimated}
-        self._column = places([accel, gyro, *self._free])
+        rows = in_order([gyro, accel, *parameters], lambda p: p)
+        self._parameters = tuple(rows)
+        place, columns = places(rows), places([accel, gyro, *self._free])
+        self._biases = accel.name, gyro.name
+        size = sum(p.mean.size for p in rows)
+        self._values = np.empty(size)
+        # Of all components by the tangent space of those that are estimated; rotations come later.
+        self._derivative = np.zeros((size, sum(p.mean.size for p in [accel, gyro, *self._free])))
+        self._varying: list[tuple[Parameter, slice, slice]] = []
+        for p in rows:
+            own = place[p.name]
+            if not p.estimated:
+                self._values[own] = in_unit(p, prior_mean(p)).value
+                continue
+            self._varying.append((p, own, columns[p.name]))
+            self._derivative[own, columns[p.name]] = np.eye(p.mean.size) / p.si
+        self._exact = np.concatenate([p.sigma == 0.0 for p in rows])
 
     def at(
         self, values: Mapping[str, Array], bias: Array, P: Array, undetermined: Array
@@ -74,21 +88,18 @@ class CalibrationReport:
         """
         if undetermined.size:
             values, P = _at_prior(self._free, values, P, undetermined)
-        accel, gyro = list(self._column)[:2]
+        accel, gyro = self._biases
         values = {**values, accel: bias[:3], gyro: bias[3:]}
-        rows = [
-            self._exact[p.name] if p.name in self._exact else in_unit(p, values[p.name])
-            for p in self._rows
-        ]
-        T = np.zeros((P.shape[0], P.shape[0]))
-        at = 0
-        for r in rows:
-            name, n = r.parameter.name, r.value.size
-            if name not in self._exact:
-                T[at : at + n, self._column[name]] = r.derivative
-                at += n
-        joint = T @ P @ T.T
-        return CalibrationEstimate(*estimates_of([(r.parameter, r.value) for r in rows], joint))
+        found, derivative = self._values.copy(), self._derivative.copy()
+        for p, own, columns in self._varying:
+            if p.spec.kind == "vector":
+                found[own] = values[p.name] / p.si
+            else:
+                row = in_unit(p, values[p.name])
+                found[own], derivative[own, columns] = row.value, row.derivative
+        covariance = derivative @ P @ derivative.T
+        covariance[self._exact] = covariance[:, self._exact] = 0.0
+        return CalibrationEstimate(as_estimates(self._parameters, found, covariance), covariance)
 
 
 def _at_prior(
