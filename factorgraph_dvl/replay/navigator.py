@@ -226,10 +226,12 @@ class Navigator:
 
     def known(self, later: float) -> ConstantsPrior:
         """Return what will be known of biases and parameters `later` seconds from now."""
-        P = self._P[STATE_SIZE:, STATE_SIZE:].copy()
+        values, P = self._with_walks()
+        P = P.copy()
         P[:BIAS_SIZE, :BIAS_SIZE] += np.diag(self._walk_root_psd**2) * later
         bias = self.smoother.bias(self.smoother.node).vector()
-        return ConstantsPrior(bias, self.smoother.calibration(), P)
+        parameters = {p.name: values[p.name] for p in self.start.parameters}
+        return ConstantsPrior(bias, parameters, P)
 
     def node_before(self, time: float) -> int | None:
         """Return the state whose segment contains a time, None if it is gone or yet to come."""
@@ -241,8 +243,23 @@ class Navigator:
     def calibration(self) -> CalibrationEstimate:
         """Return the calibration as it is reported."""
         bias = self.smoother.bias(self.smoother.node).vector()
-        P = self._P[STATE_SIZE:, STATE_SIZE:]
-        return self._report.at(self.values, bias, P, self.undetermined)
+        values, P = self._with_walks()
+        return self._report.at(values, bias, P, self.undetermined)
+
+    def _with_walks(self) -> tuple[dict[str, Array], Array]:
+        """Return values, and covariance of biases and parameters, with scales as they are now."""
+        errors = self.start.errors
+        P, values = self._P[STATE_SIZE:, STATE_SIZE:], self.values
+        if not errors.walks:
+            return values, P
+        now = errors.sigma * self.smoother.errors(self.smoother.node)
+        size = len(P)
+        to_now = np.eye(size, size + errors.size)
+        for name, i in errors.walks.values():
+            values = {**values, name: values[name] + now[i]}
+            to_now[BIAS_SIZE + self.start.columns([name]), size + i] = errors.sigma[i]
+        whole = self._P_with_errors[STATE_SIZE:, STATE_SIZE:]
+        return values, to_now @ whole @ to_now.T
 
     def filtered(self, body_axes: BodyAxes) -> Trajectory:
         """Return the newest state, as a trajectory of one epoch."""

@@ -217,6 +217,8 @@ def _solution(
                 "IMU",
             )
         )
+    if trial.imu is not None and trial.dvl is not None and trial.dvl.settings.left_out:
+        findings.append(Finding(Code.MEAN_OR_LAST, message("mean_or_last.scale"), "DVL"))
     if run.unused >= LEAST:
         findings.append(Finding(Code.NOT_CONVERGED, message("not_converged.replay")))
     elif last.inconsistent:

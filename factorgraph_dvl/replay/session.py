@@ -108,15 +108,6 @@ class Replay:
         if any(p.estimated for p in settings.inertial.error_parameters()):
             settings = replace(settings, imu=settings.inertial.without_errors())
             self._findings.append(_IMU_ERRORS_LEFT_OUT)
-        self._findings += [
-            Finding(
-                Code.SCALE_WALK_LEFT_OUT,
-                message("scale_walk_left_out.replay", section=aid.section, name=key),
-                sensor=aid.label,
-            )
-            for aid in settings.aids
-            for key in aid.settings.left_out
-        ]
         self._settings = settings
         self._kind = smoother
         self._lag = lag_s

@@ -595,7 +595,7 @@ class Code(StrEnum):
     )
     MEAN_OR_LAST = (
         "mean_or_last",
-        "A bias walks. A replay reports its last value, and `solve` its mean.",
+        "A bias or a scale walks. A replay reports its last value, and `solve` its mean.",
         "The two values differ, and neither is wrong.",
         "Nothing.",
         "note",
@@ -606,12 +606,6 @@ class Code(StrEnum):
         "The trial states an error that is estimated only with an IMU.",
         "Standard deviations do not contain the effect of this error.",
         "Use --halves, which reports changes that are larger than chance.",
-    )
-    SCALE_WALK_LEFT_OUT = (
-        "scale_walk_left_out",
-        "The replay takes a scale that walks as constant.",
-        "Its standard deviations are too small.",
-        "Use `solve` for standard deviations that contain the walk.",
     )
     IMU_ERRORS_LEFT_OUT = (
         "imu_errors_left_out",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import gtsam
@@ -11,6 +12,7 @@ import pytest
 from factorgraph_dvl.graph import keys
 from factorgraph_dvl.graph.processes import Process
 from factorgraph_dvl.replay.correlated_errors import CorrelatedErrors
+from factorgraph_dvl.sensors.protocol import ScaleWalk
 
 PROCESSES = (
     Process("slow", 0, np.array([0.5, 2.0]), np.array([100.0, 50.0]), np.array([0.0, 10.0, 18.0])),
@@ -18,6 +20,9 @@ PROCESSES = (
     Process("fast", 2, np.array([0.1]), np.array([2.0]), np.array([0.0, 19.5])),
 )
 TAU = np.array([100.0, 50.0, 2.0])
+
+
+WALK = ScaleWalk("scale_error", 0.01, np.array([0.0, 20.0]), np.ones((2, 1)))
 
 
 @pytest.fixture
@@ -44,6 +49,20 @@ def test_the_covariance_of_two_states_is_that_of_the_process(errors):
     np.testing.assert_allclose(joint.at(second, first), np.diag(np.exp(-0.7 / TAU)), atol=1e-12)
 
 
+def test_the_variance_of_a_scale_that_walks_grows_with_time():
+    alone = replace(PROCESSES[1], walk=WALK)
+    errors = CorrelatedErrors.of([alone])
+    assert (errors.places, errors.walks) == ({}, {"none": ("scale_error", 0)})
+    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    first, second = keys.correlated(0), keys.correlated(1)
+    graph.addPriorVector(first, np.zeros(1), gtsam.noiseModel.Isotropic.Sigma(1, 1e-3))
+    graph.add(errors.transition(0, 5.0))
+    for key in (first, second):
+        values.insert(key, np.zeros(1))
+    found = gtsam.Marginals(graph, values).marginalCovariance(second) * errors.sigma**2
+    np.testing.assert_allclose(found, [[WALK.rate**2 * 5.0]], rtol=1e-4)
+
+
 def test_the_start_follows_from_the_last_nodes(errors):
     gaussian = gtsam.GaussianFactorGraph()
     nodes = {p.name: np.ones((p.time.size, p.size)) for p in PROCESSES}
@@ -59,8 +78,8 @@ def test_the_start_follows_from_the_last_nodes(errors):
 
 
 def test_an_error_is_interpolated_between_the_states(errors):
-    observation = SimpleNamespace(label="fast", components=("x",))
-    other = SimpleNamespace(label="other", components=("x", "y"))
+    observation = SimpleNamespace(label="fast", components=("x",), scale_walk=None)
+    other = SimpleNamespace(label="other", components=("x", "y"), scale_walk=None)
     rows = [
         SimpleNamespace(observation=observation, at=slice(0, 2), time=np.zeros(2)),
         SimpleNamespace(observation=other, at=slice(2, 3), time=np.zeros(1)),

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import msgspec
 import numpy as np
 import pytest
 from findings import of_code
 from scipy.spatial.transform import Rotation
-from truth import CORRELATED, config, scenario
+from truth import CORRELATED, config
 
 from factorgraph_dvl.analysis.error_statistics import motion_errors
+from factorgraph_dvl.graph.processes import walk_sigma, walk_time
 from factorgraph_dvl.replay import Replay, replay
 from factorgraph_dvl.sensors.finding import Code
 from factorgraph_dvl.sensors.records import rows_of
@@ -215,13 +215,22 @@ def test_a_beacon_out_of_reach_is_no_hindrance():
     assert solve(replace(trial, others=others), anyway=True).converged
 
 
-def test_a_scale_that_walks_is_said_to_be_left_out():
-    trial = simulate(scenario(manoeuvres=[{"straight_s": 2}]), 0)
-    stated = msgspec.structs.replace(trial.dvl.settings, scale_walk_std_sqrt_h=1e-3)
-    session = Replay(replace(trial, dvl=replace(trial.dvl, settings=stated)))
-    (finding,) = (f for f in session.findings if f.code == Code.SCALE_WALK_LEFT_OUT)
-    assert finding.sensor == "DVL"
-    assert all(f.code != Code.SCALE_WALK_LEFT_OUT for f in Replay(trial).findings)
+def test_a_scale_that_walks_is_reported_as_it_is_at_the_end():
+    """A batch solution has the scale at its nodes, of which the last is that of the end."""
+    walks = {"dvl": {"scale_walk_sqrt_h": 0.02}, "trial": {"dvl": {"scale_walk_std_sqrt_h": 0.02}}}
+    scene = config("seed-a-phase-90", manoeuvres=TURNS, reference_rate_hz=100, **walks)
+    trial = simulate(scene, 1)
+    solution, _ = replay(trial, rate_hz=2.0)
+    assert any(f.code == Code.MEAN_OR_LAST and f.sensor == "DVL" for f in solution.findings)
+    solved, *_ = solved_problems(replace(trial, noise="stated"))
+    (process,) = solved.problem.processes
+    values = solved.minimum.evaluation.parameters
+    unit = walk_sigma(process.walk, walk_time(process.time))
+    end = values["scale_error"] + unit * values[process.name][-1, -1]
+    scale = solution.estimate("scale_error")
+    assert abs(scale.value - end)[0] < 0.3 * scale.std[0]
+    mean = solve(replace(trial, noise="stated")).estimate("scale_error")
+    assert scale.std[0] > 1.2 * mean.std[0]
 
 
 def test_correlated_noise_as_the_trial_states_it():
