@@ -169,6 +169,8 @@ class Rows:
         Jacobian with respect to these variables side by side.
     vector : ndarray, shape (M, d)
         Residual.
+    begin : int, default 0
+        Number of the first item among all of an observation.
     """
 
     source: str
@@ -177,6 +179,7 @@ class Rows:
     sizes: tuple[int, ...]
     matrix: Array
     vector: Array
+    begin: int = 0
 
 
 def observed(
@@ -560,18 +563,23 @@ class Problem:
         return_freed()
 
     def observation_rows(self, evaluation: Evaluation) -> Iterator[Rows]:
-        """Yield the rows of each observation, unused ones included: these are zero."""
+        """Yield the rows of each observation, some at a time.
+
+        Unused ones are included: these are zero.
+        """
         for block in self._blocks:
             for bound in block.bound:
                 lin = self._linearized(bound, block.parameters, evaluation)
-                found = [
-                    self._jacobian(bound, block.parameters, lin, slice(a, b), evaluation, {})
-                    for a, b in pairwise([*range(0, max(len(lin.residual), 1), _CHUNK), None])
-                ]
-                matrix, vector = (np.concatenate(each) for each in zip(*found, strict=True))
                 o, sizes = bound.observation, tuple(self._sizes(block))
                 variables = self._keys_at(block, self._nodes_of(bound))
-                yield Rows(o.label, o.components, variables, sizes, matrix, vector)
+                for begin in range(0, max(len(lin.residual), 1), _CHUNK):
+                    some = slice(begin, begin + _CHUNK)
+                    matrix, vector = self._jacobian(
+                        bound, block.parameters, lin, some, evaluation, {}
+                    )
+                    yield Rows(
+                        o.label, o.components, variables[some], sizes, matrix, vector, begin
+                    )
 
     def nonlinear_graph(self) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
         """Return the whole problem for GTSAM's own optimisers, and values to start from.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Iterator
 
 import numpy as np
 
@@ -19,8 +19,10 @@ _LEAST_PROBES = 4
 _NUMBERS = 1_000_000
 
 
-def leverage(rows: Sequence[Rows], information: SquareRootInformation) -> list[Array]:
-    """Return unbiased estimates of the leverages of rows, for sums over many of them.
+def leverage(
+    rows: Callable[[], Iterable[Rows]], count: int, information: SquareRootInformation
+) -> Iterator[tuple[Rows, Array]]:
+    """Yield rows with unbiased estimates of their leverages (M, d), for sums over many of them.
 
     The leverage of a row is its place on the diagonal of H = J P Jᵀ. With random signs z, z times
     H z has that expectation (Hutchinson, A stochastic estimator of the trace of the influence
@@ -29,29 +31,23 @@ def leverage(rows: Sequence[Rows], information: SquareRootInformation) -> list[A
 
     Parameters
     ----------
-    rows : sequence of Rows
-        Rows of the graph.
+    rows : callable
+        Returns the rows of the graph, each time the same: it is asked twice.
+    count : int
+        How many numbers their vectors have.
     information : SquareRootInformation
         Information of the whole graph.
-
-    Returns
-    -------
-    list of ndarray
-        Of each element of `rows`, (M, d).
     """
     rng = np.random.default_rng(0)
-    count = max(sum(each.vector.size for each in rows), 1)
-    probes = int(np.clip(_NUMBERS // count, _LEAST_PROBES, _MOST_PROBES))
+    probes = int(np.clip(_NUMBERS // max(count, 1), _LEAST_PROBES, _MOST_PROBES))
     sums: dict[int, Array] = {}
     signs = []
-    for each in rows:
+    for each in rows():
         z = rng.choice([-1.0, 1.0], (*each.vector.shape, probes))
-        signs.append(z)
+        signs.append(z.astype(np.int8))
         add_transposed_product(each, z, sums)
     if not sums:
-        return []
+        return
     with_probes = information.covariance_with([sums])
-    return [
-        np.asarray(np.mean(z * product(each, with_probes), axis=2))
-        for each, z in zip(rows, signs, strict=True)
-    ]
+    for each, z in zip(rows(), signs, strict=True):
+        yield each, np.asarray(np.mean(z * product(each, with_probes), axis=2))

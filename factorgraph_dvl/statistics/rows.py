@@ -21,14 +21,15 @@ PRIOR = "prior of {}"
 WALK = "random walk of {}"
 CORRELATED = "correlated noise of {}"
 
-# Items whose products are taken at once. Chosen: some ten megabytes.
+# Native factors whose rows are taken at once. Chosen: some ten megabytes.
 _CHUNK = 4096
 
 
 def rows_by_source(problem: Problem, evaluation: Evaluation) -> Iterator[Rows]:
     """Yield all rows of the linearised graph: of the IMU, of priors, of observations.
 
-    The source of an observation is its label; those of others are words.
+    The source of an observation is its label; those of others are words. Those of one source may
+    come in several parts.
     """
     yield from _native_rows(problem, evaluation)
     yield from problem.observation_rows(evaluation)
@@ -41,7 +42,7 @@ def rows_with_times(problem: Problem, evaluation: Evaluation) -> Iterator[tuple[
     node_time = problem.chain.segments.node_time
     for rows in rows_by_source(problem, evaluation):
         if rows.source in when:
-            yield rows, when[rows.source]
+            yield rows, when[rows.source][rows.begin : rows.begin + len(rows.vector)]
         elif rows.keys.shape[1] > 1:
             first = rows.keys[:, 0]
             letter = keys.letter_of(int(first[0]))
@@ -51,16 +52,13 @@ def rows_with_times(problem: Problem, evaluation: Evaluation) -> Iterator[tuple[
 
 def product(rows: Rows, columns: Mapping[int, Array]) -> Array:
     """Return the Jacobian times columns (size, n) of its variables by key, (M, d, n)."""
-    parts = []
-    for chunk in _chunks(rows):
-        total: Array | float = 0.0
-        for own, matrix in _by_variable(rows, chunk):
-            first = _runs(own)
-            known = np.stack([columns[key] for key in own[first].tolist()])
-            lengths = np.diff(first, append=own.size)
-            total = total + matrix @ (known[0] if first.size == 1 else known.repeat(lengths, 0))
-        parts.append(np.asarray(total))
-    return np.concatenate(parts)
+    total: Array | float = 0.0
+    for own, matrix in _by_variable(rows):
+        first = _runs(own)
+        known = np.stack([columns[key] for key in own[first].tolist()])
+        lengths = np.diff(first, append=own.size)
+        total = total + matrix @ (known[0] if first.size == 1 else known.repeat(lengths, 0))
+    return np.asarray(total)
 
 
 def add_transposed_product(rows: Rows, factors: Array, sums: dict[int, Array]) -> None:
@@ -75,13 +73,12 @@ def add_transposed_product(rows: Rows, factors: Array, sums: dict[int, Array]) -
     sums : dict of int to ndarray
         By key; changed.
     """
-    for chunk in _chunks(rows):
-        turned = factors[chunk].transpose(0, 2, 1)
-        for own, matrix in _by_variable(rows, chunk):
-            first = _runs(own)
-            added = np.add.reduceat(turned @ matrix, first, axis=0)
-            for key, part in zip(own[first].tolist(), added, strict=True):
-                sums[key] = sums[key] + part if key in sums else part
+    turned = factors.transpose(0, 2, 1)
+    for own, matrix in _by_variable(rows):
+        first = _runs(own)
+        added = np.add.reduceat(turned @ matrix, first, axis=0)
+        for key, part in zip(own[first].tolist(), added, strict=True):
+            sums[key] = sums[key] + part if key in sums else part
 
 
 def _runs(keys_: IntArray) -> IntArray:
@@ -89,20 +86,15 @@ def _runs(keys_: IntArray) -> IntArray:
     return np.flatnonzero(np.diff(keys_, prepend=keys_[0] - 1))
 
 
-def _chunks(rows: Rows) -> Iterator[slice]:
-    count = len(rows.matrix)
-    return (slice(first, first + _CHUNK) for first in range(0, max(count, 1), _CHUNK))
-
-
-def _by_variable(rows: Rows, chunk: slice) -> Iterator[tuple[IntArray, Array]]:
-    """Yield keys (M,) and Jacobian (M, d, size) of each variable of some items."""
+def _by_variable(rows: Rows) -> Iterator[tuple[IntArray, Array]]:
+    """Yield keys (M,) and Jacobian (M, d, size) of each variable."""
     edges = np.cumsum([0, *rows.sizes])
     for i in range(len(rows.sizes)):
-        yield rows.keys[chunk, i], rows.matrix[chunk, :, edges[i] : edges[i + 1]]
+        yield rows.keys[:, i], rows.matrix[:, :, edges[i] : edges[i + 1]]
 
 
 def _native_rows(problem: Problem, evaluation: Evaluation) -> Iterator[Rows]:
-    """Yield the rows of the factors that GTSAM linearises itself, those of one source together."""
+    """Yield the rows of the factors that GTSAM linearises itself, some of one source together."""
     gaussian = problem.native(evaluation)
     sizes = evaluation.values.dims()
     names = {problem.key(p.name): p.name for p in problem.parameters}
@@ -113,20 +105,28 @@ def _native_rows(problem: Problem, evaluation: Evaluation) -> Iterator[Rows]:
         factor = gaussian.at(i)
         own = list(factor.keys())
         kind = (_source(own, names, of_biases), tuple(sizes[key] for key in own))
-        found.setdefault(kind, []).append((own, np.array(factor.augmentedJacobian())))
+        items = found.setdefault(kind, [])
+        items.append((own, np.array(factor.augmentedJacobian())))
+        if len(items) == _CHUNK:
+            yield from _together(problem, *kind, found.pop(kind))
+    for kind, items in found.items():
+        yield from _together(problem, *kind, items)
+
+
+def _together(
+    problem: Problem, source: str, shape: tuple[int, ...], items: list[tuple[list[int], Array]]
+) -> Iterator[Rows]:
+    """Yield the rows of factors of one source: their variables, and their augmented Jacobians."""
+    variables = np.array([own for own, _ in items])
+    matrix = np.stack([augmented for _, augmented in items])
     gyro, accel = (p.name for p in problem.chain.biases)
-    for (source, shape), items in found.items():
-        variables = np.array([own for own, _ in items])
-        matrix = np.stack([augmented for _, augmented in items])
-        parts = {source.format(of_biases): slice(None)}
-        if source == WALK or (source == PRIOR and problem.chain.biases[0].joint is None):
-            # GTSAM's order; the rows are independent of each other.
-            parts = {source.format(accel): slice(0, 3), source.format(gyro): slice(3, 6)}
-        for name, own_rows in parts.items():
-            part = matrix[:, own_rows]
-            yield Rows(
-                name, ("",) * part.shape[1], variables, shape, part[..., :-1], -part[..., -1]
-            )
+    parts = {source.format(f"{gyro}, {accel}"): slice(None)}
+    if source == WALK or (source == PRIOR and problem.chain.biases[0].joint is None):
+        # GTSAM's order; the rows are independent of each other.
+        parts = {source.format(accel): slice(0, 3), source.format(gyro): slice(3, 6)}
+    for name, own_rows in parts.items():
+        part = matrix[:, own_rows]
+        yield Rows(name, ("",) * part.shape[1], variables, shape, part[..., :-1], -part[..., -1])
 
 
 def _source(own: list[int], names: Mapping[int, str], biases: str) -> str:

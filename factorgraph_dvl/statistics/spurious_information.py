@@ -21,7 +21,7 @@ from factorgraph_dvl.graph.problem import Evaluation, Problem
 from factorgraph_dvl.imu.propagation import Attachment
 from factorgraph_dvl.sensors.protocol import Motion, Observation, Values
 
-# Measurements whose covariances are found at once. Chosen: some megabytes.
+# Measurements whose covariances and products are found at once. Chosen: some megabytes.
 _CHUNK = 4096
 
 
@@ -128,8 +128,11 @@ def spurious_by(
                 replace(motion, alpha_b=motion.alpha_b + alpha_error),
             ]
         for changed in errors:
-            change = (jacobian(changed) - base) * weight[:, :, None]
-            out += change.transpose(0, 2, 1) @ change
+            change = jacobian(changed)
+            change -= base
+            change *= weight[:, :, None]
+            for part in parts:
+                out[part] += change[part].transpose(0, 2, 1) @ change[part]
     return out
 
 

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
 from factorgraph_dvl.geometry.vectors import Array
-from factorgraph_dvl.graph.problem import Evaluation, Problem, Rows
+from factorgraph_dvl.graph.problem import Evaluation, Problem
 from factorgraph_dvl.statistics.leverage import leverage
 from factorgraph_dvl.statistics.rows import CORRELATED, rows_by_source
 from factorgraph_dvl.statistics.square_root_information import SquareRootInformation
@@ -92,21 +93,26 @@ def variance_components(
     """
     processes = {CORRELATED.format(p.label): p for p in problem.processes}
     wanted = {*problem.noise_factors, *processes}
-    source = (
-        rows_by_source(problem, evaluation) if processes else problem.observation_rows(evaluation)
+    source = partial(rows_by_source, problem) if processes else problem.observation_rows
+    count = sum(
+        residual.size
+        for o, residual in zip(problem.observations, evaluation.residuals, strict=True)
+        if o.label in wanted
     )
-    rows = [r for r in source if r.source in wanted]
-    found = dict(zip(map(id, rows), leverage(rows, information), strict=True))
+    count += sum(p.prior_residuals(evaluation.parameters[p.name]).size for p in processes.values())
+    found: dict[str, list[tuple[Array, Array]]] = {}
+    for r, h in leverage(
+        lambda: (r for r in source(evaluation) if r.source in wanted), count, information
+    ):
+        found.setdefault(r.source, []).append((r.vector, h))
     white = {
-        r.source: _white(problem, evaluation, r, found[id(r)])
-        for r in rows
-        if r.source not in processes
+        label: _white(problem, evaluation, label, *map(np.concatenate, zip(*parts, strict=True)))
+        for label, parts in found.items()
+        if label not in processes
     }
     groups = {o.label: o.noise_groups for o in problem.observations}
     correlated = {
-        p.label: _innovations(
-            [(r, found[id(r)]) for r in rows if r.source == source_name], groups[p.label]
-        )
+        p.label: _innovations(found[source_name], groups[p.label])
         for source_name, p in processes.items()
         if p.label in problem.noise_factors
     }
@@ -114,12 +120,12 @@ def variance_components(
 
 
 def _innovations(
-    rows: list[tuple[Rows, Array]], groups: tuple[tuple[int, ...], ...]
+    rows: list[tuple[Array, Array]], groups: tuple[tuple[int, ...], ...]
 ) -> NoiseFactor:
-    """Return factors on the innovations of correlated noise."""
+    """Return factors on the innovations of correlated noise, from residuals and leverages."""
     # A scale that walks is the last component, and in no group.
     size = 1 + max(map(max, groups))
-    squares = np.sum([np.sum(r.vector[:, :size] ** 2, axis=0) for r, _ in rows], axis=0)
+    squares = np.sum([np.sum(r[:, :size] ** 2, axis=0) for r, _ in rows], axis=0)
     freedom = np.sum([np.sum(1.0 - h[:, :size], axis=0) for _, h in rows], axis=0)
     factor, redundancy = np.ones(size), np.zeros(size)
     for group in map(list, groups):
@@ -130,16 +136,21 @@ def _innovations(
     return NoiseFactor(factor, redundancy)
 
 
-def _white(problem: Problem, evaluation: Evaluation, each: Rows, h: Array) -> NoiseFactor:
-    """Return factors on the standard deviations that a sensor states, from its rows."""
-    label, size = each.source, len(each.components)
+def _white(
+    problem: Problem, evaluation: Evaluation, label: str, vector: Array, h: Array
+) -> NoiseFactor:
+    """Return factors on the standard deviations that a sensor states.
+
+    From the residuals and leverages of its rows.
+    """
+    size = vector.shape[1]
     (i,) = (i for i, o in enumerate(problem.observations) if o.label == label)
     sigma = problem.sigma(evaluation)[i]
     others = problem.sigma(evaluation, {label: np.zeros(size)})[i]
     used = problem.weights[i] > 0.0
     own = 1.0 - np.divide(others, sigma, out=np.ones(used.shape), where=used) ** 2
     long_run = problem.long_run.get(label, np.ones(size))
-    squares = np.sum(own * each.vector**2, axis=0) * long_run**2
+    squares = np.sum(own * vector**2, axis=0) * long_run**2
     freedom = np.sum(own * (used - h), axis=0)
     before = problem.noise_factors[label]
     factor, redundancy = np.ones(size), np.zeros(size)
