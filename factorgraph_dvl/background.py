@@ -6,21 +6,64 @@ import copyreg
 import gc
 import os
 import pickle
+import select
 import signal
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Any, BinaryIO, NoReturn, TypeVar
+from typing import Any, BinaryIO, Generic, NoReturn, Protocol, TypeVar
 
 # Number of processes that a run may have. The command line sets it unless the user did. Without
 # it there is one: a program with threads of its own cannot fork safely.
 PROCESSES = "FACTORGRAPH_DVL_PROCESSES"
 _PR_SET_PDEATHSIG = 1
+# By how much less urgent second processes are. Chosen: a third of the time of the first one, where
+# they share a core.
+_LESS_URGENT = 5
 
 
 _Input = TypeVar("_Input")
 _Result = TypeVar("_Result")
+_Result_co = TypeVar("_Result_co", covariant=True)
+
+
+class Awaited(Protocol[_Result_co]):
+    """Work whose result is awaited."""
+
+    def __call__(self) -> _Result_co:
+        """Return the result once it is there."""
+
+    @property
+    def is_there(self) -> bool:
+        """Whether the result is there without waiting."""
+
+
+@dataclass(frozen=True)
+class _Later(Generic[_Result]):
+    """Work that is done when its result is asked for."""
+
+    work: Callable[[], _Result]
+    is_there: bool = False
+
+    def __call__(self) -> _Result:
+        return self.work()
+
+
+@dataclass(frozen=True)
+class _Elsewhere:
+    """Work that a second process does."""
+
+    reply: BinaryIO
+
+    @property
+    def is_there(self) -> bool:
+        """Whether the second process has begun to send its result."""
+        return bool(select.select([self.reply], [], [], 0.0)[0])
+
+    def __call__(self) -> Any:
+        return _received(self.reply)
 
 
 def _unchanging(values: dict[Any, Any]) -> MappingProxyType[Any, Any]:
@@ -32,7 +75,9 @@ copyreg.pickle(MappingProxyType, lambda mapping: (_unchanging, (dict(mapping),))
 
 
 @contextmanager
-def in_background(work: Callable[[], _Result]) -> Iterator[Callable[[], _Result]]:
+def in_background(
+    work: Callable[[], _Result], *, urgent: bool = False
+) -> Iterator[Awaited[_Result]]:
     """Start work in a second process, and yield what waits for its result.
 
     The second process begins as a copy of this one: it has all data, and only its result is sent
@@ -43,6 +88,8 @@ def in_background(work: Callable[[], _Result]) -> Iterator[Callable[[], _Result]
     ----------
     work : callable
         Returns a result that can be pickled. It prints nothing.
+    urgent : bool, default False
+        Whether it is as urgent as what this process does meanwhile.
 
     Raises
     ------
@@ -57,14 +104,17 @@ def in_background(work: Callable[[], _Result]) -> Iterator[Callable[[], _Result]
     ...     total()
     10
     """
-    with on_standby(lambda _: work()) as start:
+    with on_standby(lambda _: work(), urgent=urgent) as start:
         yield start(None)
 
 
 @contextmanager
 def on_standby(
-    work: Callable[[_Input], _Result], prepare: Callable[[], object] = bool
-) -> Iterator[Callable[[_Input], Callable[[], _Result]]]:
+    work: Callable[[_Input], _Result],
+    prepare: Callable[[], object] = bool,
+    *,
+    urgent: bool = False,
+) -> Iterator[Callable[[_Input], Awaited[_Result]]]:
     """Start a second process that waits for input, and yield what starts its work.
 
     That returns what waits for the result; all else is as of `in_background`.
@@ -75,6 +125,8 @@ def on_standby(
         Takes an input that can be pickled, and returns a result that can be.
     prepare : callable, optional
         What the second process does first, such as loading modules.
+    urgent : bool, default False
+        As of `in_background`.
 
     Examples
     --------
@@ -83,17 +135,17 @@ def on_standby(
     ...     total()
     3
     """
-    second = _fork(work, prepare) if available() else None
+    second = _fork(work, prepare, urgent=urgent) if available() else None
     if second is None:
-        yield lambda given: lambda: work(given)
+        yield lambda given: _Later(lambda: work(given))
         return
     process, order, reply = second
 
-    def start(given: _Input) -> Callable[[], _Result]:
+    def start(given: _Input) -> Awaited[_Result]:
         # Of a process that was killed the reply ends early.
         with suppress(BrokenPipeError), order:
             pickle.dump(given, order, protocol=pickle.HIGHEST_PROTOCOL)
-        return lambda: _received(reply)
+        return _Elsewhere(reply)
 
     try:
         with reply:
@@ -115,7 +167,7 @@ def available() -> bool:
 
 
 def _fork(
-    work: Callable[[Any], Any], prepare: Callable[[], object]
+    work: Callable[[Any], Any], prepare: Callable[[], object], *, urgent: bool
 ) -> tuple[int, BinaryIO, BinaryIO] | None:
     """Return the second process, where its input goes to and where its reply comes from.
 
@@ -132,6 +184,8 @@ def _fork(
         return None
     if process == 0:
         os.close(given)
+        if not urgent:
+            os.nice(_LESS_URGENT)
         _work(work, prepare, order, result, parent)
     os.close(order)
     os.close(result)

@@ -32,6 +32,22 @@ def test_a_second_process_sends_its_result() -> None:
 
 
 @pytest.mark.usefixtures("two")
+def test_whether_a_result_is_there() -> None:
+    with in_background(lambda: time.sleep(0.5)) as found:
+        assert not found.is_there
+        time.sleep(2.0)
+        assert found.is_there
+        assert found() is None
+
+
+@pytest.mark.usefixtures("two")
+@pytest.mark.parametrize("urgent", [False, True])
+def test_a_second_process_is_less_urgent_unless_it_is_said(urgent: bool) -> None:
+    with in_background(lambda: os.nice(0), urgent=urgent) as found:
+        assert (found() > os.nice(0)) == (not urgent)
+
+
+@pytest.mark.usefixtures("two")
 def test_results_larger_than_a_pipe_arrive() -> None:
     with in_background(lambda: bytes(1_000_000)) as found:
         assert len(found()) == 1_000_000

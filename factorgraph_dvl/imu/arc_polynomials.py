@@ -13,7 +13,7 @@ from math import comb
 
 import numpy as np
 
-from factorgraph_dvl.geometry.vectors import Array, IntArray
+from factorgraph_dvl.geometry.vectors import Array, IntArray, median
 from factorgraph_dvl.imu.polynomials import (
     highest_difference,
     interpolation,
@@ -25,6 +25,8 @@ from factorgraph_dvl.imu.polynomials import (
 UNIFORM = 1e-3
 # Intervals up to which all polynomials are kept.
 _SHORT = 200
+# Samples whose differences are in memory at a time. Chosen: some MB.
+_CHUNK = 50_000
 # How much rougher than the noise of the gyro a motion must be to look for a step in it,
 # and how much smoother the stencil on one side.
 _ROUGH = 6.0
@@ -75,7 +77,17 @@ class ArcPolynomials:
 
     def difference_at(self, index: IntArray) -> Array:
         """Return the highest difference of the rate about intervals `index`, (M, 3), rad/s."""
-        return self.differences[self._centred_sample(index)]
+        arc = self.arc_of[index]
+        sample = self._centred_sample(index)
+        first = self.arcs[arc, 0] + sample - self.first_sample[arc]
+        place = first + np.arange(self.width + self.averaged)[:, None]
+        # The last edge of an arc is no start of an interval.
+        inside = np.minimum(place, self.arcs[arc, 1] - 1)
+        edges = self.start[inside] + np.where(inside < place, self.dt[inside], 0.0)
+        values = self.rate[sample + np.arange(self.width)[:, None]]
+        step = self._steps[arc][:, None]
+        out = highest_difference(values, edges, self.width, self.averaged, step)
+        return np.asarray(out[0])
 
     @property
     def width(self) -> int:
@@ -83,26 +95,37 @@ class ArcPolynomials:
         return 5 if self.averaged else 6
 
     @cached_property
-    def differences(self) -> Array:
-        """Highest difference of the rate over the stencil from each sample on, (S, 3)."""
-        out = np.full(self.rate.shape, np.inf)
-        for (a, b), base in zip(self.arcs, self.first_sample, strict=True):
-            edges = np.append(self.start[a:b], self.end[b - 1])
-            count = b - a + (0 if self.averaged else 1)
-            highest = highest_difference(
-                self.rate[base : base + count], edges, self.width, self.averaged
-            )
-            out[base : base + highest.shape[0]] = highest
-        return out
+    def _steps(self) -> Array:
+        """Median length of the intervals of each arc, (A,), s."""
+        return np.array(
+            [median(np.diff(self.start[a:b], append=self.end[b - 1])) for a, b in self.arcs]
+        )
 
     @cached_property
     def _roughness(self) -> Array:
-        """Size of `differences`, (S,), rad/s."""
-        return np.asarray(np.linalg.norm(self.differences, axis=1))
+        """Size of the highest difference of the rate over the stencil from each sample on, (S,).
+
+        In rad/s; infinite where the arc ends within the stencil.
+        """
+        out = np.full(len(self.rate), np.inf)
+        for (a, b), base, step in zip(self.arcs, self.first_sample, self._steps, strict=True):
+            edges = np.append(self.start[a:b], self.end[b - 1])
+            count = b - a + (0 if self.averaged else 1)
+            for begin in range(0, count - self.width + 1, _CHUNK):
+                size = min(_CHUNK, count - self.width + 1 - begin) + self.width - 1
+                highest = highest_difference(
+                    self.rate[base + begin : base + begin + size],
+                    edges[begin : begin + size + self.averaged],
+                    self.width,
+                    self.averaged,
+                    step,
+                )
+                out[base + begin : base + begin + len(highest)] = np.linalg.norm(highest, axis=1)
+        return out
 
     @property
     def difference_sigma(self) -> float:
-        """Standard deviation of `differences` from the noise of the gyro, rad/s."""
+        """Standard deviation of the highest difference from the noise of the gyro, rad/s."""
         return self.gyro_sigma * float(np.sqrt(comb(2 * self.width - 2, self.width - 1)))
 
     def _centred_sample(self, index: IntArray) -> IntArray:

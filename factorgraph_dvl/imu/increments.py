@@ -148,7 +148,7 @@ class Increments(ArcPolynomials):
         unresolved = np.sqrt(np.maximum(rough**2 - noise**2, 0.0)) / 4.0
         omega_sigma, alpha_sigma, force_sigma = (np.empty(index.size) for _ in range(3))
         time = self.start[index] + since
-        for arc, (rates, forces) in enumerate(self._smoothed):
+        for arc, (rates, forces) in enumerate(self.smoothed):
             mine = np.flatnonzero(self.arc_of[index] == arc)
             omega_sigma[mine], alpha_sigma[mine] = rates.sigma, rates.slope_sigma
             force_sigma[mine] = forces.sigma
@@ -175,11 +175,15 @@ class Increments(ArcPolynomials):
     @property
     def chosen_windows(self) -> tuple[int, int]:
         """Samples over which rate and force of the last arc are smoothed; 0 = not at all."""
-        rate, force = self._smoothed[-1]
+        rate, force = self.smoothed[-1]
         return rate.window, force.window
 
+    def keep(self, smoothed: tuple[tuple[Smoothed, Smoothed], ...]) -> None:
+        """Keep what `smoothed` of the same increments is, found elsewhere."""
+        vars(self)["smoothed"] = smoothed
+
     @cached_property
-    def _smoothed(self) -> tuple[tuple[Smoothed, Smoothed], ...]:
+    def smoothed(self) -> tuple[tuple[Smoothed, Smoothed], ...]:
         """Rate and force of each arc, smoothed where their noise asks for it."""
         out = []
         for (a, b), base in zip(self.arcs, self.first_sample, strict=True):
@@ -200,7 +204,7 @@ class Increments(ArcPolynomials):
                     if regular
                     else unsmoothed(dt, sigma)
                 )
-            out.append((pair[0], pair[1]))
+            out.append((pair[0], pair[1].on_knots_of(pair[0])))
         return tuple(out)
 
     def _blended_rate(self, index: IntArray, since: Array, c: Array) -> tuple[Array, Array]:

@@ -9,7 +9,7 @@ the motion allows take it down.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from math import factorial
 
@@ -69,6 +69,13 @@ class Smoothed:
             np.asarray(self.spline(time, 1)),
             np.asarray(np.abs(self.misfit(time))),
         )
+
+    def on_knots_of(self, other: Smoothed) -> Smoothed:
+        """Return this signal on the knots of another one at the same times, which are then one."""
+        if self.spline is None or other.spline is None:
+            return self
+        knots = other.spline.t
+        return replace(self, spline=BSpline.construct_fast(knots, self.spline.c, self.spline.k))
 
 
 def unsmoothed(dt: float, sigma: float) -> Smoothed:

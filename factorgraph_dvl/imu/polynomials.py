@@ -14,19 +14,24 @@ _GAUSS_NODES = np.array([0.5 - np.sqrt(15.0) / 10.0, 0.5, 0.5 + np.sqrt(15.0) / 
 _GAUSS_WEIGHTS = np.array([5.0, 8.0, 5.0]) / 18.0
 
 
-def highest_difference(values: Array, edges: Array, width: int, averaged: bool) -> Array:
+def highest_difference(
+    values: Array, edges: Array, width: int, averaged: bool, step: Array | float | None = None
+) -> Array:
     """Return differences of order width - 1 of means over intervals or values at their ends.
 
-    As they would be at regular intervals: by divided differences, that of the integral
-    for means.
+    As they would be at regular intervals of length `step`, by default the median: by divided
+    differences, that of the integral for means. Along the first axis of values (N, ..., n) and
+    edges (E, ...).
     """
     reach = 1 if averaged else 0
     out = values
     for order in range(1, width):
         span = edges[order + reach :] - edges[: -order - reach]
-        out = (out[1:] - out[:-1]) / span[:, None]
+        out = (out[1:] - out[:-1]) / span[..., None]
     factor = factorial(width) if averaged else factorial(width - 1)
-    return np.asarray(out * factor * median(np.diff(edges)) ** (width - 1))
+    if step is None:
+        step = median(np.diff(edges))
+    return np.asarray(out * factor * step ** (width - 1))
 
 
 def interpolation(edges: Array, averaged: bool) -> Array:

@@ -111,11 +111,13 @@ def solve_with_problem(
     anyway: bool = False,
     progress: Progress | None = None,
     stages: Stages | None = None,
+    meanwhile: Callable[[SolvedProblem], object] = bool,
 ) -> tuple[Solution, SolvedProblem | SmoothedMotion | None]:
     """Return the solution of a trial, and its problem at the most probable minimum.
 
     That of a planar trial is of another kind, and None here. Parameters and errors are those of
-    `solve`; in `stages` results of alignment and mounting are kept, and taken from.
+    `solve`; in `stages` results of alignment and mounting are kept, and taken from. `meanwhile` is
+    called with a problem at its minimum where there is time while a second process tests it.
     """
     _check_above_zero("rate_hz", rate_hz)
     _check_above_zero("state_interval_s", state_interval_s)
@@ -138,7 +140,7 @@ def solve_with_problem(
             trial, lambda: prepare(trial, state_interval_s, report, stages), anyway=anyway
         )
         with explained(errors):
-            found, solved = _most_probable(trial, prepared, rate_hz, report, stages)
+            found, solved = _most_probable(trial, prepared, rate_hz, report, stages, meanwhile)
     return found.with_findings(errors), solved
 
 
@@ -168,6 +170,7 @@ def _most_probable(
     rate_hz: float,
     report: Progress,
     stages: Stages | None,
+    meanwhile: Callable[[SolvedProblem], object],
 ) -> tuple[Solution, SolvedProblem]:
     """Return the most probable of all minima from all positions, with the spread of the others."""
     starts = prepared.start_positions.states
@@ -184,7 +187,7 @@ def _most_probable(
             summaries = [summarise(trial, each, rate_hz=rate_hz) for each in minima]
             return most_probable_minimum(summaries, against), minima[0]
 
-        solution, minimum = speculated(summarised)
+        solution, minimum = speculated(summarised, lambda found: meanwhile(found[1]))
         solutions.append(solution)
         best.append(minimum)
     costs = significant_costs([cost_terms(each) for each in best])

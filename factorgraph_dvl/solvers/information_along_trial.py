@@ -13,6 +13,7 @@ Sequential Estimation, 1977, ch. VI). At the end it is what the smoother has.
 
 from __future__ import annotations
 
+import weakref
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -92,18 +93,33 @@ def solve_then_history(
     Parameters and errors as of `solvers.batch.solve`, and `stages` as of `solve_with_problem`;
     `entries` as of `information_history`.
     """
+    followed: list[tuple[weakref.ref[SolvedProblem], InformationHistory]] = []
+
+    def follow(found: SolvedProblem) -> InformationHistory:
+        if progress:
+            progress("information along the trial", 0, None)
+        out = information_history(found, entries=entries)
+        followed.append((weakref.ref(found), out))
+        return out
+
     solution, solved = solve_with_problem(
-        trial, rate_hz=rate_hz, anyway=anyway, progress=progress, stages=stages
+        trial,
+        rate_hz=rate_hz,
+        anyway=anyway,
+        progress=progress,
+        stages=stages,
+        meanwhile=follow,
     )
 
     def history() -> InformationHistory | None:
         if solved is None:
             return None
-        if progress:
-            progress("information along the trial", 0, None)
         if isinstance(solved, SmoothedMotion):
+            if progress:
+                progress("information along the trial", 0, None)
             return motion_history(solved, entries=entries)
-        return information_history(solved, entries=entries)
+        done = (known for found, known in followed if found() is solved)
+        return next(done, None) or follow(solved)
 
     return solution, history
 

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from factorgraph_dvl.background import in_background
 from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph.inertial_chain import Chain, inertial_chain
@@ -160,7 +161,9 @@ def prepare(
     frame = trial.frame()
     report("increments", 0, None)
     inc, gaps = increments(trial.inertial)
-    seg = segments(inc, state_interval_s, dense_epochs(trial, frame, state_interval_s))
+    with in_background(lambda: inc.smoothed, urgent=True) as smoothed:
+        seg = segments(inc, state_interval_s, dense_epochs(trial, frame, state_interval_s))
+        inc.keep(smoothed())
     report("alignment", 0, None)
     on_one_clock = trial.on_one_clock()
     aligned = finished(

@@ -8,7 +8,7 @@ from dataclasses import replace
 from functools import partial
 from typing import TypeVar
 
-from factorgraph_dvl.background import available, in_background
+from factorgraph_dvl.background import Awaited, available, in_background
 from factorgraph_dvl.graph.problem import Problem
 from factorgraph_dvl.sensors.imu import Imu
 from factorgraph_dvl.solvers.known_parameters import Explanation, explanation
@@ -20,7 +20,9 @@ Explain = Callable[[Problem, Minimum, Imu], Explanation | None]
 _Result = TypeVar("_Result")
 
 
-def speculated(compute: Callable[[Explain], _Result]) -> _Result:
+def speculated(
+    compute: Callable[[Explain], _Result], meanwhile: Callable[[_Result], object]
+) -> _Result:
     """Return a result that rests on tests of known parameters, with these in a second process.
 
     The tests seldom find anything. The result is computed as if they found nothing, and anew
@@ -30,17 +32,21 @@ def speculated(compute: Callable[[Explain], _Result]) -> _Result:
     ----------
     compute : callable
         Returns the result with the test that it is given, which it makes once.
+    meanwhile : callable
+        Called with a result while a test of it still runs, for what would be done later.
     """
     if not available():
         return compute(explanation)
     with ExitStack() as stack:
-        tests: list[Callable[[], Explanation | None]] = []
+        tests: list[Awaited[Explanation | None]] = []
 
         def later(problem: Problem, minimum: Minimum, imu: Imu) -> None:
             test = partial(explanation, problem, minimum, imu)
             tests.append(stack.enter_context(in_background(test)))
 
         result = compute(later)
+        if not all(test.is_there for test in tests):
+            meanwhile(result)
         found = [test() for test in tests]
     if not any(found):
         return result

@@ -101,10 +101,9 @@ def variance_components(
     )
     count += sum(p.prior_residuals(evaluation.parameters[p.name]).size for p in processes.values())
     found: dict[str, list[tuple[Array, Array]]] = {}
-    for r, h in leverage(
-        lambda: (r for r in source(evaluation) if r.source in wanted), count, information
-    ):
-        found.setdefault(r.source, []).append((r.vector, h))
+    estimated = partial(filter, lambda rows: rows.source in wanted)
+    for rows, h in leverage(lambda: estimated(source(evaluation)), count, information):
+        found.setdefault(rows.source, []).append((rows.vector, h))
     white = {
         label: _white(problem, evaluation, label, *map(np.concatenate, zip(*parts, strict=True)))
         for label, parts in found.items()

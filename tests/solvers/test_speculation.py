@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -13,7 +14,9 @@ from factorgraph_dvl.background import PROCESSES
 from factorgraph_dvl.errors import DataError
 from factorgraph_dvl.sensors.finding import Code
 from factorgraph_dvl.simulation import simulate
+from factorgraph_dvl.solvers import speculation
 from factorgraph_dvl.solvers.batch import solve
+from factorgraph_dvl.solvers.information_along_trial import solve_with_history
 from factorgraph_dvl.solvers.speculation import speculated
 
 SCENE = {
@@ -67,5 +70,31 @@ def test_records_that_cannot_be_used_come_before_what_fails_with_them(trial, pro
 def test_without_a_test_the_result_is_computed_once(processes):
     processes(2)
     given = []
-    assert speculated(lambda explain: given.append(explain) or 3) == 3
+    assert speculated(lambda explain: given.append(explain) or 3, given.append) == 3
     assert len(given) == 1
+
+
+def test_time_while_a_test_runs_is_used(processes, monkeypatch):
+    processes(2)
+    monkeypatch.setattr(speculation, "explanation", lambda *_: time.sleep(0.3))
+    used = []
+    assert speculated(lambda explain: explain(None, None, None) or 3, used.append) == 3
+    assert used == [3]
+    used.clear()
+
+    def slow(explain):
+        explain(None, None, None)
+        time.sleep(1.0)
+        return 3
+
+    # The test has ended by then.
+    assert speculated(slow, used.append) == 3
+    assert not used
+
+
+def test_the_history_is_the_same_whenever_it_is_followed(trial, processes):
+    processes(1)
+    _, later = solve_with_history(trial, rate_hz=1.0)
+    processes(2)
+    _, meanwhile = solve_with_history(trial, rate_hz=1.0)
+    np.testing.assert_array_equal(meanwhile.root, later.root)
