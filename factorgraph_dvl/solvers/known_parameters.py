@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
-import gtsam
 import numpy as np
 
 from factorgraph_dvl.geometry.vectors import Array
-from factorgraph_dvl.graph import keys
 from factorgraph_dvl.graph.clocks import parameters_of
 from factorgraph_dvl.graph.freed_memory import return_freed
 from factorgraph_dvl.graph.problem import Evaluation, Problem
@@ -24,14 +22,11 @@ from factorgraph_dvl.sensors.message import Message, message
 from factorgraph_dvl.sensors.parameters import UNITS, Parameter
 from factorgraph_dvl.solvers.change_along_trial import CHANGED, component_changes
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, factorized
+from factorgraph_dvl.solvers.state_ranges import StateRanges, eliminated_by_ranges
 from factorgraph_dvl.statistics.constancy import by_interval
 from factorgraph_dvl.statistics.robust_weights import robust_scale
-from factorgraph_dvl.statistics.rows import rows_with_times
 from factorgraph_dvl.statistics.scores import Score, Scores, scores
-from factorgraph_dvl.statistics.square_root_information import (
-    SquareRootInformation,
-    eliminated,
-)
+from factorgraph_dvl.statistics.square_root_information import SquareRootInformation
 
 # Logarithm of the probability, shared among all tests, below which a misfit is no chance.
 _LOG10_P = -6.0
@@ -51,10 +46,6 @@ _LEAST_SCALE = 0.5
 # Share of the squares of a scale of the gyros that the wrong `sampling` may leave. Chosen: the
 # motion between samples is known to some per cent, and the scale to ten.
 _LEFT = 0.2
-# Segments from which on states are eliminated in ranges, and how many of these. Chosen: those of a
-# trial of hours, whose columns for all candidates take as much memory as all else.
-_MANY = 10_000
-_RANGES = 6
 # Trial, s, from which on tests are made. Chosen: shorter ones have rival minima.
 _SHORTEST = 60.0
 
@@ -181,63 +172,13 @@ def _tests_of_known(
     ]
     if not known:
         return {}
-    by_ranges = problem.chain.segments.first.size > _MANY and not problem.processes
-    if by_ranges:
-        found = _scores_by_ranges(problem, evaluation, known)
-    else:
-        test, at, columns = _freed(problem, evaluation, known)
-        information, delta = factorized(test, at)
-        found = scores(delta, information, columns)
+    ranges, columns = _freed(problem, evaluation, known)
+    found = scores(ranges.information.solution(), ranges.information, columns)
     tests = {p.name: found.test([p.name]) for p in known}
     if any(t.log10_p < _LOG10_P for t in tests.values()):
-        if by_ranges:
-            test, at, columns = _freed(problem, evaluation, known)
-            information, _ = factorized(test, at)
-        scatter = _scatter(test, at, information, columns, found)
+        scatter = _scatter(problem.chain.segments.node_time, ranges, columns, found)
         tests = {name: t.divided(scatter[name]) for name, t in tests.items()}
     return {p.name: (p, tests[p.name]) for p in known}
-
-
-def _scores_by_ranges(
-    problem: Problem, evaluation: Evaluation, known: Sequence[Parameter]
-) -> Scores:
-    """Return the scores of known parameters; states are eliminated range by range.
-
-    So the columns of all candidates are there for the states of one range only.
-    """
-    count = problem.chain.segments.first.size
-    edges = np.linspace(0, count, _RANGES + 1).astype(int).tolist()
-    graph = gtsam.GaussianFactorGraph()
-    for a, b in itertools.pairwise(edges):
-        graph, sizes, columns = _after_range(problem, evaluation, known, slice(a, b), graph)
-    information = eliminated(graph, keys.ordering(sizes), sizes)
-    return scores(information.solution(), information, columns)
-
-
-def _after_range(
-    problem: Problem,
-    evaluation: Evaluation,
-    known: Sequence[Parameter],
-    block: slice,
-    graph: gtsam.GaussianFactorGraph,
-) -> tuple[gtsam.GaussianFactorGraph, dict[int, int], dict[str, tuple[int, Array]]]:
-    """Return a graph with the factors of some segments, without the states before their end.
-
-    And the sizes of all variables that all states share, and columns as `_freed` returns them.
-    """
-    test, at, columns = _freed(problem, evaluation, known, block)
-    gaussian = test.linearize(at)
-    # Priors of what all states share count once.
-    again = range(test.chain.graph.size(), test.graph.size()) if block.start else range(0)
-    for i in range(gaussian.size()):
-        if i not in again:
-            graph.push_back(gaussian.at(i))
-    order = keys.ordering(problem.chain.keys_of(problem.chain.nodes_of(block)))
-    _, left = graph.eliminatePartialMultifrontal(order, gtsam.EliminateQR)
-    shared = [] if problem.chain.walking else [keys.bias(0)]
-    shared += [test.key(p.name) for p in test.parameters]
-    dims = at.values.dims()
-    return left, {key: int(dims[key]) for key in shared}, columns
 
 
 def _is_plausible(p: Parameter, test: Score) -> bool:
@@ -334,16 +275,20 @@ def _wide(p: Parameter, mean: Array) -> Parameter:
 
 
 def _freed(
-    problem: Problem,
-    evaluation: Evaluation,
-    known: Sequence[Parameter],
-    block: slice | None = None,
-) -> tuple[Problem, Evaluation, dict[str, tuple[int, Array]]]:
-    """Return the problem with known parameters free, where it is, and their keys and priors."""
+    problem: Problem, evaluation: Evaluation, known: Sequence[Parameter]
+) -> tuple[StateRanges, dict[str, tuple[int, Array]]]:
+    """Return the problem with known parameters free, where it is, and their keys and priors.
+
+    Its states are eliminated.
+    """
     names = {p.name for p in known}
     free = [_wide(p, p.mean) if p.name in names else p for p in problem.all_parameters]
-    test, at = _scattered(problem, evaluation, free, block)
-    return test, at, {p.name: (test.key(p.name), p.sigma) for p in free if p.name in names}
+    ranges = eliminated_by_ranges(
+        partial(_scattered, problem, evaluation, free),
+        problem.chain,
+        whole=bool(problem.processes),
+    )
+    return ranges, {p.name: (ranges.names[p.name], p.sigma) for p in free if p.name in names}
 
 
 def _scattered(
@@ -388,9 +333,8 @@ def _scattered(
 
 
 def _scatter(
-    test: Problem,
-    at: Evaluation,
-    information: SquareRootInformation,
+    node_time: Array,
+    ranges: StateRanges,
     columns: Mapping[str, tuple[int, Array]],
     found: Scores,
 ) -> dict[str, float]:
@@ -402,11 +346,13 @@ def _scatter(
     """
     # In units of the wide priors.
     scaled = [{key: np.diag(1.0 / sigma)} for key, sigma in columns.values()]
-    gain = np.linalg.inv(information.covariance_of(scaled))
-    following = {key: P @ gain for key, P in information.covariance_with(scaled).items()}
-    time = test.chain.segments.node_time
-    edges = np.linspace(time[0], time[-1], _INTERVALS + 1)[1:-1]
-    score, known = by_interval(rows_with_times(test, at), following, edges)
+    gain = np.linalg.inv(ranges.information.covariance_of(scaled))
+    shared = {key: P @ gain for key, P in ranges.information.covariance_with(scaled).items()}
+    edges = np.linspace(node_time[0], node_time[-1], _INTERVALS + 1)[1:-1]
+    score, known = np.zeros((2, 1))
+    for rows, following in ranges.rows(shared):
+        of_range = by_interval(rows, following, edges)
+        score, known = score + of_range[0], known + of_range[1]
     out = {}
     for name, place in found.places.items():
         own = known[:, place, place]

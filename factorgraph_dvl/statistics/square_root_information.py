@@ -57,7 +57,7 @@ class SquareRootInformation:
         place = {key: i for i, c in enumerate(self._cliques) for key in c.frontals}
         # That of the separator that was eliminated first: it has all the others.
         self._parents = [
-            max((place[key] for key in c.separators), default=-1) for c in self._cliques
+            max((place.get(key, -1) for key in c.separators), default=-1) for c in self._cliques
         ]
 
     def solution(self) -> gtsam.VectorValues:
@@ -97,6 +97,26 @@ class SquareRootInformation:
             if clique.separators:
                 z = z - clique.T @ np.concatenate([out[key] for key in clique.separators])
             x = _solve(clique.R, z, transposed=False)
+            row = 0
+            for key in clique.frontals:
+                out[key] = x[row : row + self._sizes[key]]
+                row += self._sizes[key]
+        return out
+
+    def following(self, known: Mapping[int, Array]) -> dict[int, Array]:
+        """Return how every variable follows others, on which the trees depend.
+
+        Parameters
+        ----------
+        known : mapping of int to ndarray
+            How the others follow n components, (size, n) by key.
+        """
+        out: dict[int, Array] = {}
+        for clique in self._cliques:
+            above = np.concatenate(
+                [out[key] if key in out else known[key] for key in clique.separators]
+            )
+            x = _solve(clique.R, -clique.T @ above, transposed=False)
             row = 0
             for key in clique.frontals:
                 out[key] = x[row : row + self._sizes[key]]

@@ -10,13 +10,8 @@ import pytest
 from truth import TURNS_AND_BRAKING, merged, scenario
 
 from factorgraph_dvl.sensors.finding import Code
-from factorgraph_dvl.sensors.imu import ERRORS
-from factorgraph_dvl.sensors.records import rows_of
 from factorgraph_dvl.simulation import faults, simulate
-from factorgraph_dvl.solvers import known_parameters
-from factorgraph_dvl.solvers.batch import solve, solved_problems
-from factorgraph_dvl.solvers.levenberg_marquardt import factorized
-from factorgraph_dvl.statistics.scores import scores
+from factorgraph_dvl.solvers.batch import solve
 
 SCENE = {
     "noise": True,
@@ -117,29 +112,3 @@ def test_a_prior_that_the_data_put_far_outside_is_widened(trial):
     assert abs(bias.value[1] - 0.03) < 4.0 * bias.std[1]
     scale = solution.estimate("scale_error")
     assert abs(scale.value[0] - 0.005) < 4.0 * scale.std[0]
-
-
-@pytest.mark.parametrize("walks", [False, True])
-def test_scores_by_ranges_of_states_are_those_of_the_whole(trial, walks):
-    if walks:
-        walk = {"gyro_bias_walk_deg_h_sqrt_h": 0.1, "accel_bias_walk_ug_sqrt_h": 20.0}
-        settings = msgspec.structs.replace(trial.imu.settings, **walk)
-        trial = replace(trial, imu=replace(trial.imu, settings=settings))
-    # A gap, in which a range ends somewhere.
-    silent = (trial.imu.time > 40.0) & (trial.imu.time < 43.0)
-    trial = replace(trial, imu=rows_of(trial.imu, ~silent))
-    solved, *_ = solved_problems(trial)
-    problem, evaluation = solved.problem, solved.minimum.evaluation
-    candidates = [
-        p for p in problem.all_parameters if not p.estimated and p.spec.plausible is not None
-    ]
-    assert {p.name for p in candidates} > {*ERRORS, "gnss_lever_arm_m"}
-    test, at, columns = known_parameters._freed(problem, evaluation, candidates)
-    information, delta = factorized(test, at)
-    expected = scores(delta, information, columns)
-    found = known_parameters._scores_by_ranges(problem, evaluation, candidates)
-    for p in candidates:
-        one, other = found.test([p.name]), expected.test([p.name])
-        assert one.chi2 == pytest.approx(other.chi2, rel=1e-6, abs=1e-6)
-        np.testing.assert_allclose(one.std, other.std, rtol=1e-6)
-        np.testing.assert_allclose(one.step / other.std, other.step / other.std, atol=1e-6)
