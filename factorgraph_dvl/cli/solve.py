@@ -6,8 +6,10 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from functools import partial
+from importlib import import_module
 from math import isfinite
 from pathlib import Path
+from threading import Thread
 from typing import TYPE_CHECKING, Annotated, cast
 
 import typer
@@ -124,7 +126,6 @@ def solve(
     """
 
     def run(trial: Trial, progress: ProgressLine, stages: FinishedStages | None) -> _Found:
-        # The solver is slow to import: do so after the checks of the input.
         from factorgraph_dvl.analysis.comparison.halves import halves_of
         from factorgraph_dvl.solvers.information_along_trial import solve_then_history
 
@@ -154,6 +155,7 @@ def solve(
         quiet=quiet,
         resume=resume,
         options={"anyway": f"{anyway}"},
+        solver="solvers.information_along_trial",
     )
 
 
@@ -242,6 +244,7 @@ def _solve_into(
     quiet: bool,
     resume: bool = False,
     options: Mapping[str, str] | None = None,
+    solver: str = "baselines",
 ) -> None:
     """Load a trial, run a solver, write and show its solution.
 
@@ -260,7 +263,8 @@ def _solve_into(
 
     work = claim_output(out, force=force, owned=OWNED, inputs=inputs_of(trial_path))
     with ProgressLine(quiet=quiet) as progress, ExitStack() as second:
-        trial = load_trial(trial_path, anyway=anyway)
+        with _loading(solver):
+            trial = load_trial(trial_path, anyway=anyway)
         draw: Callable[[_Drawn], Callable[[], None]] | None = None
         if figures is not None:
             # Matplotlib takes as long to load as the figures do to draw.
@@ -297,6 +301,17 @@ def _solve_into(
     _print_solution(trial, found)
     print_written(out)
     end_with(solution.verdict)
+
+
+@contextmanager
+def _loading(name: str) -> Iterator[None]:
+    """Load a module meanwhile: Python waits little while Arrow reads tables."""
+    thread = Thread(target=import_module, args=(f"factorgraph_dvl.{name}",))
+    thread.start()
+    try:
+        yield
+    finally:
+        thread.join()
 
 
 def _stages(

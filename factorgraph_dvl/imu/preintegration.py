@@ -315,7 +315,11 @@ def _knots(
                 knots.put(at, here)
             i -= begin[0]
             less[at] += rotate(here.dR, behind[i]) * (dt[:, None] / 12.0)
-            now.put(live, here.after(turn[i], left[i], dv[i], dt))
+            after = here.after(turn[i], left[i], dv[i], dt)
+            if is_live.all():
+                now = after
+            else:
+                now.put(live, after)
         ends.put(np.arange(first.size)[block], now)
     return knots, less, ends
 

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
 import msgspec
 import numpy as np
 
+from factorgraph_dvl.background import in_background
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.io.calibration_file import (
@@ -129,17 +131,19 @@ def save_solution(
     with new_folder(Path(path), force=force, owned=OWNED) as folder:
         # What the solver has freed is not needed while figures are drawn.
         release_memory()
-        with nullcontext() if extra is None else extra(folder):
-            columns = trajectory_columns(solution.trajectory)
-            if smoothed is not None:
-                columns |= _smoothed_columns(solution.trajectory, smoothed)
-            write_table(folder / TRAJECTORY_FILE, columns)
-            if solution.hypotheses:
-                _write_hypotheses(folder, solution.hypotheses)
-            if solution.rejected:
-                write_table(folder / REJECTED_FILE, rejected_columns(solution.rejected))
-            if solution.residuals:
-                write_table(folder / RESIDUALS_FILE, residual_columns(solution.residuals))
+        columns = trajectory_columns(solution.trajectory)
+        if smoothed is not None:
+            columns |= _smoothed_columns(solution.trajectory, smoothed)
+        write = partial(write_table, folder / TRAJECTORY_FILE, columns)
+        with in_background(write, urgent=True) as written:
+            with nullcontext() if extra is None else extra(folder):
+                if solution.hypotheses:
+                    _write_hypotheses(folder, solution.hypotheses)
+                if solution.rejected:
+                    write_table(folder / REJECTED_FILE, rejected_columns(solution.rejected))
+                if solution.residuals:
+                    write_table(folder / RESIDUALS_FILE, residual_columns(solution.residuals))
+            written()
         (folder / CALIBRATION_FILE).write_bytes(encode_calibration(solution))
 
 

@@ -175,7 +175,10 @@ def _floats(values: NDArray[Any]) -> pa.Array:
 
 def _texts(values: NDArray[np.str_]) -> pa.Array:
     """Return texts (N,) as Arrow's."""
-    encoded = [text.encode() for text in values.tolist()]
+    texts = values.tolist()
+    # Names and labels are few, and come again and again.
+    of_text = {text: text.encode() for text in set(texts)}
+    encoded = [of_text[text] for text in texts]
     ends = np.cumsum([0, *map(len, encoded)], dtype=np.int32)
     buffers = [None, pa.py_buffer(ends), pa.py_buffer(b"".join(encoded))]
     return pa.Array.from_buffers(pa.string(), values.size, buffers)

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from factorgraph_dvl.quality.plausibility import findings
 from factorgraph_dvl.quality.records import SensorSurvey, record_of, travel
 from factorgraph_dvl.sensors.finding import Finding, errors_of
 from factorgraph_dvl.sensors.speed_log import SpeedLog
@@ -67,6 +66,9 @@ def survey(trial: Trial) -> Survey:
     >>> found.duration, len(found.sensors)
     (85.98, 3)
     """
+    # What looks for findings takes long to load: a solve has it in a second process.
+    from factorgraph_dvl.quality.plausibility import findings
+
     sensors = []
     if trial.imu is not None:
         sensors.append(record_of("IMU", trial.imu.time, np.zeros(trial.imu.time.size, dtype=bool)))

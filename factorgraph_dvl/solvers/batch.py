@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from copy import copy
 from dataclasses import replace
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import gtsam
 import numpy as np
@@ -17,7 +17,6 @@ from factorgraph_dvl.imu.propagation import States
 from factorgraph_dvl.quality.refusal import accepted_errors, explained
 from factorgraph_dvl.quality.survey import survey
 from factorgraph_dvl.ranging.hypothesis_weights import significant_costs
-from factorgraph_dvl.ranging.planar_solution import solve_planar
 from factorgraph_dvl.ranging.position_from_ranges import StartPositions
 from factorgraph_dvl.sensors.finding import Finding
 from factorgraph_dvl.solution import Progress, Solution, ambiguity, joined, most_probable_minimum
@@ -34,9 +33,6 @@ from factorgraph_dvl.solvers.minima import (
     distinct,
     evidence_against,
 )
-from factorgraph_dvl.solvers.motion_preparation import prepare_motion
-from factorgraph_dvl.solvers.motion_smoother import SmoothedMotion, smooth_motion
-from factorgraph_dvl.solvers.motion_summary import summarise_motion
 from factorgraph_dvl.solvers.preparation import Preparation, prepare
 from factorgraph_dvl.solvers.rounds import SettledMinimum, settle
 from factorgraph_dvl.solvers.speculation import Explain, speculated
@@ -45,6 +41,9 @@ from factorgraph_dvl.solvers.state_times import STATE_INTERVAL
 from factorgraph_dvl.solvers.summary import summarise
 from factorgraph_dvl.solvers.trajectory import TRAJECTORY_RATE
 from factorgraph_dvl.trial import Trial
+
+if TYPE_CHECKING:
+    from factorgraph_dvl.solvers.motion_smoother import SmoothedMotion
 
 _Prepared = TypeVar("_Prepared")
 
@@ -125,12 +124,19 @@ def solve_with_problem(
     trial.frame()
     report = progress or _silent
     solved: SolvedProblem | SmoothedMotion
+    # Solvers of some kinds of trials are loaded for these only.
     if trial.planar:
+        from factorgraph_dvl.ranging.planar_solution import solve_planar
+
         records = survey(trial)
         with explained(accepted_errors(records, anyway=anyway)):
             found = solve_planar(trial, rate_hz=rate_hz, progress=report)
         return found.with_findings(records.problems), None
     if trial.imu is None:
+        from factorgraph_dvl.solvers.motion_preparation import prepare_motion
+        from factorgraph_dvl.solvers.motion_smoother import smooth_motion
+        from factorgraph_dvl.solvers.motion_summary import summarise_motion
+
         motion, errors = _prepared(trial, lambda: prepare_motion(trial), anyway=anyway)
         with explained(errors):
             solved = smooth_motion(motion, report)

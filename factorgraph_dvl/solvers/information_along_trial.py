@@ -28,8 +28,6 @@ from factorgraph_dvl.solution import Progress, Solution
 from factorgraph_dvl.solvers.batch import solve_with_problem
 from factorgraph_dvl.solvers.calibration import prior_along, reported
 from factorgraph_dvl.solvers.fixed_directions import SolvedProblem
-from factorgraph_dvl.solvers.motion_information import motion_history
-from factorgraph_dvl.solvers.motion_smoother import SmoothedMotion
 from factorgraph_dvl.solvers.stages import Stages
 from factorgraph_dvl.statistics.information_history import InformationHistory
 from factorgraph_dvl.statistics.spurious_information import spurious_information
@@ -114,7 +112,9 @@ def solve_then_history(
     def history() -> InformationHistory | None:
         if solved is None:
             return None
-        if isinstance(solved, SmoothedMotion):
+        if not isinstance(solved, SolvedProblem):
+            from factorgraph_dvl.solvers.motion_information import motion_history
+
             if progress:
                 progress("information along the trial", 0, None)
             return motion_history(solved, entries=entries)
