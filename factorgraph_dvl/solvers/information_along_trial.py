@@ -17,6 +17,7 @@ import weakref
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
+import gtsam
 import numpy as np
 from scipy.linalg.lapack import dgeqrf, dtrtri
 
@@ -141,6 +142,7 @@ def information_history(found: SolvedProblem, *, entries: int | None = None) -> 
     """
     problem, evaluation = found.problem, found.minimum.evaluation
     triangles, _ = run_filter(problem, evaluation)
+    problem.release()
     count = len(triangles)
     shown = np.unique(np.linspace(0, count - 1, min(entries or count, count)).astype(int))
     undetermined = _undetermined(problem, evaluation, found.covariances.given, triangles, shown)
@@ -200,7 +202,8 @@ def run_filter(
     frontier = [] if start is None else _own_keys(problem, 0)
     root = np.zeros((0, c)) if start is None else start.root
     for k in range(-1 if start is None else 0, last + 1):
-        rows = steps.get(k, [])
+        # Factors that nobody else holds go with their step.
+        rows = steps.pop(k, [])
         present = dict.fromkeys((*frontier, *(key for row in rows for key in row.keys)))
         inner = [key for key in present if key not in columns]
         leaving = [key for key in inner if k < last and gone_after[key] <= k]
@@ -304,16 +307,21 @@ def _constants(problem: Problem) -> dict[int, int]:
 
 @dataclass(frozen=True)
 class _Factor:
-    """Whitened rows of a factor, with its variables."""
+    """A linear factor, with its variables."""
 
     keys: list[int]
-    matrix: Array
+    factor: gtsam.JacobianFactor
+
+    @property
+    def matrix(self) -> Array:
+        """Whitened rows; those of all factors at once would take as much memory as all else."""
+        return np.asarray(self.factor.jacobian()[0])
 
 
 def _rows_by_step(
     problem: Problem, evaluation: Evaluation, *, with_priors: bool
 ) -> dict[int, list[_Factor]]:
-    """Return all factors by the first node of each.
+    """Return all factors of the linearised graph by the first node of each.
 
     What involves nothing but constants and the first node without a measurement, the priors, is
     under -1; noise that is correlated belongs to the node before its own.
@@ -337,7 +345,7 @@ def _rows_by_step(
         if is_prior and not with_priors:
             continue
         k = -1 if is_prior else min(known, default=0)
-        out.setdefault(k, []).append(_Factor(involved, factor.jacobian()[0]))
+        out.setdefault(k, []).append(_Factor(involved, factor))
     return out
 
 
@@ -357,18 +365,18 @@ def _stacked(
         width += sizes[key]
     column |= {key: width + at for key, at in constants.items()}
     width += sum(sizes[key] for key in constants)
-    blocks = [_Factor([*frontier, *constants], root), *factors]
-    out = np.zeros((sum(len(f.matrix) for f in blocks), width))
+    blocks = [([*frontier, *constants], root), *((f.keys, f.matrix) for f in factors)]
+    out = np.zeros((sum(len(matrix) for _, matrix in blocks), width))
     row = 0
-    for f in blocks:
+    for involved, matrix in blocks:
         at = 0
-        for key in f.keys:
+        for key in involved:
             size = sizes[key]
-            out[row : row + len(f.matrix), column[key] : column[key] + size] = f.matrix[
+            out[row : row + len(matrix), column[key] : column[key] + size] = matrix[
                 :, at : at + size
             ]
             at += size
-        row += len(f.matrix)
+        row += len(matrix)
     return out, width
 
 
