@@ -24,16 +24,17 @@ def residual_columns(residuals: Sequence[Residuals]) -> dict[str, Any]:
     """
     parts = []
     for r in residuals:
+        # Texts as objects take eight bytes each, and as many as the longest has otherwise.
         size = r.residual.size
         parts.append(
             (
                 np.repeat(r.time, len(r.components)),
-                np.full(size, r.label),
-                np.tile(r.components, r.time.size),
-                np.full(size, r.reason),
+                np.full(size, r.label, dtype=object),
+                np.tile(np.array(r.components, dtype=object), r.time.size),
+                np.full(size, r.reason, dtype=object),
                 r.residual.ravel(),
                 r.sigma.ravel(),
-                np.full(size, r.unit),
+                np.full(size, r.unit, dtype=object),
             )
         )
     return {

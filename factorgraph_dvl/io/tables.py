@@ -18,6 +18,8 @@ from factorgraph_dvl.geometry.vectors import Array
 
 _EMPTY = ("", "nan", "NaN", "NAN")
 _PARQUET = (".parquet", ".pq")
+# Texts that are encoded at once. Chosen: some megabytes.
+_TEXTS_AT_ONCE = 100_000
 # Tables in memory, by section of trial.yaml: mappings of columns, or DataFrames.
 Tables = Mapping[str, Any]
 # Columns that hold text, in whatever table.
@@ -153,7 +155,7 @@ def write_table(path: Path, columns: Mapping[str, NDArray[Any]]) -> None:
     """
     table = pa.table(
         {
-            name: _texts(values) if values.dtype.kind == "U" else _floats(values)
+            name: _texts(values) if values.dtype.kind in "UO" else _floats(values)
             for name, values in columns.items()
         }
     )
@@ -173,8 +175,15 @@ def _floats(values: NDArray[Any]) -> pa.Array:
     return pa.Array.from_buffers(pa.float64(), values.size, [mask, pa.py_buffer(values)])
 
 
-def _texts(values: NDArray[np.str_]) -> pa.Array:
+def _texts(values: NDArray[Any]) -> pa.ChunkedArray:
     """Return texts (N,) as Arrow's."""
+    parts = range(0, values.size, _TEXTS_AT_ONCE)
+    return pa.chunked_array(
+        [_some_texts(values[a : a + _TEXTS_AT_ONCE]) for a in parts], pa.string()
+    )
+
+
+def _some_texts(values: NDArray[Any]) -> pa.Array:
     texts = values.tolist()
     # Names and labels are few, and come again and again.
     of_text = {text: text.encode() for text in set(texts)}

@@ -284,8 +284,8 @@ class Imu:
         return cls(settings, columns["time_s"], gyro, accel, source)
 
     def columns(self) -> dict[str, Array]:
-        """Return the record as a table."""
-        return named_columns(COLUMNS, np.column_stack([self.time, self.gyro, self.accel]))
+        """Return the record as a table, whose columns are views."""
+        return dict(zip(COLUMNS, [self.time, *self.gyro.T, *self.accel.T], strict=True))
 
     @property
     def error_std(self) -> ImuErrorStd:
