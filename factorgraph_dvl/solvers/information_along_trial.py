@@ -310,7 +310,7 @@ class _Factor:
     """A linear factor, with its variables."""
 
     keys: list[int]
-    factor: gtsam.JacobianFactor
+    factor: gtsam.GaussianFactor
 
     @property
     def matrix(self) -> Array:
