@@ -135,15 +135,10 @@ class Chain:
         origin, count = self.segments.origin, self.segments.node_time.size
         return range(int(origin[block.start]), int(np.append(origin, count)[block.stop]))
 
-    def in_branches(self) -> list[int]:
-        """Return the keys of states and walking biases in an order of elimination.
-
-        In time, but for every so many nodes one, which come last: what is between two of them is a
-        branch of its own.
-        """
-        nodes = range(self.segments.node_time.size)
-        order = [k for k in nodes if k % _BRANCH] + [*nodes[::_BRANCH]]
-        return self.keys_of(order)
+    @property
+    def joints(self) -> range:
+        """Nodes between which branches lie: eliminated last, they leave each by itself."""
+        return range(0, self.segments.node_time.size, _BRANCH)
 
     def keys_of(self, nodes: Iterable[int]) -> list[int]:
         """Return the keys of the states at nodes, each with that of its bias where biases walk."""

@@ -626,11 +626,13 @@ class Problem:
         last = [self._key[p.name] for p in self.parameters]
         if not self.chain.walking:
             last.insert(0, keys.bias(0))
-        if branches and not self.processes:
-            first = self.chain.in_branches()
-        else:
-            time = self.chain.segments.node_time
-            first = in_time_order(time, self.processes, walking=self.chain.walking)
+        time = self.chain.segments.node_time
+        first = in_time_order(time, self.processes, walking=self.chain.walking)
+        if branches:
+            joints = set(self.chain.keys_of(self.chain.joints))
+            for p in self.processes:
+                joints.update(p.around(time[self.chain.joints]))
+            first = sorted(first, key=joints.__contains__)
         return keys.ordering([*first, *last])
 
     def key(self, name: str) -> int:

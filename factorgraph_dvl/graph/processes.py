@@ -93,6 +93,11 @@ class Process:
         j = np.clip(np.searchsorted(self.time, time, side="right") - 1, 0, self.time.size - 2)
         return j, np.clip((time - self.time[j]) / (self.time[j + 1] - self.time[j]), 0.0, 1.0)
 
+    def around(self, time: Array) -> set[int]:
+        """Return the keys of the nodes before and after times (M,)."""
+        before, _ = self.place(time)
+        return {self.key(j) for j in np.union1d(before, before + 1).tolist()}
+
     def _error(self, nodes: Array, time: Array) -> Array:
         """Return the error of each component of a node at times (M,), (M, size)."""
         j, after = self.place(time)

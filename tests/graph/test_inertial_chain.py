@@ -13,7 +13,6 @@ from truth import exact_states, scenario
 
 from factorgraph_dvl.geometry.rotations import exp_so3
 from factorgraph_dvl.geometry.units import DEG_PER_HOUR
-from factorgraph_dvl.graph import inertial_chain as inertial_chain_module
 from factorgraph_dvl.graph import keys
 from factorgraph_dvl.graph.inertial_chain import inertial_chain, square_root
 from factorgraph_dvl.imu.increments import increments
@@ -55,18 +54,6 @@ def test_the_truth_costs_next_to_nothing(walks):
     assert cost / chain.graph.size() < 0.5
     off = replace(states, v_n=states.v_n + np.linspace(0.0, 1.0, len(states.v_n))[:, None])
     assert chain.graph.error(values_of(chain, off)) > 100.0 * (cost + 1.0)
-
-
-@pytest.mark.parametrize("walks", [False, True])
-def test_branches_have_every_variable_once_and_what_joins_them_last(walks, monkeypatch):
-    monkeypatch.setattr(inertial_chain_module, "_BRANCH", 10)
-    chain, states = chain_of(walking() if walks else scenario(manoeuvres=SHORT))
-    order = chain.in_branches()
-    nodes = range(len(states.p_n))
-    own = [keys.node(k) for k in nodes] + [keys.bias(k) for k in nodes if walks]
-    assert sorted(order) == sorted(own)
-    joints = {keys.node(k) for k in nodes[::10]} | {keys.bias(k) for k in nodes[::10] if walks}
-    assert set(order[-len(joints) :]) == joints
 
 
 def test_a_known_start_holds_the_first_attitude():

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 
 import gtsam
 import numpy as np
 import pytest
 from problems import SHORT, problem_of
+from problems import walking as walking_biases
 from truth import scenario
 
-from factorgraph_dvl.graph import keys
+from factorgraph_dvl.graph import inertial_chain, keys
 from factorgraph_dvl.graph.problem import Problem
 from factorgraph_dvl.graph.processes import Process, node_times
 from factorgraph_dvl.sensors.protocol import ScaleWalk
@@ -181,3 +183,43 @@ def test_nodes_leave_out_what_was_not_measured():
     assert nodes.size < 100
     assert nodes[0] == 0.0
     assert nodes[-1] == 1e9 + 99.0
+
+
+@pytest.mark.parametrize("walks", [False, True])
+@pytest.mark.parametrize("labels", [[], ["GNSS position", "DVL velocity"]])
+def test_branches_of_states_and_processes_are_joined_by_what_goes_last(walks, labels, monkeypatch):
+    monkeypatch.setattr(inertial_chain, "_BRANCH", 10)
+    scene = walking_biases() if walks else scenario(manoeuvres=SHORT)
+    plain, start = problem_of(scene)
+    time = plain.chain.segments.node_time
+    nodes = np.linspace(time[0], time[-1], time.size // 3)
+    processes = [process(o, i, nodes) for i, o in enumerate(labels)]
+    problem = Problem(plain.chain, plain.observations, plain.all_parameters, processes=processes)
+    for p in processes:
+        for j in range(p.time.size):
+            start.insert(p.key(j), p.zero[j])
+    problem.weigh(problem.evaluate(start))
+    ordering = problem.ordering()
+    order = [ordering.at(i) for i in range(ordering.size())]
+    assert sorted(order) == sorted(start.keys())
+    first = next(i for i, key in enumerate(order) if key == keys.node(0))
+    branch = {key: key for key in order[:first]}
+
+    def root(key):
+        return key if branch[key] == key else root(branch[key])
+
+    gaussian = problem.linearize(problem.evaluate(start))
+    for i in range(gaussian.size()):
+        involved = gaussian.at(i).keys()
+        own = [key for key in involved if key in branch]
+        for one, other in pairwise(own):
+            branch[root(one)] = root(other)
+    by_branch = {}
+    for key in branch:
+        by_branch.setdefault(root(key), []).append(key)
+    states = [
+        {keys.index_of(key) // 10 for key in each if keys.letter_of(key) == "x"}
+        for each in by_branch.values()
+    ]
+    assert all(len(each) <= 1 for each in states)
+    assert set().union(*states) == set(range(-(-(time.size - 1) // 10)))
