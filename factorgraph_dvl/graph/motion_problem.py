@@ -29,6 +29,12 @@ from factorgraph_dvl.sensors.protocol import Linearization, Motion, Observation
 ATTITUDE = "attitude"
 CURRENT = "current"
 _SCALE = "scale_error"
+_LEVER_ARM = "lever_arm_m"
+# Products e_i × with the unit vectors, (3, 3, 3).
+_CROSS = np.cross(np.eye(3)[:, None], np.eye(3)[None]).transpose(0, 2, 1)
+# Largest share of the information on a lever arm that noise of rates may be. Chosen: with one of
+# more than a half, rounds take steps that grow.
+_MOST_NOISE = 0.5
 # Factor on the density of acceleration that makes a prior weak. Chosen: of its effect on constants
 # a percent is left, and the states stay determined in gaps.
 _WEAKER = 100.0
@@ -350,7 +356,7 @@ class MotionProblem:
     def follow_motion(
         self, evaluation: MotionEvaluation, factors: Factorisation, covariances: Covariances
     ) -> Array:
-        """Set the slope by which scale errors do not depend on the prior of the motion.
+        """Set the slope that takes the prior of the motion and noise of rates out of constants.
 
         At the least cost the prior holds the velocity back, and a scale error makes up for it: in
         a tidal race one of 0.29 came from it. Its gradient is therefore that of residuals about
@@ -361,6 +367,11 @@ class MotionProblem:
 
         A vessel that keeps its track moves independently of the current, one that drifts moves
         with it. In between, a share of the current's information on the scale error counts.
+
+        Rates of a record have noise n, and a lever arm l that is too short makes less of n × l.
+        The gradient by l has the expectation of this, and the slope is its opposite (corrected
+        score: Nakamura, Biometrika 77 (1990)). Of noise that makes more than half of the
+        information on l, half is taken: with all, no value may be left that solves it.
 
         Returns
         -------
@@ -397,9 +408,40 @@ class MotionProblem:
                     by_row += np.sum(J[:, :, place] * each, axis=(0, 2))
                 rows = by_row.sum() if gain.size == 1 else by_row
                 by_track[self.columns[_SCALE]] += rows / gain
+        for name, column in self.columns.items():
+            if name.endswith(_LEVER_ARM):
+                by_noise = self._by_noise_of_rates(name, evaluation, covariances)
+                share = np.linalg.eigvals(by_noise @ covariances.constants[column, column])
+                by_noise *= min(_MOST_NOISE / max(np.abs(share).max(), 1e-300), 1.0)
+                slope[column] -= by_noise @ evaluation.parameters[name]
         self.slope = slope + _TRACK * by_track
         self._slope_at = dict(evaluation.parameters)
         return by_track
+
+    def _by_noise_of_rates(
+        self, name: str, evaluation: MotionEvaluation, covariances: Covariances
+    ) -> Array:
+        """Return the information on a lever arm that noise of the rates pretends, (3, 3)."""
+        out = np.zeros((3, 3))
+        for o, seen, W in zip(
+            self.observations, evaluation.seen, evaluation.whitening, strict=True
+        ):
+            if name not in o.parameters:
+                continue
+            time = seen.time - self.offset(evaluation.parameters)
+            stamp = time + self._attitude_lag(time, evaluation.parameters)
+            variance = self.attitude.rate_noise(stamp, seen.body.theta_by_rph)
+            if not variance.any():
+                continue
+            rows = _rows(o, seen, W @ seen.by_state, W @ seen.by_parameters, seen.residual)
+            # Derivatives by the velocity in the body, as those by the velocity in n. Residuals
+            # lack the noise that the states follow.
+            J = W @ seen.by_state[:, :, 3:6] @ seen.motion.nRb
+            left = np.maximum(1.0 - rows.leverage(covariances), 0.0)
+            weight = J.transpose(0, 2, 1) @ (left[:, :, None] * J)
+            # By noise along each axis, whose product with the lever arm is e_i × l.
+            out += np.einsum("mi,mjk,ijp,ikq->pq", variance, weight, _CROSS, _CROSS, optimize=True)
+        return out
 
     def equations(self, evaluation: MotionEvaluation) -> NormalEquations:
         """Return the normal equations at an evaluation."""
@@ -471,7 +513,11 @@ class MotionProblem:
             other = self.with_chain(chain)
             scale = np.ones(chain.size)
             for p, q in zip(self.chain.processes, chain.processes, strict=True):
-                scale[chain.place(p.name)] = np.maximum(q.sigma, 1e-300) / p.sigma
+                # One without variance stays so.
+                scale[chain.place(p.name)] = np.divide(
+                    np.maximum(q.sigma, 1e-300), p.sigma, out=np.ones(p.sigma.size),
+                    where=p.sigma > 0.0,
+                )  # fmt: skip
             states = evaluation.states / scale
             equations = data.scaled(scale)
             equations.constant_gradient += slope

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from factorgraph_dvl.errors import DataError
-from factorgraph_dvl.sensors.records import check_range
+from factorgraph_dvl.sensors.records import check_range, noise_beside_motion, white_noise
 
 
 @pytest.mark.parametrize(
@@ -32,3 +32,19 @@ def test_single_values_out_of_range_say_nothing_of_the_unit() -> None:
 def test_infinite_values_are_out_of_range_and_in_no_unit() -> None:
     with pytest.raises(DataError, match=r"expected -50 to 50 m/s$"):
         check_range({"vel_x_m_s": np.array([0.0, np.inf])}, -50.0, 50.0, "m/s", "dvl")
+
+
+def test_white_noise_is_found_beside_slow_motion() -> None:
+    noise = np.random.default_rng(0).standard_normal((20_000, 2))
+    motion = 30.0 * np.sin(0.15 * np.arange(20_000.0))[:, None]
+    found = noise_beside_motion(noise + motion)
+    np.testing.assert_allclose(found, 1.0, rtol=0.05)
+
+
+@pytest.mark.parametrize("per_sample", [1.0, 1.5, 2.0])
+def test_fast_motion_is_no_noise(per_sample: float) -> None:
+    noise = np.random.default_rng(0).standard_normal((20_000, 1))
+    motion = 10.0 * np.sin(per_sample * np.arange(20_000.0))[:, None]
+    assert noise_beside_motion(motion)[0] < 0.05
+    assert noise_beside_motion(noise + motion)[0] < 1.05
+    assert white_noise(noise + motion)[0] > 1.2
