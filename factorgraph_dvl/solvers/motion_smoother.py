@@ -31,6 +31,9 @@ from factorgraph_dvl.statistics.robust_weights import robust_scale
 # Decrease of the cost that the linear model still promises at a minimum, and steps of the first
 # round, which starts far off, and of others, in which noise and strengths move the minimum.
 _CONVERGED = 1e-3
+# The same while noise and strengths still change. Chosen: 0.3 standard deviations of a constant,
+# as the next round moves it by more.
+_NEAR_ENOUGH = 0.05
 _FAR_STEPS = 6
 # Change of constants within two rounds, in standard deviations, below which steps count as those
 # at a minimum with a kink: the acceleration jumps at a node, where a clock may move a measurement.
@@ -141,11 +144,11 @@ def smooth_motion(prepared: MotionPreparation, report: Progress) -> SmoothedMoti
     iterations, searches, free_current = 0, 0, prepared.current_is_free
     changing = [message("not_converged.all")]
     last_moved, reach = np.zeros_like(problem.chain.density), _FAR
-    earlier = [values]
+    earlier, enough = [values], _NEAR_ENOUGH
     last_noise = {label: np.zeros_like(f) for label, f in problem.noise_factors.items()}
     for round_ in range(_ROUNDS):
         evaluation, factors, steps, reached = _minimise(
-            problem, states, values, report, far=round_ == 0
+            problem, states, values, report, far=round_ == 0, enough=enough
         )
         iterations += steps
         states, values = evaluation.states, evaluation.parameters
@@ -184,7 +187,7 @@ def smooth_motion(prepared: MotionPreparation, report: Progress) -> SmoothedMoti
         density = np.clip(chain.density * np.exp(_hastened(moved, last_moved)), *_DENSITY)
         last_moved = moved
         # A search takes twenty factorisations: not in every round.
-        if free_current and (not changing or round_ % _CURRENT_ROUNDS == 0):
+        if free_current and (not changing or round_ % _CURRENT_ROUNDS == _CURRENT_ROUNDS - 1):
             report("current", round_, None)
             chain = _current(problem, evaluation, chain, reach)
             reach = _NEAR
@@ -205,6 +208,9 @@ def smooth_motion(prepared: MotionPreparation, report: Progress) -> SmoothedMoti
             changing.append(message("not_converged.outliers"))
             if round_ < _ROUNDS - 1:
                 continue
+        if not changing and enough > _CONVERGED:
+            enough = _CONVERGED
+            changing.append(message("not_converged.minimum"))
         if not changing or round_ == _ROUNDS - 1:
             break
         problem = problem.with_chain(replace(chain, density=density))
@@ -255,10 +261,12 @@ def _minimise(
     report: Progress,
     *,
     far: bool,
+    enough: float,
 ) -> tuple[MotionEvaluation, Factorisation, int, bool]:
     """Return the minimum near states and values, its factorisation, steps, and if it was reached.
 
-    From a far start weights follow the first steps: a DVL's noise is that of its speed.
+    It is reached where the cost can decrease by no more than `enough`. From a far start weights
+    follow the first steps: a DVL's noise is that of its speed.
     """
     most = _FAR_STEPS if far else _STEPS
     evaluation, cost = _weighted(problem, states, values)
@@ -279,12 +287,12 @@ def _minimise(
                 where="all sensors",
                 hint="Inspect the trial: standard deviations may differ by too many digits",
             ) from None
-        if factors.decrease < _CONVERGED:
+        if factors.decrease < enough:
             return evaluation, factors, steps, True
         after = _lower(problem, evaluation, cost, factors)
         if after is None:
             # No digits are left, or the weights hold the step back.
-            return evaluation, factors, steps, factors.decrease < 1e-2
+            return evaluation, factors, steps, factors.decrease < max(enough, 1e-2)
         evaluation, cost = after
         if far and steps < 3:
             evaluation, cost = _weighted(problem, evaluation.states, evaluation.parameters)

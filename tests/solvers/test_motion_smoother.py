@@ -273,6 +273,29 @@ def test_a_current_that_changes_for_hours_moves_no_clock_of_the_start():
     assert np.linalg.norm(log_so3(start["misalignment_deg"] @ truth.T)) < 5.0 * DEG
 
 
+def test_a_current_is_searched_once_noise_and_acceleration_are_known():
+    # With those of the start it came out as 2 m/s that change within a minute, and no round
+    # settled.
+    solution = solve(simulate(shortened("ship-water", repeat=2), 2), rate_hz=0.1)
+    assert solution.converged
+    assert abs(solution.estimate("scale_error").value[0]) < 0.05
+
+
+@pytest.mark.slow
+def test_through_water_errors_are_as_large_as_their_standard_deviations():
+    """The current is that of the trial: its mean, of which the simulation knows the truth."""
+    off, current = [], []
+    for seed in range(RUNS):
+        trial = simulate(shortened("ship-water", repeat=2), seed)
+        solution, truth = solve(trial, rate_hz=0.1), trial.calibration_truth
+        off.append(np.concatenate(list(deviations(solution, truth).values())))
+        found = solution.estimate("current_m_s")
+        current.append((found.value - truth["current_m_s"]) / found.std)
+    for each in (off, current):
+        low, high = rms_band(np.size(each))
+        assert low < np.sqrt(np.mean(np.square(each))) < high
+
+
 @pytest.mark.slow
 def test_through_water_standard_deviations_are_those_of_least_squares(monkeypatch):
     monkeypatch.syspath_prepend(CONFIGS.parent / "benchmarks")
