@@ -219,6 +219,20 @@ class Factorisation:
         out = cho_solve_banded((self._factor, False), right.reshape(k * n, -1), check_finite=False)
         return np.asarray(out.reshape(right.shape))
 
+    def covariance_with(self, nodes: Array, constants: Array) -> tuple[Array, Array]:
+        """Return covariances with sums of states and constants, (K, n, m) and (c, m).
+
+        Parameters
+        ----------
+        nodes : ndarray, shape (K, n, m)
+            Weights of the states in the sums.
+        constants : ndarray, shape (c, m)
+            Weights of the constants.
+        """
+        through = np.einsum("kic,kim->cm", self.influence, nodes)
+        of_constants = self.constants @ (constants - through)
+        return self.solve_nodes(nodes) - self.influence @ of_constants, of_constants
+
     def step(self) -> tuple[Array, Array]:
         """Return the Gauss-Newton step of nodes (K, n) and constants (c,)."""
         constants = -self.constants @ self._constant_gradient

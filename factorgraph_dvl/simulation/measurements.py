@@ -147,7 +147,8 @@ def simulate_dvl(
     jitter_rng, noise_rng, water_rng = rng.spawn(3)
     time = sample_times(truth, motion.duration, jitter_rng)
     state = motion.at(time)
-    velocity = _dvl_velocity(scenario, state, _water(scenario, time, state, water_rng))
+    water = _water(scenario, time, state, water_rng)
+    velocity = _dvl_velocity(scenario, state, water)
     if scenario.noise:
         speed = np.linalg.norm(velocity, axis=1, keepdims=True)
         sigma = np.hypot(truth.velocity_std_m_s, truth.velocity_std_fraction * speed)
@@ -169,6 +170,8 @@ def simulate_dvl(
     }
     if truth.reference == "water":
         calibration["current_m_s"] = np.array(scenario.current_m_s[:2])
+        if truth.moving_water is not None:
+            calibration["current_m_s"] = np.mean(water[:, :2], axis=0)
     return dvl, calibration
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -39,6 +40,34 @@ from factorgraph_dvl.trial import Trial
 _CHUNK = 4000
 _MOTION_NOISE = "acceleration between states"
 _TRACK = "how much the current carries the vessel"
+_MEAN_CURRENT = "current_m_s"
+
+
+@dataclass(frozen=True)
+class _OverTrial:
+    """The constants, with the mean of the current over the trial in place of its process's.
+
+    A trial of hours shows the mean of a process that changes over hours badly, and its strength,
+    on which the standard deviation depends, no better: errors were 2.3 standard deviations.
+    What it carried the vessel with on average is known as well as the velocities.
+
+    Parameters
+    ----------
+    values : dict of str to ndarray
+        Of the parameters.
+    with_nodes, with_constants : ndarray, shape (K, n, c) or (c, c)
+        Covariances of states and constants (rows) with them (columns).
+    by_track : ndarray, shape (c,)
+        Their standard deviations, with signs, that come from the share of the current.
+    covariance : ndarray, shape (c, c)
+        Theirs, that of this share included.
+    """
+
+    values: dict[str, Array]
+    with_nodes: Array
+    with_constants: Array
+    by_track: Array
+    covariance: Array
 
 
 def summarise_motion(trial: Trial, found: SmoothedMotion, *, rate_hz: float) -> Solution:
@@ -54,8 +83,9 @@ def summarise_motion(trial: Trial, found: SmoothedMotion, *, rate_hz: float) -> 
         Rate of the trajectory, Hz; at most that of the attitude record.
     """
     problem, evaluation = found.problem, found.evaluation
+    over_trial = _over_trial(found)
     estimates, covariance, gain = reported_calibration(
-        problem, evaluation.parameters, found.constants
+        problem, over_trial.values, over_trial.covariance
     )
     residuals, rejected = _residuals(found)
     noise = tuple(Noise(noise_name(n), f) for n, f in problem.noise_factors.items())
@@ -85,7 +115,36 @@ def summarise_motion(trial: Trial, found: SmoothedMotion, *, rate_hz: float) -> 
         rejected=rejected,
         limits=trial.limits,
         noise=noise,
-        error_budget=_causes(found, in_order(problem.all_parameters, lambda p: p), gain),
+        error_budget=_causes(
+            found, over_trial, in_order(problem.all_parameters, lambda p: p), gain
+        ),
+    )
+
+
+def _over_trial(found: SmoothedMotion) -> _OverTrial:
+    """Return the constants with the mean of the current over the trial."""
+    problem, factors = found.problem, found.factors
+    chain, values = problem.chain, dict(found.evaluation.parameters)
+    with_nodes = found.covariances.with_constants.copy()
+    with_constants = found.covariances.constants.copy()
+    covariance, by_track = with_constants.copy(), found.by_track.copy()
+    if chain.has(CURRENT) and _MEAN_CURRENT in problem.columns:
+        own, place = problem.columns[_MEAN_CURRENT], chain.place(CURRENT)
+        sigma = next(p.sigma for p in chain.processes if p.name == CURRENT)
+        share = np.gradient(chain.time)
+        share /= share.sum()
+        weights = np.zeros((*found.evaluation.states.shape, 2))
+        weights[:, place] = share[:, None, None] * np.diag(sigma)
+        values[_MEAN_CURRENT] = values[_MEAN_CURRENT] + np.einsum(
+            "kim,ki->m", weights, found.evaluation.states
+        )
+        alone = np.eye(problem.constants)[:, own]
+        with_nodes[:, :, own], with_constants[:, own] = factors.covariance_with(weights, alone)
+        covariance = with_constants.copy()
+        covariance[own] += np.einsum("kim,kic->mc", weights, with_nodes)
+        by_track = with_constants.T @ np.linalg.solve(factors.constants, by_track)
+    return _OverTrial(
+        values, with_nodes, with_constants, by_track, covariance + np.outer(by_track, by_track)
     )
 
 
@@ -234,22 +293,23 @@ def trajectory_of(
 
 
 def _causes(
-    found: SmoothedMotion, reported: Sequence[Parameter], gain: Array
+    found: SmoothedMotion, over_trial: _OverTrial, reported: Sequence[Parameter], gain: Array
 ) -> tuple[Cause, ...]:
     """Return what each cause adds to the standard deviations: P = sum k kᵀ over rows of noise."""
-    problem, cov = found.problem, found.covariances
+    problem = found.problem
+    with_nodes, with_constants = over_trial.with_nodes, over_trial.with_constants
     variances: dict[str, Array] = {}
     chain = problem.chain
     motion = problem.motion_rows(found.evaluation.states)
     for rows in (motion, *problem.rows(found.evaluation)):
         k = (
-            rows.before @ cov.with_constants[rows.node]
-            + rows.after @ cov.with_constants[rows.node + 1]
-            + rows.constants @ cov.constants
+            rows.before @ with_nodes[rows.node]
+            + rows.after @ with_nodes[rows.node + 1]
+            + rows.constants @ with_constants
         ) @ gain.T
         squares = np.sum(k**2, axis=0)
         if rows is motion:
-            first = (chain.first()[:, None] * cov.with_constants[0]) @ gain.T
+            first = (chain.first()[:, None] * with_nodes[0]) @ gain.T
             squares += first**2
             variances[_MOTION_NOISE] = squares[:6].sum(axis=0)
             for process in chain.processes:
@@ -262,10 +322,10 @@ def _causes(
     if problem.parameters:
         whiten = np.linalg.inv(problem.prior_root)
         for p in problem.parameters:
-            k = whiten[problem.columns[p.name]] @ cov.constants @ gain.T
+            k = whiten[problem.columns[p.name]] @ with_constants @ gain.T
             variances[PRIOR.format(p.name)] = np.sum(k**2, axis=0)
     if chain.has(CURRENT):
-        variances[_TRACK] = (gain @ found.by_track) ** 2
+        variances[_TRACK] = (gain @ over_trial.by_track) ** 2
     assumed = {
         PRIOR.format(p.name): numbers_with_unit(p.sigma / p.si, UNITS[p.spec.unit].text)
         for p in problem.parameters

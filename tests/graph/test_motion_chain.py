@@ -91,3 +91,7 @@ def test_covariances_and_step_are_those_of_the_dense_system():
     found = factors.covariances().around(np.array([2]))[0]
     rows = [*range(2 * n, 4 * n), *range(k * n, k * n + c)]
     np.testing.assert_allclose(found, P[np.ix_(rows, rows)], atol=1e-9)
+    sums = rng.standard_normal((k * n + c, 2))
+    with_sums = factors.covariance_with(sums[: k * n].reshape(k, n, 2), sums[k * n :])
+    of_nodes = with_sums[0].reshape(k * n, 2)
+    np.testing.assert_allclose(np.vstack([of_nodes, with_sums[1]]), P @ sums, atol=1e-9)
