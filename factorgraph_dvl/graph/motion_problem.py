@@ -201,6 +201,7 @@ class MotionProblem:
         self._weights: list[tuple[Array, Array, Array]] = []
         self._bound: dict[str, Array] = {}
         self._last: tuple[MotionEvaluation, NormalEquations] | None = None
+        self._last_rows: tuple[MotionEvaluation, tuple[WhitenedRows, ...]] | None = None
         # A parameter that no measurement names belongs to the attitude.
         self._of_attitude = {p.name for p in attitude.sensor.parameters()}
 
@@ -232,12 +233,11 @@ class MotionProblem:
         """Set the weights of all measurements from their covariances there, and evaluate."""
         self._bound = {}
         seen = tuple(self._see(o, states, parameters) for o in self.observations)
-        self._weigh(seen, parameters)
-        return MotionEvaluation(states, parameters, seen, self._whitening(seen))
+        return MotionEvaluation(states, parameters, seen, self._weigh(seen, parameters))
 
     def _whitening(self, seen: Sequence[Seen]) -> tuple[Array, ...]:
         return tuple(
-            np.linalg.inv(np.linalg.cholesky(own + s.interpolation.variance(J) * used)) * used
+            _inverse_root(own + s.interpolation.variance(J) * used) * used
             for s, (own, J, used) in zip(seen, self._weights, strict=False)
         )
 
@@ -273,9 +273,12 @@ class MotionProblem:
         """Return the times of the nodes less true times, s."""
         return float(parameters[self.clock][0])
 
-    def _weigh(self, all_seen: Sequence[Seen], parameters: Mapping[str, Array]) -> None:
-        """Set the weights of all measurements from their covariances."""
+    def _weigh(
+        self, all_seen: Sequence[Seen], parameters: Mapping[str, Array]
+    ) -> tuple[Array, ...]:
+        """Set the weights of all measurements from their covariances, and return the whitening."""
         self._weights, self.total_sigma = [], []
+        whitening = []
         for o, seen in zip(self.observations, all_seen, strict=True):
             # A clock that moves must not follow errors that are as rough as a random walk.
             self._bound[o.label] = seen.time
@@ -285,11 +288,12 @@ class MotionProblem:
             spread = seen.by_rph * self.attitude.white
             pairs = used[:, :, None] * used[:, None, :]
             R += spread @ spread.transpose(0, 2, 1) * pairs
-            variance = np.diagonal(
-                R + seen.interpolation.variance(seen.by_state), axis1=1, axis2=2
-            )
+            between = seen.interpolation.variance(seen.by_state)
+            variance = np.diagonal(R + between, axis1=1, axis2=2)
             self.total_sigma.append(np.where(used, np.sqrt(variance), np.inf))
             self._weights.append((R, seen.by_state, pairs))
+            whitening.append(_inverse_root(R + between * pairs) * pairs)
+        return tuple(whitening)
 
     def usable(self, observation: Observation, seen: Seen) -> np.ndarray:
         """Whether measurements (M,) are covered and not rejected."""
@@ -303,14 +307,21 @@ class MotionProblem:
         factor = self.noise_factors.get(observation.label, 1.0)
         return observation.sigma(seen.motion, parameters, factor)
 
-    def rows(self, evaluation: MotionEvaluation) -> Iterator[WhitenedRows]:
-        """Yield the whitened rows of each observation, unused ones as zeros."""
-        for o, seen, W in zip(
-            self.observations, evaluation.seen, evaluation.whitening, strict=True
-        ):
-            yield _rows(
-                o, seen, W @ seen.by_state, W @ seen.by_parameters, rotate(W, seen.residual)
+    def rows(self, evaluation: MotionEvaluation) -> tuple[WhitenedRows, ...]:
+        """Return the whitened rows of each observation, unused ones as zeros, not to be changed.
+
+        Those of the last evaluation are kept.
+        """
+        if self._last_rows is not None and self._last_rows[0] is evaluation:
+            return self._last_rows[1]
+        out = tuple(
+            _rows(o, seen, W @ seen.by_state, W @ seen.by_parameters, rotate(W, seen.residual))
+            for o, seen, W in zip(
+                self.observations, evaluation.seen, evaluation.whitening, strict=True
             )
+        )
+        self._last_rows = (evaluation, out)
+        return out
 
     def residuals(self, evaluation: MotionEvaluation, covariances: Covariances) -> Iterator[Array]:
         """Yield residuals (M, d) in their standard deviations, rejected ones too, nan if missing.
@@ -395,19 +406,15 @@ class MotionProblem:
         if self.chain.has(CURRENT) and _SCALE in self.columns:
             given, place = covariances.given_constants(), self.chain.place(CURRENT)
             gain = 1.0 + evaluation.parameters[_SCALE]
-            for o, seen, W in zip(
-                self.observations, evaluation.seen, evaluation.whitening, strict=True
-            ):
+            for o, rows in zip(self.observations, self.rows(evaluation), strict=True):
                 if _SCALE not in o.parameters:
                     continue
-                at = seen.interpolation
-                before, after = at.by_nodes(W @ seen.by_state)
-                through = given.with_states(at.node, before, after, place)
-                by_row = np.zeros(W.shape[1])
-                for J, each in zip((before, after), through, strict=True):
+                through = given.with_states(rows.node, rows.before, rows.after, place)
+                by_row = np.zeros(rows.residual.shape[1])
+                for J, each in zip((rows.before, rows.after), through, strict=True):
                     by_row += np.sum(J[:, :, place] * each, axis=(0, 2))
-                rows = by_row.sum() if gain.size == 1 else by_row
-                by_track[self.columns[_SCALE]] += rows / gain
+                by_scale = by_row.sum() if gain.size == 1 else by_row
+                by_track[self.columns[_SCALE]] += by_scale / gain
         for name, column in self.columns.items():
             if name.endswith(_LEVER_ARM):
                 by_noise = self._by_noise_of_rates(name, evaluation, covariances)
@@ -423,8 +430,12 @@ class MotionProblem:
     ) -> Array:
         """Return the information on a lever arm that noise of the rates pretends, (3, 3)."""
         out = np.zeros((3, 3))
-        for o, seen, W in zip(
-            self.observations, evaluation.seen, evaluation.whitening, strict=True
+        for o, seen, W, rows in zip(
+            self.observations,
+            evaluation.seen,
+            evaluation.whitening,
+            self.rows(evaluation),
+            strict=True,
         ):
             if name not in o.parameters:
                 continue
@@ -433,7 +444,6 @@ class MotionProblem:
             variance = self.attitude.rate_noise(stamp, seen.body.theta_by_rph)
             if not variance.any():
                 continue
-            rows = _rows(o, seen, W @ seen.by_state, W @ seen.by_parameters, seen.residual)
             # Derivatives by the velocity in the body, as those by the velocity in n. Residuals
             # lack the noise that the states follow.
             J = W @ seen.by_state[:, :, 3:6] @ seen.motion.nRb
@@ -495,36 +505,55 @@ class MotionProblem:
             known = part.without_first(b - a)
             yield known.factorise().constants
 
-    def deviance(self, evaluation: MotionEvaluation) -> Callable[[MotionChain], float]:
+    def deviance(self, evaluation: MotionEvaluation, name: str) -> Callable[[Array, float], float]:
         """Return twice the negative logarithm of the restricted likelihood, but for a constant.
 
-        It is a function of other priors with the same nodes and processes. States and parameters
-        are integrated out, linear at the evaluation, so that only what they leave says how strong
-        a prior is. Weights of measurements and interpolation are those of this prior.
+        It is a function of standard deviations (p,) and correlation time, s, of a process. States
+        and parameters are integrated out, linear at the evaluation, so that only what they leave
+        says how strong a process is. Weights of measurements and interpolation are those of the
+        present one.
 
         Parameters
         ----------
         evaluation : MotionEvaluation
             Near the minimum.
+        name : str
+            Of the process.
         """
-        data, slope = self._without_motion(evaluation), self.slope
+        place, present = self.chain.place(name), self._sigma(name)
+        rows = self.motion_rows(evaluation.states)
+        for values in (rows.before, rows.after, rows.residual):
+            values[:, place] = 0.0
+        equations = self._without_motion(evaluation).copy()
+        equations.constant_gradient += self.slope
+        equations.add_steps(rows.before, rows.after, rows.residual)
+        self._add_first(equations, evaluation.states)
+        own = np.arange(place.start, place.stop)
+        x, dt = evaluation.states[:, place], np.diff(self.chain.time)[:, None]
+        diagonal, off = equations.diagonal[:, own, own], equations.off[:, own, own]
+        # The prior of the first state is replaced too.
+        diagonal[0] -= 1.0
+        gradient = equations.node_gradient[:, own]
+        gradient[0] -= x[0]
 
-        def of(chain: MotionChain) -> float:
-            other = self.with_chain(chain)
-            scale = np.ones(chain.size)
-            for p, q in zip(self.chain.processes, chain.processes, strict=True):
-                # One without variance stays so.
-                scale[chain.place(p.name)] = np.divide(
-                    np.maximum(q.sigma, 1e-300), p.sigma, out=np.ones(p.sigma.size),
-                    where=p.sigma > 0.0,
-                )  # fmt: skip
-            states = evaluation.states / scale
-            equations = data.scaled(scale)
-            equations.constant_gradient += slope
-            prior = other._add_motion(equations, states)
+        def of(sigma: Array, tau: float) -> float:
+            gain = (present / sigma) ** 2
+            phi, new = np.exp(-dt / tau), -np.expm1(-2.0 * dt / tau)
+            weight, change = gain / new, x[1:] - phi * x[:-1]
+            by_change = weight * change
+            equations.diagonal[:, own, own] = diagonal
+            equations.diagonal[1:, own, own] += weight
+            equations.diagonal[:-1, own, own] += phi**2 * weight
+            equations.diagonal[0, own, own] += gain
+            equations.off[:, own, own] = off - phi * weight
+            equations.node_gradient[:, own] = gradient
+            equations.node_gradient[1:, own] += by_change
+            equations.node_gradient[:-1, own] -= phi * by_change
+            equations.node_gradient[0, own] += gain * x[0]
             factors = equations.factorise()
-            cost = prior - 2.0 * factors.decrease
-            return cost - chain.log_determinant() + factors.log_determinant
+            prior = float(np.sum(by_change * change) + gain @ x[0] ** 2)
+            of_prior = float(np.sum(np.log(weight)) + np.sum(np.log(gain)))
+            return prior - 2.0 * factors.decrease - of_prior + factors.log_determinant
 
         return of
 
@@ -690,6 +719,11 @@ class MotionProblem:
         out.chain = chain
         out._bound = {}
         return out
+
+
+def _inverse_root(covariances: Array) -> Array:
+    """Return the inverses (M, d, d) of the lower Cholesky factors of covariances."""
+    return np.asarray(np.linalg.inv(np.linalg.cholesky(covariances)))
 
 
 def _rows(

@@ -451,13 +451,10 @@ def _current(
     It is searched within a reach of its logarithm first.
     """
     now = next(p for p in chain.processes if p.name == CURRENT)
-    deviance_of = problem.deviance(evaluation)
-
-    def chain_of(x: Array) -> MotionChain:
-        return with_sigma(chain, CURRENT, np.full(2, np.exp(x[0])), float(np.exp(x[1])))
+    deviance_of = problem.deviance(evaluation, CURRENT)
 
     def deviance(x: Array) -> float:
-        return deviance_of(chain_of(x))
+        return deviance_of(np.full(2, np.exp(x[0])), float(np.exp(x[1])))
 
     limits = [_CURRENT_STD, _CURRENT_TIME]
     start = np.clip([np.log(now.sigma[0]), np.log(now.tau)], *np.transpose(limits))
@@ -468,4 +465,5 @@ def _current(
         bounds=limits,
         options={"initial_tr_radius": reach, "final_tr_radius": _FINEST, "maxfev": 40},
     )
-    return chain_of(found.x)
+    sigma, tau = np.exp(found.x)
+    return with_sigma(chain, CURRENT, np.full(2, sigma), float(tau))
