@@ -74,11 +74,10 @@ class InnovationGate:
         """
         window = self._windows.setdefault(label, deque(maxlen=_WINDOW))
         limit = _LIMIT if echo_limit is None else echo_limit
-        beyond = np.any(np.abs(normalised) >= limit, axis=1)
-        there = np.isfinite(normalised)
-        squares = np.where(there, normalised, 0.0) ** 2
-        squares = squares.sum(axis=1) / there.sum(axis=1)
-        window.extend(zip(beyond.tolist(), squares.tolist(), strict=True))
+        # A few numbers at a time: plain ones take a tenth of the time of arrays.
+        rows = normalised.tolist()
+        beyond = np.array([any(abs(x) >= limit for x in row) for row in rows], dtype=bool)
+        window.extend(zip(beyond.tolist(), map(_mean_square, rows), strict=True))
         finding = self._judge(label, window, limit, echo_limit is not None)
         used = np.zeros_like(beyond) if label in self.excluded else ~beyond
         self.rejected[label] += int((~used).sum())
@@ -123,3 +122,9 @@ class InnovationGate:
                 )
             return Finding(Code.CONTRADICTS, text, label)
         return None
+
+
+def _mean_square(row: list[float]) -> float:
+    """Return the mean square of the finite numbers of a row, nan if there are none."""
+    squares = [x * x for x in row if math.isfinite(x)]
+    return math.fsum(squares) / len(squares) if squares else math.nan

@@ -115,7 +115,9 @@ def gated(
     findings : list of Finding
         What the gate noticed.
     """
+    there = np.isfinite(sigma)
     total = np.sqrt(np.sum((jacobian @ P) * jacobian, axis=1) + sigma**2)
+    all_found, all_spread = np.where(there, (residual, total), np.nan)
     weights, innovations, findings = [], [], []
     first = 0
     for r in measured.rows:
@@ -123,9 +125,7 @@ def gated(
         shape = r.time.size, len(o.components)
         part = slice(first, first + shape[0] * shape[1])
         first = part.stop
-        there = np.isfinite(sigma[part])
-        found = np.where(there, residual[part], np.nan).reshape(shape)
-        spread = np.where(there, total[part], np.nan).reshape(shape)
+        found, spread = all_found[part].reshape(shape), all_spread[part].reshape(shape)
         used, finding = gate.accept(o.label, found / spread, o.gate)
         findings += [] if finding is None else [finding]
         weights.append(used[:, None] / sigma[part].reshape(shape))
