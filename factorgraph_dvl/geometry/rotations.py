@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from factorgraph_dvl.geometry.units import DEG
-from factorgraph_dvl.geometry.vectors import Array, skew
+from factorgraph_dvl.geometry.vectors import IDENTITY, Array, skew
 
 BodyAxes = Literal["RFU", "FRD", "FLU"]
 _Angle = TypeVar("_Angle", float, Array)
@@ -79,9 +79,9 @@ def right_jacobian(phi: ArrayLike) -> Array:
     angle = float(np.linalg.norm(phi))
     cross = skew(phi)
     if angle < 1e-4:
-        return np.eye(3) - cross / 2.0 + cross @ cross / 6.0
+        return IDENTITY - cross / 2.0 + cross @ cross / 6.0
     return (
-        np.eye(3)
+        IDENTITY
         - (1.0 - np.cos(angle)) / angle**2 * cross
         + (angle - np.sin(angle)) / angle**3 * cross @ cross
     )
@@ -99,7 +99,7 @@ def inverse_right_jacobian(phi: ArrayLike) -> Array:
     safe = np.where(small, 1.0, angle)
     half = safe / 2.0
     gain = np.where(small, 1.0 / 12.0, (1.0 - half / np.tan(half)) / safe**2)
-    return np.asarray(np.eye(3) + cross / 2.0 + gain * (cross @ cross))
+    return np.asarray(IDENTITY + cross / 2.0 + gain * (cross @ cross))
 
 
 def reported_rotation_vector(matrix: ArrayLike, near: ArrayLike) -> Array:

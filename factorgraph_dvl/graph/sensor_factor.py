@@ -305,15 +305,11 @@ class NodeMeasurements:
     def sigma(self, motions: Sequence[Motion], values: Mapping[str, Array]) -> Array:
         """Return the standard deviations, (R,), at motions of each kind."""
         values = {**self.fixed, **values}
-        return np.concatenate(
-            [
-                np.broadcast_to(
-                    r.observation.sigma(motion, values),
-                    (r.time.size, len(r.observation.components)),
-                ).ravel()
-                for r, motion in zip(self.rows, motions, strict=True)
-            ]
-        )
+        parts, index = self._components
+        out = np.empty(index.size)
+        for r, part, motion in zip(self.rows, parts, motions, strict=True):
+            out[part].reshape(r.time.size, -1)[:] = r.observation.sigma(motion, values)
+        return out
 
 
 @dataclass(frozen=True)

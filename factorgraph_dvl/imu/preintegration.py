@@ -15,7 +15,7 @@ from factorgraph_dvl.errors import DataError
 from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.records import rows_of
 from factorgraph_dvl.geometry.rotations import exp_so3, log_so3
-from factorgraph_dvl.geometry.vectors import Array, IntArray, cross, rotate, skew
+from factorgraph_dvl.geometry.vectors import IDENTITY, Array, IntArray, cross, rotate, skew
 from factorgraph_dvl.imu.increments import Increments, increments
 from factorgraph_dvl.sensors.imu import Imu, ImuSettings
 
@@ -326,7 +326,7 @@ def _knots(
 
 def _turns(phi: Array) -> tuple[Array, Array]:
     """Return Exp(phi), and its mean over the way to it, of rotation vectors (M, 3)."""
-    return exp_so3(phi), np.eye(3) + 0.5 * skew(phi)
+    return exp_so3(phi), IDENTITY + 0.5 * skew(phi)
 
 
 def _stride(inc: Increments) -> int:
@@ -462,7 +462,7 @@ def one_segment(inc: Increments, first: int, last: int) -> Segments:
     inside = np.arange(first, last)
     phi, dv = inc.over(inside)
     turn, left = _turns(phi)
-    dR = np.concatenate([np.eye(3)[None], turn[:-1]])
+    dR = np.concatenate([IDENTITY[None], turn[:-1]])
     # Products of all up to each: of runs that become twice as long.
     run = 1
     while run < inside.size:
@@ -528,9 +528,9 @@ def gtsam_measurements(
         Earth rate in n.
     """
     inc = seg.increments
-    gyro_psd = settings.gyro_noise_root_psd**2 * np.eye(3)
-    accel_psd = settings.accel_noise_root_psd**2 * np.eye(3)
-    integration_psd = _INTEGRATION_ROOT_PSD**2 * np.eye(3)
+    gyro_psd = settings.gyro_noise_root_psd**2 * IDENTITY
+    accel_psd = settings.accel_noise_root_psd**2 * IDENTITY
+    integration_psd = _INTEGRATION_ROOT_PSD**2 * IDENTITY
     is_open = np.flatnonzero(np.any(inc.open_sigma > 0.0, axis=1))
     some_open = np.searchsorted(is_open, seg.first) < np.searchsorted(is_open, seg.last)
     no_extra = np.zeros((3, 3))
@@ -547,7 +547,7 @@ def gtsam_measurements(
             if some_open[s]:
                 own = slice(seg.first[s], seg.last[s])
                 extra = (inc.open_sigma[own] * inc.dt[own, None]) ** 2 / seg.duration[s]
-                extra_gyro, extra_accel = (e.sum() * np.eye(3) for e in np.hsplit(extra, 2))
+                extra_gyro, extra_accel = (e.sum() * IDENTITY for e in np.hsplit(extra, 2))
             params.setGyroscopeCovariance(gyro_psd + extra_gyro)
             params.setAccelerometerCovariance(accel_psd + extra_accel)
             pim = gtsam.PreintegratedImuMeasurementsG(params)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factorgraph_dvl.geometry.rotations import exp_so3
-from factorgraph_dvl.geometry.vectors import Array, IntArray, cross, rotate, skew
+from factorgraph_dvl.geometry.vectors import IDENTITY, Array, IntArray, cross, rotate, skew
 from factorgraph_dvl.imu.preintegration import Segments
 from factorgraph_dvl.sensors.protocol import Linearization, Motion
 
@@ -131,7 +131,7 @@ def _attach(seg: Segments, index: IntArray, since: Array, earth_rate_n: Array) -
         node=node,
         tau=tau,
         dR=dR @ exp_so3(part.phi),
-        dA=before.dA + dR @ (np.eye(3) + 0.5 * skew(part.phi)) * h[:, :, None],
+        dA=before.dA + dR @ (IDENTITY + 0.5 * skew(part.phi)) * h[:, :, None],
         dV=before.dV + turned,
         dP=before.dP + before.dV * h + 0.5 * turned * h,
         gyro=part.omega,

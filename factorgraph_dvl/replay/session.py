@@ -109,6 +109,7 @@ class Replay:
             settings = replace(settings, imu=settings.inertial.without_errors())
             self._findings.append(_IMU_ERRORS_LEFT_OUT)
         self._settings = settings
+        self._sections = tuple(aid.section for aid in settings.aids)
         self._kind = smoother
         self._lag = lag_s
         self._interval = 1.0 / rate_hz
@@ -220,10 +221,9 @@ class Replay:
         ConfigError
             If the trial does not have such a sensor.
         """
-        sections = [aid.section for aid in self._settings.aids]
-        if record.section not in sections:
+        if record.section not in self._sections:
             raise ConfigError(
-                f"the trial has no sensor {record.section}", expected=", ".join(sections)
+                f"the trial has no sensor {record.section}", expected=", ".join(self._sections)
             )
         record = self._duplicates.without(record)
         if record.time.size:

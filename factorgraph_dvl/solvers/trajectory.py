@@ -210,7 +210,9 @@ def _closed(
 def _in_n(P: Array, states: States) -> Array:
     """Return the covariances of attitude, position and velocity in n, (K, 3, 3, 3)."""
     # GTSAM's tangent space is in body axes, which differ from node to node; n does not.
-    blocks = np.stack([P[:, i : i + 3, i : i + 3] for i in (0, 3, 6)], axis=1)
+    blocks = np.empty((len(P), 3, 3, 3))
+    for i in range(3):
+        blocks[:, i] = P[:, 3 * i : 3 * i + 3, 3 * i : 3 * i + 3]
     R = states.nRb[:, None]
     return np.asarray(R @ blocks @ R.transpose(0, 1, 3, 2))
 
