@@ -148,3 +148,20 @@ def test_the_oldest_state_stays_a_leaf_when_old_states_are_corrected():
             late.add(gtsam.PriorFactorNavState(keys.node(old), smoother.state(old), noise))
             smoother.correct(late, old)
     assert len(smoother.times) == 21
+
+
+def test_what_is_kept_of_old_states_is_what_the_tree_has():
+    prior, values, steps = chain_of_states(60)
+    smoother = Smoother(prior, values, node=0, time=0.0, parameters=(), walking=False, lag=4.0)
+    for time, graph, new in steps:
+        smoother.extend(time, graph, new)
+    wanted = list(smoother.times)
+    kept = smoother.state_covariances(wanted)
+    estimates = smoother.states(wanted)
+    # A correction that says nothing makes it look again.
+    none = gtsam.noiseModel.Isotropic.Sigma(9, 1e9)
+    nothing = gtsam.NonlinearFactorGraph()
+    nothing.add(gtsam.PriorFactorNavState(keys.node(wanted[5]), smoother.state(wanted[5]), none))
+    smoother.correct(nothing, wanted[5])
+    np.testing.assert_allclose(smoother.state_covariances(wanted), kept, rtol=1e-6, atol=1e-12)
+    np.testing.assert_allclose(smoother.states(wanted).p_n, estimates.p_n, atol=1e-9)
