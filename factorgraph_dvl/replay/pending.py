@@ -19,6 +19,9 @@ SAME_TIME = 1e-6
 # clock, not a feed that delivers out of order.
 AHEAD = 60.0
 
+# Records of a sensor from which on they are joined before they are looked at; chosen.
+_MANY = 4
+
 
 class PendingMeasurements:
     """Records by sensor, until the IMU reaches their time.
@@ -83,15 +86,34 @@ class PendingMeasurements:
         tuple of (Aid, ndarray) or None
             Rows and their true times, s; None if nothing is due.
         """
-        record = joined(self._records.pop(section))
-        clock = None if frame is None else self._clock(record, frame)
-        lag = 0.0 if clock is None else clock.lag(record.time, values, clock_zero)
-        true = record.time - lag
-        due = true < end - SAME_TIME
-        if due.all():
-            return record, true
-        self._records[section] = [rows_of(record, ~due)]
-        return (rows_of(record, due), true[due]) if due.any() else None
+        records = self._records.pop(section)
+        # Many at once are fewer than one by one.
+        if len(records) > _MANY:
+            records = [joined(records)]
+
+        def true_times(record: Aid) -> Array:
+            clock = None if frame is None else self._clock(record, frame)
+            lag = 0.0 if clock is None else clock.lag(record.time, values, clock_zero)
+            return np.asarray(record.time - lag)
+
+        taken: list[tuple[Aid, Array]] = []
+        left: list[Aid] = []
+        for record in records:
+            true = true_times(record)
+            due = true < end - SAME_TIME
+            if due.all():
+                taken.append((record, true))
+                continue
+            if due.any():
+                taken.append((rows_of(record, due), true[due]))
+                record = rows_of(record, ~due)
+            left.append(record)
+        if left:
+            self._records[section] = left
+        if len(taken) < 2:
+            return taken[0] if taken else None
+        whole = joined([record for record, _ in taken])
+        return whole, true_times(whole)
 
     def first_after(self, section: str, time: float) -> float:
         """Return the first time of a pending row after a time, s; infinite if there is none."""
