@@ -250,6 +250,7 @@ def _solve_into(
 
     Stages of runs with `options`, which they depend on, are kept until the run ends.
     """
+    from factorgraph_dvl.graph.freed_memory import return_freed
     from factorgraph_dvl.io.run_file import run_of
     from factorgraph_dvl.io.solution_folder import (
         FIGURES_FOLDER,
@@ -280,6 +281,7 @@ def _solve_into(
             if draw is not None:
                 drawn = draw(_Drawn(solution, history, folder / FIGURES_FOLDER))
             along = found.along()
+            return_freed()
             progress("write", 0, None)
             yield
             write_beams(trial, solution, folder)

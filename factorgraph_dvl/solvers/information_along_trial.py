@@ -87,7 +87,7 @@ def solve_then_history(
 ) -> tuple[Solution, Callable[[], InformationHistory | None]]:
     """Solve a trial; return what follows the information on its constants along it, too.
 
-    A planar trial has no such history.
+    That is to be called once. A planar trial has no such history.
 
     Parameters and errors as of `solvers.batch.solve`, and `stages` as of `solve_with_problem`;
     `entries` as of `information_history`.
@@ -111,16 +111,21 @@ def solve_then_history(
     )
 
     def history() -> InformationHistory | None:
-        if solved is None:
+        nonlocal solved
+        # The problem, most of what takes memory, is not needed any more then.
+        found, solved = solved, None
+        if found is None:
             return None
-        if not isinstance(solved, SolvedProblem):
-            from factorgraph_dvl.solvers.motion_information import motion_history
+        done = (known for minimum, known in followed if minimum() is found)
+        if (out := next(done, None)) is not None:
+            return out
+        if isinstance(found, SolvedProblem):
+            return follow(found)
+        from factorgraph_dvl.solvers.motion_information import motion_history
 
-            if progress:
-                progress("information along the trial", 0, None)
-            return motion_history(solved, entries=entries)
-        done = (known for found, known in followed if found() is solved)
-        return next(done, None) or follow(solved)
+        if progress:
+            progress("information along the trial", 0, None)
+        return motion_history(found, entries=entries)
 
     return solution, history
 
