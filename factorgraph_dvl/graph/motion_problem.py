@@ -511,7 +511,8 @@ class MotionProblem:
         It is a function of standard deviations (p,) and correlation time, s, of a process. States
         and parameters are integrated out, linear at the evaluation, so that only what they leave
         says how strong a process is. Weights of measurements and interpolation are those of the
-        present one.
+        present one. The slope is left out: where a process is strong, it would pull constants that
+        are then little known so far that no likelihood stood against it.
 
         Parameters
         ----------
@@ -525,7 +526,6 @@ class MotionProblem:
         for values in (rows.before, rows.after, rows.residual):
             values[:, place] = 0.0
         equations = self._without_motion(evaluation).copy()
-        equations.constant_gradient += self.slope
         equations.add_steps(rows.before, rows.after, rows.residual)
         self._add_first(equations, evaluation.states)
         own = np.arange(place.start, place.stop)
