@@ -182,6 +182,10 @@ class Increments(ArcPolynomials):
         """Keep what `smoothed` of the same increments is, found elsewhere."""
         vars(self)["smoothed"] = smoothed
 
+    def release(self) -> None:
+        """Free what `smoothed` keeps, about as much as the samples; it is found anew if needed."""
+        vars(self).pop("smoothed", None)
+
     @cached_property
     def smoothed(self) -> tuple[tuple[Smoothed, Smoothed], ...]:
         """Rate and force of each arc, smoothed where their noise asks for it."""

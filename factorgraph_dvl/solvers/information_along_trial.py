@@ -97,6 +97,8 @@ def solve_then_history(
     def follow(found: SolvedProblem) -> InformationHistory:
         if progress:
             progress("information along the trial", 0, None)
+        # All measurements are bound, and the trajectory is there.
+        found.problem.chain.segments.increments.release()
         out = information_history(found, entries=entries)
         followed.append((weakref.ref(found), out))
         return out
