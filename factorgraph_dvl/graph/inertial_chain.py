@@ -23,6 +23,7 @@ from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph import keys
 from factorgraph_dvl.imu.preintegration import Segments, gtsam_measurements
 from factorgraph_dvl.imu.propagation import States
+from factorgraph_dvl.sensors.imu import ImuSettings
 from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.trial import Trial
 
@@ -42,8 +43,10 @@ _LEAST_STD = 1e-7
 # Nodes of a branch. Measured: the time that GTSAM takes for a single one grows with the square of
 # its length; for 19,200 nodes it is 1.4 s in one branch, and 0.4 s in branches of 32 or of 128.
 _BRANCH = 128
-# Step of a bias that does not walk, SI. Chosen: regular, and no walk.
-LEAST_WALK = 1e-12
+# Steps of an accelerometer and a gyro bias that do not walk while the other does, m/s² and rad/s.
+# Chosen: regular, and below 0.1 µg and 0.001 deg/h in a day; with less, products with these rows
+# are rounding errors.
+LEAST_WALK = np.repeat([1e-9, 1e-11], 3)
 
 
 @dataclass(frozen=True)
@@ -62,8 +65,8 @@ class Chain:
         Gyro and accelerometer bias, as their mean over the trial is reported.
     first_biases : tuple of (Parameter, Parameter)
         The same at the first node.
-    walking : bool
-        Whether every node has a bias of its own.
+    imu : ImuSettings
+        What is assumed of the IMU.
     graph : gtsam.NonlinearFactorGraph
         IMU factors, walks of the biases, priors of the states.
     """
@@ -73,8 +76,23 @@ class Chain:
     gravity_n: Array
     biases: tuple[Parameter, Parameter]
     first_biases: tuple[Parameter, Parameter]
-    walking: bool
+    imu: ImuSettings
     graph: gtsam.NonlinearFactorGraph
+
+    @property
+    def walking(self) -> bool:
+        """Whether every node has a bias of its own."""
+        return self.imu.bias_walks
+
+    @property
+    def bias_steps(self) -> Array:
+        """Standard deviations of the steps of walking biases from node to node, SI, (S, 6).
+
+        Of the accelerometers first, as in GTSAM's biases.
+        """
+        walks = [self.imu.accel_bias_walk_root_psd, self.imu.gyro_bias_walk_root_psd]
+        root_time = np.sqrt(np.diff(self.segments.node_time))[:, None]
+        return np.maximum(root_time * np.repeat(walks, 3), LEAST_WALK)
 
     @property
     def middle(self) -> float:
@@ -154,17 +172,12 @@ def inertial_chain(trial: Trial, frame: LocalFrame, seg: Segments, start: States
     settings = trial.inertial.settings
     graph = gtsam.NonlinearFactorGraph()
     first, mean = (trial.inertial.parameters(t) for t in (0.0, float(seg.duration.sum())))
-    chain = Chain(frame, seg, gravity_n, mean, first, settings.bias_walks, graph)
+    chain = Chain(frame, seg, gravity_n, mean, first, settings, graph)
     pims = gtsam_measurements(seg, settings, gravity_n, frame.earth_rate)
     for k, pim in zip(seg.origin.tolist(), pims, strict=True):
         graph.add(gtsam.GalileanImuFactor2(keys.node(k), keys.node(k + 1), chain.bias_key(k), pim))
     if chain.walking:
-        root_psd = np.repeat(
-            [settings.accel_bias_walk_root_psd, settings.gyro_bias_walk_root_psd], 3
-        )
-        step = np.diff(seg.node_time)
-        for k in range(step.size):
-            walk = np.maximum(root_psd * np.sqrt(step[k]), LEAST_WALK)
+        for k, walk in enumerate(chain.bias_steps):
             graph.add(
                 gtsam.BetweenFactorConstantBias(
                     keys.bias(k),

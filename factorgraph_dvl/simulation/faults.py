@@ -396,11 +396,15 @@ def imu_bias_walk(gyro_deg_h_sqrt_h: float, accel_ug_sqrt_h: float = 0.0) -> Fau
         imu = trial.inertial
         root = np.sqrt(np.diff(imu.time, prepend=imu.time[0]) / HOUR)[:, None]
         walk = np.cumsum(root * rng.standard_normal((imu.time.size, 6)), axis=0)
+        gyro, accel = gyro_deg_h_sqrt_h * walk[:, :3], accel_ug_sqrt_h * walk[:, 3:]
+        # The truth of a bias that walks is its mean.
+        trial = _truth(trial, "gyro_bias_deg_h", gyro.mean(axis=0))
+        trial = _truth(trial, "accel_bias_ug", accel.mean(axis=0))
         return _with(
             trial,
             "imu",
-            gyro=imu.gyro + gyro_deg_h_sqrt_h * DEG_PER_HOUR * walk[:, :3],
-            accel=imu.accel + accel_ug_sqrt_h * MICRO_G * walk[:, 3:],
+            gyro=imu.gyro + DEG_PER_HOUR * gyro,
+            accel=imu.accel + MICRO_G * accel,
         )
 
     return fault

@@ -7,7 +7,6 @@ import numpy as np
 from factorgraph_dvl.geometry.units import HOUR
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph.problem import Problem
-from factorgraph_dvl.sensors.imu import ImuSettings
 from factorgraph_dvl.sensors.parameters import UNITS, Parameter
 from factorgraph_dvl.solution import Cause
 from factorgraph_dvl.solvers.calibration import reported, spread_of_fixed
@@ -16,7 +15,7 @@ from factorgraph_dvl.statistics.error_budget import error_budget
 from factorgraph_dvl.statistics.rows import CORRELATED, IMU_NOISE, PRIOR, WALK, rows_by_source
 
 
-def causes(found: SolvedProblem, imu: ImuSettings) -> tuple[Cause, ...]:
+def causes(found: SolvedProblem) -> tuple[Cause, ...]:
     """Return what each cause adds to the standard deviations of a calibration.
 
     The squares of all causes add up to the variances that are reported.
@@ -25,8 +24,6 @@ def causes(found: SolvedProblem, imu: ImuSettings) -> tuple[Cause, ...]:
     ----------
     found : SolvedProblem
         Problem at its minimum, with covariances.
-    imu : ImuSettings
-        What is stated of the IMU.
     """
     problem, evaluation = found.problem, found.minimum.evaluation
     rows = reported(problem, evaluation)
@@ -42,7 +39,7 @@ def causes(found: SolvedProblem, imu: ImuSettings) -> tuple[Cause, ...]:
         variances["directions that the data do not determine"] = np.sum(spread**2, axis=1)
     is_free = np.concatenate([np.full(v.size, d is not None) for _, v, d in rows])
     exact = np.concatenate([p.sigma == 0.0 for p, _, _ in rows])
-    assumed = _assumed(found, imu, [p for p, _, _ in rows])
+    assumed = _assumed(found, [p for p, _, _ in rows])
     labels = {o.label for o in problem.observations}
     out = []
     for source, variance in variances.items():
@@ -55,11 +52,10 @@ def causes(found: SolvedProblem, imu: ImuSettings) -> tuple[Cause, ...]:
     return tuple(sorted(out, key=lambda c: -float(np.max(c.adds**2 / total))))
 
 
-def _assumed(
-    found: SolvedProblem, imu: ImuSettings, parameters: list[Parameter]
-) -> dict[str, str]:
+def _assumed(found: SolvedProblem, parameters: list[Parameter]) -> dict[str, str]:
     """Return what is assumed of each source, as text."""
     problem: Problem = found.problem
+    imu = problem.chain.imu
     out = {
         IMU_NOISE: f"{imu.gyro_noise_deg_sqrt_h:.3g} deg/√h, "
         f"{imu.accel_noise_ug_sqrt_hz:.3g} µg/√Hz"

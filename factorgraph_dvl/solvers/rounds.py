@@ -21,6 +21,7 @@ from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.sensors.message import Message, message
 from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.solution import Progress
+from factorgraph_dvl.solvers.bias_walks import BiasWalks, bias_walks
 from factorgraph_dvl.solvers.change_along_trial import CHANGED, component_changes
 from factorgraph_dvl.solvers.correlated_noise import (
     correlated_noise,
@@ -61,6 +62,7 @@ _OUTLIERS = message("not_converged.outliers")
 _TIMES = message("not_converged.times")
 _CORRELATED = message("not_converged.correlated")
 _KNOWN = message("not_converged.known")
+_WALKS = message("not_converged.walks")
 # Parameters that are estimated although they were stated as known. Chosen: a third is a sign that
 # the model is wrong.
 _MOST_FREED = 2
@@ -167,6 +169,7 @@ def settle(
     }
     searches = 0
     correlation_searched = False
+    walks: BiasWalks | None = None
     freed: list[Explanation] = []
     left: Explanation | None = None
     parameters: tuple[Parameter, ...] = prepared.parameters
@@ -245,7 +248,17 @@ def settle(
             if found.gain > 0.0 and _changes_explain_more(problem, minimum, found.gain):
                 # Noise that persists would take the place of what changed.
                 found = correlated_noise(problem, minimum.evaluation, ())
-            if found.processes or found.long_run:
+            elif found.gain > 0.0 and walks is None and constants_prior is None:
+                walks = bias_walks(prepared, problem, minimum, report)
+            if walks is not None and prepared is not walks.prepared:
+                prepared = walks.prepared
+                states, values = walks.evaluation.states, walks.evaluation.parameters
+                chain, p_gravity = prepared.chain(states), states.p_n
+                changing.append(_WALKS)
+                # Gross errors beside the wrong IMU may be none.
+                robust, tolerance = {}, {}
+                searches, correlation_searched, count = 0, False, 0
+            elif found.processes or found.long_run:
                 changing.append(_CORRELATED)
                 tolerance = {}
                 long_run = found.long_run
@@ -285,6 +298,7 @@ def settle(
     findings = (
         *_at_the_gate(cycle),
         *levels.findings,
+        *(walks.findings if walks is not None else ()),
         *explanation_findings(freed, left, minimum.evaluation),
     )
     if changing:

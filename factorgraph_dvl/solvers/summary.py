@@ -90,7 +90,7 @@ def summarise(trial: Trial, found: SolvedProblem, *, rate_hz: float) -> Solution
         rejected=rejected,
         limits=trial.limits,
         noise=noise,
-        error_budget=causes(found, trial.inertial.settings),
+        error_budget=causes(found),
     )
 
 

@@ -31,7 +31,7 @@ def rows_by_source(problem: Problem, evaluation: Evaluation) -> Iterator[Rows]:
     The source of an observation is its label; those of others are words. Those of one source may
     come in several parts.
     """
-    yield from _native_rows(problem, evaluation)
+    yield from native_rows(problem, evaluation)
     yield from problem.observation_rows(evaluation)
 
 
@@ -93,7 +93,7 @@ def _by_variable(rows: Rows) -> Iterator[tuple[IntArray, Array]]:
         yield rows.keys[:, i], rows.matrix[:, :, edges[i] : edges[i + 1]]
 
 
-def _native_rows(problem: Problem, evaluation: Evaluation) -> Iterator[Rows]:
+def native_rows(problem: Problem, evaluation: Evaluation) -> Iterator[Rows]:
     """Yield the rows of the factors that GTSAM linearises itself, some of one source together."""
     gaussian = problem.native(evaluation)
     sizes = evaluation.values.dims()

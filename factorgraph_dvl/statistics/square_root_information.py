@@ -60,6 +60,11 @@ class SquareRootInformation:
             max((place.get(key, -1) for key in c.separators), default=-1) for c in self._cliques
         ]
 
+    @property
+    def log_determinant(self) -> float:
+        """Logarithm of the determinant of the information."""
+        return 2.0 * sum(float(np.log(np.abs(np.diag(c.R))).sum()) for c in self._cliques)
+
     def solution(self) -> gtsam.VectorValues:
         """Return the minimum of the graph."""
         found: dict[int, Array] = {}

@@ -12,8 +12,8 @@ from factorgraph_dvl.solvers.causes import causes
 
 @pytest.mark.parametrize("kind", ["turning", "straight"])
 def test_the_squares_of_all_causes_are_the_variances(kind):
-    trial, found = getattr(solved, kind)()
-    parts = causes(found, trial.imu.settings)
+    _, found = getattr(solved, kind)()
+    parts = causes(found)
     std = np.concatenate([e.std for e in calibration(found)[0]])
     total = np.sqrt(np.sum([c.adds**2 for c in parts], axis=0))
     np.testing.assert_allclose(total, std, rtol=0.01)

@@ -1,0 +1,203 @@
+"""Biases of the IMU that walk more than stated, where that explains what residuals do not fit."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from msgspec import structs
+from scipy.stats import chi2 as chi_square
+
+from factorgraph_dvl.graph.problem import Evaluation, Problem
+from factorgraph_dvl.sensors.finding import Code, Finding
+from factorgraph_dvl.sensors.imu import BIASES, ImuSettings
+from factorgraph_dvl.sensors.message import message
+from factorgraph_dvl.solution import Progress
+from factorgraph_dvl.solvers.known_parameters import explanation
+from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, factorized, minimise
+from factorgraph_dvl.solvers.preparation import Preparation
+from factorgraph_dvl.statistics.leverage import leverage
+from factorgraph_dvl.statistics.rows import IMU_NOISE, WALK, native_rows
+from factorgraph_dvl.statistics.square_root_information import SquareRootInformation
+
+# Keys of the walks, and what walks.
+_WALKS = dict(
+    zip(("gyro_bias_walk_deg_h_sqrt_h", "accel_bias_walk_ug_sqrt_h"), BIASES, strict=True)
+)
+_UNITS = dict(zip(_WALKS, ("deg/h/√h", "µg/√h"), strict=True))
+# Walks to start from, in the units of the keys. Chosen: those of bad MEMS; a few estimates
+# lead from there to any other.
+_START = dict(zip(_WALKS, (30.0, 3000.0), strict=True))
+# Square of a residual of the IMU, in the mean and in variances, from which on its noise is not
+# what is stated, and probability of it by chance. Chosen: data sheets are right within a factor
+# of three.
+_NOT_NOISE = 9.0
+_LOG_P = np.log(1e-6)
+# The same of a sensor, up to which it fits. Chosen: what is left is less than the noise.
+_FITS = 1.5
+# Estimates of a walk, and relative change from which on another one follows. Chosen: a walk is
+# known to a fifth at best.
+_ESTIMATES = 8
+_SAME_WALK = 0.2
+# Logarithm of the likelihood by which one walk more must explain more. Chosen: e^-5 is no chance.
+_PER_WALK = 5.0
+# Factor on what is stated, below which a walk is as stated.
+_AS_STATED = 3.0
+
+
+@dataclass(frozen=True)
+class BiasWalks:
+    """Walks of the biases that explain a misfit, in place of those stated.
+
+    Parameters
+    ----------
+    prepared : Preparation
+        With them.
+    evaluation : Evaluation
+        The minimum with them.
+    against : float
+        Negative logarithm of their likelihood, but for a constant that all walks share, and a
+        price of each walk.
+    findings : tuple of Finding
+        What the user must know.
+    """
+
+    prepared: Preparation
+    evaluation: Evaluation
+    against: float
+    findings: tuple[Finding, ...]
+
+
+def bias_walks(
+    prepared: Preparation, problem: Problem, minimum: Minimum, report: Progress
+) -> BiasWalks | None:
+    """Return the walks of biases that explain a misfit; None where none does.
+
+    The IMU carries the motion to all sensors: where its biases walk more than the model allows,
+    the residuals of the others grow. The walk is the cause if all of them fit with a larger one.
+
+    Parameters
+    ----------
+    prepared : Preparation
+        What was minimised, with the IMU as it is stated.
+    problem : Problem
+        The same, with white noise as it is stated.
+    minimum : Minimum
+        Where it ended.
+    report : callable
+        Called with stage, iteration and cost.
+    """
+    information = minimum.square_root or factorized(problem, minimum.evaluation)[0]
+    imu = prepared.trial.inertial
+    walking = [bias for name, bias in _WALKS.items() if getattr(imu.settings, name) > 0.0]
+    sources = [IMU_NOISE, *map(WALK.format, walking)]
+    if not _is_not_noise(*_squares(problem, minimum.evaluation, information, sources)):
+        return None
+    proven = replace(minimum, square_root=information)
+    if explanation(problem, proven, imu) is not None:
+        # A walk can follow what a constant explains.
+        return None
+    found = [
+        _with_walks(prepared, problem, minimum.evaluation, names, report)
+        for names in (*([name] for name in _WALKS), list(_WALKS))
+    ]
+    possible = [each for each in found if each is not None]
+    return min(possible, key=lambda each: each.against, default=None)
+
+
+def _with_walks(
+    prepared: Preparation,
+    problem: Problem,
+    evaluation: Evaluation,
+    names: list[str],
+    report: Progress,
+) -> BiasWalks | None:
+    """Return walks of some biases that explain a misfit; None if these do not."""
+    stated = prepared.trial.inertial.settings
+    walks = {name: _START[name] for name in names}
+    for _ in range(_ESTIMATES):
+        walking = _stating(prepared, walks)
+        test = Problem(
+            walking.chain(evaluation.states),
+            problem.observations,
+            problem.all_parameters,
+            start=evaluation.parameters,
+            clock_zero=problem.clock_zero,
+        )
+        test.reject(problem.rejected)
+        test.noise_factors = problem.noise_factors
+        test.robust_weights = problem.robust_weights
+        at = test.values(evaluation.states, test.prior_values() | evaluation.parameters)
+        minimum = minimise(test, at, stage="walking biases", progress=report)
+        if not minimum.converged:
+            return None
+        evaluation = minimum.evaluation
+        ratios = {}
+        for name in names:
+            own = [WALK.format(_WALKS[name])]
+            squares, freedom = _squares(test, evaluation, minimum.information, own)
+            ratios[name] = float(np.sqrt((squares + 1.0) / (max(freedom, 0.0) + 1.0)))
+        if max(abs(ratio - 1.0) for ratio in ratios.values()) < _SAME_WALK:
+            break
+        walks = {name: walk * ratios[name] for name, walk in walks.items()}
+    squares, freedom = _squares(test, evaluation, minimum.information, [IMU_NOISE])
+    least = min(walks[name] / max(getattr(stated, name), 1e-12) for name in names)
+    if not _fits(test, evaluation) or _is_not_noise(squares, freedom) or least < _AS_STATED:
+        return None
+    steps = np.log(test.chain.bias_steps).sum()
+    against = (
+        _PER_WALK * len(names)
+        + evaluation.cost
+        + 0.5 * minimum.information.log_determinant
+        + float(steps)
+    )
+    findings = tuple(_finding(name, walks[name], stated) for name in names)
+    return BiasWalks(walking, evaluation, against, findings)
+
+
+def _stating(prepared: Preparation, walks: dict[str, float]) -> Preparation:
+    """Return what is prepared, with walks of the biases as if they were stated."""
+    imu = prepared.trial.inertial
+    settings = structs.replace(imu.settings, **walks)
+    return replace(prepared, trial=replace(prepared.trial, imu=replace(imu, settings=settings)))
+
+
+def _squares(
+    problem: Problem,
+    evaluation: Evaluation,
+    information: SquareRootInformation,
+    sources: Iterable[str],
+) -> tuple[float, float]:
+    """Return the squares of residuals of some sources, and what they are by chance."""
+    wanted = set(sources)
+    rows = [r for r in native_rows(problem, evaluation) if r.source in wanted]
+    squares = sum(float(np.sum(r.vector**2)) for r in rows)
+    taken = sum(float(h.sum()) for h in leverage(rows, information))
+    return squares, sum(r.vector.size for r in rows) - taken
+
+
+def _is_not_noise(squares: float, freedom: float) -> bool:
+    """Whether residuals of the IMU are larger than data sheets are wrong, and than by chance."""
+    freedom = max(freedom, 1.0)
+    large = squares > _NOT_NOISE * freedom
+    return large and bool(chi_square.logsf(squares, freedom) < _LOG_P)
+
+
+def _fits(problem: Problem, evaluation: Evaluation) -> bool:
+    """Whether all sensors fit."""
+    return all(
+        float(np.sum(residual**2)) <= _FITS * max(int(np.count_nonzero(weight)), 1)
+        for residual, weight in zip(evaluation.residuals, problem.weights, strict=True)
+    )
+
+
+def _finding(name: str, walk: float, stated: ImuSettings) -> Finding:
+    text = message(
+        "estimated_instead.walk",
+        name=name,
+        value=walk,
+        stated=getattr(stated, name),
+        unit=_UNITS[name],
+    )
+    return Finding(Code.ESTIMATED_INSTEAD, text, sensor="IMU", parameter=_WALKS[name])
