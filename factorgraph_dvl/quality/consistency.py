@@ -62,6 +62,9 @@ _ARM_SIGMAS = 12.0
 # clocks that are off by far. Chosen: what good trials leave, and what wrong ones do.
 _CONTRADICTS = 0.1
 _UNEXPLAINED = 0.3
+# Variance of what is left beside that of noise, from which on axes are tried as well. Chosen:
+# wrong axes make motion of their own, of which what they do not explain is a small share.
+_BEYOND_NOISE = 5.0
 # Share of the changes of velocity that must be elsewhere to show what is wrong throughout.
 _ENOUGH = 0.5
 # Searches for gross errors, each with what those before left out. Chosen: the first sees the
@@ -138,12 +141,19 @@ def consistency_findings(trial: Trial, errors: Sequence[Finding]) -> Iterator[Fi
         views = _views(windows, sensors)
     wrong: list[Candidate] = []
     suspected = any(f.code == Code.GYRO_UNIT for f in errors)
+    suspected = suspected or any(view.beyond_noise > _BEYOND_NOISE for view in views)
     if suspected or max((view.excess for view in views), default=0.0) > _CONTRADICTS:
         down_b = frd_from_body(trial.body_axes)[2]
         wrong = diagnosis(compare, trial.inertial, -down_b)
     if wrong:
-        corrected = carried_windows(wrong[0].corrected(trial.inertial))
-        views = _views(corrected or windows, sensors)
+        corrected = [
+            _views(carried_windows(each.corrected(trial.inertial)) or windows, sensors)
+            for each in wrong
+        ]
+        # One mistake is more probable than another one and a mirrored DVL.
+        alone = [i for i, each in enumerate(corrected) if not any(v.mirrored for v in each)]
+        wrong = [wrong[i] for i in alone] or wrong
+        views = corrected[alone[0] if alone else 0]
         directions = next((v.directions() for v in views if isinstance(v, _GnssView)), None)
         yield _imu_finding(wrong, directions, trial.body_axes)
     for view in views:
@@ -240,11 +250,17 @@ class _GnssView:
     compared: GnssWindows
     clock: ClockOffset | None
     around: float
+    mirrored = False
 
     @cached_property
     def excess(self) -> float:
         """Share of the changes of velocity that neither IMU nor noise explains."""
         return _excess(self.compared, self.clock, self.around)
+
+    @property
+    def beyond_noise(self) -> float:
+        """Variance of what neither IMU nor clock explains, beside that of stated noise."""
+        return _beyond_noise(self.compared, self.clock, self.around)
 
     @property
     def off(self) -> float:
@@ -291,10 +307,20 @@ class _DvlView:
     clock: ClockOffset | None
     around: float
 
+    @property
+    def mirrored(self) -> bool:
+        """Whether the axes of the DVL are mirrored."""
+        return self.compared.handedness < 0
+
     @cached_property
     def excess(self) -> float:
         """Share of the changes of velocity that neither IMU nor noise explains."""
         return _excess(self.compared, self.clock, self.around)
+
+    @property
+    def beyond_noise(self) -> float:
+        """Variance of what neither IMU nor clock explains, beside that of stated noise."""
+        return _beyond_noise(self.compared, self.clock, self.around)
 
     @property
     def off(self) -> float:
@@ -318,7 +344,7 @@ class _DvlView:
     def findings(self) -> Iterator[Finding]:
         """Yield what is wrong with axes and clock."""
         late = _late(self.compared, self.clock, self.around)
-        if self.compared.handedness < 0:
+        if self.mirrored:
             yield mirrored_finding(self.sensor, self.compared.fit(late))
         if self.clock is not None:
             yield from _clock(self.sensor, self.clock, self.around)
@@ -358,6 +384,15 @@ def _excess(comparison: Comparison, clock: ClockOffset | None, around: float) ->
     if signal[elsewhere].sum() > _ENOUGH * signal.sum():
         share = min(share, float(squares[elsewhere].sum() / signal[elsewhere].sum()))
     return share - 1.5 * noise_share(comparison)
+
+
+def _beyond_noise(comparison: Comparison, clock: ClockOffset | None, around: float) -> float:
+    """Return the variance of what is left beside that of stated noise."""
+    if clock is None or comparison.noise <= 0.0:
+        return 0.0
+    left = comparison.residual(_late(comparison, clock, around))
+    count = max(float(comparison.count.sum()), 1.0)
+    return float(np.sum(left**2)) / (comparison.noise**2 * count)
 
 
 def _off(clock: ClockOffset | None, around: float) -> float:

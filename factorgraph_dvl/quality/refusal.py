@@ -7,11 +7,13 @@ from contextlib import contextmanager
 
 from factorgraph_dvl.errors import DataError, FactorgraphDvlError
 from factorgraph_dvl.quality.survey import Survey
-from factorgraph_dvl.sensors.finding import Finding
+from factorgraph_dvl.sensors.finding import Code, Finding
 
 
 def accepted_errors(found: Survey, *, anyway: bool) -> tuple[Finding, ...]:
     """Return the errors in records with which there is still something to solve.
+
+    And warnings of axes that the course contradicts: no residual shows these.
 
     Parameters
     ----------
@@ -33,7 +35,8 @@ def accepted_errors(found: Survey, *, anyway: bool) -> tuple[Finding, ...]:
             hint="Correct the record, leave its sensor out, or go on with --anyway "
             "(in Python anyway=True)",
         )
-    return found.errors
+    off_course = [f for f in found.problems if f.code == Code.COURSE and f.severity == "warning"]
+    return (*found.errors, *off_course)
 
 
 @contextmanager

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
 from msgspec import structs
 from scipy.stats import chi2 as chi_square
 
-from factorgraph_dvl.graph.problem import Evaluation, Problem
+from factorgraph_dvl.graph.problem import Evaluation, Problem, Rows
 from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.sensors.imu import BIASES, ImuSettings
 from factorgraph_dvl.sensors.message import message
@@ -171,10 +171,15 @@ def _squares(
 ) -> tuple[float, float]:
     """Return the squares of residuals of some sources, and what they are by chance."""
     wanted = set(sources)
-    rows = [r for r in native_rows(problem, evaluation) if r.source in wanted]
-    squares = sum(float(np.sum(r.vector**2)) for r in rows)
-    taken = sum(float(h.sum()) for h in leverage(rows, information))
-    return squares, sum(r.vector.size for r in rows) - taken
+
+    def rows() -> Iterator[Rows]:
+        return (r for r in native_rows(problem, evaluation) if r.source in wanted)
+
+    squares, count = 0.0, 0
+    for each in rows():
+        squares += float(np.sum(each.vector**2))
+        count += each.vector.size
+    return squares, count - sum(float(h.sum()) for _, h in leverage(rows, count, information))
 
 
 def _is_not_noise(squares: float, freedom: float) -> bool:

@@ -11,7 +11,8 @@ from truth import config, scenario
 
 from factorgraph_dvl.quality.survey import survey
 from factorgraph_dvl.sensors.finding import Code
-from factorgraph_dvl.simulation import faults, simulate
+from factorgraph_dvl.simulation import faults, parse_scenario, simulate
+from factorgraph_dvl.solvers.batch import solve
 from factorgraph_dvl.trial import Trial
 
 SWAP_XY = np.eye(3)[[1, 0, 2]]
@@ -344,3 +345,39 @@ def test_a_mirrored_axis_is_named_where_sway_hides_the_clock() -> None:
         texts = found(swaying_turns(), faults.axes_changed("imu", mirror(axis).tolist()))
         assert Code.IMU_AXES in texts
         assert f"axis {'xyz'[axis]} is mirrored" in texts[Code.IMU_AXES]
+
+
+@pytest.fixture(scope="module")
+def dive() -> Trial:
+    """Ten minutes under water: GNSS sees the vehicle go straight, and the DVL sees its turns."""
+    scene = config("dive")
+    legs = next(m for m in scene["manoeuvres"] if "repeat" in m)
+    legs["repeat"] = 1
+    scene["gnss"]["outages_s"] = [[305, 1080]]
+    return simulate(parse_scenario(scene), 0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("matrix", "fields", "code", "words"),
+    [
+        (mirror(0), (), Code.IMU_AXES, "gyros and accelerometers, axis x is mirrored"),
+        (SWAP_XY, (), Code.IMU_AXES, "gyros and accelerometers, axes x and y are swapped"),
+        (mirror(1), ("accel",), Code.ACCEL_AXES, "accelerometers, axis y is mirrored"),
+    ],
+)
+def test_one_mistake_is_named_rather_than_another_and_a_mirrored_dvl(
+    dive: Trial, matrix: np.ndarray, fields: tuple[str, ...], code: Code, words: str
+) -> None:
+    """The wrong motion is large, and what it leaves unexplained is a small share of it."""
+    texts = found(dive, faults.axes_changed("imu", matrix.tolist(), *fields))
+    assert list(texts) == [code]
+    assert words in texts[code]
+
+
+@pytest.mark.slow
+def test_a_solve_says_that_the_bow_is_elsewhere(dive: Trial) -> None:
+    """No residual shows it, and who goes straight may go sideways: doubtful."""
+    solution = solve(faults.with_faults(dive, [faults.body_axes_misstated("FLU")]), rate_hz=1.0)
+    assert solution.verdict.grade == "doubtful"
+    assert Code.COURSE in [reason.code for reason in solution.verdict.reasons]
