@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 from msgspec import structs
 from scipy.stats import chi2 as chi_square
 
+from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph.problem import Evaluation, Problem, Rows
 from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.sensors.imu import BIASES, ImuSettings
 from factorgraph_dvl.sensors.message import message
 from factorgraph_dvl.solution import Progress
-from factorgraph_dvl.solvers.known_parameters import explanation
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, factorized, minimise
 from factorgraph_dvl.solvers.preparation import Preparation
 from factorgraph_dvl.statistics.leverage import leverage
@@ -70,21 +70,28 @@ class BiasWalks:
 
 
 def bias_walks(
-    prepared: Preparation, problem: Problem, minimum: Minimum, report: Progress
+    prepared: Preparation,
+    problem: Problem,
+    minimum: Minimum,
+    noise: Mapping[str, Array],
+    report: Progress,
 ) -> BiasWalks | None:
     """Return the walks of biases that explain a misfit; None where none does.
 
     The IMU carries the motion to all sensors: where its biases walk more than the model allows,
-    the residuals of the others grow. The walk is the cause if all of them fit with a larger one.
+    the residuals of the others grow, though nothing is wrong with them. The walk is the cause
+    if all of them fit with a larger one.
 
     Parameters
     ----------
     prepared : Preparation
         What was minimised, with the IMU as it is stated.
     problem : Problem
-        The same, with white noise as it is stated.
+        The same, with noise as residuals ask for.
     minimum : Minimum
         Where it ended.
+    noise : mapping of str to ndarray
+        By label, factors (d,) on the noise of sensors: 1 where it is as stated.
     report : callable
         Called with stage, iteration and cost.
     """
@@ -94,12 +101,8 @@ def bias_walks(
     sources = [IMU_NOISE, *map(WALK.format, walking)]
     if not _is_not_noise(*_squares(problem, minimum.evaluation, information, sources)):
         return None
-    proven = replace(minimum, square_root=information)
-    if explanation(problem, proven, imu) is not None:
-        # A walk can follow what a constant explains.
-        return None
     found = [
-        _with_walks(prepared, problem, minimum.evaluation, names, report)
+        _with_walks(prepared, problem, minimum.evaluation, names, noise, report)
         for names in (*([name] for name in _WALKS), list(_WALKS))
     ]
     possible = [each for each in found if each is not None]
@@ -111,6 +114,7 @@ def _with_walks(
     problem: Problem,
     evaluation: Evaluation,
     names: list[str],
+    noise: Mapping[str, Array],
     report: Progress,
 ) -> BiasWalks | None:
     """Return walks of some biases that explain a misfit; None if these do not."""
@@ -126,7 +130,7 @@ def _with_walks(
             clock_zero=problem.clock_zero,
         )
         test.reject(problem.rejected)
-        test.noise_factors = problem.noise_factors
+        test.noise_factors = noise
         test.robust_weights = problem.robust_weights
         at = test.values(evaluation.states, test.prior_values() | evaluation.parameters)
         minimum = minimise(test, at, stage="walking biases", progress=report)

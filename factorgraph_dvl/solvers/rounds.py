@@ -20,12 +20,14 @@ from factorgraph_dvl.imu.propagation import States
 from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.sensors.message import Message, message
 from factorgraph_dvl.sensors.parameters import Parameter
+from factorgraph_dvl.sensors.protocol import DO_NOT_FIT
 from factorgraph_dvl.solution import Progress
 from factorgraph_dvl.solvers.bias_walks import BiasWalks, bias_walks
 from factorgraph_dvl.solvers.change_along_trial import CHANGED, component_changes
 from factorgraph_dvl.solvers.correlated_noise import (
     correlated_noise,
     long_run_share,
+    noise_of,
     with_innovations,
 )
 from factorgraph_dvl.solvers.known_parameters import (
@@ -248,17 +250,7 @@ def settle(
             if found.gain > 0.0 and _changes_explain_more(problem, minimum, found.gain):
                 # Noise that persists would take the place of what changed.
                 found = correlated_noise(problem, minimum.evaluation, ())
-            elif found.gain > 0.0 and walks is None and constants_prior is None:
-                walks = bias_walks(prepared, problem, minimum, report)
-            if walks is not None and prepared is not walks.prepared:
-                prepared = walks.prepared
-                states, values = walks.evaluation.states, walks.evaluation.parameters
-                chain, p_gravity = prepared.chain(states), states.p_n
-                changing.append(_WALKS)
-                # Gross errors beside the wrong IMU may be none.
-                robust, tolerance = {}, {}
-                searches, correlation_searched, count = 0, False, 0
-            elif found.processes or found.long_run:
+            if found.processes or found.long_run:
                 changing.append(_CORRELATED)
                 tolerance = {}
                 long_run = found.long_run
@@ -291,6 +283,16 @@ def settle(
                 changing.append(_CORRELATED)
             elif not (same and _same(levels.factors[-1], last.factors[-1])):
                 changing.append(_NOISE)
+        if not changing and walks is None and left is None and not freed and _misfit(problem):
+            walks = bias_walks(prepared, problem, minimum, as_stated, report)
+            if walks is not None:
+                prepared = walks.prepared
+                states, values = walks.evaluation.states, walks.evaluation.parameters
+                chain, p_gravity = prepared.chain(states), states.p_n
+                changing.append(_WALKS)
+                robust, long_run, levels, tolerance = {}, {}, first_levels, {}
+                searches, correlation_searched, count = 0, False, 0
+                tested = None
         if not changing:
             break
         rejected = outliers
@@ -321,6 +323,11 @@ def _changes_explain_more(problem: Problem, minimum: Minimum, gain: float) -> bo
         return False
     most = max(found, key=lambda c: c.fall)
     return max(c.chi2 for c in found) > gain or gain < most.fall < _MOST_SCATTER * most.chi2
+
+
+def _misfit(problem: Problem) -> bool:
+    """Whether the noise of a sensor is far more than anyone would state."""
+    return any(np.max(noise.factor) > DO_NOT_FIT for noise in noise_of(problem))
 
 
 @dataclass(frozen=True)
