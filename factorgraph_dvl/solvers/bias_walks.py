@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from msgspec import structs
-from scipy.stats import chi2 as chi_square
+from scipy.special import chdtrc
 
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph.problem import Evaluation, Problem, Rows
@@ -33,7 +33,7 @@ _START = dict(zip(_WALKS, (30.0, 3000.0), strict=True))
 # what is stated, and probability of it by chance. Chosen: data sheets are right within a factor
 # of three.
 _NOT_NOISE = 9.0
-_LOG_P = np.log(1e-6)
+_CHANCE = 1e-6
 # The same of a sensor, up to which it fits. Chosen: what is left is less than the noise.
 _FITS = 1.5
 # Estimates of a walk, and relative change from which on another one follows. Chosen: a walk is
@@ -190,7 +190,7 @@ def _is_not_noise(squares: float, freedom: float) -> bool:
     """Whether residuals of the IMU are larger than data sheets are wrong, and than by chance."""
     freedom = max(freedom, 1.0)
     large = squares > _NOT_NOISE * freedom
-    return large and bool(chi_square.logsf(squares, freedom) < _LOG_P)
+    return large and bool(chdtrc(freedom, squares) < _CHANCE)
 
 
 def _fits(problem: Problem, evaluation: Evaluation) -> bool:
