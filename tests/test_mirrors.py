@@ -42,7 +42,6 @@ ELSEWHERE = {
     "statistics/information_history": "analysis/information/test_shares.py",
     "statistics/leverage": "statistics/test_rows.py",
     "statistics/spurious_information": "replay/test_session.py",
-    "statistics/square_root_information": "solvers/test_posterior.py",
     "imu/arc_polynomials": "imu/test_increments.py",
     "io/corrected_record": "sensors/test_dvl_beams.py",
     "io/data_frames": "io",

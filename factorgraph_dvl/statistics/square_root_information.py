@@ -225,7 +225,9 @@ class SquareRootInformation:
                 rows = np.concatenate([_range(where[key]) for key in clique.separators])
                 P_SS = above[np.ix_(rows, rows)]
                 P_FS = -gain @ P_SS
-                P[:f, :f] = inverse @ inverse.T - P_FS @ gain.T
+                # An asymmetry would double from one clique to the next where biases walk far.
+                P_FF = inverse @ inverse.T - P_FS @ gain.T
+                P[:f, :f] = 0.5 * (P_FF + P_FF.T)
                 P[:f, f:], P[f:, :f], P[f:, f:] = P_FS, P_FS.T, P_SS
             else:
                 P[:] = inverse @ inverse.T
