@@ -119,7 +119,7 @@ class AttitudeRecord:
             for d, alone in ((0, 1.0), (1, _SLOPE / self.interval))
         )
         self._rate_sigma = slope * self.white
-        # Of samples that are far apart, noise is not told from motion that they miss.
+        # Of samples that are far apart, noise looks like motion that they miss.
         self._noise = np.minimum(noise_beside_motion(rph), self.white) if width else np.zeros(3)
         self._gains = _rate_gains(width)
         self.white = gain * self.white

@@ -178,7 +178,7 @@ def noise_beside_motion(values: Array) -> Array:
 
     What a cubic through the neighbours misses has covariances of known ratios from one sample to
     the next, if it is white noise: 1, -0.8, 0.4, -0.11. Motion has others, and what fits all of
-    them is noise. Motion at half the sampling rate alone is not told from noise.
+    them is noise. Only motion at half the sampling rate looks like noise.
     """
     missed = _missed(values)
     count = len(missed)
