@@ -107,7 +107,7 @@ def sample_section(lines: Sequence[str]) -> list[str]:
     return ["", f"## Seed {SAMPLED_SEED} alone", "", *lines]
 
 
-def config(name: str, **top: Any) -> dict[str, Any]:
+def config(name: str, /, **top: Any) -> dict[str, Any]:
     """Return a scenario of configs/ as plain data, with changes at the top level."""
     text = (ROOT / "configs" / f"{name}.yaml").read_text(encoding="utf-8")
     return {**yaml.safe_load(text), **top}

@@ -14,7 +14,7 @@ from factorgraph_dvl.sensors.catalogue import AIDS, PLANAR, aid_types, load_plug
 from factorgraph_dvl.sensors.imu import ImuSettings
 from factorgraph_dvl.sensors.protocol import Aid, NoiseModel, SensorSection
 from factorgraph_dvl.settings.sections import Positive, Section, Sigma3, check_epoch
-from factorgraph_dvl.settings.yaml_file import parse_yaml
+from factorgraph_dvl.settings.yaml_file import dump_yaml, parse_yaml
 
 _Pitch = Annotated[float, Meta(ge=-90, le=90)]
 _Speed = Annotated[float, Meta(ge=-200, le=200)]
@@ -167,7 +167,4 @@ def parse_trial(text: str, source: str) -> TrialSettings:
 
 def to_yaml(settings: TrialSettings) -> str:
     """Return the text of trial.yaml."""
-    import yaml
-
-    plain = {k: v for k, v in msgspec.to_builtins(settings).items() if v != ""}
-    return yaml.safe_dump(plain, sort_keys=False, allow_unicode=True, default_flow_style=None)
+    return dump_yaml({k: v for k, v in msgspec.to_builtins(settings).items() if v != ""})

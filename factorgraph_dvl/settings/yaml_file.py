@@ -27,6 +27,16 @@ class _Loader(yaml.SafeLoader):
     yaml_implicit_resolvers: dict[str, list[tuple[str, re.Pattern[str]]]] = {}  # noqa: RUF012
 
 
+class _Dumper(yaml.SafeDumper):
+    """Text is quoted where YAML 1.1 or the loader would take it for something else."""
+
+
+def _decimal(loader: yaml.SafeLoader, node: yaml.ScalarNode) -> int:
+    # That of YAML 1.1 takes 010 for octal.
+    return int(loader.construct_scalar(node))
+
+
+_Loader.add_constructor("tag:yaml.org,2002:int", _decimal)
 for _tag, _pattern, _first in (
     ("null", r"~|null|Null|NULL|", ["~", "n", "N", ""]),
     ("bool", r"true|True|TRUE|false|False|FALSE", list("tTfF")),
@@ -37,9 +47,10 @@ for _tag, _pattern, _first in (
         list("-+.0123456789"),
     ),
 ):
-    _Loader.add_implicit_resolver(
-        f"tag:yaml.org,2002:{_tag}", re.compile(f"^(?:{_pattern})$"), _first
-    )
+    for _class in (_Loader, _Dumper):
+        _class.add_implicit_resolver(
+            f"tag:yaml.org,2002:{_tag}", re.compile(f"^(?:{_pattern})$"), _first
+        )
 
 
 def read_yaml(path: Path, kind: type[T], *, source: str = "") -> T:
@@ -82,6 +93,28 @@ def parse_yaml(text: str, kind: type[T], *, source: str) -> T:
         return msgspec.convert(value, kind)
     except msgspec.ValidationError as error:
         raise _explain(str(error), root, value, kind, source) from None
+
+
+def dump_yaml(value: Any, *, flow: bool | None = None, width: int = 80) -> str:
+    """Return YAML text that `parse_yaml` reads back as the same values.
+
+    Parameters
+    ----------
+    value : mapping, sequence or scalar
+        Plain values.
+    flow : bool, optional
+        Whether mappings and lists are within braces; by default, those of scalars only.
+    width : int, optional
+        Characters in a line, about.
+    """
+    return yaml.dump(
+        value,
+        Dumper=_Dumper,
+        sort_keys=False,
+        allow_unicode=True,
+        default_flow_style=flow,
+        width=width,
+    )
 
 
 def _compose(text: str, source: str) -> yaml.Node:

@@ -7,7 +7,10 @@ import re
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
+
+from factorgraph_dvl.simulation import parse_scenario
 
 ROOT = Path(__file__).resolve().parents[2]
 SCRIPTS = sorted(p.stem for p in (ROOT / "benchmarks").glob("*.py") if p.stem != "common")
@@ -62,6 +65,13 @@ def test_pages_of_the_documentation_name_the_commit_of_a_clean_tree():
     for line in written:
         assert line.split("`")[1] in validation
         assert re.search(r" from commit [0-9a-f]{10} \(clean tree\); do not edit\.", line), line
+
+
+def test_the_scenario_of_a_campaign_has_its_name_and_mount(benchmark):
+    built = benchmark("campaign").scenario("0007", 453.0, (0.0, 0.0, 0.1))
+    assert built.name == "0007"
+    mount = parse_scenario(benchmark("common").config("seed-a-phase-90")).dvl.misalignment_deg
+    assert np.subtract(built.dvl.misalignment_deg, mount) == pytest.approx([0.0, 0.0, 0.1])
 
 
 def test_a_changed_tree_is_named(benchmark, monkeypatch):

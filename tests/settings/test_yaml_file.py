@@ -8,7 +8,7 @@ import msgspec
 import pytest
 
 from factorgraph_dvl.errors import ConfigError
-from factorgraph_dvl.settings.yaml_file import parse_yaml
+from factorgraph_dvl.settings.yaml_file import dump_yaml, parse_yaml
 
 
 class Entry(msgspec.Struct, forbid_unknown_fields=True):
@@ -54,3 +54,34 @@ def test_wrong_entries_of_a_typed_mapping_are_named(text, line, message):
         parse_yaml(text, Settings, source="file.yaml")
     assert f"file.yaml line {line}" in str(caught.value)
     assert message in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "0008",
+        "0o17",
+        "1e3",
+        "-1E-2",
+        "no",
+        "true",
+        "null",
+        "~",
+        "",
+        "1:30",
+        "2022-10-12",
+        "0x1F",
+        ".5",
+        "a: b",
+    ],
+)
+def test_text_that_looks_like_something_else_stays_text(text):
+    for flow in (None, True):
+        written = dump_yaml({"text": text, "more": [text, 1e-3, 1e22, True, None, 8]}, flow=flow)
+        read = parse_yaml(written, dict, source="file.yaml")
+        assert read == {"text": text, "more": [text, 1e-3, 1e22, True, None, 8]}
+
+
+def test_leading_zeros_do_not_make_a_number_octal():
+    assert parse_yaml("size: 010\n", Entry, source="file.yaml").size == 10.0
+    assert parse_yaml("size: 008\n", Entry, source="file.yaml").size == 8.0

@@ -17,6 +17,7 @@ from factorgraph_dvl.io.importing import motion, orientation, positions, velocit
 from factorgraph_dvl.io.importing.decisions import Decisions
 from factorgraph_dvl.io.importing.merging import Merged
 from factorgraph_dvl.io.importing.time_base import FIRST_DATE, Timed
+from factorgraph_dvl.settings.yaml_file import dump_yaml
 from factorgraph_dvl.trial import NO_LOCK, NO_MOTION, NO_POSITION
 
 Tables = Callable[[float], Iterator[dict[str, Array]]]
@@ -289,10 +290,9 @@ def _add_log(
 
 def yaml_text(settings: Mapping[str, Any], comments: Mapping[str, str]) -> str:
     """Return the text of trial.yaml, each decision above the key that it stands behind."""
-    import yaml
 
     def flow(value: Any) -> str:
-        text = yaml.safe_dump(value, default_flow_style=True, allow_unicode=True, width=10_000)
+        text = dump_yaml(value, flow=True, width=10_000)
         return text.removesuffix("...\n").strip()
 
     lines = ["# Imported by factorgraph-dvl; import.log says why each key is as it is"]
