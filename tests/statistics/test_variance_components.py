@@ -80,3 +80,41 @@ def test_a_sensor_whose_noise_is_stated_keeps_it(trial):
     assert "dvl_velocity" not in factors(solution)
     (finding,) = (f for f in solution.findings if f.code == Code.LARGE_RESIDUALS)
     assert "too small until you correct it" in finding.text
+
+
+# Beams and depth beside GNSS and DVL: more than 100 residuals of each kind are redundant.
+ALL_KINDS = merged(
+    SCENE,
+    {
+        "dvl_beams": {
+            "rate_hz": 5,
+            "slant_azimuth_deg": [[30, 45], [30, 315], [30, 225], [30, 135]],
+            "lever_arm_m": [1, 1.2, 1.4],
+            "velocity_std_m_s": 0.005,
+        },
+        "depth": {"rate_hz": 5, "std_m": 0.05, "sea_surface_height_m": 17.3},
+    },
+)
+# The stated noise of each kind, as simulated.
+STATED = {
+    "dvl_velocity": ("dvl", {"velocity_std_m_s": 0.002, "velocity_std_fraction": 0.002}),
+    "gnss_position": ("gnss", {"position_std_m": [0.5, 0.5, 1.0]}),
+    "gnss_velocity": ("gnss", {"velocity_std_m_s": [0.1, 0.1, 0.1]}),
+    "beam_velocity": ("dvl_beams", {"velocity_std_m_s": 0.005, "velocity_std_fraction": 0.0}),
+    "depth": ("depth", {"std_m": 0.05}),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("wrong", [5.0, 0.2])
+@pytest.mark.parametrize("kind", STATED)
+def test_noise_of_every_kind_is_recovered(kind, wrong):
+    section, keys = STATED[kind]
+    claims = {name: np.multiply(wrong, value).tolist() for name, value in keys.items()}
+    misstated = merged(ALL_KINDS, {"trial": {section: claims}})
+    solution = solve(simulate(scenario(**misstated), 1), rate_hz=1.0)
+    assert solution.converged
+    found = factors(solution)
+    assert set(found) == set(STATED)
+    for name, factor in found.items():
+        np.testing.assert_allclose(factor, 1.0 / wrong if name == kind else 1.0, rtol=0.15)
