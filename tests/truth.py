@@ -113,6 +113,12 @@ TURNS_AND_BRAKING = [
     {"turn_deg_s": 8, "duration_s": 20, "ramp_s": 4},
     {"straight_s": 20},
 ]
+# The same between straight legs on which errors that persist show.
+LONGER_TURNS_AND_BRAKING = [
+    {"straight_s": 40},
+    *TURNS_AND_BRAKING[1:-1],
+    {"straight_s": 60},
+]
 
 
 def merged(base: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:

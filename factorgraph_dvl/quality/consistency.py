@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TypeVar
+from typing import Generic, TypeVar
 
 import numpy as np
 
@@ -223,7 +223,7 @@ def _view(
         if gnss is None:
             return None
         gnss = _without_outliers(gnss, around)
-        return _GnssView(sensor, windows, gnss, clock_offset(gnss, around), around)
+        return _GnssView(windows, gnss, clock_offset(gnss, around), around, sensor)
     dvl = dvl_windows(windows, sensor, around)
     if dvl is None:
         return None
@@ -238,43 +238,70 @@ def _view(
 def _dvl_view(
     windows: CarriedWindows, sensor: Dvl, compared: DvlWindows, around: float
 ) -> _DvlView:
-    return _DvlView(sensor, windows, compared, clock_offset(compared, around), around)
+    return _DvlView(windows, compared, clock_offset(compared, around), around, sensor)
 
 
 @dataclass(frozen=True)
-class _GnssView:
-    """GNSS against the IMU; `clock` is None where there are too few data; `around`, s."""
+class _View(Generic[_Windows]):
+    """A sensor against the IMU; `clock` is None where there are too few data; `around`, s."""
 
-    sensor: Gnss
     windows: CarriedWindows
-    compared: GnssWindows
+    compared: _Windows
     clock: ClockOffset | None
     around: float
-    mirrored = False
+
+    @property
+    def late(self) -> float | Array:
+        """By how much the clock is late at each window, s."""
+        return self.around if self.clock is None else self.clock.late(self.compared.time)
 
     @cached_property
     def excess(self) -> float:
-        """Share of the changes of velocity that neither IMU nor noise explains."""
-        return _excess(self.compared, self.clock, self.around)
+        """Share of the changes of velocity that neither IMU nor noise explains.
+
+        What is wrong with axes shows wherever the velocity changes; a share that only one window
+        leaves, or two beside each other, is something else.
+        """
+        # Where noise is more than all changes of velocity, the IMU shows nothing to compare.
+        if self.clock is None or noise_share(self.compared) > 1.0:
+            return 0.0
+        squares = np.sum(self.compared.residual(self.late) ** 2, axis=(1, 2))
+        signal = self.compared.signal
+        elsewhere = np.abs(np.arange(signal.size) - int(np.argmax(squares))) > 1
+        share = float(squares.sum() / max(signal.sum(), 1e-12))
+        if signal[elsewhere].sum() > _ENOUGH * signal.sum():
+            share = min(share, float(squares[elsewhere].sum() / signal[elsewhere].sum()))
+        return share - 1.5 * noise_share(self.compared)
 
     @property
     def beyond_noise(self) -> float:
         """Variance of what neither IMU nor clock explains, beside that of stated noise."""
-        return _beyond_noise(self.compared, self.clock, self.around)
+        if self.clock is None or self.compared.noise <= 0.0:
+            return 0.0
+        left = self.compared.residual(self.late)
+        count = max(float(self.compared.count.sum()), 1.0)
+        return float(np.sum(left**2)) / (self.compared.noise**2 * count)
 
     @property
     def off(self) -> float:
         """How far the clock is from what is stated, s."""
-        return _off(self.clock, self.around)
+        return 0.0 if self.clock is None else abs(self.clock.offset - self.around)
+
+
+@dataclass(frozen=True)
+class _GnssView(_View[GnssWindows]):
+    """GNSS against the IMU."""
+
+    sensor: Gnss
+    mirrored = False
 
     def fit(self) -> WindowFit:
         """Return the fit with the clock set right."""
-        return self.compared.fit(_late(self.compared, self.clock, self.around))
+        return self.compared.fit(self.late)
 
     def directions(self) -> BodyDirections:
         """Return vertical and course in body axes."""
-        late = _late(self.compared, self.clock, self.around)
-        return body_directions(self.compared, late, self.compared.fit(late))
+        return body_directions(self.compared, self.late, self.fit())
 
     def findings(self) -> Iterator[Finding]:
         """Yield what is wrong with axes, clock and antenna."""
@@ -298,34 +325,15 @@ class _GnssView:
 
 
 @dataclass(frozen=True)
-class _DvlView:
-    """A DVL against the IMU; `clock` is None where there are too few data; `around`, s."""
+class _DvlView(_View[DvlWindows]):
+    """A DVL against the IMU."""
 
     sensor: Dvl
-    windows: CarriedWindows
-    compared: DvlWindows
-    clock: ClockOffset | None
-    around: float
 
     @property
     def mirrored(self) -> bool:
         """Whether the axes of the DVL are mirrored."""
         return self.compared.handedness < 0
-
-    @cached_property
-    def excess(self) -> float:
-        """Share of the changes of velocity that neither IMU nor noise explains."""
-        return _excess(self.compared, self.clock, self.around)
-
-    @property
-    def beyond_noise(self) -> float:
-        """Variance of what neither IMU nor clock explains, beside that of stated noise."""
-        return _beyond_noise(self.compared, self.clock, self.around)
-
-    @property
-    def off(self) -> float:
-        """How far the clock is from what is stated, s."""
-        return _off(self.clock, self.around)
 
     def believed_beside(self, right: _DvlView) -> bool:
         """Whether these axes, mirrored, are believed rather than right-handed ones.
@@ -334,7 +342,7 @@ class _DvlView:
         """
         if self.clock is None or right.clock is None:
             return False
-        scale_error = self.compared.fit(_late(self.compared, self.clock, self.around)).scale_error
+        scale_error = self.compared.fit(self.late).scale_error
         ratio = self.clock.unexplained / max(right.clock.unexplained, 1e-12)
         better = ratio < 1.0 / _MIRRORED and right.excess > _CONTRADICTS
         aliased = ratio < 1.0 and self.off < _ALIASED_S
@@ -343,9 +351,8 @@ class _DvlView:
 
     def findings(self) -> Iterator[Finding]:
         """Yield what is wrong with axes and clock."""
-        late = _late(self.compared, self.clock, self.around)
         if self.mirrored:
-            yield mirrored_finding(self.sensor, self.compared.fit(late))
+            yield mirrored_finding(self.sensor, self.compared.fit(self.late))
         if self.clock is not None:
             yield from _clock(self.sensor, self.clock, self.around)
 
@@ -358,49 +365,12 @@ def _without_gross_errors(sensor: Gnss | Dvl, views: Sequence[_GnssView | _DvlVi
     compared: GnssWindows | DvlWindows = view.compared
     gross = np.zeros(compared.inside.shape, dtype=bool)
     for _ in range(_SEARCHES):
-        found = isolated(
-            compared.residual(_late(compared, view.clock, view.around)), compared.inside
-        )
+        found = isolated(compared.residual(view.late), compared.inside)
         if not found.any():
             break
         gross |= found
         compared = replace(compared, inside=compared.inside & ~found)
     return rows_of(sensor, ~np.isin(sensor.time, compared.time[gross])) if gross.any() else sensor
-
-
-def _excess(comparison: Comparison, clock: ClockOffset | None, around: float) -> float:
-    """Return the share of the changes of velocity that neither IMU nor noise explains.
-
-    What is wrong with axes shows wherever the velocity changes; a share that only one window
-    leaves, or two beside each other, is something else.
-    """
-    # Where noise is more than all changes of velocity, the IMU shows nothing to compare.
-    if clock is None or noise_share(comparison) > 1.0:
-        return 0.0
-    squares = np.sum(comparison.residual(_late(comparison, clock, around)) ** 2, axis=(1, 2))
-    signal = comparison.signal
-    elsewhere = np.abs(np.arange(signal.size) - int(np.argmax(squares))) > 1
-    share = float(squares.sum() / max(signal.sum(), 1e-12))
-    if signal[elsewhere].sum() > _ENOUGH * signal.sum():
-        share = min(share, float(squares[elsewhere].sum() / signal[elsewhere].sum()))
-    return share - 1.5 * noise_share(comparison)
-
-
-def _beyond_noise(comparison: Comparison, clock: ClockOffset | None, around: float) -> float:
-    """Return the variance of what is left beside that of stated noise."""
-    if clock is None or comparison.noise <= 0.0:
-        return 0.0
-    left = comparison.residual(_late(comparison, clock, around))
-    count = max(float(comparison.count.sum()), 1.0)
-    return float(np.sum(left**2)) / (comparison.noise**2 * count)
-
-
-def _off(clock: ClockOffset | None, around: float) -> float:
-    return 0.0 if clock is None else abs(clock.offset - around)
-
-
-def _late(comparison: Comparison, clock: ClockOffset | None, around: float) -> float | Array:
-    return around if clock is None else clock.late(comparison.time)
 
 
 def _clock(sensor: Gnss | Dvl, clock: ClockOffset, around: float) -> Iterator[Finding]:

@@ -72,7 +72,7 @@ class Explanation:
     @property
     def freed(self) -> Parameter:
         """The parameter, to be estimated."""
-        return _wide(self.parameter, self.parameter.mean)
+        return wide(self.parameter, self.parameter.mean)
 
 
 def explanation(problem: Problem, minimum: Minimum, imu: Imu) -> Explanation | None:
@@ -104,7 +104,7 @@ def explanation(problem: Problem, minimum: Minimum, imu: Imu) -> Explanation | N
     ]
     if not significant:
         return None
-    same, at = _scattered(problem, evaluation, problem.all_parameters)
+    same, at = with_scattered_noise(problem, evaluation, problem.all_parameters)
     changes = component_changes(same, at, factorized(same, at)[0])
     certain = [e for e in changes if e.change.chi2 > CHANGED**2]
     count = sum(int(np.count_nonzero(w)) for w in problem.weights)
@@ -183,7 +183,7 @@ def _tests_of_known(
 
 def _is_plausible(p: Parameter, test: Score) -> bool:
     """Whether a parameter can be as far from what it was taken to be."""
-    return bool(np.all(np.abs(test.step) < _FAR * _wide(p, p.mean).sigma))
+    return bool(np.all(np.abs(test.step) < _FAR * wide(p, p.mean).sigma))
 
 
 def confirmed(problem: Problem, minimum: Minimum, found: Explanation) -> bool:
@@ -268,7 +268,7 @@ def _numbers(p: Parameter, value: Array) -> Message:
     return message("words.numbers_with_unit", values=value / p.si, unit=unit)
 
 
-def _wide(p: Parameter, mean: Array) -> Parameter:
+def wide(p: Parameter, mean: Array) -> Parameter:
     """Return a parameter that may be anything plausible around a mean."""
     assert p.spec.plausible is not None
     return replace(p, mean=mean, sigma=np.full(p.mean.size, p.spec.plausible * p.si))
@@ -282,16 +282,16 @@ def _freed(
     Its states are eliminated.
     """
     names = {p.name for p in known}
-    free = [_wide(p, p.mean) if p.name in names else p for p in problem.all_parameters]
+    free = [wide(p, p.mean) if p.name in names else p for p in problem.all_parameters]
     ranges = eliminated_by_ranges(
-        partial(_scattered, problem, evaluation, free),
+        partial(with_scattered_noise, problem, evaluation, free),
         problem.chain,
         whole=bool(problem.processes),
     )
     return ranges, {p.name: (ranges.names[p.name], p.sigma) for p in free if p.name in names}
 
 
-def _scattered(
+def with_scattered_noise(
     problem: Problem,
     evaluation: Evaluation,
     parameters: Sequence[Parameter],

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import yaml
 from msgspec import structs
-from truth import CONFIGS, merged, scenario
+from truth import CONFIGS, LONGER_TURNS_AND_BRAKING, merged, scenario
 
 from factorgraph_dvl.sensors.finding import Code
 from factorgraph_dvl.simulation import faults, parse_scenario, simulate
@@ -16,13 +16,7 @@ from factorgraph_dvl.solvers.batch import solve
 
 SCENE = {
     "noise": True,
-    "manoeuvres": [
-        {"straight_s": 40},
-        {"turn_deg_s": -6, "duration_s": 20, "ramp_s": 4},
-        {"accelerate_m_s2": -0.2, "to_m_s": 2},
-        {"turn_deg_s": 8, "duration_s": 20, "ramp_s": 4},
-        {"straight_s": 60},
-    ],
+    "manoeuvres": LONGER_TURNS_AND_BRAKING,
     "imu": {"rate_hz": 50},
     "dvl": {"velocity_std_fraction": 0.001},
     "trial": {"dvl": {"velocity_std_fraction": 0.001}},

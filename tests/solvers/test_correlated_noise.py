@@ -10,7 +10,7 @@ import pytest
 import yaml
 from monte_carlo import RUNS, rms_band
 from problems import SHORT, problem_of
-from truth import CONFIGS, scenario
+from truth import CONFIGS, LONGER_TURNS_AND_BRAKING, scenario
 
 from factorgraph_dvl.simulation import parse_scenario, simulate
 from factorgraph_dvl.simulation.faults import (
@@ -26,13 +26,7 @@ from factorgraph_dvl.solvers.correlated_noise import correlated_noise
 
 LONG = {
     "noise": True,
-    "manoeuvres": [
-        {"straight_s": 40},
-        {"turn_deg_s": -6, "duration_s": 20, "ramp_s": 4},
-        {"accelerate_m_s2": -0.2, "to_m_s": 2},
-        {"turn_deg_s": 8, "duration_s": 20, "ramp_s": 4},
-        {"straight_s": 60},
-    ],
+    "manoeuvres": LONGER_TURNS_AND_BRAKING,
     "imu": {"rate_hz": 50, "gyro_noise_deg_sqrt_h": 0.005},
     "dvl": {"rate_hz": 5, "velocity_std_m_s": 0.01},
     "trial": {"dvl": {"velocity_std_m_s": 0.01}},

@@ -15,7 +15,7 @@ from factorgraph_dvl.sensors.records import rows_of
 from factorgraph_dvl.simulation import simulate
 from factorgraph_dvl.solvers import state_ranges
 from factorgraph_dvl.solvers.batch import solved_problems
-from factorgraph_dvl.solvers.known_parameters import _scattered, _wide
+from factorgraph_dvl.solvers.known_parameters import wide, with_scattered_noise
 from factorgraph_dvl.solvers.levenberg_marquardt import factorized
 from factorgraph_dvl.solvers.state_ranges import eliminated_by_ranges
 from factorgraph_dvl.statistics.constancy import by_interval
@@ -56,14 +56,14 @@ def solved(request):
         if not p.estimated and p.spec.plausible is not None
     }
     assert known > {*ERRORS}
-    free = [_wide(p, p.mean) if p.name in known else p for p in found.problem.all_parameters]
+    free = [wide(p, p.mean) if p.name in known else p for p in found.problem.all_parameters]
     return found.problem, found.minimum.evaluation, known, free
 
 
 @pytest.mark.parametrize("longest", [7, 1000])
 def test_ranges_have_the_information_of_the_whole(solved, monkeypatch, longest):
     problem, evaluation, known, free = solved
-    part = partial(_scattered, problem, evaluation, free)
+    part = partial(with_scattered_noise, problem, evaluation, free)
     test, at = part(None)
     columns = {p.name: (test.key(p.name), p.sigma) for p in free if p.name in known}
     information, delta = factorized(test, at)
