@@ -260,6 +260,11 @@ def noise_name(label: str) -> str:
     return label.lower().replace(" ", "_")
 
 
+def white_noise(factors: Mapping[str, Array]) -> tuple[Noise, ...]:
+    """Return noise that is white, from factors (d,) on what is stated, by label."""
+    return tuple(Noise(noise_name(label), factor) for label, factor in factors.items())
+
+
 @dataclass(frozen=True)
 class Hypothesis:
     """A trajectory that the data allow, or allowed for some time.

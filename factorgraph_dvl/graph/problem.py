@@ -479,6 +479,14 @@ class Problem:
                 return True
         return False
 
+    @property
+    def white_factors(self) -> dict[str, Array]:
+        """Factors (d,) on the stated standard deviations of white noise, by label."""
+        return {
+            label: np.asarray(self.noise_factors.get(label, 1.0) * self.long_run.get(label, 1.0))
+            for label in {*self.noise_factors, *self.long_run}
+        }
+
     def sigma(
         self, evaluation: Evaluation, factors: Mapping[str, Array | float] | None = None
     ) -> list[Array]:

@@ -302,13 +302,23 @@ class NodeMeasurements:
             ]
         )
 
-    def sigma(self, motions: Sequence[Motion], values: Mapping[str, Array]) -> Array:
-        """Return the standard deviations, (R,), at motions of each kind."""
+    def sigma(
+        self,
+        motions: Sequence[Motion],
+        values: Mapping[str, Array],
+        factors: Mapping[str, Array],
+    ) -> Array:
+        """Return the standard deviations, (R,), at motions of each kind.
+
+        `factors` (d,) multiply those that sensors state for their own noise, by label.
+        """
         values = {**self.fixed, **values}
         parts, index = self._components
         out = np.empty(index.size)
         for r, part, motion in zip(self.rows, parts, motions, strict=True):
-            out[part].reshape(r.time.size, -1)[:] = r.observation.sigma(motion, values)
+            out[part].reshape(r.time.size, -1)[:] = r.observation.sigma(
+                motion, values, factors.get(r.observation.label, 1.0)
+            )
         return out
 
 
@@ -528,7 +538,7 @@ def sensor_factor(
     )
     states = state_of(values.atNavState(keys["state"]), values.atConstantBias(keys["bias"]))
     _, motions = measured.motions(states, given)
-    weight = 1.0 / measured.sigma(motions, given)
+    weight = 1.0 / measured.sigma(motions, given, {})
     shared = [keys[p.name] for p in free]
     return measurement_factor(measured, weight, keys["state"], keys["bias"], shared)
 

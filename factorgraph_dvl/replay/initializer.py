@@ -235,6 +235,9 @@ class Initializer:
         if not self.history.complete or before.start.sections != after.start.sections:
             return
         old, new = before.calibration(), after.calibration()
+        if [e.name for e in old.estimates] != [e.name for e in new.estimates]:
+            # A parameter that was stated as known is estimated instead.
+            return
         std = np.sqrt(np.diag(new.covariance))
         free = std > 0.0
         moved = np.concatenate(

@@ -27,7 +27,7 @@ from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.sensors.message import message
 from factorgraph_dvl.sensors.protocol import Observation
 from factorgraph_dvl.sensors.records import rows_of
-from factorgraph_dvl.solution import Progress, Trajectory
+from factorgraph_dvl.solution import Noise, Progress, Trajectory, white_noise
 from factorgraph_dvl.solvers.motion_preparation import (
     TURN_SPAN,
     motion_observations,
@@ -143,6 +143,14 @@ class MotionReplay:
         self._residuals_to: dict[str, float] = {}
         self._rejected: Counter[str] = Counter()
         self._noted = set(trial.notes)
+
+    @property
+    def noise(self) -> tuple[Noise, ...]:
+        """Noise of the sensors, as the last batch solution found it."""
+        if self._current is None:
+            return ()
+        batch, _ = self._current
+        return white_noise(batch.found.problem.noise_factors)
 
     def counts(self) -> list[Finding]:
         """Return how many measurements were not used, and why."""

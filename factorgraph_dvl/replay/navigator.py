@@ -349,7 +349,7 @@ class Navigator:
         else:
             states = state_of(s.state(k), s.bias(k))
             residual, matrix, motions = measured.linearize(states, self.values)
-        sigma = measured.sigma(motions, self.values)
+        sigma = measured.sigma(motions, self.values, self.start.noise_factors)
         errors = None
         if self.start.errors.size:
             errors, error = self._correlated_errors(k, measured)

@@ -194,7 +194,7 @@ def _solution(
             )
         )
     findings += run.counts()
-    findings += consistency_findings(calibration.estimates, residuals)
+    findings += consistency_findings(calibration.estimates, residuals, run.noise)
     findings += prior_findings(trial, calibration.estimates, calibration.covariance)
     why = message("not_observable.prior_reported")
     for e in calibration.estimates:
@@ -240,4 +240,5 @@ def _solution(
         residuals=residuals,
         findings=tuple(findings),
         limits=trial.limits,
+        noise=run.noise,
     )

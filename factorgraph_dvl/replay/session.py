@@ -28,7 +28,7 @@ from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.sensors.message import message
 from factorgraph_dvl.sensors.protocol import Aid
 from factorgraph_dvl.sensors.records import rows_of
-from factorgraph_dvl.solution import Progress, Trajectory
+from factorgraph_dvl.solution import Noise, Progress, Trajectory
 from factorgraph_dvl.solvers.state_times import CLOSEST
 from factorgraph_dvl.trial import Trial
 
@@ -118,6 +118,7 @@ class Replay:
             settings, self._interval, progress or (lambda stage, iteration, cost: None)
         )
         self._navigator: Navigator | None = None
+        self._noise: tuple[Noise, ...] = ()
         self._gate = InnovationGate()
         self._pending = PendingMeasurements(settings.body_axes)
         self._duplicates = Duplicates()
@@ -145,6 +146,11 @@ class Replay:
     def settled(self) -> bool:
         """Whether the calibration is known well enough to go on without batch solutions."""
         return self._initializer.history is None
+
+    @property
+    def noise(self) -> tuple[Noise, ...]:
+        """Noise of the sensors, as the last batch solution found it."""
+        return self._noise
 
     @property
     def findings(self) -> tuple[Finding, ...]:
@@ -316,6 +322,7 @@ class Replay:
         if start is None:
             return None
         self._deferred.clear()
+        self._noise = start.noise
         lag = self._lag if self._kind == "fixed-lag" else None
         self._navigator = Navigator(
             start, self._settings.inertial, self._gate, lag=lag, memory=self._lag

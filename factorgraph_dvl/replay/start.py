@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
 import gtsam
@@ -21,8 +21,9 @@ from factorgraph_dvl.sensors.finding import Finding
 from factorgraph_dvl.sensors.message import Message, message
 from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.sensors.protocol import AttitudeAid
-from factorgraph_dvl.solution import Progress, Trajectory
+from factorgraph_dvl.solution import Noise, Progress, Trajectory
 from factorgraph_dvl.solvers.batch import settled_minimum
+from factorgraph_dvl.solvers.correlated_noise import noise_of
 from factorgraph_dvl.solvers.posterior import posterior
 from factorgraph_dvl.solvers.state_times import needs_states
 from factorgraph_dvl.solvers.trajectory import EPOCH_ROUNDING, TRAJECTORY_RATE, trajectory_between
@@ -70,6 +71,10 @@ class ReplayStart:
         Spurious information on the parameters, in units of the priors' standard deviations.
     walking : bool
         Whether biases walk.
+    noise_factors : mapping of str to ndarray
+        By label, factors (d,) on the standard deviations that sensors state for their own noise.
+    noise : tuple of Noise
+        Noise as it is reported.
     errors : CorrelatedErrors
         Correlated errors of the sensors.
     clock_zero : float
@@ -79,7 +84,7 @@ class ReplayStart:
     findings : tuple of Finding
         What the user must know.
     misfit : float
-        Largest RMS normalised residual of any kind of measurement.
+        Largest RMS of the residuals of any kind of measurement, over what is stated.
     """
 
     frame: LocalFrame
@@ -97,6 +102,8 @@ class ReplayStart:
     windows: tuple[int, int]
     spurious: Array
     walking: bool
+    noise_factors: Mapping[str, Array]
+    noise: tuple[Noise, ...]
     errors: CorrelatedErrors
     clock_zero: float
     trajectory: Trajectory
@@ -149,12 +156,10 @@ def solve_start(
     DataError, SolveError
         If the data so far cannot be solved.
     """
-    # The smoother goes on with the noise that is stated.
     settled, start_positions = settled_minimum(
         trial,
         progress=progress,
         constants_prior=known,
-        estimate_noise=False,
         clock_zero=clock_zero,
     )
     problem, minimum = settled.problem, settled.minimum
@@ -203,6 +208,8 @@ def solve_start(
         windows=chain.segments.increments.chosen_windows,
         spurious=spurious,
         walking=chain.walking,
+        noise_factors=problem.white_factors,
+        noise=noise_of(problem),
         errors=errors,
         clock_zero=clock_zero,
         trajectory=_trajectory(
@@ -246,10 +253,13 @@ def _own_states(trial: Trial, frame: LocalFrame, interval: float) -> tuple[str, 
 
 def _misfit(problem: Problem, evaluation: Evaluation) -> float:
     out = 0.0
-    for residual, weight in zip(evaluation.residuals, problem.weights, strict=True):
+    factors = [problem.white_factors.get(o.label, 1.0) for o in problem.observations]
+    for residual, weight, factor in zip(
+        evaluation.residuals, problem.weights, factors, strict=True
+    ):
         used = weight > 0.0
         if np.count_nonzero(used) >= _ENOUGH:
-            out = max(out, float(np.sqrt(np.mean(residual[used] ** 2))))
+            out = max(out, float(np.sqrt(np.mean((factor * residual)[used] ** 2))))
     return out
 
 

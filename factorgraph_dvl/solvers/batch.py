@@ -246,7 +246,6 @@ def settled_minimum(
     state_interval_s: float = STATE_INTERVAL,
     progress: Progress | None = None,
     constants_prior: ConstantsPrior | None = None,
-    estimate_noise: bool = True,
     clock_zero: float | None = None,
 ) -> tuple[SettledMinimum, StartPositions]:
     """Return the minimum of a trial's cost, and all positions where it may have started.
@@ -263,8 +262,6 @@ def settled_minimum(
         Called with stage, iteration and cost.
     constants_prior : ConstantsPrior, optional
         Joint prior of biases and calibration, in place of the trial's priors.
-    estimate_noise : bool, default True
-        As of `settle`.
     clock_zero : float, optional
         When the offsets of clocks hold, s; by default in the middle of the trial.
     """
@@ -277,7 +274,6 @@ def settled_minimum(
         start.states[0],
         report,
         constants_prior=constants_prior,
-        estimate_noise=estimate_noise,
         clock_zero=clock_zero,
     )
     findings = (*prepared.findings, *settled.findings, *ambiguity(start.hypotheses))

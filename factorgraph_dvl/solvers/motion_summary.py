@@ -21,14 +21,13 @@ from factorgraph_dvl.sensors.protocol import Motion
 from factorgraph_dvl.solution import (
     Cause,
     Estimate,
-    Noise,
     Residuals,
     Solution,
     Trajectory,
     consistency_findings,
-    noise_name,
     not_observable,
     outlier_findings,
+    white_noise,
 )
 from factorgraph_dvl.solvers.causes import numbers_with_unit
 from factorgraph_dvl.solvers.motion_smoother import SmoothedMotion
@@ -88,7 +87,7 @@ def summarise_motion(trial: Trial, found: SmoothedMotion, *, rate_hz: float) -> 
         problem, over_trial.values, over_trial.covariance
     )
     residuals, rejected = _residuals(found)
-    noise = tuple(Noise(noise_name(n), f) for n, f in problem.noise_factors.items())
+    noise = white_noise(problem.noise_factors)
     findings = [*found.findings]
     for o, seen in zip(problem.observations, evaluation.seen, strict=True):
         left_out = int((~seen.covered).sum())

@@ -116,7 +116,6 @@ def settle(
     *,
     constants_prior: ConstantsPrior | None = None,
     values: dict[str, Array] | None = None,
-    estimate_noise: bool = True,
     clock_zero: float | None = None,
     stages: Stages | None = None,
     explain: Explain = explanation,
@@ -136,9 +135,6 @@ def settle(
         its values are those to start from.
     values : dict of str to ndarray, optional
         Parameters to start from; by default mountings that fit the motion.
-    estimate_noise : bool, default True
-        Whether to estimate the noise of sensors from their residuals, where the trial does not
-        say that it is as stated.
     clock_zero : float, optional
         When the offsets of clocks hold, s; by default in the middle of the trial.
     stages : Stages, optional
@@ -163,11 +159,10 @@ def settle(
     rejected = prepared.start_positions.rejected
     tried: list[Mapping[str, Array]] = []
     cycle: list[Mapping[str, Array]] = []
-    estimated = prepared.estimated_noise if estimate_noise else frozenset()
     as_stated = {
         o.label: np.ones(len(o.components))
         for o in prepared.observations
-        if o.label in estimated and o.noise_groups
+        if o.label in prepared.estimated_noise and o.noise_groups
     }
     searches = 0
     correlation_searched = False

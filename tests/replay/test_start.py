@@ -18,7 +18,7 @@ def silent(stage, iteration, cost):
 
 def test_the_last_state_knows_what_the_batch_knows(started):
     start = started.start
-    settled, _ = settled_minimum(started.early, estimate_noise=False, clock_zero=0.0)
+    settled, _ = settled_minimum(started.early, clock_zero=0.0)
     covariances = posterior(settled.problem, settled.minimum)
     gaussian = start.prior.linearize(start.values)
     smoother = Smoother(

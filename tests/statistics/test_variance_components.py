@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import msgspec
 import numpy as np
 import pytest
+from stated_noise import stated
 from truth import CONING, merged, scenario
 
 from factorgraph_dvl.sensors.finding import Code
@@ -30,23 +30,6 @@ def trial():
 @pytest.fixture(scope="module")
 def honest(trial):
     return solve(trial, rate_hz=1.0)
-
-
-def stated(trial, factor_dvl=1.0, factor_gnss=1.0, **settings):
-    """State noise that is wrong by factors."""
-    dvl, gnss = trial.dvl.settings, trial.gnss
-    dvl = msgspec.structs.replace(
-        dvl,
-        velocity_std_m_s=factor_dvl * dvl.velocity_std_m_s,
-        velocity_std_fraction=factor_dvl * dvl.velocity_std_fraction,
-        **settings,
-    )
-    gnss = replace(
-        gnss,
-        position_std=factor_gnss * gnss.position_std,
-        velocity_std=factor_gnss * gnss.velocity_std,
-    )
-    return replace(trial, dvl=replace(trial.dvl, settings=dvl), gnss=gnss)
 
 
 def factors(solution):
