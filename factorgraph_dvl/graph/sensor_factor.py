@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, cast
+from typing import Any
 
 import gtsam
 import numpy as np
@@ -19,7 +19,6 @@ from factorgraph_dvl.geometry.vectors import Array, IntArray
 from factorgraph_dvl.graph.clocks import linearized, parameters_of, true_time
 from factorgraph_dvl.graph.keys import BIAS_SIZE, STATE_SIZE
 from factorgraph_dvl.graph.priors import places, prior_mean, value_at
-from factorgraph_dvl.graph.problem import node_jacobian
 from factorgraph_dvl.imu.preintegration import Preintegration
 from factorgraph_dvl.imu.propagation import (
     Attachment,
@@ -266,30 +265,26 @@ class NodeMeasurements:
         motion = motion_at(at, states, self.gravity_n, rate, increments)
         motions = self._at_true_times(motion, values)
         transition = Transition(at, states, motion, rate, increments)
-        parts, index = self._components
-        found = [
-            linearized(r.observation, own, values, wanted, self.clock_zero)
-            for r, own, wanted in zip(self.rows, motions, self._wanted, strict=True)
-        ]
-        # All components at once, each as a measurement of its own.
-        by_motion: dict[str, Any] = {name: _stacked(found, name, parts) for name in _BY_MOTION}
-        residual = np.concatenate([lin.residual.ravel() for lin in found])
-        whole = Linearization(residual[:, None], **by_motion)
-        window = cast(Transition, _Window(transition, index))
-        first = STATE_SIZE + BIAS_SIZE
-        matrix = np.zeros((index.size, first + sum(p.mean.size for p in self.parameters)))
-        matrix[:, :first] = node_jacobian(whole, window)[:, 0]
-        for part, lin in zip(parts, found, strict=True):
-            by_parameters = matrix[part].reshape(*lin.residual.shape, -1)[:, :, first:]
+        first, size = STATE_SIZE + BIAS_SIZE, sum(p.mean.size for p in self.parameters)
+        residuals, matrices = [], []
+        for r, own, wanted in zip(self.rows, motions, self._wanted, strict=True):
+            lin = linearized(r.observation, own, values, wanted, self.clock_zero)
+            matrix = np.zeros((*lin.residual.shape, first + size))
+            matrix[:, :, :first] = _by_motion(lin) @ transition.whole[r.at]
+            by_parameters = matrix[:, :, first:]
             for name, jacobian in lin.d_parameters.items():
                 if name in self._place:
                     by_parameters[:, :, self._place[name]] = jacobian
-        if self.sensitivity is not None:
-            errors = [p for p in self.parameters if p.name in ERRORS]
-            own = by_errors(whole, window, rows_of(self.sensitivity, index), elements(errors))
-            columns = [np.r_[self._place[p.name]] for p in errors]
-            matrix[:, first + np.concatenate(columns)] = own[:, 0]
-        return residual, matrix, motions
+            if self.sensitivity is not None:
+                part = Transition(rows_of(at, r.at), states, rows_of(motion, r.at), rate)
+                errors = [p for p in self.parameters if p.name in ERRORS]
+                columns = np.concatenate([np.r_[self._place[p.name]] for p in errors])
+                by_parameters[:, :, columns] = by_errors(
+                    lin, part, rows_of(self.sensitivity, r.at), elements(errors)
+                )
+            residuals.append(lin.residual.ravel())
+            matrices.append(matrix.reshape(-1, first + size))
+        return np.concatenate(residuals), np.concatenate(matrices), motions
 
     def residuals(self, states: States, values: Mapping[str, Array]) -> Array:
         """Return the residuals, (R,)."""
@@ -343,35 +338,17 @@ class Linearized:
         """Whether it was computed at these very states and values."""
         pairs = [*zip(vars(self.states).values(), vars(states).values(), strict=True)]
         pairs += [(self.values[name], value) for name, value in values.items()]
-        return all((ours == theirs).all() for ours, theirs in pairs)
+        # Bytes of few numbers take less time to compare.
+        return all(ours.tobytes() == theirs.tobytes() for ours, theirs in pairs)
 
 
-class _Window:
-    """A transition at some of its times, of which one may come several times."""
-
-    def __init__(self, transition: Transition, index: IntArray) -> None:
-        self._transition = transition
-        self._index = index
-
-    @cached_property
-    def at(self) -> Attachment:
-        """Attachment of these times."""
-        return rows_of(self._transition.at, self._index)
-
-    def __getattr__(self, name: str) -> Array:
-        found: Array = getattr(self._transition, name)[self._index]
-        return found
-
-
-def _stacked(found: Sequence[Linearization], name: str, parts: Sequence[slice]) -> Array | None:
-    """Return derivatives by one of the motion's variables, (R, 1, 3); None if all are zero."""
-    given = [getattr(lin, name) for lin in found]
-    if all(jacobian is None for jacobian in given):
-        return None
-    out = np.zeros((parts[-1].stop, 1, 3))
-    for part, jacobian, lin in zip(parts, given, found, strict=True):
+def _by_motion(lin: Linearization) -> Array:
+    """Return the derivatives by attitude, position, velocity and rate, (M, d, 12)."""
+    out = np.zeros((*lin.residual.shape, 12))
+    for i, name in enumerate(_BY_MOTION):
+        jacobian = getattr(lin, name)
         if jacobian is not None:
-            out[part].reshape(*lin.residual.shape, 3)[:] = jacobian
+            out[:, :, 3 * i : 3 * i + 3] = jacobian
     return out
 
 

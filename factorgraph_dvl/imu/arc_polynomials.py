@@ -23,6 +23,9 @@ from factorgraph_dvl.imu.polynomials import (
 # Relative spread of intervals up to which a stencil counts as regular. Chosen: far below what
 # the interpolation sees.
 UNIFORM = 1e-3
+# The same of intervals against their median, so that every stencil is regular. By definition: two
+# of them then differ by less than that.
+_EVEN = 0.49 * UNIFORM
 # Intervals up to which all polynomials are kept.
 _SHORT = 200
 # Samples whose differences are in memory at a time. Chosen: some MB.
@@ -72,20 +75,24 @@ class ArcPolynomials:
     def arc_of(self) -> IntArray:
         """Arc of each interval, (N,)."""
         # One byte each, where there are not many.
+        if len(self.arcs) == 1:
+            return np.zeros(self.dt.size, dtype=np.uint8)
         arc = np.arange(len(self.arcs), dtype=np.min_scalar_type(len(self.arcs)))
         return np.repeat(arc, self.arcs[:, 1] - self.arcs[:, 0])
 
     def difference_at(self, index: IntArray) -> Array:
         """Return the highest difference of the rate about intervals `index`, (M, 3), rad/s."""
-        arc = self.arc_of[index]
         sample = self._centred_sample(index)
+        if self.dt.size <= _SHORT:
+            return np.asarray(self._highest[sample])
+        arc = self.arc_of[index]
         first = self.arcs[arc, 0] + sample - self.first_sample[arc]
         place = first + np.arange(self.width + self.averaged)[:, None]
         # The last edge of an arc is no start of an interval.
         inside = np.minimum(place, self.arcs[arc, 1] - 1)
         edges = self.start[inside] + np.where(inside < place, self.dt[inside], 0.0)
         values = self.rate[sample + np.arange(self.width)[:, None]]
-        step = self._steps[arc][:, None]
+        step = self.step[arc][:, None]
         out = highest_difference(values, edges, self.width, self.averaged, step)
         return np.asarray(out[0])
 
@@ -95,11 +102,34 @@ class ArcPolynomials:
         return 5 if self.averaged else 6
 
     @cached_property
-    def _steps(self) -> Array:
+    def step(self) -> Array:
         """Median length of the intervals of each arc, (A,), s."""
+        return np.array([median(self.dt[a:b]) for a, b in self.arcs])
+
+    @cached_property
+    def unevenness(self) -> Array:
+        """Largest share by which an interval of each arc differs from their median, (A,)."""
         return np.array(
-            [median(np.diff(self.start[a:b], append=self.end[b - 1])) for a, b in self.arcs]
+            [
+                np.abs(self.dt[a:b] / step - 1.0).max()
+                for (a, b), step in zip(self.arcs, self.step, strict=True)
+            ]
         )
+
+    @cached_property
+    def _highest(self) -> Array:
+        """Highest difference of the rate over the stencil from each sample on, (S, 3), rad/s.
+
+        Of a short record; infinite where the arc ends within the stencil.
+        """
+        out = np.full(self.rate.shape, np.inf)
+        for (a, b), base, step in zip(self.arcs, self.first_sample, self.step, strict=True):
+            count = b - a + (0 if self.averaged else 1)
+            edges = np.concatenate([self.start[a:b], self.start[b - 1 : b] + self.dt[b - 1 : b]])
+            out[base : base + count - self.width + 1] = highest_difference(
+                self.rate[base : base + count], edges, self.width, self.averaged, step
+            )
+        return out
 
     @cached_property
     def _roughness(self) -> Array:
@@ -107,8 +137,10 @@ class ArcPolynomials:
 
         In rad/s; infinite where the arc ends within the stencil.
         """
+        if self.dt.size <= _SHORT:
+            return np.asarray(np.sqrt(np.einsum("ij,ij->i", self._highest, self._highest)))
         out = np.full(len(self.rate), np.inf)
-        for (a, b), base, step in zip(self.arcs, self.first_sample, self._steps, strict=True):
+        for (a, b), base, step in zip(self.arcs, self.first_sample, self.step, strict=True):
             edges = np.append(self.start[a:b], self.end[b - 1])
             count = b - a + (0 if self.averaged else 1)
             for begin in range(0, count - self.width + 1, _CHUNK):
@@ -133,7 +165,8 @@ class ArcPolynomials:
         arc = self.arc_of[index]
         first, last = self.arcs[arc, 0], self.arcs[arc, 1]
         count = last - first + (0 if self.averaged else 1)
-        return self.first_sample[arc] + np.clip(index - first - 2, 0, count - self.width)
+        stencil = np.minimum(np.maximum(index - first - 2, 0), count - self.width)
+        return np.asarray(self.first_sample[arc] + stencil)
 
     def _stencil(self, inside: IntArray, most: IntArray, base: IntArray) -> IntArray:
         """Return the first sample, within the arc, of the stencils of intervals `inside` it.
@@ -141,9 +174,9 @@ class ArcPolynomials:
         Centred, unless the rate is rougher there than noise explains: then the smoothest
         stencil that still holds the interval.
         """
-        stencil = np.clip(inside - 2, 0, most)
+        stencil = np.minimum(np.maximum(inside - 2, 0), most)
         roughness = self._roughness[base + stencil]
-        rough = np.flatnonzero(roughness > _ROUGH * self.difference_sigma)
+        (rough,) = (roughness > _ROUGH * self.difference_sigma).nonzero()
         if rough.size:
             back = np.arange(self.width if self.averaged else self.width - 1)
             options = np.clip(inside[rough, None] - back, 0, most[rough, None])
@@ -170,20 +203,23 @@ class ArcPolynomials:
         first, last = self.arcs[arc, 0], self.arcs[arc, 1]
         width = self.width
         count = last - first + (0 if self.averaged else 1)
-        stencil = self._stencil(index - first, count - width, self.first_sample[arc])
-        offset = index - first - stencil
-        rows = (self.first_sample[arc] + stencil)[:, None] + np.arange(width)
+        inside, base = index - first, self.first_sample[arc]
+        stencil = self._stencil(inside, count - width, base)
+        offset = inside - stencil
+        rows = (base + stencil)[:, None] + np.arange(width)
         values = np.concatenate([self.rate[rows], self.force[rows]], axis=2)
+        edge_count = width + self.averaged
+        out = np.matmul(regular_interpolations(edge_count, self.averaged)[offset], values)
+        if self.unevenness.max() < _EVEN:
+            return np.asarray(out)
 
         # Edges of the stencil's intervals, relative to the interval and in its lengths.
         intervals = (first + stencil)[:, None] + np.arange(width if self.averaged else width - 1)
         lengths = self.dt[intervals] / self.dt[index][:, None]
         uniform = np.all(np.abs(lengths - 1.0) < UNIFORM, axis=1)
-        regular = regular_interpolations(lengths.shape[1] + 1, self.averaged)
-        out = np.matmul(regular[offset], values)
         rest = np.flatnonzero(~uniform)
         if rest.size:
-            edges = np.zeros((rest.size, lengths.shape[1] + 1))
+            edges = np.zeros((rest.size, edge_count))
             np.cumsum(lengths[rest], axis=1, out=edges[:, 1:])
             edges -= np.take_along_axis(edges, offset[rest][:, None], axis=1)
             out[rest] = np.matmul(interpolation(edges, self.averaged), values[rest])

@@ -8,6 +8,7 @@ the sample before: all samples are there when a trial is processed.
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -21,7 +22,7 @@ from factorgraph_dvl.imu.interpolation import Smoothed, smooth, unsmoothed
 from factorgraph_dvl.imu.polynomials import evaluate, integrate, rate_and_slope
 from factorgraph_dvl.imu.timestamps import JUMP, fill_lost, unrounded
 from factorgraph_dvl.sensors.finding import Code, Finding
-from factorgraph_dvl.sensors.imu import Imu
+from factorgraph_dvl.sensors.imu import Imu, ImuSettings
 from factorgraph_dvl.sensors.message import message
 
 # Lost samples up to this number are interpolated; a longer gap ends the arc. Chosen: a polynomial
@@ -109,8 +110,7 @@ class Increments(ArcPolynomials):
     def locate(self, time: Array) -> tuple[IntArray, Array, np.ndarray]:
         """Return interval, time since its start (s) and whether an arc covers the time."""
         # Times that were rounded belong to the interval at whose start they are meant to be.
-        index = np.searchsorted(self.start, time + _ROUNDING, side="right") - 1
-        index = np.clip(index, 0, None)
+        index = np.maximum(self.start.searchsorted(time + _ROUNDING, side="right") - 1, 0)
         since = time - self.start[index]
         slack = _ROUNDING + 1e-3 * self.dt[index]
         return index, since, (since >= -slack) & (since <= self.dt[index] + slack)
@@ -190,14 +190,15 @@ class Increments(ArcPolynomials):
     def smoothed(self) -> tuple[tuple[Smoothed, Smoothed], ...]:
         """Rate and force of each arc, smoothed where their noise asks for it."""
         out = []
-        for (a, b), base in zip(self.arcs, self.first_sample, strict=True):
+        for (a, b), base, dt, unlike in zip(
+            self.arcs, self.first_sample, self.step, self.unevenness, strict=True
+        ):
             steps = self.dt[a:b]
-            dt = median(steps)
             time = self.start[a:b] + 0.5 * steps
             if not self.averaged:
                 time = np.append(self.start[a:b], self.end[b - 1])
             own = slice(base, base + time.size)
-            regular = np.abs(steps / dt - 1.0).max() < UNIFORM
+            regular = unlike < UNIFORM
             pair = []
             for i, (signal, sigma) in enumerate(
                 ((self.rate[own], self.gyro_sigma), (self.force[own], self.accel_sigma))
@@ -208,7 +209,10 @@ class Increments(ArcPolynomials):
                     if regular
                     else unsmoothed(dt, sigma)
                 )
-            out.append((pair[0], pair[1].on_knots_of(pair[0])))
+            # Those of few are not worth sharing.
+            if self.dt.size > _FEW:
+                pair[1] = pair[1].on_knots_of(pair[0])
+            out.append((pair[0], pair[1]))
         return tuple(out)
 
     def _blended_rate(self, index: IntArray, since: Array, c: Array) -> tuple[Array, Array]:
@@ -274,25 +278,76 @@ def increments(
     if averaged:
         edges = [np.concatenate([[e[0] - median(np.diff(e))], e]) for e in edges]
     ends = np.cumsum([e.size - 1 for e in edges])
-    dt = median(np.diff(imu.time))
-    out = Increments(
+    out = _increments(
+        imu.settings,
+        median(np.diff(imu.time)),
+        windows,
         start=np.concatenate([time[a] + e[:-1] for (a, _), e in zip(whole, edges, strict=True)]),
         dt=np.concatenate([np.diff(e) for e in edges]),
         arcs=np.stack([np.concatenate([[0], ends[:-1]]), ends], axis=1),
         rate=_in_a_row([rate[a:b] for a, b in whole]),
         force=_in_a_row([force[a:b] for a, b in whole]),
         first_sample=np.cumsum([0, *(b - a for a, b in whole)])[:-1],
-        averaged=averaged,
         open_sigma=_in_a_row([filled_sigma[a + (not averaged) : b] for a, b in whole]),
-        gyro_sigma=imu.settings.gyro_noise_root_psd / np.sqrt(dt),
-        accel_sigma=imu.settings.accel_noise_root_psd / np.sqrt(dt),
+    )
+    alone = [(b - a, float(time[a])) for a, b in itertools.pairwise(bounds) if b - a < _LEAST]
+    return out, (*lost, *_unused(alone), *_gaps(out))
+
+
+def unbroken_increments(
+    settings: ImuSettings, time: Array, rate: Array, force: Array, windows: tuple[int, int]
+) -> Increments:
+    """Return increments between samples of which none was lost, with times as they are.
+
+    Parameters
+    ----------
+    settings : ImuSettings
+        Of the IMU.
+    time : ndarray, shape (S,), s
+        Of the samples, `_LEAST` at least.
+    rate, force : ndarray, shape (S, 3)
+        The samples.
+    windows : tuple of (int, int)
+        See `Increments`.
+    """
+    since = time - time[0]
+    dt = since[1:] - since[:-1]
+    usual = median(dt)
+    start = time[:-1]
+    if settings.sampling == "mean":
+        dt = np.concatenate([[usual], dt])
+        start = np.concatenate([[start[0] - usual], start])
+    return _increments(
+        settings,
+        usual,
+        windows,
+        start=start,
+        dt=dt,
+        arcs=np.array([[0, dt.size]]),
+        rate=rate,
+        force=force,
+        first_sample=np.zeros(1, dtype=int),
+        open_sigma=np.zeros((dt.size, 6)),
+    )
+
+
+def _increments(
+    settings: ImuSettings, step: float, windows: tuple[int, int] | None, **arrays: Array
+) -> Increments:
+    """Return increments of these arrays, and of the noise of samples every `step` s."""
+    root_step = math.sqrt(step)
+    averaged = settings.sampling == "mean"
+    out = Increments(
+        **arrays,
+        averaged=averaged,
+        gyro_sigma=settings.gyro_noise_root_psd / root_step,
+        accel_sigma=settings.accel_noise_root_psd / root_step,
         windows=windows,
     )
     if not averaged:
         noise = np.repeat([out.gyro_sigma, out.accel_sigma], 3)
         np.hypot(out.open_sigma, open_steps(out, noise), out=out.open_sigma)
-    alone = [(b - a, float(time[a])) for a, b in itertools.pairwise(bounds) if b - a < _LEAST]
-    return out, (*lost, *_unused(alone), *_gaps(out))
+    return out
 
 
 def _in_a_row(parts: Sequence[Array]) -> Array:

@@ -168,6 +168,8 @@ class Segments:
 
     def since_start(self, index: IntArray) -> Integrals:
         """Return what adds up from the starts of segments to those of intervals (M,)."""
+        if self.spacing == 1 and self.first.size == 1:
+            return rows_of(self.knots, index - self.first[0])
         segment = np.searchsorted(self.first, index, side="right") - 1
         inside = index - self.first[segment]
         found = rows_of(self.knots, self.first_knot[segment] + inside // self.spacing)
@@ -531,8 +533,8 @@ def gtsam_measurements(
     gyro_psd = settings.gyro_noise_root_psd**2 * IDENTITY
     accel_psd = settings.accel_noise_root_psd**2 * IDENTITY
     integration_psd = _INTEGRATION_ROOT_PSD**2 * IDENTITY
-    is_open = np.flatnonzero(np.any(inc.open_sigma > 0.0, axis=1))
-    some_open = np.searchsorted(is_open, seg.first) < np.searchsorted(is_open, seg.last)
+    is_open = np.flatnonzero(inc.open_sigma.any(axis=1))
+    some_open = is_open.searchsorted(seg.first) < is_open.searchsorted(seg.last)
     no_extra = np.zeros((3, 3))
     by_steps = _by_sample if inc.dt.size < _FEW else _by_stride
     out = []

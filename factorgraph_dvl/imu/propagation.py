@@ -96,7 +96,7 @@ def _inside(seg: Segments, time: Array) -> tuple[IntArray, Array]:
     A time on the edge of the chain may be off it by rounding.
     """
     index, since, _ = seg.increments.locate(time)
-    inside = np.clip(index, seg.first[0], seg.last[-1] - 1)
+    inside = np.minimum(np.maximum(index, seg.first[0]), seg.last[-1] - 1)
     return inside, np.where(inside == index, since, time - seg.increments.start[inside])
 
 
@@ -119,7 +119,7 @@ def segment_ends(seg: Segments, earth_rate_n: Array) -> Attachment:
 def _attach(seg: Segments, index: IntArray, since: Array, earth_rate_n: Array) -> Attachment:
     inc = seg.increments
     part = inc.partial(index, since)
-    segment = np.searchsorted(seg.first, index, side="right") - 1
+    segment = seg.first.searchsorted(index, side="right") - 1
     node = seg.origin[segment]
     before = seg.since_start(index)
     dR = before.dR
@@ -249,6 +249,23 @@ class Transition:
     def v_accel(self) -> Array:
         """Velocity by accelerometer bias."""
         return -self.turned @ self.at.dA
+
+    @cached_property
+    def whole(self) -> Array:
+        """Attitude, position, velocity and rate by the node before, (M, 12, 15).
+
+        Columns: attitude, position, velocity, accelerometer bias, gyro bias.
+        """
+        out = np.zeros((self.at.tau.size, 12, 15))
+        out[:, 0:3, 0:3], out[:, 0:3, 12:15] = self.theta_theta, self.theta_gyro
+        out[:, 3:6, 0:3], out[:, 3:6, 3:6] = self.p_theta, self.p_p
+        out[:, 3:6, 6:9], out[:, 6:9, 6:9] = self.p_v, self.v_v
+        out[:, 3:6, 9:12], out[:, 3:6, 12:15] = self.p_accel, self.p_gyro
+        out[:, 6:9, 0:3] = self.v_theta
+        out[:, 6:9, 9:12], out[:, 6:9, 12:15] = self.v_accel, self.v_gyro
+        out[:, 9:12] = self.omega_theta @ out[:, 0:3]
+        out[:, 9:12, 12:15] -= IDENTITY
+        return out
 
 
 def attitude_jacobian(lin: Linearization, transition: Transition) -> Array | None:

@@ -95,7 +95,10 @@ def unrounded(time: Array, number: Array | None = None) -> Array:
     quantum = float(np.spacing(np.abs(time).max()))
     for decimals in range(1, 7):
         unit = 10.0**-decimals
-        if unit < 0.5 * slope and np.all(np.abs(since / unit - np.rint(since / unit)) < 1e-3):
+        if unit >= 0.5 * slope:
+            continue
+        scaled = since / unit
+        if np.abs(scaled - np.rint(scaled)).max() < 1e-3:
             quantum = max(quantum, unit)
             break
     # A fitted line may be off by as much as the rounding itself.

@@ -76,12 +76,13 @@ class InnovationGate:
         limit = _LIMIT if echo_limit is None else echo_limit
         # A few numbers at a time: plain ones take a tenth of the time of arrays.
         rows = normalised.tolist()
-        beyond = np.array([any(abs(x) >= limit for x in row) for row in rows], dtype=bool)
-        window.extend(zip(beyond.tolist(), map(_mean_square, rows), strict=True))
+        beyond = [any(abs(x) >= limit for x in row) for row in rows]
+        window.extend(zip(beyond, map(_mean_square, rows), strict=True))
         finding = self._judge(label, window, limit, echo_limit is not None)
-        used = np.zeros_like(beyond) if label in self.excluded else ~beyond
-        self.rejected[label] += int((~used).sum())
-        return used, finding
+        excluded = label in self.excluded
+        used = [not (excluded or outlier) for outlier in beyond]
+        self.rejected[label] += used.count(False)
+        return np.array(used, dtype=bool), finding
 
     def _judge(
         self, label: str, window: deque[tuple[bool, float]], limit: float, echoes: bool

@@ -15,6 +15,9 @@ from factorgraph_dvl.sensors.protocol import Aid
 from factorgraph_dvl.sensors.records import joined, rows_of
 from factorgraph_dvl.trial import Trial
 
+# What rounding may take off a time, s: the sample at which a segment ended belongs to it.
+_ROUNDING = 1e-6
+
 
 class RecordHistory:
     """Records that grow, and lose what is too old.
@@ -117,7 +120,7 @@ class RecordHistory:
         """Return the records up to a time, s, as a trial."""
         whole = np.concatenate(self._samples)
         self._samples = [whole]
-        samples = whole[whole[:, 0] <= until]
+        samples = whole[whole[:, 0] <= until + _ROUNDING]
         aids: dict[str, Aid] = {}
         for section, records in self._aids.items():
             record = joined(records)

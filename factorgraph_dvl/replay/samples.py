@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from factorgraph_dvl.geometry.vectors import Array, IntArray
-from factorgraph_dvl.imu.increments import MAX_FILLED, increments
+from factorgraph_dvl.imu.increments import MAX_FILLED, increments, unbroken_increments
 from factorgraph_dvl.imu.preintegration import Segments, one_segment
 from factorgraph_dvl.imu.timestamps import unrounded
-from factorgraph_dvl.sensors.imu import Imu, ImuSettings
+from factorgraph_dvl.sensors.imu import Imu, ImuSettings, within_limits
 
 # Samples on each side of a segment that its polynomials may use; chosen: twice their degree.
 _SIDE = 8
@@ -42,6 +42,11 @@ class Gap:
     after: float
 
 
+def _are_possible(table: Array) -> bool:
+    """Whether samples are numbers that an IMU can measure."""
+    return within_limits(table[:, 1:4], table[:, 4:7]) and bool(np.isfinite(table[:, 0]).all())
+
+
 class SampleBuffer:
     """Buffer of samples, as long as segments reach back.
 
@@ -63,6 +68,8 @@ class SampleBuffer:
     def __init__(self, settings: ImuSettings) -> None:
         self._settings = settings
         self._table = np.empty((0, 7))
+        # Their times in a row of memory; and their numbers, lost ones counted, once `dt` is known.
+        self._time, self._number = np.empty((2, 0))
         self._stale: list[Array] = []
         self.dt = 0.0
         self.windows: tuple[int, int] = (0, 0)
@@ -72,7 +79,7 @@ class SampleBuffer:
     @property
     def newest(self) -> float:
         """Time of the newest sample, s."""
-        return float(self._table[-1, 0]) if self._table.size else -np.inf
+        return float(self._time[-1]) if self._time.size else -np.inf
 
     @property
     def side(self) -> int:
@@ -94,19 +101,36 @@ class SampleBuffer:
         float
             Jump of the clock back, s; 0 if there was none.
         """
-        good = np.all(np.isfinite(table), axis=1)
-        self.rejected += int((~good).sum())
-        table = table[good]
+        if table.shape[0] and not _are_possible(table):
+            good = np.all(np.isfinite(table), axis=1)
+            self.rejected += int((~good).sum())
+            table = table[good]
+            if table.shape[0] and not _are_possible(table):
+                # The error says what is not.
+                Imu(self._settings, table[:1, 0], table[:, 1:4], table[:, 4:7])
         if table.shape[0] == 0:
             return table, 0.0
         jump = 0.0
-        if table[0, 0] <= self.newest or np.any(np.diff(table[:, 0]) <= 0.0):
+        if table[0, 0] <= self.newest or (table[1:, 0] <= table[:-1, 0]).any():
             table, jump = self._ordered(table)
         if table.shape[0]:
             self._table = np.concatenate([self._table, table])
-            if self.dt == 0.0 and self._table.shape[0] >= _INTERVAL:
-                self.dt = float(np.median(np.diff(self._table[:, 0])))
+            self._time = np.concatenate([self._time, table[:, 0]])
+            if self.dt == 0.0 and self._time.size >= _INTERVAL:
+                self.dt = float(np.median(np.diff(self._time)))
+            if self.dt > 0.0:
+                self._count()
         return table, jump
+
+    def _count(self) -> None:
+        """Number the samples that have no number yet."""
+        known = self._number.size
+        first = max(known - 1, 0)
+        steps = np.rint(np.diff(self._time[first:]) / self.dt)
+        last = self._number[-1] if known else 0.0
+        if not known:
+            steps = np.concatenate([[0.0], steps])
+        self._number = np.concatenate([self._number, last + np.cumsum(np.maximum(steps, 1.0))])
 
     def _ordered(self, table: Array) -> tuple[Array, float]:
         """Return samples newer than all before, after correction of jumps of the clock back."""
@@ -140,16 +164,19 @@ class SampleBuffer:
 
     def gap_after(self, time: float) -> Gap | None:
         """Return the first gap after a time, None if there is none."""
-        t = self._table[:, 0]
-        t = t[max(int(np.searchsorted(t, time, side="right")) - 1, 0) :]
-        after = self._after_gaps(t)
-        return Gap(float(t[after[0] - 1]), float(t[after[0]])) if after.size else None
+        t = self._time
+        first = max(int(t.searchsorted(time, side="right")) - 1, 0)
+        after = self._after_gaps(slice(first, None))
+        if not after.size:
+            return None
+        return Gap(float(t[first + after[0] - 1]), float(t[first + after[0]]))
 
-    def _after_gaps(self, time: Array) -> IntArray:
-        """Return which of some samples follow a gap; none until the interval is known."""
-        if self.dt == 0.0:
+    def _after_gaps(self, some: slice) -> IntArray:
+        """Return which of some samples in a row follow a gap; none until the interval is known."""
+        number = self._number[some]
+        if number.size == 0 or number[-1] - number[0] == number.size - 1:
             return np.empty(0, dtype=int)
-        return np.flatnonzero(np.diff(time) > (MAX_FILLED + 1.5) * self.dt) + 1
+        return np.flatnonzero(np.diff(number) > MAX_FILLED + 1) + 1
 
     def segment_after(
         self, start: float, interval: float, wanted: float, *, end: bool
@@ -177,53 +204,61 @@ class SampleBuffer:
             The segment; the gap that follows the start at once; None if the samples have not
             come so far.
         """
-        t = np.ascontiguousarray(self._table[:, 0])
+        t = self._time
         gap = self.gap_after(start)
-        count = t.size if gap is None else int(np.searchsorted(t, gap.before, side="right"))
+        count = t.size if gap is None else int(t.searchsorted(gap.before, side="right"))
         complete = end or gap is not None
-        a = int(np.argmin(np.abs(t[:count] - start)))
+        a = min(int(t.searchsorted(start)), count - 1)
+        if a and start - t[a - 1] <= t[a] - start:
+            a -= 1
         if a + 1 >= count:
             return gap
         cell = np.floor((t[a:count] + 0.5 * self.dt) / interval)
-        later = np.flatnonzero(cell > cell[0])
-        if later.size == 0 and not complete:
-            return None
-        b = a + int(later[0]) if later.size else count - 1
-        before = int(np.searchsorted(t, wanted + _SAME_TIME, side="right")) - 1
+        b = a + int(cell.searchsorted(cell[0], side="right"))
+        if b == count:
+            if not complete:
+                return None
+            b = count - 1
+        before = int(t.searchsorted(wanted + _SAME_TIME, side="right")) - 1
         if a < before < b:
             b = before
         if not complete and b + self.side >= count:
             return None
-        begin = int(self._after_gaps(t[: a + 1]).max(initial=0))
+        begin = int(self._after_gaps(slice(a + 1)).max(initial=0))
         low, high = max(a - self.side, begin), min(b + self.side + 1, count)
         if high - low < LEAST:
             return gap
-        time = self._regular(t[begin:high])[low - begin :]
-        part = self._table[low:high]
-        imu = Imu(self._settings, time, part[:, 1:4], part[:, 4:7])
-        inc, _ = increments(imu, self.windows)
+        # As `increments` takes the stamps of a whole record.
+        regular = unrounded(t[begin:high], self._number[begin:high])
+        time = t[begin] + regular[low - begin :]
+        part, number = self._table[low:high], self._number[low:high]
+        signals = part[:, 1:4], part[:, 4:7]
+        if number[-1] - number[0] == high - low - 1:
+            inc = unbroken_increments(self._settings, time, *signals, self.windows)
+            # Means end at their times.
+            return one_segment(inc, a - low + inc.averaged, b - low + inc.averaged)
+        inc, _ = increments(Imu(self._settings, time, *signals), self.windows)
         first = int(np.argmin(np.abs(inc.start - time[a - low])))
         last = int(np.argmin(np.abs(inc.end - time[b - low]))) + 1
         self.interpolated += last - first - (b - a)
         return one_segment(inc, first, last)
 
-    def _regular(self, time: Array) -> Array:
-        """Return stamps without gaps as `increments` takes those of a whole record."""
-        steps = np.rint(np.diff(time, prepend=time[:1]) / self.dt)
-        return np.asarray(time[0] + unrounded(time, np.cumsum(np.maximum(steps, 1.0))))
-
     def forget(self, time: float) -> None:
         """Drop what no segment that starts at `time` or later needs."""
-        first = int(np.searchsorted(self._table[:, 0], time)) - max(_CLOCK, self.side + 1)
+        first = int(self._time.searchsorted(time)) - max(_CLOCK, self.side + 1)
         if first > 0:
-            self._table = self._table[first:]
+            self._table, self._time = self._table[first:], self._time[first:]
+            self._number = self._number[first:]
 
     def shift(self, since: float, by: float) -> None:
         """Move the samples at and after a time by some seconds."""
-        later = self._table[:, 0] >= since
-        self._table = self._table.copy()
-        self._table[later, 0] += by
+        self._table, self._time = self._table.copy(), self._time.copy()
+        self._time[self._time >= since] += by
+        self._table[:, 0] = self._time
+        self._number = np.empty(0)
+        if self.dt > 0.0:
+            self._count()
 
     def since(self, time: float) -> Array:
         """Return the samples at and after a time, (M, 7)."""
-        return self._table[np.searchsorted(self._table[:, 0], time) :]
+        return self._table[self._time.searchsorted(time) :]

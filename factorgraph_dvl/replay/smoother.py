@@ -38,6 +38,8 @@ _NEVER = 1e9
 _MOST = 0.4
 # Interval at which steps are checked, s; chosen.
 _CHECK = 1.0
+# What rounding may take off a time, s: it must not decide when steps are checked.
+_ROUNDING = 1e-6
 
 
 class Smoother:
@@ -349,7 +351,7 @@ class Smoother:
     def _moved(self) -> int | None:
         """Return the oldest state that has moved too far from where it was linearised."""
         now = self.times[self.node]
-        if now < self._checked + _CHECK:
+        if now < self._checked + _CHECK - _ROUNDING:
             return None
         self._checked = now
         delta = self._isam.getDelta()

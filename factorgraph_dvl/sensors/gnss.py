@@ -13,7 +13,7 @@ from msgspec import UNSET, UnsetType
 from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.rotations import BodyAxes
 from factorgraph_dvl.geometry.units import DEG, GEODETIC_SI
-from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.geometry.vectors import IDENTITY, Array
 from factorgraph_dvl.sensors.carried_point import PointPosition, PointVelocity
 from factorgraph_dvl.sensors.clock import Clock, ClockSection
 from factorgraph_dvl.sensors.message import Message, message
@@ -48,6 +48,9 @@ HORIZONTAL_AND_UP = ((0, 1), (2,))
 
 # Plausible size, m. Chosen: a vessel's length, for an antenna that was not measured.
 _LEVER_ARM = ParameterSpec("gnss_lever_arm", "m", frame="b", nuisance=True, plausible=5.0)
+# Rate of the body relative to itself.
+_AT_REST = np.zeros(3)
+_AT_REST.setflags(write=False)
 _CLOCK = Clock.of("gnss", prefix="gnss_")
 TIME_OFFSET = _CLOCK.offset.name
 
@@ -209,9 +212,12 @@ class Gnss:
 
         The lever arm keeps its components in c, and c turns at omega_eb_b - omega_cb_b.
         """
-        if self.turning is not None:
-            return self.turning.at(time)
-        return np.broadcast_to(np.eye(3), (time.size, 3, 3)), np.zeros((time.size, 3))
+        bRc, omega_cb_b = self._carrier(time)
+        return np.broadcast_to(bRc, (time.size, 3, 3)), np.broadcast_to(omega_cb_b, (time.size, 3))
+
+    def _carrier(self, time: Array) -> tuple[Array, Array]:
+        """Return the same, once for all times where the body carries the antenna itself."""
+        return (IDENTITY, _AT_REST) if self.turning is None else self.turning.at(time)
 
     def lever_arm(self, time: Array) -> tuple[Array, Array]:
         """Return the nominal lever arm in body, (M, 3), m, and omega_cb_b of `carrier`."""
@@ -239,11 +245,11 @@ class Gnss:
             known = np.where(known < 0, np.argmax(has_position), known)
             lat, lon = lat[known], lon[known]
         lRn = frame.level_from_tangent(lat, lon)
-        bRc, omega_cb_b = self.carrier(self.time)
         s = self.settings
         if has_position.any():
             m = has_position
             p_n = frame.position(*self.geodetic[m].T)
+            bRc, _ = self._carrier(self.time[m])
             out.append(
                 PointPosition(
                     time=self.time[m],
@@ -253,7 +259,7 @@ class Gnss:
                     label="GNSS position",
                     clock=_CLOCK,
                     lever_arm=LEVER_ARM,
-                    bRc=bRc[m],
+                    bRc=bRc,
                     noise_groups=HORIZONTAL_AND_UP,
                     correlated=expected_correlation(
                         s.correlation_time_s, s.correlated_std_m, 3, USUAL_CORRELATION_TIME
@@ -262,6 +268,7 @@ class Gnss:
             )
         if has_velocity.any():
             m = has_velocity
+            bRc, omega_cb_b = self._carrier(self.time[m])
             out.append(
                 PointVelocity(
                     time=self.time[m],
@@ -271,8 +278,8 @@ class Gnss:
                     label="GNSS velocity",
                     clock=_CLOCK,
                     lever_arm=LEVER_ARM,
-                    bRc=bRc[m],
-                    omega_cb_b=omega_cb_b[m],
+                    bRc=bRc,
+                    omega_cb_b=omega_cb_b,
                     noise_groups=HORIZONTAL_AND_UP,
                     correlated=expected_correlation(
                         s.velocity_correlation_time_s, s.correlated_velocity_std_m_s, 3

@@ -112,6 +112,12 @@ ERRORS = {spec.name: elements for spec, elements in _ERRORS}
 GYRO_SCALE = _ERRORS[0][0].name
 
 
+def within_limits(gyro: Array, accel: Array) -> bool:
+    """Whether all rates, rad/s, and forces, m/s², can be; what is not a number cannot."""
+    limits = (gyro, _MAX_RATE_RAD_S), (accel, _MAX_FORCE_M_S2)
+    return all(-limit <= signal.min() and signal.max() <= limit for signal, limit in limits)
+
+
 @dataclass(frozen=True)
 class ImuErrorStd:
     """Standard deviations of the errors of an IMU that grow with rate and force, SI.
@@ -265,9 +271,7 @@ class Imu:
 
     def __post_init__(self) -> None:
         check_times(self.time, self.source)
-        # Not a number is within no limits either.
-        limits = (self.gyro, _MAX_RATE_RAD_S), (self.accel, _MAX_FORCE_M_S2)
-        if all(-limit <= signal.min() and signal.max() <= limit for signal, limit in limits):
+        if within_limits(self.gyro, self.accel):
             return
         gyro = named_columns(COLUMNS[1:4], self.gyro)
         accel = named_columns(COLUMNS[4:7], self.accel)
