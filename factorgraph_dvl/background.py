@@ -12,6 +12,7 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from functools import cache, cached_property, partial
 from types import MappingProxyType
 from typing import Any, BinaryIO, Generic, NoReturn, Protocol, TypeVar
 
@@ -30,7 +31,7 @@ _Result_co = TypeVar("_Result_co", covariant=True)
 
 
 class Awaited(Protocol[_Result_co]):
-    """Work whose result is awaited."""
+    """Work whose result is awaited, and may be asked for again."""
 
     def __call__(self) -> _Result_co:
         """Return the result once it is there."""
@@ -63,7 +64,19 @@ class _Elsewhere:
         return bool(select.select([self.reply], [], [], 0.0)[0])
 
     def __call__(self) -> Any:
-        return _received(self.reply)
+        done, result = self._received
+        if done:
+            return result
+        raise result
+
+    @cached_property
+    def _received(self) -> tuple[bool, Any]:
+        """Whether the work was done, and its result or error."""
+        try:
+            done, result = pickle.load(self.reply)
+        except EOFError:
+            return False, MemoryError("a second process was killed")
+        return done, result
 
 
 def _unchanging(values: dict[Any, Any]) -> MappingProxyType[Any, Any]:
@@ -137,7 +150,7 @@ def on_standby(
     """
     second = _fork(work, prepare, urgent=urgent) if available() else None
     if second is None:
-        yield lambda given: _Later(lambda: work(given))
+        yield lambda given: _Later(cache(partial(work, given)))
         return
     process, order, reply = second
 
@@ -228,14 +241,3 @@ def _reply(work: Callable[[Any], Any], prepare: Callable[[], object], given: Bin
         return pickle.dumps((True, done), protocol=pickle.HIGHEST_PROTOCOL)
     except Exception as error:
         return pickle.dumps((False, error), protocol=pickle.HIGHEST_PROTOCOL)
-
-
-def _received(reply: BinaryIO) -> Any:
-    """Return the result that the second process sends, or raise its error."""
-    try:
-        done, result = pickle.load(reply)
-    except EOFError:
-        raise MemoryError("a second process was killed") from None
-    if done:
-        return result
-    raise result

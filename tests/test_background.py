@@ -31,6 +31,26 @@ def test_a_second_process_sends_its_result() -> None:
     assert second != os.getpid()
 
 
+@pytest.mark.parametrize("processes", ["1", "2"])
+def test_a_result_may_be_asked_for_again(
+    processes: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setenv(PROCESSES, processes)
+    file = tmp_path / "done"
+
+    def work() -> int:
+        with file.open("a") as done:
+            done.write(".")
+        return 7
+
+    with in_background(work) as found, in_background(refuse) as refused:
+        assert [found(), found()] == [7, 7]
+        for _ in range(2):
+            with pytest.raises(DataError, match="is empty"):
+                refused()
+    assert file.read_text() == "."
+
+
 @pytest.mark.usefixtures("two")
 def test_whether_a_result_is_there() -> None:
     with in_background(lambda: time.sleep(0.5)) as found:

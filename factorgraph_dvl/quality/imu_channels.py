@@ -89,17 +89,20 @@ def _spikes(values: Array, moves: np.ndarray) -> Iterator[Finding]:
     deviation = np.abs(signed)
     rounding = np.finfo(float).eps * np.abs(values[:, moves]).max(axis=0)
     usual = np.maximum(np.median(deviation, axis=0), rounding)
+    row, column = np.nonzero(deviation[1:-1] > _SPIKE * usual)
+    spike = signed[row + 1, column]
     # A spike makes both its neighbours deviate half as much to the other side; a corner does not.
     alone = [
-        np.abs(beside + 0.5 * signed[1:-1]) < 0.2 * deviation[1:-1]
-        for beside in (signed[:-2], signed[2:])
+        np.abs(signed[row + beside, column] + 0.5 * spike) < 0.2 * np.abs(spike)
+        for beside in (0, 2)
     ]
-    ratio = deviation[1:-1] / usual
-    hit = (ratio > _SPIKE) & alone[0] & alone[1]
-    count = int(np.any(hit, axis=1).sum())
-    added = _MEDIAN_SQUARED * np.sum(np.square(ratio), axis=0, where=hit) / ratio.shape[0]
+    hit = alone[0] & alone[1]
+    ratio = np.abs(spike[hit]) / usual[column[hit]]
+    count = np.unique(row[hit]).size
+    squares = np.bincount(column[hit], np.square(ratio), minlength=usual.size)
+    added = _MEDIAN_SQUARED * squares / (len(deviation) - 2)
     if added.max() > (_ADDED if count >= _SPIKES else _ADDED_BY_FEW):
-        size = np.max(ratio, where=hit, initial=0.0)
+        size = ratio.max()
         yield Finding(
             Code.IMU_SPIKES,
             message("imu_spikes.single", count=count, size=size),

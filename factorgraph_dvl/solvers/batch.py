@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from copy import copy
 from dataclasses import replace
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING
 
 import gtsam
 import numpy as np
@@ -44,8 +45,6 @@ from factorgraph_dvl.trial import Trial
 
 if TYPE_CHECKING:
     from factorgraph_dvl.solvers.motion_smoother import SmoothedMotion
-
-_Prepared = TypeVar("_Prepared")
 
 
 def solve(
@@ -137,37 +136,37 @@ def solve_with_problem(
         from factorgraph_dvl.solvers.motion_smoother import smooth_motion
         from factorgraph_dvl.solvers.motion_summary import summarise_motion
 
-        motion, errors = _prepared(trial, lambda: prepare_motion(trial), anyway=anyway)
-        with explained(errors):
+        with _surveyed(trial, anyway=anyway) as errors:
+            motion = prepare_motion(trial)
+            errors()
             solved = smooth_motion(motion, report)
             found = summarise_motion(trial, solved, rate_hz=rate_hz)
     else:
-        prepared, errors = _prepared(
-            trial, lambda: prepare(trial, state_interval_s, report, stages), anyway=anyway
-        )
-        with explained(errors):
-            found, solved = _most_probable(trial, prepared, rate_hz, report, stages, meanwhile)
-    return found.with_findings(errors), solved
+        with _surveyed(trial, anyway=anyway) as errors:
+            prepared = prepare(trial, state_interval_s, report, stages)
+            found, solved = _most_probable(
+                trial, prepared, rate_hz, report, stages, meanwhile, errors
+            )
+    return found.with_findings(errors()), solved
 
 
-def _prepared(
-    trial: Trial, prepare: Callable[[], _Prepared], *, anyway: bool
-) -> tuple[_Prepared, tuple[Finding, ...]]:
-    """Return a prepared trial, and the errors in its records with which it can be solved."""
-    prepared: _Prepared | None = None
-    failure: Exception | None = None
+@contextmanager
+def _surveyed(trial: Trial, *, anyway: bool) -> Iterator[Callable[[], tuple[Finding, ...]]]:
+    """Survey a trial meanwhile, and yield what waits for the errors with which it can be solved.
+
+    That raises DataError if there are records that cannot be used. So does the block if it fails:
+    that is what the user must know.
+    """
     with in_background(lambda: survey(trial)) as surveyed:
+
+        def errors() -> tuple[Finding, ...]:
+            return accepted_errors(surveyed(), anyway=anyway)
+
         try:
-            prepared = prepare()
-        except Exception as error:
-            # Where records cannot be used, that is what the user must know.
-            failure = error
-        errors = accepted_errors(surveyed(), anyway=anyway)
-    with explained(errors):
-        if failure is not None:
-            raise failure
-    assert prepared is not None
-    return prepared, errors
+            yield errors
+        except Exception as failure:
+            with explained(errors()):
+                raise failure
 
 
 def _most_probable(
@@ -177,8 +176,12 @@ def _most_probable(
     report: Progress,
     stages: Stages | None,
     meanwhile: Callable[[SolvedProblem], object],
+    ready: Callable[[], object],
 ) -> tuple[Solution, SolvedProblem]:
-    """Return the most probable of all minima from all positions, with the spread of the others."""
+    """Return the most probable of all minima from all positions, with the spread of the others.
+
+    `ready` is called before a minimisation with all sensors begins.
+    """
     starts = prepared.start_positions.states
     # Of several starts each has a mounting of its own.
     mounting = stages if len(starts) == 1 else None
@@ -188,7 +191,7 @@ def _most_probable(
         def summarised(
             explain: Explain, states: States = states
         ) -> tuple[Solution, SolvedProblem]:
-            minima = _minima(prepared, states, prepared.findings, report, mounting, explain)
+            minima = _minima(prepared, states, prepared.findings, report, mounting, explain, ready)
             against = np.array([evidence_against(each) for each in minima])
             summaries = [summarise(trial, each, rate_hz=rate_hz) for each in minima]
             return most_probable_minimum(summaries, against), minima[0]
@@ -234,9 +237,10 @@ def _minima(
     report: Progress,
     stages: Stages | None = None,
     explain: Explain = explanation,
+    ready: Callable[[], object] = bool,
 ) -> list[SolvedProblem]:
     """Return the minima near some states and their rivals, the most probable first."""
-    found = competing_minima(prepared, states, report, stages, explain)
+    found = competing_minima(prepared, states, report, stages, explain, ready)
     return distinct(prepared, [_with_covariances(each, findings, report) for each in found])
 
 

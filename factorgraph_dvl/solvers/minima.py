@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -47,6 +47,7 @@ def competing_minima(
     report: Progress,
     stages: Stages | None = None,
     explain: Explain = explanation,
+    ready: Callable[[], object] = bool,
 ) -> list[SettledMinimum]:
     """Return the minimum that some states lead to, then others that are about as probable.
 
@@ -63,10 +64,10 @@ def competing_minima(
         Called with stage, iteration and cost.
     stages : Stages, optional
         Where what the first starts from is kept, and taken from.
-    explain : callable, optional
+    explain, ready : callable, optional
         As of `settle`, for the first.
     """
-    first = settle(prepared, states, report, stages=stages, explain=explain)
+    first = settle(prepared, states, report, stages=stages, explain=explain, ready=ready)
     rotations = [p for p in prepared.parameters if p.rotation and p.estimated]
     time = prepared.segments.node_time
     is_free = any(p.sigma.max() > _ANY_ANGLE for p in rotations)

@@ -7,7 +7,7 @@ settled.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -119,6 +119,7 @@ def settle(
     clock_zero: float | None = None,
     stages: Stages | None = None,
     explain: Explain = explanation,
+    ready: Callable[[], object] = bool,
 ) -> SettledMinimum:
     """Return the minimum that some states lead to.
 
@@ -141,6 +142,8 @@ def settle(
         Where the mountings are kept, and taken from.
     explain : callable, optional
         Test of parameters that are taken as known.
+    ready : callable, optional
+        Called before the first minimisation with all sensors; it may refuse the records.
     """
     chain = prepared.chain(states)
     p_gravity = states.p_n
@@ -156,6 +159,7 @@ def settle(
         )
         states, values, iterations = start.states, start.values, start.iterations
         robust = start.robust_weights
+    ready()
     rejected = prepared.start_positions.rejected
     tried: list[Mapping[str, Array]] = []
     cycle: list[Mapping[str, Array]] = []
