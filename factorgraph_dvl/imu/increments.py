@@ -96,6 +96,11 @@ class Increments(ArcPolynomials):
     accel_sigma: float
     windows: tuple[int, int] | None = None
 
+    @cached_property
+    def fastest(self) -> float:
+        """Largest component of the rate, rad/s."""
+        return max(float(self.rate.max()), -float(self.rate.min()))
+
     def ticks(self, rate_hz: float) -> Array:
         """Return the multiples of 1 / rate that the arcs cover, s; gaps cost nothing."""
         runs = [

@@ -21,8 +21,13 @@ from factorgraph_dvl.sensors.imu import Imu, ImuSettings
 
 # Velocity noise that GTSAM adds to the position; only to keep its covariance regular.
 _INTEGRATION_ROOT_PSD = 1e-7
-# Longest stride, s. Measured: in 2 Hz sway of 4 deg the covariance of a second moves by 0.04 %.
+# Time between knots, and the shortest stride, s. Measured: in 2 Hz sway of 4 deg the covariance of
+# a second moves by 0.005 %.
 _STRIDE = 0.04
+# Largest angle, rad, by which a stride of several knots may turn, and most knots of one. Chosen:
+# less than that sway turns from knot to knot. Measured: the covariance then moves by 0.06 %.
+_LITTLE_TURN = 0.03
+_MOST_KNOTS = 3
 # Samples from which on strides take less time than samples one by one.
 _FEW = 1000
 # Samples that are integrated at once. Chosen: some ten megabytes.
@@ -156,10 +161,13 @@ class Segments:
         """Length of the segments, (S,), s."""
         return self.node_time[self.origin + 1] - self.node_time[self.origin]
 
-    @property
+    @cached_property
     def stride(self) -> int:
-        """Samples in a stride."""
-        return _stride(self.increments)
+        """Samples in a stride: more of them where the body turns slowly."""
+        shortest = _stride(self.increments)
+        angle = self.increments.fastest * shortest * float(np.mean(self.increments.dt))
+        knots = int(min(_LITTLE_TURN / max(angle, _LITTLE_TURN / _MOST_KNOTS), _MOST_KNOTS))
+        return shortest * max(knots, 1)
 
     @cached_property
     def first_knot(self) -> IntArray:
@@ -332,7 +340,7 @@ def _turns(phi: Array) -> tuple[Array, Array]:
 
 
 def _stride(inc: Increments) -> int:
-    """Return the samples in a stride."""
+    """Return the samples in the shortest stride."""
     return max(int(_STRIDE / float(np.mean(inc.dt)) + 1e-3), 1)
 
 
@@ -532,11 +540,15 @@ def gtsam_measurements(
     inc = seg.increments
     gyro_psd = settings.gyro_noise_root_psd**2 * IDENTITY
     accel_psd = settings.accel_noise_root_psd**2 * IDENTITY
-    integration_psd = _INTEGRATION_ROOT_PSD**2 * IDENTITY
+    by_sample = inc.dt.size < _FEW
+    # Noise of the force moves the position within a step, too; to GTSAM it is one force there.
+    length = float(inc.dt.mean()) * (1.0 if by_sample else 0.5 * seg.stride)
+    within = settings.accel_noise_root_psd**2 * length**2 / 12.0
+    integration_psd = (_INTEGRATION_ROOT_PSD**2 + within) * IDENTITY
     is_open = np.flatnonzero(inc.open_sigma.any(axis=1))
     some_open = is_open.searchsorted(seg.first) < is_open.searchsorted(seg.last)
     no_extra = np.zeros((3, 3))
-    by_steps = _by_sample if inc.dt.size < _FEW else _by_stride
+    by_steps = _by_sample if by_sample else _by_stride
     out = []
     for block in seg.blocks():
         first, rate, force, step = by_steps(seg, block)

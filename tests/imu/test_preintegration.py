@@ -245,9 +245,10 @@ def test_imu_factors_have_zero_error_at_the_truth(cases, name):
     assert micro_g < 0.02
 
 
-@pytest.mark.parametrize("name", ["coning", "south"])
-def test_strides_lead_where_samples_do(cases, name, monkeypatch):
+@pytest.mark.parametrize(("name", "samples_of_a_stride"), [("coning", 4), ("south", 12)])
+def test_strides_lead_where_samples_do(cases, name, samples_of_a_stride, monkeypatch):
     case = cases[name]
+    assert case.seg.stride == samples_of_a_stride
     strides = case.pims()
     monkeypatch.setattr("factorgraph_dvl.imu.preintegration._FEW", case.seg.increments.dt.size + 1)
     samples = case.pims()
