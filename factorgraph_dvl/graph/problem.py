@@ -211,6 +211,8 @@ class Problem:
         Correlated errors of the observations, at most one each.
     usable : mapping of str to ndarray of bool, optional
         By label, measurements (M,) that may be used where the IMU covers them; by default all.
+    like : Problem, optional
+        Another one of the same segments, where measurements at the same times are bound already.
 
     Attributes
     ----------
@@ -247,6 +249,7 @@ class Problem:
         clock_zero: float | None = None,
         processes: Sequence[Process] = (),
         usable: Mapping[str, BoolArray] | None = None,
+        like: Problem | None = None,
     ) -> None:
         self.chain = chain
         self.processes = tuple(processes)
@@ -280,8 +283,10 @@ class Problem:
         self.clock_tolerance: Mapping[str, float] = {}
         self._start = {**self.prior_values(), **(start or {})}
         self._bound: list[_Bound] = []
+        known = [] if like is None else like._bound
         for observation in observations:
-            self._bound.append(self._bind(observation, (usable or {}).get(observation.label)))
+            may_be_used = (usable or {}).get(observation.label)
+            self._bound.append(self._bind(observation, may_be_used, [*self._bound, *known]))
         errors = [p for p in self.parameters if p.name in ERRORS]
         self._imu_errors: ImuErrors | None = None
         if errors:
@@ -663,7 +668,10 @@ class Problem:
         bias = np.broadcast_to(bias, (n, BIAS_SIZE))
         return States(nRb, p_n, v_n, gyro_bias=bias[:, 3:], accel_bias=bias[:, :3])
 
-    def _bind(self, observation: Observation, usable: BoolArray | None) -> _Bound:
+    def _bind(
+        self, observation: Observation, usable: BoolArray | None, others: Sequence[_Bound]
+    ) -> _Bound:
+        """Tie an observation to the chain, as others at the same times are."""
         time = true_time(observation, self._start, self.clock_zero)
         covered = self.chain.segments.increments.locate(time)[2]
         if usable is not None:
@@ -673,7 +681,7 @@ class Problem:
         weight = np.repeat(covered.astype(float)[:, None], len(observation.components), axis=1)
         labels = [process.label for process in self.processes]
         own = labels.index(observation.label) if observation.label in labels else None
-        for other in self._bound:
+        for other in others:
             if np.array_equal(other.time, time):
                 return _Bound(observation, other.attachment, time, covered, weight, own)
         at, _ = attach_inside(self.chain.segments, time, self.chain.frame.earth_rate)

@@ -323,6 +323,7 @@ def with_scattered_noise(
         start=values,
         clock_zero=problem.clock_zero,
         processes=problem.processes,
+        like=problem if block is None else None,
     )
     test.reject(problem.rejected)
     test.noise_factors = _as_scattered(problem, evaluation)

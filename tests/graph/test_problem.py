@@ -12,6 +12,7 @@ from factorgraph_dvl.geometry.rotations import exp_so3, rotation_from_rph
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.graph import keys
 from factorgraph_dvl.graph.clocks import parameters_of, true_time
+from factorgraph_dvl.graph.problem import Problem
 from factorgraph_dvl.sensors.imu import ERRORS
 from factorgraph_dvl.simulation import simulate
 from factorgraph_dvl.solvers.levenberg_marquardt import factorized
@@ -50,6 +51,23 @@ def keyed(problem, names, k):
 def jacobians(problem, evaluation):
     factors = measurement_factors(problem, problem.linearize(evaluation))
     return [factor.augmentedJacobian() for factor in factors]
+
+
+def test_measurements_at_the_same_times_are_bound_once():
+    problem, _ = problem_of(scenario(manoeuvres=SHORT))
+    late = {"time_offset_s": np.array([0.01])}
+    for start in (None, late):
+        other = Problem(
+            problem.chain, problem.observations, problem.all_parameters, start=start, like=problem
+        )
+        alone = Problem(problem.chain, problem.observations, problem.all_parameters, start=start)
+        for at, own, o in zip(
+            other.attachments, problem.attachments, problem.observations, strict=True
+        ):
+            assert (at is own) == (start is None or o.label != "DVL velocity")
+        for at, own in zip(other.attachments, alone.attachments, strict=True):
+            np.testing.assert_array_equal(at.tau, own.tau)
+            np.testing.assert_array_equal(at.dP, own.dP)
 
 
 def test_released_factors_come_back_the_same():
