@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -134,15 +133,18 @@ def save_solution(
         columns = trajectory_columns(solution.trajectory)
         if smoothed is not None:
             columns |= _smoothed_columns(solution.trajectory, smoothed)
-        write = partial(write_table, folder / TRAJECTORY_FILE, columns)
+
+        def write() -> None:
+            write_table(folder / TRAJECTORY_FILE, columns)
+            if solution.residuals:
+                write_table(folder / RESIDUALS_FILE, residual_columns(solution.residuals))
+
         with in_background(write, urgent=True) as written:
             with nullcontext() if extra is None else extra(folder):
                 if solution.hypotheses:
                     _write_hypotheses(folder, solution.hypotheses)
                 if solution.rejected:
                     write_table(folder / REJECTED_FILE, rejected_columns(solution.rejected))
-                if solution.residuals:
-                    write_table(folder / RESIDUALS_FILE, residual_columns(solution.residuals))
             written()
         (folder / CALIBRATION_FILE).write_bytes(encode_calibration(solution))
 

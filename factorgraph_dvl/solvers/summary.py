@@ -7,6 +7,7 @@ from functools import partial
 
 import numpy as np
 
+from factorgraph_dvl.background import Awaited, in_background
 from factorgraph_dvl.geometry.records import rows_of
 from factorgraph_dvl.graph.problem import Evaluation, Problem
 from factorgraph_dvl.quality.earlier_calibration import prior_findings
@@ -14,6 +15,7 @@ from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.sensors.message import Message, message
 from factorgraph_dvl.sensors.protocol import Motion
 from factorgraph_dvl.solution import (
+    Cause,
     Estimate,
     Residuals,
     Solution,
@@ -45,6 +47,14 @@ def summarise(trial: Trial, found: SolvedProblem, *, rate_hz: float) -> Solution
     rate_hz : float
         Rate of the trajectory, Hz.
     """
+    with in_background(lambda: causes(found), urgent=True) as error_budget:
+        return _summarised(trial, found, rate_hz, error_budget)
+
+
+def _summarised(
+    trial: Trial, found: SolvedProblem, rate_hz: float, error_budget: Awaited[tuple[Cause, ...]]
+) -> Solution:
+    """Return the solution at a minimum, with an error budget that is awaited."""
     problem, minimum, chain = found.problem, found.minimum, found.problem.chain
     evaluation = minimum.evaluation
     estimates, covariance = calibration(found)
@@ -90,7 +100,7 @@ def summarise(trial: Trial, found: SolvedProblem, *, rate_hz: float) -> Solution
         rejected=rejected,
         limits=trial.limits,
         noise=noise,
-        error_budget=causes(found),
+        error_budget=error_budget(),
     )
 
 
