@@ -885,23 +885,31 @@ def node_jacobian(lin: Linearization, transition: Transition) -> Array:
     transition : Transition
         From the nodes to these times.
     """
-    out = np.zeros((*lin.residual.shape, STATE_SIZE + BIAS_SIZE))
-    theta, p, v, accel, gyro = (out[:, :, i : i + 3] for i in range(0, 15, 3))
+    products: list[list[tuple[Array, Array]]] = [[] for _ in range(5)]
+    theta, p, v, accel, gyro = products
     d_theta = attitude_jacobian(lin, transition)
-    if lin.d_omega is not None:
-        gyro -= lin.d_omega
     if d_theta is not None:
-        theta += d_theta @ transition.theta_theta
-        gyro += d_theta @ transition.theta_gyro
+        theta.append((d_theta, transition.theta_theta))
+        gyro.append((d_theta, transition.theta_gyro))
     if lin.d_p is not None:
-        theta += lin.d_p @ transition.p_theta
-        p += lin.d_p @ transition.p_p
-        v += lin.d_p @ transition.p_v
-        accel += lin.d_p @ transition.p_accel
-        gyro += lin.d_p @ transition.p_gyro
+        theta.append((lin.d_p, transition.p_theta))
+        p.append((lin.d_p, transition.p_p))
+        v.append((lin.d_p, transition.p_v))
+        accel.append((lin.d_p, transition.p_accel))
+        gyro.append((lin.d_p, transition.p_gyro))
     if lin.d_v is not None:
-        theta += lin.d_v @ transition.v_theta
-        v += lin.d_v @ transition.v_v
-        accel += lin.d_v @ transition.v_accel
-        gyro += lin.d_v @ transition.v_gyro
+        theta.append((lin.d_v, transition.v_theta))
+        v.append((lin.d_v, transition.v_v))
+        accel.append((lin.d_v, transition.v_accel))
+        gyro.append((lin.d_v, transition.v_gyro))
+    out = np.zeros((*lin.residual.shape, STATE_SIZE + BIAS_SIZE))
+    for i, of_block in enumerate(products):
+        block = out[:, :, 3 * i : 3 * i + 3]
+        # In place, the first product takes a third of the time.
+        for left, right in of_block[:1]:
+            np.matmul(left, right, out=block)
+        for left, right in of_block[1:]:
+            block += left @ right
+    if lin.d_omega is not None:
+        out[:, :, -3:] -= lin.d_omega
     return out
