@@ -59,9 +59,8 @@ def normal_gravity(lat: ArrayLike, height: ArrayLike) -> Array:
 
 def enu_from_ecef(lat: ArrayLike, lon: ArrayLike) -> Array:
     """Return the (..., 3, 3) rotation from ECEF to local-level ENU at lat, lon (rad)."""
-    lat, lon = np.broadcast_arrays(np.asarray(lat, float), np.asarray(lon, float))
     sl, cl, so, co = np.sin(lat), np.cos(lat), np.sin(lon), np.cos(lon)
-    out = np.zeros((*lat.shape, 3, 3))
+    out = np.zeros((*np.broadcast(sl, so).shape, 3, 3))
     out[..., 0, 0], out[..., 0, 1] = -so, co
     out[..., 1, 0], out[..., 1, 1], out[..., 1, 2] = -sl * co, -sl * so, cl
     out[..., 2, 0], out[..., 2, 1], out[..., 2, 2] = cl * co, cl * so, sl

@@ -36,7 +36,7 @@ def skew(v: ArrayLike) -> Array:
 
 def cross(a: Array, b: Array) -> Array:
     """Return the cross products of vectors (..., 3), faster than NumPy's."""
-    if max(a.size, b.size) <= 3 * _FEW:
+    if max(a.size, b.size) <= 6 * _FEW:
         # Component i is the difference of products with the indices i + 1 and i + 2.
         return np.asarray((a * b.take(_NEXT, -1) - a.take(_NEXT, -1) * b).take(_NEXT, -1))
     # For many, a quarter of the time.

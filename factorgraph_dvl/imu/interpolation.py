@@ -27,6 +27,8 @@ _HALF_WIDTHS = (2, 3, 5, 8, 12, 18, 25)
 _LONGEST = 0.25
 # Degree of the local polynomials. Chosen: follows a slope and its change.
 ORDER = 3
+# The narrowest window.
+_NARROW = 2 * _HALF_WIDTHS[0] + 1
 # Samples that the window is chosen from. Chosen: minutes of motion, searched in milliseconds.
 _ENOUGH = 60_000
 # Noise of a derivative between single samples, in units of sample noise over interval.
@@ -129,22 +131,40 @@ def smooth(
     width = best_window(values, dt, sigma) if window is None else window
     if width == 0 or width > values.shape[0]:
         return unsmoothed(dt, sigma)
-    found = local_cubics(values, width)
-    if averaged:
-        # The mean over an interval exceeds the value at its middle by a'' dt² / 24.
-        found = found - local_cubics(values, width, deriv=2) / 24.0
-    narrow = 2 * _HALF_WIDTHS[0] + 1
-    misfit = local_cubics(values, narrow)
-    misfit -= found
+    if values.shape[0] > _SHORT:
+        found, misfit = _found_and_misfit(values, width, averaged)
+        spline = make_interp_spline(time, found, k=3)
+    else:
+        to_spline, to_misfit = _short_matrices(values.shape[0], width, averaged)
+        spline = _short_spline(time, to_spline @ values, 3)
+        misfit = to_misfit @ values
     np.abs(misfit, out=misfit)
-    misfit[misfit <= _STEP * sigma * white_gain(narrow)] = 0.0
+    misfit[misfit <= _STEP * sigma * white_gain(_NARROW)] = 0.0
     return Smoothed(
-        spline=_interpolant(time, found, 3),
+        spline=spline,
         misfit=_broken_line(time, misfit),
         sigma=sigma * white_gain(width),
         slope_sigma=sigma * _slope_gain(width) / dt,
         window=width,
     )
+
+
+def _found_and_misfit(values: Array, width: int, averaged: bool) -> tuple[Array, Array]:
+    """Return a smoothed signal (N, 3), and by how much a narrow window differs from it."""
+    found = _filtered(values, width)
+    if averaged:
+        # The mean over an interval exceeds the value at its middle by a'' dt² / 24.
+        found -= _filtered(values, width, deriv=2) / 24.0
+    misfit = _filtered(values, _NARROW)
+    misfit -= found
+    return found, misfit
+
+
+@lru_cache(maxsize=64)
+def _short_matrices(count: int, width: int, averaged: bool) -> tuple[Array, Array]:
+    """Return what takes samples to the coefficients of their spline, and to the misfit."""
+    found, misfit = _found_and_misfit(np.eye(count), width, averaged)
+    return _spline_matrix(count, 3)[1] @ found, misfit
 
 
 @lru_cache(maxsize=64)
@@ -165,20 +185,20 @@ def _slope_gain(width: int) -> float:
     """
     count = 2 * width + 1
     knots, matrix = _spline_matrix(count, 3)
-    spline = BSpline(knots, matrix @ _filter_matrix(count, width, 0), 3)
+    spline = BSpline(knots, matrix @ _filter_matrix(count, width), 3)
     return float(np.linalg.norm(spline(width + 0.25, 1)))
 
 
-def local_cubics(values: Array, width: int, deriv: int = 0) -> Array:
-    """Return the values (N, 3), or a derivative at unit intervals, of local cubics."""
+def local_cubics(values: Array, width: int) -> Array:
+    """Return the values (N, 3) of local cubics."""
     if values.shape[0] > _SHORT:
-        return _filtered(values, width, deriv)
-    return np.asarray(_filter_matrix(values.shape[0], width, deriv) @ values)
+        return _filtered(values, width)
+    return np.asarray(_filter_matrix(values.shape[0], width) @ values)
 
 
 @lru_cache(maxsize=64)
-def _filter_matrix(count: int, width: int, deriv: int) -> Array:
-    return _filtered(np.eye(count), width, deriv)
+def _filter_matrix(count: int, width: int) -> Array:
+    return _filtered(np.eye(count), width)
 
 
 def _filtered(values: Array, width: int, deriv: int = 0) -> Array:
@@ -211,7 +231,7 @@ def _polynomial(width: int) -> Array:
 def _broken_line(time: Array, values: Array) -> BSpline:
     """Return lines between values (N, 3) at regular times, most of which are zero."""
     if time.size <= _SHORT:
-        return _interpolant(time, values, 1)
+        return _short_spline(time, values, 1)
     # Lines that start and end at zero need no knots in between.
     beside = np.pad(values.any(axis=1), 1)
     kept = beside[:-2] | beside[1:-1] | beside[2:]
@@ -219,13 +239,11 @@ def _broken_line(time: Array, values: Array) -> BSpline:
     return make_interp_spline(time[kept], values[kept], k=1)
 
 
-def _interpolant(time: Array, values: Array, degree: int) -> BSpline:
-    """Return the spline through values (N, 3) at regular times."""
-    if time.size > _SHORT:
-        return make_interp_spline(time, values, k=degree)
-    knots, matrix = _spline_matrix(time.size, degree)
+def _short_spline(time: Array, coefficients: Array, degree: int) -> BSpline:
+    """Return the spline over regular times; of degree 1 the values are the coefficients."""
+    knots, _ = _spline_matrix(time.size, degree)
     step = (time[-1] - time[0]) / (time.size - 1)
-    return BSpline.construct_fast(time[0] + step * knots, matrix @ values, degree)
+    return BSpline.construct_fast(time[0] + step * knots, coefficients, degree)
 
 
 @lru_cache(maxsize=64)

@@ -126,11 +126,12 @@ def _attach(seg: Segments, index: IntArray, since: Array, earth_rate_n: Array) -
     turned = rotate(dR, part.dv)
     h = since[:, None]
     tau = inc.start[index] + since - seg.node_time[node]
+    turned_by, turn = exp_so3(np.stack([part.phi, -tau[:, None] * earth_rate_n]))
     return Attachment(
         segment=segment,
         node=node,
         tau=tau,
-        dR=dR @ exp_so3(part.phi),
+        dR=dR @ turned_by,
         dA=before.dA + dR @ (IDENTITY + 0.5 * skew(part.phi)) * h[:, :, None],
         dV=before.dV + turned,
         dP=before.dP + before.dV * h + 0.5 * turned * h,
@@ -140,7 +141,7 @@ def _attach(seg: Segments, index: IntArray, since: Array, earth_rate_n: Array) -
         omega_sigma=part.omega_sigma,
         alpha_sigma=part.alpha_sigma,
         force_sigma=part.force_sigma,
-        turn=exp_so3(-tau[:, None] * earth_rate_n),
+        turn=turn,
     )
 
 

@@ -92,7 +92,7 @@ def unrounded(time: Array, number: Array | None = None) -> Array:
     since = time - time[0]
     slope = float(count @ since) / float(count @ count)
     line = since.mean() + slope * count
-    quantum = float(np.spacing(np.abs(time).max()))
+    quantum = float(np.spacing(max(abs(time[0]), abs(time[-1]))))
     for decimals in range(1, 7):
         unit = 10.0**-decimals
         if unit >= 0.5 * slope:

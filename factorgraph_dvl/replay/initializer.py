@@ -120,7 +120,7 @@ class Initializer:
             )
         )
         if self.history is None:
-            state = navigator.filtered(self._settings.body_axes)
+            state = navigator.newest(self._settings.body_axes)()
             speed = float(np.linalg.norm(state.velocity[0]))
             reach = speed * length + 0.5 * _ACCELERATION * length**2 + _SWAY
             self._prior = navigator.known(length)

@@ -372,12 +372,13 @@ class MotionReplay:
             problem, at.parameters, constants + np.outer(by_track, by_track)
         )
         findings, self.findings = tuple(self.findings), []
+        state = trajectory_of(problem, at, window.covariances, np.array([now]))
         return Update(
             time=now,
             latency=perf_counter() - began,
-            state=trajectory_of(problem, at, window.covariances, np.array([now])),
-            trajectory=trajectory,
-            calibration=CalibrationEstimate(estimates, covariance),
+            find_state=lambda: state,
+            find_trajectory=lambda: trajectory,
+            find_calibration=lambda: CalibrationEstimate(estimates, covariance),
             smoothed=smoothed,
             innovations=innovations,
             findings=findings,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import gc
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from time import perf_counter
 from typing import Literal
@@ -253,8 +253,8 @@ class Replay:
                 nav = self._start(until)
                 if nav is not None:
                     self._trajectory_to = nav.time
-                    motion, state = nav.start.trajectory, nav.filtered(self._settings.body_axes)
-                    yield self._update(nav, began, motion, state, solved=True, end=end)
+                    motion = _constantly(nav.start.trajectory)
+                    yield self._update(nav, began, motion, solved=True, end=end)
                 elif end and until >= self._samples.newest - self._samples.delay:
                     return
                 continue
@@ -274,15 +274,11 @@ class Replay:
                 for i in nav.innovations:
                     self._initializer.history.reject(i.label, i.time[~i.used])
             self._samples.forget(nav.time)
-            axes = self._settings.body_axes
-            trajectory, state = nav.last_segment(axes, self._trajectory_to)
+            trajectory = nav.last_segment(self._settings.body_axes, self._trajectory_to)
             self._trajectory_to = nav.time
             again = self._solve_again(nav) if self._initializer.solve_due(nav) else None
-            if again is None:
-                yield self._update(nav, began, trajectory, state, solved=False, end=end)
-            else:
-                state = again.filtered(axes)
-                yield self._update(again, began, trajectory, state, solved=True, end=end)
+            known, solved = (nav, False) if again is None else (again, True)
+            yield self._update(known, began, trajectory, solved=solved, end=end)
 
     def _next_own_state(self, nav: Navigator) -> float:
         """Return the time of the next attitude that needs a state of its own, s."""
@@ -411,13 +407,12 @@ class Replay:
         self,
         nav: Navigator,
         began: float,
-        trajectory: Trajectory,
-        state: Trajectory,
+        trajectory: Callable[[], Trajectory],
         *,
         solved: bool,
         end: bool,
     ) -> Update:
-        """Return what is known now; `trajectory` since the update before, `state` the newest."""
+        """Return what is known now; `trajectory` since the update before."""
         self._newest_state = nav.time
         smoothed = None
         oldest = nav.smoother.times.get(self._smoothed_to, np.inf)
@@ -431,13 +426,12 @@ class Replay:
         innovations = tuple(nav.innovations)
         for taken in (self._findings, self._initializer.findings, nav.findings, nav.innovations):
             taken.clear()
-        calibration = nav.calibration()
         return Update(
             time=nav.time,
             latency=perf_counter() - began,
-            state=state,
-            trajectory=trajectory,
-            calibration=calibration,
+            find_state=nav.newest(self._settings.body_axes),
+            find_trajectory=trajectory,
+            find_calibration=nav.find_calibration(),
             smoothed=smoothed,
             innovations=innovations,
             findings=findings,
@@ -454,3 +448,8 @@ class Replay:
         out = nav.smoothed(self._smoothed_to, last, self._settings.body_axes)
         self._smoothed_to = last
         return out
+
+
+def _constantly(trajectory: Trajectory) -> Callable[[], Trajectory]:
+    """Return what returns a trajectory."""
+    return lambda: trajectory

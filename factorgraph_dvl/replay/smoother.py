@@ -140,10 +140,12 @@ class Smoother:
     def state(self, k: int) -> gtsam.NavState:
         """Return the estimate of state k."""
         key = keys.node(k)
-        if key in self._place:
+        if key not in self._place:
+            return self._isam.calculateEstimateNavState(key)
+        if k not in self._states:
             at = self._isam.getLinearizationPoint().atNavState(key)
-            return at.retract(self._step[self._place[key]])
-        return self._isam.calculateEstimateNavState(key)
+            self._states[k] = at.retract(self._step[self._place[key]])
+        return self._states[k]
 
     def bias(self, k: int) -> gtsam.imuBias.ConstantBias:
         """Return the estimate of the bias at state k."""
@@ -201,6 +203,8 @@ class Smoother:
         R, d = net.matrix()
         self._inverse, _ = dtrtri(R)
         self._step = self._inverse @ d
+        # Of the newest, which are asked for again and again.
+        self._states: dict[int, gtsam.NavState] = {}
         if before and order[: len(before)] == before:
             later = [*self._of_state(self.node), *self._shared()]
             own = self._place[before[-1]].stop

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -48,13 +50,9 @@ class Update:
     time : float
         Time of the newest state, s.
     latency : float
-        Time that the update took to compute, s.
-    state : Trajectory
-        The newest state, as a trajectory of one epoch.
-    trajectory : Trajectory
-        The motion since the update before, at the epochs of a batch solution.
-    calibration : CalibrationEstimate
-        The calibration with its joint covariance.
+        Time that the update took to compute, s, without what is computed when it is read.
+    find_state, find_trajectory, find_calibration : callable
+        Return `state`, `trajectory` and `calibration`, of what was known at the update.
     smoothed : Trajectory or None
         Earlier epochs, smoothed with later data; None if there are none this time.
     innovations : tuple of Innovations
@@ -70,11 +68,26 @@ class Update:
 
     time: float
     latency: float
-    state: Trajectory
-    trajectory: Trajectory
-    calibration: CalibrationEstimate
+    find_state: Callable[[], Trajectory]
+    find_trajectory: Callable[[], Trajectory]
+    find_calibration: Callable[[], CalibrationEstimate]
     smoothed: Trajectory | None
     innovations: tuple[Innovations, ...]
     findings: tuple[Finding, ...]
     solved: bool
     inconsistent: tuple[str, ...]
+
+    @cached_property
+    def state(self) -> Trajectory:
+        """The newest state, as a trajectory of one epoch."""
+        return self.find_state()
+
+    @cached_property
+    def trajectory(self) -> Trajectory:
+        """The motion since the update before, at the epochs of a batch solution."""
+        return self.find_trajectory()
+
+    @cached_property
+    def calibration(self) -> CalibrationEstimate:
+        """The calibration with its joint covariance."""
+        return self.find_calibration()

@@ -354,7 +354,7 @@ class DvlVelocity(PlainObservation):
         """
         floor, fraction = self.noise
         predicted = self.residual(motion, values) + self.measured_d
-        speed = np.linalg.norm(predicted, axis=1, keepdims=True)
+        speed = np.sqrt((predicted * predicted).sum(axis=1, keepdims=True))
         std = np.where(np.isnan(self.std), np.hypot(floor, fraction * speed), self.std)
         std = np.maximum(std, _LEAST_SIGMA) * factor
         return np.hypot(std, lever_arm_sigma(motion, values[LEVER_ARM])[:, None])

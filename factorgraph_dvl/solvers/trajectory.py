@@ -132,12 +132,6 @@ def attached_epochs(
     return epochs, rows_of(at, slice(others.size))
 
 
-def with_end(epochs: Epochs, end: float) -> Epochs:
-    """Return epochs of a single segment, and its end, s, as one more."""
-    index = np.append(np.arange(epochs.time.size + 1), epochs.time.size)
-    return replace(epochs, time=np.append(epochs.time, end), at=rows_of(epochs.at, index))
-
-
 def successive(parts: Sequence[Epochs]) -> Epochs:
     """Return times in single segments that follow each other as those of one chain."""
     if len(parts) == 1:

@@ -16,7 +16,7 @@ def navigator(started):
 
 
 def position_sigma(navigator, started):
-    return navigator.filtered(started.trial.body_axes).position_std[0]
+    return navigator.newest(started.trial.body_axes)().position_std[0]
 
 
 def test_a_segment_takes_the_motion_on_by_its_length(navigator, started):
@@ -24,7 +24,7 @@ def test_a_segment_takes_the_motion_on_by_its_length(navigator, started):
         seg = started.segment(i)
         navigator.extend(seg, started.aids(seg))
         assert navigator.time == pytest.approx(seg.node_time[1])
-    last, _ = navigator.last_segment(started.trial.body_axes, navigator.time - 1.0)
+    last = navigator.last_segment(started.trial.body_axes, navigator.time - 1.0)()
     assert last.time.size == 10
     found = motion_errors(last, started.trial.reference)
     for v in (found.position, found.velocity, found.attitude):
@@ -89,3 +89,18 @@ def test_what_will_be_known_later_is_less_by_the_walk_of_the_biases(navigator, s
 
 def test_no_rotation_has_changed_at_the_start(navigator):
     assert navigator.rotation_change < 1e-6
+
+
+def test_what_was_known_is_the_same_when_it_is_read_later(navigator, started):
+    axes = started.trial.body_axes
+    segments = [started.segment(i) for i in range(2)]
+    navigator.extend(segments[0], started.aids(segments[0]))
+    finders = (navigator.newest(axes), navigator.last_segment(axes, 0.0))
+    now, calibration = [find() for find in finders], navigator.calibration()
+    known = navigator.find_calibration()
+    navigator.extend(segments[1], started.aids(segments[1]))
+    for before, find in zip(now, finders, strict=True):
+        for name, values in vars(before).items():
+            np.testing.assert_array_equal(getattr(find(), name), values, err_msg=name)
+    np.testing.assert_array_equal(known().covariance, calibration.covariance)
+    assert not np.array_equal(navigator.calibration().covariance, calibration.covariance)

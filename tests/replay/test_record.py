@@ -36,7 +36,8 @@ def update(time, names, *, epochs, smoothed=None, used=True):
         np.array([used]),
     )  # fmt: skip
     return Update(
-        time, 0.01, trajectory([time]), trajectory(epochs), calibration, smoothed,
+        time, 0.01, lambda: trajectory([time]), lambda: trajectory(epochs), lambda: calibration,
+        smoothed,
         (innovation,), (note(time),), False, (),
     )  # fmt: skip
 

@@ -32,8 +32,9 @@ def update(time, std=0.01, value=0.0, findings=(), inconsistent=()):
     )
     calibration = CalibrationEstimate((estimate,), std**2 * np.eye(3))
     return Update(
-        time, 0.01, NOWHERE, NOWHERE, calibration, None, (), tuple(findings), False, inconsistent
-    )
+        time, 0.01, lambda: NOWHERE, lambda: NOWHERE, lambda: calibration, None, (),
+        tuple(findings), False, inconsistent,
+    )  # fmt: skip
 
 
 def grades(trial, updates):
