@@ -227,15 +227,6 @@ class NodeMeasurements:
         used = [parameters_of(r.observation) for r in self.rows]
         return [[name for name in self._place if name in each] for each in used]
 
-    @cached_property
-    def _components(self) -> tuple[list[slice], IntArray]:
-        """Slices of the kinds among all R components, and the time of each component."""
-        count = np.arange(self.attachment.tau.size)
-        index = [count[r.at].repeat(len(r.observation.components)) for r in self.rows]
-        ends = np.cumsum([each.size for each in index]).tolist()
-        parts = [slice(end - each.size, end) for each, end in zip(index, ends, strict=True)]
-        return parts, np.concatenate(index)
-
     def motions(self, states: States, values: Mapping[str, Array]) -> tuple[Motion, list[Motion]]:
         """Return the motion at all times as attached, and at the true times of each kind."""
         motion = motion_at(self.corrected(values), states, self.gravity_n, self.earth_rate_n)
@@ -308,13 +299,11 @@ class NodeMeasurements:
         `factors` (d,) multiply those that sensors state for their own noise, by label.
         """
         values = {**self.fixed, **values}
-        parts, index = self._components
-        out = np.empty(index.size)
-        for r, part, motion in zip(self.rows, parts, motions, strict=True):
-            out[part].reshape(r.time.size, -1)[:] = r.observation.sigma(
-                motion, values, factors.get(r.observation.label, 1.0)
-            )
-        return out
+        each = (
+            r.observation.sigma(motion, values, factors.get(r.observation.label, 1.0))
+            for r, motion in zip(self.rows, motions, strict=True)
+        )
+        return np.concatenate([sigma.ravel() for sigma in each])
 
 
 @dataclass(frozen=True)
