@@ -92,9 +92,9 @@ def measure(trial: Trial, name: str, kind: str, seconds: float, rate: float) -> 
         now = process_time()
         if len(updates) == 1 and not updates[0].solved:
             busy.append(1e3 * (now - cpu))
-            for name, times in read.items():
+            for what, times in read.items():
                 began_read = perf_counter()
-                getattr(updates[0], name)
+                getattr(updates[0], what)
                 times.append(1e3 * (perf_counter() - began_read))
         cpu = process_time()
     wall = perf_counter() - began

@@ -126,7 +126,8 @@ class SampleBuffer:
         """Number the samples that have no number yet."""
         known = self._number.size
         first = max(known - 1, 0)
-        steps = np.rint(np.diff(self._time[first:]) / self.dt)
+        time = self._time[first:]
+        steps = np.rint((time[1:] - time[:-1]) / self.dt)
         last = self._number[-1] if known else 0.0
         if not known:
             steps = np.concatenate([[0.0], steps])

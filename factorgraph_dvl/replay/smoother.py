@@ -150,10 +150,12 @@ class Smoother:
     def bias(self, k: int) -> gtsam.imuBias.ConstantBias:
         """Return the estimate of the bias at state k."""
         key = self.bias_key(k)
-        if key in self._place:
+        if key not in self._place:
+            return self._isam.calculateEstimateConstantBias(key)
+        if key not in self._biases:
             at = self._isam.getLinearizationPoint().atConstantBias(key)
-            return at.retract(self._step[self._place[key]])
-        return self._isam.calculateEstimateConstantBias(key)
+            self._biases[key] = at.retract(self._step[self._place[key]])
+        return self._biases[key]
 
     def errors(self, k: int) -> Array:
         """Return the estimate of the correlated errors at state k, (n,), of unit variance."""
@@ -205,6 +207,7 @@ class Smoother:
         self._step = self._inverse @ d
         # Of the newest, which are asked for again and again.
         self._states: dict[int, gtsam.NavState] = {}
+        self._biases: dict[int, gtsam.imuBias.ConstantBias] = {}
         if before and order[: len(before)] == before:
             later = [*self._of_state(self.node), *self._shared()]
             own = self._place[before[-1]].stop
