@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -12,13 +13,20 @@ from factorgraph_dvl.graph.problem import Evaluation, Problem
 from factorgraph_dvl.graph.processes import Process, node_times, walk_sigma, walk_time
 from factorgraph_dvl.sensors.protocol import Observation, ScaleWalk
 from factorgraph_dvl.solution import Noise, noise_name
+from factorgraph_dvl.solvers.levenberg_marquardt import factorized
 from factorgraph_dvl.statistics.correlation import Correlation, fit_correlation
+from factorgraph_dvl.statistics.leverage import leverage
 from factorgraph_dvl.statistics.variance_components import LEAST_FACTOR
 
 # Correlation time, s, below which noise is no process: white noise of its long-run variance takes
 # its place. Measured: with 4 s, and noise that is correlated over 5 s, σ was 2 to 5 times too
 # large under sway; nodes every 0.7 s cost a fifth more time.
 _SHORT = 2.0
+# Share of the shortest time that the trajectory follows, up to which residuals show how short a
+# correlation time is, and the time from which the whole graph finds a longer one. Measured:
+# noise of a DVL over 5 s looked like 1 s beside a tactical IMU, and positions were 2 sigma off.
+_SEEN_SHARE = 0.3
+_START_TIME = 4.0
 # Correlation times in a trial below which only the density 2 σ² / τ can be
 # estimated. Measured: σ alone is then uncertain by a factor.
 _MANY = 20.0
@@ -90,6 +98,9 @@ def correlated_noise(
             residuals = np.where(used, evaluation.residuals[i], np.nan)
             found = _fits(o, residuals)
             if found:
+                if any(fit.time_s < _SHORT for fit in found.values()):
+                    followed = _followed_time(problem, evaluation, i)
+                    found = _as_followed(o.noise_groups, found, followed)
                 rms = np.sqrt(np.nanmean(residuals**2, axis=0))
                 process, white, inflation = _model(o, found, sigma, rms, when, len(processes))
                 factors[o.label] = white
@@ -128,6 +139,45 @@ def _fits(o: Observation, residuals: Array) -> dict[tuple[int, ...], Correlation
         fit = fit_correlation(o.time, residuals[:, list(group)], expected_time_s=expected)
         if fit is not None and fit.white + fit.correlated > LEAST_FACTOR**2:
             out[group] = fit
+    return out
+
+
+def _followed_time(problem: Problem, evaluation: Evaluation, i: int) -> Array:
+    """Return the time (d,), s, over which the trajectory follows each component of a sensor.
+
+    Residuals have lost as many degrees of freedom as leverages sum up to: what is slower than the
+    frequency that they fill, half of their number over the length of the record.
+    """
+    o = problem.observations[i]
+    information = factorized(problem, evaluation)[0]
+    followed = np.zeros(len(o.components))
+    of_sensor = partial(filter, lambda rows: rows.source == o.label)
+    parts = leverage(
+        lambda: of_sensor(problem.observation_rows(evaluation)),
+        evaluation.residuals[i].size,
+        information,
+    )
+    for _, h in parts:
+        followed += h.sum(axis=0)
+    return float(np.ptp(o.time)) / (np.pi * np.maximum(followed, 1.0))
+
+
+def _as_followed(
+    groups: tuple[tuple[int, ...], ...],
+    found: Mapping[tuple[int, ...], Correlation],
+    followed: Array,
+) -> dict[tuple[int, ...], Correlation]:
+    """Return fits with a time to start from where the trajectory follows what is slower.
+
+    There, noise of some components may seem to be white: it starts with the least correlated of
+    the fits, and the graph finds how much of it there is.
+    """
+    out = dict(found)
+    least = min(found.values(), key=lambda fit: fit.correlated)
+    for group in groups:
+        fit = found.get(group, least)
+        if fit.time_s > _SEEN_SHARE * followed[list(group)].min():
+            out[group] = replace(fit, time_s=max(fit.time_s, _START_TIME))
     return out
 
 

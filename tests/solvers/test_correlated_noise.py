@@ -10,8 +10,9 @@ import pytest
 import yaml
 from monte_carlo import RUNS, rms_band
 from problems import SHORT, problem_of
-from truth import CONFIGS, LONGER_TURNS_AND_BRAKING, scenario
+from truth import CONFIGS, LONGER_TURNS_AND_BRAKING, merged, scenario
 
+from factorgraph_dvl.analysis.error_statistics import trajectory_errors
 from factorgraph_dvl.simulation import parse_scenario, simulate
 from factorgraph_dvl.simulation.faults import (
     clock_step,
@@ -92,6 +93,33 @@ def test_stated_correlation_is_used_as_stated(wandering):
     assert "dvl_velocity" not in noise(solution)
     residual = next(r for r in solution.residuals if r.label == "DVL velocity")
     assert np.std(residual.residual / residual.sigma) == pytest.approx(1.0, abs=0.1)
+
+
+@pytest.mark.slow
+def test_noise_that_the_trajectory_follows_is_found():
+    """Beside a cheap IMU the residuals of a DVL lose what is slower than a second."""
+    times, squares = [], []
+    for seed in range(4):
+        scene = merged(
+            LONG,
+            {
+                "imu": {"gyro_noise_deg_sqrt_h": 0.3, "accel_noise_ug_sqrt_hz": 150},
+                "manoeuvres": [
+                    *LONG["manoeuvres"],
+                    {"accelerate_m_s2": 0.2, "to_m_s": 4},
+                    *LONG["manoeuvres"],
+                ],
+                "dvl": {"correlated_share": 0.5, "correlation_time_s": 5},
+            },
+        )
+        trial = simulate(scenario(**scene), seed)
+        solution = solve(trial)
+        times.append(noise(solution)["dvl_velocity"].correlation_time)
+        position = trajectory_errors(solution, trial.reference).position
+        squares.append(np.mean(position.normalised**2))
+    assert np.exp(np.nanmean(np.log(times))) == pytest.approx(5.0, rel=0.5)
+    # Measured: 1.5; as white noise of its long run, 4.5.
+    assert np.mean(squares) < 2.0
 
 
 def test_noise_over_a_second_counts_as_white_noise_of_its_long_run(trial):
