@@ -90,13 +90,14 @@ def test_a_trial_without_a_position_is_refused():
         prepare(replace(trial, gnss=None), 1.0, lambda *_: None)
 
 
-def test_large_jumps_of_gnss_turn_no_mounting_that_is_started_from(prepared):
+@pytest.mark.parametrize("size", [10.0, 50.0])
+def test_jumps_of_gnss_turn_no_mounting_that_is_started_from(prepared, size):
     """Fixes 50 m off for a tenth of the trial."""
     trial, _ = solved.turning()
     fixes = trial.gnss.geodetic.copy()
     jump = slice(len(fixes) // 2, len(fixes) // 2 + len(fixes) // 10)
-    fixes[jump, 2] += 5.0
-    fixes[jump, :2] += 50.0 / 6.4e6
+    fixes[jump, 2] += 0.1 * size
+    fixes[jump, :2] += size / 6.4e6
     jumping = replace(trial, gnss=replace(trial.gnss, geodetic=fixes))
     other = prepare(jumping, 1.0, lambda *_: None)
     (states,) = other.start_positions.states
