@@ -37,6 +37,20 @@ def test_a_cubic_is_left_as_it_is(count):
     np.testing.assert_array_equal(misfit, 0.0)
 
 
+def test_a_sway_that_goes_on_keeps_its_size_under_noise_and_beside_steps():
+    """Lever arms of a DVL are as much too long as the rate of the sway is too small."""
+    rng = np.random.default_rng(3)
+    time = DT * np.arange(40_000)
+    sway = 0.88 * np.sin(4.0 * np.pi * time)[:, None] * np.ones(3)
+    steps = np.where((time > 100.0) & (time < 120.0), 0.2, 0.0)[:, None]
+    values = sway + steps + 2.6e-3 * rng.standard_normal(sway.shape)
+    window = best_window(values, DT, 2.6e-3)
+    found = smooth(time, values, DT, 2.6e-3, averaged=False, window=window)
+    left = found.spline(time) - values
+    assert window > 5
+    assert abs(np.sum(left * sway) / np.sum(sway**2)) < 3e-4
+
+
 def test_means_are_corrected_to_the_value_at_the_middle():
     # The mean of t² over an interval exceeds its middle's by dt² / 12.
     values = np.repeat((TIME**2 + DT**2 / 12.0)[:, None], 3, axis=1)
