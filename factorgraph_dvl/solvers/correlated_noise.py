@@ -93,7 +93,8 @@ def correlated_noise(
         if stated is not None and stated.sigma is not None:
             tau = np.full(sigma.size, stated.time)
             nodes = node_times(when, stated.time, stated.sigma, sigma)
-            process = Process(o.label, len(processes), stated.sigma, tau, nodes)
+            short = float(np.ptp(when)) < _MANY * stated.time
+            process = Process(o.label, len(processes), stated.sigma, tau, nodes, short)
         elif o.label in estimated and np.ptp(when) >= _SHORTEST:
             residuals = np.where(used, evaluation.residuals[i], np.nan)
             found = _fits(o, residuals)

@@ -10,9 +10,9 @@ import pytest
 import yaml
 from monte_carlo import RUNS, rms_band
 from problems import SHORT, problem_of
-from truth import CONFIGS, LONGER_TURNS_AND_BRAKING, merged, scenario
+from truth import CONFIGS, CORRELATED, LONGER_TURNS_AND_BRAKING, config, merged, scenario
 
-from factorgraph_dvl.analysis.error_statistics import trajectory_errors
+from factorgraph_dvl.analysis.error_statistics import motion_errors, trajectory_errors
 from factorgraph_dvl.simulation import parse_scenario, simulate
 from factorgraph_dvl.simulation.faults import (
     clock_step,
@@ -219,3 +219,15 @@ def test_noise_that_persists_at_ten_times_what_is_stated_leaves_a_minimum(fault,
     assert solution.converged
     assert solution.verdict.grade == "doubtful"
     assert solution.verdict.reasons[0].sensor == label
+
+
+@pytest.mark.slow
+def test_a_short_trial_leaves_the_stated_deviation_of_what_wanders_for_longer():
+    """Within 45 s an error over 100 s is nearly constant, and looks as if there were none."""
+    scene = config("seed-a-phase-90", reference_rate_hz=10, **CORRELATED)
+    nees = []
+    for seed in range(4):
+        trial = simulate(scene, seed).until(45.0)
+        solution = solve(trial, rate_hz=1.0)
+        nees.append(motion_errors(solution.trajectory, trial.reference).position.nees.mean())
+    assert np.mean(nees) < 6.0

@@ -31,6 +31,7 @@ TIMES = {
     "seed-a-phase-0": (40.0, 60.0, 90.0, 130.0, 180.0, 250.0, 350.0, 453.0),
     "seed-a-phase-90": (40.0, 60.0, 90.0, 130.0, 180.0, 250.0, 350.0, 453.0),
     "correlated noise": (40.0, 60.0, 90.0, 130.0, 180.0, 250.0, 350.0, 453.0),
+    "correlated noise, estimated": (40.0, 60.0, 90.0, 130.0, 180.0, 250.0, 350.0, 453.0),
     "cruise": (60.0, 100.0, 200.0, 300.0, 450.0, 600.0, 900.0, 1200.0),
 }
 # Biases that are hardly better known in the end than before must scatter as the trial states.
@@ -62,7 +63,7 @@ def up_to(trial, end):
 
 
 def scene_of(name):
-    if name == "correlated noise":
+    if name.startswith("correlated noise"):
         return config("seed-a-phase-90", reference_rate_hz=100, imu=DRAWN, **CORRELATED)
     return config(name, reference_rate_hz=100)
 
@@ -70,6 +71,8 @@ def scene_of(name):
 def one(job):
     name, seed = job
     trial = up_to(simulate(scene_of(name), seed), END)
+    if name == "correlated noise":
+        trial = replace(trial, noise="stated")
     session, updates = Replay(trial, rate_hz=1.0), []
     imu = trial.imu
     edges = np.arange(0.0, imu.time[-1] + 1.0, 1.0)
@@ -93,7 +96,6 @@ def one(job):
         nees.append(error @ np.linalg.solve(P, error))
         errors = motion_errors(u.state, trial.reference)
         motion.append([v.nees[0] for v in (errors.position, errors.velocity, errors.attitude)])
-    # A replay takes the noise as it is stated.
     batch = solve(replace(trial, noise="stated"))
     value = np.concatenate([e.value for e in batch.estimates])
     last = np.concatenate([e.value for e in updates[-1].calibration.estimates])
@@ -107,6 +109,8 @@ def runs(request):
     return in_two_processes(one, [(request.param, seed) for seed in range(RUNS)])
 
 
+# What a replay finds of correlated noise in the first minute is not what the whole trial shows.
+@pytest.mark.parametrize("runs", [n for n in TIMES if "estimated" not in n], indirect=True)
 def test_every_run_starts_soon_and_ends_where_the_batch_solver_does(runs):
     assert max(r.started for r in runs) < 40.0
     worst = np.max(np.abs([r.apart for r in runs]), axis=0)
