@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import gc
 import os
 import sys
@@ -45,6 +46,8 @@ def run(args: list[str]) -> NoReturn:
     os.environ.setdefault(PROCESSES, "2")
     # Most objects live until the end: looking for garbage among them took 4 % of a run.
     gc.set_threshold(_ALLOCATIONS)
+    # Nor is it worth while when the process ends. Measured: 16 % of `--help`.
+    atexit.register(gc.freeze)
     guard_streams()
     if "--json" in args:
         _run_with_events(args)
