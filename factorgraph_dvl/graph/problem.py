@@ -341,6 +341,24 @@ class Problem:
             out.insert(self._key[p.name], gtsam.Rot3(value) if p.rotation else value)
         return out
 
+    def same_values(self, states: States, parameters: dict[str, Array]) -> gtsam.Values:
+        """Return the values that `arrays` are of, to the last digit; that takes longer."""
+        out = self.values(states, parameters)
+        for k, nRb in enumerate(states.nRb):
+            state = gtsam.NavState(gtsam.Rot3(nRb), states.p_n[k], states.v_n[k])
+            out.update(keys.node(k), state)
+        return out
+
+    def arrays(self, values: gtsam.Values) -> tuple[States, dict[str, Array]]:
+        """Return states, and parameters by name, of GTSAM's values; rotations as matrices."""
+        parameters = {**self._fixed}
+        for p in self.parameters:
+            parameters[p.name] = self._parameter(values, p)
+        for process in self.processes:
+            nodes = [values.atVector(process.key(j)) for j in range(process.time.size)]
+            parameters[process.name] = np.array(nodes)
+        return self._states(values), parameters
+
     @cached_property
     def columns(self) -> dict[str, slice]:
         """Place of every estimated parameter among all of them."""
@@ -378,13 +396,7 @@ class Problem:
 
     def evaluate(self, values: gtsam.Values) -> Evaluation:
         """Evaluate motion, residuals and cost."""
-        states = self._states(values)
-        parameters = {**self._fixed}
-        for p in self.parameters:
-            parameters[p.name] = self._parameter(values, p)
-        for process in self.processes:
-            nodes = [values.atVector(process.key(j)) for j in range(process.time.size)]
-            parameters[process.name] = np.array(nodes)
+        states, parameters = self.arrays(values)
         own_cost = self.graph.error(values)
         imu = None
         if self._imu_errors is not None:

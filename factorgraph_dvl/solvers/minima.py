@@ -63,7 +63,7 @@ def competing_minima(
     report : callable
         Called with stage, iteration and cost.
     stages : Stages, optional
-        Where what the first starts from is kept, and taken from.
+        Where what the first starts from, and its rounds, are kept, and taken from.
     explain, ready : callable, optional
         As of `settle`, for the first.
     """

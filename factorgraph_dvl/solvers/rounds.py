@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -30,6 +31,7 @@ from factorgraph_dvl.solvers.correlated_noise import (
     noise_of,
     with_innovations,
 )
+from factorgraph_dvl.solvers.finished_minimum import finished_minimum
 from factorgraph_dvl.solvers.known_parameters import (
     Explanation,
     confirmed,
@@ -139,7 +141,7 @@ def settle(
     clock_zero : float, optional
         When the offsets of clocks hold, s; by default in the middle of the trial.
     stages : Stages, optional
-        Where the mountings are kept, and taken from.
+        Where the mountings and the minimum of each round are kept, and taken from.
     explain : callable, optional
         Test of parameters that are taken as known.
     ready : callable, optional
@@ -180,7 +182,7 @@ def settle(
     levels = first_levels
     changing = [message("not_converged.all")]
     tolerance: Mapping[str, float] = {}
-    count = in_a_row = fruitless = 0
+    count = in_a_row = fruitless = minimised = 0
     movement = np.inf
     bound = values
     while count < _ROUNDS and fruitless < _FRUITLESS:
@@ -212,7 +214,16 @@ def settle(
         # At the ends of the record two bindings may use one measurement in turn.
         usable = problem.usable if tolerance else None
         at = problem.values(states, problem.prior_values() | values)
-        minimum = minimise(problem, at, stage="all sensors", progress=report, binding=True)
+        minimised += 1
+        # Tests of known parameters that are made later may lead elsewhere from the same round on.
+        name = "-".join(["minimum", f"{minimised}", *(e.parameter.name for e in freed)])
+        minimum = finished_minimum(
+            stages,
+            name,
+            problem,
+            at,
+            partial(minimise, stage="all sensors", progress=report, binding=True),
+        )
         iterations += minimum.iterations
         fruitless = 0 if minimum.converged else fruitless + minimum.iterations
         states, values = minimum.evaluation.states, minimum.evaluation.parameters

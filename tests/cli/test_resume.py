@@ -60,6 +60,7 @@ def test_a_run_continues_after_the_stages_that_had_ended(run, monkeypatch, trial
     killed(trial, tmp_path / "out", "covariance")
     monkeypatch.setattr(preparation, "initial_states", forbidden)
     monkeypatch.setattr(rounds, "mounted_start", forbidden)
+    monkeypatch.setattr(rounds, "minimise", forbidden)
     result = run(*options(trial, tmp_path / "out", "--resume"))
     assert result.code == 0, result.err
     assert {name: (tmp_path / "out" / name).read_bytes() for name in RESULTS} == whole
