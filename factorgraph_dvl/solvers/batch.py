@@ -115,7 +115,8 @@ def solve_with_problem(
 
     That of a planar trial is of another kind, and None here. Parameters and errors are those of
     `solve`; in `stages` results of alignment, mounting and rounds are kept, and taken from.
-    `meanwhile` is called with a problem at its minimum where there is time while a second process tests it.
+    `meanwhile` is called with a problem at its minimum where there is time while a second process
+    tests it.
     """
     _check_above_zero("rate_hz", rate_hz)
     _check_above_zero("state_interval_s", state_interval_s)
