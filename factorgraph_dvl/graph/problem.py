@@ -9,7 +9,7 @@ slow and makes GTSAM's optimisers copy all values.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise, zip_longest
@@ -57,7 +57,6 @@ from factorgraph_dvl.sensors.protocol import (
     Linearization,
     Motion,
     Observation,
-    SensorClock,
 )
 
 # Stands for zero in a fixed direction, in standard deviations of the prior. Chosen: what data
@@ -406,12 +405,14 @@ class Problem:
         for process in self.processes:
             own_cost += 0.5 * float(np.sum(process.prior_residuals(parameters[process.name]) ** 2))
         motions = []
-        computed: dict[tuple[int, SensorClock | None], Motion] = {}
+        computed: dict[tuple[int, bytes, bool], Motion] = {}
         for bound in self._bound:
-            # Position and velocity of one receiver share attachment and clock.
-            shared = (id(bound.attachment), bound.observation.clock)
+            late = self._late(bound, parameters)
+            moved = bool(np.abs(late).max() > self._tolerance(bound, EXTRAPOLATED))
+            # Measurements at the same true times share the motion, of whatever sensor they are.
+            shared = (id(bound.attachment), late.tobytes(), moved)
             if shared not in computed:
-                computed[shared] = self._motion(bound, states, parameters)
+                computed[shared] = self._motion(bound, states, parameters, late, moved=moved)
             motions.append(computed[shared])
         residuals, cost = self._whitened(motions, parameters)
         return Evaluation(
@@ -557,22 +558,26 @@ class Problem:
         for block in self._blocks:
             if not block.factors:
                 self._lay_out(block)
-            self._fill(block, evaluation)
+        self._fill(evaluation)
+        for block in self._blocks:
             for factor in block.factors:
                 gaussian.push_back(factor)
         return gaussian
 
-    def _fill(self, block: _Block, evaluation: Evaluation) -> None:
-        """Write the rows of a block into its factors, some measurements at a time."""
-        linear = [self._linearized(bound, block.parameters, evaluation) for bound in block.bound]
-        for parts in zip_longest(*block.parts):
-            transitions: dict[int, Transition] = {}
-            for bound, lin, part in zip(block.bound, linear, parts, strict=True):
+    def _fill(self, evaluation: Evaluation) -> None:
+        """Write the rows of measurements into their factors, some at a time."""
+        observed = [(block, bound) for block in self._blocks for bound in block.bound]
+        linear = [
+            self._linearized(bound, block.parameters, evaluation) for block, bound in observed
+        ]
+        of_all = (parts for block in self._blocks for parts in block.parts)
+        for some in zip_longest(*of_all):
+            transitions: dict[tuple[int, Hashable], Transition] = {}
+            for (block, bound), lin, part in zip(observed, linear, some, strict=True):
                 if part is None:
                     continue
-                some = part.measurements
                 matrix, vector = self._jacobian(
-                    bound, block.parameters, lin, some, evaluation, transitions
+                    bound, block.parameters, lin, part.measurements, evaluation, transitions
                 )
                 matrix, vector = matrix.reshape(-1, matrix.shape[2]), -vector.ravel()
                 for factor_index, there, here in part.places:
@@ -669,12 +674,11 @@ class Problem:
 
     def _states(self, values: gtsam.Values) -> States:
         n = self.chain.segments.node_time.size
-        nRb, p_n, v_n = np.empty((n, 3, 3)), np.empty((n, 3)), np.empty((n, 3))
+        # A matrix of GTSAM's is [nRb, p, v; 0, I]: one call takes less than one for each part.
+        state = np.empty((n, 5, 5))
         for k in range(n):
-            state = values.atNavState(keys.node(k))
-            nRb[k] = state.attitude().matrix()
-            p_n[k] = state.position()
-            v_n[k] = state.velocity()
+            state[k] = values.atNavState(keys.node(k)).matrix()
+        nRb, p_n, v_n = (state[:, :3, part].copy() for part in (slice(0, 3), 3, 4))
         m = n if self.chain.walking else 1
         bias = np.array([values.atConstantBias(keys.bias(k)).vector() for k in range(m)])
         bias = np.broadcast_to(bias, (n, BIAS_SIZE))
@@ -713,17 +717,23 @@ class Problem:
             least if clock is None else max(self.clock_tolerance.get(clock.names[0], 0.0), least)
         )
 
-    def _motion(self, bound: _Bound, states: States, parameters: dict[str, Array]) -> Motion:
-        """Return the motion at the true times of measurements.
+    def _motion(
+        self,
+        bound: _Bound,
+        states: States,
+        parameters: dict[str, Array],
+        late: Array,
+        *,
+        moved: bool,
+    ) -> Motion:
+        """Return the motion at the true times of measurements, `late` (M,) s after they are bound.
 
         Where a clock moves on the way to the minimum, a motion extrapolated from where the
-        measurements were bound would give the cost of another one.
+        measurements were bound would give the cost of another one: those that `moved` are not.
         """
         rate = self.chain.frame.earth_rate
-        late = self._late(bound, parameters)
-        if np.abs(late).max() <= self._tolerance(bound, EXTRAPOLATED):
-            at, rest = bound.attachment, late
-        else:
+        at, rest = bound.attachment, late
+        if moved:
             at, _ = attach_inside(self.chain.segments, bound.time + late, rate)
             rest = np.zeros_like(late)
         at = self._corrected(bound, at, parameters)
@@ -822,26 +832,30 @@ class Problem:
         lin: Linearization,
         some: slice | IntArray,
         evaluation: Evaluation,
-        transitions: dict[int, Transition],
+        transitions: dict[tuple[int, Hashable], Transition],
     ) -> tuple[Array, Array]:
         """Return the whitened Jacobian (M, d, n) and residual (M, d) of some measurements.
 
-        Columns: state, bias, correlated error, parameters. `transitions` to the times of each
-        motion, by its identity, are kept for other observations there.
+        Columns: state, bias, correlated error, parameters. `transitions` to times of a motion, by
+        its identity and which they are, are kept for other observations there.
         """
         lin = _of_some(lin, some)
         motion = evaluation.motions[self._bound.index(bound)]
         attachment = rows_of(bound.attachment, some)
         errors = self._imu_errors
         by = None if errors is None else rows_of(errors.sensitivity(bound.attachment), some)
-        if id(motion) not in transitions:
+        here = (
+            id(motion),
+            some.tobytes() if isinstance(some, np.ndarray) else (some.start, some.stop),
+        )
+        if here not in transitions:
             at = attachment
             if errors is not None and by is not None:
                 at = errors.without(at, by, errors.vector(evaluation.parameters))
-            transitions[id(motion)] = Transition(
+            transitions[here] = Transition(
                 at, evaluation.states, rows_of(motion, some), self.chain.frame.earth_rate
             )
-        transition = transitions[id(motion)]
+        transition = transitions[here]
         found = dict(lin.d_parameters)
         if errors is not None and by is not None:
             found |= errors.columns(lin, transition, by)
