@@ -42,6 +42,10 @@ _RAW_SLOPE = 2.0
 # Signals up to this length, samples, are smoothed by matrices that are kept: a replay smooths a
 # second at a time, and SciPy's filters take more time to begin than to filter so few.
 _SHORT = 300
+# Samples that are smoothed at once, and others on both sides of them beside those of the window.
+# Chosen: some ten megabytes; of what is so far away a spline keeps less than 1e-28.
+_AT_ONCE = 50_000
+_BESIDE = 50
 # Differences between a narrow and the chosen window beyond which the motion has a step.
 _STEP = 4.0
 
@@ -151,15 +155,13 @@ def smooth(
     width = best_window(values, dt, sigma) if window is None else window
     if width == 0 or width > values.shape[0]:
         return unsmoothed(dt, sigma)
+    least = _STEP * sigma * white_gain(_NARROW)
     if values.shape[0] > _SHORT:
-        found, misfit = _found_and_misfit(values, width, averaged)
-        spline = make_interp_spline(time, found, k=3)
+        spline, misfit = _long_spline(time, values, width, least, averaged=averaged)
     else:
         to_spline, to_misfit = _short_matrices(values.shape[0], width, averaged)
         spline = _short_spline(time, to_spline @ values, 3)
-        misfit = to_misfit @ values
-    np.abs(misfit, out=misfit)
-    misfit[misfit <= _STEP * sigma * white_gain(_NARROW)] = 0.0
+        misfit = _from(least, to_misfit @ values)
     return Smoothed(
         spline=spline,
         misfit=_broken_line(time, misfit),
@@ -167,6 +169,33 @@ def smooth(
         slope_sigma=sigma * _slope_gain(width) / dt,
         window=width,
     )
+
+
+def _long_spline(
+    time: Array, values: Array, width: int, least: float, *, averaged: bool
+) -> tuple[BSpline, Array]:
+    """Return the spline of a smoothed signal, and the size of its misfit from `least` on."""
+    count = len(values)
+    # Unlike those of `zeros_like`, these zeros take no memory until one is written.
+    coefficients, misfit = np.empty(values.shape), np.zeros(values.shape)
+    for first in range(0, count, _AT_ONCE):
+        last = min(first + _AT_ONCE, count)
+        begin, end = max(first - width - _BESIDE, 0), min(last + width + _BESIDE, count)
+        own = slice(first - begin, last - begin)
+        found, off = _found_and_misfit(values[begin:end], width, averaged)
+        coefficients[first:last] = make_interp_spline(time[begin:end], found, k=3).c[own]
+        off = _from(least, off[own])
+        rows = np.flatnonzero(off.any(axis=1))
+        misfit[first + rows] = off[rows]
+    knots = np.concatenate([np.repeat(time[:1], 4), time[2:-2], np.repeat(time[-1:], 4)])
+    return BSpline.construct_fast(knots, coefficients, 3), misfit
+
+
+def _from(least: float, misfit: Array) -> Array:
+    """Return the sizes of a misfit, those up to a least one as 0."""
+    size = np.abs(misfit)
+    size[size <= least] = 0.0
+    return size
 
 
 def _found_and_misfit(values: Array, width: int, averaged: bool) -> tuple[Array, Array]:

@@ -8,10 +8,14 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from factorgraph_dvl.geometry.records import concatenated
 from factorgraph_dvl.geometry.rotations import exp_so3
 from factorgraph_dvl.geometry.vectors import IDENTITY, Array, IntArray, cross, rotate, skew
 from factorgraph_dvl.imu.preintegration import Segments
 from factorgraph_dvl.sensors.protocol import Linearization, Motion
+
+# Times that are attached at once. Chosen: some ten megabytes.
+_CHUNK = 16_000
 
 
 @dataclass(frozen=True)
@@ -117,6 +121,14 @@ def segment_ends(seg: Segments, earth_rate_n: Array) -> Attachment:
 
 
 def _attach(seg: Segments, index: IntArray, since: Array, earth_rate_n: Array) -> Attachment:
+    parts = [
+        _attach_some(seg, index[a : a + _CHUNK], since[a : a + _CHUNK], earth_rate_n)
+        for a in range(0, max(index.size, 1), _CHUNK)
+    ]
+    return parts[0] if len(parts) == 1 else concatenated(parts)
+
+
+def _attach_some(seg: Segments, index: IntArray, since: Array, earth_rate_n: Array) -> Attachment:
     inc = seg.increments
     part = inc.partial(index, since)
     segment = seg.first.searchsorted(index, side="right") - 1

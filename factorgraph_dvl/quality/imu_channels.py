@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from factorgraph_dvl.geometry.vectors import Array, BoolArray
+from factorgraph_dvl.geometry.vectors import Array, BoolArray, IntArray
 from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.sensors.imu import COLUMNS, Imu
 from factorgraph_dvl.sensors.invalid_values import frozen_samples, runs
@@ -39,8 +39,8 @@ _MEDIAN_SQUARED = 1.5 * 0.6745**2
 
 def channel_findings(imu: Imu) -> Iterator[Finding]:
     """Yield channels that do not measure, always or for a while."""
-    values = np.concatenate([imu.gyro, imu.accel], axis=1)
-    moves = np.ptp(values, axis=0) > 0.0
+    channels = [*imu.gyro.T, *imu.accel.T]
+    moves = np.array([np.ptp(channel) > 0.0 for channel in channels])
     if imu.time.size < _SINGLE or not moves.any():
         return
     constant = [k for k in range(6) if not moves[k]]
@@ -49,19 +49,20 @@ def channel_findings(imu: Imu) -> Iterator[Finding]:
         constant = [k for k in constant if k >= 3]
     if constant:
         found = [
-            message("words.is_always", name=COLUMNS[k + 1], value=values[0, k]) for k in constant
+            message("words.is_always", name=COLUMNS[k + 1], value=channels[k][0]) for k in constant
         ]
         text = message("imu_channel.constant", channels=found)
         yield Finding(Code.IMU_CHANNEL, text, "IMU", severity="error")
-    ends = [e for k in np.flatnonzero(moves).tolist() for e in _ends(COLUMNS[k + 1], values[:, k])]
+    ends = [e for k in np.flatnonzero(moves).tolist() for e in _ends(COLUMNS[k + 1], channels[k])]
     if ends:
         text = message("saturated.ends", ends=ends)
         yield Finding(Code.SATURATED, text, "IMU", severity="error")
-    yield from _spikes(values, moves)
+    moving = [channels[k] for k in np.flatnonzero(moves).tolist()]
+    yield from _spikes(moving)
     yield from _jitter(imu)
-    same = np.diff(values[:, moves], axis=0) == 0.0
+    same = [np.diff(channel) == 0.0 for channel in moving]
     interval = float(np.median(np.diff(imu.time)))
-    begin, length = _longest(same.all(axis=1))
+    begin, length = _longest(np.logical_and.reduce(same))
     if length >= max(_ALL, _LEAST_S / interval):
         yield _frozen(message("frozen_values.all"), imu, begin, length)
         return
@@ -69,46 +70,50 @@ def channel_findings(imu: Imu) -> Iterator[Finding]:
         (message("frozen_values.gyros"), slice(0, 3)),
         (message("frozen_values.accelerometers"), slice(3, 6)),
     ):
-        frozen = frozen_samples(values[:, some]) & moves[some].all()
+        frozen = frozen_samples(channels[some]) & moves[some].all()
         begin, length = _longest(frozen[1:])
         if length:
             yield _frozen(what, imu, begin, length)
             return
     for column, k in enumerate(np.flatnonzero(moves).tolist()):
-        begin, length = _longest(same[:, column])
+        begin, length = _longest(same[column])
         if length >= max(_SINGLE, 2.0 * _LEAST_S / interval):
             what = message("frozen_values.one", name=COLUMNS[k + 1])
             yield _frozen(what, imu, begin, length)
 
 
-def _spikes(values: Array, moves: np.ndarray) -> Iterator[Finding]:
+def _spikes(channels: Sequence[Array]) -> Iterator[Finding]:
     """Yield that single samples stand out from those before and after."""
-    if values.shape[0] < 2 * _ALL:
+    if channels[0].size < 2 * _ALL:
         return
-    signed = values[1:-1, moves] - 0.5 * (values[2:, moves] + values[:-2, moves])
-    deviation = np.abs(signed)
-    rounding = np.finfo(float).eps * np.abs(values[:, moves]).max(axis=0)
-    usual = np.maximum(np.median(deviation, axis=0), rounding)
-    row, column = np.nonzero(deviation[1:-1] > _SPIKE * usual)
-    spike = signed[row + 1, column]
-    # A spike makes both its neighbours deviate half as much to the other side; a corner does not.
-    alone = [
-        np.abs(signed[row + beside, column] + 0.5 * spike) < 0.2 * np.abs(spike)
-        for beside in (0, 2)
-    ]
-    hit = alone[0] & alone[1]
-    ratio = np.abs(spike[hit]) / usual[column[hit]]
-    count = np.unique(row[hit]).size
-    squares = np.bincount(column[hit], np.square(ratio), minlength=usual.size)
-    added = _MEDIAN_SQUARED * squares / (len(deviation) - 2)
-    if added.max() > (_ADDED if count >= _SPIKES else _ADDED_BY_FEW):
-        size = ratio.max()
+    spikes = [_spikes_of(channel) for channel in channels]
+    ratio = np.concatenate([size for _, size in spikes])
+    count = np.unique(np.concatenate([place for place, _ in spikes])).size
+    squares = max(float(np.sum(np.square(size))) for _, size in spikes)
+    added = _MEDIAN_SQUARED * squares / (channels[0].size - 4)
+    if added > (_ADDED if count >= _SPIKES else _ADDED_BY_FEW):
         yield Finding(
             Code.IMU_SPIKES,
-            message("imu_spikes.single", count=count, size=size),
+            message("imu_spikes.single", count=count, size=ratio.max()),
             "IMU",
             severity="error",
         )
+
+
+def _spikes_of(channel: Array) -> tuple[IntArray, Array]:
+    """Return where single samples of a channel stand out, and by how many usual deviations."""
+    signed = channel[1:-1] - 0.5 * (channel[2:] + channel[:-2])
+    deviation = np.abs(signed)
+    rounding = np.finfo(float).eps * np.abs(channel).max()
+    usual = np.maximum(np.median(deviation), rounding)
+    place = np.flatnonzero(deviation[1:-1] > _SPIKE * usual)
+    spike = signed[place + 1]
+    # A spike makes both its neighbours deviate half as much to the other side; a corner does not.
+    alone = [
+        np.abs(signed[place + beside] + 0.5 * spike) < 0.2 * np.abs(spike) for beside in (0, 2)
+    ]
+    hit = alone[0] & alone[1]
+    return place[hit], np.abs(spike[hit]) / usual
 
 
 def _jitter(imu: Imu) -> Iterator[Finding]:

@@ -65,13 +65,13 @@ def without_invalid_values(
         _blank(out, VELOCITY_COLUMNS, "GNSS", source, findings)
         _blank_fixes(out, source, findings)
     elif section == Imu.section:
-        zero = np.all(np.stack([out[name] for name in IMU_COLUMNS[1:]]) == 0.0, axis=0)
+        zero = np.logical_and.reduce([out[name] == 0.0 for name in IMU_COLUMNS[1:]])
         if 0 < zero.sum() < 0.5 * zero.size:
             out = {name: values[~zero] for name, values in out.items()}
             text = message("invalid_values.zero_samples", count=zero.sum())
             findings.append(_finding("IMU", source, [text]))
-        channels = np.stack([out[name] for name in IMU_COLUMNS[1:]], axis=1)
-        frozen = frozen_samples(channels[:, :3]) | frozen_samples(channels[:, 3:])
+        channels = [out[name] for name in IMU_COLUMNS[1:]]
+        frozen = frozen_samples(channels[:3]) | frozen_samples(channels[3:])
         if frozen.any():
             out = {name: values[~frozen] for name, values in out.items()}
             text = message("invalid_values.repeated_samples", count=frozen.sum())
@@ -79,16 +79,16 @@ def without_invalid_values(
     return out, findings
 
 
-def frozen_samples(values: Array) -> BoolArray:
-    """Return which samples of a triad (M, 3) repeat those before for long, (M,) bool.
+def frozen_samples(triad: Sequence[Array]) -> BoolArray:
+    """Return which samples of three channels (M,) repeat those before for long, (M,) bool.
 
     Three channels with digits of their own never do by chance. Coarse digits, and samples that are
     written several times, repeat in many runs.
     """
-    same = np.all(np.diff(values, axis=0) == 0.0, axis=1)
+    same = np.logical_and.reduce([np.diff(channel) == 0.0 for channel in triad])
     begin, end = runs(same)
     long = end - begin >= _REPEATED
-    out = np.zeros(values.shape[0], dtype=bool)
+    out = np.zeros(triad[0].size, dtype=bool)
     if np.count_nonzero(~long) > np.count_nonzero(long):
         return out
     for a, b in zip(begin[long].tolist(), end[long].tolist(), strict=True):
@@ -98,7 +98,8 @@ def frozen_samples(values: Array) -> BoolArray:
 
 def runs(true: BoolArray) -> tuple[IntArray, IntArray]:
     """Return where runs of true (M,) begin, and where they end."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], true.astype(int), [0]])))
+    inside = np.pad(true, 1)
+    edges = np.flatnonzero(inside[1:] != inside[:-1])
     return edges[::2], edges[1::2]
 
 

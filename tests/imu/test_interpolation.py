@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from factorgraph_dvl.imu import interpolation
 from factorgraph_dvl.imu.interpolation import best_window, smooth, unsmoothed
 
 DT = 0.01
@@ -49,6 +50,23 @@ def test_a_sway_that_goes_on_keeps_its_size_under_noise_and_beside_steps():
     left = found.spline(time) - values
     assert window > 5
     assert abs(np.sum(left * sway) / np.sum(sway**2)) < 3e-4
+
+
+@pytest.mark.parametrize("averaged", [True, False])
+def test_a_long_signal_is_smoothed_in_parts_as_in_one(monkeypatch, averaged):
+    time = DT * np.arange(2_100)
+    values = np.random.default_rng(4).normal(0.0, 1.0, (time.size, 3)) + np.sin(time)[:, None]
+    values[700:] += 30.0
+    found = []
+    for size in (time.size, 500):
+        monkeypatch.setattr(interpolation, "_AT_ONCE", size)
+        found.append(smooth(time, values, DT, 1.0, averaged=averaged, window=17))
+    whole, parts = found
+    for signal in ("spline", "misfit"):
+        one, other = getattr(whole, signal), getattr(parts, signal)
+        np.testing.assert_array_equal(other.t, one.t)
+        np.testing.assert_allclose(other.c, one.c, rtol=0.0, atol=1e-14)
+    assert whole.misfit.c.any()
 
 
 def test_means_are_corrected_to_the_value_at_the_middle():

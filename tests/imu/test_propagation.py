@@ -6,6 +6,7 @@ import numpy as np
 from inertial import constant_segments
 
 from factorgraph_dvl.geometry.rotations import exp_so3, log_so3
+from factorgraph_dvl.imu import propagation
 from factorgraph_dvl.imu.propagation import (
     States,
     attach,
@@ -87,3 +88,13 @@ def test_a_motion_is_extrapolated_with_its_rates():
     np.testing.assert_allclose(found.v_n, two.v_n, atol=0.2 * late.item() ** 2)
     np.testing.assert_allclose(found.p_n, two.p_n, atol=0.2 * late.item() ** 3)
     np.testing.assert_allclose(found.nRb @ exp_so3([0, 0, -0.09]), np.eye(3)[None], atol=1e-9)
+
+
+def test_times_are_attached_in_parts_as_at_once(monkeypatch):
+    seg = constant_segments(3.0, gyro=(0.0, 0.0, 0.1))
+    time = np.linspace(seg.node_time[0], seg.node_time[-1], 11)
+    whole = attach(seg, time, NO_RATE)
+    monkeypatch.setattr(propagation, "_CHUNK", 4)
+    parts = attach(seg, time, NO_RATE)
+    for name, values in vars(whole).items():
+        np.testing.assert_array_equal(getattr(parts, name), values)
