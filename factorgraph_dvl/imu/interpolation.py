@@ -43,7 +43,7 @@ _RAW_SLOPE = 2.0
 # second at a time, and SciPy's filters take more time to begin than to filter so few.
 _SHORT = 300
 # Samples that are smoothed at once, and others on both sides of them beside those of the window.
-# Chosen: some ten megabytes; of what is so far away a spline keeps less than 1e-28.
+# Chosen: some ten megabytes; on a spline, what is so many samples off has a share below 1e-28.
 _AT_ONCE = 50_000
 _BESIDE = 50
 # Differences between a narrow and the chosen window beyond which the motion has a step.
