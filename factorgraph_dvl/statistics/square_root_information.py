@@ -202,7 +202,7 @@ class SquareRootInformation:
                 for i, other in partners.get(key, ()):
                     if other in place:
                         rows = np.concatenate([_range(place[each]) for each in pairs[i]])
-                        out[i] = P[np.ix_(rows, rows)]
+                        out[i] = P[rows[:, None], rows]
         return out
 
     def _joint(self) -> Iterator[tuple[_Clique, dict[int, slice], Array]]:
@@ -223,7 +223,7 @@ class SquareRootInformation:
             if s:
                 where, above = joint[parent]
                 rows = np.concatenate([_range(where[key]) for key in clique.separators])
-                P_SS = above[np.ix_(rows, rows)]
+                P_SS = above[rows[:, None], rows]
                 P_FS = -gain @ P_SS
                 # An asymmetry would double from one clique to the next where biases walk far.
                 P_FF = inverse @ inverse.T - P_FS @ gain.T
