@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
+
 import numpy as np
 
 from factorgraph_dvl.geometry.units import HOUR
 from factorgraph_dvl.geometry.vectors import Array
-from factorgraph_dvl.graph.problem import Problem
+from factorgraph_dvl.graph.problem import Problem, Rows
 from factorgraph_dvl.sensors.parameters import UNITS, Parameter
 from factorgraph_dvl.solution import Cause
 from factorgraph_dvl.solvers.calibration import reported, spread_of_fixed
@@ -15,7 +17,9 @@ from factorgraph_dvl.statistics.error_budget import error_budget
 from factorgraph_dvl.statistics.rows import CORRELATED, IMU_NOISE, PRIOR, WALK, rows_by_source
 
 
-def causes(found: SolvedProblem) -> tuple[Cause, ...]:
+def causes(
+    found: SolvedProblem, use: Callable[[Iterator[Rows]], object] = iter
+) -> tuple[Cause, ...]:
     """Return what each cause adds to the standard deviations of a calibration.
 
     The squares of all causes add up to the variances that are reported.
@@ -24,6 +28,8 @@ def causes(found: SolvedProblem) -> tuple[Cause, ...]:
     ----------
     found : SolvedProblem
         Problem at its minimum, with covariances.
+    use : callable, optional
+        As of `error_budget`; not called where nothing is estimated.
     """
     problem, evaluation = found.problem, found.minimum.evaluation
     rows = reported(problem, evaluation)
@@ -31,7 +37,7 @@ def causes(found: SolvedProblem) -> tuple[Cause, ...]:
     if not functionals:
         return ()
     parts = error_budget(
-        rows_by_source(problem, evaluation), found.covariances.information, functionals
+        rows_by_source(problem, evaluation), found.covariances.information, functionals, use
     )
     variances = {source: np.diag(part) for source, part in parts.items()}
     spread = spread_of_fixed(found)

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
-from factorgraph_dvl.graph.problem import Evaluation, Problem
+from factorgraph_dvl.graph.problem import Evaluation, Problem, Rows
 from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.sensors.imu import ERRORS
 from factorgraph_dvl.sensors.message import Message, message
@@ -15,7 +15,7 @@ from factorgraph_dvl.sensors.parameters import UNITS, Parameter
 from factorgraph_dvl.solvers.calibration import reported
 from factorgraph_dvl.solvers.fixed_directions import SolvedProblem
 from factorgraph_dvl.statistics.constancy import Change, changes
-from factorgraph_dvl.statistics.rows import rows_with_times
+from factorgraph_dvl.statistics.rows import rows_by_source, rows_with_times
 from factorgraph_dvl.statistics.square_root_information import SquareRootInformation
 
 # Standard deviations from which on a change is one. Chosen: the probability by chance is below
@@ -45,7 +45,10 @@ class ComponentChange:
 
 
 def component_changes(
-    problem: Problem, evaluation: Evaluation, information: SquareRootInformation
+    problem: Problem,
+    evaluation: Evaluation,
+    information: SquareRootInformation,
+    every: Iterable[Rows] | None = None,
 ) -> list[ComponentChange]:
     """Return the most probable change of each component, errors of the IMU left out.
 
@@ -57,6 +60,8 @@ def component_changes(
         Its minimum.
     information : SquareRootInformation
         Information there.
+    every : iterable of Rows, optional
+        All rows of the graph that is linearised there, if something else needs them, too.
     """
     chain = problem.chain
     # Biases that walk change anyway.
@@ -72,7 +77,7 @@ def component_changes(
     of_component = [(name, p) for p, _ in rows for name in p.component_names]
     time = chain.segments.node_time
     tests = changes(
-        rows_with_times(problem, evaluation),
+        rows_with_times(problem, rows_by_source(problem, evaluation) if every is None else every),
         information.covariance_with(functionals),
         information.covariance_of(functionals),
         (float(time[0]), float(time[-1])),
@@ -84,7 +89,7 @@ def component_changes(
     ]
 
 
-def change_findings(found: SolvedProblem) -> Iterator[Finding]:
+def change_findings(found: SolvedProblem, every: Iterable[Rows]) -> Iterator[Finding]:
     """Yield a finding where a parameter changes along the trial by more than chance allows.
 
     Of several components the most probable one is named, and those that are about as probable.
@@ -93,9 +98,11 @@ def change_findings(found: SolvedProblem) -> Iterator[Finding]:
     ----------
     found : SolvedProblem
         Problem at its minimum, with covariances.
+    every : iterable of Rows
+        All rows of the graph that is linearised there.
     """
     tests = component_changes(
-        found.problem, found.minimum.evaluation, found.covariances.information
+        found.problem, found.minimum.evaluation, found.covariances.information, every
     )
     significant = [t for t in tests if t.change.chi2 >= CHANGED**2]
     if not significant:

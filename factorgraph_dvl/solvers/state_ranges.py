@@ -14,7 +14,7 @@ from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph import keys
 from factorgraph_dvl.graph.inertial_chain import Chain
 from factorgraph_dvl.graph.problem import Evaluation, Problem, Rows
-from factorgraph_dvl.statistics.rows import rows_with_times
+from factorgraph_dvl.statistics.rows import rows_by_source, rows_with_times
 from factorgraph_dvl.statistics.square_root_information import (
     SquareRootInformation,
     eliminated,
@@ -79,7 +79,7 @@ class StateRanges:
             yield (
                 (
                     each
-                    for each in rows_with_times(problem, at)
+                    for each in rows_with_times(problem, rows_by_source(problem, at))
                     if not (
                         block and block.start and shared.keys() >= set(each[0].keys[0].tolist())
                     )

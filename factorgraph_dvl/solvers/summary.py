@@ -7,7 +7,6 @@ from functools import partial
 
 import numpy as np
 
-from factorgraph_dvl.background import Awaited, in_background
 from factorgraph_dvl.geometry.records import rows_of
 from factorgraph_dvl.graph.problem import Evaluation, Problem
 from factorgraph_dvl.quality.earlier_calibration import prior_findings
@@ -15,7 +14,6 @@ from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.sensors.message import Message, message
 from factorgraph_dvl.sensors.protocol import Motion
 from factorgraph_dvl.solution import (
-    Cause,
     Estimate,
     Residuals,
     Solution,
@@ -47,14 +45,6 @@ def summarise(trial: Trial, found: SolvedProblem, *, rate_hz: float) -> Solution
     rate_hz : float
         Rate of the trajectory, Hz.
     """
-    with in_background(lambda: causes(found), urgent=True) as error_budget:
-        return _summarised(trial, found, rate_hz, error_budget)
-
-
-def _summarised(
-    trial: Trial, found: SolvedProblem, rate_hz: float, error_budget: Awaited[tuple[Cause, ...]]
-) -> Solution:
-    """Return the solution at a minimum, with an error budget that is awaited."""
     problem, minimum, chain = found.problem, found.minimum, found.problem.chain
     evaluation = minimum.evaluation
     estimates, covariance = calibration(found)
@@ -81,7 +71,10 @@ def _summarised(
     findings += prior_findings(trial, estimates, covariance)
     findings += mostly_rejected(residuals, [r for r in rejected if r.reason == "echo"])
     findings += outlier_findings(residuals, [r for r in rejected if r.reason != "echo"])
-    findings += change_findings(found)
+    changes: list[Finding] = []
+    # The rows, which take longest to make, serve both.
+    error_budget = causes(found, lambda rows: changes.extend(change_findings(found, rows)))
+    findings += changes
     findings += _unobservable(trial, problem, estimates, evaluation.motions)
     return Solution(
         trial=trial.name,
@@ -100,7 +93,7 @@ def _summarised(
         rejected=rejected,
         limits=trial.limits,
         noise=noise,
-        error_budget=error_budget(),
+        error_budget=error_budget,
     )
 
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
 import numpy as np
 
@@ -16,6 +17,7 @@ def error_budget(
     rows: Iterable[Rows],
     information: SquareRootInformation,
     functionals: Sequence[Mapping[int, Array]],
+    use: Callable[[Iterator[Rows]], object] = iter,
 ) -> dict[str, Array]:
     """Return what each source adds to the covariance of linear functionals.
 
@@ -33,6 +35,8 @@ def error_budget(
         Information of the same rows.
     functionals : sequence of mapping of int to ndarray
         Each maps keys to (n, size) matrices; values add up over keys.
+    use : callable, optional
+        Called with the rows, one after another as they are added up, for another use of them.
 
     Returns
     -------
@@ -41,8 +45,15 @@ def error_budget(
     """
     with_functionals = information.covariance_with(functionals)
     out: dict[str, Array] = {}
-    for each in rows:
-        noise = product(each, with_functionals)
-        part = np.einsum("mdi,mdj->ij", noise, noise, optimize=True)
-        out[each.source] = out.get(each.source, 0.0) + part
+
+    def added() -> Iterator[Rows]:
+        for each in rows:
+            noise = product(each, with_functionals)
+            part = np.einsum("mdi,mdj->ij", noise, noise, optimize=True)
+            out[each.source] = out.get(each.source, 0.0) + part
+            yield each
+
+    passing = added()
+    use(passing)
+    deque(passing, maxlen=0)
     return out

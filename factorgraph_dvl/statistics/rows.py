@@ -6,7 +6,7 @@ rows: P = P (sum JᵀJ) P. Whatever asks what a source of noise does starts from
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 
 import numpy as np
 
@@ -35,12 +35,12 @@ def rows_by_source(problem: Problem, evaluation: Evaluation) -> Iterator[Rows]:
     yield from problem.observation_rows(evaluation)
 
 
-def rows_with_times(problem: Problem, evaluation: Evaluation) -> Iterator[tuple[Rows, Array]]:
-    """Yield the rows that belong to times, with these: all but priors."""
+def rows_with_times(problem: Problem, every: Iterable[Rows]) -> Iterator[tuple[Rows, Array]]:
+    """Yield those of the rows by source that belong to times, with these: all but priors."""
     when = {o.label: o.time for o in problem.observations}
     processes = {keys.letter_of(p.key(0)): p.time for p in problem.processes}
     node_time = problem.chain.segments.node_time
-    for rows in rows_by_source(problem, evaluation):
+    for rows in every:
         if rows.source in when:
             yield rows, when[rows.source][rows.begin : rows.begin + len(rows.vector)]
         elif rows.keys.shape[1] > 1:

@@ -19,7 +19,7 @@ from factorgraph_dvl.solvers.known_parameters import wide, with_scattered_noise
 from factorgraph_dvl.solvers.levenberg_marquardt import factorized
 from factorgraph_dvl.solvers.state_ranges import eliminated_by_ranges
 from factorgraph_dvl.statistics.constancy import by_interval
-from factorgraph_dvl.statistics.rows import rows_with_times
+from factorgraph_dvl.statistics.rows import rows_by_source, rows_with_times
 from factorgraph_dvl.statistics.scores import scores
 
 SCENE = {
@@ -86,7 +86,7 @@ def test_ranges_have_the_information_of_the_whole(solved, monkeypatch, longest):
     edges = np.linspace(time[0], time[-1], 6)[1:-1]
     gain = np.linalg.inv(information.covariance_of(scaled))
     following = {key: P @ gain for key, P in information.covariance_with(scaled).items()}
-    whole = by_interval(rows_with_times(test, at), following, edges)
+    whole = by_interval(rows_with_times(test, rows_by_source(test, at)), following, edges)
     shared = ranges.information.covariance_with(scaled)
     parts = [
         by_interval(rows, own, edges)
