@@ -208,13 +208,17 @@ class NodeMeasurements:
         """Return the attachment without the errors of the IMU."""
         if self.sensitivity is None:
             return self.attachment
-        errors = [p for p in self.parameters if p.name in ERRORS]
-        sizes = np.concatenate([values[p.name] for p in errors])
-        return corrected(self.attachment, self.sensitivity, elements(errors), sizes)
+        sizes = np.concatenate([values[p.name] for p in self._imu_errors])
+        return corrected(self.attachment, self.sensitivity, elements(self._imu_errors), sizes)
 
     def attachment_of(self, rows: AttachedMeasurements) -> Attachment:
         """Return the attachment of measurements of one kind."""
         return rows_of(self.attachment, rows.at)
+
+    @cached_property
+    def _imu_errors(self) -> list[Parameter]:
+        """The errors of the IMU among the parameters."""
+        return [p for p in self.parameters if p.name in ERRORS]
 
     @cached_property
     def _place(self) -> dict[str, slice]:
@@ -268,11 +272,11 @@ class NodeMeasurements:
                     by_parameters[:, :, self._place[name]] = jacobian
             if self.sensitivity is not None:
                 part = Transition(rows_of(at, r.at), states, rows_of(motion, r.at), rate)
-                errors = [p for p in self.parameters if p.name in ERRORS]
-                columns = np.concatenate([np.r_[self._place[p.name]] for p in errors])
-                by_parameters[:, :, columns] = by_errors(
-                    lin, part, rows_of(self.sensitivity, r.at), elements(errors)
+                of_errors = by_errors(
+                    lin, part, rows_of(self.sensitivity, r.at), elements(self._imu_errors)
                 )
+                columns = np.concatenate([np.r_[self._place[p.name]] for p in self._imu_errors])
+                by_parameters[:, :, columns] = of_errors
             residuals.append(lin.residual.ravel())
             matrices.append(matrix.reshape(-1, first + size))
         return np.concatenate(residuals), np.concatenate(matrices), motions

@@ -253,13 +253,14 @@ def _own_states(trial: Trial, frame: LocalFrame, interval: float) -> tuple[str, 
 
 def _misfit(problem: Problem, evaluation: Evaluation) -> float:
     out = 0.0
-    factors = [problem.white_factors.get(o.label, 1.0) for o in problem.observations]
-    for residual, weight, factor in zip(
-        evaluation.residuals, problem.weights, factors, strict=True
+    factors = problem.white_factors
+    for o, residual, weight in zip(
+        problem.observations, evaluation.residuals, problem.weights, strict=True
     ):
         used = weight > 0.0
         if np.count_nonzero(used) >= _ENOUGH:
-            out = max(out, float(np.sqrt(np.mean((factor * residual)[used] ** 2))))
+            stated = factors.get(o.label, 1.0) * residual
+            out = max(out, float(np.sqrt(np.mean(stated[used] ** 2))))
     return out
 
 
