@@ -1,21 +1,27 @@
 """Offsets of the clocks of GNSS and DVL from that of the IMU, before anything is solved.
 
 The IMU, carried through windows, says how velocity and attitude change; a clock is off by what
-makes the other sensor's velocities fit these changes. A scan finds the offset, Gauss-Newton steps
-refine it together with a rate or a jump, and the scatter of short blocks gives the standard
-deviation, whatever the noise is.
+makes the other sensor's velocities fit these changes. A scan finds the offset, from which a fit
+starts, without or with a rate or a jump.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol, Self
 
 import numpy as np
 
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.initialization.carried_windows import MARGIN_S
+from factorgraph_dvl.initialization.clock_fit import (
+    ClockFit,
+    Comparison,
+    blocks,
+    fit_clock,
+    variances,
+    window_misfits,
+)
 
 # Steps of the scan, s, and of a finer one around its minimum, with its reach. Chosen: turns last
 # seconds; under sway at 2 Hz minima lie every 0.25 s, and are 0.05 s wide.
@@ -33,9 +39,6 @@ _SHARE = 0.15
 # Windows that are scanned, of each third of the record. Chosen: those with the largest changes
 # of velocity show nearly all.
 _SCANNED = 2
-# Half of the difference in time by which residuals are differentiated, s.
-_DIFFERENCE_S = 0.02
-_ITERATIONS = 6
 # Minima of the finer scan that are refined. Chosen: aliases of a sway on both sides.
 _MINIMA = 5
 # Log-likelihood per degree of freedom by which minima differ at least, or the nearest is taken.
@@ -52,17 +55,8 @@ _DOMINATES = 50.0
 # Windows beside it in which other offsets are refined. Chosen: those with the largest changes of
 # velocity show nearly all.
 _BESIDE = 4
-# Halvings of a step that does not gain.
-_HALVINGS = 3
-# Blocks of measurements whose errors are independent, s. Chosen: several times the correlation
-# time of GNSS velocities.
-_BLOCK_S = 10.0
 # Fewer blocks say nothing of the scatter between them, as on either side of a jump.
 _LEAST_BLOCKS = 6
-# A rate or a jump is one where it is so many standard deviations, and better than none by this
-# much of the log-likelihood. Chosen: chance gives neither in 10 000 trials.
-_CERTAIN = 6.0
-_BETTER = 20.0
 # Height of the score process, in standard deviations, from which on a rate or a jump is tried.
 # Chosen: without a change it stays below 3.2 in 99 % (Andrews 1993).
 _CHANGES = 3.2
@@ -71,8 +65,6 @@ _CHANGES = 3.2
 _ALIKE_WINDOWS = 30.0
 # Share of the squares that one that explains a misfit leaves at most.
 _MOST = 0.25
-# Largest step of Gauss-Newton, s. Chosen: a minimum's width under sway.
-_LARGEST_STEP_S = 0.3
 # Drifts over the trial that are tried, and their step, s. Chosen: what stamps at an assumed rate
 # make; under sway at 2 Hz thirds of a trial find aliases, and minima are 0.05 s wide.
 _DRIFT_S = 1.2
@@ -81,38 +73,6 @@ _DRIFT_STEP_S = 0.06
 _BREAKS = 15
 # Measurements that are compared at a time. Chosen: their columns stay in the cache.
 _TOGETHER = 5000
-# Misfit below which nothing is gained, m/s. Chosen: finer than any receiver's or DVL's digits.
-_LEAST_MISFIT = 1e-3
-
-
-class Comparison(Protocol):
-    """Velocities of a sensor against the carried IMU, in W windows of n."""
-
-    @property
-    def time(self) -> Array:
-        """Times as in the record, (W, n), s."""
-
-    @property
-    def inside(self) -> np.ndarray:
-        """Which of them are meant, (W, n) bool."""
-
-    @property
-    def count(self) -> Array:
-        """Degrees of freedom of each window, (W,)."""
-
-    @property
-    def signal(self) -> Array:
-        """Sum of squares of the changes of velocity in each window, (W,)."""
-
-    @property
-    def noise(self) -> float:
-        """Stated standard deviation of a component, m/s."""
-
-    def only(self, lines: np.ndarray) -> Self:
-        """Return some of the windows."""
-
-    def residual(self, offset: float | Array) -> Array:
-        """Return what is left if the sensor is late by offsets (..., W, n), (..., W, n, 3)."""
 
 
 @dataclass(frozen=True)
@@ -173,14 +133,14 @@ def clock_offset(
     ClockOffset or None
         The clock, None where there are too few data.
     """
-    if np.unique(_blocks(comparison)).size < _LEAST_BLOCKS:
+    if np.unique(blocks(comparison)).size < _LEAST_BLOCKS:
         return None
     time = comparison.time
     middle = float(np.mean(time[comparison.inside]))
     whole, first, last = _scan(comparison, around, reach)
     whole = _dominating(comparison, whole, around, reach)
     one = np.ones_like(time)
-    constant = _refined(comparison, one[..., None], np.array([whole]))
+    constant = fit_clock(comparison, one[..., None], np.array([whole]))
     best, rate, jump, jump_time = constant, (0.0, 0.0), (0.0, 0.0), np.nan
     span = float(np.ptp(time[comparison.inside]))
     if _changes(comparison, constant) or abs(last - first) > _STEP_S:
@@ -189,7 +149,8 @@ def clock_offset(
         starts = [(constant.values[0], 0.0), (0.5 * (first + last), slope)]
         starts += [_drift(comparison, middle, (around, constant.values[0]))]
         drift = _first_of(comparison, design, starts)
-        if drift.better_than(best) and _explains(comparison, drift, constant):
+        every = np.ones(len(time), dtype=bool)
+        if drift.better_than(best, every) and _explains(comparison, drift, constant, every):
             best, rate = drift, (float(drift.values[1]), float(drift.sigma[1]))
         breaks = [
             _break(comparison, float(constant.values[0]), around, reach),
@@ -197,11 +158,15 @@ def clock_offset(
         ]
         for at, before, after in breaks:
             design = np.stack([one, (time > at).astype(float)], axis=-1)
-            found = _refined(comparison, design, np.array([before, after - before]))
-            sides = [np.unique(_blocks(comparison)[side]).size for side in (time > at, time <= at)]
-            enough = min(sides) >= _LEAST_BLOCKS and _explains(comparison, found, constant, at)
+            found = fit_clock(comparison, design, np.array([before, after - before]))
+            sides = [np.unique(blocks(comparison)[side]).size for side in (time > at, time <= at)]
+            # In the window that it is in, the mean force over a jump makes a step of velocity.
+            outside = ~_spans(comparison, at)
+            enough = min(sides) >= _LEAST_BLOCKS and _explains(
+                comparison, found, constant, outside
+            )
             # A jump has as many parameters as a rate.
-            better = found.better_than(constant) and found.likelihood > best.likelihood
+            better = found.better_than(constant, outside) and found.gain(best, outside) > 0.0
             if enough and better:
                 best, rate = found, (0.0, 0.0)
                 jump, jump_time = (float(found.values[1]), float(found.sigma[1])), at
@@ -215,30 +180,9 @@ def clock_offset(
         jump_sigma=jump[1],
         jump_time=float(jump_time),
         middle=middle,
-        gain=(best.likelihood - _likelihood(comparison, zero)) / best.inflation,
+        gain=float(np.sum(window_misfits(comparison, zero) - best.misfits)) / best.inflation,
         unexplained=float(np.sum(best.residual**2)) / _signal(comparison),
     )
-
-
-@dataclass(frozen=True)
-class _Fit:
-    """Clock parameters `values`, `sigma` (c,); `inflation`: variance by the scatter of
-    blocks over that of white noise; `score`, `information` (W, n) of the offset.
-    """
-
-    values: Array
-    sigma: Array
-    inflation: float
-    likelihood: float
-    residual: Array
-    score: Array
-    information: Array
-
-    def better_than(self, other: _Fit) -> bool:
-        """Whether its last parameter is certain, and the likelihood better for it."""
-        certain = abs(self.values[-1]) > _CERTAIN * self.sigma[-1]
-        gain = (self.likelihood - other.likelihood) / self.inflation
-        return bool(certain and gain > _BETTER)
 
 
 def _scan(comparison: Comparison, around: float, reach: float) -> tuple[float, float, float]:
@@ -246,7 +190,7 @@ def _scan(comparison: Comparison, around: float, reach: float) -> tuple[float, f
     some, parts = _strongest(comparison)
     freedom = max(float(some.count.sum()), 1.0)
     # A clock that is right needs no scan.
-    near = _refined(some, np.ones_like(some.time)[..., None], np.array([around]))
+    near = fit_clock(some, np.ones_like(some.time)[..., None], np.array([around]))
     squares, offset = float(np.sum(near.residual**2)), float(near.values[0])
     right = squares < min(freedom * (_NOISE * some.noise) ** 2, _SHARE * _signal(some))
     if right and abs(offset - around) < _FINE_REACH_S:
@@ -270,14 +214,8 @@ def _scan(comparison: Comparison, around: float, reach: float) -> tuple[float, f
 
 def stands_out(comparison: Comparison, offset: float | Array) -> float:
     """Return the variance of the window that fits worst, beside that of the usual window."""
-    variance = _variances(comparison, offset)
+    variance = variances(comparison, comparison.residual(offset))
     return float(variance.max() / max(float(np.median(variance)), 1e-12))
-
-
-def _variances(comparison: Comparison, offset: float | Array) -> Array:
-    """Return the mean square of each window, (W,), and of digits."""
-    squares = np.sum(comparison.residual(offset) ** 2, axis=(1, 2))
-    return np.asarray(squares / np.maximum(comparison.count, 1.0) + _LEAST_MISFIT**2)
 
 
 def _dominating(comparison: Comparison, offset: float, around: float, reach: float) -> float:
@@ -285,7 +223,7 @@ def _dominating(comparison: Comparison, offset: float, around: float, reach: flo
 
     Sway repeats itself, and steady turns as well. Where the motion changes, the difference shows.
     """
-    at = _variances(comparison, offset)
+    at = variances(comparison, comparison.residual(offset))
     worst = int(np.argmax(at))
     if at[worst] < _STANDS_OUT * np.median(at):
         return offset
@@ -296,8 +234,8 @@ def _dominating(comparison: Comparison, offset: float, around: float, reach: flo
     likely = np.argsort(_misfits_at(some, minima).sum(axis=1))
     best, most = offset, _DOMINATES
     for start in minima[likely[:_MINIMA]]:
-        fit = _refined(some, np.ones_like(some.time)[..., None], np.array([start]))
-        ratio = _variances(comparison, float(fit.values[0])) / at
+        fit = fit_clock(some, np.ones_like(some.time)[..., None], np.array([start]))
+        ratio = variances(comparison, comparison.residual(float(fit.values[0]))) / at
         gain = -0.5 * float(np.sum(comparison.count * np.log(ratio)))
         if gain > most and ratio.max() < _NO_WORSE and ratio[worst] < _BETTER_THERE:
             best, most = float(fit.values[0]), gain
@@ -367,91 +305,41 @@ def _misfits_at(comparison: Comparison, offsets: Array) -> Array:
     shape = comparison.time.shape
     together = max(int(_TOGETHER / comparison.time.size), 1)
     parts = (late[k : k + together] for k in range(0, len(late), together))
-    misfits = (
-        _misfits(comparison, comparison.residual(np.broadcast_to(part, (len(part), *shape))))
+    found = (
+        window_misfits(comparison, comparison.residual(np.broadcast_to(part, (len(part), *shape))))
         for part in parts
     )
-    return np.concatenate(list(misfits))
+    return np.concatenate(list(found))
 
 
-def _refined(comparison: Comparison, design: Array, start: Array) -> _Fit:
-    """Return clock parameters by Gauss-Newton; `design` (W, n, c) takes them to offsets."""
-    values = start
-    residual = comparison.residual(design @ values)
-    likelihood = _likelihood(comparison, residual)
-    blocks = _blocks(comparison)
-    count = int(blocks.max()) + 1
-    for _ in range(_ITERATIONS):
-        later, sooner = (
-            comparison.residual(design @ values + step) for step in (_DIFFERENCE_S, -_DIFFERENCE_S)
-        )
-        slope = (later - sooner) / (2.0 * _DIFFERENCE_S)
-        squares = np.maximum(np.sum(residual**2, axis=(1, 2)), 1e-12)
-        weight = (np.maximum(comparison.count, 1.0) / squares)[:, None]
-        a = np.sum(slope**2, axis=2) * weight
-        b = np.sum(slope * residual, axis=2) * weight
-        information = np.einsum("wn,wni,wnj->ij", a, design, design)
-        information += 1e-12 * np.diag(np.maximum(np.diag(information), 1e-12))
-        inverse = np.linalg.inv(information)
-        step = -inverse @ np.einsum("wn,wni->i", b, design)
-        largest = float(np.max(np.abs(design @ step)))
-        step *= min(1.0, _LARGEST_STEP_S / max(largest, 1e-12))
-        for _ in range(_HALVINGS):
-            trial = comparison.residual(design @ (values + step))
-            new = _likelihood(comparison, trial)
-            if new > likelihood:
-                break
-            step = 0.5 * step
-        if new <= likelihood:
-            break
-        done = new - likelihood < 0.01
-        values, residual, likelihood = values + step, trial, new
-        if done:
-            break
-    scores = np.stack(
-        [np.bincount(blocks.ravel(), (b * d).ravel(), count) for d in np.moveaxis(design, -1, 0)]
-    )
-    used = np.bincount(blocks.ravel(), comparison.inside.ravel(), count) > 0
-    spread = scores @ scores.T * (used.sum() / max(used.sum() - start.size, 1))
-    covariance = inverse @ spread @ inverse
-    variance = np.maximum(np.diag(covariance), np.diag(inverse))
-    return _Fit(
-        values=values,
-        sigma=np.sqrt(variance),
-        inflation=float(variance[-1] / inverse[-1, -1]),
-        likelihood=likelihood,
-        residual=residual,
-        score=b,
-        information=a,
-    )
-
-
-def _first_of(comparison: Comparison, design: Array, starts: Sequence[tuple[float, ...]]) -> _Fit:
+def _first_of(
+    comparison: Comparison, design: Array, starts: Sequence[tuple[float, ...]]
+) -> ClockFit:
     """Return the best of the fits from several starts."""
-    fits = [_refined(comparison, design, np.array(start)) for start in starts]
+    fits = [fit_clock(comparison, design, np.array(start)) for start in starts]
     return max(fits, key=lambda fit: fit.likelihood)
 
 
 def _nearest_of(
     comparison: Comparison, starts: Sequence[float], around: float, freedom: float
-) -> _Fit:
+) -> ClockFit:
     """Return, of the fits that are nearly the best, the one nearest to what is stated."""
     one = np.ones_like(comparison.time)[..., None]
-    fits = [_refined(comparison, one, np.array([start])) for start in starts]
+    fits = [fit_clock(comparison, one, np.array([start])) for start in starts]
     most = max(fit.likelihood for fit in fits)
     good = [fit for fit in fits if fit.likelihood >= most - _ALIKE * freedom]
     return min(good, key=lambda fit: abs(float(fit.values[0]) - around))
 
 
-def _changes(comparison: Comparison, fit: _Fit) -> bool:
+def _changes(comparison: Comparison, fit: ClockFit) -> bool:
     """Whether the offset seems to change along the trial, by its scores."""
     order = np.argsort(comparison.time, axis=None)
     share = np.cumsum(fit.information.ravel()[order])
     share /= max(share[-1], 1e-12)
     process = np.cumsum(fit.score.ravel()[order])
     process -= share * process[-1]
-    blocks = np.bincount(_blocks(comparison).ravel(), fit.score.ravel())
-    scale = float(np.sqrt(np.sum(blocks**2)))
+    of_blocks = np.bincount(blocks(comparison).ravel(), fit.score.ravel())
+    scale = float(np.sqrt(np.sum(of_blocks**2)))
     inner = (share > 0.1) & (share < 0.9)
     height = np.abs(process) / np.sqrt(np.maximum(share * (1.0 - share), 0.01)) * inner
     return bool(height.max() > _CHANGES * max(scale, 1e-12))
@@ -470,19 +358,24 @@ def _drift(comparison: Comparison, middle: float, offsets: Sequence[float]) -> t
     return tried[int(np.argmin(_misfits_at(some, late).sum(axis=1)))]
 
 
-def _explains(comparison: Comparison, fit: _Fit, without: _Fit, at: float = np.nan) -> bool:
-    """Whether a fit explains most of a misfit, or leaves about as much in each window.
+def _spans(comparison: Comparison, at: float) -> np.ndarray:
+    """Return which windows a time lies within, (W,) bool."""
+    time = np.where(comparison.inside, comparison.time, np.nan)
+    return np.asarray((np.nanmin(time, axis=1) <= at) & (at <= np.nanmax(time, axis=1)))
 
-    If not, something else is wrong there. The time of a jump, `at`, is not known well enough for
-    the window that it is in.
+
+def _explains(
+    comparison: Comparison, fit: ClockFit, without: ClockFit, windows: np.ndarray
+) -> bool:
+    """Whether a fit explains most of a misfit, or leaves about as much in each of some windows.
+
+    If not, something else is wrong there.
     """
     if np.sum(fit.residual**2) < _MOST * np.sum(without.residual**2):
         return True
     variance = np.sum(fit.residual**2, axis=(1, 2)) / np.maximum(comparison.count, 1.0)
     usual = max(float(np.median(variance)), comparison.noise**2)
-    time = np.where(comparison.inside, comparison.time, np.nan)
-    around = (np.nanmin(time, axis=1) <= at) & (at <= np.nanmax(time, axis=1))
-    return bool(np.all(variance[~around] < _ALIKE_WINDOWS * usual))
+    return bool(np.all(variance[windows] < _ALIKE_WINDOWS * usual))
 
 
 def _break(
@@ -538,20 +431,3 @@ def _break_near(comparison: Comparison, k: int, before: float, after: float) -> 
     tried = np.linspace(first, last, _BREAKS)
     late = np.where(time > tried[:, None, None], after, before)
     return float(tried[np.argmin(_misfits_at(comparison, late).sum(axis=1))])
-
-
-def _blocks(comparison: Comparison) -> np.ndarray:
-    """Return in which block each measurement is, (W, n), numbered from 0."""
-    time = comparison.time
-    return np.asarray(np.floor((time - time.min()) / _BLOCK_S), dtype=int)
-
-
-def _misfits(comparison: Comparison, residual: Array) -> Array:
-    """Return minus the log-likelihood of each window, (..., W), its noise unknown."""
-    squares = np.sum(residual**2, axis=(-2, -1))
-    freedom = np.maximum(comparison.count, 1.0)
-    return np.asarray(0.5 * freedom * np.log(squares / freedom + _LEAST_MISFIT**2))
-
-
-def _likelihood(comparison: Comparison, residual: Array) -> float:
-    return -float(np.sum(_misfits(comparison, residual)))

@@ -17,9 +17,9 @@ from factorgraph_dvl.geometry.rotations import BodyAxes, frd_from_body
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.initialization.carried_windows import CarriedWindows, carried_windows
+from factorgraph_dvl.initialization.clock_fit import Comparison
 from factorgraph_dvl.initialization.clock_offsets import (
     ClockOffset,
-    Comparison,
     clock_offset,
     least_misfit,
     noise_share,

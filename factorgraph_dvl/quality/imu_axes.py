@@ -14,7 +14,8 @@ import numpy as np
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.initialization.carried_windows import CarriedWindows, carried_windows
-from factorgraph_dvl.initialization.clock_offsets import Comparison, least_misfit
+from factorgraph_dvl.initialization.clock_fit import Comparison
+from factorgraph_dvl.initialization.clock_offsets import least_misfit
 from factorgraph_dvl.quality.axis_permutations import in_words, mirrored, swapped
 from factorgraph_dvl.sensors.finding import Code
 from factorgraph_dvl.sensors.imu import Imu
