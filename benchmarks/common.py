@@ -16,10 +16,10 @@ import platform
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterable, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Iterable, Iterator, Sequence
+from concurrent.futures import Executor
+from contextlib import contextmanager
 from dataclasses import replace
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +28,7 @@ import yaml
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from factorgraph_dvl.campaign.cluster import connected
 from factorgraph_dvl.trial import Trial
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -113,9 +114,11 @@ def config(name: str, /, **top: Any) -> dict[str, Any]:
     return {**yaml.safe_load(text), **top}
 
 
-def pool(jobs: int | None) -> ProcessPoolExecutor:
-    """Return processes that start afresh."""
-    return ProcessPoolExecutor(jobs, get_context("spawn"))
+@contextmanager
+def pool(jobs: int) -> Iterator[Executor]:
+    """Yield as many workers of a campaign."""
+    with connected(jobs, None) as client:
+        yield client.get_executor(pure=False)
 
 
 def new_figure(width: float, height: float) -> Figure:
