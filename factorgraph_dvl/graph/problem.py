@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from itertools import pairwise, zip_longest
+from itertools import zip_longest
 
 import gtsam
 import numpy as np
@@ -23,10 +23,12 @@ from factorgraph_dvl.geometry.rotations import BodyAxes
 from factorgraph_dvl.geometry.vectors import Array, BoolArray, IntArray
 from factorgraph_dvl.graph import keys
 from factorgraph_dvl.graph.clocks import linearized, parameters_of, true_time
+from factorgraph_dvl.graph.factor_layout import CHUNK, Part, factor_layout
 from factorgraph_dvl.graph.freed_memory import return_freed
 from factorgraph_dvl.graph.imu_errors import ImuErrors, LinearImuFactors
 from factorgraph_dvl.graph.inertial_chain import Chain
 from factorgraph_dvl.graph.keys import BIAS_SIZE, STATE_SIZE
+from factorgraph_dvl.graph.node_jacobian import node_jacobian, some_of
 from factorgraph_dvl.graph.priors import (
     ConstantsPrior,
     add_bias_prior,
@@ -46,7 +48,6 @@ from factorgraph_dvl.imu.propagation import (
     States,
     Transition,
     attach_inside,
-    attitude_jacobian,
     extrapolated,
     motion_at,
 )
@@ -73,10 +74,6 @@ EXTRAPOLATED = 1e-3
 _SAME_WEIGHT = 0.2
 
 
-# Measurements whose rows are found at once. Chosen: some ten megabytes.
-_CHUNK = 4000
-
-
 @dataclass(eq=False)
 class _Bound:
     """An observation tied to the chain; `usable` measurements (M,) are covered by the IMU.
@@ -92,17 +89,6 @@ class _Bound:
     correlated: int | None = None
 
 
-@dataclass(frozen=True)
-class _Part:
-    """Some measurements of an observation, and the places of their rows in factors.
-
-    Each place is the index of a factor, rows there, and rows of these measurements.
-    """
-
-    measurements: slice | IntArray
-    places: list[tuple[int, slice, slice]]
-
-
 @dataclass
 class _Block:
     """Observations with the same variables: one factor per set of nodes for all of them.
@@ -114,7 +100,7 @@ class _Block:
     bound: list[_Bound]
     parameters: tuple[Parameter, ...]
     correlated: int | None = None
-    parts: list[list[_Part]] = field(default_factory=list)
+    parts: list[list[Part]] = field(default_factory=list)
     factors: list[gtsam.JacobianFactor] = field(default_factory=list)
     matrices: list[Array] = field(default_factory=list)
     vectors: list[Array] = field(default_factory=list)
@@ -602,8 +588,8 @@ class Problem:
                 lin = self._linearized(bound, block.parameters, evaluation)
                 o, sizes = bound.observation, tuple(self._sizes(block))
                 variables = self._keys_at(block, self._nodes_of(bound))
-                for begin in range(0, max(len(lin.residual), 1), _CHUNK):
-                    some = slice(begin, begin + _CHUNK)
+                for begin in range(0, max(len(lin.residual), 1), CHUNK):
+                    some = slice(begin, begin + CHUNK)
                     matrix, vector = self._jacobian(
                         bound, block.parameters, lin, some, evaluation, {}
                     )
@@ -754,37 +740,15 @@ class Problem:
 
     def _lay_out(self, block: _Block) -> None:
         """Make a block's factors for the nodes that its measurements depend on."""
-        nodes = np.concatenate([self._nodes_of(b) for b in block.bound])
-        # One number for each pair of nodes, which sorts as the pair does.
-        pair = np.ravel_multi_index(tuple(nodes.T), tuple(nodes.max(axis=0, initial=0) + 1))
-        _, index, place = np.unique(pair, return_index=True, return_inverse=True)
-        used = nodes[index]
-        counts = np.zeros(len(used), dtype=int)
-        edges = np.cumsum([b.observation.time.size for b in block.bound])[:-1]
-        block.parts = []
-        for bound, own in zip(block.bound, np.split(place, edges), strict=True):
-            d = len(bound.observation.components)
-            order = np.argsort(own, kind="stable")
-            present, first, count = np.unique(own[order], return_index=True, return_counts=True)
-            in_order = bool(np.all(np.diff(order) == 1))
-            parts = []
-            for a, b in pairwise(_part_edges(first, own.size)):
-                whole = slice(int(first[a]), int(first[b - 1] + count[b - 1]))
-                begin, there = d * (first[a:b] - first[a]), counts[present[a:b]]
-                rows = d * count[a:b]
-                places = zip(
-                    present[a:b].tolist(),
-                    map(slice, there.tolist(), (there + rows).tolist()),
-                    map(slice, begin.tolist(), (begin + rows).tolist()),
-                    strict=True,
-                )
-                parts.append(_Part(whole if in_order else order[whole], list(places)))
-            block.parts.append(parts)
-            counts[present] += d * count
+        found = factor_layout(
+            [self._nodes_of(b) for b in block.bound],
+            [len(b.observation.components) for b in block.bound],
+        )
+        block.parts = found.parts
         sizes = self._sizes(block)
         block.matrices, block.vectors, block.factors = [], [], []
-        variables = self._keys_at(block, used).tolist()
-        for own, rows in zip(variables, counts.tolist(), strict=True):
+        variables = self._keys_at(block, found.nodes).tolist()
+        for own, rows in zip(variables, found.rows, strict=True):
             factor = jacobian_template(own, sizes, rows)
             block.factors.append(factor)
             block.matrices.append(factor.getA())
@@ -839,7 +803,7 @@ class Problem:
         Columns: state, bias, correlated error, parameters. `transitions` to times of a motion, by
         its identity and which they are, are kept for other observations there.
         """
-        lin = _of_some(lin, some)
+        lin = some_of(lin, some)
         motion = evaluation.motions[self._bound.index(bound)]
         attachment = rows_of(bound.attachment, some)
         errors = self._imu_errors
@@ -873,69 +837,3 @@ class Problem:
         weight = bound.weight[some]
         full *= weight[:, :, None]
         return full, weight * residual
-
-
-def _part_edges(first: IntArray, count: int) -> list[int]:
-    """Return where parts of some measurements begin and end, by the first ones of factors."""
-    begins = np.searchsorted(first, np.arange(0, count, _CHUNK))
-    return np.unique(np.append(begins, first.size)).tolist()
-
-
-def _of_some(lin: Linearization, some: slice | IntArray) -> Linearization:
-    """Return the derivatives of some of M measurements."""
-    count = len(lin.residual)
-
-    def own(each: Array) -> Array:
-        # What is the same for all stands there once.
-        return np.asarray(np.broadcast_to(each, (count, *each.shape[1:]))[some])
-
-    by_motion = {
-        name: own(each)
-        for name in ("d_theta", "d_p", "d_v", "d_omega")
-        if (each := getattr(lin, name)) is not None
-    }
-    by_parameters = {name: own(each) for name, each in lin.d_parameters.items()}
-    return Linearization(lin.residual[some], **by_motion, d_parameters=by_parameters)
-
-
-def node_jacobian(lin: Linearization, transition: Transition) -> Array:
-    """Return the derivative of residuals with respect to node and bias, (M, d, 15).
-
-    Columns: attitude, position, velocity in GTSAM's tangent space of NavState, then
-    accelerometer and gyro bias.
-
-    Parameters
-    ----------
-    lin : Linearization
-        Derivatives with respect to the motion at the M times.
-    transition : Transition
-        From the nodes to these times.
-    """
-    products: list[list[tuple[Array, Array]]] = [[] for _ in range(5)]
-    theta, p, v, accel, gyro = products
-    d_theta = attitude_jacobian(lin, transition)
-    if d_theta is not None:
-        theta.append((d_theta, transition.theta_theta))
-        gyro.append((d_theta, transition.theta_gyro))
-    if lin.d_p is not None:
-        theta.append((lin.d_p, transition.p_theta))
-        p.append((lin.d_p, transition.p_p))
-        v.append((lin.d_p, transition.p_v))
-        accel.append((lin.d_p, transition.p_accel))
-        gyro.append((lin.d_p, transition.p_gyro))
-    if lin.d_v is not None:
-        theta.append((lin.d_v, transition.v_theta))
-        v.append((lin.d_v, transition.v_v))
-        accel.append((lin.d_v, transition.v_accel))
-        gyro.append((lin.d_v, transition.v_gyro))
-    out = np.zeros((*lin.residual.shape, STATE_SIZE + BIAS_SIZE))
-    for i, of_block in enumerate(products):
-        block = out[:, :, 3 * i : 3 * i + 3]
-        # In place, the first product takes a third of the time.
-        for left, right in of_block[:1]:
-            np.matmul(left, right, out=block)
-        for left, right in of_block[1:]:
-            block += left @ right
-    if lin.d_omega is not None:
-        out[:, :, -3:] -= lin.d_omega
-    return out

@@ -87,7 +87,8 @@ def test_rows_of_some_measurements_at_a_time_are_those_of_all(monkeypatch):
     evaluation = problem.evaluate(values)
     at_once = jacobians(problem, evaluation)
     problem.release()
-    monkeypatch.setattr("factorgraph_dvl.graph.problem._CHUNK", 7)
+    for module in ("factor_layout", "problem"):
+        monkeypatch.setattr(f"factorgraph_dvl.graph.{module}.CHUNK", 7)
     in_parts = jacobians(problem, evaluation)
     for a, b in zip(at_once, in_parts, strict=True):
         np.testing.assert_array_equal(a, b)

@@ -15,7 +15,7 @@ from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.rotations import log_so3
 from factorgraph_dvl.geometry.units import DEG, HOUR
 from factorgraph_dvl.geometry.vectors import Array
-from factorgraph_dvl.graph.problem import node_jacobian
+from factorgraph_dvl.graph.node_jacobian import node_jacobian
 from factorgraph_dvl.imu.increments import increments
 from factorgraph_dvl.imu.preintegration import Segments, gtsam_measurements, segments
 from factorgraph_dvl.imu.propagation import States, Transition, attach, motion_at, segment_ends

@@ -1,0 +1,70 @@
+"""Derivatives of measurements by the node before them, through the motion in between."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from factorgraph_dvl.geometry.vectors import Array, IntArray
+from factorgraph_dvl.graph.keys import BIAS_SIZE, STATE_SIZE
+from factorgraph_dvl.imu.propagation import Transition, attitude_jacobian
+from factorgraph_dvl.sensors.protocol import Linearization
+
+
+def some_of(lin: Linearization, some: slice | IntArray) -> Linearization:
+    """Return residuals and derivatives of some of M measurements."""
+    count = len(lin.residual)
+
+    def own(each: Array) -> Array:
+        # What is the same for all stands there once.
+        return np.asarray(np.broadcast_to(each, (count, *each.shape[1:]))[some])
+
+    by_motion = {
+        name: own(each)
+        for name in ("d_theta", "d_p", "d_v", "d_omega")
+        if (each := getattr(lin, name)) is not None
+    }
+    by_parameters = {name: own(each) for name, each in lin.d_parameters.items()}
+    return Linearization(lin.residual[some], **by_motion, d_parameters=by_parameters)
+
+
+def node_jacobian(lin: Linearization, transition: Transition) -> Array:
+    """Return the derivative of residuals with respect to node and bias, (M, d, 15).
+
+    Columns: attitude, position, velocity in GTSAM's tangent space of NavState, then
+    accelerometer and gyro bias.
+
+    Parameters
+    ----------
+    lin : Linearization
+        Derivatives with respect to the motion at the M times.
+    transition : Transition
+        From the nodes to these times.
+    """
+    products: list[list[tuple[Array, Array]]] = [[] for _ in range(5)]
+    theta, p, v, accel, gyro = products
+    d_theta = attitude_jacobian(lin, transition)
+    if d_theta is not None:
+        theta.append((d_theta, transition.theta_theta))
+        gyro.append((d_theta, transition.theta_gyro))
+    if lin.d_p is not None:
+        theta.append((lin.d_p, transition.p_theta))
+        p.append((lin.d_p, transition.p_p))
+        v.append((lin.d_p, transition.p_v))
+        accel.append((lin.d_p, transition.p_accel))
+        gyro.append((lin.d_p, transition.p_gyro))
+    if lin.d_v is not None:
+        theta.append((lin.d_v, transition.v_theta))
+        v.append((lin.d_v, transition.v_v))
+        accel.append((lin.d_v, transition.v_accel))
+        gyro.append((lin.d_v, transition.v_gyro))
+    out = np.zeros((*lin.residual.shape, STATE_SIZE + BIAS_SIZE))
+    for i, of_block in enumerate(products):
+        block = out[:, :, 3 * i : 3 * i + 3]
+        # In place, the first product takes a third of the time.
+        for left, right in of_block[:1]:
+            np.matmul(left, right, out=block)
+        for left, right in of_block[1:]:
+            block += left @ right
+    if lin.d_omega is not None:
+        out[:, :, -3:] -= lin.d_omega
+    return out
