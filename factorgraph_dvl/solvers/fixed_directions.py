@@ -40,6 +40,8 @@ class SolvedProblem:
         standard deviations.
     findings : tuple of Finding, optional
         What the user must know.
+    spurious : ndarray, shape (K, P, P), optional
+        Spurious information by node there, if it is known already.
     """
 
     problem: Problem
@@ -47,6 +49,7 @@ class SolvedProblem:
     covariances: Posterior
     fixed: Array
     findings: tuple[Finding, ...] = ()
+    spurious: Array | None = None
 
 
 def with_covariances(
@@ -78,6 +81,7 @@ def with_covariances(
         problem, evaluation, covariances.parameters, covariances.given, at_truth=at_truth
     )
     fixed = information.undetermined_directions()
+    spurious: Array | None = information.by_node
     if fixed.size:
         # How other variables change with the directions is linear here, where these belong.
         full = parameter_information(problem, evaluation)
@@ -88,7 +92,8 @@ def with_covariances(
         problem.fix_directions(fixed, origin)
         minimum = minimise_again(problem.values(evaluation.states, origin))
         covariances = considered(posterior(problem, minimum), changes)
-    return SolvedProblem(problem, minimum, covariances, fixed, findings)
+        spurious = None
+    return SolvedProblem(problem, minimum, covariances, fixed, findings, spurious)
 
 
 def undetermined_there(solved: SolvedProblem, free: Problem) -> bool:

@@ -152,29 +152,31 @@ def information_history(found: SolvedProblem, *, entries: int | None = None) -> 
     problem.release()
     count = len(triangles)
     shown = np.unique(np.linspace(0, count - 1, min(entries or count, count)).astype(int))
-    undetermined = _undetermined(problem, evaluation, found.covariances.given, triangles, shown)
+    undetermined = _undetermined(found, triangles, shown)
     return as_history(
         problem, evaluation, found.fixed, triangles[shown], undetermined, nodes=shown
     )
 
 
-def _undetermined(
-    problem: Problem, evaluation: Evaluation, nodes: Array, triangles: Array, shown: Array
-) -> dict[int, Array]:
+def _undetermined(found: SolvedProblem, triangles: Array, shown: Array) -> dict[int, Array]:
     """Return the directions that the data do not determine yet, by entry of the history."""
+    problem = found.problem
     size = len(problem.prior_root)
     if size == 0:
         return {}
-    spurious = np.zeros((nodes.shape[0], size, size))
-    np.cumsum(spurious_information(problem, evaluation, nodes)[:-1], axis=0, out=spurious[1:])
+    by_node, given = found.spurious, found.covariances.given
+    if by_node is None:
+        by_node = spurious_information(problem, found.minimum.evaluation, given)
+    spurious = np.zeros_like(by_node)
+    np.cumsum(by_node[:-1], axis=0, out=spurious[1:])
     spurious = spurious[shown]
     # The last columns are those of the parameters: their triangle has all else eliminated.
     root = triangles[shown, -size:, -size:] @ problem.prior_root
     data = np.swapaxes(root, 1, 2) @ root - np.eye(size)
     # The last entry was judged by the solver.
     doubtful = np.flatnonzero(largest_spurious_share(data, spurious)[:-1] >= SPURIOUS)
-    found = {int(k): undetermined_directions(data[k], spurious[k]) for k in doubtful}
-    return {k: directions for k, directions in found.items() if directions.size}
+    left = {int(k): undetermined_directions(data[k], spurious[k]) for k in doubtful}
+    return {k: directions for k, directions in left.items() if directions.size}
 
 
 def run_filter(

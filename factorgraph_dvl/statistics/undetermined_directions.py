@@ -5,7 +5,8 @@ A direction whose information is mostly spurious is not observable, and stays at
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -38,12 +39,17 @@ class DataInformation:
     ----------
     data : ndarray, shape (P, P)
         Information once all other variables are eliminated.
-    spurious : ndarray, shape (P, P)
-        Part of it that the error of the motion is expected to add.
+    by_node : ndarray, shape (K, P, P)
+        Part of it that the error of the motion at each node is expected to add.
     """
 
     data: Array
-    spurious: Array
+    by_node: Array
+
+    @cached_property
+    def spurious(self) -> Array:
+        """Part of the information that the error of the motion is expected to add, (P, P)."""
+        return np.asarray(self.by_node.sum(axis=0))
 
     def undetermined_directions(self) -> Array:
         """Return the directions (P, h) that are not observable, if any is spurious."""
@@ -100,12 +106,10 @@ def data_information(
     """
     size = len(problem.prior_root)
     if size == 0:
-        return DataInformation(*[np.zeros((0, 0))] * 2)
+        return DataInformation(np.zeros((0, 0)), np.zeros((len(state_covariances), 0, 0)))
     data = np.linalg.inv(parameter_covariance) - np.eye(size)
-    spurious = spurious_information(problem, evaluation, state_covariances).sum(axis=0)
-    if at_truth:
-        data = data + spurious
-    return DataInformation(data, spurious)
+    out = DataInformation(data, spurious_information(problem, evaluation, state_covariances))
+    return replace(out, data=data + out.spurious) if at_truth else out
 
 
 def parameter_information(problem: Problem, evaluation: Evaluation) -> Array:
