@@ -16,6 +16,7 @@ from __future__ import annotations
 import weakref
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import gtsam
 import numpy as np
@@ -337,19 +338,21 @@ def _rows_by_step(
     """
     gaussian = problem.linearize(evaluation)
     time = problem.chain.segments.node_time
-    step = {keys.node(k): k for k in range(time.size)}
+    of_states = {keys.node(k): k for k in range(time.size)}
     if problem.chain.walking:
-        step |= {keys.bias(k): k for k in range(time.size)}
+        of_states |= {keys.bias(k): k for k in range(time.size)}
+    of_errors: dict[int, int] = {}
     for p in problem.processes:
         before = np.searchsorted(time, p.time, side="right") - 1
-        step |= {p.key(j): int(k) for j, k in enumerate(np.clip(before, 0, time.size - 1))}
+        of_errors |= {p.key(j): int(k) for j, k in enumerate(np.clip(before, 0, time.size - 1))}
     priors = problem.graph.size()
     out: dict[int, list[_Factor]] = {}
     for i in range(gaussian.size()):
         factor = gaussian.at(i)
         involved = list(factor.keys())
-        states = {step[key] for key in involved if key in step and not keys.is_process(key)}
-        known = states or {step[key] for key in involved if key in step}
+        known = {of_states[key] for key in involved if key in of_states} or {
+            of_errors[key] for key in involved if key in of_errors
+        }
         is_prior = i < priors and known <= {0}
         if is_prior and not with_priors:
             continue
@@ -395,5 +398,11 @@ def _triangle(rows: Array, size: int) -> Array:
         rows = np.concatenate([rows, np.zeros((size - rows.shape[0], size))])
     # Rows of large weight first: Householder's reflections then lose no digits of the others.
     heavy = np.argsort(-np.abs(rows).max(axis=1), kind="stable")
-    R = np.triu(dgeqrf(rows[heavy])[0][:size])
-    return R * np.where(np.diag(R) < 0.0, -1.0, 1.0)[:, None]
+    R = dgeqrf(rows[heavy])[0][:size]
+    return R * np.where(np.diag(R) < 0.0, -1.0, 1.0)[:, None] * _upper(size)
+
+
+@lru_cache(maxsize=16)
+def _upper(size: int) -> Array:
+    """Return ones on and above the diagonal, (size, size), zeros below it."""
+    return np.triu(np.ones((size, size)))
