@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from enum import StrEnum
@@ -9,7 +10,6 @@ from functools import partial
 from importlib import import_module
 from math import isfinite
 from pathlib import Path
-from threading import Thread
 from typing import TYPE_CHECKING, Annotated, cast
 
 import typer
@@ -264,7 +264,10 @@ def _solve_into(
 
     work = claim_output(out, force=force, owned=OWNED, inputs=inputs_of(trial_path))
     with ProgressLine(quiet=quiet) as progress, ExitStack() as second:
-        with _loading(solver):
+        with ThreadPoolExecutor() as beside:
+            # Python waits little while Arrow reads tables, and while files are hashed.
+            beside.submit(import_module, f"factorgraph_dvl.{solver}")
+            fingerprint = beside.submit(_fingerprint, trial_path, options)
             trial = load_trial(trial_path, anyway=anyway)
         draw: Callable[[_Drawn], Callable[[], None]] | None = None
         if figures is not None:
@@ -272,7 +275,7 @@ def _solve_into(
             draw = second.enter_context(
                 on_standby(partial(_draw, trial, figures.value), _load_figures)
             )
-        stages = None if options is None else _stages(work, trial_path, options, resume)
+        stages = None if options is None else _stages(work, fingerprint.result(), resume)
         found = run(trial, progress, stages)
         solution, history = found.solution, found.history
 
@@ -305,26 +308,18 @@ def _solve_into(
     end_with(solution.verdict)
 
 
-@contextmanager
-def _loading(name: str) -> Iterator[None]:
-    """Load a module meanwhile: Python waits little while Arrow reads tables."""
-    thread = Thread(target=import_module, args=(f"factorgraph_dvl.{name}",))
-    thread.start()
-    try:
-        yield
-    finally:
-        thread.join()
-
-
-def _stages(
-    work: Path, trial_path: Path, options: Mapping[str, str], resume: bool
-) -> FinishedStages:
-    """Return the finished stages of a run; they are removed unless it is interrupted or killed."""
+def _fingerprint(trial_path: Path, options: Mapping[str, str] | None) -> str:
+    """Return the hash of what a run depends on; empty if it keeps no stages."""
     from factorgraph_dvl.campaign.record import fingerprint_of
-    from factorgraph_dvl.io.finished_stages import FinishedStages
     from factorgraph_dvl.io.trial_folder import files_of
 
-    fingerprint = fingerprint_of(files_of(trial_path), options)
+    return "" if options is None else fingerprint_of(files_of(trial_path), options)
+
+
+def _stages(work: Path, fingerprint: str, resume: bool) -> FinishedStages:
+    """Return the finished stages of a run; they are removed unless it is interrupted or killed."""
+    from factorgraph_dvl.io.finished_stages import FinishedStages
+
     stages = FinishedStages(work / "stages", fingerprint, resume=resume)
     if resume and not stages.found:
         warn(

@@ -157,7 +157,7 @@ class SquareRootInformation:
                 block = pending.setdefault(key, np.zeros((self._sizes[key], total)))
                 block[:, first:last] += matrix.T
         for clique in reversed(self._cliques):
-            if not any(key in pending for key in clique.frontals):
+            if pending.keys().isdisjoint(clique.frontals):
                 yield np.zeros((clique.R.shape[0], total))
                 continue
             w = np.concatenate(
