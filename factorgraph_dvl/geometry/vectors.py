@@ -24,8 +24,9 @@ _SKEW[_LAST, 3 * np.arange(3) + _NEXT] = -1.0
 
 def median(values: Array) -> float:
     """Return the median of numbers (N,); of few, in a tenth of the time of NumPy's."""
-    places = (values.size - 1) // 2, values.size // 2
-    return 0.5 * float(np.partition(values, places)[list(places)].sum())
+    below, above = (values.size - 1) // 2, values.size // 2
+    placed = np.partition(values, (below, above))
+    return 0.5 * float(placed[below] + placed[above])
 
 
 def skew(v: ArrayLike) -> Array:
@@ -61,7 +62,7 @@ def cross_variance(omega_sigma: Array, squares: Array) -> Array:
     components of l, (3,) or (M, 3).
     """
     across = squares.sum(axis=-1, keepdims=True) - squares
-    return np.asarray(0.5 * np.sum(omega_sigma**2 * across, axis=1))
+    return np.asarray(0.5 * (omega_sigma**2 * across).sum(axis=1))
 
 
 def rotate(matrices: Array, vectors: Array) -> Array:

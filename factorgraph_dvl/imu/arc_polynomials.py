@@ -155,6 +155,16 @@ class ArcPolynomials:
                 out[base + begin : base + begin + len(highest)] = np.linalg.norm(highest, axis=1)
         return out
 
+    def _bounds(self, index: IntArray) -> tuple[IntArray | int, IntArray | int, IntArray | int]:
+        """Return first and last-plus-one interval, and first sample, of the arcs of intervals.
+
+        Of a single arc plain numbers, which take less time.
+        """
+        if len(self.arcs) == 1:
+            return int(self.arcs[0, 0]), int(self.arcs[0, 1]), int(self.first_sample[0])
+        arc = self.arc_of[index]
+        return self.arcs[arc, 0], self.arcs[arc, 1], self.first_sample[arc]
+
     @property
     def difference_sigma(self) -> float:
         """Standard deviation of the highest difference from the noise of the gyro, rad/s."""
@@ -162,13 +172,12 @@ class ArcPolynomials:
 
     def _centred_sample(self, index: IntArray) -> IntArray:
         """Return the first sample of the centred stencil of intervals `index`."""
-        arc = self.arc_of[index]
-        first, last = self.arcs[arc, 0], self.arcs[arc, 1]
+        first, last, base = self._bounds(index)
         count = last - first + (0 if self.averaged else 1)
         stencil = np.minimum(np.maximum(index - first - 2, 0), count - self.width)
-        return np.asarray(self.first_sample[arc] + stencil)
+        return np.asarray(base + stencil)
 
-    def _stencil(self, inside: IntArray, most: IntArray, base: IntArray) -> IntArray:
+    def _stencil(self, inside: IntArray, most: IntArray | int, base: IntArray | int) -> IntArray:
         """Return the first sample, within the arc, of the stencils of intervals `inside` it.
 
         Centred, unless the rate is rougher there than noise explains: then the smoothest
@@ -178,6 +187,7 @@ class ArcPolynomials:
         roughness = self._roughness[base + stencil]
         (rough,) = (roughness > _ROUGH * self.difference_sigma).nonzero()
         if rough.size:
+            most, base = (np.broadcast_to(each, inside.shape) for each in (most, base))
             back = np.arange(self.width if self.averaged else self.width - 1)
             options = np.clip(inside[rough, None] - back, 0, most[rough, None])
             scores = self._roughness[base[rough, None] + options]
@@ -199,11 +209,10 @@ class ArcPolynomials:
         return self._fit(np.arange(self.dt.size))
 
     def _fit(self, index: IntArray) -> Array:
-        arc = self.arc_of[index]
-        first, last = self.arcs[arc, 0], self.arcs[arc, 1]
+        first, last, base = self._bounds(index)
         width = self.width
         count = last - first + (0 if self.averaged else 1)
-        inside, base = index - first, self.first_sample[arc]
+        inside = index - first
         stencil = self._stencil(inside, count - width, base)
         offset = inside - stencil
         rows = (base + stencil)[:, None] + np.arange(width)

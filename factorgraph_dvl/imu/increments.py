@@ -136,7 +136,7 @@ class Increments(ArcPolynomials):
         for a in range(0, index.size, _CHUNK):
             part = index[a : a + _CHUNK]
             c = self.coefficients(part)
-            phi[a : a + _CHUNK], dv[a : a + _CHUNK] = integrate(c, self.dt[part], 1.0)
+            phi[a : a + _CHUNK], dv[a : a + _CHUNK] = integrate(c, self.dt[part])
         return phi, dv
 
     def partial(self, index: IntArray, since: Array) -> Partial:
@@ -154,7 +154,9 @@ class Increments(ArcPolynomials):
         omega_sigma, alpha_sigma, force_sigma = (np.empty(index.size) for _ in range(3))
         time = self.start[index] + since
         for arc, (rates, forces) in enumerate(self.smoothed):
-            mine = np.flatnonzero(self.arc_of[index] == arc)
+            # Views of all are no copies.
+            alone = len(self.arcs) == 1
+            mine = slice(None) if alone else np.flatnonzero(self.arc_of[index] == arc)
             omega_sigma[mine], alpha_sigma[mine] = rates.sigma, rates.slope_sigma
             force_sigma[mine] = forces.sigma
             if rates.spline is None:
@@ -198,27 +200,45 @@ class Increments(ArcPolynomials):
         for (a, b), base, dt, unlike in zip(
             self.arcs, self.first_sample, self.step, self.unevenness, strict=True
         ):
-            steps = self.dt[a:b]
-            time = self.start[a:b] + 0.5 * steps
+            time = self.start[a:b] + 0.5 * self.dt[a:b]
             if not self.averaged:
                 time = np.append(self.start[a:b], self.end[b - 1])
             own = slice(base, base + time.size)
-            regular = unlike < UNIFORM
-            pair = []
-            for i, (signal, sigma) in enumerate(
-                ((self.rate[own], self.gyro_sigma), (self.force[own], self.accel_sigma))
-            ):
-                window = None if self.windows is None else self.windows[i]
-                pair.append(
-                    smooth(time, signal, dt, sigma, averaged=self.averaged, window=window)
-                    if regular
-                    else unsmoothed(dt, sigma)
-                )
+            rates, forces = self._smoothed_pair(
+                time, self.rate[own], self.force[own], dt, regular=unlike < UNIFORM
+            )
             # Those of few are not worth sharing.
             if self.dt.size > _FEW:
-                pair[1] = pair[1].on_knots_of(pair[0])
-            out.append((pair[0], pair[1]))
+                forces = forces.on_knots_of(rates)
+            out.append((rates, forces))
         return tuple(out)
+
+    def smooth_with_neighbours(self, time: Array, rate: Array, force: Array) -> None:
+        """Smooth a single arc as part of samples (S, 3) that reach beyond it, at times (S,)."""
+        dt = time[1:] - time[:-1]
+        step = median(dt)
+        regular = bool(np.abs(dt / step - 1.0).max() < UNIFORM)
+        middle = time - 0.5 * np.concatenate([[step], dt]) if self.averaged else time
+        self.keep((self._smoothed_pair(middle, rate, force, step, regular=regular),))
+
+    def _smoothed_pair(
+        self, time: Array, rate: Array, force: Array, dt: float, *, regular: bool
+    ) -> tuple[Smoothed, Smoothed]:
+        if not regular:
+            return unsmoothed(dt, self.gyro_sigma), unsmoothed(dt, self.accel_sigma)
+        by_rate, by_force = (None, None) if self.windows is None else self.windows
+        return (
+            smooth(time, rate, dt, self.gyro_sigma, averaged=self.averaged, window=by_rate),
+            smooth(
+                time,
+                force,
+                dt,
+                self.accel_sigma,
+                averaged=self.averaged,
+                window=by_force,
+                with_misfit=False,
+            ),
+        )
 
     def _blended_rate(self, index: IntArray, since: Array, c: Array) -> tuple[Array, Array]:
         """Return rate and derivative, (M, 3), continuous from interval to interval.
@@ -300,9 +320,16 @@ def increments(
 
 
 def unbroken_increments(
-    settings: ImuSettings, time: Array, rate: Array, force: Array, windows: tuple[int, int]
+    settings: ImuSettings,
+    time: Array,
+    rate: Array,
+    force: Array,
+    windows: tuple[int, int],
+    wanted: slice,
 ) -> Increments:
     """Return increments between samples of which none was lost, with times as they are.
+
+    Those outside of what is wanted are only smoothed with it.
 
     Parameters
     ----------
@@ -314,26 +341,31 @@ def unbroken_increments(
         The samples.
     windows : tuple of (int, int)
         See `Increments`.
+    wanted : slice
+        The samples between which increments are wanted, `_LEAST` at least.
     """
-    since = time - time[0]
+    own = time[wanted]
+    since = own - own[0]
     dt = since[1:] - since[:-1]
     usual = median(dt)
-    start = time[:-1]
+    start = own[:-1]
     if settings.sampling == "mean":
         dt = np.concatenate([[usual], dt])
         start = np.concatenate([[start[0] - usual], start])
-    return _increments(
+    out = _increments(
         settings,
         usual,
         windows,
         start=start,
         dt=dt,
         arcs=np.array([[0, dt.size]]),
-        rate=rate,
-        force=force,
+        rate=rate[wanted],
+        force=force[wanted],
         first_sample=np.zeros(1, dtype=int),
         open_sigma=np.zeros((dt.size, 6)),
     )
+    out.smooth_with_neighbours(time, rate, force)
+    return out
 
 
 def _increments(

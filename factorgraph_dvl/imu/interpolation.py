@@ -59,7 +59,7 @@ class Smoothed:
     spline : BSpline or None
         Value over time, None where the samples are best left alone.
     misfit : BSpline or None
-        What the window does not resolve, over time; None likewise.
+        What the window does not resolve, over time; None where nothing, or where not asked for.
     sigma, slope_sigma : float
         Standard deviation of value and derivative from the noise.
     window : int
@@ -75,12 +75,9 @@ class Smoothed:
     def at(self, time: Array) -> tuple[Array, Array, Array]:
         """Return value, derivative and what is not resolved at times, (M, 3) each."""
         assert self.spline is not None
-        assert self.misfit is not None
-        return (
-            np.asarray(self.spline(time)),
-            np.asarray(self.spline(time, 1)),
-            np.asarray(np.abs(self.misfit(time))),
-        )
+        value = np.asarray(self.spline(time))
+        misfit = np.zeros_like(value) if self.misfit is None else np.abs(self.misfit(time))
+        return value, np.asarray(self.spline(time, 1)), np.asarray(misfit)
 
     def on_knots_of(self, other: Smoothed) -> Smoothed:
         """Return this signal on the knots of another one at the same times, which are then one."""
@@ -134,6 +131,7 @@ def smooth(
     *,
     averaged: bool,
     window: int | None = None,
+    with_misfit: bool = True,
 ) -> Smoothed:
     """Smooth a signal.
 
@@ -151,20 +149,26 @@ def smooth(
         Whether samples are means over their intervals.
     window : int, optional
         Number of samples; None = `best_window`.
+    with_misfit : bool, default True
+        Whether to find what the window does not resolve.
     """
     width = best_window(values, dt, sigma) if window is None else window
     if width == 0 or width > values.shape[0]:
         return unsmoothed(dt, sigma)
     least = _STEP * sigma * white_gain(_NARROW)
+    misfit: Array | None
     if values.shape[0] > _SHORT:
         spline, misfit = _long_spline(time, values, width, least, averaged=averaged)
     else:
         to_spline, to_misfit = _short_matrices(values.shape[0], width, averaged)
         spline = _short_spline(time, to_spline @ values, 3)
-        misfit = _from(least, to_misfit @ values)
+        misfit = _from(least, to_misfit @ values) if with_misfit else None
+    line = None
+    if with_misfit and misfit is not None and misfit.any():
+        line = _broken_line(time, misfit)
     return Smoothed(
         spline=spline,
-        misfit=_broken_line(time, misfit),
+        misfit=line,
         sigma=sigma * white_gain(width),
         slope_sigma=sigma * _slope_gain(width) / dt,
         window=width,

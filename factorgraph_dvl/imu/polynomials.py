@@ -12,6 +12,8 @@ from factorgraph_dvl.geometry.vectors import Array, cross, median
 # Gauss-Legendre quadrature with three nodes on [0, 1]: exact up to degree five.
 _GAUSS_NODES = np.array([0.5 - np.sqrt(15.0) / 10.0, 0.5, 0.5 + np.sqrt(15.0) / 10.0])
 _GAUSS_WEIGHTS = np.array([5.0, 8.0, 5.0]) / 18.0
+# What takes differences of rates there to their first and second derivative over an interval.
+_SLOPE, _CURVATURE = np.sqrt(15.0) / 3.0, 10.0 / 3.0
 
 
 def highest_difference(
@@ -83,27 +85,26 @@ def rate_and_slope(c: Array, since: Array, dt: Array) -> tuple[Array, Array]:
     return at[:, 0], at[:, 1] / dt[:, None]
 
 
-def integrate(c: Array, dt: Array, u: Array | float) -> tuple[Array, Array]:
-    """Return rotation vector and velocity increment over [0, u] of intervals.
+def integrate(c: Array, dt: Array, u: Array | None = None) -> tuple[Array, Array]:
+    """Return rotation vector and velocity increment over [0, u] of intervals, or over all of them.
 
     The rotation by the sixth-order Magnus expansion at Gauss points (Blanes, Casas,
     Oteo, Ros, Phys. Rep. 470 (2009), eq. 253), the velocity by Gauss quadrature of the
     force rotated to the start.
     """
-    nodes = np.multiply.outer(u, _GAUSS_NODES)
-    rows = powers(nodes, c.shape[1])
+    count = c.shape[1]
+    rows, integral = _whole_rows(count) if u is None else _node_rows(u, count)
     at = _at_nodes(rows, c)
     w1, w2, w3 = at[:, :, :3]
-    h = (dt * u)[:, None]
+    h = (dt if u is None else dt * u)[:, None]
     a1 = h * w2
-    a2 = (np.sqrt(15.0) / 3.0) * h * (w3 - w1)
-    a3 = (10.0 / 3.0) * h * (w3 - 2.0 * w2 + w1)
+    a2 = _SLOPE * h * (w3 - w1)
+    a3 = _CURVATURE * h * (w3 - 2.0 * w2 + w1)
     # R' = R [w x] mirrors the textbook's Y' = A Y: every commutator changes sign.
     c1 = -cross(a1, a2)
     c2 = cross(a1, 2.0 * a3 + c1) / 60.0
     phi = a1 + a3 / 12.0 - cross(-20.0 * a1 - a3 + c1, a2 + c2) / 240.0
 
-    integral = rows * nodes[..., None] / np.arange(1, c.shape[1] + 1)
     turned = dt[:, None] * _at_nodes(integral, c[:, :, :3])
     force = at[:, :, 3:]
     once = cross(turned, force)
@@ -111,6 +112,21 @@ def integrate(c: Array, dt: Array, u: Array | float) -> tuple[Array, Array]:
     rotated = force + once + twice / 2.0 + cross(turned, twice) / 6.0
     mean = rotated.transpose(1, 2, 0) @ _GAUSS_WEIGHTS
     return phi, h * mean
+
+
+def _node_rows(u: Array | float, count: int) -> tuple[Array, Array]:
+    """Return what takes coefficients to values at Gauss points of [0, u], and to integrals there.
+
+    Of shape (..., 3, count) for numbers u (...).
+    """
+    nodes = np.multiply.outer(u, _GAUSS_NODES)
+    rows = powers(nodes, count)
+    return rows, rows * nodes[..., None] / np.arange(1, count + 1)
+
+
+@lru_cache(maxsize=8)
+def _whole_rows(count: int) -> tuple[Array, Array]:
+    return _node_rows(1.0, count)
 
 
 def _at_nodes(rows: Array, c: Array) -> Array:

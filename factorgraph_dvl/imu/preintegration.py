@@ -482,9 +482,9 @@ def one_segment(inc: Increments, first: int, last: int) -> Segments:
     turned = rotate(dR, dv)
     dV, dP = np.zeros((2, inside.size, 3))
     dA = np.zeros((inside.size, 3, 3))
-    np.cumsum(turned[:-1], axis=0, out=dV[1:])
-    np.cumsum((dR @ left * dt[:, :, None])[:-1], axis=0, out=dA[1:])
-    np.cumsum((dV * dt + 0.5 * turned * dt)[:-1], axis=0, out=dP[1:])
+    turned[:-1].cumsum(axis=0, out=dV[1:])
+    (dR @ left * dt[:, :, None])[:-1].cumsum(axis=0, out=dA[1:])
+    (dV * dt + 0.5 * turned * dt)[:-1].cumsum(axis=0, out=dP[1:])
     knots, whole = Integrals(dR, dV, dP, dA), slice(-1, None)
     return Segments(
         increments=inc,
@@ -552,7 +552,7 @@ def gtsam_measurements(
     out = []
     for block in seg.blocks():
         first, rate, force, step = by_steps(seg, block)
-        steps = step.tolist()
+        forces, rates, steps = list(force), list(rate), step.tolist()
         for s, (begin, end) in enumerate(pairwise(first.tolist()), block.start):
             params = gtsam.PreintegrationParams(gravity_n[s])
             params.setOmegaCoriolis(earth_rate_n)
@@ -567,14 +567,14 @@ def gtsam_measurements(
             pim = gtsam.PreintegratedImuMeasurementsG(params)
             add = pim.integrateMeasurement
             for i in range(begin, end):
-                add(force[i], rate[i], steps[i])
+                add(forces[i], rates[i], steps[i])
             out.append(pim)
     return out
 
 
 def _by_sample(seg: Segments, block: slice) -> tuple[IntArray, Array, Array, Array]:
     """Return steps of one sample each; see `_by_stride`."""
-    first = np.append(seg.first[block], seg.last[block][-1])
+    first = np.concatenate([seg.first[block], seg.last[block][-1:]])
     inside = np.arange(first[0], first[-1])
     phi, dv = seg.increments.over(inside)
     step = seg.increments.dt[inside]

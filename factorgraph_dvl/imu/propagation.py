@@ -138,7 +138,7 @@ def _attach_some(seg: Segments, index: IntArray, since: Array, earth_rate_n: Arr
     turned = rotate(dR, part.dv)
     h = since[:, None]
     tau = inc.start[index] + since - seg.node_time[node]
-    turned_by, turn = exp_so3(np.stack([part.phi, -tau[:, None] * earth_rate_n]))
+    turned_by, turn = exp_so3(np.array([part.phi, -tau[:, None] * earth_rate_n]))
     return Attachment(
         segment=segment,
         node=node,

@@ -131,7 +131,7 @@ class SampleBuffer:
         last = self._number[-1] if known else 0.0
         if not known:
             steps = np.concatenate([[0.0], steps])
-        self._number = np.concatenate([self._number, last + np.cumsum(np.maximum(steps, 1.0))])
+        self._number = np.concatenate([self._number, last + np.maximum(steps, 1.0).cumsum()])
 
     def _ordered(self, table: Array) -> tuple[Array, float]:
         """Return samples newer than all before, after correction of jumps of the clock back."""
@@ -235,9 +235,12 @@ class SampleBuffer:
         part, number = self._table[low:high], self._number[low:high]
         signals = part[:, 1:4], part[:, 4:7]
         if number[-1] - number[0] == high - low - 1:
-            inc = unbroken_increments(self._settings, time, *signals, self.windows)
+            # Polynomials need their neighbours only, smoothing all of its window.
+            near = slice(max(a - low - _SIDE, 0), b - low + _SIDE + 1)
+            inc = unbroken_increments(self._settings, time, *signals, self.windows, near)
             # Means end at their times.
-            return one_segment(inc, a - low + inc.averaged, b - low + inc.averaged)
+            before = low + near.start - inc.averaged
+            return one_segment(inc, a - before, b - before)
         inc, _ = increments(Imu(self._settings, time, *signals), self.windows)
         first = int(np.argmin(np.abs(inc.start - time[a - low])))
         last = int(np.argmin(np.abs(inc.end - time[b - low]))) + 1

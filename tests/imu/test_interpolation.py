@@ -91,8 +91,12 @@ def test_a_step_is_named_as_not_resolved():
     assert misfit[3].min() > 0.1
     np.testing.assert_allclose(misfit[2], found.at(np.array([4.99, 5.0]))[2].mean(axis=0))
     assert misfit[[0, -1]].max() == 0.0
-    # Nothing is kept where there is nothing.
+    # Nothing is kept where there is nothing, or where nobody asks.
     assert found.misfit.c.shape[0] < 50
+    assert smooth(TIME, 0.0 * values, DT, 1e-3, averaged=False, window=25).misfit is None
+    alone = smooth(TIME, values, DT, 1e-3, averaged=False, window=25, with_misfit=False)
+    assert alone.misfit is None
+    np.testing.assert_array_equal(alone.spline.c, found.spline.c)
 
 
 def test_samples_that_are_left_alone_have_their_own_noise():
