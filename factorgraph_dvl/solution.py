@@ -617,7 +617,7 @@ def as_estimates(
     for p in parameters:
         rows = slice(at, at + p.mean.size)
         at += p.mean.size
-        prior = p.sigma / p.si
+        prior_value, prior = p.reported_prior
         observable = (prior > 0.0) & (std[rows] <= OBSERVABLE * prior)
         if unseparated:
             observable &= [name not in unseparated for name in p.component_names]
@@ -627,7 +627,7 @@ def as_estimates(
                 component_names=p.component_names,
                 value=values[rows],
                 std=std[rows],
-                prior_value=p.mean / p.si,
+                prior_value=prior_value,
                 prior_std=prior,
                 observable=observable,
                 nominal=p.nominal,

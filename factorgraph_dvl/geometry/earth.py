@@ -16,6 +16,10 @@ SEMI_MAJOR = 6378137.0
 FLATTENING = 1.0 / 298.257223563
 ECCENTRICITY_SQUARED = FLATTENING * (2.0 - FLATTENING)
 _SEMI_MINOR = SEMI_MAJOR * (1.0 - FLATTENING)
+# What takes sine and cosine of a reduced latitude to those of the latitude and back, but for a
+# factor that they share; and their cubes to the centre of curvature.
+_TO_REDUCED = np.array([_SEMI_MINOR, SEMI_MAJOR])
+_CENTRE = ECCENTRICITY_SQUARED * np.array([SEMI_MAJOR**2 / _SEMI_MINOR, -SEMI_MAJOR])
 # Steps of the latitude. Measured: the third leaves rounding up to 10,000 km above the ellipsoid.
 _LATITUDE_STEPS = 3
 _GRAVITY_EQUATOR = 9.7803253359
@@ -72,9 +76,16 @@ def _ecef(lat: ArrayLike, lon: ArrayLike, height: ArrayLike) -> Array:
     height = np.asarray(height, dtype=float)
     s, c = np.sin(lat), np.cos(lat)
     east = SEMI_MAJOR / np.sqrt(1.0 - ECCENTRICITY_SQUARED * s**2)
-    out = (east + height) * c
-    up = ((1.0 - ECCENTRICITY_SQUARED) * east + height) * s
-    return np.stack([out * np.cos(lon), out * np.sin(lon), up], axis=-1)
+    along = (east + height) * c
+    out = np.empty((*np.broadcast(along, lon).shape, 3))
+    out[..., 0], out[..., 1] = along * np.cos(lon), along * np.sin(lon)
+    out[..., 2] = ((1.0 - ECCENTRICITY_SQUARED) * east + height) * s
+    return out
+
+
+def _unit(vectors: Array) -> Array:
+    """Return vectors (..., 2) of unit length."""
+    return np.asarray(vectors / np.hypot(vectors[..., 0], vectors[..., 1])[..., None])
 
 
 @dataclass(frozen=True)
@@ -129,16 +140,17 @@ class LocalFrame:
         By the reduced latitude, step by step: Bowring, Survey Review 23(181), 1976.
         """
         ecef = np.asarray(p_n, dtype=float) @ self._enu_from_ecef + self._origin
-        z, out = ecef[..., 2], np.hypot(ecef[..., 0], ecef[..., 1])
+        # Above the equator, and from the axis.
+        place = np.empty((*ecef.shape[:-1], 2))
+        place[..., 0] = z = ecef[..., 2]
+        place[..., 1] = out = np.hypot(ecef[..., 0], ecef[..., 1])
         # Sine and cosine of a latitude, but for a factor that they share.
-        up, along = SEMI_MAJOR * z, _SEMI_MINOR * out
+        reduced = place * _TO_REDUCED[::-1]
         for _ in range(_LATITUDE_STEPS):
-            size = np.hypot(up, along)
-            sine = z + ECCENTRICITY_SQUARED * SEMI_MAJOR**2 / _SEMI_MINOR * (up / size) ** 3
-            cosine = out - ECCENTRICITY_SQUARED * SEMI_MAJOR * (along / size) ** 3
-            up, along = _SEMI_MINOR * sine, SEMI_MAJOR * cosine
-        size = np.hypot(sine, cosine)
-        s, c = sine / size, cosine / size
+            latitude = place + _CENTRE * _unit(reduced) ** 3
+            reduced = latitude * _TO_REDUCED
+        latitude = _unit(latitude)
+        s, c = latitude[..., 0], latitude[..., 1]
         height = out * c + z * s - SEMI_MAJOR * np.sqrt(1.0 - ECCENTRICITY_SQUARED * s**2)
         return np.arctan2(s, c), np.arctan2(ecef[..., 1], ecef[..., 0]), height
 

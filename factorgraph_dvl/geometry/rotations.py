@@ -103,7 +103,7 @@ def inverse_right_jacobian(phi: ArrayLike) -> Array:
     Finite for |phi| < 2 pi.
     """
     phi = np.asarray(phi, dtype=float)
-    angle = np.linalg.norm(phi, axis=-1)[..., None, None]
+    angle = np.sqrt((phi * phi).sum(axis=-1))[..., None, None]
     cross = skew(phi)
     small = angle < 1e-4
     safe = np.where(small, 1.0, angle)
@@ -179,10 +179,11 @@ def rph_from_rotation(nRb: ArrayLike, body_axes: BodyAxes) -> Array:
     """Return roll, pitch, heading (..., 3), rad, of nRb; heading in [0, 2 pi)."""
     nRb = np.asarray(nRb, dtype=float)
     frd = _ENU_FROM_NED.T @ nRb @ _FRD_FROM_BODY[body_axes].T
-    pitch = np.arcsin(np.clip(-frd[..., 2, 0], -1.0, 1.0))
-    roll = np.arctan2(frd[..., 2, 1], frd[..., 2, 2])
-    heading = np.arctan2(frd[..., 1, 0], frd[..., 0, 0]) % (2.0 * np.pi)
-    return np.stack([roll, pitch, heading], axis=-1)
+    rph = np.empty(nRb.shape[:-1])
+    rph[..., 0] = np.arctan2(frd[..., 2, 1], frd[..., 2, 2])
+    rph[..., 1] = np.arcsin(np.maximum(np.minimum(-frd[..., 2, 0], 1.0), -1.0))
+    rph[..., 2] = np.arctan2(frd[..., 1, 0], frd[..., 0, 0]) % (2.0 * np.pi)
+    return rph
 
 
 def rph_jacobian(rph: ArrayLike, body_axes: BodyAxes) -> Array:

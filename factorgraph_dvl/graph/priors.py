@@ -160,11 +160,11 @@ def local_coordinates(p: Parameter, value: Array, origin: Array) -> Array:
 
 def places(parameters: Sequence[Parameter]) -> dict[str, slice]:
     """Return the place of each parameter among the components of all."""
-    ends = np.cumsum([p.mean.size for p in parameters])
-    return {
-        p.name: slice(int(end) - p.mean.size, int(end))
-        for p, end in zip(parameters, ends, strict=True)
-    }
+    out, end = {}, 0
+    for p in parameters:
+        out[p.name] = slice(end, end + p.mean.size)
+        end += p.mean.size
+    return out
 
 
 def after_step(

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import accumulate
 from typing import Any
 
 import gtsam
@@ -226,7 +227,7 @@ class NodeMeasurements:
         return places(self.parameters)
 
     @cached_property
-    def _wanted(self) -> list[list[str]]:
+    def wanted(self) -> list[list[str]]:
         """Names of the parameters that each kind depends on."""
         used = [parameters_of(r.observation) for r in self.rows]
         return [[name for name in self._place if name in each] for each in used]
@@ -242,8 +243,13 @@ class NodeMeasurements:
         for r in self.rows:
             if r.at != at:
                 part, at = rows_of(motion, r.at), r.at
-            late = true_time(r.observation, values, self.clock_zero) - r.time
-            out.append(extrapolated(part, late))
+            clock = r.observation.clock
+            # A clock that is not estimated stays as it was when the times were attached.
+            if clock is not None and not self._place.keys().isdisjoint(clock.names):
+                late = true_time(r.observation, values, self.clock_zero) - r.time
+                out.append(extrapolated(part, late))
+            else:
+                out.append(part)
         return out
 
     def linearize(
@@ -262,7 +268,7 @@ class NodeMeasurements:
         transition = Transition(at, states, motion, rate, increments)
         first, size = STATE_SIZE + BIAS_SIZE, sum(p.mean.size for p in self.parameters)
         residuals, matrices = [], []
-        for r, own, wanted in zip(self.rows, motions, self._wanted, strict=True):
+        for r, own, wanted in zip(self.rows, motions, self.wanted, strict=True):
             lin = linearized(r.observation, own, values, wanted, self.clock_zero)
             matrix = np.zeros((*lin.residual.shape, first + size))
             matrix[:, :, :first] = _by_motion(lin) @ transition.whole[r.at]
@@ -316,23 +322,31 @@ class Linearized:
 
     Parameters
     ----------
-    states, values : States or mapping of str to ndarray
-        Of the node and the parameters.
+    state, bias : gtsam.NavState or gtsam.imuBias.ConstantBias
+        Of the node.
+    values : mapping of str to ndarray
+        Of the parameters.
     residual, jacobian : ndarray
         As `NodeMeasurements.linearize` returns them.
     """
 
-    states: States
+    state: gtsam.NavState
+    bias: gtsam.imuBias.ConstantBias
     values: Mapping[str, Array]
     residual: Array
     jacobian: Array
 
-    def is_at(self, states: States, values: Mapping[str, Array]) -> bool:
-        """Whether it was computed at these very states and values."""
-        pairs = [*zip(vars(self.states).values(), vars(states).values(), strict=True)]
-        pairs += [(self.values[name], value) for name, value in values.items()]
+    def is_at(
+        self,
+        state: gtsam.NavState,
+        bias: gtsam.imuBias.ConstantBias,
+        values: Mapping[str, Array],
+    ) -> bool:
+        """Whether it was computed at this very state and these values."""
+        if not (self.state.equals(state, 0.0) and self.bias.equals(bias, 0.0)):
+            return False
         # Bytes of few numbers take less time to compare.
-        return all(ours.tobytes() == theirs.tobytes() for ours, theirs in pairs)
+        return all(self.values[name].tobytes() == at.tobytes() for name, at in values.items())
 
 
 def _by_motion(lin: Linearization) -> Array:
@@ -376,25 +390,25 @@ def measurement_factor(
     every = [node_key, bias_key, *parameter_keys]
     added = [] if errors is None else [*errors.items()]
     sizes = [STATE_SIZE, BIAS_SIZE, *(p.mean.size for p in measured.parameters)]
-    edges = np.cumsum([0, *sizes])
+    edges = list(accumulate(sizes, initial=0))
     rows = weight.size
     if len(every) != len(sizes):
         raise ValueError(f"{len(parameter_keys)} keys for {len(measured.parameters)} parameters")
 
     def error(this: gtsam.CustomFactor, at: gtsam.Values, jacobians: list[Array] | None) -> Array:
-        states = state_of(at.atNavState(node_key), at.atConstantBias(bias_key))
+        state, bias = at.atNavState(node_key), at.atConstantBias(bias_key)
         values = {
             p.name: at.atRot3(key).matrix() if p.rotation else at.atVector(key)
             for p, key in zip(measured.parameters, parameter_keys, strict=True)
         }
         error = sum((gain @ at.atVector(key) for key, gain in added), start=np.zeros(rows))
         if jacobians is None:
-            return weight * (measured.residuals(states, values) + error)
+            return weight * (measured.residuals(state_of(state, bias), values) + error)
         once = kept.pop() if kept else None
-        if once is not None and once.is_at(states, values):
+        if once is not None and once.is_at(state, bias, values):
             residual, matrix = once.residual, once.jacobian
         else:
-            residual, matrix, _ = measured.linearize(states, values)
+            residual, matrix, _ = measured.linearize(state_of(state, bias), values)
         if matrix.shape != (rows, edges[-1]) or len(jacobians) != len(sizes) + len(added):
             raise ValueError(f"Jacobian of shape {matrix.shape}, expected {(rows, edges[-1])}")
         matrix = matrix * weight[:, None]
@@ -410,11 +424,11 @@ def measurement_factor(
 
 def state_of(state: gtsam.NavState, bias: gtsam.imuBias.ConstantBias) -> States:
     """Return GTSAM's state and bias as the states of a single node."""
-    vector = bias.vector()
+    matrix, vector = state.matrix()[None], bias.vector()
     return States(
-        state.attitude().matrix()[None],
-        state.position()[None],
-        state.velocity()[None],
+        matrix[:, :3, :3],
+        matrix[:, :3, 3],
+        matrix[:, :3, 4],
         gyro_bias=vector[None, 3:],
         accel_bias=vector[None, :3],
     )

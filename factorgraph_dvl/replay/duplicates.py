@@ -37,7 +37,7 @@ class Duplicates:
         columns = list(arrays_of(record).values())
         new = np.ones(record.time.size, dtype=bool)
         for i in range(record.time.size):
-            row = b"".join(np.ascontiguousarray(column[i]).tobytes() for column in columns)
+            row = b"".join(column[i].tobytes() for column in columns)
             if row in known:
                 new[i] = False
                 continue

@@ -45,7 +45,9 @@ class InnovationGate:
     """
 
     def __init__(self) -> None:
-        self._windows: dict[str, deque[tuple[bool, float]]] = {}
+        # By kind, of the last measurements: whether each is an outlier, and its mean square, 0 of
+        # an outlier.
+        self._windows: dict[str, tuple[deque[bool], deque[float]]] = {}
         self.inconsistent: set[str] = set()
         self.excluded: set[str] = set()
         self.rejected: Counter[str] = Counter()
@@ -72,32 +74,36 @@ class InnovationGate:
         Finding or None
             What changed; None if nothing did.
         """
-        window = self._windows.setdefault(label, deque(maxlen=_WINDOW))
+        if label not in self._windows:
+            self._windows[label] = deque(maxlen=_WINDOW), deque(maxlen=_WINDOW)
+        outliers, squares = self._windows[label]
         limit = _LIMIT if echo_limit is None else echo_limit
         # A few numbers at a time: plain ones take a tenth of the time of arrays.
         rows = normalised.tolist()
         beyond = [any(abs(x) >= limit for x in row) for row in rows]
-        window.extend(zip(beyond, map(_mean_square, rows), strict=True))
-        finding = self._judge(label, window, limit, echo_limit is not None)
+        outliers.extend(beyond)
+        squares.extend(
+            0.0 if outlier else _mean_square(row)
+            for outlier, row in zip(beyond, rows, strict=True)
+        )
+        finding = self._judge(label, limit, echo_limit is not None)
         excluded = label in self.excluded
         used = [not (excluded or outlier) for outlier in beyond]
         self.rejected[label] += used.count(False)
         return np.array(used, dtype=bool), finding
 
-    def _judge(
-        self, label: str, window: deque[tuple[bool, float]], limit: float, echoes: bool
-    ) -> Finding | None:
+    def _judge(self, label: str, limit: float, echoes: bool) -> Finding | None:
         readmit, exclude = (
             (_READMIT_SHARE_ECHOES, _EXCLUDE_SHARE_ECHOES)
             if echoes
             else (_READMIT_SHARE, _EXCLUDE_SHARE)
         )
         # Outliers are rejected one by one and say nothing of the others.
-        within = [square for beyond, square in window if not beyond]
-        count = len(window) - len(within)
-        share = count / len(window)
-        rms = math.sqrt(math.fsum(within) / len(within)) if within else math.inf
-        full = len(window) == _WINDOW
+        outliers, squares = self._windows[label]
+        count, total = sum(outliers), len(outliers)
+        share = count / total
+        rms = math.sqrt(math.fsum(squares) / (total - count)) if count < total else math.inf
+        full = total == _WINDOW
         if label in self.inconsistent:
             if full and share <= readmit and rms < _CONSISTENT_RMS:
                 self.inconsistent.discard(label)
@@ -112,14 +118,14 @@ class InnovationGate:
                     label,
                 )
         if label not in self.excluded and (
-            (len(window) >= _LEAST and share > exclude) or (full and rms > _EXCLUDE_RMS)
+            (total >= _LEAST and share > exclude) or (full and rms > _EXCLUDE_RMS)
         ):
             self.inconsistent.add(label)
             self.excluded.add(label)
             text = message("contradicts.excluded", count=_WINDOW, ratio=rms)
             if share > exclude:
                 text = message(
-                    "contradicts.excluded_beyond", count=count, total=len(window), limit=limit
+                    "contradicts.excluded_beyond", count=count, total=total, limit=limit
                 )
             return Finding(Code.CONTRADICTS, text, label)
         return None

@@ -27,7 +27,8 @@ class LocalGravity:
 
     def at(self, p_n: Array) -> Array:
         """Return gravity (1, 3), m/s², at a position (1, 3), m."""
-        if np.linalg.norm(p_n - self._origin) > _LINEAR:
+        shift = p_n[0] - self._origin
+        if shift @ shift > _LINEAR**2:
             self._origin = p_n[0]
             nearby = p_n + _LINEAR * np.vstack([np.zeros(3), np.eye(3)])
             found = self._frame.gravity_without_rotation(nearby)

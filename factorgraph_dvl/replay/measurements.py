@@ -116,7 +116,7 @@ def gated(
         What the gate noticed.
     """
     there = np.isfinite(sigma)
-    total = np.sqrt(np.sum((jacobian @ P) * jacobian, axis=1) + sigma**2)
+    total = np.sqrt(((jacobian @ P) * jacobian).sum(axis=1) + sigma**2)
     all_found, all_spread = np.where(there, (residual, total), np.nan)
     weights, innovations, findings = [], [], []
     first = 0

@@ -329,7 +329,7 @@ class Navigator:
             at = self._linear
             states = state_of(at.state, at.bias)
             residual, matrix, motions = measured.linearize(states, at.parameters)
-            first = Linearized(states, at.parameters, residual, matrix)
+            first = Linearized(at.state, at.bias, at.parameters, residual, matrix)
             residual = residual + matrix @ self._local_coordinates(at)[own]
         else:
             states = state_of(s.state(k), s.bias(k))

@@ -101,10 +101,11 @@ class PendingMeasurements:
         for record in records:
             true = true_times(record)
             due = true < end - SAME_TIME
-            if due.all():
+            count = np.count_nonzero(due)
+            if count == due.size:
                 taken.append((record, true))
                 continue
-            if due.any():
+            if count:
                 taken.append((rows_of(record, due), true[due]))
                 record = rows_of(record, ~due)
             left.append(record)

@@ -10,7 +10,7 @@ is a leaf that can be marginalised as it is. The estimates are the same.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import accumulate
+from itertools import accumulate, takewhile
 
 import gtsam
 import numpy as np
@@ -124,8 +124,8 @@ class Smoother:
             Start values of the new state, of its bias if that walks, and of its errors.
         """
         if self._lag is not None:
-            gone = [k for k, t in self.times.items() if t < time - self._lag and k < self.node]
-            for k in gone:
+            end = time - self._lag
+            for k in takewhile(lambda k: self.times[k] < end, range(self.oldest, self.node)):
                 self._marginalise(k)
         self.node += 1
         self.times[self.node] = time
@@ -216,15 +216,15 @@ class Smoother:
 
     def states(self, wanted: Sequence[int]) -> States:
         """Return the estimates of states, by their indices, with the biases there."""
-        each = [self.state(k) for k in wanted]
+        matrices = np.array([self.state(k).matrix() for k in wanted])
         if self._walking:
             bias = np.array([self.bias(k).vector() for k in wanted])
         else:
-            bias = np.tile(self.bias(self.node).vector(), (len(each), 1))
+            bias = self.bias(self.node).vector()[None].repeat(len(wanted), axis=0)
         return States(
-            np.array([state.attitude().matrix() for state in each]),
-            np.array([state.position() for state in each]),
-            np.array([state.velocity() for state in each]),
+            matrices[:, :3, :3],
+            matrices[:, :3, 3],
+            matrices[:, :3, 4],
             gyro_bias=bias[:, 3:],
             accel_bias=bias[:, :3],
         )

@@ -86,5 +86,5 @@ class Clock:
         zero : float, s
             When the offset holds.
         """
-        offset, rate = (float(values[name][0]) for name in self.names)
+        offset, rate = float(values[self.offset.name][0]), float(values[self.rate.name][0])
         return offset + rate * (time - zero)

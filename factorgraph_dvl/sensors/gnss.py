@@ -247,7 +247,7 @@ class Gnss:
         lRn = frame.level_from_tangent(lat, lon)
         s = self.settings
         if has_position.any():
-            m = has_position
+            m = slice(None) if has_position.all() else has_position
             p_n = frame.position(*self.geodetic[m].T)
             bRc, _ = self._carrier(self.time[m])
             out.append(
@@ -267,7 +267,7 @@ class Gnss:
                 )
             )
         if has_velocity.any():
-            m = has_velocity
+            m = slice(None) if has_velocity.all() else has_velocity
             bRc, omega_cb_b = self._carrier(self.time[m])
             out.append(
                 PointVelocity(

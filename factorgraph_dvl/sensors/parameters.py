@@ -230,6 +230,11 @@ class Parameter:
         return self.spec.kind == "rotation"
 
     @cached_property
+    def reported_prior(self) -> tuple[Array, Array]:
+        """Mean and sigma in the unit in which they are reported."""
+        return self.mean / self.si, self.sigma / self.si
+
+    @cached_property
     def estimated(self) -> bool:
         """Whether any component is free."""
         return bool(np.any(self.sigma > 0.0))

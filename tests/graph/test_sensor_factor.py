@@ -151,7 +151,9 @@ def test_what_was_computed_elsewhere_is_not_taken():
     """A range is not linear in the position, nor a velocity in the accelerometer's bias."""
     measured, states, values = node_measurements(trial=FREE)
     residual, jacobian, _ = measured.linearize(states, values)
-    computed = Linearized(states, values, residual + 100.0, jacobian)
+    at = gtsam_values(measured, states, values)
+    own = at.atNavState(keys.node(0)), at.atConstantBias(keys.bias(0))
+    computed = Linearized(*own, values, residual + 100.0, jacobian)
 
     def is_taken(states, values):
         factor = factor_of(measured, computed)
