@@ -32,14 +32,16 @@ def median(values: Array) -> float:
 def skew(v: ArrayLike) -> Array:
     """Return the cross-product matrices [v x] of vectors (..., 3), as (..., 3, 3)."""
     v = np.asarray(v, dtype=float)
-    return np.asarray((v @ _SKEW).reshape(*v.shape, 3))
+    rows: Array = v @ _SKEW
+    return rows.reshape(*v.shape, 3)
 
 
 def cross(a: Array, b: Array) -> Array:
     """Return the cross products of vectors (..., 3), faster than NumPy's."""
     if max(a.size, b.size) <= 6 * _FEW:
         # Component i is the difference of products with the indices i + 1 and i + 2.
-        return np.asarray((a * b.take(_NEXT, -1) - a.take(_NEXT, -1) * b).take(_NEXT, -1))
+        differences: Array = a * b.take(_NEXT, -1) - a.take(_NEXT, -1) * b
+        return differences.take(_NEXT, -1)
     # For many, a quarter of the time.
     out = np.empty(np.broadcast_shapes(a.shape, b.shape))
     for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
@@ -68,5 +70,6 @@ def cross_variance(omega_sigma: Array, squares: Array) -> Array:
 def rotate(matrices: Array, vectors: Array) -> Array:
     """Return the products of matrices (M, 3, 3) and vectors (M, 3) or (3,), as (M, 3)."""
     if matrices.size <= 9 * _FEW:
-        return np.asarray((matrices @ vectors[..., None])[..., 0])
+        columns: Array = matrices @ vectors[..., None]
+        return columns[..., 0]
     return np.asarray(np.einsum("...ij,...j->...i", matrices, vectors))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -52,7 +53,7 @@ class Clock:
         )
         return cls(offset, rate)
 
-    @property
+    @cached_property
     def names(self) -> tuple[str, str]:
         """Names of offset and rate."""
         return self.offset.name, self.rate.name

@@ -204,7 +204,7 @@ class Parameter:
     joint: JointPrior | None = None
     nominal: Array | None = None
 
-    @property
+    @cached_property
     def name(self) -> str:
         """Name in calibration.json."""
         return self.spec.name
@@ -219,12 +219,12 @@ class Parameter:
         """Names of the components as in `covariance.order`."""
         return self.spec.component_names
 
-    @property
+    @cached_property
     def si(self) -> float:
         """SI value of one reported unit."""
         return self.spec.si
 
-    @property
+    @cached_property
     def rotation(self) -> bool:
         """Whether the value is a rotation."""
         return self.spec.kind == "rotation"
