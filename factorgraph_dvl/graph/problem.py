@@ -196,11 +196,13 @@ class Problem:
         Correlated errors of the observations, at most one each.
     usable : mapping of str to ndarray of bool, optional
         By label, measurements (M,) that may be used where the IMU covers them; by default all.
-    like : Problem, optional
-        Another one of the same segments, where measurements at the same times are bound already.
+    attached : sequence of (ndarray, Attachment), optional
+        Times (M,) that are attached already, such as those of another problem's `attached`.
 
     Attributes
     ----------
+    bound_at : dict of str to ndarray
+        Values of parameters at which measurements were bound to the chain.
     processes : tuple of Process
         They may be replaced by others at the same nodes.
     noise_factors : mapping of str to ndarray
@@ -234,7 +236,7 @@ class Problem:
         clock_zero: float | None = None,
         processes: Sequence[Process] = (),
         usable: Mapping[str, BoolArray] | None = None,
-        like: Problem | None = None,
+        attached: Sequence[tuple[Array, Attachment]] = (),
     ) -> None:
         self.chain = chain
         self.processes = tuple(processes)
@@ -266,12 +268,11 @@ class Problem:
         self.long_run: Mapping[str, Array] = {}
         self.robust_weights: Mapping[str, Array] = {}
         self.clock_tolerance: Mapping[str, float] = {}
-        self._start = {**self.prior_values(), **(start or {})}
+        self.bound_at = {**self.prior_values(), **(start or {})}
         self._bound: list[_Bound] = []
-        known = [] if like is None else like._bound
         for observation in observations:
             may_be_used = (usable or {}).get(observation.label)
-            self._bound.append(self._bind(observation, may_be_used, [*self._bound, *known]))
+            self._bound.append(self._bind(observation, may_be_used, attached))
         errors = [p for p in self.parameters if p.name in ERRORS]
         self._imu_errors: ImuErrors | None = None
         if errors:
@@ -294,6 +295,28 @@ class Problem:
     def attachments(self) -> tuple[Attachment, ...]:
         """Where the observations hang on the chain."""
         return tuple(b.attachment for b in self._bound)
+
+    def attached(
+        self, some: Sequence[IntArray | slice], first: int = 0
+    ) -> list[tuple[Array, Attachment]]:
+        """Return the true times of some measurements, and where they hang on a part of the chain.
+
+        Parameters
+        ----------
+        some : sequence of ndarray of int or slice
+            Which of each observation's.
+        first : int, default 0
+            First segment of that part.
+        """
+        out = {}
+        for bound, own in zip(self._bound, some, strict=True):
+            if id(bound.attachment) not in out:
+                at = rows_of(bound.attachment, own)
+                out[id(bound.attachment)] = (
+                    bound.time[own],
+                    replace(at, segment=at.segment - first),
+                )
+        return list(out.values())
 
     @property
     def imu_errors(self) -> ImuErrors | None:
@@ -671,10 +694,13 @@ class Problem:
         return States(nRb, p_n, v_n, gyro_bias=bias[:, 3:], accel_bias=bias[:, :3])
 
     def _bind(
-        self, observation: Observation, usable: BoolArray | None, others: Sequence[_Bound]
+        self,
+        observation: Observation,
+        usable: BoolArray | None,
+        attached: Sequence[tuple[Array, Attachment]],
     ) -> _Bound:
         """Tie an observation to the chain, as others at the same times are."""
-        time = true_time(observation, self._start, self.clock_zero)
+        time = true_time(observation, self.bound_at, self.clock_zero)
         covered = self.chain.segments.increments.locate(time)[2]
         if usable is not None:
             covered = covered & usable
@@ -683,9 +709,9 @@ class Problem:
         weight = np.repeat(covered.astype(float)[:, None], len(observation.components), axis=1)
         labels = [process.label for process in self.processes]
         own = labels.index(observation.label) if observation.label in labels else None
-        for other in others:
-            if np.array_equal(other.time, time):
-                return _Bound(observation, other.attachment, time, covered, weight, own)
+        for when, at in (*((b.time, b.attachment) for b in self._bound), *attached):
+            if np.array_equal(when, time):
+                return _Bound(observation, at, time, covered, weight, own)
         at, _ = attach_inside(self.chain.segments, time, self.chain.frame.earth_rate)
         # Times that are not covered weigh nothing; they only need a place on the chain.
         return _Bound(observation, at, time, covered, weight, own)

@@ -139,12 +139,18 @@ class Increments(ArcPolynomials):
             phi[a : a + _CHUNK], dv[a : a + _CHUNK] = integrate(c, self.dt[part])
         return phi, dv
 
-    def partial(self, index: IntArray, since: Array) -> Partial:
-        """Return the motion over the first `since` seconds of intervals `index`, (M,)."""
+    def partial(self, index: IntArray, since: Array, *, rates: bool = True) -> Partial:
+        """Return the motion over the first `since` seconds of intervals `index`, (M,).
+
+        The signals at its end are zero without `rates`: these take most of the time.
+        """
         c = self.coefficients(index)
         dt = self.dt[index]
         u = since / dt
         phi, dv = integrate(c, dt, u)
+        if not rates:
+            vectors, numbers = np.zeros((index.size, 3)), np.zeros(index.size)
+            return Partial(phi, dv, vectors, vectors, vectors, vectors, numbers, numbers)
         omega, alpha, force = (np.empty((index.size, 3)) for _ in range(3))
         # A step or a vibration leaves high differences, a smooth motion almost none; what
         # the gyro's noise accounts for is in its own standard deviation already.
@@ -153,16 +159,16 @@ class Increments(ArcPolynomials):
         unresolved = np.sqrt(np.maximum(rough**2 - noise**2, 0.0)) / 4.0
         omega_sigma, alpha_sigma, force_sigma = (np.empty(index.size) for _ in range(3))
         time = self.start[index] + since
-        for arc, (rates, forces) in enumerate(self.smoothed):
+        for arc, (rate, forces) in enumerate(self.smoothed):
             # Views of all are no copies.
             alone = len(self.arcs) == 1
             mine = slice(None) if alone else np.flatnonzero(self.arc_of[index] == arc)
-            omega_sigma[mine], alpha_sigma[mine] = rates.sigma, rates.slope_sigma
+            omega_sigma[mine], alpha_sigma[mine] = rate.sigma, rate.slope_sigma
             force_sigma[mine] = forces.sigma
-            if rates.spline is None:
+            if rate.spline is None:
                 omega[mine], alpha[mine] = self._blended_rate(index[mine], since[mine], c[mine])
             else:
-                omega[mine], alpha[mine], misfit = rates.at(time[mine])
+                omega[mine], alpha[mine], misfit = rate.at(time[mine])
                 unresolved[mine] = np.hypot(unresolved[mine], misfit)
             if forces.spline is None:
                 force[mine] = evaluate(c[mine, :, 3:], u[mine])

@@ -81,9 +81,9 @@ class Attachment:
     turn: Array
 
 
-def attach(seg: Segments, time: Array, earth_rate_n: Array) -> Attachment:
-    """Attach times (M,), all covered by arcs, to the chain."""
-    return _attach(seg, *_inside(seg, time), earth_rate_n)
+def attach(seg: Segments, time: Array, earth_rate_n: Array, *, rates: bool = True) -> Attachment:
+    """Attach times (M,), all covered by arcs, to the chain; without `rates` these are zero."""
+    return _attach(seg, *_inside(seg, time), earth_rate_n, rates=rates)
 
 
 def attach_with_ends(seg: Segments, time: Array, earth_rate_n: Array) -> Attachment:
@@ -114,23 +114,27 @@ def attach_inside(
     return attach(seg, np.where(covered, time, nearest), earth_rate_n), covered
 
 
-def segment_ends(seg: Segments, earth_rate_n: Array) -> Attachment:
-    """Attach the ends of all segments to the nodes at their starts."""
+def segment_ends(seg: Segments, earth_rate_n: Array, *, rates: bool = True) -> Attachment:
+    """Attach the ends of all segments to the nodes at their starts; `rates` as of `attach`."""
     index = seg.last - 1
-    return _attach(seg, index, seg.increments.dt[index], earth_rate_n)
+    return _attach(seg, index, seg.increments.dt[index], earth_rate_n, rates=rates)
 
 
-def _attach(seg: Segments, index: IntArray, since: Array, earth_rate_n: Array) -> Attachment:
+def _attach(
+    seg: Segments, index: IntArray, since: Array, earth_rate_n: Array, *, rates: bool = True
+) -> Attachment:
     parts = [
-        _attach_some(seg, index[a : a + _CHUNK], since[a : a + _CHUNK], earth_rate_n)
+        _attach_some(seg, index[a : a + _CHUNK], since[a : a + _CHUNK], earth_rate_n, rates=rates)
         for a in range(0, max(index.size, 1), _CHUNK)
     ]
     return parts[0] if len(parts) == 1 else concatenated(parts)
 
 
-def _attach_some(seg: Segments, index: IntArray, since: Array, earth_rate_n: Array) -> Attachment:
+def _attach_some(
+    seg: Segments, index: IntArray, since: Array, earth_rate_n: Array, *, rates: bool
+) -> Attachment:
     inc = seg.increments
-    part = inc.partial(index, since)
+    part = inc.partial(index, since, rates=rates)
     segment = seg.first.searchsorted(index, side="right") - 1
     node = seg.origin[segment]
     before = seg.since_start(index)

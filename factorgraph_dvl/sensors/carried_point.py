@@ -13,14 +13,14 @@ from factorgraph_dvl.sensors.protocol import (
     ExpectedCorrelation,
     Linearization,
     Motion,
-    PlainObservation,
+    ObservationByRows,
     Values,
     lever_arm_sigma,
 )
 
 
 @dataclass(frozen=True, kw_only=True)
-class _OfPoint(PlainObservation):
+class _OfPoint(ObservationByRows):
     """What position and velocity of a point have in common."""
 
     time: Array

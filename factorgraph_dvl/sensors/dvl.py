@@ -23,7 +23,7 @@ from factorgraph_dvl.sensors.protocol import (
     Linearization,
     Motion,
     Observation,
-    PlainObservation,
+    ObservationByRows,
     ScaleWalk,
     SensorSection,
     Values,
@@ -304,7 +304,7 @@ class Dvl:
 
 
 @dataclass(frozen=True)
-class DvlVelocity(PlainObservation):
+class DvlVelocity(ObservationByRows):
     """Velocity reported by a DVL.
 
     The error is zero where

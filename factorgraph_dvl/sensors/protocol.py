@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, replace
 from typing import Any, ClassVar, Literal, Protocol, Self, runtime_checkable
 
 import numpy as np
@@ -11,7 +11,7 @@ from msgspec import UNSET, UnsetType
 
 from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.rotations import BodyAxes
-from factorgraph_dvl.geometry.vectors import Array, cross_variance
+from factorgraph_dvl.geometry.vectors import Array, IntArray, cross_variance
 from factorgraph_dvl.sensors.finding import Finding
 from factorgraph_dvl.sensors.message import Message
 from factorgraph_dvl.sensors.parameters import Parameter, ParameterSpec
@@ -237,6 +237,25 @@ class PlainObservation:
     correlated: ExpectedCorrelation | None = None
     scale_walk: ScaleWalk | None = None
     independent: bool = False
+
+
+class ObservationByRows(PlainObservation):
+    """A data class of which every array with as many rows as measurements has one for each."""
+
+    time: Array
+
+    def some(self, index: IntArray) -> Self:
+        """Return some of its M measurements, (K,); of three, an axis would count as one."""
+        count = self.time.size
+
+        def own(value: Any) -> Any:
+            if isinstance(value, Mapping):
+                return {name: own(each) for name, each in value.items()}
+            by_row = isinstance(value, np.ndarray) and value.ndim and len(value) == count
+            return value[index] if by_row else value
+
+        every: Any = self
+        return replace(every, **{f.name: own(getattr(self, f.name)) for f in fields(every)})
 
 
 class SensorSection(Section, frozen=True, kw_only=True):

@@ -290,6 +290,8 @@ def _with_covariances(
 ) -> SolvedProblem:
     """Return a minimum with its covariances, and with undetermined directions fixed."""
     problem, before = settled.problem, settled.minimum
+    # All measurements are bound, and a trajectory has no rates.
+    problem.chain.segments.increments.release()
 
     def minimise_again(values: gtsam.Values) -> Minimum:
         stage = "all sensors, without undetermined directions"

@@ -22,8 +22,9 @@ import gtsam
 import numpy as np
 from scipy.linalg.lapack import dgeqrf, dtrtri
 
-from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.geometry.vectors import Array, IntArray
 from factorgraph_dvl.graph import keys
+from factorgraph_dvl.graph.freed_memory import return_freed
 from factorgraph_dvl.graph.keys import BIAS_SIZE
 from factorgraph_dvl.graph.problem import FIXED_DIRECTION_STD, Evaluation, Problem
 from factorgraph_dvl.solution import Progress, Solution
@@ -98,8 +99,6 @@ def solve_then_history(
     def follow(found: SolvedProblem) -> InformationHistory:
         if progress:
             progress("information along the trial", 0, None)
-        # All measurements are bound, and the trajectory is there.
-        found.problem.chain.segments.increments.release()
         out = information_history(found, entries=entries)
         followed.append((weakref.ref(found), out))
         return out
@@ -113,15 +112,17 @@ def solve_then_history(
         meanwhile=follow,
     )
 
+    done = next((known for minimum, known in followed if minimum() is solved), None)
+    if done is not None:
+        # The problem, most of what takes memory, is not needed any more then.
+        solved = None
+        return_freed()
+
     def history() -> InformationHistory | None:
         nonlocal solved
-        # The problem, most of what takes memory, is not needed any more then.
         found, solved = solved, None
         if found is None:
-            return None
-        done = (known for minimum, known in followed if minimum() is found)
-        if (out := next(done, None)) is not None:
-            return out
+            return done
         if isinstance(found, SolvedProblem):
             return follow(found)
         from factorgraph_dvl.solvers.motion_information import motion_history
@@ -149,14 +150,11 @@ def information_history(found: SolvedProblem, *, entries: int | None = None) -> 
         first and the last. By default every node has one.
     """
     problem, evaluation = found.problem, found.minimum.evaluation
-    triangles, _ = run_filter(problem, evaluation)
-    problem.release()
-    count = len(triangles)
+    count = problem.chain.segments.node_time.size
     shown = np.unique(np.linspace(0, count - 1, min(entries or count, count)).astype(int))
+    triangles, _ = run_filter(problem, evaluation, nodes=shown)
     undetermined = _undetermined(found, triangles, shown)
-    return as_history(
-        problem, evaluation, found.fixed, triangles[shown], undetermined, nodes=shown
-    )
+    return as_history(problem, evaluation, found.fixed, triangles, undetermined, nodes=shown)
 
 
 def _undetermined(found: SolvedProblem, triangles: Array, shown: Array) -> dict[int, Array]:
@@ -172,7 +170,7 @@ def _undetermined(found: SolvedProblem, triangles: Array, shown: Array) -> dict[
     np.cumsum(by_node[:-1], axis=0, out=spurious[1:])
     spurious = spurious[shown]
     # The last columns are those of the parameters: their triangle has all else eliminated.
-    root = triangles[shown, -size:, -size:] @ problem.prior_root
+    root = triangles[:, -size:, -size:] @ problem.prior_root
     data = np.swapaxes(root, 1, 2) @ root - np.eye(size)
     # The last entry was judged by the solver.
     doubtful = np.flatnonzero(largest_spurious_share(data, spurious)[:-1] >= SPURIOUS)
@@ -181,7 +179,11 @@ def _undetermined(found: SolvedProblem, triangles: Array, shown: Array) -> dict[
 
 
 def run_filter(
-    problem: Problem, evaluation: Evaluation, start: Frontier | None = None
+    problem: Problem,
+    evaluation: Evaluation,
+    start: Frontier | None = None,
+    *,
+    nodes: IntArray | None = None,
 ) -> tuple[Array, Frontier]:
     """Return the triangles over the constants before any data and at each later node.
 
@@ -192,15 +194,19 @@ def run_filter(
     start : Frontier, optional
         Information at the first node; by default the priors in the graph. If it is given, they
         are left out: it contains them.
+    nodes : ndarray of int, optional
+        Those whose triangles are returned, in order; by default all.
 
     Returns
     -------
     triangles : ndarray, shape (K, c, c)
-        Square-root information on the constants.
+        Square-root information on the constants, before any data for the first node of all.
     frontier : Frontier
         Information at the last node.
     """
     steps = _rows_by_step(problem, evaluation, with_priors=start is None)
+    # Nothing else holds the factors then, so that each goes with its step.
+    problem.release()
     sizes = evaluation.values.dims()
     last = problem.chain.segments.node_time.size - 1
     # A variable goes at the last step that depends on it, those of the last node never.
@@ -208,7 +214,9 @@ def run_filter(
     gone_after |= dict.fromkeys(_own_keys(problem, last), last)
     columns = _constants(problem)
     c = sum(sizes[key] for key in columns)
-    out = np.empty((last + 1, c, c))
+    wanted = np.arange(last + 1) if nodes is None else nodes
+    place = {k: i for i, k in enumerate(wanted.tolist())}
+    out = np.empty((wanted.size, c, c))
     frontier = [] if start is None else _own_keys(problem, 0)
     root = np.zeros((0, c)) if start is None else start.root
     for k in range(-1 if start is None else 0, last + 1):
@@ -223,7 +231,8 @@ def run_filter(
         gone = sum(sizes[key] for key in leaving)
         root, frontier = triangle[gone:, gone:], staying
         # Measurements at the very last node, if any, belong to its time.
-        out[min(k + 1, last)] = triangle[len(triangle) - c :, len(triangle) - c :]
+        if (at := place.get(min(k + 1, last))) is not None:
+            out[at] = triangle[len(triangle) - c :, len(triangle) - c :]
     ending = c + sum(sizes[key] for key in _own_keys(problem, last))
     return out, Frontier(root[len(root) - ending :, len(root) - ending :])
 

@@ -20,6 +20,7 @@ from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.sensors.imu import ERRORS, GYRO_SCALE, Imu
 from factorgraph_dvl.sensors.message import Message, message
 from factorgraph_dvl.sensors.parameters import UNITS, Parameter
+from factorgraph_dvl.sensors.protocol import ObservationByRows
 from factorgraph_dvl.solvers.change_along_trial import CHANGED, component_changes
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, factorized
 from factorgraph_dvl.solvers.state_ranges import StateRanges, eliminated_by_ranges
@@ -46,6 +47,8 @@ _LEAST_SCALE = 0.5
 # Share of the squares of a scale of the gyros that the wrong `sampling` may leave. Chosen: the
 # motion between samples is known to some per cent, and the scale to ten.
 _LEFT = 0.2
+# Measurements of a sensor up to which parts of a trial evaluate all. Chosen: these cost nothing.
+_FEW = 1000
 # Trial, s, from which on tests are made. Chosen: shorter ones have rival minima.
 _SHORTEST = 60.0
 
@@ -284,7 +287,13 @@ def _freed(
     names = {p.name for p in known}
     free = [wide(p, p.mean) if p.name in names else p for p in problem.all_parameters]
     ranges = eliminated_by_ranges(
-        partial(with_scattered_noise, problem, evaluation, free),
+        partial(
+            with_scattered_noise,
+            problem,
+            evaluation,
+            free,
+            noise=_as_scattered(problem, evaluation),
+        ),
         problem.chain,
         whole=bool(problem.processes),
     )
@@ -296,22 +305,29 @@ def with_scattered_noise(
     evaluation: Evaluation,
     parameters: Sequence[Parameter],
     block: slice | None = None,
+    *,
+    noise: dict[str, Array] | None = None,
 ) -> tuple[Problem, Evaluation]:
     """Return a problem with other parameters where it is, and noise as residuals scatter.
 
-    Of some segments only where a block of them is given.
+    Of some segments only where a block of them is given; `noise` has its factors, if known.
     """
     values = evaluation.parameters
     chain, observations, robust = problem.chain, problem.observations, problem.robust_weights
-    if block is not None:
+    if block is None:
+        attached = problem.attached([slice(None)] * len(observations))
+    else:
         own = [
             np.flatnonzero((at.segment >= block.start) & (at.segment < block.stop))
             for at in problem.attachments
         ]
+        attached = problem.attached(own, block.start)
         rows = {o.label: index for o, index in zip(observations, own, strict=True)}
         chain = chain.part(block)
         observations = tuple(
-            ObservationRows(o, index)
+            o.some(index)
+            if isinstance(o, ObservationByRows) and o.time.size > _FEW
+            else ObservationRows(o, index)
             for o, index in zip(observations, own, strict=True)
             if index.size
         )
@@ -320,13 +336,13 @@ def with_scattered_noise(
         chain,
         observations,
         parameters,
-        start=values,
+        start=problem.bound_at,
         clock_zero=problem.clock_zero,
         processes=problem.processes,
-        like=problem if block is None else None,
+        attached=attached,
     )
     test.reject(problem.rejected)
-    test.noise_factors = _as_scattered(problem, evaluation)
+    test.noise_factors = _as_scattered(problem, evaluation) if noise is None else noise
     test.robust_weights = robust
     test.long_run = problem.long_run
     at = test.evaluate(test.values(evaluation.states, test.prior_values() | values))

@@ -41,7 +41,7 @@ def speculated(
         tests: list[Awaited[Explanation | None]] = []
 
         def later(problem: Problem, minimum: Minimum, imu: Imu) -> None:
-            test = partial(explanation, problem, minimum, imu)
+            test = partial(_of_its_own, problem, minimum, imu)
             tests.append(stack.enter_context(in_background(test)))
 
         result = compute(later)
@@ -60,3 +60,10 @@ def speculated(
         return replace(first, parameter=own[first.parameter.name])
 
     return compute(again)
+
+
+def _of_its_own(problem: Problem, minimum: Minimum, imu: Imu) -> Explanation | None:
+    """Return what `explanation` does, in a process of its own."""
+    # What it binds is bound already.
+    problem.chain.segments.increments.release()
+    return explanation(problem, minimum, imu)

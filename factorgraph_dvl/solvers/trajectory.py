@@ -64,12 +64,13 @@ def trajectory_between(
     time : ndarray, shape (M,), s
         When the motion is wanted.
     """
-    ends = motion_at(segment_ends(seg, frame.earth_rate), states, gravity_n, frame.earth_rate)
+    last = segment_ends(seg, frame.earth_rate, rates=False)
+    ends = motion_at(last, states, gravity_n, frame.earth_rate)
     closing = _closing(ends, states, seg.origin + 1)
     P_n = _in_n(P, states)
 
     def part(time: Array) -> Trajectory:
-        at = attach(seg, time, frame.earth_rate)
+        at = attach(seg, time, frame.earth_rate, rates=False)
         motion = motion_at(at, states, gravity_n, frame.earth_rate)
         fraction = np.clip(at.tau / seg.duration[at.segment], 0.0, 1.0)
         motion = _closed(motion, fraction, at.segment, closing)

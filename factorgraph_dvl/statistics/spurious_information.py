@@ -9,18 +9,20 @@ errors in variables). The expected share of that error in the information is com
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from factorgraph_dvl.geometry.records import rows_of
-from factorgraph_dvl.geometry.vectors import Array, rotate, skew
+from factorgraph_dvl.geometry.vectors import Array, IntArray, rotate, skew
 from factorgraph_dvl.graph.clocks import linearized, parameters_of
 from factorgraph_dvl.graph.problem import Evaluation, Problem
 from factorgraph_dvl.imu.propagation import Attachment
-from factorgraph_dvl.sensors.protocol import Motion, Observation, Values
+from factorgraph_dvl.sensors.protocol import Motion, Observation, ObservationByRows, Values
 
+# Measurements that are varied at once. Chosen: some ten megabytes.
+_AT_ONCE = 20_000
 # Measurements whose covariances and products are found at once. Chosen: some megabytes.
 _CHUNK = 4096
 
@@ -52,21 +54,37 @@ def spurious_information(problem: Problem, evaluation: Evaluation, nodes: Array)
         strict=True,
     ):
         names = [p.name for p in problem.parameters if p.name in parameters_of(observation)]
-        if names:
+        if not names:
+            continue
+        places = [problem.columns[name] for name in names]
+        columns = np.concatenate([np.arange(p.start, p.stop) for p in places])
+        for own, some in _parts(observation):
+            node = attachment.node[own]
             part = spurious_by(
-                observation,
-                attachment,
-                motion,
-                weight,
+                some,
+                rows_of(attachment, own),
+                rows_of(motion, own),
+                weight[own],
                 nodes,
                 evaluation.parameters,
                 names,
                 problem.clock_zero,
             )
-            places = [problem.columns[name] for name in names]
-            columns = np.concatenate([np.arange(p.start, p.stop) for p in places])
-            np.add.at(out, (attachment.node[:, None, None], columns[:, None], columns), part)
-    return np.asarray(root.T @ out @ root)
+            np.add.at(out, (node[:, None, None], columns[:, None], columns), part)
+    for a in range(0, len(out), _CHUNK):
+        out[a : a + _CHUNK] = root.T @ out[a : a + _CHUNK] @ root
+    return out
+
+
+def _parts(observation: Observation) -> Iterator[tuple[slice | IntArray, Observation]]:
+    """Yield measurements some at a time, where an observation can be taken apart."""
+    count = observation.time.size
+    if count <= _AT_ONCE or not isinstance(observation, ObservationByRows):
+        yield slice(None), observation
+        return
+    for first in range(0, count, _AT_ONCE):
+        index = np.arange(first, min(first + _AT_ONCE, count))
+        yield index, observation.some(index)
 
 
 def spurious_by(

@@ -56,9 +56,14 @@ def jacobians(problem, evaluation):
 def test_measurements_at_the_same_times_are_bound_once():
     problem, _ = problem_of(scenario(manoeuvres=SHORT))
     late = {"time_offset_s": np.array([0.01])}
+    known = [(b.time, b.attachment) for b in problem._bound]
     for start in (None, late):
         other = Problem(
-            problem.chain, problem.observations, problem.all_parameters, start=start, like=problem
+            problem.chain,
+            problem.observations,
+            problem.all_parameters,
+            start=start,
+            attached=known,
         )
         alone = Problem(problem.chain, problem.observations, problem.all_parameters, start=start)
         for at, own, o in zip(

@@ -76,7 +76,7 @@ def test_without_a_test_the_result_is_computed_once(processes):
 
 def test_time_while_a_test_runs_is_used(processes, monkeypatch):
     processes(2)
-    monkeypatch.setattr(speculation, "explanation", lambda *_: time.sleep(0.3))
+    monkeypatch.setattr(speculation, "_of_its_own", lambda *_: time.sleep(0.3))
     used = []
     assert speculated(lambda explain: explain(None, None, None) or 3, used.append) == 3
     assert used == [3]
