@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -119,7 +120,7 @@ def _run_trials(
     write_page(found, out)
     _print_campaign(found)
     print_folder(out)
-    _end(len(found.failed))
+    _end(len(found.failed), len(runs))
 
 
 def _run_seeds(
@@ -151,12 +152,14 @@ def _run_seeds(
     write_seeds(found, records, scenario, out)
     write_seed_page(found, scenario, seeds, out)
     if found is not None:
-        for s in (found.nees, *found.ratio, *found.coverage):
+        ratios = [replace(s, name=f"rms of error over σ of {s.name}") for s in found.ratio]
+        for s in (found.nees, *ratios, *found.coverage):
             band = f"{s.low:.4g} to {s.high:.4g}"
-            text = f"{s.name}: {s.value:.4g}, by chance {band}{'' if s.inside else ': OUTSIDE'}"
+            outside = "" if s.inside else ": OUTSIDE"
+            text = f"{s.name}: {s.value:.4g}, by chance (99 %) {band}{outside}"
             stdout().print(text, markup=False, soft_wrap=True)
     print_folder(out)
-    _end(sum(not r.done for r in records))
+    _end(sum(not r.done for r in records), len(runs))
 
 
 def _run(
@@ -173,14 +176,18 @@ def _run(
 
     found: dict[int, RunRecord] = {}
     count = min(workers or default_workers(), len(runs))
-    with connected(count, scheduler) as client, CountLine(len(runs), quiet=quiet) as progress:
-        write_begun(out)
-        if not quiet:
-            link = client.dashboard_link
-            stderr().print(f"Dashboard: {link}", markup=False, highlight=False, soft_wrap=True)
-        for i, record in records(client, runs, labels):
-            found[i] = record
-            progress(labels[i] if record.done else f"{labels[i]} FAILED: {record.error}")
+    try:
+        with connected(count, scheduler) as client, CountLine(len(runs), quiet=quiet) as progress:
+            write_begun(out)
+            if not quiet:
+                link = client.dashboard_link
+                stderr().print(f"Dashboard: {link}", markup=False, highlight=False, soft_wrap=True)
+            for i, record in records(client, runs, labels):
+                found[i] = record
+                progress(labels[i] if record.done else f"{labels[i]} FAILED: {record.error}")
+    except KeyboardInterrupt:
+        warn("interrupted; the same command continues after the finished runs")
+        raise
     return [found[i] for i in range(len(runs))]
 
 
@@ -188,7 +195,7 @@ def _print_campaign(found: Campaign) -> None:
     console = stdout()
     unused = [t for t in found.trials if t.unused]
     for t in unused:
-        warn(f"{t.name} is not used: {t.unused}")
+        warn(f"{t.label} is not used: {t.unused}")
     joint = found.joint
     if joint is None:
         warn("no trial has a result that can be used: there is no joint calibration")
@@ -209,8 +216,8 @@ def _print_campaign(found: Campaign) -> None:
         console.print(text, markup=False, soft_wrap=True)
 
 
-def _end(failed: int) -> None:
+def _end(failed: int, count: int) -> None:
     """End with exit code 1 if runs have no result."""
     if failed:
-        stderr().print(f"error: {failed} of the runs have no result", markup=False, style="red")
+        stderr().print(f"error: {failed} of {count} runs failed", markup=False, style="red")
         raise typer.Exit(1)

@@ -21,6 +21,7 @@ from factorgraph_dvl.cli.console import (
     print_error_budget,
     print_table,
     print_written,
+    stderr,
     stdout,
     warn,
 )
@@ -324,13 +325,16 @@ def _stages(work: Path, fingerprint: str, resume: bool) -> FinishedStages:
     if resume and not stages.found:
         warn(
             "--resume: there is no interrupted run of this trial with these options and this "
-            "version of the program, so all stages run anew"
+            "version of the program, so the run starts from the beginning"
         )
+    elif stages.names:
+        kept = ", ".join(stages.names)
+        stderr().print(f"Continuing after the finished stages {kept}", markup=False)
 
     def ended(_: object, error: BaseException | None, __: object) -> None:
         code = getattr(error, "code", 0)
-        if stages.any and (isinstance(error, KeyboardInterrupt) or code == INTERRUPTED):
-            warn("interrupted; --resume continues after the stages that had ended")
+        if stages.names and (isinstance(error, KeyboardInterrupt) or code == INTERRUPTED):
+            warn("interrupted; the same command with --resume continues after the finished stages")
         else:
             stages.remove()
 

@@ -47,9 +47,10 @@ class FinishedStages:
             _write(file, fingerprint.encode())
 
     @property
-    def any(self) -> bool:
-        """Whether there is the result of a stage."""
-        return any(self._folder.glob(f"*{_SUFFIX}"))
+    def names(self) -> list[str]:
+        """Names of the stages that have a result, the oldest first."""
+        files = sorted(self._folder.glob(f"*{_SUFFIX}"), key=lambda file: file.stat().st_mtime_ns)
+        return [file.stem for file in files]
 
     def result(self, stage: str, kind: type[_Result], compute: Callable[[], _Result]) -> _Result:
         """Return the result of a stage: the one that was kept, else a new one, which is kept.

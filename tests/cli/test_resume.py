@@ -63,6 +63,7 @@ def test_a_run_continues_after_the_stages_that_had_ended(run, monkeypatch, trial
     monkeypatch.setattr(rounds, "minimise", forbidden)
     result = run(*options(trial, tmp_path / "out", "--resume"))
     assert result.code == 0, result.err
+    assert "Continuing after the finished stages alignment, mounting, minimum-1" in result.err
     assert {name: (tmp_path / "out" / name).read_bytes() for name in RESULTS} == whole
     assert [p.name for p in tmp_path.iterdir()] == ["out"]
 
