@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cache, cached_property, partial
+from threading import current_thread, main_thread
 from types import MappingProxyType
 from typing import Any, BinaryIO, Generic, NoReturn, Protocol, TypeVar
 
@@ -189,20 +190,42 @@ def _fork(
     parent = os.getpid()
     pipes = (*os.pipe(), *os.pipe())
     order, given, reply, result = pipes
-    try:
-        process = os.fork()
-    except OSError:
-        for end in pipes:
-            os.close(end)
-        return None
-    if process == 0:
-        os.close(given)
-        if not urgent:
-            os.nice(_LESS_URGENT)
-        _work(work, prepare, order, result, parent)
+    with _interrupts_wait():
+        try:
+            process = os.fork()
+        except OSError:
+            for end in pipes:
+                os.close(end)
+            return None
+        if process == 0:
+            os.close(given)
+            if not urgent:
+                os.nice(_LESS_URGENT)
+            _work(work, prepare, order, result, parent)
     os.close(order)
     os.close(result)
     return process, os.fdopen(given, "wb"), os.fdopen(reply, "rb")
+
+
+@contextmanager
+def _interrupts_wait() -> Iterator[None]:
+    """Let interrupts wait for the end of the block.
+
+    Python loses an interrupt that comes while it calls what belongs to a fork, and a copy of this
+    process that is interrupted before it works would clean up what the first process still needs.
+    """
+    before = signal.getsignal(signal.SIGINT)
+    if before is None or current_thread() is not main_thread():
+        yield
+        return
+    came: list[object] = []
+    signal.signal(signal.SIGINT, lambda *_: came.append(True))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+        if came:
+            signal.raise_signal(signal.SIGINT)
 
 
 def _work(

@@ -124,6 +124,37 @@ def test_it_ends_with_the_block_and_cleans_up_nothing_of_the_first(tmp_path: Pat
     assert marker.read_text() == "."
 
 
+@pytest.mark.parametrize("where", ["parent", "child"])
+@pytest.mark.usefixtures("two")
+def test_an_interrupt_during_the_fork_ends_the_first_process_alone(
+    where: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cleaned, fork = tmp_path / "cleaned", os.fork
+
+    def interrupted_fork() -> int:
+        process = fork()
+        if (process == 0) == (where == "child"):
+            signal.raise_signal(signal.SIGINT)
+        return process
+
+    monkeypatch.setattr(os, "fork", interrupted_fork)
+
+    def run() -> None:
+        try:
+            with in_background(lambda: 1) as found:
+                assert found() == 1
+        finally:
+            with cleaned.open("a") as file:
+                file.write(f"{os.getpid()}\n")
+
+    if where == "parent":
+        with pytest.raises(KeyboardInterrupt):
+            run()
+    else:
+        run()
+    assert cleaned.read_text() == f"{os.getpid()}\n"
+
+
 @pytest.mark.parametrize("why", ["one process", "one core", "no fork", "another system"])
 @pytest.mark.usefixtures("two")
 def test_otherwise_the_work_is_done_in_line(why: str, monkeypatch: pytest.MonkeyPatch) -> None:
