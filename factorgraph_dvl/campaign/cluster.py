@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+import signal
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
@@ -81,7 +82,20 @@ def connected(workers: int, scheduler: str | None) -> Iterator[Client]:
         ) as cluster,
         Client(cluster) as client,
     ):
+        _leave_interrupts(client)
         yield client
+
+
+def _leave_interrupts(client: Client) -> None:
+    """Have workers leave Ctrl-C to this process, and to the solves that they started."""
+    from distributed import WorkerPlugin
+
+    class Uninterrupted(WorkerPlugin):  # type: ignore[misc]
+        def setup(self, worker: Any) -> None:
+            # What is ignored, programs that are started would ignore, too.
+            signal.signal(signal.SIGINT, lambda *_: None)
+
+    client.register_plugin(Uninterrupted())
 
 
 def _allow_failures(client: Client) -> None:

@@ -60,6 +60,7 @@ def campaign(
     """
     from factorgraph_dvl.campaign.files import CAMPAIGN_FILE, OWNED
     from factorgraph_dvl.errors import ConfigError
+    from factorgraph_dvl.io.folders import SETTINGS_FILE
 
     if workers is not None and scheduler is not None:
         raise ConfigError("--workers and --scheduler exclude each other", expected="one of them")
@@ -71,6 +72,12 @@ def campaign(
         if not path.exists():
             kind = "a trial folder" if seeds is None else "a scenario, a YAML file"
             raise ConfigError("does not exist", where=str(path), expected=kind)
+        if seeds is None and path.is_file() and path.name != SETTINGS_FILE:
+            raise ConfigError(
+                "is not a trial",
+                where=str(path),
+                expected="a trial folder, or a scenario --seeds N",
+            )
     # What an earlier run of this command left is its own, whether it ended or was killed.
     resumed = (out / CAMPAIGN_FILE).exists()
     claim_output(out, force=force or resumed, owned=OWNED, inputs=trials)

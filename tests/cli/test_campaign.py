@@ -35,6 +35,7 @@ def test_bad_input_is_refused_before_anything_starts(run, tmp_path):
             *("--out", tmp_path / "out"),
         ),
         "exists and is not empty": (tmp_path / "trial", "--out", full),
+        "a scenario --seeds N": (CONFIGS / "cruise.yaml", "--out", tmp_path / "out"),
     }
     for message, args in cases.items():
         result = run("campaign", *args)
@@ -113,6 +114,25 @@ def test_a_worker_that_is_killed_costs_what_it_was_running(tmp_path):
     assert all(found[i].done for i in range(12))
     started = [len(list(counts.glob(f"{label}.*"))) for label in labels]
     assert sum(started) <= 12 + 3
+
+
+@pytest.mark.slow
+def test_a_worker_leaves_an_interrupt_to_the_command_and_what_it_starts_does_not():
+    pytest.importorskip("distributed")
+
+    from factorgraph_dvl.campaign.cluster import connected
+
+    with connected(1, None) as client:
+        (process,) = client.run(os.getpid).values()
+        os.kill(process, signal.SIGINT)
+        interrupted = ["import os, signal", "signal.raise_signal(signal.SIGINT)"]
+        code = client.submit(
+            subprocess.call,
+            [sys.executable, "-c", "; ".join(interrupted)],
+            stderr=subprocess.DEVNULL,
+        )
+        assert code.result(timeout=60) == -signal.SIGINT
+        assert list(client.run(os.getpid).values()) == [process]
 
 
 @pytest.mark.slow
