@@ -9,7 +9,7 @@ import pickle
 import select
 import signal
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cache, cached_property, partial
@@ -242,10 +242,7 @@ def _work(
         # The first process ends it, also where that is killed, and alone keeps its files locked.
         signal.signal(signal.SIGINT, signal.SIG_IGN)
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
-        first, last = sorted((order, result))
-        os.closerange(3, first)
-        os.closerange(first + 1, last)
-        os.closerange(last + 1, os.sysconf("SC_OPEN_MAX"))
+        _leave_files({0, 1, 2, order, result})
         if os.getppid() == parent:
             # Collecting what the first process made would copy it.
             gc.freeze()
@@ -254,6 +251,18 @@ def _work(
     finally:
         # Nothing of what the first process has to clean up is cleaned up here.
         os._exit(0)
+
+
+def _leave_files(kept: Collection[int]) -> None:
+    """Close what is open but some descriptors, and have nothing in its place.
+
+    Libraries that close their own when this process is copied again would fail: Arrow then ends
+    the copy.
+    """
+    opened = map(int, os.listdir("/proc/self/fd"))
+    nothing = os.open(os.devnull, os.O_RDWR)
+    for number in {*opened} - {*kept, nothing}:
+        os.dup2(nothing, number, inheritable=False)
 
 
 def _reply(work: Callable[[Any], Any], prepare: Callable[[], object], given: BinaryIO) -> bytes:

@@ -7,6 +7,7 @@ from pathlib import Path
 from types import MappingProxyType
 
 import pytest
+from pyarrow import csv
 
 from factorgraph_dvl.background import PROCESSES, available, in_background, on_standby
 from factorgraph_dvl.errors import DataError
@@ -122,6 +123,21 @@ def test_it_ends_with_the_block_and_cleans_up_nothing_of_the_first(tmp_path: Pat
     with pytest.raises(ProcessLookupError):
         os.kill(int(started.read_text()), 0)
     assert marker.read_text() == "."
+
+
+@pytest.mark.usefixtures("two")
+def test_a_second_process_may_have_one_of_its_own_after_arrow_has_read(tmp_path: Path) -> None:
+    """Arrow closes a pipe of its own in every copy, and ends it if that fails."""
+    table = tmp_path / "table.csv"
+    table.write_text("a,b\n1,2\n")
+    assert csv.read_csv(table).num_rows == 1
+
+    def nested() -> int:
+        with in_background(lambda: 2) as found:
+            return found()
+
+    with in_background(nested) as found:
+        assert found() == 2
 
 
 @pytest.mark.parametrize("where", ["parent", "child"])
