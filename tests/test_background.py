@@ -3,6 +3,7 @@ from __future__ import annotations
 import os
 import signal
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from types import MappingProxyType
 
@@ -140,8 +141,16 @@ def test_a_second_process_may_have_one_of_its_own_after_arrow_has_read(tmp_path:
         assert found() == 2
 
 
+@pytest.fixture
+def interruptible() -> Iterator[None]:
+    """Interrupts end a test, also where a shell started it in the background."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
 @pytest.mark.parametrize("where", ["parent", "child"])
-@pytest.mark.usefixtures("two")
+@pytest.mark.usefixtures("two", "interruptible")
 def test_an_interrupt_during_the_fork_ends_the_first_process_alone(
     where: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
