@@ -113,7 +113,15 @@ TURNS_AND_BRAKING = [
     {"turn_deg_s": 8, "duration_s": 20, "ramp_s": 4},
     {"straight_s": 20},
 ]
-# The same between straight legs on which errors that persist show.
+# They with the noise of good sensors, and with a clock of the DVL that is known.
+KNOWN_CLOCK = {
+    "noise": True,
+    "manoeuvres": TURNS_AND_BRAKING,
+    "gnss": {"position_std_m": [0.1, 0.1, 0.2], "velocity_std_m_s": [0.03] * 3},
+    "dvl": {"velocity_std_fraction": 0.001},
+    "trial": {"dvl": {"velocity_std_fraction": 0.001, "time_offset_std_s": 0.0}},
+}
+# The manoeuvres between straight legs on which errors that persist show.
 LONGER_TURNS_AND_BRAKING = [
     {"straight_s": 40},
     *TURNS_AND_BRAKING[1:-1],

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from truth import TURNS_AND_BRAKING, merged, scenario
+from truth import KNOWN_CLOCK, merged, scenario
 
 from factorgraph_dvl.background import PROCESSES
 from factorgraph_dvl.io.finished_stages import FinishedStages
@@ -16,13 +16,6 @@ from factorgraph_dvl.simulation import simulate
 from factorgraph_dvl.solvers import rounds
 from factorgraph_dvl.solvers.batch import solve_with_problem
 
-SCENE = {
-    "noise": True,
-    "manoeuvres": TURNS_AND_BRAKING,
-    "gnss": {"position_std_m": [0.1, 0.1, 0.2], "velocity_std_m_s": [0.03] * 3},
-    "dvl": {"velocity_std_fraction": 0.001},
-    "trial": {"dvl": {"velocity_std_fraction": 0.001, "time_offset_std_s": 0.0}},
-}
 CORRELATED = {
     "trial": {"dvl": {"correlation_time_s": 8.0, "correlated_std_m_s": 0.01, "noise": "stated"}}
 }
@@ -60,7 +53,7 @@ def forbidden(*args, **kwargs):
 
 @pytest.mark.parametrize("more", [{}, CORRELATED, WALKING], ids=["as is", "correlated", "walking"])
 def test_a_kept_minimum_is_taken_to_the_last_digit(monkeypatch, tmp_path, more):
-    trial = simulate(scenario(**merged(merged({}, SCENE), more)), 4)
+    trial = simulate(scenario(**merged(merged({}, KNOWN_CLOCK), more)), 4)
     first = solved(trial, tmp_path / "stages", resume=False)
     kept = list((tmp_path / "stages").glob("minimum-*"))
     assert kept
@@ -72,7 +65,7 @@ def test_a_kept_minimum_is_taken_to_the_last_digit(monkeypatch, tmp_path, more):
 def test_rounds_with_another_parameter_are_kept_apart(monkeypatch, tmp_path, processes):
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0, 1})
     monkeypatch.setenv(PROCESSES, f"{processes}")
-    trial = simulate(scenario(**merged({}, SCENE)), 4)
+    trial = simulate(scenario(**merged({}, KNOWN_CLOCK)), 4)
     late = replace(trial, dvl=replace(trial.dvl, time=trial.dvl.time + 0.05))
     first = solved(late, tmp_path / "stages", resume=False)
     assert Code.ESTIMATED_INSTEAD in [f.code for f in first[0].findings]
@@ -81,7 +74,7 @@ def test_rounds_with_another_parameter_are_kept_apart(monkeypatch, tmp_path, pro
 
 
 def test_a_damaged_minimum_is_searched_again(tmp_path):
-    trial = simulate(scenario(**merged({}, SCENE)), 4)
+    trial = simulate(scenario(**merged({}, KNOWN_CLOCK)), 4)
     first = solved(trial, tmp_path / "stages", resume=False)
     for file in (tmp_path / "stages").glob("minimum-*"):
         file.write_bytes(file.read_bytes()[:-9])

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from truth import TURNS_AND_BRAKING, merged, scenario
+from truth import KNOWN_CLOCK, merged, scenario
 
 from factorgraph_dvl.background import PROCESSES
 from factorgraph_dvl.errors import DataError
@@ -19,18 +19,10 @@ from factorgraph_dvl.solvers.batch import solve
 from factorgraph_dvl.solvers.information_along_trial import solve_with_history
 from factorgraph_dvl.solvers.speculation import speculated
 
-SCENE = {
-    "noise": True,
-    "manoeuvres": TURNS_AND_BRAKING,
-    "gnss": {"position_std_m": [0.1, 0.1, 0.2], "velocity_std_m_s": [0.03] * 3},
-    "dvl": {"velocity_std_fraction": 0.001},
-    "trial": {"dvl": {"velocity_std_fraction": 0.001, "time_offset_std_s": 0.0}},
-}
-
 
 @pytest.fixture(scope="module")
 def trial():
-    return simulate(scenario(**merged({}, SCENE)), 4)
+    return simulate(scenario(**merged({}, KNOWN_CLOCK)), 4)
 
 
 @pytest.fixture
