@@ -29,7 +29,6 @@ import common
 import numpy as np
 import psutil
 
-from factorgraph_dvl.background import PROCESSES
 from factorgraph_dvl.io.trial_folder import save_trial
 from factorgraph_dvl.simulation import parse_scenario, simulate
 from factorgraph_dvl.simulation.scenario import Scenario
@@ -103,14 +102,7 @@ def killed(folder: Path, args: Any) -> list[Row]:
     for path in trials[: args.single]:
         start = perf_counter()
         solve = ["solve", str(path), "--out", str(folder / "single" / path.name), "--quiet"]
-        # On one core, as a worker of one thread has.
-        subprocess.run(
-            command(*solve),
-            check=True,
-            stdout=subprocess.DEVNULL,
-            env=os.environ | {PROCESSES: "1"},
-            preexec_fn=lambda: os.sched_setaffinity(0, {0}),
-        )
+        subprocess.run(command(*solve), check=True, stdout=subprocess.DEVNULL)
         single.append(perf_counter() - start)
     start = perf_counter()
     content, kills, starts = campaign(folder, trials, args.workers, args.between)

@@ -10,13 +10,13 @@ not made again.
 from __future__ import annotations
 
 import json
-import multiprocessing
 import re
+import subprocess
+import sys
 import tempfile
 import time
 import traceback
 from collections.abc import Iterable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -43,6 +43,8 @@ PAGE = "faults.md"
 LONGEST_S = 900.0
 # Errors, in standard deviations, and noncentrality, from which on a fault must be seen.
 LARGE, SEEN = 5.0, 30.0
+# Time between two looks at the processes, s: a run takes longer.
+LOOK_S = 0.2
 # Times that the problem is bound to the clocks anew for a noncentrality.
 BINDINGS = 3
 
@@ -148,21 +150,33 @@ def _write(run: Run, path: Path) -> None:
     path.write_text(json.dumps(result), encoding="utf-8")
 
 
-def result(run: Run, cache: Path) -> dict[str, Any]:
-    """Return what became of a run: from the cache, or from a process of its own."""
-    path = cache / f"{run.key}.json"
-    if not path.exists():
-        process = multiprocessing.get_context("fork").Process(target=_write, args=(run, path))
-        process.start()
-        process.join(LONGEST_S)
-        if process.is_alive():
-            process.terminate()
-            process.join()
-        if not path.exists():
-            why = {"grade": "crashed", "reason": f"ended with {process.exitcode}"}
-            path.write_text(json.dumps(why), encoding="utf-8")
-    found: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-    return found
+def make(runs: Sequence[Run], args: Any) -> None:
+    """Make the runs that are not in the cache, each in a process of its own."""
+    left = [run for run in runs if not file_of(run, args.cache).exists()]
+    going: list[tuple[Run, subprocess.Popen[bytes], float]] = []
+    while left or going:
+        while left and len(going) < args.jobs:
+            command = [sys.executable, __file__, "--seeds", f"{args.seeds}", "--run", left[0].key]
+            process = subprocess.Popen([*command, "--cache", str(args.cache)])
+            going.append((left.pop(0), process, time.monotonic() + LONGEST_S))
+        time.sleep(LOOK_S)
+        for each in list(going):
+            run, process, end = each
+            if process.poll() is None and time.monotonic() > end:
+                process.kill()
+                process.wait()
+            if process.returncode is None:
+                continue
+            going.remove(each)
+            path = file_of(run, args.cache)
+            if not path.exists():
+                why = {"grade": "crashed", "reason": f"ended with {process.returncode}"}
+                path.write_text(json.dumps(why), encoding="utf-8")
+
+
+def file_of(run: Run, cache: Path) -> Path:
+    """Return the file in the cache that has the result of a run."""
+    return cache / f"{run.key}.json"
 
 
 def worst(found: dict[str, Any]) -> float:
@@ -267,16 +281,19 @@ def main() -> None:
     parser = common.parser(__doc__, seeds=1)
     parser.add_argument("--only", default="", help="regular expression of runs to make")
     parser.add_argument("--cache", type=Path, default=common.OUT / "faults", help="of the runs")
+    parser.add_argument("--run", help="make this run alone, in this process")
     args = common.parse(parser)
     args.cache.mkdir(parents=True, exist_ok=True)
+    if args.run is not None:
+        (run,) = (each for each in all_runs(args.seeds) if each.key == args.run)
+        _write(run, file_of(run, args.cache))
+        return
     runs = [r for r in all_runs(args.seeds) if r.row is None or re.search(args.only, r.key)]
     wanted = {(r.scenario, r.seed) for r in runs if r.row is not None}
     runs = [r for r in runs if (r.scenario, r.seed) in wanted]
-    with ThreadPoolExecutor(args.jobs) as pool:
-        found = list(pool.map(lambda run: result(run, args.cache), runs))
-    print(
-        common.write_page(args.out / PAGE, page(args.origin, list(zip(runs, found, strict=True))))
-    )
+    make(runs, args)
+    found = [(run, json.loads(file_of(run, args.cache).read_text("utf-8"))) for run in runs]
+    print(common.write_page(args.out / PAGE, page(args.origin, found)))
 
 
 if __name__ == "__main__":

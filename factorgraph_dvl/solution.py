@@ -429,7 +429,7 @@ class Solution(Judged):
     hypotheses: tuple[Hypothesis, ...] = ()
     rejected: tuple[Residuals, ...] = ()
     inputs: tuple[str, ...] = ()
-    limits: Mapping[str, float] = field(default_factory=lambda: DEFAULT_LIMITS)
+    limits: Mapping[str, float] = field(default_factory=lambda: dict(DEFAULT_LIMITS))
     noise: tuple[Noise, ...] = ()
     error_budget: tuple[Cause, ...] = ()
     epoch: str = ""
@@ -562,7 +562,7 @@ class Calibration(Judged):
     covariance: Array
     findings: tuple[Finding, ...] = ()
     inputs: tuple[str, ...] = ()
-    limits: Mapping[str, float] = field(default_factory=lambda: DEFAULT_LIMITS)
+    limits: Mapping[str, float] = field(default_factory=lambda: dict(DEFAULT_LIMITS))
     noise: tuple[Noise, ...] = ()
     error_budget: tuple[Cause, ...] = ()
     epoch: str = ""

@@ -177,7 +177,7 @@ class Trial:
     reference: Reference | None = None
     calibration_truth: dict[str, Array] = field(default_factory=dict)
     notes: tuple[Finding, ...] = ()
-    limits: Mapping[str, float] = field(default_factory=lambda: DEFAULT_LIMITS)
+    limits: Mapping[str, float] = field(default_factory=lambda: dict(DEFAULT_LIMITS))
 
     def __repr__(self) -> str:
         counts = [] if self.imu is None else [f"imu {self.imu.time.size}"]

@@ -27,8 +27,8 @@ CAPABILITIES = (
     (
         "units, rotations, Earth, settings, trial, solution",
         "conventions celestial directions earth errors solution trial yaml_file __init__",
-        "geometry/* settings/* errors solution trial background __init__",
-        "settings/ranges settings/files background",
+        "geometry/* settings/* errors solution trial __init__",
+        "settings/ranges settings/files",
     ),
     (
         "sensors: settings, records, residuals",
@@ -59,8 +59,7 @@ CAPABILITIES = (
         "statistics/correlation statistics/constancy solvers/change_along_trial "
         "solvers/correlated_noise solvers/known_parameters solvers/motion_* "
         "statistics/error_budget statistics/robust_weights statistics/rows statistics/scores "
-        "statistics/variance_components solvers/causes solvers/minima solvers/outliers "
-        "solvers/speculation",
+        "statistics/variance_components solvers/causes solvers/minima solvers/outliers",
     ),
     (
         "position from ranges, planar trials",

@@ -23,7 +23,7 @@ SENSOR_DATA = (
 )
 # GTSAM, SciPy and Matplotlib take most of a second to load: only what needs none of them may
 # be imported where the command line starts.
-LIGHT = ("background", "errors", "settings", "cli")
+LIGHT = ("errors", "settings", "cli")
 # Each takes half a second to load; `scipy.special` has distributions, `imu.interpolation` filters.
 SLOW_TO_LOAD = ("scipy.signal", "scipy.stats")
 MODULES = sorted(
@@ -70,7 +70,7 @@ def test_the_map_of_the_package_is_that_of_the_tree():
 
 def test_the_top_holds_no_module_without_a_home():
     loose = {parts[0] for parts in MODULES if len(parts) == 1}
-    assert loose == {"background", "errors", "solution", "trial"}
+    assert loose == {"errors", "solution", "trial"}
 
 
 def test_no_solver_loads_what_takes_longer_than_a_short_trial():
@@ -84,6 +84,23 @@ def test_no_solver_loads_what_takes_longer_than_a_short_trial():
                 for alias in node.names
             }
             assert not names.intersection(SLOW_TO_LOAD), parts
+
+
+def test_no_module_starts_threads_or_copies_of_its_process():
+    """GTSAM, Arrow and BLAS bear neither well; C is called where Python has no call."""
+    for parts in MODULES:
+        source = PACKAGE.joinpath(*parts).with_suffix(".py").read_text(encoding="utf-8")
+        names = {
+            layer_of(name)
+            for node in ast.walk(ast.parse(source))
+            if isinstance(node, ast.Import | ast.ImportFrom)
+            for name in (
+                [node.module] if isinstance(node, ast.ImportFrom) else [a.name for a in node.names]
+            )
+        }
+        assert not names & {"threading", "_thread", "multiprocessing", "concurrent"}, parts
+        assert "ctypes" not in names or parts == ("io", "folders"), parts
+        assert not any(word in source for word in ("fork(", "preexec_fn", "Executor(")), parts
 
 
 def test_no_package_hides_a_public_function():

@@ -38,7 +38,6 @@ ELSEWHERE = {
     "initialization/track_velocity": "solvers/test_motion_smoother.py",
     "replay/update": "replay/test_record.py",
     "solvers/motion_*": "solvers/test_motion_smoother.py",
-    "solvers/stages": "io/test_finished_stages.py",
     "statistics/information_history": "analysis/information/test_shares.py",
     "statistics/leverage": "statistics/test_rows.py",
     "statistics/spurious_information": "replay/test_session.py",

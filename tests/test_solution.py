@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from dataclasses import replace
 from pathlib import Path
 
@@ -39,6 +40,11 @@ def test_representations_are_short(trial, solution):
     assert repr(solution) == "<Solution of 'short run' by batch: good, 9 parameters>"
     assert repr(solution.trajectory).startswith("<Trajectory of 86")
     assert repr(trial) == "<Trial 'short run': imu 4300, gnss 172, dvl 172>"
+
+
+def test_a_solution_goes_to_another_process_and_back(solution):
+    again = pickle.loads(pickle.dumps(solution))
+    assert again.summary() == solution.summary()
 
 
 def test_summary_and_html_have_every_component(solution):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import pickle
+
 import numpy as np
 from builders import build_trial
 
@@ -21,3 +23,10 @@ def test_sensors_are_found_by_type():
     assert dived.find(Depth) is dived.depth is depth
     assert dived.find(Star) is None
     assert dived.beacons is dived.beams is None
+
+
+def test_a_trial_goes_to_another_process_and_back():
+    trial = build_trial()
+    again = pickle.loads(pickle.dumps(trial))
+    assert again.limits == trial.limits
+    np.testing.assert_array_equal(again.imu.gyro, trial.imu.gyro)

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import ctypes
+import fcntl
 import os
 import signal
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 from time import perf_counter
@@ -16,7 +16,6 @@ from time import perf_counter
 import numpy as np
 from msgspec import UnsetType
 
-from factorgraph_dvl.background import PROCESSES
 from factorgraph_dvl.campaign.record import (
     RunRecord,
     fingerprint_of,
@@ -34,7 +33,6 @@ from factorgraph_dvl.settings.yaml_file import parse_yaml, read_text
 TRIALS_FOLDER = "trials"
 # Chosen: the end of what a run that failed wrote to standard error.
 _LONGEST_ERROR = 2000
-_PR_SET_PDEATHSIG = 1
 
 
 def run_trial(trial: str, label: str, out: str, options: Sequence[str]) -> RunRecord:
@@ -73,17 +71,15 @@ def run_trial(trial: str, label: str, out: str, options: Sequence[str]) -> RunRe
     folder.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryFile() as log:
         start = perf_counter()
-        process = subprocess.Popen(
-            command,
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.DEVNULL,
-            stderr=log,
-            preexec_fn=_die_with(os.getpid()),
-            # Every core has a trial of its own.
-            env=os.environ | {PROCESSES: "1"},
-        )
-        # Of this process alone: getrusage knows only the largest of all.
-        _, status, usage = os.wait4(process.pid, 0)
+        # The system ends a process by a signal when the other end of its standard input is
+        # closed: by this process, or by its death.
+        theirs, ours = os.pipe()
+        with open(ours, "wb"), open(theirs, "rb") as end:
+            process = subprocess.Popen(command, stdin=end, stdout=subprocess.DEVNULL, stderr=log)
+            fcntl.fcntl(end, fcntl.F_SETOWN, process.pid)
+            fcntl.fcntl(end, fcntl.F_SETFL, os.O_ASYNC)
+            # Of this process alone: getrusage knows only the largest of all.
+            _, status, usage = os.wait4(process.pid, 0)
         process.returncode = os.waitstatus_to_exitcode(status)
         record.wall_s = perf_counter() - start
         record.cpu_s = usage.ru_utime + usage.ru_stime
@@ -147,15 +143,3 @@ def _reason(code: int, text: str) -> str:
     lines = [line for line in text.splitlines() if line.startswith("error: ")]
     found = lines[-1].removeprefix("error: ") if lines else text[-_LONGEST_ERROR:]
     return found[:_LONGEST_ERROR] or f"the process ended with exit code {code}"
-
-
-def _die_with(parent: int) -> Callable[[], None]:
-    """Return what a child calls so that it is killed when its parent ends."""
-    libc = ctypes.CDLL(None)
-
-    def ask() -> None:
-        libc.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
-        if os.getppid() != parent:
-            os._exit(1)
-
-    return ask

@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
 
-from factorgraph_dvl.background import PROCESSES
 from factorgraph_dvl.cli.commands import Commands
 from factorgraph_dvl.cli.options import INTERRUPTED, claims
 from factorgraph_dvl.cli.streams import guard_streams, output_failure
@@ -43,7 +42,6 @@ def run(args: list[str]) -> NoReturn:
     # All matrices are small: more threads only slow each other down.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     os.environ.setdefault("OMP_NUM_THREADS", "1")
-    os.environ.setdefault(PROCESSES, "2")
     # Most objects live until the end: looking for garbage among them took 4 % of a run.
     gc.set_threshold(_ALLOCATIONS)
     # Nor is it worth while when the process ends. Measured: 16 % of `--help`.

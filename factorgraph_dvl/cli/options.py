@@ -47,12 +47,12 @@ claims = ExitStack()
 
 def claim_output(
     out: Path, *, force: bool, owned: Sequence[str], inputs: Iterable[Path | None]
-) -> Path:
-    """Reserve the output folder until the command ends; return its working folder.
+) -> None:
+    """Reserve the output folder until the command ends.
 
     The parameters are those of `claim`.
     """
     from factorgraph_dvl.io.folders import claim
 
     given = [path for path in inputs if path is not None]
-    return claims.enter_context(claim(out, force=force, owned=owned, inputs=given))
+    claims.enter_context(claim(out, force=force, owned=owned, inputs=given))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from contextlib import contextmanager
 from dataclasses import replace
 from enum import StrEnum
 from pathlib import Path
@@ -37,8 +36,6 @@ from factorgraph_dvl.cli.verdict import end_with, print_findings, print_verdict
 from factorgraph_dvl.errors import ConfigError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
     from factorgraph_dvl.analysis.convergence import Convergence
     from factorgraph_dvl.replay import ReplayRecord
     from factorgraph_dvl.solution import Solution
@@ -249,9 +246,7 @@ def _write(
     )
     from factorgraph_dvl.report.files.convergence import to_csv
 
-    @contextmanager
-    def add(folder: Path) -> Iterator[None]:
-        yield
+    def add(folder: Path) -> None:
         write_beams(trial, solution, folder)
         write_instrument(solution, folder)
         write_history(folder, record.time, record.names, record.std, record.values, record.latency)

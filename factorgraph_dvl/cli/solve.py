@@ -2,31 +2,24 @@
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from enum import StrEnum
-from functools import partial
-from importlib import import_module
 from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, cast
 
 import typer
 
-from factorgraph_dvl.background import on_standby
 from factorgraph_dvl.cli.console import (
     ProgressLine,
     drawing,
     print_error_budget,
     print_table,
     print_written,
-    stderr,
     stdout,
     warn,
 )
 from factorgraph_dvl.cli.options import (
-    INTERRUPTED,
     Anyway,
     FigureKind,
     Figures,
@@ -37,19 +30,17 @@ from factorgraph_dvl.cli.options import (
     SolutionPath,
     TrialPath,
     claim_output,
-    claims,
 )
 from factorgraph_dvl.cli.plausibility import errors_in
 from factorgraph_dvl.cli.report import write_report
 from factorgraph_dvl.cli.verdict import end_with, print_findings, print_verdict
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping
+    from collections.abc import Callable
 
     from factorgraph_dvl.analysis.comparison.halves import Halves
     from factorgraph_dvl.baselines import History
     from factorgraph_dvl.baselines.calibration import Method
-    from factorgraph_dvl.io.finished_stages import FinishedStages
     from factorgraph_dvl.solution import Solution
     from factorgraph_dvl.statistics.information_history import InformationHistory
     from factorgraph_dvl.trial import Trial
@@ -59,31 +50,17 @@ if TYPE_CHECKING:
 _ENTRIES = 500
 
 
-def _unknown() -> None:
-    """Return the information along the trial of a method that does not follow it."""
-
-
 @dataclass(frozen=True)
 class _Found:
     """What a run found.
 
-    The solution, how a filter converged, what follows the information along the trial, and its
-    halves.
+    The solution, how a filter converged, the information along the trial, and its halves.
     """
 
     solution: Solution
     history: History | None = None
-    along: Callable[[], InformationHistory | None] = _unknown
+    along: InformationHistory | None = None
     halves: Halves | None = None
-
-
-@dataclass(frozen=True)
-class _Drawn:
-    """What figures show, and where they go."""
-
-    solution: Solution
-    history: History | None
-    folder: Path
 
 
 class KalmanMethod(StrEnum):
@@ -116,7 +93,7 @@ def solve(
     ] = False,
     anyway: Anyway = False,
     resume: Annotated[
-        bool, typer.Option("--resume", help="Continue a run that was interrupted.")
+        bool, typer.Option("--resume", help="Without effect: a run starts from the beginning.")
     ] = False,
     quiet: Quiet = False,
 ) -> None:
@@ -125,26 +102,22 @@ def solve(
     Examples:
       factorgraph-dvl solve data/seed-a-phase-90 --out out
     """
+    if resume:
+        warn(
+            "--resume has no effect any more: a run takes only seconds, and starts from the "
+            "beginning; leave the option out"
+        )
 
-    def run(trial: Trial, progress: ProgressLine, stages: FinishedStages | None) -> _Found:
+    def run(trial: Trial, progress: ProgressLine) -> _Found:
         from factorgraph_dvl.analysis.comparison.halves import halves_of
-        from factorgraph_dvl.solvers.information_along_trial import solve_then_history
+        from factorgraph_dvl.solvers.information_along_trial import solve_with_history
 
         parts = halves_of(trial) if halves else None
-        solution, along = solve_then_history(
-            trial,
-            rate_hz=rate,
-            entries=_ENTRIES,
-            anyway=anyway,
-            progress=progress,
-            stages=stages,
+        solution, along = solve_with_history(
+            trial, rate_hz=rate, entries=_ENTRIES, anyway=anyway, progress=progress
         )
-        if parts is None:
-            return _Found(solution, along=along)
-        # The problem of the whole trial goes before those of the halves come.
-        history = along()
-        del along
-        return _with_halves(trial, _Found(solution, along=lambda: history), parts, progress)
+        found = _Found(solution, along=along)
+        return found if parts is None else _with_halves(trial, found, parts, progress)
 
     _solve_into(
         out,
@@ -154,9 +127,6 @@ def solve(
         figures=None if no_figures else figures,
         anyway=anyway,
         quiet=quiet,
-        resume=resume,
-        options={"anyway": f"{anyway}"},
-        solver="solvers.information_along_trial",
     )
 
 
@@ -190,7 +160,7 @@ def kalman(
 
         raise ConfigError("--linear belongs to one method", expected="--method nine-state")
 
-    def run(trial: Trial, progress: ProgressLine, _: FinishedStages | None) -> _Found:
+    def run(trial: Trial, progress: ProgressLine) -> _Found:
         from factorgraph_dvl.baselines import calibrate
         from factorgraph_dvl.quality.refusal import explained
 
@@ -237,21 +207,14 @@ def _with_halves(
 def _solve_into(
     out: Path,
     trial_path: Path,
-    run: Callable[[Trial, ProgressLine, FinishedStages | None], _Found],
+    run: Callable[[Trial, ProgressLine], _Found],
     *,
     force: bool,
     figures: FigureKind | None,
     anyway: bool,
     quiet: bool,
-    resume: bool = False,
-    options: Mapping[str, str] | None = None,
-    solver: str = "baselines",
 ) -> None:
-    """Load a trial, run a solver, write and show its solution.
-
-    Stages of runs with `options`, which they depend on, are kept until the run ends.
-    """
-    from factorgraph_dvl.graph.freed_memory import return_freed
+    """Load a trial, run a solver, write and show its solution."""
     from factorgraph_dvl.io.run_file import run_of
     from factorgraph_dvl.io.solution_folder import (
         FIGURES_FOLDER,
@@ -263,31 +226,14 @@ def _solve_into(
     from factorgraph_dvl.io.tables import write_table
     from factorgraph_dvl.io.trial_folder import inputs_of, load_trial
 
-    work = claim_output(out, force=force, owned=OWNED, inputs=inputs_of(trial_path))
-    with ProgressLine(quiet=quiet) as progress, ExitStack() as second:
-        with ThreadPoolExecutor() as beside:
-            # Python waits little while Arrow reads tables, and while files are hashed.
-            beside.submit(import_module, f"factorgraph_dvl.{solver}")
-            fingerprint = beside.submit(_fingerprint, trial_path, options)
-            trial = load_trial(trial_path, anyway=anyway)
-        draw: Callable[[_Drawn], Callable[[], None]] | None = None
-        if figures is not None:
-            # Matplotlib takes as long to load as the figures do to draw.
-            draw = second.enter_context(
-                on_standby(partial(_draw, trial, figures.value), _load_figures)
-            )
-        stages = None if options is None else _stages(work, fingerprint.result(), resume)
-        found = run(trial, progress, stages)
-        solution, history = found.solution, found.history
+    claim_output(out, force=force, owned=OWNED, inputs=inputs_of(trial_path))
+    with ProgressLine(quiet=quiet) as progress:
+        trial = load_trial(trial_path, anyway=anyway)
+        found = run(trial, progress)
+        solution, history, along = found.solution, found.history, found.along
+        progress("write", 0, None)
 
-        @contextmanager
-        def add(folder: Path) -> Iterator[None]:
-            if draw is not None:
-                drawn = draw(_Drawn(solution, history, folder / FIGURES_FOLDER))
-            along = found.along()
-            return_freed()
-            progress("write", 0, None)
-            yield
+        def add(folder: Path) -> None:
             write_beams(trial, solution, folder)
             if history is not None:
                 write_history(folder, history.time, history.names, history.std, history.values)
@@ -299,9 +245,9 @@ def _solve_into(
             shown = history or along
             series = None if shown is None else (shown.time, shown.names, shown.std)
             write_report(folder, str(out), solution, run_of(trial), series)
-            if draw is not None:
+            if figures is not None:
                 with drawing():
-                    drawn()
+                    _draw(trial, solution, history, folder / FIGURES_FOLDER, figures.value)
 
         save_solution(solution, out, force=force, extra=add)
     _print_solution(trial, found)
@@ -309,51 +255,15 @@ def _solve_into(
     end_with(solution.verdict)
 
 
-def _fingerprint(trial_path: Path, options: Mapping[str, str] | None) -> str:
-    """Return the hash of what a run depends on; empty if it keeps no stages."""
-    from factorgraph_dvl.campaign.record import fingerprint_of
-    from factorgraph_dvl.io.trial_folder import files_of
-
-    return "" if options is None else fingerprint_of(files_of(trial_path), options)
-
-
-def _stages(work: Path, fingerprint: str, resume: bool) -> FinishedStages:
-    """Return the finished stages of a run; they are removed unless it is interrupted or killed."""
-    from factorgraph_dvl.io.finished_stages import FinishedStages
-
-    stages = FinishedStages(work / "stages", fingerprint, resume=resume)
-    if resume and not stages.found:
-        warn(
-            "--resume: there is no interrupted run of this trial with these options and this "
-            "version of the program, so the run starts from the beginning"
-        )
-    elif stages.names:
-        kept = ", ".join(stages.names)
-        stderr().print(f"Continuing after the finished stages {kept}", markup=False)
-
-    def ended(_: object, error: BaseException | None, __: object) -> None:
-        code = getattr(error, "code", 0)
-        if stages.names and (isinstance(error, KeyboardInterrupt) or code == INTERRUPTED):
-            warn("interrupted; the same command with --resume continues after the finished stages")
-        else:
-            stages.remove()
-
-    claims.push(ended)
-    return stages
-
-
-def _load_figures() -> None:
-    """Load what draws figures."""
-    import factorgraph_dvl.report.figures.solution  # noqa: F401
-
-
-def _draw(trial: Trial, kind: str, given: _Drawn) -> None:
+def _draw(
+    trial: Trial, solution: Solution, history: History | None, folder: Path, kind: str
+) -> None:
     """Draw the figures of a solution."""
     from factorgraph_dvl.report.figures.solution import write_figures
 
-    write_figures(trial, given.solution, given.folder, kind=kind)
-    if given.history is not None:
-        draw_history(trial, given.solution, given.history, given.folder, kind)
+    write_figures(trial, solution, folder, kind=kind)
+    if history is not None:
+        draw_history(trial, solution, history, folder, kind)
 
 
 def draw_history(

@@ -24,7 +24,6 @@ from factorgraph_dvl.geometry.vectors import Array, BoolArray, IntArray
 from factorgraph_dvl.graph import keys
 from factorgraph_dvl.graph.clocks import linearized, parameters_of, true_time
 from factorgraph_dvl.graph.factor_layout import CHUNK, Part, factor_layout
-from factorgraph_dvl.graph.freed_memory import return_freed
 from factorgraph_dvl.graph.imu_errors import ImuErrors, LinearImuFactors
 from factorgraph_dvl.graph.inertial_chain import Chain
 from factorgraph_dvl.graph.keys import BIAS_SIZE, STATE_SIZE
@@ -349,14 +348,6 @@ class Problem:
             out.insert(self._key[p.name], gtsam.Rot3(value) if p.rotation else value)
         return out
 
-    def same_values(self, states: States, parameters: dict[str, Array]) -> gtsam.Values:
-        """Return the values that `arrays` are of, to the last digit; that takes longer."""
-        out = self.values(states, parameters)
-        for k, nRb in enumerate(states.nRb):
-            state = gtsam.NavState(gtsam.Rot3(nRb), states.p_n[k], states.v_n[k])
-            out.update(keys.node(k), state)
-        return out
-
     def arrays(self, values: gtsam.Values) -> tuple[States, dict[str, Array]]:
         """Return states, and parameters by name, of GTSAM's values; rotations as matrices."""
         parameters = {**self._fixed}
@@ -599,7 +590,6 @@ class Problem:
             block.parts, block.matrices, block.vectors, block.factors = [], [], [], []
         if self._imu_errors is not None:
             self._imu_errors.release()
-        return_freed()
 
     def observation_rows(self, evaluation: Evaluation) -> Iterator[Rows]:
         """Yield the rows of each observation, some at a time.

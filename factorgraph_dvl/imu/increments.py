@@ -191,10 +191,6 @@ class Increments(ArcPolynomials):
         rate, force = self.smoothed[-1]
         return rate.window, force.window
 
-    def keep(self, smoothed: tuple[tuple[Smoothed, Smoothed], ...]) -> None:
-        """Keep what `smoothed` of the same increments is, found elsewhere."""
-        vars(self)["smoothed"] = smoothed
-
     def release(self) -> None:
         """Free what `smoothed` keeps, about as much as the samples; it is found anew if needed."""
         vars(self).pop("smoothed", None)
@@ -225,7 +221,8 @@ class Increments(ArcPolynomials):
         step = median(dt)
         regular = bool(np.abs(dt / step - 1.0).max() < UNIFORM)
         middle = time - 0.5 * np.concatenate([[step], dt]) if self.averaged else time
-        self.keep((self._smoothed_pair(middle, rate, force, step, regular=regular),))
+        smoothed = self._smoothed_pair(middle, rate, force, step, regular=regular)
+        vars(self)["smoothed"] = (smoothed,)
 
     def _smoothed_pair(
         self, time: Array, rate: Array, force: Array, dt: float, *, regular: bool

@@ -192,7 +192,7 @@ def _adds(cause: _Cause, order: Sequence[str], rows: Sequence[int]) -> Array:
 
 def _limits(file: _File, source: str) -> Mapping[str, float]:
     if isinstance(file.limits, UnsetType):
-        return DEFAULT_LIMITS
+        return dict(DEFAULT_LIMITS)
     for name, limit in file.limits.items():
         if not limit > 0.0:
             raise DataError(

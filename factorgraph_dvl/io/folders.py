@@ -26,6 +26,8 @@ from factorgraph_dvl.errors import DataError, OutputError
 
 SETTINGS_FILE = "trial.yaml"
 _PARTIAL, _NEW, _OLD, _OWNED = "partial", "new", "old", "owned"
+# Earlier versions kept results of a run there that was interrupted.
+_STAGES = "stages"
 _NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
 _AT_FDCWD, _RENAME_EXCHANGE = -100, 2
 
@@ -255,7 +257,8 @@ def _recover(work: Path, target: Path) -> None:
     """Remove what a killed run left, and put back what it had set aside."""
     file = work / _OWNED
     owned = file.read_text(encoding="utf-8").splitlines() if file.exists() else []
-    shutil.rmtree(work / _PARTIAL, ignore_errors=True)
+    for left in (_PARTIAL, _STAGES):
+        shutil.rmtree(work / left, ignore_errors=True)
     for aside in (work / _OLD, work / _NEW):
         if aside.is_dir():
             if target.exists():
@@ -294,7 +297,7 @@ def _replace(work: Path, target: Path, owned: Sequence[str]) -> None:
 
 
 def _exchange(a: Path, b: Path) -> None:
-    """Let two folders trade names at one instant."""
+    """Let two folders trade names at one instant: the standard library has no call for that."""
     libc = ctypes.CDLL(None, use_errno=True)
     names = os.fsencode(a), os.fsencode(b)
     if libc.renameat2(_AT_FDCWD, names[0], _AT_FDCWD, names[1], _RENAME_EXCHANGE) != 0:

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any, Literal
 
 import msgspec
 import numpy as np
 
-from factorgraph_dvl.background import in_background
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.io.calibration_file import (
@@ -93,7 +91,7 @@ def save_solution(
     path: Path | str,
     *,
     force: bool = False,
-    extra: Callable[[Path], AbstractContextManager[object]] | None = None,
+    extra: Callable[[Path], object] | None = None,
     smoothed: Trajectory | None = None,
 ) -> None:
     """Write a solution folder, complete or not at all.
@@ -107,8 +105,7 @@ def save_solution(
     force : bool, default False
         Replace the solution that is there.
     extra : callable, optional
-        Called with the folder before it appears under `path`; returns a context manager that adds
-        files. The solution is written within.
+        Called with the folder before it appears under `path`, to add files.
     smoothed : Trajectory, optional
         What later data made of states of the trajectory; more columns of it.
 
@@ -133,19 +130,16 @@ def save_solution(
         columns = trajectory_columns(solution.trajectory)
         if smoothed is not None:
             columns |= _smoothed_columns(solution.trajectory, smoothed)
-
-        def write() -> None:
-            write_table(folder / TRAJECTORY_FILE, columns)
-            if solution.residuals:
-                write_table(folder / RESIDUALS_FILE, residual_columns(solution.residuals))
-
-        with in_background(write, urgent=True) as written:
-            with nullcontext() if extra is None else extra(folder):
-                if solution.hypotheses:
-                    _write_hypotheses(folder, solution.hypotheses)
-                if solution.rejected:
-                    write_table(folder / REJECTED_FILE, rejected_columns(solution.rejected))
-            written()
+        write_table(folder / TRAJECTORY_FILE, columns)
+        del columns
+        if solution.residuals:
+            write_table(folder / RESIDUALS_FILE, residual_columns(solution.residuals))
+        if solution.hypotheses:
+            _write_hypotheses(folder, solution.hypotheses)
+        if solution.rejected:
+            write_table(folder / REJECTED_FILE, rejected_columns(solution.rejected))
+        if extra is not None:
+            extra(folder)
         (folder / CALIBRATION_FILE).write_bytes(encode_calibration(solution))
 
 

@@ -66,7 +66,7 @@ def survey(trial: Trial) -> Survey:
     >>> found.duration, len(found.sensors)
     (85.98, 3)
     """
-    # What looks for findings takes long to load: a solve has it in a second process.
+    # What looks for findings takes long to load.
     from factorgraph_dvl.quality.plausibility import findings
 
     sensors = []

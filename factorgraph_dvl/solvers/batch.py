@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from copy import copy
 from dataclasses import replace
 from typing import TYPE_CHECKING
@@ -11,7 +9,6 @@ from typing import TYPE_CHECKING
 import gtsam
 import numpy as np
 
-from factorgraph_dvl.background import in_background
 from factorgraph_dvl.errors import ConfigError
 from factorgraph_dvl.graph.priors import ConstantsPrior
 from factorgraph_dvl.imu.propagation import States
@@ -26,7 +23,6 @@ from factorgraph_dvl.solvers.fixed_directions import (
     undetermined_there,
     with_covariances,
 )
-from factorgraph_dvl.solvers.known_parameters import explanation
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, minimise
 from factorgraph_dvl.solvers.minima import (
     competing_minima,
@@ -36,8 +32,6 @@ from factorgraph_dvl.solvers.minima import (
 )
 from factorgraph_dvl.solvers.preparation import Preparation, prepare
 from factorgraph_dvl.solvers.rounds import SettledMinimum, settle
-from factorgraph_dvl.solvers.speculation import Explain, speculated
-from factorgraph_dvl.solvers.stages import Stages
 from factorgraph_dvl.solvers.state_times import STATE_INTERVAL
 from factorgraph_dvl.solvers.summary import summarise
 from factorgraph_dvl.solvers.trajectory import TRAJECTORY_RATE
@@ -108,98 +102,52 @@ def solve_with_problem(
     state_interval_s: float = STATE_INTERVAL,
     anyway: bool = False,
     progress: Progress | None = None,
-    stages: Stages | None = None,
-    meanwhile: Callable[[SolvedProblem], object] = bool,
 ) -> tuple[Solution, SolvedProblem | SmoothedMotion | None]:
     """Return the solution of a trial, and its problem at the most probable minimum.
 
     That of a planar trial is of another kind, and None here. Parameters and errors are those of
-    `solve`; in `stages` results of alignment, mounting and rounds are kept, and taken from.
-    `meanwhile` is called with a problem at its minimum where there is time while a second process
-    tests it.
+    `solve`.
     """
     _check_above_zero("rate_hz", rate_hz)
     _check_above_zero("state_interval_s", state_interval_s)
     # What a trial without positions lacks comes before what is odd in its records.
     trial.frame()
     report = progress or _silent
+    report("survey", 0, None)
+    records = survey(trial)
+    errors = accepted_errors(records, anyway=anyway)
     solved: SolvedProblem | SmoothedMotion
     # Solvers of some kinds of trials are loaded for these only.
-    if trial.planar:
-        from factorgraph_dvl.ranging.planar_solution import solve_planar
+    with explained(errors):
+        if trial.planar:
+            from factorgraph_dvl.ranging.planar_solution import solve_planar
 
-        records = survey(trial)
-        with explained(accepted_errors(records, anyway=anyway)):
             found = solve_planar(trial, rate_hz=rate_hz, progress=report)
-        return found.with_findings(records.problems), None
-    if trial.imu is None:
-        from factorgraph_dvl.solvers.motion_preparation import prepare_motion
-        from factorgraph_dvl.solvers.motion_smoother import smooth_motion
-        from factorgraph_dvl.solvers.motion_summary import summarise_motion
+            return found.with_findings(records.problems), None
+        if trial.imu is None:
+            from factorgraph_dvl.solvers.motion_preparation import prepare_motion
+            from factorgraph_dvl.solvers.motion_smoother import smooth_motion
+            from factorgraph_dvl.solvers.motion_summary import summarise_motion
 
-        with _surveyed(trial, anyway=anyway) as errors:
-            motion = prepare_motion(trial)
-            errors()
-            solved = smooth_motion(motion, report)
+            solved = smooth_motion(prepare_motion(trial), report)
             found = summarise_motion(trial, solved, rate_hz=rate_hz)
-    else:
-        with _surveyed(trial, anyway=anyway) as errors:
-            prepared = prepare(trial, state_interval_s, report, stages)
-            found, solved = _most_probable(
-                trial, prepared, rate_hz, report, stages, meanwhile, errors
-            )
-    return found.with_findings(errors()), solved
-
-
-@contextmanager
-def _surveyed(trial: Trial, *, anyway: bool) -> Iterator[Callable[[], tuple[Finding, ...]]]:
-    """Survey a trial meanwhile, and yield what waits for the errors with which it can be solved.
-
-    That raises DataError if there are records that cannot be used. So does the block if it fails:
-    that is what the user must know.
-    """
-    with in_background(lambda: survey(trial)) as surveyed:
-
-        def errors() -> tuple[Finding, ...]:
-            return accepted_errors(surveyed(), anyway=anyway)
-
-        try:
-            yield errors
-        except Exception as failure:
-            with explained(errors()):
-                raise failure
+        else:
+            prepared = prepare(trial, state_interval_s, report)
+            found, solved = _most_probable(trial, prepared, rate_hz, report)
+    return found.with_findings(errors), solved
 
 
 def _most_probable(
-    trial: Trial,
-    prepared: Preparation,
-    rate_hz: float,
-    report: Progress,
-    stages: Stages | None,
-    meanwhile: Callable[[SolvedProblem], object],
-    ready: Callable[[], object],
+    trial: Trial, prepared: Preparation, rate_hz: float, report: Progress
 ) -> tuple[Solution, SolvedProblem]:
-    """Return the most probable of all minima from all positions, with the spread of the others.
-
-    `ready` is called before a minimisation with all sensors begins.
-    """
-    starts = prepared.start_positions.states
-    # Of several starts each has a mounting of its own.
-    mounting = stages if len(starts) == 1 else None
+    """Return the most probable of all minima from all positions, with the spread of the others."""
     solutions, best = [], []
-    for states in starts:
-
-        def summarised(
-            explain: Explain, states: States = states
-        ) -> tuple[Solution, SolvedProblem]:
-            minima = _minima(prepared, states, prepared.findings, report, mounting, explain, ready)
-            against = np.array([evidence_against(each) for each in minima])
-            summaries = [summarise(trial, each, rate_hz=rate_hz) for each in minima]
-            return most_probable_minimum(summaries, against), minima[0]
-
-        solution, minimum = speculated(summarised, lambda found: meanwhile(found[1]))
-        solutions.append(solution)
-        best.append(minimum)
+    for states in prepared.start_positions.states:
+        minima = _minima(prepared, states, prepared.findings, report)
+        against = np.array([evidence_against(each) for each in minima])
+        summaries = [summarise(trial, each, rate_hz=rate_hz) for each in minima]
+        solutions.append(most_probable_minimum(summaries, against))
+        best.append(minima[0])
     costs = significant_costs([cost_terms(each) for each in best])
     likeliest = int(np.argmin(costs))
     return joined(solutions, costs, prepared.start_positions.hypotheses), best[likeliest]
@@ -236,12 +184,9 @@ def _minima(
     states: States,
     findings: tuple[Finding, ...],
     report: Progress,
-    stages: Stages | None = None,
-    explain: Explain = explanation,
-    ready: Callable[[], object] = bool,
 ) -> list[SolvedProblem]:
     """Return the minima near some states and their rivals, the most probable first."""
-    found = competing_minima(prepared, states, report, stages, explain, ready)
+    found = competing_minima(prepared, states, report)
     return distinct(prepared, [_with_covariances(each, findings, report) for each in found])
 
 

@@ -13,8 +13,7 @@ Sequential Estimation, 1977, ch. VI). At the end it is what the smoother has.
 
 from __future__ import annotations
 
-import weakref
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -24,14 +23,12 @@ from scipy.linalg.lapack import dgeqrf, dtrtri
 
 from factorgraph_dvl.geometry.vectors import Array, IntArray
 from factorgraph_dvl.graph import keys
-from factorgraph_dvl.graph.freed_memory import return_freed
 from factorgraph_dvl.graph.keys import BIAS_SIZE
 from factorgraph_dvl.graph.problem import FIXED_DIRECTION_STD, Evaluation, Problem
 from factorgraph_dvl.solution import Progress, Solution
 from factorgraph_dvl.solvers.batch import solve_with_problem
 from factorgraph_dvl.solvers.calibration import prior_along, reported
 from factorgraph_dvl.solvers.fixed_directions import SolvedProblem
-from factorgraph_dvl.solvers.stages import Stages
 from factorgraph_dvl.statistics.information_history import InformationHistory
 from factorgraph_dvl.statistics.spurious_information import spurious_information
 from factorgraph_dvl.statistics.undetermined_directions import (
@@ -70,68 +67,19 @@ def solve_with_history(
 ) -> tuple[Solution, InformationHistory | None]:
     """Solve a trial, and follow the information on its constants along it.
 
-    Parameters and errors as of `solve_then_history`.
-    """
-    solution, history = solve_then_history(
-        trial, rate_hz=rate_hz, entries=entries, anyway=anyway, progress=progress
-    )
-    return solution, history()
-
-
-def solve_then_history(
-    trial: Trial,
-    *,
-    rate_hz: float,
-    entries: int | None = None,
-    anyway: bool = False,
-    progress: Progress | None = None,
-    stages: Stages | None = None,
-) -> tuple[Solution, Callable[[], InformationHistory | None]]:
-    """Solve a trial; return what follows the information on its constants along it, too.
-
-    That is to be called once. A planar trial has no such history.
-
-    Parameters and errors as of `solvers.batch.solve`, and `stages` as of `solve_with_problem`;
+    A planar trial has no such history. Parameters and errors as of `solvers.batch.solve`;
     `entries` as of `information_history`.
     """
-    followed: list[tuple[weakref.ref[SolvedProblem], InformationHistory]] = []
+    solution, solved = solve_with_problem(trial, rate_hz=rate_hz, anyway=anyway, progress=progress)
+    if solved is None:
+        return solution, None
+    if progress:
+        progress("information along the trial", 0, None)
+    if isinstance(solved, SolvedProblem):
+        return solution, information_history(solved, entries=entries)
+    from factorgraph_dvl.solvers.motion_information import motion_history
 
-    def follow(found: SolvedProblem) -> InformationHistory:
-        if progress:
-            progress("information along the trial", 0, None)
-        out = information_history(found, entries=entries)
-        followed.append((weakref.ref(found), out))
-        return out
-
-    solution, solved = solve_with_problem(
-        trial,
-        rate_hz=rate_hz,
-        anyway=anyway,
-        progress=progress,
-        stages=stages,
-        meanwhile=follow,
-    )
-
-    done = next((known for minimum, known in followed if minimum() is solved), None)
-    if done is not None:
-        # The problem, most of what takes memory, is not needed any more then.
-        solved = None
-        return_freed()
-
-    def history() -> InformationHistory | None:
-        nonlocal solved
-        found, solved = solved, None
-        if found is None:
-            return done
-        if isinstance(found, SolvedProblem):
-            return follow(found)
-        from factorgraph_dvl.solvers.motion_information import motion_history
-
-        if progress:
-            progress("information along the trial", 0, None)
-        return motion_history(found, entries=entries)
-
-    return solution, history
+    return solution, motion_history(solved, entries=entries)
 
 
 def information_history(found: SolvedProblem, *, entries: int | None = None) -> InformationHistory:

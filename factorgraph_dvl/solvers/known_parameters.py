@@ -10,7 +10,6 @@ import numpy as np
 
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph.clocks import parameters_of
-from factorgraph_dvl.graph.freed_memory import return_freed
 from factorgraph_dvl.graph.problem import Evaluation, Problem
 from factorgraph_dvl.graph.sensor_factor import ObservationRows
 from factorgraph_dvl.imu.sampling import apparent_gyro_scale
@@ -100,7 +99,6 @@ def explanation(problem: Problem, minimum: Minimum, imu: Imu) -> Explanation | N
         **_tests_of_priors(problem, evaluation, information),
         **_tests_of_known(problem, evaluation),
     }
-    return_freed()
     limit = _LOG10_P - np.log10(max(len(tests), 1))
     significant = [
         (p, test) for p, test in tests.values() if test.log10_p < limit and _is_plausible(p, test)

@@ -53,15 +53,12 @@ class Minimum:
         have moved measurements, so that another problem follows.
     iterations : int
         Accepted and refused steps.
-    linear_at : gtsam.Values, optional
-        Where the graph of `square_root` is linear: before the last step.
     """
 
     evaluation: Evaluation
     square_root: SquareRootInformation | None
     converged: bool
     iterations: int
-    linear_at: gtsam.Values | None = None
 
     @property
     def information(self) -> SquareRootInformation:
@@ -125,7 +122,7 @@ def minimise(
             where=stage,
             hint="Inspect the trial: a unit or a column may be wrong",
         )
-    gaussian, linear_at = problem.linearize(evaluation), evaluation.values
+    gaussian = problem.linearize(evaluation)
     ordering, sizes = problem.ordering(), values.dims()
     if enough:
         enough *= 0.5 * sum(np.count_nonzero(weights) for weights in problem.weights)
@@ -168,14 +165,14 @@ def minimise(
             if progress:
                 progress(stage, iteration, evaluation.cost)
             if ended and damping == 0.0 and (root is not None or not proven):
-                return Minimum(evaluation, root, True, iteration, linear_at)
+                return Minimum(evaluation, root, True, iteration)
             if evaluation.cost < enough:
                 return Minimum(evaluation, None, False, iteration)
             if small or gain > _GOOD_GAIN:
                 damping = damping / 10.0 if damping > _FIRST_DAMPING else 0.0
             elif gain < _POOR_GAIN:
                 damping *= 10.0
-            gaussian, linear_at = problem.linearize(evaluation), evaluation.values
+            gaussian = problem.linearize(evaluation)
             if damping <= failed:
                 # Steps that small gain nothing, and larger ones fail: so it would go on.
                 break
@@ -189,7 +186,7 @@ def minimise(
                 break
         root = None
     root = eliminated(gaussian, problem.ordering(branches=False), sizes)
-    return Minimum(evaluation, root, False, iteration, linear_at)
+    return Minimum(evaluation, root, False, iteration)
 
 
 def factorized(

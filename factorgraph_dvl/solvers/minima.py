@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -15,12 +15,9 @@ from factorgraph_dvl.imu.propagation import States
 from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.solution import Progress
 from factorgraph_dvl.solvers.fixed_directions import SolvedProblem
-from factorgraph_dvl.solvers.known_parameters import explanation
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, minimise
 from factorgraph_dvl.solvers.preparation import ROUGH_TOLERANCE, Preparation
 from factorgraph_dvl.solvers.rounds import SettledMinimum, settle
-from factorgraph_dvl.solvers.speculation import Explain
-from factorgraph_dvl.solvers.stages import Stages
 from factorgraph_dvl.statistics.robust_weights import rejection_cost
 
 # Length, s, up to which start values may lead to a wrong minimum, and standard deviation, rad,
@@ -42,12 +39,7 @@ _SAME_ANGLE = 15.0 * DEG
 
 
 def competing_minima(
-    prepared: Preparation,
-    states: States,
-    report: Progress,
-    stages: Stages | None = None,
-    explain: Explain = explanation,
-    ready: Callable[[], object] = bool,
+    prepared: Preparation, states: States, report: Progress
 ) -> list[SettledMinimum]:
     """Return the minimum that some states lead to, then others that are about as probable.
 
@@ -62,12 +54,8 @@ def competing_minima(
         Where to start.
     report : callable
         Called with stage, iteration and cost.
-    stages : Stages, optional
-        Where what the first starts from, and its rounds, are kept, and taken from.
-    explain, ready : callable, optional
-        As of `settle`, for the first.
     """
-    first = settle(prepared, states, report, stages=stages, explain=explain, ready=ready)
+    first = settle(prepared, states, report)
     rotations = [p for p in prepared.parameters if p.rotation and p.estimated]
     time = prepared.segments.node_time
     is_free = any(p.sigma.max() > _ANY_ANGLE for p in rotations)

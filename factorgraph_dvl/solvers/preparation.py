@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
-from factorgraph_dvl.background import in_background
 from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph.inertial_chain import Chain, inertial_chain
@@ -18,17 +16,15 @@ from factorgraph_dvl.imu.preintegration import Segments, segments
 from factorgraph_dvl.imu.propagation import States
 from factorgraph_dvl.imu.timestamps import without_strays
 from factorgraph_dvl.initialization.attitude_sensors import attitudes
-from factorgraph_dvl.initialization.in_motion_alignment import AlignedStates, initial_states
+from factorgraph_dvl.initialization.in_motion_alignment import initial_states
 from factorgraph_dvl.initialization.mountings import mounted_aids, mountings_from_motion
 from factorgraph_dvl.ranging.position_from_ranges import StartPositions, positions_from_ranges
-from factorgraph_dvl.sensors.finding import Code, Finding, Severity
-from factorgraph_dvl.sensors.message import decoded, encoded
+from factorgraph_dvl.sensors.finding import Finding
 from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.sensors.protocol import Observation
 from factorgraph_dvl.solution import Progress
 from factorgraph_dvl.solvers.levenberg_marquardt import minimise
 from factorgraph_dvl.solvers.outliers import robust_weights
-from factorgraph_dvl.solvers.stages import Stages, finished
 from factorgraph_dvl.solvers.state_times import dense_epochs
 from factorgraph_dvl.trial import Trial
 
@@ -92,49 +88,7 @@ class Preparation:
         )
 
 
-@dataclass(frozen=True)
-class _Said:
-    """A finding as plain data."""
-
-    code: Code
-    message: Any
-    text: str
-    sensor: str
-    parameter: str
-    severity: Severity
-
-
-@dataclass(frozen=True)
-class _Aligned:
-    """Aligned states with findings as plain data, as stages keep them."""
-
-    states: States
-    mountings: dict[str, Array]
-    findings: tuple[_Said, ...]
-
-    def again(self) -> AlignedStates:
-        """Return the aligned states."""
-        findings = tuple(
-            Finding(f.code, decoded(f.message, f.text), f.sensor, f.parameter, f.severity)
-            for f in self.findings
-        )
-        return AlignedStates(self.states, self.mountings, findings)
-
-
-def _kept(found: AlignedStates) -> _Aligned:
-    said = []
-    for f in found.findings:
-        plain = None if isinstance(f.message, str) else encoded(f.message)
-        said.append(_Said(f.code, plain, f.text, f.sensor, f.parameter, f.severity))
-    return _Aligned(found.states, found.mountings, tuple(said))
-
-
-def prepare(
-    trial: Trial,
-    state_interval_s: float,
-    report: Progress,
-    stages: Stages | None = None,
-) -> Preparation:
+def prepare(trial: Trial, state_interval_s: float, report: Progress) -> Preparation:
     """Return segments, start states and measurements of a trial.
 
     Parameters
@@ -145,8 +99,6 @@ def prepare(
         Time between the states of the graph, s.
     report : callable
         Called with stage, iteration and cost.
-    stages : Stages, optional
-        Where the start states are kept, and taken from.
 
     Raises
     ------
@@ -162,15 +114,10 @@ def prepare(
     frame = trial.frame()
     report("increments", 0, None)
     inc, gaps = increments(trial.inertial)
-    with in_background(lambda: inc.smoothed, urgent=True) as smoothed:
-        seg = segments(inc, state_interval_s, dense_epochs(trial, frame, state_interval_s))
-        inc.keep(smoothed())
+    seg = segments(inc, state_interval_s, dense_epochs(trial, frame, state_interval_s))
     report("alignment", 0, None)
     on_one_clock = trial.on_one_clock()
-    aligned = finished(
-        stages, "alignment", _Aligned, lambda: _kept(initial_states(on_one_clock, frame, seg))
-    )
-    start = aligned.again()
+    start = initial_states(on_one_clock, frame, seg)
     if trial.beacons is not None:
         report("ranges", 0, None)
     start_positions = positions_from_ranges(on_one_clock, frame, seg, start.states)

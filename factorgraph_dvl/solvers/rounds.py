@@ -7,9 +7,8 @@ settled.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 
@@ -31,7 +30,6 @@ from factorgraph_dvl.solvers.correlated_noise import (
     noise_of,
     with_innovations,
 )
-from factorgraph_dvl.solvers.finished_minimum import finished_minimum
 from factorgraph_dvl.solvers.known_parameters import (
     Explanation,
     confirmed,
@@ -40,10 +38,8 @@ from factorgraph_dvl.solvers.known_parameters import (
 )
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, factorized, minimise
 from factorgraph_dvl.solvers.outliers import robust_weights
-from factorgraph_dvl.solvers.preparation import MountedStart, Preparation, mounted_start
+from factorgraph_dvl.solvers.preparation import Preparation, mounted_start
 from factorgraph_dvl.solvers.process_fit import refitted
-from factorgraph_dvl.solvers.speculation import Explain
-from factorgraph_dvl.solvers.stages import Stages, finished
 from factorgraph_dvl.statistics.variance_components import (
     VarianceComponents,
     variance_components,
@@ -119,9 +115,6 @@ def settle(
     constants_prior: ConstantsPrior | None = None,
     values: dict[str, Array] | None = None,
     clock_zero: float | None = None,
-    stages: Stages | None = None,
-    explain: Explain = explanation,
-    ready: Callable[[], object] = bool,
 ) -> SettledMinimum:
     """Return the minimum that some states lead to.
 
@@ -140,12 +133,6 @@ def settle(
         Parameters to start from; by default mountings that fit the motion.
     clock_zero : float, optional
         When the offsets of clocks hold, s; by default in the middle of the trial.
-    stages : Stages, optional
-        Where the mountings and the minimum of each round are kept, and taken from.
-    explain : callable, optional
-        Test of parameters that are taken as known.
-    ready : callable, optional
-        Called before the first minimisation with all sensors; it may refuse the records.
     """
     chain = prepared.chain(states)
     p_gravity = states.p_n
@@ -155,13 +142,9 @@ def settle(
     robust: dict[str, Array] = {}
     usable: Mapping[str, BoolArray] | None = None
     if values is None:
-        first = states
-        start = finished(
-            stages, "mounting", MountedStart, lambda: mounted_start(prepared, chain, first, report)
-        )
+        start = mounted_start(prepared, chain, states, report)
         states, values, iterations = start.states, start.values, start.iterations
         robust = start.robust_weights
-    ready()
     rejected = prepared.start_positions.rejected
     tried: list[Mapping[str, Array]] = []
     cycle: list[Mapping[str, Array]] = []
@@ -182,7 +165,7 @@ def settle(
     levels = first_levels
     changing = [message("not_converged.all")]
     tolerance: Mapping[str, float] = {}
-    count = in_a_row = fruitless = minimised = 0
+    count = in_a_row = fruitless = 0
     movement = np.inf
     bound = values
     while count < _ROUNDS and fruitless < _FRUITLESS:
@@ -214,16 +197,7 @@ def settle(
         # At the ends of the record two bindings may use one measurement in turn.
         usable = problem.usable if tolerance else None
         at = problem.values(states, problem.prior_values() | values)
-        minimised += 1
-        # Tests of known parameters that are made later may lead elsewhere from the same round on.
-        name = "-".join(["minimum", f"{minimised}", *(e.parameter.name for e in freed)])
-        minimum = finished_minimum(
-            stages,
-            name,
-            problem,
-            at,
-            partial(minimise, stage="all sensors", progress=report, binding=True),
-        )
+        minimum = minimise(problem, at, stage="all sensors", progress=report, binding=True)
         iterations += minimum.iterations
         fruitless = 0 if minimum.converged else fruitless + minimum.iterations
         states, values = minimum.evaluation.states, minimum.evaluation.parameters
@@ -275,7 +249,7 @@ def settle(
             tested = parameters
             # The test has a problem of its own, and more columns.
             problem.release()
-            left = explain(problem, minimum, prepared.trial.inertial)
+            left = explanation(problem, minimum, prepared.trial.inertial)
             if left is not None and len(freed) < _MOST_FREED:
                 freed.append(left)
                 parameters = tuple(

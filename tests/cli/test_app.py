@@ -38,22 +38,21 @@ def stub(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
         entries: int,
         anyway: bool,
         progress: Callable[..., None],
-        stages: object,
-    ) -> tuple[Solution, Callable[[], InformationHistory | None]]:
+    ) -> tuple[Solution, InformationHistory | None]:
         state["trial"], state["rate"] = trial, rate_hz
         progress("alignment", 0, None)
         progress("batch", 0, 9.87e12)
         progress("batch", 1, 12.51234)
         if state["raises"] is not None:
             raise state["raises"]
-        return state["solution"], lambda: state.get("along")
+        return state["solution"], state.get("along")
 
     def write_figures(trial: Trial, solution: Solution, folder: Path, *, kind: str) -> None:
         folder.mkdir()
         (folder / "track.png").write_text("png")
 
     module = factorgraph_dvl.solvers.information_along_trial
-    monkeypatch.setattr(module, "solve_then_history", solve)
+    monkeypatch.setattr(module, "solve_with_history", solve)
     monkeypatch.setattr(factorgraph_dvl.report.figures.solution, "write_figures", write_figures)
     return state
 

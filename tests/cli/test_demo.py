@@ -42,10 +42,10 @@ def test_the_demo_is_the_shipped_trial_and_opens_its_page(
     solution = build_solution()
 
     def solve(*_: Any, **__: Any) -> Any:
-        return solution, lambda: None
+        return solution, None
 
     monkeypatch.setattr(
-        "factorgraph_dvl.solvers.information_along_trial.solve_then_history", solve
+        "factorgraph_dvl.solvers.information_along_trial.solve_with_history", solve
     )
     monkeypatch.setattr(
         "factorgraph_dvl.report.figures.solution.write_figures", lambda *_, **__: []

@@ -52,8 +52,8 @@ def test_a_result_comes_with_its_verdict_and_its_files(
 ) -> None:
     solution = build_solution()
     monkeypatch.setattr(
-        "factorgraph_dvl.solvers.information_along_trial.solve_then_history",
-        lambda *_, **__: (solution, lambda: None),
+        "factorgraph_dvl.solvers.information_along_trial.solve_with_history",
+        lambda *_, **__: (solution, None),
     )
     out = tmp_path / "out"
     result = run("--json", "solve", write_trial(tmp_path), "--out", out, "--no-figures")

@@ -334,10 +334,10 @@ def test_a_second_run_into_one_output_fails_at_once(tmp_path, capsys, monkeypatc
                 check=False,
             )
         )
-        return build_solution(), lambda: None
+        return build_solution(), None
 
     module = factorgraph_dvl.solvers.information_along_trial
-    monkeypatch.setattr(module, "solve_then_history", solve)
+    monkeypatch.setattr(module, "solve_with_history", solve)
     assert run("solve", trial, "--out", out, "--no-figures") == 0
     (second,) = codes
     assert second.returncode == 2

@@ -2,8 +2,6 @@ from __future__ import annotations
 
 import csv
 import json
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -156,9 +154,7 @@ def test_a_solution_without_estimates_is_saved(tmp_path: Path) -> None:
 def test_extra_files_appear_with_the_solution(tmp_path: Path) -> None:
     path = tmp_path / "s"
 
-    @contextmanager
-    def extra(folder: Path) -> Iterator[None]:
-        yield
+    def extra(folder: Path) -> None:
         assert not path.exists()
         (folder / "figures").mkdir()
         (folder / "figures" / "track.png").write_text("png")

@@ -179,6 +179,13 @@ def test_without_any_position_there_is_no_frame():
         solve(replace(trial, gnss=None))
 
 
+def test_records_that_cannot_be_used_come_before_what_fails_with_them():
+    trial = simulate(scenario())
+    nothing = np.full_like(trial.dvl.velocity, np.nan)
+    with pytest.raises(DataError, match="--anyway"):
+        solve(replace(trial, dvl=replace(trial.dvl, velocity=nothing)))
+
+
 def test_a_dvl_that_never_locks_and_no_dvl():
     trial = simulate(scenario(dvl={"no_lock_s": [[0.0, 100.0]]}))
     solution = solve(trial, anyway=True)

@@ -15,7 +15,6 @@ from matplotlib.gridspec import GridSpec
 
 from factorgraph_dvl.analysis.beam_quality import beam_quality, calibrates, calibration_of
 from factorgraph_dvl.analysis.error_statistics import trajectory_errors
-from factorgraph_dvl.background import in_background
 from factorgraph_dvl.errors import ConfigError
 from factorgraph_dvl.geometry.records import rows_of
 from factorgraph_dvl.report.figures.beams import beam_quality_figure
@@ -61,16 +60,8 @@ def write_figures(
         `error_budget.png`.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    known = drawings(solution, trial)
-
-    def drawn(names: Sequence[str]) -> list[Path]:
-        figures = {name: known[name](None) for name in names}
-        return save_figures(figures, folder, solution.verdict, name=solution.trial, kind=kind)
-
-    names = list(known)
-    # Every other one in a second process: those that take long stand side by side.
-    with in_background(lambda: drawn(names[1::2]), urgent=True) as others:
-        return [*drawn(names[::2]), *others()]
+    figures = {name: draw(None) for name, draw in drawings(solution, trial).items()}
+    return save_figures(figures, folder, solution.verdict, name=solution.trial, kind=kind)
 
 
 def plot(
