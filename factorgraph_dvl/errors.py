@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import re
 import unicodedata
+
+# As which Python shows bytes of names that it cannot decode.
+_UNKNOWN_BYTES = re.compile("[\udc80-\udcff]+")
 
 
 class FactorgraphDvlError(Exception):
@@ -90,6 +94,20 @@ class OutputError(FactorgraphDvlError):
     exit_code = 1
 
 
+def as_text(name: object) -> str:
+    r"""Return the name of a file as text that any file in UTF-8 can hold.
+
+    Where Python does not know the encoding of names, they are taken to be in UTF-8; bytes that
+    are not are escaped, such as `\xff`.
+    """
+    return _UNKNOWN_BYTES.sub(
+        lambda found: (
+            found[0].encode("ascii", "surrogateescape").decode("utf-8", "backslashreplace")
+        ),
+        str(name),
+    )
+
+
 def printable(text: str) -> str:
     r"""Return text with what does not print escaped, such as `\x1b` and `\u202e`.
 
@@ -98,6 +116,7 @@ def printable(text: str) -> str:
     """
     if text.isprintable():
         return text
+    text = as_text(text)
     return "".join(
         c
         if c.isprintable() or unicodedata.category(c) == "Zs"

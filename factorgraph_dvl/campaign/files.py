@@ -16,6 +16,7 @@ from factorgraph_dvl.campaign.record import write_whole
 from factorgraph_dvl.campaign.seed_run import SEEDS_FOLDER, SeedRecord
 from factorgraph_dvl.campaign.trial_run import TRIALS_FOLDER
 from factorgraph_dvl.campaign.trials import Campaign
+from factorgraph_dvl.errors import as_text
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.io.calibration_file import CALIBRATION_FILE, encode_calibration
 from factorgraph_dvl.io.tables import write_table
@@ -93,7 +94,7 @@ def write_seeds(
                 values[i] = r.deviation[k], np.sqrt(r.covariance[k][k])
         columns |= {f"{name}_error": values[:, 0], f"{name}_std": values[:, 1]}
     _write_table(out / SEEDS_FILE, columns)
-    content: dict[str, Any] = {"format": 1, "ended": True, "scenario": str(scenario)}
+    content: dict[str, Any] = {"format": 1, "ended": True, "scenario": as_text(scenario)}
     content["seeds"] = len(records)
     content["failed"] = [{"seed": int(r.name), "error": r.error} for r in records if not r.done]
     if found is not None:

@@ -23,7 +23,7 @@ from factorgraph_dvl.campaign.record import (
     read_record,
     write_record,
 )
-from factorgraph_dvl.errors import FactorgraphDvlError
+from factorgraph_dvl.errors import FactorgraphDvlError, as_text
 from factorgraph_dvl.io.calibration_file import CALIBRATION_FILE, load_calibration
 from factorgraph_dvl.io.trial_folder import files_of, locate
 from factorgraph_dvl.io.trial_yaml import TrialSettings
@@ -59,7 +59,7 @@ def run_trial(trial: str, label: str, out: str, options: Sequence[str]) -> RunRe
     if earlier is not None and same and earlier.result == hash_of(folder / CALIBRATION_FILE):
         return earlier
     file.unlink(missing_ok=True)
-    record = RunRecord(name=Path(trial).name, fingerprint=fingerprint, done=False)
+    record = RunRecord(name=as_text(Path(trial).name), fingerprint=fingerprint, done=False)
     try:
         _describe(record, Path(trial))
     except FactorgraphDvlError as error:
@@ -107,7 +107,7 @@ def _settings_of(trial: Path) -> tuple[TrialSettings, str, Path]:
     """Return the settings of a trial, its name and folder."""
     folder, file = locate(trial)
     settings = parse_yaml(read_text(file), TrialSettings, source=file.name)
-    return settings, settings.name or folder.resolve().name, folder
+    return settings, settings.name or as_text(folder.resolve().name), folder
 
 
 def _describe(record: RunRecord, trial: Path) -> None:

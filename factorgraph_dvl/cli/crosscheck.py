@@ -63,6 +63,7 @@ def crosscheck(
       factorgraph-dvl crosscheck out out-kalman --out out/crosscheck
     """
     from factorgraph_dvl.analysis.comparison.crosscheck import crosscheck as compare
+    from factorgraph_dvl.errors import as_text
     from factorgraph_dvl.io.calibration_file import check_verdict
     from factorgraph_dvl.io.external_results import load_results, load_truth
     from factorgraph_dvl.io.folders import new_folder
@@ -90,7 +91,9 @@ def crosscheck(
             write_table(folder / "differences.csv", difference_columns(check.motion))
         if not no_figures:
             _draw_crosscheck(check, folder, figures.value)
-        (folder / "crosscheck.json").write_bytes(to_json(check, {"A": str(a), "B": str(b)}))
+        (folder / "crosscheck.json").write_bytes(
+            to_json(check, {"A": as_text(a), "B": as_text(b)})
+        )
     _print_crosscheck(check, a, b)
     print_written(out)
 

@@ -72,6 +72,7 @@ def deadreckon(
       factorgraph-dvl deadreckon data/seed-a-phase-90 --calibration out --out out/deadreckon
     """
     from factorgraph_dvl.analysis.dead_reckoning.before_after import before_after
+    from factorgraph_dvl.errors import as_text
     from factorgraph_dvl.io.external_results import own_calibration, read_calibration_values
     from factorgraph_dvl.io.folders import new_folder
     from factorgraph_dvl.io.motion_table import motion_columns
@@ -114,8 +115,8 @@ def deadreckon(
                 _draw(trial, result, folder, verdict, figures.value)
             about = {
                 "trial": trial.name,
-                "calibration": str(calibration),
-                "attitude": attitude,
+                "calibration": as_text(calibration),
+                "attitude": as_text(attitude),
                 "align_s": align,
                 "errors": list(map(str, errors)),
             }

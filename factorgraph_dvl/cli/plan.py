@@ -50,6 +50,7 @@ def plan(
       factorgraph-dvl plan configs/plans/harbour.yaml --out plan
     """
     from factorgraph_dvl.analysis.information.observability import observability as look
+    from factorgraph_dvl.errors import as_text
     from factorgraph_dvl.io.folders import new_folder
     from factorgraph_dvl.planning import predict, propose, requirements
     from factorgraph_dvl.report.files.plan import OWNED, to_json
@@ -57,21 +58,22 @@ def plan(
 
     claim_output(out, force=force, owned=OWNED, inputs=(source,))
     planned = load_scenario(source)
+    name = as_text(source)
     with ProgressLine(quiet=quiet) as progress:
         progress("prediction", 0, None)
         prediction = predict(planned)
         # A record without noise may well repeat one value.
         errors = errors_in(simulate(planned), anyway=anyway)
         solution = prediction.solution.with_findings(errors)
-        required = requirements(planned.required, solution.estimates, str(source))
+        required = requirements(planned.required, solution.estimates, name)
         view = look(solution, trial=prediction.trial, history=prediction.history, kind="plan")
         proposal = propose(prediction, required, progress=progress)
         progress("write", 0, None)
         with new_folder(out, force=force, owned=OWNED) as folder:
             kind = None if no_figures else figures.value
-            write_observability(view, folder, str(source), solution.verdict, figures=kind)
+            write_observability(view, folder, name, solution.verdict, figures=kind)
             (folder / "plan.json").write_bytes(
-                to_json(solution, prediction.duration, required, proposal, str(source))
+                to_json(solution, prediction.duration, required, proposal, name)
             )
     print_observability(view)
     print_error_budget(solution)

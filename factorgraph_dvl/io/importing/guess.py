@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from factorgraph_dvl.errors import DataError
+from factorgraph_dvl.errors import DataError, as_text
 from factorgraph_dvl.geometry.units import STANDARD_GRAVITY
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.io.formats.format import Kind
@@ -102,7 +102,7 @@ def guess(path: Path) -> str:
             expected="a line of names, such as `time_s,vel_x_m_s,vel_y_m_s,vel_z_m_s`",
             hint=f"Found {', '.join(names[:20])}; write the mapping by hand",
         )
-    lines = [f"  - file: {path.name}", f"    kind: {kind}"]
+    lines = [f"  - file: {as_text(path.name)}", f"    kind: {kind}"]
     lines.append(f"    time: {_time(names, columns, time, iso)}")
     if kind == "imu":
         lines.append(f"    axes: {_axes(columns[:, fields['accel_z'][0]])}")

@@ -9,7 +9,7 @@ from typing import Any
 
 import msgspec
 
-from factorgraph_dvl.errors import DataError
+from factorgraph_dvl.errors import DataError, as_text
 from factorgraph_dvl.io.folders import SETTINGS_FILE, claim, new_folder
 from factorgraph_dvl.io.formats.format import Format
 from factorgraph_dvl.io.formats.framing import map_file
@@ -88,7 +88,7 @@ def import_files(
                 _read(Path(path), found, spool, mapping, decisions, say)
             streams = on_utc(spool.streams(), spool, decisions)
             say("assemble")
-            name = Path(files[0]).stem
+            name = as_text(Path(files[0]).stem)
             assembly, epoch = assemble(streams, name, decisions)
             _override(assembly.settings, {} if mapping is None else mapping.trial)
             write_tables(assembly, epoch, folder)
