@@ -11,6 +11,8 @@ from typing import TypeVar
 import msgspec
 
 from factorgraph_dvl import __version__
+from factorgraph_dvl.errors import DataError
+from factorgraph_dvl.settings.files import MEGABYTE, open_file, read_bytes
 
 # Bytes that are read at once for a fingerprint.
 _BLOCK = 1 << 20
@@ -76,8 +78,9 @@ def write_whole(path: Path, content: bytes) -> None:
 def read_record(path: Path, kind: type[_Record]) -> _Record | None:
     """Return a record, None where there is none that can be read."""
     try:
-        return msgspec.json.decode(path.read_bytes(), type=kind)
-    except (OSError, msgspec.MsgspecError):
+        content = read_bytes(path, limit=MEGABYTE, expected="the record of a run")
+        return msgspec.json.decode(content, type=kind)
+    except (DataError, msgspec.MsgspecError):
         return None
 
 
@@ -100,12 +103,12 @@ def fingerprint_of(files: Iterable[Path], options: Mapping[str, str]) -> str:
 
 
 def hash_of(path: Path) -> str:
-    """Return the SHA-256 of a file; empty if it does not exist."""
+    """Return the SHA-256 of a file; empty if there is none that can be read."""
     total = hashlib.sha256()
     try:
-        with path.open("rb") as file:
+        with open_file(path, expected="a file") as file:
             while block := file.read(_BLOCK):
                 total.update(block)
-    except OSError:
+    except (DataError, OSError):
         return ""
     return total.hexdigest()

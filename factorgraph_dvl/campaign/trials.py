@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
+from io import TextIOWrapper
 from pathlib import Path
 
 import numpy as np
@@ -15,10 +16,11 @@ from factorgraph_dvl.campaign.information import TrialCalibration, information_o
 from factorgraph_dvl.campaign.joint_calibration import JointCalibration, joint_calibration
 from factorgraph_dvl.campaign.record import RunRecord
 from factorgraph_dvl.campaign.trial_run import TRIALS_FOLDER
-from factorgraph_dvl.errors import ConfigError, DataError
+from factorgraph_dvl.errors import ConfigError, DataError, as_text
 from factorgraph_dvl.geometry.units import DAY
 from factorgraph_dvl.io.calibration_file import load_calibration
 from factorgraph_dvl.sensors.message import Message, message
+from factorgraph_dvl.settings.files import open_file
 from factorgraph_dvl.solution import Calibration
 
 
@@ -131,7 +133,9 @@ def assembled(
         if record.done:
             calibration = load_calibration(out / TRIALS_FOLDER / label)
             unused = _reason_against(calibration, anyway)
-        trials.append(CampaignTrial(label, record.name, str(path), record, calibration, unused))
+        trials.append(
+            CampaignTrial(label, record.name, as_text(path), record, calibration, unused)
+        )
     times = [_time_of(t.record.epoch) for t in trials]
     dated = all(np.isfinite(times))
     if dated:
@@ -169,7 +173,10 @@ def read_covariates(path: Path) -> dict[str, dict[str, float]]:
     """
     expected = "a column `trial`, and columns of numbers such as temperature_deg_c"
     try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
+        with (
+            open_file(path, expected=expected) as raw,
+            TextIOWrapper(raw, "utf-8-sig", newline="") as file,
+        ):
             rows = list(csv.reader(file))
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise DataError(f"cannot be read ({error})", where=str(path), expected=expected) from None

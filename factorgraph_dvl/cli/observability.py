@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -55,6 +56,7 @@ def observability(
     Examples:
       factorgraph-dvl observability data/seed-a-phase-90 --out observability
     """
+    from factorgraph_dvl.errors import as_text
     from factorgraph_dvl.io.folders import new_folder
     from factorgraph_dvl.io.segments_file import read_segments
     from factorgraph_dvl.io.trial_folder import inputs_of
@@ -67,7 +69,7 @@ def observability(
         progress("write", 0, None)
         with new_folder(out, force=force, owned=OWNED) as folder:
             kind = None if no_figures else figures.value
-            write_observability(view, folder, str(source), solution.verdict, figures=kind)
+            write_observability(view, folder, as_text(source), solution.verdict, figures=kind)
     print_observability(view)
     print_written(out)
     end_with(solution.verdict)
@@ -86,7 +88,7 @@ def _view(
     from factorgraph_dvl.io.solution_folder import load_solution
     from factorgraph_dvl.io.trial_folder import load_trial
 
-    if (source / CALIBRATION_FILE).exists() and not (source / SETTINGS_FILE).exists():
+    if os.path.lexists(source / CALIBRATION_FILE) and not (source / SETTINGS_FILE).exists():
         solution = load_solution(source)
         return solution, look(solution, given=given)
     trial = load_trial(source, anyway=anyway)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -9,6 +10,7 @@ import typer
 
 from factorgraph_dvl.cli.console import print_file, warn
 from factorgraph_dvl.cli.options import Force
+from factorgraph_dvl.errors import as_text
 
 if TYPE_CHECKING:
     from factorgraph_dvl.io.run_file import Run
@@ -70,7 +72,7 @@ def _load(folder: Path) -> Result:
 
     run = read_run(folder)
     return Result(
-        name=str(folder),
+        name=as_text(folder),
         solution=load_solution(folder),
         run=_builtins(run) if run is not None else {},
         history=read_history(folder),
@@ -87,7 +89,7 @@ def _read_json(file: Path) -> dict[str, Any]:
     from factorgraph_dvl.errors import DataError
     from factorgraph_dvl.settings.files import MEGABYTE, read_bytes
 
-    if not file.exists():
+    if not os.path.lexists(file):
         return {}
     content = read_bytes(file, limit=16 * MEGABYTE, expected="a result in JSON")
     try:
@@ -118,7 +120,9 @@ def write_report(
 
     (folder / RUN_FILE).write_bytes(encode_run(run))
     try:
-        result = Result(name, solution, _builtins(run), history, halves=read_halves(folder))
+        result = Result(
+            as_text(name), solution, _builtins(run), history, halves=read_halves(folder)
+        )
         (folder / REPORT_FILE).write_text(report_page(result), encoding="utf-8")
     except Exception as error:
         warn(f"{REPORT_FILE} could not be written: {type(error).__name__}: {error}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -59,7 +60,7 @@ def read_residuals(path: Path) -> tuple[Residuals, ...]:
     DataError
         If the file cannot be read or misses a column.
     """
-    if not path.exists():
+    if not os.path.lexists(path):
         return ()
     columns = read_table(path, _COLUMNS, source=str(path))
     _, first, group = np.unique(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import platform
 from importlib.metadata import version
 from pathlib import Path
@@ -90,7 +91,7 @@ def read_run(folder: Path) -> Run | None:
         If it cannot be read.
     """
     file = folder / RUN_FILE
-    if not file.exists():
+    if not os.path.lexists(file):
         return None
     try:
         content = read_bytes(file, limit=_MAX_BYTES, expected="the settings of a solution")

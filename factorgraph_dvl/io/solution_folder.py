@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -259,7 +260,7 @@ def read_history(path: Path) -> tuple[Array, tuple[str, ...], Array] | None:
         If it does not hold what it should.
     """
     file = path / HISTORY_FILE
-    if not file.exists():
+    if not os.path.lexists(file):
         return None
     names = tuple(name.removesuffix("_std") for name in read_header(file) if name.endswith("_std"))
     columns = read_table(file, ("time_s", *(f"{name}_std" for name in names)), source=str(file))
@@ -276,7 +277,7 @@ def read_halves(path: Path) -> dict[str, Any]:
         If it does not hold what it should.
     """
     file = path / HALVES_FILE
-    return read_table(file, read_header(file), source=str(file)) if file.exists() else {}
+    return read_table(file, read_header(file), source=str(file)) if os.path.lexists(file) else {}
 
 
 def trajectory_columns(trajectory: Trajectory) -> dict[str, Array]:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import csv
+import io
+import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Literal, Self
 
 import numpy as np
 import pyarrow as pa
@@ -15,6 +17,7 @@ from numpy.typing import NDArray
 
 from factorgraph_dvl.errors import DataError
 from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.settings.files import check_file, open_file
 
 _EMPTY = ("", "nan", "NaN", "NAN")
 _PARQUET = (".parquet", ".pq")
@@ -60,9 +63,8 @@ def read_table(
         twice, or a cell is not a number.
     """
     source = source or path.name
-    if not path.is_file():
-        what = "is a folder" if path.is_dir() else "does not exist"
-        raise DataError(f"the file {what}", where=source, expected=f"a table at {path}")
+    # Arrow opens the file by its name.
+    check_file(path, expected=f"a table at {path}", where=source)
     is_parquet = path.suffix.lower() in _PARQUET
     try:
         header = _parquet_header(path, source) if is_parquet else _csv_header(path, source)
@@ -136,9 +138,9 @@ def read_header(path: Path) -> list[str]:
 
 def count_rows(path: Path) -> int:
     """Return about how many rows a table has, without reading them."""
-    if path.suffix.lower() in _PARQUET:
-        return int(pyarrow.parquet.read_metadata(path).num_rows)
-    with path.open("rb") as file:
+    with open_file(path, expected="a table") as file:
+        if path.suffix.lower() in _PARQUET:
+            return int(pyarrow.parquet.read_metadata(file).num_rows)
         lines = sum(block.count(b"\n") for block in iter(lambda: file.read(1 << 20), b""))
     return lines - 1
 
@@ -160,11 +162,17 @@ def write_table(path: Path, columns: Mapping[str, NDArray[Any]]) -> None:
         }
     )
     if path.suffix.lower() in _PARQUET:
-        pyarrow.parquet.write_table(table, path, write_page_checksum=True)
+        with _arrow_file(path, "w") as out:
+            pyarrow.parquet.write_table(table, out, write_page_checksum=True)
         return
     with path.open("wb") as file:
         file.write((",".join(columns) + "\n").encode())
         pyarrow.csv.write_csv(table, file, pyarrow.csv.WriteOptions(include_header=False))
+
+
+def _arrow_file(path: Path, mode: Literal["r", "w"] = "r") -> pa.OSFile:
+    """Return a file that Arrow opens; by itself it knows names in UTF-8 only."""
+    return pa.OSFile(os.fsencode(path), mode)
 
 
 def _floats(values: NDArray[Any]) -> pa.Array:
@@ -213,13 +221,15 @@ class TableWriter:
     def __exit__(self, *failure: object) -> None:
         if self._writer is not None:
             self._writer.close()
+            self._file.close()
 
     def write(self, columns: Mapping[str, Array]) -> None:
         """Append columns (N,); nan is written as empty."""
         table = pa.table({name: _floats(x) for name, x in columns.items()})
         if self._writer is None:
+            self._file = _arrow_file(self._path, "w")
             self._writer = pyarrow.parquet.ParquetWriter(
-                self._path, table.schema, write_page_checksum=True
+                self._file, table.schema, write_page_checksum=True
             )
         self._writer.write_table(table)
         self.rows += table.num_rows
@@ -268,7 +278,7 @@ def _separator_hint(header: Sequence[str]) -> str:
 
 
 def _csv_header(path: Path, source: str) -> list[str]:
-    with path.open("rb") as file:
+    with open_file(path, expected="a table", where=source) as file:
         line = file.readline(1_000_000)
     try:
         header = next(csv.reader([line.decode("utf-8-sig").strip()]), [])
@@ -288,17 +298,18 @@ def _read_csv(path: Path, header: list[str], names: list[str], source: str) -> p
     # Columns that are not read may bear any name, or the same one twice.
     unique = [name if name in names else f"unread {i}" for i, name in enumerate(header)]
     try:
-        return pyarrow.csv.read_csv(
-            path,
-            read_options=pyarrow.csv.ReadOptions(column_names=unique, skip_rows=1),
-            convert_options=pyarrow.csv.ConvertOptions(
-                column_types={
-                    name: pa.string() if name in TEXT else pa.float64() for name in names
-                },
-                include_columns=names,
-                null_values=list(_EMPTY),
-            ),
-        )
+        with _arrow_file(path) as file:
+            return pyarrow.csv.read_csv(
+                file,
+                read_options=pyarrow.csv.ReadOptions(column_names=unique, skip_rows=1),
+                convert_options=pyarrow.csv.ConvertOptions(
+                    column_types={
+                        name: pa.string() if name in TEXT else pa.float64() for name in names
+                    },
+                    include_columns=names,
+                    null_values=list(_EMPTY),
+                ),
+            )
     except pa.ArrowInvalid as error:
         raise _explain_csv(path, header, names, source, error) from None
 
@@ -308,7 +319,10 @@ def _explain_csv(
 ) -> DataError:
     """Return what is wrong with the first row that cannot be read, and its line."""
     rows = 0
-    with path.open(encoding="utf-8-sig", errors="replace", newline="") as file:
+    with (
+        open_file(path, expected="a table", where=source) as raw,
+        io.TextIOWrapper(raw, "utf-8-sig", "replace", newline="") as file,
+    ):
         reader = csv.reader(file)
         next(reader)
         try:
@@ -346,7 +360,8 @@ def _is_number(cell: str) -> bool:
 
 def _parquet_header(path: Path, source: str) -> list[str]:
     try:
-        return list(pyarrow.parquet.read_schema(path).names)
+        with _arrow_file(path) as file:
+            return list(pyarrow.parquet.read_schema(file).names)
     except pa.ArrowInvalid as error:
         raise DataError(
             "is not a Parquet file", where=source, expected="a table of numbers"
@@ -354,7 +369,8 @@ def _parquet_header(path: Path, source: str) -> list[str]:
 
 
 def _read_parquet(path: Path, header: list[str], names: list[str], source: str) -> pa.Table:
-    table = pyarrow.parquet.read_table(path, columns=names, page_checksum_verification=True)
+    with _arrow_file(path) as file:
+        table = pyarrow.parquet.read_table(file, columns=names, page_checksum_verification=True)
     for field in table.schema:
         if field.name in TEXT:
             continue

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import msgspec
@@ -23,7 +24,7 @@ class _Truth(msgspec.Struct):
 
 def read_truth(path: Path) -> dict[str, Array]:
     """Return the true calibration of a truth.json; empty if there is no such file."""
-    if not path.exists():
+    if not os.path.lexists(path):
         return {}
     expected = '{"parameters": {name: {"value": [numbers]}}}'
     content = read_bytes(path, limit=MEGABYTE, expected=expected)

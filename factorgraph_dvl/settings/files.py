@@ -1,15 +1,22 @@
-"""Files that are read whole: regular ones only, and no larger than their kind can be."""
+"""Input files: regular ones only, opened in one place."""
 
 from __future__ import annotations
 
 import os
 import stat
+from io import BufferedReader
 from pathlib import Path
 
 from factorgraph_dvl.errors import ConfigError, DataError
 
 # By definition, bytes.
 MEGABYTE = 1_000_000
+_OTHERS = (
+    (stat.S_ISDIR, "a folder"),
+    (stat.S_ISFIFO, "a pipe"),
+    (stat.S_ISSOCK, "a socket"),
+    (lambda mode: not stat.S_ISREG(mode), "a device"),
+)
 
 
 def read_bytes(
@@ -19,9 +26,7 @@ def read_bytes(
     expected: str,
     kind: type[ConfigError | DataError] = DataError,
 ) -> bytes:
-    """Read a file.
-
-    A pipe or a device may block for ever or never end: it is not read.
+    """Read a file that is no larger than its kind can be.
 
     Parameters
     ----------
@@ -37,31 +42,85 @@ def read_bytes(
     Raises
     ------
     DataError
-        If there is no such file, it is none, it is too large, or it cannot be read.
+        If it cannot be opened or read, or is too large.
     """
-    where = str(path)
-    try:
-        with open(path, "rb", opener=_open_at_once) as file:
-            status = os.fstat(file.fileno())
-            if not stat.S_ISREG(status.st_mode):
-                raise kind("is a pipe or a device", where=where, expected="a regular file")
-            if status.st_size > limit:
+    with open_file(path, expected=expected, kind=kind) as file:
+        try:
+            size = os.fstat(file.fileno()).st_size
+            if size > limit:
                 raise kind(
-                    f"the file has {status.st_size / MEGABYTE:.0f} MB",
-                    where=where,
+                    f"the file has {size / MEGABYTE:.0f} MB",
+                    where=str(path),
                     expected=f"{expected}, at most {limit / MEGABYTE:g} MB",
                 )
             return file.read(limit)
+        except OSError as error:
+            raise kind(f"cannot be read ({error.strerror})", where=str(path)) from None
+
+
+def open_file(
+    path: Path,
+    *,
+    expected: str,
+    where: str = "",
+    kind: type[ConfigError | DataError] = DataError,
+) -> BufferedReader:
+    """Open a regular file for reading.
+
+    A pipe or a device may block for ever, never end, or act when it is opened: it is not opened.
+
+    Parameters
+    ----------
+    path : path-like
+        Of the file.
+    expected : str
+        What it should hold, for messages.
+    where : str, optional
+        Name of the file in messages; by default its path.
+    kind : type of ConfigError or DataError, optional
+        Of the error.
+
+    Raises
+    ------
+    DataError
+        If there is no such file, it is no regular one, or it cannot be opened.
+    """
+    where = where or str(path)
+    try:
+        mode = os.stat(path).st_mode
+        for is_one, name in _OTHERS:
+            if is_one(mode):
+                raise kind(f"is {name}", where=where, expected=f"a regular file: {expected}")
+        return open(path, "rb", opener=_open_at_once)
     except (FileNotFoundError, NotADirectoryError):
         raise kind("the file does not exist", where=where, expected=expected) from None
-    except IsADirectoryError:
-        raise kind("is a folder", where=where, expected=f"a file: {expected}") from None
     except OSError as error:
-        raise kind(f"cannot be read ({error.strerror})", where=where) from None
+        raise kind(f"cannot be read ({error.strerror})", where=where, expected=expected) from None
+    except UnicodeEncodeError as error:
+        raise kind(
+            f"the name of the file cannot be written in {error.encoding}, the encoding of this "
+            "system's file names",
+            where=where,
+            expected="a locale with UTF-8, such as LC_ALL=C.UTF-8",
+        ) from None
     except ValueError:
         raise kind("is not the name of a file", where=where, expected=expected) from None
 
 
+def check_file(
+    path: Path,
+    *,
+    expected: str,
+    where: str = "",
+    kind: type[ConfigError | DataError] = DataError,
+) -> None:
+    """Raise the error of `open_file` unless a file can be opened.
+
+    For files that a library opens by their names. The parameters are those of `open_file`.
+    """
+    open_file(path, expected=expected, where=where, kind=kind).close()
+
+
 def _open_at_once(path: str, flags: int) -> int:
-    # Opening a pipe would wait for somebody to write into it.
+    # Opening a pipe that has just taken the place of the file would wait for a writer.
     return os.open(path, flags | getattr(os, "O_NONBLOCK", 0))

@@ -127,7 +127,7 @@ def test_only_regular_files_of_some_size_are_read(tmp_path: Path, name: str, wha
     else:
         with file.open("wb") as large:
             large.truncate(65_000_000)
-    expected = "MB" if what == "large" else "is a pipe or a device"
+    expected = "MB" if what == "large" else f"is a {what}"
     with pytest.raises((ConfigError, DataError), match=expected):
         load_trial(path)
 

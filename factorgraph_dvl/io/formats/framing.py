@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import mmap
+import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factorgraph_dvl.errors import DataError
+from factorgraph_dvl.settings.files import open_file
 
 # What every reader takes: a memory map of a file, or bytes in memory.
 Source = bytes | mmap.mmap
@@ -63,21 +65,18 @@ def map_file(path: Path) -> Source:
     Raises
     ------
     DataError
-        If it is missing, a folder or unreadable.
+        If it is missing, no regular file, or unreadable.
     """
-    if not path.is_file():
-        what = "is a folder" if path.is_dir() else "does not exist"
-        raise DataError(f"the file {what}", where=path.name, expected=f"a file at {path}")
-    try:
-        with path.open("rb") as file:
-            if path.stat().st_size == 0:
-                return b""
+    with open_file(path, expected=f"a file at {path}", where=path.name) as file:
+        if os.fstat(file.fileno()).st_size == 0:
+            return b""
+        try:
             # Only some systems can be asked to drop pages.
             kind = _Map if hasattr(mmap, "MADV_DONTNEED") else mmap.mmap
             return kind(file.fileno(), 0, access=mmap.ACCESS_READ)
-    except OSError as error:
-        reason = error.strerror or str(error)
-        raise DataError(f"cannot be read ({reason})", where=path.name) from error
+        except OSError as error:
+            reason = error.strerror or str(error)
+            raise DataError(f"cannot be read ({reason})", where=path.name) from error
 
 
 def as_bytes(source: Source, start: int, stop: int) -> Bytes:

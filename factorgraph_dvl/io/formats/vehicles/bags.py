@@ -33,6 +33,7 @@ from factorgraph_dvl.io.formats.vehicles.library import (
     silently,
 )
 from factorgraph_dvl.io.formats.velocities import INSTRUMENT
+from factorgraph_dvl.settings.files import check_file, open_file
 
 DVL_TYPE = "marine_acoustic_msgs/msg/Dvl"
 _SQLITE = b"SQLite format 3\0"
@@ -81,7 +82,7 @@ def read(path: Path, mapping: Mapping[str, Any] | None = None) -> Iterator[Batch
         If nothing in the bag is whole.
     """
     load("rosbags.highlevel", "bags")
-    _check_ending(path)
+    _check_files(path)
     settings = None if mapping is None else msgspec.convert(mapping, MappingSettings)
     topics: dict[str, list[TableMapping]] = {}
     for table in () if settings is None else settings.of(path, topics=True):
@@ -175,11 +176,14 @@ def typestore() -> Any:
     return store
 
 
-def _check_ending(path: Path) -> None:
-    """The library goes by the ending of the name; a wrong one leads it astray."""
+def _check_files(path: Path) -> None:
+    """The library opens files by their names, and goes by the ending of that of a bag."""
     if path.is_dir():
+        for inside in path.iterdir():
+            if inside.name == "metadata.yaml" or inside.suffix in _ENDINGS.values():
+                check_file(inside, expected="a file of a bag")
         return
-    with path.open("rb") as file:
+    with open_file(path, expected="a bag", where=path.name) as file:
         head = file.read(16)
     for magic, ending in _ENDINGS.items():
         if head.startswith(magic) and path.suffix != ending:

@@ -26,6 +26,7 @@ from factorgraph_dvl.io.formats.vehicles.library import (
     unreadable,
 )
 from factorgraph_dvl.io.formats.velocities import INSTRUMENT
+from factorgraph_dvl.settings.files import open_file
 
 _MAGIC = b"ULog\x01\x12\x35"
 # A receiver without time reports less.
@@ -61,11 +62,12 @@ def read(path: Path, mapping: Mapping[str, Any] | None = None) -> Iterator[Batch
         If the file cannot be read.
     """
     library = load("pyulog", "px4")
-    try:
-        with quiet(), path.open("rb") as file:
+    expected = "a ULog file of PX4"
+    with open_file(path, expected=expected, where=path.name) as file, quiet():
+        try:
             log = library.ULog(file, list(CONVERTERS), disable_str_exceptions=True)
-    except Exception as error:  # Of any type: the library does not foresee all damage.
-        raise unreadable(path, error, "a ULog file of PX4") from None
+        except Exception as error:  # Of any type: the library does not foresee all damage.
+            raise unreadable(path, error, expected) from None
     found = [data for data in log.data_list if len(data.data.get("timestamp", ()))]
     if not found:
         raise DataError(
