@@ -33,6 +33,8 @@ _AT_FDCWD, _RENAME_EXCHANGE = -100, 2
 
 # Working folders that this process has locked, by the output that they belong to.
 _claimed: dict[Path, Path] = {}
+# Files that this process wrote last to each output, relative to it.
+_written: dict[Path, list[Path]] = {}
 
 
 @contextmanager
@@ -60,9 +62,9 @@ def claim(
     ------
     DataError
         If the folder holds inputs or, without `force`, anything; if another run is writing
-        to it; if it cannot be written or replaced.
+        to it; if it is a link to itself; if it cannot be written or replaced.
     """
-    target = path.resolve()
+    target = real_path(path)
     if target in _claimed:
         yield _claimed[target]
         return
@@ -109,13 +111,14 @@ def new_folder(path: Path, *, force: bool = False, owned: Sequence[str] = ()) ->
     OutputError
         If the disk is full or fails.
     """
-    target = path.resolve()
+    target = real_path(path)
     with claim(path, force=force, owned=owned) as work:
         (work / _OWNED).write_text("\n".join(owned), encoding="utf-8")
         partial = work / _PARTIAL
         partial.mkdir()
         try:
             yield partial
+            files = sorted(p.relative_to(partial) for p in partial.rglob("*") if p.is_file())
             partial.chmod(target.stat().st_mode & 0o7777 if target.is_dir() else 0o777 & ~_umask())
             try:
                 partial.rename(target)
@@ -125,6 +128,7 @@ def new_folder(path: Path, *, force: bool = False, owned: Sequence[str] = ()) ->
                 if not force:
                     raise _occupied(path) from None
                 _replace(work, target, owned)
+            _written[target] = files
         except OSError as error:
             if error.errno not in _NO_ROOM:
                 raise
@@ -135,6 +139,16 @@ def new_folder(path: Path, *, force: bool = False, owned: Sequence[str] = ()) ->
             ) from error
         finally:
             shutil.rmtree(partial, ignore_errors=True)
+
+
+def files_written(path: Path) -> list[Path]:
+    """Return the files that this process wrote last to an output folder, relative to it."""
+    return _written.get(real_path(path), [])
+
+
+def real_path(path: Path) -> Path:
+    """Return a path without links; those that lead back to themselves stay in it."""
+    return Path(os.path.realpath(path))
 
 
 def _check_inputs(path: Path, target: Path, owned: Sequence[str], inputs: Iterable[Path]) -> None:
@@ -160,7 +174,7 @@ def _check_inputs(path: Path, target: Path, owned: Sequence[str], inputs: Iterab
 
 def _lies_in(item: Path, folder: Path) -> bool:
     """Whether a file or folder lies in another, at any depth, by its own or its real name."""
-    for name in (item.absolute(), item.resolve()):
+    for name in (item.absolute(), real_path(item)):
         for parent in (name, *name.parents):
             with suppress(OSError):
                 if parent.samefile(folder):
@@ -170,6 +184,13 @@ def _lies_in(item: Path, folder: Path) -> bool:
 
 def _check_place(path: Path, target: Path) -> None:
     """Raise DataError if no folder can be renamed to `target`."""
+    if any(place.is_symlink() for place in (target, *target.parents)):
+        raise DataError(
+            "is a link that leads back to itself",
+            where=str(path),
+            expected="a folder, or a new name",
+            hint="Choose another folder, or remove the link",
+        )
     if target.exists() and not target.is_dir():
         raise DataError("is a file", where=str(path), expected="a folder, or a new name")
     parent = target.parent

@@ -16,7 +16,10 @@ def check_new_file(path: Path, *, force: bool) -> None:
         raise DataError("is a folder", where=str(path), expected="the name of a file")
     if not path.parent.is_dir():
         raise DataError("the folder does not exist", where=str(path.parent), expected="a folder")
-    if path.exists() and not force:
+    if path.exists() and not path.is_file():
+        raise DataError("is a pipe or a device", where=str(path), expected="the name of a file")
+    # A link that leads nowhere, too, would be replaced.
+    if os.path.lexists(path) and not force:
         raise DataError(
             "the file exists",
             where=str(path),

@@ -364,3 +364,43 @@ def test_an_output_that_cannot_appear_leaves_no_folder(tmp_path):
     (trial / "imu.csv").unlink()
     assert run("solve", trial, "--out", tmp_path / "deep" / "out") == 2
     assert [path.name for path in tmp_path.iterdir()] == ["trial"]
+
+
+def test_only_what_a_run_wrote_is_listed(tmp_path, capsys):
+    line = ["--json", "simulate", CONFIGS.parent / "examples" / "short.yaml", "--out"]
+    out = tmp_path / "out"
+    assert run(*line, out) == 0
+    first = capsys.readouterr().out
+    (out / "notes.json").write_text("mine, and no JSON")
+    (out / "mine").mkdir()
+    (out / "mine" / "notes.txt").write_text("mine")
+    assert run(*line, out, "--force") == 0
+    assert capsys.readouterr().out == first
+    (written,) = (e for e in map(json.loads, first.splitlines()) if e["event"] == "written")
+    assert set(written["files"]) == {p.name for p in out.iterdir()} - {"notes.json", "mine"}
+
+
+def test_an_output_that_is_a_loop_of_links_is_refused(tmp_path, capsys):
+    (tmp_path / "a").symlink_to(tmp_path / "b")
+    (tmp_path / "b").symlink_to(tmp_path / "a")
+    trial = write_trial(tmp_path)
+    before = sorted(tmp_path.iterdir())
+    for out in (tmp_path / "a", tmp_path / "a" / "result"):
+        for options in ((), ("--force",)):
+            assert run("solve", trial, "--out", out, *options) == 2
+            said = capsys.readouterr().err
+            assert f"error: {out}: is a link that leads back to itself; expected a folder" in said
+    assert run("export", trial, "--to", "netcdf", "--out", tmp_path / "a") == 2
+    assert "a: the file exists; expected a new file" in capsys.readouterr().err
+    assert run("export", trial, "--to", "netcdf", "--out", tmp_path / "a" / "x.nc") == 2
+    assert "the folder does not exist" in capsys.readouterr().err
+    assert sorted(tmp_path.iterdir()) == before
+
+
+def test_an_output_file_takes_the_place_of_no_device(tmp_path, capsys):
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    trial = write_trial(tmp_path)
+    assert run("export", trial, "--to", "netcdf", "--out", pipe, "--force") == 2
+    assert "is a pipe or a device; expected the name of a file" in capsys.readouterr().err
+    assert pipe.is_fifo()
