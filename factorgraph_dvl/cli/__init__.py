@@ -8,7 +8,10 @@ from typing import NoReturn
 
 
 def main(argv: list[str] | None = None) -> NoReturn:
-    """Run the command line and exit: 0 done, 1 could not deliver, 2 bad input or usage.
+    """Run the command line and exit.
+
+    The exit code is 0 if it is done, 1 if it could not deliver, 2 for bad input or usage, 130
+    after an interrupt.
 
     Parameters
     ----------
@@ -19,11 +22,25 @@ def main(argv: list[str] | None = None) -> NoReturn:
     # 50 MB while the results of a trial of 80 minutes are written.
     os.environ.setdefault("ARROW_DEFAULT_MEMORY_POOL", "system")
     try:
-        # Loading takes long enough to be interrupted.
-        from factorgraph_dvl.cli.app import run
-
-        run(sys.argv[1:] if argv is None else argv)
+        _run(sys.argv[1:] if argv is None else argv)
     except KeyboardInterrupt:
         if sys.stderr is not None:
             sys.stderr.write("error: interrupted\n")
         sys.exit(130)
+
+
+def _run(args: list[str]) -> NoReturn:
+    # Loading takes long enough to be interrupted.
+    from factorgraph_dvl.cli import interrupts
+
+    interrupts.watch()
+    try:
+        from factorgraph_dvl.cli.app import run
+
+        run(args)
+    except Exception as error:
+        if interrupts.came():
+            raise KeyboardInterrupt from error
+        raise
+    finally:
+        interrupts.end()

@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
 
-from factorgraph_dvl.cli.commands import Commands
+from factorgraph_dvl.cli import interrupts
+from factorgraph_dvl.cli.commands import Commands, lost_folder
 from factorgraph_dvl.cli.options import INTERRUPTED, claims
 from factorgraph_dvl.cli.streams import guard_streams, output_failure
 from factorgraph_dvl.errors import FactorgraphDvlError, OutputError, printable
@@ -47,9 +48,17 @@ def run(args: list[str]) -> NoReturn:
     # Nor is it worth while when the process ends. Measured: 16 % of `--help`.
     atexit.register(gc.freeze)
     guard_streams()
-    if "--json" in args:
-        _run_with_events(args)
-    _run(args)
+    try:
+        if "--json" in args:
+            _run_with_events(args)
+        _run(args)
+    except SystemExit as done:
+        failure = output_failure()
+        if failure is None:
+            raise
+        complete = "" if done.code else "; the files of this run are complete"
+        message = f"standard output cannot be written ({failure.strerror}){complete}"
+        _fail(message, _code_of(done) or 1, args, "output")
 
 
 def _run_with_events(args: list[str]) -> NoReturn:
@@ -64,11 +73,18 @@ def _run_with_events(args: list[str]) -> NoReturn:
             _fail("the command is missing", 2, args, "usage")
         _run(args)
     except SystemExit as done:
-        code = done.code if isinstance(done.code, int) else int(bool(done.code))
-        events.emit(events.End(code))
+        events.emit(events.End(_code_of(done)))
         raise
+    except KeyboardInterrupt:
+        events.emit(events.Failed("interrupted", "interrupted"))
+        events.emit(events.End(INTERRUPTED))
+        sys.exit(INTERRUPTED)
     finally:
         events.switch(False)
+
+
+def _code_of(done: SystemExit) -> int:
+    return done.code if isinstance(done.code, int) else int(bool(done.code))
 
 
 def _emit_help(args: list[str]) -> NoReturn:
@@ -94,50 +110,50 @@ def _run(args: list[str]) -> NoReturn:
     try:
         with claims:
             _call(args)
-    except FactorgraphDvlError as error:
+        interrupts.check()
+    except BaseException as error:
+        if _is_interrupt(error):
+            # Said without rich, which may be what was being loaded.
+            raise KeyboardInterrupt from error
+        _end_with(error, args)
+    sys.exit(0)
+
+
+def _is_interrupt(error: BaseException | None) -> bool:
+    """Return whether an interrupt came; libraries turn it into errors of their own, or into none.
+
+    Typer turns it into an exit.
+    """
+    if interrupts.came():
+        return True
+    while error is not None:
+        if isinstance(error, KeyboardInterrupt):
+            return True
+        error = error.__cause__ or error.__context__
+    return False
+
+
+def _end_with(error: BaseException, args: list[str]) -> NoReturn:
+    """Say an error, and end with its exit code."""
+    if isinstance(error, OSError):
+        error = lost_folder() or error
+    if isinstance(error, FactorgraphDvlError):
         from factorgraph_dvl.cli.console import warn
 
         for note in getattr(error, "__notes__", ()):
             warn(note)
         parts = {name: getattr(error, name) for name in ("what", "where", "expected", "hint")}
         _fail(str(error), error.exit_code, args, _kind_of(error), parts)
-    except OSError as error:
+    if isinstance(error, OSError):
         name = error.filename if error.filename is not None else "a file"
         _fail(f"{name}: {error.strerror or error}", 2, args, "system")
-    except Exception as error:
-        if _interrupted(error):
-            raise KeyboardInterrupt from error
-        # Typer's errors of usage have no public base class.
-        if hasattr(error, "format_message"):
-            _fail(error.format_message(), 2, args, "usage")
-        hint = "" if "--debug" in args else ". Run with --debug to see where"
-        _fail(f"internal error: {type(error).__name__}: {error}{hint}", 1, args, "internal")
-    except SystemExit as done:
-        if done.code == INTERRUPTED:
-            if "--json" in args:
-                _fail("interrupted", INTERRUPTED, args, "interrupted")
-            # Said without rich, which may be what was being loaded.
-            raise KeyboardInterrupt from done
-        failure = output_failure()
-        if failure is None or done.code:
-            raise
-        _fail(
-            f"standard output cannot be written ({failure.strerror}); the files of this run "
-            "are complete",
-            1,
-            args,
-            "output",
-        )
-    sys.exit(0)
-
-
-def _interrupted(error: BaseException | None) -> bool:
-    """Return whether an error was caused by an interrupt, as during an import."""
-    while error is not None:
-        if isinstance(error, KeyboardInterrupt):
-            return True
-        error = error.__cause__ or error.__context__
-    return False
+    if not isinstance(error, Exception):
+        raise error
+    # Typer's errors of usage have no public base class.
+    if hasattr(error, "format_message"):
+        _fail(error.format_message(), 2, args, "usage")
+    hint = "" if "--debug" in args else ". Run with --debug to see where"
+    _fail(f"internal error: {type(error).__name__}: {error}{hint}", 1, args, "internal")
 
 
 def _kind_of(error: FactorgraphDvlError) -> FailureKind:

@@ -103,7 +103,7 @@ def _run_trials(
     scheduler: str | None,
     quiet: bool,
 ) -> None:
-    from factorgraph_dvl.campaign.files import write_campaign
+    from factorgraph_dvl.campaign.files import CAMPAIGN_FILE, write_campaign
     from factorgraph_dvl.campaign.page import write_page
     from factorgraph_dvl.campaign.trial_run import name_of, run_trial
     from factorgraph_dvl.campaign.trials import (
@@ -112,6 +112,7 @@ def _run_trials(
         labels_of,
         read_covariates,
     )
+    from factorgraph_dvl.io.calibration_file import CALIBRATION_FILE
 
     follow = {} if covariates is None else read_covariates(covariates)
     # Before hours of solving, not after.
@@ -126,7 +127,8 @@ def _run_trials(
     write_campaign(found, out)
     write_page(found, out)
     _print_campaign(found)
-    print_folder(out)
+    calibration = [] if found.joint is None else [CALIBRATION_FILE]
+    print_folder(out, *calibration, CAMPAIGN_FILE)
     _end(len(found.failed), len(runs))
 
 
@@ -138,7 +140,7 @@ def _run_seeds(
     scheduler: str | None,
     quiet: bool,
 ) -> None:
-    from factorgraph_dvl.campaign.files import write_seeds
+    from factorgraph_dvl.campaign.files import CAMPAIGN_FILE, write_seeds
     from factorgraph_dvl.campaign.monte_carlo import monte_carlo
     from factorgraph_dvl.campaign.page import write_seed_page
     from factorgraph_dvl.campaign.seed_run import SeedRecord, run_seed
@@ -165,7 +167,7 @@ def _run_seeds(
             outside = "" if s.inside else ": OUTSIDE"
             text = f"{s.name}: {s.value:.4g}, by chance (99 %) {band}{outside}"
             stdout().print(text, markup=False, soft_wrap=True)
-    print_folder(out)
+    print_folder(out, CAMPAIGN_FILE)
     _end(sum(not r.done for r in records), len(runs))
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from importlib import import_module
 from typing import Any
 
@@ -9,6 +10,7 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 
 from factorgraph_dvl.cli.memory import naming_memory
+from factorgraph_dvl.errors import DataError
 
 # Function of each command within this subpackage, and what a list of commands says of it.
 COMMANDS = {
@@ -107,7 +109,23 @@ class _Listed(TyperCommand):
     def make_context(self, *args: Any, **options: Any) -> Any:
         """Return the context of the command itself."""
         assert self.name is not None
-        return command(self.name).make_context(*args, **options)
+        context = command(self.name).make_context(*args, **options)
+        if (error := lost_folder()) is not None:
+            raise error
+        return context
+
+
+def lost_folder() -> DataError | None:
+    """Return an error if the current directory was deleted: no relative path can be read then."""
+    try:
+        os.getcwd()
+    except FileNotFoundError:
+        return DataError(
+            "the current directory no longer exists",
+            expected="a directory that was not deleted or replaced",
+            hint="Change to another one, such as by `cd ~`, or back to its name",
+        )
+    return None
 
 
 class Commands(TyperGroup):

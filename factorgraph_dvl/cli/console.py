@@ -6,7 +6,7 @@ import sys
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from time import perf_counter, time
+from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
 import msgspec
@@ -23,8 +23,8 @@ from rich.progress import (
 )
 from rich.text import Text
 
-from factorgraph_dvl.cli import events
-from factorgraph_dvl.errors import printable
+from factorgraph_dvl.cli import events, interrupts
+from factorgraph_dvl.errors import as_text, printable
 
 if TYPE_CHECKING:
     from types import TracebackType
@@ -34,7 +34,6 @@ if TYPE_CHECKING:
     from factorgraph_dvl.sensors.finding import Finding
     from factorgraph_dvl.solution import Solution
 
-_STARTED = time()
 # Chosen: width of tables in a file or a pipe, columns; that of a page or a mail.
 _PIPE_WIDTH = 80
 # Share of a run that is done when each stage of the batch solver begins. Measured on the shipped
@@ -121,6 +120,8 @@ class ProgressLine:
         done : float, optional
             Share of the run that is done; by default that of the stage, if it is a solver's.
         """
+        interrupts.check()
+        stage = printable(stage)
         elapsed = perf_counter() - self._start
         left = self._time_left(elapsed, share_done(stage, iteration) if done is None else done)
         if events.active():
@@ -182,6 +183,7 @@ class CountLine:
 
     def __call__(self, text: str) -> None:
         """Count one more, and say which."""
+        interrupts.check()
         self._done += 1
         if events.active() and not self._quiet:
             elapsed = perf_counter() - self._start
@@ -202,11 +204,11 @@ def _live_line(*columns: ProgressColumn, quiet: bool) -> Progress:
 
 def print_written(out: Path) -> None:
     """List the files that this run wrote to a folder."""
-    # A folder that --force replaced may contain other files.
-    new = (p for p in out.rglob("*") if p.is_file() and p.stat().st_mtime >= _STARTED - 1.0)
-    written = sorted(path.relative_to(out) for path in new)
+    from factorgraph_dvl.io.folders import files_written
+
+    written = files_written(out)
     if events.active():
-        events.emit(events.Written(str(out), list(map(str, written))))
+        events.emit(events.Written(as_text(out), list(map(as_text, written))))
         _emit_results(out, written)
         return
     stdout().print(f"Wrote {', '.join(map(str, written))} to {out}", markup=False, soft_wrap=True)
@@ -215,17 +217,16 @@ def print_written(out: Path) -> None:
 def print_file(file: Path) -> None:
     """Print which file this run wrote."""
     if events.active():
-        events.emit(events.Written(str(file.parent), [file.name]))
+        events.emit(events.Written(as_text(file.parent), [as_text(file.name)]))
         return
     stdout().print(f"Wrote {file}", markup=False, soft_wrap=True)
 
 
-def print_folder(out: Path) -> None:
-    """Print where this run wrote its results, where the files are too many to list."""
+def print_folder(out: Path, *results: str) -> None:
+    """Print where this run wrote files that are too many to list; as events, name its results."""
     if events.active():
-        results = sorted(path.relative_to(out) for path in out.glob("*.json"))
-        events.emit(events.Written(str(out), list(map(str, results))))
-        _emit_results(out, results)
+        events.emit(events.Written(as_text(out), [*results]))
+        _emit_results(out, map(Path, results))
         return
     stdout().print(f"Wrote {out}", markup=False, soft_wrap=True)
 

@@ -1,13 +1,15 @@
 from __future__ import annotations
 
 import io
+from pathlib import Path
 from typing import Any
 
 import pytest
 from rich.console import Console
 
 import factorgraph_dvl.cli.console as console
-from factorgraph_dvl.cli.console import CountLine, ProgressLine, share_done
+from factorgraph_dvl.cli import events
+from factorgraph_dvl.cli.console import CountLine, ProgressLine, print_folder, share_done
 
 
 @pytest.fixture
@@ -81,3 +83,16 @@ def test_the_share_that_is_done_only_grows() -> None:
     assert all(share is not None and 0.0 <= share < 1.0 for share in found)
     assert found == sorted(found, key=lambda share: share or 0.0)
     assert share_done("ranges", 0) is None
+
+
+def test_results_in_a_folder_are_those_of_the_run(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "campaign.json").write_text("{}")
+    (tmp_path / "mine.json").write_text("no JSON")
+    events.switch(True)
+    try:
+        print_folder(tmp_path, "campaign.json")
+    finally:
+        events.switch(False)
+    assert capsys.readouterr().out.count("campaign.json") == 2
