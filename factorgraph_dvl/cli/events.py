@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import math
 import sys
 from typing import Any, Literal
@@ -138,4 +139,7 @@ def _finite(event: Event) -> Event:
 def schema() -> dict[str, Any]:
     """Return the JSON Schema of a line."""
     found: dict[str, Any] = msgspec.json.schema(Event)
+    # Python 3.13 compiles docstrings without their indentation, earlier versions with it.
+    for definition in found["$defs"].values():
+        definition["description"] = inspect.cleandoc(definition["description"])
     return found
