@@ -58,7 +58,8 @@ def posix(
     exists = exists & (hour >= 0) & (hour < 24) & (minute >= 0) & (minute < 60)
     exists = exists & (second >= 0.0) & (second < 61.0)
     months = np.where(exists, (year - 1970) * 12 + month - 1, 0).astype("datetime64[M]")
-    length = (months + 1).astype("datetime64[D]") - months.astype("datetime64[D]")
+    after = months + np.timedelta64(1, "M")
+    length = after.astype("datetime64[D]") - months.astype("datetime64[D]")
     exists = exists & (day <= length.astype(np.int64))
     midnight = months.astype("datetime64[s]").astype(float) + (np.where(exists, day, 1) - 1) * DAY
     return np.where(exists, midnight + hour * 3600.0 + minute * 60.0 + second, np.nan)
