@@ -15,12 +15,12 @@ eq. 21 is the predicted one. What is estimated is fed back at once.
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass
 from datetime import UTC, datetime
 
 import erfa
 import numpy as np
+from erfa import ufunc
 from scipy.spatial.transform import Rotation
 
 from factorgraph_dvl.baselines.kalman_filter import ForwardPass, smoothed_errors, update
@@ -98,9 +98,9 @@ def _earth_from_stars(epoch: str, time: Array, ut1_utc: float) -> Array:
     moment = moment.replace(tzinfo=UTC) if moment.tzinfo is None else moment.astimezone(UTC)
     unix_day, second = divmod(moment.timestamp(), DAY)
     day, fraction = 2440587.5 + unix_day, second / DAY
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", erfa.ErfaWarning)
-        tai_day, tai_fraction = erfa.utctai(day, fraction)
+    # `erfa.utctai` warns of years beyond the leap seconds it knows: to catch that would change
+    # the warnings of all threads.
+    tai_day, tai_fraction, _ = ufunc.utctai(day, fraction)
     tt_day, tt_fraction = erfa.taitt(tai_day, tai_fraction + time / DAY)
     nutated = erfa.pnm06a(tt_day, tt_fraction)
     sidereal = erfa.gst06(day, fraction + (time + ut1_utc) / DAY, tt_day, tt_fraction, nutated)

@@ -12,6 +12,7 @@ import msgspec
 
 from factorgraph_dvl import __version__
 from factorgraph_dvl.errors import DataError
+from factorgraph_dvl.settings.convert import from_json
 from factorgraph_dvl.settings.files import MEGABYTE, open_file, read_bytes
 
 # Bytes that are read at once for a fingerprint.
@@ -79,7 +80,7 @@ def read_record(path: Path, kind: type[_Record]) -> _Record | None:
     """Return a record, None where there is none that can be read."""
     try:
         content = read_bytes(path, limit=MEGABYTE, expected="the record of a run")
-        return msgspec.json.decode(content, type=kind)
+        return from_json(content, kind)
     except (DataError, msgspec.MsgspecError):
         return None
 

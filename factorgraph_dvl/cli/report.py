@@ -87,13 +87,14 @@ def _read_json(file: Path) -> dict[str, Any]:
     import msgspec
 
     from factorgraph_dvl.errors import DataError
+    from factorgraph_dvl.settings.convert import from_json
     from factorgraph_dvl.settings.files import MEGABYTE, read_bytes
 
     if not os.path.lexists(file):
         return {}
     content = read_bytes(file, limit=16 * MEGABYTE, expected="a result in JSON")
     try:
-        return msgspec.json.decode(content, type=dict[str, Any])
+        return from_json(content, dict[str, Any])
     except (msgspec.MsgspecError, RecursionError) as error:
         raise DataError(f"cannot be read ({error})", where=str(file)) from None
 

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import warnings
 from datetime import UTC, datetime
 
 import erfa
 import numpy as np
+from erfa import ufunc
 
 from factorgraph_dvl.errors import ConfigError
 from factorgraph_dvl.geometry.rotations import best_rotation
@@ -42,10 +42,10 @@ def earth_from_inertial(epoch: str, time: Array, ut1_utc: float = 0.0) -> Array:
         If there is no epoch, or one before 1972.
     """
     day, fraction = _utc(epoch)
-    with warnings.catch_warnings():
-        # Years beyond the leap seconds that ERFA knows: a second is 1e-6 arcsec of precession.
-        warnings.simplefilter("ignore", erfa.ErfaWarning)
-        tt = erfa.taitt(*erfa.utctai(day, fraction))
+    # `erfa.utctai` warns of years beyond the leap seconds it knows: a second is 1e-6 arcsec of
+    # precession. To catch that would change the warnings of all threads.
+    *tai, _ = ufunc.utctai(day, fraction)
+    tt = erfa.taitt(*tai)
     steps = np.unique(np.floor(time / _POLE_STEP))
     grid = _POLE_STEP * np.union1d(steps, steps + 1.0)
     pole = np.stack(erfa.xys06a(tt[0], np.asarray(tt[1]) + grid / DAY), axis=1)

@@ -24,6 +24,7 @@ from factorgraph_dvl.sensors.fingerprint import PATTERN
 from factorgraph_dvl.sensors.grades import DEFAULT_LIMITS, Grade
 from factorgraph_dvl.sensors.message import decoded, encoded, message
 from factorgraph_dvl.sensors.verdict import VerdictGrade
+from factorgraph_dvl.settings.convert import from_json
 from factorgraph_dvl.settings.files import MEGABYTE, read_bytes
 from factorgraph_dvl.settings.ranges import out_of_range
 from factorgraph_dvl.settings.sections import check_epoch
@@ -348,7 +349,7 @@ def _parameter(e: Estimate, grades: tuple[Grade, ...]) -> _Parameter:
 
 def _decode(file: Path) -> _File:
     try:
-        calibration = msgspec.json.decode(read_calibration_bytes(file), type=_File)
+        calibration = from_json(read_calibration_bytes(file), _File)
     except (msgspec.MsgspecError, ValueError, RecursionError) as error:
         raise DataError(f"cannot be read ({error})", where=str(file)) from None
     for name, parameter in calibration.parameters.items():

@@ -21,6 +21,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from fnmatch import fnmatchcase
 from pathlib import Path, PurePath
+from threading import get_ident
 
 from factorgraph_dvl.errors import DataError, OutputError
 
@@ -31,8 +32,8 @@ _STAGES = "stages"
 _NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
 _AT_FDCWD, _RENAME_EXCHANGE = -100, 2
 
-# Working folders that this process has locked, by the output that they belong to.
-_claimed: dict[Path, Path] = {}
+# Working folders that threads of this process have locked, by thread and output.
+_claimed: dict[tuple[int, Path], Path] = {}
 # Files that this process wrote last to each output, relative to it.
 _written: dict[Path, list[Path]] = {}
 
@@ -65,8 +66,9 @@ def claim(
         to it; if it is a link to itself; if it cannot be written or replaced.
     """
     target = real_path(path)
-    if target in _claimed:
-        yield _claimed[target]
+    mine = (get_ident(), target)
+    if mine in _claimed:
+        yield _claimed[mine]
         return
     _check_inputs(path, target, owned, inputs)
     _check_place(path, target)
@@ -77,10 +79,10 @@ def claim(
     try:
         _recover(work, target)
         _check_content(path, target, force, owned)
-        _claimed[target] = work
+        _claimed[mine] = work
         yield work
     finally:
-        _claimed.pop(target, None)
+        _claimed.pop(mine, None)
         # What could not be removed stays there for the next run.
         if not ((work / _OLD).exists() or (work / _NEW).exists()):
             (work / _OWNED).unlink(missing_ok=True)
@@ -119,7 +121,8 @@ def new_folder(path: Path, *, force: bool = False, owned: Sequence[str] = ()) ->
         try:
             yield partial
             files = sorted(p.relative_to(partial) for p in partial.rglob("*") if p.is_file())
-            partial.chmod(target.stat().st_mode & 0o7777 if target.is_dir() else 0o777 & ~_umask())
+            if target.is_dir():
+                partial.chmod(target.stat().st_mode & 0o7777)
             try:
                 partial.rename(target)
             except OSError as error:
@@ -364,9 +367,3 @@ def _is_newer(a: Path, b: Path) -> bool:
     """Whether a file is another than b, and was written after it."""
     one, other = a.lstat(), b.lstat()
     return not os.path.samestat(one, other) and one.st_mtime_ns > other.st_mtime_ns
-
-
-def _umask() -> int:
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask

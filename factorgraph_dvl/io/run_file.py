@@ -13,6 +13,7 @@ import numpy as np
 
 from factorgraph_dvl.errors import DataError
 from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.settings.convert import from_json
 from factorgraph_dvl.settings.files import MEGABYTE, read_bytes
 from factorgraph_dvl.trial import Trial
 
@@ -95,6 +96,6 @@ def read_run(folder: Path) -> Run | None:
         return None
     try:
         content = read_bytes(file, limit=_MAX_BYTES, expected="the settings of a solution")
-        return msgspec.json.decode(content, type=Run)
+        return from_json(content, Run)
     except (msgspec.MsgspecError, ValueError, RecursionError) as error:
         raise DataError(f"cannot be read ({error})", where=str(file)) from None

@@ -11,6 +11,7 @@ import numpy as np
 from factorgraph_dvl.errors import DataError, printable
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.io.calibration_file import check_values
+from factorgraph_dvl.settings.convert import from_json
 from factorgraph_dvl.settings.files import MEGABYTE, read_bytes
 
 
@@ -29,7 +30,7 @@ def read_truth(path: Path) -> dict[str, Array]:
     expected = '{"parameters": {name: {"value": [numbers]}}}'
     content = read_bytes(path, limit=MEGABYTE, expected=expected)
     try:
-        truth = msgspec.json.decode(content, type=_Truth)
+        truth = from_json(content, _Truth)
     except (msgspec.MsgspecError, ValueError, RecursionError) as error:
         raise DataError(f"cannot be read ({error})", where=path.name, expected=expected) from None
     out = {}

@@ -11,6 +11,7 @@ import msgspec
 import yaml
 
 from factorgraph_dvl.errors import ConfigError
+from factorgraph_dvl.settings.convert import from_plain
 from factorgraph_dvl.settings.files import MEGABYTE, read_bytes
 
 T = TypeVar("T")
@@ -90,7 +91,7 @@ def parse_yaml(text: str, kind: type[T], *, source: str) -> T:
     root = _compose(text, source)
     value = _Builder(source).build(root, ())
     try:
-        return msgspec.convert(value, kind)
+        return from_plain(value, kind)
     except msgspec.ValidationError as error:
         raise _explain(str(error), root, value, kind, source) from None
 
@@ -280,7 +281,7 @@ def _entries(path: tuple[Key | None, ...], value: Any, kind: Any) -> tuple[Key, 
 
 def _fits(value: Any, kind: Any) -> bool:
     try:
-        msgspec.convert(value, Any if kind is None else kind)
+        from_plain(value, Any if kind is None else kind)
     except msgspec.ValidationError:
         return False
     return True

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import warnings
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, cast
 
 import erfa
 import numpy as np
+from erfa import ufunc
 from scipy.spatial.transform import Rotation
 
 from factorgraph_dvl.errors import ConfigError
@@ -80,20 +80,20 @@ def _inertial_from_earth(epoch: str, time: Array, ut1_utc: float) -> Rotation:
     begin = datetime.fromisoformat(epoch)
     if begin.tzinfo is not None:
         begin = begin.astimezone(UTC)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", erfa.ErfaWarning)
-        utc = erfa.dtf2d(
-            "UTC",
-            begin.year,
-            begin.month,
-            begin.day,
-            begin.hour,
-            begin.minute,
-            begin.second + begin.microsecond * 1e-6,
-        )
-        tai_day, tai_fraction = erfa.utctai(*utc)
-        tt = erfa.taitt(tai_day, tai_fraction + time / DAY)
-        ut1 = erfa.utcut1(*utc, ut1_utc)
+    # `erfa.utctai` warns of years beyond the leap seconds it knows: to catch that would change
+    # the warnings of all threads.
+    *utc, _ = ufunc.dtf2d(
+        b"UTC",
+        begin.year,
+        begin.month,
+        begin.day,
+        begin.hour,
+        begin.minute,
+        begin.second + begin.microsecond * 1e-6,
+    )
+    tai_day, tai_fraction, _ = ufunc.utctai(*utc)
+    tt = erfa.taitt(tai_day, tai_fraction + time / DAY)
+    *ut1, _ = ufunc.utcut1(*utc, ut1_utc)
     matrix = erfa.c2t06a(*tt, ut1[0], ut1[1] + time / DAY, 0.0, 0.0)
     return Rotation.from_matrix(matrix).inv()
 

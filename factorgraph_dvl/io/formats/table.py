@@ -8,7 +8,6 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute
@@ -29,6 +28,7 @@ from factorgraph_dvl.io.formats.mapping import (
     MappingSettings,
     TableMapping,
 )
+from factorgraph_dvl.settings.convert import from_plain
 
 # Bytes that are parsed at a time.
 _BLOCK = 1 << 23
@@ -59,7 +59,7 @@ def read(path: Path, mapping: Mapping[str, Any] | None = None) -> Iterator[Batch
     DataError
         If a column is missing.
     """
-    settings = None if mapping is None else msgspec.convert(mapping, MappingSettings)
+    settings = None if mapping is None else from_plain(mapping, MappingSettings)
     tables = () if settings is None else settings.of(path)
     if not tables:
         raise ConfigError(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from threading import Lock
 
 import numpy as np
 from matplotlib import rc_context
@@ -49,6 +50,8 @@ _WIDE_BUCKETS = 400
 _MOST_CROSSINGS = 500.0
 # The envelope of noise is jagged and reads like two lines: later.
 _MOST_CROSSINGS_OF_NOISE = 1600.0
+# All threads have the same settings of Matplotlib.
+_settings = Lock()
 
 
 def save_figures(
@@ -109,7 +112,7 @@ def verdict_label(verdict: Verdict) -> str:
 def _save_vectors(figure: Figure, path: Path) -> Path:
     """Write a figure as SVG or PDF; the same figure gives the same bytes."""
     date = {"svg": "Date", "pdf": "CreationDate"}[path.suffix[1:]]
-    with rc_context({"svg.hashsalt": "factorgraph-dvl"}):
+    with _settings, rc_context({"svg.hashsalt": "factorgraph-dvl"}):
         figure.savefig(path, metadata={date: None})
     return path
 

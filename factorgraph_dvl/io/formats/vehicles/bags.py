@@ -12,7 +12,6 @@ from importlib import resources
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import msgspec
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
@@ -33,6 +32,7 @@ from factorgraph_dvl.io.formats.vehicles.library import (
     silently,
 )
 from factorgraph_dvl.io.formats.velocities import INSTRUMENT
+from factorgraph_dvl.settings.convert import from_plain
 from factorgraph_dvl.settings.files import check_file, open_file
 
 DVL_TYPE = "marine_acoustic_msgs/msg/Dvl"
@@ -83,7 +83,7 @@ def read(path: Path, mapping: Mapping[str, Any] | None = None) -> Iterator[Batch
     """
     load("rosbags.highlevel", "bags")
     _check_files(path)
-    settings = None if mapping is None else msgspec.convert(mapping, MappingSettings)
+    settings = None if mapping is None else from_plain(mapping, MappingSettings)
     topics: dict[str, list[TableMapping]] = {}
     for table in () if settings is None else settings.of(path, topics=True):
         topics.setdefault(table.topic, []).append(table)
