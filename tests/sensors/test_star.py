@@ -86,6 +86,14 @@ def test_earth_rotation_by_hand():
     assert turn(found.T, by_hand) > 3600.0
 
 
+def test_years_beyond_the_known_leap_seconds_are_no_warning(recwarn):
+    far = simulate(config("star", epoch="2099-12-01T05:30:00Z", **SHORT), 1)
+    frame = far.frame()
+    assert np.isfinite(star_attitudes(star_of(far), far.epoch, frame.lat, frame.lon).nRb).all()
+    assert np.isfinite(earth_from_inertial(far.epoch, np.array([0.0]))).all()
+    assert not recwarn.list
+
+
 @pytest.mark.parametrize("epoch", [EPOCH, "2018-12-01T06:30:00+01:00", "2018-12-01T05:30:00"])
 def test_earth_rotation_is_that_of_the_whole_transformation(epoch):
     time = np.array([-30.0, 0.0, 700.5, 86400.0])
