@@ -40,7 +40,7 @@ from factorgraph_dvl import load_trial
 from factorgraph_dvl.geometry.earth import RATE, enu_from_ecef
 from factorgraph_dvl.geometry.rotations import exp_so3, log_so3, rotation_from_rph
 from factorgraph_dvl.geometry.units import DEG_PER_HOUR
-from factorgraph_dvl.graph.inertial_chain import Chain, inertial_chain
+from factorgraph_dvl.graph.inertial_chain import InertialChain, inertial_chain
 from factorgraph_dvl.graph.problem import Problem
 from factorgraph_dvl.imu.increments import increments
 from factorgraph_dvl.imu.preintegration import segments
@@ -284,7 +284,7 @@ def history_times(trial: Trial) -> Iterator[tuple[str, str, str]]:
     yield "**ratio of these two**", f"{best['with'] / best['without']:.2f}", "2"
 
 
-def problem_of(trial: Trial, chain: Chain, aids: tuple[Aid, ...]) -> Problem:
+def problem_of(trial: Trial, chain: InertialChain, aids: tuple[Aid, ...]) -> Problem:
     observations = [o for aid in aids for o in aid.observations(chain.frame, trial.body_axes)]
     parameters = [p for aid in aids for p in aid.parameters()]
     return Problem(chain, observations, parameters)

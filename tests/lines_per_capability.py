@@ -55,9 +55,11 @@ CAPABILITIES = (
         "graph chain keys priors information solvers/*",
         "graph/* solvers/* statistics/*",
         "graph/imu_errors graph/clocks graph/processes graph/native_graph graph/motion_* "
+        "graph/smooth_* "
         "graph/bordered_chain "
         "statistics/correlation statistics/constancy solvers/change_along_trial "
         "solvers/correlated_noise solvers/known_parameters solvers/motion_* "
+        "solvers/preparation_without_imu "
         "statistics/error_budget statistics/robust_weights statistics/rows statistics/scores "
         "statistics/variance_components solvers/causes solvers/minima solvers/outliers",
     ),

@@ -39,18 +39,41 @@ def true_time(observation: Observation, values: Mapping[str, Array], zero: float
     return observation.time - clock.lag(observation.time, values, zero)
 
 
+def time_on_chain(
+    observation: Observation, values: Mapping[str, Array], zero: float, clock: str | None
+) -> Array:
+    """Return the times of measurements by the clock of the nodes, (M,), s.
+
+    Parameters
+    ----------
+    observation : Observation
+        M measurements.
+    values : mapping of str to ndarray
+        Values of the parameters, SI.
+    zero : float, s
+        Time at which the offsets of clocks hold.
+    clock : str, optional
+        Name of the offset of the clock that the nodes have; None = they are at true times.
+    """
+    time = true_time(observation, values, zero)
+    return time if clock is None else time + values[clock][0]
+
+
 def linearized(
     observation: Observation,
     motion: Motion,
     values: Mapping[str, Array],
     wanted: Collection[str],
     zero: float,
+    clock: str | None = None,
 ) -> Linearization:
     """Return residual and Jacobians of measurements, those of their clock included.
 
     With the lag o + r (t - t0) of the stamps,
 
         dρ/do = -(dρ/dθ ω_eb + dρ/dp v + dρ/dv a + dρ/dω α),    dρ/dr = (t - t0) dρ/do.
+
+    Nodes that move with a clock of lag n have dρ/dn = -dρ/do, for all measurements.
 
     Parameters
     ----------
@@ -64,12 +87,12 @@ def linearized(
         Parameters whose Jacobians are needed.
     zero : float, s
         Time t0 at which the offsets of clocks hold.
+    clock : str, optional
+        Name of the offset of the clock that the nodes have; None = they are at true times.
     """
     lin = observation.linearize(motion, values, wanted)
-    if observation.clock is None:
-        return lin
-    offset, rate = observation.clock.names
-    if offset not in wanted and rate not in wanted:
+    own = () if observation.clock is None else observation.clock.names
+    if not {*own, clock} & {*wanted}:
         return lin
     by_time = np.zeros((*lin.residual.shape, 1))
     for jacobian, change in (
@@ -81,8 +104,10 @@ def linearized(
         if jacobian is not None:
             by_time += jacobian @ change[:, :, None]
     found = dict(lin.d_parameters)
-    if offset in wanted:
-        found[offset] = -by_time
-    if rate in wanted:
-        found[rate] = -by_time * (observation.time - zero)[:, None, None]
+    since = (observation.time - zero)[:, None, None]
+    for name, by in zip(own, (-by_time, -by_time * since), strict=False):
+        if name in wanted:
+            found[name] = by
+    if clock is not None and clock in wanted:
+        found[clock] = found.get(clock, 0.0) + by_time
     return replace(lin, d_parameters=found)

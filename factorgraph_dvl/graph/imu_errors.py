@@ -7,15 +7,17 @@ with the errors, so the errors get columns of their own in the linear factors.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass
 
 import gtsam
 import numpy as np
 
-from factorgraph_dvl.geometry.vectors import Array
-from factorgraph_dvl.graph.inertial_chain import Chain
+from factorgraph_dvl.geometry.records import rows_of
+from factorgraph_dvl.geometry.vectors import Array, IntArray
 from factorgraph_dvl.graph.keys import BIAS_SIZE, STATE_SIZE
 from factorgraph_dvl.graph.template import jacobian_template
+from factorgraph_dvl.imu.preintegration import Segments
 from factorgraph_dvl.imu.propagation import Attachment, Transition
 from factorgraph_dvl.imu.sensitivity import (
     Sensitivity,
@@ -57,8 +59,8 @@ class ImuErrors:
 
     Parameters
     ----------
-    chain : Chain
-        Inertial part of the graph.
+    segments : Segments
+        Increments of the IMU between the nodes.
     parameters : sequence of Parameter
         Errors that are estimated.
     keys : sequence of int
@@ -69,7 +71,7 @@ class ImuErrors:
 
     def __init__(
         self,
-        chain: Chain,
+        segments: Segments,
         parameters: Sequence[Parameter],
         keys: Sequence[int],
         attachments: Sequence[Attachment],
@@ -77,12 +79,12 @@ class ImuErrors:
         self.names = tuple(p.name for p in parameters)
         self._keys = list(keys)
         self._sizes = [p.mean.size for p in parameters]
-        self._segments = chain.segments
+        self._segments = segments
         self._elements = elements(parameters)
         unique = {id(at): at for at in attachments}
-        whole, found = sensitivities(chain.segments, self._elements, list(unique.values()))
+        whole, found = sensitivities(segments, self._elements, list(unique.values()))
         self._whole = whole
-        self._ends = predicted(chain.segments, whole)
+        self._ends = predicted(segments, whole)
         self._by: dict[int, Sensitivity] = dict(zip(unique, found, strict=True))
         self._factors: list[gtsam.JacobianFactor] = []
 
@@ -109,6 +111,12 @@ class ImuErrors:
         parts = np.split(every, np.cumsum(self._sizes)[:-1], axis=2)
         return dict(zip(self.names, parts, strict=True))
 
+    def at(self, attachment: Attachment, bound: Attachment) -> ImuErrors:
+        """Return the errors where measurements at `bound` have another attachment."""
+        out = copy(self)
+        out._by = {**self._by, id(attachment): self._by[id(bound)]}
+        return out
+
     def linearized(self, native: gtsam.GaussianFactorGraph, errors: Array) -> LinearImuFactors:
         """Return native factors with what errors (n,) change in those of the IMU.
 
@@ -127,6 +135,12 @@ class ImuErrors:
     def sensitivity(self, bound: Attachment) -> Sensitivity:
         """Return how what is integrated up to measurements moves with the errors."""
         return self._by[id(bound)]
+
+    def of_rows(self, bound: Attachment, rows: Attachment, some: IntArray) -> ImuErrors:
+        """Return the same for some measurements (K,) of those that are bound, with `rows`."""
+        out = copy(self)
+        out._by = {id(rows): rows_of(self._by[id(bound)], some)}
+        return out
 
     def factors(self, graph: gtsam.NonlinearFactorGraph) -> list[gtsam.CustomFactor]:
         """Return the IMU factors, which a graph begins with, as they depend on the errors."""

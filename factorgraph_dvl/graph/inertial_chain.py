@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
+from typing import ClassVar
 
 import gtsam
 import numpy as np
 
 from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.rotations import (
+    BodyAxes,
     exp_so3,
     inverse_right_jacobian,
     log_so3,
@@ -19,13 +21,40 @@ from factorgraph_dvl.geometry.rotations import (
     rph_jacobian,
 )
 from factorgraph_dvl.geometry.units import DEG
-from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.geometry.vectors import Array, BoolArray, IntArray
 from factorgraph_dvl.graph import keys
+from factorgraph_dvl.graph.chain import StepRows
+from factorgraph_dvl.graph.imu_errors import ImuErrors
+from factorgraph_dvl.graph.keys import BIAS_SIZE, STATE_SIZE
+from factorgraph_dvl.graph.node_jacobian import node_jacobian
+from factorgraph_dvl.graph.priors import (
+    PRIOR,
+    ConstantsPrior,
+    add_bias_prior,
+    joint_linear_prior,
+    loose_diagonal,
+    square_root,
+)
+from factorgraph_dvl.graph.trajectory import EPOCH_ROUNDING, trajectory_between
 from factorgraph_dvl.imu.preintegration import Segments, gtsam_measurements
-from factorgraph_dvl.imu.propagation import States
-from factorgraph_dvl.sensors.imu import ImuSettings
+from factorgraph_dvl.imu.propagation import (
+    Attachment,
+    States,
+    Transition,
+    attach_inside,
+    later,
+    motion_at,
+)
+from factorgraph_dvl.sensors.imu import ERRORS, ImuSettings
 from factorgraph_dvl.sensors.parameters import Parameter
+from factorgraph_dvl.sensors.protocol import Linearization, Motion
+from factorgraph_dvl.solution import Trajectory
 from factorgraph_dvl.trial import Trial
+
+IMU_NOISE = "IMU noise"
+FIRST_STATE = "prior of the first state"
+GAP = "motion while the IMU is silent"
+WALK = "random walk of {}"
 
 # Standard deviations of a first state that nothing else determines, rad, m, m/s. Chosen: so large
 # that they only keep an unaided chain from being singular.
@@ -50,7 +79,7 @@ LEAST_WALK = np.repeat([1e-9, 1e-11], 3)
 
 
 @dataclass(frozen=True)
-class Chain:
+class InertialChain:
     """The inertial part of a graph, common to every set of aiding sensors.
 
     Parameters
@@ -78,6 +107,25 @@ class Chain:
     first_biases: tuple[Parameter, Parameter]
     imu: ImuSettings
     graph: gtsam.NonlinearFactorGraph
+    # Nodes are at true times, which are those of the IMU.
+    clock: ClassVar[str | None] = None
+    interpolates: ClassVar[bool] = False
+    step_source: ClassVar[str | None] = None
+
+    @property
+    def node_time(self) -> Array:
+        """Times of the nodes, (K,), s."""
+        return self.segments.node_time
+
+    @property
+    def count(self) -> int:
+        """Number of segments."""
+        return int(self.segments.first.size)
+
+    @property
+    def duration(self) -> float:
+        """How long the motion is known, s."""
+        return float(self.segments.duration.sum())
 
     @property
     def walking(self) -> bool:
@@ -98,6 +146,16 @@ class Chain:
     def middle(self) -> float:
         """Middle of the record, s."""
         return 0.5 * float(self.segments.node_time[0] + self.segments.node_time[-1])
+
+    @property
+    def constants(self) -> dict[int, int]:
+        """Dimensions of the variables that all nodes share, by key: of biases that do not walk."""
+        return {} if self.walking else {keys.bias(0): BIAS_SIZE}
+
+    @property
+    def sizes(self) -> list[int]:
+        """Dimensions of the variables of a measurement."""
+        return [STATE_SIZE, BIAS_SIZE]
 
     @cached_property
     def zeros(self) -> gtsam.Values:
@@ -124,16 +182,193 @@ class Chain:
             step.insert(keys.bias(k), row)
         return self.zeros.retract(step)
 
+    def states(self, values: gtsam.Values) -> States:
+        """Return states and biases as arrays."""
+        return self._states(values, range(self.node_time.size))
+
+    def states_around(self, values: gtsam.Values, k: int) -> States:
+        """Return the states that measurements after node k depend on: its own."""
+        return self._states(values, range(k, k + 1))
+
+    def from_node(self, k: int) -> InertialChain:
+        """Return what carries the motion of measurements after node k, taken as the first."""
+        return self
+
+    def _states(self, values: gtsam.Values, nodes: range) -> States:
+        # A matrix of GTSAM's is [nRb, p, v; 0, I]: one call takes less than one for each part.
+        state = np.empty((len(nodes), 5, 5))
+        for i, k in enumerate(nodes):
+            state[i] = values.atNavState(keys.node(k)).matrix()
+        nRb, p_n, v_n = (state[:, :3, part].copy() for part in (slice(0, 3), 3, 4))
+        own = nodes if self.walking else [0]
+        bias = np.array([values.atConstantBias(keys.bias(k)).vector() for k in own])
+        bias = np.broadcast_to(bias, (len(nodes), BIAS_SIZE))
+        return States(nRb, p_n, v_n, gyro_bias=bias[:, 3:], accel_bias=bias[:, :3])
+
+    def steps(self, states: States) -> Iterator[StepRows]:
+        """Yield nothing: what ties the nodes is in `graph`."""
+        yield from ()
+
+    def covers(self, time: Array) -> BoolArray:
+        """Whether the IMU recorded the motion at times (M,)."""
+        return np.asarray(self.segments.increments.locate(time)[2])
+
+    def attach(self, time: Array) -> Attachment:
+        """Return where times (M,) hang on the chain; those that are not covered, where nearest."""
+        return attach_inside(self.segments, time, self.frame.earth_rate)[0]
+
+    def later(self, at: Attachment, late: Array) -> Attachment:
+        """Return an attachment at times that are later by (M,) s, to the same nodes."""
+        return later(at, late, self.frame.earth_rate)
+
+    def left(self, at: Attachment, late: Array, tolerance: float) -> bool:
+        """Whether measurements later by (M,) s are to be bound anew; tolerance in s."""
+        return bool(np.abs(late).max() > tolerance)
+
+    def motion(self, at: Attachment, states: States) -> Motion:
+        """Return the motion at M attached times, carried forward from the nodes before."""
+        return motion_at(at, states, self.gravity_n, self.frame.earth_rate)
+
+    def transition(self, at: Attachment, states: States, motion: Motion) -> Transition:
+        """Return the derivatives of the motion at attached times by the nodes before."""
+        return Transition(at, states, motion, self.frame.earth_rate)
+
+    def node_jacobian(self, lin: Linearization, transition: Transition) -> Array:
+        """Return the derivative of residuals by the variables of measurements, (M, d, 15)."""
+        return node_jacobian(lin, transition)
+
+    def variables(self, node: IntArray) -> list[IntArray]:
+        """Return the keys of the variables of measurements after nodes (M,), (M,) each."""
+        return [keys.nodes(node), keys.bias(0) + self.walking * node]
+
+    def add_prior(
+        self,
+        graph: gtsam.NonlinearFactorGraph,
+        parameters: Sequence[Parameter],
+        key_of: Mapping[str, int],
+        constants_prior: ConstantsPrior | None,
+    ) -> Sequence[Parameter]:
+        """Add the prior of the biases; return the parameters whose priors it does not have.
+
+        Parameters
+        ----------
+        graph : gtsam.NonlinearFactorGraph
+            Added to.
+        parameters : sequence of Parameter
+            Those that are estimated.
+        key_of : mapping of str to int
+            Their keys.
+        constants_prior : ConstantsPrior, optional
+            Joint prior of biases and parameters, in place of their own.
+        """
+        if constants_prior is not None:
+            graph.add(joint_linear_prior(constants_prior, self.bias_key(0), parameters, key_of))
+            return ()
+        joint = self.biases[0].joint
+        with_biases = [p for p in parameters if p.joint and p.joint is joint]
+        add_bias_prior(graph, self.first_biases, self.bias_key(0), with_biases, key_of)
+        return [p for p in parameters if not p.joint or p.joint is not joint]
+
+    def mean_constants(
+        self, states: States
+    ) -> Iterator[tuple[Parameter, Array, dict[int, Array]]]:
+        """Yield each bias with its mean over the trial, in reported units, and its derivatives.
+
+        These are by the variables of the graph, by key.
+        """
+        seg = self.segments
+        weight = np.zeros(seg.node_time.size)
+        weight[seg.origin] += seg.duration
+        weight[seg.origin + 1] += seg.duration
+        weight /= weight.sum()
+        gyro, accel = self.biases
+        for parameter, bias, first in ((gyro, states.gyro_bias, 3), (accel, states.accel_bias, 0)):
+            select = np.eye(BIAS_SIZE)[first : first + 3] / parameter.si
+            by_node = {keys.bias(k): w * select for k, w in enumerate(weight)}
+            functional = by_node if self.walking else {keys.bias(0): select}
+            yield parameter, weight @ bias / parameter.si, functional
+
+    def trajectory(
+        self, states: States, P: Array, body_axes: BodyAxes, rate_hz: float, after: float = -np.inf
+    ) -> Trajectory:
+        """Return the motion at a rate, with its covariance.
+
+        Parameters
+        ----------
+        states : States
+            Of the K nodes.
+        P : ndarray, shape (K, 9, 9)
+            Their covariances, in GTSAM's tangent space.
+        body_axes : BodyAxes
+            Axes of the body.
+        rate_hz : float
+            Epochs in a second.
+        after : float, optional
+            Time of the last epoch before those that are wanted, s.
+        """
+        time = self.segments.increments.ticks(rate_hz)
+        time = time[time * rate_hz > after * rate_hz + EPOCH_ROUNDING]
+        return trajectory_between(
+            self.segments, states, P, self.gravity_n, self.frame, body_axes, time
+        )
+
+    def release(self) -> None:
+        """Free what only binding measurements, and a trajectory with rates, need."""
+        self.segments.increments.release()
+
+    def sources(self, letters: str) -> dict[str, slice]:
+        """Return the sources of noise of one of its factors, and which rows each has.
+
+        In GTSAM's order of biases; rows of different sources are independent of each other.
+        """
+        gyro, accel = (p.name for p in self.biases)
+        if letters.startswith("xxb"):
+            return {IMU_NOISE: slice(None)}
+        if letters == "bb" or (letters == "b" and self.biases[0].joint is None):
+            source = WALK if letters == "bb" else PRIOR
+            return {source.format(accel): slice(0, 3), source.format(gyro): slice(3, 6)}
+        if letters == "b":
+            return {PRIOR.format(f"{gyro}, {accel}"): slice(None)}
+        return {{"x": FIRST_STATE, "xx": GAP}[letters]: slice(None)}
+
+    def assumed(self) -> dict[str, str]:
+        """Return what is assumed of each of these sources, as text."""
+        imu = self.imu
+        gyro, accel = self.biases
+        return {
+            IMU_NOISE: f"{imu.gyro_noise_deg_sqrt_h:.3g} deg/√h, "
+            f"{imu.accel_noise_ug_sqrt_hz:.3g} µg/√Hz",
+            WALK.format(gyro.name): f"{imu.gyro_bias_walk_deg_h_sqrt_h:.3g} deg/h/√h",
+            WALK.format(accel.name): f"{imu.accel_bias_walk_ug_sqrt_h:.3g} µg/√h",
+        }
+
+    def errors(
+        self, parameters: Sequence[Parameter], key_of: Mapping[str, int], at: Sequence[Attachment]
+    ) -> ImuErrors | None:
+        """Return the errors of the IMU among parameters; None if none is estimated.
+
+        Parameters
+        ----------
+        parameters : sequence of Parameter
+            Those that are estimated.
+        key_of : mapping of str to int
+            Their keys.
+        at : sequence of Attachment
+            Where measurements hang on the chain.
+        """
+        own = [p for p in parameters if p.name in ERRORS]
+        return ImuErrors(self.segments, own, [key_of[p.name] for p in own], at) if own else None
+
     def bias_key(self, k: int) -> int:
         """Return the key of the bias at node k."""
         return keys.bias(k if self.walking else 0)
 
-    def part(self, block: slice) -> Chain:
+    def part(self, block: slice) -> InertialChain:
         """Return the part of some segments in a row; states keep their keys.
 
         Its factors are those of these segments, and others whose first state is in `nodes_of` it.
         """
-        count, nodes = self.segments.first.size, self.nodes_of(block)
+        count, nodes = self.count, self.nodes_of(block)
         graph = gtsam.NonlinearFactorGraph()
         for i in range(block.start, block.stop):
             graph.add(self.graph.at(i))
@@ -167,14 +402,14 @@ class Chain:
         return [key for k in nodes for key in (keys.node(k), keys.bias(k))]
 
 
-def inertial_chain(trial: Trial, frame: LocalFrame, seg: Segments, start: States) -> Chain:
+def inertial_chain(trial: Trial, frame: LocalFrame, seg: Segments, start: States) -> InertialChain:
     """Return the inertial part of the graph, with gravity at the positions of `start`."""
     middle = 0.5 * (start.p_n[seg.origin] + start.p_n[seg.origin + 1])
     gravity_n = frame.gravity_without_rotation(middle)
     settings = trial.inertial.settings
     graph = gtsam.NonlinearFactorGraph()
     first, mean = (trial.inertial.parameters(t) for t in (0.0, float(seg.duration.sum())))
-    chain = Chain(frame, seg, gravity_n, mean, first, settings, graph)
+    chain = InertialChain(frame, seg, gravity_n, mean, first, settings, graph)
     pims = gtsam_measurements(seg, settings, gravity_n, frame.earth_rate)
     for k, pim in zip(seg.origin.tolist(), pims, strict=True):
         graph.add(gtsam.GalileanImuFactor2(keys.node(k), keys.node(k + 1), chain.bias_key(k), pim))
@@ -257,16 +492,3 @@ def _gap_factor(before: int, after: int, node_time: Array) -> gtsam.CustomFactor
         return np.concatenate([turn, shift, b.velocity() - a.velocity()])
 
     return gtsam.CustomFactor(loose_diagonal(sigma), node_keys, error)
-
-
-def square_root(root: Array) -> gtsam.noiseModel.Gaussian:
-    """Return a noise model from square-root information (n, n), not squared on the way."""
-    return gtsam.noiseModel.Gaussian.SqrtInformation(np.linalg.qr(root, mode="r"), False)
-
-
-def loose_diagonal(sigmas: Array) -> gtsam.noiseModel.Diagonal:
-    """Return a diagonal noise model that stays one.
-
-    GTSAM's default takes a sigma below 1e-8, as of a good gyro's bias, for a constraint.
-    """
-    return gtsam.noiseModel.Diagonal.Sigmas(sigmas, False)

@@ -2,38 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
 
 import gtsam
 import numpy as np
 
-from factorgraph_dvl.geometry.records import concatenated, rows_of
 from factorgraph_dvl.geometry.vectors import Array
-from factorgraph_dvl.graph import keys
-from factorgraph_dvl.graph.clocks import parameters_of
+from factorgraph_dvl.graph.bound_observation import BoundObservation
+from factorgraph_dvl.graph.chain import Chain
+from factorgraph_dvl.graph.priors import value_at
 from factorgraph_dvl.graph.problem import Problem
 from factorgraph_dvl.graph.processes import Process
-from factorgraph_dvl.graph.sensor_factor import (
-    AttachedMeasurements,
-    NodeMeasurements,
-    ObservationRows,
-    at_first_node,
-    measurement_factor,
-)
-from factorgraph_dvl.imu.propagation import Attachment
-from factorgraph_dvl.imu.sensitivity import Sensitivity
-from factorgraph_dvl.sensors.imu import ERRORS
-from factorgraph_dvl.sensors.parameters import Parameter, ParameterSpec
-from factorgraph_dvl.sensors.protocol import Linearization, Motion
 
 
 def native_graph(problem: Problem) -> gtsam.NonlinearFactorGraph:
     """Return the nonlinear graph that a problem linearises in bulk.
 
-    IMU factors with gravity per segment, walks of the biases and all priors are the problem's
-    own. What was measured between a node and the next is one custom factor, with the weights
-    that measurements have now; it depends on the nodes of their correlated errors as well.
+    Factors from node to node, with gravity per segment where there is an IMU, and all priors are
+    the problem's own. Each measurement is one custom factor, with the weights that it has now; it
+    depends on the nodes of its correlated error as well.
     """
     imu_errors = problem.imu_errors
     graph = gtsam.NonlinearFactorGraph()
@@ -44,148 +31,99 @@ def native_graph(problem: Problem) -> gtsam.NonlinearFactorGraph:
         graph.push_back(problem.graph.at(i))
     for process in problem.processes:
         _add_prior(graph, process)
-    for k in range(problem.chain.segments.node_time.size):
-        measured = _measurement_factor(problem, k)
-        if measured is not None:
-            graph.add(measured)
+    for factor in _step_factors(problem):
+        graph.add(factor)
+    for bound in problem.bound:
+        for i in np.flatnonzero((bound.weight > 0.0).any(axis=1)).tolist():
+            graph.add(_measurement_factor(problem, bound, i))
     return graph
 
 
-def _measurement_factor(problem: Problem, k: int) -> gtsam.CustomFactor | None:
-    """Return the factor of what was measured after node k, None if nothing was."""
-    chain, imu_errors = problem.chain, problem.imu_errors
-    rows: list[AttachedMeasurements] = []
-    attachments: list[Attachment] = []
-    sensitivities: list[Sensitivity] = []
-    nodes: dict[str, int] = {}
-    weights = []
-    count = 0
-    for o, at, weight in zip(
-        problem.observations, problem.attachments, problem.weights, strict=True
-    ):
-        (index,) = np.nonzero((at.node == k) & (weight > 0.0).any(axis=1))
-        if not index.size:
-            continue
-        # Where the measurements were bound, which is not where their clock puts them now.
-        time = chain.segments.node_time[k] + at.tau[index]
-        place = slice(count, count + index.size)
-        own = ObservationRows(o, index)
-        for process in problem.processes:
-            if process.label == o.label:
-                own = CorrelatedRows(o, index, process)
-                nodes.update(own.nodes)
-        rows.append(AttachedMeasurements(own, place, time))
-        attachments.append(rows_of(at, index))
-        weights.append(weight[index].ravel())
-        if imu_errors is not None:
-            sensitivities.append(rows_of(imu_errors.sensitivity(at), index))
-        count += index.size
-    if not rows:
-        return None
-    attachment = concatenated(attachments)
-    used = {name for r in rows for name in parameters_of(r.observation)}
-    if imu_errors is not None:
-        used |= ERRORS.keys()
-    parameters = tuple(p for p in problem.parameters if p.name in used)
+# Returns residual and Jacobian at values of all variables.
+_Linearize = Callable[[gtsam.Values], tuple[Array, Array]]
+
+
+def _factor(
+    every: Sequence[int], sizes: Sequence[int], rows: int, linearize: _Linearize
+) -> gtsam.CustomFactor:
+    """Return a custom factor of unit noise; shapes are checked, as GTSAM crashes by wrong ones."""
+    edges = np.cumsum([0, *sizes])
+
+    def error(this: gtsam.CustomFactor, at: gtsam.Values, jacobians: list[Array] | None) -> Array:
+        residual, matrix = linearize(at)
+        if jacobians is not None:
+            if matrix.shape != (rows, edges[-1]):
+                raise ValueError(f"Jacobian of shape {matrix.shape}, expected {(rows, edges[-1])}")
+            for i in range(len(every)):
+                jacobians[i] = np.asfortranarray(matrix[:, edges[i] : edges[i + 1]])
+        return residual
+
+    return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(rows), list(every), error)
+
+
+def _measurement_factor(problem: Problem, bound: BoundObservation, i: int) -> gtsam.CustomFactor:
+    """Return the factor of one measurement."""
+    single = bound.single(i)
+    processes, parameters = problem.processes_of(bound), bound.parameters(problem.parameters)
     shared = [problem.key(p.name) for p in parameters]
-    measured = NodeMeasurements(
-        attachment=at_first_node(attachment),
-        rows=tuple(rows),
-        parameters=(*parameters, *_as_parameters(rows)),
-        fixed=problem.prior_values(),
-        gravity_n=chain.gravity_n[attachment.segment[:1]],
-        earth_rate_n=chain.frame.earth_rate,
-        clock_zero=problem.clock_zero,
-        sensitivity=concatenated(sensitivities) if sensitivities else None,
-    )
-    every = [*shared, *nodes.values()]
-    return measurement_factor(
-        measured, np.concatenate(weights), keys.node(k), chain.bias_key(k), every
-    )
+    every = bound.keys_at(bound.nodes(processes)[[i]], processes, shared)[0].tolist()
+    wanted = [p.name for p in parameters]
+    k, rows = int(bound.attachment.node[i]), bound.weight.shape[1]
+    parameters_at = _parameters_at(problem, every)
 
-
-@dataclass(frozen=True)
-class CorrelatedRows(ObservationRows):
-    """Some measurements of an observation with a correlated error, whose nodes are parameters.
-
-    Parameters
-    ----------
-    process : Process
-        The error.
-    """
-
-    process: Process
-
-    @property
-    def nodes(self) -> dict[str, int]:
-        """Keys of the nodes that the measurements lie between, by name."""
-        before, _ = self.process.place(self.time)
-        every = range(int(before.min()), int(before.max()) + 2)
-        return {_node_name(self.process, j): self.process.key(j) for j in every}
-
-    @property
-    def parameters(self) -> tuple[str, ...]:
-        """Names of calibration parameters and nodes."""
-        return (*self.whole.parameters, *self.nodes)
-
-    def residual(self, motion: Motion, values: Mapping[str, Array]) -> Array:
-        """Return predicted - measured, (K, d), the error included in what is predicted."""
-        residual = super().residual(motion, values)
-        return self.process.with_error(residual, self._at_nodes(values), self.time)
-
-    def linearize(
-        self, motion: Motion, values: Mapping[str, Array], wanted: Collection[str]
-    ) -> Linearization:
-        """Return the residual and its Jacobians."""
-        lin = super().linearize(motion, values, wanted)
-        nodes = self._at_nodes(values)
-        gain = self.process.gain(nodes, self.time)[..., None]
-        of_motion = {
-            name: gain * each
-            for name in ("d_theta", "d_p", "d_v", "d_omega")
-            if (each := getattr(lin, name)) is not None
-        }
-        by_parameters = {name: gain * each for name, each in lin.d_parameters.items()}
-        return replace(
-            lin,
-            **of_motion,
-            residual=self.process.with_error(lin.residual, nodes, self.time),
-            d_parameters=by_parameters | self._by_nodes(lin.residual),
+    def linearize(at: gtsam.Values) -> tuple[Array, Array]:
+        values = parameters_at(at)
+        states = problem.chain.states_around(at, k)
+        motion = single.motion(states, values, single.late(values), moved=False)
+        lin = single.linearized(motion, values, wanted, processes)
+        matrix, residual = single.jacobian(
+            lin, slice(None), motion, states, values, wanted, processes, {}
         )
+        return residual[0], matrix[0]
 
-    def _at_nodes(self, values: Mapping[str, Array]) -> Array:
-        """Return the nodes of the error, (J, size); zero where none is among the values."""
-        out = self.process.zero
-        for j in range(len(out)):
-            out[j] = values.get(_node_name(self.process, j), out[j])
+    return _factor(every, bound.sizes(processes, parameters), rows, linearize)
+
+
+def _step_factors(problem: Problem) -> Iterator[gtsam.CustomFactor]:
+    """Yield the factors from node to node that GTSAM does not have, one for each step."""
+    chain = problem.chain
+    for k in range(chain.count if chain.interpolates else 0):
+        every = [int(each[0]) for each in chain.variables(np.array([k]))]
+        yield _step_factor(chain, k, every)
+
+
+def _step_factor(chain: Chain, k: int, every: Sequence[int]) -> gtsam.CustomFactor:
+    local = chain.from_node(k)
+
+    def linearize(at: gtsam.Values) -> tuple[Array, Array]:
+        (step,) = local.steps(chain.states_around(at, k))
+        return step.residual[0], step.by_nodes[0]
+
+    return _factor(every, chain.sizes, sum(chain.sizes) // 2, linearize)
+
+
+def _parameters_at(
+    problem: Problem, every: Sequence[int]
+) -> Callable[[gtsam.Values], Mapping[str, Array]]:
+    """Return a function of values to all parameters, the others than of some keys as zero."""
+    own = set(every)
+    fixed = problem.prior_values()
+    estimated = [p for p in problem.parameters if problem.key(p.name) in own]
+    nodes = {
+        process: [j for j in range(process.time.size) if process.key(j) in own]
+        for process in problem.processes
+    }
+
+    def at(values: gtsam.Values) -> Mapping[str, Array]:
+        out = fixed | {p.name: value_at(values, problem.key(p.name), p) for p in estimated}
+        for process, some in nodes.items():
+            errors = process.zero
+            for j in some:
+                errors[j] = values.atVector(process.key(j))
+            out[process.name] = errors
         return out
 
-    def _by_nodes(self, residual: Array) -> dict[str, Array]:
-        """Return the derivatives of the error with respect to each node, (K, d, size)."""
-        before, _ = self.process.place(self.time)
-        found = dict.fromkeys(self.nodes, np.zeros(()))
-        for part, jacobian in enumerate(self.process.jacobians(residual, self.time)):
-            for name in found:
-                here = [_node_name(self.process, int(j) + part) == name for j in before]
-                found[name] = found[name] + np.where(np.array(here)[:, None, None], jacobian, 0.0)
-        return found
-
-
-def _node_name(process: Process, j: int) -> str:
-    return f"{process.name} {j}"
-
-
-def _as_parameters(rows: Sequence[AttachedMeasurements]) -> Iterator[Parameter]:
-    """Yield the nodes of correlated errors as parameters of a factor."""
-    seen = set()
-    for r in rows:
-        if isinstance(r.observation, CorrelatedRows):
-            sigma = np.ones(r.observation.process.size)
-            for name in r.observation.nodes:
-                if name not in seen:
-                    seen.add(name)
-                    spec = ParameterSpec(name, labels=("",) * sigma.size)
-                    yield Parameter(spec, 0.0 * sigma, sigma)
+    return at
 
 
 def _add_prior(graph: gtsam.NonlinearFactorGraph, process: Process) -> None:

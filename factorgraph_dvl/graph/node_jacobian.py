@@ -4,27 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from factorgraph_dvl.geometry.vectors import Array, IntArray
+from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph.keys import BIAS_SIZE, STATE_SIZE
 from factorgraph_dvl.imu.propagation import Transition, attitude_jacobian
 from factorgraph_dvl.sensors.protocol import Linearization
-
-
-def some_of(lin: Linearization, some: slice | IntArray) -> Linearization:
-    """Return residuals and derivatives of some of M measurements."""
-    count = len(lin.residual)
-
-    def own(each: Array) -> Array:
-        # What is the same for all stands there once.
-        return np.asarray(np.broadcast_to(each, (count, *each.shape[1:]))[some])
-
-    by_motion = {
-        name: own(each)
-        for name in ("d_theta", "d_p", "d_v", "d_omega")
-        if (each := getattr(lin, name)) is not None
-    }
-    by_parameters = {name: own(each) for name, each in lin.d_parameters.items()}
-    return Linearization(lin.residual[some], **by_motion, d_parameters=by_parameters)
 
 
 def node_jacobian(lin: Linearization, transition: Transition) -> Array:

@@ -11,13 +11,16 @@ from scipy.linalg import block_diag
 
 from factorgraph_dvl.geometry.rotations import exp_so3, inverse_right_jacobian, right_jacobian
 from factorgraph_dvl.geometry.vectors import Array
-from factorgraph_dvl.graph.inertial_chain import loose_diagonal, square_root
 from factorgraph_dvl.graph.keys import BIAS_SIZE
 from factorgraph_dvl.sensors.parameters import Parameter
 
+# Source of noise of a prior.
+PRIOR = "prior of {}"
 # Stands for a standard deviation of 0 in a parameter of which other components are estimated,
 # SI. Chosen: far below what is measured.
 _FIXED_STD = 1e-7
+# Root of the information that a tilt adds, in that of the parameters. Chosen: σ stay the same.
+_TILT_GAIN = 0.01
 # Least eigenvalue of the correlations of a calibration. Chosen: it may know a combination of
 # parameters a million times better than each.
 _LEAST_EIGENVALUE = 1e-12
@@ -90,13 +93,54 @@ def prior_root(parameters: Sequence[Parameter]) -> Array:
     return out
 
 
+@dataclass(frozen=True)
+class Tilt:
+    """A gradient of the objective by the parameters that no residual has.
+
+    As that of the volume of the states: the minimum of the squares alone is not the most probable
+    one where the states are known the better, the larger a parameter is.
+
+    Parameters
+    ----------
+    gradient : ndarray, shape (P,), 1/SI
+        In the tangent space at the origin.
+    sigma : ndarray, shape (P,), SI
+        Standard deviations of the parameters.
+    origin : dict of str to ndarray
+        Values of the parameters where it holds.
+    """
+
+    gradient: Array
+    sigma: Array
+    origin: dict[str, Array]
+
+    @property
+    def _gain(self) -> Array:
+        return np.asarray(_TILT_GAIN / np.maximum(self.sigma, np.finfo(float).tiny))
+
+    @property
+    def constant(self) -> float:
+        """What its factor adds to the cost at the origin."""
+        return 0.5 * float(np.sum((self.gradient / self._gain) ** 2))
+
+    def factor(
+        self, parameters: Sequence[Parameter], key_of: Mapping[str, int]
+    ) -> gtsam.CustomFactor:
+        """Return a factor with this gradient, and with hardly any information."""
+        gain = self._gain
+        return linear_prior(parameters, key_of, np.diag(gain), self.origin, self.gradient / gain)
+
+
 def linear_prior(
     parameters: Sequence[Parameter],
     key_of: Mapping[str, int],
     gain: Array,
     origin: Mapping[str, Array],
+    offset: Array | float = 0.0,
 ) -> gtsam.CustomFactor:
     """Return a factor of unit noise on gain times the difference of parameters to an origin.
+
+    An offset adds to the product.
 
     The callback must not know the problem: GTSAM would keep it, and it GTSAM's graph, and
     nothing would ever free the two.
@@ -104,7 +148,7 @@ def linear_prior(
     columns = [gain[:, place] for place in places(parameters).values()]
 
     def error(this: gtsam.CustomFactor, at: gtsam.Values, jacobians: list[Array] | None) -> Array:
-        total = np.zeros(gain.shape[0])
+        total = np.zeros(gain.shape[0]) + offset
         for i, (p, part) in enumerate(zip(parameters, columns, strict=True)):
             off = local_coordinates(p, value_at(at, key_of[p.name], p), origin[p.name])
             total += part @ off
@@ -221,3 +265,16 @@ def _root_of(group: Sequence[Parameter]) -> Array:
         *(right_jacobian(p.mean) if p.rotation else np.eye(p.mean.size) for p in group)
     )
     return np.asarray(to_tangent @ root)
+
+
+def square_root(root: Array) -> gtsam.noiseModel.Gaussian:
+    """Return a noise model from square-root information (n, n), not squared on the way."""
+    return gtsam.noiseModel.Gaussian.SqrtInformation(np.linalg.qr(root, mode="r"), False)
+
+
+def loose_diagonal(sigmas: Array) -> gtsam.noiseModel.Diagonal:
+    """Return a diagonal noise model that stays one.
+
+    GTSAM's default takes a sigma below 1e-8, as of a good gyro's bias, for a constraint.
+    """
+    return gtsam.noiseModel.Diagonal.Sigmas(sigmas, False)

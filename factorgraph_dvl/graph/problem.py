@@ -10,9 +10,11 @@ slow and makes GTSAM's optimisers copy all values.
 from __future__ import annotations
 
 from collections.abc import Hashable, Iterator, Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import zip_longest
+from typing import Any
 
 import gtsam
 import numpy as np
@@ -22,17 +24,21 @@ from factorgraph_dvl.geometry.records import rows_of
 from factorgraph_dvl.geometry.rotations import BodyAxes
 from factorgraph_dvl.geometry.vectors import Array, BoolArray, IntArray
 from factorgraph_dvl.graph import keys
-from factorgraph_dvl.graph.clocks import linearized, parameters_of, true_time
+from factorgraph_dvl.graph.bound_observation import (
+    EXTRAPOLATED,
+    SAME_TIME,
+    BoundObservation,
+    Processes,
+    processes_of,
+)
+from factorgraph_dvl.graph.chain import Chain
+from factorgraph_dvl.graph.clocks import time_on_chain
 from factorgraph_dvl.graph.factor_layout import CHUNK, Part, factor_layout
 from factorgraph_dvl.graph.imu_errors import ImuErrors, LinearImuFactors
-from factorgraph_dvl.graph.inertial_chain import Chain
-from factorgraph_dvl.graph.keys import BIAS_SIZE, STATE_SIZE
-from factorgraph_dvl.graph.node_jacobian import node_jacobian, some_of
 from factorgraph_dvl.graph.priors import (
     ConstantsPrior,
-    add_bias_prior,
+    Tilt,
     add_priors,
-    joint_linear_prior,
     linear_prior,
     local_coordinates,
     places,
@@ -45,10 +51,6 @@ from factorgraph_dvl.graph.template import jacobian_template
 from factorgraph_dvl.imu.propagation import (
     Attachment,
     States,
-    Transition,
-    attach_inside,
-    extrapolated,
-    motion_at,
 )
 from factorgraph_dvl.sensors.imu import ERRORS
 from factorgraph_dvl.sensors.parameters import Parameter
@@ -62,30 +64,9 @@ from factorgraph_dvl.sensors.protocol import (
 # Stands for zero in a fixed direction, in standard deviations of the prior. Chosen: what data
 # that do not determine the direction cannot move.
 FIXED_DIRECTION_STD = 1e-4
-# How far, s, a motion is extrapolated before its measurements are bound anew. Measured: 2 Hz
-# sway of 4 deg then differs by 3e-6 rad/s from a straight line in the rate.
-_SAME_TIME = 2e-4
-# The same, s, before the motion is integrated anew on the way to a minimum. Measured: at most
-# 7e-5 rad/s in the same sway.
-EXTRAPOLATED = 1e-3
 # Relative change of a standard deviation from which on measurements are weighed anew. Chosen:
 # less hardly moves the minimum.
 _SAME_WEIGHT = 0.2
-
-
-@dataclass(eq=False)
-class _Bound:
-    """An observation tied to the chain; `usable` measurements (M,) are covered by the IMU.
-
-    `correlated` is the place of its correlated error among those of the problem, if it has one.
-    """
-
-    observation: Observation
-    attachment: Attachment
-    time: Array
-    usable: BoolArray
-    weight: Array
-    correlated: int | None = None
 
 
 @dataclass
@@ -96,9 +77,8 @@ class _Block:
     `matrices` and `vectors` are views into `factors` and live no longer than they do.
     """
 
-    bound: list[_Bound]
+    bound: list[BoundObservation]
     parameters: tuple[Parameter, ...]
-    correlated: int | None = None
     parts: list[list[Part]] = field(default_factory=list)
     factors: list[gtsam.JacobianFactor] = field(default_factory=list)
     matrices: list[Array] = field(default_factory=list)
@@ -197,6 +177,8 @@ class Problem:
         By label, measurements (M,) that may be used where the IMU covers them; by default all.
     attached : sequence of (ndarray, Attachment), optional
         Times (M,) that are attached already, such as those of another problem's `attached`.
+    tilt : Tilt, optional
+        Gradient of the objective by the parameters that no residual has.
 
     Attributes
     ----------
@@ -236,6 +218,7 @@ class Problem:
         processes: Sequence[Process] = (),
         usable: Mapping[str, BoolArray] | None = None,
         attached: Sequence[tuple[Array, Attachment]] = (),
+        tilt: Tilt | None = None,
     ) -> None:
         self.chain = chain
         self.processes = tuple(processes)
@@ -248,19 +231,14 @@ class Problem:
         }
         self._fixed = {p.name: prior_mean(p) for p in parameters if not p.estimated}
         self.graph = gtsam.NonlinearFactorGraph(chain.graph)
-        if constants_prior is None:
-            joint = chain.biases[0].joint
-            with_biases = [p for p in self.parameters if p.joint and p.joint is joint]
-            others = [p for p in self.parameters if not p.joint or p.joint is not joint]
-            add_bias_prior(
-                self.graph, chain.first_biases, chain.bias_key(0), with_biases, self._key
-            )
-            add_priors(self.graph, others, self._key)
-        else:
-            self.graph.add(
-                joint_linear_prior(constants_prior, chain.bias_key(0), self.parameters, self._key)
-            )
+        others = chain.add_prior(self.graph, self.parameters, self._key, constants_prior)
+        add_priors(self.graph, others, self._key)
+        self.tilt = tilt
+        if tilt is not None and self.parameters:
+            self.graph.add(tilt.factor(self.parameters, self._key))
         self._weighed_at: gtsam.Values | None = None
+        # Factors from node to node, their matrices and vectors: views that live no longer.
+        self._steps: list[tuple[gtsam.JacobianFactor, Array, Array]] = []
         self.uncovered: dict[str, int] = {}
         self.rejected: Mapping[str, Array] = {}
         self.noise_factors: Mapping[str, Array] = {}
@@ -268,27 +246,28 @@ class Problem:
         self.robust_weights: Mapping[str, Array] = {}
         self.clock_tolerance: Mapping[str, float] = {}
         self.bound_at = {**self.prior_values(), **(start or {})}
-        self._bound: list[_Bound] = []
+        self._bound: list[BoundObservation] = []
         for observation in observations:
             may_be_used = (usable or {}).get(observation.label)
             self._bound.append(self._bind(observation, may_be_used, attached))
-        errors = [p for p in self.parameters if p.name in ERRORS]
-        self._imu_errors: ImuErrors | None = None
-        if errors:
-            error_keys = [self._key[p.name] for p in errors]
-            self._imu_errors = ImuErrors(chain, errors, error_keys, self.attachments)
-        blocks: dict[tuple[tuple[str, ...], int | None], _Block] = {}
+        self._imu_errors = chain.errors(self.parameters, self._key, self.attachments)
+        blocks: dict[tuple[tuple[str, ...], ...], _Block] = {}
         for bound in self._bound:
-            own = (*parameters_of(bound.observation), *ERRORS)
-            used = tuple(p for p in self.parameters if p.name in own)
-            kind = tuple(p.name for p in used), bound.correlated
-            blocks.setdefault(kind, _Block([], used, bound.correlated)).bound.append(bound)
+            bound.errors = self._imu_errors
+            used = bound.parameters(self.parameters)
+            kind = tuple(p.name for p in used), self.processes_of(bound).names
+            blocks.setdefault(kind, _Block([], used)).bound.append(bound)
         self._blocks = list(blocks.values())
 
     @property
     def observations(self) -> tuple[Observation, ...]:
         """The observations, in the order of `Evaluation.residuals`."""
         return tuple(b.observation for b in self._bound)
+
+    @property
+    def bound(self) -> tuple[BoundObservation, ...]:
+        """The observations as they are tied to the chain."""
+        return tuple(self._bound)
 
     @property
     def attachments(self) -> tuple[Attachment, ...]:
@@ -336,7 +315,7 @@ class Problem:
         """Return the prior means of all parameters, rotations as matrices."""
         return {p.name: prior_mean(p) for p in self.all_parameters}
 
-    def values(self, states: States, parameters: dict[str, Array]) -> gtsam.Values:
+    def values(self, states: Any, parameters: dict[str, Array]) -> gtsam.Values:
         """Return GTSAM's values of states and parameters."""
         out = self.chain.values(states)
         for process in self.processes:
@@ -348,7 +327,7 @@ class Problem:
             out.insert(self._key[p.name], gtsam.Rot3(value) if p.rotation else value)
         return out
 
-    def arrays(self, values: gtsam.Values) -> tuple[States, dict[str, Array]]:
+    def arrays(self, values: gtsam.Values) -> tuple[Any, dict[str, Array]]:
         """Return states, and parameters by name, of GTSAM's values; rotations as matrices."""
         parameters = {**self._fixed}
         for p in self.parameters:
@@ -356,7 +335,7 @@ class Problem:
         for process in self.processes:
             nodes = [values.atVector(process.key(j)) for j in range(process.time.size)]
             parameters[process.name] = np.array(nodes)
-        return self._states(values), parameters
+        return self.chain.states(values), parameters
 
     @cached_property
     def columns(self) -> dict[str, slice]:
@@ -396,23 +375,25 @@ class Problem:
     def evaluate(self, values: gtsam.Values) -> Evaluation:
         """Evaluate motion, residuals and cost."""
         states, parameters = self.arrays(values)
-        own_cost = self.graph.error(values)
+        own_cost = self.graph.error(values) - (0.0 if self.tilt is None else self.tilt.constant)
         imu = None
         if self._imu_errors is not None:
             errors = self._imu_errors.vector(parameters)
             imu = self._imu_errors.linearized(self.graph.linearize(values), errors)
             own_cost += imu.more_cost
+        for step in self.chain.steps(states):
+            own_cost += 0.5 * float(np.vdot(step.residual, step.residual))
         for process in self.processes:
             own_cost += 0.5 * float(np.sum(process.prior_residuals(parameters[process.name]) ** 2))
         motions = []
         computed: dict[tuple[int, bytes, bool], Motion] = {}
         for bound in self._bound:
-            late = self._late(bound, parameters)
+            late = bound.late(parameters)
             moved = bool(np.abs(late).max() > self._tolerance(bound, EXTRAPOLATED))
             # Measurements at the same true times share the motion, of whatever sensor they are.
             shared = (id(bound.attachment), late.tobytes(), moved)
             if shared not in computed:
-                computed[shared] = self._motion(bound, states, parameters, late, moved=moved)
+                computed[shared] = bound.motion(states, parameters, late, moved=moved)
             motions.append(computed[shared])
         residuals, cost = self._whitened(motions, parameters)
         return Evaluation(
@@ -424,7 +405,7 @@ class Problem:
     ) -> tuple[list[Array], float]:
         """Return the whitened residuals of all observations, and their cost."""
         residuals = [
-            bound.weight * self.residual(bound.observation, motion, parameters)
+            bound.weight * bound.residual(motion, parameters, self.processes_of(bound))
             for bound, motion in zip(self._bound, motions, strict=True)
         ]
         return residuals, sum(0.5 * float(np.vdot(each, each)) for each in residuals)
@@ -443,11 +424,12 @@ class Problem:
         parameters : dict of str to ndarray
             Of an evaluation.
         """
-        out = observation.residual(motion, parameters)
-        for process in self.processes:
-            if process.label == observation.label:
-                out = process.with_error(out, parameters[process.name], observation.time)
-        return out
+        (bound,) = (b for b in self._bound if b.observation is observation)
+        return bound.residual(motion, parameters, self.processes_of(bound))
+
+    def processes_of(self, bound: BoundObservation) -> Processes:
+        """Return the processes that an observation depends on."""
+        return processes_of(bound.observation, self.processes)
 
     def reject(self, rejected: Mapping[str, Array]) -> None:
         """Use no measurements at the times (K,) that are given by label."""
@@ -520,15 +502,13 @@ class Problem:
             Factors (d,) by label, by default `noise_factors`.
         """
         factors = self.noise_factors if factors is None else factors
-        return [
-            b.observation.sigma(
-                motion,
-                evaluation.parameters,
-                factors.get(b.observation.label, 1.0)
-                * self.long_run.get(b.observation.label, 1.0),
-            )
-            for b, motion in zip(self._bound, evaluation.motions, strict=True)
-        ]
+        out = []
+        for bound, motion in zip(self._bound, evaluation.motions, strict=True):
+            label = bound.observation.label
+            own = factors.get(label, 1.0) * self.long_run.get(label, 1.0)
+            values = bound.values(evaluation.parameters, self.processes_of(bound))
+            out.append(bound.observation.sigma(motion, values, own))
+        return out
 
     def log_sigma(self, evaluation: Evaluation) -> list[Array]:
         """Return the sums of the logarithms of the standard deviations of measurements, (M,) each.
@@ -554,6 +534,8 @@ class Problem:
 
         Its measurement factors are written in place at the next call.
         """
+        if self.chain.interpolates:
+            self._follow(evaluation.parameters)
         gaussian = self.native(evaluation)
         for block in self._blocks:
             if not block.factors:
@@ -564,6 +546,16 @@ class Problem:
                 gaussian.push_back(factor)
         return gaussian
 
+    def _follow(self, parameters: dict[str, Array]) -> None:
+        """Bind measurements anew that a clock has moved beyond their nodes."""
+        for block in self._blocks:
+            for bound in block.bound:
+                late = bound.late(parameters)
+                if self.chain.left(bound.attachment, late, SAME_TIME):
+                    bound.time = bound.time + late
+                    bound.attachment = self.chain.attach(bound.time)
+                    block.parts, block.matrices, block.vectors, block.factors = [], [], [], []
+
     def _fill(self, evaluation: Evaluation) -> None:
         """Write the rows of measurements into their factors, some at a time."""
         observed = [(block, bound) for block in self._blocks for bound in block.bound]
@@ -572,7 +564,7 @@ class Problem:
         ]
         of_all = (parts for block in self._blocks for parts in block.parts)
         for some in zip_longest(*of_all):
-            transitions: dict[tuple[int, Hashable], Transition] = {}
+            transitions: dict[Hashable, Any] = {}
             for (block, bound), lin, part in zip(observed, linear, some, strict=True):
                 if part is None:
                     continue
@@ -588,6 +580,7 @@ class Problem:
         """Free the factors of measurements; the next linearisation makes others."""
         for block in self._blocks:
             block.parts, block.matrices, block.vectors, block.factors = [], [], [], []
+        self._steps = []
         if self._imu_errors is not None:
             self._imu_errors.release()
 
@@ -600,7 +593,7 @@ class Problem:
             for bound in block.bound:
                 lin = self._linearized(bound, block.parameters, evaluation)
                 o, sizes = bound.observation, tuple(self._sizes(block))
-                variables = self._keys_at(block, self._nodes_of(bound))
+                variables = self._keys_at(block, bound.nodes(self.processes_of(bound)))
                 for begin in range(0, max(len(lin.residual), 1), CHUNK):
                     some = slice(begin, begin + CHUNK)
                     matrix, vector = self._jacobian(
@@ -609,6 +602,39 @@ class Problem:
                     yield Rows(
                         o.label, o.components, variables[some], sizes, matrix, vector, begin
                     )
+
+    def observation_rows_at(
+        self, evaluation: Evaluation, parameters: Mapping[str, Array]
+    ) -> Iterator[Rows]:
+        """Yield the rows of the observations that depend on parameters, at values of these.
+
+        States, other parameters and weights are those of the evaluation. Measurements stay at
+        their nodes.
+
+        Parameters
+        ----------
+        evaluation : Evaluation
+            Where the graph is linear but for these parameters.
+        parameters : mapping of str to ndarray
+            Values of some parameters by name, rotations as matrices.
+        """
+        other, values = copy(self), {**evaluation.parameters, **parameters}
+        found: dict[BoundObservation, BoundObservation] = {}
+        motions = []
+        for bound, motion in zip(self._bound, evaluation.motions, strict=True):
+            if not parameters.keys() & bound.names:
+                continue
+            own = bound.at(values) if parameters.keys() & bound.clocks else bound
+            if own is not bound or parameters.keys() & ERRORS.keys():
+                motion = own.motion(evaluation.states, values, own.late(values))
+            found[bound] = own
+            motions.append(motion)
+        other._bound = list(found.values())
+        other._blocks = [
+            replace(block, bound=[found[each] for each in block.bound if each in found])
+            for block in self._blocks
+        ]
+        yield from other.observation_rows(replace(evaluation, parameters=values, motions=motions))
 
     def nonlinear_graph(self) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
         """Return the whole problem for GTSAM's own optimisers, and values to start from.
@@ -636,15 +662,50 @@ class Problem:
             raise ValueError("the measurements have no weights yet: call `weigh` first")
         return native_graph(self), gtsam.Values(self._weighed_at)
 
-    def native(self, evaluation: Evaluation) -> gtsam.GaussianFactorGraph:
-        """Return all factors but those of measurements, linear at an evaluation."""
+    def native(self, evaluation: Evaluation, *, steps: bool = True) -> gtsam.GaussianFactorGraph:
+        """Return all factors but those of measurements, linear at an evaluation.
+
+        Without `steps`, those of `chain_rows` are left out.
+        """
         if self._imu_errors is None or evaluation.imu is None:
             out = self.graph.linearize(evaluation.values)
         else:
             out = self._imu_errors.filled(evaluation.imu)
+        if steps:
+            self._add_steps(out, evaluation)
         for process in self.processes:
             process.add_prior(out, evaluation.parameters[process.name])
         return out
+
+    def _add_steps(self, gaussian: gtsam.GaussianFactorGraph, evaluation: Evaluation) -> None:
+        """Add the factors from node to node; these are written in place at the next call."""
+        count = 0
+        for rows in self.chain_rows(evaluation):
+            for own, by, residual in zip(
+                rows.keys.tolist(), rows.matrix, rows.vector, strict=True
+            ):
+                if count == len(self._steps):
+                    factor = jacobian_template(own, rows.sizes, len(rows.components))
+                    self._steps.append((factor, factor.getA(), factor.getb()))
+                factor, matrix, vector = self._steps[count]
+                matrix[...], vector[...] = by, -residual
+                gaussian.push_back(factor)
+                count += 1
+
+    def chain_rows(self, evaluation: Evaluation) -> Iterator[Rows]:
+        """Yield the rows from node to node that GTSAM does not linearise itself."""
+        for step in self.chain.steps(evaluation.states):
+            node = np.arange(step.first, step.first + len(step.residual))
+            variables = np.column_stack(self.chain.variables(node))
+            yield Rows(
+                step.source,
+                step.components,
+                variables,
+                tuple(self.chain.sizes),
+                step.by_nodes,
+                step.residual,
+                step.first,
+            )
 
     def ordering(self, *, branches: bool = True) -> gtsam.Ordering:
         """Return an elimination order in which biases and calibration come last.
@@ -652,11 +713,9 @@ class Problem:
         In branches for a step by Cholesky's factorisation of the whole; else in time, for QR part
         by part, which then leaves less to keep.
         """
-        last = [self._key[p.name] for p in self.parameters]
-        if not self.chain.walking:
-            last.insert(0, keys.bias(0))
-        time = self.chain.segments.node_time
-        first = in_time_order(time, self.processes, walking=self.chain.walking)
+        last = [*self.chain.constants, *(self._key[p.name] for p in self.parameters)]
+        time = self.chain.node_time
+        first = in_time_order(self.chain, self.processes)
         if branches:
             joints = set(self.chain.keys_of(self.chain.joints))
             for p in self.processes:
@@ -671,93 +730,53 @@ class Problem:
     def _parameter(self, values: gtsam.Values, p: Parameter) -> Array:
         return value_at(values, self._key[p.name], p)
 
-    def _states(self, values: gtsam.Values) -> States:
-        n = self.chain.segments.node_time.size
-        # A matrix of GTSAM's is [nRb, p, v; 0, I]: one call takes less than one for each part.
-        state = np.empty((n, 5, 5))
-        for k in range(n):
-            state[k] = values.atNavState(keys.node(k)).matrix()
-        nRb, p_n, v_n = (state[:, :3, part].copy() for part in (slice(0, 3), 3, 4))
-        m = n if self.chain.walking else 1
-        bias = np.array([values.atConstantBias(keys.bias(k)).vector() for k in range(m)])
-        bias = np.broadcast_to(bias, (n, BIAS_SIZE))
-        return States(nRb, p_n, v_n, gyro_bias=bias[:, 3:], accel_bias=bias[:, :3])
-
     def _bind(
         self,
         observation: Observation,
         usable: BoolArray | None,
         attached: Sequence[tuple[Array, Attachment]],
-    ) -> _Bound:
+    ) -> BoundObservation:
         """Tie an observation to the chain, as others at the same times are."""
-        time = true_time(observation, self.bound_at, self.clock_zero)
-        covered = self.chain.segments.increments.locate(time)[2]
+        time = time_on_chain(observation, self.bound_at, self.clock_zero, self.chain.clock)
+        covered = self.chain.covers(time)
         if usable is not None:
             covered = covered & usable
         if not covered.all():
             self.uncovered[observation.label] = int((~covered).sum())
         weight = np.repeat(covered.astype(float)[:, None], len(observation.components), axis=1)
-        labels = [process.label for process in self.processes]
-        own = labels.index(observation.label) if observation.label in labels else None
-        for when, at in (*((b.time, b.attachment) for b in self._bound), *attached):
-            if np.array_equal(when, time):
-                return _Bound(observation, at, time, covered, weight, own)
-        at, _ = attach_inside(self.chain.segments, time, self.chain.frame.earth_rate)
+        before = ((b.time, b.attachment) for b in self._bound)
         # Times that are not covered weigh nothing; they only need a place on the chain.
-        return _Bound(observation, at, time, covered, weight, own)
+        at = next((at for when, at in (*before, *attached) if np.array_equal(when, time)), None)
+        return BoundObservation(
+            observation,
+            self.chain,
+            self.chain.attach(time) if at is None else at,
+            time,
+            covered,
+            weight,
+            self.clock_zero,
+        )
 
     def needs_rebinding(self, parameters: dict[str, Array]) -> bool:
-        """Whether a clock has moved measurements too far from where they were bound."""
-        return any(
-            np.abs(self._late(b, parameters)).max() > self._tolerance(b, _SAME_TIME)
+        """Whether a clock has moved measurements too far from where they were bound.
+
+        Where the motion is known between nodes for all times alike, they are followed.
+        """
+        return not self.chain.interpolates and any(
+            self.chain.left(b.attachment, b.late(parameters), self._tolerance(b, SAME_TIME))
             for b in self._bound
         )
 
-    def _tolerance(self, bound: _Bound, least: float) -> float:
+    def _tolerance(self, bound: BoundObservation, least: float) -> float:
         clock = bound.observation.clock
         return (
             least if clock is None else max(self.clock_tolerance.get(clock.names[0], 0.0), least)
         )
 
-    def _motion(
-        self,
-        bound: _Bound,
-        states: States,
-        parameters: dict[str, Array],
-        late: Array,
-        *,
-        moved: bool,
-    ) -> Motion:
-        """Return the motion at the true times of measurements, `late` (M,) s after they are bound.
-
-        Where a clock moves on the way to the minimum, a motion extrapolated from where the
-        measurements were bound would give the cost of another one: those that `moved` are not.
-        """
-        rate = self.chain.frame.earth_rate
-        at, rest = bound.attachment, late
-        if moved:
-            at, _ = attach_inside(self.chain.segments, bound.time + late, rate)
-            rest = np.zeros_like(late)
-        at = self._corrected(bound, at, parameters)
-        return extrapolated(motion_at(at, states, self.chain.gravity_n, rate), rest)
-
-    def _corrected(
-        self, bound: _Bound, at: Attachment, parameters: dict[str, Array]
-    ) -> Attachment:
-        """Return an attachment without the errors of the IMU."""
-        if self._imu_errors is None:
-            return at
-        errors = self._imu_errors.vector(parameters)
-        return self._imu_errors.corrected(at, bound.attachment, errors)
-
-    def _late(self, bound: _Bound, parameters: dict[str, Array]) -> Array:
-        """Return by how much clocks have moved measurements since they were bound, (M,), s."""
-        return true_time(bound.observation, parameters, self.clock_zero) - bound.time
-
     def _lay_out(self, block: _Block) -> None:
         """Make a block's factors for the nodes that its measurements depend on."""
         found = factor_layout(
-            [self._nodes_of(b) for b in block.bound],
+            [b.nodes(self.processes_of(b)) for b in block.bound],
             [len(b.observation.components) for b in block.bound],
         )
         block.parts = found.parts
@@ -770,86 +789,43 @@ class Problem:
             block.matrices.append(factor.getA())
             block.vectors.append(factor.getb())
 
-    def _nodes_of(self, bound: _Bound) -> IntArray:
-        """Return the nodes of each measurement: of the chain, and of its correlated error."""
-        node = bound.attachment.node[:, None]
-        if bound.correlated is None:
-            return node
-        before, _ = self.processes[bound.correlated].place(bound.observation.time)
-        return np.column_stack([node, before])
-
     def _keys_at(self, block: _Block, nodes: IntArray) -> IntArray:
-        """Return the variables of a block's measurements at nodes as `_nodes_of` has them."""
-        node = nodes[:, 0]
-        out = [keys.nodes(node), keys.bias(0) + self.chain.walking * node]
-        if block.correlated is not None:
-            first = self.processes[block.correlated].key(0)
-            out += [first + nodes[:, 1], first + nodes[:, 1] + 1]
-        out += [np.full(node.size, self._key[p.name]) for p in block.parameters]
-        return np.column_stack(out)
+        """Return the variables of a block's measurements at nodes as they have them."""
+        first = block.bound[0]
+        shared = [self._key[p.name] for p in block.parameters]
+        return first.keys_at(nodes, self.processes_of(first), shared)
 
     def _sizes(self, block: _Block) -> list[int]:
         """Return the dimensions of these variables."""
-        out = [STATE_SIZE, BIAS_SIZE]
-        if block.correlated is not None:
-            out += [self.processes[block.correlated].size] * 2
-        return out + [p.mean.size for p in block.parameters]
+        first = block.bound[0]
+        return first.sizes(self.processes_of(first), block.parameters)
 
     def _linearized(
-        self, bound: _Bound, parameters: Sequence[Parameter], evaluation: Evaluation
+        self, bound: BoundObservation, parameters: Sequence[Parameter], evaluation: Evaluation
     ) -> Linearization:
         """Return an observation linearised at an evaluation."""
         motion = evaluation.motions[self._bound.index(bound)]
         wanted = [p.name for p in parameters]
-        return linearized(
-            bound.observation, motion, evaluation.parameters, wanted, self.clock_zero
-        )
+        return bound.linearized(motion, evaluation.parameters, wanted, self.processes_of(bound))
 
     def _jacobian(
         self,
-        bound: _Bound,
+        bound: BoundObservation,
         parameters: Sequence[Parameter],
         lin: Linearization,
         some: slice | IntArray,
         evaluation: Evaluation,
-        transitions: dict[tuple[int, Hashable], Transition],
+        transitions: dict[Hashable, Any],
     ) -> tuple[Array, Array]:
-        """Return the whitened Jacobian (M, d, n) and residual (M, d) of some measurements.
-
-        Columns: state, bias, correlated error, parameters. `transitions` to times of a motion, by
-        its identity and which they are, are kept for other observations there.
-        """
-        lin = some_of(lin, some)
-        motion = evaluation.motions[self._bound.index(bound)]
-        attachment = rows_of(bound.attachment, some)
-        errors = self._imu_errors
-        by = None if errors is None else rows_of(errors.sensitivity(bound.attachment), some)
-        here = (
-            id(motion),
-            some.tobytes() if isinstance(some, np.ndarray) else (some.start, some.stop),
+        """Return the whitened Jacobian (M, d, n) and residual (M, d) of some measurements."""
+        here = bound.at(evaluation.parameters) if self.chain.interpolates else bound
+        return here.jacobian(
+            lin,
+            some,
+            evaluation.motions[self._bound.index(bound)],
+            evaluation.states,
+            evaluation.parameters,
+            [p.name for p in parameters],
+            self.processes_of(bound),
+            transitions,
         )
-        if here not in transitions:
-            at = attachment
-            if errors is not None and by is not None:
-                at = errors.without(at, by, errors.vector(evaluation.parameters))
-            transitions[here] = Transition(
-                at, evaluation.states, rows_of(motion, some), self.chain.frame.earth_rate
-            )
-        transition = transitions[here]
-        found = dict(lin.d_parameters)
-        if errors is not None and by is not None:
-            found |= errors.columns(lin, transition, by)
-        state, others = node_jacobian(lin, transition), [found[p.name] for p in parameters]
-        by_nodes: list[Array] = []
-        residual = lin.residual
-        if bound.correlated is not None:
-            process, time = self.processes[bound.correlated], bound.observation.time[some]
-            nodes = evaluation.parameters[process.name]
-            gain = process.gain(nodes, time)[..., None]
-            by_nodes = process.jacobians(residual, time)
-            state, others = gain * state, [gain * each for each in others]
-            residual = process.with_error(residual, nodes, time)
-        full = np.concatenate([state, *by_nodes, *others], axis=2)
-        weight = bound.weight[some]
-        full *= weight[:, :, None]
-        return full, weight * residual

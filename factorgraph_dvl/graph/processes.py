@@ -16,6 +16,7 @@ import numpy as np
 
 from factorgraph_dvl.geometry.vectors import Array, IntArray
 from factorgraph_dvl.graph import keys
+from factorgraph_dvl.graph.chain import Chain
 from factorgraph_dvl.sensors.protocol import ScaleWalk
 
 # Most of a correlation time between two nodes. Chosen: interpolation then leaves out 6 % of the
@@ -26,18 +27,20 @@ _GAP = 5.0
 # Correlation time of a scale that walks, in lengths of the record. Chosen: over one length its
 # changes then have 85 % of the variance of a walk.
 _LENGTHS = 3.0
+# Place of a process in the order of elimination, after the variables of a node of the same time.
+_LAST = 2
 
 
 @dataclass(frozen=True, eq=False)
 class Process:
-    """A correlated error that adds to the components of an observation.
+    """A correlated error that adds to the components of an observation, or to a parameter.
 
         c_{j+1} = phi c_j + noise of variance 1 - phi²,    phi = exp(-dt / tau)
 
     Parameters
     ----------
     label : str
-        Label of the observation.
+        Label of the observation; what it is, where it adds to a parameter.
     index : int
         Of the process among those of the problem.
     sigma : ndarray, shape (n,), SI
@@ -50,6 +53,10 @@ class Process:
         Whether only the density 2 sigma² / tau can be estimated, and sigma is as stated.
     walk : ScaleWalk, optional
         Of the scale, which is the last component of the nodes.
+    parameter : str, optional
+        Name of the parameter that it adds to, for all observations that depend on it.
+    free : bool, default False
+        Whether its deviation and time are to be estimated although it is of no observation.
     """
 
     label: str
@@ -59,6 +66,8 @@ class Process:
     time: Array
     density_only: bool = False
     walk: ScaleWalk | None = None
+    parameter: str | None = None
+    free: bool = False
 
     @cached_property
     def _of_nodes(self) -> tuple[Array, Array]:
@@ -98,7 +107,7 @@ class Process:
         before, _ = self.place(time)
         return {self.key(j) for j in np.union1d(before, before + 1).tolist()}
 
-    def _error(self, nodes: Array, time: Array) -> Array:
+    def error(self, nodes: Array, time: Array) -> Array:
         """Return the error of each component of a node at times (M,), (M, size)."""
         j, after = self.place(time)
         between = (1.0 - after)[:, None] * nodes[j] + after[:, None] * nodes[j + 1]
@@ -106,7 +115,7 @@ class Process:
 
     def with_error(self, residual: Array, nodes: Array, time: Array) -> Array:
         """Return residuals (M, n) at times (M,) with the error by the nodes (J, size) added."""
-        error = self._error(nodes, time)
+        error = self.error(nodes, time)
         n = self.sigma.size
         out = residual + error[:, :n]
         if self.walk is not None:
@@ -117,7 +126,7 @@ class Process:
         """Return the derivatives of `with_error` with respect to residuals, (M, 1)."""
         if self.walk is None:
             return np.ones((time.size, 1))
-        return 1.0 + self._error(nodes, time)[:, self.sigma.size :]
+        return 1.0 + self.error(nodes, time)[:, self.sigma.size :]
 
     def jacobians(self, residual: Array, time: Array) -> list[Array]:
         """Return the derivatives of `with_error` with respect to nodes before and after."""
@@ -128,6 +137,20 @@ class Process:
         if self.walk is not None:
             columns[:, :, n] = sigma[n] * self._predicted(residual, time)
         return [share[:, None, None] * columns for share in (1.0 - after, after)]
+
+    def through(self, jacobian: Array, time: Array) -> list[Array]:
+        """Return the derivatives by nodes before and after of what depends on its parameter.
+
+        Parameters
+        ----------
+        jacobian : ndarray, shape (M, d, n)
+            Derivatives by the parameter.
+        time : ndarray, shape (M,), s
+            Of the measurements.
+        """
+        _, after = self.place(time)
+        by_node = jacobian * self._of_nodes[0]
+        return [share[:, None, None] * by_node for share in (1.0 - after, after)]
 
     def _predicted(self, residual: Array, time: Array) -> Array:
         # What was measured has noise, which a scale of its own would make smaller.
@@ -148,6 +171,11 @@ class Process:
     def _weight(self) -> Array:
         """Inverse standard deviations of the innovations, (J - 1, size)."""
         return 1.0 / np.sqrt(-np.expm1(-2.0 * np.diff(self.time)[:, None] / self._of_nodes[1]))
+
+    @property
+    def log_determinant(self) -> float:
+        """Logarithm of the determinant of the prior covariance of all nodes."""
+        return -2.0 * float(np.log(self._weight).sum())
 
     def prior_residuals(self, nodes: Array) -> Array:
         """Return whitened residuals (J, size): the first node, then the transitions."""
@@ -216,18 +244,16 @@ def node_times(time: Array, tau: float, sigma: Array, white: Array) -> Array:
     )
 
 
-def in_time_order(node_time: Array, processes: Sequence[Process], *, walking: bool) -> list[int]:
-    """Return the keys of states, biases and processes in the order of elimination.
+def in_time_order(chain: Chain, processes: Sequence[Process]) -> list[int]:
+    """Return the keys of nodes and processes in the order of elimination.
 
     In time: a node of a process goes when the last state that depends on it has gone. COLAMD's
     order takes four times as long once there are processes.
     """
     items: list[tuple[float, int, int]] = []
-    for k, t in enumerate(node_time.tolist()):
-        items.append((t, 0, keys.node(k)))
-        if walking:
-            items.append((t, 1, keys.bias(k)))
+    for k, t in enumerate(chain.node_time.tolist()):
+        items += [(t, i, key) for i, key in enumerate(chain.keys_of([k]))]
     for p in processes:
         last = p.time.size - 1
-        items += [(float(p.time[min(j + 1, last)]), 2, p.key(j)) for j in range(last + 1)]
+        items += [(float(p.time[min(j + 1, last)]), _LAST, p.key(j)) for j in range(last + 1)]
     return [key for _, _, key in sorted(items)]

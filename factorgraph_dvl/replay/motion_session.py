@@ -14,6 +14,7 @@ from factorgraph_dvl.geometry.records import concatenated
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph.motion_chain import MotionChain, chain_nodes
 from factorgraph_dvl.graph.motion_problem import TRACK_STD
+from factorgraph_dvl.graph.trajectory import TRAJECTORY_RATE
 from factorgraph_dvl.imu.attitude_record import AttitudeRecord
 from factorgraph_dvl.replay.calibration import CalibrationEstimate
 from factorgraph_dvl.replay.motion_window import (
@@ -42,7 +43,6 @@ from factorgraph_dvl.solvers.motion_summary import (
     trajectory_epochs,
     trajectory_of,
 )
-from factorgraph_dvl.solvers.trajectory import TRAJECTORY_RATE
 from factorgraph_dvl.trial import Trial
 
 # Time, s, by which states are behind the records: whether the vessel turns shows in the seconds

@@ -13,14 +13,27 @@ from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.rotations import BodyAxes, rph_from_rotation, rph_jacobian
 from factorgraph_dvl.geometry.vectors import Array, IntArray, rotate
 from factorgraph_dvl.graph import keys
-from factorgraph_dvl.graph.inertial_chain import LEAST_WALK, loose_diagonal
+from factorgraph_dvl.graph.inertial_chain import LEAST_WALK
 from factorgraph_dvl.graph.keys import BIAS_SIZE, STATE_SIZE
-from factorgraph_dvl.graph.priors import ConstantsPrior, local_coordinates, value_at
+from factorgraph_dvl.graph.priors import (
+    ConstantsPrior,
+    local_coordinates,
+    loose_diagonal,
+    value_at,
+)
 from factorgraph_dvl.graph.sensor_factor import (
     Linearized,
     NodeMeasurements,
     measurement_factor,
     state_of,
+)
+from factorgraph_dvl.graph.trajectory import (
+    TRAJECTORY_RATE,
+    Epochs,
+    attached_epochs,
+    epochs_between,
+    successive,
+    trajectory_at,
 )
 from factorgraph_dvl.imu.preintegration import Segments, gtsam_measurements
 from factorgraph_dvl.replay.calibration import CalibrationEstimate, CalibrationReport
@@ -36,14 +49,6 @@ from factorgraph_dvl.sensors.imu import Imu
 from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.sensors.protocol import Aid
 from factorgraph_dvl.solution import Trajectory
-from factorgraph_dvl.solvers.trajectory import (
-    TRAJECTORY_RATE,
-    Epochs,
-    attached_epochs,
-    epochs_between,
-    successive,
-    trajectory_at,
-)
 
 
 @dataclass(frozen=True)

@@ -13,9 +13,10 @@ from factorgraph_dvl.geometry.rotations import BodyAxes
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph import keys
+from factorgraph_dvl.graph.inertial_chain import InertialChain
 from factorgraph_dvl.graph.priors import ConstantsPrior, prior_mean
 from factorgraph_dvl.graph.problem import Evaluation, Problem
-from factorgraph_dvl.imu.propagation import States
+from factorgraph_dvl.graph.trajectory import TRAJECTORY_RATE
 from factorgraph_dvl.replay.correlated_errors import CorrelatedErrors
 from factorgraph_dvl.sensors.finding import Finding
 from factorgraph_dvl.sensors.message import Message, message
@@ -26,7 +27,6 @@ from factorgraph_dvl.solvers.batch import settled_minimum
 from factorgraph_dvl.solvers.correlated_noise import noise_of
 from factorgraph_dvl.solvers.posterior import posterior
 from factorgraph_dvl.solvers.state_times import needs_states
-from factorgraph_dvl.solvers.trajectory import EPOCH_ROUNDING, TRAJECTORY_RATE, trajectory_between
 from factorgraph_dvl.statistics.spurious_information import spurious_information
 from factorgraph_dvl.trial import Trial
 
@@ -182,10 +182,11 @@ def solve_start(
     # The whole error, also what all states share: the smoother linearises later states without it.
     spurious = spurious_information(problem, evaluation, covariances.nodes).sum(axis=0)
     chain = problem.chain
-    last = chain.segments.node_time.size - 1
-    values = _last_values(problem, evaluation.values, last)
+    assert isinstance(chain, InertialChain)
+    last = chain.node_time.size - 1
+    values = _last_values(problem, evaluation.values, chain.bias_key(last), last)
     gaussian = problem.linearize(evaluation)
-    time = float(chain.segments.node_time[-1])
+    time = float(chain.node_time[-1])
     errors = CorrelatedErrors.of(problem.processes)
     if errors.size:
         found = errors.add_start(gaussian, problem.processes, evaluation.parameters, last, time)
@@ -212,22 +213,11 @@ def solve_start(
         noise=noise_of(problem),
         errors=errors,
         clock_zero=clock_zero,
-        trajectory=_trajectory(
-            problem, evaluation.states, covariances.nodes, trial.body_axes, since
+        trajectory=chain.trajectory(
+            evaluation.states, covariances.nodes, trial.body_axes, TRAJECTORY_RATE, since
         ),
         findings=settled.findings,
         misfit=_misfit(problem, evaluation),
-    )
-
-
-def _trajectory(
-    problem: Problem, states: States, P: Array, body_axes: BodyAxes, since: float
-) -> Trajectory:
-    chain = problem.chain
-    time = chain.segments.increments.ticks(TRAJECTORY_RATE)
-    time = time[time * TRAJECTORY_RATE > since * TRAJECTORY_RATE + EPOCH_ROUNDING]
-    return trajectory_between(
-        chain.segments, states, P, chain.gravity_n, chain.frame, body_axes, time
     )
 
 
@@ -264,11 +254,10 @@ def _misfit(problem: Problem, evaluation: Evaluation) -> float:
     return out
 
 
-def _last_values(problem: Problem, values: gtsam.Values, last: int) -> gtsam.Values:
+def _last_values(problem: Problem, values: gtsam.Values, bias: int, last: int) -> gtsam.Values:
     """Return the values of the last state, its bias and the parameters."""
     out = gtsam.Values()
     out.insert(keys.node(last), values.atNavState(keys.node(last)))
-    bias = problem.chain.bias_key(last)
     out.insert(bias, values.atConstantBias(bias))
     for p in problem.parameters:
         key = problem.key(p.name)

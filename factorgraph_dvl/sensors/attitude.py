@@ -23,10 +23,11 @@ from factorgraph_dvl.sensors.clock import Clock, ClockSection
 from factorgraph_dvl.sensors.message import Message, message
 from factorgraph_dvl.sensors.parameters import SCALAR, Parameter, ParameterSpec
 from factorgraph_dvl.sensors.protocol import (
+    ExpectedCorrelation,
     Linearization,
     Motion,
     Observation,
-    PlainObservation,
+    ObservationByRows,
     SensorSection,
     Values,
 )
@@ -36,6 +37,7 @@ from factorgraph_dvl.sensors.records import (
     check_times,
     named_columns,
     stack,
+    white_noise,
 )
 from factorgraph_dvl.settings.sections import NonNegative, Positive, Sigma3
 
@@ -43,6 +45,8 @@ TILT_COLUMNS = ("roll_deg", "pitch_deg")
 COLUMNS = (*TILT_COLUMNS, "heading_deg")
 # Period of Schuler's pendulum, s: 2 pi sqrt(R / g), R the radius and g the gravity of the Earth.
 SCHULER_PERIOD = 84.4 * 60.0
+# Fewest samples whose white noise is measured. Chosen: it is then known to a third.
+_FEWEST = 12
 # Times the correlation time after which an error counts as another one beside an IMU: the mean of
 # a Gauss-Markov process over a long time T has the variance 2 sigma² tau / T.
 _APART = 2.0
@@ -204,6 +208,20 @@ class Attitude:
         angles = AttitudeAngles(self.time[rows], np.nan_to_num(rph), std, frame, body_axes, _CLOCK)
         return (angles,)
 
+    def dense_observations(
+        self, frame: LocalFrame, body_axes: BodyAxes
+    ) -> tuple[Observation, ...]:
+        """Return all attitudes: their lasting error is a process beside the noise of each."""
+        tilt = self.measures_tilt
+        rows = np.flatnonzero(~np.isnan(self.rph[:, 2]))
+        rph = self.rph[rows].copy()
+        if not tilt:
+            rph[:, :2] = 0.0
+        own = dense_angles(
+            self.time[rows], rph, self.error, frame, body_axes, _CLOCK, self.label, measured=tilt
+        )
+        return (own,)
+
     def explain(self, parameter: str, component: int, motion: Motion | None) -> Message:
         """Say why an error of the attitude or its clock could not be observed."""
         if parameter in _CLOCK.names:
@@ -267,8 +285,44 @@ def heading_error(
     return total, by
 
 
+def dense_angles(
+    time: Array,
+    rph: Array,
+    error: AttitudeError,
+    frame: LocalFrame,
+    body_axes: BodyAxes,
+    clock: Clock,
+    label: str,
+    parameters: tuple[str, ...] | None = None,
+    *,
+    measured: bool = True,
+) -> AttitudeAngles:
+    """Return attitudes (M, 3) whose errors persist, with the noise that is new in each.
+
+    That is at least the noise of the record; roll and pitch are new in each if not `measured`.
+    """
+    known = np.asarray(~np.isnan(rph).any(axis=1))
+    white = error.white
+    if known.sum() >= _FEWEST:
+        own = white_noise(np.unwrap(rph[known], axis=0))
+        white = np.maximum(white, own if measured else own * [0.0, 0.0, 1.0])
+    std = np.where(np.isnan(rph), np.inf, np.maximum(white, LEAST_STD))
+    return AttitudeAngles(
+        time,
+        np.nan_to_num(rph),
+        std,
+        frame,
+        body_axes,
+        clock,
+        label=label,
+        parameters=AttitudeAngles.parameters if parameters is None else parameters,
+        noise_groups=((0,), (1,), (2,)) if measured else ((2,),),
+        correlated=ExpectedCorrelation(error.tau, error.sigma) if error.sigma.any() else None,
+    )
+
+
 @dataclass(frozen=True)
-class AttitudeAngles(PlainObservation):
+class AttitudeAngles(ObservationByRows):
     """Roll, pitch and heading; zero error where measured = angles of nRb + heading error.
 
     Parameters
@@ -299,10 +353,12 @@ class AttitudeAngles(PlainObservation):
     unit: str = "rad"
     components: tuple[str, ...] = ("roll", "pitch", "heading")
     parameters: tuple[str, ...] = (HEADING_OFFSET, SCHULER, DEVIATION)
+    noise_groups: tuple[tuple[int, ...], ...] = ()
+    correlated: ExpectedCorrelation | None = None
 
     def sigma(self, motion: Motion, values: Values, factor: Array | float = 1.0) -> Array:
         """Return the standard deviations, (M, 3), rad."""
-        return self.std * factor
+        return self.std * np.where(np.isinf(self.std), 1.0, factor)
 
     def residual(self, motion: Motion, values: Values) -> Array:
         """Return predicted - measured, (M, 3), rad."""

@@ -407,7 +407,8 @@ def _from_joint(p: Parameter, joint: JointPrior) -> Parameter:
 
 def _velocity_at_dvl(motion: Motion, values: Values) -> tuple[Array, Array]:
     """Return the velocities of DVL and IMU, relative to bottom or water, in body, (M, 3)."""
-    current_n = np.zeros(3)
-    current_n[:2] = values[CURRENT]
+    # One for all, or one for each.
+    current_n = np.zeros((*values[CURRENT].shape[:-1], 3))
+    current_n[..., :2] = values[CURRENT]
     imu_b = rotate(motion.nRb.transpose(0, 2, 1), motion.v_n - current_n)
     return imu_b + cross(motion.omega_eb_b, values[LEVER_ARM]), imu_b

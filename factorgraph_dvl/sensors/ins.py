@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar, Self
 
 import numpy as np
@@ -19,6 +19,7 @@ from factorgraph_dvl.sensors.attitude import (
     AttitudeError,
     Share,
     check_angles,
+    dense_angles,
     spaced,
 )
 from factorgraph_dvl.sensors.carried_point import PointPosition, PointVelocity
@@ -26,6 +27,7 @@ from factorgraph_dvl.sensors.clock import Clock, ClockSection
 from factorgraph_dvl.sensors.message import Message, message
 from factorgraph_dvl.sensors.parameters import Parameter, ParameterSpec
 from factorgraph_dvl.sensors.protocol import (
+    ExpectedCorrelation,
     Motion,
     Observation,
     SensorSection,
@@ -215,6 +217,35 @@ class Ins:
             ),
         )
         return tuple(o for o in kept if o.time.size)
+
+    def dense_observations(
+        self, frame: LocalFrame, body_axes: BodyAxes
+    ) -> tuple[Observation, ...]:
+        """Return all of its record: lasting errors are processes beside the noise of each."""
+        s = self.settings
+        lasting = np.sqrt(s.correlated_share) * np.median(self.total_std, axis=0)
+        position, velocity = (
+            replace(
+                o,
+                noise_groups=((0, 1), (2,)),
+                correlated=ExpectedCorrelation(s.correlation_time_s, own) if own.any() else None,
+            )
+            for o, own in zip(
+                self.motion_observations(frame), (lasting[:3], lasting[3:6]), strict=True
+            )
+        )
+        rows = np.flatnonzero(~np.isnan(self.rph[:, 0]))
+        angles = dense_angles(
+            self.time[rows],
+            self.rph[rows],
+            self.error,
+            frame,
+            body_axes,
+            _CLOCK,
+            "INS attitude",
+            parameters=(),
+        )
+        return position, velocity, angles
 
     def motion_observations(
         self, frame: LocalFrame, apart: float = 0.0

@@ -11,6 +11,7 @@ import numpy as np
 
 from factorgraph_dvl.errors import ConfigError
 from factorgraph_dvl.graph.priors import ConstantsPrior
+from factorgraph_dvl.graph.trajectory import TRAJECTORY_RATE
 from factorgraph_dvl.imu.propagation import States
 from factorgraph_dvl.quality.refusal import accepted_errors, explained
 from factorgraph_dvl.quality.survey import survey
@@ -34,7 +35,6 @@ from factorgraph_dvl.solvers.preparation import Preparation, prepare
 from factorgraph_dvl.solvers.rounds import SettledMinimum, settle
 from factorgraph_dvl.solvers.state_times import STATE_INTERVAL
 from factorgraph_dvl.solvers.summary import summarise
-from factorgraph_dvl.solvers.trajectory import TRAJECTORY_RATE
 from factorgraph_dvl.trial import Trial
 
 if TYPE_CHECKING:
@@ -236,7 +236,7 @@ def _with_covariances(
     """Return a minimum with its covariances, and with undetermined directions fixed."""
     problem, before = settled.problem, settled.minimum
     # All measurements are bound, and a trajectory has no rates.
-    problem.chain.segments.increments.release()
+    problem.chain.release()
 
     def minimise_again(values: gtsam.Values) -> Minimum:
         stage = "all sensors, without undetermined directions"

@@ -10,6 +10,7 @@ from msgspec import structs
 from scipy.special import chdtrc
 
 from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.graph.inertial_chain import IMU_NOISE, WALK
 from factorgraph_dvl.graph.problem import Evaluation, Problem, Rows
 from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.sensors.imu import BIASES, ImuSettings
@@ -18,7 +19,7 @@ from factorgraph_dvl.solution import Progress
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, factorized, minimise
 from factorgraph_dvl.solvers.preparation import Preparation
 from factorgraph_dvl.statistics.leverage import leverage
-from factorgraph_dvl.statistics.rows import IMU_NOISE, WALK, native_rows
+from factorgraph_dvl.statistics.rows import native_rows
 from factorgraph_dvl.statistics.square_root_information import SquareRootInformation
 
 # Keys of the walks, and what walks.
@@ -122,8 +123,9 @@ def _with_walks(
     walks = {name: _START[name] for name in names}
     for _ in range(_ESTIMATES):
         walking = _stating(prepared, walks)
+        chain = walking.chain(evaluation.states)
         test = Problem(
-            walking.chain(evaluation.states),
+            chain,
             problem.observations,
             problem.all_parameters,
             start=evaluation.parameters,
@@ -149,7 +151,7 @@ def _with_walks(
     least = min(walks[name] / max(getattr(stated, name), 1e-12) for name in names)
     if not _fits(test, evaluation) or _is_not_noise(squares, freedom) or least < _AS_STATED:
         return None
-    steps = np.log(test.chain.bias_steps).sum()
+    steps = np.log(chain.bias_steps).sum()
     against = (
         _PER_WALK * len(names)
         + evaluation.cost

@@ -7,9 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from factorgraph_dvl.geometry.vectors import Array
-from factorgraph_dvl.graph import keys
 from factorgraph_dvl.graph.problem import Evaluation, Problem
-from factorgraph_dvl.imu.preintegration import Segments
 from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.solution import Estimate
 from factorgraph_dvl.solvers.fixed_directions import SolvedProblem
@@ -25,19 +23,9 @@ def reported(
     variables of the graph, by key; None for one that is fixed. What walks is reported as its mean
     over the trial.
     """
-    chain = problem.chain
-    weight = _mean_weights(chain.segments)
-    gyro, accel = chain.biases
-    states = evaluation.states
-    rows: list[tuple[Parameter, Array, dict[int, Array] | None]] = []
-    for parameter, bias, first in ((gyro, states.gyro_bias, 3), (accel, states.accel_bias, 0)):
-        select = np.eye(6)[first : first + 3] / parameter.si
-        functional = (
-            {keys.bias(k): w * select for k, w in enumerate(weight)}
-            if chain.walking
-            else {keys.bias(0): select}
-        )
-        rows.append((parameter, weight @ bias / parameter.si, functional))
+    rows: list[tuple[Parameter, Array, dict[int, Array] | None]] = [
+        *problem.chain.mean_constants(evaluation.states)
+    ]
     for p in problem.all_parameters:
         row = in_unit(p, evaluation.parameters[p.name])
         own = {problem.key(p.name): row.derivative} if p.estimated else None
@@ -124,11 +112,3 @@ def prior_along(
                 part += matrix @ by_key[key]
         parts.append(part)
     return np.concatenate(parts)
-
-
-def _mean_weights(seg: Segments) -> Array:
-    """Return weights of the nodes in the mean over the time that the IMU recorded."""
-    weight = np.zeros(seg.node_time.size)
-    weight[seg.origin] += seg.duration
-    weight[seg.origin + 1] += seg.duration
-    return np.asarray(weight / weight.sum())

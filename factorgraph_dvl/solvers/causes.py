@@ -8,13 +8,14 @@ import numpy as np
 
 from factorgraph_dvl.geometry.units import HOUR
 from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.graph.priors import PRIOR
 from factorgraph_dvl.graph.problem import Problem, Rows
 from factorgraph_dvl.sensors.parameters import UNITS, Parameter
 from factorgraph_dvl.solution import Cause
 from factorgraph_dvl.solvers.calibration import reported, spread_of_fixed
 from factorgraph_dvl.solvers.fixed_directions import SolvedProblem
 from factorgraph_dvl.statistics.error_budget import error_budget
-from factorgraph_dvl.statistics.rows import CORRELATED, IMU_NOISE, PRIOR, WALK, rows_by_source
+from factorgraph_dvl.statistics.rows import CORRELATED, rows_by_source
 
 
 def causes(
@@ -61,11 +62,7 @@ def causes(
 def _assumed(found: SolvedProblem, parameters: list[Parameter]) -> dict[str, str]:
     """Return what is assumed of each source, as text."""
     problem: Problem = found.problem
-    imu = problem.chain.imu
-    out = {
-        IMU_NOISE: f"{imu.gyro_noise_deg_sqrt_h:.3g} deg/√h, "
-        f"{imu.accel_noise_ug_sqrt_hz:.3g} µg/√Hz"
-    }
+    out = problem.chain.assumed()
     for o, weight in zip(problem.observations, problem.weights, strict=True):
         sigma = 1.0 / np.where(weight > 0.0, weight, np.nan)
         if (weight > 0.0).any():
@@ -80,13 +77,10 @@ def _assumed(found: SolvedProblem, parameters: list[Parameter]) -> dict[str, str
         if process.walk is not None:
             assumed.append(f"scale {process.walk.rate * np.sqrt(HOUR):.2g} /√h")
         out[CORRELATED.format(process.label)] = ", ".join(assumed)
-    priors = [*problem.chain.biases, *(p for p in parameters if p.name in problem.columns)]
-    for p in priors:
+    of_chain = [p for p, _, _ in problem.chain.mean_constants(found.minimum.evaluation.states)]
+    for p in [*of_chain, *(p for p in parameters if p.name in problem.columns)]:
         unit = UNITS[p.spec.unit].text
         out[PRIOR.format(p.name)] = numbers_with_unit(p.sigma / p.si, unit)
-    gyro, accel = problem.chain.biases
-    out[WALK.format(gyro.name)] = f"{imu.gyro_bias_walk_deg_h_sqrt_h:.3g} deg/h/√h"
-    out[WALK.format(accel.name)] = f"{imu.accel_bias_walk_ug_sqrt_h:.3g} µg/√h"
     return out
 
 

@@ -63,9 +63,16 @@ def component_changes(
     every : iterable of Rows, optional
         All rows of the graph that is linearised there, if something else needs them, too.
     """
-    chain = problem.chain
+    chain, own = problem.chain, problem.chain.constants
     # Biases that walk change anyway.
-    constant = {*problem.columns, *(() if chain.walking else (p.name for p in chain.biases))}
+    constant = {
+        *problem.columns,
+        *(
+            p.name
+            for p, _, by in chain.mean_constants(evaluation.states)
+            if by.keys() <= own.keys()
+        ),
+    }
     rows = [
         (p, derivatives)
         for p, _, derivatives in reported(problem, evaluation)
@@ -75,7 +82,7 @@ def component_changes(
         return []
     functionals = [derivatives for _, derivatives in rows]
     of_component = [(name, p) for p, _ in rows for name in p.component_names]
-    time = chain.segments.node_time
+    time = chain.node_time
     tests = changes(
         rows_with_times(problem, rows_by_source(problem, evaluation) if every is None else every),
         information.covariance_with(functionals),

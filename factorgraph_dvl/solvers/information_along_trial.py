@@ -23,7 +23,6 @@ from scipy.linalg.lapack import dgeqrf, dtrtri
 
 from factorgraph_dvl.geometry.vectors import Array, IntArray
 from factorgraph_dvl.graph import keys
-from factorgraph_dvl.graph.keys import BIAS_SIZE
 from factorgraph_dvl.graph.problem import FIXED_DIRECTION_STD, Evaluation, Problem
 from factorgraph_dvl.solution import Progress, Solution
 from factorgraph_dvl.solvers.batch import solve_with_problem
@@ -98,7 +97,7 @@ def information_history(found: SolvedProblem, *, entries: int | None = None) -> 
         first and the last. By default every node has one.
     """
     problem, evaluation = found.problem, found.minimum.evaluation
-    count = problem.chain.segments.node_time.size
+    count = problem.chain.node_time.size
     shown = np.unique(np.linspace(0, count - 1, min(entries or count, count)).astype(int))
     triangles, _ = run_filter(problem, evaluation, nodes=shown)
     undetermined = _undetermined(found, triangles, shown)
@@ -156,7 +155,7 @@ def run_filter(
     # Nothing else holds the factors then, so that each goes with its step.
     problem.release()
     sizes = evaluation.values.dims()
-    last = problem.chain.segments.node_time.size - 1
+    last = problem.chain.node_time.size - 1
     # A variable goes at the last step that depends on it, those of the last node never.
     gone_after = {key: k for k, rows in sorted(steps.items()) for row in rows for key in row.keys}
     gone_after |= dict.fromkeys(_own_keys(problem, last), last)
@@ -186,8 +185,8 @@ def run_filter(
 
 
 def _own_keys(problem: Problem, k: int) -> list[int]:
-    """Return the variables of a node: its state, and its bias where biases walk."""
-    return [keys.node(k), keys.bias(k)] if problem.chain.walking else [keys.node(k)]
+    """Return the variables of a node: its state, and what it has beside."""
+    return problem.chain.keys_of([k])
 
 
 def as_history(
@@ -251,7 +250,7 @@ def as_history(
         if info != 0:
             raise np.linalg.LinAlgError("a constant without a prior")
         root[k] = _triangle(np.hstack([transport @ inverse, spread]).T, size).T
-    time = problem.chain.segments.node_time
+    time = problem.chain.node_time
     return InformationHistory(
         time=time if nodes is None else time[nodes],
         names=tuple(name for name, is_kept in zip(names, is_free, strict=True) if is_kept),
@@ -263,12 +262,10 @@ def _constants(problem: Problem) -> dict[int, int]:
     """Return the columns of the variables that do not belong to a time, parameters last."""
     out: dict[int, int] = {}
     at = 0
-    if not problem.chain.walking:
-        out[keys.bias(0)] = 0
-        at = BIAS_SIZE
-    for p in problem.parameters:
-        out[problem.key(p.name)] = at
-        at += p.mean.size
+    own = {problem.key(p.name): p.mean.size for p in problem.parameters}
+    for key, size in (*problem.chain.constants.items(), *own.items()):
+        out[key] = at
+        at += size
     return out
 
 
@@ -294,10 +291,8 @@ def _rows_by_step(
     under -1; noise that is correlated belongs to the node before its own.
     """
     gaussian = problem.linearize(evaluation)
-    time = problem.chain.segments.node_time
-    of_states = {keys.node(k): k for k in range(time.size)}
-    if problem.chain.walking:
-        of_states |= {keys.bias(k): k for k in range(time.size)}
+    time = problem.chain.node_time
+    of_states = {key: k for k in range(time.size) for key in problem.chain.keys_of([k])}
     of_errors: dict[int, int] = {}
     for p in problem.processes:
         before = np.searchsorted(time, p.time, side="right") - 1

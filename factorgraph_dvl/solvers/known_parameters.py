@@ -77,7 +77,7 @@ class Explanation:
         return wide(self.parameter, self.parameter.mean)
 
 
-def explanation(problem: Problem, minimum: Minimum, imu: Imu) -> Explanation | None:
+def explanation(problem: Problem, minimum: Minimum, imu: Imu | None) -> Explanation | None:
     """Return what would explain most of a misfit; None if chance may have made it.
 
     None also where a change along the trial explains more.
@@ -91,7 +91,7 @@ def explanation(problem: Problem, minimum: Minimum, imu: Imu) -> Explanation | N
     imu : Imu
         The samples, as they are stated to be taken.
     """
-    time = problem.chain.segments.node_time
+    time = problem.chain.node_time
     if time[-1] - time[0] < _SHORTEST:
         return None
     evaluation, information = minimum.evaluation, minimum.information
@@ -124,7 +124,7 @@ def explanation(problem: Problem, minimum: Minimum, imu: Imu) -> Explanation | N
         for e in certain
         if fall - e.change.fall < 2.0 * _TIE
     )
-    if parameter.name == GYRO_SCALE and _is_sampling(test, imu):
+    if imu is not None and parameter.name == GYRO_SCALE and _is_sampling(test, imu):
         others = (*others, "imu.sampling")
     return Explanation(parameter, test, others)
 
@@ -177,7 +177,7 @@ def _tests_of_known(
     found = scores(ranges.information.solution(), ranges.information, columns)
     tests = {p.name: found.test([p.name]) for p in known}
     if any(t.log10_p < _LOG10_P for t in tests.values()):
-        scatter = _scatter(problem.chain.segments.node_time, ranges, columns, found)
+        scatter = _scatter(problem.chain.node_time, ranges, columns, found)
         tests = {name: t.divided(scatter[name]) for name, t in tests.items()}
     return {p.name: (p, tests[p.name]) for p in known}
 

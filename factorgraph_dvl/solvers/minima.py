@@ -81,7 +81,7 @@ def _rough_minima(
     prepared: Preparation, first: SettledMinimum, states: States
 ) -> tuple[Problem, list[Minimum]]:
     """Return a problem, and its minima from all headings and mountings, the lowest first."""
-    chain = first.problem.chain
+    chain = prepared.chain(first.minimum.evaluation.states)
     # A problem of their own: minimising weighs the measurements anew.
     problem = Problem(
         chain,

@@ -13,6 +13,7 @@ from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array, rotate
 from factorgraph_dvl.graph.bordered_chain import Covariances
 from factorgraph_dvl.graph.motion_problem import ATTITUDE, CURRENT, MotionEvaluation, MotionProblem
+from factorgraph_dvl.graph.priors import PRIOR
 from factorgraph_dvl.sensors.attitude import HEADING_OFFSET, heading_error
 from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.sensors.message import Message, message
@@ -32,7 +33,6 @@ from factorgraph_dvl.solution import (
 from factorgraph_dvl.solvers.causes import numbers_with_unit
 from factorgraph_dvl.solvers.motion_smoother import SmoothedMotion
 from factorgraph_dvl.solvers.reported import estimates_of, in_order, in_unit
-from factorgraph_dvl.statistics.rows import PRIOR
 from factorgraph_dvl.trial import Trial
 
 # Epochs whose covariances are computed at once.

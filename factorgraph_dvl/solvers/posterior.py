@@ -50,7 +50,7 @@ class Posterior:
 def posterior(problem: Problem, minimum: Minimum) -> Posterior:
     """Return the covariances at a minimum that was proven, fixed directions taken as exact."""
     information = minimum.information
-    wanted = [keys.node(k) for k in range(problem.chain.segments.node_time.size)]
+    wanted = [keys.node(k) for k in range(problem.chain.node_time.size)]
     marginals = information.marginals(wanted)
     nodes = np.stack([marginals[key] for key in wanted])
     if not problem.parameters:

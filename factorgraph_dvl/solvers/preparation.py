@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Any, Protocol
 
 import numpy as np
 
 from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.vectors import Array
-from factorgraph_dvl.graph.inertial_chain import Chain, inertial_chain
+from factorgraph_dvl.graph.chain import Chain
+from factorgraph_dvl.graph.inertial_chain import InertialChain, inertial_chain
 from factorgraph_dvl.graph.problem import Problem, observed
+from factorgraph_dvl.graph.processes import Process
 from factorgraph_dvl.imu.increments import increments
 from factorgraph_dvl.imu.noise import with_recorded_noise
 from factorgraph_dvl.imu.preintegration import Segments, segments
@@ -23,7 +27,8 @@ from factorgraph_dvl.sensors.finding import Finding
 from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.sensors.protocol import Observation
 from factorgraph_dvl.solution import Progress
-from factorgraph_dvl.solvers.levenberg_marquardt import minimise
+from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, minimise
+from factorgraph_dvl.solvers.motion_strengths import Strengths
 from factorgraph_dvl.solvers.outliers import robust_weights
 from factorgraph_dvl.solvers.state_times import dense_epochs
 from factorgraph_dvl.trial import Trial
@@ -39,6 +44,44 @@ _ROUGHLY_NOISE = 1.5
 # the mounting is. Measured: three jumps of 10 m for 30 s make 3, and led the mounting beside a
 # MEMS IMU to a clock that is off by half a period of the sway; noise as stated makes 1.
 _GROSS = 2.0
+
+
+class Prepared(Protocol):
+    """What every minimisation of a trial starts from, whatever its chain."""
+
+    @property
+    def trial(self) -> Trial:
+        """The trial."""
+
+    @property
+    def observations(self) -> tuple[Observation, ...]:
+        """Measurements of all sensors."""
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """Calibration parameters of all sensors, fixed ones included."""
+
+    @property
+    def estimated_noise(self) -> frozenset[str]:
+        """Labels of the observations whose stated noise is only where to start."""
+
+    @property
+    def rejected(self) -> Mapping[str, Array]:
+        """Times of measurements that are left out from the start, by label."""
+
+    def chain(self, states: Any) -> Chain:
+        """Return the nodes of some states, and what ties them."""
+
+    def start(self, chain: Any, states: Any, report: Progress) -> MountedStart:
+        """Return where the minimisation with all sensors starts."""
+
+    def stated_processes(
+        self, chain: Any, states: Any, values: Mapping[str, Array]
+    ) -> tuple[Process, ...]:
+        """Return the processes that are in the problem from the start."""
+
+    def strengths(self, problem: Problem, minimum: Minimum) -> Strengths | None:
+        """Return the strengths of the motion's prior, None where the chain has none."""
 
 
 @dataclass(frozen=True)
@@ -77,11 +120,29 @@ class Preparation:
     mountings: dict[str, Array]
     findings: tuple[Finding, ...]
 
-    def chain(self, states: States) -> Chain:
+    @property
+    def rejected(self) -> Mapping[str, Array]:
+        """Times of measurements that are left out from the start, by label."""
+        return self.start_positions.rejected
+
+    def start(self, chain: InertialChain, states: States, report: Progress) -> MountedStart:
+        """Return where the minimisation with all sensors starts."""
+        return mounted_start(self, chain, states, report)
+
+    def stated_processes(
+        self, chain: InertialChain, states: States, values: Mapping[str, Array]
+    ) -> tuple[Process, ...]:
+        """Return none: noise is white until residuals show another one."""
+        return ()
+
+    def strengths(self, problem: Problem, minimum: Minimum) -> None:
+        """Return None: the IMU ties the nodes."""
+
+    def chain(self, states: States) -> InertialChain:
         """Return the inertial part of the graph, with gravity along the track of states."""
         return inertial_chain(self.trial, self.frame, self.segments, states)
 
-    def mountings_at(self, chain: Chain, states: States) -> list[dict[str, Array]]:
+    def mountings_at(self, chain: InertialChain, states: States) -> list[dict[str, Array]]:
         """Return values of the mountings that fit the motion of states, the best first."""
         return mountings_from_motion(
             self.trial, self.frame, self.segments, chain.gravity_n, states
@@ -157,8 +218,8 @@ class MountedStart:
 
     Parameters
     ----------
-    states : States
-        Motion.
+    states : object
+        Motion of the nodes, as their chain has it.
     values : dict of str to ndarray
         Parameters that fit it.
     robust_weights : dict of str to ndarray
@@ -167,14 +228,14 @@ class MountedStart:
         That it took.
     """
 
-    states: States
+    states: Any
     values: dict[str, Array]
     robust_weights: dict[str, Array]
     iterations: int
 
 
 def mounted_start(
-    prepared: Preparation, chain: Chain, states: States, report: Progress
+    prepared: Preparation, chain: InertialChain, states: States, report: Progress
 ) -> MountedStart:
     """Return states, and values of the parameters that fit them.
 

@@ -9,14 +9,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
 from factorgraph_dvl.geometry.vectors import Array, BoolArray
-from factorgraph_dvl.graph.priors import ConstantsPrior
-from factorgraph_dvl.graph.problem import EXTRAPOLATED, Evaluation, Problem
+from factorgraph_dvl.graph.bound_observation import EXTRAPOLATED
+from factorgraph_dvl.graph.priors import ConstantsPrior, Tilt
+from factorgraph_dvl.graph.problem import Evaluation, Problem
 from factorgraph_dvl.graph.processes import Process
-from factorgraph_dvl.imu.propagation import States
 from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.sensors.message import Message, message
 from factorgraph_dvl.sensors.parameters import Parameter
@@ -36,9 +37,9 @@ from factorgraph_dvl.solvers.known_parameters import (
     explanation,
     explanation_findings,
 )
-from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, factorized, minimise
+from factorgraph_dvl.solvers.levenberg_marquardt import CONVERGED, Minimum, factorized, minimise
 from factorgraph_dvl.solvers.outliers import robust_weights
-from factorgraph_dvl.solvers.preparation import Preparation, mounted_start
+from factorgraph_dvl.solvers.preparation import Preparation, Prepared
 from factorgraph_dvl.solvers.process_fit import refitted
 from factorgraph_dvl.statistics.variance_components import (
     VarianceComponents,
@@ -56,6 +57,10 @@ _ROUNDS = 24
 _FRUITLESS = 150
 # Rounds after which noise counts as not settled. Measured: a factor of five takes two.
 _NOISE_ROUNDS = 4
+# Estimates of the strength of a motion's prior, and promised fall of the cost that ends a
+# minimisation before the next one. Measured: four to eight are enough.
+_MOTION_ROUNDS = 10
+_ROUGHLY = 1e-2
 # What of a problem changes without a new one.
 _NOISE = message("not_converged.noise")
 _OUTLIERS = message("not_converged.outliers")
@@ -63,6 +68,7 @@ _TIMES = message("not_converged.times")
 _CORRELATED = message("not_converged.correlated")
 _KNOWN = message("not_converged.known")
 _WALKS = message("not_converged.walks")
+_MOTION = message("not_converged.acceleration")
 # Parameters that are estimated although they were stated as known. Chosen: a third is a sign that
 # the model is wrong.
 _MOST_FREED = 2
@@ -108,8 +114,8 @@ class SettledMinimum:
 
 
 def settle(
-    prepared: Preparation,
-    states: States,
+    prepared: Prepared,
+    states: Any,
     report: Progress,
     *,
     constants_prior: ConstantsPrior | None = None,
@@ -120,9 +126,9 @@ def settle(
 
     Parameters
     ----------
-    prepared : Preparation
-        Segments, measurements and parameters.
-    states : States
+    prepared : Prepared
+        Chain, measurements and parameters.
+    states : object
         Where to start.
     report : callable
         Called with stage, iteration and cost.
@@ -142,10 +148,10 @@ def settle(
     robust: dict[str, Array] = {}
     usable: Mapping[str, BoolArray] | None = None
     if values is None:
-        start = mounted_start(prepared, chain, states, report)
+        start = prepared.start(chain, states, report)
         states, values, iterations = start.states, start.values, start.iterations
         robust = start.robust_weights
-    rejected = prepared.start_positions.rejected
+    rejected = prepared.rejected
     tried: list[Mapping[str, Array]] = []
     cycle: list[Mapping[str, Array]] = []
     as_stated = {
@@ -162,6 +168,11 @@ def settle(
     tested: tuple[Parameter, ...] | None = None
     long_run: Mapping[str, Array] = {}
     first_levels = _NoiseLevels((as_stated,), bool(as_stated))
+    tilt: Tilt | None = None
+    motion = 0
+    first_levels = replace(
+        first_levels, processes=prepared.stated_processes(chain, states, values)
+    )
     levels = first_levels
     changing = [message("not_converged.all")]
     tolerance: Mapping[str, float] = {}
@@ -186,6 +197,7 @@ def settle(
                 clock_zero=clock_zero,
                 processes=levels.processes,
                 usable=usable,
+                tilt=tilt,
             )
             problem.reject(rejected)
         problem.processes = levels.processes
@@ -197,14 +209,33 @@ def settle(
         # At the ends of the record two bindings may use one measurement in turn.
         usable = problem.usable if tolerance else None
         at = problem.values(states, problem.prior_values() | values)
-        minimum = minimise(problem, at, stage="all sensors", progress=report, binding=True)
+        minimum = minimise(
+            problem,
+            at,
+            stage="all sensors",
+            progress=report,
+            binding=True,
+            tolerance=_ROUGHLY if chain.interpolates and motion < _MOTION_ROUNDS else CONVERGED,
+        )
         iterations += minimum.iterations
         fruitless = 0 if minimum.converged else fruitless + minimum.iterations
         states, values = minimum.evaluation.states, minimum.evaluation.parameters
         changing = _changing(problem, minimum.evaluation)
         if changing == [_TIMES] and in_a_row >= _IN_A_ROW and not tolerance:
             tolerance = _clock_tolerance(prepared, problem, minimum.evaluation)
-        if np.sqrt(np.mean((states.p_n - p_gravity) ** 2)) > _SAME_GRAVITY:
+        strengths = prepared.strengths(problem, minimum) if motion < _MOTION_ROUNDS else None
+        if strengths is not None:
+            motion += 1
+            levels = replace(
+                levels, factors=(*levels.factors, strengths.factors), processes=strengths.processes
+            )
+            chain, tilt = strengths.chain, strengths.tilt
+            values = strengths.values
+            if not strengths.same:
+                changing.append(_MOTION)
+                continue
+            motion = _MOTION_ROUNDS
+        elif np.sqrt(np.mean((states.p_n - p_gravity) ** 2)) > _SAME_GRAVITY:
             changing.insert(0, message("not_converged.gravity"))
             chain = prepared.chain(states)
             p_gravity = states.p_n
@@ -234,14 +265,15 @@ def settle(
             if found.gain > 0.0 and _changes_explain_more(problem, minimum, found.gain):
                 # Noise that persists would take the place of what changed.
                 found = correlated_noise(problem, minimum.evaluation, ())
-            if found.processes or found.long_run:
+            if found.long_run or {p.label for p in found.processes} - {
+                p.label for p in levels.processes
+            }:
                 changing.append(_CORRELATED)
                 tolerance = {}
                 long_run = found.long_run
                 white = levels.factors[-1] | found.factors
-                levels = replace(
-                    levels, factors=(*levels.factors, white), processes=found.processes
-                )
+                processes = _with_others(levels.processes, found.processes)
+                levels = replace(levels, factors=(*levels.factors, white), processes=processes)
                 if any(process.label in robust for process in found.processes):
                     # What wanders for long is no outlier.
                     robust, searches = {}, 0
@@ -249,7 +281,7 @@ def settle(
             tested = parameters
             # The test has a problem of its own, and more columns.
             problem.release()
-            left = explanation(problem, minimum, prepared.trial.inertial)
+            left = explanation(problem, minimum, prepared.trial.imu)
             if left is not None and len(freed) < _MOST_FREED:
                 freed.append(left)
                 parameters = tuple(
@@ -267,7 +299,14 @@ def settle(
                 changing.append(_CORRELATED)
             elif not (same and _same(levels.factors[-1], last.factors[-1])):
                 changing.append(_NOISE)
-        if not changing and walks is None and left is None and not freed and _misfit(problem):
+        if (
+            not changing
+            and isinstance(prepared, Preparation)
+            and walks is None
+            and left is None
+            and not freed
+            and _misfit(problem)
+        ):
             walks = bias_walks(prepared, problem, minimum, as_stated, report)
             if walks is not None:
                 prepared = walks.prepared
@@ -296,6 +335,14 @@ def settle(
     converged = minimum.converged and not changing
     minimum = replace(minimum, converged=converged, iterations=iterations)
     return SettledMinimum(problem, minimum, not changing, findings)
+
+
+def _with_others(before: Sequence[Process], found: Sequence[Process]) -> tuple[Process, ...]:
+    """Return processes as they were, with others that were found."""
+    known = {p.label for p in before}
+    free = (i for i in range(len(before) + len(found)) if i not in {p.index for p in before})
+    others = (p for p in found if p.label not in known)
+    return (*before, *(replace(p, index=i) for p, i in zip(others, free, strict=False)))
 
 
 def _changes_explain_more(problem: Problem, minimum: Minimum, gain: float) -> bool:
@@ -388,7 +435,7 @@ def _changing(problem: Problem, evaluation: Evaluation) -> list[Message]:
 
 
 def _clock_tolerance(
-    prepared: Preparation, problem: Problem, evaluation: Evaluation
+    prepared: Prepared, problem: Problem, evaluation: Evaluation
 ) -> dict[str, float]:
     """Return how closely clocks are to settle, s, by the names of their offsets."""
     names = {o.clock.names[0] for o in prepared.observations if o.clock is not None}
@@ -401,7 +448,9 @@ def _clock_tolerance(
 
 
 def _halfway(
-    prepared: Preparation, before: Mapping[str, Array], after: Mapping[str, Array]
+    prepared: Prepared,
+    before: Mapping[str, Array],
+    after: Mapping[str, Array],
 ) -> dict[str, Array]:
     """Return offsets and rates of clocks half-way between two sets of values."""
     names = _clock_parameters(prepared, before, after)
@@ -409,7 +458,9 @@ def _halfway(
 
 
 def _clock_movement(
-    prepared: Preparation, before: Mapping[str, Array], after: Mapping[str, Array]
+    prepared: Prepared,
+    before: Mapping[str, Array],
+    after: Mapping[str, Array],
 ) -> float:
     """Return the largest change of an offset, s, or of a rate between two sets of values."""
     names = _clock_parameters(prepared, before, after)
@@ -417,7 +468,9 @@ def _clock_movement(
 
 
 def _clock_parameters(
-    prepared: Preparation, before: Mapping[str, Array], after: Mapping[str, Array]
+    prepared: Prepared,
+    before: Mapping[str, Array],
+    after: Mapping[str, Array],
 ) -> list[str]:
     """Return the names of offsets and rates of clocks that both sets of values have."""
     clocks = [o.clock for o in prepared.observations if o.clock is not None]

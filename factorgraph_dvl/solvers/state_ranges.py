@@ -12,7 +12,7 @@ import numpy as np
 
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph import keys
-from factorgraph_dvl.graph.inertial_chain import Chain
+from factorgraph_dvl.graph.chain import Chain
 from factorgraph_dvl.graph.problem import Evaluation, Problem, Rows
 from factorgraph_dvl.statistics.rows import rows_by_source, rows_with_times
 from factorgraph_dvl.statistics.square_root_information import (
@@ -103,7 +103,7 @@ def eliminated_by_ranges(part: Part, chain: Chain, *, whole: bool = False) -> St
     whole : bool, default False
         Whether there is one range only, however long the chain is.
     """
-    count = chain.segments.first.size
+    count = chain.count
     edges = np.linspace(0, count, (1 if whole else -(-count // _LONGEST)) + 1).astype(int)
     blocks: list[slice | None] = [slice(a, b) for a, b in pairwise(edges.tolist())]
     if len(blocks) == 1:
@@ -154,5 +154,4 @@ def _eliminations(
 
 def _shared(problem: Problem) -> list[int]:
     """Return the keys of what all states share."""
-    biases = [] if problem.chain.walking else [keys.bias(0)]
-    return biases + [problem.key(p.name) for p in problem.parameters]
+    return [*problem.chain.constants, *(problem.key(p.name) for p in problem.parameters)]

@@ -28,7 +28,6 @@ from factorgraph_dvl.solvers.change_along_trial import change_findings
 from factorgraph_dvl.solvers.correlated_noise import noise_of
 from factorgraph_dvl.solvers.fixed_directions import SolvedProblem
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum
-from factorgraph_dvl.solvers.trajectory import trajectory_between
 from factorgraph_dvl.statistics.robust_weights import windows
 from factorgraph_dvl.trial import Trial
 
@@ -48,14 +47,8 @@ def summarise(trial: Trial, found: SolvedProblem, *, rate_hz: float) -> Solution
     problem, minimum, chain = found.problem, found.minimum, found.problem.chain
     evaluation = minimum.evaluation
     estimates, covariance = calibration(found)
-    trajectory = trajectory_between(
-        chain.segments,
-        evaluation.states,
-        found.covariances.nodes,
-        chain.gravity_n,
-        chain.frame,
-        trial.body_axes,
-        chain.segments.increments.ticks(rate_hz),
+    trajectory = chain.trajectory(
+        evaluation.states, found.covariances.nodes, trial.body_axes, rate_hz
     )
     residuals = _residuals(problem, minimum)
     rejected = _rejected(problem, minimum)
@@ -172,7 +165,7 @@ def _unobservable(
         )
         for name in observation.parameters
     }
-    duration = float(problem.chain.segments.duration.sum())
+    duration = problem.chain.duration
     out: list[Finding] = []
     calibrated = {p.name: p.joint for p in problem.all_parameters if p.joint is not None}
     kept = [n for e in estimates if e.name in calibrated and not e.observable.all()

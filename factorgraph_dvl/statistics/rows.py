@@ -12,14 +12,12 @@ import numpy as np
 
 from factorgraph_dvl.geometry.vectors import Array, IntArray
 from factorgraph_dvl.graph import keys
+from factorgraph_dvl.graph.priors import PRIOR
 from factorgraph_dvl.graph.problem import Evaluation, Problem, Rows
 
-IMU_NOISE = "IMU noise"
-FIRST_STATE = "prior of the first state"
-GAP = "motion while the IMU is silent"
-PRIOR = "prior of {}"
-WALK = "random walk of {}"
 CORRELATED = "correlated noise of {}"
+# Stands for the sources that the chain names.
+_OF_CHAIN = ""
 
 # Native factors whose rows are taken at once. Chosen: some ten megabytes.
 _CHUNK = 4096
@@ -39,7 +37,7 @@ def rows_with_times(problem: Problem, every: Iterable[Rows]) -> Iterator[tuple[R
     """Yield those of the rows by source that belong to times, with these: all but priors."""
     when = {o.label: o.time for o in problem.observations}
     processes = {keys.letter_of(p.key(0)): p.time for p in problem.processes}
-    node_time = problem.chain.segments.node_time
+    node_time = problem.chain.node_time
     for rows in every:
         if rows.source in when:
             yield rows, when[rows.source][rows.begin : rows.begin + len(rows.vector)]
@@ -95,16 +93,17 @@ def _by_variable(rows: Rows) -> Iterator[tuple[IntArray, Array]]:
 
 def native_rows(problem: Problem, evaluation: Evaluation) -> Iterator[Rows]:
     """Yield the rows of the factors that GTSAM linearises itself, some of one source together."""
-    gaussian = problem.native(evaluation)
+    yield from problem.chain_rows(evaluation)
+    gaussian = problem.native(evaluation, steps=False)
     sizes = evaluation.values.dims()
     names = {problem.key(p.name): p.name for p in problem.parameters}
-    of_biases = ", ".join(p.name for p in problem.chain.biases)
+    of_chain = ", ".join(p.name for p, _, _ in problem.chain.mean_constants(evaluation.states))
     names |= {p.key(j): p.label for p in problem.processes for j in range(p.time.size)}
     found: dict[tuple[str, tuple[int, ...]], list[tuple[list[int], Array]]] = {}
     for i in range(gaussian.size()):
         factor = gaussian.at(i)
         own = list(factor.keys())
-        kind = (_source(own, names, of_biases), tuple(sizes[key] for key in own))
+        kind = (_source(own, names, of_chain), tuple(sizes[key] for key in own))
         items = found.setdefault(kind, [])
         items.append((own, np.array(factor.augmentedJacobian())))
         if len(items) == _CHUNK:
@@ -119,31 +118,23 @@ def _together(
     """Yield the rows of factors of one source: their variables, and their augmented Jacobians."""
     variables = np.array([own for own, _ in items])
     matrix = np.stack([augmented for _, augmented in items])
-    gyro, accel = (p.name for p in problem.chain.biases)
-    parts = {source.format(f"{gyro}, {accel}"): slice(None)}
-    if source == WALK or (source == PRIOR and problem.chain.biases[0].joint is None):
-        # GTSAM's order; the rows are independent of each other.
-        parts = {source.format(accel): slice(0, 3), source.format(gyro): slice(3, 6)}
+    parts = {source: slice(None)}
+    if source == _OF_CHAIN:
+        parts = problem.chain.sources("".join(map(keys.letter_of, items[0][0])))
     for name, own_rows in parts.items():
         part = matrix[:, own_rows]
         yield Rows(name, ("",) * part.shape[1], variables, shape, part[..., :-1], -part[..., -1])
 
 
-def _source(own: list[int], names: Mapping[int, str], biases: str) -> str:
+def _source(own: list[int], names: Mapping[int, str], of_chain: str) -> str:
     """Return the source of a factor's noise, from its variables."""
-    letters = "".join(map(keys.letter_of, own))
-    if letters.startswith("xxb"):
-        return IMU_NOISE
     if keys.is_process(own[0]):
         return CORRELATED.format(names[own[0]])
+    if keys.letter_of(own[0]) == "x":
+        return _OF_CHAIN
     calibration = [names[key] for key in own if key in names]
-    if calibration and "b" in letters:
-        calibration.insert(0, biases)
-    if calibration:
-        return PRIOR.format(", ".join(calibration))
-    return {
-        "bb": WALK,
-        "b": PRIOR,
-        "x": FIRST_STATE,
-        "xx": GAP,
-    }[letters]
+    if not calibration:
+        return _OF_CHAIN
+    if len(calibration) < len(own):
+        calibration.insert(0, of_chain)
+    return PRIOR.format(", ".join(calibration))

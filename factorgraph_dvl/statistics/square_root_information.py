@@ -7,8 +7,9 @@ the digits that navigation-grade gyros need.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import gtsam
 import numpy as np
@@ -54,16 +55,63 @@ class SquareRootInformation:
         for tree in trees:
             self._cliques += reversed(_cliques_of(tree, sizes))
         self._cliques.reverse()
-        place = {key: i for i, c in enumerate(self._cliques) for key in c.frontals}
+
+    @cached_property
+    def _place(self) -> dict[int, int]:
+        """Number of the clique in which each variable is frontal."""
+        return {key: i for i, clique in enumerate(self._cliques) for key in clique.frontals}
+
+    @cached_property
+    def _parents(self) -> list[int]:
+        """Number of each clique's parent, -1 where there is none."""
         # That of the separator that was eliminated first: it has all the others.
-        self._parents = [
-            max((place.get(key, -1) for key in c.separators), default=-1) for c in self._cliques
+        return [
+            max((self._place.get(key, -1) for key in c.separators), default=-1)
+            for c in self._cliques
         ]
 
     @property
     def log_determinant(self) -> float:
         """Logarithm of the determinant of the information."""
         return 2.0 * sum(float(np.log(np.abs(np.diag(c.R))).sum()) for c in self._cliques)
+
+    @property
+    def decrease(self) -> float:
+        """Half the sum of squares that the minimum takes off that of the right-hand side."""
+        return 0.5 * sum(float(clique.d @ clique.d) for clique in self._cliques)
+
+    def given(self, known: Collection[int]) -> SquareRootInformation:
+        """Return the information of the other variables where some stay as they are.
+
+        The rows of the others do not change: R x_F + T x_S = d with the known part of x zero.
+
+        Parameters
+        ----------
+        known : collection of int
+            Keys of variables that were eliminated after all the others.
+
+        Raises
+        ------
+        ValueError
+            If others were eliminated after them.
+        """
+        cliques = []
+        for clique in self._cliques:
+            frontals = tuple(key for key in clique.frontals if key not in known)
+            separators = tuple(key for key in clique.separators if key not in known)
+            # The last clique may have some of both: then the known ones come after the others.
+            last = len(frontals) == len(clique.frontals)
+            if frontals != clique.frontals[: len(frontals)] or (separators and not last):
+                raise ValueError("the known variables must be eliminated after all others")
+            if not frontals:
+                continue
+            n = sum(self._sizes[key] for key in frontals)
+            keep = [key not in known for key in clique.separators for _ in range(self._sizes[key])]
+            T = clique.T[:n, np.array(keep, bool)]
+            cliques.append(_Clique(frontals, separators, clique.R[:n, :n], T, clique.d[:n]))
+        out = SquareRootInformation([], self._sizes)
+        out._cliques = cliques
+        return out
 
     def solution(self) -> gtsam.VectorValues:
         """Return the minimum of the graph."""
@@ -187,22 +235,19 @@ class SquareRootInformation:
                     out[key] = 0.5 * (block + block.T)
         return out
 
-    def joint_covariances(self, pairs: Sequence[tuple[int, int]]) -> list[Array]:
-        """Return the joint covariances of pairs of variables that a factor ties together.
+    def joint_covariances(self, groups: Sequence[tuple[int, ...]]) -> list[Array]:
+        """Return the joint covariances of groups of variables that a factor ties together.
 
         Such variables share a clique: that of the one that was eliminated first.
         """
-        partners: dict[int, list[tuple[int, int]]] = {}
-        for i, (a, b) in enumerate(pairs):
-            partners.setdefault(a, []).append((i, b))
-            partners.setdefault(b, []).append((i, a))
-        out: list[Array] = [np.empty((0, 0))] * len(pairs)
-        for clique, place, P in self._joint():
-            for key in clique.frontals:
-                for i, other in partners.get(key, ()):
-                    if other in place:
-                        rows = np.concatenate([_range(place[each]) for each in pairs[i]])
-                        out[i] = P[rows[:, None], rows]
+        wanted: dict[int, list[int]] = {}
+        for i, group in enumerate(groups):
+            wanted.setdefault(max(self._place[key] for key in group), []).append(i)
+        out: list[Array] = [np.empty((0, 0))] * len(groups)
+        for index, (_, place, P) in enumerate(self._joint()):
+            for i in wanted.get(index, ()):
+                rows = np.concatenate([_range(place[key]) for key in groups[i]])
+                out[i] = P[rows[:, None], rows]
         return out
 
     def _joint(self) -> Iterator[tuple[_Clique, dict[int, slice], Array]]:

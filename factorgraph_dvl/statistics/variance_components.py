@@ -22,6 +22,8 @@ _PRIOR_FREEDOM = 1.0 / (2.0 * np.log(3.0) ** 2)
 LEAST_FACTOR = 0.1
 # Redundancy below which no factor is estimated. Chosen: it would be uncertain by over 20 %.
 _LEAST_REDUNDANCY = 10.0
+# Groups of the components of a process that is of no observation.
+_TOGETHER = ((0, 1),)
 # Relative change of a factor from which on it counts, and in its own standard deviations.
 # Chosen: less changes no σ that is shown, or is chance.
 _SAME_FACTOR = 0.05
@@ -60,10 +62,13 @@ class VarianceComponents:
         By label, factors on the standard deviations that sensors state.
     correlated : dict of str to NoiseFactor
         By label, factors on the innovations of correlated noise, relative to those assumed.
+    steps : tuple of ndarray, shape (K - 1, d), optional
+        Squares of the residuals from node to node, and what is left of their freedom.
     """
 
     white: dict[str, NoiseFactor]
     correlated: dict[str, NoiseFactor]
+    steps: tuple[Array, Array] | None = None
 
 
 def variance_components(
@@ -92,14 +97,17 @@ def variance_components(
         Information there.
     """
     processes = {CORRELATED.format(p.label): p for p in problem.processes}
-    wanted = {*problem.noise_factors, *processes}
-    source = partial(rows_by_source, problem) if processes else problem.observation_rows
+    steps = problem.chain.step_source
+    wanted = {*problem.noise_factors, *processes, *((steps,) if steps else ())}
+    native = bool(processes) or steps is not None
+    source = partial(rows_by_source, problem) if native else problem.observation_rows
     count = sum(
         residual.size
         for o, residual in zip(problem.observations, evaluation.residuals, strict=True)
         if o.label in wanted
     )
     count += sum(p.prior_residuals(evaluation.parameters[p.name]).size for p in processes.values())
+    count += problem.chain.count * 12 * (steps is not None)
     found: dict[str, list[tuple[Array, Array]]] = {}
     estimated = partial(filter, lambda rows: rows.source in wanted)
     for rows, h in leverage(lambda: estimated(source(evaluation)), count, information):
@@ -107,15 +115,19 @@ def variance_components(
     white = {
         label: _white(problem, evaluation, label, *map(np.concatenate, zip(*parts, strict=True)))
         for label, parts in found.items()
-        if label not in processes
+        if label not in processes and label != steps
     }
     groups = {o.label: o.noise_groups for o in problem.observations}
     correlated = {
-        p.label: _innovations(found[source_name], groups[p.label])
+        p.label: _innovations(found[source_name], groups.get(p.label, _TOGETHER))
         for source_name, p in processes.items()
-        if p.label in problem.noise_factors
+        if p.label in problem.noise_factors or p.free
     }
-    return VarianceComponents(white, correlated)
+    of_steps = None
+    if steps is not None:
+        r, h = map(np.concatenate, zip(*found[steps], strict=True))
+        of_steps = r**2, 1.0 - h
+    return VarianceComponents(white, correlated, of_steps)
 
 
 def _innovations(

@@ -14,7 +14,8 @@ from truth import exact_states, scenario
 from factorgraph_dvl.geometry.rotations import exp_so3
 from factorgraph_dvl.geometry.units import DEG_PER_HOUR
 from factorgraph_dvl.graph import keys
-from factorgraph_dvl.graph.inertial_chain import inertial_chain, square_root
+from factorgraph_dvl.graph.inertial_chain import inertial_chain
+from factorgraph_dvl.graph.priors import square_root
 from factorgraph_dvl.imu.increments import increments
 from factorgraph_dvl.imu.preintegration import segments
 from factorgraph_dvl.simulation import simulate

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from factorgraph_dvl.graph.node_jacobian import some_of
+from factorgraph_dvl.graph.bound_observation import some_of
 from factorgraph_dvl.sensors.protocol import Linearization
 
 

@@ -11,15 +11,15 @@ from inertial import constant_segments
 from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.rotations import exp_so3, rotation_from_rph
 from factorgraph_dvl.geometry.units import DEG
-from factorgraph_dvl.imu.preintegration import one_segment
-from factorgraph_dvl.imu.propagation import States
-from factorgraph_dvl.solvers.trajectory import (
+from factorgraph_dvl.graph.trajectory import (
     attached_epochs,
     epochs_between,
     successive,
     trajectory_at,
     trajectory_between,
 )
+from factorgraph_dvl.imu.preintegration import one_segment
+from factorgraph_dvl.imu.propagation import States
 
 FRAME = LocalFrame(0.6, 2.0, 0.0)
 

@@ -67,14 +67,14 @@ def trajectory_between(
     last = segment_ends(seg, frame.earth_rate, rates=False)
     ends = motion_at(last, states, gravity_n, frame.earth_rate)
     closing = _closing(ends, states, seg.origin + 1)
-    P_n = _in_n(P, states)
+    P_n = tangent_in_n(P, states.nRb)
 
     def part(time: Array) -> Trajectory:
         at = attach(seg, time, frame.earth_rate, rates=False)
         motion = motion_at(at, states, gravity_n, frame.earth_rate)
         fraction = np.clip(at.tau / seg.duration[at.segment], 0.0, 1.0)
         motion = _closed(motion, fraction, at.segment, closing)
-        return _reported(time, motion, _between(P_n, at.node, fraction), frame, body_axes)
+        return reported(time, motion, between(P_n, at.node, fraction), frame, body_axes)
 
     parts = [part(time[i : i + _CHUNK]) for i in range(0, max(time.size, 1), _CHUNK)]
     return parts[0] if len(parts) == 1 else concatenated(parts)
@@ -173,8 +173,8 @@ def trajectory_at(
     segment = epochs.at.segment[:count]
     fraction = np.clip(epochs.at.tau[:count] / epochs.duration[segment], 0.0, 1.0)
     motion = _closed(rows_of(motion, slice(count)), fraction, segment, closing)
-    covariance = _between(_in_n(P, states), segment, fraction)
-    return _reported(epochs.time, motion, covariance, frame, body_axes)
+    covariance = between(tangent_in_n(P, states.nRb), segment, fraction)
+    return reported(epochs.time, motion, covariance, frame, body_axes)
 
 
 def _closing(ends: Motion, states: States, after: IntArray) -> tuple[Array, Array, Array]:
@@ -202,23 +202,23 @@ def _closed(
     )
 
 
-def _in_n(P: Array, states: States) -> Array:
+def tangent_in_n(P: Array, nRb: Array) -> Array:
     """Return the covariances of attitude, position and velocity in n, (K, 3, 3, 3)."""
     # GTSAM's tangent space is in body axes, which differ from node to node; n does not.
     blocks = np.empty((len(P), 3, 3, 3))
     for i in range(3):
         blocks[:, i] = P[:, 3 * i : 3 * i + 3, 3 * i : 3 * i + 3]
-    R = states.nRb[:, None]
+    R = nRb[:, None]
     return np.asarray(R @ blocks @ R.transpose(0, 1, 3, 2))
 
 
-def _between(P_n: Array, node: IntArray, fraction: Array) -> Array:
+def between(P_n: Array, node: IntArray, fraction: Array) -> Array:
     """Return covariances between those of nodes and of the next, (M, 3, 3, 3)."""
     before = P_n[node]
     return np.asarray(before + fraction[:, None, None, None] * (P_n[node + 1] - before))
 
 
-def _reported(
+def reported(
     time: Array, motion: Motion, P_n: Array, frame: LocalFrame, body_axes: BodyAxes
 ) -> Trajectory:
     """Return a motion with its covariances in the frames of a trajectory."""

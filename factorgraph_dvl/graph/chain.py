@@ -1,0 +1,221 @@
+"""What every chain of nodes answers: the motion at any time, and its derivatives by the nodes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import gtsam
+
+from factorgraph_dvl.geometry.earth import LocalFrame
+from factorgraph_dvl.geometry.rotations import BodyAxes
+from factorgraph_dvl.geometry.vectors import Array, BoolArray, IntArray
+from factorgraph_dvl.graph.imu_errors import ImuErrors
+from factorgraph_dvl.graph.priors import ConstantsPrior
+from factorgraph_dvl.sensors.parameters import Parameter
+from factorgraph_dvl.sensors.protocol import Linearization, Motion
+from factorgraph_dvl.solution import Trajectory
+
+
+@dataclass(frozen=True)
+class StepRows:
+    """Whitened rows from node to node: the prior of the motion.
+
+    Parameters
+    ----------
+    source : str
+        Where the noise comes from.
+    components : tuple of str
+        Names of the d rows of a step.
+    first : int
+        First of the M steps.
+    residual : ndarray, shape (M, d)
+        Of unit noise.
+    by_nodes : ndarray, shape (M, d, n)
+        Derivatives by the variables of the nodes before and after, as `Chain.variables`.
+    """
+
+    source: str
+    components: tuple[str, ...]
+    first: int
+    residual: Array
+    by_nodes: Array
+
+
+class ChainStates(Protocol):
+    """States of the K nodes of a chain; each kind of chain has more beside these."""
+
+    @property
+    def nRb(self) -> Array:
+        """Attitude, body to n, (K, 3, 3)."""
+
+    @property
+    def p_n(self) -> Array:
+        """Position in n, (K, 3), m."""
+
+    @property
+    def v_n(self) -> Array:
+        """Velocity over ground in n, (K, 3), m/s."""
+
+
+class Attached(Protocol):
+    """Where M times hang on a chain."""
+
+    @property
+    def node(self) -> IntArray:
+        """Node before each, (M,)."""
+
+
+class Chain(Protocol):
+    """Nodes, what ties them to each other, and the motion in between.
+
+    Each node has a navigation state, attitude, position and velocity in GTSAM's tangent space of
+    `NavState`, and may have a second variable.
+    """
+
+    @property
+    def frame(self) -> LocalFrame:
+        """Tangent frame n."""
+
+    @property
+    def clock(self) -> str | None:
+        """Name of the time offset of the clock that the nodes have; None = true times."""
+
+    @property
+    def node_time(self) -> Array:
+        """Times of the nodes, (K,), s."""
+
+    @property
+    def count(self) -> int:
+        """Number of its segments, of which `part` takes some."""
+
+    @property
+    def duration(self) -> float:
+        """How long the motion is known, s."""
+
+    @property
+    def middle(self) -> float:
+        """Middle of the record, s."""
+
+    @property
+    def graph(self) -> gtsam.NonlinearFactorGraph:
+        """Its own factors, as far as GTSAM linearises them."""
+
+    @property
+    def constants(self) -> Mapping[int, int]:
+        """Dimensions of the variables that all nodes share, by key."""
+
+    @property
+    def sizes(self) -> Sequence[int]:
+        """Dimensions of the variables of a measurement, as `variables` has them."""
+
+    @property
+    def joints(self) -> range:
+        """Nodes between which branches lie: eliminated last, they leave each by itself."""
+
+    def part(self, block: slice) -> Chain:
+        """Return the part of some segments in a row; states keep their keys."""
+
+    def nodes_of(self, block: slice) -> range:
+        """Return the nodes from the first of some segments to that of the segments after them."""
+
+    def keys_of(self, nodes: Iterable[int]) -> list[int]:
+        """Return the keys of the variables of nodes, node by node."""
+
+    def values(self, states: Any) -> gtsam.Values:
+        """Return GTSAM's values of states."""
+
+    def states(self, values: gtsam.Values) -> Any:
+        """Return states as arrays."""
+
+    def states_around(self, values: gtsam.Values, k: int) -> Any:
+        """Return the states that measurements after node k depend on."""
+
+    def from_node(self, k: int) -> Chain:
+        """Return what carries the motion of measurements after node k, taken as the first."""
+
+    def add_prior(
+        self,
+        graph: gtsam.NonlinearFactorGraph,
+        parameters: Sequence[Parameter],
+        key_of: Mapping[str, int],
+        constants_prior: ConstantsPrior | None,
+    ) -> Sequence[Parameter]:
+        """Add the prior of its constants; return the parameters whose priors it does not have."""
+
+    def mean_constants(self, states: Any) -> Iterator[tuple[Parameter, Array, dict[int, Array]]]:
+        """Yield its own parameters with their means over the trial, and the derivatives of these.
+
+        In reported units; derivatives by the variables of the graph, by key.
+        """
+
+    def trajectory(self, states: Any, P: Array, body_axes: BodyAxes, rate_hz: float) -> Trajectory:
+        """Return the motion at a rate, with its covariance.
+
+        Parameters
+        ----------
+        states : object
+            Of the K nodes.
+        P : ndarray, shape (K, 9, 9)
+            Their covariances, in GTSAM's tangent space.
+        body_axes : BodyAxes
+            Axes of the body.
+        rate_hz : float
+            Epochs in a second.
+        """
+
+    def release(self) -> None:
+        """Free what only binding measurements needs."""
+
+    def sources(self, letters: str) -> dict[str, slice]:
+        """Return the sources of noise of one of its factors, and which rows each has.
+
+        Parameters
+        ----------
+        letters : str
+            Of the factor's variables.
+        """
+
+    def assumed(self) -> dict[str, str]:
+        """Return what is assumed of each of these sources, as text."""
+
+    def errors(
+        self, parameters: Sequence[Parameter], key_of: Mapping[str, int], at: Sequence[Any]
+    ) -> ImuErrors | None:
+        """Return the errors of the IMU among parameters, None if there are none."""
+
+    def covers(self, time: Array) -> BoolArray:
+        """Whether the motion is known at times (M,)."""
+
+    def attach(self, time: Array) -> Any:
+        """Return where times (M,) hang on the chain; those that are not covered, where nearest."""
+
+    def later(self, at: Any, late: Array) -> Any:
+        """Return an attachment at times that are later by (M,) s, to the same nodes."""
+
+    def left(self, at: Any, late: Array, tolerance: float) -> bool:
+        """Whether measurements later by (M,) s are to be bound anew; tolerance in s."""
+
+    def motion(self, at: Any, states: Any) -> Motion:
+        """Return the motion at M attached times."""
+
+    def transition(self, at: Any, states: Any, motion: Motion) -> Any:
+        """Return the derivatives of the motion at attached times by the nodes."""
+
+    def node_jacobian(self, lin: Linearization, transition: Any) -> Array:
+        """Return the derivative of residuals by the variables of measurements, (M, d, n)."""
+
+    @property
+    def step_source(self) -> str | None:
+        """Source of the noise of `steps`; None where there are none."""
+
+    @property
+    def interpolates(self) -> bool:
+        """Whether the motion between nodes follows from both: at any time, without samples."""
+
+    def steps(self, states: Any) -> Iterator[StepRows]:
+        """Yield the whitened rows from node to node that are not in `graph`, some at a time."""
+
+    def variables(self, node: IntArray) -> list[IntArray]:
+        """Return the keys of the variables of measurements after nodes (M,), (M,) each."""

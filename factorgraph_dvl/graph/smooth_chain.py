@@ -1,0 +1,492 @@
+"""The chain of a trial without IMU: states of motion, tied to each other by their inertia."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import ClassVar
+
+import gtsam
+import numpy as np
+
+from factorgraph_dvl.geometry.earth import LocalFrame
+from factorgraph_dvl.geometry.records import concatenated
+from factorgraph_dvl.geometry.rotations import BodyAxes, log_so3
+from factorgraph_dvl.geometry.vectors import Array, BoolArray, IntArray
+from factorgraph_dvl.graph import keys
+from factorgraph_dvl.graph.chain import StepRows
+from factorgraph_dvl.graph.keys import RATE_SIZE, STATE_SIZE
+from factorgraph_dvl.graph.priors import ConstantsPrior, loose_diagonal
+from factorgraph_dvl.graph.smooth_motion import (
+    Between,
+    NodeSteps,
+    SmoothStates,
+    interpolated,
+    log_determinant_of_steps,
+    motion_steps,
+    node_steps,
+)
+from factorgraph_dvl.graph.trajectory import between, epochs_between, reported, tangent_in_n
+from factorgraph_dvl.sensors.parameters import Parameter
+from factorgraph_dvl.sensors.protocol import Linearization, Motion
+from factorgraph_dvl.solution import Trajectory
+
+# Source of noise of the prior of the motion.
+MOTION = "acceleration between states"
+FIRST_STATE = "prior of the first state"
+# Names of the rows of a step.
+_COMPONENTS = tuple(
+    f"{kind} {axis}"
+    for kind in ("turn", "shift", "angular acceleration", "acceleration")
+    for axis in "xyz"
+)
+# Standard deviations of the first state, rad, m, m/s and rad/s. Chosen: they only keep the chain
+# regular.
+_FREE = np.repeat([np.pi, 1e5, 1e2, 1.0], 3)
+# Nodes of a branch, as of the inertial chain.
+_BRANCH = 128
+# Share of the time between nodes that a measurement may lie beyond them. Chosen: a cubic goes on
+# that far.
+_BEYOND = 0.02
+# Time, s, for which the motion goes on beyond the ends. Chosen: about one more step.
+_MARGIN = 1.0
+# Steps whose rows are made at once. Chosen: some ten megabytes.
+_CHUNK = 4096
+
+
+@dataclass(frozen=True)
+class Attached:
+    """Where M times hang on the chain.
+
+    Parameters
+    ----------
+    node : ndarray of int, shape (M,)
+        Node before.
+    segment : ndarray of int, shape (M,)
+        The same: segments are from node to node.
+    time : ndarray, shape (M,), s
+        By the clock of the nodes.
+    """
+
+    node: IntArray
+    segment: IntArray
+    time: Array
+
+
+@dataclass(frozen=True)
+class TrackFrame:
+    """Level axes that turn with the vessel's heading, but not with the waves.
+
+    Parameters
+    ----------
+    nRt : ndarray, shape (K, 3, 3)
+        Axes to n, at the nodes.
+    omega_t : ndarray, shape (K, 3), rad/s
+        Their rate relative to n.
+    """
+
+    nRt: Array
+    omega_t: Array
+
+    def some(self, nodes: slice) -> TrackFrame:
+        """Return the axes at some nodes."""
+        return TrackFrame(self.nRt[nodes], self.omega_t[nodes])
+
+
+@dataclass(frozen=True)
+class ChainStates(SmoothStates):
+    """States of the nodes, with what leads from one to the next.
+
+    Attitude and rates go on along the axes of the body, position and velocity along those of the
+    track: waves turn a vessel, but not its velocity.
+
+    Parameters
+    ----------
+    time : ndarray, shape (K,), s
+        Of the nodes.
+    track : TrackFrame
+        At the nodes.
+    """
+
+    time: Array
+    track: TrackFrame
+
+    @cached_property
+    def turning(self) -> tuple[SmoothStates, NodeSteps]:
+        """Attitude and rates alone, and what leads from node to node."""
+        none = np.zeros_like(self.p_n)
+        own = SmoothStates(self.nRb, none, none, self.omega_b)
+        return own, node_steps(self.time, own, none[1:])
+
+    @cached_property
+    def moving(self) -> tuple[SmoothStates, NodeSteps]:
+        """Position and velocity with the axes of the track, and what leads from node to node."""
+        own = SmoothStates(self.track.nRt, self.p_n, self.v_n, self.track.omega_t)
+        return own, node_steps(self.time, own, np.zeros_like(self.p_n[1:]))
+
+
+@dataclass(frozen=True)
+class SmoothChain:
+    """Nodes of a trial without IMU, and the prior of their motion.
+
+    Parameters
+    ----------
+    frame : LocalFrame
+        Tangent frame n.
+    node_time : ndarray, shape (K,), s
+        Of the nodes, by `clock`.
+    density : ndarray, shape (K - 1, 6)
+        Power spectral densities of the acceleration between nodes, as of `motion_steps`.
+    start : SmoothStates
+        States about which the prior of the first is loose.
+    track : TrackFrame
+        Axes in which the velocity through the water changes little.
+    clock : str, optional
+        Name of the time offset of the clock that the nodes have; None = true times.
+    resolution : float, default 0, s
+        Interval of the densest record: a trajectory has no more epochs.
+    block : slice, optional
+        Steps whose prior it has, of a part; by default all.
+    """
+
+    frame: LocalFrame
+    node_time: Array
+    density: Array
+    start: SmoothStates
+    track: TrackFrame
+    clock: str | None = None
+    resolution: float = 0.0
+    block: slice | None = None
+    interpolates: ClassVar[bool] = True
+    step_source: ClassVar[str | None] = MOTION
+
+    @property
+    def count(self) -> int:
+        """Number of its segments, from node to node."""
+        return self.node_time.size - 1
+
+    @property
+    def duration(self) -> float:
+        """How long the motion is known, s."""
+        return float(self.node_time[-1] - self.node_time[0])
+
+    @property
+    def middle(self) -> float:
+        """Middle of the record, s."""
+        return 0.5 * float(self.node_time[0] + self.node_time[-1])
+
+    @cached_property
+    def graph(self) -> gtsam.NonlinearFactorGraph:
+        """Prior of the first state."""
+        graph = gtsam.NonlinearFactorGraph()
+        if self.block is None or self.block.start == 0:
+            s = self.start
+            state = gtsam.NavState(gtsam.Rot3(s.nRb[0]), s.p_n[0], s.v_n[0])
+            loose = loose_diagonal(_FREE[:STATE_SIZE])
+            graph.add(gtsam.PriorFactorNavState(keys.node(0), state, loose))
+            graph.addPriorVector(keys.rate(0), s.omega_b[0], loose_diagonal(_FREE[STATE_SIZE:]))
+        return graph
+
+    @property
+    def constants(self) -> dict[int, int]:
+        """Dimensions of the variables that all nodes share, by key: none."""
+        return {}
+
+    @property
+    def sizes(self) -> list[int]:
+        """Dimensions of the variables of a measurement."""
+        return [STATE_SIZE, RATE_SIZE] * 2
+
+    @property
+    def joints(self) -> range:
+        """Nodes between which branches lie: eliminated last, they leave each by itself."""
+        return range(0, self.node_time.size, _BRANCH)
+
+    def part(self, block: slice) -> SmoothChain:
+        """Return the part of some steps in a row; states keep their keys."""
+        out = replace(self, block=block)
+        # Of all states, which take long to insert.
+        vars(out)["zeros"] = self.zeros
+        return out
+
+    def nodes_of(self, block: slice) -> range:
+        """Return the nodes from the first of some steps to that of the steps after them."""
+        return range(block.start, block.stop + (block.stop == self.count))
+
+    def keys_of(self, nodes: Iterable[int]) -> list[int]:
+        """Return the keys of the states of nodes, each with that of its rates."""
+        return [key for k in nodes for key in (keys.node(k), keys.rate(k))]
+
+    def variables(self, node: IntArray) -> list[IntArray]:
+        """Return the keys of the variables of measurements after nodes (M,), (M,) each."""
+        return [first + k for k in (node, node + 1) for first in (keys.node(0), keys.rate(0))]
+
+    @cached_property
+    def zeros(self) -> gtsam.Values:
+        """States and rates of zero: they take GTSAM far longer to insert than to move."""
+        out, state = gtsam.Values(), gtsam.NavState()
+        for k in range(self.node_time.size):
+            out.insert(keys.node(k), nav_state=state)
+            out.insert(keys.rate(k), np.zeros(RATE_SIZE))
+        return out
+
+    def values(self, states: SmoothStates) -> gtsam.Values:
+        """Return GTSAM's values of states and rates."""
+        step = gtsam.VectorValues()
+        rows = np.hstack([log_so3(states.nRb), states.p_n, states.v_n])
+        for k, (row, rate) in enumerate(zip(rows, states.omega_b, strict=True)):
+            step.insert(keys.node(k), row)
+            step.insert(keys.rate(k), rate)
+        return self.zeros.retract(step)
+
+    def states(self, values: gtsam.Values) -> ChainStates:
+        """Return states as arrays."""
+        return self._states(values, range(self.node_time.size))
+
+    def states_around(self, values: gtsam.Values, k: int) -> ChainStates:
+        """Return the states that measurements after node k depend on."""
+        return self._states(values, range(k, k + 2))
+
+    def from_node(self, k: int) -> SmoothChain:
+        """Return what carries the motion from node k to the next, which then are the first two."""
+        two = slice(k, k + 2)
+        return replace(
+            self,
+            node_time=self.node_time[two],
+            density=self.density[k : k + 1],
+            track=self.track.some(two),
+        )
+
+    def _states(self, values: gtsam.Values, nodes: range) -> ChainStates:
+        state, omega = np.empty((len(nodes), 5, 5)), np.empty((len(nodes), RATE_SIZE))
+        for i, k in enumerate(nodes):
+            # A matrix of GTSAM's is [nRb, p, v; 0, I].
+            state[i] = values.atNavState(keys.node(k)).matrix()
+            omega[i] = values.atVector(keys.rate(k))
+        nRb, p_n, v_n = (state[:, :3, part].copy() for part in (slice(0, 3), 3, 4))
+        some = slice(nodes.start, nodes.stop)
+        return ChainStates(nRb, p_n, v_n, omega, self.node_time[some], self.track.some(some))
+
+    def covers(self, time: Array) -> BoolArray:
+        """Whether times (M,) are between the first node and the last."""
+        return np.asarray((time >= self.node_time[0]) & (time <= self.node_time[-1]))
+
+    def attach(self, time: Array) -> Attached:
+        """Return where times (M,) hang on the chain; those that are not covered, where nearest."""
+        node = np.searchsorted(self.node_time, time, side="right") - 1
+        node = np.clip(node, 0, self.count - 1)
+        # A clock may take a measurement a little beyond the ends.
+        first, last = self.node_time[0] - _MARGIN, self.node_time[-1] + _MARGIN
+        return Attached(node, node, np.clip(time, first, last))
+
+    def later(self, at: Attached, late: Array) -> Attached:
+        """Return an attachment at times that are later by (M,) s, to the same nodes."""
+        return replace(at, time=at.time + late)
+
+    def left(self, at: Attached, late: Array, tolerance: float) -> bool:
+        """Whether measurements later by (M,) s are to be bound anew: they left their nodes."""
+        first, last = self.node_time[at.node], self.node_time[at.node + 1]
+        beyond = np.maximum(first - at.time - late, at.time + late - last)
+        return bool(np.any(beyond > np.maximum(_BEYOND * (last - first), tolerance)))
+
+    def motion(self, at: Attached, states: ChainStates) -> Motion:
+        """Return the motion at M attached times."""
+        return self._between(at, states).motion
+
+    def transition(self, at: Attached, states: ChainStates, motion: Motion) -> Transition:
+        """Return the motion at attached times, from which derivatives by the nodes follow."""
+        return self._between(at, states)
+
+    def _between(self, at: Attached, states: ChainStates) -> Transition:
+        none = np.zeros_like(states.p_n[1:])
+        turning, moving = (
+            interpolated(states.time, own, none, at.time, at.node, steps)
+            for own, steps in (states.turning, states.moving)
+        )
+        return Transition(states.nRb, states.track.nRt, turning, moving)
+
+    def node_jacobian(self, lin: Linearization, transition: Transition) -> Array:
+        """Return the derivative of residuals by the variables of measurements, (M, d, 24)."""
+        return transition.by_nodes(lin)
+
+    def steps(self, states: ChainStates) -> Iterator[StepRows]:
+        """Yield the whitened rows of the prior of the motion, some at a time."""
+        block = slice(0, self.count) if self.block is None else self.block
+        for first in range(block.start, block.stop, _CHUNK):
+            last = min(first + _CHUNK, block.stop)
+            nodes = slice(first, last + 1)
+            turn, move = (
+                motion_steps(
+                    self.node_time[nodes],
+                    SmoothStates(*(getattr(own, name)[nodes] for name in _OF_STATE)),
+                    np.zeros((last - first, 3)),
+                    self.density[first:last],
+                )
+                for own, _ in (states.turning, states.moving)
+            )
+            tRb = (states.track.nRt.transpose(0, 2, 1) @ states.nRb)[nodes]
+            by_nodes = [
+                _joined(turn.before, move.before, tRb[:-1]),
+                _joined(turn.after, move.after, tRb[1:]),
+            ]
+            residual = np.where(_TURNING, turn.residual, move.residual)
+            yield StepRows(MOTION, _COMPONENTS, first, residual, np.concatenate(by_nodes, axis=2))
+
+    @property
+    def log_determinant(self) -> float:
+        """Logarithm of the determinant of the covariance of all steps."""
+        return log_determinant_of_steps(self.node_time, self.density)
+
+    def add_prior(
+        self,
+        graph: gtsam.NonlinearFactorGraph,
+        parameters: Sequence[Parameter],
+        key_of: Mapping[str, int],
+        constants_prior: ConstantsPrior | None,
+    ) -> Sequence[Parameter]:
+        """Add nothing: it has no constants; return all parameters."""
+        return parameters
+
+    def mean_constants(
+        self, states: ChainStates
+    ) -> Iterator[tuple[Parameter, Array, dict[int, Array]]]:
+        """Yield nothing: it has no parameters of its own."""
+        yield from ()
+
+    def errors(
+        self, parameters: Sequence[Parameter], key_of: Mapping[str, int], at: Sequence[Attached]
+    ) -> None:
+        """Return None: there is no IMU."""
+
+    def trajectory(
+        self,
+        states: ChainStates,
+        P: Array,
+        body_axes: BodyAxes,
+        rate_hz: float,
+        lag: float = 0.0,
+    ) -> Trajectory:
+        """Return the motion at a rate, with its covariance.
+
+        Parameters
+        ----------
+        states : ChainStates
+            Of the K nodes.
+        P : ndarray, shape (K, 9, 9)
+            Their covariances at true times, in GTSAM's tangent space.
+        body_axes : BodyAxes
+            Axes of the body.
+        rate_hz : float
+            Epochs in a second, at most those of the densest record.
+        lag : float, default 0, s
+            By how much the clock of the nodes is late.
+        """
+        rate_hz = min(rate_hz, 1.0 / self.resolution if self.resolution else rate_hz)
+        first, last = self.node_time[[0, -1]] - lag
+        time = epochs_between(first, last, rate_hz)
+        P_n = tangent_in_n(P, states.nRb)
+        parts = []
+        for i in range(0, max(time.size, 1), _CHUNK):
+            some = time[i : i + _CHUNK]
+            at = self.attach(some + lag)
+            found = self._between(at, states)
+            span = np.diff(self.node_time)[at.node]
+            fraction = (at.time - self.node_time[at.node]) / span
+            covariance = between(P_n, at.node, fraction)
+            every = np.zeros((some.size, 9, 12))
+            every[:, np.arange(9), np.arange(9)] = 1.0
+            missing = found.variance(self.density, every)
+            R = found.motion.nRb
+            for j in range(3):
+                own = slice(3 * j, 3 * j + 3)
+                block = missing[:, own, own]
+                covariance[:, j] += R @ block @ R.transpose(0, 2, 1) if j == 0 else block
+            parts.append(reported(some, found.motion, covariance, self.frame, body_axes))
+        return parts[0] if len(parts) == 1 else concatenated(parts)
+
+    def release(self) -> None:
+        """Free nothing: nothing is kept for binding measurements."""
+
+    def sources(self, letters: str) -> dict[str, slice]:
+        """Return the sources of noise of one of its factors, and which rows each has."""
+        return {FIRST_STATE: slice(None)}
+
+    def assumed(self) -> dict[str, str]:
+        """Return what is assumed of each of these sources, as text."""
+        turning, moving = np.sqrt(np.median(self.density, axis=0)).reshape(2, 3)
+        return {MOTION: f"{np.degrees(turning.max()):.2g} deg/s/√s, {moving.max():.2g} m/s/√s"}
+
+
+_OF_STATE = ("nRb", "p_n", "v_n", "omega_b")
+# Rows of a step that are of the rotation, and columns of a node.
+_TURNING = np.tile(np.repeat([True, False], 3), 2)
+_BY_ATTITUDE = np.repeat([True, False, False, True], 3)
+_ATTITUDE = np.flatnonzero(_BY_ATTITUDE)
+
+
+def _joined(turning: Array, moving: Array, tRb: Array) -> Array:
+    """Return derivatives (M, d, 12) of steps by a node from those of rotation and track.
+
+    The latter are by position and velocity in axes of the track, tRb (M, 3, 3) from body.
+    """
+    out = turning * (_TURNING[:, None] & _BY_ATTITUDE)
+    for own in (slice(3, 6), slice(6, 9)):
+        out[:, :, own] = (moving[:, :, own] @ tRb) * ~_TURNING[:, None]
+    return out
+
+
+@dataclass(frozen=True)
+class Transition:
+    """Motion at M times between nodes: attitude and rates apart from position and velocity.
+
+    Parameters
+    ----------
+    nRb, nRt : ndarray, shape (K, 3, 3)
+        Axes of the body and of the track at the nodes, to n.
+    turning, moving : Between
+        Attitude and rates, in axes of the body; position and velocity, in axes of the track.
+    """
+
+    nRb: Array
+    nRt: Array
+    turning: Between
+    moving: Between
+
+    @property
+    def motion(self) -> Motion:
+        """The motion."""
+        turning, moving = self.turning.motion, self.moving.motion
+        return replace(turning, p_n=moving.p_n, v_n=moving.v_n, a_n=moving.a_n)
+
+    def by_nodes(self, lin: Linearization) -> Array:
+        """Return the derivatives (M, d, 24) of residuals by both nodes."""
+        node, rows = self.turning.node, by_motion(lin)
+        out = np.zeros((*rows.shape[:2], 24))
+        if lin.d_theta is not None or lin.d_omega is not None:
+            found = self.turning.derivatives(rows * _BY_ATTITUDE)
+            for i, by in enumerate((found.before, found.after)):
+                out[:, :, 12 * i + _ATTITUDE] = by[:, :, _ATTITUDE]
+        if lin.d_p is not None or lin.d_v is not None:
+            found = self.moving.derivatives(rows * ~_BY_ATTITUDE)
+            for i, by in enumerate((found.before, found.after)):
+                k = node + i
+                tRb = self.nRt[k].transpose(0, 2, 1) @ self.nRb[k]
+                for own in (slice(3, 6), slice(6, 9)):
+                    out[:, :, 12 * i + own.start : 12 * i + own.stop] = by[:, :, own] @ tRb
+        return out
+
+    def variance(self, density: Array, rows: Array) -> Array:
+        """Return the covariance (M, d, d) of rows J (M, d, 12) times the motion, given nodes."""
+        turning = self.turning.variance(density, rows * _BY_ATTITUDE)
+        return turning + self.moving.variance(density, rows * ~_BY_ATTITUDE)
+
+
+def by_motion(lin: Linearization) -> Array:
+    """Return the derivatives by attitude, position, velocity and rate, (M, d, 12)."""
+    out = np.zeros((*lin.residual.shape, 12))
+    for i, name in enumerate(("d_theta", "d_p", "d_v", "d_omega")):
+        jacobian = getattr(lin, name)
+        if jacobian is not None:
+            out[:, :, 3 * i : 3 * i + 3] = jacobian
+    return out

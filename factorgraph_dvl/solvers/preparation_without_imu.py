@@ -1,0 +1,481 @@
+"""From a trial without IMU to where its minimisation starts: nodes, states, values of clocks."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import msgspec
+import numpy as np
+
+from factorgraph_dvl.errors import ConfigError, DataError
+from factorgraph_dvl.geometry.earth import LocalFrame
+from factorgraph_dvl.geometry.rotations import BodyAxes, rotation_from_rph
+from factorgraph_dvl.geometry.units import DEG
+from factorgraph_dvl.geometry.vectors import Array, BoolArray, IntArray
+from factorgraph_dvl.graph.chain import Chain
+from factorgraph_dvl.graph.priors import prior_mean
+from factorgraph_dvl.graph.problem import Problem
+from factorgraph_dvl.graph.processes import Process, node_times
+from factorgraph_dvl.graph.smooth_chain import SmoothChain, TrackFrame
+from factorgraph_dvl.graph.smooth_motion import SmoothStates
+from factorgraph_dvl.imu.attitude_record import AttitudeRecord, level_axes
+from factorgraph_dvl.initialization.dvl_mounting import initial_mountings
+from factorgraph_dvl.initialization.record_clocks import clock_lags
+from factorgraph_dvl.initialization.track_velocity import Track, body_track
+from factorgraph_dvl.sensors.attitude import Attitude
+from factorgraph_dvl.sensors.finding import Code, Finding
+from factorgraph_dvl.sensors.ins import Ins
+from factorgraph_dvl.sensors.message import message
+from factorgraph_dvl.sensors.parameters import Parameter
+from factorgraph_dvl.sensors.protocol import Aid, Motion, Observation
+from factorgraph_dvl.sensors.records import rows_of
+from factorgraph_dvl.solution import Progress
+from factorgraph_dvl.solvers.correlated_noise import correlated_noise
+from factorgraph_dvl.solvers.levenberg_marquardt import Minimum
+from factorgraph_dvl.solvers.motion_strengths import Strengths, motion_strengths
+from factorgraph_dvl.solvers.preparation import MountedStart
+from factorgraph_dvl.trial import Trial
+
+CURRENT = "current"
+# Sensors that ask more of the motion than a motion prior gives.
+_NEED_IMU = frozenset({"star", "turntable", "beacons"})
+# Turn rate, averaged over seconds, from which on a vessel turns. Chosen: above yaw in a seaway.
+_TURNING = 0.4 * DEG
+_TURN_SPAN = 10.0
+# Span, s, over which the heading of the track is averaged, and interval of its samples. Chosen:
+# waves that move a ship are shorter, its turns longer.
+_WAVES, _GRID = 20.0, 0.5
+# Longest time between nodes, s, and most nodes. Chosen: waves that move a ship are resolved.
+_LONGEST = 1.5
+_MOST_NODES = 60_000
+# Longest spans, s, over which positions make a velocity, over ground and through water. Chosen:
+# below the time in which a ship turns; through water noise makes wrong clocks more likely.
+_GROUND_SPAN, _WATER_SPAN = 5.0, 15.0
+# Density of acceleration, m²/s³, where the log does not show one.
+_DENSITY = 1e-3
+# Least densities, m²/s³ and rad²/s³. Chosen: they keep the chain regular.
+_LEAST = np.repeat([1e-12, 1e-9], 3)
+# Spans, s, over which changes of velocity on legs show the density; in turns, in which velocity
+# changes steadily, they are the intervals of the pings.
+_LEG_SPANS = (2.0, 10.0)
+# Fewest pings that show which speeds are far off, and by how much: in standard deviations of all,
+# and at least, m/s. Chosen: lever arms, currents and clocks that are off by seconds make less.
+_FEWEST, _FAR_OFF, _FAR_OFF_M_S = 20, 8.0, 2.0
+# Start values of the current as a process: standard deviation, m/s, and correlation time, s.
+_CURRENT_STD, _CURRENT_TIME = 0.1, 3600.0
+# Index of the current among processes. Chosen: after those of all observations.
+_CURRENT_INDEX = 30
+
+
+@dataclass(frozen=True)
+class PreparationWithoutImu:
+    """What every minimisation of a trial without IMU starts from.
+
+    Parameters
+    ----------
+    trial : Trial
+        The trial.
+    first_chain : SmoothChain
+        Nodes, with densities to start from.
+    states : SmoothStates
+        Of the nodes.
+    values : dict of str to ndarray
+        Of clocks and mountings.
+    turning : ndarray of bool, shape (K - 1,)
+        Whether the vessel turns between nodes.
+    observations : tuple of Observation
+        Measurements of all sensors.
+    parameters : tuple of Parameter
+        Calibration parameters of all sensors, fixed ones included.
+    processes : tuple of Process
+        Of the current, if the velocity is through water.
+    estimated_noise : frozenset of str
+        Labels of the observations whose stated noise is only where to start.
+    findings : tuple of Finding
+        What the user must know.
+    """
+
+    trial: Trial
+    first_chain: SmoothChain
+    states: SmoothStates
+    values: dict[str, Array]
+    turning: BoolArray
+    observations: tuple[Observation, ...]
+    parameters: tuple[Parameter, ...]
+    processes: tuple[Process, ...]
+    estimated_noise: frozenset[str]
+    findings: tuple[Finding, ...]
+    rejected: Mapping[str, Array] = field(default_factory=dict)
+
+    def chain(self, states: SmoothStates) -> SmoothChain:
+        """Return the nodes, with densities to start from."""
+        return self.first_chain
+
+    def stated_processes(
+        self, chain: Chain, states: SmoothStates, values: Mapping[str, Array]
+    ) -> tuple[Process, ...]:
+        """Return the processes that the trial states, and those of what is no error."""
+        problem = Problem(chain, self.observations, self.parameters, start=dict(values))
+        every = problem.prior_values() | dict(values)
+        evaluation = problem.evaluate(problem.values(states, every))
+        problem.weigh(evaluation)
+        return (*correlated_noise(problem, evaluation, ()).processes, *self.processes)
+
+    def strengths(self, problem: Problem, minimum: Minimum) -> Strengths:
+        """Return the strengths of motion and noise that residuals ask for."""
+        return motion_strengths(problem, minimum, self.turning)
+
+    def start(self, chain: Chain, states: SmoothStates, report: Progress) -> MountedStart:
+        """Return where the minimisation starts: motion and mountings are known by the records."""
+        return MountedStart(states, self.values, {}, 0)
+
+
+def prepare_without_imu(trial: Trial) -> PreparationWithoutImu:
+    """Return nodes, start states and measurements of a trial without IMU.
+
+    Raises
+    ------
+    ConfigError
+        If sensors are missing, or ask for an IMU.
+    DataError
+        If records are too short.
+    """
+    sensor, source = trial.attitude, trial.position_sensor
+    if sensor is None or source is None:
+        raise ConfigError(
+            "nothing measures the position",
+            where="trial.yaml",
+            expected="with `attitude`, also `gnss` or `ins`",
+        )
+    for aid in trial.aids:
+        if aid.section in _NEED_IMU:
+            raise ConfigError(
+                f"`{aid.section}` needs an IMU",
+                where="trial.yaml",
+                expected="an imu section, or no such sensor",
+            )
+    frame = trial.frame()
+    record = AttitudeRecord(sensor, trial.body_axes, estimated=trial.estimates_noise(sensor))
+    water = trial.dvl is not None and trial.dvl.settings.reference == "water"
+    track = body_track(source, frame, record, longest=_WATER_SPAN if water else _GROUND_SPAN)
+    parameters = _parameters(trial)
+    values = {p.name: prior_mean(p) for p in parameters}
+    values |= _start_values(trial, record, track, frame, parameters)
+    clock = _clock(trial, frame)
+    late = float(values[record.sensor.clock.offset.name][0])
+    lag = float(values[clock][0])
+    nodes = _nodes(trial, record, track, late=late, lag=lag)
+    turning = _turns(record, 0.5 * (nodes[1:] + nodes[:-1]) + late - lag)
+    states = _states(record, track, frame, nodes - lag, late)
+    chain = SmoothChain(
+        frame=frame,
+        node_time=nodes,
+        density=_densities(trial, record, values, states, nodes, turning, late),
+        start=states,
+        track=_track_frame(record, frame, states, nodes - lag, late),
+        clock=clock if any(p.name == clock and p.estimated for p in parameters) else None,
+        resolution=record.interval,
+    )
+    if chain.clock is None:
+        chain = replace(chain, node_time=nodes - lag)
+    by_aid = [(aid, _observations(aid, frame, trial.body_axes, trial)) for aid in trial.aids]
+    return PreparationWithoutImu(
+        trial=trial,
+        first_chain=chain,
+        states=states,
+        values=values,
+        turning=turning,
+        observations=tuple(o for _, every in by_aid for o in every),
+        parameters=parameters,
+        processes=_currents(trial, chain) if water else (),
+        estimated_noise=frozenset(
+            o.label
+            for aid, every in by_aid
+            if trial.estimates_noise(aid)
+            for o in every
+            if o.noise_groups
+        ),
+        findings=(*trial.notes, *_notes(trial), *_left_out(trial)),
+    )
+
+
+def _observations(
+    aid: Aid, frame: LocalFrame, body_axes: BodyAxes, trial: Trial
+) -> tuple[Observation, ...]:
+    """Return all that a sensor measured: errors that last are processes here."""
+    if isinstance(aid, Attitude):
+        return aid.dense_observations(frame, body_axes)
+    if isinstance(aid, Ins):
+        found = aid.dense_observations(frame, body_axes)
+        return found[:2] if trial.find(Attitude) is not None else found
+    return aid.observations(frame, body_axes)
+
+
+def _currents(trial: Trial, chain: SmoothChain) -> tuple[Process, ...]:
+    """Return the current as a process about its mean."""
+    assert trial.dvl is not None
+    s = trial.dvl.settings
+    sigma, tau = s.current_variation_std_m_s, s.current_correlation_time_s
+    known = isinstance(sigma, float) and isinstance(tau, float)
+    std = np.full(2, sigma if isinstance(sigma, float) else _CURRENT_STD)
+    time = tau if isinstance(tau, float) else _CURRENT_TIME
+    if not std.any():
+        return ()
+    noise = np.full(2, float(np.median(trial.dvl.sigma())))
+    nodes = node_times(chain.node_time, time, std, noise)
+    return (
+        Process(
+            CURRENT,
+            _CURRENT_INDEX,
+            std,
+            np.full(2, time),
+            nodes,
+            parameter="current_m_s",
+            free=not known,
+        ),
+    )
+
+
+def _states(
+    record: AttitudeRecord, track: Track, frame: LocalFrame, time: Array, late: float
+) -> SmoothStates:
+    """Return states at true times (M,) by records alone."""
+    p_n, v_n, _ = track.at(time)
+    stamp = np.clip(time + late, record.time[0], record.time[-1])
+    body = record.at(stamp, np.zeros((time.size, 3)), level_axes(frame, p_n))
+    return SmoothStates(body.nRb, p_n, v_n, body.omega_eb_b)
+
+
+def _track_frame(
+    record: AttitudeRecord, frame: LocalFrame, states: SmoothStates, time: Array, late: float
+) -> TrackFrame:
+    """Return level axes that turn with the heading averaged over waves, at true times (K,)."""
+    grid = np.arange(time[0] - _WAVES, time[-1] + _WAVES + _GRID, _GRID)
+    heading = record.rph_at(grid + late)[:, 2]
+    width = 2 * round(0.25 * _WAVES / _GRID) + 1
+    # Twice: a triangle.
+    for _ in range(2):
+        padded = np.pad(heading, width // 2, mode="reflect", reflect_type="odd")
+        heading = np.convolve(padded, np.full(width, 1.0 / width), mode="valid")
+    angle = np.interp(time, grid, heading)
+    rate = np.interp(time, grid, np.gradient(heading, _GRID))
+    rph = np.column_stack([np.zeros((time.size, 2)), angle])
+    nRt = level_axes(frame, states.p_n) @ rotation_from_rph(rph, "FRD")
+    return TrackFrame(nRt, np.column_stack([np.zeros((time.size, 2)), rate]))
+
+
+def _parameters(trial: Trial) -> tuple[Parameter, ...]:
+    """Return the parameters of all sensors; the clock of the positions is that of the trial.
+
+    Without an IMU only differences of clocks show.
+    """
+    section = "ins" if trial.gnss is None else "gnss"
+    out = []
+    for aid in trial.aids:
+        for p in aid.parameters():
+            reference = aid.section == section and p.stem.endswith(("time_offset", "clock_rate"))
+            out.append(replace(p, sigma=np.zeros_like(p.sigma)) if reference else p)
+    return tuple(out)
+
+
+def _start_values(
+    trial: Trial,
+    record: AttitudeRecord,
+    track: Track,
+    frame: LocalFrame,
+    parameters: Sequence[Parameter],
+) -> dict[str, Array]:
+    """Return values of clocks and DVL that fit the track and the attitudes."""
+    dvl = trial.log
+    by_name = {p.name: p for p in parameters}
+    attitude_clock = by_name[record.sensor.clock.offset.name]
+    if dvl is None or not dvl.locked.any():
+        return {}
+    late = float(attitude_clock.mean[0])
+
+    def motion_at(time: Array, attitude_late: float) -> tuple[Motion, np.ndarray]:
+        p_n, v_n, known = track.at(time)
+        stamp = time + attitude_late
+        body = record.at(stamp, np.zeros((time.size, 3)), level_axes(frame, p_n))
+        none = np.zeros_like(p_n)
+        motion = Motion(body.nRb, p_n, v_n, body.omega_eb_b, none, body.alpha_b, body.omega_sigma)
+        return motion, np.asarray(known & record.covers(stamp))
+
+    dvl = rows_of(dvl, _without_gross_errors(dvl.time, dvl.velocity, dvl.locked, track))
+    pings = np.flatnonzero(dvl.locked)
+    pings = pings[:: max(pings.size // 3000, 1)]
+    through_water = dvl.settings.reference == "water"
+    clock = next(p for p in dvl.parameters() if p.name == "time_offset_s")
+    lag, late = clock_lags(
+        dvl.time[pings], dvl.velocity[pings], motion_at, clock, attitude_clock,
+        current=through_water,
+    )  # fmt: skip
+    found = {attitude_clock.name: np.array([late])}
+    if trial.dvl is None:
+        return found
+    settings = dvl.settings
+    if through_water:
+        # A mounting that fits better with another clock makes up for the current.
+        settings = msgspec.structs.replace(settings, time_offset_std_s=0.0)
+    shifted = replace(dvl, settings=settings, time=dvl.time - lag + float(clock.mean[0]))
+    best = initial_mountings(shifted, lambda time: motion_at(time, late))[0]
+    found |= {name: value for name, value in best.items() if name in by_name}
+    if clock.name in found:
+        found[clock.name] = found[clock.name] + lag - clock.mean
+    return found
+
+
+def _without_gross_errors(time: Array, velocity: Array, locked: Array, track: Track) -> IntArray:
+    """Return the pings whose speed is about that of the track: one that is far off turns a fit.
+
+    No mounting changes a speed.
+
+    Parameters
+    ----------
+    time : ndarray, shape (M,), s
+        Of the pings.
+    velocity : ndarray, shape (M, 3), m/s
+        By the DVL.
+    locked : ndarray of bool, shape (M,)
+        Whether there is a velocity.
+    track : Track
+        Of the body.
+    """
+    _, v_n, covered = track.at(time)
+    known = np.flatnonzero(covered & (locked > 0))
+    if known.size < _FEWEST:
+        return np.asarray(np.flatnonzero(locked))
+    off = np.linalg.norm(velocity[known], axis=1) - np.linalg.norm(v_n[known], axis=1)
+    off = np.abs(off - np.median(off))
+    gate = max(_FAR_OFF * 1.4826 * float(np.median(off)), _FAR_OFF_M_S)
+    return np.asarray(known[off < gate])
+
+
+def _clock(trial: Trial, frame: LocalFrame) -> str:
+    """Return the time offset of the clock of the nodes: of what measures the velocity most often.
+
+    Its measurements stay where they are between nodes when its clock moves; with weights of the
+    clock before, that of a DVL was held back 13 times as strongly as the data pulled it.
+    """
+    sensor = trial.dvl or trial.beams or trial.find(Ins) or trial.gnss
+    assert sensor is not None
+    clock = sensor.observations(frame, trial.body_axes)[0].clock
+    assert clock is not None
+    return clock.names[0]
+
+
+def _nodes(
+    trial: Trial, record: AttitudeRecord, track: Track, *, late: float, lag: float
+) -> Array:
+    """Return the times of the nodes by their clock: those of pings, and others in between.
+
+    Parameters
+    ----------
+    trial : Trial
+        Without IMU.
+    record : AttitudeRecord
+        How the body points.
+    track : Track
+        Of the body.
+    late, lag : float, s
+        Time offsets of the attitude and of the nodes.
+    """
+    first = lag + max(track.time[0], record.time[0] - late)
+    last = lag + min(track.time[-1], record.time[-1] - late)
+    if last - first < 10.0:
+        raise DataError(
+            "positions and attitudes have less than 10 s in common",
+            where=record.sensor.source,
+            expected="records of the same time, by one clock",
+        )
+    log = trial.log
+    own = track.time + lag if log is None or log.locked.sum() < 2 else log.time[log.locked]
+    own = own[(own > first) & (own < last)]
+    longest = max(_LONGEST, (last - first) / _MOST_NODES)
+    kept = [first]
+    for t in own.tolist():
+        if t - kept[-1] > 0.5 * longest:
+            kept.append(t)
+    edges = np.append(kept, last)
+    wide = np.flatnonzero(np.diff(edges) > longest)
+    more = [
+        np.linspace(edges[i], edges[i + 1], int(np.ceil((edges[i + 1] - edges[i]) / longest)) + 1)
+        for i in wide
+    ]
+    every = np.unique(np.concatenate([edges, *more]))
+    return np.asarray(every[np.concatenate([[True], np.diff(every) > 1e-3])])
+
+
+def _turns(record: AttitudeRecord, time: Array) -> BoolArray:
+    """Whether the heading changes over seconds about stamps (M,) of the attitude."""
+    ahead = record.rph_at(time + 0.5 * _TURN_SPAN)[:, 2]
+    behind = record.rph_at(time - 0.5 * _TURN_SPAN)[:, 2]
+    return np.asarray(np.abs(ahead - behind) / _TURN_SPAN > _TURNING)
+
+
+def _densities(
+    trial: Trial,
+    record: AttitudeRecord,
+    values: dict[str, Array],
+    states: SmoothStates,
+    nodes: Array,
+    turning: BoolArray,
+    late: float,
+) -> Array:
+    """Return densities of acceleration to start from, (K - 1, 6), on legs and in turns.
+
+    Velocities that are L apart differ by the density times L and by twice the noise: from two L
+    both follow. Rates are those of the record.
+    """
+    out = np.tile(np.repeat([0.0, _DENSITY], 3), (nodes.size - 1, 1))
+    step, change = np.diff(nodes)[:, None], np.diff(states.omega_b, axis=0)
+    for where in (turning, ~turning):
+        if where.any():
+            out[where, :3] = np.mean((change**2 / step)[where], axis=0)
+    log = trial.log
+    if log is not None and log.locked.sum() >= 50:
+        rows = np.flatnonzero(log.locked)
+        time = log.time[rows] - float(values["time_offset_s"][0])
+        v_b = log.velocity[rows] @ values.get("misalignment_deg", np.eye(3))
+        interval = float(np.median(np.diff(time)))
+        in_turn = _turns(record, time + late)
+        spans = {False: _LEG_SPANS, True: (interval, 2.0 * interval)}
+        for kind, of_kind in spans.items():
+            found = _density(v_b, in_turn == kind, of_kind, interval)
+            out[turning == kind, 3:] = found
+    return np.maximum(out, _LEAST)
+
+
+def _density(v_b: Array, wanted: BoolArray, spans: tuple[float, float], interval: float) -> Array:
+    """Return the density (3,) of what changes velocities (M, 3) over two spans, s."""
+    squares = []
+    for span in spans:
+        step = min(max(1, round(span / interval)), len(v_b) - 1)
+        alike = wanted[step:] & wanted[:-step]
+        if step < round(span / interval) or alike.sum() < 20:
+            return np.full(3, _DENSITY)
+        squares.append(np.mean((v_b[step:] - v_b[:-step])[alike] ** 2, axis=0))
+    found = np.maximum((squares[1] - squares[0]) / (spans[1] - spans[0]), 0.0)
+    return np.maximum(found, 1e-6)
+
+
+def _left_out(trial: Trial) -> list[Finding]:
+    """Name errors that the trial states and that are not estimated without an IMU."""
+    return [
+        Finding(
+            Code.ERROR_LEFT_OUT,
+            message("error_left_out.change", section=aid.section, name=key),
+            sensor=aid.label,
+        )
+        for aid in trial.aids
+        for key in aid.settings.left_out
+    ]
+
+
+def _notes(trial: Trial) -> tuple[Finding, ...]:
+    """Return what is left out, for the user."""
+    if trial.find(Ins) is None or trial.find(Attitude) is None:
+        return ()
+    text = message("unused.ins_attitude")
+    return (Finding(Code.UNUSED, text, sensor="INS"),)

@@ -1,0 +1,196 @@
+r"""Likelihood of the constants with the states integrated out.
+
+A trial has states x, of which there are more the longer it lasts, and constants c: what is to
+be calibrated. With whitened residuals r(x, c), their Jacobian J with respect to x and the noise
+Sigma that whitens them, Laplace's approximation of the integral over x is
+
+.. math::
+
+   -2 \log L(c) = \min_x |r(x, c)|^2 + \log\det\Lambda_{xx}(c) + \log\det\Sigma
+                  + \text{const}, \qquad \Lambda_{xx} = J^T J,
+
+which is exact where r is linear in x. The minimum of the first term alone, over states and
+constants together, is biased where J depends on c: a smaller scale of a log makes velocities
+that are not known well less certain, and their volume larger. With many states, each known from
+few measurements, the second term is as steep as the first.
+
+**Value.** With the constants eliminated last, the conditionals of the states, R x + T c = d,
+hold everything. Where residuals are linear in x about the evaluation,
+
+.. math::
+
+   \min_x |r|^2 = |r|^2 - |d|^2, \qquad \log\det\Lambda_{xx} = 2 \sum \log |R_{ii}|.
+
+The restricted likelihood, by which noise is estimated, integrates the constants too: it has
+|d|² and log det R of all conditionals, the constants' Schur complement included.
+
+**Gradient.** With P the covariance of the states given the constants,
+
+.. math::
+
+   \frac{\partial}{\partial c_i} \log\det\Lambda_{xx}
+     = 2 \sum_m \left\langle \frac{\partial J_m}{\partial c_i}, J_m P \right\rangle.
+
+A row J_m depends on few variables, which share a clique: one pass through the tree gives their
+covariance, exactly. ∂J_m/∂c_i is a difference of rows at two values of c_i, of the observations
+that depend on it. Native factors do not depend on constants but linearly.
+
+Half the gradient is what the term adds to the gradient of the cost, and -P_cc times that is how
+far it moves the constants, P_cc their covariance.
+
+References
+----------
+Kristensen, Nielsen, Berg, Skaug and Bell, TMB: Automatic differentiation and Laplace
+approximation, Journal of Statistical Software 70(5), 2016.
+Lindstrom and Bates, Nonlinear mixed effects models for repeated measures data, Biometrics 46(3),
+1990.
+Harville, Maximum likelihood approaches to variance component estimation and to related problems,
+Journal of the American Statistical Association 72(358), 1977.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+
+from factorgraph_dvl.geometry.rotations import exp_so3
+from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.graph.problem import Evaluation, Problem, Rows
+from factorgraph_dvl.sensors.parameters import Parameter
+from factorgraph_dvl.statistics.square_root_information import SquareRootInformation
+
+# Step of a difference, in standard deviations of the parameter, and at most, SI. Chosen: what
+# the rows are not linear in is then below 1e-5 of the change, and rounding below 1e-6 in the
+# gradient times the standard deviation.
+_STEP = 1e-3
+_LONGEST_STEP = 1e-6
+
+
+def marginal_objective(
+    problem: Problem, evaluation: Evaluation, information: SquareRootInformation
+) -> float:
+    """Return -2 log of the likelihood of the constants, with the states integrated out.
+
+    At the constants of the evaluation and the best states near it. It has the squares of all
+    residuals, those of priors included, log det of the states' information given the constants,
+    and log det of the covariances of measurements and of their correlated errors. Left out are
+    what no state, constant or noise factor of a measurement changes: n log 2 pi, and log det of
+    the noise of the IMU, of walks of its biases, of a motion's prior and of the priors of
+    constants. Densities of these are compared with their log det added. A measurement that a
+    robust weight leaves out has its log sigma all the same, and no price for being left out.
+
+    Parameters
+    ----------
+    problem : Problem
+        Weighed at the evaluation.
+    evaluation : Evaluation
+        Where the graph is linear.
+    information : SquareRootInformation
+        From the elimination there, the constants last.
+    """
+    return _objective(problem, evaluation, information.given(_constants(problem)))
+
+
+def restricted_objective(
+    problem: Problem, evaluation: Evaluation, information: SquareRootInformation
+) -> float:
+    """Return -2 log of the likelihood of the noise, with states and constants integrated out.
+
+    At the best states and constants near the evaluation; arguments, and what is left out, as in
+    `marginal_objective`.
+    """
+    return _objective(problem, evaluation, information)
+
+
+def _objective(
+    problem: Problem, evaluation: Evaluation, information: SquareRootInformation
+) -> float:
+    log_sigma = sum(float(each.sum()) for each in problem.log_sigma(evaluation))
+    correlated = sum(process.log_determinant for process in problem.processes)
+    least = evaluation.cost - information.decrease
+    return 2.0 * (least + log_sigma) + information.log_determinant + correlated
+
+
+def log_determinant_gradient(
+    problem: Problem, evaluation: Evaluation, information: SquareRootInformation
+) -> Array:
+    """Return the gradient (P,) of log det of the states' information by the constants.
+
+    At fixed states and weights, in the tangent space of the estimated parameters, SI, in the
+    order of `Problem.columns`.
+
+    Parameters
+    ----------
+    problem : Problem
+        With weights.
+    evaluation : Evaluation
+        Where the graph is linear.
+    information : SquareRootInformation
+        From the elimination there, the constants last.
+    """
+    constants = _constants(problem)
+    out = np.zeros(len(problem.prior_root))
+    if not constants:
+        return out
+    every = {problem.key(name): np.eye(out.size)[:, own] for name, own in problem.columns.items()}
+    sigma = np.sqrt(np.diag(information.covariance_of([every])))
+    steps = np.minimum(_STEP * sigma, _LONGEST_STEP)
+    with_states = _covariance_with_states(
+        problem.observation_rows(evaluation), information.given(constants), constants
+    )
+
+    def total(p: Parameter, value: Array) -> float:
+        out = 0.0
+        for rows in problem.observation_rows_at(evaluation, {p.name: value}):
+            found = with_states[rows.source, rows.begin]
+            out += float(np.einsum("mdn,mdn->", _by_states(rows, constants), found))
+        return out
+
+    for p in problem.parameters:
+        value, own = evaluation.parameters[p.name], problem.columns[p.name]
+        before = total(p, value)
+        for i, step in enumerate(np.diag(steps[own])):
+            after = total(p, value @ exp_so3(step) if p.rotation else value + step)
+            out[own.start + i] = 2.0 * (after - before) / step[i]
+    return out
+
+
+def _constants(problem: Problem) -> set[int]:
+    """Return the keys of the constants."""
+    return {problem.key(p.name) for p in problem.parameters}
+
+
+def _states_of(rows: Rows, constants: set[int]) -> int:
+    """Return how many of the k variables of each item are states, which come before constants."""
+    return sum(key not in constants for key in rows.keys[:1].ravel().tolist())
+
+
+def _by_states(rows: Rows, constants: set[int]) -> Array:
+    """Return the columns of the states, (M, d, n)."""
+    return rows.matrix[:, :, : sum(rows.sizes[: _states_of(rows, constants)])]
+
+
+def _covariance_with_states(
+    every: Iterable[Rows], given: SquareRootInformation, constants: set[int]
+) -> dict[tuple[str, int], Array]:
+    """Return the covariance J P of rows with their own states given the constants, (M, d, n).
+
+    By source and number of the first item.
+    """
+    jacobians, groups = {}, {}
+    place: dict[tuple[int, ...], int] = {}
+    for rows in every:
+        own = rows.keys[:, : _states_of(rows, constants)]
+        jacobian = _by_states(rows, constants).copy()
+        # What is not used need not be in the graph.
+        used = np.flatnonzero(np.any(jacobian, axis=(1, 2)))
+        number = [place.setdefault(tuple(group), len(place)) for group in own[used].tolist()]
+        jacobians[rows.source, rows.begin] = jacobian
+        groups[rows.source, rows.begin] = used, number
+    joint = given.joint_covariances(list(place))
+    for part, (used, number) in groups.items():
+        if number:
+            own_covariance = np.stack([joint[i] for i in number])
+            jacobians[part][used] = jacobians[part][used] @ own_covariance
+    return jacobians

@@ -1,0 +1,65 @@
+"""A trial without IMU on the graph: noise and strengths by likelihood, and what is found."""
+
+from __future__ import annotations
+
+import msgspec
+import numpy as np
+import pytest
+from truth import CONFIGS
+
+from factorgraph_dvl.geometry.rotations import log_so3
+from factorgraph_dvl.geometry.units import DEG
+from factorgraph_dvl.simulation import load_scenario, simulate
+from factorgraph_dvl.solvers.preparation_without_imu import prepare_without_imu
+from factorgraph_dvl.solvers.rounds import settle
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module")
+def trial():
+    scenario = load_scenario(CONFIGS / "ship.yaml")
+    legs = scenario.manoeuvres[0]["manoeuvres"]
+    return simulate(
+        msgspec.structs.replace(scenario, manoeuvres=[{"repeat": 1, "manoeuvres": legs}]), 1
+    )
+
+
+@pytest.fixture(scope="module")
+def settled(trial):
+    prepared = prepare_without_imu(trial)
+    return settle(prepared, prepared.states, lambda *_: None)
+
+
+def sigma_of(settled, name):
+    problem, information = settled.problem, settled.minimum.information
+    size = problem.columns[name].stop - problem.columns[name].start
+    P = information.covariance_of([{problem.key(name): np.eye(size)}])
+    return np.sqrt(np.diag(P))
+
+
+def test_it_settles_near_the_truth(trial, settled):
+    assert settled.minimum.converged
+    values, truth = settled.minimum.evaluation.parameters, trial.calibration_truth
+    off = log_so3(values["misalignment_deg"]) - truth["misalignment_deg"] * DEG
+    assert np.abs(off / sigma_of(settled, "misalignment_deg")).max() < 5.0
+    for name in ("scale_error", "lever_arm_m", "time_offset_s", "attitude_time_offset_s"):
+        off = values[name] - truth.get(name, 0.0)
+        assert np.abs(off / sigma_of(settled, name)).max() < 5.0, name
+
+
+def test_the_noise_is_found(settled):
+    factors = settled.problem.noise_factors
+    sigma = dict(
+        zip(
+            (o.label for o in settled.problem.observations),
+            settled.problem.sigma(settled.minimum.evaluation),
+            strict=True,
+        )
+    )
+    # As simulated, where the settings state or start with others.
+    np.testing.assert_allclose(
+        np.median(sigma["Attitude"], axis=0) / DEG, [0.01, 0.01, 0.02], rtol=0.15
+    )
+    np.testing.assert_allclose(np.median(sigma["DVL velocity"], axis=0), 0.05, rtol=0.2)
+    assert factors["Attitude"].max() < 1.0
