@@ -65,22 +65,27 @@ def _run_with_events(args: list[str]) -> NoReturn:
     from factorgraph_dvl.cli import events
 
     events.switch(True)
+    code = INTERRUPTED
     try:
-        if "--help" in args:
-            _emit_help(args)
-        # Typer would print its help.
-        if not set(args) - set(_EVERYWHERE):
-            _fail("the command is missing", 2, args, "usage")
-        _run(args)
-    except SystemExit as done:
-        events.emit(events.End(_code_of(done)))
-        raise
+        try:
+            if "--help" in args:
+                _emit_help(args)
+            # Typer would print its help.
+            if not set(args) - set(_EVERYWHERE):
+                _fail("the command is missing", 2, args, "usage")
+            _run(args)
+        except SystemExit as done:
+            # The last event states the exit code: no interrupt may change it any more.
+            interrupts.end()
+            code = _code_of(done)
     except KeyboardInterrupt:
+        interrupts.end()
         events.emit(events.Failed("interrupted", "interrupted"))
-        events.emit(events.End(INTERRUPTED))
-        sys.exit(INTERRUPTED)
+    try:
+        events.emit(events.End(code))
     finally:
         events.switch(False)
+    sys.exit(code)
 
 
 def _code_of(done: SystemExit) -> int:

@@ -95,6 +95,26 @@ main(["--version"])
     assert done.stdout.startswith("factorgraph-dvl ")
 
 
+def test_an_interrupt_after_the_last_event_does_not_contradict_it() -> None:
+    script = """
+import signal
+signal.signal(signal.SIGINT, signal.default_int_handler)
+from factorgraph_dvl.cli import events, main
+emit = events.emit
+def interrupted(event):
+    emit(event)
+    if isinstance(event, events.End):
+        signal.raise_signal(signal.SIGINT)
+events.emit = interrupted
+main(["--json", "--version"])
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, timeout=60, check=False
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout.splitlines()[-1] == '{"event":"end","exit_code":0}'
+
+
 def test_a_handler_of_somebody_else_stays() -> None:
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
