@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import stat
 from io import BufferedReader
@@ -95,7 +96,11 @@ def open_file(
     except (FileNotFoundError, NotADirectoryError):
         raise kind("the file does not exist", where=where, expected=expected) from None
     except OSError as error:
-        raise kind(f"cannot be read ({error.strerror})", where=where, expected=expected) from None
+        loop = error.errno == errno.ELOOP
+        what = (
+            "is a link that leads back to itself" if loop else f"cannot be read ({error.strerror})"
+        )
+        raise kind(what, where=where, expected=expected) from None
     except UnicodeEncodeError as error:
         raise kind(
             f"the name of the file cannot be written in {error.encoding}, the encoding of this "

@@ -67,7 +67,7 @@ def map_file(path: Path) -> Source:
     DataError
         If it is missing, no regular file, or unreadable.
     """
-    with open_file(path, expected=f"a file at {path}", where=path.name) as file:
+    with open_file(path, expected=f"a file of an instrument at {path}", where=path.name) as file:
         if os.fstat(file.fileno()).st_size == 0:
             return b""
         try:
