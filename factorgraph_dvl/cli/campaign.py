@@ -72,7 +72,7 @@ def campaign(
         if not path.exists():
             kind = "a trial folder" if seeds is None else "a scenario, a YAML file"
             raise ConfigError("does not exist", where=str(path), expected=kind)
-        if seeds is None and path.is_file() and path.name != SETTINGS_FILE:
+        if seeds is None and not path.is_dir() and path.name != SETTINGS_FILE:
             raise ConfigError(
                 "is not a trial",
                 where=str(path),

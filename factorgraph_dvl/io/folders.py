@@ -199,7 +199,11 @@ def _check_place(path: Path, target: Path) -> None:
     parent = target.parent
     while not parent.exists():
         parent = parent.parent
-    if not (parent.is_dir() and os.access(parent, os.W_OK | os.X_OK)):
+    if not parent.is_dir():
+        raise DataError(
+            f"{parent} is not a folder", where=str(path), expected="a folder, or a new name"
+        )
+    if not os.access(parent, os.W_OK | os.X_OK):
         raise DataError(
             "cannot be written",
             where=str(path),

@@ -21,6 +21,8 @@ from factorgraph_dvl.simulation import simulate
 
 def test_bad_input_is_refused_before_anything_starts(run, tmp_path):
     (tmp_path / "trial").mkdir()
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
     full = tmp_path / "full"
     full.mkdir()
     (full / "thesis.tex").write_text("all of it")
@@ -35,6 +37,7 @@ def test_bad_input_is_refused_before_anything_starts(run, tmp_path):
             *("--out", tmp_path / "out"),
         ),
         "exists and is not empty": (tmp_path / "trial", "--out", full),
+        "pipe: is not a trial": (tmp_path / "trial", pipe, "--out", tmp_path / "out"),
         "a scenario --seeds N": (CONFIGS / "cruise.yaml", "--out", tmp_path / "out"),
     }
     for message, args in cases.items():

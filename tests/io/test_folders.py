@@ -397,6 +397,14 @@ def test_an_output_that_is_a_loop_of_links_is_refused(tmp_path, capsys):
     assert sorted(tmp_path.iterdir()) == before
 
 
+def test_a_folder_is_not_written_below_what_is_no_folder(tmp_path, capsys):
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    trial = write_trial(tmp_path)
+    assert run("solve", trial, "--out", pipe / "result") == 2
+    assert f"result: {pipe} is not a folder; expected a folder" in capsys.readouterr().err
+
+
 def test_an_output_file_takes_the_place_of_no_device(tmp_path, capsys):
     pipe = tmp_path / "pipe"
     os.mkfifo(pipe)
