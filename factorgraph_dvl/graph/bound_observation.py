@@ -237,7 +237,9 @@ class BoundObservation:
             To times of a motion, by its identity and which they are: kept for other observations.
         """
         lin, when = some_of(lin, some), self.observation.time[some]
-        attachment = rows_of(self.attachment, some)
+        # A motion that is interpolated is never extrapolated from where measurements were bound.
+        bound = self.at(parameters) if self.chain.interpolates else self
+        attachment = rows_of(bound.attachment, some)
         errors = self.errors
         by = None if errors is None else rows_of(errors.sensitivity(self.attachment), some)
         here = (

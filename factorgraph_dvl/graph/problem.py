@@ -48,10 +48,7 @@ from factorgraph_dvl.graph.priors import (
 )
 from factorgraph_dvl.graph.processes import Process, in_time_order
 from factorgraph_dvl.graph.template import jacobian_template
-from factorgraph_dvl.imu.propagation import (
-    Attachment,
-    States,
-)
+from factorgraph_dvl.imu.propagation import Attachment
 from factorgraph_dvl.sensors.imu import ERRORS
 from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.sensors.protocol import (
@@ -93,7 +90,7 @@ class Evaluation:
     ----------
     values : gtsam.Values
         Values of all variables, as GTSAM has them.
-    states, parameters : States or dict of str to ndarray
+    states, parameters : ChainStates or dict of str to ndarray
         The same as arrays; parameters by name, rotations as matrices.
     motions, residuals : list of Motion or list of ndarray
         Per observation; residuals whitened, (M, d).
@@ -818,8 +815,7 @@ class Problem:
         transitions: dict[Hashable, Any],
     ) -> tuple[Array, Array]:
         """Return the whitened Jacobian (M, d, n) and residual (M, d) of some measurements."""
-        here = bound.at(evaluation.parameters) if self.chain.interpolates else bound
-        return here.jacobian(
+        return bound.jacobian(
             lin,
             some,
             evaluation.motions[self._bound.index(bound)],

@@ -256,6 +256,7 @@ class SmoothChain:
             node_time=self.node_time[two],
             density=self.density[k : k + 1],
             track=self.track.some(two),
+            block=None,
         )
 
     def _states(self, values: gtsam.Values, nodes: range) -> ChainStates:

@@ -78,6 +78,21 @@ def test_each_measurement_is_a_factor_of_its_own_and_the_whole_graph_is_the_prob
     assert np.abs((found - expected) / scale).max() < 1e-8
 
 
+def test_the_whole_graph_is_the_problem_also_where_clocks_have_moved(prepared, problem):
+    clocks = [name for name in prepared.values if name.endswith("time_offset_s")]
+    late = {name: prepared.values[name] + 0.03 for name in clocks if name != problem.chain.clock}
+    values = problem.values(prepared.states, problem.prior_values() | prepared.values | late)
+    problem.weigh(problem.evaluate(values))
+    graph, start = problem.nonlinear_graph()
+    evaluation = problem.evaluate(start)
+    assert max(np.abs(b.late(evaluation.parameters)).max() for b in problem.bound) > 0.02
+    ordering = problem.ordering()
+    expected, _ = problem.linearize(evaluation).hessian(ordering)
+    found, _ = graph.linearize(start).hessian(ordering)
+    scale = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
+    assert np.abs((found - expected) / scale).max() < 1e-8
+
+
 def test_gtsams_own_optimiser_and_marginals_agree(prepared, problem):
     values = problem.values(prepared.states, problem.prior_values() | prepared.values)
     near = minimise(problem, values, stage="test", tolerance=1e-8).evaluation
