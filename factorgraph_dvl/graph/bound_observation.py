@@ -236,7 +236,7 @@ class BoundObservation:
         transitions : dict
             To times of a motion, by its identity and which they are: kept for other observations.
         """
-        lin, when = some_of(lin, some), self.observation.time[some]
+        lin, when = lin.some(some), self.observation.time[some]
         # A motion that is interpolated is never extrapolated from where measurements were bound.
         bound = self.at(parameters) if self.chain.interpolates else self
         attachment = rows_of(bound.attachment, some)
@@ -293,20 +293,3 @@ class BoundObservation:
         """Return the dimensions of these variables."""
         of_processes = [p.size for p in processes.all for _ in range(2)]
         return [*self.chain.sizes, *of_processes, *(p.mean.size for p in parameters)]
-
-
-def some_of(lin: Linearization, some: slice | IntArray) -> Linearization:
-    """Return residuals and derivatives of some of M measurements."""
-    count = len(lin.residual)
-
-    def own(each: Array) -> Array:
-        # What is the same for all stands there once.
-        return np.asarray(np.broadcast_to(each, (count, *each.shape[1:]))[some])
-
-    by_motion = {
-        name: own(each)
-        for name in ("d_theta", "d_p", "d_v", "d_omega")
-        if (each := getattr(lin, name)) is not None
-    }
-    by_parameters = {name: own(each) for name, each in lin.d_parameters.items()}
-    return Linearization(lin.residual[some], **by_motion, d_parameters=by_parameters)

@@ -90,8 +90,8 @@ class Evaluation:
     ----------
     values : gtsam.Values
         Values of all variables, as GTSAM has them.
-    states, parameters : ChainStates or dict of str to ndarray
-        The same as arrays; parameters by name, rotations as matrices.
+    states, parameters : object or dict of str to ndarray
+        The same as arrays; states as the chain has them, parameters by name, rotations as matrices.
     motions, residuals : list of Motion or list of ndarray
         Per observation; residuals whitened, (M, d).
     cost : float
@@ -103,7 +103,7 @@ class Evaluation:
     """
 
     values: gtsam.Values
-    states: States
+    states: Any
     parameters: dict[str, Array]
     motions: list[Motion]
     residuals: list[Array]

@@ -10,7 +10,6 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import accumulate
-from typing import Any
 
 import gtsam
 import numpy as np
@@ -44,8 +43,6 @@ from factorgraph_dvl.sensors.protocol import (
 
 # What rounding may take off a time, s.
 _ROUNDING = 1e-6
-# Derivatives by the motion, as `Linearization` names them.
-_BY_MOTION = ("d_theta", "d_p", "d_v", "d_omega")
 
 
 @dataclass(frozen=True)
@@ -133,18 +130,7 @@ class ObservationRows:
         self, motion: Motion, values: Mapping[str, Array], wanted: Collection[str]
     ) -> Linearization:
         """Return the residual and its Jacobians."""
-        whole = self.whole.linearize(self._embedded(motion), values, wanted)
-
-        def own(jacobian: Any) -> Any:
-            if jacobian is None:
-                return None
-            return np.broadcast_to(jacobian, (self.whole.time.size, *jacobian.shape[1:]))[
-                self.index
-            ]
-
-        by_motion = {name: own(getattr(whole, name)) for name in _BY_MOTION}
-        by_parameters = {name: own(found) for name, found in whole.d_parameters.items()}
-        return Linearization(own(whole.residual), **by_motion, d_parameters=by_parameters)
+        return self.whole.linearize(self._embedded(motion), values, wanted).some(self.index)
 
     def _embedded(self, motion: Motion) -> Motion:
         """Return a motion at all M times: what the others see does not matter."""
@@ -271,7 +257,7 @@ class NodeMeasurements:
         for r, own, wanted in zip(self.rows, motions, self.wanted, strict=True):
             lin = linearized(r.observation, own, values, wanted, self.clock_zero)
             matrix = np.zeros((*lin.residual.shape, first + size))
-            matrix[:, :, :first] = _by_motion(lin) @ transition.whole[r.at]
+            matrix[:, :, :first] = lin.by_motion @ transition.whole[r.at]
             by_parameters = matrix[:, :, first:]
             for name, jacobian in lin.d_parameters.items():
                 if name in self._place:
@@ -347,16 +333,6 @@ class Linearized:
             return False
         # Bytes of few numbers take less time to compare.
         return all(self.values[name].tobytes() == at.tobytes() for name, at in values.items())
-
-
-def _by_motion(lin: Linearization) -> Array:
-    """Return the derivatives by attitude, position, velocity and rate, (M, d, 12)."""
-    out = np.zeros((*lin.residual.shape, 12))
-    for i, name in enumerate(_BY_MOTION):
-        jacobian = getattr(lin, name)
-        if jacobian is not None:
-            out[:, :, 3 * i : 3 * i + 3] = jacobian
-    return out
 
 
 def measurement_factor(

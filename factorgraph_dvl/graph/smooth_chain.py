@@ -462,7 +462,7 @@ class Transition:
 
     def by_nodes(self, lin: Linearization) -> Array:
         """Return the derivatives (M, d, 24) of residuals by both nodes."""
-        node, rows = self.turning.node, by_motion(lin)
+        node, rows = self.turning.node, lin.by_motion
         out = np.zeros((*rows.shape[:2], 24))
         if lin.d_theta is not None or lin.d_omega is not None:
             found = self.turning.derivatives(rows * _BY_ATTITUDE)
@@ -481,13 +481,3 @@ class Transition:
         """Return the covariance (M, d, d) of rows J (M, d, 12) times the motion, given nodes."""
         turning = self.turning.variance(density, rows * _BY_ATTITUDE)
         return turning + self.moving.variance(density, rows * ~_BY_ATTITUDE)
-
-
-def by_motion(lin: Linearization) -> Array:
-    """Return the derivatives by attitude, position, velocity and rate, (M, d, 12)."""
-    out = np.zeros((*lin.residual.shape, 12))
-    for i, name in enumerate(("d_theta", "d_p", "d_v", "d_omega")):
-        jacobian = getattr(lin, name)
-        if jacobian is not None:
-            out[:, :, 3 * i : 3 * i + 3] = jacobian
-    return out

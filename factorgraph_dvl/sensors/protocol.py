@@ -27,6 +27,8 @@ NoiseModel = Literal["estimated", "stated"]
 # the first by chance, and no data sheet is wrong by the second.
 TOO_LARGE = 1.3
 DO_NOT_FIT = 10.0
+# Derivatives by the motion, as `Linearization` names them.
+_BY_MOTION = ("d_theta", "d_p", "d_v", "d_omega")
 # Correlation time where none is stated, s. Chosen: that of multipath and atmosphere.
 USUAL_CORRELATION_TIME = 100.0
 
@@ -85,6 +87,30 @@ class Linearization:
     d_v: Array | None = None
     d_omega: Array | None = None
     d_parameters: dict[str, Array] = field(default_factory=dict)
+
+    @property
+    def by_motion(self) -> Array:
+        """Derivatives by attitude, position, velocity and rate, (M, d, 12)."""
+        out = np.zeros((*self.residual.shape, 12))
+        for i, name in enumerate(_BY_MOTION):
+            jacobian = getattr(self, name)
+            if jacobian is not None:
+                out[:, :, 3 * i : 3 * i + 3] = jacobian
+        return out
+
+    def some(self, index: slice | IntArray) -> Linearization:
+        """Return residuals and derivatives of some of the M measurements."""
+        count = len(self.residual)
+
+        def own(each: Array) -> Array:
+            # What is the same for all stands there once.
+            return np.asarray(np.broadcast_to(each, (count, *each.shape[1:]))[index])
+
+        by_motion = {
+            name: own(each) for name in _BY_MOTION if (each := getattr(self, name)) is not None
+        }
+        by_parameters = {name: own(each) for name, each in self.d_parameters.items()}
+        return Linearization(self.residual[index], **by_motion, d_parameters=by_parameters)
 
 
 class SensorClock(Protocol):

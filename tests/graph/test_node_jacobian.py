@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from factorgraph_dvl.graph.bound_observation import some_of
 from factorgraph_dvl.sensors.protocol import Linearization
 
 
@@ -18,7 +17,7 @@ def test_derivatives_of_some_measurements_are_theirs():
         np.arange(8.0).reshape(4, 2), d_v=by_speed, d_parameters={"scale": constant}
     )
     for some in (slice(1, 3), np.array([3, 0])):
-        found = some_of(lin, some)
+        found = lin.some(some)
         np.testing.assert_array_equal(found.residual, lin.residual[some])
         np.testing.assert_array_equal(found.d_v, by_speed[some])
         np.testing.assert_array_equal(found.d_parameters["scale"], np.ones((2, 2, 1)))
