@@ -91,7 +91,8 @@ class Evaluation:
     values : gtsam.Values
         Values of all variables, as GTSAM has them.
     states, parameters : object or dict of str to ndarray
-        The same as arrays; states as the chain has them, parameters by name, rotations as matrices.
+        The same as arrays: states as the chain has them, parameters by name, rotations as
+        matrices.
     motions, residuals : list of Motion or list of ndarray
         Per observation; residuals whitened, (M, d).
     cost : float
