@@ -51,12 +51,7 @@ from factorgraph_dvl.graph.template import jacobian_template
 from factorgraph_dvl.imu.propagation import Attachment
 from factorgraph_dvl.sensors.imu import ERRORS
 from factorgraph_dvl.sensors.parameters import Parameter
-from factorgraph_dvl.sensors.protocol import (
-    Aid,
-    Linearization,
-    Motion,
-    Observation,
-)
+from factorgraph_dvl.sensors.protocol import Aid, Linearization, Motion, Observation
 
 # Stands for zero in a fixed direction, in standard deviations of the prior. Chosen: what data
 # that do not determine the direction cannot move.
@@ -158,7 +153,7 @@ class Problem:
     Parameters
     ----------
     chain : Chain
-        Inertial part of the graph.
+        Nodes, and what ties them to each other.
     observations : sequence of Observation
         Measurements of the aiding sensors.
     parameters : sequence of Parameter
@@ -172,7 +167,7 @@ class Problem:
     processes : sequence of Process, optional
         Correlated errors of the observations, at most one each.
     usable : mapping of str to ndarray of bool, optional
-        By label, measurements (M,) that may be used where the IMU covers them; by default all.
+        By label, measurements (M,) that may be used where the chain covers them; by default all.
     attached : sequence of (ndarray, Attachment), optional
         Times (M,) that are attached already, such as those of another problem's `attached`.
     tilt : Tilt, optional
@@ -301,7 +296,7 @@ class Problem:
 
     @property
     def usable(self) -> dict[str, BoolArray]:
-        """Measurements (M,) that the IMU covers, by label."""
+        """Measurements (M,) that may be used and that the chain covers, by label."""
         return {b.observation.label: b.usable for b in self._bound}
 
     @property
@@ -647,7 +642,7 @@ class Problem:
         graph : gtsam.NonlinearFactorGraph
             Its minimum is that of the problem.
         values : gtsam.Values
-            States `x`, biases `b`, and parameters, at `key`.
+            States `x`, biases `b` or rates `w`, and parameters, at `key`.
 
         Raises
         ------

@@ -23,7 +23,6 @@ from factorgraph_dvl.graph.smooth_motion import (
     NodeSteps,
     SmoothStates,
     interpolated,
-    log_determinant_of_steps,
     motion_steps,
     node_steps,
 )
@@ -141,7 +140,7 @@ class SmoothChain:
     start : SmoothStates
         States about which the prior of the first is loose.
     track : TrackFrame
-        Axes in which the velocity through the water changes little.
+        Axes in which the velocity changes little.
     clock : str, optional
         Name of the time offset of the clock that the nodes have; None = true times.
     resolution : float, default 0, s
@@ -333,11 +332,6 @@ class SmoothChain:
             ]
             residual = np.where(_TURNING, turn.residual, move.residual)
             yield StepRows(MOTION, _COMPONENTS, first, residual, np.concatenate(by_nodes, axis=2))
-
-    @property
-    def log_determinant(self) -> float:
-        """Logarithm of the determinant of the covariance of all steps."""
-        return log_determinant_of_steps(self.node_time, self.density)
 
     def add_prior(
         self,

@@ -20,7 +20,7 @@ their first two derivatives, give every Jacobian here.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
 
@@ -122,20 +122,13 @@ def motion_steps(time: Array, states: SmoothStates, current_n: Array, density: A
     return Steps(residual, *steps.by_tangents(slice(None), by_gamma, by_rate, by_start))
 
 
-def log_determinant_of_steps(time: Array, density: Array) -> float:
-    """Return the logarithm of the determinant of the covariance of all steps together."""
-    dt = np.diff(time)
-    each = np.broadcast_to(density, (dt.size, 6))
-    return float(6.0 * np.log(dt**4 / 12.0).sum() + 2.0 * np.log(each).sum())
-
-
 @dataclass(frozen=True)
 class Between:
     """Motion at M times between the nodes; `interpolated` makes it.
 
     Derivatives and variances are of rows J times the motion: theta of nRb Exp(theta), p_n, v_n,
-    omega_eb_b, in this order. They take memory of M d 12 numbers and more, so of many times those
-    of `some` are better asked for one after the other.
+    omega_eb_b, in this order. They take memory of M d 12 numbers and more, so many times are
+    better asked for in parts.
 
     Parameters
     ----------
@@ -160,12 +153,6 @@ class Between:
     rate: Array
     u_b: Array
     steps: NodeSteps
-
-    def some(self, index: IntArray | slice) -> Between:
-        """Return the motion at some of the times."""
-        motion = Motion(*(getattr(self.motion, f.name)[index] for f in fields(Motion)))
-        rows = ("node", "tau", "gamma", "rate", "u_b")
-        return replace(self, motion=motion, **{name: getattr(self, name)[index] for name in rows})
 
     def derivatives(self, rows: Array) -> Derivatives:
         """Return the derivatives of rows J (M, d, 12) times the motion."""
@@ -199,16 +186,6 @@ class Between:
         gg = tau**3 * rest**3 / (3.0 * span**3)
         gr = tau**2 * rest**2 * (rest - tau) / (2.0 * span**3)
         rr = tau * rest * (span**2 - 3.0 * tau * rest) / span**3
-        return self._spread(density, rows, (gg, gr, rr))
-
-    def variance_rate(self, density: Array, rows: Array) -> Array:
-        """Return the derivative of `variance` in time, at constant attitude and rates."""
-        tau, span = self.tau, self.steps.span[self.node]
-        rest = span - tau
-        left = rest - tau
-        gg = tau**2 * rest**2 * left / span**3
-        gr = tau * rest * (left**2 - tau * rest) / span**3
-        rr = left * (span**2 - 6.0 * tau * rest) / span**3
         return self._spread(density, rows, (gg, gr, rr))
 
     def _spread(self, density: Array, rows: Array, variances: tuple[Array, Array, Array]) -> Array:

@@ -167,12 +167,10 @@ def settle(
     parameters: tuple[Parameter, ...] = prepared.parameters
     tested: tuple[Parameter, ...] | None = None
     long_run: Mapping[str, Array] = {}
-    first_levels = _NoiseLevels((as_stated,), bool(as_stated))
     tilt: Tilt | None = None
     motion = 0
-    first_levels = replace(
-        first_levels, processes=prepared.stated_processes(chain, states, values)
-    )
+    stated = prepared.stated_processes(chain, states, values)
+    first_levels = _NoiseLevels((as_stated,), bool(as_stated), processes=stated)
     levels = first_levels
     changing = [message("not_converged.all")]
     tolerance: Mapping[str, float] = {}
@@ -290,6 +288,7 @@ def settle(
                 # With another model, all that its misfit made is to be found anew.
                 changing.append(_KNOWN)
                 robust, long_run, levels, tolerance = {}, {}, first_levels, {}
+                tilt, motion = None, 0
                 searches, correlation_searched, count = 0, False, 0
         if not changing and levels.estimated and minimum.converged:
             last = levels
@@ -448,9 +447,7 @@ def _clock_tolerance(
 
 
 def _halfway(
-    prepared: Prepared,
-    before: Mapping[str, Array],
-    after: Mapping[str, Array],
+    prepared: Prepared, before: Mapping[str, Array], after: Mapping[str, Array]
 ) -> dict[str, Array]:
     """Return offsets and rates of clocks half-way between two sets of values."""
     names = _clock_parameters(prepared, before, after)
@@ -458,9 +455,7 @@ def _halfway(
 
 
 def _clock_movement(
-    prepared: Prepared,
-    before: Mapping[str, Array],
-    after: Mapping[str, Array],
+    prepared: Prepared, before: Mapping[str, Array], after: Mapping[str, Array]
 ) -> float:
     """Return the largest change of an offset, s, or of a rate between two sets of values."""
     names = _clock_parameters(prepared, before, after)
@@ -468,9 +463,7 @@ def _clock_movement(
 
 
 def _clock_parameters(
-    prepared: Prepared,
-    before: Mapping[str, Array],
-    after: Mapping[str, Array],
+    prepared: Prepared, before: Mapping[str, Array], after: Mapping[str, Array]
 ) -> list[str]:
     """Return the names of offsets and rates of clocks that both sets of values have."""
     clocks = [o.clock for o in prepared.observations if o.clock is not None]

@@ -11,10 +11,8 @@ from factorgraph_dvl.geometry.vectors import rotate
 from factorgraph_dvl.graph.smooth_motion import (
     SmoothStates,
     interpolated,
-    log_determinant_of_steps,
     motion_steps,
 )
-from factorgraph_dvl.sensors.protocol import Motion
 
 TIME = np.array([0.0, 0.7, 2.0, 4.5, 5.0, 6.1])
 AT = np.array([0.0, 0.2, 0.7, 1.1, 3.9, 4.6, 5.9, 6.1])
@@ -145,7 +143,6 @@ def test_whitened_by_the_covariance_of_a_step():
     states, current = scene(0.3)
     varying = DENSITY * np.linspace(1.0, 3.0, TIME.size - 1)[:, None]
     found = motion_steps(TIME, states, current, varying)
-    total = 0.0
     for k, t in enumerate(np.diff(TIME)):
         (nRb, other), p = states.nRb[k : k + 2], states.p_n[k : k + 2]
         relative = nRb.T @ (p[1] - p[0] - current[k] * t)
@@ -160,10 +157,6 @@ def test_whitened_by_the_covariance_of_a_step():
         e = np.concatenate([gamma - t * twists[0], rate - twists[0]])
         expected = np.linalg.solve(np.linalg.cholesky(Q), e)
         np.testing.assert_allclose(found.residual[k], expected, rtol=1e-9, atol=1e-9)
-        total += np.linalg.slogdet(Q)[1]
-    assert log_determinant_of_steps(TIME, varying) == pytest.approx(total, rel=1e-12)
-    one = log_determinant_of_steps(TIME, DENSITY)
-    assert one == pytest.approx(total - 12.0 * np.log(np.linspace(1.0, 3.0, 5)).sum())
 
 
 @pytest.mark.parametrize("size", SIZES)
@@ -201,28 +194,6 @@ def test_jacobians_between_nodes(size):
             (found.by_current[m], by_current[k, :, m].T),
         ):
             np.testing.assert_allclose(block, expected, atol=1e-7 * scale)
-
-
-def test_rows_of_some_times_are_those_of_all():
-    states, current = scene(0.5)
-    between = interpolated(TIME, states, current, AT)
-    every = between.derivatives(EVERY)
-    rows = np.random.default_rng(1).standard_normal((AT.size, 3, 12))
-    index = np.array([6, 1, 3])
-    some = between.some(index)
-    for found, whole in zip(some.derivatives(rows[index]), every, strict=True):
-        np.testing.assert_allclose(found, rows[index] @ whole[index], atol=1e-12)
-    factors = np.linspace(1.0, 3.0, TIME.size - 1)
-    varying = DENSITY * factors[:, None]
-    for name in ("variance", "variance_rate"):
-        each = factors[between.node][:, None, None] * getattr(between, name)(DENSITY, EVERY)
-        whole = rows @ each @ rows.swapaxes(1, 2)
-        found = getattr(some, name)(varying, rows[index])
-        np.testing.assert_allclose(found, whole[index], atol=1e-12)
-    for f in fields(Motion):
-        np.testing.assert_array_equal(
-            getattr(some.motion, f.name), getattr(between.motion, f.name)[index]
-        )
 
 
 def test_at_the_nodes_and_beyond_the_ends_it_is_the_nodes():
@@ -303,15 +274,3 @@ def test_variance_is_that_of_the_process_given_both_nodes(turn, tolerance):
         np.testing.assert_allclose(
             found[m] / np.outer(sigma, sigma), expected / np.outer(sigma, sigma), atol=tolerance
         )
-
-
-def test_variance_rate_is_the_slope_of_the_variance():
-    # At rest, where attitude and rates are constant.
-    states = constant_twist(np.zeros(6), np.zeros(3), TIME)
-    at, h = np.array([0.3, 1.7, 2.9, 4.8, 5.2]), 1e-5
-    rows = np.random.default_rng(1).standard_normal((at.size, 3, 12))
-    up, down, here = (
-        interpolated(TIME, states, np.zeros((TIME.size - 1, 3)), t) for t in (at + h, at - h, at)
-    )
-    slope = (up.variance(DENSITY, rows) - down.variance(DENSITY, rows)) / (2.0 * h)
-    np.testing.assert_allclose(here.variance_rate(DENSITY, rows), slope, rtol=1e-6, atol=1e-10)
