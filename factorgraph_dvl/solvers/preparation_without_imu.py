@@ -63,7 +63,7 @@ _LEG_SPANS = (2.0, 10.0)
 # and at least, m/s. Chosen: lever arms, currents and clocks that are off by seconds make less.
 _FEWEST, _FAR_OFF, _FAR_OFF_M_S = 20, 8.0, 2.0
 # Start values of the current as a process: standard deviation, m/s, and correlation time, s.
-_CURRENT_STD, _CURRENT_TIME = 0.1, 3600.0
+_CURRENT_STD, _CURRENT_TIME = 0.5, 3600.0
 # Index of the current among processes. Chosen: after those of all observations.
 _CURRENT_INDEX = 30
 

@@ -51,3 +51,33 @@ def leverage(
     with_probes = information.covariance_with([sums])
     for each, z in zip(rows(), signs, strict=True):
         yield each, np.asarray(np.mean(z * product(each, with_probes), axis=2))
+
+
+def exact_leverage(
+    rows: Iterable[Rows], information: SquareRootInformation
+) -> Iterator[tuple[Rows, Array]]:
+    """Yield rows with their leverages (M, d): where few degrees of freedom are left of many.
+
+    The variables of an item must share a clique, as those of a factor of the graph do.
+
+    Parameters
+    ----------
+    rows : iterable of Rows
+        Of the graph.
+    information : SquareRootInformation
+        Information of the whole graph.
+    """
+    every = list(rows)
+    place: dict[tuple[int, ...], int] = {}
+    used = [np.flatnonzero(np.any(each.matrix, axis=(1, 2))) for each in every]
+    number = [
+        [place.setdefault(tuple(group), len(place)) for group in each.keys[i].tolist()]
+        for each, i in zip(every, used, strict=True)
+    ]
+    joint = information.joint_covariances(list(place))
+    for each, i, own in zip(every, used, number, strict=True):
+        h = np.zeros(each.vector.shape)
+        if own:
+            matrix = each.matrix[i]
+            h[i] = np.sum((matrix @ np.stack([joint[k] for k in own])) * matrix, axis=2)
+        yield each, h

@@ -9,7 +9,7 @@ import numpy as np
 
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph.problem import Evaluation, Problem
-from factorgraph_dvl.statistics.leverage import leverage
+from factorgraph_dvl.statistics.leverage import exact_leverage, leverage
 from factorgraph_dvl.statistics.rows import CORRELATED, rows_by_source
 from factorgraph_dvl.statistics.square_root_information import SquareRootInformation
 
@@ -110,7 +110,12 @@ def variance_components(
     count += problem.chain.count * 12 * (steps is not None)
     found: dict[str, list[tuple[Array, Array]]] = {}
     estimated = partial(filter, lambda rows: rows.source in wanted)
-    for rows, h in leverage(lambda: estimated(source(evaluation)), count, information):
+    with_leverage = (
+        leverage(lambda: estimated(source(evaluation)), count, information)
+        if steps is None
+        else exact_leverage(estimated(source(evaluation)), information)
+    )
+    for rows, h in with_leverage:
         found.setdefault(rows.source, []).append((rows.vector, h))
     white = {
         label: _white(problem, evaluation, label, *map(np.concatenate, zip(*parts, strict=True)))
