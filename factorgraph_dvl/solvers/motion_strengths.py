@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from factorgraph_dvl.geometry.vectors import Array, BoolArray
+from factorgraph_dvl.geometry.vectors import Array, IntArray
 from factorgraph_dvl.graph.priors import Tilt
 from factorgraph_dvl.graph.problem import Problem
 from factorgraph_dvl.graph.processes import Process
@@ -54,7 +54,7 @@ class Strengths:
     same: bool
 
 
-def motion_strengths(problem: Problem, minimum: Minimum, turning: BoolArray) -> Strengths:
+def motion_strengths(problem: Problem, minimum: Minimum, phase: IntArray) -> Strengths:
     """Return strengths by restricted maximum likelihood, and the tilt that goes with them.
 
     Parameters
@@ -63,8 +63,8 @@ def motion_strengths(problem: Problem, minimum: Minimum, turning: BoolArray) -> 
         Of a chain without IMU.
     minimum : Minimum
         Where it ended.
-    turning : ndarray of bool, shape (K - 1,)
-        Whether the vessel turns: accelerations there have densities of their own.
+    phase : ndarray of int, shape (K - 1,)
+        What the heading does: accelerations have densities of their own in each phase.
     """
     chain = problem.chain
     assert isinstance(chain, SmoothChain)
@@ -80,14 +80,14 @@ def motion_strengths(problem: Problem, minimum: Minimum, turning: BoolArray) -> 
     density = chain.density.copy()
     assert found.steps is not None
     squares, freedom = ((each[:, :6] + each[:, 6:]) for each in found.steps)
-    for where in (turning, ~turning):
-        if where.any():
-            total, left = squares[where].sum(axis=0), freedom[where].sum(axis=0)
-            ratio = (total + _PRIOR_FREEDOM) / (np.maximum(left, 0.0) + _PRIOR_FREEDOM)
-            ratio = np.exp(np.clip(np.log(ratio), -_LARGEST, _LARGEST))
-            after = np.clip(density[where] * ratio, _LEAST, _MOST)
-            changes.append(np.log(after[0] / density[where][0]) * (left > 1.0))
-            density[where] = after
+    for kind in np.unique(phase):
+        where = phase == kind
+        total, left = squares[where].sum(axis=0), freedom[where].sum(axis=0)
+        ratio = (total + _PRIOR_FREEDOM) / (np.maximum(left, 0.0) + _PRIOR_FREEDOM)
+        ratio = np.exp(np.clip(np.log(ratio), -_LARGEST, _LARGEST))
+        after = np.clip(density[where] * ratio, _LEAST, _MOST)
+        changes.append(np.log(after[0] / density[where][0]) * (left > 1.0))
+        density[where] = after
     processes, values = [], dict(evaluation.parameters)
     for process in problem.processes:
         own = found.correlated.get(process.label)

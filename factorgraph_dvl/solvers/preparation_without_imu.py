@@ -80,10 +80,12 @@ class PreparationWithoutImu:
         Nodes, with densities to start from.
     states : SmoothStates
         Of the nodes.
+    record : AttitudeRecord
+        Whose heading the track follows.
     values : dict of str to ndarray
         Of clocks and mountings.
-    turning : ndarray of bool, shape (K - 1,)
-        Whether the vessel turns between nodes.
+    phase : ndarray of int, shape (K - 1,)
+        What the heading does between nodes: 0 = stays, 1 = turns, 2 = begins or ends to turn.
     observations : tuple of Observation
         Measurements of all sensors.
     parameters : tuple of Parameter
@@ -99,8 +101,9 @@ class PreparationWithoutImu:
     trial: Trial
     first_chain: SmoothChain
     states: SmoothStates
+    record: AttitudeRecord
     values: dict[str, Array]
-    turning: BoolArray
+    phase: IntArray
     observations: tuple[Observation, ...]
     parameters: tuple[Parameter, ...]
     processes: tuple[Process, ...]
@@ -124,7 +127,12 @@ class PreparationWithoutImu:
 
     def strengths(self, problem: Problem, minimum: Minimum) -> Strengths:
         """Return the strengths of motion and noise that residuals ask for."""
-        return motion_strengths(problem, minimum, self.turning)
+        found = motion_strengths(problem, minimum, self.phase)
+        chain, values = found.chain, minimum.evaluation.parameters
+        lag = 0.0 if chain.clock is None else float(values[chain.clock][0])
+        late = float(values[self.record.sensor.clock.offset.name][0])
+        axes = _track_axes(self.record, chain.frame, self.states, chain.node_time - lag, late)
+        return replace(found, chain=replace(chain, nRt=axes))
 
     def start(self, chain: Chain, states: SmoothStates, report: Progress) -> MountedStart:
         """Return where the minimisation starts: motion and mountings are known by the records."""
@@ -166,14 +174,14 @@ def prepare_without_imu(trial: Trial) -> PreparationWithoutImu:
     late = float(values[record.sensor.clock.offset.name][0])
     lag = float(values[clock][0])
     nodes = _nodes(trial, record, track, late=late, lag=lag)
-    turning = _turns(record, 0.5 * (nodes[1:] + nodes[:-1]) + late - lag)
+    phase = _phases(record, 0.5 * (nodes[1:] + nodes[:-1]) + late - lag)
     # Pings are half-way between nodes of the attitude: its acceleration jumps at these.
     half = 0.5 * float(np.median(np.diff(nodes)))
     states = _states(record, track, frame, nodes - lag, late - half)
     chain = SmoothChain(
         frame=frame,
         node_time=nodes,
-        density=_densities(trial, record, values, states, nodes, turning, late),
+        density=_densities(trial, record, values, states, nodes, phase, late),
         start=states,
         nRt=_track_axes(record, frame, states, nodes - lag, late),
         clock=clock if any(p.name == clock and p.estimated for p in parameters) else None,
@@ -188,8 +196,9 @@ def prepare_without_imu(trial: Trial) -> PreparationWithoutImu:
         trial=trial,
         first_chain=chain,
         states=states,
+        record=record,
         values=values,
-        turning=turning,
+        phase=phase,
         observations=tuple(o for _, every in by_aid for o in every),
         parameters=parameters,
         processes=_currents(trial, chain) if water else (),
@@ -258,10 +267,17 @@ def _track_axes(
     grid = np.arange(time[0] - _WAVES, time[-1] + _WAVES + _GRID, _GRID)
     heading = record.rph_at(grid + late)[:, 2]
     width = 2 * round(0.25 * _WAVES / _GRID) + 1
-    # Twice: a triangle.
-    for _ in range(2):
-        padded = np.pad(heading, width // 2, mode="reflect", reflect_type="odd")
-        heading = np.convolve(padded, np.full(width, 1.0 / width), mode="valid")
+
+    def mean(angle: Array) -> Array:
+        # Twice: a triangle.
+        for _ in range(2):
+            padded = np.pad(angle, width // 2, mode="reflect", reflect_type="odd")
+            angle = np.convolve(padded, np.full(width, 1.0 / width), mode="valid")
+        return angle
+
+    # What the mean leaves over is averaged too, so that it follows where a turn begins (Tukey's
+    # twicing).
+    heading = mean(2.0 * heading - mean(heading))
     angle = np.interp(time, grid, heading)
     rph = np.column_stack([np.zeros((time.size, 2)), angle])
     return level_axes(frame, states.p_n) @ rotation_from_rph(rph, "FRD")
@@ -410,11 +426,19 @@ def _nodes(
     return np.asarray(every[np.concatenate([[True], np.diff(every) > 1e-3])])
 
 
-def _turns(record: AttitudeRecord, time: Array) -> BoolArray:
-    """Whether the heading changes over seconds about stamps (M,) of the attitude."""
-    ahead = record.rph_at(time + 0.5 * _TURN_SPAN)[:, 2]
-    behind = record.rph_at(time - 0.5 * _TURN_SPAN)[:, 2]
-    return np.asarray(np.abs(ahead - behind) / _TURN_SPAN > _TURNING)
+def _phases(record: AttitudeRecord, time: Array) -> IntArray:
+    """Return what the heading does about stamps (M,) of the attitude, averaged over seconds.
+
+    It stays (0), turns at a rate (1), or begins or ends to turn (2): axes that turn with its
+    average are behind it then.
+    """
+    ahead, here, behind = (
+        record.rph_at(time + shift)[:, 2] for shift in (_TURN_SPAN, 0.0, -_TURN_SPAN)
+    )
+    after, before = (ahead - here) / _TURN_SPAN, (here - behind) / _TURN_SPAN
+    changes = np.abs(after - before) > _TURNING
+    turns = np.abs(after + before) > 2.0 * _TURNING
+    return np.where(changes, 2, turns.astype(int))
 
 
 def _densities(
@@ -423,30 +447,29 @@ def _densities(
     values: dict[str, Array],
     states: SmoothStates,
     nodes: Array,
-    turning: BoolArray,
+    phase: IntArray,
     late: float,
 ) -> Array:
-    """Return densities of acceleration to start from, (K - 1, 6), on legs and in turns.
+    """Return densities of acceleration to start from, (K - 1, 6), by what the heading does.
 
     Velocities that are L apart differ by the density times L and by twice the noise: from two L
     both follow. Rates are those of the record.
     """
     out = np.tile(np.repeat([0.0, _DENSITY], 3), (nodes.size - 1, 1))
     step, change = np.diff(nodes)[:, None], np.diff(states.omega_b, axis=0)
-    for where in (turning, ~turning):
-        if where.any():
-            out[where, :3] = np.mean((change**2 / step)[where], axis=0)
+    for kind in np.unique(phase):
+        where = phase == kind
+        out[where, :3] = np.mean((change**2 / step)[where], axis=0)
     log = trial.log
     if log is not None and log.locked.sum() >= 50:
         rows = np.flatnonzero(log.locked)
         time = log.time[rows] - float(values["time_offset_s"][0])
         v_b = log.velocity[rows] @ values.get("misalignment_deg", np.eye(3))
         interval = float(np.median(np.diff(time)))
-        in_turn = _turns(record, time + late)
-        spans = {False: _LEG_SPANS, True: (interval, 2.0 * interval)}
-        for kind, of_kind in spans.items():
-            found = _density(v_b, in_turn == kind, of_kind, interval)
-            out[turning == kind, 3:] = found
+        at_pings = _phases(record, time + late)
+        for kind in np.unique(phase):
+            spans = (interval, 2.0 * interval) if kind else _LEG_SPANS
+            out[phase == kind, 3:] = _density(v_b, at_pings == kind, spans, interval)
     return np.maximum(out, _LEAST)
 
 
