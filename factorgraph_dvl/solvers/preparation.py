@@ -80,7 +80,9 @@ class Prepared(Protocol):
     ) -> tuple[Process, ...]:
         """Return the processes that are in the problem from the start."""
 
-    def strengths(self, problem: Problem, minimum: Minimum) -> Strengths | None:
+    def strengths(
+        self, problem: Problem, minimum: Minimum, before: Strengths | None
+    ) -> Strengths | None:
         """Return the strengths of the motion's prior, None where the chain has none."""
 
 
@@ -135,7 +137,7 @@ class Preparation:
         """Return none: noise is white until residuals show another one."""
         return ()
 
-    def strengths(self, problem: Problem, minimum: Minimum) -> None:
+    def strengths(self, problem: Problem, minimum: Minimum, before: Strengths | None) -> None:
         """Return None: the IMU ties the nodes."""
 
     def chain(self, states: States) -> InertialChain:

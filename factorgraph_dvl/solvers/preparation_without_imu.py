@@ -125,9 +125,10 @@ class PreparationWithoutImu:
         problem.weigh(evaluation)
         return (*correlated_noise(problem, evaluation, ()).processes, *self.processes)
 
-    def strengths(self, problem: Problem, minimum: Minimum) -> Strengths:
+    def strengths(self, problem: Problem, minimum: Minimum, before: Strengths | None) -> Strengths:
         """Return the strengths of motion and noise that residuals ask for."""
-        found = motion_strengths(problem, minimum, self.phase)
+        steps = None if before is None else before.steps
+        found = motion_strengths(problem, minimum, self.phase, steps)
         chain, values = found.chain, minimum.evaluation.parameters
         lag = 0.0 if chain.clock is None else float(values[chain.clock][0])
         late = float(values[self.record.sensor.clock.offset.name][0])
