@@ -10,16 +10,17 @@ import numpy as np
 from factorgraph_dvl.errors import ConfigError
 from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.rotations import rotation_from_rph
-from factorgraph_dvl.geometry.units import DEG, DEG_PER_HOUR, MICRO_G
+from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array, rotate
-from factorgraph_dvl.imu.propagation import States
+from factorgraph_dvl.graph.smooth_motion import SmoothStates
+from factorgraph_dvl.sensors.attitude import Attitude, AttitudeAngles
+from factorgraph_dvl.sensors.ins import Ins
+from factorgraph_dvl.sensors.records import white_noise
 from factorgraph_dvl.simulation import plan_motion, simulate
 from factorgraph_dvl.simulation.motion import TrueMotion
 from factorgraph_dvl.simulation.scenario import AngularSway, Heave, Scenario, StartSettings
 from factorgraph_dvl.solution import Solution
-from factorgraph_dvl.solvers.information_along_trial import RATE_HZ, Frontier
-from factorgraph_dvl.solvers.motion_information import motion_history, predict_motion
-from factorgraph_dvl.solvers.motion_summary import summarise_motion
+from factorgraph_dvl.solvers.information_along_trial import Frontier
 from factorgraph_dvl.solvers.prediction import TrueStates, continue_posterior, predict_posterior
 from factorgraph_dvl.statistics.information_history import InformationHistory
 from factorgraph_dvl.trial import Trial
@@ -97,14 +98,8 @@ def predict(scenario: Scenario) -> Prediction:
     recorded, scenario = scenario, msgspec.structs.replace(scenario, noise=False)
     motion = plan_motion(scenario)
     trial = simulate(scenario)
-    true_states = _true_states(motion, trial)
-    frontier: Frontier | None = None
-    if trial.imu is None:
-        found = predict_motion(trial, simulate(recorded), true_states)
-        solution = summarise_motion(trial, found, rate_hz=RATE_HZ)
-        history = motion_history(found)
-    else:
-        solution, history, frontier = predict_posterior(trial, true_states)
+    white = _white_noise(simulate(recorded)) if trial.imu is None else {}
+    solution, history, frontier = predict_posterior(trial, _true_states(motion), white)
     return Prediction(
         scenario=scenario,
         trial=trial,
@@ -163,7 +158,7 @@ def extend(
     trial = simulate(further)
     start = ending.frontier
     assert start is not None
-    history, frontier = continue_posterior(trial, _true_states(motion, trial), start)
+    history, frontier = continue_posterior(trial, _true_states(motion), start)
     return history, _ending(motion, frontier, ending.time)
 
 
@@ -186,22 +181,28 @@ def _ending(motion: TrueMotion, frontier: Frontier | None, before: float) -> End
     return Ending(start, before + motion.duration, frontier)
 
 
-def _true_states(motion: TrueMotion, trial: Trial) -> TrueStates:
-    none = np.zeros(3)
-    gyro = trial.calibration_truth.get("gyro_bias_deg_h", none) * DEG_PER_HOUR
-    accel = trial.calibration_truth.get("accel_bias_ug", none) * MICRO_G
-
-    def states(frame: LocalFrame, time: Array) -> States:
+def _true_states(motion: TrueMotion) -> TrueStates:
+    def states(frame: LocalFrame, time: Array) -> SmoothStates:
         state = motion.at(np.clip(time, 0.0, motion.duration))
         lRn = frame.level_from_tangent(state.geodetic[:, 0], state.geodetic[:, 1])
         nRl = lRn.transpose(0, 2, 1)
-        zero = np.zeros((time.size, 3))
-        return States(
+        return SmoothStates(
             nRb=nRl @ rotation_from_rph(state.rph, motion.body_axes),
             p_n=frame.position(*state.geodetic.T),
             v_n=rotate(nRl, state.v_n),
-            gyro_bias=zero + gyro,
-            accel_bias=zero + accel,
+            omega_b=state.omega_eb_b,
         )
 
     return states
+
+
+def _white_noise(recorded: Trial) -> dict[str, Array]:
+    """Return the white noise of attitudes, by label: no trial states it, a record shows it."""
+    frame = recorded.frame()
+    return {
+        o.label: white_noise(np.unwrap(o.measured, axis=0))
+        for aid in recorded.aids
+        if isinstance(aid, Attitude | Ins) and recorded.estimates_noise(aid)
+        for o in aid.dense_observations(frame, recorded.body_axes)
+        if isinstance(o, AttitudeAngles)
+    }

@@ -55,7 +55,7 @@ _GROUND_SPAN, _WATER_SPAN = 5.0, 15.0
 # Density of acceleration, m²/s³, where the log does not show one.
 _DENSITY = 1e-3
 # Least densities, m²/s³ and rad²/s³. Chosen: they keep the chain regular.
-_LEAST = np.repeat([1e-12, 1e-9], 3)
+LEAST_DENSITY = np.repeat([1e-12, 1e-9], 3)
 # Spans, s, over which changes of velocity on legs show the density; in turns, in which velocity
 # changes steadily, they are the intervals of the pings.
 _LEG_SPANS = (2.0, 10.0)
@@ -444,7 +444,7 @@ def _densities(
         for kind, of_kind in spans.items():
             found = _density(v_b, in_turn == kind, of_kind, interval)
             out[turning == kind, 3:] = found
-    return np.maximum(out, _LEAST)
+    return np.maximum(out, LEAST_DENSITY)
 
 
 def _density(v_b: Array, wanted: BoolArray, spans: tuple[float, float], interval: float) -> Array:
