@@ -227,10 +227,7 @@ class Problem:
         others = chain.add_prior(self.graph, self.parameters, self._key, constants_prior)
         add_priors(self.graph, others, self._key)
         self.tilt = tilt
-        # Its place among the factors of `graph`.
-        self.tilt_index: int | None = None
         if tilt is not None and self.parameters:
-            self.tilt_index = self.graph.size()
             self.graph.add(tilt.factor(self.parameters, self._key))
         self._weighed_at: gtsam.Values | None = None
         # Factors from node to node, their matrices and vectors: views that live no longer.

@@ -286,8 +286,7 @@ def _rows_by_step(
     """Return all factors of the linearised graph by the first node of each.
 
     What involves nothing but constants and the first node without a measurement, the priors, is
-    under -1; noise that is correlated belongs to the node before its own. A tilt is no
-    information.
+    under -1; noise that is correlated belongs to the node before its own.
     """
     gaussian = problem.linearize(evaluation)
     time = problem.chain.node_time
@@ -299,8 +298,6 @@ def _rows_by_step(
     priors = problem.graph.size()
     out: dict[int, list[_Factor]] = {}
     for i in range(gaussian.size()):
-        if i == problem.tilt_index:
-            continue
         factor = gaussian.at(i)
         involved = list(factor.keys())
         known = {of_states[key] for key in involved if key in of_states} or {
