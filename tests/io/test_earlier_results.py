@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from running import run  # noqa: F401
 
 from factorgraph_dvl.campaign.record import RunRecord
 from factorgraph_dvl.campaign.trials import assembled
@@ -42,7 +43,7 @@ def test_a_result_is_loaded_whole(folder):
     assert set(names) <= set(solution.order)
 
 
-def test_its_page_is_made_anew_and_compared(folder, run):
+def test_its_page_is_made_anew_and_compared(folder, run):  # noqa: F811
     assert run("report", folder).code == 0
     page = (folder / "report.html").read_text(encoding="utf-8")
     assert "how much the current carries the vessel" in page
