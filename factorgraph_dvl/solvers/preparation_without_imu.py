@@ -17,7 +17,7 @@ from factorgraph_dvl.graph.chain import Chain
 from factorgraph_dvl.graph.priors import prior_mean
 from factorgraph_dvl.graph.problem import Problem
 from factorgraph_dvl.graph.processes import Process, node_times
-from factorgraph_dvl.graph.smooth_chain import SmoothChain, TrackFrame
+from factorgraph_dvl.graph.smooth_chain import SmoothChain
 from factorgraph_dvl.graph.smooth_motion import SmoothStates
 from factorgraph_dvl.imu.attitude_record import AttitudeRecord, level_axes
 from factorgraph_dvl.initialization.dvl_mounting import initial_mountings
@@ -173,7 +173,7 @@ def prepare_without_imu(trial: Trial) -> PreparationWithoutImu:
         node_time=nodes,
         density=_densities(trial, record, values, states, nodes, turning, late),
         start=states,
-        track=_track_frame(record, frame, states, nodes - lag, late),
+        nRt=_track_axes(record, frame, states, nodes - lag, late),
         clock=clock if any(p.name == clock and p.estimated for p in parameters) else None,
         resolution=record.interval,
     )
@@ -247,9 +247,9 @@ def _states(
     return SmoothStates(body.nRb, p_n, v_n, body.omega_eb_b)
 
 
-def _track_frame(
+def _track_axes(
     record: AttitudeRecord, frame: LocalFrame, states: SmoothStates, time: Array, late: float
-) -> TrackFrame:
+) -> Array:
     """Return level axes that turn with the heading averaged over waves, at true times (K,)."""
     grid = np.arange(time[0] - _WAVES, time[-1] + _WAVES + _GRID, _GRID)
     heading = record.rph_at(grid + late)[:, 2]
@@ -259,10 +259,8 @@ def _track_frame(
         padded = np.pad(heading, width // 2, mode="reflect", reflect_type="odd")
         heading = np.convolve(padded, np.full(width, 1.0 / width), mode="valid")
     angle = np.interp(time, grid, heading)
-    rate = np.interp(time, grid, np.gradient(heading, _GRID))
     rph = np.column_stack([np.zeros((time.size, 2)), angle])
-    nRt = level_axes(frame, states.p_n) @ rotation_from_rph(rph, "FRD")
-    return TrackFrame(nRt, np.column_stack([np.zeros((time.size, 2)), rate]))
+    return level_axes(frame, states.p_n) @ rotation_from_rph(rph, "FRD")
 
 
 def _parameters(trial: Trial) -> tuple[Parameter, ...]:
