@@ -13,7 +13,7 @@ from factorgraph_dvl.geometry.rotations import rotation_from_rph
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array, rotate
 from factorgraph_dvl.graph.smooth_motion import SmoothStates
-from factorgraph_dvl.sensors.attitude import Attitude, AttitudeAngles
+from factorgraph_dvl.sensors.attitude import LEAST_STD, Attitude, AttitudeAngles
 from factorgraph_dvl.sensors.ins import Ins
 from factorgraph_dvl.sensors.records import white_noise
 from factorgraph_dvl.simulation import plan_motion, simulate
@@ -40,7 +40,8 @@ class Ending:
     time : float
         Time since the start of the plan, s, for the phase of the sway.
     frontier : Frontier or None
-        Posterior at the end; None without IMU, where the whole plan is predicted anew.
+        Posterior at the end; None without IMU, where the whole plan is predicted anew: errors of
+        compass and GNSS last longer than a manoeuvre.
     """
 
     start: StartSettings
@@ -95,10 +96,12 @@ def predict(scenario: Scenario) -> Prediction:
             where=scenario.source,
             expected="imu, attitude or ins in place of heading and log",
         )
-    recorded, scenario = scenario, msgspec.structs.replace(scenario, noise=False)
+    scenario = msgspec.structs.replace(scenario, noise=False)
     motion = plan_motion(scenario)
     trial = simulate(scenario)
-    white = _white_noise(simulate(recorded)) if trial.imu is None else {}
+    white: dict[str, Array] = {}
+    if trial.imu is None:
+        white = _white_noise(simulate(msgspec.structs.replace(scenario, noise=True)))
     solution, history, frontier = predict_posterior(trial, _true_states(motion), white)
     return Prediction(
         scenario=scenario,
@@ -106,7 +109,7 @@ def predict(scenario: Scenario) -> Prediction:
         solution=replace(solution, solver="plan"),
         history=history,
         duration=motion.duration,
-        ending=_ending(motion, frontier, 0.0),
+        ending=_ending(motion, None if trial.imu is None else frontier, 0.0),
     )
 
 
@@ -199,10 +202,13 @@ def _true_states(motion: TrueMotion) -> TrueStates:
 def _white_noise(recorded: Trial) -> dict[str, Array]:
     """Return the white noise of attitudes, by label: no trial states it, a record shows it."""
     frame = recorded.frame()
-    return {
-        o.label: white_noise(np.unwrap(o.measured, axis=0))
-        for aid in recorded.aids
-        if isinstance(aid, Attitude | Ins) and recorded.estimates_noise(aid)
-        for o in aid.dense_observations(frame, recorded.body_axes)
-        if isinstance(o, AttitudeAngles)
-    }
+    out = {}
+    for aid in recorded.aids:
+        if not (isinstance(aid, Attitude | Ins) and recorded.estimates_noise(aid)):
+            continue
+        for o in aid.dense_observations(frame, recorded.body_axes):
+            if isinstance(o, AttitudeAngles):
+                estimated = np.isin(np.arange(3), [i for group in o.noise_groups for i in group])
+                own = np.maximum(white_noise(np.unwrap(o.measured, axis=0)), LEAST_STD)
+                out[o.label] = np.where(estimated, own, np.median(o.std, axis=0))
+    return out

@@ -82,12 +82,13 @@ def component_changes(
         return []
     functionals = [derivatives for _, derivatives in rows]
     of_component = [(name, p) for p, _ in rows for name in p.component_names]
-    time = chain.node_time
+    time, tilt = chain.node_time, problem.tilt
     tests = changes(
         rows_with_times(problem, rows_by_source(problem, evaluation) if every is None else every),
         information.covariance_with(functionals),
         information.covariance_of(functionals),
         (float(time[0]), float(time[-1])),
+        {problem.key(n): tilt.gradient[own] for n, own in problem.columns.items()} if tilt else {},
     )
     return [
         ComponentChange(name, p, test)
