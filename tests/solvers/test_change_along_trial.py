@@ -35,7 +35,7 @@ ACCURATE = {
 }
 
 
-def tests_of(trial):
+def most_probable_changes(trial):
     prepared = prepare_without_imu(trial)
     found = settle(prepared, prepared.states, lambda *_: None)
     minimum = found.minimum
@@ -54,7 +54,7 @@ def turned(trial, degrees, after):
 def test_a_mount_that_turns_is_found(seed):
     trial = simulate(config("ship", manoeuvres=LINES * 2, **ACCURATE), seed)
     middle = float(np.mean(trial.dvl.time[[0, -1]]))
-    found = max(tests_of(turned(trial, 0.5, middle)), key=lambda t: t.change.fall)
+    found = max(most_probable_changes(turned(trial, 0.5, middle)), key=lambda t: t.change.fall)
     assert found.name == "misalignment_z_deg"
     assert found.change.significance > CHANGED
     assert found.change.time == pytest.approx(middle, abs=10.0)
@@ -64,4 +64,4 @@ def test_a_mount_that_turns_is_found(seed):
 @pytest.mark.parametrize("seed", [1, 2])
 def test_an_honest_mount_is_not_accused(seed):
     trial = simulate(config("ship", manoeuvres=LINES * 2, **ACCURATE), seed)
-    assert max(t.change.significance for t in tests_of(trial)) < CHANGED
+    assert max(t.change.significance for t in most_probable_changes(trial)) < CHANGED
