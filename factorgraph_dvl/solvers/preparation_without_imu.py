@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import msgspec
 import numpy as np
@@ -23,6 +23,7 @@ from factorgraph_dvl.imu.attitude_record import AttitudeRecord, level_axes
 from factorgraph_dvl.initialization.dvl_mounting import initial_mountings
 from factorgraph_dvl.initialization.record_clocks import clock_lags
 from factorgraph_dvl.initialization.track_velocity import Track, body_track
+from factorgraph_dvl.ranging.position_from_ranges import StartPositions
 from factorgraph_dvl.sensors.attitude import Attitude
 from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.sensors.ins import Ins
@@ -106,7 +107,16 @@ class PreparationWithoutImu:
     processes: tuple[Process, ...]
     estimated_noise: frozenset[str]
     findings: tuple[Finding, ...]
-    rejected: Mapping[str, Array] = field(default_factory=dict)
+
+    @property
+    def start_positions(self) -> StartPositions:
+        """States to start from: the records know the position."""
+        return StartPositions((self.states,))
+
+    @property
+    def rejected(self) -> Mapping[str, Array]:
+        """Return none: gross errors are found by the minimisation."""
+        return {}
 
     def chain(self, states: SmoothStates) -> SmoothChain:
         """Return the nodes, with densities to start from."""
