@@ -139,6 +139,19 @@ class Rows:
     begin: int = 0
 
 
+class _Tilted(gtsam.GaussianFactorGraph):
+    """A linear graph with a tilt, whose error is the cost: without the tilt's constant."""
+
+    def __init__(self, others: gtsam.GaussianFactorGraph, constant: float) -> None:
+        super().__init__()
+        self.push_back(others)
+        self._constant = constant
+
+    def error(self, at: gtsam.VectorValues) -> float:
+        """Return the cost that the linear model has at a step."""
+        return float(super().error(at)) - self._constant
+
+
 def observed(
     aids: Sequence[Aid], frame: LocalFrame, body_axes: BodyAxes
 ) -> tuple[tuple[Observation, ...], tuple[Parameter, ...]]:
@@ -531,6 +544,7 @@ class Problem:
             self._follow(evaluation.parameters)
         gaussian = self.native(evaluation)
         if self.tilt is not None:
+            gaussian = _Tilted(gaussian, self.tilt.constant)
             factor = self.tilt.factor(self.parameters, self._key)
             gaussian.push_back(factor.linearize(evaluation.values))
         self._add_steps(gaussian, evaluation)
@@ -548,9 +562,10 @@ class Problem:
         for block in self._blocks:
             for bound in block.bound:
                 late = bound.late(parameters)
-                if self.chain.left(bound.attachment, late, SAME_TIME):
+                shift = self.chain.shift(parameters)
+                if self.chain.left(bound.attachment, late, SAME_TIME, shift):
                     bound.time = bound.time + late
-                    bound.attachment = self.chain.attach(bound.time)
+                    bound.attachment = self.chain.attach(bound.time, shift)
                     block.parts, block.matrices, block.vectors, block.factors = [], [], [], []
 
     def _fill(self, evaluation: Evaluation) -> None:
@@ -658,10 +673,12 @@ class Problem:
 
         if self._weighed_at is None:
             raise ValueError("the measurements have no weights yet: call `weigh` first")
+        if self.chain.interpolates:
+            self._follow(self.arrays(self._weighed_at)[1])
         return native_graph(self), gtsam.Values(self._weighed_at)
 
     def native(self, evaluation: Evaluation) -> gtsam.GaussianFactorGraph:
-        """Return the factors of priors and processes, and those of GTSAM, linear at an evaluation."""
+        """Return the factors of priors, of processes and of GTSAM, linear at an evaluation."""
         if self._imu_errors is None or evaluation.imu is None:
             out = self.graph.linearize(evaluation.values)
         else:
@@ -743,7 +760,7 @@ class Problem:
         return BoundObservation(
             observation,
             self.chain,
-            self.chain.attach(time) if at is None else at,
+            self.chain.attach(time, self.chain.shift(self.bound_at)) if at is None else at,
             time,
             covered,
             weight,

@@ -64,13 +64,14 @@ class Attached:
         Node before.
     segment : ndarray of int, shape (M,)
         The same: segments are from node to node.
-    time : ndarray, shape (M,), s
-        By the clock of the nodes.
+    time, turned : ndarray, shape (M,), s
+        By the clock of the nodes, and by that of their attitudes.
     """
 
     node: IntArray
     segment: IntArray
     time: Array
+    turned: Array
 
 
 @dataclass(frozen=True)
@@ -109,6 +110,11 @@ class SmoothChain:
         Axes of the track to n: level, they turn with the heading but not with waves.
     clock : str, optional
         Name of the time offset of the clock that the nodes have; None = true times.
+    attitude_clock : str, optional
+        Name of the time offset of the clock that their attitudes have: measurements of attitude
+        then stay where they are between nodes whatever the clocks.
+    first_shift : float, default 0, s
+        By how much that clock was late where both agree with the times of the nodes.
     resolution : float, default 0, s
         Interval of the densest record: a trajectory has no more epochs.
     block : slice, optional
@@ -121,6 +127,8 @@ class SmoothChain:
     start: SmoothStates
     nRt: Array
     clock: str | None = None
+    attitude_clock: str | None = None
+    first_shift: float = 0.0
     resolution: float = 0.0
     block: slice | None = None
     interpolates: ClassVar[bool] = True
@@ -235,25 +243,41 @@ class SmoothChain:
         return ChainStates(nRb, p_n, v_n, omega, self.node_time[some])
 
     def covers(self, time: Array) -> BoolArray:
-        """Whether times (M,) are between the first node and the last."""
-        return np.asarray((time >= self.node_time[0]) & (time <= self.node_time[-1]))
+        """Whether times (M,) are between the first node and the last but one.
 
-    def attach(self, time: Array) -> Attached:
-        """Return where times (M,) hang on the chain; those that are not covered, where nearest."""
-        node = np.searchsorted(self.node_time, time, side="right") - 1
+        The last one is for attitudes, whose nodes may be earlier.
+        """
+        return np.asarray((time >= self.node_time[0]) & (time <= self.node_time[-2]))
+
+    def shift(self, parameters: Mapping[str, Array]) -> float:
+        """Return by how much its clock of attitudes is late beside that of the nodes, s."""
+        if self.attitude_clock is None:
+            return 0.0
+        lag = 0.0 if self.clock is None else float(parameters[self.clock][0])
+        return float(parameters[self.attitude_clock][0]) - lag - self.first_shift
+
+    def attach(self, time: Array, shift: float = 0.0) -> Attached:
+        """Return where times (M,) hang on the chain; those that are not covered, where nearest.
+
+        Between the nodes that their attitude is between: what turns a vessel is faster than what
+        moves it.
+        """
+        turned = time + shift
+        node = np.searchsorted(self.node_time, turned, side="right") - 1
         node = np.clip(node, 0, self.count - 1)
         # A clock may take a measurement a little beyond the ends.
-        first, last = self.node_time[0] - _MARGIN, self.node_time[-1] + _MARGIN
-        return Attached(node, node, np.clip(time, first, last))
+        ends = self.node_time[0] - _MARGIN, self.node_time[-1] + _MARGIN
+        return Attached(node, node, np.clip(time, *ends), np.clip(turned, *ends))
 
-    def later(self, at: Attached, late: Array) -> Attached:
+    def later(self, at: Attached, late: Array, shift: float = 0.0) -> Attached:
         """Return an attachment at times that are later by (M,) s, to the same nodes."""
-        return replace(at, time=at.time + late)
+        return replace(at, time=at.time + late, turned=at.time + late + shift)
 
-    def left(self, at: Attached, late: Array, tolerance: float) -> bool:
+    def left(self, at: Attached, late: Array, tolerance: float, shift: float = 0.0) -> bool:
         """Whether measurements later by (M,) s are to be bound anew: they left their nodes."""
         first, last = self.node_time[at.node], self.node_time[at.node + 1]
-        beyond = np.maximum(first - at.time - late, at.time + late - last)
+        turned = at.time + late + shift
+        beyond = np.maximum(first - turned, turned - last)
         return bool(np.any(beyond > np.maximum(_BEYOND * (last - first), tolerance)))
 
     def motion(self, at: Attached, states: ChainStates) -> Motion:
@@ -264,7 +288,7 @@ class SmoothChain:
         self, at: Attached, states: ChainStates, motion: Motion | None = None
     ) -> Between:
         """Return the motion at attached times, from which derivatives by the nodes follow."""
-        return interpolated(states.turns, states.time, states, at.time, at.node)
+        return interpolated(states.turns, states.time, states, at.node, at.time, at.turned)
 
     def node_jacobian(self, lin: Linearization, transition: Between) -> Array:
         """Return the derivative of residuals by the variables of measurements, (M, d, 24)."""

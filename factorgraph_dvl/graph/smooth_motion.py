@@ -193,8 +193,8 @@ class Between:
         The node before each.
     motion : Motion
         At the times.
-    tau : ndarray, shape (M,), s
-        Time since the node before.
+    tau, tau_turned : ndarray, shape (M,), s
+        Time since the node before, of position and velocity, and of attitude and rate.
     gamma, rate : ndarray, shape (M, 3)
         Local variable of the attitude and its derivative in time.
     states : SmoothStates
@@ -206,6 +206,7 @@ class Between:
     node: IntArray
     motion: Motion
     tau: Array
+    tau_turned: Array
     gamma: Array
     rate: Array
     states: SmoothStates
@@ -214,10 +215,12 @@ class Between:
     def by_nodes(self, lin: Linearization) -> Array:
         """Return the derivatives (M, d, 24) of residuals by the tangents of both nodes."""
         out = np.zeros((*lin.residual.shape, 24))
-        weights = _hermite(self.tau, self.turns.span[self.node])[:2, :, :, None, None]
+        span = self.turns.span[self.node]
         if lin.d_theta is not None or lin.d_omega is not None:
+            weights = _hermite(self.tau_turned, span)[:2, :, :, None, None]
             self._add_turn(out, weights, lin.d_theta, lin.d_omega)
         if lin.d_p is not None or lin.d_v is not None:
+            weights = _hermite(self.tau, span)[:2, :, :, None, None]
             parts = zip(weights, (lin.d_p, lin.d_v), strict=True)
             by_end, by_end_rate, by_rate = np.sum(
                 [w * by for w, by in parts if by is not None], axis=0
@@ -281,9 +284,9 @@ class Between:
 
 
 def interpolated(
-    turns: Turns, time: Array, states: SmoothStates, at: Array, node: IntArray
+    turns: Turns, time: Array, states: SmoothStates, node: IntArray, at: Array, turned: Array
 ) -> Between:
-    """Return the motion at times `at` (M,), s, after nodes (M,).
+    """Return the motion at times `at` (M,), s, and the attitude at `turned`, after nodes (M,).
 
     The position's derivative in time is the velocity, and that of the attitude the rate.
 
@@ -295,18 +298,20 @@ def interpolated(
         Of the nodes.
     states : SmoothStates
         At the nodes.
-    at : ndarray, shape (M,), s
-        Times of the motion.
     node : ndarray of int, shape (M,)
         Nodes before, whose motion goes on where a time is not between them and the next.
+    at, turned : ndarray, shape (M,), s
+        Times of the motion by the clock of the nodes, and by that of their attitudes.
     """
-    tau = at - time[node]
-    weights = _hermite(tau, turns.span[node])[..., None]
+    tau, tau_turned = at - time[node], turned - time[node]
+    span = turns.span[node]
+    weights = _hermite(tau, span)[..., None]
     turn = np.stack([turns.phi[node], turns.rate[node], turns.start[node]])
     move = np.stack(
         [states.p_n[node + 1] - states.p_n[node], states.v_n[node + 1], states.v_n[node]]
     )
-    gamma, rate, rate_of_rate = (weights * turn).sum(axis=1)
+    of_turn = _hermite(tau_turned, span)[..., None]
+    gamma, rate, rate_of_rate = (of_turn * turn).sum(axis=1)
     shift, v_n, a_n = (weights * move).sum(axis=1)
     right = _Function(_RIGHT, gamma)
     motion = Motion(
@@ -318,7 +323,7 @@ def interpolated(
         alpha_b=right.times(rate_of_rate) + right.derivative_times(rate, rate),
         omega_sigma=np.zeros_like(rate),
     )
-    return Between(node, motion, tau, gamma, rate, states, turns)
+    return Between(node, motion, tau, tau_turned, gamma, rate, states, turns)
 
 
 def _hermite(tau: Array, span: Array) -> Array:

@@ -64,9 +64,10 @@ def component_changes(
         All rows of the graph that is linearised there, if something else needs them, too.
     """
     chain, own = problem.chain, problem.chain.constants
-    # Biases that walk change anyway.
+    # Biases that walk, and what processes vary, change anyway.
+    varying = {process.parameter for process in problem.processes}
     constant = {
-        *problem.columns,
+        *(name for name in problem.columns if name not in varying),
         *(
             p.name
             for p, _, by in chain.mean_constants(evaluation.states)

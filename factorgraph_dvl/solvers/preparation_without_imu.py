@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import msgspec
 import numpy as np
@@ -23,6 +23,7 @@ from factorgraph_dvl.imu.attitude_record import AttitudeRecord, level_axes
 from factorgraph_dvl.initialization.dvl_mounting import initial_mountings
 from factorgraph_dvl.initialization.record_clocks import clock_lags
 from factorgraph_dvl.initialization.track_velocity import Track, body_track
+from factorgraph_dvl.ranging.position_from_ranges import StartPositions
 from factorgraph_dvl.sensors.attitude import Attitude
 from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.sensors.ins import Ins
@@ -106,7 +107,16 @@ class PreparationWithoutImu:
     processes: tuple[Process, ...]
     estimated_noise: frozenset[str]
     findings: tuple[Finding, ...]
-    rejected: Mapping[str, Array] = field(default_factory=dict)
+
+    @property
+    def start_positions(self) -> StartPositions:
+        """States to start from: the records know the position."""
+        return StartPositions((self.states,))
+
+    @property
+    def rejected(self) -> Mapping[str, Array]:
+        """Return none: gross errors are found by the minimisation."""
+        return {}
 
     def chain(self, states: SmoothStates) -> SmoothChain:
         """Return the nodes, with densities to start from."""
@@ -167,7 +177,9 @@ def prepare_without_imu(trial: Trial) -> PreparationWithoutImu:
     lag = float(values[clock][0])
     nodes = _nodes(trial, record, track, late=late, lag=lag)
     turning = _turns(record, 0.5 * (nodes[1:] + nodes[:-1]) + late - lag)
-    states = _states(record, track, frame, nodes - lag, late)
+    # Pings are half-way between nodes of the attitude: its acceleration jumps at these.
+    half = 0.5 * float(np.median(np.diff(nodes)))
+    states = _states(record, track, frame, nodes - lag, late - half)
     chain = SmoothChain(
         frame=frame,
         node_time=nodes,
@@ -175,10 +187,12 @@ def prepare_without_imu(trial: Trial) -> PreparationWithoutImu:
         start=states,
         nRt=_track_axes(record, frame, states, nodes - lag, late),
         clock=clock if any(p.name == clock and p.estimated for p in parameters) else None,
+        attitude_clock=record.sensor.clock.offset.name,
+        first_shift=late - lag - half,
         resolution=record.interval,
     )
     if chain.clock is None:
-        chain = replace(chain, node_time=nodes - lag)
+        chain = replace(chain, node_time=nodes - lag, first_shift=late - half)
     by_aid = [(aid, _observations(aid, frame, trial.body_axes, trial)) for aid in trial.aids]
     return PreparationWithoutImu(
         trial=trial,
@@ -401,7 +415,8 @@ def _nodes(
         np.linspace(edges[i], edges[i + 1], int(np.ceil((edges[i + 1] - edges[i]) / longest)) + 1)
         for i in wide
     ]
-    every = np.unique(np.concatenate([edges, *more]))
+    # One more: the attitude of the last ping is between two nodes.
+    every = np.unique(np.concatenate([edges, *more, [last + longest]]))
     return np.asarray(every[np.concatenate([[True], np.diff(every) > 1e-3])])
 
 
