@@ -9,7 +9,7 @@ import numpy as np
 
 from factorgraph_dvl.errors import ConfigError
 from factorgraph_dvl.geometry.earth import LocalFrame
-from factorgraph_dvl.geometry.rotations import rotation_from_rph
+from factorgraph_dvl.geometry.rotations import exp_so3, rotation_from_rph
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array, rotate
 from factorgraph_dvl.graph.smooth_motion import SmoothStates
@@ -186,13 +186,18 @@ def _ending(motion: TrueMotion, frontier: Frontier | None, before: float) -> End
 
 def _true_states(motion: TrueMotion) -> TrueStates:
     def states(frame: LocalFrame, time: Array) -> SmoothStates:
-        state = motion.at(np.clip(time, 0.0, motion.duration))
+        inside = np.clip(time, 0.0, motion.duration)
+        state = motion.at(inside)
         lRn = frame.level_from_tangent(state.geodetic[:, 0], state.geodetic[:, 1])
         nRl = lRn.transpose(0, 2, 1)
+        v_n, beyond = rotate(nRl, state.v_n), (time - inside)[:, None]
+        # A node may be a little before the start or after the end.
         return SmoothStates(
-            nRb=nRl @ rotation_from_rph(state.rph, motion.body_axes),
-            p_n=frame.position(*state.geodetic.T),
-            v_n=rotate(nRl, state.v_n),
+            nRb=nRl
+            @ rotation_from_rph(state.rph, motion.body_axes)
+            @ exp_so3(beyond * state.omega_eb_b),
+            p_n=frame.position(*state.geodetic.T) + beyond * v_n,
+            v_n=v_n,
             omega_b=state.omega_eb_b,
         )
 

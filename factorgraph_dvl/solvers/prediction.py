@@ -14,6 +14,7 @@ from factorgraph_dvl.geometry.units import DEG_PER_HOUR, MICRO_G
 from factorgraph_dvl.geometry.vectors import Array, BoolArray
 from factorgraph_dvl.graph.chain import Chain
 from factorgraph_dvl.graph.inertial_chain import inertial_chain
+from factorgraph_dvl.graph.priors import prior_mean
 from factorgraph_dvl.graph.problem import Evaluation, Problem, observed
 from factorgraph_dvl.graph.processes import Process
 from factorgraph_dvl.graph.smooth_chain import SmoothChain
@@ -177,8 +178,10 @@ def _with_imu(trial: Trial, true_states: TrueStates) -> _Planned:
 def _without_imu(trial: Trial, true_states: TrueStates) -> _Planned:
     prepared = prepare_without_imu(trial)
     chain, values = prepared.first_chain, _true_values(trial, prepared.parameters)
-    late = 0.0 if chain.clock is None else values.get(chain.clock, 0.0)
-    states = true_states(chain.frame, chain.node_time - late)
+    every = {p.name: prior_mean(p) for p in prepared.parameters} | values
+    time = chain.node_time - (0.0 if chain.clock is None else every[chain.clock])
+    states, turned = (true_states(chain.frame, t) for t in (time, time - chain.shift(every)))
+    states = replace(states, nRb=turned.nRb, omega_b=turned.omega_b)
     return _Planned(
         as_moving(chain, states, prepared.turning),
         states,
