@@ -14,7 +14,9 @@ from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array, rotate
 from factorgraph_dvl.graph.smooth_motion import SmoothStates
 from factorgraph_dvl.sensors.attitude import LEAST_STD, Attitude, AttitudeAngles
+from factorgraph_dvl.sensors.carried_point import PointPosition, PointVelocity
 from factorgraph_dvl.sensors.ins import Ins
+from factorgraph_dvl.sensors.protocol import Observation
 from factorgraph_dvl.sensors.records import white_noise
 from factorgraph_dvl.simulation import plan_motion, simulate
 from factorgraph_dvl.simulation.motion import TrueMotion
@@ -101,7 +103,7 @@ def predict(scenario: Scenario) -> Prediction:
     trial = simulate(scenario)
     white: dict[str, Array] = {}
     if trial.imu is None:
-        white = _white_noise(simulate(msgspec.structs.replace(scenario, noise=True)))
+        white = _white_noise(simulate(msgspec.structs.replace(scenario, noise=True)), trial)
     solution, history, frontier = predict_posterior(trial, _true_states(motion), white)
     return Prediction(
         scenario=scenario,
@@ -204,16 +206,36 @@ def _true_states(motion: TrueMotion) -> TrueStates:
     return states
 
 
-def _white_noise(recorded: Trial) -> dict[str, Array]:
-    """Return the white noise of attitudes, by label: no trial states it, a record shows it."""
-    frame = recorded.frame()
+def _white_noise(recorded: Trial, exact: Trial) -> dict[str, Array]:
+    """Return the white noise of attitude and INS, by label: no trial states it, a record shows it.
+
+    Parameters
+    ----------
+    recorded, exact : Trial
+        With noise and without.
+    """
+    frame, axes = exact.frame(), exact.body_axes
     out = {}
-    for aid in recorded.aids:
-        if not (isinstance(aid, Attitude | Ins) and recorded.estimates_noise(aid)):
+    for noisy, aid in zip(recorded.aids, exact.aids, strict=True):
+        if not (isinstance(noisy, Attitude | Ins) and isinstance(aid, Attitude | Ins)):
             continue
-        for o in aid.dense_observations(frame, recorded.body_axes):
-            if isinstance(o, AttitudeAngles):
-                estimated = np.isin(np.arange(3), [i for group in o.noise_groups for i in group])
-                own = np.maximum(white_noise(np.unwrap(o.measured, axis=0)), LEAST_STD)
-                out[o.label] = np.where(estimated, own, np.median(o.std, axis=0))
+        if not recorded.estimates_noise(noisy):
+            continue
+        both = (each.dense_observations(frame, axes) for each in (noisy, aid))
+        for one, other in zip(*both, strict=True):
+            error = np.unwrap(_measured(one) - _measured(other), axis=0)
+            in_group = [i for group in one.noise_groups for i in group]
+            own = np.maximum(white_noise(error), LEAST_STD)
+            estimated = np.isin(np.arange(own.size), in_group)
+            out[one.label] = np.where(estimated, own, np.nan)
     return out
+
+
+def _measured(o: Observation) -> Array:
+    """Return what an attitude sensor or an INS measured, (M, 3), SI."""
+    if isinstance(o, PointPosition):
+        return o.measured_n
+    if isinstance(o, PointVelocity):
+        return o.measured_l
+    assert isinstance(o, AttitudeAngles)
+    return o.measured

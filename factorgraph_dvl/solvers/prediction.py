@@ -83,7 +83,7 @@ def predict_posterior(
         Returns the motion at (K,) times in a frame.
     white : mapping of str to ndarray, optional
         By label of an observation, standard deviations (d,) of its white noise, SI, where a solver
-        finds them in the record.
+        finds them in the record; NaN where they are as stated.
 
     Returns
     -------
@@ -134,7 +134,7 @@ def _at_truth(
     planned = (_without_imu if trial.imu is None else _with_imu)(trial, true_states)
     problem, evaluation = _problem(planned, planned.processes, {})
     factors = {
-        o.label: white[o.label] / np.median(sigma, axis=0)
+        o.label: np.nan_to_num(white[o.label] / np.median(sigma, axis=0), nan=1.0)
         for o, sigma in zip(problem.observations, problem.sigma(evaluation), strict=True)
         if o.label in white
     }
