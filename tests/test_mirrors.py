@@ -83,7 +83,6 @@ ELSEWHERE = {
     "sensors/turntable*": "sensors/test_dvl_beams.py",
     "settings/sections": "settings/test_yaml_file.py",
     "simulation/*": "simulation/test_measurements.py",
-    "solvers/change_along_trial": "solvers",
     "solvers/prediction": "planning/test_prediction.py",
 }
 MODULES = sorted(

@@ -66,6 +66,14 @@ class Prepared(Protocol):
         """Labels of the observations whose stated noise is only where to start."""
 
     @property
+    def start_positions(self) -> StartPositions:
+        """States to start from, one set for each position that the records allow."""
+
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """What the user must know."""
+
+    @property
     def rejected(self) -> Mapping[str, Array]:
         """Times of measurements that are left out from the start, by label."""
 

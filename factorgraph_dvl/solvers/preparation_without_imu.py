@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import msgspec
 import numpy as np
@@ -23,6 +23,7 @@ from factorgraph_dvl.imu.attitude_record import AttitudeRecord, level_axes
 from factorgraph_dvl.initialization.dvl_mounting import initial_mountings
 from factorgraph_dvl.initialization.record_clocks import clock_lags
 from factorgraph_dvl.initialization.track_velocity import Track, body_track
+from factorgraph_dvl.ranging.position_from_ranges import StartPositions
 from factorgraph_dvl.sensors.attitude import Attitude
 from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.sensors.ins import Ins
@@ -55,7 +56,7 @@ _GROUND_SPAN, _WATER_SPAN = 5.0, 15.0
 # Density of acceleration, m²/s³, where the log does not show one.
 _DENSITY = 1e-3
 # Least densities, m²/s³ and rad²/s³. Chosen: they keep the chain regular.
-_LEAST = np.repeat([1e-12, 1e-9], 3)
+LEAST_DENSITY = np.repeat([1e-12, 1e-9], 3)
 # Spans, s, over which changes of velocity on legs show the density; in turns, in which velocity
 # changes steadily, they are the intervals of the pings.
 _LEG_SPANS = (2.0, 10.0)
@@ -109,7 +110,16 @@ class PreparationWithoutImu:
     processes: tuple[Process, ...]
     estimated_noise: frozenset[str]
     findings: tuple[Finding, ...]
-    rejected: Mapping[str, Array] = field(default_factory=dict)
+
+    @property
+    def start_positions(self) -> StartPositions:
+        """States to start from: the records know the position."""
+        return StartPositions((self.states,))
+
+    @property
+    def rejected(self) -> Mapping[str, Array]:
+        """Return none: gross errors are found by the minimisation."""
+        return {}
 
     def chain(self, states: SmoothStates) -> SmoothChain:
         """Return the nodes, with densities to start from."""
@@ -471,7 +481,7 @@ def _densities(
         for kind in np.unique(phase):
             spans = (interval, 2.0 * interval) if kind else _LEG_SPANS
             out[phase == kind, 3:] = _density(v_b, at_pings == kind, spans, interval)
-    return np.maximum(out, _LEAST)
+    return np.maximum(out, LEAST_DENSITY)
 
 
 def _density(v_b: Array, wanted: BoolArray, spans: tuple[float, float], interval: float) -> Array:

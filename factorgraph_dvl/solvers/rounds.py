@@ -70,6 +70,7 @@ _CORRELATED = message("not_converged.correlated")
 _KNOWN = message("not_converged.known")
 _WALKS = message("not_converged.walks")
 _MOTION = message("not_converged.acceleration")
+_MINIMUM = message("not_converged.minimum")
 # Parameters that are estimated although they were stated as known. Chosen: a third is a sign that
 # the model is wrong.
 _MOST_FREED = 2
@@ -235,13 +236,20 @@ def settle(
             )
             chain, tilt = strengths.chain, strengths.tilt
             values = strengths.values
-            motion = _MOTION_ROUNDS if strengths.same else motion
-            changing.append(_MOTION)
+            # The last minimum was a rough one, good enough for strengths.
+            changing.append(_MINIMUM if strengths.same else _MOTION)
+            if strengths.same:
+                motion = _MOTION_ROUNDS
             continue
         if np.sqrt(np.mean((states.p_n - p_gravity) ** 2)) > _SAME_GRAVITY:
             changing.insert(0, message("not_converged.gravity"))
             chain = prepared.chain(states)
             p_gravity = states.p_n
+        if chain.interpolates:
+            # Its steps are so stiff that the last one, however small, turns their rows by more
+            # than their noise: information and rows must be those of the same values.
+            information = factorized(problem, minimum.evaluation)[0]
+            minimum = replace(minimum, square_root=information)
         if not cycle:
             if not (tried and _same(tried[-1], rejected)):
                 tried.append(rejected)
