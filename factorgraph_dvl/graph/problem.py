@@ -545,8 +545,8 @@ class Problem:
         gaussian = self.native(evaluation)
         if self.tilt is not None:
             gaussian = _Tilted(gaussian, self.tilt.constant)
-            factor = self.tilt.factor(self.parameters, self._key)
-            gaussian.push_back(factor.linearize(evaluation.values))
+            tilt = self.tilt.factor(self.parameters, self._key)
+            gaussian.push_back(tilt.linearize(evaluation.values))
         self._add_steps(gaussian, evaluation)
         for block in self._blocks:
             if not block.factors:
