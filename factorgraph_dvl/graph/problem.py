@@ -139,19 +139,6 @@ class Rows:
     begin: int = 0
 
 
-class _Tilted(gtsam.GaussianFactorGraph):
-    """A linear graph with a tilt, whose error is the cost: without the tilt's constant."""
-
-    def __init__(self, others: gtsam.GaussianFactorGraph, constant: float) -> None:
-        super().__init__()
-        self.push_back(others)
-        self._constant = constant
-
-    def error(self, at: gtsam.VectorValues) -> float:
-        """Return the cost that the linear model has at a step."""
-        return float(super().error(at)) - self._constant
-
-
 def observed(
     aids: Sequence[Aid], frame: LocalFrame, body_axes: BodyAxes
 ) -> tuple[tuple[Observation, ...], tuple[Parameter, ...]]:
@@ -544,9 +531,8 @@ class Problem:
             self._follow(evaluation.parameters)
         gaussian = self.native(evaluation)
         if self.tilt is not None:
-            gaussian = _Tilted(gaussian, self.tilt.constant)
-            factor = self.tilt.factor(self.parameters, self._key)
-            gaussian.push_back(factor.linearize(evaluation.values))
+            tilt = self.tilt.factor(self.parameters, self._key)
+            gaussian.push_back(tilt.linearize(evaluation.values))
         self._add_steps(gaussian, evaluation)
         for block in self._blocks:
             if not block.factors:

@@ -6,9 +6,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from factorgraph_dvl.geometry.vectors import Array, rotate
+from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph import keys
-from factorgraph_dvl.graph.problem import Evaluation, Problem
+from factorgraph_dvl.graph.problem import Problem
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum
 from factorgraph_dvl.statistics.square_root_information import SquareRootInformation
 
@@ -63,30 +63,6 @@ def posterior(problem: Problem, minimum: Minimum) -> Posterior:
     given = nodes - cross @ np.linalg.solve(P, cross.transpose(0, 2, 1))
     others = {key: out for key, out in with_every.items() if key not in every}
     return Posterior(information, nodes, given, P, others, {})
-
-
-def at_true_times(
-    problem: Problem, evaluation: Evaluation, found: Posterior
-) -> tuple[float, Array]:
-    """Return by how much the nodes are late, s, and their covariances (K, 9, 9) at true times.
-
-    Nodes that have the clock of a sensor are where the body was earlier by its offset: there
-    the motion errs by what it changes in the error of the offset too.
-    """
-    chain, states = problem.chain, evaluation.states
-    if chain.clock is None:
-        return 0.0, found.nodes
-    motion = chain.motion(chain.attach(chain.node_time), states)
-    bRn = states.nRb.transpose(0, 2, 1)
-    moved = np.hstack([motion.omega_eb_b, rotate(bRn, motion.v_n), rotate(bRn, motion.a_n)])
-    own = problem.prior_root[problem.columns[chain.clock]][0]
-    every = range(chain.node_time.size)
-    with_clock = np.stack([found.with_parameters[keys.node(k)] @ own for k in every])
-    cross = with_clock[:, :, None] * moved[:, None, :]
-    variance = float(own @ found.parameters @ own)
-    P = found.nodes + cross + cross.transpose(0, 2, 1)
-    P += variance * moved[:, :, None] * moved[:, None, :]
-    return float(evaluation.parameters[chain.clock][0]), P
 
 
 def changes_with(found: Posterior, directions: Array, coupled: Array) -> dict[int, Array]:

@@ -10,7 +10,6 @@ import numpy as np
 from factorgraph_dvl.geometry.records import rows_of
 from factorgraph_dvl.geometry.rotations import BodyAxes
 from factorgraph_dvl.graph.problem import Evaluation, Problem
-from factorgraph_dvl.graph.smooth_chain import SmoothChain
 from factorgraph_dvl.quality.earlier_calibration import prior_findings
 from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.sensors.message import Message, message
@@ -32,7 +31,7 @@ from factorgraph_dvl.solvers.correlated_noise import noise_of
 from factorgraph_dvl.solvers.fixed_directions import SolvedProblem
 from factorgraph_dvl.solvers.heading_and_misalignment import heading_and_misalignment
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum
-from factorgraph_dvl.solvers.posterior import at_true_times
+from factorgraph_dvl.solvers.true_times import trajectory_at_true_times
 from factorgraph_dvl.statistics.robust_weights import windows
 from factorgraph_dvl.trial import Trial
 
@@ -96,12 +95,11 @@ def summarise(trial: Trial, found: SolvedProblem, *, rate_hz: float) -> Solution
 
 def _trajectory(found: SolvedProblem, body_axes: BodyAxes, rate_hz: float) -> Trajectory:
     """Return the motion at a rate, at true times."""
-    problem, evaluation = found.problem, found.minimum.evaluation
-    chain, states = problem.chain, evaluation.states
-    if not isinstance(chain, SmoothChain):
-        return chain.trajectory(states, found.covariances.nodes, body_axes, rate_hz)
-    lag, nodes = at_true_times(problem, evaluation, found.covariances)
-    return chain.trajectory(states, nodes, body_axes, rate_hz, lag)
+    chain = found.problem.chain
+    if chain.interpolates:
+        return trajectory_at_true_times(found, body_axes, rate_hz)
+    states = found.minimum.evaluation.states
+    return chain.trajectory(states, found.covariances.nodes, body_axes, rate_hz)
 
 
 def _residuals(problem: Problem, minimum: Minimum) -> tuple[Residuals, ...]:
