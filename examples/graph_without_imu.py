@@ -1,8 +1,8 @@
 """Print the graph of a ship without an IMU
 ========================================
 
-Solve three minutes of a simulated ship with a gyrocompass, GNSS and a DVL, and print one line for each kind
-of factor: how many there are, what they measure, and the keys of the first::
+Solve three minutes of a simulated ship with a gyrocompass, GNSS and a DVL, and print one line for
+each kind of factor: how many there are, the keys of the first, and what these are::
 
     python examples/graph_without_imu.py
 """

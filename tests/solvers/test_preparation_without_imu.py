@@ -21,6 +21,7 @@ from factorgraph_dvl.io.trial_folder import load_trial, save_trial
 from factorgraph_dvl.sensors.finding import Code
 from factorgraph_dvl.simulation import load_scenario, simulate
 from factorgraph_dvl.solvers.batch import solve, solve_with_problem
+from factorgraph_dvl.solvers.known_parameters import wide, with_scattered_noise
 from factorgraph_dvl.solvers.preparation_without_imu import prepare_without_imu
 
 RUNS = int(os.environ.get("FACTORGRAPH_DVL_SEEDS", "20"))
@@ -257,6 +258,24 @@ def test_the_error_of_the_graph_is_the_cost_but_for_a_constant(short):
         off.append(graph.error(there) - problem.evaluate(there).cost)
     assert off[0] == pytest.approx(problem.tilt.constant)
     np.testing.assert_allclose(off, off[0], rtol=1e-10)
+
+
+def test_problems_of_tests_have_the_slope_of_the_objective(short):
+    _, solved = short
+    problem, evaluation = solved.problem, solved.minimum.evaluation
+    free = [wide(p, p.mean) if p.name == "gnss_lever_arm_m" else p for p in problem.all_parameters]
+    test, at = with_scattered_noise(problem, evaluation, free)
+    assert "gnss_lever_arm_m" in test.columns
+    for name, own in test.columns.items():
+        expected = problem.tilt.gradient[problem.columns[name]] if name in problem.columns else 0.0
+        np.testing.assert_array_equal(test.tilt.gradient[own], expected)
+    with_slope = test.linearize(at).gradientAtZero()
+    test.tilt = None
+    without = test.linearize(at).gradientAtZero()
+    for name, own in problem.columns.items():
+        found = with_slope.at(test.key(name)) - without.at(test.key(name))
+        # In the tangent space at the minimum, not at the origin of the slope.
+        np.testing.assert_allclose(found, problem.tilt.gradient[own], rtol=5e-3, atol=1e-6)
 
 
 def ratio(scenario, runs):
