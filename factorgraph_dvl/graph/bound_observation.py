@@ -30,6 +30,8 @@ SAME_TIME = 2e-4
 # The same, s, before the motion is integrated anew on the way to a minimum. Measured: at most
 # 7e-5 rad/s in the same sway.
 EXTRAPOLATED = 1e-3
+# Unit of the residuals of attitudes.
+_ANGLE = "rad"
 
 
 @dataclass(frozen=True)
@@ -98,6 +100,10 @@ class BoundObservation:
     clock_zero: float
     errors: ImuErrors | None = None
 
+    def __post_init__(self) -> None:
+        # Until it is known that it does not.
+        self._sees_motion = self.chain.interpolates
+
     def single(self, i: int) -> BoundObservation:
         """Return a measurement by itself, as if the node before it were the first."""
         index = np.array([i])
@@ -148,6 +154,21 @@ class BoundObservation:
         of_chain = (self.chain.clock, self.chain.attitude_clock)
         return {*parameters_of(self.observation), *ERRORS, *of_chain}
 
+    @property
+    def turning(self) -> bool:
+        """Whether it hangs where its attitude is: as attitudes do, and what moves with the nodes.
+
+        Nothing is known less well than what is carried beyond the nodes.
+        """
+        clock, own = self.observation.clock, self.chain.attitude_clock
+        with_nodes = clock is not None and clock.names[0] == self.chain.clock
+        return own is not None and (with_nodes or self.observation.unit == _ANGLE)
+
+    def attached(self, parameters: Mapping[str, Array]) -> Any:
+        """Return where measurements hang on the chain by clocks as they are."""
+        time = self.time + self.late(parameters)
+        return self.chain.attach(time, self.chain.shift(parameters), turning=self.turning)
+
     def late(self, parameters: Mapping[str, Array]) -> Array:
         """Return by how much clocks have moved measurements since they were bound, (M,), s."""
         now = time_on_chain(self.observation, parameters, self.clock_zero, self.chain.clock)
@@ -163,14 +184,28 @@ class BoundObservation:
         """
         at, rest = self.attachment, late
         if self.chain.interpolates:
-            at = self.chain.attach(self.time + late, self.chain.shift(parameters))
-            return self.chain.motion(at, states)
+            return self.chain.motion(self.attached(parameters), states)
         if moved:
             at, rest = self.chain.attach(self.time + late), np.zeros_like(late)
         if self.errors is not None:
             vector = self.errors.vector(parameters)
             at = self.errors.corrected(at, self.attachment, vector)
         return extrapolated(self.chain.motion(at, states), rest)
+
+    def missing(
+        self, motion: Motion, parameters: Mapping[str, Array], processes: Processes
+    ) -> Array | None:
+        """Return what the motion between nodes adds to the variance of measurements, (M, d).
+
+        None where it is recorded, and for attitudes, by which it is known.
+        """
+        if not self._sees_motion:
+            return None
+        lin = self.linearized(motion, parameters, (), processes)
+        self._sees_motion = any(by is not None for by in (lin.d_p, lin.d_v, lin.d_omega))
+        if not self._sees_motion:
+            return None
+        return self.chain.missing(self.attached(parameters), lin)
 
     def values(self, parameters: Mapping[str, Array], processes: Processes) -> Mapping[str, Array]:
         """Return the parameters that measurements see: what varies has a value for each."""

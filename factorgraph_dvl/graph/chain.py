@@ -195,14 +195,31 @@ class Chain(Protocol):
     def covers(self, time: Array) -> BoolArray:
         """Whether the motion is known at times (M,)."""
 
-    def attach(self, time: Array, shift: float = 0.0) -> Any:
-        """Return where times (M,) hang on the chain; those that are not covered, where nearest."""
+    def attach(self, time: Array, shift: float = 0.0, *, turning: bool = False) -> Any:
+        """Return where times (M,) hang on the chain; those that are not covered, where nearest.
+
+        Parameters
+        ----------
+        time : ndarray, shape (M,), s
+            By the clock of the nodes.
+        shift : float, default 0, s
+            Of the clock of attitudes beside it.
+        turning : bool, default False
+            Whether they hang between the nodes that their attitude is between, as measurements of
+            attitude do, and those that move with the nodes.
+        """
 
     def later(self, at: Any, late: Array, shift: float = 0.0) -> Any:
         """Return an attachment at times that are later by (M,) s, to the same nodes."""
 
-    def left(self, at: Any, late: Array, tolerance: float, shift: float = 0.0) -> bool:
+    def left(self, at: Any, late: Array, tolerance: float) -> bool:
         """Whether measurements later by (M,) s are to be bound anew; tolerance in s."""
+
+    def missing(self, at: Any, lin: Linearization) -> Array:
+        """Return the variance (M, d) of what is predicted at attached times given the nodes.
+
+        Where the motion between nodes is not recorded.
+        """
 
     def motion(self, at: Any, states: Any) -> Motion:
         """Return the motion at M attached times."""

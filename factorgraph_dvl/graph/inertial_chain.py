@@ -218,7 +218,7 @@ class InertialChain:
         """Return 0: attitudes are at the times of the nodes."""
         return 0.0
 
-    def attach(self, time: Array, shift: float = 0.0) -> Attachment:
+    def attach(self, time: Array, shift: float = 0.0, *, turning: bool = False) -> Attachment:
         """Return where times (M,) hang on the chain; those that are not covered, where nearest."""
         return attach_inside(self.segments, time, self.frame.earth_rate)[0]
 
@@ -226,9 +226,13 @@ class InertialChain:
         """Return an attachment at times that are later by (M,) s, to the same nodes."""
         return later(at, late, self.frame.earth_rate)
 
-    def left(self, at: Attachment, late: Array, tolerance: float, shift: float = 0.0) -> bool:
+    def left(self, at: Attachment, late: Array, tolerance: float) -> bool:
         """Whether measurements later by (M,) s are to be bound anew; tolerance in s."""
         return bool(np.abs(late).max() > tolerance)
+
+    def missing(self, at: Attachment, lin: Linearization) -> Array:
+        """Return zero: the IMU recorded the motion."""
+        return np.zeros_like(lin.residual)
 
     def motion(self, at: Attachment, states: States) -> Motion:
         """Return the motion at M attached times, carried forward from the nodes before."""

@@ -500,7 +500,9 @@ class Problem:
             label = bound.observation.label
             own = factors.get(label, 1.0) * self.long_run.get(label, 1.0)
             values = bound.values(evaluation.parameters, self.processes_of(bound))
-            out.append(bound.observation.sigma(motion, values, own))
+            sigma = bound.observation.sigma(motion, values, own)
+            missing = bound.missing(motion, evaluation.parameters, self.processes_of(bound))
+            out.append(sigma if missing is None else np.sqrt(sigma**2 + missing))
         return out
 
     def log_sigma(self, evaluation: Evaluation) -> list[Array]:
@@ -547,11 +549,10 @@ class Problem:
         """Bind measurements anew that a clock has moved beyond their nodes."""
         for block in self._blocks:
             for bound in block.bound:
-                late = bound.late(parameters)
-                shift = self.chain.shift(parameters)
-                if self.chain.left(bound.attachment, late, SAME_TIME, shift):
-                    bound.time = bound.time + late
-                    bound.attachment = self.chain.attach(bound.time, shift)
+                at = bound.attached(parameters)
+                if not np.array_equal(at.node, bound.attachment.node):
+                    bound.time = bound.time + bound.late(parameters)
+                    bound.attachment = at
                     block.parts, block.matrices, block.vectors, block.factors = [], [], [], []
 
     def _fill(self, evaluation: Evaluation) -> None:
@@ -740,18 +741,14 @@ class Problem:
         if not covered.all():
             self.uncovered[observation.label] = int((~covered).sum())
         weight = np.repeat(covered.astype(float)[:, None], len(observation.components), axis=1)
-        before = ((b.time, b.attachment) for b in self._bound)
+        out = BoundObservation(
+            observation, self.chain, None, time, covered, weight, self.clock_zero
+        )
+        before = ((b.time, b.attachment) for b in self._bound if b.turning == out.turning)
         # Times that are not covered weigh nothing; they only need a place on the chain.
         at = next((at for when, at in (*before, *attached) if np.array_equal(when, time)), None)
-        return BoundObservation(
-            observation,
-            self.chain,
-            self.chain.attach(time, self.chain.shift(self.bound_at)) if at is None else at,
-            time,
-            covered,
-            weight,
-            self.clock_zero,
-        )
+        out.attachment = out.attached(self.bound_at) if at is None else at
+        return out
 
     def needs_rebinding(self, parameters: dict[str, Array]) -> bool:
         """Whether a clock has moved measurements too far from where they were bound.

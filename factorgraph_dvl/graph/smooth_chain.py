@@ -25,6 +25,7 @@ from factorgraph_dvl.graph.smooth_motion import (
     interpolated,
     motion_steps,
     turns_of,
+    variance_between,
 )
 from factorgraph_dvl.graph.trajectory import between, epochs_between, reported, tangent_in_n
 from factorgraph_dvl.sensors.parameters import Parameter
@@ -45,11 +46,6 @@ _COMPONENTS = tuple(
 _FREE = np.repeat([np.pi, 1e5, 1e2, 1.0], 3)
 # Nodes of a branch, as of the inertial chain.
 _BRANCH = 128
-# Share of the time between nodes that a measurement may lie beyond them. Chosen: a cubic goes on
-# that far.
-_BEYOND = 0.02
-# Time, s, for which the motion goes on beyond the ends. Chosen: about one more step.
-_MARGIN = 1.0
 # Steps whose rows are made at once. Chosen: some ten megabytes.
 _CHUNK = 4096
 
@@ -256,29 +252,44 @@ class SmoothChain:
         lag = 0.0 if self.clock is None else float(parameters[self.clock][0])
         return float(parameters[self.attitude_clock][0]) - lag - self.first_shift
 
-    def attach(self, time: Array, shift: float = 0.0) -> Attached:
-        """Return where times (M,) hang on the chain; those that are not covered, where nearest.
-
-        Between the nodes that their attitude is between: what turns a vessel is faster than what
-        moves it.
-        """
+    def attach(self, time: Array, shift: float = 0.0, *, turning: bool = False) -> Attached:
+        """Return where times (M,) hang on the chain; those that are not covered, where nearest."""
         turned = time + shift
-        node = np.searchsorted(self.node_time, turned, side="right") - 1
+        by = turned if turning else time
+        node = np.searchsorted(self.node_time, by, side="right") - 1
         node = np.clip(node, 0, self.count - 1)
-        # A clock may take a measurement a little beyond the ends.
-        ends = self.node_time[0] - _MARGIN, self.node_time[-1] + _MARGIN
-        return Attached(node, node, np.clip(time, *ends), np.clip(turned, *ends))
+        return Attached(node, node, time, turned)
 
     def later(self, at: Attached, late: Array, shift: float = 0.0) -> Attached:
         """Return an attachment at times that are later by (M,) s, to the same nodes."""
         return replace(at, time=at.time + late, turned=at.time + late + shift)
 
-    def left(self, at: Attached, late: Array, tolerance: float, shift: float = 0.0) -> bool:
-        """Whether measurements later by (M,) s are to be bound anew: they left their nodes."""
-        first, last = self.node_time[at.node], self.node_time[at.node + 1]
-        turned = at.time + late + shift
-        beyond = np.maximum(first - turned, turned - last)
-        return bool(np.any(beyond > np.maximum(_BEYOND * (last - first), tolerance)))
+    def left(self, at: Attached, late: Array, tolerance: float) -> bool:
+        """Return False: where measurements are between nodes is followed."""
+        return False
+
+    def missing(self, at: Attached, lin: Linearization) -> Array:
+        """Return the variance (M, d) of what is predicted at attached times given the nodes.
+
+        Without it, a measurement would count for more the nearer to a node, and so draw clocks.
+        """
+        begin, span = self.node_time[at.node], np.diff(self.node_time)[at.node]
+        density, axes = self.density[at.node], self.nRt[at.node]
+        out = np.zeros_like(lin.residual)
+        for time, q, by_value, by_rate in (
+            (at.turned, density[:, :3], lin.d_theta, lin.d_omega),
+            (at.time, density[:, 3:], _turned(lin.d_p, axes), _turned(lin.d_v, axes)),
+        ):
+            of_value, of_both, of_rate = variance_between(time - begin, span)[..., None, None]
+            variance = np.zeros((*out.shape, 3))
+            if by_value is not None:
+                variance = variance + of_value * by_value**2
+            if by_rate is not None:
+                variance = variance + of_rate * by_rate**2
+            if by_value is not None and by_rate is not None:
+                variance = variance + 2.0 * of_both * by_value * by_rate
+            out += np.sum(variance * q[:, None, :], axis=2)
+        return out
 
     def motion(self, at: Attached, states: ChainStates) -> Motion:
         """Return the motion at M attached times."""
@@ -376,6 +387,11 @@ class SmoothChain:
         """Return what is assumed of each of these sources, as text."""
         turning, moving = np.sqrt(np.median(self.density, axis=0)).reshape(2, 3)
         return {MOTION: f"{np.degrees(turning.max()):.2g} deg/s/√s, {moving.max():.2g} m/s/√s"}
+
+
+def _turned(jacobian: Array | None, axes: Array) -> Array | None:
+    """Return derivatives (M, d, 3) by vectors in n as those by vectors in other axes."""
+    return None if jacobian is None else jacobian @ axes
 
 
 _OF_STATE = ("nRb", "p_n", "v_n", "omega_b")

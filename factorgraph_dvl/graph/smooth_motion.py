@@ -273,10 +273,7 @@ class Between:
             rad², m² and m²/s².
         """
         span = self.turns.span[self.node]
-        tau = np.clip(self.tau, 0.0, span)
-        rest = span - tau
-        of_value = (tau**3 * rest**3 / (3.0 * span**3))[:, None]
-        of_rate = (tau * rest * (span**2 - 3.0 * tau * rest) / span**3)[:, None]
+        of_value, _, of_rate = variance_between(self.tau, span)[..., None]
         turning, moving = np.split(density[self.node], 2, axis=1)
         axes = np.stack([self.motion.nRb, nRt[self.node], nRt[self.node]], axis=1)
         variance = np.stack([of_value * turning, of_value * moving, of_rate * moving], axis=1)
@@ -326,19 +323,42 @@ def interpolated(
     return Between(node, motion, tau, tau_turned, gamma, rate, states, turns)
 
 
+def variance_between(tau: Array, span: Array) -> Array:
+    """Return variance of a value, covariance with its rate, and variance of that, (3, M).
+
+    Given both nodes, over the density.
+
+    Parameters
+    ----------
+    tau, span : ndarray, shape (M,), s
+        Times since the node before, and from it to the next.
+    """
+    inside = np.clip(tau, 0.0, span)
+    beyond = tau - inside
+    tau, rest = inside, span - inside
+    of_both = tau**2 * rest**2 * (rest - tau) / 2.0
+    of_rate = tau * rest * (span**2 - 3.0 * tau * rest)
+    between = np.stack([tau**3 * rest**3 / 3.0, of_both, of_rate]) / span**3
+    far = np.abs(beyond)
+    return between + np.stack([far**3 / 3.0, far * beyond / 2.0, far])
+
+
 def _hermite(tau: Array, span: Array) -> Array:
     """Return weights (3, 3, M) of what changes from node to node, of its rates at end and start.
 
-    Of its value, of its rate, and of the derivative of that.
+    Of its value, of its rate, and of the derivative of that. Beyond the nodes the rate stays.
     """
-    s, r = tau / span, 1.0 - tau / span
-    return np.array(
+    inside = np.clip(tau, 0.0, span)
+    beyond = tau - inside
+    tau, s, r = inside, inside / span, 1.0 - inside / span
+    value, rate, bend = np.array(
         [
             [s**2 * (3.0 - 2.0 * s), -tau * s * r, tau * r**2],
             [6.0 * s * r / span, s * (3.0 * s - 2.0), r * (1.0 - 3.0 * s)],
             [6.0 * (r - s) / span**2, (6.0 * s - 2.0) / span, (6.0 * s - 4.0) / span],
         ]
     )
+    return np.array([value + beyond * rate, rate, bend * (beyond == 0.0)])
 
 
 def _powers(s: Array, g: Array) -> Array:

@@ -117,7 +117,9 @@ def log_determinant_gradient(
     """Return the gradient (P,) of log det of the states' information by the constants.
 
     At fixed states and weights, in the tangent space of the estimated parameters, SI, in the
-    order of `Problem.columns`.
+    order of `Problem.columns`. Zero by clocks where the motion is interpolated: it would be that of
+    where measurements are between nodes, of which the likelihood of the motion itself knows
+    nothing.
 
     Parameters
     ----------
@@ -139,7 +141,10 @@ def log_determinant_gradient(
         problem.observation_rows(evaluation), information.given(constants), constants
     )
 
+    clocks = {name for bound in problem.bound for name in bound.clocks}
     for p in problem.parameters:
+        if problem.chain.interpolates and p.name in clocks:
+            continue
         value, own = evaluation.parameters[p.name], problem.columns[p.name]
         for i, step in enumerate(np.diag(steps[own])):
             there = value @ exp_so3(step) if p.rotation else value + step
