@@ -239,11 +239,8 @@ class SmoothChain:
         return ChainStates(nRb, p_n, v_n, omega, self.node_time[some])
 
     def covers(self, time: Array) -> BoolArray:
-        """Whether times (M,) are between the first node and the last but one.
-
-        The last one is for attitudes, whose nodes may be earlier.
-        """
-        return np.asarray((time >= self.node_time[0]) & (time <= self.node_time[-2]))
+        """Whether times (M,) are between the first node and the last."""
+        return np.asarray((time >= self.node_time[0]) & (time <= self.node_time[-1]))
 
     def shift(self, parameters: Mapping[str, Array]) -> float:
         """Return by how much its clock of attitudes is late beside that of the nodes, s."""

@@ -186,9 +186,7 @@ def prepare_without_imu(trial: Trial) -> PreparationWithoutImu:
     lag = float(values[clock][0])
     nodes = _nodes(trial, record, track, late=late, lag=lag)
     phase = _phases(record, 0.5 * (nodes[1:] + nodes[:-1]) + late - lag)
-    # Pings are half-way between nodes of the attitude: its acceleration jumps at these.
-    half = 0.5 * float(np.median(np.diff(nodes)))
-    states = _states(record, track, frame, nodes - lag, late - half)
+    states = _states(record, track, frame, nodes - lag, late)
     chain = SmoothChain(
         frame=frame,
         node_time=nodes,
@@ -197,11 +195,11 @@ def prepare_without_imu(trial: Trial) -> PreparationWithoutImu:
         nRt=_track_axes(record, frame, states, nodes - lag, late),
         clock=clock if any(p.name == clock and p.estimated for p in parameters) else None,
         attitude_clock=record.sensor.clock.offset.name,
-        first_shift=late - lag - half,
+        first_shift=late - lag,
         resolution=record.interval,
     )
     if chain.clock is None:
-        chain = replace(chain, node_time=nodes - lag, first_shift=late - half)
+        chain = replace(chain, node_time=nodes - lag, first_shift=late)
     by_aid = [(aid, _observations(aid, frame, trial.body_axes, trial)) for aid in trial.aids]
     return PreparationWithoutImu(
         trial=trial,
@@ -432,8 +430,7 @@ def _nodes(
         np.linspace(edges[i], edges[i + 1], int(np.ceil((edges[i + 1] - edges[i]) / longest)) + 1)
         for i in wide
     ]
-    # One more: the attitude of the last ping is between two nodes.
-    every = np.unique(np.concatenate([edges, *more, [last + longest]]))
+    every = np.unique(np.concatenate([edges, *more]))
     return np.asarray(every[np.concatenate([[True], np.diff(every) > 1e-3])])
 
 

@@ -117,9 +117,8 @@ def log_determinant_gradient(
     """Return the gradient (P,) of log det of the states' information by the constants.
 
     At fixed states and weights, in the tangent space of the estimated parameters, SI, in the
-    order of `Problem.columns`. Zero by clocks where the motion is interpolated: it would be that of
-    where measurements are between nodes, of which the likelihood of the motion itself knows
-    nothing.
+    order of `Problem.columns`. Zero by clocks where the motion is interpolated: it would be that
+    of the places of measurements between nodes, which mean nothing.
 
     Parameters
     ----------
