@@ -42,12 +42,12 @@ CURRENT = "current"
 _NEED_IMU = frozenset({"star", "turntable", "beacons"})
 # Turn rate, averaged over seconds, from which on a vessel turns. Chosen: above yaw in a seaway.
 _TURNING = 0.4 * DEG
-_TURN_SPAN = 10.0
+TURN_SPAN = 10.0
 # Span, s, over which the heading of the track is averaged, and interval of its samples. Chosen:
 # waves that move a ship are shorter, its turns longer.
-_WAVES, _GRID = 20.0, 0.5
+WAVES, _GRID = 20.0, 0.5
 # Longest time between nodes, s, and most nodes. Chosen: waves that move a ship are resolved.
-_LONGEST = 1.5
+LONGEST = 1.5
 _MOST_NODES = 60_000
 # Longest spans, s, over which positions make a velocity, over ground and through water. Chosen:
 # below the time in which a ship turns; through water noise makes wrong clocks more likely.
@@ -162,24 +162,26 @@ def prepare_without_imu(trial: Trial) -> PreparationWithoutImu:
     parameters = _parameters(trial)
     values = {p.name: prior_mean(p) for p in parameters}
     values |= _start_values(trial, record, track, frame, parameters)
-    clock = _clock(trial, frame)
+    clock = node_clock(trial, frame)
     late = float(values[record.sensor.clock.offset.name][0])
     lag = float(values[clock][0])
     nodes = _nodes(trial, record, track, late=late, lag=lag)
-    turning = _turns(record, 0.5 * (nodes[1:] + nodes[:-1]) + late - lag)
+    turning = turns(record, 0.5 * (nodes[1:] + nodes[:-1]) + late - lag)
     states = _states(record, track, frame, nodes - lag, late)
     chain = SmoothChain(
         frame=frame,
         node_time=nodes,
         density=_densities(trial, record, values, states, nodes, turning, late),
         start=states,
-        track=_track_frame(record, frame, states, nodes - lag, late),
+        track=track_frame(record, frame, states, nodes - lag, late),
         clock=clock if any(p.name == clock and p.estimated for p in parameters) else None,
         resolution=record.interval,
     )
     if chain.clock is None:
         chain = replace(chain, node_time=nodes - lag)
-    by_aid = [(aid, _observations(aid, frame, trial.body_axes, trial)) for aid in trial.aids]
+    by_aid = [
+        (aid, lasting_observations(aid, frame, trial.body_axes, trial)) for aid in trial.aids
+    ]
     return PreparationWithoutImu(
         trial=trial,
         first_chain=chain,
@@ -200,7 +202,7 @@ def prepare_without_imu(trial: Trial) -> PreparationWithoutImu:
     )
 
 
-def _observations(
+def lasting_observations(
     aid: Aid, frame: LocalFrame, body_axes: BodyAxes, trial: Trial
 ) -> tuple[Observation, ...]:
     """Return all that a sensor measured: errors that last are processes here."""
@@ -247,13 +249,13 @@ def _states(
     return SmoothStates(body.nRb, p_n, v_n, body.omega_eb_b)
 
 
-def _track_frame(
+def track_frame(
     record: AttitudeRecord, frame: LocalFrame, states: SmoothStates, time: Array, late: float
 ) -> TrackFrame:
     """Return level axes that turn with the heading averaged over waves, at true times (K,)."""
-    grid = np.arange(time[0] - _WAVES, time[-1] + _WAVES + _GRID, _GRID)
+    grid = np.arange(time[0] - WAVES, time[-1] + WAVES + _GRID, _GRID)
     heading = record.rph_at(grid + late)[:, 2]
-    width = 2 * round(0.25 * _WAVES / _GRID) + 1
+    width = 2 * round(0.25 * WAVES / _GRID) + 1
     # Twice: a triangle.
     for _ in range(2):
         padded = np.pad(heading, width // 2, mode="reflect", reflect_type="odd")
@@ -352,7 +354,7 @@ def _without_gross_errors(time: Array, velocity: Array, locked: Array, track: Tr
     return np.asarray(known[off < gate])
 
 
-def _clock(trial: Trial, frame: LocalFrame) -> str:
+def node_clock(trial: Trial, frame: LocalFrame) -> str:
     """Return the time offset of the clock of the nodes: of what measures the velocity most often.
 
     Its measurements stay where they are between nodes when its clock moves; with weights of the
@@ -392,12 +394,21 @@ def _nodes(
     log = trial.log
     own = track.time + lag if log is None or log.locked.sum() < 2 else log.time[log.locked]
     own = own[(own > first) & (own < last)]
-    longest = max(_LONGEST, (last - first) / _MOST_NODES)
+    longest = max(LONGEST, (last - first) / _MOST_NODES)
+    return without_long_steps(np.append(far_apart(first, own, longest), last), longest)
+
+
+def far_apart(first: float, own: Array, longest: float) -> Array:
+    """Return a time, s, and those after it that are half the longest step apart, or more."""
     kept = [first]
     for t in own.tolist():
         if t - kept[-1] > 0.5 * longest:
             kept.append(t)
-    edges = np.append(kept, last)
+    return np.array(kept)
+
+
+def without_long_steps(edges: Array, longest: float) -> Array:
+    """Return times (M,), s, with others in between where steps are too long."""
     wide = np.flatnonzero(np.diff(edges) > longest)
     more = [
         np.linspace(edges[i], edges[i + 1], int(np.ceil((edges[i + 1] - edges[i]) / longest)) + 1)
@@ -407,11 +418,11 @@ def _nodes(
     return np.asarray(every[np.concatenate([[True], np.diff(every) > 1e-3])])
 
 
-def _turns(record: AttitudeRecord, time: Array) -> BoolArray:
+def turns(record: AttitudeRecord, time: Array) -> BoolArray:
     """Whether the heading changes over seconds about stamps (M,) of the attitude."""
-    ahead = record.rph_at(time + 0.5 * _TURN_SPAN)[:, 2]
-    behind = record.rph_at(time - 0.5 * _TURN_SPAN)[:, 2]
-    return np.asarray(np.abs(ahead - behind) / _TURN_SPAN > _TURNING)
+    ahead = record.rph_at(time + 0.5 * TURN_SPAN)[:, 2]
+    behind = record.rph_at(time - 0.5 * TURN_SPAN)[:, 2]
+    return np.asarray(np.abs(ahead - behind) / TURN_SPAN > _TURNING)
 
 
 def _densities(
@@ -439,7 +450,7 @@ def _densities(
         time = log.time[rows] - float(values["time_offset_s"][0])
         v_b = log.velocity[rows] @ values.get("misalignment_deg", np.eye(3))
         interval = float(np.median(np.diff(time)))
-        in_turn = _turns(record, time + late)
+        in_turn = turns(record, time + late)
         spans = {False: _LEG_SPANS, True: (interval, 2.0 * interval)}
         for kind, of_kind in spans.items():
             found = _density(v_b, in_turn == kind, of_kind, interval)

@@ -1,0 +1,301 @@
+"""The newest nodes of a replay without IMU, and what is known of them by all that came before.
+
+Variables that leave are eliminated in the order of time. What is left of their factors is one
+linear factor on the first node that stays, on the processes there and on the constants.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import gtsam
+import numpy as np
+from scipy.linalg import solve_triangular
+
+from factorgraph_dvl.geometry.records import rows_of
+from factorgraph_dvl.geometry.rotations import BodyAxes
+from factorgraph_dvl.geometry.vectors import Array, BoolArray, rotate
+from factorgraph_dvl.graph import keys
+from factorgraph_dvl.graph.bound_observation import SAME_TIME
+from factorgraph_dvl.graph.priors import ConstantsPrior
+from factorgraph_dvl.graph.problem import Evaluation, Problem
+from factorgraph_dvl.graph.processes import Process
+from factorgraph_dvl.graph.smooth_chain import ChainStates, SmoothChain
+from factorgraph_dvl.graph.template import jacobian_template
+from factorgraph_dvl.graph.trajectory import TRAJECTORY_RATE, reported, tangent_in_n
+from factorgraph_dvl.sensors.parameters import Parameter
+from factorgraph_dvl.solution import Trajectory
+from factorgraph_dvl.statistics.square_root_information import SquareRootInformation
+
+# Time, s, before the first node at which the motion is known. Chosen: clocks move by less from one
+# window to the next, and no measurement may be lost at the first node.
+_BEFORE = 0.1
+
+
+@dataclass(frozen=True)
+class Known:
+    """What is known of the first node of a window by all that came before it.
+
+    Parameters
+    ----------
+    keys, sizes : list of int
+        Of the variables of the node, of processes and of constants, and their dimensions.
+    root : ndarray, shape (n, n)
+        Square root R of their information, upper triangular: R (x - x0) = d + unit noise.
+    right : ndarray, shape (n,)
+        d.
+    values : gtsam.Values
+        x0.
+    """
+
+    keys: list[int]
+    sizes: list[int]
+    root: Array
+    right: Array
+    values: gtsam.Values
+
+    def tilted(self, gradient: Array) -> Known:
+        """Return it with a gradient (P,) of the cost by the constants, its last variables."""
+        right, own = self.right.copy(), slice(self.right.size - gradient.size, None)
+        right[own] -= solve_triangular(self.root[own, own], gradient, trans="T")
+        return replace(self, right=right)
+
+    def factor(self) -> gtsam.LinearContainerFactor:
+        """Return it as a factor."""
+        linear = jacobian_template(self.keys, self.sizes, self.right.size)
+        linear.getA()[...], linear.getb()[...] = self.root, self.right
+        return gtsam.LinearContainerFactor(linear, self.values)
+
+
+@dataclass(frozen=True)
+class WindowChain(SmoothChain):
+    """Nodes of which the first, and the constants, have a prior by all that came before.
+
+    Parameters
+    ----------
+    known : Known
+        The prior.
+    """
+
+    known: Known = field(kw_only=True)
+
+    @cached_property
+    def graph(self) -> gtsam.NonlinearFactorGraph:
+        """What is known of the first node and the constants."""
+        graph = gtsam.NonlinearFactorGraph()
+        graph.add(self.known.factor())
+        return graph
+
+    def add_prior(
+        self,
+        graph: gtsam.NonlinearFactorGraph,
+        parameters: Sequence[Parameter],
+        key_of: Mapping[str, int],
+        constants_prior: ConstantsPrior | None,
+    ) -> Sequence[Parameter]:
+        """Add nothing, and leave nothing to add: what is known has all priors of parameters."""
+        return ()
+
+    def covers(self, time: Array) -> BoolArray:
+        """Whether times (M,) are between the first node, or a little before it, and the last."""
+        return np.asarray((time >= self.node_time[0] - _BEFORE) & (time <= self.node_time[-1]))
+
+
+@dataclass(frozen=True)
+class Past:
+    """What leaves a window at a node that becomes the first.
+
+    Parameters
+    ----------
+    known : Known
+        Of what stays.
+    processes : tuple of Process
+        As they go on.
+    nodes : mapping of str to ndarray
+        Their nodes (J, size) that stay, by name.
+    measured : mapping of str to float
+        By label, the time, s, of the last measurement that leaves.
+    """
+
+    known: Known
+    processes: tuple[Process, ...]
+    nodes: Mapping[str, Array]
+    measured: Mapping[str, float]
+
+
+@dataclass(frozen=True)
+class Window:
+    """Nodes and where a step of their problem led; also those of a batch solution.
+
+    Parameters
+    ----------
+    problem : Problem
+        With a chain without IMU.
+    evaluation : Evaluation
+        Where the step ended.
+    information : SquareRootInformation
+        From the elimination of the step, the constants last.
+    """
+
+    problem: Problem
+    evaluation: Evaluation
+    information: SquareRootInformation
+
+    @property
+    def chain(self) -> SmoothChain:
+        """The nodes."""
+        chain = self.problem.chain
+        assert isinstance(chain, SmoothChain)
+        return chain
+
+    @property
+    def values(self) -> dict[str, Array]:
+        """Values of parameters, and of the nodes of processes."""
+        return self.evaluation.parameters
+
+    @property
+    def lag(self) -> float:
+        """Times of the nodes less true times, s."""
+        clock = self.chain.clock
+        return 0.0 if clock is None else float(self.values[clock][0])
+
+    @cached_property
+    def constants(self) -> Array:
+        """Covariance (P, P) of the parameters, in their tangent space, SI."""
+        columns = self.problem.columns
+        size = sum(p.mean.size for p in self.problem.parameters)
+        every = {self.problem.key(name): np.eye(size)[:, own] for name, own in columns.items()}
+        return self.information.covariance_of([every]) if every else np.zeros((0, 0))
+
+    @cached_property
+    def states(self) -> Array:
+        """Covariances (K, 9, 9) of the states at true times, in GTSAM's tangent space.
+
+        A clock of the nodes that is off by some time moves them along the motion.
+        """
+        wanted = [keys.node(k) for k in range(self.chain.node_time.size)]
+        marginals = self.information.marginals(wanted)
+        P = np.stack([marginals[key] for key in wanted])
+        clock = self.chain.clock
+        if clock is None:
+            return P
+        with_clock = self.information.covariance_with([{self.problem.key(clock): np.eye(1)}])
+        own = with_clock[self.problem.key(clock)][0, 0]
+        cross = np.stack([with_clock[key] for key in wanted])
+        motion = self.chain.motion(self.chain.attach(self.chain.node_time), self.evaluation.states)
+        bRn = motion.nRb.transpose(0, 2, 1)
+        moved = (motion.omega_eb_b, rotate(bRn, motion.v_n), rotate(bRn, motion.a_n))
+        by_time = np.concatenate(moved, axis=1)[:, :, None]
+        both = cross @ by_time.transpose(0, 2, 1)
+        both = both + both.transpose(0, 2, 1)
+        return np.asarray(P + both + own * by_time @ by_time.transpose(0, 2, 1))
+
+    def newest(self, body_axes: BodyAxes) -> Trajectory:
+        """Return the last state, as a trajectory of one epoch."""
+        chain, states = self.chain, self.evaluation.states
+        own = slice(-1, None)
+        motion = chain.motion(chain.attach(chain.node_time[own]), states)
+        P = tangent_in_n(self.states[own], states.nRb[own])
+        return reported(chain.node_time[own] - self.lag, motion, P, chain.frame, body_axes)
+
+    def motion(self, since: float, last: int, body_axes: BodyAxes) -> Trajectory:
+        """Return the motion after a true time, s, and up to a node that is not the first."""
+        before = int(np.searchsorted(self.chain.node_time, since + self.lag, side="right")) - 1
+        nodes = slice(min(max(before, 0), last - 1), last + 1)
+        chain, s = self.chain, self.evaluation.states
+        chain = replace(
+            chain,
+            node_time=chain.node_time[nodes],
+            density=chain.density[nodes][: last - nodes.start],
+            track=chain.track.some(nodes),
+        )
+        own = (s.nRb[nodes], s.p_n[nodes], s.v_n[nodes], s.omega_b[nodes])
+        states = ChainStates(*own, chain.node_time, chain.track)
+        found = chain.trajectory(states, self.states[nodes], body_axes, TRAJECTORY_RATE, self.lag)
+        return rows_of(found, found.time > since + SAME_TIME)
+
+    def before(self, first: int) -> Past:
+        """Return what all that came before a node say of what stays.
+
+        The factors of measurements and steps after the node are left out: they are to be linear
+        where the next window is.
+        """
+        problem, at = self.problem, self.evaluation
+        gaussian = problem.linearize(at)
+        starts = {p.name: self._first_node_of(p, first) for p in problem.processes}
+        gone = set(self.chain.keys_of(range(first)))
+        gone.update(p.key(j) for p in problem.processes for j in range(starts[p.name]))
+        past, priors = gtsam.GaussianFactorGraph(), problem.graph.size()
+        for i in range(gaussian.size()):
+            own = gaussian.at(i).keys()
+            # Priors come first, but for those of processes, which have one variable.
+            prior = i < priors or (len(own) == 1 and keys.is_process(own[0]))
+            if prior or not gone.isdisjoint(own):
+                past.push_back(gaussian.at(i))
+        ordering = problem.ordering(branches=False)
+        every = [ordering.at(i) for i in range(ordering.size())]
+        leaving = keys.ordering(key for key in every if key in gone)
+        _, rest = past.eliminatePartialMultifrontal(leaving, gtsam.EliminateQR)
+        kept, matrix, vector = _depended_on(rest, every, at.values.dims())
+        triangle: Array = np.linalg.qr(np.column_stack([matrix, vector]), mode="r")
+        n = matrix.shape[1]
+        renamed = {keys.node(first): keys.node(0), keys.rate(first): keys.rate(0)}
+        for p in problem.processes:
+            first_left = starts[p.name]
+            renamed |= {p.key(j): p.key(j - first_left) for j in range(first_left, p.time.size)}
+        sizes, values = at.values.dims(), gtsam.Values()
+        rotations = {problem.key(p.name) for p in problem.parameters if p.rotation}
+        for key in kept:
+            if key == keys.node(first):
+                values.insert(keys.node(0), nav_state=at.values.atNavState(key))
+            elif key in rotations:
+                values.insert(key, at.values.atRot3(key))
+            else:
+                values.insert(renamed.get(key, key), at.values.atVector(key))
+        known = Known(
+            [renamed.get(key, key) for key in kept],
+            [int(sizes[key]) for key in kept],
+            triangle[:n, :n],
+            triangle[:n, n],
+            values,
+        )
+        return Past(
+            known,
+            tuple(p.going_on(p.time[starts[p.name] :], p.walk) for p in problem.processes),
+            {p.name: self.values[p.name][starts[p.name] :] for p in problem.processes},
+            self._measured_before(first),
+        )
+
+    def _first_node_of(self, process: Process, first: int) -> int:
+        """Return the first node of a process that measurements after a node of the chain need."""
+        time = [self.chain.node_time[first:]]
+        for bound in self.problem.bound:
+            if process in self.problem.processes_of(bound).all:
+                time.append(bound.observation.time[bound.attachment.node >= first])
+        return int(process.place(np.concatenate(time))[0].min())
+
+    def _measured_before(self, first: int) -> dict[str, float]:
+        """Return the time of the last measurement before a node, by label."""
+        out = {}
+        for bound in self.problem.bound:
+            time = bound.observation.time[bound.attachment.node < first]
+            if time.size:
+                out[bound.observation.label] = float(time[-1])
+        return out
+
+
+def _depended_on(
+    graph: gtsam.GaussianFactorGraph, every: Sequence[int], sizes: Mapping[int, int]
+) -> tuple[list[int], Array, Array]:
+    """Return the variables, in order, on which a graph depends, with its matrix and vector.
+
+    A node of a process has zeros only where the last measurement was at the node before.
+    """
+    there = set(graph.keyVector())
+    order = [key for key in every if key in there]
+    matrix, vector = graph.jacobian(keys.ordering(order))
+    parts = np.split(matrix, np.cumsum([sizes[key] for key in order])[:-1], axis=1)
+    kept = {key: part for key, part in zip(order, parts, strict=True) if part.any()}
+    return list(kept), np.concatenate(list(kept.values()), axis=1), vector
