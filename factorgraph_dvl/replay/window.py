@@ -239,7 +239,7 @@ class Window:
         leaving = keys.ordering(key for key in every if key in gone)
         _, rest = past.eliminatePartialMultifrontal(leaving, gtsam.EliminateQR)
         kept, matrix, vector = _depended_on(rest, every, at.values.dims())
-        triangle: Array = np.linalg.qr(np.column_stack([matrix, vector]), mode="r")
+        triangle = np.asarray(np.linalg.qr(np.column_stack([matrix, vector]), mode="r"))
         n = matrix.shape[1]
         renamed = {keys.node(first): keys.node(0), keys.rate(first): keys.rate(0)}
         for p in problem.processes:
