@@ -119,10 +119,10 @@ class BoundObservation:
 
     def at(self, parameters: Mapping[str, Array]) -> BoundObservation:
         """Return the measurements where clocks have moved them, at the same nodes."""
-        late = self.late(parameters)
-        if not late.any():
+        late, shift = self.late(parameters), self.chain.shift(parameters)
+        if not late.any() and not shift:
             return self
-        at, errors = self.chain.later(self.attachment, late), self.errors
+        at, errors = self.chain.later(self.attachment, late, shift), self.errors
         return replace(
             self,
             attachment=at,
@@ -139,12 +139,14 @@ class BoundObservation:
     def clocks(self) -> set[str | None]:
         """Names of the parameters that move it in time."""
         clock = self.observation.clock
-        return {self.chain.clock, *(() if clock is None else clock.names)}
+        of_chain = (self.chain.clock, self.chain.attitude_clock)
+        return {*of_chain, *(() if clock is None else clock.names)}
 
     @property
     def names(self) -> set[str | None]:
         """Names of the parameters that it may depend on."""
-        return {*parameters_of(self.observation), *ERRORS, self.chain.clock}
+        of_chain = (self.chain.clock, self.chain.attitude_clock)
+        return {*parameters_of(self.observation), *ERRORS, *of_chain}
 
     def late(self, parameters: Mapping[str, Array]) -> Array:
         """Return by how much clocks have moved measurements since they were bound, (M,), s."""
@@ -161,7 +163,8 @@ class BoundObservation:
         """
         at, rest = self.attachment, late
         if self.chain.interpolates:
-            return self.chain.motion(self.chain.attach(self.time + late), states)
+            at = self.chain.attach(self.time + late, self.chain.shift(parameters))
+            return self.chain.motion(at, states)
         if moved:
             at, rest = self.chain.attach(self.time + late), np.zeros_like(late)
         if self.errors is not None:
@@ -203,7 +206,13 @@ class BoundObservation:
         names = {*wanted, *(p.parameter for p in processes.varying if p.parameter)}
         values = self.values(parameters, processes)
         return linearized(
-            self.observation, motion, values, names, self.clock_zero, self.chain.clock
+            self.observation,
+            motion,
+            values,
+            names,
+            self.clock_zero,
+            self.chain.clock,
+            self.chain.attitude_clock,
         )
 
     def jacobian(

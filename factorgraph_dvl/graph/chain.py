@@ -83,6 +83,13 @@ class Chain(Protocol):
         """Name of the time offset of the clock that the nodes have; None = true times."""
 
     @property
+    def attitude_clock(self) -> str | None:
+        """Name of the time offset of the clock that attitudes of nodes have, if another one."""
+
+    def shift(self, parameters: Mapping[str, Array]) -> float:
+        """Return by how much its clock of attitudes is late beside that of the nodes, s."""
+
+    @property
     def node_time(self) -> Array:
         """Times of the nodes, (K,), s."""
 
@@ -188,13 +195,13 @@ class Chain(Protocol):
     def covers(self, time: Array) -> BoolArray:
         """Whether the motion is known at times (M,)."""
 
-    def attach(self, time: Array) -> Any:
+    def attach(self, time: Array, shift: float = 0.0) -> Any:
         """Return where times (M,) hang on the chain; those that are not covered, where nearest."""
 
-    def later(self, at: Any, late: Array) -> Any:
+    def later(self, at: Any, late: Array, shift: float = 0.0) -> Any:
         """Return an attachment at times that are later by (M,) s, to the same nodes."""
 
-    def left(self, at: Any, late: Array, tolerance: float) -> bool:
+    def left(self, at: Any, late: Array, tolerance: float, shift: float = 0.0) -> bool:
         """Whether measurements later by (M,) s are to be bound anew; tolerance in s."""
 
     def motion(self, at: Any, states: Any) -> Motion:

@@ -66,6 +66,7 @@ def linearized(
     wanted: Collection[str],
     zero: float,
     clock: str | None = None,
+    attitude_clock: str | None = None,
 ) -> Linearization:
     """Return residual and Jacobians of measurements, those of their clock included.
 
@@ -73,7 +74,8 @@ def linearized(
 
         dρ/do = -(dρ/dθ ω_eb + dρ/dp v + dρ/dv a + dρ/dω α),    dρ/dr = (t - t0) dρ/do.
 
-    Nodes that move with a clock of lag n have dρ/dn = -dρ/do, for all measurements.
+    Nodes that move with a clock of lag n have dρ/dn = -dρ/do, for all measurements; where their
+    attitudes have a clock of their own, each of both takes its terms.
 
     Parameters
     ----------
@@ -89,25 +91,30 @@ def linearized(
         Time t0 at which the offsets of clocks hold.
     clock : str, optional
         Name of the offset of the clock that the nodes have; None = they are at true times.
+    attitude_clock : str, optional
+        The same of their attitudes and rates; None = that of the nodes.
     """
     lin = observation.linearize(motion, values, wanted)
     own = () if observation.clock is None else observation.clock.names
-    if not {*own, clock} & {*wanted}:
+    if not {*own, clock, attitude_clock} & {*wanted}:
         return lin
-    by_time = np.zeros((*lin.residual.shape, 1))
-    for jacobian, change in (
-        (lin.d_theta, motion.omega_eb_b),
-        (lin.d_p, motion.v_n),
-        (lin.d_v, motion.a_n),
-        (lin.d_omega, motion.alpha_b),
-    ):
-        if jacobian is not None:
-            by_time += jacobian @ change[:, :, None]
+
+    def by_change(*of: tuple[Array | None, Array]) -> Array:
+        out = np.zeros((*lin.residual.shape, 1))
+        for jacobian, change in of:
+            if jacobian is not None:
+                out += jacobian @ change[:, :, None]
+        return out
+
+    turning = by_change((lin.d_theta, motion.omega_eb_b), (lin.d_omega, motion.alpha_b))
+    moving = by_change((lin.d_p, motion.v_n), (lin.d_v, motion.a_n))
+    by_time = turning + moving
     found = dict(lin.d_parameters)
     since = (observation.time - zero)[:, None, None]
     for name, by in zip(own, (-by_time, -by_time * since), strict=False):
         if name in wanted:
             found[name] = by
-    if clock is not None and clock in wanted:
-        found[clock] = found.get(clock, 0.0) + by_time
+    for of_chain, by in ((clock, moving), (attitude_clock or clock, turning)):
+        if of_chain is not None and of_chain in wanted:
+            found[of_chain] = found.get(of_chain, 0.0) + by
     return replace(lin, d_parameters=found)

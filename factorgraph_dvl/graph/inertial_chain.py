@@ -109,6 +109,7 @@ class InertialChain:
     graph: gtsam.NonlinearFactorGraph
     # Nodes are at true times, which are those of the IMU.
     clock: ClassVar[str | None] = None
+    attitude_clock: ClassVar[str | None] = None
     interpolates: ClassVar[bool] = False
     step_source: ClassVar[str | None] = None
 
@@ -213,15 +214,19 @@ class InertialChain:
         """Whether the IMU recorded the motion at times (M,)."""
         return np.asarray(self.segments.increments.locate(time)[2])
 
-    def attach(self, time: Array) -> Attachment:
+    def shift(self, parameters: Mapping[str, Array]) -> float:
+        """Return 0: attitudes are at the times of the nodes."""
+        return 0.0
+
+    def attach(self, time: Array, shift: float = 0.0) -> Attachment:
         """Return where times (M,) hang on the chain; those that are not covered, where nearest."""
         return attach_inside(self.segments, time, self.frame.earth_rate)[0]
 
-    def later(self, at: Attachment, late: Array) -> Attachment:
+    def later(self, at: Attachment, late: Array, shift: float = 0.0) -> Attachment:
         """Return an attachment at times that are later by (M,) s, to the same nodes."""
         return later(at, late, self.frame.earth_rate)
 
-    def left(self, at: Attachment, late: Array, tolerance: float) -> bool:
+    def left(self, at: Attachment, late: Array, tolerance: float, shift: float = 0.0) -> bool:
         """Whether measurements later by (M,) s are to be bound anew; tolerance in s."""
         return bool(np.abs(late).max() > tolerance)
 

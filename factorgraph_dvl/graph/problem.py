@@ -544,9 +544,10 @@ class Problem:
         for block in self._blocks:
             for bound in block.bound:
                 late = bound.late(parameters)
-                if self.chain.left(bound.attachment, late, SAME_TIME):
+                shift = self.chain.shift(parameters)
+                if self.chain.left(bound.attachment, late, SAME_TIME, shift):
                     bound.time = bound.time + late
-                    bound.attachment = self.chain.attach(bound.time)
+                    bound.attachment = self.chain.attach(bound.time, shift)
                     block.parts, block.matrices, block.vectors, block.factors = [], [], [], []
 
     def _fill(self, evaluation: Evaluation) -> None:
@@ -653,6 +654,8 @@ class Problem:
 
         if self._weighed_at is None:
             raise ValueError("the measurements have no weights yet: call `weigh` first")
+        if self.chain.interpolates:
+            self._follow(self.arrays(self._weighed_at)[1])
         return native_graph(self), gtsam.Values(self._weighed_at)
 
     def native(self, evaluation: Evaluation, *, steps: bool = True) -> gtsam.GaussianFactorGraph:
@@ -743,7 +746,7 @@ class Problem:
         return BoundObservation(
             observation,
             self.chain,
-            self.chain.attach(time) if at is None else at,
+            self.chain.attach(time, self.chain.shift(self.bound_at)) if at is None else at,
             time,
             covered,
             weight,

@@ -20,11 +20,11 @@ from factorgraph_dvl.graph.keys import RATE_SIZE, STATE_SIZE
 from factorgraph_dvl.graph.priors import ConstantsPrior, loose_diagonal
 from factorgraph_dvl.graph.smooth_motion import (
     Between,
-    NodeSteps,
     SmoothStates,
+    Turns,
     interpolated,
     motion_steps,
-    node_steps,
+    turns_of,
 )
 from factorgraph_dvl.graph.trajectory import between, epochs_between, reported, tangent_in_n
 from factorgraph_dvl.sensors.parameters import Parameter
@@ -64,65 +64,32 @@ class Attached:
         Node before.
     segment : ndarray of int, shape (M,)
         The same: segments are from node to node.
-    time : ndarray, shape (M,), s
-        By the clock of the nodes.
+    time, turned : ndarray, shape (M,), s
+        By the clock of the nodes, and by that of their attitudes.
     """
 
     node: IntArray
     segment: IntArray
     time: Array
-
-
-@dataclass(frozen=True)
-class TrackFrame:
-    """Level axes that turn with the vessel's heading, but not with the waves.
-
-    Parameters
-    ----------
-    nRt : ndarray, shape (K, 3, 3)
-        Axes to n, at the nodes.
-    omega_t : ndarray, shape (K, 3), rad/s
-        Their rate relative to n.
-    """
-
-    nRt: Array
-    omega_t: Array
-
-    def some(self, nodes: slice) -> TrackFrame:
-        """Return the axes at some nodes."""
-        return TrackFrame(self.nRt[nodes], self.omega_t[nodes])
+    turned: Array
 
 
 @dataclass(frozen=True)
 class ChainStates(SmoothStates):
-    """States of the nodes, with what leads from one to the next.
-
-    Attitude and rates go on along the axes of the body, position and velocity along those of the
-    track: waves turn a vessel, but not its velocity.
+    """States of the nodes, with what turns the body from one to the next.
 
     Parameters
     ----------
     time : ndarray, shape (K,), s
         Of the nodes.
-    track : TrackFrame
-        At the nodes.
     """
 
     time: Array
-    track: TrackFrame
 
     @cached_property
-    def turning(self) -> tuple[SmoothStates, NodeSteps]:
-        """Attitude and rates alone, and what leads from node to node."""
-        none = np.zeros_like(self.p_n)
-        own = SmoothStates(self.nRb, none, none, self.omega_b)
-        return own, node_steps(self.time, own, none[1:])
-
-    @cached_property
-    def moving(self) -> tuple[SmoothStates, NodeSteps]:
-        """Position and velocity with the axes of the track, and what leads from node to node."""
-        own = SmoothStates(self.track.nRt, self.p_n, self.v_n, self.track.omega_t)
-        return own, node_steps(self.time, own, np.zeros_like(self.p_n[1:]))
+    def turns(self) -> Turns:
+        """What turns the body from node to node."""
+        return turns_of(self.time, self)
 
 
 @dataclass(frozen=True)
@@ -139,10 +106,15 @@ class SmoothChain:
         Power spectral densities of the acceleration between nodes, as of `motion_steps`.
     start : SmoothStates
         States about which the prior of the first is loose.
-    track : TrackFrame
-        Axes in which the velocity changes little.
+    nRt : ndarray, shape (K, 3, 3)
+        Axes of the track to n: level, they turn with the heading but not with waves.
     clock : str, optional
         Name of the time offset of the clock that the nodes have; None = true times.
+    attitude_clock : str, optional
+        Name of the time offset of the clock that their attitudes have: measurements of attitude
+        then stay where they are between nodes whatever the clocks.
+    first_shift : float, default 0, s
+        By how much that clock was late where both agree with the times of the nodes.
     resolution : float, default 0, s
         Interval of the densest record: a trajectory has no more epochs.
     block : slice, optional
@@ -153,8 +125,10 @@ class SmoothChain:
     node_time: Array
     density: Array
     start: SmoothStates
-    track: TrackFrame
+    nRt: Array
     clock: str | None = None
+    attitude_clock: str | None = None
+    first_shift: float = 0.0
     resolution: float = 0.0
     block: slice | None = None
     interpolates: ClassVar[bool] = True
@@ -254,7 +228,7 @@ class SmoothChain:
             self,
             node_time=self.node_time[two],
             density=self.density[k : k + 1],
-            track=self.track.some(two),
+            nRt=self.nRt[two],
             block=None,
         )
 
@@ -266,47 +240,57 @@ class SmoothChain:
             omega[i] = values.atVector(keys.rate(k))
         nRb, p_n, v_n = (state[:, :3, part].copy() for part in (slice(0, 3), 3, 4))
         some = slice(nodes.start, nodes.stop)
-        return ChainStates(nRb, p_n, v_n, omega, self.node_time[some], self.track.some(some))
+        return ChainStates(nRb, p_n, v_n, omega, self.node_time[some])
 
     def covers(self, time: Array) -> BoolArray:
-        """Whether times (M,) are between the first node and the last."""
-        return np.asarray((time >= self.node_time[0]) & (time <= self.node_time[-1]))
+        """Whether times (M,) are between the first node and the last but one.
 
-    def attach(self, time: Array) -> Attached:
-        """Return where times (M,) hang on the chain; those that are not covered, where nearest."""
-        node = np.searchsorted(self.node_time, time, side="right") - 1
+        The last one is for attitudes, whose nodes may be earlier.
+        """
+        return np.asarray((time >= self.node_time[0]) & (time <= self.node_time[-2]))
+
+    def shift(self, parameters: Mapping[str, Array]) -> float:
+        """Return by how much its clock of attitudes is late beside that of the nodes, s."""
+        if self.attitude_clock is None:
+            return 0.0
+        lag = 0.0 if self.clock is None else float(parameters[self.clock][0])
+        return float(parameters[self.attitude_clock][0]) - lag - self.first_shift
+
+    def attach(self, time: Array, shift: float = 0.0) -> Attached:
+        """Return where times (M,) hang on the chain; those that are not covered, where nearest.
+
+        Between the nodes that their attitude is between: what turns a vessel is faster than what
+        moves it.
+        """
+        turned = time + shift
+        node = np.searchsorted(self.node_time, turned, side="right") - 1
         node = np.clip(node, 0, self.count - 1)
         # A clock may take a measurement a little beyond the ends.
-        first, last = self.node_time[0] - _MARGIN, self.node_time[-1] + _MARGIN
-        return Attached(node, node, np.clip(time, first, last))
+        ends = self.node_time[0] - _MARGIN, self.node_time[-1] + _MARGIN
+        return Attached(node, node, np.clip(time, *ends), np.clip(turned, *ends))
 
-    def later(self, at: Attached, late: Array) -> Attached:
+    def later(self, at: Attached, late: Array, shift: float = 0.0) -> Attached:
         """Return an attachment at times that are later by (M,) s, to the same nodes."""
-        return replace(at, time=at.time + late)
+        return replace(at, time=at.time + late, turned=at.time + late + shift)
 
-    def left(self, at: Attached, late: Array, tolerance: float) -> bool:
+    def left(self, at: Attached, late: Array, tolerance: float, shift: float = 0.0) -> bool:
         """Whether measurements later by (M,) s are to be bound anew: they left their nodes."""
         first, last = self.node_time[at.node], self.node_time[at.node + 1]
-        beyond = np.maximum(first - at.time - late, at.time + late - last)
+        turned = at.time + late + shift
+        beyond = np.maximum(first - turned, turned - last)
         return bool(np.any(beyond > np.maximum(_BEYOND * (last - first), tolerance)))
 
     def motion(self, at: Attached, states: ChainStates) -> Motion:
         """Return the motion at M attached times."""
-        return self._between(at, states).motion
+        return self.transition(at, states).motion
 
-    def transition(self, at: Attached, states: ChainStates, motion: Motion) -> Transition:
+    def transition(
+        self, at: Attached, states: ChainStates, motion: Motion | None = None
+    ) -> Between:
         """Return the motion at attached times, from which derivatives by the nodes follow."""
-        return self._between(at, states)
+        return interpolated(states.turns, states.time, states, at.node, at.time, at.turned)
 
-    def _between(self, at: Attached, states: ChainStates) -> Transition:
-        none = np.zeros_like(states.p_n[1:])
-        turning, moving = (
-            interpolated(states.time, own, none, at.time, at.node, steps)
-            for own, steps in (states.turning, states.moving)
-        )
-        return Transition(states.nRb, states.track.nRt, turning, moving)
-
-    def node_jacobian(self, lin: Linearization, transition: Transition) -> Array:
+    def node_jacobian(self, lin: Linearization, transition: Between) -> Array:
         """Return the derivative of residuals by the variables of measurements, (M, d, 24)."""
         return transition.by_nodes(lin)
 
@@ -316,22 +300,11 @@ class SmoothChain:
         for first in range(block.start, block.stop, _CHUNK):
             last = min(first + _CHUNK, block.stop)
             nodes = slice(first, last + 1)
-            turn, move = (
-                motion_steps(
-                    self.node_time[nodes],
-                    SmoothStates(*(getattr(own, name)[nodes] for name in _OF_STATE)),
-                    np.zeros((last - first, 3)),
-                    self.density[first:last],
-                )
-                for own, _ in (states.turning, states.moving)
-            )
-            tRb = (states.track.nRt.transpose(0, 2, 1) @ states.nRb)[nodes]
-            by_nodes = [
-                _joined(turn.before, move.before, tRb[:-1]),
-                _joined(turn.after, move.after, tRb[1:]),
-            ]
-            residual = np.where(_TURNING, turn.residual, move.residual)
-            yield StepRows(MOTION, _COMPONENTS, first, residual, np.concatenate(by_nodes, axis=2))
+            some = SmoothStates(*(getattr(states, name)[nodes] for name in _OF_STATE))
+            turns = turns_of(self.node_time[nodes], some)
+            found = motion_steps(turns, some, self.nRt[nodes], self.density[first:last])
+            by_nodes = np.concatenate([found.before, found.after], axis=2)
+            yield StepRows(MOTION, _COMPONENTS, first, found.residual, by_nodes)
 
     def add_prior(
         self,
@@ -385,18 +358,10 @@ class SmoothChain:
         for i in range(0, max(time.size, 1), _CHUNK):
             some = time[i : i + _CHUNK]
             at = self.attach(some + lag)
-            found = self._between(at, states)
+            found = self.transition(at, states)
             span = np.diff(self.node_time)[at.node]
             fraction = (at.time - self.node_time[at.node]) / span
-            covariance = between(P_n, at.node, fraction)
-            every = np.zeros((some.size, 9, 12))
-            every[:, np.arange(9), np.arange(9)] = 1.0
-            missing = found.variance(self.density, every)
-            R = found.motion.nRb
-            for j in range(3):
-                own = slice(3 * j, 3 * j + 3)
-                block = missing[:, own, own]
-                covariance[:, j] += R @ block @ R.transpose(0, 2, 1) if j == 0 else block
+            covariance = between(P_n, at.node, fraction) + found.missing(self.density, self.nRt)
             parts.append(reported(some, found.motion, covariance, self.frame, body_axes))
         return parts[0] if len(parts) == 1 else concatenated(parts)
 
@@ -414,64 +379,3 @@ class SmoothChain:
 
 
 _OF_STATE = ("nRb", "p_n", "v_n", "omega_b")
-# Rows of a step that are of the rotation, and columns of a node.
-_TURNING = np.tile(np.repeat([True, False], 3), 2)
-_BY_ATTITUDE = np.repeat([True, False, False, True], 3)
-_ATTITUDE = np.flatnonzero(_BY_ATTITUDE)
-
-
-def _joined(turning: Array, moving: Array, tRb: Array) -> Array:
-    """Return derivatives (M, d, 12) of steps by a node from those of rotation and track.
-
-    The latter are by position and velocity in axes of the track, tRb (M, 3, 3) from body.
-    """
-    out = turning * (_TURNING[:, None] & _BY_ATTITUDE)
-    for own in (slice(3, 6), slice(6, 9)):
-        out[:, :, own] = (moving[:, :, own] @ tRb) * ~_TURNING[:, None]
-    return out
-
-
-@dataclass(frozen=True)
-class Transition:
-    """Motion at M times between nodes: attitude and rates apart from position and velocity.
-
-    Parameters
-    ----------
-    nRb, nRt : ndarray, shape (K, 3, 3)
-        Axes of the body and of the track at the nodes, to n.
-    turning, moving : Between
-        Attitude and rates, in axes of the body; position and velocity, in axes of the track.
-    """
-
-    nRb: Array
-    nRt: Array
-    turning: Between
-    moving: Between
-
-    @property
-    def motion(self) -> Motion:
-        """The motion."""
-        turning, moving = self.turning.motion, self.moving.motion
-        return replace(turning, p_n=moving.p_n, v_n=moving.v_n, a_n=moving.a_n)
-
-    def by_nodes(self, lin: Linearization) -> Array:
-        """Return the derivatives (M, d, 24) of residuals by both nodes."""
-        node, rows = self.turning.node, lin.by_motion
-        out = np.zeros((*rows.shape[:2], 24))
-        if lin.d_theta is not None or lin.d_omega is not None:
-            found = self.turning.derivatives(rows * _BY_ATTITUDE)
-            for i, by in enumerate((found.before, found.after)):
-                out[:, :, 12 * i + _ATTITUDE] = by[:, :, _ATTITUDE]
-        if lin.d_p is not None or lin.d_v is not None:
-            found = self.moving.derivatives(rows * ~_BY_ATTITUDE)
-            for i, by in enumerate((found.before, found.after)):
-                k = node + i
-                tRb = self.nRt[k].transpose(0, 2, 1) @ self.nRb[k]
-                for own in (slice(3, 6), slice(6, 9)):
-                    out[:, :, 12 * i + own.start : 12 * i + own.stop] = by[:, :, own] @ tRb
-        return out
-
-    def variance(self, density: Array, rows: Array) -> Array:
-        """Return the covariance (M, d, d) of rows J (M, d, 12) times the motion, given nodes."""
-        turning = self.turning.variance(density, rows * _BY_ATTITUDE)
-        return turning + self.moving.variance(density, rows * ~_BY_ATTITUDE)

@@ -43,7 +43,7 @@ from factorgraph_dvl.solvers.preparation_without_imu import (
     lasting_observations,
     node_clock,
     prepare_without_imu,
-    track_frame,
+    track_axes,
     turns,
     without_long_steps,
 )
@@ -187,7 +187,7 @@ class ReplayWithoutImu:
             if nodes.size:
                 found = self._extend(*self._current, nodes, until, smoothed)
                 window = self._current[1]
-                trajectory = self._trajectory(window, window.chain.count)
+                trajectory = self._trajectory(window, window.last)
         if (until >= self._solve_at and not end) or (end and self._current is None):
             whole = self._solve(until, smoothed, end=end)
             solved = whole is not None
@@ -200,7 +200,7 @@ class ReplayWithoutImu:
         """Return the last update with what stays in the window when no more records come."""
         assert self._current is not None
         _, window = self._current
-        rest = self._smooth(window, window.chain.count)
+        rest = self._smooth(window, window.last)
         parts = [part for part in (last.smoothed, rest) if part is not None]
         return replace(last, smoothed=concatenated(parts))
 
@@ -226,7 +226,8 @@ class ReplayWithoutImu:
             return None
         whole = Window(settled.problem, settled.minimum.evaluation, settled.minimum.information)
         chain = whole.chain
-        count = int(np.searchsorted(chain.node_time, self._latest(whole, until, end=end), "right"))
+        latest = self._latest(whole, until, end=end)
+        count = int(np.searchsorted(chain.node_time[: whole.last + 1], latest, "right"))
         if count < _FEWEST:
             return None
         batch = self._batch(prepared, settled.problem, until)
@@ -239,14 +240,12 @@ class ReplayWithoutImu:
         smoothed.append(self._smooth(whole, min(first + 1, count - 1)))
         past = self._leave(batch, whole, first)
         nodes = slice(first, count)
-        s = whole.evaluation.states
-        states = SmoothStates(s.nRb[nodes], s.p_n[nodes], s.v_n[nodes], s.omega_b[nodes])
         problem, at = self._window(
             batch,
             past,
             chain.node_time[nodes],
-            chain.density[nodes][: count - first - 1],
-            states,
+            chain.density[first : count - 1],
+            _some(whole.evaluation.states, nodes),
             whole.values,
             until,
         )
@@ -306,25 +305,24 @@ class ReplayWithoutImu:
     ) -> Judged:
         """Add nodes to the window, and let the oldest leave it."""
         chain = window.chain
-        first = self._first_node(np.append(chain.node_time, nodes))
+        real = chain.node_time[: window.last + 1]
         # A gap longer than the lag leaves the last node.
-        first = min(first, chain.count)
-        smoothed.append(self._smooth(window, min(first + 1, chain.count)))
+        first = min(self._first_node(np.append(real, nodes)), window.last)
+        smoothed.append(self._smooth(window, min(first + 1, window.last)))
         past = self._leave(batch, window, first)
-        gained = float(nodes[-1] - chain.node_time[-1])
+        gained = float(nodes[-1] - real[-1])
         past = replace(past, known=past.known.tilted(gained * batch.tilt))
-        time = np.append(chain.node_time[first:], nodes)
+        time = np.append(real[first:], nodes)
         record = self._attitudes(float(time[0]), until)
-        middle = 0.5 * (time[1:] + time[:-1])[chain.count - first :]
+        middle = 0.5 * (time[1:] + time[:-1])[window.last - first :]
         turning = turns(record, middle + batch.late - (0.0 if chain.clock is None else batch.lag))
         density = np.where(turning[:, None], batch.in_turns, batch.on_legs)
-        states = self._predicted(window, record, first, nodes)
         problem, at = self._window(
             batch,
             past,
             time,
-            np.concatenate([chain.density[first:], density]),
-            states,
+            np.concatenate([chain.density[first : window.last], density]),
+            _some(window.evaluation.states, slice(first, window.last + 1)),
             window.values,
             until,
         )
@@ -364,7 +362,7 @@ class ReplayWithoutImu:
         time, density : ndarray, shape (K,) or (K - 1, 6)
             Of the nodes.
         states : SmoothStates
-            There.
+            Of the first of them.
         values : mapping of str to ndarray
             Of the parameters.
         until : float
@@ -373,14 +371,20 @@ class ReplayWithoutImu:
         whole = batch.problem
         assert isinstance(whole.chain, SmoothChain)
         record = self._attitudes(float(time[0]), until)
+        # One more: the attitude of the last ping is between two nodes.
+        time = np.append(time, time[-1] + LONGEST)
+        density = np.concatenate([density, density[-1:]])
+        states = _going_on_straight(whole.chain, record, time, states)
         true = time - (0.0 if whole.chain.clock is None else batch.lag)
         chain = WindowChain(
             frame=whole.chain.frame,
             node_time=time,
             density=density,
             start=states,
-            track=track_frame(record, whole.chain.frame, states, true, batch.late),
+            nRt=track_axes(record, whole.chain.frame, states, true, batch.late),
             clock=whole.chain.clock,
+            attitude_clock=whole.chain.attitude_clock,
+            first_shift=whole.chain.first_shift,
             resolution=whole.chain.resolution,
             known=past.known,
         )
@@ -430,7 +434,7 @@ class ReplayWithoutImu:
 
     def _next_nodes(self, batch: _Batch, window: Window, until: float, *, end: bool) -> Array:
         """Return the times of the nodes that the records up to a time, s, allow."""
-        last = float(window.chain.node_time[-1])
+        last = float(window.chain.node_time[window.last])
         latest = self._latest(window, until, end=end)
         # True times where the clock of the nodes is not estimated.
         own = self._positions + window.lag if self._pings is None else self._pings
@@ -460,31 +464,6 @@ class ReplayWithoutImu:
         first = min(int(np.searchsorted(time, since - 2.0 * WAVES)), max(last - _ATTITUDES, 0))
         rows = rows_of(self._attitude, slice(first, last))
         return AttitudeRecord(rows, self._trial.body_axes, estimated=False)
-
-    def _predicted(
-        self, window: Window, record: AttitudeRecord, first: int, nodes: Array
-    ) -> SmoothStates:
-        """Return the states from a node on, and about those of new nodes.
-
-        Positions and velocities go on as they were; how the body points is as it was measured.
-        """
-        s, chain = window.evaluation.states, window.chain
-        late = float(window.values[self._attitude.clock.offset.name][0]) - window.lag
-        since = (nodes - chain.node_time[-1])[:, None]
-        p_n = s.p_n[-1] + since * s.v_n[-1]
-        stamp = np.clip(nodes + late, record.time[0], record.time[-1])
-        body = record.at(stamp, np.zeros((nodes.size, 3)), level_axes(chain.frame, p_n))
-        # With the turn of the body about the vertical.
-        turned = body.rph[:, 2] - record.rph_at(chain.node_time[-1:] + late)[:, 2]
-        nRl = level_axes(chain.frame, s.p_n[-1:])[0]
-        down = np.column_stack([np.zeros((nodes.size, 2)), -turned])
-        turn = nRl @ exp_so3(down) @ nRl.T
-        v_n = rotate(turn, np.broadcast_to(s.v_n[-1], p_n.shape))
-        new = (body.nRb, p_n, v_n, body.omega_eb_b)
-        old = (s.nRb, s.p_n, s.v_n, s.omega_b)
-        return SmoothStates(
-            *(np.concatenate([a[first:], b]) for a, b in zip(old, new, strict=True))
-        )
 
     def _first_node(self, time: Array) -> int:
         """Return the oldest node within the lag; two stay at least."""
@@ -520,7 +499,7 @@ class ReplayWithoutImu:
         assert self._current is not None
         _, window = self._current
         problem, axes = window.problem, self._trial.body_axes
-        now = float(window.chain.node_time[-1]) - window.lag
+        now = window.now
         report = CalibrationReport(problem.all_parameters)
         undetermined = np.zeros((len(window.constants), 0))
         new = [i for i in found.innovations if i.time.size]
@@ -540,6 +519,33 @@ class ReplayWithoutImu:
             solved=solved,
             inconsistent=tuple(sorted(self._gate.inconsistent)),
         )
+
+
+def _some(states: SmoothStates, nodes: slice) -> SmoothStates:
+    """Return the states of some nodes."""
+    every = (states.nRb, states.p_n, states.v_n, states.omega_b)
+    return SmoothStates(*(each[nodes] for each in every))
+
+
+def _going_on_straight(
+    chain: SmoothChain, record: AttitudeRecord, time: Array, states: SmoothStates
+) -> SmoothStates:
+    """Return states of the first nodes at times (K,), s, and about those of the others.
+
+    The speed goes on as it was, and turns as the body does; how that points is as it was measured.
+    """
+    known = len(states.p_n)
+    since = (time[known:] - time[known - 1])[:, None]
+    stamp = np.clip(time[known - 1 :] + chain.first_shift, record.time[0], record.time[-1])
+    p_n = states.p_n[-1] + since * states.v_n[-1]
+    level = level_axes(chain.frame, p_n)
+    body = record.at(stamp[1:], np.zeros_like(p_n), level)
+    turned = np.zeros_like(p_n)
+    turned[:, 2] = record.rph_at(stamp[:1])[:, 2] - body.rph[:, 2]
+    v_n = rotate(level @ exp_so3(turned) @ level.transpose(0, 2, 1), states.v_n[-1:])
+    new = (body.nRb, p_n, v_n, body.omega_eb_b)
+    old = (states.nRb, states.p_n, states.v_n, states.omega_b)
+    return SmoothStates(*(np.concatenate([a, b]) for a, b in zip(old, new, strict=True)))
 
 
 def _typical(std: Array) -> Array:

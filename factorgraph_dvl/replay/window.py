@@ -14,24 +14,27 @@ import gtsam
 import numpy as np
 from scipy.linalg import solve_triangular
 
-from factorgraph_dvl.geometry.records import rows_of
 from factorgraph_dvl.geometry.rotations import BodyAxes
-from factorgraph_dvl.geometry.vectors import Array, BoolArray, rotate
+from factorgraph_dvl.geometry.vectors import Array, BoolArray, IntArray, rotate
 from factorgraph_dvl.graph import keys
-from factorgraph_dvl.graph.bound_observation import SAME_TIME
 from factorgraph_dvl.graph.priors import ConstantsPrior
 from factorgraph_dvl.graph.problem import Evaluation, Problem
 from factorgraph_dvl.graph.processes import Process
-from factorgraph_dvl.graph.smooth_chain import ChainStates, SmoothChain
+from factorgraph_dvl.graph.smooth_chain import SmoothChain
 from factorgraph_dvl.graph.template import jacobian_template
-from factorgraph_dvl.graph.trajectory import TRAJECTORY_RATE, reported, tangent_in_n
+from factorgraph_dvl.graph.trajectory import (
+    TRAJECTORY_RATE,
+    between,
+    epochs_between,
+    reported,
+    tangent_in_n,
+)
 from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.solution import Trajectory
 from factorgraph_dvl.statistics.square_root_information import SquareRootInformation
 
-# Time, s, before the first node at which the motion is known. Chosen: clocks move by less from one
-# window to the next, and no measurement may be lost at the first node.
-_BEFORE = 0.1
+# Rows of a state that are of the attitude, and those that are not.
+_ATTITUDE, _OTHERS = slice(0, 3), slice(3, 9)
 
 
 @dataclass(frozen=True)
@@ -99,8 +102,8 @@ class WindowChain(SmoothChain):
         return ()
 
     def covers(self, time: Array) -> BoolArray:
-        """Whether times (M,) are between the first node, or a little before it, and the last."""
-        return np.asarray((time >= self.node_time[0] - _BEFORE) & (time <= self.node_time[-1]))
+        """Whether times (M,) are up to the last node but one: what came before is gone."""
+        return np.asarray(time <= self.node_time[-2])
 
 
 @dataclass(frozen=True)
@@ -151,6 +154,11 @@ class Window:
         return chain
 
     @property
+    def last(self) -> int:
+        """The last node at which something was measured; one more has the attitude after it."""
+        return self.chain.node_time.size - 2
+
+    @property
     def values(self) -> dict[str, Array]:
         """Values of parameters, and of the nodes of processes."""
         return self.evaluation.parameters
@@ -169,52 +177,72 @@ class Window:
         every = {self.problem.key(name): np.eye(size)[:, own] for name, own in columns.items()}
         return self.information.covariance_of([every]) if every else np.zeros((0, 0))
 
+    @property
+    def now(self) -> float:
+        """True time up to which the motion is known, s."""
+        time, shift = self.chain.node_time, self.chain.shift(self.values)
+        return float(min(time[-2], time[-1] - shift)) - self.lag
+
     @cached_property
     def states(self) -> Array:
-        """Covariances (K, 9, 9) of the states at true times, in GTSAM's tangent space.
+        """Covariances (K, 9, 9) of what the nodes have, where true times are exact.
 
-        A clock of the nodes that is off by some time moves them along the motion.
+        In GTSAM's tangent space. A clock of the nodes that is off by some time moves them along
+        the motion.
         """
-        wanted = [keys.node(k) for k in range(self.chain.node_time.size)]
+        chain, s = self.chain, self.evaluation.states
+        wanted = [keys.node(k) for k in range(chain.node_time.size)]
         marginals = self.information.marginals(wanted)
         P = np.stack([marginals[key] for key in wanted])
-        clock = self.chain.clock
-        if clock is None:
+        clocks = [
+            (self.problem.key(clock), rows)
+            for clock, rows in (
+                (chain.attitude_clock or chain.clock, _ATTITUDE),
+                (chain.clock, _OTHERS),
+            )
+            if clock is not None and clock in self.problem.columns
+        ]
+        if not clocks:
             return P
-        with_clock = self.information.covariance_with([{self.problem.key(clock): np.eye(1)}])
-        own = with_clock[self.problem.key(clock)][0, 0]
-        cross = np.stack([with_clock[key] for key in wanted])
-        motion = self.chain.motion(self.chain.attach(self.chain.node_time), self.evaluation.states)
-        bRn = motion.nRb.transpose(0, 2, 1)
-        moved = (motion.omega_eb_b, rotate(bRn, motion.v_n), rotate(bRn, motion.a_n))
-        by_time = np.concatenate(moved, axis=1)[:, :, None]
-        both = cross @ by_time.transpose(0, 2, 1)
-        both = both + both.transpose(0, 2, 1)
-        return np.asarray(P + both + own * by_time @ by_time.transpose(0, 2, 1))
+        bRn = s.nRb.transpose(0, 2, 1)
+        acceleration = np.gradient(s.v_n, chain.node_time, axis=0)
+        moved = np.hstack([s.omega_b, rotate(bRn, s.v_n), rotate(bRn, acceleration)])
+        by_clocks = np.zeros((len(P), 9, len(clocks)))
+        for i, (_, rows) in enumerate(clocks):
+            by_clocks[:, rows, i] = moved[:, rows]
+        found = self.information.covariance_with([{key: np.eye(1)} for key, _ in clocks])
+        cross = np.stack([found[key] for key in wanted]) @ by_clocks.transpose(0, 2, 1)
+        own = np.concatenate([found[key] for key, _ in clocks])
+        P = P + cross + cross.transpose(0, 2, 1)
+        return np.asarray(P + by_clocks @ own @ by_clocks.transpose(0, 2, 1))
 
     def newest(self, body_axes: BodyAxes) -> Trajectory:
-        """Return the last state, as a trajectory of one epoch."""
-        chain, states = self.chain, self.evaluation.states
-        own = slice(-1, None)
-        motion = chain.motion(chain.attach(chain.node_time[own]), states)
-        P = tangent_in_n(self.states[own], states.nRb[own])
-        return reported(chain.node_time[own] - self.lag, motion, P, chain.frame, body_axes)
+        """Return the newest motion that is known, as a trajectory of one epoch."""
+        return self._at(np.array([self.now]), body_axes)
 
     def motion(self, since: float, last: int, body_axes: BodyAxes) -> Trajectory:
-        """Return the motion after a true time, s, and up to a node that is not the first."""
-        before = int(np.searchsorted(self.chain.node_time, since + self.lag, side="right")) - 1
-        nodes = slice(min(max(before, 0), last - 1), last + 1)
-        chain, s = self.chain, self.evaluation.states
-        chain = replace(
-            chain,
-            node_time=chain.node_time[nodes],
-            density=chain.density[nodes][: last - nodes.start],
-            track=chain.track.some(nodes),
+        """Return the motion after a true time, s, and up to a node."""
+        chain = self.chain
+        first = chain.node_time[0] - min(chain.shift(self.values), 0.0) - self.lag
+        end = min(float(chain.node_time[last]) - self.lag, self.now)
+        rate = TRAJECTORY_RATE
+        if chain.resolution:
+            rate = min(rate, 1.0 / chain.resolution)
+        return self._at(epochs_between(max(since, first), end, rate), body_axes)
+
+    def _at(self, time: Array, body_axes: BodyAxes) -> Trajectory:
+        """Return the motion at true times (M,), s."""
+        chain, states = self.chain, self.evaluation.states
+        at = chain.attach(time + self.lag, chain.shift(self.values))
+        found = chain.transition(at, states)
+        P_n = tangent_in_n(self.states, states.nRb)
+        # The attitude is between other nodes.
+        parts = ((P_n[:, :1], at.turned), (P_n[:, 1:], at.time))
+        covariance = np.concatenate(
+            [between(own, *_place(chain.node_time, when)) for own, when in parts], axis=1
         )
-        own = (s.nRb[nodes], s.p_n[nodes], s.v_n[nodes], s.omega_b[nodes])
-        states = ChainStates(*own, chain.node_time, chain.track)
-        found = chain.trajectory(states, self.states[nodes], body_axes, TRAJECTORY_RATE, self.lag)
-        return rows_of(found, found.time > since + SAME_TIME)
+        covariance += found.missing(chain.density, chain.nRt)
+        return reported(time, found.motion, covariance, chain.frame, body_axes)
 
     def before(self, first: int) -> Past:
         """Return what all that came before a node say of what stays.
@@ -284,6 +312,13 @@ class Window:
             if time.size:
                 out[bound.observation.label] = float(time[-1])
         return out
+
+
+def _place(node_time: Array, time: Array) -> tuple[IntArray, Array]:
+    """Return the nodes before times (M,), and how far the times are on the way to the next."""
+    node = np.clip(np.searchsorted(node_time, time, side="right") - 1, 0, node_time.size - 2)
+    fraction = (time - node_time[node]) / (node_time[node + 1] - node_time[node])
+    return node, np.clip(fraction, 0.0, 1.0)
 
 
 def _depended_on(

@@ -17,7 +17,7 @@ from factorgraph_dvl.graph.chain import Chain
 from factorgraph_dvl.graph.priors import prior_mean
 from factorgraph_dvl.graph.problem import Problem
 from factorgraph_dvl.graph.processes import Process, node_times
-from factorgraph_dvl.graph.smooth_chain import SmoothChain, TrackFrame
+from factorgraph_dvl.graph.smooth_chain import SmoothChain
 from factorgraph_dvl.graph.smooth_motion import SmoothStates
 from factorgraph_dvl.imu.attitude_record import AttitudeRecord, level_axes
 from factorgraph_dvl.initialization.dvl_mounting import initial_mountings
@@ -167,18 +167,22 @@ def prepare_without_imu(trial: Trial) -> PreparationWithoutImu:
     lag = float(values[clock][0])
     nodes = _nodes(trial, record, track, late=late, lag=lag)
     turning = turns(record, 0.5 * (nodes[1:] + nodes[:-1]) + late - lag)
-    states = _states(record, track, frame, nodes - lag, late)
+    # Pings are half-way between nodes of the attitude: its acceleration jumps at these.
+    half = 0.5 * float(np.median(np.diff(nodes)))
+    states = _states(record, track, frame, nodes - lag, late - half)
     chain = SmoothChain(
         frame=frame,
         node_time=nodes,
         density=_densities(trial, record, values, states, nodes, turning, late),
         start=states,
-        track=track_frame(record, frame, states, nodes - lag, late),
+        nRt=track_axes(record, frame, states, nodes - lag, late),
         clock=clock if any(p.name == clock and p.estimated for p in parameters) else None,
+        attitude_clock=record.sensor.clock.offset.name,
+        first_shift=late - lag - half,
         resolution=record.interval,
     )
     if chain.clock is None:
-        chain = replace(chain, node_time=nodes - lag)
+        chain = replace(chain, node_time=nodes - lag, first_shift=late - half)
     by_aid = [
         (aid, lasting_observations(aid, frame, trial.body_axes, trial)) for aid in trial.aids
     ]
@@ -249,9 +253,9 @@ def _states(
     return SmoothStates(body.nRb, p_n, v_n, body.omega_eb_b)
 
 
-def track_frame(
+def track_axes(
     record: AttitudeRecord, frame: LocalFrame, states: SmoothStates, time: Array, late: float
-) -> TrackFrame:
+) -> Array:
     """Return level axes that turn with the heading averaged over waves, at true times (K,)."""
     grid = np.arange(time[0] - WAVES, time[-1] + WAVES + _GRID, _GRID)
     heading = record.rph_at(grid + late)[:, 2]
@@ -261,10 +265,8 @@ def track_frame(
         padded = np.pad(heading, width // 2, mode="reflect", reflect_type="odd")
         heading = np.convolve(padded, np.full(width, 1.0 / width), mode="valid")
     angle = np.interp(time, grid, heading)
-    rate = np.interp(time, grid, np.gradient(heading, _GRID))
     rph = np.column_stack([np.zeros((time.size, 2)), angle])
-    nRt = level_axes(frame, states.p_n) @ rotation_from_rph(rph, "FRD")
-    return TrackFrame(nRt, np.column_stack([np.zeros((time.size, 2)), rate]))
+    return level_axes(frame, states.p_n) @ rotation_from_rph(rph, "FRD")
 
 
 def _parameters(trial: Trial) -> tuple[Parameter, ...]:
@@ -395,7 +397,9 @@ def _nodes(
     own = track.time + lag if log is None or log.locked.sum() < 2 else log.time[log.locked]
     own = own[(own > first) & (own < last)]
     longest = max(LONGEST, (last - first) / _MOST_NODES)
-    return without_long_steps(np.append(far_apart(first, own, longest), last), longest)
+    # One more: the attitude of the last ping is between two nodes.
+    edges = [*far_apart(first, own, longest), last, last + longest]
+    return without_long_steps(np.array(edges), longest)
 
 
 def far_apart(first: float, own: Array, longest: float) -> Array:
