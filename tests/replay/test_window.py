@@ -38,8 +38,16 @@ def whole(ship):
     """All nodes of a batch solution."""
     prepared = prepare_without_imu(ship)
     settled = settle(prepared, prepared.states, lambda stage, iteration, cost: None)
-    minimum = settled.minimum
-    return Window(settled.problem, minimum.evaluation, minimum.information)
+    problem, minimum = settled.problem, settled.minimum
+    # What the clocks have moved beyond the last node since it was bound.
+    beyond = {
+        b.observation.label: b.observation.time[
+            ~problem.chain.covers(b.time + b.late(minimum.evaluation.parameters))
+        ]
+        for b in problem.bound
+    }
+    problem.reject(beyond)
+    return Window(problem, minimum.evaluation, minimum.information)
 
 
 def later(ship, whole, first):
