@@ -3,52 +3,49 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from time import perf_counter
 
 import numpy as np
 
-from factorgraph_dvl.errors import ConfigError, FactorgraphDvlError, SolveError
+from factorgraph_dvl.errors import ConfigError, FactorgraphDvlError
 from factorgraph_dvl.geometry.records import concatenated
 from factorgraph_dvl.geometry.rotations import exp_so3
 from factorgraph_dvl.geometry.vectors import Array, BoolArray, rotate
-from factorgraph_dvl.graph.bound_observation import SAME_TIME, processes_of
+from factorgraph_dvl.graph.bound_observation import SAME_TIME
 from factorgraph_dvl.graph.problem import Evaluation, Problem
-from factorgraph_dvl.graph.processes import Process
 from factorgraph_dvl.graph.smooth_chain import SmoothChain
 from factorgraph_dvl.graph.smooth_motion import SmoothStates
 from factorgraph_dvl.imu.attitude_record import AttitudeRecord, level_axes
+from factorgraph_dvl.replay.batch_solution import BatchSolution
 from factorgraph_dvl.replay.calibration import CalibrationReport
 from factorgraph_dvl.replay.gate import InnovationGate
 from factorgraph_dvl.replay.outages import Outages
 from factorgraph_dvl.replay.sequential_gate import Judged, judged
 from factorgraph_dvl.replay.update import Update
-from factorgraph_dvl.replay.window import Past, Window, WindowChain
-from factorgraph_dvl.sensors.attitude import Attitude, AttitudeAngles
-from factorgraph_dvl.sensors.carried_point import PointPosition, PointVelocity
+from factorgraph_dvl.replay.window import (
+    Past,
+    Window,
+    WindowChain,
+    information_without,
+    stepped,
+)
 from factorgraph_dvl.sensors.finding import Code, Finding
-from factorgraph_dvl.sensors.ins import Ins
 from factorgraph_dvl.sensors.message import message
 from factorgraph_dvl.sensors.protocol import Observation
 from factorgraph_dvl.sensors.records import rows_of
 from factorgraph_dvl.solution import Noise, Progress, Trajectory
-from factorgraph_dvl.solvers.correlated_noise import noise_of
 from factorgraph_dvl.solvers.preparation_without_imu import (
     LONGEST,
     TURN_SPAN,
     WAVES,
-    PreparationWithoutImu,
     far_apart,
-    lasting_observations,
-    node_clock,
     prepare_without_imu,
     track_axes,
-    turns,
     without_long_steps,
 )
 from factorgraph_dvl.solvers.rounds import settle
-from factorgraph_dvl.statistics.square_root_information import SquareRootInformation, eliminated
 from factorgraph_dvl.trial import Trial
 
 # Time, s, by which states are behind the records: whether the vessel turns shows in the seconds
@@ -63,48 +60,8 @@ _FIRST = 60.0
 _GROWTH, _RETRY = 1.5, 1.2
 # Fewest attitudes that say how the vessel turns; chosen: what a spline and its smoothing need.
 _ATTITUDES = 50
-# Density of acceleration in turns, m²/s³, until the first one; chosen: that of ships.
-_FIRST_TURNS = 1e-3
-# Steps of a window. Measured: after one, σ of clocks were 5 % too small in turns.
-_STEPS = 2
-# What sensors measure whose noise is that of their record.
-_Measured = AttitudeAngles | PointPosition | PointVelocity
 # Fewest nodes of a start; chosen.
 _FEWEST = 4
-
-
-@dataclass(frozen=True)
-class _Batch:
-    """Batch solution of the records up to a time, s, and what windows take from it.
-
-    Parameters
-    ----------
-    trial : Trial
-        Records up to then.
-    problem : Problem
-        At its minimum.
-    lag, late : float
-        Stamps of the nodes' clock and of the attitude less true times where it started, s: how the
-        track turns is fixed by these.
-    on_legs, in_turns : ndarray, shape (6,)
-        Densities of acceleration.
-    tilt : ndarray, shape (P,), 1/s
-        Gradient of the states' volume that every second adds.
-    std : dict of str to ndarray
-        By label, standard deviations (d,) of noise that sensors take from the whole record.
-    labels : dict of str to set of str
-        Labels of the measurements of each sensor, by its section.
-    """
-
-    trial: Trial
-    problem: Problem
-    lag: float
-    late: float
-    on_legs: Array
-    in_turns: Array
-    tilt: Array
-    std: dict[str, Array]
-    labels: dict[str, set[str]]
 
 
 class ReplayWithoutImu:
@@ -151,7 +108,7 @@ class ReplayWithoutImu:
         self.findings: list[Finding] = []
         self._start = float(max(aid.time[0] for aid in trial.aids))
         self._solve_at = self._start + _FIRST
-        self._current: tuple[_Batch, Window] | None = None
+        self._current: tuple[BatchSolution, Window] | None = None
         self._gate, self._outages = InnovationGate(), Outages()
         # Number of rows of each sensor that are before the window.
         self._before: dict[str, int] = {}
@@ -165,7 +122,7 @@ class ReplayWithoutImu:
     @property
     def noise(self) -> tuple[Noise, ...]:
         """Noise of the sensors, as the last batch solution found it."""
-        return () if self._current is None else noise_of(self._current[0].problem)
+        return () if self._current is None else self._current[0].noise
 
     def counts(self) -> list[Finding]:
         """Return how many measurements were not used, and why."""
@@ -230,7 +187,7 @@ class ReplayWithoutImu:
         count = int(np.searchsorted(chain.node_time[: whole.last + 1], latest, "right"))
         if count < _FEWEST:
             return None
-        batch = self._batch(prepared, settled.problem, until)
+        batch = BatchSolution.of(prepared, settled.problem, until - self._start)
         found = [*prepared.findings, *settled.findings]
         self.findings += [f for f in found if f not in self._noted]
         self._noted.update(found)
@@ -249,55 +206,14 @@ class ReplayWithoutImu:
             whole.values,
             until,
         )
-        self._current = batch, _stepped(problem, at)
+        self._current = batch, stepped(problem, at)
         for bound in problem.bound:
             self._note_compared(bound.observation, bound.usable)
         return whole, count - 1
 
-    def _batch(self, prepared: PreparationWithoutImu, problem: Problem, until: float) -> _Batch:
-        """Return what windows take from a batch solution of the records up to a time."""
-        trial, chain = prepared.trial, problem.chain
-        assert isinstance(chain, SmoothChain)
-        turning = prepared.turning
-        legs, curves = (chain.density[each][:1] for each in (~turning, turning))
-        on_legs = (legs if legs.size else curves)[0]
-        first_turns = np.maximum(on_legs, np.repeat([0.0, _FIRST_TURNS], 3))
-        tilt = np.zeros(sum(p.mean.size for p in problem.parameters))
-        if problem.tilt is not None:
-            tilt = problem.tilt.gradient / (until - self._start)
-        clock, start = node_clock(trial, chain.frame), problem.prior_values() | prepared.values
-        labels = {
-            aid.section: {
-                o.label for o in lasting_observations(aid, chain.frame, trial.body_axes, trial)
-            }
-            for aid in trial.aids
-        }
-        own = {
-            label
-            for aid in trial.aids
-            if isinstance(aid, Attitude | Ins)
-            for label in labels[aid.section]
-        }
-        std = {
-            o.label: _typical(o.std)
-            for o in problem.observations
-            if isinstance(o, _Measured) and o.label in own
-        }
-        return _Batch(
-            trial,
-            problem,
-            float(start[clock][0]),
-            float(start[self._attitude.clock.offset.name][0]),
-            on_legs,
-            curves[0] if curves.size else first_turns,
-            tilt,
-            std,
-            labels,
-        )
-
     def _extend(
         self,
-        batch: _Batch,
+        batch: BatchSolution,
         window: Window,
         nodes: Array,
         until: float,
@@ -315,13 +231,11 @@ class ReplayWithoutImu:
         time = np.append(real[first:], nodes)
         record = self._attitudes(float(time[0]), until)
         middle = 0.5 * (time[1:] + time[:-1])[window.last - first :]
-        turning = turns(record, middle + batch.late - (0.0 if chain.clock is None else batch.lag))
-        density = np.where(turning[:, None], batch.in_turns, batch.on_legs)
         problem, at = self._window(
             batch,
             past,
             time,
-            np.concatenate([chain.density[first : window.last], density]),
+            np.concatenate([chain.density[first : window.last], batch.density(record, middle)]),
             _some(window.evaluation.states, slice(first, window.last + 1)),
             window.values,
             until,
@@ -332,18 +246,18 @@ class ReplayWithoutImu:
             & (b.observation.time > self._compared.get(b.observation.label, -np.inf))
             for b in problem.bound
         }
-        found = judged(problem, at, _without(problem, at, new), new, self._gate)
+        found = judged(problem, at, information_without(problem, at, new), new, self._gate)
         for label, times in found.rejected.items():
             self._rejected[label] = np.union1d(self._rejected.get(label, times), times)
         for bound in problem.bound:
             self._note_compared(bound.observation, new[bound.observation.label])
         problem.reject(self._rejected)
-        self._current = batch, _stepped(problem, at)
+        self._current = batch, stepped(problem, at)
         return found
 
     def _window(
         self,
-        batch: _Batch,
+        batch: BatchSolution,
         past: Past,
         time: Array,
         density: Array,
@@ -355,7 +269,7 @@ class ReplayWithoutImu:
 
         Parameters
         ----------
-        batch : _Batch
+        batch : BatchSolution
             Noise and strengths.
         past : Past
             What left.
@@ -368,42 +282,39 @@ class ReplayWithoutImu:
         until : float
             Time up to which records are read, s.
         """
-        whole = batch.problem
-        assert isinstance(whole.chain, SmoothChain)
+        whole = batch.chain
         record = self._attitudes(float(time[0]), until)
         # One more: the attitude of the last ping is between two nodes.
         time = np.append(time, time[-1] + LONGEST)
-        density = np.concatenate([density, density[-1:]])
-        states = _going_on_straight(whole.chain, record, time, states)
-        true = time - (0.0 if whole.chain.clock is None else batch.lag)
+        states = _going_on_straight(whole, record, time, states)
         chain = WindowChain(
-            frame=whole.chain.frame,
+            frame=whole.frame,
             node_time=time,
-            density=density,
+            density=np.concatenate([density, density[-1:]]),
             start=states,
-            nRt=track_axes(record, whole.chain.frame, states, true, batch.late),
-            clock=whole.chain.clock,
-            attitude_clock=whole.chain.attitude_clock,
-            first_shift=whole.chain.first_shift,
-            resolution=whole.chain.resolution,
+            nRt=track_axes(record, whole.frame, states, time - batch.lag, batch.late),
+            clock=whole.clock,
+            attitude_clock=whole.attitude_clock,
+            first_shift=whole.first_shift,
+            resolution=whole.resolution,
             known=past.known,
         )
         observations = self._observations(batch, until)
-        processes, nodes = _going_on(past, observations)
+        processes, nodes = past.going_on(observations)
         problem = Problem(
             chain,
             observations,
-            whole.all_parameters,
+            batch.parameters,
             start={**values},
-            clock_zero=whole.clock_zero,
+            clock_zero=batch.clock_zero,
             processes=processes,
         )
-        problem.noise_factors, problem.long_run = whole.noise_factors, whole.long_run
+        problem.noise_factors, problem.long_run = batch.noise_factors, batch.long_run
         problem.reject(self._rejected)
         at = problem.evaluate(problem.values(states, {**values, **nodes}))
         return problem, problem.weighed(at)
 
-    def _observations(self, batch: _Batch, until: float) -> list[Observation]:
+    def _observations(self, batch: BatchSolution, until: float) -> list[Observation]:
         """Return what was measured and is not before the window, up to a time, s."""
         out: list[Observation] = []
         for aid in self._trial.aids:
@@ -411,35 +322,35 @@ class ReplayWithoutImu:
             rows = slice(self._before.get(aid.section, 0), last)
             if rows.stop <= rows.start:
                 continue
-            frame, axes = batch.problem.chain.frame, self._trial.body_axes
-            every = lasting_observations(rows_of(aid, rows), frame, axes, self._trial)
-            found = [o for o in every if o.time.size]
+            found = batch.observations(rows_of(aid, rows))
             if not found:
                 self._before[aid.section] = last
-            for o in found:
-                if isinstance(o, _Measured) and o.label in batch.std:
-                    # A few rows hardly show it.
-                    o = replace(o, std=o.std * (batch.std[o.label] / _typical(o.std)))
-                out.append(o)
+            out += found
         return out
 
-    def _leave(self, batch: _Batch, window: Window, node: int) -> Past:
+    def _leave(self, batch: BatchSolution, window: Window, node: int) -> Past:
         """Return what is known before a node; what was measured there is read no more."""
         past = window.before(node)
+        self._rejected = {
+            label: times[times > past.measured.get(label, -np.inf)]
+            for label, times in self._rejected.items()
+        }
         for aid in self._trial.aids:
             for label in batch.labels[aid.section] & past.measured.keys():
                 row = int(np.searchsorted(aid.time, past.measured[label], side="right"))
                 self._before[aid.section] = max(row, self._before.get(aid.section, 0))
         return past
 
-    def _next_nodes(self, batch: _Batch, window: Window, until: float, *, end: bool) -> Array:
+    def _next_nodes(
+        self, batch: BatchSolution, window: Window, until: float, *, end: bool
+    ) -> Array:
         """Return the times of the nodes that the records up to a time, s, allow."""
         last = float(window.chain.node_time[window.last])
         latest = self._latest(window, until, end=end)
         # True times where the clock of the nodes is not estimated.
         own = self._positions + window.lag if self._pings is None else self._pings
-        if self._pings is not None and window.chain.clock is None:
-            own = own - batch.lag
+        if self._pings is not None:
+            own = own - batch.pings_late
         nodes = far_apart(last, own[(own > last) & (own <= latest)], LONGEST)
         if latest - nodes[-1] > (SAME_TIME if end else LONGEST):
             nodes = np.append(nodes, latest)
@@ -548,11 +459,6 @@ def _going_on_straight(
     return SmoothStates(*(np.concatenate([a, b]) for a, b in zip(old, new, strict=True)))
 
 
-def _typical(std: Array) -> Array:
-    """Return the median standard deviation of each component of measurements (M, d)."""
-    return np.array([np.median(own[np.isfinite(own)]) for own in std.T])
-
-
 def _left_out(problem: Problem) -> dict[str, Array]:
     """Return the times of the measurements that a batch solution left out, by label."""
     out = dict(problem.rejected)
@@ -562,59 +468,3 @@ def _left_out(problem: Problem) -> dict[str, Array]:
             none = o.time[np.all(weight == 0.0, axis=1)]
             out[o.label] = np.union1d(out.get(o.label, none), none)
     return out
-
-
-def _going_on(
-    past: Past, observations: Sequence[Observation]
-) -> tuple[list[Process], dict[str, Array]]:
-    """Return processes with nodes as far as measurements need them, and values there."""
-    processes, values = [], {}
-    for process in past.processes:
-        own = [o for o in observations if process in processes_of(o, [process]).all]
-        last = max((float(o.time[-1]) for o in own), default=-np.inf)
-        step = float(process.time[-1] - process.time[-2])
-        more = max(int(np.ceil((last - process.time[-1]) / step)), 0) if own else 0
-        time = np.append(process.time, process.time[-1] + step * np.arange(1, more + 1))
-        walks = (o.scale_walk for o in own if o.label == process.label)
-        processes.append(process.going_on(time, next(walks, process.walk)))
-        nodes = past.nodes[process.name]
-        values[process.name] = np.concatenate([nodes, nodes[-1:].repeat(more, axis=0)])
-    return processes, values
-
-
-def _without(
-    problem: Problem, at: Evaluation, which: Mapping[str, BoolArray]
-) -> SquareRootInformation:
-    """Return the information without some measurements, of which the weights are as they were."""
-    weights = [bound.weight for bound in problem.bound]
-    for bound in problem.bound:
-        bound.weight = bound.weight * ~which[bound.observation.label][:, None]
-    information = _eliminated(problem, at)
-    for bound, weight in zip(problem.bound, weights, strict=True):
-        bound.weight = weight
-    return information
-
-
-def _stepped(problem: Problem, at: Evaluation) -> Window:
-    """Return a window after Gauss-Newton steps.
-
-    The second is for the newest states: where they are only predicted, turns seem to say more of
-    clocks than they do.
-    """
-    for _ in range(_STEPS):
-        at = problem.weighed(at)
-        information = _eliminated(problem, at)
-        at = problem.evaluate(at.values.retract(information.solution()))
-    return Window(problem, at, information)
-
-
-def _eliminated(problem: Problem, at: Evaluation) -> SquareRootInformation:
-    try:
-        ordering = problem.ordering(branches=False)
-        return eliminated(problem.linearize(at), ordering, at.values.dims())
-    except (RuntimeError, np.linalg.LinAlgError):
-        raise SolveError(
-            "the information is not positive definite",
-            where="replay",
-            hint="Inspect the trial: standard deviations may differ by too many digits",
-        ) from None

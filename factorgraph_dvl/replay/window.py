@@ -14,9 +14,11 @@ import gtsam
 import numpy as np
 from scipy.linalg import solve_triangular
 
+from factorgraph_dvl.errors import SolveError
 from factorgraph_dvl.geometry.rotations import BodyAxes
 from factorgraph_dvl.geometry.vectors import Array, BoolArray, IntArray, rotate
 from factorgraph_dvl.graph import keys
+from factorgraph_dvl.graph.bound_observation import processes_of
 from factorgraph_dvl.graph.priors import ConstantsPrior
 from factorgraph_dvl.graph.problem import Evaluation, Problem
 from factorgraph_dvl.graph.processes import Process
@@ -30,9 +32,12 @@ from factorgraph_dvl.graph.trajectory import (
     tangent_in_n,
 )
 from factorgraph_dvl.sensors.parameters import Parameter
+from factorgraph_dvl.sensors.protocol import Observation
 from factorgraph_dvl.solution import Trajectory
-from factorgraph_dvl.statistics.square_root_information import SquareRootInformation
+from factorgraph_dvl.statistics.square_root_information import SquareRootInformation, eliminated
 
+# Steps of a window. Measured: after one, σ of clocks were 5 % too small in turns.
+_STEPS = 2
 # Rows of a state that are of the attitude, and those that are not.
 _ATTITUDE, _OTHERS = slice(0, 3), slice(3, 9)
 
@@ -126,6 +131,23 @@ class Past:
     processes: tuple[Process, ...]
     nodes: Mapping[str, Array]
     measured: Mapping[str, float]
+
+    def going_on(
+        self, observations: Sequence[Observation]
+    ) -> tuple[list[Process], dict[str, Array]]:
+        """Return processes with nodes as far as measurements need them, and values there."""
+        processes, values = [], {}
+        for process in self.processes:
+            own = [o for o in observations if process in processes_of(o, [process]).all]
+            last = max((float(o.time[-1]) for o in own), default=-np.inf)
+            end, step = process.time[-1], float(process.time[-1] - process.time[-2])
+            more = int(np.ceil((last - end) / step)) if last > end else 0
+            time = np.append(process.time, end + step * np.arange(1, more + 1))
+            walks = (o.scale_walk for o in own if o.label == process.label)
+            processes.append(process.going_on(time, next(walks, process.walk)))
+            nodes = self.nodes[process.name]
+            values[process.name] = np.concatenate([nodes, nodes[-1:].repeat(more, axis=0)])
+        return processes, values
 
 
 @dataclass(frozen=True)
@@ -312,6 +334,44 @@ class Window:
             if time.size:
                 out[bound.observation.label] = float(time[-1])
         return out
+
+
+def information_without(
+    problem: Problem, at: Evaluation, which: Mapping[str, BoolArray]
+) -> SquareRootInformation:
+    """Return the information without some measurements, of which the weights are as they were."""
+    weights = [bound.weight for bound in problem.bound]
+    for bound in problem.bound:
+        bound.weight = bound.weight * ~which[bound.observation.label][:, None]
+    information = _eliminated(problem, at)
+    for bound, weight in zip(problem.bound, weights, strict=True):
+        bound.weight = weight
+    return information
+
+
+def stepped(problem: Problem, at: Evaluation) -> Window:
+    """Return a window after Gauss-Newton steps.
+
+    The second is for the newest states: where they are only predicted, turns seem to say more of
+    clocks than they do.
+    """
+    for _ in range(_STEPS):
+        at = problem.weighed(at)
+        information = _eliminated(problem, at)
+        at = problem.evaluate(at.values.retract(information.solution()))
+    return Window(problem, at, information)
+
+
+def _eliminated(problem: Problem, at: Evaluation) -> SquareRootInformation:
+    try:
+        ordering = problem.ordering(branches=False)
+        return eliminated(problem.linearize(at), ordering, at.values.dims())
+    except (RuntimeError, np.linalg.LinAlgError):
+        raise SolveError(
+            "the information is not positive definite",
+            where="replay",
+            hint="Inspect the trial: standard deviations may differ by too many digits",
+        ) from None
 
 
 def _place(node_time: Array, time: Array) -> tuple[IntArray, Array]:
