@@ -53,9 +53,9 @@ class Known:
     root : ndarray, shape (n, n)
         Square root R of their information, upper triangular: R (x - x0) = d + unit noise.
     right : ndarray, shape (n,)
-        d.
+        Right-hand side d.
     values : gtsam.Values
-        x0.
+        Where the rows are linear, x0.
     """
 
     keys: list[int]
