@@ -29,6 +29,9 @@ def native_graph(problem: Problem) -> gtsam.NonlinearFactorGraph:
         graph.add(factor)
     for i in range(len(replaced), problem.graph.size()):
         graph.push_back(problem.graph.at(i))
+    if problem.tilt is not None:
+        keys = {p.name: problem.key(p.name) for p in problem.parameters}
+        graph.add(problem.tilt.factor(problem.parameters, keys))
     for process in problem.processes:
         _add_prior(graph, process)
     for factor in _step_factors(problem):

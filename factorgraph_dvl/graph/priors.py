@@ -19,8 +19,9 @@ PRIOR = "prior of {}"
 # Stands for a standard deviation of 0 in a parameter of which other components are estimated,
 # SI. Chosen: far below what is measured.
 _FIXED_STD = 1e-7
-# Root of the information that a tilt adds, in that of the parameters. Chosen: σ stay the same.
-_TILT_GAIN = 0.01
+# What the factor of a tilt adds to the cost where it holds. Chosen: along the gradient it adds a
+# millionth of the square of the slope, in standard deviations, and leaves the cost nine digits.
+_TILT_CONSTANT = 1e6
 # Least eigenvalue of the correlations of a calibration. Chosen: it may know a combination of
 # parameters a million times better than each.
 _LEAST_EIGENVALUE = 1e-12
@@ -115,20 +116,55 @@ class Tilt:
     origin: dict[str, Array]
 
     @property
-    def _gain(self) -> Array:
-        return np.asarray(_TILT_GAIN / np.maximum(self.sigma, np.finfo(float).tiny))
-
-    @property
     def constant(self) -> float:
-        """What its factor adds to the cost at the origin."""
-        return 0.5 * float(np.sum((self.gradient / self._gain) ** 2))
+        """What its factor adds to the cost beside `cost`."""
+        return _TILT_CONSTANT
+
+    def cost(self, parameters: Sequence[Parameter], values: Mapping[str, Array]) -> float:
+        """Return what it adds to the cost: zero at the origin."""
+        off = [local_coordinates(p, values[p.name], self.origin[p.name]) for p in parameters]
+        return float(self.gradient @ np.concatenate(off))
+
+    def of(self, before: Sequence[Parameter], after: Sequence[Parameter]) -> Tilt:
+        """Return it for other parameters: without a gradient by those that it does not have."""
+        known = places(before)
+        parts = [
+            (self.gradient[known[p.name]], self.sigma[known[p.name]])
+            if p.name in known
+            else (np.zeros(p.mean.size), p.sigma)
+            for p in after
+        ]
+        gradient, sigma = map(np.concatenate, zip(*parts, strict=True))
+        means = {p.name: prior_mean(p) for p in after}
+        return Tilt(gradient, sigma, means | self.origin)
 
     def factor(
         self, parameters: Sequence[Parameter], key_of: Mapping[str, int]
     ) -> gtsam.CustomFactor:
-        """Return a factor with this gradient, and with hardly any information."""
-        gain = self._gain
-        return linear_prior(parameters, key_of, np.diag(gain), self.origin, self.gradient / gain)
+        """Return a factor with this gradient, and with hardly any information.
+
+        The error e has half the square c + g d, so that its slope is g wherever it is.
+        """
+        gradient, origin = self.gradient, self.origin
+        own = list(places(parameters).values())
+
+        def error(
+            this: gtsam.CustomFactor, at: gtsam.Values, jacobians: list[Array] | None
+        ) -> Array:
+            off = [
+                local_coordinates(p, value_at(at, key_of[p.name], p), origin[p.name])
+                for p in parameters
+            ]
+            total = np.sqrt(2.0 * (_TILT_CONSTANT + gradient @ np.concatenate(off)))
+            if jacobians is not None:
+                for i, (p, each) in enumerate(zip(parameters, off, strict=True)):
+                    slope = gradient[None, own[i]] / total
+                    by_step = slope @ inverse_right_jacobian(each) if p.rotation else slope
+                    jacobians[i] = np.asfortranarray(by_step)
+            return np.array([total])
+
+        noise = gtsam.noiseModel.Unit.Create(1)
+        return gtsam.CustomFactor(noise, [key_of[p.name] for p in parameters], error)
 
 
 def linear_prior(
@@ -136,11 +172,8 @@ def linear_prior(
     key_of: Mapping[str, int],
     gain: Array,
     origin: Mapping[str, Array],
-    offset: Array | float = 0.0,
 ) -> gtsam.CustomFactor:
     """Return a factor of unit noise on gain times the difference of parameters to an origin.
-
-    An offset adds to the product.
 
     The callback must not know the problem: GTSAM would keep it, and it GTSAM's graph, and
     nothing would ever free the two.
@@ -148,7 +181,7 @@ def linear_prior(
     columns = [gain[:, place] for place in places(parameters).values()]
 
     def error(this: gtsam.CustomFactor, at: gtsam.Values, jacobians: list[Array] | None) -> Array:
-        total = np.zeros(gain.shape[0]) + offset
+        total = np.zeros(gain.shape[0])
         for i, (p, part) in enumerate(zip(parameters, columns, strict=True)):
             off = local_coordinates(p, value_at(at, key_of[p.name], p), origin[p.name])
             total += part @ off

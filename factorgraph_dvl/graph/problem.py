@@ -226,9 +226,7 @@ class Problem:
         self.graph = gtsam.NonlinearFactorGraph(chain.graph)
         others = chain.add_prior(self.graph, self.parameters, self._key, constants_prior)
         add_priors(self.graph, others, self._key)
-        self.tilt = tilt
-        if tilt is not None and self.parameters:
-            self.graph.add(tilt.factor(self.parameters, self._key))
+        self.tilt = tilt if self.parameters else None
         self._weighed_at: gtsam.Values | None = None
         # Factors from node to node, their matrices and vectors: views that live no longer.
         self._steps: list[tuple[gtsam.JacobianFactor, Array, Array]] = []
@@ -368,7 +366,9 @@ class Problem:
     def evaluate(self, values: gtsam.Values) -> Evaluation:
         """Evaluate motion, residuals and cost."""
         states, parameters = self.arrays(values)
-        own_cost = self.graph.error(values) - (0.0 if self.tilt is None else self.tilt.constant)
+        own_cost = self.graph.error(values)
+        if self.tilt is not None:
+            own_cost += self.tilt.cost(self.parameters, parameters)
         imu = None
         if self._imu_errors is not None:
             errors = self._imu_errors.vector(parameters)
@@ -530,6 +530,10 @@ class Problem:
         if self.chain.interpolates:
             self._follow(evaluation.parameters)
         gaussian = self.native(evaluation)
+        if self.tilt is not None:
+            tilt = self.tilt.factor(self.parameters, self._key)
+            gaussian.push_back(tilt.linearize(evaluation.values))
+        self._add_steps(gaussian, evaluation)
         for block in self._blocks:
             if not block.factors:
                 self._lay_out(block)
@@ -641,7 +645,8 @@ class Problem:
         Returns
         -------
         graph : gtsam.NonlinearFactorGraph
-            Its minimum is that of the problem.
+            Its minimum is that of the problem, and its error the cost but for a constant: that of
+            the tilt, which is a factor of its own.
         values : gtsam.Values
             States `x`, biases `b` or rates `w`, and parameters, at `key`.
 
@@ -658,17 +663,12 @@ class Problem:
             self._follow(self.arrays(self._weighed_at)[1])
         return native_graph(self), gtsam.Values(self._weighed_at)
 
-    def native(self, evaluation: Evaluation, *, steps: bool = True) -> gtsam.GaussianFactorGraph:
-        """Return all factors but those of measurements, linear at an evaluation.
-
-        Without `steps`, those of `chain_rows` are left out.
-        """
+    def native(self, evaluation: Evaluation) -> gtsam.GaussianFactorGraph:
+        """Return the factors of priors, of processes and of GTSAM, linear at an evaluation."""
         if self._imu_errors is None or evaluation.imu is None:
             out = self.graph.linearize(evaluation.values)
         else:
             out = self._imu_errors.filled(evaluation.imu)
-        if steps:
-            self._add_steps(out, evaluation)
         for process in self.processes:
             process.add_prior(out, evaluation.parameters[process.name])
         return out

@@ -177,13 +177,27 @@ class Process:
 
     def mean_walk(self, nodes: Array) -> tuple[float, dict[int, Array]]:
         """Return the mean of a scale that walks, and its derivatives by the key of each node."""
-        weight = np.zeros(self.time.size)
-        step = np.diff(self.time)
-        weight[:-1] += step
-        weight[1:] += step
+        weight = self._time_about_nodes
         weight *= self._of_nodes[0][-1] / weight.sum()
         last = np.eye(1, self.size, self.size - 1)
         return float(weight @ nodes[:, -1]), {self.key(j): w * last for j, w in enumerate(weight)}
+
+    def mean(self, nodes: Array) -> tuple[Array, dict[int, Array]]:
+        """Return the mean of each component, and its derivatives by the key of each node."""
+        weight = self._time_about_nodes
+        weight = weight[:, None] * self._of_nodes[0] / weight.sum()
+        return np.sum(weight * nodes, axis=0), {
+            self.key(j): np.diag(w) for j, w in enumerate(weight)
+        }
+
+    @property
+    def _time_about_nodes(self) -> Array:
+        """Twice the time that belongs to each node."""
+        out = np.zeros(self.time.size)
+        step = np.diff(self.time)
+        out[:-1] += step
+        out[1:] += step
+        return out
 
     @property
     def _weight(self) -> Array:

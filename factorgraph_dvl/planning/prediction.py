@@ -9,17 +9,20 @@ import numpy as np
 
 from factorgraph_dvl.errors import ConfigError
 from factorgraph_dvl.geometry.earth import LocalFrame
-from factorgraph_dvl.geometry.rotations import rotation_from_rph
-from factorgraph_dvl.geometry.units import DEG, DEG_PER_HOUR, MICRO_G
+from factorgraph_dvl.geometry.rotations import exp_so3, rotation_from_rph
+from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array, rotate
-from factorgraph_dvl.imu.propagation import States
+from factorgraph_dvl.graph.smooth_motion import SmoothStates
+from factorgraph_dvl.sensors.attitude import LEAST_STD, Attitude, AttitudeAngles
+from factorgraph_dvl.sensors.carried_point import PointPosition, PointVelocity
+from factorgraph_dvl.sensors.ins import Ins
+from factorgraph_dvl.sensors.protocol import Observation
+from factorgraph_dvl.sensors.records import white_noise
 from factorgraph_dvl.simulation import plan_motion, simulate
 from factorgraph_dvl.simulation.motion import TrueMotion
 from factorgraph_dvl.simulation.scenario import AngularSway, Heave, Scenario, StartSettings
 from factorgraph_dvl.solution import Solution
-from factorgraph_dvl.solvers.information_along_trial import RATE_HZ, Frontier
-from factorgraph_dvl.solvers.motion_information import motion_history, predict_motion
-from factorgraph_dvl.solvers.motion_summary import summarise_motion
+from factorgraph_dvl.solvers.information_along_trial import Frontier
 from factorgraph_dvl.solvers.prediction import TrueStates, continue_posterior, predict_posterior
 from factorgraph_dvl.statistics.information_history import InformationHistory
 from factorgraph_dvl.trial import Trial
@@ -39,7 +42,8 @@ class Ending:
     time : float
         Time since the start of the plan, s, for the phase of the sway.
     frontier : Frontier or None
-        Posterior at the end; None without IMU, where the whole plan is predicted anew.
+        Posterior at the end; None without IMU, where the whole plan is predicted anew: errors of
+        compass and GNSS last longer than a manoeuvre.
     """
 
     start: StartSettings
@@ -94,24 +98,20 @@ def predict(scenario: Scenario) -> Prediction:
             where=scenario.source,
             expected="imu, attitude or ins in place of heading and log",
         )
-    recorded, scenario = scenario, msgspec.structs.replace(scenario, noise=False)
+    scenario = msgspec.structs.replace(scenario, noise=False)
     motion = plan_motion(scenario)
     trial = simulate(scenario)
-    true_states = _true_states(motion, trial)
-    frontier: Frontier | None = None
+    white: dict[str, Array] = {}
     if trial.imu is None:
-        found = predict_motion(trial, simulate(recorded), true_states)
-        solution = summarise_motion(trial, found, rate_hz=RATE_HZ)
-        history = motion_history(found)
-    else:
-        solution, history, frontier = predict_posterior(trial, true_states)
+        white = _white_noise(simulate(msgspec.structs.replace(scenario, noise=True)), trial)
+    solution, history, frontier = predict_posterior(trial, _true_states(motion), white)
     return Prediction(
         scenario=scenario,
         trial=trial,
         solution=replace(solution, solver="plan"),
         history=history,
         duration=motion.duration,
-        ending=_ending(motion, frontier, 0.0),
+        ending=_ending(motion, None if trial.imu is None else frontier, 0.0),
     )
 
 
@@ -163,7 +163,7 @@ def extend(
     trial = simulate(further)
     start = ending.frontier
     assert start is not None
-    history, frontier = continue_posterior(trial, _true_states(motion, trial), start)
+    history, frontier = continue_posterior(trial, _true_states(motion), start)
     return history, _ending(motion, frontier, ending.time)
 
 
@@ -186,22 +186,56 @@ def _ending(motion: TrueMotion, frontier: Frontier | None, before: float) -> End
     return Ending(start, before + motion.duration, frontier)
 
 
-def _true_states(motion: TrueMotion, trial: Trial) -> TrueStates:
-    none = np.zeros(3)
-    gyro = trial.calibration_truth.get("gyro_bias_deg_h", none) * DEG_PER_HOUR
-    accel = trial.calibration_truth.get("accel_bias_ug", none) * MICRO_G
-
-    def states(frame: LocalFrame, time: Array) -> States:
-        state = motion.at(np.clip(time, 0.0, motion.duration))
+def _true_states(motion: TrueMotion) -> TrueStates:
+    def states(frame: LocalFrame, time: Array) -> SmoothStates:
+        inside = np.clip(time, 0.0, motion.duration)
+        state = motion.at(inside)
         lRn = frame.level_from_tangent(state.geodetic[:, 0], state.geodetic[:, 1])
         nRl = lRn.transpose(0, 2, 1)
-        zero = np.zeros((time.size, 3))
-        return States(
-            nRb=nRl @ rotation_from_rph(state.rph, motion.body_axes),
-            p_n=frame.position(*state.geodetic.T),
-            v_n=rotate(nRl, state.v_n),
-            gyro_bias=zero + gyro,
-            accel_bias=zero + accel,
+        v_n, beyond = rotate(nRl, state.v_n), (time - inside)[:, None]
+        # A node may be a little before the start or after the end.
+        return SmoothStates(
+            nRb=nRl
+            @ rotation_from_rph(state.rph, motion.body_axes)
+            @ exp_so3(beyond * state.omega_eb_b),
+            p_n=frame.position(*state.geodetic.T) + beyond * v_n,
+            v_n=v_n,
+            omega_b=state.omega_eb_b,
         )
 
     return states
+
+
+def _white_noise(recorded: Trial, exact: Trial) -> dict[str, Array]:
+    """Return the white noise of attitude and INS, by label: no trial states it, a record shows it.
+
+    Parameters
+    ----------
+    recorded, exact : Trial
+        With noise and without.
+    """
+    frame, axes = exact.frame(), exact.body_axes
+    out = {}
+    for noisy, aid in zip(recorded.aids, exact.aids, strict=True):
+        if not (isinstance(noisy, Attitude | Ins) and isinstance(aid, Attitude | Ins)):
+            continue
+        if not recorded.estimates_noise(noisy):
+            continue
+        both = (each.dense_observations(frame, axes) for each in (noisy, aid))
+        for one, other in zip(*both, strict=True):
+            error = np.unwrap(_measured(one) - _measured(other), axis=0)
+            in_group = [i for group in one.noise_groups for i in group]
+            own = np.maximum(white_noise(error), LEAST_STD)
+            estimated = np.isin(np.arange(own.size), in_group)
+            out[one.label] = np.where(estimated, own, np.nan)
+    return out
+
+
+def _measured(o: Observation) -> Array:
+    """Return what an attitude sensor or an INS measured, (M, 3), SI."""
+    if isinstance(o, PointPosition):
+        return o.measured_n
+    if isinstance(o, PointVelocity):
+        return o.measured_l
+    assert isinstance(o, AttitudeAngles)
+    return o.measured

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -49,8 +50,9 @@ class StartPositions:
 
     Parameters
     ----------
-    states : tuple of States
-        Of each living hypothesis, most probable first; at least one.
+    states : tuple of object
+        Motion of the nodes, as their chain has it, of each living hypothesis, most probable first;
+        at least one.
     hypotheses : tuple of Hypothesis, optional
         The living ones, in the same order, then the dead; empty if a position is known.
     rejected : mapping of str to ndarray, optional
@@ -59,7 +61,7 @@ class StartPositions:
         What the user must know.
     """
 
-    states: tuple[States, ...]
+    states: tuple[Any, ...]
     hypotheses: tuple[Hypothesis, ...] = ()
     rejected: Mapping[str, Array] = field(default_factory=dict)
     findings: tuple[Finding, ...] = ()

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from factorgraph_dvl.geometry.vectors import Array, BoolArray
+from factorgraph_dvl.geometry.vectors import Array, IntArray
 from factorgraph_dvl.graph.problem import Problem
 from factorgraph_dvl.graph.smooth_chain import SmoothChain
 from factorgraph_dvl.imu.attitude_record import AttitudeRecord
@@ -22,7 +22,7 @@ from factorgraph_dvl.solvers.preparation_without_imu import (
     PreparationWithoutImu,
     lasting_observations,
     node_clock,
-    turns,
+    phases,
 )
 from factorgraph_dvl.trial import Trial
 
@@ -55,8 +55,8 @@ class BatchSolution:
         turns is fixed by these. `lag` is zero where the nodes are at true times.
     pings_late : float, s
         Stamps of pings less times of the nodes; zero where nodes have the clock of the pings.
-    on_legs, in_turns : ndarray, shape (6,)
-        Densities of acceleration.
+    densities : ndarray, shape (3, 6)
+        Densities of acceleration, by what the heading does: it stays, turns, or begins or ends to.
     tilt : ndarray, shape (P,), 1/s
         Gradient of the states' volume that every second adds.
     std : dict of str to ndarray
@@ -75,8 +75,7 @@ class BatchSolution:
     lag: float
     late: float
     pings_late: float
-    on_legs: Array
-    in_turns: Array
+    densities: Array
     tilt: Array
     std: dict[str, Array]
     labels: dict[str, set[str]]
@@ -89,10 +88,6 @@ class BatchSolution:
         trial, chain = prepared.trial, problem.chain
         assert isinstance(chain, SmoothChain)
         assert trial.attitude is not None
-        turning = prepared.turning
-        legs, curves = (chain.density[each][:1] for each in (~turning, turning))
-        on_legs = (legs if legs.size else curves)[0]
-        first_turns = np.maximum(on_legs, np.repeat([0.0, _FIRST_TURNS], 3))
         tilt = np.zeros(sum(p.mean.size for p in problem.parameters))
         if problem.tilt is not None:
             tilt = problem.tilt.gradient / duration
@@ -113,8 +108,7 @@ class BatchSolution:
             lag=0.0 if chain.clock is None else lag,
             late=float(start[trial.attitude.clock.offset.name][0]),
             pings_late=lag if chain.clock is None else 0.0,
-            on_legs=on_legs,
-            in_turns=curves[0] if curves.size else first_turns,
+            densities=_densities(chain.density, prepared.phase),
             tilt=tilt,
             std={
                 o.label: _typical(o.std)
@@ -128,8 +122,7 @@ class BatchSolution:
 
     def density(self, record: AttitudeRecord, time: Array) -> Array:
         """Return the densities of acceleration at times (M,) by the nodes' clock, (M, 6)."""
-        turning: BoolArray = turns(record, time + self.late - self.lag)
-        return np.where(turning[:, None], self.in_turns, self.on_legs)
+        return np.asarray(self.densities[phases(record, time + self.late - self.lag)])
 
     def observations(self, aid: Aid) -> list[Observation]:
         """Return what some rows of a sensor measured, with the noise of the whole record."""
@@ -142,6 +135,24 @@ class BatchSolution:
                 o = replace(o, std=o.std * (self.std[o.label] / _typical(o.std)))
             out.append(o)
         return out
+
+
+def _densities(density: Array, phase: IntArray) -> Array:
+    """Return the density (3, 6) of each phase from those of steps, (K - 1, 6) and (K - 1,).
+
+    Where the vessel has not turned yet, another strength is assumed for that.
+    """
+    out: list[Array] = []
+    for kind in range(3):
+        own = density[phase == kind]
+        if own.size:
+            out.append(own[0])
+        elif out:
+            out.append(np.maximum(out[-1], np.repeat([0.0, _FIRST_TURNS], 3)))
+        else:
+            # It has turned from the beginning.
+            out.append(density[np.argmin(phase)])
+    return np.array(out)
 
 
 def _typical(std: Array) -> Array:

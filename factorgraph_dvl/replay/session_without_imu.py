@@ -230,12 +230,13 @@ class ReplayWithoutImu:
         past = replace(past, known=past.known.tilted(gained * batch.tilt))
         time = np.append(real[first:], nodes)
         record = self._attitudes(float(time[0]), until)
-        middle = 0.5 * (time[1:] + time[:-1])[window.last - first :]
+        # What the heading does about the newest steps shows only in the seconds to come.
+        middle = 0.5 * (time[1:] + time[:-1])
         problem, at = self._window(
             batch,
             past,
             time,
-            np.concatenate([chain.density[first : window.last], batch.density(record, middle)]),
+            batch.density(record, middle),
             _some(window.evaluation.states, slice(first, window.last + 1)),
             window.values,
             until,

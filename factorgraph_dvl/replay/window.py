@@ -16,7 +16,7 @@ from scipy.linalg import solve_triangular
 
 from factorgraph_dvl.errors import SolveError
 from factorgraph_dvl.geometry.rotations import BodyAxes
-from factorgraph_dvl.geometry.vectors import Array, BoolArray, IntArray, rotate
+from factorgraph_dvl.geometry.vectors import Array, BoolArray
 from factorgraph_dvl.graph import keys
 from factorgraph_dvl.graph.bound_observation import processes_of
 from factorgraph_dvl.graph.priors import ConstantsPrior
@@ -24,22 +24,23 @@ from factorgraph_dvl.graph.problem import Evaluation, Problem
 from factorgraph_dvl.graph.processes import Process
 from factorgraph_dvl.graph.smooth_chain import SmoothChain
 from factorgraph_dvl.graph.template import jacobian_template
-from factorgraph_dvl.graph.trajectory import (
-    TRAJECTORY_RATE,
-    between,
-    epochs_between,
-    reported,
-    tangent_in_n,
-)
+from factorgraph_dvl.graph.trajectory import TRAJECTORY_RATE
 from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.sensors.protocol import Observation
 from factorgraph_dvl.solution import Trajectory
+from factorgraph_dvl.solvers.levenberg_marquardt import Minimum
+from factorgraph_dvl.solvers.posterior import Posterior, posterior
+from factorgraph_dvl.solvers.true_times import (
+    covariances_at_true_times,
+    epochs_at_most,
+    known_span,
+    motion_at_true_times,
+    nodes_late,
+)
 from factorgraph_dvl.statistics.square_root_information import SquareRootInformation, eliminated
 
 # Steps of a window. Measured: after one, σ of clocks were 5 % too small in turns.
 _STEPS = 2
-# Rows of a state that are of the attitude, and those that are not.
-_ATTITUDE, _OTHERS = slice(0, 3), slice(3, 9)
 
 
 @dataclass(frozen=True)
@@ -188,55 +189,27 @@ class Window:
     @property
     def lag(self) -> float:
         """Times of the nodes less true times, s."""
-        clock = self.chain.clock
-        return 0.0 if clock is None else float(self.values[clock][0])
-
-    @cached_property
-    def constants(self) -> Array:
-        """Covariance (P, P) of the parameters, in their tangent space, SI."""
-        columns = self.problem.columns
-        size = sum(p.mean.size for p in self.problem.parameters)
-        every = {self.problem.key(name): np.eye(size)[:, own] for name, own in columns.items()}
-        return self.information.covariance_of([every]) if every else np.zeros((0, 0))
+        return nodes_late(self.chain, self.values)
 
     @property
     def now(self) -> float:
         """True time up to which the motion is known, s."""
-        time, shift = self.chain.node_time, self.chain.shift(self.values)
-        return float(min(time[-2], time[-1] - shift)) - self.lag
+        return known_span(self.chain, self.values)[1]
+
+    @cached_property
+    def constants(self) -> Array:
+        """Covariance (P, P) of the parameters, in their tangent space, SI."""
+        root = self.problem.prior_root
+        return np.asarray(root @ self._posterior.parameters @ root.T)
 
     @cached_property
     def states(self) -> Array:
-        """Covariances (K, 9, 9) of what the nodes have, where true times are exact.
+        """Covariances (K, 9, 9) of the states of nodes where the true times are exact."""
+        return covariances_at_true_times(self.problem, self.evaluation, self._posterior)
 
-        In GTSAM's tangent space. A clock of the nodes that is off by some time moves them along
-        the motion.
-        """
-        chain, s = self.chain, self.evaluation.states
-        wanted = [keys.node(k) for k in range(chain.node_time.size)]
-        marginals = self.information.marginals(wanted)
-        P = np.stack([marginals[key] for key in wanted])
-        clocks = [
-            (self.problem.key(clock), rows)
-            for clock, rows in (
-                (chain.attitude_clock or chain.clock, _ATTITUDE),
-                (chain.clock, _OTHERS),
-            )
-            if clock is not None and clock in self.problem.columns
-        ]
-        if not clocks:
-            return P
-        bRn = s.nRb.transpose(0, 2, 1)
-        acceleration = np.gradient(s.v_n, chain.node_time, axis=0)
-        moved = np.hstack([s.omega_b, rotate(bRn, s.v_n), rotate(bRn, acceleration)])
-        by_clocks = np.zeros((len(P), 9, len(clocks)))
-        for i, (_, rows) in enumerate(clocks):
-            by_clocks[:, rows, i] = moved[:, rows]
-        found = self.information.covariance_with([{key: np.eye(1)} for key, _ in clocks])
-        cross = np.stack([found[key] for key in wanted]) @ by_clocks.transpose(0, 2, 1)
-        own = np.concatenate([found[key] for key, _ in clocks])
-        P = P + cross + cross.transpose(0, 2, 1)
-        return np.asarray(P + by_clocks @ own @ by_clocks.transpose(0, 2, 1))
+    @cached_property
+    def _posterior(self) -> Posterior:
+        return posterior(self.problem, Minimum(self.evaluation, self.information, True, 0))
 
     def newest(self, body_axes: BodyAxes) -> Trajectory:
         """Return the newest motion that is known, as a trajectory of one epoch."""
@@ -244,27 +217,13 @@ class Window:
 
     def motion(self, since: float, last: int, body_axes: BodyAxes) -> Trajectory:
         """Return the motion after a true time, s, and up to a node."""
-        chain = self.chain
-        first = chain.node_time[0] - min(chain.shift(self.values), 0.0) - self.lag
-        end = min(float(chain.node_time[last]) - self.lag, self.now)
-        rate = TRAJECTORY_RATE
-        if chain.resolution:
-            rate = min(rate, 1.0 / chain.resolution)
-        return self._at(epochs_between(max(since, first), end, rate), body_axes)
+        first, end = known_span(self.chain, self.values)
+        end = min(float(self.chain.node_time[last]) - self.lag, end)
+        epochs = epochs_at_most(self.chain, max(since, first), end, TRAJECTORY_RATE)
+        return self._at(epochs, body_axes)
 
     def _at(self, time: Array, body_axes: BodyAxes) -> Trajectory:
-        """Return the motion at true times (M,), s."""
-        chain, states = self.chain, self.evaluation.states
-        at = chain.attach(time + self.lag, chain.shift(self.values))
-        found = chain.transition(at, states)
-        P_n = tangent_in_n(self.states, states.nRb)
-        # The attitude is between other nodes.
-        parts = ((P_n[:, :1], at.turned), (P_n[:, 1:], at.time))
-        covariance = np.concatenate(
-            [between(own, *_place(chain.node_time, when)) for own, when in parts], axis=1
-        )
-        covariance += found.missing(chain.density, chain.nRt)
-        return reported(time, found.motion, covariance, chain.frame, body_axes)
+        return motion_at_true_times(self.chain, self.evaluation, self.states, body_axes, time)
 
     def before(self, first: int) -> Past:
         """Return what all that came before a node say of what stays.
@@ -277,11 +236,14 @@ class Window:
         starts = {p.name: self._first_node_of(p, first) for p in problem.processes}
         gone = set(self.chain.keys_of(range(first)))
         gone.update(p.key(j) for p in problem.processes for j in range(starts[p.name]))
+        constants = {problem.key(p.name) for p in problem.parameters}
         past, priors = gtsam.GaussianFactorGraph(), problem.graph.size()
         for i in range(gaussian.size()):
             own = gaussian.at(i).keys()
-            # Priors come first, but for those of processes, which have one variable.
-            prior = i < priors or (len(own) == 1 and keys.is_process(own[0]))
+            # Priors come first, but for those of processes, which have one variable, and for what
+            # is of constants alone.
+            prior = i < priors or constants.issuperset(own)
+            prior = prior or (len(own) == 1 and keys.is_process(own[0]))
             if prior or not gone.isdisjoint(own):
                 past.push_back(gaussian.at(i))
         ordering = problem.ordering(branches=False)
@@ -372,13 +334,6 @@ def _eliminated(problem: Problem, at: Evaluation) -> SquareRootInformation:
             where="replay",
             hint="Inspect the trial: standard deviations may differ by too many digits",
         ) from None
-
-
-def _place(node_time: Array, time: Array) -> tuple[IntArray, Array]:
-    """Return the nodes before times (M,), and how far the times are on the way to the next."""
-    node = np.clip(np.searchsorted(node_time, time, side="right") - 1, 0, node_time.size - 2)
-    fraction = (time - node_time[node]) / (node_time[node + 1] - node_time[node])
-    return node, np.clip(fraction, 0.0, 1.0)
 
 
 def _depended_on(

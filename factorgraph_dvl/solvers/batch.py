@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from copy import copy
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import Any
 
 import gtsam
 import numpy as np
@@ -12,7 +12,6 @@ import numpy as np
 from factorgraph_dvl.errors import ConfigError
 from factorgraph_dvl.graph.priors import ConstantsPrior
 from factorgraph_dvl.graph.trajectory import TRAJECTORY_RATE
-from factorgraph_dvl.imu.propagation import States
 from factorgraph_dvl.quality.refusal import accepted_errors, explained
 from factorgraph_dvl.quality.survey import survey
 from factorgraph_dvl.ranging.hypothesis_weights import significant_costs
@@ -31,14 +30,12 @@ from factorgraph_dvl.solvers.minima import (
     distinct,
     evidence_against,
 )
-from factorgraph_dvl.solvers.preparation import Preparation, prepare
+from factorgraph_dvl.solvers.preparation import Prepared, prepare
+from factorgraph_dvl.solvers.preparation_without_imu import prepare_without_imu
 from factorgraph_dvl.solvers.rounds import SettledMinimum, settle
 from factorgraph_dvl.solvers.state_times import STATE_INTERVAL
 from factorgraph_dvl.solvers.summary import summarise
 from factorgraph_dvl.trial import Trial
-
-if TYPE_CHECKING:
-    from factorgraph_dvl.solvers.motion_smoother import SmoothedMotion
 
 
 def solve(
@@ -59,7 +56,7 @@ def solve(
         Rate of the trajectory in the solution, Hz; the solver's states are independent of it.
     state_interval_s : float, optional
         Time between the states of the graph, s; less where the noise of the gyros in between
-        matters to a sensor of attitude.
+        matters to a sensor of attitude. Without an IMU states are at pings.
     anyway : bool, optional
         Solve although there are records that cannot be used.
     progress : callable, optional
@@ -102,7 +99,7 @@ def solve_with_problem(
     state_interval_s: float = STATE_INTERVAL,
     anyway: bool = False,
     progress: Progress | None = None,
-) -> tuple[Solution, SolvedProblem | SmoothedMotion | None]:
+) -> tuple[Solution, SolvedProblem | None]:
     """Return the solution of a trial, and its problem at the most probable minimum.
 
     That of a planar trial is of another kind, and None here. Parameters and errors are those of
@@ -116,29 +113,27 @@ def solve_with_problem(
     report("survey", 0, None)
     records = survey(trial)
     errors = accepted_errors(records, anyway=anyway)
-    solved: SolvedProblem | SmoothedMotion
-    # Solvers of some kinds of trials are loaded for these only.
     with explained(errors):
         if trial.planar:
+            # Its solver is loaded for such trials only.
             from factorgraph_dvl.ranging.planar_solution import solve_planar
 
             found = solve_planar(trial, rate_hz=rate_hz, progress=report)
             return found.with_findings(records.problems), None
-        if trial.imu is None:
-            from factorgraph_dvl.solvers.motion_preparation import prepare_motion
-            from factorgraph_dvl.solvers.motion_smoother import smooth_motion
-            from factorgraph_dvl.solvers.motion_summary import summarise_motion
-
-            solved = smooth_motion(prepare_motion(trial), report)
-            found = summarise_motion(trial, solved, rate_hz=rate_hz)
-        else:
-            prepared = prepare(trial, state_interval_s, report)
-            found, solved = _most_probable(trial, prepared, rate_hz, report)
+        prepared = _prepared(trial, state_interval_s, report)
+        found, solved = _most_probable(trial, prepared, rate_hz, report)
     return found.with_findings(errors), solved
 
 
+def _prepared(trial: Trial, state_interval_s: float, report: Progress) -> Prepared:
+    """Return what the minimisation of a trial starts from."""
+    if trial.imu is None:
+        return prepare_without_imu(trial)
+    return prepare(trial, state_interval_s, report)
+
+
 def _most_probable(
-    trial: Trial, prepared: Preparation, rate_hz: float, report: Progress
+    trial: Trial, prepared: Prepared, rate_hz: float, report: Progress
 ) -> tuple[Solution, SolvedProblem]:
     """Return the most probable of all minima from all positions, with the spread of the others."""
     solutions, best = [], []
@@ -173,15 +168,15 @@ def solved_problems(
     """
     report = progress or _silent
     _check_above_zero("state_interval_s", state_interval_s)
-    prepared = prepare(trial, state_interval_s, report)
+    prepared = _prepared(trial, state_interval_s, report)
     start = prepared.start_positions
     findings = (*prepared.findings, *ambiguity(start.hypotheses))
     return _minima(prepared, start.states[0], findings, report)
 
 
 def _minima(
-    prepared: Preparation,
-    states: States,
+    prepared: Prepared,
+    states: Any,
     findings: tuple[Finding, ...],
     report: Progress,
 ) -> list[SolvedProblem]:
@@ -217,7 +212,7 @@ def settled_minimum(
     """
     report = progress or _silent
     _check_above_zero("state_interval_s", state_interval_s)
-    prepared = prepare(trial, state_interval_s, report)
+    prepared = _prepared(trial, state_interval_s, report)
     start = prepared.start_positions
     settled = settle(
         prepared,

@@ -130,6 +130,7 @@ def _with_walks(
             problem.all_parameters,
             start=evaluation.parameters,
             clock_zero=problem.clock_zero,
+            tilt=problem.tilt,
         )
         test.reject(problem.rejected)
         test.noise_factors = noise

@@ -20,8 +20,8 @@ def reported(
     """Return all calibration parameters in the order in which they are reported.
 
     Each with its value in reported units and the derivatives of that with respect to the
-    variables of the graph, by key; None for one that is fixed. What walks is reported as its mean
-    over the trial.
+    variables of the graph, by key; None for one that is fixed. What walks or varies is reported
+    as its mean over the trial.
     """
     rows: list[tuple[Parameter, Array, dict[int, Array] | None]] = [
         *problem.chain.mean_constants(evaluation.states)
@@ -31,6 +31,10 @@ def reported(
         own = {problem.key(p.name): row.derivative} if p.estimated else None
         value = row.value
         for process in problem.processes:
+            if own is not None and process.parameter == p.name:
+                change, by_node = process.mean(evaluation.parameters[process.name])
+                value = value + change / p.si
+                own |= {key: d / p.si for key, d in by_node.items()}
             if own is not None and process.walk is not None and process.walk.parameter == p.name:
                 mean, by_node = process.mean_walk(evaluation.parameters[process.name])
                 value = value + mean

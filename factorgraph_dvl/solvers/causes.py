@@ -47,16 +47,29 @@ def causes(
     is_free = np.concatenate([np.full(v.size, d is not None) for _, v, d in rows])
     exact = np.concatenate([p.sigma == 0.0 for p, _, _ in rows])
     assumed = _assumed(found, [p for p, _, _ in rows])
-    labels = {o.label for o in problem.observations}
+    names = _names(problem)
     out = []
     for source, variance in variances.items():
         adds = np.zeros(is_free.size)
         adds[is_free] = np.sqrt(np.maximum(variance, 0.0))
         adds[exact] = 0.0
-        text = f"noise of {source}" if source in labels else source
-        out.append(Cause(text, assumed.get(source, ""), adds))
+        out.append(Cause(names.get(source, source), assumed.get(source, ""), adds))
     total = np.maximum(np.sum([c.adds**2 for c in out], axis=0), np.finfo(float).tiny)
     return tuple(sorted(out, key=lambda c: -float(np.max(c.adds**2 / total))))
+
+
+def _names(problem: Problem) -> dict[str, str]:
+    """Return the words for sources that have others as causes.
+
+    Without an IMU what persists of an error is as much stated as what is new in each measurement.
+    """
+    out = {o.label: f"noise of {o.label}" for o in problem.observations}
+    for process in problem.processes:
+        if process.parameter is not None:
+            out[CORRELATED.format(process.label)] = f"changes of the {process.label}"
+        elif problem.chain.interpolates:
+            out[CORRELATED.format(process.label)] = f"lasting errors of {process.label}"
+    return out
 
 
 def _assumed(found: SolvedProblem, parameters: list[Parameter]) -> dict[str, str]:
@@ -68,8 +81,10 @@ def _assumed(found: SolvedProblem, parameters: list[Parameter]) -> dict[str, str
         if (weight > 0.0).any():
             middle = [float(np.nanmedian(s)) for s in sigma.T if np.isfinite(s).any()]
             out[o.label] = numbers_with_unit(np.array(middle), o.unit)
+    units = {o.label: o.unit for o in problem.observations}
+    units |= {p.name: UNITS[p.spec.unit].text for p in parameters}
     for process in problem.processes:
-        (unit,) = (o.unit for o in problem.observations if o.label == process.label)
+        unit = units[process.label if process.parameter is None else process.parameter]
         assumed = []
         if process.sigma.any():
             over = numbers_with_unit(process.tau[process.sigma > 0.0], "s")

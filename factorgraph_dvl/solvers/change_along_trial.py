@@ -64,9 +64,10 @@ def component_changes(
         All rows of the graph that is linearised there, if something else needs them, too.
     """
     chain, own = problem.chain, problem.chain.constants
-    # Biases that walk change anyway.
+    # Biases that walk, and what processes vary, change anyway.
+    varying = {process.parameter for process in problem.processes}
     constant = {
-        *problem.columns,
+        *(name for name in problem.columns if name not in varying),
         *(
             p.name
             for p, _, by in chain.mean_constants(evaluation.states)
@@ -82,12 +83,13 @@ def component_changes(
         return []
     functionals = [derivatives for _, derivatives in rows]
     of_component = [(name, p) for p, _ in rows for name in p.component_names]
-    time = chain.node_time
+    time, tilt = chain.node_time, problem.tilt
     tests = changes(
         rows_with_times(problem, rows_by_source(problem, evaluation) if every is None else every),
         information.covariance_with(functionals),
         information.covariance_of(functionals),
         (float(time[0]), float(time[-1])),
+        {problem.key(n): tilt.gradient[own] for n, own in problem.columns.items()} if tilt else {},
     )
     return [
         ComponentChange(name, p, test)

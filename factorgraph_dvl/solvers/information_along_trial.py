@@ -22,7 +22,6 @@ import numpy as np
 from scipy.linalg.lapack import dgeqrf, dtrtri
 
 from factorgraph_dvl.geometry.vectors import Array, IntArray
-from factorgraph_dvl.graph import keys
 from factorgraph_dvl.graph.problem import FIXED_DIRECTION_STD, Evaluation, Problem
 from factorgraph_dvl.solution import Progress, Solution
 from factorgraph_dvl.solvers.batch import solve_with_problem
@@ -45,7 +44,8 @@ class Frontier:
     Parameters
     ----------
     root : ndarray, shape (n, n)
-        Upper triangle; columns: state, its bias where biases walk, constants.
+        Upper triangle; columns: state, what its node has beside (a bias that walks, rates),
+        constants.
     """
 
     root: Array
@@ -74,11 +74,7 @@ def solve_with_history(
         return solution, None
     if progress:
         progress("information along the trial", 0, None)
-    if isinstance(solved, SolvedProblem):
-        return solution, information_history(solved, entries=entries)
-    from factorgraph_dvl.solvers.motion_information import motion_history
-
-    return solution, motion_history(solved, entries=entries)
+    return solution, information_history(solved, entries=entries)
 
 
 def information_history(found: SolvedProblem, *, entries: int | None = None) -> InformationHistory:
@@ -173,7 +169,9 @@ def run_filter(
         inner = [key for key in present if key not in columns]
         leaving = [key for key in inner if k < last and gone_after[key] <= k]
         # The states come right before the constants, so that the frontier is the end of R.
-        staying = sorted(set(inner) - set(leaving), key=lambda key: not keys.is_process(key))
+        own = _own_keys(problem, min(k + 1, last))
+        others = [key for key in inner if key not in leaving and key not in own]
+        staying = [*others, *(key for key in own if key in present)]
         triangle = _triangle(*_stacked(root, frontier, rows, [*leaving, *staying], columns, sizes))
         gone = sum(sizes[key] for key in leaving)
         root, frontier = triangle[gone:, gone:], staying

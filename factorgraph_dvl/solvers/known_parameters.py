@@ -330,6 +330,12 @@ def with_scattered_noise(
             if index.size
         )
         robust = {label: weight[rows[label]] for label, weight in robust.items()}
+    tilt = problem.tilt
+    if tilt is not None:
+        # It counts once, in the part that has the priors.
+        first = block is None or block.start == 0
+        estimated = [p for p in parameters if p.estimated]
+        tilt = tilt.of(problem.parameters, estimated) if first else None
     test = Problem(
         chain,
         observations,
@@ -338,6 +344,7 @@ def with_scattered_noise(
         clock_zero=problem.clock_zero,
         processes=problem.processes,
         attached=attached,
+        tilt=tilt,
     )
     test.reject(problem.rejected)
     test.noise_factors = _as_scattered(problem, evaluation) if noise is None else noise

@@ -140,11 +140,13 @@ def minimise(
         damped = _damped(gaussian, evaluation.values, damping) if damping > 0.0 else gaussian
         last = proven and damping == 0.0 and promised < _ANOTHER_FOLLOWS
         delta = None if careful or last else quick_step(damped, ordering)
-        promised = evaluation.cost - gaussian.error(delta) if delta is not None else -np.inf
+        promised = (
+            _promised(problem, evaluation, gaussian, delta) if delta is not None else -np.inf
+        )
         if delta is None or (proven and not promised > max(tolerance, _NEARLY)):
             root = eliminated(damped, problem.ordering(branches=False), sizes)
             delta = root.solution()
-            promised = evaluation.cost - gaussian.error(delta)
+            promised = _promised(problem, evaluation, gaussian, delta)
         assert delta is not None
         near = binding and promised < _ANOTHER_FOLLOWS
         if near and problem.needs_rebinding(evaluation.parameters):
@@ -192,6 +194,17 @@ def minimise(
         root = None
     root = eliminated(gaussian, problem.ordering(branches=False), sizes)
     return Minimum(evaluation, root, False, iteration)
+
+
+def _promised(
+    problem: Problem,
+    evaluation: Evaluation,
+    gaussian: gtsam.GaussianFactorGraph,
+    delta: gtsam.VectorValues,
+) -> float:
+    """Return by how much the linear model says that the cost falls."""
+    beside = 0.0 if problem.tilt is None else problem.tilt.constant
+    return float(evaluation.cost + beside - gaussian.error(delta))
 
 
 def _shorter(

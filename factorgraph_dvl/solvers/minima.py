@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -16,7 +17,7 @@ from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.solution import Progress
 from factorgraph_dvl.solvers.fixed_directions import SolvedProblem
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, minimise
-from factorgraph_dvl.solvers.preparation import ROUGH_TOLERANCE, Preparation
+from factorgraph_dvl.solvers.preparation import ROUGH_TOLERANCE, Preparation, Prepared
 from factorgraph_dvl.solvers.rounds import SettledMinimum, settle
 from factorgraph_dvl.statistics.robust_weights import rejection_cost
 
@@ -38,28 +39,28 @@ _ROUGHLY_AS_GOOD = 30.0
 _SAME_ANGLE = 15.0 * DEG
 
 
-def competing_minima(
-    prepared: Preparation, states: States, report: Progress
-) -> list[SettledMinimum]:
+def competing_minima(prepared: Prepared, states: Any, report: Progress) -> list[SettledMinimum]:
     """Return the minimum that some states lead to, then others that are about as probable.
 
     In some seconds neither heading nor mounting is known before the DVL is used, and start
-    values lead to any of several minima. From longer trials they lead to the right one.
+    values lead to any of several minima. From longer trials they lead to the right one, as they do
+    without an IMU: a sensor then measures the heading.
 
     Parameters
     ----------
-    prepared : Preparation
-        Segments, measurements and parameters.
-    states : States
-        Where to start.
+    prepared : Prepared
+        Chain, measurements and parameters.
+    states : object
+        Where to start, as the chain has it.
     report : callable
         Called with stage, iteration and cost.
     """
     first = settle(prepared, states, report)
     rotations = [p for p in prepared.parameters if p.rotation and p.estimated]
-    time = prepared.segments.node_time
+    time = first.problem.chain.node_time
     is_free = any(p.sigma.max() > _ANY_ANGLE for p in rotations)
-    if time[-1] - time[0] > _SHORT or not is_free:
+    long = time[-1] - time[0] > _SHORT
+    if long or not is_free or not isinstance(prepared, Preparation):
         return [first]
     report("other mountings", 0, None)
     out = [first]
@@ -88,6 +89,7 @@ def _rough_minima(
         prepared.observations,
         prepared.parameters,
         start=first.minimum.evaluation.parameters,
+        tilt=first.problem.tilt,
     )
     problem.noise_factors = first.problem.noise_factors
     problem.robust_weights = first.problem.robust_weights
@@ -135,14 +137,14 @@ def _is_among(
     return False
 
 
-def distinct(prepared: Preparation, minima: Sequence[SolvedProblem]) -> list[SolvedProblem]:
+def distinct(prepared: Prepared, minima: Sequence[SolvedProblem]) -> list[SolvedProblem]:
     """Return the most probable of the minima that are the same now, once for each.
 
     Some differed only along what the data do not determine, which is fixed at the prior since.
 
     Parameters
     ----------
-    prepared : Preparation
+    prepared : Prepared
         What all started from.
     minima : sequence of SolvedProblem
         With their covariances.

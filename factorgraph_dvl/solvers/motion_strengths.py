@@ -2,24 +2,32 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from factorgraph_dvl.geometry.vectors import Array, BoolArray
+from factorgraph_dvl.geometry.vectors import Array, IntArray
 from factorgraph_dvl.graph.priors import Tilt
 from factorgraph_dvl.graph.problem import Problem
 from factorgraph_dvl.graph.processes import Process
 from factorgraph_dvl.graph.smooth_chain import SmoothChain
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, factorized
 from factorgraph_dvl.statistics.marginal_likelihood import log_determinant_gradient
-from factorgraph_dvl.statistics.variance_components import variance_components
+from factorgraph_dvl.statistics.variance_components import (
+    VarianceComponents,
+    variance_components,
+)
 
 # Change of a logarithm from which on another estimate follows, and the largest of one estimate.
 # Chosen: less changes no σ that is shown.
-_SAME, _LARGEST = 0.1, 2.0
+_SAME, _LARGEST = 0.1, 3.0
+# Ratio of two steps up to which they are extrapolated. Chosen: five steps in one.
+_MOST_RATIO = 0.8
 # Movement of the constants, in standard deviations, from which on another estimate follows.
 _SAME_CONSTANTS = 0.1
+# Degrees of freedom below which a strength changes nothing else. Chosen: one.
+_FEWEST = 1.0
 # Least and largest densities, rad²/s³ and m²/s³. Chosen: the chain stays regular.
 _LEAST, _MOST = np.repeat([1e-14, 1e-10], 3), np.repeat([1.0, 1e2], 3)
 # Freedom of a prior at what was assumed, so that a class of few steps keeps its density.
@@ -42,6 +50,8 @@ class Strengths:
         Gradient of the states' volume by the constants.
     values : dict of str to ndarray
         Of all parameters, processes in their new unit.
+    steps : dict of str to ndarray
+        By strength, changes of the logarithms of its variances that residuals asked for.
     same : bool
         Whether all are about the same as before.
     """
@@ -51,10 +61,16 @@ class Strengths:
     processes: tuple[Process, ...]
     tilt: Tilt
     values: dict[str, Array]
+    steps: dict[str, Array]
     same: bool
 
 
-def motion_strengths(problem: Problem, minimum: Minimum, turning: BoolArray) -> Strengths:
+def motion_strengths(
+    problem: Problem,
+    minimum: Minimum,
+    phase: IntArray,
+    before: Mapping[str, Array] | None = None,
+) -> Strengths:
     """Return strengths by restricted maximum likelihood, and the tilt that goes with them.
 
     Parameters
@@ -63,37 +79,33 @@ def motion_strengths(problem: Problem, minimum: Minimum, turning: BoolArray) -> 
         Of a chain without IMU.
     minimum : Minimum
         Where it ended.
-    turning : ndarray of bool, shape (K - 1,)
-        Whether the vessel turns: accelerations there have densities of their own.
+    phase : ndarray of int, shape (K - 1,)
+        What the heading does: accelerations have densities of their own in each phase.
+    before : mapping of str to ndarray, optional
+        `Strengths.steps` of the estimate before.
     """
     chain = problem.chain
     assert isinstance(chain, SmoothChain)
-    problem.weigh(minimum.evaluation)
     evaluation = problem.weighed(minimum.evaluation)
     information, _ = factorized(problem, evaluation)
     found = variance_components(problem, evaluation, information)
-    changes = []
-    factors = dict(problem.noise_factors)
-    for label, each in found.white.items():
-        changes.append(np.log(each.factor / factors[label]))
-        factors[label] = each.factor
+    wanted = _wanted(problem, found, phase)
+    steps = {
+        name: np.clip(_hastened(step, (before or {}).get(name)), -_LARGEST, _LARGEST)
+        for name, (step, _) in wanted.items()
+    }
+    factors = {
+        label: factor * np.exp(0.5 * steps[label])
+        for label, factor in problem.noise_factors.items()
+    }
     density = chain.density.copy()
-    assert found.steps is not None
-    squares, freedom = ((each[:, :6] + each[:, 6:]) for each in found.steps)
-    for where in (turning, ~turning):
-        if where.any():
-            total, left = squares[where].sum(axis=0), freedom[where].sum(axis=0)
-            ratio = (total + _PRIOR_FREEDOM) / (np.maximum(left, 0.0) + _PRIOR_FREEDOM)
-            ratio = np.exp(np.clip(np.log(ratio), -_LARGEST, _LARGEST))
-            after = np.clip(density[where] * ratio, _LEAST, _MOST)
-            changes.append(np.log(after[0] / density[where][0]) * (left > 1.0))
-            density[where] = after
+    for kind in np.unique(phase).tolist():
+        own = density[phase == kind] * np.exp(steps[f"{chain.step_source} {kind}"])
+        density[phase == kind] = np.clip(own, _LEAST, _MOST)
     processes, values = [], dict(evaluation.parameters)
     for process in problem.processes:
-        own = found.correlated.get(process.label)
-        if own is not None and not process.density_only:
-            ratio = np.clip(own.factor, np.exp(-1.0), np.exp(1.0))
-            changes.append(np.log(ratio) * (own.redundancy > 1.0))
+        if process.name in steps:
+            ratio = np.exp(0.5 * steps[process.name])
             values[process.name] = values[process.name] / ratio
             process = replace(process, sigma=process.sigma * ratio)
         processes.append(process)
@@ -103,10 +115,49 @@ def motion_strengths(problem: Problem, minimum: Minimum, turning: BoolArray) -> 
     }
     covariance = information.covariance_of([every]) if every else np.zeros((0, 0))
     tilt = Tilt(gradient, np.sqrt(np.diag(covariance)), dict(evaluation.parameters))
-    before = problem.tilt.gradient if problem.tilt is not None else np.zeros(gradient.size)
-    moved = covariance @ (gradient - before) / np.maximum(tilt.sigma, 1e-300)
-    same = max((float(np.abs(c).max()) for c in changes), default=0.0) < _SAME
+    tilted = problem.tilt.gradient if problem.tilt is not None else np.zeros(gradient.size)
+    moved = covariance @ (gradient - tilted) / np.maximum(tilt.sigma, 1e-300)
+    changed = [step * (left > _FEWEST) for step, left in wanted.values()]
+    same = max((float(np.abs(c).max()) for c in changed), default=0.0) < 2.0 * _SAME
     same = same and float(np.abs(moved).max(initial=0.0)) < _SAME_CONSTANTS
+    chain = replace(chain, density=density)
     return Strengths(
-        replace(chain, density=density), factors, tuple(processes), tilt, values, same
+        chain,
+        factors,
+        tuple(processes),
+        tilt,
+        values,
+        {name: step for name, (step, _) in wanted.items()},
+        same,
     )
+
+
+def _wanted(
+    problem: Problem, found: VarianceComponents, phase: IntArray
+) -> dict[str, tuple[Array, Array]]:
+    """Return steps of the logarithms of variances and their freedom: noise, motion, processes."""
+    out = {}
+    for label, white in found.white.items():
+        step = 2.0 * np.log(white.factor / problem.noise_factors[label])
+        out[label] = step, white.redundancy
+    assert found.steps is not None
+    squares, freedom = ((each[:, :6] + each[:, 6:]) for each in found.steps)
+    for kind in np.unique(phase).tolist():
+        total, left = (each[phase == kind].sum(axis=0) for each in (squares, freedom))
+        left = np.maximum(left, 0.0)
+        ratio = (total + _PRIOR_FREEDOM) / (left + _PRIOR_FREEDOM)
+        out[f"{problem.chain.step_source} {kind}"] = np.log(ratio), left
+    for process in problem.processes:
+        own = found.correlated.get(process.label)
+        if own is not None and not process.density_only:
+            out[process.name] = 2.0 * np.log(own.factor), own.redundancy
+    return out
+
+
+def _hastened(step: Array, before: Array | None) -> Array:
+    """Return steps of a fixed-point iteration that go where their ratio points (Aitken)."""
+    if before is None or before.shape != step.shape:
+        return step
+    known = np.abs(before) > _SAME
+    ratio = np.divide(step, before, out=np.zeros_like(step), where=known)
+    return np.asarray(step / (1.0 - np.clip(ratio, -1.0, _MOST_RATIO)))

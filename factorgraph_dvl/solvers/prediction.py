@@ -2,18 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
 
 import gtsam
 import numpy as np
 
 from factorgraph_dvl.geometry.earth import LocalFrame
-from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.geometry.units import DEG_PER_HOUR, MICRO_G
+from factorgraph_dvl.geometry.vectors import Array, IntArray
+from factorgraph_dvl.graph.chain import Chain
 from factorgraph_dvl.graph.inertial_chain import inertial_chain
+from factorgraph_dvl.graph.priors import prior_mean
 from factorgraph_dvl.graph.problem import Evaluation, Problem, observed
+from factorgraph_dvl.graph.processes import Process
+from factorgraph_dvl.graph.smooth_chain import SmoothChain
+from factorgraph_dvl.graph.smooth_motion import SmoothStates
 from factorgraph_dvl.imu.increments import increments
 from factorgraph_dvl.imu.preintegration import segments
 from factorgraph_dvl.imu.propagation import States
+from factorgraph_dvl.sensors.parameters import Parameter
+from factorgraph_dvl.sensors.protocol import Observation
 from factorgraph_dvl.solution import Solution
 from factorgraph_dvl.solvers.correlated_noise import correlated_noise
 from factorgraph_dvl.solvers.fixed_directions import with_covariances
@@ -24,16 +34,44 @@ from factorgraph_dvl.solvers.information_along_trial import (
     run_filter,
 )
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, factorized
+from factorgraph_dvl.solvers.preparation_without_imu import LEAST_DENSITY, prepare_without_imu
 from factorgraph_dvl.solvers.state_times import STATE_INTERVAL, dense_epochs
 from factorgraph_dvl.solvers.summary import summarise
 from factorgraph_dvl.statistics.information_history import InformationHistory
 from factorgraph_dvl.trial import Trial
 
-TrueStates = Callable[[LocalFrame, Array], States]
+# Returns the true motion at times (M,), s, in a frame.
+TrueStates = Callable[[LocalFrame, Array], SmoothStates]
+
+
+@dataclass(frozen=True)
+class _Planned:
+    """A planned trial: what its problem is made of.
+
+    Parameters
+    ----------
+    chain : Chain
+        Nodes, and what ties them.
+    states : object
+        True states of the nodes.
+    values : dict of str to ndarray
+        True values of what is estimated.
+    observations, parameters : tuple of Observation or Parameter
+        Of all sensors.
+    processes : tuple of Process, optional
+        Beside those of the sensors.
+    """
+
+    chain: Chain
+    states: Any
+    values: dict[str, Array]
+    observations: tuple[Observation, ...]
+    parameters: tuple[Parameter, ...]
+    processes: tuple[Process, ...] = ()
 
 
 def predict_posterior(
-    trial: Trial, true_states: TrueStates
+    trial: Trial, true_states: TrueStates, white: Mapping[str, Array] | None = None
 ) -> tuple[Solution, InformationHistory, Frontier]:
     """Return what a solver will know of a trial, without noise and without solving.
 
@@ -42,7 +80,10 @@ def predict_posterior(
     trial : Trial
         Its records without noise, its true calibration, and the noise that it claims.
     true_states : TrueStates
-        Returns the states at (K,) times in a frame.
+        Returns the motion at (K,) times in a frame.
+    white : mapping of str to ndarray, optional
+        By label of an observation, standard deviations (d,) of its white noise, SI, where a solver
+        finds them in the record; NaN where they are as stated.
 
     Returns
     -------
@@ -53,7 +94,7 @@ def predict_posterior(
     frontier : Frontier
         Information at the last node, to go on from.
     """
-    problem, evaluation = _at_truth(trial, true_states)
+    problem, evaluation = _at_truth(trial, true_states, white or {})
     triangles, frontier = run_filter(problem, evaluation)
 
     def linearised_at(values: gtsam.Values) -> Minimum:
@@ -77,24 +118,82 @@ def continue_posterior(
     Parameters
     ----------
     trial, true_states : Trial or TrueStates
-        As of `predict_posterior`; its priors are not used.
+        As of `predict_posterior`, with an IMU; its priors are not used.
     start : Frontier
         At the first node.
     """
-    problem, evaluation = _at_truth(trial, true_states)
+    problem, evaluation = _at_truth(trial, true_states, {})
     triangles, frontier = run_filter(problem, evaluation, start)
     none_fixed = np.zeros((len(problem.prior_root), 0))
     return as_history(problem, evaluation, none_fixed, triangles[-1:], {}), frontier
 
 
-def _at_truth(trial: Trial, true_states: TrueStates) -> tuple[Problem, Evaluation]:
+def _at_truth(
+    trial: Trial, true_states: TrueStates, white: Mapping[str, Array]
+) -> tuple[Problem, Evaluation]:
+    planned = (_without_imu if trial.imu is None else _with_imu)(trial, true_states)
+    problem, evaluation = _problem(planned, planned.processes, {})
+    factors = {
+        o.label: np.nan_to_num(white[o.label] / np.median(sigma, axis=0), nan=1.0)
+        for o, sigma in zip(problem.observations, problem.sigma(evaluation), strict=True)
+        if o.label in white
+    }
+    stated = correlated_noise(problem, evaluation, ()).processes
+    if not stated and not factors:
+        return problem, evaluation
+    return _problem(planned, (*stated, *planned.processes), factors)
+
+
+def _problem(
+    planned: _Planned, processes: tuple[Process, ...], factors: Mapping[str, Array]
+) -> tuple[Problem, Evaluation]:
+    """Return a problem with its weights at the truth, and its evaluation there."""
+    problem = Problem(
+        planned.chain,
+        planned.observations,
+        planned.parameters,
+        start=planned.values,
+        processes=processes,
+    )
+    problem.noise_factors = factors
+    values = problem.values(planned.states, problem.prior_values() | planned.values)
+    return problem, problem.weighed(problem.evaluate(values))
+
+
+def _with_imu(trial: Trial, true_states: TrueStates) -> _Planned:
     frame = trial.frame()
     inc, _ = increments(trial.inertial)
     seg = segments(inc, STATE_INTERVAL, dense_epochs(trial, frame, STATE_INTERVAL))
-    states = true_states(frame, seg.node_time)
-    chain = inertial_chain(trial, frame, seg, states)
+    motion = true_states(frame, seg.node_time)
+    zero, none = np.zeros_like(motion.v_n), np.zeros(3)
+    gyro = trial.calibration_truth.get("gyro_bias_deg_h", none) * DEG_PER_HOUR
+    accel = trial.calibration_truth.get("accel_bias_ug", none) * MICRO_G
+    states = States(motion.nRb, motion.p_n, motion.v_n, zero + gyro, zero + accel)
     observations, parameters = observed(trial.aids, frame, trial.body_axes)
     parameters = (*parameters, *trial.inertial.error_parameters())
+    chain = inertial_chain(trial, frame, seg, states)
+    return _Planned(chain, states, _true_values(trial, parameters), observations, parameters)
+
+
+def _without_imu(trial: Trial, true_states: TrueStates) -> _Planned:
+    prepared = prepare_without_imu(trial)
+    chain, values = prepared.first_chain, _true_values(trial, prepared.parameters)
+    every = {p.name: prior_mean(p) for p in prepared.parameters} | values
+    time = chain.node_time - (0.0 if chain.clock is None else every[chain.clock])
+    states, turned = (true_states(chain.frame, t) for t in (time, time - chain.shift(every)))
+    states = replace(states, nRb=turned.nRb, omega_b=turned.omega_b)
+    return _Planned(
+        as_moving(chain, states, prepared.phase),
+        states,
+        values,
+        prepared.observations,
+        prepared.parameters,
+        prepared.processes,
+    )
+
+
+def _true_values(trial: Trial, parameters: Sequence[Parameter]) -> dict[str, Array]:
+    """Return the true values of those that are estimated."""
     truth: dict[str, Array] = {}
     for p in parameters:
         value = trial.calibration_truth.get(p.name)
@@ -103,22 +202,22 @@ def _at_truth(trial: Trial, true_states: TrueStates) -> tuple[Problem, Evaluatio
                 # One scale is estimated of an instrument that has three.
                 value = np.mean(value, keepdims=True)
             truth[p.name] = p.internal(value)
-    problem, evaluation = _weighed(
-        Problem(chain, observations, parameters, start=truth), states, truth
-    )
-    stated = correlated_noise(problem, evaluation, ()).processes
-    if not stated:
-        return problem, evaluation
-    problem = Problem(chain, observations, parameters, start=truth, processes=stated)
-    return _weighed(problem, states, truth)
+    return truth
 
 
-def _weighed(
-    problem: Problem, states: States, truth: Mapping[str, Array]
-) -> tuple[Problem, Evaluation]:
-    """Return a problem with its weights at the truth, and its evaluation there."""
-    values = problem.values(states, {**problem.prior_values(), **truth})
-    return problem, problem.weighed(problem.evaluate(values))
+def as_moving(chain: SmoothChain, states: SmoothStates, phase: IntArray) -> SmoothChain:
+    """Return a chain with the densities that its states have, by what the heading does.
+
+    Those that the preparation takes from records without noise are those of the sway, which turns
+    the velocity of a log but not that of the track.
+    """
+    own = chain.states(chain.values(states))
+    squares = np.concatenate([step.residual for step in chain.steps(own)]) ** 2
+    density = chain.density.copy()
+    for kind in np.unique(phase):
+        where = phase == kind
+        density[where] *= 0.5 * (squares[where, :6] + squares[where, 6:]).mean(axis=0)
+    return replace(chain, density=np.maximum(density, LEAST_DENSITY))
 
 
 def _minimum(problem: Problem, evaluation: Evaluation) -> Minimum:

@@ -66,6 +66,14 @@ class Prepared(Protocol):
         """Labels of the observations whose stated noise is only where to start."""
 
     @property
+    def start_positions(self) -> StartPositions:
+        """States to start from, one set for each position that the records allow."""
+
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """What the user must know."""
+
+    @property
     def rejected(self) -> Mapping[str, Array]:
         """Times of measurements that are left out from the start, by label."""
 
@@ -80,7 +88,9 @@ class Prepared(Protocol):
     ) -> tuple[Process, ...]:
         """Return the processes that are in the problem from the start."""
 
-    def strengths(self, problem: Problem, minimum: Minimum) -> Strengths | None:
+    def strengths(
+        self, problem: Problem, minimum: Minimum, before: Strengths | None
+    ) -> Strengths | None:
         """Return the strengths of the motion's prior, None where the chain has none."""
 
 
@@ -135,7 +145,7 @@ class Preparation:
         """Return none: noise is white until residuals show another one."""
         return ()
 
-    def strengths(self, problem: Problem, minimum: Minimum) -> None:
+    def strengths(self, problem: Problem, minimum: Minimum, before: Strengths | None) -> None:
         """Return None: the IMU ties the nodes."""
 
     def chain(self, states: States) -> InertialChain:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import msgspec
 import numpy as np
@@ -23,6 +23,7 @@ from factorgraph_dvl.imu.attitude_record import AttitudeRecord, level_axes
 from factorgraph_dvl.initialization.dvl_mounting import initial_mountings
 from factorgraph_dvl.initialization.record_clocks import clock_lags
 from factorgraph_dvl.initialization.track_velocity import Track, body_track
+from factorgraph_dvl.ranging.position_from_ranges import StartPositions
 from factorgraph_dvl.sensors.attitude import Attitude
 from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.sensors.ins import Ins
@@ -55,7 +56,7 @@ _GROUND_SPAN, _WATER_SPAN = 5.0, 15.0
 # Density of acceleration, m²/s³, where the log does not show one.
 _DENSITY = 1e-3
 # Least densities, m²/s³ and rad²/s³. Chosen: they keep the chain regular.
-_LEAST = np.repeat([1e-12, 1e-9], 3)
+LEAST_DENSITY = np.repeat([1e-12, 1e-9], 3)
 # Spans, s, over which changes of velocity on legs show the density; in turns, in which velocity
 # changes steadily, they are the intervals of the pings.
 _LEG_SPANS = (2.0, 10.0)
@@ -80,10 +81,12 @@ class PreparationWithoutImu:
         Nodes, with densities to start from.
     states : SmoothStates
         Of the nodes.
+    record : AttitudeRecord
+        Whose heading the track follows.
     values : dict of str to ndarray
         Of clocks and mountings.
-    turning : ndarray of bool, shape (K - 1,)
-        Whether the vessel turns between nodes.
+    phase : ndarray of int, shape (K - 1,)
+        What the heading does between nodes: 0 = stays, 1 = turns, 2 = begins or ends to turn.
     observations : tuple of Observation
         Measurements of all sensors.
     parameters : tuple of Parameter
@@ -99,14 +102,24 @@ class PreparationWithoutImu:
     trial: Trial
     first_chain: SmoothChain
     states: SmoothStates
+    record: AttitudeRecord
     values: dict[str, Array]
-    turning: BoolArray
+    phase: IntArray
     observations: tuple[Observation, ...]
     parameters: tuple[Parameter, ...]
     processes: tuple[Process, ...]
     estimated_noise: frozenset[str]
     findings: tuple[Finding, ...]
-    rejected: Mapping[str, Array] = field(default_factory=dict)
+
+    @property
+    def start_positions(self) -> StartPositions:
+        """States to start from: the records know the position."""
+        return StartPositions((self.states,))
+
+    @property
+    def rejected(self) -> Mapping[str, Array]:
+        """Return none: gross errors are found by the minimisation."""
+        return {}
 
     def chain(self, states: SmoothStates) -> SmoothChain:
         """Return the nodes, with densities to start from."""
@@ -122,9 +135,15 @@ class PreparationWithoutImu:
         problem.weigh(evaluation)
         return (*correlated_noise(problem, evaluation, ()).processes, *self.processes)
 
-    def strengths(self, problem: Problem, minimum: Minimum) -> Strengths:
+    def strengths(self, problem: Problem, minimum: Minimum, before: Strengths | None) -> Strengths:
         """Return the strengths of motion and noise that residuals ask for."""
-        return motion_strengths(problem, minimum, self.turning)
+        steps = None if before is None else before.steps
+        found = motion_strengths(problem, minimum, self.phase, steps)
+        chain, values = found.chain, minimum.evaluation.parameters
+        lag = 0.0 if chain.clock is None else float(values[chain.clock][0])
+        late = float(values[self.record.sensor.clock.offset.name][0])
+        axes = track_axes(self.record, chain.frame, self.states, chain.node_time - lag, late)
+        return replace(found, chain=replace(chain, nRt=axes))
 
     def start(self, chain: Chain, states: SmoothStates, report: Progress) -> MountedStart:
         """Return where the minimisation starts: motion and mountings are known by the records."""
@@ -166,14 +185,14 @@ def prepare_without_imu(trial: Trial) -> PreparationWithoutImu:
     late = float(values[record.sensor.clock.offset.name][0])
     lag = float(values[clock][0])
     nodes = _nodes(trial, record, track, late=late, lag=lag)
-    turning = turns(record, 0.5 * (nodes[1:] + nodes[:-1]) + late - lag)
+    phase = phases(record, 0.5 * (nodes[1:] + nodes[:-1]) + late - lag)
     # Pings are half-way between nodes of the attitude: its acceleration jumps at these.
     half = 0.5 * float(np.median(np.diff(nodes)))
     states = _states(record, track, frame, nodes - lag, late - half)
     chain = SmoothChain(
         frame=frame,
         node_time=nodes,
-        density=_densities(trial, record, values, states, nodes, turning, late),
+        density=_densities(trial, record, values, states, nodes, phase, late),
         start=states,
         nRt=track_axes(record, frame, states, nodes - lag, late),
         clock=clock if any(p.name == clock and p.estimated for p in parameters) else None,
@@ -190,8 +209,9 @@ def prepare_without_imu(trial: Trial) -> PreparationWithoutImu:
         trial=trial,
         first_chain=chain,
         states=states,
+        record=record,
         values=values,
-        turning=turning,
+        phase=phase,
         observations=tuple(o for _, every in by_aid for o in every),
         parameters=parameters,
         processes=_currents(trial, chain) if water else (),
@@ -260,10 +280,17 @@ def track_axes(
     grid = np.arange(time[0] - WAVES, time[-1] + WAVES + _GRID, _GRID)
     heading = record.rph_at(grid + late)[:, 2]
     width = 2 * round(0.25 * WAVES / _GRID) + 1
-    # Twice: a triangle.
-    for _ in range(2):
-        padded = np.pad(heading, width // 2, mode="reflect", reflect_type="odd")
-        heading = np.convolve(padded, np.full(width, 1.0 / width), mode="valid")
+
+    def mean(angle: Array) -> Array:
+        # Twice: a triangle.
+        for _ in range(2):
+            padded = np.pad(angle, width // 2, mode="reflect", reflect_type="odd")
+            angle = np.convolve(padded, np.full(width, 1.0 / width), mode="valid")
+        return angle
+
+    # What the mean leaves over is averaged too, so that it follows where a turn begins (Tukey's
+    # twicing).
+    heading = mean(2.0 * heading - mean(heading))
     angle = np.interp(time, grid, heading)
     rph = np.column_stack([np.zeros((time.size, 2)), angle])
     return level_axes(frame, states.p_n) @ rotation_from_rph(rph, "FRD")
@@ -422,11 +449,19 @@ def without_long_steps(edges: Array, longest: float) -> Array:
     return np.asarray(every[np.concatenate([[True], np.diff(every) > 1e-3])])
 
 
-def turns(record: AttitudeRecord, time: Array) -> BoolArray:
-    """Whether the heading changes over seconds about stamps (M,) of the attitude."""
-    ahead = record.rph_at(time + 0.5 * TURN_SPAN)[:, 2]
-    behind = record.rph_at(time - 0.5 * TURN_SPAN)[:, 2]
-    return np.asarray(np.abs(ahead - behind) / TURN_SPAN > _TURNING)
+def phases(record: AttitudeRecord, time: Array) -> IntArray:
+    """Return what the heading does about stamps (M,) of the attitude, averaged over seconds.
+
+    It stays (0), turns at a rate (1), or begins or ends to turn (2): axes that turn with its
+    average are behind it then.
+    """
+    ahead, here, behind = (
+        record.rph_at(time + shift)[:, 2] for shift in (TURN_SPAN, 0.0, -TURN_SPAN)
+    )
+    after, before = (ahead - here) / TURN_SPAN, (here - behind) / TURN_SPAN
+    changes = np.abs(after - before) > _TURNING
+    turns = np.abs(after + before) > 2.0 * _TURNING
+    return np.where(changes, 2, turns.astype(int))
 
 
 def _densities(
@@ -435,31 +470,30 @@ def _densities(
     values: dict[str, Array],
     states: SmoothStates,
     nodes: Array,
-    turning: BoolArray,
+    phase: IntArray,
     late: float,
 ) -> Array:
-    """Return densities of acceleration to start from, (K - 1, 6), on legs and in turns.
+    """Return densities of acceleration to start from, (K - 1, 6), by what the heading does.
 
     Velocities that are L apart differ by the density times L and by twice the noise: from two L
     both follow. Rates are those of the record.
     """
     out = np.tile(np.repeat([0.0, _DENSITY], 3), (nodes.size - 1, 1))
     step, change = np.diff(nodes)[:, None], np.diff(states.omega_b, axis=0)
-    for where in (turning, ~turning):
-        if where.any():
-            out[where, :3] = np.mean((change**2 / step)[where], axis=0)
+    for kind in np.unique(phase):
+        where = phase == kind
+        out[where, :3] = np.mean((change**2 / step)[where], axis=0)
     log = trial.log
     if log is not None and log.locked.sum() >= 50:
         rows = np.flatnonzero(log.locked)
         time = log.time[rows] - float(values["time_offset_s"][0])
         v_b = log.velocity[rows] @ values.get("misalignment_deg", np.eye(3))
         interval = float(np.median(np.diff(time)))
-        in_turn = turns(record, time + late)
-        spans = {False: _LEG_SPANS, True: (interval, 2.0 * interval)}
-        for kind, of_kind in spans.items():
-            found = _density(v_b, in_turn == kind, of_kind, interval)
-            out[turning == kind, 3:] = found
-    return np.maximum(out, _LEAST)
+        at_pings = phases(record, time + late)
+        for kind in np.unique(phase):
+            spans = (interval, 2.0 * interval) if kind else _LEG_SPANS
+            out[phase == kind, 3:] = _density(v_b, at_pings == kind, spans, interval)
+    return np.maximum(out, LEAST_DENSITY)
 
 
 def _density(v_b: Array, wanted: BoolArray, spans: tuple[float, float], interval: float) -> Array:

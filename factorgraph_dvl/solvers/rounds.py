@@ -38,6 +38,7 @@ from factorgraph_dvl.solvers.known_parameters import (
     explanation_findings,
 )
 from factorgraph_dvl.solvers.levenberg_marquardt import CONVERGED, Minimum, factorized, minimise
+from factorgraph_dvl.solvers.motion_strengths import Strengths
 from factorgraph_dvl.solvers.outliers import robust_weights
 from factorgraph_dvl.solvers.preparation import Preparation, Prepared
 from factorgraph_dvl.solvers.process_fit import refitted
@@ -69,6 +70,7 @@ _CORRELATED = message("not_converged.correlated")
 _KNOWN = message("not_converged.known")
 _WALKS = message("not_converged.walks")
 _MOTION = message("not_converged.acceleration")
+_MINIMUM = message("not_converged.minimum")
 # Parameters that are estimated although they were stated as known. Chosen: a third is a sign that
 # the model is wrong.
 _MOST_FREED = 2
@@ -169,6 +171,7 @@ def settle(
     long_run: Mapping[str, Array] = {}
     tilt: Tilt | None = None
     motion = 0
+    last_strengths: Strengths | None = None
     stated = prepared.stated_processes(chain, states, values)
     first_levels = _NoiseLevels((as_stated,), bool(as_stated), processes=stated)
     levels = first_levels
@@ -207,13 +210,15 @@ def settle(
         # At the ends of the record two bindings may use one measurement in turn.
         usable = problem.usable if tolerance else None
         at = problem.values(states, problem.prior_values() | values)
+        roughly = chain.interpolates and motion < _MOTION_ROUNDS
         minimum = minimise(
             problem,
             at,
             stage="all sensors",
             progress=report,
             binding=True,
-            tolerance=_ROUGHLY if chain.interpolates and motion < _MOTION_ROUNDS else CONVERGED,
+            proven=not roughly,
+            tolerance=_ROUGHLY if roughly else CONVERGED,
         )
         iterations += minimum.iterations
         fruitless = 0 if minimum.converged else fruitless + minimum.iterations
@@ -221,7 +226,9 @@ def settle(
         changing = _changing(problem, minimum.evaluation)
         if changing == [_TIMES] and in_a_row >= _IN_A_ROW and not tolerance:
             tolerance = _clock_tolerance(prepared, problem, minimum.evaluation)
-        strengths = prepared.strengths(problem, minimum) if motion < _MOTION_ROUNDS else None
+        strengths = None
+        if motion < _MOTION_ROUNDS:
+            strengths = last_strengths = prepared.strengths(problem, minimum, last_strengths)
         if strengths is not None:
             motion += 1
             levels = replace(
@@ -229,14 +236,20 @@ def settle(
             )
             chain, tilt = strengths.chain, strengths.tilt
             values = strengths.values
-            if not strengths.same:
-                changing.append(_MOTION)
-                continue
-            motion = _MOTION_ROUNDS
-        elif np.sqrt(np.mean((states.p_n - p_gravity) ** 2)) > _SAME_GRAVITY:
+            # The last minimum was a rough one, good enough for strengths.
+            changing.append(_MINIMUM if strengths.same else _MOTION)
+            if strengths.same:
+                motion = _MOTION_ROUNDS
+            continue
+        if np.sqrt(np.mean((states.p_n - p_gravity) ** 2)) > _SAME_GRAVITY:
             changing.insert(0, message("not_converged.gravity"))
             chain = prepared.chain(states)
             p_gravity = states.p_n
+        if chain.interpolates:
+            # Its steps are so stiff that the last one, however small, turns their rows by more
+            # than their noise: information and rows must be those of the same values.
+            information = factorized(problem, minimum.evaluation)[0]
+            minimum = replace(minimum, square_root=information)
         if not cycle:
             if not (tried and _same(tried[-1], rejected)):
                 tried.append(rejected)
@@ -288,7 +301,7 @@ def settle(
                 # With another model, all that its misfit made is to be found anew.
                 changing.append(_KNOWN)
                 robust, long_run, levels, tolerance = {}, {}, first_levels, {}
-                tilt, motion = None, 0
+                tilt, motion, last_strengths = None, 0, None
                 searches, correlation_searched, count = 0, False, 0
         if not changing and levels.estimated and minimum.converged:
             last = levels

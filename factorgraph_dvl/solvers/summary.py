@@ -8,6 +8,7 @@ from functools import partial
 import numpy as np
 
 from factorgraph_dvl.geometry.records import rows_of
+from factorgraph_dvl.geometry.rotations import BodyAxes
 from factorgraph_dvl.graph.problem import Evaluation, Problem
 from factorgraph_dvl.quality.earlier_calibration import prior_findings
 from factorgraph_dvl.sensors.finding import Code, Finding
@@ -17,6 +18,7 @@ from factorgraph_dvl.solution import (
     Estimate,
     Residuals,
     Solution,
+    Trajectory,
     consistency_findings,
     mostly_rejected,
     not_observable,
@@ -27,7 +29,9 @@ from factorgraph_dvl.solvers.causes import causes
 from factorgraph_dvl.solvers.change_along_trial import change_findings
 from factorgraph_dvl.solvers.correlated_noise import noise_of
 from factorgraph_dvl.solvers.fixed_directions import SolvedProblem
+from factorgraph_dvl.solvers.heading_and_misalignment import heading_and_misalignment
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum
+from factorgraph_dvl.solvers.true_times import trajectory_at_true_times
 from factorgraph_dvl.statistics.robust_weights import windows
 from factorgraph_dvl.trial import Trial
 
@@ -44,12 +48,9 @@ def summarise(trial: Trial, found: SolvedProblem, *, rate_hz: float) -> Solution
     rate_hz : float
         Rate of the trajectory, Hz.
     """
-    problem, minimum, chain = found.problem, found.minimum, found.problem.chain
+    problem, minimum = found.problem, found.minimum
     evaluation = minimum.evaluation
     estimates, covariance = calibration(found)
-    trajectory = chain.trajectory(
-        evaluation.states, found.covariances.nodes, trial.body_axes, rate_hz
-    )
     residuals = _residuals(problem, minimum)
     rejected = _rejected(problem, minimum)
     findings = [*found.findings]
@@ -57,7 +58,8 @@ def summarise(trial: Trial, found: SolvedProblem, *, rate_hz: float) -> Solution
         text = message("not_converged.do_not_use", iterations=minimum.iterations)
         findings.append(Finding(Code.NOT_CONVERGED, text, severity="error"))
     for label, count in problem.uncovered.items():
-        text = message("unused.without_imu", count=count)
+        key = "unused.without_motion" if trial.imu is None else "unused.without_imu"
+        text = message(key, count=count)
         findings.append(Finding(Code.UNUSED, text, sensor=label))
     noise = noise_of(problem)
     findings += consistency_findings(estimates, residuals, noise)
@@ -69,6 +71,7 @@ def summarise(trial: Trial, found: SolvedProblem, *, rate_hz: float) -> Solution
     error_budget = causes(found, lambda rows: changes.extend(change_findings(found, rows)))
     findings += changes
     findings += _unobservable(trial, problem, estimates, evaluation.motions)
+    findings += heading_and_misalignment(trial, found)
     return Solution(
         trial=trial.name,
         solver="batch",
@@ -80,7 +83,7 @@ def summarise(trial: Trial, found: SolvedProblem, *, rate_hz: float) -> Solution
         cost=evaluation.cost,
         estimates=estimates,
         covariance=covariance,
-        trajectory=trajectory,
+        trajectory=_trajectory(found, trial.body_axes, rate_hz),
         residuals=residuals,
         findings=tuple(findings),
         rejected=rejected,
@@ -88,6 +91,16 @@ def summarise(trial: Trial, found: SolvedProblem, *, rate_hz: float) -> Solution
         noise=noise,
         error_budget=error_budget,
     )
+
+
+def _trajectory(found: SolvedProblem, body_axes: BodyAxes, rate_hz: float) -> Trajectory:
+    """Return the motion at a rate, at true times."""
+    chain = found.problem.chain
+    if chain.interpolates:
+        at = found.minimum.evaluation
+        return trajectory_at_true_times(found.problem, at, found.covariances, body_axes, rate_hz)
+    states = found.minimum.evaluation.states
+    return chain.trajectory(states, found.covariances.nodes, body_axes, rate_hz)
 
 
 def _residuals(problem: Problem, minimum: Minimum) -> tuple[Residuals, ...]:
@@ -178,7 +191,7 @@ def _unobservable(
     def why(name: str, component: int) -> Message | str:
         if name in by_name:
             reason = by_name[name].explain(name, component, seen.get(name))
-            if trial.gnss is None:
+            if trial.gnss is None and trial.imu is not None:
                 return message("not_observable.and_no_gnss", reason=reason)
             return reason
         if trial.gnss is None:

@@ -61,6 +61,7 @@ def changes(
     with_components: Mapping[int, Array],
     covariance: Array,
     span: tuple[float, float],
+    gradient: Mapping[int, Array] | None = None,
 ) -> list[Change]:
     """Return the most probable change of each component of some parameters.
 
@@ -74,6 +75,10 @@ def changes(
     change with unknown change point, Econometrica 61(4), 1993; Zeileis and Hornik, Generalized
     M-fluctuation tests for parameter instability, 2007). The most probable time has the largest.
 
+    Where the objective has a gradient g that no row has, the score of the whole trial is g. It
+    counts as the information does: S(t) - I(t) P g, the score where the rows alone have their
+    minimum.
+
     Parameters
     ----------
     rows : iterable of tuple of (Rows, ndarray)
@@ -84,6 +89,8 @@ def changes(
         Of the components.
     span : tuple of (float, float)
         First and last time, s.
+    gradient : mapping of int to ndarray, optional
+        Gradient g by variables, (size,) by key.
     """
     edges = np.linspace(*span, INTERVALS + 1)[1:-1]
     scale = np.sqrt(np.diag(covariance))
@@ -94,6 +101,9 @@ def changes(
     score, information = by_interval(rows, following, edges)
     before = np.cumsum(score, axis=0)[:-1]
     known = np.cumsum(information, axis=0)[:-1]
+    if gradient:
+        along = sum(following[key].T @ own for key, own in gradient.items())
+        before = before - known @ correlation @ along
     V = np.diagonal(known - known @ correlation @ known, axis1=1, axis2=2)
     own, total = np.diagonal(known, axis1=1, axis2=2), np.diag(information.sum(axis=0))
     share = own / np.maximum(total, np.finfo(float).tiny)

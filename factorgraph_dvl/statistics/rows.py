@@ -94,7 +94,7 @@ def _by_variable(rows: Rows) -> Iterator[tuple[IntArray, Array]]:
 def native_rows(problem: Problem, evaluation: Evaluation) -> Iterator[Rows]:
     """Yield the rows of the factors that GTSAM linearises itself, some of one source together."""
     yield from problem.chain_rows(evaluation)
-    gaussian = problem.native(evaluation, steps=False)
+    gaussian = problem.native(evaluation)
     sizes = evaluation.values.dims()
     names = {problem.key(p.name): p.name for p in problem.parameters}
     of_chain = ", ".join(p.name for p, _, _ in problem.chain.mean_constants(evaluation.states))

@@ -46,6 +46,9 @@ def spurious_information(problem: Problem, evaluation: Evaluation, nodes: Array)
     """
     root = problem.prior_root
     out = np.zeros((nodes.shape[0], len(root), len(root)))
+    if problem.chain.interpolates:
+        # The states are integrated out there, so that no estimate follows their errors.
+        return out
     for observation, attachment, motion, weight in zip(
         problem.observations,
         problem.attachments,

@@ -55,6 +55,7 @@ class SquareRootInformation:
         for tree in trees:
             self._cliques += reversed(_cliques_of(tree, sizes))
         self._cliques.reverse()
+        self._indices: dict[tuple[tuple[int, int], ...], Array] = {}
 
     @cached_property
     def _place(self) -> dict[int, int]:
@@ -231,7 +232,8 @@ class SquareRootInformation:
         for clique, place, P in self._joint():
             for key in clique.frontals:
                 if key in left:
-                    block = P[place[key], place[key]]
+                    own = slice(place[key], place[key] + self._sizes[key])
+                    block = P[own, own]
                     out[key] = 0.5 * (block + block.T)
         return out
 
@@ -246,14 +248,23 @@ class SquareRootInformation:
         out: list[Array] = [np.empty((0, 0))] * len(groups)
         for index, (_, place, P) in enumerate(self._joint()):
             for i in wanted.get(index, ()):
-                rows = np.concatenate([_range(place[key]) for key in groups[i]])
+                rows = self._components(place, groups[i])
                 out[i] = P[rows[:, None], rows]
         return out
 
-    def _joint(self) -> Iterator[tuple[_Clique, dict[int, slice], Array]]:
-        """Yield each clique, the places of its variables and their joint covariance."""
+    def _components(self, place: Mapping[int, int], keys_: tuple[int, ...]) -> Array:
+        """Return the components of variables among those of a clique: alike in most cliques."""
+        shape = tuple((place[key], self._sizes[key]) for key in keys_)
+        found = self._indices.get(shape)
+        if found is None:
+            found = np.concatenate([np.arange(start, start + size) for start, size in shape])
+            self._indices[shape] = found
+        return found
+
+    def _joint(self) -> Iterator[tuple[_Clique, dict[int, int], Array]]:
+        """Yield each clique, where its variables begin, and their joint covariance."""
         # Of cliques whose children are still to come.
-        joint: dict[int, tuple[dict[int, slice], Array]] = {}
+        joint: dict[int, tuple[dict[int, int], Array]] = {}
         children = [0] * len(self._cliques)
         for parent in self._parents:
             if parent >= 0:
@@ -267,7 +278,7 @@ class SquareRootInformation:
             P = np.empty((f + s, f + s))
             if s:
                 where, above = joint[parent]
-                rows = np.concatenate([_range(where[key]) for key in clique.separators])
+                rows = self._components(where, clique.separators)
                 P_SS = above[rows[:, None], rows]
                 P_FS = -gain @ P_SS
                 # An asymmetry would double from one clique to the next where biases walk far.
@@ -276,10 +287,10 @@ class SquareRootInformation:
                 P[:f, f:], P[f:, :f], P[f:, f:] = P_FS, P_FS.T, P_SS
             else:
                 P[:] = inverse @ inverse.T
-            place: dict[int, slice] = {}
+            place: dict[int, int] = {}
             row = 0
             for key in (*clique.frontals, *clique.separators):
-                place[key] = slice(row, row + self._sizes[key])
+                place[key] = row
                 row += self._sizes[key]
             if children[index]:
                 joint[index] = place, P
@@ -344,10 +355,6 @@ def _cliques_of(tree: gtsam.GaussianBayesTree, sizes: Mapping[int, int]) -> list
         out.append(_Clique(frontals, separators, R, T, d))
         stack += [clique[i] for i in range(clique.nrChildren())]
     return out
-
-
-def _range(s: slice) -> np.ndarray:
-    return np.arange(s.start, s.stop)
 
 
 def _solve(R: Array, rhs: Array, *, transposed: bool) -> Array:

@@ -20,3 +20,23 @@ def test_gtsams_optimiser_calibrates_as_solve_does(monkeypatch, capsys):
     apart = [float(x) for x in re.findall(r"differs by (\S+) σ", capsys.readouterr().out)]
     assert len(apart) == 3
     assert max(apart) < 0.01
+
+
+def test_the_graph_without_imu_is_printed_kind_by_kind(monkeypatch, capsys):
+    script = ROOT / "examples" / "graph_without_imu.py"
+    monkeypatch.chdir(ROOT)
+    runpy.run_path(str(script), run_name="__main__")
+    *lines, last = capsys.readouterr().out.splitlines()
+    kinds = {}
+    for line in lines:
+        count, keys, names = re.fullmatch(r" *(\d+) × ([^:]+): (.*)", line).groups()
+        kinds[names] = int(count), keys.split()
+    nodes, steps = kinds["state"][0], kinds["state, turn rates"]
+    assert nodes == 1
+    assert steps[0] > 100
+    assert steps[1] == ["x0", "w0", "x1", "w1"]
+    measured = {names: count for names, (count, _) in kinds.items() if "time_offset_s" in names}
+    assert sorted(measured.values())[-1] > 4 * sorted(measured.values())[0]
+    assert sum("misalignment_deg" in names for names in measured) >= 1
+    error, cost = (float(x) for x in re.findall(r"\d[\d.]*", last))
+    assert error > cost

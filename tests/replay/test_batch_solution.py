@@ -48,15 +48,17 @@ def test_a_few_rows_have_the_noise_of_the_record(ship, found):
 def test_densities_are_those_of_turns_where_the_vessel_turns(ship, found):
     _, batch = found
     record = AttitudeRecord(ship.attitude, ship.body_axes, estimated=False)
-    density = batch.density(record, np.array([20.0, 60.0]))
-    np.testing.assert_array_equal(density, [batch.on_legs, batch.in_turns])
-    assert np.any(batch.on_legs != batch.in_turns)
+    density = batch.density(record, np.array([20.0, 43.0, 65.0]))
+    np.testing.assert_array_equal(density, batch.densities[[0, 2, 1]])
+    assert np.any(batch.densities[0] != batch.densities[1])
 
 
 def test_before_the_first_turn_another_strength_is_assumed(ship):
     _, batch = solved(ship.until(35.0), 35.0)
-    np.testing.assert_array_equal(batch.in_turns[:3], batch.on_legs[:3])
-    assert np.all(batch.in_turns[3:] >= 1e-3)
+    leg, *others = batch.densities
+    for density in others:
+        np.testing.assert_array_equal(density[:3], leg[:3])
+        assert np.all(density[3:] >= 1e-3)
 
 
 def test_the_tilt_grows_with_time(found):

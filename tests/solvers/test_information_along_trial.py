@@ -8,20 +8,25 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from problems import SHORT, dense_covariance, problem_of, walking
-from truth import scenario
+from truth import config, scenario
 
 from factorgraph_dvl.analysis.information.manoeuvres import Segment
 from factorgraph_dvl.analysis.information.shares import information_shares
 from factorgraph_dvl.geometry.rotations import exp_so3, log_so3
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.graph import keys
+from factorgraph_dvl.graph.priors import Tilt
+from factorgraph_dvl.graph.problem import Problem
 from factorgraph_dvl.simulation import simulate
 from factorgraph_dvl.solvers.batch import solved_problems
 from factorgraph_dvl.solvers.information_along_trial import (
+    as_history,
     information_history,
     run_filter,
     solve_with_history,
 )
+from factorgraph_dvl.solvers.levenberg_marquardt import factorized
+from factorgraph_dvl.solvers.preparation_without_imu import prepare_without_imu
 from factorgraph_dvl.statistics.information_history import InformationHistory
 
 CALM = {"sway": {}, "current_m_s": [0.3, -0.1, 0]}
@@ -201,3 +206,56 @@ def test_a_trial_without_a_dvl_has_the_biases():
     assert len(history.names) == 6
     assert all("_bias_" in name for name in history.names)
     assert history.std[-1, history.names.index("accel_bias_z_ug")] < 50.0
+
+
+@pytest.fixture(scope="module", params=["ship", "ship-water"])
+def without_imu(request):
+    """A problem without IMU near its minimum, with a tilt, as linearised there."""
+    lines = [{"straight_s": 40}, {"turn_deg_s": 3, "duration_s": 30}, {"straight_s": 20}]
+    prepared = prepare_without_imu(simulate(config(request.param, manoeuvres=lines), 1))
+    chain = prepared.chain(prepared.states)
+    parameters = prepared.parameters
+    free = [p for p in parameters if p.estimated]
+    sigma = np.concatenate([1e-3 * p.sigma for p in free])
+    tilt = Tilt(1.0 / sigma, sigma, {p.name: prepared.values[p.name] for p in free})
+    problem = Problem(
+        chain,
+        prepared.observations,
+        parameters,
+        start=prepared.values,
+        processes=prepared.stated_processes(chain, prepared.states, prepared.values),
+        tilt=tilt,
+    )
+    values = problem.values(prepared.states, problem.prior_values() | prepared.values)
+    return problem, problem.weighed(problem.evaluate(values))
+
+
+def test_without_imu_it_ends_with_the_information_of_the_whole(without_imu):
+    problem, evaluation = without_imu
+    triangles, frontier = run_filter(problem, evaluation)
+    information, _ = factorized(problem, evaluation)
+    every = {
+        problem.key(name): np.eye(len(problem.prior_root))[:, own]
+        for name, own in problem.columns.items()
+    }
+    expected = information.covariance_of([every])
+    S = np.linalg.inv(triangles[-1])
+    std = np.sqrt(np.diag(expected))
+    assert np.abs((S @ S.T - expected) / np.outer(std, std)).max() < 1e-6
+    # A state and its rates, and the constants.
+    assert frontier.root.shape[0] == 12 + std.size
+
+
+def test_without_imu_it_begins_with_the_priors_and_grows(without_imu):
+    problem, evaluation = without_imu
+    triangles, _ = run_filter(problem, evaluation)
+    fixed = np.zeros((len(problem.prior_root), 0))
+    history = as_history(problem, evaluation, fixed, triangles, {})
+    np.testing.assert_allclose(history.time, problem.chain.node_time)
+    prior = {
+        name: sigma
+        for p in problem.parameters
+        for name, sigma in zip(p.component_names, p.sigma / p.si, strict=True)
+    }
+    np.testing.assert_allclose(history.std[0], [prior[name] for name in history.names], rtol=1e-6)
+    assert (np.diff(history.std, axis=0) / history.std[:-1]).max() < 1e-9

@@ -8,8 +8,9 @@ from functools import partial
 import msgspec
 import numpy as np
 import pytest
-from truth import TURNS_AND_BRAKING, merged, scenario
+from truth import TURNS_AND_BRAKING, config, merged, scenario
 
+from factorgraph_dvl.graph.problem import Problem
 from factorgraph_dvl.sensors.imu import ERRORS
 from factorgraph_dvl.sensors.records import rows_of
 from factorgraph_dvl.simulation import simulate
@@ -17,6 +18,7 @@ from factorgraph_dvl.solvers import state_ranges
 from factorgraph_dvl.solvers.batch import solved_problems
 from factorgraph_dvl.solvers.known_parameters import wide, with_scattered_noise
 from factorgraph_dvl.solvers.levenberg_marquardt import factorized
+from factorgraph_dvl.solvers.preparation_without_imu import prepare_without_imu
 from factorgraph_dvl.solvers.state_ranges import eliminated_by_ranges
 from factorgraph_dvl.statistics.constancy import by_interval
 from factorgraph_dvl.statistics.rows import rows_by_source, rows_with_times
@@ -94,3 +96,21 @@ def test_ranges_have_the_information_of_the_whole(solved, monkeypatch, longest):
     ]
     for one, other in zip(zip(*parts, strict=True), whole, strict=True):
         np.testing.assert_allclose(sum(one), other, rtol=1e-5, atol=1e-7 * np.abs(other).max())
+
+
+def test_ranges_of_a_chain_without_imu_have_the_information_of_the_whole(monkeypatch):
+    lines = [{"straight_s": 40}, {"turn_deg_s": 3, "duration_s": 30}, {"straight_s": 20}]
+    prepared = prepare_without_imu(simulate(config("ship", manoeuvres=lines), 1))
+    chain, values = prepared.chain(prepared.states), prepared.values
+    problem = Problem(chain, prepared.observations, prepared.parameters, start=values)
+    at = problem.values(prepared.states, problem.prior_values() | values)
+    evaluation = problem.weighed(problem.evaluate(at))
+    part = partial(with_scattered_noise, problem, evaluation, problem.all_parameters)
+    whole = eliminated_by_ranges(part, chain)
+    monkeypatch.setattr(state_ranges, "_LONGEST", 20)
+    ranges = eliminated_by_ranges(part, chain)
+    assert len(ranges.blocks) > 3
+    size = len(problem.prior_root)
+    every = {key: np.eye(size)[:, problem.columns[name]] for name, key in ranges.names.items()}
+    found, expected = (each.information.covariance_of([every]) for each in (ranges, whole))
+    np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-9 * np.abs(expected).max())

@@ -22,9 +22,11 @@ TIME = np.arange(400.0)
 DESIGN = np.stack([np.ones(400), np.random.default_rng(5).normal(size=400)], axis=1)
 
 
-def fitted(data):
-    """Return the tests of a least-squares fit of DESIGN to data with unit noise."""
+def fitted(data, gradient=None):
+    """Return the tests of a fit of DESIGN to data with unit noise, with a gradient beside it."""
     x = np.linalg.lstsq(DESIGN, data, rcond=None)[0]
+    if gradient is not None:
+        x = x - np.linalg.solve(DESIGN.T @ DESIGN, gradient)
     graph = gtsam.GaussianFactorGraph()
     graph.add(1, DESIGN, data - DESIGN @ x, gtsam.noiseModel.Unit.Create(400))
     ordering = gtsam.Ordering()
@@ -39,6 +41,7 @@ def fitted(data):
         information.covariance_with([functional]),
         information.covariance_of([functional]),
         (0.0, 399.0),
+        None if gradient is None else {1: gradient},
     )
 
 
@@ -63,6 +66,15 @@ def test_the_test_is_the_fall_of_the_cost(component):
     assert fall / 1.7 < test.chi2 <= fall * (1.0 + 1e-9)
     assert test.size == pytest.approx(size, rel=1e-9)
     assert (test.size / test.std) ** 2 == pytest.approx(fall, rel=1e-9)
+
+
+def test_a_gradient_that_no_row_has_makes_no_change():
+    data = np.random.default_rng(4).normal(size=400)
+    with_gradient = fitted(data, np.array([80.0, -60.0]))
+    for one, other in zip(with_gradient, fitted(data), strict=True):
+        assert one.time == other.time
+        assert one.chi2 == pytest.approx(other.chi2, rel=1e-9)
+        assert one.size == pytest.approx(other.size, rel=1e-9)
 
 
 def test_a_drift_is_the_largest_fall_although_it_scatters_most():

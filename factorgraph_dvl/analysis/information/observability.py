@@ -138,8 +138,8 @@ def observability(
         varying = set(view.names if view is not None else ()) - set(history.names)
         if varying:
             missing.append(
-                f"σ along the trial of {', '.join(sorted(varying))}: a random-walk bias is not "
-                "constant"
+                f"σ along the trial of {', '.join(sorted(varying))}: what varies along the trial "
+                "is no constant"
             )
     return Observability(
         name=solution.trial,

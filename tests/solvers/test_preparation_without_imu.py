@@ -6,25 +6,33 @@ import importlib
 import os
 from dataclasses import replace
 
+import gtsam
 import msgspec
 import numpy as np
 import pytest
 from monte_carlo import rms_band
-from truth import CONFIGS, SCHULER, with_ins
+from truth import CONFIGS, SCHULER, config, with_ins
 
 from factorgraph_dvl.analysis.error_statistics import calibration_errors
 from factorgraph_dvl.errors import ConfigError, FactorgraphDvlError
 from factorgraph_dvl.geometry.rotations import exp_so3, log_so3
 from factorgraph_dvl.geometry.units import DEG
-from factorgraph_dvl.graph.priors import after_step
 from factorgraph_dvl.io.trial_folder import load_trial, save_trial
 from factorgraph_dvl.sensors.finding import Code
 from factorgraph_dvl.simulation import load_scenario, simulate
-from factorgraph_dvl.solvers.batch import solve
-from factorgraph_dvl.solvers.motion_preparation import prepare_motion
+from factorgraph_dvl.solvers.batch import solve, solve_with_problem
+from factorgraph_dvl.solvers.known_parameters import wide, with_scattered_noise
+from factorgraph_dvl.solvers.preparation_without_imu import prepare_without_imu
 
 RUNS = int(os.environ.get("FACTORGRAPH_DVL_SEEDS", "20"))
 MOUNTING = ("misalignment_deg", "scale_error", "lever_arm_m")
+# Longer trials have too many digits for the Cholesky factorisation of GTSAM's `Marginals`.
+TURNS = [
+    {"straight_s": 20},
+    {"turn_deg_s": 4, "duration_s": 30, "ramp_s": 2},
+    {"straight_s": 15},
+    {"turn_deg_s": -4, "duration_s": 25, "ramp_s": 2},
+]
 
 
 def shortened(name="ship", repeat=1, **changes):
@@ -40,15 +48,20 @@ def ship():
 
 
 @pytest.fixture(scope="module")
-def solution(ship):
-    return solve(ship, rate_hz=1.0)
+def solved(ship):
+    return solve_with_problem(ship, rate_hz=1.0)
+
+
+@pytest.fixture(scope="module")
+def solution(solved):
+    return solved[0]
 
 
 def test_a_scale_that_walks_is_named_as_left_out(ship):
     settings = msgspec.structs.replace(ship.dvl.settings, scale_walk_std_sqrt_h=0.001)
     walking = replace(ship, dvl=replace(ship.dvl, settings=settings))
     for each, count in ((ship, 0), (walking, 1)):
-        found = prepare_motion(each).findings
+        found = prepare_without_imu(each).findings
         assert sum(f.code == Code.ERROR_LEFT_OUT for f in found) == count
 
 
@@ -65,6 +78,25 @@ def test_a_ship_with_compass_gnss_and_adcp_is_calibrated(ship, solution):
         assert np.all(np.abs(z) < 4.0), name
     assert solution.estimate("misalignment_deg").std[2] < 0.35
     assert solution.estimate("scale_error").std[0] < 0.002
+    assert not [f for f in solution.findings if f.severity != "note"]
+
+
+def test_the_motion_is_that_of_the_ship(ship, solution):
+    trajectory, true = solution.trajectory, ship.reference
+    rows = np.searchsorted(true.time, trajectory.time - 1e-6)
+    np.testing.assert_allclose(true.time[rows], trajectory.time, atol=1e-6)
+    frame = ship.frame()
+    off = frame.position(*trajectory.geodetic.T) - frame.position(*true.geodetic[rows].T)
+    turned = trajectory.rph - true.rph[rows]
+    turned = np.angle(np.exp(1j * turned))
+    for error, covariance, largest in (
+        (off, trajectory.position_cov, 2.5),
+        (trajectory.velocity - true.velocity[rows], trajectory.velocity_cov, 2.0),
+        (turned, trajectory.rph_cov, 2.0),
+    ):
+        std = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+        ratio = np.sqrt(np.mean((error / std) ** 2, axis=0))
+        assert np.all(ratio < largest)
 
 
 def test_a_gross_error_turns_no_mounting(ship):
@@ -77,7 +109,7 @@ def test_a_gross_error_turns_no_mounting(ship):
         gnss=replace(short.gnss, geodetic=fixes),
         dvl=replace(short.dvl, velocity=velocity),
     )
-    a, b = (prepare_motion(each).values for each in (short, wrong))
+    a, b = (prepare_without_imu(each).values for each in (short, wrong))
     turned = a["misalignment_deg"] @ b["misalignment_deg"].T
     assert np.trace(turned) > 1.0 + 2.0 * np.cos(10.0 * DEG)
     assert abs(a["time_offset_s"][0] - b["time_offset_s"][0]) < 0.5
@@ -96,6 +128,20 @@ def test_clocks_agree_with_each_other(ship, solution):
 def test_causes_add_up_to_the_variances(solution):
     total = np.sum([c.adds**2 for c in solution.error_budget], axis=0)
     np.testing.assert_allclose(total, np.diag(solution.covariance), rtol=1e-6)
+
+
+def test_no_cause_is_the_slope_of_the_objective(solved):
+    solution, found = solved
+    priors = {c.cause for c in solution.error_budget if c.cause.startswith("prior of ")}
+    own = {f"prior of {p.name}" for p in found.problem.parameters}
+    assert found.problem.tilt is not None
+    assert priors == own | {"prior of the first state"}
+    causes = {c.cause for c in solution.error_budget} - priors
+    assert causes == {
+        "acceleration between states",
+        *(f"noise of {o.label}" for o in found.problem.observations),
+        *(f"lasting errors of {label}" for label in ("GNSS position", "Attitude")),
+    }
 
 
 def test_the_phase_is_known_better_relative_to_the_compass(solution):
@@ -124,6 +170,10 @@ def ins_scenario(repeat=1):
     return with_ins(shortened(repeat=repeat), SCHULER)
 
 
+@pytest.mark.xfail(
+    strict=True,
+    reason="states interpolate between samples once a second: the clock of the DVL follows noise",
+)
 def test_an_ins_alone_is_enough():
     trial = simulate(ins_scenario(), 3)
     solution = solve(trial, rate_hz=1.0)
@@ -131,6 +181,101 @@ def test_an_ins_alone_is_enough():
     assert "ins_time_offset_s" not in solution.order
     for name, z in deviations(solution, trial.calibration_truth).items():
         assert np.all(np.abs(z) < 4.0), name
+    offset = solution.estimate("time_offset_s")
+    assert abs(offset.value[0]) < 4.0 * offset.std[0]
+
+
+@pytest.fixture(scope="module")
+def short():
+    return solve_with_problem(simulate(config("ship", manoeuvres=TURNS), 1), rate_hz=1.0)
+
+
+def exported(problem, best):
+    """Return the graph for GTSAM's own optimisers, and values away from the minimum."""
+    graph, _ = problem.nonlinear_graph()
+    steps = gtsam.VectorValues()
+    for key, size in best.dims().items():
+        steps.insert(key, np.full(size, 1e-4))
+    return graph, best.retract(steps)
+
+
+def assert_same(solution, problem, best, found, covariance_of):
+    """Assert that a minimum of GTSAM's is that of `solve`, and so are the deviations."""
+    for p in problem.parameters:
+        key = problem.key(p.name)
+        theirs = np.sqrt(np.diag(covariance_of(key)))
+        if p.rotation:
+            off = gtsam.Rot3.Logmap(best.atRot3(key).between(found.atRot3(key)))
+        else:
+            off = found.atVector(key) - best.atVector(key)
+            if p.name in {e.name for e in solution.estimates}:
+                std = solution.estimate(p.name).std * p.si
+                np.testing.assert_allclose(theirs, std, rtol=0.01)
+        assert np.abs(off / theirs).max() < 0.01, p.name
+
+
+def test_gtsams_own_optimiser_and_marginals_agree(short):
+    solution, solved = short
+    assert solution.converged
+    problem, evaluation = solved.problem, solved.minimum.evaluation
+    assert np.abs(problem.tilt.gradient).max() > 0.0
+    graph, start = exported(problem, evaluation.values)
+    parameters = gtsam.LevenbergMarquardtParams()
+    parameters.setLinearSolverType("MULTIFRONTAL_QR")
+    parameters.setRelativeErrorTol(1e-12)
+    found = gtsam.LevenbergMarquardtOptimizer(graph, start, parameters).optimize()
+    marginals = gtsam.Marginals(graph, found)
+    assert_same(solution, problem, evaluation.values, found, marginals.marginalCovariance)
+
+
+def test_isam2_agrees(short):
+    solution, solved = short
+    problem, evaluation = solved.problem, solved.minimum.evaluation
+    graph, start = exported(problem, evaluation.values)
+    parameters = gtsam.ISAM2Params()
+    parameters.setFactorization("QR")
+    parameters.setRelinearizeThreshold(1e-6)
+    parameters.relinearizeSkip = 1
+    isam = gtsam.ISAM2(parameters)
+    isam.update(graph, start)
+    for _ in range(6):
+        isam.update()
+    found = isam.calculateEstimate()
+    assert_same(solution, problem, evaluation.values, found, isam.marginalCovariance)
+
+
+def test_the_error_of_the_graph_is_the_cost_but_for_a_constant(short):
+    _, solved = short
+    problem, at = solved.problem, solved.minimum.evaluation.values
+    graph, _ = problem.nonlinear_graph()
+    rng = np.random.default_rng(1)
+    off = []
+    for scale in (0.0, 1e-5, 1e-4):
+        step = gtsam.VectorValues()
+        for key, size in at.dims().items():
+            step.insert(key, scale * rng.normal(size=size))
+        there = at.retract(step)
+        off.append(graph.error(there) - problem.evaluate(there).cost)
+    assert off[0] == pytest.approx(problem.tilt.constant)
+    np.testing.assert_allclose(off, off[0], rtol=1e-10)
+
+
+def test_problems_of_tests_have_the_slope_of_the_objective(short):
+    _, solved = short
+    problem, evaluation = solved.problem, solved.minimum.evaluation
+    free = [wide(p, p.mean) if p.name == "gnss_lever_arm_m" else p for p in problem.all_parameters]
+    test, at = with_scattered_noise(problem, evaluation, free)
+    assert "gnss_lever_arm_m" in test.columns
+    for name, own in test.columns.items():
+        expected = problem.tilt.gradient[problem.columns[name]] if name in problem.columns else 0.0
+        np.testing.assert_array_equal(test.tilt.gradient[own], expected)
+    with_slope = test.linearize(at).gradientAtZero()
+    test.tilt = None
+    without = test.linearize(at).gradientAtZero()
+    for name, own in problem.columns.items():
+        found = with_slope.at(test.key(name)) - without.at(test.key(name))
+        # In the tangent space at the minimum, not at the origin of the slope.
+        np.testing.assert_allclose(found, problem.tilt.gradient[own], rtol=5e-3, atol=1e-6)
 
 
 def ratio(scenario, runs):
@@ -166,116 +311,44 @@ def test_noise_of_a_compass_makes_no_lever_arm_shorter():
     assert np.all(np.abs(np.mean(off, axis=0)) < 4.0 / np.sqrt(RUNS))
 
 
+@pytest.mark.slow
+@pytest.mark.xfail(reason="as of an INS alone")
 def test_white_noise_of_an_ins_moves_no_clock():
     trial = simulate(ins_scenario(repeat=2), 0)
     offset = solve(trial, rate_hz=0.1).estimate("time_offset_s")
     assert abs(offset.value[0]) < 4.0 * offset.std[0]
 
 
-def variances_of_motion(prepared, label, late):
-    problem = prepared.problem
-    values = problem.prior_values() | prepared.values | {"time_offset_s": np.array([late])}
-    (at,) = (i for i, o in enumerate(problem.observations) if o.label == label)
-    return problem.evaluate(prepared.states, values).seen[at].interpolation.motion_variance
-
-
-def test_pings_stay_between_nodes_wherever_their_clock_moves(ship):
-    prepared = prepare_motion(ship)
-    first, later = (variances_of_motion(prepared, "DVL velocity", late) for late in (0.0, 0.3))
-    np.testing.assert_allclose(first, later, rtol=1e-6)
-
-
-def test_an_ins_is_at_nodes_in_turns():
-    prepared = prepare_motion(simulate(ins_scenario(), 3))
-    variances = variances_of_motion(prepared, "INS velocity", 0.3)[:, 1, 1, 0]
-    assert np.sum(variances < 1e-9) > prepared.turning.sum() > 100
-
-
-def test_the_variance_of_the_motion_has_its_derivative(ship):
-    chain = prepare_motion(ship).problem.chain
-    span = np.diff(chain.time)
-    time = chain.time[:-1] + np.linspace(0.05, 0.95, span.size) * span
-    step = 1e-4 * span
-    every = np.broadcast_to(np.eye(chain.size), (time.size, chain.size, chain.size))
-    low, high = (chain.at(time + change).variance(every) for change in (-step, step))
-    slope = ((high - low) / (2.0 * step[:, None, None]))[:, :6, :6]
-    rate = chain.at(time).variance_rate(every)[:, :6, :6]
-    np.testing.assert_allclose(rate, slope, atol=1e-6 * np.abs(slope).max())
-
-
-def test_derivatives_by_clocks_are_those_of_residuals(ship):
-    problem = (prepared := prepare_motion(ship)).problem
-    values = problem.prior_values() | prepared.values
-    step = 1e-4
-    for name in ("time_offset_s", "attitude_time_offset_s"):
-        low, high = (
-            problem.evaluate(prepared.states, values | {name: values[name] + change}).seen
-            for change in (-step, step)
-        )
-        now = problem.evaluate(prepared.states, values).seen
-        for a, seen, b in zip(low, now, high, strict=True):
-            inside = a.covered & seen.covered & b.covered
-            inside &= a.interpolation.node == b.interpolation.node
-            slope = (b.residual - a.residual)[inside] / (2.0 * step)
-            found = seen.by_parameters[inside][:, :, problem.columns[name].start]
-            # The squares of rates in waves are left out.
-            np.testing.assert_allclose(found, slope, atol=0.01)
-
-
-def scale_error_with(prepared, strength, *, follows):
-    """Return the scale error, and its standard deviation, of another density of acceleration."""
-    problem = prepared.problem
-    chain = replace(problem.chain, density=strength * problem.chain.density)
-    problem = problem.with_chain(chain)
-    states, values = prepared.states, problem.prior_values() | prepared.values
-    problem.weighed(states, values)
-    for _ in range(6):
-        evaluation = problem.evaluate(states, values)
-        factors = problem.equations(evaluation).factorise()
-        if follows:
-            problem.follow_motion(evaluation, factors, factors.covariances())
-        nodes, constants = problem.equations(evaluation).factorise().step()
-        states = states + nodes
-        values = after_step(problem.parameters, values, constants)
-    column = problem.columns["scale_error"]
-    return values["scale_error"][0], np.sqrt(factors.constants[column, column][0, 0])
-
-
-def test_a_scale_error_does_not_make_up_for_a_prior_that_is_too_smooth():
-    prepared = prepare_motion(simulate(shortened(), 1))
-    (smooth, std), (rough, _) = (
-        scale_error_with(prepared, strength, follows=False) for strength in (0.03, 10.0)
-    )
-    before = smooth - rough
-    assert before > 1.5 * std
-    (smooth, _), (rough, _) = (
-        scale_error_with(prepared, strength, follows=True) for strength in (0.03, 10.0)
-    )
-    assert abs(smooth - rough) < 0.3 * before
-
-
-def test_a_current_adds_what_is_unknown_of_its_share_in_the_motion():
-    solution = solve(simulate(shortened("ship-water"), 1), rate_hz=0.1)
-    (cause,) = (c for c in solution.error_budget if "carries the vessel" in c.cause)
-    at = solution.order.index("scale_error")
-    # A fast ship owes little to it.
-    assert 0.0 < cause.adds[at] < 0.5 * np.sqrt(solution.covariance[at, at])
+def test_the_current_is_its_mean_over_the_trial():
+    trial = simulate(shortened("ship-water"), 2)
+    solution, solved = solve_with_problem(trial, rate_hz=0.1)
+    # Before, it came out as 2 m/s that change within a minute, and no round settled.
+    assert solution.converged
+    assert abs(solution.estimate("scale_error").value[0]) < 0.05
+    current = solution.estimate("current_m_s")
+    off = current.value - trial.calibration_truth["current_m_s"]
+    assert np.all(np.abs(off) < 4.0 * current.std)
+    # What it is over much longer times is known much worse.
+    (process,) = (p for p in solved.problem.processes if p.parameter == "current_m_s")
+    assert np.all(current.std < 0.1 * process.sigma)
+    causes = {c.cause for c in solution.error_budget}
+    assert "changes of the current" in causes
     total = np.sum([c.adds**2 for c in solution.error_budget], axis=0)
     np.testing.assert_allclose(total, np.diag(solution.covariance), rtol=1e-6)
 
 
 def test_a_current_that_changes_for_hours_moves_no_clock_of_the_start():
     trial = simulate(load_scenario(CONFIGS / "ship-water.yaml"), 1)
-    start = prepare_motion(trial).values
+    start = prepare_without_imu(trial).values
     for name in ("time_offset_s", "attitude_time_offset_s"):
         assert abs(start[name][0]) < 0.5, name
     truth = exp_so3(trial.calibration_truth["misalignment_deg"] * DEG)
     assert np.linalg.norm(log_so3(start["misalignment_deg"] @ truth.T)) < 5.0 * DEG
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [1, 2])
 def test_no_slope_of_the_cost_makes_a_current_stronger(seed):
-    # With it, the current came out as 2 m/s that change within a minute, and no round settled.
     solution = solve(simulate(shortened("ship-water", repeat=2), seed), rate_hz=0.1)
     assert solution.converged
     assert abs(solution.estimate("scale_error").value[0]) < 0.05

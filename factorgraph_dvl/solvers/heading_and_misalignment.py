@@ -1,0 +1,81 @@
+"""The misalignment about the vertical, with the error of the heading and without it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from factorgraph_dvl.geometry.rotations import frd_from_body
+from factorgraph_dvl.geometry.units import DEG
+from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.graph.problem import Problem
+from factorgraph_dvl.graph.processes import Process
+from factorgraph_dvl.sensors.attitude import HEADING_OFFSET, Attitude, heading_error
+from factorgraph_dvl.sensors.finding import Code, Finding
+from factorgraph_dvl.sensors.ins import Ins
+from factorgraph_dvl.sensors.message import message
+from factorgraph_dvl.solvers.fixed_directions import SolvedProblem
+from factorgraph_dvl.solvers.reported import in_unit
+from factorgraph_dvl.trial import Trial
+
+_MISALIGNMENT = "misalignment_deg"
+# Component of an attitude that is the heading.
+_HEADING = 2
+
+
+def heading_and_misalignment(trial: Trial, found: SolvedProblem) -> Iterator[Finding]:
+    """Say how well the misalignment is known relative to the mean of the compass.
+
+    A heading that is too large by e looks like a misalignment by e about the vertical: without an
+    IMU data show their sum, with the mean of e over the trial.
+    """
+    problem, sensor = found.problem, trial.attitude
+    parameters = {p.name: p for p in problem.parameters}
+    if trial.imu is not None or sensor is None or _MISALIGNMENT not in parameters:
+        return
+    lasting = _lasting(problem)
+    if lasting is None and HEADING_OFFSET not in parameters:
+        return
+    values = found.minimum.evaluation.parameters
+    mean, by_error = _mean_error(problem, lasting, values, sensor)
+    down = frd_from_body(trial.body_axes)[2]
+    alone = {problem.key(_MISALIGNMENT): down[None]}
+    P = found.covariances.information.covariance_of([alone, alone | by_error])
+    std, relative_std = np.sqrt(np.diag(P)) / DEG
+    angle = -float(down @ in_unit(parameters[_MISALIGNMENT], values[_MISALIGNMENT]).value)
+    text = message(
+        "heading_error.about_the_vertical",
+        angle=angle,
+        std=float(std),
+        relative=angle - mean / DEG,
+        relative_std=float(relative_std),
+    )
+    yield Finding(Code.HEADING_ERROR, text, parameter=_MISALIGNMENT)
+
+
+def _lasting(problem: Problem) -> Process | None:
+    """Return the error of the attitude that persists, None if there is none."""
+    of_attitude = {o.label for o in problem.observations if "heading" in o.components}
+    for process in problem.processes:
+        if process.label in of_attitude and process.sigma[_HEADING] > 0.0:
+            return process
+    return None
+
+
+def _mean_error(
+    problem: Problem, lasting: Process | None, values: dict[str, Array], sensor: Attitude | Ins
+) -> tuple[float, dict[int, Array]]:
+    """Return the mean error of the heading, rad, and its derivatives (1, n) by key."""
+    measured = ~np.isnan(sensor.rph[:, _HEADING])
+    time = sensor.time[measured]
+    stated, by = heading_error(time, sensor.rph[measured, _HEADING], values, 0.0)
+    weight = np.gradient(time)
+    weight /= weight.sum()
+    mean = float(weight @ stated)
+    out = {problem.key(n): (weight @ each)[None] for n, each in by.items() if n in problem.columns}
+    if lasting is not None:
+        error, by_node = lasting.mean(values[lasting.name])
+        mean += float(error[_HEADING])
+        out |= {key: each[[_HEADING]] for key, each in by_node.items()}
+    return mean, out
