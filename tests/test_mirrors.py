@@ -28,7 +28,6 @@ ELSEWHERE = {
     "geometry/celestial": "sensors/test_star.py",
     "geometry/records": "graph/test_problem.py",
     "geometry/units": "settings/test_ranges.py",
-    "graph/bordered_chain": "graph/test_motion_chain.py",
     "graph/bound_observation": "graph/test_problem.py",
     "graph/chain": "graph/test_smooth_chain.py",
     "graph/clocks": "solvers/test_clocks.py",

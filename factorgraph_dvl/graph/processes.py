@@ -8,7 +8,7 @@ that walks is one more component of the nodes, with a correlation time of severa
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import gtsam
@@ -57,6 +57,8 @@ class Process:
         Name of the parameter that it adds to, for all observations that depend on it.
     free : bool, default False
         Whether its deviation and time are to be estimated although it is of no observation.
+    goes_on : bool, default False
+        Whether nodes before it are gone, so that its first node has no prior of its own.
     """
 
     label: str
@@ -68,6 +70,22 @@ class Process:
     walk: ScaleWalk | None = None
     parameter: str | None = None
     free: bool = False
+    goes_on: bool = False
+
+    def going_on(self, time: Array, walk: ScaleWalk | None) -> Process:
+        """Return it at other nodes, of which the first was among its own.
+
+        Parameters
+        ----------
+        time : ndarray, shape (J,), s
+            Times of the nodes.
+        walk : ScaleWalk, optional
+            Of the scale, with what is measured there.
+        """
+        out = replace(self, time=time, walk=walk, goes_on=True)
+        # A walk's go by the length of the whole record.
+        vars(out)["_of_nodes"] = self._of_nodes
+        return out
 
     @cached_property
     def _of_nodes(self) -> tuple[Array, Array]:
@@ -195,14 +213,16 @@ class Process:
         """Return whitened residuals (J, size): the first node, then the transitions."""
         phi = np.exp(-np.diff(self.time)[:, None] / self._of_nodes[1])
         steps = (nodes[1:] - phi * nodes[:-1]) * self._weight
-        return np.concatenate([nodes[:1], steps])
+        first = np.zeros_like(nodes[:1]) if self.goes_on else nodes[:1]
+        return np.concatenate([first, steps])
 
     def add_prior(self, gaussian: gtsam.GaussianFactorGraph, nodes: Array) -> None:
         """Add the factors of `prior_residuals`, which are linear."""
         n = self.size
         residuals = self.prior_residuals(nodes)
         unit = gtsam.noiseModel.Unit.Create(n)
-        gaussian.add(self.key(0), np.eye(n), -residuals[0], unit)
+        if not self.goes_on:
+            gaussian.add(self.key(0), np.eye(n), -residuals[0], unit)
         phi = np.exp(-np.diff(self.time)[:, None] / self._of_nodes[1])
         after = self._weight
         for j in range(len(phi)):

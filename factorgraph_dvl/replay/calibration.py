@@ -39,20 +39,22 @@ class CalibrationReport:
     ----------
     parameters : sequence of Parameter
         All parameters, those that are not estimated included.
-    gyro, accel : Parameter
-        Gyro bias and accelerometer bias.
+    *biases : Parameter
+        Gyro bias and accelerometer bias, of a trial with an IMU.
     """
 
-    def __init__(self, parameters: Sequence[Parameter], gyro: Parameter, accel: Parameter) -> None:
+    def __init__(self, parameters: Sequence[Parameter], *biases: Parameter) -> None:
         self._free = [p for p in parameters if p.estimated]
-        rows = in_order([gyro, accel, *parameters], lambda p: p)
+        rows = in_order([*biases, *parameters], lambda p: p)
         self._parameters = tuple(rows)
-        place, columns = places(rows), places([accel, gyro, *self._free])
-        self._biases = accel.name, gyro.name
-        size = sum(p.mean.size for p in rows)
+        # GTSAM has that of the accelerometer first.
+        self._biases = biases[::-1]
+        columns = places([*self._biases, *self._free])
+        place, size = places(rows), sum(p.mean.size for p in rows)
         self._values = np.empty(size)
         # Of all components by the tangent space of those that are estimated; rotations come later.
-        self._derivative = np.zeros((size, sum(p.mean.size for p in [accel, gyro, *self._free])))
+        free = sum(p.mean.size for p in [*self._biases, *self._free])
+        self._derivative = np.zeros((size, free))
         self._varying: list[tuple[Parameter, slice, slice]] = []
         for p in rows:
             own = place[p.name]
@@ -72,9 +74,9 @@ class CalibrationReport:
         ----------
         values : mapping of str to ndarray
             Values of the parameters, SI; rotations as matrices.
-        bias : ndarray, shape (6,)
+        bias : ndarray, shape (6,) or (0,)
             Accelerometer bias and gyro bias, SI.
-        P : ndarray, shape (6 + n, 6 + n)
+        P : ndarray, shape (6 + n, 6 + n) or (n, n)
             Joint covariance of accelerometer bias, gyro bias and the estimated parameters, in
             GTSAM's tangent space, SI.
         undetermined : ndarray, shape (n, h)
@@ -88,8 +90,9 @@ class CalibrationReport:
         """
         if undetermined.size:
             values, P = _at_prior(self._free, values, P, undetermined)
-        accel, gyro = self._biases
-        values = {**values, accel: bias[:3], gyro: bias[3:]}
+        values = {**values}
+        for name, own in places(self._biases).items():
+            values[name] = bias[own]
         found, derivative = self._values.copy(), self._derivative.copy()
         for p, own, columns in self._varying:
             if p.spec.kind == "vector":

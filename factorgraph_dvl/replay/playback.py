@@ -13,10 +13,10 @@ from factorgraph_dvl.imu.timestamps import without_strays
 from factorgraph_dvl.quality.earlier_calibration import prior_findings
 from factorgraph_dvl.quality.refusal import accepted_errors, explained
 from factorgraph_dvl.quality.survey import survey
-from factorgraph_dvl.replay.motion_session import MOST_UPDATES_HZ, MotionReplay
 from factorgraph_dvl.replay.record import Recorder, ReplayRecord
 from factorgraph_dvl.replay.samples import LEAST
 from factorgraph_dvl.replay.session import LAG, RATE, Kind, Replay
+from factorgraph_dvl.replay.session_without_imu import MOST_UPDATES_HZ, ReplayWithoutImu
 from factorgraph_dvl.replay.update import Update
 from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.sensors.message import message
@@ -142,7 +142,7 @@ def _played_without_imu(
         raise ConfigError(
             f"smoother is {smoother!r}, which needs an IMU", expected="fixed-lag, without an IMU"
         )
-    run = MotionReplay(trial, lag_s, progress or (lambda stage, iteration, cost: None))
+    run = ReplayWithoutImu(trial, lag_s, progress or (lambda stage, iteration, cost: None))
     recorder = Recorder()
     time = trial.body_sensor.time
     end = float(max(aid.time[-1] for aid in trial.aids))
@@ -167,13 +167,13 @@ def _take(recorder: Recorder, update: Update, watch: Watch | None) -> None:
         watch(update)
 
 
-def _never_started(trial: Trial, run: Replay | MotionReplay) -> SolveError:
+def _never_started(trial: Trial, run: Replay | ReplayWithoutImu) -> SolveError:
     why = "; ".join(map(str, run.findings)) or "the record is too short"
     return SolveError(f"the data were never sufficient to start: {why}", where=trial.name)
 
 
 def _solution(
-    trial: Trial, run: Replay | MotionReplay, recorder: Recorder, last: Update
+    trial: Trial, run: Replay | ReplayWithoutImu, recorder: Recorder, last: Update
 ) -> Solution:
     calibration = last.calibration
     residuals = recorder.residuals()

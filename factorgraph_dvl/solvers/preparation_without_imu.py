@@ -43,12 +43,12 @@ CURRENT = "current"
 _NEED_IMU = frozenset({"star", "turntable", "beacons"})
 # Turn rate, averaged over seconds, from which on a vessel turns. Chosen: above yaw in a seaway.
 _TURNING = 0.4 * DEG
-_TURN_SPAN = 10.0
+TURN_SPAN = 10.0
 # Span, s, over which the heading of the track is averaged, and interval of its samples. Chosen:
 # waves that move a ship are shorter, its turns longer.
-_WAVES, _GRID = 20.0, 0.5
+WAVES, _GRID = 20.0, 0.5
 # Longest time between nodes, s, and most nodes. Chosen: waves that move a ship are resolved.
-_LONGEST = 1.5
+LONGEST = 1.5
 _MOST_NODES = 60_000
 # Longest spans, s, over which positions make a velocity, over ground and through water. Chosen:
 # below the time in which a ship turns; through water noise makes wrong clocks more likely.
@@ -142,7 +142,7 @@ class PreparationWithoutImu:
         chain, values = found.chain, minimum.evaluation.parameters
         lag = 0.0 if chain.clock is None else float(values[chain.clock][0])
         late = float(values[self.record.sensor.clock.offset.name][0])
-        axes = _track_axes(self.record, chain.frame, self.states, chain.node_time - lag, late)
+        axes = track_axes(self.record, chain.frame, self.states, chain.node_time - lag, late)
         return replace(found, chain=replace(chain, nRt=axes))
 
     def start(self, chain: Chain, states: SmoothStates, report: Progress) -> MountedStart:
@@ -181,18 +181,18 @@ def prepare_without_imu(trial: Trial) -> PreparationWithoutImu:
     parameters = _parameters(trial)
     values = {p.name: prior_mean(p) for p in parameters}
     values |= _start_values(trial, record, track, frame, parameters)
-    clock = _clock(trial, frame)
+    clock = node_clock(trial, frame)
     late = float(values[record.sensor.clock.offset.name][0])
     lag = float(values[clock][0])
     nodes = _nodes(trial, record, track, late=late, lag=lag)
-    phase = _phases(record, 0.5 * (nodes[1:] + nodes[:-1]) + late - lag)
+    phase = phases(record, 0.5 * (nodes[1:] + nodes[:-1]) + late - lag)
     states = _states(record, track, frame, nodes - lag, late)
     chain = SmoothChain(
         frame=frame,
         node_time=nodes,
         density=_densities(trial, record, values, states, nodes, phase, late),
         start=states,
-        nRt=_track_axes(record, frame, states, nodes - lag, late),
+        nRt=track_axes(record, frame, states, nodes - lag, late),
         clock=clock if any(p.name == clock and p.estimated for p in parameters) else None,
         attitude_clock=record.sensor.clock.offset.name,
         first_shift=late - lag,
@@ -200,7 +200,9 @@ def prepare_without_imu(trial: Trial) -> PreparationWithoutImu:
     )
     if chain.clock is None:
         chain = replace(chain, node_time=nodes - lag, first_shift=late)
-    by_aid = [(aid, _observations(aid, frame, trial.body_axes, trial)) for aid in trial.aids]
+    by_aid = [
+        (aid, lasting_observations(aid, frame, trial.body_axes, trial)) for aid in trial.aids
+    ]
     return PreparationWithoutImu(
         trial=trial,
         first_chain=chain,
@@ -222,7 +224,7 @@ def prepare_without_imu(trial: Trial) -> PreparationWithoutImu:
     )
 
 
-def _observations(
+def lasting_observations(
     aid: Aid, frame: LocalFrame, body_axes: BodyAxes, trial: Trial
 ) -> tuple[Observation, ...]:
     """Return all that a sensor measured: errors that last are processes here."""
@@ -269,13 +271,13 @@ def _states(
     return SmoothStates(body.nRb, p_n, v_n, body.omega_eb_b)
 
 
-def _track_axes(
+def track_axes(
     record: AttitudeRecord, frame: LocalFrame, states: SmoothStates, time: Array, late: float
 ) -> Array:
     """Return level axes that turn with the heading averaged over waves, at true times (K,)."""
-    grid = np.arange(time[0] - _WAVES, time[-1] + _WAVES + _GRID, _GRID)
+    grid = np.arange(time[0] - WAVES, time[-1] + WAVES + _GRID, _GRID)
     heading = record.rph_at(grid + late)[:, 2]
-    width = 2 * round(0.25 * _WAVES / _GRID) + 1
+    width = 2 * round(0.25 * WAVES / _GRID) + 1
 
     def mean(angle: Array) -> Array:
         # Twice: a triangle.
@@ -379,7 +381,7 @@ def _without_gross_errors(time: Array, velocity: Array, locked: Array, track: Tr
     return np.asarray(known[off < gate])
 
 
-def _clock(trial: Trial, frame: LocalFrame) -> str:
+def node_clock(trial: Trial, frame: LocalFrame) -> str:
     """Return the time offset of the clock of the nodes: of what measures the velocity most often.
 
     Its measurements stay where they are between nodes when its clock moves; with weights of the
@@ -419,12 +421,23 @@ def _nodes(
     log = trial.log
     own = track.time + lag if log is None or log.locked.sum() < 2 else log.time[log.locked]
     own = own[(own > first) & (own < last)]
-    longest = max(_LONGEST, (last - first) / _MOST_NODES)
+    longest = max(LONGEST, (last - first) / _MOST_NODES)
+    # One more: the attitude of the last ping is between two nodes.
+    edges = [*far_apart(first, own, longest), last, last + longest]
+    return without_long_steps(np.array(edges), longest)
+
+
+def far_apart(first: float, own: Array, longest: float) -> Array:
+    """Return a time, s, and those after it that are half the longest step apart, or more."""
     kept = [first]
     for t in own.tolist():
         if t - kept[-1] > 0.5 * longest:
             kept.append(t)
-    edges = np.append(kept, last)
+    return np.array(kept)
+
+
+def without_long_steps(edges: Array, longest: float) -> Array:
+    """Return times (M,), s, with others in between where steps are too long."""
     wide = np.flatnonzero(np.diff(edges) > longest)
     more = [
         np.linspace(edges[i], edges[i + 1], int(np.ceil((edges[i + 1] - edges[i]) / longest)) + 1)
@@ -434,16 +447,16 @@ def _nodes(
     return np.asarray(every[np.concatenate([[True], np.diff(every) > 1e-3])])
 
 
-def _phases(record: AttitudeRecord, time: Array) -> IntArray:
+def phases(record: AttitudeRecord, time: Array) -> IntArray:
     """Return what the heading does about stamps (M,) of the attitude, averaged over seconds.
 
     It stays (0), turns at a rate (1), or begins or ends to turn (2): axes that turn with its
     average are behind it then.
     """
     ahead, here, behind = (
-        record.rph_at(time + shift)[:, 2] for shift in (_TURN_SPAN, 0.0, -_TURN_SPAN)
+        record.rph_at(time + shift)[:, 2] for shift in (TURN_SPAN, 0.0, -TURN_SPAN)
     )
-    after, before = (ahead - here) / _TURN_SPAN, (here - behind) / _TURN_SPAN
+    after, before = (ahead - here) / TURN_SPAN, (here - behind) / TURN_SPAN
     changes = np.abs(after - before) > _TURNING
     turns = np.abs(after + before) > 2.0 * _TURNING
     return np.where(changes, 2, turns.astype(int))
@@ -474,7 +487,7 @@ def _densities(
         time = log.time[rows] - float(values["time_offset_s"][0])
         v_b = log.velocity[rows] @ values.get("misalignment_deg", np.eye(3))
         interval = float(np.median(np.diff(time)))
-        at_pings = _phases(record, time + late)
+        at_pings = phases(record, time + late)
         for kind in np.unique(phase):
             spans = (interval, 2.0 * interval) if kind else _LEG_SPANS
             out[phase == kind, 3:] = _density(v_b, at_pings == kind, spans, interval)

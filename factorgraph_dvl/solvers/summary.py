@@ -97,7 +97,8 @@ def _trajectory(found: SolvedProblem, body_axes: BodyAxes, rate_hz: float) -> Tr
     """Return the motion at a rate, at true times."""
     chain = found.problem.chain
     if chain.interpolates:
-        return trajectory_at_true_times(found, body_axes, rate_hz)
+        at = found.minimum.evaluation
+        return trajectory_at_true_times(found.problem, at, found.covariances, body_axes, rate_hz)
     states = found.minimum.evaluation.states
     return chain.trajectory(states, found.covariances.nodes, body_axes, rate_hz)
 

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 
 from factorgraph_dvl.geometry.records import concatenated
 from factorgraph_dvl.geometry.rotations import BodyAxes
 from factorgraph_dvl.geometry.vectors import Array, rotate
 from factorgraph_dvl.graph import keys
+from factorgraph_dvl.graph.problem import Evaluation, Problem
 from factorgraph_dvl.graph.smooth_chain import SmoothChain
 from factorgraph_dvl.graph.trajectory import between, epochs_between, reported, tangent_in_n
 from factorgraph_dvl.solution import Trajectory
-from factorgraph_dvl.solvers.fixed_directions import SolvedProblem
+from factorgraph_dvl.solvers.posterior import Posterior
 
 # Epochs whose covariances are computed at once. Chosen: some ten megabytes.
 _CHUNK = 4096
@@ -19,14 +22,15 @@ _CHUNK = 4096
 _ATTITUDE, _OTHERS = slice(0, 3), slice(3, 9)
 
 
-def covariances_at_true_times(found: SolvedProblem) -> Array:
+def covariances_at_true_times(
+    problem: Problem, evaluation: Evaluation, covariances: Posterior
+) -> Array:
     """Return the covariances (K, 9, 9) of the states of nodes where the true times are exact.
 
     At a true time is what the nodes have later by the offset of their clock: there the motion errs
     by what it changes in the error of the offset too.
     """
-    problem, covariances = found.problem, found.covariances
-    chain, states = problem.chain, found.minimum.evaluation.states
+    chain, states = problem.chain, evaluation.states
     acceleration = np.gradient(states.v_n, chain.node_time, axis=0)
     bRn = states.nRb.transpose(0, 2, 1)
     moved = np.hstack([states.omega_b, rotate(bRn, states.v_n), rotate(bRn, acceleration)])
@@ -42,31 +46,65 @@ def covariances_at_true_times(found: SolvedProblem) -> Array:
     return P + by_clocks @ covariances.parameters @ by_clocks.transpose(0, 2, 1)
 
 
+def known_span(chain: SmoothChain, values: Mapping[str, Array]) -> tuple[float, float]:
+    """Return the true times from which on and up to which the motion is known, s.
+
+    Positions are known up to the last node but one, attitudes up to the last.
+    """
+    node_time, shift = chain.node_time, chain.shift(values)
+    first = float(node_time[0]) - min(shift, 0.0)
+    last = min(float(node_time[-2]), float(node_time[-1]) - shift)
+    lag = nodes_late(chain, values)
+    return first - lag, last - lag
+
+
+def nodes_late(chain: SmoothChain, values: Mapping[str, Array]) -> float:
+    """Return the times of the nodes less true times, s."""
+    return 0.0 if chain.clock is None else float(values[chain.clock][0])
+
+
 def trajectory_at_true_times(
-    found: SolvedProblem, body_axes: BodyAxes, rate_hz: float
+    problem: Problem,
+    evaluation: Evaluation,
+    covariances: Posterior,
+    body_axes: BodyAxes,
+    rate_hz: float,
 ) -> Trajectory:
     """Return the motion at a rate, with its covariance, at most at that of the densest record.
 
     Parameters
     ----------
-    found : SolvedProblem
-        Of a chain without IMU, with covariances.
+    problem : Problem
+        Of a chain without IMU.
+    evaluation : Evaluation
+        Its minimum.
+    covariances : Posterior
+        There.
     body_axes : BodyAxes
         Axes of the body.
     rate_hz : float
         Epochs in a second.
     """
-    chain, evaluation = found.problem.chain, found.minimum.evaluation
+    chain = problem.chain
     assert isinstance(chain, SmoothChain)
-    values, states, node_time = evaluation.parameters, evaluation.states, chain.node_time
-    lag = 0.0 if chain.clock is None else float(values[chain.clock][0])
-    shift = chain.shift(values)
+    time = epochs_at_most(chain, *known_span(chain, evaluation.parameters), rate_hz)
+    P = covariances_at_true_times(problem, evaluation, covariances)
+    return motion_at_true_times(chain, evaluation, P, body_axes, time)
+
+
+def epochs_at_most(chain: SmoothChain, first: float, last: float, rate_hz: float) -> Array:
+    """Return the epochs after a time and up to another, s, at a rate that the record has."""
     rate_hz = min(rate_hz, 1.0 / chain.resolution if chain.resolution else rate_hz)
-    # Positions are known up to the last node but one, attitudes up to the last.
-    first = node_time[0] - min(shift, 0.0)
-    last = min(node_time[-2], node_time[-1] - shift)
-    time = epochs_between(first - lag, last - lag, rate_hz)
-    P_n = tangent_in_n(covariances_at_true_times(found), states.nRb)
+    return epochs_between(first, last, rate_hz)
+
+
+def motion_at_true_times(
+    chain: SmoothChain, evaluation: Evaluation, P: Array, body_axes: BodyAxes, time: Array
+) -> Trajectory:
+    """Return the motion at times (M,), s, by `covariances_at_true_times` P (K, 9, 9)."""
+    values, states, node_time = evaluation.parameters, evaluation.states, chain.node_time
+    lag, shift = nodes_late(chain, values), chain.shift(values)
+    P_n = tangent_in_n(P, states.nRb)
     parts = []
     for i in range(0, max(time.size, 1), _CHUNK):
         some = time[i : i + _CHUNK]

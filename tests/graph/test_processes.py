@@ -41,6 +41,26 @@ def test_the_prior_is_that_of_a_stationary_process():
         np.testing.assert_allclose(covariance[:, i, :, i], np.exp(-lag / TAU[i]), atol=1e-12)
 
 
+def test_a_process_goes_on_from_what_is_known():
+    """The first node has no prior of its own then, and a walk is still that of the whole."""
+    p = walking()
+    on = p.going_on(np.array([5.0, 6.0, 8.0]), p.walk)
+    nodes = np.full((3, 4), 2.0)
+    assert not on.prior_residuals(nodes)[0].any()
+    gaussian = gtsam.GaussianFactorGraph()
+    on.add_prior(gaussian, nodes)
+    assert [gaussian.at(i).size() for i in range(gaussian.size())] == [2, 2]
+    whole = replace(p, time=np.array([0.0, 2.0, 5.0, 6.0]))
+    part = p.going_on(np.array([5.0, 6.0]), p.walk)
+    own = np.ones((4, 4))
+    np.testing.assert_allclose(
+        part.prior_residuals(own[2:])[1], whole.prior_residuals(own)[3], rtol=1e-12
+    )
+    np.testing.assert_allclose(
+        part.error(own[2:], np.array([5.5])), whole.error(own, np.array([5.5])), rtol=1e-12
+    )
+
+
 def test_residuals_by_hand():
     p = process()
     nodes = np.array([[1.0, 0.0, 0.0], [2.0, 0.0, 0.0], [0.0] * 3, [0.0] * 3])
