@@ -50,9 +50,9 @@ class BatchSolution:
         As of the problem.
     noise : tuple of Noise
         The same, as it is reported.
-    lag, late : float, s
-        Stamps of the nodes and of the attitude less true times where it started: how the track
-        turns is fixed by these. `lag` is zero where the nodes are at true times.
+    late : float, s
+        Stamps of the attitude less times of the nodes where it started: phases of turns are by
+        these.
     pings_late : float, s
         Stamps of pings less times of the nodes; zero where nodes have the clock of the pings.
     densities : ndarray, shape (3, 6)
@@ -72,7 +72,6 @@ class BatchSolution:
     noise_factors: Mapping[str, Array]
     long_run: Mapping[str, Array]
     noise: tuple[Noise, ...]
-    lag: float
     late: float
     pings_late: float
     densities: Array
@@ -93,6 +92,7 @@ class BatchSolution:
             tilt = problem.tilt.gradient / duration
         start = problem.prior_values() | prepared.values
         lag = float(start[node_clock(trial, chain.frame)][0])
+        late = float(start[trial.attitude.clock.offset.name][0])
         by_aid = [
             (aid, lasting_observations(aid, chain.frame, trial.body_axes, trial))
             for aid in trial.aids
@@ -105,8 +105,7 @@ class BatchSolution:
             noise_factors=problem.noise_factors,
             long_run=problem.long_run,
             noise=noise_of(problem),
-            lag=0.0 if chain.clock is None else lag,
-            late=float(start[trial.attitude.clock.offset.name][0]),
+            late=late if chain.clock is None else late - lag,
             pings_late=lag if chain.clock is None else 0.0,
             densities=_densities(chain.density, prepared.phase),
             tilt=tilt,
@@ -122,7 +121,7 @@ class BatchSolution:
 
     def density(self, record: AttitudeRecord, time: Array) -> Array:
         """Return the densities of acceleration at times (M,) by the nodes' clock, (M, 6)."""
-        return np.asarray(self.densities[phases(record, time + self.late - self.lag)])
+        return np.asarray(self.densities[phases(record, time + self.late)])
 
     def observations(self, aid: Aid) -> list[Observation]:
         """Return what some rows of a sensor measured, with the noise of the whole record."""

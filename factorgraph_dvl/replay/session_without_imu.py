@@ -46,6 +46,7 @@ from factorgraph_dvl.solvers.preparation_without_imu import (
     without_long_steps,
 )
 from factorgraph_dvl.solvers.rounds import settle
+from factorgraph_dvl.solvers.true_times import nodes_late
 from factorgraph_dvl.trial import Trial
 
 # Time, s, by which states are behind the records: whether the vessel turns shows in the seconds
@@ -288,12 +289,13 @@ class ReplayWithoutImu:
         # One more: the attitude of the last ping is between two nodes.
         time = np.append(time, time[-1] + LONGEST)
         states = _going_on_straight(whole, record, time, states)
+        late = float(values[self._attitude.clock.offset.name][0])
         chain = WindowChain(
             frame=whole.frame,
             node_time=time,
             density=np.concatenate([density, density[-1:]]),
             start=states,
-            nRt=track_axes(record, whole.frame, states, time - batch.lag, batch.late),
+            nRt=track_axes(record, whole.frame, states, time - nodes_late(whole, values), late),
             clock=whole.clock,
             attitude_clock=whole.attitude_clock,
             first_shift=whole.first_shift,
