@@ -46,6 +46,8 @@ _COMPONENTS = tuple(
 _FREE = np.repeat([np.pi, 1e5, 1e2, 1.0], 3)
 # Nodes of a branch, as of the inertial chain.
 _BRANCH = 128
+# What rounding may add to a time, s.
+_ROUNDING = 1e-6
 # Steps whose rows are made at once. Chosen: some ten megabytes.
 _CHUNK = 4096
 
@@ -239,8 +241,12 @@ class SmoothChain:
         return ChainStates(nRb, p_n, v_n, omega, self.node_time[some])
 
     def covers(self, time: Array) -> BoolArray:
-        """Whether times (M,) are between the first node and the last."""
-        return np.asarray((time >= self.node_time[0]) & (time <= self.node_time[-1]))
+        """Whether times (M,) are between the first node and the last but one.
+
+        The last one is for attitudes, whose nodes may be earlier.
+        """
+        first, last = self.node_time[[0, -2]]
+        return np.asarray((time >= first - _ROUNDING) & (time <= last + _ROUNDING))
 
     def shift(self, parameters: Mapping[str, Array]) -> float:
         """Return by how much its clock of attitudes is late beside that of the nodes, s."""

@@ -12,6 +12,7 @@ from factorgraph_dvl.graph.priors import Tilt
 from factorgraph_dvl.graph.problem import Problem
 from factorgraph_dvl.graph.processes import Process
 from factorgraph_dvl.graph.smooth_chain import SmoothChain
+from factorgraph_dvl.graph.smooth_motion import SmoothStates
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, factorized
 from factorgraph_dvl.statistics.marginal_likelihood import log_determinant_gradient
 from factorgraph_dvl.statistics.variance_components import (
@@ -48,6 +49,8 @@ class Strengths:
         With their deviations.
     tilt : Tilt
         Gradient of the states' volume by the constants.
+    states : SmoothStates
+        Of the nodes of this chain.
     values : dict of str to ndarray
         Of all parameters, processes in their new unit.
     steps : dict of str to ndarray
@@ -60,6 +63,7 @@ class Strengths:
     factors: dict[str, Array]
     processes: tuple[Process, ...]
     tilt: Tilt
+    states: SmoothStates
     values: dict[str, Array]
     steps: dict[str, Array]
     same: bool
@@ -126,6 +130,7 @@ def motion_strengths(
         factors,
         tuple(processes),
         tilt,
+        evaluation.states,
         values,
         {name: step for name, (step, _) in wanted.items()},
         same,

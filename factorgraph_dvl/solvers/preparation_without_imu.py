@@ -17,7 +17,7 @@ from factorgraph_dvl.graph.chain import Chain
 from factorgraph_dvl.graph.priors import prior_mean
 from factorgraph_dvl.graph.problem import Problem
 from factorgraph_dvl.graph.processes import Process, node_times
-from factorgraph_dvl.graph.smooth_chain import SmoothChain
+from factorgraph_dvl.graph.smooth_chain import ChainStates, SmoothChain
 from factorgraph_dvl.graph.smooth_motion import SmoothStates
 from factorgraph_dvl.imu.attitude_record import AttitudeRecord, level_axes
 from factorgraph_dvl.initialization.dvl_mounting import initial_mountings
@@ -55,6 +55,10 @@ _MOST_NODES = 60_000
 _GROUND_SPAN, _WATER_SPAN = 5.0, 15.0
 # Density of acceleration, m²/s³, where the log does not show one.
 _DENSITY = 1e-3
+# Share of the time between nodes by which their attitudes are earlier. Chosen: where a ping is at
+# a node of both, the acceleration jumps, and clocks stay there; with a half, fixes are carried far
+# beyond the nodes of the attitude.
+_EARLY = 0.25
 # Least densities, m²/s³ and rad²/s³. Chosen: they keep the chain regular.
 LEAST_DENSITY = np.repeat([1e-12, 1e-9], 3)
 # Spans, s, over which changes of velocity on legs show the density; in turns, in which velocity
@@ -143,7 +147,8 @@ class PreparationWithoutImu:
         lag = 0.0 if chain.clock is None else float(values[chain.clock][0])
         late = float(values[self.record.sensor.clock.offset.name][0])
         axes = track_axes(self.record, chain.frame, self.states, chain.node_time - lag, late)
-        return replace(found, chain=replace(chain, nRt=axes))
+        chain, states = _anew(replace(chain, nRt=axes), minimum.evaluation.states, values)
+        return replace(found, chain=chain, states=states)
 
     def start(self, chain: Chain, states: SmoothStates, report: Progress) -> MountedStart:
         """Return where the minimisation starts: motion and mountings are known by the records."""
@@ -186,7 +191,8 @@ def prepare_without_imu(trial: Trial) -> PreparationWithoutImu:
     lag = float(values[clock][0])
     nodes = _nodes(trial, record, track, late=late, lag=lag)
     phase = phases(record, 0.5 * (nodes[1:] + nodes[:-1]) + late - lag)
-    states = _states(record, track, frame, nodes - lag, late)
+    early = _early(nodes)
+    states = _states(record, track, frame, nodes - lag, late, early)
     chain = SmoothChain(
         frame=frame,
         node_time=nodes,
@@ -195,11 +201,11 @@ def prepare_without_imu(trial: Trial) -> PreparationWithoutImu:
         nRt=track_axes(record, frame, states, nodes - lag, late),
         clock=clock if any(p.name == clock and p.estimated for p in parameters) else None,
         attitude_clock=record.sensor.clock.offset.name,
-        first_shift=late - lag,
+        first_shift=late - lag - early,
         resolution=record.interval,
     )
     if chain.clock is None:
-        chain = replace(chain, node_time=nodes - lag, first_shift=late)
+        chain = replace(chain, node_time=nodes - lag, first_shift=late - early)
     by_aid = [
         (aid, lasting_observations(aid, frame, trial.body_axes, trial)) for aid in trial.aids
     ]
@@ -261,12 +267,35 @@ def _currents(trial: Trial, chain: SmoothChain) -> tuple[Process, ...]:
     )
 
 
+def _anew(
+    chain: SmoothChain, states: ChainStates, values: Mapping[str, Array]
+) -> tuple[SmoothChain, SmoothStates]:
+    """Return a chain whose attitudes are as early as at first, and its states.
+
+    Clocks have moved pings between nodes of the attitude; at a node they would stay.
+    """
+    moved = chain.shift(values) - _early(chain.node_time)
+    motion = chain.motion(chain.attach(chain.node_time, moved, turning=True), states)
+    own = SmoothStates(motion.nRb, states.p_n, states.v_n, motion.omega_eb_b)
+    return replace(chain, first_shift=chain.first_shift + moved), own
+
+
+def _early(nodes: Array) -> float:
+    """Return by how much attitudes of nodes are earlier than the rest of them, s."""
+    return _EARLY * float(np.median(np.diff(nodes)))
+
+
 def _states(
-    record: AttitudeRecord, track: Track, frame: LocalFrame, time: Array, late: float
+    record: AttitudeRecord,
+    track: Track,
+    frame: LocalFrame,
+    time: Array,
+    late: float,
+    early: float,
 ) -> SmoothStates:
-    """Return states at true times (M,) by records alone."""
+    """Return states at true times (M,) by records alone, attitudes `early` s before these."""
     p_n, v_n, _ = track.at(time)
-    stamp = np.clip(time + late, record.time[0], record.time[-1])
+    stamp = np.clip(time + late - early, record.time[0], record.time[-1])
     body = record.at(stamp, np.zeros((time.size, 3)), level_axes(frame, p_n))
     return SmoothStates(body.nRb, p_n, v_n, body.omega_eb_b)
 

@@ -235,7 +235,7 @@ def settle(
                 levels, factors=(*levels.factors, strengths.factors), processes=strengths.processes
             )
             chain, tilt = strengths.chain, strengths.tilt
-            values = strengths.values
+            states, values = strengths.states, strengths.values
             # The last minimum was a rough one, good enough for strengths.
             changing.append(_MINIMUM if strengths.same else _MOTION)
             if strengths.same:
@@ -268,6 +268,8 @@ def settle(
             outliers_found = robust_weights(problem, minimum.evaluation)
             if outliers_found is not None:
                 changing.append(_OUTLIERS)
+                # What they made of the noise is to be found anew.
+                motion, last_strengths = 0, None
                 robust, evaluation = outliers_found
                 states, values = evaluation.states, evaluation.parameters
         if not changing and not correlation_searched and minimum.converged:
@@ -303,7 +305,7 @@ def settle(
                 robust, long_run, levels, tolerance = {}, {}, first_levels, {}
                 tilt, motion, last_strengths = None, 0, None
                 searches, correlation_searched, count = 0, False, 0
-        if not changing and levels.estimated and minimum.converged:
+        if not changing and levels.estimated and minimum.converged and not chain.interpolates:
             last = levels
             levels = _next_noise(levels, problem, minimum)
             same = levels.processes == last.processes
