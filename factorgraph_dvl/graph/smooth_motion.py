@@ -270,7 +270,7 @@ class Between:
         Returns
         -------
         ndarray, shape (M, 3, 3, 3)
-            rad², m² and m²/s².
+            In rad², m² and m²/s².
         """
         span = self.turns.span[self.node]
         of_value, _, of_rate = variance_between(self.tau, span)[..., None]
