@@ -57,6 +57,7 @@ import numpy as np
 from factorgraph_dvl.geometry.rotations import exp_so3
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph.problem import Evaluation, Problem, Rows
+from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.statistics.square_root_information import SquareRootInformation
 
 # Step of a difference, in standard deviations of the parameter, and at most, SI. Chosen: what
@@ -140,17 +141,20 @@ def log_determinant_gradient(
         problem.observation_rows(evaluation), information.given(constants), constants
     )
 
+    def total(p: Parameter, value: Array) -> float:
+        every = problem.observation_rows_at(evaluation, {p.name: value})
+        found = ((rows, with_states[rows.source, rows.begin]) for rows in every)
+        return sum(float(np.vdot(_by_states(rows, constants), own)) for rows, own in found)
+
     clocks = {name for bound in problem.bound for name in bound.clocks}
     for p in problem.parameters:
         if problem.chain.interpolates and p.name in clocks:
             continue
         value, own = evaluation.parameters[p.name], problem.columns[p.name]
+        before = total(p, value)
         for i, step in enumerate(np.diag(steps[own])):
-            there = value @ exp_so3(step) if p.rotation else value + step
-            for rows in problem.observation_rows_at(evaluation, {p.name: there}):
-                at = _by_states(rows, constants)
-                before, found = with_states[rows.source, rows.begin]
-                out[own.start + i] += 2.0 * float(np.vdot(at - before, found)) / step[i]
+            after = total(p, value @ exp_so3(step) if p.rotation else value + step)
+            out[own.start + i] = 2.0 * (after - before) / step[i]
     return out
 
 
@@ -171,8 +175,8 @@ def _by_states(rows: Rows, constants: set[int]) -> Array:
 
 def _covariance_with_states(
     every: Iterable[Rows], given: SquareRootInformation, constants: set[int]
-) -> dict[tuple[str, int], tuple[Array, Array]]:
-    """Return rows J by their own states, and their covariance J P given the constants, (M, d, n).
+) -> dict[tuple[str, int], Array]:
+    """Return the covariance J P of rows with their own states given the constants, (M, d, n).
 
     By source and number of the first item.
     """
@@ -187,11 +191,8 @@ def _covariance_with_states(
         jacobians[rows.source, rows.begin] = jacobian
         groups[rows.source, rows.begin] = used, number
     joint = given.joint_covariances(list(place))
-    out = {}
     for part, (used, number) in groups.items():
-        with_states = np.zeros_like(jacobians[part])
         if number:
             own_covariance = np.stack([joint[i] for i in number])
-            with_states[used] = jacobians[part][used] @ own_covariance
-        out[part] = jacobians[part], with_states
-    return out
+            jacobians[part][used] = jacobians[part][used] @ own_covariance
+    return jacobians

@@ -58,6 +58,8 @@ def test_it_stops_early_where_another_problem_follows(monkeypatch):
 class AtAKink:
     """Lowest cost at 0, where a linear model promises to lower it further."""
 
+    tilt = None
+
     def evaluate(self, values):
         return SimpleNamespace(
             values=values, parameters={}, cost=1.0 + float(np.abs(values.atVector(0)).sum())

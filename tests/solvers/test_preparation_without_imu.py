@@ -170,10 +170,6 @@ def ins_scenario(repeat=1):
     return with_ins(shortened(repeat=repeat), SCHULER)
 
 
-@pytest.mark.xfail(
-    strict=True,
-    reason="states interpolate between samples once a second: the clock of the DVL follows noise",
-)
 def test_an_ins_alone_is_enough():
     trial = simulate(ins_scenario(), 3)
     solution = solve(trial, rate_hz=1.0)

@@ -216,6 +216,8 @@ def by_hand(c, x):
 
     problem = SimpleNamespace(
         parameters=[SimpleNamespace(name="c", rotation=False)],
+        bound=(),
+        chain=SimpleNamespace(interpolates=False),
         columns={"c": slice(0, 1)},
         prior_root=np.eye(1),
         processes=(),
