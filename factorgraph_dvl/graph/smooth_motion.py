@@ -273,10 +273,11 @@ class Between:
             In rad², m² and m²/s².
         """
         span = self.turns.span[self.node]
+        of_turn = variance_between(self.tau_turned, span)[0, :, None]
         of_value, _, of_rate = variance_between(self.tau, span)[..., None]
         turning, moving = np.split(density[self.node], 2, axis=1)
         axes = np.stack([self.motion.nRb, nRt[self.node], nRt[self.node]], axis=1)
-        variance = np.stack([of_value * turning, of_value * moving, of_rate * moving], axis=1)
+        variance = np.stack([of_turn * turning, of_value * moving, of_rate * moving], axis=1)
         return np.asarray((axes * variance[:, :, None, :]) @ axes.swapaxes(2, 3))
 
 

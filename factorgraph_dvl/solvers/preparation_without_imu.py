@@ -224,7 +224,7 @@ def prepare_without_imu(trial: Trial) -> PreparationWithoutImu:
             for aid, every in by_aid
             if trial.estimates_noise(aid)
             for o in every
-            if o.noise_groups
+            if o.noise_groups and not _followed(o, nodes)
         ),
         findings=(*trial.notes, *_notes(trial), *_left_out(trial)),
     )
@@ -265,6 +265,15 @@ def _currents(trial: Trial, chain: SmoothChain) -> tuple[Process, ...]:
             free=not known,
         ),
     )
+
+
+def _followed(o: Observation, nodes: Array) -> bool:
+    """Whether attitudes come no more often than nodes: the motion between them follows each.
+
+    What is noise of theirs, and what motion, they do not show.
+    """
+    interval = float(np.median(np.diff(o.time))) if o.time.size > 1 else np.inf
+    return o.unit == "rad" and interval > 0.5 * float(np.median(np.diff(nodes)))
 
 
 def _anew(
@@ -309,8 +318,8 @@ def track_axes(
     width = 2 * round(0.25 * WAVES / _GRID) + 1
 
     def mean(angle: Array) -> Array:
-        # Twice: a triangle.
-        for _ in range(2):
+        # Three times: what is left of waves is a thirtieth.
+        for _ in range(3):
             padded = np.pad(angle, width // 2, mode="reflect", reflect_type="odd")
             angle = np.convolve(padded, np.full(width, 1.0 / width), mode="valid")
         return angle
@@ -482,12 +491,12 @@ def phases(record: AttitudeRecord, time: Array) -> IntArray:
     It stays (0), turns at a rate (1), or begins or ends to turn (2): axes that turn with its
     average are behind it then.
     """
-    ahead, here, behind = (
-        record.rph_at(time + shift)[:, 2] for shift in (TURN_SPAN, 0.0, -TURN_SPAN)
-    )
-    after, before = (ahead - here) / TURN_SPAN, (here - behind) / TURN_SPAN
-    changes = np.abs(after - before) > _TURNING
-    turns = np.abs(after + before) > 2.0 * _TURNING
+    # The average of the heading reaches two spans ahead and behind.
+    shifts = TURN_SPAN * np.arange(-2, 3)
+    heading = np.stack([record.rph_at(time + shift)[:, 2] for shift in shifts])
+    rate = np.diff(heading, axis=0) / TURN_SPAN
+    changes = np.any(np.abs(np.diff(rate, axis=0)) > _TURNING, axis=0)
+    turns = np.abs(rate[1] + rate[2]) > 2.0 * _TURNING
     return np.where(changes, 2, turns.astype(int))
 
 

@@ -13,6 +13,7 @@ from factorgraph_dvl.geometry.rotations import exp_so3
 from factorgraph_dvl.graph import keys
 from factorgraph_dvl.graph.problem import Problem
 from factorgraph_dvl.graph.smooth_motion import SmoothStates
+from factorgraph_dvl.sensors.protocol import Linearization
 from factorgraph_dvl.simulation import simulate
 from factorgraph_dvl.solvers.levenberg_marquardt import factorized, minimise
 from factorgraph_dvl.solvers.preparation_without_imu import prepare_without_imu
@@ -44,9 +45,10 @@ def values(prepared, problem):
     rng = np.random.default_rng(1)
     off = rng.normal(0.0, 1e-3, (prepared.states.p_n.shape[0], 12))
     states = prepared.states.retracted(off)
-    # The last fix is at a node, beyond which its attitude is that of other nodes.
+    # Accelerations jump at nodes, so nothing that a clock moves may be at one.
     chain = problem.chain
-    late = {name: prepared.values[name] + 0.02 for name in (chain.clock, chain.attitude_clock)}
+    late = {chain.clock: 0.013, chain.attitude_clock: 0.02}
+    late = {name: prepared.values[name] + by for name, by in late.items()}
     return problem.values(states, problem.prior_values() | prepared.values | late)
 
 
@@ -57,27 +59,117 @@ def moved(values, key, step):
     return values.retract(delta)
 
 
+def by_level_axes(problem, here, there):
+    """Return whitened residuals of attitudes if only positions, and so level axes, change."""
+    out = []
+    for bound, before, after in zip(problem.bound, here.motions, there.motions, strict=True):
+        if bound.observation.unit == "rad":
+            motion = replace(before, p_n=after.p_n)
+            residual = problem.residual(bound.observation, motion, here.parameters)
+            out.append((bound.weight * residual).ravel())
+    return np.concatenate(out)
+
+
 def test_the_gradient_is_that_of_the_cost(problem, values):
     problem.weigh(problem.evaluate(values))
-    gradient = problem.linearize(problem.evaluate(values)).gradientAtZero()
+    here = problem.evaluate(values)
+    gradient = problem.linearize(here).gradientAtZero()
     some = [keys.node(7), keys.rate(7), *(problem.key(p.name) for p in problem.parameters)]
     some += [process.key(1) for process in problem.processes]
-    clocks = [problem.key(p.name) for p in problem.parameters if "time_offset" in p.name]
-    attitude = [o.label for o in problem.observations].index("Attitude")
+    level = by_level_axes(problem, here, here)
     for key in some:
         for i in range(values.dims()[key]):
             step = np.zeros(values.dims()[key])
             step[i] = 1e-6
-            there = [problem.evaluate(moved(values, key, s * step)) for s in (1.0, -1.0)]
-            expected = (there[0].cost - there[1].cost) / 2e-6
+            cost = []
+            for way in (1.0, -1.0):
+                there = problem.evaluate(moved(values, key, way * step))
+                # What turns the level axes at the position, 1e-6 rad/s, is left out of Jacobians.
+                turned = by_level_axes(problem, here, there)
+                cost.append(there.cost - 0.5 * (turned - level) @ (turned + level))
+            expected = (cost[0] - cost[1]) / 2e-6
             scale = max(1.0, np.abs(gradient.at(key)).max())
-            if key in clocks:
-                # They move the level axes of attitudes, by 1e-6 rad/s, which rows leave out.
-                squares = [0.5 * np.sum(each.residuals[attitude] ** 2) for each in there]
-                by_level = (squares[0] - squares[1]) / 2e-6
-                assert abs(by_level) < 1.0
-                expected -= by_level
-            assert gradient.at(key)[i] == pytest.approx(expected, abs=2e-4 * scale)
+            assert gradient.at(key)[i] == pytest.approx(expected, abs=1e-5 * scale)
+
+
+def test_the_clock_of_attitudes_leaves_these_where_they_are(prepared, problem):
+    name = problem.chain.attitude_clock
+    start = problem.prior_values() | prepared.values
+    problem.weigh(problem.evaluate(problem.values(prepared.states, start)))
+    before, after = (
+        problem.evaluate(problem.values(prepared.states, start | {name: start[name] + late}))
+        for late in (0.0, 0.02)
+    )
+    of_attitude = [b.observation.unit == "rad" for b in problem.bound]
+    assert sum(of_attitude) == 1
+    for k, bound in enumerate(problem.bound):
+        here, there = before.motions[k], after.motions[k]
+        used = (bound.weight > 0.0).all(axis=1)
+        weight = bound.weight[used]
+        changed = np.abs((after.residuals[k] - before.residuals[k])[used] / weight)
+        if bound.observation.unit == "rad":
+            np.testing.assert_allclose(there.nRb, here.nRb, atol=1e-12)
+            # At up to 8 m/s the level axes turn by 8/6.4e6 rad/s, heading by tan(latitude) of it.
+            assert 0.0 < changed.max() < 0.02 * 4.0 * 8.0 / 6.4e6
+        else:
+            assert changed.max() > 1e-4
+
+
+def test_what_is_missing_half_way_by_hand(prepared):
+    chain, k = prepared.first_chain, 5
+    start, dt = chain.node_time[k], chain.node_time[k + 1] - chain.node_time[k]
+    q, axis, zero = chain.density[k], np.array([0.0, 1.0, 0.0]), np.zeros((1, 1))
+    at = chain.attach(np.array([start + 0.5 * dt]))
+    along = {"d_p": chain.nRt[k] @ axis, "d_v": chain.nRt[k] @ axis, "d_theta": axis}
+    along = {name: each[None, None] for name, each in (along | {"d_omega": axis}).items()}
+
+    def missing(*names, at=at):
+        lin = Linearization(zero, **{name: along[name] for name in names})
+        return float(chain.missing(at, lin)[0, 0])
+
+    # tau³ rest³ / 3 dt³ of a value, tau rest (dt² - 3 tau rest) / dt³ of its rate.
+    assert missing("d_v") == pytest.approx(q[4] * dt / 16.0)
+    assert missing("d_p") == pytest.approx(q[4] * dt**3 / 192.0)
+    assert missing("d_omega") == pytest.approx(q[1] * dt / 16.0)
+    assert missing("d_theta") == pytest.approx(q[1] * dt**3 / 192.0)
+    # Half-way both are independent; at a third, tau² rest² (rest - tau) / 2 dt³ = 2/243 dt².
+    every = missing("d_p", "d_v", "d_theta", "d_omega")
+    assert every == pytest.approx((q[1] + q[4]) * (dt / 16.0 + dt**3 / 192.0))
+    third = chain.attach(np.array([start + dt / 3.0]))
+    both, alone = missing("d_p", "d_v", at=third), (missing(n, at=third) for n in ("d_p", "d_v"))
+    assert both - sum(alone) == pytest.approx(2.0 * q[4] * 2.0 / 243.0 * dt**2)
+    # Attitudes have their own place between the nodes, and beyond these only one node is known.
+    late = chain.attach(at.time, shift=0.5 * dt + 2.0)
+    late = replace(late, node=at.node)
+    assert missing("d_v", at=late) == pytest.approx(q[4] * dt / 16.0)
+    assert missing("d_omega", at=late) == pytest.approx(2.0 * q[1])
+    assert missing("d_theta", at=late) == pytest.approx(8.0 / 3.0 * q[1])
+
+
+def test_pings_at_nodes_miss_nothing_where_clocks_agree(prepared, problem):
+    start = problem.prior_values() | prepared.values
+    clock = problem.chain.attitude_clock
+    (ping,) = (b for b in problem.bound if b.observation.unit == "m/s")
+    # Where the record begins nodes are elsewhere.
+    at_nodes = np.abs(ping.time[:, None] - problem.chain.node_time).min(axis=1) < 1e-9
+    assert at_nodes.sum() > ping.time.size - 4
+
+    def missing(late):
+        parameters = start | {clock: start[clock] + late}
+        evaluation = problem.evaluate(problem.values(prepared.states, parameters))
+        motion = evaluation.motions[problem.bound.index(ping)]
+        return ping.missing(motion, evaluation.parameters, problem.processes_of(ping))
+
+    # Attitudes of nodes are early by this.
+    agreed = -problem.chain.shift(start)
+    np.testing.assert_allclose(missing(agreed)[at_nodes], 0.0, atol=1e-12)
+    assert (missing(agreed)[~at_nodes & ping.usable] > 1e-6).all()
+    # Rates, which count by the lever arm, and attitudes, by the speed, then are between nodes.
+    beside, tau = missing(0.1)[at_nodes], 0.1
+    assert (beside.max(axis=1) > 1e-9).all()
+    arm, speed = np.linalg.norm(start["lever_arm_m"]), 8.0
+    q = problem.chain.density[:, :3].max()
+    assert beside.max() < q * (arm * np.sqrt(tau) + speed * np.sqrt(tau**3 / 3.0)) ** 2
 
 
 def test_each_measurement_is_a_factor_of_its_own_and_the_whole_graph_is_the_problem(

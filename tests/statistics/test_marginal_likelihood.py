@@ -216,11 +216,11 @@ def by_hand(c, x):
 
     problem = SimpleNamespace(
         parameters=[SimpleNamespace(name="c", rotation=False)],
-        bound=(),
-        chain=SimpleNamespace(interpolates=False),
         columns={"c": slice(0, 1)},
         prior_root=np.eye(1),
         processes=(),
+        chain=SimpleNamespace(interpolates=False),
+        bound=[SimpleNamespace(clocks={"c"})],
         key=lambda name: C,
         log_sigma=lambda evaluation: [np.zeros(2)],
         observation_rows=lambda evaluation: rows(c),
@@ -243,6 +243,12 @@ def test_a_walk_measured_twice_by_hand(x):
     # det of the information is c⁴ + 3 c² + 1.
     gradient = log_determinant_gradient(problem, evaluation, information)
     assert gradient == pytest.approx([44 / 29], rel=1e-6)
+    # Where the motion is interpolated, that by a clock is left out.
+    problem.chain.interpolates = True
+    assert not log_determinant_gradient(problem, evaluation, information).any()
+    problem.bound[0].clocks = {"another"}
+    again = log_determinant_gradient(problem, evaluation, information)
+    np.testing.assert_array_equal(again, gradient)
 
 
 def test_the_restricted_objective_of_the_walk_by_hand():
