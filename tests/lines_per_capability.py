@@ -54,9 +54,8 @@ CAPABILITIES = (
         "factor graph, batch solver, covariance",
         "graph chain keys priors information solvers/*",
         "graph/* solvers/* statistics/*",
-        "graph/imu_errors graph/clocks graph/processes graph/native_graph graph/motion_* "
+        "graph/imu_errors graph/clocks graph/processes graph/native_graph "
         "graph/smooth_* "
-        "graph/bordered_chain "
         "statistics/correlation statistics/constancy solvers/change_along_trial "
         "solvers/correlated_noise solvers/known_parameters solvers/motion_* "
         "solvers/preparation_without_imu "
