@@ -460,8 +460,10 @@ def _nodes(
     own = track.time + lag if log is None or log.locked.sum() < 2 else log.time[log.locked]
     own = own[(own > first) & (own < last)]
     longest = max(LONGEST, (last - first) / _MOST_NODES)
-    # One more: the attitude of the last ping is between two nodes.
-    edges = [*far_apart(first, own, longest), last, last + longest]
+    # No node is where a record begins or ends, which clocks move beyond it; and one more, as the
+    # attitude of the last ping is between two nodes.
+    half = 0.5 * longest
+    edges = [*far_apart(first - half, own, longest), last + half, last + half + longest]
     return without_long_steps(np.array(edges), longest)
 
 

@@ -241,7 +241,8 @@ def settle(
             if strengths.same:
                 motion = _MOTION_ROUNDS
             continue
-        if np.sqrt(np.mean((states.p_n - p_gravity) ** 2)) > _SAME_GRAVITY:
+        moved = np.sqrt(np.mean((states.p_n - p_gravity) ** 2))
+        if not chain.interpolates and moved > _SAME_GRAVITY:
             changing.insert(0, message("not_converged.gravity"))
             chain = prepared.chain(states)
             p_gravity = states.p_n
