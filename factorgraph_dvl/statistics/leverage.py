@@ -8,7 +8,7 @@ import numpy as np
 
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph.problem import Rows
-from factorgraph_dvl.statistics.rows import add_transposed_product, product
+from factorgraph_dvl.statistics.rows import add_transposed_product, product, with_own_covariance
 from factorgraph_dvl.statistics.square_root_information import SquareRootInformation
 
 # Random vectors, at most and at least, and their numbers in all. Chosen: one pass through the
@@ -68,16 +68,6 @@ def exact_leverage(
         Information of the whole graph.
     """
     every = list(rows)
-    place: dict[tuple[int, ...], int] = {}
-    used = [np.flatnonzero(np.any(each.matrix, axis=(1, 2))) for each in every]
-    number = [
-        [place.setdefault(tuple(group), len(place)) for group in each.keys[i].tolist()]
-        for each, i in zip(every, used, strict=True)
-    ]
-    joint = information.joint_covariances(list(place))
-    for each, i, own in zip(every, used, number, strict=True):
-        h = np.zeros(each.vector.shape)
-        if own:
-            matrix = each.matrix[i]
-            h[i] = np.sum((matrix @ np.stack([joint[k] for k in own])) * matrix, axis=2)
-        yield each, h
+    products = with_own_covariance([(each.keys, each.matrix) for each in every], information)
+    for each, with_own in zip(every, products, strict=True):
+        yield each, np.sum(with_own * each.matrix, axis=2)

@@ -58,6 +58,7 @@ from factorgraph_dvl.geometry.rotations import exp_so3
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph.problem import Evaluation, Problem, Rows
 from factorgraph_dvl.sensors.parameters import Parameter
+from factorgraph_dvl.statistics.rows import with_own_covariance
 from factorgraph_dvl.statistics.square_root_information import SquareRootInformation
 
 # Step of a difference, in standard deviations of the parameter, and at most, SI. Chosen: what
@@ -180,19 +181,8 @@ def _covariance_with_states(
 
     By source and number of the first item.
     """
-    jacobians, groups = {}, {}
-    place: dict[tuple[int, ...], int] = {}
+    places, parts = [], []
     for rows in every:
-        own = rows.keys[:, : _states_of(rows, constants)]
-        jacobian = _by_states(rows, constants).copy()
-        # What is not used need not be in the graph.
-        used = np.flatnonzero(np.any(jacobian, axis=(1, 2)))
-        number = [place.setdefault(tuple(group), len(place)) for group in own[used].tolist()]
-        jacobians[rows.source, rows.begin] = jacobian
-        groups[rows.source, rows.begin] = used, number
-    joint = given.joint_covariances(list(place))
-    for part, (used, number) in groups.items():
-        if number:
-            own_covariance = np.stack([joint[i] for i in number])
-            jacobians[part][used] = jacobians[part][used] @ own_covariance
-    return jacobians
+        places.append((rows.source, rows.begin))
+        parts.append((rows.keys[:, : _states_of(rows, constants)], _by_states(rows, constants)))
+    return dict(zip(places, with_own_covariance(parts, given), strict=True))

@@ -6,7 +6,7 @@ rows: P = P (sum JᵀJ) P. Whatever asks what a source of noise does starts from
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 import numpy as np
 
@@ -14,6 +14,7 @@ from factorgraph_dvl.geometry.vectors import Array, IntArray
 from factorgraph_dvl.graph import keys
 from factorgraph_dvl.graph.priors import PRIOR
 from factorgraph_dvl.graph.problem import Evaluation, Problem, Rows
+from factorgraph_dvl.statistics.square_root_information import SquareRootInformation
 
 CORRELATED = "correlated noise of {}"
 # Stands for the sources that the chain names.
@@ -77,6 +78,39 @@ def add_transposed_product(rows: Rows, factors: Array, sums: dict[int, Array]) -
         added = np.add.reduceat(turned @ matrix, first, axis=0)
         for key, part in zip(own[first].tolist(), added, strict=True):
             sums[key] = sums[key] + part if key in sums else part
+
+
+def with_own_covariance(
+    parts: Sequence[tuple[IntArray, Array]], information: SquareRootInformation
+) -> list[Array]:
+    """Return the covariance J P of rows with their own variables, (M, d, n) for each part.
+
+    Zero where a row is. The variables of an item share a clique, as those of a factor do.
+
+    Parameters
+    ----------
+    parts : sequence of tuple of ndarray
+        Keys (M, k) of the variables of each item, and its rows J by these (M, d, n).
+    information : SquareRootInformation
+        Of all variables.
+    """
+    place: dict[tuple[int, ...], int] = {}
+    out = [np.zeros_like(matrix) for _, matrix in parts]
+    # What is not used need not be in the graph.
+    used = [np.flatnonzero(np.any(matrix, axis=(1, 2))) for _, matrix in parts]
+    number = [
+        np.array([place.setdefault(tuple(k), len(place)) for k in own[i].tolist()], dtype=int)
+        for (own, _), i in zip(parts, used, strict=True)
+    ]
+    for joint in information.joint_in_parts(list(place)):
+        known = np.zeros(len(place), dtype=bool)
+        known[list(joint)] = True
+        for (_, matrix), i, own, product_ in zip(parts, used, number, out, strict=True):
+            some = np.flatnonzero(known[own])
+            if some.size:
+                P = np.stack([joint[k] for k in own[some].tolist()])
+                product_[i[some]] = matrix[i[some]] @ P
+    return out
 
 
 def _runs(keys_: IntArray) -> IntArray:

@@ -22,6 +22,8 @@ from factorgraph_dvl.graph import keys
 # conditional, up to 60 kB for each state, of which a tenth is needed; each part looks through all
 # factors that are left.
 _PARTS = 16
+# Joint covariances that are held at once. Chosen: some ten megabytes.
+_AT_ONCE = 2048
 # Variables from which on there are parts. Chosen: fewer need little memory.
 _MANY = 500
 
@@ -242,15 +244,26 @@ class SquareRootInformation:
 
         Such variables share a clique: that of the one that was eliminated first.
         """
+        out: list[Array] = [np.empty((0, 0))] * len(groups)
+        for found in self.joint_in_parts(groups):
+            for i, P in found.items():
+                out[i] = P
+        return out
+
+    def joint_in_parts(self, groups: Sequence[tuple[int, ...]]) -> Iterator[dict[int, Array]]:
+        """Yield `joint_covariances` by number of the group, some at a time."""
         wanted: dict[int, list[int]] = {}
         for i, group in enumerate(groups):
             wanted.setdefault(max(self._place[key] for key in group), []).append(i)
-        out: list[Array] = [np.empty((0, 0))] * len(groups)
+        out: dict[int, Array] = {}
         for index, (_, place, P) in enumerate(self._joint()):
             for i in wanted.get(index, ()):
                 rows = self._components(place, groups[i])
                 out[i] = P[rows[:, None], rows]
-        return out
+            if len(out) >= _AT_ONCE:
+                yield out
+                out = {}
+        yield out
 
     def _components(self, place: Mapping[int, int], keys_: tuple[int, ...]) -> Array:
         """Return the components of variables among those of a clique: alike in most cliques."""
