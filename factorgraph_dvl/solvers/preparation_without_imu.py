@@ -460,11 +460,15 @@ def _nodes(
     own = track.time + lag if log is None or log.locked.sum() < 2 else log.time[log.locked]
     own = own[(own > first) & (own < last)]
     longest = max(LONGEST, (last - first) / _MOST_NODES)
-    # No node is where a record begins or ends, which clocks move beyond it; and one more, as the
-    # attitude of the last ping is between two nodes.
-    half = 0.5 * longest
-    edges = [*far_apart(first - half, own, longest), last + half, last + half + longest]
-    return without_long_steps(np.array(edges), longest)
+    if not own.size:
+        own = np.array([0.5 * (first + last)])
+    kept = far_apart(own[0], own[1:], longest)
+    # Before and after the pings as between them, and one more: the attitude of the last ping is
+    # between two nodes.
+    step = min(longest, float(np.median(np.diff(kept)))) if kept.size > 1 else longest
+    before = kept[0] - step * np.arange((kept[0] - first) // step + 1.0, 0.0, -1.0)
+    after = kept[-1] + step * np.arange(1.0, (last - kept[-1]) // step + 3.0)
+    return without_long_steps(np.concatenate([before, kept, after]), longest)
 
 
 def far_apart(first: float, own: Array, longest: float) -> Array:
