@@ -286,7 +286,8 @@ def _rows_by_step(
     """Return all factors of the linearised graph by the first node of each.
 
     What involves nothing but constants and the first node without a measurement, the priors, is
-    under -1; noise that is correlated belongs to the node before its own.
+    under -1; noise that is correlated belongs to the node before its own, or before the first
+    measurement that has it, as clocks differ.
     """
     gaussian = problem.linearize(evaluation)
     time = problem.chain.node_time
@@ -297,6 +298,8 @@ def _rows_by_step(
         of_errors |= {p.key(j): int(k) for j, k in enumerate(np.clip(before, 0, time.size - 1))}
     priors = problem.graph.size()
     out: dict[int, list[_Factor]] = {}
+    first_use: dict[int, int] = {}
+    others: list[tuple[int, _Factor]] = []
     for i in range(gaussian.size()):
         factor = gaussian.at(i)
         involved = list(factor.keys())
@@ -307,7 +310,14 @@ def _rows_by_step(
         if is_prior and not with_priors:
             continue
         k = -1 if is_prior else min(known, default=0)
+        if of_errors.keys() >= set(involved):
+            others.append((k, _Factor(involved, factor)))
+            continue
+        first_use |= {key: min(k, first_use.get(key, k)) for key in involved}
         out.setdefault(k, []).append(_Factor(involved, factor))
+    for k, correlated in others:
+        k = min(k, *(first_use.get(key, k) for key in correlated.keys[-1:]))
+        out.setdefault(k, []).append(correlated)
     return out
 
 
