@@ -96,21 +96,7 @@ NO_SWAY = {"sway": {"roll": [], "pitch": [], "yaw": []}}
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "with_an_ins",
-    [
-        pytest.param(False, id="attitude"),
-        pytest.param(
-            True,
-            id="ins",
-            marks=pytest.mark.xfail(
-                strict=True,
-                reason="the solver does not converge, and its clock is 3 of its standard "
-                "deviations off: the plan's is 1.7 times as large",
-            ),
-        ),
-    ],
-)
+@pytest.mark.parametrize("with_an_ins", [False, True], ids=["attitude", "ins"])
 def test_a_prediction_without_imu_is_what_the_solver_claims(with_an_ins):
     scene = config("ship", manoeuvres=LINES)
     if with_an_ins:

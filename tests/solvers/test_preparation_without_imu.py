@@ -315,7 +315,6 @@ def test_noise_of_a_compass_makes_no_lever_arm_shorter():
 
 
 @pytest.mark.slow
-@pytest.mark.xfail(reason="as of an INS alone")
 def test_white_noise_of_an_ins_moves_no_clock():
     trial = simulate(ins_scenario(repeat=2), 0)
     offset = solve(trial, rate_hz=0.1).estimate("time_offset_s")
