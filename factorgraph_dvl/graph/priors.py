@@ -22,6 +22,9 @@ _FIXED_STD = 1e-7
 # What the factor of a tilt adds to the cost where it holds. Chosen: along the gradient it adds a
 # millionth of the square of the slope, in standard deviations, and leaves the cost nine digits.
 _TILT_CONSTANT = 1e6
+# Share of its prior's standard deviation by which a parameter that is held may move, inverted.
+# Chosen: below what is measured.
+_HELD = 1e4
 # Least eigenvalue of the correlations of a calibration. Chosen: it may know a combination of
 # parameters a million times better than each.
 _LEAST_EIGENVALUE = 1e-12
@@ -109,11 +112,22 @@ class Tilt:
         Standard deviations of the parameters.
     origin : dict of str to ndarray
         Values of the parameters where it holds.
+    hold : ndarray, shape (P, P), 1/SI, optional
+        Square root of the information that keeps a step short, about the origin.
     """
 
     gradient: Array
     sigma: Array
     origin: dict[str, Array]
+    hold: Array | None = None
+
+    @classmethod
+    def holding(cls, parameters: Sequence[Parameter], values: Mapping[str, Array]) -> Tilt:
+        """Return what leaves parameters where they are, while states find their minimum."""
+        free = [p for p in parameters if p.estimated]
+        sigma = np.concatenate([p.sigma for p in free]) if free else np.zeros(0)
+        origin = {p.name: values[p.name] for p in free}
+        return cls(np.zeros(sigma.size), sigma, origin, np.diag(_HELD / np.maximum(sigma, _FIXED_STD)))
 
     @property
     def constant(self) -> float:
@@ -122,8 +136,11 @@ class Tilt:
 
     def cost(self, parameters: Sequence[Parameter], values: Mapping[str, Array]) -> float:
         """Return what it adds to the cost: zero at the origin."""
-        off = [local_coordinates(p, values[p.name], self.origin[p.name]) for p in parameters]
-        return float(self.gradient @ np.concatenate(off))
+        off = np.concatenate(
+            [local_coordinates(p, values[p.name], self.origin[p.name]) for p in parameters]
+        )
+        held = 0.0 if self.hold is None else 0.5 * float(np.sum((self.hold @ off) ** 2))
+        return float(self.gradient @ off) + held
 
     def of(self, before: Sequence[Parameter], after: Sequence[Parameter]) -> Tilt:
         """Return it for other parameters: without a gradient by those that it does not have."""
@@ -141,11 +158,12 @@ class Tilt:
     def factor(
         self, parameters: Sequence[Parameter], key_of: Mapping[str, int]
     ) -> gtsam.CustomFactor:
-        """Return a factor with this gradient, and with hardly any information.
+        """Return a factor with this gradient, and with hardly any information but the hold.
 
         The error e has half the square c + g d, so that its slope is g wherever it is.
         """
         gradient, origin = self.gradient, self.origin
+        hold = np.zeros((0, gradient.size)) if self.hold is None else self.hold
         own = list(places(parameters).values())
 
         def error(
@@ -155,15 +173,16 @@ class Tilt:
                 local_coordinates(p, value_at(at, key_of[p.name], p), origin[p.name])
                 for p in parameters
             ]
-            total = np.sqrt(2.0 * (_TILT_CONSTANT + gradient @ np.concatenate(off)))
+            every = np.concatenate(off)
+            total = np.sqrt(2.0 * (_TILT_CONSTANT + gradient @ every))
             if jacobians is not None:
                 for i, (p, each) in enumerate(zip(parameters, off, strict=True)):
-                    slope = gradient[None, own[i]] / total
+                    slope = np.vstack([gradient[None, own[i]] / total, hold[:, own[i]]])
                     by_step = slope @ inverse_right_jacobian(each) if p.rotation else slope
                     jacobians[i] = np.asfortranarray(by_step)
-            return np.array([total])
+            return np.concatenate([[total], hold @ every])
 
-        noise = gtsam.noiseModel.Unit.Create(1)
+        noise = gtsam.noiseModel.Unit.Create(1 + len(hold))
         return gtsam.CustomFactor(noise, [key_of[p.name] for p in parameters], error)
 
 

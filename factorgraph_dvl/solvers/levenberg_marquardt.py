@@ -217,10 +217,11 @@ def _shorter(
     """Return where the parabola through both ends of a step has its minimum, if that is lower.
 
     Its slope at the start is -2 times what the linear model promises. Where noise moves clocks, or
-    two of them make up for each other, whole steps lead to and fro.
+    two of them make up for each other, whole steps lead to and fro. A step that raises the cost by
+    more than it promised to lower it goes beyond what a parabola describes: damping turns it, too.
     """
     fallen = evaluation.cost - whole.cost
-    if not np.isfinite(fallen):
+    if not fallen > -promised:
         return whole
     share = promised / (2.0 * promised - fallen)
     found = problem.evaluate(evaluation.values.retract(delta.scale(share)))

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.linalg import solve_triangular
 
 from factorgraph_dvl.geometry.vectors import Array, IntArray
 from factorgraph_dvl.graph.priors import Tilt
@@ -27,6 +28,9 @@ _SAME, _LARGEST = 0.1, 3.0
 _MOST_RATIO = 0.8
 # Movement of the constants, in standard deviations, from which on another estimate follows.
 _SAME_CONSTANTS = 0.1
+# Longest step of the constants, in standard deviations of all together, that a gradient of the
+# log determinant is trusted for. Chosen: it holds over some of them.
+_TRUSTED = 3.0
 # Degrees of freedom below which a strength changes nothing else. Chosen: one.
 _FEWEST = 1.0
 # Least and largest densities, rad²/s³ and m²/s³. Chosen: the chain stays regular.
@@ -91,7 +95,9 @@ def motion_strengths(
     chain = problem.chain
     assert isinstance(chain, SmoothChain)
     evaluation = problem.weighed(minimum.evaluation)
-    information, _ = factorized(problem, evaluation)
+    # Nothing holds the constants in what follows.
+    problem.tilt = None
+    information, step = factorized(problem, evaluation)
     found = variance_components(problem, evaluation, information)
     wanted = _wanted(problem, found, phase)
     steps = {
@@ -118,10 +124,9 @@ def motion_strengths(
         problem.key(name): np.eye(gradient.size)[:, own] for name, own in problem.columns.items()
     }
     covariance = information.covariance_of([every]) if every else np.zeros((0, 0))
-    tilt = Tilt(gradient, np.sqrt(np.diag(covariance)), dict(evaluation.parameters))
-    tilted = problem.tilt.gradient if problem.tilt is not None else np.zeros(gradient.size)
-    moved = covariance @ (gradient - tilted) / np.maximum(tilt.sigma, 1e-300)
-    changed = [step * (left > _FEWEST) for step, left in wanted.values()]
+    moved = np.concatenate([step.at(key) for key in every]) if every else np.zeros(0)
+    tilt, moved = _next_tilt(evaluation.parameters, covariance, moved, gradient)
+    changed = [each * (left > _FEWEST) for each, left in wanted.values()]
     same = max((float(np.abs(c).max()) for c in changed), default=0.0) < 2.0 * _SAME
     same = same and float(np.abs(moved).max(initial=0.0)) < _SAME_CONSTANTS
     chain = replace(chain, density=density)
@@ -132,9 +137,39 @@ def motion_strengths(
         tilt,
         evaluation.states,
         values,
-        {name: step for name, (step, _) in wanted.items()},
+        {name: each for name, (each, _) in wanted.items()},
         same,
     )
+
+
+def _next_tilt(
+    values: Mapping[str, Array], covariance: Array, step: Array, gradient: Array
+) -> tuple[Tilt, Array]:
+    """Return the tilt at some values, and the step of the parameters that it asks for, in σ.
+
+    The gradient holds near by: a longer step than `_TRUSTED` is held back.
+
+    Parameters
+    ----------
+    values : mapping of str to ndarray
+        All parameters.
+    covariance : ndarray, shape (P, P)
+        Of the estimated parameters.
+    step : ndarray, shape (P,)
+        To the minimum without a tilt.
+    gradient : ndarray, shape (P,)
+        Half that of the log determinant.
+    """
+    sigma = np.sqrt(np.diag(covariance))
+    moved = (step - covariance @ gradient) / np.maximum(sigma, 1e-300)
+    correlation = covariance / np.maximum(np.outer(sigma, sigma), 1e-300)
+    root = np.linalg.cholesky(correlation)
+    inverse = np.asarray(solve_triangular(root, np.eye(sigma.size), lower=True))
+    far = float(np.linalg.norm(inverse @ moved))
+    hold = None
+    if far > _TRUSTED:
+        hold = np.sqrt(far / _TRUSTED - 1.0) * inverse / sigma
+    return Tilt(gradient, sigma, dict(values), hold), moved
 
 
 def _wanted(

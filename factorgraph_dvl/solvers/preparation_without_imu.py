@@ -547,8 +547,7 @@ def _density(v_b: Array, wanted: BoolArray, spans: tuple[float, float], interval
         if step < round(span / interval) or alike.sum() < 20:
             return np.full(3, _DENSITY)
         squares.append(np.mean((v_b[step:] - v_b[:-step])[alike] ** 2, axis=0))
-    found = np.maximum((squares[1] - squares[0]) / (spans[1] - spans[0]), 0.0)
-    return np.maximum(found, 1e-6)
+    return np.asarray(np.maximum(squares[1] / spans[1], 1e-6))
 
 
 def _left_out(trial: Trial) -> list[Finding]:

@@ -60,7 +60,7 @@ _FRUITLESS = 150
 _NOISE_ROUNDS = 4
 # Estimates of the strength of a motion's prior, and promised fall of the cost that ends a
 # minimisation before the next one. Measured: four to eight are enough.
-_MOTION_ROUNDS = 10
+_MOTION_ROUNDS = 20
 _ROUGHLY = 1e-2
 # What of a problem changes without a new one.
 _NOISE = message("not_converged.noise")
@@ -153,6 +153,10 @@ def settle(
         start = prepared.start(chain, states, report)
         states, values, iterations = start.states, start.values, start.iterations
         robust = start.robust_weights
+    parameters: tuple[Parameter, ...] = prepared.parameters
+    tilt: Tilt | None = None
+    if chain.interpolates and constants_prior is None:
+        tilt = Tilt.holding(parameters, values)
     rejected = prepared.rejected
     tried: list[Mapping[str, Array]] = []
     cycle: list[Mapping[str, Array]] = []
@@ -166,10 +170,8 @@ def settle(
     walks: BiasWalks | None = None
     freed: list[Explanation] = []
     left: Explanation | None = None
-    parameters: tuple[Parameter, ...] = prepared.parameters
     tested: tuple[Parameter, ...] | None = None
     long_run: Mapping[str, Array] = {}
-    tilt: Tilt | None = None
     motion = 0
     last_strengths: Strengths | None = None
     stated = prepared.stated_processes(chain, states, values)
@@ -304,7 +306,10 @@ def settle(
                 # With another model, all that its misfit made is to be found anew.
                 changing.append(_KNOWN)
                 robust, long_run, levels, tolerance = {}, {}, first_levels, {}
-                tilt, motion, last_strengths = None, 0, None
+                if tilt is not None:
+                    free = tuple(p for p in parameters if p.estimated)
+                    tilt = tilt.of(problem.parameters, free)
+                motion, last_strengths = 0, None
                 searches, correlation_searched, count = 0, False, 0
         if not changing and levels.estimated and minimum.converged and not chain.interpolates:
             last = levels
