@@ -127,7 +127,9 @@ class Tilt:
         free = [p for p in parameters if p.estimated]
         sigma = np.concatenate([p.sigma for p in free]) if free else np.zeros(0)
         origin = {p.name: values[p.name] for p in free}
-        return cls(np.zeros(sigma.size), sigma, origin, np.diag(_HELD / np.maximum(sigma, _FIXED_STD)))
+        return cls(
+            np.zeros(sigma.size), sigma, origin, np.diag(_HELD / np.maximum(sigma, _FIXED_STD))
+        )
 
     @property
     def constant(self) -> float:

@@ -20,6 +20,7 @@ from truth import TURNING, scenario
 from factorgraph_dvl.baselines import calibrate
 from factorgraph_dvl.errors import ConfigError, DataError
 from factorgraph_dvl.geometry.rotations import exp_so3
+from factorgraph_dvl.graph.priors import Tilt, prior_mean
 from factorgraph_dvl.io.calibration_file import encode_calibration
 from factorgraph_dvl.io.earlier_calibration import calibrated_by
 from factorgraph_dvl.io.trial_folder import load_trial, save_trial
@@ -266,3 +267,40 @@ def test_a_problem_with_a_joint_prior_is_freed():
     del problem
     gc.collect()
     assert known() is None
+
+
+def test_a_tilt_holds_parameters_where_they_are():
+    problem, values = problem_of(scenario(manoeuvres=SHORT))
+    parameters, keys = (
+        problem.parameters,
+        {p.name: problem.key(p.name) for p in problem.parameters},
+    )
+    origin = {p.name: prior_mean(p) for p in parameters}
+    sigma = np.concatenate([p.sigma for p in parameters])
+    gradient = np.arange(1.0, sigma.size + 1.0)
+    tilt = Tilt(gradient, sigma, origin, np.diag(1.0 / sigma))
+    factor = tilt.factor(parameters, keys)
+    moved = problem.evaluate(values).parameters
+    off = problem.difference(moved, origin)
+    # By hand: the gradient times the step, and half of each step over its sigma squared.
+    expected = gradient @ off + 0.5 * np.sum((off / sigma) ** 2)
+    assert tilt.cost(parameters, origin) == 0.0
+    assert tilt.cost(parameters, moved) == pytest.approx(expected, rel=1e-12)
+    assert factor.error(values) - tilt.constant == pytest.approx(expected, abs=1e-8)
+    linear = factor.linearize(values)
+    jacobian, _ = linear.jacobian()
+    assert jacobian.shape == (1 + sigma.size, sigma.size)
+    for p in parameters:
+
+        def error(step, key=keys[p.name]):
+            delta = gtsam.VectorValues()
+            delta.insert(key, step)
+            return factor.unwhitenedError(values.retract(delta))
+
+        numerical = differentiate(error, p.mean.size, step=1e-5)
+        own = jacobian[:, problem.columns[p.name]]
+        np.testing.assert_allclose(own, numerical, rtol=1e-5, atol=1e-5)
+    # Held, they stay; without a hold, the factor is the gradient alone.
+    held = Tilt.holding(parameters, origin)
+    assert held.cost(parameters, moved) > 1e6 * 0.5 * np.sum((off / sigma) ** 2)
+    assert replace(tilt, hold=None).cost(parameters, moved) == pytest.approx(gradient @ off)

@@ -103,10 +103,13 @@ def test_a_boat_with_a_gnss_compass_without_tilt():
     correction = 1.0 / (1.0 + solution.estimate("scale_error").value[0])
     assert correction == pytest.approx(0.992, abs=0.006)
     # A straight run shows no lever arm that is good enough, and none along the vertical. To
-    # starboard, 233 pings of 0.04 m/s at a yaw rate of 0.23 deg/s rms make 0.64 m.
+    # starboard, 233 pings at the recorded yaw rate of 0.23 deg/s rms are the most that can show
+    # it; part of that rate is noise of the compass, 0.3 deg from second to second.
+    noise = next(n for n in solution.noise if n.name == "dvl_velocity")
+    least = 0.05 * noise.factor[1] / (0.23 * DEG * np.sqrt(233.0))
     std = solution.estimate("lever_arm_m").std
     assert std[0] > 0.2
-    assert std[1] == pytest.approx(0.04 / (0.23 * DEG * np.sqrt(233.0)), rel=0.2)
+    assert least < std[1] < 2.0 * least
     assert std[2] > 9.0
     # An independent fit: 1.6 s.
     clock = solution.estimate("time_offset_s")
