@@ -249,12 +249,17 @@ def noise_of(problem: Problem) -> tuple[Noise, ...]:
         for process in problem.processes:
             if process.label == o.label and process.sigma.any():
                 applied = factor * problem.long_run.get(o.label, 1.0)
-                stated = _typical(weight) / applied
-                known = stated > 0.0
-                share = np.divide(process.sigma, stated, out=np.zeros(known.size), where=known)
+                stated = whole = _typical(weight) / applied
+                if o.correlated is not None and o.correlated.sigma is not None:
+                    whole = np.hypot(stated, o.correlated.sigma)
+                known = whole > 0.0
+                white, share = (
+                    np.divide(each, whole, out=np.zeros(known.size), where=known)
+                    for each in (factor * stated, process.sigma)
+                )
                 # Where only the density is known, its deviation is that of the whole.
                 join = np.maximum if process.density_only else np.hypot
-                factor = join(factor, share)
+                factor = join(white, share)
                 time = np.where(process.sigma > 0.0, process.tau, np.nan)
                 std = process.sigma
         out.append(Noise(noise_name(o.label), factor, time, std))

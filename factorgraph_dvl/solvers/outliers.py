@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 
 import numpy as np
 
 from factorgraph_dvl.geometry.vectors import Array, BoolArray
 from factorgraph_dvl.graph.problem import Evaluation, Problem
 from factorgraph_dvl.solvers.levenberg_marquardt import quick_step
-from factorgraph_dvl.statistics.robust_weights import Truncation, windows
+from factorgraph_dvl.statistics.robust_weights import Truncation, misfit, windows
 from factorgraph_dvl.statistics.square_root_information import eliminated
+from factorgraph_dvl.statistics.variance_components import LEAST_FACTOR
 
-# Share of the measurements of a kind from which on it is the model that is wrong, and none is
-# rejected. Chosen: more than all gross errors of a bad trial together.
-_TOO_MANY = 0.4
 # Measurements from which on outliers are searched. Chosen: fewer do not show their own scale.
 _FEWEST = 20
 
@@ -23,6 +22,9 @@ def robust_weights(
     problem: Problem, evaluation: Evaluation
 ) -> tuple[dict[str, Array], Evaluation] | None:
     """Return weights 0 or 1 by label, and where the rest leads; None if there is no outlier.
+
+    A sensor's measurements are rejected only if that makes all of them more likely (`misfit`):
+    truncated squares alone may split honest noise into what is small and what is not.
 
     Parameters
     ----------
@@ -37,7 +39,8 @@ def robust_weights(
     problem.robust_weights = {}
     problem.weigh(evaluation)
     used = _used(problem, groups)
-    residuals = _normalised(problem, evaluation, used, groups)
+    residuals = before = _normalised(problem, evaluation, used, groups)
+    sigma = problem.sigma(evaluation)
     search = _searches(problem, evaluation, groups)
     search = {label: truncation for label, truncation in search.items() if truncation.worth_it}
     weights: dict[str, Array] = {}
@@ -57,12 +60,18 @@ def robust_weights(
             break
         evaluation = after
         residuals = _normalised(problem, evaluation, used, groups)
-    final = {label: t.outliers(residuals[label]) for label, t in search.items()}
-    found = {
-        label: 1.0 - _with_windows(problem.observations[groups[label]].time, out, used[label])
-        for label, out in final.items()
-        if out.any() and (out & used[label]).sum() < _TOO_MANY * used[label].sum()
-    }
+    found = {}
+    for label, truncation in search.items():
+        i = groups[label]
+        out = truncation.outliers(residuals[label])
+        out = _with_windows(problem.observations[i].time, out, used[label])
+        factor = problem.noise_factors.get(label)
+        least = None if factor is None else LEAST_FACTOR / float(factor.min())
+        of_noise = partial(misfit, sigma=sigma[i], unit=problem.observations[i].unit, least=least)
+        none = np.zeros_like(out)
+        honest = min(of_noise(each[label], rejected=none) for each in (before, residuals))
+        if out.any() and of_noise(residuals[label], rejected=out) < honest:
+            found[label] = 1.0 - out
     problem.robust_weights = found
     return found, evaluation
 
@@ -105,8 +114,8 @@ def _normalised(
     return out
 
 
-def _with_windows(time: Array, out: BoolArray, used: BoolArray) -> Array:
-    """Return outliers with what lies between those that are wrong together, same shape, 0 or 1."""
+def _with_windows(time: Array, out: BoolArray, used: BoolArray) -> BoolArray:
+    """Return outliers with what lies between those that are wrong together, same shape."""
     known = used if out.shape[1] > 1 else np.asarray(used.any(axis=1, keepdims=True))
     whole = [o | windows(time, o & k, k) for o, k in zip(out.T, known.T, strict=True)]
-    return np.stack(whole, axis=1).astype(float)
+    return np.stack(whole, axis=1)

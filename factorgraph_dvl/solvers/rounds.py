@@ -183,7 +183,6 @@ def settle(
     movement = np.inf
     bound = values
     while count < _ROUNDS and fruitless < _FRUITLESS:
-        count += 1
         only_times = changing == [_TIMES]
         before = movement
         movement = _clock_movement(prepared, bound, values) if only_times else np.inf
@@ -243,6 +242,7 @@ def settle(
             if strengths.same:
                 motion = _MOTION_ROUNDS
             continue
+        count += 1
         moved = np.sqrt(np.mean((states.p_n - p_gravity) ** 2))
         if not chain.interpolates and moved > _SAME_GRAVITY:
             changing.insert(0, message("not_converged.gravity"))
@@ -290,6 +290,7 @@ def settle(
                 white = levels.factors[-1] | found.factors
                 processes = _with_others(levels.processes, found.processes)
                 levels = replace(levels, factors=(*levels.factors, white), processes=processes)
+                motion, last_strengths = 0, None
                 if any(process.label in robust for process in found.processes):
                     # What wanders for long is no outlier.
                     robust, searches = {}, 0
