@@ -95,10 +95,7 @@ def explanation(problem: Problem, minimum: Minimum, imu: Imu | None) -> Explanat
     if time[-1] - time[0] < _SHORTEST:
         return None
     evaluation, information = minimum.evaluation, minimum.information
-    tests = {
-        **_tests_of_priors(problem, evaluation, information),
-        **_tests_of_known(problem, evaluation),
-    }
+    tests = _tests(problem, evaluation, information)
     limit = _LOG10_P - np.log10(max(len(tests), 1))
     significant = [
         (p, test) for p, test in tests.values() if test.log10_p < limit and _is_plausible(p, test)
@@ -156,10 +153,10 @@ def _tests_of_priors(
     return out
 
 
-def _tests_of_known(
-    problem: Problem, evaluation: Evaluation
+def _tests(
+    problem: Problem, evaluation: Evaluation, information: SquareRootInformation
 ) -> dict[str, tuple[Parameter, Score]]:
-    """Return tests of what is taken as known, by name."""
+    """Return tests of what is taken as known, within a prior or for certain, by name."""
     used = {
         name
         for o, weight in zip(problem.observations, problem.weights, strict=True)
@@ -171,15 +168,17 @@ def _tests_of_known(
         for p in problem.all_parameters
         if not p.estimated and p.spec.plausible is not None and p.name in used
     ]
-    if not known:
+    out = _tests_of_priors(problem, evaluation, information)
+    free = [*(p for p, _ in out.values()), *known]
+    if not free:
         return {}
-    ranges, columns = _freed(problem, evaluation, known)
+    ranges, columns = _freed(problem, evaluation, free)
     found = scores(ranges.information.solution(), ranges.information, columns)
-    tests = {p.name: found.test([p.name]) for p in known}
-    if any(t.log10_p < _LOG10_P for t in tests.values()):
-        scatter = _scatter(problem.chain.node_time, ranges, columns, found)
-        tests = {name: t.divided(scatter[name]) for name, t in tests.items()}
-    return {p.name: (p, tests[p.name]) for p in known}
+    out |= {p.name: (p, found.test([p.name])) for p in known}
+    if all(test.log10_p >= _LOG10_P for _, test in out.values()):
+        return out
+    scatter = _scatter(problem.chain.node_time, ranges, columns, found)
+    return {name: (p, test.divided(scatter[name])) for name, (p, test) in out.items()}
 
 
 def _is_plausible(p: Parameter, test: Score) -> bool:
