@@ -291,13 +291,14 @@ class Trial:
         """Return the trial with stamps of GNSS less their stated time offset."""
         return self if self.gnss is None else replace(self, gnss=self.gnss.on_trial_clock())
 
-    def until(self, end: float) -> Trial:
-        """Return the records up to a time, s; a sensor that has none yet is left out."""
+    def until(self, end: float, *, since: float = -np.inf) -> Trial:
+        """Return the records between two times, s; a sensor that has none then is left out."""
 
         def cut(record: _Record | None) -> _Record | None:
-            if record is None or record.time[0] > end:
+            if record is None:
                 return None
-            return rows_of(record, record.time <= end)
+            inside = (record.time >= since) & (record.time <= end)
+            return rows_of(record, inside) if inside.any() else None
 
         others = (cut(aid) for aid in self.others)
         return replace(

@@ -34,6 +34,7 @@ from factorgraph_dvl.solvers.preparation import Prepared, prepare
 from factorgraph_dvl.solvers.preparation_without_imu import prepare_without_imu
 from factorgraph_dvl.solvers.rounds import SettledMinimum, settle
 from factorgraph_dvl.solvers.state_times import STATE_INTERVAL
+from factorgraph_dvl.solvers.stretch import started_from_stretch
 from factorgraph_dvl.solvers.summary import summarise
 from factorgraph_dvl.trial import Trial
 
@@ -128,7 +129,7 @@ def solve_with_problem(
 def _prepared(trial: Trial, state_interval_s: float, report: Progress) -> Prepared:
     """Return what the minimisation of a trial starts from."""
     if trial.imu is None:
-        return prepare_without_imu(trial)
+        return started_from_stretch(prepare_without_imu(trial), report)
     return prepare(trial, state_interval_s, report)
 
 

@@ -60,7 +60,7 @@ def robust_weights(
             break
         evaluation = after
         residuals = _normalised(problem, evaluation, used, groups)
-    found = {}
+    found: dict[str, Array] = {}
     for label, truncation in search.items():
         i = groups[label]
         out = truncation.outliers(residuals[label])
@@ -71,7 +71,7 @@ def robust_weights(
         none = np.zeros_like(out)
         honest = min(of_noise(each[label], rejected=none) for each in (before, residuals))
         if out.any() and of_noise(residuals[label], rejected=out) < honest:
-            found[label] = 1.0 - out
+            found[label] = 1.0 - out.astype(float)
     problem.robust_weights = found
     return found, evaluation
 

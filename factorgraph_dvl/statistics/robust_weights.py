@@ -18,9 +18,9 @@ _LEAST_SCALE = 0.2
 _GROWTH = 3.0
 # From which on weights are 0 or 1. Chosen: a band of 1 % about the gate is left.
 _LARGEST_MU = 50.0
-# Share of gross errors among measurements, and the range that they lie in, by unit of the residual:
-# what a rejected measurement costs hardly changes with either. Chosen: one in a hundred; any
-# direction, a vessel's area of work, twice the speed that a DVL can measure.
+# Share of gross errors among measurements, and the range that they lie in, by unit of the
+# residual: what a rejected measurement costs hardly changes with either. Chosen: one in a hundred;
+# any direction, a vessel's area of work, twice the speed that a DVL can measure.
 _SHARE = 0.01
 _RANGE = {"rad": 2.0 * np.pi, "m": 1e4, "m/s": 20.0}
 # Rejected measurements that make a window, s in which they lie, and the least share of all

@@ -1,0 +1,71 @@
+"""A stretch of a long trial without IMU, solved first: where the minimisation of all of it starts.
+
+Densities, noise and constants take ten estimates from nothing, and three or four from there.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from factorgraph_dvl.errors import DataError
+from factorgraph_dvl.graph.smooth_chain import SmoothChain
+from factorgraph_dvl.solution import Progress
+from factorgraph_dvl.solvers.preparation_without_imu import (
+    PreparationWithoutImu,
+    prepare_without_imu,
+)
+from factorgraph_dvl.solvers.rounds import settle
+
+# Length of the stretch, s, and how many of them a trial must have. Measured: an hour takes half
+# the time so, and the stretch a quarter of that.
+_LENGTH = 1200.0
+_WORTH_IT = 2.5
+
+
+def started_from_stretch(
+    prepared: PreparationWithoutImu, report: Progress
+) -> PreparationWithoutImu:
+    """Return what starts from the solution of the stretch with the most turns; as it was if short.
+
+    Parameters
+    ----------
+    prepared : PreparationWithoutImu
+        Of the whole trial.
+    report : callable
+        Called with stage, iteration and cost.
+    """
+    time = prepared.first_chain.node_time
+    if time[-1] - time[0] < _WORTH_IT * _LENGTH:
+        return prepared
+    turns = np.concatenate([[0], np.cumsum(prepared.phase > 0)])
+    last = np.searchsorted(time, time + _LENGTH)
+    inside = np.flatnonzero(last < time.size)
+    first = int(inside[np.argmax(turns[last[inside]] - turns[inside])])
+    trial = prepared.trial.until(time[last[first]], since=time[first])
+    try:
+        part = prepare_without_imu(trial)
+    except DataError:
+        # A sensor may be silent there.
+        return prepared
+    settled = settle(part, part.states, report)
+    if not settled.settled or {p.name for p in part.parameters} != {
+        p.name for p in prepared.parameters
+    }:
+        return prepared
+    chain, found = prepared.first_chain, settled.problem
+    assert isinstance(found.chain, SmoothChain)
+    density = chain.density.copy()
+    for kind in np.intersect1d(part.phase, prepared.phase):
+        density[prepared.phase == kind] = found.chain.density[part.phase == kind][0]
+    values = settled.minimum.evaluation.parameters
+    strengths = {process.name: process.sigma for process in found.processes}
+    return replace(
+        prepared,
+        first_chain=replace(chain, density=density),
+        values=prepared.values | {p.name: values[p.name] for p in prepared.parameters},
+        processes=tuple(
+            replace(p, sigma=strengths.get(p.name, p.sigma)) for p in prepared.processes
+        ),
+    )
