@@ -9,7 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from factorgraph_dvl.errors import DataError
+from factorgraph_dvl.errors import ConfigError, DataError
 from factorgraph_dvl.graph.smooth_chain import SmoothChain
 from factorgraph_dvl.solution import Progress
 from factorgraph_dvl.solvers.preparation_without_imu import (
@@ -46,7 +46,7 @@ def started_from_stretch(
     trial = prepared.trial.until(time[last[first]], since=time[first])
     try:
         part = prepare_without_imu(trial)
-    except DataError:
+    except (ConfigError, DataError):
         # A sensor may be silent there.
         return prepared
     settled = settle(part, part.states, report)

@@ -7,6 +7,7 @@ import pytest
 
 from factorgraph_dvl.statistics.robust_weights import (
     Truncation,
+    misfit,
     rejection_cost,
     robust_scale,
     windows,
@@ -93,3 +94,43 @@ def test_a_rejected_measurement_costs_half_the_gate():
         rejection_cost(np.array([[1.0], [0.0]]), 3), [0.0, 8.133], rtol=1e-3
     )
     np.testing.assert_allclose(rejection_cost(np.array([[1.0, 0.0]]), 2), [5.414], rtol=1e-3)
+
+
+def test_misfit_by_hand():
+    """Two good residuals of 1 and -1 sigma, and a gross one, of a sensor of 0.1 m/s."""
+    residuals = np.array([[1.0], [-1.0], [50.0], [np.nan]])
+    sigma = np.full((4, 1), 0.1)
+    rejected = np.array([[False], [False], [True], [False]])
+    found = misfit(residuals, sigma, rejected, "m/s", 0.1)
+    # Uniform over 20 m/s, one in a hundred: 2 log 2000.
+    expected = 2.0 * (1.0 + np.log(2.0 * np.pi * 0.1**2)) + 2.0 * np.log(2000.0)
+    assert found == pytest.approx(expected)
+    assert found < misfit(residuals, sigma, np.zeros_like(rejected), "m/s", 0.1)
+
+
+def test_gross_errors_are_worth_their_rejection_and_halves_of_honest_noise_are_not():
+    rng = np.random.default_rng(1)
+    sigma = np.full((400, 1), 0.1)
+    honest = rng.normal(0.0, 1.0, (400, 1))
+    gross = honest.copy()
+    gross[::40] += 100.0
+    # Truncated, the smaller half has a tenth of the noise, and all of the larger is beyond it.
+    mixed = honest * np.where(np.arange(400)[:, None] % 2, 0.1, 1.0)
+    for residuals, out, pays in (
+        (gross, np.abs(gross) > 10.0, True),
+        (mixed, np.abs(mixed) > 0.4, False),
+    ):
+        none = np.zeros_like(out)
+        with_all = misfit(residuals, sigma, none, "m/s", 0.01)
+        assert (misfit(residuals, sigma, out, "m/s", 0.01) < with_all) == pays
+
+
+def test_rejecting_everything_never_pays_as_noise_goes_to_zero():
+    """The price is in absolute units, so that it grows as the noise of the others falls."""
+    residuals = np.random.default_rng(2).normal(0.0, 1.0, (400, 1))
+    sigma = np.full((400, 1), 1e-3)
+    costs = [
+        misfit(residuals, sigma, np.abs(residuals) > limit, "m", None)
+        for limit in (np.inf, 1.0, 0.1, 0.01)
+    ]
+    assert np.all(np.diff(costs) > 0.0)
