@@ -51,7 +51,13 @@ from factorgraph_dvl.graph.template import jacobian_template
 from factorgraph_dvl.imu.propagation import Attachment
 from factorgraph_dvl.sensors.imu import ERRORS
 from factorgraph_dvl.sensors.parameters import Parameter
-from factorgraph_dvl.sensors.protocol import Aid, Linearization, Motion, Observation
+from factorgraph_dvl.sensors.protocol import (
+    Aid,
+    Linearization,
+    Motion,
+    Observation,
+    gross_error_cost,
+)
 
 # Stands for zero in a fixed direction, in standard deviations of the prior. Chosen: what data
 # that do not determine the direction cannot move.
@@ -509,12 +515,19 @@ class Problem:
         """Return the sums of the logarithms of the standard deviations of measurements, (M,) each.
 
         Costs of minima whose measurements weigh differently compare with these added. Zero where
-        a measurement cannot be used.
+        a measurement cannot be used; where it is rejected, what that costs beside none of its
+        residual.
         """
-        return [
-            bound.usable * np.sum(np.log(np.where(np.isfinite(sigma), sigma, 1.0)), axis=1)
-            for bound, sigma in zip(self._bound, self.sigma(evaluation), strict=True)
-        ]
+        out = []
+        for bound, sigma in zip(self._bound, self.sigma(evaluation), strict=True):
+            measured = np.isfinite(sigma)
+            logarithm = np.log(np.where(measured, sigma, 1.0))
+            robust = self.robust_weights.get(bound.observation.label)
+            if robust is not None:
+                cost = gross_error_cost(bound.observation.unit) - 0.5 * np.log(2.0 * np.pi)
+                logarithm = np.where(measured & (robust == 0.0), cost, logarithm)
+            out.append(bound.usable * np.sum(logarithm, axis=1))
+        return out
 
     def _weights(self, evaluation: Evaluation) -> list[Array]:
         """Return the weights that measurements have by their standard deviations there."""

@@ -19,7 +19,6 @@ from factorgraph_dvl.solvers.fixed_directions import SolvedProblem
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, minimise
 from factorgraph_dvl.solvers.preparation import ROUGH_TOLERANCE, Preparation, Prepared
 from factorgraph_dvl.solvers.rounds import SettledMinimum, settle
-from factorgraph_dvl.statistics.robust_weights import rejection_cost
 
 # Length, s, up to which start values may lead to a wrong minimum, and standard deviation, rad,
 # of a mounting from which on it may. Chosen:
@@ -168,18 +167,7 @@ def evidence_against(found: SolvedProblem) -> float:
 
 def _against(problem: Problem, evaluation: Evaluation) -> float:
     """Return the negative logarithm of the posterior density, but for a constant."""
-    parts = [*problem.log_sigma(evaluation), *_rejection_costs(problem)]
-    return evaluation.cost + sum(float(part.sum()) for part in parts)
-
-
-def _rejection_costs(problem: Problem) -> list[Array]:
-    """Return what outliers cost in place of their residuals, (M,) of each observation."""
-    return [
-        rejection_cost(problem.robust_weights[o.label], len(o.components))
-        if o.label in problem.robust_weights
-        else np.zeros(o.time.size)
-        for o in problem.observations
-    ]
+    return evaluation.cost + sum(float(part.sum()) for part in problem.log_sigma(evaluation))
 
 
 def cost_terms(found: SolvedProblem) -> Array:
@@ -187,18 +175,15 @@ def cost_terms(found: SolvedProblem) -> Array:
     problem, evaluation = found.problem, found.minimum.evaluation
     parts = []
     total = 0.0
-    for observation, residual, weight, log_sigma, rejected in zip(
+    for observation, residual, usable, log_sigma in zip(
         problem.observations,
         evaluation.residuals,
-        problem.weights,
+        problem.usable.values(),
         problem.log_sigma(evaluation),
-        _rejection_costs(problem),
         strict=True,
     ):
         own = 0.5 * np.sum(residual**2, axis=1)
         total += own.sum()
         gate = observation.gate or 0.0
-        parts.append(
-            np.where((weight > 0.0).any(axis=1), own, 0.5 * gate**2) + log_sigma + rejected
-        )
+        parts.append(np.where(usable, own, 0.5 * gate**2) + log_sigma)
     return np.concatenate([*parts, [evaluation.cost - total]])

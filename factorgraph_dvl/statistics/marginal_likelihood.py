@@ -78,8 +78,8 @@ def marginal_objective(
     and log det of the covariances of measurements and of their correlated errors. Left out are
     what no state, constant or noise factor of a measurement changes: n log 2 pi, and log det of
     the noise of the IMU, of walks of its biases, of a motion's prior and of the priors of
-    constants. Densities of these are compared with their log det added. A measurement that a
-    robust weight leaves out has its log sigma all the same, and no price for being left out.
+    constants. Densities of these are compared with their log det added. A rejected measurement
+    has the cost of a gross error in place of its log sigma.
 
     Parameters
     ----------

@@ -6,6 +6,7 @@ import numpy as np
 from scipy.special import chdtri
 
 from factorgraph_dvl.geometry.vectors import Array, BoolArray
+from factorgraph_dvl.sensors.protocol import gross_error_cost
 
 # Probability with which a good measurement passes the gate. Chosen: one in a thousand is lost.
 _GATE = 0.999
@@ -18,11 +19,6 @@ _LEAST_SCALE = 0.2
 _GROWTH = 3.0
 # From which on weights are 0 or 1. Chosen: a band of 1 % about the gate is left.
 _LARGEST_MU = 50.0
-# Share of gross errors among measurements, and the range that they lie in, by unit of the
-# residual: what a rejected measurement costs hardly changes with either. Chosen: one in a hundred;
-# any direction, a vessel's area of work, twice the speed that a DVL can measure.
-_SHARE = 0.01
-_RANGE = {"rad": 2.0 * np.pi, "m": 1e4, "m/s": 20.0}
 # Rejected measurements that make a window, s in which they lie, and the least share of all
 # measurements in between. Chosen: locks that are wrong together reject nearly all.
 _RUN = 5
@@ -101,28 +97,13 @@ class Truncation:
         return np.asarray(self.squares(residuals / relative) > self._gate)
 
 
-def rejection_cost(weights: Array, components: int) -> Array:
-    """Return what rejected measurements cost in place of their residuals, (M,): half the gate.
-
-    Parameters
-    ----------
-    weights : ndarray, shape (M, d) or (M, 1)
-        0 where rejected, else 1.
-    components : int
-        Number d of components.
-    """
-    freedom = 1 if weights.shape[1] == components else components
-    return 0.5 * chdtri(freedom, 1.0 - _GATE) * np.sum(1.0 - weights, axis=1)
-
-
 def misfit(
     residuals: Array, sigma: Array, rejected: BoolArray, unit: str, least: float | None
 ) -> float:
     """Return -2 log of the likelihood of measurements of which some are gross errors.
 
-    Those follow a uniform density over the sensor's range, so that each costs the same, in
-    absolute units, whatever the noise of the others; it carries no log sigma. The noise of the
-    others is as large as their residuals.
+    Each of these costs the same, in absolute units (`gross_error_cost`); it carries no log sigma.
+    The noise of the others is as large as their residuals.
 
     Parameters
     ----------
@@ -145,7 +126,7 @@ def misfit(
     if least is not None:
         scale = np.maximum(np.sqrt(squares / np.maximum(count, 1)), least)
     noise = squares / scale**2 + count * (2.0 * np.log(scale) + np.log(2.0 * np.pi))
-    price = 2.0 * np.log(_RANGE.get(unit, _RANGE["m"]) / _SHARE)
+    price = 2.0 * gross_error_cost(unit)
     volume = 2.0 * np.log(sigma, out=np.zeros(used.shape), where=used).sum()
     return float(noise.sum() + volume + price * np.sum(known & rejected))
 

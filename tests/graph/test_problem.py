@@ -347,3 +347,19 @@ def test_initial_priors_are_east_north_up_and_roll_pitch_heading():
         values = gtsam.Values()
         values.insert(keys.node(0), state)
         assert prior.error(values) == pytest.approx(0.5e-6, rel=1e-3)
+
+
+def test_a_rejected_measurement_costs_a_gross_error_in_place_of_its_log_sigma():
+    problem, values = problem_of(scenario(manoeuvres=SHORT))
+    evaluation = problem.evaluate(values)
+    before = dict(zip(problem.usable, problem.log_sigma(evaluation), strict=True))
+    weights = np.ones((before["DVL velocity"].size, 1))
+    weights[3] = 0.0
+    problem.robust_weights = {"DVL velocity": weights}
+    after = dict(zip(problem.usable, problem.log_sigma(evaluation), strict=True))
+    # Uniform over 20 m/s, one in a hundred, beside the sqrt(2 pi) of all others.
+    expected = 3.0 * (np.log(20.0 / 0.01) - 0.5 * np.log(2.0 * np.pi))
+    assert after["DVL velocity"][3] == pytest.approx(expected)
+    changed = {label for label in before if np.any(before[label] != after[label])}
+    assert changed == {"DVL velocity"}
+    assert np.count_nonzero(before["DVL velocity"] != after["DVL velocity"]) == 1

@@ -19,11 +19,9 @@ SEEDS = int(os.environ.get("FACTORGRAPH_DVL_SEEDS", "20"))
 
 def test_a_ping_counts_as_evidence_by_any_of_its_beams():
     residual = np.array([[0.0, 3.0, 4.0], [0.0, 0.0, 0.0]])
-    weight = np.array([[0.0, 1.0, 1.0], [0.0, 0.0, 0.0]])
     problem = SimpleNamespace(
         observations=[SimpleNamespace(gate=2.0, label="Range", time=np.zeros(2))],
-        robust_weights={},
-        weights=[weight],
+        usable={"Range": np.array([True, False])},
         log_sigma=lambda _: [np.array([3.0, 0.0])],
     )
     minimum = SimpleNamespace(evaluation=SimpleNamespace(residuals=[residual], cost=20.0))

@@ -8,7 +8,6 @@ import pytest
 from factorgraph_dvl.statistics.robust_weights import (
     Truncation,
     misfit,
-    rejection_cost,
     robust_scale,
     windows,
 )
@@ -87,13 +86,6 @@ def test_windows_join_what_is_wrong_together():
     assert inside.sum() == 30
     # Few and far between, as of a sensor that measures seldom, they are no window.
     assert not windows(20.0 * time, rejected, used).any()
-
-
-def test_a_rejected_measurement_costs_half_the_gate():
-    np.testing.assert_allclose(
-        rejection_cost(np.array([[1.0], [0.0]]), 3), [0.0, 8.133], rtol=1e-3
-    )
-    np.testing.assert_allclose(rejection_cost(np.array([[1.0, 0.0]]), 2), [5.414], rtol=1e-3)
 
 
 def test_misfit_by_hand():
