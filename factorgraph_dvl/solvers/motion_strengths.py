@@ -109,9 +109,14 @@ def motion_strengths(
         for label, factor in problem.noise_factors.items()
     }
     density = chain.density.copy()
+    changed = {name: each * (left > _FEWEST) for name, (each, left) in wanted.items()}
     for kind in np.unique(phase).tolist():
-        own = density[phase == kind] * np.exp(steps[f"{chain.step_source} {kind}"])
-        density[phase == kind] = np.clip(own, _LEAST, _MOST)
+        name = f"{chain.step_source} {kind}"
+        before_it = density[phase == kind][0]
+        after = np.clip(before_it * np.exp(steps[name]), _LEAST, _MOST)
+        density[phase == kind] = after
+        # At a bound, what is asked for beyond it changes nothing.
+        changed[name] = np.where(after == before_it, 0.0, changed[name])
     processes, values = [], dict(evaluation.parameters)
     for process in problem.processes:
         if process.name in steps:
@@ -126,8 +131,7 @@ def motion_strengths(
     covariance = information.covariance_of([every]) if every else np.zeros((0, 0))
     moved = np.concatenate([step.at(key) for key in every]) if every else np.zeros(0)
     tilt, moved = _next_tilt(evaluation.parameters, covariance, moved, gradient)
-    changed = [each * (left > _FEWEST) for each, left in wanted.values()]
-    same = max((float(np.abs(c).max()) for c in changed), default=0.0) < 2.0 * _SAME
+    same = max((float(np.abs(c).max()) for c in changed.values()), default=0.0) < 2.0 * _SAME
     same = same and float(np.abs(moved).max(initial=0.0)) < _SAME_CONSTANTS
     chain = replace(chain, density=density)
     return Strengths(

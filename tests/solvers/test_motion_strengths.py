@@ -10,6 +10,7 @@ from truth import CONFIGS
 from factorgraph_dvl.geometry.rotations import log_so3
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.simulation import load_scenario, simulate
+from factorgraph_dvl.solvers import motion_strengths
 from factorgraph_dvl.solvers.preparation_without_imu import prepare_without_imu
 from factorgraph_dvl.solvers.rounds import settle
 
@@ -63,3 +64,18 @@ def test_the_noise_is_found(settled):
     )
     np.testing.assert_allclose(np.median(sigma["DVL velocity"], axis=0), 0.05, rtol=0.2)
     assert factors["Attitude"].max() < 1.0
+
+
+@pytest.mark.parametrize("at_bound", [True, False])
+def test_a_density_at_its_bound_changes_no_more(settled, monkeypatch, at_bound):
+    """Residuals may ask for less for ever: another estimate would be the same."""
+    problem, density = settled.problem, settled.problem.chain.density
+    as_it_is = {label: (0.0 * f, 100.0 + 0.0 * f) for label, f in problem.noise_factors.items()}
+    less = {f"{problem.chain.step_source} 0": (-np.ones(6), np.full(6, 100.0))}
+    monkeypatch.setattr(motion_strengths, "_wanted", lambda *_: as_it_is | less)
+    if at_bound:
+        monkeypatch.setattr(motion_strengths, "_LEAST", density[0])
+    phase = np.zeros(len(density), dtype=int)
+    found = motion_strengths.motion_strengths(problem, settled.minimum, phase)
+    assert found.same == at_bound
+    assert np.array_equal(found.chain.density[0], density[0]) == at_bound
