@@ -49,6 +49,7 @@ from factorgraph_dvl.graph.priors import (
 from factorgraph_dvl.graph.processes import Process, in_time_order
 from factorgraph_dvl.graph.template import jacobian_template
 from factorgraph_dvl.imu.propagation import Attachment
+from factorgraph_dvl.sensors.gross_errors import gross_errors
 from factorgraph_dvl.sensors.imu import ERRORS
 from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.sensors.protocol import (
@@ -56,7 +57,6 @@ from factorgraph_dvl.sensors.protocol import (
     Linearization,
     Motion,
     Observation,
-    gross_error_cost,
 )
 
 # Stands for zero in a fixed direction, in standard deviations of the prior. Chosen: what data
@@ -515,17 +515,22 @@ class Problem:
         """Return the sums of the logarithms of the standard deviations of measurements, (M,) each.
 
         Costs of minima whose measurements weigh differently compare with these added. Zero where
-        a measurement cannot be used; where it is rejected, what that costs beside none of its
-        residual.
+        a measurement cannot be used; where it is rejected, the cost of a gross error.
         """
         out = []
-        for bound, sigma in zip(self._bound, self.sigma(evaluation), strict=True):
+        for bound, motion, sigma in zip(
+            self._bound, evaluation.motions, self.sigma(evaluation), strict=True
+        ):
             measured = np.isfinite(sigma)
             logarithm = np.log(np.where(measured, sigma, 1.0))
             robust = self.robust_weights.get(bound.observation.label)
             if robust is not None:
-                cost = gross_error_cost(bound.observation.unit) - 0.5 * np.log(2.0 * np.pi)
-                logarithm = np.where(measured & (robust == 0.0), cost, logarithm)
+                error = self.residual(bound.observation, motion, evaluation.parameters)
+                wrong = robust == 0.0
+                cost = gross_errors(
+                    np.where(measured, error, np.nan), sigma, wrong, bound.observation.unit
+                )
+                logarithm = np.where(wrong & measured, cost - 0.5 * np.log(2.0 * np.pi), logarithm)
             out.append(bound.usable * np.sum(logarithm, axis=1))
         return out
 

@@ -27,11 +27,6 @@ NoiseModel = Literal["estimated", "stated"]
 # the first by chance, and no data sheet is wrong by the second.
 TOO_LARGE = 1.3
 DO_NOT_FIT = 10.0
-# Share of gross errors among measurements, and the range that they lie in, by unit of the
-# residual: what a rejected measurement costs hardly changes with either. Chosen: one in a hundred;
-# any direction, a vessel's area of work, twice the speed that a DVL can measure.
-_GROSS_SHARE = 0.01
-_GROSS_RANGE = {"rad": 2.0 * np.pi, "m": 1e4, "m/s": 20.0}
 # Derivatives by the motion, as `Linearization` names them.
 _BY_MOTION = ("d_theta", "d_p", "d_v", "d_omega")
 # Correlation time where none is stated, s. Chosen: that of multipath and atmosphere.
@@ -127,15 +122,6 @@ class SensorClock(Protocol):
 
     def lag(self, time: Array, values: Values, zero: float) -> Array:
         """Return stamps minus true times, (M,), s."""
-
-
-def gross_error_cost(unit: str) -> float:
-    """Return -log of the probability density of a gross error, in a unit of residuals.
-
-    It is uniform over the range of the sensor, so that a rejected measurement costs the same
-    whatever the noise of the others.
-    """
-    return float(np.log(_GROSS_RANGE.get(unit, _GROSS_RANGE["m"]) / _GROSS_SHARE))
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,12 @@ import numpy as np
 from factorgraph_dvl.geometry.vectors import Array, BoolArray
 from factorgraph_dvl.graph.problem import Evaluation, Problem
 from factorgraph_dvl.solvers.levenberg_marquardt import quick_step
-from factorgraph_dvl.statistics.robust_weights import Truncation, misfit, windows
+from factorgraph_dvl.statistics.robust_weights import (
+    Truncation,
+    misfit,
+    persistent_misfit,
+    windows,
+)
 from factorgraph_dvl.statistics.square_root_information import eliminated
 from factorgraph_dvl.statistics.variance_components import LEAST_FACTOR
 
@@ -68,8 +73,13 @@ def robust_weights(
         factor = problem.noise_factors.get(label)
         least = None if factor is None else LEAST_FACTOR / float(factor.min())
         of_noise = partial(misfit, sigma=sigma[i], unit=problem.observations[i].unit, least=least)
-        none = np.zeros_like(out)
-        honest = min(of_noise(each[label], rejected=none) for each in (before, residuals))
+        honest = min(
+            min(
+                of_noise(each, rejected=np.zeros_like(out)),
+                persistent_misfit(each, sigma[i], least),
+            )
+            for each in (before[label], residuals[label])
+        )
         if out.any() and of_noise(residuals[label], rejected=out) < honest:
             found[label] = 1.0 - out.astype(float)
     problem.robust_weights = found

@@ -6,7 +6,7 @@ import numpy as np
 from scipy.special import chdtri
 
 from factorgraph_dvl.geometry.vectors import Array, BoolArray
-from factorgraph_dvl.sensors.protocol import gross_error_cost
+from factorgraph_dvl.sensors.gross_errors import gross_errors, steps
 
 # Probability with which a good measurement passes the gate. Chosen: one in a thousand is lost.
 _GATE = 0.999
@@ -102,8 +102,7 @@ def misfit(
 ) -> float:
     """Return -2 log of the likelihood of measurements of which some are gross errors.
 
-    Each of these costs the same, in absolute units (`gross_error_cost`); it carries no log sigma.
-    The noise of the others is as large as their residuals.
+    The noise of the others is white and as large as their residuals.
 
     Parameters
     ----------
@@ -118,17 +117,34 @@ def misfit(
     least : float, optional
         Least noise, in standard deviations; None where they are final as they are.
     """
+    good = np.where(rejected, np.nan, residuals)
+    scale = _level(good, least)
+    wrong = gross_errors(residuals * sigma, sigma * scale, rejected, unit)
+    return _noise(good, sigma, scale) + 2.0 * float(wrong.sum())
+
+
+def persistent_misfit(residuals: Array, sigma: Array, least: float | None) -> float:
+    """Return -2 log of the likelihood of measurements whose noise persists, none a gross error.
+
+    What is white is the step from one to the next. Parameters as in `misfit`.
+    """
+    step, spread = steps(residuals * sigma, sigma)
+    return _noise(step / spread, spread, _level(step / spread, least))
+
+
+def _level(residuals: Array, least: float | None) -> Array:
+    """Return the root mean square (d,) of residuals (M, d), `least` at least; ones if None."""
+    if least is None:
+        return np.ones(residuals.shape[1])
+    count = np.isfinite(residuals).sum(axis=0)
+    return np.maximum(np.sqrt(np.nansum(residuals**2, axis=0) / np.maximum(count, 1)), least)
+
+
+def _noise(residuals: Array, sigma: Array, scale: Array) -> float:
+    """Return -2 log of the likelihood of white noise `scale` (d,) times as large as `sigma`."""
     known = np.isfinite(residuals)
-    used = known & ~rejected
-    count = used.sum(axis=0)
-    squares = np.sum(np.where(used, residuals, 0.0) ** 2, axis=0)
-    scale = np.ones(count.size)
-    if least is not None:
-        scale = np.maximum(np.sqrt(squares / np.maximum(count, 1)), least)
-    noise = squares / scale**2 + count * (2.0 * np.log(scale) + np.log(2.0 * np.pi))
-    price = 2.0 * gross_error_cost(unit)
-    volume = 2.0 * np.log(sigma, out=np.zeros(used.shape), where=used).sum()
-    return float(noise.sum() + volume + price * np.sum(known & rejected))
+    cost = (residuals / scale) ** 2 + 2.0 * np.log(sigma * scale) + np.log(2.0 * np.pi)
+    return float(np.sum(cost, where=known))
 
 
 def windows(time: Array, rejected: BoolArray, used: BoolArray) -> BoolArray:

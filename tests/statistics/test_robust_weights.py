@@ -8,6 +8,7 @@ import pytest
 from factorgraph_dvl.statistics.robust_weights import (
     Truncation,
     misfit,
+    persistent_misfit,
     robust_scale,
     windows,
 )
@@ -126,3 +127,29 @@ def test_rejecting_everything_never_pays_as_noise_goes_to_zero():
         for limit in (np.inf, 1.0, 0.1, 0.01)
     ]
     assert np.all(np.diff(costs) > 0.0)
+
+
+def test_persistent_misfit_by_hand():
+    """Two steps, of 1 and -2 m/s, each with the noise of two measurements of 0.1 m/s."""
+    residuals = np.array([[0.0], [10.0], [np.nan], [-10.0]])
+    sigma = np.full((4, 1), 0.1)
+    spread = 0.1 * np.sqrt(2.0)
+    expected = (1.0 + 4.0) / spread**2 + 2.0 * np.log(2.0 * np.pi * spread**2)
+    assert persistent_misfit(residuals, sigma, None) == pytest.approx(expected)
+
+
+def test_a_jump_is_worth_its_rejection_and_a_slow_error_is_not():
+    """Both leave the rest larger than their steps; the jump has but two steps."""
+    white = np.random.default_rng(3).normal(0.0, 0.3, (400, 1))
+    sigma = np.full((400, 1), 0.1)
+    jump, slow = white.copy(), white.copy()
+    jump[100:200] += 30.0
+    slow += 30.0 * np.sin(np.linspace(0.0, 6.0, 400))[:, None]
+    for residuals, pays in ((jump, True), (slow, False)):
+        out = np.abs(residuals) > 10.0
+        rejecting = misfit(residuals, sigma, out, "m/s", 0.1)
+        honest = min(
+            misfit(residuals, sigma, np.zeros_like(out), "m/s", 0.1),
+            persistent_misfit(residuals, sigma, 0.1),
+        )
+        assert (rejecting < honest) == pays
