@@ -29,7 +29,7 @@ import common
 import numpy as np
 import psutil
 
-from factorgraph_dvl.io.trial_folder import save_trial
+from factorgraph_dvl.files.trial_folder import save_trial
 from factorgraph_dvl.simulation import parse_scenario, simulate
 from factorgraph_dvl.simulation.scenario import Scenario
 

@@ -27,8 +27,8 @@ from fault_rows import MOTIONS, ROWS, SCENARIOS, Row
 
 from factorgraph_dvl.analysis.error_statistics import calibration_errors, trajectory_errors
 from factorgraph_dvl.errors import FactorgraphDvlError
+from factorgraph_dvl.files.trial_folder import load_trial, save_trial
 from factorgraph_dvl.graph.problem import Problem
-from factorgraph_dvl.io.trial_folder import load_trial, save_trial
 from factorgraph_dvl.simulation import faults as f
 from factorgraph_dvl.simulation import parse_scenario, simulate
 from factorgraph_dvl.solution import Solution

@@ -19,10 +19,10 @@ from common import config, rms
 from factorgraph_dvl.analysis.dead_reckoning.before_after import BeforeAfter, before_after
 from factorgraph_dvl.analysis.error_statistics import trajectory_errors
 from factorgraph_dvl.baselines import sins
+from factorgraph_dvl.files.earlier_calibration import calibrated_by
 from factorgraph_dvl.geometry.units import DEG_PER_HOUR
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.imu.attitude_history import AttitudeHistory
-from factorgraph_dvl.io.earlier_calibration import calibrated_by
 from factorgraph_dvl.report.figures.dead_reckoning import errors_figure, lever_arm_figure
 from factorgraph_dvl.report.figures.drawing import save_figures
 from factorgraph_dvl.simulation import parse_scenario, simulate

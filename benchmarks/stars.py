@@ -20,7 +20,7 @@ from factorgraph_dvl.analysis.error_statistics import (
     nees_band,
     trajectory_errors,
 )
-from factorgraph_dvl.io.earlier_calibration import calibrated_by, with_biases_of
+from factorgraph_dvl.files.earlier_calibration import calibrated_by, with_biases_of
 from factorgraph_dvl.sensors.records import rows_of
 from factorgraph_dvl.simulation import parse_scenario, simulate
 from factorgraph_dvl.solution import Calibration, Estimate, Solution

@@ -47,16 +47,16 @@ if TYPE_CHECKING:
         FactorgraphDvlError,
         SolveError,
     )
+    from factorgraph_dvl.files.calibration_file import load_calibration
+    from factorgraph_dvl.files.solution_folder import load_solution, save_solution
+    from factorgraph_dvl.files.trial_folder import load_trial, save_trial
+    from factorgraph_dvl.files.trial_tables import trial_from_tables
     from factorgraph_dvl.geometry.earth import LocalFrame
     from factorgraph_dvl.graph.problem import Problem
     from factorgraph_dvl.graph.sensor_check import check_sensor
     from factorgraph_dvl.graph.sensor_factor import measured_nodes, sensor_factor
     from factorgraph_dvl.imu.attitude_history import AttitudeHistory
     from factorgraph_dvl.imu.preintegration import preintegrate
-    from factorgraph_dvl.io.calibration_file import load_calibration
-    from factorgraph_dvl.io.solution_folder import load_solution, save_solution
-    from factorgraph_dvl.io.trial_folder import load_trial, save_trial
-    from factorgraph_dvl.io.trial_tables import trial_from_tables
     from factorgraph_dvl.planning.prediction import predict
     from factorgraph_dvl.quality.survey import survey
     from factorgraph_dvl.replay.session import Replay
@@ -101,23 +101,23 @@ _PUBLIC = {
     "information_of": "campaign.information",
     "joint_calibration": "campaign.joint_calibration",
     "kalman": "baselines.calibration",
-    "load_calibration": "io.calibration_file",
+    "load_calibration": "files.calibration_file",
     "load_scenario": "simulation.scenario",
-    "load_solution": "io.solution_folder",
-    "load_trial": "io.trial_folder",
+    "load_solution": "files.solution_folder",
+    "load_trial": "files.trial_folder",
     "measured_nodes": "graph.sensor_factor",
     "mounting_of": "analysis.dead_reckoning.integration",
     "observability": "analysis.information.observability",
     "predict": "planning.prediction",
     "preintegrate": "imu.preintegration",
-    "save_solution": "io.solution_folder",
-    "save_trial": "io.trial_folder",
+    "save_solution": "files.solution_folder",
+    "save_trial": "files.trial_folder",
     "sensor_factor": "graph.sensor_factor",
     "simulate": "simulation",
     "solve": "solvers.batch",
     "solved_problems": "solvers.batch",
     "survey": "quality.survey",
-    "trial_from_tables": "io.trial_tables",
+    "trial_from_tables": "files.trial_tables",
 }
 
 __all__ = [

@@ -25,7 +25,7 @@ from factorgraph_dvl.sensors.verdict import Verdict, verdict_of
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-    from factorgraph_dvl.io.data_frames import FrameTable
+    from factorgraph_dvl.files.data_frames import FrameTable
     from factorgraph_dvl.report.figures.drawing import Canvas
     from factorgraph_dvl.trial import Trial
 
@@ -470,7 +470,7 @@ class Solution(Judged):
         ConfigError
             If there is no such table, or pandas is not installed (extra `notebook`).
         """
-        from factorgraph_dvl.io.data_frames import to_dataframe
+        from factorgraph_dvl.files.data_frames import to_dataframe
 
         return to_dataframe(self, table)
 
@@ -485,7 +485,7 @@ class Solution(Judged):
         ConfigError
             If xarray is not installed (extra `notebook`).
         """
-        from factorgraph_dvl.io.data_frames import to_xarray
+        from factorgraph_dvl.files.data_frames import to_xarray
 
         return to_xarray(self)
 

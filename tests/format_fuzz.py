@@ -25,7 +25,7 @@ import format_writers as writers
 import numpy as np
 
 from factorgraph_dvl.errors import DataError
-from factorgraph_dvl.io.formats.catalogue import FORMATS
+from factorgraph_dvl.files.formats.catalogue import FORMATS
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 LIMIT = 1 << 16

@@ -85,9 +85,9 @@ CAPABILITIES = (
     (
         "trial and solution folders",
         "io/*",
-        "io/*",
-        "io/formats/* io/importing/* io/exporting/* io/data_frames io/output_file io/run_file "
-        "io/residual_table io/earlier_calibration",
+        "files/*",
+        "files/formats/* files/importing/* files/exporting/* files/data_frames files/output_file "
+        "files/run_file files/residual_table files/earlier_calibration",
     ),
     (
         "plausibility of records",

@@ -102,7 +102,7 @@ def test_no_module_starts_threads_or_copies_of_its_process():
             if name != "threading" or not {a.name for a in node.names} <= LOCKS
         }
         assert not names & {"threading", "_thread", "multiprocessing", "concurrent"}, parts
-        assert "ctypes" not in names or parts == ("io", "folders"), parts
+        assert "ctypes" not in names or parts == ("files", "folders"), parts
         assert not any(word in source for word in ("fork(", "preexec_fn", "Executor(")), parts
 
 

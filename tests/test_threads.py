@@ -14,8 +14,8 @@ import pytest
 from kinds import TRIALS
 
 from factorgraph_dvl.errors import DataError
-from factorgraph_dvl.io.folders import claim
-from factorgraph_dvl.io.trial_folder import save_trial
+from factorgraph_dvl.files.folders import claim
+from factorgraph_dvl.files.trial_folder import save_trial
 
 _PROGRAMS = Path(__file__).with_name("thread_programs.py")
 _PACKAGE = Path(__file__).resolve().parent.parent / "factorgraph_dvl"

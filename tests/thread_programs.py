@@ -30,7 +30,7 @@ _MORE = 3
 def first_use(in_main: str, trial: Path) -> str:
     """Load a trial, parse its settings and import the solvers, all for the first time."""
     # Otherwise the parsers would only wait for the import of what they parse with.
-    files_of = import_module("factorgraph_dvl.io.trial_folder").files_of
+    files_of = import_module("factorgraph_dvl.files.trial_folder").files_of
 
     def load() -> Any:
         return digest(factorgraph_dvl.load_trial(trial))

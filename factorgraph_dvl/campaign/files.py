@@ -17,9 +17,9 @@ from factorgraph_dvl.campaign.seed_run import SEEDS_FOLDER, SeedRecord
 from factorgraph_dvl.campaign.trial_run import TRIALS_FOLDER
 from factorgraph_dvl.campaign.trials import Campaign
 from factorgraph_dvl.errors import as_text
+from factorgraph_dvl.files.calibration_file import CALIBRATION_FILE, encode_calibration
+from factorgraph_dvl.files.tables import write_table
 from factorgraph_dvl.geometry.vectors import Array
-from factorgraph_dvl.io.calibration_file import CALIBRATION_FILE, encode_calibration
-from factorgraph_dvl.io.tables import write_table
 from factorgraph_dvl.solution import OBSERVABLE, Calibration, Estimate
 
 CAMPAIGN_FILE = "campaign.json"

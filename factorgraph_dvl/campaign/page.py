@@ -14,8 +14,8 @@ from factorgraph_dvl.campaign.monte_carlo import MonteCarlo, Statistic
 from factorgraph_dvl.campaign.record import write_whole
 from factorgraph_dvl.campaign.trial_run import TRIALS_FOLDER
 from factorgraph_dvl.campaign.trials import Campaign, CampaignTrial
+from factorgraph_dvl.files.calibration_file import CALIBRATION_FILE
 from factorgraph_dvl.geometry.vectors import Array
-from factorgraph_dvl.io.calibration_file import CALIBRATION_FILE
 from factorgraph_dvl.report.figures.drawing import VERDICT_COLOURS
 from factorgraph_dvl.report.html.markup import (
     Cell,

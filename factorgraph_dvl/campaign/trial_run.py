@@ -24,9 +24,9 @@ from factorgraph_dvl.campaign.record import (
     write_record,
 )
 from factorgraph_dvl.errors import FactorgraphDvlError, as_text
-from factorgraph_dvl.io.calibration_file import CALIBRATION_FILE, load_calibration
-from factorgraph_dvl.io.trial_folder import files_of, locate
-from factorgraph_dvl.io.trial_yaml import TrialSettings
+from factorgraph_dvl.files.calibration_file import CALIBRATION_FILE, load_calibration
+from factorgraph_dvl.files.trial_folder import files_of, locate
+from factorgraph_dvl.files.trial_yaml import TrialSettings
 from factorgraph_dvl.sensors.dvl import CALIBRATED, DvlSettings
 from factorgraph_dvl.settings.yaml_file import parse_yaml, read_text
 

@@ -29,8 +29,8 @@ def allan(
       factorgraph-dvl allan static.csv --out allan
     """
     from factorgraph_dvl.analysis.static_noise import static_noise
-    from factorgraph_dvl.io.folders import new_folder
-    from factorgraph_dvl.io.tables import read_table
+    from factorgraph_dvl.files.folders import new_folder
+    from factorgraph_dvl.files.tables import read_table
     from factorgraph_dvl.report.files.imu_noise import imu_yaml, noise_table
     from factorgraph_dvl.report.text import figure_files
     from factorgraph_dvl.sensors.imu import COLUMNS, Imu, ImuSettings

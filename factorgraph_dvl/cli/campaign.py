@@ -60,7 +60,7 @@ def campaign(
     """
     from factorgraph_dvl.campaign.files import CAMPAIGN_FILE, OWNED
     from factorgraph_dvl.errors import ConfigError
-    from factorgraph_dvl.io.folders import SETTINGS_FILE
+    from factorgraph_dvl.files.folders import SETTINGS_FILE
 
     if workers is not None and scheduler is not None:
         raise ConfigError("--workers and --scheduler exclude each other", expected="one of them")
@@ -112,7 +112,7 @@ def _run_trials(
         labels_of,
         read_covariates,
     )
-    from factorgraph_dvl.io.calibration_file import CALIBRATION_FILE
+    from factorgraph_dvl.files.calibration_file import CALIBRATION_FILE
 
     follow = {} if covariates is None else read_covariates(covariates)
     # Before hours of solving, not after.

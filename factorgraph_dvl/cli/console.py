@@ -204,7 +204,7 @@ def _live_line(*columns: ProgressColumn, quiet: bool) -> Progress:
 
 def print_written(out: Path) -> None:
     """List the files that this run wrote to a folder."""
-    from factorgraph_dvl.io.folders import files_written
+    from factorgraph_dvl.files.folders import files_written
 
     written = files_written(out)
     if events.active():

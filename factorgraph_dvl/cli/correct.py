@@ -29,13 +29,13 @@ def correct(
 
     from factorgraph_dvl.analysis.beam_quality import calibration_of, check_same_instrument
     from factorgraph_dvl.errors import DataError
-    from factorgraph_dvl.io.calibration_file import check_usable, load_calibration
-    from factorgraph_dvl.io.corrected_record import (
+    from factorgraph_dvl.files.calibration_file import check_usable, load_calibration
+    from factorgraph_dvl.files.corrected_record import (
         OWNED,
         save_corrected,
         save_corrected_dvl,
     )
-    from factorgraph_dvl.io.trial_folder import inputs_of, load_trial
+    from factorgraph_dvl.files.trial_folder import inputs_of, load_trial
     from factorgraph_dvl.sensors.dvl import CALIBRATED, MISALIGNMENT
     from factorgraph_dvl.sensors.dvl_beams import DvlBeams
 

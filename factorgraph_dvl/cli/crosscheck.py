@@ -64,11 +64,11 @@ def crosscheck(
     """
     from factorgraph_dvl.analysis.comparison.crosscheck import crosscheck as compare
     from factorgraph_dvl.errors import as_text
-    from factorgraph_dvl.io.calibration_file import check_verdict
-    from factorgraph_dvl.io.external_results import load_results, load_truth
-    from factorgraph_dvl.io.folders import new_folder
-    from factorgraph_dvl.io.tables import write_table
-    from factorgraph_dvl.io.trial_folder import inputs_of
+    from factorgraph_dvl.files.calibration_file import check_verdict
+    from factorgraph_dvl.files.external_results import load_results, load_truth
+    from factorgraph_dvl.files.folders import new_folder
+    from factorgraph_dvl.files.tables import write_table
+    from factorgraph_dvl.files.trial_folder import inputs_of
     from factorgraph_dvl.report.files.crosscheck import OWNED, difference_columns, to_csv, to_json
 
     given = [path for path in (a, b, reference, truth) if path is not None]

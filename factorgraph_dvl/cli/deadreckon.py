@@ -73,11 +73,11 @@ def deadreckon(
     """
     from factorgraph_dvl.analysis.dead_reckoning.before_after import before_after
     from factorgraph_dvl.errors import as_text
-    from factorgraph_dvl.io.external_results import own_calibration, read_calibration_values
-    from factorgraph_dvl.io.folders import new_folder
-    from factorgraph_dvl.io.motion_table import motion_columns
-    from factorgraph_dvl.io.tables import write_table
-    from factorgraph_dvl.io.trial_folder import inputs_of, load_trial
+    from factorgraph_dvl.files.external_results import own_calibration, read_calibration_values
+    from factorgraph_dvl.files.folders import new_folder
+    from factorgraph_dvl.files.motion_table import motion_columns
+    from factorgraph_dvl.files.tables import write_table
+    from factorgraph_dvl.files.trial_folder import inputs_of, load_trial
     from factorgraph_dvl.quality.refusal import explained
     from factorgraph_dvl.report.files.dead_reckoning import (
         OWNED,
@@ -188,8 +188,8 @@ def _attitude(
             )  # fmt: skip
         history = AttitudeHistory(trial.inertial, trial.reference, trial.body_axes, np.zeros(3))
         return history.at, ()
-    from factorgraph_dvl.io.calibration_file import check_verdict
-    from factorgraph_dvl.io.solution_folder import load_solution
+    from factorgraph_dvl.files.calibration_file import check_verdict
+    from factorgraph_dvl.files.solution_folder import load_solution
 
     if not Path(source).is_dir():
         raise ConfigError(

@@ -36,7 +36,7 @@ def demo(
     import webbrowser
     from importlib.resources import as_file, files
 
-    from factorgraph_dvl.io.solution_folder import REPORT_FILE
+    from factorgraph_dvl.files.solution_folder import REPORT_FILE
 
     if (out / "trial.yaml").exists():
         raise DataError("contains a trial", where=str(out), expected="a new folder")

@@ -14,7 +14,7 @@ from factorgraph_dvl.cli.options import Force
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from factorgraph_dvl.io.exporting.motion import ExportedMotion
+    from factorgraph_dvl.files.exporting.motion import ExportedMotion
 
 
 class ExportFormat(StrEnum):
@@ -65,8 +65,8 @@ def export(
 
       factorgraph-dvl export trial --to pd0
     """
-    from factorgraph_dvl.io.exporting.trial import export_trial
-    from factorgraph_dvl.io.folders import SETTINGS_FILE
+    from factorgraph_dvl.files.exporting.trial import export_trial
+    from factorgraph_dvl.files.folders import SETTINGS_FILE
 
     if folder.name == SETTINGS_FILE or (folder / SETTINGS_FILE).is_file():
         written, notes = export_trial(folder, to.value, out, force=force)
@@ -79,10 +79,10 @@ def export(
 
 def _export_solution(folder: Path, to: ExportFormat, out: Path | None, *, force: bool) -> None:
     from factorgraph_dvl.errors import ConfigError
-    from factorgraph_dvl.io.exporting.motion import exported_motion
-    from factorgraph_dvl.io.output_file import check_new_file, write_file
-    from factorgraph_dvl.io.run_file import read_run
-    from factorgraph_dvl.io.solution_folder import EXPORT_STEM, load_solution
+    from factorgraph_dvl.files.exporting.motion import exported_motion
+    from factorgraph_dvl.files.output_file import check_new_file, write_file
+    from factorgraph_dvl.files.run_file import read_run
+    from factorgraph_dvl.files.solution_folder import EXPORT_STEM, load_solution
 
     if folder.exists() and to not in _TRAJECTORIES:
         raise ConfigError(
@@ -105,7 +105,7 @@ def _export_solution(folder: Path, to: ExportFormat, out: Path | None, *, force:
 
 
 def _writer(to: ExportFormat) -> Callable[[ExportedMotion, Path], None]:
-    from factorgraph_dvl.io.exporting import arrays, geographic, navigation, tum
+    from factorgraph_dvl.files.exporting import arrays, geographic, navigation, tum
 
     return {
         ExportFormat.TUM: tum.write_tum,

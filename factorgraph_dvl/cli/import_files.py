@@ -40,9 +40,9 @@ def import_(
       factorgraph-dvl import sensors.pd0 ship.nmea --out trial
     """
     from factorgraph_dvl.errors import ConfigError
-    from factorgraph_dvl.io.formats.mapping import MappingSettings
-    from factorgraph_dvl.io.importing.guess import guess_all
-    from factorgraph_dvl.io.importing.raw_files import OWNED, import_files
+    from factorgraph_dvl.files.formats.mapping import MappingSettings
+    from factorgraph_dvl.files.importing.guess import guess_all
+    from factorgraph_dvl.files.importing.raw_files import OWNED, import_files
     from factorgraph_dvl.settings.yaml_file import read_yaml
 
     if guess:

@@ -13,7 +13,7 @@ def inspect(trial_path: TrialPath) -> None:
     Examples:
       factorgraph-dvl inspect data/seed-a-phase-90
     """
-    from factorgraph_dvl.io.trial_folder import load_trial
+    from factorgraph_dvl.files.trial_folder import load_trial
     from factorgraph_dvl.quality.survey import survey
     from factorgraph_dvl.report.terminal.tables import (
         finding_lines,

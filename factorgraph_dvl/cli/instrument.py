@@ -26,7 +26,7 @@ def instrument(
 
     from factorgraph_dvl.analysis.instrument_terms import instrument_of
     from factorgraph_dvl.cli import events
-    from factorgraph_dvl.io.calibration_file import check_usable, load_calibration
+    from factorgraph_dvl.files.calibration_file import check_usable, load_calibration
     from factorgraph_dvl.report.files.instrument import instrument_text
 
     found = load_calibration(calibration)

@@ -48,8 +48,8 @@ def naming_memory(command: Callable[_P, _R]) -> Callable[_P, _R]:
 
 def _sizes(trial_path: Path) -> tuple[int, int]:
     """Return the rows of a trial's IMU and of its other sensors; 0 if unknown."""
-    from factorgraph_dvl.io.tables import count_rows
-    from factorgraph_dvl.io.trial_folder import record_files
+    from factorgraph_dvl.files.tables import count_rows
+    from factorgraph_dvl.files.trial_folder import record_files
 
     try:
         imu, *others = (count_rows(file) for file in record_files(trial_path))

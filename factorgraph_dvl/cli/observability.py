@@ -57,9 +57,9 @@ def observability(
       factorgraph-dvl observability data/seed-a-phase-90 --out observability
     """
     from factorgraph_dvl.errors import as_text
-    from factorgraph_dvl.io.folders import new_folder
-    from factorgraph_dvl.io.segments_file import read_segments
-    from factorgraph_dvl.io.trial_folder import inputs_of
+    from factorgraph_dvl.files.folders import new_folder
+    from factorgraph_dvl.files.segments_file import read_segments
+    from factorgraph_dvl.files.trial_folder import inputs_of
     from factorgraph_dvl.report.files.observability import OWNED
 
     claim_output(out, force=force, owned=OWNED, inputs=(*inputs_of(source), segments))
@@ -83,10 +83,10 @@ def _view(
 ) -> tuple[Solution, Observability]:
     """Return a solution, that of a trial or that in a folder, and its observability."""
     from factorgraph_dvl.analysis.information.observability import observability as look
-    from factorgraph_dvl.io.calibration_file import CALIBRATION_FILE
-    from factorgraph_dvl.io.folders import SETTINGS_FILE
-    from factorgraph_dvl.io.solution_folder import load_solution
-    from factorgraph_dvl.io.trial_folder import load_trial
+    from factorgraph_dvl.files.calibration_file import CALIBRATION_FILE
+    from factorgraph_dvl.files.folders import SETTINGS_FILE
+    from factorgraph_dvl.files.solution_folder import load_solution
+    from factorgraph_dvl.files.trial_folder import load_trial
 
     if os.path.lexists(source / CALIBRATION_FILE) and not (source / SETTINGS_FILE).exists():
         solution = load_solution(source)
@@ -103,7 +103,7 @@ def write_observability(
     view: Observability, folder: Path, source: str, verdict: Verdict, *, figures: str | None
 ) -> None:
     """Write JSON, tables and, in a format, figures to a folder."""
-    from factorgraph_dvl.io.tables import write_table
+    from factorgraph_dvl.files.tables import write_table
     from factorgraph_dvl.report.files.observability import history_columns, to_csv, to_json
 
     (folder / "observability.csv").write_text(to_csv(view), encoding="utf-8")

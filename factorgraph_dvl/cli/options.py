@@ -52,7 +52,7 @@ def claim_output(
 
     The parameters are those of `claim`.
     """
-    from factorgraph_dvl.io.folders import claim
+    from factorgraph_dvl.files.folders import claim
 
     given = [path for path in inputs if path is not None]
     claims.enter_context(claim(out, force=force, owned=owned, inputs=given))

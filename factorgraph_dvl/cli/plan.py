@@ -51,7 +51,7 @@ def plan(
     """
     from factorgraph_dvl.analysis.information.observability import observability as look
     from factorgraph_dvl.errors import as_text
-    from factorgraph_dvl.io.folders import new_folder
+    from factorgraph_dvl.files.folders import new_folder
     from factorgraph_dvl.planning import predict, propose, requirements
     from factorgraph_dvl.report.files.plan import OWNED, to_json
     from factorgraph_dvl.simulation import load_scenario, simulate

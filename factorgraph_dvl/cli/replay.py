@@ -87,8 +87,8 @@ def replay(
       factorgraph-dvl replay data/seed-a-phase-90 --out out --live
     """
     from factorgraph_dvl.analysis.convergence import check_limits, convergence
-    from factorgraph_dvl.io.solution_folder import OWNED
-    from factorgraph_dvl.io.trial_folder import inputs_of, load_trial
+    from factorgraph_dvl.files.solution_folder import OWNED
+    from factorgraph_dvl.files.trial_folder import inputs_of, load_trial
 
     std_asked = _limits("--good-std", good_std)
     error_asked = _limits("--good-error", good_error)
@@ -236,8 +236,8 @@ def _write(
     figures: FigureKind | None,
 ) -> None:
     from factorgraph_dvl.cli.solve import write_beams, write_instrument
-    from factorgraph_dvl.io.run_file import run_of
-    from factorgraph_dvl.io.solution_folder import (
+    from factorgraph_dvl.files.run_file import run_of
+    from factorgraph_dvl.files.solution_folder import (
         CONVERGENCE_FILE,
         FIGURES_FOLDER,
         save_solution,

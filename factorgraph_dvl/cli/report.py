@@ -13,7 +13,7 @@ from factorgraph_dvl.cli.options import Force
 from factorgraph_dvl.errors import as_text
 
 if TYPE_CHECKING:
-    from factorgraph_dvl.io.run_file import Run
+    from factorgraph_dvl.files.run_file import Run
     from factorgraph_dvl.report.html.content import Result
     from factorgraph_dvl.solution import Solution
 
@@ -45,8 +45,8 @@ def report(
       factorgraph-dvl report out-batch out-kalman --out comparison.html
     """
     from factorgraph_dvl.errors import ConfigError
-    from factorgraph_dvl.io.output_file import write_file
-    from factorgraph_dvl.io.solution_folder import REPORT_FILE
+    from factorgraph_dvl.files.output_file import write_file
+    from factorgraph_dvl.files.solution_folder import REPORT_FILE
     from factorgraph_dvl.report.html.page import comparison_page, report_page
 
     if out is None and len(folders) > 1:
@@ -66,8 +66,8 @@ def report(
 
 def _load(folder: Path) -> Result:
     """Return what a solution folder holds."""
-    from factorgraph_dvl.io.run_file import read_run
-    from factorgraph_dvl.io.solution_folder import load_solution, read_halves, read_history
+    from factorgraph_dvl.files.run_file import read_run
+    from factorgraph_dvl.files.solution_folder import load_solution, read_halves, read_history
     from factorgraph_dvl.report.html.content import Result
 
     run = read_run(folder)
@@ -114,8 +114,8 @@ def write_report(
     history: tuple[Any, tuple[str, ...], Any] | None = None,
 ) -> None:
     """Write run.json, and report.html; a page that fails is a warning: results are worth more."""
-    from factorgraph_dvl.io.run_file import RUN_FILE, encode_run
-    from factorgraph_dvl.io.solution_folder import REPORT_FILE, read_halves
+    from factorgraph_dvl.files.run_file import RUN_FILE, encode_run
+    from factorgraph_dvl.files.solution_folder import REPORT_FILE, read_halves
     from factorgraph_dvl.report.html.content import Result
     from factorgraph_dvl.report.html.page import report_page
 

@@ -44,7 +44,7 @@ def reproduce(
       factorgraph-dvl reproduce luo-2024 --out paper --table 3
     """
     from factorgraph_dvl.errors import ConfigError
-    from factorgraph_dvl.io.folders import new_folder
+    from factorgraph_dvl.files.folders import new_folder
     from factorgraph_dvl.report.text import figure_files
     from factorgraph_dvl.reproduce import PAPERS
     from factorgraph_dvl.reproduce.page import selected, write_page

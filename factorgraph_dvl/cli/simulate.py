@@ -27,7 +27,7 @@ def simulate(
     Examples:
       factorgraph-dvl simulate configs/cruise.yaml --out trial --seed 1
     """
-    from factorgraph_dvl.io.trial_folder import OWNED, check_simulated, save_trial
+    from factorgraph_dvl.files.trial_folder import OWNED, check_simulated, save_trial
     from factorgraph_dvl.simulation import load_scenario
     from factorgraph_dvl.simulation import simulate as run
 

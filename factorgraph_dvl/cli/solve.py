@@ -215,16 +215,16 @@ def _solve_into(
     quiet: bool,
 ) -> None:
     """Load a trial, run a solver, write and show its solution."""
-    from factorgraph_dvl.io.run_file import run_of
-    from factorgraph_dvl.io.solution_folder import (
+    from factorgraph_dvl.files.run_file import run_of
+    from factorgraph_dvl.files.solution_folder import (
         FIGURES_FOLDER,
         HALVES_FILE,
         OWNED,
         save_solution,
         write_history,
     )
-    from factorgraph_dvl.io.tables import write_table
-    from factorgraph_dvl.io.trial_folder import inputs_of, load_trial
+    from factorgraph_dvl.files.tables import write_table
+    from factorgraph_dvl.files.trial_folder import inputs_of, load_trial
 
     claim_output(out, force=force, owned=OWNED, inputs=inputs_of(trial_path))
     with ProgressLine(quiet=quiet) as progress:
@@ -285,8 +285,8 @@ def write_beams(trial: Trial, solution: Solution, folder: Path) -> None:
     """Write consistency and angles of the beams, if the solution calibrates beams."""
     from factorgraph_dvl.analysis.beam_angles import beam_angles
     from factorgraph_dvl.analysis.beam_quality import beam_quality, calibrates, calibration_of
-    from factorgraph_dvl.io.solution_folder import BEAM_ANGLES_FILE, BEAMS_FILE
-    from factorgraph_dvl.io.tables import write_table
+    from factorgraph_dvl.files.solution_folder import BEAM_ANGLES_FILE, BEAMS_FILE
+    from factorgraph_dvl.files.tables import write_table
 
     if trial.beams is not None and calibrates(solution, trial.beams):
         quality = beam_quality(trial.beams, calibration_of(trial.beams, solution))
@@ -298,7 +298,7 @@ def write_beams(trial: Trial, solution: Solution, folder: Path) -> None:
 def write_instrument(solution: Solution, folder: Path) -> None:
     """Write the calibration of a DVL in the terms of instruments, if it can be used."""
     from factorgraph_dvl.analysis.instrument_terms import NEEDED, instrument_of
-    from factorgraph_dvl.io.solution_folder import INSTRUMENT_FILE
+    from factorgraph_dvl.files.solution_folder import INSTRUMENT_FILE
     from factorgraph_dvl.report.files.instrument import instrument_text
 
     usable = solution.verdict.grade != "do not use"

@@ -12,8 +12,8 @@ from running import Run, run
 
 from factorgraph_dvl.analysis.static_noise import StaticNoise, static_noise
 from factorgraph_dvl.errors import DataError
+from factorgraph_dvl.files.tables import write_table
 from factorgraph_dvl.geometry.units import DEG_PER_HOUR, DEG_PER_SQRT_HOUR, MICRO_G
-from factorgraph_dvl.io.tables import write_table
 from factorgraph_dvl.report.files.imu_noise import imu_yaml
 from factorgraph_dvl.sensors.imu import Imu, ImuSettings
 

@@ -17,8 +17,8 @@ from factorgraph_dvl.baselines.navigation import navigate
 from factorgraph_dvl.cli import main
 from factorgraph_dvl.cli.solve import KalmanMethod
 from factorgraph_dvl.errors import ConfigError, DataError
-from factorgraph_dvl.io.solution_folder import load_solution
-from factorgraph_dvl.io.tables import read_table
+from factorgraph_dvl.files.solution_folder import load_solution
+from factorgraph_dvl.files.tables import read_table
 from factorgraph_dvl.sensors.finding import Code
 from factorgraph_dvl.simulation import simulate
 

@@ -18,8 +18,8 @@ from factorgraph_dvl.campaign.page import write_page
 from factorgraph_dvl.campaign.record import RunRecord, fingerprint_of, read_record, write_record
 from factorgraph_dvl.campaign.trials import assembled, labels_of, read_covariates
 from factorgraph_dvl.errors import ConfigError, DataError
-from factorgraph_dvl.io.calibration_file import load_calibration
-from factorgraph_dvl.io.earlier_calibration import calibrated_by
+from factorgraph_dvl.files.calibration_file import load_calibration
+from factorgraph_dvl.files.earlier_calibration import calibrated_by
 
 
 def dive(number):

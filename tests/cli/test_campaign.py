@@ -15,7 +15,7 @@ import yaml
 from truth import CONFIGS, TURNING, scenario
 from workers import sleepy_run
 
-from factorgraph_dvl.io.trial_folder import save_trial
+from factorgraph_dvl.files.trial_folder import save_trial
 from factorgraph_dvl.simulation import simulate
 
 

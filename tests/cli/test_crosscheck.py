@@ -12,7 +12,7 @@ from comparisons import moved
 
 from factorgraph_dvl.analysis.comparison.crosscheck import crosscheck
 from factorgraph_dvl.cli import main
-from factorgraph_dvl.io.solution_folder import load_solution, save_solution
+from factorgraph_dvl.files.solution_folder import load_solution, save_solution
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples" / "crosscheck"
 

@@ -14,7 +14,7 @@ from builders import build_solution, build_trial
 from running import Run
 
 from factorgraph_dvl.cli.commands import COMMANDS, command
-from factorgraph_dvl.io.trial_folder import save_trial
+from factorgraph_dvl.files.trial_folder import save_trial
 
 ROOT = Path(__file__).parent.parent.parent
 

@@ -15,8 +15,8 @@ from running import Run
 
 from factorgraph_dvl.cli.commands import COMMANDS
 from factorgraph_dvl.cli.events import Event
-from factorgraph_dvl.io.calibration_file import encode_calibration
-from factorgraph_dvl.io.solution_folder import save_solution
+from factorgraph_dvl.files.calibration_file import encode_calibration
+from factorgraph_dvl.files.solution_folder import save_solution
 
 
 def lines(out: str) -> list[Any]:

@@ -8,7 +8,7 @@ import pytest
 from running import run  # noqa: F401
 from truth import scenario
 
-from factorgraph_dvl.io.trial_folder import save_trial
+from factorgraph_dvl.files.trial_folder import save_trial
 from factorgraph_dvl.simulation import simulate
 
 

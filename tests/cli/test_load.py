@@ -22,7 +22,7 @@ import format_writers as writers
 import pytest
 from kinds import TRIALS
 
-from factorgraph_dvl.io.trial_folder import save_trial
+from factorgraph_dvl.files.trial_folder import save_trial
 
 RUNS = int(os.environ.get("FACTORGRAPH_DVL_LOAD", "40"))
 # Codes that docs/format.md lists.

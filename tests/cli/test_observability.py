@@ -15,8 +15,8 @@ from truth import SWELL, scenario
 
 from factorgraph_dvl.analysis.information.observability import observability
 from factorgraph_dvl.cli import main
-from factorgraph_dvl.io.solution_folder import save_solution
-from factorgraph_dvl.io.trial_folder import save_trial
+from factorgraph_dvl.files.solution_folder import save_solution
+from factorgraph_dvl.files.trial_folder import save_trial
 from factorgraph_dvl.report.files.observability import to_json
 from factorgraph_dvl.simulation import simulate
 from factorgraph_dvl.trial import Trial

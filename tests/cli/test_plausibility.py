@@ -15,10 +15,10 @@ from truth import CONFIGS, scenario
 from factorgraph_dvl import solve
 from factorgraph_dvl.cli import main
 from factorgraph_dvl.errors import DataError, SolveError
+from factorgraph_dvl.files.calibration_file import load_calibration
+from factorgraph_dvl.files.solution_folder import save_solution
+from factorgraph_dvl.files.trial_folder import load_trial, save_trial
 from factorgraph_dvl.geometry.units import DEG
-from factorgraph_dvl.io.calibration_file import load_calibration
-from factorgraph_dvl.io.solution_folder import save_solution
-from factorgraph_dvl.io.trial_folder import load_trial, save_trial
 from factorgraph_dvl.quality.refusal import explained
 from factorgraph_dvl.quality.survey import survey
 from factorgraph_dvl.replay import replay

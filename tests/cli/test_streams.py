@@ -18,7 +18,7 @@ from truth import scenario
 
 from factorgraph_dvl.cli.memory import naming_memory
 from factorgraph_dvl.errors import SolveError
-from factorgraph_dvl.io.solution_folder import save_solution
+from factorgraph_dvl.files.solution_folder import save_solution
 
 CLI = (sys.executable, "-m", "factorgraph_dvl.cli")
 

@@ -11,8 +11,8 @@ from builders import build_solution, build_trial, edit, write_trial
 from running import Run
 
 from factorgraph_dvl.errors import DataError
-from factorgraph_dvl.io.solution_folder import save_solution
-from factorgraph_dvl.io.trial_folder import load_trial
+from factorgraph_dvl.files.solution_folder import save_solution
+from factorgraph_dvl.files.trial_folder import load_trial
 from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.solution import Estimate
 

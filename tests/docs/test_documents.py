@@ -22,11 +22,11 @@ from markdown_tables import faults
 from running import Run, run  # noqa: F401
 from truth import merged, scenario
 
-from factorgraph_dvl.io.external_results import read_calibration_values
-from factorgraph_dvl.io.formats.mapping import MappingSettings
-from factorgraph_dvl.io.segments_file import read_segments
-from factorgraph_dvl.io.trial_folder import save_trial
-from factorgraph_dvl.io.trial_yaml import TrialSettings
+from factorgraph_dvl.files.external_results import read_calibration_values
+from factorgraph_dvl.files.formats.mapping import MappingSettings
+from factorgraph_dvl.files.segments_file import read_segments
+from factorgraph_dvl.files.trial_folder import save_trial
+from factorgraph_dvl.files.trial_yaml import TrialSettings
 from factorgraph_dvl.settings.yaml_file import parse_yaml
 from factorgraph_dvl.simulation import parse_scenario, simulate
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from factorgraph_dvl.io.formats.catalogue import FORMATS
+from factorgraph_dvl.files.formats.catalogue import FORMATS
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "formats.md"
 

@@ -19,11 +19,11 @@ from truth import TURNING, scenario
 
 from factorgraph_dvl.baselines import calibrate
 from factorgraph_dvl.errors import ConfigError, DataError
+from factorgraph_dvl.files.calibration_file import encode_calibration
+from factorgraph_dvl.files.earlier_calibration import calibrated_by
+from factorgraph_dvl.files.trial_folder import load_trial, save_trial
 from factorgraph_dvl.geometry.rotations import exp_so3
 from factorgraph_dvl.graph.priors import Tilt, prior_mean
-from factorgraph_dvl.io.calibration_file import encode_calibration
-from factorgraph_dvl.io.earlier_calibration import calibrated_by
-from factorgraph_dvl.io.trial_folder import load_trial, save_trial
 from factorgraph_dvl.sensors.finding import Code
 from factorgraph_dvl.sensors.parameters import JointPrior
 from factorgraph_dvl.simulation import simulate

@@ -10,8 +10,8 @@ import pytest
 from calibrations import calibration
 from truth import scenario
 
+from factorgraph_dvl.files.earlier_calibration import calibrated_by
 from factorgraph_dvl.initialization.mountings import _near_fixes, mounted_aids
-from factorgraph_dvl.io.earlier_calibration import calibrated_by
 from factorgraph_dvl.sensors.gnss import Gnss, GnssSettings
 from factorgraph_dvl.simulation import simulate
 

@@ -10,7 +10,7 @@ from planar import BASE, changed, trial, without
 from truth import merged
 
 from factorgraph_dvl.cli import main
-from factorgraph_dvl.io.trial_folder import save_trial
+from factorgraph_dvl.files.trial_folder import save_trial
 from factorgraph_dvl.quality.survey import survey
 from factorgraph_dvl.sensors.finding import Code
 from factorgraph_dvl.simulation import parse_scenario, simulate

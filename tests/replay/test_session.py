@@ -14,7 +14,7 @@ from factorgraph_dvl import load_solution, save_trial, solve
 from factorgraph_dvl.analysis.error_statistics import calibration_errors, motion_errors
 from factorgraph_dvl.cli import main
 from factorgraph_dvl.errors import ConfigError, DataError, SolveError
-from factorgraph_dvl.io.tables import read_table
+from factorgraph_dvl.files.tables import read_table
 from factorgraph_dvl.quality.survey import Survey
 from factorgraph_dvl.replay import Replay, replay
 from factorgraph_dvl.report.terminal.live import live_view

@@ -11,14 +11,14 @@ from jacobians import check_jacobians, random_motion
 from truth import exact_motion, scenario
 
 from factorgraph_dvl.errors import DataError, FactorgraphDvlError
+from factorgraph_dvl.files.solution_folder import save_solution
+from factorgraph_dvl.files.trial_folder import load_trial, save_trial
 from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.graph.inertial_chain import inertial_chain
 from factorgraph_dvl.graph.problem import Problem
 from factorgraph_dvl.imu.increments import increments
 from factorgraph_dvl.imu.preintegration import segments
 from factorgraph_dvl.imu.propagation import States
-from factorgraph_dvl.io.solution_folder import save_solution
-from factorgraph_dvl.io.trial_folder import load_trial, save_trial
 from factorgraph_dvl.replay import replay
 from factorgraph_dvl.sensors.beacon import Beacons, BeaconSettings, offset_name
 from factorgraph_dvl.sensors.records import rows_of

@@ -11,7 +11,7 @@ from factorgraph_dvl_compass import BIAS, Compass
 
 from factorgraph_dvl import load_trial
 from factorgraph_dvl.errors import ConfigError
-from factorgraph_dvl.io.tables import write_table
+from factorgraph_dvl.files.tables import write_table
 from factorgraph_dvl.sensors import catalogue
 
 COMPASS = EntryPoint("compass", "factorgraph_dvl_compass:Compass", catalogue.GROUP)

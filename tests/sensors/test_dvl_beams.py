@@ -27,13 +27,13 @@ from factorgraph_dvl.analysis.information.segment_singular_values import (
 from factorgraph_dvl.baselines import calibrate
 from factorgraph_dvl.cli import main
 from factorgraph_dvl.errors import ConfigError, DataError
+from factorgraph_dvl.files.external_results import read_truth
+from factorgraph_dvl.files.solution_folder import load_solution, save_solution
+from factorgraph_dvl.files.trial_folder import load_trial, save_trial
 from factorgraph_dvl.geometry.rotations import exp_so3
 from factorgraph_dvl.geometry.unit_vectors import tangent_axes, turned, turned_jacobian, turns_to
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.imu.attitude_history import AttitudeHistory
-from factorgraph_dvl.io.external_results import read_truth
-from factorgraph_dvl.io.solution_folder import load_solution, save_solution
-from factorgraph_dvl.io.trial_folder import load_trial, save_trial
 from factorgraph_dvl.planning.prediction import extend, predict
 from factorgraph_dvl.quality.survey import survey
 from factorgraph_dvl.report.figures.observability import (

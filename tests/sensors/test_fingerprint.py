@@ -14,10 +14,10 @@ from truth import TURNING, scenario
 
 from factorgraph_dvl.baselines import calibrate
 from factorgraph_dvl.errors import DataError
-from factorgraph_dvl.io.calibration_file import encode_calibration, load_calibration
-from factorgraph_dvl.io.earlier_calibration import calibrated_by
-from factorgraph_dvl.io.solution_folder import load_solution, save_solution
-from factorgraph_dvl.io.trial_folder import load_trial, save_trial
+from factorgraph_dvl.files.calibration_file import encode_calibration, load_calibration
+from factorgraph_dvl.files.earlier_calibration import calibrated_by
+from factorgraph_dvl.files.solution_folder import load_solution, save_solution
+from factorgraph_dvl.files.trial_folder import load_trial, save_trial
 from factorgraph_dvl.replay import replay
 from factorgraph_dvl.sensors.fingerprint import fingerprints, shared
 from factorgraph_dvl.sensors.imu import Imu

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from builders import build_solution
 
-from factorgraph_dvl.io.trial_yaml import LimitSettings
+from factorgraph_dvl.files.trial_yaml import LimitSettings
 from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.sensors.grades import DEFAULT_LIMITS, grades
 from factorgraph_dvl.sensors.verdict import verdict_of

@@ -25,6 +25,9 @@ from factorgraph_dvl.baselines.star_filter import run_filter, star_attitudes
 from factorgraph_dvl.baselines.strapdown import compose, prepare
 from factorgraph_dvl.cli import main
 from factorgraph_dvl.errors import ConfigError, DataError
+from factorgraph_dvl.files.solution_folder import load_solution
+from factorgraph_dvl.files.tables import read_table
+from factorgraph_dvl.files.trial_folder import load_trial, save_trial
 from factorgraph_dvl.geometry.celestial import (
     attitudes_from_vectors,
     earth_from_inertial,
@@ -34,9 +37,6 @@ from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.rotations import exp_so3, log_so3
 from factorgraph_dvl.geometry.units import ARCSEC, DEG
 from factorgraph_dvl.imu.increments import increments
-from factorgraph_dvl.io.solution_folder import load_solution
-from factorgraph_dvl.io.tables import read_table
-from factorgraph_dvl.io.trial_folder import load_trial, save_trial
 from factorgraph_dvl.quality.survey import survey
 from factorgraph_dvl.sensors.finding import Code
 from factorgraph_dvl.sensors.star import Star, StarAttitude, StarSettings

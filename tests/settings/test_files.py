@@ -11,7 +11,7 @@ from builders import build_solution, write_trial
 from running import Run, run
 
 from factorgraph_dvl.errors import ConfigError, DataError
-from factorgraph_dvl.io.solution_folder import save_solution
+from factorgraph_dvl.files.solution_folder import save_solution
 from factorgraph_dvl.settings.files import read_bytes
 
 __all__ = ["run"]

@@ -16,7 +16,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from factorgraph_dvl.errors import ConfigError, DataError
-from factorgraph_dvl.io.trial_folder import load_trial
+from factorgraph_dvl.files.trial_folder import load_trial
 from factorgraph_dvl.sensors.attitude import Attitude
 from factorgraph_dvl.sensors.catalogue import AIDS
 from factorgraph_dvl.sensors.imu import Imu

@@ -8,7 +8,7 @@ from truth import CONFIGS, merged
 
 from factorgraph_dvl.cli import main
 from factorgraph_dvl.errors import ConfigError
-from factorgraph_dvl.io.trial_folder import load_trial
+from factorgraph_dvl.files.trial_folder import load_trial
 from factorgraph_dvl.simulation import parse_scenario, simulate
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from truth import TURNING, scenario
 
-from factorgraph_dvl.io.calibration_file import encode_calibration, load_calibration
+from factorgraph_dvl.files.calibration_file import encode_calibration, load_calibration
 from factorgraph_dvl.report.figures.error_budget import error_budget_figure
 from factorgraph_dvl.report.terminal.error_budget import error_budget_table
 from factorgraph_dvl.simulation import simulate

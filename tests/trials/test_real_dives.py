@@ -11,7 +11,7 @@ import pytest
 from dives import dive
 from scipy.stats import chi2
 
-from factorgraph_dvl.io.trial_folder import load_trial
+from factorgraph_dvl.files.trial_folder import load_trial
 from factorgraph_dvl.quality.survey import survey
 from factorgraph_dvl.sensors.dvl import DvlSettings
 from factorgraph_dvl.sensors.finding import Code

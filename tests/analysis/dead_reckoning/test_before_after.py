@@ -24,13 +24,13 @@ from factorgraph_dvl.analysis.dead_reckoning.integration import (
 from factorgraph_dvl.analysis.dead_reckoning.track_error import score
 from factorgraph_dvl.baselines import sins
 from factorgraph_dvl.errors import DataError
+from factorgraph_dvl.files.solution_folder import save_solution
+from factorgraph_dvl.files.trial_folder import save_trial
 from factorgraph_dvl.geometry.earth import ECCENTRICITY_SQUARED, RATE, SEMI_MAJOR, LocalFrame
 from factorgraph_dvl.geometry.rotations import log_so3, rotation_from_rph
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.imu.attitude_history import AttitudeHistory
 from factorgraph_dvl.imu.attitude_record import orientations
-from factorgraph_dvl.io.solution_folder import save_solution
-from factorgraph_dvl.io.trial_folder import save_trial
 from factorgraph_dvl.simulation import load_scenario, plan_motion, simulate
 from factorgraph_dvl.simulation.compass import InsTruth
 from factorgraph_dvl.solution import Trajectory
@@ -281,7 +281,7 @@ def test_command_writes_its_folder(run, folder):  # noqa: F811
 
 
 def test_the_tracks_have_a_compass_and_marks_of_time(folder):
-    from factorgraph_dvl.io.trial_folder import load_trial
+    from factorgraph_dvl.files.trial_folder import load_trial
     from factorgraph_dvl.report.figures.dead_reckoning import tracks_figure
 
     trial = load_trial(folder / "trial")
@@ -295,7 +295,7 @@ def test_the_tracks_have_a_compass_and_marks_of_time(folder):
 def test_command_takes_the_attitude_of_a_solution_or_the_reference(run, folder, tmp_path):  # noqa: F811
     from builders import build_solution
 
-    from factorgraph_dvl.io.trial_folder import load_trial
+    from factorgraph_dvl.files.trial_folder import load_trial
 
     trial = load_trial(folder / "trial")
     r = trial.reference
@@ -316,7 +316,7 @@ def test_command_takes_the_attitude_of_a_solution_or_the_reference(run, folder, 
 
 
 def test_a_score_that_ends_before_the_track_says_so(run, folder, tmp_path):  # noqa: F811
-    from factorgraph_dvl.io.trial_folder import load_trial
+    from factorgraph_dvl.files.trial_folder import load_trial
 
     trial = load_trial(folder / "trial")
     early = trial.reference.time <= 20.0

@@ -1,0 +1,296 @@
+"""Nortek AD2CP files: bottom track, orientation and the configuration they begin with.
+
+Source: Nortek, Signature Integrator's Guide (2017), 6.1 (header, DF20 bottom track, DF3
+records); AHRS fields as in the DF3 table. `ad2cp_tracks` has the records of DVLs. Records of other
+kinds are passed over, whole.
+"""
+
+from __future__ import annotations
+
+import re
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from factorgraph_dvl.files.formats import ad2cp_tracks
+from factorgraph_dvl.files.formats.clocks import posix
+from factorgraph_dvl.files.formats.framing import BLOCK, Records, Source, number
+from factorgraph_dvl.files.formats.losses import Frame, Losses, count_stretch
+from factorgraph_dvl.geometry.units import DEG
+
+ENU, XYZ, BEAM = range(3)
+BOTTOM, BURST, AVERAGE, TEXT = 0x17, 0x15, 0x16, 0xA0
+# Nucleus frames its packets alike, with kinds of its own.
+NUCLEUS = 0x20
+_SYNC = b"\xa5"
+_SEED = 0xB58C
+# Bytes of a header, 12 in its long form.
+_HEADER = 10
+# The largest records, of raw echo sounder samples, have some 100 kB.
+_LARGEST = 1 << 24
+_UNITS = {
+    "sound_speed": 0.1,
+    "temperature": 0.01,
+    "pressure": 0.001,
+    "heading": 0.01 * DEG,
+    "pitch": 0.01 * DEG,
+    "roll": 0.01 * DEG,
+    "acceleration": 9.81 / 16384.0,
+}
+_FIELDS = ((1 << 5, "velocity", "<i4"), (1 << 8, "distance", "<i4"), (1 << 9, "merit", "<u2"))
+_IMPOSSIBLE = "record of bottom track with an impossible layout"
+# Above this a velocity is one of nothing: the widest velocity range is 30 m/s.
+_FASTEST = 50.0
+
+PING = np.dtype(
+    [
+        ("at", "i8"),
+        ("time", "f8"),
+        ("number", "i8"),
+        ("beams", "u1"),
+        ("coordinates", "u1"),
+        *((name, "f8") for name in ("sound_speed", "temperature", "pressure")),
+        *((name, "f8") for name in ("heading", "pitch", "roll")),
+        ("acceleration", "f8", (3,)),
+        ("velocity", "f8", (4,)),
+        ("distance", "f8", (4,)),
+        ("merit", "f8", (4,)),
+        ("rotation", "f8", (3, 3)),
+        ("quaternion", "f8", (4,)),
+        ("rate", "f8", (3,)),
+        ("status", "u4"),
+        ("error", "u4"),
+    ]
+)
+_HEAD = np.dtype(
+    {
+        "names": [
+            *("offset", "flags", "date", "fraction", "sound_speed", "temperature", "pressure"),
+            *("heading", "pitch", "roll", "layout", "acceleration", "scale"),
+            *("error", "status", "number"),
+        ],
+        "offsets": [1, 2, 8, 14, 16, 18, 20, 24, 26, 28, 30, 46, 60, 66, 70, 74],
+        "formats": [
+            *("u1", "<u2", "6u1", "<u2", "<u2", "<i2", "<u4", "<u2", "<i2", "<i2", "<u2"),
+            *("3<i2", "i1", "<u4", "<u4", "<u4"),
+        ],
+        "itemsize": 78,
+    }
+)
+
+
+@dataclass(frozen=True)
+class Ad2cp:
+    """What a file holds, or a part of it.
+
+    Parameters
+    ----------
+    bottom : Records
+        (N,) of `PING`, bottom track: `time`, seconds since 1970; angles in rad as sent;
+        `velocity` m/s by beam or axis, `distance` m, `merit` (figure of merit), nan where
+        not measured; `rotation`, `quaternion` and `rate` (rad/s) of the AHRS, nan without.
+    tracks : Records
+        (M,) of `ad2cp_tracks.TRACK`, bottom and water track of DVLs.
+    text : tuple of str
+        String records, in order: configuration, and sentences that were sent to it.
+    """
+
+    bottom: Records
+    tracks: Records
+    text: tuple[str, ...]
+
+
+def read_ad2cp(
+    source: Source, block: int = BLOCK, losses: Losses | None = None
+) -> Iterator[Ad2cp]:
+    """Read records whose checksums are right.
+
+    Parameters
+    ----------
+    source : Source
+        The file.
+    block : int
+        Number of records at a time.
+    losses : Losses, optional
+        Takes counts of what was left out.
+
+    Yields
+    ------
+    Ad2cp
+    """
+    losses = Losses() if losses is None else losses
+    pings: list[tuple[int, bytes]] = []
+    dvl: list[tuple[int, int, bytes]] = []
+    text: list[str] = []
+    for family, kind, start, stop in frames(source, losses):
+        if family == NUCLEUS:
+            continue
+        if kind == BOTTOM:
+            pings.append((start, source[start:stop]))
+        elif kind in (ad2cp_tracks.BOTTOM, ad2cp_tracks.WATER):
+            record = source[start:stop]
+            if ad2cp_tracks.is_whole(record):
+                dvl.append((start, kind, record))
+            else:
+                losses.add(_IMPOSSIBLE, start)
+        elif kind == TEXT:
+            text.append(source[start + 1 : stop].rstrip(b"\0").decode("latin-1"))
+        if len(pings) + len(dvl) + len(text) >= block:
+            yield Ad2cp(_bottom_track(pings, losses), ad2cp_tracks.tracks(dvl), tuple(text))
+            pings, dvl, text = [], [], []
+    yield Ad2cp(_bottom_track(pings, losses), ad2cp_tracks.tracks(dvl), tuple(text))
+
+
+def beam_matrix(text: str) -> np.ndarray[tuple[int, int], np.dtype[np.float64]] | None:
+    """Return the matrix from bottom-track beams to X, Y, Z, Z2 of a configuration, or None."""
+    line = re.search(r"GETXFBT,ROWS=(\d),COLS=(\d),([^\r\n]*)", text)
+    if line is None:
+        return None
+    rows, columns = int(line[1]), int(line[2])
+    values = dict(re.findall(r"(M\d\d)=([-+.\deE]+)", line[3]))
+    out = np.array(
+        [[number(values.get(f"M{i + 1}{j + 1}", "")) for j in range(columns)] for i in range(rows)]
+    )
+    return out if out.size and np.isfinite(out).all() else None
+
+
+def frames(source: Source, losses: Losses | None = None) -> Iterator[tuple[int, int, int, int]]:
+    """Find records of Nortek's instruments whose checksums are right.
+
+    Parameters
+    ----------
+    source : Source
+        The file.
+    losses : Losses, optional
+        Takes counts of what was left out.
+
+    Yields
+    ------
+    Family, kind, and start and stop of what stands behind the header.
+    """
+    losses = Losses() if losses is None else losses
+    at, free, size = 0, 0, len(source)
+    while (at := source.find(_SYNC, at)) >= 0:
+        header = _header(source, at)
+        if header is not None:
+            stop = at + header.size + header.length
+            if stop <= size and checksum(source[at + header.size : stop]) == header.data_sum:
+                count_stretch(source, free, at, losses, _FRAME)
+                yield header.family, header.kind, at + header.size, stop
+                at = free = stop
+                continue
+        at += 1
+    count_stretch(source, free, size, losses, _FRAME)
+
+
+class _Header(NamedTuple):
+    size: int
+    kind: int
+    family: int
+    length: int
+    data_sum: int
+
+
+def _header(source: Source, at: int) -> _Header | None:
+    """Return the header at a position, None if there is none whose own checksum is right."""
+    raw = source[at : at + 12]
+    if raw[1:2] not in (b"\x0a", b"\x0c") or len(raw) < raw[1]:
+        return None
+    layout = struct.Struct("<BBBBIHH" if raw[1] == 12 else "<BBBBHHH")
+    _, *fields, head_sum = layout.unpack_from(raw)
+    header = _Header(*fields)
+    is_right = checksum(raw[: header.size - 2]) == head_sum and header.length <= _LARGEST
+    return header if is_right else None
+
+
+def _size(source: Source, at: int) -> int:
+    header = _header(source, at)
+    return 0 if header is None else header.size + header.length
+
+
+_FRAME = Frame("record", _SYNC, _size)
+
+
+def checksum(data: bytes) -> int:
+    """Return the checksum of bytes: their little-endian 16-bit words and a seed, summed.
+
+    Parameters
+    ----------
+    data : bytes
+        A last odd byte counts as the upper half of a word.
+    """
+    even = len(data) & ~1
+    total = _SEED + int(np.frombuffer(data[:even], "<u2").sum(dtype=np.int64))
+    return (total + (data[-1] << 8 if len(data) & 1 else 0)) & 0xFFFF
+
+
+def covered(sample: bytes) -> int:
+    """Return the number of bytes of a sample that lie in records of AD2CP."""
+    found = frames(sample)
+    return sum(stop - start + _HEADER for family, _, start, stop in found if family != NUCLEUS)
+
+
+def _bottom_track(pings: list[tuple[int, bytes]], losses: Losses) -> Records:
+    """Return the pings of DF20 records, in the order of the file."""
+    alike: dict[bytes, list[tuple[int, bytes]]] = {}
+    for at, record in pings:
+        if len(record) >= _HEAD.itemsize:
+            # What decides on the layout: offset of data, flags, number of beams, length.
+            key = record[1:4] + bytes([record[31] >> 4]) + len(record).to_bytes(4, "little")
+            alike.setdefault(key, []).append((at, record))
+    parts = [_alike(group) for group in alike.values()]
+    out = np.concatenate(parts) if parts else np.empty(0, PING)
+    if pings:
+        impossible = len(pings) - len(out)
+        losses.add(_IMPOSSIBLE, pings[0][0], impossible)
+    return out[np.argsort(out["at"], kind="stable")]
+
+
+def _alike(pings: list[tuple[int, bytes]]) -> Records:
+    """Return the pings of records of one layout; none if it is no possible one."""
+    raw = np.frombuffer(b"".join(record for _, record in pings), np.uint8)
+    raw = raw.reshape(len(pings), -1)
+    head = np.ascontiguousarray(raw[:, : _HEAD.itemsize]).view(_HEAD)[:, 0]
+    beams, flags, at = int(head["layout"][0]) >> 12, int(head["flags"][0]), int(head["offset"][0])
+    fields = [(flag, name, form) for flag, name, form in _FIELDS if flags & flag]
+    needed = at + beams * sum(int(form[2]) for _, _, form in fields)
+    if not 1 <= beams <= 4 or needed > raw.shape[1]:
+        return np.empty(0, PING)
+    out = np.zeros(len(pings), PING)
+    out["at"] = [start for start, _ in pings]
+    out["beams"], out["coordinates"] = beams, (head["layout"] >> 10) & 3
+    # Years count from 1900 and months from 0, as in C.
+    year, month, day, hour, minute, second = head["date"].astype(np.int64).T
+    seconds = second + head["fraction"] * 1e-4
+    out["time"] = posix(year + 1900, month + 1, day, hour, minute, seconds)
+    for name, unit in _UNITS.items():
+        out[name] = head[name] * unit
+    for name in ("error", "status", "number"):
+        out[name] = head[name]
+    for name in ("velocity", "distance", "merit", "rotation", "quaternion", "rate"):
+        out[name] = np.nan
+    for _, name, form in fields:
+        size = beams * int(form[2])
+        out[name][:, :beams] = np.ascontiguousarray(raw[:, at : at + size]).view(form)
+        at += size
+    out["velocity"] *= 10.0 ** head["scale"].astype(float)[:, None]
+    out["distance"] *= 1e-3
+    if flags & 1 << 10 and raw.shape[1] >= at + 64:
+        ahrs = np.ascontiguousarray(raw[:, at : at + 64]).view("<f4").astype(float)
+        ahrs[~np.isfinite(ahrs)] = np.nan
+        out["rotation"] = ahrs[:, :9].reshape(-1, 3, 3)
+        out["quaternion"], out["rate"] = ahrs[:, 9:13], ahrs[:, 13:] * DEG
+    _mark_lost(out)
+    return out
+
+
+def _mark_lost(pings: Records) -> None:
+    # Without an echo the figure of merit is at its limit, distances are negative or 0,
+    # and velocities are beyond what the instrument can measure.
+    lost = (pings["merit"] >= 65535.0) | (pings["distance"] <= 0.0)
+    lost |= np.abs(pings["velocity"]) > _FASTEST
+    pings["velocity"] = np.where(lost, np.nan, pings["velocity"])
+    pings["distance"] = np.where(pings["distance"] <= 0.0, np.nan, pings["distance"])

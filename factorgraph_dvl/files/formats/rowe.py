@@ -1,0 +1,154 @@
+"""Rowe Technology ensembles (`.ens`): bottom track and the NMEA sentences stored with it.
+
+Source: no document of the maker could be read; the layout is that of the maker's own public
+reader (rowetechinc/rti_python). Velocities are those over ground as the instrument sends them.
+"""
+
+from __future__ import annotations
+
+import binascii
+import struct
+from collections.abc import Iterator
+
+import numpy as np
+
+from factorgraph_dvl.files.formats.clocks import posix
+from factorgraph_dvl.files.formats.framing import BLOCK, Records, Source
+from factorgraph_dvl.files.formats.losses import Frame, Losses, count_stretch
+from factorgraph_dvl.files.formats.nmea import KINDS, read_nmea
+from factorgraph_dvl.files.formats.velocities import BEAM, INSTRUMENT, VELOCITY, empty, without
+from factorgraph_dvl.geometry.units import DEG
+
+# What an ensemble begins with, its largest size, bytes, and the value of a lost beam: by
+# the manual, the size chosen.
+_SYNC = b"\x80" * 16
+_LARGEST = 1 << 20
+# Bytes before the data: sync, and number and length with their inverses.
+_HEADER = 32
+_BAD = 88.888
+# Floats before the first array of bottom track.
+_HEAD = 14
+_SIZES = {10: 4, 20: 4, 50: 1}
+
+
+def read_rowe(
+    source: Source, block: int = BLOCK, losses: Losses | None = None
+) -> Iterator[tuple[Records, dict[str, Records]]]:
+    """Read ensembles whose checksum is right.
+
+    Parameters
+    ----------
+    source : Source
+        The file.
+    block : int
+        Number of ensembles at a time.
+    losses : Losses, optional
+        Takes counts of what was left out.
+
+    Yields
+    ------
+    (N,) of `VELOCITY`, those with bottom track, in instrument axes with beams beside; and
+    the sentences, as `read_nmea` returns them, `received` at the time of their ensemble.
+    Roll is near 180 degrees when the instrument looks down.
+    """
+    pings: list[Records] = []
+    nmea: dict[str, list[Records]] = {name: [] for name in KINDS}
+    for at, payload in _ensembles(source, Losses() if losses is None else losses):
+        sets = dict(_data_sets(payload))
+        time = _time(sets.get("E000008", b""))
+        ping = _bottom_track(sets.get("E000010", b""))
+        if ping is not None:
+            ping["at"], ping["time"] = at, time
+            pings.append(ping)
+        for part in read_nmea(sets.get("E000011", b"")):
+            for name, records in part.items():
+                records["at"] += at
+                records["received"] = time
+                nmea[name].append(records)
+        if len(pings) >= block:
+            yield _stack(pings, nmea)
+            pings, nmea = [], {name: [] for name in KINDS}
+    yield _stack(pings, nmea)
+
+
+def _stack(
+    pings: list[Records], nmea: dict[str, list[Records]]
+) -> tuple[Records, dict[str, Records]]:
+    joined = {
+        name: np.concatenate(parts) if parts else np.empty(0, KINDS[name])
+        for name, parts in nmea.items()
+    }
+    return np.concatenate(pings) if pings else np.empty(0, VELOCITY), joined
+
+
+def _ensembles(source: Source, losses: Losses) -> Iterator[tuple[int, bytes]]:
+    at, free, size = 0, 0, len(source)
+    while (at := source.find(_SYNC, at)) >= 0:
+        stop = at + _size(source, at)
+        if at < stop <= size:
+            payload = source[at + _HEADER : stop - 4]
+            (stated,) = struct.unpack("<I", source[stop - 4 : stop])
+            if binascii.crc_hqx(payload, 0) == stated:
+                count_stretch(source, free, at, losses, _FRAME)
+                yield at, payload
+                at = free = stop
+                continue
+        at += 1
+    count_stretch(source, free, size, losses, _FRAME)
+
+
+def _size(source: Source, at: int) -> int:
+    """Return the number of bytes of an ensemble, 0 if there is no header at its position."""
+    header = source[at + len(_SYNC) : at + _HEADER]
+    if len(header) < _HEADER - len(_SYNC):
+        return 0
+    number, inverse, length, inverse_length = struct.unpack("<4I", header)
+    is_header = number ^ inverse == length ^ inverse_length == 0xFFFFFFFF
+    return _HEADER + length + 4 if is_header and length <= _LARGEST else 0
+
+
+_FRAME = Frame("ensemble", _SYNC, _size)
+
+
+def _data_sets(payload: bytes) -> Iterator[tuple[str, bytes]]:
+    """Yield name and content of each data set of an ensemble."""
+    at = 0
+    while at + 20 <= len(payload):
+        kind, elements, multiplier, _, name_length = struct.unpack_from("<5I", payload, at)
+        start = at + 20 + name_length
+        stop = start + elements * multiplier * _SIZES.get(kind, 4)
+        if name_length > 64 or stop > len(payload):
+            return
+        yield payload[at + 20 : start].rstrip(b"\0").decode("latin-1"), payload[start:stop]
+        at = stop
+
+
+def _time(content: bytes) -> float:
+    if len(content) < 52:
+        return np.nan
+    year, month, day, hour, minute, second, hundredth = struct.unpack_from("<7i", content, 24)
+    return float(posix(year, month, day, hour, minute, second + hundredth * 0.01)[0])
+
+
+def _bottom_track(content: bytes) -> Records | None:
+    values = np.frombuffer(content[: len(content) & ~3], "<f4").astype(float)
+    if len(values) < _HEAD or not 1.0 <= values[12] <= 4.0:
+        return None
+    beams = int(values[12])
+    if len(values) < _HEAD + 10 * beams:
+        return None
+    values[~np.isfinite(values)] = np.nan
+    # Range, SNR, amplitude, correlation, then velocity and count in beam, instrument and
+    # Earth axes.
+    arrays = values[_HEAD : _HEAD + 10 * beams].reshape(10, beams)
+    ping = empty(1, INSTRUMENT if beams >= 3 else BEAM)
+    for name, index in (("heading", 2), ("pitch", 3), ("roll", 4)):
+        ping[name] = values[index] * DEG
+    ping["temperature"], ping["depth"], ping["sound_speed"] = values[5], values[9], values[10]
+    ping["range"][0, :beams] = np.where(arrays[0] > 0.0, arrays[0], np.nan)
+    ping["beam_velocity"][0, :beams] = without(arrays[4], _BAD)
+    if beams >= 3:
+        velocity = without(arrays[6], _BAD)
+        ping["velocity"] = velocity[:3]
+        ping["error"] = velocity[3] if beams == 4 else np.nan
+    return ping

@@ -1,0 +1,179 @@
+"""Nortek Nucleus: packets decoded by nucleus-driver, found by their checksums here.
+
+Units and axes are those that the names in the maker's driver state: m/s, rad/s, degrees; forward,
+right, down. They were not compared with an instrument.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from factorgraph_dvl.files.formats.ad2cp import NUCLEUS, frames
+from factorgraph_dvl.files.formats.format import Batch, Clock, Format, Kind, empty, left_out
+from factorgraph_dvl.files.formats.framing import BLOCK, Records, map_file
+from factorgraph_dvl.files.formats.losses import Losses
+from factorgraph_dvl.files.formats.vehicles.library import column, columns, load, silently
+from factorgraph_dvl.files.formats.velocities import INSTRUMENT
+from factorgraph_dvl.geometry.units import DEG
+
+IMU, AHRS, BOTTOM, WATER, INS = 0x82, 0xD2, 0xB4, 0xBE, 0xDC
+# A calibration must not be compared with what was made of the same data.
+_INS = "packets of the INS were left out: it navigates by the same IMU and DVL"
+_HEADER = 10
+# Without an echo the driver passes on these.
+_NO_VELOCITY, _NO_MERIT = -32.0, 10.0
+_AXES = "axes of the Nucleus taken as forward, right, down: not verified"
+_SHIFT = "stamps of velocities were shifted by dtXYZ, from the stamp to their measurement"
+Packet = dict[str, Any]
+
+
+class _Silent:
+    """Where the parser writes what it thinks of a packet."""
+
+    def write_warning(self, message: object) -> None:
+        """Drop a message."""
+
+    write_exception = write_message = write_warning
+
+
+def share(path: Path, sample: bytes) -> float:
+    """Return the share of a sample that lies in packets of a Nucleus."""
+    if not sample:
+        return 0.0
+    found = [_HEADER + stop - start for kind, _, start, stop in frames(sample) if kind == NUCLEUS]
+    return sum(found) / len(sample)
+
+
+def read(path: Path, mapping: Mapping[str, Any] | None = None) -> Iterator[Batch]:
+    """Read IMU, AHRS, bottom track and water track packets.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    mapping : mapping, optional
+        Not used.
+
+    Yields
+    ------
+    Batch
+
+    Raises
+    ------
+    ConfigError
+        If nucleus-driver is not installed.
+    DataError
+        If the file cannot be read.
+    """
+    # The parser alone: the driver around it opens sockets.
+    parser = load("nucleus_driver._parser", "nucleus").Parser(messages=_Silent())
+    source = map_file(path)
+    gathered: dict[int, list[Packet]] = {kind: [] for kind in _CONVERTERS}
+    losses, notes = Losses(), []
+    for family, kind, start, stop in frames(source, losses):
+        if family == NUCLEUS and kind == INS and _INS not in notes:
+            notes.append(_INS)
+        if family != NUCLEUS or kind not in gathered:
+            continue
+        packet = _decoded(parser, bytearray(source[start - _HEADER : stop]))
+        if packet is None:
+            losses.add("packet too short for what it states", start - _HEADER)
+            continue
+        packet["at"] = start - _HEADER
+        gathered[kind].append(packet)
+        if len(gathered[kind]) >= BLOCK:
+            yield from silently(_CONVERTERS[kind](gathered[kind]))
+            gathered[kind] = []
+    for kind, packets in gathered.items():
+        if packets:
+            yield from silently(_CONVERTERS[kind](packets))
+    yield replace(left_out(losses), notes=tuple(notes))
+
+
+def _decoded(parser: Any, frame: bytearray) -> Packet | None:
+    try:
+        header, data, packet = parser.get_packet(frame)
+    except Exception:  # Of any type: the library does not foresee all damage.
+        return None
+    return packet if header and data and "flags.posixTime" in packet and len(packet) > 13 else None
+
+
+def _timed(kind: Kind, packets: list[Packet]) -> tuple[Records, Clock]:
+    out = empty(kind, len(packets))
+    out["at"] = [packet["at"] for packet in packets]
+    out["time"] = column(packets, "timeStamp") + column(packets, "microSeconds") * 1e-6
+    out["received"] = out["time"]
+    return out, "utc" if column(packets, "flags.posixTime").all() else "own"
+
+
+def _imu(packets: list[Packet]) -> Iterator[Batch]:
+    out, clock = _timed("imu", packets)
+    out["gyro"] = columns(packets, "gyro.x", "gyro.y", "gyro.z")
+    out["accel"] = columns(packets, "accelerometer.x", "accelerometer.y", "accelerometer.z")
+    valid = column(packets, "status.isValid") == 1.0
+    yield Batch("imu", out[valid], clock, "IMU", "FRD", notes=(_AXES,))
+
+
+def _attitude(packets: list[Packet]) -> Iterator[Batch]:
+    out, clock = _timed("attitude", packets)
+    for name in ("roll", "pitch", "heading"):
+        out[name] = column(packets, f"ahrsData.{name}") * DEG
+    declination = column(packets, "declination")
+    is_true = bool(np.all(np.isfinite(declination) & (declination != 0.0)))
+    note = "headings of the AHRS rest on its compass" + (
+        ", with a declination that was set" if is_true else "; no declination was set"
+    )
+    yield Batch(
+        "attitude", out, clock, "AHRS", "FRD", "true" if is_true else "magnetic", (_AXES, note)
+    )
+    depth, _ = _timed("depth", packets)
+    depth["depth"] = column(packets, "depth")
+    yield Batch("depth", depth, clock, "AHRS")
+
+
+def _track(kind: Kind, stream: str) -> Callable[[list[Packet]], Iterator[Batch]]:
+    def convert(packets: list[Packet]) -> Iterator[Batch]:
+        out, clock = _timed(kind, packets)
+        velocity = columns(packets, *(f"velocity{axis}" for axis in "XYZ"))
+        merit = columns(packets, *(f"fom{axis}" for axis in "XYZ"))
+        valid = columns(packets, *(f"status.{axis}VelocityValid" for axis in "xyz")) == 1.0
+        valid &= (velocity > _NO_VELOCITY) & (merit < _NO_MERIT)
+        out["axes"], out["velocity"] = INSTRUMENT, np.where(valid, velocity, np.nan)
+        out["std"] = np.where(valid & (merit > 0.0), merit, np.nan)
+        distance = columns(packets, *(f"distanceBeam{i}" for i in (1, 2, 3)))
+        known = columns(packets, *(f"status.beam{i}DistanceValid" for i in (1, 2, 3))) == 1.0
+        out["range"][:, :3] = np.where(known & (distance > 0.0), distance, np.nan)
+        out["sound_speed"] = column(packets, "soundSpeed")
+        out["temperature"] = column(packets, "temperature")
+        delay = column(packets, "dtXYZ")
+        out["delay"] = np.where((delay > 0.0) & (delay < 1.0), delay, np.nan)
+        note = "velocities along beams were left out: directions and signs are not documented"
+        shifted = (_SHIFT,) if np.isfinite(out["delay"]).any() else ()
+        yield Batch(kind, out, clock, stream, "FRD", notes=(_AXES, note, *shifted))
+
+    return convert
+
+
+_CONVERTERS: dict[int, Callable[[list[Packet]], Iterator[Batch]]] = {
+    IMU: _imu,
+    AHRS: _attitude,
+    BOTTOM: _track("dvl", "bottom track"),
+    WATER: _track("water", "water track"),
+}
+
+FORMAT = Format(
+    name="nucleus",
+    family="dvl",
+    title="Nortek Nucleus",
+    share=share,
+    read=read,
+    verified="packets written after the fields of the maker's driver; axes not verified",
+    endings=(".nucleus",),
+    module="nucleus_driver",
+    extra="nucleus",
+)

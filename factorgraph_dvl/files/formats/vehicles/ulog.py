@@ -1,0 +1,187 @@
+"""PX4 logs (ULog), through pyulog.
+
+Source: PX4, uORB message reference. Bodies are forward, right, down. Times are microseconds since
+the start, which GPS messages relate to UTC.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from factorgraph_dvl.errors import DataError
+from factorgraph_dvl.files.formats.format import Batch, Format, empty, positive
+from factorgraph_dvl.files.formats.framing import Records
+from factorgraph_dvl.files.formats.vehicles.library import (
+    gga_quality,
+    load,
+    quiet,
+    silently,
+    unreadable,
+)
+from factorgraph_dvl.files.formats.velocities import INSTRUMENT
+from factorgraph_dvl.geometry.units import DEG, MICROSECOND
+from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.settings.files import open_file
+
+_MAGIC = b"ULog\x01\x12\x35"
+# A receiver without time reports less.
+_EARLIEST = 1e8
+# Columns by name: of one message of the log.
+Columns = Mapping[str, Array]
+
+
+def share(path: Path, sample: bytes) -> float:
+    """Return whether a sample starts as a ULog file does."""
+    return float(sample.startswith(_MAGIC))
+
+
+def read(path: Path, mapping: Mapping[str, Any] | None = None) -> Iterator[Batch]:
+    """Read the messages in `CONVERTERS`; others are passed over.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    mapping : mapping, optional
+        Not used.
+
+    Yields
+    ------
+    Batch
+
+    Raises
+    ------
+    ConfigError
+        If pyulog is not installed.
+    DataError
+        If the file cannot be read.
+    """
+    library = load("pyulog", "px4")
+    expected = "a ULog file of PX4"
+    with open_file(path, expected=expected, where=path.name) as file, quiet():
+        try:
+            log = library.ULog(file, list(CONVERTERS), disable_str_exceptions=True)
+        except Exception as error:  # Of any type: the library does not foresee all damage.
+            raise unreadable(path, error, expected) from None
+    found = [data for data in log.data_list if len(data.data.get("timestamp", ()))]
+    if not found:
+        raise DataError(
+            "has none of the messages that are read here",
+            where=path.name,
+            expected=", ".join(CONVERTERS),
+        )
+    # What the receivers sent stands in the log beside what was chosen of it.
+    if any(data.name == "vehicle_gps_position" for data in found):
+        found = [data for data in found if data.name != "sensor_gps"]
+    yield from silently(
+        CONVERTERS[data.name](f"{data.name}[{data.multi_id}]", data.data) for data in found
+    )
+    if log.file_corruption:
+        note = f"{path.name} is damaged: pyulog left messages out"
+        yield Batch("clock", empty("clock", 0), notes=(note,))
+
+
+def _column(columns: Columns, *names: str) -> Array:
+    """Return the first column that is there, or nan: names changed between versions."""
+    for name in names:
+        if name in columns:
+            return np.asarray(columns[name], float)
+    return np.full(len(columns["timestamp"]), np.nan)
+
+
+def _vectors(columns: Columns, name: str, count: int = 3) -> Array:
+    return np.stack([_column(columns, f"{name}[{i}]") for i in range(count)], axis=1)
+
+
+def _started(out: Records, columns: Columns) -> Records:
+    out["at"] = np.arange(len(out))
+    out["received"] = _column(columns, "timestamp") * MICROSECOND
+    stamps = _column(columns, "timestamp_sample") * MICROSECOND
+    out["time"] = np.where(stamps > 0.0, stamps, out["received"])
+    return out
+
+
+def _count(columns: Columns) -> int:
+    return len(columns["timestamp"])
+
+
+def _imu(stream: str, columns: Columns) -> Batch:
+    out = _started(empty("imu", _count(columns)), columns)
+    out["gyro"] = _vectors(columns, "gyro_rad")
+    out["accel"] = _vectors(columns, "accelerometer_m_s2")
+    return Batch("imu", out, "own", stream, "FRD")
+
+
+def _attitude(stream: str, columns: Columns) -> Batch:
+    out = _started(empty("attitude", _count(columns)), columns)
+    q = _vectors(columns, "q", 4)
+    good = np.isfinite(q).all(axis=1) & (np.linalg.norm(q, axis=1) > 0.5)
+    # PX4 has the scalar first; the rotation takes the body to north, east, down.
+    angles = Rotation.from_quat(q[good][:, [1, 2, 3, 0]]).as_euler("ZYX")
+    rph = np.full((len(q), 3), np.nan)
+    rph[good] = angles[:, ::-1]
+    out["roll"], out["pitch"], out["heading"] = rph[:, 0], rph[:, 1], rph[:, 2] % (2.0 * np.pi)
+    note = f"{stream}: the filter of the autopilot; its heading may rest on a compass"
+    return Batch("attitude", out, "own", stream, "FRD", notes=(note,))
+
+
+def _fix(stream: str, columns: Columns) -> Batch:
+    out = _started(empty("fix", _count(columns)), columns)
+    utc = _column(columns, "time_utc_usec") * MICROSECOND
+    out["time"] = np.where(utc > _EARLIEST, utc, np.nan)
+    # Before version 1.14 positions were integers of 1e-7 degrees and of millimetres.
+    units = (1e-7, 1e-3) if "lat" in columns else (1.0, 1.0)
+    out["lat"] = _column(columns, "latitude_deg", "lat") * units[0] * DEG
+    out["lon"] = _column(columns, "longitude_deg", "lon") * units[0] * DEG
+    out["altitude"] = _column(columns, "altitude_msl_m", "alt") * units[1]
+    out["height"] = _column(columns, "altitude_ellipsoid_m", "alt_ellipsoid") * units[1]
+    kind = _column(columns, "fix_type")
+    # The last is extrapolated.
+    out["quality"] = np.where(kind == 8.0, 6.0, gga_quality(kind))
+    north, east, down = (_column(columns, f"vel_{axis}_m_s") for axis in "ned")
+    velocity = np.stack([east, north, -down], axis=1)
+    valid = _column(columns, "vel_ned_valid") != 0.0
+    out["velocity"] = np.where(valid[:, None], velocity, np.nan)
+    stds = np.stack([_column(columns, name) for name in ("eph", "eph", "epv")], axis=1)
+    out["std"] = positive(stds)
+    out["velocity_std"] = positive(_column(columns, "s_variance_m_s"))[:, None]
+    return Batch("fix", out, "utc", stream)
+
+
+def _odometry(stream: str, columns: Columns) -> Batch:
+    """`vehicle_visual_odometry`, as which vehicles under water log their DVL."""
+    out = _started(empty("dvl", _count(columns)), columns)
+    in_body = _column(columns, "velocity_frame") == 3.0
+    out["velocity"] = np.where(in_body[:, None], _vectors(columns, "velocity"), np.nan)
+    variance = _vectors(columns, "velocity_variance")
+    out["std"] = np.sqrt(positive(variance))
+    out["axes"] = INSTRUMENT
+    note = f"{stream}: velocities in the body's axes, taken as those of a DVL; others left out"
+    return Batch("dvl", out, "own", stream, "FRD", notes=(note,))
+
+
+CONVERTERS: dict[str, Callable[[str, Columns], Batch]] = {
+    "sensor_combined": _imu,
+    "vehicle_attitude": _attitude,
+    "vehicle_gps_position": _fix,
+    "sensor_gps": _fix,
+    "vehicle_visual_odometry": _odometry,
+}
+
+FORMAT = Format(
+    name="ulog",
+    family="vehicle",
+    title="PX4 ULog",
+    share=share,
+    read=read,
+    verified="files written after PX4's description of the format",
+    endings=(".ulg", ".ulog"),
+    module="pyulog",
+    extra="px4",
+    limit="pyulog keeps the messages that are read here in memory, at most the size of the file",
+)

@@ -1,0 +1,180 @@
+"""The DVL record of a trial: velocities in instrument axes, or along beams."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from factorgraph_dvl.errors import DataError
+from factorgraph_dvl.files.formats.framing import Records
+from factorgraph_dvl.files.importing.axes import beam_geometry, describe_axes, in_instrument_axes
+from factorgraph_dvl.files.importing.decisions import Decisions
+from factorgraph_dvl.files.importing.merging import SAMPLE, Merged, merge
+from factorgraph_dvl.files.importing.positions import best_source
+from factorgraph_dvl.files.importing.speeds import speed_of
+from factorgraph_dvl.files.importing.time_base import Timed
+from factorgraph_dvl.geometry.units import DEG
+from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.sensors.dvl import STD_COLUMNS, VELOCITY_COLUMNS
+from factorgraph_dvl.sensors.dvl_beams import beam_columns
+
+# Chosen: the least σ that a log is taken to have, and that of one that says nothing, m/s.
+_LEAST_STD, _USUAL_STD = 0.005, 0.02
+# The standard deviation of normal errors is this times their median magnitude.
+_MAD = 1.4826
+
+
+@dataclass(frozen=True)
+class Velocities:
+    """Pings over the bottom or through the water.
+
+    Parameters
+    ----------
+    pings : Merged
+        In order.
+    reference : {'bottom', 'water'}
+        What velocities are relative to.
+    directions : ndarray, shape (4, 3), or None
+        Outward beams, if velocities along beams are to be used.
+    std : float, m/s
+        Of a velocity, or of one along a beam.
+    own_std : bool
+        Whether the instrument states that of each ping.
+    locked, count : int
+        Pings with lock, and all.
+    """
+
+    pings: Merged
+    reference: str
+    directions: Array | None
+    std: float
+    own_std: bool
+    locked: int
+    count: int
+
+    @property
+    def section(self) -> str:
+        """Section of trial.yaml, and name of the table."""
+        return "dvl" if self.directions is None else "dvl_beams"
+
+    def tables(self, epoch: float) -> Iterator[dict[str, Array]]:
+        """Yield parts of the table."""
+        for time, part in self.pings.chunks():
+            table = {"time_s": time + np.nan_to_num(part["delay"]) - epoch}
+            if self.directions is not None:
+                names = beam_columns(len(self.directions))
+                yield table | {name: part["beams"][:, i] for i, name in enumerate(names)}
+                continue
+            velocity = in_instrument_axes(part)
+            velocity[np.isnan(velocity).any(axis=1)] = np.nan
+            table |= {name: velocity[:, i] for i, name in enumerate(VELOCITY_COLUMNS)}
+            if self.own_std:
+                std = np.where(np.isfinite(velocity), part["std"], np.nan)
+                table |= {name: std[:, i] for i, name in enumerate(STD_COLUMNS)}
+            yield table
+
+
+def choose(streams: Sequence[Timed], decisions: Decisions) -> Velocities | None:
+    """Return the pings of all files, None if there is no velocity log.
+
+    Parameters
+    ----------
+    streams : sequence of Timed
+        Of all kinds.
+    decisions : Decisions
+        Takes what was chosen, and why.
+
+    Raises
+    ------
+    DataError
+        If the files are of several instruments.
+    """
+    _check_one_instrument(streams)
+    usable = _usable(streams, decisions)
+    for kind, reference in (("dvl", "bottom"), ("water", "water")):
+        pings = merge(best_source(usable, kind, _lock, decisions), decisions)
+        if pings is None:
+            continue
+        locked = sum(int(np.isfinite(speed_of(part)).sum()) for _, part in pings.chunks())
+        has_water = any(timed.stream.kind == "water" for timed in streams)
+        if kind == "dvl" and locked == 0 and has_water:
+            continue
+        return _velocities(pings, reference, locked, decisions)
+    return None
+
+
+def _usable(streams: Sequence[Timed], decisions: Decisions) -> list[Timed]:
+    out = []
+    for timed in streams:
+        if timed.known:
+            out.append(timed)
+        elif timed.stream.kind in ("dvl", "water"):
+            decisions.add(
+                timed.stream.label, f"{len(timed.time)} pings, none with a time → left out"
+            )
+    return out
+
+
+def _lock(source: Sequence[Timed]) -> float:
+    return float(
+        sum(np.isfinite(speed_of(timed.stream.records[:SAMPLE])).sum() for timed in source)
+    )
+
+
+def _check_one_instrument(streams: Sequence[Timed]) -> None:
+    """Raise DataError where files are of several velocity logs: they are not one record."""
+    logs: dict[tuple[object, ...], str] = {}
+    for timed in streams:
+        if timed.stream.kind == "dvl":
+            angles = timed.stream.records[:SAMPLE]["beam_angle"]
+            angle = float(np.nanmedian(angles)) / DEG if np.isfinite(angles).any() else 0.0
+            logs.setdefault((timed.stream.format, round(angle)), timed.stream.file)
+    if len(set(logs.values())) > 1:
+        raise DataError(
+            f"the files are from {len(logs)} velocity logs ({', '.join(logs.values())})",
+            where="import",
+            expected="files of one log; import the others to separate trials",
+        )
+
+
+def _velocities(pings: Merged, reference: str, locked: int, decisions: Decisions) -> Velocities:
+    count = pings.count
+    label = pings.label
+    what = (
+        "pings with bottom lock"
+        if reference == "bottom"
+        else "pings with a velocity through water"
+    )
+    decisions.add(label, f"{locked} of {count} {what}", "dvl.file")
+    if reference == "water":
+        decisions.add(
+            label,
+            "no bottom track → mean velocity through the water of the cells that are mostly good, "
+            "with a current to estimate",
+            "dvl.reference",
+        )
+    describe_axes(pings, decisions)
+    directions = beam_geometry(pings) if locked and reference == "bottom" else None
+    sample = pings.sample
+    own_std = bool(np.isfinite(sample["std"]).any()) and directions is None
+    return Velocities(
+        pings, reference, directions, _std(sample, label, decisions), own_std, locked, count
+    )
+
+
+def _std(sample: Records, label: str, decisions: Decisions) -> float:
+    error = sample["error"][np.isfinite(sample["error"])]
+    if len(error):
+        # The error velocity is scaled so that its σ is that of the horizontal velocities.
+        spread = _MAD * float(np.median(np.abs(error - np.median(error))))
+        value = max(_LEAST_STD, round(spread, 4))
+        decisions.add(
+            label,
+            f"σ of velocities from the spread of the error velocity: {spread:.4f} m/s",
+            "dvl.velocity_std_m_s",
+        )
+        return value
+    decisions.add(label, "no error velocity → σ chosen as is usual", "dvl.velocity_std_m_s")
+    return _USUAL_STD

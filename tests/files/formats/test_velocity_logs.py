@@ -1,0 +1,207 @@
+"""Velocity logs from PD4 to Rowe: written by their documents, read back."""
+
+from __future__ import annotations
+
+import json
+from datetime import UTC, datetime
+
+import format_writers as writers
+import numpy as np
+import pytest
+from format_samples import PD13, SERIAL, WHEN, rowe_ensemble
+from format_writers import nmea
+
+from factorgraph_dvl.files.formats.dvl_sentences import read_cerulean, read_nortek
+from factorgraph_dvl.files.formats.pd4 import read_pd4
+from factorgraph_dvl.files.formats.pd6 import read_pd6
+from factorgraph_dvl.files.formats.rowe import read_rowe
+from factorgraph_dvl.files.formats.velocities import BEAM, EARTH, INSTRUMENT, SHIP
+from factorgraph_dvl.files.formats.water_linked import crc8, read_water_linked
+
+DEG = np.pi / 180.0
+
+
+def test_pd4_and_pd5():
+    data = writers.pd4(1, (0.123, -0.456, 1.0, 0.002), (10, 11, 0, 12.34), (23, 59, 58, 7))
+    data += b"\r\n>" + writers.pd4(0, (0.1, 0.2, None, 0.3), (1, 2, 3, 4), (0, 0, 0, 0))
+    data += writers.pd4(
+        2, (1.0, 2.0, 3.0, 0.0), (1, 2, 3, 4), (1, 2, 3, 4), long=True, heading=350.5
+    )
+    (found,) = read_pd4(data)
+    short, long = found[:2], found[2:]
+    np.testing.assert_allclose(short["velocity"][0], [0.123, -0.456, 1.0])
+    np.testing.assert_array_equal(short["axes"], [INSTRUMENT, BEAM])
+    np.testing.assert_allclose(short["range"][0], [10, 11, np.nan, 12.34])
+    assert short["second"][0] == pytest.approx(86398.07)
+    np.testing.assert_allclose(short["beam_velocity"][1], [0.1, 0.2, np.nan, 0.3])
+    assert np.isnan(short["velocity"][1]).all()
+    assert np.isnan(short["heading"]).all()
+    assert short["at"][0] == 0
+    assert long["axes"][0] == SHIP
+    np.testing.assert_allclose(
+        [long[n][0] / DEG for n in ("pitch", "roll", "heading")], [1.5, -2.5, 350.5]
+    )
+    assert (long["depth"][0], long["temperature"][0], long["sound_speed"][0]) == (
+        pytest.approx(12.3),
+        10.5,
+        1501,
+    )
+
+
+def test_pd4_damage():
+    good = writers.pd4(1, (0.1, 0.2, 0.3, 0.0), (1, 2, 3, 4), (1, 2, 3, 4))
+    bad = bytearray(good)
+    bad[7] ^= 4
+    found = [part for part in read_pd4(good[:20] + good + bytes(bad) + good) if len(part)]
+    assert sum(map(len, found)) == 2
+
+
+def test_pd6_and_pd13():
+    second = ":SA,0,0,0\n:TS,21030405060812,35,10,1,1500,0\n"
+    second += ":BI,-32768,-32768,-32768,-32768,V\n:BE,+5,+6,+7,V\n"
+    third = ":SA,0,0,0\n:BE,+5,+6,+7,A\n"
+    (found,) = read_pd6((PD13 + second + third).replace("\n", "\r\n").encode())
+    assert len(found) == 3
+    np.testing.assert_allclose(found["velocity"][0], [0.123, -0.456, 1.0])
+    assert found["axes"][0] == INSTRUMENT
+    assert found["time"][0] == pytest.approx(WHEN.timestamp(), abs=1e-6)
+    np.testing.assert_allclose(found["range"][0], [10.05, 9.9, np.nan, 10.125])
+    assert found["altitude"][0] == 10.1
+    np.testing.assert_allclose(
+        [found[n][0] / DEG for n in ("pitch", "roll", "heading")], [1.5, -2.25, 181.02]
+    )
+    assert np.isnan(found["velocity"][1]).all()
+    np.testing.assert_allclose(found["velocity"][2], [0.005, 0.006, 0.007])
+    assert found["axes"][2] == EARTH
+
+
+def test_nortek_published_sentences():
+    data = (
+        b"$PNORBT0,1,040721,131335.3341,23.961,-48.122,-32.76800,10.00000,0.00,0x00000000*48\r\n"
+        b"$PNORBT7,1452244916.7508,1.234,-1.234,0.1234,0.1234,0.1234,12.34,23.45,23.45,23.45,23.45*39\r\n"
+        b"$PNORBT9,1452244916.7508,1.234,-1.234,0.1234,0.1234,0.1234,12.34,23.45,23.45,23.45,23.45,23.4,1567.8,1.2,12.3,0x000FFFFF*1E\r\n"
+        b"$PNORBT,3,112813,072228.2345,0.1234,0.1234,1.11111,122.2,36.66,2.22222,F7*7A\r\n"
+    )
+    (found,) = read_nortek(data)
+    assert len(found) == 4
+    assert np.isnan(found["beam_velocity"][0]).all()
+    assert found["time"][0] == pytest.approx(
+        datetime(2021, 4, 7, 13, 13, 35, 334100, UTC).timestamp(), abs=1e-4
+    )
+    np.testing.assert_allclose(found["velocity"][1], 0.1234)
+    assert found["time"][2] == 1452244916.7508
+    assert found["sound_speed"][2] == 1567.8
+    assert found["beam_velocity"][3][2] == 1.11111
+
+
+def test_nortek_beams_of_one_time_and_tags():
+    data = b"".join(
+        nmea(
+            f"PNORBT1,BEAM={i},DATE=040721,TIME=131335.{k},DT1=0,DT2=0,BV={i}.5,FM=0.1,DIST=1{i}.0,STAT=0x1"
+        )
+        for k in (1, 2)
+        for i in (1, 2, 3, 4)
+    )
+    data += nmea(
+        "PNORBT6,TIME=1452244916.75,DT1=1.2,DT2=-1.2,VX=0.1,VY=-32.768,VZ=0.3,FOM=0.002,D1=1.0,D2=0.0,D3=3.0,D4=4.0"
+    )
+    (found,) = read_nortek(data)
+    assert len(found) == 3
+    np.testing.assert_allclose(found["beam_velocity"][:2], [[1.5, 2.5, 3.5, 4.5]] * 2)
+    np.testing.assert_allclose(found["range"][0], [11, 12, 13, 14])
+    np.testing.assert_allclose(found["velocity"][2], [0.1, np.nan, 0.3])
+    np.testing.assert_allclose(found["range"][2], [1, np.nan, 3, 4])
+    assert found["merit"][2] == 0.002
+
+
+def test_cerulean():
+    # Cerulean's example, whose own checksum is not that of its text.
+    data = nmea("DVPDL,101234000,50000,0.001263,-0.019663,-0.745226,-0.000,0.001,-0.005,100")
+    data += nmea("DVPDX,101334000,100000,0,0,0,0.1,0.2,0.3,0,1,0.1,0.2,3.0")
+    fields = "T,A,3333,1.5,-2.5,90.0,0,0.01,5.5,1.25,-0.75,48.1,-123.0,0.1,1,0,0,0,6,6,6,6,"
+    fields += "T,T,F,T,0.1,0.2,0.3,0.4,5,6,7,8,"
+    data += nmea("DVEXT," + fields) + nmea("DVEXT," + fields.replace("T,A", "F,A", 1))
+    (increments, extended) = next(iter(read_cerulean(data)))
+    np.testing.assert_allclose(increments["velocity"][0], [0.0, 0.02, -0.1])
+    assert increments["second"][0] == 101.234
+    assert np.isnan(increments["velocity"][1]).all()
+    np.testing.assert_allclose(extended["velocity"][0], [-0.75, 1.25, 0.01])
+    np.testing.assert_allclose(extended["beam_velocity"][0], [0.1, 0.2, np.nan, 0.4])
+    np.testing.assert_allclose(extended["second"], [0.1, 0.2])
+    assert np.isnan(extended["velocity"][1]).all()
+    assert extended["axes"][0] == EARTH
+
+
+def test_water_linked_published_reports():
+    (found, positions) = next(iter(read_water_linked(SERIAL)))
+    assert len(found) == 2
+    np.testing.assert_allclose(found["velocity"][0], [0.12, -0.4, 2.0])
+    np.testing.assert_allclose(found["beam_velocity"][0], [0.07, -0.5, 2.2, 1.8])
+    np.testing.assert_allclose(found["range"][0], [1.1, 1.25, 1.4, 1.35])
+    assert found["time"][0] == pytest.approx(7e-6)
+    assert np.isnan(found["velocity"][1]).all()
+    np.testing.assert_allclose(found["second"], [0.123, 1.19851])
+    assert positions["x"][0] == 0.41
+    assert positions["yaw"][0] / DEG == pytest.approx(19.3)
+
+
+def test_water_linked_json():
+    beam = {
+        "id": 0,
+        "velocity": 0.1,
+        "distance": 0.55,
+        "rssi": -30,
+        "nsd": -88,
+        "beam_valid": True,
+    }
+    report = {"time": 106.5, "vx": 0.5, "vy": -0.25, "vz": 0.1, "fom": 0.002, "altitude": 0.49}
+    report |= {
+        "transducers": [beam, beam | {"id": 1, "beam_valid": False}],
+        "velocity_valid": True,
+    }
+    report |= {
+        "status": 0,
+        "format": "json_v3",
+        "type": "velocity",
+        "time_of_validity": 1638191471563017,
+    }
+    data = b"2021-11-29 " + json.dumps(report).encode() + b"\n"
+    data += json.dumps(report | {"velocity_valid": False}).encode() + b"\n{broken\n[1]\n"
+    data += json.dumps({"ts": 49056.809, "x": 1.0, "type": "position_local"}).encode()
+    (found, positions) = next(iter(read_water_linked(data)))
+    np.testing.assert_allclose(found["velocity"], [[0.5, -0.25, 0.1], [np.nan] * 3])
+    np.testing.assert_allclose(found["beam_velocity"][0], [0.1, np.nan, np.nan, np.nan])
+    assert found["time"][0] == pytest.approx(1638191471.563017, abs=1e-6)
+    assert found["second"][1] == pytest.approx(0.213)
+    assert positions["time"][0] == 49056.809
+
+
+def test_crc_of_the_standard_check():
+    assert crc8(b"123456789") == 0xF4
+
+
+@pytest.mark.parametrize(
+    "text", [b"[" * 60000, b'{"vx":' * 9000, b'{"vx":' + b"9" * 6000 + b',"velocity_valid":true}']
+)
+def test_hostile_json_is_passed_over(text):
+    for found, _ in read_water_linked(text):
+        assert not np.isfinite(found["velocity"]).any()
+
+
+def test_rowe():
+    data = (
+        rowe_ensemble(sentence=nmea("GPHDT,85.5,T"))
+        + b"\x80" * 20
+        + rowe_ensemble(2)[:-1]
+        + rowe_ensemble(3)
+    )
+    (found, sentences) = next(iter(read_rowe(data)))
+    assert len(found) == 2
+    np.testing.assert_allclose(found["velocity"][0], [0.5, -0.6, 0.7], atol=1e-6)
+    np.testing.assert_allclose(found["beam_velocity"][0], [0.1, np.nan, 0.3, 0.4], atol=1e-6)
+    np.testing.assert_allclose(found["range"][0], [10, np.nan, 11, 12])
+    assert found["time"][0] == pytest.approx(WHEN.timestamp(), abs=1e-6)
+    np.testing.assert_allclose(
+        [found[n][0] / DEG for n in ("heading", "pitch", "roll")], [123, 2, 181], atol=1e-5
+    )
+    assert sentences["HDT"]["received"][0] == pytest.approx(WHEN.timestamp(), abs=1e-6)
