@@ -41,7 +41,9 @@ class Model:
     parameters : tuple of Parameter
         Calibration parameters, known ones included.
     reference : tuple of (object, dict of str to ndarray)
-        States and parameters at which gravity and the weights of measurements are taken.
+        States and parameters at which the weights of measurements are taken.
+    track : ndarray, shape (K, 3), m
+        Positions of the nodes in n at which gravity is taken.
     processes : tuple of Process
         Correlated errors.
     noise_factors : mapping of str to ndarray
@@ -66,6 +68,7 @@ class Model:
     chain: Chain
     parameters: tuple[Parameter, ...]
     reference: tuple[Any, dict[str, Array]]
+    track: Array
     processes: tuple[Process, ...] = ()
     noise_factors: Mapping[str, Array] = field(default_factory=dict)
     long_run: Mapping[str, Array] = field(default_factory=dict)
@@ -202,8 +205,8 @@ def minimised(
 ) -> tuple[Model, Problem, Minimum]:
     """Return a model at its minimum, its problem and the minimum.
 
-    Gravity and weights are those of the model's reference, so that the objective compares with
-    that of others; where the minimum is far from it, they are taken there.
+    Gravity and weights are those of the model, so that the objective compares with that of others;
+    where the minimum is far from where they were taken, they are taken there.
 
     Parameters
     ----------
@@ -239,15 +242,16 @@ def minimised(
         )
         iterations += minimum.iterations
         states, values = minimum.evaluation.states, minimum.evaluation.parameters
-        moved = float(np.sqrt(np.mean((states.p_n - model.reference[0].p_n) ** 2)))
+        moved = float(np.sqrt(np.mean((states.p_n - model.track) ** 2)))
         heavier = not model.chain.interpolates and moved > _SAME_GRAVITY
-        again = heavier or problem.needs_reweighting(minimum.evaluation)
-        if not (again or problem.needs_rebinding(values)):
+        lighter = problem.needs_reweighting(minimum.evaluation)
+        if not (heavier or lighter or problem.needs_rebinding(values)):
             break
-        chain = model.prepared.chain(states) if heavier else model.chain
-        reference = (states, values) if again else model.reference
         last, problem = problem, None
-        model = replace(model, chain=chain, reference=reference)
+        if heavier:
+            model = replace(model, chain=model.prepared.chain(states), track=states.p_n)
+        if heavier or lighter:
+            model = replace(model, reference=(states, values))
     return model, problem or last, replace(minimum, iterations=iterations)
 
 

@@ -104,7 +104,7 @@ def settle(
     steps: list[Step] = [
         MotionStrengths(), States(), Gates(), GrossErrors(), Correlation(), known, Noise(), walks,
     ]  # fmt: skip
-    going_on = True
+    recorded, changed, going_on = at, "", True
     while going_on and len(record) < _MOST_STEPS:
         going_on = False
         for step in steps:
@@ -112,10 +112,13 @@ def settle(
             iterations += tried
             if found is None:
                 continue
-            fall, move = at.objective - found.objective, found.moved_from(at)
-            record.append(SolverStep(step.name, found.objective, fall, move))
+            changed = changed or step.name
+            fall, move = recorded.objective - found.objective, found.moved_from(recorded)
             going_on = found.rough or fall > _SAME_OBJECTIVE or move > _SAME_CONSTANTS
             at = found
+            if not found.rough:
+                record.append(SolverStep(changed, found.objective, fall, move))
+                recorded, changed = found, ""
             if going_on:
                 break
     findings = (
@@ -141,7 +144,7 @@ def _start(
     clock_zero: float | None,
 ) -> tuple[Proposal, int]:
     """Return what is assumed first, where its minimisation starts, and iterations up to there."""
-    chain = prepared.chain(states)
+    chain, track = prepared.chain(states), states.p_n
     robust: dict[str, Array] = {}
     iterations = 0
     if constants_prior is not None:
@@ -158,6 +161,7 @@ def _start(
         chain,
         prepared.parameters,
         (states, values),
+        track,
         processes=prepared.stated_processes(chain, states, values),
         noise_factors={
             o.label: np.ones(len(o.components))
@@ -200,7 +204,8 @@ def _kept(step: Step, at: Estimated, report: Progress) -> tuple[Estimated | None
             rough=proposal.rough,
         )
         iterations += found.minimum.iterations
-        if found.objective < at.objective:
+        # An objective is that of a minimum: where one was not reached, it is still open.
+        if found.objective < at.objective or (at.rough and proposal.model is at.model):
             return found, iterations
     if not at.model.is_applied(at.problem):
         at.model.applied(at.problem)

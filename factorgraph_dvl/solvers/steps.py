@@ -101,8 +101,8 @@ class MotionStrengths:
         """Yield strengths that the residuals ask for, and others on the way there."""
         model = at.model
         # What other assumptions made of the noise is to be found anew.
-        own = (model.parameters, model.robust_weights, tuple(p.label for p in model.processes))
-        if own == self._settled_for:
+        own = model.parameters, model.robust_weights, _labels(model)
+        if _are_those(own, self._settled_for):
             return
         found = model.prepared.strengths(at.problem, at.minimum, self._last)
         if found is None:
@@ -139,7 +139,7 @@ class States:
     def proposals(self, at: Estimated) -> Iterator[Proposal]:
         """Yield the same model where its minimum is not reached."""
         if at.rough or not at.minimum.converged:
-            yield _from(at)
+            yield Proposal(at.model, at.states, at.values)
 
 
 class Gates:
@@ -165,8 +165,8 @@ class GrossErrors:
     def proposals(self, at: Estimated) -> Iterator[Proposal]:
         """Yield the gross errors that are found where all measurements count."""
         model, problem = at.model, at.problem
-        own = (model.parameters, model.prepared, tuple(p.label for p in model.processes))
-        if own != self._for:
+        own = model.parameters, model.prepared, _labels(model)
+        if not _are_those(own, self._for):
             self._for, self._searched = own, 0
         if self._searched >= _SEARCHES:
             return
@@ -196,8 +196,8 @@ class Correlation:
     def proposals(self, at: Estimated) -> Iterator[Proposal]:
         """Yield the correlated noise that a trial states, or that residuals show."""
         model, problem, minimum = at.model, at.problem, at.minimum
-        own = (model.parameters, model.prepared)
-        if own == self._for or not minimum.converged:
+        own = model.parameters, model.prepared
+        if _are_those(own, self._for) or not minimum.converged:
             return
         self._for = own
         found = correlated_noise(problem, minimum.evaluation, set(model.noise_factors))
@@ -283,7 +283,7 @@ class Noise:
                 for label, factor in factors.items()
             }
             part = tuple(map(_between, model.processes, processes, np.full(len(processes), share)))
-            if _same(changed, before) and part == model.processes:
+            if _same(changed, before) and _are_those(part, model.processes):
                 return
             yield _from(at, noise_factors=changed, processes=part)
 
@@ -323,6 +323,18 @@ class Walks:
             *reference,
         )
         self.findings = ()
+
+
+def _labels(model: Model) -> str:
+    """Return which noise persists."""
+    return ", ".join(p.label for p in model.processes)
+
+
+def _are_those(some: tuple[Any, ...], others: tuple[Any, ...] | None) -> bool:
+    """Whether objects are the same, and not only equal; texts, if they are equal."""
+    return others is not None and all(
+        a is b or (isinstance(a, str) and a == b) for a, b in zip(some, others, strict=True)
+    )
 
 
 def _between(before: Process, after: Process, share: float) -> Process:

@@ -111,8 +111,8 @@ def _objective(
     correlated = sum(process.log_determinant for process in problem.processes)
     _, prior = np.linalg.slogdet(problem.prior_root)
     least = evaluation.cost - information.decrease
-    return (
-        2.0 * (least + log_sigma + float(prior))
+    return float(
+        2.0 * (least + log_sigma + prior)
         + information.log_determinant
         + correlated
         + problem.chain.log_determinant
