@@ -27,15 +27,14 @@ CAPABILITIES = (
     (
         "units, rotations, Earth, settings, trial, solution",
         "conventions celestial directions earth errors solution trial yaml_file __init__",
-        "geometry/* settings/* errors solution trial __init__",
+        "geometry/* settings/* errors message estimates solution trial __init__",
         "settings/ranges settings/files",
     ),
     (
         "sensors: settings, records, residuals",
         "sensors/* beam_geometry gains turning",
         "sensors/*",
-        "sensors/ins sensors/attitude sensors/finding sensors/verdict sensors/invalid_values "
-        "sensors/imu_grades sensors/fingerprint sensors/grades sensors/clock",
+        "sensors/ins sensors/attitude sensors/imu_grades sensors/fingerprint sensors/clock",
     ),
     (
         "IMU: increments, preintegration, motion at any time",
@@ -65,7 +64,7 @@ CAPABILITIES = (
     (
         "position from ranges, planar trials",
         "anchoring planar/*",
-        "ranging/* quality/*planar*",
+        "ranging/* plausibility/*planar*",
         "",
     ),
     ("replay", "replay/*", "replay/*", ""),
@@ -92,9 +91,10 @@ CAPABILITIES = (
     (
         "plausibility of records",
         "analysis/*sanity analysis/records analysis/*survey analysis/finding",
-        "quality/*",
-        "quality/consistency quality/bow_and_course quality/*_axes quality/axis_permutations "
-        "quality/sensor_clocks quality/earlier_calibration quality/refusal",
+        "quality/* plausibility/*",
+        "quality/* plausibility/consistency plausibility/bow_and_course plausibility/*_axes "
+        "plausibility/axis_permutations plausibility/sensor_clocks "
+        "plausibility/earlier_calibration plausibility/refusal",
     ),
     (
         "analyses",

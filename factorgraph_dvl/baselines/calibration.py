@@ -37,10 +37,10 @@ from factorgraph_dvl.baselines.summary import (
 from factorgraph_dvl.baselines.wahba import wahba
 from factorgraph_dvl.errors import ConfigError, DataError
 from factorgraph_dvl.geometry.rotations import BodyAxes, rph_from_rotation
-from factorgraph_dvl.imu.timestamps import JUMP, without_strays
+from factorgraph_dvl.imu.timestamps import JUMP, without_restarted_clock
+from factorgraph_dvl.message import message
+from factorgraph_dvl.quality.finding import Code, Finding
 from factorgraph_dvl.sensors.dvl import SCALE_SPEC, Dvl
-from factorgraph_dvl.sensors.finding import Code, Finding
-from factorgraph_dvl.sensors.message import message
 from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.solution import Progress, Solution
 from factorgraph_dvl.trial import Trial
@@ -153,7 +153,7 @@ def calibrate(
     report = progress or (lambda stage, iteration, cost: None)
     if method == "4sv-2ob" or method == "4sv-3ob":
         return filter_planar(trial, method, progress=report)
-    trial = (trial if trial.imu is None else without_strays(trial)).on_one_clock()
+    trial = (trial if trial.imu is None else without_restarted_clock(trial)).on_one_clock()
     if method == "star" or method == "liu-2020":
         report("SINS/stars", 0, None)
         solution, outcome = calibrate_gyros(trial, rate_hz=rate_hz, printed=method == "liu-2020")

@@ -21,9 +21,9 @@ from factorgraph_dvl.baselines.outcome import Estimated, Outcome, history_rows, 
 from factorgraph_dvl.baselines.point_sets import Points, misfit, rotation_starts
 from factorgraph_dvl.geometry.rotations import exp_so3, log_so3
 from factorgraph_dvl.geometry.vectors import Array, rotate, skew
+from factorgraph_dvl.message import message
+from factorgraph_dvl.quality.finding import Code, Finding
 from factorgraph_dvl.sensors.dvl import SCALES_SPEC
-from factorgraph_dvl.sensors.finding import Code, Finding
-from factorgraph_dvl.sensors.message import message
 from factorgraph_dvl.sensors.parameters import Parameter
 
 # Chosen: prior standard deviation of the bias, m/s, where the trial fixes it: the method

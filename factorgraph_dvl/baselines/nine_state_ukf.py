@@ -18,7 +18,7 @@ from factorgraph_dvl.errors import ConfigError
 from factorgraph_dvl.geometry.rotations import exp_so3
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array
-from factorgraph_dvl.sensors.finding import Finding
+from factorgraph_dvl.quality.finding import Finding
 from factorgraph_dvl.sensors.parameters import Parameter
 
 # Squared distance of the sigma points, in standard deviations: that of a normal distribution's

@@ -202,14 +202,16 @@ def _run(
 
 def _print_campaign(found: Campaign) -> None:
     console = stdout()
+    from factorgraph_dvl.quality.texts import text_of
+
     unused = [t for t in found.trials if t.unused]
     for t in unused:
-        warn(f"{t.label} is not used: {t.unused}")
+        warn(f"{t.label} is not used: {text_of(t.unused)}")
     joint = found.joint
     if joint is None:
         warn("no trial has a result that can be used: there is no joint calibration")
         return
-    from factorgraph_dvl.report.text import with_std
+    from factorgraph_dvl.quality.notation import with_std
 
     std = [float(v) ** 0.5 for v in joint.covariance.diagonal()]
     for k, name in enumerate(joint.information.names):

@@ -14,7 +14,7 @@ def inspect(trial_path: TrialPath) -> None:
       factorgraph-dvl inspect data/seed-a-phase-90
     """
     from factorgraph_dvl.files.trial_folder import load_trial
-    from factorgraph_dvl.quality.survey import survey
+    from factorgraph_dvl.plausibility.survey import survey
     from factorgraph_dvl.report.terminal.tables import (
         finding_lines,
         imu_lines,

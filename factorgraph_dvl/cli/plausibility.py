@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from factorgraph_dvl.sensors.finding import Finding
+    from factorgraph_dvl.quality.finding import Finding
     from factorgraph_dvl.trial import Trial
 
 
@@ -24,7 +24,7 @@ def errors_in(trial: Trial, *, anyway: bool) -> tuple[Finding, ...]:
     DataError
         If there are records that cannot be used, unless `anyway`.
     """
-    from factorgraph_dvl.quality.refusal import accepted_errors
-    from factorgraph_dvl.quality.survey import survey
+    from factorgraph_dvl.plausibility.refusal import accepted_errors
+    from factorgraph_dvl.plausibility.survey import survey
 
     return accepted_errors(survey(trial), anyway=anyway)

@@ -6,12 +6,12 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
+from factorgraph_dvl.estimates import Cause
 from factorgraph_dvl.geometry.units import HOUR
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph.priors import PRIOR
 from factorgraph_dvl.graph.problem import Problem, Rows
 from factorgraph_dvl.sensors.parameters import UNITS, Parameter
-from factorgraph_dvl.solution import Cause
 from factorgraph_dvl.solvers.calibration import reported, spread_of_fixed
 from factorgraph_dvl.solvers.fixed_directions import SolvedProblem
 from factorgraph_dvl.statistics.error_budget import error_budget

@@ -18,10 +18,10 @@ from factorgraph_dvl.graph.bound_observation import EXTRAPOLATED
 from factorgraph_dvl.graph.priors import ConstantsPrior, Tilt
 from factorgraph_dvl.graph.problem import Evaluation, Problem
 from factorgraph_dvl.graph.processes import Process
-from factorgraph_dvl.sensors.finding import Code, Finding
-from factorgraph_dvl.sensors.message import Message, message
+from factorgraph_dvl.message import Message, message
+from factorgraph_dvl.quality.finding import Code, Finding
+from factorgraph_dvl.quality.results import DO_NOT_FIT
 from factorgraph_dvl.sensors.parameters import Parameter
-from factorgraph_dvl.sensors.protocol import DO_NOT_FIT
 from factorgraph_dvl.solution import Progress
 from factorgraph_dvl.solvers.bias_walks import BiasWalks, bias_walks
 from factorgraph_dvl.solvers.change_along_trial import CHANGED, component_changes

@@ -8,9 +8,10 @@ from datetime import UTC, datetime
 import numpy as np
 
 from factorgraph_dvl.errors import DataError
+from factorgraph_dvl.estimates import Trajectory
 from factorgraph_dvl.geometry.rotations import BodyAxes
 from factorgraph_dvl.geometry.vectors import Array
-from factorgraph_dvl.solution import Solution, Trajectory
+from factorgraph_dvl.solution import Solution
 
 # Times of a trial that are seconds since 1970 already. Chosen: since 2001.
 _UNIX_FROM = 1e9
