@@ -19,9 +19,14 @@ from factorgraph_dvl.estimates import (
 from factorgraph_dvl.geometry.rotations import BodyAxes
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.quality.finding import Finding
-from factorgraph_dvl.quality.grades import DEFAULT_LIMITS, Grade, grades_of
 from factorgraph_dvl.quality.notation import split_unit, with_std
-from factorgraph_dvl.quality.verdict import Verdict, verdict_of_result
+from factorgraph_dvl.quality.verdict import (
+    DEFAULT_LIMITS,
+    Grade,
+    Verdict,
+    grades_of,
+    verdict_of_result,
+)
 
 # Called on the way to a solution: with the stage, what is counted in it, and the cost if any.
 Progress = Callable[[str, int, float | None], None]

@@ -15,7 +15,7 @@ from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.rotations import BodyAxes, frd_from_body
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.quality.finding import Finding
-from factorgraph_dvl.quality.grades import DEFAULT_LIMITS
+from factorgraph_dvl.quality.verdict import DEFAULT_LIMITS
 from factorgraph_dvl.sensors.attitude import Attitude
 from factorgraph_dvl.sensors.beacon import Beacons
 from factorgraph_dvl.sensors.beam_geometry import as_dvl

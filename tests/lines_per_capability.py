@@ -58,8 +58,8 @@ CAPABILITIES = (
         "statistics/correlation statistics/constancy solvers/change_along_trial "
         "solvers/correlated_noise solvers/known_parameters solvers/motion_* "
         "solvers/preparation_without_imu "
-        "statistics/error_budget statistics/robust_weights statistics/rows statistics/scores "
-        "statistics/variance_components solvers/causes solvers/minima solvers/outliers",
+        "statistics/robust_weights statistics/rows statistics/scores "
+        "statistics/variance_components solvers/error_budget solvers/minima solvers/outliers",
     ),
     (
         "position from ranges, planar trials",
@@ -73,7 +73,7 @@ CAPABILITIES = (
         "Kalman baselines",
         "kalman/*",
         "baselines/*",
-        "baselines/nine_state_ukf baselines/liu_2020 baselines/luo_2024",
+        "baselines/liu_2020 baselines/luo_2024",
     ),
     (
         "simulation",
@@ -85,16 +85,15 @@ CAPABILITIES = (
         "trial and solution folders",
         "io/*",
         "files/*",
-        "files/formats/* files/importing/* files/exporting/* files/data_frames files/output_file "
+        "files/formats/* files/importing/* files/exporting/* files/data_frames "
         "files/run_file files/residual_table files/earlier_calibration",
     ),
     (
         "plausibility of records",
         "analysis/*sanity analysis/records analysis/*survey analysis/finding",
         "quality/* plausibility/*",
-        "quality/* plausibility/consistency plausibility/bow_and_course plausibility/*_axes "
-        "plausibility/axis_permutations plausibility/sensor_clocks "
-        "plausibility/earlier_calibration plausibility/refusal",
+        "quality/* plausibility/consistency plausibility/axes plausibility/clocks "
+        "plausibility/earlier_calibration",
     ),
     (
         "analyses",
@@ -115,7 +114,7 @@ CAPABILITIES = (
         "cli/*",
         "cli/*",
         "cli/allan cli/import_files cli/reproduce cli/campaign* cli/events cli/export cli/report "
-        "cli/streams cli/memory cli/verdict",
+        "cli/verdict",
     ),
     ("publications, measured", "", "reproduce/*", "reproduce/*"),
 )

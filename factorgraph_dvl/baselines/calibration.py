@@ -12,8 +12,7 @@ from factorgraph_dvl.baselines.beam_calibration import calibrate_beams
 from factorgraph_dvl.baselines.least_squares import least_squares
 from factorgraph_dvl.baselines.luo_2024 import as_printed
 from factorgraph_dvl.baselines.navigation import Navigation, attitude_is_known, navigate
-from factorgraph_dvl.baselines.nine_state import nine_state, with_bias
-from factorgraph_dvl.baselines.nine_state_ukf import unscented
+from factorgraph_dvl.baselines.nine_state import nine_state, unscented, with_bias
 from factorgraph_dvl.baselines.outcome import History, Outcome, history_of
 from factorgraph_dvl.baselines.point_set_filter import point_set
 from factorgraph_dvl.baselines.point_sets import Points

@@ -11,9 +11,8 @@ import msgspec
 import numpy as np
 
 from factorgraph_dvl.campaign.joint_calibration import JointCalibration
-from factorgraph_dvl.campaign.monte_carlo import MonteCarlo, Statistic
+from factorgraph_dvl.campaign.monte_carlo import SEEDS_FOLDER, MonteCarlo, SeedRecord, Statistic
 from factorgraph_dvl.campaign.record import write_whole
-from factorgraph_dvl.campaign.seed_run import SEEDS_FOLDER, SeedRecord
 from factorgraph_dvl.campaign.trial_run import TRIALS_FOLDER
 from factorgraph_dvl.campaign.trials import Campaign
 from factorgraph_dvl.errors import as_text

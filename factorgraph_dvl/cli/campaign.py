@@ -141,9 +141,8 @@ def _run_seeds(
     quiet: bool,
 ) -> None:
     from factorgraph_dvl.campaign.files import CAMPAIGN_FILE, write_seeds
-    from factorgraph_dvl.campaign.monte_carlo import monte_carlo
+    from factorgraph_dvl.campaign.monte_carlo import SeedRecord, monte_carlo, run_seed
     from factorgraph_dvl.campaign.page import write_seed_page
-    from factorgraph_dvl.campaign.seed_run import SeedRecord, run_seed
     from factorgraph_dvl.simulation import load_scenario
 
     # One error now, in place of one for each seed.

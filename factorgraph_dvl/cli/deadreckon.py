@@ -16,6 +16,7 @@ from factorgraph_dvl.cli.console import (
     stdout,
     warn,
 )
+from factorgraph_dvl.cli.inspect import errors_in
 from factorgraph_dvl.cli.options import (
     Anyway,
     FigureKind,
@@ -26,7 +27,6 @@ from factorgraph_dvl.cli.options import (
     TrialPath,
     claim_output,
 )
-from factorgraph_dvl.cli.plausibility import errors_in
 from factorgraph_dvl.cli.verdict import end_with
 
 if TYPE_CHECKING:
@@ -78,7 +78,7 @@ def deadreckon(
     from factorgraph_dvl.files.motion_table import motion_columns
     from factorgraph_dvl.files.tables import write_table
     from factorgraph_dvl.files.trial_folder import inputs_of, load_trial
-    from factorgraph_dvl.plausibility.refusal import explained
+    from factorgraph_dvl.plausibility.survey import explained
     from factorgraph_dvl.quality.verdict import verdict_of
     from factorgraph_dvl.report.files.dead_reckoning import (
         OWNED,

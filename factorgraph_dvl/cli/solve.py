@@ -19,6 +19,7 @@ from factorgraph_dvl.cli.console import (
     stdout,
     warn,
 )
+from factorgraph_dvl.cli.inspect import errors_in
 from factorgraph_dvl.cli.options import (
     Anyway,
     FigureKind,
@@ -31,7 +32,6 @@ from factorgraph_dvl.cli.options import (
     TrialPath,
     claim_output,
 )
-from factorgraph_dvl.cli.plausibility import errors_in
 from factorgraph_dvl.cli.report import write_report
 from factorgraph_dvl.cli.verdict import end_with, print_findings, print_verdict
 
@@ -162,7 +162,7 @@ def kalman(
 
     def run(trial: Trial, progress: ProgressLine) -> _Found:
         from factorgraph_dvl.baselines import calibrate
-        from factorgraph_dvl.plausibility.refusal import explained
+        from factorgraph_dvl.plausibility.survey import explained
 
         name = "nine-state-linear" if linear else method and method.value
         errors = errors_in(trial, anyway=anyway)

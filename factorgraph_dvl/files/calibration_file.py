@@ -20,9 +20,8 @@ from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.message import encoded, message
 from factorgraph_dvl.quality.finding import Code, Finding, Severity
-from factorgraph_dvl.quality.grades import DEFAULT_LIMITS, Grade
 from factorgraph_dvl.quality.texts import decoded
-from factorgraph_dvl.quality.verdict import VerdictGrade
+from factorgraph_dvl.quality.verdict import DEFAULT_LIMITS, Grade, VerdictGrade
 from factorgraph_dvl.sensors.catalogue import specs_of
 from factorgraph_dvl.sensors.dvl import CALIBRATED
 from factorgraph_dvl.sensors.fingerprint import PATTERN

@@ -36,8 +36,8 @@ from factorgraph_dvl.files.truth_file import read_truth, truth_json
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.message import message
 from factorgraph_dvl.quality.finding import Code, Finding
-from factorgraph_dvl.quality.grades import DEFAULT_LIMITS
 from factorgraph_dvl.quality.invalid_values import without_invalid_values
+from factorgraph_dvl.quality.verdict import DEFAULT_LIMITS
 from factorgraph_dvl.sensors.catalogue import AIDS, aid_types
 from factorgraph_dvl.sensors.dvl import Dvl
 from factorgraph_dvl.sensors.dvl_beams import DvlBeams

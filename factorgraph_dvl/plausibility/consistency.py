@@ -29,21 +29,17 @@ from factorgraph_dvl.initialization.dvl_windows import DvlWindows, dvl_windows
 from factorgraph_dvl.initialization.gnss_windows import GnssWindows, WindowFit, gnss_windows
 from factorgraph_dvl.initialization.velocity_windows import isolated
 from factorgraph_dvl.message import Message, either, message
-from factorgraph_dvl.plausibility.axis_permutations import in_words
-from factorgraph_dvl.plausibility.bow_and_course import (
+from factorgraph_dvl.plausibility.axes import (
     BodyDirections,
     axes_that_fit,
     body_directions,
+    in_words,
     off_course,
     relabelling,
 )
-from factorgraph_dvl.plausibility.dvl_axes import mirrored_finding
-from factorgraph_dvl.plausibility.imu_axes import HANDEDNESS, Candidate, diagnosis
-from factorgraph_dvl.plausibility.sensor_clocks import (
-    LEAP_SECONDS,
-    clock_findings,
-    far_clock_finding,
-)
+from factorgraph_dvl.plausibility.clocks import LEAP_SECONDS, clock_findings, far_clock_finding
+from factorgraph_dvl.plausibility.dvl import mirrored_finding
+from factorgraph_dvl.plausibility.imu import HANDEDNESS, Candidate, diagnosis
 from factorgraph_dvl.quality.finding import Code, Finding
 from factorgraph_dvl.sensors.dvl import Dvl
 from factorgraph_dvl.sensors.gnss import Gnss

@@ -12,8 +12,7 @@ from factorgraph_dvl.errors import ConfigError, SolveError
 from factorgraph_dvl.imu.timestamps import without_restarted_clock
 from factorgraph_dvl.message import message
 from factorgraph_dvl.plausibility.earlier_calibration import prior_findings
-from factorgraph_dvl.plausibility.refusal import accepted_errors, explained
-from factorgraph_dvl.plausibility.survey import survey
+from factorgraph_dvl.plausibility.survey import accepted_errors, explained, survey
 from factorgraph_dvl.quality.finding import Code, Finding
 from factorgraph_dvl.quality.results import consistency_findings, not_observable
 from factorgraph_dvl.replay.record import Recorder, ReplayRecord

@@ -12,8 +12,7 @@ import numpy as np
 from factorgraph_dvl.errors import ConfigError
 from factorgraph_dvl.graph.priors import ConstantsPrior
 from factorgraph_dvl.graph.trajectory import TRAJECTORY_RATE
-from factorgraph_dvl.plausibility.refusal import accepted_errors, explained
-from factorgraph_dvl.plausibility.survey import survey
+from factorgraph_dvl.plausibility.survey import accepted_errors, explained, survey
 from factorgraph_dvl.quality.finding import Finding
 from factorgraph_dvl.quality.results import ambiguity
 from factorgraph_dvl.ranging.hypothesis_weights import significant_costs

@@ -14,8 +14,8 @@ from factorgraph_dvl.graph.problem import Evaluation, Problem
 from factorgraph_dvl.graph.sensor_factor import ObservationRows
 from factorgraph_dvl.imu.sampling import apparent_gyro_scale
 from factorgraph_dvl.message import Message, message
+from factorgraph_dvl.plausibility.clocks import LEAP_SECONDS
 from factorgraph_dvl.plausibility.earlier_calibration import prior_against_data
-from factorgraph_dvl.plausibility.sensor_clocks import LEAP_SECONDS
 from factorgraph_dvl.quality.finding import Code, Finding
 from factorgraph_dvl.sensors.imu import ERRORS, GYRO_SCALE, Imu
 from factorgraph_dvl.sensors.parameters import UNITS, Parameter

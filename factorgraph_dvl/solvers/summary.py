@@ -23,9 +23,9 @@ from factorgraph_dvl.quality.results import (
 from factorgraph_dvl.sensors.protocol import Motion
 from factorgraph_dvl.solution import Solution
 from factorgraph_dvl.solvers.calibration import calibration
-from factorgraph_dvl.solvers.causes import causes
 from factorgraph_dvl.solvers.change_along_trial import change_findings
 from factorgraph_dvl.solvers.correlated_noise import noise_of
+from factorgraph_dvl.solvers.error_budget import causes
 from factorgraph_dvl.solvers.fixed_directions import SolvedProblem
 from factorgraph_dvl.solvers.heading_and_misalignment import heading_and_misalignment
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum

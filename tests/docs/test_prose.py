@@ -17,8 +17,8 @@ from typer.main import get_command
 from factorgraph_dvl.cli.app import app
 from factorgraph_dvl.cli.commands import COMMANDS
 from factorgraph_dvl.cli.commands import command as command_named
-from factorgraph_dvl.quality.texts import catalogue
 from factorgraph_dvl.quality.finding import Code
+from factorgraph_dvl.quality.texts import catalogue
 
 ROOT = Path(__file__).resolve().parents[2]
 PACKAGE = ROOT / "factorgraph_dvl"

@@ -11,7 +11,7 @@ from factorgraph_dvl.analysis.information.segment_singular_values import dominan
 from factorgraph_dvl.estimates import Estimate
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.message import Message, message, together
-from factorgraph_dvl.quality.grades import DEFAULT_LIMITS, Grade, grades_of
+from factorgraph_dvl.quality.verdict import DEFAULT_LIMITS, Grade, grades_of
 
 # Chosen: a direction is undetermined if at least half of the prior's σ remains; above the second
 # share the data do not inform it at all.

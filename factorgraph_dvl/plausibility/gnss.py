@@ -7,13 +7,24 @@ from collections.abc import Iterator
 import numpy as np
 from scipy.integrate import cumulative_trapezoid
 
-from factorgraph_dvl.geometry.units import DEG
+from factorgraph_dvl.geometry.units import DEG, KNOT
 from factorgraph_dvl.geometry.vectors import Array, interpolate
 from factorgraph_dvl.message import Message, message
 from factorgraph_dvl.plausibility.records import WINDOW_S, velocity_between_fixes
-from factorgraph_dvl.plausibility.speed_units import MOVING_M_S, SPEED_UNITS
 from factorgraph_dvl.quality.finding import Code, Finding
 from factorgraph_dvl.sensors.gnss import Gnss
+
+# Below this speed, m/s, a vehicle is not called moving. Chosen: drift by wind and sea.
+MOVING_M_S = 0.3
+# SI value of what a speed may have been written in.
+SPEED_UNITS = {
+    "knots": KNOT,
+    "km/h": 1.0 / 3.6,
+    "ft/s": 0.3048,
+    "cm/s": 0.01,
+    "mm/s": 0.001,
+}
+
 
 # Share of the intervals in which velocities agree, from which on fixes jump, and no unit is wrong.
 # Chosen: of 30 % outliers half of the intervals have one at an end.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import solved
 from truth import TURNING, scenario
 
 from factorgraph_dvl.files.calibration_file import encode_calibration, load_calibration
@@ -11,8 +12,8 @@ from factorgraph_dvl.report.figures.error_budget import error_budget_figure
 from factorgraph_dvl.report.terminal.error_budget import error_budget_table
 from factorgraph_dvl.simulation import simulate
 from factorgraph_dvl.solvers.batch import solve, solved_problems
-from factorgraph_dvl.solvers.calibration import reported
-from factorgraph_dvl.statistics.error_budget import error_budget
+from factorgraph_dvl.solvers.calibration import calibration, reported
+from factorgraph_dvl.solvers.error_budget import causes, error_budget
 from factorgraph_dvl.statistics.rows import rows_by_source
 from factorgraph_dvl.statistics.square_root_information import eliminated
 
@@ -74,3 +75,18 @@ def test_budgets_are_shown(solution):
     assert table.row_count == np.count_nonzero(np.diag(solution.covariance))
     (ax,) = error_budget_figure(solution).axes
     assert len(ax.get_yticklabels()) == table.row_count
+
+
+@pytest.mark.parametrize("kind", ["turning", "straight"])
+def test_the_squares_of_all_causes_are_the_variances(kind):
+    _, found = getattr(solved, kind)()
+    parts = causes(found)
+    std = np.concatenate([e.std for e in calibration(found)[0]])
+    total = np.sqrt(np.sum([c.adds**2 for c in parts], axis=0))
+    np.testing.assert_allclose(total, std, rtol=0.01)
+    # The largest first, each with what is assumed of it.
+    share = [float(np.max(c.adds**2 / np.maximum(std**2, 1e-300))) for c in parts]
+    assert share == sorted(share, reverse=True)
+    assumed = {c.cause: c.assumed for c in parts}
+    assert assumed["noise of DVL velocity"].endswith("m/s")
+    assert ("directions that the data do not determine" in assumed) == (kind == "straight")

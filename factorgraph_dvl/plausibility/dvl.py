@@ -1,4 +1,4 @@
-"""Whether unit and sign of a DVL agree with GNSS and its mounting."""
+"""Whether units, signs, axes and beams of a DVL are plausible."""
 
 from __future__ import annotations
 
@@ -6,15 +6,18 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from factorgraph_dvl.geometry.rotations import BodyAxes, exp_so3, frd_from_body
+from factorgraph_dvl.geometry.rotations import BodyAxes, exp_so3, frd_from_body, log_so3
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array, interpolate
-from factorgraph_dvl.message import Message, message
-from factorgraph_dvl.plausibility.gnss_units import RADIANS
+from factorgraph_dvl.initialization.dvl_windows import DvlFit
+from factorgraph_dvl.message import Message, either, message
+from factorgraph_dvl.plausibility.axes import in_words, mirrored, swapped
+from factorgraph_dvl.plausibility.gnss import MOVING_M_S, RADIANS, SPEED_UNITS
 from factorgraph_dvl.plausibility.records import WINDOW_S, gnss_velocity
-from factorgraph_dvl.plausibility.speed_units import MOVING_M_S, SPEED_UNITS
 from factorgraph_dvl.quality.finding import Code, Finding
+from factorgraph_dvl.sensors.beam_geometry import as_dvl, error_velocity
 from factorgraph_dvl.sensors.dvl import MISALIGNMENT, VELOCITY_COLUMNS, Dvl
+from factorgraph_dvl.sensors.dvl_beams import DvlBeams
 from factorgraph_dvl.sensors.gnss import Gnss
 
 # What a ping takes, and which sign it has.
@@ -146,3 +149,79 @@ def _sign_findings(
             dvl.label,
             severity="ok",
         )
+
+
+# Misalignments that differ by less, rad, are equally likely by their size. Chosen.
+_ALIKE = 20.0 * DEG
+
+
+def mirrored_finding(dvl: Dvl, fit: DvlFit) -> Finding:
+    """Return the error that the DVL's axes can only be mirrored ones, and which.
+
+    Parameters
+    ----------
+    dvl : Dvl
+        Record of the DVL.
+    fit : DvlFit
+        Of its pings to the carried IMU, with mirrored axes.
+    """
+    prior = next(p for p in dvl.parameters() if p.name == MISALIGNMENT)
+    explained = []
+    for P in (-np.eye(3), *(mirrored(k) for k in range(3)), *(swapped(k) for k in range(3))):
+        dRb = P @ fit.dRb
+        deviation = float(np.linalg.norm(log_so3(exp_so3(prior.mean).T @ dRb)))
+        explained.append((deviation, P, log_so3(dRb) / DEG))
+    least = min(deviation for deviation, _, _ in explained)
+    likely = [each for each in explained if each[0] < least + _ALIKE]
+    return Finding(
+        Code.DVL_AXES,
+        message("dvl_axes.mirrored", causes=either([_cause(P, a) for _, P, a in likely])),
+        dvl.label,
+        severity="error",
+    )
+
+
+def _cause(P: Array, angles: Array) -> Message:
+    if np.array_equal(P, -np.eye(3)):
+        return message("dvl_axes.as_pd0", angles=angles)
+    return message("dvl_axes.cause", axes=in_words(P), angles=angles)
+
+
+# Times what noise and priors make of the error velocity from which on it is too large, and share
+# of lost pings that is worth a word. Chosen: no honest instrument comes near; half are left.
+_TOO_LARGE = 3.0
+_MOSTLY = 0.5
+
+
+def beam_findings(beams: DvlBeams) -> Iterator[Finding]:
+    """Check how often each beam is lost, and how well nominal beams agree."""
+    lost = np.isnan(beams.velocity).mean(axis=0)
+    if lost.any():
+        yield Finding(
+            Code.BEAMS_LOST,
+            message("beams_lost.shares", shares=100.0 * lost),
+            beams.label,
+            severity="note" if lost.max() > _MOSTLY else "ok",
+        )
+    yield from _agreement(beams)
+
+
+def _agreement(beams: DvlBeams) -> Iterator[Finding]:
+    """Compare the error velocity with what noise, and errors as the priors allow, make of it."""
+    s = beams.settings
+    scale = np.broadcast_to(np.array(s.scale_error, dtype=float), (len(s.nominal_d),))
+    error = error_velocity((1.0 + scale)[:, None] * s.nominal_d, beams.velocity)
+    log = as_dvl(beams)
+    known = np.isfinite(error) & log.locked
+    if known.sum() < 3:
+        return
+    rms = float(np.sqrt(np.mean(error[known] ** 2)))
+    speed = float(np.sqrt(np.mean(np.sum(log.velocity[known] ** 2, axis=1))))
+    noise = float(np.sqrt(np.nanmean(beams.sigma()[known] ** 2)))
+    prior = speed * float(np.hypot(s.direction_std_deg * DEG, s.scale_error_std))
+    if rms > _TOO_LARGE * np.hypot(noise, prior):
+        text = message("beams_disagree.more", rms=rms, speed=speed)
+        yield Finding(Code.BEAMS_DISAGREE, text, beams.label)
+    else:
+        text = message("beams_disagree.explained", rms=rms)
+        yield Finding(Code.BEAMS_DISAGREE, text, beams.label, severity="ok")

@@ -1,8 +1,9 @@
-"""Causes of the standard deviations of a calibration: its error budget in reported units."""
+"""Error budget: what each cause adds to the standard deviations of a calibration."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
 import numpy as np
 
@@ -14,8 +15,8 @@ from factorgraph_dvl.graph.problem import Problem, Rows
 from factorgraph_dvl.sensors.parameters import UNITS, Parameter
 from factorgraph_dvl.solvers.calibration import reported, spread_of_fixed
 from factorgraph_dvl.solvers.fixed_directions import SolvedProblem
-from factorgraph_dvl.statistics.error_budget import error_budget
-from factorgraph_dvl.statistics.rows import CORRELATED, rows_by_source
+from factorgraph_dvl.statistics.rows import CORRELATED, product, rows_by_source
+from factorgraph_dvl.statistics.square_root_information import SquareRootInformation
 
 
 def causes(
@@ -109,3 +110,49 @@ def numbers_with_unit(values: Array, unit: str) -> str:
 def _brief(value: float) -> str:
     """Write a number with two digits that count, and without an exponent up to a million."""
     return f"{float(f'{value:.2g}'):g}"
+
+
+def error_budget(
+    rows: Iterable[Rows],
+    information: SquareRootInformation,
+    functionals: Sequence[Mapping[int, Array]],
+    use: Callable[[Iterator[Rows]], object] = iter,
+) -> dict[str, Array]:
+    """Return what each source adds to the covariance of linear functionals.
+
+    Each row has unit noise of its own, so with X = P Wᵀ
+
+        W P Wᵀ = sum over sources, sum over rows of (J X)ᵀ (J X):
+
+    exact, and additive.
+
+    Parameters
+    ----------
+    rows : iterable of Rows
+        All rows of the graph.
+    information : SquareRootInformation
+        Information of the same rows.
+    functionals : sequence of mapping of int to ndarray
+        Each maps keys to (n, size) matrices; values add up over keys.
+    use : callable, optional
+        Called with the rows, one after another as they are added up, for another use of them.
+
+    Returns
+    -------
+    dict of str to ndarray
+        By source, (sum n, sum n); their sum is `information.covariance_of(functionals)`.
+    """
+    with_functionals = information.covariance_with(functionals)
+    out: dict[str, Array] = {}
+
+    def added() -> Iterator[Rows]:
+        for each in rows:
+            noise = product(each, with_functionals)
+            part = np.einsum("mdi,mdj->ij", noise, noise, optimize=True)
+            out[each.source] = out.get(each.source, 0.0) + part
+            yield each
+
+    passing = added()
+    use(passing)
+    deque(passing, maxlen=0)
+    return out

@@ -12,9 +12,8 @@ from builders import build_solution
 from factorgraph_dvl.estimates import Noise, Residuals
 from factorgraph_dvl.files.trial_yaml import LimitSettings
 from factorgraph_dvl.quality.finding import Code, Finding
-from factorgraph_dvl.quality.grades import DEFAULT_LIMITS, grades
 from factorgraph_dvl.quality.results import consistency_findings
-from factorgraph_dvl.quality.verdict import verdict_of
+from factorgraph_dvl.quality.verdict import DEFAULT_LIMITS, grades, verdict_of
 
 
 def test_grades_compare_with_the_limit():
