@@ -19,7 +19,7 @@ ROOT = PACKAGE.parent
 SENSOR_DATA = (
     *("Imu", "ImuSettings", "Gnss", "Ins", "Dvl", "Star", "Aid", "Motion"),
     *("Heading", "SpeedLog", "Depth", "Beacons"),
-    *("Parameter", "SPEC", "Code", "Finding", "message", "Message"),
+    *("Parameter", "SPEC"),
 )
 # GTSAM, SciPy and Matplotlib take most of a second to load: only what needs none of them may
 # be imported where the command line starts.
@@ -72,7 +72,7 @@ def test_the_map_of_the_package_is_that_of_the_tree():
 
 def test_the_top_holds_no_module_without_a_home():
     loose = {parts[0] for parts in MODULES if len(parts) == 1}
-    assert loose == {"errors", "solution", "trial"}
+    assert loose == {"errors", "estimates", "message", "solution", "trial"}
 
 
 def test_no_solver_loads_what_takes_longer_than_a_short_trial():

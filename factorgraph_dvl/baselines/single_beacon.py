@@ -18,20 +18,15 @@ import numpy as np
 
 from factorgraph_dvl.baselines.outcome import History
 from factorgraph_dvl.errors import DataError
+from factorgraph_dvl.estimates import Estimate, Residuals, Trajectory
 from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.message import message
+from factorgraph_dvl.quality.finding import Code, Finding
+from factorgraph_dvl.quality.results import contradictions
 from factorgraph_dvl.sensors.beacon import Beacons
 from factorgraph_dvl.sensors.depth import Depth
-from factorgraph_dvl.sensors.finding import Code, Finding
-from factorgraph_dvl.sensors.message import message
 from factorgraph_dvl.sensors.speed_log import Heading, SpeedLog
-from factorgraph_dvl.solution import (
-    Estimate,
-    Progress,
-    Residuals,
-    Solution,
-    Trajectory,
-    contradictions,
-)
+from factorgraph_dvl.solution import Progress, Solution
 from factorgraph_dvl.trial import Trial
 
 Method = Literal["4sv-2ob", "4sv-3ob"]

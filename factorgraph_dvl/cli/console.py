@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
     from rich.table import Table
 
-    from factorgraph_dvl.sensors.finding import Finding
+    from factorgraph_dvl.quality.finding import Finding
     from factorgraph_dvl.solution import Solution
 
 # Chosen: width of tables in a file or a pipe, columns; that of a page or a mail.
@@ -285,7 +285,7 @@ def warn(message: str) -> None:
 
 def found_event(finding: Finding) -> events.Found:
     """Return a finding as an event."""
-    from factorgraph_dvl.sensors.message import encoded
+    from factorgraph_dvl.message import encoded
 
     sensor, parameter, text = map(printable, (finding.sensor, finding.parameter, finding.text))
     code, own = finding.code, finding.message

@@ -16,6 +16,7 @@ from factorgraph_dvl.cli.console import (
     stdout,
     warn,
 )
+from factorgraph_dvl.cli.inspect import errors_in
 from factorgraph_dvl.cli.options import (
     Anyway,
     FigureKind,
@@ -26,14 +27,13 @@ from factorgraph_dvl.cli.options import (
     TrialPath,
     claim_output,
 )
-from factorgraph_dvl.cli.plausibility import errors_in
 from factorgraph_dvl.cli.verdict import end_with
 
 if TYPE_CHECKING:
     from factorgraph_dvl.analysis.dead_reckoning.before_after import BeforeAfter
     from factorgraph_dvl.analysis.dead_reckoning.integration import OrientationAt
-    from factorgraph_dvl.sensors.finding import Finding
-    from factorgraph_dvl.sensors.verdict import Verdict
+    from factorgraph_dvl.quality.finding import Finding
+    from factorgraph_dvl.quality.verdict import Verdict
     from factorgraph_dvl.trial import Trial
 
 
@@ -78,7 +78,8 @@ def deadreckon(
     from factorgraph_dvl.files.motion_table import motion_columns
     from factorgraph_dvl.files.tables import write_table
     from factorgraph_dvl.files.trial_folder import inputs_of, load_trial
-    from factorgraph_dvl.quality.refusal import explained
+    from factorgraph_dvl.plausibility.survey import explained
+    from factorgraph_dvl.quality.verdict import verdict_of
     from factorgraph_dvl.report.files.dead_reckoning import (
         OWNED,
         RESULT_FILE,
@@ -87,7 +88,6 @@ def deadreckon(
         error_table,
         to_json,
     )
-    from factorgraph_dvl.sensors.verdict import verdict_of
 
     read = (*inputs_of(trial_path), calibration, None if attitude is None else Path(attitude))
     claim_output(out, force=force, owned=OWNED, inputs=read)

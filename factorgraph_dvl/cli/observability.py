@@ -29,7 +29,7 @@ from factorgraph_dvl.cli.verdict import end_with
 
 if TYPE_CHECKING:
     from factorgraph_dvl.analysis.information.observability import Observability
-    from factorgraph_dvl.sensors.verdict import Verdict
+    from factorgraph_dvl.quality.verdict import Verdict
     from factorgraph_dvl.solution import Solution
 
 

@@ -12,7 +12,7 @@ from factorgraph_dvl.cli.console import found_event, say, stderr, stdout
 from factorgraph_dvl.errors import printable
 
 if TYPE_CHECKING:
-    from factorgraph_dvl.sensors.verdict import Verdict
+    from factorgraph_dvl.quality.verdict import Verdict
     from factorgraph_dvl.solution import Solution
 
 
@@ -30,7 +30,7 @@ def print_verdict(solution: Solution) -> None:
 
 def print_findings(solution: Solution) -> None:
     """Print the reasons of the verdict, then notes that tables do not show."""
-    from factorgraph_dvl.sensors.finding import Code
+    from factorgraph_dvl.quality.finding import Code
 
     for reason in solution.verdict.reasons:
         say(reason)

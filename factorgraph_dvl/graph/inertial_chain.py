@@ -11,6 +11,7 @@ from typing import ClassVar
 import gtsam
 import numpy as np
 
+from factorgraph_dvl.estimates import Trajectory
 from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.rotations import (
     BodyAxes,
@@ -48,7 +49,6 @@ from factorgraph_dvl.imu.propagation import (
 from factorgraph_dvl.sensors.imu import ERRORS, ImuSettings
 from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.sensors.protocol import Linearization, Motion
-from factorgraph_dvl.solution import Trajectory
 from factorgraph_dvl.trial import Trial
 
 IMU_NOISE = "IMU noise"

@@ -35,6 +35,7 @@ from factorgraph_dvl.graph.chain import Chain
 from factorgraph_dvl.graph.clocks import time_on_chain
 from factorgraph_dvl.graph.factor_layout import CHUNK, Part, factor_layout
 from factorgraph_dvl.graph.imu_errors import ImuErrors, LinearImuFactors
+from factorgraph_dvl.graph.native_graph import native_graph
 from factorgraph_dvl.graph.priors import (
     ConstantsPrior,
     Tilt,
@@ -685,8 +686,6 @@ class Problem:
         ValueError
             If measurements have not been weighed yet.
         """
-        from factorgraph_dvl.graph.native_graph import native_graph
-
         if self._weighed_at is None:
             raise ValueError("the measurements have no weights yet: call `weigh` first")
         if self.chain.interpolates:

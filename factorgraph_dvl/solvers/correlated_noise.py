@@ -8,11 +8,11 @@ from functools import partial
 
 import numpy as np
 
+from factorgraph_dvl.estimates import Noise, noise_name
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph.problem import Evaluation, Problem
 from factorgraph_dvl.graph.processes import Process, node_times, walk_sigma, walk_time
 from factorgraph_dvl.sensors.protocol import Observation, ScaleWalk
-from factorgraph_dvl.solution import Noise, noise_name
 from factorgraph_dvl.solvers.levenberg_marquardt import factorized
 from factorgraph_dvl.statistics.correlation import Correlation, fit_correlation
 from factorgraph_dvl.statistics.leverage import leverage

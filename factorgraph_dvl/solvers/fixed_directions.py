@@ -10,7 +10,7 @@ import numpy as np
 
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph.problem import Problem
-from factorgraph_dvl.sensors.finding import Finding
+from factorgraph_dvl.quality.finding import Finding
 from factorgraph_dvl.solution import SolverStep
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, factorized
 from factorgraph_dvl.solvers.posterior import Posterior, changes_with, considered, posterior

@@ -16,8 +16,8 @@ import numpy as np
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph.priors import ConstantsPrior, Tilt
 from factorgraph_dvl.graph.problem import Problem
-from factorgraph_dvl.sensors.finding import Code, Finding
-from factorgraph_dvl.sensors.message import message
+from factorgraph_dvl.message import message
+from factorgraph_dvl.quality.finding import Code, Finding
 from factorgraph_dvl.solution import Progress, SolverStep
 from factorgraph_dvl.solvers.known_parameters import explanation_findings
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum

@@ -15,8 +15,8 @@ import numpy as np
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph.problem import Problem
 from factorgraph_dvl.graph.processes import Process
-from factorgraph_dvl.sensors.finding import Finding
-from factorgraph_dvl.sensors.protocol import DO_NOT_FIT
+from factorgraph_dvl.quality.finding import Finding
+from factorgraph_dvl.quality.results import DO_NOT_FIT
 from factorgraph_dvl.solution import Progress
 from factorgraph_dvl.solvers.bias_walks import bias_walks
 from factorgraph_dvl.solvers.change_along_trial import CHANGED, component_changes

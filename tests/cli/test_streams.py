@@ -16,7 +16,7 @@ from builders import build_solution, build_trial, edit, write_trial
 from running import Run
 from truth import scenario
 
-from factorgraph_dvl.cli.memory import naming_memory
+from factorgraph_dvl.cli.commands import naming_memory
 from factorgraph_dvl.errors import SolveError
 from factorgraph_dvl.files.solution_folder import save_solution
 

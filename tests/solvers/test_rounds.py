@@ -11,7 +11,7 @@ from problems import SHORT
 from truth import scenario
 
 from factorgraph_dvl.graph.problem import Problem
-from factorgraph_dvl.sensors.finding import Code
+from factorgraph_dvl.quality.finding import Code
 from factorgraph_dvl.simulation import simulate
 from factorgraph_dvl.solvers import rounds
 from factorgraph_dvl.solvers.batch import solve

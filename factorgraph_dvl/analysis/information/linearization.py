@@ -21,6 +21,7 @@ from factorgraph_dvl.analysis.information.segment_singular_values import (
     point_set_rows,
     singular_values,
 )
+from factorgraph_dvl.estimates import Estimate, Trajectory
 from factorgraph_dvl.geometry.rotations import BodyAxes, log_so3, rotation_from_rph, rph_jacobian
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array
@@ -35,7 +36,7 @@ from factorgraph_dvl.sensors.dvl import (
 )
 from factorgraph_dvl.sensors.dvl_beams import DIRECTION as BEAM_DIRECTION
 from factorgraph_dvl.sensors.dvl_beams import SCALE_ERROR as BEAM_SCALE_ERROR
-from factorgraph_dvl.solution import Estimate, Solution, Trajectory
+from factorgraph_dvl.solution import Solution
 from factorgraph_dvl.trial import Trial
 
 # Parameters of a DVL, of single beams, and those that have columns only if they are estimated.

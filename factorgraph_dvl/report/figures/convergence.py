@@ -11,7 +11,9 @@ from numpy.typing import ArrayLike
 
 from factorgraph_dvl.analysis.convergence import Convergence
 from factorgraph_dvl.analysis.error_statistics import true_value_of
+from factorgraph_dvl.estimates import Estimate
 from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.quality.verdict import Verdict
 from factorgraph_dvl.report.figures.calibration import readable
 from factorgraph_dvl.report.figures.drawing import (
     ACCENT,
@@ -26,8 +28,6 @@ from factorgraph_dvl.report.figures.drawing import (
     save_figures,
     style,
 )
-from factorgraph_dvl.sensors.verdict import Verdict
-from factorgraph_dvl.solution import Estimate
 
 # Points of a line. Chosen: more than a panel has pixels.
 _POINTS = 2000

@@ -12,7 +12,8 @@ from rich.table import Table
 
 from factorgraph_dvl.analysis.dead_reckoning.before_after import BeforeAfter, Run
 from factorgraph_dvl.analysis.dead_reckoning.track_error import Score, Stretches
-from factorgraph_dvl.report.text import figure_files, fixed
+from factorgraph_dvl.quality.notation import fixed
+from factorgraph_dvl.report.figure_files import figure_files
 
 RESULT_FILE = "deadreckon.json"
 TRACK_FILE = "track.csv"

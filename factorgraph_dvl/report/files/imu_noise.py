@@ -10,7 +10,7 @@ from rich.text import Text
 
 from factorgraph_dvl.analysis.static_noise import AxisNoise, Figure, StaticNoise
 from factorgraph_dvl.geometry.units import DEG_PER_HOUR, DEG_PER_SQRT_HOUR, HOUR, MICRO_G
-from factorgraph_dvl.report.text import with_std
+from factorgraph_dvl.quality.notation import with_std
 
 # By definition, in SI.
 _PER_SQRT_HOUR = 1.0 / np.sqrt(HOUR)

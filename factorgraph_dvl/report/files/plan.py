@@ -10,10 +10,10 @@ from rich.text import Text
 
 from factorgraph_dvl.planning.proposal import Proposal
 from factorgraph_dvl.planning.requirements import Requirement
+from factorgraph_dvl.quality.notation import split_unit
 from factorgraph_dvl.report.files.observability import OWNED as OF_THE_VIEW
 from factorgraph_dvl.report.files.observability import encode
 from factorgraph_dvl.report.terminal.tables import add_column
-from factorgraph_dvl.report.text import split_unit
 from factorgraph_dvl.solution import Solution
 
 # Files of the command; the first makes the folder valid.

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
 
-from factorgraph_dvl.report.html.words import chinese
-from factorgraph_dvl.sensors.message import Message, in_language
+from factorgraph_dvl.message import Message
+from factorgraph_dvl.quality.texts import chinese, text_of
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ def both(english: str, own: str = "") -> Html:
 
 def said(message: Message | str) -> Html:
     """Return a message in English and Chinese; a text from a file as it is."""
-    return both(in_language(message, "en"), in_language(message, "zh"))
+    return both(text_of(message), text_of(message, "zh"))
 
 
 def joined(*cells: Cell, by: str = " ") -> Html:

@@ -11,8 +11,13 @@ from factorgraph_dvl.analysis.error_statistics import true_value_of
 from factorgraph_dvl.analysis.information.further_manoeuvres import further_manoeuvres
 from factorgraph_dvl.analysis.information.manoeuvres import Segment, find_segments
 from factorgraph_dvl.analysis.information.marginals import marginals
+from factorgraph_dvl.estimates import Cause
 from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.units import DEG
+from factorgraph_dvl.quality.finding import Finding
+from factorgraph_dvl.quality.notation import at_precision, fixed, in_words, with_std
+from factorgraph_dvl.quality.texts import chinese_cause, component_names
+from factorgraph_dvl.quality.verdict import Verdict
 from factorgraph_dvl.report.html.content import Result
 from factorgraph_dvl.report.html.markup import (
     Cell,
@@ -30,16 +35,7 @@ from factorgraph_dvl.report.html.markup import (
 )
 from factorgraph_dvl.report.html.plots import Plot
 from factorgraph_dvl.report.html.track import track_svg
-from factorgraph_dvl.report.html.words import (
-    chinese_cause,
-    chinese_finding,
-    component_names,
-    dictionary,
-)
-from factorgraph_dvl.report.text import at_precision, fixed, in_words, with_std
-from factorgraph_dvl.sensors.finding import Finding
-from factorgraph_dvl.sensors.verdict import Verdict
-from factorgraph_dvl.solution import Cause, Solution
+from factorgraph_dvl.solution import Solution
 
 # Class of each verdict in the style sheet.
 _CLASSES = {"good": "good", "doubtful": "doubtful", "do not use": "unusable"}
@@ -110,16 +106,18 @@ def verdict_box(verdict: Verdict) -> Html:
 
 def _what(finding: Finding) -> Html:
     """Return what was found."""
-    return both(str(finding), chinese_finding(finding))
+    return both(str(finding), finding.chinese)
 
 
 def _reason(finding: Finding) -> Html:
-    _, why, action = dictionary("findings")[finding.code]
+    code = finding.code
     return element(
         "div",
         paragraph(element("b", _what(finding)), Html(" "), _code(finding)),
-        paragraph(both(finding.code.why, why)),
-        paragraph(element("b", both("What to do:")), " ", both(finding.code.action, action)),
+        paragraph(both(code.why, code.text("why", "zh"))),
+        paragraph(
+            element("b", both("What to do:")), " ", both(code.action, code.text("action", "zh"))
+        ),
         class_="reason",
     )
 

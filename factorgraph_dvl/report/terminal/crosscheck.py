@@ -17,8 +17,8 @@ from factorgraph_dvl.analysis.comparison.motion_difference import (
     mean_nees,
 )
 from factorgraph_dvl.analysis.error_statistics import nees_band
+from factorgraph_dvl.quality.notation import at_precision, split_unit, with_std
 from factorgraph_dvl.report.terminal.tables import width_of
-from factorgraph_dvl.report.text import at_precision, split_unit, with_std
 
 # Chosen: wider than any table, in columns.
 _UNLIMITED = 10_000

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from rich.table import Table
 
+from factorgraph_dvl.quality.notation import split_unit
 from factorgraph_dvl.report.terminal.tables import add_column, width_of
-from factorgraph_dvl.report.text import split_unit
 from factorgraph_dvl.solution import Solution
 
 # Causes that are shown of each component. Chosen: they make up nearly all of it.

@@ -11,8 +11,9 @@ from rich.text import Text
 from factorgraph_dvl.analysis.information.marginals import Marginals
 from factorgraph_dvl.analysis.information.observability import Observability
 from factorgraph_dvl.geometry.units import DEG
+from factorgraph_dvl.quality.notation import fixed, split_unit, with_std
+from factorgraph_dvl.quality.texts import text_of
 from factorgraph_dvl.report.terminal.tables import GRADES, add_column
-from factorgraph_dvl.report.text import fixed, split_unit, with_std
 
 # Chosen: more rows do not fit on a screen.
 _MAX_SEGMENTS = 16
@@ -98,7 +99,7 @@ def direction_lines(marginals: Marginals) -> list[str]:
     """Return a line for each weak direction."""
     if not marginals.sentences:
         return ["All directions are observable: the data at least halve the prior's σ of each."]
-    return [f"- {sentence}." for sentence in marginals.sentences]
+    return [f"- {text_of(sentence)}." for sentence in marginals.sentences]
 
 
 def _sources(view: Observability, component: str) -> str:

@@ -17,10 +17,10 @@ from factorgraph_dvl.analysis.convergence import Convergence
 from factorgraph_dvl.analysis.error_statistics import CalibrationErrors
 from factorgraph_dvl.errors import printable
 from factorgraph_dvl.geometry.earth import LocalFrame
-from factorgraph_dvl.quality.survey import Survey
-from factorgraph_dvl.report.text import at_precision, fixed, split_unit, with_std
+from factorgraph_dvl.plausibility.survey import Survey
+from factorgraph_dvl.quality.notation import at_precision, fixed, split_unit, with_std
+from factorgraph_dvl.quality.verdict import Verdict
 from factorgraph_dvl.sensors.imu import ImuSettings
-from factorgraph_dvl.sensors.verdict import Verdict
 from factorgraph_dvl.solution import Solution
 
 # Of findings, by severity.

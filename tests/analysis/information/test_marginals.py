@@ -7,7 +7,7 @@ import pytest
 from scipy.linalg import eigh
 
 from factorgraph_dvl.analysis.information.marginals import marginals
-from factorgraph_dvl.solution import Estimate
+from factorgraph_dvl.estimates import Estimate
 
 
 def estimate(name, components, std, prior):

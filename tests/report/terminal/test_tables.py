@@ -10,7 +10,9 @@ from rich.console import Console
 from rich.table import Table
 
 from factorgraph_dvl.analysis.error_statistics import calibration_errors
-from factorgraph_dvl.quality.survey import survey
+from factorgraph_dvl.estimates import Cause
+from factorgraph_dvl.plausibility.survey import survey
+from factorgraph_dvl.quality.notation import at_precision, fixed, split_unit, with_std
 from factorgraph_dvl.report.terminal.error_budget import error_budget_table
 from factorgraph_dvl.report.terminal.tables import (
     add_column,
@@ -20,8 +22,6 @@ from factorgraph_dvl.report.terminal.tables import (
     sensor_table,
     width_of,
 )
-from factorgraph_dvl.report.text import at_precision, fixed, split_unit, with_std
-from factorgraph_dvl.solution import Cause
 
 TRUTH = {"misalignment_deg": [1.0, 2.0, 3.0], "scale_error": [0.005]}
 
