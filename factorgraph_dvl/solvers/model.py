@@ -298,6 +298,6 @@ def with_objective(
     objective = restricted_objective(problem, evaluation, information)
     if not minimum.converged:
         # What the linear model promises is not there yet.
-        objective += 2.0 * information.decrease
+        objective += 2.0 * information.given(problem.constants).decrease
     minimum = replace(minimum, square_root=information)
     return Estimated(model, problem, minimum, objective, rough)

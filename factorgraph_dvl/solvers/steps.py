@@ -15,6 +15,7 @@ import numpy as np
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph.problem import Problem
 from factorgraph_dvl.graph.processes import Process
+from factorgraph_dvl.graph.smooth_chain import SmoothChain
 from factorgraph_dvl.quality.finding import Finding
 from factorgraph_dvl.quality.results import DO_NOT_FIT
 from factorgraph_dvl.solution import Progress
@@ -38,8 +39,8 @@ from factorgraph_dvl.statistics.variance_components import (
     variance_components,
 )
 
-# Times that a change of noise is halved before it is dropped. Chosen: what is left changes no σ.
-_HALVED = 3
+# Shares of a change of noise that are tried in turn. Chosen: what is left changes no σ.
+_SHARES = (1.0, 0.5, 0.25, 0.125)
 # Parameters that are estimated although they were stated as known. Chosen: a third is a sign that
 # the model is wrong.
 _MOST_FREED = 2
@@ -111,21 +112,22 @@ class MotionStrengths:
         self._last = found
         if found.same:
             self._settled_for, self._last = own, None
-        yield _with_strengths(model, found)
-        if self._last is not None:
-            # The steps before pointed too far.
-            self._last = model.prepared.strengths(at.problem, at.minimum, None)
-            assert self._last is not None
-            yield _with_strengths(model, self._last)
+        for share in _SHARES:
+            yield _with_strengths(model, found, share)
 
 
-def _with_strengths(model: Model, found: Strengths) -> Proposal:
-    """Return a model with other strengths."""
+def _with_strengths(model: Model, found: Strengths, share: float) -> Proposal:
+    """Return a model part of the way to other strengths, in logarithms."""
+    before = model.chain
+    assert isinstance(before, SmoothChain)
+    density = before.density ** (1.0 - share) * found.chain.density**share
     changed = replace(
         model,
-        chain=found.chain,
-        processes=found.processes,
-        noise_factors=found.factors,
+        chain=replace(found.chain, density=density),
+        processes=tuple(
+            _between(p, q, share) for p, q in zip(model.processes, found.processes, strict=True)
+        ),
+        noise_factors=_part_of(model.noise_factors, found.factors, share),
         tilt=found.tilt,
     )
     return Proposal(changed, found.states, found.values, rough=not found.same)
@@ -277,12 +279,11 @@ class Noise:
             else p
             for p in refitted(problem, minimum.evaluation)
         )
-        for share in 0.5 ** np.arange(_HALVED + 1):
-            changed = {
-                label: before[label] ** (1.0 - share) * factor**share
-                for label, factor in factors.items()
-            }
-            part = tuple(map(_between, model.processes, processes, np.full(len(processes), share)))
+        for share in _SHARES:
+            changed = _part_of(before, factors, share)
+            part = tuple(
+                _between(p, q, share) for p, q in zip(model.processes, processes, strict=True)
+            )
             if _same(changed, before) and _are_those(part, model.processes):
                 return
             yield _from(at, noise_factors=changed, processes=part)
@@ -335,6 +336,13 @@ def _are_those(some: tuple[Any, ...], others: tuple[Any, ...] | None) -> bool:
     return others is not None and all(
         a is b or (isinstance(a, str) and a == b) for a, b in zip(some, others, strict=True)
     )
+
+
+def _part_of(
+    before: Mapping[str, Array], after: Mapping[str, Array], share: float
+) -> dict[str, Array]:
+    """Return factors part of the way to others, in logarithms."""
+    return {label: before[label] ** (1.0 - share) * after[label] ** share for label in before}
 
 
 def _between(before: Process, after: Process, share: float) -> Process:

@@ -21,8 +21,9 @@ hold everything. Where residuals are linear in x about the evaluation,
 
    \min_x |r|^2 = |r|^2 - |d|^2, \qquad \log\det\Lambda_{xx} = 2 \sum \log |R_{ii}|.
 
-The restricted likelihood, by which noise is estimated, integrates the constants too: it has
-|d|² and log det R of all conditionals, the constants' Schur complement included.
+The restricted likelihood, by which noise is estimated, integrates the constants too, about the
+most probable ones: it has log det R of all conditionals, the constants' Schur complement included.
+(|d|² of all would be that of the joint minimum, where log det R has another value.)
 
 **Gradient.** With P the covariance of the states given the constants,
 
@@ -90,7 +91,8 @@ def marginal_objective(
     information : SquareRootInformation
         From the elimination there, the constants last.
     """
-    return _objective(problem, evaluation, information.given(_constants(problem)))
+    given = information.given(_constants(problem))
+    return _objective(problem, evaluation, given.decrease, given.log_determinant)
 
 
 def restricted_objective(
@@ -98,22 +100,37 @@ def restricted_objective(
 ) -> float:
     """Return -2 log of the likelihood of the noise, with states and constants integrated out.
 
-    At the best states and constants near the evaluation; arguments, and what is left out, as in
-    `marginal_objective`.
+    By Laplace's approximation at the constants of the evaluation, which are to be the most
+    probable ones: `marginal_objective`, and log det of the constants' Schur complement. Arguments,
+    and what is left out, are the same.
     """
-    return _objective(problem, evaluation, information)
+    decrease = information.given(_constants(problem)).decrease
+    return _objective(problem, evaluation, decrease, information.log_determinant)
 
 
 def _objective(
-    problem: Problem, evaluation: Evaluation, information: SquareRootInformation
+    problem: Problem, evaluation: Evaluation, decrease: float, log_determinant: float
 ) -> float:
+    """Return the terms of an objective.
+
+    Parameters
+    ----------
+    problem : Problem
+        With weights.
+    evaluation : Evaluation
+        Where the graph is linear.
+    decrease : float
+        What the best states take off the cost.
+    log_determinant : float
+        Log det of the information of what is integrated out.
+    """
     log_sigma = sum(float(each.sum()) for each in problem.log_sigma(evaluation))
     correlated = sum(process.log_determinant for process in problem.processes)
     _, prior = np.linalg.slogdet(problem.prior_root)
-    least = evaluation.cost - information.decrease
+    least = evaluation.cost - decrease
     return float(
         2.0 * (least + log_sigma + prior)
-        + information.log_determinant
+        + log_determinant
         + correlated
         + problem.chain.log_determinant
         + log_prior(problem.noise_factors, problem.observations)
