@@ -17,7 +17,7 @@ from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.solution import Progress
 from factorgraph_dvl.solvers.levenberg_marquardt import CONVERGED, Minimum, factorized, minimise
 from factorgraph_dvl.solvers.preparation import Prepared
-from factorgraph_dvl.statistics.marginal_likelihood import restricted_objective
+from factorgraph_dvl.statistics.marginal_likelihood import constants_of, restricted_objective
 
 # Root mean square change of the positions, m, from which on gravity is taken anew. Chosen: 1 m
 # turns it by 0.16 micro-g.
@@ -298,6 +298,6 @@ def with_objective(
     objective = restricted_objective(problem, evaluation, information)
     if not minimum.converged:
         # What the linear model promises is not there yet.
-        objective += 2.0 * information.given(problem.constants).decrease
+        objective += 2.0 * information.given(constants_of(problem)).decrease
     minimum = replace(minimum, square_root=information)
     return Estimated(model, problem, minimum, objective, rough)

@@ -126,7 +126,7 @@ def settle(
         *explanation_findings(known.freed, known.left, at.minimum.evaluation),
     )
     if going_on:
-        text = message("not_converged.rounds", rounds=len(record), changing=[record[-1].change])
+        text = message("not_converged.steps", count=len(record))
         findings += (Finding(Code.NOT_CONVERGED, text, severity="error"),)
     at.problem.release()
     minimum = replace(

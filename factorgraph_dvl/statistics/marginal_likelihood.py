@@ -91,7 +91,7 @@ def marginal_objective(
     information : SquareRootInformation
         From the elimination there, the constants last.
     """
-    given = information.given(_constants(problem))
+    given = information.given(constants_of(problem))
     return _objective(problem, evaluation, given.decrease, given.log_determinant)
 
 
@@ -104,7 +104,7 @@ def restricted_objective(
     probable ones: `marginal_objective`, and log det of the constants' Schur complement. Arguments,
     and what is left out, are the same.
     """
-    decrease = information.given(_constants(problem)).decrease
+    decrease = information.given(constants_of(problem)).decrease
     return _objective(problem, evaluation, decrease, information.log_determinant)
 
 
@@ -174,7 +174,7 @@ def log_determinant_gradient(
     information : SquareRootInformation
         From the elimination there, the constants last.
     """
-    constants = _constants(problem)
+    constants = constants_of(problem)
     out = np.zeros(len(problem.prior_root))
     if not constants:
         return out
@@ -202,7 +202,7 @@ def log_determinant_gradient(
     return out
 
 
-def _constants(problem: Problem) -> set[int]:
+def constants_of(problem: Problem) -> set[int]:
     """Return the keys of the constants."""
     return {problem.key(p.name) for p in problem.parameters}
 
