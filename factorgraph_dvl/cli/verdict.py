@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 def print_verdict(solution: Solution) -> None:
     """Print the verdict on one line, with its first reason and what to do about it."""
-    from factorgraph_dvl.report.terminal.tables import verdict_line
+    from factorgraph_dvl.report.tables import verdict_line
 
     verdict = solution.verdict
     if events.active():
