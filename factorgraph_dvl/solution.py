@@ -76,6 +76,28 @@ class Judged:
         )
 
 
+@dataclass(frozen=True)
+class SolverStep:
+    """A change of what is assumed of a trial, that the solver has kept.
+
+    Parameters
+    ----------
+    change : str
+        What has changed.
+    objective : float
+        -2 log of the restricted likelihood after it, but for a constant.
+    fall : float
+        What it took off the objective.
+    largest_move_sigma : float
+        Largest move of a calibration component, in standard deviations.
+    """
+
+    change: str
+    objective: float
+    fall: float
+    largest_move_sigma: float
+
+
 @dataclass(frozen=True, repr=False)
 class Solution(Judged):
     """What a solver found.
@@ -117,6 +139,8 @@ class Solution(Judged):
         What makes up the standard deviations, the largest causes first.
     epoch : str, optional
         UTC of time zero, ISO 8601; empty if not given.
+    steps : tuple of SolverStep, optional
+        What the solver changed of its assumptions, in order.
 
     Examples
     --------
@@ -148,6 +172,7 @@ class Solution(Judged):
     noise: tuple[Noise, ...] = ()
     error_budget: tuple[Cause, ...] = ()
     epoch: str = ""
+    steps: tuple[SolverStep, ...] = ()
 
     @property
     def span(self) -> tuple[float, float] | None:

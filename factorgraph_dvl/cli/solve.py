@@ -244,7 +244,7 @@ def _solve_into(
             write_instrument(solution, folder)
             shown = history or along
             series = None if shown is None else (shown.time, shown.names, shown.std)
-            write_report(folder, str(out), solution, run_of(trial), series)
+            write_report(folder, str(out), solution, run_of(trial, solution.steps), series)
             if figures is not None:
                 with drawing():
                     _draw(trial, solution, history, folder / FIGURES_FOLDER, figures.value)

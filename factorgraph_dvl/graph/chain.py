@@ -235,6 +235,10 @@ class Chain(Protocol):
         """Source of the noise of `steps`; None where there are none."""
 
     @property
+    def log_determinant(self) -> float:
+        """Log det of the covariance of what ties the nodes, as far as models differ in it."""
+
+    @property
     def interpolates(self) -> bool:
         """Whether the motion between nodes follows from both: at any time, without samples."""
 

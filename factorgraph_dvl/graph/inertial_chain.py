@@ -144,6 +144,11 @@ class InertialChain:
         return np.maximum(root_time * np.repeat(walks, 3), LEAST_WALK)
 
     @property
+    def log_determinant(self) -> float:
+        """Log det of the covariance of the steps of walking biases."""
+        return 2.0 * float(np.log(self.bias_steps).sum()) if self.walking else 0.0
+
+    @property
     def middle(self) -> float:
         """Middle of the record, s."""
         return 0.5 * float(self.segments.node_time[0] + self.segments.node_time[-1])

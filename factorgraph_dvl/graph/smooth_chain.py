@@ -143,6 +143,11 @@ class SmoothChain:
         return float(self.node_time[-1] - self.node_time[0])
 
     @property
+    def log_determinant(self) -> float:
+        """Log det of the covariance of the steps, but for what their length makes it."""
+        return 2.0 * float(np.log(self.density).sum())
+
+    @property
     def middle(self) -> float:
         """Middle of the record, s."""
         return 0.5 * float(self.node_time[0] + self.node_time[-1])

@@ -248,6 +248,7 @@ def _with_covariances(
     findings = (*findings, *settled.findings)
     free = copy(problem)
     solved = with_covariances(problem, before, minimise_again, findings=findings)
+    solved = replace(solved, steps=settled.steps)
     if before.converged or not solved.minimum.converged:
         return solved
     converged = settled.settled and undetermined_there(solved, free)

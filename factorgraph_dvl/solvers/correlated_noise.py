@@ -53,12 +53,15 @@ class CorrelatedNoise:
         By label, factors (d,) on standard deviations for noise that persists for seconds.
     gain : float
         Fall of -2 log likelihood by what is not stated, against white noise alone.
+    long_run_gain : float
+        The part of it by noise that persists for seconds.
     """
 
     processes: tuple[Process, ...]
     factors: dict[str, Array]
     long_run: dict[str, Array]
     gain: float
+    long_run_gain: float
 
 
 def correlated_noise(
@@ -78,7 +81,7 @@ def correlated_noise(
     processes: list[Process] = []
     factors: dict[str, Array] = {}
     long_run: dict[str, Array] = {}
-    gain = 0.0
+    gain = long_run_gain = 0.0
     for i, o in enumerate(problem.observations):
         weight = problem.weights[i]
         used = weight > 0.0
@@ -108,11 +111,12 @@ def correlated_noise(
                 gain += sum(fit.gain for fit in found.values())
                 if (inflation != 1.0).any():
                     long_run[o.label] = inflation
+                    long_run_gain += sum(f.gain for f in found.values() if f.time_s < _SHORT)
         if o.scale_walk is not None and np.ptp(when) > 0.0:
             process = _walking(process, o.label, len(processes), o.scale_walk, sigma, when)
         if process is not None:
             processes.append(process)
-    return CorrelatedNoise(tuple(processes), factors, long_run, gain)
+    return CorrelatedNoise(tuple(processes), factors, long_run, gain, long_run_gain)
 
 
 def _walking(

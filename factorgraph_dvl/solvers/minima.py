@@ -181,17 +181,12 @@ def cost_terms(found: SolvedProblem) -> Array:
     problem, evaluation = found.problem, found.minimum.evaluation
     parts = []
     total = 0.0
-    for observation, residual, usable, log_sigma in zip(
-        problem.observations,
-        evaluation.residuals,
-        problem.usable.values(),
-        problem.log_sigma(evaluation),
-        strict=True,
+    for residual, log_sigma in zip(
+        evaluation.residuals, problem.log_sigma(evaluation), strict=True
     ):
         own = 0.5 * np.sum(residual**2, axis=1)
         total += own.sum()
-        gate = observation.gate or 0.0
-        parts.append(np.where(usable, own, 0.5 * gate**2) + log_sigma)
+        parts.append(own + log_sigma)
     return np.concatenate([*parts, [evaluation.cost - total]])
 
 

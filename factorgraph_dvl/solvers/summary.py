@@ -88,6 +88,7 @@ def summarise(trial: Trial, found: SolvedProblem, *, rate_hz: float) -> Solution
         limits=trial.limits,
         noise=noise,
         error_budget=error_budget,
+        steps=found.steps,
     )
 
 

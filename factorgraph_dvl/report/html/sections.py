@@ -540,9 +540,32 @@ def settings_section(result: Result) -> Section:
             "Settings",
             table([both("section"), both("key"), both("value")], settings, label="Settings"),
         ),
+        *_solver_steps(run.get("steps", ())),
         element("h3", both("Versions")),
         table([both("package"), both("version")], versions, label="Versions"),
         key="settings",
+    )
+
+
+def _solver_steps(steps: Sequence[Mapping[str, Any]]) -> Iterator[Html]:
+    """Yield what the solver changed of its assumptions, step by step."""
+    if not steps:
+        return
+    header = ["round", "what changed", "objective", "fall", "largest move, σ"]
+    rows = [
+        [f"{s['round']}", both(s["change"]), f"{s['objective']:.1f}", f"{s['fall']:.2f}",
+         f"{s['largest_move_sigma']:.2f}"]
+        for s in steps
+    ]  # fmt: skip
+    label = "Steps of the solver"
+    text = (
+        "The solver keeps a change of its assumptions only if it lowers the objective: "
+        "-2 log of the restricted likelihood, up to a constant."
+    )
+    yield folded(
+        label,
+        paragraph(both(text)),
+        table([both(h) for h in header], rows, label=label, numeric=(0, 2, 3, 4)),
     )
 
 
