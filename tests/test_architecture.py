@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import ast
 import os
+import tomllib
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 import package_map
+import pytest
 from importlinter.cli import lint_imports
 
 import factorgraph_dvl
@@ -64,6 +67,54 @@ def layer_of(name):
 def test_contracts_of_imports_are_kept(monkeypatch):
     monkeypatch.chdir(ROOT)
     assert lint_imports(config_filename="pyproject.toml", no_cache=True) == os.EX_OK
+
+
+def importers_and_imported():
+    """Yield modules with what each imports, wherever in it: also in functions, also for types.
+
+    The public names of the package are left out: they are loaded when they are used.
+    """
+    names = {".".join(part for part in parts if part != "__init__") for parts in MODULES}
+    for parts in MODULES:
+        module = ".".join(part for part in parts if part != "__init__")
+        for name in imported(read(parts)):
+            target = name if name in names else name.rpartition(".")[0]
+            if target in names and target != module:
+                yield module, target
+
+
+def test_imports_make_no_circle():
+    for of in (lambda module: module, layer_of):
+        graph = {}
+        for module, target in importers_and_imported():
+            if of(module) != of(target):
+                graph.setdefault(of(module), set()).add(of(target))
+        try:
+            TopologicalSorter(graph).prepare()
+        except CycleError as circle:
+            raise AssertionError(" -> ".join(circle.args[1])) from None
+
+
+def test_a_circle_within_functions_would_be_seen():
+    source = "def f():\n    from factorgraph_dvl.solution import Solution\n"
+    assert imported(ast.parse(source)) == ["solution.Solution"]
+    with pytest.raises(CycleError):
+        TopologicalSorter({"solution": {"files"}, "files": {"solution"}}).prepare()
+
+
+def test_no_import_goes_up():
+    settings = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+    contracts = settings["tool"]["importlinter"]["contracts"]
+    assert not any("ignore_imports" in contract for contract in contracts)
+    (layers,) = (each["layers"] for each in contracts if each["type"] == "layers")
+    floor = {name: number for number, names in enumerate(layers) for name in names.split(" | ")}
+    wrong = [
+        f"{module} imports {target}"
+        for module, target in importers_and_imported()
+        if layer_of(module) != layer_of(target)
+        and floor[layer_of(module)] >= floor[layer_of(target)]
+    ]
+    assert not wrong, "\n".join(wrong)
 
 
 def test_the_map_of_the_package_is_that_of_the_tree():

@@ -160,6 +160,17 @@ def calibrate(
     if method == "beams":
         solution, outcome = calibrate_beams(trial, rate_hz=rate_hz, report=report)
         return solution, history_of(outcome)
+    return _calibrate_dvl(trial, _dvl_of(trial, method), method, rate_hz, report)
+
+
+def _dvl_of(trial: Trial, method: DvlMethod) -> Dvl:
+    """Return the DVL that a method calibrates.
+
+    Raises
+    ------
+    ConfigError, DataError
+        If there is none, or it measures through the water, for which the method does not allow.
+    """
     dvl = trial.log
     if dvl is None:
         raise DataError(
@@ -176,6 +187,13 @@ def calibrate(
             expected="bottom",
             hint="`solve` estimates the current; methods joyce and pollard-read allow for it",
         )
+    return dvl
+
+
+def _calibrate_dvl(
+    trial: Trial, dvl: Dvl, method: DvlMethod, rate_hz: float, report: Progress
+) -> tuple[Solution, History | None]:
+    """Calibrate a DVL against the smoothed motion; see `calibrate`."""
     prior = {p.stem: p for p in dvl.parameters()}
     offset = float(prior["time_offset"].mean[0])
     pings = dvl.time[dvl.locked] - offset

@@ -76,26 +76,7 @@ def calibrate_gyros(
     ConfigError, DataError
         If the trial has no star tracker, no epoch, no GNSS, or too few attitudes.
     """
-    star = trial.find(Star)
-    if star is None:
-        raise DataError(
-            "the trial has no star tracker", where="trial.yaml", expected="a star section"
-        )
-    if not trial.epoch:
-        raise ConfigError(
-            "the trial has no `epoch`",
-            where="trial.yaml key epoch",
-            expected="UTC of time_s = 0, such as 2022-10-12T02:00:00Z",
-        )
-    settings = star.settings
-    if max(settings.mounting_std_deg) > _KNOWN_DEG:
-        raise ConfigError(
-            f"the mounting of the star tracker is not known ({max(settings.mounting_std_deg):g} "
-            "deg), and this filter does not estimate it",
-            where="trial.yaml star.mounting_std_deg",
-            expected=f"at most {_KNOWN_DEG:g}",
-            hint="`solve` estimates the mounting",
-        )
+    star = _star_of(trial)
     frame = trial.frame()
     inc, _ = increments(trial.inertial)
     samples = prepare(inc, trial.inertial.settings)
@@ -141,6 +122,37 @@ def calibrate_gyros(
             solution, solver="kalman-liu-2020", findings=(*solution.findings, _IN_N)
         )
     return solution, outcome
+
+
+def _star_of(trial: Trial) -> Star:
+    """Return the star tracker, if this filter can use it.
+
+    Raises
+    ------
+    ConfigError, DataError
+        If there is none, or no epoch, or its mounting is not known.
+    """
+    star = trial.find(Star)
+    if star is None:
+        raise DataError(
+            "the trial has no star tracker", where="trial.yaml", expected="a star section"
+        )
+    if not trial.epoch:
+        raise ConfigError(
+            "the trial has no `epoch`",
+            where="trial.yaml key epoch",
+            expected="UTC of time_s = 0, such as 2022-10-12T02:00:00Z",
+        )
+    settings = star.settings
+    if max(settings.mounting_std_deg) > _KNOWN_DEG:
+        raise ConfigError(
+            f"the mounting of the star tracker is not known ({max(settings.mounting_std_deg):g} "
+            "deg), and this filter does not estimate it",
+            where="trial.yaml star.mounting_std_deg",
+            expected=f"at most {_KNOWN_DEG:g}",
+            hint="`solve` estimates the mounting",
+        )
+    return star
 
 
 def _drift(trial: Trial, tracks: list[AttitudeTrack], drift: Array, P: Array) -> Estimated:

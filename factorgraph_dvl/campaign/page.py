@@ -25,6 +25,7 @@ from factorgraph_dvl.report.html.markup import (
     Html,
     Section,
     both,
+    component_cell,
     element,
     paragraph,
     said,
@@ -32,7 +33,6 @@ from factorgraph_dvl.report.html.markup import (
     table,
 )
 from factorgraph_dvl.report.html.page import whole_page
-from factorgraph_dvl.report.html.sections import component_cell
 
 # Of a panel, in pixels.
 _WIDTH, _HEIGHT, _LEFT, _RIGHT, _TOP, _BOTTOM = 900, 190, 90, 20, 12, 24

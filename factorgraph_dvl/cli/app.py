@@ -16,7 +16,8 @@ import typer
 
 from factorgraph_dvl.cli import interrupts
 from factorgraph_dvl.cli.commands import Commands, lost_folder
-from factorgraph_dvl.cli.options import INTERRUPTED, claims
+from factorgraph_dvl.cli.exit_codes import BAD_INPUT, DONE, INTERRUPTED, NO_RESULT, exit_code_of
+from factorgraph_dvl.cli.options import claims
 from factorgraph_dvl.errors import FactorgraphDvlError, OutputError, printable
 
 if TYPE_CHECKING:
@@ -125,7 +126,7 @@ def run(args: list[str]) -> NoReturn:
             raise
         complete = "" if done.code else "; the files of this run are complete"
         message = f"standard output cannot be written ({failure.strerror}){complete}"
-        _fail(message, _code_of(done) or 1, args, "output")
+        _fail(message, _code_of(done) or NO_RESULT, args, "output")
 
 
 def _run_with_events(args: list[str]) -> NoReturn:
@@ -139,7 +140,7 @@ def _run_with_events(args: list[str]) -> NoReturn:
                 _emit_help(args)
             # Typer would print its help.
             if not set(args) - set(_EVERYWHERE):
-                _fail("the command is missing", 2, args, "usage")
+                _fail("the command is missing", BAD_INPUT, args, "usage")
             _run(args)
         except SystemExit as done:
             # The last event states the exit code: no interrupt may change it any more.
@@ -166,7 +167,7 @@ def _emit_help(args: list[str]) -> NoReturn:
     with redirect_stdout(StringIO()) as shown, suppress(SystemExit):
         _call(args)
     events.emit(events.Text(shown.getvalue()))
-    sys.exit(0)
+    sys.exit(DONE)
 
 
 def _call(args: list[str]) -> None:
@@ -188,7 +189,7 @@ def _run(args: list[str]) -> NoReturn:
             # Said without rich, which may be what was being loaded.
             raise KeyboardInterrupt from error
         _end_with(error, args)
-    sys.exit(0)
+    sys.exit(DONE)
 
 
 def _is_interrupt(error: BaseException | None) -> bool:
@@ -215,23 +216,28 @@ def _end_with(error: BaseException, args: list[str]) -> NoReturn:
         for note in getattr(error, "__notes__", ()):
             warn(note)
         parts = {name: getattr(error, name) for name in ("what", "where", "expected", "hint")}
-        _fail(str(error), error.exit_code, args, _kind_of(error), parts)
+        _fail(str(error), exit_code_of(error), args, _kind_of(error), parts)
     if isinstance(error, OSError):
         name = error.filename if error.filename is not None else "a file"
-        _fail(f"{name}: {error.strerror or error}", 2, args, "system")
+        _fail(f"{name}: {error.strerror or error}", exit_code_of(error), args, "system")
     if not isinstance(error, Exception):
         raise error
     # Typer's errors of usage have no public base class.
     if hasattr(error, "format_message"):
-        _fail(error.format_message(), 2, args, "usage")
+        _fail(error.format_message(), exit_code_of(error), args, "usage")
     hint = "" if "--debug" in args else ". Run with --debug to see where"
-    _fail(f"internal error: {type(error).__name__}: {error}{hint}", 1, args, "internal")
+    _fail(
+        f"internal error: {type(error).__name__}: {error}{hint}",
+        exit_code_of(error),
+        args,
+        "internal",
+    )
 
 
 def _kind_of(error: FactorgraphDvlError) -> FailureKind:
     if isinstance(error, OutputError):
         return "output"
-    return "input" if error.exit_code == 2 else "result"
+    return "input" if exit_code_of(error) == BAD_INPUT else "result"
 
 
 def _fail(

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from factorgraph_dvl.cli.console import CountLine, print_folder, stderr, stdout, warn
+from factorgraph_dvl.cli.exit_codes import NO_RESULT
 from factorgraph_dvl.cli.options import (
     Anyway,
     FigureKind,
@@ -227,7 +228,7 @@ def _print_campaign(found: Campaign) -> None:
 
 
 def _end(failed: int, count: int) -> None:
-    """End with exit code 1 if runs have no result."""
+    """End with `NO_RESULT` if runs have no result."""
     if failed:
         stderr().print(f"error: {failed} of {count} runs failed", markup=False, style="red")
-        raise typer.Exit(1)
+        raise typer.Exit(NO_RESULT)

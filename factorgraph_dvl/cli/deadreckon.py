@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -85,7 +86,6 @@ def deadreckon(
         RESULT_FILE,
         TRACK_FILE,
         UNCALIBRATED_FILE,
-        error_table,
         to_json,
     )
 
@@ -104,15 +104,13 @@ def deadreckon(
             result = before_after(trial, values, source)
         progress("write")
         with new_folder(out, force=force, owned=OWNED) as folder:
-            for name, run in (
-                (TRACK_FILE, result.calibrated),
-                (UNCALIBRATED_FILE, result.uncalibrated),
-            ):
+            tracks = {TRACK_FILE: result.calibrated, UNCALIBRATED_FILE: result.uncalibrated}
+            for name, run in tracks.items():
                 write_table(folder / name, motion_columns(run.track.motion))
             if not no_figures:
                 reasons = () if own is None else own.verdict.reasons
-                verdict = verdict_of((*errors, *trial.notes, *findings, *reasons))
-                _draw(trial, result, folder, verdict, figures.value)
+                found = (*errors, *trial.notes, *findings, *reasons)
+                _draw(trial, result, folder, verdict_of(found), figures.value)
             about = {
                 "trial": trial.name,
                 "calibration": as_text(calibration),
@@ -121,6 +119,29 @@ def deadreckon(
                 "errors": list(map(str, errors)),
             }
             (folder / RESULT_FILE).write_bytes(to_json(result, about))
+    _print_errors(result)
+    _say(trial, result, (*errors, *trial.notes, *findings))
+    print_written(out)
+    end_with(verdict_of(errors))
+
+
+def _say(trial: Trial, result: BeforeAfter, findings: Sequence[Finding]) -> None:
+    """Print findings, and warn of a current and of pings without bottom lock."""
+    for finding in findings:
+        say(finding)
+    if trial.dvl is not None and trial.dvl.settings.reference == "water":
+        warn("the DVL measures velocity through the water: the track drifts with the current")
+    if result.calibrated.track.bridged > 0.0:
+        warn(
+            f"{result.calibrated.track.bridged:.1f} s without bottom lock were bridged with the "
+            "velocity before and after"
+        )
+
+
+def _print_errors(result: BeforeAfter) -> None:
+    """Print the errors of the tracks, and how far they are known."""
+    from factorgraph_dvl.report.files.dead_reckoning import error_table
+
     if result.calibrated.score is None:
         warn("neither a reference nor GNSS covers the track, so its errors are unknown")
     else:
@@ -135,17 +156,6 @@ def deadreckon(
                 f"{result.scored_by} ends at {end:.1f} s, before the track ({last:.1f} s): "
                 f"distance and errors are valid up to {end:.1f} s"
             )
-    for finding in (*errors, *trial.notes, *findings):
-        say(finding)
-    if trial.dvl is not None and trial.dvl.settings.reference == "water":
-        warn("the DVL measures velocity through the water: the track drifts with the current")
-    if result.calibrated.track.bridged > 0.0:
-        warn(
-            f"{result.calibrated.track.bridged:.1f} s without bottom lock were bridged with the "
-            "velocity before and after"
-        )
-    print_written(out)
-    end_with(verdict_of(errors))
 
 
 def _default_attitude(trial: Trial) -> str:

@@ -41,12 +41,7 @@ def inspect(trial_path: TrialPath) -> None:
     """
     from factorgraph_dvl.files.trial_folder import load_trial
     from factorgraph_dvl.plausibility.survey import survey
-    from factorgraph_dvl.report.terminal.tables import (
-        finding_lines,
-        imu_lines,
-        motion_line,
-        sensor_table,
-    )
+    from factorgraph_dvl.report.tables import finding_lines, imu_lines, motion_line, sensor_table
 
     trial = load_trial(trial_path, anyway=True)
     result = survey(trial)

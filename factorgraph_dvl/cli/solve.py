@@ -309,10 +309,11 @@ def write_instrument(solution: Solution, folder: Path) -> None:
 
 def _print_solution(trial: Trial, found: _Found) -> None:
     from factorgraph_dvl.analysis.error_statistics import calibration_errors, paper_accuracy
-    from factorgraph_dvl.report.terminal.tables import (
+    from factorgraph_dvl.report.tables import (
         calibration_table,
         halves_table,
         hypothesis_table,
+        known_errors,
         rejected_line,
     )
 
@@ -321,7 +322,7 @@ def _print_solution(trial: Trial, found: _Found) -> None:
     truth = trial.calibration_truth
     if solution.estimates:
         errors = calibration_errors(solution, truth) if truth else None
-        print_table(calibration_table(solution, errors, width=stdout().width))
+        print_table(calibration_table(solution, known_errors(errors)))
         print_error_budget(solution)
         accuracy = paper_accuracy(solution.estimates, truth)
         if isfinite(accuracy):

@@ -9,6 +9,7 @@ from rich.text import Text
 
 from factorgraph_dvl.cli import events
 from factorgraph_dvl.cli.console import found_event, say, stderr, stdout
+from factorgraph_dvl.cli.exit_codes import NO_RESULT
 from factorgraph_dvl.errors import printable
 
 if TYPE_CHECKING:
@@ -18,7 +19,7 @@ if TYPE_CHECKING:
 
 def print_verdict(solution: Solution) -> None:
     """Print the verdict on one line, with its first reason and what to do about it."""
-    from factorgraph_dvl.report.terminal.tables import verdict_line
+    from factorgraph_dvl.report.tables import verdict_line
 
     verdict = solution.verdict
     if events.active():
@@ -42,10 +43,10 @@ def print_findings(solution: Solution) -> None:
 
 
 def end_with(verdict: Verdict) -> None:
-    """End the command with exit code 1 if a result is not to be used."""
+    """End the command with `NO_RESULT` if a result is not to be used."""
     if verdict.grade == "do not use":
         text = printable(f"error: not to be used: {verdict.reasons[0]}")
         if events.active():
-            raise typer.Exit(1)
+            raise typer.Exit(NO_RESULT)
         stderr().print(Text(text, "red"), soft_wrap=True)
-        raise typer.Exit(1)
+        raise typer.Exit(NO_RESULT)

@@ -9,7 +9,7 @@ from truth import TURNING, scenario
 
 from factorgraph_dvl.files.calibration_file import encode_calibration, load_calibration
 from factorgraph_dvl.report.figures.error_budget import error_budget_figure
-from factorgraph_dvl.report.terminal.error_budget import error_budget_table
+from factorgraph_dvl.report.tables import error_budget_table
 from factorgraph_dvl.simulation import simulate
 from factorgraph_dvl.solvers.batch import solve, solved_problems
 from factorgraph_dvl.solvers.calibration import calibration, reported
@@ -72,9 +72,9 @@ def test_a_budget_comes_back_from_its_file(solution, tmp_path):
 
 def test_budgets_are_shown(solution):
     table = error_budget_table(solution)
-    assert table.row_count == np.count_nonzero(np.diag(solution.covariance))
+    assert len(table.ends) == np.count_nonzero(np.diag(solution.covariance))
     (ax,) = error_budget_figure(solution).axes
-    assert len(ax.get_yticklabels()) == table.row_count
+    assert len(ax.get_yticklabels()) == len(table.ends)
 
 
 @pytest.mark.parametrize("kind", ["turning", "straight"])

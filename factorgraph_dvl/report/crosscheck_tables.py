@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from rich.table import Table
-from rich.text import Text
 
 from factorgraph_dvl.analysis.comparison.calibration_difference import AGREE_SIGMAS, Component
 from factorgraph_dvl.analysis.comparison.crosscheck import AgainstTruth, CrossCheck
@@ -18,68 +16,37 @@ from factorgraph_dvl.analysis.comparison.motion_difference import (
 )
 from factorgraph_dvl.analysis.error_statistics import nees_band
 from factorgraph_dvl.quality.notation import at_precision, split_unit, with_std
-from factorgraph_dvl.report.terminal.tables import width_of
+from factorgraph_dvl.report.table import Component as Named
+from factorgraph_dvl.report.table import Mark, Table, unit_of
 
-# Chosen: wider than any table, in columns.
-_UNLIMITED = 10_000
 _STYLES = {"agree": "green", "differ": "red", "not comparable": "yellow"}
 
 
-def component_table(check: CrossCheck, *, width: int = _UNLIMITED) -> Table:
-    """Return a table of every calibration component of both results, with its verdict.
-
-    Parameters
-    ----------
-    check : CrossCheck
-        Cross-check to show.
-    width : int, optional
-        Columns of the terminal. If they are too few, only the differences are shown.
-    """
-    table = _full_table(check)
-    return table if width_of(table) <= width else _brief_table(check)
-
-
-def _brief_table(check: CrossCheck) -> Table:
+def component_table(check: CrossCheck) -> Table:
+    """Return a table of every calibration component of both results, with its verdict."""
     table = Table(title="Calibration: A − B")
-    table.add_column("parameter", no_wrap=True)
-    table.add_column("A − B ± σ", justify="right", no_wrap=True)
-    table.add_column("in σ", justify="right", no_wrap=True)
-    table.add_column("verdict", no_wrap=True)
-    for c in check.components:
-        name, unit = split_unit(c.name)
-        table.add_row(
-            f"{name}, {unit}" if unit else name,
-            _value(c.difference, c.std, c.std),
-            _or_dash(c.in_sigmas, "+.2f"),
-            Text(c.verdict, _STYLES[c.verdict]),
-        )
-    return table
-
-
-def _full_table(check: CrossCheck) -> Table:
-    table = Table(title="Calibration: A − B")
-    table.add_column("parameter", no_wrap=True)
-    for header in ("A ± σ", "B ± σ", "A − B", "σ of A − B", "in σ"):
-        table.add_column(header, justify="right", no_wrap=True)
-    table.add_column("which σ", no_wrap=True)
-    table.add_column("unit", no_wrap=True)
-    table.add_column("verdict", no_wrap=True)
-    table.add_column("reason", no_wrap=True)
+    table.column("parameter")
+    for header in ("A ± σ", "B ± σ"):
+        table.column(header, numeric=True, detail=True)
+    table.column("A − B ± σ", numeric=True)
+    table.column("in σ", numeric=True)
+    table.column("which σ", detail=True)
+    table.column("unit")
+    table.column("verdict")
+    table.column("reason", detail=True)
     components = check.components
     for i, c in enumerate(components):
-        name, unit = split_unit(c.name)
         scale = _resolution(c)
         last = i + 1 == len(components) or components[i + 1].parameter != c.parameter
-        table.add_row(
-            name,
+        table.row(
+            Named(c.name),
             _value(c.a, c.std_a, scale),
             _value(c.b, c.std_b, scale),
-            at_precision(c.difference, scale) if np.isfinite(c.difference) else "–",
-            _or_dash(c.std, ".2g"),
+            _value(c.difference, c.std, c.std if np.isfinite(c.std) else scale),
             _or_dash(c.in_sigmas, "+.2f"),
             "" if c.kind == "none" else c.kind,
-            unit,
-            Text(c.verdict, _STYLES[c.verdict]),
+            unit_of(c.name),
+            Mark(c.verdict, _STYLES[c.verdict]),
             c.reason,
             end_section=last,
         )
@@ -90,13 +57,13 @@ def motion_table(motion: MotionDifference) -> Table:
     """Return a table of the differences of the trajectories, component by component."""
     span = f"{motion.time.size} epochs, {motion.time[0] + 0.0:.10g} to {motion.time[-1]:.10g} s"
     table = Table(title=f"Trajectory: A − B at {span}")
-    table.add_column("component", no_wrap=True)
+    table.column("component")
     for header in ("unit", "RMS", "largest", "at s", "RMS in σ", "largest in σ", "within 2σ %"):
-        table.add_column(header, justify="left" if header == "unit" else "right", no_wrap=True)
-    table.add_column("which σ", no_wrap=True)
+        table.column(header, numeric=header != "unit")
+    table.column("which σ")
     for i, (s, kind) in enumerate(zip(motion.spreads, motion.kinds, strict=True)):
         name, unit = split_unit(s.name)
-        table.add_row(
+        table.row(
             name,
             unit,
             f"{s.rms:.3g}",
@@ -166,12 +133,12 @@ def verdict_line(components: Sequence[Component]) -> str:
 
 def _calibration_truth(sides: Sequence[tuple[str, AgainstTruth]]) -> Table:
     table = Table(title="Calibration: error against the truth")
-    table.add_column("parameter", no_wrap=True)
-    table.add_column("truth", justify="right", no_wrap=True)
+    table.column("parameter")
+    table.column("truth", numeric=True)
     for side, _ in sides:
-        table.add_column(f"error of {side}", justify="right", no_wrap=True)
-        table.add_column("in its σ", justify="right", no_wrap=True)
-    table.add_column("unit")
+        table.column(f"error of {side}", numeric=True)
+        table.column("in its σ", numeric=True)
+    table.column("unit")
     rows: dict[str, list[str]] = {}
     for k, (_, against) in enumerate(sides):
         errors = against.calibration
@@ -183,8 +150,8 @@ def _calibration_truth(sides: Sequence[tuple[str, AgainstTruth]]) -> Table:
             row[2 + 2 * k] = _or_dash(float(errors.normalised[i]), "+.2f")
     for name, row in rows.items():
         short, unit = split_unit(name)
-        table.add_row(short, *row, unit)
-    table.add_section()
+        table.row(short, *row, unit)
+    table.end_section()
     nees, inside = ["NEES (expected)", ""], ["within 2σ (expected 95.4 %)", ""]
     for _, against in sides:
         errors = against.calibration
@@ -195,18 +162,18 @@ def _calibration_truth(sides: Sequence[tuple[str, AgainstTruth]]) -> Table:
         nees += [f"{errors.nees:.3g}", f"{low:.3g} to {high:.3g}"]
         z = np.abs(errors.normalised[errors.tested])
         inside += [f"{int((z <= 2.0).sum())} of {z.size}", f"{100.0 * (z <= 2.0).mean():.0f} %"]
-    table.add_row(*nees, "")
-    table.add_row(*inside, "")
+    table.row(*nees, "")
+    table.row(*inside, "")
     return table
 
 
 def _trajectory_truth(sides: Sequence[tuple[str, AgainstTruth]]) -> Table:
     table = Table(title="Trajectory: error against the reference")
-    table.add_column("component", no_wrap=True)
-    table.add_column("unit", no_wrap=True)
+    table.column("component")
+    table.column("unit")
     for side, _ in sides:
         for header in (f"RMS of {side}", f"largest of {side}", f"{side} in 2σ, %"):
-            table.add_column(header, justify="right", no_wrap=True)
+            table.column(header, numeric=True)
     found = [
         None if against.trajectory is None else error_spreads(against.trajectory)
         for _, against in sides
@@ -222,14 +189,14 @@ def _trajectory_truth(sides: Sequence[tuple[str, AgainstTruth]]) -> Table:
             s = spreads[i]
             share = _or_dash(100.0 * s.within_2_sigma, ".1f")
             cells += [f"{s.rms:.3g}", f"{s.largest:.3g}", share]
-        table.add_row(name, unit, *cells, end_section=i % 3 == 2)
+        table.row(name, unit, *cells, end_section=i % 3 == 2)
     for k, group in enumerate(("position", "velocity", "attitude")):
         cells = []
         for _, against in sides:
             errors = against.trajectory
             nees = "–" if errors is None else _or_dash(float(mean_nees(errors)[k]), ".2f")
             cells += [nees, "", ""]
-        table.add_row(f"{group}: NEES (expected 3)", "", *cells)
+        table.row(f"{group}: NEES (expected 3)", "", *cells)
     table.caption = f"Expected within 2σ: {100.0 * TWO_SIGMA_SHARE:.1f} %, over many trials"
     return table
 

@@ -5,15 +5,14 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from rich.table import Table
-from rich.text import Text
 
 from factorgraph_dvl.analysis.information.marginals import Marginals
 from factorgraph_dvl.analysis.information.observability import Observability
 from factorgraph_dvl.geometry.units import DEG
-from factorgraph_dvl.quality.notation import fixed, split_unit, with_std
+from factorgraph_dvl.quality.notation import fixed, split_unit
 from factorgraph_dvl.quality.texts import text_of
-from factorgraph_dvl.report.terminal.tables import GRADES, add_column
+from factorgraph_dvl.report.table import Table
+from factorgraph_dvl.report.tables import posterior_table
 
 # Chosen: more rows do not fit on a screen.
 _MAX_SEGMENTS = 16
@@ -24,15 +23,15 @@ _MIN_SHARE = 0.1
 def segment_table(view: Observability) -> Table:
     """Return a table of the segments: motion and determined directions of the DVL."""
     table = Table(title="Segments")
-    add_column(table, "motion")
+    table.column("motion")
     for header in ("from s", "to s", "m/s", "turn deg", "rms rate deg/s"):
-        add_column(table, header, numeric=True)
+        table.column(header, numeric=True)
     point_set = view.point_set
     if point_set is not None:
-        add_column(table, "determined")
-        add_column(table, "strongest")
-        add_column(table, "weakest")
-        add_column(table, "up to its end")
+        table.column("determined")
+        table.column("strongest")
+        table.column("weakest")
+        table.column("up to its end")
     shown = view.segments[:_MAX_SEGMENTS]
     for k, m in enumerate(shown):
         row = [
@@ -57,7 +56,7 @@ def segment_table(view: Observability) -> Table:
                 else "–",
                 f"{int(np.sum(total.observed))} of {n}",
             ]
-        table.add_row(*(Text(text) for text in row))
+        table.row(*row)
     omitted = len(view.segments) - len(shown)
     if omitted:
         table.caption = f"and {omitted} more, in observability.json"
@@ -66,32 +65,14 @@ def segment_table(view: Observability) -> Table:
 
 def marginal_table(view: Observability) -> Table:
     """Return a table of posterior against prior, and of the sources of the information."""
-    m = view.marginals
-    assert m is not None
-    table = Table(title="Posterior against prior")
-    add_column(table, "component")
-    add_column(table, "value ± std", numeric=True)
-    add_column(table, "unit")
-    add_column(table, "prior std", numeric=True)
-    add_column(table, "std/prior", numeric=True)
-    add_column(table, "observable")
-    add_column(table, "grade")
+    assert view.marginals is not None
+    table = posterior_table(view.marginals)
     if view.shares is not None:
-        add_column(table, "information from")
-    for i, component in enumerate(m.names):
-        name, unit = split_unit(component)
-        row: list[str | Text] = [
-            name,
-            with_std(float(m.value[i]), float(m.std[i])),
-            unit,
-            f"{float(m.prior_std[i]):.3g}",
-            f"{float(m.ratio[i]):.2g}",
-            Text("yes", "green") if m.observable[i] else Text("no", "yellow"),
-            Text(m.grade[i], GRADES[m.grade[i]]),
+        table.column("information from")
+        table.rows = [
+            (*row, _sources(view, name))
+            for row, name in zip(table.rows, view.marginals.names, strict=True)
         ]
-        if view.shares is not None:
-            row.append(_sources(view, component))
-        table.add_row(*row)
     return table
 
 
