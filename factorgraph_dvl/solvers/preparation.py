@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
+import msgspec
 import numpy as np
 
 from factorgraph_dvl.geometry.earth import LocalFrame
@@ -151,6 +152,12 @@ class Preparation:
     def chain(self, states: States) -> InertialChain:
         """Return the inertial part of the graph, with gravity along the track of states."""
         return inertial_chain(self.trial, self.frame, self.segments, states)
+
+    def with_imu(self, **keys: float) -> Preparation:
+        """Return it with keys of the IMU as if they were stated."""
+        imu = self.trial.inertial
+        settings = msgspec.structs.replace(imu.settings, **keys)
+        return replace(self, trial=replace(self.trial, imu=replace(imu, settings=settings)))
 
     def mountings_at(self, chain: InertialChain, states: States) -> list[dict[str, Array]]:
         """Return values of the mountings that fit the motion of states, the best first."""
