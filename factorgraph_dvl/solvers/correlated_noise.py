@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -222,6 +222,14 @@ def _model(
     )
     process = Process(o.label, index, process_sigma, tau, nodes, density_only)
     return process, white, inflation
+
+
+def with_others(before: Sequence[Process], found: Sequence[Process]) -> tuple[Process, ...]:
+    """Return processes as they were, with others that were found."""
+    known = {p.label for p in before}
+    free = (i for i in range(len(before) + len(found)) if i not in {p.index for p in before})
+    others = (p for p in found if p.label not in known)
+    return (*before, *(replace(p, index=i) for p, i in zip(others, free, strict=False)))
 
 
 def with_innovations(process: Process, factor: Array) -> Process:

@@ -44,8 +44,8 @@ class Model:
         States and parameters at which the weights of measurements are taken.
     track : ndarray, shape (K, 3), m
         Positions of the nodes in n at which gravity is taken.
-    processes : tuple of Process
-        Correlated errors.
+    processes, stated_processes : tuple of Process
+        Correlated errors, and those that the trial states.
     noise_factors : mapping of str to ndarray
         By label, factors (d,) on stated standard deviations.
     long_run : mapping of str to ndarray
@@ -70,6 +70,7 @@ class Model:
     reference: tuple[Any, dict[str, Array]]
     track: Array
     processes: tuple[Process, ...] = ()
+    stated_processes: tuple[Process, ...] = ()
     noise_factors: Mapping[str, Array] = field(default_factory=dict)
     long_run: Mapping[str, Array] = field(default_factory=dict)
     gain: float = 0.0
@@ -81,10 +82,9 @@ class Model:
 
     def as_stated(self) -> Model:
         """Return it with nothing found of noise and gross errors."""
-        states, values = self.reference
         return replace(
             self,
-            processes=self.prepared.stated_processes(self.chain, states, values),
+            processes=self.stated_processes,
             noise_factors={label: np.ones(f.size) for label, f in self.noise_factors.items()},
             long_run={},
             gain=0.0,
@@ -227,6 +227,9 @@ def minimised(
     if before is not None and model.is_laid_out_as(before.model):
         problem = before.problem
         model.applied(problem)
+    elif before is not None:
+        # Its factors take as much memory as those of the next one.
+        before.problem.release()
     iterations = 0
     for _ in range(_REFERENCES):
         problem = problem or model.problem(values)

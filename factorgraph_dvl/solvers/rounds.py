@@ -19,6 +19,7 @@ from factorgraph_dvl.graph.problem import Problem
 from factorgraph_dvl.message import message
 from factorgraph_dvl.quality.finding import Code, Finding
 from factorgraph_dvl.solution import Progress, SolverStep
+from factorgraph_dvl.solvers.correlated_noise import correlated_noise, with_others
 from factorgraph_dvl.solvers.known_parameters import explanation_findings
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum
 from factorgraph_dvl.solvers.model import Estimated, Model, estimated, minimised
@@ -156,13 +157,15 @@ def _start(
     tilt = None
     if chain.interpolates and constants_prior is None:
         tilt = Tilt.holding(prepared.parameters, values)
+    processes = prepared.stated_processes(chain, states, values)
     model = Model(
         prepared,
         chain,
         prepared.parameters,
         (states, values),
         track,
-        processes=prepared.stated_processes(chain, states, values),
+        processes=processes,
+        stated_processes=processes,
         noise_factors={
             o.label: np.ones(len(o.components))
             for o in prepared.observations
@@ -178,7 +181,10 @@ def _start(
 
 
 def _first(start: Proposal, report: Progress) -> Estimated:
-    """Return the first minimum: gravity and weights are taken there, and all others compare."""
+    """Return the first minimum: gravity and weights are taken there, and all others compare.
+
+    Correlated noise that the trial states is in it.
+    """
     if start.model.chain.interpolates:
         return estimated(start.model, start.states, start.values, report, rough=True)
     model, problem, minimum = minimised(
@@ -186,7 +192,11 @@ def _first(start: Proposal, report: Progress) -> Estimated:
     )
     rough = Estimated(model, problem, minimum, np.inf, rough=True)
     reference = rough.states, rough.values
-    found = estimated(replace(model, reference=reference), *reference, report, before=rough)
+    stated = with_others(
+        model.processes, correlated_noise(problem, minimum.evaluation, ()).processes
+    )
+    model = replace(model, reference=reference, processes=stated, stated_processes=stated)
+    found = estimated(model, *reference, report, before=rough)
     iterations = minimum.iterations + found.minimum.iterations
     return replace(found, minimum=replace(found.minimum, iterations=iterations))
 

@@ -26,6 +26,7 @@ from factorgraph_dvl.solvers.correlated_noise import (
     long_run_share,
     noise_of,
     with_innovations,
+    with_others,
 )
 from factorgraph_dvl.solvers.known_parameters import Explanation, explanation
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, factorized
@@ -196,7 +197,7 @@ class Correlation:
     _for: tuple[Any, ...] | None = None
 
     def proposals(self, at: Estimated) -> Iterator[Proposal]:
-        """Yield the correlated noise that a trial states, or that residuals show."""
+        """Yield the correlated noise that residuals show."""
         model, problem, minimum = at.model, at.problem, at.minimum
         own = model.parameters, model.prepared
         if _are_those(own, self._for) or not minimum.converged:
@@ -212,7 +213,7 @@ class Correlation:
         persists = any(p.label in model.robust_weights for p in found.processes)
         yield _from(
             at,
-            processes=_with_others(model.processes, found.processes),
+            processes=with_others(model.processes, found.processes),
             noise_factors={**model.noise_factors, **found.factors},
             long_run=found.long_run,
             gain=found.long_run_gain,
@@ -356,14 +357,6 @@ def _between(before: Process, after: Process, share: float) -> Process:
         sigma=before.sigma * ratio**share,
         tau=before.tau * (after.tau / before.tau) ** share,
     )
-
-
-def _with_others(before: tuple[Process, ...], found: tuple[Process, ...]) -> tuple[Process, ...]:
-    """Return processes as they were, with others that were found."""
-    known = {p.label for p in before}
-    free = (i for i in range(len(before) + len(found)) if i not in {p.index for p in before})
-    others = (p for p in found if p.label not in known)
-    return (*before, *(replace(p, index=i) for p, i in zip(others, free, strict=False)))
 
 
 def _changes_explain_more(problem: Problem, minimum: Minimum, gain: float) -> bool:
