@@ -8,7 +8,7 @@ import solved
 from truth import TURNING, scenario
 
 from factorgraph_dvl.files.calibration_file import encode_calibration, load_calibration
-from factorgraph_dvl.report.figures.error_budget import error_budget_figure
+from factorgraph_dvl.report.figures.calibration import error_budget_figure
 from factorgraph_dvl.report.tables import error_budget_table
 from factorgraph_dvl.simulation import simulate
 from factorgraph_dvl.solvers.batch import solve, solved_problems
