@@ -15,7 +15,6 @@ from factorgraph_dvl.graph.trajectory import TRAJECTORY_RATE
 from factorgraph_dvl.quality.refusal import accepted_errors, explained
 from factorgraph_dvl.quality.survey import survey
 from factorgraph_dvl.ranging.hypothesis_weights import significant_costs
-from factorgraph_dvl.ranging.position_from_ranges import StartPositions
 from factorgraph_dvl.sensors.finding import Finding
 from factorgraph_dvl.solution import Progress, Solution, ambiguity, joined, most_probable_minimum
 from factorgraph_dvl.solvers.fixed_directions import (
@@ -30,6 +29,8 @@ from factorgraph_dvl.solvers.minima import (
     distinct,
     evidence_against,
 )
+from factorgraph_dvl.solvers.planar_preparation import PlanarPreparation, prepare_planar
+from factorgraph_dvl.solvers.position_from_ranges import StartPositions
 from factorgraph_dvl.solvers.preparation import Prepared, prepare
 from factorgraph_dvl.solvers.preparation_without_imu import prepare_without_imu
 from factorgraph_dvl.solvers.rounds import SettledMinimum, settle
@@ -100,11 +101,10 @@ def solve_with_problem(
     state_interval_s: float = STATE_INTERVAL,
     anyway: bool = False,
     progress: Progress | None = None,
-) -> tuple[Solution, SolvedProblem | None]:
+) -> tuple[Solution, SolvedProblem]:
     """Return the solution of a trial, and its problem at the most probable minimum.
 
-    That of a planar trial is of another kind, and None here. Parameters and errors are those of
-    `solve`.
+    Parameters and errors are those of `solve`.
     """
     _check_above_zero("rate_hz", rate_hz)
     _check_above_zero("state_interval_s", state_interval_s)
@@ -115,12 +115,6 @@ def solve_with_problem(
     records = survey(trial)
     errors = accepted_errors(records, anyway=anyway)
     with explained(errors):
-        if trial.planar:
-            # Its solver is loaded for such trials only.
-            from factorgraph_dvl.ranging.planar_solution import solve_planar
-
-            found = solve_planar(trial, rate_hz=rate_hz, progress=report)
-            return found.with_findings(records.problems), None
         prepared = _prepared(trial, state_interval_s, report)
         found, solved = _most_probable(trial, prepared, rate_hz, report)
     return found.with_findings(errors), solved
@@ -128,6 +122,8 @@ def solve_with_problem(
 
 def _prepared(trial: Trial, state_interval_s: float, report: Progress) -> Prepared:
     """Return what the minimisation of a trial starts from."""
+    if trial.planar:
+        return prepare_planar(trial, report)
     if trial.imu is None:
         return started_from_stretch(prepare_without_imu(trial), report)
     return prepare(trial, state_interval_s, report)

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from scipy.linalg import solve_triangular
 
 from factorgraph_dvl.geometry.vectors import Array, IntArray
+from factorgraph_dvl.graph.chain import Chain
 from factorgraph_dvl.graph.priors import Tilt
 from factorgraph_dvl.graph.problem import Problem
 from factorgraph_dvl.graph.processes import Process
 from factorgraph_dvl.graph.smooth_chain import SmoothChain
-from factorgraph_dvl.graph.smooth_motion import SmoothStates
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, factorized
 from factorgraph_dvl.statistics.marginal_likelihood import log_determinant_gradient
 from factorgraph_dvl.statistics.variance_components import (
@@ -45,15 +46,15 @@ class Strengths:
 
     Parameters
     ----------
-    chain : SmoothChain
+    chain : Chain
         With densities.
     factors : dict of str to ndarray
         By label, factors (d,) on stated white noise.
     processes : tuple of Process
         With their deviations.
-    tilt : Tilt
+    tilt : Tilt, optional
         Gradient of the states' volume by the constants.
-    states : SmoothStates
+    states : object
         Of the nodes of this chain.
     values : dict of str to ndarray
         Of all parameters, processes in their new unit.
@@ -63,11 +64,11 @@ class Strengths:
         Whether all are about the same as before.
     """
 
-    chain: SmoothChain
+    chain: Chain
     factors: dict[str, Array]
     processes: tuple[Process, ...]
-    tilt: Tilt
-    states: SmoothStates
+    tilt: Tilt | None
+    states: Any
     values: dict[str, Array]
     steps: dict[str, Array]
     same: bool

@@ -23,7 +23,6 @@ from factorgraph_dvl.imu.attitude_record import AttitudeRecord, level_axes
 from factorgraph_dvl.initialization.dvl_mounting import initial_mountings
 from factorgraph_dvl.initialization.record_clocks import clock_lags
 from factorgraph_dvl.initialization.track_velocity import Track, body_track
-from factorgraph_dvl.ranging.position_from_ranges import StartPositions
 from factorgraph_dvl.sensors.attitude import Attitude
 from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.sensors.ins import Ins
@@ -35,6 +34,7 @@ from factorgraph_dvl.solution import Progress
 from factorgraph_dvl.solvers.correlated_noise import correlated_noise
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum
 from factorgraph_dvl.solvers.motion_strengths import Strengths, motion_strengths
+from factorgraph_dvl.solvers.position_from_ranges import StartPositions
 from factorgraph_dvl.solvers.preparation import MountedStart
 from factorgraph_dvl.trial import Trial
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from factorgraph_dvl.geometry.records import rows_of
 from factorgraph_dvl.geometry.rotations import BodyAxes
+from factorgraph_dvl.graph.planar_chain import PlanarChain
 from factorgraph_dvl.graph.problem import Evaluation, Problem
 from factorgraph_dvl.quality.earlier_calibration import prior_findings
 from factorgraph_dvl.sensors.finding import Code, Finding
@@ -31,6 +32,7 @@ from factorgraph_dvl.solvers.correlated_noise import noise_of
 from factorgraph_dvl.solvers.fixed_directions import SolvedProblem
 from factorgraph_dvl.solvers.heading_and_misalignment import heading_and_misalignment
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum
+from factorgraph_dvl.solvers.planar_trajectory import planar_trajectory
 from factorgraph_dvl.solvers.true_times import trajectory_at_true_times
 from factorgraph_dvl.statistics.robust_weights import windows
 from factorgraph_dvl.trial import Trial
@@ -96,6 +98,8 @@ def summarise(trial: Trial, found: SolvedProblem, *, rate_hz: float) -> Solution
 def _trajectory(found: SolvedProblem, body_axes: BodyAxes, rate_hz: float) -> Trajectory:
     """Return the motion at a rate, at true times."""
     chain = found.problem.chain
+    if isinstance(chain, PlanarChain):
+        return planar_trajectory(found, chain, rate_hz)
     if chain.interpolates:
         at = found.minimum.evaluation
         return trajectory_at_true_times(found.problem, at, found.covariances, body_axes, rate_hz)
