@@ -35,8 +35,11 @@ _BEFORE = 3.0
 # Share of rejected measurements among the newest from which on the track is fitted anew. Chosen:
 # so many are no echoes.
 _MOSTLY_REJECTED = 0.5
-# Promised fall of the cost at which a track fits.
-_ROUGHLY = 1e-3
+# Promised fall of the cost at which a track fits, and steps after which it counts as it is.
+# Chosen: with few ranges the cost is a narrow valley around the beacon, along which whole steps
+# fail; what is left of it changes no weight.
+_ROUGHLY = 0.03
+_STEPS = 15
 
 
 @dataclass(frozen=True)
@@ -192,6 +195,7 @@ class PlanarSetup:
                 stage="hypotheses",
                 proven=False,
                 tolerance=_ROUGHLY,
+                max_iterations=_STEPS,
             )
             x, values = found.evaluation.states.x, found.evaluation.parameters
             echoes = problem.outliers(found.evaluation)
