@@ -17,11 +17,14 @@ from factorgraph_dvl.quality.survey import survey
 from factorgraph_dvl.ranging.hypothesis_weights import significant_costs
 from factorgraph_dvl.sensors.finding import Finding
 from factorgraph_dvl.solution import Progress, Solution, ambiguity, joined, most_probable_minimum
+from factorgraph_dvl.solvers.calibration import calibration
+from factorgraph_dvl.solvers.curved_posterior import points_along_arc
 from factorgraph_dvl.solvers.fixed_directions import (
     SolvedProblem,
     undetermined_there,
     with_covariances,
 )
+from factorgraph_dvl.solvers.hypotheses import relative_costs
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, minimise
 from factorgraph_dvl.solvers.minima import (
     competing_minima,
@@ -30,13 +33,14 @@ from factorgraph_dvl.solvers.minima import (
     evidence_against,
 )
 from factorgraph_dvl.solvers.planar_preparation import PlanarPreparation, prepare_planar
+from factorgraph_dvl.solvers.planar_setup import Track
 from factorgraph_dvl.solvers.position_from_ranges import StartPositions
 from factorgraph_dvl.solvers.preparation import Prepared, prepare
 from factorgraph_dvl.solvers.preparation_without_imu import prepare_without_imu
 from factorgraph_dvl.solvers.rounds import SettledMinimum, settle
 from factorgraph_dvl.solvers.state_times import STATE_INTERVAL
 from factorgraph_dvl.solvers.stretch import started_from_stretch
-from factorgraph_dvl.solvers.summary import summarise
+from factorgraph_dvl.solvers.summary import summarise, trajectory
 from factorgraph_dvl.trial import Trial
 
 
@@ -136,13 +140,43 @@ def _most_probable(
     solutions, best = [], []
     for states in prepared.start_positions.states:
         minima = _minima(prepared, states, prepared.findings, report)
-        against = np.array([evidence_against(each) for each in minima])
-        summaries = [summarise(trial, each, rate_hz=rate_hz) for each in minima]
-        solutions.append(most_probable_minimum(summaries, against))
+        if isinstance(prepared, PlanarPreparation):
+            solutions.append(_along_arc(trial, prepared, minima[0], rate_hz, report))
+        else:
+            against = np.array([evidence_against(each) for each in minima])
+            summaries = [summarise(trial, each, rate_hz=rate_hz) for each in minima]
+            solutions.append(most_probable_minimum(summaries, against))
         best.append(minima[0])
-    costs = significant_costs([cost_terms(each) for each in best])
+    if isinstance(prepared, PlanarPreparation):
+        costs = relative_costs([Track(b.problem, b.minimum.evaluation, True) for b in best])
+    else:
+        costs = significant_costs([cost_terms(each) for each in best])
     likeliest = int(np.argmin(costs))
     return joined(solutions, costs, prepared.start_positions.hypotheses), best[likeliest]
+
+
+def _along_arc(
+    trial: Trial,
+    prepared: PlanarPreparation,
+    found: SolvedProblem,
+    rate_hz: float,
+    report: Progress,
+) -> Solution:
+    """Return the solution of a track, with the spread along the arc that ranges leave."""
+    points, against = points_along_arc(found, prepared.setup.rows.place, report)
+    whole = summarise(trial, found, rate_hz=rate_hz)
+    if len(points) == 1:
+        return whole
+    spread = []
+    for each in points:
+        estimates, covariance = calibration(each)
+        motion = trajectory(each, trial.body_axes, rate_hz)
+        spread.append(
+            replace(whole, estimates=estimates, covariance=covariance, trajectory=motion)
+        )
+    mixture = most_probable_minimum(spread, against)
+    # They are no minima, but one that is drawn out.
+    return replace(mixture, findings=whole.findings, iterations=whole.iterations)
 
 
 def solved_problems(

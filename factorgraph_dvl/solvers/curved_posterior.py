@@ -77,7 +77,7 @@ def points_along_arc(
             out.append(replace(found, problem=held, minimum=minimum,
                                covariances=posterior(held, minimum), spurious=None))  # fmt: skip
             costs.append(cost)
-    if not out:
+    if len(out) < 2:
         return [found], np.zeros(1)
     order = np.argsort(costs)
     return [out[i] for i in order], np.array(costs)[order]

@@ -156,11 +156,12 @@ def _searched(setup: PlanarSetup, nodes: int) -> list[Track]:
         track = setup.fitted(setup.reckoned(start.position, values, nodes), values, echoes)
         if not any(same_track(setup, track, other) for other in found):
             found.append(track)
-    against = _costs(found)
+    against = relative_costs(found)
     return [track for track, value in zip(found, against, strict=True) if value < NEGLIGIBLE]
 
 
-def _costs(found: Sequence[Track]) -> Array:
+def relative_costs(found: Sequence[Track]) -> Array:
+    """Return the costs of tracks of the same data relative to the best, (F,)."""
     data, priors = zip(*(track.terms for track in found), strict=True) if found else ((), ())
     return hypothesis_costs(data, priors)
 
@@ -201,14 +202,14 @@ def _weighted(
     dropped: list[TrackedHypothesis] = []
     ordered = sorted(hypotheses, key=lambda h: h.fit.cost)
     for h, against in zip(
-        ordered, _costs([h.fit for h in ordered]), strict=True
+        ordered, relative_costs([h.fit for h in ordered]), strict=True
     ):
         if against > NEGLIGIBLE or any(same_track(setup, h.fit, other.fit) for other in kept):
             h.weight = 0.0
             dropped.append(h)
         else:
             kept.append(h)
-    likelihood = np.exp(-_costs([h.fit for h in kept]))
+    likelihood = np.exp(-relative_costs([h.fit for h in kept]))
     for h, value in zip(kept, likelihood, strict=True):
         h.weight = float(value / likelihood.sum())
         h.highest = max(h.highest, h.weight)
@@ -233,7 +234,7 @@ def _time_of_death(
         middle = (before + after) // 2
         own = setup.followed(earlier, middle)
         fits = [own, *(_cut(setup, o, middle) for o in others)]
-        likelihood = np.exp(-_costs(fits))
+        likelihood = np.exp(-relative_costs(fits))
         if likelihood[0] / likelihood.sum() < DEAD:
             after = middle
         else:

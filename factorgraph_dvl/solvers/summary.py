@@ -85,7 +85,7 @@ def summarise(trial: Trial, found: SolvedProblem, *, rate_hz: float) -> Solution
         cost=evaluation.cost,
         estimates=estimates,
         covariance=covariance,
-        trajectory=_trajectory(found, trial.body_axes, rate_hz),
+        trajectory=trajectory(found, trial.body_axes, rate_hz),
         residuals=residuals,
         findings=tuple(findings),
         rejected=rejected,
@@ -95,7 +95,7 @@ def summarise(trial: Trial, found: SolvedProblem, *, rate_hz: float) -> Solution
     )
 
 
-def _trajectory(found: SolvedProblem, body_axes: BodyAxes, rate_hz: float) -> Trajectory:
+def trajectory(found: SolvedProblem, body_axes: BodyAxes, rate_hz: float) -> Trajectory:
     """Return the motion at a rate, at true times."""
     chain = found.problem.chain
     if isinstance(chain, PlanarChain):
