@@ -24,10 +24,10 @@ DEAD = 1e-3
 # Chosen: a hypothesis is reported if its weight ever reached this.
 _LIKELY = 0.05
 # Chosen: number of times at which hypotheses are fitted and weighed.
-_UPDATES = 40
+_UPDATES = 24
 # Chosen: indices of those at which to search for new hypotheses as well, denser at first, when
 # the ranges determine little.
-_SEARCHES = (0, 1, 2, 4, 8, 16, 28)
+_SEARCHES = (0, 1, 2, 4, 8, 16)
 # Chosen: rows before the first of them; a start and a current have four unknowns.
 _FIRST_ROWS = 8
 
