@@ -381,4 +381,6 @@ def as_planar(
         depth,
         trial.required(Beacons),
     )
-    return Trial(trial.name, None, others=others, body_axes=trial.body_axes, initial_position=first)
+    return Trial(
+        trial.name, None, others=others, body_axes=trial.body_axes, initial_position=first
+    )

@@ -167,9 +167,7 @@ def ranging_rows(track: DeadReckoning, frame: LocalFrame, body_axes: BodyAxes) -
             + 0.5 * wander
             + (slack * np.nan_to_num(range_)) ** 2
         ),
-        rate_std=np.sqrt(
-            s.range_rate_std_m_s**2 + 0.5 * noise / interval + _LEAST_RATE_STD**2
-        )
+        rate_std=np.sqrt(s.range_rate_std_m_s**2 + 0.5 * noise / interval + _LEAST_RATE_STD**2)
         * np.ones(time.size),
         since=time - grid[0],
     )

@@ -99,7 +99,5 @@ def _held(problem: Problem, place: Array, along: Array, sigma: float) -> Problem
     )
     origin = gtsam.Values()
     origin.insert(keys.node(0), np.zeros(4))
-    out.graph.push_back(
-        gtsam.LinearContainerFactor(factor, origin)
-    )
+    out.graph.push_back(gtsam.LinearContainerFactor(factor, origin))
     return out

@@ -201,9 +201,7 @@ def _weighted(
     kept: list[TrackedHypothesis] = []
     dropped: list[TrackedHypothesis] = []
     ordered = sorted(hypotheses, key=lambda h: h.fit.cost)
-    for h, against in zip(
-        ordered, relative_costs([h.fit for h in ordered]), strict=True
-    ):
+    for h, against in zip(ordered, relative_costs([h.fit for h in ordered]), strict=True):
         if against > NEGLIGIBLE or any(same_track(setup, h.fit, other.fit) for other in kept):
             h.weight = 0.0
             dropped.append(h)

@@ -101,7 +101,14 @@ class PlanarPreparation:
         """Return what is assumed: how smooth the motion is, its records say."""
         at = minimum.evaluation
         return Strengths(
-            problem.chain, dict(problem.noise_factors), (), None, at.states, at.parameters, {}, True
+            problem.chain,
+            dict(problem.noise_factors),
+            (),
+            None,
+            at.states,
+            at.parameters,
+            {},
+            True,
         )
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.vectors import Array, interpolate
 from factorgraph_dvl.graph import keys
-from factorgraph_dvl.graph.planar_chain import PlanarChain, PlanarStates, Recorded
+from factorgraph_dvl.graph.planar_chain import PlanarChain, Recorded
 from factorgraph_dvl.graph.problem import Evaluation, Problem
 from factorgraph_dvl.ranging.dead_reckoning import DeadReckoning, dead_reckoned
 from factorgraph_dvl.ranging.search import RangingRows, ranging_rows

@@ -123,7 +123,9 @@ def test_the_log_by_hand_and_against_differences():
         ends = [log.residual(replace(motion, v_n=motion.v_n + s * h), values) for s in (1, -1)]
         np.testing.assert_allclose(lin.d_v[:, :, i], (ends[0] - ends[1]) / 2e-6, atol=1e-8)
         turned = [
-            log.residual(replace(motion, nRb=motion.nRb @ gtsam.Rot3.Expmap(s * h).matrix()), values)
+            log.residual(
+                replace(motion, nRb=motion.nRb @ gtsam.Rot3.Expmap(s * h).matrix()), values
+            )
             for s in (1, -1)
         ]
         expected = (turned[0] - turned[1]) / 2e-6
@@ -139,7 +141,9 @@ def test_zero_error_at_the_truth(constant):
     problem, at = evaluation_of(t, setup, *true_state(t, setup))
     # The turn is abrupt: where it begins and ends, halfway between samples, the motion misses by
     # centimetres, and the reference is interpolated as well.
-    for o, residual, weight in zip(problem.observations, at.residuals, problem.weights, strict=True):
+    for o, residual, weight in zip(
+        problem.observations, at.residuals, problem.weights, strict=True
+    ):
         off = np.abs(residual / np.maximum(weight, 1e-9))[2:-2]
         assert np.median(off) < 2e-3, o.label
         assert off.max() < (2e-2 if o.unit == "m" else 6e-2), o.label

@@ -47,7 +47,10 @@ def test_a_straight_run_by_hand():
     np.testing.assert_allclose(track.spread[10], 10.0 * by_hand)
     # A current of 0.1 m/s to the east, and a heading that is 90 degrees too large: it goes north.
     zero = {p.name: p.mean for p in track.parameters}
-    values = zero | {"heading_bias_deg": np.array([np.pi / 2.0]), "current_m_s": np.array([0.1, 0])}
+    values = zero | {
+        "heading_bias_deg": np.array([np.pi / 2.0]),
+        "current_m_s": np.array([0.1, 0]),
+    }
     moved, velocity = track.over_ground(np.array([10.0]), values)
     np.testing.assert_allclose(moved, [[6.0, 20.0]], atol=1e-12)
     np.testing.assert_allclose(velocity, [[0.6, 2.0]], atol=1e-12)
