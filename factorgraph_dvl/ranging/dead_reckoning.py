@@ -1,4 +1,4 @@
-"""Dead reckoning in the plane: heading, speed and depth over time, and how smooth the motion is."""
+"""Dead reckoning in the plane by heading, speed and depth, and how smooth the motion is."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A planar trial as a problem: its chain, its measurements, and tracks that fit the first of them."""
+"""A planar trial as a problem: its chain, its measurements, and tracks that fit them."""
 
 from __future__ import annotations
 
