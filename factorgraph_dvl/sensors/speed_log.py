@@ -193,15 +193,14 @@ class SpeedLog:
 
     def observations(self, frame: LocalFrame, body_axes: BodyAxes) -> tuple[Observation, ...]:
         """Return the velocity along the axes of the body."""
-        own = ~self.missing
+        own = ~np.isnan(self.speed)
         if not own.any():
             return ()
         starboard = self.starboard[own]
         measured = np.stack([self.speed[own], np.nan_to_num(starboard)], axis=1)
         std = np.full(measured.shape, self.settings.speed_std_m_s)
         std[np.isnan(starboard), 1] = _NO_LEEWAY
-        axes = frd_from_body(body_axes)[:2]
-        return (LogVelocity(self.time[own], measured, std, axes),)
+        return (LogVelocity(self.time[own], measured, std, body_axes),)
 
     def explain(self, parameter: str, component: int, motion: Motion | None) -> Message:
         """Say why current or scale error could not be observed."""
@@ -229,22 +228,22 @@ class LogVelocity(ObservationByRows):
         Ahead and to starboard.
     std : ndarray, shape (M, 2), m/s
         Of each.
-    axes : ndarray, shape (2, 3)
-        F, from body axes.
+    body_axes : BodyAxes
+        Axes of the body.
     """
 
     time: Array
     measured: Array
     std: Array
-    axes: Array
+    body_axes: BodyAxes
 
     label: str = "Log velocity"
     unit: str = "m/s"
     components: tuple[str, ...] = ("ahead", "starboard")
     parameters: tuple[str, ...] = (SCALE_ERROR, HEADING_BIAS, CURRENT)
     clock: ClassVar[None] = None
-    noise_groups: ClassVar[tuple[tuple[int, ...], ...]] = ((0,), (1,))
-    independent: ClassVar[bool] = True
+    noise_groups = ((0,), (1,))
+    independent = True
 
     def sigma(self, motion: Motion, values: Values, factor: Array | float = 1.0) -> Array:
         """Return the standard deviations."""
@@ -282,5 +281,5 @@ class LogVelocity(ObservationByRows):
         through_b = rotate(motion.nRb.transpose(0, 2, 1), motion.v_n - current_n)
         b = float(values[HEADING_BIAS][0])
         turn = np.array([[np.cos(b), -np.sin(b)], [np.sin(b), np.cos(b)]])
-        rows = turn @ self.axes
+        rows = turn @ frd_from_body(self.body_axes)[:2]
         return through_b @ rows.T, rows, through_b

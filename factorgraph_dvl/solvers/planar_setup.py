@@ -39,7 +39,7 @@ _MOSTLY_REJECTED = 0.5
 # Chosen: with few ranges the cost is a narrow valley around the beacon, along which whole steps
 # fail; what is left of it changes no weight.
 _ROUGHLY = 0.03
-_STEPS = 15
+_STEPS = 8
 
 
 @dataclass(frozen=True)

@@ -99,8 +99,7 @@ def test_the_log_by_hand_and_against_differences():
     chain = chain_of(setup_of(trial()).chain.frame)
     x = np.array([[0.0, 0.0, 3.0, 1.0], [6.0, 2.0, 3.0, 1.0]])
     motion = chain.motion(chain.attach(np.array([1.0])), chain.with_recorded(chain.node_time, x))
-    axes = frd_from_body("FRD")[:2]
-    log = LogVelocity(np.array([1.0]), np.zeros((1, 2)), np.ones((1, 2)), axes)
+    log = LogVelocity(np.array([1.0]), np.zeros((1, 2)), np.ones((1, 2)), "FRD")
     values = {
         "log_scale_error": np.array([0.1]),
         "heading_bias_deg": np.zeros(1),
