@@ -300,15 +300,14 @@ class PlanarChain:
         of_value, of_both, of_rate = variance_between(at.time - begin, span)[..., None]
         density = self.density[at.node]
         out = np.zeros_like(lin.residual)
-        d_p, d_v = (None if d is None else d[:, :, :2] @ density for d in (lin.d_p, lin.d_v))
         if lin.d_p is not None:
-            out += of_value * np.sum(d_p * lin.d_p[:, :, :2], axis=2)
+            out += of_value * _variance(lin.d_p, density, lin.d_p)
             out += (self.recorded.height_std * lin.d_p[:, :, 2]) ** 2
         if lin.d_v is not None:
-            out += of_rate * np.sum(d_v * lin.d_v[:, :, :2], axis=2)
+            out += of_rate * _variance(lin.d_v, density, lin.d_v)
             out += (self.recorded.climb_std * lin.d_v[:, :, 2]) ** 2
-            if lin.d_p is not None:
-                out += 2.0 * of_both * np.sum(d_p * lin.d_v[:, :, :2], axis=2)
+        if lin.d_p is not None and lin.d_v is not None:
+            out += 2.0 * of_both * _variance(lin.d_p, density, lin.d_v)
         if lin.d_theta is not None:
             out += (self.recorded.heading_std * (lin.d_theta @ self._down_b)) ** 2
         return out
@@ -476,3 +475,8 @@ class PlanarChain:
         if np.isfinite(self.start_std).all():
             return {MOTION: text, FIRST_STATE: f"{self.start_std[:2].max():.2g} m"}
         return {MOTION: text}
+
+
+def _variance(a: Array, density: Array, b: Array) -> Array:
+    """Return aᵀ Q b of derivatives (M, d, 3), in the plane, by densities (M, 2, 2), (M, d)."""
+    return np.asarray(np.sum((a[:, :, :2] @ density) * b[:, :, :2], axis=2))

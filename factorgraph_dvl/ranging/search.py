@@ -15,7 +15,7 @@ import numpy as np
 
 from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.rotations import BodyAxes, rotation_from_rph
-from factorgraph_dvl.geometry.vectors import Array, interpolate
+from factorgraph_dvl.geometry.vectors import Array, IntArray, interpolate
 from factorgraph_dvl.ranging.dead_reckoning import DeadReckoning
 from factorgraph_dvl.sensors.beacon import GATE
 
@@ -67,7 +67,7 @@ class RangingRows:
     rate_std: Array
     since: Array
 
-    def some(self, index: Array) -> RangingRows:
+    def some(self, index: IntArray) -> RangingRows:
         """Return some of the rows."""
         return RangingRows(*(getattr(self, name)[index] for name in self.__dataclass_fields__))
 

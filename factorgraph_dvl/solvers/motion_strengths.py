@@ -10,7 +10,6 @@ import numpy as np
 from scipy.linalg import solve_triangular
 
 from factorgraph_dvl.geometry.vectors import Array, IntArray
-from factorgraph_dvl.graph.chain import Chain
 from factorgraph_dvl.graph.priors import Tilt
 from factorgraph_dvl.graph.problem import Problem
 from factorgraph_dvl.graph.processes import Process
@@ -46,7 +45,7 @@ class Strengths:
 
     Parameters
     ----------
-    chain : Chain
+    chain : object
         With densities.
     factors : dict of str to ndarray
         By label, factors (d,) on stated white noise.
@@ -64,7 +63,7 @@ class Strengths:
         Whether all are about the same as before.
     """
 
-    chain: Chain
+    chain: Any
     factors: dict[str, Array]
     processes: tuple[Process, ...]
     tilt: Tilt | None

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from planar import ALL_CONSTANTS, evaluation_of, setup_of, trial, true_state
 
-from factorgraph_dvl.geometry.rotations import frd_from_body
 from factorgraph_dvl.graph import keys
 from factorgraph_dvl.graph.planar_chain import EARTH_RADIUS, PlanarChain, Recorded
 from factorgraph_dvl.sensors.protocol import Linearization
