@@ -120,8 +120,8 @@ class Between:
     ----------
     motion : Motion
         At M times.
-    by_nodes : ndarray, shape (M, 6, 8)
-        Derivatives of position and velocity in n by the nodes before and after.
+    by_nodes : ndarray, shape (M, 9, 8)
+        Derivatives of attitude, position and velocity by the nodes before and after.
     """
 
     motion: Motion
@@ -291,6 +291,11 @@ class PlanarChain:
         """Down in body axes, (3,)."""
         return frd_from_body(self.body_axes)[2]
 
+    @property
+    def _convergence(self) -> float:
+        """Angle by which meridians converge per metre to the east, rad/m."""
+        return float(np.tan(self.frame.lat)) / EARTH_RADIUS
+
     def missing(self, at: Attached, lin: Linearization) -> Array:
         """Return the variance (M, d) of what is predicted at attached times given the nodes.
 
@@ -347,12 +352,14 @@ class PlanarChain:
         of = self.recorded
         rate = np.interp(at.time, of.time, of.heading_rate)
         zero = np.zeros((at.time.size, 3))
-        by_nodes = np.zeros((at.time.size, 6, 8))
+        by_nodes = np.zeros((at.time.size, 9, 8))
         for axis in range(2):
-            by_nodes[:, axis, axis::2] = weights.T
-            by_nodes[:, 3 + axis, axis::2] = slopes.T
-        # The height over the tangent plane falls away from its origin.
-        by_nodes[:, 2] = -np.einsum("mi,mij->mj", p, by_nodes[:, :2]) / EARTH_RADIUS
+            by_nodes[:, 3 + axis, axis::2] = weights.T
+            by_nodes[:, 6 + axis, axis::2] = slopes.T
+        # North turns with the place, and the height over the tangent plane falls away. Measured:
+        # without the first, steps along the arc that ranges leave do not end.
+        by_nodes[:, :3] = -self._convergence * self._down_b[:, None] * by_nodes[:, 3:4]
+        by_nodes[:, 5] = -np.einsum("mi,mij->mj", p, by_nodes[:, 3:5]) / EARTH_RADIUS
         moving = Motion(
             nRb=nRb,
             p_n=p_n,
@@ -370,16 +377,15 @@ class PlanarChain:
         down = np.sum(p**2, axis=1) / (2.0 * EARTH_RADIUS)
         height = np.interp(time, of.time, of.height) - self.frame.height
         # North at a place east of the origin is not that of n: meridians converge.
-        converge = p[:, 0] / EARTH_RADIUS * np.tan(self.frame.lat)
         rph = np.zeros((len(x), 3))
-        rph[:, 2] = np.interp(time, of.time, of.heading) - converge
+        rph[:, 2] = np.interp(time, of.time, of.heading) - self._convergence * p[:, 0]
         climb = np.interp(time, of.time, of.climb)
         p_n = np.column_stack([p, height - down])
         return rotation_from_rph(rph, self.body_axes), p_n, np.column_stack([x[:, 2:], climb])
 
     def node_jacobian(self, lin: Linearization, transition: Between) -> Array:
         """Return the derivative of residuals by the variables of measurements, (M, d, 8)."""
-        return lin.by_motion[:, :, 3:9] @ transition.by_nodes
+        return lin.by_motion[:, :, :9] @ transition.by_nodes
 
     @cached_property
     def _step_rows(self) -> tuple[Array, Array]:
