@@ -10,6 +10,7 @@ from typing import ClassVar
 import gtsam
 import numpy as np
 
+from factorgraph_dvl.estimates import Trajectory
 from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.rotations import BodyAxes, frd_from_body, rotation_from_rph
 from factorgraph_dvl.geometry.vectors import Array, BoolArray, IntArray
@@ -20,7 +21,6 @@ from factorgraph_dvl.graph.smooth_motion import variance_between
 from factorgraph_dvl.graph.trajectory import epochs_between, reported
 from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.sensors.protocol import Linearization, Motion
-from factorgraph_dvl.solution import Trajectory
 
 # Source of noise of the prior of the motion, and of that of the first state.
 MOTION = "acceleration between states"
@@ -177,6 +177,11 @@ class PlanarChain:
     def duration(self) -> float:
         """How long the motion is known, s."""
         return float(self.node_time[-1] - self.node_time[0])
+
+    @property
+    def log_determinant(self) -> float:
+        """Log det of the covariance of the steps, but for what their length makes it."""
+        return 2.0 * float(np.linalg.slogdet(self.density)[1].sum())
 
     @property
     def middle(self) -> float:
@@ -356,7 +361,7 @@ class PlanarChain:
         for axis in range(2):
             by_nodes[:, 3 + axis, axis::2] = weights.T
             by_nodes[:, 6 + axis, axis::2] = slopes.T
-        # North turns with the place, and the height over the tangent plane falls away. Measured:
+        # North turns with the place, and the height over the tangent plane drops. Measured:
         # without the first, steps along the arc that ranges leave do not end.
         by_nodes[:, :3] = -self._convergence * self._down_b[:, None] * by_nodes[:, 3:4]
         by_nodes[:, 5] = -np.einsum("mi,mij->mj", p, by_nodes[:, 3:5]) / EARTH_RADIUS

@@ -32,7 +32,7 @@ from factorgraph_dvl.trial import InitialPosition, Trial
 
 # Chosen: values further apart, s, miss a whole turn of a vehicle.
 _SLOWEST_S = 60.0
-# Chosen: velocities closer than this, s, tell no more.
+# Chosen: velocities closer than this, s, show no more.
 _LEAST_INTERVAL = 0.2
 # Chosen: time over which the rate of climb is taken, s; between two depths it is noise.
 _SLOPE_OVER = 10.0

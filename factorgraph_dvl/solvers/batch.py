@@ -12,11 +12,11 @@ import numpy as np
 from factorgraph_dvl.errors import ConfigError
 from factorgraph_dvl.graph.priors import ConstantsPrior
 from factorgraph_dvl.graph.trajectory import TRAJECTORY_RATE
-from factorgraph_dvl.quality.refusal import accepted_errors, explained
-from factorgraph_dvl.quality.survey import survey
+from factorgraph_dvl.plausibility.survey import accepted_errors, explained, survey
+from factorgraph_dvl.quality.finding import Finding
+from factorgraph_dvl.quality.results import ambiguity
 from factorgraph_dvl.ranging.hypothesis_weights import significant_costs
-from factorgraph_dvl.sensors.finding import Finding
-from factorgraph_dvl.solution import Progress, Solution, ambiguity, joined, most_probable_minimum
+from factorgraph_dvl.solution import Progress, Solution
 from factorgraph_dvl.solvers.calibration import calibration
 from factorgraph_dvl.solvers.curved_posterior import points_along_arc
 from factorgraph_dvl.solvers.fixed_directions import (
@@ -31,6 +31,8 @@ from factorgraph_dvl.solvers.minima import (
     cost_terms,
     distinct,
     evidence_against,
+    joined,
+    most_probable_minimum,
 )
 from factorgraph_dvl.solvers.planar_preparation import PlanarPreparation, prepare_planar
 from factorgraph_dvl.solvers.planar_setup import Track
@@ -276,6 +278,7 @@ def _with_covariances(
     findings = (*findings, *settled.findings)
     free = copy(problem)
     solved = with_covariances(problem, before, minimise_again, findings=findings)
+    solved = replace(solved, steps=settled.steps)
     if before.converged or not solved.minimum.converged:
         return solved
     converged = settled.settled and undetermined_there(solved, free)

@@ -12,11 +12,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from factorgraph_dvl.estimates import Hypothesis
 from factorgraph_dvl.geometry.rotations import wrapped
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.ranging.hypothesis_weights import NEGLIGIBLE, hypothesis_costs
 from factorgraph_dvl.ranging.search import search
-from factorgraph_dvl.solution import Hypothesis
 from factorgraph_dvl.solvers.planar_setup import PlanarSetup, Track
 
 # Chosen: weight below which a hypothesis is dead: one in a thousand.

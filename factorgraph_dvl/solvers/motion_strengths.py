@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from scipy.linalg import solve_triangular
@@ -14,7 +13,8 @@ from factorgraph_dvl.graph.priors import Tilt
 from factorgraph_dvl.graph.problem import Problem
 from factorgraph_dvl.graph.processes import Process
 from factorgraph_dvl.graph.smooth_chain import SmoothChain
-from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, factorized
+from factorgraph_dvl.graph.smooth_motion import SmoothStates
+from factorgraph_dvl.solvers.levenberg_marquardt import Minimum
 from factorgraph_dvl.statistics.marginal_likelihood import log_determinant_gradient
 from factorgraph_dvl.statistics.variance_components import (
     VarianceComponents,
@@ -45,15 +45,15 @@ class Strengths:
 
     Parameters
     ----------
-    chain : object
+    chain : SmoothChain
         With densities.
     factors : dict of str to ndarray
         By label, factors (d,) on stated white noise.
     processes : tuple of Process
         With their deviations.
-    tilt : Tilt, optional
+    tilt : Tilt
         Gradient of the states' volume by the constants.
-    states : object
+    states : SmoothStates
         Of the nodes of this chain.
     values : dict of str to ndarray
         Of all parameters, processes in their new unit.
@@ -63,11 +63,11 @@ class Strengths:
         Whether all are about the same as before.
     """
 
-    chain: Any
+    chain: SmoothChain
     factors: dict[str, Array]
     processes: tuple[Process, ...]
-    tilt: Tilt | None
-    states: Any
+    tilt: Tilt
+    states: SmoothStates
     values: dict[str, Array]
     steps: dict[str, Array]
     same: bool
@@ -97,7 +97,8 @@ def motion_strengths(
     evaluation = problem.weighed(minimum.evaluation)
     # Nothing holds the constants in what follows.
     problem.tilt = None
-    information, step = factorized(problem, evaluation)
+    information = minimum.information
+    step = information.solution()
     found = variance_components(problem, evaluation, information)
     wanted = _wanted(problem, found, phase)
     steps = {

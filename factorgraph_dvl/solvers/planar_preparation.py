@@ -12,7 +12,7 @@ from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph.planar_chain import PlanarChain, PlanarStates
 from factorgraph_dvl.graph.problem import Problem
 from factorgraph_dvl.graph.processes import Process
-from factorgraph_dvl.sensors.finding import Finding
+from factorgraph_dvl.quality.finding import Finding
 from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.sensors.protocol import Observation
 from factorgraph_dvl.solution import Progress
@@ -97,19 +97,8 @@ class PlanarPreparation:
         """Return none: the current is constant."""
         return ()
 
-    def strengths(self, problem: Problem, minimum: Minimum, before: Strengths | None) -> Strengths:
-        """Return what is assumed: how smooth the motion is, its records say."""
-        at = minimum.evaluation
-        return Strengths(
-            problem.chain,
-            dict(problem.noise_factors),
-            (),
-            None,
-            at.states,
-            at.parameters,
-            {},
-            True,
-        )
+    def strengths(self, problem: Problem, minimum: Minimum, before: Strengths | None) -> None:
+        """Return None: how smooth the motion is, its records say."""
 
 
 def prepare_planar(trial: Trial, report: Progress) -> PlanarPreparation:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 
+from factorgraph_dvl.estimates import Trajectory
 from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.vectors import Array, interpolate
 from factorgraph_dvl.graph import keys
@@ -17,7 +18,7 @@ from factorgraph_dvl.ranging.dead_reckoning import DeadReckoning, dead_reckoned
 from factorgraph_dvl.ranging.search import RangingRows, ranging_rows
 from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.sensors.protocol import Observation
-from factorgraph_dvl.solution import Trajectory
+from factorgraph_dvl.solvers.fixed_directions import SolvedProblem
 from factorgraph_dvl.solvers.levenberg_marquardt import factorized, minimise
 from factorgraph_dvl.trial import Trial
 
@@ -283,6 +284,30 @@ def planar_setup(trial: Trial, frame: LocalFrame) -> PlanarSetup:
         o for aid in (track.log, track.beacons) for o in aid.observations(frame, trial.body_axes)
     )
     return PlanarSetup(trial, track, chain, observations, initial is not None)
+
+
+def planar_trajectory(found: SolvedProblem, chain: PlanarChain, rate_hz: float) -> Trajectory:
+    """Return the motion at a rate, with headings less their constant error.
+
+    Parameters
+    ----------
+    found : SolvedProblem
+        Of a planar chain, at its minimum.
+    chain : PlanarChain
+        Its chain.
+    rate_hz : float
+        Epochs in a second.
+    """
+    at, P = found.minimum.evaluation, found.covariances
+    out = chain.trajectory(at.states, P.nodes, chain.body_axes, rate_hz)
+    bias = chain.heading_bias
+    if bias not in found.problem.columns:
+        return out
+    rph, rph_cov = out.rph.copy(), out.rph_cov.copy()
+    rph[:, 2] = (rph[:, 2] - at.parameters[bias][0]) % (2.0 * np.pi)
+    root = found.problem.prior_root[found.problem.columns[bias]][0]
+    rph_cov[:, 2, 2] += root @ P.parameters @ root
+    return replace(out, rph=rph, rph_cov=rph_cov)
 
 
 def _same(a: Mapping[str, Array], b: Mapping[str, Array]) -> bool:

@@ -13,16 +13,16 @@ from typing import Any
 
 import numpy as np
 
+from factorgraph_dvl.estimates import Hypothesis
 from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.rotations import exp_so3
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph.planar_chain import PlanarChain
 from factorgraph_dvl.imu.preintegration import Segments
 from factorgraph_dvl.imu.propagation import States
+from factorgraph_dvl.message import message
+from factorgraph_dvl.quality.finding import Code, Finding
 from factorgraph_dvl.ranging.dead_reckoning import as_planar
-from factorgraph_dvl.sensors.finding import Code, Finding
-from factorgraph_dvl.sensors.message import message
-from factorgraph_dvl.solution import Hypothesis
 from factorgraph_dvl.solvers.hypotheses import follow, reported, schedule
 from factorgraph_dvl.solvers.planar_setup import PlanarSetup, Track, planar_setup
 from factorgraph_dvl.trial import InitialPosition, Trial

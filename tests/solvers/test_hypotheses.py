@@ -7,7 +7,7 @@ import pytest
 from findings import of_code
 from planar import STRAIGHT, error_of, trial, truth
 
-from factorgraph_dvl.sensors.finding import Code
+from factorgraph_dvl.quality.finding import Code
 from factorgraph_dvl.solvers.batch import solve
 
 

@@ -9,8 +9,8 @@ import pytest
 from planar import STRAIGHT, changed, setup_of, trial
 
 from factorgraph_dvl.errors import DataError, SolveError
-from factorgraph_dvl.quality.survey import survey
-from factorgraph_dvl.sensors.finding import Code
+from factorgraph_dvl.plausibility.survey import survey
+from factorgraph_dvl.quality.finding import Code
 from factorgraph_dvl.solvers.batch import solve
 
 SHORT = {"manoeuvres": [{"straight_s": 30}, {"turn_deg_s": 2, "duration_s": 30}]}
