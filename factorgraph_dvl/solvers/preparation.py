@@ -24,13 +24,13 @@ from factorgraph_dvl.initialization.in_motion_alignment import initial_states
 from factorgraph_dvl.initialization.mountings import mounted_aids, mountings_from_motion
 from factorgraph_dvl.quality.finding import Finding
 from factorgraph_dvl.quality.star_catalogue import star_catalogue_findings
-from factorgraph_dvl.ranging.position_from_ranges import StartPositions, positions_from_ranges
 from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.sensors.protocol import Observation
 from factorgraph_dvl.solution import Progress
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, minimise
 from factorgraph_dvl.solvers.motion_strengths import Strengths
 from factorgraph_dvl.solvers.outliers import robust_weights
+from factorgraph_dvl.solvers.position_from_ranges import StartPositions, positions_from_ranges
 from factorgraph_dvl.solvers.state_times import dense_epochs
 from factorgraph_dvl.trial import Trial
 
