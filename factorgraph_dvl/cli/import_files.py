@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from factorgraph_dvl.cli.console import ProgressLine, print_written, stdout, warn
+from factorgraph_dvl.cli.console import ProgressLine, print_table, print_written, stdout, warn
 from factorgraph_dvl.cli.options import Force, Quiet, claim_output
+
+if TYPE_CHECKING:
+    from factorgraph_dvl.files.importing.account import Account
+    from factorgraph_dvl.report.table import Table
 
 
 def import_(
@@ -58,6 +62,23 @@ def import_(
         )
     for line in decisions.lines:
         stdout().print(line, markup=False, highlight=False, soft_wrap=True)
+    for account in decisions.accounts:
+        print_table(_table(account))
+    for text in decisions.warnings:
+        warn(text)
     for text in decisions.missing:
         warn(f"missing: {text}")
     print_written(out)
+
+
+def _table(account: Account) -> Table:
+    from factorgraph_dvl.report.table import Table
+
+    table = Table(title=f"Records of {account.file}")
+    table.column("type")
+    table.column("read", numeric=True)
+    table.column("skipped", numeric=True)
+    table.column("reasons")
+    for kind, read, skipped, reasons in account.rows():
+        table.row(kind, str(read), str(skipped), reasons)
+    return table

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from factorgraph_dvl.files.formats.clocks import posix
 from factorgraph_dvl.files.formats.format import Batch, Format, Kind, empty, left_out
 from factorgraph_dvl.files.formats.framing import BLOCK, Records, Source, map_file, number
-from factorgraph_dvl.files.formats.losses import Frame, Losses, count_stretch
+from factorgraph_dvl.files.formats.losses import UNKNOWN_TYPE, Frame, Losses, count_stretch
 from factorgraph_dvl.files.formats.nmea import join, read_nmea, sentence_batches
 from factorgraph_dvl.files.formats.velocities import BEAM, EARTH, INSTRUMENT
 from factorgraph_dvl.geometry.units import DEG
@@ -132,6 +132,7 @@ def read_ad2cp(
     text: list[str] = []
     for family, kind, start, stop in frames(source, losses):
         if family == NUCLEUS:
+            losses.skip(f"packet 0x{kind:02X} of a Nucleus", UNKNOWN_TYPE)
             continue
         if kind == BOTTOM:
             pings.append((start, source[start:stop]))
@@ -141,7 +142,9 @@ def read_ad2cp(
                 dvl.append((start, kind, record))
             else:
                 losses.add(_IMPOSSIBLE, start)
-        elif kind == TEXT:
+        elif kind != TEXT:
+            losses.skip(f"record 0x{kind:02X}", UNKNOWN_TYPE)
+        else:
             text.append(source[start + 1 : stop].rstrip(b"\0").decode("latin-1"))
         if len(pings) + len(dvl) + len(text) >= block:
             yield Ad2cp(_bottom_track(pings, losses), tracks(dvl), tuple(text))
@@ -436,7 +439,8 @@ def read(path: Path, mapping: Mapping[str, Any] | None = None) -> Iterator[Batch
         nmea = join(read_nmea(sentences))
         stamps = np.concatenate([block.bottom["time"], block.tracks["time"]])
         stamps = stamps[np.isfinite(stamps)]
-        yield from sentence_batches(nmea, float(np.median(stamps)) if len(stamps) else None)
+        near = float(np.median(stamps)) if len(stamps) else None
+        yield from sentence_batches(nmea, near, losses)
     yield left_out(losses)
 
 

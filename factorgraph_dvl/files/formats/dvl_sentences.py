@@ -37,6 +37,8 @@ from factorgraph_dvl.geometry.units import DEG
 Row = dict[str, object]
 # Fields of the two sentences of Cerulean.
 _INCREMENT, _EXTENDED = 9, 34
+_NORTEK = b"PNORBT[016789]?"
+_CERULEAN = b"DVPD[LX]|DVEXT"
 
 
 def read_nortek(
@@ -61,7 +63,7 @@ def read_nortek(
     """
     losses = Losses() if losses is None else losses
     rows: list[Row] = []
-    for sentence in sentences(source, b"PNORBT[016789]?"):
+    for sentence in sentences(source, _NORTEK):
         # With tags, in the same order: `NAME=value`.
         fields = [field.rpartition(b"=")[2] for field in sentence.fields]
         name = sentence.address[6:]
@@ -140,7 +142,7 @@ def read_cerulean(
     increments: list[Row] = []
     extended: list[Row] = []
     elapsed = 0.0
-    for sentence in sentences(source, b"DVPD[LX]|DVEXT"):
+    for sentence in sentences(source, _CERULEAN):
         if len(sentence.fields) < (_EXTENDED if sentence.address == b"DVEXT" else _INCREMENT):
             losses.add(NOT_USABLE, sentence.at)
             continue
@@ -220,6 +222,7 @@ FORMATS = (
         partial(read_pings, read_nortek, "own", ""),
         "published sentences",
         in_text=True,
+        addresses=_NORTEK,
     ),
     Format(
         "cerulean",
@@ -229,5 +232,6 @@ FORMATS = (
         _read_cerulean,
         "files written after the document",
         in_text=True,
+        addresses=_CERULEAN,
     ),
 )

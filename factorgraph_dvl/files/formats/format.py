@@ -11,7 +11,11 @@ To add a format, write a module in this package that has
 
 and put it into the table of `catalogue.py`. From there `import` knows it. What a reader decides
 (a sign, an axis, a unit) it says in `Batch.notes`, one sentence each: they go to `import.log`.
-What it leaves out because it is damaged it counts in `Losses`, which its last batch has.
+No record is lost in silence. What a reader leaves out it counts in `Losses`, which its last batch
+has: damage, whole records by type with the reason, and types that it does not read. Records that
+the instrument's own status calls invalid stay in the batch, which says so in `valid`: only the
+whole file shows whether the instrument ever sets that status. Records of a batch without a time
+or a value are counted for all readers alike (`faults`).
 A third-party library is imported inside `read`, and named with its extra in `Format`.
 
 Records of all kinds have `at`, their position in the file; `time`, on the clock that the batch
@@ -28,9 +32,10 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from factorgraph_dvl.files.formats.framing import Records
-from factorgraph_dvl.files.formats.losses import Losses
+from factorgraph_dvl.files.formats.losses import NO_LOCK, NO_TIME, NO_VALUE, Losses
 from factorgraph_dvl.geometry.rotations import BodyAxes
 from factorgraph_dvl.geometry.vectors import Array
 
@@ -116,6 +121,10 @@ KINDS: dict[Kind, np.dtype[Any]] = {
 }
 
 
+# The field without which a record of a kind says nothing.
+_VALUE: dict[Kind, str] = {"fix": "lat", "ins": "lat", "course": "speed", "depth": "depth"}
+
+
 @dataclass(frozen=True)
 class Batch:
     """Consecutive records of one kind.
@@ -141,6 +150,8 @@ class Batch:
     directions : tuple of tuple of float, optional
         Outward directions of the beams (4, 3) in instrument axes, where the file has them and
         `beam_angle` does not say them.
+    valid : ndarray of bool, shape (N,), optional
+        What the status of the instrument says of each record.
     """
 
     kind: Kind
@@ -152,6 +163,17 @@ class Batch:
     notes: tuple[str, ...] = ()
     losses: Losses | None = None
     directions: tuple[tuple[float, ...], ...] = ()
+    valid: NDArray[np.bool_] | None = None
+
+    @property
+    def type(self) -> str:
+        """Name of the type of its records, as `Losses` has it."""
+        return type_name(self.kind, self.stream)
+
+
+def type_name(kind: Kind, stream: str = "") -> str:
+    """Return the name of a type of records for people."""
+    return f"{stream} ({kind})" if stream else kind
 
 
 Reader = Callable[[Path, Mapping[str, Any] | None], Iterator[Batch]]
@@ -181,6 +203,8 @@ class Format:
         Usual endings of names, lower case with dot; they decide between equal shares only.
     in_text : bool, optional
         Whether its records may stand in one text file with those of other such formats.
+    addresses : bytes, optional
+        Regular expression of the addresses of sentences that it reads.
     module, extra : str, optional
         Third-party module that reading needs, and the extra that installs it.
     limit : str, optional
@@ -195,6 +219,7 @@ class Format:
     verified: str
     endings: tuple[str, ...] = ()
     in_text: bool = False
+    addresses: bytes = b""
     module: str = ""
     extra: str = ""
     limit: str = ""
@@ -203,6 +228,23 @@ class Format:
 def positive(values: Array) -> Array:
     """Return values above 0, and nan in place of others, which stand for what is not known."""
     return np.where(values > 0.0, values, np.nan)
+
+
+def faults(batch: Batch) -> dict[str, NDArray[np.bool_]]:
+    """Return which records (N,) of a batch cannot be used, by the reason, each for one reason."""
+    records = batch.records
+    timeless = np.isnan(records["time"]) & np.isnan(records["received"])
+    valueless, reason = np.zeros(len(records), bool), NO_VALUE
+    if batch.kind in ("dvl", "water"):
+        along = np.isfinite(records["beams"]).any(axis=1) & (records["axes"] == 0)
+        valueless, reason = ~np.isfinite(records["velocity"]).all(axis=1) & ~along, NO_LOCK
+    elif batch.kind == "imu":
+        valueless = ~(np.isfinite(records["gyro"]) & np.isfinite(records["accel"])).all(axis=1)
+    elif batch.kind == "attitude":
+        valueless = np.isnan(records["roll"]) & np.isnan(records["heading"])
+    elif (name := _VALUE.get(batch.kind)) is not None:
+        valueless = np.isnan(records[name])
+    return {NO_TIME: timeless, reason: valueless & ~timeless}
 
 
 def left_out(losses: Losses) -> Batch:

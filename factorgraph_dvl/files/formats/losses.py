@@ -1,4 +1,4 @@
-"""What a reader left out of a damaged file: how much, of what, from where on."""
+"""What a reader left out of a file: damage, from where on, and records by type with the reason."""
 
 from __future__ import annotations
 
@@ -11,6 +11,13 @@ from factorgraph_dvl.files.formats.framing import Bytes, Index, Source, as_bytes
 
 _WRONG = "{} with a wrong checksum"
 _BYTES = "byte outside records"
+# Why a whole record is skipped. A type that no reader here knows is no fault of the file.
+UNKNOWN_TYPE = "type not read"
+NO_FIX = "no fix"
+NO_LOCK = "no lock"
+NO_VALUE = "no value"
+NO_TIME = "no time"
+STATUS = "status"
 
 
 @dataclass
@@ -20,13 +27,31 @@ class Losses:
     Parameters
     ----------
     counts : dict of str to int
-        By what it is, in the singular, its noun first.
+        Damage, by what it is, in the singular, its noun first.
     first : int or None
-        Position of the first in the file.
+        Position of the first damage in the file.
+    used : dict of str to int
+        Whole records by type that were read and stand in no batch of their own, as those that
+        date others.
+    skipped : dict of str to dict of str to int
+        Whole records that stand in no batch: by type, then by the reason.
     """
 
     counts: dict[str, int] = field(default_factory=dict)
     first: int | None = None
+    used: dict[str, int] = field(default_factory=dict)
+    skipped: dict[str, dict[str, int]] = field(default_factory=dict)
+
+    def use(self, kind: str, count: int = 1) -> None:
+        """Count whole records of a type that were read for the sake of others."""
+        if count:
+            self.used[kind] = self.used.get(kind, 0) + count
+
+    def skip(self, kind: str, reason: str, count: int = 1) -> None:
+        """Count whole records of a type that were skipped; nothing if `count` is 0."""
+        if count:
+            reasons = self.skipped.setdefault(kind, {})
+            reasons[reason] = reasons.get(reason, 0) + count
 
     def add(self, what: str, at: int, count: int = 1) -> None:
         """Count what was left out at a position of the file; nothing if `count` is 0."""
@@ -38,6 +63,11 @@ class Losses:
         """Add the counts of another one, of the same file."""
         for what, count in other.counts.items():
             self.add(what, other.first or 0, count)
+        for kind, count in other.used.items():
+            self.use(kind, count)
+        for kind, reasons in other.skipped.items():
+            for reason, count in reasons.items():
+                self.skip(kind, reason, count)
 
     def __str__(self) -> str:
         """Return a phrase such as `2 rows without a time, the first at byte 3,400`."""

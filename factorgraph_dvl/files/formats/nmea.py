@@ -28,9 +28,10 @@ from factorgraph_dvl.files.formats.format import (
     HeadingReference,
     empty,
     left_out,
+    type_name,
 )
 from factorgraph_dvl.files.formats.framing import BLOCK_OF_LINES, Records, Source, map_file, number
-from factorgraph_dvl.files.formats.losses import Losses
+from factorgraph_dvl.files.formats.losses import NO_FIX, NO_VALUE, UNKNOWN_TYPE, Losses
 from factorgraph_dvl.files.formats.sentences import NOT_USABLE, Sentence, sentences
 from factorgraph_dvl.geometry.units import DEG, KNOT
 from factorgraph_dvl.geometry.vectors import Array
@@ -93,7 +94,9 @@ def read_nmea(
         kind, row = decode(sentence)
         if row is None:
             # $PASHR has other forms, whose fields are others.
-            if kind in KINDS and kind != "PASHR":
+            if kind == "PASHR":
+                losses.skip(_OTHER_PASHR, UNKNOWN_TYPE)
+            elif kind in KINDS:
                 losses.add(NOT_USABLE, sentence.at)
             continue
         head = (sentence.at, sentence.received, sentence.checked, sentence.address[:2])
@@ -261,7 +264,8 @@ Sentences = dict[str, Records]
 # GGA: 0 no fix, 6 dead reckoning, 7 typed in, 8 simulated.
 _MEASURED = (1, 2, 3, 4, 5, 9)
 _NO_FIX = "GGA of quality 0, 6, 7 or 8 is no measurement: left out"
-_UNCHECKED = "sentence without the checksum that others in the file have"
+UNCHECKED = "sentence without the checksum that others in the file have"
+_OTHER_PASHR = "PASHR of another form"
 _UNTIMED = "sentences without a time have that of the sentence with a time before them"
 # Chosen: sentences with a time that wait for others of their burst; more are left of lost ones.
 _WAITING = 2
@@ -287,16 +291,16 @@ def read(path: Path, mapping: Mapping[str, Any] | None = None) -> Iterator[Batch
         if checked:
             for part in block.values():
                 lost = part["at"][~part["checked"]]
-                losses.add(_UNCHECKED, int(lost[0]) if len(lost) else 0, len(lost))
+                losses.add(UNCHECKED, int(lost[0]) if len(lost) else 0, len(lost))
             block = {kind: part[part["checked"]] for kind, part in block.items()}
-        for batch in sentence_batches(block, near):
+        for batch in sentence_batches(block, near, losses):
             if batch.clock == "utc" and len(batch.records):
                 near = float(batch.records["time"][-1])
             yield batch
     yield left_out(losses)
 
 
-def sentence_batches(block: Sentences, near: float | None) -> Iterator[Batch]:
+def sentence_batches(block: Sentences, near: float | None, losses: Losses) -> Iterator[Batch]:
     """Convert sentences.
 
     Parameters
@@ -306,18 +310,22 @@ def sentence_batches(block: Sentences, near: float | None) -> Iterator[Batch]:
     near : float or None, s
         Some time within half a day of sentences that have neither a date nor a time of
         reception; None if there is none.
+    losses : Losses
+        Takes counts of sentences without a fix or a speed, and of those that complete others.
 
     Yields
     ------
     Batch
     """
+    for kind in ("ZDA", "GST"):
+        losses.use(kind, len(block[kind]))
     times = {kind: _times(block, kind, near) for kind in ("GGA", "RMC", "ZDA", "PASHR")}
     clock: Clock = "utc"
     if not any(np.isfinite(time).any() for time in times.values()):
         clock = "day"
         times = {kind: np.array(block[kind]["second"]) for kind in times}
-    yield from _fixes(block, times, clock)
-    yield from _courses(block, times, clock)
+    yield from _fixes(block, times, clock, losses)
+    yield from _courses(block, times, clock, losses)
     yield from _attitudes(block, times, clock)
     yield from _clocks(block, times, clock)
 
@@ -372,7 +380,9 @@ def _in_turn(received: Array, time: Array, arrived: Array) -> Array:
     return out
 
 
-def _fixes(block: Sentences, times: Mapping[str, Array], clock: Clock) -> Iterator[Batch]:
+def _fixes(
+    block: Sentences, times: Mapping[str, Array], clock: Clock, losses: Losses
+) -> Iterator[Batch]:
     gga, rmc, gst = block["GGA"], block["RMC"], block["GST"]
     if len(gga):
         out = empty("fix", len(gga))
@@ -390,8 +400,10 @@ def _fixes(block: Sentences, times: Mapping[str, Array], clock: Clock) -> Iterat
             out["std"] = np.where(same[:, None], std, np.nan)
         measured = np.isin(out["quality"], _MEASURED) & np.isfinite(out["lat"])
         more = () if measured.all() else (_NO_FIX,)
+        losses.skip(type_name("fix", "GGA"), NO_FIX, int((~measured).sum()))
         yield Batch("fix", out[measured], clock, "GGA", notes=more)
     valid = (rmc["valid"] > 0.0) & np.isfinite(rmc["lat"])
+    losses.skip(type_name("fix", "RMC"), NO_FIX, int((~valid).sum()))
     if valid.any():
         out = empty("fix", len(rmc))
         for name in ("at", "received", "lat", "lon"):
@@ -400,7 +412,9 @@ def _fixes(block: Sentences, times: Mapping[str, Array], clock: Clock) -> Iterat
         yield Batch("fix", out[valid], clock, "RMC")
 
 
-def _courses(block: Sentences, times: Mapping[str, Array], clock: Clock) -> Iterator[Batch]:
+def _courses(
+    block: Sentences, times: Mapping[str, Array], clock: Clock, losses: Losses
+) -> Iterator[Batch]:
     for kind in ("RMC", "VTG"):
         part = block[kind]
         out = empty("course", len(part))
@@ -412,6 +426,7 @@ def _courses(block: Sentences, times: Mapping[str, Array], clock: Clock) -> Iter
             out["time"] = _at_same_time(block, kind, times)
         more = () if kind == "RMC" else (_UNTIMED,)
         good = np.isfinite(out["speed"])
+        losses.skip(type_name("course", kind), NO_VALUE, int((~good).sum()))
         if good.any():
             yield Batch("course", out[good], clock, kind, notes=more)
 
@@ -459,5 +474,6 @@ FORMATS = (
         "pynmeagps, published sentences",
         (".nmea", ".txt", ".log", ".n1r", ".n2r", ".nms"),
         in_text=True,
+        addresses=ADDRESSES,
     ),
 )

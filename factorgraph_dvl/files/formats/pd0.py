@@ -19,7 +19,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factorgraph_dvl.files.formats.clocks import posix
-from factorgraph_dvl.files.formats.format import Batch, Clock, Format, Kind, empty, left_out
+from factorgraph_dvl.files.formats.format import (
+    Batch,
+    Clock,
+    Format,
+    Kind,
+    empty,
+    left_out,
+    type_name,
+)
 from factorgraph_dvl.files.formats.framing import (
     Bytes,
     Index,
@@ -30,7 +38,7 @@ from factorgraph_dvl.files.formats.framing import (
     summed_frames,
     u16,
 )
-from factorgraph_dvl.files.formats.losses import Losses, count_outside, summed
+from factorgraph_dvl.files.formats.losses import NO_FIX, Losses, count_outside, summed
 from factorgraph_dvl.files.formats.nmea import sentence_batches
 from factorgraph_dvl.files.formats.pd0_navigation import VMDAS, embedded_sentences, vmdas_fixes
 from factorgraph_dvl.files.formats.velocities import BEAM
@@ -351,11 +359,11 @@ def read(path: Path, mapping: Mapping[str, Any] | None = None) -> Iterator[Batch
     """Read a file; the parameters and the result are those of `Format.read`."""
     losses = Losses()
     for block in read_pd0(map_file(path), losses):
-        yield from _batches(block)
+        yield from _batches(block, losses)
     yield left_out(losses)
 
 
-def _batches(block: Block) -> Iterator[Batch]:
+def _batches(block: Block, losses: Losses) -> Iterator[Batch]:
     pings, vmdas = block.pings, block.vmdas
     times: Array = pings["time"]
     clock: Clock = "own"
@@ -390,9 +398,9 @@ def _batches(block: Block) -> Iterator[Batch]:
         _about_heading(pings),
     )
     if len(vmdas):
-        yield from _fixes_of_vmdas(vmdas)
+        yield from _fixes_of_vmdas(vmdas, losses)
     yield from sentence_batches(
-        block.nmea, near=float(np.nanmedian(times)) if _any(times) else None
+        block.nmea, float(np.nanmedian(times)) if _any(times) else None, losses
     )
 
 
@@ -453,7 +461,7 @@ def _times_of_vmdas(pings: Records, vmdas: Records) -> Array:
     return time
 
 
-def _fixes_of_vmdas(vmdas: Records) -> Iterator[Batch]:
+def _fixes_of_vmdas(vmdas: Records, losses: Losses) -> Iterator[Batch]:
     parts = []
     for which in ("first", "last"):
         out = empty("fix", len(vmdas))
@@ -463,6 +471,7 @@ def _fixes_of_vmdas(vmdas: Records) -> Iterator[Batch]:
     # Alternating, as they were measured.
     fixes = np.stack(parts, axis=1).reshape(-1)
     good = np.isfinite(fixes["lat"]) & np.isfinite(fixes["time"])
+    losses.skip(type_name("fix", "VmDas"), NO_FIX, int((~good).sum()))
     yield Batch("fix", fixes[good], "utc", "VmDas", notes=(_HEIGHT,))
 
 

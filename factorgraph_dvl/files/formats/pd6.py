@@ -16,7 +16,7 @@ import numpy as np
 from factorgraph_dvl.files.formats.clocks import posix
 from factorgraph_dvl.files.formats.format import Format, positive
 from factorgraph_dvl.files.formats.framing import BLOCK, Records, Source, lines, number
-from factorgraph_dvl.files.formats.losses import Losses
+from factorgraph_dvl.files.formats.losses import UNKNOWN_TYPE, Losses
 from factorgraph_dvl.files.formats.velocities import (
     EARTH,
     INSTRUMENT,
@@ -32,6 +32,7 @@ from factorgraph_dvl.geometry.units import DEG
 _AXES = {b":BI": INSTRUMENT, b":BS": SHIP, b":BE": EARTH}
 _FIELDS = {b":SA": 3, b":TS": 5, b":RA": 5, b":BI": 5, b":BS": 4, b":BE": 4, b":BD": 5}
 _LINE = re.compile(rb"(:SA|:TS|:RA|:BI|:BS|:BE|:BD),([^:]*)")
+_OTHER = re.compile(rb"(:[A-Z]{2}),")
 _BAD = -32768.0
 
 
@@ -63,6 +64,8 @@ def read_pd6(
         # A prompt or a time may stand before the line.
         match = _LINE.search(line)
         if match is None:
+            if other := _OTHER.search(line):
+                losses.skip(other[1].decode(), UNKNOWN_TYPE)
             continue
         start, name, fields = match.start(), match[1], match[2].strip().split(b",")
         if len(fields) < _FIELDS[name]:
@@ -78,9 +81,12 @@ def read_pd6(
             ping["at"] = at + start
             for angle, field in zip(("pitch", "roll", "heading"), fields, strict=False):
                 ping[angle] = number(field) * DEG
-        elif ping is None:
             continue
-        elif name in _AXES:
+        if ping is None:
+            losses.skip(name.decode(), "before the first ensemble")
+            continue
+        losses.use(name.decode())
+        if name in _AXES:
             if _AXES[name] < best:
                 best = _velocity(ping, name, fields)
         else:

@@ -9,11 +9,13 @@ from typing import Any
 import numpy as np
 
 from factorgraph_dvl.files.formats.clocks import nearest_day
-from factorgraph_dvl.files.formats.format import Batch, Clock, Format, empty
+from factorgraph_dvl.files.formats.format import Batch, Clock, Format, empty, left_out
 from factorgraph_dvl.files.formats.framing import Records, map_file
-from factorgraph_dvl.files.formats.nmea import KINDS, read_nmea, utc
+from factorgraph_dvl.files.formats.losses import Losses
+from factorgraph_dvl.files.formats.nmea import KINDS, UNCHECKED, read_nmea, utc
 from factorgraph_dvl.files.formats.sentences import sentences
 
+_OF_BURST = ("ATITUD", "POSITI", "SPEED_", "STDHRP", "STDPOS", "STDSPD", "TIME__")
 # A sentence besides its fields: `$`, commas, checksum, line end.
 _FRAME = 7
 _PITCH = (
@@ -34,10 +36,18 @@ def share(path: Path, sample: bytes) -> float:
 
 def read(path: Path, mapping: Mapping[str, Any] | None = None) -> Iterator[Batch]:
     """Read a file; the parameters and the result are those of `Format.read`."""
+    losses = Losses()
     for block in read_nmea(map_file(path)):
+        for kind in _OF_BURST:
+            part = block[kind]
+            unchecked = part["at"][~part["checked"]]
+            losses.add(UNCHECKED, int(unchecked[0]) if len(unchecked) else 0, len(unchecked))
+            if kind != "ATITUD":
+                losses.use(f"PIXSE {kind}", int(part["checked"].sum()))
         block = {kind: part[part["checked"]] for kind, part in block.items()}
         if len(block["ATITUD"]):
             yield _batch(block)
+    yield left_out(losses)
 
 
 def _batch(block: dict[str, Records]) -> Batch:
@@ -105,5 +115,6 @@ FORMATS = (
         read,
         "a published burst with its checksums; the sign of its pitch is not verified",
         in_text=True,
+        addresses=b"PIXSE",
     ),
 )

@@ -17,7 +17,7 @@ import numpy as np
 from factorgraph_dvl.files.formats.clocks import posix
 from factorgraph_dvl.files.formats.format import Batch, Format, left_out
 from factorgraph_dvl.files.formats.framing import BLOCK, Records, Source, map_file
-from factorgraph_dvl.files.formats.losses import Frame, Losses, count_stretch
+from factorgraph_dvl.files.formats.losses import UNKNOWN_TYPE, Frame, Losses, count_stretch
 from factorgraph_dvl.files.formats.nmea import KINDS, read_nmea, sentence_batches
 from factorgraph_dvl.files.formats.velocities import (
     BEAM,
@@ -65,14 +65,17 @@ def read_rowe(
     """
     pings: list[Records] = []
     nmea: dict[str, list[Records]] = {name: [] for name in KINDS}
-    for at, payload in _ensembles(source, Losses() if losses is None else losses):
+    losses = Losses() if losses is None else losses
+    for at, payload in _ensembles(source, losses):
         sets = dict(_data_sets(payload))
         time = _time(sets.get("E000008", b""))
         ping = _bottom_track(sets.get("E000010", b""))
         if ping is not None:
             ping["at"], ping["time"] = at, time
             pings.append(ping)
-        for part in read_nmea(sets.get("E000011", b"")):
+        else:
+            losses.skip("ensemble without bottom track", UNKNOWN_TYPE)
+        for part in read_nmea(sets.get("E000011", b""), losses=losses):
             for name, records in part.items():
                 records["at"] += at
                 records["received"] = time
@@ -174,7 +177,7 @@ def _read_rowe(path: Path, mapping: Mapping[str, Any] | None = None) -> Iterator
             near = float(np.nanmedian(velocities["time"]))
             yield pings(velocities, "own", "", "")
             yield from attitude(velocities, "own")
-        yield from sentence_batches(nmea, near)
+        yield from sentence_batches(nmea, near, losses)
     yield left_out(losses)
 
 

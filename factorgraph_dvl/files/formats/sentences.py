@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Iterator, Sequence
 from datetime import UTC, datetime, timedelta
 from typing import NamedTuple
 
@@ -12,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factorgraph_dvl.files.formats.framing import WINDOW, Bytes, Index, Source, as_bytes
-from factorgraph_dvl.files.formats.losses import Losses
+from factorgraph_dvl.files.formats.losses import UNKNOWN_TYPE, Losses
 
 NOT_USABLE = "sentence with too few fields"
 # As in the pattern below, with the address.
@@ -23,6 +24,8 @@ _DATE = re.compile(
 )
 _YEARDAY = re.compile(rb"(\d{4}):(\d{3}):(\d{2}):(\d{2}):(\d{2})(\.\d{1,9})?")
 _UNIX = re.compile(rb"(?<![\d.])(1\d{9})(\d{3})?(\.\d{1,9})?(?!\d)")
+
+_SENTENCE = re.compile(rb"\$([A-Z][A-Z0-9]{3,9}),[ -#%-)+-~]{0,512}\*[0-9A-Fa-f]{2}")
 
 
 def _among(characters: bytes) -> NDArray[np.bool_]:
@@ -129,21 +132,25 @@ def _received(prefix: bytes) -> float:
     return math.nan
 
 
-def text_losses(source: Source) -> Losses:
-    """Count the damage of a text file that has sentences, of whatever address.
+def text_losses(source: Source, addresses: Sequence[bytes] = ()) -> Losses:
+    """Count the damage of a text file that has sentences, and sentences that no reader knows.
 
     Parameters
     ----------
     source : Source
         The file.
+    addresses : sequence of bytes, optional
+        Regular expressions of the addresses that readers know, empty where one reads none.
 
     Returns
     -------
     Losses
         Sentences whose checksum is wrong, such without their start or their end, and bytes that
-        are no text.
+        are no text; sentences of other addresses by their type.
     """
     losses = Losses()
+    known = [re.compile(pattern) for pattern in addresses if pattern]
+    others: Counter[bytes] = Counter()
     for begin in range(0, len(source), WINDOW):
         lead = min(begin, LONGEST)
         data = as_bytes(source, begin - lead, begin + WINDOW + LONGEST)
@@ -157,7 +164,19 @@ def text_losses(source: Source) -> Losses:
             inside = places[(places >= here.start) & (places < here.stop)]
             if len(inside):
                 losses.add(what, begin - lead + int(inside[0]), len(inside))
+        others.update(_addresses(source, begin))
+    for address, count in others.items():
+        if not any(pattern.fullmatch(address) for pattern in known):
+            losses.skip(address.decode("latin-1"), UNKNOWN_TYPE, count)
     return losses
+
+
+def _addresses(source: Source, begin: int) -> Iterator[bytes]:
+    """Yield the addresses of the sentences that start in a window, whole ones by their look."""
+    for match in _SENTENCE.finditer(source[begin : begin + WINDOW + LONGEST]):
+        if match.start() >= WINDOW:
+            break
+        yield match[1]
 
 
 def _damaged(data: Bytes) -> Iterator[tuple[str, Index]]:

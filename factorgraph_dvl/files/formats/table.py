@@ -34,6 +34,7 @@ from factorgraph_dvl.settings.convert import from_plain
 _BLOCK = 1 << 23
 # Line ends of text, of which a block ends with one; a longer line is no line of a table.
 _LONGEST_LINE = 1 << 20
+_TRUE = (b"true", b"yes", b"y", b"t")
 _OTHER_CELLS = "row with another number of cells"
 _SEPARATORS = {",": b",", ";": b";", "tab": b"\t", "space": b" "}
 
@@ -97,7 +98,8 @@ def _batches(path: Path, table: TableMapping) -> Iterator[Batch]:
         out["received"] = out["time"]
 
         def column(name: ColumnName, rows: pa.Table = rows) -> Array:
-            return _numbers(rows.column(place[name]))
+            cells = rows.column(place[name])
+            return _flags(cells) if name == table.valid else _numbers(cells)
 
         fill(out, table, column)
         yield Batch(
@@ -267,6 +269,12 @@ def _numbers(cells: pa.ChunkedArray) -> Array:
     except pa.ArrowInvalid:
         values = np.array([number(cell.strip()) for cell in cells.to_pylist()])
     return np.where(np.isfinite(values), values, np.nan)
+
+
+def _flags(cells: pa.ChunkedArray) -> Array:
+    """Return cells as numbers (N,), 1 for those that say `true` in a word."""
+    words = np.array([cell.strip(b' "\r').lower() in _TRUE for cell in cells.to_pylist()], bool)
+    return np.where(words, 1.0, _numbers(cells))
 
 
 def _times(table: TableMapping, cells: list[pa.ChunkedArray]) -> Array:

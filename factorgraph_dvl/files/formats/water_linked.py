@@ -18,7 +18,7 @@ import numpy as np
 
 from factorgraph_dvl.files.formats.format import Batch, Format, left_out, positive
 from factorgraph_dvl.files.formats.framing import BLOCK, Records, Source, lines, map_file, number
-from factorgraph_dvl.files.formats.losses import Losses
+from factorgraph_dvl.files.formats.losses import UNKNOWN_TYPE, Losses
 from factorgraph_dvl.files.formats.velocities import (
     INSTRUMENT,
     pings,
@@ -32,6 +32,10 @@ POSITION = np.dtype(
     + [(name, "f8") for name in ("roll", "pitch", "yaw")]
 )
 _SERIAL = re.compile(rb"w(r[zxup]),([ -)+-~]{1,400})\*([0-9a-f]{2})")
+_UNUSABLE = "too few fields, or no report before it"
+_BRACE = re.compile(rb"[{}]")
+# Bytes of a report on several lines. Chosen: some times what one has.
+_LONGEST_REPORT = 1 << 14
 Row = dict[str, Any]
 
 
@@ -59,7 +63,7 @@ def read_water_linked(
     velocities: list[Row] = []
     positions: list[tuple[float, ...]] = []
     elapsed = 0.0
-    for at, line in lines(source):
+    for at, line in _reports(source):
         row: Row | None = None
         start = line.find(b"{")
         if start >= 0:
@@ -68,8 +72,11 @@ def read_water_linked(
                 losses.add("line of damaged JSON", at + start)
             if message.get("type") == "position_local":
                 positions.append((at + start, *_json_position(message)))
+                losses.skip("position_local", UNKNOWN_TYPE)
             elif "vx" in message and "velocity_valid" in message:
                 row = _json_velocity(message)
+            elif message:
+                losses.skip(str(message.get("type", "other JSON"))[:40], UNKNOWN_TYPE)
         elif match := _SERIAL.search(line):
             start = match.start()
             if crc8(line[start : match.end() - 3]) != int(match[3], 16):
@@ -78,12 +85,16 @@ def read_water_linked(
             fields = match[2].split(b",")
             if match[1] == b"rp" and len(fields) >= 9:
                 positions.append((at + start, *_serial_position(fields)))
+                losses.skip("wrp", UNKNOWN_TYPE)
             elif match[1] == b"ru" and len(fields) >= 3 and velocities:
                 _serial_beam(velocities[-1], fields)
+                losses.use("wru")
             elif match[1] == b"rz" and len(fields) >= 11:
                 row = _serial_velocity(fields)
             elif match[1] == b"rx" and len(fields) >= 8:
                 row = _old_velocity(fields)
+            else:
+                losses.skip("w" + match[1].decode(), _UNUSABLE)
         if row is not None:
             step = row.pop("step")
             elapsed += step if 0.0 <= step < 3600.0 else 0.0
@@ -92,6 +103,40 @@ def read_water_linked(
                 velocities, positions = [], []
             velocities.append({**row, "at": at + start, "second": elapsed})
     yield _blocks(velocities, positions)
+
+
+def _reports(source: Source) -> Iterator[tuple[int, bytes]]:
+    """Yield lines, and objects that stand on several lines, as the maker's tools write them.
+
+    Such an object begins with a brace that ends its line; a brace as far to the left begins the
+    next one, whatever became of this one.
+    """
+    begin, depth, margin, gathered = 0, 0, 0, b""
+    for at, line in lines(source):
+        if not depth and not line.rstrip().endswith(b"{"):
+            yield at, line
+            continue
+        start, indent = 0, len(line) - len(line.lstrip())
+        if depth and indent <= margin and line.lstrip().startswith(b"{"):
+            yield begin, gathered
+            depth = 0
+        for brace in _BRACE.finditer(line):
+            if brace[0] == b"{":
+                if not depth:
+                    start, margin, gathered = brace.start(), indent, b""
+                    begin = at + start
+                depth += 1
+            elif depth:
+                depth -= 1
+                if not depth:
+                    yield begin, gathered + line[start : brace.end()]
+        if depth:
+            gathered += line[start:]
+            if len(gathered) > _LONGEST_REPORT:
+                yield begin, gathered
+                depth = 0
+    if depth:
+        yield begin, gathered
 
 
 def _crc8_of_byte(value: int) -> int:

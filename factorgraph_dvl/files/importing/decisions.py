@@ -5,8 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from factorgraph_dvl.errors import printable
+from factorgraph_dvl.files.importing.account import Account
 
 LOG_FILE = "import.log"
+WARNING = "warning: "
 MISSING = "missing: "
 _DIGEST = "trial.yaml sha256 "
 
@@ -23,11 +25,17 @@ class Decisions:
         Of keys of trial.yaml, as `section.key`.
     missing : list of str
         What the trial lacks, with what would help.
+    accounts : list of Account
+        Records of each file by type, read and skipped.
+    warnings : list of str
+        What of a file was left out, or kept against its status.
     """
 
     lines: list[str] = field(default_factory=list)
     comments: dict[str, str] = field(default_factory=dict)
     missing: list[str] = field(default_factory=list)
+    accounts: list[Account] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
 
     def add(self, subject: str, text: str, *keys: str) -> None:
         """Note a decision, and the keys of trial.yaml that it stands behind."""
@@ -41,9 +49,20 @@ class Decisions:
         """Note what is missing."""
         self.missing.append(printable(text))
 
+    def warn(self, text: str) -> None:
+        """Note what the user must know of a file."""
+        self.warnings.append(printable(text))
+
     def text(self, digest: str) -> str:
         """Return the text of import.log, which ends with the digest of trial.yaml."""
-        lines = [*self.lines, *(MISSING + text for text in self.missing), _DIGEST + digest]
+        records = (
+            printable(f"{account.file}: records: {line}")
+            for account in self.accounts
+            for line in account.lines()
+        )
+        warnings = (WARNING + text for text in self.warnings)
+        missing = (MISSING + text for text in self.missing)
+        lines = [*self.lines, *records, *warnings, *missing, _DIGEST + digest]
         return "\n".join(lines) + "\n"
 
 

@@ -17,6 +17,7 @@ from factorgraph_dvl.files.formats.losses import Losses
 from factorgraph_dvl.files.formats.mapping import MappingSettings
 from factorgraph_dvl.files.formats.sentences import text_losses
 from factorgraph_dvl.files.formats.table import FORMAT as TABLE
+from factorgraph_dvl.files.importing.account import Account
 from factorgraph_dvl.files.importing.assembly import (
     SUFFIX,
     assemble,
@@ -34,6 +35,8 @@ _SECTIONS = ("imu", "ins", "gnss", "attitude", "dvl", "dvl_beams", "depth")
 # The log first: a folder without it was not written by an import.
 OWNED = (LOG_FILE, SETTINGS_FILE, NEW_SETTINGS, *(name + SUFFIX for name in _SECTIONS))
 _SPOOL = ".spool"
+# Types of records that an error names.
+_SHOWN = 8
 
 Progress = Callable[[str], None]
 
@@ -83,7 +86,7 @@ def import_files(
         with new_folder(out, force=force, owned=OWNED) as folder:
             spool_folder = folder / _SPOOL
             spool_folder.mkdir()
-            spool = Spool(spool_folder, decisions.add)
+            spool = Spool(spool_folder, decisions.add, decisions.warn)
             for path, found in zip(files, formats, strict=True):
                 _read(Path(path), found, spool, mapping, decisions, say)
             streams = on_utc(spool.streams(), spool, decisions)
@@ -138,9 +141,10 @@ def _read(
 ) -> None:
     size = path.stat().st_size
     decisions.add(path.name, " and ".join(form.title for form in formats) + f", {size} bytes")
-    count = 0
     # Text is looked through once, whatever formats stand in it.
-    losses = text_losses(map_file(path)) if formats[0].in_text else Losses()
+    losses = Losses()
+    if formats[0].in_text:
+        losses = text_losses(map_file(path), [form.addresses for form in formats])
     plain = None if mapping is None else msgspec.to_builtins(mapping)
     for form in formats:
         if form.limit:
@@ -149,18 +153,24 @@ def _read(
             spool.append(path.name, form.name, batch)
             if batch.losses is not None:
                 losses.include(batch.losses)
-            count += len(batch.records)
             if len(batch.records):
                 done = min(int(batch.records["at"][-1]) / max(size, 1), 1.0)
                 say(f"read {path.name}, {100.0 * done:.0f} %")
     if damage := str(losses):
         decisions.add(path.name, f"{damage} → left out")
-    if not count:
+    account = Account(path.name, spool.tallies(path.name))
+    has_records = bool(account.types)
+    account.include(losses)
+    if not has_records:
         raise DataError(
             "contains no data that a trial can use",
             where=path.name,
             expected="velocities, positions, attitude, depth, or the samples of an IMU",
+            hint="; ".join(account.lines()[:_SHOWN]),
         )
+    decisions.accounts.append(account)
+    for text in account.warnings():
+        decisions.warn(text)
 
 
 def _override(settings: dict[str, Any], stated: Mapping[str, Any]) -> None:

@@ -8,13 +8,28 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
+from numpy.typing import NDArray
 
-from factorgraph_dvl.files.formats.format import KINDS, Batch, Clock, HeadingReference, Kind
+from factorgraph_dvl.files.formats.format import (
+    KINDS,
+    Batch,
+    Clock,
+    HeadingReference,
+    Kind,
+    faults,
+    type_name,
+)
 from factorgraph_dvl.files.formats.framing import Records
+from factorgraph_dvl.files.formats.losses import STATUS
+from factorgraph_dvl.files.importing.account import Tally
 from factorgraph_dvl.geometry.vectors import Array
 
 # Records at a time. Chosen: some MB.
 CHUNK = 50_000
+_NEVER_SET = (
+    "{file}: {kind}: the status calls all {count} records invalid → kept, as a status that is "
+    "never set says nothing"
+)
 Directions = tuple[tuple[float, ...], ...]
 
 
@@ -114,26 +129,83 @@ class Spool:
         For the records; it exists.
     note : callable
         Takes the name of a file and a sentence that its reader decided.
+    warn : callable, optional
+        Takes a warning.
     """
 
-    def __init__(self, folder: Path, note: Callable[[str, str], None]) -> None:
-        self._folder, self._note = folder, note
+    def __init__(
+        self,
+        folder: Path,
+        note: Callable[[str, str], None],
+        warn: Callable[[str], None] = lambda text: None,
+    ) -> None:
+        self._folder, self._note, self._warn = folder, note, warn
         self._files: dict[_Key, BinaryIO] = {}
+        self._tallies: dict[tuple[str, str], Tally] = {}
+        # Of streams with a status: those in which it was set, the number that it calls invalid,
+        # and all records of those in which it was not.
+        self._seen: set[_Key] = set()
+        self._invalid: dict[_Key, int] = {}
+        self._aside: dict[_Key, BinaryIO] = {}
         self._stored = 0
 
     def append(self, file: str, form: str, batch: Batch) -> None:
-        """Add the records of a batch, and pass on its notes."""
+        """Add the records of a batch, and pass on its notes.
+
+        Records whose status says that they are invalid are kept aside until the stream has a
+        valid one: a status that an instrument never sets says nothing.
+        """
         for note in batch.notes:
             self._note(file, note)
         if not len(batch.records):
             return
+        tally = self._tallies.setdefault((file, batch.type), Tally())
+        bad = np.zeros(len(batch.records), bool)
+        for reason, found in faults(batch).items():
+            tally.skip(reason, int(found.sum()))
+            bad |= found
         key = (
             *(file, form, batch.kind, batch.clock),
             *(batch.stream, batch.axes, batch.heading, batch.directions),
         )
         if key not in self._files:
             self._files[key] = self._new().open("wb")
-        self._files[key].write(np.ascontiguousarray(batch.records).tobytes())
+        keep = np.ones(len(bad), bool) if batch.valid is None else batch.valid | bad
+        self._files[key].write(batch.records[keep].tobytes())
+        tally.read += int((keep & ~bad).sum())
+        if batch.valid is not None:
+            self._set_aside(key, batch, keep, is_set=bool((batch.valid & ~bad).any()))
+
+    def _set_aside(
+        self, key: _Key, batch: Batch, keep: NDArray[np.bool_], *, is_set: bool
+    ) -> None:
+        """Keep all records of a stream as long as its status was never set."""
+        if is_set:
+            self._seen.add(key)
+            if (aside := self._aside.pop(key, None)) is not None:
+                aside.close()
+                Path(aside.name).unlink()
+        self._invalid[key] = self._invalid.get(key, 0) + int((~keep).sum())
+        if key not in self._seen:
+            if key not in self._aside:
+                self._aside[key] = self._new().open("wb")
+            self._aside[key].write(batch.records.tobytes())
+
+    def tallies(self, file: str) -> dict[str, Tally]:
+        """Return the records of a file that was read, by type."""
+        for key in [key for key in self._invalid if key[0] == file]:
+            count = self._invalid.pop(key)
+            tally = self._tallies[file, type_name(key[2], key[4])]
+            if not count:
+                continue
+            if key in self._seen:
+                tally.skip(STATUS, count)
+                continue
+            tally.read += count
+            self._files.pop(key).close()
+            self._files[key] = self._aside.pop(key)
+            self._warn(_NEVER_SET.format(file=file, kind=type_name(key[2], key[4]), count=count))
+        return {kind: tally for (name, kind), tally in self._tallies.items() if name == file}
 
     def store(self, parts: Iterable[Array]) -> Stored:
         """Write numbers, part by part."""

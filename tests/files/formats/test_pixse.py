@@ -17,7 +17,7 @@ DEG = np.pi / 180.0
 def read(tmp_path, data):
     path = tmp_path / "log.txt"
     path.write_bytes(data)
-    return list(pixse.read(path))
+    return [batch for batch in pixse.read(path) if len(batch.records)]
 
 
 def test_a_published_burst_is_a_navigation_solution(tmp_path):

@@ -391,9 +391,13 @@ def test_nucleus_without_lock_and_without_utc(tmp_path):
     data += logs.nucleus_track(5.1, (1.0, 2.0, 3.0), status=0)
     data += logs.nucleus_imu(5.0, (0, 0, 0), (0, 0, 0), valid=False, posix=False)
     data += logs.nucleus_track(5.2, (1.0, 2.0, 3.0), kind=0xBE)
-    found, _, _ = read(nucleus, write(tmp_path / "log.nucleus", data))
-    assert np.isnan(found["dvl", "bottom track"]["velocity"]).all()
-    assert ("imu", "IMU") not in found
+    found, batches, _ = read(nucleus, write(tmp_path / "log.nucleus", data))
+    np.testing.assert_array_equal(
+        np.isnan(found["dvl", "bottom track"]["velocity"]).all(axis=1), [True, False]
+    )
+    np.testing.assert_array_equal(batches["dvl", "bottom track"].valid, [True, False])
+    assert not batches["imu", "IMU"].valid.any()
+    assert batches["water", "water track"].valid.all()
     np.testing.assert_allclose(found["water", "water track"]["velocity"], [[1.0, 2.0, 3.0]])
 
 

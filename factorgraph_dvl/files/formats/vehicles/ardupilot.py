@@ -15,8 +15,9 @@ import numpy as np
 
 from factorgraph_dvl.errors import DataError
 from factorgraph_dvl.files.formats.clocks import gps_to_utc
-from factorgraph_dvl.files.formats.format import Batch, Format, empty, positive
+from factorgraph_dvl.files.formats.format import Batch, Format, empty, left_out, positive
 from factorgraph_dvl.files.formats.framing import BLOCK, Records, Source, map_file
+from factorgraph_dvl.files.formats.losses import UNKNOWN_TYPE, Losses
 from factorgraph_dvl.files.formats.vehicles.library import (
     column,
     columns,
@@ -102,8 +103,21 @@ def read(path: Path, mapping: Mapping[str, Any] | None = None) -> Iterator[Batch
         try:
             note = f"{path.name}: {damaged} bytes are in no message" if damaged else ""
             yield from _batches(path, log, note)
+            yield left_out(_passed_over(log))
         finally:
             log.close()
+
+
+def _passed_over(log: Any) -> Losses:
+    """Count the messages of types that are not read here, by the index of the library."""
+    losses = Losses()
+    for number, count in enumerate(log.counts):
+        name = log.id_to_name.get(number, str(number))
+        if name == "GPA":
+            losses.use(name, int(count))
+        elif name not in _CONVERTERS:
+            losses.skip(name, UNKNOWN_TYPE, int(count))
+    return losses
 
 
 def _whole(source: Source) -> list[tuple[int, int]]:

@@ -17,8 +17,9 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from factorgraph_dvl.errors import DataError
-from factorgraph_dvl.files.formats.format import Batch, Format, Kind, empty, positive
+from factorgraph_dvl.files.formats.format import Batch, Format, Kind, empty, left_out, positive
 from factorgraph_dvl.files.formats.framing import BLOCK, Records, map_file
+from factorgraph_dvl.files.formats.losses import UNKNOWN_TYPE, Losses
 from factorgraph_dvl.files.formats.mapping import UNITS, MappingSettings, TableMapping
 from factorgraph_dvl.files.formats.table import describe as describe_mapping
 from factorgraph_dvl.files.formats.table import fill, on_clock
@@ -93,7 +94,9 @@ def read(path: Path, mapping: Mapping[str, Any] | None = None) -> Iterator[Batch
     for table in () if settings is None else settings.of(path, topics=True):
         topics.setdefault(table.topic, []).append(table)
     notes: list[str] = []
-    yield from _batches(path, _messages(path, notes, topics), notes, topics)
+    losses = Losses()
+    yield from _batches(path, _messages(path, notes, topics, losses), notes, topics, losses)
+    yield left_out(losses)
 
 
 class Raw(NamedTuple):
@@ -118,7 +121,9 @@ class Raw(NamedTuple):
     decode: Callable[[bytes, str], Any]
 
 
-def _messages(path: Path, notes: list[str], topics: Container[str]) -> Iterator[Raw]:
+def _messages(
+    path: Path, notes: list[str], topics: Container[str], losses: Losses
+) -> Iterator[Raw]:
     """Read messages by the index of the bag, and without it from where that fails."""
     latest = -1
     rosbags = load("rosbags.highlevel", "bags")
@@ -127,9 +132,12 @@ def _messages(path: Path, notes: list[str], topics: Container[str]) -> Iterator[
             reader = rosbags.AnyReader([path], default_typestore=typestore())
             reader.open()
         try:
-            wanted = [
-                c for c in reader.connections if c.msgtype in CONVERTERS or c.topic in topics
-            ]
+            wanted = []
+            for c in reader.connections:
+                if c.msgtype in CONVERTERS or c.topic in topics:
+                    wanted.append(c)
+                else:
+                    losses.skip(f"{c.topic} ({c.msgtype})", UNKNOWN_TYPE, c.msgcount)
             found = reader.messages(connections=wanted) if wanted else ()
             for connection, time, data in found:
                 yield Raw(connection.topic, connection.msgtype, time, data, reader.deserialize)
@@ -146,7 +154,10 @@ def _messages(path: Path, notes: list[str], topics: Container[str]) -> Iterator[
     for file in files:
         for channel, time, data in whole_messages(map_file(file)):
             is_wanted = channel.kind in CONVERTERS or channel.topic in topics
-            if not is_wanted or time <= latest:
+            if time <= latest:
+                continue
+            if not is_wanted:
+                losses.skip(f"{channel.topic} ({channel.kind})", UNKNOWN_TYPE)
                 continue
             if channel not in decoders:
                 decoders[channel] = _decoder(channel)
@@ -204,6 +215,7 @@ def _batches(
     messages: Iterator[Raw],
     notes: list[str],
     topics: Mapping[str, list[TableMapping]],
+    losses: Losses,
 ) -> Iterator[Batch]:
     gathered: dict[tuple[str, str], list[Message]] = {}
     velocities: list[Message] = []
@@ -214,10 +226,12 @@ def _batches(
             message = raw.decode(raw.data, raw.kind)
         except Exception as error:  # Of any type, as above.
             unread.append(error)
+            losses.skip(f"{raw.topic} ({raw.kind})", "damaged")
             continue
         row = count, raw.time * 1e-9, message
         if raw.kind == TWIST and raw.topic not in topics and _is_gnss(raw.topic, message):
             velocities.append(row)
+            losses.use(f"{raw.topic} ({raw.kind})")
             continue
         key = raw.topic, raw.kind
         rows = gathered.setdefault(key, [])

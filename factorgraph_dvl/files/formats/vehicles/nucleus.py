@@ -16,7 +16,7 @@ import numpy as np
 from factorgraph_dvl.files.formats.ad2cp import NUCLEUS, frames
 from factorgraph_dvl.files.formats.format import Batch, Clock, Format, Kind, empty, left_out
 from factorgraph_dvl.files.formats.framing import BLOCK, Records, map_file
-from factorgraph_dvl.files.formats.losses import Losses
+from factorgraph_dvl.files.formats.losses import UNKNOWN_TYPE, Losses
 from factorgraph_dvl.files.formats.vehicles.library import column, columns, load, silently
 from factorgraph_dvl.files.formats.velocities import INSTRUMENT
 from factorgraph_dvl.geometry.units import DEG
@@ -24,6 +24,11 @@ from factorgraph_dvl.geometry.units import DEG
 IMU, AHRS, BOTTOM, WATER, INS = 0x82, 0xD2, 0xB4, 0xBE, 0xDC
 # A calibration must not be compared with what was made of the same data.
 _INS = "packets of the INS were left out: it navigates by the same IMU and DVL"
+_NAMES = {
+    0x87: "magnetometer (packet 0x87)",
+    0xAA: "current profile (packet 0xAA)",
+    INS: "INS (packet 0xDC)",
+}
 _HEADER = 10
 # Without an echo the driver passes on these.
 _NO_VELOCITY, _NO_MERIT = -32.0, 10.0
@@ -79,6 +84,7 @@ def read(path: Path, mapping: Mapping[str, Any] | None = None) -> Iterator[Batch
         if family == NUCLEUS and kind == INS and _INS not in notes:
             notes.append(_INS)
         if family != NUCLEUS or kind not in gathered:
+            losses.skip(_NAMES.get(kind, f"packet 0x{kind:02X}"), UNKNOWN_TYPE)
             continue
         packet = _decoded(parser, bytearray(source[start - _HEADER : stop]))
         if packet is None:
@@ -116,7 +122,7 @@ def _imu(packets: list[Packet]) -> Iterator[Batch]:
     out["gyro"] = columns(packets, "gyro.x", "gyro.y", "gyro.z")
     out["accel"] = columns(packets, "accelerometer.x", "accelerometer.y", "accelerometer.z")
     valid = column(packets, "status.isValid") == 1.0
-    yield Batch("imu", out[valid], clock, "IMU", "FRD", notes=(_AXES,))
+    yield Batch("imu", out, clock, "IMU", "FRD", notes=(_AXES,), valid=valid)
 
 
 def _attitude(packets: list[Packet]) -> Iterator[Batch]:
@@ -141,10 +147,10 @@ def _track(kind: Kind, stream: str) -> Callable[[list[Packet]], Iterator[Batch]]
         out, clock = _timed(kind, packets)
         velocity = columns(packets, *(f"velocity{axis}" for axis in "XYZ"))
         merit = columns(packets, *(f"fom{axis}" for axis in "XYZ"))
-        valid = columns(packets, *(f"status.{axis}VelocityValid" for axis in "xyz")) == 1.0
-        valid &= (velocity > _NO_VELOCITY) & (merit < _NO_MERIT)
-        out["axes"], out["velocity"] = INSTRUMENT, np.where(valid, velocity, np.nan)
-        out["std"] = np.where(valid & (merit > 0.0), merit, np.nan)
+        status = columns(packets, *(f"status.{axis}VelocityValid" for axis in "xyz")) == 1.0
+        measured = (velocity > _NO_VELOCITY) & (merit < _NO_MERIT)
+        out["axes"], out["velocity"] = INSTRUMENT, np.where(measured, velocity, np.nan)
+        out["std"] = np.where(measured & (merit > 0.0), merit, np.nan)
         distance = columns(packets, *(f"distanceBeam{i}" for i in (1, 2, 3)))
         known = columns(packets, *(f"status.beam{i}DistanceValid" for i in (1, 2, 3))) == 1.0
         out["range"][:, :3] = np.where(known & (distance > 0.0), distance, np.nan)
@@ -154,7 +160,8 @@ def _track(kind: Kind, stream: str) -> Callable[[list[Packet]], Iterator[Batch]]
         out["delay"] = np.where((delay > 0.0) & (delay < 1.0), delay, np.nan)
         note = "velocities along beams were left out: directions and signs are not documented"
         shifted = (_SHIFT,) if np.isfinite(out["delay"]).any() else ()
-        yield Batch(kind, out, clock, stream, "FRD", notes=(_AXES, note, *shifted))
+        notes = (_AXES, note, *shifted)
+        yield Batch(kind, out, clock, stream, "FRD", notes=notes, valid=status.all(axis=1))
 
     return convert
 

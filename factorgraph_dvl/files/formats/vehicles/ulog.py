@@ -6,7 +6,8 @@ the start, which GPS messages relate to UTC.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections import Counter
+from collections.abc import Callable, Container, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +15,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from factorgraph_dvl.errors import DataError
-from factorgraph_dvl.files.formats.format import Batch, Format, empty, positive
-from factorgraph_dvl.files.formats.framing import Records
+from factorgraph_dvl.files.formats.format import Batch, Format, empty, left_out, positive
+from factorgraph_dvl.files.formats.framing import Records, Source, map_file
+from factorgraph_dvl.files.formats.losses import UNKNOWN_TYPE, Losses
 from factorgraph_dvl.files.formats.vehicles.library import (
     gga_quality,
     load,
@@ -29,6 +31,9 @@ from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.settings.files import open_file
 
 _MAGIC = b"ULog\x01\x12\x35"
+# Bytes before the first message, and of the name of a topic that is shown.
+_FILE_HEADER, _LONGEST_NAME = 16, 60
+_NO_TOPIC = "messages of no topic"
 # A receiver without time reports less.
 _EARLIEST = 1e8
 # Columns by name: of one message of the log.
@@ -81,9 +86,33 @@ def read(path: Path, mapping: Mapping[str, Any] | None = None) -> Iterator[Batch
     yield from silently(
         CONVERTERS[data.name](f"{data.name}[{data.multi_id}]", data.data) for data in found
     )
+    yield left_out(_passed_over(map_file(path), {data.name for data in found}))
     if log.file_corruption:
         note = f"{path.name} is damaged: pyulog left messages out"
         yield Batch("clock", empty("clock", 0), notes=(note,))
+
+
+def _passed_over(source: Source, read: Container[str]) -> Losses:
+    """Count the messages of topics that are not read, which the library does not keep."""
+    losses = Losses()
+    topics: dict[int, str] = {}
+    counts: Counter[int] = Counter()
+    at, size = _FILE_HEADER, len(source)
+    while at + 3 <= size:
+        head = source[at : at + 6]
+        length = int.from_bytes(head[:2], "little")
+        if head[2:3] == b"D":
+            counts[int.from_bytes(head[3:5], "little")] += 1
+        elif head[2:3] == b"A":
+            message = source[at + 3 : at + 3 + length]
+            number = int.from_bytes(message[1:3], "little")
+            topics[number] = message[3:].decode("latin-1")[:_LONGEST_NAME]
+        at += 3 + length
+    for number, count in counts.items():
+        topic = topics.get(number, _NO_TOPIC)
+        if topic not in read:
+            losses.skip(topic, UNKNOWN_TYPE, count)
+    return losses
 
 
 def _column(columns: Columns, *names: str) -> Array:

@@ -1,0 +1,219 @@
+"""No record is lost in silence: read and skipped by type, with the reason."""
+
+from __future__ import annotations
+
+import json
+from functools import partial
+from pathlib import Path
+
+import format_fuzz as fuzz
+import format_writers as writers
+import numpy as np
+import pytest
+from running import run  # noqa: F401
+
+from factorgraph_dvl.files.formats.catalogue import FORMATS
+from factorgraph_dvl.files.formats.format import Batch, empty
+from factorgraph_dvl.files.formats.losses import Losses
+from factorgraph_dvl.files.importing.account import Account
+from factorgraph_dvl.files.importing.raw_files import import_files
+from factorgraph_dvl.files.importing.spool import Spool
+
+RECORDINGS = Path(__file__).resolve().parents[4] / "shared" / "data" / "recordings"
+
+
+def gga(i, quality=1):
+    return writers.nmea(f"GPGGA,1235{i:02d},4807.038,N,01131.000,E,{quality},08,0.9,5.4,M,6.9,M,,")
+
+
+def accounted(tmp_path, name, data):
+    path = tmp_path / name
+    path.write_bytes(data)
+    decisions = import_files([path], tmp_path / "trial")
+    (account,) = decisions.accounts
+    log = (tmp_path / "trial" / "import.log").read_text()
+    for line in account.lines():
+        assert f"{name}: records: {line}\n" in log
+    return {kind: (read, reasons) for kind, read, _, reasons in account.rows()}, decisions
+
+
+def test_sentences(tmp_path):
+    wrong = bytearray(gga(40))
+    wrong[20] ^= 1
+    other = writers.nmea("GPGSV,3,1,11,03,03,111,00")
+    data = b"".join(map(gga, range(20))) + gga(30, 0) * 3 + other * 4 + bytes(wrong)
+    data += writers.nmea("GPZDA,123520.00,25,07,2022,00,00") + writers.nmea("PASHR,ATT,1,2")
+    found, decisions = accounted(tmp_path, "a.nmea", data)
+    assert found == {
+        "GGA (fix)": (20, "no fix"),
+        "GPGSV": (0, "type not read"),
+        "PASHR of another form": (0, "type not read"),
+        "ZDA": (1, ""),
+        "damaged": (0, "sentence with a wrong checksum"),
+    }
+    assert decisions.warnings == ["a.nmea: GGA (fix): 3 of 23 records skipped (no fix)"]
+    assert "warning: a.nmea: GGA (fix)" in (tmp_path / "trial" / "import.log").read_text()
+
+
+def test_a_tenth_is_not_worth_a_warning(tmp_path):
+    data = b"".join(map(gga, range(27))) + gga(30, 0) * 3
+    assert accounted(tmp_path, "a.nmea", data)[1].warnings == []
+
+
+def batch_of(time, valid, kind="imu"):
+    records = empty(kind, len(time))
+    records["time"] = time
+    for name in ("gyro", "accel"):
+        records[name] = 1.0
+    return Batch(kind, records, "own", "IMU", valid=np.array(valid, bool))
+
+
+@pytest.fixture
+def spool(tmp_path):
+    said = []
+    out = Spool(tmp_path, lambda *_: None, said.append)
+    return out, said
+
+
+def test_a_status_that_is_never_set_drops_nothing(spool):
+    store, said = spool
+    for start in (0.0, 10.0):
+        store.append("f", "nucleus", batch_of(start + np.arange(5.0), [False] * 5))
+    (tally,) = store.tallies("f").values()
+    assert (tally.read, tally.skipped) == (10, {})
+    assert said == [
+        "f: IMU (imu): the status calls all 10 records invalid → kept, as a status that is never "
+        "set says nothing"
+    ]
+    (stream,) = store.streams()
+    np.testing.assert_array_equal(stream.records[:]["time"], [0, 1, 2, 3, 4, 10, 11, 12, 13, 14])
+
+
+def test_a_status_that_is_set_once_counts_from_the_start(spool):
+    store, said = spool
+    store.append("f", "nucleus", batch_of(np.arange(5.0), [False] * 5))
+    store.append("f", "nucleus", batch_of(5.0 + np.arange(3.0), [True, False, True]))
+    store.append("f", "nucleus", batch_of(np.array([9.0]), [False]))
+    (tally,) = store.tallies("f").values()
+    assert (tally.read, tally.skipped) == (2, {"status": 7})
+    (stream,) = store.streams()
+    np.testing.assert_array_equal(stream.records[:]["time"], [5.0, 7.0])
+    assert said == []
+
+
+def test_records_without_time_or_value(spool):
+    store, _ = spool
+    batch = batch_of(np.array([0.0, np.nan, 2.0, 3.0]), [True] * 4)
+    batch.records["accel"][2, 1] = np.nan
+    store.append("f", "nucleus", batch)
+    (tally,) = store.tallies("f").values()
+    assert (tally.read, tally.skipped) == (2, {"no time": 1, "no value": 1})
+    assert tally.reasons == "1 no time, 1 no value"
+
+
+def whole_files():
+    for name, files in fuzz.files().items():
+        yield from (pytest.param(name, ending, lambda d=d: d, id=name) for ending, d in files)
+    for name, files in fuzz.of_libraries().items():
+        yield from (pytest.param(name, ending, make, id=name) for ending, make in files)
+
+
+@pytest.mark.parametrize(("name", "ending", "make"), list(whole_files()))
+def test_every_reader_accounts_for_what_it_read(tmp_path, name, ending, make):
+    (form,) = (form for form in FORMATS if form.name == name)
+    if form.module:
+        pytest.importorskip(form.module.partition(".")[0])
+    path = tmp_path / f"log{ending}"
+    path.write_bytes(make())
+    spool = Spool(tmp_path, lambda *_: None)
+    losses, count, has_losses = Losses(), 0, False
+    for batch in form.read(path, None):
+        spool.append("f", name, batch)
+        count += len(batch.records)
+        if batch.losses is not None:
+            losses.include(batch.losses)
+            has_losses = True
+    account = Account("f", spool.tallies("f"))
+    assert sum(read + skipped for _, read, skipped, _ in account.rows()) == count
+    assert has_losses, "the reader does not say what it left out"
+    account.include(losses)
+    assert sum(row[1] for row in account.rows()) > 0
+
+
+def test_the_table_is_an_event(tmp_path, run):  # noqa: F811
+    (tmp_path / "a.nmea").write_bytes(b"".join(map(gga, range(5))) + gga(30, 0))
+    done = run("import", tmp_path / "a.nmea", "--out", tmp_path / "trial", "--json")
+    events = [json.loads(line) for line in done.out.splitlines()]
+    (table,) = (event for event in events if event["event"] == "table")
+    assert table["columns"] == ["type", "read", "skipped", "reasons"]
+    assert table["rows"] == [["GGA (fix)", "5", "1", "no fix"]]
+    warned = [event["text"] for event in events if event["event"] == "warning"]
+    assert "a.nmea: GGA (fix): 1 of 6 records skipped (no fix)" in warned
+
+
+class TestRecordings:
+    """Counts by type against decoders of others, on recordings outside this repository."""
+
+    def accounted(self, tmp_path, name):
+        if not (RECORDINGS / name).is_file():
+            pytest.skip(f"no recording {name}")
+        decisions = import_files([RECORDINGS / name], tmp_path / "trial")
+        return {kind: (read, skipped) for kind, read, skipped, _ in decisions.accounts[0].rows()}
+
+    def test_nucleus(self, tmp_path):
+        parser = pytest.importorskip("nucleus_driver._parser")
+        found = self.accounted(tmp_path, "nucleus_at_rest.nucleus")
+        data = (RECORDINGS / "nucleus_at_rest.nucleus").read_bytes()
+        # By the maker's parser alone: header of 10 bytes, its length of the rest at byte 4.
+        silent = type("", (), dict.fromkeys(("write_warning", "write_exception"), print))()
+        decoder, counts, at = parser.Parser(messages=silent), {}, 0
+        while (at := data.find(b"\xa5\x0a", at)) >= 0 and at + 10 <= len(data):
+            stop = at + 10 + int.from_bytes(data[at + 4 : at + 6], "little")
+            header, content, _ = decoder.get_packet(bytearray(data[at:stop]))
+            if stop <= len(data) and header and content:
+                counts[data[at + 2]] = counts.get(data[at + 2], 0) + 1
+                at = stop
+            else:
+                at += 1
+        kinds = {
+            "IMU (imu)": 0x82,
+            "AHRS (attitude)": 0xD2,
+            "bottom track (dvl)": 0xB4,
+            "water track (water)": 0xBE,
+            "magnetometer (packet 0x87)": 0x87,
+            "current profile (packet 0xAA)": 0xAA,
+        }
+        assert {name: sum(found[name]) for name in kinds} == {
+            name: counts[kind] for name, kind in kinds.items()
+        }
+        assert found["IMU (imu)"] == (17_773, 0)
+
+    def test_water_linked(self, tmp_path):
+        found = self.accounted(tmp_path, "water_linked_a50.json")
+        text = (RECORDINGS / "water_linked_a50.json").read_text()
+        assert sum(found["dvl"]) == text.count('"velocity_valid"') == 232
+        assert found["dvl"][0] == text.count('"velocity_valid": true')
+        assert found["position_local"] == (0, text.count('"type": "position_local"'))
+
+    def test_ardupilot(self, tmp_path):
+        reader = pytest.importorskip("pymavlink.DFReader")
+        found = self.accounted(tmp_path, "ardusub_small.BIN")
+        log = reader.DFReader_binary(str(RECORDINGS / "ardusub_small.BIN"))
+        counts = {}
+        for message in iter(partial(log.recv_match, strict=True), None):
+            counts[message.get_type()] = counts.get(message.get_type(), 0) + 1
+        log.close()
+        assert {
+            name.partition("[")[0]: sum(count) for name, count in found.items() if count != (0, 0)
+        } == counts
+
+    def test_ulog(self, tmp_path):
+        pyulog = pytest.importorskip("pyulog")
+        found = self.accounted(tmp_path, "px4_small.ulg")
+        counts, ours = {}, {}
+        for data in pyulog.ULog(str(RECORDINGS / "px4_small.ulg")).data_list:
+            counts[data.name] = counts.get(data.name, 0) + len(data.data["timestamp"])
+        for name, count in found.items():
+            topic = name.partition("[")[0]
+            ours[topic] = ours.get(topic, 0) + sum(count)
+        assert ours == counts
