@@ -135,7 +135,12 @@ def own_files():
         "pd6": [samples.PD13.encode() * 40],
         "nortek": [nortek],
         "cerulean": [cerulean],
-        "water-linked": [samples.SERIAL * 20, json_lines],
+        "water-linked": [
+            samples.SERIAL * 20,
+            json_lines,
+            json.dumps([report] * 30, indent=4).encode(),
+        ],
+        "water-linked-table": [samples.WATER_LINKED_TABLE],
         "rowe": [b"".join(rowe)],
         "sbet": [smooth],
         "smrmsg": [np.ascontiguousarray(samples.deviations(300)).tobytes()],

@@ -104,3 +104,21 @@ $PIXSE,STDPOS,20563.20,18004.65,50.00*7D
 $PIXSE,STDSPD,19.747,13.032,10.002*41
 $PIXSE,ALGSTS,00000045,00004000*60
 """
+
+# Reports of a Water Linked DVL as a table, with the stamps of a computer.
+_BEAM_COLUMNS = ("id", "velocity", "distance", "beam_valid")
+WATER_LINKED_TABLE = (
+    ",".join(
+        [
+            *["time", "vx", "vy", "vz", "fom", "altitude", "velocity_valid", "status"],
+            *(f"transducers_{i}_{name}" for i in range(4) for name in _BEAM_COLUMNS),
+        ]
+    )
+    + "\n"
+    + "".join(
+        f"{1638191471.5 + 0.25 * i},0.5,{0.01 * i},-0.1,0.02,1.5,{i % 4 != 0},0,"
+        + ",".join(f"{beam},0.{beam}1,1.{beam},True" for beam in range(4))
+        + "\n"
+        for i in range(40)
+    )
+).encode()

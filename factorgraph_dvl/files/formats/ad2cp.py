@@ -500,7 +500,7 @@ FORMATS = (
         "Nortek AD2CP: bottom track (0x17), tracks of DVLs (0x1B, 0x1D), text",
         share,
         read,
-        "mhkit on one recording; 0x1B and 0x1D: files written after public readers that agree",
+        "one recording (VelEchoBT01), by mhkit; 0x1B and 0x1D by public readers that agree only",
         (".ad2cp",),
     ),
 )

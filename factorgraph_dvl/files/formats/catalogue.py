@@ -14,6 +14,7 @@ from factorgraph_dvl.files.formats import (
     rtklib,
     sbet,
     water_linked,
+    water_linked_table,
 )
 from factorgraph_dvl.files.formats.format import Format
 from factorgraph_dvl.files.formats.table import FORMAT as TABLE
@@ -26,6 +27,7 @@ FORMATS: tuple[Format, ...] = (
     *pd6.FORMATS,
     *dvl_sentences.FORMATS,
     *water_linked.FORMATS,
+    *water_linked_table.FORMATS,
     *rowe.FORMATS,
     *rtklib.FORMATS,
     *sbet.FORMATS,

@@ -471,7 +471,7 @@ FORMATS = (
         "NMEA 0183: GGA, RMC, VTG, ZDA, GST, HDT, `$PASHR`, `$PRDID`, `$PADCP`",
         share,
         read,
-        "pynmeagps, published sentences",
+        "published sentences, by pynmeagps",
         (".nmea", ".txt", ".log", ".n1r", ".n2r", ".nms"),
         in_text=True,
         addresses=ADDRESSES,

@@ -490,7 +490,7 @@ FORMATS = (
         "Teledyne PD0; `.ENX`, `.ENS`, `.ENR`, `.STA`, `.LTA` of VmDas; WinRiver",
         share,
         read,
-        "mhkit on three recordings, velocities to 1e-5 m/s",
+        "three recordings (Nenana River, VmDas, WinRiver), by mhkit: velocities to 1e-5 m/s",
         (".pd0", ".enx", ".ens", ".enr", ".sta", ".lta", ".000"),
     ),
 )

@@ -117,7 +117,7 @@ FORMATS = (
         "Teledyne PD4, PD5",
         share_of_records(read_pd4, _PD4_BYTES),
         partial(read_pings, read_pd4, "day", "RFU"),
-        "files written after the manufacturer's tables",
+        "by its document only",
         (".pd4", ".pd5"),
     ),
 )

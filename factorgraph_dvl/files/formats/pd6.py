@@ -135,7 +135,7 @@ FORMATS = (
         "Teledyne PD6, PD13",
         share_of_records(read_pd6, _PD6_BYTES),
         partial(read_pings, read_pd6, "own", "RFU"),
-        "files written after the manufacturer's tables",
+        "by its document only",
         (".pd6", ".pd13"),
         in_text=True,
     ),

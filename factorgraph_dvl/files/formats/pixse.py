@@ -11,11 +11,12 @@ import numpy as np
 from factorgraph_dvl.files.formats.clocks import nearest_day
 from factorgraph_dvl.files.formats.format import Batch, Clock, Format, empty, left_out
 from factorgraph_dvl.files.formats.framing import Records, map_file
-from factorgraph_dvl.files.formats.losses import Losses
+from factorgraph_dvl.files.formats.losses import UNKNOWN_TYPE, Losses
 from factorgraph_dvl.files.formats.nmea import KINDS, UNCHECKED, read_nmea, utc
 from factorgraph_dvl.files.formats.sentences import sentences
 
 _OF_BURST = ("ATITUD", "POSITI", "SPEED_", "STDHRP", "STDPOS", "STDSPD", "TIME__")
+_LONGEST_NAME = 12
 # A sentence besides its fields: `$`, commas, checksum, line end.
 _FRAME = 7
 _PITCH = (
@@ -37,7 +38,12 @@ def share(path: Path, sample: bytes) -> float:
 def read(path: Path, mapping: Mapping[str, Any] | None = None) -> Iterator[Batch]:
     """Read a file; the parameters and the result are those of `Format.read`."""
     losses = Losses()
-    for block in read_nmea(map_file(path)):
+    source = map_file(path)
+    for sentence in sentences(source, b"PIXSE"):
+        kind = sentence.fields[0].decode("latin-1")
+        if kind not in _OF_BURST:
+            losses.skip(f"PIXSE {kind[:_LONGEST_NAME]}", UNKNOWN_TYPE)
+    for block in read_nmea(source):
         for kind in _OF_BURST:
             part = block[kind]
             unchecked = part["at"][~part["checked"]]
@@ -113,7 +119,7 @@ FORMATS = (
         "Exail `$PIXSE`",
         share,
         read,
-        "a published burst with its checksums; the sign of its pitch is not verified",
+        "by a published burst only; the sign of its pitch is not verified",
         in_text=True,
         addresses=b"PIXSE",
     ),

@@ -43,6 +43,10 @@ _HEAD = 14
 _SIZES = {10: 4, 20: 4, 50: 1}
 
 
+# Data sets with the time, bottom track and sentences; a name is at most so long.
+_READ, _LONGEST_NAME = ("E000008", "E000010", "E000011"), 16
+
+
 def read_rowe(
     source: Source, block: int = BLOCK, losses: Losses | None = None
 ) -> Iterator[tuple[Records, dict[str, Records]]]:
@@ -68,6 +72,9 @@ def read_rowe(
     losses = Losses() if losses is None else losses
     for at, payload in _ensembles(source, losses):
         sets = dict(_data_sets(payload))
+        for name in sets:
+            if name not in _READ:
+                losses.skip(f"data set {name[:_LONGEST_NAME]}", UNKNOWN_TYPE)
         time = _time(sets.get("E000008", b""))
         ping = _bottom_track(sets.get("E000010", b""))
         if ping is not None:
@@ -191,7 +198,7 @@ FORMATS = (
         "Rowe `.ens`",
         share_of_records(read_rowe, _ROWE_BYTES),
         _read_rowe,
-        "not verified: no document and no recording was available",
+        "a recording of a boat (267 pings), counts by a search for its marks; values not compared",
         (".ens",),
     ),
 )

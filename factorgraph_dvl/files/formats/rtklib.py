@@ -178,7 +178,7 @@ FORMATS = (
         "RTKLIB `.pos`",
         _share_rtklib,
         _read_rtklib,
-        "files written after the manual",
+        "by its document only",
         (".pos",),
     ),
 )

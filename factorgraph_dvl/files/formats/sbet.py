@@ -214,7 +214,7 @@ FORMATS = (
         "SBET",
         _share_sbet,
         _read_sbet,
-        "files written after public record tables; its wander angle is not verified",
+        "by public record tables only; its wander angle is not verified",
         (".sbet", ".out"),
     ),
     Format(
@@ -223,7 +223,7 @@ FORMATS = (
         "smrmsg: standard deviations of an SBET file",
         _share_smrmsg,
         _read_smrmsg,
-        "files written after public record tables",
+        "by public record tables only",
         (".out", ".smrmsg"),
     ),
 )

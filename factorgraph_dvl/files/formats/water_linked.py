@@ -1,4 +1,4 @@
-"""Water Linked DVLs: JSON lines, and `wrz`, `wru`, `wrp` of the serial protocol.
+"""Water Linked DVLs: JSON, by lines or as an array, and the serial `wrz`, `wru`, `wrp`.
 
 Source: Water Linked's published DVL protocol, 2.4 and json_v3, with its examples. Axes are
 X forward, Y starboard, Z down of the DVL, turned by its own mounting offset; velocities are
@@ -74,7 +74,7 @@ def read_water_linked(
                 positions.append((at + start, *_json_position(message)))
                 losses.skip("position_local", UNKNOWN_TYPE)
             elif "vx" in message and "velocity_valid" in message:
-                row = _json_velocity(message)
+                row = velocity_of(message)
             elif message:
                 losses.skip(str(message.get("type", "other JSON"))[:40], UNKNOWN_TYPE)
         elif match := _SERIAL.search(line):
@@ -117,9 +117,13 @@ def _reports(source: Source) -> Iterator[tuple[int, bytes]]:
             yield at, line
             continue
         start, indent = 0, len(line) - len(line.lstrip())
-        if depth and indent <= margin and line.lstrip().startswith(b"{"):
-            yield begin, gathered
-            depth = 0
+        if depth and indent <= margin:
+            if line.lstrip().startswith(b"{"):
+                yield begin, gathered
+                depth = 0
+            elif not line.lstrip().startswith(b"}"):
+                # Its own lines are no farther to the right: the margin says nothing.
+                margin = -1
         for brace in _BRACE.finditer(line):
             if brace[0] == b"{":
                 if not depth:
@@ -176,7 +180,8 @@ def _value(message: Row, name: str) -> float:
     return float(value) if abs(value) < 1e18 else math.nan
 
 
-def _json_velocity(message: Row) -> Row:
+def velocity_of(message: Row) -> Row:
+    """Return the velocity of a report of the JSON protocol, and the `step` since the last one."""
     good = message["velocity_valid"] is True
     beams = np.full((2, 4), np.nan)
     transducers = message.get("transducers")
@@ -261,7 +266,8 @@ FORMATS = (
         "Water Linked JSON, `wrz`, `wru`, `wrp`",
         share_of_records(read_water_linked, _WATER_LINKED_BYTES),
         _read_water_linked,
-        "the document's examples",
+        "JSON: a recording of an A50 without lock, counts by a search of its "
+        "text; `wrz`, `wru`, `wrp` by their document only",
         (".json", ".jsonl"),
         in_text=True,
     ),

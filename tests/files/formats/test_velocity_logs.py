@@ -16,7 +16,9 @@ from factorgraph_dvl.files.formats.pd4 import read_pd4
 from factorgraph_dvl.files.formats.pd6 import read_pd6
 from factorgraph_dvl.files.formats.rowe import read_rowe
 from factorgraph_dvl.files.formats.velocities import BEAM, EARTH, INSTRUMENT, SHIP
+from factorgraph_dvl.files.formats.water_linked import FORMATS as WATER_LINKED
 from factorgraph_dvl.files.formats.water_linked import crc8, read_water_linked
+from factorgraph_dvl.files.formats.water_linked_table import FORMATS as WATER_LINKED_TABLES
 
 DEG = np.pi / 180.0
 
@@ -143,6 +145,122 @@ def test_water_linked_published_reports():
     np.testing.assert_allclose(found["second"], [0.123, 1.19851])
     assert positions["x"][0] == 0.41
     assert positions["yaw"][0] / DEG == pytest.approx(19.3)
+
+
+def reports(count):
+    return [
+        {
+            "time": 100.0 + i,
+            **{"vx": 0.5 + i, "vy": -0.1, "vz": 0.2, "fom": 0.01, "altitude": 1.5},
+            "transducers": [
+                {"id": k, "velocity": 0.1 * k, "distance": 1.0 + k, "beam_valid": k != 2}
+                for k in range(4)
+            ],
+            **{"velocity_valid": i % 3 != 1, "status": 0, "type": "velocity"},
+        }
+        for i in range(count)
+    ]
+
+
+def joined(batches):
+    return np.concatenate([batch.records for batch in batches if batch.kind == "dvl"])
+
+
+def read_format(formats, path):
+    (form,) = formats
+    assert form.share(path, path.read_bytes()) > 0.01
+    return list(form.read(path, None))
+
+
+class TestReportsInOneFile:
+    def lines(self, tmp_path, count=30):
+        path = tmp_path / "lines.json"
+        path.write_text("".join(json.dumps(report) + "\n" for report in reports(count)))
+        return joined(read_format(WATER_LINKED, path))
+
+    def same(self, found, expected):
+        for name in ("time", "velocity", "beams", "range", "std"):
+            np.testing.assert_array_equal(found[name], expected[name])
+
+    @pytest.mark.parametrize("between", [",", ",\n", ",\r\n  ", " , "])
+    @pytest.mark.parametrize("indent", [1, 4])
+    def test_an_array_on_several_lines(self, tmp_path, between, indent):
+        path = tmp_path / "log.json"
+        path.write_text(
+            "[" + between.join(json.dumps(r, indent=indent) for r in reports(30)) + "]\n"
+        )
+        self.same(joined(read_format(WATER_LINKED, path)), self.lines(tmp_path))
+        path.write_text(json.dumps(reports(30), indent=indent))
+        self.same(joined(read_format(WATER_LINKED, path)), self.lines(tmp_path))
+
+    def test_a_report_that_was_cut_costs_no_other(self, tmp_path):
+        texts = [json.dumps(report, indent=4) for report in reports(30)]
+        texts[7] = texts[7][: texts[7].index("distance")]
+        path = tmp_path / "log.json"
+        path.write_text("[" + ",\n".join(texts) + "]")
+        batches = read_format(WATER_LINKED, path)
+        expected = np.delete(self.lines(tmp_path), 7)
+        np.testing.assert_array_equal(joined(batches)["velocity"], expected["velocity"])
+        assert str(batches[-1].losses).startswith("1 line of damaged JSON, at byte")
+
+    def flat(self, report):
+        out = {}
+        for name, value in report.items():
+            if name == "transducers":
+                for index, beam in enumerate(value):
+                    out |= {f"transducers_{index}_{key}": x for key, x in beam.items()}
+            else:
+                out[name] = value
+        return out
+
+    def table(self, tmp_path, times=None, separator=","):
+        rows = [self.flat(report) for report in reports(30)]
+        for row, time in zip(rows, times or [], strict=False):
+            row["time"] = time
+        lines = [separator.join(rows[0]), *(separator.join(map(str, r.values())) for r in rows)]
+        path = tmp_path / "log.csv"
+        path.write_text("\n".join(lines) + "\n")
+        return read_format(WATER_LINKED_TABLES, path)
+
+    @pytest.mark.parametrize("separator", [",", ";", "\t"])
+    def test_a_table_is_what_its_reports_are(self, tmp_path, separator):
+        times = [100.0 + i % 7 for i in range(30)]
+        found = joined(self.table(tmp_path, times, separator))
+        expected = self.lines(tmp_path)
+        np.testing.assert_allclose(found["time"], np.cumsum(times) * 1e-3)
+        for name in ("velocity", "beams", "range", "std"):
+            np.testing.assert_array_equal(found[name], expected[name])
+        # By hand: the second is not valid, and its third beam neither.
+        assert np.isnan(found["velocity"][1]).all()
+        np.testing.assert_array_equal(found["velocity"][2], [2.5, -0.1, 0.2])
+        np.testing.assert_array_equal(found["range"][0], [1.0, 2.0, np.nan, 4.0])
+
+    @pytest.mark.parametrize(
+        "stamp",
+        [
+            lambda t: t,
+            lambda t: round(t * 1e3),
+            lambda t: round(t * 1e6),
+            lambda t: str(np.datetime64(round(t * 1e3), "ms")) + "Z",
+        ],
+    )
+    def test_stamps(self, tmp_path, stamp):
+        times = [1638191471.5 + 0.25 * i for i in range(30)]
+        batches = self.table(tmp_path, [stamp(t) for t in times])
+        np.testing.assert_allclose(joined(batches)["time"], times, rtol=0, atol=1e-5)
+        assert "stamps" in batches[0].notes[0]
+
+    def test_rows_that_were_cut_are_counted(self, tmp_path):
+        self.table(tmp_path)
+        path = tmp_path / "log.csv"
+        path.write_text(path.read_text() + "1,2,3\n")
+        batches = read_format(WATER_LINKED_TABLES, path)
+        assert batches[-1].losses.counts == {"row with another number of cells": 1}
+
+    def test_other_tables_are_not_taken(self, tmp_path):
+        path = tmp_path / "log.csv"
+        path.write_text("time,vx,vy,vz\n" + "1,2,3,4\n" * 9)
+        assert WATER_LINKED_TABLES[0].share(path, path.read_bytes()) == 0.0
 
 
 def test_water_linked_json():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from functools import partial
 from pathlib import Path
 
@@ -194,6 +195,18 @@ class TestRecordings:
         assert sum(found["dvl"]) == text.count('"velocity_valid"') == 232
         assert found["dvl"][0] == text.count('"velocity_valid": true')
         assert found["position_local"] == (0, text.count('"type": "position_local"'))
+
+    def test_rowe(self, tmp_path):
+        found = self.accounted(tmp_path, "rowe_boat_turns.ens")
+        data = (RECORDINGS / "rowe_boat_turns.ens").read_bytes()
+        assert sum(found["dvl"]) == data.count(b"\x80" * 16) == 267
+        # One data set of each ensemble repeats sentences of another one, and is not read.
+        assert found["data set R000003"] == (0, 267)
+        repeated = b"".join(part[:158] for part in data.split(b"R000003\0")[1:])
+        for name in ("GGA (fix)", "RMC (fix)", "VTG (course)", "HDT (attitude)", "ZDA"):
+            pattern = rb"\$[A-Z]{2}" + name[:3].encode() + rb",[^$]*?\*[0-9A-F]{2}"
+            again = len(re.findall(pattern, repeated))
+            assert sum(found[name]) == len(re.findall(pattern, data)) - again
 
     def test_ardupilot(self, tmp_path):
         reader = pytest.importorskip("pymavlink.DFReader")

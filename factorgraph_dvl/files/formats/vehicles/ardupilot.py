@@ -260,7 +260,10 @@ FORMAT = Format(
     title="ArduPilot .BIN",
     share=share,
     read=read,
-    verified="files written after ArduPilot's page of log messages",
+    verified=(
+        "`IMU`, `ATT`: a recording of ArduSub, counts by type by pymavlink; "
+        "`GPS`, `VISO` by their document only"
+    ),
     endings=(".bin",),
     module="pymavlink",
     extra="ardupilot",

@@ -208,7 +208,10 @@ FORMAT = Format(
     title="PX4 ULog",
     share=share,
     read=read,
-    verified="files written after PX4's description of the format",
+    verified=(
+        "IMU, attitude, GPS: a recording of PX4, counts by type by pyulog; "
+        "odometry by its document only"
+    ),
     endings=(".ulg", ".ulog"),
     module="pyulog",
     extra="px4",

@@ -1,0 +1,155 @@
+"""Logs of Water Linked DVLs as tables: the reports of the JSON protocol, a row each.
+
+Programs that log these instruments flatten a report to columns of the same names: `time`, `vx`,
+`vy`, `vz`, `fom`, `altitude`, `velocity_valid`, and `transducers_0_velocity` and so on for beams.
+Units and axes are those of the protocol. `time` is either that of the protocol, the milliseconds
+since the report before, or a stamp: stamps increase from row to row.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterator, Mapping
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from factorgraph_dvl.files.formats.format import Batch, Format, left_out
+from factorgraph_dvl.files.formats.framing import (
+    BLOCK_OF_LINES,
+    Source,
+    lines,
+    map_file,
+    number,
+)
+from factorgraph_dvl.files.formats.losses import Losses
+from factorgraph_dvl.files.formats.velocities import INSTRUMENT, pings, records
+from factorgraph_dvl.files.formats.water_linked import Row, velocity_of
+from factorgraph_dvl.geometry.vectors import Array
+
+_NEEDED = frozenset(("time", "vx", "vy", "vz", "fom", "altitude", "velocity_valid"))
+_BEAM = re.compile(r"transducers?[^0-9A-Za-z]*(\d)[^0-9A-Za-z]+(velocity|distance|beam_valid)")
+_TRUE = (b"true", b"1", b"1.0", b"y", b"yes", b"t")
+_OTHER_CELLS = "row with another number of cells"
+# Rows by which `time` is judged, and lines among which the names of columns stand.
+_JUDGED, _FIRST_LINES = 200, 5
+# Stamps from 1973 on in each unit, the largest first; smaller ones are seconds.
+_UNITS = ((1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3))
+_STAMPS = "`time` increases from row to row → stamps in {unit:g} s"
+_STEPS = "`time` does not increase → milliseconds since the row before, as in the protocol"
+
+
+def share(path: Path, sample: bytes) -> float:
+    """Return whether the first lines of a sample name the columns of such a table."""
+    return float(_header(sample) is not None)
+
+
+def read(path: Path, mapping: Mapping[str, Any] | None = None) -> Iterator[Batch]:
+    """Read a file; the parameters and the result are those of `Format.read`."""
+    source = map_file(path)
+    found = _header(source)
+    if found is None:
+        return
+    separator, names, start = found
+    losses = Losses()
+    texts = (line for _, line in islice(_rows(source, separator, names, start), _JUDGED))
+    unit = _unit_of_stamps(np.array([_seconds(cells[names.index("time")]) for cells in texts]))
+    note = _STEPS if unit is None else _STAMPS.format(unit=unit)
+    rows: list[Row] = []
+    elapsed = 0.0
+    for at, cells in _rows(source, separator, names, start, losses):
+        row = velocity_of(_message(names, cells))
+        step = row.pop("step")
+        if unit is not None:
+            elapsed = row["time"] = _seconds(cells[names.index("time")]) * unit
+        else:
+            elapsed += step if 0.0 <= step < 3600.0 else 0.0
+        rows.append({**row, "at": at, "second": elapsed})
+        if len(rows) >= BLOCK_OF_LINES:
+            yield _batch(rows, note)
+            rows = []
+    if rows:
+        yield _batch(rows, note)
+    yield left_out(losses)
+
+
+def _batch(rows: list[Row], note: str) -> Batch:
+    found = pings(records(rows, INSTRUMENT), "own", "FRD", "")
+    return Batch("dvl", found.records, "own", axes="FRD", notes=(note,))
+
+
+def _header(source: Source) -> tuple[bytes, list[str], int] | None:
+    """Return separator, names of columns and where the rows start; None if there are none."""
+    for at, line in islice(lines(source), _FIRST_LINES):
+        for separator in (b",", b";", b"\t"):
+            cells = line.removeprefix(b"\xef\xbb\xbf").split(separator)
+            names = [cell.strip(b' "').decode("latin-1") for cell in cells]
+            if set(names) >= _NEEDED:
+                return separator, names, at + len(line) + 1
+    return None
+
+
+def _rows(
+    source: Source, separator: bytes, names: list[str], start: int, losses: Losses | None = None
+) -> Iterator[tuple[int, list[bytes]]]:
+    for at, line in lines(source):
+        if at < start or not line.strip():
+            continue
+        cells = [cell.strip(b' "') for cell in line.split(separator)]
+        if len(cells) == len(names):
+            yield at, cells
+        elif losses is not None:
+            losses.add(_OTHER_CELLS, at)
+
+
+def _unit_of_stamps(time: Array) -> float | None:
+    """Return the unit of stamps, s, None for the times since the row before."""
+    time = time[np.isfinite(time)]
+    if len(time) < 2 or (np.diff(time) <= 0.0).any():
+        return None
+    size = float(np.median(time))
+    return next((unit for least, unit in _UNITS if size >= least), 1.0)
+
+
+def _seconds(cell: bytes) -> float:
+    """Return a number, or the seconds since 1970 of a date and time, taken as UTC."""
+    value = number(cell)
+    if math.isnan(value) and b":" in cell:
+        text = cell.decode("ascii", "replace").replace("/", "-").removesuffix("Z")
+        try:
+            stamp = np.datetime64(text.replace(" ", "T"), "us")
+        except ValueError:
+            return math.nan
+        return math.nan if np.isnat(stamp) else float(stamp.astype(np.int64)) * 1e-6
+    return value
+
+
+def _message(names: list[str], cells: list[bytes]) -> dict[str, Any]:
+    """Return the report that a row was made of."""
+    beams: dict[int, dict[str, Any]] = {}
+    message: dict[str, Any] = {}
+    for name, cell in zip(names, cells, strict=True):
+        if match := _BEAM.fullmatch(name):
+            index, name = int(match[1]), match[2]
+            target = beams.setdefault(index, {"id": index})
+        else:
+            target = message
+        target[name] = cell.lower() in _TRUE if name.endswith("_valid") else number(cell)
+    return {**message, "transducers": list(beams.values())}
+
+
+FORMATS = (
+    Format(
+        "water-linked-table",
+        "dvl",
+        "Water Linked reports as a table: `time`, `vx`, `vy`, `vz`, `fom`, `altitude`, "
+        "`velocity_valid`",
+        share,
+        read,
+        "by its document only: reports as a table, against the same as JSON",
+        (".csv", ".txt", ".tsv"),
+    ),
+)
