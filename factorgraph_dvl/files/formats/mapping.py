@@ -155,7 +155,13 @@ class TableMapping(Section, frozen=True, kw_only=True):
     axes: BodyAxes = "RFU"
     coordinates: Literal["beam", "instrument", "ship", "earth"] = "instrument"
     beam_angle_deg: Annotated[float, msgspec.Meta(ge=5, le=45)] | None = None
-    heading: HeadingReference = "unknown"
+    # YAML reads `true` without quotation marks as a truth value.
+    heading: HeadingReference | bool = "unknown"
+
+    @property
+    def heading_reference(self) -> HeadingReference:
+        """What headings refer to."""
+        return "true" if isinstance(self.heading, bool) else self.heading
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -170,6 +176,8 @@ class TableMapping(Section, frozen=True, kw_only=True):
         if not any(set(way) <= set(self.columns) for way in ways):
             text = ", or ".join(" ".join(way) for way in ways)
             raise ValueError(f"`columns` of {self.kind} needs {text}")
+        if self.heading is False:
+            raise ValueError("`heading` must be true, magnetic or unknown; found `false`")
         if self.coordinates == "beam" and self.beam_angle_deg is None:
             raise ValueError("`coordinates: beam` needs `beam_angle_deg`")
         if self.topic and (self.time.columns is not None or self.time.unit == "iso"):

@@ -108,7 +108,7 @@ def _batches(path: Path, table: TableMapping) -> Iterator[Batch]:
             table.time.batch_clock,
             table.kind,
             table.axes,
-            table.heading,
+            table.heading_reference,
             notes,
         )
     yield left_out(losses)

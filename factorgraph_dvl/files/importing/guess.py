@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import glob
+import json
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -41,6 +43,8 @@ _WORDS = (
     (r"(v|vel|velocity)( |_)?(d|down)", "vel_down"),
     (r"(beam|bv|b) ?([1234])( vel(ocity)?)?", "beam"),
 )
+# Words that YAML takes for truth values or for nothing.
+_YAML_WORDS = ("y", "n", "yes", "no", "on", "off", "true", "false", "null")
 _TIME = re.compile(r"(time|t|stamp|timestamp|utc|gps time|time s|ens t|utc s of day|seconds)")
 _UNITS = (
     (r"deg(rees)?[ _/]*(per)?[ _/]*s(ec)?|dps", "deg/s"),
@@ -102,7 +106,7 @@ def guess(path: Path) -> str:
             expected="a line of names, such as `time_s,vel_x_m_s,vel_y_m_s,vel_z_m_s`",
             hint=f"Found {', '.join(names[:20])}; write the mapping by hand",
         )
-    lines = [f"  - file: {as_text(path.name)}", f"    kind: {kind}"]
+    lines = [f"  - file: {_quoted(glob.escape(as_text(path.name)))}", f"    kind: {kind}"]
     lines.append(f"    time: {_time(names, columns, time, iso)}")
     if kind == "imu":
         lines.append(f"    axes: {_axes(columns[:, fields['accel_z'][0]])}")
@@ -111,7 +115,7 @@ def guess(path: Path) -> str:
     if kind == "ins" and "height" not in fields:
         fields["height"] = fields["altitude"]
     if kind == "attitude" and "true" in names[fields["heading"][0]].lower():
-        lines.append("    heading: true  # by its name; else magnetic, or unknown")
+        lines.append('    heading: "true"  # by its name; else magnetic, or unknown')
     if kind == "dvl" and "beam1" in fields:
         lines.append("    coordinates: beam")
         lines.append("    beam_angle_deg: 30  # from the vertical: not in the table")
@@ -255,5 +259,5 @@ def _unit_by_size(field: str, values: Array, usual: str) -> tuple[str, str]:
 
 
 def _quoted(name: str) -> str:
-    plain = re.fullmatch(r"[A-Za-z][\w ]*", name) and name.lower() not in ("y", "n", "on", "no")
-    return name if plain else '"' + name.replace('"', '\\"') + '"'
+    plain = re.fullmatch(r"[A-Za-z][\w .]*", name) and name.lower() not in _YAML_WORDS
+    return name if plain else json.dumps(name, ensure_ascii=False)

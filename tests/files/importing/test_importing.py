@@ -455,6 +455,42 @@ trial: {dvl: {lever_arm_m: [1, 2, 3]}}
         assert read_yaml(out / "trial.yaml", dict)["body_axes"] == "FRD"
         assert decisions.missing == [decisions.missing[0]]
 
+    @pytest.mark.parametrize(
+        ("name", "header", "row"),
+        [
+            ("a.csv", "time_s,roll_deg,pitch_deg,heading true (deg)", "{t},1,2,30"),
+            ("no", "time_s,heading_deg", "{t},30"),
+            ("a: b.csv", "t_ms;sog_kn;cog_deg", "{t};2;30"),
+            ("a #1.csv", "time_s,lat_deg,lon_deg,height_m", "{t},48.1,-11.5,300"),
+            ('a"b.csv', "utc,v_x_m_s,v_y_m_s,v_z_m_s", "{t},1,0,0"),
+            ("[a].csv", "time_s,beam1_m_s,beam2_m_s,beam3_m_s,beam4_m_s", "{t},1,0,0,1"),
+            ("true", "time_s,depth_m", "{t},4"),
+            ("a\\b.csv", "time_s,yaw true", "{t},0.5"),
+        ],
+    )
+    def test_every_guess_is_accepted(self, tmp_path, name, header, row):
+        path = tmp_path / name
+        lines = [header, *(row.format(t=1e9 + t) for t in range(30))]
+        path.write_text("\n".join(lines) + "\n")
+        (table,) = parse_yaml(guess_all([path]), MappingSettings, source="guess").of(path)
+        if "true" in header:
+            assert table.heading_reference == "true"
+        if table.kind in ("dvl", "fix", "attitude"):
+            mapping = parse_yaml(guess_all([path]), MappingSettings, source="guess")
+            (account,) = import_files([path], tmp_path / "out", mapping=mapping).accounts
+            assert [(read, skipped) for _, read, skipped, _ in account.rows()] == [(30, 0)]
+
+    @pytest.mark.parametrize("written", ["true", '"true"', "True"])
+    def test_true_headings_may_be_a_truth_value(self, written):
+        text = (
+            "tables:\n  - kind: attitude\n    time: {column: t}\n    columns: {heading: h}\n"
+            f"    heading: {written}\n"
+        )
+        (table,) = parse_yaml(text, MappingSettings, source="m").tables
+        assert table.heading_reference == "true"
+        with pytest.raises(ConfigError, match="heading"):
+            parse_yaml(text.replace(written, "false"), MappingSettings, source="m")
+
     def test_guess_refuses_what_is_no_table(self, tmp_path):
         path = tmp_path / "x.csv"
         path.write_text("a,b\n1,2\n")

@@ -291,10 +291,9 @@ def _mapped(table: TableMapping, messages: list[Message]) -> Batch:
     (name,) = table.time.names
     out["time"] = on_clock(table, column(name) * UNITS[table.time.unit])
     fill(out, table, column)
-    clock, topic = table.time.batch_clock, table.topic
-    return Batch(
-        table.kind, out, clock, topic, table.axes, table.heading, tuple(describe_mapping(table))
-    )
+    clock, topic, heading = table.time.batch_clock, table.topic, table.heading_reference
+    notes = tuple(describe_mapping(table))
+    return Batch(table.kind, out, clock, topic, table.axes, heading, notes)
 
 
 def _field(message: Any, name: str) -> float:
