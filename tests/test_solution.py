@@ -149,3 +149,18 @@ def test_a_scale_error_that_no_log_has_is_not_to_be_used(solution, value, std, s
     )
     found = consistency_findings([scale], [])
     assert [f.severity for f in found if f.code == Code.IMPOSSIBLE_SCALE] == ["error"] * refused
+
+
+@pytest.mark.parametrize(("value", "cause"), [
+    (np.sin(np.deg2rad(20)) / np.sin(np.deg2rad(30)) - 1, "look 20 deg from the vertical, and 30"),
+    (np.sin(np.deg2rad(25)) / np.sin(np.deg2rad(30)) - 1, "look 25 deg from the vertical, and 30"),
+    (-2.02, "the sign is reversed"),
+    (-1.2, "a current, a unit or another error"),
+])  # fmt: skip
+def test_a_scale_error_names_its_cause(solution, value, cause):
+    scale = replace(
+        solution.estimate("scale_error"), value=np.array([value]), std=np.array([0.01])
+    )
+    found = consistency_findings([scale], [])
+    (text,) = (f.text for f in found if f.code == Code.IMPOSSIBLE_SCALE)
+    assert cause in text

@@ -15,6 +15,7 @@ from factorgraph_dvl.plausibility.axes import in_words, mirrored, swapped
 from factorgraph_dvl.plausibility.gnss import MOVING_M_S, RADIANS, SPEED_UNITS
 from factorgraph_dvl.plausibility.records import WINDOW_S, gnss_velocity
 from factorgraph_dvl.quality.finding import Code, Finding
+from factorgraph_dvl.quality.scale_causes import beam_angles
 from factorgraph_dvl.sensors.beam_geometry import as_dvl, error_velocity
 from factorgraph_dvl.sensors.dvl import MISALIGNMENT, VELOCITY_COLUMNS, Dvl
 from factorgraph_dvl.sensors.dvl_beams import DvlBeams
@@ -29,6 +30,8 @@ _FEW = 10
 # Chosen: how far the ratio of speeds may be from 1 over the bottom; and the ratio that a current
 # makes of the speeds through water and over ground.
 _ALLOWED, _FASTEST_CURRENT = 0.25, 3.0
+# How far sway may take that ratio from the one of averages where a beam angle explains both.
+_SWAY = 0.1
 
 
 def dvl_findings(
@@ -81,6 +84,13 @@ def _speed_findings(dvl: Dvl, gnss: Gnss) -> Iterator[Finding]:
     # Sway moves DVL and antenna by their lever arms, but not on the average.
     steady = _steady_ratio(pings[inside], dvl.velocity[dvl.locked][inside], at_ping)
     in_water = dvl.settings.reference == "water"
+    angles = beam_angles(steady)
+    if not in_water and angles is not None and abs(ratio / steady - 1.0) < _SWAY:
+        right, assumed = angles
+        text = message("dvl_unit.beam_angle", ratio=steady, right=right, assumed=assumed)
+        far = abs(steady - 1.0) > _ALLOWED
+        yield Finding(Code.DVL_UNIT, text, dvl.label, severity="error" if far else "warning")
+        return
     in_current = in_water and 1.0 / _FASTEST_CURRENT < ratio < _FASTEST_CURRENT
     if in_current or min(abs(ratio - 1.0), abs(steady - 1.0)) <= _ALLOWED:
         yield Finding(
@@ -210,7 +220,8 @@ def _agreement(beams: DvlBeams) -> Iterator[Finding]:
     """Compare the error velocity with what noise, and errors as the priors allow, make of it."""
     s = beams.settings
     scale = np.broadcast_to(np.array(s.scale_error, dtype=float), (len(s.nominal_d),))
-    error = error_velocity((1.0 + scale)[:, None] * s.nominal_d, beams.velocity)
+    gain = (1.0 + scale)[:, None] * s.nominal_d
+    error = error_velocity(gain, beams.velocity)
     log = as_dvl(beams)
     known = np.isfinite(error) & log.locked
     if known.sum() < 3:
@@ -219,8 +230,14 @@ def _agreement(beams: DvlBeams) -> Iterator[Finding]:
     speed = float(np.sqrt(np.mean(np.sum(log.velocity[known] ** 2, axis=1))))
     noise = float(np.sqrt(np.nanmean(beams.sigma()[known] ** 2)))
     prior = speed * float(np.hypot(s.direction_std_deg * DEG, s.scale_error_std))
-    if rms > _TOO_LARGE * np.hypot(noise, prior):
+    allowed = _TOO_LARGE * np.hypot(noise, prior)
+    if rms > allowed:
         text = message("beams_disagree.more", rms=rms, speed=speed)
+        signs = 1.0 - 2.0 * np.eye(len(gain))
+        left = [error_velocity(gain, beams.velocity[known] * sign) for sign in signs]
+        agree = [str(k + 1) for k, e in enumerate(left) if np.sqrt(np.nanmean(e**2)) < allowed]
+        if agree:
+            text = message("beams_disagree.reversed", rms=rms, speed=speed, beams=either(agree))
         yield Finding(Code.BEAMS_DISAGREE, text, beams.label)
     else:
         text = message("beams_disagree.explained", rms=rms)

@@ -12,6 +12,7 @@ from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.message import Message, message
 from factorgraph_dvl.quality.finding import Code, Finding
+from factorgraph_dvl.quality.scale_causes import scale_cause
 
 # Factors by which residuals are larger than stated from which on every standard deviation is too
 # small, and the model another than the data's. Chosen: sums of some hundred residuals stay below
@@ -109,9 +110,12 @@ def _impossible_scale(e: Estimate) -> list[Finding]:
         return []
     worst = int(np.argmax(off - _CERTAIN * e.std))
     value, std, name = e.value[worst], e.std[worst], e.component_names[worst]
-    text = message(
-        "impossible_scale.larger", name=name, value=value, std=std, limit=100.0 * _LARGEST_SCALE
-    )
+    cause = scale_cause(float(value))
+    if cause is None:
+        numbers = {"name": name, "value": value, "std": std}
+        text = message("impossible_scale.larger", **numbers, limit=100.0 * _LARGEST_SCALE)
+    else:
+        text = message("impossible_scale.caused", name=name, value=value, std=std, cause=cause)
     return [Finding(Code.IMPOSSIBLE_SCALE, text, parameter=e.name)]
 
 

@@ -134,6 +134,21 @@ PROBLEMS: dict[str, tuple[Callable[[Trial], Trial], str, str]] = {
     "at 0, 0": (at_zero, "GNSS", "0, 0"),
     "DVL knots": (lambda t: dvl_velocity(t, 1 / 0.5144), "DVL", "knots"),
     "DVL slow": (lambda t: dvl_velocity(t, 0.3), "DVL", "is it in m/s"),
+    "DVL beams of 20 deg": (
+        lambda t: dvl_velocity(t, np.sin(np.deg2rad(20)) / np.sin(np.deg2rad(30))),
+        "DVL",
+        "look 20 deg from the vertical, and 30 deg were assumed",
+    ),
+    "DVL beams of 30 deg": (
+        lambda t: dvl_velocity(t, np.sin(np.deg2rad(30)) / np.sin(np.deg2rad(25))),
+        "DVL",
+        "look 30 deg from the vertical, and 25 deg were assumed",
+    ),
+    "DVL beams of 25 deg": (
+        lambda t: dvl_velocity(t, np.sin(np.deg2rad(25)) / np.sin(np.deg2rad(30))),
+        "DVL",
+        "look 25 deg from the vertical, and 30 deg were assumed",
+    ),
     "DVL sign": (lambda t: dvl_velocity(t, -1.0), "DVL", "PD0"),
     "DVL clock": (lambda t: late_dvl(t, 1e6), "DVL", "do not overlap"),
     "DVL late": (lambda t: late_dvl(t, 40.0), "DVL", "outside that of the IMU"),
