@@ -54,6 +54,9 @@ class InstrumentTerms:
         Rz(-EA) Ry(EJ) Rx(EI) in forward, starboard, down.
     alignment_std : ndarray, shape (3,), deg
         Standard deviations of `alignment`.
+    axes : ndarray, shape (3, 3)
+        Axes x, y, z of the DVL as it was recorded, a row each, in forward, starboard, down of the
+        vehicle.
     """
 
     dvl_in_body: dict[Order, Angles]
@@ -64,6 +67,7 @@ class InstrumentTerms:
     lever_arm_std: Array
     alignment: Array
     alignment_std: Array
+    axes: Array
 
 
 def instrument_of(calibration: Calibration | Solution) -> InstrumentTerms:
@@ -126,6 +130,7 @@ def instrument_of(calibration: Calibration | Solution) -> InstrumentTerms:
         lever_arm_std=np.sqrt(np.diag(frd @ lever_covariance @ frd.T)),
         alignment=alignment.value,
         alignment_std=alignment.std,
+        axes=exp_so3(alpha * DEG) @ frd.T,
     )
 
 

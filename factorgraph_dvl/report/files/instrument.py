@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from factorgraph_dvl.analysis.instrument_terms import ORDERS, Angles, InstrumentTerms, Order
+from factorgraph_dvl.analysis.mount import mount_in_words
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.quality.notation import fixed
 
@@ -33,6 +34,9 @@ def instrument_text(instrument: InstrumentTerms, name: str) -> str:
         "# Angles: roll about the forward axis (positive starboard down), pitch about the",
         "# starboard axis (positive bow up), yaw about the downward axis (positive clockwise from",
         "# above). The DVL's axes are named as the body's are: if aligned, it has zero angles.",
+        "",
+        "# The mount, with the axes of the DVL as they were recorded:",
+        *(f"# {sentence}" for sentence in mount_in_words(i.axes)),
         "",
         "# Attitude of the DVL in the vehicle, C_d^b: DVL components to body components.",
         "dvl_in_body:",
