@@ -828,7 +828,7 @@ def test_good_beams_have_no_problems():
     ("change", "severity", "message"),
     [
         (lambda v: v[:, [0, 2, 1, 3]], "warning", "is their order"),
-        (lambda v: v * [1, 1, -1, 1], "warning", "with the sign of beam 3 reversed"),
+        (lambda v: v * [1, 1, -1, 1], "warning", "the sign of beam 3 or 4 reversed"),
         (lambda v: -v, "warning", "Moving in the direction of a beam must give it a positive"),
         (lambda v: v * [np.nan, np.nan, 1, 1], "warning", "there is no ping with three beams"),
         (lambda v: v * [1, 1, np.nan, 1], "note", "lost at 0, 0, 100, 0 % of the pings"),
